@@ -1,6 +1,6 @@
-//! Values as CBOR (RFC 8949) with typed arrays (RFC 8746), both ways, as the rosbridge protocol has it: docs/spec/json.md.
+//! Values as CBOR (RFC 8949) with typed arrays (RFC 8746), both ways, as in the rosbridge protocol: docs/spec/json.md.
 //!
-//! Heads of items are `ciborium`'s; what is in them is read by the layout, whose depth is the depth of this.
+//! `ciborium` reads the heads of items; the layout directs the reading of their content and bounds the depth.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use crate::definition::{DUMMY_MEMBER, Primitive, Shape};
 use crate::fault::{Budget, ValueError, ValueProblem, fits, fits_bound, fits_one_more, short};
 use crate::layout::{Element, Layout, Member};
 use crate::number::{Number, fit, little};
-use crate::value::{Packed, Value, scalar};
+use crate::value::{PackedArray, Value, scalar};
 
 /// `uint8`, as a typed array.
 const TAG_OCTETS: u64 = 64;
@@ -19,18 +19,18 @@ const TAG_OCTETS: u64 = 64;
 const TAG_UNITS: u64 = 69;
 /// "This is CBOR", which may stand in front (RFC 8949, 3.4.6).
 const TAG_SELF_DESCRIBED: u64 = 55799;
-/// Elements that room is made for before they are there.
+/// Most elements for which memory is reserved before they are read.
 const RESERVE_MAX: usize = 1024;
 
 impl Value {
-    /// As CBOR. [`Layout::from_cbor`] reads it.
+    /// Returns CBOR. [`Layout::from_cbor`] reads it.
     pub fn to_cbor(&self) -> Vec<u8> {
         let mut out = Vec::new();
         self.write_cbor(&mut out);
         out
     }
 
-    /// Appends it as CBOR. Depth is bounded: layouts are.
+    /// Appends the value as CBOR. The depth is bounded as that of layouts.
     pub fn write_cbor(&self, out: &mut Vec<u8>) {
         match self {
             Self::Bool(value) => head(out, Header::Simple(if *value { simple::TRUE } else { simple::FALSE })),
@@ -51,7 +51,7 @@ impl Value {
                 let bytes: Vec<u8> = units.iter().flat_map(|unit| unit.to_le_bytes()).collect();
                 write_bytes(out, &bytes);
             }
-            Self::Packed(packed) => match tag_of(packed.primitive()) {
+            Self::PackedArray(packed) => match tag_of(packed.primitive()) {
                 Some(tag) => {
                     head(out, Header::Tag(tag));
                     write_bytes(out, packed.octets());
@@ -78,7 +78,7 @@ impl Value {
 }
 
 fn head(out: &mut Vec<u8>, header: Header) {
-    // A vector takes all.
+    // Writing to a vector never fails.
     let _ = Encoder::from(out).push(header);
 }
 
@@ -92,7 +92,7 @@ fn write_bytes(out: &mut Vec<u8>, bytes: &[u8]) {
     out.extend_from_slice(bytes);
 }
 
-/// The tag of a typed array; `bool` has none, and octets need none.
+/// Returns the tag of a typed array; `bool` has none, and octets need none.
 fn tag_of(primitive: Primitive) -> Option<u64> {
     Some(match primitive {
         Primitive::Uint16 => TAG_UNITS,
@@ -108,10 +108,10 @@ fn tag_of(primitive: Primitive) -> Option<u64> {
     })
 }
 
-/// What a typed array of a tag has in it, and whether the least byte comes first.
-fn of_tag(tag: u64) -> Option<(Primitive, bool)> {
+/// Returns the element type of a typed array's tag, and whether it is little endian.
+fn from_tag(tag: u64) -> Option<(Primitive, bool)> {
     Some(match tag {
-        // 68 is for graphics: what is out of range is the next that is not.
+        // Tag 68 is clamped arithmetic for graphics; as data it is the same.
         TAG_OCTETS | 68 => (Primitive::Uint8, true),
         65 => (Primitive::Uint16, false),
         66 => (Primitive::Uint32, false),
@@ -135,8 +135,8 @@ fn of_tag(tag: u64) -> Option<(Primitive, bool)> {
 }
 
 impl Layout {
-    /// Reads a message of the type from CBOR. Members that are left out take their default; octets and typed arrays share
-    /// the memory of what is read.
+    /// Reads a message of the type from CBOR. Missing members take their default; octets and typed arrays share the
+    /// memory of the input.
     pub fn from_cbor(&self, cbor: &Bytes) -> Result<Value, ValueError> {
         let mut reader = Reader { layout: self, body: cbor.clone(), at: 0, budget: Budget::default() };
         let mut first = reader.header()?;
@@ -180,7 +180,7 @@ impl Reader<'_> {
         Ok(taken)
     }
 
-    /// What a head of bytes, or of text, announces. In pieces it comes if nobody knew its length.
+    /// Reads the content of a head of bytes or text. Content of unknown length comes in pieces.
     fn content(&mut self, length: Option<usize>, text: bool) -> Result<Bytes, ValueProblem> {
         if let Some(bytes) = length {
             self.budget.bytes(bytes)?;
@@ -243,7 +243,8 @@ impl Reader<'_> {
         Ok(Value::Record(members))
     }
 
-    /// The head of the next item of a collection of which so many are left; of none if it says when it ends.
+    /// Reads the head of the next item of a collection with this many left; a collection of unknown length marks its
+    /// end.
     fn next(&mut self, left: &mut Option<usize>) -> Result<Option<Header>, ValueProblem> {
         match left {
             Some(0) => return Ok(None),
@@ -272,7 +273,7 @@ impl Reader<'_> {
             }
             (Header::Tag(tag), Some(primitive)) => {
                 let no_tag = || is_no(Header::Tag(tag), "an array");
-                let source = of_tag(tag).ok_or_else(no_tag)?;
+                let source = from_tag(tag).ok_or_else(no_tag)?;
                 let length = match self.header()? {
                     Header::Bytes(length) => length,
                     other => return Err(is_no(other, "the bytes of a typed array").into()),
@@ -329,7 +330,7 @@ impl Reader<'_> {
             );
         }
         fits(member.shape, bytes.len() / size)?;
-        // Octets of a `byte[]` come as signed ones from some.
+        // Some clients send the octets of a `byte[]` as signed ones.
         let octets = |primitive| matches!(primitive, Primitive::Byte | Primitive::Uint8);
         let same = source == target || octets(target) && size == 1;
         if same && (is_little || size == 1) {
@@ -363,14 +364,14 @@ impl Reader<'_> {
                     other => return Err(is_no(other, "string").into()),
                 };
                 fits_bound(bound, bytes.len())?;
-                match (first, Value::of_bytes(bytes)) {
+                match (first, Value::from_bytes(bytes)) {
                     (Header::Text(_), Value::Raw(_)) => return Err(no_utf8().into()),
                     (_, value) => value,
                 }
             }
             Element::WString { bound } => {
                 let units: Vec<u16> = match first {
-                    Header::Text(length) => match Value::of_bytes(self.content(length, true)?) {
+                    Header::Text(length) => match Value::from_bytes(self.content(length, true)?) {
                         Value::Text(text) => {
                             fits_bound(bound, text.encode_utf16().count())?;
                             return Ok(Value::Text(text));
@@ -387,7 +388,7 @@ impl Reader<'_> {
                     other => return Err(is_no(other, "wstring").into()),
                 };
                 fits_bound(bound, units.len())?;
-                Value::of_units(units)
+                Value::from_units(units)
             }
             Element::Struct(_) => Value::Record(Vec::new()),
         })
@@ -412,9 +413,9 @@ impl Reader<'_> {
     }
 }
 
-/// Elements of an array or a sequence of primitives. They fit: what they are was looked at.
+/// Returns the elements of an array or a sequence of primitives, whose values were checked before.
 fn packed(primitive: Primitive, octets: Bytes) -> Value {
-    Packed::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::Packed)
+    PackedArray::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::PackedArray)
 }
 
 fn ended() -> ValueProblem {
@@ -453,13 +454,13 @@ mod tests {
         Ok(value.to_json())
     }
 
-    /// A map of one member `a`.
+    /// Returns a map of one member `a`.
     fn with(item: &[u8]) -> Vec<u8> {
         [b"\xa1\x61a", item].concat()
     }
 
     #[test]
-    fn what_rosbridge_writes_is_written() {
+    fn cbor_is_written_as_rosbridge_writes_it() {
         let json = r#"{"o": "AQI=", "f": [1.5], "i": [-2], "b": [true], "t": {"a": 1}, "s": "x", "n": -1, "d": 0.1}"#;
         let layout =
             layout("uint8[] o\nfloat32[] f\nint16[] i\nbool[] b\nTwo t\nstring s\nint64 n\nfloat64 d");
@@ -479,7 +480,7 @@ mod tests {
     }
 
     #[test]
-    fn what_clients_write_is_understood() {
+    fn cbor_of_clients_is_understood() {
         for (text, item, found) in [
             ("int64 a", &b"\x3b\x7f\xff\xff\xff\xff\xff\xff\xff"[..], r#"{"a":-9223372036854775808}"#),
             ("uint64 a", b"\x1b\xff\xff\xff\xff\xff\xff\xff\xff", r#"{"a":18446744073709551615}"#),
@@ -490,7 +491,7 @@ mod tests {
             ("int16[] a", b"\xd8\x49\x42\xff\xfe", r#"{"a":[-2]}"#),
             ("byte[] a", b"\xd8\x48\x42\xff\x01", r#"{"a":"/wE="}"#),
             ("int8[] a", b"\x41\x07", r#"{"a":[7]}"#),
-            // Nobody knew how many.
+            // Of unknown length.
             ("string a", b"\x7f\x61h\x61i\xff", r#"{"a":"hi"}"#),
             ("uint8[] a", b"\x5f\x41\x01\x41\x02\xff", r#"{"a":"AQI="}"#),
             ("string[] a", b"\x9f\x61x\x60\xff", r#"{"a":["x",""]}"#),

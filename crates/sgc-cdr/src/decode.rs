@@ -6,14 +6,14 @@ use crate::definition::{Primitive, Shape};
 use crate::encoding::{ENCAPSULATION_BYTES, Encoding, PADDING_BYTES_MAX, Padding, WideUnit};
 use crate::layout::{Element, Layout, Member};
 use crate::path;
-use crate::value::{Packed, Value, scalar};
+use crate::value::{PackedArray, Value, scalar};
 
 /// Most values in one message; an array or a sequence of primitives is one.
 pub const VALUES_MAX: usize = 4 << 20;
-/// Elements that room is made for before they are there.
+/// Most elements for which memory is reserved before they are read.
 const RESERVE_MAX: usize = 1024;
 
-/// Why a payload is no message of the type.
+/// The reason why a payload is no message of the type.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DecodeError {
     /// Too short for its encapsulation header.
@@ -25,10 +25,10 @@ pub enum DecodeError {
     /// A representation that ROS 2 does not use.
     #[error("representation {id:#06x} is neither CDR nor CDR2")]
     Representation {
-        /// As in the header.
+        /// The id in the header.
         id: u16,
     },
-    /// It ends too early.
+    /// The payload ends too early.
     #[error("it ends in {member}")]
     End {
         /// The path of the member that is cut: `pose.position.x`.
@@ -49,16 +49,16 @@ pub enum DecodeError {
     Bool {
         /// The path of the member.
         member: String,
-        /// What it is.
+        /// The value.
         found: u8,
     },
     /// Too many values.
     #[error("it has more than {VALUES_MAX} values")]
     TooManyValues,
-    /// Something is left over.
+    /// Bytes are left over.
     #[error("{bytes} bytes are left over: the publisher's definition is another")]
     LeftOver {
-        /// How many.
+        /// Their number.
         bytes: usize,
     },
 }
@@ -93,15 +93,15 @@ impl Layout {
         self.decode_as(payload).map(|(value, _)| value)
     }
 
-    /// Decodes a serialised message, and says how it is written: [`Layout::encode_as`] writes it again as it was, but for
-    /// alignment that is not filled with zeros, texts without the NUL at their end, and members that this definition lacks.
+    /// Decodes a serialised message, and returns its encoding: [`Layout::encode_as`] writes it again as it was, except
+    /// for non-zero alignment bytes, texts without the NUL at their end, and members that this definition lacks.
     pub fn decode_as(&self, payload: &Bytes) -> Result<(Value, Encoding), DecodeError> {
         let short = DecodeError::TooShort { bytes: payload.len() };
         let Some((head, body)) = payload.split_first_chunk::<ENCAPSULATION_BYTES>() else {
             return Err(short);
         };
         let id = u16::from_be_bytes([head[0], head[1]]);
-        let plain = Encoding::of(id).ok_or(DecodeError::Representation { id })?;
+        let plain = Encoding::from_id(id).ok_or(DecodeError::Representation { id })?;
         let said = head[3] & PADDING_BYTES_MAX as u8 != 0;
         let body = payload.slice_ref(body);
         let decode = |wide| -> Result<_, DecodeError> {
@@ -116,7 +116,7 @@ impl Layout {
             };
             Ok((value, Encoding { padding, ..encoding }))
         };
-        // Which width a `wstring` has, only the whole shows.
+        // Only the whole message shows the width of a `wstring`.
         match decode(WideUnit::Two) {
             Err(first) if self.is_wide() && !plain.is_second() => decode(WideUnit::Four).map_err(|_| first),
             result => result,
@@ -129,12 +129,12 @@ struct Decoder<'a> {
     encoding: Encoding,
     body: Bytes,
     at: usize,
-    /// Where what is being read ends.
+    /// End of the structure that is being read.
     end: usize,
     values: usize,
 }
 
-/// Where the body ended; what was being read is added on the way up.
+/// The end of the body; the path is assembled on the way up.
 enum Stop {
     End,
     Bound { found: u32, bound: u32 },
@@ -155,7 +155,7 @@ impl From<Stop> for DecodeError {
 }
 
 impl Decoder<'_> {
-    /// The value, and how many bytes are behind it.
+    /// Returns the value, and the number of bytes behind it.
     fn run(mut self) -> Result<(Value, usize), DecodeError> {
         let Some(root) = self.layout.structs.len().checked_sub(1) else {
             return Ok((Value::Record(Vec::new()), 0));
@@ -167,7 +167,7 @@ impl Decoder<'_> {
         }
     }
 
-    /// A message. Layouts have no circles and a bounded depth, and so has this.
+    /// Reads a message. Layouts have no circles and a bounded depth, so the recursion is bounded.
     fn record(&mut self, place: usize) -> Result<Value, DecodeError> {
         let layout = self.layout;
         let Some(this) = layout.structs.get(place) else { return Ok(Value::Record(Vec::new())) };
@@ -181,7 +181,7 @@ impl Decoder<'_> {
         }
         let mut members = Vec::with_capacity(this.members.len());
         for member in &this.members {
-            // A publisher with an older definition leaves out what was added behind.
+            // A publisher with an older definition leaves out the members added later.
             if self.encoding.is_delimited() && self.at == self.end {
                 break;
             }
@@ -229,7 +229,7 @@ impl Decoder<'_> {
         if let Element::Primitive(primitive) = member.element {
             return self.packed(primitive, count);
         }
-        // Every element has a byte at least.
+        // Every element has at least one byte.
         if count > self.end - self.at {
             return Err(Stop::End.into());
         }
@@ -255,10 +255,10 @@ impl Decoder<'_> {
             turned.chunks_exact_mut(size).for_each(<[u8]>::reverse);
             octets = turned.into();
         }
-        if let Some(packed) = Packed::new(primitive, octets.clone()) {
-            return Ok(Value::Packed(packed));
+        if let Some(packed) = PackedArray::new(primitive, octets.clone()) {
+            return Ok(Value::PackedArray(packed));
         }
-        // Whole they are: it is a `bool` that is none.
+        // The elements are complete, so a `bool` is wrong.
         let wrong = octets.iter().enumerate().find(|(_, octet)| **octet > 1);
         let (index, found) = wrong.map_or((0, 0), |(index, octet)| (index, *octet));
         Err(DecodeError::from(Stop::Bool(found)).at(index))
@@ -297,7 +297,7 @@ impl Decoder<'_> {
             text.truncate(text.len() - 1);
         }
         within(text.len(), bound)?;
-        Ok(Value::of_bytes(text))
+        Ok(Value::from_bytes(text))
     }
 
     fn wide_string(&mut self, bound: Option<u32>) -> Result<Value, Stop> {
@@ -319,14 +319,14 @@ impl Decoder<'_> {
             text.pop();
         }
         within(text.len(), bound)?;
-        Ok(Value::of_units(text))
+        Ok(Value::from_units(text))
     }
 
     fn length(&mut self) -> Result<u32, Stop> {
         Ok(u32::from_le_bytes(self.number()?))
     }
 
-    /// A number of so many bytes, aligned to them, the least first.
+    /// Reads a number of this many bytes, aligned to its size, little endian.
     fn number<const N: usize>(&mut self) -> Result<[u8; N], Stop> {
         let begin = self.at.next_multiple_of(self.encoding.alignment(N));
         let end = begin.checked_add(N).filter(|end| *end <= self.end).ok_or(Stop::End)?;
@@ -382,13 +382,13 @@ mod tests {
     }
 
     #[test]
-    fn what_says_its_size_may_be_older_or_newer() {
-        // DHEADER 4: `a` and `b` of the struct; then what an older publisher does not have.
+    fn sized_structures_may_be_older_or_newer() {
+        // DHEADER 4: `a` and `b` of the struct; then the members that an older publisher does not have.
         let older = b"\0\x09\0\0\x08\0\0\0\x04\0\0\0\x01\0\x02\0";
         assert_eq!(decode("Two x\nuint8 added", older).unwrap(), r#"{"x":{"a":1,"b":2}}"#);
         let newer = b"\0\x09\0\0\x0c\0\0\0\x05\0\0\0\x01\0\x02\0\x09\0\0\0";
         assert_eq!(decode("Two x", newer).unwrap(), r#"{"x":{"a":1,"b":2}}"#);
-        // A sequence of structs says its size in version 2.
+        // A sequence of structs carries its size in version 2.
         let sequence = b"\0\x07\0\0\x08\0\0\0\x01\0\0\0\x01\0\x02\0";
         assert_eq!(decode("Two[] x", sequence).unwrap(), r#"{"x":[{"a":1,"b":2}]}"#);
     }
@@ -416,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_said() {
+    fn values_that_do_not_fit_are_reported() {
         let member = || "a".to_owned();
         for (text, payload, error) in [
             ("uint8 a", &b"\0\x01"[..], DecodeError::TooShort { bytes: 2 }),

@@ -1,4 +1,4 @@
-//! What members are that a value leaves out: the default that the definition names, else zero, empty, nothing.
+//! Values of missing members: the default that the definition names, or zero, empty, nothing.
 
 use std::sync::Arc;
 
@@ -8,14 +8,14 @@ use crate::definition::{Base, FieldType, Primitive, Shape};
 use crate::fault::{Budget, ValueError, ValueProblem, fits, fits_bound};
 use crate::layout::{Element, Layout, Member};
 use crate::number::{Number, little};
-use crate::value::{Packed, Value, scalar};
+use crate::value::{PackedArray, Value, scalar};
 
 /// A default of a definition.
 #[derive(Clone, Debug)]
 pub(crate) struct MemberDefault {
-    /// As the definition spells it.
+    /// The definition's spelling.
     pub(crate) text: String,
-    /// What it means; `None` if it means nothing.
+    /// Its value; `None` if the text is invalid.
     pub(crate) value: Option<Value>,
 }
 
@@ -27,7 +27,7 @@ impl MemberDefault {
 }
 
 impl Layout {
-    /// The value of a member that is left out.
+    /// Returns the value of a missing member.
     pub(crate) fn default_of(&self, member: &Member, budget: &mut Budget) -> Result<Value, ValueError> {
         match &member.default {
             Some(MemberDefault { value: Some(value), .. }) => {
@@ -40,7 +40,7 @@ impl Layout {
         }
     }
 
-    /// A message with nothing in it but defaults.
+    /// Returns a message with nothing in it but defaults.
     pub(crate) fn default_record(&self, place: usize, budget: &mut Budget) -> Result<Value, ValueError> {
         left_out(budget)?;
         let members = self.structs.get(place).map_or(&[][..], |this| &this.members);
@@ -62,7 +62,9 @@ impl Layout {
             let bytes = count.checked_mul(primitive.bytes()).ok_or(ValueProblem::TooLarge)?;
             budget.bytes(bytes)?;
             let octets = Bytes::from(vec![0; bytes]);
-            return Ok(Packed::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::Packed));
+            return Ok(
+                PackedArray::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::PackedArray)
+            );
         }
         (0..count).map(|_| self.zero_element(member, budget)).collect::<Result<_, _>>().map(Value::List)
     }
@@ -82,7 +84,7 @@ impl Layout {
     }
 }
 
-/// What is not there has no bytes that bound it, but takes memory.
+/// Charges a missing member, which has no bytes that bound it, but takes memory.
 fn left_out(budget: &mut Budget) -> Result<(), ValueProblem> {
     budget.value()?;
     budget.bytes(size_of::<Value>())
@@ -92,13 +94,13 @@ fn content_bytes(value: &Value) -> usize {
     match value {
         Value::Text(text) => text.len(),
         Value::Octets(octets) => octets.len(),
-        Value::Packed(packed) => packed.octets().len(),
+        Value::PackedArray(packed) => packed.octets().len(),
         Value::List(all) => all.iter().map(|value| size_of::<Value>() + content_bytes(value)).sum(),
         _ => 0,
     }
 }
 
-/// What the text of a default says (`rosidl_adapter`, `parse_value_string`); `None` if it is no value of the type.
+/// Parses the text of a default (`rosidl_adapter`, `parse_value_string`); `None` if it is no value of the type.
 fn literal(field_type: &FieldType, text: &str) -> Option<Value> {
     let text = text.trim();
     if field_type.shape == Shape::One {
@@ -113,10 +115,10 @@ fn literal(field_type: &FieldType, text: &str) -> Option<Value> {
     let Base::Primitive(primitive) = field_type.base else { return Some(Value::List(all)) };
     let octets: Bytes =
         all.iter().flat_map(|value| little(value).into_iter().take(primitive.bytes())).collect();
-    Some(Packed::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::Packed))
+    Some(PackedArray::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::PackedArray))
 }
 
-/// What is between commas, but for those in quotes.
+/// Splits a text at commas outside of quotes.
 fn parts(text: &str) -> Option<Vec<&str>> {
     let mut all = Vec::new();
     let mut rest = text.trim();
@@ -137,7 +139,7 @@ fn parts(text: &str) -> Option<Vec<&str>> {
     Some(all)
 }
 
-/// Where a text in quotes ends: behind them.
+/// Returns the end of a text in quotes: behind them.
 fn quoted_end(text: &str, quote: char) -> Option<usize> {
     let mut escaped = false;
     let end = text.char_indices().skip(1).find(|(_, c)| {
@@ -184,7 +186,7 @@ fn integer(text: &str) -> Option<i128> {
         .into_iter()
         .find_map(|(prefix, radix)| Some((lower.strip_prefix(prefix)?, radix)))
         .unwrap_or((&lower, 10));
-    // A sign is behind.
+    // A sign was removed before.
     let plain = digits.bytes().all(|byte| byte.is_ascii_alphanumeric());
     i128::from_str_radix(digits, radix).ok().filter(|_| plain).map(|value| sign * value)
 }

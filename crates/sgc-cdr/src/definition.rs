@@ -1,10 +1,9 @@
-//! What a message consists of, as its definition says (the ROS 2 design article "Interface definition using .msg / .srv /
-//! .action files").
+//! The definition of a message (the ROS 2 design article "Interface definition using .msg / .srv / .action files").
 
 use std::fmt;
 use std::str::FromStr;
 
-/// Member that a message without any has, since IDL knows no empty structure.
+/// Member of a message that has none, because IDL knows no empty structure.
 pub const DUMMY_MEMBER: &str = "structure_needs_at_least_one_member";
 /// Longest name of a type, bytes.
 const TYPE_NAME_BYTES_MAX: usize = 255;
@@ -23,7 +22,8 @@ pub struct TypeName {
 pub struct TypeNameError(String);
 
 impl TypeName {
-    /// The name of a type; `None` if a part of it is not an identifier or `kind` is none of `msg`, `srv`, `action`.
+    /// Returns the name of a type; `None` if a part of it is not an identifier or `kind` is none of `msg`, `srv`,
+    /// `action`.
     pub fn new(package: &str, kind: &str, name: &str) -> Option<Self> {
         let kind = ["msg", "srv", "action"].into_iter().find(|k| *k == kind)?;
         let fits = package.len() + name.len() < TYPE_NAME_BYTES_MAX - 8;
@@ -34,22 +34,22 @@ impl TypeName {
         })
     }
 
-    /// The package.
+    /// Returns the package.
     pub fn package(&self) -> &str {
         &self.package
     }
 
-    /// `"msg"`, `"srv"` or `"action"`.
+    /// Returns `"msg"`, `"srv"` or `"action"`.
     pub fn kind(&self) -> &'static str {
         self.kind
     }
 
-    /// The name within the package.
+    /// Returns the name within the package.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Name of the file that defines it, without its extension: that of `SetBool_Request` is `SetBool`.
+    /// Returns the name of the file that defines it, without its extension: that of `SetBool_Request` is `SetBool`.
     pub fn file_stem(&self) -> &str {
         let suffixes: &[&str] = match self.kind {
             "srv" => &["_Request", "_Response", "_Event"],
@@ -75,22 +75,22 @@ impl TypeName {
 
 /// The messages of a service.
 impl TypeName {
-    /// What it is asked with: `std_srvs/srv/SetBool_Request` of `std_srvs/srv/SetBool`.
+    /// Returns the request: `std_srvs/srv/SetBool_Request` of `std_srvs/srv/SetBool`.
     pub fn request(&self) -> Self {
         self.with("_Request")
     }
 
-    /// What it answers with.
+    /// Returns the response.
     pub fn response(&self) -> Self {
         self.with("_Response")
     }
 
-    /// What is told of both to who looks (REP 2012).
+    /// Returns the event message of both, for introspection (REP 2012).
     pub(crate) fn event(&self) -> Self {
         self.with("_Event")
     }
 
-    /// The service that it is a message of, if it is one's.
+    /// Returns the service of this message, if it is a service's.
     pub fn service(&self) -> Option<Self> {
         let suffixes = ["_Request", "_Response", "_Event"].iter();
         let name = suffixes.filter(|_| self.kind != "msg").find_map(|s| self.name.strip_suffix(s))?;
@@ -110,7 +110,7 @@ impl FromStr for TypeName {
         let mut parts = text.split('/');
         match (parts.next(), parts.next(), parts.next(), parts.next()) {
             (Some(package), Some(kind), Some(name), None) => Self::new(package, kind, name).ok_or_else(shown),
-            // As the tools of ROS 2 take it.
+            // As the tools of ROS 2 accept it.
             (Some(package), Some(name), None, None) => Self::new(package, "msg", name).ok_or_else(shown),
             _ => Err(shown()),
         }
@@ -159,7 +159,7 @@ pub enum Primitive {
 }
 
 impl Primitive {
-    /// Its bytes when serialised, and what it is aligned to.
+    /// Returns its serialised size, which is also its alignment in version 1.
     pub fn bytes(self) -> usize {
         match self {
             Self::Bool | Self::Byte | Self::Int8 | Self::Uint8 => 1,
@@ -169,7 +169,7 @@ impl Primitive {
         }
     }
 
-    /// As definitions spell it: `float64`.
+    /// Returns the spelling in definitions: `float64`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Bool => "bool",
@@ -206,7 +206,7 @@ impl Primitive {
     }
 }
 
-/// What one element of a member is.
+/// Type of one element of a member.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Base {
     /// A type of fixed size.
@@ -225,7 +225,7 @@ pub enum Base {
     Message(TypeName),
 }
 
-/// How many elements a member has.
+/// Number of elements of a member.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Shape {
     /// One.
@@ -242,9 +242,9 @@ pub enum Shape {
 /// Type of a member.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FieldType {
-    /// Of one element.
+    /// Type of one element.
     pub base: Base,
-    /// How many of them.
+    /// Number of elements.
     pub shape: Shape,
 }
 

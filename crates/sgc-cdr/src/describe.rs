@@ -1,7 +1,7 @@
-//! A type with all that it contains as bytes, so that who has no definition of it can be given one (REP 2016).
+//! A type with everything that it contains as bytes, for nodes that have no definition of it (REP 2016).
 //!
-//! The form is the message `type_description_interfaces/msg/TypeDescription`, serialised as any other: what nodes of ROS 2
-//! answer when they are asked for the description of a type. Who sends it, and with what, is for others.
+//! The form is the message `type_description_interfaces/msg/TypeDescription`, serialised as any other: the answer of
+//! ROS 2 nodes to a request for a type description. Callers send it.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -21,44 +21,44 @@ const DESCRIPTION: &str = "type_description_interfaces/msg/TypeDescription";
 /// Longest description, bytes.
 pub const DESCRIPTION_BYTES_MAX: usize = 256 * 1024;
 
-/// Why there is no description, or why one is not believed.
+/// The reason why there is no description, or why one is not believed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DescriptionError {
-    /// It is too long.
+    /// The description is too long.
     #[error("the description has {bytes} bytes, more than {DESCRIPTION_BYTES_MAX}")]
     TooLong {
         /// Its bytes.
         bytes: usize,
     },
-    /// It is no message.
+    /// The description cannot be decoded.
     #[error("the description cannot be read: {0}")]
     Decode(#[from] DecodeError),
-    /// It cannot be written.
+    /// The description cannot be written.
     #[error("the description cannot be written: {0}")]
     Encode(#[from] ValueError),
-    /// A member of it is not what ROS 2 has.
+    /// A member of the description has a value that ROS 2 does not know.
     #[error("the description has {found:?} as {what}")]
     Content {
-        /// What it is for.
+        /// The meaning of the member.
         what: &'static str,
-        /// What it is.
+        /// The value.
         found: String,
     },
-    /// What it describes is no type.
+    /// The described type is invalid.
     #[error(transparent)]
     Type(#[from] TypeError),
-    /// It describes another type than the one of the hash.
+    /// The description is of another type than that of the hash.
     #[error("the description is one of {found}, not of {expected}")]
     Hash {
-        /// The hash of what is described.
+        /// The hash of the description.
         found: String,
-        /// The hash that was asked for.
+        /// The expected hash.
         expected: String,
     },
 }
 
 impl Layout {
-    /// Describes the type with all that it contains. Defaults are in it, constants are not; at most
+    /// Describes the type with everything that it contains: defaults included, constants left out; at most
     /// [`DESCRIPTION_BYTES_MAX`] bytes.
     pub fn describe(&self) -> Result<Vec<u8>, DescriptionError> {
         let this = self.structs.last().map(individual);
@@ -74,8 +74,8 @@ impl Layout {
         Ok(bytes)
     }
 
-    /// The type that a description describes. Its hash, `RIHS01_` and 64 hexadecimal digits, has to be the one that is
-    /// expected; it says nothing of defaults (REP 2016), so those are not taken over.
+    /// Returns the type of a description. Its hash, `RIHS01_` and 64 hexadecimal digits, has to be the expected one; it
+    /// does not cover defaults (REP 2016), so those are not taken over.
     pub fn from_description(bytes: &Bytes, expected_hash: &str) -> Result<Self, DescriptionError> {
         if bytes.len() > DESCRIPTION_BYTES_MAX {
             return Err(DescriptionError::TooLong { bytes: bytes.len() });
@@ -133,7 +133,7 @@ fn individual(this: &Struct) -> Value {
     ])
 }
 
-/// A member of a description, which has all of its members: it was decoded by its layout.
+/// Returns a member of a description, which has all of its members, because its layout decoded it.
 fn member<'a>(value: &'a Value, name: &str) -> &'a Value {
     const NONE: &Value = &Value::Bool(false);
     let Value::Record(members) = value else { return NONE };
@@ -158,7 +158,7 @@ fn wrong(what: &'static str, found: &str) -> DescriptionError {
 
 fn type_name(text: &str) -> Result<TypeName, DescriptionError> {
     let name: TypeName = text.parse().map_err(|_| wrong("name of a type", text))?;
-    // `std_msgs/String` is one for tools, and no name that is hashed.
+    // Tools accept `std_msgs/String`, but it is no name in a hash.
     if name.to_string() == text { Ok(name) } else { Err(wrong("name of a type", text)) }
 }
 
@@ -177,7 +177,7 @@ fn definition(individual: &Value) -> Result<Definition, DescriptionError> {
         all.push(Field {
             name: name.to_owned(),
             field_type: field_type(member(field, "type"))?,
-            // No hash vouches for it.
+            // No hash covers it.
             default: None,
         });
     }
@@ -210,7 +210,7 @@ fn field_type(value: &Value) -> Result<FieldType, DescriptionError> {
         18 => Base::WString { bound: None },
         21 if string_capacity > 0 => Base::String { bound: Some(string_capacity) },
         22 if string_capacity > 0 => Base::WString { bound: Some(string_capacity) },
-        _ => Base::Primitive(Primitive::of_id(id).ok_or_else(no_id)?),
+        _ => Base::Primitive(Primitive::from_id(id).ok_or_else(no_id)?),
     };
     Ok(FieldType { base, shape })
 }
@@ -246,7 +246,7 @@ mod tests {
         let ours = layout("p/msg/M", text);
         let bytes = Bytes::from(ours.describe().unwrap());
         let read = Layout::from_description(&bytes, &ours.type_hash()).unwrap();
-        // Nothing vouches for defaults.
+        // No hash covers defaults.
         assert_eq!(read.from_json(b"{}").unwrap().at("a"), Some(Value::List(Vec::new())));
         let other = layout("p/msg/M", "int8[8] c").type_hash();
         let error = Layout::from_description(&bytes, &other).unwrap_err();
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_description_is_said() {
+    fn malformed_descriptions_are_reported() {
         let hash = layout("p/msg/M", "int8 a").type_hash();
         let of = |json: &str| {
             let bytes = description().unwrap().from_json(json.as_bytes()).unwrap();

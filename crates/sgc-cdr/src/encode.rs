@@ -7,18 +7,18 @@ use crate::encoding::{ENCAPSULATION_BYTES, Encoding, Padding};
 use crate::fault::{Budget, ValueError, ValueProblem, fits, fits_bound};
 use crate::layout::{Element, Layout, Member};
 use crate::number::{fit, little};
-use crate::value::{Packed, Value};
+use crate::value::{PackedArray, Value};
 
 impl Layout {
     /// Serialises a message as ROS 2 does today: CDR of version 1, little endian, with its encapsulation header.
     ///
-    /// Members may come in any order, and those that are left out take their default. Integers may be of either kind, and
+    /// Members may come in any order, and missing ones take their default. Integers may be of either kind, and
     /// sequences of primitives lists, as long as each number fits its member.
     pub fn encode(&self, value: &Value) -> Result<Vec<u8>, ValueError> {
         self.encode_as(value, Encoding::default())
     }
 
-    /// Serialises a message in a given way, such as that of another payload, which [`Layout::decode_as`] says.
+    /// Serialises a message in a given encoding, such as that of another payload from [`Layout::decode_as`].
     pub fn encode_as(&self, value: &Value, encoding: Encoding) -> Result<Vec<u8>, ValueError> {
         let mut out = Vec::with_capacity(ENCAPSULATION_BYTES);
         out.extend(encoding.id().to_be_bytes());
@@ -42,20 +42,20 @@ impl Layout {
 struct Encoder<'a> {
     layout: &'a Layout,
     encoding: Encoding,
-    /// With the encapsulation header, which alignment does not count.
+    /// The output, with the encapsulation header, which alignment does not count.
     out: Vec<u8>,
-    /// For what is left out.
+    /// Bound on missing members.
     budget: Budget,
 }
 
 impl Encoder<'_> {
-    /// A message. Layouts have no circles and a bounded depth, and so has this.
+    /// Writes a message. Layouts have no circles and a bounded depth, so the recursion is bounded.
     fn record(&mut self, place: usize, value: &Value) -> Result<(), ValueError> {
         let Value::Record(given) = value else { return Err(is_no(value, "a message").into()) };
         let layout = self.layout;
         let Some(this) = layout.structs.get(place) else { return Ok(()) };
         let size = self.encoding.is_delimited().then(|| self.begin_sized());
-        // They come in order, most often.
+        // Members usually come in order.
         let mut next = 0;
         let mut taken = 0;
         for member in &this.members {
@@ -91,7 +91,7 @@ impl Encoder<'_> {
         let count = match value {
             Value::List(all) => all.len(),
             Value::Octets(octets) => octets.len(),
-            Value::Packed(packed) => packed.len(),
+            Value::PackedArray(packed) => packed.len(),
             _ => return Err(is_no(value, "a sequence").into()),
         };
         fits(member.shape, count)?;
@@ -104,7 +104,9 @@ impl Encoder<'_> {
             (Element::Primitive(Primitive::Byte | Primitive::Uint8), Value::Octets(octets)) => {
                 self.out.extend_from_slice(octets);
             }
-            (Element::Primitive(primitive), Value::Packed(packed)) if packed.primitive() == primitive => {
+            (Element::Primitive(primitive), Value::PackedArray(packed))
+                if packed.primitive() == primitive =>
+            {
                 self.packed(packed);
             }
             (_, Value::List(all)) => {
@@ -112,7 +114,7 @@ impl Encoder<'_> {
                     self.element(member, value).map_err(|error| error.at(index))?;
                 }
             }
-            (_, Value::Packed(packed)) => {
+            (_, Value::PackedArray(packed)) => {
                 for (index, value) in packed.iter().enumerate() {
                     self.element(member, &value).map_err(|error| error.at(index))?;
                 }
@@ -123,13 +125,13 @@ impl Encoder<'_> {
                     self.element(member, &value).map_err(|error| error.at(index))?;
                 }
             }
-            // Sequences are all there are, as their count shows.
+            // Only sequences are left, as their count shows.
             _ => {}
         }
         self.end_sized(size)
     }
 
-    fn packed(&mut self, packed: &Packed) {
+    fn packed(&mut self, packed: &PackedArray) {
         if packed.is_empty() {
             return;
         }
@@ -169,7 +171,7 @@ impl Encoder<'_> {
         Ok(())
     }
 
-    /// Without a NUL behind: no vendor writes one.
+    /// Writes a `wstring` without a NUL at the end: no vendor writes one.
     fn wide_string(
         &mut self,
         bound: Option<u32>,
@@ -197,7 +199,7 @@ impl Encoder<'_> {
         Ok(())
     }
 
-    /// A number of these bytes, the least first, aligned to as many as they are.
+    /// Writes a number of these bytes, little endian, aligned to its size.
     fn number(&mut self, little: &[u8]) {
         self.align(little.len());
         if self.encoding.is_little() {
@@ -213,7 +215,7 @@ impl Encoder<'_> {
         self.out.resize(ENCAPSULATION_BYTES + aligned, 0);
     }
 
-    /// Leaves room for how many bytes what follows has; gives where that ends.
+    /// Leaves room for the size of the following data, and returns the offset of its end.
     fn begin_sized(&mut self) -> usize {
         self.number(&[0; 4]);
         self.out.len()
@@ -259,14 +261,14 @@ mod tests {
     }
 
     #[test]
-    fn what_is_decoded_is_encoded_as_it_was() {
+    fn decoded_messages_encode_to_the_same_bytes() {
         let text = "uint8 a\nuint64 b\nstring c\nuint16[] d";
         let nested = "Two[] x\nstring[] y\nwstring z";
         for (text, payload) in [
             (text, &b"\0\x01\0\0\x01\0\0\0\0\0\0\0\x02\0\0\0\0\0\0\0\x03\0\0\0hi\0\0\x01\0\0\0\x05\0"[..]),
             (text, b"\0\0\0\0\x01\0\0\0\0\0\0\0\0\0\0\0\0\0\0\x02\0\0\0\x03hi\0\0\0\0\0\x01\0\x05"),
             (text, b"\0\x07\0\0\x01\0\0\0\x02\0\0\0\0\0\0\0\x03\0\0\0hi\0\0\x01\0\0\0\x05\0\0\0"),
-            // Filled up, and said so.
+            // Padded, and marked so.
             (text, b"\0\x01\0\x02\x01\0\0\0\0\0\0\0\x02\0\0\0\0\0\0\0\x03\0\0\0hi\0\0\x01\0\0\0\x05\0\0\0"),
             (
                 nested,

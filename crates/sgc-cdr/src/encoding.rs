@@ -1,20 +1,20 @@
-//! How the bytes of a message are laid out, beside its type (DDS-XTypes 1.3, 7.4 and 7.6.3.1.2; RTPS 2.5, 10.2).
+//! Encodings of a message's bytes, beside its type (DDS-XTypes 1.3, 7.4 and 7.6.3.1.2; RTPS 2.5, 10.2).
 
 /// Bytes before the body: representation and options.
 pub(crate) const ENCAPSULATION_BYTES: usize = 4;
-/// Bytes that a payload may be filled up with.
+/// Most padding bytes of a payload.
 pub(crate) const PADDING_BYTES_MAX: usize = 3;
 
-/// How a payload is written. The default is what ROS 2 vendors write today: CDR of version 1, little endian.
+/// Encoding of a payload. The default is that of ROS 2 vendors today: CDR of version 1, little endian.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Encoding {
     /// The order of the bytes of a number.
     pub order: ByteOrder,
     /// The version of CDR.
     pub version: CdrVersion,
-    /// How wide a unit of a `wstring` is.
+    /// Width of a unit of a `wstring`.
     pub wide: WideUnit,
-    /// Whether it is filled up to a multiple of four bytes.
+    /// Whether it is padded to a multiple of four bytes.
     pub padding: Padding,
 }
 
@@ -34,9 +34,9 @@ pub enum CdrVersion {
     /// XCDR1, plain.
     #[default]
     One,
-    /// XCDR2, plain: what has 8 bytes is aligned to 4, and collections of what is no primitive say their size.
+    /// XCDR2, plain: 8-byte values are aligned to 4, and collections of non-primitives carry their size.
     Two,
-    /// XCDR2, where structures say their size as well, and may end early or go on.
+    /// XCDR2, where structures carry their size as well, and may end early or go on.
     TwoDelimited,
 }
 
@@ -56,15 +56,15 @@ pub enum Padding {
     /// None, as Fast DDS writes it.
     #[default]
     None,
-    /// There, and nobody says how many, as `rmw_cyclonedds_cpp` writes it.
+    /// Present without a count, as `rmw_cyclonedds_cpp` writes it.
     Silent,
-    /// There, and the lowest two bits of the options say how many, as Cyclone DDS writes it.
+    /// Present, counted in the lowest two bits of the options, as Cyclone DDS writes it.
     Said,
 }
 
 impl Encoding {
-    /// By the id of a representation; `None` for those that ROS 2 does not use.
-    pub(crate) fn of(id: u16) -> Option<Self> {
+    /// Returns the encoding of a representation id; `None` for those that ROS 2 does not use.
+    pub(crate) fn from_id(id: u16) -> Option<Self> {
         let version = match id {
             0x0000 | 0x0001 => CdrVersion::One,
             0x0006 | 0x0007 => CdrVersion::Two,
@@ -75,7 +75,7 @@ impl Encoding {
         Some(Self { order, version, ..Self::default() })
     }
 
-    /// The id of the representation, as the header has it.
+    /// Returns the id of the representation in the header.
     pub(crate) fn id(self) -> u16 {
         let version = match self.version {
             CdrVersion::One => 0x0000,
@@ -97,12 +97,12 @@ impl Encoding {
         self.version == CdrVersion::TwoDelimited
     }
 
-    /// What a number of so many bytes is aligned to.
+    /// Returns the alignment of a number of this many bytes.
     pub(crate) fn alignment(self, bytes: usize) -> usize {
         if self.is_second() { bytes.min(4) } else { bytes }
     }
 
-    /// Bytes of a unit of a `wstring`.
+    /// Returns the bytes of a unit of a `wstring`.
     pub(crate) fn wide_bytes(self) -> usize {
         if self.wide == WideUnit::Four && !self.is_second() { 4 } else { 2 }
     }

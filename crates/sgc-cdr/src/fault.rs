@@ -1,4 +1,4 @@
-//! What is wrong with a value that is to become a message, whether it comes as [`Value`](crate::Value), JSON or CBOR.
+//! Errors of a value that is to become a message, whether it comes as [`Value`](crate::Value), JSON or CBOR.
 
 use crate::VALUES_MAX;
 use crate::definition::Shape;
@@ -6,20 +6,20 @@ use crate::path;
 
 /// Most bytes that texts and elements of primitives take in one message: as many as a node carries in one.
 pub const CONTENT_BYTES_MAX: usize = 64 << 20;
-/// Characters of what somebody wrote that are shown.
+/// Most characters of foreign text that are shown.
 const SHOWN_MAX: usize = 80;
 
-/// A value that is none of its type.
+/// A value that does not fit its type.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{}{problem}", shown(.path))]
 pub struct ValueError {
     /// The path of the member that it is in, `pose.position.x`; empty for the message itself.
     pub path: String,
-    /// What is wrong.
+    /// The problem.
     pub problem: ValueProblem,
 }
 
-/// What is wrong with a value.
+/// A problem with a value.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ValueProblem {
     /// Text that is no base64.
@@ -28,28 +28,28 @@ pub enum ValueProblem {
     /// More elements, bytes of a string or units of a wide one than its bound.
     #[error("{found} elements, and at most {bound} are allowed")]
     Bound {
-        /// As many as there are.
+        /// Their number.
         found: usize,
-        /// As many as there may be.
+        /// The bound.
         bound: usize,
     },
     /// An array of another size.
     #[error("{found} elements, not {expected}")]
     Count {
-        /// As many as there are.
+        /// Number of elements found.
         found: usize,
-        /// As many as the array has.
+        /// Number of elements of the array.
         expected: usize,
     },
-    /// A member is left out, and its definition has a default that cannot be read.
+    /// A member is missing, and the default of its definition cannot be read.
     #[error("it is left out, and its default cannot be read")]
     Default,
-    /// Something else than the type.
+    /// A value of another kind than the type.
     #[error("{found}, not {expected}")]
     Kind {
-        /// What it is.
+        /// The value.
         found: String,
-        /// What it should be.
+        /// The expected kind.
         expected: &'static str,
     },
     /// A number that the type does not have.
@@ -84,7 +84,7 @@ fn shown(path: &str) -> String {
     if path.is_empty() { String::new() } else { format!("{path}: ") }
 }
 
-/// The begin of what somebody wrote.
+/// Returns the beginning of a foreign text.
 pub(crate) fn short(text: &str) -> String {
     text.chars().take(SHOWN_MAX).collect()
 }
@@ -107,7 +107,7 @@ impl ValueError {
     }
 }
 
-/// What a message may still take. Left-out members count: a few bytes may stand for a large message.
+/// The remaining size of a message. Missing members count: a few bytes may stand for a large message.
 #[derive(Debug)]
 pub(crate) struct Budget {
     values: usize,
@@ -127,14 +127,14 @@ impl Budget {
         Ok(())
     }
 
-    /// Takes so many bytes.
+    /// Takes this many bytes.
     pub(crate) fn bytes(&mut self, bytes: usize) -> Result<(), ValueProblem> {
         self.bytes = self.bytes.checked_sub(bytes).ok_or(ValueProblem::TooLarge)?;
         Ok(())
     }
 }
 
-/// Whether an array or a sequence has as many elements as it may.
+/// Checks that an array or a sequence has a permitted number of elements.
 pub(crate) fn fits(shape: Shape, found: usize) -> Result<(), ValueProblem> {
     match shape {
         Shape::Array(expected) if found != expected as usize => {
@@ -145,7 +145,7 @@ pub(crate) fn fits(shape: Shape, found: usize) -> Result<(), ValueProblem> {
     }
 }
 
-/// Whether it may have one more element.
+/// Checks that it may have one more element.
 pub(crate) fn fits_one_more(shape: Shape, found: usize) -> Result<(), ValueProblem> {
     let most = match shape {
         Shape::One => return Ok(()),
@@ -160,7 +160,7 @@ pub(crate) fn fits_one_more(shape: Shape, found: usize) -> Result<(), ValueProbl
     }
 }
 
-/// Whether it is within a bound.
+/// Checks a bound.
 pub(crate) fn fits_bound(bound: Option<u32>, found: usize) -> Result<(), ValueProblem> {
     let bound = bound.unwrap_or(u32::MAX) as usize;
     if found > bound { Err(ValueProblem::Bound { found, bound }) } else { Ok(()) }

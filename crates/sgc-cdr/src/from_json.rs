@@ -1,6 +1,7 @@
-//! JSON to values, straight by the layout: octets become bytes and numbers elements of their type, with nothing in between.
+//! JSON to values, straight by the layout: octets become bytes and numbers elements of their type, with nothing in
+//! between.
 //!
-//! What is understood is in docs/spec/json.md. Depth is that of the layout, since members that it does not have are errors.
+//! docs/spec/json.md defines the accepted JSON. The depth is that of the layout, because unknown members are errors.
 
 use std::cell::{Cell, RefCell};
 use std::fmt;
@@ -18,18 +19,18 @@ use crate::json::ESCAPED_BYTE;
 use crate::layout::{Element, Layout, Member, Struct};
 use crate::number::{Number, little};
 use crate::path;
-use crate::value::{Packed, Value};
+use crate::value::{PackedArray, Value};
 
-/// Base64 with or without the signs that fill it up.
+/// Base64 with or without padding.
 const BASE64: GeneralPurpose = GeneralPurpose::new(
     &STANDARD,
     GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
 );
-/// Elements that room is made for before they are there.
+/// Most elements for which memory is reserved before they are read.
 const RESERVE_MAX: usize = 1024;
 
 impl Layout {
-    /// Reads a message of the type from JSON in UTF-8. Members that are left out take their default.
+    /// Reads a message of the type from JSON in UTF-8. Missing members take their default.
     pub fn from_json(&self, json: &[u8]) -> Result<Value, ValueError> {
         let no_text = |why: std::str::Utf8Error| {
             ValueProblem::Syntax(format!("the JSON is not UTF-8 at byte {}", why.valid_up_to()))
@@ -50,7 +51,7 @@ impl Layout {
     }
 }
 
-/// What all parts of a message share. `serde_json` knows no errors but its own: ours are kept here meanwhile.
+/// State that all parts of a message share. `serde_json` carries only its own errors: ours are kept here meanwhile.
 struct Reader<'a> {
     layout: &'a Layout,
     budget: RefCell<Budget>,
@@ -126,7 +127,7 @@ impl<'de> Visitor<'de> for Record<'_, '_> {
             if given.is_some() {
                 return Err(reader.fail(ValueProblem::Twice(member.name.to_string())));
             }
-            let value = map.next_value_seed(OfMember { reader, member });
+            let value = map.next_value_seed(MemberSeed { reader, member });
             *given = Some(reader.under(&member.name, value)?);
             next = index + 1;
         }
@@ -149,11 +150,11 @@ impl<'de> Visitor<'de> for Record<'_, '_> {
     }
 }
 
-/// The name of a member; its place is what comes of it.
+/// Reads the name of a member into its index.
 struct Key<'r, 'a> {
     reader: &'r Reader<'a>,
     this: &'a Struct,
-    /// The member that comes now, if they come in order.
+    /// The next member, if they come in order.
     next: usize,
 }
 
@@ -184,18 +185,18 @@ impl Visitor<'_> for Key<'_, '_> {
 
 /// A member: one element, or all of them.
 #[derive(Clone, Copy)]
-struct OfMember<'r, 'a> {
+struct MemberSeed<'r, 'a> {
     reader: &'r Reader<'a>,
     member: &'a Member,
 }
 
-impl<'de> DeserializeSeed<'de> for OfMember<'_, '_> {
+impl<'de> DeserializeSeed<'de> for MemberSeed<'_, '_> {
     type Value = Value;
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Value, D::Error> {
         let Self { reader, member } = self;
         if member.shape == Shape::One {
-            return OfElement { reader, member }.deserialize(deserializer);
+            return ElementSeed { reader, member }.deserialize(deserializer);
         }
         reader.value()?;
         match member.element {
@@ -205,7 +206,7 @@ impl<'de> DeserializeSeed<'de> for OfMember<'_, '_> {
     }
 }
 
-impl<'de> Visitor<'de> for OfMember<'_, '_> {
+impl<'de> Visitor<'de> for MemberSeed<'_, '_> {
     type Value = Value;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -227,13 +228,13 @@ impl<'de> Visitor<'de> for OfMember<'_, '_> {
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut all: A) -> Result<Value, A::Error> {
         let Self { reader, member } = self;
-        let element = OfElement { reader, member };
+        let element = ElementSeed { reader, member };
         let mut count = 0;
         if let Element::Primitive(primitive) = member.element {
             let size = primitive.bytes();
             let mut octets = Vec::new();
             while let Some(value) =
-                reader.at(count, all.next_element_seed(OfPrimitive { reader, primitive }))?
+                reader.at(count, all.next_element_seed(PrimitiveSeed { reader, primitive }))?
             {
                 reader.check(fits_one_more(member.shape, count))?;
                 reader.bytes(size)?;
@@ -242,7 +243,9 @@ impl<'de> Visitor<'de> for OfMember<'_, '_> {
             }
             reader.check(fits(member.shape, count))?;
             let octets = Bytes::from(octets);
-            return Ok(Packed::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::Packed));
+            return Ok(
+                PackedArray::new(primitive, octets.clone()).map_or(Value::Octets(octets), Value::PackedArray)
+            );
         }
         let mut values = Vec::with_capacity(all.size_hint().unwrap_or(0).min(RESERVE_MAX));
         while let Some(value) = reader.at(count, all.next_element_seed(element))? {
@@ -257,12 +260,12 @@ impl<'de> Visitor<'de> for OfMember<'_, '_> {
 
 /// One element.
 #[derive(Clone, Copy)]
-struct OfElement<'r, 'a> {
+struct ElementSeed<'r, 'a> {
     reader: &'r Reader<'a>,
     member: &'a Member,
 }
 
-impl<'de> DeserializeSeed<'de> for OfElement<'_, '_> {
+impl<'de> DeserializeSeed<'de> for ElementSeed<'_, '_> {
     type Value = Value;
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Value, D::Error> {
@@ -271,7 +274,7 @@ impl<'de> DeserializeSeed<'de> for OfElement<'_, '_> {
             Element::Struct(place) => Record { reader, place }.deserialize(deserializer),
             Element::Primitive(primitive) => {
                 reader.value()?;
-                OfPrimitive { reader, primitive }.deserialize(deserializer)
+                PrimitiveSeed { reader, primitive }.deserialize(deserializer)
             }
             Element::String { bound } => Text { reader, bound, wide: false }.deserialize(deserializer),
             Element::WString { bound } => Text { reader, bound, wide: true }.deserialize(deserializer),
@@ -281,18 +284,18 @@ impl<'de> DeserializeSeed<'de> for OfElement<'_, '_> {
 
 /// A primitive, as a value that fits it.
 #[derive(Clone, Copy)]
-struct OfPrimitive<'r, 'a> {
+struct PrimitiveSeed<'r, 'a> {
     reader: &'r Reader<'a>,
     primitive: Primitive,
 }
 
-impl OfPrimitive<'_, '_> {
+impl PrimitiveSeed<'_, '_> {
     fn number<E: Error>(self, number: Number) -> Result<Value, E> {
         self.reader.check(number.fit(self.primitive))
     }
 }
 
-impl<'de> DeserializeSeed<'de> for OfPrimitive<'_, '_> {
+impl<'de> DeserializeSeed<'de> for PrimitiveSeed<'_, '_> {
     type Value = Value;
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Value, D::Error> {
@@ -305,7 +308,7 @@ impl<'de> DeserializeSeed<'de> for OfPrimitive<'_, '_> {
     }
 }
 
-impl Visitor<'_> for OfPrimitive<'_, '_> {
+impl Visitor<'_> for PrimitiveSeed<'_, '_> {
     type Value = Value;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -346,12 +349,12 @@ impl Visitor<'_> for OfPrimitive<'_, '_> {
     }
 }
 
-/// A float of the JSON that stands for it.
+/// Parses a float, or the JSON that stands for one.
 fn float(text: &str, primitive: Primitive) -> Result<Value, ValueProblem> {
     let of = |value: f64| Number::Float64(value).fit(primitive);
     let wrong = || ValueProblem::Kind { found: short(text), expected: primitive.name() };
     match text {
-        // `rosbridge_suite` writes null for what is no number.
+        // `rosbridge_suite` writes null for values that are no numbers.
         "null" | "\"NaN\"" => of(f64::NAN),
         "\"Infinity\"" => of(f64::INFINITY),
         "\"-Infinity\"" => of(f64::NEG_INFINITY),
@@ -384,7 +387,7 @@ struct Text<'r, 'a> {
 impl<'de> DeserializeSeed<'de> for Text<'_, '_> {
     type Value = Value;
 
-    /// As bytes, where half of a surrogate pair is no error.
+    /// Reads bytes, where half of a surrogate pair is no error.
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Value, D::Error> {
         self.reader.value()?;
         deserializer.deserialize_bytes(self)
@@ -409,7 +412,7 @@ impl Visitor<'_> for Text<'_, '_> {
         let units = units(text);
         if wide {
             reader.check(fits_bound(bound, units.len()))?;
-            return Ok(Value::of_units(units));
+            return Ok(Value::from_units(units));
         }
         let mut bytes = Vec::with_capacity(text.len());
         for c in char::decode_utf16(units) {
@@ -423,11 +426,11 @@ impl Visitor<'_> for Text<'_, '_> {
             }
         }
         reader.check(fits_bound(bound, bytes.len()))?;
-        Ok(Value::of_bytes(bytes.into()))
+        Ok(Value::from_bytes(bytes.into()))
     }
 }
 
-/// The units of UTF-16 of a text in which halves of surrogate pairs stand as UTF-8 would write them.
+/// Returns the UTF-16 units of a text with half surrogate pairs in UTF-8 form.
 fn units(text: &[u8]) -> Vec<u16> {
     let mut units = Vec::with_capacity(text.len());
     for chunk in text.chunk_by(|_, next| next & 0xc0 == 0x80) {
@@ -436,7 +439,7 @@ fn units(text: &[u8]) -> Vec<u16> {
             (Err(_), [0xed, second, third]) => {
                 units.push(0xd000 | u16::from(second & 0x3f) << 6 | u16::from(third & 0x3f));
             }
-            // The rest is what `serde_json` took from a text.
+            // `serde_json` accepted everything else as text.
             (Err(_), _) => {}
         }
     }
@@ -450,13 +453,13 @@ mod tests {
     fn read(text: &str, json: &str) -> Result<String, String> {
         let layout = layout(text);
         let value = layout.from_json(json.as_bytes()).map_err(|error| error.to_string())?;
-        // What is read fits the type.
+        // Every value that was read fits the type.
         layout.encode(&value).unwrap();
         Ok(value.to_json())
     }
 
     #[test]
-    fn what_clients_write_is_understood() {
+    fn json_of_clients_is_understood() {
         for (text, json, found) in [
             ("int64 a", r#"{"a": -9223372036854775808}"#, r#"{"a":-9223372036854775808}"#),
             ("uint64 a", r#"{"a": "18446744073709551615"}"#, r#"{"a":18446744073709551615}"#),

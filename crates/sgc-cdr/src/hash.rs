@@ -1,4 +1,4 @@
-//! The hash of a type (REP 2016): what tells two definitions of one name apart.
+//! The hash of a type (REP 2016), which tells apart two definitions of one name.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -29,7 +29,8 @@ const PRIMITIVES: [(u8, Primitive); 12] = [
 ];
 
 impl Layout {
-    /// The hash that rmw announces for a message, or a service, of this definition: `RIHS01_` and 64 hexadecimal digits.
+    /// Returns the hash that rmw announces for a message, or a service, of this definition: `RIHS01_` and 64
+    /// hexadecimal digits.
     pub fn type_hash(&self) -> String {
         let mut text = String::from("{\"type_description\": ");
         if let Some(this) = self.structs.last() {
@@ -47,7 +48,7 @@ impl Layout {
         })
     }
 
-    /// Everything that the type contains, in the order of names.
+    /// Returns everything that the type contains, in the order of names.
     pub(crate) fn referenced(&self) -> BTreeMap<String, &Struct> {
         let inner = self.structs.split_last().map_or(&[][..], |(_, inner)| inner);
         inner.iter().map(|inner| (inner.name.to_string(), inner)).collect()
@@ -73,7 +74,7 @@ fn describe(text: &mut String, this: &Struct) {
     text.push_str("]}");
 }
 
-/// Id, capacity and string capacity of a type.
+/// Returns id, capacity and string capacity of a type.
 pub(crate) fn ids(field_type: &FieldType) -> (u8, u32, u32) {
     let (id, string_capacity) = match &field_type.base {
         Base::Primitive(primitive) => (primitive.id(), 0),
@@ -95,7 +96,7 @@ impl Primitive {
         PRIMITIVES.iter().find(|(_, primitive)| *primitive == self).map_or(0, |(id, _)| *id)
     }
 
-    pub(crate) fn of_id(id: u8) -> Option<Self> {
+    pub(crate) fn from_id(id: u8) -> Option<Self> {
         PRIMITIVES.iter().find(|(known, _)| *known == id).map(|(_, primitive)| *primitive)
     }
 }

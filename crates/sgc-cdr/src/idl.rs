@@ -1,8 +1,8 @@
-//! Parses `.idl` files: the part of OMG IDL 4.2 that ROS 2 takes (the ROS 2 design article "IDL - Interface Definition
-//! Language"), which is modules, structures, constants, and type names for arrays.
+//! Parses `.idl` files: the part of OMG IDL 4.2 that ROS 2 accepts (the ROS 2 design article "IDL - Interface
+//! Definition Language"), which is modules, structures, constants, and type names for arrays.
 //!
-//! Annotations are read over, but for `@default`. `char`, `wchar` and `long double` have no type in `.msg` files, and none
-//! here; unions, enumerations, maps and inheritance ROS 2 has none of either.
+//! Annotations are skipped, except `@default`. `char`, `wchar` and `long double` have no type in `.msg` files, and none
+//! here; ROS 2 has no unions, enumerations, maps or inheritance either.
 
 use std::collections::BTreeMap;
 
@@ -14,13 +14,13 @@ use crate::parse::{
     DEFINITION_BYTES_MAX, MEMBERS_MAX, ParseError, ParseProblem, Part, action_definitions, suffixes,
 };
 
-/// What the module with the constants of a message has behind its name.
+/// Suffix of the module with the constants of a message.
 const CONSTANTS: &str = "_Constants";
-/// How deep modules may be in each other.
+/// Greatest depth of modules.
 const MODULES_MAX: usize = 8;
 
-/// Parses the `.idl` file that defines `file`, as [`parse`](crate::parse) does others: with the same definitions, and those
-/// messages that ROS 2 makes of an action.
+/// Parses the `.idl` file that defines `file`, as [`parse`](crate::parse) does others: with the same definitions, and
+/// the messages that ROS 2 derives from an action.
 pub fn parse_idl(file: &TypeName, text: &str) -> Result<Vec<Definition>, ParseError> {
     if text.len() > DEFINITION_BYTES_MAX {
         return Err(ParseError { name: file.clone(), line: 1, problem: ParseProblem::TooLong });
@@ -41,7 +41,7 @@ pub fn parse_idl(file: &TypeName, text: &str) -> Result<Vec<Definition>, ParseEr
     })
 }
 
-/// Whether a definition is IDL: its first word is `module`, which is no type of a `.msg` file.
+/// Returns whether a definition is IDL: its first word is `module`, which is no type of a `.msg` file.
 pub(crate) fn is_idl(text: &str) -> bool {
     matches!(Tokens { text, at: 0 }.next(), Ok(Some("module")))
 }
@@ -49,7 +49,7 @@ pub(crate) fn is_idl(text: &str) -> bool {
 struct Parser<'a> {
     file: &'a TypeName,
     tokens: Tokens<'a>,
-    /// Those that are open.
+    /// The open modules.
     modules: Vec<&'a str>,
     /// Names for types.
     types: BTreeMap<&'a str, FieldType>,
@@ -61,7 +61,7 @@ struct Parser<'a> {
 }
 
 impl<'a> Parser<'a> {
-    /// All of the file. Modules may be in each other, and nothing else may: nothing here calls itself.
+    /// Reads the whole file. Only modules may nest, so nothing here calls itself.
     fn items(&mut self) -> Result<(), ParseProblem> {
         loop {
             match self.tokens.next()? {
@@ -87,7 +87,7 @@ impl<'a> Parser<'a> {
     }
 
     fn constant(&mut self) -> Result<(), ParseProblem> {
-        let FieldType { base, shape } = self.of_type()?;
+        let FieldType { base, shape } = self.field_type()?;
         let name = self.name()?;
         self.sign("=")?;
         let value = self.tokens.until(&[";"])?;
@@ -97,7 +97,7 @@ impl<'a> Parser<'a> {
         if let Ok(number) = value.parse() {
             self.constants.insert(name, number);
         }
-        // Those of no structure are for sizes.
+        // Constants outside of a structure serve as sizes.
         let of = self.modules.last().and_then(|module| module.strip_suffix(CONSTANTS));
         if let Some(of) = of {
             self.count()?;
@@ -111,7 +111,7 @@ impl<'a> Parser<'a> {
     }
 
     fn type_name(&mut self) -> Result<(), ParseProblem> {
-        let field_type = self.of_type()?;
+        let field_type = self.field_type()?;
         let name = self.name()?;
         let field_type = self.declared(field_type)?;
         self.sign(";")?;
@@ -140,7 +140,7 @@ impl<'a> Parser<'a> {
                 default = self.annotation()?.or(default);
                 continue;
             }
-            let plain = self.of_type()?;
+            let plain = self.field_type()?;
             loop {
                 let name = self.name()?;
                 let field_type = self.declared(plain.clone())?;
@@ -148,7 +148,7 @@ impl<'a> Parser<'a> {
                     return Err(ParseProblem::Twice(short(name)));
                 }
                 self.count()?;
-                // Those of arrays are texts.
+                // Defaults of arrays are texts.
                 let default = default.map(|text: &str| match field_type.shape {
                     Shape::One => text.to_owned(),
                     _ => text.trim_matches('"').to_owned(),
@@ -168,7 +168,7 @@ impl<'a> Parser<'a> {
         Ok(())
     }
 
-    /// What is behind a name: the size of an array, or nothing.
+    /// Reads the text behind a name: the size of an array, or nothing.
     fn declared(&mut self, plain: FieldType) -> Result<FieldType, ParseProblem> {
         if !self.tokens.takes("[")? {
             return Ok(plain);
@@ -181,7 +181,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    fn of_type(&mut self) -> Result<FieldType, ParseProblem> {
+    fn field_type(&mut self) -> Result<FieldType, ParseProblem> {
         let one = |base| FieldType { base, shape: Shape::One };
         match self.word()? {
             "sequence" => {
@@ -215,7 +215,7 @@ impl<'a> Parser<'a> {
         Ok(Some(bound))
     }
 
-    /// A type that begins with a word, and is no sequence.
+    /// Reads a type that begins with a word, and is no sequence.
     fn plain_type(&mut self, first: &'a str) -> Result<FieldType, ParseProblem> {
         let one = |base| Ok(FieldType { base, shape: Shape::One });
         let primitive = match first {
@@ -255,7 +255,7 @@ impl<'a> Parser<'a> {
         one(Base::Primitive(primitive))
     }
 
-    /// A type by its name: of this file, or `package::msg::Name`.
+    /// Reads a type by its name: of this file, or `package::msg::Name`.
     fn named_type(&mut self, first: &'a str) -> Result<FieldType, ParseProblem> {
         let mut parts = vec![first];
         while self.tokens.takes("::")? {
@@ -276,7 +276,7 @@ impl<'a> Parser<'a> {
         Ok(FieldType { base, shape: Shape::One })
     }
 
-    /// Reads over an annotation whose sign was read; gives the value of `@default(value=…)`.
+    /// Skips an annotation whose sign was read, and returns the value of `@default(value=…)`.
     fn annotation(&mut self) -> Result<Option<&'a str>, ParseProblem> {
         let mut name = self.name()?;
         while self.tokens.takes("::")? {
@@ -292,7 +292,7 @@ impl<'a> Parser<'a> {
 
     fn part(&mut self, name: &str) -> Result<&mut Part, ParseProblem> {
         let known = self.file.name();
-        // Constants of what is no structure of this file are nobody's.
+        // Constants for no structure of this file are ignored.
         if !name.starts_with(known) {
             return Err(expected(known, name));
         }
@@ -349,7 +349,7 @@ fn expected(expected: &str, found: &str) -> ParseProblem {
     ParseProblem::Expected { expected: expected.to_owned(), found: short(found) }
 }
 
-/// Words, signs and texts, one after the other; comments and lines of the preprocessor are left out.
+/// Words, signs and texts in sequence; comments and preprocessor lines are left out.
 struct Tokens<'a> {
     text: &'a str,
     at: usize,
@@ -380,7 +380,7 @@ impl<'a> Tokens<'a> {
         Ok(false)
     }
 
-    /// All up to a sign, which is read; what is in parentheses belongs together.
+    /// Reads everything up to a sign, which is read, too; text in parentheses belongs together.
     fn until(&mut self, signs: &[&str]) -> Result<&'a str, ParseProblem> {
         self.skip()?;
         let begin = self.at;
@@ -424,7 +424,7 @@ fn is_word(c: char) -> bool {
     c.is_ascii_alphanumeric() || c == '_' || c == '.'
 }
 
-/// How long a text in quotes is, with them.
+/// Returns the length of a text in quotes, with them.
 fn quoted(text: &str, quote: char) -> Option<usize> {
     let mut escaped = false;
     let end = text.char_indices().skip(1).find(|(_, c)| {
@@ -462,7 +462,7 @@ mod tests {
         }
     }
 
-    /// As `rosidl_adapter` writes it.
+    /// Writes IDL as `rosidl_adapter` does.
     fn idl(file: &TypeName, definitions: &[Definition]) -> String {
         let mut text = format!(
             "// generated\n#include \"x.idl\"\nmodule {} {{\n  module {} {{\n",
@@ -510,7 +510,7 @@ mod tests {
     }
 
     #[test]
-    fn what_ships_is_the_same_as_idl() {
+    fn shipped_types_are_the_same_as_idl() {
         let (mut ours, mut theirs) = (Library::empty(), Library::empty());
         for file in Library::shipped_files() {
             let definitions = parse(&file, &Library::shipped(&file).unwrap()).unwrap();
@@ -534,7 +534,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_by_hand_is_understood() {
+    fn handwritten_idl_is_understood() {
         let text = "const unsigned long SIZE = 3; typedef sequence<string<SIZE>, 2> Names;\n\
                     module M_Constants { const string NAME = \"a; b\"; const long LOW = -1; };\n\
                     /* why */ @extensibility(FINAL) struct M { @key long a, b[SIZE]; Names names; // so\n\

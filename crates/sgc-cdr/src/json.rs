@@ -8,20 +8,20 @@ use base64::engine::general_purpose::STANDARD;
 use crate::definition::DUMMY_MEMBER;
 use crate::value::Value;
 
-/// What stands for a byte of a `string` that is no UTF-8 is this and the byte (Python's `surrogateescape`, PEP 383).
+/// Base of the code that stands for a byte of a `string` that is no UTF-8 (Python's `surrogateescape`, PEP 383).
 pub(crate) const ESCAPED_BYTE: u16 = 0xdc00;
 
 impl Value {
-    /// As JSON, in one line: members in their order, 64-bit integers as numbers, octets in base64, and what JSON has no
-    /// number for as one of the texts `"NaN"`, `"Infinity"`, `"-Infinity"`. [`Layout::from_json`](crate::Layout::from_json)
-    /// reads it.
+    /// Returns JSON in one line: members in their order, 64-bit integers as numbers, octets in base64, and numbers that
+    /// JSON lacks as one of the texts `"NaN"`, `"Infinity"`, `"-Infinity"`.
+    /// [`Layout::from_json`](crate::Layout::from_json) reads it.
     pub fn to_json(&self) -> String {
         let mut out = String::new();
         self.write_json(&mut out);
         out
     }
 
-    /// Appends it as JSON. Depth is bounded: layouts are.
+    /// Appends the value as JSON. The depth is bounded as that of layouts.
     pub fn write_json(&self, out: &mut String) {
         match self {
             Self::Bool(value) => write(out, value),
@@ -45,7 +45,7 @@ impl Value {
                 }
             }),
             Self::Octets(octets) => quoted(out, |out| STANDARD.encode_string(octets, out)),
-            Self::Packed(packed) => list(out, packed.iter(), |out, value| value.write_json(out)),
+            Self::PackedArray(packed) => list(out, packed.iter(), |out, value| value.write_json(out)),
             Self::List(all) => list(out, all, |out, value| value.write_json(out)),
             Self::Record(members) => {
                 out.push('{');
@@ -66,7 +66,7 @@ fn write(out: &mut String, value: &impl std::fmt::Display) {
     let _ = write!(out, "{value}");
 }
 
-/// The shortest number that is this one in its own type.
+/// Writes the shortest number that is this one in its own type.
 fn float(out: &mut String, value: &impl std::fmt::Debug, wide: f64) {
     let _ = match wide {
         _ if wide.is_finite() => write!(out, "{value:?}"),
@@ -115,7 +115,7 @@ fn escaped(out: &mut String, text: &str) {
     out.push_str(rest);
 }
 
-/// A unit of UTF-16 by its number.
+/// Writes a unit of UTF-16 by its number.
 fn unit(out: &mut String, unit: u16) {
     let _ = write!(out, "\\u{unit:04x}");
 }
@@ -128,7 +128,7 @@ mod tests {
 
     use super::*;
     use crate::definition::Primitive;
-    use crate::value::Packed;
+    use crate::value::PackedArray;
 
     #[test]
     fn numbers_are_exact_and_short() {
@@ -148,19 +148,19 @@ mod tests {
 
     #[test]
     fn members_keep_their_order() {
-        let packed = Packed::new(Primitive::Int16, Bytes::from_static(&[1, 0, 2, 0])).unwrap();
+        let packed = PackedArray::new(Primitive::Int16, Bytes::from_static(&[1, 0, 2, 0])).unwrap();
         let members = vec![
             (Arc::from("z"), Value::Text("\"\n".into())),
             (Arc::from("a"), Value::Octets(Bytes::from_static(&[1, 2]))),
             (Arc::from("m"), Value::List(vec![Value::Bool(true), Value::Record(Vec::new())])),
-            (Arc::from("p"), Value::Packed(packed)),
+            (Arc::from("p"), Value::PackedArray(packed)),
             (Arc::from(DUMMY_MEMBER), Value::Uint(0)),
         ];
         assert_eq!(Value::Record(members).to_json(), r#"{"z":"\"\n","a":"AQI=","m":[true,{}],"p":[1,2]}"#);
     }
 
     #[test]
-    fn what_is_no_unicode_is_kept() {
+    fn text_that_is_no_unicode_is_kept() {
         let raw = Value::Raw(Bytes::from_static(b"a\xff\x01\xc3\xbc\xc3"));
         assert_eq!(raw.to_json(), "\"a\\udcff\\u0001\u{fc}\\udcc3\"");
         let wide = Value::Wide(vec![0x61, 0xd83d, 0xde00, 0xd800, 0xdc]);

@@ -1,4 +1,4 @@
-//! A type with all that it contains, resolved.
+//! A type with everything that it contains, resolved.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -6,18 +6,18 @@ use std::sync::Arc;
 use crate::defaults::MemberDefault;
 use crate::definition::{Constant, FieldType, Primitive, Shape, TypeName};
 
-/// How deep types may contain each other.
+/// Greatest depth of types within types.
 pub const LAYOUT_DEPTH_MAX: usize = 32;
-/// How many types one may contain.
+/// Most types that one may contain.
 pub const LAYOUT_STRUCTS_MAX: usize = 1024;
 
-/// Bytes of a payload that hold the stamp of the header that it begins with.
+/// Bytes of a payload that hold the stamp of its header.
 pub const HEADER_STAMP_BYTES: usize = 24;
 
-/// What the CDR of a type looks like. Made by [`Library::layout`](crate::Library::layout): complete, and without circles.
+/// The layout of a type's CDR, made by [`Library::layout`](crate::Library::layout): complete, and without circles.
 #[derive(Clone, Debug)]
 pub struct Layout {
-    /// The type itself is the last one: what it contains comes before it.
+    /// The type itself is the last one: its parts come before it.
     pub(crate) structs: Vec<Struct>,
 }
 
@@ -26,7 +26,7 @@ pub struct Layout {
 pub(crate) struct Struct {
     pub(crate) name: TypeName,
     pub(crate) members: Vec<Member>,
-    /// Those of its definition; a description that travels has none.
+    /// Constants of its definition; a transmitted description has none.
     pub(crate) constants: Vec<Constant>,
 }
 
@@ -36,9 +36,9 @@ pub(crate) struct Member {
     pub(crate) name: Arc<str>,
     pub(crate) element: Element,
     pub(crate) shape: Shape,
-    /// As the definition has it.
+    /// Its type in the definition.
     pub(crate) field_type: FieldType,
-    /// What it is if it is left out, if the definition says so.
+    /// The default of the definition, if there is one.
     pub(crate) default: Option<MemberDefault>,
 }
 
@@ -52,17 +52,17 @@ pub(crate) enum Element {
     WString {
         bound: Option<u32>,
     },
-    /// Place in the layout, before that of the struct that contains it.
+    /// Index in the layout, before that of the containing struct.
     Struct(usize),
 }
 
 impl Layout {
-    /// The type.
+    /// Returns the name of the type.
     pub fn name(&self) -> Option<&TypeName> {
         self.structs.last().map(|s| &s.name)
     }
 
-    /// The layout of a type that this one contains, such as a service its request; of the type itself that is all of it.
+    /// Returns the layout of a contained type, such as a service's request; for the type itself that is all of it.
     pub fn part(&self, name: &TypeName) -> Option<Self> {
         let place = self.structs.iter().position(|inner| inner.name == *name)?;
         let mut structs = Vec::new();
@@ -70,7 +70,7 @@ impl Layout {
         Some(Self { structs })
     }
 
-    /// Puts a copy of what is at a place behind copies of what it contains; gives its place there.
+    /// Copies a struct behind copies of its parts, and returns its index there.
     fn copy(&self, place: usize, into: &mut Vec<Struct>, places: &mut BTreeMap<usize, usize>) -> usize {
         if let Some(there) = places.get(&place) {
             return *there;
@@ -87,7 +87,7 @@ impl Layout {
         into.len() - 1
     }
 
-    /// Whether its first member is a `std_msgs/msg/Header`, whose stamp [`Layout::header_stamp_ns`] finds.
+    /// Returns whether its first member is a `std_msgs/msg/Header`, whose stamp [`Layout::header_stamp_ns`] finds.
     pub fn begins_with_header(&self) -> bool {
         let first = self.structs.last().and_then(|this| this.members.first());
         let Some((Element::Struct(place), Shape::One)) = first.map(|m| (m.element, m.shape)) else {
@@ -96,7 +96,7 @@ impl Layout {
         self.structs.get(place).is_some_and(|inner| inner.name.to_string() == "std_msgs/msg/Header")
     }
 
-    /// The stamp of the header that a message begins with, nanoseconds since the Unix epoch; the first
+    /// Returns the stamp of the header at the beginning of a message, nanoseconds since the Unix epoch; the first
     /// [`HEADER_STAMP_BYTES`] of its payload are enough.
     pub fn header_stamp_ns(&self, payload: &[u8]) -> Option<i64> {
         if !self.begins_with_header() {
@@ -105,7 +105,7 @@ impl Layout {
         let id = u16::from_be_bytes([*payload.first()?, *payload.get(1)?]);
         let at = match id {
             0x0000 | 0x0001 | 0x0006 | 0x0007 => 4,
-            // The message, the header and the stamp say their size.
+            // The message, the header and the stamp carry their sizes.
             0x0008 | 0x0009 => 16,
             _ => return None,
         };
@@ -117,7 +117,7 @@ impl Layout {
         seconds.checked_mul(1_000_000_000)?.checked_add(i64::from(word(at + 4)?))
     }
 
-    /// Whether there is a `wstring` anywhere in it.
+    /// Returns whether it contains a `wstring` anywhere.
     pub(crate) fn is_wide(&self) -> bool {
         let mut members = self.structs.iter().flat_map(|s| &s.members);
         members.any(|m| matches!(m.element, Element::WString { .. }))

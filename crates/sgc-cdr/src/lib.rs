@@ -2,12 +2,12 @@
 //!
 //! [`Library`] holds definitions: those that come with ROS 2 ship inside, others are parsed from the text of `.msg`,
 //! `.srv`, `.action` and `.idl` files, which the caller finds, or come as a description ([`Layout::from_description`]).
-//! [`Library::layout`] resolves a type to what its CDR looks like. [`Layout::decode`] turns a payload into a [`Value`],
-//! which is shown as YAML, JSON or CBOR; [`Layout::from_json`], [`Layout::from_cbor`] and [`Layout::encode`] go the other
-//! way. Where definitions are looked for, and where payloads come from, is for others.
+//! [`Library::layout`] resolves a type to the layout of its CDR. [`Layout::decode`] turns a payload into a [`Value`],
+//! which is shown as YAML, JSON or CBOR; [`Layout::from_json`], [`Layout::from_cbor`] and [`Layout::encode`] go the
+//! other way. Callers find definitions and payloads.
 //!
-//! Payloads, definitions, JSON and CBOR are anybody's: sizes, depths and counts are bounded, and what does not fit is a typed
-//! error.
+//! Payloads, definitions, JSON and CBOR are untrusted: sizes, depths and counts are bounded, and input that does not
+//! fit is a typed error.
 #![forbid(unsafe_code)]
 
 mod cbor;
@@ -44,5 +44,5 @@ pub use idl::parse_idl;
 pub use layout::{HEADER_STAMP_BYTES, LAYOUT_DEPTH_MAX, LAYOUT_STRUCTS_MAX, Layout};
 pub use library::{Library, LookUp, TypeError};
 pub use parse::{DEFINITION_BYTES_MAX, ParseError, ParseProblem, parse};
-pub use value::{Packed, Value};
+pub use value::{PackedArray, Value};
 pub use yaml::YamlStyle;

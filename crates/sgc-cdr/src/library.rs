@@ -1,4 +1,4 @@
-//! The definitions that are known, and looking up those that are not.
+//! The known definitions, and the lookup of others.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -11,40 +11,40 @@ use crate::parse::{ParseError, parse};
 
 /// The interfaces that ship inside: `common.txt`, written by `scripts/make-interfaces.py`.
 const COMMON: &str = include_str!("common.txt");
-/// What a file in it begins with.
+/// Beginning of a file in it.
 const COMMON_HEAD: &str = "== ";
 
 /// Finds the text of the file that defines a type, `.idl` or not: `std_srvs/srv/SetBool` for
 /// `std_srvs/srv/SetBool_Request`.
 pub type LookUp<'a> = dyn FnMut(&TypeName) -> Option<String> + 'a;
 
-/// Why a type cannot be decoded.
+/// The reason why a type cannot be decoded.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum TypeError {
-    /// Nobody defines it.
+    /// No definition of the type is known.
     #[error("no definition of {name}{}", within(.needed_by))]
     Unknown {
         /// The type.
         name: TypeName,
-        /// The type that contains it, if it is not the one that was asked for.
+        /// The type that contains it, if it is not the requested one.
         needed_by: Option<Box<TypeName>>,
     },
-    /// Its definition is wrong.
+    /// The definition is wrong.
     #[error(transparent)]
     Parse(#[from] ParseError),
-    /// It contains itself.
+    /// The type contains itself.
     #[error("{name} contains itself")]
     Circle {
         /// The type.
         name: TypeName,
     },
-    /// It contains types in types in types.
+    /// The type contains types too deeply.
     #[error("{name} is nested deeper than {LAYOUT_DEPTH_MAX} types")]
     TooDeep {
         /// The type.
         name: TypeName,
     },
-    /// It contains too many types.
+    /// The type contains too many types.
     #[error("{name} consists of more than {LAYOUT_STRUCTS_MAX} types")]
     TooLarge {
         /// The type.
@@ -63,12 +63,12 @@ pub struct Library {
 }
 
 impl Library {
-    /// Knows nothing.
+    /// Returns a library without definitions.
     pub fn empty() -> Self {
         Self::default()
     }
 
-    /// The text of the file among the shipped interfaces that defines this type.
+    /// Returns the text of the shipped file that defines this type.
     pub fn shipped(file: &TypeName) -> Option<String> {
         let head = format!("{COMMON_HEAD}{file}\n");
         let begin = match COMMON.find(&format!("\n{head}")) {
@@ -81,12 +81,12 @@ impl Library {
         text.get(..end).filter(|text| !text.starts_with(COMMON_HEAD)).or(Some("")).map(str::to_owned)
     }
 
-    /// Files among the shipped interfaces: `std_msgs/msg/String`, `std_srvs/srv/SetBool`.
+    /// Iterates over the shipped files: `std_msgs/msg/String`, `std_srvs/srv/SetBool`.
     pub fn shipped_files() -> impl Iterator<Item = TypeName> {
         COMMON.lines().filter_map(|line| line.strip_prefix(COMMON_HEAD)?.parse().ok())
     }
 
-    /// Adds what a file defines; what was known under those names is replaced.
+    /// Adds the definitions of a file, in place of known ones with their names.
     pub fn add(&mut self, file: &TypeName, text: &str) -> Result<(), ParseError> {
         for definition in parse(file, text)? {
             self.define(definition);
@@ -94,27 +94,27 @@ impl Library {
         Ok(())
     }
 
-    /// Adds what an `.idl` file defines; what was known under those names is replaced.
+    /// Adds the definitions of an `.idl` file, in place of known ones with their names.
     pub fn add_idl(&mut self, file: &TypeName, text: &str) -> Result<(), ParseError> {
         parse_idl(file, text)?.into_iter().for_each(|definition| self.define(definition));
         Ok(())
     }
 
-    /// Adds a definition; what was known under its name is replaced.
+    /// Adds a definition, in place of a known one with its name.
     pub(crate) fn define(&mut self, definition: Definition) {
         self.definitions.insert(definition.name.clone(), definition);
     }
 
-    /// The definition of a type, if it is known.
+    /// Returns the definition of a type, if it is known.
     pub fn definition(&self, name: &TypeName) -> Option<&Definition> {
         self.definitions.get(name)
     }
 
-    /// What the CDR of a type looks like. Asks `look_up` for what is not known, and takes what ships where it has
-    /// nothing.
+    /// Returns the layout of a type's CDR. Asks `look_up` for unknown definitions, and takes shipped ones where it has
+    /// none.
     ///
-    /// A service is a type, too, as type hashes and descriptions have it: one that contains its messages, and is never
-    /// serialised. [`Layout::part`] gives those.
+    /// A service is a type, too, as in type hashes and descriptions: it contains its messages, and is never serialised.
+    /// [`Layout::part`] returns their layouts.
     pub fn layout(&mut self, name: &TypeName, look_up: &mut LookUp<'_>) -> Result<Layout, TypeError> {
         let mut resolver = Resolver { library: self, look_up, structs: Vec::new(), places: BTreeMap::new() };
         resolver.resolve(name, None, &mut BTreeSet::new())?;
@@ -142,8 +142,8 @@ impl Library {
         self.definitions.get(name).ok_or_else(unknown)
     }
 
-    /// Adds what ROS 2 makes of a service's two messages (REP 2012, and `rosidl_generator_type_description`), if they are
-    /// known: the message that tells of both, and the service as a type.
+    /// Adds the definitions that ROS 2 derives from a service's two messages (REP 2012, and
+    /// `rosidl_generator_type_description`), if they are known: the event message, and the service as a type.
     fn define_service(&mut self, service: &TypeName) {
         let (request, response) = (service.request(), service.response());
         let is_known = |name| self.definitions.contains_key(name);
@@ -180,7 +180,7 @@ struct Resolver<'a, 'b> {
 }
 
 impl Resolver<'_, '_> {
-    /// Puts a type behind what it contains; gives its place. `above` are those that contain it.
+    /// Puts a type behind its parts, and returns its index. `above` are the types that contain it.
     fn resolve(
         &mut self,
         name: &TypeName,
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_given_comes_before_what_ships() {
+    fn given_definitions_come_before_shipped_ones() {
         let name = "std_msgs/msg/String".parse().unwrap();
         let layout = Library::empty().layout(&name, &mut |_| Some("int8 a\nint8 b\n".into())).unwrap();
         assert_eq!(layout.structs[0].members.len(), 2);
@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_laid_out_is_said() {
+    fn types_without_a_layout_are_reported() {
         let name = |text: &str| text.parse::<TypeName>().unwrap();
         let mut texts = |file: &TypeName| match file.name() {
             "A" => Some("B b".to_owned()),

@@ -7,7 +7,7 @@ use crate::value::Value;
 /// Integers up to this one have a `float64` of their own.
 const WHOLE_MAX: f64 = 9_007_199_254_740_992.0;
 
-/// A number as somebody has it.
+/// A number before its conversion.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Number {
     Integer(i128),
@@ -16,7 +16,7 @@ pub(crate) enum Number {
 }
 
 impl Number {
-    pub(crate) fn of(value: &Value) -> Option<Self> {
+    pub(crate) fn from_value(value: &Value) -> Option<Self> {
         Some(match value {
             Value::Int(value) => Self::Integer(i128::from(*value)),
             Value::Uint(value) => Self::Integer(i128::from(*value)),
@@ -26,7 +26,8 @@ impl Number {
         })
     }
 
-    /// As a value of a type. Integers become floats, the next one; floats become integers if they are whole and exact.
+    /// Converts the number to a type. Integers become the nearest float; floats become integers if they are whole and
+    /// exact.
     pub(crate) fn fit(self, primitive: Primitive) -> Result<Value, ValueProblem> {
         match primitive {
             Primitive::Bool => Err(self.is_no(primitive)),
@@ -36,7 +37,7 @@ impl Number {
                 Self::Integer(value) => Ok(Value::Float32(value as f32)),
                 Self::Float64(value) => {
                     let narrow = value as f32;
-                    // An infinity stays one; what is finite does not become one.
+                    // An infinity stays infinite; a finite number does not become infinite.
                     if narrow.is_infinite() && value.is_finite() {
                         return Err(self.out_of(primitive));
                     }
@@ -102,18 +103,18 @@ impl Number {
     }
 }
 
-/// A value as a primitive, if it is one that fits.
+/// Converts a value to a primitive, if it fits.
 pub(crate) fn fit(value: &Value, primitive: Primitive) -> Result<Value, ValueProblem> {
     match (primitive, value) {
         (Primitive::Bool, Value::Bool(value)) => Ok(Value::Bool(*value)),
-        _ => match Number::of(value) {
+        _ => match Number::from_value(value) {
             Some(number) => number.fit(primitive),
             None => Err(ValueProblem::Kind { found: value.kind().to_owned(), expected: primitive.name() }),
         },
     }
 }
 
-/// The bytes of a value that was made to fit a primitive, the least first: the first so many of eight.
+/// Returns the bytes of a value that fits its primitive, little endian: the first of eight.
 pub(crate) fn little(value: &Value) -> [u8; 8] {
     match value {
         Value::Bool(value) => u64::from(*value).to_le_bytes(),

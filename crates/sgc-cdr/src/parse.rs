@@ -5,26 +5,26 @@ use crate::definition::{
 };
 use crate::fault::short;
 
-/// Longest text that is looked at, bytes.
+/// Longest text that is parsed, bytes.
 pub const DEFINITION_BYTES_MAX: usize = 256 * 1024;
 /// Most members and constants of one message.
 pub(crate) const MEMBERS_MAX: usize = 4096;
-/// What separates request from response, and goal from result from feedback.
+/// Separator of request and response, and of goal, result and feedback.
 const SEPARATOR: &str = "---";
 
 /// A mistake in a definition.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{name}, line {line}: {problem}")]
 pub struct ParseError {
-    /// Of which type.
+    /// The type.
     pub name: TypeName,
-    /// Where, from 1 on.
+    /// The line, from 1.
     pub line: usize,
-    /// What.
+    /// The problem.
     pub problem: ParseProblem,
 }
 
-/// What is wrong in a line.
+/// A problem in a line.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ParseProblem {
     /// The text is too long.
@@ -33,38 +33,38 @@ pub enum ParseProblem {
     /// Too many members.
     #[error("the definition has more than {MEMBERS_MAX} members")]
     TooManyMembers,
-    /// A type that is none.
+    /// An invalid type.
     #[error("{0:?} is not a type")]
     Type(String),
-    /// A name that is none.
+    /// An invalid name.
     #[error("{0:?} is not a name of a member")]
     Name(String),
     /// A name twice.
     #[error("{0:?} is there twice")]
     Twice(String),
-    /// A constant that cannot be one.
+    /// An invalid constant.
     #[error("{0:?} cannot be a constant: its type is neither a primitive nor a string")]
     Constant(String),
-    /// Something else than what has to stand there, in IDL.
+    /// Unexpected text, in IDL.
     #[error("{found:?} stands where {expected} should")]
     Expected {
-        /// What should.
+        /// The expected text.
         expected: String,
-        /// What does.
+        /// The text found.
         found: String,
     },
-    /// Not as many parts as the kind has.
+    /// A wrong number of parts for the kind.
     #[error("the definition has {found} parts separated by ---, not {expected}")]
     Parts {
-        /// Parts it has.
+        /// Number found.
         found: usize,
-        /// Parts it should have.
+        /// Number expected.
         expected: usize,
     },
 }
 
-/// Parses the file that defines `file`: a message, both of a service, or all of an action, with those messages that
-/// ROS 2 makes of it.
+/// Parses the file that defines `file`: a message, both messages of a service, or all of an action, with the messages
+/// that ROS 2 derives from it.
 pub fn parse(file: &TypeName, text: &str) -> Result<Vec<Definition>, ParseError> {
     let fail = |line, problem| ParseError { name: file.clone(), line, problem };
     if text.len() > DEFINITION_BYTES_MAX {
@@ -99,7 +99,7 @@ pub fn parse(file: &TypeName, text: &str) -> Result<Vec<Definition>, ParseError>
     Ok(all)
 }
 
-/// What a file of a kind defines, behind its name.
+/// Returns the name suffixes of the definitions in a file of this kind.
 pub(crate) fn suffixes(kind: &str) -> &'static [&'static str] {
     match kind {
         "srv" => &["_Request", "_Response"],
@@ -108,7 +108,7 @@ pub(crate) fn suffixes(kind: &str) -> &'static [&'static str] {
     }
 }
 
-/// The messages that ROS 2 makes of an action; none of others. `None` if its name is too long.
+/// Returns the messages that ROS 2 derives from an action; none for other kinds. `None` if its name is too long.
 pub(crate) fn action_definitions(file: &TypeName) -> Option<Vec<Definition>> {
     let named =
         |suffix: &str| TypeName::new(file.package(), file.kind(), &format!("{}{suffix}", file.name()));
@@ -118,8 +118,8 @@ pub(crate) fn action_definitions(file: &TypeName) -> Option<Vec<Definition>> {
         let mut definition = Definition { name: named(suffix)?, fields: Vec::new(), constants: Vec::new() };
         for (name, field) in fields {
             let base = match field {
-                Made::Known(base) => base,
-                Made::Part(suffix) => Base::Message(named(suffix)?),
+                FieldSource::Known(base) => base,
+                FieldSource::Part(suffix) => Base::Message(named(suffix)?),
             };
             let field_type = FieldType { base, shape: Shape::One };
             definition.fields.push(Field { name: name.to_owned(), field_type, default: None });
@@ -129,15 +129,16 @@ pub(crate) fn action_definitions(file: &TypeName) -> Option<Vec<Definition>> {
     Some(all)
 }
 
-enum Made {
+enum FieldSource {
     Known(Base),
     Part(&'static str),
 }
 
-/// The messages of an action's services and topics (the ROS 2 design article "Actions").
-fn action_messages() -> Vec<(&'static str, Vec<(&'static str, Made)>)> {
-    let known =
-        |package, name| TypeName::new(package, "msg", name).map(|name| Made::Known(Base::Message(name)));
+/// Returns the messages of an action's services and topics (the ROS 2 design article "Actions").
+fn action_messages() -> Vec<(&'static str, Vec<(&'static str, FieldSource)>)> {
+    let known = |package, name| {
+        TypeName::new(package, "msg", name).map(|name| FieldSource::Known(Base::Message(name)))
+    };
     let (Some(id), Some(result_id), Some(feedback_id), Some(stamp)) = (
         known("unique_identifier_msgs", "UUID"),
         known("unique_identifier_msgs", "UUID"),
@@ -146,16 +147,16 @@ fn action_messages() -> Vec<(&'static str, Vec<(&'static str, Made)>)> {
     ) else {
         return Vec::new();
     };
-    let primitive = |primitive| Made::Known(Base::Primitive(primitive));
+    let primitive = |primitive| FieldSource::Known(Base::Primitive(primitive));
     vec![
-        ("_SendGoal_Request", vec![("goal_id", id), ("goal", Made::Part("_Goal"))]),
+        ("_SendGoal_Request", vec![("goal_id", id), ("goal", FieldSource::Part("_Goal"))]),
         ("_SendGoal_Response", vec![("accepted", primitive(Primitive::Bool)), ("stamp", stamp)]),
         ("_GetResult_Request", vec![("goal_id", result_id)]),
         (
             "_GetResult_Response",
-            vec![("status", primitive(Primitive::Int8)), ("result", Made::Part("_Result"))],
+            vec![("status", primitive(Primitive::Int8)), ("result", FieldSource::Part("_Result"))],
         ),
-        ("_FeedbackMessage", vec![("goal_id", feedback_id), ("feedback", Made::Part("_Feedback"))]),
+        ("_FeedbackMessage", vec![("goal_id", feedback_id), ("feedback", FieldSource::Part("_Feedback"))]),
     ]
 }
 
@@ -214,7 +215,7 @@ impl Part {
     }
 }
 
-/// The value in the rest of a line. A `#` begins a comment, but for in quotes.
+/// Returns the value in the rest of a line. A `#` outside of quotes begins a comment.
 fn literal(base: &Base, rest: &str) -> String {
     let rest = rest.trim();
     let quote = rest.chars().next().filter(|c| matches!(c, '"' | '\''));

@@ -1,5 +1,5 @@
-//! Paths of members in errors: `pose.position.x`, `transforms[2].header`. They are put together on the way up, so that what
-//! fits costs nothing.
+//! Paths of members in errors: `pose.position.x`, `transforms[2].header`. They are assembled on the way up, so that
+//! valid input costs nothing.
 
 /// Puts a member in front.
 pub(crate) fn under(path: &mut String, member: &str) {

@@ -1,22 +1,22 @@
-//! A type with all that it contains as text: definitions of `.msg` files one after the other, as MCAP and Foxglove have
-//! them (`ros2msg`).
+//! A type with everything that it contains as text: definitions of `.msg` files in sequence, as in MCAP and Foxglove
+//! (`ros2msg`).
 //!
-//! It is for programs that read messages: comments and defaults are not in it. Constants are, where a definition has told
-//! of them: descriptions that travel do not.
+//! It is for programs that read messages: comments and defaults are left out. Constants are included where a definition
+//! has them; transmitted descriptions have none.
 
 use std::fmt::Write as _;
 
 use crate::definition::{Base, Constant, DUMMY_MEMBER, FieldType, Primitive, Shape, TypeName};
 use crate::layout::{Layout, Struct};
 
-/// What stands between two definitions.
+/// Line between two definitions.
 const RULE: &str = "================================================================================";
-/// What stands for a message without members: readers take a text of nothing for a definition that is missing.
+/// Text of a message without members: readers take an empty text for a missing definition.
 const NO_MEMBERS: &str = "# no members\n";
 
 impl Layout {
-    /// The definition of the type, then those of all that it contains, each behind a line of `=` and one that says
-    /// `MSG: package/Name`.
+    /// Returns the definition of the type, then those of all parts, each behind a line of `=` and a line `MSG:
+    /// package/Name`.
     pub fn to_ros2msg(&self) -> String {
         let mut text = String::new();
         let Some(this) = self.structs.last() else { return text };
@@ -30,7 +30,7 @@ impl Layout {
 }
 
 fn write_struct(text: &mut String, this: &Struct) {
-    // With constants alone Foxglove takes it for no message.
+    // Foxglove takes a definition with only constants for no message.
     if this.members.iter().all(|member| &*member.name == DUMMY_MEMBER) {
         return text.push_str(NO_MEMBERS);
     }
@@ -42,7 +42,7 @@ fn write_struct(text: &mut String, this: &Struct) {
     }
 }
 
-/// Leaves out what programs might not read: other spellings than those of numbers, and texts with more than letters.
+/// Leaves out constants that programs might not read: unusual number spellings, and texts with more than letters.
 fn write_constant(text: &mut String, constant: &Constant) {
     let Constant { name, base, value } = constant;
     let value = value.trim();
@@ -99,7 +99,7 @@ fn base_text(base: &Base) -> String {
     }
 }
 
-/// `std_msgs/Header` for `std_msgs/msg/Header`; parts of services and actions keep all of their names.
+/// Returns `std_msgs/Header` for `std_msgs/msg/Header`; parts of services and actions keep their full names.
 fn short_name(name: &TypeName) -> String {
     match name.kind() {
         "msg" => format!("{}/{}", name.package(), name.name()),
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_described_is_written_as_well() {
+    fn described_types_are_written_as_well() {
         let of = layout("int8 LOW=-1\nTwo[2] two\nstring<=7 s");
         let described = Layout::from_description(&of.describe().unwrap().into(), &of.type_hash()).unwrap();
         assert_eq!(described.to_ros2msg(), of.to_ros2msg().replace("int8 LOW=-1\n", ""));

@@ -1,9 +1,9 @@
-//! What the tests of several modules have in common.
+//! Common helpers of the tests of several modules.
 
 use crate::layout::Layout;
 use crate::library::Library;
 
-/// The layout of a message of this definition, which may contain `Two` and `Empty`.
+/// Returns the layout of a message of this definition, which may contain `Two` and `Empty`.
 pub(crate) fn layout(text: &str) -> Layout {
     let mut texts = |file: &crate::TypeName| match file.name() {
         "M" => Some(text.to_owned()),

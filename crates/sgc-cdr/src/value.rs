@@ -1,4 +1,4 @@
-//! What a message says.
+//! Values of messages.
 
 use std::sync::Arc;
 
@@ -6,7 +6,7 @@ use bytes::Bytes;
 
 use crate::definition::Primitive;
 
-/// A value of a message. What it was declared as is in its definition.
+/// A value of a message. Its definition has its declared type.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Value {
     /// `bool`.
@@ -23,12 +23,12 @@ pub enum Value {
     Text(String),
     /// A `string` that is not UTF-8: its bytes.
     Raw(Bytes),
-    /// A `wstring` that is not UTF-16, since half of a surrogate pair lacks: its units.
+    /// A `wstring` that is not UTF-16, because half of a surrogate pair is missing: its units.
     Wide(Vec<u16>),
     /// Arrays and sequences of `byte`, `char` and `uint8`.
     Octets(Bytes),
     /// Arrays and sequences of other primitives.
-    Packed(Packed),
+    PackedArray(PackedArray),
     /// Other arrays and sequences.
     List(Vec<Value>),
     /// A message: its members in order.
@@ -36,28 +36,31 @@ pub enum Value {
 }
 
 impl Value {
-    /// A member by its path: `pose.position.x`, with `[2]` for an element of a sequence: `transforms[0].header`.
+    /// Returns a member by its path: `pose.position.x`, with `[2]` for an element of a sequence:
+    /// `transforms[0].header`.
     pub fn at(&self, path: &str) -> Option<Value> {
-        enum Here<'a> {
+        enum Cursor<'a> {
             Within(&'a Value),
-            /// Of a sequence of primitives, which has no values in it.
+            /// An element of a packed sequence, which has no values in it.
             Made(Value),
         }
-        let mut here = Here::Within(self);
+        let mut here = Cursor::Within(self);
         for part in path.split('.') {
             let (name, mut rest) = match part.find('[') {
                 Some(bracket) => part.split_at(bracket),
                 None => (part, ""),
             };
-            let Here::Within(Self::Record(members)) = here else { return None };
-            here = Here::Within(&members.iter().find(|(n, _)| &**n == name)?.1);
+            let Cursor::Within(Self::Record(members)) = here else { return None };
+            here = Cursor::Within(&members.iter().find(|(n, _)| &**n == name)?.1);
             while let Some(inner) = rest.strip_prefix('[') {
                 let (index, after) = inner.split_once(']')?;
                 let index: usize = index.parse().ok()?;
                 here = match here {
-                    Here::Within(Self::List(all)) => Here::Within(all.get(index)?),
-                    Here::Within(Self::Octets(all)) => Here::Made(Self::Uint(u64::from(*all.get(index)?))),
-                    Here::Within(Self::Packed(all)) => Here::Made(all.at(index)?),
+                    Cursor::Within(Self::List(all)) => Cursor::Within(all.get(index)?),
+                    Cursor::Within(Self::Octets(all)) => {
+                        Cursor::Made(Self::Uint(u64::from(*all.get(index)?)))
+                    }
+                    Cursor::Within(Self::PackedArray(all)) => Cursor::Made(all.at(index)?),
                     _ => return None,
                 };
                 rest = after;
@@ -67,12 +70,12 @@ impl Value {
             }
         }
         Some(match here {
-            Here::Within(value) => value.clone(),
-            Here::Made(value) => value,
+            Cursor::Within(value) => value.clone(),
+            Cursor::Made(value) => value,
         })
     }
 
-    /// What it is, for who expected something else.
+    /// Returns the kind of value, for errors.
     pub(crate) fn kind(&self) -> &'static str {
         match self {
             Self::Bool(_) => "a bool",
@@ -81,21 +84,21 @@ impl Value {
             Self::Text(_) => "a text",
             Self::Raw(_) => "a text that is not UTF-8",
             Self::Wide(_) => "a text that is not UTF-16",
-            Self::Octets(_) | Self::Packed(_) | Self::List(_) => "a sequence",
+            Self::Octets(_) | Self::PackedArray(_) | Self::List(_) => "a sequence",
             Self::Record(_) => "a message",
         }
     }
 
-    /// A text of UTF-8 or what looks like it.
-    pub(crate) fn of_bytes(bytes: Bytes) -> Self {
+    /// Returns a text of UTF-8, or the raw bytes.
+    pub(crate) fn from_bytes(bytes: Bytes) -> Self {
         match std::str::from_utf8(&bytes) {
             Ok(text) => Self::Text(text.to_owned()),
             Err(_) => Self::Raw(bytes),
         }
     }
 
-    /// A text of UTF-16 or what looks like it.
-    pub(crate) fn of_units(units: Vec<u16>) -> Self {
+    /// Returns a text of UTF-16, or the raw units.
+    pub(crate) fn from_units(units: Vec<u16>) -> Self {
         match String::from_utf16(&units) {
             Ok(text) => Self::Text(text),
             Err(_) => Self::Wide(units),
@@ -103,17 +106,17 @@ impl Value {
     }
 }
 
-/// Elements of an array or a sequence of primitives, as they are in little endian CDR: an element takes no more than its
-/// bytes, and those of a payload are shared with it. Two are equal if all bits are: NaN is equal to itself.
+/// Elements of an array or a sequence of primitives, as in little endian CDR: an element takes no more than its bytes,
+/// and those of a payload share its memory. Two are equal if all bits are: NaN is equal to itself.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Packed {
+pub struct PackedArray {
     primitive: Primitive,
     octets: Bytes,
 }
 
-impl Packed {
-    /// Elements of these bytes, the least of each first. `None` if the last one is not whole, if a `bool` is neither 0 nor
-    /// 1, and for `byte` and `uint8`, which are [`Value::Octets`].
+impl PackedArray {
+    /// Returns elements of these bytes, little endian. `None` if the last one is incomplete, if a `bool` is neither 0
+    /// nor 1, and for `byte` and `uint8`, which are [`Value::Octets`].
     pub fn new(primitive: Primitive, octets: Bytes) -> Option<Self> {
         let fits = match primitive {
             Primitive::Byte | Primitive::Uint8 => false,
@@ -123,40 +126,40 @@ impl Packed {
         fits.then_some(Self { primitive, octets })
     }
 
-    /// What its elements are.
+    /// Returns the type of its elements.
     pub fn primitive(&self) -> Primitive {
         self.primitive
     }
 
-    /// Its elements, the least byte of each first.
+    /// Returns the bytes of its elements, little endian.
     pub fn octets(&self) -> &Bytes {
         &self.octets
     }
 
-    /// How many elements there are.
+    /// Returns the number of elements.
     pub fn len(&self) -> usize {
         self.octets.len() / self.primitive.bytes()
     }
 
-    /// Whether there is none.
+    /// Returns whether there are no elements.
     pub fn is_empty(&self) -> bool {
         self.octets.is_empty()
     }
 
-    /// An element.
+    /// Returns an element.
     pub fn at(&self, index: usize) -> Option<Value> {
         let size = self.primitive.bytes();
         let begin = index.checked_mul(size)?;
         self.octets.get(begin..begin.checked_add(size)?).map(|bytes| scalar(self.primitive, bytes))
     }
 
-    /// All elements.
+    /// Iterates over all elements.
     pub fn iter(&self) -> impl Iterator<Item = Value> {
         self.octets.chunks_exact(self.primitive.bytes()).map(|bytes| scalar(self.primitive, bytes))
     }
 }
 
-/// A primitive of its bytes, the least first; those that lack are zero.
+/// Returns a primitive of its bytes, little endian; missing bytes are zero.
 pub(crate) fn scalar(primitive: Primitive, bytes: &[u8]) -> Value {
     let mut eight = [0; 8];
     for (to, from) in eight.iter_mut().zip(bytes) {
@@ -188,12 +191,12 @@ mod tests {
             Value::Record(members.into_iter().map(|(name, value)| (Arc::from(name), value)).collect())
         };
         let stamp = record(vec![("sec", Value::Int(2)), ("nanosec", Value::Uint(5))]);
-        let ranges = Packed::new(Primitive::Int16, Bytes::from_static(&[1, 0, 0xff, 0xff])).unwrap();
+        let ranges = PackedArray::new(Primitive::Int16, Bytes::from_static(&[1, 0, 0xff, 0xff])).unwrap();
         let message = record(vec![
             ("header", record(vec![("stamp", stamp)])),
             ("list", Value::List(vec![record(vec![("x", Value::Bool(true))])])),
             ("data", Value::Octets(Bytes::from_static(&[7, 8]))),
-            ("ranges", Value::Packed(ranges)),
+            ("ranges", Value::PackedArray(ranges)),
         ]);
         assert_eq!(message.at("list[0].x"), Some(Value::Bool(true)));
         assert_eq!(message.at("data[1]"), Some(Value::Uint(8)));
@@ -215,7 +218,8 @@ mod tests {
 
     #[test]
     fn packed_elements_are_whole() {
-        let packed = |primitive, octets: &'static [u8]| Packed::new(primitive, Bytes::from_static(octets));
+        let packed =
+            |primitive, octets: &'static [u8]| PackedArray::new(primitive, Bytes::from_static(octets));
         assert_eq!(packed(Primitive::Int16, &[1]), None);
         assert_eq!(packed(Primitive::Bool, &[2]), None);
         assert_eq!(packed(Primitive::Uint8, &[2]), None);

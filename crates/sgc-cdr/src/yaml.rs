@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use crate::value::Value;
 
-/// How much of a message is shown.
+/// Extent of the shown message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct YamlStyle {
     /// Elements of a sequence, and characters of a text, that are shown; `None` for all.
@@ -12,19 +12,19 @@ pub struct YamlStyle {
 }
 
 impl Default for YamlStyle {
-    /// As `ros2 topic echo` does without `--full-length`.
+    /// Returns the style of `ros2 topic echo` without `--full-length`.
     fn default() -> Self {
         Self { elements: Some(128) }
     }
 }
 
 impl Value {
-    /// As YAML, each line ended.
+    /// Returns YAML, each line ended.
     pub fn to_yaml(&self, style: YamlStyle) -> String {
         let mut out = String::new();
         match self {
             Self::Record(members) if !members.is_empty() => block(&mut out, self, 0, style, false),
-            Self::List(_) | Self::Octets(_) | Self::Packed(_) => {
+            Self::List(_) | Self::Octets(_) | Self::PackedArray(_) => {
                 block(&mut out, self, 0, style, false);
                 if !out.ends_with('\n') {
                     out.push('\n');
@@ -39,7 +39,7 @@ impl Value {
     }
 }
 
-/// Writes what has lines of its own. `begun` if its first line is.
+/// Writes a value with lines of its own. `begun` if its first line has begun.
 fn block(out: &mut String, value: &Value, depth: usize, style: YamlStyle, begun: bool) {
     let indent = |out: &mut String, begun: bool| {
         if !begun {
@@ -56,7 +56,7 @@ fn block(out: &mut String, value: &Value, depth: usize, style: YamlStyle, begun:
                         out.push('\n');
                         block(out, member, depth + 1, style, false);
                     }
-                    Value::List(_) | Value::Octets(_) | Value::Packed(_) if !is_empty(member) => {
+                    Value::List(_) | Value::Octets(_) | Value::PackedArray(_) if !is_empty(member) => {
                         out.push('\n');
                         block(out, member, depth, style, false);
                     }
@@ -90,7 +90,7 @@ fn block(out: &mut String, value: &Value, depth: usize, style: YamlStyle, begun:
             }
             ellipsis(out, shown < octets.len(), indent);
         }
-        Value::Packed(packed) => {
+        Value::PackedArray(packed) => {
             let shown = style.elements.unwrap_or(packed.len()).min(packed.len());
             for element in packed.iter().take(shown) {
                 indent(out, false);
@@ -116,7 +116,7 @@ fn is_empty(value: &Value) -> bool {
     match value {
         Value::List(all) => all.is_empty(),
         Value::Octets(octets) => octets.is_empty(),
-        Value::Packed(packed) => packed.is_empty(),
+        Value::PackedArray(packed) => packed.is_empty(),
         _ => false,
     }
 }
@@ -129,10 +129,10 @@ fn scalar(value: &Value, style: YamlStyle) -> String {
         Value::Float32(value) => float(f64::from(*value)),
         Value::Float64(value) => float(*value),
         Value::Text(text) => shown(text, style),
-        // YAML has no sign for what is no Unicode.
+        // YAML has no form for invalid Unicode.
         Value::Raw(bytes) => shown(&String::from_utf8_lossy(bytes), style),
         Value::Wide(units) => shown(&String::from_utf16_lossy(units), style),
-        Value::List(_) | Value::Octets(_) | Value::Packed(_) => "[]".to_owned(),
+        Value::List(_) | Value::Octets(_) | Value::PackedArray(_) => "[]".to_owned(),
         Value::Record(_) => "{}".to_owned(),
     }
 }
@@ -146,7 +146,7 @@ fn shown(text: &str, style: YamlStyle) -> String {
     }
 }
 
-/// As Python shows a float in YAML: `1.0`, `1.0e-05`, `.nan`.
+/// Returns a float as Python shows it in YAML: `1.0`, `1.0e-05`, `.nan`.
 fn float(value: f64) -> String {
     if value.is_nan() {
         return ".nan".to_owned();
@@ -169,7 +169,7 @@ fn float(value: f64) -> String {
     if text.contains('.') { text } else { format!("{text}.0") }
 }
 
-/// A text, in quotes where YAML would take it for something else.
+/// Returns a text, in quotes where YAML would take it for something else.
 fn quoted(text: &str) -> String {
     let control = |c: char| {
         c.is_control() || matches!(c, '\u{2028}' | '\u{2029}' | '\u{feff}' | '\u{fffe}' | '\u{ffff}')

@@ -1,4 +1,4 @@
-//! Random types with random values: whatever way a message takes, it is the same behind it.
+//! Random types with random values: every conversion of a message gives the same message back.
 #![allow(clippy::unwrap_used)]
 
 use std::fmt::Write as _;
@@ -8,8 +8,8 @@ use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::{RngCore as _, SeedableRng as _};
 use sgc_cdr::{
-    Base, ByteOrder, CdrVersion, DUMMY_MEMBER, Encoding, Layout, Library, Packed, Padding, Primitive, Shape,
-    TypeName, VALUES_MAX, Value, ValueProblem,
+    Base, ByteOrder, CdrVersion, DUMMY_MEMBER, Encoding, Layout, Library, PackedArray, Padding, Primitive,
+    Shape, TypeName, VALUES_MAX, Value, ValueProblem,
 };
 
 const PRIMITIVES: [Primitive; 12] = [
@@ -34,7 +34,7 @@ impl Random {
         self.0.next_u32() % bound
     }
 
-    fn of<T: Copy>(&mut self, all: &[T]) -> T {
+    fn pick<T: Copy>(&mut self, all: &[T]) -> T {
         all[self.below(all.len() as u32) as usize]
     }
 
@@ -47,7 +47,7 @@ impl Random {
                 0 => format!("string{bound}"),
                 1 => format!("wstring{bound}"),
                 2 if number < last => format!("T{}", number + 1 + self.below(last - number)),
-                _ => self.of(&PRIMITIVES).name().to_owned(),
+                _ => self.pick(&PRIMITIVES).name().to_owned(),
             };
             let shape = match self.below(6) {
                 0 => "[]".to_owned(),
@@ -83,7 +83,7 @@ impl Random {
             return Value::List((0..count).map(|_| self.element(library, base)).collect());
         };
         let bytes: Bytes = (0..count).flat_map(|_| self.bits(*primitive)).collect();
-        Packed::new(*primitive, bytes.clone()).map_or(Value::Octets(bytes), Value::Packed)
+        PackedArray::new(*primitive, bytes.clone()).map_or(Value::Octets(bytes), Value::PackedArray)
     }
 
     /// The bytes of a primitive. There is one NaN: formats of text have no more.
@@ -113,7 +113,7 @@ impl Random {
             Base::Message(name) => self.message(library, name),
             Base::Primitive(primitive) => {
                 let bytes = Bytes::from(self.bits(*primitive));
-                match Packed::new(*primitive, bytes.clone()) {
+                match PackedArray::new(*primitive, bytes.clone()) {
                     Some(one) => one.at(0).unwrap(),
                     None => Value::Uint(u64::from(bytes[0])),
                 }
@@ -121,7 +121,7 @@ impl Random {
             Base::String { bound } => {
                 let bytes: Bytes = (0..self.below(bound.unwrap_or(12).min(12) + 1))
                     .map(|_| {
-                        self.of(&[b'a', b'"', b'\\', b'\n', 0, 1, 0x7f, 0x80, 0xc3, 0xbc, 0xed, 0xa0, 0xff])
+                        self.pick(&[b'a', b'"', b'\\', b'\n', 0, 1, 0x7f, 0x80, 0xc3, 0xbc, 0xed, 0xa0, 0xff])
                     })
                     .collect();
                 match std::str::from_utf8(&bytes) {
@@ -131,9 +131,9 @@ impl Random {
             }
             Base::WString { bound } => {
                 let mut units: Vec<u16> = (0..self.below(bound.unwrap_or(8).min(8) + 1))
-                    .map(|_| self.of(&[0x61, 0, 0xfc, 0xd83d, 0xde00, 0xdc80, 0xffff]))
+                    .map(|_| self.pick(&[0x61, 0, 0xfc, 0xd83d, 0xde00, 0xdc80, 0xffff]))
                     .collect();
-                // One at the end would be taken for what ends it.
+                // A NUL at the end would be taken for the terminator.
                 while units.last() == Some(&0) {
                     units.pop();
                 }
@@ -146,7 +146,7 @@ impl Random {
     }
 }
 
-/// Equal in every bit: `==` of floats is not.
+/// Equal in every bit, unlike `==` of floats.
 fn same(a: &Value, b: &Value) -> bool {
     match (a, b) {
         (Value::Float32(a), Value::Float32(b)) => a.to_bits() == b.to_bits(),
@@ -176,7 +176,7 @@ fn check(layout: &Layout, value: &Value, why: &str) {
             let (read, found) = layout.decode_as(&padded).unwrap();
             assert_eq!(layout.encode_as(&read, found).unwrap(), padded, "{why} {padding:?}");
         }
-        // What is cut is never the message.
+        // A truncated message never equals the whole.
         for end in 0..payload.len() {
             let _ = layout.decode(&payload.slice(..end));
         }
@@ -238,7 +238,7 @@ fn large_messages_take_no_more_than_their_bytes() {
     let payload = Bytes::from(image.encode(&value).unwrap());
     let Some(Value::Octets(found)) = image.decode(&payload).unwrap().at("data") else { panic!("octets") };
     assert_eq!(found, data);
-    // It is the payload's memory.
+    // The value shares the payload's memory.
     assert!(payload.as_ptr_range().contains(&found.as_ptr()));
     let cbor = Bytes::from(value.to_cbor());
     assert_eq!(image.from_cbor(&cbor).unwrap(), value);
@@ -246,7 +246,7 @@ fn large_messages_take_no_more_than_their_bytes() {
 }
 
 #[test]
-fn what_lies_about_its_size_takes_none() {
+fn a_false_size_takes_no_memory() {
     let array = shipped("std_msgs/msg/Float64MultiArray");
     let strings = shipped("rcl_interfaces/msg/ListParametersResult");
     // A gigabyte is claimed, in CDR and CBOR.
@@ -270,7 +270,7 @@ fn what_lies_about_its_size_takes_none() {
     assert!(matches!(problem("[".repeat(1 << 20)), ValueProblem::Syntax(_)));
     assert!(matches!(problem(format!("{{\"data\":{}", "[".repeat(1 << 20))), ValueProblem::Syntax(_)));
     assert!(matches!(problem("{\"layout\":".repeat(1 << 18)), ValueProblem::Unknown(_)));
-    // Few bytes of what is left out become many values.
+    // A few bytes with missing members become many values.
     let objects = format!("{{\"layout\":{{\"dim\":[{}{{}}]}}}}", "{},".repeat(VALUES_MAX / 3));
     assert!(matches!(problem(objects), ValueProblem::TooManyValues | ValueProblem::TooLarge));
     // Deep CBOR ends where the type does.
@@ -301,7 +301,7 @@ fn random_bytes_are_no_trouble() {
             layout.decode(&changed(&cdr).into()).ok(),
         ];
         for value in values.into_iter().flatten() {
-            // What is read can be written, and read.
+            // Every value that was read can be written, and read again.
             let payload = layout.encode(&value).unwrap();
             assert!(layout.decode(&payload.into()).is_ok());
         }

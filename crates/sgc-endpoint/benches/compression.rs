@@ -1,8 +1,8 @@
-//! What compression costs and saves, in one thread: compressing and sealing against sealing alone, and the same at the
+//! Cost and savings of compression, in one thread: compressing and sealing against sealing alone, and the same at the
 //! other end.
 //!
-//! The ways take turns, so that what else the machine does meets all of them; of each the median counts.
-//! `cargo bench -p sgc-endpoint --bench compression` prints the table of `benchmarks/large-messages.md`.
+//! The variants take turns, so that other work of the machine affects all of them; of each the median counts. `cargo
+//! bench -p sgc-endpoint --bench compression` prints the table of `benchmarks/large-messages.md`.
 #![allow(clippy::print_stdout)]
 
 use std::time::{Duration, Instant};
@@ -19,7 +19,7 @@ use sgc_wire::{
 const NAME: Name = Name([1; 32]);
 const ROUNDS: usize = 41;
 
-/// Numbers that look random and are the same each time.
+/// Returns numbers that look random and are the same each time.
 struct Dice(u64);
 
 impl Dice {
@@ -59,7 +59,7 @@ fn points() -> Vec<u8> {
     out
 }
 
-/// A `std_msgs/msg/String` with what programs put into such: names and numbers, again and again.
+/// A `std_msgs/msg/String` as programs often send it: names and numbers, again and again.
 fn json(bytes: usize) -> Vec<u8> {
     let (mut out, mut dice) = (vec![0, 1, 0, 0, 0, 0, 0, 0], Dice(3));
     while out.len() < bytes {
@@ -72,7 +72,7 @@ fn json(bytes: usize) -> Vec<u8> {
     out
 }
 
-struct Way {
+struct Variant {
     encoding: PayloadEncoding,
     source: Source,
     sink: Sink,
@@ -82,7 +82,7 @@ struct Way {
     rounds: Vec<(usize, Duration, Duration)>,
 }
 
-impl Way {
+impl Variant {
     fn new(encoding: PayloadEncoding) -> Self {
         let config = SourceConfig {
             name: NAME,
@@ -151,7 +151,7 @@ fn main() {
     ] {
         let payload = Bytes::from(payload);
         let kinds = [PayloadEncoding::Plain, PayloadEncoding::Lz4, PayloadEncoding::Zstd];
-        let mut ways = kinds.map(Way::new);
+        let mut ways = kinds.map(Variant::new);
         for _ in 0..ROUNDS {
             ways.iter_mut().for_each(|way| way.round(&payload));
         }

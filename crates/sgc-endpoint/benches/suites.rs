@@ -1,8 +1,7 @@
-//! What the suites cost: from a payload to sealed and signed packets, and from those to a message, in one
-//! thread.
+//! Cost of the suites: from a payload to sealed and signed packets, and from those to a message, in one thread.
 //!
-//! The suites take turns in short rounds, so that what else the machine does meets all of them; of each the
-//! median round counts. `cargo bench -p sgc-endpoint` prints the tables of `benchmarks/suites.md`.
+//! The suites take turns in short rounds, so that other work of the machine affects all of them; of each the median
+//! round counts. `cargo bench -p sgc-endpoint` prints the tables of `benchmarks/suites.md`.
 #![allow(clippy::print_stdout)]
 
 use std::time::{Duration, Instant};
@@ -14,7 +13,7 @@ use sgc_wire::{Class, MessageHead, MessageKind, Name, Packet, SecretBytes, SinkI
 
 const NAME: Name = Name([1; 32]);
 const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
-/// How long one configuration is measured, of all suites together.
+/// Time for which one configuration is measured, of all suites together.
 const MEASURE: Duration = Duration::from_millis(1500);
 const ROUNDS_MIN: usize = 5;
 
@@ -22,7 +21,7 @@ struct Ends {
     suite: Suite,
     source: Source,
     sink: Sink,
-    /// Of each round, per message: sealing and opening.
+    /// Times of each round, per message: sealing and opening.
     rounds: Vec<(Duration, Duration)>,
 }
 

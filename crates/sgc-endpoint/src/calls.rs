@@ -1,13 +1,12 @@
-//! Calls of a service by name: [`Caller`] remembers what is not answered yet, [`Answerer`] what was asked.
+//! Calls of a service by name: [`Caller`] remembers unanswered calls, [`Answerer`] received ones.
 //!
-//! Messages carry the call's number at the source that asks. Whatever breaks between the two, a call is published
-//! again until it is answered, and is carried out once, since the answerer knows it again: what is under way is not
-//! begun twice, what is done is answered from memory, and of what it remembers no more it says so. Nothing here ends
-//! a call by time: it lives as long as its client. A call that ends without an answer is a [`LostCall`], which the driver
-//! takes, counts and explains.
+//! Messages carry the call's number at the source that asks. A call is published again until it is answered, through
+//! any failure between the two, and is carried out once, because the answerer recognises it: a running call is not
+//! begun twice, a finished one is answered from memory, and a forgotten one is reported as gone. No call ends by time
+//! here: it lives as long as its client. A call that ends without an answer is a [`LostCall`], which the driver takes,
+//! counts and explains.
 //!
-//! Sending, sealing and the local network are the driver's. `L` is how that one tells local calls apart, `S` how it tells
-//! local servers apart.
+//! The driver sends, seals and serves the local network. `L` identifies its local calls, `S` its local servers.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -16,27 +15,27 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use sgc_wire::{MessageKind, SourceId};
 
-/// When it is asked first what became of a call; each time later it is twice as long, up to [`ASK_EVERY_MAX`].
+/// Time after which a caller first asks about a call; each later time is twice as long, up to [`ASK_EVERY_MAX`].
 pub const ASK_AFTER: Duration = Duration::from_secs(5);
-/// How long it is at most between two such questions.
+/// Longest time between two such questions.
 pub const ASK_EVERY_MAX: Duration = Duration::from_secs(300);
-/// An answer that is larger is acknowledged, so that it need not be remembered.
+/// A larger answer is acknowledged, so that it need not be remembered.
 pub const ANSWER_KEPT_BYTES_MAX: usize = 64 << 10;
 
 /// Bounds of one service at one node.
 #[derive(Clone, Debug)]
 pub struct CallLimits {
-    /// Calls of one local client that are not answered.
+    /// Unanswered calls of one local client.
     pub open_per_client_max: usize,
-    /// Calls of all.
+    /// Unanswered calls of all clients.
     pub open_max: usize,
     /// Bytes of their requests.
     pub open_bytes_max: usize,
-    /// Calls of one source that are remembered, under way or over.
+    /// Remembered calls of one source, running or over.
     pub remembered_per_source_max: usize,
     /// Sources whose calls are remembered.
     pub sources_max: usize,
-    /// Bytes of answers that are remembered; the newest is, whatever its size.
+    /// Bytes of remembered answers; the newest answer is remembered whatever its size.
     pub answer_bytes_max: usize,
 }
 
@@ -53,48 +52,48 @@ impl Default for CallLimits {
     }
 }
 
-/// What became of the calls of one service, so far.
+/// Counts of the calls of one service, so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct CallStats {
     /// Calls taken.
     pub calls: u64,
-    /// Those that wait for their answer.
+    /// Calls that wait for their answer.
     pub open: u64,
-    /// Those that were answered.
+    /// Calls that were answered.
     pub answered: u64,
 }
 
 /// The reason for which a call is not answered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum CallLoss {
-    /// Too many calls were open where it was made ([`CallRefused`]): it was not taken.
+    /// Too many calls were open at the caller ([`CallRefusal`]): the call was not taken.
     Refused,
-    /// Too many calls of its node were under way at the owner: it was not taken.
+    /// Too many calls of the caller's node were running at the owner: the call was not taken.
     OwnerFull,
-    /// The servers that were asked are gone.
+    /// The servers that got the request are gone.
     ServerGone,
     /// The owner's node started anew and remembers nothing: the call may have been carried out.
     OwnerRestarted,
     /// The service ended while the call waited: its servers stayed away, its owner left, or a rule changed.
     Withdrawn,
-    /// Its client is gone.
+    /// The client is gone.
     ClientGone,
-    /// The answer came, and was asked for when the owner kept it no more.
+    /// The answer was lost and requested again after the owner had forgotten it.
     Forgotten,
     /// The request or the answer is larger than any message.
     TooLarge,
-    /// The answer came, and the client was not there to hear it.
+    /// The answer came after the client had gone.
     Unheard,
-    /// Messages of the local network came faster than they were taken: requests, or answers.
+    /// Messages of the local network, requests or answers, came faster than they were taken.
     Overrun,
     /// A message of the local network does not say to which call it belongs.
     Unreadable,
-    /// The owner did not say why.
+    /// The owner gave no reason.
     Unsaid,
 }
 
 impl CallLoss {
-    /// All of them.
+    /// All reasons.
     pub const ALL: [Self; 12] = [
         Self::Refused,
         Self::OwnerFull,
@@ -155,7 +154,7 @@ impl CallLoss {
     }
 }
 
-/// A call that is not answered, and whose it was: a local call at the node that called, a source at the owner.
+/// A call that is not answered, with its caller: a local call at the calling node, a source at the owner.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LostCall<W> {
     /// The reason.
@@ -164,22 +163,22 @@ pub struct LostCall<W> {
     pub of: W,
 }
 
-/// Why a local call is not taken.
+/// The reason why a local call is not taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum CallRefused {
+pub enum CallRefusal {
     /// Too many of this client wait for their answers.
     #[error("a client has {max} calls without an answer")]
     Client {
         /// The bound.
         max: usize,
     },
-    /// Too many of all clients do.
+    /// Too many of all clients wait for their answers.
     #[error("{max} calls are without an answer")]
     Calls {
         /// The bound.
         max: usize,
     },
-    /// Their requests are too large together.
+    /// Requests without an answer are too large together.
     #[error("requests of more than {max} bytes are without an answer")]
     Bytes {
         /// The bound.
@@ -193,18 +192,18 @@ struct Open<L> {
     client: [u8; 16],
     local: L,
     payload: Bytes,
-    /// True if it was published: it may have arrived.
+    /// Whether it was published: it may have arrived.
     published: bool,
     ask_at: Instant,
     ask_after: Duration,
 }
 
-/// What an answer comes to at who called.
+/// Effect of a message at the caller.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Outcome<L> {
-    /// It belongs to nothing here, or is the second one.
+    /// The message belongs to no open call, or is its second answer.
     Nothing,
-    /// It answers this local call.
+    /// The answer of this local call.
     Answers(L),
     /// The call has to be published again.
     Again(Bytes),
@@ -217,17 +216,17 @@ pub struct Caller<L> {
     next: u64,
     open: BTreeMap<u64, Open<L>>,
     bytes: usize,
-    /// True while what is published can arrive.
+    /// Set while published messages can arrive.
     granted: bool,
     /// Not later than the first question that is due.
     ask_at: Option<Instant>,
     stats: CallStats,
-    /// Those that the driver has not taken yet.
+    /// Lost calls that the driver has not taken yet.
     lost: Vec<LostCall<L>>,
 }
 
 impl<L: Copy> Caller<L> {
-    /// No calls yet.
+    /// Returns a caller without calls.
     pub fn new(limits: CallLimits) -> Self {
         Self {
             limits,
@@ -241,23 +240,23 @@ impl<L: Copy> Caller<L> {
         }
     }
 
-    /// Takes a call of a local client. Its number, if it is to be published at once; otherwise it waits for
-    /// [`Self::granted`].
+    /// Takes a call of a local client. Returns its number if the driver has to publish it at once; otherwise it waits
+    /// for [`Self::granted`].
     pub fn call(
         &mut self,
         now: Instant,
         client: [u8; 16],
         local: L,
         payload: Bytes,
-    ) -> Result<Option<u64>, CallRefused> {
+    ) -> Result<Option<u64>, CallRefusal> {
         let limits = &self.limits;
         let of_client = self.open.values().filter(|open| open.client == client).count();
         let refused = if of_client >= limits.open_per_client_max {
-            Some(CallRefused::Client { max: limits.open_per_client_max })
+            Some(CallRefusal::Client { max: limits.open_per_client_max })
         } else if self.open.len() >= limits.open_max {
-            Some(CallRefused::Calls { max: limits.open_max })
+            Some(CallRefusal::Calls { max: limits.open_max })
         } else if self.bytes + payload.len() > limits.open_bytes_max {
-            Some(CallRefused::Bytes { max: limits.open_bytes_max })
+            Some(CallRefusal::Bytes { max: limits.open_bytes_max })
         } else {
             None
         };
@@ -276,8 +275,9 @@ impl<L: Copy> Caller<L> {
         Ok(published.then_some(number))
     }
 
-    /// There is a way to the owner, another than before: all that is open is to be published, on it. With `anew` the
-    /// owner remembers nothing: what may have arrived is not asked again, since it may have been carried out.
+    /// Notes a new route to the owner. Returns all open calls, to be published on it. With `anew` the owner has
+    /// restarted and remembers nothing: a call that may have arrived is not sent again, because it may have been
+    /// carried out.
     pub fn granted(&mut self, now: Instant, anew: bool) -> Vec<(u64, Bytes)> {
         if anew {
             let published = self.open.iter().filter(|(_, open)| open.published).map(|(number, _)| *number);
@@ -295,12 +295,12 @@ impl<L: Copy> Caller<L> {
         self.open.iter_mut().map(publish).collect()
     }
 
-    /// The way to the owner is lost for now.
+    /// Notes that the route to the owner is lost for now.
     pub fn lost(&mut self) {
         self.granted = false;
     }
 
-    /// Takes what the owner says of a call, with the payload of the message.
+    /// Takes the owner's message about a call, with its payload.
     pub fn handle(&mut self, kind: MessageKind, number: u64, payload: &[u8]) -> Outcome<L> {
         match kind {
             MessageKind::Reply => match self.remove(number) {
@@ -322,20 +322,20 @@ impl<L: Copy> Caller<L> {
         }
     }
 
-    /// An answer of [`Outcome::Answers`] could not be given to its client.
+    /// Notes that an answer of [`Outcome::Answers`] could not be given to its client.
     pub fn unheard(&mut self, local: L) {
         self.stats.answered -= 1;
         self.lost.push(LostCall { loss: CallLoss::Unheard, of: local });
     }
 
-    /// A local client is gone: its calls are over. Their numbers, for the owner to forget them too.
+    /// Ends the calls of a local client that is gone. Returns their numbers, for the owner to forget them too.
     pub fn client_gone(&mut self, is_of: impl Fn(&L) -> bool) -> Vec<u64> {
         let gone: Vec<_> = self.open.iter().filter(|(_, o)| is_of(&o.local)).map(|(n, _)| *n).collect();
         gone.iter().for_each(|number| self.lose(*number, CallLoss::ClientGone));
         gone
     }
 
-    /// The service ended: nothing that is open will be answered.
+    /// Ends the service: no open call will be answered.
     pub fn withdraw(&mut self) {
         for number in self.open.keys().copied().collect::<Vec<_>>() {
             self.lose(number, CallLoss::Withdrawn);
@@ -354,7 +354,7 @@ impl<L: Copy> Caller<L> {
         std::mem::take(&mut self.lost)
     }
 
-    /// The calls that have been quiet for so long that it is to be asked what became of them.
+    /// Returns the calls that have been quiet for so long that the caller has to ask about them.
     pub fn ask_due(&mut self, now: Instant) -> Vec<u64> {
         if !self.granted || self.ask_at.is_none_or(|at| at > now) {
             return Vec::new();
@@ -369,12 +369,12 @@ impl<L: Copy> Caller<L> {
         due
     }
 
-    /// When to look for them.
+    /// Returns the time of the next [`Self::ask_due`].
     pub fn deadline(&self) -> Option<Instant> {
         self.ask_at.filter(|_| self.granted)
     }
 
-    /// What became of them.
+    /// Returns the counts.
     pub fn stats(&self) -> CallStats {
         CallStats { open: self.open.len() as u64, ..self.stats }
     }
@@ -389,72 +389,72 @@ impl<L: Copy> Caller<L> {
     }
 }
 
-/// A call that is remembered.
+/// State of a remembered call.
 #[derive(Debug)]
-enum Known<L> {
-    /// It is on its way to the local server.
+enum CallState<L> {
+    /// The request is on its way to the local server.
     Asking,
     /// The local server was asked under this id.
     Asked(L),
     Answered(Bytes),
-    /// Nothing more is known of it than that it was carried out, or may have been, and why its answer is not here.
+    /// The call was or may have been carried out, and its answer is not here for this reason.
     Over(CallLoss),
 }
 
-impl<L> Known<L> {
+impl<L> CallState<L> {
     fn is_open(&self) -> bool {
         matches!(self, Self::Asking | Self::Asked(_))
     }
 }
 
-/// What is to be done with what came of a call.
+/// Action of the answerer's driver.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Answering {
     /// Nothing.
     Nothing,
-    /// Ask the local server, then say so by [`Answerer::asked`] or [`Answerer::not_asked`].
+    /// Ask the local server, then call [`Answerer::asked`] or [`Answerer::not_asked`].
     Ask,
-    /// Tell who asked.
+    /// Tell the caller.
     Tell(MessageKind, Bytes),
 }
 
 #[derive(Debug)]
-struct Remembered<L> {
-    calls: BTreeMap<u64, Known<L>>,
-    /// What is lower and not in `calls` is over.
+struct SourceCalls<L> {
+    calls: BTreeMap<u64, CallState<L>>,
+    /// Lower numbers that are not in `calls` are over.
     from: u64,
     /// Larger is later.
     heard: u64,
 }
 
-/// A call that local servers were asked.
+/// A call that was given to local servers.
 #[derive(Debug)]
-struct Asked<S> {
+struct ForwardedCall<S> {
     source: SourceId,
     number: u64,
-    /// Those of them that are still there; one set for all calls that have the same.
+    /// Servers that are still there; calls with the same servers share one set.
     servers: Arc<BTreeSet<S>>,
 }
 
-/// The calls that others make of one local service.
+/// The calls of others to one local service.
 #[derive(Debug)]
 pub struct Answerer<L, S> {
     limits: CallLimits,
-    sources: BTreeMap<SourceId, Remembered<L>>,
-    local: BTreeMap<L, Asked<S>>,
-    /// The servers that were asked last.
+    sources: BTreeMap<SourceId, SourceCalls<L>>,
+    local: BTreeMap<L, ForwardedCall<S>>,
+    /// The servers of the last call.
     servers: Arc<BTreeSet<S>>,
-    /// Answers, oldest first, some of which are here no more.
+    /// Answers, oldest first; some are forgotten already.
     answers: VecDeque<(SourceId, u64)>,
     answer_bytes: usize,
     heard: u64,
     stats: CallStats,
-    /// Those that the driver has not taken yet.
+    /// Lost calls that the driver has not taken yet.
     lost: Vec<LostCall<SourceId>>,
 }
 
 impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
-    /// No calls yet.
+    /// Returns an answerer without calls.
     pub fn new(limits: CallLimits) -> Self {
         Self {
             limits,
@@ -469,11 +469,11 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
         }
     }
 
-    /// Takes what a source says of a call of its own.
+    /// Takes a source's message about a call of its own.
     pub fn handle(&mut self, source: SourceId, kind: MessageKind, number: u64) -> Answering {
         match kind {
             MessageKind::Request => self.request(source, number),
-            MessageKind::Ask => self.what_became(source, number),
+            MessageKind::Ask => self.answer_question(source, number),
             MessageKind::Forget => {
                 self.forget(source, number);
                 Answering::Nothing
@@ -482,32 +482,35 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
         }
     }
 
-    /// These local servers were asked under this id. An answer that came before is given to [`Self::answered`] after this.
+    /// Notes that these local servers got the call under this id. An earlier answer goes to [`Self::answered`] after
+    /// this.
     pub fn asked(&mut self, source: SourceId, number: u64, local: L, servers: BTreeSet<S>) {
-        if let Some(known) = self.known(&source, number).filter(|known| matches!(known, Known::Asking)) {
-            *known = Known::Asked(local);
+        if let Some(known) = self.known(&source, number).filter(|known| matches!(known, CallState::Asking)) {
+            *known = CallState::Asked(local);
             if *self.servers != servers {
                 self.servers = Arc::new(servers);
             }
-            self.local.insert(local, Asked { source, number, servers: self.servers.clone() });
+            self.local.insert(local, ForwardedCall { source, number, servers: self.servers.clone() });
         }
     }
 
-    /// The local server could not be asked: who called may ask again.
+    /// Notes that the local server could not be asked: the caller may ask again.
     pub fn not_asked(&mut self, source: SourceId, number: u64) {
         let remembered = self.sources.get_mut(&source);
-        if let Some(remembered) = remembered.filter(|r| matches!(r.calls.get(&number), Some(Known::Asking))) {
+        if let Some(remembered) =
+            remembered.filter(|r| matches!(r.calls.get(&number), Some(CallState::Asking)))
+        {
             remembered.calls.remove(&number);
             self.stats.calls -= 1;
         }
     }
 
-    /// The local server answered: whom to tell, and of which call.
+    /// Takes the local server's answer. Returns the caller's source and the call's number.
     pub fn answered(&mut self, local: &L, payload: &Bytes) -> Option<(SourceId, u64)> {
-        let Asked { source, number, .. } = self.local.remove(local)?;
+        let ForwardedCall { source, number, .. } = self.local.remove(local)?;
         self.stats.answered += 1;
         if let Some(known) = self.known(&source, number) {
-            *known = Known::Answered(payload.clone());
+            *known = CallState::Answered(payload.clone());
             self.answers.push_back((source, number));
             self.answer_bytes += payload.len();
         }
@@ -520,8 +523,8 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
         Some((source, number))
     }
 
-    /// A local server is gone: a call that was asked of no other will not be answered. Returns whom to tell, and of which
-    /// calls, with the payload.
+    /// Notes that a local server is gone: calls that only it got will not be answered. Returns the sources and numbers
+    /// to tell, with the payload.
     pub fn server_gone(&mut self, server: &S) -> Vec<(SourceId, u64, Bytes)> {
         let mut last: Option<[Arc<BTreeSet<S>>; 2]> = None;
         for asked in self.local.values_mut().filter(|asked| asked.servers.contains(server)) {
@@ -534,26 +537,26 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
         self.lose_unanswerable()
     }
 
-    /// Gives up calls of which no server is there that was asked. Returns what [`Self::server_gone`] does.
+    /// Gives up calls without a remaining server. Returns the same as [`Self::server_gone`].
     pub fn lose_unanswerable(&mut self) -> Vec<(SourceId, u64, Bytes)> {
         self.lose_asked(CallLoss::ServerGone, |asked| asked.servers.is_empty())
     }
 
-    /// All local servers are gone: nothing that was asked of them will be answered.
+    /// Notes that all local servers are gone: their calls will not be answered.
     pub fn servers_gone(&mut self) -> Vec<(SourceId, u64, Bytes)> {
         self.lose_asked(CallLoss::ServerGone, |_| true)
     }
 
-    /// The service ended: nothing that was asked will be answered.
+    /// Ends the service: no call will be answered.
     pub fn withdraw(&mut self) {
         self.lose_asked(CallLoss::Withdrawn, |_| true);
     }
 
-    /// The answer of a call is larger than any message. Returns the payload of the `gone` to tell.
+    /// Gives up a call whose answer is larger than any message. Returns the payload of its `gone` message.
     pub fn too_large(&mut self, source: SourceId, number: u64) -> Bytes {
         self.drop_answer(&source, number);
         if let Some(known) = self.known(&source, number) {
-            *known = Known::Over(CallLoss::TooLarge);
+            *known = CallState::Over(CallLoss::TooLarge);
             self.stats.answered -= 1;
             self.lost.push(LostCall { loss: CallLoss::TooLarge, of: source });
         }
@@ -568,25 +571,25 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
     fn lose_asked(
         &mut self,
         loss: CallLoss,
-        is_lost: impl Fn(&Asked<S>) -> bool,
+        is_lost: impl Fn(&ForwardedCall<S>) -> bool,
     ) -> Vec<(SourceId, u64, Bytes)> {
         let lost: Vec<_> = self.local.iter().filter(|(_, asked)| is_lost(asked)).map(|(id, _)| *id).collect();
         let lost: Vec<_> = lost.iter().filter_map(|id| self.local.remove(id)).collect();
         for asked in &lost {
             self.lost.push(LostCall { loss, of: asked.source });
             if let Some(known) = self.known(&asked.source, asked.number) {
-                *known = Known::Over(loss);
+                *known = CallState::Over(loss);
             }
         }
         lost.into_iter().map(|asked| (asked.source, asked.number, loss.payload())).collect()
     }
 
-    /// What became of them.
+    /// Returns the counts.
     pub fn stats(&self) -> CallStats {
         CallStats { open: self.open() as u64, ..self.stats }
     }
 
-    /// Calls that the local server was asked and has not answered.
+    /// Returns the number of calls that the local server has not answered.
     pub fn open(&self) -> usize {
         self.local.len()
     }
@@ -595,13 +598,15 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
         let max = self.limits.remembered_per_source_max;
         self.make_room(&source);
         self.heard += 1;
-        let remembered = Remembered { calls: BTreeMap::new(), from: 0, heard: 0 };
+        let remembered = SourceCalls { calls: BTreeMap::new(), from: 0, heard: 0 };
         let remembered = self.sources.entry(source).or_insert(remembered);
         remembered.heard = self.heard;
         match remembered.calls.get(&number) {
-            Some(Known::Asking | Known::Asked(_)) => return Answering::Nothing,
-            Some(Known::Answered(payload)) => return Answering::Tell(MessageKind::Reply, payload.clone()),
-            Some(Known::Over(why)) => return gone(*why),
+            Some(CallState::Asking | CallState::Asked(_)) => return Answering::Nothing,
+            Some(CallState::Answered(payload)) => {
+                return Answering::Tell(MessageKind::Reply, payload.clone());
+            }
+            Some(CallState::Over(why)) => return gone(*why),
             None if number < remembered.from => return gone(CallLoss::Forgotten),
             None => {}
         }
@@ -617,61 +622,60 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
             }
         }
         if let Some(remembered) = self.sources.get_mut(&source) {
-            remembered.calls.insert(number, Known::Asking);
+            remembered.calls.insert(number, CallState::Asking);
         }
         self.stats.calls += 1;
         Answering::Ask
     }
 
-    fn what_became(&self, source: SourceId, number: u64) -> Answering {
+    fn answer_question(&self, source: SourceId, number: u64) -> Answering {
         let remembered = self.sources.get(&source);
         match remembered.and_then(|r| r.calls.get(&number)) {
-            Some(Known::Asking | Known::Asked(_)) => Answering::Nothing,
-            Some(Known::Answered(payload)) => Answering::Tell(MessageKind::Reply, payload.clone()),
-            Some(Known::Over(why)) => gone(*why),
+            Some(CallState::Asking | CallState::Asked(_)) => Answering::Nothing,
+            Some(CallState::Answered(payload)) => Answering::Tell(MessageKind::Reply, payload.clone()),
+            Some(CallState::Over(why)) => gone(*why),
             None if remembered.is_some_and(|r| number < r.from) => gone(CallLoss::Forgotten),
             None => Answering::Tell(MessageKind::Unknown, Bytes::new()),
         }
     }
 
-    /// That it was there stays: it may be on another way here once more.
+    /// Forgets the answer, but not the call: a copy of it may still be on the way.
     fn forget(&mut self, source: SourceId, number: u64) {
         self.drop_answer(&source, number);
         let Some(known) = self.known(&source, number) else { return };
         if !known.is_open() {
             return;
         }
-        if let Known::Asked(local) = std::mem::replace(known, Known::Over(CallLoss::ClientGone)) {
+        if let CallState::Asked(local) = std::mem::replace(known, CallState::Over(CallLoss::ClientGone)) {
             self.local.remove(&local);
         }
         self.lost.push(LostCall { loss: CallLoss::ClientGone, of: source });
     }
 
-    fn known(&mut self, source: &SourceId, number: u64) -> Option<&mut Known<L>> {
+    fn known(&mut self, source: &SourceId, number: u64) -> Option<&mut CallState<L>> {
         self.sources.get_mut(source)?.calls.get_mut(&number)
     }
 
     fn drop_answer(&mut self, source: &SourceId, number: u64) {
         if let Some(known) = self.known(source, number)
-            && let Known::Answered(payload) = known
+            && let CallState::Answered(payload) = known
         {
             let bytes = payload.len();
-            *known = Known::Over(CallLoss::Forgotten);
+            *known = CallState::Over(CallLoss::Forgotten);
             self.answer_bytes -= bytes;
         }
-        // What is not there any more must not gather.
+        // Forgotten answers must not accumulate.
         if self.answers.len() > 2 * self.limits.remembered_per_source_max {
             let sources = &self.sources;
             let is_there = |(source, number): &(SourceId, u64)| {
                 let known = sources.get(source).and_then(|r| r.calls.get(number));
-                matches!(known, Some(Known::Answered(_)))
+                matches!(known, Some(CallState::Answered(_)))
             };
             self.answers.retain(is_there);
         }
     }
 
-    /// Makes room for one more source, if this one is new: of those that wait for nothing the one that was heard of
-    /// least lately goes.
+    /// Makes room for a new source: of those without open calls the one that was silent for longest goes.
     fn make_room(&mut self, source: &SourceId) {
         if self.sources.contains_key(source) || self.sources.len() < self.limits.sources_max {
             return;
@@ -685,7 +689,7 @@ impl<L: Copy + Ord, S: Clone + Ord> Answerer<L, S> {
     }
 }
 
-/// The answer to who asks for a call that will not be answered.
+/// Returns the message for a call that will not be answered.
 fn gone(why: CallLoss) -> Answering {
     Answering::Tell(MessageKind::Gone, why.payload())
 }
@@ -721,7 +725,7 @@ mod tests {
         Answerer::new(CallLimits::default())
     }
 
-    /// The only server.
+    /// Returns the only server.
     fn one() -> BTreeSet<u8> {
         BTreeSet::from([0])
     }
@@ -737,7 +741,7 @@ mod tests {
         assert_eq!(caller.handle(MessageKind::Reply, 2, b""), Outcome::Nothing);
         caller.lost();
         assert_eq!(caller.granted(now, false), [(1, payload("a"))]);
-        // Another run of the owner remembers nothing: what may have been carried out is not asked again.
+        // Another run of the owner remembers nothing: a call that may have been carried out is not sent again.
         caller.lost();
         assert_eq!(caller.call(now, [1; 16], 12, payload("c")), Ok(None));
         assert_eq!(caller.granted(now, true), [(3, payload("c"))]);
@@ -752,12 +756,12 @@ mod tests {
         for n in 0..2 {
             caller.call(now, [1; 16], n, payload("x")).unwrap();
         }
-        assert_eq!(caller.call(now, [1; 16], 2, payload("x")), Err(CallRefused::Client { max: 2 }));
+        assert_eq!(caller.call(now, [1; 16], 2, payload("x")), Err(CallRefusal::Client { max: 2 }));
         caller.call(now, [2; 16], 3, payload("x")).unwrap();
-        assert_eq!(caller.call(now, [2; 16], 4, payload("x")), Err(CallRefused::Calls { max: 3 }));
+        assert_eq!(caller.call(now, [2; 16], 4, payload("x")), Err(CallRefusal::Calls { max: 3 }));
         assert_eq!(caller.client_gone(|local| *local == 0), [1]);
         let large = Bytes::from(vec![0; CallLimits::default().open_bytes_max]);
-        assert!(matches!(caller.call(now, [3; 16], 5, large), Err(CallRefused::Bytes { .. })));
+        assert!(matches!(caller.call(now, [3; 16], 5, large), Err(CallRefusal::Bytes { .. })));
         assert_eq!(caller.stats(), CallStats { calls: 3, open: 2, answered: 0 });
         let [refused, gone] = [CallLoss::Refused, CallLoss::ClientGone];
         let all = [(refused, 2), (refused, 4), (gone, 0), (refused, 5)].map(|(loss, of)| lost(loss, of));
@@ -786,7 +790,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_asked_twice_is_carried_out_once() {
+    fn a_call_asked_twice_is_carried_out_once() {
         let mut answerer = answerer();
         let request = MessageKind::Request;
         assert_eq!(answerer.handle(A, request, 1), Answering::Ask);
@@ -811,7 +815,7 @@ mod tests {
     }
 
     #[test]
-    fn what_never_reached_a_server_may_be_asked_again_and_what_died_with_it_may_not() {
+    fn a_call_may_be_asked_again_only_if_no_server_got_it() {
         let mut answerer = answerer();
         assert_eq!(answerer.handle(A, MessageKind::Request, 1), Answering::Ask);
         answerer.not_asked(A, 1);

@@ -1,28 +1,28 @@
-//! Payloads made shorter before they are sealed, and brought back behind the seal.
+//! Compression of payloads before sealing, and decompression after opening.
 //!
-//! Both ends keep what their algorithm needs from message to message. Who decides what is compressed, and counts, is the
-//! driver. A payload that does not shrink goes as it is, so that each message says how it is written.
+//! Both ends keep their algorithm's memory from message to message. The driver decides which payloads to compress, and
+//! counts. A payload that does not shrink is sent unchanged, so each message names its encoding.
 
 use bytes::{BufMut, Bytes, BytesMut};
 use lz4_flex::block::CompressTable;
 use sgc_wire::{MESSAGE_BYTES_MAX, PayloadEncoding};
 
-/// Payloads that are shorter are not tried: there is little to gain.
+/// Shorter payloads are not tried: there is little to gain.
 pub const COMPRESS_BYTES_MIN: usize = 256;
-/// The level of Zstandard: the fastest of its regular ones, since a message waits while it is compressed.
+/// The level of Zstandard: the fastest of its regular ones, because a message waits for its compression.
 const ZSTD_LEVEL: i32 = 1;
-/// The length before what is compressed.
+/// Bytes of the length before compressed data.
 const LENGTH_BYTES: usize = 4;
-/// No byte of LZ4 stands for more.
+/// Most bytes that one byte of LZ4 stands for.
 const LZ4_RATIO_MAX: usize = 255;
 
-/// Why a payload was not brought back.
+/// The reason why a payload was not decompressed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CompressionError {
-    /// It claims to be longer than any message.
+    /// The payload claims to be longer than any message.
     #[error("a compressed payload that claims {0} bytes")]
     TooLong(u32),
-    /// It is none, or of another length than it claims.
+    /// Malformed data, or another length than claimed.
     #[error("a compressed payload that is malformed, or not of the length that it claims")]
     Malformed,
     /// The algorithm has no memory.
@@ -30,7 +30,7 @@ pub enum CompressionError {
     Memory,
 }
 
-/// Makes payloads shorter.
+/// Compresses payloads.
 #[derive(Default)]
 pub struct Compressor {
     zstd: Option<zstd::bulk::Compressor<'static>>,
@@ -39,7 +39,8 @@ pub struct Compressor {
 }
 
 impl Compressor {
-    /// The payload in this encoding, if that is shorter by more than an eighth: less is not worth the other end's time.
+    /// Returns the payload in this encoding, if that is shorter by more than an eighth: less is not worth the other
+    /// end's time.
     pub fn compress(&mut self, encoding: PayloadEncoding, payload: &[u8]) -> Option<Bytes> {
         if !(COMPRESS_BYTES_MIN..=MESSAGE_BYTES_MAX as usize).contains(&payload.len()) {
             return None;
@@ -53,7 +54,7 @@ impl Compressor {
                 }
                 self.scratch.clear();
                 self.scratch.reserve_exact(most);
-                // What does not fit into its room is an error, and does not shrink.
+                // Output that does not fit its room is an error: the payload does not shrink.
                 let bytes = self.zstd.as_mut()?.compress_to_buffer(payload, &mut self.scratch).ok()?;
                 Some(bytes).filter(|bytes| *bytes <= most)?
             }
@@ -72,14 +73,14 @@ impl Compressor {
     }
 }
 
-/// Brings payloads back.
+/// Decompresses payloads.
 #[derive(Default)]
 pub struct Decompressor {
     zstd: Option<zstd::bulk::Decompressor<'static>>,
 }
 
 impl Decompressor {
-    /// The payload as it was. It takes the memory that it claims and no more, which is at most that of a message.
+    /// Returns the original payload. It takes the claimed memory and no more, which is at most that of a message.
     pub fn decompress(
         &mut self,
         encoding: PayloadEncoding,
@@ -136,7 +137,7 @@ mod tests {
             .collect()
     }
 
-    /// Nothing that shrinks.
+    /// Returns bytes that do not shrink.
     fn noise(bytes: usize) -> Vec<u8> {
         let mut state = 1u64;
         let step = || {
@@ -147,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn what_shrinks_comes_back_and_what_does_not_goes_as_it_is() {
+    fn compressible_payloads_round_trip_and_others_go_unchanged() {
         for encoding in BOTH {
             let (mut compressor, mut decompressor) = (Compressor::default(), Decompressor::default());
             for bytes in [1 << 20, 256, 300, 70_000, 5 << 20, 257] {
@@ -179,7 +180,7 @@ mod tests {
                 Decompressor::default().decompress(encoding, claim.into())
             };
             assert_eq!(claims(1 << 20), Ok(payload.into()));
-            // A bomb: more than it says, or more than there may be.
+            // A bomb: more than it claims, or more than the limit.
             for length in [0, 1, 1000, (1 << 20) - 1, (1 << 20) + 1, MESSAGE_BYTES_MAX] {
                 assert_eq!(claims(length), Err(CompressionError::Malformed), "{encoding:?} {length}");
             }
@@ -202,7 +203,7 @@ mod tests {
             for at in 0..packed.len() {
                 let mut bent = packed.to_vec();
                 bent[at] ^= 0x55;
-                // Whatever it comes to, it is no longer than what it claims.
+                // Any result is no longer than the claim.
                 let _ = decompressor.decompress(encoding, bent.into());
                 let good = decompressor.decompress(encoding, packed.clone());
                 assert_eq!(good, Ok(payload.clone().into()), "{encoding:?} {at}");

@@ -1,7 +1,9 @@
-//! Consumers over the wire: a node tells the owners of what it uses which ROS 2 subscribers, publishers and service clients it has of that.
+//! Consumers over the wire: a node tells owners which ROS 2 subscribers, publishers and service clients use their
+//! interfaces.
 //!
-//! A node is asked at a name of its own by owners that granted it something. The answer is sealed to the owner, holds what uses
-//! interfaces of that owner alone, and is given again whenever that changes. Which of it is shown is for the owner's driver.
+//! Owners ask a node at a name of its own if they granted it something. The answer is sealed to the owner, holds only
+//! consumers of that owner's interfaces, and is repeated after each change. The owner's driver decides which consumers
+//! to show.
 
 use std::collections::BTreeMap;
 
@@ -12,7 +14,7 @@ use sgc_wire::{
 
 use crate::Endpoint;
 use crate::endpoint::Event;
-use crate::joins::{LostReason, Wish};
+use crate::joins::{JoinKind, LostReason};
 use crate::owner::{OLDER_REQUEST, is_older, place};
 use crate::shares::GrantedSink;
 
@@ -24,17 +26,17 @@ pub(crate) struct ConsumerAsker {
     told: Option<Vec<Consumer>>,
 }
 
-/// Name at which `node` is asked for its consumers.
+/// Returns the name at which `node` is asked for its consumers.
 pub(crate) fn consumers_name(node: &NodeId) -> (Name, Blind) {
     let blind = consumers_blind(node);
     (name_of(node, &blind), blind)
 }
 
-/// As one who uses what others own.
+/// The user's part.
 impl Endpoint {
-    /// Sets the consumers of this node, by the owner of what they use; each owner is told its own when it asks and when they
-    /// change. Those beyond [`CONSUMERS_MAX`] of an owner are left out. The name to ask at is advertised from the first
-    /// consumer on.
+    /// Sets the consumers of this node, by the owner of the used interface; each owner gets its own when it asks and
+    /// when they change. Those beyond [`CONSUMERS_MAX`] of an owner are left out. The name of the question is
+    /// advertised from the first consumer on.
     pub fn set_consumers(&mut self, now: Now, mut consumers: BTreeMap<NodeId, Vec<Consumer>>) {
         self.now = now;
         consumers.values_mut().for_each(|all| all.truncate(CONSUMERS_MAX));
@@ -81,7 +83,7 @@ impl Endpoint {
         self.tell_consumers(sink);
     }
 
-    /// Tells an owner its consumers here if they are others than it was told.
+    /// Tells an owner its consumers here if they differ from the last answer.
     fn tell_consumers(&mut self, sink: SinkId) {
         let (Some(asked), Some(consumers)) = (self.consumer_askers.get_mut(&sink), &self.consumers) else {
             return;
@@ -125,16 +127,16 @@ impl Endpoint {
     }
 }
 
-/// As an owner.
+/// The owner's part.
 impl Endpoint {
-    /// Asks a node for its consumers of what this one owns, until [`Self::leave_consumers`]. A node that tells none, or is of
-    /// a version that cannot, does not advertise the name that it is asked at: then nothing happens.
+    /// Asks a node for its consumers of this node's interfaces, until [`Self::leave_consumers`]. A node that reports
+    /// none, or of a version that cannot, does not advertise the name of the question: then nothing happens.
     pub fn ask_consumers(&mut self, now: Now, peer: NodeId) {
         let (name, _) = consumers_name(&peer);
-        self.join(now, name, peer, Wish::Consumers);
+        self.join(now, name, peer, JoinKind::Consumers);
     }
 
-    /// Asks a node no longer.
+    /// Stops asking a node.
     pub fn leave_consumers(&mut self, now: Now, peer: &NodeId) {
         let (name, _) = consumers_name(peer);
         self.leave(now, &name);

@@ -1,7 +1,6 @@
-//! The machine: what the user wishes, what its router says, and the time, in; frames and events out.
+//! The endpoint's state machine: the user's requests, the router's frames, and the time, in; frames and events out.
 //!
-//! What it does as the owner of names is in `owner.rs`, what it does as one who joins others' names in
-//! `joiner.rs`.
+//! `owner.rs` has its part as the owner of names, `joiner.rs` its part as the joiner of others' names.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -22,9 +21,9 @@ use crate::advert_pace::AdvertPace;
 use crate::consumers::{ConsumerAsker, consumers_name};
 use crate::joins::{Join, JoinState, JoinStatus, LostReason, RefusedBy};
 use crate::shares::{GrantedSink, Shares};
-use crate::types::{TypeAsker, types_name};
+use crate::type_exchange::{TypeAsker, types_name};
 
-/// How often it is looked for certificates that have ended, which happens without anything else.
+/// Interval of looking for expired certificates, which no other event reports.
 const ENFORCE_EVERY: Duration = Duration::from_secs(20);
 
 /// Advertisements and withdrawals after which all names are advertised together again: routers keep 512 of an owner
@@ -34,17 +33,17 @@ const ADVERTS_APART_MAX: usize = 64;
 /// Bounds and timers of an endpoint.
 #[derive(Clone, Debug)]
 pub struct Limits {
-    /// Interfaces shared.
+    /// Shared interfaces.
     pub shares_max: usize,
     /// Sinks granted per name.
     pub sinks_per_name_max: usize,
     /// Sinks of one node granted per name.
     pub sinks_per_peer_max: usize,
-    /// How long an advertisement holds without being renewed; it is renewed after a third of it.
+    /// Lifetime of an advertisement; it is renewed after a third of it.
     pub lease: Duration,
-    /// How long an epoch lasts if nothing ends it earlier.
+    /// Lifetime of an epoch if nothing ends it earlier.
     pub rotate_every: Duration,
-    /// How long a new epoch waits for those who have not said that they have its key.
+    /// Time that a new epoch waits for sinks that have not acknowledged its key.
     pub rotate_wait: Duration,
 }
 
@@ -61,33 +60,33 @@ impl Default for Limits {
     }
 }
 
-/// What an endpoint is made of.
+/// Parameters of an endpoint.
 #[derive(Clone, Debug)]
 pub struct EndpointConfig {
-    /// Who this node is.
+    /// This node's identity.
     pub identity: Arc<Identity>,
-    /// True if this node gives members their certificates.
+    /// Whether this node gives members their certificates.
     pub authority: bool,
-    /// True if this authority carries operations out for operators.
+    /// Whether this authority carries out operations for operators.
     pub operations: bool,
     /// Bounds and timers.
     pub limits: Limits,
 }
 
-/// What the driver has to do.
+/// Work for the driver.
 #[derive(Clone, Debug)]
 pub enum Output {
     /// Hand a frame to this node's router.
     Send(Control),
-    /// Something happened that concerns the user of this endpoint.
+    /// An event for the user of this endpoint.
     Event(Event),
-    /// Something was refused; count it and, where it matters, say it.
-    Dropped(Dropped),
-    /// Nothing more to do until then, or until something happens.
+    /// A frame or body was dropped: count it and, where it matters, log it.
+    Dropped(EndpointDrop),
+    /// Nothing more to do until this time, or until something happens.
     Timeout(Option<Instant>),
 }
 
-/// What happened.
+/// An event.
 #[derive(Clone, Debug)]
 pub enum Event {
     /// A sink of a share was granted.
@@ -96,7 +95,7 @@ pub enum Event {
         name: Name,
         /// The sink.
         sink: SinkId,
-        /// Whose it is.
+        /// The sink's node.
         peer: NodeId,
         /// Whether it receives or publishes.
         role: Role,
@@ -107,7 +106,7 @@ pub enum Event {
         name: Name,
         /// The sink.
         sink: SinkId,
-        /// Whose it was.
+        /// The sink's node.
         peer: NodeId,
     },
     /// A sink of a share lost its right; a new epoch begins for the others.
@@ -116,9 +115,9 @@ pub enum Event {
         name: Name,
         /// The sink.
         sink: SinkId,
-        /// Whose it was.
+        /// The sink's node.
         peer: NodeId,
-        /// Why.
+        /// The reason.
         reason: RefuseReason,
     },
     /// An epoch of a share begins: its sources publish under this key from now on.
@@ -128,18 +127,18 @@ pub enum Event {
         /// The new key.
         grant: TopicGrant,
     },
-    /// What this node's own sink of a share that others publish on has to know.
+    /// Key and sources for this node's own sink of a share that others publish on.
     OwnGrant {
         /// The share.
         name: Name,
         /// Key and sources.
         grant: TopicGrant,
     },
-    /// A member asks this authority for a certificate; to be answered with [`Endpoint::answer_renewal`].
+    /// A member asks this authority for a certificate; [`Endpoint::answer_renewal`] answers.
     RenewAsked {
-        /// Whom to answer.
+        /// The sink to answer.
         sink: SinkId,
-        /// Who it is.
+        /// The member.
         peer: sgc_trust::VerifiedPeer,
         /// Signing request (PKCS #10), DER.
         csr: bytes::Bytes,
@@ -151,10 +150,10 @@ pub enum Event {
     },
     /// The authority does not give this node credentials.
     RenewRefused {
-        /// By whom and why.
+        /// The refusing node, with the reason.
         by: RefusedBy,
     },
-    /// A node of this fleet asks this authority for an operation; to be answered with [`Endpoint::answer_operation`].
+    /// A node of this fleet asks this authority for an operation; [`Endpoint::answer_operation`] answers.
     OperationAsked {
         /// The sink to answer.
         sink: SinkId,
@@ -165,16 +164,16 @@ pub enum Event {
     },
     /// An authority answered an operation.
     OperationAnswered {
-        /// The name that it was asked at.
+        /// The name of the request.
         name: Name,
         /// The answer.
         answer: OperationAnswer,
     },
-    /// An authority, or a router before it, refuses to be asked for operations.
+    /// An authority, or a router before it, refuses requests for operations.
     OperationDenied {
-        /// The name that it was asked at.
+        /// The name of the request.
         name: Name,
-        /// By whom and why.
+        /// The refusing node, with the reason.
         by: RefusedBy,
     },
     /// A member asked to follow what this node shares. The event repeats with each request of that member.
@@ -186,18 +185,18 @@ pub enum Event {
     SinkRefused {
         /// The share.
         name: Name,
-        /// Who asked.
+        /// The requester.
         peer: NodeId,
-        /// Why not.
+        /// The reason.
         reason: RefuseReason,
     },
     /// A granted sink asks one of this node's sources for messages.
     Recover(Recover),
-    /// A join was granted, or what was granted changed.
+    /// A join was granted, or its grant changed.
     Granted {
         /// The name.
         name: Name,
-        /// The sink that it was granted to; another one after the way to the owner changed.
+        /// The granted sink; another one after the route to the owner changed.
         sink: SinkId,
         /// Key and sources.
         grant: TopicGrant,
@@ -206,97 +205,97 @@ pub enum Event {
     Refused {
         /// The name.
         name: Name,
-        /// By whom and why.
+        /// The refusing node, with the reason.
         by: RefusedBy,
     },
     /// A granted join carries nothing until it is granted again.
     Lost {
         /// The name.
         name: Name,
-        /// Why.
+        /// The reason.
         reason: LostReason,
     },
-    /// What an owner says that types of its interfaces look like, of those that were asked for; not verified yet.
+    /// An owner's descriptions of requested types of its interfaces; not verified yet.
     Types {
         /// The owner.
         owner: NodeId,
         /// The types.
         types: Vec<DescribedType>,
     },
-    /// The consumers that a node has of what this one owns, whenever they change; not limited to interfaces that it was
-    /// granted.
+    /// A node's consumers of this node's interfaces, whenever they change; not limited to interfaces that were granted
+    /// to it.
     Consumers {
         /// The node.
         peer: NodeId,
         /// Its consumers.
         consumers: Vec<Consumer>,
     },
-    /// The consumers of a node are not told any more, until [`Event::Consumers`] tells them again.
+    /// A node does not report its consumers any more, until the next [`Event::Consumers`].
     ConsumersLost {
         /// The node.
         peer: NodeId,
-        /// Why.
+        /// The reason.
         reason: LostReason,
     },
     /// A followed owner's catalogue, whenever it changes.
     Catalogue {
         /// The owner.
         owner: NodeId,
-        /// What it shares with this node.
+        /// Its shares, as this node may see them.
         catalogue: Catalogue,
     },
-    /// A followed owner is out of reach; its catalogue stands until it says otherwise.
+    /// A followed owner is out of reach; its catalogue stands until the next one comes.
     OwnerLost {
         /// The owner.
         owner: NodeId,
-        /// Why.
+        /// The reason.
         reason: LostReason,
     },
     /// A followed owner does not answer with a catalogue.
     OwnerRefused {
         /// The owner.
         owner: NodeId,
-        /// By whom and why.
+        /// The refusing node, with the reason.
         by: RefusedBy,
     },
 }
 
-/// Why something was refused.
+/// The reason why a frame or body was dropped.
 #[derive(Clone, Debug, thiserror::Error)]
-pub enum Dropped {
+pub enum EndpointDrop {
     /// A signed body that does not verify.
     #[error("{what} not believed: {why}")]
     NotVerified {
         /// Advertisement, join or answer.
         what: &'static str,
-        /// What is wrong with it.
+        /// The error of the verification.
         why: SignedError,
     },
     /// A grant that does not open.
     #[error("grant not usable: {0}")]
     Grant(#[from] GrantError),
-    /// A frame that concerns nothing here.
-    #[error("{what} that concerns nothing here")]
+    /// A frame without a purpose here.
+    #[error("unexpected {what}")]
     Unexpected {
         /// Kind of frame.
         what: &'static str,
     },
-    /// A catalogue too large to be sent; the asker got as many entries as fit.
+    /// A catalogue too large to be sent; the requester got as many entries as fit.
     #[error("the catalogue for one node is too large: {left_out} entries left out")]
     CatalogueTooLarge {
-        /// How many entries it lacks.
+        /// Number of missing entries.
         left_out: usize,
     },
 }
 
-impl Dropped {
-    /// Returns `true` if an operator should hear of it. Answers cross with requests that are made anew, so a frame that concerns nothing
-    /// here is ordinary while nodes start.
+impl EndpointDrop {
+    /// Returns `true` if an operator should hear of it. Answers cross with repeated requests, so unexpected frames are
+    /// ordinary while nodes start.
     pub fn is_suspicious(&self) -> bool {
         !matches!(self, Self::Unexpected { .. })
     }
 
-    /// A short, stable name for counters.
+    /// Returns a short, stable name for counters.
     pub fn key(&self) -> &'static str {
         match self {
             Self::NotVerified { .. } => "endpoint_not_verified",
@@ -307,30 +306,30 @@ impl Dropped {
     }
 }
 
-/// The machine.
+/// The state machine.
 #[derive(Debug)]
 pub struct Endpoint {
     pub(crate) config: EndpointConfig,
     pub(crate) anchors: Arc<TrustAnchors>,
     pub(crate) rng: ChaCha20Rng,
-    /// One for each secret that names are derived from, the newest first.
+    /// One for each naming secret, the newest first.
     pub(crate) catalogue_names: Vec<(Name, Blind)>,
-    /// Where members ask this authority.
+    /// Name under which members ask this authority.
     pub(crate) renewal_name: Option<(Name, Blind)>,
     pub(crate) renewals: BTreeMap<SinkId, GrantedSink>,
     /// Name under which operators ask this authority.
     pub(crate) operations_name: Option<(Name, Blind)>,
     pub(crate) operations: BTreeMap<SinkId, GrantedSink>,
-    /// Where this owner is asked what its types look like.
+    /// Name under which this owner is asked for its types.
     pub(crate) types_name: (Name, Blind),
-    /// True once it describes any.
+    /// Set once it describes any type.
     pub(crate) describes: bool,
     pub(crate) questions: BTreeMap<SinkId, TypeAsker>,
-    /// Shares that were described, of which nobody who asked was told yet.
+    /// Described shares that were not yet reported to the requesters.
     pub(crate) untold: BTreeSet<Name>,
-    /// The name at which owners ask for this node's consumers.
+    /// Name under which owners ask for this node's consumers.
     pub(crate) consumers_name: (Name, Blind),
-    /// The consumers, by the owner of what they use; `None` until there is one.
+    /// The consumers, by the owner of the used interface; `None` until there is one.
     pub(crate) consumers: Option<BTreeMap<NodeId, Vec<Consumer>>>,
     pub(crate) consumer_askers: BTreeMap<SinkId, ConsumerAsker>,
     pub(crate) shares: Shares,
@@ -339,7 +338,7 @@ pub struct Endpoint {
     pub(crate) followed: BTreeMap<Name, NodeId>,
     pub(crate) followed_names: BTreeMap<NodeId, String>,
     pub(crate) catalogue_dirty: bool,
-    /// Until when what changes in the catalogue is gathered.
+    /// End of the time in which changes of the catalogue are collected.
     pub(crate) catalogue_rests: Option<Instant>,
     pub(crate) unadvertised: BTreeSet<Blind>,
     pub(crate) withdrawn: BTreeSet<Blind>,
@@ -348,7 +347,7 @@ pub struct Endpoint {
     /// Advertisements and withdrawals since all names were advertised together.
     adverts_apart: usize,
     pub(crate) renew_at: Option<Instant>,
-    /// When to look for certificates that have ended.
+    /// Time of the next look for expired certificates.
     pub(crate) enforce_at: Option<Instant>,
     pub(crate) outputs: VecDeque<Output>,
     clock: ClockWatch,
@@ -356,7 +355,7 @@ pub struct Endpoint {
 }
 
 impl Endpoint {
-    /// An endpoint that shares nothing yet. With a fleet secret it advertises its catalogue at once.
+    /// Returns an endpoint that shares nothing yet. With a fleet secret it advertises its catalogue at once.
     pub fn new(config: EndpointConfig, rng: ChaCha20Rng, now: Now) -> Self {
         let identity = &config.identity;
         let own = identity.node_id();
@@ -404,22 +403,22 @@ impl Endpoint {
         }
     }
 
-    /// A fresh random id for a source.
+    /// Returns a fresh random id for a source.
     pub fn new_source_id(&mut self) -> SourceId {
         let mut id = [0; 16];
         self.rng.fill_bytes(&mut id);
         SourceId(id)
     }
 
-    /// Other CAs, or certificates revoked: who lost their certificate lose what they were granted.
+    /// Takes other CAs or revocations: nodes whose certificates are no longer valid lose their grants.
     pub fn set_anchors(&mut self, now: Now, anchors: Arc<TrustAnchors>) {
         self.now = now;
         self.anchors = anchors;
         self.enforce();
     }
 
-    /// Another certificate of this node, or other secrets. Everything is advertised anew; what was granted is asked
-    /// for again under the new certificate while it goes on.
+    /// Takes another certificate of this node, or other secrets. Everything is advertised anew. Grants are requested
+    /// again under the new certificate, and serve meanwhile.
     pub fn set_identity(&mut self, now: Now, identity: Arc<Identity>) {
         self.now = now;
         let names = catalogue_names(&identity);
@@ -434,7 +433,7 @@ impl Endpoint {
         self.refresh_joins();
     }
 
-    /// A frame from this node's router.
+    /// Takes a frame from this node's router.
     pub fn handle_frame(&mut self, now: Now, frame: Control) {
         self.now = now;
         match frame {
@@ -458,7 +457,7 @@ impl Endpoint {
             Control::LinkState { .. } => self.unexpected("link state"),
             Control::Query { .. } => self.unexpected("query"),
             Control::Label { .. } | Control::LabelAck { .. } => self.unexpected("label"),
-            Control::Pulse { .. } => self.unexpected("pulse"),
+            Control::Probe { .. } => self.unexpected("probe"),
             Control::Clock { .. } => self.unexpected("clock"),
             Control::IdentityInUse { .. } => self.unexpected("identity"),
             Control::LaneOffer { .. } | Control::LaneAnswer { .. } | Control::LaneWanted { .. } => {
@@ -467,11 +466,11 @@ impl Endpoint {
         }
     }
 
-    /// Time passed.
+    /// Acts on timers that are due.
     pub fn handle_timeout(&mut self, now: Now) {
         self.now = now;
         if self.clock.was_set(now) {
-            // Messages that were signed by the old time may be refused, and so may requests.
+            // Advertisements and requests with the old time may be refused.
             self.advertise_all();
             self.joins.values_mut().for_each(|join| join.retry_refused_by_time(now.instant));
         }
@@ -487,7 +486,7 @@ impl Endpoint {
         self.ask_due();
     }
 
-    /// The next thing to do; call until it is [`Output::Timeout`].
+    /// Returns the next output; call until it is [`Output::Timeout`].
     pub fn poll_output(&mut self) -> Output {
         if self.outputs.is_empty() {
             self.advertise();
@@ -506,24 +505,24 @@ impl Endpoint {
         })
     }
 
-    /// The name of this node's catalogue; `None` for a router's identity, or after shutdown.
+    /// Returns the name of this node's catalogue; `None` for a router's identity, or after shutdown.
     pub fn catalogue_name(&self) -> Option<Name> {
         self.catalogue_names.first().map(|(name, _)| *name)
     }
 
-    /// Where a join stands.
+    /// Returns the status of a join.
     pub fn join_status(&self, name: &Name) -> Option<JoinStatus> {
         self.joins.get(name).map(Join::status)
     }
 
-    /// Where the following of an owner stands: the best of its catalogues.
+    /// Returns the status of following an owner: the best of its catalogues.
     pub fn follow_status(&self, owner: &NodeId) -> Option<JoinStatus> {
         let names = self.followed.iter().filter(|(_, o)| *o == owner);
         let all: Vec<_> = names.filter_map(|(name, _)| self.join_status(name)).collect();
         all.iter().find(|s| **s == JoinStatus::Granted).or(all.first()).copied()
     }
 
-    /// Who was granted a share.
+    /// Returns the sinks of a share, with their nodes.
     pub fn granted(&self, name: &Name) -> Vec<(SinkId, NodeId)> {
         self.shares.granted(name).collect()
     }
@@ -538,13 +537,13 @@ impl Endpoint {
         self.unadvertised.extend(fixed.chain(self.shares.shares.values().map(|s| s.blind)));
     }
 
-    /// When what is due of them may be sent, if that is later.
+    /// Returns the time at which due advertisements may be sent, if that is later.
     fn advert_deadline(&self) -> Option<Instant> {
         let is_due = !self.withdrawn.is_empty() || !self.unadvertised.is_empty();
         self.advert_pace.opens_at().filter(|_| is_due)
     }
 
-    /// Sends what is due of advertisements and withdrawals, as many names in one as fit, unless it is to be gathered.
+    /// Sends due advertisements and withdrawals, with as many names in one as fit, unless they are collected.
     fn advertise(&mut self) {
         if self.advert_deadline().is_some_and(|at| at > self.now.instant) {
             return;
@@ -579,7 +578,7 @@ impl Endpoint {
         }
     }
 
-    /// This node advertised with that number in an earlier run, and is not believed below it.
+    /// Skips to this number: an earlier run of this node used it, and routers ignore lower ones.
     pub(crate) fn overtake(&mut self, seq: u64) {
         if seq > self.advert_seq {
             self.advert_seq = seq;
@@ -587,12 +586,12 @@ impl Endpoint {
         }
     }
 
-    pub(crate) fn drop_frame(&mut self, why: Dropped) {
+    pub(crate) fn drop_frame(&mut self, why: EndpointDrop) {
         self.outputs.push_back(Output::Dropped(why));
     }
 
     pub(crate) fn unexpected(&mut self, what: &'static str) {
-        self.drop_frame(Dropped::Unexpected { what });
+        self.drop_frame(EndpointDrop::Unexpected { what });
     }
 
     pub(crate) fn event(&mut self, event: Event) {
@@ -608,7 +607,7 @@ impl Endpoint {
     }
 }
 
-/// Where `identity` publishes its catalogue: one name for each secret that it holds, the newest first.
+/// Returns the names of `identity`'s catalogue: one for each of its secrets, the newest first.
 fn catalogue_names(identity: &Identity) -> Vec<(Name, Blind)> {
     let metadata = Metadata::catalogue(identity.node_name().as_str());
     identity

@@ -1,4 +1,4 @@
-//! What a source keeps of what it published: for late joiners, and for who lost something on the way.
+//! Published messages that a source keeps for late joiners, and for sinks with losses.
 //!
 //! One queue of consecutive numbers serves both; each has its own end of it. Payloads are references.
 
@@ -7,26 +7,26 @@ use std::collections::VecDeque;
 use bytes::Bytes;
 use sgc_wire::{MessageHead, MessageKind};
 
-/// Messages that a reliable source keeps for who lost them.
+/// Messages that a reliable source keeps for recovery.
 pub const RECOVERY_MESSAGES_MAX: usize = 4096;
 /// Bytes of those; the newest message is kept whatever its size.
 pub const RECOVERY_BYTES_MAX: usize = 16 << 20;
 
-/// What a kept message counts beyond its payload, bytes.
+/// Size of a kept message beyond its payload, bytes.
 const KEPT_OVERHEAD_BYTES: usize = 64;
 
-/// How much a reliable source keeps for who lost it. By number and bytes alone: that bounds memory as it is, and a
-/// bound by age would take away what is asked for after a long interruption, when nobody else has it.
+/// Messages that a reliable source keeps for recovery. Bounds are number and bytes: they bound memory, and a bound by
+/// age would drop messages that are asked for after a long interruption, when nobody else has them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RecoveryLimits {
-    /// Messages, marks among them; 0 if what is lost stays lost.
+    /// Messages, marks among them; 0 if lost messages stay lost.
     pub messages_max: usize,
     /// Bytes.
     pub bytes_max: usize,
 }
 
 impl RecoveryLimits {
-    /// Nothing: nobody can ask for it.
+    /// Keeps nothing: nobody can ask for lost messages.
     pub const NONE: Self = Self { messages_max: 0, bytes_max: 0 };
 }
 
@@ -37,13 +37,13 @@ impl Default for RecoveryLimits {
 }
 
 /// A message as it was published.
-pub(crate) struct Kept {
+pub(crate) struct HistoryEntry {
     pub(crate) seq: u64,
     pub(crate) head: MessageHead,
     pub(crate) payload: Bytes,
 }
 
-impl Kept {
+impl HistoryEntry {
     pub(crate) fn is_mark(&self) -> bool {
         self.head.kind == MessageKind::Mark
     }
@@ -57,19 +57,19 @@ impl Kept {
 struct Tail {
     from: u64,
     numbers: usize,
-    /// Numbers that are no marks.
+    /// Messages that are no marks.
     messages: usize,
     bytes: usize,
 }
 
 impl Tail {
-    fn add(&mut self, kept: &Kept) {
+    fn add(&mut self, kept: &HistoryEntry) {
         self.numbers += 1;
         self.messages += usize::from(!kept.is_mark());
         self.bytes += kept.bytes();
     }
 
-    fn drop_first(&mut self, first: &Kept) {
+    fn drop_first(&mut self, first: &HistoryEntry) {
         self.from = first.seq + 1;
         self.numbers -= 1;
         self.messages -= usize::from(!first.is_mark());
@@ -82,22 +82,22 @@ pub(crate) struct History {
     bytes_max: usize,
     recovery: RecoveryLimits,
     /// Consecutive numbers, up to the last published.
-    kept: VecDeque<Kept>,
-    /// What late joiners get.
+    kept: VecDeque<HistoryEntry>,
+    /// Messages for late joiners.
     late: Tail,
-    /// What is there to be recovered.
+    /// Messages for recovery.
     recent: Tail,
 }
 
 impl History {
-    /// Keeps `depth` messages of at most `bytes_max` for late joiners.
+    /// Returns a history of `depth` messages of at most `bytes_max` for late joiners.
     pub(crate) fn new(depth: usize, bytes_max: usize, recovery: RecoveryLimits) -> Self {
         let tail = || Tail { from: 1, numbers: 0, messages: 0, bytes: 0 };
         Self { depth, bytes_max, recovery, kept: VecDeque::new(), late: tail(), recent: tail() }
     }
 
     /// Takes the next message.
-    pub(crate) fn push(&mut self, message: Kept) {
+    pub(crate) fn push(&mut self, message: HistoryEntry) {
         let next = message.seq + 1;
         self.late.add(&message);
         self.recent.add(&message);
@@ -122,7 +122,7 @@ impl History {
         self.drop_unused();
     }
 
-    /// Keeps so many messages for late joiners from here on, at least one if it kept any.
+    /// Sets the number of messages for late joiners, at least one if it kept any.
     pub(crate) fn set_depth(&mut self, depth: usize) {
         if self.depth > 0 {
             self.depth = depth.max(1);
@@ -133,7 +133,7 @@ impl History {
 
     fn trim_late(&mut self) {
         let front = self.front();
-        // Marks are small, and count for late joiners in nothing but bytes.
+        // Marks are small, and only their bytes count for late joiners.
         while self.depth > 0
             && (self.late.messages > self.depth || self.late.bytes > self.bytes_max)
             && let Some(first) = self.kept.get((self.late.from - front) as usize)
@@ -150,13 +150,13 @@ impl History {
         }
     }
 
-    /// The number that is kept longest; that of late joiners if none is.
+    /// Returns the oldest number to keep; that of late joiners if there is none.
     fn front(&self) -> u64 {
         self.kept.front().map_or(self.late.from, |m| m.seq)
     }
 
-    /// Lets go what was dated before `ns`, up to the first that was not: messages of one publisher are dated in turn. What has
-    /// no date stays, marks go too.
+    /// Drops messages dated before `ns`, up to the first later one: dates of one publisher rise. Messages without a
+    /// date stay; marks go too.
     pub(crate) fn expire(&mut self, ns: i64) {
         while let Some(first) = self.kept.front()
             && (first.is_mark() || (1..ns).contains(&first.head.source_timestamp_ns))
@@ -171,26 +171,26 @@ impl History {
         }
     }
 
-    /// Where the history for late joiners begins: the next number if there is none.
+    /// Returns the beginning of the history for late joiners: the next number if there is none.
     pub(crate) fn late_from(&self) -> u64 {
         self.late.from
     }
 
-    /// The oldest number that is here; the next one if there is none.
+    /// Returns the oldest number that is here; the next one if there is none.
     pub(crate) fn oldest(&self) -> u64 {
         self.late.from.min(self.recent.from)
     }
 
-    /// The number published last, if it is here.
-    pub(crate) fn newest(&self) -> Option<&Kept> {
+    /// Returns the message published last, if it is here.
+    pub(crate) fn newest(&self) -> Option<&HistoryEntry> {
         self.kept.back()
     }
 
-    pub(crate) fn newest_mut(&mut self) -> Option<&mut Kept> {
+    pub(crate) fn newest_mut(&mut self) -> Option<&mut HistoryEntry> {
         self.kept.back_mut()
     }
 
-    /// What is here of `from..=to`, as references that outlive a change.
+    /// Returns the kept messages of `from..=to`, as references that outlive a change.
     pub(crate) fn range(&self, from: u64, to: u64) -> Vec<(u64, MessageHead, Bytes)> {
         let begin = self.kept.partition_point(|m| m.seq < from);
         let asked = self.kept.iter().skip(begin).take_while(|m| m.seq <= to);
@@ -210,7 +210,7 @@ mod tests {
     fn push(history: &mut History, kind: MessageKind, bytes: usize) {
         let seq = history.newest().map_or(history.oldest(), |m| m.seq + 1);
         let head = MessageHead::new(kind, 0);
-        history.push(Kept { seq, head, payload: vec![0; bytes].into() });
+        history.push(HistoryEntry { seq, head, payload: vec![0; bytes].into() });
     }
 
     fn seqs(history: &History, from: u64) -> Vec<u64> {
@@ -234,7 +234,7 @@ mod tests {
         let mut history = history(100, 10_000, 2, 10_000);
         for n in 1..=9_i64 {
             let head = MessageHead::new(if n == 7 { MessageKind::Mark } else { MessageKind::Write }, n * 10);
-            history.push(Kept { seq: n as u64, head, payload: vec![0; 8].into() });
+            history.push(HistoryEntry { seq: n as u64, head, payload: vec![0; 8].into() });
         }
         history.set_depth(3);
         assert_eq!((history.late_from(), seqs(&history, 0)), (6, vec![6, 7, 8, 9]));
@@ -278,12 +278,12 @@ mod tests {
     }
 
     #[test]
-    fn what_has_expired_goes_and_what_came_after_it_stays() {
+    fn expired_messages_go_and_later_ones_stay() {
         let mut history = history(3, 10_000, 5, 10_000);
         for n in 1..=6_i64 {
             let kind = if n == 2 { MessageKind::Mark } else { MessageKind::Write };
             let head = MessageHead::new(kind, if n == 2 { 0 } else { n * 10 });
-            history.push(Kept { seq: n as u64, head, payload: vec![0; 8].into() });
+            history.push(HistoryEntry { seq: n as u64, head, payload: vec![0; 8].into() });
         }
         assert_eq!((history.late_from(), history.oldest()), (4, 2));
         history.expire(35);
@@ -293,7 +293,7 @@ mod tests {
         history.expire(i64::MAX);
         assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0).len()), (7, 7, 0));
         let head = MessageHead::new(MessageKind::Write, 70);
-        history.push(Kept { seq: 7, head, payload: vec![0; 8].into() });
+        history.push(HistoryEntry { seq: 7, head, payload: vec![0; 8].into() });
         assert_eq!((history.late_from(), history.oldest(), seqs(&history, 0)), (7, 7, vec![7]));
     }
 
@@ -301,7 +301,7 @@ mod tests {
     fn without_a_purpose_nothing_is_kept() {
         let mut history = history(0, 1000, 0, 0);
         for n in 1..4 {
-            history.push(Kept {
+            history.push(HistoryEntry {
                 seq: n,
                 head: MessageHead::new(MessageKind::Write, 0),
                 payload: Bytes::from_static(b"x"),

@@ -1,4 +1,5 @@
-//! As one who joins others' names: topics to receive or to publish on, catalogues, and the authority of the fleet.
+//! The part of the endpoint that joins others' names: topics to receive or to publish on, catalogues, and the
+//! authority.
 
 use std::sync::Arc;
 
@@ -10,14 +11,14 @@ use sgc_trust::{
 };
 use sgc_wire::{
     Answer, AnswerBody, Control, Decode, DescribedType, Encode as _, GrantContent, JoinBody, Metadata, Name,
-    NodeId, Now, OperationRequest, Recover, RefuseReason, RejectReason, Signed, SinkId, SourceId,
+    NodeId, Now, OperationRequest, Recover, RefuseReason, RejectReason, SignedBody, SinkId, SourceId,
 };
 
-use crate::endpoint::{Dropped, Endpoint, Event, Output};
-use crate::joins::{Join, JoinState, LostReason, RefusedBy, Rerouting, Wish};
+use crate::endpoint::{Endpoint, EndpointDrop, Event, Output};
+use crate::joins::{Join, JoinKind, JoinState, LostReason, RefusedBy, Rerouting};
 
 impl Endpoint {
-    /// Follows a fleet member's catalogue; false if this identity holds no fleet secret to find it with.
+    /// Follows a fleet member's catalogue. Returns `false` if this identity has no fleet secret to find it with.
     pub fn follow(&mut self, now: Now, owner_name: &str) -> bool {
         self.now = now;
         let Some(owner) = self.config.identity.node_id_of(owner_name) else { return false };
@@ -26,15 +27,15 @@ impl Endpoint {
         true
     }
 
-    /// Follows a catalogue no longer.
+    /// Stops following a catalogue.
     pub fn unfollow(&mut self, now: Now, owner: &NodeId) {
         self.now = now;
         self.followed_names.remove(owner);
         self.refollow();
     }
 
-    /// Follows the catalogues of all followed owners under all secrets in use, and no others: while a secret is
-    /// being replaced, some owners are found under the old one and some under the new.
+    /// Follows the catalogues of all followed owners under all secrets in use, and no others: during a change of the
+    /// secret, some owners are found under the old one and some under the new.
     pub(crate) fn refollow(&mut self) {
         let identity = self.config.identity.clone();
         let names = |(owner, owner_name): (&NodeId, &String)| {
@@ -51,36 +52,37 @@ impl Endpoint {
         }
         for (name, owner) in wanted {
             self.followed.insert(name, owner);
-            self.join(self.now, name, owner, Wish::Follow);
+            self.join(self.now, name, owner, JoinKind::Follow);
         }
     }
 
-    /// Asks the fleet's authority for credentials; asks anew if it did before. False if the identity names none.
+    /// Asks the fleet's authority for credentials, in place of an earlier request. Returns `false` if the identity
+    /// names no authority.
     pub fn renew(&mut self, now: Now, csr: Bytes) -> bool {
         let identity = &self.config.identity;
         let Some(authority) = identity.authority() else { return false };
         let name = name_of(&authority, &renewal_blind(&identity.as_peer().ca));
         self.leave(now, &name);
-        self.join(now, name, authority, Wish::Renew(csr));
+        self.join(now, name, authority, JoinKind::Renew(csr));
         true
     }
 
-    /// Asks `authority` for an operation on this fleet, in place of what it was asked before; returns the name that it is
-    /// asked at, which is to be left once [`Event::OperationAnswered`] or [`Event::OperationDenied`] came.
+    /// Asks `authority` for an operation on this fleet, in place of an earlier request. Returns the name of the
+    /// request, which the caller leaves after [`Event::OperationAnswered`] or [`Event::OperationDenied`].
     pub fn operate(&mut self, now: Now, authority: NodeId, request: &OperationRequest) -> Name {
         let name = name_of(&authority, &operations_blind(&self.config.identity.as_peer().ca));
         self.leave(now, &name);
-        self.join(now, name, authority, Wish::Operate(request.to_bytes()));
+        self.join(now, name, authority, JoinKind::Operate(request.to_bytes()));
         name
     }
 
-    /// Joins a name of `owner`; waits for it if need be, and joins again whenever it must.
-    pub fn join(&mut self, now: Now, name: Name, owner: NodeId, wish: Wish) {
+    /// Joins a name of `owner`: waits for it if necessary, and joins again whenever it has to.
+    pub fn join(&mut self, now: Now, name: Name, owner: NodeId, kind: JoinKind) {
         self.now = now;
         if self.joins.contains_key(&name) {
             return;
         }
-        self.joins.insert(name, Join::new(owner, wish));
+        self.joins.insert(name, Join::new(owner, kind));
         self.send(Control::Interest { names: vec![name] });
     }
 
@@ -95,7 +97,7 @@ impl Endpoint {
         self.send(Control::Uninterest { names: vec![*name] });
     }
 
-    /// The sink under which a name is granted to this node.
+    /// Returns the sink under which a name is granted to this node.
     pub fn sink_of(&self, name: &Name) -> Option<SinkId> {
         self.is_granted(name).then(|| self.joins.get(name)?.sink()).flatten()
     }
@@ -108,15 +110,15 @@ impl Endpoint {
         }
     }
 
-    /// Asks for everything granted once more, under the present certificate. Nothing is interrupted.
+    /// Asks for every grant once more, under the present certificate. Nothing is interrupted.
     pub(crate) fn refresh_joins(&mut self) {
         let identity = self.config.identity.clone();
         let frames: Vec<_> = self
             .joins
             .iter()
             .filter_map(|(name, join)| match &join.state {
-                JoinState::Granted { sink, reply_key, .. } if !join.wish.is_question() => {
-                    Some(self.join_frame(&identity, *name, *sink, &join.wish, reply_key.public().clone()))
+                JoinState::Granted { sink, reply_key, .. } if !join.kind.is_question() => {
+                    Some(self.join_frame(&identity, *name, *sink, &join.kind, reply_key.public().clone()))
                 }
                 _ => None,
             })
@@ -129,13 +131,13 @@ impl Endpoint {
         identity: &Arc<Identity>,
         name: Name,
         sink: SinkId,
-        wish: &Wish,
+        kind: &JoinKind,
         reply_key: Bytes,
     ) -> Control {
         let body = JoinBody {
             name,
             sink,
-            request: wish.request(),
+            request: kind.request(),
             issued_at: self.now.unix,
             chain: identity.chain_bytes(),
             reply_key,
@@ -167,13 +169,13 @@ impl Endpoint {
         }
     }
 
-    /// A router knows a better way than the one that this sink's data takes.
+    /// Handles a router's notice of a better route for this sink.
     pub(crate) fn handle_reroute(&mut self, name: Name, sink: SinkId) {
         let Some(join) = self.joins.get(&name).filter(|j| j.sink() == Some(sink)) else {
             return self.unexpected("reroute");
         };
         let asks = matches!((&join.state, &join.rerouting), (JoinState::Granted { .. }, Rerouting::No));
-        if asks && !join.wish.is_question() {
+        if asks && !join.kind.is_question() {
             self.ask_beside(name);
         }
     }
@@ -183,12 +185,12 @@ impl Endpoint {
         let Some(join) = self.joins.get_mut(&name) else { return };
         let reply_key = ReplyKey::generate(Kem::for_fleet(identity.post_quantum()));
         let (sink, reply_key) = join.ask_beside(self.now.instant, reply_key, &mut self.rng);
-        let wish = join.wish.clone();
-        let frame = self.join_frame(&identity, name, sink, &wish, reply_key);
+        let kind = join.kind.clone();
+        let frame = self.join_frame(&identity, name, sink, &kind, reply_key);
         self.send(frame);
     }
 
-    /// Gives up what was asked beside a grant.
+    /// Gives up the request beside a grant.
     fn leave_beside(&mut self, name: &Name) {
         let Some(join) = self.joins.get_mut(name) else { return };
         let sink = join.rerouted_sink();
@@ -198,7 +200,7 @@ impl Endpoint {
         }
     }
 
-    /// What was asked beside a grant takes the place of that grant, which is gone; true if there was something.
+    /// Replaces a lost grant by the request beside it. Returns `true` if there was one.
     fn fall_back(&mut self, name: &Name) -> bool {
         let Some(join) = self.joins.get_mut(name) else { return false };
         match std::mem::replace(&mut join.rerouting, Rerouting::No) {
@@ -210,10 +212,10 @@ impl Endpoint {
         }
     }
 
-    pub(crate) fn handle_advert(&mut self, signed: &Signed) {
+    pub(crate) fn handle_advert(&mut self, signed: &SignedBody) {
         let advert = match verify_advert(&self.anchors, signed, self.now.unix) {
             Ok(advert) => advert,
-            Err(why) => return self.drop_frame(Dropped::NotVerified { what: "advertisement", why }),
+            Err(why) => return self.drop_frame(EndpointDrop::NotVerified { what: "advertisement", why }),
         };
         if advert.owner.node_id == self.config.identity.node_id() {
             return self.overtake(advert.body.seq);
@@ -234,7 +236,7 @@ impl Endpoint {
         }
     }
 
-    /// The way to a name's owner is gone.
+    /// Handles the loss of the route to a name's owner.
     pub(crate) fn lose(&mut self, name: Name, reason: LostReason, withdrawn: bool) {
         self.leave_beside(&name);
         let Some(join) = self.joins.get_mut(&name) else { return };
@@ -253,15 +255,15 @@ impl Endpoint {
     }
 
     fn lost(&mut self, name: Name, reason: LostReason) {
-        match (self.followed.get(&name), self.joins.get(&name).map(|j| &j.wish)) {
+        match (self.followed.get(&name), self.joins.get(&name).map(|j| &j.kind)) {
             (Some(owner), _) => self.owner_lost(*owner, reason),
-            (None, Some(Wish::Consumers)) => self.consumers_lost(name, reason),
-            (None, Some(Wish::Renew(_) | Wish::Operate(_) | Wish::Types(_))) => {}
+            (None, Some(JoinKind::Consumers)) => self.consumers_lost(name, reason),
+            (None, Some(JoinKind::Renew(_) | JoinKind::Operate(_) | JoinKind::Types(_))) => {}
             (None, _) => self.event(Event::Lost { name, reason }),
         }
     }
 
-    /// One catalogue of an owner is lost; the owner is once all are.
+    /// Notes that one catalogue of an owner is lost; the owner is lost once all are.
     fn owner_lost(&mut self, owner: NodeId, reason: LostReason) {
         if !self.hears(&owner) {
             self.event(Event::OwnerLost { owner, reason });
@@ -273,18 +275,18 @@ impl Endpoint {
     }
 
     fn refused(&mut self, name: Name, by: RefusedBy) {
-        match (self.followed.get(&name).copied(), self.joins.get(&name).map(|j| &j.wish)) {
+        match (self.followed.get(&name).copied(), self.joins.get(&name).map(|j| &j.kind)) {
             (Some(owner), _) if self.hears(&owner) => {}
             (Some(owner), _) => self.event(Event::OwnerRefused { owner, by }),
-            (None, Some(Wish::Renew(_))) => self.event(Event::RenewRefused { by }),
-            (None, Some(Wish::Operate(_))) => self.event(Event::OperationDenied { name, by }),
-            // What is not described is not known; that is seen where it is needed.
-            (None, Some(Wish::Types(_) | Wish::Consumers)) => {}
+            (None, Some(JoinKind::Renew(_))) => self.event(Event::RenewRefused { by }),
+            (None, Some(JoinKind::Operate(_))) => self.event(Event::OperationDenied { name, by }),
+            // A missing description shows where it is needed.
+            (None, Some(JoinKind::Types(_) | JoinKind::Consumers)) => {}
             (None, _) => self.event(Event::Refused { name, by }),
         }
     }
 
-    /// Asks the owner of `name`, if there is a way to it.
+    /// Asks the owner of `name`, if there is a route to it.
     fn ask(&mut self, name: Name) {
         let identity = self.config.identity.clone();
         let Some(join) = self.joins.get_mut(&name) else { return };
@@ -293,15 +295,15 @@ impl Endpoint {
             return;
         }
         // An authority may require post-quantum keys before this node's identity says so.
-        let of_authority = matches!(join.wish, Wish::Renew(_) | Wish::Operate(_));
+        let of_authority = matches!(join.kind, JoinKind::Renew(_) | JoinKind::Operate(_));
         let reply_key = ReplyKey::generate(Kem::for_fleet(of_authority || identity.post_quantum()));
         let (sink, reply_key) = join.ask(self.now.instant, reply_key, &mut self.rng);
-        let wish = join.wish.clone();
-        let frame = self.join_frame(&identity, name, sink, &wish, reply_key);
+        let kind = join.kind.clone();
+        let frame = self.join_frame(&identity, name, sink, &kind, reply_key);
         self.send(frame);
     }
 
-    pub(crate) fn handle_answer(&mut self, signed: &Signed) {
+    pub(crate) fn handle_answer(&mut self, signed: &SignedBody) {
         let Ok(claimed) = AnswerBody::from_slice(&signed.body) else {
             return self.unexpected("answer");
         };
@@ -310,7 +312,7 @@ impl Endpoint {
         };
         match verify_answer(&owner, signed) {
             Ok(body) => self.handle_verified_answer(&owner, body),
-            Err(why) => self.drop_frame(Dropped::NotVerified { what: "answer", why }),
+            Err(why) => self.drop_frame(EndpointDrop::NotVerified { what: "answer", why }),
         }
     }
 
@@ -345,7 +347,7 @@ impl Endpoint {
                 if was_granted {
                     self.lost(name, LostReason::Refused(reason));
                 }
-                // That a share has ended is no refusal: it is what the owner wanted.
+                // The end of a share is no refusal: the owner wanted it.
                 if !(was_granted && reason == RefuseReason::NotShared) {
                     self.refused(name, by);
                 }
@@ -367,7 +369,7 @@ impl Endpoint {
         }
     }
 
-    /// The answer to what was asked over a better way: it takes the place of what was granted before.
+    /// Takes the answer to the request over a better route: it replaces the old grant.
     fn handle_answer_beside(&mut self, owner: &VerifiedPeer, body: AnswerBody) {
         let AnswerBody { name, sink, serial, answer } = body;
         let Some(join) = self.joins.get_mut(&name) else { return };
@@ -377,7 +379,7 @@ impl Endpoint {
         };
         let (enc, sealed) = match answer {
             Answer::Grant { enc, sealed } => (enc, sealed),
-            // Whoever is refused now will lose what it has by the owner's own doing.
+            // A refusal here leads to the loss of the old grant by the owner itself.
             Answer::Refuse { .. } => return,
         };
         match reply_key.open(&name, &sink, serial, &enc, &sealed) {
@@ -405,30 +407,30 @@ impl Endpoint {
         serial: u64,
         content: GrantContent,
     ) {
-        let wish = self.joins.get(&name).map(|j| &j.wish);
-        match (content, wish) {
-            (GrantContent::Catalogue(catalogue), Some(Wish::Follow)) => {
+        let kind = self.joins.get(&name).map(|j| &j.kind);
+        match (content, kind) {
+            (GrantContent::Catalogue(catalogue), Some(JoinKind::Follow)) => {
                 self.event(Event::Catalogue { owner, catalogue });
             }
-            (GrantContent::Topic(grant), Some(Wish::Subscribe { .. } | Wish::Publish(_))) => {
+            (GrantContent::Topic(grant), Some(JoinKind::Subscribe { .. } | JoinKind::Publish(_))) => {
                 self.event(Event::Granted { name, sink, grant });
                 if serial > 1 {
-                    // A new epoch waits for it.
+                    // A new epoch waits for the acknowledgement.
                     self.send(Control::Ack { name, sink, serial });
                 }
             }
-            (GrantContent::Credentials(credentials), Some(Wish::Renew(_))) => {
+            (GrantContent::Credentials(credentials), Some(JoinKind::Renew(_))) => {
                 self.event(Event::Renewed { credentials });
             }
-            (GrantContent::Operation(answer), Some(Wish::Operate(_))) => {
+            (GrantContent::Operation(answer), Some(JoinKind::Operate(_))) => {
                 self.event(Event::OperationAnswered { name, answer });
             }
-            (GrantContent::Types(types), Some(Wish::Types(names))) => {
+            (GrantContent::Types(types), Some(JoinKind::Types(names))) => {
                 let asked = |t: &DescribedType| names.contains(&t.name);
                 let types: Vec<_> = types.into_iter().filter(asked).collect();
                 self.event(Event::Types { owner, types });
             }
-            (GrantContent::Consumers(consumers), Some(Wish::Consumers)) => {
+            (GrantContent::Consumers(consumers), Some(JoinKind::Consumers)) => {
                 self.event(Event::Consumers { peer: owner, consumers });
             }
             _ => self.unexpected("kind of grant"),
@@ -438,7 +440,7 @@ impl Endpoint {
     pub(crate) fn handle_reject(&mut self, name: Name, sink: SinkId, reason: RejectReason) {
         let Some(join) = self.joins.get_mut(&name) else { return self.unexpected("reject") };
         if join.rerouted_sink() == Some(sink) {
-            // What is granted still serves; if it does not, the answer is there already or will be asked for.
+            // The old grant still serves; if it does not, the answer is here already or will be asked for.
             return join.retry_beside(self.now.instant, &mut self.rng);
         }
         if join.sink() != Some(sink) {
@@ -446,7 +448,7 @@ impl Endpoint {
         }
         let was_granted = matches!(join.state, JoinState::Granted { .. });
         let by = RefusedBy::Router(reason);
-        // A broken way mends by itself; anything else the user should see while it is retried.
+        // A broken route mends by itself; the user should see any other reason during retries.
         let visible = !matches!(reason, RejectReason::RouteLost | RejectReason::NoRoute);
         if was_granted && !visible && self.fall_back(&name) {
             return self.lost(name, LostReason::Cut(reason));

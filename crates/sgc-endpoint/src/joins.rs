@@ -1,4 +1,4 @@
-//! What this node asks of others: one state per joined name, from waiting to granted and back.
+//! This node's joins: one state per joined name, from waiting to granted and back.
 
 use std::time::{Duration, Instant};
 
@@ -9,7 +9,7 @@ use sgc_wire::{
     Encode, Name, NodeId, RefuseReason, RejectReason, Request, SinkId, SourceOffer, TypeQuestion,
 };
 
-/// Wait before asking again for what was granted until now: the way may be another by now.
+/// Wait before the first repeated request for a lost grant: the route may be another by now.
 const RETRY_FIRST: Duration = Duration::from_millis(20);
 /// Shortest wait before asking again after that.
 const RETRY_MIN: Duration = Duration::from_millis(50);
@@ -19,20 +19,20 @@ const REROUTE_RETRY: Duration = Duration::from_millis(500);
 const RETRY_MAX: Duration = Duration::from_secs(10);
 /// Wait before asking an owner again that refused.
 const REFUSED_RETRY: Duration = Duration::from_secs(30);
-/// How long an answer is waited for; routers give up earlier and say so.
+/// Time to wait for an answer; routers give up earlier and report it.
 const ANSWER_WAIT: Duration = Duration::from_secs(15);
 
-/// Who refused.
+/// The refusing node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RefusedBy {
-    /// The owner, signed.
+    /// The owner, by a signed answer.
     Owner(RefuseReason),
     /// A router on the way.
     Router(RejectReason),
 }
 
 impl RefusedBy {
-    /// Returns `true` if a clock that is set right may make it another answer.
+    /// Returns `true` if a corrected clock may change the answer.
     pub(crate) fn is_about_time(self) -> bool {
         matches!(
             self,
@@ -51,42 +51,42 @@ impl std::fmt::Display for RefusedBy {
     }
 }
 
-/// Why a grant no longer carries data.
+/// The reason why a grant no longer carries data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LostReason {
     /// The owner withdrew the name.
     Withdrawn,
-    /// No router in reach knows a way to the owner.
+    /// No router in reach knows a route to the owner.
     Unreachable,
-    /// A router cut the branch; asking again.
+    /// A router cut the branch; the join is repeated.
     Cut(RejectReason),
-    /// The owner took the grant back.
+    /// The owner revoked the grant.
     Refused(RefuseReason),
 }
 
-/// What a join is for.
+/// Purpose of a join.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Wish {
-    /// To receive what is published under a name; `describe` if its owner's catalogue cannot be seen.
+pub enum JoinKind {
+    /// To receive the messages of a name; `describe` if its owner's catalogue cannot be seen.
     Subscribe {
-        /// True if the grant is to say what the name stands for.
+        /// Whether the grant has to contain the metadata of the name.
         describe: bool,
     },
     /// To publish under a name.
     Publish(SourceOffer),
-    /// The catalogue of an owner.
+    /// To receive the catalogue of an owner.
     Follow,
-    /// A fresh certificate for this signing request (PKCS #10, DER).
+    /// To get a certificate for this signing request (PKCS #10, DER).
     Renew(Bytes),
-    /// An operation on the fleet that the owner is the authority of: an encoded [`sgc_wire::OperationRequest`].
+    /// To request an operation on the fleet from its authority: an encoded [`sgc_wire::OperationRequest`].
     Operate(Bytes),
-    /// What the types of these interfaces of an owner look like.
+    /// To get the types of these interfaces of an owner.
     Types(Vec<Name>),
-    /// The consumers that a node has of what this one owns.
+    /// To get a node's consumers of this node's interfaces.
     Consumers,
 }
 
-impl Wish {
+impl JoinKind {
     pub(crate) fn request(&self) -> Request {
         match self {
             Self::Subscribe { describe } => Request::Subscribe { describe: *describe },
@@ -101,26 +101,26 @@ impl Wish {
         }
     }
 
-    /// Whether an answer is for good: there is nothing that flows, and no better way to be looked for.
+    /// Returns whether one answer ends the join: no data flows, and no better route is looked for.
     pub(crate) fn is_question(&self) -> bool {
         matches!(self, Self::Renew(_) | Self::Operate(_) | Self::Types(_))
     }
 }
 
-/// Where a join stands, for status.
+/// Status of a join.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum JoinStatus {
     /// Nobody in reach advertises the name.
     Waiting,
     /// Asked, not answered yet.
     Asked,
-    /// Refused; asking again later.
+    /// Refused; the join is repeated later.
     Refused(RefusedBy),
     /// Granted.
     Granted,
 }
 
-/// What a join waits for.
+/// State of a join, by the event that it waits for.
 #[derive(Debug)]
 pub(crate) enum JoinState {
     /// An advertisement.
@@ -133,10 +133,10 @@ pub(crate) enum JoinState {
     Granted { sink: SinkId, reply_key: ReplyKey, serial: u64 },
 }
 
-/// Asking again over a better way, while what was granted goes on.
+/// State of a request over a better route, while the old grant serves.
 #[derive(Debug)]
 pub(crate) enum Rerouting {
-    /// It does not.
+    /// There is none.
     No,
     /// The owner's answer.
     ExpectAnswer { sink: SinkId, reply_key: ReplyKey, deadline: Instant },
@@ -147,9 +147,9 @@ pub(crate) enum Rerouting {
 /// A joined name.
 #[derive(Debug)]
 pub(crate) struct Join {
-    /// Whose it must be.
+    /// The owner that the name has to have.
     pub(crate) owner: NodeId,
-    pub(crate) wish: Wish,
+    pub(crate) kind: JoinKind,
     /// The owner as its last advertisement proved it; `None` while there is none.
     pub(crate) reachable: Option<VerifiedPeer>,
     pub(crate) state: JoinState,
@@ -159,9 +159,9 @@ pub(crate) struct Join {
 }
 
 impl Join {
-    pub(crate) fn new(owner: NodeId, wish: Wish) -> Self {
+    pub(crate) fn new(owner: NodeId, kind: JoinKind) -> Self {
         let (state, rerouting) = (JoinState::ExpectAdvert, Rerouting::No);
-        Self { owner, wish, reachable: None, state, rerouting, attempts: 0 }
+        Self { owner, kind, reachable: None, state, rerouting, attempts: 0 }
     }
 
     pub(crate) fn status(&self) -> JoinStatus {
@@ -174,7 +174,7 @@ impl Join {
         }
     }
 
-    /// The sink that asked or was granted.
+    /// Returns the sink of the request or grant.
     pub(crate) fn sink(&self) -> Option<SinkId> {
         match &self.state {
             JoinState::ExpectAnswer { sink, .. } | JoinState::Granted { sink, .. } => Some(*sink),
@@ -182,7 +182,7 @@ impl Join {
         }
     }
 
-    /// The sink that asks again over a better way.
+    /// Returns the sink of the request over a better route.
     pub(crate) fn rerouted_sink(&self) -> Option<SinkId> {
         match &self.rerouting {
             Rerouting::ExpectAnswer { sink, .. } => Some(*sink),
@@ -190,7 +190,7 @@ impl Join {
         }
     }
 
-    /// When to act if nothing happens.
+    /// Returns the time to act if nothing happens.
     pub(crate) fn deadline(&self) -> Option<Instant> {
         let state = match &self.state {
             JoinState::ExpectAnswer { deadline, .. } => Some(*deadline),
@@ -205,7 +205,7 @@ impl Join {
         state.into_iter().chain(rerouting).min()
     }
 
-    /// Asks now: a fresh sink id and reply key.
+    /// Asks now, with a fresh sink id and reply key.
     pub(crate) fn ask(
         &mut self,
         now: Instant,
@@ -219,7 +219,7 @@ impl Join {
         (sink, public)
     }
 
-    /// Asks over a better way, beside what is granted.
+    /// Asks over a better route, beside the grant.
     pub(crate) fn ask_beside(
         &mut self,
         now: Instant,
@@ -232,13 +232,13 @@ impl Join {
         (sink, public)
     }
 
-    /// Asks over a better way a little later: the way may not be there yet.
+    /// Asks over a better route a little later: the route may not be complete yet.
     pub(crate) fn retry_beside(&mut self, now: Instant, rng: &mut impl RngCore) {
         let wait = REROUTE_RETRY.mul_f64(0.5 + f64::from(rng.next_u32() % 1000) / 2000.0);
         self.rerouting = Rerouting::ExpectRetry { at: now + wait };
     }
 
-    /// Asks again later: soon and then ever more patiently, with jitter so that many do not ask at once.
+    /// Asks again later: soon and then after growing pauses, with jitter so that many do not ask at once.
     pub(crate) fn retry(&mut self, now: Instant, refused: Option<RefusedBy>, rng: &mut impl RngCore) {
         let wait = match refused {
             Some(RefusedBy::Owner(_)) => REFUSED_RETRY,
@@ -258,7 +258,7 @@ impl Join {
         }
     }
 
-    /// Starts patience afresh.
+    /// Resets the pauses.
     pub(crate) fn succeeded(&mut self) {
         self.attempts = 0;
     }

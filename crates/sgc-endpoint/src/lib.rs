@@ -1,12 +1,12 @@
-//! Publish and subscribe by name: what a node does for itself, as opposed to what it carries for others.
+//! Publish and subscribe by name: a node's own traffic, as opposed to the traffic that it carries for others.
 //!
-//! [`Endpoint`] is a pure machine: frames of its own router, the user's wishes and the time go in; frames and
-//! events come out. After each `handle_*` or wish the driver drains [`Endpoint::poll_output`] until
-//! [`Output::Timeout`]. [`Source`] and [`Sink`] are the two ends of the data path: they seal and open on the
-//! thread that calls them, and never call the machine.
+//! [`Endpoint`] is a pure machine: frames of its own router, the user's requests and the time go in; frames and events
+//! come out. After each call the driver drains [`Endpoint::poll_output`] until [`Output::Timeout`]. [`Source`] and
+//! [`Sink`] are the two ends of the data path: they seal and open on the thread that calls them, and never call the
+//! machine.
 //!
-//! It knows nothing of ROS (that is `sgc-ros`) and nothing of routes (that is `sgc-router`); it meets
-//! routers in frames only. The normative text is `docs/spec/trust.md` and `docs/spec/routing.md`.
+//! The crate knows nothing of ROS (that is `sgc-ros`) and nothing of routes (that is `sgc-router`); it meets routers in
+//! frames only. The normative text is `docs/spec/trust.md` and `docs/spec/routing.md`.
 #![forbid(unsafe_code)]
 
 mod advert_pace;
@@ -24,20 +24,20 @@ mod partial;
 mod shares;
 mod sink;
 mod source;
-mod types;
+mod type_exchange;
 
 pub use advert_pace::{ADVERT_INTERVAL, ADVERTS_BURST};
 pub use calls::{
-    ANSWER_KEPT_BYTES_MAX, ASK_AFTER, ASK_EVERY_MAX, Answerer, Answering, CallLimits, CallLoss, CallRefused,
+    ANSWER_KEPT_BYTES_MAX, ASK_AFTER, ASK_EVERY_MAX, Answerer, Answering, CallLimits, CallLoss, CallRefusal,
     CallStats, Caller, LostCall, Outcome,
 };
 pub use compression::{COMPRESS_BYTES_MIN, CompressionError, Compressor, Decompressor};
-pub use endpoint::{Dropped, Endpoint, EndpointConfig, Event, Limits, Output};
+pub use endpoint::{Endpoint, EndpointConfig, EndpointDrop, Event, Limits, Output};
 pub use history::{RECOVERY_BYTES_MAX, RECOVERY_MESSAGES_MAX, RecoveryLimits};
-pub use joins::{JoinStatus, LostReason, RefusedBy, Wish};
+pub use joins::{JoinKind, JoinStatus, LostReason, RefusedBy};
 pub use marks::{MARK_AFTER, Marks};
 pub use parking::{PARKED_BYTES_MAX, PARKED_LOOKS_MAX, PARKED_PACKETS_MAX};
 pub use shares::{ShareError, ShareSpec};
 pub use sink::{AskAgain, Delivery, EPOCHS_MAX, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
 pub use source::{FRAGMENT_BYTES, PublishError, SOURCE_MESSAGES_MAX, Source, SourceConfig, SourceProgress};
-pub use types::{PackedType, unpack_type};
+pub use type_exchange::{PackedType, unpack_type};

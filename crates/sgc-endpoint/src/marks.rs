@@ -1,25 +1,25 @@
-//! When a source that fell silent says what it published last, so that who lost it notices. Whether anybody listens,
-//! and the clock, are the driver's.
+//! The times at which a silent source repeats its last number, so that sinks notice a loss. The driver has the clock,
+//! and knows whether anybody listens.
 
 use std::time::{Duration, Instant};
 
 use crate::SourceProgress;
 
-/// How long after its last message a source says so: more than once, since that may be lost too.
+/// Times after its last message at which a source sends a mark: several, because marks may be lost, too.
 pub const MARK_AFTER: [Duration; 3] =
     [Duration::from_secs(1), Duration::from_secs(4), Duration::from_secs(15)];
 
-/// What was seen of one source.
+/// Progress of one source at the last look.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Marks {
     last_message: u64,
-    /// When that was seen first.
+    /// Time of the first look at that progress.
     since: Option<Instant>,
     said: usize,
 }
 
 impl Marks {
-    /// Looks at how far the source is; true if it is to say so now ([`crate::Source::mark`]).
+    /// Looks at the source's progress. Returns `true` if it has to send a mark now ([`crate::Source::mark`]).
     pub fn is_due(&mut self, now: Instant, progress: &SourceProgress) -> bool {
         let last_message = progress.last_message();
         if !progress.recovers() || last_message == 0 {
@@ -33,7 +33,7 @@ impl Marks {
         due
     }
 
-    /// When to look again; `None` until there is another message.
+    /// Returns the time of the next look; `None` until there is another message.
     pub fn deadline(&self) -> Option<Instant> {
         Some(self.since? + *MARK_AFTER.get(self.said)?)
     }

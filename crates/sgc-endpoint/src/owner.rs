@@ -1,25 +1,25 @@
-//! As the owner of names: shares, whom they are granted to, epochs, the catalogue, and for an authority the
-//! credentials of members.
+//! The owner's part of the endpoint: shares, their sinks, epochs, the catalogue, and for an authority the credentials
+//! of members.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_trust::{Denied, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
+use sgc_trust::{DenialReason, Kem, Policy, TopicSecret, VerifiedPeer, name_of, seal_grant, verify_join};
 use sgc_wire::{
     Answer, AnswerBody, Blind, CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Control,
     Credentials, Decode, Encode, GrantContent, JoinBody, Metadata, Name, NodeId, Now, OperationAnswer, Qos,
-    Recover, RefuseReason, Request, Role, SEALED_BYTES_MAX, Signed, SinkId, SourceId, TopicGrant,
+    Recover, RefuseReason, Request, Role, SEALED_BYTES_MAX, SignedBody, SinkId, SourceId, TopicGrant,
 };
 
 use crate::advert_pace::AdvertPace;
-use crate::endpoint::{Dropped, Endpoint, Event, Limits};
+use crate::endpoint::{Endpoint, EndpointDrop, Event, Limits};
 use crate::shares::{Epoch, GrantedSink, Rotation, Share, ShareError, ShareSpec};
 use crate::{SinkProgress, SourceProgress};
 
-/// Epochs that were granted and are not in use yet. Sinks hold [`crate::EPOCHS_MAX`] keys, of which some may be of
-/// epochs whose packets are still under way.
+/// Granted epochs that are not in use yet. Sinks hold [`crate::EPOCHS_MAX`] keys, some of them for epochs whose packets
+/// are still in flight.
 const EPOCHS_AHEAD_MAX: u32 = 3;
 
 /// A request that is older than the one known of its sink or node.
@@ -28,7 +28,7 @@ pub(crate) const OLDER_REQUEST: &str = "older request";
 /// Nodes that have a place at the operations name of an authority: operators are few.
 const OPERATIONS_ASKED_MAX: usize = 64;
 
-/// How long changes of the catalogue are gathered after it was sent.
+/// Time for which changes of the catalogue are collected after it was sent.
 const CATALOGUE_REST: Duration = Duration::from_millis(100);
 
 impl Endpoint {
@@ -68,7 +68,7 @@ impl Endpoint {
         Ok(name)
     }
 
-    /// Changes what a share offers; its name and key stay.
+    /// Changes the offer of a share; its name and key stay.
     pub fn update_share(&mut self, now: Now, name: &Name, qos: Qos, sources: Vec<CatalogueSource>) {
         self.now = now;
         let Some(share) = self.shares.shares.get_mut(name) else { return };
@@ -85,7 +85,7 @@ impl Endpoint {
         }
     }
 
-    /// Changes who may join a share. Who no longer may is cut at once, and the others get a new key.
+    /// Changes the policy of a share. Sinks without the right are cut at once, and the others get a new key.
     pub fn update_policy(&mut self, now: Now, name: &Name, policy: Policy) {
         self.now = now;
         let Some(share) = self.shares.shares.get_mut(name) else { return };
@@ -97,7 +97,7 @@ impl Endpoint {
         self.enforce();
     }
 
-    /// Which sources of this node publish under a share.
+    /// Sets this node's sources of a share.
     pub fn set_sources(&mut self, now: Now, name: &Name, sources: Vec<Arc<SourceProgress>>) {
         self.now = now;
         let Some(share) = self.shares.shares.get_mut(name) else { return };
@@ -110,15 +110,14 @@ impl Endpoint {
         self.regrant(*name);
     }
 
-    /// How far this node's own sink of a share is with the sources of others: who is granted from here on is told
-    /// that what was heard is past.
+    /// Sets the progress of this node's own sink of a share: later grants tell that received messages are past.
     pub fn set_own_sink(&mut self, name: &Name, progress: Arc<SinkProgress>) {
         if let Some(share) = self.shares.shares.get_mut(name) {
             share.heard = Some(progress);
         }
     }
 
-    /// Ends a share: withdrawn everywhere, its sinks told.
+    /// Ends a share: withdraws it everywhere, and tells its sinks.
     pub fn unshare(&mut self, now: Now, name: &Name) {
         self.now = now;
         let Some(share) = self.shares.shares.remove(name) else { return };
@@ -135,7 +134,7 @@ impl Endpoint {
         }
     }
 
-    /// Who publishes on a share: by source, the sink that what is for it is addressed to.
+    /// Returns the publishers of a share: by source, the sink that packets for it are addressed to.
     pub fn publishers(&self, name: &Name) -> BTreeMap<SourceId, SinkId> {
         let sinks = self.shares.shares.get(name).into_iter().flat_map(|share| &share.sinks);
         let publishers = sinks.filter_map(|(sink, granted)| match &granted.request {
@@ -145,12 +144,12 @@ impl Endpoint {
         publishers.collect()
     }
 
-    /// The key of a share, for its sources.
+    /// Returns the key of a share, for its sources.
     pub fn share_grant(&self, name: &Name) -> Option<TopicGrant> {
         self.shares.shares.get(name).map(|s| s.grant(&s.epoch, None))
     }
 
-    /// True if the type of a share has a key, so that each of its instances has a history.
+    /// Returns `true` if the type of a share has a key, so that each of its instances has a history.
     pub fn is_keyed(&self, name: &Name) -> bool {
         self.shares.shares.get(name).is_some_and(|s| !s.spec.keyless)
     }
@@ -161,13 +160,13 @@ impl Endpoint {
         self.begin_epoch(*name);
     }
 
-    /// Takes back all names, for a clean shutdown.
+    /// Withdraws all names, for a clean shutdown.
     pub fn withdraw_all(&mut self, now: Now) {
         for name in self.shares.shares.keys().copied().collect::<Vec<_>>() {
             self.unshare(now, &name);
         }
         self.unadvertised.clear();
-        // Nothing is gathered any more.
+        // Nothing is collected any more.
         self.advert_pace = AdvertPace::default();
         for (name, blind) in std::mem::take(&mut self.catalogue_names) {
             self.end_catalogue(name, blind);
@@ -182,7 +181,7 @@ impl Endpoint {
         self.catalogue_rests = None;
     }
 
-    /// Answers [`Event::RenewAsked`], once or again when something changed.
+    /// Answers [`Event::RenewAsked`], once or again after a change.
     pub fn answer_renewal(&mut self, now: Now, sink: SinkId, answer: Result<Credentials, RefuseReason>) {
         self.now = now;
         let Some((name, _)) = self.renewal_name else { return };
@@ -225,7 +224,7 @@ impl Endpoint {
         }
     }
 
-    /// Who asked this authority and is still there: sink, node, and signing request.
+    /// Iterates over the members that ask this authority: sink, node, and signing request.
     pub fn renewing(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer, &Bytes)> {
         self.renewals.iter().filter_map(|(sink, asked)| match &asked.request {
             Request::Ask { what: csr } => Some((*sink, &asked.peer, csr)),
@@ -245,7 +244,7 @@ impl Endpoint {
         }
     }
 
-    /// Cuts everyone who has lost the right to what was granted, and begins new epochs for those who stay.
+    /// Cuts every node that has lost the right to its grant, and begins new epochs for the others.
     pub(crate) fn enforce(&mut self) {
         let mut cut = Vec::new();
         let mut names = BTreeSet::new();
@@ -258,7 +257,7 @@ impl Endpoint {
                 let denied = denied(&granted.peer, granted.request.role());
                 cut.extend(denied.map(|reason| (*name, *sink, reason)));
             }
-            // That it left, or was cut off by a router that heard of it first, does not make it forget the key.
+            // A node that left, or that a router cut off first, still knows the key.
             if share.left.values().any(|(peer, role)| denied(peer, *role).is_some()) {
                 names.insert(*name);
             }
@@ -301,7 +300,7 @@ impl Endpoint {
         self.enforce_consumers();
     }
 
-    /// Who lost the right to a share begins anew if it gets it back.
+    /// Forgets the history rights of peers that lost the right to a share: they begin anew if they get it back.
     fn forget_denied(&mut self) {
         let (anchors, now) = (self.anchors.clone(), self.now.unix);
         for share in self.shares.shares.values_mut() {
@@ -313,12 +312,12 @@ impl Endpoint {
         }
     }
 
-    /// Why a peer whose certificate was good when it asked may not have anything any more.
+    /// Returns the reason why a peer with a once valid certificate may not have anything any more.
     pub(crate) fn standing(&self, peer: &VerifiedPeer) -> Option<RefuseReason> {
         if self.anchors.is_peer_revoked(peer) {
             Some(RefuseReason::Revoked)
         } else if !self.anchors.stands(peer) {
-            // Its CA was taken out of those that are trusted here.
+            // This node no longer trusts the peer's CA.
             Some(RefuseReason::NotVerified)
         } else if peer.not_after < self.now.unix {
             Some(RefuseReason::Expired)
@@ -332,9 +331,9 @@ impl Endpoint {
         let limits = &self.config.limits;
         let (wait, every) = (limits.rotate_wait, limits.rotate_every);
         let Some(share) = self.shares.shares.get_mut(&name) else { return };
-        // An epoch that some were granted and that never began is skipped: one of them may be who was cut. The time
-        // runs on from the first of them, or many in a row would put the new key off for ever; and sinks hold few keys,
-        // so beyond that number the next one waits for its turn.
+        // An epoch that never began is skipped, if some sinks have its key: a cut node may be one of them. The time
+        // runs on from the first of these, or a series of them would delay the new key for ever. Sinks hold few keys,
+        // so beyond that number the next epoch waits for its turn.
         let ahead = share.newest().number - share.epoch.number;
         let deadline = match &mut share.rotation {
             Some(rotation) if ahead >= EPOCHS_AHEAD_MAX => {
@@ -385,7 +384,7 @@ impl Endpoint {
         over.into_iter().for_each(|name| self.begin_epoch(name));
     }
 
-    /// Grants the newest epoch to every sink again: key or sources changed.
+    /// Grants the newest epoch to every sink again, because key or sources changed.
     fn regrant(&mut self, name: Name) {
         let Some(share) = self.shares.shares.get(&name) else { return };
         for sink in share.sinks.keys().copied().collect::<Vec<_>>() {
@@ -394,7 +393,7 @@ impl Endpoint {
         self.tell_own(name);
     }
 
-    /// Who publishes is told to all that hear them: those of a service are heard by this node alone.
+    /// Tells every receiver of a share its publishers; this node alone receives those of a service.
     fn publishers_changed(&mut self, name: Name) {
         if self.shares.shares.get(&name).is_some_and(Share::is_service) {
             self.tell_own(name);
@@ -416,7 +415,7 @@ impl Endpoint {
         }
     }
 
-    /// Tells this node's own sink of a share on which others may publish.
+    /// Updates this node's own sink of a share on which others may publish.
     fn tell_own(&mut self, name: Name) {
         let Some(share) = self.shares.shares.get_mut(&name) else { return };
         share.told_own |= !share.spec.policy.publish.is_empty();
@@ -438,12 +437,12 @@ impl Endpoint {
         }
     }
 
-    /// When followers are to be told what changed meanwhile.
+    /// Returns the time at which followers get the collected changes.
     pub(crate) fn catalogue_deadline(&self) -> Option<Instant> {
         self.catalogue_rests.filter(|_| self.catalogue_dirty)
     }
 
-    /// Sends each follower its catalogue if what it may see changed, at once the first time and then after a while: a
+    /// Sends each follower its catalogue if its visible part changed, at once the first time and then after a while: a
     /// network that starts makes hundreds of changes.
     pub(crate) fn tell_followers(&mut self) {
         if self.catalogue_rests.is_some_and(|until| self.now.instant < until)
@@ -466,7 +465,7 @@ impl Endpoint {
             return;
         }
         if left_out > 0 {
-            self.drop_frame(Dropped::CatalogueTooLarge { left_out });
+            self.drop_frame(EndpointDrop::CatalogueTooLarge { left_out });
         }
         let Some(follower) = self.shares.followers.get_mut(&(name, sink)) else { return };
         follower.serial += 1;
@@ -478,7 +477,7 @@ impl Endpoint {
         }
     }
 
-    /// Answers yes; false if the request's reply key is unusable, which is answered with no.
+    /// Grants a request. Returns `false` if its reply key is unusable; the request is then refused.
     pub(crate) fn grant(
         &mut self,
         name: Name,
@@ -521,12 +520,12 @@ impl Endpoint {
         self.operations_name.is_some_and(|(n, _)| n == *name)
     }
 
-    pub(crate) fn handle_join(&mut self, signed: &Signed) {
+    pub(crate) fn handle_join(&mut self, signed: &SignedBody) {
         let join = match verify_join(&self.anchors, signed, self.now.unix) {
             Ok(join) => join,
             Err(why) => {
-                // Answered as well as can be: the body may at least say whom to answer. Only for a name of ours, or
-                // anybody could have anything signed.
+                // A malformed body may still contain name and sink for an answer. Only names of this node are answered,
+                // or anybody could have anything signed.
                 if let Ok(JoinBody { name, sink, .. }) = JoinBody::from_slice(&signed.body)
                     && (self.shares.shares.contains_key(&name)
                         || self.is_catalogue(&name)
@@ -537,12 +536,12 @@ impl Endpoint {
                 {
                     self.refuse(name, sink, 1, why.refuse_reason());
                 }
-                self.drop_frame(Dropped::NotVerified { what: "join", why });
+                self.drop_frame(EndpointDrop::NotVerified { what: "join", why });
                 return;
             }
         };
         let JoinBody { name, sink, request, reply_key, issued_at, .. } = join.body;
-        // In a post-quantum fleet nothing is granted that a recording could be made to tell later.
+        // In a post-quantum fleet nothing is granted that a recording could reveal later.
         let identity = &self.config.identity;
         let own_fleet = join.peer.ca == identity.as_peer().ca;
         if identity.post_quantum() && own_fleet && reply_key.len() != Kem::XWing.reply_key_bytes() {
@@ -585,7 +584,8 @@ impl Endpoint {
         let reply_key = asked.reply_key.clone();
         let role = asked.request.role();
         let publishes = role == Role::Publish;
-        // A request may come twice, on another way or under a new certificate: its answers keep growing numbers.
+        // A request may come twice, on another route or under a new certificate: the serials of its answers keep
+        // growing.
         let serial = share.sinks.get(&sink).map_or(0, |s| s.serial) + 1;
         if role == Role::Subscribe {
             share.note_since(&asked.peer, max);
@@ -599,7 +599,7 @@ impl Endpoint {
             }
             return;
         }
-        // It came between two epochs: it needs both keys.
+        // The sink came between two epochs: it needs both keys.
         let between = self.shares.shares.get_mut(&name).and_then(|s| s.rotation.as_mut());
         if let Some(rotation) = between {
             rotation.waiting.insert(sink, serial + 1);
@@ -613,7 +613,7 @@ impl Endpoint {
         }
     }
 
-    /// A publisher that asks anew, because the way here changed, may come before its old place is given up.
+    /// Replaces a publisher that asks again after a route change, which may come before its old sink has left.
     fn replace_publisher(&mut self, name: &Name, sink: &SinkId, asked: &GrantedSink) {
         let Some(share) = self.shares.shares.get_mut(name) else { return };
         let Request::Publish { offer } = &asked.request else { return };
@@ -649,7 +649,7 @@ impl Endpoint {
         place(share.sinks.iter(), asked, &self.config.limits)
     }
 
-    /// Ends the oldest sink of a node that has as many as it may.
+    /// Ends the oldest sink of a node that is at its limit.
     fn give_up_place(&mut self, name: Name, sink: SinkId) {
         let granted = self.shares.shares.get(&name).and_then(|share| share.sinks.get(&sink));
         let Some(serial) = granted.map(|granted| granted.serial + 1) else { return };
@@ -768,7 +768,7 @@ impl Endpoint {
         }
     }
 
-    /// A sink asks for messages; of those that were published before it may have any it is told the history at most.
+    /// Handles a sink's request for messages. Of those published before it had the right it gets at most the history.
     pub(crate) fn handle_recover(&mut self, mut recover: Recover) {
         let share = self.shares.shares.get(&recover.name);
         let granted = share.and_then(|s| Some((s, s.sinks.get(&recover.sink)?)));
@@ -785,13 +785,13 @@ impl Endpoint {
     }
 }
 
-/// Returns `true` if a request of a node was signed before another one of it, and so is played again.
+/// Returns `true` if a request of a node was signed before another one of it, and so is a replay.
 pub(crate) fn is_older(asked: &GrantedSink, known: &GrantedSink) -> bool {
     asked.peer.node_id == known.peer.node_id && asked.issued_at < known.issued_at
 }
 
-/// Returns the place that one who asks takes from its own node, if that has as many as it may: that of the request which was
-/// signed first. Routers on the way may keep leaves back and play requests again, but sign none.
+/// Returns the place that a request takes from its own node, if the node is at its limit: that of the request signed
+/// first. Routers on the way may withhold leaves and replay requests, but sign none.
 pub(crate) fn place<'a, K: Copy + 'a>(
     granted: impl ExactSizeIterator<Item = (&'a K, &'a GrantedSink)>,
     asked: &GrantedSink,
@@ -810,16 +810,17 @@ pub(crate) fn place<'a, K: Copy + 'a>(
     if all >= limits.sinks_per_name_max { Err(RefuseReason::Limit) } else { Ok(None) }
 }
 
-/// True if another node has the place of this sink.
+/// Returns `true` if another node has the place of this sink.
 fn is_of_another(granted: &BTreeMap<SinkId, GrantedSink>, sink: &SinkId, peer: &NodeId) -> bool {
     granted.get(sink).is_some_and(|known| known.peer.node_id != *peer)
 }
 
-/// A request that was signed before the one that is known of its node.
+/// A request that was signed before the known one of its node.
 struct OlderRequest;
 
-/// Gives the one place of a node to a request: the newer one is of the newer run, or of a newer certificate. Returns the sink
-/// that had it, and the serial of its refusal; an error if that one was signed later, so that this one is played again.
+/// Gives the one place of a node to a request: the newer one is of the newer run, or of a newer certificate. Returns
+/// the sink that had it, and the serial of its refusal; an error if that one was signed later, so that this one is a
+/// replay.
 fn take_older(
     granted: &mut BTreeMap<SinkId, GrantedSink>,
     sink: &SinkId,
@@ -837,15 +838,15 @@ fn take_older(
     Ok(other)
 }
 
-fn refusal(denied: Denied) -> RefuseReason {
+fn refusal(denied: DenialReason) -> RefuseReason {
     match denied {
-        Denied::NotListed => RefuseReason::NotPermitted,
-        Denied::Role => RefuseReason::RoleNotOffered,
+        DenialReason::NotListed => RefuseReason::NotPermitted,
+        DenialReason::Role => RefuseReason::RoleNotOffered,
     }
 }
 
 /// Makes a catalogue small enough to be sent: first without the nodes of its publishers, then without telling volatile
-/// publishers apart, and last by leaving entries out; returns how many.
+/// publishers apart, and last by leaving out entries. Returns the number of those.
 fn fit(catalogue: &mut Catalogue) -> usize {
     let all = catalogue.entries.len();
     let room = SEALED_BYTES_MAX - 1024;

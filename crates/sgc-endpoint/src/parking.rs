@@ -1,4 +1,4 @@
-//! Packets that came before the grant that explains them: of an epoch or a source that is not known yet.
+//! Packets that came before the grant that explains their epoch or source.
 
 use std::collections::{BTreeSet, VecDeque};
 
@@ -9,19 +9,20 @@ use sgc_wire::{Packet, SourceId};
 pub const PARKED_PACKETS_MAX: usize = 256;
 /// Most bytes parked at one sink.
 pub const PARKED_BYTES_MAX: usize = 4 << 20;
-/// Grants that a packet waits for. Each source that comes to be has a grant of its own, so that as many may be under way when the
-/// packet's source did.
+/// Grants that a packet waits for. Each new source has a grant of its own, so many may be in flight before that of the
+/// packet's source.
 pub const PARKED_LOOKS_MAX: u8 = 64;
-/// Looks for which a grant of a later epoch than the packet's counts: a source is announced in the epoch in which it came to be.
+/// Looks for which a grant of a later epoch than the packet's counts: a source is announced in the epoch in which it
+/// begins.
 const PAST_EPOCH_LOOKS: u8 = PARKED_LOOKS_MAX / 4;
 
-/// A packet and how often it was looked at in vain.
-pub(crate) struct Parked {
+/// A packet, and the number of looks in vain.
+pub(crate) struct ParkedPacket {
     pub(crate) packet: Packet,
     looks: u8,
 }
 
-impl Parked {
+impl ParkedPacket {
     pub(crate) fn new(packet: &Packet) -> Self {
         // A copy, so that the bound holds: the payload may be a small piece of a large buffer of the
         // transport.
@@ -31,23 +32,23 @@ impl Parked {
         Self { packet, looks: 0 }
     }
 
-    /// Counts a look in vain at a grant of this epoch; true if there was one too many.
+    /// Counts a look in vain at a grant of this epoch. Returns `true` if it was one too many.
     pub(crate) fn looked_in_vain(&mut self, epoch: u32) -> bool {
         self.looks += if epoch > self.packet.header.epoch { PAST_EPOCH_LOOKS } else { 1 };
         self.looks >= PARKED_LOOKS_MAX
     }
 }
 
-/// The parked packets of a sink, in the order in which they came.
+/// The parked packets of a sink, oldest first.
 #[derive(Default)]
 pub(crate) struct Parking {
-    packets: VecDeque<Parked>,
+    packets: VecDeque<ParkedPacket>,
     bytes: usize,
 }
 
 impl Parking {
-    /// Parks a packet; the number of those that had to make room for it, oldest first.
-    pub(crate) fn push(&mut self, parked: Parked) -> usize {
+    /// Parks a packet. Returns the number of older ones that were dropped for it.
+    pub(crate) fn push(&mut self, parked: ParkedPacket) -> usize {
         self.bytes += parked.packet.encoded_bytes();
         self.packets.push_back(parked);
         let before = self.packets.len();
@@ -58,7 +59,7 @@ impl Parking {
         before - self.packets.len()
     }
 
-    /// Drops the packets of the sources that are passed over; these sources.
+    /// Drops the packets of the sources that are passed over, and returns these sources.
     pub(crate) fn drop_of(&mut self, is_passed_over: impl Fn(&SourceId) -> bool) -> BTreeSet<SourceId> {
         let mut sources = BTreeSet::new();
         for parked in self.take() {
@@ -72,8 +73,8 @@ impl Parking {
         sources
     }
 
-    /// Takes all out.
-    pub(crate) fn take(&mut self) -> VecDeque<Parked> {
+    /// Takes all packets.
+    pub(crate) fn take(&mut self) -> VecDeque<ParkedPacket> {
         self.bytes = 0;
         std::mem::take(&mut self.packets)
     }

@@ -1,4 +1,4 @@
-//! Messages of several fragments while they are incomplete. What is put here was authenticated before.
+//! Incomplete messages of several fragments. Fragments are authenticated before they come here.
 
 use std::collections::VecDeque;
 
@@ -23,9 +23,9 @@ pub(crate) struct Partial {
 pub(crate) struct Partials(VecDeque<Partial>);
 
 impl Partials {
-    /// Where a fragment can be opened to directly: into its place in a message that was begun and lacks it.
-    /// The first fragment has no such place, since the message's head stands behind it. What is written
-    /// counts for nothing until [`Self::put`] says so.
+    /// Returns the place of a fragment in a message that was begun and lacks it, to be opened into directly. The first
+    /// fragment has no such place, because the message's head stands behind it. The bytes count for nothing until
+    /// [`Self::put`].
     pub(crate) fn place(&mut self, header: &PacketHeader) -> Option<&mut [u8]> {
         let partial = self.0.iter_mut().find(|p| p.seq == header.seq)?;
         if header.index == 0 || !partial.matches(header) || partial.has(header.index) {
@@ -35,13 +35,13 @@ impl Partials {
         partial.message.get_mut(start..start + header.fragment_bytes())
     }
 
-    /// True if a fragment of the message is here.
+    /// Returns `true` if a fragment of the message is here.
     pub(crate) fn has_begun(&self, seq: u64) -> bool {
         self.0.iter().any(|p| p.seq == seq)
     }
 
-    /// Takes a fragment, which begins its message or is one of a message that has begun; `fragment` is `None`
-    /// if it was opened in its place. The number is that of messages given up to stay below `max`.
+    /// Takes a fragment, which begins its message or belongs to one that has begun; `fragment` is `None` if it was
+    /// opened in its place. Returns the number of messages given up to stay below `max`.
     pub(crate) fn put(
         &mut self,
         header: &PacketHeader,
@@ -72,14 +72,14 @@ impl Partials {
         }
     }
 
-    /// Gives up the messages up to `seq`; how many those were.
+    /// Gives up the messages up to `seq`, and returns their number.
     pub(crate) fn give_up(&mut self, seq: u64) -> u64 {
         let before = self.0.len();
         self.0.retain(|p| p.seq > seq);
         (before - self.0.len()) as u64
     }
 
-    /// Gives up the oldest message; the memory that it took, 0 if there is none.
+    /// Gives up the oldest message, and returns its memory, 0 if there is none.
     pub(crate) fn give_up_oldest(&mut self) -> usize {
         self.0.pop_front().map_or(0, |partial| partial.message.len())
     }
@@ -89,7 +89,7 @@ impl Partials {
         self.0.clear();
     }
 
-    /// Memory that the messages take.
+    /// Returns the memory of the messages.
     pub(crate) fn bytes(&self) -> usize {
         self.0.iter().map(|p| p.message.len()).sum()
     }

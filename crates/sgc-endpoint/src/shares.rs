@@ -1,4 +1,4 @@
-//! What this node owns: its shares, who was granted them, and what each asker sees in the catalogue.
+//! The names that this node owns: its shares, their sinks, and the part of the catalogue that each node sees.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -15,28 +15,28 @@ use sgc_wire::{
 
 use crate::{PackedType, SinkProgress, SourceProgress};
 
-/// What to share.
+/// Parameters of a share.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ShareSpec {
-    /// What the name is derived from.
+    /// The metadata from which the name derives.
     pub metadata: Metadata,
-    /// Who may join.
+    /// The nodes that may join.
     pub policy: Policy,
-    /// How payloads are protected.
+    /// Protection of payloads.
     pub suite: Suite,
     /// Class of its traffic.
     pub class: Class,
-    /// True if the DDS type has no key.
+    /// Whether the DDS type has no key.
     pub keyless: bool,
     /// `RIHS01_…` type hash, if known.
     pub type_hash: Option<String>,
-    /// What the interface as a whole offers.
+    /// QoS of the interface as a whole.
     pub qos: Qos,
     /// This node's publishers behind it, as far as sinks tell them apart.
     pub sources: Vec<CatalogueSource>,
 }
 
-/// Why something is not shared.
+/// The reason why an interface is not shared.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ShareError {
     /// The identity has no fleet secret: it is a router's.
@@ -50,7 +50,7 @@ pub enum ShareError {
         /// ROS type.
         type_name: String,
     },
-    /// Too many.
+    /// Too many shares.
     #[error("at most {max} interfaces can be shared by one node")]
     Limit {
         /// The bound.
@@ -58,17 +58,17 @@ pub enum ShareError {
     },
 }
 
-/// One who was granted.
+/// A granted sink.
 #[derive(Clone, Debug)]
 pub(crate) struct GrantedSink {
     pub(crate) peer: VerifiedPeer,
     pub(crate) request: Request,
     pub(crate) reply_key: Bytes,
-    /// Time at which the request was signed: of requests that are played again none is newer than the last of their node.
+    /// Time at which the request was signed: a replayed request is never newer than the last of its node.
     pub(crate) issued_at: UnixMillis,
     /// Serial of the last answer.
     pub(crate) serial: u64,
-    /// What it was told last, so that it is not told again; only used for catalogues.
+    /// The last catalogue sent to it, so that it is not sent again.
     pub(crate) told: Option<Catalogue>,
 }
 
@@ -87,23 +87,23 @@ impl Epoch {
     }
 }
 
-/// An epoch that its sinks were granted and that is not in use yet.
+/// An epoch that was granted and is not in use yet.
 #[derive(Debug)]
 pub(crate) struct Rotation {
     pub(crate) epoch: Epoch,
-    /// Who has not said yet that it has the key, and with which answer it got it.
+    /// Sinks that have not acknowledged the key, each with the serial of its answer.
     pub(crate) waiting: BTreeMap<SinkId, u64>,
-    /// When the epoch begins even if some have not.
+    /// Time at which the epoch begins without them.
     pub(crate) deadline: Instant,
-    /// True if another is to follow at once.
+    /// Whether another epoch has to follow at once.
     pub(crate) again: bool,
 }
 
-/// Since when a node may receive a share: nothing older is sent to it again, on whatever way it asks.
+/// The point from which a node may receive a share: nothing older is sent to it again, on any route.
 #[derive(Debug)]
-pub(crate) struct Since {
+pub(crate) struct ReceiveStart {
     pub(crate) peer: VerifiedPeer,
-    /// By source; of one that came later, all.
+    /// Floors by source; a source that is not listed came later, and all its messages may be sent.
     floors: BTreeMap<SourceId, u64>,
 }
 
@@ -114,25 +114,25 @@ pub(crate) struct Share {
     pub(crate) blind: Blind,
     pub(crate) epoch: Epoch,
     pub(crate) rotation: Option<Rotation>,
-    /// When the epoch has lasted long enough.
+    /// End of the epoch's lifetime.
     pub(crate) rotate_at: Instant,
     /// This node's own sources.
     pub(crate) own: Vec<Arc<SourceProgress>>,
-    /// What this node has heard of others' sources.
+    /// Progress of this node's sink with others' sources.
     pub(crate) heard: Option<Arc<SinkProgress>>,
     pub(crate) sinks: BTreeMap<SinkId, GrantedSink>,
-    /// True once this node's own sink was told of it: it has to hear when nobody may publish any more, too.
+    /// Set once this node's own sink was told of the share: it has to learn also that nobody may publish any more.
     pub(crate) told_own: bool,
-    /// Who receives it, or did, and what it may have sent to it again.
-    pub(crate) since: BTreeMap<NodeId, Since>,
-    /// Who left and still has the newest key. If one of them loses its right, that key has to go.
+    /// Nodes that receive or received it, and the messages that may be sent to them again.
+    pub(crate) since: BTreeMap<NodeId, ReceiveStart>,
+    /// Nodes that left and still have the newest key. If one of them loses its right, the key has to be replaced.
     pub(crate) left: BTreeMap<NodeId, (VerifiedPeer, Role)>,
-    /// What its type looks like, if that is known.
+    /// Description of its type, if known.
     pub(crate) described: Option<PackedType>,
 }
 
 impl Share {
-    /// What is granted of an epoch to one who asked with `request`.
+    /// Returns the grant of an epoch for this request.
     pub(crate) fn grant(&self, epoch: &Epoch, peer: Option<&GrantedSink>) -> TopicGrant {
         let own = self.own.iter().map(|s| s.announce()).map(|announce| {
             let floor = match peer {
@@ -142,7 +142,7 @@ impl Share {
             let recover = if announce.recover > 0 { floor } else { 0 };
             SourceAnnounce { recover, ..announce }
         });
-        // By source: one that moved to another way may have two places for a while.
+        // By source: after a route change a source may have two sinks for a while.
         let others: BTreeMap<_, _> = self
             .sinks
             .values()
@@ -151,12 +151,12 @@ impl Share {
                 Request::Subscribe { .. } | Request::Ask { .. } => None,
             })
             .collect();
-        // They keep no history; what this node has heard of them is past to whoever is told of them now.
+        // They keep no history; messages that this node has received are past for new sinks.
         let others = others.into_iter().map(|(source, key)| {
             let next = self.heard.as_ref().map_or(0, |heard| heard.newest(&source)).saturating_add(1);
             SourceAnnounce { source, key, oldest: next, next, recover: 0 }
         });
-        // Who calls a service hears its owner alone, and who else calls it is nobody's business.
+        // A service's client receives from its owner alone, and does not learn of other clients.
         let others = others.filter(|_| peer.is_none() || !self.is_service());
         let describe = peer.filter(|p| matches!(p.request, Request::Subscribe { describe: true }));
         TopicGrant {
@@ -168,16 +168,16 @@ impl Share {
         }
     }
 
-    /// True if those who publish on it call a service.
+    /// Returns `true` if its publishers call a service.
     pub(crate) fn is_service(&self) -> bool {
         self.spec.metadata.kind == Kind::Service
     }
 
-    /// Remembers since when a node receives the share, if it did not before; at most `max` nodes, beside those that
-    /// receive it now.
+    /// Remembers from when on a node receives the share, if it is new; at most `max` nodes, beside those that receive
+    /// it now.
     pub(crate) fn note_since(&mut self, peer: &VerifiedPeer, max: usize) {
         if let Some(known) = self.since.get_mut(&peer.node_id) {
-            // It may have another certificate by now.
+            // The node may have another certificate by now.
             known.peer = peer.clone();
             return;
         }
@@ -188,26 +188,26 @@ impl Share {
             }
         }
         let floors = self.own.iter().map(|s| s.announce()).map(|a| (a.source, a.oldest)).collect();
-        self.since.insert(peer.node_id, Since { peer: peer.clone(), floors });
+        self.since.insert(peer.node_id, ReceiveStart { peer: peer.clone(), floors });
     }
 
-    /// The first message of a source that a node may have sent to it again.
+    /// Returns the first message of a source that may be sent to a node again.
     pub(crate) fn floor(&self, node: &NodeId, source: &SourceId) -> Option<u64> {
         self.since.get(node).map(|since| since.floors.get(source).copied().unwrap_or(1))
     }
 
-    /// Forgets the floors of sources that are no more.
+    /// Forgets the floors of sources that no longer exist.
     pub(crate) fn forget_floors(&mut self) {
         let own: BTreeSet<_> = self.own.iter().map(|s| s.id()).collect();
         self.since.values_mut().for_each(|since| since.floors.retain(|source, _| own.contains(source)));
     }
 
-    /// The epoch that sinks were told last.
+    /// Returns the epoch of the last grants.
     pub(crate) fn newest(&self) -> &Epoch {
         self.rotation.as_ref().map_or(&self.epoch, |r| &r.epoch)
     }
 
-    /// True if `source` publishes here already, other than by the request of `sink`.
+    /// Returns `true` if `source` publishes here already, other than by the request of `sink`.
     pub(crate) fn has_source(&self, source: &SourceId, sink: &SinkId) -> bool {
         let offered =
             |s: &GrantedSink| matches!(&s.request, Request::Publish { offer } if offer.source == *source);
@@ -215,7 +215,7 @@ impl Share {
             || self.sinks.iter().any(|(id, s)| id != sink && offered(s))
     }
 
-    /// The share as `peer` may see it.
+    /// Returns the share's entry in the catalogue for `peer`.
     pub(crate) fn entry(&self, peer: &VerifiedPeer) -> CatalogueEntry {
         let policy = &self.spec.policy;
         CatalogueEntry {
@@ -232,9 +232,9 @@ impl Share {
         }
     }
 
-    /// This node's publishers behind it; and one for all others, where others may publish. They are not told apart: each would
-    /// be listed after its first messages. A transient-local topic has no others, since those keep no history; and who calls a
-    /// service is nobody else's business.
+    /// Returns this node's publishers, and one entry for all others, where others may publish. These are not told
+    /// apart: each would be listed after its first messages. A transient-local topic has no others, because they keep
+    /// no history; and a service's clients are hidden from each other.
     fn listed_sources(&self) -> Vec<CatalogueSource> {
         let has_others =
             !self.spec.policy.publish.is_empty() && !self.spec.qos.is_transient_local() && !self.is_service();
@@ -244,23 +244,23 @@ impl Share {
     }
 }
 
-/// All shares of a node, and those who follow its catalogue.
+/// All shares of a node, and the followers of its catalogue.
 #[derive(Debug, Default)]
 pub(crate) struct Shares {
     pub(crate) shares: BTreeMap<Name, Share>,
-    /// By the name of the catalogue, of which there is one for each secret that names are derived from.
+    /// Followers by the name of the catalogue, of which there is one for each naming secret.
     pub(crate) followers: BTreeMap<(Name, SinkId), GrantedSink>,
     pub(crate) version: u64,
 }
 
 impl Shares {
-    /// What `peer` may see.
+    /// Returns the catalogue for `peer`.
     pub(crate) fn catalogue_for(&self, peer: &VerifiedPeer) -> Catalogue {
         let entries = self.shares.values().map(|s| s.entry(peer)).filter(|e| e.subscribe || e.publish);
         Catalogue { version: self.version, entries: entries.collect() }
     }
 
-    /// The nodes granted one name, each sink once.
+    /// Iterates over the nodes granted one name, each sink once.
     pub(crate) fn granted(&self, name: &Name) -> impl Iterator<Item = (SinkId, NodeId)> + '_ {
         self.shares.get(name).into_iter().flat_map(|s| s.sinks.iter().map(|(id, g)| (*id, g.peer.node_id)))
     }

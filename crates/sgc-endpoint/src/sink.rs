@@ -1,10 +1,10 @@
-//! One subscriber of one name: opens and verifies packets, puts messages together, and delivers each once.
+//! One subscriber of one name: opens and verifies packets, assembles messages, and delivers each once.
 //!
-//! Of a source that can send again what was lost it delivers every number in turn: one that is missing is asked for, and
-//! what comes before the answer is left out, since the answer contains it. So order needs no memory.
+//! If a source can send lost messages again, the sink delivers every number in turn: it asks for missing ones, and
+//! drops later ones that come before the answer, because the answer contains them. So order needs no memory.
 //!
-//! Nothing is allocated on the word of a header: the packet that claims a size must open, and be signed,
-//! first. A packet that is refused leaves no state.
+//! The claims of a header allocate nothing: the packet must open, and be signed, first. A refused packet leaves no
+//! state.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
@@ -17,18 +17,18 @@ use sgc_wire::{
     SinkId, Slab, SourceAnnounce, SourceId, TopicGrant,
 };
 
-use crate::parking::{Parked, Parking};
+use crate::parking::{ParkedPacket, Parking};
 use crate::partial::Partials;
 use crate::source::without_lists;
 
-/// Epochs whose keys are held at once. One that is over is held until [`Sink::retire_epochs`]; beyond this
-/// number the oldest goes.
+/// Epochs whose keys are held at once. A past epoch is held until [`Sink::retire_epochs`]; beyond this number the
+/// oldest goes.
 pub const EPOCHS_MAX: usize = 8;
 
 /// Bounds of one sink.
 #[derive(Clone, Debug)]
 pub struct SinkLimits {
-    /// Sources believed; those announced beyond it are not.
+    /// Most sources; further announced ones are ignored.
     pub sources_max: usize,
     /// Messages of one source that may be incomplete at once.
     pub partials_per_source_max: usize,
@@ -49,22 +49,22 @@ impl Default for SinkLimits {
 /// A complete message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Message {
-    /// Who published it.
+    /// The publishing source.
     pub source: SourceId,
     /// Its number at the source.
     pub seq: u64,
-    /// What it is and when it was published.
+    /// Kind and time of publication.
     pub head: MessageHead,
-    /// True if its publisher waits for who cannot take it; otherwise newer ones replace it.
+    /// Whether its publisher waits for slow receivers; otherwise newer messages replace it.
     pub reliable: bool,
     /// The payload, as it was published.
     pub payload: Bytes,
 }
 
-/// What a packet came to.
+/// Result of a packet.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Delivery {
-    /// It completed a message.
+    /// The packet completed a message.
     Message(Message),
     /// More fragments are needed.
     Incomplete,
@@ -72,32 +72,32 @@ pub enum Delivery {
     Mark,
     /// No message: the publisher of this source asserted its liveliness.
     Asserted(SourceId),
-    /// The source must be asked for what is missing before its messages can be delivered; see [`Sink::ask`].
+    /// The sink has to ask the source for missing messages before it delivers later ones; see [`Sink::ask`].
     NeedsHistory(SourceId),
-    /// The source has sent what it was asked for.
+    /// The source has sent the requested messages.
     Synced(SourceId),
-    /// That many numbers of the source will never be delivered: nobody has their messages any more.
+    /// This many numbers of the source will never be delivered: nobody has their messages any more.
     Lost(SourceId, u64),
-    /// It waits for the grant that tells of its epoch or source; see [`Sink::regrant`].
+    /// The packet waits for the grant that explains its epoch or source; see [`Sink::regrant`].
     Parked,
 }
 
-/// Why a packet was dropped.
+/// The reason why a packet was dropped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum SinkDrop {
-    /// It could not be opened.
+    /// The packet could not be opened.
     #[error(transparent)]
     Open(#[from] OpenError),
-    /// It is for another sink, or for this one as it asked before.
+    /// The packet is for another sink, or for an earlier id of this one.
     #[error("addressed to another sink")]
     NotForUs,
-    /// Several grants were to tell of its source, and none did.
+    /// Several grants came, and none announced its source.
     #[error("of a source that the owner does not announce")]
     UnknownSource,
-    /// Several grants were to tell of its epoch, and none did.
+    /// Several grants came, and none had its epoch.
     #[error("of an epoch that was never granted")]
     UnknownEpoch,
-    /// It waits for a grant, and an older one that did has been dropped for it.
+    /// The packet waits for a grant, and an older waiting packet was dropped for it.
     #[error("too many packets wait for a grant")]
     ParkingFull,
     /// The message was published before the source was announced to this sink, and not asked for.
@@ -118,7 +118,7 @@ pub enum SinkDrop {
     /// The message's head is malformed.
     #[error("message head malformed")]
     Head,
-    /// What its source was asked for has not arrived yet, and will contain it.
+    /// The requested messages have not arrived yet, and will contain this one.
     #[error("awaiting the answer that contains it")]
     AwaitingHistory,
     /// The bound on incomplete messages is reached, and its source would have more than its share of them.
@@ -127,7 +127,7 @@ pub enum SinkDrop {
 }
 
 impl SinkDrop {
-    /// A short, stable name for counters.
+    /// Returns a short, stable name for counters.
     pub fn key(&self) -> &'static str {
         match self {
             Self::Open(OpenError::Suite { .. }) => "sink_suite",
@@ -152,70 +152,69 @@ impl SinkDrop {
     }
 }
 
-/// How far a sink is with each source, to be read without its lock.
+/// Progress of a sink with each source, readable without its lock.
 #[derive(Debug, Default)]
 pub struct SinkProgress {
     newest: Mutex<BTreeMap<SourceId, Arc<AtomicU64>>>,
 }
 
 impl SinkProgress {
-    /// The greatest number of a message of the source that was delivered; 0 before any, or if the sink does not
-    /// know the source.
+    /// Returns the greatest delivered number of the source; 0 before any, or if the sink does not know the source.
     pub fn newest(&self, source: &SourceId) -> u64 {
         let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
         newest.get(source).map_or(0, |n| n.load(Acquire))
     }
 }
 
-/// What to do about a source that was asked, if nothing was heard for a while.
+/// Action for a source that was asked and then silent for a while.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum AskAgain {
     /// Nothing is missing any more.
     No,
     /// The answer is on its way.
     Wait,
-    /// Ask for all from this number on.
+    /// Ask for all messages from this number on.
     From(u64),
 }
 
-/// What the next grant may explain.
-enum Unexplained {
+/// The fact that a packet lacks and the next grant may bring.
+enum MissingGrant {
     Epoch,
     Source,
 }
 
-/// A source that was announced.
+/// An announced source.
 struct SourceState {
-    /// What its signatures verify with, as announced; parsed when the first packet opens.
+    /// The announced key of its signatures; parsed when the first packet opens.
     announced_key: Bytes,
     verifier: Option<BatchVerifier>,
-    /// By epoch: for packets to all.
+    /// Keys for packets to all, by epoch.
     keys: Vec<SourceKey>,
-    /// For packets to this sink, of the epoch seen last.
+    /// The key for packets to this sink, of the epoch seen last.
     addressed: Option<SourceKey>,
     window: ReplayWindow,
     /// The window's newest, for [`SinkProgress`].
     newest: Arc<AtomicU64>,
-    /// Packets to all below it are replays of what was published before this sink was told of the source.
+    /// Lower numbers to all are replays from before this sink was told of the source.
     next: u64,
-    /// Packets to this sink below it are none that this sink asked for.
+    /// This sink did not ask for lower numbers.
     oldest: u64,
-    /// True if what is lost can be asked for: then its messages are delivered in the order of their numbers.
+    /// Whether lost messages can be asked for: then messages are delivered in the order of their numbers.
     recovers: bool,
-    /// The next number: of such a source all below it are done with, of another it is one more than the newest.
+    /// The next number: of a source with recovery all lower ones are done, of another it is one more than the newest.
     expected: u64,
     partials: Partials,
-    /// False while something is missing: a transient-local source's history, or what a broken way lost.
+    /// `false` while something is missing: a transient-local source's history, or messages lost on a broken route.
     synced: bool,
-    /// True once it was asked for.
+    /// Set once the source was asked for it.
     asked: bool,
-    /// True if the history is to begin wherever it does.
+    /// Whether the history may begin at any number.
     anew: bool,
-    /// True if something of the answer came since somebody looked.
+    /// Whether a part of the answer came since the last look.
     heard: bool,
-    /// True if the answer has a hole, so that it must be asked for once more.
+    /// Whether the answer has a hole, so that it must be asked for once more.
     torn: bool,
-    /// The last epoch in which it is believed, if the newest grant no longer announces it.
+    /// The last epoch of the source, if the newest grant no longer announces it.
     last_epoch: Option<u32>,
 }
 
@@ -231,14 +230,13 @@ pub struct Sink {
     parking: Parking,
     incomplete: u64,
     scratch: Vec<u8>,
-    /// For messages of one packet.
+    /// Memory for messages of one packet.
     slab: Slab,
     progress: Arc<SinkProgress>,
 }
 
 impl Sink {
-    /// A sink that was granted as `id`. A transient-local one takes each source's history before anything
-    /// else.
+    /// Returns a sink that was granted as `id`. A transient-local one takes each source's history before anything else.
     pub fn new(name: Name, id: SinkId, grant: TopicGrant, transient_local: bool, limits: SinkLimits) -> Self {
         let mut sink = Self {
             name,
@@ -257,16 +255,14 @@ impl Sink {
         sink
     }
 
-    /// Takes a further grant, and hands over what the packets come to that waited for it.
+    /// Takes a further grant, and returns the results of the packets that waited for it.
     ///
-    /// - A later epoch is added to those that are known. What was delivered is remembered; packets of the
-    ///   epochs before open until [`Self::retire_epochs`].
-    /// - Another key for an epoch that was known, or an earlier epoch, is that of an owner that started anew:
-    ///   nothing of before counts.
-    /// - Under another id (the way to the owner changed, and this sink asked again), what a source has published
-    ///   beyond what is here must be asked for.
-    /// - A source that is no longer announced is believed in the epochs until then, and in none that begins
-    ///   later.
+    /// - A later epoch is added to the known ones. Delivered numbers are remembered; packets of the earlier epochs open until
+    ///   [`Self::retire_epochs`].
+    /// - Another key for a known epoch, or an earlier epoch, is that of a restarted owner: nothing of before counts.
+    /// - Under another id (the route to the owner changed, and this sink asked again), newer messages of a source must be asked
+    ///   for.
+    /// - A source that is no longer announced counts in the epochs until then, and in no later one.
     pub fn regrant(
         &mut self,
         id: SinkId,
@@ -294,7 +290,7 @@ impl Sink {
             self.id = id;
             for source in self.sources.values_mut() {
                 source.addressed = None;
-                // Whom it was asked as is nobody any more.
+                // The id of the request is no longer valid.
                 source.asked = false;
             }
         }
@@ -304,11 +300,11 @@ impl Sink {
             let result = match self.handle(&parked.packet) {
                 Ok(Ok(delivery)) => Ok(delivery),
                 Ok(Err(unexplained)) if parked.looked_in_vain(latest) => Err(match unexplained {
-                    Unexplained::Epoch => SinkDrop::UnknownEpoch,
-                    Unexplained::Source => SinkDrop::UnknownSource,
+                    MissingGrant::Epoch => SinkDrop::UnknownEpoch,
+                    MissingGrant::Source => SinkDrop::UnknownSource,
                 }),
                 Ok(Err(_)) => {
-                    // It was here before, so there is room.
+                    // The packet was parked before, so there is room.
                     self.parking.push(parked);
                     continue;
                 }
@@ -318,8 +314,7 @@ impl Sink {
         }
     }
 
-    /// Drops all epochs but the newest, and the sources that are not announced in it: their packets are
-    /// refused.
+    /// Drops all epochs but the newest, and the sources that are not announced in it: their packets are refused.
     pub fn retire_epochs(&mut self) {
         let newest = self.newest_epoch();
         self.epochs.retain(|known| known.epoch == newest);
@@ -328,13 +323,13 @@ impl Sink {
         self.list_progress();
     }
 
-    /// The announced sources of which something is missing.
+    /// Iterates over the announced sources with missing messages.
     pub fn unsynced(&self) -> impl Iterator<Item = SourceId> + '_ {
         self.sources.iter().filter(|(_, s)| !s.synced && s.last_epoch.is_none()).map(|(id, _)| *id)
     }
 
-    /// From which number on a source must be asked for its messages, which the caller then does; `None` if nothing is
-    /// missing. 0 stands for its history, wherever that begins.
+    /// Returns the number from which on a source must be asked for its messages, which the caller then does; `None` if
+    /// nothing is missing. 0 stands for the whole history.
     pub fn ask(&mut self, source: SourceId) -> Option<u64> {
         let state = self.sources.get_mut(&source).filter(|s| !s.synced && s.last_epoch.is_none())?;
         state.asked = true;
@@ -343,7 +338,7 @@ impl Sink {
         Some(if state.anew { 0 } else { state.expected })
     }
 
-    /// The same a while after it was asked.
+    /// Returns the action for a source a while after it was asked.
     pub fn ask_again(&mut self, source: SourceId) -> AskAgain {
         match self.sources.get_mut(&source) {
             Some(state) if !state.synced && state.heard && !state.torn => {
@@ -354,18 +349,19 @@ impl Sink {
         }
     }
 
-    /// True if the messages of a source can be asked for again, so that none need be taken that can go nowhere.
+    /// Returns `true` if the messages of a source can be asked for again, so that messages without a destination may be
+    /// dropped.
     pub fn recovers(&self, source: &SourceId) -> bool {
         self.sources.get(source).is_some_and(|s| s.recovers)
     }
 
-    /// Drops the packets that wait for a grant and are of sources whose messages can go nowhere yet; these sources. Each must be
-    /// [suspected](Self::suspect) once its messages can go somewhere.
+    /// Drops the parked packets of sources whose messages have no destination yet. Returns these sources; each must be
+    /// [suspected](Self::suspect) once its messages have one.
     pub fn pass_over(&mut self, can_go_nowhere: impl Fn(&SourceId) -> bool) -> BTreeSet<SourceId> {
         self.parking.drop_of(can_go_nowhere)
     }
 
-    /// Something of a source was not handed over: it must be asked for it, if it can be.
+    /// Marks a source of which a message was not handed over: it must be asked for it, if it can be.
     pub fn suspect(&mut self, source: &SourceId) {
         let known = self.sources.get_mut(source);
         if let Some(source) = known.filter(|s| s.recovers && s.last_epoch.is_none()) {
@@ -373,8 +369,8 @@ impl Sink {
         }
     }
 
-    /// Begins anew with a source whose messages went nowhere meanwhile: its history will be asked for, and
-    /// delivered again. Other messages that were published until now stay past.
+    /// Begins anew with a source whose messages had no destination meanwhile: its history will be asked for, and
+    /// delivered again. Other earlier messages stay past.
     pub fn forget(&mut self, source: &SourceId) {
         if let Some(state) = self.sources.get_mut(source) {
             state.next = state.next.max(state.window.newest().saturating_add(1));
@@ -391,32 +387,32 @@ impl Sink {
         debug_assert_eq!(packet.header.name, self.name);
         match self.handle(packet)? {
             Ok(delivery) => Ok(delivery),
-            Err(_) if self.parking.push(Parked::new(packet)) > 0 => Err(SinkDrop::ParkingFull),
+            Err(_) if self.parking.push(ParkedPacket::new(packet)) > 0 => Err(SinkDrop::ParkingFull),
             Err(_) => Ok(Delivery::Parked),
         }
     }
 
-    /// Messages given up because a newer one was complete first, or for want of room.
+    /// Returns the messages given up because a newer one was complete first, or for want of room.
     pub fn incomplete(&self) -> u64 {
         self.incomplete
     }
 
-    /// How far it is with each source, to be read while another thread feeds it.
+    /// Returns the progress with each source, to be read while another thread feeds the sink.
     pub fn progress(&self) -> Arc<SinkProgress> {
         self.progress.clone()
     }
 
-    /// Packets that wait for a grant.
+    /// Returns the number of packets that wait for a grant.
     pub fn parked(&self) -> usize {
         self.parking.len()
     }
 
-    /// The epochs whose packets open, oldest first.
+    /// Iterates over the epochs whose packets open, oldest first.
     pub fn epochs(&self) -> impl Iterator<Item = u32> + '_ {
         self.epochs.iter().map(|known| known.epoch)
     }
 
-    /// Signatures that were checked.
+    /// Returns the number of checked signatures.
     pub fn signatures_checked(&self) -> u64 {
         let verifiers = self.sources.values().filter_map(|s| s.verifier.as_ref());
         verifiers.map(BatchVerifier::signatures_checked).sum()
@@ -426,8 +422,8 @@ impl Sink {
         self.epochs.last().map_or(0, |known| known.epoch)
     }
 
-    /// Takes over who is announced; `before` is the newest epoch that was known before, if this is not the first, and
-    /// `moved` says that packets came another way until now.
+    /// Takes over the announced sources; `before` is the newest known epoch, if this grant is not the first, and
+    /// `moved` means that packets came on another route until now.
     fn announce(
         &mut self,
         announced: Vec<SourceAnnounce>,
@@ -461,7 +457,7 @@ impl Sink {
         self.list_progress();
     }
 
-    /// Lists the sources that are known by now.
+    /// Lists the sources known by now.
     fn list_progress(&self) {
         let newest = self.sources.iter().map(|(id, s)| (*id, s.newest.clone())).collect();
         *self.progress.newest.lock().unwrap_or_else(PoisonError::into_inner) = newest;
@@ -484,16 +480,16 @@ impl Sink {
         }
     }
 
-    /// What a packet comes to, if a grant explained it. In this order: what costs nothing (addressee, epoch,
-    /// suite, replay); the seal, which only holders of the topic's key pass; the signature.
-    fn handle(&mut self, packet: &Packet) -> Result<Result<Delivery, Unexplained>, SinkDrop> {
+    /// Returns the result of a packet, if a grant explained it. Checks in this order: the cheap facts (addressee,
+    /// epoch, suite, replay); the seal, which only holders of the topic's key pass; the signature.
+    fn handle(&mut self, packet: &Packet) -> Result<Result<Delivery, MissingGrant>, SinkDrop> {
         let header = &packet.header;
         if header.to.is_some_and(|to| to != self.id) {
             return Err(SinkDrop::NotForUs);
         }
         let Some(grant) = self.epochs.iter().find(|known| known.epoch == header.epoch) else {
             if header.epoch > self.newest_epoch() {
-                return Ok(Err(Unexplained::Epoch));
+                return Ok(Err(MissingGrant::Epoch));
             }
             return Err(OpenError::Epoch { found: header.epoch }.into());
         };
@@ -511,10 +507,10 @@ impl Sink {
         };
         let known = self.sources.get_mut(&header.source);
         let Some(source) = known.filter(|s| s.last_epoch.is_none_or(|last| header.epoch <= last)) else {
-            // Who does not hold the topic's key takes no room.
+            // Nodes without the topic's key take no room.
             let mut text = vec![0; opened_bytes(header)];
             derive(grant, &self.name, header)?.open(header, payload, &mut text)?;
-            return Ok(Err(Unexplained::Source));
+            return Ok(Err(MissingGrant::Source));
         };
         source.check_freshness(header)?;
         source.derive_key(grant, &self.name, header)?;
@@ -529,19 +525,19 @@ impl Sink {
         let mut opened = if header.fragments() == 1 {
             let mut text = self.slab.room(text_bytes);
             text.resize(text_bytes, 0);
-            Opened::Whole(text)
+            OpenBuffer::Whole(text)
         } else if partials.place(header).is_some() {
-            Opened::InPlace
+            OpenBuffer::InPlace
         } else {
             let mut scratch = std::mem::take(&mut self.scratch);
             scratch.clear();
             scratch.resize(text_bytes, 0);
-            Opened::Aside(scratch)
+            OpenBuffer::Aside(scratch)
         };
         let out = match &mut opened {
-            Opened::Whole(text) => &mut text[..],
-            Opened::Aside(text) => &mut text[..],
-            Opened::InPlace => partials.place(header).unwrap_or_default(),
+            OpenBuffer::Whole(text) => &mut text[..],
+            OpenBuffer::Aside(text) => &mut text[..],
+            OpenBuffer::InPlace => partials.place(header).unwrap_or_default(),
         };
         let mut result = key.open(header, payload, out);
         if result.is_ok() && suite.is_signed() {
@@ -551,14 +547,14 @@ impl Sink {
             Ok(()) => self.accept(header, &mut opened),
             Err(error) => Err(error.into()),
         };
-        if let Opened::Aside(scratch) = opened {
+        if let OpenBuffer::Aside(scratch) = opened {
             self.scratch = scratch;
         }
         delivery.map(Ok)
     }
 
-    /// Makes room for a message that begins. Of a source that has no more than its share with it, the oldest messages of the
-    /// sources that have most give way.
+    /// Makes room for a message that begins. If its source has no more than its share with it, the oldest messages of
+    /// the sources with the most give way.
     fn make_partial_room(&mut self, header: &PacketHeader) -> Result<(), SinkDrop> {
         let max = self.limits.partial_bytes_max;
         let held: BTreeMap<SourceId, usize> =
@@ -585,11 +581,11 @@ impl Sink {
         Ok(())
     }
 
-    /// Returns what an assertion comes to that `by` says of a publisher: of one at its own node, which signs with the same key. Others'
-    /// publishers are none of its business.
+    /// Returns the result of an assertion in `by` about a publisher. It counts for publishers of the same node, which
+    /// sign with the same key, and for no others.
     fn asserted(&self, by: &SourceId, publisher: [u8; 8]) -> Delivery {
         let Some(SourceState { announced_key, .. }) = self.sources.get(by) else { return Delivery::Mark };
-        let [first, last] = [0, 0xff].map(|byte| SourceId::of_publisher(publisher, [byte; 8]));
+        let [first, last] = [0, 0xff].map(|byte| SourceId::from_publisher(publisher, [byte; 8]));
         let is_it = |(id, state): &(&SourceId, &SourceState)| {
             *id != by && state.last_epoch.is_none() && state.announced_key == *announced_key
         };
@@ -597,14 +593,14 @@ impl Sink {
         found.map_or(Delivery::Mark, |(id, _)| Delivery::Asserted(*id))
     }
 
-    /// Takes what a packet opened to: fragment, and behind the first one the head.
-    fn accept(&mut self, header: &PacketHeader, opened: &mut Opened) -> Result<Delivery, SinkDrop> {
+    /// Takes the opened text of a packet: fragment, and behind the first one the head.
+    fn accept(&mut self, header: &PacketHeader, opened: &mut OpenBuffer) -> Result<Delivery, SinkDrop> {
         let head = match opened {
-            Opened::Whole(_) | Opened::Aside(_) if header.index == 0 => {
+            OpenBuffer::Whole(_) | OpenBuffer::Aside(_) if header.index == 0 => {
                 let at = opened.text().len() - MESSAGE_HEAD_BYTES;
                 let head = MessageHead::from_slice(&opened.text()[at..]).map_err(|_| SinkDrop::Head)?;
                 opened.truncate(at);
-                // Number 0 is the mark that a history was sent, and nothing else.
+                // Number 0 is the mark of a history's end, and nothing else.
                 if (head.kind == MessageKind::Synced) != (header.seq == 0) {
                     return Err(SinkDrop::Head);
                 }
@@ -619,7 +615,7 @@ impl Sink {
             if head.is_none() || header.total > 0 {
                 return Err(SinkDrop::Head);
             }
-            // With a hole in it the answer is asked for again, after a while.
+            // An answer with a hole is asked for again, after a while.
             if source.torn {
                 return Err(SinkDrop::AwaitingHistory);
             }
@@ -631,7 +627,7 @@ impl Sink {
             source.heard = true;
         }
         if let Some(head) = head.filter(|head| head.kind == MessageKind::Mark) {
-            // An assertion that is sent again is no news of a publisher's liveliness.
+            // A resent assertion is no news of a publisher's liveliness.
             let asserted = head.asserted().filter(|_| header.to.is_none() && !source.recovers);
             let Some(publisher) = asserted else { return source.take_mark(header, opened.text()) };
             oldest_of_mark(header, opened.text())?;
@@ -651,13 +647,13 @@ impl Sink {
             return source.await_history(header.source);
         }
         let complete = match (opened, head) {
-            (Opened::Whole(text), Some(head)) => Some((head, std::mem::take(text).freeze())),
+            (OpenBuffer::Whole(text), Some(head)) => Some((head, std::mem::take(text).freeze())),
             (opened, head) => {
                 if begins {
                     self.make_partial_room(header)?;
                 }
                 let source = self.sources.get_mut(&header.source).ok_or(SinkDrop::UnknownSource)?;
-                let fragment = (!matches!(opened, Opened::InPlace)).then(|| opened.text());
+                let fragment = (!matches!(opened, OpenBuffer::InPlace)).then(|| opened.text());
                 let max = self.limits.partials_per_source_max;
                 let (complete, given_up) = source.partials.put(header, head, fragment, max)?;
                 self.incomplete += given_up;
@@ -668,7 +664,7 @@ impl Sink {
         let source = self.sources.get_mut(&header.source).ok_or(SinkDrop::UnknownSource)?;
         source.done(header.seq);
         if header.reliable {
-            // A reliable flow is in order: what is older and incomplete will never be complete.
+            // A reliable flow is in order: older incomplete messages will never be complete.
             self.incomplete += source.partials.give_up(header.seq);
         }
         let PacketHeader { source, seq, reliable, .. } = *header;
@@ -676,8 +672,8 @@ impl Sink {
     }
 }
 
-/// Where a packet was opened to.
-enum Opened {
+/// Place of a packet's opened text.
+enum OpenBuffer {
     /// Memory of its own, which becomes the message.
     Whole(BytesMut),
     /// Its place in the message.
@@ -686,8 +682,8 @@ enum Opened {
     Aside(Vec<u8>),
 }
 
-impl Opened {
-    /// What it was opened to, if that is here.
+impl OpenBuffer {
+    /// Returns the opened text, if it is here.
     fn text(&self) -> &[u8] {
         match self {
             Self::Whole(text) => text,
@@ -696,7 +692,7 @@ impl Opened {
         }
     }
 
-    /// Leaves out what stands behind.
+    /// Cuts off the rest.
     fn truncate(&mut self, bytes: usize) {
         match self {
             Self::Whole(text) => text.truncate(bytes),
@@ -730,35 +726,35 @@ impl SourceState {
         }
     }
 
-    /// How many numbers are lost for good. The floors stay those of the first announcement: what is under way since
-    /// then was not delivered yet, and what was is in the window.
+    /// Takes a repeated announcement and returns the number of messages that are lost for good. The floors stay those
+    /// of the first announcement: later messages were not delivered yet, or are in the window.
     fn announce_again(&mut self, announce: &SourceAnnounce) -> u64 {
         self.last_epoch = None;
         if self.announced_key != announce.key {
             self.announced_key = announce.key.clone();
             self.verifier = None;
         }
-        // Nothing older will be sent to this node, whatever it asks for.
+        // Nothing older will be sent to this node.
         let lost = if self.recovers { announce.recover.saturating_sub(self.expected) } else { 0 };
         self.give_up(lost);
         lost
     }
 
-    /// Something is missing from here on.
+    /// Notes that messages are missing from here on.
     fn unsync(&mut self) {
         self.synced = false;
         self.asked = false;
         self.partials.clear();
     }
 
-    /// A number is missing.
+    /// Notes that a number is missing.
     fn miss(&mut self) {
         if self.synced {
             self.unsync();
         }
     }
 
-    /// A message that came too early.
+    /// Handles a message that came too early.
     fn await_history(&mut self, source: SourceId) -> Result<Delivery, SinkDrop> {
         if std::mem::replace(&mut self.asked, true) {
             return Err(SinkDrop::AwaitingHistory);
@@ -766,14 +762,14 @@ impl SourceState {
         Ok(Delivery::NeedsHistory(source))
     }
 
-    /// A number is done with: its message is complete.
+    /// Notes that a message is complete.
     fn done(&mut self, seq: u64) {
         self.window.accept(seq);
         self.newest.fetch_max(seq, Release);
         self.expected = self.expected.max(seq.saturating_add(1));
     }
 
-    /// The next numbers will never come.
+    /// Gives up the next numbers, which will never come.
     fn give_up(&mut self, numbers: u64) {
         if numbers > 0 {
             self.expected += numbers;
@@ -781,7 +777,7 @@ impl SourceState {
         }
     }
 
-    /// Takes a mark, of which each has its number. One that goes ahead of an answer says what is lost for good.
+    /// Takes a mark; each has its number. A mark ahead of an answer reports messages that are lost for good.
     fn take_mark(&mut self, header: &PacketHeader, text: &[u8]) -> Result<Delivery, SinkDrop> {
         let oldest = oldest_of_mark(header, text)?;
         let in_turn = !self.recovers || header.seq == self.expected;
@@ -797,7 +793,7 @@ impl SourceState {
             self.done(header.seq);
             return Ok(Delivery::Mark);
         }
-        // It goes ahead of an answer; its turn comes.
+        // The mark goes ahead of an answer, and counts in its turn.
         let lost = if self.anew { 0 } else { oldest.saturating_sub(self.expected) };
         if lost == 0 {
             return Ok(Delivery::Incomplete);
@@ -819,7 +815,7 @@ impl SourceState {
             return Err(SinkDrop::Replayed);
         }
         match self.window.check(header.seq) {
-            // As in DDS: what is best effort comes in order or not at all.
+            // As in DDS: best-effort messages come in order or not at all.
             Freshness::Fresh if !header.reliable && header.to.is_none() && header.seq < self.expected => {
                 Err(SinkDrop::Late)
             }
@@ -828,8 +824,7 @@ impl SourceState {
         }
     }
 
-    /// Derives the key for a packet if it is not here yet: one for each epoch, and one more for what is
-    /// addressed.
+    /// Derives the key for a packet if it is not here yet: one for each epoch, and one more for packets to this sink.
     fn derive_key(
         &mut self,
         grant: &TopicGrant,
@@ -853,7 +848,7 @@ fn oldest_of_mark(header: &PacketHeader, text: &[u8]) -> Result<u64, SinkDrop> {
     if oldest > header.seq { Err(SinkDrop::Head) } else { Ok(oldest) }
 }
 
-/// The key that a packet was sealed with, if it is what it says.
+/// Derives the key of a packet from its header.
 fn derive(grant: &TopicGrant, name: &Name, header: &PacketHeader) -> Result<SourceKey, OpenError> {
     let key = match &header.to {
         Some(sink) => SourceKey::derive_addressed(grant, name, &header.source, sink),
@@ -873,6 +868,6 @@ fn verify(
     if verifier.is_none() {
         *verifier = BatchVerifier::new(suite, announced_key);
     }
-    // A source that was announced with a key of no use has signed nothing.
+    // A source with an unusable key has signed nothing.
     verifier.as_mut().ok_or(OpenError::Signature)?.verify(header, payload)
 }

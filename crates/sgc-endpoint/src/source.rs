@@ -1,8 +1,8 @@
-//! One publisher under one name: numbers messages, cuts, seals and signs them, and keeps what late joiners, and
-//! those who lost something, may ask for.
+//! One publisher under one name: numbers messages, cuts, seals and signs them, and keeps those that late joiners and
+//! sinks with losses may ask for.
 //!
-//! A payload is read once, from where it is into the packets that leave; fragments of a large message leave
-//! before its end is read. Who may hear it, and when its epoch ends, is decided by the endpoint.
+//! A payload is read once, from its place into the leaving packets; fragments of a large message leave before its end
+//! is read. The endpoint decides who may receive it, and when its epoch ends.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
@@ -14,14 +14,14 @@ use sgc_wire::{
     SourceAnnounce, SourceId, TopicGrant,
 };
 
-use crate::history::{History, Kept, RecoveryLimits};
+use crate::history::{History, HistoryEntry, RecoveryLimits};
 
 /// Bytes of message in one packet.
 pub const FRAGMENT_BYTES: u16 = 16 * 1024;
 /// Most messages of one source. At a million a second it lasts nine years; a new source id begins anew.
 pub const SOURCE_MESSAGES_MAX: u64 = 1 << 48;
 
-/// What a source is made of.
+/// Parameters of a source.
 #[derive(Clone, Debug)]
 pub struct SourceConfig {
     /// The name it publishes under.
@@ -36,11 +36,11 @@ pub struct SourceConfig {
     pub history_depth: usize,
     /// Bytes kept for late joiners.
     pub history_bytes_max: usize,
-    /// What is kept beyond that for who loses something; of reliable sources only.
+    /// Bounds of messages kept beyond that for recovery; of reliable sources only.
     pub recovery: RecoveryLimits,
 }
 
-/// Why a message was not published.
+/// The reason why a message was not published.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PublishError {
     /// Larger than any sink accepts.
@@ -49,20 +49,20 @@ pub enum PublishError {
         /// Its length.
         bytes: usize,
     },
-    /// The source has numbered all messages that it can; it takes one of another id to go on.
+    /// The source has used all its numbers; publishing continues with a source of another id.
     #[error("a source carries at most {SOURCE_MESSAGES_MAX} messages")]
     Exhausted,
-    /// What is for one sink would be kept for others.
+    /// A message for one sink would be kept for others.
     #[error("a source that keeps messages has none for one sink alone")]
     Keeps,
 }
 
-/// How far a source is, to be read without its lock.
+/// Progress of a source, readable without its lock.
 #[derive(Debug)]
 pub struct SourceProgress {
     source: SourceId,
     key: Bytes,
-    /// True if what is lost can be asked for.
+    /// Whether lost messages can be asked for.
     recovers: bool,
     next: AtomicU64,
     oldest: AtomicU64,
@@ -74,7 +74,7 @@ pub struct SourceProgress {
 }
 
 impl SourceProgress {
-    /// The source with its present floors, for the owner to vouch for.
+    /// Returns the source with its present floors, for the owner's grant.
     pub fn announce(&self) -> SourceAnnounce {
         // Both only grow, `next` first: read the other way round, the oldest is never beyond the next.
         let oldest = self.oldest.load(Acquire);
@@ -88,33 +88,33 @@ impl SourceProgress {
         self.source
     }
 
-    /// What its messages verify with; empty if the suite has no signatures.
+    /// Returns the key that verifies its messages; empty if the suite has no signatures.
     pub fn key(&self) -> &Bytes {
         &self.key
     }
 
-    /// True if what sinks lose can be sent to them again.
+    /// Returns `true` if the source can send lost messages again.
     pub fn recovers(&self) -> bool {
         self.recovers
     }
 
-    /// Messages published, and marks.
+    /// Returns the number of published messages and marks.
     pub fn published(&self) -> u64 {
         self.next.load(Acquire).saturating_sub(1)
     }
 
-    /// The number of the last message that is no mark: what has to change for a silence to end.
+    /// Returns the number of the last message that is no mark: a larger one ends a silence.
     pub fn last_message(&self) -> u64 {
         self.last_message.load(Acquire)
     }
 
-    /// Messages published since the present epoch began; many ask for a new one.
+    /// Returns the messages published in the present epoch; many require a new one.
     pub fn published_in_epoch(&self) -> u64 {
         let start = self.epoch_start.load(Acquire);
         self.published().saturating_sub(start)
     }
 
-    /// Signatures made: one for each batch.
+    /// Returns the number of signatures: one for each batch.
     pub fn signatures(&self) -> u64 {
         self.signatures.load(Acquire)
     }
@@ -124,7 +124,7 @@ impl SourceProgress {
 pub struct Source {
     config: SourceConfig,
     suite: Suite,
-    /// The present epoch, for deriving keys; without the lists that came with it.
+    /// The present epoch, for deriving keys; without the lists of its grant.
     grant: TopicGrant,
     key: SourceKey,
     message_key: MessageKey,
@@ -138,8 +138,8 @@ pub struct Source {
 }
 
 impl Source {
-    /// A source that starts at message 1; `None` if the grant's suite is not in this build, or the key is not
-    /// one to sign with in it. Sources may share a key.
+    /// Makes a source that starts at message 1; `None` if the grant's suite is not in this build, or the key does not
+    /// fit it. Sources may share a key.
     ///
     /// Never make two sources under one id with one topic key: their nonces would repeat.
     pub fn new(config: SourceConfig, grant: &TopicGrant, message_key: MessageKey) -> Option<Self> {
@@ -175,8 +175,8 @@ impl Source {
         })
     }
 
-    /// Seals what follows in a new epoch; what waits for a signature leaves first. False, and nothing
-    /// happens, unless the epoch is later than the present one and of the same suite.
+    /// Seals later messages in a new epoch, after the packets that wait for a signature. Returns `false`, and does
+    /// nothing, unless the epoch is later than the present one and of the same suite.
     #[must_use]
     pub fn rekey(&mut self, grant: &TopicGrant, emit: impl FnMut(Packet)) -> bool {
         if grant.epoch <= self.grant.epoch || grant.suite != self.grant.suite {
@@ -192,8 +192,8 @@ impl Source {
 
     /// Seals one message and hands its packets to `emit` in order.
     ///
-    /// With `more` the caller says that it publishes again at once, or calls [`Self::flush`]: packets may
-    /// then wait for those that follow, and share a signature with them. Without it nothing waits.
+    /// With `more` the caller promises to publish again at once, or to call [`Self::flush`]: packets may then wait for
+    /// the next ones, and share a signature with them. Without it nothing waits.
     pub fn publish(
         &mut self,
         head: &MessageHead,
@@ -208,8 +208,8 @@ impl Source {
         result
     }
 
-    /// Seals one message for one sink alone and hands its packets to `emit` in order; of a source that keeps nothing.
-    /// It is numbered like any other: so no nonce is used twice, and the sink takes it once.
+    /// Seals one message for one sink alone and hands its packets to `emit` in order; for a source without history. The
+    /// message has a number like any other: so no nonce is used twice, and the sink takes it once.
     pub fn publish_to(
         &mut self,
         sink: SinkId,
@@ -226,12 +226,12 @@ impl Source {
         let Some(key) = key else { return Ok(()) };
         let seq = self.next_number(&payload)?;
         self.seal_fragments(Some(&key), seq, head, &payload, &mut emit);
-        self.keep(Kept { seq, head: *head, payload });
+        self.keep(HistoryEntry { seq, head: *head, payload });
         self.flush(emit);
         Ok(())
     }
 
-    /// Signs and hands over what waits for a signature.
+    /// Signs and hands over the packets that wait for a signature.
     pub fn flush(&mut self, mut emit: impl FnMut(Packet)) {
         if self.batch.is_empty() {
             return;
@@ -245,16 +245,15 @@ impl Source {
         self.batch.reuse(signed);
     }
 
-    /// Numbers and keeps one message that nobody listens to, without sealing it: who is on another way to this
-    /// source will ask for it.
+    /// Numbers and keeps one message that nobody listens to, without sealing it: a sink whose route to this source is
+    /// not complete will ask for it.
     pub fn record(&mut self, head: &MessageHead, payload: Bytes) -> Result<(), PublishError> {
         let seq = self.next_number(&payload)?;
-        self.keep(Kept { seq, head: *head, payload });
+        self.keep(HistoryEntry { seq, head: *head, payload });
         Ok(())
     }
 
-    /// Says to all what was published until here, so that who lost the last of it notices; nothing if there is
-    /// nothing that could be asked for.
+    /// Tells all sinks the last number, so that those that missed it notice; nothing if no message could be asked for.
     pub fn mark(&mut self, mut emit: impl FnMut(Packet)) {
         self.flush(&mut emit);
         if !self.progress.recovers || self.seq == 0 || self.seq >= SOURCE_MESSAGES_MAX {
@@ -264,7 +263,7 @@ impl Source {
         self.flush(emit);
     }
 
-    /// Says to all that a publisher asserted its liveliness, by a mark: in the name of a source that keeps nothing, so that
+    /// Tells all sinks, by a mark, that a publisher asserted its liveliness. The source keeps nothing, so that
     /// assertions take no place of messages.
     ///
     /// # Errors
@@ -279,16 +278,16 @@ impl Source {
         }
         let seq = self.next_number(&Bytes::new())?;
         let (head, payload) =
-            (MessageHead::of_assertion(publisher), Bytes::copy_from_slice(&seq.to_be_bytes()));
+            (MessageHead::for_assertion(publisher), Bytes::copy_from_slice(&seq.to_be_bytes()));
         self.seal_fragments(None, seq, &head, &payload, &mut emit);
-        self.keep(Kept { seq, head, payload });
+        self.keep(HistoryEntry { seq, head, payload });
         self.flush(emit);
         Ok(())
     }
 
-    /// Hands the kept messages `from..=to` to `emit`, sealed for one sink in the present epoch, and then the
-    /// sign that they were sent. What was published before leaves before. From 0 it is what late joiners get; if the
-    /// first that is asked for is here no more, a mark that says so goes ahead.
+    /// Hands the kept messages `from..=to` to `emit`, sealed for one sink in the present epoch, and then the sign of
+    /// their end. Waiting packets leave before. From 0 it is the history for late joiners; if the first requested
+    /// message is gone, a mark about that goes ahead.
     pub fn replay(&mut self, sink: SinkId, from: u64, to: u64, mut emit: impl FnMut(Packet)) {
         self.flush(&mut emit);
         let Some(key) = SourceKey::derive_addressed(&self.grant, &self.config.name, &self.config.id, &sink)
@@ -312,45 +311,45 @@ impl Source {
         self.flush(emit);
     }
 
-    /// Lets go what was dated before `ns`, nanoseconds since the Unix epoch: its lifespan is over, and nobody is to be given
-    /// it any more.
+    /// Drops messages dated before `ns`, nanoseconds since the Unix epoch: their lifespan is over, and nobody gets them
+    /// any more.
     pub fn expire(&mut self, ns: i64) {
         self.history.expire(ns);
         self.progress.oldest.store(self.history.late_from(), Release);
     }
 
-    /// Keeps so many messages for late joiners from here on, if it keeps any for them.
+    /// Sets the number of messages kept for late joiners, if the source keeps any.
     pub fn set_history_depth(&mut self, depth: usize) {
         self.history.set_depth(depth);
         self.progress.oldest.store(self.history.late_from(), Release);
     }
 
-    /// Its id.
+    /// Returns its id.
     pub fn id(&self) -> SourceId {
         self.config.id
     }
 
-    /// Messages published, and marks.
+    /// Returns the number of published messages and marks.
     pub fn published(&self) -> u64 {
         self.seq
     }
 
-    /// The epoch that it seals in.
+    /// Returns the epoch in which it seals.
     pub fn epoch(&self) -> u32 {
         self.grant.epoch
     }
 
-    /// Messages published since the present epoch began; many ask for a new one.
+    /// Returns the messages published in the present epoch; many require a new one.
     pub fn published_in_epoch(&self) -> u64 {
         self.progress.published_in_epoch()
     }
 
-    /// The source with its present floors, for the owner to vouch for.
+    /// Returns the source with its present floors, for the owner's grant.
     pub fn announce(&self) -> SourceAnnounce {
         self.progress.announce()
     }
 
-    /// The same, to be read while another thread publishes.
+    /// Returns its progress, to be read while another thread publishes.
     pub fn progress(&self) -> Arc<SourceProgress> {
         self.progress.clone()
     }
@@ -363,7 +362,7 @@ impl Source {
     ) -> Result<(), PublishError> {
         let seq = self.next_number(&payload)?;
         self.seal_fragments(None, seq, head, &payload, emit);
-        self.keep(Kept { seq, head: *head, payload });
+        self.keep(HistoryEntry { seq, head: *head, payload });
         Ok(())
     }
 
@@ -371,8 +370,8 @@ impl Source {
     fn seal_mark(&mut self, emit: &mut impl FnMut(Packet)) {
         self.seq += 1;
         let head = MessageHead::new(MessageKind::Mark, 0);
-        // Its own place in the history may be that of the oldest: what it says is what is left then.
-        self.keep(Kept { seq: self.seq, head, payload: Bytes::from_static(&[0; 8]) });
+        // The mark's own place in the history may be that of the oldest message: it reports the state after that.
+        self.keep(HistoryEntry { seq: self.seq, head, payload: Bytes::from_static(&[0; 8]) });
         let payload = Bytes::copy_from_slice(&self.history.oldest().to_be_bytes());
         if let Some(mark) = self.history.newest_mut() {
             mark.payload = payload.clone();
@@ -391,10 +390,10 @@ impl Source {
         Ok(self.seq)
     }
 
-    fn keep(&mut self, message: Kept) {
+    fn keep(&mut self, message: HistoryEntry) {
         let (seq, is_mark) = (message.seq, message.is_mark());
         self.history.push(message);
-        // What is announced as past can be asked for by now, so the order matters.
+        // The order matters: a message that is announced as past may be asked for at once.
         self.progress.next.store(seq + 1, Release);
         self.progress.oldest.store(self.history.late_from(), Release);
         if !is_mark {
@@ -447,7 +446,7 @@ impl Source {
     }
 }
 
-/// What keys are derived from.
+/// Returns the part of a grant from which keys are derived.
 pub(crate) fn without_lists(grant: &TopicGrant) -> TopicGrant {
     let TopicGrant { epoch, suite, key, .. } = grant;
     TopicGrant { epoch: *epoch, suite: *suite, key: key.clone(), sources: Vec::new(), entry: None }

@@ -1,7 +1,7 @@
-//! How often a payload is copied on its way: once at the source, into the packets, and once at the sink, into the message.
+//! Copies of a payload on its way: one at the source, into the packets, and one at the sink, into the message.
 //!
-//! A copy needs a place. An allocator that counts sees each that is made, on this thread; so what a message takes beyond
-//! its own length says whether there is a second one. `-- --nocapture` prints it.
+//! Every copy is an allocation, and a counting allocator sees those of this thread; so the memory of a message beyond
+//! its own length shows whether there is a second copy. `-- --nocapture` prints it.
 #![allow(clippy::print_stderr, reason = "what was counted is of use")]
 
 use bytes::Bytes;
@@ -17,7 +17,7 @@ use sgc_wire::{
 #[global_allocator]
 static COUNTING: CountingAllocator = CountingAllocator;
 
-/// Bytes that were allocated meanwhile.
+/// Returns the bytes that were allocated meanwhile.
 fn taken<T>(work: impl FnOnce() -> T) -> (usize, T) {
     let (taken, result) = allocations(work);
     (taken.bytes, result)
@@ -26,13 +26,13 @@ fn taken<T>(work: impl FnOnce() -> T) -> (usize, T) {
 const NAME: Name = Name([1; 32]);
 const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
 
-/// So many small messages share a piece of memory at the source: with fewer than these it would count once too often, or
+/// Number of small messages that share a piece of memory at the source: with fewer it would count once too often, or
 /// not at all.
 const ROUNDS: usize = 8;
-/// What a packet and a message take besides their payload: header, head, tag, counters of references, a signature and
-/// the hashes of a batch; bytes. Less than the smallest payload here, so that a second copy of any shows.
+/// Bytes of a packet and a message besides their payload: header, head, tag, counters of references, a signature and
+/// the hashes of a batch. Less than the smallest payload here, so that a second copy of any shows.
 const ASIDE: usize = 700;
-/// What a key, a window and a verifier take, once for each source; bytes.
+/// Memory of a key, a window and a verifier, once for each source; bytes.
 const ONCE: usize = 40_000;
 
 fn ends(suite: Suite, history_depth: usize) -> (Source, Sink) {
@@ -66,7 +66,7 @@ fn deliver(sink: &mut Sink, packets: &[Packet]) -> Vec<Bytes> {
     packets.iter().filter_map(payload).collect()
 }
 
-/// Bytes taken at the source and at the sink, a message.
+/// Bytes allocated at the source and at the sink, per message.
 fn measure(suite: Suite, bytes: usize, at_once: usize, history: usize) -> (usize, usize) {
     let (mut source, mut sink) = ends(suite, history);
     let payload = Bytes::from(vec![7; bytes]);
@@ -121,7 +121,7 @@ fn a_large_message_takes_one_fragment_more_the_first_time() {
     assert!(first > bytes && first < bytes + ONCE, "{first}");
 }
 
-/// What the transport received in two pieces is joined first: a copy more.
+/// A packet that the transport received in two pieces is joined first: one copy more.
 #[test]
 fn a_packet_in_pieces_is_copied_once_more() {
     let (mut source, mut sink) = ends(Suite::Standard, 0);

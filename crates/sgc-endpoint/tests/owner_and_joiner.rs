@@ -1,12 +1,12 @@
-//! One endpoint, spoken to in frames: what it answers, what it believes, what it bounds.
+//! One endpoint, addressed in frames: its answers, its checks, its bounds.
 
 use std::sync::Arc;
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
-    ADVERT_INTERVAL, ADVERTS_BURST, Dropped, Endpoint, EndpointConfig, Event, JoinStatus, Limits, LostReason,
-    Output, ShareError, ShareSpec, Wish,
+    ADVERT_INTERVAL, ADVERTS_BURST, Endpoint, EndpointConfig, EndpointDrop, Event, JoinKind, JoinStatus,
+    Limits, LostReason, Output, ShareError, ShareSpec,
 };
 use sgc_testkit::{Clock, Member, identity};
 use sgc_trust::{Grantees, Identity, Policy, ReplyKey, Suite, seal_grant};
@@ -15,14 +15,14 @@ use sgc_wire::{
     Metadata, Name, Qos, RefuseReason, Request, SecretBytes, SinkId, TopicGrant,
 };
 
-/// An endpoint and what came out of it since it was last asked.
+/// An endpoint, and its outputs since the last call.
 struct Bench {
     endpoint: Endpoint,
     clock: Clock,
     identity: Arc<Identity>,
     sent: Vec<Control>,
     events: Vec<Event>,
-    dropped: Vec<Dropped>,
+    dropped: Vec<EndpointDrop>,
     timeout: Option<std::time::Instant>,
 }
 
@@ -82,7 +82,7 @@ impl Bench {
         self.share(topic, policy).expect("within the bounds")
     }
 
-    /// The advertisements sent: sequence number, whether a withdrawal, how many names.
+    /// Returns the advertisements sent: sequence number, whether a withdrawal, number of names.
     fn adverts(&self) -> Vec<(u64, bool, usize)> {
         self.sent
             .iter()
@@ -94,7 +94,7 @@ impl Bench {
             .collect()
     }
 
-    /// The answers sent: whom to, and why not if not.
+    /// The answers sent: sink, and the reason of a refusal.
     fn answers(&self) -> Vec<(SinkId, Option<RefuseReason>)> {
         self.sent
             .iter()
@@ -150,7 +150,7 @@ fn a_node_with_all_places_of_a_topic_takes_those_of_its_oldest_requests() {
             let expected: Vec<_> = gone.into_iter().chain([(SinkId([n; 16]), None)]).collect();
             assert_eq!(answers, expected, "request {n}");
         }
-        // A router that has them plays them again: those that gave up their places get none from newer ones.
+        // A router replays the refused ones: sinks that lost their places get none from newer ones.
         for n in 1..=4 {
             bench.frame(frames[n - 1].clone());
             assert_eq!(bench.answers(), [(SinkId([n as u8; 16]), Some(RefuseReason::Limit))]);
@@ -197,7 +197,7 @@ fn an_older_request_of_a_sink_does_not_bring_its_key_back() {
 #[test]
 fn names_that_come_one_by_one_do_not_stay_apart() {
     let mut bench = owner();
-    // Which advertisement speaks for each name, as routers keep it.
+    // The advertisement that speaks for each name, as routers keep it.
     let mut words = std::collections::BTreeMap::new();
     let mut most = 0;
     for n in 0..500 {
@@ -227,7 +227,11 @@ fn a_joiner_whose_fleet_is_unknown_is_refused_and_told_why() {
     let (frame, _) = join(&bench, &stranger, name, 1);
     bench.frame(frame);
     assert_eq!(bench.answers(), [(SinkId([1; 16]), Some(RefuseReason::NotVerified))]);
-    assert!(matches!(bench.dropped[..], [Dropped::NotVerified { what: "join", .. }]), "{:?}", bench.dropped);
+    assert!(
+        matches!(bench.dropped[..], [EndpointDrop::NotVerified { what: "join", .. }]),
+        "{:?}",
+        bench.dropped
+    );
     assert_eq!(bench.endpoint.granted(&name), []);
 }
 
@@ -302,7 +306,7 @@ fn names_that_come_one_by_one_are_gathered_as_routers_take_no_more() {
     adverts.extend(bench.adverts());
     assert_eq!(adverts.len(), ADVERTS_BURST as usize, "one with all the others");
     assert_eq!(adverts.last().map(|advert| advert.2), Some(count + 1), "and again with those before");
-    // The end is told at once.
+    // The end is announced at once.
     bench.endpoint.withdraw_all(bench.clock.now());
     bench.drain();
     let withdrawn = bench.adverts();
@@ -357,12 +361,12 @@ fn a_topic_shared_again_within_the_same_moment_is_advertised_after_its_withdrawa
     bench.endpoint.unshare(bench.clock.now(), &name);
     assert_eq!(bench.share_with_fleet("/a"), name);
     bench.drain();
-    // Withdrawn and shared between two drains: for the network nothing happened but a renewal.
+    // Withdrawn and shared again between two drains: the network sees only a renewal.
     let adverts = bench.adverts();
     assert!(adverts.last().is_some_and(|a| !a.1), "{adverts:?}");
 }
 
-/// An owner says that it has a name.
+/// Delivers an owner's advertisement of a name.
 fn advertise(bench: &mut Bench, owner: &Identity, blind: sgc_wire::Blind) {
     let body = AdvertBody {
         chain: owner.chain_bytes(),
@@ -375,7 +379,7 @@ fn advertise(bench: &mut Bench, owner: &Identity, blind: sgc_wire::Blind) {
     bench.frame(Control::Advert { cost: 1, signed: owner.sign_advert(&body) });
 }
 
-/// A joiner that was granted `/a` of the robot, with what is needed to go on answering it.
+/// A joiner with a grant of `/a` of the robot, and the keys to answer it further.
 fn granted() -> (Bench, Arc<Identity>, Name, SinkId, bytes::Bytes) {
     let mut bench = Bench::new("desk", Limits::default());
     let arm = identity(&Member::new("arm-1"));
@@ -383,7 +387,7 @@ fn granted() -> (Bench, Arc<Identity>, Name, SinkId, bytes::Bytes) {
     let metadata = Metadata::topic("arm-1", "/a", "p/msg/T");
     let blind = sgc_trust::TopicSecret::derive(secret, &metadata).blind();
     let name = sgc_trust::name_of(&arm.node_id(), &blind);
-    bench.endpoint.join(bench.clock.now(), name, arm.node_id(), Wish::Subscribe { describe: false });
+    bench.endpoint.join(bench.clock.now(), name, arm.node_id(), JoinKind::Subscribe { describe: false });
     bench.drain();
     assert!(matches!(&bench.sent[..], [Control::Interest { names }] if *names == [name]), "{:?}", bench.sent);
     advertise(&mut bench, &arm, blind);
@@ -421,7 +425,7 @@ fn answers_are_taken_in_their_order_and_each_once() {
     );
     for old in [second, third] {
         bench.frame(old);
-        assert!(bench.events.is_empty() && matches!(bench.dropped[..], [Dropped::Unexpected { .. }]));
+        assert!(bench.events.is_empty() && matches!(bench.dropped[..], [EndpointDrop::Unexpected { .. }]));
         assert_eq!(bench.endpoint.join_status(&name), Some(JoinStatus::Granted));
     }
 }
@@ -432,12 +436,12 @@ fn an_answer_that_the_owner_did_not_sign_or_seal_changes_nothing() {
     let other = identity(&Member::new("mallory"));
     bench.frame(grant(&other, name, sink, &reply_key, 2, 8));
     assert!(
-        matches!(bench.dropped[..], [Dropped::NotVerified { what: "answer", .. }]),
+        matches!(bench.dropped[..], [EndpointDrop::NotVerified { what: "answer", .. }]),
         "{:?}",
         bench.dropped
     );
     bench.frame(grant(&arm, name, SinkId([0; 16]), &reply_key, 2, 8));
-    assert!(matches!(bench.dropped[..], [Dropped::Unexpected { .. }]), "{:?}", bench.dropped);
+    assert!(matches!(bench.dropped[..], [EndpointDrop::Unexpected { .. }]), "{:?}", bench.dropped);
     assert_eq!((bench.events.len(), bench.endpoint.join_status(&name)), (0, Some(JoinStatus::Granted)));
 }
 
@@ -458,7 +462,7 @@ fn a_name_of_another_owner_than_expected_is_not_asked_for() {
     let (arm, other) = (identity(&Member::new("arm-1")), identity(&Member::new("mallory")));
     let blind = sgc_wire::Blind([5; 32]);
     let name = sgc_trust::name_of(&arm.node_id(), &blind);
-    bench.endpoint.join(bench.clock.now(), name, other.node_id(), Wish::Subscribe { describe: false });
+    bench.endpoint.join(bench.clock.now(), name, other.node_id(), JoinKind::Subscribe { describe: false });
     bench.drain();
     advertise(&mut bench, &arm, blind);
     assert!(bench.sent.is_empty());

@@ -13,7 +13,7 @@ use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Challenge, Class,
     Consumer, Control, Credentials, DescribedType, Encode, GrantContent, Hello, JoinBody, MessageHead,
     MessageKind, Metadata, Name, OperationAnswer, PayloadEncoding, PayloadForm, Qos, Recover, RefuseReason,
-    RejectReason, Request, Role, RosNode, SecretBytes, SecretGeneration, Signed, SinkId, SourceId,
+    RejectReason, Request, Role, RosNode, SecretBytes, SecretGeneration, SignedBody, SinkId, SourceId,
     SourceOffer, TopicGrant, TypeQuestion, UnixMillis,
 };
 
@@ -84,7 +84,8 @@ fn gateway() -> Vec<Vec<u8>> {
 
 fn control() -> Vec<Vec<u8>> {
     let (name, sink, source) = (NAME, SINK, SourceId([3; 16]));
-    let signed = Signed { body: Bytes::from_static(b"some body"), signature: Bytes::from_static(&[7; 70]) };
+    let signed =
+        SignedBody { body: Bytes::from_static(b"some body"), signature: Bytes::from_static(&[7; 70]) };
     let frames = [
         Control::Hello(Hello {
             minor: 0,

@@ -11,7 +11,7 @@ use sgc_trust::{
 };
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Decode, GrantContent, JoinBody, Metadata, Name, Request,
-    SecretBytes, Signed, SinkId, TopicGrant, UnixMillis,
+    SecretBytes, SignedBody, SinkId, TopicGrant, UnixMillis,
 };
 
 const NOW: UnixMillis = UnixMillis(1_795_000_000_000);
@@ -25,7 +25,7 @@ struct Cast {
     /// A key, and what a grant sealed to it is.
     grants: Vec<(ReplyKey, Bytes, Bytes)>,
     /// An advertisement, a join and an answer of the arm.
-    signed: [Signed; 3],
+    signed: [SignedBody; 3],
     token: ShareToken,
     csr: Vec<u8>,
 }
@@ -95,7 +95,7 @@ fn alter(good: &[u8], edits: &[u8]) -> Vec<u8> {
     all
 }
 
-fn check_signed(which: usize, signed: &Signed) -> bool {
+fn check_signed(which: usize, signed: &SignedBody) -> bool {
     let cast = cast();
     let anchors = cast.fleet.anchors();
     match which {
@@ -131,19 +131,21 @@ pub fn run(input: &[u8]) {
         }
         3 => {
             let (body, signature) = input.split_at(input.len().saturating_sub(70));
-            let signed =
-                Signed { body: Bytes::copy_from_slice(body), signature: Bytes::copy_from_slice(signature) };
+            let signed = SignedBody {
+                body: Bytes::copy_from_slice(body),
+                signature: Bytes::copy_from_slice(signature),
+            };
             assert!(!check_signed(kind % 3, &signed));
         }
         4 => {
             let good = &cast.signed[kind % 3];
             let body = Bytes::from(alter(&good.body, input));
             let same = body == good.body;
-            let signed = Signed { body, signature: good.signature.clone() };
+            let signed = SignedBody { body, signature: good.signature.clone() };
             assert_eq!(check_signed(kind % 3, &signed), same);
             let signature = Bytes::from(alter(&good.signature, input));
             let verified =
-                check_signed(kind % 3, &Signed { body: good.body.clone(), signature: signature.clone() });
+                check_signed(kind % 3, &SignedBody { body: good.body.clone(), signature: signature.clone() });
             assert_eq!(verified, signature == good.signature);
         }
         5 => {

@@ -14,7 +14,7 @@ use std::time::{Duration, Instant, SystemTime};
 use bytes::Bytes;
 use rand_core::{OsRng, TryRngCore};
 use sgc_trust::{
-    Absorbed, CertId, Fleet, FleetError, Grantees, ROSTER_NODES_MAX, TrustAnchors, VerifiedPeer,
+    CertId, CrlReport, Fleet, FleetError, Grantees, ROSTER_NODES_MAX, TrustAnchors, VerifiedPeer,
     requested_key_hash, serial_of,
 };
 use sgc_wire::{Credentials, NodeId, Now, RefuseReason, SinkId, UnixMillis};
@@ -361,16 +361,16 @@ impl FleetDesk {
 impl FleetDesk {
     /// Takes over into the file what the lists in force revoke and it does not know: another copy of it made them.
     fn catch_up(&self, anchors: &TrustAnchors, now: Now) {
-        let absorb = || -> Result<Absorbed, FleetFileError> {
+        let absorb = || -> Result<CrlReport, FleetFileError> {
             let mut locked = LockedFleet::open(&self.file)?;
             let absorbed = locked.fleet.absorb(anchors, now.unix).map_err(|why| locked.error(why))?;
-            if absorbed != Absorbed::default() {
+            if absorbed != CrlReport::default() {
                 locked.save()?;
             }
             Ok(absorbed)
         };
         match absorb() {
-            Ok(Absorbed { revoked, .. }) if !revoked.is_empty() => {
+            Ok(CrlReport { revoked, .. }) if !revoked.is_empty() => {
                 warn!(
                     nodes = revoked.join(", "),
                     "another copy of the fleet's file revoked nodes; the file here knows it now. What else that copy did \

@@ -279,7 +279,7 @@ impl Served {
     fn tell(&self, source: SourceId, kind: MessageKind, number: u64, payload: Bytes) -> IsTooLarge {
         // Who is gone asks again when it is back.
         let Some(sink) = self.lock().sinks.get(&source).copied() else { return IsTooLarge::No };
-        self.share.publish_call(&MessageHead::of_call(kind, number), payload, Some(sink))
+        self.share.publish_call(&MessageHead::for_call(kind, number), payload, Some(sink))
     }
 
     fn failed(&self, why: &RosError) {
@@ -484,7 +484,7 @@ impl Called {
     }
 
     fn publish(&self, kind: MessageKind, number: u64, payload: Bytes) {
-        let head = MessageHead::of_call(kind, number);
+        let head = MessageHead::for_call(kind, number);
         if self.share.publish_call(&head, payload, None) == IsTooLarge::Yes {
             self.lock().caller.lose(number, CallLoss::TooLarge);
             self.count_lost();

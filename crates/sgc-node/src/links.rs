@@ -469,11 +469,11 @@ impl ControlRx {
                 self.link.define_label(label, name).map_err(|error| error.to_string())?;
                 Ok(self.answer(Control::LabelAck { label }))
             }
-            Control::Pulse { answers: false } if is_greeted => {
-                Ok(self.answer(Control::Pulse { answers: true }))
+            Control::Probe { answers: false } if is_greeted => {
+                Ok(self.answer(Control::Probe { answers: true }))
             }
             // That something came is the answer.
-            Control::Pulse { answers: true } if is_greeted => Ok(true),
+            Control::Probe { answers: true } if is_greeted => Ok(true),
             Control::LabelAck { label } if is_greeted => match self.progress.acknowledge(label) {
                 true => Ok(true),
                 false => Err(format!("label {} is acknowledged but was not given", label.index())),
@@ -852,9 +852,9 @@ mod tests {
         }
         // What is an answer has none.
         for answers in [true, false] {
-            link.send_control(Control::Pulse { answers }.to_bytes()).await.unwrap();
+            link.send_control(Control::Probe { answers }.to_bytes()).await.unwrap();
         }
-        assert_eq!(heard().await, Control::Pulse { answers: true });
+        assert_eq!(heard().await, Control::Probe { answers: true });
         link.send_control(frame.to_bytes()).await.unwrap();
         match soon(link.closed()).await {
             LinkError::Closed { by_peer: true, reason } => reason,

@@ -5,7 +5,7 @@
 use std::collections::BTreeSet;
 
 use sgc_transport::{Refusal, RefusalKind, RefusedPeer};
-use sgc_trust::{AddressPrefix, CaFingerprint, CertError, Repeated, Repeats};
+use sgc_trust::{AddressPrefix, CaFingerprint, CertError, RepeatCount, Repeats};
 use tokio::time::Instant;
 use tracing::{debug, warn};
 
@@ -44,7 +44,7 @@ impl RefusalLog {
 
     /// Logs how many refusals were counted.
     pub(crate) fn summarise(&mut self) {
-        for Repeated { source, count, within } in self.repeats.take_due(Instant::now().into_std()) {
+        for RepeatCount { source, count, within } in self.repeats.take_due(Instant::now().into_std()) {
             let seconds = within.as_secs();
             match source {
                 // They were named once, which is all there is to say.

@@ -16,7 +16,7 @@ use bytes::Bytes;
 use sgc_endpoint::{Compressor, Marks, PublishError, Source, SourceProgress};
 use sgc_ros::{Guid, HandleSamples, KeyHash, Sample, SampleKind, Shaping};
 use sgc_router::LinkId;
-use sgc_transport::prompt::{self, AtHand};
+use sgc_transport::prompt::{self, WakeBatch};
 use sgc_wire::{
     MessageHead, MessageKind, Name, Packet, PayloadEncoding, PayloadForm, Recover, SinkId, SourceId,
     TopicGrant,
@@ -339,7 +339,7 @@ impl LocalShare {
     pub(crate) fn publish(self: &Arc<Self>, sample: Sample) {
         // With others behind it, or in many packets, it is sent by the runtime while this thread seals.
         let is_alone = !sample.more && sample.payload.len() <= AT_HAND_BYTES_MAX;
-        let _at_hand = is_alone.then(|| AtHand::begin(&self.runtime));
+        let _at_hand = is_alone.then(|| WakeBatch::begin(&self.runtime));
         if !self.is_shaped.load(Relaxed) {
             return self.publish_now(sample);
         }
@@ -359,7 +359,7 @@ impl LocalShare {
             return Err(sample);
         }
         // Its tasks are run when the locks are free again.
-        let _at_hand = AtHand::begin(&self.runtime);
+        let _at_hand = WakeBatch::begin(&self.runtime);
         // Who has the locks may be pushed back.
         let Ok(inbox) = self.inbox.try_lock() else { return Err(sample) };
         let Ok(slot) = self.slot_of(sample.writer) else { return Err(sample) };

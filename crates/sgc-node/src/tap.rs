@@ -12,7 +12,7 @@ use bytes::{Buf as _, Bytes};
 use sgc_cdr::Layout;
 use sgc_endpoint::{Decompressor, Message};
 use sgc_ros::{Sample, SampleKind};
-use sgc_types::Described;
+use sgc_types::ResolvedType;
 use sgc_wire::{KEY_HASH_BYTES, MessageKind, PayloadEncoding, PayloadForm, Representations};
 use tokio::sync::Notify;
 
@@ -235,7 +235,7 @@ pub(crate) struct Tap {
     /// `RIHS01_…`, if it is known.
     pub type_hash: Option<String>,
     /// What its messages look like, if that is known.
-    pub described: Option<Arc<Described>>,
+    pub described: Option<Arc<ResolvedType>>,
     /// What goes by.
     pub queue: Arc<TapQueue>,
     /// A local reader that is there for this alone.

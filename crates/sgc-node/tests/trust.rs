@@ -26,7 +26,7 @@ use sgc_trust::{
 };
 use sgc_wire::{
     Answer, AnswerBody, Control, Decode as _, Encode as _, GrantContent, Hello, JoinBody, Metadata, Name,
-    Operation, OperationAnswer, OperationRefusal, OperationRequest, Request, Signed, SinkId, UnixMillis,
+    Operation, OperationAnswer, OperationRefusal, OperationRequest, Request, SignedBody, SinkId, UnixMillis,
 };
 use support::*;
 
@@ -509,7 +509,7 @@ impl ByHand {
     }
 
     /// A request to `name`, as it is signed, and what opens its answer.
-    fn request(&self, name: Name, sink: u8, request: &OperationRequest) -> (Signed, ReplyKey) {
+    fn request(&self, name: Name, sink: u8, request: &OperationRequest) -> (SignedBody, ReplyKey) {
         let reply_key = ReplyKey::generate(Kem::X25519);
         let body = JoinBody {
             name,
@@ -523,7 +523,7 @@ impl ByHand {
     }
 
     /// Sends it and opens the answer.
-    fn ask(&self, name: Name, sink: u8, signed: &Signed, reply_key: &ReplyKey) -> OperationAnswer {
+    fn ask(&self, name: Name, sink: u8, signed: &SignedBody, reply_key: &ReplyKey) -> OperationAnswer {
         let id = SinkId([sink; 16]);
         let body = loop {
             self.send(&Control::Join { signed: signed.clone() });

@@ -629,7 +629,7 @@ fn same_reader(a: Option<&EndpointSpec>, b: Option<&EndpointSpec>) -> bool {
 fn source_of(secret: &FleetSecret, writer: &Guid, rng: &mut impl RngCore) -> SourceId {
     let mut random = [0; 8];
     rng.fill_bytes(&mut random);
-    SourceId::of_publisher(secret.publisher_tag(&writer.0), random)
+    SourceId::from_publisher(secret.publisher_tag(&writer.0), random)
 }
 
 fn describe(qos: &Qos) -> String {

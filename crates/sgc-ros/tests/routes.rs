@@ -475,7 +475,7 @@ fn each_far_latched_publisher_gets_a_writer_of_its_own() {
 fn a_publisher_whose_node_started_anew_keeps_its_writer() {
     let mut b = bench(&[], &[("/tf_static", None)]);
     let name = theirs("/tf_static", STRING);
-    let source = |tag, run| SourceId::of_publisher([tag; 8], [run; 8]);
+    let source = |tag, run| SourceId::from_publisher([tag; 8], [run; 8]);
     let list = |sources: &[SourceId]| {
         let mut entry = entry("/tf_static", STRING, latched(), &vec![1; sources.len()]);
         entry.sources.iter_mut().zip(sources).for_each(|(listed, source)| listed.source = *source);
@@ -569,7 +569,7 @@ fn policies_of_a_rule_are_offered_in_the_place_of_those_that_are_found() {
 fn a_depth_that_becomes_known_or_unknown_leaves_the_writer_open() {
     let mut b = bench(&[], &[("/map", None)]);
     let name = theirs("/map", STRING);
-    let source = |run| SourceId::of_publisher([1; 8], [run; 8]);
+    let source = |run| SourceId::from_publisher([1; 8], [run; 8]);
     let list = |run, history| {
         let mut entry = entry("/map", STRING, latched(), &[1]);
         (entry.sources[0].source, entry.sources[0].qos.history) = (source(run), history);
@@ -606,7 +606,7 @@ fn a_depth_that_becomes_known_or_unknown_leaves_the_writer_open() {
 #[test]
 fn an_owner_that_started_anew_may_find_its_publishers_one_by_one() {
     let (name, name_b) = (theirs("/tf_static", STRING), theirs("/b", STRING));
-    let source = |tag, run| SourceId::of_publisher([tag; 8], [run; 8]);
+    let source = |tag, run| SourceId::from_publisher([tag; 8], [run; 8]);
     let list = |topic: &str, sources: &[SourceId]| {
         let mut entry = entry(topic, STRING, latched(), &vec![1; sources.len()]);
         entry.sources.iter_mut().zip(sources).for_each(|(listed, source)| listed.source = *source);

@@ -1,16 +1,16 @@
-//! What the data path needs to know of one name. Immutable: a change makes a new entry.
+//! The forwarding entry of one name for the data path. Immutable: a change makes a new entry.
 
 use sgc_wire::SinkId;
 use smallvec::SmallVec;
 
 use crate::LinkId;
 
-/// The compiled trees of one name at this node: one, and for a while a second one when the way to the owner changes.
+/// The compiled trees of one name at this node: one, and for a while a second one after a route change.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct FibEntry {
-    /// By the link towards the owner, ascending.
+    /// The trees, ascending by their link towards the owner.
     pub trees: SmallVec<[Tree; 1]>,
-    /// Which link each sink is behind, ascending by sink, for packets to one sink.
+    /// The link towards each sink, ascending by sink, for packets to one sink.
     pub sinks: Vec<(SinkId, LinkId)>,
 }
 
@@ -26,20 +26,20 @@ pub struct Tree {
 }
 
 impl FibEntry {
-    /// True if data of this name may come in over `link`.
+    /// Returns `true` if data of this name may come in over `link`.
     pub fn accepts_from(&self, link: LinkId) -> bool {
         self.trees.iter().any(|t| t.up == link || t.publishers.contains(&link))
     }
 
-    /// The links that a packet for all goes out on, having come in over `ingress`: down the trees that it comes
-    /// from the root of, or both ways in those that a publisher behind `ingress` belongs to.
+    /// Iterates over the links for a packet to all that came in over `ingress`: down the trees whose root is there, or
+    /// in both directions in those with a publisher behind `ingress`.
     pub fn egress(&self, ingress: LinkId) -> impl Iterator<Item = LinkId> + '_ {
         let fed = self.trees.iter().filter(move |t| t.up == ingress || t.publishers.contains(&ingress));
         let links = fed.flat_map(move |t| {
             let up = (t.up != ingress).then_some(t.up);
             t.down.iter().copied().filter(move |l| *l != ingress && Some(*l) != up).chain(up)
         });
-        // Two trees are there for a moment only, so the links are few; each is to get one copy.
+        // Two trees exist only for a moment, so the links are few; each gets one copy.
         let single = self.trees.len() == 1;
         let mut seen = SmallVec::<[LinkId; 4]>::new();
         links.filter(move |link| {
@@ -51,8 +51,8 @@ impl FibEntry {
         })
     }
 
-    /// The link that a packet for one sink goes out on, having come in over `ingress`: only what comes from the owner's
-    /// side goes to one.
+    /// Returns the link for a packet to one sink that came in over `ingress`: such packets come only from the owner's
+    /// side.
     pub fn egress_to(&self, ingress: LinkId, sink: &SinkId) -> Option<LinkId> {
         if self.trees.iter().all(|t| t.up != ingress) {
             return None;
@@ -60,7 +60,7 @@ impl FibEntry {
         self.sinks.binary_search_by(|(s, _)| s.cmp(sink)).ok().map(|i| self.sinks[i].1)
     }
 
-    /// All links that data can leave on, each once, ascending.
+    /// Returns all links that data can leave on, each once, ascending.
     pub fn links(&self) -> SmallVec<[LinkId; 4]> {
         let trees = self.trees.iter();
         let mut links: SmallVec<[LinkId; 4]> = trees
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_for_one_sink_comes_from_the_owners_side() {
+    fn packets_for_one_sink_come_from_the_owners_side() {
         let sink = SinkId([7; 16]);
         let entry = FibEntry { trees: [tree(1, &[], &[2, 3])].into(), sinks: vec![(sink, LinkId(2))] };
         assert_eq!(entry.egress_to(LinkId(1), &sink), Some(LinkId(2)));

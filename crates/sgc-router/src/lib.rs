@@ -29,6 +29,6 @@ pub use limits::Limits;
 pub use links::Neighbour;
 pub use mapping::MappingKind;
 pub use router::{
-    DropReason, Dropped, LinkClose, LinkId, Output, Router, RouterConfig, RouterStats, clocks_differ,
+    DropReason, LinkClose, LinkId, Output, Router, RouterConfig, RouterDrop, RouterStats, clocks_differ,
 };
-pub use topology::Ways;
+pub use topology::RouteStats;

@@ -1,15 +1,15 @@
-//! Bounds on what neighbours may make a router remember and do.
+//! Bounds on the memory and work that neighbours may cause at a router.
 
 use std::time::{Duration, Instant};
 
-/// Longest way, in links, that data can take.
+/// Longest route of data, in links.
 pub(crate) const HOPS_MAX: u8 = sgc_wire::HOP_LIMIT - 3;
 /// Interval at which a name that somebody waits for is asked for again.
 pub(crate) const QUERY_EVERY: Duration = Duration::from_secs(20);
-/// How many times as many requests a router may bring as a proxy.
+/// Multiple of a proxy's requests that a router may bring.
 const ROUTER_FACTOR: u32 = 16;
 
-/// Bounds on what neighbours may make this node remember.
+/// Bounds on the memory that neighbours may take at this node.
 #[derive(Clone, Debug)]
 pub struct Limits {
     /// Names known in all.
@@ -24,47 +24,48 @@ pub struct Limits {
     pub branches_per_peer_max: usize,
     /// Branches of one name.
     pub branches_per_name_max: usize,
-    /// Names that one node may be interested in, over all its links; as many that nobody knows may a router have asked for.
+    /// Names that one node may be interested in, over all its links; also the unknown names that a router may have
+    /// asked for.
     pub interests_per_peer_max: usize,
-    /// Names that nobody knows which all routers are asked for on behalf of one node within 20 s, for the first time and again.
-    /// Others wait for their turn. On behalf of a router, sixteen times as many.
+    /// Unknown names that all routers are asked for on behalf of one node within 20 s, counted separately for first and
+    /// repeated questions. Others wait for their turn. A router has sixteen times as many.
     pub unknown_per_peer_max: u32,
     /// Advertisements and withdrawals of one owner that are in force; beyond it the oldest are void.
     pub adverts_per_owner_max: usize,
     /// Bytes of them.
     pub advert_bytes_per_owner_max: usize,
-    /// Names that nobody knows which all routers together may have asked for. Beyond it the router with the most is told of its
-    /// oldest no more.
+    /// Unknown names that all routers together may have asked for. Beyond it the router with the most loses its oldest
+    /// question.
     pub asks_max: usize,
-    /// Questions remembered that were passed on. Beyond it the neighbour that brought the most loses its oldest; that
+    /// Questions remembered after passing them on. Beyond it the neighbour that brought the most loses its oldest; that
     /// neighbour itself brings more only when that one is 5 s old.
     pub questions_max: usize,
-    /// Withdrawn names remembered against replay. Beyond it the owner with the most loses its oldest withdrawal, and with it
-    /// whatever it advertised before.
+    /// Withdrawn names remembered against replay. Beyond it the owner with the most loses its oldest withdrawal, and
+    /// with it every earlier advertisement.
     pub tombstones_max: usize,
-    /// How long an owner may take to answer a join, and a sink to find the better way that it was told of.
+    /// Time that an owner may take to answer a join, and a sink to ask over a better route.
     pub answer_wait: Duration,
     /// Longest lease of an advertisement or link state that is honoured.
     pub lease_max: Duration,
     /// Links of one node at one time.
     pub links_per_node_max: usize,
-    /// Requests to join that a proxy may bring at once; refilled by an eighth of it a second. A router, which
-    /// speaks for many, may bring sixteen times as many.
+    /// Requests to join that a proxy may bring at once; refilled by an eighth of it a second. A router, which brings
+    /// those of many, may bring sixteen times as many.
     pub joins_burst: u32,
     /// Names that a neighbour may ask for at once; refilled by an eighth of it a second. A router may ask for sixteen times as
     /// many.
     pub queries_burst: u32,
-    /// Advertisements and link states of a node that are passed on at once, each to all routers; refilled by an eighth of it
-    /// a second. What is beyond it waits, and only the newest of it goes on.
+    /// Advertisements and link states of a node that are passed on at once, each to all routers; refilled by an eighth
+    /// of it a second. Further ones wait, and only the newest of them is passed on.
     pub announcements_burst: u32,
-    /// Announcements that had to be verified and were no news, or more than their signer may have passed on, which a
-    /// neighbour may bring at once; refilled by an eighth of it a second. A router may bring sixteen times as many.
+    /// Verified announcements without news, or beyond their signer's allowance, that a neighbour may bring at once;
+    /// refilled by an eighth of it a second. A router may bring sixteen times as many.
     pub stale_burst: u32,
-    /// Revocation lists of one CA that are news and are taken from neighbours at once; refilled by one a second. What is
-    /// beyond it waits, and only the newest of it is taken. The CA of this node's own fleet has no such bound. Greater
-    /// than [`sgc_trust::FLEET_LISTS_MAX`], so that all lists in force fit.
+    /// New revocation lists of one CA that are taken from neighbours at once; refilled by one a second. Further ones
+    /// wait, and only the newest of them is taken. The CA of this node's own fleet has no such bound. Greater than
+    /// [`sgc_trust::FLEET_LISTS_MAX`], so that all lists in force fit.
     pub lists_burst: u32,
-    /// Things that do not verify which a node may bring before its link is closed; one is forgiven a second.
+    /// Unverifiable bodies that a node may bring before its link is closed; one is forgiven a second.
     pub forgeries_max: u32,
 }
 
@@ -97,7 +98,7 @@ impl Default for Limits {
     }
 }
 
-/// What one node may still do here, over all its links.
+/// The remaining allowance of one node, over all its links.
 #[derive(Debug)]
 pub(crate) struct Allowance {
     joins: Budget,
@@ -105,10 +106,10 @@ pub(crate) struct Allowance {
     announcements: Budget,
     stale: Budget,
     forgeries: Budget,
-    /// Names that all are asked for, for the first time.
-    first: Turns,
-    /// The same, again.
-    again: Turns,
+    /// First questions for names.
+    first: TurnBudget,
+    /// Repeated questions for names.
+    again: TurnBudget,
     /// Branches that it has here.
     pub(crate) branches: usize,
 }
@@ -121,34 +122,34 @@ impl Allowance {
             announcements: Budget::new(limits.announcements_burst, limits.announcements_burst / 8),
             stale: Budget::new(limits.stale_burst, limits.stale_burst / 8),
             forgeries: Budget::new(limits.forgeries_max, 1),
-            first: Turns::new(limits.unknown_per_peer_max),
-            again: Turns::new(limits.unknown_per_peer_max),
+            first: TurnBudget::new(limits.unknown_per_peer_max),
+            again: TurnBudget::new(limits.unknown_per_peer_max),
             branches: 0,
         }
     }
 
-    /// Takes a request to join; false if there is none left.
+    /// Takes a request to join. Returns `false` if none is left.
     pub(crate) fn may_join(&mut self, now: Instant, is_router: bool) -> bool {
         self.joins.take(now, 1, if is_router { ROUTER_FACTOR } else { 1 })
     }
 
-    /// Takes a question for so many names; false if that is too many.
+    /// Takes a question for this many names. Returns `false` if that is too many.
     pub(crate) fn may_query(&mut self, now: Instant, names: usize, is_router: bool) -> bool {
         let names = names.max(1).try_into().unwrap_or(u32::MAX);
         self.queries.take(now, names, if is_router { ROUTER_FACTOR } else { 1 })
     }
 
-    /// The turns of names that all are asked for on its behalf.
-    pub(crate) fn turns(&mut self, again: bool) -> &mut Turns {
+    /// Returns the turns of questions on its behalf.
+    pub(crate) fn turns(&mut self, again: bool) -> &mut TurnBudget {
         if again { &mut self.again } else { &mut self.first }
     }
 
-    /// Takes something that it signed for all; false if that is too much to pass on now.
+    /// Takes an announcement. Returns `false` if that is too much to pass on now.
     pub(crate) fn may_announce(&mut self, now: Instant) -> bool {
         self.announcements.take(now, 1, 1)
     }
 
-    /// Returns true if it may bring another announcement that has to be verified and may turn out to be no news.
+    /// Returns `true` if it may bring another announcement that has to be verified and may be no news.
     pub(crate) fn may_bring(&self, now: Instant, is_router: bool) -> bool {
         self.stale.has_room(now, 1, if is_router { ROUTER_FACTOR } else { 1 })
     }
@@ -158,12 +159,12 @@ impl Allowance {
         self.stale.take(now, 1, if is_router { ROUTER_FACTOR } else { 1 });
     }
 
-    /// Takes one from what it may get wrong; false if there is none left.
+    /// Takes an error. Returns `false` if none is left.
     pub(crate) fn may_err(&mut self, now: Instant) -> bool {
         self.forgeries.take(now, 1, 1)
     }
 
-    /// True if nothing is used, so that forgetting it gives nothing back.
+    /// Returns `true` if nothing is used, so that forgetting it gives nothing back.
     pub(crate) fn is_whole(&self, now: Instant) -> bool {
         let budgets = [&self.joins, &self.queries, &self.announcements, &self.stale, &self.forgeries];
         let turns = [&self.first, &self.again];
@@ -173,15 +174,15 @@ impl Allowance {
     }
 }
 
-/// Turns that are given out in order: so many in each [`QUERY_EVERY`].
+/// Turns in order: a fixed number in each [`QUERY_EVERY`].
 #[derive(Debug)]
-pub(crate) struct Turns {
+pub(crate) struct TurnBudget {
     max: u32,
-    /// Time at which all that were given out are paid for.
+    /// Time at which the turns taken so far are used up.
     next: Option<Instant>,
 }
 
-impl Turns {
+impl TurnBudget {
     fn new(max: u32) -> Self {
         Self { max: max.max(1), next: None }
     }
@@ -196,7 +197,7 @@ impl Turns {
         self.next.and_then(|next| next.checked_sub(ahead)).map_or(now, |at| at.max(now))
     }
 
-    /// Takes it.
+    /// Takes the next turn.
     pub(crate) fn take(&mut self, now: Instant, is_router: bool) -> Instant {
         let at = self.next(now, is_router);
         self.next = Some(self.next.map_or(now, |next| next.max(now)) + self.interval(is_router));
@@ -228,7 +229,7 @@ impl Budget {
         self.used_at(now, factor) + f64::from(tokens) <= f64::from(self.burst) * f64::from(factor)
     }
 
-    /// Returns when one token is there.
+    /// Returns the time of the next token.
     pub(crate) fn next_at(&self, now: Instant) -> Instant {
         let missing = (self.used_at(now, 1) + 1.0 - f64::from(self.burst)).max(0.0);
         now + Duration::from_secs_f64(missing / f64::from(self.rate))

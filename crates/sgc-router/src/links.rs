@@ -1,38 +1,38 @@
-//! One neighbour: who it is, what it said of itself, what its link costs, and what depends on it.
+//! One neighbour: its identity, its greeting, the cost of its link, and the state that depends on the link.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CertId, VerifiedPeer};
-use sgc_wire::{Hello, Name, NodeId, Now, SinkId, ToldClock, UnixMillis};
+use sgc_wire::{Hello, Name, NodeId, Now, PeerClock, SinkId, UnixMillis};
 
 use crate::names::RecordId;
-use crate::tell::Telling;
+use crate::tell::SyncProgress;
 
-/// What every link costs besides its round trip: among ways that are as quick, the one with fewer links is better.
+/// Cost of every link besides its round trip: of equally quick routes, the one with fewer links is better.
 const COST_OF_LINK: u32 = 1000;
 /// Cost of a link whose round trip is not known.
 const COST_UNKNOWN: u32 = 10_000;
-/// What a link costs besides while it seems dead: it is a way only where there is no other.
+/// Further cost of a link that seems dead: it serves only where there is no other route.
 pub(crate) const COST_SUSPECT: u32 = 1 << 28;
-/// A measured round trip counts when it has been that far from the one that counts: by a quarter and by this.
+/// A measured round trip counts once it has differed by a quarter and by this from the present one.
 const COST_CHANGE_MIN: u32 = 2000;
-/// For how long it must have been so.
+/// Time for which it must have differed.
 const COST_CHANGE_AFTER: Duration = Duration::from_secs(5);
 
-/// What the handshake proved of the node at the other end of a link.
+/// The node at the other end of a link, as the handshake proved it.
 #[derive(Clone, Debug)]
 pub struct Neighbour {
-    /// Who it is.
+    /// The node.
     pub node: NodeId,
     /// Its certificate, and those between it and the CA.
     pub certs: Arc<[CertId]>,
-    /// True if its certificate lets it carry others' names.
+    /// Whether its certificate lets it carry others' names.
     pub may_route: bool,
-    /// Last moment at which its certificate holds.
+    /// Last moment at which its certificate is valid.
     pub not_after: UnixMillis,
-    /// What the link is to cost, microseconds of round trip; `None` if that is to be measured.
+    /// Configured cost of the link, microseconds of round trip; `None` to measure it.
     pub cost: Option<u32>,
 }
 
@@ -43,8 +43,8 @@ impl From<&VerifiedPeer> for Neighbour {
     }
 }
 
-/// What a link was told of a name that it asked for: the record's number, and the cost.
-pub(crate) type Told = Option<(RecordId, u32)>;
+/// The last record of a requested name that a link was told, by its number, and the cost.
+pub(crate) type RecordCost = Option<(RecordId, u32)>;
 
 /// State of a link that is up.
 #[derive(Debug)]
@@ -54,26 +54,26 @@ pub(crate) struct LinkState {
     /// Its certificates; none for this node itself.
     pub(crate) certs: Arc<[CertId]>,
     may_route: bool,
-    /// Last moment at which its certificate holds.
+    /// Last moment at which its certificate is valid.
     not_after: UnixMillis,
-    /// The same by the monotonic clock; a certificate that outlasts the clock never ends.
+    /// The same by the monotonic clock; `None` for a certificate that outlasts the clock.
     pub(crate) expires: Option<Instant>,
     /// Its greeting; nothing else is accepted before it.
     pub(crate) hello: Option<Hello>,
     pub(crate) cost: Cost,
-    /// Branches that it is an end of.
+    /// Branches that end at this link.
     pub(crate) branches: BTreeSet<(Name, SinkId)>,
-    /// Names that it wants to hear of, and what it heard.
-    pub(crate) interests: BTreeMap<Name, Told>,
-    /// Owners of names that its node asked for, and until when it is to be told of changes. Routers only.
+    /// Names that the neighbour wants to know of, and the records that it was told.
+    pub(crate) interests: BTreeMap<Name, RecordCost>,
+    /// Owners of names that its node asked for, and the end of its interest in changes. Routers only.
     pub(crate) follows: BTreeMap<NodeId, Instant>,
-    /// Names that are known over it.
+    /// Names that are known over this link.
     pub(crate) names: usize,
-    /// Progress of telling it the state that was known when it greeted.
-    pub(crate) telling: Option<Telling>,
-    /// Its wall clock, as it told it.
-    pub(crate) told_clock: Option<ToldClock>,
-    /// Time at which it was told everything once more because a clock was set.
+    /// Progress of telling it the state at the time of its greeting.
+    pub(crate) sync: Option<SyncProgress>,
+    /// The neighbour's wall clock, from its own report.
+    pub(crate) told_clock: Option<PeerClock>,
+    /// Time at which it was last told everything again because a clock was set.
     pub(crate) told_again: Option<Instant>,
 }
 
@@ -90,13 +90,13 @@ impl LinkState {
         state
     }
 
-    /// Reckons when the certificate ends, by the clocks as they are now.
+    /// Computes the end of the certificate by the present clocks.
     pub(crate) fn set_expiry(&mut self, now: Now) {
         let left = Duration::from_millis(self.not_after.0.saturating_sub(now.unix.0));
         self.expires = now.instant.checked_add(left);
     }
 
-    /// The link to this node's own endpoint.
+    /// Returns the link to this node's own endpoint.
     pub(crate) fn local(node: NodeId) -> Self {
         Self {
             node,
@@ -110,19 +110,19 @@ impl LinkState {
             interests: BTreeMap::new(),
             follows: BTreeMap::new(),
             names: 0,
-            telling: None,
+            sync: None,
             told_clock: None,
             told_again: None,
         }
     }
 
-    /// True once it said that it carries others' names, if its certificate lets it.
+    /// Returns `true` once it greeted as a router, if its certificate lets it.
     pub(crate) fn is_transit(&self) -> bool {
         self.may_route && self.hello.is_some_and(|h| h.transit)
     }
 }
 
-/// What a link costs: a set figure, or its round trip, damped so that jitter moves nothing.
+/// The cost of a link: a configured figure, or its round trip, damped so that jitter does not change it.
 #[derive(Debug)]
 pub(crate) struct Cost {
     set: Option<u32>,
@@ -130,9 +130,9 @@ pub(crate) struct Cost {
     smoothed: Option<u32>,
     /// The round trip that counts.
     counts: Option<u32>,
-    /// Since when the smoothed one is far from it.
+    /// Time since which the smoothed one differs much.
     differs_since: Option<Instant>,
-    /// True while nothing at all comes over the link.
+    /// Set while nothing at all arrives over the link.
     suspect: bool,
 }
 
@@ -141,19 +141,19 @@ impl Cost {
         Self { set, smoothed: None, counts: None, differs_since: None, suspect: false }
     }
 
-    /// What it is now.
+    /// Returns the present cost.
     pub(crate) fn now(&self) -> u32 {
         let measured = || self.counts.map_or(COST_UNKNOWN, |rtt| rtt.saturating_add(COST_OF_LINK));
         let cost = self.set.unwrap_or_else(measured);
         if self.suspect { cost.saturating_add(COST_SUSPECT) } else { cost }
     }
 
-    /// True while nothing at all comes over the link.
+    /// Returns `true` while nothing at all arrives over the link.
     pub(crate) fn is_suspect(&self) -> bool {
         self.suspect
     }
 
-    /// Takes a measurement; true if that changes the cost.
+    /// Takes a measurement. Returns `true` if it changes the cost.
     pub(crate) fn measure(&mut self, now: Instant, rtt: Duration, suspect: bool) -> bool {
         let before = self.now();
         self.suspect = suspect;

@@ -1,8 +1,7 @@
 //! Bounds on the new revocation lists of one CA that are taken from neighbours.
 //!
-//! A list that is news is verified, kept on the disk and passed on to every neighbour, so whoever holds the key of a
-//! partner's CA could have the whole mesh do that without end. This module decides when a list is due; `trust.rs` verifies
-//! it and passes it on.
+//! A new list is verified, stored and passed on to every neighbour, so the holder of a partner's CA key could make the
+//! whole mesh do that without end. This module decides when a list is due; `trust.rs` verifies it and passes it on.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -15,10 +14,10 @@ use crate::router::LinkId;
 
 /// Lists of a CA that are taken in a second, once its burst is used.
 const LISTS_PER_SECOND: u32 = 1;
-/// Shortest time until a list that waits is looked at again.
+/// Shortest time until a waiting list is looked at again.
 const RETRY_MIN: Duration = Duration::from_millis(10);
 
-/// The allowance that each CA has left, but for that of the node's own fleet. The caller names trusted CAs only, which bounds it.
+/// The remaining allowance of each CA, except the node's own fleet. The caller names trusted CAs only, which bounds it.
 #[derive(Debug, Default)]
 pub(crate) struct ListAllowances {
     cas: BTreeMap<CaFingerprint, ListAllowance>,
@@ -42,7 +41,7 @@ pub(crate) struct WaitingList {
 }
 
 impl ListAllowances {
-    /// Takes one list of `ca`; false if it has none left.
+    /// Takes one list of `ca`. Returns `false` if none is left.
     pub(crate) fn take(&mut self, now: Instant, ca: CaFingerprint, burst: u32) -> bool {
         let budget = || Budget::new(burst, LISTS_PER_SECOND);
         let new = || ListAllowance { budget: budget(), waiting: None, retry_at: now };
@@ -65,23 +64,23 @@ impl ListAllowances {
         }
     }
 
-    /// Returns true if this very list waits.
+    /// Returns `true` if this very list waits.
     pub(crate) fn awaits(&self, der: &Bytes) -> bool {
         self.cas.values().filter_map(|ca| ca.waiting.as_ref()).any(|waiting| waiting.der == *der)
     }
 
-    /// Returns when the next list that waits may be due.
+    /// Returns the time of the next look at a waiting list.
     pub(crate) fn next_at(&self) -> Option<Instant> {
         self.cas.values().filter(|ca| ca.waiting.is_some()).map(|ca| ca.retry_at).min()
     }
 
-    /// Takes the lists out whose time to be looked at again has come.
+    /// Removes and returns the lists that are due for another look.
     pub(crate) fn due(&mut self, now: Instant) -> Vec<WaitingList> {
         let due = self.cas.values_mut().filter(|ca| ca.retry_at <= now);
         due.filter_map(|ca| ca.waiting.take()).collect()
     }
 
-    /// Forgets the CAs that are trusted no more.
+    /// Forgets the CAs that are no longer trusted.
     pub(crate) fn retain(&mut self, is_trusted: impl Fn(&CaFingerprint) -> bool) {
         self.cas.retain(|ca, _| is_trusted(ca));
     }

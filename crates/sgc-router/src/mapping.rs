@@ -1,52 +1,52 @@
-//! How it becomes known which node owns a name: two ways, behind one trait.
+//! Two rules by which routers learn the owners of names, behind one trait.
 //!
-//! A mapping decides who is told of what, and who is asked; `names.rs` keeps what is known and sends the frames.
-//! Routers with different mappings understand each other: what one is not told, it asks for.
+//! A mapping decides which routers are told, and which are asked; `names.rs` keeps the records and sends the frames.
+//! Routers with different mappings understand each other: a router asks for names that it is not told.
 
 use crate::router::LinkId;
 
-/// Which mapping a router uses.
+/// The mapping of a router.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum MappingKind {
     /// Advertisements go to all routers, as in the paper (FogROS2-SGC, section IV): every router knows every name.
     #[default]
     Flood,
-    /// Advertisements stay at the routers that the owner is attached to; others ask when somebody wants a name, and keep
-    /// the answer for as long as it is wanted.
+    /// Advertisements stay at the routers that the owner is attached to; others ask when somebody wants a name, and
+    /// keep the answer for as long as it is wanted.
     Query,
 }
 
-/// What is known of a name that somebody waits for.
+/// Knowledge of the place of a name that somebody waits for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Known {
-    /// Nothing, or its owner is nowhere in reach.
-    No,
-    /// Where it is, from one who tells everybody.
-    Told,
-    /// Where it is, as an answer that came over this link.
+pub(crate) enum NameLocation {
+    /// Unknown, or its owner is out of reach.
+    Unknown,
+    /// Known from a router that tells all names.
+    Flooded,
+    /// Known from an answer that came over this link.
     Answered(LinkId),
 }
 
-/// Whom to ask about it.
+/// The routers to ask about it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Ask {
     Nobody,
     Everyone,
-    /// So that this neighbour goes on telling of changes.
+    /// One neighbour, so that it continues to tell changes.
     One(LinkId),
 }
 
-/// How names spread.
+/// A rule by which names spread.
 pub(crate) trait Mapping: std::fmt::Debug + Send + Sync {
-    /// True if routers are told of names that they did not ask for.
+    /// Returns `true` if routers are told of names that they did not ask for.
     fn tells_unasked(&self) -> bool;
 
-    /// Whom to ask about a name that somebody here waits for.
-    fn ask(&self, known: Known) -> Ask {
+    /// Returns the routers to ask about a name that somebody here waits for.
+    fn ask(&self, known: NameLocation) -> Ask {
         match known {
-            Known::No => Ask::Everyone,
-            Known::Told => Ask::Nobody,
-            Known::Answered(link) => Ask::One(link),
+            NameLocation::Unknown => Ask::Everyone,
+            NameLocation::Flooded => Ask::Nobody,
+            NameLocation::Answered(link) => Ask::One(link),
         }
     }
 }

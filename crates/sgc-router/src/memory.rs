@@ -1,13 +1,13 @@
-//! [`Memory`]: announcements that are in force no longer, so that none of them becomes news again.
+//! [`Memory`]: announcements that are no longer in force, so that none of them becomes news again.
 //!
-//! A signed announcement verifies for minutes after it was superseded or its lease ended. The memory keeps a few digests and one
-//! number for each signer, so no signer can displace what is remembered of another.
+//! A signed announcement verifies for minutes after it was superseded or its lease ended. The memory keeps a few
+//! digests and one number for each signer, so no signer can displace the memory of another.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
 
 use sgc_trust::CLOCK_SKEW_MAX;
-use sgc_wire::{NodeId, Signed};
+use sgc_wire::{NodeId, SignedBody};
 
 /// Digests remembered of one signer. Neighbours repeat the last few announcements of a node when paths differ in speed or a
 /// partition ends; they are recognised without verifying them again.
@@ -15,22 +15,22 @@ const DIGESTS_MAX: usize = 8;
 
 /// The memory of one signer.
 #[derive(Debug)]
-struct Past {
+struct SignerMemory {
     /// Announcements with lower numbers are void.
     floor: u64,
-    /// The floor that the last link state of the signer named, which ended.
+    /// The floor in the signer's last link state, which ended.
     run_floor: u64,
-    /// The one with the greatest number that ended without a newer one; its signer has to exceed it.
-    newest: Option<(u64, Signed)>,
+    /// The announcement with the greatest number that ended without a newer one; its signer has to exceed the number.
+    newest: Option<(u64, SignedBody)>,
     digests: VecDeque<[u8; 32]>,
-    /// After that no announcement of before verifies any more.
+    /// Time after which no earlier announcement verifies any more.
     until: Instant,
 }
 
-/// Announcements of all signers that are in force no longer.
+/// Announcements of all signers that are no longer in force.
 #[derive(Debug, Default)]
 pub(crate) struct Memory {
-    signers: BTreeMap<NodeId, Past>,
+    signers: BTreeMap<NodeId, SignerMemory>,
     digests: BTreeMap<[u8; 32], (NodeId, u64)>,
     forgets: BTreeSet<(Instant, NodeId)>,
 }
@@ -47,16 +47,16 @@ impl Memory {
     }
 
     /// Returns the announcement with the greatest number that ended, and the number.
-    pub(crate) fn newest(&self, signer: &NodeId) -> Option<(u64, &Signed)> {
+    pub(crate) fn newest(&self, signer: &NodeId) -> Option<(u64, &SignedBody)> {
         self.signers.get(signer)?.newest.as_ref().map(|(seq, signed)| (*seq, signed))
     }
 
-    /// Returns when something is to be forgotten.
+    /// Returns the time of the next expiry.
     pub(crate) fn deadline(&self) -> Option<Instant> {
         self.forgets.first().map(|(at, _)| *at)
     }
 
-    /// Remembers an announcement that a newer one took the place of. At most `max` signers are remembered; with more, the one
+    /// Remembers an announcement that a newer one replaced. At most `max` signers are remembered; with more, the one
     /// that was quiet for longest is forgotten.
     pub(crate) fn superseded(
         &mut self,
@@ -82,7 +82,7 @@ impl Memory {
         signer: &NodeId,
         seq: u64,
         digest: [u8; 32],
-        signed: &Signed,
+        signed: &SignedBody,
         max: usize,
     ) {
         self.superseded(now, signer, seq, digest, max);
@@ -93,7 +93,7 @@ impl Memory {
         }
     }
 
-    /// Remembers the floor that a signer's link state named, now that the link state has ended.
+    /// Remembers the floor in a signer's link state, which has ended.
     pub(crate) fn run_ended(&mut self, now: Instant, signer: &NodeId, floor: u64, max: usize) {
         self.past(now, signer, max).run_floor = floor;
     }
@@ -103,8 +103,8 @@ impl Memory {
         self.signers.get(signer).map_or(0, |past| past.run_floor)
     }
 
-    /// Returns the memory of a signer, kept from now on for as long as anything of before may verify.
-    fn past(&mut self, now: Instant, signer: &NodeId, max: usize) -> &mut Past {
+    /// Returns the memory of a signer, kept from now on for as long as any earlier announcement may verify.
+    fn past(&mut self, now: Instant, signer: &NodeId, max: usize) -> &mut SignerMemory {
         if !self.signers.contains_key(signer)
             && self.signers.len() >= max
             && let Some((_, quietest)) = self.forgets.first().copied()
@@ -112,7 +112,7 @@ impl Memory {
             self.forget(&quietest);
         }
         let until = now + 2 * CLOCK_SKEW_MAX;
-        let empty = || Past { floor: 0, run_floor: 0, newest: None, digests: VecDeque::new(), until };
+        let empty = || SignerMemory { floor: 0, run_floor: 0, newest: None, digests: VecDeque::new(), until };
         let past = self.signers.entry(*signer).or_insert_with(empty);
         self.forgets.remove(&(past.until, *signer));
         self.forgets.insert((until, *signer));
@@ -120,7 +120,7 @@ impl Memory {
         past
     }
 
-    /// Forgets what cannot verify any more.
+    /// Forgets announcements that cannot verify any more.
     pub(crate) fn expire(&mut self, now: Instant) {
         while let Some((_, signer)) = self.forgets.first().copied().filter(|(at, _)| *at <= now) {
             self.forget(&signer);
@@ -154,7 +154,7 @@ mod tests {
     fn a_signer_displaces_only_what_is_remembered_of_itself() {
         #[allow(clippy::disallowed_methods)]
         let start = Instant::now();
-        let signed = Signed { body: Bytes::from_static(b"body"), signature: Bytes::new() };
+        let signed = SignedBody { body: Bytes::from_static(b"body"), signature: Bytes::new() };
         let (quiet, busy) = (NodeId([1; 32]), NodeId([2; 32]));
         let mut memory = Memory::default();
         memory.ended(start, &quiet, 7, digest(0), &signed, 10);

@@ -1,28 +1,28 @@
-//! Names: who owns them, which way that is, and who is told of it.
+//! Names: their owners, the routes to them, and the nodes to tell.
 //!
-//! What is known of a name does not depend on links: an advertisement says whose it is, and where that is the topology
-//! says. So a robot that moves changes one entry, and a link that breaks none. A node that carries nobody else's names
-//! sees no topology; it goes by what its routers tell it.
+//! The record of a name does not depend on links: an advertisement names its owner, and the topology has the owner's
+//! place. So a robot that moves changes one entry, and a link that breaks none. A node that carries nobody else's names
+//! sees no topology; it relies on its routers.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CLOCK_SKEW_MAX, VerifiedPeer, signed_digest, verify_advert};
-use sgc_wire::{Control, HOP_LIMIT, NAMES_PER_FRAME_MAX, Name, NodeId, Now, Signed, UnixMillis};
+use sgc_wire::{Control, HOP_LIMIT, NAMES_PER_FRAME_MAX, Name, NodeId, Now, SignedBody, UnixMillis};
 use smallvec::SmallVec;
 
 use crate::limits::QUERY_EVERY;
 use crate::links::{COST_SUSPECT, LinkState};
-use crate::mapping::{Ask, Known};
+use crate::mapping::{Ask, NameLocation};
 use crate::memory::Memory;
 use crate::router::{DropReason, LinkId, Router};
 use crate::shares::Shares;
 use crate::topology::{NodeRecord, cost_differs};
 
-/// For how long one who asked is told of what becomes known.
+/// Time for which a router that asked is told of new owners.
 const QUERY_LEASE: Duration = Duration::from_secs(60);
-/// The same question goes on at most that often.
+/// Least time after which the same question is passed on again.
 const QUERY_AGAIN: Duration = Duration::from_secs(5);
 
 /// Approximate memory of a record beside its signed bytes, bytes.
@@ -41,18 +41,18 @@ pub(crate) struct Record {
     pub(crate) seq: u64,
     withdraw: bool,
     names: Box<[Name]>,
-    signed: Signed,
+    signed: SignedBody,
     issued_at: UnixMillis,
     digest: [u8; 32],
-    /// End of its lease; of a withdrawal, the time from which nothing that it withdrew verifies.
+    /// End of its lease; for a withdrawal, the time from which no withdrawn advertisement verifies.
     expires: Instant,
     /// The middle of its lease: owners renew after a third.
     renewal_due: Instant,
     /// Names that no newer one speaks for.
     live: usize,
-    /// The link that it came over first.
+    /// The link that brought it first.
     from: LinkId,
-    /// When it was asked for; `None` if it was told unasked.
+    /// Time of the question for it; `None` if it came unasked.
     asked: Option<Instant>,
 }
 
@@ -63,20 +63,20 @@ impl Record {
     }
 }
 
-/// Why a record counts no longer.
+/// The reason why a record no longer counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Gone {
-    /// Newer ones speak for its names.
+enum RecordEnd {
+    /// Newer records speak for its names.
     Superseded,
-    /// Its lease is over, it is not believed any more, or it had to make room.
+    /// Its lease has ended, its certificate is no longer believed, or it had to make room.
     Ended,
     /// This node does not want its names; it may come again.
     Unwanted,
 }
 
-/// The way to a name, at a node that goes by what it is told.
+/// The routes to a name, at a node that relies on its routers.
 #[derive(Debug, Default)]
-struct Heard {
+struct NameRoutes {
     /// Cost from the neighbour to the owner.
     over: SmallVec<[(LinkId, u32); 2]>,
     selected: Option<LinkId>,
@@ -84,7 +84,7 @@ struct Heard {
 
 /// The advertisements and withdrawals of one owner.
 #[derive(Debug, Default)]
-struct OfOwner {
+struct OwnerRecords {
     /// Its advertisements, by sequence number.
     records: BTreeSet<(u64, RecordId)>,
     /// Its withdrawals, by sequence number.
@@ -97,15 +97,15 @@ struct OfOwner {
     bytes: usize,
 }
 
-impl OfOwner {
-    fn of_kind(&mut self, withdraw: bool) -> (&mut BTreeSet<(u64, RecordId)>, &mut usize) {
+impl OwnerRecords {
+    fn records_of_kind(&mut self, withdraw: bool) -> (&mut BTreeSet<(u64, RecordId)>, &mut usize) {
         match withdraw {
             true => (&mut self.withdrawals, &mut self.withdrawn),
             false => (&mut self.records, &mut self.names),
         }
     }
 
-    /// The first to make room: a withdrawal, since the memory keeps the number of that.
+    /// Returns the first record to give way: a withdrawal, because the memory keeps its number.
     fn oldest(&self) -> Option<RecordId> {
         self.withdrawals.first().or(self.records.first()).map(|(_, id)| *id)
     }
@@ -120,38 +120,38 @@ impl OfOwner {
 struct Question {
     id: u64,
     at: Instant,
-    /// Until the answer is known.
+    /// Set until the answer is known.
     open: bool,
 }
 
-/// Everything that is known of names.
+/// All records and routes of names.
 #[derive(Debug, Default)]
 pub(crate) struct Names {
-    /// The newest word on each name: an advertisement or a withdrawal.
+    /// The newest record of each name: an advertisement or a withdrawal.
     words: BTreeMap<Name, RecordId>,
     records: BTreeMap<RecordId, Record>,
     expiries: BTreeSet<(Instant, RecordId)>,
     /// The middle of the lease of each advertisement.
     renewals: BTreeSet<(Instant, RecordId)>,
     seen: BTreeMap<[u8; 32], RecordId>,
-    owners: BTreeMap<NodeId, OfOwner>,
+    owners: BTreeMap<NodeId, OwnerRecords>,
     next_id: RecordId,
-    /// Records that are in force no longer.
+    /// Records that are no longer in force.
     memory: Memory,
     /// Names that withdrawals speak for, in all and by owner, the one with the most last.
     withdrawn: usize,
     most_withdrawn: BTreeSet<(usize, NodeId)>,
     /// Records that wait for the allowance of their owner to be passed on.
     waiting: BTreeMap<NodeId, BTreeSet<RecordId>>,
-    heard: BTreeMap<Name, Heard>,
-    /// Who wants to hear of a name: proxies, and this node's own endpoint.
+    heard: BTreeMap<Name, NameRoutes>,
+    /// Links that want to know of a name: proxies, and this node's own endpoint.
     watchers: BTreeMap<Name, BTreeSet<LinkId>>,
-    /// Names that are asked for, and when the next time is.
+    /// Names that are asked for, with the time of the next question.
     asking: BTreeMap<Name, Instant>,
     ask_at: BTreeSet<(Instant, Name)>,
-    /// The question for a name that was passed on last, charged to who brought it.
+    /// The last question for a name that was passed on, charged to its bringer.
     passed_on: Shares<Name, Question>,
-    /// Names that routers asked for over a link and nobody knew, and until when they are to be told.
+    /// Unknown names that routers asked for over a link, with the end of their interest.
     asks: Shares<(LinkId, Name), Instant>,
     /// Questions that began here.
     questions: u64,
@@ -163,30 +163,30 @@ impl Names {
         self.records.get(&self.id(name)?)
     }
 
-    /// The owners of what is advertised or withdrawn.
+    /// Iterates over the owners of records.
     pub(crate) fn owners(&self) -> impl Iterator<Item = &NodeId> {
         self.owners.keys()
     }
 
-    /// The names that the advertisements of an owner speak for.
+    /// Iterates over the names that the advertisements of an owner speak for.
     fn names_of(&self, owner: &NodeId) -> impl Iterator<Item = &Name> {
         let records = self.owners.get(owner).into_iter().flat_map(|of_owner| &of_owner.records);
         let named = records.filter_map(|(_, id)| Some((id, self.records.get(id)?)));
         named.flat_map(move |(id, r)| r.names.iter().filter(move |n| self.words.get(*n) == Some(id)))
     }
 
-    /// The advertisement that speaks for a name.
+    /// Returns the advertisement that speaks for a name.
     fn id(&self, name: &Name) -> Option<RecordId> {
         let id = self.words.get(name)?;
         self.records.get(id).filter(|record| !record.withdraw).map(|_| *id)
     }
 
-    /// Names that are advertised.
+    /// Returns the number of advertised names.
     fn live(&self) -> usize {
         self.words.len().saturating_sub(self.withdrawn)
     }
 
-    /// Names that are advertised, asked for or heard of.
+    /// Returns the number of names that are advertised, asked for or heard of.
     pub(crate) fn known(&self) -> usize {
         let others = self.watchers.keys().chain(self.heard.keys());
         let unknown: BTreeSet<_> = others.filter(|n| self.id(n).is_none()).collect();
@@ -204,24 +204,24 @@ impl Names {
         [expiry, ask, renewal, self.memory.deadline(), self.prune_at].into_iter().flatten()
     }
 
-    /// The number of the next record.
+    /// Returns the number of the next record.
     pub(crate) fn next_id(&self) -> RecordId {
         self.next_id
     }
 
-    /// The newest sequence number known of a name, withdrawn or not.
+    /// Returns the newest known sequence number of a name, withdrawn or not.
     fn known_seq(&self, name: &Name) -> Option<u64> {
         self.records.get(self.words.get(name)?).map(|record| record.seq)
     }
 
     /// Returns the last message of an owner, in force or not, and its number.
-    fn newest(&self, owner: &NodeId) -> Option<(u64, &Signed)> {
-        let in_force = self.owners.get(owner).and_then(OfOwner::newest);
+    fn newest(&self, owner: &NodeId) -> Option<(u64, &SignedBody)> {
+        let in_force = self.owners.get(owner).and_then(OwnerRecords::newest);
         let in_force = in_force.and_then(|(seq, id)| Some((seq, &self.records.get(&id)?.signed)));
         in_force.into_iter().chain(self.memory.newest(owner)).max_by_key(|(seq, _)| *seq)
     }
 
-    /// A node's link state ended, and named this floor.
+    /// Notes that a node's link state ended, with this floor.
     pub(crate) fn run_ended(&mut self, now: Instant, node: &NodeId, floor: u64, max: usize) {
         self.memory.run_ended(now, node, floor, max);
     }
@@ -243,18 +243,18 @@ impl Names {
         }
     }
 
-    /// The owners of those that wait.
+    /// Returns the owners of waiting records.
     pub(crate) fn waiting(&self) -> Vec<NodeId> {
         self.waiting.keys().copied().collect()
     }
 
-    /// The record of an owner that has waited for longest, and the link that it came over.
+    /// Returns the owner's record that has waited for longest, and the link that brought it.
     pub(crate) fn first_waiting(&self, owner: &NodeId) -> Option<(RecordId, LinkId)> {
         let id = self.waiting.get(owner)?.first()?;
         self.records.get(id).map(|record| (*id, record.from))
     }
 
-    /// Forgets what was asked for over a link.
+    /// Forgets the questions of a link.
     pub(crate) fn forget_asks(&mut self, link: LinkId) {
         self.asks.remove_range((link, Name([0; 32]))..=(link, Name([0xff; 32])));
     }
@@ -273,15 +273,15 @@ impl Names {
 }
 
 impl Router {
-    /// The link towards the owner of `name`, and the cost of the way.
-    pub(crate) fn way(&self, name: &Name) -> Option<(LinkId, u32)> {
+    /// Returns the link towards the owner of `name`, and the cost of the route.
+    pub(crate) fn next_hop(&self, name: &Name) -> Option<(LinkId, u32)> {
         let record = self.names.record(name)?;
         let owner = &record.owner.node_id;
         if *owner == self.config.node {
             return Some((LinkId::LOCAL, 0));
         }
         if self.config.transit {
-            return self.way_to(owner);
+            return self.next_hop_to(owner);
         }
         let heard = self.names.heard.get(name)?;
         let over = |(link, cost): &(LinkId, u32)| {
@@ -295,11 +295,12 @@ impl Router {
         Some((link, cost))
     }
 
-    /// The link towards a node, and the cost of the way, as the topology says it or a link of this node itself.
-    fn way_to(&self, node: &NodeId) -> Option<(LinkId, u32)> {
+    /// Returns the link towards a node, and the cost of the route, from the topology or from a link of this node
+    /// itself.
+    fn next_hop_to(&self, node: &NodeId) -> Option<(LinkId, u32)> {
         let direct = self.link_to(node);
-        let way = self.topology.way(&self.config.node, node);
-        match (way, direct) {
+        let next_hop = self.topology.next_hop(&self.config.node, node);
+        match (next_hop, direct) {
             (Some((cost, first)), _) if first == *node => Some((direct?.0, cost)),
             (Some((cost, first)), direct) => match (self.link_to(&first), direct) {
                 (Some((link, _)), Some((straight, own))) => {
@@ -312,12 +313,12 @@ impl Router {
         }
     }
 
-    /// True if `name` may be told over `link`: not back where it is, and others' names only by routers.
-    fn may_tell(&self, way: LinkId, link: LinkId) -> bool {
-        way != link && (way == LinkId::LOCAL || link == LinkId::LOCAL || self.config.transit)
+    /// Returns `true` if `name` may be told over `link`: not back where it is, and others' names only by routers.
+    fn may_tell(&self, next_hop: LinkId, link: LinkId) -> bool {
+        next_hop != link && (next_hop == LinkId::LOCAL || link == LinkId::LOCAL || self.config.transit)
     }
 
-    pub(crate) fn handle_advert(&mut self, now: Now, link: LinkId, cost: u32, signed: Signed) {
+    pub(crate) fn handle_advert(&mut self, now: Now, link: LinkId, cost: u32, signed: SignedBody) {
         let Some(state) = self.links.get(&link) else { return };
         let (neighbour, from_router, is_local) = (state.node, state.is_transit(), link == LinkId::LOCAL);
         let digest = signed_digest(&signed);
@@ -347,7 +348,7 @@ impl Router {
                 self.charge_stale(link);
                 return self.stale_advert(link, &owner, seq);
             }
-            // What this node itself said, perhaps in a run whose clock was ahead: its endpoint has to go on from there.
+            // This node's own record, perhaps of a run whose clock was ahead: its endpoint has to continue from there.
             return self.send(LinkId::LOCAL, Control::Advert { cost, signed });
         }
         if !from_router && owner != neighbour {
@@ -358,7 +359,7 @@ impl Router {
         let run = run.unwrap_or_else(|| self.names.memory.run_floor(&owner));
         let floor = run.max(self.names.memory.floor(&owner));
         let is_news = |n: &Name| self.names.known_seq(n).is_none_or(|known| seq > known);
-        // This node's own word is always the newest.
+        // This node's own record is always the newest.
         let mut news: Vec<_> =
             advert.names.iter().copied().filter(|n| is_local || seq >= floor && is_news(n)).collect();
         if news.is_empty() {
@@ -366,7 +367,7 @@ impl Router {
             return self.stale_advert(link, &owner, seq);
         }
         if !self.config.transit && !is_local {
-            // What nobody here wants, a node that carries nothing need not know.
+            // A node that carries nothing need not know names that nobody here wants.
             news.retain(|n| self.names.watchers.contains_key(n));
             if news.is_empty() {
                 return self.charge_stale(link);
@@ -395,21 +396,21 @@ impl Router {
             renewal_due: now.instant + expires.saturating_duration_since(now.instant) / 2,
             live: 0,
             from: link,
-            // Owners tell of changes without being asked.
+            // Owners announce changes unasked.
             asked: (asked && from_router && !withdraw).then_some(now.instant),
         };
         if withdraw {
             return self.withdraw(link, &owner, record, &news);
         }
         let id = self.insert(record, &news);
-        // A node that only listens may hear of names that it knew already from another neighbour.
+        // A node that only listens may learn of known names from another neighbour.
         self.hear(link, cost, id);
         self.pass_on_or_wait(link, &owner, id);
         news.extend(self.make_room(&owner));
         self.routes_changed(&news);
     }
 
-    /// An owner said something newer before; if it says this itself, it should hear of that.
+    /// Answers an old advertisement: if it comes from the owner itself, the owner should learn the newer number.
     fn stale_advert(&mut self, link: LinkId, owner: &NodeId, seq: u64) {
         let newest = self.names.newest(owner).filter(|(newest, _)| *newest > seq);
         let known = newest.map_or(seq, |(newest, _)| newest);
@@ -422,7 +423,7 @@ impl Router {
         self.drop_frame(link, DropReason::Stale { seq, known });
     }
 
-    /// The bound that these names would exceed.
+    /// Returns the bound that these names would exceed.
     fn over_limit(
         &self,
         link: LinkId,
@@ -453,8 +454,8 @@ impl Router {
         }
     }
 
-    /// Voids the oldest of what an owner advertised and withdrew if that is too much, and the oldest withdrawals of the owner
-    /// with the most if there are too many in all; returns the names that are not advertised any more.
+    /// Voids the oldest records of an owner that has too many, and the oldest withdrawals of the owner with the most if
+    /// there are too many in all. Returns the names that are no longer advertised.
     fn make_room(&mut self, owner: &NodeId) -> Vec<Name> {
         let mut gone = Vec::new();
         let limits = &self.config.limits;
@@ -465,14 +466,14 @@ impl Router {
             && (of_owner.records.len() + of_owner.withdrawals.len() > most || of_owner.bytes > bytes_max)
             && let Some(oldest) = of_owner.oldest()
         {
-            gone.extend(self.forget_record(oldest, Gone::Ended));
+            gone.extend(self.forget_record(oldest, RecordEnd::Ended));
         }
         while self.names.withdrawn > tombstones_max
             && let Some((_, owner)) = self.names.most_withdrawn.last().copied()
             && let Some((_, oldest)) =
                 self.names.owners.get(&owner).and_then(|o| o.withdrawals.first()).copied()
         {
-            self.forget_record(oldest, Gone::Ended);
+            self.forget_record(oldest, RecordEnd::Ended);
         }
         gone
     }
@@ -486,7 +487,7 @@ impl Router {
             self.names.renewals.insert((record.renewal_due, id));
         }
         let of_owner = self.names.owners.entry(record.owner.node_id).or_default();
-        of_owner.of_kind(record.withdraw).0.insert((record.seq, id));
+        of_owner.records_of_kind(record.withdraw).0.insert((record.seq, id));
         of_owner.bytes += record.bytes();
         let withdraw = record.withdraw;
         self.names.records.insert(id, record);
@@ -497,7 +498,7 @@ impl Router {
                 question.open = false;
             }
             if let Some(old) = self.names.words.insert(*name, id) {
-                self.release(old, 1, Gone::Superseded);
+                self.release(old, 1, RecordEnd::Superseded);
             }
         }
         self.hold(id, names.len());
@@ -509,10 +510,10 @@ impl Router {
         record.live += names;
         let (owner, withdraw, from) = (record.owner.node_id, record.withdraw, record.from);
         self.count(&owner, withdraw, from, names, usize::saturating_add);
-        self.release(id, 0, Gone::Unwanted);
+        self.release(id, 0, RecordEnd::Unwanted);
     }
 
-    /// Counts names that a record speaks for, more or fewer.
+    /// Counts names that a record gains or loses.
     fn count(
         &mut self,
         owner: &NodeId,
@@ -522,7 +523,7 @@ impl Router {
         change: fn(usize, usize) -> usize,
     ) {
         let Some(of_owner) = self.names.owners.get_mut(owner) else { return };
-        let (_, count) = of_owner.of_kind(withdraw);
+        let (_, count) = of_owner.records_of_kind(withdraw);
         let old = std::mem::replace(count, change(*count, names));
         let new = *count;
         if withdraw {
@@ -536,8 +537,8 @@ impl Router {
         }
     }
 
-    /// Names are not of this record any more; without any it is gone.
-    fn release(&mut self, id: RecordId, names: usize, gone: Gone) {
+    /// Takes names from a record; without any it is removed.
+    fn release(&mut self, id: RecordId, names: usize, gone: RecordEnd) {
         let Some(record) = self.names.records.get_mut(&id) else { return };
         record.live = record.live.saturating_sub(names);
         let is_gone = record.live == 0;
@@ -552,7 +553,7 @@ impl Router {
         self.names.renewals.remove(&(record.renewal_due, id));
         self.names.waits_no_more(&owner, id);
         if let Some(of_owner) = self.names.owners.get_mut(&owner) {
-            of_owner.of_kind(withdraw).0.remove(&(record.seq, id));
+            of_owner.records_of_kind(withdraw).0.remove(&(record.seq, id));
             of_owner.bytes = of_owner.bytes.saturating_sub(record.bytes());
             if of_owner.records.is_empty() && of_owner.withdrawals.is_empty() {
                 self.names.owners.remove(&owner);
@@ -561,14 +562,14 @@ impl Router {
         let (now, max) = (self.now.instant, self.config.limits.nodes_max);
         let Record { seq, digest, signed, .. } = record;
         match gone {
-            Gone::Superseded => self.names.memory.superseded(now, &owner, seq, digest, max),
-            Gone::Ended => self.names.memory.ended(now, &owner, seq, digest, &signed, max),
-            Gone::Unwanted => {}
+            RecordEnd::Superseded => self.names.memory.superseded(now, &owner, seq, digest, max),
+            RecordEnd::Ended => self.names.memory.ended(now, &owner, seq, digest, &signed, max),
+            RecordEnd::Unwanted => {}
         }
     }
 
     /// Forgets all names that a record still speaks for.
-    fn forget_record(&mut self, id: RecordId, gone: Gone) -> Vec<Name> {
+    fn forget_record(&mut self, id: RecordId, gone: RecordEnd) -> Vec<Name> {
         let Some(record) = self.names.records.get(&id) else { return Vec::new() };
         let names: Vec<_> =
             record.names.iter().copied().filter(|n| self.names.words.get(n) == Some(&id)).collect();
@@ -580,11 +581,11 @@ impl Router {
         names
     }
 
-    /// Forgets what an owner advertised in a run before this one.
+    /// Forgets the advertisements of an owner's earlier run.
     pub(crate) fn void_names(&mut self, owner: &NodeId, floor: u64) {
         let old = self.names.owners.get(owner).into_iter().flat_map(|o| o.records.range(..(floor, 0)));
         for id in old.map(|(_, id)| *id).collect::<Vec<_>>() {
-            let names = self.forget_record(id, Gone::Superseded);
+            let names = self.forget_record(id, RecordEnd::Superseded);
             self.routes_changed(&names);
         }
     }
@@ -593,7 +594,7 @@ impl Router {
         let mut known: Vec<_> = names.iter().copied().filter(|n| self.names.id(n).is_some()).collect();
         let frame = Control::Advert { cost: 0, signed: record.signed.clone() };
         let id = self.insert(record, names);
-        // Those who never heard of the names need not hear that they are gone.
+        // Neighbours that never heard of the names need no withdrawal.
         if known.is_empty() {
             self.charge_stale(link);
         } else {
@@ -604,7 +605,7 @@ impl Router {
         self.routes_changed(&known);
     }
 
-    /// A node that goes by what it is told: the owner of a record's names is in reach over this link.
+    /// Notes, at a node that relies on its routers, that the owner of a record is in reach over this link.
     fn hear(&mut self, link: LinkId, cost: u32, id: RecordId) {
         if self.config.transit || link == LinkId::LOCAL {
             return;
@@ -617,7 +618,7 @@ impl Router {
             // It may have been without interest when the record came.
             if self.names.known_seq(name).is_none_or(|known| known < seq) {
                 if let Some(old) = self.names.words.insert(*name, id) {
-                    self.release(old, 1, Gone::Superseded);
+                    self.release(old, 1, RecordEnd::Superseded);
                 }
                 self.hold(id, 1);
             }
@@ -630,7 +631,7 @@ impl Router {
         self.routes_changed(&names);
     }
 
-    /// A neighbour can no longer reach these names.
+    /// Handles a neighbour's notice that it can no longer reach these names.
     pub(crate) fn handle_unreach(&mut self, link: LinkId, names: &[Name]) {
         if self.config.transit {
             return self.drop_frame(link, DropReason::Unknown { what: "unreach" });
@@ -645,8 +646,8 @@ impl Router {
         self.routes_changed(&lost);
     }
 
-    /// Nothing that was heard over a link counts any more.
-    pub(crate) fn unhear(&mut self, link: LinkId) {
+    /// Forgets every route over a link.
+    pub(crate) fn forget_via(&mut self, link: LinkId) {
         let mut lost = Vec::new();
         for (name, heard) in &mut self.names.heard {
             if heard.over.iter().any(|(l, _)| *l == link) {
@@ -686,9 +687,9 @@ impl Router {
             for name in news {
                 let record = self.names.record(&name);
                 let is_late = |r: &Record| r.asked.is_some() || r.renewal_due <= now.instant;
-                let needs = self.way(&name).is_none()
+                let needs = self.next_hop(&name).is_none()
                     || record.is_some_and(|r| is_late(r) && r.owner.node_id != self.config.node);
-                // Another may have come for it before, and have many before it.
+                // Another waiting node may have an earlier turn, behind many others.
                 let due = self.names.asking.get(&name).copied();
                 if needs && due.is_none_or(|at| at > now.instant + QUERY_EVERY) {
                     let turn = self.turn(&name, false);
@@ -698,8 +699,8 @@ impl Router {
         }
     }
 
-    /// Returns the time at which all may be asked for a name on behalf of those who wait for it: the first turn of any of them. This node's
-    /// own endpoint need not wait.
+    /// Returns the time at which all routers may be asked for a name on behalf of its waiting nodes: the first turn of
+    /// any of them. This node's own endpoint need not wait.
     fn turn(&mut self, name: &Name, again: bool) -> Instant {
         let now = self.now.instant;
         let watchers: SmallVec<[LinkId; 8]> =
@@ -742,11 +743,11 @@ impl Router {
         }
         self.names.watchers.remove(name);
         self.names.stop_asking(name);
-        if !self.config.transit && self.way(name).is_none_or(|(link, _)| link != LinkId::LOCAL) {
+        if !self.config.transit && self.next_hop(name).is_none_or(|(link, _)| link != LinkId::LOCAL) {
             self.names.heard.remove(name);
             if let Some(id) = self.names.id(name) {
                 self.names.words.remove(name);
-                self.release(id, 1, Gone::Unwanted);
+                self.release(id, 1, RecordEnd::Unwanted);
             }
         }
     }
@@ -760,7 +761,7 @@ impl Router {
         }
     }
 
-    /// Asks a neighbour that just greeted for the names that are wanted here.
+    /// Asks a neighbour that just greeted for the wanted names.
     pub(crate) fn send_interests(&mut self, link: LinkId) {
         if self.config.transit {
             return;
@@ -771,12 +772,12 @@ impl Router {
         }
     }
 
-    /// The next record, from one number up to another, that a router is told unasked: those of this node, and if the mapping says
-    /// so all. It may have been out of reach when names were withdrawn, so it hears of that, too.
+    /// Returns the next record, between two numbers, for a router that did not ask: those of this node, and if the
+    /// mapping says so all. The router may have missed withdrawals, so it gets those, too.
     pub(crate) fn next_advert(&self, from: RecordId, end: RecordId) -> Option<RecordId> {
         let all = self.config.transit && self.mapping.tells_unasked();
         let own = self.config.node;
-        // Whatever a withdrawal of before that ended has no lease left.
+        // Advertisements that an older withdrawal ended have no lease left.
         let oldest = self.now.instant + 2 * CLOCK_SKEW_MAX - self.config.limits.lease_max;
         let told = |record: &Record| match record.withdraw {
             true => all && record.expires > oldest,
@@ -785,7 +786,8 @@ impl Router {
         self.names.records.range(from..end).find(|(_, record)| told(record)).map(|(id, _)| *id)
     }
 
-    /// An advertisement, and the withdrawals of those of its names that do not hold any more; nothing if it would not be believed.
+    /// Returns an advertisement, and the withdrawals of those of its names that are void; nothing if the receiver would
+    /// not believe it.
     pub(crate) fn record_frames(&self, id: RecordId, cost: u32) -> Vec<Control> {
         let record = self.names.records.get(&id).filter(|record| self.verifies_elsewhere(record.issued_at));
         let Some(record) = record else { return Vec::new() };
@@ -806,7 +808,7 @@ impl Router {
         frames
     }
 
-    /// Passes on a record that came over `ingress`: to all routers, or to those who asked.
+    /// Passes on a record that came over `ingress`: to all routers, or to those that asked.
     pub(crate) fn tell_record_to_routers(&mut self, ingress: LinkId, owner: &NodeId, id: RecordId) {
         let Some(record) = self.names.records.get(&id) else { return };
         let names: Vec<_> =
@@ -838,7 +840,7 @@ impl Router {
         }
     }
 
-    /// Hands a withdrawal to those who were told of one of the names.
+    /// Hands a withdrawal to the links that were told of one of the names.
     fn tell_watchers(&mut self, ingress: LinkId, names: &[Name], frame: &Control) {
         let told = |link: &LinkState| names.iter().any(|n| matches!(link.interests.get(n), Some(Some(_))));
         let targets: Vec<_> =
@@ -855,12 +857,12 @@ impl Router {
         }
     }
 
-    /// The ways to these names may be others by now: their trees follow, and who wants to know is told.
+    /// Updates trees and interested neighbours after the routes to these names may have changed.
     pub(crate) fn routes_changed(&mut self, names: &[Name]) {
         let mut watched = BTreeMap::<LinkId, Vec<Name>>::new();
         for name in names {
             self.select(name);
-            self.follow_way(name);
+            self.follow_next_hop(name);
             for link in self.names.watchers.get(name).into_iter().flatten() {
                 watched.entry(*link).or_default().push(*name);
             }
@@ -871,7 +873,7 @@ impl Router {
         if self.config.transit {
             let waited = names.iter().filter(|n| self.names.watchers.contains_key(*n));
             let lost: Vec<_> = waited
-                .filter(|n| !self.names.asking.contains_key(*n) && self.way(n).is_none())
+                .filter(|n| !self.names.asking.contains_key(*n) && self.next_hop(n).is_none())
                 .copied()
                 .collect();
             for name in lost {
@@ -881,35 +883,35 @@ impl Router {
         }
     }
 
-    /// The ways to these owners may be others by now. Names that nobody advertises have no way before or after.
-    pub(crate) fn ways_to_owners_changed(&mut self, owners: &[NodeId]) {
+    /// Handles possible route changes to these owners. Names without an advertisement have no route before or after.
+    pub(crate) fn owner_routes_changed(&mut self, owners: &[NodeId]) {
         let counts = |n: &&Name| self.names.watchers.contains_key(*n) || self.trees.contains_key(*n);
         let names: BTreeSet<_> =
             owners.iter().flat_map(|owner| self.names.names_of(owner).filter(counts)).copied().collect();
-        self.check_ways(names);
+        self.check_next_hops(names);
         self.answer_asks(owners);
     }
 
-    /// The links of a node that carries nobody else's names are others by now.
-    pub(crate) fn ways_changed(&mut self) {
-        self.check_ways(self.names.watchers.keys().chain(self.trees.keys()).copied().collect());
+    /// Handles changed links of a node that carries nobody else's names.
+    pub(crate) fn own_links_changed(&mut self) {
+        self.check_next_hops(self.names.watchers.keys().chain(self.trees.keys()).copied().collect());
     }
 
-    fn check_ways(&mut self, names: BTreeSet<Name>) {
+    fn check_next_hops(&mut self, names: BTreeSet<Name>) {
         self.topology.names_checked += names.len() as u64;
         self.routes_changed(&names.into_iter().collect::<Vec<_>>());
     }
 
     fn select(&mut self, name: &Name) {
         if !self.config.transit {
-            let way = self.way(name).map(|(link, _)| link);
+            let next_hop = self.next_hop(name).map(|(link, _)| link);
             if let Some(heard) = self.names.heard.get_mut(name) {
-                heard.selected = way;
+                heard.selected = next_hop;
             }
         }
     }
 
-    /// Tells a neighbour once more of the names that it asked for: it did not believe what it was told.
+    /// Tells a neighbour the names of its interest again, because it did not believe the last records.
     pub(crate) fn tell_interested_again(&mut self, link: LinkId) {
         let Some(state) = self.links.get_mut(&link) else { return };
         let names: Vec<_> = state.interests.keys().copied().collect();
@@ -917,7 +919,7 @@ impl Router {
         self.tell_interested(link, &names);
     }
 
-    /// Tells one who is interested what is news of these names: each advertisement once.
+    /// Tells an interested neighbour the news of these names: each advertisement once.
     fn tell_interested(&mut self, link: LinkId, names: &[Name]) {
         let mut adverts = BTreeMap::new();
         let mut gone = Vec::new();
@@ -925,9 +927,9 @@ impl Router {
             let Some(told) = self.links.get(&link).and_then(|l| l.interests.get(name)).copied() else {
                 continue;
             };
-            let way = self.way(name).filter(|(way, _)| self.may_tell(*way, link));
+            let next_hop = self.next_hop(name).filter(|(next_hop, _)| self.may_tell(*next_hop, link));
             let id = self.names.id(name);
-            let news = match (told, way.zip(id)) {
+            let news = match (told, next_hop.zip(id)) {
                 (None, None) => continue,
                 (Some(_), None) => {
                     gone.push(*name);
@@ -957,8 +959,8 @@ impl Router {
 
     // ---- Questions among routers.
 
-    /// Somebody asks. The answer goes back over the link that a question came over first: its copies over others are
-    /// passed over, or every router would be told of every name that anybody asks for.
+    /// Handles a question. The answer goes back over the link that brought the question first: copies over others are
+    /// ignored, or every router would be told of every requested name.
     pub(crate) fn handle_query(&mut self, now: Now, link: LinkId, id: u64, hops: u8, names: &[Name]) {
         let Some(state) = self.links.get(&link) else { return };
         if !self.config.transit || !state.is_transit() {
@@ -977,8 +979,8 @@ impl Router {
             if before.is_some_and(|q| q.id == id) {
                 continue;
             }
-            let way = self.way(name).filter(|(way, _)| *way != link);
-            if way.is_some()
+            let next_hop = self.next_hop(name).filter(|(next_hop, _)| *next_hop != link);
+            if next_hop.is_some()
                 && let Some(record) = self.names.record(name)
             {
                 let (owner, from) = (record.owner.node_id, record.from);
@@ -1014,7 +1016,7 @@ impl Router {
         }
     }
 
-    /// Asks all routers but the one who asked.
+    /// Asks all routers but the asker.
     fn pass_on(&mut self, now: Instant, asker: Option<LinkId>, id: u64, hops: u8, names: &[Name]) {
         if names.is_empty() {
             return;
@@ -1022,7 +1024,7 @@ impl Router {
         let by = asker.and_then(|link| self.links.get(&link)).map_or(self.config.node, |state| state.node);
         let max = self.config.limits.questions_max;
         let question = Question { id, at: now, open: true };
-        // Copies of a question that is forgotten while they are under way would go on again.
+        // If a question were forgotten while copies of it are in flight, those would be passed on again.
         let is_settled = |q: &Question| q.at + QUERY_AGAIN <= now;
         let passed_on = &mut self.names.passed_on;
         let (names, refused): (Vec<_>, Vec<_>) =
@@ -1047,10 +1049,10 @@ impl Router {
         }
     }
 
-    /// Number of a new question: nobody else has it, and nobody sees whose it is.
+    /// Returns the number of a new question: unique, and without a trace of the asker.
     fn question(&mut self) -> u64 {
         self.names.questions += 1;
-        // Of an odd factor, so that runs whose numbers are near each other have others.
+        // The odd factor gives different numbers to runs whose own numbers are near each other.
         let spread = self.names.questions.wrapping_mul(0x9e37_79b9_7f4a_7c15);
         self.config.incarnation.wrapping_add(spread)
     }
@@ -1062,7 +1064,7 @@ impl Router {
         }
     }
 
-    /// A router that asked is told where the owner is, and of changes from here on.
+    /// Tells a router that asked the owner's place, now and after each change.
     fn answer(&mut self, link: LinkId, owner: &NodeId, names: &[Name]) {
         let until = self.now.instant + QUERY_LEASE;
         for name in names {
@@ -1071,7 +1073,7 @@ impl Router {
         let Some(state) = self.links.get_mut(&link) else { return };
         let new = state.follows.insert(*owner, until).is_none();
         self.names.prune_at.get_or_insert(until);
-        // Routers are known to all; and who follows is told of changes.
+        // All routers are known to it, and it learns of changes because it follows the owner.
         let is_told = |r: &&NodeRecord| new && !r.transit && self.verifies_elsewhere(r.issued_at);
         if let Some(record) = self.topology.node(owner).filter(is_told) {
             let signed = record.signed.clone();
@@ -1087,7 +1089,7 @@ impl Router {
         }
     }
 
-    /// Answers what could not be answered before of the names of these owners.
+    /// Answers open questions for the names of these owners.
     fn answer_asks(&mut self, owners: &[NodeId]) {
         let waits = |s: &LinkState| self.names.asks.held_by(&s.node) > 0;
         let waiting: Vec<_> = self.links.iter().filter(|(_, s)| waits(s)).map(|(l, _)| *l).collect();
@@ -1099,7 +1101,7 @@ impl Router {
             }
         }
         for (link, owner, name) in open {
-            if self.way(&name).is_none_or(|(way, _)| way == link) {
+            if self.next_hop(&name).is_none_or(|(next_hop, _)| next_hop == link) {
                 continue;
             }
             self.answer(link, &owner, &[name]);
@@ -1107,7 +1109,7 @@ impl Router {
         }
     }
 
-    /// What a router on the way must know before it can take a request for a name.
+    /// Tells a router on the route the owner's record, which it needs before it can take a request for a name.
     pub(crate) fn introduce(&mut self, link: LinkId, name: &Name) {
         let transit = self.links.get(&link).is_some_and(|l| l.is_transit());
         if self.mapping.tells_unasked() || !self.config.transit || !transit {
@@ -1121,7 +1123,7 @@ impl Router {
 
     /// Asks other routers for names that somebody here waits for, if that is due.
     pub(crate) fn ask_due(&mut self, now: Now) {
-        // It is looked for whenever the machine is drained, so mostly there is nothing.
+        // Checked whenever the machine is drained, so usually nothing is due.
         if self.names.ask_at.first().is_none_or(|(at, _)| *at > now.instant) {
             return;
         }
@@ -1129,14 +1131,14 @@ impl Router {
         let mut one = BTreeMap::<LinkId, Vec<Name>>::new();
         while let Some((at, name)) = self.names.ask_at.first().copied().filter(|(at, _)| *at <= now.instant) {
             self.names.ask_at.remove(&(at, name));
-            let known = match self.names.record(&name).filter(|_| self.way(&name).is_some()) {
-                None => Known::No,
-                // The first to answer, or one that told it unasked, may keep back a later one.
-                Some(record) if record.renewal_due <= now.instant => Known::No,
+            let known = match self.names.record(&name).filter(|_| self.next_hop(&name).is_some()) {
+                None => NameLocation::Unknown,
+                // A router that answered, or told the record unasked, may withhold a later one.
+                Some(record) if record.renewal_due <= now.instant => NameLocation::Unknown,
                 Some(record) => match record.asked {
-                    Some(_) if self.links.contains_key(&record.from) => Known::Answered(record.from),
-                    Some(_) => Known::No,
-                    None => Known::Told,
+                    Some(_) if self.links.contains_key(&record.from) => NameLocation::Answered(record.from),
+                    Some(_) => NameLocation::Unknown,
+                    None => NameLocation::Flooded,
                 },
             };
             match self.mapping.ask(known) {
@@ -1166,7 +1168,7 @@ impl Router {
         }
     }
 
-    /// Asks one router for its newest word on a name.
+    /// Asks one router for its newest record of a name.
     pub(crate) fn ask_neighbour(&mut self, link: LinkId, name: Name) {
         if self.config.transit && self.links.get(&link).is_some_and(LinkState::is_transit) {
             let id = self.question();
@@ -1176,8 +1178,8 @@ impl Router {
 
     // ---- Time and trust.
 
-    /// All are asked for the wanted names of advertisements of which half of the lease is over: owners renew after a third, so
-    /// whoever told them may keep the renewal back.
+    /// Asks all routers for the wanted names of advertisements in the second half of their lease: owners renew after a
+    /// third, so the router that told them may withhold the renewal.
     fn ask_for_renewals(&mut self, now: Instant) {
         while let Some((at, id)) = self.names.renewals.first().copied().filter(|(at, _)| *at <= now) {
             self.names.renewals.remove(&(at, id));
@@ -1199,8 +1201,9 @@ impl Router {
         while let Some((at, id)) = self.names.expiries.first().copied().filter(|(at, _)| *at <= now.instant) {
             self.names.expiries.remove(&(at, id));
             let withdraw = self.names.records.get(&id).is_some_and(|record| record.withdraw);
-            // Nothing verifies any more that a withdrawal which is over speaks against.
-            let names = self.forget_record(id, if withdraw { Gone::Superseded } else { Gone::Ended });
+            // No advertisement that an expired withdrawal voids verifies any more.
+            let names =
+                self.forget_record(id, if withdraw { RecordEnd::Superseded } else { RecordEnd::Ended });
             if !withdraw {
                 self.routes_changed(&names);
             }
@@ -1219,28 +1222,28 @@ impl Router {
         }
     }
 
-    /// Forgets what was advertised under certificates that are no longer believed.
+    /// Forgets advertisements under certificates that are no longer believed.
     pub(crate) fn distrust_names(&mut self) {
         let untrusted = |(_, r): &(&RecordId, &Record)| self.is_untrusted(&r.owner.path);
         let gone: Vec<_> = self.names.records.iter().filter(untrusted).map(|(id, _)| *id).collect();
         for id in gone {
             // It counts again if its certificate does.
-            let names = self.forget_record(id, Gone::Unwanted);
+            let names = self.forget_record(id, RecordEnd::Unwanted);
             self.routes_changed(&names);
         }
     }
 
-    /// Names whose owners are in reach.
+    /// Returns the number of names whose owners are in reach.
     pub(crate) fn routed_names(&self) -> usize {
         let reached = |r: &&Record| {
             let owner = &r.owner.node_id;
-            *owner == self.config.node || !self.config.transit || self.way_to(owner).is_some()
+            *owner == self.config.node || !self.config.transit || self.next_hop_to(owner).is_some()
         };
         let heard = |r: &Record| {
             if self.config.transit || r.owner.node_id == self.config.node {
                 return r.live;
             }
-            r.names.iter().filter(|n| self.way(n).is_some()).count()
+            r.names.iter().filter(|n| self.next_hop(n).is_some()).count()
         };
         self.names.records.values().filter(|r| !r.withdraw).filter(reached).map(heard).sum()
     }

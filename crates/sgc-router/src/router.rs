@@ -1,6 +1,6 @@
-//! The machine: frames and link changes in, frames and forwarding entries out.
+//! The router's state machine: frames and link changes in, frames and forwarding entries out.
 //!
-//! The network is in `topology.rs`, names are in `names.rs`, trees in `tree.rs`, whom to believe in `trust.rs`.
+//! The network is in `topology.rs`, names are in `names.rs`, trees in `tree.rs`, certificates and lists in `trust.rs`.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt;
@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CLOCK_SKEW_MAX, CaFingerprint, CrlError, Identity, SignedError, TrustAnchors};
-use sgc_wire::{ClockWatch, Control, Hello, Name, NodeId, Now, SinkId, ToldClock, UnixMillis};
+use sgc_wire::{ClockWatch, Control, Hello, Name, NodeId, Now, PeerClock, SinkId, UnixMillis};
 use smallvec::SmallVec;
 
 use crate::FibEntry;
@@ -17,7 +17,7 @@ use crate::links::{LinkState, Neighbour};
 use crate::lists::ListAllowances;
 use crate::mapping::{Mapping, MappingKind};
 use crate::names::Names;
-use crate::topology::{Topology, Ways};
+use crate::topology::{RouteStats, Topology};
 use crate::tree::Tree;
 
 /// A link of this node, by number. Numbers are never used again while the process lives.
@@ -35,81 +35,81 @@ impl fmt::Display for LinkId {
     }
 }
 
-/// Links of one node; each must fit into what it says of itself.
+/// Links of one node; its link state must have room for each.
 const LINKS_MAX: usize = sgc_wire::ADJACENCIES_MAX + sgc_wire::ATTACHED_MAX;
 
-/// Allowances that are kept without looking whether they are of use.
+/// Number of allowances below which unused ones are kept.
 const ALLOWANCES_MIN: usize = 1024;
 
 /// Least time until a neighbour is told everything once more because a clock was set.
 const TELL_AGAIN_EVERY: Duration = Duration::from_secs(60);
 
-/// Returns `true` if bodies that one of two nodes signs are not believed by the other, for their clocks.
+/// Returns `true` if clocks differ so much that either node refuses the other's signed bodies.
 pub fn clocks_differ(ahead_ms: i64) -> bool {
     ahead_ms.unsigned_abs() > CLOCK_SKEW_MAX.as_millis() as u64
 }
 
-/// What a router is made of.
+/// Parameters of a router.
 #[derive(Clone, Debug)]
 pub struct RouterConfig {
-    /// This node, and what it signs with.
+    /// This node's identity, for signing.
     pub identity: Arc<Identity>,
-    /// The same, by its id.
+    /// This node's id.
     pub node: NodeId,
-    /// True if it carries others' names.
+    /// Whether it carries others' names.
     pub transit: bool,
     /// Random number of this run.
     pub incarnation: u64,
-    /// When this run began: what the node advertised before is void.
+    /// Beginning of this run: earlier advertisements of the node are void.
     pub started: UnixMillis,
-    /// How it becomes known where names are; of no meaning unless `transit`.
+    /// Mapping of names to owners; unused unless `transit`.
     pub mapping: MappingKind,
-    /// Whose certificates it believes.
+    /// The trust anchors.
     pub anchors: Arc<TrustAnchors>,
     /// Bounds.
     pub limits: Limits,
 }
 
-/// What the driver has to do.
+/// Work for the driver.
 #[derive(Clone, Debug)]
 pub enum Output {
     /// Send a frame over a link; over [`LinkId::LOCAL`], hand it to the endpoint.
     Send {
-        /// Where.
+        /// The link.
         link: LinkId,
-        /// What.
+        /// The frame.
         frame: Control,
     },
     /// The forwarding of a name changed; `None` ends it.
     Forward {
-        /// Which.
+        /// The name.
         name: Name,
         /// The new entry.
         entry: Option<FibEntry>,
     },
     /// Close a link; the driver then reports it down.
     Close {
-        /// Which.
+        /// The link.
         link: LinkId,
-        /// Why.
+        /// The reason.
         reason: LinkClose,
     },
-    /// Other certificates are believed from here on: a newer revocation list came. To be kept, and told to whatever
-    /// else verifies certificates.
+    /// The trust anchors changed, because a newer revocation list came. The driver stores them, and passes them to
+    /// everything else that verifies certificates.
     Trust(Arc<TrustAnchors>),
-    /// Call [`Router::handle_flushed`] once the link has taken all frames before; the router has more for it than a queue is to
-    /// hold.
+    /// Call [`Router::handle_flushed`] once the link has taken all earlier frames; the router has more for it than a
+    /// queue can hold.
     Flush {
-        /// Which.
+        /// The link.
         link: LinkId,
     },
-    /// Something was refused; count it and, where it matters, say it.
-    Dropped(Dropped),
-    /// Nothing more to do until then, or until something happens.
+    /// A frame or body was dropped: count it and, where it matters, log it.
+    Dropped(RouterDrop),
+    /// Nothing more to do until this time, or until something happens.
     Timeout(Option<Instant>),
 }
 
-/// Why a link is closed.
+/// The reason why a link is closed.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum LinkClose {
     /// Another run of the node has the place of this one.
@@ -117,8 +117,8 @@ pub enum LinkClose {
     Superseded {
         /// The link of the other run, if it is here; otherwise the other run is linked to another router.
         by: Option<LinkId>,
-        /// True if the run that is closed is known to live: it came back after it was superseded once. The process of
-        /// a run that just greeted anew is mostly gone.
+        /// Whether the closed run is known to live, because it came back after it was superseded once. The process of a
+        /// run that just greeted anew is usually gone.
         alive: bool,
     },
     /// A frame came before the greeting, or a second greeting.
@@ -133,29 +133,29 @@ pub enum LinkClose {
     /// The node's certificate was revoked, or its CA is no longer trusted.
     #[error("the peer's certificate is revoked")]
     Revoked,
-    /// The node's certificate is over.
-    #[error("the peer's certificate has ended")]
+    /// The node's certificate has expired.
+    #[error("the peer's certificate has expired")]
     Expired,
     /// The node has too many links.
     #[error("the peer has too many links")]
     TooMany,
-    /// The peer sent too much that does not verify.
-    #[error("the peer keeps sending what does not verify")]
+    /// The peer sent too many bodies that do not verify.
+    #[error("the peer keeps sending bodies that do not verify")]
     Forgeries,
 }
 
-/// What was refused, and who sent it.
+/// A dropped frame or body, and its sender.
 #[derive(Clone, Debug)]
-pub struct Dropped {
-    /// The link it came over.
+pub struct RouterDrop {
+    /// The link that brought it.
     pub link: LinkId,
     /// The node at its other end, if the link is known.
     pub peer: Option<NodeId>,
-    /// Why.
+    /// The reason.
     pub reason: DropReason,
 }
 
-/// Why a frame was refused.
+/// The reason why a frame or body was dropped.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DropReason {
     /// A signed body that does not verify.
@@ -163,28 +163,28 @@ pub enum DropReason {
     NotVerified {
         /// Advertisement, join or answer.
         what: &'static str,
-        /// What is wrong with it.
+        /// The error of the verification.
         why: SignedError,
     },
     /// A node that carries nobody else's names advertised for another owner.
-    #[error("advertises names of {owner:?}, which is another node")]
+    #[error("advertises names of another node, {}", owner.short())]
     NotOwner {
         /// The owner in the advertisement.
         owner: NodeId,
     },
-    /// An answer that none of the owner's keys known here signed. Its sink asks again, and the neighbour is asked for the
-    /// owner's advertisement: the owner may have another certificate by now.
-    #[error("answer is not signed with a key of {owner:?} that is known here")]
+    /// An answer that no known key of the owner signed. Its sink asks again, and the neighbour is asked for the owner's
+    /// advertisement: the owner may have another certificate by now.
+    #[error("answer is not signed with a known key of node {}", owner.short())]
     OwnerKey {
         /// The owner of the name.
         owner: NodeId,
     },
-    /// An advertisement that is older than what is known, or withdrawn.
+    /// An advertisement that is older than the known one, or withdrawn.
     #[error("advertisement {seq} is not newer than {known}")]
     Stale {
         /// Its sequence number.
         seq: u64,
-        /// The one known.
+        /// The known number.
         known: u64,
     },
     /// Too many hops.
@@ -193,23 +193,23 @@ pub enum DropReason {
     /// A bound of [`Limits`] is reached.
     #[error("limit reached: {what}")]
     Limit {
-        /// Which.
+        /// The bound.
         what: &'static str,
     },
-    /// Its neighbour has brought more questions for names than others, and there is no room for them. It may be as honest as any:
-    /// it brings those of the nodes behind it.
+    /// The neighbour has brought the most questions for names, and the table is full. It may be honest: it brings the
+    /// questions of the nodes behind it.
     #[error("too many questions for names are under way")]
     QuestionsFull,
-    /// The neighbour has brought too many announcements that were no news; not looked at.
-    #[error("brings too many announcements that are old")]
+    /// The neighbour has brought too many announcements without news; this one was not looked at.
+    #[error("brings too many old announcements")]
     StaleFlood,
-    /// A frame for a name or sink that is not known here.
-    #[error("{what} for a name or sink that is unknown here")]
+    /// A frame for an unknown name or sink.
+    #[error("{what} for an unknown name or sink")]
     Unknown {
         /// Kind of frame.
         what: &'static str,
     },
-    /// A frame from a neighbour that is not on the way to the owner.
+    /// A frame from a neighbour that is not on the route to the owner.
     #[error("{what} from a neighbour that is not on the way to the owner")]
     WrongWay {
         /// Kind of frame.
@@ -221,13 +221,13 @@ pub enum DropReason {
     /// A revocation list that is not believed.
     #[error("revocation list not believed: {0}")]
     Crl(CrlError),
-    /// A revocation list that is news, beyond the allowance of its CA. The newest of such waits.
+    /// A new revocation list beyond the allowance of its CA. The newest such list waits.
     #[error("new revocation lists of the CA {ca} come faster than one a second; the newest of them waits")]
     ListFlood {
         /// The CA that signed it.
         ca: CaFingerprint,
     },
-    /// A signed body from a clock that is not near the one here.
+    /// A signed body whose time is not near the time here.
     #[error(
         "{what} signed at {signed}, which is not near {now}: one of the two clocks is wrong, or it is a replay"
     )]
@@ -239,7 +239,7 @@ pub enum DropReason {
         /// The time here.
         now: UnixMillis,
     },
-    /// A neighbour says that it is a router, and its certificate does not.
+    /// A neighbour claims to be a router without the certificate of one.
     #[error(
         "says that it carries others' names, but its certificate does not let it: enroll it with --router or --may-route"
     )]
@@ -247,7 +247,7 @@ pub enum DropReason {
 }
 
 impl DropReason {
-    /// True for what an honest neighbour never causes; the others happen when frames cross.
+    /// Returns `true` for reasons that an honest neighbour never causes; the others happen when frames cross.
     pub fn is_suspicious(&self) -> bool {
         match self {
             Self::NotVerified { .. }
@@ -269,7 +269,7 @@ impl DropReason {
         }
     }
 
-    /// A short, stable name for counters.
+    /// Returns a short, stable name for counters.
     pub fn key(&self) -> &'static str {
         match self {
             Self::NotVerified { .. } => "not_verified",
@@ -291,7 +291,7 @@ impl DropReason {
     }
 }
 
-/// How much is known, for status.
+/// Sizes of the router's tables, for status.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RouterStats {
     /// Names with a route.
@@ -306,7 +306,7 @@ pub struct RouterStats {
     pub tombstones: usize,
 }
 
-/// The machine.
+/// The state machine.
 #[derive(Debug)]
 pub struct Router {
     pub(crate) config: RouterConfig,
@@ -315,26 +315,26 @@ pub struct Router {
     /// The links to each neighbour, ascending.
     pub(crate) links_of: BTreeMap<NodeId, SmallVec<[LinkId; 2]>>,
     allowances: BTreeMap<NodeId, Allowance>,
-    /// With so many it is time to look which are of no use.
+    /// Number of allowances at which the router looks for unused ones.
     allowances_max: usize,
     pub(crate) topology: Topology,
     pub(crate) names: Names,
     pub(crate) trees: BTreeMap<Name, Tree>,
-    /// Branches that wait for something, and until when.
+    /// Branches that wait for something, by their deadlines.
     pub(crate) deadlines: BTreeSet<(Instant, Name, SinkId)>,
     /// Time at which to pass on announcements beyond the allowance of their signer.
     pub(crate) late_at: Option<Instant>,
     pub(crate) lists: ListAllowances,
     pub(crate) outputs: VecDeque<Output>,
-    /// True once another run of this node took over from this one.
+    /// Set once another run of this node took over from this one.
     yields: bool,
     clock: ClockWatch,
-    /// As the driver said last.
+    /// The driver's last time.
     pub(crate) now: Now,
 }
 
 impl Router {
-    /// A router with nothing but its local link.
+    /// Returns a router with only its local link.
     pub fn new(config: RouterConfig, now: Now) -> Self {
         let mut local = LinkState::local(config.node);
         local.hello = Some(Hello {
@@ -366,7 +366,7 @@ impl Router {
         }
     }
 
-    /// A link to an authenticated node is up; greets it.
+    /// Takes a new link to an authenticated node, and greets it.
     pub fn handle_link_up(&mut self, now: Now, link: LinkId, neighbour: Neighbour) {
         debug_assert_ne!(link, LinkId::LOCAL);
         self.now = now;
@@ -397,21 +397,21 @@ impl Router {
         };
         self.send(link, Control::Hello(hello));
         self.send(link, Control::Clock { time: now.unix });
-        // Before anything that they bear on.
+        // Lists go first, before everything that they bear on.
         for der in self.config.anchors.crls().cloned().collect::<Vec<_>>() {
             self.send(link, Control::Crl { der });
         }
     }
 
-    /// A link is down; everything that depended on it is taken back.
+    /// Handles the end of a link: everything that depended on it is withdrawn.
     pub fn handle_link_down(&mut self, now: Now, link: LinkId) {
         debug_assert_ne!(link, LinkId::LOCAL);
         self.now = now;
         self.forget_link(link);
     }
 
-    /// What is measured of a link: its round trip, and whether nothing at all comes over it although something should.
-    /// Such a link is used only where there is no other way.
+    /// Takes the measurements of a link: its round trip, and whether nothing at all arrives although something should.
+    /// Such a link is used only where there is no other route.
     pub fn handle_link_quality(&mut self, now: Now, link: LinkId, round_trip: Duration, suspect: bool) {
         self.now = now;
         let Some(state) = self.links.get_mut(&link) else { return };
@@ -421,7 +421,7 @@ impl Router {
         }
     }
 
-    /// A frame came over a link.
+    /// Takes a frame from a link.
     pub fn handle_frame(&mut self, now: Now, link: LinkId, frame: Control) {
         self.now = now;
         let Some(state) = self.links.get(&link) else {
@@ -452,7 +452,7 @@ impl Router {
             Control::Label { .. } | Control::LabelAck { .. } => {
                 self.drop_frame(link, DropReason::Unknown { what: "label" });
             }
-            Control::Pulse { .. } => self.drop_frame(link, DropReason::Unknown { what: "pulse" }),
+            Control::Probe { .. } => self.drop_frame(link, DropReason::Unknown { what: "probe" }),
             Control::Clock { time } => self.handle_clock(now, link, time),
             // Its content is for the operator alone.
             Control::IdentityInUse { .. } => self.drop_frame(link, DropReason::Unknown { what: "identity" }),
@@ -466,13 +466,13 @@ impl Router {
         }
     }
 
-    /// The link has taken all frames that came before an [`Output::Flush`].
+    /// Notes that the link has taken all frames before an [`Output::Flush`].
     pub fn handle_flushed(&mut self, now: Now, link: LinkId) {
         self.now = now;
-        self.go_on_telling(link);
+        self.continue_sync(link);
     }
 
-    /// Time passed.
+    /// Acts on timers that are due.
     pub fn handle_timeout(&mut self, now: Now) {
         self.now = now;
         if self.clock.was_set(now) {
@@ -486,7 +486,7 @@ impl Router {
         self.branches_timeout(now);
     }
 
-    /// The next thing to do; call until it is [`Output::Timeout`].
+    /// Returns the next output; call until it is [`Output::Timeout`].
     pub fn poll_output(&mut self) -> Output {
         if self.outputs.is_empty() {
             self.originate_due(self.now);
@@ -510,16 +510,16 @@ impl Router {
         })
     }
 
-    /// Another certificate of this node: it describes itself anew.
+    /// Takes another certificate of this node, which then signs its link state anew.
     pub fn set_identity(&mut self, now: Now, identity: Arc<Identity>) {
         self.now = now;
         self.config.identity = identity;
         self.topology.touch_own(now.instant);
     }
 
-    /// A peer closed a link because another run of this node has its place. From here on this run takes over from no
-    /// other: where two processes have one identity, the one that was started last keeps its links, and the other has
-    /// them when that one is gone.
+    /// Notes that a peer closed a link because another run of this node has its place. From here on this run takes over
+    /// from no other: where two processes have one identity, the one that was started last keeps its links, and the
+    /// other gets them when that one is gone.
     pub fn handle_superseded(&mut self) {
         self.yields = true;
     }
@@ -529,12 +529,13 @@ impl Router {
         self.yields
     }
 
-    /// Returns by how many milliseconds the clock of a link's peer is ahead of the one here, as the peer told it.
+    /// Returns by how many milliseconds the clock of a link's peer is ahead of the one here, from the peer's own
+    /// report.
     pub fn clock_ahead_ms(&self, link: LinkId) -> Option<i64> {
         Some(self.links.get(&link)?.told_clock?.ahead_ms(self.now))
     }
 
-    /// How much is known.
+    /// Returns the sizes of the tables.
     pub fn stats(&self) -> RouterStats {
         RouterStats {
             routed_names: self.routed_names(),
@@ -545,22 +546,22 @@ impl Router {
         }
     }
 
-    /// The link towards the owner of `name`, and the cost of the way, microseconds of round trip.
+    /// Returns the link towards the owner of `name`, and the cost of the route, microseconds of round trip.
     pub fn route(&self, name: &Name) -> Option<(LinkId, u32)> {
-        self.way(name)
+        self.next_hop(name)
     }
 
-    /// Cost of the way to a router, microseconds of round trip; `None` if it is out of reach.
+    /// Returns the cost of the route to a router, microseconds of round trip; `None` if it is out of reach.
     pub fn cost_to(&self, router: &NodeId) -> Option<u32> {
-        self.topology.way(&self.config.node, router).map(|(cost, _)| cost)
+        self.topology.next_hop(&self.config.node, router).map(|(cost, _)| cost)
     }
 
-    /// What the searches for ways came to.
-    pub fn ways(&self) -> Ways {
-        self.topology.ways()
+    /// Returns the results of the route searches.
+    pub fn route_stats(&self) -> RouteStats {
+        self.topology.route_stats()
     }
 
-    /// What a link costs, microseconds of round trip, and whether it seems dead.
+    /// Returns the cost of a link, microseconds of round trip, and whether it seems dead.
     pub fn link_cost(&self, link: LinkId) -> Option<(u32, bool)> {
         let cost = &self.links.get(&link)?.cost;
         Some((cost.now(), cost.is_suspect()))
@@ -591,15 +592,15 @@ impl Router {
         self.links_changed(self.now.instant, &node);
     }
 
-    /// Tells a neighbour what it is to know of this node, and of the network if it is a router.
+    /// Tells a neighbour this node's state, and that of the network if it is a router.
     fn tell_all(&mut self, link: LinkId) {
         if self.links.get(&link).is_some_and(LinkState::is_transit) {
-            self.begin_telling(link);
+            self.begin_sync(link);
         }
         self.send_interests(link);
     }
 
-    /// Closes the link of a run whose place another one has.
+    /// Closes the link of a run that another one supersedes.
     pub(crate) fn supersede(&mut self, link: LinkId, by: Option<LinkId>, alive: bool) {
         self.outputs.push_back(Output::Close { link, reason: LinkClose::Superseded { by, alive } });
         self.forget_link(link);
@@ -607,15 +608,15 @@ impl Router {
 
     fn handle_clock(&mut self, now: Now, link: LinkId, time: UnixMillis) {
         let Some(state) = self.links.get_mut(&link).filter(|_| link != LinkId::LOCAL) else { return };
-        let told = ToldClock::new(time, now);
+        let told = PeerClock::new(time, now);
         let was_wrong = state.told_clock.replace(told).is_some_and(|old| clocks_differ(old.ahead_ms(now)));
-        // One of the two refused what the other signed until now, and would hear of it with the next lease only.
+        // One of the two refused the other's bodies until now, and would get new ones with the next lease only.
         if was_wrong && !clocks_differ(told.ahead_ms(now)) {
             self.tell_again(now, link);
         }
     }
 
-    /// The wall clock here was set: peers are told, and what was signed by the old time is signed anew.
+    /// Handles a new setting of the wall clock here: tells peers, and signs own bodies anew.
     fn clock_was_set(&mut self, now: Now) {
         let links: Vec<_> = self.links.keys().filter(|l| **l != LinkId::LOCAL).copied().collect();
         for link in links {
@@ -628,7 +629,7 @@ impl Router {
         self.topology.touch_own(now.instant);
     }
 
-    /// Tells a neighbour what it was told when it greeted, at most once in [`TELL_AGAIN_EVERY`].
+    /// Tells a neighbour everything again, at most once in [`TELL_AGAIN_EVERY`].
     fn tell_again(&mut self, now: Now, link: LinkId) {
         let Some(state) = self.links.get_mut(&link).filter(|s| s.hello.is_some()) else { return };
         if state.told_again.is_some_and(|at| now.instant.saturating_duration_since(at) < TELL_AGAIN_EVERY) {
@@ -639,7 +640,7 @@ impl Router {
         self.tell_interested_again(link);
     }
 
-    /// Takes back everything that came over or goes over `link`.
+    /// Withdraws everything that came over or goes over `link`.
     pub(crate) fn forget_link(&mut self, link: LinkId) {
         let Some(state) = self.links.remove(&link) else { return };
         if let Some(of_node) = self.links_of.get_mut(&state.node) {
@@ -653,16 +654,16 @@ impl Router {
         }
         self.names.forget_asks(link);
         self.cut_link(link, state.branches);
-        self.unhear(link);
+        self.forget_via(link);
         if state.hello.is_some() {
             self.links_changed(self.now.instant, &state.node);
         }
     }
 
-    /// What a node may still do here.
+    /// Returns the remaining allowance of a node.
     pub(crate) fn allowance(&mut self, node: &NodeId) -> &mut Allowance {
         if self.allowances.len() >= self.allowances_max {
-            // Those who have used nothing lately are given the same again when they come back.
+            // A node that has used nothing lately gets the same allowance when it comes back.
             let now = self.now.instant;
             self.allowances.retain(|_, allowance| !allowance.is_whole(now));
             self.allowances_max = 2 * self.allowances.len().max(ALLOWANCES_MIN);
@@ -671,8 +672,8 @@ impl Router {
         self.allowances.entry(*node).or_insert_with(|| Allowance::new(limits))
     }
 
-    /// Returns true if an announcement from over `link` is to be verified; else it is dropped, because its neighbour brought
-    /// too many that were no news.
+    /// Returns `true` if an announcement from `link` may be verified; otherwise it is dropped, because its neighbour
+    /// brought too many without news.
     pub(crate) fn may_bring(&mut self, link: LinkId) -> bool {
         let Some(state) = self.links.get(&link).filter(|_| link != LinkId::LOCAL) else { return true };
         let (node, is_router, now) = (state.node, state.is_transit(), self.now.instant);
@@ -698,6 +699,6 @@ impl Router {
 
     pub(crate) fn drop_frame(&mut self, link: LinkId, reason: DropReason) {
         let peer = self.links.get(&link).map(|l| l.node);
-        self.outputs.push_back(Output::Dropped(Dropped { link, peer, reason }));
+        self.outputs.push_back(Output::Dropped(RouterDrop { link, peer, reason }));
     }
 }

@@ -1,6 +1,6 @@
-//! [`Shares`]: a bounded table of which each node has its share, so that none can fill it for all.
+//! [`Shares`]: a bounded table with a share for each node, so that none can fill it for all.
 //!
-//! Nothing is set aside for anybody: a node may hold as much as others leave. Only a full table decides who gives way.
+//! Nothing is reserved: a node may hold as much as others leave. Only a full table decides which entry gives way.
 //! `sgc_trust::Places` has the same rule for the handshakes of strangers, of which there are few.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -110,7 +110,7 @@ impl<K: Ord + Copy, V> Shares<K, V> {
     fn make_room(&mut self, node: &NodeId, may_give_way: impl Fn(&V) -> bool) -> bool {
         let own = self.held_by(node);
         let Some((most, heaviest)) = self.held.last().copied() else { return false };
-        // Displacing one of theirs leaves them with as many as the newcomer's node, at least.
+        // Displacing one of that node's entries leaves it with at least as many as the newcomer's node.
         let is_heavier = most > own + 1;
         let of = if is_heavier || own == 0 { heaviest } else { *node };
         let Some((_, oldest)) = self.of_node.get(&of).and_then(BTreeSet::first).copied() else {
@@ -143,7 +143,7 @@ mod tests {
         NodeId([number; 32])
     }
 
-    /// Puts in what gives way once it is `true`.
+    /// Inserts an entry that gives way once it is `true`.
     fn put(shares: &mut Shares<u32, bool>, by: u8, key: u32, settled: bool) -> bool {
         shares.insert(node(by), key, settled, 8, |settled| *settled)
     }

@@ -1,4 +1,4 @@
-//! Shortest ways through the network of routers (Dijkstra), from one of them to all.
+//! Shortest routes through the network of routers (Dijkstra), from one of them to all.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
@@ -7,7 +7,7 @@ use sgc_wire::NodeId;
 
 use crate::limits::HOPS_MAX;
 
-/// The way to a node.
+/// The route to a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Path {
     /// Sum of the costs of its links, microseconds of round trip.
@@ -18,9 +18,9 @@ pub(crate) struct Path {
     pub(crate) first: NodeId,
 }
 
-/// Ways from `root` to all routers that can be reached. `edges` are those from a node that both ends confirm, with
-/// costs above zero. Of equal ways the one whose first node `before` has, then the one with fewer links, then the lower
-/// first node: so a way stays as it is until there is a better one.
+/// Returns the routes from `root` to all reachable routers. `edges` are those from a node that both ends confirm, with
+/// costs above zero. Of equal routes the one whose first node is that of `before` wins, then the one with fewer links,
+/// then the lower first node: so a route stays until there is a better one.
 pub(crate) fn shortest_paths<I: Iterator<Item = (NodeId, u32)>>(
     root: NodeId,
     before: &BTreeMap<NodeId, Path>,
@@ -44,7 +44,7 @@ pub(crate) fn shortest_paths<I: Iterator<Item = (NodeId, u32)>>(
         }
         for (next, edge) in edges(&node) {
             let first = if node == root { next } else { path.first };
-            // A cost of nothing would make ties that lead back.
+            // A cost of zero would make ties that lead back.
             let found = Path { cost: path.cost.saturating_add(edge.max(1)), hops: path.hops + 1, first };
             if done.contains_key(&next) {
                 continue;

@@ -1,13 +1,14 @@
-//! Telling neighbours: all that is known to one that greets, in parts, and what its signer's allowance kept back.
+//! Telling neighbours: the whole state for one that greets, in parts, and announcements beyond their signers'
+//! allowances.
 //!
-//! The driver's queue for a link is bounded, and a full one ends the link. So a router hands out a part, waits until the link
-//! has taken it, and goes on. News that come meanwhile go out at once.
+//! The driver's queue for a link is bounded, and a full one ends the link. So a router hands out a part, waits until
+//! the link has taken it, and continues. News that come meanwhile go out at once.
 
 use std::collections::VecDeque;
 use std::ops::Bound;
 use std::time::Duration;
 
-use sgc_wire::{Control, NodeId, Now, Signed};
+use sgc_wire::{Control, NodeId, Now, SignedBody};
 
 use crate::names::RecordId;
 use crate::router::{LinkId, Output, Router};
@@ -19,9 +20,9 @@ const TELL_BYTES_MAX: usize = 1 << 20;
 /// Interval of looks at announcements beyond the allowance of their signer.
 const LATE_EVERY: Duration = Duration::from_millis(100);
 
-/// Progress of telling a neighbour the state that was known when it greeted.
+/// Progress of telling a neighbour the state at the time of its greeting.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Telling {
+pub(crate) enum SyncProgress {
     /// Link states, in the order of their nodes.
     Nodes { after: Option<NodeId>, end: RecordId },
     /// Advertisements and withdrawals, in the order in which they came, up to the first after the greeting.
@@ -39,44 +40,44 @@ impl Room {
         self.frames > 0 && self.bytes > 0
     }
 
-    fn take(&mut self, signed: &Signed) {
+    fn take(&mut self, signed: &SignedBody) {
         self.frames = self.frames.saturating_sub(1);
         self.bytes = self.bytes.saturating_sub(signed.body.len() + signed.signature.len());
     }
 }
 
 impl Router {
-    /// Tells a router that just greeted what is known of the network and of names.
-    pub(crate) fn begin_telling(&mut self, link: LinkId) {
-        // This node's own link state comes first: ways to it wait for that.
+    /// Begins to tell a router that just greeted the state of the network and of names.
+    pub(crate) fn begin_sync(&mut self, link: LinkId) {
+        // This node's own link state comes first: routes to it wait for that.
         if let Some(record) = self.topology.node(&self.config.node) {
             let signed = record.signed.clone();
             self.send(link, Control::LinkState { signed });
         }
         let end = self.names.next_id();
         if let Some(state) = self.links.get_mut(&link) {
-            state.telling = Some(Telling::Nodes { after: None, end });
+            state.sync = Some(SyncProgress::Nodes { after: None, end });
         }
-        self.go_on_telling(link);
+        self.continue_sync(link);
     }
 
-    /// Tells the next part, and asks to hear when the link has taken it if there is more.
-    pub(crate) fn go_on_telling(&mut self, link: LinkId) {
-        let Some(mut telling) = self.links.get_mut(&link).and_then(|state| state.telling.take()) else {
+    /// Tells the next part, and asks for a notice when the link has taken it if there is more.
+    pub(crate) fn continue_sync(&mut self, link: LinkId) {
+        let Some(mut sync) = self.links.get_mut(&link).and_then(|state| state.sync.take()) else {
             return;
         };
         let mut room = Room { frames: TELL_FRAMES_MAX, bytes: TELL_BYTES_MAX };
         while room.is_left() {
-            let next = match telling {
-                Telling::Nodes { after, end } => match self.next_node(after) {
+            let next = match sync {
+                SyncProgress::Nodes { after, end } => match self.next_node(after) {
                     Some((node, signed)) => {
                         room.take(&signed);
                         self.send(link, Control::LinkState { signed });
-                        Telling::Nodes { after: Some(node), end }
+                        SyncProgress::Nodes { after: Some(node), end }
                     }
-                    None => Telling::Adverts { next: 0, end },
+                    None => SyncProgress::Adverts { next: 0, end },
                 },
-                Telling::Adverts { next, end } => match self.next_advert(next, end) {
+                SyncProgress::Adverts { next, end } => match self.next_advert(next, end) {
                     Some(id) => {
                         for frame in self.record_frames(id, 0) {
                             if let Control::Advert { signed, .. } = &frame {
@@ -84,21 +85,21 @@ impl Router {
                             }
                             self.send(link, frame);
                         }
-                        Telling::Adverts { next: id + 1, end }
+                        SyncProgress::Adverts { next: id + 1, end }
                     }
                     None => return,
                 },
             };
-            telling = next;
+            sync = next;
         }
         if let Some(state) = self.links.get_mut(&link) {
-            state.telling = Some(telling);
+            state.sync = Some(sync);
             self.outputs.push_back(Output::Flush { link });
         }
     }
 
-    /// The next link state that a neighbour is told unasked.
-    fn next_node(&self, after: Option<NodeId>) -> Option<(NodeId, Signed)> {
+    /// Returns the next link state for a neighbour that did not ask.
+    fn next_node(&self, after: Option<NodeId>) -> Option<(NodeId, SignedBody)> {
         if !self.config.transit {
             return None;
         }
@@ -113,7 +114,7 @@ impl Router {
         told.map(|(node, record)| (*node, record.signed.clone()))
     }
 
-    /// Passes on an advertisement or withdrawal that is news, now or when the allowance of its owner permits.
+    /// Passes on a new advertisement or withdrawal, now or when the allowance of its owner permits.
     pub(crate) fn pass_on_or_wait(&mut self, link: LinkId, owner: &NodeId, id: RecordId) {
         let now = self.now.instant;
         if link == LinkId::LOCAL || self.allowance(owner).may_announce(now) {
@@ -125,7 +126,7 @@ impl Router {
         }
     }
 
-    /// Passes on a link state that is news, now or when the allowance of its node permits.
+    /// Passes on a new link state, now or when the allowance of its node permits.
     pub(crate) fn pass_on_node_or_wait(&mut self, link: LinkId, node: &NodeId) {
         let now = self.now.instant;
         if self.allowance(node).may_announce(now) {
@@ -137,7 +138,7 @@ impl Router {
         }
     }
 
-    /// Passes on what waited for the allowance of its signer.
+    /// Passes on announcements that waited for the allowance of their signer.
     pub(crate) fn pass_on_late(&mut self, now: Now) {
         if self.late_at.take_if(|at| *at <= now.instant).is_none() {
             return;

@@ -1,8 +1,8 @@
-//! The network as its nodes describe it: link states in, ways out.
+//! The network from its nodes' link states, and the routes through it.
 //!
-//! Each node signs to whom it is linked. Routers pass link states on to each other, every one once, and each finds the
-//! shortest ways by itself. An edge counts only if both its ends say it, so nobody can claim to be where it is not.
-//! Ways to names are `names.rs`'s.
+//! Each node signs its links. Routers pass link states on to each other, every one once, and each finds the shortest
+//! routes by itself. An edge counts only if both its ends list it, so nobody can claim to be where it is not.
+//! `names.rs` has the routes to names.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Bound;
@@ -10,36 +10,36 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CertId, next_seq, signed_digest, verify_link_state};
-use sgc_wire::{Adjacency, Control, LinkStateBody, NodeId, NodeTag, Now, Signed, UnixMillis};
+use sgc_wire::{Adjacency, Control, LinkStateBody, NodeId, NodeTag, Now, SignedBody, UnixMillis};
 
 use crate::links::LinkState;
 use crate::memory::Memory;
 use crate::router::{DropReason, LinkId, Router};
 use crate::spf::{Path, shortest_paths};
 
-/// How long a link state holds; it is signed anew after a third of it.
+/// Lifetime of a link state; it is signed anew after a third of it.
 const LEASE: Duration = Duration::from_secs(300);
 /// Least time between two link states of this node.
 const ORIGINATE_EVERY: Duration = Duration::from_millis(100);
-/// Least time between two searches for ways.
+/// Least time between two searches for routes.
 const SEARCH_EVERY: Duration = Duration::from_millis(50);
-/// A cost that differs by less than a quarter is not told anew.
+/// A cost that differs by less than a quarter is not announced anew.
 const COST_PART: u32 = 4;
 
-/// What a router's searches for ways came to.
+/// Results of a router's searches for routes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Ways {
+pub struct RouteStats {
     /// Routers in reach, this one among them.
     pub routers: usize,
     /// Searches so far.
     pub searches: u64,
-    /// When one found other ways than the one before.
+    /// Time of the last search that found other routes.
     pub changed: Option<Instant>,
-    /// Names whose ways were looked at again because of them.
+    /// Names whose routes were checked again because of them.
     pub names_checked: u64,
 }
 
-/// A node as it described itself.
+/// A node's verified link state.
 #[derive(Debug)]
 pub(crate) struct NodeRecord {
     pub(crate) seq: u64,
@@ -49,7 +49,7 @@ pub(crate) struct NodeRecord {
     routers: Vec<Adjacency>,
     attached: Vec<NodeTag>,
     pub(crate) certs: Arc<[CertId]>,
-    pub(crate) signed: Signed,
+    pub(crate) signed: SignedBody,
     pub(crate) issued_at: UnixMillis,
     digest: [u8; 32],
     expires: Instant,
@@ -66,37 +66,37 @@ impl NodeRecord {
     }
 }
 
-/// Changes that ways depend on.
+/// Changes that affect routes.
 #[derive(Debug, Default)]
 struct Changes {
-    /// Nodes that this node gained or lost a link to, or that describe themselves in another way.
+    /// Nodes that gained or lost a link to this node, or whose link states changed.
     nodes: BTreeSet<NodeId>,
     /// Nodes that a router gained or lost.
     attached: BTreeSet<NodeTag>,
 }
 
-/// All nodes that described themselves, and the ways to the routers among them.
+/// All link states, and the routes to the routers among them.
 #[derive(Debug, Default)]
 pub(crate) struct Topology {
     nodes: BTreeMap<NodeId, NodeRecord>,
     expiries: BTreeSet<(Instant, NodeId)>,
     seen: BTreeMap<[u8; 32], NodeId>,
-    /// Link states that are in force no longer.
+    /// Link states that are no longer in force.
     memory: Memory,
     /// Nodes whose link states wait for their allowance to be passed on.
     pub(crate) late: BTreeSet<NodeId>,
     paths: BTreeMap<NodeId, Path>,
     /// Changes since the last search.
     changes: Changes,
-    /// Names whose ways were looked at again after a search.
+    /// Names whose routes were checked again after a search.
     pub(crate) names_checked: u64,
-    /// When to search for ways, if something changed.
+    /// Time of the next search, if something changed.
     pub(crate) search_at: Option<Instant>,
     searched: Option<Instant>,
     searches: u64,
-    /// When a search found other ways than the one before.
-    ways_changed: Option<Instant>,
-    /// When to describe this node anew.
+    /// Time of the last search that found other routes.
+    routes_changed: Option<Instant>,
+    /// Time at which this node signs its next link state.
     pub(crate) originate_at: Option<Instant>,
     originated: Option<Instant>,
     own_seq: u64,
@@ -107,7 +107,7 @@ impl Topology {
         self.nodes.get(node)
     }
 
-    /// How many nodes are known.
+    /// Returns the number of known nodes.
     pub(crate) fn len(&self) -> usize {
         self.nodes.len()
     }
@@ -116,30 +116,30 @@ impl Topology {
         self.expiries.first().map(|(at, _)| *at).into_iter().chain(self.memory.deadline()).min()
     }
 
-    /// The nodes that described themselves, from one on.
+    /// Iterates over nodes with link states, from one on.
     pub(crate) fn nodes_from(&self, from: Bound<NodeId>) -> impl Iterator<Item = (&NodeId, &NodeRecord)> {
         self.nodes.range((from, Bound::Unbounded))
     }
 
-    /// The greatest number that a node described itself with, as far as is known.
+    /// Returns the greatest known number of a node's link states.
     fn known_seq(&self, node: &NodeId) -> Option<u64> {
         let ended = self.memory.floor(node).checked_sub(1);
         self.nodes.get(node).map(|record| record.seq).max(ended)
     }
 
-    /// The link state of that number.
-    fn newest(&self, node: &NodeId) -> Option<(u64, &Signed)> {
+    /// Returns the link state with that number.
+    fn newest(&self, node: &NodeId) -> Option<(u64, &SignedBody)> {
         let in_force = self.nodes.get(node).map(|record| (record.seq, &record.signed));
         in_force.into_iter().chain(self.memory.newest(node)).max_by_key(|(seq, _)| *seq)
     }
 
-    /// A link of this node to another one changed.
+    /// Notes that a link of this node to another one changed.
     pub(crate) fn link_changed(&mut self, now: Instant, node: &NodeId) {
         self.changes.nodes.insert(*node);
         self.touch(now);
     }
 
-    /// A node describes itself in another way, or not any more. A mere renewal changes no way.
+    /// Notes that a node's link state changed or ended. A mere renewal changes no route.
     fn record_changed(
         &mut self,
         now: Instant,
@@ -157,7 +157,7 @@ impl Topology {
             return;
         }
         self.changes.attached.extend(before.symmetric_difference(&after));
-        // The edges between routers are the search's.
+        // The search handles edges between routers.
         let is_router = |record: Option<&NodeRecord>| record.is_some_and(|r| r.transit);
         let edges_only = is_router(old) && is_router(new);
         if !same && !edges_only {
@@ -171,21 +171,21 @@ impl Topology {
         self.search_at.get_or_insert(at);
     }
 
-    /// This node begins. A router waits a moment, in which its links come up, so that it speaks of all of them at once;
-    /// a node that only has something to share or to ask is in more of a hurry.
+    /// Begins. A router waits a moment for its links to come up, so that its first link state has all of them; a node
+    /// that only shares or asks is in more of a hurry.
     pub(crate) fn begin(&mut self, now: Instant, transit: bool) {
         self.originated = transit.then_some(now);
         self.touch_own(now);
     }
 
-    /// This node's own links changed.
+    /// Notes that this node's own links changed.
     pub(crate) fn touch_own(&mut self, now: Instant) {
         let at = self.originated.map_or(now, |at| now.max(at + ORIGINATE_EVERY));
         self.originate_at = Some(self.originate_at.map_or(at, |due| due.min(at)));
     }
 
-    /// The way from this router to a node: its cost and the first node on it.
-    pub(crate) fn way(&self, own: &NodeId, node: &NodeId) -> Option<(u32, NodeId)> {
+    /// Returns the route from this router to a node: its cost and the first node on it.
+    pub(crate) fn next_hop(&self, own: &NodeId, node: &NodeId) -> Option<(u32, NodeId)> {
         if let Some(path) = self.paths.get(node) {
             return Some((path.cost, path.first));
         }
@@ -199,25 +199,25 @@ impl Topology {
         record.routers.iter().filter_map(over).min().map(|(cost, _, first)| (cost, first))
     }
 
-    /// What the searches for ways came to.
-    pub(crate) fn ways(&self) -> Ways {
-        Ways {
+    /// Returns the results of the route searches.
+    pub(crate) fn route_stats(&self) -> RouteStats {
+        RouteStats {
             routers: self.paths.len(),
             searches: self.searches,
-            changed: self.ways_changed,
+            changed: self.routes_changed,
             names_checked: self.names_checked,
         }
     }
 
     /// Returns `true` if a later run of a node than the one that `started` then is linked to another router than `own`,
-    /// and that router says so, too.
+    /// and that router lists it, too.
     pub(crate) fn is_elsewhere(&self, own: &NodeId, node: &NodeId, started: UnixMillis) -> bool {
         let Some(record) = self.nodes.get(node).filter(|r| r.floor > started.0) else { return false };
         let says = |at: &Adjacency| self.nodes.get(&at.node).is_some_and(|r| r.says(node, record.transit));
         record.routers.iter().any(|at| at.node != *own && self.paths.contains_key(&at.node) && says(at))
     }
 
-    /// Searches for the ways to all routers; returns which of these owners may have another way by now.
+    /// Searches for the routes to all routers. Returns these owners' ids whose routes may have changed.
     fn search<'a>(
         &mut self,
         now: Instant,
@@ -238,7 +238,7 @@ impl Topology {
         let paths = shortest_paths(root, &self.paths, edges);
         self.searches += 1;
         if paths != self.paths {
-            self.ways_changed = Some(now);
+            self.routes_changed = Some(now);
         }
         let before = std::mem::replace(&mut self.paths, paths);
         let Changes { mut nodes, attached } = std::mem::take(&mut self.changes);
@@ -277,7 +277,7 @@ impl Topology {
         self.nodes.insert(node, record);
     }
 
-    /// Takes a link state out of force; returns the number below which advertisements of its node are void.
+    /// Ends a link state. Returns the number below which advertisements of its node are void.
     fn end(&mut self, now: Instant, node: &NodeId, max: usize) -> Option<u64> {
         let old = self.take(node)?;
         self.record_changed(now, node, Some(&old), None);
@@ -295,13 +295,13 @@ impl Topology {
 }
 
 impl Router {
-    /// This node's links to a neighbour or their costs changed.
+    /// Handles a change of this node's links to a neighbour, or of their costs.
     pub(crate) fn links_changed(&mut self, now: Instant, neighbour: &NodeId) {
         self.topology.touch_own(now);
         self.topology.link_changed(now, neighbour);
     }
 
-    pub(crate) fn handle_link_state(&mut self, now: Now, link: LinkId, signed: Signed) {
+    pub(crate) fn handle_link_state(&mut self, now: Now, link: LinkId, signed: SignedBody) {
         let Some(state) = self.links.get(&link).filter(|_| link != LinkId::LOCAL) else { return };
         let (neighbour, from_router) = (state.node, state.is_transit());
         let digest = signed_digest(&signed);
@@ -320,7 +320,7 @@ impl Router {
         };
         let (node, body) = (verified.node.node_id, verified.body);
         if node == self.config.node {
-            // Of an earlier run whose clock was ahead: this one goes on from there.
+            // From an earlier run whose clock was ahead: this run continues from there.
             if body.seq >= self.topology.own_seq {
                 self.topology.own_seq = body.seq;
                 self.topology.touch_own(now.instant);
@@ -376,7 +376,7 @@ impl Router {
         self.pass_on_node_or_wait(link, &node);
     }
 
-    /// A node described itself with a greater number before; if it says this itself, it should hear of that.
+    /// Answers an old link state of a node: if it comes from the node itself, the node should learn the newer number.
     fn stale_link_state(&mut self, link: LinkId, node: &NodeId, seq: u64) {
         let known = self.topology.known_seq(node).unwrap_or(seq);
         if self.links.get(&link).is_some_and(|state| state.node == *node)
@@ -388,7 +388,7 @@ impl Router {
         self.drop_frame(link, DropReason::Stale { seq, known });
     }
 
-    /// Closes the links of earlier runs of a node whose latest one describes itself at another router.
+    /// Closes the links of earlier runs of a node whose latest run is linked to another router.
     fn supersede_runs_before(&mut self, node: &NodeId, floor: u64) {
         let of_node = self.links_of.get(node).into_iter().flatten().copied();
         let earlier = |link: &LinkId| {
@@ -402,7 +402,7 @@ impl Router {
         }
     }
 
-    /// Describes this node, if that is due: to all routers that it is linked to.
+    /// Signs this node's link state, if that is due, and sends it to all neighbouring routers.
     pub(crate) fn originate_due(&mut self, now: Now) {
         if self.topology.originate_at.is_none_or(|at| at > now.instant) {
             return;
@@ -452,7 +452,7 @@ impl Router {
         self.tell_link_state(LinkId::LOCAL, &node);
     }
 
-    /// Passes on what a node said of itself: a router to all routers, others as the mapping says.
+    /// Passes on a link state: a router's to all routers, others as the mapping says.
     pub(crate) fn tell_link_state(&mut self, ingress: LinkId, node: &NodeId) {
         let is_told = |record: &&NodeRecord| self.verifies_elsewhere(record.issued_at);
         let Some(record) = self.topology.node(node).filter(is_told) else { return };
@@ -469,18 +469,18 @@ impl Router {
         }
     }
 
-    /// Searches for ways if that is due; then everything that goes another way by now is told so.
+    /// Searches for routes if that is due, and updates everything that takes another route now.
     pub(crate) fn search_due(&mut self, now: Now) {
         if self.topology.search_at.is_none_or(|at| at > now.instant) {
             return;
         }
         if self.config.transit {
             let owners = self.topology.search(now.instant, self.config.node, self.names.owners());
-            self.ways_to_owners_changed(&owners);
+            self.owner_routes_changed(&owners);
         } else {
             self.topology.search_at = None;
             self.topology.changes = Changes::default();
-            self.ways_changed();
+            self.own_links_changed();
         }
     }
 
@@ -496,14 +496,14 @@ impl Router {
         self.topology.memory.expire(now.instant);
     }
 
-    /// Takes a link state out of force; what its node advertised before the run that it was of stays void.
+    /// Ends a link state; advertisements from before its run stay void.
     fn end_node(&mut self, now: Instant, node: &NodeId) {
         if let Some(floor) = self.topology.end(now, node, self.config.limits.nodes_max) {
             self.names.run_ended(now, node, floor, self.config.limits.nodes_max);
         }
     }
 
-    /// Forgets what nodes said whose certificates are no longer believed.
+    /// Forgets link states under certificates that are no longer believed.
     pub(crate) fn distrust_nodes(&mut self, now: Instant) {
         let gone: Vec<_> = self
             .topology
@@ -519,7 +519,7 @@ impl Router {
         }
     }
 
-    /// The best link to a neighbour: the cheapest, of about equal ones the newest.
+    /// Returns the best link to a neighbour: the cheapest, of about equal ones the newest.
     pub(crate) fn link_to(&self, node: &NodeId) -> Option<(LinkId, u32)> {
         let of_node = self.links_of.get(node).into_iter().flatten().rev();
         let up =
@@ -535,7 +535,7 @@ impl Router {
     }
 }
 
-/// True if a neighbour that was told `old` should hear of `new`.
+/// Returns `true` if a neighbour that was told `old` has to be told `new`.
 pub(crate) fn cost_differs(old: u32, new: u32) -> bool {
     old.abs_diff(new) > old.min(new) / COST_PART
 }

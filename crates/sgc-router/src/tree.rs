@@ -1,7 +1,7 @@
-//! Trees: who receives what, over which branches.
+//! Trees: the sinks of a name, and the branches to them.
 //!
-//! A branch is pinned to the link towards the owner that its request took. When the way to the owner changes, the
-//! branches that are there go on while their sinks ask again over the new way; those whose link is gone are cut.
+//! A branch is pinned to the link towards the owner that its request took. When the route to the owner changes,
+//! existing branches serve while their sinks ask again over the new route; branches whose link is gone are cut.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -9,22 +9,22 @@ use std::time::Instant;
 
 use sgc_trust::{CertId, SignedError, VerifiedPeer, verify_answer, verify_join};
 use sgc_wire::{
-    Answer, AnswerBody, Control, Decode, JoinBody, Name, NodeId, Now, Recover, RejectReason, Role, Signed,
-    SinkId,
+    Answer, AnswerBody, Control, Decode, JoinBody, Name, NodeId, Now, Recover, RejectReason, Role,
+    SignedBody, SinkId,
 };
 use smallvec::SmallVec;
 
 use crate::fib::{self, FibEntry};
 use crate::router::{DropReason, LinkId, Output, Router};
 
-/// What a branch waits for.
+/// Stage of a branch, by the event that it waits for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Stage {
     /// The owner's answer.
     ExpectAnswer { until: Instant },
     /// Nothing.
     Granted,
-    /// That its sink asks again over a better way.
+    /// The sink's new request over a better route.
     Draining { until: Instant },
 }
 
@@ -63,8 +63,8 @@ impl Branch {
 #[derive(Debug, Default)]
 pub(crate) struct Tree {
     pub(crate) branches: BTreeMap<SinkId, Branch>,
-    /// From which link each link with sinks behind it is fed: that of the branch over it that was granted last. Never
-    /// from an older one again, or the trees of several sinks could make a circle (`docs/spec/tree-model.md`).
+    /// The upper link of each link with sinks behind it: that of the branch granted last. It never goes back to an
+    /// older one, or the trees of several sinks could form a circle (`docs/spec/tree-model.md`).
     feeds: BTreeMap<(LinkId, Role), LinkId>,
 }
 
@@ -74,9 +74,9 @@ impl Tree {
         let mut trees = BTreeMap::<LinkId, fib::Tree>::new();
         let tree = |up| fib::Tree { up, down: SmallVec::new(), publishers: SmallVec::new() };
         for (sink, branch) in self.branches.iter().filter(|(_, b)| b.carries()) {
-            // What still comes over an old link is of no use, but not wrong.
+            // Data that still comes over an old link is useless, but not wrong.
             trees.entry(branch.up).or_insert_with(|| tree(branch.up));
-            // Publishers, too: what a service replies is for one of them.
+            // Publishers, too: a service's reply is for one of them.
             entry.sinks.push((*sink, branch.link));
         }
         for ((link, role), up) in &self.feeds {
@@ -92,8 +92,8 @@ impl Tree {
 }
 
 impl Router {
-    pub(crate) fn handle_join(&mut self, now: Now, link: LinkId, signed: Signed) {
-        // Verifying is what costs: who asks too often is refused before it.
+    pub(crate) fn handle_join(&mut self, now: Now, link: LinkId, signed: SignedBody) {
+        // Verification is expensive: a node that asks too often is refused before it.
         let Some(state) = self.links.get(&link) else { return };
         let (node, is_router) = (state.node, state.is_transit());
         if link != LinkId::LOCAL && !self.allowance(&node).may_join(now.instant, is_router) {
@@ -103,7 +103,7 @@ impl Router {
         let join = match verify_join(&self.config.anchors, &signed, now.unix) {
             Ok(join) => join,
             Err(why) => {
-                // Whoever sent it hears why: with a wrong clock, nothing else would say so.
+                // The sender learns the reason: with a wrong clock, nothing else would tell it.
                 self.reject_unverified(link, &signed, why.reject_reason());
                 return self.not_verified(now, link, "join", why);
             }
@@ -112,8 +112,8 @@ impl Router {
         let owner = self.names.record(&name).map(|record| record.owner.clone());
         let reject = |this: &mut Self, reason| this.send(link, Control::Reject { name, sink, reason });
         if let Some(known) = self.trees.get_mut(&name).and_then(|t| t.branches.get_mut(&sink)) {
-            // A sink has one place in the tree and asks once: the same request over another link is a replay, or has
-            // gone in a circle. Over the same one it asks again under a new certificate, and what it has goes on.
+            // A sink has one place in the tree and asks once: the same request over another link is a replay, or went
+            // in a circle. Over the same link it may ask again under a new certificate, and keeps its branch.
             if known.peer != join.peer.node_id || known.link != link {
                 return reject(self, RejectReason::NoRoute);
             }
@@ -122,8 +122,8 @@ impl Router {
             let up = known.up;
             return self.send(up, Control::Join { signed });
         }
-        let way = self.way(&name).filter(|(up, _)| *up != link);
-        let Some(((up, _), owner)) = way.zip(owner) else {
+        let next_hop = self.next_hop(&name).filter(|(up, _)| *up != link);
+        let Some(((up, _), owner)) = next_hop.zip(owner) else {
             return reject(self, RejectReason::NoRoute);
         };
         if !(up == LinkId::LOCAL || link == LinkId::LOCAL || self.config.transit) {
@@ -161,8 +161,8 @@ impl Router {
         }
     }
 
-    pub(crate) fn handle_answer(&mut self, now: Now, link: LinkId, signed: Signed) {
-        // The name and sink are needed to find the keys that may have signed; they are believed only after.
+    pub(crate) fn handle_answer(&mut self, now: Now, link: LinkId, signed: SignedBody) {
+        // Name and sink are needed to find the possible signing keys; they count only after verification.
         let body = match AnswerBody::from_slice(&signed.body) {
             Ok(body) => body,
             Err(why) => return self.not_verified(now, link, "answer", SignedError::Decode(why)),
@@ -174,8 +174,8 @@ impl Router {
                 None => DropReason::Unknown { what: "answer" },
                 Some(_) => DropReason::WrongWay { what: "answer" },
             };
-            // The owner granted a sink that has left meanwhile, or a request that came here in a circle: neither it nor
-            // whoever is between must keep it.
+            // The owner granted a sink that has left, or a request that came here in a circle: the grant is given back,
+            // so that neither the owner nor a router between keeps it.
             if matches!(body.answer, Answer::Grant { .. }) {
                 self.send(link, Control::Leave { name, sink });
             }
@@ -194,9 +194,9 @@ impl Router {
         self.send(down, Control::Answer { signed });
     }
 
-    /// Returns `true` if the owner of a name signed an answer: with the key of its advertisement in force, or with the one that
-    /// it had when the request was passed on. Answers and advertisements may cross when an owner has another certificate.
-    fn is_of_owner(&self, now: Now, name: &Name, branch: &Branch, signed: &Signed) -> bool {
+    /// Returns `true` if the owner of a name signed an answer: with the key of its advertisement in force, or with the
+    /// key at the time of the request. Answers and advertisements may cross when an owner has another certificate.
+    fn is_of_owner(&self, now: Now, name: &Name, branch: &Branch, signed: &SignedBody) -> bool {
         let signs = |owner: &VerifiedPeer| verify_answer(owner, signed).is_ok();
         let newest = self.names.record(name).map(|record| &record.owner);
         if newest.is_some_and(|owner| signs(owner)) {
@@ -208,9 +208,9 @@ impl Router {
         is_another && holds && signs(before)
     }
 
-    /// An answer is not signed with a key that is known here, so it goes no further: it is forged, or the owner has a
-    /// certificate that the neighbour knows and this node does not. So the neighbour is asked for it, and not held for a forger.
-    /// The sink asks again; no branch takes more than two such answers.
+    /// Handles an answer that no known key signed. It goes no further: it is forged, or the owner has a certificate
+    /// that the neighbour knows and this node does not. So the neighbour is asked for it, and not taken for a forger.
+    /// The sink asks again; a branch accepts at most two such answers.
     fn answer_of_unknown_key(&mut self, link: LinkId, name: Name, sink: SinkId) {
         let Some(branch) = self.branch(&name, &sink) else { return };
         let (owner, is_granted) = (branch.owner.node_id, branch.stage == Stage::Granted);
@@ -231,7 +231,7 @@ impl Router {
         }
     }
 
-    /// The way changed closer to the owner; passed on to the sink.
+    /// Passes on to the sink that the route changed closer to the owner.
     pub(crate) fn handle_reroute(&mut self, link: LinkId, name: Name, sink: SinkId) {
         match self.branch(&name, &sink).map(|b| (b.up == link, b.link)) {
             None => self.drop_frame(link, DropReason::Unknown { what: "reroute" }),
@@ -240,12 +240,12 @@ impl Router {
         }
     }
 
-    /// A sink asks for what it missed; passed on towards the owner if the sink has a place in the tree.
+    /// Passes on a sink's request for lost messages towards the owner, if the sink has a place in the tree.
     pub(crate) fn handle_recover(&mut self, link: LinkId, recover: Recover) {
         self.send_from_sink(link, recover.name, recover.sink, "recover", Control::Recover(recover));
     }
 
-    /// A sink has the key of an epoch; passed on towards the owner if it has a place in the tree.
+    /// Passes on a sink's acknowledgement of a key towards the owner, if the sink has a place in the tree.
     pub(crate) fn handle_ack(&mut self, link: LinkId, name: Name, sink: SinkId, serial: u64) {
         self.send_from_sink(link, name, sink, "acknowledgement", Control::Ack { name, sink, serial });
     }
@@ -257,20 +257,20 @@ impl Router {
         }
     }
 
-    /// The way to a name may be another by now. Sinks whose branches take an old one are told to ask again; what was
-    /// not answered yet is given up, since the answer would come over the old one.
-    pub(crate) fn follow_way(&mut self, name: &Name) {
+    /// Follows a possible route change of a name. Sinks with branches over an old route are told to ask again;
+    /// unanswered requests are given up, because their answers would come over the old one.
+    pub(crate) fn follow_next_hop(&mut self, name: &Name) {
         let Some(tree) = self.trees.get(name) else { return };
         let known = self.names.record(name).is_some();
-        let way = self.way(name).map(|(link, _)| link);
+        let next_hop = self.next_hop(name).map(|(link, _)| link);
         let mut moved = Vec::new();
         for (sink, branch) in &tree.branches {
-            match (way, branch.stage) {
-                // Withdrawn: the owner tells its sinks by itself, but one that died does not.
+            match (next_hop, branch.stage) {
+                // Withdrawn: the owner itself tells its sinks, unless it died.
                 (None, _) if !known => moved.push((*sink, true)),
-                // As far as is known here the owner is out of reach; whoever is next to it will say so.
+                // The owner is out of reach from here; its neighbours will report it.
                 (None, _) => {}
-                (Some(way), _) if way == branch.up => {}
+                (Some(next_hop), _) if next_hop == branch.up => {}
                 (Some(_), Stage::ExpectAnswer { .. }) => moved.push((*sink, true)),
                 (Some(_), Stage::Granted) => moved.push((*sink, false)),
                 (Some(_), Stage::Draining { .. }) => {}
@@ -285,7 +285,7 @@ impl Router {
         }
     }
 
-    /// Lets a granted branch go on while its sink asks again.
+    /// Keeps a granted branch while its sink asks again.
     fn drain(&mut self, name: Name, sink: SinkId) {
         let until = self.now.instant + self.config.limits.answer_wait;
         let Some(branch) = self.trees.get_mut(&name).and_then(|t| t.branches.get_mut(&sink)) else { return };
@@ -314,14 +314,14 @@ impl Router {
         }
     }
 
-    /// Cuts what is left of a branch whose upper part is gone.
+    /// Cuts the rest of a branch whose upper part is gone.
     fn cut_down(&mut self, name: Name, sink: SinkId, reason: RejectReason) {
         if let Some(branch) = self.remove_branch(name, sink) {
             self.send(branch.link, Control::Reject { name, sink, reason });
         }
     }
 
-    /// A link is gone, and with it all branches over it.
+    /// Cuts all branches over a lost link.
     pub(crate) fn cut_link(&mut self, link: LinkId, branches: impl IntoIterator<Item = (Name, SinkId)>) {
         for (name, sink) in branches {
             match self.branch(&name, &sink).map(|b| b.up == link) {
@@ -348,8 +348,8 @@ impl Router {
         }
     }
 
-    /// Refuses a request that was not verified, as well as can be: its body may at least say whom to answer.
-    fn reject_unverified(&mut self, link: LinkId, signed: &Signed, reason: RejectReason) {
+    /// Refuses an unverified request as far as possible: its body may at least name the sink to answer.
+    fn reject_unverified(&mut self, link: LinkId, signed: &SignedBody, reason: RejectReason) {
         if let Ok(JoinBody { name, sink, .. }) = JoinBody::from_slice(&signed.body) {
             self.send(link, Control::Reject { name, sink, reason });
         }

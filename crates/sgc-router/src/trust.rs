@@ -1,4 +1,4 @@
-//! Whom to believe: revocation lists, certificates that end, and links that bring what does not verify.
+//! Trust: revocation lists, expired certificates, and links that bring unverifiable bodies.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -11,19 +11,19 @@ use sgc_wire::{Control, Now, UnixMillis};
 
 use crate::router::{DropReason, LinkClose, LinkId, Output, Router};
 
-/// How long a frame may be under way to a neighbour, and the clocks of honest nodes usually differ at most.
+/// Longest time of a frame to a neighbour, plus the usual difference of honest nodes' clocks.
 const UNDER_WAY_MAX: Duration = Duration::from_secs(10);
 
 impl Router {
-    /// Takes a revocation list from this node's user; true if it is news, which is then told everywhere.
+    /// Takes a revocation list from this node's user. Returns `true` if it is news, which is then passed on everywhere.
     pub fn add_crl(&mut self, now: Now, der: &Bytes) -> Result<bool, CrlError> {
         let Some(anchors) = self.config.anchors.with_crl(der, now.unix)? else { return Ok(false) };
         self.take_list(now, LinkId::LOCAL, der, anchors);
         Ok(true)
     }
 
-    /// Believes these CAs, with their revocation lists, from here on. Everything that rests on a certificate which
-    /// is no longer good ends: links, routes, branches.
+    /// Replaces the trust anchors, with their revocation lists. Everything under a certificate that is no longer valid
+    /// ends: links, routes, branches.
     pub fn set_anchors(&mut self, now: Now, anchors: Arc<TrustAnchors>) {
         self.now = now;
         self.lists.retain(|ca| anchors.ca_spki(ca).is_some());
@@ -63,14 +63,14 @@ impl Router {
     /// Looks again at the lists that waited for the allowance of their CA.
     pub(crate) fn take_waiting_lists(&mut self, now: Now) {
         for waiting in self.lists.due(now.instant) {
-            // It was verified when it came. By now it may be no news, or its CA may be over or trusted no more.
+            // Verified when it came. By now it may be no news, or its CA may have expired or be no longer trusted.
             if let Err(why) = self.learn_or_wait(now, waiting.from, &waiting.der) {
                 self.drop_frame(waiting.from, DropReason::Crl(why));
             }
         }
     }
 
-    /// Takes a list that a neighbour brought, if it is news and its CA has room; true if so.
+    /// Takes a neighbour's list, if it is news and its CA has room. Returns `true` if so.
     fn learn_or_wait(&mut self, now: Now, link: LinkId, der: &Bytes) -> Result<bool, CrlError> {
         let Some(CrlNews { ca, number, anchors }) = self.config.anchors.crl_news(der, now.unix)? else {
             return Ok(false);
@@ -85,7 +85,7 @@ impl Router {
         Ok(true)
     }
 
-    /// Believes a list from here on and passes it on.
+    /// Takes over a list and passes it on.
     fn take_list(&mut self, now: Now, from: LinkId, der: &Bytes, anchors: TrustAnchors) {
         let anchors = Arc::new(anchors);
         self.outputs.push_back(Output::Trust(anchors.clone()));
@@ -97,21 +97,21 @@ impl Router {
         }
     }
 
-    /// True if one of these, from the one below a CA down to a node's, is revoked, or that CA is not trusted.
+    /// Returns `true` if one of these, from the one below a CA down to a node's, is revoked, or that CA is not trusted.
     pub(crate) fn is_untrusted(&self, certs: &[CertId]) -> bool {
         let anchors = &self.config.anchors;
         let other_ca = certs.first().is_some_and(|c| anchors.ca_spki(&c.ca).is_none());
         other_ca || anchors.is_path_revoked(certs)
     }
 
-    /// Returns `true` if neighbours will believe something signed then that they are told now. A lease is reckoned from when an
-    /// announcement came, so one that was played again late outlasts the time in which it verifies.
+    /// Returns `true` if neighbours will still believe a body with this time of signing. A lease counts from an
+    /// announcement's arrival, so a late replay outlasts the time in which it verifies.
     pub(crate) fn verifies_elsewhere(&self, issued_at: UnixMillis) -> bool {
         let age = self.now.unix.0.saturating_sub(issued_at.0);
         Duration::from_millis(age) + UNDER_WAY_MAX <= CLOCK_SKEW_MAX
     }
 
-    /// Until when something signed holds: for its lease, and not beyond its signer's certificate.
+    /// Returns the end of a signed body: its lease, but not beyond its signer's certificate.
     pub(crate) fn lease_end(
         &self,
         now: Now,
@@ -119,7 +119,7 @@ impl Router {
         signer: &VerifiedPeer,
     ) -> Result<Instant, SignedError> {
         let not_after = signer.not_after;
-        // Certificates are judged by the second, so one may verify when nothing of it is left.
+        // Certificates are judged by the second, so one may verify although no time of it is left.
         let left = not_after.0.checked_sub(now.unix.0).filter(|left| *left > 0);
         let left = left.ok_or(CertError::Expired { not_after, now: now.unix })?;
         let lease = Duration::from_millis(lease_ms.into()).min(self.config.limits.lease_max);
@@ -137,11 +137,11 @@ impl Router {
         }
     }
 
-    /// Something signed over `link` is not believed. Who sends many such is cut off.
+    /// Handles an unverifiable body from `link`. A node that sends many is cut off.
     pub(crate) fn not_verified(&mut self, now: Now, link: LinkId, what: &'static str, why: SignedError) {
         let from_router = self.links.get(&link).is_some_and(|l| l.is_transit());
         let honest = match &why {
-            // Clocks differ, certificates end, and lists spread, without anybody lying.
+            // Clocks differ, certificates expire, and lists spread, without anybody's fault.
             SignedError::Clock { .. } => true,
             SignedError::Cert(
                 CertError::Expired { .. }
@@ -156,7 +156,7 @@ impl Router {
             | SignedError::Decode(_)
             | SignedError::Sequence { .. } => false,
         };
-        // Those two cost no verification, and a router may well bring many of them.
+        // These two cost no verification, and a router may well bring many of them.
         let is_cheap = matches!(why, SignedError::Clock { .. } | SignedError::Cert(CertError::UnknownIssuer));
         self.drop_frame(
             link,

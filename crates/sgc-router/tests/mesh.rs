@@ -1,4 +1,4 @@
-//! One router among scripted neighbours: which way it takes, and what it tells of it.
+//! One router among scripted neighbours: the routes that it takes, and the neighbours that it tells.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -42,7 +42,7 @@ struct Bench {
     seq: u64,
     /// Links that the router closed.
     closed: Vec<u32>,
-    /// Links that the router waits for to take what they were sent.
+    /// Links whose queues the router waits for.
     flushes: Vec<LinkId>,
     /// True while no link takes anything.
     stuck: bool,
@@ -50,11 +50,11 @@ struct Bench {
 
 impl Bench {
     fn with(mapping: MappingKind, limits: Limits) -> Self {
-        Self::of_kind(mapping, limits, true)
+        Self::with_kind(mapping, limits, true)
     }
 
     /// A router, or a proxy that is linked to the same routers.
-    fn of_kind(mapping: MappingKind, limits: Limits, transit: bool) -> Self {
+    fn with_kind(mapping: MappingKind, limits: Limits, transit: bool) -> Self {
         let router_identity = |name: &str| identity(&Member { router: true, ..Member::new(name) });
         let own = router_identity("cloud");
         let clock = Clock::default();
@@ -124,12 +124,12 @@ impl Bench {
         self.drain();
     }
 
-    /// The router with a number; 0 is the one under test.
+    /// Returns the router with a number; 0 is the one under test.
     fn node(&self, router: usize) -> NodeId {
         if router == 0 { self.own.node_id() } else { self.routers[router - 1].node_id() }
     }
 
-    /// A router's link state without other nodes, for the test to change.
+    /// Returns a router's link state without other nodes, for the test to change.
     fn link_state(&self, node: &Identity, seq: u64, links: &[(usize, u32)]) -> LinkStateBody {
         let mut routers: Vec<_> =
             links.iter().map(|(n, cost)| Adjacency { node: self.node(*n), cost: *cost }).collect();
@@ -146,7 +146,7 @@ impl Bench {
         }
     }
 
-    /// A link state of a router, over a link: to which routers it is linked, and whether to the owner.
+    /// Sends a router's link state over a link: the routers that it is linked to, and whether the owner is.
     fn says(&mut self, link: u32, router: usize, links: &[(usize, u32)], owner: bool) {
         self.seq += 1;
         let attached = owner.then(|| self.owner.node_id().tag()).into_iter().collect();
@@ -157,7 +157,7 @@ impl Bench {
         self.pass(ms(100));
     }
 
-    /// Where the owner says that it is.
+    /// Sends the owner's link state: the routers that it is attached to.
     fn owner_says(&mut self, link: u32, floor: u64, routers: &[(usize, u32)]) {
         self.seq += 1;
         let body = LinkStateBody { floor, transit: false, ..self.link_state(&self.owner, self.seq, routers) };
@@ -225,7 +225,7 @@ impl Bench {
         name_of(&self.owner.node_id(), blind)
     }
 
-    /// Link in use and cost.
+    /// Returns the link in use, and the cost.
     fn route(&self, blind: &Blind) -> Option<(u32, u32)> {
         self.router.route(&self.name(blind)).map(|(link, cost)| (link.0, cost))
     }
@@ -248,7 +248,7 @@ impl Bench {
         self.grant_by(&self.owner.clone(), link, sink, blind);
     }
 
-    /// A grant that a node signed, in the owner's place or as the owner under another certificate.
+    /// Returns a grant signed by a node, in the owner's place or as the owner under another certificate.
     fn grant_by(&mut self, signer: &Identity, link: u32, sink: u8, blind: &Blind) {
         let answer = Answer::Grant { enc: Bytes::new(), sealed: Bytes::new() };
         let (name, sink) = (self.name(blind), SinkId([sink; 16]));
@@ -256,7 +256,7 @@ impl Bench {
         self.frame(link, Control::Answer { signed });
     }
 
-    /// The kinds of the frames sent since the last, with their links.
+    /// Returns the kinds of the frames sent since the last call, with their links.
     fn told(&self) -> Vec<(u32, &'static str)> {
         let kind = |frame: &Control| match frame {
             Control::Advert { signed, .. } => {
@@ -280,7 +280,7 @@ impl Bench {
         told
     }
 
-    /// What leaves for all, having come in over a link.
+    /// Returns the links for a packet to all that came in over a link.
     fn egress(&self, ingress: u32) -> Vec<u32> {
         self.entry.iter().flat_map(|e| e.egress(LinkId(ingress))).map(|l| l.0).collect()
     }
@@ -318,7 +318,7 @@ fn a_router_that_begins_speaks_once_of_all_links_that_come_up_with_it() {
 fn an_edge_counts_only_if_both_its_ends_say_it() {
     let mut bench = Bench::new();
     bench.says(1, 1, &[(0, 1000), (4, 10)], true);
-    // Router 1 says that it is linked to 4, and that the owner is attached to it; neither says so.
+    // Router 1 claims links to 4 and to the owner; neither of them lists the link.
     bench.says(1, 4, &[(2, 10)], true);
     bench.owner_says(1, 0, &[(4, 500)]);
     bench.advert(1, 10, &[A]);
@@ -406,7 +406,7 @@ fn names_are_told_to_all_routers_or_to_those_who_ask() {
         let names = vec![bench.name(&A)];
         bench.frame(1, Control::Query { id: 0, hops: 0, names });
         assert_eq!(bench.told(), [(1, "advert"), (1, "link state")], "{mapping:?}: an answer");
-        // Who asked hears of changes.
+        // The asker is told of changes.
         bench.frame(4, bench.advert_frame(11, true, &[A]));
         assert!(bench.told().contains(&(1, "withdrawal")), "{mapping:?}");
     }
@@ -436,7 +436,7 @@ fn an_unknown_name_is_asked_for_once_and_all_who_asked_are_answered() {
 }
 
 #[test]
-fn who_waits_for_a_name_makes_the_router_ask_again_and_again() {
+fn a_waiting_sink_makes_the_router_ask_again_and_again() {
     for mapping in [MappingKind::Flood, MappingKind::Query] {
         let mut bench = Bench::with(mapping, Limits::default());
         bench.with_proxies();
@@ -483,7 +483,7 @@ fn an_advertisement_told_before_anybody_wanted_it_is_asked_for_if_it_is_not_rene
     for mapping in [MappingKind::Flood, MappingKind::Query] {
         let mut bench = Bench::with(mapping, Limits::default());
         bench.with_proxies();
-        // Perhaps by one who plays it again and keeps back what comes after it.
+        // An attacker may replay it and withhold the later ones.
         bench.with_owner_behind(5000, 9000);
         bench.frame(4, Control::Interest { names: vec![bench.name(&A)] });
         assert_eq!(asked_of(&bench, 1), [], "it is known");
@@ -518,7 +518,7 @@ fn an_advertisement_that_came_too_late_to_be_believed_by_others_is_not_told() {
     let body = LinkStateBody { lease_ms, ..bench.link_state(&bench.routers[3], 1, &[]) };
     let link_state = Control::LinkState { signed: bench.routers[3].sign_link_state(&body) };
     let late = bench.routers[4].clone();
-    // Those of router 4, which is not linked, and of the owner.
+    // The link states of router 4, which is not linked, and of the owner.
     let told = |bench: &Bench| {
         let all = bench.sent.iter().filter(|(link, _)| *link >= 6);
         all.filter(|(_, frame)| *frame == advert || *frame == link_state).count()
@@ -553,7 +553,7 @@ fn questions_are_bounded() {
 }
 
 #[test]
-fn what_a_node_signs_for_all_is_bounded_and_so_are_interests() {
+fn flooded_announcements_and_interests_of_a_node_are_bounded() {
     let limits = Limits { announcements_burst: 8, queries_burst: 8, ..Limits::default() };
     let mut bench = Bench::with(MappingKind::Flood, limits);
     bench.with_proxies();
@@ -643,7 +643,7 @@ fn replays_of_a_nodes_announcements_leave_it_its_allowance_and_cost_who_brings_t
     }
     let of = |key| bench.dropped.iter().filter(|d| **d == key).count();
     assert_eq!(of("limit"), 0);
-    // Those that are remembered by their digest are known at once; others cost a verification, which is charged.
+    // Remembered ones are recognised by their digest at once; others cost a verification, which is charged.
     assert!(of("stale_flood") > 2000, "{}", of("stale_flood"));
     // Others bring news as before: the neighbour pays for itself.
     bench.dropped.clear();
@@ -696,7 +696,7 @@ fn an_owner_hears_which_number_it_has_to_exceed_after_its_lease() {
 }
 
 #[test]
-fn what_one_owner_withdraws_displaces_nothing_of_another() {
+fn a_withdrawal_displaces_no_record_of_another_owner() {
     let limits = Limits { tombstones_max: 64, adverts_per_owner_max: 40, ..Limits::default() };
     let mut bench = Bench::with(MappingKind::Flood, limits);
     bench.with_owner_behind(5000, 9000);
@@ -721,8 +721,8 @@ fn what_one_owner_withdraws_displaces_nothing_of_another() {
 }
 
 #[test]
-fn what_an_owner_advertises_is_bounded_in_records_and_bytes() {
-    // A record of 256 names of which one is left, again and again.
+fn advertisements_of_an_owner_are_bounded_in_records_and_bytes() {
+    // A record of 256 names of which only one is left, repeatedly.
     let all: Vec<_> = (0..255).map(numbered).collect();
     let of_records = Limits { adverts_per_owner_max: 20, ..Limits::default() };
     let of_bytes = Limits { advert_bytes_per_owner_max: 20 * 50_000, ..Limits::default() };
@@ -738,7 +738,7 @@ fn what_an_owner_advertises_is_bounded_in_records_and_bytes() {
         let names = bench.router.stats().names;
         assert!((256..256 + 1 + 24).contains(&names), "{names}");
         assert!(bench.router.route(&name_of(&bench.user.node_id(), &A)).is_none() && names > 256);
-        // The oldest are gone, the newest are there, and a replay of those that are gone brings them not back.
+        // The oldest are gone, the newest are there, and a replay does not bring the old ones back.
         bench.dropped.clear();
         let blinds: Vec<_> = all.iter().copied().chain([numbered(1000)]).collect();
         bench.advert(2, 10, &blinds);
@@ -751,7 +751,7 @@ fn a_name_that_is_said_many_times_at_once_is_one_name() {
     let limits = Limits { adverts_per_owner_max: 4, ..Limits::default() };
     let mut bench = Bench::with(MappingKind::Flood, limits);
     let mallory = identity(&Member::new("mallory"));
-    // Withdrawn 256 times it takes the room of one, so others' names find theirs.
+    // Names withdrawn 256 times take the room of one withdrawal, so others' names find room.
     bench.frame(1, bench.advert_of(&mallory, 10, true, &[numbered(0); 256]));
     assert_eq!(bench.router.stats().tombstones, 1);
     let honest = bench.advert_of(&bench.user, 10, false, &[A]);
@@ -789,7 +789,7 @@ fn a_router_that_greets_is_told_in_parts_as_its_link_takes_them() {
         bench.advert(1, 11 + n as u64, &[numbered(n)]);
         bench.pass(ms(40));
     }
-    // The last announcements of the others are of a minute ago.
+    // The last announcements of the others are a minute old.
     let names = bench.router.stats().names;
     assert!(names > 1400, "{names}");
     bench.stuck = true;
@@ -805,7 +805,7 @@ fn a_router_that_greets_is_told_in_parts_as_its_link_takes_them() {
         assert_eq!((link, bench.flushes.len()), (LinkId(6), 0));
         bench.sent.clear();
         if parts == 3 {
-            // News do not wait for it.
+            // News do not wait for the rest of the state.
             bench.advert(1, 20_000, &[B]);
             assert!(bench.told().contains(&(6, "advert")));
             bench.sent.clear();
@@ -814,7 +814,7 @@ fn a_router_that_greets_is_told_in_parts_as_its_link_takes_them() {
         bench.drain();
     }
     assert_eq!((adverts.len(), parts), (names, names.div_ceil(256)));
-    // A link that ends meanwhile is not told on.
+    // A link that ends meanwhile is told nothing more.
     bench.up(7, &late, true, 1000);
     let link = bench.flushes.pop().expect("there is more than a part");
     bench.link_down(7);
@@ -824,7 +824,7 @@ fn a_router_that_greets_is_told_in_parts_as_its_link_takes_them() {
 }
 
 #[test]
-fn what_an_owner_advertised_before_it_started_anew_is_void() {
+fn advertisements_from_before_an_owners_restart_are_void() {
     let mut bench = Bench::new();
     bench.with_owner_behind(5000, 9000);
     bench.owner_says(1, 11, &[(4, 500)]);
@@ -952,7 +952,7 @@ fn a_grant_for_a_sink_that_left_is_given_back() {
     bench.with_owner_behind(5000, 9000);
     bench.grant(1, 1, &A);
     assert_eq!((bench.told(), bench.dropped.as_slice()), (vec![(1, "leave")], ["unknown"].as_slice()));
-    // The same for one whose request is known here by another way.
+    // The same for a sink whose request is known here over another link.
     bench.join(3, 2, &A);
     bench.grant(2, 2, &A);
     assert_eq!((bench.told(), bench.dropped.last()), (vec![(2, "leave")], Some(&"wrong_way")));
@@ -960,7 +960,7 @@ fn a_grant_for_a_sink_that_left_is_given_back() {
     assert_eq!(bench.told(), [(3, "answer")]);
 }
 
-/// The owner of the bench with its next certificate, which is for another key.
+/// The owner of the bench with its next certificate, which has another key.
 fn renewed_owner() -> Arc<Identity> {
     identity(&Member { renewal: 1, ..Member::new("arm-1") })
 }
@@ -979,7 +979,7 @@ fn an_answer_with_a_key_that_is_not_known_yet_goes_no_further_and_its_bringer_is
         assert_eq!(bench.entry, None);
         bench.pass(ms(10));
     }
-    // Its neighbour may be as honest as the owner.
+    // Its neighbour may be honest.
     assert_eq!((bench.closed.as_slice(), bench.dropped.last()), ([0; 0].as_slice(), Some(&"owner_key")));
     bench.frame(1, bench.advert_of(&renewed, 11, false, &[A]));
     bench.join(4, 200, &A);
@@ -1020,7 +1020,7 @@ fn a_granted_branch_outlives_an_answer_that_nobody_known_signed_until_its_sink_a
 
 #[test]
 fn an_answer_is_verified_when_its_name_is_not_known_any_more() {
-    let mut bench = Bench::of_kind(MappingKind::Flood, Limits::default(), false);
+    let mut bench = Bench::with_kind(MappingKind::Flood, Limits::default(), false);
     let names = vec![bench.name(&A)];
     bench.frame(0, Control::Interest { names: names.clone() });
     bench.advert(1, 10, &[A]);
@@ -1092,11 +1092,11 @@ fn a_link_state_looks_again_only_at_names_whose_ways_it_may_change() {
     names.push(bench.name(&A));
     bench.frame(4, Control::Interest { names });
     bench.pass(ms(200));
-    let checked = |bench: &Bench| bench.router.ways().names_checked;
+    let checked = |bench: &Bench| bench.router.route_stats().names_checked;
     let before = checked(&bench);
     let desk = bench.user.clone();
     for n in 0..20 {
-        // A member that signs again and again what it said, or that its link costs more each time.
+        // A member that repeats its announcements, or raises the cost of its link each time.
         for cost in [1000, 1000 + n * 1000] {
             bench.seq += 1;
             let body = LinkStateBody { transit: false, ..bench.link_state(&desk, bench.seq, &[(0, cost)]) };
@@ -1105,9 +1105,9 @@ fn a_link_state_looks_again_only_at_names_whose_ways_it_may_change() {
         }
     }
     assert_eq!((checked(&bench), bench.dropped.as_slice()), (before, [""; 0].as_slice()));
-    let searches = bench.router.ways().searches;
+    let searches = bench.router.route_stats().searches;
     bench.owner_says(1, 0, &[(4, 500)]);
-    assert_eq!((checked(&bench), bench.router.ways().searches), (before, searches), "a renewal");
+    assert_eq!((checked(&bench), bench.router.route_stats().searches), (before, searches), "a renewal");
     bench.owner_says(1, 0, &[(4, 600)]);
     assert_eq!((checked(&bench), bench.route(&A)), (before + 1, Some((1, 6600))));
     bench.says(2, 2, &[(0, 1000), (4, 2000)], false);
@@ -1120,7 +1120,7 @@ fn a_link_state_looks_again_only_at_names_whose_ways_it_may_change() {
     assert_eq!((checked(&bench), bench.route(&A)), (before + 5, Some((1, 6600))));
 }
 
-/// The names that a link was asked for since the last frame.
+/// Returns the names that a link was asked for since the last frame.
 fn asked_of(bench: &Bench, link: u32) -> Vec<Name> {
     let queries = bench.sent.iter().filter_map(|(to, frame)| match frame {
         Control::Query { names, .. } if *to == link => Some(names.clone()),
@@ -1140,14 +1140,14 @@ fn a_router_may_ask_again_for_what_it_asked_for_when_there_is_no_room_for_more()
     bench.frame(1, Control::Query { id: 2, hops: 0, names: names.clone() });
     assert_eq!((asked_of(&bench, 2), bench.dropped.as_slice()), (names.clone(), [""; 0].as_slice()));
     bench.pass(Duration::from_secs(20));
-    // One too many keeps the others from nothing.
+    // A neighbour with one question too many does not affect the others.
     let more = [unknown_names(&bench, 8, 1), names.clone()].concat();
     bench.frame(1, Control::Query { id: 3, hops: 0, names: more });
     assert_eq!((asked_of(&bench, 2), bench.dropped.as_slice()), (names, ["limit"].as_slice()));
 }
 
 #[test]
-fn one_routers_questions_leave_room_for_those_of_others() {
+fn questions_of_one_router_leave_room_for_those_of_others() {
     let limits = Limits { questions_max: 64, asks_max: 64, ..Limits::default() };
     let mut bench = Bench::with(MappingKind::Query, limits);
     let many = unknown_names(&bench, 0, 200);
@@ -1163,7 +1163,7 @@ fn one_routers_questions_leave_room_for_those_of_others() {
         "those that are under way stay"
     );
     bench.dropped.clear();
-    // Another one has all of its questions asked, and its answers come.
+    // Another neighbour has all of its questions asked, and its answers come.
     for (n, blind) in [A, B].into_iter().enumerate() {
         let names = vec![bench.name(&blind)];
         bench.frame(2, Control::Query { id: 1000 + n as u64, hops: 0, names: names.clone() });
@@ -1181,7 +1181,7 @@ fn one_routers_questions_leave_room_for_those_of_others() {
     bench.owner_says(6, 0, &[(0, 1000)]);
     bench.advert(6, 10, &[A, B]);
     assert!(bench.told().contains(&(2, "advert")), "{:?}", bench.told());
-    // Later, the first one may bring others in place of its own.
+    // Later, the first one may replace its own questions.
     bench.dropped.clear();
     bench.pass(Duration::from_secs(5));
     let more = unknown_names(&bench, 2000, 20);
@@ -1229,7 +1229,7 @@ fn names_that_nobody_has_are_asked_for_in_turn_and_anothers_at_once() {
         most = most.max(asked.len());
         all.extend(asked);
     }
-    // As many for the first time as again, and the one of the other.
+    // The first and repeated questions of the one, and those of the other.
     assert!(most <= 8 + 8 + 2, "{most}");
     assert_eq!(all.len(), 100, "each has its turn");
     assert_eq!(bench.dropped, [""; 0]);

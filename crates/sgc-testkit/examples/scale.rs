@@ -209,7 +209,7 @@ fn search_time(mesh: &mut Mesh) -> Duration {
     let at = mesh.routers()[0];
     let mut router = mesh.take_router(at);
     let Now { mut instant, mut unix } = mesh.now();
-    let (began, searches) = (cpu(), router.ways().searches);
+    let (began, searches) = (cpu(), router.route_stats().searches);
     for n in 0..TIMED {
         instant += Duration::from_millis(200);
         unix.0 += 200;
@@ -219,7 +219,7 @@ fn search_time(mesh: &mut Mesh) -> Duration {
         router.handle_timeout(now);
         while !matches!(router.poll_output(), Output::Timeout(_)) {}
     }
-    (cpu() - began) / (router.ways().searches - searches).max(1) as u32
+    (cpu() - began) / (router.route_stats().searches - searches).max(1) as u32
 }
 
 /// Cold start, changes, questions, requests.

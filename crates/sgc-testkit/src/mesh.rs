@@ -10,11 +10,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_router::{Limits, LinkId, MappingKind, Neighbour, Output, Router, RouterConfig, Ways};
+use sgc_router::{Limits, LinkId, MappingKind, Neighbour, Output, RouteStats, Router, RouterConfig};
 use sgc_trust::{Identity, name_of};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Control, Decode, Encode, Hello, JoinBody, Name, NodeId, Request,
-    Signed, SinkId, UnixMillis,
+    SignedBody, SinkId, UnixMillis,
 };
 
 use crate::cast::{Member, identity};
@@ -481,7 +481,7 @@ impl Mesh {
             assert!(at < end, "does not settle: {:?}", self.tally);
             self.step(at);
         }
-        let ways = self.routers().into_iter().filter_map(|n| self.router(n).ways().changed).max();
+        let ways = self.routers().into_iter().filter_map(|n| self.router(n).route_stats().changed).max();
         self.tally.ways = ways.unwrap_or(self.since).saturating_duration_since(self.since);
         self.clock.advance_to(self.clock.instant() + SETTLED_AFTER);
         self.restart()
@@ -531,7 +531,7 @@ impl Mesh {
         }
         let Some(router) = &mut self.stations[station].router else { return };
         let began = (self.cpu)();
-        let searches = router.ways().searches;
+        let searches = router.route_stats().searches;
         match (input, frame) {
             (Input::Up(link, neighbour), _) => router.handle_link_up(now, link, neighbour),
             (Input::Down(link), _) => router.handle_link_down(now, link),
@@ -546,7 +546,7 @@ impl Mesh {
                 output => outputs.push(output),
             }
         };
-        self.tally.searches += router.ways().searches - searches;
+        self.tally.searches += router.route_stats().searches - searches;
         self.tally.cpu += (self.cpu)().saturating_sub(began);
         self.wake(station, wake);
         let mut local = VecDeque::new();
@@ -620,7 +620,7 @@ impl Mesh {
     pub fn check(&self, sample: usize) {
         let routers = self.routers();
         for at in &routers {
-            let Ways { routers: known, .. } = self.router(*at).ways();
+            let RouteStats { routers: known, .. } = self.router(*at).route_stats();
             assert_eq!(known, routers.len(), "router {at} does not reach all");
         }
         for at in routers.iter().step_by(routers.len().div_ceil(sample)) {
@@ -679,7 +679,7 @@ fn blinds(batch: usize) -> impl Iterator<Item = Blind> {
 
 /// Kind and length of a frame.
 fn weigh(frame: &Control) -> (&'static str, usize) {
-    let signed = |s: &Signed| SIGNED_OVERHEAD_BYTES + s.body.len() + s.signature.len();
+    let signed = |s: &SignedBody| SIGNED_OVERHEAD_BYTES + s.body.len() + s.signature.len();
     match frame {
         Control::LinkState { signed: s } => ("link state", signed(s)),
         Control::Advert { signed: s, .. } => ("advert", 4 + signed(s)),
@@ -698,7 +698,8 @@ mod tests {
 
     #[test]
     fn frames_weigh_what_their_encoding_is_long() {
-        let signed = Signed { body: Bytes::from_static(&[1; 700]), signature: Bytes::from_static(&[2; 71]) };
+        let signed =
+            SignedBody { body: Bytes::from_static(&[1; 700]), signature: Bytes::from_static(&[2; 71]) };
         let names = vec![Name([3; 32]); 3];
         for frame in [
             Control::LinkState { signed: signed.clone() },

@@ -11,8 +11,8 @@ use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
-    AskAgain, Delivery, Endpoint, EndpointConfig, Event, JoinStatus, Marks, Message, RecoveryLimits,
-    ShareSpec, Sink, SinkDrop, SinkLimits, Source, SourceConfig, Wish,
+    AskAgain, Delivery, Endpoint, EndpointConfig, Event, JoinKind, JoinStatus, Marks, Message,
+    RecoveryLimits, ShareSpec, Sink, SinkDrop, SinkLimits, Source, SourceConfig,
 };
 use sgc_router::{FibEntry, LinkClose, LinkId, MappingKind, Neighbour, Router, RouterConfig};
 use sgc_trust::{Grantees, Identity, MessageKey, Policy, Suite, TrustAnchors, name_of};
@@ -614,7 +614,7 @@ impl Running {
                 retire_at: None,
             };
             self.sinks.insert(name, local);
-            self.endpoint.join(now, name, owner_id, Wish::Subscribe { describe: false });
+            self.endpoint.join(now, name, owner_id, JoinKind::Subscribe { describe: false });
         }
     }
 

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use sgc_endpoint::{RecoveryLimits, Sink, SinkLimits, Source, SourceConfig, Wish};
+use sgc_endpoint::{JoinKind, RecoveryLimits, Sink, SinkLimits, Source, SourceConfig};
 use sgc_trust::{MessageKey, Suite, name_of};
 use sgc_wire::{Name, NodeId, Now, Packet, Reliability, SinkId, SourceId, SourceOffer, TopicGrant};
 
@@ -73,7 +73,7 @@ impl Running {
             let message_key = MessageKey::generate(suite);
             let offer = SourceOffer { source: config.id, key: message_key.public().clone() };
             self.publishers.insert(name, Publisher { owner, config, message_key, grant: None, source: None });
-            self.endpoint.join(now, name, owner_id, Wish::Publish(offer));
+            self.endpoint.join(now, name, owner_id, JoinKind::Publish(offer));
         }
     }
 

@@ -67,9 +67,9 @@ pub enum What {
     /// The endpoint said so.
     Event(Event),
     /// The router refused a frame.
-    RouterDrop(sgc_router::Dropped),
+    RouterDrop(sgc_router::RouterDrop),
     /// The endpoint refused a frame.
-    EndpointDrop(sgc_endpoint::Dropped),
+    EndpointDrop(sgc_endpoint::EndpointDrop),
     /// The data path refused a packet.
     DataDrop {
         /// Its name.

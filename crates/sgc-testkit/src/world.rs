@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_endpoint::{Event, JoinStatus, PackedType, Wish};
+use sgc_endpoint::{Event, JoinKind, JoinStatus, PackedType};
 use sgc_router::{LinkClose, LinkId, MappingKind, Neighbour, RouterStats};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
 use sgc_wire::{
@@ -439,7 +439,7 @@ impl World {
         let (now, id) = (self.now_at(node), self.identity(owner).node_id());
         if let Some(running) = &mut self.nodes[node.0].running {
             // As with a token, which says nothing of the topic but its name.
-            running.endpoint.join(now, name, id, Wish::Subscribe { describe: true });
+            running.endpoint.join(now, name, id, JoinKind::Subscribe { describe: true });
         }
         self.settle(node);
     }
@@ -514,7 +514,7 @@ impl World {
         self.note(format!("publish blindly {node:?} {owner:?}:{topic}"));
         let (now, name, id) = (self.now_at(node), self.name(owner, topic), self.identity(owner).node_id());
         if let Some(running) = &mut self.nodes[node.0].running {
-            running.endpoint.join(now, name, id, Wish::Publish(offer));
+            running.endpoint.join(now, name, id, JoinKind::Publish(offer));
         }
         self.settle(node);
     }

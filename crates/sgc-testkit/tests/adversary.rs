@@ -20,7 +20,7 @@ use sgc_testkit::{
 use sgc_trust::{CertError, Kem, ReplyKey, SignedError};
 use sgc_wire::{
     Adjacency, AdvertBody, Blind, Control, JoinBody, LinkStateBody, Name, Recover, RejectReason, Request,
-    Signed, SinkId, SourceId,
+    SignedBody, SinkId, SourceId,
 };
 
 /// Seeds that every run of the tests replays.
@@ -666,11 +666,11 @@ impl Run {
 
 /// The same with a bit of body or signature changed.
 fn spoilt(frame: Control) -> Control {
-    let spoil = |signed: Signed| {
+    let spoil = |signed: SignedBody| {
         let mut body = signed.body.to_vec();
         let at = body.len() / 2;
         body[at] ^= 1;
-        Signed { body: body.into(), ..signed }
+        SignedBody { body: body.into(), ..signed }
     };
     match frame {
         Control::Advert { cost, signed } => Control::Advert { cost, signed: spoil(signed) },

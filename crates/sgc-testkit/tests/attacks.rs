@@ -8,7 +8,7 @@ use sgc_testkit::{Captured, DataDrop, Member, NodeKey, Sharing, What, World, ide
 use sgc_trust::{Identity, Suite};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Class, Control, Decode, JoinBody, NodeId, Packet, PacketHeader,
-    RejectReason, Request, Role, Signed, SinkId, SourceId, SourceOffer,
+    RejectReason, Request, Role, SignedBody, SinkId, SourceId, SourceOffer,
 };
 
 const fn ms(n: u64) -> Duration {
@@ -60,11 +60,11 @@ fn is_advert_of(world: &World, owner: NodeKey, frame: &Control) -> bool {
     body.chain == world.identity(owner).chain_bytes() && !body.withdraw
 }
 
-fn altered(signed: &Signed) -> Signed {
+fn altered(signed: &SignedBody) -> SignedBody {
     let mut signature = signed.signature.to_vec();
     let at = signature.len() - 1;
     signature[at] ^= 1;
-    Signed { body: signed.body.clone(), signature: signature.into() }
+    SignedBody { body: signed.body.clone(), signature: signature.into() }
 }
 
 /// How many frames or packets a node refused for that reason.
@@ -171,7 +171,7 @@ fn a_withdrawn_advertisement_cannot_be_replayed() {
 
 /// The answers that `west` passes on to the operator are replaced by what `forge` makes of them; nothing is
 /// granted on their word.
-fn check_forged_answers(seed: u64, forge: impl Fn(AnswerBody) -> Signed + 'static) {
+fn check_forged_answers(seed: u64, forge: impl Fn(AnswerBody) -> SignedBody + 'static) {
     let mut scene = scene(seed);
     let Scene { world, arm, west, desk, .. } = &mut scene;
     let (arm, west, desk) = (*arm, *west, *desk);

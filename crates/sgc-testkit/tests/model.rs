@@ -476,8 +476,8 @@ impl Run {
                     }
                 }
                 What::EndpointDrop(dropped) => match dropped {
-                    sgc_endpoint::Dropped::Unexpected { .. } => true,
-                    sgc_endpoint::Dropped::NotVerified { why, .. } => {
+                    sgc_endpoint::EndpointDrop::Unexpected { .. } => true,
+                    sgc_endpoint::EndpointDrop::NotVerified { why, .. } => {
                         matches!(why, SignedError::Cert(CertError::Revoked { .. })) || clock(why)
                     }
                     _ => false,

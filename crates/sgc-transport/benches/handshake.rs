@@ -1,4 +1,4 @@
-//! What a link costs to make, by key exchange: `cargo bench -p sgc-transport --bench handshake`.
+//! Cost of making a link, by key exchange: `cargo bench -p sgc-transport --bench handshake`.
 //!
 //! Over loopback, both ends in one process: from the call until the greetings are exchanged, both certificates (P-256)
 //! verified. Bytes are those of UDP payloads, padding included.

@@ -1,4 +1,4 @@
-//! What labels save, beside packets with their names in the same run: `cargo bench -p sgc-transport --bench labels`.
+//! Savings of labels, beside packets with their names in the same run: `cargo bench -p sgc-transport --bench labels`.
 //!
 //! One name over one link, over loopback, both ends in one process on two threads. Bytes are those of UDP payloads:
 //! QUIC's own, and acknowledgements, included.
@@ -20,7 +20,7 @@ use sgc_wire::{Class, Label, Name};
 /// Packets of a round; those of both forms take turns.
 const PACKETS: u64 = 100_000;
 const ROUNDS: usize = 15;
-/// What the suite `group` adds to the first fragment: message head and tag.
+/// Bytes that the suite `group` adds to the first fragment: message head and tag.
 const SEALED: usize = 12 + 16;
 
 fn main() {
@@ -56,7 +56,7 @@ fn main() {
     });
 }
 
-/// CPU time of the process's threads until now, nanoseconds: less than the clock's it depends on what else runs.
+/// Returns the CPU time of the process's threads until now, nanoseconds: other load affects it less than the clock.
 fn cpu_ns() -> f64 {
     let tasks = std::fs::read_dir("/proc/self/task").unwrap().flatten();
     let times = tasks.filter_map(|t| std::fs::read_to_string(t.path().join("schedstat")).ok());

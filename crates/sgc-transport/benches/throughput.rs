@@ -1,4 +1,4 @@
-//! What goes through one link over loopback, by each congestion controller in turn: `cargo bench -p sgc-transport --bench
+//! Throughput of one link over loopback, by each congestion controller in turn: `cargo bench -p sgc-transport --bench
 //! throughput`. Both ends are in one process on two threads.
 #![allow(
     clippy::print_stdout,

@@ -1,29 +1,29 @@
-//! Memory of a node for what its links received and nobody has read yet.
+//! Memory of a node for received bytes that nobody has read yet.
 //!
-//! A window is what a peer may fill without anybody reading, and a peer that means harm fills it. So windows shrink with the number of
-//! links: each link is given its part of one budget when it begins, and keeps it. What a window is used for is the transport's.
+//! A hostile peer fills its window. So windows shrink with the number of links: each link gets its part of one budget
+//! when it begins, and keeps it. The transport decides the use of a window.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-/// Bytes that the links of a node share unless it says otherwise: the n-th link is given an n-th.
+/// Default budget of a node's links, bytes: the n-th link gets an n-th.
 pub const RECEIVE_BUDGET_BYTES: u64 = 128 << 20;
-/// The least that a link is given, bytes: 160 Mbit/s at a round trip of 50 ms.
+/// Smallest window of a link, bytes: 160 Mbit/s at a round trip of 50 ms.
 pub const RECEIVE_WINDOW_BYTES_MIN: u32 = 1 << 20;
 
-/// The budget of the receive windows of one node. Clones share it, so one [`crate::LinkOptions`] is to be cloned for all
+/// The budget of the receive windows of one node. Clones share it, so clone one [`crate::LinkOptions`] for all
 /// listeners and dialers of the node.
 ///
-/// The n-th link that is there at once gets at most an n-th of the budget, and no less than [`RECEIVE_WINDOW_BYTES_MIN`]. Links
-/// that end leave their place to others. So the windows of n links are less than the budget · (1 + ln n) + n · 1 MiB together,
-/// whatever comes and goes.
+/// The n-th concurrent link gets at most an n-th of the budget, and no less than [`RECEIVE_WINDOW_BYTES_MIN`]. Links
+/// that end leave their place to others. So the windows of n links are always less than the budget · (1 + ln n) + n · 1
+/// MiB together.
 #[derive(Clone, Debug)]
 pub struct ReceiveBudget {
-    shared: Arc<Shared>,
+    shared: Arc<BudgetState>,
 }
 
 #[derive(Debug)]
-struct Shared {
+struct BudgetState {
     budget_bytes: u64,
     links: AtomicU64,
     granted_bytes: AtomicU64,
@@ -36,13 +36,13 @@ impl Default for ReceiveBudget {
 }
 
 impl ReceiveBudget {
-    /// Creates a budget of so many bytes.
+    /// Creates a budget of this size.
     pub fn new(budget_bytes: u64) -> Self {
         let (links, granted_bytes) = (AtomicU64::new(0), AtomicU64::new(0));
-        Self { shared: Arc::new(Shared { budget_bytes, links, granted_bytes }) }
+        Self { shared: Arc::new(BudgetState { budget_bytes, links, granted_bytes }) }
     }
 
-    /// Returns how many bytes all links may have received and not read now.
+    /// Returns the bytes that all links together may have received and not read now.
     pub fn granted_bytes(&self) -> u64 {
         self.shared.granted_bytes.load(Relaxed)
     }
@@ -65,12 +65,12 @@ pub(crate) struct WindowLease {
 }
 
 impl WindowLease {
-    /// Returns how many bytes of all flows together the peer may have sent and we not read.
+    /// Returns the bytes of all flows together that the peer may have sent and we not read.
     pub(crate) fn link_bytes(&self) -> u32 {
         self.bytes
     }
 
-    /// Returns the same for one flow, at most `max`: a flow that nobody reads takes half, so others go on.
+    /// Returns the bytes of one flow, at most `max`: a flow that nobody reads takes half, so others continue.
     pub(crate) fn flow_bytes(&self, max: u32) -> u32 {
         max.min(self.bytes / 2).max(1)
     }
@@ -108,12 +108,12 @@ mod tests {
     }
 
     #[test]
-    fn whatever_comes_and_goes_the_sum_is_bounded() {
+    fn the_sum_of_windows_stays_bounded() {
         let mut rng = ChaCha20Rng::seed_from_u64(1);
         let budget = ReceiveBudget::default();
         let mut leases = Vec::new();
         for step in 0..20_000_u32 {
-            // Herds come, and any may go.
+            // Links come in herds and end in any order.
             if leases.is_empty() || rng.next_u32() % 1000 < 400 + 200 * (step / 1000 % 2) {
                 leases.push(budget.lease(MAX));
             } else {

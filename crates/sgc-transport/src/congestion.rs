@@ -1,6 +1,6 @@
-//! How much is sent when: the congestion controllers, and the gate that each keeps for its connection.
+//! The congestion controllers, and the gate that each keeps for its connection.
 //!
-//! Nothing here reads a clock, opens a socket or draws random numbers: QUIC says what happened, and when.
+//! Nothing here reads a clock, opens a socket or draws random numbers: QUIC reports events with their times.
 
 mod delay;
 mod gate;
@@ -20,25 +20,25 @@ use delay::Delay;
 pub(crate) use gate::Gate;
 use plain::Plain;
 
-/// What decides how much may be under way on a link.
+/// The congestion controller of a link.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum Congestion {
-    /// Keeps the queue short: what is urgent arrives in time on a thin link that something else fills.
+    /// Keeps the queue short: urgent packets arrive in time on a thin link that other traffic fills.
     #[default]
     Delay,
-    /// CUBIC (RFC 9438): fills the queue until something is lost.
+    /// CUBIC (RFC 9438): fills the queue until packets are lost.
     Cubic,
-    /// BBR, as quinn has it.
+    /// BBR in quinn's version.
     Bbr,
     /// NewReno (RFC 9002).
     NewReno,
 }
 
 impl Congestion {
-    /// All of them.
+    /// All controllers.
     pub const ALL: [Self; 4] = [Self::Delay, Self::Cubic, Self::Bbr, Self::NewReno];
 
-    /// What it is called in configurations.
+    /// Returns the name in configurations.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Delay => "delay",
@@ -48,7 +48,7 @@ impl Congestion {
         }
     }
 
-    /// For one connection: its factory, and the gate that its controllers keep.
+    /// Returns a factory for one connection, and the gate that its controllers keep.
     pub(crate) fn for_connection(self) -> (Arc<dyn ControllerFactory + Send + Sync>, Arc<Gate>) {
         let gate = Arc::new(Gate::default());
         (Arc::new(Factory { kind: self, gate: Arc::clone(&gate) }), gate)
@@ -61,7 +61,7 @@ impl fmt::Display for Congestion {
     }
 }
 
-/// A name that is not that of a [`Congestion`].
+/// A name of no [`Congestion`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{0:?} is none of delay, cubic, bbr, newreno")]
 pub struct UnknownCongestion(pub String);
@@ -74,8 +74,7 @@ impl FromStr for Congestion {
     }
 }
 
-/// Makes a controller for each path that one connection comes to use. They share its gate, of which only the present
-/// one is told anything.
+/// Makes a controller for each path that one connection uses. They share its gate, and only the present one updates it.
 struct Factory {
     kind: Congestion,
     gate: Arc<Gate>,
@@ -95,11 +94,11 @@ impl ControllerFactory for Factory {
     }
 }
 
-/// What has been sent and neither acknowledged nor lost, kept from what a controller is told.
+/// Bytes sent and neither acknowledged nor lost, from a controller's events.
 #[derive(Clone, Copy, Debug, Default)]
 struct InFlight(u64);
 
-/// Less than this in one go is taken for an acknowledgement, which nobody acknowledges.
+/// A shorter packet counts as an acknowledgement, which nobody acknowledges.
 const ACK_ONLY_BYTES: u64 = 200;
 
 impl InFlight {

@@ -1,9 +1,8 @@
-//! What a running node shows of itself and whom it believes, both of which change while it runs.
+//! A running node's own certificate and the CAs that it trusts, both of which change while it runs.
 //!
-//! One store is shared by everything that makes links. Each handshake reads it afresh, so a renewed certificate is
-//! shown by the next link and a list of revoked ones counts from the next certificate that comes. Links that are up
-//! are not touched: which of them have to go, and when to ask, is for the node that holds them
-//! ([`CredentialStore::objection`]).
+//! Everything that makes links shares one store. Each handshake reads it afresh, so the next link shows a renewed
+//! certificate, and a new revocation list counts from the next certificate on. The store does not touch links that are
+//! up: the node decides which of them to close, and when to ask ([`CredentialStore::objection`]).
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -18,22 +17,22 @@ use crate::error::CloseReason;
 /// The certificate and key of this node and the CAs that it trusts. Clones share.
 #[derive(Clone)]
 pub struct CredentialStore {
-    shared: Arc<Shared>,
+    shared: Arc<CurrentCredentials>,
 }
 
-struct Shared {
+struct CurrentCredentials {
     identity: ArcSwap<Identity>,
     anchors: ArcSwap<TrustAnchors>,
-    /// The CAs whose nodes may attach; all that are believed if there is nothing.
+    /// The CAs whose nodes may attach; `None` stands for all trusted ones.
     admitted: ArcSwapOption<BTreeSet<CaFingerprint>>,
 }
 
 impl CredentialStore {
-    /// With this identity and the CAs that it brings.
+    /// Returns a store with this identity and its CAs.
     pub fn new(identity: Arc<Identity>) -> Self {
         let anchors = ArcSwap::from_pointee(identity.anchors().clone());
         Self {
-            shared: Arc::new(Shared {
+            shared: Arc::new(CurrentCredentials {
                 identity: ArcSwap::new(identity),
                 anchors,
                 admitted: ArcSwapOption::empty(),
@@ -41,40 +40,40 @@ impl CredentialStore {
         }
     }
 
-    /// Shows another certificate from the next handshake on. Whom this node believes stays as it is: an identity file
-    /// holds CAs and no revocations, so taking them from there would forget those.
+    /// Shows another certificate from the next handshake on. The trust anchors stay: an identity file holds CAs and no
+    /// revocations, so anchors from the file would forget the revocations.
     pub fn set_identity(&self, identity: Arc<Identity>) {
         self.shared.identity.store(identity);
     }
 
-    /// Believes others from the next certificate on, also in handshakes that are under way. A link may have passed the
+    /// Replaces the trust anchors from the next certificate on, also in running handshakes. A link may have passed the
     /// check just before: ask [`CredentialStore::objection`] of every link afterwards, and of each new one.
     pub fn set_anchors(&self, anchors: TrustAnchors) {
         self.shared.anchors.store(Arc::new(anchors));
     }
 
-    /// Lets only nodes of these CAs attach to listeners from the next certificate on; `None` is every CA that is
-    /// believed. Whom this node dials is not restricted by it. For links that are up: [`CredentialStore::admits`].
+    /// Lets only nodes of these CAs attach to listeners from the next certificate on; `None` stands for every trusted
+    /// CA. It does not restrict dialling. For links that are up: [`CredentialStore::admits`].
     pub fn set_admitted(&self, admitted: Option<BTreeSet<CaFingerprint>>) {
         self.shared.admitted.store(admitted.map(Arc::new));
     }
 
-    /// Whether this peer may attach to a listener of this node.
+    /// Returns whether this peer may attach to a listener of this node.
     pub fn admits(&self, peer: &VerifiedPeer) -> bool {
         self.shared.admitted.load().as_ref().is_none_or(|admitted| admitted.contains(&peer.ca))
     }
 
-    /// What is shown now.
+    /// Returns the present identity.
     pub fn identity(&self) -> Arc<Identity> {
         self.shared.identity.load_full()
     }
 
-    /// Who is believed now.
+    /// Returns the present trust anchors.
     pub fn anchors(&self) -> Arc<TrustAnchors> {
         self.shared.anchors.load_full()
     }
 
-    /// Why a peer that was let in would not be let in again at the time `now`: what its link is to be closed with.
+    /// Returns the reason for closing a peer's link, if the peer would not be let in again at the time `now`.
     pub fn objection(&self, peer: &VerifiedPeer, now: UnixMillis) -> Option<CloseReason> {
         let anchors = self.shared.anchors.load();
         if anchors.is_peer_revoked(peer) {

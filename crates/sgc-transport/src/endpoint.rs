@@ -58,11 +58,11 @@ impl Listener {
         Ok(Self { addr: ListenAddr { addr: local, ..addr.clone() }, kind })
     }
 
-    /// The next link, or the next peer that was refused and why; `None` once closed.
+    /// Returns the next link, or the next refused peer with the reason; `None` once closed.
     ///
-    /// Handshakes run beside each other, as long as this is being awaited often enough to start them; at most
+    /// Handshakes run concurrently, as long as this is awaited often enough to start them: at most
     /// [`LinkOptions::handshakes_max`] at once, each for at most [`LinkOptions::handshake_timeout`]. Refusals are
-    /// counted already; logging them is the caller's. Dropping the future loses nothing.
+    /// counted already; the caller logs them. Dropping the future loses nothing.
     pub async fn accept(&mut self) -> Option<Result<AnyLink, RefusedPeer>> {
         let result = match &mut self.kind {
             Kind::Quic(listener) => listener.accept().await?.map(AnyLink::Quic),
@@ -72,7 +72,7 @@ impl Listener {
         Some(result.map_err(|(remote, reason)| RefusedPeer { remote, reason }))
     }
 
-    /// Where it listens, with the port that the system chose if it was to.
+    /// Returns the local address, with the real port if the system chose it.
     pub fn local(&self) -> &ListenAddr {
         &self.addr
     }
@@ -87,13 +87,13 @@ impl Listener {
     }
 }
 
-/// A peer that came to a [`Listener`] and has no link.
+/// A peer that came to a [`Listener`] and got no link.
 #[derive(Clone, Debug, thiserror::Error)]
 #[error("{remote} is refused: {reason}")]
 pub struct RefusedPeer {
-    /// Where it came from.
+    /// The peer's address.
     pub remote: SocketAddr,
-    /// Why.
+    /// The reason.
     pub reason: Refusal,
 }
 
@@ -107,8 +107,8 @@ pub struct Dialer {
 }
 
 impl Dialer {
-    /// A dialer with these credentials; each dial uses what the store holds then. Sockets are opened with the first
-    /// dial and then shared by all.
+    /// Returns a dialer with these credentials; each dial uses the store's content at that time. Sockets are opened
+    /// with the first dial and then shared by all.
     pub fn new(
         credentials: impl Into<CredentialStore>,
         options: LinkOptions,
@@ -123,14 +123,14 @@ impl Dialer {
         Self { resolve_timeout, quic, udp, dtls, stream }
     }
 
-    /// Makes a link: looks the host up, tries its addresses, and returns once the far node has accepted. It tries
-    /// once; trying again is the caller's. Needs a tokio runtime around it.
+    /// Makes a link: looks the host up, tries its addresses, and returns once the far node has accepted. It tries once;
+    /// the caller tries again. Needs a tokio runtime around it.
     pub async fn dial(&self, url: &LinkUrl) -> Result<AnyLink, DialError> {
         let addresses = race::resolve(url, self.resolve_timeout).await?;
         self.dial_at(url, addresses).await
     }
 
-    /// Makes a link to these addresses, at most 8 of them, which the caller knows to be those of `url`.
+    /// Makes a link to these addresses, at most 8, which the caller knows to be those of `url`.
     pub async fn dial_at(&self, url: &LinkUrl, addresses: Vec<SocketAddr>) -> Result<AnyLink, DialError> {
         self.connect(url, addresses, Greeting::default()).await
     }
@@ -174,9 +174,9 @@ impl Dialer {
         );
     }
 
-    /// Moves every link over datagrams to a fresh socket, so that it leaves by the interface that the system would choose
-    /// now: for when addresses or routes have changed. Links live on, and what is under way is sent again where it was
-    /// lost. Every socket is tried; the first error is returned, and its links stay where they are.
+    /// Moves every link over datagrams to a fresh socket, so that it leaves by the interface that the system would
+    /// choose now. Callers do this when addresses or routes have changed. Links live on, and lost packets are sent
+    /// again. Every socket is tried; the first error is returned, and its links stay where they are.
     pub fn rebind(&self) -> io::Result<()> {
         let results = [self.quic.rebind(), self.udp.rebind(), self.dtls.rebind()];
         results.into_iter().collect()

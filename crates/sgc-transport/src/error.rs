@@ -1,7 +1,7 @@
 //! Everything that ends a link, a flow or an attempt at a link, each with its cause.
 //!
-//! What the other side is told is not what is logged here: over the wire go a TLS alert or a small code, and text
-//! that comes from there is shown only after being shortened and stripped of control characters.
+//! The other side learns less than the log: only a TLS alert or a small code goes over the wire. Text from the other
+//! side is shown only after it was shortened and stripped of control characters.
 
 use std::fmt;
 use std::io;
@@ -20,13 +20,13 @@ use crate::url::LinkUrl;
 
 const TEXT_CHARS_MAX: usize = 200;
 
-/// Why a node closes a link, told to its peer.
+/// A node's reason for closing a link, told to its peer.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CloseReason {
-    /// The node stops, or needs the link no more.
+    /// The node stops, or does not need the link any more.
     #[error("it says goodbye")]
     Goodbye,
-    /// The same two nodes have a newer link.
+    /// A newer link connects the same two nodes.
     #[error("a newer link took its place")]
     Replaced,
     /// The peer broke the protocol.
@@ -38,30 +38,30 @@ pub enum CloseReason {
     /// The node has too much to do.
     #[error("it is overloaded")]
     Overloaded,
-    /// The certificate of the node that is told so was revoked.
+    /// The receiver's certificate was revoked.
     #[error("the certificate was revoked")]
     Revoked,
-    /// The certificate of the node that is told so is over.
+    /// The receiver's certificate has expired.
     #[error("the certificate expired")]
     Expired,
-    /// The node that is told so did not answer.
+    /// The receiver did not answer.
     #[error("no answer came")]
     Silent,
-    /// Another process uses the identity of the node that is told so, at this place, and has its links.
+    /// Another process uses the receiver's identity at the named place and has its links.
     #[error("the identity is in use at another place: {0}")]
     InUse(String),
     /// A reason that this version does not know.
     #[error("reason {code}: {text}")]
     Other {
-        /// Its number.
+        /// The reason's code.
         code: u64,
-        /// What the peer says of it.
+        /// The peer's explanation.
         text: String,
     },
 }
 
 impl CloseReason {
-    /// What a node is told whose CA is not among those that may attach.
+    /// Returns the reason for a node whose CA is not among those that may attach.
     pub fn not_admitted() -> Self {
         Self::Denied("nodes of its CA may not attach here".into())
     }
@@ -98,16 +98,16 @@ impl CloseReason {
     }
 }
 
-/// Why one end of a flow ends it before its time, told to the other.
+/// The reason why one end of a flow ends it early, told to the other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FlowEnd {
-    /// No one needs it any more.
+    /// Nobody needs the flow any more.
     Unwanted,
-    /// What came was malformed.
+    /// Malformed input.
     Malformed,
-    /// The flow's version is not spoken.
+    /// Unknown version of the flow.
     Version,
-    /// What remains is out of date.
+    /// The rest of the flow is out of date.
     Stale,
     /// A reason that this version does not know.
     Other(u64),
@@ -147,49 +147,49 @@ impl fmt::Display for FlowEnd {
     }
 }
 
-/// Why the far side refused this node, as far as it lets on.
+/// The far side's reason for refusing this node, as far as the far side reveals it.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PeerRefusal {
-    /// It saw no certificate of ours.
+    /// The far side saw no certificate of ours.
     #[error("it saw no certificate: does this node have an identity?")]
     NoCertificate,
-    /// Our CA is not one that it trusts.
+    /// The far side does not trust our CA.
     #[error("it does not trust our CA: are the two nodes of different fleets?")]
     OtherCa,
-    /// It serves other CAs.
+    /// The far side serves other CAs.
     #[error("it serves other fleets only: its keeper has to add our CA to `accept` in [router]")]
     NotAdmitted,
-    /// To it our certificate is over, or has not begun.
+    /// The far side considers our certificate expired or not yet valid.
     #[error("to it our certificate is expired or not yet valid: enroll again, or compare the clocks")]
     Expired,
     /// Our certificate was revoked.
     #[error("our certificate was revoked: the keeper of the fleet has to enroll this node again")]
     Revoked,
-    /// It cannot use our certificate.
+    /// The far side cannot use our certificate.
     #[error("it cannot use our certificate (alert {0}); its log says why")]
     BadCertificate(u8),
-    /// It speaks another version of the protocol, or another protocol.
+    /// The far side speaks another version of the protocol, or another protocol.
     #[error("it does not speak this version of SGC: are both nodes of one release?")]
     Version,
-    /// It accepts no key exchange that we offer.
+    /// The far side accepts no key exchange that we offer.
     #[error(
         "it accepts no key exchange of ours: one of the two requires post-quantum X25519MLKEM768 and the other does \
          not have it; upgrade that one, or turn `post_quantum` off in both fleets"
     )]
     KeyExchange,
-    /// It has too much to do.
+    /// The far side is overloaded.
     #[error("it is overloaded: try again later")]
     Overloaded,
-    /// It gave up before the link was made.
+    /// The far side gave up before the link was made.
     #[error("it gave up while connecting")]
     GaveUp,
-    /// Something else.
+    /// Another reason.
     #[error("{0}")]
     Other(String),
 }
 
 impl PeerRefusal {
-    /// From the close frame of a peer's transport (RFC 9000, 20.1; TLS alerts: RFC 8446, 6.2).
+    /// Reads the close frame of a peer's transport (RFC 9000, 20.1; TLS alerts: RFC 8446, 6.2).
     pub(crate) fn from_code(code: TransportErrorCode, text: &[u8]) -> Self {
         const TLS_ALERT: u64 = 0x100;
         match u64::from(code) {
@@ -200,7 +200,7 @@ impl PeerRefusal {
         }
     }
 
-    /// From an alert of TLS or DTLS (RFC 8446, 6.2).
+    /// Reads an alert of TLS or DTLS (RFC 8446, 6.2).
     pub(crate) fn from_alert(alert: u8) -> Self {
         match alert {
             116 => Self::NoCertificate,
@@ -216,13 +216,13 @@ impl PeerRefusal {
     }
 }
 
-/// How a peer broke the protocol. It ends the link.
+/// A peer's breach of the protocol. It ends the link.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ProtocolError {
     /// A control frame claims to be too long.
     #[error("control frame of {bytes} bytes, at most {CONTROL_FRAME_BYTES_MAX} are allowed")]
     ControlFrameTooLong {
-        /// What it claims.
+        /// The claimed length.
         bytes: u64,
     },
     /// The control stream ended while the link lives.
@@ -231,29 +231,29 @@ pub enum ProtocolError {
     /// The first control frame is no greeting.
     #[error("the greeting is malformed: {0}")]
     Greeting(#[source] DecodeError),
-    /// It broke the rules of a multiplexed stream.
+    /// A breach of the rules of a multiplexed stream.
     #[error("{0}")]
     Stream(#[source] StreamViolation),
-    /// The certificates of DTLS and of the TLS inside are not of one node.
+    /// The certificates of DTLS and of the TLS inside belong to different nodes.
     #[error("its certificate in DTLS is not that of the node inside")]
     OtherNode,
 }
 
-/// Why a link ended or could not be made.
+/// The reason why a link ended or could not be made.
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum LinkError {
-    /// It was closed.
+    /// One side closed the link.
     #[error("{}", Closing(*by_peer, reason))]
     Closed {
-        /// By the peer, or here.
+        /// Whether the peer closed it.
         by_peer: bool,
-        /// Why.
+        /// The reason.
         reason: CloseReason,
     },
     /// Nothing came for too long.
     #[error("nothing arrived for {} s: the network is down or the peer is gone", after.as_secs_f32())]
     TimedOut {
-        /// How long.
+        /// The time without input.
         after: Duration,
     },
     /// The peer did not finish its part of connecting.
@@ -262,7 +262,7 @@ pub enum LinkError {
         after.as_secs_f32()
     )]
     HandshakeTimedOut {
-        /// How long.
+        /// The time that the peer had.
         after: Duration,
     },
     /// The host is there, and no program listens on that port for TCP.
@@ -275,13 +275,13 @@ pub enum LinkError {
         "the connection was cut: the peer was stopped or restarted, or something between the two ended it"
     )]
     Cut,
-    /// The bytes that came are not those that the peer sent.
-    #[error("what came was altered on the way: somebody, or a broken device, is between the two nodes")]
+    /// Somebody altered the bytes on the way.
+    #[error("received bytes were altered on the way: an attacker or a broken device is between the two nodes")]
     Altered,
-    /// The peer is there and has forgotten the link.
+    /// The peer is there but has forgotten the link.
     #[error("the peer restarted and no longer knows this link")]
     PeerRestarted,
-    /// The peer's certificate is refused here.
+    /// This node refuses the peer's certificate.
     #[error("refused: {0}")]
     RefusedHere(#[source] CertError),
     /// The peer refused us.
@@ -299,7 +299,7 @@ pub enum LinkError {
         /// Its length.
         bytes: usize,
     },
-    /// The peer's handshake is longer than any that is read.
+    /// The peer's handshake is longer than the limit.
     #[error("its handshake is longer than any that nodes read: is a node listening there?")]
     HandshakeTooLong,
     /// The listener has no DTLS 1.3.
@@ -313,7 +313,7 @@ pub enum LinkError {
     DatagramTooLong {
         /// Its length.
         bytes: usize,
-        /// The most that fits now; 0 if this link has no datagrams.
+        /// The longest datagram that fits now; 0 if this link has no datagrams.
         max: usize,
     },
     /// DTLS cannot sign with the key of this node's identity.
@@ -330,7 +330,7 @@ pub enum LinkError {
 }
 
 impl LinkError {
-    /// True if the link lives on.
+    /// Returns `true` if the link lives on.
     pub fn is_link_alive(&self) -> bool {
         matches!(self, Self::FlowStopped(_) | Self::FrameTooLong { .. } | Self::DatagramTooLong { .. })
     }
@@ -360,7 +360,7 @@ impl From<io::Error> for LinkError {
     }
 }
 
-/// Why no more can be read from a flow. Only [`FlowError::Link`] concerns the link.
+/// The reason why a flow yields nothing more. Only [`FlowError::Link`] concerns the link.
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum FlowError {
     /// A flow of a version that is not spoken here.
@@ -372,7 +372,7 @@ pub enum FlowError {
     /// A packet claims to be too long.
     #[error("a packet of {bytes} bytes, at most {} are allowed", crate::framing::FLOW_PACKET_BYTES_MAX)]
     PacketTooLong {
-        /// What it claims.
+        /// The claimed length.
         bytes: u64,
     },
     /// A packet's header is malformed, or of an unknown version.
@@ -381,7 +381,7 @@ pub enum FlowError {
     /// The flow ended inside of a packet.
     #[error("the flow ended inside of a packet")]
     Truncated,
-    /// The sender ended it before its time.
+    /// The sender ended the flow early.
     #[error("the sender ended the flow: {0}")]
     Ended(FlowEnd),
     /// The link ended.
@@ -390,7 +390,7 @@ pub enum FlowError {
 }
 
 impl FlowError {
-    /// What the sender is told, if anything is left to tell.
+    /// Returns the reason to tell the sender, if there is anything left to stop.
     pub(crate) fn stop_code(&self) -> Option<FlowEnd> {
         match self {
             Self::Version { .. } | Self::Packet(DecodeError::Version { .. }) => Some(FlowEnd::Version),
@@ -400,54 +400,54 @@ impl FlowError {
     }
 }
 
-/// A peer gives labels out of order, or one twice.
+/// A label out of order, or one given twice.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("label {found} was given where {expected} comes next")]
 pub struct LabelError {
-    /// What it gave.
+    /// The label that the peer gave.
     pub found: u32,
     /// The next in order; the number of labels if there may be no more.
     pub expected: u32,
 }
 
-/// Why a peer that came to a listener has no link.
+/// The reason why an incoming peer has no link.
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum Refusal {
-    /// Its certificate is not accepted.
+    /// This node does not accept the peer's certificate.
     #[error("{0}")]
     Certificate(#[source] CertError),
-    /// It speaks another version, or another protocol.
+    /// The peer speaks another version, or another protocol.
     #[error("it does not speak this version of SGC: {0}")]
     Version(String),
-    /// It offers no key exchange that is accepted here.
+    /// The peer offers no key exchange that is accepted here.
     #[error(
         "it offers no key exchange that this node accepts{}",
         if *post_quantum { ": post-quantum X25519MLKEM768 is required here and it does not have it; upgrade it, or \
          turn `post_quantum` off in this fleet" } else { "" }
     )]
     KeyExchange {
-        /// True if only post-quantum ones are.
+        /// Whether this node accepts only post-quantum ones.
         post_quantum: bool,
     },
-    /// Its handshake is longer than any that is read.
+    /// The peer's handshake is longer than the limit.
     #[error("its handshake is longer than any that is read")]
     HandshakeTooLong,
-    /// Its greeting is none.
+    /// The peer's first frame is no greeting.
     #[error("{0}")]
     Greeting(#[source] ProtocolError),
-    /// It did not finish in time.
+    /// The peer did not finish in time.
     #[error("it did not finish connecting within {} s", after.as_secs_f32())]
     TimedOut {
-        /// The time it had.
+        /// The time that the peer had.
         after: Duration,
     },
-    /// Too many connect at once.
+    /// Too many peers connect at once.
     #[error("{pending} nodes are connecting already")]
     TooMany {
-        /// How many.
+        /// Number of connection attempts.
         pending: usize,
     },
-    /// Too many connect at once from its address.
+    /// Too many connect at once from the peer's address.
     #[error("{pending} connections from {prefix} are connecting already")]
     TooManyFromAddress {
         /// The address.
@@ -455,7 +455,7 @@ pub enum Refusal {
         /// Number of connection attempts from it.
         pending: usize,
     },
-    /// It refused us, or gave up.
+    /// The peer refused us, or gave up.
     #[error("{0}")]
     ByPeer(#[source] PeerRefusal),
     /// The transport failed.
@@ -464,7 +464,7 @@ pub enum Refusal {
 }
 
 impl Refusal {
-    /// What it counts as.
+    /// Returns the kind under which the refusal is counted.
     pub fn kind(&self) -> RefusalKind {
         match self {
             Self::Certificate(CertError::NoCertificate) => RefusalKind::NoCertificate,
@@ -492,15 +492,15 @@ impl Refusal {
     }
 }
 
-/// Why dialling led to no link.
+/// The reason why dialling led to no link.
 #[derive(Debug, thiserror::Error)]
 pub enum DialError {
     /// The host name could not be looked up.
     #[error("{url}: the host name cannot be looked up: {source}")]
     Resolve {
-        /// What was dialled.
+        /// The dialled URL.
         url: LinkUrl,
-        /// What the resolver said.
+        /// The resolver's error.
         source: io::Error,
     },
     /// The host name has no address.
@@ -509,15 +509,15 @@ pub enum DialError {
     /// Every address failed.
     #[error("{url}: {}", Attempts(attempts))]
     Failed {
-        /// What was dialled.
+        /// The dialled URL.
         url: LinkUrl,
-        /// What was tried, and what came of it.
+        /// The tried addresses, each with its error.
         attempts: Vec<(SocketAddr, LinkError)>,
     },
 }
 
 impl DialError {
-    /// True if somebody answered there and either certificate or the version was refused: trying again soon is of no
+    /// Returns `true` if a peer answered and either certificate or the version was refused: trying again soon is of no
     /// use.
     pub fn is_refusal(&self) -> bool {
         let refused = |error: &LinkError| match error {
@@ -540,7 +540,7 @@ impl fmt::Display for Attempts<'_> {
     }
 }
 
-/// Who closed a link, and why; where the cause lies with one of the two, which one.
+/// Text for a closed link: the side that closed it and the reason. Where one side caused it, the text names that side.
 struct Closing<'a>(bool, &'a CloseReason);
 
 impl fmt::Display for Closing<'_> {
@@ -567,7 +567,7 @@ impl fmt::Display for Closing<'_> {
     }
 }
 
-/// Text of a peer, fit for a log.
+/// Makes a peer's text fit for a log.
 fn printable(text: &[u8]) -> String {
     let text = String::from_utf8_lossy(text);
     text.chars().filter(|c| !c.is_control()).take(TEXT_CHARS_MAX).collect()

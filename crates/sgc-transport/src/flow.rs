@@ -8,24 +8,24 @@ use bytes::Bytes;
 use sgc_wire::{Label, Packet, Slab};
 
 use crate::error::{FlowEnd, FlowError, LinkError};
-use crate::framing::{Gathered, Pieces, packet_head};
+use crate::framing::{PieceJoiner, Pieces, packet_head};
 use crate::labels::Labels;
 use crate::{quic, stream};
 
-/// Payloads up to this are copied behind their header: what that costs is less than what a transport takes to keep
-/// another piece (quinn looks through all that are not acknowledged for each that it sends).
+/// Payloads up to this length are copied behind their header: the copy costs less than another piece of memory in the
+/// transport (quinn looks through all unacknowledged pieces for each packet that it sends).
 const JOINED_PAYLOAD_BYTES_MAX: usize = 2048;
 
-/// The sending end of a flow. Dropped, it ends the flow after what was sent, or, in the middle of a packet, at once; what was
-/// only queued is not sent.
+/// The sending end of a flow. Dropping it ends the flow after the sent packets, or at once in the middle of a packet.
+/// Queued packets are not sent.
 #[derive(Debug)]
 pub struct FlowTx {
     outlet: Outlet,
     has_begun: bool,
-    /// For what stands before payloads.
+    /// Memory for headers.
     heads: Slab,
-    /// The end of what is queued.
-    gathered: Gathered,
+    /// The last piece of the queue.
+    gathered: PieceJoiner,
     queued_bytes: usize,
 }
 
@@ -35,7 +35,7 @@ pub(crate) enum Outlet {
     Stream(stream::Outlet),
 }
 
-/// The halves of all transports' flows can do the same.
+/// The halves of all transports' flows have the same methods.
 macro_rules! each {
     ($half:ident, $self:expr, $inner:ident => $body:expr) => {
         match $self {
@@ -47,7 +47,7 @@ macro_rules! each {
 
 impl FlowTx {
     pub(crate) fn new(outlet: Outlet) -> Self {
-        let (heads, gathered) = (Slab::default(), Gathered::default());
+        let (heads, gathered) = (Slab::default(), PieceJoiner::default());
         Self { outlet, has_begun: false, heads, gathered, queued_bytes: 0 }
     }
 
@@ -59,16 +59,16 @@ impl FlowTx {
         self.send_as(packet, None).await
     }
 
-    /// Sends a packet with this label in place of its name, if there is one: the peer must have said that it knows
-    /// what it stands for. Otherwise as [`Self::send`].
+    /// Sends a packet with this label in place of its name, if there is one: the peer must have confirmed the label.
+    /// Otherwise as [`Self::send`].
     pub async fn send_as(&mut self, packet: &Packet, label: Option<Label>) -> Result<(), LinkError> {
         self.flush().await?;
         self.queue_as(packet, label);
         self.flush().await
     }
 
-    /// Keeps a packet, in the form of [`Self::send_as`], to be sent with others at the next [`Self::flush`]: many short ones
-    /// take the transport hardly more than one. Whoever queues bounds it, by [`Self::queued_bytes`].
+    /// Keeps a packet, in the form of [`Self::send_as`], to be sent with others at the next [`Self::flush`]: many short
+    /// ones take the transport hardly more work than one. The caller bounds the queue, by [`Self::queued_bytes`].
     pub fn queue_as(&mut self, packet: &Packet, label: Option<Label>) {
         let joined = packet.payload.len() <= JOINED_PAYLOAD_BYTES_MAX;
         let head = packet_head(packet, label, !self.has_begun, joined, &mut self.heads);
@@ -83,13 +83,13 @@ impl FlowTx {
         }
     }
 
-    /// Bytes that were queued since all that was queued had been sent.
+    /// Returns the bytes that were queued since the queue was last empty.
     pub fn queued_bytes(&self) -> usize {
         self.queued_bytes
     }
 
-    /// Sends what is queued; waits while the peer or the network takes no more. If the future is dropped, the next one goes
-    /// on where it stood.
+    /// Sends the queue; waits while the peer or the network takes no more. If the future is dropped, the next one
+    /// continues where it stopped.
     pub async fn flush(&mut self) -> Result<(), LinkError> {
         self.settle();
         each!(Outlet, &mut self.outlet, outlet => outlet.flush().await?);
@@ -106,26 +106,27 @@ impl FlowTx {
         each!(Outlet, &mut self.outlet, outlet => outlet.queue(pieces.into_iter()));
     }
 
-    /// Ends the flow after what was sent or queued, which the transport still delivers.
+    /// Ends the flow after the sent and queued packets, which the transport still delivers.
     pub async fn finish(mut self) -> Result<(), LinkError> {
         self.settle();
         each!(Outlet, &mut self.outlet, outlet => outlet.finish().await)
     }
 
-    /// Ends the flow after what was sent or queued; the result waits until the far side has all of it, or wants no more.
+    /// Ends the flow after the sent and queued packets. The result waits until the far side has all of it, or stopped
+    /// it.
     pub async fn finish_slowly(mut self) -> Result<Delivery, LinkError> {
         self.settle();
         each!(Outlet, &mut self.outlet, outlet => outlet.finish().await?);
         Ok(Delivery { outlet: self.outlet })
     }
 
-    /// Ends the flow at once; what has not arrived will not.
+    /// Ends the flow at once; data in flight is lost.
     pub fn reset(mut self, end: FlowEnd) {
         each!(Outlet, &mut self.outlet, outlet => outlet.reset(end));
     }
 }
 
-/// A flow that was ended in good order and may still be under way. Dropped, it is nobody's concern any more, and arrives.
+/// A flow that was ended in good order and may still be in flight. It arrives even if this is dropped.
 #[derive(Debug)]
 pub struct Delivery {
     outlet: Outlet,
@@ -138,7 +139,7 @@ impl Delivery {
     }
 }
 
-/// The receiving end of a flow. Dropped, it tells the sender that no one needs the flow any more.
+/// The receiving end of a flow. Dropping it tells the sender that nobody needs the flow any more.
 #[derive(Debug)]
 pub struct FlowRx {
     inlet: Inlet,
@@ -165,9 +166,9 @@ impl FlowRx {
         Self { inlet, labels, pieces: Pieces::default(), state: State::ExpectVersion }
     }
 
-    /// Receives the next packet, `None` once the flow is over. The payload consists of slices of what the
-    /// transport hands out (quinn joins pieces by itself where many small ones would hold much memory). An error ends this flow, is told to the sender, and leaves
-    /// the link alone. Dropping the future loses nothing.
+    /// Receives the next packet, `None` once the flow is over. The payload consists of slices of the transport's memory
+    /// (quinn itself joins pieces where many small ones would hold much memory). An error ends this flow, is told to
+    /// the sender, and leaves the link alone. Dropping the future loses nothing.
     pub async fn recv(&mut self) -> Result<Option<Packet>, FlowError> {
         let result = self.next().await;
         match &result {
@@ -183,12 +184,12 @@ impl FlowRx {
         result
     }
 
-    /// Tells the sender why no more will be received.
+    /// Stops the flow and tells the sender the reason.
     pub fn stop(mut self, end: FlowEnd) {
         self.tell(end);
     }
 
-    /// True if nothing has been received of what follows.
+    /// Returns `true` if no part of the next packet has arrived.
     pub fn is_at_rest(&self) -> bool {
         self.pieces.is_empty()
     }

@@ -1,9 +1,9 @@
-//! How frames and packets lie in a stream of bytes (`docs/spec/wire.md`, links). Pure: it sees pieces of the stream
-//! as the transport received them and hands out slices of the same pieces.
+//! Framing of control frames and packets in a stream of bytes (`docs/spec/wire.md`, links). Pure: it sees pieces of the
+//! stream as the transport received them and hands out slices of the same pieces.
 //!
-//! Control stream: frames of `u32 length | body`; the first in each direction is a greeting. Flow: one byte
-//! of version, then packets of `u32 length | header | payload`. Lengths are checked before anything waits for the
-//! bytes they announce.
+//! Control stream: frames of `u32 length | body`; the first in each direction is a greeting. Flow: one byte of version,
+//! then packets of `u32 length | header | payload`. Lengths are checked before anything waits for the bytes they
+//! announce.
 
 use std::collections::VecDeque;
 
@@ -16,7 +16,7 @@ use sgc_wire::{
 use crate::error::{FlowError, ProtocolError};
 use crate::labels::Labels;
 
-/// Version of what two nodes say on a link, in the greeting.
+/// Version of the link protocol, in the greeting.
 pub const LINK_VERSION: u16 = 1;
 /// Version of the framing of a flow, its first byte.
 pub const FLOW_VERSION: u8 = 1;
@@ -38,7 +38,7 @@ pub(crate) struct Pieces {
 }
 
 impl Pieces {
-    /// Appends what was received.
+    /// Appends received bytes.
     pub(crate) fn push(&mut self, piece: Bytes) {
         if !piece.is_empty() {
             self.bytes += piece.len();
@@ -101,7 +101,7 @@ impl Pieces {
         Packet::new(decoded, payload).map(Some).map_err(FlowError::Packet)
     }
 
-    /// True if nothing is left.
+    /// Returns `true` if nothing is left.
     pub(crate) fn is_empty(&self) -> bool {
         self.bytes == 0
     }
@@ -163,13 +163,13 @@ impl Pieces {
     }
 }
 
-/// What stands before a control frame.
+/// Returns the head of a control frame.
 pub(crate) fn control_head(length: usize) -> Bytes {
     Bytes::copy_from_slice(&u32::try_from(length).unwrap_or(u32::MAX).to_be_bytes())
 }
 
-/// What stands before the payload of a packet in a flow, with the flow's version if it is the first; `joined` with the
-/// payload behind it. It is written to memory of `slab`.
+/// Returns the bytes before the payload of a packet in a flow, with the flow's version if it is the first; `joined`
+/// appends the payload. They lie in memory of `slab`.
 pub(crate) fn packet_head(
     packet: &Packet,
     label: Option<Label>,
@@ -191,25 +191,25 @@ pub(crate) fn packet_head(
     head
 }
 
-/// Bytes that are to be written one behind the other; those that lie so in memory, too, are one piece.
+/// Joins byte strings that are written in sequence: neighbours in memory become one piece.
 #[derive(Debug, Default)]
-pub(crate) struct Gathered(BytesMut);
+pub(crate) struct PieceJoiner(BytesMut);
 
-impl Gathered {
-    /// Adds the next. What lies elsewhere and came before is a piece by itself.
+impl PieceJoiner {
+    /// Adds the next bytes. Returns the earlier piece if the next bytes lie elsewhere.
     pub(crate) fn push(&mut self, next: BytesMut) -> Option<Bytes> {
         let before = if self.0.as_ptr_range().end == next.as_ptr() { None } else { self.take() };
         self.0.unsplit(next);
         before
     }
 
-    /// What there is.
+    /// Takes the piece, if there is one.
     pub(crate) fn take(&mut self) -> Option<Bytes> {
         (!self.0.is_empty()).then(|| std::mem::take(&mut self.0).freeze())
     }
 }
 
-/// A packet in one piece, as a datagram carries it, in memory of `slab`.
+/// Returns a packet in one piece, as a datagram carries it, in memory of `slab`.
 pub(crate) fn datagram(packet: &Packet, label: Option<Label>, slab: &mut Slab) -> Bytes {
     let mut out = slab.room(packet.encoded_bytes_as(label));
     packet.header.put_as(label, &mut out);
@@ -220,7 +220,7 @@ pub(crate) fn datagram(packet: &Packet, label: Option<Label>, slab: &mut Slab) -
 /// The first control frame in each direction: the version, then extensions, of which unknown ones are skipped.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Greeting {
-    /// This connection is no link but a lane of one, agreed on there.
+    /// Set if this connection is a lane that was agreed on over a link.
     pub(crate) lane: Option<LaneToken>,
 }
 
@@ -276,7 +276,7 @@ mod tests {
         Packet::new(header, Bytes::copy_from_slice(payload).into()).unwrap()
     }
 
-    /// The stream in pieces of `size` bytes.
+    /// Returns the stream in pieces of `size` bytes.
     fn pieces(stream: &[u8], size: usize) -> Pieces {
         let mut out = Pieces::default();
         stream.chunks(size).for_each(|c| out.push(Bytes::copy_from_slice(c)));
@@ -331,7 +331,7 @@ mod tests {
     #[test]
     fn short_packets_behind_each_other_are_one_piece() {
         let p = packet(&[7; 300], None);
-        let (mut slab, mut gathered, mut pieces) = (Slab::default(), Gathered::default(), Vec::new());
+        let (mut slab, mut gathered, mut pieces) = (Slab::default(), PieceJoiner::default(), Vec::new());
         let mut stream = Vec::new();
         for n in 0..100 {
             let head = packet_head(&p, None, n == 0, true, &mut slab);
@@ -341,10 +341,10 @@ mod tests {
         pieces.extend(gathered.take());
         assert!(gathered.take().is_none());
         assert_eq!(pieces.concat(), stream);
-        // As many as share memory there.
+        // One piece for all that share memory.
         assert!(pieces.len() <= 100 / 8 + 2, "{}", pieces.len());
-        // Memory that was freed may be handed out where something else ends: that is one piece as well.
-        let mut apart = Gathered::default();
+        // The allocator may place new memory where other memory ends: that is one piece as well.
+        let mut apart = PieceJoiner::default();
         assert!(apart.push(BytesMut::from(&b"a"[..])).is_none());
         let before = apart.push(BytesMut::from(&b"b"[..]));
         assert_eq!([before.unwrap_or_default(), apart.take().unwrap()].concat(), b"ab");

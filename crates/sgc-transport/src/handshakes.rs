@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::time::Instant;
 
-use sgc_trust::{AddressPrefix, Crowded, PlaceDecision, PlaceLimits, Places};
+use sgc_trust::{AddressPrefix, PlaceDecision, PlaceLimits, PlaceRefusal, Places};
 
 use crate::error::Refusal;
 use crate::metrics::TransportMetrics;
@@ -68,8 +68,8 @@ impl<T: Holder> Handshakes<T> {
             PlaceDecision::Refuse(crowded) => (None, crowded),
         };
         let refusal = match crowded {
-            Crowded::All { held } => Refusal::TooMany { pending: held },
-            Crowded::Prefix { prefix, held } => Refusal::TooManyFromAddress { prefix, pending: held },
+            PlaceRefusal::All { held } => Refusal::TooMany { pending: held },
+            PlaceRefusal::Prefix { prefix, held } => Refusal::TooManyFromAddress { prefix, pending: held },
         };
         metrics.count_refused(refusal.kind());
         let remote = evicted.as_ref().map_or(remote, Holder::remote);

@@ -1,5 +1,5 @@
-//! What the labels of one link stand for, as the peer said. Giving labels to names, and telling the peer, is the
-//! driver's (`docs/spec/wire.md`, labels).
+//! Names behind the labels of one link, as the peer defined them. The driver gives labels to names and tells the peer
+//! (`docs/spec/wire.md`, labels).
 
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -28,27 +28,27 @@ impl Default for Labels {
 }
 
 impl Labels {
-    /// Takes in what the next label stands for. Another than the next, so also one that stands for a name already, is
-    /// refused: that is what bounds the memory, and what keeps a packet from meaning two names.
+    /// Defines the next label. Any other label is refused, also one that is defined already: this bounds the memory,
+    /// and keeps a packet from meaning two names.
     pub(crate) fn define(&self, label: Label, name: Name) -> Result<(), LabelError> {
         let expected = self.defined.load(Ordering::Acquire);
         let error = LabelError { found: label.index(), expected };
         let (chunk, at) = place(label);
         let chunk = self.chunks.get(chunk).filter(|_| label.index() == expected).ok_or(error)?;
         let chunk = chunk.get_or_init(|| Box::new(std::array::from_fn(|_| OnceLock::new())));
-        // Of two callers at once one is second.
+        // Only one of two concurrent callers sets the name.
         chunk.get(at).ok_or(error)?.set(name).map_err(|_| error)?;
         self.defined.store(expected + 1, Ordering::Release);
         Ok(())
     }
 
-    /// What a label stands for.
+    /// Returns the name of a label.
     pub(crate) fn name_of(&self, label: Label) -> Option<Name> {
         let (chunk, at) = place(label);
         self.chunks.get(chunk)?.get()?.get(at)?.get().copied()
     }
 
-    /// How many stand for names.
+    /// Returns the number of defined labels.
     pub(crate) fn count(&self) -> u32 {
         self.defined.load(Ordering::Acquire)
     }

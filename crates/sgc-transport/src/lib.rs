@@ -1,12 +1,12 @@
 //! Links: authenticated connections between two nodes, the same to their users over every transport.
 //!
-//! A [`Link`] carries control frames (reliable, ordered), flows (reliable packets of one topic each, none waiting
-//! for another) and datagrams (best effort). It exists only after both ends have proven who they are with the
+//! A [`Link`] carries control frames (reliable, ordered), flows (reliable packets of one topic each, none waiting for
+//! another) and datagrams (best effort). It exists only after both ends have proven their identities with the
 //! certificates of their [`sgc_trust::Identity`]. [`Listener`] and [`Dialer`] make links.
 //!
-//! What is *not* here: routing, queues, reconnecting, policy. A link says who is at the other end and why it
-//! ended; what follows from that is the node's. QUIC is below, by itself, inside of DTLS or with packets that are
-//! authenticated only, or a stream of bytes: TLS, TCP, WebSocket.
+//! This crate has no routing, queues, reconnecting or policy. A link tells its peer and the cause of its end; the node
+//! draws the consequences. Below a link is QUIC (by itself, inside of DTLS, or with packets that are authenticated
+//! only) or a stream of bytes: TLS, TCP, WebSocket.
 #![forbid(unsafe_code)]
 
 mod budget;
@@ -30,13 +30,13 @@ mod stream;
 mod tls;
 mod url;
 
-/// Entry points for fuzzing: each panics if what it is given shows a defect.
+/// Entry points for fuzzing: each panics if its input shows a defect.
 #[cfg(feature = "fuzzing")]
 pub mod fuzzing {
     pub use crate::stream::{fuzz_bytes, fuzz_operations};
 }
 
-/// What is counted by itself in benchmarks, though nobody else may reach it.
+/// Internals that benchmarks measure by themselves.
 #[cfg(feature = "benchmarks")]
 #[doc(hidden)]
 pub mod benchmarks {

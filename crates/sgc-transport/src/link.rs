@@ -17,17 +17,17 @@ use crate::stream::StreamLink;
 ///
 /// Priorities: control before realtime before default before bulk flows; datagrams before all flows.
 pub trait Link: Clone + Send + Sync + 'static {
-    /// Who is at the other end, proven before anything of it is believed.
+    /// Returns the node at the other end, which has proven its identity.
     fn peer(&self) -> &VerifiedPeer;
 
-    /// Its address now; it changes when the peer roams.
+    /// Returns the peer's present address; it changes when the peer roams.
     fn remote(&self) -> SocketAddr;
 
-    /// True if this node dialled.
+    /// Returns `true` if this node dialled.
     fn is_dialer(&self) -> bool;
 
-    /// What it showed if it is no link but a lane of one, as the nodes agreed on that link. Whoever accepts it judges it:
-    /// only its peer is proven here.
+    /// Returns the token that the peer showed if this connection is a lane of a link, as the nodes agreed on that link.
+    /// The accepting side has to judge the token: only the peer's identity is proven here.
     fn lane(&self) -> Option<LaneToken>;
 
     /// Sends a control frame of at most [`crate::CONTROL_FRAME_BYTES_MAX`]: reliable, in order, not copied. If the
@@ -40,46 +40,46 @@ pub trait Link: Clone + Send + Sync + 'static {
     /// Opens a flow of this class; waits while the peer has as many open as it permits.
     fn open_flow(&self, class: Class) -> impl Future<Output = Result<FlowTx, LinkError>> + Send;
 
-    /// The next flow that the peer opened. Dropping the future loses nothing.
+    /// Waits for the next flow that the peer opened. Dropping the future loses nothing.
     fn accept_flow(&self) -> impl Future<Output = Result<FlowRx, LinkError>> + Send;
 
-    /// The longest packet ([`Packet::encoded_bytes`]) that fits a datagram now; `None` if the link has none.
+    /// Returns the longest packet ([`Packet::encoded_bytes`]) that fits a datagram now; `None` if the link has none.
     fn datagram_max(&self) -> Option<usize>;
 
-    /// Sends a packet that may be lost; waits while those before it have not left.
+    /// Sends a packet that may be lost; waits while earlier datagrams have not left.
     fn send_datagram(&self, packet: &Packet) -> impl Future<Output = Result<(), LinkError>> + Send {
         self.send_datagram_as(packet, None)
     }
 
-    /// The same with this label in place of the packet's name, if there is one: the peer must have said that it knows
-    /// what it stands for.
+    /// Sends a datagram with this label in place of the packet's name, if there is one: the peer must have confirmed
+    /// the label.
     fn send_datagram_as(
         &self,
         packet: &Packet,
         label: Option<Label>,
     ) -> impl Future<Output = Result<(), LinkError>> + Send;
 
-    /// Receives the next packet that came as a datagram. The inner error is one datagram that was malformed
-    /// and is dropped; the outer one is the end of the link. Dropping the future loses nothing.
+    /// Receives the next packet that came as a datagram. The inner error is one malformed datagram, which is dropped;
+    /// the outer one is the end of the link. Dropping the future loses nothing.
     fn recv_datagram(&self) -> impl Future<Output = Result<Result<Packet, DecodeError>, LinkError>> + Send;
 
-    /// From here on packets of the peer under this label are of this name. The error is the peer's mistake.
+    /// Defines a label: from here on the peer's packets under it have this name. The error is the peer's mistake.
     fn define_label(&self, label: Label, name: Name) -> Result<(), LabelError>;
 
-    /// How many labels of the peer stand for names.
+    /// Returns the number of labels of the peer that stand for names.
     fn labels_defined(&self) -> u32;
 
-    /// What the transport measured so far.
+    /// Returns the measurements so far.
     fn stats(&self) -> LinkStats;
 
-    /// Closes it and tells the peer why; every pending operation ends with that reason.
+    /// Closes the link and tells the peer the reason; every pending operation ends with it.
     fn close(&self, reason: CloseReason);
 
-    /// Waits for its end and says why it came.
+    /// Waits for the end of the link and returns its cause.
     fn closed(&self) -> impl Future<Output = LinkError> + Send;
 }
 
-/// How the two ends of a link agreed on its keys.
+/// Key exchange of the two ends of a link.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum KeyExchange {
     /// Not known.
@@ -87,12 +87,12 @@ pub enum KeyExchange {
     Unknown,
     /// X25519 alone.
     X25519,
-    /// X25519 and ML-KEM-768, which also stands against quantum computers.
+    /// X25519 and ML-KEM-768, which also withstands quantum computers.
     X25519MlKem768,
 }
 
 impl KeyExchange {
-    /// Its name in TLS (IANA, supported groups).
+    /// Returns the name in TLS (IANA, supported groups).
     pub fn label(self) -> &'static str {
         match self {
             Self::Unknown => "unknown",
@@ -102,7 +102,7 @@ impl KeyExchange {
     }
 }
 
-/// What a transport measures of a link.
+/// A transport's measurements of a link.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LinkStats {
     /// Smoothed round-trip time.
@@ -115,15 +115,15 @@ pub struct LinkStats {
     pub received_bytes: u64,
     /// Packets of the transport sent.
     pub sent_packets: u64,
-    /// Of these, lost. What was in them is sent again, unless it was a datagram.
+    /// Packets lost of these. Their content is sent again, except for datagrams.
     pub lost_packets: u64,
     /// Bytes in those.
     pub lost_bytes: u64,
-    /// How many bytes the congestion controller lets be under way.
+    /// Bytes that the congestion controller allows in flight.
     pub congestion_window_bytes: u64,
     /// Longest packet of the transport that the path carries, bytes.
     pub mtu_bytes: u16,
-    /// How its keys were agreed on.
+    /// Key exchange of the link.
     pub key_exchange: KeyExchange,
 }
 

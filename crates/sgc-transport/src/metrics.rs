@@ -1,8 +1,8 @@
-//! Counts of what links went through, for `sgc status` and the metrics page. It counts; it logs nothing.
+//! Counters of links, for `sgc status` and the metrics page. This module logs nothing.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-/// Why peers are refused, as far as counting goes; [`crate::Refusal`] tells more.
+/// The kind of refusal that is counted; [`crate::Refusal`] has the details.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum RefusalKind {
     /// No certificate was presented.
@@ -11,29 +11,29 @@ pub enum RefusalKind {
     OtherCa,
     /// The certificate is from a CA whose nodes may not attach here.
     NotAdmitted,
-    /// The certificate, or its CA, is over.
+    /// The certificate, or its CA, has expired.
     Expired,
-    /// The certificate has not begun.
+    /// The certificate is not yet valid.
     NotYetValid,
     /// The certificate was revoked.
     Revoked,
-    /// The certificate is altered, malformed or for something else.
+    /// The certificate is altered, malformed or for another purpose.
     BadCertificate,
-    /// It speaks another version of the protocol, or another protocol.
+    /// The peer speaks another version of the protocol, or another protocol.
     Version,
-    /// It offers no key exchange that is accepted here.
+    /// The peer offers no key exchange that is accepted here.
     KeyExchange,
-    /// Its handshake is longer than any that is read.
+    /// The peer's handshake is longer than the limit.
     HandshakeTooLong,
-    /// It connected and then said something that is no greeting.
+    /// The peer connected and sent no valid greeting.
     BadGreeting,
-    /// It did not finish in time.
+    /// The peer did not finish in time.
     TimedOut,
     /// Too many were connecting at once.
     TooMany,
-    /// Too many were connecting at once from its address.
+    /// Too many were connecting at once from the peer's address.
     TooManyFromAddress,
-    /// It refused us, or gave up.
+    /// The peer refused us, or gave up.
     ByPeer,
     /// The transport failed.
     Transport,
@@ -60,7 +60,7 @@ impl RefusalKind {
         Self::Transport,
     ];
 
-    /// Its name as a label of a metric.
+    /// Returns the label of the metric.
     pub fn label(self) -> &'static str {
         match self {
             Self::NoCertificate => "no_certificate",

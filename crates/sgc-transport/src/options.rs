@@ -1,4 +1,4 @@
-//! What can be set of links. Every number is a bound; none can be infinite.
+//! Settings of links. Every number is a bound; none can be infinite.
 
 use std::fmt;
 use std::time::Duration;
@@ -6,56 +6,57 @@ use std::time::Duration;
 use crate::budget::ReceiveBudget;
 use crate::congestion::Congestion;
 
-/// Settings of the links of one listener or dialer. The default is meant for all.
+/// Settings of the links of one listener or dialer. The defaults suit all.
 #[derive(Clone)]
 pub struct LinkOptions {
-    /// How long a peer may take to connect and prove who it is.
+    /// Time in which a peer has to connect and prove its identity.
     pub handshake_timeout: Duration,
-    /// How long looking up a host name may take.
+    /// Time for looking up a host name.
     pub resolve_timeout: Duration,
-    /// How often something is sent on an idle link, so that NATs keep it and its end is noticed.
+    /// Interval of packets on an idle link, so that NATs keep it and its end is noticed.
     pub keep_alive: Duration,
-    /// How long nothing may arrive before a link counts as lost.
+    /// Time without input after which a link counts as lost.
     pub idle_timeout: Duration,
-    /// Most bytes that the peer may have sent and we not read, all flows of a link together. Where there are many links it
-    /// is less, by [`Self::receive_budget`].
+    /// Most bytes that the peer may have sent before they are read here, all flows of a link together. Where there are
+    /// many links the window is smaller, by [`Self::receive_budget`].
     pub receive_window_bytes: u32,
-    /// The same for one flow; at most half of what the link has.
+    /// Most bytes of one flow that the peer may have sent before they are read here; at most half of the link's.
     pub flow_window_bytes: u32,
     /// The budget for the windows of all links. Clones of these settings share it.
     pub receive_budget: ReceiveBudget,
-    /// Most bytes that we may have sent and the peer not acknowledged, all flows of a link together.
+    /// Most bytes that may be sent and not acknowledged, all flows of a link together.
     pub send_window_bytes: u32,
     /// Most flows that the peer may have open at once.
     pub flows_max: u32,
-    /// Most bytes of datagrams that wait to be sent: small, since what waits here can no longer be replaced by
-    /// something newer.
+    /// Most bytes of datagrams that wait to be sent. It is small, because newer data can no longer replace waiting
+    /// datagrams.
     pub datagram_send_bytes: usize,
     /// Most bytes of datagrams that wait to be read; the oldest go first.
     pub datagram_receive_bytes: usize,
     /// Most handshakes that a listener works on at once.
     pub handshakes_max: usize,
-    /// Most of these from one IPv4 address or one IPv6 network of 64 bits ([`sgc_trust::AddressPrefix`]).
+    /// Most handshakes from one IPv4 address or one IPv6 network of 64 bits ([`sgc_trust::AddressPrefix`]).
     pub handshakes_per_address_max: usize,
-    /// From how many on a peer first has to prove that it receives at its address (QUIC Retry; a ticket, over DTLS).
+    /// Number of handshakes from which on a peer first has to prove that it receives at its address (QUIC Retry; a
+    /// ticket, over DTLS).
     pub handshakes_unvalidated_max: usize,
-    /// Key exchange that also stands against quantum computers (X25519MLKEM768). True: nothing else is offered or
-    /// accepted, so no one can talk the two ends out of it. False: X25519 is preferred, and a peer that requires the
-    /// other gets it. An identity of a fleet that requires it requires it here too.
+    /// Whether keys have to withstand quantum computers (X25519MLKEM768). `true`: nothing else is offered or accepted,
+    /// so nobody can talk the two ends out of it. `false`: X25519 is preferred, and a peer that requires the other gets
+    /// it. An identity of a fleet that requires it requires it here too.
     pub post_quantum: bool,
-    /// Segmentation and receive offloads of UDP, where the system has them. Without them datagrams are sent and
-    /// received one by one, for drivers that get it wrong; ECN, the choice of the source address on hosts with several, and
-    /// MTU discovery go with them. A link with a [`Self::dscp`] has none either.
+    /// Whether UDP uses segmentation and receive offloads, where the system has them. Without them datagrams are sent
+    /// and received one by one, for faulty drivers. ECN, the choice of the source address on hosts with several, and
+    /// MTU discovery are then off, too. A link with a [`Self::dscp`] has none of these either.
     pub offload: bool,
-    /// Whether links over UDP look for the longest packet that the path carries; else they stay at 1200 bytes. What DTLS
-    /// carries is at most 1340 bytes long.
+    /// Whether links over UDP look for the longest packet that the path carries; otherwise they stay at 1200 bytes.
+    /// Packets inside of DTLS are at most 1340 bytes long.
     pub mtu_discovery: bool,
-    /// `true` to speak DTLS 1.2 with listeners that have no 1.3. Anyone on the way can then make a dialer fall back to it, and
-    /// sees the certificates of both ends.
+    /// Whether to speak DTLS 1.2 with listeners that have no 1.3. Anyone on the way can then make a dialer fall back to
+    /// it, and sees the certificates of both ends.
     pub dtls12: bool,
-    /// The code point of differentiated services (RFC 2474), 0 to 63, that everything a link sends is marked with.
+    /// The code point of differentiated services (RFC 2474), 0 to 63, on everything that a link sends.
     pub dscp: Option<u8>,
-    /// What decides how much may be under way.
+    /// The congestion controller.
     pub congestion: Congestion,
 }
 

@@ -1,9 +1,9 @@
-//! Tasks that may be run by the thread that wakes them.
+//! Tasks that the waking thread may run.
 //!
-//! A thread outside of the runtime that hands a packet to a task has to wake a thread of the runtime, and where the
-//! machine is idle that takes longer than all the work. Within an [`AtHand`] the tasks that the thread wakes are run by it,
-//! at the end. Whatever else wakes a task has the runtime run it, as any other; a task never runs twice at once, and what
-//! wakes it while it runs has it run again. Decides nothing about what tasks do, and makes no threads.
+//! A thread outside of the runtime that hands a packet to a task has to wake a thread of the runtime. On an idle
+//! machine that takes longer than all the work. Within a [`WakeBatch`] the thread itself runs the tasks that it woke,
+//! at the end. Any other waker has the runtime run the task as usual. A task never runs twice at once; a wake-up while
+//! it runs makes it run again. This module decides nothing about the tasks' work and makes no threads.
 
 use std::cell::RefCell;
 use std::collections::VecDeque;
@@ -20,25 +20,26 @@ use quinn::{AsyncTimer, AsyncUdpSocket, Runtime, TokioRuntime};
 use tokio::runtime::{EnterGuard, Handle};
 use tokio::time::{Sleep, sleep_until};
 
-/// Tasks that one thread runs at once; what is left is the runtime's. One that wakes itself is not to keep it for ever.
+/// Most runs of tasks in one batch; the runtime runs the rest. A task that wakes itself must not keep the thread for
+/// ever.
 const RUNS_MAX: usize = 16;
 
 thread_local! {
-    /// What this thread woke and will run, if it is to.
+    /// Tasks that this thread woke and will run; `None` outside of a batch.
     static AT_HAND: RefCell<Option<VecDeque<Arc<Task>>>> = const { RefCell::new(None) };
 }
 
 type Work = Pin<Box<dyn Future<Output = ()> + Send>>;
 
-/// Nothing is to be done until it is woken.
+/// The task waits for a wake-up.
 const IDLE: u8 = 0;
-/// It was woken, and whoever did sees to it that it is run.
+/// The task was woken, and the waking side has arranged its run.
 const DUE: u8 = 1;
-/// A thread runs it.
+/// A thread runs the task.
 const RUNS: u8 = 2;
-/// The same, and it was woken meanwhile.
+/// A thread runs the task, and it was woken meanwhile.
 const RUNS_AGAIN: u8 = 3;
-/// It has ended.
+/// The task has ended.
 const DONE: u8 = 4;
 
 struct Task {
@@ -60,7 +61,7 @@ impl Task {
         self.work.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// True if the caller has to see to it that it is run.
+    /// Returns `true` if the caller has to arrange the run.
     fn is_due_now(&self) -> bool {
         let woken = |state| match state {
             IDLE => Some(DUE),
@@ -70,7 +71,7 @@ impl Task {
         self.state.fetch_update(Ordering::AcqRel, Ordering::Acquire, woken) == Ok(IDLE)
     }
 
-    /// Sees to it that it is run: by this thread if it collects what it wakes, or else by the runtime.
+    /// Arranges the run: on this thread if it collects a batch, or else on the runtime.
     fn schedule(self: &Arc<Self>) {
         let collect = |at_hand: &RefCell<Option<VecDeque<_>>>| match &mut *at_hand.borrow_mut() {
             Some(tasks) => {
@@ -86,13 +87,13 @@ impl Task {
     }
 
     fn hand_over(&self) {
-        // There is none before the runtime ran it first, which it is about to.
+        // There is no waker before the runtime ran the task first, which it is about to do.
         if let Some(runtime) = self.runtime.get() {
             runtime.wake_by_ref();
         }
     }
 
-    /// Runs it if it is due; otherwise another thread did or does.
+    /// Runs the task if it is due; otherwise another thread ran it or runs it.
     fn run(self: &Arc<Self>) {
         if self.state.compare_exchange(DUE, RUNS, Ordering::AcqRel, Ordering::Acquire).is_err() {
             return;
@@ -150,26 +151,26 @@ impl Future for Runner {
 
 impl Drop for Runner {
     fn drop(&mut self) {
-        // The runtime ends: what the task holds may hold the task.
+        // The runtime ends: drop the work, because it may hold its own task.
         let work = self.0.work().take();
         self.0.state.store(DONE, Ordering::Release);
         drop(work);
     }
 }
 
-/// While it is there, tasks that this thread wakes wait for its end, and then this thread runs them. For threads of the
-/// runtime there is [`poll_at_hand`].
-pub struct AtHand<'a> {
-    /// Whether this thread collects already: then the outer one runs them.
+/// A batch of wake-ups: while it lives, tasks that this thread wakes wait, and its end runs them on this thread.
+/// Threads of the runtime use [`poll_at_hand`].
+pub struct WakeBatch<'a> {
+    /// Whether this thread collects already: then the outer batch runs the tasks.
     is_inner: bool,
-    /// None where the runtime is around it.
+    /// `None` inside of the runtime.
     _runtime: Option<EnterGuard<'a>>,
-    /// It is of one thread.
+    /// Bound to one thread.
     _thread: PhantomData<*const ()>,
 }
 
-impl<'a> AtHand<'a> {
-    /// Begins to collect, in this runtime.
+impl<'a> WakeBatch<'a> {
+    /// Begins a batch, in this runtime.
     pub fn begin(runtime: &'a Handle) -> Self {
         Self::collect(Some(runtime.enter()))
     }
@@ -184,13 +185,13 @@ impl<'a> AtHand<'a> {
     }
 }
 
-impl fmt::Debug for AtHand<'_> {
+impl fmt::Debug for WakeBatch<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("AtHand").finish_non_exhaustive()
+        f.debug_struct("WakeBatch").finish_non_exhaustive()
     }
 }
 
-impl Drop for AtHand<'_> {
+impl Drop for WakeBatch<'_> {
     fn drop(&mut self) {
         if self.is_inner {
             return;
@@ -204,18 +205,18 @@ impl Drop for AtHand<'_> {
     }
 }
 
-/// Waits for something in a task of the runtime, whose thread runs what that wakes at once, instead of in its turn.
+/// Awaits a future in a task of the runtime, whose thread runs the tasks that it wakes at once instead of in their
+/// turn.
 pub async fn poll_at_hand<T>(future: impl Future<Output = T>) -> T {
     let mut future = pin!(future);
     poll_fn(|cx| {
-        let _at_hand = AtHand::collect(None);
+        let _at_hand = WakeBatch::collect(None);
         future.as_mut().poll(cx)
     })
     .await
 }
 
-/// Waits for something on a thread outside of the runtime. What it has at hand is the runtime's from then on, unless nothing
-/// is to be waited for.
+/// Awaits a future on a thread outside of the runtime. Tasks of its batch go to the runtime before it blocks.
 pub fn block_on<T>(runtime: &Handle, future: impl Future<Output = T>) -> T {
     let mut future = pin!(future);
     {
@@ -234,7 +235,7 @@ fn hand_over(tasks: Option<VecDeque<Arc<Task>>>) {
     }
 }
 
-/// Tokio for quinn, whose tasks may be run by who wakes them.
+/// Tokio for quinn, with tasks that the waking thread may run.
 #[derive(Debug)]
 pub(crate) struct PromptRuntime;
 
@@ -259,8 +260,8 @@ impl Runtime for PromptRuntime {
     }
 }
 
-/// A timer that is put off without telling the runtime: a connection does so with each packet, and one that is put forward
-/// wakes a thread of the runtime.
+/// A timer that is postponed without telling the runtime: a connection postpones it with each packet, and an earlier
+/// time would wake a thread of the runtime.
 #[derive(Debug)]
 struct Timer {
     at: Instant,
@@ -306,7 +307,7 @@ mod tests {
         tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap()
     }
 
-    /// A task that notes who runs it after each ring of its bell, and has been run once.
+    /// Spawns a task that notes its thread after each ring of its bell, and has been run once.
     fn listening(runtime: &tokio::runtime::Runtime) -> (Arc<Notify>, Arc<Mutex<Vec<thread::ThreadId>>>) {
         let (bell, heard) = (Arc::new(Notify::new()), Arc::new(Mutex::new(Vec::new())));
         let (ring, note) = (bell.clone(), heard.clone());
@@ -323,13 +324,13 @@ mod tests {
     }
 
     #[test]
-    fn who_wakes_a_task_runs_it() {
+    fn the_waking_thread_runs_the_task() {
         // Nobody drives the runtime meanwhile.
         let runtime = runtime();
         let (bell, heard) = listening(&runtime);
         {
-            let _outer = AtHand::begin(runtime.handle());
-            let inner = AtHand::begin(runtime.handle());
+            let _outer = WakeBatch::begin(runtime.handle());
+            let inner = WakeBatch::begin(runtime.handle());
             bell.notify_one();
             drop(inner);
             assert!(heard.lock().unwrap().is_empty(), "not before the end");
@@ -355,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_at_hand_does_not_wait_for_who_waits() {
+    fn ready_tasks_do_not_wait_for_a_blocked_thread() {
         let runtime =
             tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
         let (bell, (answer, answered)) = (Arc::new(Notify::new()), oneshot::channel());
@@ -369,7 +370,7 @@ mod tests {
             });
         });
         has_begun.recv_timeout(PATIENCE).unwrap();
-        let _at_hand = AtHand::begin(runtime.handle());
+        let _at_hand = WakeBatch::begin(runtime.handle());
         bell.notify_one();
         block_on(runtime.handle(), async { timeout(PATIENCE, answered).await }).unwrap().unwrap();
     }
@@ -395,7 +396,7 @@ mod tests {
                 let (asked, waker, runtime) = (&asked, &waker, &runtime);
                 scope.spawn(move || {
                     for _ in 0..RINGS {
-                        let _at_hand = by_hand.then(|| AtHand::begin(runtime.handle()));
+                        let _at_hand = by_hand.then(|| WakeBatch::begin(runtime.handle()));
                         asked.fetch_add(1, Ordering::SeqCst);
                         let waker = waker.lock().unwrap().clone();
                         waker.into_iter().for_each(Waker::wake);
@@ -412,12 +413,12 @@ mod tests {
 
     #[test]
     fn a_runtime_that_ends_takes_its_tasks_along() {
-        struct Held(Mutex<Option<Waker>>);
+        struct WakerHolder(Mutex<Option<Waker>>);
         let runtime = runtime();
-        let held = Arc::new(Held(Mutex::new(None)));
-        let weak: Weak<Held> = Arc::downgrade(&held);
+        let held = Arc::new(WakerHolder(Mutex::new(None)));
+        let weak: Weak<WakerHolder> = Arc::downgrade(&held);
         runtime.block_on(async {
-            // It holds what holds its own waker.
+            // The task holds its own waker.
             spawn(poll_fn(move |cx| {
                 *held.0.lock().unwrap() = Some(cx.waker().clone());
                 Poll::Pending

@@ -1,4 +1,4 @@
-//! From a host to the first of its addresses that answers, the same for every transport.
+//! Connects to the first of a host's addresses that answers, the same for every transport.
 
 use std::future::Future;
 use std::net::SocketAddr;
@@ -12,10 +12,10 @@ use crate::url::LinkUrl;
 
 /// Most addresses of one host that are tried.
 pub(crate) const ADDRESSES_MAX: usize = 8;
-/// How long one address may be silent before the next is tried beside it (as in RFC 8305).
+/// Silence of one address after which the next is tried beside it (as in RFC 8305).
 const STAGGER: Duration = Duration::from_millis(300);
 
-/// Looks the host of a URL up; at least one address.
+/// Looks up the host of a URL. Returns at least one address.
 pub(crate) async fn resolve(url: &LinkUrl, patience: Duration) -> Result<Vec<SocketAddr>, DialError> {
     let lookup = tokio::net::lookup_host((url.host.as_str(), url.port));
     let late = || std::io::Error::new(std::io::ErrorKind::TimedOut, "the resolver does not answer");
@@ -54,7 +54,7 @@ where
         let has_more = rest.len() > 0;
         tokio::select! {
             Some(done) = racing.join_next() => match done {
-                // The others are dropped with the set, before any of them has become a link over there.
+                // The others are dropped with the set, before any of them has become a link at the far end.
                 Ok((address, Ok(connected))) => return Ok((address, connected)),
                 Ok((address, Err(error))) => failed.push((address, error)),
                 Err(error) => tracing::error!(%error, "an attempt to connect ended abnormally"),

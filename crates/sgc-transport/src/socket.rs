@@ -1,8 +1,8 @@
-//! UDP sockets, with the options that links may have.
+//! UDP sockets, with the options of links.
 //!
-//! Sending and receiving is quinn's wherever that will do. A link that is marked (DSCP) or goes without offloads has a socket
-//! that does so datagram by datagram: quinn's way writes the whole type-of-service byte of each datagram for the sake of ECN,
-//! and has the kernel join what it receives.
+//! Quinn sends and receives wherever that will do. A link that is marked (DSCP) or goes without offloads has a socket
+//! that works datagram by datagram: quinn writes the whole type-of-service byte of each datagram for ECN, and lets the
+//! kernel join received datagrams.
 
 use std::future::Future;
 use std::io::{self, IoSliceMut};
@@ -20,12 +20,12 @@ use tokio::io::unix::AsyncFd;
 
 use crate::options::LinkOptions;
 
-/// What is asked of the system for each direction, bytes; it may give less (`net.core.rmem_max`, `wmem_max`).
+/// Requested buffer for each direction, bytes; the system may give less (`net.core.rmem_max`, `wmem_max`).
 const BUFFER_BYTES: usize = 4 << 20;
 /// The greatest code point of differentiated services (RFC 2474).
 pub(crate) const DSCP_MAX: u8 = 63;
 
-/// The address that stands for every interface and any port, of the family of this one.
+/// Returns the address of every interface and any port, of the same family.
 pub(crate) fn any_like(remote: SocketAddr) -> SocketAddr {
     match remote {
         SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
@@ -43,7 +43,7 @@ pub(crate) fn bind(
         // A system without IPv4 has nothing to share.
         let _ = socket.set_only_v6(false);
     }
-    // What the system does not give, it does not give.
+    // A smaller buffer is logged and used.
     if socket.recv_buffer_size().unwrap_or(0) < BUFFER_BYTES {
         let _ = socket.set_recv_buffer_size(BUFFER_BYTES);
     }
@@ -64,7 +64,7 @@ pub(crate) fn bind(
     Ok((socket, local))
 }
 
-/// Marks what a socket sends, in both families if it is of both.
+/// Marks the datagrams of a socket, in both families if it serves both.
 pub(crate) fn mark(socket: &SockRef<'_>, is_ipv6: bool, dscp: u8) -> io::Result<()> {
     if dscp > DSCP_MAX {
         return Err(io::Error::new(io::ErrorKind::InvalidInput, "a DSCP is at most 63"));
@@ -80,8 +80,8 @@ pub(crate) fn mark(socket: &SockRef<'_>, is_ipv6: bool, dscp: u8) -> io::Result<
     }
 }
 
-/// One datagram at a time: no segmentation or receive offload, no ECN, the source address is the system's choice, and no
-/// MTU discovery.
+/// A socket for one datagram at a time: no segmentation or receive offload, no ECN, the system's choice of source
+/// address, and no MTU discovery.
 #[derive(Debug)]
 struct PlainSocket {
     io: tokio::net::UdpSocket,
@@ -97,7 +97,7 @@ impl AsyncUdpSocket for PlainSocket {
         for datagram in transmit.contents.chunks(size) {
             match self.io.try_send_to(datagram, transmit.destination) {
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Err(error),
-                // Everything else is a datagram lost, as in quinn's own socket: the path may come back.
+                // As in quinn's own socket, any other error is a lost datagram: the path may come back.
                 Err(error) => tracing::trace!(%error, destination = %transmit.destination, "not sent"),
                 Ok(_) => {}
             }
@@ -118,7 +118,7 @@ impl AsyncUdpSocket for PlainSocket {
                 match self.io.try_recv_from(buf) {
                     Ok((len, addr)) => *meta = RecvMeta { addr, len, stride: len, ecn: None, dst_ip: None },
                     Err(error) if error.kind() == io::ErrorKind::WouldBlock || count > 0 => break,
-                    // A datagram of ours that nobody took says so here; it is no end of the socket.
+                    // The error reports an earlier datagram that nobody took; the socket lives on.
                     Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => break,
                     Err(error) => return Poll::Ready(Err(error)),
                 }
@@ -133,8 +133,8 @@ impl AsyncUdpSocket for PlainSocket {
     }
 }
 
-/// Quinn's sending and receiving, with offloads, on a socket of which the runtime is told only that something came. It would
-/// hear of room, too, after each datagram that left, and wake a thread for it.
+/// Quinn's sending and receiving, with offloads, on a socket whose runtime hears of received datagrams only. Otherwise
+/// it would hear of room after each datagram that left, and wake a thread for it.
 #[derive(Debug)]
 struct BatchSocket {
     io: AsyncFd<std::net::UdpSocket>,
@@ -151,7 +151,7 @@ impl BatchSocket {
     }
 }
 
-/// Has the runtime told of one direction of a socket only.
+/// Registers a socket with the runtime for one direction only.
 #[expect(
     deprecated,
     reason = "what replaces it is unsafe, for descriptors that close early; this one is the socket's own"
@@ -205,7 +205,7 @@ impl AsyncUdpSocket for BatchSocket {
     }
 }
 
-/// Waits until a socket takes more, if it took no more.
+/// Waits until a socket takes more, if it was full.
 struct Room {
     socket: Arc<BatchSocket>,
     waiting: Option<Waiting>,
@@ -225,7 +225,7 @@ impl UdpPoller for Room {
         }
         let future = waiting.get_or_insert_with(|| {
             let socket = Arc::clone(socket);
-            // Registered for as long as it is waited for. What was room before that is reported, too.
+            // Registered only while somebody waits. Earlier room is reported, too.
             Box::pin(async move {
                 let room = watch(socket.io.get_ref().try_clone()?, Interest::WRITABLE)?;
                 room.writable().await.map(drop)
@@ -285,7 +285,7 @@ mod tests {
         let (from, to) = (new(), new());
         let destination = to.local_addr().unwrap();
         let mut room = from.clone().create_io_poller();
-        // As if the last had found none.
+        // As if the last datagram had found no room.
         from.is_full.store(true, Ordering::Relaxed);
         timeout(PATIENCE, poll_fn(|cx| room.as_mut().poll_writable(cx))).await.unwrap().unwrap();
         let contents = [7; 3 * 1000];

@@ -11,10 +11,10 @@ use rustls::sign::SingleCertAndKey;
 
 use crate::credentials::CredentialStore;
 use crate::options::LinkOptions;
-use verifier::{Anyone, PeerVerifier, Presenter};
+use verifier::{AcceptAnyCertificate, ListenerCertResolver, PeerVerifier};
 pub(crate) use verifier::{Findings, alert, judge};
 
-/// What web proxies expect to find in TLS.
+/// Application protocol that web proxies expect in TLS.
 const HTTP_ALPN: &[u8] = b"http/1.1";
 
 static CLASSICAL: LazyLock<Arc<CryptoProvider>> =
@@ -26,13 +26,14 @@ fn provider_with(kx_groups: Vec<&'static dyn SupportedKxGroup>) -> Arc<CryptoPro
     Arc::new(CryptoProvider { kx_groups, ..rustls::crypto::aws_lc_rs::default_provider() })
 }
 
-/// A node that does not require post-quantum key exchange still has it, second: so a fleet can be switched node by node,
-/// and one that has not been reached yet is not locked out by those that have.
+/// A node that does not require post-quantum key exchange still offers it, second: so a fleet can be switched node by
+/// node, and switched nodes do not lock out the others.
 fn provider(post_quantum: bool) -> &'static Arc<CryptoProvider> {
     if post_quantum { &POST_QUANTUM } else { &CLASSICAL }
 }
 
-/// For one incoming connection that speaks this application protocol (RFC 7301), with a verdict of its own.
+/// Returns the configuration for one incoming connection with this application protocol (RFC 7301), with a verdict of
+/// its own.
 pub(crate) fn server(
     credentials: &CredentialStore,
     options: &LinkOptions,
@@ -42,7 +43,7 @@ pub(crate) fn server(
     let post_quantum = options.post_quantum || identity.post_quantum();
     let provider = provider(post_quantum);
     let (verifier, findings) = PeerVerifier::new(credentials, provider, post_quantum);
-    let presenter = Presenter {
+    let presenter = ListenerCertResolver {
         key: identity.certified_key(),
         accepted: provider.kx_groups.iter().map(|g| g.name()).collect(),
         findings: Arc::clone(&findings),
@@ -60,7 +61,7 @@ pub(crate) fn server(
     (tls, findings)
 }
 
-/// For one outgoing connection that speaks this application protocol, with a verdict of its own.
+/// Returns the configuration for one outgoing connection with this application protocol, with a verdict of its own.
 pub(crate) fn client(
     credentials: &CredentialStore,
     options: &LinkOptions,
@@ -80,13 +81,13 @@ pub(crate) fn client(
     tls.alpn_protocols = vec![alpn.to_vec()];
     tls.resumption = rustls::client::Resumption::disabled();
     tls.enable_early_data = false;
-    // No one routes by it, and it would tell the network where a node thinks it is going.
+    // No node routes by the server name, and it would reveal the dialled node to the network.
     tls.enable_sni = false;
     (tls, findings)
 }
 
-/// For the TLS around WebSocket, which a web proxy may end in this node's place: it hides what passes from who looks on,
-/// and proves nothing to either end.
+/// Returns the configuration for the TLS around WebSocket, which a web proxy may end in this node's place. It hides the
+/// traffic from onlookers and proves nothing to either end.
 pub(crate) fn outer_server(credentials: &CredentialStore) -> rustls::ServerConfig {
     let key = SingleCertAndKey::from(credentials.identity().certified_key());
     let mut tls = rustls::ServerConfig::builder_with_provider(Arc::clone(&CLASSICAL))
@@ -100,14 +101,14 @@ pub(crate) fn outer_server(credentials: &CredentialStore) -> rustls::ServerConfi
     tls
 }
 
-/// The other end of [`outer_server`], or of a web proxy's. Whoever it is, the nodes' own TLS is within. It names the host,
-/// since web proxies choose by that.
+/// Returns the configuration for the other end of [`outer_server`], or of a web proxy's. It authenticates nobody,
+/// because the nodes' own TLS is within. It names the host, because web proxies choose by the name.
 pub(crate) fn outer_client() -> rustls::ClientConfig {
     let mut tls = rustls::ClientConfig::builder_with_provider(Arc::clone(&CLASSICAL))
         .with_protocol_versions(&[&rustls::version::TLS13])
         .expect("the provider has cipher suites of TLS 1.3")
         .dangerous()
-        .with_custom_certificate_verifier(Arc::new(Anyone::new(&CLASSICAL)))
+        .with_custom_certificate_verifier(Arc::new(AcceptAnyCertificate::new(&CLASSICAL)))
         .with_no_client_auth();
     tls.alpn_protocols = vec![HTTP_ALPN.to_vec()];
     tls.resumption = rustls::client::Resumption::disabled();

@@ -1,15 +1,16 @@
-//! Where links lead and where they are awaited: `quic://router.example:7447`, `wss://router.example/sgc`, `quic://[::]:7447`.
+//! URLs to dial and addresses to listen on: `quic://router.example:7447`, `wss://router.example/sgc`,
+//! `quic://[::]:7447`.
 //!
-//! It parses and prints; host names are resolved when a link is dialled.
+//! This module parses and prints. Host names are resolved when a link is dialled.
 
 use std::fmt;
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 use std::str::FromStr;
 
-/// The port where none is given, except for those of the web.
+/// Default port, except for WebSocket.
 pub const DEFAULT_PORT: u16 = 7447;
 
-/// The path of WebSocket where none is given.
+/// Default path of WebSocket.
 pub const DEFAULT_PATH: &str = "/sgc";
 
 /// The greatest cost that can be set, milliseconds of round trip.
@@ -25,15 +26,15 @@ pub enum Scheme {
     Quic,
     /// QUIC inside of DTLS 1.2 or 1.3 (RFC 6347, RFC 9147) over UDP.
     Dtls,
-    /// QUIC over UDP whose packets are authenticated and can be read by everyone.
+    /// QUIC over UDP with authenticated packets that everyone can read.
     Udp,
     /// TLS 1.3 (RFC 8446) over TCP.
     Tls,
-    /// TCP whose records are authenticated and can be read by everyone, once both ends have proven who they are.
+    /// TCP with authenticated records that everyone can read, after both ends have proven their identity.
     Tcp,
     /// WebSocket (RFC 6455) over TCP, with TLS inside.
     Ws,
-    /// The same over TLS.
+    /// WebSocket over TLS, with TLS inside.
     Wss,
 }
 
@@ -51,7 +52,7 @@ impl Scheme {
         }
     }
 
-    /// The port where none is given.
+    /// Returns the default port.
     pub fn default_port(self) -> u16 {
         match self {
             Self::Ws => 80,
@@ -60,7 +61,7 @@ impl Scheme {
         }
     }
 
-    /// Returns `true` if what a link says can be read by everyone on its way; payloads of topics are sealed all the same.
+    /// Returns `true` if everyone on the way can read the link's traffic; payloads of topics are sealed all the same.
     pub fn is_readable(self) -> bool {
         matches!(self, Self::Udp | Self::Tcp)
     }
@@ -84,18 +85,18 @@ impl fmt::Display for Scheme {
     }
 }
 
-/// Where to dial.
+/// The URL of a node to dial.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct LinkUrl {
-    /// By which transport.
+    /// The transport.
     pub scheme: Scheme,
     /// Host name or IP address, an IPv6 address without brackets.
     pub host: String,
     /// Port.
     pub port: u16,
-    /// Of WebSocket, where it is another than [`DEFAULT_PATH`].
+    /// Path of WebSocket, unless it is [`DEFAULT_PATH`].
     pub path: Option<String>,
-    /// What the link is to cost where ways are weighed, milliseconds of round trip; measured if not given.
+    /// Cost of the link in routing, milliseconds of round trip; measured if absent.
     pub cost_ms: Option<u32>,
 }
 
@@ -121,12 +122,12 @@ impl FromStr for LinkUrl {
 }
 
 impl LinkUrl {
-    /// What WebSocket asks for.
+    /// Returns the path that WebSocket requests.
     pub fn path(&self) -> &str {
         self.path.as_deref().unwrap_or(DEFAULT_PATH)
     }
 
-    /// Host and port, as they stand in a URL.
+    /// Returns host and port as a URL has them.
     pub(crate) fn authority(&self) -> String {
         if self.host.contains(':') {
             format!("[{}]:{}", self.host, self.port)
@@ -143,24 +144,24 @@ impl fmt::Display for LinkUrl {
     }
 }
 
-/// Where to listen.
+/// The address to listen on.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ListenAddr {
-    /// For which transport.
+    /// The transport.
     pub scheme: Scheme,
     /// The address to bind: `[::]` for every interface, IPv4 and IPv6 alike. Port 0 lets the system choose.
     pub addr: SocketAddr,
-    /// Of WebSocket, where it is another than [`DEFAULT_PATH`].
+    /// Path of WebSocket, unless it is [`DEFAULT_PATH`].
     pub path: Option<String>,
 }
 
 impl ListenAddr {
-    /// The address for this transport, with what is default of the rest.
+    /// Returns the address for this transport, with defaults for the rest.
     pub fn new(scheme: Scheme, addr: SocketAddr) -> Self {
         Self { scheme, addr, path: None }
     }
 
-    /// What WebSocket is to be asked for.
+    /// Returns the path that WebSocket requests have to name.
     pub fn path(&self) -> &str {
         self.path.as_deref().unwrap_or(DEFAULT_PATH)
     }
@@ -185,7 +186,7 @@ impl fmt::Display for ListenAddr {
     }
 }
 
-/// Why a text is no URL of a link.
+/// The reason why a text is no URL of a link.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum UrlError {
     /// There is no scheme.
@@ -194,27 +195,27 @@ pub enum UrlError {
     /// No transport of that name is known.
     #[error("{0}:// is not known: quic, dtls, udp, tls, tcp, ws and wss are")]
     SchemeUnknown(String),
-    /// The host is none.
+    /// Invalid host.
     #[error("{0:?} is neither a host name nor an IP address (IPv6 is written in brackets)")]
     Host(String),
     /// Only addresses can be listened on.
     #[error("{0:?} is no IP address to listen on: [::] and 0.0.0.0 stand for every interface")]
     NotAnAddress(String),
-    /// The port is none.
+    /// Invalid port.
     #[error("{0:?} is not a port number")]
     Port(String),
-    /// A cost that is not one.
+    /// Invalid cost.
     #[error("{0:?} is no cost of a link: write ?cost=20ms, 1 to {COST_MS_MAX} ms")]
     Cost(String),
-    /// The path is none.
+    /// Invalid path.
     #[error("{0:?} is no path: write wss://HOST/PATH, at most {PATH_BYTES_MAX} letters, digits and /._~-")]
     Path(String),
-    /// Something follows.
+    /// Text after the end.
     #[error("{0:?} does not belong into the address of a link")]
     Trailing(String),
 }
 
-/// Milliseconds, as in `20ms`.
+/// Parses milliseconds, as in `20ms`.
 fn cost_ms(text: &str) -> Result<u32, UrlError> {
     let number = text.strip_suffix("ms").and_then(|number| number.parse().ok());
     number
@@ -262,7 +263,7 @@ fn split(text: &str) -> Result<(Scheme, &str, u16, Option<String>), UrlError> {
     Ok((scheme, host, port, path))
 }
 
-/// A path, if it is another than the default.
+/// Returns a path unless it is the default.
 fn path_of(path: &str) -> Result<Option<String>, UrlError> {
     let is_in_paths = |b: u8| b.is_ascii_alphanumeric() || b"/._~-".contains(&b);
     if path.len() > PATH_BYTES_MAX || !path.bytes().all(is_in_paths) {

@@ -1,5 +1,4 @@
-//! How often a link allocates for a packet that it sends and receives, besides what QUIC does by itself in its own tasks.
-//! `-- --nocapture` prints both.
+//! Allocations of a link for each packet that it sends and receives, besides those of QUIC in its own tasks.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 #![allow(clippy::print_stderr, reason = "what was counted is of use")]
 
@@ -32,15 +31,15 @@ async fn linked() -> (Dialer, Server, AnyLink, AnyLink) {
     (dialer, server, near, far)
 }
 
-/// For each packet: what sending and receiving it allocated, and what all did.
-struct Counted {
+/// Allocations for each packet: in sending, in receiving, and in all.
+struct AllocationCounts {
     sent: f64,
     received: f64,
     all: f64,
 }
 
-impl Counted {
-    fn of(what: &str, [sent, received]: [usize; 2], before: Allocations) -> Self {
+impl AllocationCounts {
+    fn report(what: &str, [sent, received]: [usize; 2], before: Allocations) -> Self {
         let each = |count: usize| count as f64 / PACKETS as f64;
         let all = allocated_here().count - before.count;
         let counted = Self { sent: each(sent), received: each(received), all: each(all) };
@@ -57,7 +56,7 @@ fn shared(bytes: usize) -> impl Fn(u64) -> Packet {
     move |seq| packet(seq, first.slice(..payload.len()))
 }
 
-async fn by_flow(bytes: usize) -> Counted {
+async fn by_flow(bytes: usize) -> AllocationCounts {
     let (_dialer, _server, near, far) = linked().await;
     let packet = shared(bytes);
     let mut out = near.open_flow(sgc_wire::Class::Default).await.unwrap();
@@ -76,10 +75,10 @@ async fn by_flow(bytes: usize) -> Counted {
         assert_eq!(result.unwrap().unwrap().header.seq, seq);
         counts = [counts[0] + sent.count, counts[1] + received.count];
     }
-    Counted::of(&format!("{bytes} bytes in a flow"), counts, before)
+    AllocationCounts::report(&format!("{bytes} bytes in a flow"), counts, before)
 }
 
-async fn by_datagram(bytes: usize) -> Counted {
+async fn by_datagram(bytes: usize) -> AllocationCounts {
     let (_dialer, _server, near, far) = linked().await;
     let packet = shared(bytes);
     let (mut counts, mut before) = ([0, 0], Allocations::default());
@@ -94,7 +93,7 @@ async fn by_datagram(bytes: usize) -> Counted {
         assert_eq!(result.unwrap().unwrap().header.seq, seq);
         counts = [counts[0] + sent.count, counts[1] + received.count];
     }
-    Counted::of(&format!("{bytes} bytes in a datagram"), counts, before)
+    AllocationCounts::report(&format!("{bytes} bytes in a datagram"), counts, before)
 }
 
 #[tokio::test]

@@ -1,4 +1,4 @@
-//! What every transport does for its users, over loopback: one suite, run for each scheme.
+//! The promises of every transport to its users, over loopback: one suite, run for each scheme.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 #[macro_use]
@@ -26,7 +26,7 @@ each_transport! {
         control_frames_go_both_ways_in_order
         thirteen_megabytes_arrive_intact_and_in_order
         flows_do_not_wait_for_each_other
-        what_is_queued_leaves_together_and_in_order
+        queued_packets_leave_together_and_in_order
         a_flow_given_up_inside_of_a_packet_does_not_pass_for_finished
         either_end_can_end_a_flow
         datagrams_carry_small_packets
@@ -39,7 +39,7 @@ each_transport! {
     ]: quic udp dtls tls tcp ws wss
 }
 
-/// The kernel ends the connections of a program that was killed, and answers where nobody listens.
+/// The kernel ends the connections of a killed program, and refuses connections where nobody listens.
 fn is_tcp(scheme: &str) -> bool {
     matches!(scheme, "tls" | "tcp" | "ws" | "wss")
 }
@@ -57,7 +57,7 @@ async fn both_ends_know_each_other(scheme: &str) {
     assert_eq!(near.remote(), server.addr);
     assert!(near.is_dialer() && !far.is_dialer());
     assert!(near.stats().mtu_bytes >= 1200 && far.stats().received_bytes > 0);
-    // Known at once: ways are weighed by it as soon as there is a link.
+    // Known at once: routing weighs the link as soon as it exists.
     assert!([&near, &far].iter().all(|link| !link.stats().rtt.is_zero()));
     assert_eq!((metrics.dialed(), server.metrics.accepted()), (1, 1));
     assert_eq!(server.metrics.handshakes_pending(), 0);
@@ -228,7 +228,7 @@ async fn flows_do_not_wait_for_each_other(scheme: &str) {
     let mut first = soon(far.accept_flow()).await.unwrap();
     let mut second = soon(far.accept_flow()).await.unwrap();
     assert_eq!(soon(second.recv()).await.unwrap().unwrap().header.seq, 7);
-    // The send that was given up left the flow whole: what it had begun comes first.
+    // The cancelled send left the flow whole: its packet comes first.
     let last = packet(2, Bytes::from_static(b"last"));
     let finish = async {
         stuck.send(&last).await.unwrap();
@@ -249,7 +249,7 @@ async fn flows_do_not_wait_for_each_other(scheme: &str) {
     assert!(count >= 2, "{count}");
 }
 
-async fn what_is_queued_leaves_together_and_in_order(scheme: &str) {
+async fn queued_packets_leave_together_and_in_order(scheme: &str) {
     let (near, far) = pair_on(scheme, LinkOptions::default()).await;
     let sizes = [0, 1, 100, 2048, 2049, 3, 16 << 10, 5];
     let of = |seq: usize| packet(seq as u64, Bytes::from(vec![seq as u8; sizes[seq % sizes.len()]]));
@@ -265,7 +265,7 @@ async fn what_is_queued_leaves_together_and_in_order(scheme: &str) {
         }
         assert_eq!(tx.queued_bytes(), 0);
     }
-    // What is queued at the end belongs to it.
+    // Queued packets at the end belong to the flow.
     tx.finish().await.unwrap();
     let mut rx = soon(far.accept_flow()).await.unwrap();
     let mut seqs = Vec::new();
@@ -462,7 +462,7 @@ async fn a_dead_peer_is_noticed_and_a_restarted_one_at_once(scheme: &str) {
     let second = runtime();
     let _restarted = listen(&second, &url);
     let error = soon(link.closed()).await;
-    // What the kernel says of a connection whose program is gone does not tell whether another took its place.
+    // The kernel's error for a connection whose program is gone does not tell whether another took its place.
     if is_tcp(scheme) {
         assert!(matches!(error, LinkError::Cut), "{error}");
         return second.shutdown_background();

@@ -17,14 +17,14 @@ use tokio::net::{TcpSocket, TcpStream};
 
 /// Places of the listeners below.
 const PLACES: usize = 12;
-/// Of these, for one address.
+/// Places for one address.
 const PLACES_PER_ADDRESS: usize = 4;
 /// More handshakes than there are places.
 const FLOOD: usize = 20;
 
 /// A handshake that its peer keeps open.
 #[allow(dead_code, reason = "they are held, not used")]
-enum Stalled {
+enum StalledHandshake {
     Tcp(TcpStream),
     Udp(UdpSocket),
     Quic(Endpoint, Option<quinn::Connection>),
@@ -35,8 +35,14 @@ fn attacker(host: u8) -> SocketAddr {
     SocketAddr::new(IpAddr::V4(Ipv4Addr::new(127, 0, 0, 1 + host)), 0)
 }
 
-/// Begins a handshake from this address, as far as makes it count as engaged, and leaves it there.
-async fn stall(scheme: &str, server: &Server, member: &Identity, from: SocketAddr, number: u32) -> Stalled {
+/// Begins a handshake from this address until it counts as engaged, and leaves it there.
+async fn stall(
+    scheme: &str,
+    server: &Server,
+    member: &Identity,
+    from: SocketAddr,
+    number: u32,
+) -> StalledHandshake {
     match scheme {
         "quic" | "udp" => {
             let alpn = if scheme == "udp" { "sgc-udp/1" } else { "sgc/1" };
@@ -46,21 +52,21 @@ async fn stall(scheme: &str, server: &Server, member: &Identity, from: SocketAdd
             let connecting = endpoint.connect_with(config, server.addr, "x.invalid").unwrap();
             // A refusal is an answer, too.
             let connection = soon(connecting).await.ok();
-            Stalled::Quic(endpoint, connection)
+            StalledHandshake::Quic(endpoint, connection)
         }
         "dtls" => {
             let socket = UdpSocket::bind(from).unwrap();
             prove_and_stall(&socket, server.addr, number);
-            Stalled::Udp(socket)
+            StalledHandshake::Udp(socket)
         }
         _ => {
             let socket = TcpSocket::new_v4().unwrap();
             socket.bind(from).unwrap();
             let mut tcp = soon(socket.connect(server.addr)).await.unwrap();
             let start: &[u8] = if scheme == "ws" { b"GET /sgc" } else { &[22, 3, 1] };
-            // It may be turned away already.
+            // The peer may have been turned away already.
             let _ = tcp.write_all(start).await;
-            Stalled::Tcp(tcp)
+            StalledHandshake::Tcp(tcp)
         }
     }
 }
@@ -75,7 +81,7 @@ fn crowded_listener(scheme: &str, fleet: &sgc_trust::Fleet) -> Server {
         ..LinkOptions::default()
     };
     let mut server = Server::start_on(scheme, enroll(fleet, "router"), options);
-    // Refusals are for the counters here.
+    // Only the counters of refusals matter here.
     let mut results = std::mem::replace(&mut server.results, tokio::sync::mpsc::channel(1).1);
     tokio::spawn(async move {
         // A link that is dropped says goodbye, perhaps before its dialer has returned.
@@ -96,8 +102,8 @@ async fn wait_for_pending(server: &Server, least: u64) {
     .await;
 }
 
-/// Whatever one host does, it holds its share of the places and no more, and others connect.
-async fn one_address_that_stalls_keeps_nobody_else_out(scheme: &str) {
+/// One host holds at most its share of the places, and others connect.
+async fn a_stalling_address_keeps_nobody_else_out(scheme: &str) {
     let fleet = fleet(1);
     let arm = enroll(&fleet, "arm-1");
     let server = crowded_listener(scheme, &fleet);
@@ -140,10 +146,10 @@ async fn a_few_addresses_that_take_all_places_make_room_for_another(scheme: &str
     assert!(server.metrics.refused(RefusalKind::TooMany) >= 1, "one of theirs gave way");
 }
 
-/// Time without progress after which the far end takes no more.
+/// Time without progress after which the far end is full.
 const STUCK: Duration = Duration::from_millis(500);
 
-/// However many peers send and are not read, the node holds what its budget says.
+/// However many peers send without being read, the node holds no more than its budget.
 async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
     const LINKS: u64 = 12;
     const BUDGET_BYTES: u64 = 8 << 20;
@@ -152,7 +158,7 @@ async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
     let receive_budget = ReceiveBudget::new(BUDGET_BYTES);
     let options = LinkOptions { receive_budget: receive_budget.clone(), ..LinkOptions::default() };
     let mut server = Server::start_on(scheme, enroll(&fleet, "router"), options);
-    // Bytes that they have under way count as received here: so they are few.
+    // Bytes in flight count as received here, so there are few.
     let sends = LinkOptions { send_window_bytes: 64 << 10, ..LinkOptions::default() };
     let dialer = Dialer::new(arm, sends, Default::default());
     let (mut links, mut senders) = (Vec::new(), tokio::task::JoinSet::new());
@@ -161,7 +167,7 @@ async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
         let far = server.link().await;
         let sender = near.clone();
         senders.spawn(async move {
-            // Two flows fill what a link may have, since one may have half.
+            // Two flows fill the window of a link, because one may have half.
             let mut taken = 0;
             for _ in 0..2 {
                 let mut flow = sender.open_flow(sgc_wire::Class::Default).await.unwrap();
@@ -183,7 +189,7 @@ async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
     let granted = receive_budget.granted_bytes();
     // 8 + 4 + 2.7 + 2 + 1.6 + 1.3 + 1.1 + 5 · 1 MiB.
     assert!(granted < 27 << 20, "{granted} bytes granted");
-    // Bytes that wait at the senders are theirs: those under way, and the queue of each flow.
+    // Bytes that wait at the senders count for them: those in flight, and the queue of each flow.
     let waiting = LINKS * (1 << 20);
     assert!(taken <= granted + waiting, "{taken} bytes taken of {granted} granted");
     drop((links, dialer));
@@ -198,7 +204,7 @@ async fn links_that_nobody_reads_share_one_budget(scheme: &str) {
 each_transport! {
     [
         links_that_nobody_reads_share_one_budget
-        one_address_that_stalls_keeps_nobody_else_out
+        a_stalling_address_keeps_nobody_else_out
         a_few_addresses_that_take_all_places_make_room_for_another
     ]: quic dtls udp tls tcp ws wss
 }

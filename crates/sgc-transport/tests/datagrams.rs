@@ -22,7 +22,7 @@ each_transport! {
         large_messages_survive_loss_and_reordering
         links_are_made_through_loss
         a_path_of_1280_bytes_is_wide_enough
-        what_is_altered_on_the_way_is_dropped
+        altered_datagrams_are_dropped
         links_without_offloads_and_with_marks_work
     ]: quic udp dtls
 }
@@ -33,7 +33,7 @@ fn image(bytes: u32) -> Bytes {
     (0..bytes).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect()
 }
 
-/// A link through a relay, which is fair at first.
+/// Makes a link through a relay, which is fair at first.
 async fn relayed(scheme: &str, options: LinkOptions) -> (Dialer, AnyLink, AnyLink, Relay) {
     let fleet = fleet(1);
     let mut server = Server::start_on(scheme, enroll(&fleet, "router"), options.clone());
@@ -85,7 +85,7 @@ async fn a_nat_that_changes_its_port_costs_nothing(scheme: &str) {
     says(&near, &far, "there").await;
     says(&far, &near, "and back").await;
     moved(&far, before).await;
-    // The other way round: the listener sends, and only the dialer's acknowledgements tell of its address.
+    // In the other direction: the listener sends, and only the dialer's acknowledgements show its address.
     let before = far.remote();
     flow_with(&far, &near, image(3_000_000), async || relay.change_port()).await;
     moved(&far, before).await;
@@ -105,13 +105,13 @@ async fn a_dialer_that_moves_keeps_its_links(scheme: &str) {
         says(&near, &far, "control").await;
     }
     assert_eq!(server.metrics.accepted(), 1);
-    // An idle link moves, too, and at once: not only with what is sent on it next.
+    // An idle link moves, too, and at once: not only with its next packet.
     let before = far.remote();
     dialer.rebind().unwrap();
     moved(&far, before).await;
 }
 
-/// Waits until the peer is seen elsewhere.
+/// Waits until the peer has another address.
 async fn moved(link: &AnyLink, before: SocketAddr) {
     soon(async {
         while link.remote() == before {
@@ -124,8 +124,8 @@ async fn moved(link: &AnyLink, before: SocketAddr) {
 async fn large_messages_survive_loss_and_reordering(scheme: &str) {
     let (_dialer, near, far, relay) = relayed(scheme, LinkOptions::default()).await;
     for (loss, reorder) in [(0, 0), (10, 20), (50, 50)] {
-        relay.weather.loss.store(loss, Relaxed);
-        relay.weather.reorder.store(reorder, Relaxed);
+        relay.impairment.loss.store(loss, Relaxed);
+        relay.impairment.reorder.store(reorder, Relaxed);
         flow_with(&near, &far, image(13_000_000), async || {}).await;
     }
 }
@@ -138,8 +138,8 @@ async fn links_are_made_through_loss(scheme: &str) {
     let dialer = Dialer::new(enroll(&fleet, "arm-1"), options, Default::default());
     for seed in 0..4 {
         let relay = Relay::start(server.addr, seed).await;
-        relay.weather.loss.store(150, Relaxed);
-        relay.weather.reorder.store(100, Relaxed);
+        relay.impairment.loss.store(150, Relaxed);
+        relay.impairment.reorder.store(100, Relaxed);
         let url = format!("{scheme}://{}", relay.addr).parse().unwrap();
         let near = soon(dialer.dial(&url)).await.unwrap();
         let far = server.link().await;
@@ -152,8 +152,8 @@ async fn a_path_of_1280_bytes_is_wide_enough(scheme: &str) {
     let fleet = fleet(1);
     let mut server = Server::start_on(scheme, enroll(&fleet, "router"), LinkOptions::default());
     let relay = Relay::start(server.addr, 5).await;
-    // What IPv6 and UDP leave of it.
-    relay.weather.longest.store(1232, Relaxed);
+    // The path's MTU less the headers of IPv6 and UDP.
+    relay.impairment.longest.store(1232, Relaxed);
     let dialer = dialer(enroll(&fleet, "arm-1"));
     let url = format!("{scheme}://{}", relay.addr).parse().unwrap();
     let near = soon(dialer.dial(&url)).await.unwrap();
@@ -163,17 +163,17 @@ async fn a_path_of_1280_bytes_is_wide_enough(scheme: &str) {
     assert!(near.stats().mtu_bytes <= 1232 && far.stats().mtu_bytes <= 1232);
 }
 
-async fn what_is_altered_on_the_way_is_dropped(scheme: &str) {
-    // Nothing else that is as long is to be on the way.
+async fn altered_datagrams_are_dropped(scheme: &str) {
+    // No other packet of this length should be on the way.
     let options = LinkOptions { mtu_discovery: false, ..LinkOptions::default() };
     let (_dialer, near, far, relay) = relayed(scheme, options).await;
-    relay.weather.tap.store(true, Relaxed);
-    relay.weather.flip.store(true, Relaxed);
+    relay.impairment.tap.store(true, Relaxed);
+    relay.impairment.flip.store(true, Relaxed);
     let payload = Bytes::from("visible on the wire ".repeat(40));
     let sent = packet(5, payload.clone());
     far.send_datagram(&sent).await.unwrap();
     soon(async {
-        while relay.weather.flipped.load(Relaxed) == 0 {
+        while relay.impairment.flipped.load(Relaxed) == 0 {
             tokio::time::sleep(std::time::Duration::from_millis(1)).await;
         }
     })
@@ -182,7 +182,7 @@ async fn what_is_altered_on_the_way_is_dropped(scheme: &str) {
     let second = packet(6, payload.clone());
     far.send_datagram(&second).await.unwrap();
     assert_eq!(soon(near.recv_datagram()).await.unwrap().unwrap().header.seq, 6);
-    let seen = relay.weather.seen.lock().unwrap();
+    let seen = relay.impairment.seen.lock().unwrap();
     let is_visible = seen.iter().any(|d| d.windows(40).any(|w| w == &payload[..40]));
     assert_eq!(is_visible, scheme == "udp");
 }

@@ -1,4 +1,4 @@
-//! DTLS beside ours: `openssl`, floods of hellos, keys that DTLS cannot use.
+//! DTLS with other implementations: `openssl`, floods of hellos, keys that DTLS cannot use.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 #[path = "support/openssl.rs"]
@@ -20,13 +20,13 @@ use sgc_trust::{CertError, Identity};
 use support::*;
 use tokio::io::{AsyncBufReadExt as _, AsyncRead, AsyncWriteExt as _, BufReader};
 
-/// The identity's parts in the form that `openssl` reads, in a directory that goes with it.
+/// The identity's parts in the form that `openssl` reads, in a directory that is removed with it.
 struct Files {
     dir: PathBuf,
 }
 
 impl Files {
-    fn of(identity: &Identity, name: &str) -> Self {
+    fn write(identity: &Identity, name: &str) -> Self {
         let dir = std::env::temp_dir().join(format!("sgc-dtls-{}-{name}", std::process::id()));
         std::fs::create_dir_all(&dir).unwrap();
         std::fs::write(
@@ -50,7 +50,7 @@ impl Drop for Files {
     }
 }
 
-/// Reads lines until one has this in it, and returns what came.
+/// Reads lines until one contains this text, and returns them.
 async fn until(lines: &mut tokio::io::Lines<BufReader<impl AsyncRead + Unpin>>, wanted: &str) -> String {
     let mut seen = String::new();
     let patience = Duration::from_secs(10);
@@ -69,7 +69,7 @@ async fn openssl_connects_with_certificates_of_both_sides() {
     let fleet = fleet(1);
     let options = LinkOptions { handshake_timeout: Duration::from_millis(1500), ..LinkOptions::default() };
     let mut server = Server::start_on("dtls", enroll(&fleet, "router"), options);
-    let files = Files::of(&enroll(&fleet, "arm-1"), "client");
+    let files = Files::write(&enroll(&fleet, "arm-1"), "client");
     let (ca, leaf, key) = (files.path("ca.pem"), files.path("leaf.der"), files.path("key.pem"));
     let to = server.addr.to_string();
     let mut child = openssl(
@@ -95,7 +95,7 @@ async fn openssl_connects_with_certificates_of_both_sides() {
     assert!(seen.contains("Verification: OK"), "{seen}");
     assert!(seen.contains("DTLSv1.2"), "{seen}");
     assert!(seen.contains("ECDHE-ECDSA-AES"), "{seen}");
-    // It says nothing that we know, and gets no link.
+    // The peer speaks no known protocol inside, and gets no link.
     let mut stdin = child.stdin.take().unwrap();
     stdin.write_all(b"hello\n").await.unwrap();
     let refused = server.refusal().await;
@@ -111,7 +111,7 @@ async fn openssl_without_a_certificate_or_with_one_of_another_fleet_is_refused()
     let _nobody = openssl("s_client", &["-dtls1_2", "-connect", &to]);
     let refused = server.refusal().await;
     assert!(matches!(refused.reason, Refusal::Certificate(CertError::NoCertificate)), "{refused}");
-    let files = Files::of(&enroll(&theirs, "arm-1"), "foreign");
+    let files = Files::write(&enroll(&theirs, "arm-1"), "foreign");
     let (leaf, key) = (files.path("leaf.der"), files.path("key.pem"));
     let args = ["-dtls1_2", "-connect", &to, "-cert", &leaf, "-certform", "DER", "-key", &key];
     let _foreign = openssl("s_client", &args);
@@ -122,7 +122,7 @@ async fn openssl_without_a_certificate_or_with_one_of_another_fleet_is_refused()
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_dialer_connects_to_openssl_with_certificates_of_both_sides() {
     let fleet = fleet(1);
-    let files = Files::of(&enroll(&fleet, "router"), "server");
+    let files = Files::write(&enroll(&fleet, "router"), "server");
     let (ca, leaf, key) = (files.path("ca.pem"), files.path("leaf.der"), files.path("key.pem"));
     let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let accept = format!("127.0.0.1:{port}");
@@ -156,7 +156,7 @@ async fn a_dialer_connects_to_openssl_with_certificates_of_both_sides() {
     let dialer = Dialer::new(enroll(&fleet, "arm-1"), options, Arc::default());
     let url = format!("dtls://{accept}").parse().unwrap();
     let error = dial_with(&dialer, &url).await.unwrap_err();
-    // It is of the fleet and is no node: nothing that it says inside is known.
+    // The peer is of the fleet but no node: nothing inside is known.
     assert!(matches!(error, LinkError::RefusedByPeer(PeerRefusal::Version)), "{error}");
     let seen = until(&mut lines, "CIPHER is").await;
     assert!(seen.contains("Client certificate") || seen.contains("BEGIN CERTIFICATE"), "{seen}");
@@ -220,7 +220,7 @@ async fn a_hello_in_the_name_of_a_peer_does_not_disturb_its_link() {
     let fleet = fleet(1);
     let mut server = dtls_router(&fleet);
     let listener = server.addr;
-    // In between, so that its address can be used by somebody else as well.
+    // Interleaved, so that somebody else can use its address as well.
     let middle = Arc::new(tokio::net::UdpSocket::bind("127.0.0.1:0").await.unwrap());
     let front = Arc::new(tokio::net::UdpSocket::bind("127.0.0.1:0").await.unwrap());
     let url = format!("dtls://{}", front.local_addr().unwrap()).parse().unwrap();
@@ -314,17 +314,25 @@ async fn datagrams_that_were_overheard_move_no_link() {
     let url = format!("dtls://{}", relay.addr).parse().unwrap();
     let near = dial(enroll(&fleet, "arm-1"), &url).await.unwrap();
     let far = server.link().await;
-    relay.weather.tap.store(true, Relaxed);
+    relay.impairment.tap.store(true, Relaxed);
     near.send_control(bytes::Bytes::from(vec![5; 3000])).await.unwrap();
     soon(far.recv_control()).await.unwrap();
     let overheard = |relay: &Relay| -> Vec<Vec<u8>> {
-        relay.weather.seen.lock().unwrap().iter().filter(|d| d[0] == 0xc1 && d.len() > 60).cloned().collect()
+        relay
+            .impairment
+            .seen
+            .lock()
+            .unwrap()
+            .iter()
+            .filter(|d| d[0] == 0xc1 && d.len() > 60)
+            .cloned()
+            .collect()
     };
     until_true(|| overheard(&relay).len() >= 2).await;
     let here = far.remote();
     let thief = tokio::net::UdpSocket::bind("127.0.0.1:0").await.unwrap();
     for datagram in overheard(&relay) {
-        // As it was, and altered where the number of the record, its length and its content are.
+        // The original, and copies with altered record number, length and content.
         thief.send_to(&datagram, server.addr).await.unwrap();
         for at in [9, 10, 11, 12, 13, 30] {
             let mut altered = datagram.clone();
@@ -332,7 +340,7 @@ async fn datagrams_that_were_overheard_move_no_link() {
             thief.send_to(&altered, server.addr).await.unwrap();
         }
     }
-    // An id that is not known is answered, which also says that all before it was looked at.
+    // An unknown id is answered, which also shows that all earlier datagrams were looked at.
     let mut unknown = overheard(&relay)[0].clone();
     unknown[1..9].fill(0xee);
     thief.send_to(&unknown, server.addr).await.unwrap();
@@ -349,17 +357,17 @@ async fn a_node_that_is_another_inside_gets_no_link() {
     let fleet = fleet(1);
     let mut server = dtls_router(&fleet);
     let relay = Relay::start(server.addr, 3).await;
-    relay.weather.tap.store(true, Relaxed);
-    relay.weather.loss.store(1000, Relaxed);
+    relay.impairment.tap.store(true, Relaxed);
+    relay.impairment.loss.store(1000, Relaxed);
     let store = CredentialStore::new(enroll(&fleet, "arm-1"));
     let dialing = {
         let (dialer, url) = (dialer(store.clone()), format!("dtls://{}", relay.addr).parse().unwrap());
         tokio::spawn(async move { dial_with(&dialer, &url).await })
     };
-    // DTLS has begun as one node; QUIC is going to be another.
-    until_true(|| !relay.weather.seen.lock().unwrap().is_empty()).await;
+    // DTLS began as one node; QUIC continues as another.
+    until_true(|| !relay.impairment.seen.lock().unwrap().is_empty()).await;
     store.set_identity(enroll(&fleet, "arm-12"));
-    relay.weather.loss.store(0, Relaxed);
+    relay.impairment.loss.store(0, Relaxed);
     let refused = server.refusal().await;
     assert!(matches!(refused.reason, Refusal::Greeting(ProtocolError::OtherNode)), "{refused}");
     let error = soon(dialing).await.unwrap().unwrap_err();
@@ -401,7 +409,7 @@ impl SharedAddress {
                             if seen.insert(from) {
                                 dialers.lock().unwrap().insert(0, from);
                             }
-                            // One that was taken out is heard no more.
+                            // A dialer that was removed is no longer heard.
                             if dialers.lock().unwrap().contains(&from) {
                                 let _ = outside.send_to(&up[..len], listener).await;
                             }
@@ -436,7 +444,7 @@ async fn talk(near: &AnyLink, far: &AnyLink) {
     }
 }
 
-/// Sends what a member says to the listener from an address that is not the member's, and waits until it was heard.
+/// Sends a member's records to the listener from an address that is not the member's, and waits until they were heard.
 async fn spoof(
     server: &mut Server,
     fleet: &sgc_trust::Fleet,
@@ -447,12 +455,12 @@ async fn spoof(
     let near = dial(enroll(fleet, "thief"), &url).await.unwrap();
     let far = server.link().await;
     talk(&near, &far).await;
-    relay.weather.seen.lock().unwrap().clear();
-    relay.weather.tap.store(true, Relaxed);
-    relay.weather.loss.store(1000, Relaxed);
+    relay.impairment.seen.lock().unwrap().clear();
+    relay.impairment.tap.store(true, Relaxed);
+    relay.impairment.loss.store(1000, Relaxed);
     near.send_control(bytes::Bytes::from_static(b"spoofed")).await.unwrap();
     let held = |relay: &Relay| -> Vec<Vec<u8>> {
-        relay.weather.seen.lock().unwrap().iter().filter(|d| d[0] == 0xc1).cloned().collect()
+        relay.impairment.seen.lock().unwrap().iter().filter(|d| d[0] == 0xc1).cloned().collect()
     };
     until_true(|| !held(&relay).is_empty()).await;
     soon(async {
@@ -481,7 +489,7 @@ async fn member_that_spoofs_an_address_takes_no_route() {
     let far = server.link().await;
     talk(&near, &far).await;
     let thief = spoof(&mut server, &fleet, &nat.outside).await;
-    // The listener speaks first: nothing of the owner's has come that could have put it right.
+    // The listener speaks first: nothing of the owner has come that could have corrected it.
     far.send_control(bytes::Bytes::from_static(b"first")).await.unwrap();
     let heard = tokio::time::timeout(Duration::from_millis(800), near.recv_control()).await;
     assert_eq!(heard.expect("the route is the thief's").unwrap(), "first");
@@ -523,7 +531,7 @@ async fn peer_that_answers_keeps_its_address_from_one_that_listens_in() {
     let near = dial(enroll(&fleet, "arm-1"), &nat.url).await.unwrap();
     let far = server.link().await;
     talk(&near, &far).await;
-    // A member on the way hears all that goes to the address, and connects from there.
+    // A member on the way sees everything to the address, and connects from there.
     nat.copies.store(2, Relaxed);
     let options = LinkOptions { handshake_timeout: Duration::from_secs(3), ..LinkOptions::default() };
     let thief = Dialer::new(enroll(&fleet, "thief"), options, Arc::default());

@@ -1,4 +1,4 @@
-//! Strangers that meet a node over DTLS: certificates of any length, and listeners that are nobody.
+//! Strangers that meet a node over DTLS: certificates of any length, and listeners without an identity.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 #[path = "support/openssl.rs"]
@@ -16,7 +16,7 @@ use openssl::{openssl, pem};
 use sgc_transport::*;
 use sgc_trust::{CertError, EnrollRequest, GROUPS_MAX, Identity};
 use sgc_wire::CERT_BYTES_MAX;
-use stranger::{Encounter, FakeListener, LongCertificate, VERSIONS, visit};
+use stranger::{FakeListener, HandshakeLog, LongCertificate, VERSIONS, visit};
 use support::*;
 
 /// Lengths of strangers' certificates, bytes, and of the datagrams that carry them. In DTLS 1.3 dimpl itself cannot send
@@ -145,9 +145,9 @@ fn for_dtls(identity: &Identity) -> DtlsCertificate {
     DtlsCertificate { certificate: identity.chain()[0].to_vec(), private_key: key.serialize_der() }
 }
 
-/// Nobody who shook hands was shown a certificate, and none was on the wire in the clear.
-fn saw_nothing(met: &[Encounter], leaf: &[u8]) {
-    // The key and what follows it, which is in no other certificate.
+/// Checks that no stranger was shown a certificate, and that none was on the wire in the clear.
+fn saw_nothing(met: &[HandshakeLog], leaf: &[u8]) {
+    // The key and the bytes behind it, which no other certificate has.
     let secret = &leaf[leaf.len() / 2..leaf.len() / 2 + 24];
     assert!(!met.is_empty());
     for met in met {
@@ -171,7 +171,7 @@ async fn dialer_shows_its_certificate_to_members_only() {
         assert!(matches!(error, LinkError::RefusedHere(CertError::UnknownIssuer)), "{version:?}: {error}");
         saw_nothing(&fake.stop(), &arm.chain()[0]);
     }
-    // A member is shown it, in the clear in DTLS 1.2: so it would have been seen.
+    // A member is shown the certificate, in the clear in DTLS 1.2: so it would have been seen.
     for version in VERSIONS {
         let fake = FakeListener::start(version, for_dtls(&enroll(&fleet, "router")), 1150);
         let url = format!("dtls://{}", fake.addr).parse().unwrap();
@@ -187,7 +187,7 @@ async fn dialer_is_not_talked_out_of_dtls13() {
     let arm = enroll(&fleet, "arm-1");
     let options = LinkOptions { handshake_timeout: Duration::from_secs(1), ..LinkOptions::default() };
     let dialer = Dialer::new(Arc::clone(&arm), options, Arc::default());
-    // It answers as a listener without DTLS 1.3 does, though the hello offers nothing else.
+    // The stranger answers as a listener without DTLS 1.3 does, although the hello offers nothing else.
     let fake = tokio::net::UdpSocket::bind("127.0.0.1:0").await.unwrap();
     let url = format!("dtls://{}", fake.local_addr().unwrap()).parse().unwrap();
     let dialing = tokio::spawn(async move { dial_with(&dialer, &url).await });
@@ -291,7 +291,7 @@ async fn dialer_survives_long_cookies() {
             }
             let (len, _) = fake.recv_from(&mut hello).await.unwrap();
             hello.truncate(len);
-            // The next would be its repetition.
+            // The next would repeat it.
             (hello, fake)
         });
         let error = dial_with(&dialer, &url).await.unwrap_err();
@@ -300,7 +300,7 @@ async fn dialer_survives_long_cookies() {
             let (hello, _fake) = soon(answering).await.unwrap();
             assert!(hello.windows(bytes).any(|window| window.iter().all(|byte| *byte == 7)), "no cookie");
         } else if bytes > 10_000 {
-            // A dialer that panicked would say that nobody answered.
+            // After a panic the dialer would report that nobody answered.
             assert!(matches!(error, LinkError::Transport(_)), "{bytes}: {error}");
         }
     }

@@ -1,4 +1,4 @@
-//! Peers of QUIC links that misbehave, played by bare quinn. What links do for their users: `conformance`.
+//! Peers of QUIC links that misbehave, played by bare quinn. `conformance` tests the links' promises to their users.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 mod support;
@@ -13,7 +13,7 @@ use sgc_trust::CertError;
 use sgc_wire::{DecodeError, Encode};
 use support::*;
 
-// Where a link leads.
+// Destinations of links.
 
 #[tokio::test]
 async fn a_link_moves_to_a_fresh_socket_and_loses_nothing() {
@@ -35,7 +35,7 @@ async fn a_link_moves_to_a_fresh_socket_and_loses_nothing() {
     assert_ne!(far.remote(), before);
 }
 
-// Who gets a link.
+// Admission.
 
 #[tokio::test]
 async fn a_dialer_without_a_certificate_is_refused() {

@@ -1,5 +1,5 @@
-//! Peers of stream links that misbehave, played by bare TLS, and paths that do. What links do for their users:
-//! `conformance`.
+//! Peers of stream links that misbehave, played by bare TLS, and bad paths. `conformance` tests the links' promises to
+//! their users.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 mod support;
@@ -35,8 +35,8 @@ async fn bare_stream(
 
 const SETTINGS: [u8; 13] = [0, 0x80, 1, 0, 0, 0x80, 1, 0, 0, 0x80, 0, 1, 0];
 
-/// A bare connection that has greeted and said its settings, and the link at the listener. The listener's settings are
-/// read, and its first bytes after them are next.
+/// A bare connection that has sent greeting and settings, and the link at the listener. The listener's settings are
+/// read; its later bytes come next.
 async fn greeted_stream(server: &mut Server, identity: &Identity) -> (TlsStream<TcpStream>, AnyLink) {
     let mut tls = bare_stream(server.addr, Some(identity), "sgc-tls/1").await.unwrap();
     tls.write_all(&frame(&GREETING)).await.unwrap();
@@ -47,7 +47,7 @@ async fn greeted_stream(server: &mut Server, identity: &Identity) -> (TlsStream<
     (tls, server.link().await)
 }
 
-/// Everything until the far side ends the connection.
+/// Reads everything until the far side ends the connection.
 async fn rest(tls: &mut TlsStream<TcpStream>) -> Vec<u8> {
     let mut all = Vec::new();
     // It ends in one way or another.
@@ -59,7 +59,7 @@ fn contains(haystack: &[u8], needle: &[u8]) -> bool {
     haystack.windows(needle.len()).any(|w| w == needle)
 }
 
-// Who gets a link.
+// Admission.
 
 #[tokio::test]
 async fn a_dialer_without_a_certificate_is_refused() {
@@ -149,7 +149,7 @@ async fn a_thousand_silent_connections_keep_nobody_out() {
     for count in 0..1000 {
         silent.push(soon(TcpStream::connect(server.addr)).await.unwrap());
         if count % 500 == 499 {
-            // Each refusal is told, and has to be taken.
+            // Each refusal is reported, and has to be taken.
             let (arm, url) = (Arc::clone(&arm), server.url.clone());
             let near = tokio::spawn(async move { dial(arm, &url).await.unwrap() });
             loop {
@@ -163,12 +163,12 @@ async fn a_thousand_silent_connections_keep_nobody_out() {
             drop(near.await.unwrap());
         }
     }
-    // Each is told or counted, and none is kept beyond the places there are.
+    // Each refusal is reported or counted, and none is kept beyond the number of places.
     assert!(server.metrics.handshakes_pending() <= PLACES as u64 + 1);
     assert!(server.metrics.refused(RefusalKind::TooManyFromAddress) >= 1000 - 2 * PLACES as u64);
     let mut ended = 0;
     for tcp in &mut silent[..1000 - 2 * PLACES] {
-        // Which way it ends is the kernel's.
+        // The kernel decides which error ends it.
         let _ = soon(tcp.read(&mut [0])).await;
         ended += 1;
     }
@@ -348,7 +348,7 @@ async fn a_peer_that_reads_nothing_is_left_and_harms_nobody() {
         }
     };
     assert!(matches!(error, LinkError::TimedOut { .. }), "{error}");
-    // What one peer does not take is little: what may be under way, and what may wait.
+    // A peer that reads nothing blocks only the bytes in flight and those that may wait.
     assert!(sent <= 1 << 20, "{sent}");
     far.send_control("x".into()).await.unwrap();
     assert_eq!(soon(near.recv_control()).await.unwrap(), "x");
@@ -461,7 +461,7 @@ async fn a_path_that_falls_silent_ends_the_link_in_time() {
 }
 
 #[tokio::test]
-async fn what_is_in_the_clear_is_what_was_asked_for() {
+async fn only_requested_links_are_in_the_clear() {
     for (scheme, is_clear) in [("tcp", true), ("tls", false), ("ws", false), ("wss", false)] {
         let fleet = fleet(1);
         let mut server = Server::start_on(scheme, enroll(&fleet, "router"), LinkOptions::default());
@@ -482,7 +482,7 @@ async fn what_is_in_the_clear_is_what_was_asked_for() {
 async fn a_web_proxy_that_ends_the_tls_outside_passes_links_on_and_nothing_else() {
     let (ours, other) = (fleet(1), fleet(2));
     let mut server = Server::start_on("ws", enroll(&ours, "router"), LinkOptions::default());
-    // Its certificate is of nobody's.
+    // Its certificate is of no known CA.
     let proxy = enroll(&other, "proxy");
     let tls =
         rustls::ServerConfig::builder_with_provider(Arc::new(rustls::crypto::aws_lc_rs::default_provider()))
@@ -510,7 +510,7 @@ async fn a_web_proxy_that_ends_the_tls_outside_passes_links_on_and_nothing_else(
     assert_eq!(soon(far.recv_control()).await.unwrap(), "through");
 }
 
-/// A relay between two ends of TCP whose owner decides, piece by piece, what reaches the listener.
+/// A relay between two ends of TCP whose owner decides, piece by piece, which bytes reach the listener.
 struct Interceptor {
     /// The bytes that the dialer sent.
     sent: tokio::sync::mpsc::Receiver<Vec<u8>>,
@@ -519,7 +519,7 @@ struct Interceptor {
 }
 
 impl Interceptor {
-    /// Lets one dialer through until `made`, and then passes what it says to the owner.
+    /// Lets one dialer through until `made`, and then passes its bytes to the owner.
     async fn dial(scheme: &str, server: &mut Server, identity: Arc<Identity>) -> (Self, AnyLink, AnyLink) {
         let front = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let addr = front.local_addr().unwrap();

@@ -1,4 +1,4 @@
-//! Who keeps a link and who gets one while certificates are renewed, revoked and run out; and with which keys.
+//! Links and handshakes while certificates are renewed, revoked and expire; and their keys.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 mod support;
@@ -18,7 +18,7 @@ use sgc_wire::UnixMillis;
 use support::*;
 use tokio::net::UdpSocket;
 
-/// Those whose handshakes differ.
+/// Schemes whose handshakes differ.
 const SCHEMES: [&str; 4] = ["quic", "tls", "tcp", "wss"];
 
 /// The node's next certificate.
@@ -53,7 +53,7 @@ async fn a_revoked_dialer_is_refused_and_both_logs_name_it() {
         assert_eq!(server.metrics.refused(RefusalKind::Revoked), 1);
         // Another certificate of the same node is as good as before.
         dial(renew(&fleet, "arm-1"), &server.url).await.unwrap();
-        // The link that was there says why it goes.
+        // The existing link reports why it ends.
         let reason = store.objection(far.peer(), now()).unwrap();
         assert_eq!(reason, CloseReason::Revoked);
         far.close(reason);
@@ -91,7 +91,7 @@ async fn a_session_that_was_good_does_not_let_a_revoked_certificate_back_in() {
     let arm = enroll(&fleet, "arm-1");
     let store = CredentialStore::new(enroll(&fleet, "router"));
     let mut server = Server::start(store.clone(), LinkOptions::default());
-    // It keeps whatever sessions it is given, and would go on with them.
+    // The client keeps its sessions, and would resume them.
     let tls = bare_tls(Some(&arm), "sgc/1", None);
     let (connection, _control, far) =
         greet(bare_with(server.addr, tls.clone()).await.unwrap(), &mut server).await;
@@ -206,7 +206,7 @@ async fn only_nodes_of_admitted_cas_attach_and_both_logs_name_it() {
         }
         assert_eq!(server.metrics.refused(RefusalKind::NotAdmitted), 2);
 
-        // Whom this node dials is not restricted, and the next handshake goes by what holds then.
+        // Dialling is not restricted, and the next handshake uses the rules of its time.
         let other = Server::start_on(scheme, of(&second), LinkOptions::default());
         dial(store.clone(), &other.url).await.unwrap();
         store.set_admitted(None);
@@ -253,7 +253,7 @@ async fn a_fleet_is_switched_to_post_quantum_keys_while_its_nodes_run() {
     };
     assert_eq!(agreed().await, ("X25519", "X25519"));
     fleet.set_post_quantum(true, now()).unwrap();
-    // One after the other, and nobody is locked out between.
+    // Nodes are switched one by one, and nobody is locked out between.
     router.set_identity(renew(&fleet, "router"));
     assert_eq!(agreed().await, ("X25519MLKEM768", "X25519MLKEM768"));
     arm.set_identity(renew(&fleet, "arm-1"));
@@ -278,7 +278,7 @@ async fn where_post_quantum_is_required_a_classical_dialer_is_refused() {
         assert!(refused.to_string().contains("X25519MLKEM768 is required here"), "{refused}");
     }
     assert_eq!(server.metrics.refused(RefusalKind::KeyExchange), 2);
-    // One that has it and would rather not gets no choice.
+    // A node that supports it but prefers the other gets no choice.
     let groups = vec![kx_group::X25519, kx_group::X25519MLKEM768];
     let connection = bare_with(server.addr, bare_tls(Some(&arm), "sgc/1", Some(groups))).await.unwrap();
     let (_connection, _control, far) = greet(connection, &mut server).await;
@@ -463,7 +463,7 @@ async fn a_key_of_another_kind_is_named() {
 }
 
 #[tokio::test]
-async fn what_was_revoked_during_a_handshake_counts() {
+async fn a_revocation_during_a_handshake_counts() {
     let fleet = fleet(1);
     let arm = enroll(&fleet, "arm-1");
     let store = CredentialStore::new(enroll(&fleet, "router"));

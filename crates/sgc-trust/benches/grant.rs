@@ -1,4 +1,4 @@
-//! What a grant costs, by kind of reply key: `cargo bench -p sgc-trust --bench grant`.
+//! Cost of a grant, by kind of reply key: `cargo bench -p sgc-trust --bench grant`.
 //!
 //! Median and 99th percentile of single operations; it compares machines and versions, not implementations.
 #![allow(

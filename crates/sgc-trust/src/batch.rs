@@ -1,9 +1,8 @@
-//! One signature for up to 64 packets of a source: a Merkle tree over them (RFC 6962, 2.1), whose root is
-//! signed.
+//! One signature for up to 64 packets of a source: a Merkle tree over them (RFC 6962, 2.1), whose root is signed.
 //!
-//! Each packet carries its audit path, its place and the signature behind its tag, so it verifies whatever
-//! became of the others. A receiver checks a signature once per batch and remembers what followed from it: of
-//! the later packets it hashes little more than themselves. Sealing is [`crate::SourceKey`]'s.
+//! Each packet carries its audit path, its place and the signature behind its tag, so it verifies without the others. A
+//! receiver checks a signature once per batch and remembers the hashes of its tree: a later packet costs little more
+//! than its own hash. [`crate::SourceKey`] seals the packets.
 
 use std::collections::VecDeque;
 
@@ -17,25 +16,25 @@ use crate::{MessageKey, OpenError, Suite, TAG_BYTES, opened_bytes};
 /// Most packets under one signature.
 pub const BATCH_PACKETS_MAX: usize = 64;
 
-/// Batches of one source that a receiver remembers: those that may arrive mingled.
+/// Batches of one source that a receiver remembers: those that may arrive interleaved.
 const BATCHES_KNOWN_MAX: usize = 4;
 
 /// Bytes of a hash.
 const HASH_BYTES: usize = 32;
 /// Bytes of a packet's place in its batch: `u16` index and `u16` count.
 const PLACE_BYTES: usize = 4;
-/// Nodes of a tree of 64 leaves; none of fewer has more, with those that stand on two levels counted twice.
+/// Nodes of a tree of 64 leaves; smaller trees have fewer, with nodes on two levels counted twice.
 const NODES_MAX: usize = 127;
 /// A node and its sibling on each of 7 levels.
-const CLIMB_NODES_MAX: usize = 14;
+const WALK_NODES_MAX: usize = 14;
 
 type Hash = [u8; HASH_BYTES];
 
-/// Gathers the packets of a batch at their source.
+/// Collects the packets of a batch at their source.
 #[derive(Debug, Default)]
 pub struct Batch {
     leaves: Vec<Hash>,
-    /// One that is over: its memory serves the next.
+    /// A used batch, whose memory serves the next.
     spare: SignedBatch,
 }
 
@@ -49,13 +48,13 @@ pub struct SignedBatch {
 }
 
 impl Batch {
-    /// Adds a packet: its header, and what it was sealed to (ciphertext and tag).
+    /// Adds a packet: its header, and its sealed bytes (ciphertext and tag).
     pub fn push(&mut self, header: &PacketHeader, sealed: &[u8]) {
         debug_assert!(!self.is_full());
         self.leaves.push(leaf(header, sealed));
     }
 
-    /// Signs what was gathered, and begins anew. There must be something.
+    /// Signs the collected packets, and begins anew. There must be at least one.
     pub fn sign(&mut self, key: &MessageKey) -> SignedBatch {
         let SignedBatch { mut nodes, mut signature, .. } = std::mem::take(&mut self.spare);
         let count = self.leaves.len();
@@ -77,22 +76,22 @@ impl Batch {
         SignedBatch { count, nodes, signature }
     }
 
-    /// Takes back one that is over, so that signing the next takes no memory.
+    /// Takes back a used batch, so that signing the next takes no memory.
     pub fn reuse(&mut self, over: SignedBatch) {
         self.spare = over;
     }
 
-    /// Packets gathered.
+    /// Returns the number of collected packets.
     pub fn len(&self) -> usize {
         self.leaves.len()
     }
 
-    /// True if there are none.
+    /// Returns `true` if there are no packets.
     pub fn is_empty(&self) -> bool {
         self.leaves.is_empty()
     }
 
-    /// True if no more fit.
+    /// Returns `true` if no packet fits any more.
     pub fn is_full(&self) -> bool {
         self.len() >= BATCH_PACKETS_MAX
     }
@@ -110,7 +109,7 @@ impl SignedBatch {
     }
 }
 
-/// Longest trailer of a suite's packets, bytes.
+/// Returns the longest trailer of a suite's packets, bytes.
 pub fn trailer_bytes_max(suite: Suite) -> usize {
     match suite.scheme().signature_bytes() {
         0 => 0,
@@ -125,8 +124,8 @@ pub struct BatchVerifier {
     checked: u64,
 }
 
-/// A batch whose signature verified, and the nodes of its tree that follow from it. Whatever node is known,
-/// its sibling, its ancestors and their siblings are.
+/// A batch whose signature verified, and the nodes of its tree that follow from it. With a node, its sibling, its
+/// ancestors and their siblings are known.
 struct KnownBatch {
     count: u16,
     signature: Vec<u8>,
@@ -134,42 +133,41 @@ struct KnownBatch {
     nodes: Vec<Hash>,
 }
 
-/// What was hashed on the way from a leaf to the first node that is known, or to the root.
-struct Climb {
-    found: [(usize, Hash); CLIMB_NODES_MAX],
+/// The nodes hashed from a leaf up to the first known node, or to the root.
+struct MerkleWalk {
+    found: [(usize, Hash); WALK_NODES_MAX],
     len: usize,
-    /// The last that was computed: the root, unless a known node was met.
+    /// The last computed node: the root, unless a known node was met.
     root: Hash,
 }
 
 impl BatchVerifier {
-    /// For sources with this announced key; `None` if it is not a key of that suite.
+    /// Returns a verifier for sources with this announced key; `None` if it is not a key of that suite.
     pub fn new(suite: Suite, key: &[u8]) -> Option<Self> {
         Some(Self { key: VerifyKey::new(suite, key)?, known: VecDeque::new(), checked: 0 })
     }
 
-    /// Verifies that the source signed this packet. At most one signature is checked, and only success is
-    /// remembered.
+    /// Verifies that the source signed this packet. At most one signature is checked, and only success is remembered.
     pub fn verify(&mut self, header: &PacketHeader, payload: &[u8]) -> Result<(), OpenError> {
         let (sealed, trailer) = split(header, payload, self.key.signature_bytes())?;
         let Trailer { path, index, count, signature } = trailer;
         let leaf = leaf(header, sealed);
         let known = self.known.iter_mut().find(|b| b.count == count && b.signature == signature);
         if let Some(batch) = known {
-            let climb = batch.climb(leaf, index, path)?;
-            batch.learn(&climb);
+            let walk = batch.walk(leaf, index, path)?;
+            batch.learn(&walk);
             return Ok(());
         }
         let mut batch = KnownBatch { count, signature: Vec::new(), known: 0, nodes: Vec::new() };
-        let climb = batch.climb(leaf, index, path)?;
+        let walk = batch.walk(leaf, index, path)?;
         self.checked += 1;
-        if !self.key.verify(&signed_bytes(count, &climb.root), signature) {
+        if !self.key.verify(&signed_bytes(count, &walk.root), signature) {
             return Err(OpenError::Signature);
         }
         if count > 1 {
             batch.nodes = vec![[0; HASH_BYTES]; position(count.into(), height(count.into()), 0) + 1];
             batch.signature = signature.to_vec();
-            batch.learn(&climb);
+            batch.learn(&walk);
             if self.known.len() >= BATCHES_KNOWN_MAX {
                 self.known.pop_front();
             }
@@ -178,18 +176,18 @@ impl BatchVerifier {
         Ok(())
     }
 
-    /// Signatures that were checked, for good or ill.
+    /// Returns the number of checked signatures, valid or not.
     pub fn signatures_checked(&self) -> u64 {
         self.checked
     }
 }
 
 impl KnownBatch {
-    /// Hashes upwards from a leaf to the first node that is known, or to the root; what lies above a known
-    /// node must be known too, and as the path says.
-    fn climb(&self, leaf: Hash, index: u16, path: &[u8]) -> Result<Climb, OpenError> {
+    /// Hashes upwards from a leaf to the first known node, or to the root. Nodes above a known one must be known too,
+    /// and match the path.
+    fn walk(&self, leaf: Hash, index: u16, path: &[u8]) -> Result<MerkleWalk, OpenError> {
         let (count, index) = (usize::from(self.count), usize::from(index));
-        let mut climb = Climb { found: [(0, leaf); CLIMB_NODES_MAX], len: 0, root: leaf };
+        let mut walk = MerkleWalk { found: [(0, leaf); WALK_NODES_MAX], len: 0, root: leaf };
         let (mut current, mut trusted) = (leaf, false);
         let mut siblings_left = siblings(index, count).zip(path.chunks_exact(HASH_BYTES)).peekable();
         for level in 0..=height(count) {
@@ -198,7 +196,7 @@ impl KnownBatch {
                 match self.node(at) {
                     Some(known) if *known != current => return Err(OpenError::Signature),
                     Some(_) => trusted = true,
-                    None => climb.add(at, current),
+                    None => walk.add(at, current),
                 }
             }
             if let Some(((_, place), sibling)) = siblings_left.next_if(|((l, _), _)| *l == level) {
@@ -207,7 +205,7 @@ impl KnownBatch {
                 match self.node(at) {
                     Some(known) if *known != sibling => return Err(OpenError::Signature),
                     Some(_) => {}
-                    None => climb.add(at, sibling),
+                    None => walk.add(at, sibling),
                 }
                 if !trusted {
                     current =
@@ -215,16 +213,16 @@ impl KnownBatch {
                 }
             }
         }
-        climb.root = current;
-        Ok(climb)
+        walk.root = current;
+        Ok(walk)
     }
 
     fn node(&self, at: usize) -> Option<&Hash> {
         if self.known & (1 << at) != 0 { self.nodes.get(at) } else { None }
     }
 
-    fn learn(&mut self, climb: &Climb) {
-        for (at, hash) in &climb.found[..climb.len] {
+    fn learn(&mut self, walk: &MerkleWalk) {
+        for (at, hash) in &walk.found[..walk.len] {
             if let Some(node) = self.nodes.get_mut(*at) {
                 *node = *hash;
                 self.known |= 1 << at;
@@ -233,14 +231,14 @@ impl KnownBatch {
     }
 }
 
-impl Climb {
+impl MerkleWalk {
     fn add(&mut self, at: usize, hash: Hash) {
         self.found[self.len] = (at, hash);
         self.len += 1;
     }
 }
 
-/// What stands behind a packet's tag.
+/// The bytes behind a packet's tag.
 struct Trailer<'a> {
     path: &'a [u8],
     index: u16,
@@ -248,8 +246,7 @@ struct Trailer<'a> {
     signature: &'a [u8],
 }
 
-/// Divides a payload into what was sealed and the trailer. Every length must be what header, index and count
-/// say.
+/// Divides a payload into sealed bytes and trailer. Every length must match header, index and count.
 fn split<'a>(
     header: &PacketHeader,
     payload: &'a [u8],
@@ -268,7 +265,7 @@ fn split<'a>(
     if fits { Ok((sealed, Trailer { path, index, count, signature })) } else { Err(OpenError::Trailer) }
 }
 
-/// `SHA-256(0x00 ‖ header as authenticated ‖ ciphertext ‖ tag)`.
+/// Returns `SHA-256(0x00 ‖ header as authenticated ‖ ciphertext ‖ tag)`.
 fn leaf(header: &PacketHeader, sealed: &[u8]) -> Hash {
     let mut context = digest::Context::new(&digest::SHA256);
     context.update(&[0]);
@@ -277,7 +274,7 @@ fn leaf(header: &PacketHeader, sealed: &[u8]) -> Hash {
     hash(&context.finish())
 }
 
-/// `SHA-256(0x01 ‖ left ‖ right)`.
+/// Returns `SHA-256(0x01 ‖ left ‖ right)`.
 fn node(left: &Hash, right: &Hash) -> Hash {
     let mut text = [1; 1 + 2 * HASH_BYTES];
     text[1..=HASH_BYTES].copy_from_slice(left);
@@ -291,7 +288,7 @@ fn hash(digest: &digest::Digest) -> Hash {
     out
 }
 
-/// `"sgc batch v1" ‖ 0x00 ‖ u16 count ‖ root`.
+/// Returns `"sgc batch v1" ‖ 0x00 ‖ u16 count ‖ root`.
 fn signed_bytes(count: u16, root: &Hash) -> [u8; 47] {
     let mut out = [0; 47];
     out[..12].copy_from_slice(b"sgc batch v1");
@@ -300,25 +297,25 @@ fn signed_bytes(count: u16, root: &Hash) -> [u8; 47] {
     out
 }
 
-/// Levels above the leaves.
+/// Returns the number of levels above the leaves.
 fn height(count: usize) -> usize {
     count.next_power_of_two().trailing_zeros() as usize
 }
 
-/// Where a node stands in a list of all levels, leaves first. Below [`NODES_MAX`].
+/// Returns the index of a node in a list of all levels, leaves first. Below [`NODES_MAX`].
 fn position(count: usize, level: usize, index: usize) -> usize {
     let below: usize = (0..level).map(|l| width(count, l)).sum();
     debug_assert!(below + index < NODES_MAX);
     below + index
 }
 
-/// Nodes on a level. One without a sibling, the last of an odd number, stands on the next level too; which
-/// gives the trees of RFC 6962, where the left part is the largest power of two.
+/// Returns the number of nodes on a level. The last node of an odd number has no sibling and stands on the next level
+/// too; this gives the trees of RFC 6962, where the left part is the largest power of two.
 fn width(count: usize, level: usize) -> usize {
     count.div_ceil(1 << level)
 }
 
-/// The siblings on the way from a leaf to the root, as level and place on it: what the audit path lists.
+/// Iterates over the siblings from a leaf to the root, as level and place on it: the audit path.
 fn siblings(index: usize, count: usize) -> impl Iterator<Item = (usize, usize)> {
     (0..height(count)).filter_map(move |level| {
         let place = (index >> level) ^ 1;

@@ -1,8 +1,8 @@
-//! Chains that were verified before. Every advertisement and join of a node repeats its chain, and verifying that takes
-//! as long as verifying what it signed.
+//! Chains that were verified before. Every advertisement and join of a node repeats its chain, and verifying the chain
+//! takes as long as verifying the signed body.
 //!
-//! What is known belongs to one value of [`crate::TrustAnchors`]: other CAs or newer revocation lists are another value,
-//! which knows nothing yet. Refusals are not remembered. Nothing but time spent depends on what is known.
+//! The table belongs to one value of [`crate::TrustAnchors`]: other CAs or newer revocation lists are another value,
+//! with an empty table. Refusals are not remembered. The table affects only the time spent.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -14,23 +14,23 @@ use sgc_wire::UnixMillis;
 use crate::verify::VerifiedPeer;
 use crate::x509::Validity;
 
-/// Most chains that are known of one set of CAs, some 600 bytes each. The first to come is the first to go.
+/// Most chains known of one set of CAs, some 600 bytes each. The oldest goes first.
 pub(crate) const CHAINS_KNOWN_MAX: usize = 16_384;
 
 /// Peers by the chains that they were verified with.
 #[derive(Default)]
-pub(crate) struct KnownChains(Mutex<Known>);
+pub(crate) struct KnownChains(Mutex<ChainTable>);
 
 #[derive(Default)]
-struct Known {
+struct ChainTable {
     peers: BTreeMap<ChainHash, KnownPeer>,
-    /// In the order in which they came.
+    /// Chains, the oldest first.
     order: VecDeque<ChainHash>,
 }
 
 struct KnownPeer {
     peer: VerifiedPeer,
-    /// While every certificate from the leaf to the CA holds.
+    /// Time in which every certificate from the leaf to the CA is valid.
     validity: Validity,
 }
 
@@ -39,7 +39,7 @@ struct KnownPeer {
 pub(crate) struct ChainHash([u8; 32]);
 
 impl ChainHash {
-    pub(crate) fn of(chain: &[CertificateDer<'_>]) -> Self {
+    pub(crate) fn from_chain(chain: &[CertificateDer<'_>]) -> Self {
         let mut context = digest::Context::new(&digest::SHA256);
         for certificate in chain {
             context.update(&(certificate.len() as u64).to_be_bytes());
@@ -52,7 +52,7 @@ impl ChainHash {
 }
 
 impl KnownChains {
-    /// The peer of a chain that was verified before and still holds.
+    /// Returns the peer of a chain that was verified before and is still valid.
     pub(crate) fn find(&self, chain: &ChainHash, now: UnixMillis) -> Option<VerifiedPeer> {
         let known = self.lock();
         let known = known.peers.get(chain)?;
@@ -62,7 +62,7 @@ impl KnownChains {
     /// Remembers a peer whose chain was verified.
     pub(crate) fn remember(&self, chain: ChainHash, peer: VerifiedPeer, validity: Validity) {
         let mut known = self.lock();
-        let Known { peers, order } = &mut *known;
+        let ChainTable { peers, order } = &mut *known;
         if peers.insert(chain, KnownPeer { peer, validity }).is_none() {
             order.push_back(chain);
         }
@@ -73,7 +73,7 @@ impl KnownChains {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, Known> {
+    fn lock(&self) -> MutexGuard<'_, ChainTable> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -110,7 +110,7 @@ mod tests {
     }
 
     fn is_known(anchors: &TrustAnchors, chain: &[CertificateDer<'_>], now: UnixMillis) -> bool {
-        anchors.chains.find(&ChainHash::of(chain), now).is_some()
+        anchors.chains.find(&ChainHash::from_chain(chain), now).is_some()
     }
 
     #[test]
@@ -147,7 +147,7 @@ mod tests {
     #[test]
     fn a_known_chain_ends_with_its_intermediate_and_with_its_ca() {
         let spans = [
-            // CA, intermediate, leaf: the years until which they hold.
+            // CA, intermediate, leaf: the years until which they are valid.
             [2040, 2028, 2035],
             [2028, 2040, 2035],
         ];
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn what_one_ca_vouched_for_is_not_known_under_another() {
+    fn a_chain_verified_under_one_ca_is_unknown_under_another() {
         let (ours, theirs) = (fleet(1), fleet(2));
         let arm = enroll(&ours, "arm-1");
         ours.anchors().verify(arm.chain(), NOW).unwrap();
@@ -239,18 +239,18 @@ mod tests {
         let peer = enroll(&fleet, "arm-1").as_peer().clone();
         let validity = Validity { not_before: peer.not_before, not_after: peer.not_after };
         let known = KnownChains::default();
-        let hash = |n: usize| ChainHash::of(&[CertificateDer::from(n.to_be_bytes().to_vec())]);
+        let hash = |n: usize| ChainHash::from_chain(&[CertificateDer::from(n.to_be_bytes().to_vec())]);
         for n in 0..CHAINS_KNOWN_MAX + 10 {
             known.remember(hash(n), peer.clone(), validity);
             known.remember(hash(n), peer.clone(), validity);
         }
-        let Known { peers, order } = &*known.lock();
+        let ChainTable { peers, order } = &*known.lock();
         assert_eq!((peers.len(), order.len()), (CHAINS_KNOWN_MAX, CHAINS_KNOWN_MAX));
         let is_there = |n: usize| peers.contains_key(&hash(n));
         assert!(!is_there(9) && is_there(10) && is_there(CHAINS_KNOWN_MAX + 9));
     }
 
-    /// A chain of a leaf and an intermediate, which with their CA hold until the ends of these years.
+    /// Makes a chain of a leaf and an intermediate, which with their CA are valid until the ends of these years.
     fn made(
         ca_until: i32,
         intermediate_until: i32,

@@ -1,10 +1,10 @@
-//! Which certificates their CAs have taken back: X.509 revocation lists (RFC 5280, 5).
+//! X.509 revocation lists (RFC 5280, 5): the certificates that CAs have revoked.
 //!
-//! A list is believed if a trusted CA signed it, whoever brought it. The lists of a fleet add up: they name nodes and
-//! incarnations, and what one of them revokes stays revoked (`revocations.rs`). Of a CA that names serial numbers only,
-//! the list with the greatest number counts. A list whose time is over still counts. Whoever keeps newer lists from a
-//! node can so delay a revocation, and not undo one; refusing everybody instead would stop a fleet whose keeper is away.
-//! It reads no clock and stores no file.
+//! A list counts if a trusted CA signed it, no matter how it came. The lists of a fleet add up: they name nodes and
+//! incarnations, and a revocation in one of them stays (`revocations.rs`). Of a CA that names serial numbers only, the
+//! list with the greatest number counts. An outdated list still counts. An attacker who keeps newer lists from a node
+//! can so delay a revocation, and not undo one; refusing everybody instead would stop a fleet whose keeper is away.
+//! This module reads no clock and stores no file.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -20,7 +20,7 @@ use crate::verify::{Anchor, CHAIN_ALGORITHMS, CaFingerprint, CertId, TrustAnchor
 use crate::x509::{ListFields, RevokedNodeFields, may_sign_lists, split_spki, without_zeros};
 
 impl TrustAnchors {
-    /// With one more list, if it verifies and says something that is not known. `Ok(None)`: it is no news.
+    /// Returns these anchors with one more list, if it verifies and adds something; `Ok(None)` if it adds nothing.
     pub fn with_crl(&self, der: &[u8], now: UnixMillis) -> Result<Option<Self>, CrlError> {
         Ok(self.crl_news(der, now)?.map(|news| news.anchors))
     }
@@ -39,7 +39,7 @@ impl TrustAnchors {
         Ok(Some(CrlNews { ca, number, anchors: self.with_lists(Arc::new(lists)) }))
     }
 
-    /// The same CAs, and what is revoked here or elsewhere by those of them that are known there.
+    /// Returns the same CAs, with the revocations that they have here or in `known`.
     pub fn with_lists_of(&self, known: &Self) -> Self {
         let mut lists = BTreeMap::clone(&self.lists);
         let here = |ca: &CaFingerprint| self.ca_spki(ca).is_some();
@@ -50,47 +50,47 @@ impl TrustAnchors {
         self.with_lists(Arc::new(lists))
     }
 
-    /// The lists in force, DER, to be passed on: from them another node learns all that is revoked. Of each CA at most
-    /// one that names serial numbers only, and [`crate::FLEET_LISTS_MAX`] of a fleet.
+    /// Returns the lists in force, DER, to be passed on: they tell another node every revocation. Of each CA there is
+    /// at most one that names serial numbers only, and [`crate::FLEET_LISTS_MAX`] of a fleet.
     pub fn crls(&self) -> impl Iterator<Item = &Bytes> {
         self.lists.values().flat_map(CaLists::lists).map(|list| &list.der)
     }
 
-    /// The same, each with its CA and its SHA-256.
+    /// Returns the lists in force, each with its CA and its SHA-256.
     pub fn crls_by_ca(&self) -> impl Iterator<Item = (&CaFingerprint, [u8; 32], &Bytes)> {
         let all = self.lists.iter().flat_map(|(ca, lists)| lists.lists().map(move |list| (ca, list)));
         all.map(|(ca, list)| (ca, sha256(&[&list.der]), &list.der))
     }
 
-    /// The nodes that a CA has revoked by name, in all of its lists.
+    /// Returns the nodes that a CA has revoked by name, in all of its lists.
     pub fn revoked_nodes(&self, ca: &CaFingerprint) -> impl Iterator<Item = (Pseudonym, Revocation)> {
         self.lists.get(ca).into_iter().flat_map(|lists| lists.nodes()).map(|(node, r)| (*node, *r))
     }
 
-    /// The greatest number of the lists of a CA that revoke nodes by name.
+    /// Returns the greatest number of a CA's lists that revoke nodes by name.
     pub fn fleet_list_number(&self, ca: &CaFingerprint) -> Option<u64> {
         let number = self.lists.get(ca)?.fleet_number()?;
         (number.len() <= 8).then(|| number.iter().fold(0, |n, byte| (n << 8) | u64::from(*byte)))
     }
 
-    /// True if a path from the certificate below a CA down to a node's is broken: one of its certificates is revoked,
+    /// Returns `true` if a path from the certificate below a CA down to a node's is broken: one of its certificates is revoked,
     /// or that incarnation of the node.
     pub fn is_path_revoked(&self, path: &[CertId]) -> bool {
         self.path_revoked_at(path).is_some()
     }
 
-    /// True if a certificate on the path to this peer is revoked, or the peer itself.
+    /// Returns `true` if a certificate on the path to this peer is revoked, or the peer itself.
     pub fn is_peer_revoked(&self, peer: &VerifiedPeer) -> bool {
         self.is_path_revoked(&peer.path)
     }
 
-    /// Returns whether a peer whose certificate was verified would still be believed, but for the time: its CA is trusted,
-    /// and nothing on the path to it is revoked.
+    /// Returns whether a verified peer would still be believed, apart from the time: its CA is trusted, and nothing on
+    /// its path is revoked.
     pub fn stands(&self, peer: &VerifiedPeer) -> bool {
         self.ca_spki(&peer.ca).is_some() && !self.is_peer_revoked(peer)
     }
 
-    /// True if the key of the first CA made this signature, with any algorithm that it has.
+    /// Returns `true` if the key of the first CA made this signature, with any of its algorithms.
     pub(crate) fn signed_by_first(&self, message: &[u8], signature: &[u8]) -> bool {
         let Some((key_algorithm, key)) = self.anchors.first().and_then(|a| split_spki(&a.spki)) else {
             return false;
@@ -99,8 +99,8 @@ impl TrustAnchors {
         fitting.any(|a| a.verify_signature(key, message, signature).is_ok())
     }
 
-    /// Since when a path is broken. Serial numbers count for the CA that gave them. A node is the trusted CA's, whatever
-    /// is between the two.
+    /// Returns the time at which a path was broken. Serial numbers count for the CA that gave them. A node belongs to
+    /// the trusted CA, whatever is between the two.
     pub(crate) fn path_revoked_at(&self, path: &[CertId]) -> Option<UnixMillis> {
         let of_serial = |cert: &CertId| self.lists.get(&cert.ca)?.serial_revoked_at(&cert.serial);
         let of_node = || {
@@ -115,10 +115,10 @@ impl TrustAnchors {
         if der.len() > CRL_BYTES_MAX {
             return Err(CrlError::TooLong { bytes: der.len() });
         }
-        // Webpki checks the form as a whole: versions, critical extensions, that both algorithms are the same.
+        // Webpki checks the form as a whole: versions, critical extensions, and that both algorithms are the same.
         let list = BorrowedCertRevocationList::from_der(der).map_err(CrlError::from_webpki)?;
-        let fields =
-            ListFields::of(der).ok_or_else(|| CrlError::Malformed("its fields cannot be read".into()))?;
+        let fields = ListFields::from_list(der)
+            .ok_or_else(|| CrlError::Malformed("its fields cannot be read".into()))?;
         if fields.is_scoped {
             return Err(CrlError::Partial);
         }
@@ -129,7 +129,7 @@ impl TrustAnchors {
         if named.peek().is_none() {
             return Err(CrlError::UnknownIssuer);
         }
-        // Several CAs may have one name; the signature tells whose list it is.
+        // Several CAs may have one name; the signature tells the right one.
         let (anchor, _) = named.find(|(anchor, _)| anchor.signed(&fields)).ok_or(CrlError::BadSignature)?;
         if may_sign_lists(&anchor.der) != Some(true) {
             return Err(CrlError::NotAListSigner);
@@ -148,7 +148,7 @@ impl TrustAnchors {
     }
 }
 
-/// A verified list that says something new.
+/// A verified list with news.
 pub struct CrlNews {
     /// The trusted CA that signed it.
     pub ca: CaFingerprint,
@@ -173,7 +173,7 @@ impl CrlNumber {
 }
 
 impl Anchor {
-    /// True if this CA's key made the signature of the list.
+    /// Returns `true` if this CA's key made the signature of the list.
     fn signed(&self, list: &ListFields<'_>) -> bool {
         let Some((key_algorithm, key)) = split_spki(&self.spki) else { return false };
         CHAIN_ALGORITHMS
@@ -203,37 +203,37 @@ fn read_revoked_nodes(extension: &[u8]) -> Result<RevokedNodes, CrlError> {
     Ok(nodes)
 }
 
-/// Why a revocation list is not believed.
+/// The reason why a revocation list is not believed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CrlError {
-    /// It is too long.
+    /// The list is too long.
     #[error("the revocation list has {bytes} bytes, at most {CRL_BYTES_MAX} are read")]
     TooLong {
         /// Its length.
         bytes: usize,
     },
-    /// It is not the X.509 that we read.
+    /// The list cannot be read as X.509.
     #[error("the revocation list cannot be read: {0}")]
     Malformed(String),
-    /// It speaks of some certificates of its CA only, or of those of others.
+    /// The list covers only some certificates of its CA, or those of other CAs.
     #[error(
         "the revocation list is a partial one (delta, indirect, or with an issuing distribution point): have the CA \
          write a full one"
     )]
     Partial,
-    /// It has no number, so that nobody can tell which of two is newer.
+    /// The list has no number, so that nobody can tell which of two is newer.
     #[error("the revocation list has no CRL number: have the CA write one with it (RFC 5280, 5.2.3)")]
     NoNumber,
-    /// No CA that is trusted here made it.
+    /// No CA that is trusted here made the list.
     #[error("the revocation list is from a CA that is not trusted here")]
     UnknownIssuer,
-    /// It says that a trusted CA made it, and none did.
+    /// The list names a trusted CA, which did not sign it.
     #[error("the revocation list's signature is wrong: it was altered or forged")]
     BadSignature,
     /// Its CA's certificate has a key usage without cRLSign.
     #[error("the CA's certificate does not let it sign revocation lists (key usage cRLSign)")]
     NotAListSigner,
-    /// Its CA is over, and so is everything that it could revoke.
+    /// The CA has expired, and with it everything that it could revoke.
     #[error("the revocation list's CA expired at {not_after} and the clock here says {now}")]
     CaExpired {
         /// Its end.
@@ -241,13 +241,13 @@ pub enum CrlError {
         /// The time of the check.
         now: UnixMillis,
     },
-    /// With it its CA would have revoked too many nodes.
+    /// With this list its CA would have revoked too many nodes.
     #[error(
         "with this revocation list its CA would have revoked more than {REVOKED_NODES_MAX} nodes: it is not taken; \
          make a new fleet"
     )]
     TooManyNodes,
-    /// Too many lists of its CA say something of their own.
+    /// Too many lists of the CA are in force, each with revocations of its own.
     #[error(
         "{FLEET_LISTS_MAX} revocation lists of this CA are in force and none says what another does: it is not taken; \
          `sgc fleet merge` the copies of the fleet's file and hand out the list of the merged one"
@@ -256,10 +256,10 @@ pub enum CrlError {
 }
 
 impl CrlError {
-    /// True if an honest node never passes such a list on.
+    /// Returns `true` if an honest node never passes such a list on.
     pub fn is_forgery(&self) -> bool {
         match self {
-            // A CA that is not trusted here may be trusted there, clocks differ, and there may be room elsewhere.
+            // Another node may trust the CA, have another clock or more room.
             Self::UnknownIssuer | Self::CaExpired { .. } | Self::TooManyNodes | Self::TooManyLists => false,
             Self::TooLong { .. }
             | Self::Malformed(_)

@@ -1,6 +1,6 @@
-//! How a fleet takes nodes in and renews them, with keys of its making or of theirs.
+//! Enrolment and renewal of nodes, with keys of the fleet's making or of theirs.
 //!
-//! The roster is entered here; who is taken out of it, and all else about a fleet, is in `fleet.rs`.
+//! This module enters nodes in the roster. Removal from it, and all else about a fleet, is in `fleet.rs`.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -34,7 +34,7 @@ impl Fleet {
         Identity::join(member, key.pkcs8(), rng).map_err(FleetError::making)
     }
 
-    /// The same for a node that made its key itself: `csr` (PKCS #10, DER) shows that it has it. Nothing but the key
+    /// Makes an identity for a node that made its key itself: `csr` (PKCS #10, DER) proves its possession. Only the key
     /// is taken from it.
     pub fn enroll_csr(
         &mut self,
@@ -42,11 +42,11 @@ impl Fleet {
         request: &EnrollRequest,
         rng: &mut impl CryptoRng,
     ) -> Result<Membership, FleetError> {
-        self.enroll_key(&RequestedKey::of(csr)?, request, rng)
+        self.enroll_key(&RequestedKey::from_request(csr)?, request, rng)
     }
 
-    /// Makes an identity of which the roster knows nothing, so that it cannot be revoked or renewed: for fleets that
-    /// last as long as a demonstration or a test.
+    /// Makes an identity outside of the roster, so that it cannot be revoked or renewed: for fleets that last as long
+    /// as a demonstration or a test.
     pub fn issue(&self, request: &EnrollRequest, rng: &mut impl CryptoRng) -> Result<Identity, FleetError> {
         let key = Key::generate(rng);
         let incarnation = self.node(&request.node).map_or(0, |n| n.incarnation);
@@ -54,7 +54,7 @@ impl Fleet {
         Identity::join(member, key.pkcs8(), rng).map_err(FleetError::making)
     }
 
-    /// An identity with a new key for a node of the roster, in its groups and with its role.
+    /// Makes an identity with a new key for a node of the roster, in its groups and with its role.
     pub fn renew(
         &mut self,
         node: &NodeName,
@@ -66,7 +66,7 @@ impl Fleet {
         self.enroll(&request, rng)
     }
 
-    /// The same for a node that keeps the key with which it signed `csr`.
+    /// Renews a node that keeps the key with which it signed `csr`.
     pub fn renew_member(
         &mut self,
         csr: &[u8],
@@ -79,8 +79,8 @@ impl Fleet {
         self.enroll_csr(csr, &request, rng)
     }
 
-    /// Fresh certificates and the secrets in use for the node of the roster that certificates call `pseudonym`, for
-    /// the key that signed `csr`. Who asks has to be that node: the caller checks it.
+    /// Makes certificates, for the key that signed `csr`, and returns them with the secrets in use. They are for the
+    /// node of the roster with this `pseudonym`. The caller checks that the request comes from that node.
     pub fn renew_csr(
         &mut self,
         csr: &[u8],
@@ -104,7 +104,8 @@ impl Fleet {
         now: UnixMillis,
     ) -> Result<(), FleetError> {
         let leaf = chain.first().ok_or(FleetError::Adopt("there is no certificate"))?;
-        let begin = Validity::of(leaf).ok_or(FleetError::Adopt("it cannot be read"))?.not_before;
+        let begin =
+            Validity::from_certificate(leaf).ok_or(FleetError::Adopt("it cannot be read"))?.not_before;
         let peer = self
             .anchors
             .verify(chain, begin)
@@ -115,8 +116,8 @@ impl Fleet {
         self.enter(node, &peer, now).map(drop)
     }
 
-    /// Enters the certificate of a node of the roster that another copy of this fleet's file made, if that is news, and
-    /// its incarnation. `Ok(false)`: the roster has it, or it is none of this fleet.
+    /// Enters a certificate, and the incarnation, of a node of the roster that another copy of this fleet's file made.
+    /// `Ok(false)`: the roster has it, or the certificate is of another fleet.
     pub fn recognize(&mut self, peer: &VerifiedPeer, now: UnixMillis) -> Result<bool, FleetError> {
         let is_ours = self.anchors.fingerprints().next() == Some(peer.cert.ca);
         match self.node_by_pseudonym(&peer.pseudonym).map(|n| n.name.clone()) {
@@ -125,7 +126,7 @@ impl Fleet {
         }
     }
 
-    /// Enters a verified certificate; true if it was not there.
+    /// Enters a verified certificate. Returns `true` if it was new.
     fn enter(&mut self, node: NodeName, peer: &VerifiedPeer, now: UnixMillis) -> Result<bool, FleetError> {
         self.begin_roster_if_none(now)?;
         let known = self.roster.nodes.get(&node).map_or(&[][..], |n| &n.certificates);
@@ -143,7 +144,7 @@ impl Fleet {
             seen: None,
             certificates: Vec::new(),
         });
-        // The CA made the certificate, so the incarnation was given out, if only by another copy of the file.
+        // The CA made the certificate, so the incarnation exists, if only in another copy of the file.
         entry.incarnation = entry.incarnation.max(peer.incarnation);
         entry.add_certificates([IssuedCertificate {
             serial: peer.cert.serial.clone(),
@@ -177,7 +178,7 @@ impl Fleet {
         };
         let member = self.member(key, request, incarnation, rng)?;
         let leaf = member.chain.first().ok_or(FleetError::CaName)?;
-        let made = Validity::of(leaf).zip(serial_of(leaf)).ok_or(FleetError::CaName)?;
+        let made = Validity::from_certificate(leaf).zip(serial_of(leaf)).ok_or(FleetError::CaName)?;
         let (Validity { not_after, .. }, serial) = made;
         let mut node = RosterNode {
             name: request.node.clone(),
@@ -208,7 +209,7 @@ impl Fleet {
         Ok(member)
     }
 
-    /// Everything but the key, for this key.
+    /// Returns everything but the key, for this key.
     fn member(
         &self,
         key: &impl PublicKeyData,
@@ -255,28 +256,28 @@ impl Fleet {
     }
 }
 
-/// What is asked of [`Fleet::enroll`].
+/// Input of [`Fleet::enroll`].
 #[derive(Clone, Debug)]
 pub struct EnrollRequest {
-    /// For which node.
+    /// The node.
     pub node: NodeName,
-    /// The groups it is to be in, at most [`GROUPS_MAX`].
+    /// Its groups, at most [`GROUPS_MAX`].
     pub groups: Vec<GroupName>,
-    /// For a node that only routes: its identity lacks the fleet secret, so that it can derive no name and open
-    /// no payload. Its certificate lets it carry others' names.
+    /// Whether the node only routes: its identity lacks the fleet secret, so that it can derive no name and open no
+    /// payload. Its certificate lets it carry others' names.
     pub router: bool,
-    /// For a member whose certificate lets it carry others' names as well.
+    /// Whether a member's certificate lets it carry others' names as well.
     pub may_route: bool,
-    /// True if a node that was revoked may be one again, in its next incarnation.
+    /// Whether a revoked node may be enrolled again, in its next incarnation.
     pub again: bool,
-    /// How long the certificate is to hold; never longer than the CA.
+    /// Validity of the certificate; never longer than the CA's.
     pub valid: Duration,
     /// The time.
     pub now: UnixMillis,
 }
 
 impl EnrollRequest {
-    /// A node in no group, for [`LEAF_VALIDITY_DEFAULT`].
+    /// Returns a request for a node in no group, for [`LEAF_VALIDITY_DEFAULT`].
     pub fn new(node: NodeName, now: UnixMillis) -> Self {
         let (groups, valid) = (Vec::new(), LEAF_VALIDITY_DEFAULT);
         Self { node, groups, router: false, may_route: false, again: false, valid, now }

@@ -1,8 +1,7 @@
-//! A fleet: the CA that says who belongs to it, the secrets from which its names are derived, and the roster of
-//! its nodes.
+//! A fleet: its CA, the secrets from which its names are derived, and the roster of its nodes.
 //!
-//! It makes identities, renews and revokes them, and writes no file. Certificates name nodes and groups by keyed
-//! hashes, so that whoever sees one (a router, the network) learns no name.
+//! This module makes identities, renews and revokes them, and writes no file. Certificates name nodes and groups by
+//! keyed hashes, so that routers and the network learn no name.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -30,17 +29,17 @@ use crate::secret::{FleetSecret, NAMING_BLOCK, NamingSecret, SECRET_BLOCK};
 use crate::verify::{TrustAnchors, node_id, signature_input};
 use crate::x509::{CaFields, Validity, may_sign_lists};
 
-/// How long a node's certificate holds unless the request says otherwise.
+/// Validity of a node's certificate unless the request says otherwise.
 pub const LEAF_VALIDITY_DEFAULT: Duration = Duration::from_secs(90 * 86_400);
-/// How long the CA's certificate holds.
+/// Validity of the CA's certificate.
 pub const CA_VALIDITY: Duration = Duration::from_secs(10 * 365 * 86_400);
-/// When a revocation list says that the next one is to be expected; nodes keep to it for longer.
+/// Time until a revocation list announces the next one; nodes keep to a list for longer.
 pub const CRL_VALIDITY: Duration = Duration::from_secs(30 * 86_400);
-/// How long before its making a certificate begins to hold: clocks of machines differ by minutes.
+/// Time by which a certificate is valid before its making: clocks of machines differ by minutes.
 pub const CLOCK_SKEW: Duration = Duration::from_secs(600);
-/// Least time between two sightings of a node that a roster takes note of: it is written as a whole.
+/// Least time between two sightings of a node that a roster notes: the roster is written as a whole.
 pub const SEEN_STEP: Duration = Duration::from_secs(86_400);
-/// A node that was seen within this time counts as one that may come back.
+/// A node seen within this time may come back.
 pub const SEEN_RECENTLY: Duration = Duration::from_secs(30 * 86_400);
 /// Longest roster that is kept, bytes.
 pub const ROSTER_BYTES_MAX: usize = 8 * 1024 * 1024;
@@ -59,19 +58,19 @@ const SIGNATURE_BYTES_MAX: usize = 1024;
 pub struct Fleet {
     pub(crate) name: FleetName,
     pub(crate) secret: FleetSecret,
-    /// In use, newest first.
+    /// Secrets in use, newest first.
     pub(crate) naming: Vec<NamingSecret>,
     pub(crate) key: Key,
     pub(crate) certificate: CertificateDer<'static>,
     pub(crate) anchors: TrustAnchors,
     pub(crate) validity: Validity,
     pub(crate) roster: Roster,
-    /// The roster with its signature; none while the file is from before rosters.
+    /// The roster with its signature; `None` while the file is from before rosters.
     signed_roster: Option<Vec<u8>>,
 }
 
 impl Fleet {
-    /// A new fleet. Its CA holds for [`CA_VALIDITY`]; its certificate does not tell the fleet's name.
+    /// Creates a fleet. Its CA is valid for [`CA_VALIDITY`]; the CA's certificate does not tell the fleet's name.
     pub fn create(name: FleetName, now: UnixMillis, rng: &mut impl CryptoRng) -> Result<Self, FleetError> {
         let key = Key::generate(rng);
         let secret = FleetSecret::generate(rng);
@@ -81,8 +80,8 @@ impl Fleet {
         Ok(fleet)
     }
 
-    /// A fleet around a CA that exists: its certificate, DER, and its private key, PKCS #8. The CA goes on to be what
-    /// it was; the fleet's nodes are those that `sgc fleet` makes with it.
+    /// Makes a fleet around an existing CA: its certificate, DER, and its private key, PKCS #8. The CA keeps its other
+    /// purposes; the fleet's nodes are those that `sgc fleet` makes with it.
     pub fn import(
         name: FleetName,
         certificate: CertificateDer<'static>,
@@ -91,7 +90,8 @@ impl Fleet {
         rng: &mut impl CryptoRng,
     ) -> Result<Self, FleetError> {
         let key = Key::from_pkcs8(key).ok_or(FleetError::Key)?;
-        let fields = CaFields::of(&certificate).ok_or(FleetError::NotACa("it cannot be read"))?;
+        let fields =
+            CaFields::from_certificate(&certificate).ok_or(FleetError::NotACa("it cannot be read"))?;
         if !fields.is_ca {
             return Err(FleetError::NotACa("its basic constraints do not say CA"));
         }
@@ -103,14 +103,14 @@ impl Fleet {
         }
         let mut fleet = Self::assemble(name, FleetSecret::generate(rng), key, certificate)?;
         fleet.check_ca_holds(now)?;
-        // Whether the CA's name comes out as it went in shows in what is signed in its name.
+        // A list signed in the CA's name shows whether that name survives re-encoding.
         let list = fleet.revocation_list(now)?;
         fleet.anchors.with_crl(&list, now).map_err(|_| FleetError::CaName)?;
         fleet.begin_roster(now)?;
         Ok(fleet)
     }
 
-    /// Reads what [`Fleet::to_text`] wrote, and what versions before rosters wrote.
+    /// Parses the text of [`Fleet::to_text`], and that of versions before rosters.
     pub fn parse(text: &str) -> Result<Self, FleetError> {
         let mut about: Option<Block> = None;
         let mut certificate: Option<Block> = None;
@@ -150,7 +150,7 @@ impl Fleet {
         Ok(fleet)
     }
 
-    /// Everything in one text, for a file that only its owner may read.
+    /// Returns everything in one text, for a file that only its owner may read.
     pub fn to_text(&self) -> Zeroizing<String> {
         let mut about = Writer::default();
         about.u8(if self.signed_roster.is_some() { FILE_VERSION } else { FILE_VERSION_1 });
@@ -177,7 +177,7 @@ impl Fleet {
         pem::write(&comment, &blocks)
     }
 
-    /// What a node of the roster holds besides its key: these certificates of it, and the secrets in use.
+    /// Returns a node's credentials besides its key: these certificates, and the secrets in use.
     pub fn credentials_for(&self, node: &NodeName, chain: Vec<Bytes>) -> Result<Credentials, FleetError> {
         let node = self.active_node(node)?;
         let naming: &[NamingSecret] = if node.router { &[] } else { &self.naming };
@@ -188,8 +188,8 @@ impl Fleet {
         Ok(Credentials { chain, secrets: secrets.collect() })
     }
 
-    /// Takes back every certificate of these nodes. What [`Fleet::revocation_list`] makes from then on says so.
-    /// Either all are revoked or none.
+    /// Revokes every certificate of these nodes; [`Fleet::revocation_list`] includes them from then on. Either all are
+    /// revoked or none.
     pub fn revoke(&mut self, nodes: &[NodeName], now: UnixMillis) -> Result<(), FleetError> {
         if let Some(unknown) = nodes.iter().find(|n| !self.roster.nodes.contains_key(*n)) {
             return Err(FleetError::UnknownNode { node: unknown.to_string() });
@@ -214,16 +214,16 @@ impl Fleet {
         self.roster.crl_number = now.secs().max(self.roster.crl_number.saturating_add(1));
     }
 
-    /// Takes over what `other`, another copy of this fleet's file, knows: no revocation, enrolment or incarnation of
-    /// either is lost. The order in which copies are merged does not matter.
-    pub fn merge(&mut self, other: &Self, now: UnixMillis) -> Result<Merged, FleetError> {
+    /// Merges `other`, another copy of this fleet's file: no revocation, enrolment or incarnation of either is lost.
+    /// The order in which copies are merged does not matter.
+    pub fn merge(&mut self, other: &Self, now: UnixMillis) -> Result<MergeReport, FleetError> {
         if self.key.subject_public_key_info() != other.key.subject_public_key_info()
             || self.secret.expose() != other.secret.expose()
         {
             return Err(FleetError::OtherFleet { name: other.name.clone() });
         }
         if !other.has_roster() {
-            return Ok(Merged::default());
+            return Ok(MergeReport::default());
         }
         self.begin_roster_if_none(now)?;
         let mut roster = self.roster.clone();
@@ -234,7 +234,7 @@ impl Fleet {
         if roster.revoked.len() > REVOKED_NODES_MAX {
             return Err(FleetError::TooManyRevoked);
         }
-        let merged = Merged::between(&self.roster, &roster, &self.secret);
+        let merged = MergeReport::between(&self.roster, &roster, &self.secret);
         let known: Vec<_> = self.naming.iter().chain(&other.naming).cloned().collect();
         let named = |g: &Generation| known.iter().find(|n| n.generation == g.number && hash(n) == g.hash);
         let naming: Option<Vec<_>> = roster.generations.iter().rev().map(|g| named(g).cloned()).collect();
@@ -248,11 +248,11 @@ impl Fleet {
         Ok(merged)
     }
 
-    /// Takes over the nodes that this fleet's CA has revoked by name in lists which `anchors` has. Another copy of the
-    /// fleet's file made a list that says more than this one.
-    pub fn absorb(&mut self, anchors: &TrustAnchors, now: UnixMillis) -> Result<Absorbed, FleetError> {
-        let Some(ca) = self.anchors.fingerprints().next() else { return Ok(Absorbed::default()) };
-        let mut absorbed = Absorbed::default();
+    /// Takes over the nodes that this fleet's CA has revoked by name in the lists of `anchors`: another copy of the
+    /// fleet's file made a longer list.
+    pub fn absorb(&mut self, anchors: &TrustAnchors, now: UnixMillis) -> Result<CrlReport, FleetError> {
+        let Some(ca) = self.anchors.fingerprints().next() else { return Ok(CrlReport::default()) };
+        let mut absorbed = CrlReport::default();
         let mut revoked = self.roster.revoked.clone();
         for (node, revocation) in anchors.revoked_nodes(&ca) {
             if add_revocation(&mut revoked, node, revocation) {
@@ -278,13 +278,13 @@ impl Fleet {
         self.node_by_pseudonym(pseudonym).map_or_else(|| pseudonym.short(), |n| n.name.to_string())
     }
 
-    /// The list of all revoked nodes, and of their certificates that are not over: DER, to be handed to every node.
+    /// Returns the list of all revoked nodes, and of their unexpired certificates: DER, for every node.
     pub fn revocation_list(&self, now: UnixMillis) -> Result<Vec<u8>, FleetError> {
         let serials = self.roster.revoked_serials(&self.secret);
         self.fleet_list(&self.roster.revoked, &serials, self.roster.crl_number, now)
     }
 
-    /// Signs a list of any nodes, up to which incarnation each is revoked, whatever the roster says.
+    /// Signs a list of any nodes, each with the incarnation up to which it is revoked, whatever the roster says.
     pub fn revocation_list_of_nodes(
         &self,
         revoked: &[(Pseudonym, Revocation)],
@@ -304,8 +304,7 @@ impl Fleet {
         issue::fleet_list(&self.certificate, &self.key, nodes, serials, number, now)
     }
 
-    /// Signs a list of any serial numbers, each with the time since when it is revoked, as a CA does that is not a
-    /// fleet's.
+    /// Signs a list of any serial numbers, each with the time of its revocation, as a CA without a fleet does.
     pub fn revocation_list_of(
         &self,
         revoked: &[(Serial, UnixMillis)],
@@ -315,8 +314,8 @@ impl Fleet {
         issue::revocation_list(&self.certificate, &self.key, revoked, number, now)
     }
 
-    /// Makes the next generation of the naming secret, and returns its number. Shares made by who has it are named by
-    /// it; older generations stay in use until they are retired.
+    /// Makes the next generation of the naming secret, and returns its number. Nodes that have it use it to name their
+    /// shares; older generations stay in use until they are retired.
     pub fn rotate_secret(&mut self, now: UnixMillis, rng: &mut impl CryptoRng) -> Result<u32, FleetError> {
         self.begin_roster_if_none(now)?;
         if self.naming.len() >= SECRET_GENERATIONS_MAX {
@@ -330,8 +329,8 @@ impl Fleet {
         Ok(generation)
     }
 
-    /// Takes the generations before this one out of use: what is named by them is found no more. Who nodes are, and
-    /// their groups, stay with generation 1.
+    /// Takes the generations before this one out of use: names derived from them are no longer found. Node ids and
+    /// groups stay with generation 1.
     pub fn retire_secrets(&mut self, before: u32) -> Result<(), FleetError> {
         let newest = self.newest_generation();
         if before > newest {
@@ -343,14 +342,14 @@ impl Fleet {
         self.sign_roster()
     }
 
-    /// Says which node renews certificates for the fleet. Nodes learn it when they are enrolled or renewed by file.
+    /// Sets the node that renews certificates for the fleet. Nodes learn it when they are enrolled or renewed by file.
     pub fn set_authority(&mut self, node: Option<NodeName>, now: UnixMillis) -> Result<(), FleetError> {
         self.begin_roster_if_none(now)?;
         self.roster.settings.authority = node;
         self.settings_changed(now)
     }
 
-    /// Says whether links and grants of the fleet resist quantum computers. Nodes learn it as they do the authority.
+    /// Sets whether links and grants of the fleet resist quantum computers. Nodes learn it as they do the authority.
     pub fn set_post_quantum(&mut self, on: bool, now: UnixMillis) -> Result<(), FleetError> {
         self.begin_roster_if_none(now)?;
         self.roster.settings.post_quantum = on;
@@ -363,92 +362,92 @@ impl Fleet {
         self.sign_roster()
     }
 
-    /// Its name, for people.
+    /// Returns the fleet's name, for people.
     pub fn name(&self) -> &FleetName {
         &self.name
     }
 
-    /// Its secret.
+    /// Returns the fleet secret.
     pub fn secret(&self) -> &FleetSecret {
         &self.secret
     }
 
-    /// The secrets that names are derived from, newest first.
+    /// Returns the secrets that names are derived from, newest first.
     pub fn naming_secrets(&self) -> &[NamingSecret] {
         &self.naming
     }
 
-    /// The generations of the naming secret in use and when they were made, oldest first; empty without a roster.
+    /// Returns the generations of the naming secret in use with their times, oldest first; empty without a roster.
     pub fn generations(&self) -> &[Generation] {
         &self.roster.generations
     }
 
-    /// Its CA, as the one to trust.
+    /// Returns the fleet's CA as trust anchor.
     pub fn anchors(&self) -> &TrustAnchors {
         &self.anchors
     }
 
-    /// Its CA certificate, DER.
+    /// Returns the CA certificate, DER.
     pub fn ca_certificate(&self) -> &CertificateDer<'static> {
         &self.certificate
     }
 
-    /// Last moment at which its CA holds.
+    /// Returns the last moment at which the CA is valid.
     pub fn not_after(&self) -> UnixMillis {
         self.validity.not_after
     }
 
-    /// Its nodes, by name. A fleet file from before rosters has none until it changes.
+    /// Returns the nodes, by name. A fleet file from before rosters has none until it changes.
     pub fn nodes(&self) -> impl ExactSizeIterator<Item = &RosterNode> {
         self.roster.nodes.values()
     }
 
-    /// One node.
+    /// Returns one node.
     pub fn node(&self, name: &NodeName) -> Option<&RosterNode> {
         self.roster.nodes.get(name)
     }
 
-    /// Up to which incarnation the node of that name is revoked; it need not be in the roster.
+    /// Returns the incarnation up to which the node is revoked; it need not be in the roster.
     pub fn revocation_of(&self, node: &NodeName) -> Option<Revocation> {
         self.roster.revocation_of(node, &self.secret)
     }
 
-    /// Since when a node of the roster is revoked in its present incarnation.
+    /// Returns the time at which a node of the roster was revoked in its present incarnation.
     pub fn revoked_at(&self, node: &RosterNode) -> Option<UnixMillis> {
         self.revocation_of(&node.name).filter(|r| r.covers(node.incarnation)).map(|r| r.at)
     }
 
-    /// Revoked nodes, by what certificates call them.
+    /// Returns the revoked nodes, by their pseudonyms.
     pub fn revoked_nodes(&self) -> impl ExactSizeIterator<Item = (&Pseudonym, &Revocation)> {
         self.roster.revoked.iter()
     }
 
-    /// The node that certificates call so.
+    /// Returns the node of this pseudonym.
     pub fn node_by_pseudonym(&self, pseudonym: &Pseudonym) -> Option<&RosterNode> {
         self.nodes().find(|n| self.secret.pseudonym(n.name.as_str()) == *pseudonym)
     }
 
-    /// False for a file from before rosters: nodes enrolled with it are not known.
+    /// Returns `false` for a file from before rosters: nodes enrolled with it are not known.
     pub fn has_roster(&self) -> bool {
         self.signed_roster.is_some()
     }
 
-    /// The number of its last revocation list; 0 if nothing was ever revoked.
+    /// Returns the number of the last revocation list; 0 if nothing was ever revoked.
     pub fn crl_number(&self) -> u64 {
         self.roster.crl_number
     }
 
-    /// The name of the node that renews certificates.
+    /// Returns the name of the node that renews certificates.
     pub fn authority(&self) -> Option<&NodeName> {
         self.roster.settings.authority.as_ref()
     }
 
-    /// True if links and grants of the fleet resist quantum computers.
+    /// Returns `true` if links and grants of the fleet resist quantum computers.
     pub fn post_quantum(&self) -> bool {
         self.roster.settings.post_quantum
     }
 
-    /// Who the node of that name is.
+    /// Returns the id of the node of that name.
     pub fn node_id_of(&self, node: &NodeName) -> NodeId {
         node_id(&self.key.subject_public_key_info(), &self.secret.pseudonym(node.as_str()))
     }
@@ -467,8 +466,8 @@ impl Fleet {
         if now.secs() > not_after.secs() { Err(FleetError::CaExpired { not_after, now }) } else { Ok(()) }
     }
 
-    /// Notes that a node of the roster is handed the secrets in use. True if that is to be kept: they are news to it, or
-    /// it has not been seen for [`SEEN_STEP`].
+    /// Notes that a node of the roster gets the secrets in use. Returns `true` if the file has to be saved: the secrets
+    /// are new to the node, or it has not been seen for [`SEEN_STEP`].
     pub fn note_handed(&mut self, node: &NodeName, now: UnixMillis) -> Result<bool, FleetError> {
         let newest = self.newest_generation();
         let Some(node) = self.roster.nodes.get_mut(node) else { return Ok(false) };
@@ -484,8 +483,8 @@ impl Fleet {
         Ok(true)
     }
 
-    /// Members that would be lost if the generations before this one were retired: they have a certificate that holds,
-    /// were seen recently ([`SEEN_RECENTLY`]) or have an unknown time of it, and were handed no newer generation.
+    /// Returns members that would be lost if the generations before this one were retired: they have a valid
+    /// certificate, were seen recently ([`SEEN_RECENTLY`]) or at an unknown time, and were handed no newer generation.
     pub fn lacking(&self, before: u32, now: UnixMillis) -> impl Iterator<Item = &RosterNode> {
         let recently = UnixMillis(now.0.saturating_sub(SEEN_RECENTLY.as_millis() as u64));
         self.nodes().filter(move |node| {
@@ -558,7 +557,7 @@ impl Fleet {
         certificate: CertificateDer<'static>,
     ) -> Result<Self, FleetError> {
         let anchors = TrustAnchors::new([certificate.clone()]).map_err(FleetError::Certificate)?;
-        let validity = Validity::of(&certificate).ok_or(FleetError::KeyMismatch)?;
+        let validity = Validity::from_certificate(&certificate).ok_or(FleetError::KeyMismatch)?;
         let is_of_key = webpki::EndEntityCert::try_from(&certificate)
             .is_ok_and(|c| c.subject_public_key_info().as_ref() == key.subject_public_key_info());
         if !is_of_key {
@@ -570,25 +569,25 @@ impl Fleet {
     }
 }
 
-/// The gain of a copy of a fleet's file by a merge.
+/// Changes of a copy of a fleet's file by a merge.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Merged {
-    /// Nodes of which more is revoked now: their names, or the beginnings of their pseudonyms.
+pub struct MergeReport {
+    /// Nodes with further revocations: their names, or the beginnings of their pseudonyms.
     pub revoked: Vec<String>,
-    /// Nodes that it did not know.
+    /// Nodes that are new to the copy.
     pub enrolled: Vec<NodeName>,
-    /// Nodes of which it has other groups, another role, incarnation, or more certificates now.
+    /// Nodes that have other groups, another role or incarnation, or more certificates now.
     pub changed: Vec<NodeName>,
-    /// Generations of the secret that it did not have.
+    /// Generations of the secret that are new to the copy.
     pub generations: Vec<u32>,
-    /// Generations that both copies made, each with a secret of its own, and of which it has the other one's now: nodes
-    /// that have its own one have to be renewed.
+    /// Generations that both copies made, each with its own secret, where the other copy's secret replaces this one's:
+    /// nodes with the replaced secret have to be renewed.
     pub replaced: Vec<u32>,
-    /// True if nodes are told something else now when they are enrolled or renewed.
+    /// Whether nodes get other settings now when they are enrolled or renewed.
     pub settings: bool,
 }
 
-impl Merged {
+impl MergeReport {
     fn between(before: &Roster, after: &Roster, secret: &FleetSecret) -> Self {
         let named: BTreeMap<_, _> = after.nodes.keys().map(|n| (secret.pseudonym(n.as_str()), n)).collect();
         let name = |node: &Pseudonym| named.get(node).map_or_else(|| node.short(), |n| n.to_string());
@@ -613,12 +612,12 @@ impl Merged {
     }
 }
 
-/// News that revocation lists brought to a copy of a fleet's file.
+/// News of revocation lists for a copy of a fleet's file.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Absorbed {
-    /// Nodes of which more is revoked now: their names, or the beginnings of their pseudonyms.
+pub struct CrlReport {
+    /// Nodes with further revocations: their names, or the beginnings of their pseudonyms.
     pub revoked: Vec<String>,
-    /// True if another copy made a list later than this one: what else was done with it is unknown here.
+    /// Whether another copy made a list later than this one: its other changes are unknown here.
     pub is_behind: bool,
 }
 

@@ -1,4 +1,4 @@
-//! Everything that can be wrong with a fleet or with what is asked of it: one variant per cause.
+//! Errors of fleets and of requests to them: one variant per cause.
 
 use std::fmt;
 
@@ -12,7 +12,7 @@ use crate::roster::ROSTER_NODES_MAX;
 use crate::secret::{NAMING_BLOCK, SECRET_BLOCK, SECRET_BYTES};
 use crate::verify::{AnchorError, GROUPS_MAX};
 
-/// Why a fleet cannot be made, read, or enrol a node.
+/// The reason why a fleet cannot be made or read, or cannot enrol a node.
 #[derive(Debug, thiserror::Error)]
 pub enum FleetError {
     /// The file is not a sequence of blocks.
@@ -30,7 +30,7 @@ pub enum FleetError {
     /// The block that names the fleet is broken.
     #[error("block \"{FLEET_BLOCK}\" is broken")]
     About(#[source] DecodeError),
-    /// The fleet's name is none.
+    /// The fleet's name is invalid.
     #[error("block \"{FLEET_BLOCK}\" holds an illegal name")]
     Name(#[source] LabelError),
     /// The CA certificate is broken.
@@ -41,7 +41,7 @@ pub enum FleetError {
         "block \"{KEY_BLOCK}\" is no key in PKCS #8 that is P-256, P-384, Ed25519 or RSA of 2048 bits and more"
     )]
     Key,
-    /// The key is not that of the certificate.
+    /// The key does not belong to the certificate.
     #[error("the key and the certificate in the fleet file do not belong together")]
     KeyMismatch,
     /// The secret has a wrong length.
@@ -58,7 +58,7 @@ pub enum FleetError {
         "block \"{ROSTER_BLOCK}\" was altered: its signature is not the CA's; restore the file from a copy"
     )]
     RosterSignature,
-    /// The roster would be longer than what is read.
+    /// The roster would be too long.
     #[error("the roster would have {bytes} bytes, at most {ROSTER_BYTES_MAX} are kept: make a second fleet")]
     RosterFull {
         /// Its length.
@@ -81,15 +81,15 @@ pub enum FleetError {
     /// No such node.
     #[error("the fleet's roster has no node {node}: see `sgc fleet list`")]
     UnknownNode {
-        /// Which was asked for.
+        /// The requested name.
         node: String,
     },
     /// The node is revoked.
     #[error("node {node} was revoked at {at}: `sgc fleet enroll {node} --again` makes it a node anew")]
     NodeRevoked {
-        /// Which.
+        /// The node.
         node: NodeName,
-        /// Since when.
+        /// Time of the revocation.
         at: UnixMillis,
     },
     /// A request for a certificate that cannot be used.
@@ -116,7 +116,7 @@ pub enum FleetError {
     /// A certificate that is no CA's.
     #[error("this certificate is not that of a CA that may sign certificates and revocation lists: {0}")]
     NotACa(&'static str),
-    /// The CA is over.
+    /// The CA has expired.
     #[error(
         "the fleet's CA expired at {not_after} and the clock here says {now}: create a new fleet, or set the clock"
     )]
@@ -126,10 +126,10 @@ pub enum FleetError {
         /// The time of the request.
         now: UnixMillis,
     },
-    /// Too many groups are asked for.
+    /// The request has too many groups.
     #[error("a node is in at most {GROUPS_MAX} groups, {groups} are asked for")]
     TooManyGroups {
-        /// How many.
+        /// Their number.
         groups: usize,
     },
     /// The time, or the time plus the validity, is no date that certificates can hold.

@@ -9,7 +9,7 @@ use zeroize::Zeroizing;
 
 use crate::{hpke, xwing};
 
-/// Why a grant could not be sealed or opened.
+/// The reason why a grant could not be sealed or opened.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum GrantError {
     /// The request's reply key is neither an X25519 nor an X-Wing public key.
@@ -18,28 +18,28 @@ pub enum GrantError {
     /// The seal does not verify: altered, or for another request.
     #[error("the grant was not sealed to this request")]
     NotForUs,
-    /// What was sealed is no grant.
+    /// The sealed content is no grant.
     #[error("the grant's content is malformed: {0}")]
     Content(#[from] DecodeError),
 }
 
-/// How the secret of a grant travels. The one who asks chooses; the owner answers in kind.
+/// Key encapsulation of a grant. The requester chooses; the owner answers in kind.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Kem {
     /// X25519.
     #[default]
     X25519,
-    /// X-Wing: X25519 and ML-KEM-768, which also stands against quantum computers.
+    /// X-Wing: X25519 and ML-KEM-768, which also withstands quantum computers.
     XWing,
 }
 
 impl Kem {
-    /// What a node of a fleet with or without post-quantum cryptography asks with.
+    /// Returns the choice of a fleet with or without post-quantum cryptography.
     pub fn for_fleet(post_quantum: bool) -> Self {
         if post_quantum { Self::XWing } else { Self::X25519 }
     }
 
-    /// Length of a reply key, by which a request says what it chose.
+    /// Returns the length of a reply key, by which a request shows its choice.
     pub fn reply_key_bytes(self) -> usize {
         match self {
             Self::X25519 => 32,
@@ -47,7 +47,7 @@ impl Kem {
         }
     }
 
-    fn of_reply_key(key: &[u8]) -> Option<Self> {
+    fn from_reply_key(key: &[u8]) -> Option<Self> {
         [Self::X25519, Self::XWing].into_iter().find(|kem| kem.reply_key_bytes() == key.len())
     }
 }
@@ -80,8 +80,8 @@ impl ReplyKey {
         }
     }
 
-    /// A key that is known beforehand, for tests and vectors; joins make fresh ones. X25519: its 32 bytes. X-Wing: the
-    /// decapsulation key of ML-KEM-768 (FIPS 203, 7.1; 2400 bytes), then the 32 of X25519. `None` if it is no such key.
+    /// Reads a given key, for tests and vectors; joins make fresh ones. X25519: its 32 bytes. X-Wing: the decapsulation
+    /// key of ML-KEM-768 (FIPS 203, 7.1; 2400 bytes), then the 32 of X25519. `None` if it is no such key.
     pub fn from_private(kem: Kem, private: &[u8]) -> Option<Self> {
         match kem {
             Kem::X25519 => {
@@ -96,7 +96,7 @@ impl ReplyKey {
         }
     }
 
-    /// The public key, as it goes into the request.
+    /// Returns the public key, as it goes into the request.
     pub fn public(&self) -> &Bytes {
         &self.public
     }
@@ -131,7 +131,8 @@ impl std::fmt::Debug for ReplyKey {
     }
 }
 
-/// Seals a grant's content to a request, in the kind of its reply key: the encapsulated key and the sealed content.
+/// Seals a grant's content to a request, in the kind of its reply key. Returns the encapsulated key and the sealed
+/// content.
 pub fn seal_grant(
     reply_key: &[u8],
     name: &Name,
@@ -141,7 +142,7 @@ pub fn seal_grant(
 ) -> Result<(Bytes, Bytes), GrantError> {
     let plain = Zeroizing::new(content.to_vec());
     let (info, aad) = (info(name, sink), serial.to_be_bytes());
-    match Kem::of_reply_key(reply_key).ok_or(GrantError::ReplyKey)? {
+    match Kem::from_reply_key(reply_key).ok_or(GrantError::ReplyKey)? {
         Kem::X25519 => {
             let (enc, sealed) = HPKE
                 .seal(&info, &aad, &plain, &HpkePublicKey(reply_key.to_vec()))

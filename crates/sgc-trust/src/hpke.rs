@@ -1,7 +1,7 @@
 //! HPKE (RFC 9180) in base mode, for one message, over a key encapsulation that rustls' HPKE does not have.
 //!
-//! It begins where encapsulation ended: with a shared secret. HKDF-SHA256 derives from it; every output is of one block
-//! of the hash at most. No exporter, no sequence of messages.
+//! It begins after the encapsulation, with a shared secret, and derives with HKDF-SHA256; every output is at most one
+//! block of the hash. No exporter, no sequence of messages.
 
 use aws_lc_rs::aead::{self, Aad, LessSafeKey, NONCE_LEN, Nonce, UnboundKey};
 use aws_lc_rs::error::Unspecified;
@@ -11,16 +11,16 @@ use zeroize::Zeroizing;
 const MODE_BASE: u8 = 0;
 const KDF_HKDF_SHA256: u16 = 1;
 const VERSION: &[u8] = b"HPKE-v1";
-/// Of both AEADs that are known here.
+/// Key length of both AEADs.
 const KEY_BYTES: usize = 32;
 
-/// How a context is made.
+/// The algorithms of a context.
 pub(crate) struct Suite {
     /// The key encapsulation's number in HPKE's registry.
     pub(crate) kem: u16,
-    /// The AEAD's; its key has 32 bytes.
+    /// The AEAD's number; its key has 32 bytes.
     pub(crate) aead: u16,
-    /// And itself.
+    /// The AEAD.
     pub(crate) cipher: &'static aead::Algorithm,
 }
 
@@ -34,13 +34,13 @@ pub(crate) struct Context {
 }
 
 impl Context {
-    /// RFC 9180, 5.1, without a pre-shared key.
+    /// Derives a context: RFC 9180, 5.1, without a pre-shared key.
     pub(crate) fn new(suite: &Suite, secret: &[u8; 32], info: &[u8]) -> Result<Self, Unspecified> {
         let Schedule { key, nonce } = Schedule::new(suite, secret, info)?;
         Ok(Self { key: LessSafeKey::new(UnboundKey::new(suite.cipher, &key[..])?), nonce })
     }
 
-    /// Seals the one message. By value: a second under the same nonce would give both away.
+    /// Seals the one message. It takes `self` by value: a second message under the same nonce would reveal both.
     pub(crate) fn seal(self, aad: &[u8], plain: &[u8]) -> Result<Vec<u8>, Unspecified> {
         let mut sealed = Vec::with_capacity(plain.len() + self.key.algorithm().tag_len());
         sealed.extend_from_slice(plain);
@@ -68,7 +68,7 @@ impl Schedule {
     fn new(suite: &Suite, secret: &[u8; 32], info: &[u8]) -> Result<Self, Unspecified> {
         let [kem, kdf, aead] = [suite.kem, KDF_HKDF_SHA256, suite.aead].map(u16::to_be_bytes);
         let id = [b"HPKE".as_slice(), &kem, &kdf, &aead].concat();
-        // LabeledExtract without a salt, of what is no secret.
+        // LabeledExtract without a salt, of public values.
         let hash = |label: &[u8], value: &[u8]| {
             let key = hmac::Key::new(hmac::HMAC_SHA256, &[0; 32]);
             hmac::sign(&key, &[VERSION, &id, label, value].concat())
@@ -117,7 +117,7 @@ mod tests {
         assert_eq!(context().open(&vector["aad"], &vector["sealed"]).unwrap()[..], vector["plain"][..]);
     }
 
-    /// The same key schedule over the other KEM: what rustls seals opens here.
+    /// The same key schedule over the other KEM: it opens the output of rustls.
     #[test]
     fn it_agrees_with_rustls() {
         use aws_lc_rs::agreement::{self, UnparsedPublicKey, X25519};

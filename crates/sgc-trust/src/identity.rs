@@ -1,9 +1,8 @@
-//! What one node holds to be itself: certificate chain, private key, the CAs it trusts, and (not for routers) the
-//! secrets of its fleet; and the one text file in which they are kept.
+//! One node's identity: certificate chain, private key, the CAs it trusts, and (not for routers) the secrets of its
+//! fleet; and the one text file in which they are kept.
 //!
-//! It does not read the file (that, and its permissions, is the node's) and knows no clock: whether the
-//! certificate still holds is for its user to ask. No output of this module but [`Identity::to_text`] holds a
-//! secret.
+//! This module does not read the file (the node does, and checks its permissions) and knows no clock: its user checks
+//! whether the certificate is still valid. Only the output of [`Identity::to_text`] holds a secret.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -28,7 +27,7 @@ use crate::secret::{FleetSecret, NAMING_BLOCK, NamingSecret};
 use crate::verify::{AnchorError, CertError, TrustAnchors, VerifiedPeer, node_id, signature_input};
 use crate::x509::Validity;
 
-/// What an identity signs with, by the kind of its key; [`VerifiedPeer::verify_signature`] has the same list.
+/// Signature schemes of an identity, by the kind of its key; [`VerifiedPeer::verify_signature`] has the same list.
 const SCHEMES: [SignatureScheme; 4] = [
     SignatureScheme::ECDSA_NISTP256_SHA256,
     SignatureScheme::ECDSA_NISTP384_SHA384,
@@ -43,7 +42,7 @@ pub struct Identity {
     own: VerifiedPeer,
 }
 
-/// What an identity consists of.
+/// The parts of an identity.
 #[derive(Clone)]
 struct IdentityParts {
     member: Membership,
@@ -52,15 +51,15 @@ struct IdentityParts {
 }
 
 impl Identity {
-    /// Reads what [`Identity::to_text`] wrote. The parts have to fit together; whether the certificate holds
-    /// now is not asked.
+    /// Parses the text of [`Identity::to_text`]. The parts have to fit together; it does not check whether the
+    /// certificate is valid now.
     pub fn parse(text: &str) -> Result<Self, IdentityError> {
         let FileParts { member, key, reset_key } = member::read(text)?;
         let key = key.ok_or(IdentityError::Missing(KEY_BLOCK))?;
         Self::assemble(IdentityParts { member, key, reset_key })
     }
 
-    /// The identity of a node that made its key itself (PKCS #8) and was answered with the rest.
+    /// Makes the identity of a node from its own key (PKCS #8) and the fleet's answer.
     pub fn join(member: Membership, key: &[u8], rng: &mut impl CryptoRng) -> Result<Self, IdentityError> {
         let mut reset_key = Zeroizing::new([0; 32]);
         rng.fill_bytes(&mut *reset_key);
@@ -68,9 +67,9 @@ impl Identity {
         Self::assemble(IdentityParts { member, key, reset_key: Some(reset_key) })
     }
 
-    /// An identity from a certificate of an existing PKI, made for a request as [`Identity::csr`] or
-    /// `sgc fleet request` writes it. Without a secret it is a router's. The certificate has to say what was asked for
-    /// and no more: whoever signed it may not know what its names mean.
+    /// Makes an identity from a certificate of an existing PKI, made for a request of [`Identity::csr`] or `sgc fleet
+    /// request`. Without a secret it is a router's. The certificate has to name exactly the requested names and role:
+    /// its signer may not know their meaning.
     pub fn import(import: Import, rng: &mut impl CryptoRng) -> Result<Self, IdentityError> {
         let Import { node, fleet, chain, key, cas, secret, groups, may_route } = import;
         let tag = |secret: &FleetSecret, group: &GroupName| secret.group_tag(group.as_str());
@@ -100,7 +99,7 @@ impl Identity {
         Ok(identity)
     }
 
-    /// Everything in one text, for a file that only its owner may read.
+    /// Returns everything in one text, for a file that only its owner may read.
     pub fn to_text(&self) -> Zeroizing<String> {
         let parts = &self.parts;
         let head = "# SGC identity. KEEP IT SECRET: whoever holds this file is this node.\n";
@@ -109,36 +108,36 @@ impl Identity {
         member::write(&parts.member, &comment, Some(&parts.key), reset_key)
     }
 
-    /// The node's name in its fleet.
+    /// Returns the node's name in its fleet.
     pub fn node_name(&self) -> &NodeName {
         &self.parts.member.node
     }
 
-    /// The fleet's name, for people.
+    /// Returns the fleet's name, for people.
     pub fn fleet_name(&self) -> &FleetName {
         &self.parts.member.fleet
     }
 
-    /// The certificate chain, leaf first.
+    /// Returns the certificate chain, leaf first.
     pub fn chain(&self) -> &[CertificateDer<'static>] {
         &self.parts.member.chain
     }
 
-    /// The CAs that this node trusts.
+    /// Returns the CAs that this node trusts.
     pub fn anchors(&self) -> &TrustAnchors {
         &self.parts.member.anchors
     }
 
-    /// The same node with other CAs or newer revocation lists. Nothing of itself is checked against them: a node
-    /// may find out so that it is revoked.
+    /// Returns the same node with other CAs or newer revocation lists. It is not checked against them: this way a node
+    /// may learn that it is revoked.
     pub fn with_anchors(&self, anchors: TrustAnchors) -> Self {
         let mut parts = self.parts.clone();
         parts.member.anchors = anchors;
         Self { parts, certified: Arc::clone(&self.certified), own: self.own.clone() }
     }
 
-    /// The same node with the certificates and secrets that its fleet's authority sent for [`Identity::csr`]. Key,
-    /// CAs and name stay; everything else has to fit them.
+    /// Returns the same node with the certificates and secrets that its fleet's authority sent for [`Identity::csr`].
+    /// Key, CAs and name stay; everything else has to fit them.
     pub fn with_credentials(&self, credentials: &Credentials) -> Result<Self, IdentityError> {
         let mut parts = self.parts.clone();
         let chain = credentials.chain.iter().map(|c| CertificateDer::from(c.to_vec()));
@@ -158,15 +157,15 @@ impl Identity {
         if new.node_id() != self.node_id() {
             return Err(IdentityError::NameMismatch { node: new.parts.member.node });
         }
-        // Another copy of the fleet's file is behind; what it makes may be revoked already.
+        // Another copy of the fleet's file is behind; its certificates may be revoked already.
         if new.own.incarnation < self.own.incarnation {
             return Err(IdentityError::OldIncarnation);
         }
         Ok(new)
     }
 
-    /// The same node and key with everything else anew, as a fleet answered [`Identity::csr`]. CAs that it trusts
-    /// besides stay trusted.
+    /// Returns the same node and key with everything else new, as a fleet answered [`Identity::csr`]. Further CAs stay
+    /// trusted.
     pub fn with_membership(&self, member: Membership) -> Result<Self, IdentityError> {
         let more = member.anchors.certificates().cloned().collect::<Vec<_>>();
         let anchors = self.anchors().with_anchors(more).map_err(IdentityError::Ca)?;
@@ -175,14 +174,14 @@ impl Identity {
         if new.node_id() != self.node_id() {
             return Err(IdentityError::NameMismatch { node: new.parts.member.node });
         }
-        // Another copy of the fleet's file is behind; what it makes may be revoked already.
+        // Another copy of the fleet's file is behind; its certificates may be revoked already.
         if new.own.incarnation < self.own.incarnation {
             return Err(IdentityError::OldIncarnation);
         }
         Ok(new)
     }
 
-    /// A request for another certificate of the same node and key, DER (PKCS #10).
+    /// Returns a request for another certificate of the same node and key, DER (PKCS #10).
     pub fn csr(&self) -> Vec<u8> {
         let own = &self.own;
         Key::from_pkcs8(&self.parts.key)
@@ -190,22 +189,22 @@ impl Identity {
             .expect("`assemble` made a signature with this key already")
     }
 
-    /// The secrets that names are derived from, newest first; none for a router. Shares made now use the first.
+    /// Returns the secrets that names are derived from, newest first; none for a router. New shares use the first.
     pub fn naming_secrets(&self) -> &[NamingSecret] {
         &self.parts.member.naming
     }
 
-    /// The node that renews certificates for its fleet, if there is one.
+    /// Returns the node that renews certificates for the fleet, if there is one.
     pub fn authority(&self) -> Option<NodeId> {
         self.parts.member.authority
     }
 
-    /// True if its fleet wants links and grants that a quantum computer does not open later.
+    /// Returns `true` if the fleet wants links and grants that a quantum computer does not open later.
     pub fn post_quantum(&self) -> bool {
         self.parts.member.post_quantum
     }
 
-    /// What its key keeps it from, for people: one sentence each.
+    /// Returns the transports that the key rules out, for people: one sentence each.
     pub fn transport_notes(&self) -> Vec<&'static str> {
         let is_ecdsa = matches!(
             self.certified.key.choose_scheme(&SCHEMES).map(|s| s.scheme()),
@@ -217,48 +216,48 @@ impl Identity {
         }
     }
 
-    /// The fleet secret; a router has none.
+    /// Returns the fleet secret; a router has none.
     pub fn fleet_secret(&self) -> Option<&FleetSecret> {
         self.parts.member.secret.as_ref()
     }
 
-    /// Chain and private key for TLS. The key can sign and cannot be read.
+    /// Returns chain and private key for TLS. The key can sign and cannot be read.
     pub fn certified_key(&self) -> Arc<CertifiedKey> {
         Arc::clone(&self.certified)
     }
 
-    /// A random key of this node by which peers learn at once that it restarted (`sgc-transport` derives stateless
+    /// Returns a random key by which peers learn at once that this node restarted (`sgc-transport` derives stateless
     /// resets from it). It protects nothing else.
     pub fn reset_key(&self) -> Option<&[u8; 32]> {
         self.parts.reset_key.as_deref()
     }
 
-    /// What others see of this node once they have verified it.
+    /// Returns this node as others see it after verification.
     pub fn as_peer(&self) -> &VerifiedPeer {
         &self.own
     }
 
-    /// Who this node is.
+    /// Returns the node id.
     pub fn node_id(&self) -> NodeId {
         self.own.node_id
     }
 
-    /// What its certificate calls it.
+    /// Returns the pseudonym in the certificate.
     pub fn pseudonym(&self) -> Pseudonym {
         self.own.pseudonym
     }
 
-    /// Its groups.
+    /// Returns the groups.
     pub fn groups(&self) -> &[GroupTag] {
         &self.own.groups
     }
 
-    /// Last moment at which its certificate holds.
+    /// Returns the last moment at which the certificate is valid.
     pub fn not_after(&self) -> UnixMillis {
         self.own.not_after
     }
 
-    /// Who the member of this fleet with that name is; `None` without the fleet secret.
+    /// Returns the id of the member of this fleet with that name; `None` without the fleet secret.
     pub fn node_id_of(&self, node_name: &str) -> Option<NodeId> {
         let spki = self.parts.member.anchors.ca_spki(&self.own.ca)?;
         Some(node_id(spki, &self.fleet_secret()?.pseudonym(node_name)))
@@ -276,15 +275,15 @@ impl Identity {
     /// Checks that the parts fit together.
     fn assemble(parts: IdentityParts) -> Result<Self, IdentityError> {
         let member = &parts.member;
-        // What cannot sign requests cannot renew itself later.
+        // A key that cannot sign requests could not be renewed later.
         let stored = Key::from_pkcs8(&parts.key).ok_or(IdentityError::Key)?;
         let pkcs8 = PrivateKeyDer::Pkcs8(PrivatePkcs8KeyDer::from(parts.key.as_slice()));
         let key =
             rustls::crypto::aws_lc_rs::sign::any_supported_type(&pkcs8).map_err(|_| IdentityError::Key)?;
         check_signs(&*key)?;
         let leaf = member.chain.first().ok_or(IdentityError::Missing(CHAIN_BLOCK))?;
-        // At the chain's own beginning: whether it holds now is another question.
-        let validity = Validity::of(leaf).ok_or_else(|| {
+        // Checked at the chain's own beginning: its validity now is another question.
+        let validity = Validity::from_certificate(leaf).ok_or_else(|| {
             IdentityError::Chain(CertError::Malformed("its validity cannot be read".into()))
         })?;
         let own = member.anchors.verify(&member.chain, validity.not_before).map_err(IdentityError::Chain)?;
@@ -314,7 +313,7 @@ impl fmt::Debug for Identity {
     }
 }
 
-/// What [`Identity::import`] takes.
+/// Input of [`Identity::import`].
 pub struct Import {
     /// The node's name.
     pub node: NodeName,
@@ -324,17 +323,17 @@ pub struct Import {
     pub chain: Vec<CertificateDer<'static>>,
     /// Its private key, PKCS #8: P-256, P-384, Ed25519 or RSA.
     pub key: Zeroizing<Vec<u8>>,
-    /// The CAs that it is to trust, its own among them.
+    /// The CAs that the node has to trust, its own among them.
     pub cas: Vec<CertificateDer<'static>>,
     /// The fleet's secret; the certificate's pseudonym has to be the node's under it.
     pub secret: Option<FleetSecret>,
-    /// The groups that it is to be in; none without the secret.
+    /// The node's groups; none without the secret.
     pub groups: Vec<GroupName>,
-    /// True for a member that is to route for others as well. A router may in any case.
+    /// Whether a member routes for others as well. A router may in any case.
     pub may_route: bool,
 }
 
-/// Why a text is no identity.
+/// The reason why a text is no identity.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum IdentityError {
     /// The file is not a sequence of blocks.
@@ -352,7 +351,7 @@ pub enum IdentityError {
     /// The block that names the node is broken.
     #[error("block \"{ABOUT_BLOCK}\" is broken")]
     About(#[source] DecodeError),
-    /// A name in it is none.
+    /// An invalid name.
     #[error("block \"{ABOUT_BLOCK}\" holds an illegal name")]
     Name(#[source] LabelError),
     /// A CA certificate is broken.
@@ -364,7 +363,7 @@ pub enum IdentityError {
     /// The private key is broken or of a kind that is not supported.
     #[error("block \"{KEY_BLOCK}\" is no private key of a supported kind in PKCS #8")]
     Key,
-    /// The key is not that of the certificate.
+    /// The key does not belong to the certificate.
     #[error("the private key and the certificate in the identity file do not belong together")]
     KeyMismatch,
     /// A secret has a wrong length.
@@ -387,10 +386,10 @@ pub enum IdentityError {
          an old copy, `sgc fleet merge` brings it up to date"
     )]
     OldIncarnation,
-    /// A private key where none belongs.
+    /// A private key in a file that must not have one.
     #[error("this is an identity with its private key, not an answer to a request for one")]
     HasKey,
-    /// The certificate lets the node route, and nobody asked for it.
+    /// The certificate lets the node route, which was not requested.
     #[error(
         "the certificate lets the node route for others (URI sgc:role:router), which was not asked for: `--may-route` if \
          it is meant, or else have the CA sign the request again with reviewed extensions (`sgc fleet extensions`)"
@@ -405,16 +404,16 @@ pub enum IdentityError {
     /// The certificate does not let the node route.
     #[error("the certificate does not let the node route for others: it lacks the URI sgc:role:router")]
     MissingRole,
-    /// The certificate's groups are not those that were asked for.
+    /// The certificate's groups differ from the requested ones.
     #[error(
         "the certificate's groups are not those of `--group`: it has {unasked} that were not asked for, and lacks \
          {missing}; name them all, or have the CA sign the request again with reviewed extensions (`sgc fleet \
          extensions`)"
     )]
     OtherGroups {
-        /// Groups of the certificate that were not asked for.
+        /// Number of groups of the certificate that were not requested.
         unasked: usize,
-        /// Groups that the certificate lacks.
+        /// Number of groups that the certificate lacks.
         missing: usize,
     },
     /// The certificate is for a node of another name, or the secret is another fleet's.

@@ -1,6 +1,6 @@
-//! Makes what a CA signs: certificates of nodes, revocation lists; and reads requests for certificates.
+//! Makes everything that a CA signs: certificates of nodes and revocation lists. Reads requests for certificates.
 //!
-//! It keeps nothing and decides nothing: who gets what is [`crate::Fleet`]'s to know.
+//! This module keeps no state and decides nothing: [`crate::Fleet`] decides who gets which certificate.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -30,11 +30,11 @@ use crate::secret::FleetSecret;
 use crate::verify::{CHAIN_ALGORITHMS, GROUP_URI, INCARNATION_URI, NODE_URI, ROUTER_URI, sha256};
 use crate::x509::{CaFields, ListFields, RequestFields, RevokedNodeFields, Validity};
 
-/// The year 9000: what certificates can say ends a little later.
+/// The year 9000: the times of certificates end a little later.
 const TIME_MAX: UnixMillis = UnixMillis(221_845_392_000_000);
 
-/// In whole seconds, as certificates count. A macro since the type of the result belongs to a crate (`time`) that
-/// is not a dependency of this one.
+/// A time in whole seconds, as in certificates. A macro, because the type of the result belongs to a crate (`time`)
+/// that is not a dependency of this one.
 macro_rules! date_time {
     ($millis:expr) => {
         rcgen::date_time_ymd(1970, 1, 1) + Duration::from_secs($millis.secs())
@@ -53,10 +53,10 @@ const _: () = assert!(
 );
 const _: () = assert!(LIST_HEAD_BYTES_MAX + LIST_NODES_MAX * RevokedNodeFields::BYTES_MAX <= CRL_BYTES_MAX);
 
-/// A certificate that takes revocation is known by this; big-endian, without leading zeros.
+/// The serial number by which a certificate is revoked; big-endian, without leading zeros.
 pub(crate) type Serial = Arc<[u8]>;
 
-/// What a node's certificate is to say.
+/// Content of a node's certificate.
 pub(crate) struct Leaf {
     pub(crate) pseudonym: Pseudonym,
     pub(crate) groups: Vec<GroupTag>,
@@ -79,7 +79,7 @@ impl Leaf {
         Ok(params)
     }
 
-    /// A certificate for `key`, and its serial number.
+    /// Makes a certificate for `key`, and returns it with its serial number.
     pub(crate) fn sign(
         &self,
         key: &impl PublicKeyData,
@@ -90,7 +90,7 @@ impl Leaf {
     ) -> Result<CertificateDer<'static>, FleetError> {
         let mut params = self.params()?;
         params.serial_number = Some(serial(rng));
-        // Not before the CA and not past it: a certificate that outlives its CA is a surprise for later.
+        // The validity lies within the CA's: a certificate that outlives its CA would fail unexpectedly.
         params.not_before = date_time!(before(self.now, CLOCK_SKEW).max(validity.not_before));
         params.not_after = date_time!(after(self.now, self.valid)?.min(validity.not_after));
         let issuer = issuer_params(ca)?;
@@ -99,8 +99,8 @@ impl Leaf {
     }
 }
 
-/// A certificate of `key` for a new fleet. Its subject is made from its key: two CAs never share one, so that a
-/// certificate of another fleet is told apart from a forged one, and nothing is said of the fleet.
+/// Makes the CA certificate of a new fleet from `key`. Its subject derives from its key: two CAs never share one, so
+/// that a certificate of another fleet is told apart from a forged one, and the subject reveals nothing of the fleet.
 pub(crate) fn self_signed_ca(
     key: &Key,
     now: UnixMillis,
@@ -118,8 +118,8 @@ pub(crate) fn self_signed_ca(
     Ok(params.self_signed(key).map_err(FleetError::making)?.into())
 }
 
-/// A fleet's revocation list, DER: it revokes nodes, the last ones, for nodes of SGC, and as many of the serial numbers as
-/// there is room for, the last ones first, for everyone else.
+/// Makes a fleet's revocation list, DER. For nodes of SGC it revokes nodes, the last ones first. For everyone else it
+/// revokes as many serial numbers as fit, the last ones first.
 pub(crate) fn fleet_list(
     ca: &CertificateDer<'_>,
     ca_key: &Key,
@@ -143,13 +143,13 @@ pub(crate) fn fleet_list(
         revoked_secs: revocation.at.secs(),
     }));
     let unreadable = || FleetError::Making("its own revocation list cannot be read".into());
-    let algorithm = ListFields::of(&list).ok_or_else(unreadable)?.algorithm;
+    let algorithm = ListFields::from_list(&list).ok_or_else(unreadable)?.algorithm;
     let tbs = ListFields::tbs_with_revoked_nodes(&list, &value).ok_or_else(unreadable)?;
     let signature = ca_key.sign(&tbs).map_err(FleetError::making)?;
     Ok(ListFields::signed(&tbs, algorithm, &signature))
 }
 
-/// A revocation list that names serial numbers, DER.
+/// Makes a revocation list of serial numbers, DER.
 pub(crate) fn revocation_list(
     ca: &CertificateDer<'_>,
     ca_key: &Key,
@@ -177,7 +177,7 @@ pub(crate) fn revocation_list(
     Ok(list.der().to_vec())
 }
 
-/// A request for a certificate that names this node, DER (PKCS #10), signed by its key.
+/// Makes a request for a certificate that names this node, DER (PKCS #10), signed by its key.
 pub(crate) fn signing_request(
     key: &Key,
     pseudonym: Option<&Pseudonym>,
@@ -193,15 +193,15 @@ pub(crate) fn signing_request(
     Some(params.serialize_request(key).ok()?.der().to_vec())
 }
 
-/// A key that its node makes for itself, and the request for a certificate that goes to the fleet, or to another CA.
+/// A key that its node makes for itself, and the request for a certificate to the fleet or another CA.
 pub struct KeyRequest {
     key: Key,
     csr: Vec<u8>,
 }
 
 impl KeyRequest {
-    /// A new P-256 key. With a pseudonym the request names the node, so that a CA that knows nothing of SGC only has
-    /// to copy its subject alternative names.
+    /// Makes a new P-256 key. With a pseudonym the request names the node, so that a CA that knows nothing of SGC only
+    /// has to copy its subject alternative names.
     pub fn generate(pseudonym: Option<&Pseudonym>, rng: &mut impl CryptoRng) -> Result<Self, FleetError> {
         let key = Key::generate(rng);
         let csr = signing_request(&key, pseudonym, &[], false);
@@ -209,44 +209,45 @@ impl KeyRequest {
         Ok(Self { key, csr })
     }
 
-    /// The private key as text, for a file that only its owner may read.
+    /// Returns the private key as text, for a file that only its owner may read.
     pub fn key_text(&self) -> Zeroizing<String> {
         let comment = "# Private key of an SGC node. KEEP IT SECRET and where it is.\n";
         pem::write(comment, &[(KEY_BLOCK, self.key.pkcs8())])
     }
 
-    /// The private key, PKCS #8.
+    /// Returns the private key, PKCS #8.
     pub fn key(&self) -> &[u8] {
         self.key.pkcs8()
     }
 
-    /// The request (PKCS #10), DER. It is no secret.
+    /// Returns the request (PKCS #10), DER. It is no secret.
     pub fn csr(&self) -> &[u8] {
         &self.csr
     }
 
-    /// The request (PKCS #10) as text. It is no secret.
+    /// Returns the request (PKCS #10) as text. It is no secret.
     pub fn csr_text(&self) -> String {
         String::clone(&pem::write("", &[("CERTIFICATE REQUEST", &self.csr)]))
     }
 }
 
-/// The key that a request asks a certificate for. Nothing else is read of it: what a certificate says is for the CA
-/// to know.
+/// The key for which a request wants a certificate. The rest of the request is not read: the CA decides the content of
+/// certificates.
 pub(crate) struct RequestedKey {
     algorithm: &'static rcgen::SignatureAlgorithm,
     key: Vec<u8>,
 }
 
 impl RequestedKey {
-    /// Of a request that this key signed.
-    pub(crate) fn of(request: &[u8]) -> Result<Self, FleetError> {
+    /// Returns the key of a request that this key signed.
+    pub(crate) fn from_request(request: &[u8]) -> Result<Self, FleetError> {
         const ECDSA: [&rcgen::SignatureAlgorithm; 2] =
             [&rcgen::PKCS_ECDSA_P256_SHA256, &rcgen::PKCS_ECDSA_P384_SHA384];
         if request.len() > CSR_BYTES_MAX {
             return Err(FleetError::Request("it is too long"));
         }
-        let fields = RequestFields::of(request).ok_or(FleetError::Request("it is not PKCS #10 in DER"))?;
+        let fields =
+            RequestFields::from_request(request).ok_or(FleetError::Request("it is not PKCS #10 in DER"))?;
         let (key_algorithm, key) = fields.key;
         let used = CHAIN_ALGORITHMS
             .iter()
@@ -269,10 +270,10 @@ impl RequestedKey {
     }
 }
 
-/// Returns a hash of the key that a request (PKCS #10, DER) is about; that the key signed it is not checked. Requests
-/// that cannot be read differ by all their bytes.
+/// Returns a hash of the key of a request (PKCS #10, DER), without checking the key's signature. Unreadable requests
+/// differ by all their bytes.
 pub fn requested_key_hash(request: &[u8]) -> [u8; 32] {
-    match RequestFields::of(request) {
+    match RequestFields::from_request(request) {
         Some(RequestFields { key: (algorithm, key), .. }) => sha256(&[algorithm, key]),
         None => sha256(&[request]),
     }
@@ -288,9 +289,9 @@ impl PublicKeyData for RequestedKey {
     }
 }
 
-/// What certificates and lists take over from the certificate of their CA.
+/// Returns the parameters that certificates and lists take from their CA's certificate.
 fn issuer_params(ca: &CertificateDer<'_>) -> Result<CertificateParams, FleetError> {
-    let fields = CaFields::of(ca).ok_or(FleetError::CaName)?;
+    let fields = CaFields::from_certificate(ca).ok_or(FleetError::CaName)?;
     let mut params = CertificateParams::default();
     params.distinguished_name = DistinguishedName::new();
     for (id, tag, value) in fields.name {
@@ -356,7 +357,7 @@ fn common_name(name: &str) -> DistinguishedName {
     out
 }
 
-/// 126 random bits, positive and of a fixed length as RFC 5280, 4.1.2.2 wants it.
+/// Returns 126 random bits, positive and of a fixed length as RFC 5280, 4.1.2.2 requires.
 fn serial(rng: &mut impl CryptoRng) -> SerialNumber {
     let mut bytes = [0; 16];
     rng.fill_bytes(&mut bytes);

@@ -1,7 +1,7 @@
 //! Private keys: new P-256 ones made from the caller's random generator, so that a seeded test fleet is the same on
 //! each run, and stored ones of every kind that certificates may have.
 //!
-//! They sign certificates, requests and lists here; what a running node signs, [`crate::Identity`] signs.
+//! They sign certificates, requests and lists; [`crate::Identity`] signs for a running node.
 
 use aws_lc_rs::rand::SystemRandom;
 use aws_lc_rs::signature::{
@@ -19,13 +19,13 @@ const PKCS8_HEAD: [u8; 36] = [
     0x06, 0x08, 0x2a, 0x86, 0x48, 0xce, 0x3d, 0x03, 0x01, 0x07, 0x04, 0x6d, 0x30, 0x6b, 0x02, 0x01, 0x01,
     0x04, 0x20,
 ];
-/// What stands between the scalar and the public point.
+/// Bytes between the scalar and the public point.
 const PKCS8_POINT: [u8; 5] = [0xa1, 0x44, 0x03, 0x42, 0x00];
 /// A bare ECPrivateKey with the curve and without the point, around the scalar.
 const SEC1_HEAD: [u8; 7] = [0x30, 0x31, 0x02, 0x01, 0x01, 0x04, 0x20];
 const SEC1_TAIL: [u8; 12] = [0xa0, 0x0a, 0x06, 0x08, 0x2a, 0x86, 0x48, 0xce, 0x3d, 0x03, 0x01, 0x07];
 
-/// Shortest RSA key that is taken, bytes: 2048 bits, as in every verifier here.
+/// Shortest RSA key that is accepted, bytes: 2048 bits, as in every verifier here.
 const RSA_BYTES_MIN: usize = 256;
 
 /// A key pair that rcgen can sign with. Unlike rcgen's own it leaves no copy of the key in plain memory.
@@ -42,19 +42,19 @@ enum Pair {
 }
 
 impl Key {
-    /// A new P-256 key: every transport can use it.
+    /// Makes a P-256 key, which every transport can use.
     pub(crate) fn generate(rng: &mut impl CryptoRng) -> Self {
         let mut scalar = Zeroizing::new([0; 32]);
         loop {
             rng.fill_bytes(&mut *scalar);
-            // Refused are zero and what exceeds the group order: once in 2^32 draws.
+            // Zero and numbers above the group order are refused: once in 2^32 draws.
             if let Some(key) = Self::from_scalar(&scalar) {
                 return key;
             }
         }
     }
 
-    /// A key that was stored: P-256, P-384, Ed25519, or RSA of 2048 bits and more.
+    /// Reads a stored key: P-256, P-384, Ed25519, or RSA of 2048 bits and more.
     pub(crate) fn from_pkcs8(pkcs8: &[u8]) -> Option<Self> {
         let ecdsa = |algorithm| EcdsaKeyPair::from_pkcs8(algorithm, pkcs8).ok();
         let pair = None
@@ -68,7 +68,7 @@ impl Key {
         Some(Self { pair, pkcs8: Zeroizing::new(pkcs8.to_vec()) })
     }
 
-    /// For storing.
+    /// Returns the key for storing.
     pub(crate) fn pkcs8(&self) -> &[u8] {
         &self.pkcs8
     }

@@ -1,7 +1,7 @@
-//! The names that people give: nodes, groups and fleets, checked once when they are made.
+//! The names that people give to nodes, groups and fleets, checked once when they are made.
 //!
-//! They never travel: certificates carry keyed hashes of them ([`crate::FleetSecret::pseudonym`]). Because
-//! those hashes are over the exact bytes, one spelling is allowed and no other: lower case, no spaces.
+//! They never travel: certificates carry keyed hashes of them ([`crate::FleetSecret::pseudonym`]). Because the hashes
+//! cover the exact bytes, only one spelling is allowed: lower case, no spaces.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,10 +9,10 @@ use std::str::FromStr;
 /// Longest name of a node, group or fleet, bytes.
 pub const LABEL_BYTES_MAX: usize = 64;
 
-/// Why a text is no name of a node, group or fleet.
+/// The reason why a text is no name of a node, group or fleet.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum LabelError {
-    /// Nothing was given.
+    /// The text is empty.
     #[error("a {kind} name cannot be empty")]
     Empty {
         /// Node, group or fleet.
@@ -26,12 +26,12 @@ pub enum LabelError {
         /// Its length.
         bytes: usize,
     },
-    /// It starts with a dot, a dash or an underscore.
+    /// The name starts with a dot, a dash or an underscore.
     #[error("{kind} name {found:?} has to start with a letter or a digit")]
     Start {
         /// Node, group or fleet.
         kind: &'static str,
-        /// What was given.
+        /// The text.
         found: String,
     },
     /// A character that names do not have.
@@ -39,7 +39,7 @@ pub enum LabelError {
     Character {
         /// Node, group or fleet.
         kind: &'static str,
-        /// What was given.
+        /// The text.
         found: String,
         /// The first offending character.
         character: char,
@@ -53,7 +53,7 @@ macro_rules! label {
         pub struct $name(Box<str>);
 
         impl $name {
-            /// The text.
+            /// Returns the text.
             pub fn as_str(&self) -> &str {
                 &self.0
             }
@@ -119,7 +119,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_spelling_is_allowed() {
+    fn only_one_spelling_is_allowed() {
         for good in ["arm-1", "a", "0", "lab.arm_2", &"x".repeat(LABEL_BYTES_MAX)] {
             assert_eq!(good.parse::<NodeName>().unwrap().as_str(), good);
         }

@@ -1,8 +1,9 @@
-//! Who a node is, what it may do, and how payloads are sealed: identities, names, grants, suites, policy.
+//! Identities, names, grants, suites and policy: the proof of a node's identity, its rights, and the sealing of
+//! payloads.
 //!
-//! Pure: time is an argument, files are text. One thing draws randomness by itself: the cryptographic
-//! provider, for signatures and key encapsulation; nothing that decides behaviour depends on it.
-//! The normative text is `docs/spec/names.md` and `docs/spec/trust.md`.
+//! Pure: time is an argument, files are text. Only the cryptographic provider draws randomness by itself, for
+//! signatures and key encapsulation; no decision depends on it. The normative text is `docs/spec/names.md` and
+//! `docs/spec/trust.md`.
 #![forbid(unsafe_code)]
 
 mod batch;
@@ -38,13 +39,13 @@ mod xwing;
 pub use batch::{BATCH_PACKETS_MAX, Batch, BatchVerifier, SignedBatch, trailer_bytes_max};
 pub use crl::{CrlError, CrlNews, CrlNumber};
 pub use crowd::{
-    AddressPrefix, Crowded, PLACE_HELD_MIN, PlaceDecision, PlaceLimits, Places, REPEAT_SOURCES_MAX,
-    REPEAT_WINDOW, Repeated, Repeats,
+    AddressPrefix, PLACE_HELD_MIN, PlaceDecision, PlaceLimits, PlaceRefusal, Places, REPEAT_SOURCES_MAX,
+    REPEAT_WINDOW, RepeatCount, Repeats,
 };
 pub use enrol::EnrollRequest;
 pub use fleet::{
-    Absorbed, CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, Fleet, LEAF_VALIDITY_DEFAULT, Merged, ROSTER_BYTES_MAX,
-    SEEN_RECENTLY, SEEN_STEP,
+    CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, CrlReport, Fleet, LEAF_VALIDITY_DEFAULT, MergeReport,
+    ROSTER_BYTES_MAX, SEEN_RECENTLY, SEEN_STEP,
 };
 pub use fleet_error::FleetError;
 pub use grant::{GrantError, Kem, ReplyKey, seal_grant};
@@ -57,7 +58,7 @@ pub use names::{
     TopicSecret, consumers_blind, derive_name, name_of, operations_blind, renewal_blind, types_blind,
 };
 pub use pem::{FLEET_FILE_BYTES_MAX, PemError, pem_contents, pem_text};
-pub use policy::{Denied, Grantees, Listed, Policy};
+pub use policy::{DenialReason, GrantReason, Grantees, Policy};
 pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};
 pub use revocations::{FLEET_LISTS_MAX, LIST_NODES_MAX, REVOKED_NODES_MAX, Revocation};
 pub use roster::{Generation, IssuedCertificate, NODE_CERTIFICATES_MAX, ROSTER_NODES_MAX, RosterNode};

@@ -1,7 +1,7 @@
-//! Everything of an identity but its private key: what a fleet hands to a node that keeps its key to itself.
+//! Everything of an identity but its private key: a fleet hands it to a node that keeps its key to itself.
 //!
-//! Also the file format of both: text blocks, some of them secret. Whether the parts fit together is checked with the
-//! key, by [`crate::Identity`].
+//! Also the file format of both: text blocks, some of them secret. [`crate::Identity`] checks with the key whether the
+//! parts fit together.
 
 use rustls_pki_types::CertificateDer;
 use sgc_wire::{DecodeError, NodeId, Reader, SECRET_GENERATIONS_MAX, Writer};
@@ -32,13 +32,13 @@ pub struct Membership {
     pub(crate) chain: Vec<CertificateDer<'static>>,
     pub(crate) anchors: TrustAnchors,
     pub(crate) secret: Option<FleetSecret>,
-    /// In use, newest first.
+    /// Naming secrets in use, newest first.
     pub(crate) naming: Vec<NamingSecret>,
     pub(crate) authority: Option<NodeId>,
     pub(crate) post_quantum: bool,
 }
 
-/// What a file holds.
+/// Content of a file.
 pub(crate) struct FileParts {
     pub(crate) member: Membership,
     pub(crate) key: Option<Zeroizing<Vec<u8>>>,
@@ -46,7 +46,7 @@ pub(crate) struct FileParts {
 }
 
 impl Membership {
-    /// Reads what [`Membership::to_text`] wrote.
+    /// Parses the text of [`Membership::to_text`].
     pub fn parse(text: &str) -> Result<Self, IdentityError> {
         let parts = read(text)?;
         if parts.key.is_some() {
@@ -55,7 +55,7 @@ impl Membership {
         Ok(parts.member)
     }
 
-    /// All of it in one text. It holds the fleet's secrets unless it is a router's: only its node may read it.
+    /// Returns all of it in one text. It holds the fleet's secrets unless it is a router's: only its node may read it.
     pub fn to_text(&self) -> Zeroizing<String> {
         let comment = self.comment(
             "# SGC answer to a request for an identity. KEEP IT SECRET: it holds secrets of the fleet.\n\
@@ -64,23 +64,23 @@ impl Membership {
         write(self, &comment, None, None)
     }
 
-    /// For which node.
+    /// Returns the node's name.
     pub fn node_name(&self) -> &NodeName {
         &self.node
     }
 
-    /// The fleet's name, for people.
+    /// Returns the fleet's name, for people.
     pub fn fleet_name(&self) -> &FleetName {
         &self.fleet
     }
 
-    /// True if it is for a node that only routes: it holds no secret.
+    /// Returns `true` if it is for a node that only routes: it holds no secret.
     pub fn is_router(&self) -> bool {
         self.secret.is_none()
     }
 
     pub(crate) fn comment(&self, head: &str) -> String {
-        let not_after = self.chain.first().and_then(|c| Validity::of(c));
+        let not_after = self.chain.first().and_then(|c| Validity::from_certificate(c));
         let expires = not_after.map_or_else(|| "?".to_owned(), |v| v.not_after.to_string());
         format!(
             "{head}# node:    {}{}\n# fleet:   {}\n# expires: {expires}\n",
@@ -90,7 +90,7 @@ impl Membership {
         )
     }
 
-    /// Checks what needs no key: the secrets.
+    /// Checks the secrets, which needs no key.
     pub(crate) fn check_secrets(&self) -> Result<(), IdentityError> {
         check_generations(self.secret.as_ref(), &self.naming)
     }
@@ -103,7 +103,7 @@ impl std::fmt::Debug for Membership {
     }
 }
 
-/// A member has one generation or more, newest first, generation 1 the fleet secret; a router has none.
+/// Checks that a member has one generation or more, newest first, generation 1 the fleet secret, and a router none.
 pub(crate) fn check_generations(
     root: Option<&FleetSecret>,
     naming: &[NamingSecret],
@@ -123,7 +123,7 @@ pub(crate) fn check_generations(
     }
 }
 
-/// All blocks in their order.
+/// Writes all blocks in their order.
 pub(crate) fn write(
     member: &Membership,
     comment: &str,
@@ -204,20 +204,20 @@ pub(crate) fn read(text: &str) -> Result<FileParts, IdentityError> {
     }
     naming.sort_unstable_by_key(|n| std::cmp::Reverse(n.generation));
     let anchors = TrustAnchors::new(cas).map_err(IdentityError::Ca)?;
-    let About { node, fleet, post_quantum, .. } = about;
+    let NodeSummary { node, fleet, post_quantum, .. } = about;
     let member = Membership { node, fleet, chain, anchors, secret, naming, authority, post_quantum };
     member.check_secrets()?;
     Ok(FileParts { member, key: key.map(|b| b.content), reset_key })
 }
 
-struct About {
+struct NodeSummary {
     node: NodeName,
     fleet: FleetName,
     post_quantum: bool,
     names_from_root: bool,
 }
 
-fn read_about(about: &[u8]) -> Result<About, IdentityError> {
+fn read_about(about: &[u8]) -> Result<NodeSummary, IdentityError> {
     let decode = |r: &mut Reader<'_>| {
         let version = r.u8()?;
         if !(FILE_VERSION_1..=FILE_VERSION).contains(&version) {
@@ -235,5 +235,5 @@ fn read_about(about: &[u8]) -> Result<About, IdentityError> {
     r.finish().map_err(IdentityError::About)?;
     let node = node.parse().map_err(IdentityError::Name)?;
     let fleet = fleet.parse().map_err(IdentityError::Name)?;
-    Ok(About { node, fleet, post_quantum, names_from_root })
+    Ok(NodeSummary { node, fleet, post_quantum, names_from_root })
 }

@@ -1,6 +1,6 @@
-//! The keys that sources sign with, and what their signatures verify with.
+//! The keys with which sources sign, and their public halves, which verify the signatures.
 //!
-//! Whose key it is, is said by whoever announces it: the owner of the name, in its signed answer.
+//! The owner of a name announces the keys of its sources in its signed answer.
 
 use std::fmt;
 use std::sync::Arc;
@@ -17,11 +17,10 @@ use sgc_wire::SOURCE_KEY_BYTES_MAX;
 use crate::Suite;
 use crate::suite::Scheme;
 
-/// A key that messages are signed with. Cloning shares.
+/// A key that signs messages. Cloning shares.
 ///
-/// One key may serve several sources, names, epochs and suites: a signature covers the packets' headers,
-/// which hold all of these. RSA keys take a tenth of a second and more to make, so a node makes one of each
-/// kind that it needs.
+/// One key may serve several sources, names, epochs and suites: a signature covers the packets' headers, which hold all
+/// of these. RSA keys take a tenth of a second and more to make, so a node makes one of each kind that it needs.
 #[derive(Clone)]
 pub struct MessageKey {
     inner: Arc<Inner>,
@@ -34,7 +33,7 @@ enum Inner {
     Rsa(rsa::KeyPair),
 }
 
-/// A key that was given is of no use.
+/// A given key that cannot be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("not a message key of the suite {suite}")]
 pub struct MessageKeyError {
@@ -42,8 +41,7 @@ pub struct MessageKeyError {
 }
 
 impl MessageKey {
-    /// Makes a key for a suite, an empty one if its messages are not signed. The provider draws the
-    /// randomness.
+    /// Makes a key for a suite, an empty one if its messages are not signed. The provider draws the randomness.
     ///
     /// # Panics
     /// If the provider cannot make keys: it has no randomness or no memory.
@@ -59,7 +57,7 @@ impl MessageKey {
             .expect("a key that was just made has a public half")
     }
 
-    /// A stored key, PKCS #8; for tests and vectors. Sources never outlive their process, nor do their keys.
+    /// Reads a stored key, PKCS #8; for tests and vectors. Sources never outlive their process, nor do their keys.
     pub fn from_pkcs8(suite: Suite, pkcs8: &[u8]) -> Result<Self, MessageKeyError> {
         let error = MessageKeyError { suite };
         let inner = match suite.scheme() {
@@ -82,13 +80,13 @@ impl MessageKey {
         Some(Self { inner: Arc::new(inner), public })
     }
 
-    /// What its signatures verify with, as announcements carry it: 32 bytes for Ed25519, a
-    /// SubjectPublicKeyInfo for RSA, nothing for suites without signatures.
+    /// Returns the public key as announcements carry it: 32 bytes for Ed25519, a SubjectPublicKeyInfo for RSA, nothing
+    /// for suites without signatures.
     pub fn public(&self) -> &Bytes {
         &self.public
     }
 
-    /// True if it is of the kind that `suite` signs with.
+    /// Returns `true` if the key is of the suite's kind.
     pub fn fits(&self, suite: Suite) -> bool {
         match (&*self.inner, suite.scheme()) {
             (Inner::Unsigned, Scheme::Unsigned) | (Inner::Ed25519(_), Scheme::Ed25519) => true,
@@ -97,7 +95,7 @@ impl MessageKey {
         }
     }
 
-    /// Makes `signature` that of a message; empty if the suite has none.
+    /// Writes the signature of a message to `signature`; empty if the suite has none.
     pub(crate) fn sign(&self, message: &[u8], signature: &mut Vec<u8>) {
         signature.clear();
         match &*self.inner {
@@ -118,14 +116,14 @@ impl fmt::Debug for MessageKey {
     }
 }
 
-/// What a source's signatures verify with, parsed once.
+/// The public key of a source, parsed once.
 pub(crate) struct VerifyKey {
     key: ParsedPublicKey,
     scheme: Scheme,
 }
 
 impl VerifyKey {
-    /// An announced key; `None` if it is not one of the suite, or the suite has no signatures.
+    /// Parses an announced key. Returns `None` if it does not fit the suite, or the suite has no signatures.
     pub(crate) fn new(suite: Suite, public: &[u8]) -> Option<Self> {
         if public.len() > SOURCE_KEY_BYTES_MAX {
             return None;
@@ -140,8 +138,8 @@ impl VerifyKey {
         Some(Self { key: key.ok()?, scheme })
     }
 
-    /// Length of its signatures, bytes. One of another length does not verify, so neither does an RSA key of
-    /// another size than the suite's.
+    /// Returns the length of its signatures, bytes. A signature of another length does not verify, nor does an RSA key
+    /// of another size than the suite's.
     pub(crate) fn signature_bytes(&self) -> usize {
         self.scheme.signature_bytes()
     }
@@ -155,7 +153,7 @@ impl VerifyKey {
 mod tests {
     use super::*;
 
-    /// Of the message "m".
+    /// Signs the message "m".
     fn signature(key: &MessageKey) -> Vec<u8> {
         let mut signature = Vec::new();
         key.sign(b"m", &mut signature);

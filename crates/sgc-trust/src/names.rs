@@ -1,7 +1,7 @@
 //! Names from metadata and secrets (`docs/spec/names.md`).
 //!
-//! Whoever holds the topic secret derives the name; nobody reverses it; and a router that knows the owner's
-//! certificate checks a claim to a name from its blind alone.
+//! Everyone with the topic secret derives the name, nobody reverses it, and a router that knows the owner's certificate
+//! checks a claim to a name from its blind alone.
 
 use aws_lc_rs::{digest, hkdf, hmac};
 use sgc_wire::{Blind, Encode, Metadata, Name, NodeId};
@@ -15,7 +15,7 @@ use crate::{CaFingerprint, FleetSecret};
 pub struct TopicSecret([u8; 32]);
 
 impl TopicSecret {
-    /// `HKDF-SHA-256(fleet secret, metadata)`: salt `sgc topic secret v1`, info the canonical encoding.
+    /// Derives `HKDF-SHA-256(fleet secret, metadata)`: salt `sgc topic secret v1`, info the canonical encoding.
     pub fn derive(fleet: &FleetSecret, metadata: &Metadata) -> Self {
         let salt = hkdf::Salt::new(hkdf::HKDF_SHA256, b"sgc topic secret v1");
         let info = metadata.to_vec();
@@ -32,12 +32,12 @@ impl TopicSecret {
         Self(bytes)
     }
 
-    /// The bytes, for handing on this one interface. They belong in no log, and in no packet.
+    /// Returns the bytes, for handing on this one interface. They belong in no log, and in no packet.
     pub fn expose(&self) -> &[u8; 32] {
         &self.0
     }
 
-    /// `HMAC-SHA-256(topic secret, "sgc name")`.
+    /// Returns `HMAC-SHA-256(topic secret, "sgc name")`.
     pub fn blind(&self) -> Blind {
         let key = hmac::Key::new(hmac::HMAC_SHA256, &self.0);
         let mut out = [0; 32];
@@ -47,7 +47,7 @@ impl TopicSecret {
 }
 
 impl PartialEq for TopicSecret {
-    /// In constant time.
+    /// Compares in constant time.
     fn eq(&self, other: &Self) -> bool {
         aws_lc_rs::constant_time::verify_slices_are_equal(&self.0, &other.0).is_ok()
     }
@@ -61,7 +61,7 @@ impl std::fmt::Debug for TopicSecret {
     }
 }
 
-/// `SHA-256("sgc name v1" ‖ owner id ‖ blind)`.
+/// Returns `SHA-256("sgc name v1" ‖ owner id ‖ blind)`.
 pub fn name_of(owner: &NodeId, blind: &Blind) -> Name {
     let mut context = digest::Context::new(&digest::SHA256);
     context.update(b"sgc name v1");
@@ -72,30 +72,30 @@ pub fn name_of(owner: &NodeId, blind: &Blind) -> Name {
     Name(out)
 }
 
-/// The blind under which the authority of a fleet is asked for certificates: known to all who know its CA, also to
-/// routers, which hold no secret.
+/// Returns the blind for certificate requests to the authority of a fleet: everyone who knows the fleet's CA can derive
+/// it, also routers, which hold no secret.
 pub fn renewal_blind(ca: &CaFingerprint) -> Blind {
     blind_of(b"sgc renewal v1", &ca.0)
 }
 
-/// The blind under which the authority of a fleet is asked to carry out operations on it.
+/// Returns the blind for operations on a fleet at its authority.
 pub fn operations_blind(ca: &CaFingerprint) -> Blind {
     blind_of(b"sgc operations v1", &ca.0)
 }
 
-/// The blind under which an owner is asked what the types of its interfaces look like: known to all who know the owner,
-/// also to partners, which cannot derive its catalogue's.
+/// Returns the blind for questions to an owner about the types of its interfaces: everyone who knows the owner can
+/// derive it, also partners, which cannot derive its catalogue's.
 pub fn types_blind(owner: &NodeId) -> Blind {
     blind_of(b"sgc types v1", &owner.0)
 }
 
-/// The blind under which an owner asks a node for the consumers of its interfaces: known to all who know the node, also to
+/// Returns the blind for an owner's question to a node about consumers: everyone who knows the node can derive it, also
 /// owners of other fleets.
 pub fn consumers_blind(node: &NodeId) -> Blind {
     blind_of(b"sgc consumers v1", &node.0)
 }
 
-/// `SHA-256(label ‖ id)`, a blind that needs no secret.
+/// Returns `SHA-256(label ‖ id)`, a blind that needs no secret.
 fn blind_of(label: &[u8], id: &[u8]) -> Blind {
     let mut context = digest::Context::new(&digest::SHA256);
     context.update(label);
@@ -105,7 +105,7 @@ fn blind_of(label: &[u8], id: &[u8]) -> Blind {
     Blind(out)
 }
 
-/// The name of an interface, by one who holds the fleet secret.
+/// Derives the name of an interface from the fleet secret.
 pub fn derive_name(fleet: &FleetSecret, owner: &NodeId, metadata: &Metadata) -> Name {
     name_of(owner, &TopicSecret::derive(fleet, metadata).blind())
 }

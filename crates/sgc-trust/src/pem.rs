@@ -1,7 +1,7 @@
 //! Text files of several named blocks, as in RFC 7468: lines outside of blocks are comments for people.
 //!
-//! It knows nothing of what the blocks mean; [`crate::Identity`] and [`crate::Fleet`] do. Errors never repeat
-//! the content of a block, since it may be a key.
+//! [`crate::Identity`] and [`crate::Fleet`] give the blocks their meaning. Errors never repeat the content of a block,
+//! because it may be a key.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
@@ -9,13 +9,13 @@ use zeroize::Zeroizing;
 
 /// Longest identity file that is read, bytes.
 pub(crate) const FILE_BYTES_MAX: usize = 256 * 1024;
-/// Longest fleet file that is read, bytes: it knows thousands of nodes.
+/// Longest fleet file that is read, bytes: it has room for thousands of nodes.
 pub const FLEET_FILE_BYTES_MAX: usize = 16 * 1024 * 1024;
 /// Most blocks of one file.
 const BLOCKS_MAX: usize = 64;
 const LINE_CHARS: usize = 64;
 
-/// Why a text is not a sequence of blocks.
+/// The reason why a text is not a sequence of blocks.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PemError {
     /// The file is too long to be one of ours.
@@ -23,7 +23,7 @@ pub enum PemError {
     TooLong {
         /// Its length.
         bytes: usize,
-        /// The longest that is read.
+        /// The limit.
         max: usize,
     },
     /// Too many blocks.
@@ -34,13 +34,13 @@ pub enum PemError {
     Unterminated {
         /// Its label.
         label: String,
-        /// Where it begins, from 1.
+        /// The line of its beginning, from 1.
         line: usize,
     },
     /// An end without its beginning, or a beginning inside of a block.
     #[error("line {line} is out of place: a block has to begin and end with the same label")]
     Misplaced {
-        /// Where, from 1.
+        /// The line, from 1.
         line: usize,
     },
     /// The content is not base64.
@@ -48,12 +48,12 @@ pub enum PemError {
     NotBase64 {
         /// Its label.
         label: String,
-        /// Where it begins, from 1.
+        /// The line of its beginning, from 1.
         line: usize,
     },
 }
 
-/// The contents of the blocks of a file that have one of these labels, in their order; others are passed over.
+/// Returns the contents of the blocks of a file that have one of these labels, in their order; others are skipped.
 pub fn pem_contents(text: &str, labels: &[&str]) -> Result<Vec<Zeroizing<Vec<u8>>>, PemError> {
     let blocks = parse(text, FILE_BYTES_MAX)?;
     let wanted = blocks.into_iter().filter(|b| labels.contains(&b.label.as_str()));
@@ -80,7 +80,7 @@ pub(crate) fn parse(text: &str, max: usize) -> Result<Vec<Block>, PemError> {
         let end = marker(content, "-----END ");
         open = match (open, begin, end) {
             (None, Some(label), _) if blocks.len() < BLOCKS_MAX => {
-                // Capacity up front: a string that grows leaves copies of a key behind.
+                // Capacity up front: a growing string leaves copies of a key behind.
                 Some((label.to_owned(), line, Zeroizing::new(String::with_capacity(text.len()))))
             }
             (None, Some(_), _) => return Err(PemError::TooManyBlocks),
@@ -106,7 +106,7 @@ pub(crate) fn parse(text: &str, max: usize) -> Result<Vec<Block>, PemError> {
     }
 }
 
-/// The blocks as text, each behind the other.
+/// Returns the blocks as text, one behind the other.
 pub(crate) fn write(comment: &str, blocks: &[(&str, &[u8])]) -> Zeroizing<String> {
     let estimate = |(label, content): &(&str, &[u8])| 64 + 2 * label.len() + content.len() * 3 / 2;
     let mut out =
@@ -127,7 +127,7 @@ pub(crate) fn write(comment: &str, blocks: &[(&str, &[u8])]) -> Zeroizing<String
     out
 }
 
-/// One block as text; for content that is no secret.
+/// Returns one block as text; for content that is no secret.
 pub fn pem_text(label: &str, content: &[u8]) -> String {
     write("", &[(label, content)]).to_string()
 }

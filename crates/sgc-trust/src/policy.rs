@@ -1,4 +1,4 @@
-//! Who may join a share, and as what: closed unless it says otherwise.
+//! Permissions to join a share as subscriber or publisher: nobody may unless the policy says so.
 
 use std::collections::BTreeSet;
 
@@ -6,7 +6,7 @@ use sgc_wire::{GroupTag, NodeId, Role};
 
 use crate::{CaFingerprint, VerifiedPeer};
 
-/// A set of peers, by what their certificates prove.
+/// A set of peers, by the facts that their certificates prove.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Grantees {
     /// Every node of the fleets with these CAs.
@@ -17,52 +17,52 @@ pub struct Grantees {
     pub groups: BTreeSet<(CaFingerprint, GroupTag)>,
 }
 
-/// Why a peer is in a set of grantees.
+/// The reason why a peer is in a set of grantees.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Listed {
-    /// It is named itself.
+pub enum GrantReason {
+    /// The node itself is named.
     Node,
-    /// A group of it is named.
+    /// A group of the node is named.
     Group(GroupTag),
-    /// Its whole fleet is named.
+    /// The node's whole fleet is named.
     Fleet,
 }
 
 impl Grantees {
-    /// How `peer` is among them, if it is.
-    pub fn find(&self, peer: &VerifiedPeer) -> Option<Listed> {
+    /// Returns the reason why `peer` is in the set, if it is.
+    pub fn find(&self, peer: &VerifiedPeer) -> Option<GrantReason> {
         self.find_parts(&peer.node_id, &peer.ca, &peer.groups)
     }
 
-    /// How a node whose certificate proves this is among them, if it is. For those who ask about a node that is
-    /// not there; what decides about one that is, is [`Grantees::find`].
-    pub fn find_parts(&self, node: &NodeId, ca: &CaFingerprint, groups: &[GroupTag]) -> Option<Listed> {
+    /// Returns the reason why a node with these facts is in the set, if it is. For questions about an absent node;
+    /// [`Grantees::find`] decides about a present one.
+    pub fn find_parts(&self, node: &NodeId, ca: &CaFingerprint, groups: &[GroupTag]) -> Option<GrantReason> {
         if self.nodes.contains(node) {
-            return Some(Listed::Node);
+            return Some(GrantReason::Node);
         }
         let group = groups.iter().find(|g| self.groups.contains(&(*ca, **g)));
-        group.map(|g| Listed::Group(*g)).or(self.fleets.contains(ca).then_some(Listed::Fleet))
+        group.map(|g| GrantReason::Group(*g)).or(self.fleets.contains(ca).then_some(GrantReason::Fleet))
     }
 
-    /// True if nobody is.
+    /// Returns `true` if the set is empty.
     pub fn is_empty(&self) -> bool {
         self.fleets.is_empty() && self.nodes.is_empty() && self.groups.is_empty()
     }
 }
 
-/// Who may join one share.
+/// The peers that may join one share.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Policy {
-    /// Who may receive what is published.
+    /// Peers that may subscribe.
     pub subscribe: Grantees,
-    /// Who may publish, besides the owner.
+    /// Peers that may publish, besides the owner.
     pub publish: Grantees,
 }
 
-/// Why a peer is not permitted.
+/// The reason why a peer is not permitted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
-pub enum Denied {
-    /// Neither it, nor a group of it, nor its fleet is named.
+pub enum DenialReason {
+    /// Neither the node, nor a group of it, nor its fleet is named.
     #[error("neither the node, nor a group that its certificate puts it into, nor its fleet is named")]
     NotListed,
     /// The share offers that role to nobody.
@@ -71,13 +71,13 @@ pub enum Denied {
 }
 
 impl Policy {
-    /// Whether `peer` may join as `role`, and because of what.
-    pub fn permits(&self, peer: &VerifiedPeer, role: Role) -> Result<Listed, Denied> {
+    /// Returns the reason why `peer` may join as `role`, or why not.
+    pub fn permits(&self, peer: &VerifiedPeer, role: Role) -> Result<GrantReason, DenialReason> {
         let grantees = match role {
             Role::Subscribe => &self.subscribe,
-            Role::Publish if self.publish.is_empty() => return Err(Denied::Role),
+            Role::Publish if self.publish.is_empty() => return Err(DenialReason::Role),
             Role::Publish => &self.publish,
         };
-        grantees.find(peer).ok_or(Denied::NotListed)
+        grantees.find(peer).ok_or(DenialReason::NotListed)
     }
 }

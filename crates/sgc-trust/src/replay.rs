@@ -1,11 +1,11 @@
-//! A window over a source's sequence numbers: each message once.
+//! A window over a source's sequence numbers, which accepts each message once.
 
 /// Messages that may arrive behind the newest and still be told from replays.
 pub const REPLAY_WINDOW: u64 = 1024;
 
 const WORDS: usize = (REPLAY_WINDOW / 64) as usize;
 
-/// What a sequence number is to the window.
+/// State of a sequence number in the window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Freshness {
     /// Not seen yet.
@@ -16,7 +16,7 @@ pub enum Freshness {
     TooOld,
 }
 
-/// Which sequence numbers of one source were seen (the idea of RFC 4303, 3.4.3). Numbers start at 1.
+/// The seen sequence numbers of one source (the idea of RFC 4303, 3.4.3). Numbers start at 1.
 #[derive(Clone, Debug, Default)]
 pub struct ReplayWindow {
     newest: u64,
@@ -24,7 +24,7 @@ pub struct ReplayWindow {
 }
 
 impl ReplayWindow {
-    /// What `seq` is, without marking it.
+    /// Returns the state of `seq`, without marking it.
     pub fn check(&self, seq: u64) -> Freshness {
         if seq > self.newest {
             Freshness::Fresh
@@ -37,7 +37,7 @@ impl ReplayWindow {
         }
     }
 
-    /// Marks `seq` as seen and says what it was.
+    /// Marks `seq` as seen and returns its state before.
     pub fn accept(&mut self, seq: u64) -> Freshness {
         let freshness = self.check(seq);
         if freshness == Freshness::Fresh {
@@ -49,7 +49,7 @@ impl ReplayWindow {
         freshness
     }
 
-    /// The newest number seen; 0 before any.
+    /// Returns the newest number seen; 0 before any.
     pub fn newest(&self) -> u64 {
         self.newest
     }

@@ -1,7 +1,7 @@
 //! Revocations by a CA: by node and incarnation, which only grows, and by serial number.
 //!
-//! It decides what is kept of the lists of a CA and what they revoke together. Reading and checking a list is the
-//! business of `crl.rs`, writing one that of `issue.rs`.
+//! This module decides which lists of a CA are kept and what they revoke together. `crl.rs` reads and checks a list,
+//! `issue.rs` writes one.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -15,35 +15,34 @@ use crate::crl::CrlError;
 pub const REVOKED_NODES_MAX: usize = 8192;
 /// Most nodes in one list: those that were revoked last. Nodes keep the lists before it for the others.
 pub const LIST_NODES_MAX: usize = 1024;
-/// Most lists of one fleet's CA of which each says something that the others do not: those that [`REVOKED_NODES_MAX`]
-/// nodes need, and as many for copies of the fleet's file that went their own ways. A further one is refused until the
-/// copies are merged.
+/// Most lists of one fleet's CA with revocations of their own: those that [`REVOKED_NODES_MAX`] nodes need, and as many
+/// for diverged copies of the fleet's file. A further one is refused until the copies are merged.
 pub const FLEET_LISTS_MAX: usize = 2 * LISTS_OF_ONE_COPY_MAX;
 /// Lists of a growing set that do not cover each other name each node at most twice.
 const LISTS_OF_ONE_COPY_MAX: usize = 2 * REVOKED_NODES_MAX / LIST_NODES_MAX;
 
-/// Up to which incarnation a node is revoked. Of two revocations of a node the one that covers more counts; of two
+/// The incarnation up to which a node is revoked. Of two revocations of a node the one that covers more counts; of two
 /// that cover the same, the earlier one. So their order does not matter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Revocation {
     /// The highest incarnation that is revoked, and with it all before it.
     pub incarnation: u32,
-    /// Since when, in whole seconds.
+    /// Time of the revocation, in whole seconds.
     pub at: UnixMillis,
 }
 
 impl Revocation {
-    /// From the second of `at` on.
+    /// Returns a revocation from the second of `at` on.
     pub(crate) fn new(incarnation: u32, at: UnixMillis) -> Self {
         Self { incarnation, at: UnixMillis(at.secs() * 1000) }
     }
 
-    /// True if certificates of this incarnation are revoked by it.
+    /// Returns `true` if certificates of this incarnation are revoked by it.
     pub fn covers(&self, incarnation: u32) -> bool {
         incarnation <= self.incarnation
     }
 
-    /// True if `other` adds nothing to it.
+    /// Returns `true` if `other` adds nothing to it.
     fn includes(&self, other: &Self) -> bool {
         self.incarnation > other.incarnation || (self.incarnation == other.incarnation && self.at <= other.at)
     }
@@ -52,7 +51,7 @@ impl Revocation {
 /// Revoked nodes of one CA. Nothing is ever taken out of it.
 pub(crate) type RevokedNodes = BTreeMap<Pseudonym, Revocation>;
 
-/// Adds a revocation; true if it says something new.
+/// Adds a revocation. Returns `true` if it is news.
 pub(crate) fn add_revocation(nodes: &mut RevokedNodes, node: Pseudonym, revocation: Revocation) -> bool {
     match nodes.get_mut(&node) {
         Some(known) if known.includes(&revocation) => false,
@@ -72,7 +71,7 @@ pub(crate) struct RevocationList {
     pub(crate) der: Bytes,
     /// Big-endian, without leading zeros.
     pub(crate) number: Box<[u8]>,
-    /// Serial numbers without leading zeros, and since when.
+    /// Serial numbers without leading zeros, with the times of revocation.
     pub(crate) serials: BTreeMap<Box<[u8]>, UnixMillis>,
     /// Revoked nodes; `None` for a list that only names serial numbers, as other CAs than a fleet's write them.
     pub(crate) nodes: Option<RevokedNodes>,
@@ -87,17 +86,17 @@ impl RevocationList {
 /// The lists of one CA that are in force.
 #[derive(Clone, Default)]
 pub(crate) struct CaLists {
-    /// Of lists that name serial numbers only, the one with the greatest number: such a list is the whole truth of its
-    /// CA, which may take an entry off again (RFC 5280, 5.3.1, certificateHold).
+    /// The list with the greatest number, of those that name serial numbers only: such a list is its CA's whole truth,
+    /// and the CA may take an entry off again (RFC 5280, 5.3.1, certificateHold).
     plain: Option<Arc<RevocationList>>,
-    /// Lists of a fleet, by rising number. They count together, and none of them is covered by the others.
+    /// Lists of a fleet, by rising number. They count together, and the others cover none of them.
     fleet: Vec<Arc<RevocationList>>,
     /// The union of their revocations.
     nodes: Arc<RevokedNodes>,
 }
 
 impl CaLists {
-    /// With one more list; `Ok(None)` if it is no news.
+    /// Returns these lists with one more; `Ok(None)` if it adds nothing.
     pub(crate) fn with(&self, list: Arc<RevocationList>) -> Result<Option<Self>, CrlError> {
         let Some(added) = &list.nodes else {
             let is_newer = |known: &Arc<RevocationList>| is_greater(&list.number, &known.number);
@@ -128,7 +127,7 @@ impl CaLists {
         Ok(Some(Self { plain: self.plain.clone(), fleet, nodes: Arc::new(nodes) }))
     }
 
-    /// With the lists in force elsewhere that are news here and fit.
+    /// Returns these lists with those of `other` that are news and fit.
     pub(crate) fn with_all_of(&self, other: &Self) -> Self {
         let mut all = self.clone();
         for list in other.lists() {
@@ -139,30 +138,30 @@ impl CaLists {
         all
     }
 
-    /// The lists in force, from which another node learns all that is revoked.
+    /// Returns the lists in force, from which another node learns every revocation.
     pub(crate) fn lists(&self) -> impl Iterator<Item = &Arc<RevocationList>> {
         self.plain.iter().chain(&self.fleet)
     }
 
-    /// Since when a certificate with this serial number is revoked by it.
+    /// Returns the time at which a certificate with this serial number was revoked.
     pub(crate) fn serial_revoked_at(&self, serial: &[u8]) -> Option<UnixMillis> {
         self.lists().filter_map(|list| list.serials.get(serial)).min().copied()
     }
 
-    /// Revoked nodes.
+    /// Returns the revoked nodes.
     pub(crate) fn nodes(&self) -> &RevokedNodes {
         &self.nodes
     }
 
-    /// The greatest number of a fleet's list.
+    /// Returns the greatest number of a fleet's list.
     pub(crate) fn fleet_number(&self) -> Option<&[u8]> {
         self.fleet.last().map(|list| &*list.number)
     }
 }
 
-/// Takes out every list of which the others say everything, from the oldest on.
+/// Removes every list that the others cover, from the oldest on.
 fn drop_covered(lists: &mut Vec<Arc<RevocationList>>, all: &RevokedNodes) {
-    // Of each node one revocation counts; how many of the lists have that one?
+    // Of each node one revocation counts; this counts the lists that have it.
     let decisive = |list: &RevocationList| {
         let nodes: Vec<_> = list.nodes.iter().flatten().filter(|(n, r)| all.get(n) == Some(r)).collect();
         nodes.into_iter().map(|(node, _)| *node).collect::<Vec<_>>()

@@ -1,9 +1,9 @@
-//! What a fleet knows of itself: its nodes, their certificates, who is revoked, which secrets are in use.
+//! A fleet's record of itself: its nodes, their certificates, revoked nodes, and secrets in use.
 //!
-//! It holds no secret (those have blocks of their own, named here by their hashes) and no file. The CA's key signs
-//! its encoding, so that a roster that was changed by hand, or damaged, is not taken for the fleet's word. Whoever
-//! holds the fleet file can sign another; an old copy of the file is a valid one. Two copies that went their own ways
-//! merge: the order of merges does not matter, and no revocation, enrolment or incarnation is lost by one.
+//! A roster holds no secret (they have blocks of their own, named here by their hashes) and no file. The CA's key signs
+//! its encoding, so that a roster that was changed by hand, or damaged, does not pass for the fleet's. Everyone with
+//! the fleet file can sign another; an old copy of the file is a valid one. Two diverged copies merge: the order of
+//! merges does not matter, and no revocation, enrolment or incarnation is lost by one.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -22,13 +22,13 @@ pub const ROSTER_NODES_MAX: usize = 10_000;
 pub const NODE_CERTIFICATES_MAX: usize = 256;
 /// Longest serial number, bytes (RFC 5280, 4.1.2.2).
 const SERIAL_BYTES_MAX: usize = 20;
-/// How long after its end a certificate is remembered: clocks of verifiers may be behind.
+/// Time that a certificate is remembered after its end: clocks of verifiers may be behind.
 const REMEMBERED: Duration = Duration::from_secs(86_400);
 const VERSION: u8 = 2;
 /// The version before there were incarnations: a node was revoked or not.
 const VERSION_1: u8 = 1;
 
-/// One node of a fleet. [`crate::Fleet::revocation_of`] says up to which incarnation it is revoked.
+/// One node of a fleet. [`crate::Fleet::revocation_of`] returns the incarnation up to which it is revoked.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct RosterNode {
     /// Its name.
@@ -39,32 +39,32 @@ pub struct RosterNode {
     pub changed: UnixMillis,
     /// Its groups, sorted.
     pub groups: Vec<GroupName>,
-    /// True if it only routes: it has no secret.
+    /// Whether the node only routes: it has no secret.
     pub router: bool,
-    /// True if its certificates let it carry others' names.
+    /// Whether its certificates let it carry others' names.
     pub may_route: bool,
-    /// The newest generation of the naming secret that it was handed; 0 if that is unknown, or if it has none.
+    /// The newest generation of the naming secret that the node was handed; 0 if that is unknown, or if it has none.
     pub generation: u32,
-    /// Time at which the fleet last handed it something: a certificate, or secrets.
+    /// Time at which the fleet last handed the node a certificate or secrets.
     pub seen: Option<UnixMillis>,
-    /// Its certificates, those that hold longest last; those that are over are forgotten after a day.
+    /// Its certificates, those with the longest validity last; expired ones are forgotten after a day.
     pub certificates: Vec<IssuedCertificate>,
 }
 
 impl RosterNode {
-    /// Last moment at which a certificate of it holds, if that is revoked of it.
+    /// Returns the last moment at which an unrevoked certificate of the node is valid.
     pub fn expires(&self, revocation: Option<Revocation>) -> Option<UnixMillis> {
         let good = self.certificates.iter().filter(|c| c.revoked_at(revocation).is_none());
         good.map(|c| c.not_after).max()
     }
 
-    /// True if another copy says the same of it, apart from when it was last handed something.
+    /// Returns `true` if the entry of another copy is the same, apart from the time of the last handover.
     pub(crate) fn is_as(&self, other: &Self) -> bool {
         let Self { generation, seen, .. } = *self;
         *self == Self { generation, seen, ..other.clone() }
     }
 
-    /// Enters certificates of it; one that is there already keeps the earlier revocation.
+    /// Enters certificates; an entry that exists already keeps the earlier revocation.
     pub(crate) fn add_certificates(&mut self, certificates: impl IntoIterator<Item = IssuedCertificate>) {
         let mut all: BTreeMap<Serial, IssuedCertificate> = BTreeMap::new();
         for certificate in std::mem::take(&mut self.certificates).into_iter().chain(certificates) {
@@ -79,7 +79,7 @@ impl RosterNode {
         self.certificates.drain(..over);
     }
 
-    /// Takes over what the entry of the same node in another copy says.
+    /// Merges the entry of the same node in another copy.
     fn join(&mut self, other: &Self) {
         let newest =
             |node: &Self| (node.incarnation, node.changed, node.groups.clone(), node.router, node.may_route);
@@ -98,16 +98,16 @@ impl RosterNode {
 pub struct IssuedCertificate {
     /// Its serial number, big-endian, without leading zeros.
     pub serial: Serial,
-    /// Last moment at which it holds.
+    /// Last moment at which it is valid.
     pub not_after: UnixMillis,
-    /// Of which incarnation of its node it is.
+    /// The incarnation of its node.
     pub incarnation: u32,
-    /// Since when it is revoked by its serial number alone: from before there were incarnations.
+    /// Time of its revocation by serial number alone: from before there were incarnations.
     pub(crate) revoked: Option<UnixMillis>,
 }
 
 impl IssuedCertificate {
-    /// Since when it is revoked, if that is revoked of its node.
+    /// Returns the time of its revocation, given that of its node.
     pub fn revoked_at(&self, revocation: Option<Revocation>) -> Option<UnixMillis> {
         self.revoked.or_else(|| revocation.filter(|r| r.covers(self.incarnation)).map(|r| r.at))
     }
@@ -124,7 +124,7 @@ impl IssuedCertificate {
 pub struct Generation {
     /// Its number; 1 is the fleet secret itself.
     pub number: u32,
-    /// When it was made.
+    /// Time of its making.
     pub created: UnixMillis,
     /// SHA-256 of the secret.
     pub(crate) hash: [u8; 32],
@@ -146,15 +146,15 @@ pub(crate) struct Roster {
     pub(crate) settings: Settings,
     /// Generations of the naming secret before this one are out of use.
     pub(crate) oldest_generation: u32,
-    /// In use, oldest first; never empty in a fleet.
+    /// Generations in use, oldest first; never empty in a fleet.
     pub(crate) generations: Vec<Generation>,
-    /// Nodes that are or were revoked, also such as only another copy of the roster knows by name.
+    /// Nodes that are or were revoked, also those whose names only another copy of the roster knows.
     pub(crate) revoked: RevokedNodes,
     pub(crate) nodes: BTreeMap<NodeName, RosterNode>,
 }
 
 impl Roster {
-    /// Forgets certificates that are over.
+    /// Forgets expired certificates.
     pub(crate) fn prune(&mut self, now: UnixMillis) {
         let remembered = REMEMBERED.as_millis() as u64;
         for node in self.nodes.values_mut() {
@@ -162,7 +162,7 @@ impl Roster {
         }
     }
 
-    /// Every revoked certificate that is not over, those that hold longest last.
+    /// Returns every revoked certificate that has not expired, those with the longest validity last.
     pub(crate) fn revoked_serials(&self, secret: &FleetSecret) -> Vec<(Serial, UnixMillis)> {
         let of_node = |node: &RosterNode| {
             let revocation = self.revocation_of(&node.name, secret);
@@ -174,12 +174,12 @@ impl Roster {
         revoked.into_iter().map(|(_, at, serial)| (serial, at)).collect()
     }
 
-    /// Up to which incarnation the node of that name is revoked.
+    /// Returns the incarnation up to which the node of that name is revoked.
     pub(crate) fn revocation_of(&self, node: &NodeName, secret: &FleetSecret) -> Option<Revocation> {
         self.revoked.get(&secret.pseudonym(node.as_str())).copied()
     }
 
-    /// Takes over everything that another copy knows.
+    /// Merges another copy.
     pub(crate) fn join(&mut self, other: &Self) {
         self.crl_number = self.crl_number.max(other.crl_number);
         if self.settings < other.settings {
@@ -196,7 +196,7 @@ impl Roster {
         }
         let mut generations: BTreeMap<u32, Generation> = BTreeMap::new();
         for generation in self.generations.iter().chain(&other.generations) {
-            // Of two secrets that were made under one number the later one stays.
+            // Of two secrets under one number the later one stays.
             match generations.get_mut(&generation.number) {
                 Some(known) => *known = known.clone().max(generation.clone()),
                 None => drop(generations.insert(generation.number, generation.clone())),
@@ -314,7 +314,7 @@ fn read_revocation(r: &mut Reader<'_>) -> Result<(Pseudonym, Revocation), Decode
     Ok((node, revocation))
 }
 
-/// A node, and for a roster of version 1 since when it is revoked.
+/// A node, and for a roster of version 1 the time of its revocation.
 type ReadNode = (RosterNode, Option<UnixMillis>);
 
 fn read_node(r: &mut Reader<'_>) -> Result<ReadNode, DecodeError> {
@@ -448,7 +448,7 @@ mod tests {
         let mut roster = roster();
         let revoked = |roster: &Roster| roster.revoked_serials(&secret());
         let (old, new): (Serial, Serial) = ([1; 16][..].into(), [2][..].into());
-        // One by its serial number alone at each node, and one by the incarnation.
+        // One certificate by its serial number alone at each node, and one by the incarnation.
         let (at, of_node) = (UnixMillis(4), UnixMillis(4000));
         assert_eq!(revoked(&roster), [(old.clone(), at), (old.clone(), at), (new.clone(), of_node)]);
         roster.prune(UnixMillis(5 + 86_400_000));

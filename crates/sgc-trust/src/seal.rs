@@ -1,8 +1,7 @@
 //! Sealing and opening the fragments of a message, each under its source's key (`docs/spec/trust.md`).
 //!
-//! One pass at the source (plaintext into the packet) and one at the sink (packet into the message); nothing
-//! here keeps state about messages, see [`crate::ReplayWindow`] for that. Who sealed is said by
-//! [`crate::BatchVerifier`].
+//! One pass at the source (plaintext into the packet) and one at the sink (packet into the message). Nothing here keeps
+//! state about messages: [`crate::ReplayWindow`] does. [`crate::BatchVerifier`] proves the sealing source.
 
 use aws_lc_rs::aead::{Aad, LessSafeKey, NONCE_LEN, Nonce, UnboundKey};
 use aws_lc_rs::hkdf;
@@ -14,10 +13,10 @@ use crate::Suite;
 /// Bytes that sealing adds to a fragment.
 pub const TAG_BYTES: usize = 16;
 
-/// Why a packet could not be opened. The packet is dropped and counted.
+/// The reason why a packet could not be opened. The packet is dropped and counted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum OpenError {
-    /// The suite in the packet is not the one that was granted.
+    /// The suite in the packet is not that of the grant.
     #[error("cipher suite {found} is not the granted one")]
     Suite {
         /// Id found.
@@ -32,13 +31,13 @@ pub enum OpenError {
     /// The payload's length disagrees with the header.
     #[error("payload length disagrees with the header")]
     Length,
-    /// The seal does not verify: altered, or sealed by one without the key.
+    /// The seal does not verify: the packet was altered, or sealed without the key.
     #[error("the seal does not verify")]
     Forged,
     /// Index, count and path behind the tag contradict each other.
     #[error("the place in its batch is impossible")]
     Trailer,
-    /// The source did not sign it: altered, or made by another member who holds the topic's key.
+    /// The source did not sign the packet: it was altered, or made by another member with the topic's key.
     #[error("the source did not sign it")]
     Signature,
 }
@@ -52,14 +51,14 @@ pub struct SourceKey {
 }
 
 impl SourceKey {
-    /// The key of packets to all: `HKDF-SHA-256(topic key, "sgc source v1" ‖ suite ‖ epoch ‖ name ‖ source
+    /// Derives the key of packets to all: `HKDF-SHA-256(topic key, "sgc source v1" ‖ suite ‖ epoch ‖ name ‖ source
     /// id)`; `None` for a suite that this build does not have.
     pub fn derive(grant: &TopicGrant, name: &Name, source: &SourceId) -> Option<Self> {
         Self::expand(grant, name, source, None)
     }
 
-    /// The key of packets to one sink: the same with the sink's id behind the source's. History that was sent
-    /// to another sink, or to this node when it asked under another id, never opens with it.
+    /// Derives the key of packets to one sink: as [`Self::derive`], with the sink's id behind the source's. It never
+    /// opens history for another sink, nor for an earlier sink id of this node.
     pub fn derive_addressed(
         grant: &TopicGrant,
         name: &Name,
@@ -95,7 +94,7 @@ impl SourceKey {
         self.epoch
     }
 
-    /// The sink whose packets it is for; `None` for those to all.
+    /// Returns the sink that packets under this key are for; `None` for packets to all.
     pub fn to(&self) -> Option<SinkId> {
         self.to
     }
@@ -103,8 +102,8 @@ impl SourceKey {
     /// Seals a fragment: `fragment`, behind the first one the message's head, and the tag. `out` must have
     /// [`sealed_bytes`] bytes, all of which are written.
     ///
-    /// The header must be of this key's suite, epoch and addressee. The caller must seal one text only under
-    /// each (sequence, index): the nonce is made of them.
+    /// The header must have this key's suite, epoch and addressee. The caller must seal only one text under each
+    /// (sequence, index), because the nonce is made of them.
     pub fn seal(&self, header: &PacketHeader, head: &MessageHead, fragment: &[u8], out: &mut [u8]) {
         debug_assert_eq!(fragment.len(), header.fragment_bytes());
         debug_assert_eq!((header.suite, header.epoch, header.to), (self.suite.id(), self.epoch, self.to));
@@ -124,8 +123,8 @@ impl SourceKey {
             .expect("fragments are far below the AEAD's length limit");
     }
 
-    /// Opens a packet's payload into `out`, which must have [`opened_bytes`] bytes; what it holds after an
-    /// error is not to be used. What stands behind the tag is not looked at.
+    /// Opens a packet's payload into `out`, which must have [`opened_bytes`] bytes and must not be used after an error.
+    /// Bytes behind the tag are ignored.
     pub fn open(&self, header: &PacketHeader, payload: &[u8], out: &mut [u8]) -> Result<(), OpenError> {
         if header.suite != self.suite.id() {
             return Err(OpenError::Suite { found: header.suite });
@@ -154,12 +153,12 @@ impl SourceKey {
     }
 }
 
-/// Bytes that a packet's payload opens to: the fragment, and behind the first one the message's head.
+/// Returns the opened length of a packet's payload: the fragment, and behind the first one the message's head.
 pub fn opened_bytes(header: &PacketHeader) -> usize {
     header.fragment_bytes() + if header.index == 0 { MESSAGE_HEAD_BYTES } else { 0 }
 }
 
-/// Bytes that a fragment is sealed to: what it opens to, and the tag.
+/// Returns the sealed length of a fragment: the opened length and the tag.
 pub fn sealed_bytes(header: &PacketHeader) -> usize {
     opened_bytes(header) + TAG_BYTES
 }
@@ -225,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_sealed_opens_and_the_head_is_behind_the_first_fragment() {
+    fn sealed_packets_open_and_the_head_is_behind_the_first_fragment() {
         for suite in CIPHERS {
             for (total, index, bytes) in [(0, 0, 0), (5, 0, 5), (40, 0, 16), (40, 1, 16), (40, 2, 8)] {
                 let h = header(suite, total, index);

@@ -1,7 +1,7 @@
-//! What members of a fleet share and routers do not: the secrets that names are derived from.
+//! The secrets that members of a fleet share, without routers: names are derived from them.
 //!
-//! Who a node is follows from the fleet secret alone, for ever; what things are called follows from the newest
-//! *naming secret*. So a fleet can stop those who left from recognising its names, and no node becomes another.
+//! A node's id follows from the fleet secret alone, for ever; names of interfaces follow from the newest *naming
+//! secret*. So a fleet can stop former members from recognising its names, and no node gets another id.
 
 use std::fmt;
 
@@ -17,7 +17,7 @@ pub(crate) const SECRET_BLOCK: &str = "SGC FLEET SECRET";
 pub(crate) const NAMING_BLOCK: &str = "SGC NAMING SECRET";
 pub(crate) const SECRET_BYTES: usize = 32;
 
-/// What the members of a fleet share, and routers do not: the root of all its names. Never printed.
+/// The secret of a fleet's members, without routers: the root of all its names. Never printed.
 #[derive(Clone, Zeroize, ZeroizeOnDrop)]
 pub struct FleetSecret([u8; SECRET_BYTES]);
 
@@ -39,23 +39,23 @@ impl FleetSecret {
         Some(secret)
     }
 
-    /// The bytes, for deriving from them. They belong in no log and in no packet.
+    /// Returns the bytes, for deriving from them. They belong in no log and in no packet.
     pub fn expose(&self) -> &[u8; SECRET_BYTES] {
         &self.0
     }
 
-    /// What certificates call the node of this name.
+    /// Returns the pseudonym of the node of this name.
     pub fn pseudonym(&self, node_name: &str) -> Pseudonym {
         Pseudonym(self.tag(PSEUDONYM_DOMAIN, node_name))
     }
 
-    /// What certificates call the group of this name.
+    /// Returns the tag of the group of this name.
     pub fn group_tag(&self, group: &str) -> GroupTag {
         GroupTag(self.tag(GROUP_DOMAIN, group))
     }
 
-    /// What sources of a local publisher begin with: the same whenever its node starts, and to who has no secret
-    /// nothing but that. `publisher` is what identifies it on its network.
+    /// Returns the beginning of the source ids of a local publisher: the same whenever its node starts, and random to
+    /// everyone without the secret. `publisher` identifies it on its network.
     pub fn publisher_tag(&self, publisher: &[u8; 16]) -> [u8; 8] {
         let mut mac = hmac::Context::with_key(&hmac::Key::new(hmac::HMAC_SHA256, &self.0));
         mac.update(PUBLISHER_DOMAIN.as_bytes());
@@ -96,7 +96,7 @@ impl NamingSecret {
     /// The first generation whose secret has a block of its own.
     pub(crate) const STORED_FROM: u32 = 2;
 
-    /// Reads what [`NamingSecret::to_block`] wrote.
+    /// Reads the output of [`NamingSecret::to_block`].
     pub(crate) fn from_block(content: &[u8]) -> Option<Self> {
         let (generation, secret) = content.split_first_chunk()?;
         let generation = u32::from_be_bytes(*generation);
@@ -104,7 +104,7 @@ impl NamingSecret {
         Some(Self { generation, secret: FleetSecret::read(secret)? })
     }
 
-    /// `u32 generation ‖ secret`.
+    /// Returns `u32 generation ‖ secret`.
     pub(crate) fn to_block(&self) -> Zeroizing<Vec<u8>> {
         let mut block = Zeroizing::new(Vec::with_capacity(4 + SECRET_BYTES));
         block.extend_from_slice(&self.generation.to_be_bytes());

@@ -1,8 +1,7 @@
-//! Signed bodies of the control protocol: made by their signer, believed only after verification.
+//! Signed bodies of the control protocol, which count only after verification.
 //!
-//! Each body has a signing context of its own, so that none can pass for another. Bodies that carry a
-//! certificate chain also carry the time of signing, which must be near the verifier's: minutes of skew
-//! work, days do not.
+//! Each body has a signing context of its own, so that none can pass for another. Bodies that carry a certificate chain
+//! also carry the time of signing, which must be near the verifier's: minutes of skew work, days do not.
 
 use std::time::Duration;
 
@@ -10,15 +9,15 @@ use bytes::Bytes;
 use rustls_pki_types::CertificateDer;
 use sgc_wire::{
     AdvertBody, AnswerBody, Decode, DecodeError, Encode, JoinBody, LinkStateBody, Name, RefuseReason,
-    RejectReason, Signed, UnixMillis,
+    RejectReason, SignedBody, UnixMillis,
 };
 
 use crate::{CertError, Identity, SignatureError, TrustAnchors, VerifiedPeer, name_of};
 
-/// How far a signer's clock may be from the verifier's.
+/// Largest difference between a signer's and the verifier's clock.
 pub const CLOCK_SKEW_MAX: Duration = Duration::from_secs(10 * 60);
-/// Most that a sequence number, which counts milliseconds, may be ahead of the time of signing: ten years, more than any clock
-/// that was once wrong. Without a bound, one number would leave its node no greater one.
+/// Largest lead of a sequence number, which counts milliseconds, over the time of signing: ten years, more than any
+/// clock that was once wrong. Without a bound, one number would leave its node no greater one.
 pub const SEQ_AHEAD_MAX: Duration = Duration::from_secs(10 * 365 * 86_400);
 
 const ADVERT: &str = "sgc advert v1";
@@ -26,7 +25,7 @@ const JOIN: &str = "sgc join v1";
 const ANSWER: &str = "sgc answer v1";
 const LINK_STATE: &str = "sgc link state v1";
 
-/// Why a signed body is not believed.
+/// The reason why a signed body is not believed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SignedError {
     /// The body is malformed.
@@ -57,8 +56,8 @@ pub enum SignedError {
 }
 
 impl SignedError {
-    /// What a router tells the requester: a wrong clock and a certificate that is over have other cures than a
-    /// forged request; more than that a stranger is not told.
+    /// Returns the reason that a router tells the requester. A wrong clock and an expired certificate have other cures
+    /// than a forged request; a stranger learns no more than that.
     pub fn reject_reason(&self) -> RejectReason {
         match self {
             Self::Clock { .. } => RejectReason::Clock,
@@ -68,7 +67,7 @@ impl SignedError {
         }
     }
 
-    /// The same as an owner tells it.
+    /// Returns the reason that an owner tells the requester.
     pub fn refuse_reason(&self) -> RefuseReason {
         match self {
             Self::Clock { .. } => RefuseReason::Clock,
@@ -84,7 +83,7 @@ impl SignedError {
 pub struct VerifiedAdvert {
     /// The owner.
     pub owner: VerifiedPeer,
-    /// What it says.
+    /// The content.
     pub body: AdvertBody,
     /// The names of `body.blinds`, each once.
     pub names: Vec<Name>,
@@ -95,56 +94,56 @@ pub struct VerifiedAdvert {
 pub struct VerifiedJoin {
     /// The requester.
     pub peer: VerifiedPeer,
-    /// What it asks for.
+    /// The request.
     pub body: JoinBody,
 }
 
 /// A link state whose node is proven.
 #[derive(Clone, Debug)]
 pub struct VerifiedLinkState {
-    /// Whose links they are.
+    /// The node whose links they are.
     pub node: VerifiedPeer,
-    /// What it says.
+    /// The content.
     pub body: LinkStateBody,
 }
 
 impl Identity {
-    /// The certificate chain as signed bodies carry it.
+    /// Returns the certificate chain as signed bodies carry it.
     pub fn chain_bytes(&self) -> Vec<Bytes> {
         self.chain().iter().map(|c| Bytes::copy_from_slice(c)).collect()
     }
 
     /// Signs an advertisement of this node.
-    pub fn sign_advert(&self, body: &AdvertBody) -> Signed {
+    pub fn sign_advert(&self, body: &AdvertBody) -> SignedBody {
         self.signed(ADVERT, body)
     }
 
     /// Signs a join of this node.
-    pub fn sign_join(&self, body: &JoinBody) -> Signed {
+    pub fn sign_join(&self, body: &JoinBody) -> SignedBody {
         self.signed(JOIN, body)
     }
 
     /// Signs a link state of this node.
-    pub fn sign_link_state(&self, body: &LinkStateBody) -> Signed {
+    pub fn sign_link_state(&self, body: &LinkStateBody) -> SignedBody {
         self.signed(LINK_STATE, body)
     }
 
     /// Signs an answer of this node, the owner of the name.
-    pub fn sign_answer(&self, body: &AnswerBody) -> Signed {
+    pub fn sign_answer(&self, body: &AnswerBody) -> SignedBody {
         self.signed(ANSWER, body)
     }
 
-    fn signed(&self, context: &str, body: &impl Encode) -> Signed {
+    fn signed(&self, context: &str, body: &impl Encode) -> SignedBody {
         let body = body.to_bytes();
         let signature = self.sign(context, &body).into();
-        Signed { body, signature }
+        SignedBody { body, signature }
     }
 }
 
 /// Verifies an advertisement: chain, time, signature, sequence number; and derives the names it may claim.
 pub fn verify_advert(
     anchors: &TrustAnchors,
-    signed: &Signed,
+    signed: &SignedBody,
     now: UnixMillis,
 ) -> Result<VerifiedAdvert, SignedError> {
     let body = AdvertBody::from_slice(&signed.body)?;
@@ -152,7 +151,7 @@ pub fn verify_advert(
     owner.verify_signature(ADVERT, &signed.body, &signed.signature)?;
     verify_seq(body.seq, body.issued_at)?;
     let mut names: Vec<_> = body.blinds.iter().map(|b| name_of(&owner.node_id, b)).collect();
-    // A signer may say one name several times, and whoever counts them relies on it that each is there once.
+    // A signer may repeat a name, and callers that count names rely on each being there once.
     names.sort_unstable();
     names.dedup();
     Ok(VerifiedAdvert { owner, body, names })
@@ -161,7 +160,7 @@ pub fn verify_advert(
 /// Verifies a join: chain, time, signature.
 pub fn verify_join(
     anchors: &TrustAnchors,
-    signed: &Signed,
+    signed: &SignedBody,
     now: UnixMillis,
 ) -> Result<VerifiedJoin, SignedError> {
     let body = JoinBody::from_slice(&signed.body)?;
@@ -170,10 +169,11 @@ pub fn verify_join(
     Ok(VerifiedJoin { peer, body })
 }
 
-/// Verifies a link state: chain, time, signature, sequence number. Whether the node may carry others' names is for the caller to see.
+/// Verifies a link state: chain, time, signature, sequence number. The caller checks whether the node may carry others'
+/// names.
 pub fn verify_link_state(
     anchors: &TrustAnchors,
-    signed: &Signed,
+    signed: &SignedBody,
     now: UnixMillis,
 ) -> Result<VerifiedLinkState, SignedError> {
     let body = LinkStateBody::from_slice(&signed.body)?;
@@ -183,21 +183,21 @@ pub fn verify_link_state(
     Ok(VerifiedLinkState { node, body })
 }
 
-/// A fingerprint of something signed, body and signature: what was verified once needs not be verified again.
-pub fn signed_digest(signed: &Signed) -> [u8; 32] {
+/// Returns a fingerprint of a signed body and its signature, so that no body is verified twice.
+pub fn signed_digest(signed: &SignedBody) -> [u8; 32] {
     let length = (signed.body.len() as u64).to_be_bytes();
     crate::verify::sha256(&[&length, &signed.body, &signed.signature])
 }
 
 /// Verifies an answer by the owner of the name.
-pub fn verify_answer(owner: &VerifiedPeer, signed: &Signed) -> Result<AnswerBody, SignedError> {
+pub fn verify_answer(owner: &VerifiedPeer, signed: &SignedBody) -> Result<AnswerBody, SignedError> {
     let body = AnswerBody::from_slice(&signed.body)?;
     owner.verify_signature(ANSWER, &signed.body, &signed.signature)?;
     Ok(body)
 }
 
-/// Returns the sequence number that follows `last`: the time in milliseconds, so that numbers grow over restarts, or the next
-/// one. A number beyond [`SEQ_AHEAD_MAX`], which nobody believes, is not continued.
+/// Returns the sequence number that follows `last`: the time in milliseconds, so that numbers grow over restarts, or
+/// `last + 1`. A number beyond [`SEQ_AHEAD_MAX`], which nobody believes, is not continued.
 pub fn next_seq(last: u64, now: UnixMillis) -> u64 {
     let next = now.0.max(last.saturating_add(1));
     if verify_seq(next, now).is_ok() { next } else { now.0 }

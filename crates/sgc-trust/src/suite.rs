@@ -1,14 +1,14 @@
-//! The cipher suites: which AEAD seals, and who signs what is sealed (`docs/spec/trust.md`, suites).
+//! The cipher suites: the AEAD that seals, and the signature of sealed packets (`docs/spec/trust.md`, suites).
 
 use std::fmt;
 use std::str::FromStr;
 
 use aws_lc_rs::aead::{AES_256_GCM, Algorithm, CHACHA20_POLY1305};
 
-/// How payloads of a topic are protected.
+/// Protection of a topic's payloads.
 ///
-/// The `group` suites keep out whoever was not granted the topic; those who were trust each other not to
-/// forge one another. In all others each source signs, so that nobody but it can make its messages.
+/// The `group` suites keep out every node without a grant of the topic; granted nodes trust each other not to forge
+/// messages. In all others each source signs, so that only it can make its messages.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Suite {
     /// AES-256-GCM.
@@ -30,7 +30,7 @@ pub enum Suite {
     Paper3072Chacha,
 }
 
-/// What messages are signed with.
+/// Signature scheme of messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Scheme {
     /// Nothing.
@@ -54,10 +54,10 @@ impl Scheme {
 }
 
 impl Suite {
-    /// What is used where nothing else is asked for.
+    /// The suite of topics without a setting.
     pub const DEFAULT: Self = Self::Standard;
 
-    /// All, in the order of their ids.
+    /// All suites, in the order of their ids.
     pub const ALL: [Self; 8] = [
         Self::Group,
         Self::GroupChacha,
@@ -69,17 +69,17 @@ impl Suite {
         Self::Paper3072Chacha,
     ];
 
-    /// Id on the wire, from 1.
+    /// Returns the id on the wire, from 1.
     pub fn id(self) -> u8 {
         self as u8 + 1
     }
 
-    /// The suite with that id, if this build has it.
+    /// Returns the suite with that id, if this build has it.
     pub fn from_id(id: u8) -> Option<Self> {
         Self::ALL.into_iter().find(|s| s.id() == id)
     }
 
-    /// What configuration files and logs call it.
+    /// Returns the name in configuration files and logs.
     pub fn name(self) -> &'static str {
         match self {
             Self::Group => "group",
@@ -93,7 +93,7 @@ impl Suite {
         }
     }
 
-    /// True if each source signs its messages, and members cannot forge one another.
+    /// Returns `true` if each source signs its messages, and members cannot forge one another.
     pub fn is_signed(self) -> bool {
         self.scheme() != Scheme::Unsigned
     }

@@ -1,8 +1,8 @@
 //! Share tokens: one interface of an owner, for a partner whose nodes belong to another fleet.
 //!
-//! A token holds what a member of the fleet would derive: whose the interface is, what it is, and its topic secret,
-//! which leads to its name and to no other. It admits nobody by itself: the owner's policy names the partner's CA.
-//! Text and bytes are those of `docs/spec/trust.md`. Where tokens are kept is the business of the node.
+//! A token holds the values that a member of the fleet would derive: owner, metadata and topic secret, which leads to
+//! its name and to no other. It admits nobody by itself: the owner's policy names the partner's CA.
+//! `docs/spec/trust.md` defines text and bytes. The node stores tokens.
 
 use std::fmt;
 
@@ -19,32 +19,32 @@ use zeroize::Zeroizing;
 use crate::label::LABEL_BYTES_MAX;
 use crate::{AnchorError, CaFingerprint, NodeName, TopicSecret, TrustAnchors, name_of};
 
-/// What the text of a token begins with; the number is the version.
+/// Beginning of a token's text; the number is the version.
 pub const TOKEN_PREFIX: &str = "sgc-token-1:";
 /// Most routers that one token names.
 pub const TOKEN_ROUTERS_MAX: usize = 16;
 /// Longest text of a token, bytes: one with every field at its bound fits.
 pub const TOKEN_TEXT_BYTES_MAX: usize = 28 * 1024;
 
-/// What tokens of any version begin with.
+/// Beginning of tokens of any version.
 const ANY_PREFIX: &str = "sgc-token-";
 const VERSION: u8 = 1;
 const ROUTER_BYTES_MAX: usize = 300;
 const CHECKSUM_BYTES: usize = 4;
 const CHECKSUM_DOMAIN: &[u8] = b"sgc token v1";
 
-/// One interface, handed to a partner. Compared in constant time where it is secret; Debug shows nothing secret.
+/// One interface, handed to a partner. Secrets are compared in constant time; Debug shows nothing secret.
 #[derive(Clone, PartialEq, Eq)]
 pub struct ShareToken {
-    /// Whose interface it is.
+    /// Owner of the interface.
     pub owner: NodeId,
     /// The owner's name in its fleet, for people; also in the metadata.
     pub owner_name: NodeName,
     /// The CA of the owner's fleet, which the partner has to trust to reach the owner.
     pub ca: CertificateDer<'static>,
-    /// What the interface is; a topic with a type.
+    /// Metadata of the interface; a topic with a type.
     pub metadata: Metadata,
-    /// What the name follows from.
+    /// Secret from which the name follows.
     pub secret: TopicSecret,
     /// Routers at which the owner can be reached, as URLs; hints, not checked here.
     pub routers: Vec<String>,
@@ -77,7 +77,7 @@ impl ShareToken {
         Self::decode(content)
     }
 
-    /// The text of the token. It is a secret: whoever holds it can derive the name.
+    /// Returns the text of the token. It is a secret: everyone with it can derive the name.
     pub fn to_text(&self) -> Zeroizing<String> {
         let mut content = Zeroizing::new(self.encode());
         let sum = checksum(&content);
@@ -88,19 +88,19 @@ impl ShareToken {
         text
     }
 
-    /// The name of the interface.
+    /// Returns the name of the interface.
     pub fn name(&self) -> Name {
         name_of(&self.owner, &self.secret.blind())
     }
 
-    /// The CA of the owner's fleet.
+    /// Returns the CA of the owner's fleet.
     pub fn ca_fingerprint(&self) -> Result<CaFingerprint, TokenError> {
         let anchors = TrustAnchors::new([self.ca.clone()]).map_err(TokenError::Ca)?;
         anchors.fingerprints().next().ok_or(TokenError::Ca(AnchorError::None))
     }
 
     fn encode(&self) -> Vec<u8> {
-        // Capacity up front: a vector that grows leaves copies of the secret behind.
+        // Capacity up front: a growing vector leaves copies of the secret behind.
         let mut head = Writer::default();
         head.u8(VERSION);
         self.owner.encode(&mut head);
@@ -138,7 +138,7 @@ impl ShareToken {
         Ok(token)
     }
 
-    /// Whether the fields are those of a token; what is refused when read must not be written.
+    /// Checks the fields; a token that parsing would refuse must not be written.
     pub fn check(&self) -> Result<(), TokenError> {
         let Metadata { kind, owner, ros_name, type_name, .. } = &self.metadata;
         if owner != self.owner_name.as_str() {
@@ -167,8 +167,8 @@ impl fmt::Debug for ShareToken {
     }
 }
 
-/// Guards against a token that was cut or mistyped, not against one that was forged: what a forged one leads to is
-/// for the owner to refuse.
+/// Returns the checksum that detects a cut or mistyped token. It does not detect a forged one: the owner refuses the
+/// name that a forged token leads to.
 fn checksum(content: &[u8]) -> [u8; CHECKSUM_BYTES] {
     let mut context = digest::Context::new(&digest::SHA256);
     context.update(CHECKSUM_DOMAIN);
@@ -178,7 +178,7 @@ fn checksum(content: &[u8]) -> [u8; CHECKSUM_BYTES] {
     out
 }
 
-/// Why a text is no token. None of them repeats the text, which may be one but for a letter.
+/// The reason why a text is no token. No error repeats the text, which may be a token but for a letter.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum TokenError {
     /// Too long.
@@ -187,10 +187,10 @@ pub enum TokenError {
         /// Its length.
         bytes: usize,
     },
-    /// Something else altogether.
+    /// The text is no token at all.
     #[error("it is no token: one begins with \"{TOKEN_PREFIX}\"")]
     Prefix,
-    /// Of a version that is not known here.
+    /// A version that is not known here.
     #[error("its version is not known here: \"{TOKEN_PREFIX}\" is")]
     Version,
     /// Characters that tokens do not have.
@@ -208,7 +208,7 @@ pub enum TokenError {
     /// Not a topic with a type.
     #[error("it stands for no topic with a type")]
     Interface,
-    /// The CA certificate is none.
+    /// Invalid CA certificate.
     #[error("its CA certificate is of no use: {0}")]
     Ca(AnchorError),
     /// Too many routers, or too long.

@@ -1,8 +1,8 @@
-//! From a certificate chain to a verified peer: who it is, which groups it is in, what it signs.
+//! From a certificate chain to a verified peer: its node id, its groups and its signing key.
 //!
-//! The only way to a [`VerifiedPeer`] is [`TrustAnchors::verify`], so whoever holds one holds the result of a
-//! full path validation. It does not decide what a peer may do (that is the policy) and it reads no clock. Host
-//! names are not looked at anywhere: a peer is who its certificate says, wherever it is reached.
+//! The only way to a [`VerifiedPeer`] is [`TrustAnchors::verify`], so every [`VerifiedPeer`] is the result of a full
+//! path validation. This module does not decide a peer's rights (the policy does) and reads no clock. No code looks at
+//! host names: the certificate names the peer, wherever it is reached.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -26,13 +26,13 @@ pub const ANCHORS_MAX: usize = 64;
 const SGC_URI: &str = "sgc:";
 pub(crate) const NODE_URI: &str = "sgc:node:";
 pub(crate) const GROUP_URI: &str = "sgc:group:";
-/// In certificates of nodes that may carry others' names.
+/// URI in certificates of nodes that may carry others' names.
 pub(crate) const ROUTER_URI: &str = "sgc:role:router";
-/// In certificates of nodes that were enrolled again after they had been revoked; without it a certificate is of
-/// incarnation 0.
+/// URI in certificates of nodes that were enrolled again after a revocation; a certificate without it has incarnation
+/// 0.
 pub(crate) const INCARNATION_URI: &str = "sgc:incarnation:";
 
-/// What certificates and revocation lists may be signed with.
+/// Signature algorithms of certificates and revocation lists.
 pub(crate) const CHAIN_ALGORITHMS: &[&dyn SignatureVerificationAlgorithm] = &[
     algs::ECDSA_P256_SHA256,
     algs::ECDSA_P256_SHA384,
@@ -47,8 +47,8 @@ pub(crate) const CHAIN_ALGORITHMS: &[&dyn SignatureVerificationAlgorithm] = &[
     algs::RSA_PKCS1_2048_8192_SHA512,
 ];
 
-/// What nodes sign objects with: one algorithm for each kind of key, so that a signature needs no algorithm
-/// field that could be argued about.
+/// Signature algorithms of nodes for objects: one for each kind of key, so that a signature needs no algorithm field
+/// that an attacker could change.
 const OBJECT_ALGORITHMS: &[&dyn SignatureVerificationAlgorithm] = &[
     algs::ECDSA_P256_SHA256,
     algs::ECDSA_P384_SHA384,
@@ -56,15 +56,15 @@ const OBJECT_ALGORITHMS: &[&dyn SignatureVerificationAlgorithm] = &[
     algs::RSA_PSS_2048_8192_SHA256_LEGACY_KEY,
 ];
 
-/// The CAs whose nodes are believed, and what each of them has revoked. Cloning shares.
+/// The trusted CAs, and the revocations of each. Cloning shares.
 #[derive(Clone)]
 pub struct TrustAnchors {
     pub(crate) anchors: Arc<[Anchor]>,
-    /// The same once more, in the form that path building wants.
+    /// The same CAs in the form of path building.
     pub(crate) paths: Arc<[TrustAnchor<'static>]>,
-    /// By the CA that signed them.
+    /// Revocation lists by the CA that signed them.
     pub(crate) lists: Arc<BTreeMap<CaFingerprint, CaLists>>,
-    /// What was verified with these CAs and lists, and with no others.
+    /// Chains that were verified with these CAs and lists, and with no others.
     pub(crate) chains: Arc<KnownChains>,
 }
 
@@ -73,7 +73,7 @@ pub(crate) struct Anchor {
     pub(crate) spki: Box<[u8]>,
     pub(crate) fingerprint: CaFingerprint,
     pub(crate) validity: Validity,
-    /// Most intermediate CAs below it, if it limits them.
+    /// Most intermediate CAs below the CA, if it limits them.
     path_length: Option<usize>,
 }
 
@@ -98,7 +98,7 @@ impl TrustAnchors {
         Ok(Self { anchors: anchors.into(), paths: paths.into(), lists, chains })
     }
 
-    /// With more CAs, such as a partner's; one that is trusted already is not taken twice. Revocation lists stay.
+    /// Returns these anchors with more CAs, such as a partner's; known ones are not added twice. Revocation lists stay.
     pub fn with_anchors(
         &self,
         more: impl IntoIterator<Item = CertificateDer<'static>>,
@@ -112,7 +112,7 @@ impl TrustAnchors {
         Ok(Self::new(certificates)?.with_lists(Arc::clone(&self.lists)))
     }
 
-    /// The same CAs with these lists.
+    /// Returns the same CAs with these lists.
     pub(crate) fn with_lists(&self, lists: Arc<BTreeMap<CaFingerprint, CaLists>>) -> Self {
         let (anchors, paths) = (Arc::clone(&self.anchors), Arc::clone(&self.paths));
         Self { anchors, paths, lists, chains: Arc::default() }
@@ -128,7 +128,7 @@ impl TrustAnchors {
         if let Some(long) = chain.iter().find(|c| c.len() > CERT_BYTES_MAX) {
             return Err(CertError::CertificateTooLong { bytes: long.len() });
         }
-        let hash = ChainHash::of(chain);
+        let hash = ChainHash::from_chain(chain);
         if let Some(peer) = self.chains.find(&hash, now) {
             return Ok(peer);
         }
@@ -149,7 +149,7 @@ impl TrustAnchors {
         let mut certs = Vec::with_capacity(chain.len());
         let mut between: Vec<_> = path.intermediate_certificates().collect();
         between.reverse();
-        // Path validation takes the limit of a trusted CA for none.
+        // Path validation ignores the path length of a trusted CA.
         if ca.path_length.is_some_and(|most| between.len() > most) {
             return Err(CertError::PathTooLong { intermediates: between.len() });
         }
@@ -165,7 +165,7 @@ impl TrustAnchors {
         certs.push(CertId::new(issuer, leaf.serial()));
         // With certificates that its path does not need, one chain could be varied without end.
         let is_minimal = certs.len() == chain.len();
-        let peer = VerifiedPeer::of_leaf(&leaf, leaf_der, ca, certs)?;
+        let peer = VerifiedPeer::from_leaf(&leaf, leaf_der, ca, certs)?;
         if let Some(at) = self.path_revoked_at(&peer.path) {
             return Err(CertError::Revoked { at });
         }
@@ -175,17 +175,17 @@ impl TrustAnchors {
         Ok(peer)
     }
 
-    /// The CA certificates, DER.
+    /// Returns the CA certificates, DER.
     pub fn certificates(&self) -> impl Iterator<Item = &CertificateDer<'static>> {
         self.anchors.iter().map(|a| &a.der)
     }
 
-    /// The CAs, by their public keys, in the order of [`TrustAnchors::certificates`].
+    /// Returns the fingerprints of the CAs, in the order of [`TrustAnchors::certificates`].
     pub fn fingerprints(&self) -> impl Iterator<Item = CaFingerprint> {
         self.anchors.iter().map(|a| a.fingerprint)
     }
 
-    /// The public key (SubjectPublicKeyInfo, DER) of a CA that is trusted here.
+    /// Returns the public key (SubjectPublicKeyInfo, DER) of a trusted CA.
     pub fn ca_spki(&self, ca: &CaFingerprint) -> Option<&[u8]> {
         self.anchors.iter().find(|a| a.fingerprint == *ca).map(|a| &*a.spki)
     }
@@ -206,18 +206,20 @@ impl Anchor {
         let path = webpki::anchor_from_trusted_cert(&der).map_err(reason)?.to_owned();
         let spki: Box<[u8]> =
             EndEntityCert::try_from(&der).map_err(reason)?.subject_public_key_info().as_ref().into();
-        let validity = Validity::of(&der).ok_or("its validity cannot be read")?;
+        let validity = Validity::from_certificate(&der).ok_or("its validity cannot be read")?;
         let path_length = path_length(&der).ok_or("its path length cannot be read")?;
         let fingerprint = CaFingerprint(sha256(&[&spki]));
         Ok((Self { der, spki, fingerprint, validity, path_length }, path))
     }
 
-    /// While this CA and all of these hold.
+    /// Returns the time in which this CA and all of these certificates are valid.
     fn validity_with(&self, chain: &[CertificateDer<'_>]) -> Option<Validity> {
-        chain.iter().try_fold(self.validity, |all, certificate| Some(all.overlap(Validity::of(certificate)?)))
+        chain.iter().try_fold(self.validity, |all, certificate| {
+            Some(all.overlap(Validity::from_certificate(certificate)?))
+        })
     }
 
-    /// Path validation takes a trusted CA as it is; an expired one is not trusted here.
+    /// Checks that the CA has not expired: path validation does not check it.
     fn check_validity(&self, now: UnixMillis) -> Result<(), CertError> {
         let Validity { not_before, not_after } = self.validity;
         if now.secs() > not_after.secs() {
@@ -248,23 +250,23 @@ impl fmt::Debug for CaFingerprint {
     }
 }
 
-/// One certificate: its CA and the serial number that the CA gave it. What revocation lists name.
+/// One certificate in revocation lists: its CA and the serial number that the CA gave it.
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct CertId {
-    /// The CA that made it: an intermediate one, if there is one in between.
+    /// The CA that made it: an intermediate one, if there is one.
     pub ca: CaFingerprint,
     /// The serial number, big-endian, without leading zeros (RFC 5280, 4.1.2.2).
     pub serial: Arc<[u8]>,
-    /// For a node's certificate, of which node and incarnation it is.
+    /// Node and incarnation, for a node's certificate.
     pub node: Option<NodeIncarnation>,
 }
 
-/// A node between two re-enrolments: all of its certificates that are revoked together.
+/// A node between two re-enrolments: all of its certificates are revoked together.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct NodeIncarnation {
     /// The node.
     pub pseudonym: Pseudonym,
-    /// Grows when the node is enrolled again after it was revoked, and not when it is renewed.
+    /// Grows when the node is enrolled again after a revocation, and not when it is renewed.
     pub incarnation: u32,
 }
 
@@ -282,26 +284,26 @@ impl fmt::Debug for CertId {
     }
 }
 
-/// Who a verified certificate chain speaks for. Cloning shares.
+/// The node that a verified certificate chain speaks for. Cloning shares.
 #[derive(Clone, Debug)]
 pub struct VerifiedPeer {
-    /// Who it is, also as owner of names.
+    /// The node, also as owner of names.
     pub node_id: NodeId,
-    /// What its certificate calls it.
+    /// The node's pseudonym in its certificate.
     pub pseudonym: Pseudonym,
     /// Number of times that it was enrolled again after a revocation.
     pub incarnation: u32,
     /// Its groups, sorted, each once.
     pub groups: Arc<[GroupTag]>,
-    /// When its certificate begins to hold.
+    /// First moment at which its certificate is valid.
     pub not_before: UnixMillis,
-    /// Last moment at which its certificate holds.
+    /// Last moment at which its certificate is valid.
     pub not_after: UnixMillis,
-    /// The CA that vouches for it: the trusted one at the end of its path.
+    /// The trusted CA at the end of its path.
     pub ca: CaFingerprint,
     /// Its certificate.
     pub cert: CertId,
-    /// True if its certificate lets it carry others' names (`sgc:role:router`).
+    /// Whether its certificate lets it carry others' names (`sgc:role:router`).
     pub may_route: bool,
     /// All certificates of its path, from the one below the CA to its own.
     pub path: Arc<[CertId]>,
@@ -322,12 +324,12 @@ impl VerifiedPeer {
             .map_err(|_| SignatureError { signer: self.node_id })
     }
 
-    /// True if its certificate puts it into this group.
+    /// Returns `true` if its certificate puts it into this group.
     pub fn is_in(&self, group: &GroupTag) -> bool {
         self.groups.binary_search(group).is_ok()
     }
 
-    fn of_leaf(
+    fn from_leaf(
         leaf: &EndEntityCert<'_>,
         der: &[u8],
         ca: &Anchor,
@@ -337,7 +339,7 @@ impl VerifiedPeer {
         let mut incarnation = None;
         let mut groups = Vec::new();
         let mut may_route = false;
-        // URIs that are unknown here are for later versions.
+        // Unknown URIs are for later versions.
         for uri in leaf.valid_uri_names() {
             if let Some(hex) = uri.strip_prefix(NODE_URI) {
                 let id = hex.parse::<Pseudonym>().map_err(|_| CertError::NoPseudonym)?;
@@ -365,8 +367,8 @@ impl VerifiedPeer {
         let cert = path.last_mut().ok_or(CertError::NoCertificate)?;
         cert.node = Some(NodeIncarnation { pseudonym, incarnation });
         let cert = cert.clone();
-        let Validity { not_before, not_after } =
-            Validity::of(der).ok_or_else(|| CertError::Malformed("its validity cannot be read".into()))?;
+        let Validity { not_before, not_after } = Validity::from_certificate(der)
+            .ok_or_else(|| CertError::Malformed("its validity cannot be read".into()))?;
         let spki = leaf.subject_public_key_info();
         let (algorithm_id, key) = split_spki(&spki).ok_or(CertError::KeyUnsupported)?;
         let algorithm = *OBJECT_ALGORITHMS
@@ -390,18 +392,18 @@ impl VerifiedPeer {
     }
 }
 
-/// An incarnation as certificates have it: decimal, from 1, in its shortest form.
+/// Parses an incarnation in certificates: decimal, from 1, in its shortest form.
 fn read_incarnation(number: &str) -> Result<u32, CertError> {
     let read = number.parse::<u32>().ok().filter(|n| *n > 0 && n.to_string() == number);
     read.ok_or_else(|| CertError::Malformed("its incarnation is no number from 1 on".into()))
 }
 
-/// `SHA-256(CA public key ‖ pseudonym)`, the CA's key as DER SubjectPublicKeyInfo (`docs/spec/names.md`).
+/// Returns `SHA-256(CA public key ‖ pseudonym)`, the CA's key as DER SubjectPublicKeyInfo (`docs/spec/names.md`).
 pub fn node_id(ca_spki: &[u8], pseudonym: &Pseudonym) -> NodeId {
     NodeId(sha256(&[ca_spki, pseudonym.as_bytes()]))
 }
 
-/// What is signed: the context keeps a signature for one purpose from passing for another.
+/// Returns the signed bytes: the context keeps a signature for one purpose from passing for another.
 pub(crate) fn signature_input(context: &str, message: &[u8]) -> Vec<u8> {
     let mut input = Vec::with_capacity(context.len() + 1 + message.len());
     input.extend_from_slice(context.as_bytes());
@@ -418,8 +420,8 @@ pub(crate) fn sha256(parts: &[&[u8]]) -> [u8; 32] {
     out
 }
 
-/// Nodes dial and are dialled with one certificate, so either usage will do; a certificate for other purposes,
-/// such as signing mail, will not.
+/// The key usages of nodes. They dial and are dialled with one certificate, so either usage will do; a certificate for
+/// other purposes, such as signing mail, will not.
 struct PeerUsage;
 
 impl ExtendedKeyUsageValidator for PeerUsage {
@@ -441,30 +443,30 @@ impl ExtendedKeyUsageValidator for PeerUsage {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the signature is not one of node {} over this message", signer.short())]
 pub struct SignatureError {
-    /// Who was said to have signed.
+    /// The alleged signer.
     pub signer: NodeId,
 }
 
-/// Why CA certificates cannot be trusted as given.
+/// The reason why CA certificates cannot be trusted as given.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum AnchorError {
-    /// None was given.
+    /// No certificate.
     #[error("no CA certificate is given: at least one is needed")]
     None,
-    /// Too many were given.
+    /// Too many certificates.
     #[error("more than {ANCHORS_MAX} CA certificates are given")]
     TooMany,
-    /// One cannot be read.
+    /// A certificate that cannot be read.
     #[error("CA certificate {} cannot be read: {reason}", index + 1)]
     Malformed {
-        /// Which, from 0.
+        /// Its index, from 0.
         index: usize,
-        /// What is wrong with it.
+        /// The parser's error.
         reason: String,
     },
 }
 
-/// Why a certificate chain is refused.
+/// The reason why a certificate chain is refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CertError {
     /// No certificate came.
@@ -473,19 +475,19 @@ pub enum CertError {
     /// Too many certificates came.
     #[error("the chain has {certificates} certificates, at most {CHAIN_CERTS_MAX} are read")]
     ChainTooLong {
-        /// How many.
+        /// Their number.
         certificates: usize,
     },
-    /// One is too long.
+    /// A certificate is too long.
     #[error("a certificate has {bytes} bytes, at most {CERT_BYTES_MAX} are read")]
     CertificateTooLong {
         /// Its length.
         bytes: usize,
     },
-    /// It is not the X.509 that we read.
+    /// A certificate cannot be read as X.509.
     #[error("the certificate cannot be used: {0}")]
     Malformed(String),
-    /// The leaf does not say which node it is for.
+    /// The leaf does not name its node.
     #[error(
         "the certificate names no SGC node (URI sgc:node:…): make it with `sgc fleet enroll`, or have its CA sign the \
          request of `sgc fleet request` with the extensions that `sgc fleet extensions` writes"
@@ -508,16 +510,16 @@ pub enum CertError {
     /// The leaf names too many groups.
     #[error("the certificate names more than {GROUPS_MAX} groups")]
     TooManyGroups,
-    /// Its key is of a kind that nodes do not sign with.
+    /// The key is of a kind that nodes do not sign with.
     #[error("the certificate's key is not supported: P-256, P-384, Ed25519 and RSA are")]
     KeyUnsupported,
-    /// It is meant for something else.
+    /// The certificate is for another purpose.
     #[error("the certificate is for neither clients nor servers (extended key usage)")]
     WrongUsage,
-    /// No CA that is trusted here made it.
+    /// No CA that is trusted here made the certificate.
     #[error("the certificate is from a CA that is not trusted here: is the peer of another fleet?")]
     UnknownIssuer,
-    /// Its CA is believed here, but its nodes may not attach.
+    /// The CA is trusted here, but its nodes may not attach.
     #[error(
         "the certificate is from CA {ca}, which is not among those whose nodes may attach here: add that CA's file to \
          `accept` in [router], or leave it out if this is as it should be"
@@ -526,10 +528,10 @@ pub enum CertError {
         /// The CA.
         ca: CaFingerprint,
     },
-    /// It says that a trusted CA made it, and none did.
+    /// The certificate names a trusted CA, which did not sign it.
     #[error("the certificate's signature is wrong: it was altered or forged")]
     BadSignature,
-    /// It is over.
+    /// The certificate has expired.
     #[error(
         "the certificate expired at {not_after} and the clock here says {now}: enroll again, or set the clock"
     )]
@@ -539,7 +541,7 @@ pub enum CertError {
         /// The time of the check.
         now: UnixMillis,
     },
-    /// It has not begun.
+    /// The certificate is not yet valid.
     #[error("the certificate begins at {not_before} and the clock here says {now}: which clock is wrong?")]
     NotYetValid {
         /// Its beginning.
@@ -547,16 +549,16 @@ pub enum CertError {
         /// The time of the check.
         now: UnixMillis,
     },
-    /// Its CA took it back.
+    /// The CA revoked the certificate.
     #[error(
         "the certificate was revoked by its CA at {at}: if that is a mistake, the keeper of the fleet has to enroll \
          the node again"
     )]
     Revoked {
-        /// Since when, as the CA says.
+        /// Time of the revocation, as the CA gives it.
         at: UnixMillis,
     },
-    /// The CA's own certificate is over.
+    /// The CA's own certificate has expired.
     #[error("the fleet's CA expired at {not_after} and the clock here says {now}")]
     CaExpired {
         /// Its end.
@@ -567,7 +569,7 @@ pub enum CertError {
 }
 
 impl CertError {
-    /// True if the certificate, or its CA's, does not hold at the time of the check.
+    /// Returns `true` if the certificate, or its CA's, is not valid at the time of the check.
     pub fn is_expiry(&self) -> bool {
         matches!(self, Self::Expired { .. } | Self::NotYetValid { .. } | Self::CaExpired { .. })
     }

@@ -1,8 +1,8 @@
-//! The few fields of certificates and revocation lists that `webpki` checks but does not hand out, and the extension of
-//! ours that `rcgen` does not write.
+//! The few fields of certificates and revocation lists that `webpki` checks but does not hand out, and our extension,
+//! which `rcgen` does not write.
 //!
-//! It verifies nothing and is called only on what `webpki` has parsed, or whose chain it is about to verify;
-//! anything unexpected is `None`.
+//! This module verifies nothing. Its input was parsed by `webpki`, or is about to be verified; anything unexpected is
+//! `None`.
 
 use sgc_wire::UnixMillis;
 
@@ -24,8 +24,8 @@ const BASIC_CONSTRAINTS: &[u8] = &[0x55, 0x1d, 0x13];
 const KEY_USAGE: &[u8] = &[0x55, 0x1d, 0x0f];
 const CRL_NUMBER: &[u8] = &[0x55, 0x1d, 0x14];
 const DISTRIBUTION_POINT: &[u8] = &[0x55, 0x1d, 0x1c];
-/// By which a fleet's revocation list revokes nodes, 2.25.119781345836387798361097549824228883350: no registry gave it,
-/// it is a random UUID (ITU-T X.667).
+/// The extension by which a fleet's revocation list revokes nodes, 2.25.119781345836387798361097549824228883350: no
+/// registry gave the number, it is a random UUID (ITU-T X.667).
 const REVOKED_NODES: &[u8] = &[
     0x69, 0x81, 0xb4, 0x9d, 0x86, 0x93, 0xcf, 0xb3, 0xca, 0xbd, 0xc5, 0x9e, 0x84, 0xb0, 0xfe, 0x9a, 0x96,
     0xd1, 0xf7, 0x16,
@@ -35,7 +35,7 @@ const CRL_SIGN: u8 = 0x02;
 /// Bit 5: the key may sign certificates.
 const KEY_CERT_SIGN: u8 = 0x04;
 
-/// From when until when a certificate holds, both inclusive.
+/// Beginning and end of a certificate's validity, both inclusive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Validity {
     pub(crate) not_before: UnixMillis,
@@ -43,8 +43,8 @@ pub(crate) struct Validity {
 }
 
 impl Validity {
-    /// Of a DER certificate (RFC 5280, 4.1.2.5).
-    pub(crate) fn of(certificate: &[u8]) -> Option<Self> {
+    /// Reads a DER certificate (RFC 5280, 4.1.2.5).
+    pub(crate) fn from_certificate(certificate: &[u8]) -> Option<Self> {
         let mut certificate = Der(certificate).enter(SEQUENCE)?;
         let mut tbs = certificate.enter(SEQUENCE)?;
         if tbs.peek()? == VERSION {
@@ -57,19 +57,19 @@ impl Validity {
         Some(Self { not_before: validity.time()?, not_after: validity.time()? })
     }
 
-    /// While both hold; that may be never.
+    /// Returns the time in which both are valid; that may be never.
     pub(crate) fn overlap(self, other: Self) -> Self {
         let not_before = self.not_before.max(other.not_before);
         Self { not_before, not_after: self.not_after.min(other.not_after) }
     }
 
-    /// True at that time; the last second counts as a whole, as in path validation.
+    /// Returns `true` at that time; the last second counts as a whole, as in path validation.
     pub(crate) fn contains(&self, now: UnixMillis) -> bool {
         now >= self.not_before && now.secs() <= self.not_after.secs()
     }
 }
 
-/// Algorithm identifier (without its outer tag) and bare key of a DER SubjectPublicKeyInfo.
+/// Returns algorithm identifier (without its outer tag) and bare key of a DER SubjectPublicKeyInfo.
 pub(crate) fn split_spki(spki: &[u8]) -> Option<(&[u8], &[u8])> {
     let mut spki = Der(spki).enter(SEQUENCE)?;
     let algorithm = spki.enter(SEQUENCE)?.0;
@@ -79,7 +79,7 @@ pub(crate) fn split_spki(spki: &[u8]) -> Option<(&[u8], &[u8])> {
     }
 }
 
-/// The serial number of a DER certificate, without leading zeros.
+/// Returns the serial number of a DER certificate, without leading zeros.
 pub fn serial_of(certificate: &[u8]) -> Option<&[u8]> {
     let mut tbs = Der(certificate).enter(SEQUENCE)?.enter(SEQUENCE)?;
     if tbs.peek()? == VERSION {
@@ -88,19 +88,19 @@ pub fn serial_of(certificate: &[u8]) -> Option<&[u8]> {
     tbs.enter(INTEGER).map(|serial| without_zeros(serial.0))
 }
 
-/// What the making of certificates and lists needs of the certificate of their CA.
+/// The fields of a CA's certificate that certificates and lists need.
 pub(crate) struct CaFields<'a> {
     /// Its components in order: type, tag of the value, value.
     pub(crate) name: Vec<(Vec<u64>, u8, &'a [u8])>,
     pub(crate) key_id: Option<&'a [u8]>,
-    /// True if its basic constraints say that it is one.
+    /// Whether its basic constraints mark it as a CA.
     pub(crate) is_ca: bool,
-    /// True unless its key usage leaves out the signing of certificates.
+    /// `true` unless its key usage leaves out the signing of certificates.
     pub(crate) may_sign_certificates: bool,
 }
 
 impl<'a> CaFields<'a> {
-    pub(crate) fn of(certificate: &'a [u8]) -> Option<Self> {
+    pub(crate) fn from_certificate(certificate: &'a [u8]) -> Option<Self> {
         let mut tbs = Der(certificate).enter(SEQUENCE)?.enter(SEQUENCE)?;
         if tbs.peek()? == VERSION {
             tbs.skip()?;
@@ -138,9 +138,9 @@ impl<'a> CaFields<'a> {
     }
 }
 
-/// The fields of a DER CertificationRequest (PKCS #10, RFC 2986) that we read: its key, and that it signed.
+/// The fields of a DER CertificationRequest (PKCS #10, RFC 2986): its key and its signature.
 pub(crate) struct RequestFields<'a> {
-    /// What is signed: the whole first element.
+    /// The signed bytes: the whole first element.
     pub(crate) info: &'a [u8],
     /// The outer algorithm identifier without its tag.
     pub(crate) algorithm: &'a [u8],
@@ -150,7 +150,7 @@ pub(crate) struct RequestFields<'a> {
 }
 
 impl<'a> RequestFields<'a> {
-    pub(crate) fn of(request: &'a [u8]) -> Option<Self> {
+    pub(crate) fn from_request(request: &'a [u8]) -> Option<Self> {
         let mut whole = Der(request);
         let mut request = whole.enter(SEQUENCE)?;
         let from = request.0;
@@ -185,17 +185,17 @@ fn object_id(content: &[u8]) -> Option<Vec<u64>> {
     (!arcs.is_empty() && arc == 0).then_some(arcs)
 }
 
-/// True unless a DER certificate has a key usage that leaves out the signing of revocation lists.
+/// Returns `true` unless a DER certificate has a key usage that leaves out the signing of revocation lists.
 pub(crate) fn may_sign_lists(certificate: &[u8]) -> Option<bool> {
     Some(key_usage(certificate)?.is_none_or(|bits| bits & CRL_SIGN != 0))
 }
 
-/// True if the key usage of a DER certificate names the signing of certificates.
+/// Returns `true` if the key usage of a DER certificate names the signing of certificates.
 pub(crate) fn names_certificate_signing(certificate: &[u8]) -> Option<bool> {
     Some(key_usage(certificate)?.is_some_and(|bits| bits & KEY_CERT_SIGN != 0))
 }
 
-/// Most intermediate CAs below that of a DER certificate, if its basic constraints limit them.
+/// Returns the path length limit of a DER certificate, if its basic constraints have one.
 pub(crate) fn path_length(certificate: &[u8]) -> Option<Option<usize>> {
     let Some(extensions) = extensions_of(certificate)? else { return Some(None) };
     let Some(content) = extensions.find_extension(BASIC_CONSTRAINTS)? else { return Some(None) };
@@ -214,7 +214,7 @@ pub(crate) fn path_length(certificate: &[u8]) -> Option<Option<usize>> {
     }
 }
 
-/// The first byte of its key usage, if it has one.
+/// Returns the first byte of its key usage, if it has one.
 fn key_usage(certificate: &[u8]) -> Option<Option<u8>> {
     let Some(extensions) = extensions_of(certificate)? else { return Some(None) };
     match extensions.find_extension(KEY_USAGE)? {
@@ -239,7 +239,7 @@ fn extensions_of(certificate: &[u8]) -> Option<Option<Der<'_>>> {
 
 /// The fields of a DER CertificateList (RFC 5280, 5.1) that decide about it.
 pub(crate) struct ListFields<'a> {
-    /// What is signed: the whole first element.
+    /// The signed bytes: the whole first element.
     pub(crate) tbs: &'a [u8],
     /// The outer algorithm identifier without its tag.
     pub(crate) algorithm: &'a [u8],
@@ -248,14 +248,14 @@ pub(crate) struct ListFields<'a> {
     pub(crate) issuer: &'a [u8],
     /// Big-endian, without leading zeros; absent in lists of another profile.
     pub(crate) number: Option<&'a [u8]>,
-    /// True if it has an issuing distribution point: it may speak of some certificates only.
+    /// Whether it has an issuing distribution point: it may cover only some certificates.
     pub(crate) is_scoped: bool,
-    /// The value of the extension that revokes nodes, if it has one: then it is a fleet's list.
+    /// The value of the extension that revokes nodes. Only a fleet's list has it.
     pub(crate) revoked_nodes: Option<&'a [u8]>,
 }
 
 impl<'a> ListFields<'a> {
-    pub(crate) fn of(list: &'a [u8]) -> Option<Self> {
+    pub(crate) fn from_list(list: &'a [u8]) -> Option<Self> {
         let mut list = Der(list).enter(SEQUENCE)?;
         let from = list.0;
         let mut fields = list.enter(SEQUENCE)?;
@@ -281,8 +281,8 @@ impl<'a> ListFields<'a> {
         Some(Self { tbs, algorithm, signature, issuer, number, is_scoped, revoked_nodes })
     }
 
-    /// Returns the signed part of a list made anew, with this value of the extension that revokes nodes behind its other
-    /// extensions: `list` is one that has extensions and not this one.
+    /// Returns the signed part of `list` with this value of the extension that revokes nodes behind its other
+    /// extensions. `list` has extensions and not this one.
     pub(crate) fn tbs_with_revoked_nodes(list: &[u8], value: &[u8]) -> Option<Vec<u8>> {
         let mut fields = Der(list).enter(SEQUENCE)?.enter(SEQUENCE)?;
         let from = fields.0;
@@ -297,7 +297,7 @@ impl<'a> ListFields<'a> {
         Some(element(SEQUENCE, &[before, &extensions]))
     }
 
-    /// The list of which that is signed, with the algorithm of the one that it was made from.
+    /// Returns the list with this signed part, with the algorithm of its original.
     pub(crate) fn signed(tbs: &[u8], algorithm: &[u8], signature: &[u8]) -> Vec<u8> {
         element(SEQUENCE, &[tbs, &element(SEQUENCE, &[algorithm]), &element(BIT_STRING, &[&[0], signature])])
     }
@@ -315,7 +315,7 @@ impl RevokedNodeFields {
     /// Longest encoding of one, bytes.
     pub(crate) const BYTES_MAX: usize = 2 + 34 + 7 + 11;
 
-    /// Reads the value of the extension: a sequence of them, and nothing else.
+    /// Reads the value of the extension: a sequence of nodes, and nothing else.
     pub(crate) fn all(value: &[u8]) -> Option<Vec<Self>> {
         let mut whole = Der(value);
         let mut entries = whole.enter(SEQUENCE)?;
@@ -331,7 +331,7 @@ impl RevokedNodeFields {
         whole.0.is_empty().then_some(all)
     }
 
-    /// The value of the extension for these.
+    /// Returns the value of the extension for these nodes.
     pub(crate) fn write_all(entries: impl IntoIterator<Item = Self>) -> Vec<u8> {
         let mut content = Vec::new();
         for entry in entries {
@@ -348,7 +348,7 @@ impl RevokedNodeFields {
     }
 }
 
-/// One DER element with this content.
+/// Returns one DER element with this content.
 fn element(tag: u8, content: &[&[u8]]) -> Vec<u8> {
     let length: usize = content.iter().map(|part| part.len()).sum();
     let digits = length.to_be_bytes();
@@ -364,7 +364,7 @@ fn element(tag: u8, content: &[&[u8]]) -> Vec<u8> {
     out
 }
 
-/// A DER integer.
+/// Returns a DER integer.
 fn unsigned(number: u64) -> Vec<u8> {
     let bytes = number.to_be_bytes();
     let bytes = without_zeros(&bytes);
@@ -372,7 +372,7 @@ fn unsigned(number: u64) -> Vec<u8> {
     element(INTEGER, &[sign, bytes])
 }
 
-/// An unsigned big-endian number without leading zeros.
+/// Returns an unsigned big-endian number without leading zeros.
 pub(crate) fn without_zeros(number: &[u8]) -> &[u8] {
     let zeros = number.iter().take_while(|b| **b == 0).count();
     number.get(zeros..).unwrap_or_default()
@@ -386,13 +386,13 @@ impl<'a> Der<'a> {
         self.0.first().copied()
     }
 
-    /// Steps over one element, whatever it is.
+    /// Steps over one element of any kind.
     fn skip(&mut self) -> Option<()> {
         let tag = self.peek()?;
         self.enter(tag).map(drop)
     }
 
-    /// The value of one extension, if it is among these.
+    /// Returns the value of one extension, if it is among these.
     fn find_extension(mut self, id: &[u8]) -> Option<Option<&'a [u8]>> {
         while self.peek().is_some() {
             let mut extension = self.enter(SEQUENCE)?;
@@ -460,7 +460,7 @@ fn number(digits: &[u8]) -> Option<u64> {
     digits.iter().try_fold(0, |n, d| d.is_ascii_digit().then(|| n * 10 + u64::from(d - b'0')))
 }
 
-/// Days from 1970-01-01 to a Gregorian date; zero for dates before it, which hold for all our purposes.
+/// Returns the days from 1970-01-01 to a Gregorian date; zero for earlier dates, which are valid for all our purposes.
 fn days_since_1970(year: u64, month: u64, day: u64) -> u64 {
     const DAYS_BEFORE: [u64; 12] = [0, 31, 59, 90, 120, 151, 181, 212, 243, 273, 304, 334];
     let is_leap = year.is_multiple_of(4) && (!year.is_multiple_of(100) || year.is_multiple_of(400));
@@ -502,7 +502,7 @@ mod tests {
         for der in [&[][..], &[SEQUENCE], &[SEQUENCE, 5, 1], &[SEQUENCE, 0x84, 1, 1, 1, 1], &[SEQUENCE, 0x80]]
         {
             assert!(Der(der).enter(SEQUENCE).is_none());
-            assert!(Validity::of(der).is_none() && split_spki(der).is_none());
+            assert!(Validity::from_certificate(der).is_none() && split_spki(der).is_none());
         }
     }
 }

@@ -1,9 +1,8 @@
-//! X-Wing (draft-connolly-cfrg-xwing-kem): X25519 and ML-KEM-768 joined, so that a secret stands as long as one of
-//! the two does.
+//! X-Wing (draft-connolly-cfrg-xwing-kem): X25519 and ML-KEM-768 joined, so that a secret is safe as long as one of the
+//! two is.
 //!
-//! Both are AWS-LC's; what is here is how they are put together. Private keys live for one join, are never written
-//! down, and so are made by the two algorithms themselves and not from the draft's seed. AWS-LC clears them
-//! when it frees them.
+//! AWS-LC has both algorithms; this module combines them. Private keys live for one join, are never written down, and
+//! so the two algorithms make them, not the draft's seed. AWS-LC clears them when it frees them.
 
 use aws_lc_rs::agreement::{self, UnparsedPublicKey, X25519};
 use aws_lc_rs::digest;
@@ -19,15 +18,15 @@ pub(crate) const ENC_BYTES: usize = KEM_ENC_BYTES + CURVE_BYTES;
 const KEM_PUBLIC_BYTES: usize = 1184;
 const KEM_ENC_BYTES: usize = 1088;
 const KEM_PRIVATE_BYTES: usize = 2400;
-/// Where the public key stands in a private one.
+/// Offset of the public key in a private one.
 const KEM_PUBLIC_AT: usize = 1152;
 const CURVE_BYTES: usize = 32;
 const LABEL: &[u8; 6] = br"\.//^\";
 
-/// What both sides have afterwards.
+/// The secret of both sides.
 pub(crate) type SharedSecret = Zeroizing<[u8; 32]>;
 
-/// Opens what was encapsulated to its public key.
+/// A key that opens secrets encapsulated to its public key.
 pub(crate) struct PrivateKey {
     kem: kem::DecapsulationKey,
     curve: agreement::PrivateKey,
@@ -35,7 +34,7 @@ pub(crate) struct PrivateKey {
 }
 
 impl PrivateKey {
-    /// A fresh key and its public key. It fails only where the system has no randomness.
+    /// Makes a key and its public key. It fails only where the system has no randomness.
     pub(crate) fn generate() -> Result<(Self, Vec<u8>), Unspecified> {
         let kem = kem::DecapsulationKey::generate(&ML_KEM_768)?;
         let mut public = kem.encapsulation_key()?.key_bytes()?.as_ref().to_vec();
@@ -44,7 +43,7 @@ impl PrivateKey {
         Ok((key, public))
     }
 
-    /// A key that is known beforehand and its public key: the decapsulation key of ML-KEM-768 (FIPS 203, 7.1), which
+    /// Reads a given key and returns it with its public key: the decapsulation key of ML-KEM-768 (FIPS 203, 7.1), which
     /// contains its encapsulation key, and X25519's.
     pub(crate) fn from_bytes(bytes: &[u8]) -> Option<(Self, Vec<u8>)> {
         let (kem, curve) = bytes.split_at_checked(KEM_PRIVATE_BYTES)?;
@@ -55,8 +54,8 @@ impl PrivateKey {
         Some((key, public))
     }
 
-    /// The secret in `enc`. One that was made for another key, or altered, comes out as some other secret; `None` if
-    /// it cannot be any.
+    /// Returns the secret in `enc`. An altered secret, or one for another key, yields some other secret; a malformed
+    /// one yields `None`.
     pub(crate) fn decapsulate(&self, enc: &[u8]) -> Option<SharedSecret> {
         if enc.len() != ENC_BYTES {
             return None;
@@ -72,7 +71,7 @@ impl PrivateKey {
     }
 }
 
-/// A fresh secret, encapsulated to a public key; `None` if that is no public key.
+/// Makes a secret, encapsulated to a public key; `None` if the public key is malformed.
 pub(crate) fn encapsulate(public: &[u8]) -> Option<(Vec<u8>, SharedSecret)> {
     let (kem_public, curve_public) = public.split_at_checked(KEM_PUBLIC_BYTES)?;
     if curve_public.len() != CURVE_BYTES {
@@ -113,7 +112,7 @@ pub(crate) mod tests {
 
     use super::*;
 
-    /// The blocks of `tests/vectors/xwing.txt`.
+    /// Returns the blocks of `tests/vectors/xwing.txt`.
     pub(crate) fn vectors() -> Vec<BTreeMap<&'static str, Vec<u8>>> {
         let mut blocks: Vec<BTreeMap<_, _>> = Vec::new();
         for line in include_str!("../tests/vectors/xwing.txt").lines() {
@@ -152,7 +151,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_is_encapsulated_to_a_published_key_opens_with_it() {
+    fn a_secret_encapsulated_to_a_published_key_opens_with_it() {
         for vector in &vectors() {
             let (enc, secret) = encapsulate(&vector["pk"]).unwrap();
             assert_eq!(private_key(vector).decapsulate(&enc).unwrap(), secret);
@@ -175,7 +174,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_cannot_be_a_key_or_a_secret_is_refused() {
+    fn malformed_keys_and_secrets_are_refused() {
         let (key, public) = PrivateKey::generate().unwrap();
         let (enc, _) = encapsulate(&public).unwrap();
         for bytes in [&enc[..0], &enc[..ENC_BYTES - 1], &[&enc[..], &[0]].concat()] {

@@ -46,7 +46,7 @@ fn two_copies(nodes: &[&str]) -> (Fleet, Fleet) {
     (fleet, old)
 }
 
-/// With a list, if it is news.
+/// Returns the anchors with a list, if it is news.
 fn with(anchors: &TrustAnchors, list: &[u8], hours: u64) -> TrustAnchors {
     anchors.with_crl(list, at(hours)).unwrap().unwrap_or_else(|| anchors.clone())
 }
@@ -94,12 +94,12 @@ fn a_list_of_another_copy_takes_nothing_away() {
     for order in [[0, 1], [1, 0]] {
         let anchors = order.iter().fold(a.anchors().clone(), |known, n| with(&known, &lists[*n], 3));
         assert!(is_revoked(&anchors, &va, 3) && is_revoked(&anchors, &vb, 3), "{order:?}");
-        // A fresh node learns the same from what is passed on.
+        // A fresh node learns the same from the passed lists.
         let passed: Vec<Bytes> = anchors.crls().cloned().collect();
         assert_eq!(passed.len(), 2);
         let fresh = passed.iter().fold(a.anchors().clone(), |known, list| with(&known, list, 3));
         assert_eq!(revoked(&fresh), revoked(&anchors));
-        // Neither is news any more, alone or in lists that say less.
+        // Neither is news any more, alone or in shorter lists.
         for list in lists.iter().chain(&[a.revocation_list_of_nodes(&[], 1 << 40, at(3)).unwrap()]) {
             assert!(anchors.with_crl(list, at(3)).unwrap().is_none());
         }
@@ -170,8 +170,8 @@ fn a_copy_learns_from_a_list_what_another_one_revoked() {
     assert!(told.is_behind && told.revoked.len() == 2, "{told:?}");
     assert!(told.revoked.contains(&"va".to_owned()) && told.revoked.contains(&vc), "{told:?}");
     let mut old = copy(&old);
-    assert_eq!(old.absorb(&anchors, at(3)).unwrap(), Absorbed::default());
-    // Its own next list says it too, and it makes no certificate of either.
+    assert_eq!(old.absorb(&anchors, at(3)).unwrap(), CrlReport::default());
+    // Its own next list has it too, and it makes no certificate of either.
     old.revoke(&[], at(4)).unwrap();
     let own = with(old.anchors(), &old.revocation_list(at(4)).unwrap(), 4);
     assert_eq!(revoked(&own), revoked(&anchors));
@@ -183,7 +183,7 @@ fn a_copy_learns_from_a_list_what_another_one_revoked() {
     }
 }
 
-/// One thing that a keeper does with a copy, drawn at random.
+/// One operation of a keeper on a copy, drawn at random.
 fn do_something(fleet: &mut Fleet, seed: u64, hours: u64) {
     let rng = &mut rng(seed);
     let node = format!("n{}", rng.next_u32() % 5);
@@ -323,7 +323,7 @@ fn a_list_that_would_be_one_too_many_is_refused_until_the_copies_are_merged() {
     assert_eq!((anchors.crls().count(), revoked(&anchors).len()), (1, FLEET_LISTS_MAX + 1));
 }
 
-/// The revocation of a node that is known by its number, an hour after that of the one before.
+/// Revokes a node by its number, an hour after the one before.
 fn numbered(n: usize) -> (Pseudonym, Revocation) {
     let mut pseudonym = [0xff; 32];
     pseudonym[..8].copy_from_slice(&(n as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15).to_be_bytes());
@@ -363,7 +363,7 @@ fn a_list_names_the_nodes_that_were_revoked_last_and_the_lists_before_it_stay() 
         assert!(all.iter().all(|(node, _)| known.contains_key(node)), "{n} nodes");
         assert!(anchors.crls().count() <= 2 + n / (LIST_NODES_MAX - 509), "{} lists", anchors.crls().count());
     }
-    // A fresh node learns all of them from what is passed on.
+    // A fresh node learns all of them from the passed lists.
     let fresh = anchors.crls().fold(fleet.anchors().clone(), |known, list| with(&known, list, count as u64));
     assert_eq!(revoked(&fresh).len(), count);
 }
@@ -388,7 +388,7 @@ fn revocations_end_with_their_ca() {
     let va = fleet.renew(&name("va"), 20 * 366 * VALID, NOW, &mut rng(2)).unwrap();
     fleet.revoke(&[name("va")], NOW).unwrap();
     let list = fleet.revocation_list(NOW).unwrap();
-    // As long as any certificate of the node can hold, the list is taken and counts.
+    // As long as any certificate of the node can be valid, the list is taken and counts.
     let last = fleet.not_after();
     assert_eq!(va.not_after().secs(), last.secs());
     assert!(last.0 > NOW.0 + 9 * YEAR);

@@ -1,4 +1,4 @@
-//! What a fleet keeps of its nodes: the roster, roles, renewal, generations of secrets, CAs that exist already.
+//! A fleet's record of its nodes: the roster, roles, renewal, generations of secrets, existing CAs.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 use std::time::Duration;
@@ -128,7 +128,7 @@ fn a_file_from_before_rosters_is_read_and_gets_one_when_it_changes() {
     assert!(!fleet.has_roster() && fleet.nodes().len() == 0);
     assert_eq!(again(&fleet).nodes().len(), 0);
     assert!(matches!(fleet.revoke(&[name("arm-1")], NOW), Err(FleetError::UnknownNode { .. })));
-    // A certificate from then can be entered, and is revoked then.
+    // A certificate from before the roster can be entered and then revoked.
     let error = fleet.adopt(name("desk"), old.chain(), NOW).unwrap_err();
     assert!(matches!(error, FleetError::Adopt(_)), "{error}");
     fleet.adopt(name("arm-1"), old.chain(), NOW).unwrap();
@@ -154,7 +154,8 @@ fn revoking_a_node_takes_back_all_of_its_certificates() {
     let now = at(2);
     let refused = |fleet: &Fleet, i: &Identity| anchors(fleet, now).verify(i.chain(), now).is_err();
     assert!(refused(&fleet, &first) && refused(&fleet, &second) && !refused(&fleet, &desk));
-    // It can neither renew nor be enrolled by mistake, and its list stays when it is enrolled on purpose.
+    // The node can neither be renewed nor be enrolled by mistake, and its revocation stays when it is enrolled on
+    // purpose.
     let renewed = fleet.renew(&name("arm-1"), VALID, now, &mut rng(5)).unwrap_err();
     assert!(renewed.to_string().contains("was revoked at 2026-"), "{renewed}");
     let (csr, pseudonym) = (first.csr(), first.pseudonym());
@@ -168,7 +169,7 @@ fn revoking_a_node_takes_back_all_of_its_certificates() {
     // Numbers grow also where the clock was set back.
     fleet.revoke(&[name("desk")], NOW).unwrap();
     assert!(fleet.crl_number() > number);
-    // What is over needs no list.
+    // Expired certificates need no list.
     fleet.revoke(&[name("desk")], at(100)).unwrap();
     assert!(fleet.nodes().all(|n| n.certificates.is_empty()));
 }
@@ -198,7 +199,7 @@ fn a_node_may_keep_its_key_to_itself() {
         let joined = Identity::join(member, other.serialized_der(), &mut rng(3));
         assert_eq!(joined.unwrap_err(), IdentityError::KeyMismatch);
         assert!(matches!(Membership::parse(&identity.to_text()), Err(IdentityError::HasKey)));
-        // Its own request works as well as the first.
+        // A request of the finished identity works as well as the first.
         assert!(fleet.enroll_csr(&identity.csr(), &asked, &mut rng(4)).is_ok());
     }
     let key = KeyPair::generate().unwrap();
@@ -252,7 +253,7 @@ fn credentials_renew_an_identity_and_nothing_else() {
     assert_eq!(with(&|_| {}), Ok(()));
     let foreign = fleet.renew_csr(&desk.csr(), &desk.pseudonym(), short, at(30), &mut rng(6)).unwrap();
     assert_eq!(with(&|c| c.chain = foreign.chain.clone()), Err(IdentityError::KeyMismatch));
-    // Even with its own key a node becomes no other one.
+    // Even with its own key a node cannot become another one.
     let other = fleet.renew_csr(&arm.csr(), &desk.pseudonym(), short, at(30), &mut rng(6)).unwrap();
     assert_eq!(
         with(&|c| c.chain = other.chain.clone()),
@@ -457,7 +458,7 @@ fn a_roster_knows_who_was_handed_which_secret() {
     let arm = kept.node(&name("arm-1")).unwrap();
     assert_eq!((arm.generation, arm.seen), (2, Some(now(3))));
     assert_eq!(kept.node(&name("cloud")).unwrap().generation, 0);
-    // A node that was not seen for long is not waited for, nor one without a valid certificate.
+    // Nodes that were not seen for long, or have no valid certificate, need not be waited for.
     assert_eq!(lacking(&fleet, 30), ["desk"]);
     assert!(lacking(&fleet, 31).is_empty());
     fleet.renew(&name("desk"), Duration::from_secs(86_400), now(40), &mut rng(4)).unwrap();

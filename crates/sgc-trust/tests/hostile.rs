@@ -1,5 +1,4 @@
-//! Files and certificates that are damaged in every way that a seed finds: nothing panics, nothing forged is believed.
-//! The fuzz target `certs` goes on where this ends.
+//! Files and certificates with random damage, from seeds: nothing panics, nothing forged is believed.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! Who is believed to be whom: enrolment, files, chains.
+//! Identities: enrolment, files, chains.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 use std::time::Duration;
@@ -65,8 +65,8 @@ fn pseudonyms_tags_and_node_ids_are_what_the_specification_says() {
         "0ab23d5bda0052488b9dafdaf8a676fbeb840fe6043e5e4f91a41173c4d5ccdf"
     );
     assert_ne!(secret.pseudonym("operators").0, secret.group_tag("operators").0);
-    // `scripts/pki-vectors.py` prints these and those above: who a node is follows from the first secret, what its
-    // shares are called from each generation.
+    // `scripts/pki-vectors.py` prints these and those above: a node's id follows from the first secret, the names of
+    // its shares from each generation.
     let owner = node_id(&spki, &pseudonym);
     let topic = Metadata::topic("arm-1", "/camera/image", "sensor_msgs/msg/Image");
     let named = |secret: &FleetSecret| derive_name(secret, &owner, &topic).to_string();
@@ -233,7 +233,7 @@ fn chains_are_bounded() {
     assert_eq!(TrustAnchors::new(many).unwrap_err(), AnchorError::TooMany);
 }
 
-/// A CA of the kind that a company has already, and what it issues.
+/// A CA as a company already has, and its certificates.
 struct ForeignCa {
     params: CertificateParams,
     key: KeyPair,
@@ -331,7 +331,7 @@ fn a_node_whose_certificate_is_a_cas_is_refused_and_so_is_what_it_signs() {
     let forged = leaf.signed_by(&KeyPair::generate().unwrap(), &robot_as_ca).unwrap().into();
     assert_eq!(ca.anchors.verify(&[forged, robot], NOW).unwrap_err(), CertError::NodeIsCa);
 
-    // A CA that names no node is one that its owner may have made.
+    // The owner of a CA that names no node may have made it.
     let (below, below_as_ca) = ca_below(&top, &["https://example.com"]);
     let good = leaf.signed_by(&KeyPair::generate().unwrap(), &below_as_ca).unwrap().into();
     assert_eq!(ca.anchors.verify(&[good, below], NOW).unwrap().pseudonym, Pseudonym([1; 32]));
@@ -341,7 +341,7 @@ fn a_node_whose_certificate_is_a_cas_is_refused_and_so_is_what_it_signs() {
         assert_eq!(ca.anchors.verify(&[forged, below], NOW).unwrap_err(), CertError::NodeIsCa, "{role}");
     }
 
-    // The right to sign certificates without basic constraints is none, and nothing that a node asks for.
+    // The right to sign certificates without basic constraints is void, and no node requests it.
     leaf.key_usages = vec![KeyUsagePurpose::DigitalSignature, KeyUsagePurpose::KeyCertSign];
     let signer = leaf.signed_by(&KeyPair::generate().unwrap(), &top).unwrap().into();
     assert_eq!(ca.anchors.verify(&[signer], NOW).unwrap_err(), CertError::NodeIsCa);
@@ -439,7 +439,7 @@ fn debug_output_tells_no_secret() {
     for line in text.lines().filter(|l| l.len() == 64) {
         assert!(!shown.contains(line));
     }
-    // Errors of broken files tell none either.
+    // Errors of broken files reveal no secret either.
     let broken = text.replace("SGC FLEET SECRET", "SGC NOBODY KNOWS");
     let error = format!("{:?}", Identity::parse(&broken).unwrap_err());
     assert_eq!(error, "UnknownBlock(\"SGC NOBODY KNOWS\")");

@@ -1,4 +1,4 @@
-//! What is taken back stays taken back: revocation lists, whoever brings them.
+//! Revocations are permanent, however the lists arrive.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 use std::sync::Arc;
@@ -78,7 +78,7 @@ fn an_older_list_never_replaces_a_newer_one() {
         assert!(anchors.with_crl(old, NOW).unwrap().is_none());
     }
     assert!(anchors.is_peer_revoked(desk.as_peer()));
-    // The keeper may take a certificate off again.
+    // The keeper may take a certificate off the list again.
     let third = with(&anchors, &list(&fleet, 257, &[]));
     assert!(third.verify(arm.chain(), NOW).is_ok() && third.crls().count() == 1);
 }
@@ -111,7 +111,7 @@ fn the_list_of_another_ca_revokes_nothing_of_ours() {
     let both = with(&both, &foreign);
     assert!(both.verify(arm.chain(), NOW).is_ok());
     assert!(matches!(both.verify(stranger.chain(), NOW), Err(CertError::Revoked { .. })));
-    // Each CA has a list of its own, whatever the numbers.
+    // Each CA has lists of its own, independent of the numbers of others.
     let both = with(&both, &list(&ours, 1, &[&arm]));
     assert_eq!(both.crls().count(), 2);
     for identity in [&arm, &stranger] {
@@ -133,7 +133,7 @@ fn a_list_counts_before_its_time_and_for_ever() {
         let desk = enroll(&fleet, "desk", 2);
         assert!(anchors.verify(desk.chain(), UnixMillis(now)).is_ok(), "what it does not name is believed");
     }
-    // With a clock that is two days behind it is taken all the same, and counts when the clock is right.
+    // With a clock that is two days behind the list is taken, too, and counts when the clock is right.
     let anchors = fleet.anchors().with_crl(&list, UnixMillis(NOW.0 - 2 * DAY)).unwrap().unwrap();
     assert!(matches!(anchors.verify(arm.chain(), NOW), Err(CertError::Revoked { .. })));
 }
@@ -163,7 +163,7 @@ fn requesters_hear_what_they_can_do_something_about() {
     }
 }
 
-/// A CA of the kind that a company has already.
+/// A CA as a company already has.
 struct ForeignCa {
     params: CertificateParams,
     key: KeyPair,
@@ -205,7 +205,7 @@ impl ForeignCa {
             revoked_certs: serials.iter().map(entry).collect(),
             key_identifier_method: KeyIdMethod::Sha256,
         };
-        // Whether its own certificate lets it is for the verifier to find out.
+        // The verifier checks whether the CA's own certificate permits it.
         let mut params = self.params.clone();
         params.key_usages = Vec::new();
         list.signed_by(&Issuer::from_params(&params, &self.key)).unwrap().der().to_vec()
@@ -259,12 +259,12 @@ fn lists_that_decide_nothing_are_refused_with_the_cause() {
     let at = unnumbered.windows(3).rposition(|w| w == [0x55, 0x1d, 0x14]).unwrap();
     unnumbered[at + 2] = 0x7f;
     let head = if unnumbered[1] == 0x82 { 4 } else { 3 };
-    // Behind what is signed: the algorithm (7 bytes), the head of the signature (3) and the signature.
+    // Behind the signed part: the algorithm (7 bytes), the head of the signature (3) and the signature.
     let end = unnumbered.len() - 7 - 3 - 64;
     let signature = ca.key.sign(&unnumbered[head..end]).unwrap();
     unnumbered[end + 10..].copy_from_slice(&signature);
     assert_eq!(refused(&unnumbered), CrlError::NoNumber);
-    // A CA may be made not to sign lists.
+    // A CA's certificate may forbid it to sign lists.
     let other = ForeignCa::new("other", &[KeyUsagePurpose::KeyCertSign]);
     assert_eq!(
         other.anchors().with_crl(&other.crl(&[1], &[], None), NOW).unwrap_err(),

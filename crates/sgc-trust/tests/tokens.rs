@@ -1,4 +1,4 @@
-//! Share tokens: the bytes of the specification, and what is said of texts that are none.
+//! Share tokens: the bytes of the specification, and the errors of texts that are no token.
 
 #![allow(clippy::unwrap_used)]
 
@@ -111,7 +111,7 @@ fn whatever_is_changed_or_cut_is_refused() {
     }
 }
 
-/// A checksum is no defence, so that each field is judged by itself, too.
+/// A checksum is no defence, so each field is checked by itself, too.
 #[test]
 fn fields_that_cannot_be_are_refused_by_name() {
     let said = |change: fn(&mut ShareToken)| {

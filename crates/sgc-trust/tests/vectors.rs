@@ -19,7 +19,7 @@ const SINK: SinkId = SinkId([0xcc; 16]);
 
 struct Vector {
     suite: Suite,
-    /// PKCS #8 and what is announced.
+    /// The key as PKCS #8, and its announced form.
     key: Option<(Vec<u8>, Vec<u8>)>,
     headers: Vec<PacketHeader>,
     payloads: Vec<Vec<u8>>,
@@ -59,7 +59,7 @@ fn key(suite: Suite, header: &PacketHeader) -> SourceKey {
     key.expect("all suites are in every build")
 }
 
-/// What the fragment and the message head of a vector are.
+/// Returns the fragment and the message head of a vector.
 fn plain(header: &PacketHeader) -> (Vec<u8>, MessageHead) {
     let start = usize::from(header.index) * usize::from(header.grid);
     let byte = |i: usize| ((i as u64 * 7 + header.seq) % 251) as u8;
@@ -71,7 +71,7 @@ fn plain(header: &PacketHeader) -> (Vec<u8>, MessageHead) {
     (fragment, head)
 }
 
-/// The packets of a vector as this build makes them.
+/// Returns the packets of a vector as this build makes them.
 fn payloads(vector: &Vector) -> Vec<Vec<u8>> {
     let (mut batch, mut out) = (Batch::default(), Vec::new());
     for header in &vector.headers {
@@ -91,12 +91,12 @@ fn payloads(vector: &Vector) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn what_is_sealed_is_as_the_vectors_say() {
+fn sealed_packets_match_the_vectors() {
     for vector in vectors() {
         assert!(vector.headers.last().is_some_and(|h| h.to == Some(SINK)));
         let random = matches!(vector.suite.name().split('-').next(), Some("paper"));
         for ((header, ours), theirs) in vector.headers.iter().zip(payloads(&vector)).zip(&vector.payloads) {
-            // RSASSA-PSS is random: all but the signature, whose length is that of the modulus.
+            // RSASSA-PSS is random: everything but the signature is compared, whose length is that of the modulus.
             let signature = if !random {
                 0
             } else if vector.suite.name().contains("3072") {
@@ -137,8 +137,8 @@ fn the_vectors_open_and_verify() {
     }
 }
 
-/// Not a test: prints what `scripts/trust-vectors.py --take` takes, so that the other side verifies what this
-/// one signs.
+/// Not a test: prints the input of `scripts/trust-vectors.py --take`, so that the other implementation verifies these
+/// signatures.
 #[test]
 #[ignore = "prints"]
 fn packets_signed_with_rsa() {
@@ -175,7 +175,7 @@ fn the_grants_of_the_vectors_open() {
         assert_eq!(key.open(&NAME, &SINK, serial, &enc, &sealed), Ok(content.clone()), "{kem:?}");
         assert_eq!(key.open(&NAME, &SINK, serial + 1, &enc, &sealed), Err(GrantError::NotForUs));
         assert_eq!(key.open(&NAME, &SinkId([0; 16]), serial, &enc, &sealed), Err(GrantError::NotForUs));
-        // What this side seals to the same key opens too, and a shorter key is none.
+        // The key opens this side's grants too, and a shorter key is invalid.
         let (enc, sealed) = seal_grant(&public, &NAME, &SINK, 1, &content).expect("a key of that kind");
         assert_eq!(key.open(&NAME, &SINK, 1, &enc, &sealed), Ok(content.clone()));
         assert!(ReplyKey::from_private(kem, &private[1..]).is_none());

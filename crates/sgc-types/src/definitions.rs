@@ -1,6 +1,6 @@
-//! Where definitions of messages are looked for: directories that are named, `AMENT_PREFIX_PATH`, and what ships inside.
+//! Finds definitions of messages: in named directories, in `AMENT_PREFIX_PATH`, and among the shipped ones.
 //!
-//! What they mean is for `sgc-cdr`. Nothing is kept: a type is looked for once, and then described.
+//! `sgc-cdr` parses them. Nothing is kept: a type is looked up once, and then described.
 
 use std::ffi::OsStr;
 use std::fs::File;
@@ -9,25 +9,25 @@ use std::path::{Path, PathBuf};
 
 use sgc_cdr::{DEFINITION_BYTES_MAX, Layout, Library, TypeError, TypeName};
 
-/// What a sourced ROS 2 environment names its installations in.
+/// Variable in which a sourced ROS 2 environment names its installations.
 const AMENT_PREFIX_PATH: &str = "AMENT_PREFIX_PATH";
-/// Directories that are looked into.
+/// Most directories that are searched.
 const DIRS_MAX: usize = 1024;
 
 /// Finds definitions, and lays types out.
 #[derive(Clone, Debug, Default)]
 pub struct Definitions {
-    /// Those with packages in them.
+    /// Directories with packages in them.
     dirs: Vec<PathBuf>,
 }
 
 impl Definitions {
-    /// Looks into `named` first, then where the environment of the process says.
+    /// Searches `named` first, then the installations in the environment of the process.
     pub fn from_env(named: &[PathBuf]) -> Self {
         Self::new(named, std::env::var_os(AMENT_PREFIX_PATH).as_deref())
     }
 
-    /// Looks into `named` first, then into the installations of `ament`, as `AMENT_PREFIX_PATH` has them.
+    /// Searches `named` first, then the installations of `ament`, in the form of `AMENT_PREFIX_PATH`.
     pub fn new(named: &[PathBuf], ament: Option<&OsStr>) -> Self {
         let prefixes =
             ament.into_iter().flat_map(std::env::split_paths).filter(|prefix| prefix.is_absolute());
@@ -35,20 +35,20 @@ impl Definitions {
         Self { dirs: named.chain(prefixes.map(|prefix| prefix.join("share"))).take(DIRS_MAX).collect() }
     }
 
-    /// What messages of a type look like, or what a service consists of. Reads files.
+    /// Returns the layout of a type's messages, or of a service. Reads files.
     pub fn layout(&self, name: &TypeName) -> Result<Layout, TypeError> {
         Library::empty().layout(name, &mut |file| self.text(file))
     }
 
-    /// The text of the file that defines a type, beyond those that ship inside; of a message of a service that of the service:
-    /// `file` is named as [`sgc_cdr::LookUp`] has it. Reads files.
+    /// Returns the text of the file that defines a type, except for shipped ones; for a message of a service that of
+    /// the service: `file` is named as in [`sgc_cdr::LookUp`]. Reads files.
     pub fn text(&self, file: &TypeName) -> Option<String> {
         let (package, kind) = (file.package(), file.kind());
-        // Packages install both, of which the first says more.
+        // Packages install both; the first has more in it.
         let files =
             [kind, "idl"].map(|extension| Path::new(kind).join(format!("{}.{extension}", file.name())));
         self.dirs.iter().find_map(|dir| {
-            // A directory may be that of a package itself.
+            // A directory may itself be that of a package.
             let own = dir.file_name().filter(|own| *own == package).map(|_| dir.clone());
             let places = [Some(dir.join(package)), own].into_iter().flatten();
             places
@@ -78,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_named_comes_before_the_environment_and_what_ships() {
+    fn named_folders_come_before_the_environment_and_shipped_types() {
         let dir = tempfile::tempdir().unwrap();
         write(dir.path(), "ament/share/mine/msg/A.msg", "int8 from_ament");
         write(dir.path(), "ament/share/mine/srv/S.srv", "int8 a\n---\nint8 b");

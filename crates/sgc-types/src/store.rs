@@ -1,35 +1,34 @@
-//! The types that are known in this process, by name and hash: bounded in their number and in the bytes of what describes
-//! them.
+//! The types known in this process, by name and hash: bounded in number and in bytes of descriptions.
 //!
-//! What is full takes nothing more in until somebody says what is still in use: a type that somebody decodes with is never
-//! pushed out by one that somebody else sends.
+//! A full store takes nothing more in until its user removes unused types: a received type never displaces one that is
+//! being decoded with.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use sgc_cdr::{Layout, TypeName};
 
-use crate::Described;
+use crate::ResolvedType;
 
-/// Types that are kept.
+/// Most types that are kept.
 pub const TYPES_MAX: usize = 1024;
-/// Bytes of descriptions that are kept. What is made of them takes a few times as much.
+/// Most bytes of descriptions that are kept. The layouts take a few times as much.
 pub const TYPES_BYTES_MAX: usize = 8 << 20;
-/// Types that are kept for the interfaces of one owner: no one of them takes all the room.
+/// Most types that are kept for the interfaces of one owner, so that no owner takes all the room.
 pub const TYPES_PER_OWNER_MAX: usize = TYPES_MAX / 2;
-/// Bytes of their descriptions.
+/// Most bytes of their descriptions.
 pub const TYPES_PER_OWNER_BYTES_MAX: usize = TYPES_BYTES_MAX / 2;
 
-/// Types that are known. Shared: all of its calls are short.
+/// The known types. Shared: all of its calls are short.
 #[derive(Debug)]
 pub struct TypeStore {
     types_max: usize,
     bytes_max: usize,
-    kept: Mutex<Kept>,
+    kept: Mutex<StoreState>,
 }
 
 #[derive(Debug, Default)]
-struct Kept {
+struct StoreState {
     types: BTreeMap<(TypeName, String), Entry>,
     bytes: usize,
     taken_in: u64,
@@ -37,8 +36,8 @@ struct Kept {
 
 #[derive(Debug)]
 struct Entry {
-    described: Arc<Described>,
-    /// Grows with each that is taken in.
+    described: Arc<ResolvedType>,
+    /// Grows with each type taken in.
     at: u64,
 }
 
@@ -59,21 +58,21 @@ impl Default for TypeStore {
 }
 
 impl TypeStore {
-    /// Keeps at most so many types, and so many bytes of descriptions.
+    /// Returns a store of at most this many types, and bytes of descriptions.
     pub fn with_limits(types_max: usize, bytes_max: usize) -> Self {
         Self { types_max, bytes_max, kept: Mutex::default() }
     }
 
-    /// Whether a type can be taken in.
-    pub fn has_room_for(&self, described: &Described) -> bool {
+    /// Returns whether there is room for a type.
+    pub fn has_room_for(&self, described: &ResolvedType) -> bool {
         let kept = self.lock();
         let key = (described.name().clone(), described.type_hash().to_owned());
         let bytes = kept.bytes + described.description().len();
         kept.types.contains_key(&key) || kept.types.len() < self.types_max && bytes <= self.bytes_max
     }
 
-    /// Takes a type in; one that is known already stays as it is.
-    pub fn insert(&self, described: Described) -> Result<Arc<Described>, StoreFull> {
+    /// Takes a type in; a known one stays as it is.
+    pub fn insert(&self, described: ResolvedType) -> Result<Arc<ResolvedType>, StoreFull> {
         let mut kept = self.lock();
         let key = (described.name().clone(), described.type_hash().to_owned());
         if let Some(known) = kept.types.get(&key) {
@@ -97,8 +96,8 @@ impl TypeStore {
         kept.bytes = kept.types.values().map(|entry| entry.described.description().len()).sum();
     }
 
-    /// A type with its description; without a hash, of those with this name the one that came last.
-    pub fn described(&self, name: &TypeName, type_hash: Option<&str>) -> Option<Arc<Described>> {
+    /// Returns a type with its description; without a hash, the newest one with this name.
+    pub fn described(&self, name: &TypeName, type_hash: Option<&str>) -> Option<Arc<ResolvedType>> {
         let kept = self.lock();
         let named = || {
             let named = kept.types.range((name.clone(), String::new())..).take_while(|((n, _), _)| n == name);
@@ -115,8 +114,8 @@ impl TypeStore {
         found.map(|entry| entry.described.clone())
     }
 
-    /// The layout of messages of a type. The request and the response of a service are found by each hash that its endpoints
-    /// announce ([`Described::is_announced_as`]).
+    /// Returns the layout of messages of a type. The request and the response of a service are found by each hash that
+    /// its endpoints announce ([`ResolvedType::is_announced_as`]).
     pub fn layout(&self, name: &TypeName, type_hash: Option<&str>) -> Option<Arc<Layout>> {
         if let Some(described) = self.described(name, type_hash) {
             return Some(described.layout().clone());
@@ -125,7 +124,7 @@ impl TypeStore {
         service.layout().part(name).map(Arc::new)
     }
 
-    fn lock(&self) -> MutexGuard<'_, Kept> {
+    fn lock(&self) -> MutexGuard<'_, StoreState> {
         self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -136,9 +135,10 @@ mod tests {
 
     use super::*;
 
-    fn described(name: &str, text: &str) -> Described {
+    fn described(name: &str, text: &str) -> ResolvedType {
         let mut look_up = |_: &TypeName| Some(text.to_owned()).filter(|text| !text.is_empty());
-        Described::of(Library::empty().layout(&name.parse().unwrap(), &mut look_up).unwrap()).unwrap()
+        ResolvedType::from_layout(Library::empty().layout(&name.parse().unwrap(), &mut look_up).unwrap())
+            .unwrap()
     }
 
     #[test]
@@ -149,7 +149,7 @@ mod tests {
         assert!(store.layout(&name, None).is_none());
         let (old, new) = (store.insert(old).unwrap(), store.insert(new).unwrap());
         store.insert(described("p/msg/AB", "int8 other")).unwrap();
-        let hash = |found: Option<Arc<Described>>| found.unwrap().type_hash().to_owned();
+        let hash = |found: Option<Arc<ResolvedType>>| found.unwrap().type_hash().to_owned();
         assert_eq!(hash(store.described(&name, Some(old.type_hash()))), old.type_hash());
         assert_eq!(hash(store.described(&name, None)), new.type_hash());
         assert!(store.described(&name, Some("RIHS01_00")).is_none());
@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_full_takes_nothing_in_before_it_is_told_what_is_in_use() {
+    fn a_full_store_takes_nothing_in_before_unused_types_are_removed() {
         let of = |n: usize| described(&format!("p/msg/A{n}"), "int8 a");
         let bytes = of(0).description().len();
         for store in [TypeStore::with_limits(2, usize::MAX), TypeStore::with_limits(9, 2 * bytes + bytes / 2)]
@@ -179,7 +179,7 @@ mod tests {
             store.insert(of(1)).unwrap();
             assert!(!store.has_room_for(&of(2)) && store.has_room_for(&of(0)));
             assert_eq!(store.insert(of(2)).map(|_| ()), Err(StoreFull { types: 2, bytes: 2 * bytes }));
-            // What is there already needs no room.
+            // A known type needs no room.
             assert!(Arc::ptr_eq(&store.insert(of(0)).unwrap(), &first));
             store.retain(|name, _| name.name() == "A0");
             store.insert(of(2)).unwrap();

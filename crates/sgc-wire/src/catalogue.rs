@@ -1,4 +1,4 @@
-//! What a grant holds once it is unsealed: a topic's key, an owner's catalogue, or what was asked for.
+//! The content of a grant: a topic's key, an owner's catalogue, or the answer to a question.
 
 use bytes::Bytes;
 
@@ -11,7 +11,7 @@ use crate::operation::OperationAnswer;
 use crate::packet::Class;
 use crate::qos::Qos;
 use crate::ros_node::RosNode;
-use crate::types::{DescribedType, TYPE_HASH_BYTES_MAX, TYPES_PER_QUESTION_MAX};
+use crate::type_descriptions::{DescribedType, TYPE_HASH_BYTES_MAX, TYPES_PER_QUESTION_MAX};
 
 /// Most entries of one catalogue.
 pub const CATALOGUE_ENTRIES_MAX: usize = 2048;
@@ -26,17 +26,17 @@ pub const SECRET_GENERATIONS_MAX: usize = 8;
 /// The content of a grant.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum GrantContent {
-    /// The key of a topic, and who publishes on it.
+    /// The key of a topic, and its publishers.
     Topic(TopicGrant),
-    /// The list of what its owner shares with the one who asked.
+    /// The list of the owner's shares for the requester.
     Catalogue(Catalogue),
-    /// What a member needs to stay one; from its fleet's authority.
+    /// A member's fresh certificates and secrets; from its fleet's authority.
     Credentials(Credentials),
-    /// What the types of interfaces look like, as far as it was asked for and is known.
+    /// Descriptions of the requested types, as far as they are known.
     Types(Vec<DescribedType>),
     /// The result of an operation on a fleet; from its authority.
     Operation(OperationAnswer),
-    /// The consumers that a node has of the interfaces of the owner that asked.
+    /// A node's consumers of the interfaces of the owner that asked.
     Consumers(Vec<Consumer>),
 }
 
@@ -49,30 +49,31 @@ pub struct TopicGrant {
     pub suite: u8,
     /// The topic key of the epoch.
     pub key: SecretBytes,
-    /// Who publishes: nobody else is believed.
+    /// The publishing sources: no other source counts.
     pub sources: Vec<SourceAnnounce>,
-    /// What the name stands for, if that was asked for.
+    /// The catalogue entry of the name, if it was requested.
     pub entry: Option<Box<CatalogueEntry>>,
 }
 
-/// A source, as the owner vouches for it.
+/// A source, as its owner announces it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SourceAnnounce {
     /// Its id.
     pub source: SourceId,
-    /// What its messages verify with: an Ed25519 public key of 32 bytes, or the SubjectPublicKeyInfo of an RSA key;
-    /// empty if the suite has no signatures.
+    /// Public key of its signatures: an Ed25519 key of 32 bytes, or the SubjectPublicKeyInfo of an RSA key; empty if
+    /// the suite has no signatures.
     pub key: Bytes,
-    /// The oldest message that a late joiner may ask for when this was said; its next one if it keeps none for those.
+    /// At the time of the grant, the oldest message that a late joiner may ask for; the next one if there is no
+    /// history.
     pub oldest: u64,
-    /// The number of its next message when this was said: what is older than it and was not asked for is a replay.
+    /// At the time of the grant, the number of its next message: older ones that were not asked for are replays.
     pub next: u64,
-    /// The first message that the one who is told this may ever ask for again, if it lost it; 0 if what is lost of this
-    /// source stays lost.
+    /// The first message that the receiver may ever ask for again after a loss; 0 if lost messages of this source stay
+    /// lost.
     pub recover: u64,
 }
 
-/// What a member needs to stay one.
+/// A member's fresh certificates and secrets.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Credentials {
     /// Its new certificates, leaf first, DER.
@@ -90,7 +91,7 @@ pub struct SecretGeneration {
     pub secret: SecretBytes,
 }
 
-/// What an owner shares with one node.
+/// An owner's shares, as one node may see them.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct Catalogue {
     /// Grows with every change at the owner, within one incarnation of it.
@@ -102,21 +103,21 @@ pub struct Catalogue {
 /// One shared interface.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CatalogueEntry {
-    /// What it is.
+    /// Its metadata.
     pub metadata: Metadata,
-    /// The name is that of the owner and this.
+    /// The blind from which, with the owner, the name follows.
     pub blind: Blind,
-    /// True if the one who asked may subscribe to it.
+    /// Whether the requester may subscribe to it.
     pub subscribe: bool,
-    /// True if the one who asked may publish on it.
+    /// Whether the requester may publish on it.
     pub publish: bool,
     /// Cipher suite id.
     pub suite: u8,
-    /// True if the DDS type has no key.
+    /// Whether the DDS type has no key.
     pub keyless: bool,
     /// `RIHS01_…` type hash, if the owner's side knows it.
     pub type_hash: Option<String>,
-    /// What the interface as a whole offers.
+    /// QoS of the interface as a whole.
     pub qos: Qos,
     /// Class of its traffic.
     pub class: Class,
@@ -129,7 +130,7 @@ pub struct CatalogueEntry {
 pub struct CatalogueSource {
     /// The source that its packets name.
     pub source: SourceId,
-    /// What this publisher offers.
+    /// QoS of this publisher.
     pub qos: Qos,
     /// The ROS 2 node that it belongs to, if its network says so.
     pub node: Option<RosNode>,

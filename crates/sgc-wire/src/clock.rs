@@ -1,10 +1,10 @@
-//! A wall clock that is set while a program runs.
+//! A wall clock that may be set while a program runs.
 
 use std::time::Duration;
 
 use crate::ids::{Now, UnixMillis};
 
-/// Least move of the wall clock against the monotonic one that counts as having been set.
+/// Least move of the wall clock against the monotonic one that counts as a new setting.
 const STEP_MIN: Duration = Duration::from_secs(60);
 
 /// Notices that the wall clock was set: by NTP some time after the start, by a user, or while the machine slept.
@@ -14,12 +14,12 @@ pub struct ClockWatch {
 }
 
 impl ClockWatch {
-    /// Watches from now on.
+    /// Starts to watch.
     pub fn new(now: Now) -> Self {
         Self { base: now }
     }
 
-    /// Returns `true` if the wall clock was set by a minute or more since the last time that this was so.
+    /// Returns `true` if the wall clock was set by a minute or more since the last time that this returned `true`.
     pub fn was_set(&mut self, now: Now) -> bool {
         let set =
             now.unix.0.abs_diff(wall_after(self.base.unix, self.base, now).0) >= STEP_MIN.as_millis() as u64;
@@ -30,15 +30,15 @@ impl ClockWatch {
     }
 }
 
-/// A wall clock as its owner told it, carried on by the monotonic clock here.
+/// A peer's wall clock, continued by the monotonic clock here.
 #[derive(Clone, Copy, Debug)]
-pub struct ToldClock {
+pub struct PeerClock {
     time: UnixMillis,
     at: Now,
 }
 
-impl ToldClock {
-    /// The clock that a peer told at `at`.
+impl PeerClock {
+    /// Returns the clock that a peer sent at `at`.
     pub fn new(time: UnixMillis, at: Now) -> Self {
         Self { time, at }
     }
@@ -51,7 +51,7 @@ impl ToldClock {
     }
 }
 
-/// The wall clock that showed `time` at `then`, as it shows now.
+/// Returns the present time of the wall clock that showed `time` at `then`.
 fn wall_after(time: UnixMillis, then: Now, now: Now) -> UnixMillis {
     let passed = now.instant.saturating_duration_since(then.instant).as_millis();
     UnixMillis(time.0.saturating_add(u64::try_from(passed).unwrap_or(u64::MAX)))
@@ -89,10 +89,10 @@ mod tests {
     #[test]
     fn a_difference_ends_when_either_clock_is_set() {
         let base = base();
-        let told = ToldClock::new(UnixMillis(base.unix.0 + 7_200_000), base);
+        let told = PeerClock::new(UnixMillis(base.unix.0 + 7_200_000), base);
         assert_eq!(told.ahead_ms(at(base, 5000, 0)), 7_200_000);
         assert_eq!(told.ahead_ms(at(base, 5000, 7_200_000)), 0);
-        assert_eq!(ToldClock::new(UnixMillis(0), base).ahead_ms(base), -1_795_000_000_000);
-        assert_eq!(ToldClock::new(UnixMillis(u64::MAX), base).ahead_ms(base), i64::MAX);
+        assert_eq!(PeerClock::new(UnixMillis(0), base).ahead_ms(base), -1_795_000_000_000);
+        assert_eq!(PeerClock::new(UnixMillis(u64::MAX), base).ahead_ms(base), i64::MAX);
     }
 }

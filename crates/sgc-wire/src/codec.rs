@@ -1,8 +1,8 @@
 //! The bounded codec: big-endian integers, length-prefixed bytes, no back references.
 //!
-//! A [`Reader`] never indexes past its input, takes an explicit bound for every length, and treats
-//! left-over bytes as an error. A [`Writer`] only appends. What the bytes mean is decided by the types that
-//! implement [`Encode`] and [`Decode`].
+//! A [`Reader`] never indexes past its input, takes an explicit bound for every length, and treats left-over bytes as
+//! an error. A [`Writer`] only appends. The types that implement [`Encode`] and [`Decode`] give the bytes their
+//! meaning.
 
 use bytes::Bytes;
 
@@ -25,34 +25,34 @@ pub trait Encode {
     /// Appends the one canonical encoding of the value.
     fn encode(&self, w: &mut Writer);
 
-    /// The encoding on its own.
+    /// Returns the encoding on its own.
     fn to_vec(&self) -> Vec<u8> {
         let mut w = Writer::default();
         self.encode(&mut w);
         w.into_vec()
     }
 
-    /// The encoding on its own, shareable.
+    /// Returns the encoding on its own, shareable.
     fn to_bytes(&self) -> Bytes {
         Bytes::from(self.to_vec())
     }
 }
 
-/// Why bytes are not a value. What follows is always dropped and counted, never guessed at.
+/// The reason why bytes are not a value. The input is then dropped and counted, never guessed at.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DecodeError {
     /// The input ends inside a field.
     #[error("input ends inside {field}: {missing} bytes missing")]
     Truncated {
-        /// The field that is cut.
+        /// The field.
         field: &'static str,
-        /// How many bytes it lacks.
+        /// Number of missing bytes.
         missing: usize,
     },
     /// Bytes follow the value.
     #[error("{extra} bytes follow the value")]
     Trailing {
-        /// How many.
+        /// Their number.
         extra: usize,
     },
     /// A length or count exceeds its bound.
@@ -60,7 +60,7 @@ pub enum DecodeError {
     TooLong {
         /// The field.
         field: &'static str,
-        /// What was claimed.
+        /// The claimed value.
         value: usize,
         /// The bound.
         max: usize,
@@ -70,7 +70,7 @@ pub enum DecodeError {
     Value {
         /// The field.
         field: &'static str,
-        /// What it held.
+        /// The value.
         value: u64,
     },
     /// Text that is not UTF-8.
@@ -82,7 +82,7 @@ pub enum DecodeError {
     /// A format version that this build does not speak.
     #[error("version {found} of {what} is unknown here, {known} is")]
     Version {
-        /// Of what.
+        /// The kind of data.
         what: &'static str,
         /// The version found.
         found: u16,
@@ -98,7 +98,7 @@ pub enum DecodeError {
 }
 
 impl DecodeError {
-    /// A field with a value out of its range.
+    /// Returns the error of a field with a value out of its range.
     pub fn value(field: &'static str, value: u64) -> Self {
         Self::Value { field, value }
     }
@@ -207,7 +207,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Bytes not read yet.
+    /// Returns the number of bytes not read yet.
     pub fn remaining(&self) -> usize {
         self.rest.len()
     }
@@ -285,7 +285,7 @@ impl Writer {
         }
     }
 
-    /// What was written.
+    /// Returns the written bytes.
     pub fn into_vec(self) -> Vec<u8> {
         self.out
     }

@@ -1,15 +1,16 @@
-//! Consumers: the ROS 2 subscribers, publishers and service clients of a node, as it tells them to the owner of what they use.
+//! Consumers: a node's ROS 2 subscribers, publishers and service clients, as it reports them to the owner of the
+//! interface.
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
 use crate::control::Role;
 use crate::ids::Name;
 use crate::qos::Qos;
 use crate::ros_node::RosNode;
-use crate::types::TYPE_HASH_BYTES_MAX;
+use crate::type_descriptions::TYPE_HASH_BYTES_MAX;
 
 /// Most consumers in one answer.
 pub const CONSUMERS_MAX: usize = 512;
-/// Most consumers of one interface that a node tells, and that its owner shows of that node.
+/// Most consumers of one interface that a node reports, and that its owner shows of that node.
 pub const CONSUMERS_PER_INTERFACE_MAX: usize = 16;
 
 /// A subscriber, a service client, or a publisher on a topic that another node owns.
@@ -17,16 +18,16 @@ pub const CONSUMERS_PER_INTERFACE_MAX: usize = 16;
 pub struct Consumer {
     /// The interface that it uses.
     pub interface: Name,
-    /// The same for as long as the consumer lives; tells apart those of one node and interface.
+    /// Constant for as long as the consumer lives; tells apart those of one node and interface.
     pub id: [u8; 8],
-    /// The role in which its node joined the interface: [`Role::Subscribe`] of a subscriber, [`Role::Publish`] of a publisher and of a
-    /// service client.
+    /// The role in which its node joined the interface: [`Role::Subscribe`] for a subscriber, [`Role::Publish`] for a
+    /// publisher and for a service client.
     pub role: Role,
     /// The ROS 2 node that it belongs to.
     pub node: RosNode,
     /// `RIHS01_…` type hash, if its network says it.
     pub type_hash: Option<String>,
-    /// The QoS that it requests or offers; of a service client, ROS 2's for services.
+    /// The QoS that it requests or offers; for a service client, ROS 2's for services.
     pub qos: Qos,
 }
 

@@ -1,8 +1,8 @@
 //! Control frames between neighbours, and the signed bodies that travel in them from end to end.
 //!
-//! A frame is one type byte and its fields. What is signed is kept as the bytes that were signed
-//! ([`Signed`]), so that no re-encoding can change what a signature covers. Checking signatures is
-//! `sgc-trust`'s, acting on frames `sgc-router`'s and `sgc-endpoint`'s.
+//! A frame is one type byte and its fields. A signed body is kept as the bytes that were signed ([`SignedBody`]), so
+//! that no re-encoding can change the signed content. `sgc-trust` checks signatures, `sgc-router` and `sgc-endpoint`
+//! act on frames.
 
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 
@@ -19,7 +19,7 @@ pub const ADVERT_NAMES_MAX: usize = 256;
 pub const ADJACENCIES_MAX: usize = 1024;
 /// Most other nodes that are linked to one router.
 pub const ATTACHED_MAX: usize = 16_384;
-/// Most names in one interest or query, or in one notice that names are out of reach.
+/// Most names in one interest or query, or in one notice of unreachable names.
 pub const NAMES_PER_FRAME_MAX: usize = 4096;
 /// Most certificates in a chain, leaf first.
 pub const CHAIN_CERTS_MAX: usize = 4;
@@ -35,7 +35,7 @@ pub const CRL_BYTES_MAX: usize = 256 * 1024;
 pub const CSR_BYTES_MAX: usize = 4096;
 /// Longest question to an owner, bytes: a signing request is one.
 pub const ASK_BYTES_MAX: usize = 2 * CSR_BYTES_MAX;
-/// Longest public key that messages are signed with, bytes (SubjectPublicKeyInfo of RSA 4096).
+/// Longest public key of message signatures, bytes (SubjectPublicKeyInfo of RSA 4096).
 pub const SOURCE_KEY_BYTES_MAX: usize = 640;
 /// Longest sealed content of an answer, bytes.
 pub const SEALED_BYTES_MAX: usize = 768 * 1024;
@@ -45,35 +45,35 @@ pub const SEALED_BYTES_MAX: usize = 768 * 1024;
 pub enum Control {
     /// First on every link, both ways.
     Hello(Hello),
-    /// A signed advertisement, and how far its owner is from the sender.
+    /// A signed advertisement, and the sender's distance from its owner.
     Advert {
-        /// Cost of the way from the sender to the owner, microseconds of round trip; the owner's own node sends 0.
+        /// Cost of the route from the sender to the owner, microseconds of round trip; the owner's own node sends 0.
         /// Between routers it means nothing: they know the topology.
         cost: u32,
         /// An [`AdvertBody`].
-        signed: Signed,
+        signed: SignedBody,
     },
     /// The sender can no longer reach these names.
     Unreach {
-        /// Which.
+        /// The names.
         names: Vec<Name>,
     },
-    /// The sender wants to hear where these names are.
+    /// The sender wants to know the places of these names.
     Interest {
-        /// Which.
+        /// The names.
         names: Vec<Name>,
     },
-    /// The sender no longer wants to hear of these names.
+    /// The sender no longer wants to know the places of these names.
     Uninterest {
-        /// Which.
+        /// The names.
         names: Vec<Name>,
     },
     /// A signed request to join a name's tree; travels towards the owner.
     Join {
         /// Name and sink as in the body, for routers that only pass it on.
-        signed: Signed,
+        signed: SignedBody,
     },
-    /// A sink is gone; travels towards the owner.
+    /// A sink has left; travels towards the owner.
     Leave {
         /// Name.
         name: Name,
@@ -83,7 +83,7 @@ pub enum Control {
     /// The owner's signed answer to a join; travels along the branch to the sink.
     Answer {
         /// An [`AnswerBody`].
-        signed: Signed,
+        signed: SignedBody,
     },
     /// A router refuses a join, or cuts a branch.
     Reject {
@@ -91,20 +91,20 @@ pub enum Control {
         name: Name,
         /// Sink.
         sink: SinkId,
-        /// Why.
+        /// The reason.
         reason: RejectReason,
     },
-    /// A sink asks a source of its name for messages it did not get; travels towards the owner.
+    /// A sink asks a source of its name for lost messages; travels towards the owner.
     Recover(Recover),
-    /// The sender closes in good order: all it advertised is withdrawn.
+    /// The sender closes in good order: all its advertisements are withdrawn.
     Goodbye,
-    /// A certificate revocation list (RFC 5280, 5), DER, signed by its CA. First behind the greeting, and again
+    /// A certificate revocation list (RFC 5280, 5), DER, signed by its CA. Sent first behind the greeting, and again
     /// whenever a newer one is known.
     Crl {
         /// The list.
         der: Bytes,
     },
-    /// A sink holds what the answer with this serial granted; travels towards the owner.
+    /// A sink holds the grant of the answer with this serial; travels towards the owner.
     Ack {
         /// Name.
         name: Name,
@@ -113,59 +113,59 @@ pub enum Control {
         /// Serial of the answer.
         serial: u64,
     },
-    /// To whom a node is linked, and at what cost; travels from router to router.
+    /// The links of a node with their costs; travels from router to router.
     LinkState {
         /// A [`LinkStateBody`].
-        signed: Signed,
+        signed: SignedBody,
     },
-    /// Does anybody know where these names are? From router to router; answered with advertisements, now or when
-    /// they become known.
+    /// A question for the owners of these names, from router to router; answered with advertisements, now or when they
+    /// become known.
     Query {
-        /// Random number of the question, from who asked first: its copies over other links are the same question.
+        /// Random number of the question, from its first sender: copies over other links are the same question.
         id: u64,
         /// Links crossed so far.
         hops: u8,
-        /// Which.
+        /// The names.
         names: Vec<Name>,
     },
-    /// There is a better way to the owner than the one that this branch takes: the sink is to ask again, and has a
-    /// while until the branch is cut. Travels along the branch to the sink.
+    /// There is a better route to the owner than that of this branch: the sink has to ask again, and has a while until
+    /// the branch is cut. Travels along the branch to the sink.
     Reroute {
         /// Name.
         name: Name,
         /// Sink.
         sink: SinkId,
     },
-    /// From here on the sender may put this label in place of this name, in packets over this link. Between the two
-    /// nodes of a link alone; labels are given in order, from 0, and stand for one name as long as the link lives.
+    /// From here on the sender may put this label in place of this name, in packets over this link. Only between the
+    /// two nodes of a link; labels are given in order, from 0, and stand for one name as long as the link lives.
     Label {
         /// Label.
         label: Label,
         /// Name.
         name: Name,
     },
-    /// The sender knows what this label and all before it stand for: packets under them may come.
+    /// The sender knows the names of this label and all before it: packets under them may come.
     LabelAck {
         /// Label.
         label: Label,
     },
-    /// Is the other end there? Between the two nodes of a link alone. Who is asked answers at once.
-    Pulse {
+    /// A question whether the other end is there, only between the two nodes of a link. The receiver answers at once.
+    Probe {
         /// Whether this is the answer.
         answers: bool,
     },
     /// The sender, which dialled this link, wants to dial another connection for packets of this name alone, both ways.
     LaneOffer {
-        /// What the connection will show.
+        /// The token that the connection will show.
         token: LaneToken,
         /// Name.
         name: Name,
     },
-    /// Whether a connection that shows this token is awaited.
+    /// The answer to a lane offer.
     LaneAnswer {
-        /// As offered.
+        /// The offered token.
         token: LaneToken,
-        /// True if it is.
+        /// Whether the sender awaits a connection with this token.
         accepted: bool,
     },
     /// The sender, which cannot dial, wants a lane for this name.
@@ -173,14 +173,14 @@ pub enum Control {
         /// Name.
         name: Name,
     },
-    /// The sender's wall clock. Between the two nodes of a link alone: first behind the greeting, and again after the
-    /// clock was set. A hint that is shown to operators; nothing is set or believed by it.
+    /// The sender's wall clock. Only between the two nodes of a link: first behind the greeting, and again after the
+    /// clock was set. It is a hint for operators; nothing is set or believed by it.
     Clock {
-        /// The time when the frame was made.
+        /// The time at which the frame was made.
         time: UnixMillis,
     },
-    /// Another process uses the identity of the node that is told so, and was refused. Between the two nodes of a link
-    /// alone. A hint that is shown to operators.
+    /// Another process uses the receiver's identity, and was refused. Only between the two nodes of a link. It is a
+    /// hint for operators.
     IdentityInUse {
         /// The place of the other process, as the sender sees it.
         place: Place,
@@ -215,34 +215,34 @@ impl From<Place> for SocketAddr {
 /// The first frame of a link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Hello {
-    /// Minor version of the protocol; the major one is in the transport's negotiation.
+    /// Minor version of the protocol; the transport negotiates the major one.
     pub minor: u16,
-    /// Random number of this run of the process: another one means that all state of the last is void.
+    /// Random number of this run of the process: another number voids all state of the last run.
     pub incarnation: u64,
-    /// True for a router, which carries others' names; false for a node that only serves itself.
+    /// `true` for a router, which carries others' names; `false` for a node that only serves itself.
     pub transit: bool,
-    /// True if another run of this node has taken a link of this one over: this run takes over from nobody.
+    /// Whether another run of this node has taken over a link of this one: this run takes over from nobody.
     pub yields: bool,
     /// Beginning of this run, by its own clock: the floor in its link states.
     pub started: UnixMillis,
 }
 
-/// What a sink asks to be sent again. What a source no longer has, it does not send.
+/// A sink's request for messages. A source does not send messages that it no longer has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Recover {
     /// Name.
     pub name: Name,
-    /// The sink that asks; the answer goes to it alone.
+    /// The requesting sink; the answer goes to it alone.
     pub sink: SinkId,
-    /// The source that is asked.
+    /// The source.
     pub source: SourceId,
-    /// First message asked for.
+    /// First message.
     pub from: u64,
-    /// Last message asked for.
+    /// Last message.
     pub to: u64,
 }
 
-/// Why a router refuses a join.
+/// The reason why a router refuses a join.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum RejectReason {
     /// The name is not reachable from here.
@@ -253,11 +253,11 @@ pub enum RejectReason {
     Limit,
     /// The owner or a router on the way took too long.
     TimedOut,
-    /// The branch is cut because the way to the owner changed or broke.
+    /// The branch is cut because the route to the owner changed or broke.
     RouteLost,
     /// The clocks of requester and router are too far apart.
     Clock,
-    /// The requester's certificate is over, or not valid yet.
+    /// The requester's certificate has expired, or is not valid yet.
     Expired,
     /// The requester's certificate is revoked.
     Revoked,
@@ -265,48 +265,48 @@ pub enum RejectReason {
 
 /// Bytes and a signature over them.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Signed {
-    /// What was signed.
+pub struct SignedBody {
+    /// The signed bytes.
     pub body: Bytes,
     /// Signature by the key of the first certificate in the body's chain or of the name's owner.
     pub signature: Bytes,
 }
 
-/// What an owner advertises.
+/// Content of an advertisement.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct AdvertBody {
     /// Certificates of the owner, leaf first, DER.
     pub chain: Vec<Bytes>,
     /// Grows with every advertisement of the owner.
     pub seq: u64,
-    /// When it was signed.
+    /// Time of signing.
     pub issued_at: UnixMillis,
-    /// For how long it holds, milliseconds from its arrival.
+    /// Lifetime, milliseconds from its arrival.
     pub lease_ms: u32,
-    /// True if these names are withdrawn.
+    /// Whether these names are withdrawn.
     pub withdraw: bool,
     /// One per name: `name = SHA-256("sgc name v1" ‖ owner id ‖ blind)`.
     pub blinds: Vec<Blind>,
 }
 
-/// To whom a node is linked. Routers put their networks together from these; an edge counts if both its ends say it.
+/// The links of a node. Routers compute the topology from these; an edge counts if both its ends list it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LinkStateBody {
     /// Certificates of the node, leaf first, DER.
     pub chain: Vec<Bytes>,
-    /// Grows with every one of the node.
+    /// Grows with every link state of the node.
     pub seq: u64,
-    /// When it was signed.
+    /// Time of signing.
     pub issued_at: UnixMillis,
-    /// For how long it holds, milliseconds from its arrival.
+    /// Lifetime, milliseconds from its arrival.
     pub lease_ms: u32,
-    /// Advertisements of this node with lower sequence numbers are of an earlier run, and void.
+    /// Advertisements of this node with lower sequence numbers are void: they are of an earlier run.
     pub floor: u64,
-    /// True if the node carries others' names.
+    /// Whether the node carries others' names.
     pub transit: bool,
     /// The routers that it is linked to, ascending by node.
     pub routers: Vec<Adjacency>,
-    /// The other nodes that it is linked to, ascending; only a router says them.
+    /// The other nodes that it is linked to, ascending; only a router lists them.
     pub attached: Vec<NodeTag>,
 }
 
@@ -319,31 +319,31 @@ pub struct Adjacency {
     pub cost: u32,
 }
 
-/// What a joiner wants to be.
+/// Role of a joiner.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Role {
-    /// Receives what is published under the name.
+    /// Receives the messages under the name.
     Subscribe,
     /// Publishes under the name.
     Publish,
 }
 
-/// What a joiner asks for.
+/// A joiner's request.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Request {
-    /// To receive what is published under the name.
+    /// To receive the messages under the name.
     Subscribe {
-        /// True if the grant is to say what the name stands for: for one who cannot see the owner's catalogue.
+        /// Whether the grant has to contain the metadata: for a joiner that cannot see the owner's catalogue.
         describe: bool,
     },
     /// To publish under the name.
     Publish {
-        /// The source that it will publish as.
+        /// The source with which it will publish.
         offer: SourceOffer,
     },
-    /// To be answered. What is asked, the name says: that of a fleet's authority takes certificate signing requests
-    /// (PKCS #10, DER), that of its operations an [`OperationRequest`](crate::OperationRequest), that of an owner's types a
-    /// [`TypeQuestion`](crate::TypeQuestion).
+    /// To get an answer. The name tells the kind of question: that of a fleet's authority takes certificate signing
+    /// requests (PKCS #10, DER), that of its operations an [`OperationRequest`](crate::OperationRequest), that of an
+    /// owner's types a [`TypeQuestion`](crate::TypeQuestion).
     Ask {
         /// The question.
         what: Bytes,
@@ -351,7 +351,7 @@ pub enum Request {
 }
 
 impl Request {
-    /// Which way data flows over the branch.
+    /// Returns the direction of data over the branch.
     pub fn role(&self) -> Role {
         match self {
             Self::Publish { .. } => Role::Publish,
@@ -365,7 +365,7 @@ impl Request {
 pub struct SourceOffer {
     /// Its random id.
     pub source: SourceId,
-    /// What its messages verify with; empty if the suite has no signatures.
+    /// Public key of its signatures; empty if the suite has no signatures.
     pub key: Bytes,
 }
 
@@ -376,13 +376,13 @@ pub struct JoinBody {
     pub name: Name,
     /// This incarnation of the joiner.
     pub sink: SinkId,
-    /// What is asked for.
+    /// The request.
     pub request: Request,
-    /// When it was signed.
+    /// Time of signing.
     pub issued_at: UnixMillis,
     /// Certificates of the joiner, leaf first, DER.
     pub chain: Vec<Bytes>,
-    /// Fresh HPKE public key that the answer is sealed to.
+    /// Fresh HPKE public key, to which the answer is sealed.
     pub reply_key: Bytes,
 }
 
@@ -391,7 +391,7 @@ pub struct JoinBody {
 pub struct AnswerBody {
     /// The name.
     pub name: Name,
-    /// Whom it answers.
+    /// The sink that it answers.
     pub sink: SinkId,
     /// Grows with every answer to that sink.
     pub serial: u64,
@@ -399,7 +399,7 @@ pub struct AnswerBody {
     pub answer: Answer,
 }
 
-/// Yes, with what was asked for, or no, with the reason.
+/// A grant, or a refusal with its reason.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Answer {
     /// Granted; the content is sealed to the request's reply key (HPKE, RFC 9180).
@@ -409,14 +409,14 @@ pub enum Answer {
         /// Sealed content.
         sealed: Bytes,
     },
-    /// Refused, or a grant taken back.
+    /// Refused, or a grant revoked.
     Refuse {
-        /// Why.
+        /// The reason.
         reason: RefuseReason,
     },
 }
 
-/// Why an owner refuses.
+/// The reason why an owner refuses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum RefuseReason {
     /// The requester is not in the share's `to`.
@@ -431,7 +431,7 @@ pub enum RefuseReason {
     Limit,
     /// The clocks of requester and owner are too far apart.
     Clock,
-    /// The requester's certificate is over, or not valid yet.
+    /// The requester's certificate has expired, or is not valid yet.
     Expired,
     /// The requester's certificate is revoked.
     Revoked,
@@ -531,14 +531,14 @@ fn decode_names(r: &mut Reader<'_>) -> Result<Vec<Name>, DecodeError> {
     r.list("names", NAMES_PER_FRAME_MAX, Name::decode)
 }
 
-impl Encode for Signed {
+impl Encode for SignedBody {
     fn encode(&self, w: &mut Writer) {
         w.bytes(&self.body);
         w.bytes(&self.signature);
     }
 }
 
-impl Decode for Signed {
+impl Decode for SignedBody {
     fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
         Ok(Self {
             body: blob(r, "signed body", CONTROL_FRAME_BYTES_MAX)?,
@@ -637,7 +637,7 @@ impl Decode for LinkStateBody {
             })?,
             attached: r.list("attached nodes", ATTACHED_MAX, NodeTag::decode)?,
         };
-        // One encoding for each set, and they can be searched as they are.
+        // Each set has one encoding, and lists can be searched as they are.
         if !body.routers.is_sorted_by(|a, b| a.node < b.node) {
             return Err(DecodeError::value("order of adjacencies", 0));
         }
@@ -799,7 +799,7 @@ impl Encode for Control {
                 w.u8(21);
                 label.encode(w);
             }
-            Self::Pulse { answers } => {
+            Self::Probe { answers } => {
                 w.u8(22);
                 w.bool(*answers);
             }
@@ -840,13 +840,13 @@ impl Decode for Control {
                 yields: r.bool("yields")?,
                 started: UnixMillis::decode(r)?,
             }),
-            2 => Self::Advert { cost: r.u32()?, signed: Signed::decode(r)? },
+            2 => Self::Advert { cost: r.u32()?, signed: SignedBody::decode(r)? },
             3 => Self::Unreach { names: decode_names(r)? },
             4 => Self::Interest { names: decode_names(r)? },
             5 => Self::Uninterest { names: decode_names(r)? },
-            6 => Self::Join { signed: Signed::decode(r)? },
+            6 => Self::Join { signed: SignedBody::decode(r)? },
             7 => Self::Leave { name: Name::decode(r)?, sink: SinkId::decode(r)? },
-            8 => Self::Answer { signed: Signed::decode(r)? },
+            8 => Self::Answer { signed: SignedBody::decode(r)? },
             9 => Self::Reject {
                 name: Name::decode(r)?,
                 sink: SinkId::decode(r)?,
@@ -862,12 +862,12 @@ impl Decode for Control {
             11 => Self::Goodbye,
             12 => Self::Crl { der: blob(r, "revocation list", CRL_BYTES_MAX)? },
             13 => Self::Ack { name: Name::decode(r)?, sink: SinkId::decode(r)?, serial: r.u64()? },
-            14 => Self::LinkState { signed: Signed::decode(r)? },
+            14 => Self::LinkState { signed: SignedBody::decode(r)? },
             15 => Self::Query { id: r.u64()?, hops: r.u8()?, names: decode_names(r)? },
             16 => Self::Reroute { name: Name::decode(r)?, sink: SinkId::decode(r)? },
             20 => Self::Label { label: Label::decode(r)?, name: Name::decode(r)? },
             21 => Self::LabelAck { label: Label::decode(r)? },
-            22 => Self::Pulse { answers: r.bool("answers")? },
+            22 => Self::Probe { answers: r.bool("answers")? },
             23 => Self::LaneOffer { token: LaneToken::decode(r)?, name: Name::decode(r)? },
             24 => Self::LaneAnswer { token: LaneToken::decode(r)?, accepted: r.bool("accepted")? },
             25 => Self::LaneWanted { name: Name::decode(r)? },
@@ -884,7 +884,7 @@ mod tests {
     use crate::ids::LABELS_MAX;
 
     fn frames() -> Vec<Control> {
-        let signed = Signed { body: Bytes::from_static(b"body"), signature: Bytes::from_static(b"sig") };
+        let signed = SignedBody { body: Bytes::from_static(b"body"), signature: Bytes::from_static(b"sig") };
         let (name, sink) = (Name([1; 32]), SinkId([2; 16]));
         let label = Label::new(LABELS_MAX - 1).unwrap();
         vec![
@@ -912,7 +912,7 @@ mod tests {
             Control::Reroute { name, sink },
             Control::Label { label, name },
             Control::LabelAck { label },
-            Control::Pulse { answers: true },
+            Control::Probe { answers: true },
             Control::LaneOffer { token: LaneToken([4; 16]), name },
             Control::LaneAnswer { token: LaneToken([4; 16]), accepted: true },
             Control::LaneWanted { name },

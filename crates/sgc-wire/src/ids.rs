@@ -12,12 +12,12 @@ macro_rules! id {
         pub struct $name(pub [u8; $bytes]);
 
         impl $name {
-            /// The raw bytes.
+            /// Returns the raw bytes.
             pub fn as_bytes(&self) -> &[u8; $bytes] {
                 &self.0
             }
 
-            /// The first eight hexadecimal digits: enough to tell apart in a log, never an identity.
+            /// Returns the first eight hexadecimal digits: enough to tell apart in a log, never an identity.
             pub fn short(&self) -> String {
                 hex(&self.0[..4])
             }
@@ -62,24 +62,24 @@ id!(
     Name, 32, "name"
 );
 id!(
-    /// Who a node is, and so the owner of its names: `SHA-256(CA public key ‖ pseudonym)`. Survives key
-    /// rotation and moving.
+    /// The id of a node, and so of the owner of its names: `SHA-256(CA public key ‖ pseudonym)`. Survives key rotation
+    /// and moving.
     NodeId, 32, "node id"
 );
 id!(
-    /// The first bytes of a [`NodeId`]: enough to tell apart the nodes that say themselves that they are meant.
+    /// The first bytes of a [`NodeId`]: enough to tell apart nodes that confirm the link themselves.
     NodeTag, 8, "node tag"
 );
 id!(
-    /// The half of a name that proves knowledge of its topic secret without telling it.
+    /// The half of a name that proves knowledge of its topic secret without revealing it.
     Blind, 32, "blind"
 );
 id!(
-    /// What a certificate says of its subject: `HMAC(fleet secret, node name)`.
+    /// A node in its certificate: `HMAC(fleet secret, node name)`.
     Pseudonym, 32, "pseudonym"
 );
 id!(
-    /// What a certificate says of a group its subject belongs to: `HMAC(fleet secret, group name)`.
+    /// A group in a member's certificate: `HMAC(fleet secret, group name)`.
     GroupTag, 32, "group tag"
 );
 id!(
@@ -92,23 +92,23 @@ id!(
     SinkId, 16, "sink id"
 );
 id!(
-    /// What a connection shows that was agreed on as a lane of a link; random, used once.
+    /// The token of a connection that was agreed on as a lane of a link; random, used once.
     LaneToken, 16, "lane token"
 );
 
-/// The second half of the id that a publisher is listed under whose liveliness lease ran out.
+/// The second half of a publisher's listed id after its liveliness lease ran out.
 const LAPSED: [u8; 8] = [0xff; 8];
 
 impl SourceId {
     /// In a catalogue: all publishers that are not told apart.
     pub const OTHERS: Self = Self([0; 16]);
 
-    /// The source, unless it stands for all others.
+    /// Returns the source, unless it stands for all others.
     pub fn told_apart(self) -> Option<Self> {
         (self != Self::OTHERS).then_some(self)
     }
 
-    /// The id under which a publisher is listed whose liveliness lease ran out. Nothing is ever sent under it.
+    /// Returns the id that lists a publisher after its liveliness lease ran out. Nothing is ever sent under it.
     pub fn lapsed(mut self) -> Self {
         self.0[8..].copy_from_slice(&LAPSED);
         self
@@ -119,15 +119,15 @@ impl SourceId {
         self.0[8..] == LAPSED
     }
 
-    /// A source of the publisher with this tag.
-    pub fn of_publisher(tag: [u8; 8], random: [u8; 8]) -> Self {
+    /// Returns a source of the publisher with this tag.
+    pub fn from_publisher(tag: [u8; 8], random: [u8; 8]) -> Self {
         let mut id = [0; 16];
         id[..8].copy_from_slice(&tag);
         id[8..].copy_from_slice(&random);
         Self(id)
     }
 
-    /// What all sources of one publisher begin with.
+    /// Returns the common beginning of all sources of one publisher.
     pub fn publisher(&self) -> [u8; 8] {
         let mut publisher = [0; 8];
         publisher.copy_from_slice(&self.0[..8]);
@@ -136,7 +136,7 @@ impl SourceId {
 }
 
 impl NodeId {
-    /// Its tag.
+    /// Returns its tag.
     pub fn tag(&self) -> NodeTag {
         let mut tag = [0; 8];
         tag.copy_from_slice(&self.0[..8]);
@@ -147,17 +147,17 @@ impl NodeId {
 /// Names that may have a label on one link, each way: 2 MiB at the receiver.
 pub const LABELS_MAX: u32 = 1 << 16;
 
-/// What stands for a name on one link, in one direction; below [`LABELS_MAX`].
+/// A number for a name on one link, in one direction; below [`LABELS_MAX`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Label(u32);
 
 impl Label {
-    /// The label with this number, if there may be one.
+    /// Returns the label with this number, if it is within the bound.
     pub fn new(index: u32) -> Option<Self> {
         (index < LABELS_MAX).then_some(Self(index))
     }
 
-    /// Its number.
+    /// Returns its number.
     pub fn index(self) -> u32 {
         self.0
     }
@@ -176,7 +176,7 @@ impl Decode for Label {
     }
 }
 
-/// 256 secret bits: a key, or what keys are derived from. Wiped when dropped, compared in constant time, never
+/// 256 secret bits: a key, or the input of a key derivation. Wiped when dropped, compared in constant time, never
 /// printed.
 #[derive(Clone, zeroize::Zeroize, zeroize::ZeroizeOnDrop)]
 pub struct SecretBytes([u8; 32]);
@@ -187,7 +187,7 @@ impl SecretBytes {
         Self(bytes)
     }
 
-    /// The bytes, for deriving from them. They belong in no log, and on no wire but sealed.
+    /// Returns the bytes, for deriving from them. They belong in no log, and on no wire but sealed.
     pub fn expose(&self) -> &[u8; 32] {
         &self.0
     }
@@ -250,13 +250,13 @@ fn parse_hex<const N: usize>(s: &str) -> Result<[u8; N], ParseIdError> {
     Ok(out)
 }
 
-/// Wall-clock time: milliseconds since the Unix epoch, UTC. Certificates and signed objects speak it;
-/// timers use `std::time::Instant`.
+/// Wall-clock time: milliseconds since the Unix epoch, UTC. Certificates and signed objects use it; timers use
+/// `std::time::Instant`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct UnixMillis(pub u64);
 
 impl UnixMillis {
-    /// Whole seconds.
+    /// Returns whole seconds.
     pub fn secs(self) -> u64 {
         self.0 / 1000
     }
@@ -282,7 +282,7 @@ impl Decode for UnixMillis {
     }
 }
 
-/// Proleptic Gregorian date of a day counted from 1970-01-01, by eras of 400 years that start in March.
+/// Returns the proleptic Gregorian date of a day counted from 1970-01-01, by eras of 400 years that start in March.
 fn civil_from_days(days: i64) -> (i64, u32, u32) {
     let z = days + 719_468;
     let era = z.div_euclid(146_097);

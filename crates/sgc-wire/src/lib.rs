@@ -18,13 +18,13 @@ mod packet;
 mod qos;
 mod ros_node;
 mod slab;
-mod types;
+mod type_descriptions;
 
 pub use catalogue::{
     CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Credentials, ENTRY_SOURCES_MAX,
     GRANT_SOURCES_MAX, GrantContent, SECRET_GENERATIONS_MAX, SecretGeneration, SourceAnnounce, TopicGrant,
 };
-pub use clock::{ClockWatch, ToldClock};
+pub use clock::{ClockWatch, PeerClock};
 pub use codec::{Decode, DecodeError, Encode, Reader, Writer};
 pub use consumers::{CONSUMERS_MAX, CONSUMERS_PER_INTERFACE_MAX, Consumer};
 pub use control::{
@@ -32,7 +32,7 @@ pub use control::{
     AnswerBody, CERT_BYTES_MAX, CHAIN_CERTS_MAX, CONTROL_FRAME_BYTES_MAX, CRL_BYTES_MAX, CSR_BYTES_MAX,
     Control, Hello, JoinBody, LinkStateBody, NAMES_PER_FRAME_MAX, Place, REPLY_KEY_BYTES_MAX, Recover,
     RefuseReason, RejectReason, Request, Role, SEALED_BYTES_MAX, SIGNATURE_BYTES_MAX, SOURCE_KEY_BYTES_MAX,
-    Signed, SourceOffer,
+    SignedBody, SourceOffer,
 };
 pub use ids::{
     Blind, GroupTag, LABELS_MAX, Label, LaneToken, Name, NodeId, NodeTag, Now, ParseIdError, Pseudonym,
@@ -54,6 +54,6 @@ pub use packet::{
 pub use qos::{Durability, History, Liveliness, Qos, Reliability, Representations};
 pub use ros_node::RosNode;
 pub use slab::Slab;
-pub use types::{
+pub use type_descriptions::{
     DescribedType, TYPE_DESCRIPTION_BYTES_MAX, TYPE_HASH_BYTES_MAX, TYPES_PER_QUESTION_MAX, TypeQuestion,
 };

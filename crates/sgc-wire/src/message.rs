@@ -1,11 +1,11 @@
-//! What accompanies a message under the seal: what it is, and when it was published.
+//! The head of a message under the seal: its kind, and its time of publication.
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
 
 /// Length of an encoded [`MessageHead`], bytes.
 pub const MESSAGE_HEAD_BYTES: usize = 12;
 
-/// What a message does to its instance (DDS 1.4, 2.2.2.4.2).
+/// Effect of a message on its instance (DDS 1.4, 2.2.2.4.2), or its part in a call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MessageKind {
     /// Data.
@@ -14,20 +14,20 @@ pub enum MessageKind {
     Dispose,
     /// The writer no longer updates the instance; the payload holds its key.
     Unregister,
-    /// No message: the history that a sink asked for has been sent. Sequence number 0, always the same bytes.
+    /// No message: the requested history has been sent. Sequence number 0, always the same bytes.
     Synced,
-    /// No message, but numbered as one: what was published until here, and what can still be asked for. Its payload is the
-    /// number of the oldest such message, 8 bytes.
+    /// No message, but numbered as one: tells the last number, and the oldest message that can still be asked for. Its
+    /// payload is the number of that message, 8 bytes.
     Mark,
     /// A call of a service: the request.
     Request,
-    /// What a call was answered.
+    /// The reply of a call.
     Reply,
-    /// Asks what became of a call; without payload, as all that follow.
+    /// Asks for the state of a call; without payload, as all that follow.
     Ask,
-    /// The call is over for who made it.
+    /// The caller has finished the call.
     Forget,
-    /// Who was asked has never heard of the call.
+    /// The owner has never heard of the call.
     Unknown,
     /// The call will not be answered any more.
     Gone,
@@ -36,10 +36,10 @@ pub enum MessageKind {
 /// Length of the hash of a key, bytes (RTPS 2.5, 9.6.4.8).
 pub const KEY_HASH_BYTES: usize = 16;
 
-/// What a message is written in, before it is compressed.
+/// Format of a message, before it is compressed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum PayloadForm {
-    /// As the local network has it: CDR with its encapsulation header.
+    /// The format of the local network: CDR with its encapsulation header.
     #[default]
     Cdr,
     /// JSON (docs/spec/json.md).
@@ -48,10 +48,10 @@ pub enum PayloadForm {
     KeyedCdr,
 }
 
-/// How a payload is compressed, before it is sealed.
+/// Compression of a payload, before it is sealed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum PayloadEncoding {
-    /// Not at all.
+    /// None.
     #[default]
     Plain,
     /// Its length (4 bytes, big-endian), and a frame of Zstandard (RFC 8878).
@@ -65,38 +65,38 @@ pub enum PayloadEncoding {
 pub struct MessageHead {
     /// Data, or the end of an instance.
     pub kind: MessageKind,
-    /// How the payload is compressed.
+    /// Compression of the payload.
     pub encoding: PayloadEncoding,
-    /// What it is written in.
+    /// Format of the payload.
     pub form: PayloadForm,
-    /// Source time stamp, nanoseconds since the Unix epoch. Of the kinds from [`MessageKind::Request`] on, the number
+    /// Source time stamp, nanoseconds since the Unix epoch. For the kinds from [`MessageKind::Request`] on, the number
     /// of the call at its source.
     pub source_timestamp_ns: i64,
 }
 
 impl MessageHead {
-    /// The head of a message in CDR that is not compressed.
+    /// Returns the head of a message in CDR that is not compressed.
     pub const fn new(kind: MessageKind, source_timestamp_ns: i64) -> Self {
         Self { kind, encoding: PayloadEncoding::Plain, form: PayloadForm::Cdr, source_timestamp_ns }
     }
 
-    /// The head of a message that is about a call.
-    pub fn of_call(kind: MessageKind, number: u64) -> Self {
+    /// Returns the head of a message about a call.
+    pub fn for_call(kind: MessageKind, number: u64) -> Self {
         Self::new(kind, number as i64)
     }
 
-    /// The head of a mark by which a node says that this publisher of its local network asserted its liveliness.
-    pub const fn of_assertion(publisher: [u8; 8]) -> Self {
+    /// Returns the head of a mark by which a node reports that this local publisher asserted its liveliness.
+    pub const fn for_assertion(publisher: [u8; 8]) -> Self {
         Self::new(MessageKind::Mark, i64::from_be_bytes(publisher))
     }
 
-    /// Returns what the source ids of the publisher begin with that a mark says to have asserted its liveliness, if it says so.
+    /// Returns the beginning of the source ids of the publisher that asserted its liveliness, if this is such a mark.
     pub fn asserted(&self) -> Option<[u8; 8]> {
         let says_so = self.kind == MessageKind::Mark && self.source_timestamp_ns != 0;
         says_so.then(|| self.source_timestamp_ns.to_be_bytes())
     }
 
-    /// The encoding.
+    /// Returns the encoding.
     pub fn to_array(self) -> [u8; MESSAGE_HEAD_BYTES] {
         let mut out = [0; MESSAGE_HEAD_BYTES];
         out[0] = self.kind as u8;
@@ -106,7 +106,7 @@ impl MessageHead {
         out
     }
 
-    /// The call that a message is about.
+    /// Returns the number of the call.
     pub fn call(&self) -> u64 {
         self.source_timestamp_ns as u64
     }
@@ -193,7 +193,7 @@ mod tests {
     #[test]
     fn mark_with_a_time_stamp_names_the_publisher_that_asserted_its_liveliness() {
         let publisher = [0xff, 2, 3, 4, 5, 6, 7, 8];
-        let bytes = MessageHead::of_assertion(publisher).to_vec();
+        let bytes = MessageHead::for_assertion(publisher).to_vec();
         assert_eq!(bytes, [&[4, 0, 0, 0][..], &publisher].concat());
         assert_eq!(MessageHead::from_slice(&bytes).unwrap().asserted(), Some(publisher));
         assert_eq!(MessageHead::new(MessageKind::Mark, 0).asserted(), None);
@@ -207,7 +207,7 @@ mod tests {
             let bytes = [kind, 0, 0, 0, 0xff, 0, 0, 0, 0, 0, 0, 9];
             let head = MessageHead::from_slice(&bytes).unwrap();
             assert_eq!((head.kind as u8, head.call()), (kind, 0xff00_0000_0000_0009));
-            assert_eq!((head, head.to_vec()), (MessageHead::of_call(head.kind, head.call()), bytes.into()));
+            assert_eq!((head, head.to_vec()), (MessageHead::for_call(head.kind, head.call()), bytes.into()));
         }
         assert!(MessageHead::from_slice(&[11; 12]).is_err());
     }

@@ -1,4 +1,4 @@
-//! What a name is derived from: the metadata of an interface in its one canonical encoding.
+//! The metadata of an interface, from which its name derives, in its one canonical encoding.
 //!
 //! The derivation itself needs secrets and is in `sgc-trust`; the normative text is `docs/spec/names.md`.
 
@@ -9,10 +9,10 @@ pub const METADATA_VERSION: u8 = 1;
 /// Longest text of one field, bytes.
 pub const METADATA_FIELD_BYTES_MAX: usize = 1024;
 
-/// What kind of interface a name stands for.
+/// The kind of interface that a name stands for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Kind {
-    /// An owner's sealed list of what it shares; the one name that follows from owner and fleet alone.
+    /// An owner's sealed list of its shares; the one name that follows from owner and fleet alone.
     Catalogue,
     /// A ROS 2 topic.
     Topic,
@@ -31,9 +31,9 @@ pub struct Metadata {
     pub owner: String,
     /// Absolute ROS name, `/camera/image`.
     pub ros_name: String,
-    /// ROS type, `sensor_msgs/msg/Image`; a type outside ROS naming stands as DDS spells it.
+    /// ROS type, `sensor_msgs/msg/Image`; a type outside ROS naming as DDS spells it.
     pub type_name: String,
-    /// ROS node that provides it, if the user wants that to matter.
+    /// ROS node that provides it, if the user wants it in the name.
     pub node: String,
     /// Author.
     pub author: String,
@@ -43,12 +43,12 @@ pub struct Metadata {
     pub interface: String,
     /// Free text.
     pub description: String,
-    /// Any string that tells apart what is otherwise alike.
+    /// Any string that tells apart otherwise equal interfaces.
     pub unique: String,
 }
 
 impl Metadata {
-    /// Metadata of a topic, the optional fields empty.
+    /// Returns the metadata of a topic, the optional fields empty.
     pub fn topic(owner: &str, ros_name: &str, type_name: &str) -> Self {
         Self {
             kind: Kind::Topic,
@@ -64,7 +64,7 @@ impl Metadata {
         }
     }
 
-    /// Metadata of an owner's catalogue.
+    /// Returns the metadata of an owner's catalogue.
     pub fn catalogue(owner: &str) -> Self {
         Self { kind: Kind::Catalogue, ..Self::topic(owner, "", "") }
     }

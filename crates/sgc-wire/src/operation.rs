@@ -36,9 +36,9 @@ pub struct Challenge(pub [u8; 16]);
 /// A question at an authority's operations name.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum OperationRequest {
-    /// For a challenge.
+    /// A request for a challenge.
     Challenge,
-    /// For an operation, once.
+    /// A request for an operation, once.
     Execute {
         /// The challenge that the authority gave for it.
         challenge: Challenge,
@@ -60,19 +60,19 @@ pub enum Operation {
         /// Their names.
         nodes: Vec<String>,
     },
-    /// Takes a node in that made its key itself.
+    /// Enrols a node that made its key itself.
     Enroll {
         /// Its name.
         node: String,
         /// Its groups.
         groups: Vec<String>,
-        /// True if it only routes.
+        /// Whether it only routes.
         router: bool,
-        /// True if it may route for others as well.
+        /// Whether it may route for others as well.
         may_route: bool,
-        /// True if it may have been revoked before.
+        /// Whether a revoked node may be enrolled again.
         again: bool,
-        /// Validity asked for its certificate, milliseconds.
+        /// Requested validity of its certificate, milliseconds.
         valid_ms: u64,
         /// Its signing request (PKCS #10), DER.
         csr: Bytes,
@@ -81,7 +81,7 @@ pub enum Operation {
     Renew {
         /// Its name.
         node: String,
-        /// Validity asked for the certificate, milliseconds.
+        /// Requested validity of the certificate, milliseconds.
         valid_ms: u64,
         /// Its signing request (PKCS #10), DER.
         csr: Bytes,
@@ -93,9 +93,9 @@ pub enum Operation {
 pub enum OperationAnswer {
     /// A challenge for the next operation.
     Challenge(Challenge),
-    /// Nothing was done.
+    /// The authority did nothing.
     Refused {
-        /// Why.
+        /// The reason.
         why: OperationRefusal,
         /// The reason in words, at most [`REFUSAL_DETAIL_BYTES_MAX`] bytes; may be empty.
         detail: String,
@@ -104,14 +104,14 @@ pub enum OperationAnswer {
     Roster(RosterPage),
     /// The nodes are revoked.
     Revoked {
-        /// Number of the revocation list that says so.
+        /// Number of the revocation list with them.
         list: u64,
     },
     /// The node is in the roster; this is the text that makes its identity, together with its key.
     Membership(SecretText),
 }
 
-/// Why an authority carries an operation out in no part.
+/// The reason why an authority refuses an operation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum OperationRefusal {
     /// The challenge is not one that this run of the authority gave to the operator, or was used before.
@@ -120,9 +120,9 @@ pub enum OperationRefusal {
     Busy,
     /// The fleet's file cannot be read or written.
     File,
-    /// The fleet refuses; the detail says why.
+    /// The fleet refuses; the detail has the reason.
     Fleet,
-    /// A name or another field is none.
+    /// An invalid name or other field.
     Malformed,
 }
 
@@ -130,26 +130,26 @@ pub enum OperationRefusal {
 #[derive(Clone, PartialEq, Eq)]
 pub struct SecretText(String);
 
-/// A page of a roster, as people look at it.
+/// A page of a roster, for display.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RosterPage {
     /// The fleet's name.
     pub fleet: String,
-    /// Last moment at which its CA holds.
+    /// Last moment at which its CA is valid.
     pub expires: UnixMillis,
     /// The node that renews certificates.
     pub authority: Option<String>,
-    /// True if links and grants resist quantum computers.
+    /// Whether links and grants resist quantum computers.
     pub post_quantum: bool,
-    /// False if the file is from before rosters.
+    /// `false` if the file is from before rosters.
     pub has_roster: bool,
     /// Number of the last revocation list.
     pub revocation_list: u64,
-    /// Generations of the naming secret in use and when they were made, oldest first.
+    /// Generations of the naming secret in use with their times, oldest first.
     pub generations: Vec<(u32, UnixMillis)>,
     /// Nodes by name.
     pub nodes: Vec<RosterRow>,
-    /// True if there are nodes behind the last of these.
+    /// Whether further nodes follow.
     pub more: bool,
 }
 
@@ -164,13 +164,13 @@ pub struct RosterRow {
     pub incarnation: u32,
     /// Its groups.
     pub groups: Vec<String>,
-    /// True if it only routes.
+    /// Whether it only routes.
     pub router: bool,
-    /// True if it may route for others.
+    /// Whether it may route for others.
     pub may_route: bool,
-    /// Last moment at which a certificate of it holds.
+    /// Last moment at which a certificate of it is valid.
     pub expires: Option<UnixMillis>,
-    /// Since when it is revoked, if it is.
+    /// Time of its revocation, if it is revoked.
     pub revoked: Option<UnixMillis>,
     /// The newest generation of the naming secret that it was handed; 0 if that is unknown or it has none.
     pub generation: u32,
@@ -185,11 +185,11 @@ pub struct RosterRow {
 pub struct RowCertificate {
     /// Its serial number.
     pub serial: Bytes,
-    /// Last moment at which it holds.
+    /// Last moment at which it is valid.
     pub expires: UnixMillis,
     /// The incarnation of its node.
     pub incarnation: u32,
-    /// Since when it is revoked, if it is.
+    /// Time of its revocation, if it is revoked.
     pub revoked: Option<UnixMillis>,
 }
 
@@ -199,7 +199,7 @@ impl SecretText {
         Self(text)
     }
 
-    /// The text.
+    /// Returns the text.
     pub fn expose(&self) -> &str {
         &self.0
     }
@@ -220,7 +220,7 @@ impl fmt::Debug for SecretText {
 impl OperationRefusal {
     const ALL: [Self; 5] = [Self::Stale, Self::Busy, Self::File, Self::Fleet, Self::Malformed];
 
-    /// A short, stable name for counters and JSON.
+    /// Returns a short, stable name for counters and JSON.
     pub fn key(self) -> &'static str {
         match self {
             Self::Stale => "operation_stale",

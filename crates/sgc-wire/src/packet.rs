@@ -1,8 +1,7 @@
 //! Data packets: one sealed fragment of one message, under its name.
 //!
-//! The header is what routers read; they never see inside the payload. All of it but the hop limit is
-//! authenticated by the seal (`sgc-trust`), so a router may lower that and change nothing else unnoticed.
-//! Layout: `docs/spec/wire.md`.
+//! Routers read the header and never see inside the payload. The seal (`sgc-trust`) authenticates all of the header but
+//! the hop limit, so a router may lower that and change nothing else unnoticed. Layout: `docs/spec/wire.md`.
 
 use bytes::{BufMut, Bytes};
 use smallvec::SmallVec;
@@ -16,17 +15,17 @@ pub const PACKET_VERSION: u8 = 1;
 pub const HEADER_BYTES_MAX: usize = HEADER_BYTES + 16;
 /// Header without an addressee, bytes.
 pub const HEADER_BYTES: usize = 76;
-/// What a label in place of the name saves, bytes.
+/// Bytes that a label in place of the name saves.
 pub const LABEL_SAVES_BYTES: usize = 32;
-/// Longest payload of one packet, bytes: a fragment of 32 KiB and what a suite adds to it, which is a message
-/// head (12), a tag (16) and the trailer of a batch of 64 under RSA-3072 (6 · 32 + 4 + 384), rounded up.
+/// Longest payload of one packet, bytes: a fragment of 32 KiB and the additions of a suite, which are a message head
+/// (12), a tag (16) and the trailer of a batch of 64 under RSA-3072 (6 · 32 + 4 + 384), rounded up.
 pub const PAYLOAD_BYTES_MAX: usize = 32 * 1024 + 1024;
 /// Longest message, bytes of plaintext.
 pub const MESSAGE_BYTES_MAX: u32 = 64 * 1024 * 1024;
 /// Hops that a packet may take.
 pub const HOP_LIMIT: u8 = 64;
 
-/// Which traffic overtakes which (`docs/spec/wire.md`, classes).
+/// Priority of traffic (`docs/spec/wire.md`, classes).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Class {
     /// Large or patient.
@@ -41,7 +40,7 @@ pub enum Class {
 /// The header of a data packet.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PacketHeader {
-    /// Lost packets are to be sent again, and a full queue pushes back; otherwise the newest wins.
+    /// Whether lost packets are sent again and full queues push back; otherwise the newest packet wins.
     pub reliable: bool,
     /// Class.
     pub class: Class,
@@ -51,15 +50,15 @@ pub struct PacketHeader {
     pub suite: u8,
     /// Epoch of the topic key.
     pub epoch: u32,
-    /// The name it is published under.
+    /// The name of the topic.
     pub name: Name,
-    /// Who publishes.
+    /// The publishing source.
     pub source: SourceId,
     /// Number of the message at its source, from 1.
     pub seq: u64,
     /// Bytes of the whole message, unsealed.
     pub total: u32,
-    /// Which fragment, from 0.
+    /// Number of the fragment, from 0.
     pub index: u16,
     /// Bytes of every fragment but the last, unsealed.
     pub grid: u16,
@@ -78,23 +77,23 @@ const CLASS_SHIFT: u8 = 2;
 const FLAGS_KNOWN: u8 = 0x0f;
 
 impl PacketHeader {
-    /// Number of fragments of the message, at least one.
+    /// Returns the number of fragments of the message, at least one.
     pub fn fragments(&self) -> u32 {
         self.total.div_ceil(u32::from(self.grid)).max(1)
     }
 
-    /// Bytes of this fragment, unsealed.
+    /// Returns the bytes of this fragment, unsealed.
     pub fn fragment_bytes(&self) -> usize {
         let start = u32::from(self.index) * u32::from(self.grid);
         (self.total - start).min(u32::from(self.grid)) as usize
     }
 
-    /// True for the fragment that ends its message.
+    /// Returns `true` for the fragment that ends its message.
     pub fn is_last(&self) -> bool {
         u32::from(self.index) + 1 == self.fragments()
     }
 
-    /// The bytes that the seal authenticates: the encoding with its name and with hop limit zero, whatever form
+    /// Returns the bytes that the seal authenticates: the encoding with its name and with hop limit zero, whatever form
     /// links carry it in.
     pub fn associated_data(&self) -> AssociatedData {
         let mut bytes = [0; HEADER_BYTES_MAX];
@@ -112,17 +111,17 @@ impl PacketHeader {
         self.put(out, self.hops, label);
     }
 
-    /// Length of the encoding, bytes.
+    /// Returns the length of the encoding, bytes.
     pub fn encoded_bytes(&self) -> usize {
         if self.to.is_some() { HEADER_BYTES_MAX } else { HEADER_BYTES }
     }
 
-    /// Length of what [`Self::put_as`] appends, bytes.
+    /// Returns the length of the output of [`Self::put_as`], bytes.
     pub fn encoded_bytes_as(&self, label: Option<Label>) -> usize {
         self.encoded_bytes() - if label.is_some() { LABEL_SAVES_BYTES } else { 0 }
     }
 
-    /// Decodes a header of either form; `name_of` knows what the labels of the link stand for.
+    /// Decodes a header of either form; `name_of` returns the names of the link's labels.
     pub fn read(
         r: &mut Reader<'_>,
         name_of: impl FnOnce(Label) -> Option<Name>,
@@ -208,7 +207,7 @@ impl PacketHeader {
     }
 }
 
-/// What a seal authenticates of a header; see [`PacketHeader::associated_data`].
+/// The bytes of a header that a seal authenticates; see [`PacketHeader::associated_data`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct AssociatedData {
     bytes: [u8; HEADER_BYTES_MAX],
@@ -229,25 +228,25 @@ impl Encode for PacketHeader {
     }
 }
 
-/// With its name; of labels it knows none.
+/// Decodes a header with its name, and none with a label.
 impl Decode for PacketHeader {
     fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
         Self::read(r, |_| None)
     }
 }
 
-/// The sealed payload of a packet as the transport received it: one piece, or a few where it straddled the
-/// transport's buffers. Cloning shares.
+/// The sealed payload of a packet as the transport received it: one piece, or a few where it lay across the transport's
+/// buffers. Cloning shares.
 #[derive(Clone, Debug, Default)]
 pub struct Payload(pub SmallVec<[Bytes; 2]>);
 
 impl Payload {
-    /// Length, bytes.
+    /// Returns the length, bytes.
     pub fn len(&self) -> usize {
         self.0.iter().map(Bytes::len).sum()
     }
 
-    /// True if there is nothing.
+    /// Returns `true` if there is nothing.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -269,29 +268,29 @@ impl From<Bytes> for Payload {
 /// A data packet.
 #[derive(Clone, Debug)]
 pub struct Packet {
-    /// What routers read.
+    /// The header, which routers read.
     pub header: PacketHeader,
     /// Sealed fragment.
     pub payload: Payload,
 }
 
 impl Packet {
-    /// Length of the encoding, bytes.
+    /// Returns the length of the encoding, bytes.
     pub fn encoded_bytes(&self) -> usize {
         self.header.encoded_bytes() + self.payload.len()
     }
 
-    /// Length of the encoding with the label in place of the name, if there is one, bytes.
+    /// Returns the length of the encoding with the label in place of the name, if there is one, bytes.
     pub fn encoded_bytes_as(&self, label: Option<Label>) -> usize {
         self.header.encoded_bytes_as(label) + self.payload.len()
     }
 
-    /// Reads a packet that came in one piece (a datagram); the payload shares `datagram`. Of labels it knows none.
+    /// Reads a packet that came in one piece (a datagram) and without a label; the payload shares `datagram`.
     pub fn from_datagram(datagram: Bytes) -> Result<Self, DecodeError> {
         Self::from_datagram_as(datagram, |_| None)
     }
 
-    /// Reads a packet of either form that came in one piece; `name_of` knows what the labels of the link stand for.
+    /// Reads a packet of either form that came in one piece; `name_of` returns the names of the link's labels.
     pub fn from_datagram_as(
         datagram: Bytes,
         name_of: impl FnOnce(Label) -> Option<Name>,

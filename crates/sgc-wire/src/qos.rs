@@ -1,7 +1,7 @@
 //! DDS quality of service as it travels between nodes: the policies a far writer must mirror.
 //!
-//! Only the shape lives here. What a ROS 2 endpoint offers and what a reader may request of it is
-//! decided in `sgc-ros`; how a DDS implementation spells it, in `sgc-dds`.
+//! Only the shape lives here. `sgc-ros` decides the QoS that a ROS 2 endpoint offers and that a reader may request of
+//! it, `sgc-dds` converts it for a DDS implementation.
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
 
@@ -58,8 +58,8 @@ pub enum Liveliness {
     ManualByTopic,
 }
 
-/// How samples are serialised (XTypes 1.3, 7.6.3.1): what a reader takes, or the one that a writer offers. Empty is
-/// not possible; an endpoint that says nothing has plain CDR.
+/// Serialisations of samples (XTypes 1.3, 7.6.3.1): those that a reader takes, or the one that a writer offers. Never
+/// empty; an endpoint without this policy has plain CDR.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Representations(u8);
 
@@ -68,22 +68,23 @@ impl Representations {
     pub const XCDR1: Self = Self(1);
     /// XCDR version 2.
     pub const XCDR2: Self = Self(2);
-    /// Either.
+    /// Both versions.
     pub const BOTH: Self = Self(3);
 
-    /// What either names.
+    /// Returns the union of both.
     #[must_use]
     pub fn or(self, other: Self) -> Self {
         Self(self.0 | other.0)
     }
 
-    /// The one that a writer offers in whose place samples of all of these come: plain CDR, if it is among them.
+    /// Returns the serialisation of a writer in place of several that together offer these: plain CDR, if it is among
+    /// them.
     #[must_use]
     pub fn written(self) -> Self {
         if self == Self::XCDR2 { self } else { Self::XCDR1 }
     }
 
-    /// True if a writer that offers this is understood by a reader that takes `other`.
+    /// Returns `true` if a reader that takes `other` understands a writer that offers this.
     pub fn meets(self, other: Self) -> bool {
         self.0 & other.0 != 0
     }
@@ -120,7 +121,7 @@ pub struct Qos {
     pub lease_ns: Option<u64>,
     /// DDS partitions; empty is the default partition. At most [`Qos::PARTITIONS_MAX`].
     pub partitions: Vec<String>,
-    /// How its samples are serialised.
+    /// Serialisations of its samples.
     pub representations: Representations,
 }
 
@@ -130,12 +131,12 @@ impl Qos {
     /// Bound on the length of one partition's name, bytes.
     pub const PARTITION_BYTES_MAX: usize = 256;
 
-    /// True if late joiners receive history.
+    /// Returns `true` if late joiners receive history.
     pub fn is_transient_local(&self) -> bool {
         self.durability >= Durability::TransientLocal
     }
 
-    /// True if samples are acknowledged.
+    /// Returns `true` if samples are acknowledged.
     pub fn is_reliable(&self) -> bool {
         self.reliability == Reliability::Reliable
     }

@@ -1,11 +1,11 @@
-//! Who publishes or subscribes on a ROS 2 network: a node of ROS's own, not of SGC's.
+//! Publishers and subscribers on a ROS 2 network belong to ROS 2 nodes, which are not SGC nodes.
 
 use std::fmt;
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
 
-/// A ROS 2 node: namespace, name and enclave. What does not follow ROS 2's rules for these is none, so that a name
-/// may be shown and announced as it is.
+/// A ROS 2 node: namespace, name and enclave. All follow ROS 2's rules, so that a name may be shown and announced as it
+/// is.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct RosNode {
     namespace: String,
@@ -19,8 +19,8 @@ impl RosNode {
     /// Bound on an enclave, bytes.
     pub const ENCLAVE_BYTES_MAX: usize = 256;
 
-    /// A node; `None` if namespace or name are not as rcl accepts them. An enclave that is the default one, `/`, or
-    /// no enclave, is left out.
+    /// Returns a node; `None` if rcl does not accept namespace or name. An invalid enclave, or the default one, `/`, is
+    /// left out.
     pub fn new(namespace: &str, name: &str, enclave: Option<&str>) -> Option<Self> {
         let is_word = |word: &str| {
             let mut bytes = word.bytes();
@@ -40,23 +40,23 @@ impl RosNode {
         Some(Self { namespace: namespace.into(), name: name.into(), enclave: enclave.map(Into::into) })
     }
 
-    /// Its namespace, `/` or `/robot1`.
+    /// Returns its namespace, `/` or `/robot1`.
     pub fn namespace(&self) -> &str {
         &self.namespace
     }
 
-    /// Its name, `talker`.
+    /// Returns its name, `talker`.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Its enclave, if that is not `/`.
+    /// Returns its enclave, if that is not `/`.
     pub fn enclave(&self) -> Option<&str> {
         self.enclave.as_deref()
     }
 }
 
-/// The full name: `/robot1/talker`.
+/// Writes the full name: `/robot1/talker`.
 impl fmt::Display for RosNode {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.namespace.as_str() {
@@ -79,7 +79,7 @@ impl Decode for RosNode {
         let namespace = r.str("node namespace", Self::NAME_BYTES_MAX)?;
         let name = r.str("node name", Self::NAME_BYTES_MAX)?;
         let enclave = r.option("enclave", |r| r.str("enclave", Self::ENCLAVE_BYTES_MAX))?;
-        // One encoding for each: an enclave that would be left out is refused, too.
+        // Each node has one encoding: an enclave that would be left out is refused, too.
         Self::new(&namespace, &name, enclave.as_deref())
             .filter(|node| node.enclave == enclave)
             .ok_or_else(|| DecodeError::value("ROS node name", 0))

@@ -1,15 +1,15 @@
-//! [`Slab`]: memory that several small packets share, so that not each of them is an allocation. It knows nothing of what
-//! is written there.
+//! [`Slab`]: memory that several small packets share, so that not each of them is an allocation. It does not look at
+//! the content.
 
 use bytes::BytesMut;
 
-/// How many share a piece of memory. It is held until the last of them is gone, so they are few.
+/// Packets that share a piece of memory. It is held until the last of them is gone, so they are few.
 const SHARERS: usize = 8;
-/// What is longer has memory of its own, bytes.
+/// Longest packet in shared memory, bytes; a longer one has memory of its own.
 const SHARED_BYTES_MAX: usize = 4096;
 
-/// Hands out memory. What it handed out before the present piece is used again once all of it has come back, so that a few
-/// packets under way at a time take nothing new.
+/// Hands out memory. An earlier piece is used again once all of it has come back, so that a few packets in flight at a
+/// time allocate nothing.
 #[derive(Debug, Default)]
 pub struct Slab {
     free: BytesMut,
@@ -17,7 +17,7 @@ pub struct Slab {
 }
 
 impl Slab {
-    /// Empty, with room for exactly so many bytes.
+    /// Returns an empty buffer with room for exactly this many bytes.
     pub fn room(&mut self, bytes: usize) -> BytesMut {
         if bytes > SHARED_BYTES_MAX {
             return BytesMut::with_capacity(bytes);
@@ -56,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_come_back_is_used_again() {
+    fn returned_memory_is_used_again() {
         let mut slab = Slab::default();
         let mut places = std::collections::BTreeSet::new();
         for n in 0..100 * SHARERS {
@@ -65,14 +65,14 @@ mod tests {
             places.insert(room.freeze().as_ptr());
         }
         assert_eq!(places.len(), 2 * SHARERS);
-        // Nothing of what is still held.
+        // Memory that is still held is not handed out.
         let held: Vec<_> = (0..10 * SHARERS).map(|_| slab.room(100)).collect();
         let places: std::collections::BTreeSet<_> = held.iter().map(|room| room.as_ptr()).collect();
         assert_eq!(places.len(), held.len());
     }
 
     #[test]
-    fn what_is_short_shares_and_what_is_long_does_not() {
+    fn short_pieces_share_memory_and_long_ones_do_not() {
         let place = |room: &BytesMut| room.as_ptr() as usize;
         let mut slab = Slab::default();
         let rooms: Vec<_> = (0..SHARERS).map(|_| slab.room(100)).collect();

@@ -9,7 +9,7 @@ use sgc_wire::{
     Challenge, Class, Consumer, Control, Decode, Encode, GrantContent, Hello, JoinBody, Metadata, Name,
     NodeId, Operation, OperationAnswer, OperationRefusal, OperationRequest, Packet, PacketHeader, Place, Qos,
     Recover, RefuseReason, RejectReason, Request, Role, RosNode, RosterPage, RosterRow, RowCertificate,
-    SecretBytes, Signed, SinkId, SourceAnnounce, SourceId, TYPE_HASH_BYTES_MAX, TopicGrant, UnixMillis,
+    SecretBytes, SignedBody, SinkId, SourceAnnounce, SourceId, TYPE_HASH_BYTES_MAX, TopicGrant, UnixMillis,
 };
 
 const ROUNDS: u32 = 20_000;
@@ -43,8 +43,8 @@ fn survives<T: Decode + Encode>(samples: &[Vec<u8>], seed: u64) {
     assert!(accepted > 0, "the mutations never leave anything valid: the test tests nothing");
 }
 
-fn signed() -> Signed {
-    Signed { body: Bytes::from_static(b"some body"), signature: Bytes::from_static(&[7; 70]) }
+fn signed() -> SignedBody {
+    SignedBody { body: Bytes::from_static(b"some body"), signature: Bytes::from_static(&[7; 70]) }
 }
 
 #[test]
@@ -210,7 +210,7 @@ fn consumers_survive_mutation_and_arbitrary_bytes_within_their_bounds() {
     }
 }
 
-/// What is kept while an answer is read grows with its bytes, not with the number that it claims.
+/// Memory grows with the bytes of an answer, not with the number that it claims.
 #[test]
 fn claimed_consumers_that_do_not_follow_are_refused() {
     for claimed in [1, CONSUMERS_MAX as u32, CONSUMERS_MAX as u32 + 1, u32::MAX] {

@@ -24,7 +24,7 @@ fn assertion_is_of_a_publisher_at_the_same_node_each_time_and_once() {
                 assert_eq!(sink.handle_packet(&packet), Ok(Delivery::Asserted(publisher.id())));
                 assert_eq!(sink.handle_packet(&packet), Err(SinkDrop::Replayed), "a router says it again");
             }
-            // Lost ones are nothing that anybody asks for.
+            // Nobody asks for lost ones.
             asserted(&mut node, PUBLISHER);
             let next = asserted(&mut node, PUBLISHER);
             assert_eq!(sink.handle_packet(&next), Ok(Delivery::Asserted(publisher.id())));

@@ -1,11 +1,11 @@
-//! Epochs, announcements, parking, and what a replay comes to.
+//! Epochs, announcements, parking, and the results of replays.
 
 use sgc_endpoint::{EPOCHS_MAX, PARKED_LOOKS_MAX, PARKED_PACKETS_MAX};
 use sgc_trust::OpenError;
 
 use super::*;
 
-/// The suite of the tests for which it makes no difference.
+/// The suite of tests for which the suite makes no difference.
 const SUITE: Suite = Suite::Standard;
 
 fn grant_of(epoch: u32, sources: &[&Source]) -> TopicGrant {
@@ -102,7 +102,7 @@ fn only_announced_sources_are_believed() {
             assert_eq!(sink.handle_packet(packet), Ok(Delivery::Parked));
         }
         assert_eq!(delivered(&mut sink, &published(&mut known, bytes(2), false)).len(), 1);
-        // A grant that was under way does not know of it yet, the next one does.
+        // A grant that was in flight lacks the epoch; the next one has it.
         assert_eq!(regranted(&mut sink, SINK, grant(suite, 1, &[known.announce()])), []);
         let unknown_before = SourceAnnounce { oldest: 1, next: 1, ..unknown.announce() };
         let all = grant(suite, 1, &[known.announce(), unknown_before]);
@@ -115,7 +115,7 @@ fn only_announced_sources_are_believed() {
 }
 
 #[test]
-fn what_no_grant_explains_is_given_up() {
+fn packets_that_no_grant_explains_are_given_up() {
     let mut unknown = source_with(SUITE, config(6, 0));
     let mut later = source(SUITE, 0);
     let known = source_with(SUITE, config(7, 0));
@@ -178,13 +178,13 @@ fn parking_is_bounded_and_takes_only_what_opens() {
 fn a_source_that_is_not_announced_any_more_ends_with_the_epoch() {
     let (mut gone, stays) = (source(SUITE, 0), source_with(SUITE, config(6, 0)));
     let mut sink = sink(SUITE, &[&gone, &stays]);
-    // Its last messages may be under way when the owner says that it is gone.
+    // Its last messages may be in flight when the owner announces its end.
     regranted(&mut sink, SINK, grant_of(1, &[&stays]));
     assert_eq!(delivered(&mut sink, &published(&mut gone, bytes(1), false)).len(), 1);
     regranted(&mut sink, SINK, grant_of(2, &[&stays]));
     assert_eq!(delivered(&mut sink, &published(&mut gone, bytes(1), false)).len(), 1);
     let old = published(&mut gone, bytes(1), false);
-    // Who lost the right to publish but knows the new key is not believed in the new epoch.
+    // A node without the right to publish that knows the new key is not believed in the new epoch.
     rekeyed(&mut gone, 2);
     let new = published(&mut gone, bytes(2), false);
     assert_eq!(sink.handle_packet(&new[0]), Ok(Delivery::Parked));
@@ -207,7 +207,7 @@ fn recorded_packets_are_nothing_to_a_fresh_sink() {
             assert_eq!(fresh.handle_packet(&old[0]), Err(SinkDrop::BelowFloor));
             for packet in &history {
                 assert_eq!(fresh.handle_packet(packet), Err(SinkDrop::NotForUs));
-                // A router that writes another addressee, or none, over it gains nothing.
+                // A router that writes another addressee, or none, into the header gains nothing.
                 let mut readdressed = packet.clone();
                 readdressed.header.to = Some(id);
                 let refused = fresh.handle_packet(&readdressed);

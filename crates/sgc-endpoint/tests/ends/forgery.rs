@@ -1,4 +1,4 @@
-//! What is altered, made by another member, or taken from elsewhere is refused, and leaves nothing behind.
+//! Altered packets, packets of other members and copied packets are refused, and leave nothing behind.
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
@@ -26,7 +26,7 @@ fn any_altered_bit_is_detected() {
     for suite in Suite::ALL {
         let mut source = unrecovered(suite, 5);
         let mut fresh = sink(suite, &[&source]);
-        // One that knows the batch already, whose checks are others.
+        // A verifier that knows the batch already takes another code path.
         let mut knowing = sink(suite, &[&source]);
         let packets = batch(&mut source, 5);
         assert_eq!(delivered(&mut knowing, &packets[..2]).len(), 2);
@@ -189,7 +189,7 @@ fn a_forged_packet_leaves_no_trace_and_costs_at_most_one_verification() {
     let mut honest = source(suite, 0);
     let mut sink = sink(suite, &[&honest]);
     let mut mallory = Source::new(config(5, 0), &grant(suite, 1, &[]), MessageKey::generate(suite)).unwrap();
-    // Fragments in the right places of a message that is under way, of members and of strangers.
+    // Fragments in the right places of a message in transfer, of members and of strangers.
     let good = published(&mut honest, bytes(100_000), false);
     let forged = published(&mut mallory, vec![0xee; 100_000], false);
     for (good, forged) in good.iter().zip(&forged) {

@@ -1,5 +1,5 @@
-//! The two ends of the data path against each other, in every suite: what a source makes, a sink delivers,
-//! once, and nothing else.
+//! The two ends of the data path against each other, in every suite: a sink delivers each message of a source once, and
+//! nothing else.
 
 mod assertions;
 mod epochs;
@@ -23,7 +23,7 @@ const NAME: Name = Name([1; 32]);
 const SINK: SinkId = SinkId([9; 16]);
 const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
 
-/// A key that the suite signs with; made once, since RSA keys take their time.
+/// A key for the suite's signatures; made once, because RSA keys take their time.
 fn message_key(suite: Suite) -> MessageKey {
     static KEYS: OnceLock<[MessageKey; 4]> = OnceLock::new();
     let kinds = [Suite::Group, Suite::Standard, Suite::Paper, Suite::Paper3072];
@@ -57,12 +57,12 @@ fn source_with(suite: Suite, config: SourceConfig) -> Source {
     Source::new(config, &grant(suite, 1, &[]), message_key(suite)).expect("the key is of the suite")
 }
 
-/// A source whose messages stay lost if they are, and are delivered in any order.
+/// A source whose lost messages stay lost, and whose messages are delivered in any order.
 fn unrecovered(suite: Suite, id: u8) -> Source {
     source_with(suite, SourceConfig { recovery: RecoveryLimits::NONE, ..config(id, 0) })
 }
 
-/// A sink that was told of these sources as they are now, in epoch 1.
+/// Returns a sink with the present announcements of these sources, in epoch 1.
 fn sink(suite: Suite, sources: &[&Source]) -> Sink {
     Sink::new(NAME, SINK, grant(suite, 1, &announced(sources)), false, SinkLimits::default())
 }
@@ -83,7 +83,7 @@ fn flushed(source: &mut Source) -> Vec<Packet> {
     packets
 }
 
-/// What a late joiner gets.
+/// Returns the messages that a late joiner gets.
 fn replayed(source: &mut Source) -> Vec<Packet> {
     replayed_to(source, SINK, 0)
 }
@@ -105,7 +105,7 @@ fn payload(result: Result<Delivery, SinkDrop>) -> Option<Bytes> {
     }
 }
 
-/// What a sink says to a grant.
+/// Returns a sink's results of a grant.
 fn regranted(sink: &mut Sink, id: SinkId, grant: TopicGrant) -> Vec<Result<Delivery, SinkDrop>> {
     let mut released = Vec::new();
     sink.regrant(id, grant, |result| released.push(result));

@@ -67,7 +67,7 @@ fn nothing_waits_without_more_and_a_batch_is_signed_once() {
     assert_eq!(published(&mut source, bytes(1), true).len(), 0);
     assert_eq!(flushed(&mut source).len(), 1);
     assert_eq!(flushed(&mut source).len(), 0);
-    // A message that is refused takes along what waited before it.
+    // A refused message takes along the ones that waited before it.
     published(&mut source, bytes(1), true);
     let mut packets = Vec::new();
     let too_large = vec![0; sgc_wire::MESSAGE_BYTES_MAX as usize + 1];
@@ -117,7 +117,7 @@ fn incomplete_messages_are_bounded_and_counted() {
 }
 
 #[test]
-fn one_source_cannot_take_the_room_for_incomplete_messages_of_others() {
+fn a_source_cannot_take_the_room_for_incomplete_messages_of_others() {
     let mut sources: Vec<_> = (1..=3).map(|id| unrecovered(Suite::Standard, id)).collect();
     let limits = SinkLimits { partial_bytes_max: 200_000, ..SinkLimits::default() };
     let announces: Vec<_> = sources.iter().map(Source::announce).collect();
@@ -126,14 +126,15 @@ fn one_source_cannot_take_the_room_for_incomplete_messages_of_others() {
     for packets in &greedy {
         assert_eq!(sink.handle_packet(&packets[0]), Ok(Delivery::Incomplete));
     }
-    // Alone it may have all. Two that come have their shares, and its oldest messages give way.
+    // Alone a source may use all the room. When two come, each has its share, and the oldest messages of the first give
+    // way.
     let first = published(&mut sources[1], bytes(60_000), false);
     assert_eq!(sink.handle_packet(&first[0]), Ok(Delivery::Incomplete));
     assert_eq!(sink.incomplete(), 2);
     let second = published(&mut sources[2], bytes(60_000), false);
     assert_eq!(sink.handle_packet(&second[0]), Ok(Delivery::Incomplete));
     assert_eq!(sink.incomplete(), 3);
-    // It takes nothing back of them.
+    // The source does not displace them in return.
     for packets in &greedy[..3] {
         assert_eq!(sink.handle_packet(&packets[0]), Err(SinkDrop::PartialsFull));
     }
@@ -159,7 +160,7 @@ fn a_late_joiner_gets_the_history_first_and_each_message_once() {
         let live = published(&mut source, bytes(6), false);
         assert_eq!(sink.handle_packet(&live[0]), Ok(Delivery::NeedsHistory(source.id())));
         assert_eq!(sink.handle_packet(&live[0]), Err(SinkDrop::AwaitingHistory));
-        // All that was there when it joined, and what came since.
+        // All messages from before its join, and the ones since.
         assert_eq!(sink.ask(source.id()), Some(3));
         let history = replayed_to(&mut source, SINK, 3);
         assert_eq!(delivered(&mut sink, &history), [3, 4, 5, 6].map(bytes));
@@ -167,7 +168,7 @@ fn a_late_joiner_gets_the_history_first_and_each_message_once() {
         assert_eq!(delivered(&mut sink, &live).len(), 0);
         let next = published(&mut source, bytes(7), false);
         assert_eq!(delivered(&mut sink, &next), [bytes(7)]);
-        // The way changed: only what was lost, nothing twice.
+        // The route changed: only lost messages, nothing twice.
         let here = grant(suite, 1, &[source.announce()]);
         regranted(&mut sink, SinkId([3; 16]), here);
         assert_eq!(sink.unsynced().count(), 0, "nothing was lost");

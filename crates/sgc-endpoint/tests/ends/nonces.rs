@@ -1,5 +1,4 @@
-//! No key seals two texts under one nonce, whatever sources go through: the one thing that AES-GCM does not
-//! forgive.
+//! No key seals two texts under one nonce, in any history of sources: the one mistake that AES-GCM does not forgive.
 
 use std::collections::BTreeMap;
 
@@ -9,15 +8,15 @@ use sgc_trust::{TAG_BYTES, opened_bytes};
 
 use super::*;
 
-/// What a packet's key is derived from, and its nonce.
+/// The inputs of a packet's key and nonce.
 type KeyAndNonce = (u32, SourceId, Option<SinkId>, u64, u16);
 
 /// Everything that was sealed: associated data, ciphertext and tag. With one key and nonce, two of them are
 /// the same only if text and associated data are.
 #[derive(Default)]
-struct Sealed(BTreeMap<KeyAndNonce, (Vec<u8>, Vec<u8>)>);
+struct SealedTexts(BTreeMap<KeyAndNonce, (Vec<u8>, Vec<u8>)>);
 
-impl Sealed {
+impl SealedTexts {
     fn add(&mut self, seed: u64, packet: &Packet) {
         let h = &packet.header;
         let mut sealed = text(packet);
@@ -34,8 +33,8 @@ fn nonces_are_unique_over_histories_of_publishing_rekeying_replaying_and_restart
         let suite = Suite::ALL[seed as usize % 4];
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut dice = move |n: u32| rng.next_u32() % n;
-        let (mut sealed, mut epoch, mut incarnation) = (Sealed::default(), 1, 0u8);
-        // So few that marks of what is gone go ahead of many an answer.
+        let (mut sealed, mut epoch, mut incarnation) = (SealedTexts::default(), 1, 0u8);
+        // So few that marks about lost messages precede many answers.
         let recovery = RecoveryLimits { messages_max: 6, bytes_max: 1 << 20 };
         let config = |id| SourceConfig { recovery, ..config(id, 4) };
         let mut source = source_with(suite, config(incarnation));
@@ -75,8 +74,8 @@ fn nonces_are_unique_over_histories_of_publishing_rekeying_replaying_and_restart
     }
 }
 
-/// What is sent again to the same sink in the same epoch is the same, bit for bit; to another, or in another
-/// epoch, it is under another key.
+/// A packet sent again to the same sink in the same epoch is the same, bit for bit; to another, or in another epoch, it
+/// is under another key.
 #[test]
 fn replays_repeat_themselves_and_nothing_else() {
     for suite in [Suite::Group, Suite::Standard] {

@@ -1,4 +1,4 @@
-//! What a sink asks for again, what it gets, and what stays lost.
+//! Recovery: the messages that a sink asks for, those that it gets, and those that stay lost.
 
 use super::*;
 
@@ -18,7 +18,7 @@ fn marked(source: &mut Source) -> Vec<Packet> {
     packets
 }
 
-/// Asks for what is missing and hands over the answer; what came of it.
+/// Asks for missing messages, hands over the answer, and returns the results.
 fn recovered(source: &mut Source, sink: &mut Sink) -> Vec<Bytes> {
     let from = sink.ask(source.id()).expect("something is missing");
     delivered(sink, &replayed_to(source, SINK, from))
@@ -39,7 +39,7 @@ fn a_gap_is_asked_for_and_filled_in_order() {
         assert_eq!(answer.len(), 4 + 1, "nothing that is here");
         assert_eq!(delivered(&mut sink, &answer), [3, 4, 5, 6].map(bytes), "{suite}");
         assert_eq!((sink.unsynced().count(), sink.ask(source.id())), (0, None));
-        // What comes late, over whatever way, is past.
+        // Late messages, on any route, are past.
         for late in &packets[2..] {
             assert_eq!(sink.handle_packet(late), Err(SinkDrop::Replayed));
         }
@@ -54,10 +54,10 @@ fn a_message_of_which_a_part_was_lost_is_asked_for_from_its_beginning() {
     assert_eq!(delivered(&mut sink, &large[..3]).len(), 0);
     let next = published(&mut source, bytes(1), false);
     assert_eq!(sink.handle_packet(&next[0]), Ok(Delivery::NeedsHistory(source.id())));
-    // The rest comes late over another way, while the answer is under way.
+    // The rest comes late over another route, while the answer is in flight.
     assert_eq!(sink.handle_packet(&large[3]), Err(SinkDrop::AwaitingHistory));
     assert_eq!(recovered(&mut source, &mut sink), [bytes(100_000), bytes(1)]);
-    // A part of the next is no gap as long as nothing came after it.
+    // A part of the next message is no gap as long as nothing came after it.
     let large = published(&mut source, bytes(50_000), false);
     assert_eq!(sink.handle_packet(&large[1]), Ok(Delivery::Incomplete));
     assert_eq!(delivered(&mut sink, &large), [bytes(50_000)]);
@@ -76,7 +76,7 @@ fn another_way_asks_for_what_was_published_meanwhile_and_no_more() {
             let packets = published(&mut source, bytes(n), false);
             assert_eq!(delivered(&mut sink, &packets).len(), 1);
         }
-        // Nothing was lost: nothing is asked for, and what is half here is completed over the new way.
+        // Nothing was lost: nothing is asked for, and the half message is completed over the new route.
         let large = published(&mut source, bytes(40_000), false);
         delivered(&mut sink, &large[..1]);
         let before = SourceAnnounce { next: 6, ..source.announce() };
@@ -92,7 +92,7 @@ fn another_way_asks_for_what_was_published_meanwhile_and_no_more() {
         assert_eq!(sink.ask(source.id()), Some(7), "depth {depth}");
         let answer = replayed_to(&mut source, id, 7);
         assert_eq!(delivered(&mut sink, &answer), (1..=10).map(bytes).collect::<Vec<_>>());
-        // A grant on the same way says nothing of what is under way.
+        // A grant on the same route tells nothing about packets in flight.
         published(&mut source, bytes(1), false);
         regranted(&mut sink, id, grant_now(&source));
         assert_eq!(sink.unsynced().count(), 0);
@@ -109,11 +109,11 @@ fn a_late_joiner_gets_its_depth_though_more_is_kept() {
     let mut sink =
         Sink::new(NAME, SINK, grant(SUITE, 1, &announced(&[&source])), true, SinkLimits::default());
     assert_eq!(recovered(&mut source, &mut sink), [4, 5].map(bytes));
-    // Nor more to one that begins anew.
+    // A sink that begins anew gets no more either.
     sink.forget(&source.id());
     assert_eq!(sink.ask(source.id()), Some(0));
     assert_eq!(delivered(&mut sink, &replayed(&mut source)), [4, 5].map(bytes));
-    // Of a volatile topic it is nothing.
+    // A volatile topic has no history.
     let mut source = source_with(SUITE, config(6, 0));
     published(&mut source, bytes(1), false);
     let mut fresh = self::sink(SUITE, &[&source]);
@@ -144,7 +144,7 @@ fn a_mark_shows_what_was_lost_before_a_silence_and_is_no_message() {
 }
 
 #[test]
-fn what_its_source_keeps_no_more_is_counted_and_passed_over() {
+fn messages_that_a_source_no_longer_keeps_are_counted_and_passed_over() {
     for live in [true, false] {
         let (mut source, mut sink) = ends(4);
         delivered(&mut sink, &published(&mut source, bytes(1), false));
@@ -161,7 +161,7 @@ fn what_its_source_keeps_no_more_is_counted_and_passed_over() {
         }
         assert_eq!(sink.ask(source.id()), Some(2));
         let answer = replayed_to(&mut source, SINK, 2);
-        // The mark that says so, to all and to this sink, is itself one of the four that are kept.
+        // The mark about it, to all and to this sink, is itself one of the four kept messages.
         let first = if live { 19 } else { 18 };
         assert_eq!((answer[0].header.to, answer[1].header.to), (None, Some(SINK)));
         assert_eq!(sink.handle_packet(&answer[1]), Ok(Delivery::Lost(source.id(), first - 2)));
@@ -169,7 +169,7 @@ fn what_its_source_keeps_no_more_is_counted_and_passed_over() {
         assert_eq!(delivered(&mut sink, &answer[2..]), rest);
         assert_eq!(sink.unsynced().count(), 0);
         assert_eq!(delivered(&mut sink, &published(&mut source, bytes(30), false)), [bytes(30)]);
-        // Asked again, nothing is said twice.
+        // A second question repeats no delivery.
         assert_eq!(delivered(&mut sink, &replayed_to(&mut source, SINK, 2)).len(), 0);
     }
 }
@@ -186,7 +186,7 @@ fn an_answer_with_a_hole_is_asked_for_again() {
     assert_eq!(sink.unsynced().count(), 1, "its end says nothing");
     assert_eq!(sink.ask_again(source.id()), AskAgain::From(4));
     assert_eq!(recovered(&mut source, &mut sink), [4, 5, 6, 7, 8].map(bytes));
-    // One of which the end was lost shows with the next message.
+    // A message whose last fragment was lost shows with the next message.
     for n in 9..=12 {
         published(&mut source, bytes(n), false);
     }
@@ -218,7 +218,7 @@ fn an_answer_that_is_on_its_way_is_waited_for() {
     assert_eq!(sink.ask_again(source.id()), AskAgain::No);
 }
 
-/// Who says too early that all was sent, with a recorded sign, gains nothing.
+/// A recorded sign of a history's end, sent too early, gains nothing.
 #[test]
 fn an_end_that_is_played_again_loses_nothing() {
     let mut source = source(SUITE, 5);
@@ -235,7 +235,7 @@ fn an_end_that_is_played_again_loses_nothing() {
 }
 
 #[test]
-fn what_was_recorded_without_a_listener_is_there_to_be_asked_for() {
+fn messages_recorded_without_a_listener_can_be_recovered() {
     for suite in [Suite::Group, Suite::Standard] {
         let mut source = source(suite, 0);
         let mut sink = sink(suite, &[&source]);
@@ -262,7 +262,7 @@ fn a_best_effort_source_is_asked_for_nothing() {
     assert_eq!(replayed_to(&mut source, SINK, 1).len(), 1, "it keeps nothing");
 }
 
-/// A node that was granted the topic late, and says that it was there before, is told its floor by the owner.
+/// A node that was granted the topic late, and claims to have been there before, gets its floor from the owner.
 #[test]
 fn a_floor_that_rose_is_passed_over_and_counted() {
     let (mut source, mut sink) = ends(100);

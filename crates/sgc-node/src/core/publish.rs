@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_endpoint::{RecoveryLimits, Source, SourceConfig, Wish};
+use sgc_endpoint::{JoinKind, RecoveryLimits, Source, SourceConfig};
 use sgc_ros::{RosNetwork, Shaping};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, Name, NodeId, Now, SinkId, SourceId, SourceOffer, TopicGrant};
@@ -63,7 +63,7 @@ impl<N: RosNetwork> Core<N> {
         self.shares.insert(name, share);
         self.publishing.insert(name, Publishing { id, class, reliable, grant: None, next: None });
         let offer = SourceOffer { source: id, key: message_key.public().clone() };
-        self.endpoint.join(now(), name, owner, Wish::Publish(offer));
+        self.endpoint.join(now(), name, owner, JoinKind::Publish(offer));
         if calls {
             self.begin_called(name);
         }

@@ -63,7 +63,7 @@ impl LinkEntry {
         let verdict = self.heart.look(at, Seen { received_bytes, activity, remote, rtt });
         if verdict.asks {
             // If there is no room the peer does not take what is there, which is seen elsewhere.
-            self.control.send(Control::Pulse { answers: false });
+            self.control.send(Control::Probe { answers: false });
         }
         if verdict.is_dead && self.closed_for.is_none() {
             info!(%remote, peer = %self.link.peer().node_id.short(), "the peer does not answer; its link is closed");

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_endpoint::{AskAgain, RecoveryLimits, Source, SourceConfig, Wish};
+use sgc_endpoint::{AskAgain, JoinKind, RecoveryLimits, Source, SourceConfig};
 use sgc_ros::{Command, EndpointSpec, Guid, RosNetwork, Shaping, TF_MESSAGE, service_qos};
 use sgc_router::{FibEntry, LinkId};
 use sgc_trust::{MessageKey, Suite};
@@ -105,11 +105,11 @@ impl<N: RosNetwork> Core<N> {
                 let sink =
                     LocalSink::new(name, transient_local, self.requests.clone(), self.data.holds().clone());
                 self.sinks.insert(name, Arc::new(sink));
-                self.endpoint.join(now, name, owner, Wish::Subscribe { describe });
+                self.endpoint.join(now, name, owner, JoinKind::Subscribe { describe });
             }
             Command::JoinAgain { name, owner } => {
                 self.endpoint.leave(now, &name);
-                self.endpoint.join(now, name, owner, Wish::Subscribe { describe: false });
+                self.endpoint.join(now, name, owner, JoinKind::Subscribe { describe: false });
             }
             Command::Publish { name, owner, suite, class, reliable } => {
                 self.publish_under(

@@ -13,8 +13,8 @@ use sgc_cdr::{DescriptionError, TypeError, TypeName};
 use sgc_endpoint::{CompressionError, PackedType, unpack_type};
 use sgc_ros::RosNetwork;
 use sgc_types::{
-    Definitions, Described, NotBelieved, StoreFull, TYPES_BYTES_MAX, TYPES_MAX, TYPES_PER_OWNER_BYTES_MAX,
-    TYPES_PER_OWNER_MAX, TypeStore,
+    Definitions, ResolveError, ResolvedType, StoreFull, TYPES_BYTES_MAX, TYPES_MAX,
+    TYPES_PER_OWNER_BYTES_MAX, TYPES_PER_OWNER_MAX, TypeStore,
 };
 use sgc_wire::{CatalogueEntry, DescribedType, Metadata, Name, NodeId};
 use tracing::{debug, warn};
@@ -57,7 +57,7 @@ enum NeedState {
     /// Its owner told it; it is judged.
     Told,
     /// It is known.
-    Known(Arc<Described>),
+    Known(Arc<ResolvedType>),
     /// There is no room for it, or none for another of its owner's.
     NoRoom {
         /// Whether the owner has as many as it may have.
@@ -70,7 +70,7 @@ enum NeedState {
 }
 
 impl Need {
-    fn known(&self) -> Option<&Arc<Described>> {
+    fn known(&self) -> Option<&Arc<ResolvedType>> {
         match &self.state {
             NeedState::Known(described) => Some(described),
             _ => None,
@@ -95,7 +95,7 @@ struct Found {
 }
 
 /// A type that is in the store already, or one that is not.
-type KnownOrNew = Result<Arc<Described>, Described>;
+type KnownOrNew = Result<Arc<ResolvedType>, ResolvedType>;
 
 /// What became of looking for a type.
 pub(crate) struct TypeOutcome {
@@ -135,7 +135,7 @@ pub(crate) enum TypeMiss {
     Packed(#[from] CompressionError),
     /// What an owner told is not what it was asked for.
     #[error(transparent)]
-    NotBelieved(#[from] NotBelieved),
+    ResolveError(#[from] ResolveError),
     /// There is no room for it.
     #[error(transparent)]
     Full(#[from] StoreFull),
@@ -161,7 +161,7 @@ impl TypeMiss {
             Self::Definition(_) => None,
             Self::Description(_) => Some("type_not_described"),
             Self::Differs { .. } => Some("type_differs"),
-            Self::Packed(_) | Self::NotBelieved(_) => Some("type_refused"),
+            Self::Packed(_) | Self::ResolveError(_) => Some("type_refused"),
             Self::Full(_) | Self::OwnerFull { .. } => Some("types_full"),
             Self::Failed => Some("type_failed"),
         }
@@ -173,7 +173,7 @@ impl TypeMiss {
             Self::Full(_) => NeedState::NoRoom { of_owner: false },
             Self::OwnerFull { .. } => NeedState::NoRoom { of_owner: true },
             _ if asks => NeedState::Asked,
-            Self::Packed(_) | Self::NotBelieved(_) => NeedState::Refused,
+            Self::Packed(_) | Self::ResolveError(_) => NeedState::Refused,
             _ => NeedState::Unknown,
         }
     }
@@ -198,7 +198,7 @@ impl Types {
         name: Option<&Name>,
         type_name: &str,
         type_hash: Option<&str>,
-    ) -> Option<Arc<Described>> {
+    ) -> Option<Arc<ResolvedType>> {
         if let Some(described) = name.and_then(|name| self.needs.get(name)?.known()) {
             return Some(described.clone());
         }
@@ -247,7 +247,7 @@ impl Types {
 impl Types {
     /// Takes a type into the store, for an interface of another if that has an `owner`; what no interface has any more makes
     /// room.
-    fn keep(&self, described: KnownOrNew, owner: Option<&NodeId>) -> Result<Arc<Described>, TypeMiss> {
+    fn keep(&self, described: KnownOrNew, owner: Option<&NodeId>) -> Result<Arc<ResolvedType>, TypeMiss> {
         let new = match described {
             Ok(known) => return Ok(known),
             Err(new) => new,
@@ -274,9 +274,9 @@ impl Types {
     }
 
     /// An interface does not have this type any more: those are looked for once more that may have the room of it.
-    fn room_returns(&mut self, gone: &Described, owner: Option<NodeId>) {
+    fn room_returns(&mut self, gone: &ResolvedType, owner: Option<NodeId>) {
         let is_it =
-            |known: &Arc<Described>| (known.name(), known.type_hash()) == (gone.name(), gone.type_hash());
+            |known: &Arc<ResolvedType>| (known.name(), known.type_hash()) == (gone.name(), gone.type_hash());
         if self.no_room.is_empty() || self.needs.values().filter_map(Need::known).any(is_it) {
             return;
         }
@@ -396,7 +396,7 @@ impl LookedFor {
     fn found_by(self, look: impl FnOnce() -> Result<KnownOrNew, TypeMiss>) -> TypeOutcome {
         let look = || {
             let described = look()?;
-            let of: &Described = match &described {
+            let of: &ResolvedType = match &described {
                 Ok(known) => known,
                 Err(new) => new,
             };
@@ -417,7 +417,7 @@ fn find(
     if let Some(known) = type_hash.and_then(|hash| store.described(type_name, Some(hash))) {
         return Ok(Ok(known));
     }
-    let described = Described::of(definitions.layout(type_name)?)?;
+    let described = ResolvedType::from_layout(definitions.layout(type_name)?)?;
     match type_hash {
         Some(announced) if !described.is_announced_as(announced) => Err(TypeMiss::Differs {
             found: described.type_hash().to_owned(),
@@ -430,10 +430,10 @@ fn find(
 fn read(type_name: &TypeName, type_hash: Option<&str>, told: &DescribedType) -> Result<KnownOrNew, TypeMiss> {
     // Where nobody announces a hash, the owner vouches for it, and for that of a service, of which only the messages may be announced.
     let expected = type_hash.filter(|_| type_name.kind() == "msg").unwrap_or(&told.type_hash);
-    let described = Described::read(unpack_type(told)?, type_name, expected)?;
+    let described = ResolvedType::read(unpack_type(told)?, type_name, expected)?;
     if let Some(expected) = type_hash.filter(|announced| !described.is_announced_as(announced)) {
         let (found, expected) = (described.type_hash().to_owned(), expected.to_owned());
-        return Err(NotBelieved::Description(DescriptionError::Hash { found, expected }).into());
+        return Err(ResolveError::Description(DescriptionError::Hash { found, expected }).into());
     }
     Ok(Err(described))
 }
@@ -639,12 +639,12 @@ mod tests {
         Job { name: Name([1; 32]), type_name, type_hash, owner: None, told }
     }
 
-    fn run(job: Job) -> Result<Described, TypeMiss> {
+    fn run(job: Job) -> Result<ResolvedType, TypeMiss> {
         let outcome = job.run(&TypeStore::default(), &Definitions::default());
         outcome.found.map(|found| found.described.expect_err("the store is empty"))
     }
 
-    fn twist() -> Described {
+    fn twist() -> ResolvedType {
         run(job(TWIST, None, None)).unwrap()
     }
 
@@ -718,7 +718,7 @@ mod tests {
     }
 
     /// What becomes of the next job, as the control task has it.
-    fn step(types: &mut Types) -> Result<Arc<Described>, TypeMiss> {
+    fn step(types: &mut Types) -> Result<Arc<ResolvedType>, TypeMiss> {
         let job = types.jobs.pop_front().expect("something to do");
         let TypeOutcome { of, found } = job.run(&TypeStore::default(), &Definitions::default());
         assert!(types.ends(&of));
@@ -774,7 +774,8 @@ mod tests {
         let of = |n: usize| {
             let mut text = |_: &TypeName| Some(format!("int8 a{n}"));
             let mut library = sgc_cdr::Library::empty();
-            Described::of(library.layout(&"p/msg/A".parse().unwrap(), &mut text).unwrap()).unwrap()
+            ResolvedType::from_layout(library.layout(&"p/msg/A".parse().unwrap(), &mut text).unwrap())
+                .unwrap()
         };
         let name = |n: usize| Name(std::array::from_fn(|i| n.to_be_bytes()[i % 8]));
         for n in 0..TYPES_PER_OWNER_MAX {

@@ -304,7 +304,7 @@ impl<R: RngCore> Routes<R> {
     /// The nodes that answer, each under an id that nothing is sent under.
     fn listed_servers(&self, share: &ShareRoute) -> Vec<CatalogueSource> {
         let server = |guid: &Guid| CatalogueSource {
-            source: SourceId::of_publisher(self.secret.publisher_tag(&guid.0), [0; 8]),
+            source: SourceId::from_publisher(self.secret.publisher_tag(&guid.0), [0; 8]),
             qos: service_qos(),
             node: self.node_of(guid).cloned(),
         };

@@ -6,7 +6,7 @@ use sgc_endpoint::Event;
 use sgc_router::LinkClose;
 use sgc_testkit::{NodeKey, Sharing, World, WorldConfig};
 use sgc_trust::{Identity, Kem, ReplyKey};
-use sgc_wire::{Control, JoinBody, Name, RejectReason, Request, Signed, SinkId};
+use sgc_wire::{Control, JoinBody, Name, RejectReason, Request, SignedBody, SinkId};
 
 use crate::{Scene, assert_received, closed, drops, events, flowing_with, frames, ms, publish_steadily};
 
@@ -22,11 +22,11 @@ fn join(world: &World, identity: &Identity, name: Name, n: u64, valid: bool) -> 
         chain: identity.chain_bytes(),
         reply_key: ReplyKey::generate(Kem::default()).public().clone(),
     };
-    let Signed { body, signature } = identity.sign_join(&body);
+    let SignedBody { body, signature } = identity.sign_join(&body);
     let mut signature = signature.to_vec();
     let at = signature.len() - 1;
     signature[at] ^= u8::from(!valid);
-    Control::Join { signed: Signed { body, signature: signature.into() } }
+    Control::Join { signed: SignedBody { body, signature: signature.into() } }
 }
 
 /// The scene with one more member at the first router.

@@ -175,7 +175,7 @@ fn a_grant_for_another_or_for_an_altered_one_is_not_taken() {
     for at in (0..signed.body.len()).step_by(7) {
         let mut body = signed.body.to_vec();
         body[at] ^= 0x20;
-        let signed = sgc_wire::Signed { body: body.into(), signature: signed.signature.clone() };
+        let signed = sgc_wire::SignedBody { body: body.into(), signature: signed.signature.clone() };
         world.inject(*west, *lap, &Control::Answer { signed });
     }
     let granted_to_lap = grants(world, *lap, *arm).len();

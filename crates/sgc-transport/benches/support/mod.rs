@@ -1,4 +1,4 @@
-//! What benches of links share: who is at their ends, and what goes over them.
+//! Common parts of the benches of links: the identities of their ends, and their packets.
 #![allow(dead_code, unreachable_pub, reason = "shared by benches of which each uses a part")]
 
 use std::sync::Arc;

@@ -1,8 +1,8 @@
 //! The controller that keeps the queue short. It aims at a standing queue of [`QUEUE_AIM`], judged once a round trip by
-//! how much later acknowledgements come than at the best of times.
+//! the delay of acknowledgements beyond the shortest round trip.
 //!
-//! Loss says little here: radio loses at random, so only much of it, and more than there always is, slows it down.
-//! It shares a queue with others of its kind; beside one that fills every queue it asks for its share.
+//! Loss says little here: radio loses at random, so only heavy loss, beyond the path's usual loss, slows the controller
+//! down. It shares a queue with others of its kind; beside one that fills every queue it asks for its share.
 
 use std::any::Any;
 use std::sync::Arc;
@@ -14,59 +14,61 @@ use quinn_proto::RttEstimator;
 use super::gate::Limits;
 use super::{Gate, InFlight, into_any};
 
-/// How long a packet should stand in queues.
+/// Time that a packet should stand in queues.
 const QUEUE_AIM: Duration = Duration::from_millis(10);
-/// Never less under way than so many packets.
+/// Smallest window, packets.
 const WINDOW_PACKETS_MIN: u64 = 2;
-/// So many to begin with (RFC 9002, 7.2).
+/// First window, packets (RFC 9002, 7.2).
 const WINDOW_PACKETS_INITIAL: u64 = 10;
-/// Never more: it has to fit into what the connection keeps.
+/// Largest window: it has to fit into the connection's buffers.
 const WINDOW_BYTES_MAX: u64 = 32 << 20;
-/// What is urgent may have this part of the window, and at least so many packets, beyond it.
+/// Part of the window, and least number of packets, that urgent data may have beyond the window.
 const URGENT_PART: u64 = 4;
 const URGENT_PACKETS_MIN: u64 = 4;
-/// What is let in at once takes about so long on the wire: what is urgent may come just behind it.
+/// Time on the wire of data that is let in together: urgent data may come just behind it.
 const PIECE_SPAN: Duration = Duration::from_millis(2);
-/// How long a round trip counts as the best of times.
+/// Time for which a round trip counts as the shortest.
 const BASE_AGE_MAX: Duration = Duration::from_secs(10);
-/// How often the queue is emptied, to see the best of times: one who came later took a queue of others for the path's.
+/// Time between two drains of the queue, which show the shortest round trip. A late sender took others' queue for the
+/// path.
 const DRAIN_INTERVAL: Duration = Duration::from_secs(5);
-/// What is left under way then, of what would fill the path alone.
+/// Part of the path's own capacity that stays in flight during a drain.
 const DRAIN_PART: f64 = 0.75;
-/// Round trips that vary by so much from round to round still let the queue be seen; what is beyond it is added to the aim
-/// so many times, up to a bound.
+/// Jitter between rounds that still lets the queue be seen. The aim grows by a multiple of further jitter, up to a
+/// bound.
 const JITTER_FREE: Duration = Duration::from_millis(5);
 const JITTER_TIMES: u32 = 4;
 const JITTER_AIM_MAX: Duration = Duration::from_millis(24);
 /// The shortest time over which the standing queue is judged.
 const STANDING_SPAN_MIN: Duration = Duration::from_millis(4);
-/// How much of what is over the aim is taken away in a round, and of what is under it added.
+/// Part of the excess over the aim that a round takes away, and of the shortfall that it adds.
 const CUT_GAIN: f64 = 0.7;
 const GROW_GAIN: f64 = 0.5;
-/// The most that is added in a round.
+/// Largest growth in a round.
 const GROW_MAX: f64 = 0.5;
-/// With no queue in sight for so many rounds, this much is added in each: the path has become wider.
+/// After so many rounds without a queue, each round adds this part: the path has become wider.
 const QUIET_ROUNDS: u32 = 3;
 const QUIET_GROW: f64 = 0.25;
 /// The smallest part of the window that a cut leaves.
 const CUT_MAX: f64 = 0.5;
-/// After so many cuts in a row, which were a half together, the queue must have become shorter.
+/// After so many cuts in a row, a half together, the queue must have become shorter.
 const CUTS_IN_VAIN: u32 = 4;
-/// Loss that is congestion: this part of what was sent in two rounds, beyond what is lost anyway.
+/// Loss that shows congestion: this part of the packets of two rounds, beyond the usual loss.
 const LOSS_HEAVY: f64 = 0.03;
-/// Packets lost of which a part is worth computing.
+/// Fewest lost packets of which a part is computed.
 const LOST_PACKETS_MIN: u64 = 3;
-/// What a cut for loss leaves of the window: what arrives in a round trip without queue, within these.
+/// Bounds of the part of the window that a cut for loss leaves. Between them it leaves the bytes that arrive in a round
+/// trip without queue.
 const LOSS_CUT_MIN: f64 = 0.4;
 const LOSS_CUT_MAX: f64 = 0.85;
-/// If this part of the loss stays after a cut, it is not the window's doing.
+/// If this part of the loss remains after a cut, the window did not cause it.
 const LOSS_STAYS: f64 = 0.75;
-/// The rounds after a cut that are not judged, since they show what was before, and those that are.
+/// Rounds after a cut that are not judged, because they show the time before it, and rounds that are.
 const TRIAL_ROUNDS: u32 = 4;
-/// The most that is taken to be lost anyway.
+/// Highest loss that counts as usual.
 const LOSS_FLOOR_MAX: f64 = 0.12;
 
-/// The smallest round trip of a sliding span of time.
+/// Shortest round trip of a sliding span of time.
 #[derive(Clone, Copy, Debug)]
 struct Floor {
     span: Duration,
@@ -95,13 +97,13 @@ impl Floor {
     }
 }
 
-/// What happened since a packet left whose acknowledgement will end it.
+/// Counters since a packet left whose acknowledgement ends the round.
 #[derive(Clone, Copy, Debug)]
 struct Round {
     began: Instant,
     acked: u64,
     lost: u64,
-    /// The most that was under way.
+    /// Most bytes in flight.
     peak: u64,
 }
 
@@ -111,10 +113,10 @@ impl Round {
     }
 }
 
-/// Whether a smaller window loses less.
+/// Test whether a smaller window loses less.
 #[derive(Clone, Copy, Debug)]
 struct Trial {
-    /// What was lost before the cut.
+    /// Part lost before the cut.
     part: f64,
     rounds: u32,
     lost: u64,
@@ -123,30 +125,30 @@ struct Trial {
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Mode {
-    /// Twice as much each round.
+    /// The window doubles each round.
     StartUp,
-    /// At the aim.
+    /// The window stays at the aim.
     Steady,
-    /// Less for a round, so that the queue empties and the path shows its round trip.
+    /// The window shrinks for a round, so that the queue empties and the path shows its round trip.
     Drain,
 }
 
-/// The state.
+/// State of the controller.
 #[derive(Clone, Debug)]
 pub(super) struct Delay {
     gate: Arc<Gate>,
     mtu: u64,
-    /// Bytes that should be under way.
+    /// Window, bytes.
     window: f64,
-    /// What the window grows to, with each acknowledgement a little: in one step it would be a burst, which a short queue
-    /// does not hold.
+    /// Target of the window, which grows towards it a little with each acknowledgement: one step would be a burst,
+    /// which a short queue does not hold.
     goal: f64,
     in_flight: InFlight,
     mode: Mode,
     base: Floor,
-    /// When the queue was last emptied on purpose.
+    /// Time of the last drain.
     drained: Instant,
-    /// How much the standing round trip differs from round to round, seconds.
+    /// Variation of the standing round trip from round to round, seconds.
     jitter: f64,
     last_standing: Duration,
     standing: Floor,
@@ -157,13 +159,13 @@ pub(super) struct Delay {
     /// Cuts in a row, and the standing round trip and the window before the first.
     cuts: u32,
     uncut: (Duration, f64),
-    /// What seems to be lost whatever the window.
+    /// Loss that is independent of the window.
     loss_floor: f64,
-    /// After a cut for loss, whether it helps.
+    /// Test of the last cut for loss.
     trial: Option<Trial>,
-    /// Where much was lost: passed slowly.
+    /// Window at which much was lost; the window passes it slowly.
     ceiling: Option<f64>,
-    /// Rounds above it.
+    /// Rounds above the ceiling.
     above: i32,
     loss_cut: Instant,
 }
@@ -198,7 +200,7 @@ impl Delay {
         delay
     }
 
-    /// What should be under way.
+    /// Returns the bytes that should be in flight.
     fn target(&self) -> u64 {
         let window = match self.mode {
             Mode::Drain => {
@@ -211,7 +213,7 @@ impl Delay {
         (window as u64).max(WINDOW_PACKETS_MIN * self.mtu)
     }
 
-    /// What may be, if it is urgent.
+    /// Returns the bytes that may be in flight if the next are urgent.
     fn cap(&self) -> u64 {
         let target = self.target();
         target + (target / URGENT_PART).max(URGENT_PACKETS_MIN * self.mtu)
@@ -232,36 +234,36 @@ impl Delay {
         self.standing.get().unwrap_or_default()
     }
 
-    /// How long packets should stand in queues, as well as that can be told here.
+    /// Returns the aim for the queue, widened as far as jitter hides the queue.
     fn aim(&self) -> Duration {
         let beyond = Duration::from_secs_f64(self.jitter).saturating_sub(JITTER_FREE);
         QUEUE_AIM + (JITTER_TIMES * beyond).min(JITTER_AIM_MAX)
     }
 
-    /// How long packets stand in queues.
+    /// Returns the time that packets stand in queues.
     fn queue(&self) -> Duration {
         self.standing().saturating_sub(self.base())
     }
 
-    /// Up to this within a round.
+    /// Lets the window grow to this goal within a round.
     fn grow_to(&mut self, goal: f64) {
         self.goal = goal.min(WINDOW_BYTES_MAX as f64);
     }
 
-    /// At once.
+    /// Sets the window at once.
     fn set_window(&mut self, window: f64) {
         self.goal = 0.0;
         self.window = window.clamp((WINDOW_PACKETS_MIN * self.mtu) as f64, WINDOW_BYTES_MAX as f64);
     }
 
-    /// Bytes a second that arrive.
+    /// Returns the bytes that arrive in a second.
     fn rate(&self, now: Instant) -> f64 {
         let acked = self.round.acked + self.before.acked;
         let span = now.saturating_duration_since(self.before.began).as_secs_f64();
         acked as f64 / span.max(1e-6)
     }
 
-    /// What arrives in the time that a round trip at the aim takes.
+    /// Returns the bytes that arrive in a round trip with the queue at the aim.
     fn window_by_rate(&self, now: Instant) -> f64 {
         self.rate(now) * (self.base() + self.aim()).as_secs_f64()
     }
@@ -277,7 +279,7 @@ impl Delay {
         match self.mode {
             Mode::StartUp => {
                 if !uses_window {
-                    // What was not used proves nothing.
+                    // Unused window proves nothing.
                     self.set_window(
                         self.window.min((2 * round.peak).max(WINDOW_PACKETS_INITIAL * self.mtu) as f64),
                     );
@@ -300,7 +302,7 @@ impl Delay {
         }
     }
 
-    /// Towards the aim, as far as a round allows.
+    /// Steers the window towards the aim, as far as a round allows.
     fn steer(&mut self, now: Instant, queue: Duration, uses_window: bool) {
         let differs = self.standing().abs_diff(self.last_standing).as_secs_f64();
         if !self.last_standing.is_zero() {
@@ -342,7 +344,7 @@ impl Delay {
         let grown = self.window + under.max(self.window * part);
         match self.ceiling {
             Some(ceiling) if grown > ceiling => {
-                // Step by step, in steps that grow.
+                // The window passes the ceiling in growing steps.
                 self.above += 1;
                 let step = under * 1.4f64.powi(self.above);
                 self.grow_to(grown.min(self.window.max(ceiling) + step));
@@ -351,7 +353,7 @@ impl Delay {
         }
     }
 
-    /// The queue is not ours, or the path has become longer: what it takes now is the best of times.
+    /// Takes the present round trip as the shortest: the queue is not ours, or the path has become longer.
     fn rebase(&mut self, now: Instant) {
         let standing = self.standing();
         self.base = Floor::new(BASE_AGE_MAX / 2, now);
@@ -360,7 +362,7 @@ impl Delay {
         self.quiet = 0;
     }
 
-    /// The part that was lost in these rounds, if it is too much.
+    /// Returns the part that was lost in these rounds, if it is too much.
     fn heavy_loss(&mut self, round: &Round, before: &Round) -> Option<f64> {
         if let Some(mut trial) = self.trial.take() {
             trial.rounds += 1;
@@ -383,7 +385,7 @@ impl Delay {
         if part < self.loss_floor {
             self.loss_floor += (part - self.loss_floor) * 0.05;
         }
-        // What varies by chance varies more where there is more of it.
+        // Random loss varies more where there is more of it.
         let heavy = LOSS_HEAVY + self.loss_floor * 1.5;
         (lost >= LOST_PACKETS_MIN * self.mtu && part > heavy).then_some(part)
     }
@@ -423,13 +425,13 @@ impl Controller for Delay {
                 let by_rate = self.window_by_rate(now);
                 self.set_window(by_rate.clamp(self.window * 0.5, self.window));
                 self.mode = Mode::Steady;
-                // What was sent until now may be lost: that was too much, which is known.
+                // Packets sent until now may be lost; the controller has reacted to that already.
                 self.loss_cut = now;
             } else {
                 self.set_window(self.window + bytes as f64);
             }
         } else if self.window < self.goal {
-            // All of a window's acknowledgements are a round.
+            // A round is all acknowledgements of a window.
             let step = (self.goal - self.window).max(0.0) * (2.0 * bytes as f64 / self.window).min(1.0);
             self.window += step;
         }
@@ -454,10 +456,10 @@ impl Controller for Delay {
             self.rebase(now);
             self.mode = Mode::StartUp;
         } else if lost_bytes == 0 && now.saturating_duration_since(self.loss_cut) > rtt {
-            // A router marked packets (RFC 3168): it would have dropped them.
+            // A router marked packets (RFC 3168): otherwise it would have dropped them.
             self.cut_for_loss(now, 0.0);
         } else {
-            // The room that it leaves is not filled at once either.
+            // The freed room is not filled at once either.
             let (goal, rest) = (self.goal.max(self.window), self.window - lost_bytes as f64);
             self.set_window(rest.max(self.window * 0.5));
             self.grow_to(goal);

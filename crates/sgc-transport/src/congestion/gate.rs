@@ -1,8 +1,8 @@
-//! Who may write into a connection, and when: what waits should wait where it can still be replaced by something newer
-//! or be overtaken by something more urgent, not inside the connection.
+//! Admission of writers into a connection: packets should wait where newer data can still replace them and urgent
+//! packets overtake them, not inside the connection.
 //!
-//! The congestion controller of a connection says what is under way and how much should be; writers ask for leave piece
-//! by piece. It knows no clock and no socket.
+//! The congestion controller of a connection reports the bytes in flight and their limit; writers ask for a permit
+//! piece by piece. The gate knows no clock and no socket.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,22 +10,22 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use sgc_wire::Class;
 use tokio::sync::oneshot;
 
-/// The least that is admitted at once, a packet. More would stand in the way of urgent flows on a thin link.
+/// Smallest permit, a packet. A larger one would stand in the way of urgent flows on a thin link.
 const PIECE_BYTES_MIN: u64 = 1200;
-/// The most that is admitted at once.
+/// Largest permit.
 const PIECE_BYTES_MAX: u64 = 64 << 10;
-/// Of what was sent, so much is taken to have been headers: an estimate that is too high only shuts the gate early.
+/// Estimated part of headers in sent bytes: an estimate that is too high only shuts the gate early.
 const OVERHEAD_PART: u64 = 16;
 const CLASSES: usize = Class::Realtime as usize + 1;
 
-/// What a controller allows.
+/// A controller's limits.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Limits {
-    /// How much should be under way at most, for all but what is urgent.
+    /// Most bytes in flight, for all but urgent data.
     pub target: u64,
-    /// The same for what is urgent.
+    /// Most bytes in flight, for urgent data.
     pub cap: u64,
-    /// What is admitted at once, within bounds: fast links take much, so that their packets leave in batches.
+    /// Bytes of a permit, within bounds: fast links take much, so that their packets leave in batches.
     pub piece: u64,
 }
 
@@ -35,9 +35,9 @@ pub(crate) struct Gate(Mutex<State>);
 
 #[derive(Debug, Default)]
 struct State {
-    /// Sent and neither acknowledged nor lost, as the controller was last told.
+    /// Bytes sent and neither acknowledged nor lost, at the controller's last event.
     in_flight: u64,
-    /// Admitted and not sent, an estimate.
+    /// Bytes admitted and not sent, an estimate.
     unsent: u64,
     limits: Limits,
     waiting: [VecDeque<Waiter>; CLASSES],
@@ -49,7 +49,7 @@ struct Waiter {
     leave: oneshot::Sender<Permit>,
 }
 
-/// Leave to write so many bytes. Dropped, it goes back.
+/// Permission to write this many bytes. Dropping it returns the bytes.
 #[derive(Debug)]
 pub(crate) struct Permit {
     gate: Arc<Gate>,
@@ -57,13 +57,13 @@ pub(crate) struct Permit {
 }
 
 impl Gate {
-    /// Leave to write up to `want` bytes, if there is room now and nobody waits who comes first.
+    /// Permits up to `want` bytes, if there is room now and nobody waits who comes first.
     pub(crate) fn try_admit(self: &Arc<Self>, class: Class, want: usize) -> Option<Permit> {
         let bytes = self.lock().take(class, want as u64)?;
         Some(Permit { gate: Arc::clone(self), bytes })
     }
 
-    /// Waits for leave to write up to `want` bytes: those of higher classes first, those of one in turn.
+    /// Waits for a permit of up to `want` bytes: higher classes go first, equal ones in turn.
     pub(crate) async fn admit(self: &Arc<Self>, class: Class, want: usize) -> Permit {
         let want = want as u64;
         loop {
@@ -76,38 +76,38 @@ impl Gate {
                 state.waiting[class as usize].push_back(Waiter { want, leave });
                 granted
             };
-            // The other end goes only with the gate itself, which is held here.
+            // The sender goes only with the gate itself, which is held here.
             if let Ok(permit) = granted.await {
                 return permit;
             }
         }
     }
 
-    /// Something was written without leave, since it could not be withheld.
+    /// Notes bytes that were written without a permit, because they could not be withheld.
     pub(crate) fn note_written(&self, bytes: usize) {
         self.lock().unsent += bytes as u64;
     }
 
-    /// What was written and not sent has been given up.
+    /// Forgets bytes that were written, not sent and given up.
     pub(crate) fn forget_unsent(self: &Arc<Self>) {
         self.update(|state| state.unsent = 0);
     }
 
-    /// A controller begins.
+    /// Starts with the limits of a new controller.
     pub(super) fn open(self: &Arc<Self>, limits: Limits) {
         self.update(|state| {
             (state.in_flight, state.unsent, state.limits) = (0, 0, limits);
         });
     }
 
-    /// Packets left.
+    /// Notes packets that left.
     pub(super) fn on_sent(&self, bytes: u64, in_flight: u64) {
         let mut state = self.lock();
         state.in_flight = in_flight;
         state.unsent = state.unsent.saturating_sub(bytes - bytes / OVERHEAD_PART);
     }
 
-    /// The controller has news. `all_sent`: the connection had nothing left to send.
+    /// Takes news of the controller. `all_sent`: the connection had nothing left to send.
     pub(super) fn set(self: &Arc<Self>, in_flight: u64, limits: Limits, all_sent: bool) {
         self.update(|state| {
             (state.in_flight, state.limits) = (in_flight, limits);
@@ -157,7 +157,7 @@ impl State {
                 let Some(waiter) = self.waiting[class].pop_front() else { break };
                 let permit = Permit { gate: Arc::clone(gate), bytes };
                 if let Err(unwanted) = waiter.leave.send(permit) {
-                    // Its drop would want the lock that is held here.
+                    // Dropping the permit would take the lock that is held here.
                     self.unsent -= unwanted.spend(0);
                 }
             }
@@ -166,17 +166,17 @@ impl State {
 }
 
 impl Permit {
-    /// How many bytes may be written.
+    /// Returns the bytes that may be written.
     pub(crate) fn bytes(&self) -> usize {
         usize::try_from(self.bytes).unwrap_or(usize::MAX)
     }
 
-    /// So many were written; the rest goes back.
+    /// Notes that this many bytes were written; the rest is returned.
     pub(crate) fn written(mut self, bytes: usize) {
         self.bytes = self.bytes.saturating_sub(bytes as u64);
     }
 
-    /// Ends it after `bytes`, and says how many were left.
+    /// Ends the permit after `bytes` and returns the rest.
     fn spend(mut self, bytes: u64) -> u64 {
         let left = self.bytes.saturating_sub(bytes);
         self.bytes = 0;
@@ -209,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_urgent_comes_first_and_the_rest_in_turn() {
+    fn urgent_frames_go_first_and_the_rest_take_turns() {
         let gate = Arc::new(Gate::default());
         gate.open(limits(10_000, 20_000));
         gate.set(20_000, limits(10_000, 20_000), false);
@@ -227,7 +227,7 @@ mod tests {
         let Poll::Ready(permit) = poll(bulk.as_mut()) else { panic!("there is room") };
         assert_eq!(permit.bytes(), 3072);
         assert!(poll(late.as_mut()).is_pending());
-        // What one does not use the next gets.
+        // The next waiter gets unused bytes.
         drop(permit);
         assert!(poll(late.as_mut()).is_ready());
     }

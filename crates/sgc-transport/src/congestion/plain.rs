@@ -10,14 +10,13 @@ use quinn_proto::RttEstimator;
 use super::gate::Limits;
 use super::{Gate, InFlight, into_any};
 
-/// What may wait inside the connection: part of the window, and at least this. These controllers grow only while
-/// something does.
+/// Part of the window that may wait inside the connection, and the least. These controllers grow only while data waits.
 const SLACK_BYTES_MIN: u64 = 16 << 10;
 const SLACK_PART: u64 = 4;
-/// What is let in at once is this part of the window.
+/// Part of the window in one permit.
 const PIECES_PER_WINDOW: u64 = 8;
 
-/// A controller of quinn's, and the gate of its connection.
+/// A controller of quinn, and the gate of its connection.
 pub(super) struct Plain {
     gate: Arc<Gate>,
     inner: Box<dyn Controller>,
@@ -63,7 +62,7 @@ impl Controller for Plain {
     fn on_congestion_event(&mut self, now: Instant, sent: Instant, is_persistent: bool, lost_bytes: u64) {
         self.in_flight.lost(lost_bytes);
         self.inner.on_congestion_event(now, sent, is_persistent, lost_bytes);
-        // What was lost is to be sent again.
+        // Lost bytes are sent again.
         self.gate.note_written(usize::try_from(lost_bytes).unwrap_or(usize::MAX));
         self.tell(false);
     }

@@ -1,5 +1,5 @@
-//! Whole QUIC connections over paths that are computed, on a clock that is computed: what each controller makes of a
-//! path. `cargo test -p sgc-transport --lib congestion -- --ignored --nocapture` prints the table of all.
+//! Whole QUIC connections over simulated paths, on a simulated clock: the behaviour of each controller on a path.
+//! `cargo test -p sgc-transport --lib congestion -- --ignored --nocapture` prints the table of all.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -20,7 +20,7 @@ use super::*;
 use crate::LinkOptions;
 use crate::quic::{Flavor, transport as transport_with};
 
-/// Of the path from the senders to the receivers; all share it. The way back has the delay alone.
+/// The path from the senders to the receivers, which share it. The way back has the delay alone.
 #[derive(Clone, Copy, Debug)]
 struct Path {
     bits_per_second: u64,
@@ -41,16 +41,16 @@ const THIN: Path = Path {
 #[derive(Default)]
 struct Pipe {
     free: Option<Instant>,
-    /// When the last one arrives: the order stays.
+    /// Arrival of the last packet, so that the order stays.
     last: Option<Instant>,
     dropped: u64,
     carried: u64,
-    /// How long each packet stood in the queue, and since when.
+    /// Time in the queue of each packet, and its beginning.
     stood: Vec<(Instant, f64)>,
 }
 
 impl Pipe {
-    /// When a packet arrives, if it does.
+    /// Returns the arrival of a packet, unless it is lost.
     fn carry(&mut self, now: Instant, bytes: u64, path: &Path, rng: &mut ChaCha8Rng) -> Option<Instant> {
         let bytes = bytes + 28;
         let free = self.free.unwrap_or(now).max(now);
@@ -83,16 +83,16 @@ struct Node {
     endpoint: Endpoint,
     connection: Option<(ConnectionHandle, Connection)>,
     peer: SocketAddr,
-    /// Of a sender.
+    /// Set at a sender.
     gate: Option<Arc<Gate>>,
     stream: Option<StreamId>,
     begins: Instant,
-    /// Of a receiver: when, and how many bytes.
+    /// Arrivals at a receiver: time and bytes.
     received: Vec<(Instant, u64)>,
 }
 
-/// A packet under way: when it arrives, its number, and at which node.
-type UnderWay = (Instant, u64, usize, Vec<u8>);
+/// A packet in flight: arrival, number, node and bytes.
+type InFlightPacket = (Instant, u64, usize, Vec<u8>);
 
 /// Pairs of senders and receivers.
 struct World {
@@ -101,13 +101,13 @@ struct World {
     nodes: Vec<Node>,
     path: Path,
     pipe: Pipe,
-    under_way: BinaryHeap<Reverse<UnderWay>>,
+    under_way: BinaryHeap<Reverse<InFlightPacket>>,
     number: u64,
     rng: ChaCha8Rng,
 }
 
 impl World {
-    /// Senders with these controllers, each from its second on.
+    /// Returns senders with these controllers, each starting at its second.
     fn new(path: Path, senders: &[(Congestion, f64)]) -> Self {
         let key = rcgen::generate_simple_self_signed(vec!["localhost".into()]).unwrap();
         let epoch = Instant::now();
@@ -242,7 +242,7 @@ impl World {
         }
     }
 
-    /// What the two applications do: one writes what it may, the other reads what there is.
+    /// Runs the two applications: one writes as much as it may, the other reads everything.
     fn exchange(&mut self, n: usize, connection: &mut Connection) {
         let (now, node) = (self.now, &mut self.nodes[n]);
         let mut readable = Vec::new();
@@ -287,7 +287,7 @@ impl World {
         }
     }
 
-    /// What a sender's receiver got from one second to another, bits a second.
+    /// Returns the bits a second that a sender's receiver got between two times.
     fn rate(&self, sender: usize, from: f64, to: f64) -> f64 {
         let span = self.epoch + Duration::from_secs_f64(from)..self.epoch + Duration::from_secs_f64(to);
         let got = &self.nodes[2 * sender + 1].received;
@@ -295,12 +295,12 @@ impl World {
         bytes as f64 * 8.0 / (to - from)
     }
 
-    /// The part of the path that it used, from one second to another.
+    /// Returns the part of the path that the sender used between two times.
     fn used(&self, sender: usize, from: f64, to: f64) -> f64 {
         self.rate(sender, from, to) / self.path.bits_per_second as f64
     }
 
-    /// How long packets stood in the queue from one second to another, ms: the median, and what 99 of 100 stay below.
+    /// Returns the median and 99th percentile of the time in the queue between two times, ms.
     fn queue(&self, from: f64, to: f64) -> (f64, f64) {
         let span = self.epoch + Duration::from_secs_f64(from)..self.epoch + Duration::from_secs_f64(to);
         let mut stood: Vec<_> =
@@ -310,12 +310,12 @@ impl World {
         (at(0.5), at(0.99))
     }
 
-    /// The part of all packets that was lost.
+    /// Returns the part of all packets that was lost.
     fn lost(&self) -> f64 {
         self.pipe.dropped as f64 / (self.pipe.carried + self.pipe.dropped).max(1) as f64
     }
 
-    /// From this second on, how long it takes until half a second uses this part of the path.
+    /// Returns the time from this second until half a second uses this part of the path.
     fn recovery(&self, sender: usize, from: f64, part: f64) -> Option<f64> {
         let steps = (0..400).map(|n| f64::from(n) * 0.05);
         steps.into_iter().find(|t| self.used(sender, from + t, from + t + 0.5) >= part)
@@ -331,7 +331,7 @@ fn mbit(bits_per_second: f64, queue: Duration, one_way: u64) -> Path {
     Path { bits_per_second: (bits_per_second * 1e6) as u64, queue_bytes, one_way: ms(one_way), ..THIN }
 }
 
-/// The paths of the table, by name.
+/// Returns the paths of the table, by name.
 fn paths() -> Vec<(&'static str, Path)> {
     let lossy = |loss| Path { loss, ..mbit(20.0, ms(200), 20) };
     vec![
@@ -368,8 +368,8 @@ fn table() {
     println!(
         "\n| what changes | controller | used before | after | reached after s | queue p99, ms |\n|---|---|---|---|---|---|"
     );
-    type Change = fn(&mut Path);
-    let changes: [(&str, Path, Change); 4] = [
+    type PathChange = fn(&mut Path);
+    let changes: [(&str, Path, PathChange); 4] = [
         ("5 to 1 Mbit/s", Path { one_way: ms(20), ..THIN }, |p| p.bits_per_second = 1_000_000),
         ("1 to 20 Mbit/s", Path { bits_per_second: 1_000_000, one_way: ms(20), ..THIN }, |p| {
             p.bits_per_second = 20_000_000
@@ -416,7 +416,7 @@ fn table() {
     }
 }
 
-/// One flow for so many seconds.
+/// Runs one flow for this many seconds.
 fn alone(path: Path, congestion: Congestion, seconds: f64) -> World {
     let mut world = World::new(path, &[(congestion, 0.0)]);
     world.run_until(seconds);
@@ -431,7 +431,7 @@ fn a_thin_link_is_used_and_its_queue_stays_short() {
         let (p50, p99) = world.queue(2.0, 15.0);
         assert!(world.used(0, 2.0, 15.0) > 0.9, "{:.2}", world.used(0, 2.0, 15.0));
         assert!(p50 < 22.0 && p99 < 40.0, "{p50:.1} {p99:.1}");
-        // What it is compared with fills the queue.
+        // The reference fills the queue.
         assert!(alone(path, Congestion::Cubic, 15.0).queue(2.0, 15.0).0 > 4.0 * p50);
     }
 }

@@ -1,8 +1,8 @@
-//! One association: DTLS with one peer, the verdict on its certificate, and the few words that are exchanged before QUIC.
+//! One association: DTLS with one peer, the verdict on its certificate, and the few messages before QUIC.
 //!
-//! Callers give it records and the time, and take what it put into the [`Sink`]. It knows no socket and no other
-//! association; which datagrams are its own is decided in [`super::mux`]. Nothing that a peer sends is handed on before
-//! its certificate was verified.
+//! Callers give it records and the time, and take its output from the [`Sink`]. It knows no socket and no other
+//! association; [`super::mux`] decides which datagrams belong to it. Nothing that a peer sends is handed on before its
+//! certificate was verified.
 
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
@@ -16,8 +16,8 @@ use rustls_pki_types::{CertificateDer, UnixTime};
 use sgc_trust::{CertError, VerifiedPeer};
 use sgc_wire::CERT_BYTES_MAX;
 
-use super::front::{self, Echo, Inside, Token};
-use super::keys::{Keys, Loan};
+use super::front::{self, Echo, RecordMessage, Token};
+use super::keys::{Keys, SigningKeyLease};
 use crate::credentials::CredentialStore;
 use crate::error::{LinkError, PeerRefusal, Refusal};
 use crate::options::LinkOptions;
@@ -28,22 +28,23 @@ const FLIGHT_BYTES_MAX: usize = 1150;
 /// First wait for an answer to a flight; it doubles.
 const FLIGHT_RTO: Duration = Duration::from_millis(400);
 const FLIGHT_RETRIES: usize = 8;
-/// dimpl's own limit, which ours comes before.
+/// dimpl's own limit; ours comes first.
 const DIMPL_TIMEOUT: Duration = Duration::from_secs(120);
-/// How often a dialer asks for its id at first; it doubles.
+/// First interval of a dialer's questions for its id; it doubles.
 const ASK_INTERVAL: Duration = Duration::from_millis(200);
-/// How long a dialer that is refused may take to say that it refuses, too: whose word comes first is what is reported.
+/// Time that a refused dialer may take to send its own refusal: the first of the two is reported.
 const WORD_PATIENCE: Duration = Duration::from_secs(1);
-/// How often the clock of DTLS is set where no timer is due.
+/// Interval of setting the clock of DTLS where no timer is due.
 const CLOCK_INTERVAL: Duration = Duration::from_millis(20);
-/// How often a refusal is said: it is not acknowledged.
+/// Number of copies of a refusal, which is not acknowledged.
 const REFUSAL_COPIES: usize = 2;
-/// Longest datagram that is given to dimpl, bytes. A node's own flights have at most [`FLIGHT_BYTES_MAX`], and a sealed
-/// packet of QUIC is shorter than 1500.
+/// Longest datagram for dimpl, bytes. A node's own flights have at most [`FLIGHT_BYTES_MAX`], and a sealed packet of
+/// QUIC is shorter than 1500.
 const DATAGRAM_BYTES_MAX: usize = 2048;
-/// Most datagrams that dimpl keeps of messages that are not complete.
+/// Most datagrams of incomplete messages that dimpl keeps.
 const QUEUE_RX_DATAGRAMS: usize = 30;
-/// Most datagrams of a flight of ours. A peer's cookie, which a dialer repeats, fills any number of them with a record each.
+/// Most datagrams of a flight of ours. A dialer repeats a peer's cookie, which fills any number of them with a record
+/// each.
 const QUEUE_TX_DATAGRAMS: usize = 10;
 /// Most records of a flight of ours: one more, and dimpl panics (`dtls13/engine.rs`, `flight_saved_records`).
 const FLIGHT_RECORDS_MAX: usize = 12;
@@ -60,9 +61,9 @@ const FLIGHT_DATAGRAMS: usize =
 // A flight has at most six messages, and every further datagram begins with the rest of one.
 const _: () = assert!(FLIGHT_DATAGRAMS + 5 <= FLIGHT_RECORDS_MAX && FLIGHT_DATAGRAMS <= QUEUE_TX_DATAGRAMS);
 const _: () = assert!(QUEUE_TX_DATAGRAMS + 1 < FLIGHT_RECORDS_MAX);
-/// `protocol_version`: of what is spoken inside.
+/// `protocol_version`: wrong version of the protocol inside.
 const ALERT_VERSION: u8 = 70;
-/// `handshake_failure`: what listeners without DTLS 1.3 answer as well.
+/// `handshake_failure`: also the answer of listeners without DTLS 1.3.
 const ALERT_HANDSHAKE_FAILURE: u8 = 40;
 
 static CONFIG: LazyLock<Arc<Config>> = LazyLock::new(|| {
@@ -80,7 +81,7 @@ static CONFIG: LazyLock<Arc<Config>> = LazyLock::new(|| {
     Arc::new(config)
 });
 
-/// What came out of associations: packets for the wire, and plaintext for QUIC, each in one piece of memory.
+/// Output of associations: packets for the wire, and plaintext for QUIC, each in one piece of memory.
 #[derive(Debug, Default)]
 pub(super) struct Sink {
     pub(super) packets: Vec<u8>,
@@ -89,7 +90,7 @@ pub(super) struct Sink {
     pub(super) data_lens: Vec<usize>,
     /// The token that a dialer has repeated.
     pub(super) proof: Option<Token>,
-    /// The buffer that dimpl writes into, [`OUTPUT_BYTES`] long once it was used.
+    /// The buffer that dimpl writes into, [`OUTPUT_BYTES`] long after its first use.
     output: Vec<u8>,
 }
 
@@ -114,44 +115,44 @@ impl Sink {
     }
 }
 
-/// What an association is told when it begins.
+/// Parameters of a new association.
 pub(super) struct Setup<'a> {
     pub(super) credentials: &'a CredentialStore,
     pub(super) options: &'a LinkOptions,
     pub(super) is_dialer: bool,
     /// The beginning of the dialer's random, as far as a listener has it.
     pub(super) echo: Option<Echo>,
-    /// What the peer is to put in front of its records, and how the end of that would look.
+    /// The id that the peer has to put in front of its records, and the token of its reset.
     pub(super) id: u64,
     pub(super) reset: Token,
 }
 
-/// How an association ended.
+/// The reason why an association ended.
 #[derive(Clone, Debug)]
 pub(super) enum End {
-    /// Its certificate is refused here.
+    /// This node refuses the peer's certificate.
     Refused(CertError),
-    /// It refuses ours.
+    /// The peer refuses our certificate.
     ByPeer(PeerRefusal),
-    /// It speaks DTLS and nothing that we know inside of it.
+    /// The peer speaks DTLS and no known protocol inside of it.
     NotOurs,
     TimedOut,
-    /// It has forgotten us.
+    /// The peer has forgotten this association.
     Restarted,
-    /// Its handshake is longer than any that is read.
+    /// The peer's handshake is longer than the limit.
     TooLong,
-    /// It has no DTLS 1.3, and this node does not dial with 1.2.
+    /// The peer has no DTLS 1.3, and this node does not dial with 1.2.
     OldVersion,
-    /// It said so.
+    /// The peer said goodbye.
     Goodbye,
-    /// It is no longer needed here.
+    /// The association is no longer needed here.
     Released,
     /// DTLS failed.
     Broken(String),
 }
 
 impl End {
-    /// For the one who dials.
+    /// Returns the error for the dialer.
     pub(super) fn to_dialer(&self, after: Duration) -> LinkError {
         match self {
             Self::Refused(why) => LinkError::RefusedHere(why.clone()),
@@ -166,7 +167,7 @@ impl End {
         }
     }
 
-    /// For the one who listens.
+    /// Returns the refusal for the listener.
     pub(super) fn to_listener(&self, after: Duration) -> Refusal {
         match self {
             Self::Refused(why) => Refusal::Certificate(why.clone()),
@@ -179,11 +180,11 @@ impl End {
     }
 }
 
-/// Where an association stands, in order.
+/// Stage of an association, in order.
 #[derive(Clone, Debug)]
 pub(super) enum Stage {
     Handshake,
-    /// The dialer's certificate is refused; what it says of ours is waited for.
+    /// The dialer's certificate is refused; its judgement of ours is awaited.
     Refusing {
         why: CertError,
         until: Instant,
@@ -194,7 +195,7 @@ pub(super) enum Stage {
         next: Instant,
         interval: Duration,
     },
-    /// The peer is who it says.
+    /// The peer's identity is proven.
     Up {
         peer: Box<VerifiedPeer>,
         since: Instant,
@@ -205,26 +206,26 @@ pub(super) enum Stage {
 /// DTLS with one peer.
 pub(super) struct Association {
     dtls: Dtls,
-    _key: Loan,
+    _key: SigningKeyLease,
     credentials: CredentialStore,
     is_dialer: bool,
-    /// The dialer takes a listener that has no DTLS 1.3.
+    /// The dialer accepts a listener without DTLS 1.3.
     takes_dtls12: bool,
-    /// Something came that a listener without DTLS 1.3 answers.
+    /// A listener without DTLS 1.3 has answered.
     has_met_dtls12: bool,
     handshake_timeout: Duration,
     idle_timeout: Duration,
     id: u64,
     reset: Token,
-    /// Stands in front of every record that is sent.
+    /// Bytes in front of every record that is sent.
     prefix: Vec<u8>,
     started: Instant,
     clock: Instant,
     due: Instant,
-    /// When something authentic came last.
+    /// Time of the last authentic input.
     heard: Instant,
     has_data: bool,
-    /// A link uses it.
+    /// A link uses the association.
     is_claimed: bool,
     stage: Stage,
     certificate: Option<CertificateDer<'static>>,
@@ -232,14 +233,14 @@ pub(super) struct Association {
     listener: Option<Box<VerifiedPeer>>,
     /// The beginning of the random of the dialer's hello.
     echo: Option<Echo>,
-    /// What a dialer said first, for the case that it has to be said with a ticket.
+    /// A dialer's first flight, in case it has to be repeated with a ticket.
     first_flight: Vec<Vec<u8>>,
 }
 
 impl Association {
-    /// `None` if DTLS cannot use the key of the identity.
+    /// Creates an association. Returns `None` if DTLS cannot use the key of the identity.
     pub(super) fn new(setup: &Setup<'_>, now: Instant) -> Option<Self> {
-        let key = Loan::new(setup.credentials.identity().certified_key())?;
+        let key = SigningKeyLease::new(setup.credentials.identity().certified_key())?;
         let takes_dtls12 = setup.options.dtls12;
         // A listener tells the version from the hello. A dialer that has asked for both may be talked out of 1.3 by
         // anyone on the way, and in 1.2 certificates travel in the clear.
@@ -277,7 +278,7 @@ impl Association {
         })
     }
 
-    /// Says the first word.
+    /// Sends the first flight.
     pub(super) fn start(&mut self, now: Instant, sink: &mut Sink) {
         let result = self.dtls.handle_timeout(now);
         self.check(result);
@@ -291,7 +292,7 @@ impl Association {
         self.echo = self.first_flight.first().and_then(|hello| front::client_hello(hello));
     }
 
-    /// Takes one datagram's records. True if something in it was authentic and new.
+    /// Takes one datagram's records. Returns `true` if something in it was authentic and new.
     pub(super) fn receive(&mut self, records: &[u8], now: Instant, sink: &mut Sink) -> bool {
         if self.is_ended() || (!self.takes_plaintext() && front::has_plaintext(records)) {
             return false;
@@ -312,7 +313,7 @@ impl Association {
             let result = self.dtls.handle_timeout(now);
             self.check(result);
         }
-        // After an error dimpl is where it may panic, and is only asked for what it has to say.
+        // After an error dimpl may panic, so only its pending output is taken.
         if !self.is_ended() {
             match self.dtls.handle_packet(records) {
                 // Anybody could have sent that.
@@ -336,12 +337,12 @@ impl Association {
     /// Sends a token to the peer, which repeats it.
     pub(super) fn probe(&mut self, token: Token, now: Instant, sink: &mut Sink) {
         if matches!(self.stage, Stage::Up { .. }) {
-            self.say(Inside::Probe { token });
+            self.say(RecordMessage::Probe { token });
             self.drain(now, sink);
         }
     }
 
-    /// Does what is due.
+    /// Runs due timers.
     pub(super) fn tick(&mut self, now: Instant, sink: &mut Sink) {
         if self.is_ended() {
             return;
@@ -354,14 +355,14 @@ impl Association {
         }
         let is_late = now >= self.started + self.handshake_timeout;
         match &mut self.stage {
-            // Forging the answer of an old listener changes no more than this word.
+            // A forged answer of an old listener changes only this reason.
             Stage::Handshake if is_late && self.has_met_dtls12 => self.end(End::OldVersion),
             Stage::Handshake if is_late => self.end(End::TimedOut),
             Stage::Asking { .. } if is_late => self.end(End::NotOurs),
             Stage::Asking { next, interval, .. } if *next <= now => {
                 *interval *= 2;
                 *next = now + *interval;
-                self.say(Inside::Ask);
+                self.say(RecordMessage::Ask);
                 self.drain(now, sink);
             }
             Stage::Refusing { why, until } if *until <= now => {
@@ -381,7 +382,7 @@ impl Association {
         }
     }
 
-    /// When [`Self::tick`] is to be called next.
+    /// Returns the time of the next call of [`Self::tick`].
     pub(super) fn due(&self) -> Instant {
         let own = match &self.stage {
             Stage::Handshake => self.started + self.handshake_timeout,
@@ -392,8 +393,8 @@ impl Association {
         own.min(self.due)
     }
 
-    /// A listener wants to see that datagrams arrive here: sends the first ones again, with its ticket in front of
-    /// everything until there is an id.
+    /// Answers a listener that wants to see that datagrams arrive here: sends the first ones again, with its ticket in
+    /// front of everything until there is an id.
     pub(super) fn answer_challenge(&mut self, token: &Token, sink: &mut Sink) {
         if self.is_dialer && matches!(self.stage, Stage::Handshake) {
             self.prefix = front::ticket_prefix(token);
@@ -403,19 +404,19 @@ impl Association {
         }
     }
 
-    /// The beginning of the random of the dialer's hello.
+    /// Returns the beginning of the random of the dialer's hello.
     pub(super) fn echo(&self) -> Option<Echo> {
         self.echo
     }
 
-    /// The peer refuses our certificate before the handshake is over, if this is the echo of the hello that began it.
+    /// Notes that the peer refuses our certificate before the handshake is over, if this is the echo of its hello.
     pub(super) fn refused_by_peer(&mut self, alert: u8, echo: &Echo) {
         if matches!(self.stage, Stage::Handshake) && self.echo.as_ref() == Some(echo) {
             self.end(End::ByPeer(PeerRefusal::from_alert(alert)));
         }
     }
 
-    /// The listener has forgotten the association, if this is what it said.
+    /// Returns whether this token shows that the listener has forgotten the association.
     pub(super) fn is_reset_by(&self, token: &Token) -> bool {
         use ::aws_lc_rs::constant_time::verify_slices_are_equal;
         self.is_dialer
@@ -423,7 +424,7 @@ impl Association {
             && verify_slices_are_equal(&self.reset, token).is_ok()
     }
 
-    /// A link is made on it; false if there is one already.
+    /// Takes the association for a link. Returns `false` if it has one already.
     pub(super) fn claim(&mut self) -> bool {
         !std::mem::replace(&mut self.is_claimed, true)
     }
@@ -438,7 +439,7 @@ impl Association {
         }
     }
 
-    /// Ends it without a word.
+    /// Ends the association without telling the peer.
     pub(super) fn end(&mut self, end: End) {
         if !self.is_ended() {
             self.stage = Stage::Ended(end);
@@ -449,7 +450,7 @@ impl Association {
         &self.stage
     }
 
-    /// Who the peer is, as soon as that is certain.
+    /// Returns the peer as soon as it is certain.
     pub(super) fn peer(&self) -> Option<&VerifiedPeer> {
         match &self.stage {
             Stage::Up { peer, .. } => Some(peer),
@@ -457,12 +458,12 @@ impl Association {
         }
     }
 
-    /// True as long as nothing was made of it, and the peer has said nothing that QUIC could speak of.
+    /// Returns `true` as long as no link uses it, and the peer has sent nothing that QUIC could answer.
     pub(super) fn is_unused(&self) -> bool {
         !self.is_claimed && !self.has_data
     }
 
-    /// True once the peer showed a certificate, which takes a cookie of DTLS: it receives where it says.
+    /// Returns `true` once the peer showed a certificate, which takes a cookie of DTLS: it receives at its address.
     pub(super) fn has_shown(&self) -> bool {
         self.certificate.is_some()
     }
@@ -471,8 +472,8 @@ impl Association {
         matches!(self.stage, Stage::Ended(_))
     }
 
-    /// Whether records that everybody can make may still be needed: during the handshake, and in DTLS 1.2 until the
-    /// dialer is known to have the last of our flights.
+    /// Returns whether records that everybody can make may still be needed: during the handshake, and in DTLS 1.2 until
+    /// the dialer is known to have the last of our flights.
     fn takes_plaintext(&self) -> bool {
         match self.stage {
             Stage::Handshake => true,
@@ -510,13 +511,13 @@ impl Association {
         });
     }
 
-    fn say(&mut self, inside: Inside) {
+    fn say(&mut self, inside: RecordMessage) {
         let result = self.dtls.send_application_data(&inside.to_bytes()).map(drop);
         self.check(result);
     }
 
-    /// Takes everything out of DTLS, also after an error: there may be an alert to send. True if there was something that
-    /// only the peer can have sent, and not before.
+    /// Takes everything out of DTLS, also after an error: there may be an alert to send. Returns `true` if something
+    /// was new that only the peer can have sent.
     fn drain(&mut self, now: Instant, sink: &mut Sink) -> bool {
         let mut has_heard = false;
         let mut output = std::mem::take(&mut sink.output);
@@ -545,8 +546,8 @@ impl Association {
                 Output::ApplicationData(data) => {
                     self.heard = now;
                     has_heard = true;
-                    if Inside::is_inside(data) {
-                        self.heed(Inside::parse(data), now, &mut sink.proof);
+                    if RecordMessage::is_inside(data) {
+                        self.heed(RecordMessage::parse(data), now, &mut sink.proof);
                     } else if matches!(self.stage, Stage::Up { .. }) {
                         self.has_data = true;
                         sink.plaintext(data);
@@ -576,7 +577,7 @@ impl Association {
         Ok(())
     }
 
-    /// Refuses the peer's certificate in a handshake that is not over, and says so outside of DTLS.
+    /// Refuses the peer's certificate in a handshake that is not over, and tells the peer outside of DTLS.
     fn refuse_early(&mut self, why: CertError, sink: &mut Sink) {
         if let Some(echo) = &self.echo {
             let word = front::refusal(tls_alert(&why), echo);
@@ -587,7 +588,7 @@ impl Association {
         self.end(End::Refused(why));
     }
 
-    /// The handshake is over; whose it was is judged here, before anything else of the peer counts.
+    /// Judges the peer when the handshake is over, before any of its other input counts.
     fn connected(&mut self, now: Instant) {
         if !matches!(self.stage, Stage::Handshake) {
             return;
@@ -596,7 +597,7 @@ impl Association {
         if self.is_dialer {
             let Some(peer) = self.listener.take() else { return self.refuse(CertError::NoCertificate) };
             self.stage = Stage::Asking { peer, next: now + ASK_INTERVAL, interval: ASK_INTERVAL };
-            return self.say(Inside::Ask);
+            return self.say(RecordMessage::Ask);
         }
         let verdict = match self.certificate.as_slice() {
             [] => Err(CertError::NoCertificate),
@@ -608,44 +609,44 @@ impl Association {
         };
     }
 
-    /// Tells the peer why, and ends.
+    /// Tells the peer the reason, and ends.
     fn refuse(&mut self, why: CertError) {
         let alert = tls_alert(&why);
         for _ in 0..REFUSAL_COPIES {
-            self.say(Inside::Refused { alert });
+            self.say(RecordMessage::Refused { alert });
         }
         self.end(End::Refused(why));
     }
 
-    /// What the peer says besides QUIC.
-    fn heed(&mut self, inside: Inside, now: Instant, proof: &mut Option<Token>) {
+    /// Takes a message of the peer besides QUIC.
+    fn heed(&mut self, inside: RecordMessage, now: Instant, proof: &mut Option<Token>) {
         match (inside, self.is_dialer) {
-            (Inside::Ask, false) => match &self.stage {
-                Stage::Up { .. } => self.say(Inside::Answer { id: self.id, reset: self.reset }),
+            (RecordMessage::Ask, false) => match &self.stage {
+                Stage::Up { .. } => self.say(RecordMessage::Answer { id: self.id, reset: self.reset }),
                 Stage::Refusing { why, .. } => {
                     let why = why.clone();
                     self.refuse(why);
                 }
                 _ => {}
             },
-            (Inside::Answer { id, reset }, true) => {
+            (RecordMessage::Answer { id, reset }, true) => {
                 if let Stage::Asking { peer, .. } = &self.stage {
                     self.stage = Stage::Up { peer: peer.clone(), since: now };
                     self.prefix = front::id_prefix(id);
                     self.reset = reset;
                 }
             }
-            (Inside::Refused { alert }, _) => {
+            (RecordMessage::Refused { alert }, _) => {
                 let is_early = matches!(self.stage, Stage::Asking { .. } | Stage::Refusing { .. });
                 if is_early || (!self.is_dialer && !self.is_claimed) {
                     self.end(End::ByPeer(PeerRefusal::from_alert(alert)));
                 }
             }
-            (Inside::Probe { token }, true) => self.say(Inside::Proof { token }),
-            (Inside::Proof { token }, false) => *proof = Some(token),
-            (Inside::Unknown, false) => self.say(Inside::Refused { alert: ALERT_VERSION }),
-            (Inside::Ask | Inside::Proof { .. } | Inside::Unknown, true)
-            | (Inside::Answer { .. } | Inside::Probe { .. }, false) => {}
+            (RecordMessage::Probe { token }, true) => self.say(RecordMessage::Proof { token }),
+            (RecordMessage::Proof { token }, false) => *proof = Some(token),
+            (RecordMessage::Unknown, false) => self.say(RecordMessage::Refused { alert: ALERT_VERSION }),
+            (RecordMessage::Ask | RecordMessage::Proof { .. } | RecordMessage::Unknown, true)
+            | (RecordMessage::Answer { .. } | RecordMessage::Probe { .. }, false) => {}
         }
     }
 }

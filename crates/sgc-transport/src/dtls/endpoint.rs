@@ -10,7 +10,7 @@ use tokio::sync::watch;
 use tokio::time::timeout;
 
 use super::keys;
-use super::mux::{Mux, Progress, Reports, wait_for_end, wait_until_up};
+use super::mux::{Mux, Progress, RefusalReceiver, wait_for_end, wait_until_up};
 use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, DialError, LinkError, ProtocolError, Refusal};
 use crate::framing::Greeting;
@@ -25,7 +25,7 @@ use crate::{race, socket};
 pub(crate) struct DtlsListener {
     mux: Arc<Mux>,
     quic: QuicListener,
-    reports: Reports,
+    reports: RefusalReceiver,
 }
 
 impl DtlsListener {
@@ -63,16 +63,16 @@ impl DtlsListener {
     }
 }
 
-/// Dials links over DTLS, each from a socket of its own: whatever arrives there is of one association, so that nothing
-/// has to be told apart, and dials to one address do not get into each other's way.
+/// Dials links over DTLS, each from a socket of its own: every datagram there belongs to one association, and dials to
+/// one address do not disturb each other.
 pub(crate) struct DtlsDialer {
-    shared: Arc<Shared>,
+    shared: Arc<DialContext>,
     metrics: Arc<TransportMetrics>,
-    links: Mutex<Vec<Dialed>>,
+    links: Mutex<Vec<DialSocket>>,
 }
 
-/// What every dial needs.
-struct Shared {
+/// Settings that every dial needs.
+struct DialContext {
     credentials: CredentialStore,
     options: LinkOptions,
     metrics: Arc<TransportMetrics>,
@@ -80,21 +80,21 @@ struct Shared {
 
 /// The socket of one link, twice: as the associations see it and as quinn does.
 #[derive(Clone)]
-struct Dialed {
+struct DialSocket {
     remote: SocketAddr,
     mux: Arc<Mux>,
     endpoint: Endpoint,
 }
 
-/// A dial that has not led to a link yet: given up, it says goodbye.
-struct Attempt(Dialed);
+/// A dial that has not led to a link yet. Dropping it says goodbye.
+struct Attempt(DialSocket);
 
 impl Drop for Attempt {
     fn drop(&mut self) {
-        let Dialed { mux, endpoint, .. } = self.0.clone();
-        // Where the runtime is gone, there is nothing left to say it with.
+        let DialSocket { mux, endpoint, .. } = self.0.clone();
+        // Without the runtime nothing can be sent any more.
         if let Ok(runtime) = tokio::runtime::Handle::try_current() {
-            // QUIC has a word to say before, if there is a connection.
+            // QUIC sends its close before, if there is a connection.
             runtime.spawn(async move {
                 endpoint.wait_idle().await;
                 mux.close();
@@ -104,7 +104,7 @@ impl Drop for Attempt {
 }
 
 /// A connection that has not greeted.
-struct Connected {
+struct UngreetedConnection {
     attempt: Attempt,
     connection: Connection,
     parts: Parts,
@@ -118,11 +118,11 @@ impl DtlsDialer {
         options: LinkOptions,
         metrics: Arc<TransportMetrics>,
     ) -> Self {
-        let shared = Shared { credentials, options, metrics: Arc::clone(&metrics) };
+        let shared = DialContext { credentials, options, metrics: Arc::clone(&metrics) };
         Self { shared: Arc::new(shared), metrics, links: Mutex::default() }
     }
 
-    /// Dials these addresses in this order, and says `url` of them.
+    /// Dials these addresses in this order; errors name `url`.
     pub(crate) async fn dial_at(
         &self,
         url: &LinkUrl,
@@ -140,8 +140,8 @@ impl DtlsDialer {
         Ok(link)
     }
 
-    async fn greet(&self, connected: Connected, greeting: Greeting) -> Result<QuicLink, LinkError> {
-        let Connected { attempt, connection, parts, peer, mut progress } = connected;
+    async fn greet(&self, connected: UngreetedConnection, greeting: Greeting) -> Result<QuicLink, LinkError> {
+        let UngreetedConnection { attempt, connection, parts, peer, mut progress } = connected;
         let inner = parts.findings.verdict().and_then(|verdict| verdict.as_ref().ok());
         if inner.is_none_or(|inner| inner.node_id != peer.node_id) {
             let (code, text) = CloseReason::Protocol(ProtocolError::OtherNode.to_string()).to_wire();
@@ -153,7 +153,7 @@ impl DtlsDialer {
         let mut links = self.links.lock().unwrap_or_else(PoisonError::into_inner);
         links.retain(|link| link.endpoint.open_connections() > 0);
         links.push(attempt.0.clone());
-        // Dropping the attempt does what is to be done at the end of the link.
+        // Dropping the attempt cleans up at the end of the link.
         Ok(link)
     }
 
@@ -174,7 +174,7 @@ impl DtlsDialer {
         for link in &links {
             link.endpoint.close(quinn::VarInt::from_u32(code), text.as_bytes());
         }
-        // Whoever has not heard by then learns it from its own time-out.
+        // The other peers notice the end by their own time-outs.
         let _ = timeout(quic::DRAIN_TIMEOUT, async {
             for link in &links {
                 link.endpoint.wait_idle().await;
@@ -184,15 +184,15 @@ impl DtlsDialer {
     }
 }
 
-impl Shared {
-    async fn connect(&self, remote: SocketAddr) -> Result<Connected, LinkError> {
+impl DialContext {
+    async fn connect(&self, remote: SocketAddr) -> Result<UngreetedConnection, LinkError> {
         let (io, _) = socket::bind(socket::any_like(remote), &self.options)?;
         let (credentials, options) = (self.credentials.clone(), self.options.clone());
         let (mux, _) = Mux::start(true, io, credentials, options, Arc::clone(&self.metrics))?;
         let config = quic::endpoint_config(Flavor::Dtls, None, 0);
         let endpoint =
             Endpoint::new_with_abstract_socket(config, None, mux.socket(), Arc::new(PromptRuntime))?;
-        let attempt = Attempt(Dialed { remote, mux, endpoint });
+        let attempt = Attempt(DialSocket { remote, mux, endpoint });
         let dialed = &attempt.0;
         let mut progress = dialed.mux.dial(remote).ok_or(LinkError::KeyUnsupported)?;
         let peer = wait_until_up(&mut progress).await?;
@@ -206,6 +206,6 @@ impl Shared {
             connection = connecting => connection?,
             error = wait_for_end(&mut progress) => return Err(error),
         };
-        Ok(Connected { attempt, connection, parts, peer, progress })
+        Ok(UngreetedConnection { attempt, connection, parts, peer, progress })
     }
 }

@@ -1,7 +1,7 @@
-//! Whole handshakes with a hostile peer, as a script of bytes has them: for `sgc-fuzz-targets`.
+//! Whole handshakes with a hostile peer, driven by a script of bytes, for `sgc-fuzz-targets`.
 //!
-//! One end is an [`Association`]; the other is a bare `dimpl`, whose datagrams are lost, doubled, postponed, altered, cut
-//! into other records and pieces, and mixed with what the script makes up.
+//! One end is an [`Association`]; the other is a bare `dimpl`, whose datagrams are lost, doubled, postponed, altered,
+//! cut into other records and pieces, and mixed with records of the script.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use sgc_trust::Identity;
 
 use super::association::{Association, Setup, Sink, Stage};
 use super::front;
-use super::keys::{Keys, Loan};
+use super::keys::{Keys, SigningKeyLease};
 use crate::credentials::CredentialStore;
 use crate::options::LinkOptions;
 
@@ -60,7 +60,7 @@ impl<'a> Script<'a> {
 /// The hostile end.
 struct Peer {
     dtls: Dtls,
-    _key: Loan,
+    _key: SigningKeyLease,
     output: Vec<u8>,
     /// dimpl is of no use after an error.
     is_broken: bool,
@@ -99,10 +99,10 @@ impl Peer {
 }
 
 /// An association and its peer.
-struct Meeting<'a> {
+struct AssociationPair<'a> {
     association: Association,
     is_dialer: bool,
-    /// Bytes that nobody but a member is to see in the clear.
+    /// Bytes that only a member may see in the clear.
     secret: &'a [u8],
     is_member: bool,
     peer: Peer,
@@ -112,14 +112,13 @@ struct Meeting<'a> {
 }
 
 impl HandshakeExercise {
-    /// With the identity of the association, and another member of its fleet.
+    /// Creates one with the identity of the association, and another member of its fleet.
     pub fn new(ours: Arc<Identity>, member: Arc<Identity>) -> Self {
         let leaf = ours.chain()[0].to_vec();
         Self { credentials: CredentialStore::new(ours), leaf, member }
     }
 
-    /// Plays a script. Whatever it does, nobody but a member is believed, and a dialer shows its certificate to nobody
-    /// else.
+    /// Plays a script. In every script only a member is believed, and a dialer shows its certificate to no other peer.
     pub fn run(&self, script: &[u8]) {
         let mut script = Script(script);
         let Some(mut meeting) = self.meet(&mut script) else { return };
@@ -143,13 +142,13 @@ impl HandshakeExercise {
         }
     }
 
-    fn meet(&self, script: &mut Script<'_>) -> Option<Meeting<'_>> {
+    fn meet(&self, script: &mut Script<'_>) -> Option<AssociationPair<'_>> {
         let flags = script.byte();
         let (is_dialer, is_old) = (flags & 1 > 0, flags & 2 > 0);
         let sizes: &[usize] =
             if is_old { &[64, 300, 1150, 2048, 16_000, 60_000] } else { &[800, 1150, 2048, 16_000] };
         let datagram_bytes = sizes[usize::from(script.byte()) % sizes.len()];
-        let key = Loan::new(self.member.certified_key())?;
+        let key = SigningKeyLease::new(self.member.certified_key())?;
         let DtlsCertificate { mut certificate, private_key } = key.certificate();
         // In DTLS 1.3 dimpl cannot send longer ones.
         let longest = if is_old { 60_000 } else { datagram_bytes * 4 };
@@ -189,7 +188,7 @@ impl HandshakeExercise {
         let association = Association::new(&setup, now)?;
         let (output, sent) = (vec![0; 1 << 17], VecDeque::new());
         let leaf = &self.leaf[..];
-        Some(Meeting {
+        Some(AssociationPair {
             association,
             is_dialer,
             secret: &leaf[leaf.len() / 2..leaf.len() / 2 + 24],
@@ -202,8 +201,8 @@ impl HandshakeExercise {
     }
 }
 
-impl Meeting<'_> {
-    /// Takes what the association has to say, and looks at where it stands.
+impl AssociationPair<'_> {
+    /// Takes the output of the association and checks its state.
     fn settle(&mut self) {
         let mut at = 0;
         for len in &self.sink.packet_lens {
@@ -225,24 +224,24 @@ impl Meeting<'_> {
     fn deliver(&mut self, datagram: &[u8]) {
         let (association, sink) = (&mut self.association, &mut self.sink);
         match front::sort(datagram) {
-            Some(front::Front::Plain(records) | front::Front::Id(_, records)) => {
+            Some(front::DatagramKind::Plain(records) | front::DatagramKind::Id(_, records)) => {
                 association.receive(records, self.now, sink);
             }
-            Some(front::Front::Refusal(alert, echo)) => association.refused_by_peer(alert, &echo),
-            Some(front::Front::Challenge(token, _)) => association.answer_challenge(&token, sink),
+            Some(front::DatagramKind::Refusal(alert, echo)) => association.refused_by_peer(alert, &echo),
+            Some(front::DatagramKind::Challenge(token, _)) => association.answer_challenge(&token, sink),
             _ => {}
         }
         self.settle();
         self.answer();
     }
 
-    /// Gives the peer what the association said.
+    /// Gives the peer the association's output.
     fn answer(&mut self) {
         while let Some(datagram) = self.to_peer.pop_front() {
             if let Some(
-                front::Front::Plain(records)
-                | front::Front::Id(_, records)
-                | front::Front::Ticket(_, records),
+                front::DatagramKind::Plain(records)
+                | front::DatagramKind::Id(_, records)
+                | front::DatagramKind::Ticket(_, records),
             ) = front::sort(&datagram)
             {
                 self.peer.drive(self.now, Some(records));
@@ -321,7 +320,7 @@ impl Meeting<'_> {
     }
 }
 
-/// A record of the script's own.
+/// Returns a record of the script's own.
 fn record(script: &mut Script<'_>) -> Vec<u8> {
     let mut record = vec![20 + script.byte() % 7, 0xfe, 0xfd, 0, script.byte() % 3, 0, 0, 0, 0, 0];
     record.push(script.byte());
@@ -331,7 +330,7 @@ fn record(script: &mut Script<'_>) -> Vec<u8> {
     record
 }
 
-/// The records of a datagram that have the head of unencrypted ones; the rest in one piece.
+/// Returns the records of a datagram that have the head of unencrypted ones; the rest in one piece.
 fn records(mut datagram: &[u8]) -> Vec<&[u8]> {
     let mut records = Vec::new();
     while !datagram.is_empty() {
@@ -348,7 +347,7 @@ fn records(mut datagram: &[u8]) -> Vec<&[u8]> {
     records
 }
 
-/// An unencrypted handshake record in pieces of so many bytes; any other as it is.
+/// Returns an unencrypted handshake record in pieces of this many bytes; any other unchanged.
 fn pieces(record: &[u8], bytes: usize) -> Vec<Vec<u8>> {
     let is_handshake = record.first() == Some(&22) && record.get(3..5) == Some(&[0, 0]);
     let whole = || vec![record.to_vec()];

@@ -1,13 +1,13 @@
-//! What stands in front of DTLS records on the wire, and what is said inside of them besides QUIC; bytes alone.
+//! The bytes in front of DTLS records on the wire, and the messages beside QUIC inside of them.
 //!
-//! It sorts datagrams and makes them. Whether what they claim is true is for [`super::association`] and [`super::mux`].
+//! This module sorts datagrams and makes them. [`super::association`] and [`super::mux`] check their claims.
 
-/// In front of a record: the association that it belongs to, wherever it comes from. All of these bytes lie outside of
-/// what DTLS begins its records with (RFC 7983, RFC 9443).
+/// In front of a record: the association that it belongs to, wherever it comes from. DTLS records begin with none of
+/// these bytes (RFC 7983, RFC 9443).
 const ID: u8 = 0xc1;
-/// Prove that you receive at your address.
+/// Asks the peer to prove that it receives at its address.
 const CHALLENGE: u8 = 0xc2;
-/// In front of a record: the proof.
+/// In front of a record: the token that proves the address.
 const TICKET: u8 = 0xc3;
 /// The association is not known here.
 const RESET: u8 = 0xc4;
@@ -16,18 +16,18 @@ const BUSY: u8 = 0xc5;
 /// The certificate is refused, in a handshake that is not over.
 const REFUSAL: u8 = 0xc6;
 
-/// First byte of what is said inside of records and is not QUIC: QUIC never begins a packet with it.
+/// First byte of a message inside of records: QUIC never begins a packet with it.
 const INSIDE: u8 = 0;
 const HELLO: u8 = 1;
 const REFUSED: u8 = 2;
 const PROBE: u8 = 3;
 const PROOF: u8 = 4;
-/// What is spoken inside.
+/// Version of the protocol inside.
 pub(super) const INSIDE_VERSION: u8 = 1;
 
 pub(super) const ID_BYTES: usize = 8;
 pub(super) const TOKEN_BYTES: usize = 16;
-/// How much of a ClientHello's random an answer repeats, so that only who saw it can answer.
+/// Bytes of a ClientHello's random that an answer repeats, so that only nodes that saw the hello can answer.
 pub(super) const ECHO_BYTES: usize = 16;
 
 const RECORD_HEAD_BYTES: usize = 13;
@@ -41,38 +41,38 @@ const SUPPORTED_VERSIONS: u16 = 43;
 pub(super) type Token = [u8; TOKEN_BYTES];
 pub(super) type Echo = [u8; ECHO_BYTES];
 
-/// A datagram, by what stands in front.
+/// A datagram, by its first bytes.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Front<'a> {
-    /// Records as DTLS knows them.
+pub(super) enum DatagramKind<'a> {
+    /// Plain DTLS records.
     Plain(&'a [u8]),
     /// Records of an association.
     Id(u64, &'a [u8]),
-    /// Records of somebody who received a challenge.
+    /// Records of a peer that received a challenge.
     Ticket(Token, &'a [u8]),
     Challenge(Token, Echo),
     Reset(Token),
     Busy(Echo),
-    /// With an alert (RFC 8446, 6.2).
+    /// A refusal with an alert (RFC 8446, 6.2).
     Refusal(u8, Echo),
 }
 
-/// Sorts a datagram; `None` if it is none of ours.
-pub(super) fn sort(datagram: &[u8]) -> Option<Front<'_>> {
+/// Sorts a datagram; `None` if it is unknown.
+pub(super) fn sort(datagram: &[u8]) -> Option<DatagramKind<'_>> {
     let (first, rest) = datagram.split_first()?;
     match *first {
-        20..=63 => Some(Front::Plain(datagram)),
-        ID => rest.split_first_chunk().map(|(id, record)| Front::Id(u64::from_be_bytes(*id), record)),
-        TICKET => rest.split_first_chunk().map(|(token, record)| Front::Ticket(*token, record)),
+        20..=63 => Some(DatagramKind::Plain(datagram)),
+        ID => rest.split_first_chunk().map(|(id, record)| DatagramKind::Id(u64::from_be_bytes(*id), record)),
+        TICKET => rest.split_first_chunk().map(|(token, record)| DatagramKind::Ticket(*token, record)),
         CHALLENGE => {
             let (token, echo) = rest.split_first_chunk()?;
-            Some(Front::Challenge(*token, echo.try_into().ok()?))
+            Some(DatagramKind::Challenge(*token, echo.try_into().ok()?))
         }
-        RESET => rest.try_into().ok().map(Front::Reset),
-        BUSY => rest.try_into().ok().map(Front::Busy),
+        RESET => rest.try_into().ok().map(DatagramKind::Reset),
+        BUSY => rest.try_into().ok().map(DatagramKind::Busy),
         REFUSAL => {
             let (alert, echo) = rest.split_first()?;
-            Some(Front::Refusal(*alert, echo.try_into().ok()?))
+            Some(DatagramKind::Refusal(*alert, echo.try_into().ok()?))
         }
         _ => None,
     }
@@ -102,8 +102,8 @@ pub(super) fn refusal(alert: u8, echo: &Echo) -> Vec<u8> {
     [&[REFUSAL, alert], &echo[..]].concat()
 }
 
-/// The beginning of the random of the ClientHello that a datagram begins with; `None` if it begins with anything else.
-/// A hello that comes in pieces counts by the piece that holds the random.
+/// Returns the beginning of the random if a datagram begins with a ClientHello. A hello that comes in pieces counts by
+/// the piece that holds the random.
 pub(super) fn client_hello(datagram: &[u8]) -> Option<Echo> {
     let (kind, body) = first_piece(datagram)?;
     // Two bytes of version, then the random.
@@ -143,7 +143,7 @@ fn has_supported_versions(body: &[u8]) -> Option<bool> {
     Some(false)
 }
 
-/// The kind and the content of the unencrypted handshake message that a datagram begins with, if it is the message's
+/// Returns kind and content of the unencrypted handshake message that a datagram begins with, if it is the message's
 /// first piece.
 fn first_piece(datagram: &[u8]) -> Option<(u8, &[u8])> {
     let (head, rest) = datagram.split_at_checked(RECORD_HEAD_BYTES)?;
@@ -153,15 +153,15 @@ fn first_piece(datagram: &[u8]) -> Option<(u8, &[u8])> {
     (is_handshake && handshake[6..9] == [0, 0, 0]).then_some((handshake[0], body))
 }
 
-/// Whether any record of a datagram is one that everybody can make; also if it is malformed. Ciphertext of DTLS 1.3 has
-/// a header of its own, 001CSLEE (RFC 9147, 4).
+/// Returns whether any record of a datagram is one that everybody can make; also if it is malformed. Ciphertext of DTLS
+/// 1.3 has a header of its own, 001CSLEE (RFC 9147, 4).
 pub(super) fn has_plaintext(mut records: &[u8]) -> bool {
     while let Some(first) = records.first() {
         let next = match first {
             0x20..=0x3f if first & 0x10 == 0 => {
                 let sequence_bytes = if first & 0x08 == 0 { 1 } else { 2 };
                 if first & 0x04 == 0 {
-                    // Without a length it is the last.
+                    // A record without a length is the last.
                     return false;
                 }
                 let at = 1 + sequence_bytes;
@@ -185,24 +185,24 @@ fn epoch(head: &[u8]) -> u16 {
     u16::from_be_bytes([head[3], head[4]])
 }
 
-/// What is said inside of records.
+/// A message inside of records.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Inside {
-    /// The dialer asks.
+pub(super) enum RecordMessage {
+    /// The dialer asks for an id.
     Ask,
-    /// The listener answers: put this id in front from now on; that is how a reset of it would look.
+    /// The listener's answer: the id to put in front from now on, and the token of a reset.
     Answer { id: u64, reset: Token },
     /// The certificate is refused, with this alert (RFC 8446, 6.2).
     Refused { alert: u8 },
     /// The listener sends a token to an address.
     Probe { token: Token },
-    /// The dialer repeats it.
+    /// The dialer repeats the token.
     Proof { token: Token },
-    /// Another version, or nothing known.
+    /// Another version, or an unknown message.
     Unknown,
 }
 
-impl Inside {
+impl RecordMessage {
     pub(super) fn is_inside(plaintext: &[u8]) -> bool {
         plaintext.first() == Some(&INSIDE)
     }
@@ -241,29 +241,30 @@ impl Inside {
     }
 }
 
-/// What the fuzzer and the seeded test throw at this module: whatever is sorted is made of the same bytes again.
+/// Checks this module with one datagram, for the fuzzer and the seeded test: a sorted datagram encodes to the same
+/// bytes.
 #[doc(hidden)]
 pub fn exercise(datagram: &[u8]) {
     let again = match sort(datagram) {
         None => None,
-        Some(Front::Plain(record)) => {
+        Some(DatagramKind::Plain(record)) => {
             let _ = has_plaintext(record);
             // A hello is plaintext.
             assert!(client_hello(record).is_none() || has_plaintext(record));
             assert!(!is_without_dtls13(record) || has_plaintext(record));
             Some(record.to_vec())
         }
-        Some(Front::Id(id, record)) => Some([&id_prefix(id), record].concat()),
-        Some(Front::Ticket(token, record)) => Some([&ticket_prefix(&token), record].concat()),
-        Some(Front::Challenge(token, echo)) => Some(challenge(&token, &echo)),
-        Some(Front::Reset(token)) => Some(reset(&token)),
-        Some(Front::Busy(echo)) => Some(busy(&echo)),
-        Some(Front::Refusal(alert, echo)) => Some(refusal(alert, &echo)),
+        Some(DatagramKind::Id(id, record)) => Some([&id_prefix(id), record].concat()),
+        Some(DatagramKind::Ticket(token, record)) => Some([&ticket_prefix(&token), record].concat()),
+        Some(DatagramKind::Challenge(token, echo)) => Some(challenge(&token, &echo)),
+        Some(DatagramKind::Reset(token)) => Some(reset(&token)),
+        Some(DatagramKind::Busy(echo)) => Some(busy(&echo)),
+        Some(DatagramKind::Refusal(alert, echo)) => Some(refusal(alert, &echo)),
     };
     assert!(again.is_none_or(|again| again == datagram));
-    if Inside::is_inside(datagram) {
-        let inside = Inside::parse(datagram);
-        assert!(inside == Inside::Unknown || inside.to_bytes() == datagram);
+    if RecordMessage::is_inside(datagram) {
+        let inside = RecordMessage::parse(datagram);
+        assert!(inside == RecordMessage::Unknown || inside.to_bytes() == datagram);
     }
 }
 
@@ -314,7 +315,7 @@ mod tests {
         assert!(is_without_dtls13(&message(HELLO_VERIFY_REQUEST, &[0xfe, 0xff, 1, 5])));
         assert!(is_without_dtls13(&server_hello(&[0, 23, 0, 0])));
         assert!(!is_without_dtls13(&server_hello(&[0, 23, 0, 0, 0, 43, 0, 2, 0xfe, 0xfc])));
-        // A hello that is cut off says nothing.
+        // A hello that is cut off proves nothing.
         assert!(!is_without_dtls13(&server_hello(&[0, 23, 0, 9])));
         assert!(!is_without_dtls13(&hello()));
     }
@@ -334,8 +335,11 @@ mod tests {
     #[test]
     fn random_datagrams_are_sorted_without_harm() {
         let mut rng = ChaCha20Rng::seed_from_u64(7);
-        let known =
-            [hello(), challenge(&[1; 16], &[2; 16]), Inside::Answer { id: 7, reset: [3; 16] }.to_bytes()];
+        let known = [
+            hello(),
+            challenge(&[1; 16], &[2; 16]),
+            RecordMessage::Answer { id: 7, reset: [3; 16] }.to_bytes(),
+        ];
         for round in 0..20_000 {
             let mut bytes = match known.get(round % 8) {
                 Some(known) => known.clone(),

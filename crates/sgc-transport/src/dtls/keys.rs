@@ -1,5 +1,5 @@
-//! The private key of an identity, for `dimpl`, which would rather read it: it gets a number instead, and the signatures
-//! that it asks for under that number.
+//! The private key of an identity, for `dimpl`, which expects to read it. It gets a number instead, and signatures
+//! under that number.
 
 use std::collections::HashMap;
 use std::panic::AssertUnwindSafe;
@@ -20,15 +20,15 @@ fn lent() -> MutexGuard<'static, HashMap<u64, Arc<CertifiedKey>>> {
     LENT.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A key that can be signed with for as long as this lives.
+/// A registered signing key, for as long as this lives.
 #[derive(Debug)]
-pub(super) struct Loan {
+pub(super) struct SigningKeyLease {
     number: u64,
     certificate: DtlsCertificate,
 }
 
-impl Loan {
-    /// `None` if DTLS cannot use the key, or the certificate is longer than those that nodes read.
+impl SigningKeyLease {
+    /// Registers the key. Returns `None` if DTLS cannot use it, or the certificate is longer than the limit.
     pub(super) fn new(key: Arc<CertifiedKey>) -> Option<Self> {
         scheme(&key)?;
         let leaf = key.cert.first().filter(|leaf| leaf.len() <= CERT_BYTES_MAX)?.to_vec();
@@ -38,19 +38,19 @@ impl Loan {
         Some(Self { number, certificate })
     }
 
-    /// The certificate, with the number for its key.
+    /// Returns the certificate, with the number of its key.
     pub(super) fn certificate(&self) -> DtlsCertificate {
         self.certificate.clone()
     }
 }
 
-impl Drop for Loan {
+impl Drop for SigningKeyLease {
     fn drop(&mut self) {
         lent().remove(&self.number);
     }
 }
 
-/// What the key signs with, if DTLS knows it.
+/// Returns the signature scheme of the key, if DTLS knows it.
 pub(super) fn scheme(key: &CertifiedKey) -> Option<SignatureScheme> {
     let known = [SignatureScheme::ECDSA_NISTP256_SHA256, SignatureScheme::ECDSA_NISTP384_SHA384];
     key.key.choose_scheme(&known).map(|signer| signer.scheme())

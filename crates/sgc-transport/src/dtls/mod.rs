@@ -1,8 +1,8 @@
 //! Links over DTLS 1.2 and 1.3: QUIC, whose datagrams travel as application data of DTLS associations.
 //!
-//! Recovery, streams and priorities are QUIC's. What is made here: associations, whose they are, and how they are found
-//! again when a peer's address changes. `front`: bytes; `association`: one of them, without IO; `paths`: where its peer is;
-//! `mux`: all of one socket; `endpoint`: listening and dialling.
+//! QUIC does recovery, streams and priorities. This module makes associations, authenticates their peers, and finds
+//! associations again when a peer's address changes. `front`: bytes; `association`: one association, without IO;
+//! `paths`: its peer's addresses; `mux`: all associations of one socket; `endpoint`: listening and dialling.
 
 mod association;
 mod endpoint;

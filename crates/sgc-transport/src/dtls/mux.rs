@@ -1,9 +1,9 @@
-//! All associations of one UDP socket, and the socket that quinn believes it has.
+//! All associations of one UDP socket, and the socket that quinn sees.
 //!
-//! Quinn sees the peers' real addresses and validates them when they change, as in any QUIC; here it is only found out
-//! which association a datagram belongs to, and that it is authentic. A dialer has a socket for each association, so
-//! what listeners send needs no id; a listener finds established associations by the id that it gave them, and those
-//! that are not yet by address.
+//! Quinn sees the peers' real addresses and validates them when they change, as in any QUIC. This module only finds the
+//! association of a datagram and checks that it is authentic. A dialer has a socket for each association, so datagrams
+//! from listeners need no id. A listener finds established associations by the id that it gave them, and the others by
+//! address.
 
 use std::collections::{HashMap, VecDeque};
 use std::fmt;
@@ -24,7 +24,7 @@ use sgc_trust::{AddressPrefix, VerifiedPeer};
 use tokio::sync::{Notify, mpsc, watch};
 
 use super::association::{Association, End, Setup, Sink, Stage};
-use super::front::{self, Echo, Front, Token};
+use super::front::{self, DatagramKind, Echo, Token};
 use super::paths::Paths;
 use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, LinkError, PeerRefusal, Refusal};
@@ -34,9 +34,9 @@ use crate::options::LinkOptions;
 
 /// Most unproven handshakes from one [`AddressPrefix`] before the next has to answer a challenge.
 const UNPROVEN_PER_ADDRESS_MAX: usize = 8;
-/// How long a handshake that has not proven its address may be silent.
+/// Longest silence of a handshake that has not proven its address.
 const UNPROVEN_PATIENCE: Duration = Duration::from_secs(3);
-/// How long a ticket holds, at least; at most twice that.
+/// Shortest validity of a ticket; the longest is twice that.
 const TICKET_PERIOD: Duration = Duration::from_secs(30);
 /// Shortest datagram that is answered with a reset, which is shorter.
 const RESET_FOR_BYTES_MIN: usize = 40;
@@ -44,18 +44,18 @@ const RESET_FOR_BYTES_MIN: usize = 40;
 const RESETS_PER_SECOND: u32 = 200;
 /// Refusals that wait to be reported; more are counted and not reported.
 const REPORTS_MAX: usize = 64;
-/// How long an association outlives its link, so that the last word of QUIC can be said again.
+/// Time that an association outlives its link, so that QUIC can repeat its last packet.
 const LINGER: Duration = Duration::from_secs(1);
-/// How seldom and how often timers are looked at.
+/// Longest and shortest time between two looks at the timers.
 const TICK_MAX: Duration = Duration::from_secs(1);
 const TICK_MIN: Duration = Duration::from_millis(10);
 
-/// How many buffers are received into at once, and how long each is: all that the kernel joins.
+/// Number of buffers for one receive call, and the length of each: the most that the kernel joins.
 const RECV_BUFFERS: usize = 4;
 const RECV_BUFFER_BYTES: usize = 1 << 16;
-/// How often the socket is read before other tasks have a turn.
+/// Most reads of the socket before other tasks have a turn.
 const RECV_ROUNDS_MAX: usize = 16;
-/// How many packets of one association are handed to quinn in one buffer.
+/// Most packets of one association in one buffer for quinn.
 const JOINED_MAX: usize = 8;
 
 const RESET_DOMAIN: &[u8] = b"sgc dtls reset v1";
@@ -78,24 +78,24 @@ pub(crate) struct Mux {
     reports: mpsc::Sender<(SocketAddr, Refusal)>,
 }
 
-/// Refusals that are the listener's to report.
-pub(crate) type Reports = mpsc::Receiver<(SocketAddr, Refusal)>;
+/// Receiver of refusals that the listener reports.
+pub(crate) type RefusalReceiver = mpsc::Receiver<(SocketAddr, Refusal)>;
 
 #[derive(Default)]
 struct Tables {
     by_id: HashMap<u64, Arc<Peer>>,
-    /// Handshakes.
+    /// Associations whose handshake is not over.
     pending: HashMap<SocketAddr, Arc<Peer>>,
-    /// Established associations, by where their peers are.
+    /// Established associations by their peers' addresses.
     routes: HashMap<SocketAddr, Arc<Peer>>,
     resets_since: Option<Instant>,
     resets: u32,
 }
 
-/// One association and where its peer is.
+/// One association and its peer's address.
 pub(crate) struct Peer {
     id: u64,
-    /// It receives at its address.
+    /// Set once the peer has proven that it receives at its address.
     is_proven: AtomicBool,
     state: Mutex<PeerState>,
     progress: watch::Sender<Progress>,
@@ -131,7 +131,7 @@ struct PeerState {
     released: Option<Instant>,
 }
 
-/// What users of an association wait for.
+/// Progress of an association, for its users.
 #[derive(Clone)]
 pub(super) enum Progress {
     Connecting,
@@ -150,17 +150,17 @@ fn random<const N: usize>() -> [u8; N] {
 }
 
 impl Mux {
-    /// For a listener's socket, or for one that is dialled from.
+    /// Starts the associations of a listener's socket, or of a dialer's.
     pub(super) fn start(
         is_dialer: bool,
         io: Arc<dyn AsyncUdpSocket>,
         credentials: CredentialStore,
         options: LinkOptions,
         metrics: Arc<TransportMetrics>,
-    ) -> io::Result<(Arc<Self>, Reports)> {
+    ) -> io::Result<(Arc<Self>, RefusalReceiver)> {
         let port = io.local_addr()?.port();
         let (reports, receiver) = mpsc::channel(REPORTS_MAX);
-        // Without a key in the identity, the next run knows nothing of this one, and is silent.
+        // Without a key in the identity, the next run cannot reset associations of this one and stays silent.
         let reset_key = credentials.identity().reset_key().copied().unwrap_or_else(random);
         let reset_key = hmac::Key::new(hmac::HMAC_SHA256, &reset_key);
         let derived = hmac::sign(&reset_key, &[RESET_DOMAIN, &port.to_be_bytes()].concat());
@@ -184,19 +184,19 @@ impl Mux {
         Ok((mux, receiver))
     }
 
-    /// The socket for quinn.
+    /// Returns the socket for quinn.
     pub(super) fn socket(self: &Arc<Self>) -> Arc<DtlsSocket> {
         let io = Arc::clone(&lock(&self.io));
         Arc::new(DtlsSocket { mux: Arc::clone(self), io, recv: Mutex::default(), send: Arc::default() })
     }
 
-    /// Goes on with another socket; the result is quinn's.
+    /// Moves to another socket and returns the one for quinn.
     pub(super) fn move_to(self: &Arc<Self>, io: Arc<dyn AsyncUdpSocket>) -> Arc<DtlsSocket> {
         *lock(&self.io) = io;
         self.socket()
     }
 
-    /// Begins an association with this address; `None` if DTLS cannot use the identity's key.
+    /// Begins an association with this address. Returns `None` if DTLS cannot use the identity's key.
     pub(super) fn dial(&self, remote: SocketAddr) -> Option<watch::Receiver<Progress>> {
         let peer = self.open(remote, None, None, true)?;
         let mut sink = Sink::default();
@@ -206,7 +206,8 @@ impl Mux {
         Some(peer.progress.subscribe())
     }
 
-    /// Makes the association at this address the one of a link with this node. `None` if it is another's, or taken.
+    /// Takes the association at this address for a link with this node. Returns `None` if it is another node's, or
+    /// taken.
     pub(crate) fn claim(self: &Arc<Self>, remote: SocketAddr, node: &VerifiedPeer) -> Option<Claim> {
         let peer = lock(&self.tables).routes.get(&remote).cloned()?;
         let is_free = {
@@ -273,7 +274,7 @@ impl Mux {
         truncated(&hmac::sign(&self.reset_key, &id.to_be_bytes()))
     }
 
-    /// What somebody has to show who claims to receive at this address.
+    /// Returns the token that proves that a peer receives at this address.
     fn ticket(&self, remote: SocketAddr, now: Instant, age: u64) -> Option<Token> {
         let period = now.saturating_duration_since(self.born).as_secs() / TICKET_PERIOD.as_secs();
         let period = period.checked_sub(age)?;
@@ -289,15 +290,17 @@ impl Mux {
         holds(0) || holds(1)
     }
 
-    /// Takes one datagram; what QUIC is to see of it is added to `data`.
+    /// Takes one datagram and adds the packets for QUIC to `data`.
     fn receive(&self, datagram: &[u8], meta: &RecvMeta, now: Instant, sink: &mut Sink, data: &mut Ready) {
         let remote = meta.addr;
         match (front::sort(datagram), self.is_dialer) {
-            (Some(Front::Plain(records)), _) => self.receive_plain(records, None, meta, now, sink, data),
-            (Some(Front::Ticket(token, records)), false) => {
+            (Some(DatagramKind::Plain(records)), _) => {
+                self.receive_plain(records, None, meta, now, sink, data)
+            }
+            (Some(DatagramKind::Ticket(token, records)), false) => {
                 self.receive_plain(records, Some(&token), meta, now, sink, data);
             }
-            (Some(Front::Id(id, records)), false) => {
+            (Some(DatagramKind::Id(id, records)), false) => {
                 let peer = lock(&self.tables).by_id.get(&id).cloned();
                 match peer {
                     Some(peer) => {
@@ -307,7 +310,7 @@ impl Mux {
                     None => {}
                 }
             }
-            (Some(Front::Challenge(token, echo)), true) => {
+            (Some(DatagramKind::Challenge(token, echo)), true) => {
                 let Some(peer) = self.pending_at(remote) else { return };
                 let mut state = lock(&peer.state);
                 if state.association.echo() == Some(echo) {
@@ -316,7 +319,7 @@ impl Mux {
                     self.transmit(sink, remote, None);
                 }
             }
-            (Some(Front::Busy(echo)), true) => {
+            (Some(DatagramKind::Busy(echo)), true) => {
                 let Some(peer) = self.pending_at(remote) else { return };
                 let mut state = lock(&peer.state);
                 if state.association.echo() == Some(echo) {
@@ -324,13 +327,13 @@ impl Mux {
                     self.settle(&peer, &mut state);
                 }
             }
-            (Some(Front::Refusal(alert, echo)), _) => {
+            (Some(DatagramKind::Refusal(alert, echo)), _) => {
                 let Some(peer) = self.pending_at(remote) else { return };
                 let mut state = lock(&peer.state);
                 state.association.refused_by_peer(alert, &echo);
                 self.settle(&peer, &mut state);
             }
-            (Some(Front::Reset(token)), true) => {
+            (Some(DatagramKind::Reset(token)), true) => {
                 let Some(peer) = lock(&self.tables).routes.get(&remote).cloned() else { return };
                 let mut state = lock(&peer.state);
                 if state.association.is_reset_by(&token) {
@@ -346,7 +349,7 @@ impl Mux {
         lock(&self.tables).pending.get(&remote).cloned()
     }
 
-    /// Records without an id: handshakes, and peers that know no ids.
+    /// Takes records without an id: from handshakes, and from peers that know no ids.
     fn receive_plain(
         &self,
         records: &[u8],
@@ -362,8 +365,8 @@ impl Mux {
             let tables = lock(&self.tables);
             (tables.pending.get(&remote).cloned(), tables.routes.get(&remote).cloned())
         };
-        // Whoever is established is not disturbed by a hello that anybody can send in its name, nor is whoever begins by
-        // what is established.
+        // Anybody can send a hello in a peer's name, so it does not disturb an established association. Nor do records of
+        // that association disturb a handshake from the same address.
         let peer = match (pending, route) {
             (Some(pending), Some(route)) if !front::has_plaintext(records) => {
                 if self.feed(&route, records, meta, now, sink, data) {
@@ -403,7 +406,7 @@ impl Mux {
         let Entry { is_admitted, evicted, refused } =
             lock(&self.places).make_room(remote, now, &self.metrics);
         if let Some(refused) = refused {
-            // A listener that does not keep up has the counters.
+            // If the listener does not keep up, the counters still show the refusal.
             let _ = self.reports.try_send(refused);
         }
         if let Some(Slot { peer, .. }) = evicted {
@@ -425,7 +428,7 @@ impl Mux {
         }
     }
 
-    /// Gives an association what is its own. Returns whether something in it was authentic and new.
+    /// Gives an association its records. Returns whether one of them was authentic and new.
     fn feed(
         &self,
         peer: &Arc<Peer>,
@@ -445,7 +448,7 @@ impl Mux {
             peer.is_proven.store(true, Relaxed);
         }
         let mut claim = self.settle(peer, state);
-        // Quinn hears of an address when it is proved.
+        // Quinn learns of an address once it is proven.
         let mut from = *meta;
         if is_authentic && (self.is_dialer || !matches!(state.association.stage(), Stage::Up { .. })) {
             state.src_ip = meta.dst_ip;
@@ -463,7 +466,7 @@ impl Mux {
                 }
             }
         }
-        // Handshakes are answered where they come from; so is what is said at a new address.
+        // Replies to handshakes and to records from a new address go to the address that they came from.
         self.transmit(sink, meta.addr, meta.dst_ip);
         data.take(sink, &from);
         self.probe(state, now, sink);
@@ -484,8 +487,8 @@ impl Mux {
         }
     }
 
-    /// An association proved that its peer is at this address: it gets what is sent there, unless another that has the
-    /// address proves the same.
+    /// Gives the address to an association whose peer has proven it, unless another association holds the address and
+    /// proves it again.
     fn claim_address(&self, address: SocketAddr, peer: &Arc<Peer>, now: Instant, sink: &mut Sink) {
         let owner = {
             let mut state = lock(&peer.state);
@@ -516,8 +519,7 @@ impl Mux {
         self.probe(&mut state, now, sink);
     }
 
-    /// Draws the consequences of where an association stands. Returns the address that it has proved to be its peer's by
-    /// a handshake.
+    /// Acts on the state of an association. Returns the address that its handshake has proven.
     fn settle(&self, peer: &Arc<Peer>, state: &mut PeerState) -> Option<SocketAddr> {
         match state.association.stage() {
             Stage::Up { peer: node, .. } if matches!(*peer.progress.borrow(), Progress::Connecting) => {
@@ -543,7 +545,7 @@ impl Mux {
                         tables.forget(*address, peer);
                     }
                 }
-                // Who said no more than a hello may be nobody; a link that was says itself why it ended.
+                // An end after no more than a hello may be nobody's. A link that existed reports its end itself.
                 let is_news = match end {
                     End::TimedOut => state.datagrams > 1,
                     End::Refused(_) | End::ByPeer(_) | End::TooLong => true,
@@ -570,7 +572,7 @@ impl Mux {
         None
     }
 
-    /// Does what is due, and says when to come again.
+    /// Runs due timers and returns the time of the next call.
     fn tick(&self, now: Instant, sink: &mut Sink) -> Instant {
         let peers: Vec<_> = lock(&self.tables).by_id.values().cloned().collect();
         let mut next = now + TICK_MAX;
@@ -609,7 +611,7 @@ impl Mux {
         next.max(now + TICK_MIN)
     }
 
-    /// Tells whoever put an id in front that is unknown here, so that it does not have to wait for a time-out.
+    /// Tells a peer that its id is unknown here, so that it does not have to wait for a time-out.
     fn reset(&self, id: u64, meta: &RecvMeta, now: Instant) {
         {
             let mut tables = lock(&self.tables);
@@ -626,11 +628,11 @@ impl Mux {
 
     fn say(&self, datagram: &[u8], to: &RecvMeta) {
         let io = Arc::clone(&lock(&self.io));
-        // What is not sent is asked for again.
+        // The peer asks again for anything that was not sent.
         let _ = io.try_send(&single(datagram, to.addr, to.dst_ip));
     }
 
-    /// Sends what does not come from quinn: what is lost of it is said again.
+    /// Sends records that do not come from quinn. The association repeats lost ones.
     fn transmit(&self, sink: &Sink, to: SocketAddr, src_ip: Option<IpAddr>) {
         if sink.packet_lens.is_empty() {
             return;
@@ -645,7 +647,7 @@ impl Mux {
 }
 
 impl Tables {
-    /// Forgets an address, unless it has become another's.
+    /// Forgets an address, unless another association has it now.
     fn forget(&mut self, address: SocketAddr, peer: &Arc<Peer>) {
         for table in [&mut self.pending, &mut self.routes] {
             if table.get(&address).is_some_and(|p| Arc::ptr_eq(p, peer)) {
@@ -661,14 +663,14 @@ impl fmt::Debug for Mux {
     }
 }
 
-/// The hold of a link on its association, which ends soon after it.
+/// A link's hold on its association, which ends soon after the link.
 pub(crate) struct Claim {
     mux: Arc<Mux>,
     peer: Arc<Peer>,
 }
 
 impl Claim {
-    /// Waits for the end of the association, in case that it comes before that of the link.
+    /// Waits for the end of the association, in case it comes before that of the link.
     pub(crate) fn ended(&self) -> impl Future<Output = LinkError> + Send + 'static {
         let mut progress = self.peer.progress.subscribe();
         async move { wait_for_end(&mut progress).await }
@@ -712,12 +714,12 @@ async fn keep_time(mux: Weak<Mux>, wake: Arc<Notify>) {
     }
 }
 
-/// What quinn takes for a UDP socket.
+/// The socket that quinn uses as its UDP socket.
 pub(super) struct DtlsSocket {
     mux: Arc<Mux>,
     io: Arc<dyn AsyncUdpSocket>,
     recv: Mutex<Recv>,
-    send: Arc<Mutex<Sealed>>,
+    send: Arc<Mutex<SendQueue>>,
 }
 
 #[derive(Default)]
@@ -745,11 +747,11 @@ impl Ready {
         }
     }
 
-    /// Fills what quinn offers, packets of one kind together.
+    /// Fills quinn's buffers, packets of one kind together.
     fn give(&mut self, bufs: &mut [IoSliceMut<'_>], meta: &mut [RecvMeta]) -> usize {
         let mut count = 0;
         for (buf, meta) in bufs.iter_mut().zip(meta.iter_mut()) {
-            // What is longer than QUIC takes is none of it.
+            // A packet longer than quinn's buffers does not belong to QUIC.
             while self.packets.front().is_some_and(|(_, range)| range.len() > buf.len()) {
                 self.packets.pop_front();
             }
@@ -761,7 +763,7 @@ impl Ready {
             while let Some((next, range)) = self.packets.front() {
                 let is_alike =
                     next.addr == first.addr && next.ecn == first.ecn && next.dst_ip == first.dst_ip;
-                // One that is shorter can only be the last.
+                // Only the last packet may be shorter.
                 if !is_alike || range.len() > stride || len + range.len() > buf.len() || joined == JOINED_MAX
                 {
                     break;
@@ -785,16 +787,16 @@ impl Ready {
     }
 }
 
-/// Packets that are sealed, and that the socket did not take yet.
+/// Sealed packets that the socket did not take yet.
 #[derive(Default)]
-struct Sealed {
+struct SendQueue {
     sink: Sink,
-    /// How many of them have left, and where the next begins.
+    /// Number of packets that have left, and the offset of the next.
     sent: (usize, usize),
     to: Option<Heading>,
 }
 
-/// Where packets go, and how.
+/// Destination and marks of packets.
 #[derive(Clone, Copy)]
 struct Heading {
     destination: SocketAddr,
@@ -802,8 +804,8 @@ struct Heading {
     ecn: Option<EcnCodepoint>,
 }
 
-impl Sealed {
-    /// Sends as many together as the socket can.
+impl SendQueue {
+    /// Sends as many packets together as the socket can.
     fn flush(&mut self, io: &dyn AsyncUdpSocket) -> io::Result<()> {
         let Some(Heading { destination, src_ip, ecn }) = self.to else { return Ok(()) };
         let (mut index, mut at) = self.sent;
@@ -834,16 +836,16 @@ impl AsyncUdpSocket for DtlsSocket {
         Arc::clone(&self.io).create_io_poller()
     }
 
-    /// Sealed packets cannot be taken back: what the socket does not take waits here, and goes before the next.
+    /// Sealed packets cannot be taken back: those that the socket does not take wait here and go before the next.
     fn try_send(&self, transmit: &Transmit<'_>) -> io::Result<()> {
         let mut send = lock(&self.send);
         send.flush(&*self.io)?;
         let peer = lock(&self.mux.tables).routes.get(&transmit.destination).cloned();
-        // Where nobody is, a packet is lost as it is on the way.
+        // A packet for an unknown address is lost, as if on the way.
         let Some(peer) = peer else { return Ok(()) };
         send.sink.clear();
         send.sent = (0, 0);
-        // Quinn learns that its peer has moved when something comes from there; the association knows it before.
+        // Quinn learns that its peer has moved only when a packet comes from there; the association knows it before.
         let (destination, src_ip);
         {
             let now = Instant::now();
@@ -859,7 +861,7 @@ impl AsyncUdpSocket for DtlsSocket {
         send.to = Some(Heading { destination, src_ip, ecn: transmit.ecn });
         match send.flush(&*self.io) {
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
-                // Quinn may have nothing more to send, which would leave the rest here.
+                // Quinn may have nothing more to send, and the rest would stay here.
                 tokio::spawn(flush_later(Arc::clone(&self.io), Arc::clone(&self.send)));
                 Ok(())
             }
@@ -895,7 +897,7 @@ impl AsyncUdpSocket for DtlsSocket {
                 }
             }
         }
-        // A flood has had its turn.
+        // Other tasks run before the rest of a flood.
         cx.waker().wake_by_ref();
         Poll::Pending
     }
@@ -923,8 +925,8 @@ impl fmt::Debug for DtlsSocket {
     }
 }
 
-/// Sends what is left, once the socket takes more.
-async fn flush_later(io: Arc<dyn AsyncUdpSocket>, send: Arc<Mutex<Sealed>>) {
+/// Sends the rest once the socket takes more.
+async fn flush_later(io: Arc<dyn AsyncUdpSocket>, send: Arc<Mutex<SendQueue>>) {
     let mut poller = Arc::clone(&io).create_io_poller();
     loop {
         if poll_fn(|cx| poller.as_mut().poll_writable(cx)).await.is_err() {

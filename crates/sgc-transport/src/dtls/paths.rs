@@ -1,16 +1,16 @@
-//! Addresses of the peer of one association, as far as it has proved them: logic without IO.
+//! Proven addresses of one association's peer: logic without IO.
 //!
-//! A datagram proves who sent it and not where it comes from, since everybody can write any source address. So a listener
-//! asks the peer of an association to repeat a token that it sends to the new address, inside of the association
-//! (RFC 9000, 8.2), and sends nothing else there before. An address that is another association's present one changes
-//! hands only if its owner does not repeat a token that is sent to it. Who owns an address is for [`super::mux`].
+//! A datagram proves its sender but not its origin, because everybody can write any source address. So a listener asks
+//! the peer of an association to repeat a token that it sends to the new address, inside of the association (RFC 9000,
+//! 8.2), and sends nothing else there before. The present address of another association changes hands only if its
+//! owner does not repeat a token that is sent to it. [`super::mux`] keeps the owners of addresses.
 
 use std::net::{IpAddr, SocketAddr};
 use std::time::{Duration, Instant};
 
 use super::front::Token;
 
-/// Most addresses at which one association is reached: the present one, and those that it may just have left.
+/// Most addresses of one association: the present one, and those that the peer may just have left.
 pub(super) const ROUTES_MAX: usize = 3;
 /// Time until a token is sent again; it doubles.
 const PROBE_INTERVAL: Duration = Duration::from_millis(200);
@@ -19,11 +19,11 @@ const PROBES_MAX: u32 = 4;
 /// Longest time that the owner of an address may take to repeat a token.
 const CONTEST_PATIENCE: Duration = Duration::from_secs(2);
 
-/// A token under way to an address.
+/// A token in flight to an address.
 #[derive(Clone, Copy, Debug)]
 struct Probe {
     address: SocketAddr,
-    /// Which address of ours it is sent from.
+    /// The local address that sends it.
     src_ip: Option<IpAddr>,
     token: Token,
     sent: u32,
@@ -47,7 +47,7 @@ impl Probe {
         PROBE_INTERVAL * ((1 << PROBES_MAX) - 1)
     }
 
-    /// The token, if it is to be sent now.
+    /// Returns the token, if it is due now.
     fn poll(&mut self, now: Instant) -> Option<Sending> {
         if now < self.next || self.sent == PROBES_MAX {
             return None;
@@ -62,7 +62,7 @@ impl Probe {
     }
 }
 
-/// A token to be sent.
+/// A token to send.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Sending {
     pub(super) address: SocketAddr,
@@ -80,13 +80,13 @@ pub(super) struct Loss {
 /// The addresses of one association's peer.
 #[derive(Debug)]
 pub(super) struct Paths {
-    /// The present one first.
+    /// The present address first.
     addresses: Vec<SocketAddr>,
-    /// The present address is another association's by now.
+    /// Set if another association has the present address now.
     is_displaced: bool,
     /// The address that the peer may have moved to.
     moving: Option<Probe>,
-    /// The address that another association claims, and the number of that one.
+    /// The address that another association claims, and that association's number.
     contest: Option<(Probe, u64)>,
 }
 
@@ -110,7 +110,8 @@ impl Paths {
         if self.is_displaced || !self.addresses.contains(&address) { address } else { self.present() }
     }
 
-    /// Something authentic came from this address. Returns whether it is the present one; else its proof begins.
+    /// Notes that something authentic came from this address. Returns whether it is the present one; otherwise its
+    /// proof begins.
     pub(super) fn heard(
         &mut self,
         address: SocketAddr,
@@ -127,14 +128,14 @@ impl Paths {
         false
     }
 
-    /// The peer repeated this token. Returns the address that it has proved to be its own by that, if that is news.
+    /// Notes that the peer repeated this token. Returns the address that this proves, if that is news.
     pub(super) fn proved(&mut self, token: &Token) -> Option<SocketAddr> {
         self.contest = self.contest.take().filter(|(probe, _)| probe.token != *token);
         let proved = self.moving.take_if(|probe| probe.token == *token)?;
         Some(proved.address)
     }
 
-    /// Another association claims an address of this one: the proof begins that it is still the peer's.
+    /// Notes that another association claims an address of this one: the peer has to prove it again.
     pub(super) fn contested(
         &mut self,
         address: SocketAddr,
@@ -149,12 +150,12 @@ impl Paths {
         }
     }
 
-    /// The address is another association's, so far: if the peer is heard from there again, it proves it again.
+    /// Leaves the address to another association; the peer may prove it again when it is heard from there.
     pub(super) fn refused(&mut self, address: SocketAddr) {
         self.is_displaced |= address == self.present();
     }
 
-    /// The address is the peer's, and the present one from now on. Returns the one that it is no longer reached at.
+    /// Makes the address the present one. Returns the address that the peer is no longer reached at.
     pub(super) fn moved_to(&mut self, address: SocketAddr) -> Option<SocketAddr> {
         self.is_displaced = false;
         self.addresses.retain(|known| *known != address);
@@ -168,7 +169,7 @@ impl Paths {
         contest.or_else(|| self.moving.as_mut().and_then(|probe| probe.poll(now)))
     }
 
-    /// Gives up what was not proved in time. Returns the address that the peer lost by that.
+    /// Gives up proofs that took too long. Returns the address that the peer lost.
     pub(super) fn expire(&mut self, now: Instant) -> Option<Loss> {
         self.moving = self.moving.filter(|probe| now < probe.end);
         let (probe, claimant) = self.contest.take_if(|(probe, _)| now >= probe.end)?;
@@ -213,7 +214,7 @@ mod tests {
         assert!(!paths.heard(address(2), None, || [2; 16], start));
         let sending = paths.poll(start).unwrap();
         assert_eq!((sending.address, sending.token), (address(2), [2; 16]));
-        // More from there does not make another token.
+        // A second datagram from there does not make another token.
         assert!(!paths.heard(address(2), None, || [3; 16], start));
         assert_eq!(paths.poll(start), None);
         assert_eq!(paths.proved(&[3; 16]), None);
@@ -224,7 +225,7 @@ mod tests {
         assert!(paths.heard(address(2), None, || [4; 16], start));
         assert_eq!(paths.forward(address(1)), address(2));
         assert_eq!(paths.forward(address(9)), address(9));
-        // Also one that it had before.
+        // The same holds for an earlier address.
         assert!(!paths.heard(address(1), None, || [5; 16], start));
     }
 
@@ -278,7 +279,7 @@ mod tests {
     #[test]
     fn claim_that_was_refused_is_made_again() {
         let (start, mut paths) = (Instant::now(), Paths::new(address(1)));
-        // By a handshake.
+        // A handshake proves the address.
         paths.refused(address(1));
         assert!(!paths.heard(address(1), None, || [1; 16], start));
         assert_eq!(paths.proved(&[1; 16]), Some(address(1)));
@@ -286,7 +287,7 @@ mod tests {
         assert!(!paths.heard(address(1), None, || [2; 16], start));
         assert_eq!(paths.proved(&[2; 16]), Some(address(1)));
         paths.moved_to(address(1));
-        // By a token.
+        // A token proves the address.
         assert!(!paths.heard(address(2), None, || [3; 16], start));
         assert_eq!(paths.proved(&[3; 16]), Some(address(2)));
         paths.refused(address(2));

@@ -1,8 +1,8 @@
-//! QUIC whose packets can be read by everyone and altered by no one, for `udp://`.
+//! QUIC with packets that everyone can read and nobody can alter, for `udp://`.
 //!
-//! Handshakes are those of QUIC. Afterwards the keys that would seal a packet only authenticate it: the AEAD is given
-//! all of the packet as associated data and nothing to encrypt, which leaves its tag (with AES-GCM this is GMAC, NIST SP
-//! 800-38D). What is *not* here: anything that keeps a payload secret. Payloads of topics are sealed by their source.
+//! Handshakes are those of QUIC. Afterwards the keys that would seal a packet only authenticate it: the AEAD gets all
+//! of the packet as associated data and nothing to encrypt, which leaves its tag (with AES-GCM this is GMAC, NIST SP
+//! 800-38D). Nothing here keeps a payload secret: sources seal the payloads of topics.
 
 use std::any::Any;
 use std::sync::Arc;
@@ -46,7 +46,7 @@ impl<C: ServerConfig + 'static> ServerConfig for Clear<C> {
     }
 }
 
-/// Which keys TLS hands out next: first those of the handshake, then those of everything after it.
+/// The keys that TLS hands out next: first those of the handshake, then those of everything after it.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Stage {
     Handshake,

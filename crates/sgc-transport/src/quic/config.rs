@@ -18,20 +18,20 @@ use crate::credentials::CredentialStore;
 use crate::options::LinkOptions;
 use crate::tls::{self, Findings};
 
-/// What lies below QUIC, and whether its packets can be read. Each has an application protocol (RFC 7301) of its own, so that
-/// none passes for another.
+/// The layer below QUIC, and whether its packets can be read. Each has an application protocol (RFC 7301) of its own,
+/// so that none passes for another.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Flavor {
-    /// QUIC as it is.
+    /// Plain QUIC.
     Quic,
     /// Inside of DTLS.
     Dtls,
-    /// With packets that are authenticated and not encrypted.
+    /// Plain QUIC with packets that are authenticated and not encrypted.
     Udp,
 }
 
 impl Flavor {
-    /// The application protocol of version 1.
+    /// Returns the application protocol of version 1.
     fn alpn(self) -> &'static [u8] {
         match self {
             Self::Quic => b"sgc/1",
@@ -43,15 +43,15 @@ impl Flavor {
 
 /// Most bytes that are kept of one peer before its handshake is worked on.
 const INCOMING_BYTES_MAX: u64 = 64 << 10;
-/// The same for all peers together.
+/// Most bytes that are kept of all peers together before their handshakes are worked on.
 const INCOMING_BYTES_TOTAL_MAX: u64 = 8 << 20;
-/// How many packets may overtake one before it counts as lost: the network reorders.
+/// Packets that may overtake one before it counts as lost: the network reorders.
 const PACKET_THRESHOLD: u32 = 16;
-/// What a round trip is taken to be before the first was seen: it sets the time after which a first packet is sent again.
+/// Assumed round trip before the first was seen: it sets the time after which a first packet is sent again.
 const INITIAL_RTT: Duration = Duration::from_millis(150);
-/// Longest QUIC packet inside of DTLS, bytes. With records, ids, UDP and IPv6 around it, it fits 1420 bytes, which is
-/// what a WireGuard tunnel carries; whether the path does is found out from 1200 on, which fits 1280. Beginning with it
-/// would not do: one that does not fit takes what is sent with it along, and so quinn never sees that it was its length.
+/// Longest QUIC packet inside of DTLS, bytes. With records, ids, UDP and IPv6 around it, it fits 1420 bytes, the MTU of
+/// a WireGuard tunnel. MTU discovery starts at 1200, which fits 1280, and does not begin with this length: a packet
+/// that does not fit is lost with its other content, and so quinn never sees that its length was the cause.
 const DTLS_MTU: u16 = 1340;
 const RESET_DOMAIN: &[u8] = b"sgc stateless reset v1";
 const CONNECTION_ID_BYTES: usize = 8;
@@ -60,11 +60,11 @@ const CONNECTION_ID_BYTES: usize = 8;
 pub(crate) struct Parts {
     pub(crate) findings: Arc<Findings>,
     pub(crate) gate: Arc<Gate>,
-    /// Its receive window, which it has from its handshake on.
+    /// Receive window of the connection, from its handshake on.
     pub(crate) lease: WindowLease,
 }
 
-/// Everything that belongs to neither side's handshake, for one connection, and the gate of that one.
+/// Returns the settings of one connection that both sides share, and its gate.
 pub(crate) fn transport(
     flavor: Flavor,
     options: &LinkOptions,
@@ -96,7 +96,7 @@ pub(crate) fn transport(
     (Arc::new(config), gate)
 }
 
-/// For one incoming connection, with a verdict of its own.
+/// Returns the settings of one incoming connection, with a verdict of its own.
 pub(super) fn server(
     flavor: Flavor,
     credentials: &CredentialStore,
@@ -113,12 +113,12 @@ pub(super) fn server(
     let lease = options.receive_budget.lease(options.receive_window_bytes);
     let (transport, gate) = transport(flavor, options, &lease);
     config.transport_config(transport);
-    // Retry makes its own tokens; those for later connections are not worth their state.
+    // Retry makes its own tokens; tokens for later connections are not worth their state.
     config.validation_token.sent(0);
     (config, Parts { findings, gate, lease })
 }
 
-/// For the listening endpoint itself.
+/// Returns the settings of the listening endpoint itself.
 pub(super) fn listener(
     flavor: Flavor,
     credentials: &CredentialStore,
@@ -132,7 +132,7 @@ pub(super) fn listener(
     config
 }
 
-/// For one outgoing connection, with a verdict of its own.
+/// Returns the settings of one outgoing connection, with a verdict of its own.
 pub(crate) fn client(
     flavor: Flavor,
     credentials: &CredentialStore,
@@ -153,9 +153,9 @@ pub(crate) fn client(
     (config, Parts { findings, gate, lease })
 }
 
-/// For the socket of a listener. With the identity's reset key, peers of a listener that was killed and started again on
-/// the same port learn it from the first packet that they send (RFC 9000, 10.3), instead of by a time-out. The port is
-/// part of the derivation, so that two listeners of one identity cannot be used against each other (21.11).
+/// Returns the settings of a listener's socket. With the identity's reset key, peers of a listener that was killed and
+/// restarted on the same port learn it from the first packet that they send (RFC 9000, 10.3), instead of by a time-out.
+/// The port is part of the derivation, so that two listeners of one identity cannot be used against each other (21.11).
 pub(crate) fn endpoint(flavor: Flavor, reset_key: Option<&[u8; 32]>, port: u16) -> EndpointConfig {
     let mut config = match reset_key {
         None => EndpointConfig::default(),
@@ -168,13 +168,13 @@ pub(crate) fn endpoint(flavor: Flavor, reset_key: Option<&[u8; 32]>, port: u16) 
             config
         }
     };
-    // Inside of DTLS the bit tells packets from what is said beside them.
+    // Inside of DTLS the bit tells packets from other messages.
     config.grease_quic_bit(flavor != Flavor::Dtls);
     config
 }
 
-/// Connection ids that say nothing, also not by whom they were made: quinn's own are recognised only by the run of a
-/// program that made them, and packets with others are not answered, so the next run would keep silent.
+/// Random connection ids that carry nothing, not even their maker. Only the run of a program that made quinn's own ids
+/// recognises them, and leaves packets with others unanswered, so the next run would stay silent.
 struct RandomIds;
 
 impl ConnectionIdGenerator for RandomIds {

@@ -1,8 +1,8 @@
 //! Making QUIC links: listening and dialling.
 //!
-//! A link is handed out only after both certificates were verified and the greetings were exchanged. The latter is
-//! also how a dialer learns that it was accepted: in TLS 1.3 the client's handshake is over before the
-//! server has looked at its certificate.
+//! A link is handed out only after both certificates were verified and the greetings were exchanged. The greeting is
+//! also the dialer's proof that it was accepted: in TLS 1.3 the client's handshake is over before the server has looked
+//! at its certificate.
 
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -19,7 +19,8 @@ use tokio::time::timeout;
 
 use super::config::{Flavor, Parts};
 use super::{
-    ControlRx, Fate, Inlet, Outlet, Places, QuicLink, Shared, Urgency, canonical, close, config, send_frame,
+    ControlRx, Inlet, LinkEnd, LinkInner, Outlet, Places, QuicLink, Urgency, canonical, close, config,
+    send_frame,
 };
 use crate::budget::WindowLease;
 use crate::credentials::CredentialStore;
@@ -38,7 +39,7 @@ use crate::url::LinkUrl;
 
 /// TLS requires a name; ours is neither sent nor compared.
 pub(crate) const SERVER_NAME: &str = "sgc.invalid";
-/// How long a closing endpoint waits for its peers to have heard of it.
+/// Time that a closing endpoint waits for its peers to hear of it.
 pub(crate) const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Awaits QUIC links on one socket.
@@ -72,13 +73,13 @@ impl Holder for Slot {
     }
 }
 
-/// What every incoming handshake needs.
+/// State that every incoming handshake needs.
 struct Acceptor {
     flavor: Flavor,
     credentials: CredentialStore,
     options: LinkOptions,
     metrics: Arc<TransportMetrics>,
-    /// The associations that these links travel in.
+    /// The associations below these links.
     dtls: Option<Arc<Mux>>,
 }
 
@@ -94,7 +95,7 @@ impl QuicListener {
         Self::on(flavor, socket, None, credentials, options, metrics)
     }
 
-    /// On a socket that is there, and over these associations.
+    /// Listens on this socket, over these associations.
     pub(crate) fn on(
         flavor: Flavor,
         socket: Arc<dyn AsyncUdpSocket>,
@@ -141,7 +142,7 @@ impl QuicListener {
         shut(&self.endpoint, reason).await;
     }
 
-    /// Starts the handshake of a peer that has a place, and returns the refusal that comes of it.
+    /// Starts the handshake of a peer that has a place, and returns its refusal.
     fn admit(&mut self, incoming: Incoming) -> Option<(SocketAddr, Refusal)> {
         let LinkOptions { handshakes_max, handshakes_unvalidated_max, .. } = self.acceptor.options;
         let pending = self.places.pending();
@@ -193,7 +194,7 @@ impl Acceptor {
         let refusal = |e: ConnectionError| refusal(&findings, &e, &self.options);
         let connection = incoming.accept_with(Arc::new(server)).map_err(refusal)?.await.map_err(refusal)?;
         validated.store(true, Relaxed);
-        let fate = Fate::new(self.options.idle_timeout);
+        let fate = LinkEnd::new(self.options.idle_timeout);
         let claim = match &self.dtls {
             None => None,
             Some(mux) => {
@@ -215,7 +216,7 @@ impl Acceptor {
             Ok((greeting, control)) => {
                 let ended = claim.as_ref().map(Claim::ended);
                 let places = Places::new(self.options.flows_max);
-                let held = Held { fate, places, lease, claim };
+                let held = LinkResources { fate, places, lease, claim };
                 let link = link(connection, &findings, false, greeting, control, held);
                 let link = link.map_err(Refusal::Certificate)?;
                 if let Some(ended) = ended {
@@ -253,7 +254,7 @@ impl QuicDialer {
         Self { flavor, credentials, options, metrics, endpoints: Mutex::default() }
     }
 
-    /// Dials these addresses in this order, and says `url` of them.
+    /// Dials these addresses in this order; errors name `url`.
     pub(crate) async fn dial_at(
         &self,
         url: &LinkUrl,
@@ -326,13 +327,13 @@ pub(crate) async fn greet(
     greeting: Greeting,
     options: &LinkOptions,
 ) -> Result<QuicLink, LinkError> {
-    let fate = Fate::new(options.idle_timeout);
+    let fate = LinkEnd::new(options.idle_timeout);
     let after = options.handshake_timeout;
     let greeted = async {
         let (tx, rx) = connection.open_bi().await.map_err(|e| fate.explain(&e))?;
         let mut tx = Outlet::new(tx, Urgency::Control, &fate, &gate);
         let mut rx = ControlRx { inlet: Inlet::new(rx, &fate, None), pieces: Pieces::default() };
-        // At once: the listener learns of the stream from what is sent on it.
+        // Sent at once: the listener learns of the stream from its first bytes.
         send_frame(&mut tx, greeting.to_bytes()).await?;
         hear_greeting(&mut rx).await?;
         Ok((tx, rx))
@@ -340,7 +341,7 @@ pub(crate) async fn greet(
     match timeout(after, greeted).await.unwrap_or(Err(LinkError::HandshakeTimedOut { after })) {
         Ok(control) => {
             let places = Places::new(options.flows_max);
-            let held = Held { fate, places, lease, claim: None };
+            let held = LinkResources { fate, places, lease, claim: None };
             link(connection, &findings, true, greeting, control, held).map_err(LinkError::RefusedHere)
         }
         Err(error) => {
@@ -375,8 +376,8 @@ async fn hear_greeting(rx: &mut ControlRx) -> Result<Greeting, LinkError> {
 }
 
 /// Resources that a link keeps until it ends.
-struct Held {
-    fate: Arc<Fate>,
+struct LinkResources {
+    fate: Arc<LinkEnd>,
     places: Arc<Places>,
     lease: WindowLease,
     claim: Option<Claim>,
@@ -388,7 +389,7 @@ fn link(
     is_dialer: bool,
     Greeting { lane }: Greeting,
     (control_tx, control_rx): (Outlet, ControlRx),
-    Held { fate, places, lease, claim }: Held,
+    LinkResources { fate, places, lease, claim }: LinkResources,
 ) -> Result<QuicLink, CertError> {
     // TLS with mandatory certificates ends no handshake without a verdict. If it ever did, no link comes of it.
     let peer = findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate))?;
@@ -396,7 +397,7 @@ fn link(
     let gate = Arc::clone(&control_tx.gate);
     let (control_tx, control_rx) = (control_tx.into(), control_rx.into());
     let labels = Arc::default();
-    let shared = Shared {
+    let shared = LinkInner {
         connection,
         peer,
         is_dialer,
@@ -424,7 +425,7 @@ fn key_exchange(connection: &Connection) -> KeyExchange {
     }
 }
 
-/// Why an incoming handshake failed.
+/// Returns the reason why an incoming handshake failed.
 fn refusal(findings: &Findings, error: &ConnectionError, options: &LinkOptions) -> Refusal {
     const ALERT_CERTIFICATE_REQUIRED: u64 = 0x100 + 116;
     const ALERT_PROTOCOL_VERSION: u64 = 0x100 + 70;
@@ -451,8 +452,8 @@ fn refusal(findings: &Findings, error: &ConnectionError, options: &LinkOptions) 
     }
 }
 
-/// Why an authenticated peer has no link after all.
-fn ungreeted(connection: &Connection, fate: &Fate, error: LinkError) -> Refusal {
+/// Returns the reason why an authenticated peer has no link after all.
+fn ungreeted(connection: &Connection, fate: &LinkEnd, error: LinkError) -> Refusal {
     match error {
         LinkError::Protocol(why) => {
             close(connection, fate, &CloseReason::Protocol(why.to_string()), why.clone().into());
@@ -470,6 +471,6 @@ fn ungreeted(connection: &Connection, fate: &Fate, error: LinkError) -> Refusal 
 async fn shut(endpoint: &Endpoint, reason: &CloseReason) {
     let (code, text) = reason.to_wire();
     endpoint.close(VarInt::from_u32(code), text.as_bytes());
-    // Whoever has not heard by then learns it from its own time-out.
+    // The other peers notice the end by their own time-outs.
     let _ = timeout(DRAIN_TIMEOUT, endpoint.wait_idle()).await;
 }

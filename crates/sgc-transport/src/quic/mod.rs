@@ -40,18 +40,18 @@ use crate::framing::{CONTROL_FRAME_BYTES_MAX, Pieces, control_head, datagram};
 use crate::labels::Labels;
 use crate::link::{KeyExchange, Link, LinkStats};
 
-/// How long QUIC has to end a connection by itself when what it travels in has ended.
+/// Time in which QUIC ends a connection by itself after the layer below has ended.
 const LAST_WORD: Duration = Duration::from_millis(500);
-/// How many pieces one read takes at most: it bounds what is received and not yet consumed.
+/// Most pieces of one read: it bounds received and unconsumed data.
 const READ_PIECES: usize = 32;
 
 /// A link over one QUIC connection.
 #[derive(Clone)]
 pub struct QuicLink {
-    shared: Arc<Shared>,
+    shared: Arc<LinkInner>,
 }
 
-struct Shared {
+struct LinkInner {
     connection: Connection,
     peer: VerifiedPeer,
     is_dialer: bool,
@@ -60,24 +60,24 @@ struct Shared {
     control_tx: Mutex<Outlet>,
     control_rx: Mutex<ControlRx>,
     labels: Arc<Labels>,
-    /// For datagrams that leave.
+    /// Memory for outgoing datagrams.
     datagrams: std::sync::Mutex<Slab>,
-    fate: Arc<Fate>,
+    fate: Arc<LinkEnd>,
     gate: Arc<Gate>,
     places: Arc<Places>,
     _lease: WindowLease,
-    /// Its hold on what it travels in.
+    /// Hold on the association below.
     _claim: Option<Claim>,
 }
 
-/// How the connection came to end, where this side knows better than QUIC.
+/// The cause of a connection's end, where this side knows it better than QUIC.
 #[derive(Debug)]
-pub(crate) struct Fate {
+pub(crate) struct LinkEnd {
     idle_timeout: Duration,
     ended_here: OnceLock<LinkError>,
 }
 
-impl Fate {
+impl LinkEnd {
     fn new(idle_timeout: Duration) -> Arc<Self> {
         Arc::new(Self { idle_timeout, ended_here: OnceLock::new() })
     }
@@ -90,7 +90,7 @@ impl Fate {
     }
 }
 
-/// What comes before what on a link.
+/// Order of priorities on a link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Urgency {
     Of(Class),
@@ -107,21 +107,21 @@ impl Urgency {
     }
 }
 
-/// The sending half of a stream. What it was given goes out whole and in order, also when a writer is cancelled.
+/// The sending half of a stream. Its bytes go out whole and in order, also when a writer is cancelled.
 #[derive(Debug)]
 pub(crate) struct Outlet {
     stream: SendStream,
     urgency: Urgency,
     pending: Chunks,
-    /// The part of it that is being written.
+    /// The part that is being written.
     piece: Chunks,
-    fate: Arc<Fate>,
+    fate: Arc<LinkEnd>,
     gate: Arc<Gate>,
 }
 
 impl Outlet {
-    fn new(stream: SendStream, urgency: Urgency, fate: &Arc<Fate>, gate: &Arc<Gate>) -> Self {
-        // Fails only on a stream that is closed already, which the first write then says.
+    fn new(stream: SendStream, urgency: Urgency, fate: &Arc<LinkEnd>, gate: &Arc<Gate>) -> Self {
+        // Fails only on a stream that is closed already, which the first write then reports.
         let _ = stream.set_priority(urgency.priority());
         let (fate, gate) = (Arc::clone(fate), Arc::clone(gate));
         Self { stream, urgency, pending: Vec::new(), piece: Vec::new(), fate, gate }
@@ -145,7 +145,7 @@ impl Outlet {
         Ok(())
     }
 
-    /// Writes what is pending, whatever else waits.
+    /// Writes everything pending, without waiting for the gate.
     async fn write_all(&mut self) -> Result<(), WriteError> {
         let written = self.stream.write_chunks(&mut self.pending).await?;
         self.pending.drain(..written.chunks);
@@ -153,14 +153,14 @@ impl Outlet {
         Ok(())
     }
 
-    /// Writes a piece of what is pending, as soon as the gate lets it.
+    /// Writes a piece of the pending bytes, as soon as the gate admits it.
     async fn write_piece(&mut self, class: Class) -> Result<(), WriteError> {
         let want = self.pending.iter().map(Bytes::len).sum();
         let permit = match self.gate.try_admit(class, want) {
             Some(permit) => permit,
             None => tokio::select! {
                 permit = self.gate.admit(class, want) => permit,
-                // It ends before it is finished only if the peer or the connection ends it.
+                // The stream stops before its end only if the peer or the connection ends it.
                 ended = self.stream.stopped() => return Err(match ended {
                     Ok(Some(code)) => WriteError::Stopped(code),
                     Ok(None) | Err(StoppedError::ZeroRttRejected) => WriteError::ClosedStream,
@@ -186,7 +186,7 @@ impl Outlet {
             })
             .await
         };
-        // What is left of it is pending, too; references would keep memory that has left.
+        // The rest is in `pending`, too; references here would keep memory of sent bytes.
         self.piece.clear();
         skip(&mut self.pending, written?.bytes);
         Ok(())
@@ -244,7 +244,7 @@ fn front(chunks: &[Bytes], mut bytes: usize, out: &mut Chunks) {
     }
 }
 
-/// Drops the first `bytes` of these, and what is empty then.
+/// Drops the first `bytes` of these, and empty pieces.
 fn skip(chunks: &mut Chunks, mut bytes: usize) {
     let whole = chunks
         .iter()
@@ -265,17 +265,17 @@ fn skip(chunks: &mut Chunks, mut bytes: usize) {
 #[derive(Debug)]
 pub(crate) struct Inlet {
     stream: RecvStream,
-    fate: Arc<Fate>,
+    fate: Arc<LinkEnd>,
     /// None for the control stream, which is no flow.
     _place: Option<Place>,
 }
 
 impl Inlet {
-    fn new(stream: RecvStream, fate: &Arc<Fate>, place: Option<Place>) -> Self {
+    fn new(stream: RecvStream, fate: &Arc<LinkEnd>, place: Option<Place>) -> Self {
         Self { stream, fate: Arc::clone(fate), _place: place }
     }
 
-    /// Waits for more of the stream and appends it; false at its end.
+    /// Waits for more of the stream and appends it. Returns `false` at the end.
     pub(crate) async fn fill(&mut self, pieces: &mut Pieces) -> Result<bool, FlowError> {
         let mut chunks = [const { Bytes::new() }; READ_PIECES];
         match self.stream.read_chunks(&mut chunks).await {
@@ -319,13 +319,13 @@ impl ControlRx {
 }
 
 impl QuicLink {
-    /// Ends the link when what it travels in ends before it, with the error that comes of that.
+    /// Ends the link when the layer below ends first, with its error.
     pub(crate) fn end_with(&self, lower: impl Future<Output = LinkError> + Send + 'static) {
         let shared = Arc::downgrade(&self.shared);
         tokio::spawn(async move {
             let error = lower.await;
             if !matches!(error, LinkError::PeerRestarted) {
-                // QUIC may have been told more, which it has yet to read.
+                // QUIC may have a close frame of the peer still to read.
                 tokio::time::sleep(LAST_WORD).await;
             }
             // Closing what is closed would change the reason.
@@ -337,7 +337,7 @@ impl QuicLink {
         });
     }
 
-    /// Ends the link because of what the peer did, unless it has ended already.
+    /// Ends the link because of the peer's mistake, unless it has ended already.
     fn fail(&self, error: LinkError) -> LinkError {
         if let LinkError::Protocol(why) = &error {
             let reason = CloseReason::Protocol(why.to_string());
@@ -380,13 +380,13 @@ impl Link for QuicLink {
     }
 
     async fn open_flow(&self, class: Class) -> Result<FlowTx, LinkError> {
-        let Shared { connection, fate, gate, .. } = &*self.shared;
+        let LinkInner { connection, fate, gate, .. } = &*self.shared;
         let stream = connection.open_uni().await.map_err(|e| fate.explain(&e))?;
         Ok(FlowTx::new(flow::Outlet::Quic(Outlet::new(stream, Urgency::Of(class), fate, gate))))
     }
 
     async fn accept_flow(&self) -> Result<FlowRx, LinkError> {
-        let Shared { connection, fate, labels, places, .. } = &*self.shared;
+        let LinkInner { connection, fate, labels, places, .. } = &*self.shared;
         let stream = connection.accept_uni().await.map_err(|e| fate.explain(&e))?;
         let inlet = Inlet::new(stream, fate, Some(places.take(connection)));
         Ok(FlowRx::new(flow::Inlet::Quic(inlet), Arc::clone(labels)))
@@ -397,7 +397,7 @@ impl Link for QuicLink {
     }
 
     async fn send_datagram_as(&self, packet: &Packet, label: Option<Label>) -> Result<(), LinkError> {
-        let Shared { connection, fate, gate, datagrams, .. } = &*self.shared;
+        let LinkInner { connection, fate, gate, datagrams, .. } = &*self.shared;
         let bytes = packet.encoded_bytes_as(label);
         let max = connection.max_datagram_size().unwrap_or(0);
         if bytes > max {
@@ -420,7 +420,7 @@ impl Link for QuicLink {
     }
 
     async fn recv_datagram(&self) -> Result<Result<Packet, DecodeError>, LinkError> {
-        let Shared { connection, fate, labels, .. } = &*self.shared;
+        let LinkInner { connection, fate, labels, .. } = &*self.shared;
         let datagram = connection.read_datagram().await.map_err(|e| fate.explain(&e))?;
         Ok(Packet::from_datagram_as(datagram, |label| labels.name_of(label)))
     }
@@ -469,7 +469,7 @@ impl fmt::Debug for QuicLink {
     }
 }
 
-fn close(connection: &Connection, fate: &Fate, reason: &CloseReason, error: LinkError) {
+fn close(connection: &Connection, fate: &LinkEnd, reason: &CloseReason, error: LinkError) {
     // The first reason stays, as it does in QUIC.
     let _ = fate.ended_here.set(error);
     let (code, text) = reason.to_wire();

@@ -1,16 +1,15 @@
-//! How many flows a peer may have open: a few at first, and more as it opens them. QUIC keeps a place for each that it may,
-//! used or not. Which flows there are is QUIC's to know.
+//! The number of flows that a peer may have open: a few at first, and more as it opens them. QUIC keeps a place for
+//! each permitted flow, used or not. QUIC knows the flows themselves.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use quinn::{Connection, VarInt};
 
-/// How many a peer may have open before it has opened any. A peer that wants more waits a round trip each time that it is
-/// given twice as many.
+/// Flows that a peer may have open at first. A peer that wants more waits a round trip for each doubling.
 const FLOWS_AT_FIRST: u32 = 256;
 
-/// How many it may have open at first where it may have so many in the end.
+/// Returns the number of flows at first, for this number in the end.
 pub(super) fn at_first(flows_max: u32) -> u32 {
     flows_max.min(FLOWS_AT_FIRST)
 }
@@ -28,13 +27,13 @@ pub(crate) struct Places {
 pub(crate) struct Place(Arc<Places>);
 
 impl Places {
-    /// Those of a link that was made with [`at_first`].
+    /// Returns the places of a link that was made with [`at_first`].
     pub(super) fn new(flows_max: u32) -> Arc<Self> {
         let permitted = at_first(flows_max).into();
         Arc::new(Self { open: AtomicU32::new(0), permitted, max: flows_max })
     }
 
-    /// A flow that was accepted takes its place. The peer may open more where it uses half of what it has.
+    /// Gives an accepted flow its place. The peer may open more once it uses half of its places.
     pub(super) fn take(self: &Arc<Self>, connection: &Connection) -> Place {
         if let Some(more) = self.note_taken() {
             connection.set_max_concurrent_uni_streams(VarInt::from_u32(more));
@@ -42,7 +41,7 @@ impl Places {
         Place(Arc::clone(self))
     }
 
-    /// How many are permitted from here on, if that changes.
+    /// Returns the new number of permitted flows, if it changes.
     fn note_taken(&self) -> Option<u32> {
         let open = self.open.fetch_add(1, Relaxed).saturating_add(1);
         let permitted = self.permitted.load(Relaxed);
@@ -65,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_opens_many_may_open_more_up_to_the_bound() {
+    fn a_peer_that_opens_many_flows_may_open_more_up_to_the_bound() {
         let places = Places::new(1000);
         let given: Vec<_> = (0..1000).filter_map(|n| Some((n, places.note_taken()?))).collect();
         assert_eq!(given, [(128, 512), (256, 1000)]);
@@ -74,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn who_opens_and_ends_needs_no_more() {
+    fn a_peer_that_ends_its_flows_needs_no_more_places() {
         let places = Places::new(1000);
         for _ in 0..1000 {
             assert_eq!(places.note_taken(), None);

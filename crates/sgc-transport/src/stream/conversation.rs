@@ -1,5 +1,5 @@
-//! Two ends of the machine that multiplexes (`mux.rs`) with a wire between them that is a function call: what
-//! benchmarks count. No socket and no clock; it checks nothing but how much arrives.
+//! Two ends of the multiplexing machine (`mux.rs`) with a function call as their wire, for benchmarks. No socket and no
+//! clock; it checks only the number of bytes that arrive.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -9,7 +9,7 @@ use sgc_wire::Class;
 
 use super::mux::{Limits, Mux, Read, RxId, TxId};
 
-/// As links have them by default, or less: none is reached.
+/// Limits of links by default, or less: none is reached.
 const LIMITS: Limits = Limits {
     flow_window: 8 << 20,
     link_window: 32 << 20,
@@ -20,11 +20,11 @@ const LIMITS: Limits = Limits {
     keep_alive: Duration::from_secs(1),
     idle_timeout: Duration::from_secs(10),
 };
-/// What one write to a socket takes.
+/// Bytes of one write to a socket.
 const BUDGET_BYTES: u64 = 64 << 10;
-/// One way over the wire.
+/// Delay of the wire in one direction.
 const DELAY: Duration = Duration::from_micros(50);
-/// Passes over the wire after which a message that is not there never comes.
+/// Passes over the wire after which a missing message never comes.
 const PASSES_MAX: usize = 1000;
 
 /// Two machines and one flow from the first to the second.
@@ -37,7 +37,7 @@ pub struct Conversation {
 }
 
 impl Conversation {
-    /// Both ends, greeted, and a flow that is open; `None` if it cannot be opened, which is a defect.
+    /// Returns both ends, greeted, and an open flow; `None` if it cannot be opened, which is a defect.
     pub fn new(now: Instant) -> Option<Self> {
         let mut ends = [Mux::new(LIMITS, now), Mux::new(LIMITS, now)];
         let mut wire = VecDeque::new();
@@ -46,8 +46,8 @@ impl Conversation {
         Some(Self { ends, flow, read: None, now, wire })
     }
 
-    /// Carries these chunks over and says how many bytes the far end read; `None` if the machines do not take each
-    /// other's words, or the chunks.
+    /// Carries these chunks over and returns the number of bytes that the far end read; `None` if the machines do not
+    /// take each other's input, or the chunks.
     pub fn carry(&mut self, mut chunks: Vec<Bytes>) -> Option<u64> {
         let expected: u64 = chunks.iter().map(|chunk| chunk.len() as u64).sum();
         let mut received = 0;
@@ -70,7 +70,7 @@ impl Conversation {
     }
 }
 
-/// Hands over what either end has to say at this time.
+/// Hands over the output of both ends at this time.
 fn pass([near, far]: &mut [Mux; 2], now: Instant, wire: &mut VecDeque<Bytes>) -> Option<()> {
     hand_over(near, far, now, wire)?;
     hand_over(far, near, now, wire)

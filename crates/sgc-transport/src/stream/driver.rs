@@ -14,12 +14,12 @@ use tokio::time::{Sleep, sleep_until, timeout};
 
 use super::record::RecordError;
 use super::wire::Wire;
-use super::{Shared, State};
+use super::{LinkInner, State};
 use crate::error::{CloseReason, LinkError, ProtocolError};
 
-/// Bytes fetched from the machine at once, at least and at most: what is urgent waits for no more. Between, what the path
-/// delivers in little time: what is written at once becomes TLS records of up to 16 KB, which can be read when the last byte
-/// is there, and on a thin path that takes long.
+/// Bytes fetched from the machine at once, at least and at most; between, the bytes that the path delivers in little
+/// time. Urgent packets wait for no more. Bytes written together become TLS records of up to 16 KB, which can be read
+/// only when the last byte is there, and on a thin path that takes long.
 const BATCH_BYTES: (u64, u64) = (2 << 10, 64 << 10);
 /// Bytes read at once.
 const READ_BYTES: usize = 64 << 10;
@@ -27,13 +27,13 @@ const READ_BYTES: usize = 64 << 10;
 const ROUNDS_MAX: usize = 16;
 /// Pieces written at once.
 const SLICES_MAX: usize = 64;
-/// How long a link that was closed has to tell its peer.
+/// Time that a closed link has to tell its peer.
 pub(super) const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
 /// Most bytes read and thrown away while a connection ends.
 const DRAIN_BYTES_MAX: u64 = 4 << 20;
 
 /// Runs a link until it is over.
-pub(super) async fn run(wire: Wire, shared: Arc<Shared>, idle_timeout: Duration) {
+pub(super) async fn run(wire: Wire, shared: Arc<LinkInner>, idle_timeout: Duration) {
     let mut driver = Driver {
         wire,
         out: VecDeque::new(),
@@ -53,13 +53,13 @@ pub(super) async fn run(wire: Wire, shared: Arc<Shared>, idle_timeout: Duration)
     shared.ended.notify_waiters();
 }
 
-/// Ends a connection so that the peer gets what was sent last: closing while something is unread would take it back.
+/// Ends a connection so that the peer gets the last bytes: closing with unread input would make the kernel drop them.
 pub(super) async fn part(mut wire: Wire) {
     let parting = async {
         wire.shutdown().await?;
         tokio::io::copy(&mut (&mut wire).take(DRAIN_BYTES_MAX), &mut tokio::io::sink()).await
     };
-    // It is over either way.
+    // The connection is over either way.
     let _ = timeout(DRAIN_TIMEOUT, parting).await;
 }
 
@@ -74,8 +74,8 @@ struct Driver {
 }
 
 impl Driver {
-    /// Ready once nothing more is to be done: true if the peer is to be waited for.
-    fn poll(&mut self, cx: &mut Context<'_>, shared: &Shared) -> Poll<bool> {
+    /// Ready once nothing is left to do: `true` if the task has to wait for the peer.
+    fn poll(&mut self, cx: &mut Context<'_>, shared: &LinkInner) -> Poll<bool> {
         for _ in 0..ROUNDS_MAX {
             let now = Instant::now();
             let has_read = match self.read(cx, shared, now) {
@@ -130,7 +130,12 @@ impl Driver {
         Poll::Pending
     }
 
-    fn read(&mut self, cx: &mut Context<'_>, shared: &Shared, now: Instant) -> Poll<Result<(), LinkError>> {
+    fn read(
+        &mut self,
+        cx: &mut Context<'_>,
+        shared: &LinkInner,
+        now: Instant,
+    ) -> Poll<Result<(), LinkError>> {
         let mut buffer = ReadBuf::new(&mut self.buffer);
         let result = ready!(Pin::new(&mut self.wire).poll_read(cx, &mut buffer));
         let result = result.and_then(|()| match buffer.filled().len() {
@@ -154,7 +159,7 @@ impl Driver {
         Poll::Ready(Ok(()))
     }
 
-    /// Writes what it has: true if that made room for more.
+    /// Writes waiting bytes. Ready with `true` if that made room for more.
     fn write(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<bool>> {
         let mut has_written = false;
         while !self.out.is_empty() {
@@ -187,17 +192,17 @@ impl Driver {
     }
 }
 
-trait PollElapsed {
+trait PollTimer {
     fn poll_elapsed(self, cx: &mut Context<'_>) -> Poll<()>;
 }
 
-impl PollElapsed for Pin<&mut Sleep> {
+impl PollTimer for Pin<&mut Sleep> {
     fn poll_elapsed(self, cx: &mut Context<'_>) -> Poll<()> {
         std::future::Future::poll(self, cx)
     }
 }
 
-/// Why a connection that was a link is gone.
+/// Returns the reason why an established connection is gone.
 pub(super) fn lost(error: io::Error, idle_timeout: Duration) -> LinkError {
     match error.kind() {
         io::ErrorKind::UnexpectedEof

@@ -13,8 +13,8 @@ use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::{sleep, timeout};
 
 use super::driver::{DRAIN_TIMEOUT, run};
-use super::handshake::{self, Made};
-use super::{About, Shared, StreamLink};
+use super::handshake::{self, EstablishedStream};
+use super::{LinkInfo, LinkInner, StreamLink};
 use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, DialError, LinkError, Refusal};
 use crate::framing::Greeting;
@@ -27,9 +27,9 @@ use crate::url::{LinkUrl, ListenAddr, Scheme};
 
 /// Connections that the kernel keeps until they are accepted.
 const BACKLOG: i32 = 1024;
-/// How long to wait where no connection can be accepted, for want of file descriptors for instance.
+/// Pause when no connection can be accepted, for want of file descriptors for instance.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
-/// A TLS alert, `internal_error`, before any keys: what a dialer is told that there is no time for.
+/// A TLS alert, `internal_error`, before any keys: tells a dialer that there is no time for it.
 const ALERT_OVERLOADED: [u8; 7] = [21, 3, 3, 0, 2, 2, 80];
 const HTTP_OVERLOADED: &[u8] =
     b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n";
@@ -43,7 +43,7 @@ pub(crate) struct StreamListener {
     places: Handshakes<Slot>,
 }
 
-/// What every incoming handshake needs.
+/// State that every incoming handshake needs.
 struct Acceptor {
     scheme: Scheme,
     path: String,
@@ -57,7 +57,7 @@ struct Acceptor {
 struct Slot {
     remote: SocketAddr,
     task: AbortHandle,
-    /// The peer has said something.
+    /// Set once the peer has sent something.
     has_spoken: Arc<AtomicBool>,
 }
 
@@ -125,8 +125,8 @@ impl StreamListener {
         self.acceptor.links.close(reason).await;
     }
 
-    /// Starts the handshake of a peer that has a place, and returns the refusal that comes of it. Connections that
-    /// are opened and left alone keep nobody out: they are not engaged, and give way.
+    /// Starts the handshake of a peer that has a place, and returns its refusal. Connections that are opened and left
+    /// alone keep nobody out: they are not engaged, and give way.
     fn admit(&mut self, tcp: TcpStream, remote: SocketAddr) -> Option<(SocketAddr, Refusal)> {
         let now = Instant::now();
         let Entry { is_admitted, evicted, refused } =
@@ -177,7 +177,7 @@ impl Acceptor {
         }
     }
 
-    /// Tells a dialer that it cannot be heard now, if that costs nothing.
+    /// Tells a dialer that there is no time for it now, if that costs nothing.
     fn turn_away(&self, tcp: TcpStream) {
         let text = if self.scheme == Scheme::Ws { HTTP_OVERLOADED } else { &ALERT_OVERLOADED };
         if let Ok(mut tcp) = tcp.into_std() {
@@ -203,7 +203,7 @@ impl StreamDialer {
         Self { credentials, options, metrics, links: Links::default() }
     }
 
-    /// Dials these addresses in this order, and says `url` of them.
+    /// Dials these addresses in this order; errors name `url`.
     pub(crate) async fn dial_at(
         &self,
         url: &LinkUrl,
@@ -238,27 +238,33 @@ impl StreamDialer {
 
 /// Makes a link of a stream, and starts its task.
 pub(super) fn start(
-    made: Made,
+    made: EstablishedStream,
     remote: SocketAddr,
     is_dialer: bool,
     options: &LinkOptions,
-) -> (StreamLink, Arc<Shared>) {
-    let Made { wire, counters, peer, lane, rtt, key_exchange, mtu_bytes } = made;
-    let shared = Shared::new(options, counters);
+) -> (StreamLink, Arc<LinkInner>) {
+    let EstablishedStream { wire, counters, peer, lane, rtt, key_exchange, mtu_bytes } = made;
+    let shared = LinkInner::new(options, counters);
     shared.lock().mux.note_handshake(rtt);
     prompt::spawn(run(wire, Arc::clone(&shared), options.idle_timeout));
-    let about = About { remote, is_dialer, lane, key_exchange, mtu_bytes };
+    let about = LinkInfo { remote, is_dialer, lane, key_exchange, mtu_bytes };
     (StreamLink::new(Arc::clone(&shared), peer, about), shared)
 }
 
 /// The links of one endpoint, to be closed with it.
 #[derive(Default)]
 struct Links {
-    all: Mutex<Vec<Weak<Shared>>>,
+    all: Mutex<Vec<Weak<LinkInner>>>,
 }
 
 impl Links {
-    fn start(&self, made: Made, remote: SocketAddr, is_dialer: bool, options: &LinkOptions) -> StreamLink {
+    fn start(
+        &self,
+        made: EstablishedStream,
+        remote: SocketAddr,
+        is_dialer: bool,
+        options: &LinkOptions,
+    ) -> StreamLink {
         let (link, shared) = start(made, remote, is_dialer, options);
         let mut all = self.all.lock().unwrap_or_else(PoisonError::into_inner);
         if all.len() == all.capacity() {
@@ -268,7 +274,7 @@ impl Links {
         link
     }
 
-    /// Closes all, and gives their peers a while to hear of it.
+    /// Closes all links, and gives their peers a while to hear of it.
     async fn close(&self, reason: &CloseReason) {
         let all = std::mem::take(&mut *self.all.lock().unwrap_or_else(PoisonError::into_inner));
         let all: Vec<_> = all.iter().filter_map(Weak::upgrade).collect();
@@ -284,7 +290,7 @@ impl Links {
     }
 }
 
-/// A socket that takes both families where its address is that of every interface.
+/// Opens a socket, for both families if its address is that of every interface.
 fn listen(addr: SocketAddr) -> io::Result<TcpListener> {
     use socket2::{Domain, Protocol, Socket, Type};
     let socket = Socket::new(Domain::for_address(addr), Type::STREAM, Some(Protocol::TCP))?;

@@ -1,5 +1,5 @@
-//! Whole conversations with the front door of stream links, in memory, for fuzzing: hostile bytes into the acceptor, a
-//! member that says what it likes inside of TLS, and somebody on the way who alters what two honest ends say.
+//! Whole conversations with the acceptor of stream links, in memory, for fuzzing: hostile bytes into the acceptor, a
+//! member that sends arbitrary bytes inside of TLS, and an attacker who alters the bytes of two honest ends.
 
 use std::io;
 use std::pin::Pin;
@@ -14,7 +14,7 @@ use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt as _, DuplexStream, ReadBuf
 use tokio::time::timeout;
 
 use super::endpoint::start;
-use super::handshake::{self, Prepared};
+use super::handshake::{self, PreparedSocket};
 use super::wire::{Counters, Wire};
 use crate::credentials::CredentialStore;
 use crate::framing::Greeting;
@@ -44,11 +44,11 @@ pub struct DoorExercise {
 /// The mode that the first byte of a script chooses.
 #[derive(Clone, Copy)]
 enum Mode {
-    /// The script is what a stranger says.
+    /// The script holds the bytes of a stranger.
     Stranger,
-    /// The script is what a member says inside of its TLS, greeting and frames.
+    /// The script holds the bytes of a member inside of its TLS, greeting and frames.
     Member,
-    /// The script is what becomes of the bytes between two honest ends.
+    /// The script changes the bytes between two honest ends.
     Between,
 }
 
@@ -116,8 +116,8 @@ impl DoorExercise {
         let steps: Vec<Step> = script.chunks_exact(4).map(Step::from_bytes).collect();
         let ours = steps.iter().copied().step_by(2).collect();
         let theirs = steps.iter().copied().skip(1).step_by(2).collect();
-        let near = Altered { pipe: near, steps: ours, at: 0 };
-        let far = Altered { pipe: far, steps: theirs, at: 0 };
+        let near = TamperingPipe { pipe: near, steps: ours, at: 0 };
+        let far = TamperingPipe { pipe: far, steps: theirs, at: 0 };
         let listener = async {
             if let Some(link) = self.accept(Box::new(near), scheme).await {
                 converse(&link).await;
@@ -141,7 +141,7 @@ impl DoorExercise {
     }
 }
 
-fn prepared(wire: Wire) -> Prepared {
+fn prepared(wire: Wire) -> PreparedSocket {
     (wire, Arc::<Counters>::default(), MTU_BYTES)
 }
 
@@ -153,7 +153,7 @@ fn url(scheme: Scheme) -> LinkUrl {
     LinkUrl { scheme, host: "localhost".into(), port: 1, path: None, cost_ms: None }
 }
 
-/// Says all of this, and hears what comes until the other end has enough.
+/// Sends the whole script, and reads until the other end has enough.
 async fn say(mut wire: impl AsyncRead + AsyncWrite + Unpin, script: &[u8]) {
     let said = async {
         wire.write_all(script).await?;
@@ -164,7 +164,7 @@ async fn say(mut wire: impl AsyncRead + AsyncWrite + Unpin, script: &[u8]) {
     let _ = timeout(SILENCE, tokio::io::copy(&mut wire, &mut tokio::io::sink())).await;
 }
 
-/// Reads whatever comes on a link until it ends or falls silent.
+/// Reads everything on a link until it ends or falls silent.
 async fn read_all(link: &super::StreamLink) {
     loop {
         let more = async {
@@ -186,7 +186,7 @@ async fn read_all(link: &super::StreamLink) {
     }
 }
 
-/// One honest end: sends its frames, and checks that those of the other come unaltered and in order.
+/// Runs one honest end: sends its frames, and checks that those of the other arrive unaltered and in order.
 async fn converse(link: &super::StreamLink) {
     let frame = |number: u8| Bytes::from(vec![number; 100 * usize::from(number) + 1]);
     for number in 0..FRAMES {
@@ -206,7 +206,7 @@ async fn converse(link: &super::StreamLink) {
     read_all(link).await;
 }
 
-/// A change of the stream, so many bytes behind the step before.
+/// A change of the stream, this many bytes behind the step before.
 #[derive(Clone, Copy)]
 struct Step {
     after: usize,
@@ -221,15 +221,15 @@ impl Step {
     }
 }
 
-/// A pipe on which somebody alters what is read.
-struct Altered {
+/// A pipe whose bytes an attacker alters.
+struct TamperingPipe {
     pipe: DuplexStream,
     steps: std::collections::VecDeque<Step>,
     /// Bytes since the last step.
     at: usize,
 }
 
-impl AsyncRead for Altered {
+impl AsyncRead for TamperingPipe {
     fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let this = self.get_mut();
         let room = buf.remaining();
@@ -263,7 +263,7 @@ impl AsyncRead for Altered {
             }
         }
         if bytes.is_empty() {
-            // Nothing is the end of the stream, which is not meant.
+            // An empty read would be the end of the stream, which is not meant.
             cx.waker().wake_by_ref();
             return Poll::Pending;
         }
@@ -273,7 +273,7 @@ impl AsyncRead for Altered {
     }
 }
 
-impl AsyncWrite for Altered {
+impl AsyncWrite for TamperingPipe {
     fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         Pin::new(&mut self.get_mut().pipe).poll_write(cx, buf)
     }

@@ -1,5 +1,5 @@
-//! How the frames of a multiplexed stream lie in its bytes (`docs/spec/wire.md`, stream links). Pure: it reads heads
-//! and writes them; what they mean is the machine's.
+//! Encoding of the frames of a multiplexed stream (`docs/spec/wire.md`, stream links). Pure: it reads and writes heads;
+//! the machine gives them their meaning.
 
 use bytes::{BufMut as _, BytesMut};
 
@@ -14,38 +14,38 @@ pub(crate) const HEAD_BYTES_MAX: usize = 1 + 3 * 8;
 
 const NUMBER_MAX: u64 = (1 << 62) - 1;
 
-/// What stands before the bytes of a frame, or all of it.
+/// The head of a frame, or the whole frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Head {
-    /// The first frame: what one flow may have under way at first, what all may have, and how many there may be.
+    /// The first frame: first credit of one flow, credit of all flows, and their number.
     Settings { flow_credit: u64, link_credit: u64, flows: u64 },
-    /// So many bytes of a flow follow.
+    /// This many bytes of a flow follow.
     Data { flow: u64, length: u64 },
     /// The flow is over, in good order.
     Finish { flow: u64 },
-    /// The flow is over before its time.
+    /// The flow ends early.
     Reset { flow: u64, code: u64 },
     /// A flow of the receiver is not wanted any more.
     Stop { flow: u64, code: u64 },
-    /// A flow of the receiver may have so many bytes in all.
+    /// A flow of the receiver may have this many bytes in all.
     Credit { flow: u64, bytes: u64 },
-    /// All flows of the receiver together may have so many bytes in all.
+    /// All flows of the receiver together may have this many bytes in all.
     LinkCredit { bytes: u64 },
-    /// The receiver may open so many flows in all.
+    /// The receiver may open this many flows in all.
     Flows { count: u64 },
-    /// A flow of the receiver has arrived, to its end.
+    /// A flow of the receiver has arrived completely.
     Done { flow: u64 },
-    /// So many bytes of a datagram follow.
+    /// This many bytes of a datagram follow.
     Datagram { length: u64 },
     /// Asks for a [`Head::Pong`] of this number.
     Ping { number: u64 },
     /// All pings up to this one have arrived.
     Pong { number: u64 },
-    /// The link is over; so many bytes of text follow.
+    /// The link is over; this many bytes of text follow.
     Close { code: u64, length: u64 },
 }
 
-/// Where the peer broke the rules of the multiplexed stream.
+/// A peer's breach of the rules of the multiplexed stream.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum StreamViolation {
     /// No frame has this type.
@@ -57,14 +57,14 @@ pub enum StreamViolation {
     /// A piece, a datagram or a text is longer than allowed, or empty.
     #[error("a {what} of {bytes} bytes, 1 to {max} are allowed")]
     Length {
-        /// Of what.
+        /// The kind of content.
         what: &'static str,
-        /// What it claims.
+        /// The claimed length.
         bytes: u64,
-        /// The most that may be.
+        /// The limit.
         max: u64,
     },
-    /// A flow was named that is not open: over already, or not the next one.
+    /// The named flow is not open: over already, or not the next one.
     #[error("flow {0} is not open")]
     Flow(u64),
     /// More flows than were permitted.
@@ -73,12 +73,12 @@ pub enum StreamViolation {
     /// More bytes than were permitted.
     #[error("more bytes than were permitted on {}", if *.0 == 0 { "the control stream" } else { "a flow" })]
     Credit(u64),
-    /// A ping that was not sent was answered.
+    /// The answer to a ping that was not sent.
     #[error("a ping was answered that was not sent")]
     Pong,
 }
 
-/// Reads a head: it and its length, or nothing while more bytes are needed.
+/// Reads a head. Returns it and its length, or nothing while more bytes are needed.
 pub(crate) fn read_head(bytes: &[u8]) -> Result<Option<(Head, usize)>, StreamViolation> {
     let Some((&kind, rest)) = bytes.split_first() else { return Ok(None) };
     let mut numbers = Numbers { rest };
@@ -109,7 +109,7 @@ pub(crate) fn read_head(bytes: &[u8]) -> Result<Option<(Head, usize)>, StreamVio
     }
 }
 
-/// Lengths are judged with the head, before anything waits for the bytes that they announce.
+/// Judges lengths with the head, before anything waits for the bytes that they announce.
 fn check_length(head: Head) -> Result<(), StreamViolation> {
     let (what, bytes, min, max) = match head {
         Head::Data { length, .. } => ("piece", length, 1, PIECE_BYTES_LIMIT),
@@ -121,7 +121,7 @@ fn check_length(head: Head) -> Result<(), StreamViolation> {
 }
 
 impl Head {
-    /// Appends it.
+    /// Appends the head.
     pub(crate) fn write(self, out: &mut BytesMut) {
         let (kind, numbers): (u8, &[u64]) = match &self {
             Self::Settings { flow_credit, link_credit, flows } => (0, &[*flow_credit, *link_credit, *flows]),
@@ -145,7 +145,7 @@ impl Head {
     }
 }
 
-/// Numbers as in QUIC (RFC 9000, 16): the first two bits say how many bytes there are.
+/// Writes a number as in QUIC (RFC 9000, 16): the first two bits tell its length.
 fn write_number(number: u64, out: &mut BytesMut) {
     match number {
         0..=0x3f => out.put_u8(number as u8),

@@ -24,8 +24,8 @@ use tokio::net::TcpStream;
 use tokio_rustls::{TlsAcceptor, TlsConnector, TlsStream};
 
 use super::driver::part;
-use super::record::{Keys, RecordError, Tagged};
-use super::wire::{Below, Counted, Counters, Wire};
+use super::record::{Keys, RecordError, RecordStream};
+use super::wire::{Counters, CountingTcp, TlsIo, Wire};
 use super::ws::{self, UpgradeError};
 use crate::credentials::CredentialStore;
 use crate::error::{LinkError, PeerRefusal, ProtocolError, Refusal};
@@ -38,11 +38,11 @@ use crate::url::{LinkUrl, Scheme};
 
 /// TLS requires a name; ours is neither sent nor compared.
 const SERVER_NAME: &str = "sgc.invalid";
-/// Bytes that the kernel holds beyond those that it has sent: what waits there can no longer be overtaken.
+/// Unsent bytes in the kernel: urgent packets can no longer overtake them.
 const UNSENT_BYTES_MAX: u32 = 64 << 10;
 
-/// The application protocol (RFC 7301) of the innermost TLS. The two of WebSocket share theirs: a web proxy makes one of the
-/// other.
+/// Returns the application protocol (RFC 7301) of the innermost TLS. The two schemes of WebSocket share theirs: a web
+/// proxy makes one of the other.
 fn alpn(scheme: Scheme) -> &'static [u8] {
     match scheme {
         Scheme::Tcp => b"sgc-tcp/2",
@@ -52,37 +52,37 @@ fn alpn(scheme: Scheme) -> &'static [u8] {
 }
 
 /// A stream with the peer at its other end.
-pub(super) struct Made {
+pub(super) struct EstablishedStream {
     pub(super) wire: Wire,
     pub(super) counters: Arc<Counters>,
     pub(super) peer: VerifiedPeer,
     pub(super) lane: Option<LaneToken>,
-    /// Of the handshake, with what both ends took to compute.
+    /// Round trip of the handshake, with the computing time of both ends.
     pub(super) rtt: Duration,
     pub(super) key_exchange: KeyExchange,
     pub(super) mtu_bytes: u16,
 }
 
-/// A TLS connection over whatever is below, and what is known of it.
-pub(super) struct Secured {
-    tls: TlsStream<Below>,
+/// A TLS connection over any stream below, with its findings.
+pub(super) struct TlsConnection {
+    tls: TlsStream<TlsIo>,
     findings: Arc<Findings>,
     counters: Arc<Counters>,
     mtu_bytes: u16,
     scheme: Scheme,
-    /// When the last round trip of the handshake began, and how long it took.
+    /// Begin and length of the handshake's last round trip.
     asked: Instant,
     rtt: Duration,
 }
 
-/// Why a handshake came to nothing.
+/// The reason why a handshake failed.
 enum Failure {
     Io(io::Error),
     Upgrade(UpgradeError),
     Protocol(ProtocolError),
     /// The peer agreed on no application protocol.
     Alpn,
-    /// Its certificate is not accepted.
+    /// The peer's certificate is not accepted.
     Certificate(CertError),
 }
 
@@ -98,8 +98,8 @@ impl From<io::Error> for Failure {
     }
 }
 
-/// Sets a fresh connection up: nothing waits for company, and little waits unsent.
-fn prepare(tcp: TcpStream, options: &LinkOptions) -> io::Result<Prepared> {
+/// Sets a fresh connection up: the kernel delays nothing and keeps little unsent.
+fn prepare(tcp: TcpStream, options: &LinkOptions) -> io::Result<PreparedSocket> {
     tcp.set_nodelay(true)?;
     let socket = SockRef::from(&tcp);
     if let Some(dscp) = options.dscp {
@@ -108,12 +108,12 @@ fn prepare(tcp: TcpStream, options: &LinkOptions) -> io::Result<Prepared> {
     socket.set_tcp_notsent_lowat(UNSENT_BYTES_MAX)?;
     let mtu_bytes = u16::try_from(socket.tcp_mss()?).unwrap_or(u16::MAX);
     let counters = Arc::<Counters>::default();
-    let wire = Box::new(Counted { tcp, counters: Arc::clone(&counters) });
+    let wire = Box::new(CountingTcp { tcp, counters: Arc::clone(&counters) });
     Ok((wire, counters, mtu_bytes))
 }
 
-fn below(scheme: Scheme, wire: Wire) -> Below {
-    if scheme == Scheme::Tcp { Below::until_close_notify(wire) } else { Below::whole(wire) }
+fn below(scheme: Scheme, wire: Wire) -> TlsIo {
+    if scheme == Scheme::Tcp { TlsIo::until_close_notify(wire) } else { TlsIo::whole(wire) }
 }
 
 /// Accepts on a TCP connection: all of the handshake.
@@ -123,22 +123,22 @@ pub(super) async fn accept(
     path: &str,
     credentials: &CredentialStore,
     options: &LinkOptions,
-) -> Result<Made, Refusal> {
+) -> Result<EstablishedStream, Refusal> {
     let prepared = prepare(tcp, options).map_err(|e| refusal(&Findings::default(), e.into()))?;
     accept_on(prepared, scheme, path, credentials, options).await
 }
 
 /// A fresh connection: itself, its counters and its longest packet.
-pub(super) type Prepared = (Wire, Arc<Counters>, u16);
+pub(super) type PreparedSocket = (Wire, Arc<Counters>, u16);
 
-/// The same on any stream of bytes.
+/// Accepts on any stream of bytes.
 pub(super) async fn accept_on(
-    (mut wire, counters, mtu_bytes): Prepared,
+    (mut wire, counters, mtu_bytes): PreparedSocket,
     scheme: Scheme,
     path: &str,
     credentials: &CredentialStore,
     options: &LinkOptions,
-) -> Result<Made, Refusal> {
+) -> Result<EstablishedStream, Refusal> {
     let nothing = Findings::default();
     let refused = |failure| refusal(&nothing, failure);
     if scheme == Scheme::Wss {
@@ -171,7 +171,7 @@ pub(super) async fn accept_on(
         }
     };
     let rtt = Duration::ZERO;
-    let mut secured = Secured { tls, findings, counters, mtu_bytes, scheme, asked, rtt };
+    let mut secured = TlsConnection { tls, findings, counters, mtu_bytes, scheme, asked, rtt };
     match secured.be_greeted().await {
         Ok(greeting) => secured.made(greeting).map_err(refused),
         Err(failure) => {
@@ -182,28 +182,29 @@ pub(super) async fn accept_on(
     }
 }
 
-/// Dials on a TCP connection, up to the listener's certificate; whether it accepts ours, [`Secured::greet`] tells.
+/// Dials on a TCP connection, up to the listener's certificate; [`TlsConnection::greet`] tells whether the listener
+/// accepts ours.
 pub(super) async fn dial(
     tcp: TcpStream,
     url: &LinkUrl,
     credentials: &CredentialStore,
     options: &LinkOptions,
-) -> Result<Secured, LinkError> {
+) -> Result<TlsConnection, LinkError> {
     dial_on(prepare(tcp, options)?, url, credentials, options).await
 }
 
-/// The same on any stream of bytes.
+/// Dials on any stream of bytes.
 pub(super) async fn dial_on(
-    (mut wire, counters, mtu_bytes): Prepared,
+    (mut wire, counters, mtu_bytes): PreparedSocket,
     url: &LinkUrl,
     credentials: &CredentialStore,
     options: &LinkOptions,
-) -> Result<Secured, LinkError> {
+) -> Result<TlsConnection, LinkError> {
     let nothing = Findings::default();
     let failed = |failure| link_error(&nothing, failure);
     if url.scheme == Scheme::Wss {
         let connector = TlsConnector::from(Arc::new(tls::outer_client()));
-        // Web proxies choose by it.
+        // Web proxies choose by the name.
         let name = ServerName::try_from(url.host.clone()).map_err(|e| LinkError::Transport(e.to_string()))?;
         wire = Box::new(connector.connect(name, wire).await.map_err(|e| failed(e.into()))?);
     }
@@ -218,25 +219,25 @@ pub(super) async fn dial_on(
         Ok(tls) => {
             let (tls, scheme) = (TlsStream::Client(tls), url.scheme);
             let (asked, rtt) = (Instant::now(), Duration::ZERO);
-            Ok(Secured { tls, findings, counters, mtu_bytes, scheme, asked, rtt })
+            Ok(TlsConnection { tls, findings, counters, mtu_bytes, scheme, asked, rtt })
         }
         Err((error, below)) => {
-            // The listener hears why.
+            // Sends the alert before the end.
             part(below.into_wire()).await;
             Err(link_error(&findings, error.into()))
         }
     }
 }
 
-impl Secured {
-    /// The innermost TLS, for who says something of his own in it.
+impl TlsConnection {
+    /// Returns the innermost TLS, for tests that write their own bytes into it.
     #[cfg(feature = "fuzzing")]
-    pub(super) fn into_stream(self) -> TlsStream<Below> {
+    pub(super) fn into_stream(self) -> TlsStream<TlsIo> {
         self.tls
     }
 
-    /// The dialer's greeting; the listener's answer says that it accepts us.
-    pub(super) async fn greet(mut self, greeting: Greeting) -> Result<Made, LinkError> {
+    /// Sends the dialer's greeting; the listener's answer shows that it accepts us.
+    pub(super) async fn greet(mut self, greeting: Greeting) -> Result<EstablishedStream, LinkError> {
         match self.exchange(&greeting).await {
             Ok(()) => self.made(greeting).map_err(|failure| link_error(&Findings::default(), failure)),
             Err(failure) => {
@@ -265,7 +266,7 @@ impl Secured {
         let version = |f: &Failure| {
             matches!(f, Failure::Protocol(ProtocolError::Greeting(DecodeError::Version { .. })))
         };
-        // Ours tells the dialer which version is spoken here, also if it is another.
+        // Our greeting tells the dialer the version that is spoken here, also if it is another.
         if heard.as_ref().err().is_none_or(version) {
             self.send_greeting(&Greeting::default()).await?;
         }
@@ -277,7 +278,7 @@ impl Secured {
         Ok(greeting)
     }
 
-    /// A peer that names no application protocol passes in TLS, though not here.
+    /// Checks the application protocol: TLS accepts a peer that names none, a link does not.
     fn check_alpn(&self) -> Result<(), Failure> {
         let (_, common) = self.tls.get_ref();
         if common.alpn_protocol() == Some(alpn(self.scheme)) { Ok(()) } else { Err(Failure::Alpn) }
@@ -289,7 +290,7 @@ impl Secured {
         Ok(self.tls.flush().await?)
     }
 
-    /// Reads exactly the greeting: what follows belongs to the link.
+    /// Reads exactly the greeting: later bytes belong to the link.
     async fn hear_greeting(&mut self) -> Result<Greeting, Failure> {
         let mut length = [0; 4];
         self.tls.read_exact(&mut length).await?;
@@ -306,7 +307,7 @@ impl Secured {
         Greeting::from_slice(&body).map_err(ProtocolError::Greeting).map_err(Failure::Protocol)
     }
 
-    /// Waits for the authenticated end of TLS, behind which the stream goes on without it.
+    /// Waits for the authenticated end of TLS, behind which the stream continues without it.
     async fn hear_end(&mut self) -> Result<(), Failure> {
         match self.tls.read(&mut [0]).await? {
             0 => Ok(()),
@@ -314,7 +315,7 @@ impl Secured {
         }
     }
 
-    fn made(self, Greeting { lane }: Greeting) -> Result<Made, Failure> {
+    fn made(self, Greeting { lane }: Greeting) -> Result<EstablishedStream, Failure> {
         // TLS with mandatory certificates ends no handshake without a verdict. If it ever did, no link comes of it.
         let verdict = self.findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate));
         let peer = verdict.map_err(Failure::Certificate)?;
@@ -328,16 +329,16 @@ impl Secured {
             (Scheme::Tcp, TlsStream::Client(tls)) => {
                 let (below, tls) = tls.into_inner();
                 let keys = Keys::export(&tls, tls.negotiated_cipher_suite().map(|s| s.suite()), true)?;
-                Box::new(Tagged::new(below.into_wire(), keys))
+                Box::new(RecordStream::new(below.into_wire(), keys))
             }
             (Scheme::Tcp, TlsStream::Server(tls)) => {
                 let (below, tls) = tls.into_inner();
                 let keys = Keys::export(&tls, tls.negotiated_cipher_suite().map(|s| s.suite()), false)?;
-                Box::new(Tagged::new(below.into_wire(), keys))
+                Box::new(RecordStream::new(below.into_wire(), keys))
             }
             (_, tls) => Box::new(tls),
         };
-        Ok(Made {
+        Ok(EstablishedStream {
             wire,
             counters: self.counters,
             peer,
@@ -349,7 +350,7 @@ impl Secured {
     }
 }
 
-/// What TLS says of an error of the stream that it failed on.
+/// Returns the TLS error in an error of the stream.
 fn tls_error(error: &io::Error) -> Option<&rustls::Error> {
     error.get_ref().and_then(|inner| inner.downcast_ref())
 }
@@ -359,7 +360,7 @@ fn is_gone(error: &io::Error) -> bool {
     matches!(error.kind(), UnexpectedEof | ConnectionReset | ConnectionAborted | BrokenPipe | NotConnected)
 }
 
-/// Why a peer that came has no link.
+/// Returns the reason why an incoming peer has no link.
 fn refusal(findings: &Findings, failure: Failure) -> Refusal {
     if let Some(Err(cert)) = findings.verdict() {
         return Refusal::Certificate(cert.clone());
@@ -391,7 +392,7 @@ fn refusal(findings: &Findings, failure: Failure) -> Refusal {
     }
 }
 
-/// Why dialling led to no link.
+/// Returns the reason why dialling led to no link.
 fn link_error(findings: &Findings, failure: Failure) -> LinkError {
     if let Some(Err(cert)) = findings.verdict() {
         return LinkError::RefusedHere(cert.clone());
@@ -417,7 +418,7 @@ fn link_error(findings: &Findings, failure: Failure) -> LinkError {
 
 fn peer_refusal(alert: AlertDescription) -> PeerRefusal {
     match alert {
-        // `endpoint` answers with it where there is no time for a handshake.
+        // `endpoint` answers with it when there is no time for a handshake.
         AlertDescription::InternalError => PeerRefusal::Overloaded,
         alert => PeerRefusal::from_alert(alert.into()),
     }

@@ -1,8 +1,7 @@
 //! Links over one ordered stream of bytes: TLS, TCP, WebSocket.
 //!
-//! A task per link moves bytes between the socket and the machine that multiplexes them (`mux.rs`); everybody who uses the
-//! link talks to that machine and is woken by what it says. How the stream below is made and authenticated is in
-//! `endpoint.rs` and `handshake.rs`.
+//! A task per link moves bytes between the socket and the machine that multiplexes them (`mux.rs`). Users of the link
+//! call that machine and its events wake them. `endpoint.rs` and `handshake.rs` make and authenticate the stream below.
 
 #[cfg(feature = "benchmarks")]
 mod conversation;
@@ -25,13 +24,13 @@ pub(crate) use endpoint::{StreamDialer, StreamListener};
 pub use exercise::DoorExercise;
 pub use frame::StreamViolation;
 
-/// Two machines, and whatever their users do.
+/// Runs two machines with arbitrary operations of their users.
 #[cfg(feature = "fuzzing")]
 pub fn fuzz_operations(input: &[u8]) {
     mux::model::converse(input);
 }
 
-/// A machine, and whatever its peer sends.
+/// Runs a machine with arbitrary input of its peer.
 #[cfg(feature = "fuzzing")]
 pub fn fuzz_bytes(input: &[u8]) {
     mux::model::listen(input);
@@ -68,20 +67,20 @@ pub struct StreamLink {
     handle: Arc<Handle>,
 }
 
-/// What the users of a link and its flows hold in common. The link lives as long as one of them does.
+/// State that the users of a link and its flows share. The link lives as long as one of them does.
 struct Handle {
-    shared: Arc<Shared>,
+    shared: Arc<LinkInner>,
     peer: VerifiedPeer,
-    about: About,
+    about: LinkInfo,
     labels: Arc<Labels>,
-    /// What was begun and is not yet written, so that a frame goes out whole also when a sender is cancelled.
+    /// Frames begun and not yet written, so that a frame goes out whole also when a sender is cancelled.
     control_tx: tokio::sync::Mutex<Chunks>,
     control_rx: tokio::sync::Mutex<Pieces>,
 }
 
-/// What does not change while a link lives.
+/// The constant facts of a link.
 #[derive(Debug)]
-struct About {
+struct LinkInfo {
     remote: SocketAddr,
     is_dialer: bool,
     lane: Option<LaneToken>,
@@ -89,8 +88,8 @@ struct About {
     mtu_bytes: u16,
 }
 
-/// What a link's users and its task share.
-struct Shared {
+/// State that a link's users and its task share.
+struct LinkInner {
     _lease: WindowLease,
     state: Mutex<State>,
     counters: Arc<Counters>,
@@ -109,13 +108,13 @@ struct State {
     readers: BTreeMap<RxId, Waker>,
     writers: BTreeMap<TxId, Waker>,
     deliveries: BTreeMap<TxId, Waker>,
-    /// Why the link is over, once it is.
+    /// The cause of the end, once the link is over.
     end: Option<LinkError>,
     /// The task has ended, too.
     is_drained: bool,
 }
 
-impl Shared {
+impl LinkInner {
     fn new(options: &LinkOptions, counters: Arc<Counters>) -> Arc<Self> {
         let lease = options.receive_budget.lease(options.receive_window_bytes);
         let limits = Limits {
@@ -155,7 +154,7 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Does something that leaves the task with something to write.
+    /// Runs an action that may give the task bytes to write.
     fn prompt<T>(&self, act: impl FnOnce(&mut State) -> T) -> T {
         let mut state = self.lock();
         let done = act(&mut state);
@@ -167,7 +166,7 @@ impl Shared {
         done
     }
 
-    /// Tries until it succeeds or the link is over, each time that `notify` says that it may.
+    /// Tries again at each notification until it succeeds or the link is over.
     async fn until<T>(
         &self,
         notify: &Notify,
@@ -213,7 +212,7 @@ impl Shared {
         }
     }
 
-    /// Ends the link and has the peer told why.
+    /// Ends the link and lets the task tell the peer why.
     fn close(&self, reason: &CloseReason, error: LinkError) {
         self.prompt(|state| {
             if state.end.is_none() {
@@ -224,7 +223,7 @@ impl Shared {
         });
     }
 
-    /// Passes on what became possible.
+    /// Notifies waiting users of the machine's events.
     fn drain_events(&self, state: &mut State) {
         while let Some(event) = state.mux.poll_event() {
             let waker = match event {
@@ -262,7 +261,7 @@ impl Shared {
     }
 }
 
-/// From here on nothing that is notified is missed.
+/// Registers for notifications, so that none is missed from here on.
 fn enable(notified: std::pin::Pin<&mut Notified<'_>>) {
     notified.enable();
 }
@@ -279,7 +278,7 @@ impl Drop for Handle {
     }
 }
 
-/// The sending half of a flow. What it was given goes out whole and in order, also when a writer is cancelled.
+/// The sending half of a flow. Its bytes go out whole and in order, also when a writer is cancelled.
 pub(crate) struct Outlet {
     handle: Arc<Handle>,
     id: TxId,
@@ -355,7 +354,7 @@ impl Drop for Outlet {
             if is_whole {
                 state.mux.finish(self.id);
             } else {
-                // The end would pass half a frame for a whole one.
+                // A regular end would make half a frame look whole.
                 state.mux.reset(self.id, FlowEnd::Unwanted.to_wire().into());
             }
             state.mux.release(self.id);
@@ -379,7 +378,7 @@ pub(crate) struct Inlet {
 }
 
 impl Inlet {
-    /// Waits for more of the flow and appends it; false at its end.
+    /// Waits for more of the flow and appends it. Returns `false` at the end.
     pub(crate) async fn fill(&mut self, pieces: &mut Pieces) -> Result<bool, FlowError> {
         poll_fn(|cx| {
             let mut state = self.handle.shared.lock();
@@ -426,7 +425,7 @@ impl fmt::Debug for Inlet {
 }
 
 impl StreamLink {
-    fn new(shared: Arc<Shared>, peer: VerifiedPeer, about: About) -> Self {
+    fn new(shared: Arc<LinkInner>, peer: VerifiedPeer, about: LinkInfo) -> Self {
         let handle = Handle {
             shared,
             peer,
@@ -438,7 +437,7 @@ impl StreamLink {
         Self { handle: Arc::new(handle) }
     }
 
-    /// Ends the link because of what the peer did, unless it has ended already.
+    /// Ends the link because of the peer's mistake, unless it has ended already.
     fn fail(&self, why: ProtocolError) -> LinkError {
         let reason = CloseReason::Protocol(why.to_string());
         self.handle.shared.close(&reason, why.clone().into());
@@ -581,7 +580,7 @@ impl Link for StreamLink {
             rtt_min,
             sent_bytes,
             received_bytes,
-            // The kernel's; it sends again what is lost, and says nothing.
+            // The kernel resends lost packets and reports none.
             sent_packets: 0,
             lost_packets: 0,
             lost_bytes: 0,

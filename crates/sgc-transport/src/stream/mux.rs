@@ -1,11 +1,12 @@
-//! Many flows, datagrams and control frames in one ordered stream of bytes. Pure: no socket, no clock; the driver brings
-//! bytes in ([`Mux::handle_input`]), fetches what is to be written ([`Mux::poll_transmit`]) and then drains
+//! Many flows, datagrams and control frames in one ordered stream of bytes. Pure: no socket, no clock. The driver
+//! brings bytes in ([`Mux::handle_input`]), fetches the bytes to write ([`Mux::poll_transmit`]) and then drains
 //! [`Mux::poll_event`].
 //!
-//! It hands bytes out only when the driver can write, the most urgent first and in small pieces, so what waits can still be
-//! overtaken. Each side has of the other no more than it permitted: every flow, all flows and the control stream have
-//! credits of their own, so a flow that nobody reads stops itself alone. What a frame looks like is in `frame.rs`, how much
-//! may be under way in `window.rs`, and what flows contain is not looked at.
+//! [`Mux::poll_transmit`] hands bytes out only when the driver can write, the most urgent first and in small pieces, so
+//! that an urgent packet can still overtake waiting ones. Each side buffers no more for the other than it permitted:
+//! every flow, all flows together and the control stream have credits of their own, so a flow that nobody reads stops
+//! itself alone. `frame.rs` defines the frames and `window.rs` the bytes in flight. This module does not look into
+//! flows.
 
 #[cfg(any(test, feature = "fuzzing"))]
 pub(crate) mod model;
@@ -19,33 +20,34 @@ use sgc_wire::Class;
 use super::frame::{DATAGRAM_BYTES_MAX, HEAD_BYTES_MAX, Head, StreamViolation, read_head};
 use super::window::Window;
 
-/// Longest piece of a flow that is sent in one frame: what an urgent packet waits for at most.
+/// Longest piece of a flow in one frame. An urgent packet waits for at most one.
 pub(crate) const PIECE_BYTES: usize = 4 << 10;
-/// Bytes of control frames that a peer may have sent and we not read. No setting: it is known before any is.
+/// Bytes of control frames that a peer may have sent before we read them. A constant, because it is needed before any
+/// setting arrives.
 pub(crate) const CONTROL_WINDOW_BYTES: u64 = 2 << 20;
 /// Bytes of control frames that wait to be written.
 const CONTROL_PENDING_BYTES: u64 = 64 << 10;
 /// Bytes of one flow that wait to be written, at least and at most; between, half a window.
 const FLOW_PENDING_BYTES: (u64, u64) = (16 << 10, 256 << 10);
-/// What each class may have waiting beyond the one below it.
+/// Further bytes that each class may have waiting, beyond those of the class below it.
 const CLASS_BYTES: u64 = 1 << 20;
-/// What holding one datagram costs besides its bytes.
+/// Memory that one datagram takes besides its bytes.
 const DATAGRAM_COST_BYTES: usize = 64;
-/// Shorter pieces are copied together, into blocks of [`BLOCK_BYTES`]: else each would cost more than it holds.
+/// Shorter pieces are copied together into blocks of [`BLOCK_BYTES`]; alone, each would take more memory than it holds.
 const JOINED_BYTES_MAX: usize = 1 << 10;
 const BLOCK_BYTES: usize = 4 << 10;
-/// How many pieces one read takes at most.
+/// Most pieces that one read takes.
 const READ_PIECES: usize = 32;
 
-/// The control stream, where frames name a flow.
+/// Number of the control stream, in the place of a flow's.
 const CONTROL: u64 = 0;
 
-/// What both ends of a link hold to.
+/// Limits of both ends of a link.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Limits {
-    /// Bytes of one flow that the peer may have sent and we not read.
+    /// Bytes of one flow that the peer may have sent before they are read here.
     pub(crate) flow_window: u64,
-    /// The same of all flows.
+    /// Bytes of all flows that the peer may have sent before they are read here.
     pub(crate) link_window: u64,
     /// Flows that the peer may have open.
     pub(crate) flows_max: u64,
@@ -55,9 +57,9 @@ pub(crate) struct Limits {
     pub(crate) datagram_send_bytes: usize,
     /// Bytes of datagrams that wait to be read.
     pub(crate) datagram_receive_bytes: usize,
-    /// How often a ping is sent at least.
+    /// Longest time between two pings.
     pub(crate) keep_alive: Duration,
-    /// How long nothing may arrive.
+    /// Time without input after which the link is over.
     pub(crate) idle_timeout: Duration,
 }
 
@@ -69,14 +71,14 @@ pub(crate) struct TxId(u64);
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct RxId(u64);
 
-/// What became possible. Each is said once to those who met the contrary before.
+/// A notice that something became possible. It goes once to a caller that met the contrary before.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Event {
-    /// [`Mux::read`] has something to say.
+    /// [`Mux::read`] has bytes or an end.
     Readable(RxId),
-    /// [`Mux::write`] takes more, or says why not.
+    /// [`Mux::write`] takes more, or returns the reason why not.
     Writable(TxId),
-    /// [`Mux::is_delivered`] has turned true.
+    /// [`Mux::is_delivered`] became true.
     Delivered(TxId),
     /// The peer opened a flow.
     Incoming,
@@ -92,34 +94,34 @@ pub(crate) enum Event {
     DatagramWritable,
     /// The peer ended the link.
     Closed {
-        /// Its number.
+        /// The peer's code.
         code: u64,
-        /// What it says of it.
+        /// The peer's explanation.
         text: Bytes,
     },
 }
 
-/// What came of reading a flow.
+/// Result of reading a flow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Read {
-    /// There was something.
+    /// Bytes were read.
     Some,
-    /// There will be; [`Event::Readable`] says when.
+    /// No bytes yet; [`Event::Readable`] announces them.
     Blocked,
-    /// The flow is over, in good order.
+    /// The flow ended in good order.
     Finished,
-    /// The sender ended it.
+    /// The sender reset the flow.
     Reset(u64),
 }
 
-/// The machine of one end.
+/// The state machine of one end.
 #[derive(Debug)]
 pub(crate) struct Mux {
     limits: Limits,
     events: VecDeque<Event>,
-    // What comes in.
+    // Receiving.
     expect: Expect,
-    /// A head that has not come whole.
+    /// The beginning of a frame head whose rest has not come.
     carry: Vec<u8>,
     has_settings: bool,
     rx: BTreeMap<RxId, RxFlow>,
@@ -135,14 +137,14 @@ pub(crate) struct Mux {
     datagrams_rx_bytes: usize,
     is_datagram_awaited: bool,
     last_received: Instant,
-    // What goes out.
+    // Sending.
     tx: BTreeMap<TxId, TxFlow>,
     tx_next: u64,
     by_wire: BTreeMap<u64, TxId>,
     wire_next: u64,
     /// Flows that this side opened and that have no number yet.
     unnumbered: u64,
-    /// What each new flow may have at first.
+    /// First credit of each new flow.
     flow_credit: u64,
     flows_credit: u64,
     is_flow_awaited: bool,
@@ -159,7 +161,8 @@ pub(crate) struct Mux {
     pong: Option<u64>,
     resets: VecDeque<(u64, u64)>,
     news: VecDeque<RxId>,
-    /// None yet: the first goes out at once, since what a link costs is asked for as soon as it is there.
+    /// `None` at first: the first ping leaves at once, because routing asks for the link's round trip as soon as it is
+    /// up.
     last_ping: Option<Instant>,
     born: Instant,
     closing: Option<(u64, Bytes)>,
@@ -187,7 +190,7 @@ struct TxFlow {
     end: TxEnd,
     stopped: Option<u64>,
     is_done: bool,
-    /// Somebody holds it.
+    /// A handle to the flow exists.
     is_held: bool,
     is_ready: bool,
     is_blocked: bool,
@@ -226,10 +229,10 @@ struct RxFlow {
     consumed: u64,
     announced: u64,
     end: Option<RxEnd>,
-    /// Somebody may read it.
+    /// A handle to the flow exists.
     is_held: bool,
     is_awaited: bool,
-    /// What the peer is to be told; it stands in `Mux::news` as long as there is any.
+    /// News for the peer; the flow stands in `Mux::news` as long as there is any.
     stop: Option<u64>,
     is_credit_due: bool,
     is_done_due: bool,
@@ -242,7 +245,7 @@ enum RxEnd {
     Reset(u64),
 }
 
-/// Bytes that came and were not read.
+/// Received bytes that were not read yet.
 #[derive(Debug, Default)]
 struct Store {
     pieces: VecDeque<Bytes>,
@@ -251,7 +254,7 @@ struct Store {
 }
 
 impl Store {
-    /// Copies: a slice would keep the whole of what it was read with.
+    /// Copies the piece: a slice would keep the whole buffer that it was read with.
     fn push(&mut self, piece: &[u8]) {
         self.bytes += piece.len() as u64;
         if piece.len() > JOINED_BYTES_MAX {
@@ -271,7 +274,7 @@ impl Store {
         }
     }
 
-    /// Takes some: how many bytes.
+    /// Hands some pieces to the sink and returns the number of bytes.
     fn take(&mut self, mut sink: impl FnMut(Bytes)) -> u64 {
         if self.pieces.is_empty() {
             self.cut();
@@ -292,7 +295,7 @@ impl Store {
 }
 
 impl Mux {
-    /// One end of a link that begins now.
+    /// Returns one end of a link that begins now.
     pub(crate) fn new(limits: Limits, now: Instant) -> Self {
         Self {
             limits,
@@ -343,7 +346,7 @@ impl Mux {
         }
     }
 
-    /// Takes in what arrived. After an error it must not be given more.
+    /// Takes received bytes. After an error the caller must not call it again.
     pub(crate) fn handle_input(&mut self, now: Instant, mut bytes: &[u8]) -> Result<(), StreamViolation> {
         if !bytes.is_empty() {
             self.last_received = now;
@@ -390,13 +393,13 @@ impl Mux {
         Ok(())
     }
 
-    /// False if nothing came for too long.
+    /// Returns `false` if nothing came for too long.
     pub(crate) fn handle_timeout(&self, now: Instant) -> bool {
         now.saturating_duration_since(self.last_received) < self.limits.idle_timeout
     }
 
-    /// Until when [`Mux::handle_timeout`] is to be called at the latest, and [`Mux::poll_transmit`] if anything can be
-    /// written.
+    /// Returns the time by which the caller has to call [`Mux::handle_timeout`], and [`Mux::poll_transmit`] if the wire
+    /// takes bytes.
     pub(crate) fn poll_timeout(&self, can_write: bool) -> Instant {
         let idle = self.last_received + self.limits.idle_timeout;
         if !can_write {
@@ -405,12 +408,12 @@ impl Mux {
         idle.min(self.last_ping.map_or(self.born, |last| last + self.limits.keep_alive))
     }
 
-    /// What became possible.
+    /// Returns the next event.
     pub(crate) fn poll_event(&mut self) -> Option<Event> {
         self.events.pop_front()
     }
 
-    /// Appends up to about `budget` bytes that are to be written now, the most urgent first, and says how many they are.
+    /// Appends up to about `budget` bytes to write now, the most urgent first, and returns their number.
     pub(crate) fn poll_transmit(&mut self, now: Instant, budget: u64, out: &mut VecDeque<Bytes>) -> u64 {
         let before = self.window.written();
         if self.is_over {
@@ -436,7 +439,7 @@ impl Mux {
             self.ping_if_due(now);
         }
         for class in [Class::Realtime, Class::Default, Class::Bulk] {
-            // What is urgent need not wait for an answer to what is not.
+            // Urgent bytes need not wait for the acknowledgement of less urgent ones.
             let more = class as u64 * 2 * PIECE_BYTES as u64;
             while self.window.written() < end && self.window.has_room(more) && self.put_piece(class, out) {
                 self.ping_if_due(now);
@@ -449,7 +452,7 @@ impl Mux {
 
     // Flows that this side opens.
 
-    /// Opens a flow, if the peer permits one more; [`Event::FlowsAvailable`] says when it does.
+    /// Opens a flow if the peer permits one more; otherwise [`Event::FlowsAvailable`] announces the permission.
     pub(crate) fn open(&mut self, class: Class) -> Option<TxId> {
         if self.wire_next - 1 + self.unnumbered >= self.flows_credit {
             self.is_flow_awaited = true;
@@ -476,8 +479,8 @@ impl Mux {
         Some(id)
     }
 
-    /// Takes what it can of these chunks. True if all; else [`Event::Writable`] says when to try again. The error is the
-    /// peer's word that it wants no more.
+    /// Takes as many of these chunks as fit. Returns `true` if it took all; otherwise [`Event::Writable`] announces
+    /// room. The error is the code with which the peer stopped the flow.
     pub(crate) fn write(&mut self, id: TxId, chunks: &mut Vec<Bytes>) -> Result<bool, u64> {
         let (least, most) = FLOW_PENDING_BYTES;
         let pending = (self.window.bytes() / 2).clamp(least, most);
@@ -505,7 +508,7 @@ impl Mux {
         Ok(is_all)
     }
 
-    /// Ends the flow after what was written.
+    /// Ends the flow after the bytes written so far.
     pub(crate) fn finish(&mut self, id: TxId) {
         if let Some(flow) = self.tx.get_mut(&id)
             && flow.end == TxEnd::Open
@@ -528,7 +531,7 @@ impl Mux {
         flow.end = TxEnd::Reset;
         match flow.wire {
             Some(wire) => self.resets.push_back((wire, code)),
-            // The peer never heard of it.
+            // The peer never heard of the flow.
             None => {
                 self.unnumbered -= 1;
                 self.tell_flows();
@@ -537,12 +540,12 @@ impl Mux {
         self.retire_tx(id);
     }
 
-    /// True once the peer has all of the flow, or wants no more.
+    /// Returns `true` once the peer has all of the flow or stopped it.
     pub(crate) fn is_delivered(&self, id: TxId) -> bool {
         self.tx.get(&id).is_none_or(|f| f.is_done || f.stopped.is_some() || f.end == TxEnd::Reset)
     }
 
-    /// Nobody holds the flow any more.
+    /// Releases the flow: nobody holds it any more.
     pub(crate) fn release(&mut self, id: TxId) {
         if let Some(flow) = self.tx.get_mut(&id) {
             flow.is_held = false;
@@ -552,7 +555,7 @@ impl Mux {
 
     // Flows that the peer opens.
 
-    /// The next flow that the peer opened.
+    /// Returns the next flow that the peer opened.
     pub(crate) fn accept(&mut self) -> Option<RxId> {
         self.incoming.pop_front()
     }
@@ -587,7 +590,7 @@ impl Mux {
         }
     }
 
-    /// Nobody reads the flow any more; the sender is told why, unless it has ended it already.
+    /// Gives up reading the flow. The sender learns the code unless it has ended the flow already.
     pub(crate) fn stop(&mut self, id: RxId, code: u64) {
         let Some(flow) = self.rx.get_mut(&id) else { return };
         if !flow.is_held {
@@ -605,7 +608,8 @@ impl Mux {
 
     // Control frames and datagrams.
 
-    /// Takes what it can of the control stream; true if all, else [`Event::ControlWritable`] says when to try again.
+    /// Takes as many control bytes as fit. Returns `true` if it took all; otherwise [`Event::ControlWritable`]
+    /// announces room.
     pub(crate) fn write_control(&mut self, chunks: &mut Vec<Bytes>) -> bool {
         let control = &mut self.control_tx;
         let room = (control.credit - control.sent).min(CONTROL_PENDING_BYTES).saturating_sub(control.queued);
@@ -614,7 +618,8 @@ impl Mux {
         chunks.is_empty()
     }
 
-    /// Reads some of the control stream; false if there is nothing, and [`Event::ControlReadable`] says when.
+    /// Reads some of the control stream. Returns `false` if there is nothing; [`Event::ControlReadable`] announces
+    /// more.
     pub(crate) fn read_control(&mut self, sink: impl FnMut(Bytes)) -> bool {
         let taken = self.control_rx.store.take(sink);
         self.control_rx.consumed += taken;
@@ -622,8 +627,8 @@ impl Mux {
         taken > 0
     }
 
-    /// Takes a datagram of at most [`DATAGRAM_BYTES_MAX`]; false if too many wait, and [`Event::DatagramWritable`] says
-    /// when to try again.
+    /// Takes a datagram of at most [`DATAGRAM_BYTES_MAX`]. Returns `false` if too many wait;
+    /// [`Event::DatagramWritable`] announces room.
     pub(crate) fn send_datagram(&mut self, datagram: &Bytes) -> bool {
         let cost = datagram.len() + DATAGRAM_COST_BYTES;
         let fits = self.datagrams_tx_bytes + cost <= self.limits.datagram_send_bytes;
@@ -637,7 +642,7 @@ impl Mux {
         true
     }
 
-    /// The next datagram; if there is none, [`Event::DatagramReadable`] says when there is.
+    /// Returns the next datagram; if there is none, [`Event::DatagramReadable`] announces one.
     pub(crate) fn receive_datagram(&mut self) -> Option<Bytes> {
         let datagram = self.datagrams_rx.pop_front();
         self.is_datagram_awaited = datagram.is_none();
@@ -645,7 +650,7 @@ impl Mux {
         datagram
     }
 
-    /// Ends the link. What waits is dropped; the next transmission tells the peer, and there is none after it.
+    /// Ends the link and drops everything that waits. The next transmission tells the peer; none follows it.
     pub(crate) fn close(&mut self, code: u64, text: Bytes) {
         if self.closing.is_none() && !self.is_over {
             self.closing = Some((code, text));
@@ -653,7 +658,7 @@ impl Mux {
         }
     }
 
-    /// True if a transmission would say something of what was read.
+    /// Returns `true` if a transmission would carry news of read data: credit, ended flows, or room for flows.
     pub(crate) fn has_news(&self) -> bool {
         let Limits { link_window, flows_max, .. } = self.limits;
         !self.news.is_empty()
@@ -662,32 +667,32 @@ impl Mux {
             || self.flows_permitted - self.flows_announced >= (flows_max / 4).max(1)
     }
 
-    /// True once there is nothing more to be said.
+    /// Returns `true` once nothing is left to send.
     pub(crate) fn is_over(&self) -> bool {
         self.is_over
     }
 
-    /// Smoothed and shortest round trip.
+    /// Returns the smoothed and the shortest round trip.
     pub(crate) fn rtt(&self) -> (Duration, Duration) {
         self.window.rtt()
     }
 
-    /// How long the handshake took for a round trip, which counts until one is measured.
+    /// Notes the handshake's round trip, which counts until one is measured.
     pub(crate) fn note_handshake(&mut self, rtt: Duration) {
         self.window.note_handshake(rtt);
     }
 
-    /// Bytes that may be under way.
+    /// Returns the number of bytes that may be in flight.
     pub(crate) fn window_bytes(&self) -> u64 {
         self.window.bytes()
     }
 
-    /// How much is written together.
+    /// Returns the number of bytes to write together.
     pub(crate) fn bytes_together(&self) -> u64 {
         self.window.together()
     }
 
-    // What comes in.
+    // Receiving.
 
     fn next_head(&mut self, bytes: &mut &[u8]) -> Result<Option<Head>, StreamViolation> {
         if self.carry.is_empty() {
@@ -765,7 +770,7 @@ impl Mux {
                 let (bytes, left) = (BytesMut::with_capacity(length as usize), length as usize);
                 self.expect = Expect::Datagram { bytes, left };
             }
-            // One answer stands for all before it, so a flood of questions costs one.
+            // One answer stands for all questions before it, so a flood of pings costs one answer.
             Head::Ping { number } => self.pong = Some(number),
             Head::Pong { number } => {
                 if !self.window.on_pong(number, now) {
@@ -821,7 +826,7 @@ impl Mux {
         }
     }
 
-    /// A flow of the peer that is open, or the next one.
+    /// Returns a flow of the peer that is open, or opens the next one.
     fn theirs(&mut self, wire: u64) -> Result<&mut RxFlow, StreamViolation> {
         let id = RxId(wire);
         if wire == self.rx_next {
@@ -852,7 +857,7 @@ impl Mux {
         }
     }
 
-    /// A flow of ours, nothing if it is over.
+    /// Returns a flow of ours, or nothing if it is over.
     fn own(&self, wire: u64) -> Result<Option<TxId>, StreamViolation> {
         if wire == CONTROL || wire >= self.wire_next {
             return Err(StreamViolation::Flow(wire));
@@ -920,7 +925,7 @@ impl Mux {
         self.events.push_back(Event::Closed { code, text });
     }
 
-    /// Puts a flow in line to tell the peer something of it.
+    /// Queues a flow that has news for the peer.
     fn tell(&mut self, id: RxId) {
         if let Some(flow) = self.rx.get_mut(&id)
             && !std::mem::replace(&mut flow.has_news, true)
@@ -929,7 +934,7 @@ impl Mux {
         }
     }
 
-    /// Forgets a flow of the peer that is over, read and said so; the peer may open another.
+    /// Forgets a flow of the peer that is over, read and acknowledged; the peer may open another.
     fn retire_rx(&mut self, id: RxId) {
         if self.rx.get(&id).is_some_and(|f| f.end.is_some() && !f.is_held && !f.has_news) {
             self.rx.remove(&id);
@@ -937,7 +942,7 @@ impl Mux {
         }
     }
 
-    // What goes out.
+    // Sending.
 
     fn retire_tx(&mut self, id: TxId) {
         let Some(flow) = self.tx.get(&id) else { return };
@@ -964,7 +969,7 @@ impl Mux {
         }
     }
 
-    /// Room among all flows wakes those who found none.
+    /// Wakes flows that found no room among all flows, as far as there is room now.
     fn feed_starved(&mut self) {
         if self.starved.is_empty() || self.queued + PIECE_BYTES as u64 > self.limits.send_bytes {
             return;
@@ -1001,7 +1006,7 @@ impl Mux {
         }
     }
 
-    /// Everything else that is one head: answers, and what the peer is told of flows.
+    /// Writes everything else that fits one head: answers, and news of flows.
     fn put_small(&mut self) {
         if let Some(number) = self.pong.take() {
             self.head(Head::Pong { number });
@@ -1079,7 +1084,7 @@ impl Mux {
         true
     }
 
-    /// One piece of the next flow of this class, and that flow behind the others of its class.
+    /// Writes one piece of the next flow of this class and moves that flow behind the others of its class.
     fn put_piece(&mut self, class: Class, out: &mut VecDeque<Bytes>) -> bool {
         let link = self.link_credit.saturating_sub(self.link_sent);
         let Some(id) = self.ready[class as usize].pop_front() else { return false };
@@ -1181,12 +1186,12 @@ impl Mux {
     }
 }
 
-/// True once a quarter of a window was read since the last word of it.
+/// Returns `true` once a quarter of a window was read since the last announcement.
 fn is_credit_due(consumed: u64, announced: u64, window: u64) -> bool {
     consumed + window - announced >= (window / 4).max(1)
 }
 
-/// Moves up to `most` bytes from the front of one to the back of the other: how many.
+/// Moves up to `most` bytes from the front of one to the back of the other and returns their number.
 fn move_front(from: &mut Vec<Bytes>, to: &mut VecDeque<Bytes>, most: u64) -> u64 {
     let (mut left, mut whole) = (most, 0);
     for chunk in from.iter_mut() {
@@ -1208,7 +1213,7 @@ fn move_front(from: &mut Vec<Bytes>, to: &mut VecDeque<Bytes>, most: u64) -> u64
     most - left
 }
 
-/// Moves exactly so many bytes, which must be there, from the front of one to the back of the other.
+/// Moves exactly `length` bytes, which must be there, from the front of one to the back of the other.
 fn pop_front(from: &mut VecDeque<Bytes>, mut length: u64, to: &mut VecDeque<Bytes>) {
     while length > 0 {
         let Some(mut chunk) = from.pop_front() else { break };

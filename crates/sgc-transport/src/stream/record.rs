@@ -1,8 +1,8 @@
 //! Records that everyone can read and nobody can alter, for `tcp://` (`docs/spec/wire.md`, stream links).
 //!
-//! The stream behind the handshake is cut into records with a tag each. Keys come from the TLS connection before it, one for
-//! each direction, and the number of the record is its nonce: so a record that is altered, left out, repeated, put
-//! elsewhere or sent back ends the link, and nothing of it is handed on. It hides nothing; payloads are sealed by their source.
+//! The stream behind the handshake is cut into records with a tag each. Keys come from the TLS connection before it,
+//! one for each direction, and the number of the record is its nonce: so a record that is altered, left out, repeated,
+//! moved or sent back ends the link, and none of it is handed on. Records hide nothing; the source seals payloads.
 
 use std::io::{self, IoSlice};
 use std::pin::Pin;
@@ -21,21 +21,21 @@ const HEAD_BYTES: usize = 2;
 /// Longest content of a record, bytes.
 pub(super) const RECORD_BYTES_MAX: usize = 16 << 10;
 const TAG_BYTES: usize = 16;
-/// Most records under one key. It keeps what GMAC loses by each far from mattering; a link ends before it gets there.
+/// Most records under one key. It keeps the security loss of GMAC negligible; a link ends before.
 const RECORDS_MAX: u64 = 1 << 40;
 /// Bytes that wait to be written before more is taken.
 const PENDING_BYTES: usize = 64 << 10;
 /// Bytes read at once, at least.
 const READ_BYTES: usize = 32 << 10;
-/// Label that the keys are exported under (RFC 8446, 7.5); the context says which end seals with them.
+/// Label of the exported keys (RFC 8446, 7.5); the context names the end that seals with them.
 const EXPORTER: &[u8] = b"EXPORTER-SGC-tcp-records";
 const FROM_DIALER: &[u8] = b"dialer";
 const FROM_LISTENER: &[u8] = b"listener";
 
-/// Why a stream of records ended.
+/// The reason why a stream of records ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub(super) enum RecordError {
-    /// A tag does not hold, or a length is none.
+    /// Wrong tag, or an invalid length.
     #[error("a record does not verify")]
     Altered,
     /// The key was used as often as it may be.
@@ -81,7 +81,7 @@ impl Keys {
     }
 }
 
-/// The key of one direction, and how many records it was used for.
+/// The key of one direction, and the number of its records.
 struct Key {
     key: LessSafeKey,
     records: u64,
@@ -93,7 +93,7 @@ impl Key {
         Ok(Self { key: LessSafeKey::new(key), records: 0 })
     }
 
-    /// Each number once.
+    /// Returns the next nonce: each number once.
     fn nonce(&mut self) -> Result<Nonce, RecordError> {
         if self.records >= RECORDS_MAX {
             return Err(RecordError::UsedUp);
@@ -104,7 +104,7 @@ impl Key {
         Ok(Nonce::assume_unique_for_key(nonce))
     }
 
-    /// The tag of a record, its length included.
+    /// Returns the tag of a record, its length included.
     fn tag(&mut self, record: &[u8]) -> Result<[u8; TAG_BYTES], RecordError> {
         let nonce = self.nonce()?;
         let tag = self.key.seal_in_place_separate_tag(nonce, Aad::from(record), &mut []);
@@ -121,13 +121,13 @@ impl Key {
 }
 
 /// A stream of bytes as records on another.
-pub(super) struct Tagged {
+pub(super) struct RecordStream {
     wire: Wire,
     keys: Keys,
-    /// Records that are to be written, and how much of them was.
+    /// Records to write, and the bytes of them that are written.
     out: Vec<u8>,
     written: usize,
-    /// Received bytes: verified content that is to be handed out, then an incomplete record, up to `filled`.
+    /// Received bytes: verified content to hand out, then an incomplete record, up to `filled`.
     input: Box<[u8]>,
     filled: usize,
     /// Beginning and end of the verified content that is left.
@@ -138,7 +138,7 @@ pub(super) struct Tagged {
     failure: Option<RecordError>,
 }
 
-impl Tagged {
+impl RecordStream {
     pub(super) fn new(wire: Wire, keys: Keys) -> Self {
         Self {
             wire,
@@ -153,12 +153,12 @@ impl Tagged {
         }
     }
 
-    /// Verifies the next record; false if it is not there as a whole.
+    /// Verifies the next record. Returns `false` if it is not complete.
     fn take_record(&mut self) -> Result<bool, RecordError> {
         let Some(rest) = self.input.get(self.next..self.filled) else { return Ok(false) };
         let Some((head, _)) = rest.split_at_checked(HEAD_BYTES) else { return Ok(false) };
         let length = usize::from(u16::from_be_bytes([head[0], head[1]]));
-        // Judged before anything waits for what it announces.
+        // Judged before anything waits for the announced bytes.
         if length == 0 || length > RECORD_BYTES_MAX {
             return Err(RecordError::Altered);
         }
@@ -171,7 +171,7 @@ impl Tagged {
         Ok(true)
     }
 
-    /// Writes what waits.
+    /// Writes waiting records.
     fn poll_out(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         while let Some(rest) = self.out.get(self.written..).filter(|rest| !rest.is_empty()) {
             let n = ready!(Pin::new(&mut self.wire).poll_write(cx, rest))?;
@@ -185,7 +185,7 @@ impl Tagged {
         Poll::Ready(Ok(()))
     }
 
-    /// Makes records of what fits: how many bytes of it.
+    /// Makes records of the bytes that fit and returns their number.
     fn queue(&mut self, bufs: &[IoSlice<'_>]) -> Result<usize, RecordError> {
         let mut slices = bufs.iter().map(|buf| &buf[..]).filter(|buf| !buf.is_empty());
         let mut slice = slices.next().unwrap_or_default();
@@ -213,7 +213,7 @@ impl Tagged {
     }
 }
 
-impl AsyncRead for Tagged {
+impl AsyncRead for RecordStream {
     fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let this = self.get_mut();
         if buf.remaining() == 0 {
@@ -239,14 +239,14 @@ impl AsyncRead for Tagged {
                 Ok(false) => {}
                 Err(failure) => {
                     this.failure = Some(failure);
-                    // The content before it is good.
+                    // The content before the failure is good.
                     return Poll::Ready(if has_some { Ok(()) } else { Err(failure.into()) });
                 }
             }
             if has_some {
                 return Poll::Ready(Ok(()));
             }
-            // All that was verified is handed out: what is left moves to the front.
+            // All verified content is handed out: the rest moves to the front.
             this.input.copy_within(this.next..this.filled, 0);
             this.filled -= this.next;
             (this.next, this.ready) = (0, (0, 0));
@@ -262,7 +262,7 @@ impl AsyncRead for Tagged {
     }
 }
 
-impl AsyncWrite for Tagged {
+impl AsyncWrite for RecordStream {
     fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         self.poll_write_vectored(cx, &[IoSlice::new(buf)])
     }
@@ -305,17 +305,17 @@ mod tests {
 
     use super::*;
 
-    /// The keys of two ends.
+    /// Returns the keys of two ends.
     fn keys(algorithm: &'static Algorithm) -> [Keys; 2] {
         let key = |byte: u8| Key::new(algorithm, &vec![byte; algorithm.key_len()]).unwrap();
         [Keys { tx: key(1), rx: key(2) }, Keys { tx: key(2), rx: key(1) }]
     }
 
-    /// The records of these writes.
+    /// Returns the records of these writes.
     async fn records(writes: &[&[u8]]) -> Vec<Vec<u8>> {
         let [near, _] = keys(&AES_128_GCM);
         let (mut far, wire) = tokio::io::duplex(1 << 20);
-        let mut tagged = Tagged::new(Box::new(wire), near);
+        let mut tagged = RecordStream::new(Box::new(wire), near);
         let mut all = Vec::new();
         for write in writes {
             tagged.write_all(write).await.unwrap();
@@ -330,7 +330,7 @@ mod tests {
     /// Returns the content that the far end hands on of these bytes, and its last result.
     async fn read(bytes: &[u8]) -> (Vec<u8>, io::Result<usize>) {
         let [_, far] = keys(&AES_128_GCM);
-        let mut tagged = Tagged::new(Box::new(io::Cursor::new(bytes.to_vec())), far);
+        let mut tagged = RecordStream::new(Box::new(io::Cursor::new(bytes.to_vec())), far);
         let mut got = Vec::new();
         let end = tagged.read_to_end(&mut got).await;
         (got, end)
@@ -342,12 +342,13 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_is_written_arrives_in_any_division_of_the_stream() {
+    async fn written_bytes_arrive_in_any_division_of_the_stream() {
         for algorithm in [&AES_128_GCM, &AES_256_GCM, &CHACHA20_POLY1305] {
             for size in [1, 7, 1 << 20] {
                 let [near, far] = keys(algorithm);
                 let (tx, rx) = tokio::io::duplex(size);
-                let (mut tx, mut rx) = (Tagged::new(Box::new(tx), near), Tagged::new(Box::new(rx), far));
+                let (mut tx, mut rx) =
+                    (RecordStream::new(Box::new(tx), near), RecordStream::new(Box::new(rx), far));
                 let text: Vec<u8> = (0..50_000_u32).map(|n| n as u8).collect();
                 let sent = text.clone();
                 let writer = tokio::spawn(async move {
@@ -355,7 +356,7 @@ mod tests {
                         tx.write_all(part).await.unwrap();
                     }
                     tx.flush().await.unwrap();
-                    // The other way is there, too.
+                    // The other direction works, too.
                     let mut answer = [0; 2];
                     tx.read_exact(&mut answer).await.unwrap();
                     assert_eq!(&answer, b"ok");
@@ -371,7 +372,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn whatever_is_changed_ends_the_stream_before_it_is_handed_on() {
+    async fn any_change_ends_the_stream_before_it_is_handed_on() {
         let [first, second, third] =
             <[Vec<u8>; 3]>::try_from(records(&[b"first", b"second", b"third"]).await).unwrap();
         let (got, end) = read(&[&first[..], &second, &third].concat()).await;
@@ -382,7 +383,7 @@ mod tests {
                 altered[at] ^= 1 << bit;
                 let (got, end) = read(&[&first[..], &altered, &third].concat()).await;
                 assert_eq!(got, b"first", "byte {at}, bit {bit}");
-                // A length that grew has the end of the stream come first.
+                // A length that grew makes the end of the stream come first.
                 assert!(is_altered(&end) || at < HEAD_BYTES, "byte {at}, bit {bit}: {end:?}");
             }
         }
@@ -399,7 +400,7 @@ mod tests {
         }
         // A record that was sent one way does not verify the other way.
         let [near, _] = keys(&AES_128_GCM);
-        let mut tagged = Tagged::new(Box::new(io::Cursor::new(first)), near);
+        let mut tagged = RecordStream::new(Box::new(io::Cursor::new(first)), near);
         assert!(is_altered(&tagged.read_to_end(&mut Vec::new()).await));
     }
 

@@ -1,35 +1,35 @@
-//! How many bytes may be under way: as many as keep the path busy and a short queue in it. Pure.
+//! The number of bytes in flight: enough to keep the path busy with a short queue. Pure.
 //!
-//! TCP takes whatever it is given, and its congestion control fills the queue of the narrowest hop; what is urgent then
-//! waits behind what is not. So the link gives TCP only what the path delivers within its shortest round trip and
-//! [`QUEUE_TARGET`] more. It is measured from within: pings stand between the bytes, and the answer to one says that all
-//! before it has arrived. (The kernel knows more, but tells it by an ioctl only, for which this crate would need unsafe
-//! code, and knows nothing of a proxy's queues.)
+//! TCP takes any number of bytes, and its congestion control fills the queue of the narrowest hop, where urgent packets
+//! then wait behind others. So the link gives TCP only the bytes that the path delivers within its shortest round trip
+//! and [`QUEUE_TARGET`] more. It measures from within: pings stand between the bytes, and the answer to a ping shows
+//! that everything before it has arrived. (The kernel knows more, but tells it by an ioctl only, for which this crate
+//! would need unsafe code, and knows nothing of a proxy's queues.)
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-/// What is written together takes about so long on the path, or is this part of what may be under way.
+/// Time on the path of bytes that are written together, and the least part of the window for them.
 const TOGETHER: Duration = Duration::from_millis(2);
 const TOGETHER_PART: u64 = 16;
-/// How long bytes may queue on the path.
+/// Time that bytes may queue on the path.
 const QUEUE_TARGET: Duration = Duration::from_millis(12);
-/// Least bytes that may be under way.
+/// Smallest window, bytes.
 const WINDOW_BYTES_MIN: u64 = 12 << 10;
-/// Bytes that may be under way before anything was measured.
+/// Window before any measurement, bytes.
 const WINDOW_BYTES_START: u64 = 32 << 10;
-/// By how much the window grows in a round trip, at most; and does until there is a queue for the first time.
+/// Largest growth of the window in a round trip; the growth until the first queue.
 const GROWTH_MAX: f64 = 1.5;
-/// For how long answers have to be late for a queue to be seen in that, at least; a round trip if that is longer.
+/// Time for which answers have to be late to show a queue, at least; a round trip if that is longer.
 const STANDING_MIN: Duration = Duration::from_millis(25);
-/// For how long the shortest round trip counts before it is looked for again, with a path that is almost empty.
+/// Time after which the shortest round trip is measured again, with a path that is almost empty.
 const RTT_MIN_AGE_MAX: Duration = Duration::from_secs(10);
 /// Most pings without answer: a peer that answers none costs no more.
 const PINGS_MAX: usize = 64;
 /// Bytes between two pings, at least and at most.
 const PING_BYTES: (u64, u64) = (4 << 10, 256 << 10);
 
-/// The window of one link, this way.
+/// The sending window of one link.
 #[derive(Debug)]
 pub(crate) struct Window {
     bytes: u64,
@@ -38,13 +38,13 @@ pub(crate) struct Window {
     delivered: u64,
     next_ping: u64,
     pings: VecDeque<Ping>,
-    /// The round trip of the handshake, until there is a better.
+    /// Round trip of the handshake, until a better one is measured.
     handshake: Duration,
     rtt: Option<Duration>,
     rtt_min: Option<(Duration, Instant)>,
-    /// Since when the shortest of late is looked for, that, and the one of the time before.
+    /// Beginning of the present span, its shortest round trip, and that of the span before.
     shortest: Option<(Instant, Duration, Duration)>,
-    /// The shortest round trip is being looked for.
+    /// The shortest round trip is being measured.
     is_probing: bool,
     /// No queue was seen yet.
     is_starting: bool,
@@ -56,12 +56,12 @@ struct Ping {
     at: Instant,
     /// Bytes written before it, in all.
     written: u64,
-    /// Bytes under way when it was written.
+    /// Bytes in flight when it was written.
     in_flight: u64,
 }
 
 impl Window {
-    /// At most `bytes_max` under way.
+    /// Returns a window of at most `bytes_max`.
     pub(crate) fn new(bytes_max: u64) -> Self {
         let bytes_max = bytes_max.max(WINDOW_BYTES_MIN);
         Self {
@@ -80,12 +80,12 @@ impl Window {
         }
     }
 
-    /// So many bytes were written.
+    /// Notes written bytes.
     pub(crate) fn on_written(&mut self, bytes: u64) {
         self.written += bytes;
     }
 
-    /// The number of a ping to be written now; nothing if too many have no answer.
+    /// Returns the number of a ping to write now; nothing if too many have no answer.
     pub(crate) fn ping(&mut self, now: Instant) -> Option<u64> {
         if self.pings.len() >= PINGS_MAX {
             return None;
@@ -96,16 +96,16 @@ impl Window {
         Some(number)
     }
 
-    /// True if enough was written since the last ping for another to tell something.
+    /// Returns `true` if enough was written since the last ping for another to tell something.
     pub(crate) fn is_ping_due(&self) -> bool {
         let (least, most) = PING_BYTES;
         let last = self.pings.back().map_or(self.delivered, |ping| ping.written);
-        // A full window opens with an answer only, so one has to be under way.
+        // Only an answer opens a full window, so one ping has to be in flight.
         let is_stuck = self.pings.is_empty() && !self.has_room(0);
         is_stuck || self.written - last >= (self.limit() / 8).clamp(least, most)
     }
 
-    /// All pings up to this one have arrived. False if there is none of that number.
+    /// Notes that all pings up to this one have arrived. Returns `false` if no ping has that number.
     pub(crate) fn on_pong(&mut self, number: u64, now: Instant) -> bool {
         if number >= self.next_ping {
             return false;
@@ -121,7 +121,7 @@ impl Window {
         true
     }
 
-    /// True if more may be written now: `more` bytes above the window are for what is urgent.
+    /// Returns `true` if more may be written now: urgent data may use `more` bytes above the window.
     pub(crate) fn has_room(&self, more: u64) -> bool {
         self.in_flight() < self.limit() + more
     }
@@ -130,34 +130,36 @@ impl Window {
         if self.is_probing { WINDOW_BYTES_MIN } else { self.bytes }
     }
 
-    /// Bytes written, in all.
+    /// Returns the bytes written, in all.
     pub(crate) fn written(&self) -> u64 {
         self.written
     }
 
-    /// Bytes that may be under way.
+    /// Returns the bytes that may be in flight.
     pub(crate) fn bytes(&self) -> u64 {
         self.bytes
     }
 
-    /// How many of them are written together: what the path delivers in [`TOGETHER`], and a part of them at least.
+    /// Returns the bytes to write together: those that the path delivers in [`TOGETHER`], and a part of the window at
+    /// least.
     pub(crate) fn together(&self) -> u64 {
         let rtt = self.rtt.unwrap_or(self.handshake).max(TOGETHER);
         let delivered = self.bytes as f64 * TOGETHER.as_secs_f64() / rtt.as_secs_f64();
         (delivered as u64).max(self.bytes / TOGETHER_PART)
     }
 
-    /// Smoothed and shortest round trip.
+    /// Returns the smoothed and the shortest round trip.
     pub(crate) fn rtt(&self) -> (Duration, Duration) {
         (self.rtt.unwrap_or(self.handshake), self.rtt_min.map_or(self.handshake, |(rtt, _)| rtt))
     }
 
-    /// How long the handshake took for a round trip.
+    /// Notes the handshake's round trip.
     pub(crate) fn note_handshake(&mut self, rtt: Duration) {
         self.handshake = rtt;
     }
 
-    /// The shortest round trip of late. What comes and goes is the radio or a busy processor; what stays is a queue.
+    /// Returns the recent shortest round trip. Radio and busy processors cause passing delay; a queue causes lasting
+    /// delay.
     fn standing(&mut self, rtt: Duration, now: Instant) -> Duration {
         let half = self.rtt.map_or(STANDING_MIN, |rtt| rtt.max(STANDING_MIN));
         let (began, latest, before) = self.shortest.unwrap_or((now, rtt, rtt));
@@ -193,7 +195,7 @@ impl Window {
             }
         }
         let least = self.rtt_min.map_or(rtt, |(least, _)| least);
-        // What was under way arrived within this round trip; so this much does in the time that it is to take.
+        // The bytes in flight arrived within this round trip, so this part arrives in the target time.
         let was_full = ping.in_flight >= self.bytes / 2;
         let (aim, standing) = (least + QUEUE_TARGET, self.standing(rtt, now));
         let portion = |rtt: Duration| aim.as_secs_f64() / rtt.as_secs_f64();
@@ -217,8 +219,8 @@ mod tests {
 
     use super::*;
 
-    /// A path of this rate and delay, as full as the window lets it be: (bytes per second delivered, longest wait in its
-    /// queue) over the last of so many seconds. Answers are late by up to `jitter`, and stay in order.
+    /// Runs a path of this rate and delay, as full as the window lets it be. Returns bytes per second delivered and the
+    /// longest wait in its queue over the last of these seconds. Answers are late by up to `jitter`, and stay in order.
     fn run(rate: f64, rtt: Duration, jitter: Duration, seconds: u32) -> (f64, Duration) {
         let mut rng = ChaCha20Rng::seed_from_u64(1);
         let start = Instant::now();

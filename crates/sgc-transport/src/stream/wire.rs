@@ -1,5 +1,5 @@
-//! The streams of bytes below a link: what all of them can do, what is counted, and the end of TLS on a stream that goes
-//! on without it.
+//! The streams of bytes below a link: a common trait, counters, and the end of TLS on a stream that continues without
+//! it.
 
 use std::io::{self, IoSlice};
 use std::pin::Pin;
@@ -13,7 +13,7 @@ use tokio::net::TcpStream;
 /// Any stream of bytes.
 pub(super) type Wire = Box<dyn Io>;
 
-/// What a stream of bytes can do.
+/// The abilities of a stream of bytes.
 pub(super) trait Io: AsyncRead + AsyncWrite + Send + Unpin {}
 
 impl<T: AsyncRead + AsyncWrite + Send + Unpin> Io for T {}
@@ -26,19 +26,19 @@ pub(super) struct Counters {
 }
 
 impl Counters {
-    /// Sent and received.
+    /// Returns sent and received bytes.
     pub(super) fn read(&self) -> (u64, u64) {
         (self.sent.load(Relaxed), self.received.load(Relaxed))
     }
 }
 
-/// A TCP connection that counts.
-pub(super) struct Counted {
+/// A TCP connection with counters.
+pub(super) struct CountingTcp {
     pub(super) tcp: TcpStream,
     pub(super) counters: Arc<Counters>,
 }
 
-impl AsyncRead for Counted {
+impl AsyncRead for CountingTcp {
     fn poll_read(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -51,7 +51,7 @@ impl AsyncRead for Counted {
     }
 }
 
-impl Counted {
+impl CountingTcp {
     fn count(&self, written: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
         if let Poll::Ready(Ok(n)) = &written {
             self.counters.sent.fetch_add(*n as u64, Relaxed);
@@ -60,7 +60,7 @@ impl Counted {
     }
 }
 
-impl AsyncWrite for Counted {
+impl AsyncWrite for CountingTcp {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         let written = Pin::new(&mut self.tcp).poll_write(cx, buf);
         self.count(written)
@@ -90,42 +90,42 @@ impl AsyncWrite for Counted {
 
 const RECORD_HEAD_BYTES: usize = 5;
 
-/// What TLS reads from and writes to. Where TLS is to end before the stream does, it hands out one TLS record at a time and
-/// keeps the stream open when TLS ends: so what follows the record that ends TLS is never read as TLS.
-pub(super) struct Below {
+/// The stream below TLS. Where TLS ends before the stream does, it hands out one TLS record at a time and keeps the
+/// stream open when TLS ends: so bytes behind the last record of TLS are never read as TLS.
+pub(super) struct TlsIo {
     wire: Wire,
-    /// Nothing: passes everything on as it is.
+    /// `None` passes everything on as it is.
     records: Option<Records>,
 }
 
 #[derive(Default)]
 struct Records {
     head: [u8; RECORD_HEAD_BYTES],
-    /// Of the head, received and handed out.
+    /// Bytes of the head, received and handed out.
     filled: usize,
     handed: usize,
-    /// Of the body, still to come.
+    /// Bytes of the body, still to come.
     left: usize,
 }
 
-impl Below {
-    /// TLS is all there is.
+impl TlsIo {
+    /// Returns a stream that TLS uses to its end.
     pub(super) fn whole(wire: Wire) -> Self {
         Self { wire, records: None }
     }
 
-    /// TLS ends before the stream does.
+    /// Returns a stream that goes on after TLS ends.
     pub(super) fn until_close_notify(wire: Wire) -> Self {
         Self { wire, records: Some(Records::default()) }
     }
 
-    /// What is below.
+    /// Returns the stream below.
     pub(super) fn into_wire(self) -> Wire {
         self.wire
     }
 }
 
-impl AsyncRead for Below {
+impl AsyncRead for TlsIo {
     fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let Self { wire, records } = self.get_mut();
         let Some(records) = records else { return Pin::new(wire).poll_read(cx, buf) };
@@ -163,7 +163,7 @@ impl AsyncRead for Below {
     }
 }
 
-impl AsyncWrite for Below {
+impl AsyncWrite for TlsIo {
     fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         Pin::new(&mut self.get_mut().wire).poll_write(cx, buf)
     }
@@ -206,7 +206,7 @@ mod tests {
             let (mut tx, rx) = tokio::io::duplex(size);
             let sent = stream.clone();
             let writer = tokio::spawn(async move { tx.write_all(&sent).await });
-            let mut below = Below::until_close_notify(Box::new(rx));
+            let mut below = TlsIo::until_close_notify(Box::new(rx));
             for record in [record(b"first"), record(b""), record(b"second")] {
                 let mut got = Vec::new();
                 while got.len() < record.len() {

@@ -1,8 +1,9 @@
 //! A stream of bytes inside of WebSocket (RFC 6455): the upgrade of HTTP/1.1, then binary messages whose borders mean
 //! nothing.
 //!
-//! It authenticates nobody: whoever ends the TLS around it, a web proxy for instance, reads and writes what it likes, and
-//! finds the nodes' own TLS within. No extensions, no subprotocols, no cookies, and no more of HTTP than the upgrade takes.
+//! It authenticates nobody: the end of the TLS around it, a web proxy for instance, reads and writes as it likes, and
+//! finds the nodes' own TLS within. No extensions, no subprotocols, no cookies, and no more of HTTP than the upgrade
+//! takes.
 
 use std::fmt;
 use std::io;
@@ -19,7 +20,7 @@ use super::wire::Wire;
 
 /// Longest head of a request or an answer, bytes.
 pub(super) const HTTP_HEAD_BYTES_MAX: usize = 8 << 10;
-/// Longest frame that is accepted, bytes; what is within is passed on as it comes.
+/// Longest frame that is accepted, bytes; its content is passed on as it comes.
 pub(super) const WS_FRAME_BYTES_MAX: u64 = 1 << 20;
 /// Longest frame that is sent, bytes: it holds up answers to pings.
 const WS_FRAME_BYTES: usize = 64 << 10;
@@ -34,14 +35,14 @@ const CLOSE: u8 = 8;
 const PING: u8 = 9;
 const PONG: u8 = 10;
 
-/// Why HTTP did not become WebSocket.
+/// The reason why HTTP did not become WebSocket.
 #[derive(Debug)]
 pub(super) enum UpgradeError {
     /// The listener refused, with this status.
     Status(u16),
-    /// A request for something that is not here, or no request at all; the dialer was told.
+    /// A request for another page, or no request at all; the dialer was told.
     Request(String),
-    /// The answer is none.
+    /// The response is invalid.
     Answer(&'static str),
     /// The connection failed.
     Io(io::Error),
@@ -64,7 +65,7 @@ impl fmt::Display for UpgradeError {
     }
 }
 
-/// Asks for the upgrade.
+/// Requests the upgrade.
 pub(super) async fn dial(mut wire: Wire, host: &str, path: &str) -> Result<WsStream, UpgradeError> {
     let mut nonce = [0; 16];
     fill(&mut nonce);
@@ -91,7 +92,7 @@ pub(super) async fn dial(mut wire: Wire, host: &str, path: &str) -> Result<WsStr
     Ok(WsStream::new(wire, rest, true))
 }
 
-/// Awaits the request for an upgrade at this path, and answers it. Whoever asks for something else is told so.
+/// Awaits the request for an upgrade at this path, and answers it. Any other request gets an error response.
 pub(super) async fn accept(mut wire: Wire, path: &str) -> Result<WsStream, (UpgradeError, Wire)> {
     match upgrade(&mut wire, path).await {
         Ok(rest) => Ok(WsStream::new(wire, rest, false)),
@@ -138,7 +139,7 @@ async fn upgrade(wire: &mut Wire, path: &str) -> Result<BytesMut, UpgradeError> 
     Ok(rest)
 }
 
-/// Reads up to the empty line: what is before it and what came behind it; nothing if it is too long or no text.
+/// Reads up to the empty line. Returns the head and the bytes behind it; nothing if the head is too long or no text.
 async fn read_head(wire: &mut Wire) -> io::Result<Option<(String, BytesMut)>> {
     const END: &[u8] = b"\r\n\r\n";
     let mut bytes = BytesMut::with_capacity(1024);
@@ -148,7 +149,7 @@ async fn read_head(wire: &mut Wire) -> io::Result<Option<(String, BytesMut)>> {
             bytes.advance(END.len());
             return Ok(String::from_utf8(head.to_vec()).ok().map(|head| (head, bytes)));
         }
-        // Whoever speaks something else, TLS for instance, is not waited for.
+        // A peer that speaks another protocol, TLS for instance, sends no head; it is not waited for.
         if bytes.len() >= HTTP_HEAD_BYTES_MAX || bytes.first().is_some_and(|b| !b.is_ascii_uppercase()) {
             return Ok(None);
         }
@@ -184,7 +185,7 @@ fn fill(bytes: &mut [u8]) {
 /// A stream of bytes in binary messages.
 pub(super) struct WsStream {
     wire: Wire,
-    /// What a dialer sends is masked, what a listener sends is not (RFC 6455, 5.3).
+    /// Dialers mask their frames, listeners do not (RFC 6455, 5.3).
     is_dialer: bool,
     input: BytesMut,
     expect: Expect,
@@ -250,7 +251,7 @@ impl WsStream {
         Poll::Ready(Ok(()))
     }
 
-    /// Takes what it can of the input: true if `buf` got some or the stream is over, false if more input is needed.
+    /// Consumes input. Returns `true` if `buf` got bytes or the stream is over, `false` if more input is needed.
     fn consume(&mut self, buf: &mut ReadBuf<'_>) -> io::Result<bool> {
         loop {
             match &mut self.expect {
@@ -299,7 +300,7 @@ impl WsStream {
     }
 }
 
-/// Masks, or takes the mask off.
+/// Masks, or removes the mask.
 fn apply(mask: [u8; 4], bytes: &mut [u8]) {
     let mut words = bytes.chunks_exact_mut(4);
     for word in &mut words {
@@ -312,7 +313,7 @@ fn apply(mask: [u8; 4], bytes: &mut [u8]) {
     }
 }
 
-/// Reads the head of a frame: it and its length, or nothing while more bytes are needed.
+/// Reads the head of a frame. Returns it and its length, or nothing while more bytes are needed.
 fn read_frame(bytes: &[u8], is_masked: bool) -> io::Result<Option<(Frame, usize)>> {
     let wrong = |what: &str| Err(io::Error::new(io::ErrorKind::InvalidData, format!("WebSocket: {what}")));
     let [first, second, rest @ ..] = bytes else { return Ok(None) };
@@ -351,7 +352,7 @@ impl AsyncRead for WsStream {
         let this = self.get_mut();
         loop {
             if this.consume(buf)? {
-                // What a ping asked for goes out when it can; the writer's next turn takes the rest.
+                // Answers to pings go out when they can; the writer's next turn takes the rest.
                 let _ = this.poll_output(cx)?;
                 return Poll::Ready(Ok(()));
             }

@@ -1,8 +1,8 @@
-//! The judgement over the peer's certificate inside of the TLS handshake, the same for dialers and listeners.
+//! Judgement of the peer's certificate inside of the TLS handshake, the same for dialers and listeners.
 //!
-//! Made anew for each connection, it keeps its verdict, so that the log can say in full what the TLS alert only
-//! hints at. The server name is not compared: a URL says where a node is, its certificate says who it is, and
-//! whoever uses the link judges by the latter.
+//! Each connection has a verifier, which keeps its verdict, so that the log can say in full what the TLS alert only
+//! hints at. The server name is not compared: a URL says where a node is, its certificate says which node it is, and
+//! users of the link judge by the certificate.
 
 use std::fmt;
 use std::sync::{Arc, OnceLock};
@@ -22,24 +22,24 @@ use sgc_wire::UnixMillis;
 
 use crate::credentials::CredentialStore;
 
-/// What a handshake found out about the peer.
+/// A handshake's findings about the peer.
 #[derive(Debug, Default)]
 pub(crate) struct Findings {
-    /// Empty as long as no certificate came.
+    /// Empty until a certificate came.
     verdict: OnceLock<Result<VerifiedPeer, CertError>>,
     /// Whether only post-quantum key exchanges are accepted.
     pub(crate) post_quantum: bool,
-    /// Whether a dialer's groups hold one that is accepted here; empty as long as it offered none.
+    /// Whether a dialer's groups include an accepted one; empty until it offered some.
     offers_group: OnceLock<bool>,
 }
 
 impl Findings {
-    /// Who the peer is, or why it is not believed.
+    /// Returns the peer, or the reason why its certificate is not believed.
     pub(crate) fn verdict(&self) -> Option<&Result<VerifiedPeer, CertError>> {
         self.verdict.get()
     }
 
-    /// True if it was heard out and offers no key exchange that is accepted here.
+    /// Returns `true` if the dialer has sent its groups and none of them is accepted here.
     pub(crate) fn lacks_key_exchange(&self) -> bool {
         self.offers_group.get() == Some(&false)
     }
@@ -63,7 +63,7 @@ impl PeerVerifier {
         (Arc::new(Self { credentials, algorithms, findings: Arc::clone(&findings) }), findings)
     }
 
-    /// `attaches`: the peer came to a listener of this node.
+    /// Judges the chain. `attaches`: the peer came to a listener of this node.
     fn judge(
         &self,
         leaf: &CertificateDer<'_>,
@@ -80,14 +80,15 @@ impl PeerVerifier {
     }
 }
 
-/// Who shows this chain, leaf first, or why it is not believed now. `attaches`: the peer came to a listener of this node.
+/// Returns the node of this chain, leaf first, or the reason why it is not believed now. `attaches`: the peer came to a
+/// listener of this node.
 pub(crate) fn judge(
     credentials: &CredentialStore,
     chain: &[CertificateDer<'_>],
     now: UnixTime,
     attaches: bool,
 ) -> Result<VerifiedPeer, CertError> {
-    // Read here and not when the handshake began: what was revoked since counts.
+    // Read here and not when the handshake began, so that revocations since then count.
     let anchors = credentials.anchors();
     let peer = anchors.verify(chain, UnixMillis(now.as_secs().saturating_mul(1000)))?;
     if attaches && !credentials.admits(&peer) {
@@ -96,15 +97,15 @@ pub(crate) fn judge(
     Ok(peer)
 }
 
-/// Shows the listener's certificate, and notes what the dialer offers: an alert says nothing of it.
+/// Shows the listener's certificate, and notes the dialer's groups, because an alert does not tell them.
 #[derive(Debug)]
-pub(crate) struct Presenter {
+pub(crate) struct ListenerCertResolver {
     pub(crate) key: Arc<CertifiedKey>,
     pub(crate) accepted: Vec<NamedGroup>,
     pub(crate) findings: Arc<Findings>,
 }
 
-impl ResolvesServerCert for Presenter {
+impl ResolvesServerCert for ListenerCertResolver {
     fn resolve(&self, hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
         if let Some(offered) = hello.named_groups() {
             let _ = self.findings.offers_group.set(offered.iter().any(|g| self.accepted.contains(g)));
@@ -119,7 +120,7 @@ impl fmt::Debug for PeerVerifier {
     }
 }
 
-/// Rustls asks both of its verifiers for the same three things. Signatures are those of TLS 1.3, by the provider.
+/// The three methods that rustls requires of both verifiers. Signatures are those of TLS 1.3, by the provider.
 macro_rules! handshake_signatures {
     () => {
         fn verify_tls12_signature(
@@ -162,7 +163,7 @@ impl ServerCertVerifier for PeerVerifier {
 }
 
 impl ClientCertVerifier for PeerVerifier {
-    /// None: which CAs are trusted here is no one's business before they have shown a certificate.
+    /// Empty: peers do not learn which CAs are trusted here before they have shown a certificate.
     fn root_hint_subjects(&self) -> &[DistinguishedName] {
         &[]
     }
@@ -179,19 +180,19 @@ impl ClientCertVerifier for PeerVerifier {
     handshake_signatures!();
 }
 
-/// Believes whatever certificate, for TLS that only hides: what it carries is authenticated within.
+/// Accepts any certificate, for TLS that only hides: the nodes authenticate each other within it.
 #[derive(Debug)]
-pub(crate) struct Anyone {
+pub(crate) struct AcceptAnyCertificate {
     algorithms: WebPkiSupportedAlgorithms,
 }
 
-impl Anyone {
+impl AcceptAnyCertificate {
     pub(crate) fn new(provider: &CryptoProvider) -> Self {
         Self { algorithms: provider.signature_verification_algorithms }
     }
 }
 
-impl ServerCertVerifier for Anyone {
+impl ServerCertVerifier for AcceptAnyCertificate {
     fn verify_server_cert(
         &self,
         _end_entity: &CertificateDer<'_>,
@@ -206,7 +207,7 @@ impl ServerCertVerifier for Anyone {
     handshake_signatures!();
 }
 
-/// What the peer is told: the alert that fits, and no more.
+/// Returns the alert for the peer, and no more than that.
 pub(crate) fn alert(error: &CertError) -> CertificateError {
     match error {
         CertError::UnknownIssuer => CertificateError::UnknownIssuer,

@@ -57,7 +57,7 @@ pub fn packet(seq: u64, payload: Bytes) -> Packet {
     packet_of(Class::Default, seq, payload)
 }
 
-/// The same in a class.
+/// Returns a whole message in one reliable packet of a class.
 pub fn packet_of(class: Class, seq: u64, payload: Bytes) -> Packet {
     let header = PacketHeader {
         reliable: true,
@@ -83,7 +83,7 @@ pub fn joined(payload: &Payload) -> Bytes {
     out.freeze()
 }
 
-/// Whatever hangs fails.
+/// Fails if the future hangs.
 pub async fn soon<T>(future: impl Future<Output = T>) -> T {
     tokio::time::timeout(Duration::from_secs(30), future).await.expect("it hangs")
 }
@@ -106,7 +106,7 @@ impl Server {
         Self::start_at("quic://127.0.0.1:0", identity, options)
     }
 
-    /// By the transport of this scheme.
+    /// Starts a listener of this scheme.
     pub fn start_on(scheme: &str, identity: impl Into<CredentialStore>, options: LinkOptions) -> Self {
         Self::start_at(&format!("{scheme}://127.0.0.1:0"), identity, options)
     }
@@ -159,7 +159,7 @@ pub async fn pair(options: LinkOptions) -> (AnyLink, AnyLink) {
     pair_on("quic", options).await
 }
 
-/// The same by the transport of this scheme.
+/// Makes a link by the transport of this scheme.
 pub async fn pair_on(scheme: &str, options: LinkOptions) -> (AnyLink, AnyLink) {
     let fleet = fleet(1);
     let mut server = Server::start_on(scheme, enroll(&fleet, "router"), options.clone());
@@ -206,7 +206,7 @@ impl ServerCertVerifier for TrustAnyone {
     }
 }
 
-/// The TLS of a dialer that believes anyone.
+/// The TLS of a dialer that accepts any certificate.
 pub fn bare_tls(identity: Option<&Identity>, alpn: &str, groups: Option<Groups>) -> rustls::ClientConfig {
     let mut provider = rustls::crypto::aws_lc_rs::default_provider();
     provider.kx_groups = groups.unwrap_or(provider.kx_groups);
@@ -235,7 +235,7 @@ pub async fn bare(
     bare_with(addr, bare_tls(identity, alpn, None)).await
 }
 
-/// The same with TLS of one's own.
+/// Makes a bare QUIC connection with the given TLS.
 pub async fn bare_with(addr: SocketAddr, tls: rustls::ClientConfig) -> Result<Connection, ConnectionError> {
     let config = quinn::ClientConfig::new(Arc::new(QuicClientConfig::try_from(tls).unwrap()));
     let endpoint = Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
@@ -286,7 +286,7 @@ pub fn hello(number: u32) -> Vec<u8> {
     record
 }
 
-/// Begins a DTLS handshake from this socket, proves its address by the ticket that it is given, and says no more.
+/// Begins a DTLS handshake from this socket, proves its address by the received ticket, and stays silent.
 pub fn prove_and_stall(socket: &std::net::UdpSocket, listener: SocketAddr, number: u32) {
     const CHALLENGE: u8 = 0xc2;
     const TICKET: u8 = 0xc3;

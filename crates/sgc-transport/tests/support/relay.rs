@@ -11,19 +11,19 @@ use tokio::net::UdpSocket;
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
-/// How many datagrams later one that is reordered comes.
+/// Number of datagrams by which a reordered one is late.
 const REORDER_DEPTH: usize = 4;
 
-/// What the relay does with datagrams from now on; permille.
+/// The relay's treatment of datagrams from now on; permille.
 #[derive(Default)]
-pub struct Weather {
+pub struct Impairment {
     pub loss: AtomicU32,
     pub reorder: AtomicU32,
     /// Longest datagram that gets through, if not 0.
     pub longest: AtomicU32,
     /// Alters one byte of the next long datagram towards the dialer.
     pub flip: AtomicBool,
-    /// Keeps what goes by.
+    /// Keeps the passing datagrams.
     pub tap: AtomicBool,
     pub seen: Mutex<Vec<Vec<u8>>>,
     pub forwarded: AtomicU64,
@@ -32,24 +32,24 @@ pub struct Weather {
 
 pub struct Relay {
     pub addr: SocketAddr,
-    pub weather: Arc<Weather>,
+    pub impairment: Arc<Impairment>,
     new_port: Arc<Notify>,
     _tasks: JoinSet<()>,
 }
 
 impl Relay {
-    /// For one dialer.
+    /// Starts a relay for one dialer.
     pub async fn start(listener: SocketAddr, seed: u64) -> Self {
         let front = Arc::new(bind().await);
         let addr = front.local_addr().unwrap();
-        let weather = Arc::new(Weather::default());
+        let impairment = Arc::new(Impairment::default());
         let new_port = Arc::new(Notify::new());
         let mut tasks = JoinSet::new();
-        tasks.spawn(run(front, listener, seed, Arc::clone(&weather), Arc::clone(&new_port)));
-        Self { addr, weather, new_port, _tasks: tasks }
+        tasks.spawn(run(front, listener, seed, Arc::clone(&impairment), Arc::clone(&new_port)));
+        Self { addr, impairment, new_port, _tasks: tasks }
     }
 
-    /// The listener sees another port from now on, and what it sends to the old one is lost.
+    /// The listener sees another port from now on, and its datagrams to the old one are lost.
     pub fn change_port(&self) {
         self.new_port.notify_one();
     }
@@ -66,25 +66,25 @@ async fn run(
     front: Arc<UdpSocket>,
     listener: SocketAddr,
     seed: u64,
-    weather: Arc<Weather>,
+    impairment: Arc<Impairment>,
     new_port: Arc<Notify>,
 ) {
     let mut back = bind().await;
     let mut dialer = None;
-    let mut ways = [seed, !seed].map(Way::new);
+    let mut ways = [seed, !seed].map(Direction::new);
     let (mut up, mut down) = (vec![0; 65_536], vec![0; 65_536]);
     loop {
         tokio::select! {
             () = new_port.notified() => back = bind().await,
             Ok((len, from)) = front.recv_from(&mut up) => {
                 dialer = Some(from);
-                for datagram in ways[0].pass(&up[..len], &weather, false) {
+                for datagram in ways[0].pass(&up[..len], &impairment, false) {
                     let _ = back.send_to(&datagram, listener).await;
                 }
             }
             Ok((len, from)) = back.recv_from(&mut down) => {
                 if let (Some(dialer), true) = (dialer, from == listener) {
-                    for datagram in ways[1].pass(&down[..len], &weather, true) {
+                    for datagram in ways[1].pass(&down[..len], &impairment, true) {
                         let _ = front.send_to(&datagram, dialer).await;
                     }
                 }
@@ -94,19 +94,19 @@ async fn run(
 }
 
 /// One direction.
-struct Way {
+struct Direction {
     rng: ChaCha20Rng,
     held: Vec<(usize, Vec<u8>)>,
 }
 
-impl Way {
+impl Direction {
     fn new(seed: u64) -> Self {
         Self { rng: ChaCha20Rng::seed_from_u64(seed), held: Vec::new() }
     }
 
-    fn pass(&mut self, datagram: &[u8], weather: &Weather, may_flip: bool) -> Vec<Vec<u8>> {
-        if weather.tap.load(Relaxed) {
-            weather.seen.lock().unwrap().push(datagram.to_vec());
+    fn pass(&mut self, datagram: &[u8], impairment: &Impairment, may_flip: bool) -> Vec<Vec<u8>> {
+        if impairment.tap.load(Relaxed) {
+            impairment.seen.lock().unwrap().push(datagram.to_vec());
         }
         let mut out = Vec::new();
         self.held.retain_mut(|(wait, held)| {
@@ -116,25 +116,25 @@ impl Way {
             }
             *wait > 0
         });
-        let longest = weather.longest.load(Relaxed) as usize;
+        let longest = impairment.longest.load(Relaxed) as usize;
         if longest > 0 && datagram.len() > longest {
             return out;
         }
-        if self.rng.next_u32() % 1000 < weather.loss.load(Relaxed) {
+        if self.rng.next_u32() % 1000 < impairment.loss.load(Relaxed) {
             return out;
         }
         let mut datagram = datagram.to_vec();
-        if may_flip && datagram.len() > 600 && weather.flip.swap(false, Relaxed) {
+        if may_flip && datagram.len() > 600 && impairment.flip.swap(false, Relaxed) {
             let at = datagram.len() - 100;
             datagram[at] ^= 1;
-            weather.flipped.fetch_add(1, Relaxed);
+            impairment.flipped.fetch_add(1, Relaxed);
         }
-        if self.rng.next_u32() % 1000 < weather.reorder.load(Relaxed) {
+        if self.rng.next_u32() % 1000 < impairment.reorder.load(Relaxed) {
             self.held.push((REORDER_DEPTH, datagram));
         } else {
             out.insert(0, datagram);
         }
-        weather.forwarded.fetch_add(out.len() as u64, Relaxed);
+        impairment.forwarded.fetch_add(out.len() as u64, Relaxed);
         out
     }
 }

@@ -37,9 +37,9 @@ impl LongCertificate {
     }
 }
 
-/// A meeting of a stranger with a dialer or listener.
+/// A stranger's observations of one handshake.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Encounter {
+pub struct HandshakeLog {
     /// The certificate that it was shown, DER.
     pub certificate: Option<Vec<u8>>,
     /// The handshake was finished.
@@ -52,7 +52,7 @@ struct End {
     dtls: Dtls,
     buffer: Vec<u8>,
     due: Instant,
-    met: Encounter,
+    met: HandshakeLog,
 }
 
 impl End {
@@ -70,7 +70,7 @@ impl End {
             _ => Dtls::new_13(config, certificate.clone(), now),
         };
         dtls.set_active(is_client);
-        Self { dtls, buffer: vec![0; 1 << 18], due: now, met: Encounter::default() }
+        Self { dtls, buffer: vec![0; 1 << 18], due: now, met: HandshakeLog::default() }
     }
 
     fn drive(&mut self, datagram: Option<&[u8]>, mut send: impl FnMut(&[u8])) {
@@ -110,7 +110,7 @@ pub fn visit(
     certificate: &DtlsCertificate,
     datagram_bytes: usize,
     patience: Duration,
-) -> Encounter {
+) -> HandshakeLog {
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
     socket.connect(listener).unwrap();
     let mut end = End::new(version, certificate, datagram_bytes, true);
@@ -126,11 +126,11 @@ pub fn visit(
     end.met
 }
 
-/// A listener that is nobody, for as long as it lives.
+/// A listener without an identity, for as long as it lives.
 pub struct FakeListener {
     pub addr: SocketAddr,
     stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<Vec<Encounter>>>,
+    thread: Option<JoinHandle<Vec<HandshakeLog>>>,
 }
 
 impl FakeListener {
@@ -166,8 +166,8 @@ impl FakeListener {
         Self { addr, stop, thread: Some(thread) }
     }
 
-    /// Returns its encounters.
-    pub fn stop(mut self) -> Vec<Encounter> {
+    /// Stops it, and returns its observations.
+    pub fn stop(mut self) -> Vec<HandshakeLog> {
         self.stop.store(true, Relaxed);
         self.thread.take().unwrap().join().unwrap()
     }

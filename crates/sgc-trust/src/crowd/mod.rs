@@ -8,6 +8,6 @@ mod places;
 mod prefix;
 mod repeats;
 
-pub use places::{Crowded, PLACE_HELD_MIN, PlaceDecision, PlaceLimits, Places};
+pub use places::{PLACE_HELD_MIN, PlaceDecision, PlaceLimits, PlaceRefusal, Places};
 pub use prefix::AddressPrefix;
-pub use repeats::{REPEAT_SOURCES_MAX, REPEAT_WINDOW, Repeated, Repeats};
+pub use repeats::{REPEAT_SOURCES_MAX, REPEAT_WINDOW, RepeatCount, Repeats};

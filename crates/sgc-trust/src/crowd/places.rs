@@ -1,4 +1,4 @@
-//! Places for handshakes: a bound for all, a bound for each address, and which handshake gives way.
+//! Places for handshakes: a bound for all, a bound for each address, and the rule for the handshake that gives way.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -18,9 +18,9 @@ pub struct PlaceLimits {
     pub per_prefix: usize,
 }
 
-/// Why a place was not to be had.
+/// The reason why there is no place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Crowded {
+pub enum PlaceRefusal {
     /// The peer's own address holds as many as one address may.
     Prefix {
         /// The address.
@@ -41,9 +41,9 @@ pub enum PlaceDecision<T> {
     /// There is room.
     Admit,
     /// There is room because this handshake gave way; the caller ends it.
-    Evict(T, Crowded),
+    Evict(T, PlaceRefusal),
     /// There is none.
-    Refuse(Crowded),
+    Refuse(PlaceRefusal),
 }
 
 /// The handshakes under way at one listener, the oldest first. Each holds a `T`, by which the caller can end it.
@@ -91,7 +91,8 @@ impl<T> Places<T> {
         self.held.retain(|place| is_pending(&place.holder));
     }
 
-    /// Makes room for a peer of this address, or says why there is none. Callers pass the holder to [`Self::take`] then.
+    /// Makes room for a peer of this address, or returns the reason why there is none. The caller then passes the
+    /// holder to [`Self::take`].
     pub fn make_room(
         &mut self,
         prefix: AddressPrefix,
@@ -100,7 +101,7 @@ impl<T> Places<T> {
     ) -> PlaceDecision<T> {
         let own = self.held.iter().filter(|place| place.prefix == prefix).count();
         if own >= self.limits.per_prefix {
-            let crowded = Crowded::Prefix { prefix, held: own };
+            let crowded = PlaceRefusal::Prefix { prefix, held: own };
             return self.displace(|place| place.prefix == prefix, false, crowded, now, is_engaged);
         }
         if self.held.len() < self.limits.all {
@@ -113,7 +114,7 @@ impl<T> Places<T> {
         let most = counts.values().copied().max().unwrap_or(0);
         // Displacing one of theirs leaves them with as many as the newcomer's address, at least.
         let is_heavier = most > own + 1;
-        let crowded = Crowded::All { held: self.held.len() };
+        let crowded = PlaceRefusal::All { held: self.held.len() };
         let is_heaviest = |place: &Place<T>| counts.get(&place.prefix) == Some(&most);
         self.displace(is_heaviest, is_heavier, crowded, now, is_engaged)
     }
@@ -127,7 +128,7 @@ impl<T> Places<T> {
         &mut self,
         is_candidate: impl Fn(&Place<T>) -> bool,
         is_heavier: bool,
-        crowded: Crowded,
+        crowded: PlaceRefusal,
         now: Instant,
         is_engaged: impl Fn(&T) -> bool,
     ) -> PlaceDecision<T> {
@@ -189,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn one_address_has_no_more_than_its_share_however_often_it_asks() {
+    fn an_address_has_no_more_than_its_share_however_often_it_asks() {
         let mut bench = Bench::new();
         let mut refused = 0;
         for _ in 0..100 {
@@ -199,7 +200,7 @@ mod tests {
         assert_eq!(bench.held_by(1), [0, 1, 2], "engaged handshakes are not displaced at once");
         assert_eq!(bench.ask(2, true), PlaceDecision::Admit);
         bench.now += PLACE_HELD_MIN;
-        let crowded = Crowded::Prefix { prefix: host(1), held: 3 };
+        let crowded = PlaceRefusal::Prefix { prefix: host(1), held: 3 };
         assert_eq!(bench.ask(1, true), PlaceDecision::Evict((0, true), crowded));
     }
 
@@ -209,7 +210,7 @@ mod tests {
         for engaged in [true, false, false] {
             assert_eq!(bench.ask(1, engaged), PlaceDecision::Admit);
         }
-        let crowded = Crowded::Prefix { prefix: host(1), held: 3 };
+        let crowded = PlaceRefusal::Prefix { prefix: host(1), held: 3 };
         assert_eq!(bench.ask(1, true), PlaceDecision::Evict((1, false), crowded));
         assert_eq!(bench.ask(1, true), PlaceDecision::Evict((2, false), crowded));
         assert_eq!(bench.ask(1, true), PlaceDecision::Refuse(crowded));
@@ -221,7 +222,7 @@ mod tests {
         for from in [1, 1, 1, 2, 2, 2, 3, 3] {
             assert_eq!(bench.ask(from, true), PlaceDecision::Admit);
         }
-        let crowded = Crowded::All { held: 8 };
+        let crowded = PlaceRefusal::All { held: 8 };
         assert_eq!(
             bench.ask(4, true),
             PlaceDecision::Evict((0, true), crowded),
@@ -239,7 +240,7 @@ mod tests {
         for from in 1..=8 {
             assert_eq!(bench.ask(from, true), PlaceDecision::Admit);
         }
-        let crowded = Crowded::All { held: 8 };
+        let crowded = PlaceRefusal::All { held: 8 };
         assert_eq!(bench.ask(9, true), PlaceDecision::Refuse(crowded));
         bench.now += PLACE_HELD_MIN;
         assert_eq!(bench.ask(9, true), PlaceDecision::Evict((0, true), crowded));

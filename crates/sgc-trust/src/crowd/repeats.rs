@@ -5,16 +5,16 @@ use std::time::{Duration, Instant};
 
 use super::prefix::AddressPrefix;
 
-/// Over how long repeated events are counted into one line.
+/// Time over which repeated events are counted into one line.
 pub const REPEAT_WINDOW: Duration = Duration::from_secs(10);
 /// Most pairs of an address and a kind that are told apart. Events of others are counted together.
 pub const REPEAT_SOURCES_MAX: usize = 64;
 
 /// Events within the last [`REPEAT_WINDOW`], by address and kind `K`.
 ///
-/// Of a pair that is new the event is to be logged. What comes after it within the window is counted, and so is what comes
-/// in the windows after that, until one passes without any. So a flood writes [`REPEAT_SOURCES_MAX`] lines and a line for
-/// each of their windows at most, and one for all other addresses.
+/// The caller logs the first event of a pair. Later ones within the window are counted, and so are those in the next
+/// windows, until one passes without any. So a flood writes at most [`REPEAT_SOURCES_MAX`] lines, a line for each of
+/// their windows, and one for all other addresses.
 #[derive(Debug)]
 pub struct Repeats<K> {
     sources: BTreeMap<(AddressPrefix, K), Window>,
@@ -29,12 +29,12 @@ struct Window {
 
 /// Events that were counted instead of logged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Repeated<K> {
+pub struct RepeatCount<K> {
     /// The address and the kind; `None` stands for all addresses that were not told apart.
     pub source: Option<(AddressPrefix, K)>,
     /// Number of events.
     pub count: u64,
-    /// In how long.
+    /// The time in which they came.
     pub within: Duration,
 }
 
@@ -45,7 +45,7 @@ impl<K> Default for Repeats<K> {
 }
 
 impl<K: Ord + Copy> Repeats<K> {
-    /// Counts an event; returns `true` if it is to be logged by itself.
+    /// Counts an event. Returns `true` if the caller has to log it by itself.
     pub fn note(&mut self, prefix: AddressPrefix, kind: K, now: Instant) -> bool {
         if let Some(window) = self.sources.get_mut(&(prefix, kind)) {
             window.count += 1;
@@ -59,13 +59,13 @@ impl<K: Ord + Copy> Repeats<K> {
         false
     }
 
-    /// Returns when [`Self::take_due`] has something to do.
+    /// Returns the time of the next [`Self::take_due`].
     pub fn due(&self) -> Option<Instant> {
         self.sources.values().chain(&self.others).map(|window| window.since + REPEAT_WINDOW).min()
     }
 
-    /// Returns what was counted in the windows that have ended, and forgets addresses of which nothing came.
-    pub fn take_due(&mut self, now: Instant) -> Vec<Repeated<K>> {
+    /// Returns the counts of the windows that have ended, and forgets quiet addresses.
+    pub fn take_due(&mut self, now: Instant) -> Vec<RepeatCount<K>> {
         let mut all = Vec::new();
         let mut end = |window: &mut Window, source| {
             let within = now.saturating_duration_since(window.since);
@@ -75,7 +75,7 @@ impl<K: Ord + Copy> Repeats<K> {
             let count = std::mem::take(&mut window.count);
             window.since = now;
             if count > 0 {
-                all.push(Repeated { source, count, within });
+                all.push(RepeatCount { source, count, within });
             }
             count > 0
         };
@@ -114,11 +114,11 @@ mod tests {
         assert_eq!(repeats.due(), Some(start + REPEAT_WINDOW));
         assert_eq!(repeats.take_due(start + REPEAT_WINDOW / 2), []);
         let end = start + REPEAT_WINDOW;
-        let counted = Repeated { source: Some((host(1), 'x')), count: 999, within: REPEAT_WINDOW };
+        let counted = RepeatCount { source: Some((host(1), 'x')), count: 999, within: REPEAT_WINDOW };
         assert_eq!(repeats.take_due(end), [counted]);
         assert!(!repeats.note(host(1), 'x', end), "it goes on, and is still counted");
         assert!(repeats.note(host(2), 'x', end), "what had ended is news again");
-        let counted = Repeated { count: 1, ..counted };
+        let counted = RepeatCount { count: 1, ..counted };
         assert_eq!(repeats.take_due(end + REPEAT_WINDOW), [counted]);
         assert_eq!(repeats.take_due(end + 2 * REPEAT_WINDOW), []);
         assert_eq!(repeats.due(), None, "nothing is kept of it");
@@ -131,7 +131,7 @@ mod tests {
         assert_eq!(said, REPEAT_SOURCES_MAX);
         assert_eq!(repeats.sources.len(), REPEAT_SOURCES_MAX);
         let count = 100_000 - REPEAT_SOURCES_MAX as u64;
-        let counted = Repeated { source: None, count, within: REPEAT_WINDOW };
+        let counted = RepeatCount { source: None, count, within: REPEAT_WINDOW };
         assert_eq!(repeats.take_due(start + REPEAT_WINDOW), [counted]);
         assert!(repeats.note(host(1), 'x', start + REPEAT_WINDOW), "and then there is room again");
     }

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use clap::Args;
 use sgc_node::LockedFleet;
 use sgc_transport::LinkUrl;
-use sgc_trust::{Absorbed, Fleet, Merged, NodeName};
+use sgc_trust::{CrlReport, Fleet, MergeReport, NodeName};
 use sgc_wire::{CRL_BYTES_MAX, UnixMillis};
 
 use super::keeping::{LIST_EXTENSION, list_path, tell, write_list};
@@ -50,12 +50,12 @@ pub(super) fn merge(args: &MergeArgs) -> Result<(), CliError> {
         let mut other = sgc_node::read_fleet(&args.other)?;
         let done = file.fleet.merge(&other, now);
         let gained = done.map_err(|source| CliError::Fleet { path: args.other.clone(), source })?;
-        text.push_str(&match gained == Merged::default() {
+        text.push_str(&match gained == MergeReport::default() {
             true => format!("{mine}: knows everything that {theirs} does\n"),
             false => format!("{mine}: took over from {theirs}\n{}", gained_text(&gained)),
         });
         let lacked = other.merge(&file.fleet, now).map_err(|source| file.error(source))?;
-        if lacked != Merged::default() {
+        if lacked != MergeReport::default() {
             text.push_str(&format!(
                 "{theirs} is older or went its own way: put a copy of {mine} in its place.\n"
             ));
@@ -72,7 +72,7 @@ pub(super) fn merge(args: &MergeArgs) -> Result<(), CliError> {
     told.failed.map_or(Ok(()), Err)
 }
 
-fn gained_text(gained: &Merged) -> String {
+fn gained_text(gained: &MergeReport) -> String {
     let names = |nodes: &[NodeName]| nodes.iter().map(ToString::to_string).collect::<Vec<_>>();
     let numbers = |numbers: &[u32]| numbers.iter().map(ToString::to_string).collect::<Vec<_>>();
     let mut text = String::new();
@@ -109,7 +109,7 @@ pub(super) fn catch_up(fleet: &mut Fleet, file: &Path) -> Result<bool, CliError>
     match take_list(fleet, &path, unix_now()) {
         Ok(absorbed) => {
             say_behind(file, &path.display().to_string(), &absorbed);
-            Ok(absorbed != Absorbed::default())
+            Ok(absorbed != CrlReport::default())
         }
         // A file that is no list of this fleet must not keep anybody from revoking. The next list replaces it.
         Err(error @ (CliError::List { .. } | CliError::Read { .. })) => {
@@ -121,11 +121,11 @@ pub(super) fn catch_up(fleet: &mut Fleet, file: &Path) -> Result<bool, CliError>
 }
 
 /// Takes over what a list revokes.
-fn take_list(fleet: &mut Fleet, path: &Path, now: UnixMillis) -> Result<Absorbed, CliError> {
+fn take_list(fleet: &mut Fleet, path: &Path, now: UnixMillis) -> Result<CrlReport, CliError> {
     let list = files::read_limited(path, CRL_BYTES_MAX as u64)?;
     let anchors = fleet.anchors().with_crl(&list, now);
     let anchors = anchors.map_err(|source| CliError::List { path: path.to_owned(), source })?;
-    let absorbed = anchors.map_or(Ok(Absorbed::default()), |anchors| fleet.absorb(&anchors, now));
+    let absorbed = anchors.map_or(Ok(CrlReport::default()), |anchors| fleet.absorb(&anchors, now));
     absorbed.map_err(|source| CliError::Fleet { path: path.to_owned(), source })
 }
 
@@ -140,10 +140,10 @@ pub(super) fn take_heard(file: &mut LockedFleet, heard: &[Bytes], now: UnixMilli
     }
     let absorbed = file.fleet.absorb(&anchors, now).map_err(|source| file.error(source))?;
     say_behind(file.path(), "a revocation list that nodes have", &absorbed);
-    Ok(absorbed != Absorbed::default())
+    Ok(absorbed != CrlReport::default())
 }
 
-fn say_behind(fleet: &Path, list: &str, absorbed: &Absorbed) {
+fn say_behind(fleet: &Path, list: &str, absorbed: &CrlReport) {
     let fleet = fleet.display();
     let revoked = match &absorbed.revoked[..] {
         [] if !absorbed.is_behind => return,

@@ -9,7 +9,7 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use clap::Args;
 use sgc_cdr::{Layout, TypeName, YamlStyle};
-use sgc_types::{Definitions, Described};
+use sgc_types::{Definitions, ResolvedType};
 
 use super::{Tap, TapArgs};
 use crate::error::{CliError, EXIT_FAILURE};
@@ -140,11 +140,11 @@ pub(super) fn layout(tap: &Tap, dirs: &[PathBuf]) -> Result<Layout, CliError> {
 }
 
 /// What the node was told that the type looks like.
-fn told(tap: &Tap, name: &TypeName) -> Option<Described> {
+fn told(tap: &Tap, name: &TypeName) -> Option<ResolvedType> {
     let told = tap.shown.described.as_ref()?;
     let description = STANDARD.decode(&told.description).ok()?;
     let expected = tap.shown.type_hash.as_deref().unwrap_or(&told.type_hash);
-    Described::read(description.into(), name, expected).ok()
+    ResolvedType::read(description.into(), name, expected).ok()
 }
 
 fn hex(payload: &[u8]) -> String {
@@ -169,13 +169,13 @@ mod tests {
     use super::*;
 
     /// A type that is installed nowhere.
-    fn thing() -> Described {
+    fn thing() -> ResolvedType {
         let mut text = |_: &TypeName| Some("int8 a".to_owned());
         let layout = Library::empty().layout(&"mine/msg/Thing".parse().unwrap(), &mut text).unwrap();
-        Described::of(layout).unwrap()
+        ResolvedType::from_layout(layout).unwrap()
     }
 
-    fn tap(type_name: &str, type_hash: Option<&str>, told: Option<&Described>) -> Tap {
+    fn tap(type_name: &str, type_hash: Option<&str>, told: Option<&ResolvedType>) -> Tap {
         let described = told.map(|told| Told {
             type_hash: told.type_hash().to_owned(),
             description: STANDARD.encode(told.description()),

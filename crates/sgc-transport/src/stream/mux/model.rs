@@ -1,6 +1,6 @@
-//! Two machines back to back, driven by arbitrary operations, against what their users may rely on: order, nothing lost,
-//! nothing made up, credits held to, memory bounded, and nobody forgotten who was told to wait. And one machine that is fed
-//! arbitrary bytes. Fuzzing and seeded tests run the same.
+//! Two machines back to back, driven by arbitrary operations, against the promises to their users: order, no loss, no
+//! invented bytes, credits respected, memory bounded, and no waiter forgotten. Also one machine that is fed arbitrary
+//! bytes. Fuzzing and seeded tests run the same.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -26,7 +26,7 @@ fn limits() -> Limits {
     }
 }
 
-/// What stands at this offset of the flow of this number, or of the control stream (0).
+/// Returns the byte at this offset of the flow of this number, or of the control stream (0).
 fn pattern(flow: u64, offset: u64) -> u8 {
     (flow.wrapping_mul(31) ^ offset.wrapping_mul(7) ^ (offset >> 8)) as u8
 }
@@ -47,12 +47,12 @@ impl Input<'_> {
 
 struct End {
     mux: Mux,
-    /// Written and not yet arrived.
+    /// Bytes written and not yet arrived.
     wire: VecDeque<u8>,
-    tx: Vec<Sent>,
-    /// Which of them has which number on the wire.
+    tx: Vec<SendModel>,
+    /// Numbers of flows on the wire.
     by_wire: BTreeMap<u64, usize>,
-    rx: BTreeMap<RxId, Received>,
+    rx: BTreeMap<RxId, ReceiveModel>,
     may_open: bool,
     control: Sending,
     control_read: u64,
@@ -69,12 +69,12 @@ struct End {
 #[derive(Default)]
 struct Sending {
     pending: Vec<Bytes>,
-    /// Handed over, and given up by the machine's user so far.
+    /// Bytes handed over, and bytes given up by the machine's user so far.
     written: u64,
     may_write: bool,
 }
 
-struct Sent {
+struct SendModel {
     id: TxId,
     number: u64,
     sending: Sending,
@@ -85,7 +85,7 @@ struct Sent {
 }
 
 #[derive(Default)]
-struct Received {
+struct ReceiveModel {
     read: u64,
     is_over: bool,
     is_stopped: bool,
@@ -113,7 +113,7 @@ impl End {
         }
     }
 
-    /// Starts waiting or stops, as the machine says.
+    /// Starts or stops waiting, as the machine's events say.
     fn drain_events(&mut self) {
         while let Some(event) = self.mux.poll_event() {
             match event {
@@ -165,10 +165,10 @@ impl End {
         let sending = Sending { may_write: true, ..Sending::default() };
         let number = self.tx.len() as u64 + 1;
         let (is_finished, is_reset, is_stopped, is_released) = Default::default();
-        self.tx.push(Sent { id, number, sending, is_finished, is_reset, is_stopped, is_released });
+        self.tx.push(SendModel { id, number, sending, is_finished, is_reset, is_stopped, is_released });
     }
 
-    /// Writes what is pending of a flow, unless it is to wait.
+    /// Writes the pending bytes of a flow, unless it has to wait.
     fn flush(&mut self, index: usize) {
         let Some(sent) = self.tx.get_mut(index) else { return };
         if sent.sending.pending.is_empty() || !sent.sending.may_write {
@@ -202,7 +202,7 @@ impl End {
 
     fn accept(&mut self) {
         while let Some(id) = self.mux.accept() {
-            self.rx.insert(id, Received::default());
+            self.rx.insert(id, ReceiveModel::default());
             self.readable.insert(id);
         }
     }
@@ -248,7 +248,7 @@ impl End {
         assert!(offset <= from.control.written);
     }
 
-    /// Datagrams come in order; those in between were dropped.
+    /// Checks that datagrams arrive in order; missing ones were dropped.
     fn read_datagrams(&mut self, from: &End) {
         while let Some(datagram) = self.mux.receive_datagram() {
             let rest = &from.datagrams[self.datagrams_seen..];
@@ -276,7 +276,7 @@ impl End {
     }
 
     fn step(&mut self, op: u64, input: &mut Input<'_>, from: &End) {
-        let pick = |list: &Vec<Sent>, n: u64| (!list.is_empty()).then(|| n as usize % list.len());
+        let pick = |list: &Vec<SendModel>, n: u64| (!list.is_empty()).then(|| n as usize % list.len());
         match op {
             0 => self.open([Class::Bulk, Class::Default, Class::Realtime][input.next() as usize % 3]),
             1 | 2 => {
@@ -365,7 +365,7 @@ impl End {
     }
 }
 
-/// Bytes from one end to the other, in pieces of any size.
+/// Carries bytes from one end to the other, in pieces of any size.
 fn carry(from: &mut End, to: &mut End, now: Instant, mut length: usize, piece: usize) {
     while length > 0 && !from.wire.is_empty() {
         let n = piece.max(1).min(length).min(from.wire.len());
@@ -375,7 +375,7 @@ fn carry(from: &mut End, to: &mut End, now: Instant, mut length: usize, piece: u
     }
 }
 
-/// Does what the input says with two machines, then lets everything arrive.
+/// Plays the input with two machines, then lets everything arrive.
 pub(crate) fn converse(input: &[u8]) {
     let mut now = Instant::now();
     let mut input = Input(input);
@@ -397,7 +397,7 @@ pub(crate) fn converse(input: &[u8]) {
         near.check();
         far.check();
     }
-    // Nothing was lost, and nobody waits for what does not come.
+    // Nothing was lost, and nobody waits in vain.
     for round in 0.. {
         assert!(round < ROUNDS_MAX, "they never come to rest");
         let mut has_moved = false;
@@ -493,7 +493,7 @@ mod tests {
         }
     }
 
-    /// What a fuzzer found: a flow that was written in the last round, and so never sent.
+    /// A fuzzer found this: a flow that was written in the last round, and so never sent.
     #[test]
     fn programs_that_once_failed_do_not() {
         converse(&[
@@ -509,7 +509,7 @@ mod tests {
             let mut rng = ChaCha20Rng::seed_from_u64(seed);
             let mut bytes = vec![0; rng.next_u32() as usize % 600];
             rng.fill_bytes(&mut bytes);
-            // Small numbers get further: frames that exist, flows that are open.
+            // Small numbers get further: existing frames, open flows.
             for byte in bytes.iter_mut().skip(1).filter(|byte| **byte < 0xc0) {
                 *byte %= 14;
             }

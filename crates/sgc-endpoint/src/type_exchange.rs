@@ -1,7 +1,7 @@
-//! Types over the wire: an owner says what the types of its interfaces look like to those who ask and may have them, once.
+//! Types over the wire: an owner describes the types of its interfaces, once, to nodes that ask and may have them.
 //!
-//! An owner is asked at a name of its own; what it does not know yet it says when it does. Descriptions are bytes here,
-//! packed: whether one describes the type that it is said to is for who reads it.
+//! An owner is asked at a name of its own; it answers for a type once it knows that type. Descriptions are packed bytes
+//! here: the reader checks that a description matches its type.
 
 use std::collections::BTreeSet;
 
@@ -15,11 +15,11 @@ use sgc_wire::{
 
 use crate::Endpoint;
 use crate::compression::{CompressionError, Compressor, Decompressor};
-use crate::joins::Wish;
+use crate::joins::JoinKind;
 use crate::owner::{OLDER_REQUEST, is_older, place};
 use crate::shares::GrantedSink;
 
-/// What the length before a compressed description takes.
+/// Bytes of the length before a compressed description.
 const LENGTH_BYTES: usize = 4;
 /// Room for descriptions in one answer, bytes.
 const ANSWER_BYTES_MAX: usize = SEALED_BYTES_MAX - 1024;
@@ -27,14 +27,14 @@ const ANSWER_BYTES_MAX: usize = SEALED_BYTES_MAX - 1024;
 /// The description of a type as it travels.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PackedType {
-    /// `RIHS01_…` hash of what is described.
+    /// `RIHS01_…` hash of the described type.
     type_hash: String,
     encoding: PayloadEncoding,
     bytes: Bytes,
 }
 
 impl PackedType {
-    /// Packs a description; `None` if it, or the hash, is too long.
+    /// Packs a description. Returns `None` if it, or the hash, is too long.
     pub fn new(type_hash: &str, description: &Bytes) -> Option<Self> {
         if description.len() > TYPE_DESCRIPTION_BYTES_MAX || type_hash.len() > TYPE_HASH_BYTES_MAX {
             return None;
@@ -47,13 +47,13 @@ impl PackedType {
         Some(Self { type_hash: type_hash.to_owned(), encoding, bytes })
     }
 
-    fn of(&self, name: Name) -> DescribedType {
+    fn describe(&self, name: Name) -> DescribedType {
         let (encoding, description) = (self.encoding, self.bytes.clone());
         DescribedType { name, type_hash: self.type_hash.clone(), encoding, description }
     }
 }
 
-/// The description that came, as it was. It takes no more memory than a description may have.
+/// Unpacks a received description. It takes no more memory than a description may have.
 pub fn unpack_type(described: &DescribedType) -> Result<Bytes, CompressionError> {
     let packed = described.description.clone();
     if described.encoding != PayloadEncoding::Plain {
@@ -66,24 +66,24 @@ pub fn unpack_type(described: &DescribedType) -> Result<Bytes, CompressionError>
     Decompressor::default().decompress(described.encoding, packed)
 }
 
-/// One who asked what types look like.
+/// A node that asked for types.
 #[derive(Debug)]
 pub(crate) struct TypeAsker {
     asker: GrantedSink,
-    /// What it has not been told.
+    /// Types that it was not told yet.
     names: BTreeSet<Name>,
 }
 
-/// Where an owner is asked what its types look like.
+/// Returns the name at which an owner is asked for its types.
 pub(crate) fn types_name(owner: &NodeId) -> (Name, Blind) {
     let blind = types_blind(owner);
     (name_of(owner, &blind), blind)
 }
 
-/// As an owner.
+/// The owner's part.
 impl Endpoint {
-    /// What the type of a share looks like. Those who asked are told with [`Endpoint::tell_types`], so that what becomes known
-    /// at about one time is told at one time.
+    /// Sets the description of a share's type. [`Endpoint::tell_types`] tells the askers, so that descriptions that
+    /// become known at about one time travel together.
     pub fn describe(&mut self, now: Now, name: &Name, described: PackedType) {
         self.now = now;
         let Some(share) = self.shares.shares.get_mut(name) else { return };
@@ -95,7 +95,7 @@ impl Endpoint {
         self.untold.insert(*name);
     }
 
-    /// Tells those who asked what was described since the last time.
+    /// Tells the askers the types described since the last call.
     pub fn tell_types(&mut self, now: Now) {
         self.now = now;
         let untold = std::mem::take(&mut self.untold);
@@ -109,7 +109,7 @@ impl Endpoint {
         self.types_name.0 == *name
     }
 
-    /// Whoever may know the owner may ask; what it is told is what it may have.
+    /// Takes a question: every node that may know the owner may ask, and gets the types that it may have.
     pub(crate) fn handle_type_question(&mut self, name: Name, sink: SinkId, asker: GrantedSink) {
         let Request::Ask { what } = &asker.request else {
             return self.refuse(name, sink, 1, RefuseReason::RoleNotOffered);
@@ -136,8 +136,8 @@ impl Endpoint {
         self.answer_types(sink, true);
     }
 
-    /// Tells one who asked what it was not told yet and is known; with `at_least`, also that there is nothing. What has no
-    /// room in one answer is asked for again.
+    /// Tells an asker the known types that it was not told yet; with `at_least`, also that there are none. Types
+    /// without room in one answer are asked for again.
     fn answer_types(&mut self, sink: SinkId, at_least: bool) {
         let Some(asked) = self.questions.get_mut(&sink) else { return };
         let (mut types, mut bytes) = (Vec::new(), 0);
@@ -150,7 +150,7 @@ impl Endpoint {
             else {
                 continue;
             };
-            let described = described.of(*name);
+            let described = described.describe(*name);
             let more = described.to_vec().len();
             if bytes + more <= ANSWER_BYTES_MAX {
                 bytes += more;
@@ -168,7 +168,7 @@ impl Endpoint {
         }
     }
 
-    /// Cuts those who lost their certificate.
+    /// Cuts askers that lost their certificate.
     pub(crate) fn enforce_types(&mut self) {
         let lost = |(sink, asked): (&SinkId, &TypeAsker)| {
             self.standing(&asked.asker.peer).map(|reason| (*sink, reason))
@@ -195,18 +195,18 @@ impl Endpoint {
     }
 }
 
-/// As one who asks.
+/// The asker's part.
 impl Endpoint {
-    /// Asks an owner what the types of these interfaces look like, the first [`TYPES_PER_QUESTION_MAX`] of them, until it is
-    /// asked again, or for none. What it told in answer to a question it tells once more in answer to another. An owner that describes none, or is of a version that cannot, does not advertise the
-    /// name that it is asked at: then nothing happens.
+    /// Asks an owner for the types of these interfaces, the first [`TYPES_PER_QUESTION_MAX`] of them, until the next
+    /// question, or for none. Each question is answered in full, also with types told before. An owner that describes
+    /// none, or of a version that cannot, does not advertise the name of the question: then nothing happens.
     pub fn ask_types(&mut self, now: Now, owner: NodeId, mut names: Vec<Name>) {
         self.now = now;
         names.truncate(TYPES_PER_QUESTION_MAX);
         let (name, _) = types_name(&owner);
         self.leave(now, &name);
         if !names.is_empty() {
-            self.join(now, name, owner, Wish::Types(names));
+            self.join(now, name, owner, JoinKind::Types(names));
         }
     }
 }
@@ -228,7 +228,7 @@ mod tests {
     fn a_description_comes_back_whether_it_shrinks_or_not() {
         for bytes in [Bytes::from_static(b"short"), vec![7; TYPE_DESCRIPTION_BYTES_MAX].into()] {
             let packed = PackedType::new("RIHS01_00", &bytes).unwrap();
-            assert_eq!(unpack_type(&packed.of(Name([1; 32]))), Ok(bytes));
+            assert_eq!(unpack_type(&packed.describe(Name([1; 32]))), Ok(bytes));
         }
         let long = Bytes::from(vec![0; TYPE_DESCRIPTION_BYTES_MAX + 1]);
         assert_eq!(PackedType::new("RIHS01_00", &long), None);

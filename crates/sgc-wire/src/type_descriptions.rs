@@ -1,7 +1,7 @@
-//! Types over the wire: which interfaces' types somebody asks for, and what describes them.
+//! Types over the wire: a question for the types of interfaces, and their descriptions.
 //!
-//! Descriptions are bytes here, compressed or not. What they mean, and whether they are of the type that they are said to
-//! be of, is for `sgc-cdr`.
+//! Descriptions are bytes here, compressed or not. `sgc-cdr` reads them, and checks that each is of the type that it
+//! claims.
 
 use bytes::Bytes;
 
@@ -16,10 +16,10 @@ pub const TYPE_DESCRIPTION_BYTES_MAX: usize = 256 * 1024;
 /// Longest hash of a type, bytes.
 pub const TYPE_HASH_BYTES_MAX: usize = 128;
 
-/// What an owner is asked at the name of its types.
+/// A question at the name of an owner's types.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TypeQuestion {
-    /// Its interfaces whose types are asked for.
+    /// Its interfaces whose types are requested.
     pub names: Vec<Name>,
 }
 
@@ -28,9 +28,9 @@ pub struct TypeQuestion {
 pub struct DescribedType {
     /// The interface whose type it is.
     pub name: Name,
-    /// `RIHS01_…` hash of what is described.
+    /// `RIHS01_…` hash of the described type.
     pub type_hash: String,
-    /// How the description is compressed: not at all, or by Zstandard.
+    /// Compression of the description: none, or Zstandard.
     pub encoding: PayloadEncoding,
     /// A serialised `type_description_interfaces/msg/TypeDescription` (REP 2016).
     pub description: Bytes,

@@ -1,49 +1,49 @@
-//! A type that is known, with the description that others can be given (REP 2016).
+//! A known type, with its description for other nodes (REP 2016).
 
 use std::sync::Arc;
 
 use bytes::Bytes;
 use sgc_cdr::{DescriptionError, Layout, TypeName};
 
-/// A type that is known: a message's, or a service's with its messages.
+/// A known type: a message's, or a service's with its messages.
 #[derive(Clone, Debug)]
-pub struct Described {
+pub struct ResolvedType {
     name: TypeName,
     type_hash: String,
     description: Bytes,
     layout: Arc<Layout>,
 }
 
-/// Why a description is not believed.
+/// The reason why a description is not believed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum NotBelieved {
-    /// It is none, or one of another type than the one of the hash.
+pub enum ResolveError {
+    /// The description is invalid, or of another type than that of the hash.
     #[error(transparent)]
     Description(#[from] DescriptionError),
-    /// It is one of a type with another name.
+    /// The description is of a type with another name.
     #[error("the description is one of {found}, not of {expected}")]
     Name {
-        /// What it describes.
+        /// The described type.
         found: String,
-        /// What was asked for.
+        /// The requested type.
         expected: String,
     },
 }
 
-impl Described {
-    /// Describes a type.
-    pub fn of(layout: Layout) -> Result<Self, DescriptionError> {
+impl ResolvedType {
+    /// Describes the type of a layout.
+    pub fn from_layout(layout: Layout) -> Result<Self, DescriptionError> {
         let description = layout.describe()?.into();
         Self::new(layout, description).ok_or_else(nameless)
     }
 
-    /// Reads a description that somebody else made of the type of this name and hash.
-    pub fn read(description: Bytes, name: &TypeName, type_hash: &str) -> Result<Self, NotBelieved> {
+    /// Reads another node's description of the type of this name and hash.
+    pub fn read(description: Bytes, name: &TypeName, type_hash: &str) -> Result<Self, ResolveError> {
         let layout = Layout::from_description(&description, type_hash)?;
-        // Described anew: what the hash does not vouch for is not passed on.
-        let this = Self::of(layout)?;
+        // Described anew, so that nothing outside of the hash is passed on.
+        let this = Self::from_layout(layout)?;
         if this.name != *name {
-            return Err(NotBelieved::Name { found: this.name.to_string(), expected: name.to_string() });
+            return Err(ResolveError::Name { found: this.name.to_string(), expected: name.to_string() });
         }
         Ok(this)
     }
@@ -53,18 +53,18 @@ impl Described {
         Some(Self { name, type_hash, description, layout: Arc::new(layout) })
     }
 
-    /// The type.
+    /// Returns the name of the type.
     pub fn name(&self) -> &TypeName {
         &self.name
     }
 
-    /// Its hash: `RIHS01_` and 64 hexadecimal digits.
+    /// Returns its hash: `RIHS01_` and 64 hexadecimal digits.
     pub fn type_hash(&self) -> &str {
         &self.type_hash
     }
 
-    /// Returns `true` for the hashes that endpoints announce for the type: its own, and of a service those of its request and its
-    /// response, which `rmw_fastrtps` announces.
+    /// Returns `true` for the hashes that endpoints announce for the type: its own, and for a service those of its
+    /// request and response, which `rmw_fastrtps` announces.
     pub fn is_announced_as(&self, type_hash: &str) -> bool {
         let is_of =
             |half: TypeName| self.layout.part(&half).is_some_and(|part| part.type_hash() == type_hash);
@@ -73,18 +73,18 @@ impl Described {
             || name.kind() != "msg" && (is_of(name.request()) || is_of(name.response()))
     }
 
-    /// A serialised `type_description_interfaces/msg/TypeDescription`.
+    /// Returns a serialised `type_description_interfaces/msg/TypeDescription`.
     pub fn description(&self) -> &Bytes {
         &self.description
     }
 
-    /// What its messages look like.
+    /// Returns the layout of its messages.
     pub fn layout(&self) -> &Arc<Layout> {
         &self.layout
     }
 }
 
-/// No library makes a layout of nothing.
+/// Error for a layout without a type, which no library makes.
 fn nameless() -> DescriptionError {
     DescriptionError::Content { what: "name of a type", found: String::new() }
 }
@@ -95,15 +95,16 @@ mod tests {
 
     use super::*;
 
-    fn described(name: &str) -> Described {
-        Described::of(Library::empty().layout(&name.parse().unwrap(), &mut |_| None).unwrap()).unwrap()
+    fn described(name: &str) -> ResolvedType {
+        ResolvedType::from_layout(Library::empty().layout(&name.parse().unwrap(), &mut |_| None).unwrap())
+            .unwrap()
     }
 
     #[test]
-    fn what_is_described_is_read_again_also_of_services() {
+    fn descriptions_of_messages_and_services_are_read_again() {
         for name in ["geometry_msgs/msg/Twist", "std_srvs/srv/SetBool"] {
             let ours = described(name);
-            let read = Described::read(ours.description().clone(), ours.name(), ours.type_hash()).unwrap();
+            let read = ResolvedType::read(ours.description().clone(), ours.name(), ours.type_hash()).unwrap();
             assert_eq!((read.name(), read.type_hash()), (ours.name(), ours.type_hash()));
             assert_eq!(read.layout().type_hash(), ours.type_hash());
         }
@@ -128,17 +129,20 @@ mod tests {
     fn another_hash_another_name_and_too_much_are_not_believed() {
         let (twist, string) = (described("geometry_msgs/msg/Twist"), described("std_msgs/msg/String"));
         let read = |description: &Bytes, name: &TypeName, hash: &str| {
-            Described::read(description.clone(), name, hash).map(|_| ()).unwrap_err()
+            ResolvedType::read(description.clone(), name, hash).map(|_| ()).unwrap_err()
         };
         let other_hash = read(twist.description(), twist.name(), string.type_hash());
         assert!(
-            matches!(other_hash, NotBelieved::Description(DescriptionError::Hash { .. })),
+            matches!(other_hash, ResolveError::Description(DescriptionError::Hash { .. })),
             "{other_hash}"
         );
         let other_name = read(twist.description(), string.name(), twist.type_hash());
-        assert!(matches!(other_name, NotBelieved::Name { .. }), "{other_name}");
+        assert!(matches!(other_name, ResolveError::Name { .. }), "{other_name}");
         let long = vec![0; DESCRIPTION_BYTES_MAX + 1].into();
         let too_long = read(&long, twist.name(), twist.type_hash());
-        assert!(matches!(too_long, NotBelieved::Description(DescriptionError::TooLong { .. })), "{too_long}");
+        assert!(
+            matches!(too_long, ResolveError::Description(DescriptionError::TooLong { .. })),
+            "{too_long}"
+        );
     }
 }
