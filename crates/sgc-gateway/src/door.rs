@@ -1,4 +1,4 @@
-//! [`Door`]: who comes in, whatever protocol it speaks; and whether those who are in may stay.
+//! [`Door`]: admits clients of every protocol, bounds their number and disconnects those whose rights end.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
@@ -21,55 +21,55 @@ use crate::error::GatewayError;
 use crate::hub::lock;
 use crate::quota::Pool;
 
-/// Connections of other hosts that may be in their handshake at a time.
+/// Most connections of other hosts in their handshake at a time.
 const HANDSHAKES_MAX: usize = 128;
-/// Handshakes of one source: an IPv4 address, or an IPv6 network.
+/// Most handshakes of one source, an IPv4 address or an IPv6 network.
 const HANDSHAKES_OF_HOST_MAX: usize = 16;
-/// The same of programs of this host: nobody else takes these.
+/// Most handshakes of programs on this host. Other hosts cannot use these.
 const HANDSHAKES_LOCAL_MAX: usize = 128;
-/// Part of the places of clients that is kept for programs of this host.
+/// Divisor: one part in this many of all places is reserved for programs on this host.
 const LOCAL_PART: usize = 8;
-/// Part of those of other hosts' clients that one credential may have.
+/// Divisor: one credential may hold one part in this many of the places for other hosts.
 const CREDENTIAL_PART: usize = 4;
-/// Longest token that is looked at, bytes.
+/// Longest token that is examined, in bytes.
 const TOKEN_BYTES_MAX: usize = 32 << 10;
 
-/// Who is connected, for status.
+/// A connected client, for status.
 #[derive(Clone, Debug, Serialize, PartialEq, Eq)]
 pub struct ClientStatus {
-    /// What it is called.
+    /// The name of the client.
     pub name: String,
     /// `"rosbridge"`, `"foxglove"` or `"grpc"`.
     pub protocol: String,
-    /// Where it is.
+    /// The address of the client.
     pub address: String,
-    /// Since when, milliseconds since the Unix epoch.
+    /// The time of admission, in milliseconds since the Unix epoch.
     pub since: u64,
 }
 
-/// What goes on at the gateway, for status.
+/// The status of the gateway.
 #[derive(Clone, Debug, Default, Serialize, PartialEq, Eq)]
 pub struct GatewayStatus {
-    /// Where it listens.
+    /// The listening addresses.
     pub listen: Vec<String>,
-    /// Who is connected.
+    /// The connected clients.
     pub clients: Vec<ClientStatus>,
-    /// How many connections were refused, and why.
+    /// The number of refused connections by reason.
     pub refused: BTreeMap<String, u64>,
-    /// Readers on the local network, shared by all clients.
+    /// The number of readers on the local network, shared by all clients.
     pub readers: usize,
 }
 
-/// What is known of a connection before its client has said anything.
+/// The properties of a connection before its client has sent anything.
 #[derive(Clone, Debug)]
 pub(crate) struct Arrival {
     pub(crate) peer: SocketAddr,
     pub(crate) is_encrypted: bool,
-    /// What its certificate proves.
+    /// The identity that the certificate proves.
     pub(crate) certificate: Option<VerifiedPeer>,
 }
 
-/// Who comes in.
+/// The admission of clients.
 #[derive(Debug)]
 pub(crate) struct Door {
     access: AccessWatch,
@@ -87,7 +87,7 @@ struct Entered {
     is_local: bool,
 }
 
-/// A place at the gateway; free again when dropped.
+/// A client's place at the gateway, freed on drop.
 #[derive(Debug)]
 pub(crate) struct Place {
     door: Arc<Door>,
@@ -95,7 +95,7 @@ pub(crate) struct Place {
 }
 
 impl Place {
-    /// Gives the place to another client, unless the places of that client's credential are taken.
+    /// Gives the place to another client, unless all places of that client's credential are taken.
     pub(crate) fn rename(&self, client: &Client) -> Result<(), GatewayError> {
         let mut clients = lock(&self.door.clients);
         if let Err(pool) = self.door.check_places(&clients, client, Some(self.number)) {
@@ -133,7 +133,7 @@ impl Door {
         self.access.current()
     }
 
-    /// What a certificate proves; an error says why it proves nothing.
+    /// Verifies a certificate chain. Returns `None` if there is no chain or no trust anchor.
     pub(crate) fn judge_certificate(
         anchors: Option<&TrustAnchors>,
         chain: &[CertificateDer<'_>],
@@ -144,7 +144,7 @@ impl Door {
         }
     }
 
-    /// Who this is, if it may come in.
+    /// Admits a client.
     pub(crate) fn admit(
         &self,
         arrival: &Arrival,
@@ -170,7 +170,7 @@ impl Door {
         *lock(&self.refused).entry(why).or_default() += 1;
     }
 
-    /// A place for a client, if there is one.
+    /// Takes a place for a client, if one is free.
     pub(crate) fn enter(
         self: &Arc<Self>,
         client: &Client,
@@ -196,7 +196,7 @@ impl Door {
         Some(Place { door: Arc::clone(self), number })
     }
 
-    /// Returns the number of places that the clients of a pool have.
+    /// Returns the number of places for the clients of a pool.
     fn places_max(&self, pool: Pool) -> usize {
         let remote = (self.clients_max - self.clients_max / LOCAL_PART).max(1);
         match pool {
@@ -206,8 +206,8 @@ impl Door {
         }
     }
 
-    /// Refuses a client if the places of its credential, of other hosts or of all are taken. `except` is the place that it
-    /// has already.
+    /// Fails if the places of the client's credential, of other hosts or of all clients are taken. `except` is the
+    /// place that the client already has.
     fn check_places(
         &self,
         clients: &BTreeMap<u64, Entered>,
@@ -237,14 +237,14 @@ impl Door {
 
     pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
         let counted = lock(&self.refused);
-        // Whatever the protocol: of gRPC each call is admitted.
+        // The count covers all protocols, because gRPC admits each call.
         let denied = Some(("not admitted", self.access.current().denied())).filter(|(_, count)| *count > 0);
         let all = counted.iter().map(|(why, count)| (*why, *count)).chain(denied);
         all.map(|(why, count)| (why.to_owned(), count)).collect()
     }
 }
 
-/// Returns the name under which a refusal for want of a place is counted.
+/// Returns the status key of a refusal for lack of a place.
 fn no_place(pool: Pool) -> &'static str {
     match pool {
         Pool::Credential => "too many clients of one credential",
@@ -253,7 +253,8 @@ fn no_place(pool: Pool) -> &'static str {
     }
 }
 
-/// Connections that have not shown yet who they are: of this host, and of others, where the heaviest source gives way.
+/// Connections whose clients are not admitted yet. Those of this host have their own places; among other hosts the
+/// source with the most handshakes gives way.
 #[derive(Debug)]
 pub(crate) struct Handshakes {
     local: Arc<Semaphore>,
@@ -261,29 +262,29 @@ pub(crate) struct Handshakes {
     next: AtomicU64,
 }
 
-/// A handle by which a handshake of another host is ended.
+/// A handle that ends a handshake of another host.
 #[derive(Debug)]
 struct Holder {
     number: u64,
-    /// `true` once bytes have come.
+    /// `true` once bytes have arrived.
     is_engaged: Arc<AtomicBool>,
-    /// Tells by its end that another handshake has the place.
+    /// Dropping the sender tells the handshake that it lost its place.
     _evict: oneshot::Sender<()>,
 }
 
-/// One connection of these, until dropped.
+/// A connection during its handshake, counted until dropped.
 #[derive(Debug)]
 pub(crate) struct Handshake {
     handshakes: Arc<Handshakes>,
     place: HandshakePlace,
 }
 
-/// A flag that says whether bytes have come in a handshake.
+/// A flag for the arrival of the first bytes of a handshake.
 #[derive(Debug)]
 pub(crate) struct Engagement(Arc<AtomicBool>);
 
 impl Engagement {
-    /// Says that they have: the handshake keeps its place for a moment longer.
+    /// Sets the flag, after which the handshake keeps its place for a moment longer.
     pub(crate) fn begin(&self) {
         self.0.store(true, Ordering::Relaxed);
     }
@@ -291,9 +292,9 @@ impl Engagement {
 
 #[derive(Debug)]
 enum HandshakePlace {
-    /// One of this host's.
+    /// A place of this host.
     Local(#[expect(dead_code, reason = "it is for its end")] OwnedSemaphorePermit),
-    /// One of the others'.
+    /// A place of another host.
     Other { number: u64, is_engaged: Arc<AtomicBool>, evicted: oneshot::Receiver<()> },
 }
 
@@ -306,7 +307,7 @@ impl Default for Handshakes {
 }
 
 impl Handshakes {
-    /// Counts one from there, unless there are too many and none gives way.
+    /// Counts a handshake, unless all places are taken and none gives way.
     pub(crate) fn begin(this: &Arc<Self>, from: IpAddr) -> Option<Handshake> {
         let handshakes = Arc::clone(this);
         if from.to_canonical().is_loopback() {
@@ -316,7 +317,7 @@ impl Handshakes {
         let (prefix, now) = (AddressPrefix::from(from), Instant::now());
         let mut others = lock(&this.others);
         let room = others.make_room(prefix, now, |holder| holder.is_engaged.load(Ordering::Relaxed));
-        // One that gives way ends with what it held.
+        // A handshake that gives way has ended with its holder.
         if matches!(room, PlaceDecision::Refuse(_)) {
             return None;
         }
@@ -331,7 +332,7 @@ impl Handshakes {
 }
 
 impl Handshake {
-    /// Returns the flag by which the reader says that bytes have come.
+    /// Returns the flag that the reader sets when bytes arrive.
     pub(crate) fn engagement(&self) -> Engagement {
         Engagement(match &self.place {
             HandshakePlace::Local(_) => Arc::default(),
@@ -339,7 +340,7 @@ impl Handshake {
         })
     }
 
-    /// Is ready once another handshake has its place.
+    /// Is ready once another handshake has taken the place.
     pub(crate) fn poll_evicted(&mut self, cx: &mut Context<'_>) -> Poll<()> {
         match &mut self.place {
             HandshakePlace::Local(_) => Poll::Pending,
@@ -347,7 +348,7 @@ impl Handshake {
         }
     }
 
-    /// Waits until another handshake has its place.
+    /// Waits until another handshake has taken the place.
     pub(crate) async fn evicted(&mut self) {
         std::future::poll_fn(|cx| self.poll_evicted(cx)).await;
     }
@@ -381,16 +382,16 @@ mod tests {
     fn silent_hosts_lock_out_neither_others_nor_programs_of_this_one() {
         let handshakes: Arc<Handshakes> = Arc::default();
         let begin = |from: IpAddr| Handshakes::begin(&handshakes, from);
-        // A host of IPv6 has as many addresses as it likes: it is one source, and displaces itself alone.
+        // An IPv6 host with many addresses is one source and displaces only itself.
         let host = |n: u128| IpAddr::from(std::net::Ipv6Addr::from_bits(0x2001_0db8 << 96 | n));
         let silent: Vec<_> = (0..1000).map(|n| begin(host(n)).unwrap()).collect();
         assert_eq!(lock(&handshakes.others).len(), HANDSHAKES_OF_HOST_MAX);
-        // Those who do more than connect are not displaced at once, not by others of the same address either.
+        // A handshake that has sent bytes is not displaced at once, not even by the same address.
         silent.iter().for_each(|handshake| handshake.engagement().begin());
         assert!(begin(host(1001)).is_none());
         let mut honest = begin([192, 0, 2, 7].into()).unwrap();
         honest.engagement().begin();
-        // Many networks, of which each has all that it may: the heaviest makes room, and not who has one.
+        // Among many networks at their limit the heaviest gives way, not a network with one handshake.
         let mut held = Vec::new();
         for network in 1..=20u128 {
             for n in 0..HANDSHAKES_OF_HOST_MAX as u128 {
@@ -415,7 +416,7 @@ mod tests {
             let peer = peer.parse().unwrap();
             door.enter(&client(&access, peer), "rosbridge", peer)
         };
-        // Of 64 places 8 are kept for this host, and one credential has a quarter of the others.
+        // Of 64 places 8 are reserved for this host, and one credential may hold a quarter of the rest.
         let mut held: Vec<_> = std::iter::from_fn(|| enter("[2001:db8::1]:1")).collect();
         assert_eq!(held.len(), 14);
         assert!(enter("[2001:db8::2]:1").is_none(), "it is the same host");

@@ -1,4 +1,4 @@
-//! [`Server`]: the gateway's sockets. Accepts, ends TLS, finds out who it is and what it speaks, and hands it on.
+//! [`Server`]: the gateway's sockets. Accepts connections, terminates TLS, admits clients and starts their protocol.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -32,34 +32,34 @@ use crate::session::{Session, SessionLimits};
 use crate::tls::{TlsError, server_config};
 use crate::ws::{UpgradeError, Upgraded, upgrade};
 
-/// How long TLS and the upgrade may take together; of gRPC, TLS and the first call that is admitted.
+/// Time for TLS and the WebSocket upgrade together, or for TLS and the first admitted call of gRPC.
 const HANDSHAKE_MAX: Duration = Duration::from_secs(10);
-/// How long is waited after the system refused to accept, for instance since there are no more file descriptors.
+/// Pause after the system refused to accept, for instance for lack of file descriptors.
 const ACCEPT_RETRY: Duration = Duration::from_millis(100);
-/// Time for the last words on a gRPC connection on which no client is admitted any more.
+/// Time to deliver the last answers on a gRPC connection on which no client is admitted any more.
 const GRPC_FAREWELL_MAX: Duration = Duration::from_secs(2);
-/// Connections that wait to be served by gRPC.
+/// Most connections that wait for the gRPC server.
 const GRPC_WAITING_MAX: usize = 64;
-/// How the status calls messages that were not kept for later subscribers.
+/// Status key for messages that were not kept for later subscribers.
 const HISTORY_DROPPED: &str = "messages not kept for later subscribers";
 
-/// What is spoken at an address.
+/// The protocol of a listening address.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Protocol {
-    /// WebSocket: the rosbridge protocol, or Foxglove's where its subprotocol is asked for.
+    /// WebSocket: the rosbridge protocol, or Foxglove's if the client requests its subprotocol.
     WebSocket,
     /// gRPC.
     Grpc,
 }
 
-/// Where to listen, and for what.
+/// A listening address and its protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct ListenAt {
-    /// For what.
+    /// The protocol.
     pub protocol: Protocol,
-    /// Whether within TLS.
+    /// `true` for TLS.
     pub is_encrypted: bool,
-    /// Where; port 0 lets the system choose.
+    /// The address; port 0 lets the system choose.
     pub addr: SocketAddr,
 }
 
@@ -75,23 +75,23 @@ impl fmt::Display for ListenAt {
     }
 }
 
-/// What a server is to be.
+/// The options of a server.
 pub struct ServerOptions {
-    /// What programs show it as.
+    /// The name that programs display.
     pub name: String,
-    /// Where to listen.
+    /// The listening addresses.
     pub listen: Vec<ListenAt>,
-    /// Who may come in.
+    /// The access rules.
     pub access: Access,
-    /// What shows who the gateway is, within TLS.
+    /// The certificate and key of the gateway for TLS.
     pub key: Option<Arc<CertifiedKey>>,
-    /// Clients at a time.
+    /// Most clients at a time.
     pub clients_max: usize,
-    /// What each may have.
+    /// The limits of each session.
     pub limits: SessionLimits,
 }
 
-/// Why a server does not start.
+/// The reason why a server does not start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
     /// An address could not be bound.
@@ -99,23 +99,23 @@ pub enum ServerError {
     Listen {
         /// The address.
         at: ListenAt,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
-    /// There is no certificate to show, or it cannot be used.
+    /// The certificate is missing or unusable.
     #[error("the gateway's certificate: {0}")]
     Tls(#[from] TlsError),
-    /// TLS is wanted, and there is no certificate.
+    /// A TLS address is configured without a certificate.
     #[error("the gateway is to listen with TLS, and has no certificate")]
     NoKey,
 }
 
-/// TLS of both protocols.
+/// The TLS configurations of both protocols.
 #[derive(Clone)]
 struct Tls {
     ws: Arc<ServerConfig>,
     grpc: Arc<ServerConfig>,
-    /// The certificates that both show, the gateway's own first.
+    /// The certificates of both, the gateway's own first.
     chain: Vec<CertificateDer<'static>>,
 }
 
@@ -129,13 +129,13 @@ struct Shared {
     grpc: mpsc::Sender<Accepted<Placed>>,
 }
 
-/// A stream of bytes, whichever it is.
+/// Any stream of bytes.
 trait Bytes: AsyncRead + AsyncWrite + Send + Unpin {}
 
 impl<S: AsyncRead + AsyncWrite + Send + Unpin> Bytes for S {}
 
-/// A stream of bytes of gRPC. Its client has a place for as long as somebody is admitted on it, and has to be admitted in
-/// time.
+/// The byte stream of a gRPC connection. Its client must be admitted in time, and occupies a place while a client is
+/// admitted on it.
 struct Placed {
     stream: Box<dyn Bytes>,
     door: Arc<Door>,
@@ -143,15 +143,15 @@ struct Placed {
     standing: Standing,
 }
 
-/// How far a client of gRPC has come.
+/// The admission state of a gRPC connection.
 enum Standing {
-    /// It has not shown yet who it is, and has until then to do so.
+    /// The client has not been admitted yet and must be by the deadline.
     Unproven { deadline: Pin<Box<Sleep>>, handshake: Handshake },
-    /// It was admitted.
+    /// The client was admitted.
     Proven(#[expect(dead_code, reason = "it is for its end")] Place),
-    /// Nobody is admitted on it any more. It has until then to hear so, or to show something else.
+    /// No client is admitted any more. Until the deadline the client may read the refusal or show another credential.
     Denied { deadline: Pin<Box<Sleep>> },
-    /// It has to go; it was counted why.
+    /// The connection must close. The reason has been counted.
     Refused,
 }
 
@@ -167,8 +167,8 @@ impl Placed {
         Self { stream, door, connection, standing: Standing::Unproven { deadline, handshake } }
     }
 
-    /// Fails once the client may not stay. To be asked before reading as before writing: who does not read what it is
-    /// sent is not read from either.
+    /// Fails once the client may not stay. Called before reads and writes, because a client that does not read its
+    /// answers must not send either.
     fn check(&mut self, cx: &mut Context<'_>) -> io::Result<()> {
         let admitted = self.connection.poll_admitted(cx);
         let (standing, result) = match (&mut self.standing, admitted) {
@@ -228,7 +228,7 @@ impl AsyncWrite for Placed {
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        // One that has to go is not waited for to take its farewell.
+        // A connection that must close does not wait until its farewell is sent.
         self.check(cx)?;
         Pin::new(&mut self.stream).poll_shutdown(cx)
     }
@@ -247,7 +247,7 @@ impl AsyncWrite for Placed {
     }
 }
 
-/// The gateway's sockets, and who came in by them. All of it ends when dropped.
+/// The gateway's sockets and connections. All of them end when it is dropped.
 pub struct Server {
     shared: Arc<Shared>,
     local: Vec<ListenAt>,
@@ -264,7 +264,7 @@ fn tls_of(key: Option<&Arc<CertifiedKey>>, access: &Access) -> Result<Option<Tls
 }
 
 impl Server {
-    /// Binds all addresses, and serves.
+    /// Binds all addresses and serves clients.
     pub async fn start(hub: Hub, options: ServerOptions) -> Result<Self, ServerError> {
         let tls = tls_of(options.key.as_ref(), &options.access)?;
         if tls.is_none() && options.listen.iter().any(|at| at.is_encrypted) {
@@ -303,12 +303,12 @@ impl Server {
         Ok(Self { shared, local, _tasks: tasks })
     }
 
-    /// Where it listens.
+    /// Returns the listening addresses.
     pub fn local(&self) -> &[ListenAt] {
         &self.local
     }
 
-    /// Other rules, and another certificate, from now on; who is no longer admitted is disconnected.
+    /// Applies other rules and another certificate. Clients that the rules no longer admit are disconnected.
     pub fn reconfigure(&self, access: Access, key: Option<&Arc<CertifiedKey>>) -> Result<(), ServerError> {
         let tls = tls_of(key, &access)?;
         if tls.is_none() && self.local.iter().any(|at| at.is_encrypted) {
@@ -319,14 +319,14 @@ impl Server {
         Ok(())
     }
 
-    /// Shows another certificate to new connections; present ones stay.
+    /// Shows another certificate to new connections. Existing connections stay.
     pub fn show(&self, key: &Arc<CertifiedKey>) -> Result<(), ServerError> {
         let tls = tls_of(Some(key), &self.shared.door.access())?;
         self.shared.tls.send_replace(tls);
         Ok(())
     }
 
-    /// Returns the certificates that new connections are shown, the gateway's own first; none without TLS.
+    /// Returns the certificates for new connections, the gateway's own first. The list is empty without TLS.
     pub fn shown(&self) -> Vec<CertificateDer<'static>> {
         self.shared.tls.borrow().as_ref().map(|tls| tls.chain.clone()).unwrap_or_default()
     }
@@ -336,12 +336,12 @@ impl Server {
         self.shared.door.rules().change(|access| access.clone().with_gateway(gateway));
     }
 
-    /// Other CAs, or other revocation lists of theirs.
+    /// Verifies certificates against other CAs or revocation lists from now on.
     pub fn set_anchors(&self, anchors: TrustAnchors) {
         self.shared.door.rules().change(|access| access.clone().with_anchors(anchors));
     }
 
-    /// What goes on.
+    /// Returns the status of the gateway.
     pub fn status(&self) -> GatewayStatus {
         GatewayStatus {
             listen: self.local.iter().map(ToString::to_string).collect(),
@@ -351,7 +351,7 @@ impl Server {
         }
     }
 
-    /// Returns the number of refusals by their reasons.
+    /// Returns the number of refusals by reason.
     fn refused(&self) -> BTreeMap<String, u64> {
         let mut refused = self.shared.door.refused();
         let crowded = self.shared.hub.shared.quotas.refused();
@@ -361,7 +361,7 @@ impl Server {
         refused
     }
 
-    /// The hub.
+    /// Returns the hub.
     pub fn hub(&self) -> &Hub {
         &self.shared.hub
     }
@@ -374,7 +374,7 @@ impl fmt::Debug for Server {
 }
 
 async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<Shared>) {
-    // Ends all of them with the listener.
+    // The set ends all connections when the listener ends.
     let mut connections = JoinSet::new();
     loop {
         tokio::select! {
@@ -412,7 +412,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<Sh
     };
     match at.protocol {
         Protocol::Grpc => {
-            // Its clients say who they are with each call.
+            // A gRPC client shows its credential with each call.
             let Arrival { peer, is_encrypted, certificate } = arrival;
             let connection =
                 if is_encrypted { Connection::encrypted(peer, certificate) } else { Connection::plain(peer) };
@@ -440,7 +440,7 @@ async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<Sh
     }
 }
 
-/// Waits for the first bytes, and ends TLS.
+/// Waits for the first bytes and completes the TLS handshake.
 async fn arrive(
     stream: TcpStream,
     peer: SocketAddr,
@@ -448,7 +448,7 @@ async fn arrive(
     shared: &Shared,
     engagement: &Engagement,
 ) -> Option<(Box<dyn Bytes>, Arrival)> {
-    // In all that is spoken here the client speaks first.
+    // In every protocol of the gateway the client speaks first.
     stream.readable().await.ok()?;
     engagement.begin();
     if !at.is_encrypted {
@@ -480,7 +480,7 @@ async fn arrive(
     Some((Box::new(stream), Arrival { peer, is_encrypted: true, certificate }))
 }
 
-/// Serves a client until it goes, or its right ends.
+/// Serves a client until it leaves or its rights end.
 async fn speak(
     upgraded: Upgraded<Metered<Box<dyn Bytes>>>,
     arrival: Arrival,
@@ -499,7 +499,7 @@ async fn speak(
         served.await.map_err(Ended::from)
     } else {
         let (asked, place) = (Arc::clone(door), Arc::clone(&place));
-        // A token that comes later than the upgrade says who the client is from then on.
+        // A token after the upgrade changes the credential of the client.
         let authenticate: Authenticate = Arc::new(move |token| {
             let admitted = asked.admit(&arrival, None, Some(token));
             let client = admitted.map_err(|denied| denied.told().to_owned())?;
@@ -520,11 +520,11 @@ async fn speak(
     }
 }
 
-/// Why a client's connection ended, other than by its wish.
+/// The reason why a connection ended without the client's wish.
 enum Ended {
-    /// Its right ended.
+    /// The client's rights ended.
     Denied(Denied),
-    /// It failed, in these words.
+    /// The connection failed.
     Failed(String),
 }
 
@@ -553,7 +553,7 @@ mod tests {
     use super::*;
     use crate::access::Access;
 
-    /// A stream of gRPC from another host, and the other end of it.
+    /// Returns a gRPC stream from another host and its far end.
     fn placed(door: &Arc<Door>, handshakes: &Arc<Handshakes>) -> (Placed, tokio::io::DuplexStream) {
         let peer: SocketAddr = "192.0.2.1:1000".parse().unwrap();
         let (near, far) = duplex(16);
@@ -571,7 +571,7 @@ mod tests {
         let mut buf = [0; 16];
         let read = silent.read(&mut buf);
         let written = async {
-            // More than fits.
+            // These bytes exceed the buffer.
             deaf.write_all(&[0; 64]).await
         };
         let (read, written) = tokio::join!(read, written);

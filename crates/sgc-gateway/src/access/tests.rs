@@ -38,7 +38,7 @@ impl Cast {
         AccessRules { gateway, anchors: Some(self.gateway.anchors().clone()), ..AccessRules::default() }
     }
 
-    /// Rules under which the desk may receive `pattern`.
+    /// Returns rules under which the desk may receive `pattern`.
     fn listing_desk(&self, pattern: &str) -> AccessRules {
         let who = Grantees { nodes: [self.desk.node_id()].into(), ..Grantees::default() };
         let clients = vec![ClientRule { who, scope: subscribe(pattern) }];
@@ -62,7 +62,7 @@ impl Cast {
     }
 }
 
-/// A connection from there, over TLS.
+/// A TLS connection from `peer`.
 fn from(peer: &str) -> Admission<'static> {
     let peer: SocketAddr = peer.parse().unwrap();
     Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now: NOW }
@@ -133,7 +133,7 @@ fn a_page_of_another_hosts_localhost_is_no_page_of_this_host() {
                 assert_eq!(all.still_admits(&client, NOW), Ok(()), "{origin} of {peer}");
             }
         }
-        // Whoever lists it means the pages of every visitor's own host.
+        // Such an entry admits pages that a visitor's own host serves.
         let page = Admission { origin: Some("http://localhost:5173"), certificate, ..from(ELSEWHERE) };
         assert!(listed.admit(&page).is_ok());
     }
@@ -145,7 +145,7 @@ fn a_token_gives_its_scope_and_no_more() {
     let access = Access::new(cast.rules());
     let text = cast.token().to_text();
     for peer in [HERE, ELSEWHERE] {
-        // Which page shows it does not matter: others do not know it.
+        // A token admits any page, because only its holder knows it.
         let admission = Admission { token: Some(&text), origin: Some("https://any.example"), ..from(peer) };
         let client = access.admit(&admission).unwrap();
         assert_eq!((&*client.name, client.expires), ("dashboard", Some(later(HOUR))));
@@ -184,7 +184,7 @@ fn a_token_that_does_not_hold_admits_nobody_not_even_of_this_host() {
         elsewhere.sign(&cast.gateway).unwrap_err(),
         AccessTokenError::Elsewhere { gateway: cast.desk.node_id() }
     );
-    // The same node with another key: its tokens of before are over.
+    // The same node has a new key, so its former tokens are invalid.
     let renewed =
         cast.fleet.issue(&EnrollRequest::new("arm-1".parse().unwrap(), NOW), &mut cast.rng).unwrap();
     assert_eq!(renewed.node_id(), cast.gateway.node_id());
@@ -371,7 +371,7 @@ fn one_address_does_not_fill_the_log() {
     let log = Arc::clone(&heard);
     let access = Access::new(cast().rules())
         .heard_by(Arc::new(move |peer, _| log.lock().unwrap().push(peer.ip().to_string())));
-    // A page in a browser of this host may try as often as it likes, and so may whoever shows one in the clear.
+    // Pages of a browser on this host and clients that show tokens in the clear may try without limit.
     for (peer, encrypted) in [(HERE, true), (ELSEWHERE, true), ("10.0.0.10:1", false)] {
         for _ in 0..1000 {
             let admission = Admission { token: Some("sgc-access-1:AAAA"), encrypted, ..from(peer) };
@@ -407,7 +407,7 @@ fn the_largest_token_fits_and_says_what_it_said() {
         Scope { subscribe: quarter.clone(), publish: quarter.clone(), call: quarter.clone(), serve: quarter };
     let grant = AccessGrant { label: "l".repeat(ACCESS_LABEL_BYTES_MAX), scope, ..cast.grant() };
     let text = grant.clone().sign(&cast.gateway).unwrap().to_text();
-    // With the longest signature that there is.
+    // The longest signature must fit, too.
     assert!(text.len() + 512 * 4 / 3 < ACCESS_TOKEN_TEXT_BYTES_MAX, "{}", text.len());
     let read = AccessToken::parse(&text).unwrap();
     assert_eq!(read.verify(cast.gateway.as_peer()), Ok(&grant));
