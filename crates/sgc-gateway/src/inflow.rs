@@ -1,7 +1,7 @@
-//! [`Inflow`]: bytes of WebSocket messages that are not done yet. They take room of their client's quota from the first byte on, so
-//! that many connections which each begin a message of the longest kind take no more memory than the quota has.
+//! [`Inflow`]: the bytes of unfinished WebSocket messages. They are charged to the client's quota from the first byte
+//! on, so that many connections with unfinished long messages take no more memory than the quota allows.
 //!
-//! gRPC has its own way to do this (`grpc::incoming`), since its messages say their length first.
+//! gRPC has its own accounting (`grpc::incoming`), because its messages begin with their length.
 
 use std::io;
 use std::pin::Pin;
@@ -15,10 +15,10 @@ use crate::error::GatewayError;
 use crate::hub::lock;
 use crate::quota::{Permits, Quota};
 
-/// Bytes of messages that are not done yet.
+/// The bytes of unfinished messages of one connection.
 #[derive(Debug, Default)]
 pub(crate) struct Inflow {
-    /// The quota of the client, once it was admitted. The upgrade bounds all that comes before.
+    /// The quota of the client after its admission. Before that the upgrade bounds the bytes.
     quota: OnceLock<Quota>,
     held: Mutex<Held>,
 }
@@ -26,17 +26,17 @@ pub(crate) struct Inflow {
 #[derive(Debug, Default)]
 struct Held {
     bytes: usize,
-    /// One for each [`UNIT_BYTES`] beyond the first.
+    /// One unit for each [`UNIT_BYTES`] beyond the first.
     room: Vec<Permits>,
 }
 
 impl Inflow {
-    /// Takes room of this quota from now on.
+    /// Charges bytes to this quota from now on.
     pub(crate) fn admit(&self, quota: &Quota) {
         let _ = self.quota.set(quota.clone());
     }
 
-    /// Takes room for bytes that came.
+    /// Charges received bytes.
     pub(crate) fn add(&self, bytes: usize) -> Result<(), GatewayError> {
         let Some(quota) = self.quota.get() else { return Ok(()) };
         let mut held = lock(&self.held);
@@ -48,7 +48,7 @@ impl Inflow {
         Ok(())
     }
 
-    /// Gives back the room of so many bytes that were kept.
+    /// Releases bytes that were kept.
     pub(crate) fn give_back(&self, bytes: usize) {
         let mut held = lock(&self.held);
         held.bytes = held.bytes.saturating_sub(bytes);
@@ -56,7 +56,7 @@ impl Inflow {
         held.room.truncate(places);
     }
 
-    /// Gives back the room of a message that is done, but for so many bytes that are still kept.
+    /// Releases the bytes of a finished message, except for `kept` bytes.
     pub(crate) fn done_but(&self, kept: usize) {
         let mut held = lock(&self.held);
         held.bytes = kept;
@@ -64,7 +64,7 @@ impl Inflow {
     }
 }
 
-/// A stream of bytes whose reader takes room for what it reads.
+/// A stream that charges the bytes that are read from it.
 #[derive(Debug)]
 pub(crate) struct Metered<S> {
     stream: S,
@@ -142,7 +142,7 @@ mod tests {
         };
         assert!(matches!(refused, GatewayError::Crowded { pool: Pool::Total, .. }), "{refused}");
         assert_eq!(begun.len(), (2048 << 20) / BEGUN + 1);
-        // Short messages need no room, and finished ones give theirs back.
+        // Short messages need no room, and finished ones release theirs.
         let short = Inflow::default();
         short.admit(&quota);
         short.add(UNIT_BYTES).unwrap();

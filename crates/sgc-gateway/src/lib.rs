@@ -1,12 +1,11 @@
-//! Programs without ROS on a ROS 2 network: what they may do, and what it takes to do it.
+//! Access to a ROS 2 network for programs without ROS.
 //!
-//! A [`Hub`] is an ordinary node of the local ROS 2 network, which many clients share: it reads each topic once for all who
-//! subscribe, knows the graph, and finds definitions. A [`Session`] is one client's part in it, which holds it to its
-//! [`Scope`] and to bounds of its own. Protocols stand on sessions and on nothing below: [`rosbridge`], [`foxglove`],
-//! [`grpc`].
+//! A [`Hub`] is an ordinary node of the local ROS 2 network that many clients share. It reads each topic once for all
+//! subscribers, follows the graph and finds definitions. A [`Session`] is one client's use of the hub, bounded by a
+//! [`Scope`] and limits. The protocols [`rosbridge`], [`foxglove`] and [`grpc`] build on sessions only.
 //!
-//! The hub knows of no other SGC node: what it writes is shared by the proxy beside it like what any program writes, by the
-//! same rules. Sockets are opened by `server` alone, and the network behind [`LocalRos`] is for others to open.
+//! The hub knows no other SGC node: the proxy beside it shares its publications by the same rules as those of any
+//! program. Only the module `server` opens sockets, and other crates open the network behind [`LocalRos`].
 #![forbid(unsafe_code)]
 
 mod access;

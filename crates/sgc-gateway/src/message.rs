@@ -1,4 +1,4 @@
-//! [`Message`]: what came on a topic, written once in each form however many clients want it.
+//! [`Message`]: a message of a topic, converted once to each form for all clients.
 
 use std::sync::OnceLock;
 
@@ -12,16 +12,16 @@ use crate::error::GatewayError;
 
 type Written = OnceLock<Result<Bytes, GatewayError>>;
 
-/// A message that came on a topic.
+/// A message received on a topic.
 #[derive(Debug)]
 pub struct Message {
-    /// Its serialised form.
+    /// The serialised message.
     pub payload: Bytes,
-    /// When it was published, nanoseconds since the Unix epoch, by its publisher's clock.
+    /// The time of publication by the publisher's clock, in nanoseconds since the Unix epoch.
     pub source_timestamp_ns: i64,
-    /// When it came here, by this host's clock.
+    /// The time of reception by this host's clock.
     pub received_ns: i64,
-    /// Its writer on the local network, if that tells.
+    /// The writer on the local network, if known.
     pub writer: Option<Guid>,
     json: Written,
     cbor: Written,
@@ -35,7 +35,7 @@ impl Message {
         Self { payload, source_timestamp_ns, received_ns, writer, json, cbor }
     }
 
-    /// Returns the message without the forms in which it was written.
+    /// Returns the message without its cached conversions.
     pub(crate) fn unwritten(&self) -> Self {
         let (json, cbor) = (Written::new(), Written::new());
         let payload = self.payload.clone();
@@ -44,7 +44,7 @@ impl Message {
         Self { payload, source_timestamp_ns, received_ns, writer, json, cbor }
     }
 
-    /// The message in a form; `layout` is of its topic's type.
+    /// Returns the message in a form. `layout` is the layout of the topic's type.
     pub fn written(&self, form: Form, layout: &Layout) -> Result<Bytes, GatewayError> {
         let written = match form {
             Form::Cdr => return Ok(self.payload.clone()),
@@ -54,7 +54,7 @@ impl Message {
         if let Some(written) = written.get() {
             return written.clone();
         }
-        // Who wants the same meanwhile waits for it, and is to hold up nobody either.
+        // A second client that needs the same form waits here, and must not hold up others either.
         let make = || written.get_or_init(|| convert(layout, &self.payload, form));
         aside_if_long(self.payload.len(), make).clone()
     }

@@ -1,4 +1,4 @@
-//! [`Connection`]: one client's, from what it asks for to what it is told.
+//! [`Connection`]: one client's connection, with its subscriptions, publications and jobs.
 
 mod catalogue;
 
@@ -28,49 +28,49 @@ use super::protocol::{self, ClientChannel, Command, Metadata, Parameter, Sent, T
 use super::refusal::{Refusal, Refusals};
 use super::{FoxgloveError, Options};
 
-/// How messages are encoded: as ROS 2 has them, or as `docs/spec/json.md` has them; topics are always the former.
+/// Encodings of messages and calls: that of ROS 2, and that of `docs/spec/json.md`. Topics are always sent as CDR.
 const ENCODINGS: [&str; 2] = [CDR, JSON];
 const CDR: &str = "cdr";
 const JSON: &str = "json";
-/// Encapsulation header of a serialised message, bytes (RTPS 2.5, 10.2).
+/// Length of the encapsulation header of a serialised message, in bytes (RTPS 2.5, 10.2).
 const CDR_HEADER_BYTES: usize = 4;
 
-/// How long changes of the graph are gathered.
+/// Time for which graph changes are gathered.
 const SETTLE: Duration = Duration::from_millis(100);
-/// How often definitions are looked for anew that nobody had.
+/// Pause between searches for missing type definitions.
 const LOOK_AGAIN: Duration = Duration::from_secs(10);
-/// How often it is looked what was left out.
+/// Pause between reports of dropped messages.
 const REPORT: Duration = Duration::from_secs(2);
-/// How long readers of what a client begins to publish may take to be matched.
+/// Time within which the readers of a client's new topic should be matched.
 const MATCH_MAX: Duration = Duration::from_millis(200);
-/// Calls and questions for parameters under way; then nothing more is read.
+/// Most calls and parameter requests in progress. At the bound the connection is not read.
 const JOBS_MAX: usize = 512;
-/// Questions for parameters under way.
+/// Most parameter requests in progress.
 const PARAMETER_JOBS_MAX: usize = 8;
-/// Statuses that are remembered, so that none is said twice.
+/// Most statuses that are remembered to avoid repetition.
 const STATUSES_MAX: usize = 1024;
-/// Messages of a topic of events that may wait.
+/// Most queued parameter events.
 const EVENTS_MAX: usize = 256;
 
-/// How bad a status is, as the protocol numbers it.
+/// The severity of a status, as the protocol numbers it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Level {
     Warning = 1,
     Error = 2,
 }
 
-/// What a client subscribes to.
+/// A subscription of the client.
 struct Heard {
     channel: u32,
     topic: String,
     end: AbortHandle,
-    /// Left out before it came to the outbox.
+    /// Messages dropped before they reached the outbox.
     dropped_before: u64,
-    /// Left out in all when it was looked at last.
+    /// The number of dropped messages at the last report.
     reported: u64,
 }
 
-/// What a client publishes.
+/// A topic that the client publishes.
 struct Published {
     publication: Publication,
     form: Form,
@@ -78,7 +78,7 @@ struct Published {
 
 type Deliveries = SelectAll<BoxStream<'static, (u32, Delivery)>>;
 
-/// What nodes are asked.
+/// A request to nodes about their parameters.
 enum Question {
     Get(Vec<String>),
     Set(Vec<Parameter>),
@@ -93,13 +93,13 @@ impl Question {
     }
 }
 
-/// What came of work that was done beside.
+/// The result of a job that ran beside the connection.
 enum Done {
     Called { service: u32, call: u32, encoding: String, reply: Result<Bytes, Refusal> },
     Parameters { id: Option<String>, is_asked: bool, answer: Answer },
 }
 
-/// What a connection waits for.
+/// An event that the connection waits for.
 enum Event {
     Frame(Option<Result<Frame, SocketError>>),
     Done(Done),
@@ -118,7 +118,7 @@ pub(super) struct Connection<'o> {
     outbox: &'o Outbox,
     channels: Listing,
     services: Listing,
-    /// How often definitions were looked for.
+    /// The number of searches for missing type definitions.
     attempt: u64,
     looked_at: Instant,
     is_first: bool,
@@ -160,7 +160,7 @@ impl<'o> Connection<'o> {
         }
     }
 
-    /// Serves until the client goes, or has to.
+    /// Serves the client until it leaves or must leave.
     pub(super) async fn run<R>(&mut self, frames: &mut R) -> Result<(), FoxgloveError>
     where
         R: Stream<Item = Result<Frame, SocketError>> + Unpin + Send,
@@ -255,7 +255,7 @@ impl<'o> Connection<'o> {
         });
     }
 
-    /// Says something to the user. With an id it is said once, until it is another or taken back.
+    /// Sends a status to the user. A status with an id is sent once, until its text changes or it is removed.
     fn status(&mut self, level: Level, message: &str, id: Option<String>) {
         if let Some(id) = &id {
             if self.statuses.get(id).is_some_and(|said| said == message) {
@@ -269,7 +269,7 @@ impl<'o> Connection<'o> {
         self.tell(&Told::Status { level: level as u8, message, id: id.as_deref() });
     }
 
-    /// Takes back what was said.
+    /// Removes a status.
     fn remove_status(&mut self, id: &str) {
         if self.statuses.remove(id).is_some() {
             self.tell(&Told::RemoveStatus { status_ids: &[id] });
@@ -302,7 +302,7 @@ impl<'o> Connection<'o> {
                 }
                 self.refused(&refused);
             }
-            // A channel that went took its subscription along, and clients end it all the same.
+            // Clients also end subscriptions whose channel is gone, so a missing subscription is no error.
             Command::Unsubscribe { subscription_ids } => {
                 subscription_ids.into_iter().for_each(|id| self.unsubscribe(id));
             }
@@ -348,7 +348,7 @@ impl<'o> Connection<'o> {
         }
     }
 
-    /// Says what was refused of a command.
+    /// Reports the refusals of a command.
     fn refused(&mut self, refused: &Refusals) {
         for refusal in &refused.shown {
             self.status(Level::Error, &refusal.to_string(), None);
@@ -410,7 +410,7 @@ impl<'o> Connection<'o> {
         }
     }
 
-    /// Tells of topics whose messages were left out lately, and takes it back where none were.
+    /// Reports topics that lost messages lately, and removes the report for others.
     fn report(&mut self) {
         let mut said = Vec::new();
         for (id, heard) in &mut self.heard {
@@ -557,7 +557,7 @@ impl<'o> Connection<'o> {
                 depth: EVENTS_MAX,
                 ..Subscribe::default()
             };
-            // Who may ask a node may hear of it, whatever topics it has: what others changed is left out.
+            // A client that may ask a node may get its events from any topic. Events of other nodes are filtered out.
             self.events = Some(self.session.subscribe_checked(wanted).await?);
         }
         Ok(())
@@ -574,7 +574,7 @@ impl<'o> Connection<'o> {
     }
 }
 
-/// The next event of a subscription, if there is one.
+/// Waits for the next event of a subscription, or forever without one.
 async fn next_event(events: &mut Option<Subscription>) -> Option<Delivery> {
     match events {
         Some(events) => events.next().await,

@@ -1,5 +1,5 @@
-//! [`Outbox`]: what waits for one client to take it. What was asked for goes first, and bounds what is read; messages of
-//! topics wait in lanes, one a subscription, and give way.
+//! [`Outbox`]: the frames queued for one client. Answers go first and limit how much is read. Messages of topics wait
+//! in one lane per subscription and may be dropped.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -13,20 +13,20 @@ use crate::quota::Waiting;
 
 use super::protocol::message_data;
 
-/// Answers that may wait before nothing more is read from the client.
+/// Most queued answers. At the bound nothing more is read from the client.
 const ANSWERS_MAX: usize = 256;
-/// Bytes of them.
+/// Most bytes of queued answers.
 const ANSWER_BYTES_MAX: usize = 4 << 20;
-/// Messages that may wait for one subscription.
+/// Most queued messages of one subscription.
 pub(super) const LANE_MESSAGES_MAX: usize = 1024;
 
-/// What waits for one client.
+/// The frames queued for one client.
 #[derive(Debug)]
 pub(super) struct Outbox {
     state: Mutex<State>,
-    /// Told when there is something to write.
+    /// Notified when there is a frame to write.
     filled: Notify,
-    /// Told when there is room for answers again.
+    /// Notified when there is room for answers again.
     drained: Notify,
 }
 
@@ -34,7 +34,7 @@ pub(super) struct Outbox {
 struct State {
     answers: VecDeque<Frame>,
     answer_bytes: usize,
-    /// Messages in the order in which they came.
+    /// Messages in the order of their arrival.
     messages: BTreeMap<u64, Queued>,
     lanes: BTreeMap<u32, Lane>,
     next: u64,
@@ -53,7 +53,7 @@ struct Queued {
     message: Arc<Message>,
 }
 
-/// What waits for one subscription.
+/// The messages queued for one subscription.
 #[derive(Debug, Default)]
 struct Lane {
     numbers: VecDeque<u64>,
@@ -62,7 +62,7 @@ struct Lane {
 }
 
 impl Outbox {
-    /// Creates an outbox whose messages wait within that.
+    /// Creates an outbox whose messages are bounded by `message_bytes`.
     pub(super) fn new(message_bytes: Waiting) -> Self {
         let state = State {
             answers: VecDeque::new(),
@@ -79,7 +79,7 @@ impl Outbox {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Puts an answer behind the others, whether there is room or not: who reads looks first.
+    /// Appends an answer even without room. The reader checks for room before it reads.
     pub(super) fn answer(&self, frame: Frame) {
         let mut state = self.lock();
         state.answer_bytes += frame.len();
@@ -88,7 +88,7 @@ impl Outbox {
         self.filled.notify_one();
     }
 
-    /// Whether more may be read, which may need answers.
+    /// Returns `true` if requests may be read that need answers.
     pub(super) fn has_room(&self) -> bool {
         let state = self.lock();
         state.answers.len() < ANSWERS_MAX && state.answer_bytes < ANSWER_BYTES_MAX
@@ -101,7 +101,7 @@ impl Outbox {
         }
     }
 
-    /// Puts a message behind the others of its subscription. Who waits with the most gives way, its oldest first.
+    /// Appends a message of a subscription. For lack of room the lane with the most bytes loses its oldest message.
     pub(super) fn message(&self, subscription: u32, message: Arc<Message>) {
         let cost = cost(&message);
         let mut state = self.lock();
@@ -112,7 +112,7 @@ impl Outbox {
             let most = state.lanes.iter().max_by_key(|(_, lane)| lane.bytes);
             match most.filter(|(_, lane)| lane.bytes > 0).map(|(fullest, _)| *fullest) {
                 Some(fullest) => state.drop_oldest(fullest),
-                // One that is longer than all there may be passes alone.
+                // A message longer than the bound passes alone.
                 None => break,
             }
         }
@@ -127,7 +127,7 @@ impl Outbox {
         self.filled.notify_one();
     }
 
-    /// Nothing that waits for a subscription is wanted any more.
+    /// Drops all messages of a subscription.
     pub(super) fn forget(&self, subscription: u32) {
         let mut state = self.lock();
         let Some(lane) = state.lanes.remove(&subscription) else { return };
@@ -137,12 +137,12 @@ impl Outbox {
         }
     }
 
-    /// How many messages of a subscription gave way until now.
+    /// Returns the number of dropped messages of a subscription.
     pub(super) fn dropped(&self, subscription: u32) -> u64 {
         self.lock().lanes.get(&subscription).map_or(0, |lane| lane.dropped)
     }
 
-    /// What is to be written next, if anything waits.
+    /// Returns the next frame to write, if any.
     pub(super) fn pop(&self) -> Option<Frame> {
         let mut state = self.lock();
         if let Some(answer) = state.answers.pop_front() {
@@ -162,7 +162,7 @@ impl Outbox {
         Some(Frame::Binary(message_data(subscription, message.received_ns, &message.payload)))
     }
 
-    /// The next answer, if one waits.
+    /// Returns the next answer, if any.
     pub(super) fn pop_answer(&self) -> Option<Frame> {
         let mut state = self.lock();
         let answer = state.answers.pop_front()?;
@@ -170,7 +170,7 @@ impl Outbox {
         Some(answer)
     }
 
-    /// Waits until something may have come since it was asked for last. For one who writes.
+    /// Waits until a frame may have been queued since the last call. Only one task may wait.
     pub(super) async fn filled(&self) {
         self.filled.notified().await;
     }
@@ -236,7 +236,7 @@ mod tests {
             outbox.message(1, message(1000));
         }
         assert_eq!((outbox.dropped(1), outbox.dropped(7)), (2, 0));
-        // One that is longer than all there may be comes alone.
+        // A message longer than the bound passes alone.
         outbox.message(2, message(100_000));
         assert_eq!((outbox.dropped(1), outbox.dropped(7)), (5, 1));
         assert_eq!(popped(&outbox), Some((2, 100_000)));

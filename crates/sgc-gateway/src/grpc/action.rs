@@ -1,4 +1,4 @@
-//! `SendGoal` and `ServeAction`: goals that a client sends, and those that it serves.
+//! `SendGoal` and `ServeAction`: goals that a client sends, and actions that it serves.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -22,15 +22,15 @@ use crate::action::{
 use crate::content::{Content, Form};
 use crate::error::GatewayError;
 
-/// How long the end of a goal is waited for.
+/// Time for which the outcome of a goal is awaited.
 const OUTCOME_WAIT_MAX: Duration = Duration::from_secs(30 * 24 * 3600);
-/// Feedback that was there when a goal ended and is told before that.
+/// Most feedback messages that are sent after the goal ended and before its outcome.
 const LAST_FEEDBACK_MAX: usize = 64;
-/// What is to come first.
+/// The required first requests of the streams.
 const ORDER_GOAL: Fault = Fault::Order { what: "the goal" };
 const ORDER_ACTION: Fault = Fault::Order { what: "the action" };
 
-/// Sends a goal, and tells of it until it has ended.
+/// Sends a goal and streams its progress until it ends.
 pub(super) async fn send_goal(
     guest: Arc<Guest>,
     mut requests: Streaming<SendGoalRequest>,
@@ -53,7 +53,7 @@ pub(super) async fn send_goal(
     Ok(begin(Sent { place, goal, feedback, form }, requests, taken))
 }
 
-/// A goal that a server has taken.
+/// A goal that a server has accepted.
 struct Sent {
     place: Place,
     goal: Goal,
@@ -129,7 +129,7 @@ fn to_proto(status: GoalStatus) -> proto::GoalStatus {
     }
 }
 
-/// Serves an action for as long as its client listens and speaks.
+/// Serves an action until its client closes the stream.
 pub(super) async fn serve(
     guest: Arc<Guest>,
     mut requests: Streaming<ServeActionRequest>,

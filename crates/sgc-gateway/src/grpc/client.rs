@@ -1,5 +1,5 @@
-//! [`Clients`]: who was admitted. A [`Guest`] is one credential on one connection: it has a session, whose bounds all its
-//! streams share, and ends all of them once it is not admitted any more.
+//! [`Clients`]: the admission of gRPC clients. A [`Guest`] is one credential on one connection. Its streams share the
+//! bounds of one session, and all of them end when its rights end.
 
 use std::future::Future;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -21,12 +21,12 @@ use crate::feed::{Subscription, SubscriptionEnd};
 use crate::hub::{Hub, lock};
 use crate::session::Session;
 
-/// Credentials that may be in use on one connection at a time.
+/// Most credentials in use on one connection at a time.
 const CREDENTIALS_MAX: usize = 16;
-/// Streams on which one client hears of the graph at a time: each makes its view of it anew with every change.
+/// Most graph watches of one client at a time, because each computes its view anew with every change.
 const WATCHES_MAX: usize = 16;
 
-/// Admits clients.
+/// The admission of clients.
 pub(super) struct Clients {
     hub: Hub,
     access: AccessWatch,
@@ -34,14 +34,14 @@ pub(super) struct Clients {
     stopping: watch::Receiver<bool>,
 }
 
-/// The credential that was shown: of a token its hash, so that none is kept. Beside a token the origin is not looked at.
+/// The credential of a request. A token is kept as a hash only. With a token the origin does not matter.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Shown {
     token: Option<[u8; 32]>,
     origin: Option<Box<str>>,
 }
 
-/// Who was admitted on a connection because of what.
+/// A guest and the credential that admitted it.
 pub(super) struct Known {
     shown: Shown,
     guest: Arc<Guest>,
@@ -71,13 +71,13 @@ impl Clients {
         &self.hub
     }
 
-    /// Who makes a request.
+    /// Returns the guest that makes a request.
     pub(super) fn admit(&self, request: &Request<()>) -> Result<Arc<Guest>, Status> {
         Ok(self.find(request)?)
     }
 
     fn find(&self, request: &Request<()>) -> Result<Arc<Guest>, Fault> {
-        // Also once nobody can say that it is, since the front end is gone.
+        // A dropped sender means that the front end is gone.
         if *self.stopping.borrow() || self.stopping.has_changed().is_err() {
             return Err(GatewayError::Stopping.into());
         }
@@ -87,7 +87,7 @@ impl Clients {
             Some(header) => Some(bearer(header).ok_or(Fault::Authorization)?),
             None => None,
         };
-        // One that is no text is one all the same, and of nobody.
+        // An origin that is not text counts as an unknown origin.
         let origin = text("origin").map(|origin| origin.unwrap_or("?"));
         if token.is_none() && origin.is_some_and(|origin| origin.len() > ORIGIN_BYTES_MAX) {
             return Err(Fault::Origin { max: ORIGIN_BYTES_MAX });
@@ -107,7 +107,7 @@ impl Clients {
             match access.still_admits(guest.session.client(), self.access.now()) {
                 Ok(()) if !guest.has_ended() => return Ok(Arc::clone(guest)),
                 Ok(()) => drop(known.remove(at)),
-                // By the rules as they are now it may be admitted anew.
+                // The current rules may admit the client anew.
                 Err(why) => known.remove(at).guest.end(why),
             }
         }
@@ -147,14 +147,14 @@ impl Clients {
     }
 }
 
-/// The token in a header.
+/// Returns the token in an `authorization` header.
 fn bearer(header: &str) -> Option<&str> {
     let (scheme, token) = header.split_once(' ')?;
     let token = token.trim();
     (scheme.eq_ignore_ascii_case("bearer") && !token.is_empty()).then_some(token)
 }
 
-/// Ends a guest the moment its right ends, or the front end stops. The guest aborts this task when it is dropped.
+/// Ends a guest when its rights end or the front end stops. Dropping the guest aborts this task.
 async fn watch_over(
     guest: Weak<Guest>,
     access: AccessWatch,
@@ -165,7 +165,7 @@ async fn watch_over(
         denied = access.until_denied(&client) => Some(denied),
         _ = stopping.wait_for(|is_stopping| *is_stopping) => None,
     };
-    // One that is being made is there in a moment, and one that goes ends this.
+    // A guest under construction appears shortly, and a dropped guest aborts this task.
     let guest = loop {
         match guest.upgrade() {
             Some(guest) => break guest,
@@ -178,7 +178,7 @@ async fn watch_over(
     }
 }
 
-/// What a guest has at present.
+/// The numbers of a guest's streams.
 #[derive(Debug, Default)]
 struct Counts {
     subscriptions: AtomicUsize,
@@ -189,7 +189,7 @@ struct Counts {
     watches: AtomicUsize,
 }
 
-/// Of which of its bounds a stream takes one.
+/// The kind of a stream, which decides the bound that it counts against.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Taken {
     Subscription,
@@ -204,19 +204,20 @@ pub(super) enum Taken {
 pub(super) struct Guest {
     pub(super) session: Session,
     connection: WeakConnection,
-    /// The task that ends it with its right.
+    /// The task that ends the guest with its rights.
     watcher: AbortHandle,
     counts: Counts,
     ended: watch::Sender<Option<Fault>>,
-    /// Its subscriptions: each is held by a stream, which is not looked at while its client does not read.
+    /// The guest's subscriptions. Their streams are not polled while the client does not read, so they are ended
+    /// here.
     heard: Mutex<Vec<SubscriptionEnd>>,
-    /// Long messages that are written for it and under way.
+    /// Room for long messages that are sent to the guest and unread.
     pub(super) unread: Budget,
-    /// Those that it sends.
+    /// Room for long messages that the guest sends.
     pub(super) incoming: Budget,
 }
 
-/// A stream of a guest's, counted while it lasts.
+/// A stream of a guest, counted until dropped.
 pub(super) struct Place {
     pub(super) guest: Arc<Guest>,
     taken: Taken,
@@ -235,7 +236,7 @@ impl Drop for Guest {
 }
 
 impl Guest {
-    /// Who makes a request that was admitted.
+    /// Returns the guest of an admitted request.
     pub(super) fn of<T>(request: &Request<T>) -> Result<Arc<Self>, Fault> {
         request.extensions().get::<Arc<Self>>().cloned().ok_or(Fault::NoConnection)
     }
@@ -252,7 +253,7 @@ impl Guest {
         }
     }
 
-    /// Counts a stream; refuses one too many.
+    /// Counts a stream, or fails at the bound.
     pub(super) fn take(self: &Arc<Self>, taken: Taken) -> Result<Place, Fault> {
         let (count, what, max) = self.count(taken);
         let place = Place { guest: Arc::clone(self), taken };
@@ -276,7 +277,7 @@ impl Guest {
         self.ended.borrow().is_some()
     }
 
-    /// Has a subscription end with the guest, even if its client does not read.
+    /// Makes a subscription end with the guest, even if its client does not read.
     pub(super) fn holds(&self, subscription: &Subscription) {
         let mut heard = lock(&self.heard);
         heard.retain(|other| !other.has_ended());
@@ -287,7 +288,7 @@ impl Guest {
         }
     }
 
-    /// Waits until it is not admitted any more, and says why.
+    /// Waits until the guest is no longer admitted and returns the reason.
     pub(super) async fn ended(&self) -> Fault {
         let mut ended = self.ended.subscribe();
         match ended.wait_for(Option::is_some).await.map(|why| why.clone()) {
@@ -296,7 +297,7 @@ impl Guest {
         }
     }
 
-    /// Something that takes a while, while it is admitted.
+    /// Runs work while the guest is admitted.
     pub(super) async fn admitted<T>(&self, work: impl Future<Output = Result<T, Fault>>) -> Result<T, Fault> {
         tokio::select! {
             biased;

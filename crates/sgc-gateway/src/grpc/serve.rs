@@ -1,4 +1,4 @@
-//! `Serve`: a service that a client serves. Calls go to it as they come; it answers them in any order.
+//! `Serve`: a service that a client serves. The client gets calls as they arrive and answers them in any order.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -18,9 +18,9 @@ use crate::content::{Content, Form};
 use crate::error::GatewayError;
 use crate::service::{Replier, Serving};
 
-/// Calls that were not answered and are remembered: of more the oldest cannot be answered any more.
+/// Most unanswered calls. Beyond that the oldest can no longer be answered.
 const OPEN_MAX: usize = 4096;
-/// What is to come first.
+/// The required first request.
 const ORDER: Fault = Fault::Order { what: "the service" };
 
 /// A service that a client serves.
@@ -33,7 +33,7 @@ struct Work {
     last: u64,
 }
 
-/// Serves a service for as long as its client listens and speaks.
+/// Serves a service until its client closes the stream.
 pub(super) async fn serve(
     guest: Arc<Guest>,
     mut requests: Streaming<ServeRequest>,
@@ -68,7 +68,7 @@ impl Conversation for Work {
         told: &Told<ServeResponse>,
     ) -> Result<(), Status> {
         loop {
-            // A place for what may come of it is taken first, so that nothing is lost by being given up.
+            // The place for a response is reserved first, so that cancellation loses nothing.
             tokio::select! {
                 said = requests.message() => {
                     let Some(said) = said? else { return Ok(()) };

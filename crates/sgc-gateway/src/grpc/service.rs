@@ -1,4 +1,4 @@
-//! [`Service`]: the calls of `gateway.proto`, each handed to what does it.
+//! [`Service`]: the methods of `gateway.proto`, each passed to its module.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -21,16 +21,16 @@ use super::tracking::{Slot, with_slot};
 use super::{action, graph, publish, qos, serve, subscribe, types};
 use crate::content::Content;
 
-/// How long a reply is waited for by who says nothing of it.
+/// Time to wait for a reply if the client sets no deadline.
 const CALL_WAIT_MAX: Duration = Duration::from_secs(3600);
-/// So long before the deadline of its client a call is given up, a tenth of it at most: for the client to be told by whom it
-/// was not answered.
+/// A call ends this long before the client's deadline, but at most a tenth of it, so that the client learns which
+/// server did not answer.
 const CALL_MARGIN_MAX: Duration = Duration::from_millis(100);
 
-/// What a client hears as a stream.
+/// A stream of responses to a client.
 pub(super) type Responses<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
-/// All that a program may do. Who asks is among the extensions of each request.
+/// The methods of the gateway. Each request has its guest among its extensions.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Service(());
 
@@ -94,7 +94,7 @@ impl Gateway for Service {
         let form = qos::form(encoding)?;
         let content = Content { form, bytes: payload };
         let type_name = Some(&*r#type).filter(|name| !name.is_empty());
-        // It counts until there is room for its reply.
+        // The call counts until there is room for its reply.
         let _place = guest.take(Taken::Call)?;
         let called = async {
             let payload = guest.session.call(&service, type_name, &content, form, max).await?;
@@ -132,7 +132,7 @@ impl Gateway for Service {
     }
 }
 
-/// How long a client waits, as it says (`grpc-timeout`: at most eight digits and a unit).
+/// Returns the time that a client waits, from its `grpc-timeout` header: at most eight digits and a unit.
 fn deadline(metadata: &MetadataMap) -> Option<Duration> {
     let text = metadata.get("grpc-timeout")?.to_str().ok()?;
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;

@@ -1,5 +1,5 @@
-//! [`Tracking`]: what streams tell takes room of their client's [`Budget`](crate::budget::Budget) until it has left, and what they
-//! are sent until it was worked on.
+//! [`Tracking`]: outgoing messages of streams hold room in their client's [`Budget`](crate::budget::Budget) until
+//! they are sent, incoming ones until they are handled.
 
 use std::convert::Infallible;
 use std::pin::Pin;
@@ -22,7 +22,7 @@ use super::service::{Responses, Service};
 use crate::budget::Room;
 use crate::hub::lock;
 
-/// Where a stream puts the room of the message that it gives next, for the body to take along.
+/// A slot in which a stream passes the room of its next message to the body.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Slot(Arc<Mutex<Option<Room>>>);
 
@@ -32,10 +32,10 @@ impl Slot {
     }
 }
 
-/// A response of a stream, and the room that it takes.
+/// A response of a stream and its room.
 pub(super) type Told<T> = (Result<T, Status>, Option<Room>);
 
-/// A stream of what is told, each with its room.
+/// Creates a stream of responses, each with its room.
 pub(super) fn respond<T: Send + 'static>(told: mpsc::Receiver<Told<T>>) -> Response<Responses<T>> {
     let slot = Slot::default();
     let next = slot.clone();
@@ -48,15 +48,15 @@ pub(super) fn respond<T: Send + 'static>(told: mpsc::Receiver<Told<T>>) -> Respo
     with_slot(responses, slot)
 }
 
-/// A response whose messages have their room from there.
+/// Creates a response whose messages take their room from `slot`.
 pub(super) fn with_slot<T>(message: T, slot: Slot) -> Response<T> {
     let mut response = Response::new(message);
     response.extensions_mut().insert(slot);
     response
 }
 
-/// Has messages hold their room, those that come from their heads on until they were worked on, and those that go until they
-/// have left: the connection drops what it has written.
+/// A service whose messages hold their room: incoming ones from their heads until they are handled, outgoing ones
+/// until the connection has written and dropped them.
 #[derive(Clone, Debug)]
 pub(super) struct Tracking(GatewayServer<Service>);
 
@@ -80,7 +80,7 @@ impl tonic::codegen::Service<http::Request<Body>> for Tracking {
     }
 
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
-        // The one message of a call is worked on until that has its reply.
+        // The only message of a call keeps its room until the reply is ready.
         let kept: Option<Kept> = request.uri().path().ends_with("/Call").then(Kept::default);
         let guest = request.extensions().get::<Arc<Guest>>().cloned();
         let request = match guest {
@@ -100,13 +100,13 @@ impl tonic::codegen::Service<http::Request<Body>> for Tracking {
     }
 }
 
-/// What is written of a stream, with the room that it takes.
+/// The body of a response, with the room of its messages.
 struct Tracked {
     body: Body,
     slot: Slot,
 }
 
-/// Bytes, and their room.
+/// Bytes and their room.
 struct Held {
     bytes: Bytes,
     _room: Room,

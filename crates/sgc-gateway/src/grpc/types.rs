@@ -1,4 +1,4 @@
-//! `GetType`: the text by which a type is defined, and of all that it needs.
+//! `GetType`: the definition of a type as text, with the definitions that it needs.
 
 use sgc_cdr::{Library, TypeName};
 
@@ -8,11 +8,11 @@ use super::proto::get_type_response::Definition;
 use crate::error::GatewayError;
 use crate::types::Types;
 
-/// Parts of which services and actions are made.
+/// The parts of services and actions.
 const SERVICE: [&str; 2] = ["_Request", "_Response"];
 const ACTION: [&str; 3] = ["_Goal", "_Result", "_Feedback"];
 
-/// What a type is. May read files.
+/// Returns the definitions of a type. May read files.
 pub(super) fn describe(types: &Types, type_name: &str) -> Result<GetTypeResponse, Fault> {
     let name: TypeName = type_name.parse().map_err(|_| GatewayError::TypeName {
         name: type_name.to_owned(),
@@ -41,7 +41,7 @@ pub(super) fn describe(types: &Types, type_name: &str) -> Result<GetTypeResponse
             definitions.push(Definition { r#type: file, text: text.clone() });
             Some(text)
         };
-        // What is known as it was described alone has no text.
+        // A type known only by its description has no text.
         let _ = library.layout(&part, &mut look_up);
     }
     Ok(GetTypeResponse { type_hash, definitions })

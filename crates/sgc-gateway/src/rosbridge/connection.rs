@@ -1,4 +1,4 @@
-//! [`Connection`]: what one client has, and what becomes of what it sends.
+//! [`Connection`]: the state of one client, and the execution of its ops.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -30,32 +30,32 @@ use crate::quota::Held;
 use crate::session::{Advertise, Session, Subscribe, action_of};
 use crate::types::InterfaceType;
 
-/// How long a client that begins to publish waits for readers that the graph shows, so that these have its first message.
+/// Time for which a new publisher waits for the readers in the graph, so that these get its first message.
 const SETTLE_MAX: Duration = Duration::from_millis(500);
-/// Longest time that a call waits for its reply, whatever its client says.
+/// Longest wait for a reply, whatever the client asks for.
 const TIMEOUT_MAX: Duration = Duration::from_secs(3600);
-/// Errors that a client may make at once, and a second: who makes more is disconnected.
+/// Errors that a client may make in a burst, and per second. A client beyond that is disconnected.
 const ERRORS_BURST: u32 = 200;
 const ERRORS_PER_SECOND: u32 = 100;
-/// The text for a client whose message lacks pieces that have not come in time.
+/// The error text for a message whose fragments are late.
 const PIECES_LATE: &str = "pieces of the message did not come in time, and it is given up";
-/// Things that a client which has become another may not have any more, each said for itself; further ones are counted.
+/// Most individual reports about interfaces that a client lost by a change of its credential.
 const ENDED_SHOWN_MAX: usize = 16;
 
-/// What a client publishes on a topic.
+/// A topic that a client publishes.
 struct Published {
     publication: Publication,
     ids: BTreeSet<Option<OpId>>,
 }
 
-/// A call or a goal under way.
+/// A call or goal in progress.
 struct UnderWay {
-    /// What is called.
+    /// The name of the service or action.
     name: String,
     end: End,
 }
 
-/// Errors that a client may still make.
+/// The number of errors that a client may still make.
 struct Patience {
     left: u32,
     since: Instant,
@@ -66,7 +66,7 @@ impl Patience {
         Self { left: ERRORS_BURST, since: Instant::now() }
     }
 
-    /// Counts one; false if there were too many.
+    /// Counts an error. Returns `false` if there were too many.
     fn count(&mut self, now: Instant) -> bool {
         let earned =
             now.saturating_duration_since(self.since).as_millis() * u128::from(ERRORS_PER_SECOND) / 1000;
@@ -81,22 +81,22 @@ impl Patience {
     }
 }
 
-/// What one client has.
+/// The state of one client.
 pub(super) struct Connection {
     session: Arc<Session>,
-    /// Holds the present session of the client.
+    /// The current session of the client.
     sessions: watch::Sender<Arc<Session>>,
     options: Arc<RosbridgeOptions>,
     outbox: Outbox,
     is_admitted: bool,
     topics: BTreeMap<String, Topic>,
     publications: BTreeMap<String, Published>,
-    /// Topics with messages that are still to leave.
+    /// Topics with unsent messages.
     unflushed: Vec<String>,
     services: BTreeMap<String, Served>,
     actions: BTreeMap<String, ServedAction>,
     goals: BTreeMap<OpId, Arc<Notify>>,
-    /// Calls and goals under way, by their numbers; ended with the connection.
+    /// Calls and goals in progress by number, aborted with the connection.
     tasks: JoinSet<(u64, Option<OpId>)>,
     under_way: BTreeMap<u64, UnderWay>,
     next_number: u64,
@@ -104,9 +104,9 @@ pub(super) struct Connection {
     patience: Patience,
 }
 
-/// How an op can end.
+/// The failure of an op.
 enum Failure {
-    /// The client is told.
+    /// The error is reported to the client.
     Op(OpError),
     /// The connection ends.
     End(RosbridgeError),
@@ -159,7 +159,7 @@ impl Connection {
         self.sessions.subscribe()
     }
 
-    /// Does what a client asks for; only what ends the connection is an error.
+    /// Executes an op. Only an error that ends the connection is returned.
     pub(super) async fn take(&mut self, text: &str) -> Result<(), RosbridgeError> {
         let taken = self.take_op(text).await;
         self.session.message_is_done_but(self.fragments.bytes());
@@ -178,7 +178,7 @@ impl Connection {
             Ok(op) if op.name == "fragment" && self.is_admitted => match self.put_together(&op) {
                 Ok(None) => (Ok(()), None),
                 Ok(Some(whole)) => match aside_if_long(whole.len(), || Op::parse(&whole)) {
-                    // It is told with the id of the pieces if it has none.
+                    // An inner message without an id is answered with the id of its fragments.
                     Ok(inner) => (self.run(&inner).await, inner.id.or(op.id)),
                     Err(error) => (Err(error.into()), op.id),
                 },
@@ -207,12 +207,12 @@ impl Connection {
         }
     }
 
-    /// Lets leave what was published since the last time.
+    /// Sends messages that were published since the last flush.
     pub(super) async fn flush(&mut self) -> Result<(), RosbridgeError> {
         while let Some(topic) = self.unflushed.pop() {
             let Some(published) = self.publications.get(&topic) else { continue };
             let flushed = published.publication.flush().await;
-            // The client is told of each that is lost.
+            // Each lost message is reported to the client.
             if published.publication.has_ahead() {
                 self.unflushed.push(topic.clone());
             }
@@ -263,7 +263,7 @@ impl Connection {
         let Some(authenticate) = &self.options.authenticate else {
             return Err(op.refused("this gateway takes no tokens here").into());
         };
-        // Where clients can only say what the `rosauth` of ROS 1 wanted, the token stands for the code.
+        // Some clients know only the fields of ROS 1's `rosauth`, so a token may stand in its code field.
         let token = match op.text("token")? {
             Some(token) => token,
             None => op.text("mac")?.ok_or_else(|| op.refused("\"token\" is missing"))?,
@@ -287,7 +287,7 @@ impl Connection {
                 Ok(self.end_what_is_not_permitted(is_as_before).await?)
             }
             Err(why) => {
-                // Whoever guesses makes a connection for each guess.
+                // A client that guesses must open a connection for each guess.
                 let error = op.refused(why.clone());
                 self.outbox.status(Level::Error, &told(&error), op.id.as_ref()).await?;
                 Err(Failure::End(RosbridgeError::NotAdmitted(why)))
@@ -295,8 +295,8 @@ impl Connection {
         }
     }
 
-    /// Ends what a client has that it may not have, now that it is another, and says so. Calls and goals say it for
-    /// themselves.
+    /// Ends publications, services and other uses to which the client's new credential has no right, and reports
+    /// them. Calls and goals report for themselves.
     async fn end_what_is_not_permitted(&mut self, is_as_before: bool) -> Result<(), Gone> {
         let (session, mut ended) = (&self.session, Vec::new());
         let mut may = |right, name: &str| {
@@ -308,7 +308,7 @@ impl Connection {
         self.services.retain(|name, _| may(Right::Serve, action_of(name)));
         self.actions.retain(|name, _| may(Right::Serve, name));
         let why = |name: &str| match local_name(name) {
-            // It sees what the client saw.
+            // The new client may see everything that the former one saw.
             Some(_) if is_as_before => None,
             Some(_) => Some(GatewayError::OtherClient { client: session.client().name.to_string() }),
             None => session.check(Right::Call, action_of(name)).err(),
@@ -317,7 +317,7 @@ impl Connection {
             self.under_way.iter().filter_map(|(number, of)| Some((*number, why(&of.name)?))).collect();
         for (number, why) in over {
             if let Some(under_way) = self.under_way.remove(&number) {
-                // One that has ended by itself is not there to hear it.
+                // A job that has ended no longer listens.
                 let _ = under_way.end.send(why);
             }
         }
@@ -331,7 +331,7 @@ impl Connection {
         Ok(())
     }
 
-    /// A number for a call or a goal, and what tells it to end.
+    /// Registers a call or goal. Returns its number and the receiver that tells it to end.
     fn begin(&mut self, name: &str) -> (u64, oneshot::Receiver<GatewayError>) {
         self.next_number += 1;
         let (end, ended) = oneshot::channel();
@@ -347,7 +347,7 @@ impl Connection {
         Ok(())
     }
 
-    /// The message of which this is the last piece, if it is.
+    /// Adds a fragment and returns the message if it is complete.
     fn put_together(&mut self, op: &Op<'_>) -> Result<Option<String>, OpError> {
         let id = op.id.as_ref().ok_or_else(|| op.refused("\"id\" is missing"))?;
         let number = op.count("num")?.ok_or_else(|| op.refused("\"num\" is missing"))?;
@@ -357,12 +357,12 @@ impl Connection {
         taken.map_err(|error| op.refused(error.to_string()))
     }
 
-    /// Returns when the next message of which pieces are missing is given up.
+    /// Returns the time at which the next incomplete message is given up.
     pub(super) fn fragments_end(&self) -> Option<Instant> {
         self.fragments.next_end()
     }
 
-    /// Gives up messages whose pieces have not come in time, and says so.
+    /// Gives up incomplete messages whose fragments are late, and reports them.
     pub(super) async fn give_up_fragments(&mut self) -> Result<(), RosbridgeError> {
         let before = self.fragments.bytes();
         let given_up: Vec<_> = std::iter::from_fn(|| self.fragments.give_up(Instant::now())).collect();
@@ -415,7 +415,7 @@ impl Connection {
         };
         let publication = made.await.map_err(|error| op.gateway(error))?;
         publication.settle(SETTLE_MAX).await;
-        // Published without being advertised, the topic goes with whatever is unadvertised next.
+        // A topic published without an advertisement ends with any `unadvertise`.
         let ids = (op.name == "advertise").then(|| op.id.clone()).into_iter().collect();
         self.publications.insert(topic, Published { publication, ids });
         Ok(())
@@ -515,7 +515,7 @@ impl Connection {
         Ok(())
     }
 
-    /// A call that is refused before it begins is answered, too: who has made it waits for that.
+    /// Calls a service. A refusal is also sent as a reply, because the caller waits for one.
     async fn call_service(&mut self, op: &Op<'_>) -> Done {
         let begun = self.begin_call(op);
         if let (Err(error), Some(id)) = (&begun, &op.id) {
@@ -537,7 +537,7 @@ impl Connection {
             fragment_size: fragment_size(op)?,
             compression: match compression(op)? {
                 Compression::None => Compression::None,
-                // There is no form of its own for replies.
+                // Replies have no raw form.
                 Compression::Cbor | Compression::CborRaw => Compression::Cbor,
             },
         };
@@ -552,14 +552,14 @@ impl Connection {
         Ok(())
     }
 
-    /// Calls and goals are tasks of their own, so there is a bound on them before they are made.
+    /// Fails at the bound of calls and goals, which are tasks of their own.
     fn check_tasks(&self, op: &Op<'_>) -> Result<(), OpError> {
         let max = self.session.limits().calls_max;
         let checked = self.session.check_count("calls and goals under way", self.tasks.len(), max);
         checked.map_err(|error| op.gateway(error))
     }
 
-    /// There is a bound on the bytes of their arguments, too.
+    /// Reserves room for arguments, whose bytes are bounded, too.
     fn hold(&self, op: &Op<'_>) -> Result<Held, OpError> {
         let bytes = op.raw("args").map_or(0, str::len);
         self.session.hold_arguments(bytes).map_err(|error| op.gateway(error))
@@ -569,7 +569,7 @@ impl Connection {
         let service = op.needed_name("service")?;
         let type_name = op.needed_name("type")?;
         self.check_servings(op)?;
-        // Who advertises again means the new one.
+        // A second advertisement replaces the first.
         self.services.remove(&service);
         let serving = self.session.serve(&service, Some(&type_name)).await;
         let serving = serving.map_err(|error| op.gateway(error))?;
@@ -606,7 +606,7 @@ impl Connection {
             request.ok_or_else(|| op.refused(format!("{service}: no request waits under that id")))?;
         let values = op.raw("values").filter(|raw| raw.starts_with(['{', '[']));
         if !is_done && values.is_none() {
-            // ROS 2 has no reply that says so: whoever called hears nothing.
+            // ROS 2 has no reply for failures, so the caller gets none.
             let why = op.raw("values").map_or_else(|| "no reason given".to_owned(), super::op::short);
             tracing::debug!(%service, %why, "a client failed to answer");
             served.answered(op.id.as_ref());
@@ -621,11 +621,11 @@ impl Connection {
         Ok(())
     }
 
-    /// A goal that is refused before it is sent has an outcome, too: who has sent it waits for that.
+    /// Sends a goal. A refusal is also sent as a result, because the client waits for one.
     async fn send_action_goal(&mut self, op: &Op<'_>) -> Done {
         let is_known = op.id.as_ref().is_some_and(|id| self.goals.contains_key(id));
         if is_known {
-            // An outcome would be taken for that of the other.
+            // The result would be taken for that of the other goal.
             return Err(op.refused("a goal of that id is under way").into());
         }
         let begun = self.begin_goal(op);
@@ -710,7 +710,7 @@ impl Connection {
         }
     }
 
-    /// The action that an op is of, which the client serves.
+    /// Returns the action of an op, which the client must serve.
     fn served_action(&self, op: &Op<'_>) -> Result<&ServedAction, OpError> {
         let action = op.needed_name("action")?;
         let served = self.actions.get(&action);
@@ -748,7 +748,7 @@ impl Connection {
         Ok(())
     }
 
-    /// What a client says of a goal that it works on; ROS 2 is told by the gateway itself.
+    /// Checks the status that a client reports for its goal. The gateway itself reports to ROS 2.
     fn action_status(&mut self, op: &Op<'_>) -> Done {
         let served = self.served_action(op)?;
         served.goal(op.id.as_ref()).ok_or_else(|| op.refused("no goal of that id is under way"))?;
@@ -765,7 +765,7 @@ fn compression(op: &Op<'_>) -> Result<Compression, OpError> {
     Compression::of(&name).map_err(|why| op.refused(why))
 }
 
-/// At least one byte.
+/// Reads the fragment size, at least one byte.
 fn fragment_size(op: &Op<'_>) -> Result<Option<usize>, OpError> {
     match op.count("fragment_size")? {
         Some(0) => Err(op.refused("\"fragment_size\" is 1 or more")),
@@ -836,7 +836,7 @@ mod tests {
             matches!(refused, GatewayError::Crowded { pool: crate::quota::Pool::Credential, .. });
         assert!(is_of_credential, "{refused}");
         assert_eq!(begun.len(), LEFT_BYTES / PIECE_BYTES);
-        // A message that is whole gives all its room back.
+        // A complete message returns all its room.
         let before = begun.len();
         begun.truncate(1);
         assert!(quota.room_at_once(units((before - 1) * PIECE_BYTES)).is_ok());
@@ -875,7 +875,7 @@ mod tests {
             }
             held.len() * UNIT_BYTES
         };
-        // Whoever reads answers pings.
+        // Reading also answers pings.
         let mut kept = 0;
         let told = loop {
             match page.next().await.unwrap().unwrap() {

@@ -1,9 +1,9 @@
-//! [`Outbox`]: what waits to be written to a client, in two lanes, and [`write_all`], which writes it.
+//! [`Outbox`]: the frames queued for a client in two lanes, and [`write_all`], which writes them.
 //!
-//! Replies, requests and status go before messages of topics. Both lanes are short: who has something to say waits for a
-//! place, so that of a client that does not read nothing gathers here, and its subscriptions drop what is old. Long replies
-//! and requests wait for room as well, of which a client has so many bytes; replies, which nobody can hold back, are
-//! refused beyond as many more.
+//! Replies, requests and status go before messages of topics. Both lanes are short and senders wait for a place, so
+//! that for a client that does not read, frames do not pile up here and its subscriptions drop old messages. Long
+//! replies and requests also wait for room in bytes. Nothing holds back replies, so they are refused once waiting
+//! ones exceed the room.
 
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -21,16 +21,16 @@ use crate::budget::{Budget, Room};
 use crate::error::GatewayError;
 use crate::quota::Quota;
 
-/// Replies, requests and status that wait.
+/// Most queued replies, requests and status frames.
 const CONTROL_MAX: usize = 64;
-/// Batches of messages that wait.
+/// Most queued batches of messages.
 const BATCHES_MAX: usize = 4;
-/// What is written before it is flushed, bytes.
+/// Most bytes that are written before a flush.
 const FLUSH_BYTES: usize = 256 << 10;
-/// Bytes a second that a client has to take in the long run.
+/// Lowest rate at which a client must read in the long run, in bytes per second.
 const PACE_BYTES_MIN: u64 = 16 << 10;
 
-/// How much a client is told.
+/// The severity of statuses that a client receives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u8)]
 pub(super) enum Level {
@@ -61,7 +61,7 @@ impl Level {
     }
 }
 
-/// What waits to be written to a client.
+/// The frames queued for a client.
 #[derive(Clone, Debug)]
 pub(super) struct Outbox {
     control: mpsc::Sender<Said>,
@@ -84,7 +84,7 @@ impl Said {
     }
 }
 
-/// The other end of it.
+/// The receiving end of an [`Outbox`].
 #[derive(Debug)]
 pub(super) struct Outgoing {
     control: mpsc::Receiver<Said>,
@@ -92,7 +92,7 @@ pub(super) struct Outgoing {
 }
 
 impl Outgoing {
-    /// Forgets what waits to be said.
+    /// Drops all queued frames.
     pub(super) fn clear(&mut self) {
         self.batches.close();
         self.control.close();
@@ -101,12 +101,12 @@ impl Outgoing {
     }
 }
 
-/// The connection has ended.
+/// The error of an ended connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Gone;
 
 impl Outbox {
-    /// One whose long replies and requests have so many bytes.
+    /// Creates an outbox with `bytes_max` bytes of room for long replies and requests.
     pub(super) fn new(bytes_max: usize, quota: Quota) -> (Self, Outgoing) {
         let (control, control_out) = mpsc::channel(CONTROL_MAX);
         let (batches, batches_out) = mpsc::channel(BATCHES_MAX);
@@ -122,23 +122,23 @@ impl Outbox {
         self.level.store(level as u8, Ordering::Relaxed);
     }
 
-    /// Says something once there is room.
+    /// Queues a frame once there is room.
     pub(super) async fn say(&self, frame: Frame) -> Result<(), Gone> {
         let room = self.room.take(frame.bytes()).await;
         self.control.send(Said { frame, room }).await.map_err(|_| Gone)
     }
 
-    /// The same of what came by itself, and waits here until there is room.
+    /// Queues a reply, whose memory is taken already, once there is room.
     ///
     /// # Errors
-    /// If too much waits already. That the connection has ended is none: nobody is there to be told.
+    /// Too many bytes of replies wait. An ended connection is no error, because there is no client to inform.
     pub(super) async fn say_reply(&self, frame: Frame) -> Result<(), GatewayError> {
         let room = self.room.take_for_reply(frame.bytes()).await?;
         let _ = self.control.send(Said { frame, room }).await;
         Ok(())
     }
 
-    /// Waits for the turn to write out a request that is to be said: of a client that does not read, one waits.
+    /// Waits for the turn to write a request, so that a client that does not read has one unsent request.
     pub(super) async fn turn(&self) -> Turn<'_, ()> {
         self.turns.lock().await
     }
@@ -149,7 +149,7 @@ impl Outbox {
         is_wanted.then(|| status().finish())
     }
 
-    /// Tells of something, if the client wants to be told.
+    /// Sends a status if the client's level asks for it.
     pub(super) async fn status(&self, level: Level, told: &str, id: Option<&OpId>) -> Result<(), Gone> {
         match self.status_frame(level, told, id) {
             Some(frame) => self.say(frame).await,
@@ -157,20 +157,20 @@ impl Outbox {
         }
     }
 
-    /// The same from where nothing may be waited for: left out if there is no room.
+    /// Sends a status without waiting. It is dropped if there is no room.
     pub(super) fn try_status(&self, level: Level, told: &str, id: Option<&OpId>) {
         if let Some(frame) = self.status_frame(level, told, id) {
             let _ = self.control.try_send(Said { frame, room: None });
         }
     }
 
-    /// A place for messages, once there is one: so that they are written out only then.
+    /// Waits for a place for messages, so that messages are encoded only when there is one.
     pub(super) async fn place(&self) -> Result<mpsc::Permit<'_, Vec<Frame>>, Gone> {
         self.batches.reserve().await.map_err(|_| Gone)
     }
 }
 
-/// Since when a ping has not been answered.
+/// The time since which a ping has not been answered.
 #[derive(Debug, Default)]
 pub(super) struct Pulse(Mutex<Option<Instant>>);
 
@@ -179,7 +179,7 @@ impl Pulse {
         self.lock().get_or_insert_with(Instant::now);
     }
 
-    /// Something came.
+    /// Records that a message arrived.
     pub(super) fn heard(&self) {
         *self.lock() = None;
     }
@@ -193,7 +193,7 @@ impl Pulse {
     }
 }
 
-/// Writes until the connection ends.
+/// Writes frames until the connection ends.
 pub(super) async fn write_all<W>(
     sink: &mut W,
     outgoing: &mut Outgoing,
@@ -244,7 +244,7 @@ where
     }
 }
 
-/// Writes what is still to be said, and nothing of topics.
+/// Writes the remaining frames of the first lane, and no messages of topics.
 pub(super) async fn write_rest<W>(sink: &mut W, outgoing: &mut Outgoing) -> Result<(), tungstenite::Error>
 where
     W: Sink<Message, Error = tungstenite::Error> + Unpin,
@@ -271,7 +271,7 @@ where
     Ok(bytes)
 }
 
-/// So long a write may take.
+/// Limits the duration of a write.
 async fn timed(
     silence_max: Duration,
     bytes: usize,

@@ -1,4 +1,4 @@
-//! Quality of service as clients of rosbridge say it.
+//! QoS as rosbridge clients write it.
 
 use std::collections::BTreeMap;
 
@@ -6,7 +6,7 @@ use serde::Deserialize;
 use serde_json::Value as Json;
 use sgc_wire::{Durability, History, Qos, Reliability};
 
-/// Depth of a publisher that says none, and the most that one can say.
+/// The default depth of a publisher, and the largest one.
 const DEPTH_DEFAULT: u32 = 100;
 const DEPTH_MAX: u32 = 10_000;
 
@@ -30,7 +30,8 @@ enum Span {
 }
 
 impl Said {
-    /// Reads it, or says what is wrong. What it says `best_available` of is as if it was not there.
+    /// Parses the member; an error explains what is wrong. A policy with the value `best_available` counts as
+    /// missing.
     pub(super) fn read(raw: &str) -> Result<Self, String> {
         let members: BTreeMap<String, Json> =
             serde_json::from_str(raw).map_err(|_| "\"qos\" is no object".to_owned())?;
@@ -61,7 +62,7 @@ impl Said {
         Ok(said)
     }
 
-    /// What a publisher offers: reliable, unless something else is said.
+    /// Returns the QoS that a publisher offers, reliable by default.
     pub(super) fn offer(&self, is_latched: bool, queue_size: Option<usize>) -> Qos {
         let latched = if is_latched { Durability::TransientLocal } else { Durability::Volatile };
         let said = queue_size.and_then(|size| u32::try_from(size).ok()).filter(|size| *size > 0);
@@ -76,7 +77,7 @@ impl Said {
         }
     }
 
-    /// What a subscriber requests; none, if it takes publishers as they are.
+    /// Returns the QoS that a subscriber requests, or `None` if it adapts to the publishers.
     pub(super) fn request(&self) -> Option<Qos> {
         if self.reliability.is_none() && self.durability.is_none() {
             return None;

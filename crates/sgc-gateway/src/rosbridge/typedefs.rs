@@ -1,4 +1,4 @@
-//! Types as `rosapi` tells of them: a list of members for each type, or the text of the definitions.
+//! Types as `rosapi` describes them: a list of members for each type, or the text of the definitions.
 
 use std::collections::BTreeSet;
 
@@ -8,7 +8,7 @@ use sgc_cdr::{Base, DUMMY_MEMBER, Definition, Field, Library, Primitive, Shape, 
 use crate::error::GatewayError;
 use crate::types::Types;
 
-/// What stands between definitions in one text.
+/// The separator between definitions in one text.
 const RULE: &str = "================================================================================";
 
 /// `rosapi_msgs/msg/TypeDef`.
@@ -18,20 +18,20 @@ pub(super) struct TypeDef {
     type_name: String,
     fieldnames: Vec<String>,
     fieldtypes: Vec<String>,
-    /// -1 of one element, 0 of a sequence, else that of an array.
+    /// -1 for a single element, 0 for a sequence, else the length of the array.
     fieldarraylen: Vec<i64>,
     examples: Vec<String>,
     constnames: Vec<String>,
     constvalues: Vec<String>,
 }
 
-/// A type, and after it those that it contains, each once. May read files.
+/// Returns a type and the types that it contains, each once. May read files.
 pub(super) fn typedefs(types: &Types, type_name: &str) -> Result<Vec<TypeDef>, GatewayError> {
     let (library, all) = within(types, type_name)?;
     Ok(all.iter().filter_map(|name| library.definition(name)).map(typedef).collect())
 }
 
-/// The text of a type's definition, followed by those of the types that it contains, as bag files have it.
+/// Returns the text of a type's definition and of the types that it contains, as in bag files.
 pub(super) fn full_text(types: &Types, type_name: &str) -> String {
     let texts = || {
         let (_, all) = within(types, type_name)?;
@@ -47,7 +47,7 @@ pub(super) fn full_text(types: &Types, type_name: &str) -> String {
     texts().unwrap_or_else(|error| format!("# {error}"))
 }
 
-/// Definitions of a type and all that it contains, and their names, itself first.
+/// Returns the definitions of a type and of the types that it contains, and their names, beginning with the type.
 fn within(types: &Types, type_name: &str) -> Result<(Library, Vec<TypeName>), GatewayError> {
     let name: TypeName = type_name.parse().map_err(|_| GatewayError::TypeName {
         name: type_name.to_owned(),
@@ -95,12 +95,12 @@ fn typedef(definition: &Definition) -> TypeDef {
     made
 }
 
-/// As `rosapi` calls types: `std_msgs/String`.
+/// Returns a type name in the form of `rosapi`: `std_msgs/String`.
 fn short_name(name: &TypeName) -> String {
     format!("{}/{}", name.package(), name.name())
 }
 
-/// As the Python of ROS 2 calls them.
+/// Returns the name of a base type as in the Python packages of ROS 2.
 fn base_name(base: &Base) -> String {
     match base {
         Base::Primitive(Primitive::Bool) => "boolean".to_owned(),

@@ -1,4 +1,4 @@
-//! What a client is told of the graph: channels, services, and who is connected with what.
+//! The part of the graph that a client sees: channels, services and the connection graph.
 
 use std::collections::BTreeMap;
 
@@ -15,12 +15,12 @@ use crate::foxglove::connections::Connections;
 use crate::foxglove::listing::Offer;
 use crate::foxglove::protocol::{Channel, Half, Service, Told};
 
-/// How definitions are written.
+/// The encoding of definitions.
 const SCHEMA_ENCODING: &str = "ros2msg";
-/// Topics, and services, that a client is told of at once.
+/// Most topics, and most services, that are announced at once.
 const TOLD_AT_ONCE: usize = 32;
 
-/// Definitions of both halves of a service.
+/// The definitions of a service's request and response.
 struct Halves {
     request: String,
     response: String,
@@ -33,7 +33,7 @@ impl Connection<'_> {
         self.options.shows_hidden || !is_hidden(name)
     }
 
-    /// Tells all of who is connected with what, and what changes of it from now on.
+    /// Sends the whole connection graph, and its changes from now on.
     pub(super) fn begin_connections(&mut self) {
         self.connections = Some(Connections::default());
         self.tell_connections(&self.session.graph());
@@ -47,12 +47,12 @@ impl Connection<'_> {
         }
     }
 
-    /// Topics and services that the client may use.
+    /// Returns the topics and services that the client may use.
     fn offers(&self, graph: &Graph) -> (BTreeMap<String, Offer>, BTreeMap<String, Offer>) {
         let may = |right, name: &str| self.session.check(right, name).is_ok();
         let mut topics = BTreeMap::new();
         for (name, info) in graph.topics.iter().filter(|(name, _)| self.is_shown(name)) {
-            // A reader of the gateway's own is there for those who subscribe, and makes no topic.
+            // The gateway's own readers exist only for subscribers and do not make a topic.
             let is_there = !info.publishers.is_empty() || info.subscribers.iter().any(|end| !end.is_own);
             if let Some(type_name) = info.type_name().filter(|_| is_there && may(Right::Subscribe, name)) {
                 let hash = info.type_hash(type_name).map(str::to_owned);
@@ -68,7 +68,7 @@ impl Connection<'_> {
         (topics, services)
     }
 
-    /// Tells what has changed of the graph, a part at a time; false while there is more.
+    /// Sends a part of the graph's changes. Returns `false` while there are more.
     pub(super) async fn tell_graph(&mut self) -> bool {
         let graph = self.session.graph();
         self.tell_connections(&graph);
@@ -130,7 +130,7 @@ impl Connection<'_> {
                     channels.push(channel(id, topic, schema_name, schema));
                 }
                 Err(error) => {
-                    // It is shown as there; that it cannot be subscribed to is said, and why.
+                    // The topic is shown, and a status says why it cannot be subscribed to.
                     let id = self.channels.tell_unknown(&topic, offer, self.attempt, true);
                     self.unknown(&schema_name, &error);
                     channels.extend(id.map(|id| channel(id, topic, schema_name, String::new())));
@@ -186,7 +186,7 @@ impl Connection<'_> {
     }
 }
 
-/// What messages of a type look like, as text. May read files.
+/// Returns the definition of a message type as text. May read files.
 fn schema(types: &Types, type_name: &str, hash: Option<&str>) -> Result<String, GatewayError> {
     Ok(types.layout(type_name, hash)?.to_ros2msg())
 }
