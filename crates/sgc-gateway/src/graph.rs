@@ -254,7 +254,7 @@ fn add(graph: &mut Graph, endpoint: &DiscoveredEndpoint, is_own: bool, node: Opt
         }
         return;
     }
-    let Some((half, service, type_name)) = ServiceTopic::of(&endpoint.topic, &endpoint.type_name) else {
+    let Some((half, service, type_name)) = ServiceTopic::parse(&endpoint.topic, &endpoint.type_name) else {
         return;
     };
     // A server reads requests and a client writes them, so the replies add no information.
