@@ -11,7 +11,7 @@ use std::sync::Arc;
 use sgc_wire::UnixMillis;
 use tokio::sync::watch;
 
-use crate::access::{Access, Client, Denied};
+use crate::access::{Access, Client, Denial};
 use crate::clock::WallClock;
 
 /// The rules in force. Clones share.
@@ -49,7 +49,7 @@ impl AccessWatch {
     }
 
     /// Waits until a client's rights end and returns the reason.
-    pub async fn until_denied(&self, client: &Client) -> Denied {
+    pub async fn until_denied(&self, client: &Client) -> Denial {
         let mut rules = self.rules.subscribe();
         loop {
             let current = rules.borrow_and_update().clone();

@@ -17,16 +17,16 @@ use tokio::sync::mpsc;
 use tokio::time::Instant;
 
 use crate::access::Right;
-use crate::aside::aside_if_long;
 use crate::content::{Content, Form, serialise, write};
+use crate::definitions::InterfaceType;
 use crate::error::GatewayError;
 use crate::feed::Subscription;
-use crate::hub::{Shared, lock};
+use crate::hub::{HubState, lock};
+use crate::offload::offload_if_long;
 use crate::publisher::{Account, Publication};
-use crate::quota::{Charge, Quota, Resource, Waiting};
+use crate::quota::{Charge, PendingBytes, Quota, Resource};
 use crate::service::{Caller, Replier, Request, Serving};
 use crate::session::{Session, Subscribe};
-use crate::types::InterfaceType;
 
 /// Time within which a server must answer a goal or a cancel request.
 const ANSWER_MAX: Duration = Duration::from_secs(10);
@@ -70,7 +70,7 @@ pub enum GoalStatus {
 
 impl GoalStatus {
     /// Returns the status with this number, or [`Self::Unknown`].
-    pub fn of(number: i64) -> Self {
+    pub fn from_number(number: i64) -> Self {
         match number {
             1 => Self::Accepted,
             2 => Self::Executing,
@@ -114,7 +114,7 @@ pub struct Outcome {
 /// A goal that a client sent and a server accepted.
 #[derive(Clone)]
 pub struct Goal {
-    shared: Arc<Shared>,
+    shared: Arc<HubState>,
     action: Arc<str>,
     id: GoalId,
     result: Arc<Layout>,
@@ -229,9 +229,9 @@ impl Goal {
         let request = record([("goal_id", uuid(&self.id))]);
         let payload = write(&self.get_result.halves.request, &request, Form::Cdr)?;
         let reply = self.get_result.call(payload, max, &self.quota).await?;
-        aside_if_long(reply.len(), || {
+        offload_if_long(reply.len(), || {
             let reply = self.get_result.halves.reply.decode(&reply).map_err(GatewayError::Decode)?;
-            let status = GoalStatus::of(integer(&reply, "status"));
+            let status = GoalStatus::from_number(integer(&reply, "status"));
             let result = reply.at("result").unwrap_or(Value::Record(Vec::new()));
             Ok(Outcome { status, result: write(&self.result, &result, form)? })
         })
@@ -274,7 +274,7 @@ impl Feedback {
                 continue;
             }
             let read = || self.read(payload, form);
-            if let Some(said) = aside_if_long(payload.len(), read) {
+            if let Some(said) = offload_if_long(payload.len(), read) {
                 return Some(said);
             }
         }
@@ -303,7 +303,7 @@ struct Layouts {
 }
 
 impl Layouts {
-    fn find(shared: &Shared, of: &str) -> Result<Self, GatewayError> {
+    fn find(shared: &HubState, of: &str) -> Result<Self, GatewayError> {
         let layout = |part: &str| shared.types.layout(&format!("{of}_{part}"), None);
         Ok(Self { goal: layout("Goal")?, result: layout("Result")?, feedback: layout("Feedback")? })
     }
@@ -344,7 +344,7 @@ struct ActionServer {
     layouts: Layouts,
     goals: Mutex<Goals>,
     /// The bytes of kept results.
-    kept: Arc<Waiting>,
+    kept: Arc<PendingBytes>,
     send_goal: Replier,
     get_result: Replier,
     cancel_goal: Replier,
@@ -353,10 +353,10 @@ struct ActionServer {
     telling: tokio::sync::Mutex<()>,
 }
 
-type Goals = BTreeMap<GoalId, Served>;
+type Goals = BTreeMap<GoalId, GoalState>;
 
 #[derive(Debug)]
-struct Served {
+struct GoalState {
     status: GoalStatus,
     /// The goal request that has not been answered yet.
     asked: Option<RequestId>,
@@ -372,7 +372,7 @@ struct Served {
 struct KeptResult {
     /// The serialised result.
     payload: Bytes,
-    waiting: Arc<Waiting>,
+    waiting: Arc<PendingBytes>,
 }
 
 impl Drop for KeptResult {
@@ -383,7 +383,7 @@ impl Drop for KeptResult {
 
 impl ActionServing {
     async fn new(
-        shared: &Arc<Shared>,
+        shared: &Arc<HubState>,
         action: &str,
         of: &str,
         (quota, charge): (Quota, Charge),
@@ -400,7 +400,7 @@ impl ActionServing {
         let account = || Account { quota: quota.clone(), charge: None, kept: None };
         let feedback =
             Publication::new(shared, part("feedback"), feedback_type, Qos::default(), account()).await?;
-        let kept = Arc::new(Waiting::new(results_bytes_max, quota.clone()));
+        let kept = Arc::new(PendingBytes::new(results_bytes_max, quota.clone()));
         let latched =
             Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() };
         let status_type = "action_msgs/msg/GoalStatusArray".to_owned();
@@ -523,7 +523,7 @@ impl ActionServer {
     fn keep(&self, goals: &mut Goals, id: &GoalId, payload: Bytes) -> Option<KeptResult> {
         let bytes = payload.len() + RESULT_COST_BYTES;
         while !self.kept.has_room(bytes) {
-            let ended = |(other, goal): (&GoalId, &Served)| {
+            let ended = |(other, goal): (&GoalId, &GoalState)| {
                 Some((goal.ended?, *other)).filter(|(_, other)| other != id && goal.result.is_some())
             };
             let (_, oldest) = goals.iter().filter_map(ended).min()?;
@@ -564,7 +564,7 @@ impl ActionServer {
 
     /// Makes room for one more goal. Returns `false` if all goals are active.
     fn has_room(goals: &mut Goals) -> bool {
-        let is_old = |goal: &Served| goal.ended.is_some_and(|ended| ended.elapsed() >= RESULT_KEPT);
+        let is_old = |goal: &GoalState| goal.ended.is_some_and(|ended| ended.elapsed() >= RESULT_KEPT);
         goals.retain(|_, goal| !is_old(goal));
         if goals.len() >= GOALS_MAX
             && let Some((_, oldest)) = goals.iter().filter_map(|(id, goal)| Some((goal.ended?, *id))).min()
@@ -584,7 +584,7 @@ impl ActionServer {
                 let taken_ns = now_ns();
                 let (asked, status) = (Some(request.id), GoalStatus::Unknown);
                 let (result, waiting, ended) = (None, Vec::new(), None);
-                goals.insert(*id, Served { status, asked, taken_ns, result, waiting, ended });
+                goals.insert(*id, GoalState { status, asked, taken_ns, result, waiting, ended });
             }
             is_new
         });

@@ -23,9 +23,9 @@ pub(crate) struct Budget {
 }
 
 /// A reply that waits for room.
-struct Waits<'a>(&'a AtomicUsize, usize);
+struct WaitingReply<'a>(&'a AtomicUsize, usize);
 
-impl Drop for Waits<'_> {
+impl Drop for WaitingReply<'_> {
     fn drop(&mut self) {
         self.0.fetch_sub(self.1, Ordering::Relaxed);
     }
@@ -61,7 +61,7 @@ impl Budget {
         }
         let units = self.units_of(bytes);
         let before = self.waiting_units.fetch_add(units, Ordering::Relaxed);
-        let _waits = Waits(&self.waiting_units, units);
+        let _waits = WaitingReply(&self.waiting_units, units);
         if before + units > self.units {
             let max = self.units * UNIT_BYTES;
             return Err(GatewayError::TooMany { what: "bytes of replies that it does not read", max });

@@ -3,8 +3,8 @@
 use bytes::Bytes;
 use sgc_cdr::{Encoding, Layout, Value};
 
-use crate::aside::aside_if_long;
 use crate::error::GatewayError;
+use crate::offload::offload_if_long;
 
 /// The form of a message.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -45,7 +45,7 @@ impl Content {
 
     /// Decodes the message.
     pub fn value(&self, layout: &Layout) -> Result<Value, GatewayError> {
-        aside_if_long(self.bytes.len(), || match self.form {
+        offload_if_long(self.bytes.len(), || match self.form {
             Form::Cdr => layout.decode(&self.bytes).map_err(GatewayError::Decode),
             Form::Json => layout.from_json(&self.bytes).map_err(GatewayError::Value),
             Form::Cbor => layout.from_cbor(&self.bytes).map_err(GatewayError::Value),
@@ -56,7 +56,7 @@ impl Content {
     pub fn to_cdr(&self, layout: &Layout) -> Result<Bytes, GatewayError> {
         match self.form {
             Form::Cdr => Ok(self.bytes.clone()),
-            _ => aside_if_long(self.bytes.len(), || serialise(layout, &self.value(layout)?)),
+            _ => offload_if_long(self.bytes.len(), || serialise(layout, &self.value(layout)?)),
         }
     }
 }
@@ -80,7 +80,7 @@ pub(crate) fn write(layout: &Layout, value: &Value, form: Form) -> Result<Bytes,
 pub(crate) fn convert(layout: &Layout, payload: &Bytes, form: Form) -> Result<Bytes, GatewayError> {
     match form {
         Form::Cdr => Ok(payload.clone()),
-        _ => aside_if_long(payload.len(), || {
+        _ => offload_if_long(payload.len(), || {
             write(layout, &layout.decode(payload).map_err(GatewayError::Decode)?, form)
         }),
     }

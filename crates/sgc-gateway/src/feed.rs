@@ -15,12 +15,12 @@ use tokio::time::Instant;
 use crate::content::Form;
 use crate::error::GatewayError;
 use crate::graph::Graph;
-use crate::hub::Shared;
+use crate::hub::HubState;
 use crate::message::Message;
 use crate::queue::{Overflow, Queue, cost};
-use crate::quota::{Charge, Held, Payer, Waiting};
+use crate::quota::{ByteReservation, Charge, Payer, PendingBytes};
 use crate::ros::LocalReader;
-use crate::session::Waits;
+use crate::session::WaitPlace;
 
 /// Most messages of one writer that are kept for later subscribers of a transient-local topic.
 pub(crate) const LATCHED_DEPTH_MAX: usize = 100;
@@ -41,7 +41,7 @@ pub(crate) struct FeedKey {
 /// A reader and its subscribers.
 pub(crate) struct Feed {
     pub(crate) key: FeedKey,
-    hub: Weak<Shared>,
+    hub: Weak<HubState>,
     outlets: Mutex<Outlets>,
     /// The reader and its request. The lock may be held for long while the reader changes.
     reader: Mutex<Option<(LocalReader, EndpointSpec)>>,
@@ -53,7 +53,7 @@ struct Outlets {
     charge: Charge,
     /// The session that pays the charge.
     payer: Payer,
-    latched: Latched,
+    latched: LatchedMessages,
 }
 
 /// A subscription that shares a reader.
@@ -84,23 +84,23 @@ impl Outlets {
 
 /// Messages that are kept for later subscribers.
 #[derive(Default)]
-struct Latched {
+struct LatchedMessages {
     is_on: bool,
     /// The messages of each writer, the newest last.
-    writers: BTreeMap<Option<Guid>, VecDeque<Kept>>,
+    writers: BTreeMap<Option<Guid>, VecDeque<KeptMessage>>,
     depth: usize,
     /// `true` if a message was left out because no subscriber had room for it.
     is_short: bool,
 }
 
 /// A message that is kept.
-struct Kept {
+struct KeptMessage {
     message: Message,
     /// The reservation in the budget of the subscriber that pays for the message.
-    room: Held,
+    room: ByteReservation,
 }
 
-impl Latched {
+impl LatchedMessages {
     fn bytes(&self) -> usize {
         self.writers.values().map(bytes_of).sum()
     }
@@ -132,13 +132,13 @@ impl Latched {
         loop {
             let is_within = self.bytes() + bytes <= LATCHED_BYTES_MAX;
             if is_within && let Some(room) = payers().find_map(|payer| payer.take_history(bytes)) {
-                let kept = Kept { message: message.unwritten(), room };
+                let kept = KeptMessage { message: message.unwritten(), room };
                 self.writers.entry(message.writer).or_default().push_back(kept);
                 return dropped;
             }
             self.is_short |= is_within;
             dropped += 1;
-            let with_new = |(writer, kept): &(&Option<Guid>, &mut VecDeque<Kept>)| {
+            let with_new = |(writer, kept): &(&Option<Guid>, &mut VecDeque<KeptMessage>)| {
                 bytes_of(kept) + if **writer == message.writer { bytes } else { 0 }
             };
             let heaviest = self.writers.iter_mut().max_by_key(with_new);
@@ -154,7 +154,7 @@ impl Latched {
     fn pass_charges(&mut self, subscribers: &[Subscriber]) -> u64 {
         let mut dropped = 0;
         for kept in self.writers.values_mut() {
-            let has_room = |kept: &mut Kept| {
+            let has_room = |kept: &mut KeptMessage| {
                 if !subscribers.iter().any(|subscriber| subscriber.payer.has_room(&kept.room)) {
                     let bytes = kept.room.bytes();
                     let room = subscribers.iter().find_map(|subscriber| subscriber.payer.take_history(bytes));
@@ -175,7 +175,7 @@ impl Latched {
     /// Returns `true` for a message that is kept already, because a recreated reader receives again what writers
     /// keep. Compares time and content, because clocks may be set back.
     fn has(&self, sample: &Sample) -> bool {
-        let is_it = |kept: &Kept| {
+        let is_it = |kept: &KeptMessage| {
             kept.message.source_timestamp_ns == sample.source_timestamp_ns
                 && kept.message.payload == sample.payload
         };
@@ -187,7 +187,7 @@ impl Latched {
     }
 }
 
-fn bytes_of(kept: &VecDeque<Kept>) -> usize {
+fn bytes_of(kept: &VecDeque<KeptMessage>) -> usize {
     kept.iter().map(|kept| kept.room.bytes()).sum()
 }
 
@@ -198,9 +198,9 @@ impl std::fmt::Debug for Feed {
 }
 
 /// The handler of samples from a feed's reader.
-struct Intake(Arc<Feed>);
+struct FeedHandler(Arc<Feed>);
 
-impl HandleSamples for Intake {
+impl HandleSamples for FeedHandler {
     fn handle(&mut self, sample: Sample) {
         self.0.hand_out(sample);
     }
@@ -221,8 +221,8 @@ impl HandleSamples for Intake {
 }
 
 impl Feed {
-    pub(crate) fn new(key: FeedKey, hub: &Arc<Shared>, charge: Charge, payer: Payer) -> Arc<Self> {
-        let outlets = Outlets { subscribers: Vec::new(), charge, payer, latched: Latched::default() };
+    pub(crate) fn new(key: FeedKey, hub: &Arc<HubState>, charge: Charge, payer: Payer) -> Arc<Self> {
+        let outlets = Outlets { subscribers: Vec::new(), charge, payer, latched: LatchedMessages::default() };
         let (outlets, reader) = (Mutex::new(outlets), Mutex::new(None));
         Arc::new(Self { key, hub: Arc::downgrade(hub), outlets, reader })
     }
@@ -357,7 +357,7 @@ impl Feed {
         }
         // Writers send what they keep again.
         self.outlets().latched.is_short = false;
-        let made = hub.ros.reader(&wanted, Box::new(Intake(Arc::clone(self))))?;
+        let made = hub.ros.reader(&wanted, Box::new(FeedHandler(Arc::clone(self))))?;
         hub.know(own_endpoint(EndpointKind::Reader, made.guid(), &wanted));
         *reader = Some((made, wanted));
         Ok(())
@@ -403,17 +403,17 @@ pub struct Delivery {
 
 /// The options of a new subscription.
 #[derive(Debug)]
-pub(crate) struct Intaking {
+pub(crate) struct SubscriptionOptions {
     pub(crate) depth: usize,
     /// Most queued bytes of a subscription that holds up writers. It has a bound of its own, because no other queue
     /// makes room for it.
     pub(crate) bytes_max: usize,
     /// The bytes that are queued for the client in all its subscriptions.
-    pub(crate) waiting: Arc<Waiting>,
+    pub(crate) waiting: Arc<PendingBytes>,
     pub(crate) interval_min: Option<Duration>,
     pub(crate) overflow: Overflow,
     /// The place among subscriptions that hold up writers, if it is one.
-    pub(crate) waits: Option<Waits>,
+    pub(crate) waits: Option<WaitPlace>,
     /// The charge of the subscription to the client's credential.
     pub(crate) charge: Charge,
     /// The session that can be charged for the reader.
@@ -427,22 +427,22 @@ pub struct Subscription {
     layout: Arc<Layout>,
     interval_min: Option<Duration>,
     not_before: Option<Instant>,
-    _waits: Option<Waits>,
+    _waits: Option<WaitPlace>,
     _charge: Charge,
 }
 
 impl Subscription {
-    pub(crate) fn new(feed: Arc<Feed>, layout: Arc<Layout>, taking: Intaking) -> Self {
-        let queue = Arc::new(Queue::new(taking.depth, taking.bytes_max, taking.waiting, taking.overflow));
-        feed.join(&queue, taking.payer);
+    pub(crate) fn new(feed: Arc<Feed>, layout: Arc<Layout>, options: SubscriptionOptions) -> Self {
+        let queue = Arc::new(Queue::new(options.depth, options.bytes_max, options.waiting, options.overflow));
+        feed.join(&queue, options.payer);
         Self {
             feed,
             queue,
             layout,
-            interval_min: taking.interval_min,
+            interval_min: options.interval_min,
             not_before: None,
-            _waits: taking.waits,
-            _charge: taking.charge,
+            _waits: options.waits,
+            _charge: options.charge,
         }
     }
 
@@ -549,11 +549,11 @@ mod tests {
     use sgc_wire::UnixMillis;
 
     use super::*;
-    use crate::access::{Access, AccessRules, Admission, Anonymous, Client};
+    use crate::access::{Access, AccessRules, AdmissionRequest, Anonymous, Client};
+    use crate::definitions::{ShippedDefinitions, Types};
     use crate::hub::{Hub, HubOptions};
     use crate::quota::{Quota, Resource};
     use crate::session::SessionLimits;
-    use crate::types::{Shipped, Types};
 
     const MESSAGE_BYTES: usize = 1000;
     const COST: usize = MESSAGE_BYTES + crate::queue::MESSAGE_COST_BYTES;
@@ -571,7 +571,7 @@ mod tests {
     /// One session of a client and its accounts.
     struct Viewer {
         quota: Quota,
-        history: Arc<Waiting>,
+        history: Arc<PendingBytes>,
         payer: Payer,
     }
 
@@ -580,10 +580,10 @@ mod tests {
             let access = Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
             let (peer, now) = (peer.parse().unwrap(), UnixMillis(1_795_000_000_000));
             let admission =
-                Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now };
+                AdmissionRequest { peer, encrypted: true, origin: None, token: None, certificate: None, now };
             let client: Client = access.admit(&admission).unwrap();
             let quota = hub.shared.quotas.quota(&client);
-            let history = Arc::new(Waiting::new(LIMITS.waiting_bytes_max, quota.clone()));
+            let history = Arc::new(PendingBytes::new(LIMITS.waiting_bytes_max, quota.clone()));
             let payer = Payer::new(quota.clone(), LIMITS, Arc::clone(&history));
             Self { quota, history, payer }
         }
@@ -618,12 +618,12 @@ mod tests {
 
     /// Creates a queue whose messages are not charged to a session.
     fn queue() -> Arc<Queue> {
-        Arc::new(Queue::new(1000, 1 << 20, Waiting::of_own(1 << 20), Overflow::DropOldest))
+        Arc::new(Queue::new(1000, 1 << 20, PendingBytes::for_own_client(1 << 20), Overflow::DropOldest))
     }
 
     async fn hub() -> Hub {
         let own = Arc::new(FakeDomain::default().join(false));
-        Hub::start(own, Types::new(Shipped), HubOptions::default()).await.unwrap()
+        Hub::start(own, Types::new(ShippedDefinitions), HubOptions::default()).await.unwrap()
     }
 
     fn say(feed: &Feed, writer: u8, numbers: std::ops::Range<i64>) {

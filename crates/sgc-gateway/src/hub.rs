@@ -11,13 +11,13 @@ use tokio::runtime::Handle;
 use tokio::sync::{Notify, Semaphore, watch};
 use tokio::task::JoinHandle;
 
+use crate::definitions::Types;
 use crate::error::GatewayError;
-use crate::feed::{Feed, FeedKey, Intaking, Subscription};
+use crate::feed::{Feed, FeedKey, Subscription, SubscriptionOptions};
 use crate::graph::{Graph, GraphState};
 use crate::quota::Quotas;
 use crate::ros::LocalRos;
 use crate::service::Caller;
-use crate::types::Types;
 
 /// Time for which graph changes are gathered before readers are adapted.
 const SETTLE: Duration = Duration::from_millis(20);
@@ -44,7 +44,7 @@ impl Default for HubOptions {
 /// The gateway's node. Clones share it; [`Hub::stop`] ends it.
 #[derive(Clone)]
 pub struct Hub {
-    pub(crate) shared: Arc<Shared>,
+    pub(crate) shared: Arc<HubState>,
     keeper: Arc<Keeper>,
 }
 
@@ -77,7 +77,7 @@ struct Feeds {
 }
 
 /// The state that all clients share.
-pub(crate) struct Shared {
+pub(crate) struct HubState {
     pub(crate) ros: Arc<dyn LocalRos>,
     pub(crate) types: Types,
     pub(crate) runtime: Handle,
@@ -112,7 +112,7 @@ impl Hub {
     ) -> Result<Self, GatewayError> {
         let node = RosNode::new("/", &options.node, None);
         let node_name = node.as_ref().map_or_else(|| format!("/{}", options.node), ToString::to_string);
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(HubState {
             ros,
             types,
             runtime: Handle::current(),
@@ -187,7 +187,7 @@ impl Hub {
 }
 
 /// Adapts readers to the graph.
-async fn adapt(shared: Weak<Shared>, mut changed: watch::Receiver<u64>) {
+async fn adapt(shared: Weak<HubState>, mut changed: watch::Receiver<u64>) {
     while changed.changed().await.is_ok() {
         let Some(shared) = shared.upgrade() else { return };
         tokio::time::sleep(SETTLE).await;
@@ -209,7 +209,7 @@ async fn adapt(shared: Weak<Shared>, mut changed: watch::Receiver<u64>) {
 }
 
 /// Drops unused readers.
-async fn sweep(shared: Weak<Shared>) {
+async fn sweep(shared: Weak<HubState>) {
     loop {
         let Some(shared) = shared.upgrade() else { return };
         shared.unused.notified().await;
@@ -230,7 +230,7 @@ async fn sweep(shared: Weak<Shared>) {
     }
 }
 
-impl Shared {
+impl HubState {
     fn state(&self) -> MutexGuard<'_, GraphState> {
         lock(&self.state)
     }
@@ -296,7 +296,7 @@ impl Shared {
     pub(crate) async fn subscribe(
         self: &Arc<Self>,
         key: FeedKey,
-        taking: Intaking,
+        options: SubscriptionOptions,
     ) -> Result<Subscription, GatewayError> {
         self.run(move |shared| {
             let layout = shared.layout_of(&key)?;
@@ -306,7 +306,7 @@ impl Shared {
                     return Err(GatewayError::Stopping);
                 }
                 // A subscriber that holds up writers gets its own reader.
-                let payer = &taking.payer;
+                let payer = &options.payer;
                 let known = || feeds.all.iter().filter(|feed| !key.waits && feed.key == key);
                 let whole = known().find(|feed| feed.has_history_for(payer)).map(Arc::clone);
                 let feed = match (whole, known().next().map(Arc::clone)) {
@@ -328,7 +328,7 @@ impl Shared {
                 };
                 // The subscription exists before a sweep finds the feed unused, and before a new reader delivers the
                 // first messages.
-                (Arc::clone(&feed), Subscription::new(feed, layout, taking))
+                (Arc::clone(&feed), Subscription::new(feed, layout, options))
             };
             feed.adapt()?;
             Ok(subscription)

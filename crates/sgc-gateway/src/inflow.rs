@@ -20,11 +20,11 @@ use crate::quota::{Permits, Quota};
 pub(crate) struct Inflow {
     /// The quota of the client after its admission. Before that the upgrade bounds the bytes.
     quota: OnceLock<Quota>,
-    held: Mutex<Held>,
+    held: Mutex<UnfinishedBytes>,
 }
 
 #[derive(Debug, Default)]
-struct Held {
+struct UnfinishedBytes {
     bytes: usize,
     /// One unit for each [`UNIT_BYTES`] beyond the first.
     room: Vec<Permits>,
@@ -57,7 +57,7 @@ impl Inflow {
     }
 
     /// Releases the bytes of a finished message, except for `kept` bytes.
-    pub(crate) fn done_but(&self, kept: usize) {
+    pub(crate) fn finish_keeping(&self, kept: usize) {
         let mut held = lock(&self.held);
         held.bytes = kept;
         held.room.truncate(kept.saturating_sub(1) / UNIT_BYTES);
@@ -66,18 +66,18 @@ impl Inflow {
 
 /// A stream that charges the bytes that are read from it.
 #[derive(Debug)]
-pub(crate) struct Metered<S> {
+pub(crate) struct MeteredStream<S> {
     stream: S,
     inflow: Arc<Inflow>,
 }
 
-impl<S> Metered<S> {
+impl<S> MeteredStream<S> {
     pub(crate) fn new(stream: S, inflow: Arc<Inflow>) -> Self {
         Self { stream, inflow }
     }
 }
 
-impl<S: AsyncRead + Unpin> AsyncRead for Metered<S> {
+impl<S: AsyncRead + Unpin> AsyncRead for MeteredStream<S> {
     fn poll_read(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -90,7 +90,7 @@ impl<S: AsyncRead + Unpin> AsyncRead for Metered<S> {
     }
 }
 
-impl<S: AsyncWrite + Unpin> AsyncWrite for Metered<S> {
+impl<S: AsyncWrite + Unpin> AsyncWrite for MeteredStream<S> {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         Pin::new(&mut self.stream).poll_write(cx, buf)
     }
@@ -147,9 +147,9 @@ mod tests {
         short.admit(&quota);
         short.add(UNIT_BYTES).unwrap();
         assert!(short.add(1 << 20).is_err());
-        short.done_but(0);
-        begun.iter().for_each(|inflow| inflow.done_but(0));
-        let mut stream = Metered::new(&[7; 200_000][..], Arc::new(short));
+        short.finish_keeping(0);
+        begun.iter().for_each(|inflow| inflow.finish_keeping(0));
+        let mut stream = MeteredStream::new(&[7; 200_000][..], Arc::new(short));
         assert_eq!(stream.read_to_end(&mut Vec::new()).await.unwrap(), 200_000);
         assert_eq!(lock(&stream.inflow.held).room.len(), (200_000 - 1) / UNIT_BYTES);
     }

@@ -11,11 +11,11 @@
 mod access;
 mod access_watch;
 mod action;
-mod aside;
+mod admission;
 mod budget;
 mod clock;
 mod content;
-mod door;
+mod definitions;
 mod error;
 mod feed;
 pub mod foxglove;
@@ -24,6 +24,7 @@ pub mod grpc;
 mod hub;
 mod inflow;
 mod message;
+mod offload;
 mod publisher;
 mod queue;
 mod quota;
@@ -33,22 +34,22 @@ mod server;
 mod service;
 mod session;
 mod tls;
-mod types;
 mod ws;
 
 pub use access::{
     ACCESS_LABEL_BYTES_MAX, ACCESS_TOKEN_PREFIX, ACCESS_TOKEN_TEXT_BYTES_MAX, ACCESS_VALID_MS_MAX, Access,
-    AccessGrant, AccessRules, AccessToken, AccessTokenError, Admission, AdmittedBy, Anonymous, Client,
-    ClientRule, Denied, HearRefusals, ORIGIN_BYTES_MAX, PageOrigin, PageOriginError, Right, SCOPE_BYTES_MAX,
-    SCOPE_PATTERNS_MAX, Scope, ScopeError, TokenId, TokenIdError, check_access_label,
+    AccessGrant, AccessRules, AccessToken, AccessTokenError, AdmissionRequest, AdmittedBy, Anonymous, Client,
+    ClientRule, Denial, ORIGIN_BYTES_MAX, PageOrigin, PageOriginError, RefusalListener, Right,
+    SCOPE_BYTES_MAX, SCOPE_PATTERNS_MAX, Scope, ScopeError, TokenId, TokenIdError, check_access_label,
 };
 pub use access_watch::AccessWatch;
 pub use action::{
     ActionEvent, ActionReplier, ActionServing, CancelAnswer, Feedback, Goal, GoalId, GoalStatus, Outcome,
 };
+pub use admission::{ClientStatus, GatewayStatus};
 pub use clock::WallClock;
 pub use content::{Content, Form};
-pub use door::{ClientStatus, GatewayStatus};
+pub use definitions::{FindDefinitions, InterfaceType, ShippedDefinitions, Types};
 pub use error::{ErrorKind, GatewayError};
 pub use feed::{Delivery, Subscription};
 pub use graph::{ActionInfo, EndpointInfo, Graph, NodeInfo, ServiceInfo, TopicInfo, is_hidden};
@@ -61,4 +62,3 @@ pub use server::{ListenAt, Protocol, Server, ServerError, ServerOptions};
 pub use service::{Replier, Request, Serving};
 pub use session::{Advertise, Session, SessionLimits, Subscribe};
 pub use tls::{TlsError, certified_key};
-pub use types::{FindDefinitions, InterfaceType, Shipped, Types};

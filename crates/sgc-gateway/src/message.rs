@@ -6,11 +6,11 @@ use bytes::Bytes;
 use sgc_cdr::Layout;
 use sgc_ros::Guid;
 
-use crate::aside::aside_if_long;
 use crate::content::{Form, convert};
 use crate::error::GatewayError;
+use crate::offload::offload_if_long;
 
-type Written = OnceLock<Result<Bytes, GatewayError>>;
+type CachedEncoding = OnceLock<Result<Bytes, GatewayError>>;
 
 /// A message received on a topic.
 #[derive(Debug)]
@@ -23,21 +23,21 @@ pub struct Message {
     pub received_ns: i64,
     /// The writer on the local network, if known.
     pub writer: Option<Guid>,
-    json: Written,
-    cbor: Written,
+    json: CachedEncoding,
+    cbor: CachedEncoding,
 }
 
 impl Message {
     pub(crate) fn new(payload: Bytes, writer: Option<Guid>, source_timestamp_ns: i64) -> Self {
         let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         let received_ns = since.map_or(0, |since| since.as_nanos().try_into().unwrap_or(i64::MAX));
-        let (json, cbor) = (Written::new(), Written::new());
+        let (json, cbor) = (CachedEncoding::new(), CachedEncoding::new());
         Self { payload, source_timestamp_ns, received_ns, writer, json, cbor }
     }
 
     /// Returns the message without its cached conversions.
     pub(crate) fn unwritten(&self) -> Self {
-        let (json, cbor) = (Written::new(), Written::new());
+        let (json, cbor) = (CachedEncoding::new(), CachedEncoding::new());
         let payload = self.payload.clone();
         let (source_timestamp_ns, received_ns, writer) =
             (self.source_timestamp_ns, self.received_ns, self.writer);
@@ -56,6 +56,6 @@ impl Message {
         }
         // A second client that needs the same form waits here, and must not hold up others either.
         let make = || written.get_or_init(|| convert(layout, &self.payload, form));
-        aside_if_long(self.payload.len(), make).clone()
+        offload_if_long(self.payload.len(), make).clone()
     }
 }

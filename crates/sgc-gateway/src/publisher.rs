@@ -15,8 +15,8 @@ use tokio::time::Instant;
 use crate::content::{Content, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
-use crate::hub::{Shared, lock};
-use crate::quota::{Charge, Quota, Waiting};
+use crate::hub::{HubState, lock};
+use crate::quota::{Charge, PendingBytes, Quota};
 
 /// Time within which readers must acknowledge the last messages before the writer ends.
 const FAREWELL_MAX: Duration = Duration::from_secs(1);
@@ -43,13 +43,13 @@ pub(crate) struct Account {
     /// The charge of the publication to the client's credential, if it is not part of a served action.
     pub(crate) charge: Option<Charge>,
     /// The bytes of messages that the client's transient-local writers keep, if they are counted.
-    pub(crate) kept: Option<Arc<Waiting>>,
+    pub(crate) kept: Option<Arc<PendingBytes>>,
 }
 
 /// The lengths of the messages that a transient-local writer keeps for later readers.
 #[derive(Debug)]
-struct Kept {
-    waiting: Arc<Waiting>,
+struct WriterHistory {
+    waiting: Arc<PendingBytes>,
     depth: usize,
     lengths: Mutex<Lengths>,
 }
@@ -61,8 +61,8 @@ struct Lengths {
     sum: usize,
 }
 
-impl Kept {
-    fn new(waiting: Arc<Waiting>, depth: usize) -> Self {
+impl WriterHistory {
+    fn new(waiting: Arc<PendingBytes>, depth: usize) -> Self {
         Self { waiting, depth: depth.max(1), lengths: Mutex::default() }
     }
 
@@ -84,7 +84,7 @@ impl Kept {
     }
 }
 
-impl Drop for Kept {
+impl Drop for WriterHistory {
     fn drop(&mut self) {
         self.waiting.sub(lock(&self.lengths).sum);
     }
@@ -92,8 +92,8 @@ impl Drop for Kept {
 
 /// A client's publisher on a topic. Dropping it ends the writer after reliable readers have the last messages.
 pub struct Publication {
-    shared: Arc<Shared>,
-    line: Arc<Line>,
+    shared: Arc<HubState>,
+    line: Arc<WriteQueue>,
     layout: Arc<Layout>,
     topic: String,
     type_name: String,
@@ -107,24 +107,24 @@ pub struct Publication {
 }
 
 /// A writer and the messages that a thread will write to it.
-struct Line {
+struct WriteQueue {
     writer: Arc<dyn RosWriter>,
-    ahead: Mutex<Ahead>,
+    ahead: Mutex<PendingWrites>,
     /// Held while the queue is written, which keeps the order.
     turn: Mutex<()>,
     published: AtomicU64,
     /// The lengths of the messages that the writer keeps, until it ends.
-    kept: Option<Kept>,
+    kept: Option<WriterHistory>,
 }
 
 #[derive(Default)]
-struct Ahead {
+struct PendingWrites {
     /// Source timestamps in nanoseconds since the Unix epoch, and payloads.
     messages: VecDeque<(i64, Bytes)>,
     bytes: usize,
 }
 
-impl Line {
+impl WriteQueue {
     /// Writes one message, which is sent with the messages that follow or at the next flush.
     fn write(&self, stamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
         self.writer.write_ahead(SampleHead::new(SampleKind::Write, stamp_ns), payload)?;
@@ -154,7 +154,7 @@ impl Line {
 
 impl Publication {
     pub(crate) async fn new(
-        shared: &Arc<Shared>,
+        shared: &Arc<HubState>,
         topic: String,
         type_name: String,
         qos: Qos,
@@ -177,11 +177,11 @@ impl Publication {
                     qos,
                 };
                 let kept = account.kept.filter(|_| spec.qos.is_transient_local());
-                let kept = kept.map(|kept| Kept::new(kept, kept_max(&spec)));
+                let kept = kept.map(|kept| WriterHistory::new(kept, kept_max(&spec)));
                 let writer: Arc<dyn RosWriter> = Arc::from(shared.ros.writer(&spec)?);
                 shared.know(own_endpoint(EndpointKind::Writer, writer.guid(), &spec));
                 let (ahead, turn, published) = (Mutex::default(), Mutex::default(), AtomicU64::new(0));
-                let line = Arc::new(Line { writer, ahead, turn, published, kept });
+                let line = Arc::new(WriteQueue { writer, ahead, turn, published, kept });
                 let bytes_at_once_max = bytes_at_once_max(&spec);
                 let may_block = AtomicBool::new(bytes_at_once_max == 0);
                 let shared = Arc::clone(shared);

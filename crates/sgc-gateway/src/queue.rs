@@ -7,7 +7,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use tokio::sync::Notify;
 
 use crate::message::Message;
-use crate::quota::Waiting;
+use crate::quota::PendingBytes;
 
 /// Cost of a message in bytes beside its payload, because queues of very short messages are not free.
 pub(crate) const MESSAGE_COST_BYTES: usize = 256;
@@ -41,14 +41,19 @@ pub(crate) struct Queue {
     depth: AtomicUsize,
     bytes_max: usize,
     /// The bytes in all queues of the client, including this one.
-    waiting: Arc<Waiting>,
+    waiting: Arc<PendingBytes>,
     overflow: Overflow,
 }
 
 impl Queue {
     /// Creates a queue that shares `waiting` with the client's other queues. `bytes_max` bounds a queue that holds up
     /// its reader, because no other queue makes room for it.
-    pub(crate) fn new(depth: usize, bytes_max: usize, waiting: Arc<Waiting>, overflow: Overflow) -> Self {
+    pub(crate) fn new(
+        depth: usize,
+        bytes_max: usize,
+        waiting: Arc<PendingBytes>,
+        overflow: Overflow,
+    ) -> Self {
         let (state, filled, room) = (Mutex::default(), Notify::new(), Condvar::new());
         let depth = AtomicUsize::new(depth.max(1));
         Self { state, filled, room, depth, bytes_max, waiting, overflow }
@@ -193,7 +198,7 @@ mod tests {
 
     #[test]
     fn queues_of_a_client_share_what_may_wait() {
-        let waiting = Waiting::of_own(ROOM);
+        let waiting = PendingBytes::for_own_client(ROOM);
         let queue = || Queue::new(9, ROOM, Arc::clone(&waiting), Overflow::DropOldest);
         let (one, other) = (queue(), queue());
         one.push(&message(80));
@@ -209,7 +214,7 @@ mod tests {
 
     #[tokio::test]
     async fn the_oldest_gives_way_and_is_counted() {
-        let queue = Queue::new(2, ROOM, Waiting::of_own(ROOM), Overflow::DropOldest);
+        let queue = Queue::new(2, ROOM, PendingBytes::for_own_client(ROOM), Overflow::DropOldest);
         for bytes in [10, 20, 30] {
             queue.push(&message(bytes));
         }
@@ -226,8 +231,8 @@ mod tests {
     }
 
     #[test]
-    fn who_waits_for_room_goes_on_when_there_is_some_or_the_end() {
-        let queue = Arc::new(Queue::new(1, ROOM, Waiting::of_own(ROOM), Overflow::Wait));
+    fn waiting_push_continues_with_room_or_at_the_end() {
+        let queue = Arc::new(Queue::new(1, ROOM, PendingBytes::for_own_client(ROOM), Overflow::Wait));
         queue.push(&message(1));
         assert!(queue.would_wait(1));
         let pusher = {
@@ -244,8 +249,8 @@ mod tests {
     }
 
     #[test]
-    fn who_waits_for_room_is_let_pass() {
-        let queue = Arc::new(Queue::new(1, ROOM, Waiting::of_own(ROOM), Overflow::Wait));
+    fn waiting_push_can_be_let_pass() {
+        let queue = Arc::new(Queue::new(1, ROOM, PendingBytes::for_own_client(ROOM), Overflow::Wait));
         queue.push(&message(1));
         let pusher = {
             let queue = queue.clone();

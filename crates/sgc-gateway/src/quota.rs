@@ -4,7 +4,7 @@
 //! clients of other hosts together may hold [`REMOTE_SHARE`] times, and all clients of this gateway [`TOTAL_SHARE`]
 //! times. The difference between the last two is reserved for programs on this host.
 //!
-//! The module `door` decides whether a connection gets a place at all.
+//! The module `admission` decides whether a connection gets a place at all.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -493,15 +493,15 @@ impl Drop for Permits {
 
 /// A reservation for queued bytes, returned on drop.
 #[derive(Debug)]
-pub(crate) struct Held {
-    waiting: Arc<Waiting>,
+pub(crate) struct ByteReservation {
+    waiting: Arc<PendingBytes>,
     bytes: usize,
 }
 
-impl Held {
+impl ByteReservation {
     /// Reserves bytes, unless the client or one of its pools has less room.
     pub(crate) fn new(
-        waiting: &Arc<Waiting>,
+        waiting: &Arc<PendingBytes>,
         what: &'static str,
         bytes: usize,
     ) -> Result<Self, GatewayError> {
@@ -510,9 +510,9 @@ impl Held {
     }
 }
 
-impl Held {
+impl ByteReservation {
     /// Reserves bytes if there is room. A refusal is not counted.
-    pub(crate) fn if_room(waiting: &Arc<Waiting>, bytes: usize) -> Option<Self> {
+    pub(crate) fn if_room(waiting: &Arc<PendingBytes>, bytes: usize) -> Option<Self> {
         waiting.try_take(bytes).ok()?;
         Some(Self { waiting: Arc::clone(waiting), bytes })
     }
@@ -522,7 +522,7 @@ impl Held {
     }
 }
 
-impl Drop for Held {
+impl Drop for ByteReservation {
     fn drop(&mut self) {
         self.waiting.sub(self.bytes);
     }
@@ -534,11 +534,11 @@ pub(crate) struct Payer {
     quota: Quota,
     limits: SessionLimits,
     /// Bytes of messages that are kept for later subscribers.
-    history: Arc<Waiting>,
+    history: Arc<PendingBytes>,
 }
 
 impl Payer {
-    pub(crate) fn new(quota: Quota, limits: SessionLimits, history: Arc<Waiting>) -> Self {
+    pub(crate) fn new(quota: Quota, limits: SessionLimits, history: Arc<PendingBytes>) -> Self {
         Self { quota, limits, history }
     }
 
@@ -558,8 +558,8 @@ impl Payer {
     }
 
     /// Reserves room for a kept message. A refusal is not counted.
-    pub(crate) fn take_history(&self, bytes: usize) -> Option<Held> {
-        Held::if_room(&self.history, bytes)
+    pub(crate) fn take_history(&self, bytes: usize) -> Option<ByteReservation> {
+        ByteReservation::if_room(&self.history, bytes)
     }
 
     /// Returns `true` if both are the same session.
@@ -568,20 +568,20 @@ impl Payer {
     }
 
     /// Returns `true` if the reservation is this session's.
-    pub(crate) fn has_room(&self, held: &Held) -> bool {
+    pub(crate) fn has_room(&self, held: &ByteReservation) -> bool {
         Arc::ptr_eq(&held.waiting, &self.history)
     }
 }
 
 /// The bytes of messages that are queued for one client, within its own bound and those of its pools.
 #[derive(Debug)]
-pub(crate) struct Waiting {
+pub(crate) struct PendingBytes {
     bytes: AtomicUsize,
     bytes_max: usize,
     quota: Quota,
 }
 
-impl Waiting {
+impl PendingBytes {
     pub(crate) fn new(bytes_max: usize, quota: Quota) -> Self {
         Self { bytes: AtomicUsize::new(0), bytes_max, quota }
     }
@@ -652,9 +652,9 @@ impl Waiting {
 }
 
 #[cfg(test)]
-impl Waiting {
+impl PendingBytes {
     /// Creates a count for a client of this program.
-    pub(crate) fn of_own(bytes_max: usize) -> Arc<Self> {
+    pub(crate) fn for_own_client(bytes_max: usize) -> Arc<Self> {
         let quotas: Arc<Quotas> = Arc::default();
         Arc::new(Self::new(bytes_max, quotas.quota(&Client::own("test"))))
     }
@@ -667,7 +667,7 @@ mod tests {
     use sgc_wire::UnixMillis;
 
     use super::*;
-    use crate::access::{Access, AccessRules, Admission, Anonymous};
+    use crate::access::{Access, AccessRules, AdmissionRequest, Anonymous};
 
     const LIMITS: SessionLimits = SessionLimits {
         waiting_bytes_max: 100,
@@ -683,7 +683,7 @@ mod tests {
         let peer: SocketAddr = peer.parse().unwrap();
         let now = UnixMillis(1_795_000_000_000);
         let admission =
-            Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now };
+            AdmissionRequest { peer, encrypted: true, origin: None, token: None, certificate: None, now };
         access.admit(&admission).unwrap()
     }
 
@@ -699,7 +699,7 @@ mod tests {
     }
 
     #[test]
-    fn one_address_has_its_share_over_all_its_sessions() {
+    fn sessions_of_an_address_share_its_bound() {
         let quotas: Arc<Quotas> = Arc::default();
         // All addresses of an IPv6 network are one host.
         let (held, why) = take_all(&quotas.quota(&client("[2001:db8::1]:1")));
@@ -732,7 +732,7 @@ mod tests {
     #[test]
     fn bytes_that_wait_are_bounded_in_all_pools() {
         let quotas: Arc<Quotas> = Arc::default();
-        let waiting = |peer: &str| Waiting::new(100, quotas.quota(&client(peer)));
+        let waiting = |peer: &str| PendingBytes::new(100, quotas.quota(&client(peer)));
         let sessions: Vec<_> = (0..4).map(|_| waiting("10.0.0.1:1")).collect();
         sessions.iter().for_each(|session| session.add(100));
         let fifth = waiting("10.0.0.1:1");
@@ -746,7 +746,7 @@ mod tests {
     #[test]
     fn bytes_that_are_refused_leave_nothing_behind() {
         let quotas: Arc<Quotas> = Arc::default();
-        let waiting = |peer: &str| Waiting::new(100, quotas.quota(&client(peer)));
+        let waiting = |peer: &str| PendingBytes::new(100, quotas.quota(&client(peer)));
         let first = Arc::new(waiting("10.0.0.1:1"));
         let refused = first.take("bytes", 101).unwrap_err();
         assert_eq!(refused, GatewayError::TooMany { what: "bytes", max: 100 });
@@ -757,8 +757,8 @@ mod tests {
         assert_eq!(first.take("bytes", 1).unwrap_err(), crowded(Pool::Remote, 1200));
         assert_eq!(first.bytes(), 0);
         sessions.iter().for_each(|session| session.sub(100));
-        let held = Held::new(&first, "bytes", 100).unwrap();
-        assert!(Held::new(&first, "bytes", 1).is_err());
+        let held = ByteReservation::new(&first, "bytes", 100).unwrap();
+        assert!(ByteReservation::new(&first, "bytes", 1).is_err());
         drop(held);
         assert_eq!(first.bytes(), 0);
     }
@@ -768,9 +768,9 @@ mod tests {
         let quotas: Arc<Quotas> = Arc::default();
         let [before, after] = ["10.0.0.1:1", "10.0.0.2:1"].map(client);
         let moving = quotas.quota(&before);
-        let waiting = Arc::new(Waiting::new(100, moving.clone()));
+        let waiting = Arc::new(PendingBytes::new(100, moving.clone()));
         let charge = moving.take(Resource::Subscriptions, &LIMITS).unwrap();
-        let held = Held::new(&waiting, "bytes", 30).unwrap();
+        let held = ByteReservation::new(&waiting, "bytes", 30).unwrap();
         let permits = (moving.thread().await.unwrap(), moving.room(2).await.unwrap());
         moving.move_to(&after, &LIMITS).unwrap();
         let counts = |client: &Client| {

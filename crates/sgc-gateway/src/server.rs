@@ -21,16 +21,16 @@ use tokio::time::{Instant, Sleep};
 use tokio_rustls::TlsAcceptor;
 use tokio_stream::wrappers::ReceiverStream;
 
-use crate::access::{Access, Denied};
-use crate::door::{Arrival, Door, Engagement, GatewayStatus, Handshake, Handshakes, Place};
+use crate::access::{Access, Denial};
+use crate::admission::{Admission, Arrival, Engagement, GatewayStatus, Handshake, Handshakes, Place};
 use crate::foxglove::{self, FoxgloveError};
-use crate::grpc::{Accepted, Connection, Grpc, GrpcOptions};
+use crate::grpc::{AcceptedStream, Connection, Grpc, GrpcOptions};
 use crate::hub::Hub;
-use crate::inflow::{Inflow, Metered};
+use crate::inflow::{Inflow, MeteredStream};
 use crate::rosbridge::{self, Authenticate, RosbridgeError, RosbridgeOptions};
 use crate::session::{Session, SessionLimits};
 use crate::tls::{TlsError, server_config};
-use crate::ws::{UpgradeError, Upgraded, upgrade};
+use crate::ws::{Upgrade, UpgradeError, upgrade};
 
 /// Time for TLS and the WebSocket upgrade together, or for TLS and the first admitted call of gRPC.
 const HANDSHAKE_MAX: Duration = Duration::from_secs(10);
@@ -119,26 +119,26 @@ struct Tls {
     chain: Vec<CertificateDer<'static>>,
 }
 
-struct Shared {
+struct ServerState {
     hub: Hub,
-    door: Arc<Door>,
+    admission: Arc<Admission>,
     tls: watch::Sender<Option<Tls>>,
     limits: SessionLimits,
     foxglove: foxglove::Options,
     handshakes: Arc<Handshakes>,
-    grpc: mpsc::Sender<Accepted<Placed>>,
+    grpc: mpsc::Sender<AcceptedStream<GrpcStream>>,
 }
 
 /// Any stream of bytes.
-trait Bytes: AsyncRead + AsyncWrite + Send + Unpin {}
+trait ByteStream: AsyncRead + AsyncWrite + Send + Unpin {}
 
-impl<S: AsyncRead + AsyncWrite + Send + Unpin> Bytes for S {}
+impl<S: AsyncRead + AsyncWrite + Send + Unpin> ByteStream for S {}
 
 /// The byte stream of a gRPC connection. Its client must be admitted in time, and occupies a place while a client is
 /// admitted on it.
-struct Placed {
-    stream: Box<dyn Bytes>,
-    door: Arc<Door>,
+struct GrpcStream {
+    stream: Box<dyn ByteStream>,
+    admission: Arc<Admission>,
     connection: Connection,
     standing: Standing,
 }
@@ -155,16 +155,16 @@ enum Standing {
     Refused,
 }
 
-impl Placed {
+impl GrpcStream {
     fn new(
-        stream: Box<dyn Bytes>,
-        door: Arc<Door>,
+        stream: Box<dyn ByteStream>,
+        admission: Arc<Admission>,
         connection: Connection,
         deadline: Instant,
         handshake: Handshake,
     ) -> Self {
         let deadline = Box::pin(tokio::time::sleep_until(deadline));
-        Self { stream, door, connection, standing: Standing::Unproven { deadline, handshake } }
+        Self { stream, admission, connection, standing: Standing::Unproven { deadline, handshake } }
     }
 
     /// Fails once the client may not stay. Called before reads and writes, because a client that does not read its
@@ -175,21 +175,21 @@ impl Placed {
             (Standing::Refused, _) => return Err(io::ErrorKind::ConnectionAborted.into()),
             (Standing::Proven(_), Some(_)) => return Ok(()),
             (Standing::Proven(_), None) => {
-                self.door.count("no longer admitted");
+                self.admission.count("no longer admitted");
                 let deadline = Box::pin(tokio::time::sleep(GRPC_FAREWELL_MAX));
                 self.standing = Standing::Denied { deadline };
                 return self.check(cx);
             }
-            (_, Some(client)) => match self.door.enter(&client, "grpc", self.connection.peer()) {
+            (_, Some(client)) => match self.admission.enter(&client, "grpc", self.connection.peer()) {
                 Some(place) => (Standing::Proven(place), Ok(())),
                 None => (Standing::Refused, Err(io::Error::other("too many clients"))),
             },
             (Standing::Unproven { deadline, handshake }, None) => {
                 if handshake.poll_evicted(cx).is_ready() {
-                    self.door.count("handshake gave way");
+                    self.admission.count("handshake gave way");
                     (Standing::Refused, Err(io::ErrorKind::ConnectionAborted.into()))
                 } else if deadline.as_mut().poll(cx).is_ready() {
-                    self.door.count("handshake too slow");
+                    self.admission.count("handshake too slow");
                     (Standing::Refused, Err(io::ErrorKind::TimedOut.into()))
                 } else {
                     return Ok(());
@@ -205,7 +205,7 @@ impl Placed {
     }
 }
 
-impl AsyncRead for Placed {
+impl AsyncRead for GrpcStream {
     fn poll_read(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -216,7 +216,7 @@ impl AsyncRead for Placed {
     }
 }
 
-impl AsyncWrite for Placed {
+impl AsyncWrite for GrpcStream {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         self.check(cx)?;
         Pin::new(&mut self.stream).poll_write(cx, buf)
@@ -249,12 +249,12 @@ impl AsyncWrite for Placed {
 
 /// The gateway's sockets and connections. All of them end when it is dropped.
 pub struct Server {
-    shared: Arc<Shared>,
+    shared: Arc<ServerState>,
     local: Vec<ListenAt>,
     _tasks: JoinSet<()>,
 }
 
-fn tls_of(key: Option<&Arc<CertifiedKey>>, access: &Access) -> Result<Option<Tls>, TlsError> {
+fn tls_config(key: Option<&Arc<CertifiedKey>>, access: &Access) -> Result<Option<Tls>, TlsError> {
     let asks = access.takes_certificates();
     key.map(|key| {
         let ws = server_config(key, asks, &[b"http/1.1"])?;
@@ -266,23 +266,23 @@ fn tls_of(key: Option<&Arc<CertifiedKey>>, access: &Access) -> Result<Option<Tls
 impl Server {
     /// Binds all addresses and serves clients.
     pub async fn start(hub: Hub, options: ServerOptions) -> Result<Self, ServerError> {
-        let tls = tls_of(options.key.as_ref(), &options.access)?;
+        let tls = tls_config(options.key.as_ref(), &options.access)?;
         if tls.is_none() && options.listen.iter().any(|at| at.is_encrypted) {
             return Err(ServerError::NoKey);
         }
-        let door = Door::new(options.access, options.clients_max);
+        let admission = Admission::new(options.access, options.clients_max);
         let (grpc, accepted) = mpsc::channel(GRPC_WAITING_MAX);
         let mut tasks = JoinSet::new();
         let grpc_options = GrpcOptions { session: options.limits, ..GrpcOptions::default() };
-        let front = Grpc::new(hub.clone(), door.rules().clone(), grpc_options);
+        let front = Grpc::new(hub.clone(), admission.rules().clone(), grpc_options);
         tasks.spawn(async move {
             if let Err(error) = front.serve(ReceiverStream::new(accepted)).await {
                 tracing::error!(%error, "gRPC is not served any more");
             }
         });
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(ServerState {
             hub,
-            door,
+            admission,
             tls: watch::Sender::new(tls),
             limits: options.limits,
             foxglove: foxglove::Options { name: options.name, ..foxglove::Options::default() },
@@ -310,18 +310,18 @@ impl Server {
 
     /// Applies other rules and another certificate. Clients that the rules no longer admit are disconnected.
     pub fn reconfigure(&self, access: Access, key: Option<&Arc<CertifiedKey>>) -> Result<(), ServerError> {
-        let tls = tls_of(key, &access)?;
+        let tls = tls_config(key, &access)?;
         if tls.is_none() && self.local.iter().any(|at| at.is_encrypted) {
             return Err(ServerError::NoKey);
         }
         self.shared.tls.send_replace(tls);
-        self.shared.door.rules().change(|before| access.after(before));
+        self.shared.admission.rules().change(|before| access.after(before));
         Ok(())
     }
 
     /// Shows another certificate to new connections. Existing connections stay.
     pub fn show(&self, key: &Arc<CertifiedKey>) -> Result<(), ServerError> {
-        let tls = tls_of(Some(key), &self.shared.door.access())?;
+        let tls = tls_config(Some(key), &self.shared.admission.access())?;
         self.shared.tls.send_replace(tls);
         Ok(())
     }
@@ -333,19 +333,19 @@ impl Server {
 
     /// Verifies tokens with this certificate of the gateway from now on.
     pub fn set_gateway(&self, gateway: VerifiedPeer) {
-        self.shared.door.rules().change(|access| access.clone().with_gateway(gateway));
+        self.shared.admission.rules().change(|access| access.clone().with_gateway(gateway));
     }
 
     /// Verifies certificates against other CAs or revocation lists from now on.
     pub fn set_anchors(&self, anchors: TrustAnchors) {
-        self.shared.door.rules().change(|access| access.clone().with_anchors(anchors));
+        self.shared.admission.rules().change(|access| access.clone().with_anchors(anchors));
     }
 
     /// Returns the status of the gateway.
     pub fn status(&self) -> GatewayStatus {
         GatewayStatus {
             listen: self.local.iter().map(ToString::to_string).collect(),
-            clients: self.shared.door.clients(),
+            clients: self.shared.admission.clients(),
             refused: self.refused(),
             readers: self.shared.hub.readers(),
         }
@@ -353,7 +353,7 @@ impl Server {
 
     /// Returns the number of refusals by reason.
     fn refused(&self) -> BTreeMap<String, u64> {
-        let mut refused = self.shared.door.refused();
+        let mut refused = self.shared.admission.refused();
         let crowded = self.shared.hub.shared.quotas.refused();
         refused.extend(crowded.into_iter().map(|(pool, count)| (format!("too much for {pool}"), count)));
         let not_kept = self.shared.hub.shared.quotas.history_dropped();
@@ -373,7 +373,7 @@ impl fmt::Debug for Server {
     }
 }
 
-async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<Shared>) {
+async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<ServerState>) {
     // The set ends all connections when the listener ends.
     let mut connections = JoinSet::new();
     loop {
@@ -393,22 +393,22 @@ async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<Shared>
     }
 }
 
-async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<Shared>) {
-    let door = &shared.door;
+async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<ServerState>) {
+    let admission = &shared.admission;
     let Some(mut handshake) = Handshakes::begin(&shared.handshakes, peer.ip()) else {
-        return door.count("too many handshakes");
+        return admission.count("too many handshakes");
     };
     let deadline = Instant::now() + HANDSHAKE_MAX;
     let engagement = handshake.engagement();
     let arriving = arrive(stream, peer, at, &shared, &engagement);
     let arrived = tokio::select! {
         arrived = tokio::time::timeout_at(deadline, arriving) => arrived,
-        () = handshake.evicted() => return door.count("handshake gave way"),
+        () = handshake.evicted() => return admission.count("handshake gave way"),
     };
     let (stream, arrival) = match arrived {
         Ok(Some(arrived)) => arrived,
         Ok(None) => return,
-        Err(_) => return door.count("handshake too slow"),
+        Err(_) => return admission.count("handshake too slow"),
     };
     match at.protocol {
         Protocol::Grpc => {
@@ -416,15 +416,16 @@ async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<Sh
             let Arrival { peer, is_encrypted, certificate } = arrival;
             let connection =
                 if is_encrypted { Connection::encrypted(peer, certificate) } else { Connection::plain(peer) };
-            let placed = Placed::new(stream, Arc::clone(door), connection.clone(), deadline, handshake);
-            let _ = shared.grpc.send(Accepted::new(placed, connection)).await;
+            let placed =
+                GrpcStream::new(stream, Arc::clone(admission), connection.clone(), deadline, handshake);
+            let _ = shared.grpc.send(AcceptedStream::new(placed, connection)).await;
         }
         Protocol::WebSocket => {
             let inflow: Arc<Inflow> = Arc::default();
-            let stream = Metered::new(stream, Arc::clone(&inflow));
+            let stream = MeteredStream::new(stream, Arc::clone(&inflow));
             let upgraded = tokio::select! {
-                upgraded = tokio::time::timeout_at(deadline, upgrade(stream, &arrival, door, &foxglove::SUBPROTOCOLS)) => upgraded,
-                () = handshake.evicted() => return door.count("handshake gave way"),
+                upgraded = tokio::time::timeout_at(deadline, upgrade(stream, &arrival, admission, &foxglove::SUBPROTOCOLS)) => upgraded,
+                () = handshake.evicted() => return admission.count("handshake gave way"),
             };
             drop(handshake);
             match upgraded {
@@ -432,9 +433,9 @@ async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<Sh
                 Ok(Err(UpgradeError::NotAdmitted)) => {}
                 Ok(Err(UpgradeError::Socket(error))) => {
                     tracing::debug!(%peer, %error, "no WebSocket");
-                    door.count("no WebSocket");
+                    admission.count("no WebSocket");
                 }
-                Err(_) => door.count("handshake too slow"),
+                Err(_) => admission.count("handshake too slow"),
             }
         }
     }
@@ -445,9 +446,9 @@ async fn arrive(
     stream: TcpStream,
     peer: SocketAddr,
     at: ListenAt,
-    shared: &Shared,
+    shared: &ServerState,
     engagement: &Engagement,
-) -> Option<(Box<dyn Bytes>, Arrival)> {
+) -> Option<(Box<dyn ByteStream>, Arrival)> {
     // In every protocol of the gateway the client speaks first.
     stream.readable().await.ok()?;
     engagement.begin();
@@ -462,17 +463,17 @@ async fn arrive(
     let stream = match TlsAcceptor::from(config).accept(stream).await {
         Ok(stream) => stream,
         Err(error) => {
-            shared.door.count("TLS failed");
+            shared.admission.count("TLS failed");
             tracing::debug!(%peer, %error, "a client's TLS failed");
             return None;
         }
     };
     let chain = stream.get_ref().1.peer_certificates().unwrap_or_default();
-    let access = shared.door.access();
-    let certificate = match Door::judge_certificate(access.rules().anchors.as_ref(), chain) {
+    let access = shared.admission.access();
+    let certificate = match Admission::judge_certificate(access.rules().anchors.as_ref(), chain) {
         Ok(certificate) => certificate,
         Err(error) => {
-            shared.door.count("certificate does not hold");
+            shared.admission.count("certificate does not hold");
             tracing::debug!(%peer, %error, "a client's certificate does not hold");
             None
         }
@@ -482,53 +483,53 @@ async fn arrive(
 
 /// Serves a client until it leaves or its rights end.
 async fn speak(
-    upgraded: Upgraded<Metered<Box<dyn Bytes>>>,
+    upgraded: Upgrade<MeteredStream<Box<dyn ByteStream>>>,
     arrival: Arrival,
     inflow: Arc<Inflow>,
-    shared: &Shared,
+    shared: &ServerState,
 ) {
-    let (door, peer, client) = (&shared.door, arrival.peer, upgraded.client);
+    let (admission, peer, client) = (&shared.admission, arrival.peer, upgraded.client);
     let protocol = if upgraded.subprotocol.is_some() { "foxglove" } else { "rosbridge" };
-    let Some(place) = door.enter(&client, protocol, peer) else { return };
+    let Some(place) = admission.enter(&client, protocol, peer) else { return };
     let place = Arc::new(place);
     let name = Arc::clone(&client.name);
-    let session = Session::new(&shared.hub, client, shared.limits).admitted_by(door.rules().clone());
+    let session = Session::new(&shared.hub, client, shared.limits).admitted_by(admission.rules().clone());
     let session = session.metered_by(inflow);
     let ended = if upgraded.subprotocol.is_some() {
         let served = foxglove::serve(upgraded.socket, Arc::new(session), shared.foxglove.clone());
-        served.await.map_err(Ended::from)
+        served.await.map_err(EndReason::from)
     } else {
-        let (asked, place) = (Arc::clone(door), Arc::clone(&place));
+        let (asked, place) = (Arc::clone(admission), Arc::clone(&place));
         // A token after the upgrade changes the credential of the client.
         let authenticate: Authenticate = Arc::new(move |token| {
             let admitted = asked.admit(&arrival, None, Some(token));
-            let client = admitted.map_err(|denied| denied.told().to_owned())?;
+            let client = admitted.map_err(|denied| denied.client_message().to_owned())?;
             place.rename(&client).map_err(|why| why.to_string())?;
             Ok(client)
         });
         let options = RosbridgeOptions { authenticate: Some(authenticate), ..RosbridgeOptions::default() };
         let served = rosbridge::serve(upgraded.socket, Arc::new(session), options);
-        served.await.map_err(Ended::from)
+        served.await.map_err(EndReason::from)
     };
     match ended {
         Ok(()) => {}
-        Err(Ended::Denied(denied)) => {
-            door.count("no longer admitted");
+        Err(EndReason::Denied(denied)) => {
+            admission.count("no longer admitted");
             tracing::info!(client = %name, %denied, "a client is disconnected");
         }
-        Err(Ended::Failed(error)) => tracing::debug!(%peer, %error, "a client's connection failed"),
+        Err(EndReason::Failed(error)) => tracing::debug!(%peer, %error, "a client's connection failed"),
     }
 }
 
 /// The reason why a connection ended without the client's wish.
-enum Ended {
+enum EndReason {
     /// The client's rights ended.
-    Denied(Denied),
+    Denied(Denial),
     /// The connection failed.
     Failed(String),
 }
 
-impl From<RosbridgeError> for Ended {
+impl From<RosbridgeError> for EndReason {
     fn from(error: RosbridgeError) -> Self {
         match error {
             RosbridgeError::Denied(denied) => Self::Denied(denied),
@@ -537,7 +538,7 @@ impl From<RosbridgeError> for Ended {
     }
 }
 
-impl From<FoxgloveError> for Ended {
+impl From<FoxgloveError> for EndReason {
     fn from(error: FoxgloveError) -> Self {
         match error {
             FoxgloveError::Denied(denied) => Self::Denied(denied),
@@ -554,19 +555,22 @@ mod tests {
     use crate::access::Access;
 
     /// Returns a gRPC stream from another host and its far end.
-    fn placed(door: &Arc<Door>, handshakes: &Arc<Handshakes>) -> (Placed, tokio::io::DuplexStream) {
+    fn placed(
+        admission: &Arc<Admission>,
+        handshakes: &Arc<Handshakes>,
+    ) -> (GrpcStream, tokio::io::DuplexStream) {
         let peer: SocketAddr = "192.0.2.1:1000".parse().unwrap();
         let (near, far) = duplex(16);
         let handshake = Handshakes::begin(handshakes, peer.ip()).unwrap();
-        let (door, deadline) = (Arc::clone(door), Instant::now() + HANDSHAKE_MAX);
-        (Placed::new(Box::new(near), door, Connection::plain(peer), deadline, handshake), far)
+        let (admission, deadline) = (Arc::clone(admission), Instant::now() + HANDSHAKE_MAX);
+        (GrpcStream::new(Box::new(near), admission, Connection::plain(peer), deadline, handshake), far)
     }
 
     #[tokio::test(start_paused = true)]
-    async fn who_does_not_show_who_it_is_goes_and_has_had_no_place() {
-        let (door, handshakes) = (Door::new(Access::default(), 1), Arc::default());
-        let (mut silent, _far) = placed(&door, &handshakes);
-        let (mut deaf, _other) = placed(&door, &handshakes);
+    async fn unproven_client_is_disconnected_without_a_place() {
+        let (admission, handshakes) = (Admission::new(Access::default(), 1), Arc::default());
+        let (mut silent, _far) = placed(&admission, &handshakes);
+        let (mut deaf, _other) = placed(&admission, &handshakes);
         let began = Instant::now();
         let mut buf = [0; 16];
         let read = silent.read(&mut buf);
@@ -579,7 +583,7 @@ mod tests {
         assert_eq!(written.unwrap_err().kind(), io::ErrorKind::TimedOut);
         assert!(began.elapsed() >= HANDSHAKE_MAX && began.elapsed() < 2 * HANDSHAKE_MAX);
         assert!(silent.read(&mut buf).await.is_err() && silent.shutdown().await.is_err());
-        assert_eq!(door.refused(), [("handshake too slow".to_owned(), 2)].into());
-        assert!(door.clients().is_empty());
+        assert_eq!(admission.refused(), [("handshake too slow".to_owned(), 2)].into());
+        assert!(admission.clients().is_empty());
     }
 }

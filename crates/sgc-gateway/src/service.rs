@@ -16,7 +16,7 @@ use tokio::sync::{mpsc, oneshot};
 use crate::content::{Content, Form, convert, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
-use crate::hub::{Shared, lock};
+use crate::hub::{HubState, lock};
 use crate::quota::{Charge, Quota};
 
 /// Most replies that arrive before their request number is known.
@@ -33,7 +33,7 @@ pub(crate) struct Halves {
 
 impl Halves {
     /// Finds the layouts of a service type. May read files.
-    pub(crate) fn find(shared: &Shared, type_name: &str) -> Result<Self, GatewayError> {
+    pub(crate) fn find(shared: &HubState, type_name: &str) -> Result<Self, GatewayError> {
         let layout = |half: &str| shared.types.layout(&format!("{type_name}_{half}"), None);
         Ok(Self { request: layout("Request")?, reply: layout("Response")? })
     }
@@ -55,7 +55,7 @@ fn spec(service: &str, type_name: &str, halves: &Halves) -> ServiceSpec {
 }
 
 #[derive(Default)]
-struct Pending {
+struct PendingCalls {
     asked: BTreeMap<i64, oneshot::Sender<Bytes>>,
     /// Requests that are being sent, whose numbers are not known yet.
     sending: usize,
@@ -70,17 +70,17 @@ pub(crate) struct Caller {
     pub(crate) halves: Halves,
     /// The client; `None` only while it is dropped, which may block.
     client: Option<Box<dyn RosClient>>,
-    pending: Arc<Mutex<Pending>>,
-    shared: Weak<Shared>,
+    pending: Arc<Mutex<PendingCalls>>,
+    shared: Weak<HubState>,
 }
 
 /// A call in progress. Its reply is discarded after this is dropped.
-struct Asked {
+struct CallGuard {
     caller: Arc<Caller>,
     number: i64,
 }
 
-impl Drop for Asked {
+impl Drop for CallGuard {
     fn drop(&mut self) {
         lock(&self.caller.pending).asked.remove(&self.number);
     }
@@ -88,9 +88,9 @@ impl Drop for Asked {
 
 impl Caller {
     /// Creates the client of a service. May block.
-    pub(crate) fn new(shared: &Arc<Shared>, service: &str, type_name: &str) -> Result<Self, GatewayError> {
+    pub(crate) fn new(shared: &Arc<HubState>, service: &str, type_name: &str) -> Result<Self, GatewayError> {
         let halves = Halves::find(shared, type_name)?;
-        let pending: Arc<Mutex<Pending>> = Arc::default();
+        let pending: Arc<Mutex<PendingCalls>> = Arc::default();
         let answered = Arc::clone(&pending);
         let spec = spec(service, type_name, &halves);
         let client = shared.ros.client(
@@ -123,7 +123,7 @@ impl Caller {
     }
 
     /// Sends a request and returns a guard and a receiver for the reply. May block.
-    fn ask(self: &Arc<Self>, payload: Bytes) -> Result<(Asked, oneshot::Receiver<Bytes>), RosError> {
+    fn ask(self: &Arc<Self>, payload: Bytes) -> Result<(CallGuard, oneshot::Receiver<Bytes>), RosError> {
         let client = self.client.as_ref().ok_or(RosError::NoPeer { waited_ms: 0 })?;
         lock(&self.pending).sending += 1;
         let sent = client.request(payload);
@@ -143,7 +143,7 @@ impl Caller {
             None => drop(pending.asked.insert(number, send)),
         }
         drop(pending);
-        Ok((Asked { caller: Arc::clone(self), number }, reply))
+        Ok((CallGuard { caller: Arc::clone(self), number }, reply))
     }
 
     /// Calls the service and waits for the reply.
@@ -196,7 +196,7 @@ pub struct Request {
 
 /// A service that a client serves, until dropped.
 pub struct Serving {
-    shared: Arc<Shared>,
+    shared: Arc<HubState>,
     server: Arc<dyn RosServer>,
     halves: Halves,
     requests: mpsc::Receiver<Request>,
@@ -207,7 +207,7 @@ pub struct Serving {
 /// A handle that answers requests of a [`Serving`] from any task.
 #[derive(Clone)]
 pub struct Replier {
-    shared: Arc<Shared>,
+    shared: Arc<HubState>,
     server: Arc<dyn RosServer>,
     halves: Halves,
 }
@@ -244,7 +244,7 @@ impl fmt::Debug for Replier {
 
 impl Serving {
     pub(crate) async fn new(
-        shared: &Arc<Shared>,
+        shared: &Arc<HubState>,
         service: String,
         type_name: String,
         charge: Option<Charge>,

@@ -10,19 +10,19 @@ use sgc_cdr::{Library, TypeName};
 use sgc_ros::{TOPIC_BYTES_MAX, is_topic_name};
 use sgc_wire::{History, Qos};
 
-use crate::access::{Client, Denied, Right, Scope};
+use crate::access::{Client, Denial, Right, Scope};
 use crate::access_watch::AccessWatch;
 use crate::content::{Content, Form, convert};
+use crate::definitions::InterfaceType;
 use crate::error::GatewayError;
-use crate::feed::{FeedKey, Intaking, LATCHED_DEPTH_MAX, Subscription};
+use crate::feed::{FeedKey, LATCHED_DEPTH_MAX, Subscription, SubscriptionOptions};
 use crate::graph::Graph;
 use crate::hub::Hub;
 use crate::inflow::Inflow;
 use crate::publisher::{Account, Publication};
 use crate::queue::Overflow;
-use crate::quota::{Charge, Held, Payer, Quota, Resource, Waiting};
+use crate::quota::{ByteReservation, Charge, Payer, PendingBytes, Quota, Resource};
 use crate::service::Serving;
-use crate::types::InterfaceType;
 
 /// Divisor: a subscription that holds up writers gets one part in this many of the client's bytes.
 const WAITING_PARTS: usize = 16;
@@ -100,13 +100,13 @@ pub struct Session {
     access: Option<AccessWatch>,
     limits: SessionLimits,
     calls: Arc<AtomicUsize>,
-    waiting: Arc<Waiting>,
+    waiting: Arc<PendingBytes>,
     /// The bytes of messages that the client's transient-local writers keep.
-    kept: Arc<Waiting>,
+    kept: Arc<PendingBytes>,
     /// The bytes of arguments of calls and goals, until these are done or sent.
-    arguments: Arc<Waiting>,
+    arguments: Arc<PendingBytes>,
     /// The bytes of messages that are kept for later subscribers and charged to the client.
-    history: Arc<Waiting>,
+    history: Arc<PendingBytes>,
     waits: Arc<AtomicUsize>,
     /// The quota of the client's credential.
     quota: Quota,
@@ -116,21 +116,21 @@ pub struct Session {
 
 /// A place among subscriptions that hold up writers, returned on drop.
 #[derive(Debug)]
-pub(crate) struct Waits {
+pub(crate) struct WaitPlace {
     waits: Arc<AtomicUsize>,
     _charge: Charge,
 }
 
-impl Drop for Waits {
+impl Drop for WaitPlace {
     fn drop(&mut self) {
         self.waits.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
 /// A call in progress, counted until dropped.
-struct Counted<'s>(&'s AtomicUsize);
+struct ActiveCall<'s>(&'s AtomicUsize);
 
-impl Drop for Counted<'_> {
+impl Drop for ActiveCall<'_> {
     fn drop(&mut self) {
         self.0.fetch_sub(1, Ordering::Relaxed);
     }
@@ -140,7 +140,7 @@ impl Session {
     /// Creates the session of a client.
     pub fn new(hub: &Hub, client: Client, limits: SessionLimits) -> Self {
         let quota = hub.shared.quotas.quota(&client);
-        let waiting = || Arc::new(Waiting::new(limits.waiting_bytes_max, quota.clone()));
+        let waiting = || Arc::new(PendingBytes::new(limits.waiting_bytes_max, quota.clone()));
         Self {
             hub: hub.clone(),
             client,
@@ -173,18 +173,18 @@ impl Session {
     }
 
     /// Releases the room of a message that was handled.
-    pub(crate) fn message_is_done(&self) {
-        self.message_is_done_but(0);
+    pub(crate) fn finish_message(&self) {
+        self.finish_message_keeping(0);
     }
 
     /// Releases the room of a message that was handled, except for `kept` bytes.
-    pub(crate) fn message_is_done_but(&self, kept: usize) {
-        self.inflow.done_but(kept);
+    pub(crate) fn finish_message_keeping(&self, kept: usize) {
+        self.inflow.finish_keeping(kept);
     }
 
     /// Waits until the client's rights end and returns the reason. The caller then ends everything that the client
     /// has.
-    pub async fn until_denied(&self) -> Denied {
+    pub async fn until_denied(&self) -> Denial {
         match &self.access {
             Some(access) => access.until_denied(&self.client).await,
             None => std::future::pending().await,
@@ -240,8 +240,8 @@ impl Session {
     }
 
     /// Reserves room for the arguments of a call or goal.
-    pub(crate) fn hold_arguments(&self, bytes: usize) -> Result<Held, GatewayError> {
-        Held::new(&self.arguments, "bytes of arguments that wait", bytes)
+    pub(crate) fn hold_arguments(&self, bytes: usize) -> Result<ByteReservation, GatewayError> {
+        ByteReservation::new(&self.arguments, "bytes of arguments that wait", bytes)
     }
 
     /// Returns the quota of the client's credential.
@@ -377,7 +377,7 @@ impl Session {
         let charge = self.quota.take(Resource::Subscriptions, &self.limits)?;
         let waits = if wanted.waits { Some(self.take_wait()?) } else { None };
         let key = FeedKey { topic: wanted.topic, type_name, qos: wanted.qos, waits: wanted.waits };
-        let taking = Intaking {
+        let options = SubscriptionOptions {
             depth: wanted.depth.min(DEPTH_MAX),
             bytes_max: self.limits.waiting_bytes_max / WAITING_PARTS,
             waiting: Arc::clone(&self.waiting),
@@ -387,14 +387,14 @@ impl Session {
             charge,
             payer: Payer::new(self.quota.clone(), self.limits, Arc::clone(&self.history)),
         };
-        self.hub.shared.subscribe(key, taking).await
+        self.hub.shared.subscribe(key, options).await
     }
 
     /// Takes a place for one more subscription that holds up writers.
-    fn take_wait(&self) -> Result<Waits, GatewayError> {
+    fn take_wait(&self) -> Result<WaitPlace, GatewayError> {
         let charge = self.quota.take(Resource::Waits, &self.limits)?;
         let before = self.waits.fetch_add(1, Ordering::Relaxed);
-        let place = Waits { waits: Arc::clone(&self.waits), _charge: charge };
+        let place = WaitPlace { waits: Arc::clone(&self.waits), _charge: charge };
         self.check_count("subscriptions that are waited for", before, self.limits.waits_max)?;
         Ok(place)
     }
@@ -429,7 +429,7 @@ impl Session {
         let type_name = self.service_type(service, type_name)?;
         self.check_count("calls under way", self.calls.load(Ordering::Relaxed), self.limits.calls_max)?;
         self.calls.fetch_add(1, Ordering::Relaxed);
-        let _counted = Counted(&self.calls);
+        let _counted = ActiveCall(&self.calls);
         let _charge = self.quota.take(Resource::Calls, &self.limits)?;
         let name = service.to_owned();
         let caller = self.hub.shared.run(move |shared| shared.caller(&name, &type_name)).await?;

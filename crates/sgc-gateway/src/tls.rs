@@ -62,25 +62,25 @@ pub(crate) fn server_config(
         .with_protocol_versions(&[&rustls::version::TLS13])
         .map_err(TlsError::Unusable)?;
     let builder = if asks {
-        builder.with_client_cert_verifier(Arc::new(Prover { algorithms }))
+        builder.with_client_cert_verifier(Arc::new(KeyProofVerifier { algorithms }))
     } else {
         builder.with_no_client_auth()
     };
-    let mut config = builder.with_cert_resolver(Arc::new(Always(Arc::clone(key))));
+    let mut config = builder.with_cert_resolver(Arc::new(FixedCertResolver(Arc::clone(key))));
     config.alpn_protocols = protocols.iter().map(|protocol| protocol.to_vec()).collect();
     Ok(Arc::new(config))
 }
 
 /// A resolver that returns the same certificate for every name.
-struct Always(Arc<CertifiedKey>);
+struct FixedCertResolver(Arc<CertifiedKey>);
 
-impl fmt::Debug for Always {
+impl fmt::Debug for FixedCertResolver {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("Always")
     }
 }
 
-impl ResolvesServerCert for Always {
+impl ResolvesServerCert for FixedCertResolver {
     fn resolve(&self, _hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
         Some(Arc::clone(&self.0))
     }
@@ -88,11 +88,11 @@ impl ResolvesServerCert for Always {
 
 /// A verifier that makes a client prove possession of the key of its certificate, if it shows one.
 #[derive(Debug)]
-struct Prover {
+struct KeyProofVerifier {
     algorithms: WebPkiSupportedAlgorithms,
 }
 
-impl ClientCertVerifier for Prover {
+impl ClientCertVerifier for KeyProofVerifier {
     fn client_auth_mandatory(&self) -> bool {
         false
     }

@@ -10,7 +10,7 @@ use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::{WebSocketStream, tungstenite};
 
 use crate::access::Client;
-use crate::door::{Arrival, Door};
+use crate::admission::{Admission, Arrival};
 
 /// Longest message of a client, in bytes. An image of 13 MB in base64 fits three times.
 pub(crate) const MESSAGE_BYTES_MAX: usize = 64 << 20;
@@ -19,7 +19,7 @@ const TOKEN_PARAMETERS: [&str; 2] = ["token", "access_token"];
 
 /// An upgraded connection.
 #[derive(Debug)]
-pub(crate) struct Upgraded<S> {
+pub(crate) struct Upgrade<S> {
     pub(crate) socket: WebSocketStream<S>,
     pub(crate) client: Client,
     /// The negotiated subprotocol.
@@ -41,9 +41,9 @@ pub(crate) enum UpgradeError {
 pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
     stream: S,
     arrival: &Arrival,
-    door: &Arc<Door>,
+    admission: &Arc<Admission>,
     known: &[&'static str],
-) -> Result<Upgraded<S>, UpgradeError> {
+) -> Result<Upgrade<S>, UpgradeError> {
     let (mut found, mut is_refused) = (None, false);
     // The library determines the size of the error.
     #[allow(clippy::result_large_err)]
@@ -56,9 +56,9 @@ pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
         let token = bearer.or_else(|| request.uri().query().and_then(token_in));
         // An origin that is not text matches no listed origin.
         let origin = request.headers().get(ORIGIN).map(|value| value.to_str().unwrap_or("?"));
-        let client = door.admit(arrival, origin, token.as_deref()).map_err(|denied| {
+        let client = admission.admit(arrival, origin, token.as_deref()).map_err(|denied| {
             is_refused = true;
-            refusal(StatusCode::UNAUTHORIZED, denied.told())
+            refusal(StatusCode::UNAUTHORIZED, denied.client_message())
         })?;
         let offered: Vec<&str> = request
             .headers()
@@ -86,7 +86,7 @@ pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
     let Some((client, subprotocol)) = found else {
         return Err(UpgradeError::Socket(Box::new(tungstenite::Error::ConnectionClosed)));
     };
-    Ok(Upgraded { socket, client, subprotocol })
+    Ok(Upgrade { socket, client, subprotocol })
 }
 
 /// Cuts a reason to the 123 bytes that a close frame has room for (RFC 6455, 5.5).
@@ -132,14 +132,14 @@ mod tests {
     use crate::access::Access;
 
     #[tokio::test]
-    async fn who_is_not_admitted_is_told_so_and_counted_once() {
-        let door = Door::new(Access::default(), 1);
+    async fn refused_client_is_told_and_counted_once() {
+        let admission = Admission::new(Access::default(), 1);
         let peer = "192.0.2.1:1000".parse().unwrap();
         let arrival = Arrival { peer, is_encrypted: false, certificate: None };
         let ask = async |text: &str| {
             let (near, mut far) = duplex(4096);
             far.write_all(text.as_bytes()).await.unwrap();
-            let refused = upgrade(near, &arrival, &door, &[]).await.unwrap_err();
+            let refused = upgrade(near, &arrival, &admission, &[]).await.unwrap_err();
             let mut told = String::new();
             far.read_to_string(&mut told).await.unwrap();
             (refused, told)
@@ -149,7 +149,7 @@ mod tests {
         let (refused, told) = ask(upgrade).await;
         assert!(matches!(refused, UpgradeError::NotAdmitted), "{refused}");
         assert!(told.starts_with("HTTP/1.1 401") && told.contains("not admitted: "), "{told}");
-        assert_eq!(door.refused(), [("not admitted".to_owned(), 1)].into());
+        assert_eq!(admission.refused(), [("not admitted".to_owned(), 1)].into());
         let (refused, _) = ask("SSH-2.0-x\r\n\r\n").await;
         assert!(matches!(refused, UpgradeError::Socket(_)), "{refused}");
     }

@@ -16,7 +16,7 @@ use rand_chacha::rand_core::SeedableRng as _;
 use serde_json::json;
 use sgc_gateway::{
     Access, AccessGrant, AccessRules, Advertise, Client, Content, Hub, HubOptions, ListenAt, Protocol, Scope,
-    Server, ServerOptions, Session, SessionLimits, Shipped, TokenId, Types,
+    Server, ServerOptions, Session, SessionLimits, ShippedDefinitions, TokenId, Types,
 };
 use sgc_trust::{EnrollRequest, Fleet, Identity};
 use sgc_wire::{Qos, Reliability, UnixMillis};
@@ -44,7 +44,9 @@ struct Robot {
 impl Robot {
     async fn new(site: &Site) -> Self {
         let own = Arc::new(site.domain.join(false));
-        let hub = Hub::start(own, Types::new(Shipped), HubOptions { node: "robot".into() }).await.unwrap();
+        let hub = Hub::start(own, Types::new(ShippedDefinitions), HubOptions { node: "robot".into() })
+            .await
+            .unwrap();
         let session = Session::new(&hub, Client::own("robot"), SessionLimits::default());
         let advertise = |topic: &str, type_name: &str| {
             let qos = Qos { reliability: Reliability::BestEffort, ..Qos::default() };

@@ -13,7 +13,8 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use sgc_gateway::foxglove::{FoxgloveError, Options};
 use sgc_gateway::{
-    Advertise, Client, Content, Form, Hub, HubOptions, Scope, Session, SessionLimits, Shipped, Types,
+    Advertise, Client, Content, Form, Hub, HubOptions, Scope, Session, SessionLimits, ShippedDefinitions,
+    Types,
 };
 use sgc_ros::{EndpointKind, RosNetwork, RosWriter, SampleKind};
 use sgc_wire::{Durability, History, Qos};
@@ -30,7 +31,7 @@ struct Program {
 
 impl Program {
     async fn new(site: &Site, node: &str) -> Self {
-        let types = Types::new(Shipped);
+        let types = Types::new(ShippedDefinitions);
         let options = HubOptions { node: node.to_owned() };
         let hub = Hub::start(Arc::new(site.domain.join(false)), types, options).await.unwrap();
         let client = Client::own(node);
@@ -281,7 +282,7 @@ async fn parameters_are_those_of_nodes() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_is_connected_with_what_is_told_to_who_asks() {
+async fn connection_graph_is_sent_on_request() {
     let site = Site::new().await;
     let program = Program::new(&site, "arm").await;
     program.serve("/switch", "std_srvs/srv/SetBool", |_| json!({})).await;
@@ -309,7 +310,7 @@ async fn who_is_connected_with_what_is_told_to_who_asks() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_the_scope_does_not_have_is_not_there() {
+async fn interfaces_outside_the_scope_are_invisible() {
     let site = Site::new().await;
     let _talkers = [site.writer("/odom", Qos::default()), site.writer("/secret", Qos::default())];
     let _camera = Program::new(&site, "camera").await.with_parameters("/camera").await;
@@ -336,7 +337,7 @@ async fn what_the_scope_does_not_have_is_not_there() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_wrong_is_said_and_the_rest_goes_on() {
+async fn errors_are_reported_and_the_connection_continues() {
     let site = Site::new().await;
     let talker = site.writer("/chatter", Qos::default());
     let (mut viewer, _) = Viewer::new(site.session("desk")).await;
@@ -399,7 +400,7 @@ async fn types_that_nobody_knows_are_shown_and_what_to_do_is_said() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_stops_reading_loses_the_oldest_and_others_nothing() {
+async fn client_that_stops_reading_loses_only_its_oldest_messages() {
     const MESSAGES: usize = 600;
     const BYTES: usize = 60_000;
     let site = Site::new().await;
@@ -433,7 +434,7 @@ async fn who_stops_reading_loses_the_oldest_and_others_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_asks_and_does_not_read_is_not_read_from() {
+async fn client_that_does_not_read_is_not_read_from() {
     const ASKED: u32 = 2000;
     const STUCK: Duration = Duration::from_secs(1);
     let site = Site::new().await;
@@ -456,7 +457,7 @@ async fn who_asks_and_does_not_read_is_not_read_from() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_command_has_few_answers_however_much_it_asks_for() {
+async fn answers_to_a_command_are_bounded() {
     let site = Site::new().await;
     let (mut viewer, _) = Viewer::new(site.session("desk")).await;
     let subscriptions: Vec<_> = (0..1000).map(|id| json!({"id": id, "channelId": 9})).collect();
@@ -469,7 +470,7 @@ async fn one_command_has_few_answers_however_much_it_asks_for() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_leaves_leaves_nothing_behind() {
+async fn leaving_client_leaves_nothing_behind() {
     let site = Site::new().await;
     let _talker = site.writer("/chatter", Qos::default());
     let _camera = Program::new(&site, "camera").await.with_parameters("/camera").await;
@@ -493,7 +494,7 @@ async fn who_leaves_leaves_nothing_behind() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_falls_silent_is_left() {
+async fn silent_client_is_disconnected() {
     let site = Site::new().await;
     let options = Options {
         ping_interval: Duration::from_millis(100),

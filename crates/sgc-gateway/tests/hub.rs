@@ -17,7 +17,7 @@ fn hear(topic: &str) -> Subscribe {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_programs_publish_is_heard_in_each_form_and_read_once_for_all() {
+async fn messages_of_programs_arrive_in_each_form_and_are_read_once() {
     let site = Site::new().await;
     let talker = site.writer("/chatter", Qos::default());
     let (one, other) = (site.session("one"), site.session("other"));
@@ -37,7 +37,7 @@ async fn what_programs_publish_is_heard_in_each_form_and_read_once_for_all() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_subscribes_takes_each_publisher_as_it_is_whenever_it_comes() {
+async fn subscription_adapts_to_each_publisher() {
     let site = Site::new().await;
     let session = site.session("desk");
     let wanted = Subscribe { type_name: Some(STRING.into()), ..hear("/late") };
@@ -91,7 +91,7 @@ async fn clients_publish_for_programs_and_for_each_other() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_published_ahead_keeps_its_order_and_each_loss_is_told() {
+async fn queued_publications_keep_their_order_and_report_each_loss() {
     let site = Site::new().await;
     let (texts, _reader) = site.reader("/log");
     let session = site.session("logger");
@@ -169,7 +169,7 @@ async fn a_slow_client_loses_the_oldest_and_is_told_how_many() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_is_waited_for_shares_a_reader_with_nobody_which_keeps_all() {
+async fn waiting_subscriber_has_its_own_reader_that_keeps_all() {
     let site = Site::new().await;
     let _talker = site.writer("/odom", Qos { history: History::KeepLast(5), ..Qos::default() });
     site.knows("/odom").await;
@@ -201,7 +201,7 @@ async fn latched_messages_survive_a_clock_that_is_set_back() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_the_scope_does_not_have_is_refused_and_not_seen() {
+async fn interfaces_outside_the_scope_are_refused_and_invisible() {
     let site = Site::new().await;
     let _talkers = [site.writer("/odom", Qos::default()), site.writer("/secret", Qos::default())];
     site.knows("/secret").await;

@@ -15,7 +15,7 @@ const FILES: [(&str, &str); 3] = [
 const DESCRIPTOR: &str = "descriptor.bin";
 
 #[test]
-fn what_is_generated_is_what_the_proto_says() {
+fn generated_code_matches_the_proto() {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut compiler = protox::Compiler::new([here.join("proto")]).unwrap();
     compiler.include_source_info(true).include_imports(true).open_file(PROTO).unwrap();

@@ -14,7 +14,7 @@ use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value as Json, json};
 use sgc_gateway::rosbridge::{self, RosbridgeOptions};
 use sgc_gateway::{
-    Access, AccessRules, Admission, Advertise, Anonymous, Content, Form, GatewayError, Pool, Server,
+    Access, AccessRules, AdmissionRequest, Advertise, Anonymous, Content, Form, GatewayError, Pool, Server,
     ServerOptions, Session, SessionLimits, Subscribe,
 };
 use sgc_ros::{RosWriter as _, SampleKind};
@@ -43,7 +43,7 @@ fn session(site: &Site, peer: &str) -> Session {
     let access = Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
     let peer: SocketAddr = peer.parse().unwrap();
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_millis() as u64;
-    let admission = Admission {
+    let admission = AdmissionRequest {
         peer,
         encrypted: true,
         origin: None,
@@ -312,7 +312,7 @@ async fn page_that_changes(site: &Site, peer: &str) -> WebSocketStream<tokio::io
         let access = Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
         let (peer, now) = (peer.parse().unwrap(), UnixMillis(1_795_000_000_000));
         let admission =
-            Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now };
+            AdmissionRequest { peer, encrypted: true, origin: None, token: None, certificate: None, now };
         access.admit(&admission).unwrap()
     };
     let session = Session::new(&hub, admit(peer), LIMITS);
@@ -332,7 +332,7 @@ async fn auth(page: &mut WebSocketStream<tokio::io::DuplexStream>, token: &str) 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_session_has_counts_for_the_credential_that_it_shows_last() {
+async fn session_counts_for_its_latest_credential() {
     let site = Site::new().await;
     let subscribe = |n: usize| format!(r#"{{"op": "subscribe", "topic": "/p{n}", "type": "{STRING}"}}"#);
     let share = SHARES[0] * LIMITS.subscriptions_max;

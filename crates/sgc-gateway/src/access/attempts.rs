@@ -92,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_remembered_has_a_bound() {
+    fn remembered_addresses_are_bounded() {
         let mut attempts = Attempts::default();
         for n in 0..2 * ADDRESSES_MAX as u32 {
             attempts.fail(IpAddr::V4(n.into()), UnixMillis(NOW.0 + u64::from(n)));

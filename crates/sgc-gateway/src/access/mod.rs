@@ -1,6 +1,6 @@
 //! Access control of a gateway: decides which clients may connect and which rights they get.
 //!
-//! A front end describes a connection in an [`Admission`]. It gets a [`Client`] with a [`Scope`], or a [`Denied`]
+//! A front end describes a connection in an [`AdmissionRequest`]. It gets a [`Client`] with a [`Scope`], or a [`Denial`]
 //! with the reason. This module reads no file, clock or socket: the node builds an [`Access`] from its configuration
 //! at each reload. Certificates are verified before they come here; tokens are verified here.
 
@@ -72,14 +72,14 @@ pub struct AccessRules {
 }
 
 /// A callback for refused tokens, with address and reason. It is called at most ten times a minute for one address.
-pub type HearRefusals = Arc<dyn Fn(SocketAddr, &Denied) + Send + Sync>;
+pub type RefusalListener = Arc<dyn Fn(SocketAddr, &Denial) + Send + Sync>;
 
 /// The access rules and their state. Clones share the state.
 #[derive(Clone, Default)]
 pub struct Access {
     rules: Arc<AccessRules>,
     attempts: Arc<Mutex<Attempts>>,
-    hears: Option<HearRefusals>,
+    listener: Option<RefusalListener>,
     denied: Arc<AtomicU64>,
 }
 
@@ -91,7 +91,7 @@ impl fmt::Debug for Access {
 
 /// The properties of a connection that decide its admission.
 #[derive(Clone, Copy, Debug)]
-pub struct Admission<'a> {
+pub struct AdmissionRequest<'a> {
     /// The address of the client.
     pub peer: SocketAddr,
     /// `true` if the connection is encrypted.
@@ -225,7 +225,7 @@ impl fmt::Debug for Evidence {
 impl Access {
     /// Creates an `Access` with these rules.
     pub fn new(rules: AccessRules) -> Self {
-        Self { rules: Arc::new(rules), attempts: Arc::default(), hears: None, denied: Arc::default() }
+        Self { rules: Arc::new(rules), attempts: Arc::default(), listener: None, denied: Arc::default() }
     }
 
     /// Takes over the failed attempts, the listener and the refusal count of `before`, the `Access` under the former
@@ -233,15 +233,15 @@ impl Access {
     #[must_use]
     pub fn after(mut self, before: &Self) -> Self {
         self.attempts = Arc::clone(&before.attempts);
-        self.hears.clone_from(&before.hears);
+        self.listener.clone_from(&before.listener);
         self.denied = Arc::clone(&before.denied);
         self
     }
 
     /// Sets a listener for refused tokens. The listener must not block.
     #[must_use]
-    pub fn heard_by(mut self, hears: HearRefusals) -> Self {
-        self.hears = Some(hears);
+    pub fn with_refusal_listener(mut self, listener: RefusalListener) -> Self {
+        self.listener = Some(listener);
         self
     }
 
@@ -276,19 +276,19 @@ impl Access {
 
     /// Admits a client and returns its rights. If the client shows a token, the token alone decides: a certificate
     /// beside it adds no rights.
-    pub fn admit(&self, admission: &Admission<'_>) -> Result<Client, Denied> {
+    pub fn admit(&self, admission: &AdmissionRequest<'_>) -> Result<Client, Denial> {
         self.judge(admission).inspect_err(|_| {
             self.denied.fetch_add(1, Ordering::Relaxed);
         })
     }
 
-    fn judge(&self, admission: &Admission<'_>) -> Result<Client, Denied> {
+    fn judge(&self, admission: &AdmissionRequest<'_>) -> Result<Client, Denial> {
         if let Some(token) = admission.token {
             // The listener is not called again for an address that keeps trying: the log is for others, too.
             let is_heard = self.attempts().check(admission.peer.ip(), admission.now).is_ok();
             return self.admit_token(token, admission).inspect_err(|denied| {
-                if let Some(hears) = self.hears.as_ref().filter(|_| is_heard) {
-                    hears(admission.peer, denied);
+                if let Some(listener) = self.listener.as_ref().filter(|_| is_heard) {
+                    listener(admission.peer, denied);
                 }
             });
         }
@@ -312,7 +312,7 @@ impl Access {
                 }
                 // A certificate without rights counts like no certificate, because the same program may be admitted
                 // without one.
-                Err(why @ Denied::NotListed { .. }) => {
+                Err(why @ Denial::NotListed { .. }) => {
                     return self.admit_anonymous(admission, origin).map_err(|_| why);
                 }
                 Err(why) => return Err(why),
@@ -322,38 +322,38 @@ impl Access {
     }
 
     /// Fails if the current rules no longer admit this client. The caller then disconnects it.
-    pub fn still_admits(&self, client: &Client, now: UnixMillis) -> Result<(), Denied> {
+    pub fn still_admits(&self, client: &Client, now: UnixMillis) -> Result<(), Denial> {
         match &client.evidence {
             Evidence::Own => Ok(()),
             Evidence::Anonymous { ip, origin } => self.judge_anonymous(*ip, origin.as_deref()),
             Evidence::Certificate { peer, ip, origin } => {
                 let scope = self.judge_certificate(peer, *ip, origin.as_deref(), now)?;
-                if scope == *client.scope { Ok(()) } else { Err(Denied::Changed) }
+                if scope == *client.scope { Ok(()) } else { Err(Denial::Changed) }
             }
             Evidence::Token { id, is_exposed } => {
                 if *is_exposed && !self.rules.plain {
-                    return Err(Denied::PlainToken);
+                    return Err(Denial::PlainToken);
                 }
                 self.judge_time(*id, client.expires.unwrap_or(UnixMillis(0)), now)
             }
         }
     }
 
-    fn admit_token(&self, text: &str, admission: &Admission<'_>) -> Result<Client, Denied> {
+    fn admit_token(&self, text: &str, admission: &AdmissionRequest<'_>) -> Result<Client, Denial> {
         let ip = admission.peer.ip().to_canonical();
         let is_exposed = !admission.encrypted && !ip.is_loopback();
         // This host is never locked out, because a proxy on it may serve many clients.
         if !ip.is_loopback() {
             let checked = self.attempts().check(ip, admission.now);
-            checked.map_err(|wait| Denied::TooManyAttempts { ip, wait })?;
+            checked.map_err(|wait| Denial::TooManyAttempts { ip, wait })?;
         }
         if is_exposed && !self.rules.plain {
             self.attempts().fail(ip, admission.now);
-            return Err(Denied::PlainToken);
+            return Err(Denial::PlainToken);
         }
-        let result = AccessToken::parse(text).map_err(Denied::Token).and_then(|token| {
-            let gateway = self.rules.gateway.as_ref().ok_or(Denied::NoTokens)?;
-            let grant = token.verify(gateway).map_err(Denied::Token)?;
+        let result = AccessToken::parse(text).map_err(Denial::Token).and_then(|token| {
+            let gateway = self.rules.gateway.as_ref().ok_or(Denial::NoTokens)?;
+            let grant = token.verify(gateway).map_err(Denial::Token)?;
             self.judge_time(grant.id, grant.expires, admission.now)?;
             Ok(grant.clone())
         });
@@ -369,11 +369,11 @@ impl Access {
         })
     }
 
-    fn judge_time(&self, id: TokenId, expires: UnixMillis, now: UnixMillis) -> Result<(), Denied> {
+    fn judge_time(&self, id: TokenId, expires: UnixMillis, now: UnixMillis) -> Result<(), Denial> {
         if now > expires {
-            return Err(Denied::TokenExpired { id, expires });
+            return Err(Denial::TokenExpired { id, expires });
         }
-        if self.rules.revoked.contains(&id) { Err(Denied::TokenRevoked { id }) } else { Ok(()) }
+        if self.rules.revoked.contains(&id) { Err(Denial::TokenRevoked { id }) } else { Ok(()) }
     }
 
     /// Returns the scope that a certificate permits.
@@ -383,26 +383,30 @@ impl Access {
         ip: IpAddr,
         origin: Option<&str>,
         now: UnixMillis,
-    ) -> Result<Scope, Denied> {
+    ) -> Result<Scope, Denial> {
         let node = peer.node_id;
         if now > peer.not_after {
-            return Err(Denied::CertificateExpired { node, expires: peer.not_after });
+            return Err(Denial::CertificateExpired { node, expires: peer.not_after });
         }
         if self.rules.anchors.as_ref().is_some_and(|anchors| !anchors.stands(peer)) {
-            return Err(Denied::CertificateRevoked { node });
+            return Err(Denial::CertificateRevoked { node });
         }
         let mut scope = Scope::default();
         let rules = self.rules.clients.iter().filter(|rule| rule.who.find(peer).is_some());
         rules.for_each(|rule| scope.add(&rule.scope));
         if scope.is_empty() {
-            return Err(Denied::NotListed { node });
+            return Err(Denial::NotListed { node });
         }
         // A browser shows its certificate for any page that connects, so the origin must be checked too.
         self.judge_origin(origin, ip)?;
         Ok(scope)
     }
 
-    fn admit_anonymous(&self, admission: &Admission<'_>, origin: Option<Arc<str>>) -> Result<Client, Denied> {
+    fn admit_anonymous(
+        &self,
+        admission: &AdmissionRequest<'_>,
+        origin: Option<Arc<str>>,
+    ) -> Result<Client, Denial> {
         let ip = admission.peer.ip().to_canonical();
         self.judge_anonymous(ip, admission.origin)?;
         Ok(Client {
@@ -416,23 +420,23 @@ impl Access {
         })
     }
 
-    fn judge_anonymous(&self, ip: IpAddr, origin: Option<&str>) -> Result<(), Denied> {
+    fn judge_anonymous(&self, ip: IpAddr, origin: Option<&str>) -> Result<(), Denial> {
         match self.rules.anonymous {
             Anonymous::Local if ip.is_loopback() => self.judge_origin(origin, ip),
             Anonymous::All => self.judge_origin(origin, ip),
-            Anonymous::Local | Anonymous::None => Err(Denied::NoCredentials { ip }),
+            Anonymous::Local | Anonymous::None => Err(Denial::NoCredentials { ip }),
         }
     }
 
     /// Fails if a page of this origin may not connect without a token. Programs have no origin and pass. In a browser
     /// on another host, `http://localhost` is a page of that host.
-    fn judge_origin(&self, origin: Option<&str>, ip: IpAddr) -> Result<(), Denied> {
+    fn judge_origin(&self, origin: Option<&str>, ip: IpAddr) -> Result<(), Denial> {
         let Some(text) = origin else { return Ok(()) };
         let parsed = text.parse::<PageOrigin>();
         match &parsed {
             Ok(origin) if ip.is_loopback() && origin.is_loopback() => Ok(()),
             Ok(origin) if self.rules.origins.contains(origin) => Ok(()),
-            _ => Err(Denied::Origin { origin: text.chars().take(ORIGIN_BYTES_MAX).collect() }),
+            _ => Err(Denial::Origin { origin: text.chars().take(ORIGIN_BYTES_MAX).collect() }),
         }
     }
 
@@ -441,9 +445,9 @@ impl Access {
     }
 }
 
-/// The reason of a refusal, for the gateway's log. [`Denied::told`] is the text for the client.
+/// The reason of a refusal, for the gateway's log. [`Denial::told`] is the text for the client.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Denied {
+pub enum Denial {
     /// The client showed neither a token nor a certificate, and this address needs one.
     #[error(
         "a program at {ip} showed neither a token nor a certificate: make a token with `sgc token create`, name its \
@@ -529,9 +533,9 @@ pub enum Denied {
     Changed,
 }
 
-impl Denied {
+impl Denial {
     /// Returns the text for the client. It says what the user can do, but not why a token is invalid.
-    pub fn told(&self) -> &'static str {
+    pub fn client_message(&self) -> &'static str {
         match self {
             Self::NoCredentials { .. } | Self::NotListed { .. } => {
                 "not admitted: this gateway wants a token (`sgc token create` there makes one) or a certificate of its fleet"

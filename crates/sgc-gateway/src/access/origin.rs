@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn one_origin_is_written_in_one_way() {
+    fn origins_are_normalised() {
         for (text, shown) in [
             ("HTTPS://App.Example.org:443", "https://app.example.org"),
             ("http://robot.local:80", "http://robot.local"),
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_origin_is_said() {
+    fn invalid_origins_are_explained() {
         let refused = |text: &str| text.parse::<PageOrigin>().unwrap_err();
         assert_eq!(refused("null"), PageOriginError::Null);
         let right = "https://a.example".to_owned();

@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_scope_is_said() {
+    fn invalid_scopes_are_explained() {
         assert_eq!(Scope::default().check(), Err(ScopeError::Nothing));
         for wrong in ["", "odom", "/arm*", "/a/", "/a b", "~/x", "/***", &format!("/{}", "a".repeat(300))] {
             assert_eq!(

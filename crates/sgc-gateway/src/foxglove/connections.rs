@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::graph::Graph;
 
-use super::protocol::{Providers, Publishers, Subscribers, Told};
+use super::protocol::{Providers, Publishers, ServerMessage, Subscribers};
 
 type Ends = BTreeMap<String, BTreeSet<String>>;
 
@@ -20,7 +20,7 @@ impl Connections {
     /// Stores the current state and returns the changes as a message, if there are any. Names for which `is_shown` is
     /// false are left out.
     pub(super) fn update(&mut self, graph: &Graph, is_shown: impl Fn(&str) -> bool) -> Option<String> {
-        let now = Self::of(graph, is_shown);
+        let now = Self::from_graph(graph, is_shown);
         let published = changes(&self.publishers, &now.publishers);
         let subscribed = changes(&self.subscribers, &now.subscribers);
         let served = changes(&self.servers, &now.servers);
@@ -44,7 +44,7 @@ impl Connections {
         if nothing && removed_topics.is_empty() && removed_services.is_empty() {
             return None;
         }
-        let told = Told::ConnectionGraphUpdate {
+        let told = ServerMessage::ConnectionGraphUpdate {
             published_topics: &published,
             subscribed_topics: &subscribed,
             advertised_services: &served,
@@ -54,7 +54,7 @@ impl Connections {
         Some(told.to_json())
     }
 
-    fn of(graph: &Graph, is_shown: impl Fn(&str) -> bool) -> Self {
+    fn from_graph(graph: &Graph, is_shown: impl Fn(&str) -> bool) -> Self {
         let mut all = Self::default();
         for (name, info) in graph.topics.iter().filter(|(name, _)| is_shown(name)) {
             // An endpoint whose node is unknown is identified by its GUID.

@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_another_gets_another_number() {
+    fn changed_offers_get_new_numbers() {
         let mut listing = Listing::default();
         let now = there(&[("/a", "T"), ("/b", "T")]);
         assert!(listing.retain(&now).is_empty());
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_knew_is_looked_for_again() {
+    fn unknown_definitions_are_looked_up_again() {
         let mut listing = Listing::default();
         let now = there(&[("/a", "T")]);
         let id = listing.tell_unknown("/a", offer("T", None), 1, true).unwrap();

@@ -30,8 +30,8 @@ use tokio_tungstenite::tungstenite::Message as Frame;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
-use crate::access::Denied;
-use crate::quota::Waiting;
+use crate::access::Denial;
+use crate::quota::PendingBytes;
 use crate::session::Session;
 use crate::ws::close_reason;
 
@@ -93,7 +93,7 @@ pub enum FoxgloveError {
     },
     /// The client's rights ended.
     #[error("the client's right has ended: {0}")]
-    Denied(#[source] Denied),
+    Denied(#[source] Denial),
 }
 
 /// Serves a client until it leaves. Dropping the future ends the connection and everything that the client has.
@@ -109,7 +109,7 @@ where
     S: AsyncRead + AsyncWrite + Unpin + Send,
 {
     let (mut sink, mut frames) = socket.split();
-    let waiting = Waiting::new(session.limits().waiting_bytes_max, session.quota().clone());
+    let waiting = PendingBytes::new(session.limits().waiting_bytes_max, session.quota().clone());
     let outbox = Outbox::new(waiting);
     let mut connection = Connection::new(Arc::clone(&session), options, &outbox);
     let ended = tokio::select! {
@@ -121,7 +121,8 @@ where
     drop(connection);
     let farewell = async {
         if let Err(FoxgloveError::Denied(denied)) = &ended {
-            let reason = CloseFrame { code: CloseCode::Policy, reason: close_reason(denied.told()).into() };
+            let reason =
+                CloseFrame { code: CloseCode::Policy, reason: close_reason(denied.client_message()).into() };
             return sink.send(Frame::Close(Some(reason))).await;
         }
         while let Some(answer) = outbox.pop_answer() {

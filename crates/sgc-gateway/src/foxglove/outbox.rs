@@ -9,7 +9,7 @@ use tokio_tungstenite::tungstenite::Message as Frame;
 
 use crate::message::Message;
 use crate::queue::MESSAGE_COST_BYTES;
-use crate::quota::Waiting;
+use crate::quota::PendingBytes;
 
 use super::protocol::message_data;
 
@@ -35,10 +35,10 @@ struct State {
     answers: VecDeque<Frame>,
     answer_bytes: usize,
     /// Messages in the order of their arrival.
-    messages: BTreeMap<u64, Queued>,
+    messages: BTreeMap<u64, QueuedMessage>,
     lanes: BTreeMap<u32, Lane>,
     next: u64,
-    message_bytes: Waiting,
+    message_bytes: PendingBytes,
 }
 
 impl Drop for State {
@@ -48,7 +48,7 @@ impl Drop for State {
 }
 
 #[derive(Debug)]
-struct Queued {
+struct QueuedMessage {
     subscription: u32,
     message: Arc<Message>,
 }
@@ -63,7 +63,7 @@ struct Lane {
 
 impl Outbox {
     /// Creates an outbox whose messages are bounded by `message_bytes`.
-    pub(super) fn new(message_bytes: Waiting) -> Self {
+    pub(super) fn new(message_bytes: PendingBytes) -> Self {
         let state = State {
             answers: VecDeque::new(),
             answer_bytes: 0,
@@ -122,7 +122,7 @@ impl Outbox {
         let lane = state.lanes.entry(subscription).or_default();
         lane.numbers.push_back(number);
         lane.bytes += cost;
-        state.messages.insert(number, Queued { subscription, message });
+        state.messages.insert(number, QueuedMessage { subscription, message });
         drop(state);
         self.filled.notify_one();
     }
@@ -151,7 +151,7 @@ impl Outbox {
             self.drained.notify_one();
             return Some(answer);
         }
-        let (_, Queued { subscription, message }) = state.messages.pop_first()?;
+        let (_, QueuedMessage { subscription, message }) = state.messages.pop_first()?;
         let cost = cost(&message);
         state.message_bytes.sub(cost);
         if let Some(lane) = state.lanes.get_mut(&subscription) {
@@ -204,7 +204,7 @@ mod tests {
     fn outbox(message_bytes_max: usize) -> Outbox {
         let quotas: Arc<crate::quota::Quotas> = Arc::default();
         let quota = quotas.quota(&crate::access::Client::own("test"));
-        Outbox::new(Waiting::new(message_bytes_max, quota))
+        Outbox::new(PendingBytes::new(message_bytes_max, quota))
     }
 
     fn popped(outbox: &Outbox) -> Option<(u8, usize)> {
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn who_waits_with_the_most_gives_way() {
+    fn longest_lane_gives_way() {
         let outbox = outbox(4 * (1000 + MESSAGE_COST_BYTES));
         outbox.message(7, message(10));
         for _ in 0..5 {
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn one_subscription_has_so_many_at_most() {
+    fn messages_of_a_subscription_are_bounded() {
         let outbox = outbox(usize::MAX);
         for _ in 0..LANE_MESSAGES_MAX + 3 {
             outbox.message(1, message(0));

@@ -100,22 +100,22 @@ fn clip(text: &str) -> String {
 }
 
 #[derive(Deserialize)]
-struct Listed {
-    result: ListedResult,
+struct ListResponse {
+    result: ListResult,
 }
 
 #[derive(Deserialize)]
-struct ListedResult {
+struct ListResult {
     names: Vec<String>,
 }
 
 #[derive(Deserialize)]
-struct Got {
+struct GetResponse {
     values: Vec<RosValue>,
 }
 
 #[derive(Deserialize)]
-struct SetAnswer {
+struct SetResponse {
     results: Vec<SetResult>,
 }
 
@@ -234,7 +234,7 @@ impl Parameters {
         let until = Instant::now() + ALL_MAX;
         let mut left: BTreeSet<String> = nodes.keys().cloned().collect();
         let ask = |(node, names): (String, Option<Vec<String>>)| async move {
-            let got = self.of_node(&node, names).await;
+            let got = self.get_of_node(&node, names).await;
             (node, got)
         };
         let mut asked = stream::iter(nodes).map(ask).buffer_unordered(NODES_AT_ONCE);
@@ -268,12 +268,12 @@ impl Parameters {
         answer
     }
 
-    async fn of_node(&self, node: &str, names: Option<Vec<String>>) -> Result<Vec<Parameter>, Refusal> {
+    async fn get_of_node(&self, node: &str, names: Option<Vec<String>>) -> Result<Vec<Parameter>, Refusal> {
         let mut names = match names {
             Some(names) => names,
             None => {
                 let request = json!({"prefixes": [], "depth": 0});
-                let listed: Listed = self.ask(node, LIST, &request).await?;
+                let listed: ListResponse = self.ask(node, LIST, &request).await?;
                 listed.result.names
             }
         };
@@ -289,14 +289,14 @@ impl Parameters {
 
     /// Returns values in the order of their names. A missing parameter counts as not set.
     async fn values(&self, node: &str, names: &[String]) -> Result<Vec<RosValue>, Refusal> {
-        let got: Got = self.ask(node, GET, &json!({"names": names})).await?;
+        let got: GetResponse = self.ask(node, GET, &json!({"names": names})).await?;
         if got.values.len() == names.len() {
             return Ok(got.values);
         }
         // A node answers with an empty list if one of the names is not declared.
         let mut values = Vec::with_capacity(names.len());
         for name in names {
-            let got: Got = self.ask(node, GET, &json!({"names": [name]})).await?;
+            let got: GetResponse = self.ask(node, GET, &json!({"names": [name]})).await?;
             values.push(got.values.into_iter().next().unwrap_or_default());
         }
         Ok(values)
@@ -354,7 +354,7 @@ impl Parameters {
             }
         }
         if !request.is_empty() {
-            let set: SetAnswer = self.ask(node, SET, &json!({"parameters": request})).await?;
+            let set: SetResponse = self.ask(node, SET, &json!({"parameters": request})).await?;
             let results = sent.into_iter().zip(set.results).filter(|(_, result)| !result.successful);
             refused.extend(results.map(|(name, result)| (name, result.reason)));
         }
@@ -362,7 +362,7 @@ impl Parameters {
     }
 
     /// Returns the changes in an event that the client watches and may see.
-    pub(super) fn of_event(&self, event: &[u8], watched: &Watched) -> Vec<Parameter> {
+    pub(super) fn changes_in_event(&self, event: &[u8], watched: &WatchList) -> Vec<Parameter> {
         let Ok(event) = serde_json::from_slice::<RosEvent>(event) else { return Vec::new() };
         if !self.may_get(&event.node) {
             return Vec::new();
@@ -386,12 +386,12 @@ fn not_a_parameter(name: &str) -> String {
 
 /// The parameters that a client watches.
 #[derive(Debug, Default)]
-pub(super) struct Watched {
+pub(super) struct WatchList {
     names: BTreeSet<String>,
     all: bool,
 }
 
-impl Watched {
+impl WatchList {
     /// Adds names; an empty list means all parameters. Fails beyond [`WATCHED_MAX`].
     pub(super) fn add(&mut self, names: Vec<String>) -> Result<(), GatewayError> {
         self.all |= names.is_empty();
@@ -556,8 +556,8 @@ mod tests {
     }
 
     #[test]
-    fn what_is_listened_to_is_bounded_and_none_is_all() {
-        let mut watched = Watched::default();
+    fn watch_list_is_bounded_and_an_empty_one_means_all() {
+        let mut watched = WatchList::default();
         watched.add(vec!["/n.a".into()]).unwrap();
         assert!(watched.has("/n.a") && !watched.has("/n.b"));
         watched.add(Vec::new()).unwrap();

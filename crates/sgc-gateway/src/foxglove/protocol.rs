@@ -57,7 +57,7 @@ pub(super) enum ProtocolError {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(tag = "op", rename_all = "camelCase", rename_all_fields = "camelCase")]
 pub(super) enum Command {
-    Subscribe { subscriptions: Vec<Wanted> },
+    Subscribe { subscriptions: Vec<SubscribeRequest> },
     Unsubscribe { subscription_ids: Vec<u32> },
     Advertise { channels: Vec<ClientChannel> },
     Unadvertise { channel_ids: Vec<u32> },
@@ -87,7 +87,7 @@ impl Command {
 /// A requested subscription.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "camelCase")]
-pub(super) struct Wanted {
+pub(super) struct SubscribeRequest {
     pub(super) id: u32,
     pub(super) channel_id: u32,
 }
@@ -128,7 +128,7 @@ pub(super) enum ParameterKind {
 
 /// A binary message from a client.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Sent {
+pub(super) enum BinaryMessage {
     Message { channel: u32, payload: Bytes },
     Call { service: u32, call: u32, encoding: String, payload: Bytes },
 }
@@ -136,7 +136,7 @@ pub(super) enum Sent {
 /// A text message from the server.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "op", rename_all = "camelCase", rename_all_fields = "camelCase")]
-pub(super) enum Told<'a> {
+pub(super) enum ServerMessage<'a> {
     ServerInfo {
         name: &'a str,
         capabilities: &'a [&'static str],
@@ -184,7 +184,7 @@ pub(super) enum Told<'a> {
     },
 }
 
-impl Told<'_> {
+impl ServerMessage<'_> {
     pub(super) fn to_json(&self) -> String {
         // Serialisation cannot fail, because all keys are strings.
         serde_json::to_string(self).unwrap_or_default()
@@ -266,7 +266,7 @@ pub(super) fn read_text(text: &str) -> Result<Command, ProtocolError> {
 }
 
 /// Parses a binary message without copying its payload.
-pub(super) fn read_binary(mut bytes: Bytes) -> Result<Sent, ProtocolError> {
+pub(super) fn read_binary(mut bytes: Bytes) -> Result<BinaryMessage, ProtocolError> {
     let length = bytes.len();
     let too_short = ProtocolError::TooShort { bytes: length };
     let mut take = |count: usize| {
@@ -278,12 +278,12 @@ pub(super) fn read_binary(mut bytes: Bytes) -> Result<Sent, ProtocolError> {
         word.as_ref().try_into().map(u32::from_le_bytes).map_err(|_| too_short.clone())
     };
     match opcode.first().copied() {
-        Some(CLIENT_MESSAGE_DATA) => Ok(Sent::Message { channel: word()?, payload: bytes }),
+        Some(CLIENT_MESSAGE_DATA) => Ok(BinaryMessage::Message { channel: word()?, payload: bytes }),
         Some(SERVICE_CALL_REQUEST) => {
             let (service, call, length) = (word()?, word()?, word()?);
             let encoding = take(usize::try_from(length).unwrap_or(usize::MAX))?;
             let encoding = String::from_utf8(encoding.into()).map_err(|_| ProtocolError::Encoding)?;
-            Ok(Sent::Call { service, call, encoding, payload: bytes })
+            Ok(BinaryMessage::Call { service, call, encoding, payload: bytes })
         }
         Some(other) => Err(ProtocolError::Opcode(other)),
         None => Err(too_short),
@@ -332,7 +332,7 @@ mod tests {
         let read = |text: &str| read_text(text).unwrap();
         assert_eq!(
             read(r#"{"op":"subscribe","subscriptions":[{"id":0,"channelId":7}]}"#),
-            Command::Subscribe { subscriptions: vec![Wanted { id: 0, channel_id: 7 }] }
+            Command::Subscribe { subscriptions: vec![SubscribeRequest { id: 0, channel_id: 7 }] }
         );
         assert_eq!(
             read(r#"{"op":"getParameters","parameterNames":[]}"#),
@@ -373,12 +373,12 @@ mod tests {
         let read = |bytes: &[u8]| read_binary(Bytes::copy_from_slice(bytes));
         assert_eq!(
             read(&[1, 2, 0, 0, 0, 9, 9]).unwrap(),
-            Sent::Message { channel: 2, payload: vec![9, 9].into() }
+            BinaryMessage::Message { channel: 2, payload: vec![9, 9].into() }
         );
         let call = [2, 1, 0, 0, 0, 2, 0, 0, 0, 3, 0, 0, 0, b'c', b'd', b'r', 5];
         assert_eq!(
             read(&call).unwrap(),
-            Sent::Call { service: 1, call: 2, encoding: "cdr".into(), payload: vec![5].into() }
+            BinaryMessage::Call { service: 1, call: 2, encoding: "cdr".into(), payload: vec![5].into() }
         );
         for end in 0..call.len() - 1 {
             assert_eq!(read(&call[..end]), Err(ProtocolError::TooShort { bytes: end }));
@@ -391,10 +391,10 @@ mod tests {
     }
 
     #[test]
-    fn what_is_said_is_as_the_protocol_has_it() {
-        let status = Told::Status { level: 1, message: "slow", id: Some("dropped:/a") };
+    fn messages_are_encoded_as_specified() {
+        let status = ServerMessage::Status { level: 1, message: "slow", id: Some("dropped:/a") };
         assert_eq!(status.to_json(), r#"{"op":"status","level":1,"message":"slow","id":"dropped:/a"}"#);
-        let gone = Told::Unadvertise { channel_ids: &[1, 2] };
+        let gone = ServerMessage::Unadvertise { channel_ids: &[1, 2] };
         assert_eq!(gone.to_json(), r#"{"op":"unadvertise","channelIds":[1,2]}"#);
         assert_eq!(message_data(1, 2, &[3])[..], [1, 1, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 3]);
         assert_eq!(

@@ -13,7 +13,7 @@ use tonic::{Request, Status};
 use super::GrpcOptions;
 use super::connection::{Connection, WeakConnection};
 use super::fault::Fault;
-use crate::access::{Admission, Client, Denied, ORIGIN_BYTES_MAX};
+use crate::access::{AdmissionRequest, Client, Denial, ORIGIN_BYTES_MAX};
 use crate::access_watch::AccessWatch;
 use crate::budget::Budget;
 use crate::error::GatewayError;
@@ -36,18 +36,18 @@ pub(super) struct Clients {
 
 /// The credential of a request. A token is kept as a hash only. With a token the origin does not matter.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Shown {
+struct Proof {
     token: Option<[u8; 32]>,
     origin: Option<Box<str>>,
 }
 
 /// A guest and the credential that admitted it.
-pub(super) struct Known {
-    shown: Shown,
+pub(super) struct GuestEntry {
+    shown: Proof,
     guest: Arc<Guest>,
 }
 
-impl Known {
+impl GuestEntry {
     pub(super) fn client(&self) -> &Client {
         self.guest.session.client()
     }
@@ -92,7 +92,7 @@ impl Clients {
         if token.is_none() && origin.is_some_and(|origin| origin.len() > ORIGIN_BYTES_MAX) {
             return Err(Fault::Origin { max: ORIGIN_BYTES_MAX });
         }
-        let shown = Shown {
+        let shown = Proof {
             origin: origin.filter(|_| token.is_none()).map(Box::from),
             token: token.map(|token| {
                 let mut hash = [0; 32];
@@ -111,7 +111,7 @@ impl Clients {
                 Err(why) => known.remove(at).guest.end(why),
             }
         }
-        let client = access.admit(&Admission {
+        let client = access.admit(&AdmissionRequest {
             peer: connection.peer(),
             encrypted: connection.is_encrypted(),
             origin,
@@ -142,7 +142,7 @@ impl Clients {
                 session: session.admitted_by(self.access.clone()),
             }
         });
-        known.push(Known { shown, guest: Arc::clone(&guest) });
+        known.push(GuestEntry { shown, guest: Arc::clone(&guest) });
         Ok(guest)
     }
 }
@@ -191,7 +191,7 @@ struct Counts {
 
 /// The kind of a stream, which decides the bound that it counts against.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Taken {
+pub(super) enum StreamKind {
     Subscription,
     Publication,
     Serving,
@@ -220,7 +220,7 @@ pub(super) struct Guest {
 /// A stream of a guest, counted until dropped.
 pub(super) struct Place {
     pub(super) guest: Arc<Guest>,
-    taken: Taken,
+    taken: StreamKind,
 }
 
 impl Drop for Place {
@@ -237,24 +237,26 @@ impl Drop for Guest {
 
 impl Guest {
     /// Returns the guest of an admitted request.
-    pub(super) fn of<T>(request: &Request<T>) -> Result<Arc<Self>, Fault> {
+    pub(super) fn from_request<T>(request: &Request<T>) -> Result<Arc<Self>, Fault> {
         request.extensions().get::<Arc<Self>>().cloned().ok_or(Fault::NoConnection)
     }
 
-    fn count(&self, taken: Taken) -> (&AtomicUsize, &'static str, usize) {
+    fn count(&self, taken: StreamKind) -> (&AtomicUsize, &'static str, usize) {
         let limits = self.session.limits();
         match taken {
-            Taken::Subscription => (&self.counts.subscriptions, "subscriptions", limits.subscriptions_max),
-            Taken::Publication => (&self.counts.publications, "publishers", limits.publications_max),
-            Taken::Watching => (&self.counts.watches, "watches of the graph", WATCHES_MAX),
-            Taken::Call => (&self.counts.calls, "calls under way", limits.calls_max),
-            Taken::Goal => (&self.counts.goals, "goals", limits.calls_max),
-            Taken::Serving => (&self.counts.servings, "services and actions", limits.servings_max),
+            StreamKind::Subscription => {
+                (&self.counts.subscriptions, "subscriptions", limits.subscriptions_max)
+            }
+            StreamKind::Publication => (&self.counts.publications, "publishers", limits.publications_max),
+            StreamKind::Watching => (&self.counts.watches, "watches of the graph", WATCHES_MAX),
+            StreamKind::Call => (&self.counts.calls, "calls under way", limits.calls_max),
+            StreamKind::Goal => (&self.counts.goals, "goals", limits.calls_max),
+            StreamKind::Serving => (&self.counts.servings, "services and actions", limits.servings_max),
         }
     }
 
     /// Counts a stream, or fails at the bound.
-    pub(super) fn take(self: &Arc<Self>, taken: Taken) -> Result<Place, Fault> {
+    pub(super) fn take(self: &Arc<Self>, taken: StreamKind) -> Result<Place, Fault> {
         let (count, what, max) = self.count(taken);
         let place = Place { guest: Arc::clone(self), taken };
         let before = count.fetch_add(1, Ordering::Relaxed);
@@ -262,7 +264,7 @@ impl Guest {
         Ok(place)
     }
 
-    fn end(&self, why: Denied) {
+    fn end(&self, why: Denial) {
         tracing::debug!(client = %self.session.client().name, %why, "a gRPC client is not admitted any more");
         self.end_with(Fault::Denied(why));
     }

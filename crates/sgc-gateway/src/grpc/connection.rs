@@ -1,4 +1,4 @@
-//! [`Connection`]: the peer of a connection and its guests; [`Accepted`]: its byte stream.
+//! [`Connection`]: the peer of a connection and its guests; [`AcceptedStream`]: its byte stream.
 
 use std::fmt;
 use std::net::SocketAddr;
@@ -11,7 +11,7 @@ use sgc_trust::VerifiedPeer;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tonic::transport::server::Connected;
 
-use super::client::Known;
+use super::client::GuestEntry;
 use crate::access::Client;
 use crate::hub::lock;
 
@@ -23,7 +23,7 @@ struct Inner {
     peer: SocketAddr,
     is_encrypted: bool,
     certificate: Option<VerifiedPeer>,
-    known: Mutex<Vec<Known>>,
+    known: Mutex<Vec<GuestEntry>>,
     /// Woken when the rights of a client on the connection end.
     serving: AtomicWaker,
 }
@@ -72,7 +72,7 @@ impl Connection {
     }
 
     /// Returns the guests of the connection.
-    pub(super) fn known(&self) -> &Mutex<Vec<Known>> {
+    pub(super) fn known(&self) -> &Mutex<Vec<GuestEntry>> {
         &self.0.known
     }
 }
@@ -97,19 +97,19 @@ impl fmt::Debug for Connection {
 
 /// An accepted byte stream. Dropping it at the end of the connection drops everything that `IO` holds.
 #[derive(Debug)]
-pub struct Accepted<IO> {
+pub struct AcceptedStream<IO> {
     io: IO,
     connection: Connection,
 }
 
-impl<IO> Accepted<IO> {
+impl<IO> AcceptedStream<IO> {
     /// Combines a byte stream with its connection.
     pub fn new(io: IO, connection: Connection) -> Self {
         Self { io, connection }
     }
 }
 
-impl<IO> Connected for Accepted<IO> {
+impl<IO> Connected for AcceptedStream<IO> {
     type ConnectInfo = Connection;
 
     fn connect_info(&self) -> Connection {
@@ -117,7 +117,7 @@ impl<IO> Connected for Accepted<IO> {
     }
 }
 
-impl<IO: AsyncRead + Unpin> AsyncRead for Accepted<IO> {
+impl<IO: AsyncRead + Unpin> AsyncRead for AcceptedStream<IO> {
     fn poll_read(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -127,7 +127,7 @@ impl<IO: AsyncRead + Unpin> AsyncRead for Accepted<IO> {
     }
 }
 
-impl<IO: AsyncWrite + Unpin> AsyncWrite for Accepted<IO> {
+impl<IO: AsyncWrite + Unpin> AsyncWrite for AcceptedStream<IO> {
     fn poll_write(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,

@@ -13,7 +13,7 @@ use super::tracking::{self, respond};
 const RESPONSES_MAX: usize = 16;
 
 /// The sender of responses, each with its room.
-pub(super) type Told<T> = mpsc::Sender<tracking::Told<T>>;
+pub(super) type Responder<T> = mpsc::Sender<tracking::TrackedResponse<T>>;
 
 /// An exchange between a client and the hub.
 pub(super) trait Conversation: Send + Sized + 'static {
@@ -29,7 +29,7 @@ pub(super) trait Conversation: Send + Sized + 'static {
     fn work(
         &mut self,
         requests: Streaming<Self::Request>,
-        told: &Told<Self::Response>,
+        told: &Responder<Self::Response>,
     ) -> impl Future<Output = Result<(), Status>> + Send;
 }
 
@@ -51,7 +51,11 @@ pub(super) fn begin<C: Conversation>(
     respond(responses)
 }
 
-async fn run<C: Conversation>(mut conversation: C, requests: Streaming<C::Request>, told: Told<C::Response>) {
+async fn run<C: Conversation>(
+    mut conversation: C,
+    requests: Streaming<C::Request>,
+    told: Responder<C::Response>,
+) {
     let guest = Arc::clone(&conversation.place().guest);
     let why = tokio::select! {
         biased;

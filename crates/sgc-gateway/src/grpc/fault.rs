@@ -2,15 +2,15 @@
 
 use tonic::{Code, Status};
 
-use crate::access::Denied;
+use crate::access::Denial;
 use crate::error::{ErrorKind, GatewayError};
 
 /// The reason why a call fails.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum Fault {
     /// The client is not admitted, or no longer.
-    #[error("{}", .0.told())]
-    Denied(Denied),
+    #[error("{}", .0.client_message())]
+    Denied(Denial),
     /// The `authorization` header is malformed.
     #[error("`authorization` is not of the form `Bearer TOKEN`")]
     Authorization,

@@ -41,7 +41,7 @@ pub(super) fn graph(guest: &Guest, with_hidden: bool) -> GetGraphResponse {
 }
 
 /// A client that watches the graph.
-struct Watching {
+struct GraphWatch {
     place: Place,
     with_hidden: bool,
     changes: watch::Receiver<u64>,
@@ -51,7 +51,7 @@ struct Watching {
 /// Streams the whole graph and then its changes.
 pub(super) fn watch(place: Place, with_hidden: bool) -> Responses<WatchGraphResponse> {
     let changes = place.guest.session.hub().graph_changes();
-    let watching = Watching { place, with_hidden, changes, told: None };
+    let watching = GraphWatch { place, with_hidden, changes, told: None };
     Box::pin(stream::unfold(Some(watching), |watching| async {
         let mut watching = watching?;
         let guest = Arc::clone(&watching.place.guest);
@@ -63,7 +63,7 @@ pub(super) fn watch(place: Place, with_hidden: bool) -> Responses<WatchGraphResp
     }))
 }
 
-impl Watching {
+impl GraphWatch {
     async fn next(&mut self) -> Option<WatchGraphResponse> {
         loop {
             if self.told.is_some() {

@@ -22,7 +22,7 @@ use crate::hub::lock;
 const HEAD_BYTES: usize = 5;
 
 /// The room of received messages until they are handled.
-pub(super) type Kept = Arc<Mutex<Vec<Room>>>;
+pub(super) type KeptRooms = Arc<Mutex<Vec<Room>>>;
 
 /// The messages of a stream and their room.
 #[derive(Debug, Default)]
@@ -73,11 +73,11 @@ pub(super) struct Incoming<B> {
     guest: Arc<Guest>,
     messages: Messages,
     /// Keeps room for longer than the stream is read.
-    kept: Option<Kept>,
+    kept: Option<KeptRooms>,
 }
 
 impl<B> Incoming<B> {
-    pub(super) fn new(body: B, guest: Arc<Guest>, kept: Option<Kept>) -> Self {
+    pub(super) fn new(body: B, guest: Arc<Guest>, kept: Option<KeptRooms>) -> Self {
         Self { body, guest, messages: Messages::default(), kept }
     }
 }

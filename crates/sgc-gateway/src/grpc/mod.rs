@@ -13,6 +13,7 @@ mod client;
 mod connection;
 mod conversation;
 mod fault;
+mod get_type;
 mod graph;
 mod incoming;
 mod publish;
@@ -21,7 +22,6 @@ mod serve;
 mod service;
 mod subscribe;
 mod tracking;
-mod types;
 
 /// Code generated from `proto/sgc/gateway/v1/gateway.proto`, which documents it.
 pub mod proto {
@@ -45,7 +45,7 @@ use tonic::service::Routes;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::Server;
 
-pub use connection::{Accepted, Connection};
+pub use connection::{AcceptedStream, Connection};
 pub use fault::Fault;
 
 use crate::access_watch::AccessWatch;
@@ -157,7 +157,7 @@ impl Grpc {
     ///
     /// # Errors
     /// The errors of [`Grpc::routes`]. An error on a connection ends only that connection.
-    pub async fn serve<IO>(&self, incoming: impl Stream<Item = Accepted<IO>>) -> Result<(), Fault>
+    pub async fn serve<IO>(&self, incoming: impl Stream<Item = AcceptedStream<IO>>) -> Result<(), Fault>
     where
         IO: AsyncRead + AsyncWrite + Unpin + Send + 'static,
     {

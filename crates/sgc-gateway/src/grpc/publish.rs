@@ -7,7 +7,7 @@ use std::time::Duration;
 use futures_util::FutureExt as _;
 use tonic::{Status, Streaming};
 
-use super::client::{Guest, Taken};
+use super::client::{Guest, StreamKind};
 use super::fault::Fault;
 use super::proto::publish_request::{Kind, Publisher};
 use super::proto::{PublishRequest, PublishResponse};
@@ -26,7 +26,7 @@ pub(super) async fn publish(
     guest: Arc<Guest>,
     mut requests: Streaming<PublishRequest>,
 ) -> Result<PublishResponse, Status> {
-    let _place = guest.take(Taken::Publication)?;
+    let _place = guest.take(StreamKind::Publication)?;
     let next = async |requests: &mut Streaming<PublishRequest>| {
         tokio::select! {
             biased;

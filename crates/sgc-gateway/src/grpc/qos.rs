@@ -87,7 +87,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_said_of_a_qos_is_what_was_meant() {
+    fn qos_survives_conversion() {
         assert_eq!(from_proto(&proto::Qos::default()).unwrap(), Qos::default());
         let wanted = Qos {
             reliability: Reliability::BestEffort,

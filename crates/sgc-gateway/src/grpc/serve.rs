@@ -6,8 +6,8 @@ use std::sync::Arc;
 use sgc_ros::RequestId;
 use tonic::{Response, Status, Streaming};
 
-use super::client::{Guest, Place, Taken};
-use super::conversation::{Conversation, Told, begin, first};
+use super::client::{Guest, Place, StreamKind};
+use super::conversation::{Conversation, Responder, begin, first};
 use super::fault::Fault;
 use super::proto::serve_request::{Kind as Said, Reply, Server};
 use super::proto::serve_response::{Kind, Refused, Request, Served};
@@ -38,7 +38,7 @@ pub(super) async fn serve(
     guest: Arc<Guest>,
     mut requests: Streaming<ServeRequest>,
 ) -> Result<Response<Responses<ServeResponse>>, Status> {
-    let place = guest.take(Taken::Serving)?;
+    let place = guest.take(StreamKind::Serving)?;
     let Some(ServeRequest { kind: Some(Said::Server(server)) }) = first(&guest, &mut requests).await? else {
         return Err(ORDER.into());
     };
@@ -65,7 +65,7 @@ impl Conversation for Work {
     async fn work(
         &mut self,
         mut requests: Streaming<ServeRequest>,
-        told: &Told<ServeResponse>,
+        told: &Responder<ServeResponse>,
     ) -> Result<(), Status> {
         loop {
             // The place for a response is reserved first, so that cancellation loses nothing.

@@ -8,7 +8,7 @@ use tokio_stream::Stream;
 use tonic::metadata::MetadataMap;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::client::{Guest, Taken};
+use super::client::{Guest, StreamKind};
 use super::fault::Fault;
 use super::proto::gateway_server::Gateway;
 use super::proto::{
@@ -18,7 +18,7 @@ use super::proto::{
     WatchGraphResponse,
 };
 use super::tracking::{Slot, with_slot};
-use super::{action, graph, publish, qos, serve, subscribe, types};
+use super::{action, get_type, graph, publish, qos, serve, subscribe};
 use crate::content::Content;
 
 /// Time to wait for a reply if the client sets no deadline.
@@ -46,7 +46,7 @@ impl Gateway for Service {
         &self,
         request: Request<GetGraphRequest>,
     ) -> Result<Response<GetGraphResponse>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         Ok(Response::new(graph::graph(&guest, request.get_ref().include_hidden)))
     }
 
@@ -54,17 +54,17 @@ impl Gateway for Service {
         &self,
         request: Request<WatchGraphRequest>,
     ) -> Result<Response<Self::WatchGraphStream>, Status> {
-        let guest = Guest::of(&request)?;
-        let place = guest.take(Taken::Watching)?;
+        let guest = Guest::from_request(&request)?;
+        let place = guest.take(StreamKind::Watching)?;
         Ok(Response::new(graph::watch(place, request.get_ref().include_hidden)))
     }
 
     async fn get_type(&self, request: Request<GetTypeRequest>) -> Result<Response<GetTypeResponse>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         let (asked, name) = (Arc::clone(&guest), request.into_inner().r#type);
         let described = guest.session.hub().shared.run(move |shared| {
             asked.session.check_type(&name)?;
-            Ok(types::describe(&shared.types, &name))
+            Ok(get_type::describe(&shared.types, &name))
         });
         let described = described.await;
         Ok(Response::new(described.map_err(Fault::from)??))
@@ -74,7 +74,7 @@ impl Gateway for Service {
         &self,
         request: Request<Streaming<PublishRequest>>,
     ) -> Result<Response<PublishResponse>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         Ok(Response::new(publish::publish(guest, request.into_inner()).await?))
     }
 
@@ -82,12 +82,12 @@ impl Gateway for Service {
         &self,
         request: Request<SubscribeRequest>,
     ) -> Result<Response<Self::SubscribeStream>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         Ok(subscribe::subscribe(guest, request.into_inner()).await?)
     }
 
     async fn call(&self, request: Request<CallRequest>) -> Result<Response<CallResponse>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         let max = deadline(request.metadata()).unwrap_or(CALL_WAIT_MAX).min(CALL_WAIT_MAX);
         let max = max.saturating_sub(CALL_MARGIN_MAX.min(max / 10));
         let CallRequest { service, r#type, encoding, payload } = request.into_inner();
@@ -95,7 +95,7 @@ impl Gateway for Service {
         let content = Content { form, bytes: payload };
         let type_name = Some(&*r#type).filter(|name| !name.is_empty());
         // The call counts until there is room for its reply.
-        let _place = guest.take(Taken::Call)?;
+        let _place = guest.take(StreamKind::Call)?;
         let called = async {
             let payload = guest.session.call(&service, type_name, &content, form, max).await?;
             let room = guest.unread.take_for_reply(payload.len()).await?;
@@ -111,7 +111,7 @@ impl Gateway for Service {
         &self,
         request: Request<Streaming<ServeRequest>>,
     ) -> Result<Response<Self::ServeStream>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         serve::serve(guest, request.into_inner()).await
     }
 
@@ -119,7 +119,7 @@ impl Gateway for Service {
         &self,
         request: Request<Streaming<SendGoalRequest>>,
     ) -> Result<Response<Self::SendGoalStream>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         action::send_goal(guest, request.into_inner()).await
     }
 
@@ -127,7 +127,7 @@ impl Gateway for Service {
         &self,
         request: Request<Streaming<ServeActionRequest>>,
     ) -> Result<Response<Self::ServeActionStream>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         action::serve(guest, request.into_inner()).await
     }
 }

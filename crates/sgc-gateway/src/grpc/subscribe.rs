@@ -10,7 +10,7 @@ use sgc_ros::Guid;
 use tokio::sync::watch;
 use tonic::{Response, Status};
 
-use super::client::{Guest, Place, Taken};
+use super::client::{Guest, Place, StreamKind};
 use super::fault::Fault;
 use super::proto::subscribe_response::{Kind, Message, Subscribed, Unreadable};
 use super::proto::{SubscribeRequest, SubscribeResponse};
@@ -31,7 +31,7 @@ const DEPTH_MAX: u32 = 10_000;
 const RATE_MIN_HZ: f64 = 1e-5;
 
 /// A client's stream of a topic.
-struct Hearing {
+struct TopicStream {
     place: Place,
     subscription: Subscription,
     form: Form,
@@ -72,7 +72,7 @@ pub(super) async fn subscribe(
     request: SubscribeRequest,
 ) -> Result<Response<Responses<SubscribeResponse>>, Fault> {
     let (wanted, form) = wanted(request)?;
-    let place = guest.take(Taken::Subscription)?;
+    let place = guest.take(StreamKind::Subscription)?;
     let subscribed = async { Ok(guest.session.subscribe(wanted).await?) };
     let subscription = guest.admitted(subscribed).await?;
     guest.holds(&subscription);
@@ -82,7 +82,7 @@ pub(super) async fn subscribe(
     };
     let sources = Sources::new(guest.session.hub());
     let slot = Slot::default();
-    let hearing = Hearing { place, subscription, form, sources, first: Some(first), slot: slot.clone() };
+    let hearing = TopicStream { place, subscription, form, sources, first: Some(first), slot: slot.clone() };
     let responses: Responses<_> = Box::pin(stream::unfold(Some(hearing), |hearing| async {
         let mut hearing = hearing?;
         match hearing.next().await {
@@ -93,7 +93,7 @@ pub(super) async fn subscribe(
     Ok(with_slot(responses, slot))
 }
 
-impl Hearing {
+impl TopicStream {
     async fn next(&mut self) -> Result<Kind, Fault> {
         if let Some(first) = self.first.take() {
             return Ok(Kind::Subscribed(first));

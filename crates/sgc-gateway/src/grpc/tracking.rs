@@ -16,7 +16,7 @@ use tonic::server::NamedService;
 use tonic::{Response, Status};
 
 use super::client::Guest;
-use super::incoming::{Incoming, Kept};
+use super::incoming::{Incoming, KeptRooms};
 use super::proto::gateway_server::GatewayServer;
 use super::service::{Responses, Service};
 use crate::budget::Room;
@@ -33,10 +33,10 @@ impl Slot {
 }
 
 /// A response of a stream and its room.
-pub(super) type Told<T> = (Result<T, Status>, Option<Room>);
+pub(super) type TrackedResponse<T> = (Result<T, Status>, Option<Room>);
 
 /// Creates a stream of responses, each with its room.
-pub(super) fn respond<T: Send + 'static>(told: mpsc::Receiver<Told<T>>) -> Response<Responses<T>> {
+pub(super) fn respond<T: Send + 'static>(told: mpsc::Receiver<TrackedResponse<T>>) -> Response<Responses<T>> {
     let slot = Slot::default();
     let next = slot.clone();
     let responses: Responses<T> = Box::pin(ReceiverStream::new(told).map(move |(response, room)| {
@@ -81,7 +81,7 @@ impl tonic::codegen::Service<http::Request<Body>> for Tracking {
 
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
         // The only message of a call keeps its room until the reply is ready.
-        let kept: Option<Kept> = request.uri().path().ends_with("/Call").then(Kept::default);
+        let kept: Option<KeptRooms> = request.uri().path().ends_with("/Call").then(KeptRooms::default);
         let guest = request.extensions().get::<Arc<Guest>>().cloned();
         let request = match guest {
             Some(guest) => request.map(|body| Body::new(Incoming::new(body, guest, kept.clone()))),
@@ -93,7 +93,7 @@ impl tonic::codegen::Service<http::Request<Body>> for Tracking {
             drop(kept);
             let slot = response.extensions_mut().remove::<Slot>();
             Ok(match slot {
-                Some(slot) => response.map(|body| Body::new(Tracked { body, slot })),
+                Some(slot) => response.map(|body| Body::new(TrackedBody { body, slot })),
                 None => response,
             })
         })
@@ -101,24 +101,24 @@ impl tonic::codegen::Service<http::Request<Body>> for Tracking {
 }
 
 /// The body of a response, with the room of its messages.
-struct Tracked {
+struct TrackedBody {
     body: Body,
     slot: Slot,
 }
 
 /// Bytes and their room.
-struct Held {
+struct BytesWithRoom {
     bytes: Bytes,
     _room: Room,
 }
 
-impl AsRef<[u8]> for Held {
+impl AsRef<[u8]> for BytesWithRoom {
     fn as_ref(&self) -> &[u8] {
         &self.bytes
     }
 }
 
-impl http_body::Body for Tracked {
+impl http_body::Body for TrackedBody {
     type Data = Bytes;
     type Error = Status;
 
@@ -128,7 +128,7 @@ impl http_body::Body for Tracked {
     ) -> Poll<Option<Result<http_body::Frame<Bytes>, Status>>> {
         let frame = ready!(Pin::new(&mut self.body).poll_frame(cx));
         let with_room = |bytes| match lock(&self.slot.0).take() {
-            Some(_room) => Bytes::from_owner(Held { bytes, _room }),
+            Some(_room) => Bytes::from_owner(BytesWithRoom { bytes, _room }),
             None => bytes,
         };
         Poll::Ready(frame.map(|frame| frame.map(|frame| frame.map_data(with_room))))

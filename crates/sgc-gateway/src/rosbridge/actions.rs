@@ -20,7 +20,7 @@ use crate::action::{ActionEvent, ActionReplier, ActionServing, Feedback, Goal, G
 use crate::content::{Content, Form};
 use crate::error::GatewayError;
 use crate::hub::lock;
-use crate::quota::Held;
+use crate::quota::ByteReservation;
 use crate::session::Session;
 
 /// Time to wait for a goal, practically forever.
@@ -35,7 +35,7 @@ const GOALS_MAX: usize = 1024;
 
 /// A client's request to send a goal.
 #[derive(Clone, Debug)]
-pub(super) struct Wanted {
+pub(super) struct GoalRequest {
     pub(super) id: Option<OpId>,
     pub(super) action: String,
     pub(super) type_name: Option<String>,
@@ -44,7 +44,7 @@ pub(super) struct Wanted {
     pub(super) compression: Compression,
 }
 
-impl Wanted {
+impl GoalRequest {
     fn envelope(&self, op: &str, bytes: usize) -> Envelope {
         Envelope::new(op, self.compression, bytes).id(self.id.as_ref()).text("action", &self.action)
     }
@@ -61,8 +61,8 @@ impl Wanted {
 /// it any more.
 pub(super) async fn pursue(
     session: Arc<Session>,
-    wanted: Wanted,
-    args: (String, Held),
+    wanted: GoalRequest,
+    args: (String, ByteReservation),
     (cancel, mut end): (Arc<Notify>, oneshot::Receiver<GatewayError>),
     outbox: Outbox,
 ) {
@@ -109,7 +109,7 @@ pub(super) async fn pursue(
 
 async fn follow(
     session: &Session,
-    wanted: &Wanted,
+    wanted: &GoalRequest,
     goal: &Goal,
     mut feedback: Feedback,
     cancel: &Notify,
@@ -154,14 +154,14 @@ async fn follow(
     outbox.say_reply(result.finish_in_pieces(wanted.fragment_size, fragment_id)).await
 }
 
-async fn give_up(wanted: &Wanted, goal: &Goal, outbox: &Outbox) {
+async fn give_up(wanted: &GoalRequest, goal: &Goal, outbox: &Outbox) {
     if let Err(error) = goal.cancel().await {
         // Nothing waits here, because the client may not read.
         outbox.try_status(Level::Error, &told(&format!("cancel_action_goal: {error}")), wanted.id.as_ref());
     }
 }
 
-async fn tell(wanted: &Wanted, said: Result<bytes::Bytes, GatewayError>, outbox: &Outbox) {
+async fn tell(wanted: &GoalRequest, said: Result<bytes::Bytes, GatewayError>, outbox: &Outbox) {
     match said {
         Ok(values) => {
             let said = wanted.envelope("action_feedback", values.len()).content("values", &values);
@@ -215,7 +215,8 @@ impl ServedAction {
         let replier = serving.replier();
         let goals = Arc::default();
         let prefix: Arc<str> = format!("action_goal:{}:", serving.action()).into();
-        let told = Told { type_name, goals: Arc::clone(&goals), prefix: Arc::clone(&prefix), outbox };
+        let told =
+            GoalForwarder { type_name, goals: Arc::clone(&goals), prefix: Arc::clone(&prefix), outbox };
         let task = tokio::spawn(told.pass_on(serving));
         Self { replier, goals, prefix, task }
     }
@@ -243,14 +244,14 @@ impl ServedAction {
 }
 
 /// The task that forwards goals to a client.
-struct Told {
+struct GoalForwarder {
     type_name: String,
     goals: Arc<Mutex<Goals>>,
     prefix: Arc<str>,
     outbox: Outbox,
 }
 
-impl Told {
+impl GoalForwarder {
     async fn pass_on(self, mut serving: ActionServing) {
         let replier = serving.replier();
         while let Some(event) = serving.next().await {

@@ -8,27 +8,27 @@ use tokio::sync::{Notify, oneshot, watch};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 
-use super::actions::{ServedAction, Wanted, pursue};
+use super::actions::{GoalRequest, ServedAction, pursue};
 use super::calls::{Call, End, answer, refuse};
 use super::envelope::Compression;
 use super::fragments::Fragments;
 use super::input;
 use super::op::{Op, OpError, OpId, told};
 use super::options::{RosbridgeError, RosbridgeOptions};
-use super::outbox::{Gone, Level, Outbox};
-use super::qos::Said;
+use super::outbox::{ConnectionClosed, Level, Outbox};
+use super::qos::QosMember;
 use super::rosapi::local_name;
-use super::services::Served;
-use super::topics::{Topic, Wish};
+use super::services::ServedService;
+use super::topics::{SubscriptionRequest, Topic};
 use crate::access::Right;
 use crate::action::GoalStatus;
-use crate::aside::aside_if_long;
 use crate::content::Content;
+use crate::definitions::InterfaceType;
 use crate::error::GatewayError;
+use crate::offload::offload_if_long;
 use crate::publisher::Publication;
-use crate::quota::Held;
+use crate::quota::ByteReservation;
 use crate::session::{Advertise, Session, Subscribe, action_of};
-use crate::types::InterfaceType;
 
 /// Time for which a new publisher waits for the readers in the graph, so that these get its first message.
 const SETTLE_MAX: Duration = Duration::from_millis(500);
@@ -43,25 +43,25 @@ const PIECES_LATE: &str = "pieces of the message did not come in time, and it is
 const ENDED_SHOWN_MAX: usize = 16;
 
 /// A topic that a client publishes.
-struct Published {
+struct ClientPublication {
     publication: Publication,
     ids: BTreeSet<Option<OpId>>,
 }
 
 /// A call or goal in progress.
-struct UnderWay {
+struct PendingJob {
     /// The name of the service or action.
     name: String,
     end: End,
 }
 
 /// The number of errors that a client may still make.
-struct Patience {
+struct ErrorBudget {
     left: u32,
     since: Instant,
 }
 
-impl Patience {
+impl ErrorBudget {
     fn new() -> Self {
         Self { left: ERRORS_BURST, since: Instant::now() }
     }
@@ -90,18 +90,18 @@ pub(super) struct Connection {
     outbox: Outbox,
     is_admitted: bool,
     topics: BTreeMap<String, Topic>,
-    publications: BTreeMap<String, Published>,
+    publications: BTreeMap<String, ClientPublication>,
     /// Topics with unsent messages.
     unflushed: Vec<String>,
-    services: BTreeMap<String, Served>,
+    services: BTreeMap<String, ServedService>,
     actions: BTreeMap<String, ServedAction>,
     goals: BTreeMap<OpId, Arc<Notify>>,
     /// Calls and goals in progress by number, aborted with the connection.
     tasks: JoinSet<(u64, Option<OpId>)>,
-    under_way: BTreeMap<u64, UnderWay>,
+    under_way: BTreeMap<u64, PendingJob>,
     next_number: u64,
     fragments: Fragments,
-    patience: Patience,
+    patience: ErrorBudget,
 }
 
 /// The failure of an op.
@@ -118,14 +118,14 @@ impl From<OpError> for Failure {
     }
 }
 
-impl From<Gone> for Failure {
-    fn from(_: Gone) -> Self {
+impl From<ConnectionClosed> for Failure {
+    fn from(_: ConnectionClosed) -> Self {
         let closed = tokio_tungstenite::tungstenite::Error::ConnectionClosed;
         Self::End(RosbridgeError::Socket(Box::new(closed)))
     }
 }
 
-type Done = Result<(), Failure>;
+type OpResult = Result<(), Failure>;
 
 impl Connection {
     pub(super) fn new(session: Arc<Session>, options: Arc<RosbridgeOptions>, outbox: Outbox) -> Self {
@@ -146,7 +146,7 @@ impl Connection {
             under_way: BTreeMap::new(),
             next_number: 0,
             fragments,
-            patience: Patience::new(),
+            patience: ErrorBudget::new(),
         }
     }
 
@@ -162,7 +162,7 @@ impl Connection {
     /// Executes an op. Only an error that ends the connection is returned.
     pub(super) async fn take(&mut self, text: &str) -> Result<(), RosbridgeError> {
         let taken = self.take_op(text).await;
-        self.session.message_is_done_but(self.fragments.bytes());
+        self.session.finish_message_keeping(self.fragments.bytes());
         taken
     }
 
@@ -174,10 +174,10 @@ impl Connection {
                 self.goals.remove(&id);
             }
         }
-        let (done, id) = match aside_if_long(text.len(), || Op::parse(text)) {
+        let (done, id) = match offload_if_long(text.len(), || Op::parse(text)) {
             Ok(op) if op.name == "fragment" && self.is_admitted => match self.put_together(&op) {
                 Ok(None) => (Ok(()), None),
-                Ok(Some(whole)) => match aside_if_long(whole.len(), || Op::parse(&whole)) {
+                Ok(Some(whole)) => match offload_if_long(whole.len(), || Op::parse(&whole)) {
                     // An inner message without an id is answered with the id of its fragments.
                     Ok(inner) => (self.run(&inner).await, inner.id.or(op.id)),
                     Err(error) => (Err(error.into()), op.id),
@@ -223,7 +223,7 @@ impl Connection {
         Ok(())
     }
 
-    async fn run(&mut self, op: &Op<'_>) -> Done {
+    async fn run(&mut self, op: &Op<'_>) -> OpResult {
         if !self.is_admitted && op.name != "auth" {
             let how = r#"say who you are first: {"op":"auth","token":"…"}"#;
             return Err(op.refused(how).into());
@@ -259,7 +259,7 @@ impl Connection {
         }
     }
 
-    async fn auth(&mut self, op: &Op<'_>) -> Done {
+    async fn auth(&mut self, op: &Op<'_>) -> OpResult {
         let Some(authenticate) = &self.options.authenticate else {
             return Err(op.refused("this gateway takes no tokens here").into());
         };
@@ -297,7 +297,7 @@ impl Connection {
 
     /// Ends publications, services and other uses to which the client's new credential has no right, and reports
     /// them. Calls and goals report for themselves.
-    async fn end_what_is_not_permitted(&mut self, is_as_before: bool) -> Result<(), Gone> {
+    async fn end_what_is_not_permitted(&mut self, is_as_before: bool) -> Result<(), ConnectionClosed> {
         let (session, mut ended) = (&self.session, Vec::new());
         let mut may = |right, name: &str| {
             let checked = session.check(right, name);
@@ -335,13 +335,13 @@ impl Connection {
     fn begin(&mut self, name: &str) -> (u64, oneshot::Receiver<GatewayError>) {
         self.next_number += 1;
         let (end, ended) = oneshot::channel();
-        self.under_way.insert(self.next_number, UnderWay { name: name.to_owned(), end });
+        self.under_way.insert(self.next_number, PendingJob { name: name.to_owned(), end });
         (self.next_number, ended)
     }
 
-    fn set_level(&mut self, op: &Op<'_>) -> Done {
+    fn set_level(&mut self, op: &Op<'_>) -> OpResult {
         let name = op.needed_name("level")?;
-        let level = Level::of(&name);
+        let level = Level::from_name(&name);
         let level = level.ok_or_else(|| op.refused("\"level\" is none, error, warning or info"))?;
         self.outbox.set_level(level);
         Ok(())
@@ -374,12 +374,12 @@ impl Connection {
         Ok(())
     }
 
-    async fn advertise(&mut self, op: &Op<'_>) -> Done {
+    async fn advertise(&mut self, op: &Op<'_>) -> OpResult {
         let topic = op.needed_name("topic")?;
         let type_name = op.name("type")?;
         let said = match op.object("qos")? {
-            Some(raw) => Said::read(raw).map_err(|why| op.refused(why))?,
-            None => Said::default(),
+            Some(raw) => QosMember::read(raw).map_err(|why| op.refused(why))?,
+            None => QosMember::default(),
         };
         let qos = said.offer(op.bool("latch")?.unwrap_or(false), op.count("queue_size")?);
         if let Some(published) = self.publications.get_mut(&topic) {
@@ -406,7 +406,7 @@ impl Connection {
         self.begin_publishing(op, wanted).await
     }
 
-    async fn begin_publishing(&mut self, op: &Op<'_>, wanted: Advertise) -> Done {
+    async fn begin_publishing(&mut self, op: &Op<'_>, wanted: Advertise) -> OpResult {
         let max = self.session.limits().publications_max;
         let topic = wanted.topic.clone();
         let made = async {
@@ -417,11 +417,11 @@ impl Connection {
         publication.settle(SETTLE_MAX).await;
         // A topic published without an advertisement ends with any `unadvertise`.
         let ids = (op.name == "advertise").then(|| op.id.clone()).into_iter().collect();
-        self.publications.insert(topic, Published { publication, ids });
+        self.publications.insert(topic, ClientPublication { publication, ids });
         Ok(())
     }
 
-    fn unadvertise(&mut self, op: &Op<'_>) -> Done {
+    fn unadvertise(&mut self, op: &Op<'_>) -> OpResult {
         let topic = op.needed_name("topic")?;
         let Some(published) = self.publications.get_mut(&topic) else {
             let error = GatewayError::NotThere { name: topic, what: "advertised" };
@@ -437,11 +437,11 @@ impl Connection {
         Ok(())
     }
 
-    async fn publish(&mut self, op: &Op<'_>) -> Done {
+    async fn publish(&mut self, op: &Op<'_>) -> OpResult {
         let topic = op.needed_name("topic")?;
         let raw = op.needed_object("msg")?;
         if !self.publications.contains_key(&topic) {
-            let qos = Said::default().offer(op.bool("latch")?.unwrap_or(false), None);
+            let qos = QosMember::default().offer(op.bool("latch")?.unwrap_or(false), None);
             let wanted = Advertise { topic: topic.clone(), type_name: op.name("type")?, qos };
             self.begin_publishing(op, wanted).await?;
         }
@@ -459,16 +459,16 @@ impl Connection {
         Ok(done?)
     }
 
-    async fn subscribe(&mut self, op: &Op<'_>) -> Done {
+    async fn subscribe(&mut self, op: &Op<'_>) -> OpResult {
         let topic = op.needed_name("topic")?;
         let type_name = op.name("type")?;
         let said = match op.object("qos")? {
-            Some(raw) => Said::read(raw).map_err(|why| op.refused(why))?,
-            None => Said::default(),
+            Some(raw) => QosMember::read(raw).map_err(|why| op.refused(why))?,
+            None => QosMember::default(),
         };
         let throttle_ms = op.count("throttle_rate")?.unwrap_or(0);
         let queue_length = op.count("queue_length")?.unwrap_or(0);
-        let wish = Wish {
+        let wish = SubscriptionRequest {
             throttle: Duration::from_millis(throttle_ms as u64),
             queue_length: said.depth.map_or(queue_length, |depth| depth as usize),
             fragment_size: fragment_size(op)?,
@@ -503,7 +503,7 @@ impl Connection {
         Ok(())
     }
 
-    fn unsubscribe(&mut self, op: &Op<'_>) -> Done {
+    fn unsubscribe(&mut self, op: &Op<'_>) -> OpResult {
         let topic = op.needed_name("topic")?;
         let Some(heard) = self.topics.get_mut(&topic) else {
             let error = GatewayError::NotThere { name: topic, what: "subscribed to" };
@@ -516,7 +516,7 @@ impl Connection {
     }
 
     /// Calls a service. A refusal is also sent as a reply, because the caller waits for one.
-    async fn call_service(&mut self, op: &Op<'_>) -> Done {
+    async fn call_service(&mut self, op: &Op<'_>) -> OpResult {
         let begun = self.begin_call(op);
         if let (Err(error), Some(id)) = (&begun, &op.id) {
             let service = op.name("service").ok().flatten().unwrap_or_default();
@@ -560,12 +560,12 @@ impl Connection {
     }
 
     /// Reserves room for arguments, whose bytes are bounded, too.
-    fn hold(&self, op: &Op<'_>) -> Result<Held, OpError> {
+    fn hold(&self, op: &Op<'_>) -> Result<ByteReservation, OpError> {
         let bytes = op.raw("args").map_or(0, str::len);
         self.session.hold_arguments(bytes).map_err(|error| op.gateway(error))
     }
 
-    async fn advertise_service(&mut self, op: &Op<'_>) -> Done {
+    async fn advertise_service(&mut self, op: &Op<'_>) -> OpResult {
         let service = op.needed_name("service")?;
         let type_name = op.needed_name("type")?;
         self.check_servings(op)?;
@@ -573,7 +573,7 @@ impl Connection {
         self.services.remove(&service);
         let serving = self.session.serve(&service, Some(&type_name)).await;
         let serving = serving.map_err(|error| op.gateway(error))?;
-        self.services.insert(service, Served::new(serving, self.outbox.clone()));
+        self.services.insert(service, ServedService::new(serving, self.outbox.clone()));
         Ok(())
     }
 
@@ -583,7 +583,7 @@ impl Connection {
         checked.map_err(|error| op.gateway(error))
     }
 
-    fn unadvertise_service(&mut self, op: &Op<'_>) -> Done {
+    fn unadvertise_service(&mut self, op: &Op<'_>) -> OpResult {
         let service = op.needed_name("service")?;
         match self.services.remove(&service) {
             Some(_) => Ok(()),
@@ -594,7 +594,7 @@ impl Connection {
         }
     }
 
-    async fn service_response(&mut self, op: &Op<'_>) -> Done {
+    async fn service_response(&mut self, op: &Op<'_>) -> OpResult {
         let service = op.needed_name("service")?;
         let is_done = op.bool("result")?.unwrap_or(true);
         let Some(served) = self.services.get(&service) else {
@@ -622,7 +622,7 @@ impl Connection {
     }
 
     /// Sends a goal. A refusal is also sent as a result, because the client waits for one.
-    async fn send_action_goal(&mut self, op: &Op<'_>) -> Done {
+    async fn send_action_goal(&mut self, op: &Op<'_>) -> OpResult {
         let is_known = op.id.as_ref().is_some_and(|id| self.goals.contains_key(id));
         if is_known {
             // The result would be taken for that of the other goal.
@@ -630,7 +630,7 @@ impl Connection {
         }
         let begun = self.begin_goal(op);
         if let (Err(error), Some(_)) = (&begun, &op.id) {
-            let wanted = Wanted {
+            let wanted = GoalRequest {
                 id: op.id.clone(),
                 action: op.name("action").ok().flatten().unwrap_or_default(),
                 type_name: None,
@@ -651,7 +651,7 @@ impl Connection {
             Some(name) => Some(name),
             None => op.name("type")?,
         };
-        let wanted = Wanted {
+        let wanted = GoalRequest {
             id: op.id.clone(),
             action,
             type_name,
@@ -682,14 +682,14 @@ impl Connection {
         Ok(())
     }
 
-    fn cancel_action_goal(&mut self, op: &Op<'_>) -> Done {
+    fn cancel_action_goal(&mut self, op: &Op<'_>) -> OpResult {
         let goal = op.id.as_ref().and_then(|id| self.goals.get(id));
         let goal = goal.ok_or_else(|| op.refused("no goal of that id is under way"))?;
         goal.notify_one();
         Ok(())
     }
 
-    async fn advertise_action(&mut self, op: &Op<'_>) -> Done {
+    async fn advertise_action(&mut self, op: &Op<'_>) -> OpResult {
         let action = op.needed_name("action")?;
         let type_name = op.needed_name("type")?;
         self.check_servings(op)?;
@@ -702,7 +702,7 @@ impl Connection {
         Ok(())
     }
 
-    fn unadvertise_action(&mut self, op: &Op<'_>) -> Done {
+    fn unadvertise_action(&mut self, op: &Op<'_>) -> OpResult {
         let action = op.needed_name("action")?;
         match self.actions.remove(&action) {
             Some(_) => Ok(()),
@@ -717,7 +717,7 @@ impl Connection {
         served.ok_or_else(|| op.gateway(GatewayError::NotThere { name: action, what: "served" }))
     }
 
-    async fn action_feedback(&mut self, op: &Op<'_>) -> Done {
+    async fn action_feedback(&mut self, op: &Op<'_>) -> OpResult {
         let served = self.served_action(op)?;
         let goal =
             served.goal(op.id.as_ref()).ok_or_else(|| op.refused("no goal of that id is under way"))?;
@@ -727,14 +727,14 @@ impl Connection {
         input::tolerate_later(values, tell).await.map_err(|error| op.gateway(error).into())
     }
 
-    async fn action_result(&mut self, op: &Op<'_>) -> Done {
+    async fn action_result(&mut self, op: &Op<'_>) -> OpResult {
         let served = self.served_action(op)?;
         let goal =
             served.goal(op.id.as_ref()).ok_or_else(|| op.refused("no goal of that id is under way"))?;
         let is_done = op.bool("result")?.unwrap_or(true);
         let status = match (is_done, op.integer("status")?) {
             (true, None) => GoalStatus::Succeeded,
-            (_, Some(status)) if GoalStatus::of(status).is_end() => GoalStatus::of(status),
+            (_, Some(status)) if GoalStatus::from_number(status).is_end() => GoalStatus::from_number(status),
             (false, _) => GoalStatus::Aborted,
             (true, Some(status)) => {
                 return Err(op.refused(format!("status {status} is no end of a goal")).into());
@@ -749,7 +749,7 @@ impl Connection {
     }
 
     /// Checks the status that a client reports for its goal. The gateway itself reports to ROS 2.
-    fn action_status(&mut self, op: &Op<'_>) -> Done {
+    fn action_status(&mut self, op: &Op<'_>) -> OpResult {
         let served = self.served_action(op)?;
         served.goal(op.id.as_ref()).ok_or_else(|| op.refused("no goal of that id is under way"))?;
         Ok(())
@@ -762,7 +762,7 @@ fn unpublished(op: &str, topic: &str, error: &GatewayError) -> OpError {
 
 fn compression(op: &Op<'_>) -> Result<Compression, OpError> {
     let name = op.name("compression")?.unwrap_or_default();
-    Compression::of(&name).map_err(|why| op.refused(why))
+    Compression::from_name(&name).map_err(|why| op.refused(why))
 }
 
 /// Reads the fragment size, at least one byte.
@@ -785,12 +785,12 @@ mod tests {
     use tokio_tungstenite::tungstenite::protocol::Role;
 
     use super::*;
-    use crate::access::{Access, AccessRules, Admission, Anonymous, Client};
+    use crate::access::{Access, AccessRules, AdmissionRequest, Anonymous, Client};
     use crate::budget::UNIT_BYTES;
+    use crate::definitions::{ShippedDefinitions, Types};
     use crate::hub::{Hub, HubOptions};
-    use crate::inflow::{Inflow, Metered};
+    use crate::inflow::{Inflow, MeteredStream};
     use crate::session::SessionLimits;
-    use crate::types::{Shipped, Types};
 
     /// Returns a client of another host.
     fn remote_client() -> Client {
@@ -798,7 +798,7 @@ mod tests {
         let peer: SocketAddr = "10.0.0.1:1".parse().unwrap();
         let now = UnixMillis(1_795_000_000_000);
         let admission =
-            Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now };
+            AdmissionRequest { peer, encrypted: true, origin: None, token: None, certificate: None, now };
         access.admit(&admission).unwrap()
     }
 
@@ -808,7 +808,7 @@ mod tests {
         const LEFT_BYTES: usize = 8 << 20;
         const PIECE_BYTES: usize = 1 << 20;
         let own = Arc::new(FakeDomain::default().join(false));
-        let hub = Hub::start(own, Types::new(Shipped), HubOptions::default()).await.unwrap();
+        let hub = Hub::start(own, Types::new(ShippedDefinitions), HubOptions::default()).await.unwrap();
         let client = remote_client();
         let quota = hub.shared.quotas.quota(&client);
         let units = |bytes: usize| u32::try_from(bytes / UNIT_BYTES).unwrap();
@@ -852,14 +852,14 @@ mod tests {
     async fn pieces_that_do_not_come_in_time_are_given_up_with_their_room() {
         const PIECE_BYTES: usize = 4 << 20;
         let own = Arc::new(FakeDomain::default().join(false));
-        let hub = Hub::start(own, Types::new(Shipped), HubOptions::default()).await.unwrap();
+        let hub = Hub::start(own, Types::new(ShippedDefinitions), HubOptions::default()).await.unwrap();
         let client = remote_client();
         let inflow: Arc<Inflow> = Arc::default();
         let session = Session::new(&hub, client.clone(), SessionLimits::default());
         let session = Arc::new(session.metered_by(Arc::clone(&inflow)));
         let (here, there) = tokio::io::duplex(1 << 20);
         let options = RosbridgeOptions::default();
-        let there = Metered::new(there, inflow);
+        let there = MeteredStream::new(there, inflow);
         let there = WebSocketStream::from_raw_socket(there, Role::Server, Some(options.websocket())).await;
         let _served = tokio::spawn(super::super::serve(there, session, options));
         let mut page = WebSocketStream::from_raw_socket(here, Role::Client, None).await;
@@ -892,8 +892,8 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn who_errs_now_and_then_is_forgiven() {
-        let mut patience = Patience::new();
+    async fn occasional_errors_are_forgiven() {
+        let mut patience = ErrorBudget::new();
         for _ in 0..10_000 {
             assert!(patience.count(Instant::now()));
             tokio::time::advance(Duration::from_millis(11)).await;

@@ -24,7 +24,7 @@ pub(super) enum Compression {
 
 impl Compression {
     /// Parses the name of a compression. The error explains why one is not offered.
-    pub(super) fn of(name: &str) -> Result<Self, &'static str> {
+    pub(super) fn from_name(name: &str) -> Result<Self, &'static str> {
         Ok(match name {
             "none" | "" => Self::None,
             "cbor" => Self::Cbor,

@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_kept_is_bounded() {
+    fn kept_fragments_are_bounded() {
         let (mut fragments, now) = (Fragments::new(1000), Instant::now());
         for number in 0..100 {
             assert_eq!(fragments.take(&id(number), 0, 2, "x".repeat(200), now), Ok(None));

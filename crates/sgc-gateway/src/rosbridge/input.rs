@@ -12,9 +12,9 @@ use serde_json::value::RawValue;
 use serde_json::{Map, Value as Json};
 use sgc_cdr::{Layout, Value};
 
-use crate::aside::aside_if_long;
 use crate::content::Content;
 use crate::error::GatewayError;
+use crate::offload::offload_if_long;
 
 /// Most values of a text that is converted, estimated by its commas and brackets, because a parsed value takes far
 /// more memory than its text.
@@ -24,7 +24,7 @@ const VALUES_MAX: usize = 1 << 20;
 /// current time.
 pub(super) fn message(layout: &Layout, raw: &str) -> Result<Value, GatewayError> {
     let read = |raw: &str| layout.from_json(raw.as_bytes()).map_err(GatewayError::Value);
-    let mut value = aside_if_long(raw.len(), || tolerate(raw, read))?;
+    let mut value = offload_if_long(raw.len(), || tolerate(raw, read))?;
     if layout.begins_with_header() && !has_stamp(raw) {
         stamp(&mut value, now());
     }
@@ -34,7 +34,7 @@ pub(super) fn message(layout: &Layout, raw: &str) -> Result<Value, GatewayError>
 /// Reads a message, and on failure once more as ROS 1 would have written it.
 fn tolerate<T>(raw: &str, read: impl Fn(&str) -> Result<T, GatewayError>) -> Result<T, GatewayError> {
     match read(raw) {
-        Err(error @ GatewayError::Value(_)) => match of_ros_1(raw) {
+        Err(error @ GatewayError::Value(_)) => match from_ros_1(raw) {
             Some(other) => read(&other),
             None => Err(error),
         },
@@ -48,7 +48,7 @@ where
     F: Future<Output = Result<T, GatewayError>>,
 {
     match read(Content::json(raw.to_owned())).await {
-        Err(error @ GatewayError::Value(_)) => match aside_if_long(raw.len(), || of_ros_1(raw)) {
+        Err(error @ GatewayError::Value(_)) => match offload_if_long(raw.len(), || from_ros_1(raw)) {
             Some(other) => read(Content::json(other)).await,
             None => Err(error),
         },
@@ -79,7 +79,7 @@ pub(super) fn arguments(
 
 /// Returns the JSON with ROS 2's names for `secs` and `nsecs` and without null stamps, or `None` if there are none or
 /// it has more than [`VALUES_MAX`] values.
-fn of_ros_1(raw: &str) -> Option<String> {
+fn from_ros_1(raw: &str) -> Option<String> {
     if raw.bytes().filter(|byte| matches!(byte, b',' | b'[' | b'{')).nth(VALUES_MAX).is_some() {
         return None;
     }
@@ -109,8 +109,8 @@ fn rename_time(members: &mut Map<String, Json>) -> bool {
     if !is_time || members.is_empty() {
         return false;
     }
-    for (of_ros_1, of_ros_2) in [("secs", "sec"), ("nsecs", "nanosec")] {
-        if let Some(value) = members.remove(of_ros_1) {
+    for (from_ros_1, of_ros_2) in [("secs", "sec"), ("nsecs", "nanosec")] {
+        if let Some(value) = members.remove(from_ros_1) {
             members.insert(of_ros_2.to_owned(), value);
         }
     }
@@ -118,20 +118,20 @@ fn rename_time(members: &mut Map<String, Json>) -> bool {
 }
 
 #[derive(Deserialize)]
-struct Headed<'a> {
+struct WithHeader<'a> {
     #[serde(borrow)]
     header: Option<&'a RawValue>,
 }
 
 #[derive(Deserialize)]
-struct Stamped<'a> {
+struct WithStamp<'a> {
     #[serde(borrow)]
     stamp: Option<&'a RawValue>,
 }
 
 fn has_stamp(raw: &str) -> bool {
-    let header = serde_json::from_str::<Headed<'_>>(raw).ok().and_then(|headed| headed.header);
-    let stamped = header.and_then(|header| serde_json::from_str::<Stamped<'_>>(header.get()).ok());
+    let header = serde_json::from_str::<WithHeader<'_>>(raw).ok().and_then(|headed| headed.header);
+    let stamped = header.and_then(|header| serde_json::from_str::<WithStamp<'_>>(header.get()).ok());
     stamped.is_some_and(|stamped| stamped.stamp.is_some())
 }
 
@@ -153,10 +153,10 @@ pub(super) fn now() -> Duration {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::types::{Shipped, Types};
+    use crate::definitions::{ShippedDefinitions, Types};
 
     fn layout(name: &str) -> Arc<Layout> {
-        Types::new(Shipped).layout(name, None).unwrap()
+        Types::new(ShippedDefinitions).layout(name, None).unwrap()
     }
 
     #[test]
@@ -168,7 +168,7 @@ mod tests {
         assert_eq!(read.at("header.stamp.nanosec"), Some(Value::Uint(4)));
         // A text with very many values is not converted.
         let many = format!(r#"{{"secs":3,"a":[0{}]}}"#, ",0".repeat(VALUES_MAX));
-        assert_eq!((of_ros_1(&many), of_ros_1(r#"{"secs":3}"#)), (None, Some(r#"{"sec":3}"#.to_owned())));
+        assert_eq!((from_ros_1(&many), from_ros_1(r#"{"secs":3}"#)), (None, Some(r#"{"sec":3}"#.to_owned())));
         // A member that only looks like a time stays wrong.
         let wrong = message(&layout, r#"{"point":{"secs":1,"x":2}}"#).unwrap_err();
         assert_eq!(wrong.to_string(), "not a message of that type: point: there is no member \"secs\"");

@@ -30,7 +30,7 @@ use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 
-use crate::access::Denied;
+use crate::access::Denial;
 use crate::session::Session;
 use crate::ws::close_reason;
 use connection::Connection;
@@ -38,7 +38,7 @@ pub use options::{
     Authenticate, ROSBRIDGE_ADMISSION_MAX, ROSBRIDGE_CALL_MAX, ROSBRIDGE_MESSAGE_BYTES_MAX,
     ROSBRIDGE_SILENCE_MAX, RosbridgeError, RosbridgeOptions,
 };
-use outbox::{Outbox, Outgoing, Pulse, write_all, write_rest};
+use outbox::{Outbox, Outgoing, PingState, write_all, write_rest};
 
 /// Shortest interval of pings.
 const PING_INTERVAL_MIN: Duration = Duration::from_millis(10);
@@ -63,7 +63,7 @@ where
 {
     let options = Arc::new(options);
     let (outbox, mut outgoing) = Outbox::new(session.limits().waiting_bytes_max, session.quota().clone());
-    let pulse = Pulse::default();
+    let pulse = PingState::default();
     let (mut sink, mut stream) = socket.split();
     let mut connection = Connection::new(session, Arc::clone(&options), outbox);
     let denied = until_denied(connection.sessions());
@@ -92,7 +92,7 @@ where
 }
 
 /// Waits until the current rights of the client end.
-async fn until_denied(mut sessions: watch::Receiver<Arc<Session>>) -> Denied {
+async fn until_denied(mut sessions: watch::Receiver<Arc<Session>>) -> Denial {
     loop {
         let session = Arc::clone(&sessions.borrow_and_update());
         tokio::select! {
@@ -121,7 +121,7 @@ where
 async fn read_all<R>(
     stream: &mut R,
     connection: &mut Connection,
-    pulse: &Pulse,
+    pulse: &PingState,
     options: &RosbridgeOptions,
 ) -> Result<(), RosbridgeError>
 where
@@ -184,7 +184,7 @@ fn ping_interval(silence_max: Duration) -> Duration {
 }
 
 /// Fails if a ping is unanswered for too long.
-fn look(pulse: &Pulse, options: &RosbridgeOptions) -> Result<(), RosbridgeError> {
+fn look(pulse: &PingState, options: &RosbridgeOptions) -> Result<(), RosbridgeError> {
     match pulse.unanswered() {
         Some(since) if since.elapsed() >= options.silence_max => {
             Err(RosbridgeError::Silent(options.silence_max))

@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_echoed_is_short() {
+    fn echoed_text_is_short() {
         let text = format!(r#"{{"op":"{}","n":"{}"}}"#, "ä".repeat(10_000), "x".repeat(10_000));
         let op = Op::parse(&text).unwrap();
         let errors =
@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_op_is_told_as_such() {
+    fn invalid_ops_are_reported() {
         for wrong in ["[]", "3", "null", "{}", r#"{"op":3}"#] {
             assert_eq!(Op::parse(wrong).unwrap_err(), OpError::NoOp, "{wrong}");
         }

@@ -8,7 +8,7 @@ use std::time::Duration;
 use tokio_tungstenite::tungstenite;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 
-use crate::access::{Client, Denied};
+use crate::access::{Client, Denial};
 use crate::error::GatewayError;
 
 /// Longest message of a client, in bytes, in one frame or in fragments.
@@ -99,7 +99,7 @@ pub enum RosbridgeError {
     NoRoom(#[source] GatewayError),
     /// The client's rights ended.
     #[error("the client's right has ended: {0}")]
-    Denied(#[source] Denied),
+    Denied(#[source] Denial),
 }
 
 impl RosbridgeError {
@@ -111,7 +111,7 @@ impl RosbridgeError {
             Self::TooManyErrors => (1008, "too many errors".to_owned()),
             Self::NotAdmitted(why) => (1008, why.clone()),
             Self::NoRoom(why) => (1013, why.to_string()),
-            Self::Denied(why) => (1008, why.told().to_owned()),
+            Self::Denied(why) => (1008, why.client_message().to_owned()),
         })
     }
 

@@ -41,7 +41,7 @@ pub(super) enum Level {
 }
 
 impl Level {
-    pub(super) fn of(name: &str) -> Option<Self> {
+    pub(super) fn from_name(name: &str) -> Option<Self> {
         Some(match name {
             "none" => Self::None,
             "error" => Self::Error,
@@ -64,7 +64,7 @@ impl Level {
 /// The frames queued for a client.
 #[derive(Clone, Debug)]
 pub(super) struct Outbox {
-    control: mpsc::Sender<Said>,
+    control: mpsc::Sender<ControlFrame>,
     batches: mpsc::Sender<Vec<Frame>>,
     level: Arc<AtomicU8>,
     room: Arc<Budget>,
@@ -73,12 +73,12 @@ pub(super) struct Outbox {
 
 /// A frame of the first lane, and its room until it is written.
 #[derive(Debug)]
-struct Said {
+struct ControlFrame {
     frame: Frame,
     room: Option<Room>,
 }
 
-impl Said {
+impl ControlFrame {
     fn frames(self) -> (Vec<Frame>, Option<Room>) {
         (vec![self.frame], self.room)
     }
@@ -87,7 +87,7 @@ impl Said {
 /// The receiving end of an [`Outbox`].
 #[derive(Debug)]
 pub(super) struct Outgoing {
-    control: mpsc::Receiver<Said>,
+    control: mpsc::Receiver<ControlFrame>,
     batches: mpsc::Receiver<Vec<Frame>>,
 }
 
@@ -103,7 +103,7 @@ impl Outgoing {
 
 /// The error of an ended connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Gone;
+pub(super) struct ConnectionClosed;
 
 impl Outbox {
     /// Creates an outbox with `bytes_max` bytes of room for long replies and requests.
@@ -123,9 +123,9 @@ impl Outbox {
     }
 
     /// Queues a frame once there is room.
-    pub(super) async fn say(&self, frame: Frame) -> Result<(), Gone> {
+    pub(super) async fn say(&self, frame: Frame) -> Result<(), ConnectionClosed> {
         let room = self.room.take(frame.bytes()).await;
-        self.control.send(Said { frame, room }).await.map_err(|_| Gone)
+        self.control.send(ControlFrame { frame, room }).await.map_err(|_| ConnectionClosed)
     }
 
     /// Queues a reply, whose memory is taken already, once there is room.
@@ -134,7 +134,7 @@ impl Outbox {
     /// Too many bytes of replies wait. An ended connection is no error, because there is no client to inform.
     pub(super) async fn say_reply(&self, frame: Frame) -> Result<(), GatewayError> {
         let room = self.room.take_for_reply(frame.bytes()).await?;
-        let _ = self.control.send(Said { frame, room }).await;
+        let _ = self.control.send(ControlFrame { frame, room }).await;
         Ok(())
     }
 
@@ -150,7 +150,12 @@ impl Outbox {
     }
 
     /// Sends a status if the client's level asks for it.
-    pub(super) async fn status(&self, level: Level, told: &str, id: Option<&OpId>) -> Result<(), Gone> {
+    pub(super) async fn status(
+        &self,
+        level: Level,
+        told: &str,
+        id: Option<&OpId>,
+    ) -> Result<(), ConnectionClosed> {
         match self.status_frame(level, told, id) {
             Some(frame) => self.say(frame).await,
             None => Ok(()),
@@ -160,21 +165,21 @@ impl Outbox {
     /// Sends a status without waiting. It is dropped if there is no room.
     pub(super) fn try_status(&self, level: Level, told: &str, id: Option<&OpId>) {
         if let Some(frame) = self.status_frame(level, told, id) {
-            let _ = self.control.try_send(Said { frame, room: None });
+            let _ = self.control.try_send(ControlFrame { frame, room: None });
         }
     }
 
     /// Waits for a place for messages, so that messages are encoded only when there is one.
-    pub(super) async fn place(&self) -> Result<mpsc::Permit<'_, Vec<Frame>>, Gone> {
-        self.batches.reserve().await.map_err(|_| Gone)
+    pub(super) async fn place(&self) -> Result<mpsc::Permit<'_, Vec<Frame>>, ConnectionClosed> {
+        self.batches.reserve().await.map_err(|_| ConnectionClosed)
     }
 }
 
 /// The time since which a ping has not been answered.
 #[derive(Debug, Default)]
-pub(super) struct Pulse(Mutex<Option<Instant>>);
+pub(super) struct PingState(Mutex<Option<Instant>>);
 
-impl Pulse {
+impl PingState {
     fn asked(&self) {
         self.lock().get_or_insert_with(Instant::now);
     }
@@ -197,7 +202,7 @@ impl Pulse {
 pub(super) async fn write_all<W>(
     sink: &mut W,
     outgoing: &mut Outgoing,
-    pulse: &Pulse,
+    pulse: &PingState,
     silence_max: Duration,
 ) -> RosbridgeError
 where
@@ -228,7 +233,7 @@ where
                 if bytes >= FLUSH_BYTES {
                     break;
                 }
-                let next = outgoing.control.try_recv().map(Said::frames);
+                let next = outgoing.control.try_recv().map(ControlFrame::frames);
                 let next = next.or_else(|_| outgoing.batches.try_recv().map(|batch| (batch, None)));
                 drop(room);
                 (frames, room) = match next {

@@ -12,7 +12,7 @@ const DEPTH_MAX: u32 = 10_000;
 
 /// The member `qos`.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct Said {
+pub(super) struct QosMember {
     reliability: Option<Reliability>,
     durability: Option<Durability>,
     keeps_all: bool,
@@ -29,7 +29,7 @@ enum Span {
     Word(String),
 }
 
-impl Said {
+impl QosMember {
     /// Parses the member; an error explains what is wrong. A policy with the value `best_available` counts as
     /// missing.
     pub(super) fn read(raw: &str) -> Result<Self, String> {
@@ -119,8 +119,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_said_is_offered_and_requested() {
-        let said = Said::read(
+    fn qos_member_decides_offer_and_request() {
+        let said = QosMember::read(
             r#"{"reliability":"best_effort","durability":"TRANSIENT_LOCAL","depth":5,"history":"keep_last",
             "deadline":0.5,"lifespan":{"secs":1,"nsecs":2}}"#,
         )
@@ -133,13 +133,13 @@ mod tests {
         assert_eq!((offer.history, offer.deadline_ns), (History::KeepLast(5), Some(500_000_000)));
         assert_eq!(offer.lifespan_ns, Some(1_000_000_002));
         assert_eq!(said.request().unwrap().durability, Durability::TransientLocal);
-        let none = Said::read(r#"{"reliability":"best_available","deadline":"infinite"}"#).unwrap();
+        let none = QosMember::read(r#"{"reliability":"best_available","deadline":"infinite"}"#).unwrap();
         assert_eq!((none.request(), none.offer(true, Some(7)).history), (None, History::KeepLast(1)));
-        assert_eq!(Said::default().offer(false, Some(7)).history, History::KeepLast(7));
+        assert_eq!(QosMember::default().offer(false, Some(7)).history, History::KeepLast(7));
     }
 
     #[test]
-    fn what_is_wrong_is_told() {
+    fn invalid_qos_is_explained() {
         for (raw, told) in [
             ("3", "\"qos\" is no object"),
             (r#"{"reliability":"often"}"#, r#""qos": "reliability" cannot be "often""#),
@@ -147,7 +147,7 @@ mod tests {
             (r#"{"deadline":"soon"}"#, r#""qos": "deadline" is no time: "soon""#),
             (r#"{"colour":"red"}"#, r#""qos" has no member "colour""#),
         ] {
-            assert_eq!(Said::read(raw).unwrap_err(), told);
+            assert_eq!(QosMember::read(raw).unwrap_err(), told);
         }
     }
 }

@@ -11,10 +11,10 @@ use super::input;
 use super::options::RosbridgeOptions;
 use super::params::ParamError;
 use super::{params, typedefs};
-use crate::aside::aside;
+use crate::definitions::InterfaceType;
 use crate::graph::{Graph, NodeInfo, is_hidden};
+use crate::offload::offload;
 use crate::session::Session;
-use crate::types::InterfaceType;
 
 /// Longest arguments, in bytes, because errors echo them.
 const ARGS_BYTES_MAX: usize = 64 << 10;
@@ -106,20 +106,20 @@ impl RosApi<'_> {
             "action_goal_details" => self.typedefs(InterfaceType::Action, &args.type_name, "_Goal"),
             "action_result_details" => self.typedefs(InterfaceType::Action, &args.type_name, "_Result"),
             "action_feedback_details" => self.typedefs(InterfaceType::Action, &args.type_name, "_Feedback"),
-            _ => Ok(self.of_graph(service, &args)),
+            _ => Ok(self.graph_answer(service, &args)),
         })
     }
 
     fn typedefs(&self, of: InterfaceType, type_name: &str, part: &str) -> Result<Json, String> {
         let full = of.full_name(type_name).map_err(|error| error.to_string())?;
-        let found = aside(|| {
+        let found = offload(|| {
             self.session.check_type(&full)?;
             typedefs::typedefs(self.session.hub().types(), &format!("{full}{part}"))
         });
         found.map(|typedefs| json!({ "typedefs": typedefs })).map_err(|error| error.to_string())
     }
 
-    fn of_graph(&self, service: &str, args: &Args) -> Json {
+    fn graph_answer(&self, service: &str, args: &Args) -> Json {
         let graph = self.session.graph();
         let shown = |name: &&String| !is_hidden(name);
         let topics = || {
@@ -148,7 +148,7 @@ impl RosApi<'_> {
                 let (names, types): (Vec<_>, Vec<_>) = topics().unzip();
                 let types_known = self.session.hub().types();
                 let read = || types.iter().map(|of| typedefs::full_text(types_known, of)).collect::<Vec<_>>();
-                let texts = aside(read);
+                let texts = offload(read);
                 json!({ "topics": names, "types": types, "typedefs_full_text": texts })
             }
             "topics_for_type" => {

@@ -1,4 +1,4 @@
-//! [`Served`]: a service that a client serves. Requests go to the client as op `call_service`, and answers come back
+//! [`ServedService`]: a service that a client serves. Requests go to the client as op `call_service`, and answers come back
 //! as `service_response`.
 
 use std::collections::BTreeMap;
@@ -29,20 +29,20 @@ pub(super) fn next_number() -> u64 {
 
 /// A service that a client serves, until dropped.
 #[derive(Debug)]
-pub(super) struct Served {
+pub(super) struct ServedService {
     replier: Replier,
     pending: Arc<Mutex<Pending>>,
     prefix: Arc<str>,
     task: JoinHandle<()>,
 }
 
-impl Drop for Served {
+impl Drop for ServedService {
     fn drop(&mut self) {
         self.task.abort();
     }
 }
 
-impl Served {
+impl ServedService {
     pub(super) fn new(serving: Serving, outbox: Outbox) -> Self {
         let replier = serving.replier();
         let pending = Arc::default();

@@ -28,7 +28,7 @@ const WARN_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The request of one subscription.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Wish {
+pub(super) struct SubscriptionRequest {
     pub(super) throttle: Duration,
     pub(super) queue_length: usize,
     pub(super) fragment_size: Option<usize>,
@@ -50,7 +50,7 @@ struct Pace {
 #[derive(Debug)]
 pub(super) struct Topic {
     type_name: String,
-    wishes: BTreeMap<Option<OpId>, Wish>,
+    wishes: BTreeMap<Option<OpId>, SubscriptionRequest>,
     pace: watch::Sender<Pace>,
     task: JoinHandle<()>,
 }
@@ -63,11 +63,16 @@ impl Drop for Topic {
 
 impl Topic {
     /// Returns the queue length for a request.
-    pub(super) fn depth(wish: &Wish) -> usize {
+    pub(super) fn depth(wish: &SubscriptionRequest) -> usize {
         wish.depth()
     }
 
-    pub(super) fn new(subscription: Subscription, id: Option<OpId>, wish: Wish, outbox: Outbox) -> Self {
+    pub(super) fn new(
+        subscription: Subscription,
+        id: Option<OpId>,
+        wish: SubscriptionRequest,
+        outbox: Outbox,
+    ) -> Self {
         let wishes = BTreeMap::from([(id, wish)]);
         let (pace, followed) = watch::channel(pace(wishes.values(), 0));
         let type_name = subscription.type_name().to_owned();
@@ -90,7 +95,7 @@ impl Topic {
     }
 
     /// Adds a subscription, or changes the request of one.
-    pub(super) fn add(&mut self, id: Option<OpId>, wish: Wish) {
+    pub(super) fn add(&mut self, id: Option<OpId>, wish: SubscriptionRequest) {
         let is_new = self.wishes.insert(id, wish).is_none();
         self.change(u64::from(is_new));
     }
@@ -110,7 +115,7 @@ impl Topic {
     }
 }
 
-impl Wish {
+impl SubscriptionRequest {
     /// Returns the queue length.
     fn depth(&self) -> usize {
         match self.queue_length {
@@ -123,11 +128,11 @@ impl Wish {
 }
 
 /// Returns the shortest interval, the smallest fragments and the longest queue, and prefers CBOR to JSON.
-fn pace<'w>(wishes: impl Iterator<Item = &'w Wish> + Clone, replays: u64) -> Pace {
+fn pace<'w>(wishes: impl Iterator<Item = &'w SubscriptionRequest> + Clone, replays: u64) -> Pace {
     let throttle = wishes.clone().map(|wish| wish.throttle).min().unwrap_or_default();
     Pace {
         interval_min: (!throttle.is_zero()).then_some(throttle),
-        depth: wishes.clone().map(Wish::depth).max().unwrap_or(1),
+        depth: wishes.clone().map(SubscriptionRequest::depth).max().unwrap_or(1),
         fragment_size: wishes.clone().filter_map(|wish| wish.fragment_size).min(),
         compression: wishes.map(|wish| wish.compression).max().unwrap_or_default(),
         replays,
@@ -138,7 +143,7 @@ fn pace<'w>(wishes: impl Iterator<Item = &'w Wish> + Clone, replays: u64) -> Pac
 async fn pump(mut subscription: Subscription, mut followed: watch::Receiver<Pace>, outbox: Outbox) {
     let mut pace = *followed.borrow_and_update();
     subscription.set_pace(pace.depth, pace.interval_min);
-    let mut told = Told::default();
+    let mut told = WarningState::default();
     let begin_of =
         |pace: &Pace, topic: &str| Envelope::new("publish", pace.compression, 0).text("topic", topic);
     let mut begin = begin_of(&pace, subscription.topic());
@@ -218,12 +223,12 @@ pub(super) fn fragment_id() -> String {
 
 /// The warnings sent for a topic, kept to limit their rate.
 #[derive(Debug, Default)]
-struct Told {
+struct WarningState {
     dropped: u64,
     at: Option<Instant>,
 }
 
-impl Told {
+impl WarningState {
     fn may(&mut self) -> bool {
         let may = self.at.is_none_or(|at| at.elapsed() >= WARN_INTERVAL);
         if may {
@@ -256,15 +261,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn of_several_wishes_the_one_that_suits_all_is_made() {
-        let wish = |throttle, queue_length, fragment_size, compression| Wish {
+    fn pace_suits_all_requests() {
+        let wish = |throttle, queue_length, fragment_size, compression| SubscriptionRequest {
             throttle: Duration::from_millis(throttle),
             queue_length,
             fragment_size,
             compression,
         };
         let slow = wish(500, 0, Some(1000), Compression::None);
-        assert_eq!((pace([&slow].into_iter(), 0).depth, Topic::depth(&Wish::default())), (1, QUEUE_DEFAULT));
+        assert_eq!(
+            (pace([&slow].into_iter(), 0).depth, Topic::depth(&SubscriptionRequest::default())),
+            (1, QUEUE_DEFAULT)
+        );
         let queued = wish(100, 5, Some(300), Compression::Cbor);
         let both = pace([&slow, &queued].into_iter(), 0);
         assert_eq!((both.interval_min, both.depth), (Some(Duration::from_millis(100)), 5));

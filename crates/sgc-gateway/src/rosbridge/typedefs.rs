@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use serde::Serialize;
 use sgc_cdr::{Base, DUMMY_MEMBER, Definition, Field, Library, Primitive, Shape, TypeName};
 
+use crate::definitions::Types;
 use crate::error::GatewayError;
-use crate::types::Types;
 
 /// The separator between definitions in one text.
 const RULE: &str = "================================================================================";
@@ -134,11 +134,11 @@ fn example(field: &Field) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::types::Shipped;
+    use crate::definitions::ShippedDefinitions;
 
     #[test]
     fn types_are_told_with_all_that_they_contain() {
-        let types = Types::new(Shipped);
+        let types = Types::new(ShippedDefinitions);
         let all = typedefs(&types, "sensor_msgs/msg/BatteryState").unwrap();
         let names: Vec<_> = all.iter().map(|def| def.type_name.as_str()).collect();
         assert_eq!(names, ["sensor_msgs/BatteryState", "std_msgs/Header", "builtin_interfaces/Time"]);
@@ -167,10 +167,12 @@ mod tests {
 
     #[test]
     fn texts_are_as_in_bag_files() {
-        let text = full_text(&Types::new(Shipped), "geometry_msgs/msg/PointStamped");
+        let text = full_text(&Types::new(ShippedDefinitions), "geometry_msgs/msg/PointStamped");
         let parts: Vec<_> = text.split(RULE).collect();
         assert_eq!(parts.len(), 4);
         assert!(parts[1].starts_with("\nMSG: std_msgs/Header\n"), "{text}");
-        assert!(full_text(&Types::new(Shipped), "nobody/msg/Knows").starts_with("# no definition"));
+        assert!(
+            full_text(&Types::new(ShippedDefinitions), "nobody/msg/Knows").starts_with("# no definition")
+        );
     }
 }

@@ -8,7 +8,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use rand_chacha::ChaCha20Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use sgc_gateway::grpc::proto::gateway_client::GatewayClient;
-use sgc_gateway::grpc::{Accepted, Connection, Grpc, GrpcOptions, MESSAGE_BYTES_MAX};
+use sgc_gateway::grpc::{AcceptedStream, Connection, Grpc, GrpcOptions, MESSAGE_BYTES_MAX};
 use sgc_gateway::{
     Access, AccessGrant, AccessRules, AccessWatch, Anonymous, ClientRule, Scope, TokenId, WallClock,
 };
@@ -77,7 +77,7 @@ impl Gateway {
         tokio::spawn(async move {
             while let Ok((stream, peer)) = listener.accept().await {
                 stream.set_nodelay(true).unwrap();
-                if send.send(Accepted::new(stream, Connection::plain(peer))).await.is_err() {
+                if send.send(AcceptedStream::new(stream, Connection::plain(peer))).await.is_err() {
                     return;
                 }
             }

@@ -152,7 +152,7 @@ async fn a_client_that_stops_reading_loses_the_oldest_and_holds_up_nobody() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_waits_holds_up_the_publisher_and_loses_nothing() {
+async fn waiting_subscriber_holds_up_the_publisher_and_loses_nothing() {
     const MESSAGES: usize = 500;
     let gateway = Gateway::new().await;
     let keeps = RosQos { history: History::KeepAll, ..RosQos::default() };
@@ -208,7 +208,7 @@ async fn the_newest_come_at_the_rate_that_is_wanted() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_client_publishes_is_heard_by_programs() {
+async fn messages_of_a_client_reach_programs() {
     let gateway = Gateway::new().await;
     let (texts, _reader) = gateway.site.reader("/cmd");
     let mut client = gateway.client().await;
@@ -530,7 +530,7 @@ async fn streams_end_with_the_token_even_of_a_client_that_does_not_read() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_is_not_admitted_by_new_rules_is_disconnected() {
+async fn new_rules_disconnect_clients_they_do_not_admit() {
     let gateway = Gateway::new().await;
     let _talker = gateway.site.writer("/odom", RosQos::default());
     gateway.site.knows("/odom").await;
@@ -543,7 +543,7 @@ async fn who_is_not_admitted_by_new_rules_is_disconnected() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_cannot_be_is_refused_in_words_for_the_user() {
+async fn invalid_requests_are_refused_with_an_explanation() {
     let gateway = Gateway::new().await;
     let _talker = gateway.site.writer("/chatter", RosQos::default());
     gateway.site.knows("/chatter").await;

@@ -13,7 +13,7 @@ use crate::support::{STRING, Site, string};
 use sgc_ros::{RosWriter as _, SampleKind};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_no_op_is_told_and_the_connection_goes_on() {
+async fn invalid_op_is_reported_and_the_connection_continues() {
     let site = Site::new().await;
     let mut browser = client(&site).await;
     for (text, told) in [

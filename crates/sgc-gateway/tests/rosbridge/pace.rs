@@ -75,7 +75,7 @@ async fn a_rate_with_a_queue_spreads_messages_and_drops_the_oldest() {
 }
 
 #[tokio::test]
-async fn of_two_rates_the_faster_is_taken_until_it_is_unsubscribed() {
+async fn faster_of_two_rates_applies_until_it_is_unsubscribed() {
     let site = Site::new().await;
     let talker = site.writer("/fast", Qos::default());
     tokio::time::pause();

@@ -111,7 +111,7 @@ async fn types_are_told() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_the_gateway_does_not_know_is_a_service_like_any_other() {
+async fn unknown_rosapi_services_are_called_on_the_network() {
     let site = Site::new().await;
     let mut browser = client(&site).await;
     let (told, is_done) = browser.call("/rosapi/search_param", json!({})).await;

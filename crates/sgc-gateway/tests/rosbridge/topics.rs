@@ -17,7 +17,7 @@ fn write(talker: &impl sgc_ros::RosWriter, text: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_programs_publish_comes_as_json() {
+async fn messages_of_programs_arrive_as_json() {
     let site = Site::new().await;
     let talker = site.writer("/chatter", Qos::default());
     let mut browser = client(&site).await;
@@ -81,7 +81,7 @@ async fn png_is_refused_with_what_to_take_instead() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_clients_publish_is_heard_by_programs_from_the_first_message_on() {
+async fn messages_of_clients_reach_programs_from_the_first_on() {
     let site = Site::new().await;
     let (texts, _reader) = site.reader("/cmd");
     eventually(|| site.hub.graph().topics.contains_key("/cmd")).await;

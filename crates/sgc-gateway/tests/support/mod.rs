@@ -6,7 +6,7 @@ use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
 use bytes::Bytes;
-use sgc_gateway::{Client, Hub, HubOptions, Scope, Session, SessionLimits, Shipped, Types};
+use sgc_gateway::{Client, Hub, HubOptions, Scope, Session, SessionLimits, ShippedDefinitions, Types};
 use sgc_ros::{EndpointSpec, RosNetwork, Sample, dds_topic, dds_type};
 use sgc_testkit::{FakeDomain, FakeReader, FakeRos, FakeWriter};
 use sgc_wire::Qos;
@@ -24,7 +24,7 @@ pub(crate) struct Site {
 
 impl Site {
     pub(crate) async fn new() -> Self {
-        Self::with_types(Types::new(Shipped)).await
+        Self::with_types(Types::new(ShippedDefinitions)).await
     }
 
     /// One whose gateway knows these types.

@@ -5,15 +5,15 @@ use std::collections::BTreeMap;
 use tokio_tungstenite::tungstenite::Message as Frame;
 
 use crate::access::Right;
+use crate::definitions::Types;
 use crate::error::GatewayError;
 use crate::graph::{Graph, is_hidden};
 use crate::session::action_of;
-use crate::types::Types;
 
 use super::{CDR, Connection, Level};
 use crate::foxglove::connections::Connections;
 use crate::foxglove::listing::Offer;
-use crate::foxglove::protocol::{Channel, Half, Service, Told};
+use crate::foxglove::protocol::{Channel, Half, ServerMessage, Service};
 
 /// The encoding of definitions.
 const SCHEMA_ENCODING: &str = "ros2msg";
@@ -26,7 +26,7 @@ struct Halves {
     response: String,
 }
 
-type Described<T> = Vec<(String, Offer, Result<T, GatewayError>)>;
+type Descriptions<T> = Vec<(String, Offer, Result<T, GatewayError>)>;
 
 impl Connection<'_> {
     fn is_shown(&self, name: &str) -> bool {
@@ -78,11 +78,11 @@ impl Connection<'_> {
         let heard: Vec<u32> = heard.map(|(id, _)| *id).collect();
         heard.into_iter().for_each(|id| self.unsubscribe(id));
         if !gone.is_empty() {
-            self.tell(&Told::Unadvertise { channel_ids: &gone });
+            self.tell(&ServerMessage::Unadvertise { channel_ids: &gone });
         }
         let gone = self.services.retain(&services);
         if !gone.is_empty() {
-            self.tell(&Told::UnadvertiseServices { service_ids: &gone });
+            self.tell(&ServerMessage::UnadvertiseServices { service_ids: &gone });
         }
         let topics = self.channels.untold(&topics, self.attempt, TOLD_AT_ONCE);
         let services = self.services.untold(&services, self.attempt, TOLD_AT_ONCE);
@@ -110,7 +110,7 @@ impl Connection<'_> {
         is_all
     }
 
-    fn tell_topics(&mut self, topics: Described<String>) {
+    fn tell_topics(&mut self, topics: Descriptions<String>) {
         let (mut channels, mut replaced) = (Vec::new(), Vec::new());
         for (topic, offer, schema) in topics {
             let schema_name = offer.type_name.clone();
@@ -138,15 +138,15 @@ impl Connection<'_> {
             }
         }
         if !replaced.is_empty() {
-            self.tell(&Told::Unadvertise { channel_ids: &replaced });
+            self.tell(&ServerMessage::Unadvertise { channel_ids: &replaced });
         }
         if !channels.is_empty() || self.is_first {
             self.is_first = false;
-            self.tell(&Told::Advertise { channels: &channels });
+            self.tell(&ServerMessage::Advertise { channels: &channels });
         }
     }
 
-    fn tell_services(&mut self, services: Described<Halves>) {
+    fn tell_services(&mut self, services: Descriptions<Halves>) {
         let mut told = Vec::new();
         for (name, offer, schemas) in services {
             let type_name = offer.type_name.clone();
@@ -170,7 +170,7 @@ impl Connection<'_> {
             }
         }
         if !told.is_empty() {
-            self.tell(&Told::AdvertiseServices { services: &told });
+            self.tell(&ServerMessage::AdvertiseServices { services: &told });
         }
     }
 

@@ -1,4 +1,4 @@
-//! [`aside`]: slow work, such as reading files or converting images, that must not delay clients whose tasks share
+//! [`offload`]: slow work, such as reading files or converting images, that must not delay clients whose tasks share
 //! the runtime's thread.
 
 use tokio::runtime::{Handle, RuntimeFlavor};
@@ -9,15 +9,15 @@ const SHORT_BYTES_MAX: usize = 256 << 10;
 
 /// Runs work that may block or take long. Other tasks of this thread move to another thread, unless the runtime has
 /// only one.
-pub(crate) fn aside<T>(work: impl FnOnce() -> T) -> T {
+pub(crate) fn offload<T>(work: impl FnOnce() -> T) -> T {
     let has_others =
         Handle::try_current().is_ok_and(|runtime| runtime.runtime_flavor() == RuntimeFlavor::MultiThread);
     if has_others { tokio::task::block_in_place(work) } else { work() }
 }
 
 /// Runs work whose duration depends on a message of this length.
-pub(crate) fn aside_if_long<T>(bytes: usize, work: impl FnOnce() -> T) -> T {
-    if bytes > SHORT_BYTES_MAX { aside(work) } else { work() }
+pub(crate) fn offload_if_long<T>(bytes: usize, work: impl FnOnce() -> T) -> T {
+    if bytes > SHORT_BYTES_MAX { offload(work) } else { work() }
 }
 
 #[cfg(test)]
@@ -43,12 +43,12 @@ mod tests {
     #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
     async fn others_go_on_beside_what_takes_long() {
         let comes = |receive: mpsc::Receiver<()>| receive.recv_timeout(Duration::from_secs(10)).is_ok();
-        assert!(waits_for_another(move |receive| aside(|| comes(receive))).await);
-        assert!(waits_for_another(move |receive| aside_if_long(1 << 20, || comes(receive))).await);
+        assert!(waits_for_another(move |receive| offload(|| comes(receive))).await);
+        assert!(waits_for_another(move |receive| offload_if_long(1 << 20, || comes(receive))).await);
     }
 
     #[tokio::test]
     async fn where_there_is_one_thread_it_is_done_there() {
-        assert_eq!(aside(|| 7), 7);
+        assert_eq!(offload(|| 7), 7);
     }
 }

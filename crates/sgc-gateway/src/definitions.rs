@@ -6,8 +6,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use sgc_cdr::{Layout, Library, TypeError, TypeName};
 
-use crate::aside::aside;
 use crate::error::GatewayError;
+use crate::offload::offload;
 
 /// Most cached types. Beyond that the cache is emptied.
 const TYPES_MAX: usize = 4096;
@@ -23,9 +23,9 @@ pub trait FindDefinitions: Send + Sync + 'static {
 
 /// A source without further definitions.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Shipped;
+pub struct ShippedDefinitions;
 
-impl FindDefinitions for Shipped {
+impl FindDefinitions for ShippedDefinitions {
     fn text(&self, _file: &TypeName) -> Option<String> {
         None
     }
@@ -73,12 +73,12 @@ impl InterfaceType {
 }
 
 /// Layouts by type name and requested hash.
-type Known = BTreeMap<(String, Option<String>), Arc<Layout>>;
+type LayoutCache = BTreeMap<(String, Option<String>), Arc<Layout>>;
 
 /// The layouts and definitions of message types.
 pub struct Types {
     finder: Box<dyn FindDefinitions>,
-    known: Mutex<Known>,
+    known: Mutex<LayoutCache>,
 }
 
 impl fmt::Debug for Types {
@@ -106,12 +106,12 @@ impl Types {
             example: "std_msgs/msg/String",
         })?;
         let find = || Library::empty().layout(&name, &mut |file| self.finder.text(file));
-        let found = aside(find).map(Arc::new);
+        let found = offload(find).map(Arc::new);
         let is_it = |layout: &Arc<Layout>| hash.is_none_or(|hash| layout.type_hash() == hash);
         let mut is_sure = true;
         let layout = match found {
             Ok(layout) if is_it(&layout) => layout,
-            found => match (aside(|| self.finder.described(&name, hash)), found) {
+            found => match (offload(|| self.finder.described(&name, hash)), found) {
                 (Some(described), _) => described,
                 // The hash may be computed in another way, or the description may still arrive. A wrong layout shows
                 // when decoding.
@@ -143,7 +143,7 @@ impl Types {
         })?;
         let file = TypeName::new(name.package(), name.kind(), name.file_stem());
         let file = file.ok_or_else(|| unknown(name.clone()))?;
-        aside(|| self.finder.text(&file)).or_else(|| Library::shipped(&file)).ok_or_else(|| unknown(name))
+        offload(|| self.finder.text(&file)).or_else(|| Library::shipped(&file)).ok_or_else(|| unknown(name))
     }
 
     /// Returns the file that defines an interface and the files that its parts need. May read them.
@@ -166,7 +166,7 @@ impl Types {
         files
     }
 
-    fn lock(&self) -> MutexGuard<'_, Known> {
+    fn lock(&self) -> MutexGuard<'_, LayoutCache> {
         self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_found_comes_before_what_ships() {
+    fn found_definitions_precede_shipped_ones() {
         struct One;
         impl FindDefinitions for One {
             fn text(&self, file: &TypeName) -> Option<String> {

@@ -5,8 +5,8 @@ use sgc_cdr::{Library, TypeName};
 use super::fault::Fault;
 use super::proto::GetTypeResponse;
 use super::proto::get_type_response::Definition;
+use crate::definitions::Types;
 use crate::error::GatewayError;
-use crate::types::Types;
 
 /// The parts of services and actions.
 const SERVICE: [&str; 2] = ["_Request", "_Response"];
@@ -50,11 +50,11 @@ pub(super) fn describe(types: &Types, type_name: &str) -> Result<GetTypeResponse
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::types::Shipped;
+    use crate::definitions::ShippedDefinitions;
 
     #[test]
     fn a_type_comes_with_all_that_it_needs() {
-        let types = Types::new(Shipped);
+        let types = Types::new(ShippedDefinitions);
         let twist = describe(&types, "geometry_msgs/msg/TwistStamped").unwrap();
         let names: Vec<_> = twist.definitions.iter().map(|definition| &*definition.r#type).collect();
         assert_eq!(names[0], "geometry_msgs/msg/TwistStamped");

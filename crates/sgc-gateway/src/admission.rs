@@ -1,4 +1,4 @@
-//! [`Door`]: admits clients of every protocol, bounds their number and disconnects those whose rights end.
+//! [`Admission`]: admits clients of every protocol, bounds their number and disconnects those whose rights end.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
@@ -14,7 +14,7 @@ use sgc_trust::{AddressPrefix, PlaceDecision, PlaceLimits, Places, TrustAnchors,
 use sgc_wire::UnixMillis;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
-use crate::access::{Access, Admission, Client, Credential, Denied};
+use crate::access::{Access, AdmissionRequest, Client, Credential, Denial};
 use crate::access_watch::AccessWatch;
 use crate::clock::WallClock;
 use crate::error::GatewayError;
@@ -71,9 +71,9 @@ pub(crate) struct Arrival {
 
 /// The admission of clients.
 #[derive(Debug)]
-pub(crate) struct Door {
+pub(crate) struct Admission {
     access: AccessWatch,
-    clients: Mutex<BTreeMap<u64, Entered>>,
+    clients: Mutex<BTreeMap<u64, ClientEntry>>,
     refused: Mutex<BTreeMap<&'static str, u64>>,
     next: AtomicU64,
     clients_max: usize,
@@ -81,7 +81,7 @@ pub(crate) struct Door {
 
 /// A client that has a place.
 #[derive(Debug)]
-struct Entered {
+struct ClientEntry {
     status: ClientStatus,
     credential: Option<Credential>,
     is_local: bool,
@@ -90,18 +90,22 @@ struct Entered {
 /// A client's place at the gateway, freed on drop.
 #[derive(Debug)]
 pub(crate) struct Place {
-    door: Arc<Door>,
+    admission: Arc<Admission>,
     number: u64,
 }
 
 impl Place {
     /// Gives the place to another client, unless all places of that client's credential are taken.
     pub(crate) fn rename(&self, client: &Client) -> Result<(), GatewayError> {
-        let mut clients = lock(&self.door.clients);
-        if let Err(pool) = self.door.check_places(&clients, client, Some(self.number)) {
+        let mut clients = lock(&self.admission.clients);
+        if let Err(pool) = self.admission.check_places(&clients, client, Some(self.number)) {
             drop(clients);
-            self.door.count(no_place(pool));
-            return Err(GatewayError::Crowded { what: "clients", max: self.door.places_max(pool), pool });
+            self.admission.count(no_place(pool));
+            return Err(GatewayError::Crowded {
+                what: "clients",
+                max: self.admission.places_max(pool),
+                pool,
+            });
         }
         if let Some(entered) = clients.get_mut(&self.number) {
             entered.status.name = client.name.to_string();
@@ -113,11 +117,11 @@ impl Place {
 
 impl Drop for Place {
     fn drop(&mut self) {
-        lock(&self.door.clients).remove(&self.number);
+        lock(&self.admission.clients).remove(&self.number);
     }
 }
 
-impl Door {
+impl Admission {
     pub(crate) fn new(access: Access, clients_max: usize) -> Arc<Self> {
         let access = AccessWatch::new(access, WallClock::system());
         let (clients, refused, next) = (Mutex::default(), Mutex::default(), AtomicU64::new(0));
@@ -150,9 +154,9 @@ impl Door {
         arrival: &Arrival,
         origin: Option<&str>,
         token: Option<&str>,
-    ) -> Result<Client, Denied> {
+    ) -> Result<Client, Denial> {
         let token = token.map(|token| token.get(..TOKEN_BYTES_MAX).unwrap_or(token));
-        let admission = Admission {
+        let admission = AdmissionRequest {
             peer: arrival.peer,
             encrypted: arrival.is_encrypted,
             origin,
@@ -190,10 +194,12 @@ impl Door {
             address: peer.to_string(),
             since: now().0,
         };
-        clients
-            .insert(number, Entered { status, credential: client.credential(), is_local: client.is_local() });
+        clients.insert(
+            number,
+            ClientEntry { status, credential: client.credential(), is_local: client.is_local() },
+        );
         drop(clients);
-        Some(Place { door: Arc::clone(self), number })
+        Some(Place { admission: Arc::clone(self), number })
     }
 
     /// Returns the number of places for the clients of a pool.
@@ -210,11 +216,11 @@ impl Door {
     /// place that the client already has.
     fn check_places(
         &self,
-        clients: &BTreeMap<u64, Entered>,
+        clients: &BTreeMap<u64, ClientEntry>,
         client: &Client,
         except: Option<u64>,
     ) -> Result<(), Pool> {
-        let count = |is_counted: &dyn Fn(&Entered) -> bool| {
+        let count = |is_counted: &dyn Fn(&ClientEntry) -> bool| {
             let others = clients.iter().filter(|(number, _)| Some(**number) != except);
             others.filter(|(_, entered)| is_counted(entered)).count()
         };
@@ -373,8 +379,14 @@ mod tests {
     use crate::access::{AccessRules, Anonymous};
 
     fn client(access: &Access, peer: SocketAddr) -> Client {
-        let admission =
-            Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now: now() };
+        let admission = AdmissionRequest {
+            peer,
+            encrypted: true,
+            origin: None,
+            token: None,
+            certificate: None,
+            now: now(),
+        };
         access.admit(&admission).unwrap()
     }
 
@@ -409,12 +421,12 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn one_credential_and_other_hosts_leave_places() {
+    async fn credentials_and_other_hosts_leave_places() {
         let all = || Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
-        let (access, door) = (all(), Door::new(all(), 64));
+        let (access, admission) = (all(), Admission::new(all(), 64));
         let enter = |peer: &str| {
             let peer = peer.parse().unwrap();
-            door.enter(&client(&access, peer), "rosbridge", peer)
+            admission.enter(&client(&access, peer), "rosbridge", peer)
         };
         // Of 64 places 8 are reserved for this host, and one credential may hold a quarter of the rest.
         let mut held: Vec<_> = std::iter::from_fn(|| enter("[2001:db8::1]:1")).collect();
@@ -426,7 +438,7 @@ mod tests {
         assert_eq!(held.len(), 56);
         let local: Vec<_> = std::iter::from_fn(|| enter("127.0.0.1:1")).collect();
         assert_eq!(local.len(), 8);
-        let counted = door.refused();
+        let counted = admission.refused();
         assert!(counted["too many clients of one credential"] >= 2, "{counted:?}");
         assert!(counted["too many clients of other hosts"] >= 1, "{counted:?}");
         assert_eq!(counted["too many clients"], 1);
