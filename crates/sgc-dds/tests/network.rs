@@ -301,7 +301,7 @@ fn readers_are_waited_for_until_they_are_there_or_the_time_is_over() {
 
 /// The proof against loops: DDS matches the two, SGC must not pass on what the other wrote.
 #[test]
-fn what_another_sgc_node_wrote_is_not_read_again() {
+fn samples_of_other_sgc_nodes_are_skipped() {
     let (first, second, ros) = (open(94, Some("a")), open(94, Some("b")), open(94, None));
     let (_reader, samples) = read(&first, &spec("loop"));
     let other = writer(&second, &spec("loop"), 1);
@@ -426,7 +426,7 @@ fn odd_lengths_are_padded_with_zeros_and_say_so() {
 }
 
 #[test]
-fn what_is_no_sample_is_refused() {
+fn invalid_payloads_are_refused() {
     let sgc = open(79, Some("arm-1"));
     let writer = sgc.create_writer(&spec("bad")).unwrap();
     let write = |ts, payload: &'static [u8]| writer.write(SampleKind::Write, ts, Bytes::from_static(payload));
@@ -546,7 +546,7 @@ fn source_time_and_writer_are_preserved() {
 }
 
 #[test]
-fn one_that_blocks_delays_no_other_reader_where_writers_are_to_wait_either() {
+fn blocked_keep_all_reader_delays_no_other_reader() {
     const SAMPLES: usize = 2000;
     let (ros, sgc) = (open(99, None), open(99, Some("arm-1")));
     let (release, gate) = channel::<()>();
@@ -649,7 +649,7 @@ fn a_reader_says_whether_more_is_at_hand_and_never_at_the_end() {
 
 /// What became of a sample.
 #[derive(Debug, PartialEq, Eq)]
-enum Handled {
+enum Outcome {
     AtOnce(Bytes),
     OnItsThread(Bytes),
     Overrun(u64),
@@ -659,12 +659,12 @@ enum Handled {
 struct Choosy {
     may: Arc<AtomicBool>,
     gate: Receiver<()>,
-    handled: Sender<Handled>,
+    handled: Sender<Outcome>,
 }
 
 impl HandleSamples for Choosy {
     fn handle(&mut self, sample: Sample) {
-        let _ = self.handled.send(Handled::OnItsThread(sample.payload));
+        let _ = self.handled.send(Outcome::OnItsThread(sample.payload));
         let _ = self.gate.recv();
     }
 
@@ -672,17 +672,17 @@ impl HandleSamples for Choosy {
         if !self.may.load(Relaxed) {
             return Err(sample);
         }
-        let _ = self.handled.send(Handled::AtOnce(sample.payload));
+        let _ = self.handled.send(Outcome::AtOnce(sample.payload));
         Ok(())
     }
 
     fn overrun(&mut self, samples: u64) {
-        let _ = self.handled.send(Handled::Overrun(samples));
+        let _ = self.handled.send(Outcome::Overrun(samples));
     }
 }
 
 #[test]
-fn what_needs_no_waiting_is_handled_where_it_is_received_and_in_its_order() {
+fn samples_are_handled_on_the_receiving_thread_in_order() {
     let (ros, sgc) = (open(111, None), open(111, Some("arm-1")));
     let may = Arc::new(AtomicBool::new(true));
     let ((release, gate), (tell, handled)) = (channel(), channel());
@@ -695,12 +695,12 @@ fn what_needs_no_waiting_is_handled_where_it_is_received_and_in_its_order() {
         let text = string_cdr(&i.to_string());
         write(&writer, &text);
         match next(&handled) {
-            Handled::AtOnce(payload) => {
+            Outcome::AtOnce(payload) => {
                 assert_eq!(payload, padded(&text));
                 true
             }
             other => {
-                assert_eq!(other, Handled::OnItsThread(padded(&text).into()));
+                assert_eq!(other, Outcome::OnItsThread(padded(&text).into()));
                 release.send(()).unwrap();
                 false
             }
@@ -711,16 +711,16 @@ fn what_needs_no_waiting_is_handled_where_it_is_received_and_in_its_order() {
     // What the thread has is not overtaken, and what there is no room for is counted.
     may.store(false, Relaxed);
     write(&writer, &string_cdr("blocks"));
-    assert_eq!(next(&handled), Handled::OnItsThread(padded(&string_cdr("blocks")).into()));
+    assert_eq!(next(&handled), Outcome::OnItsThread(padded(&string_cdr("blocks")).into()));
     may.store(true, Relaxed);
     (0..20).for_each(|i| write(&writer, &string_cdr(&format!("behind {i}"))));
     assert!(writer.wait_acknowledged(PATIENCE));
     quiet(&handled);
     (0..6).for_each(|_| release.send(()).unwrap());
-    assert_eq!(next(&handled), Handled::Overrun(15));
+    assert_eq!(next(&handled), Outcome::Overrun(15));
     for i in 15..20 {
         let text = string_cdr(&format!("behind {i}"));
-        assert_eq!(next(&handled), Handled::OnItsThread(padded(&text).into()));
+        assert_eq!(next(&handled), Outcome::OnItsThread(padded(&text).into()));
     }
 }
 
@@ -920,7 +920,7 @@ fn partitions_keep_endpoints_apart() {
 }
 
 #[test]
-fn what_is_written_ahead_leaves_with_the_next_and_when_it_is_waited_for() {
+fn queued_samples_leave_with_the_next_or_a_flush() {
     let (ros, sgc) = (open(110, None), open(110, Some("arm-1")));
     let many = with(spec("ahead"), |qos| qos.history = History::KeepLast(1000));
     let (_reader, samples) = read(&ros, &many);
@@ -1057,7 +1057,7 @@ fn off_is_seen_by_nobody() {
 }
 
 #[test]
-fn what_cyclone_refuses_is_an_error_with_its_reason() {
+fn cyclone_errors_carry_their_reason() {
     let open = |config: DdsConfig| CycloneNetwork::open(&config).unwrap_err().to_string();
     let xml = DdsConfig { cyclonedds_uri: Some("<NoSuchElement/>".into()), ..config(94, None) };
     assert!(open(xml).contains("NoSuchElement"));
@@ -1149,7 +1149,7 @@ fn nodes_and_their_endpoints_are_told_and_gone_with_their_participant() {
 }
 
 #[test]
-fn what_proxies_announce_is_for_ros_and_not_for_other_proxies() {
+fn announcements_of_proxies_are_hidden_from_other_proxies() {
     let (ros, sgc, other) =
         (open_graph(97, None), open_graph(97, Some("arm-1")), open_graph(97, Some("arm-2")));
     let (seen, other_seen) = (discover(&ros), discover(&other));

@@ -46,25 +46,25 @@ fn spec() -> ServiceSpec {
     ServiceSpec { request: half(ServiceTopic::Request), reply: half(ServiceTopic::Reply) }
 }
 
-type Heard = Receiver<(RequestId, Bytes)>;
+type CallReceiver = Receiver<(RequestId, Bytes)>;
 
-fn client(network: &CycloneNetwork) -> (CycloneClient, Heard) {
+fn client(network: &CycloneNetwork) -> (CycloneClient, CallReceiver) {
     let (tx, rx) = channel();
     let handler = Box::new(move |id, payload| drop(tx.send((id, payload))));
     (network.create_client(&spec(), handler).unwrap(), rx)
 }
 
-fn server(network: &CycloneNetwork) -> (CycloneServer, Heard) {
+fn server(network: &CycloneNetwork) -> (CycloneServer, CallReceiver) {
     let (tx, rx) = channel();
     let handler = Box::new(move |id, payload| drop(tx.send((id, payload))));
     (network.create_server(&spec(), handler).unwrap(), rx)
 }
 
-fn next(heard: &Heard) -> (RequestId, Bytes) {
+fn next(heard: &CallReceiver) -> (RequestId, Bytes) {
     heard.recv_timeout(PATIENCE).expect("a request or a reply")
 }
 
-fn quiet(heard: &Heard) {
+fn quiet(heard: &CallReceiver) {
     assert_eq!(heard.recv_timeout(QUIET), Err(RecvTimeoutError::Timeout));
 }
 

@@ -54,21 +54,27 @@ fn blob() -> ServiceSpec {
     spec("/blob", "sgc_test_msgs/srv/Blob")
 }
 
-type Heard = Receiver<(RequestId, Bytes)>;
+type CallReceiver = Receiver<(RequestId, Bytes)>;
 
-fn server(network: &CycloneNetwork, spec: &ServiceSpec) -> (<CycloneNetwork as RosNetwork>::Server, Heard) {
+fn server(
+    network: &CycloneNetwork,
+    spec: &ServiceSpec,
+) -> (<CycloneNetwork as RosNetwork>::Server, CallReceiver) {
     let (tx, rx) = channel();
     let handler = Box::new(move |id, payload| drop(tx.send((id, payload))));
     (network.create_server(spec, handler).unwrap(), rx)
 }
 
-fn client(network: &CycloneNetwork, spec: &ServiceSpec) -> (<CycloneNetwork as RosNetwork>::Client, Heard) {
+fn client(
+    network: &CycloneNetwork,
+    spec: &ServiceSpec,
+) -> (<CycloneNetwork as RosNetwork>::Client, CallReceiver) {
     let (tx, rx) = channel();
     let handler = Box::new(move |id, payload| drop(tx.send((id, payload))));
     (network.create_client(spec, handler).unwrap(), rx)
 }
 
-fn next(heard: &Heard) -> (RequestId, Bytes) {
+fn next(heard: &CallReceiver) -> (RequestId, Bytes) {
     heard.recv_timeout(PATIENCE).expect("a request or a reply")
 }
 
