@@ -88,7 +88,7 @@ pub(crate) unsafe fn complete(sertype: *const ddsi_sertype) -> bool {
 /// `domain` must be valid, and no other thread may register types there meanwhile.
 unsafe fn complete_type(domain: *mut ddsi_domaingv, name: &CStr) -> bool {
     // SAFETY: all zeros is a valid value of this plain C struct, which the call fills; the name is copied, and both tables live for
-    // ever. What is looked up is compared with functions of the first table, which read no more than the struct has.
+    // ever. The type that is found is compared with functions of the first table, which read no more than the struct has.
     let found = unsafe {
         let mut like = ParameterListType {
             common: std::mem::zeroed(),

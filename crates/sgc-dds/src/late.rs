@@ -140,7 +140,7 @@ pub(crate) fn set_depth(
     }
     // SAFETY: the sertype of a writer that is pinned.
     let domain = unsafe { (*sertype).gv.v } as usize;
-    // SAFETY: both structures are longer than what is looked at, and live while the writer is pinned. What is found is a pointer of the kind
+    // SAFETY: both structures are longer than what is looked at, and live while the writer is pinned. A found word is a pointer of the kind
     // that it is used as, since its neighbours and its target are what they must be. The lock of the ddsi writer is held by all who change the
     // history cache, that of the cache by all who read it.
     unsafe {

@@ -1,4 +1,4 @@
-//! Foxglove's protocol on loopback, beside programs of a network in memory.
+//! Tests of Foxglove's protocol on loopback, beside programs of a network in memory.
 #![allow(clippy::unwrap_used)]
 
 mod support;
@@ -24,7 +24,7 @@ use tokio_tungstenite::tungstenite::Message as Frame;
 use support::{Site, eventually, spec, string};
 use viewer::{Viewer, serve_one};
 
-/// Another program of the network, whose types the gateway's own code knows.
+/// Another program on the network, whose types the gateway knows by itself.
 struct Program {
     session: Arc<Session>,
 }
@@ -56,7 +56,7 @@ impl Program {
         });
     }
 
-    /// Has parameters, `exposure` and `frame`, and tells of changes.
+    /// Serves the parameters `exposure` and `frame`, and announces changes.
     async fn with_parameters(self, node: &str) -> Self {
         let exposure = Arc::new(std::sync::Mutex::new(json!({"type": 3, "double_value": 0.5})));
         let wanted = Advertise {
@@ -74,7 +74,7 @@ impl Program {
                 "frame" => Some(json!({"type": 4, "string_value": "lens"})),
                 _ => None,
             };
-            // As nodes of ROS 2 do: nothing at all if one is not declared.
+            // Like ROS 2 nodes, it returns nothing at all if one name is not declared.
             let values: Option<Vec<_>> = asked["names"].as_array().unwrap().iter().map(value).collect();
             json!({"values": values.unwrap_or_default()})
         };
@@ -156,7 +156,7 @@ async fn messages_come_as_they_are_and_latched_ones_to_who_comes_late() {
     assert!((bytes[0], &bytes[12..]) == (8, &string("hello")[..]) && received_ns > 1_600_000_000_000_000_000);
     viewer.say(json!({"op": "unsubscribe", "subscriptionIds": [8]})).await;
     eventually(|| talker.matched_readers() == 0).await;
-    // A number may be used again, and another client's is another.
+    // A number may be reused, and another client's numbers are independent.
     let (mut other, _) = Viewer::new(site.session("other")).await;
     let map = other.channel("/map").await;
     other.subscribe(8, &map).await;
@@ -181,7 +181,7 @@ async fn clients_publish_in_json_and_as_it_is() {
     for expected in ["left", "right"] {
         assert_eq!(texts.recv_timeout(Duration::from_secs(5)).unwrap(), string(expected));
     }
-    // What is wrong is said once, until it is right again.
+    // An error is reported once, until the messages are valid again.
     for _ in 0..3 {
         viewer.binary(1, &[1], br#"{"date":"left"}"#).await;
     }
@@ -255,14 +255,14 @@ async fn parameters_are_those_of_nodes() {
     viewer.say(json!({"op": "getParameters", "parameterNames": [], "id": "all"})).await;
     let all = json!({"op": "parameterValues", "parameters": [exposure(0.5), frame], "id": "all"});
     assert_eq!(viewer.text("parameterValues").await, all);
-    // One that is not there is told as not set.
+    // A missing parameter is reported as not set.
     let names = ["/camera.exposure", "/camera.none"];
     viewer.say(json!({"op": "getParameters", "parameterNames": names})).await;
     let some = json!({"op": "parameterValues", "parameters": [exposure(0.5), {"name": "/camera.none"}]});
     assert_eq!(viewer.text("parameterValues").await, some);
 
     viewer.say(json!({"op": "subscribeParameterUpdates", "parameterNames": ["/camera.exposure"]})).await;
-    // A whole number for what is none, as a browser has it; and one that the node refuses.
+    // The values are an integer for a double, as a browser sends it, and one that the node refuses.
     let wanted = json!([{"name": "/camera.exposure", "value": 2}, {"name": "/camera.frame", "value": "x"}]);
     viewer.say(json!({"op": "setParameters", "parameters": wanted, "id": "set"})).await;
     viewer.status("parameters of /camera.frame: it is fixed").await;
@@ -370,7 +370,7 @@ async fn errors_are_reported_and_the_connection_continues() {
     talker.write(SampleKind::Write, 1, string("still there")).unwrap();
     assert_eq!(viewer.message().await, (1, string("still there")));
     assert_eq!(other.message().await, (1, string("still there")));
-    // What is no WebSocket any more ends this one, and no other.
+    // Data that is not WebSocket ends this connection only.
     viewer
         .send(Frame::Frame(tokio_tungstenite::tungstenite::protocol::frame::Frame::message(
             vec![255, 254],
@@ -425,7 +425,7 @@ async fn client_that_stops_reading_loses_only_its_oldest_messages() {
     while slow.message().await.1 != text(MESSAGES - 1) {
         heard += 1;
     }
-    // What the kernel holds for it comes as well, 6 MB at most.
+    // The buffers of the kernel, 6 MB at most, arrive as well.
     assert!(heard < MESSAGES / 2, "{heard} of {MESSAGES}");
     let said = slow.status("/fast: messages are left out").await;
     assert_eq!(said["level"], 1);
@@ -441,7 +441,7 @@ async fn client_that_does_not_read_is_not_read_from() {
     let (mut viewer, _) = Viewer::new(site.session("desk")).await;
     let uri = "x".repeat(60_000);
     let mut asked = 0;
-    // Each answer is as long as its question, so all that may wait on the way are 120 MB.
+    // Each answer is as long as its question, so at most 120 MB wait on the way.
     let mut is_stuck = false;
     while asked < ASKED && !is_stuck {
         let question = json!({"op": "fetchAsset", "uri": uri, "requestId": asked}).to_string();
@@ -503,7 +503,7 @@ async fn silent_client_is_disconnected() {
     };
     let (viewer, _) = Viewer::with(site.session("gone"), options.clone()).await;
     let (mut there, _) = Viewer::with(site.session("there"), options).await;
-    // Who reads answers pings, if nothing else.
+    // A client that reads answers pings, if nothing else.
     let reads = async {
         loop {
             there.text_that("never", |_| false).await;
@@ -519,7 +519,7 @@ async fn silent_client_is_disconnected() {
     assert!(!there.ended.is_finished());
 }
 
-/// The real client: npm's `@foxglove/ws-protocol`, with Foxglove's own reader of definitions.
+/// Runs the real client: npm's `@foxglove/ws-protocol`, with Foxglove's own reader of definitions.
 async fn real_client(subprotocol: &str) {
     let site = Site::new().await;
     let program = Program::new(&site, "arm").await;

@@ -1,4 +1,4 @@
-//! Clients of a hub on a network in memory, beside ordinary programs.
+//! Tests of a hub's clients on a network in memory, beside ordinary programs.
 #![allow(clippy::unwrap_used)]
 
 mod support;
@@ -63,7 +63,7 @@ async fn latched_messages_are_for_who_comes_later_too() {
         let mut heard = site.session(name).subscribe(hear("/map")).await.unwrap();
         assert_eq!(heard.next().await.unwrap().message.payload, string("map"), "{name}");
     }
-    // One that weakens what is offered has the reader made anew: nothing comes twice.
+    // A publisher that weakens the combined offer makes the reader be recreated, and no message comes twice.
     let mut heard = site.session("fourth").subscribe(hear("/map")).await.unwrap();
     assert_eq!(heard.next().await.unwrap().message.payload, string("map"));
     let other = site.writer("/map", Qos { history: History::KeepLast(7), ..latched });
@@ -112,12 +112,12 @@ async fn queued_publications_keep_their_order_and_report_each_loss() {
         }
         assert!(!publication.has_ahead());
         assert_eq!((lost, publication.published()), (1, 199), "{may_wait}");
-        // Longer ones are behind those that they follow.
+        // A long message keeps its place behind earlier ones.
         let long = string(&"x".repeat(100 << 10));
         publication.publish_ahead(&text(200)).await.unwrap();
         publication.publish_ahead(&Content::cdr(long.clone())).await.unwrap();
         publication.publish_ahead(&text(201)).await.unwrap();
-        // Its end is one of those that have it leave.
+        // Dropping the publication sends its queued messages.
         drop(publication);
         let heard = || texts.recv_timeout(Duration::from_secs(5)).unwrap();
         for number in (0..200).filter(|number| *number != 7) {
@@ -259,7 +259,7 @@ async fn subscriptions_that_are_waited_for_are_few_and_what_ends_makes_room() {
     let told = GatewayError::TooMany { what: "subscriptions that are waited for", max: 2 };
     assert_eq!(refused, Some(told));
     let _other = session.subscribe(wanted(false)).await.unwrap();
-    // It is the same program's, whoever it says it is.
+    // The new client is the same program and shares its bounds.
     let again = session.again(Client::own("again")).unwrap();
     assert!(again.subscribe(wanted(true)).await.is_err());
     drop(first);

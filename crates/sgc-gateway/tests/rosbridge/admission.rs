@@ -1,4 +1,4 @@
-//! Who a client is, and what it may do.
+//! Admission and rights of clients.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -29,7 +29,7 @@ async fn nothing_is_taken_before_a_token_is_shown() {
     let site = Site::new().await;
     let talker = site.writer("/odom", Qos::default());
     site.knows("/odom").await;
-    // roslibpy has only the words of `rosauth`; anybody else may say it plainly.
+    // roslibpy has only the fields of `rosauth`; other clients use the plain field.
     for auth in [json!({"op": "auth", "token": "right"}), json!({"op": "auth", "mac": "right", "client": ""})]
     {
         let mut browser = connect(site.session("nobody"), options()).await;
@@ -76,7 +76,7 @@ async fn new_credential_keeps_permitted_subscriptions() {
     browser.settle_amid().await;
 }
 
-/// Whatever token is shown, it permits to call `/allowed`.
+/// Returns options by which any token permits calls of `/allowed`.
 fn becomes_partner() -> RosbridgeOptions {
     RosbridgeOptions {
         authenticate: Some(Arc::new(|_: &str| {
@@ -112,7 +112,7 @@ async fn new_credential_ends_calls_and_counts_what_stays() {
     let ended =
         json!({"op": "service_response", "id": "1", "service": "/silent", "values": told, "result": false});
     assert_eq!(browser.next().await, ended);
-    // Of two there is room for one.
+    // There is room for one of two calls.
     browser.send(call("3", "/allowed")).await;
     within(allowed.next()).await.unwrap();
     browser.send(call("4", "/allowed")).await;

@@ -348,7 +348,7 @@ pub enum Problem {
     SharedNotUsed {
         /// Topic here.
         topic: String,
-        /// Whose.
+        /// The owner.
         owner: String,
     },
     /// Two local topics would be shared under one name.
