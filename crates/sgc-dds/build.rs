@@ -1,7 +1,7 @@
-//! Has the feature `sros2` link OpenSSL statically.
+//! Links OpenSSL statically for the feature `sros2`.
 //!
-//! `cyclors` asks the linker for `ssl` and `crypto` of any kind, and the linker takes a shared library where it finds one. The directory
-//! named here holds the static ones alone, and the linker looks into named directories before the system's.
+//! `cyclors` asks the linker for any `ssl` and `crypto`, and the linker prefers shared libraries. The directory named
+//! here holds only the static ones, and the linker searches named directories before the system's.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -25,7 +25,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Finds a static library where `OPENSSL_LIB_DIR` says, or where the C compiler does.
+/// Finds a static library in `OPENSSL_LIB_DIR`, or where the C compiler finds it.
 fn find(name: &str) -> Result<PathBuf, Box<dyn Error>> {
     if let Some(directory) = env::var_os("OPENSSL_LIB_DIR") {
         return Ok(Path::new(&directory).join(name));
@@ -33,7 +33,7 @@ fn find(name: &str) -> Result<PathBuf, Box<dyn Error>> {
     let compiler = env::var_os("CC").unwrap_or_else(|| "cc".into());
     let output = Command::new(compiler).arg(format!("-print-file-name={name}")).output()?;
     let path = PathBuf::from(String::from_utf8(output.stdout)?.trim());
-    // A name without a directory is the answer where there is no such library.
+    // The compiler answers with the bare name if there is no such library.
     if path.is_absolute() {
         Ok(path)
     } else {

@@ -1,15 +1,16 @@
-//! Parameters of announcements of endpoints (SEDP): those that Cyclone leaves out, and one that it must not see.
+//! Parameters of endpoint announcements (SEDP): those that Cyclone omits, and one that it must not see.
 //!
-//! - The participant of each endpoint: Fast DDS 3 shows an endpoint without it as one of no ROS node.
-//! - That a reader expects inline QoS, where [`asking`] made it: with it come the hashes of keys, which writers of Fast DDS 2 tell nobody
-//!   else. Writers of Cyclone refuse to match such a reader.
-//! - The identifiers of types (XTypes 1.3, 7.6.3.2.2) in received announcements: Cyclone asks for the types, finds those of Fast DDS 3
-//!   invalid, and then ignores all further endpoints that have them. Types are nothing to a network here but names and hashes.
+//! - The participant of each endpoint. Fast DDS 3 shows an endpoint without it as one of no ROS node.
+//! - The request of a reader for inline QoS, if [`asking`] created it. With it come the key hashes, which Fast DDS 2
+//! sends only on request. Cyclone's writers refuse to match such a reader.
+//! - The type identifiers (XTypes 1.3, 7.6.3.2.2) in received announcements. Cyclone asks for the types, considers
+//! those of Fast DDS 3 invalid, and then ignores all further endpoints with them. A network here needs only names and
+//! hashes of types.
 //!
-//! An announcement is a sample of a built-in type, which makes it of a list of parameters. [`complete`] gives the two types of a domain
-//! another table of functions, which calls Cyclone's and adds to the result. It reaches into `struct ddsi_sertype_plist` of the Cyclone
-//! that `cyclors` =0.4.0 builds (`sample.rs`, `CYCLORS`), to find the types: where they are not found, announcements are as Cyclone
-//! makes them.
+//! An announcement is a sample of a built-in type, which builds it from a list of parameters. [`complete`] gives the
+//! two types of a domain another table of functions, which calls Cyclone's and adds to the result. It finds the types
+//! by `struct ddsi_sertype_plist` of the Cyclone that `cyclors` =0.4.0 builds (`sample.rs`, `CYCLORS`). If they are
+//! not found, announcements stay as Cyclone makes them.
 
 use std::cell::Cell;
 use std::ffi::{CStr, c_void};
@@ -30,7 +31,7 @@ const PID_PARTICIPANT_GUID: u16 = 0x0050;
 const PID_ENDPOINT_GUID: u16 = 0x005a;
 const PID_EXPECTS_INLINE_QOS: u16 = 0x0043;
 
-/// PID_TYPE_INFORMATION (XTypes 1.3, 7.6.3.2.2), and a parameter that readers ignore: none has the number, and nobody has to understand it.
+/// PID_TYPE_INFORMATION (XTypes 1.3, 7.6.3.2.2), and a parameter without a meaning, which readers ignore.
 const PID_TYPE_INFORMATION: u16 = 0x0075;
 const PID_IGNORED: u16 = 0x3f75;
 
@@ -40,10 +41,10 @@ const ENTITYID_PARTICIPANT: [u8; 4] = [0x00, 0x00, 0x01, 0xc1];
 /// `DDSI_RTPS_CDR_ENC_FORMAT_PL`: lists of parameters.
 const ENCODING_FORMAT_PL: u16 = 2;
 
-/// The types that Cyclone announces readers and writers with (`ddsi_init.c`).
+/// The types with which Cyclone announces readers and writers (`ddsi_init.c`).
 const TYPES: [&CStr; 2] = [c"SubscriptionBuiltinTopicData", c"PublicationBuiltinTopicData"];
 
-// Of `ddsi__serdata_plist.h`: tables of functions that `cyclors` has no binding for.
+// Tables of functions in `ddsi__serdata_plist.h` for which `cyclors` has no binding.
 #[allow(improper_ctypes)]
 unsafe extern "C" {
     static ddsi_sertype_ops_plist: ddsi_sertype_ops;
@@ -59,11 +60,12 @@ struct ParameterListType {
 }
 
 thread_local! {
-    /// Whether the reader that this thread makes expects inline QoS.
+    /// `true` while this thread creates a reader that expects inline QoS.
     static ASKS: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Makes a reader that expects inline QoS, if `asks`. Cyclone announces a reader on the thread that makes it.
+/// Runs `make` to create a reader, which expects inline QoS if `asks`. Cyclone announces a reader on the thread that
+/// creates it.
 pub(crate) fn asking<T>(asks: bool, make: impl FnOnce() -> T) -> T {
     let before = ASKS.replace(asks);
     let made = make();
@@ -71,7 +73,7 @@ pub(crate) fn asking<T>(asks: bool, make: impl FnOnce() -> T) -> T {
     made
 }
 
-/// Completes the announcements of a domain from here on; false if its types are not as expected.
+/// Completes the announcements of a domain from now on. Returns `false` if its types are not as expected.
 ///
 /// # Safety
 /// `sertype` must be registered in the domain, and no other thread may register types there meanwhile.
@@ -86,7 +88,7 @@ pub(crate) unsafe fn complete(sertype: *const ddsi_sertype) -> bool {
 /// `domain` must be valid, and no other thread may register types there meanwhile.
 unsafe fn complete_type(domain: *mut ddsi_domaingv, name: &CStr) -> bool {
     // SAFETY: all zeros is a valid value of this plain C struct, which the call fills; the name is copied, and both tables live for
-    // ever. What is looked up is compared with functions of the first table, which read no more than the struct has.
+    // ever. The type that is found is compared with functions of the first table, which read no more than the struct has.
     let found = unsafe {
         let mut like = ParameterListType {
             common: std::mem::zeroed(),
@@ -114,7 +116,7 @@ unsafe fn complete_type(domain: *mut ddsi_domaingv, name: &CStr) -> bool {
     true
 }
 
-/// Cyclone's functions, but for those that make samples.
+/// Returns Cyclone's functions, with replacements for those that make samples.
 fn table() -> &'static ddsi_serdata_ops {
     struct Table(ddsi_serdata_ops);
     // SAFETY: function pointers, which are never written to.
@@ -133,14 +135,15 @@ fn table() -> &'static ddsi_serdata_ops {
     &table.0
 }
 
-/// Cyclone's own table.
+/// Returns Cyclone's own table.
 fn original() -> ddsi_serdata_ops {
     // SAFETY: a constant of Cyclone's.
     unsafe { ddsi_serdata_ops_plist }
 }
 
-/// Gives a received sample Cyclone's own table: Cyclone adds the sender's vendor to samples with that one only. Samples that are sent keep the table of
-/// their type, since Cyclone compares theirs with that of the sample that it makes to keep their key.
+/// Gives a received sample Cyclone's own table, because Cyclone adds the sender's vendor only to samples with that
+/// one. Sent samples keep the table of their type, because Cyclone compares it with that of the sample that it makes
+/// to keep their key.
 ///
 /// # Safety
 /// `sample` must be null, or valid and not shared yet.
@@ -198,7 +201,7 @@ unsafe extern "C" fn from_sample(
     }
 }
 
-/// The announcement with another list of parameters, in the place of one that is given back.
+/// Replaces an announcement by one with another list of parameters.
 ///
 /// # Safety
 /// `made` must be a sample of `sertype`, of Cyclone's own making.
@@ -228,7 +231,7 @@ unsafe fn changed(
     Some(changed)
 }
 
-/// Gives each identifier of a type the number of a parameter that is ignored; none if there is no identifier.
+/// Renumbers each type identifier to a parameter that is ignored. Returns `None` if there is none.
 fn hide_type(list: &mut [u8]) -> Option<()> {
     let big = list.get(1)? & 1 == 0;
     let (mut at, mut found) = (HEADER_BYTES, Vec::new());
@@ -246,8 +249,8 @@ fn hide_type(list: &mut [u8]) -> Option<()> {
     (!found.is_empty()).then_some(())
 }
 
-/// Adds to the list of parameters of an announcement, in the byte order of this machine; none if there is nothing to add, or it is no
-/// such list.
+/// Adds to the list of parameters of an announcement, in the byte order of this machine. Returns `None` if there is
+/// nothing to add, or if it is not such a list.
 fn add_missing(list: &mut Vec<u8>, expects_inline_qos: bool) -> Option<()> {
     let (mut endpoint, mut has_participant, mut bytes) = (None, false, HEADER_BYTES);
     for parameter in Parameters::new(list.get(HEADER_BYTES..)?, cfg!(target_endian = "big")) {

@@ -1,10 +1,13 @@
-//! The addresses in participants' announcements: RTPS messages with a DATA submessage of the participant writer (RTPS 2.5, 8.5.3).
+//! The addresses in participants' announcements: RTPS messages with a DATA submessage of the participant writer (RTPS
+//! 2.5, 8.5.3).
 //!
-//! Pure. It finds and replaces addresses in place, in messages of Cyclone's; it neither makes nor reads announcements otherwise.
+//! The module is pure. It finds and replaces addresses in place, in messages of Cyclone, and does nothing else with
+//! them.
 
 use std::net::Ipv4Addr;
 
-/// Bytes at the beginning of a message by which [`is_announcement`] knows it: the header, INFO_DST, INFO_TS, and the beginning of DATA.
+/// Length of the beginning by which [`is_announcement`] recognises a message: the header, INFO_DST, INFO_TS, and the
+/// beginning of DATA.
 pub(crate) const HEAD_BYTES: usize = 80;
 
 const HEADER_BYTES: usize = 20;
@@ -19,15 +22,15 @@ const PID_SENTINEL: u16 = 1;
 /// `PID_DEFAULT_UNICAST_LOCATOR` and `PID_METATRAFFIC_UNICAST_LOCATOR`.
 const PIDS_UNICAST: [u16; 2] = [0x31, 0x32];
 const UDP_V4: u32 = 1;
-/// Where a locator holds the four bytes of an IPv4 address, behind its kind, its port and twelve zeros.
+/// Position of the four bytes of an IPv4 address in a locator, behind its kind, its port and twelve zeros.
 const IPV4_AT: usize = 20;
 
-/// Returns `true` if a message that begins so announces a participant.
+/// Returns `true` if a message with this beginning announces a participant.
 pub(crate) fn is_announcement(head: &[u8]) -> bool {
     data(head).is_some()
 }
 
-/// Replaces the IPv4 addresses at which an announced participant is reached.
+/// Replaces the IPv4 addresses of an announced participant.
 pub(crate) fn replace(message: &mut [u8], with: impl Fn(Ipv4Addr) -> Ipv4Addr) {
     for at in addresses(message) {
         if let Some(bytes) = message.get_mut(at..at + 4)
@@ -38,7 +41,7 @@ pub(crate) fn replace(message: &mut [u8], with: impl Fn(Ipv4Addr) -> Ipv4Addr) {
     }
 }
 
-/// Returns where the submessage's content begins, and its flags.
+/// Returns the position of the submessage's content, and its flags.
 fn data(message: &[u8]) -> Option<(usize, u8)> {
     let mut at = HEADER_BYTES;
     for _ in 0..SUBMESSAGES_MAX {
@@ -79,7 +82,7 @@ fn find_addresses(message: &[u8], found: &mut Vec<usize>) -> Option<()> {
     Some(())
 }
 
-/// Visits the parameters of a list with where their values begin, and returns its end.
+/// Visits the parameters of a list with the positions of their values, and returns the list's end.
 fn parameters(
     message: &[u8],
     mut at: usize,

@@ -1,7 +1,7 @@
-//! What to join and how: [`DdsConfig`], and its translation into Cyclone's XML.
+//! The configuration of a DDS domain: [`DdsConfig`], and its translation into Cyclone's XML.
 //!
-//! Pure: reads no environment and no file. ROS's variables are the node's to read; [`crate::CycloneNetwork`] hands
-//! the XML to Cyclone.
+//! The module is pure: it reads no environment and no file. The node reads ROS's variables, and
+//! [`crate::CycloneNetwork`] hands the XML to Cyclone.
 
 use std::fmt::Write as _;
 use std::net::{IpAddr, Ipv4Addr};
@@ -12,40 +12,40 @@ use crate::payload::PAYLOAD_BYTES_MAX;
 use crate::security::Security;
 use crate::user_data;
 
-/// How far discovery reaches without static peers: `ROS_AUTOMATIC_DISCOVERY_RANGE`.
+/// The range of discovery without static peers: `ROS_AUTOMATIC_DISCOVERY_RANGE`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum DiscoveryRange {
-    /// Nobody is discovered, not even on this host; static peers are ignored.
+    /// No discovery, not even on this host. Static peers are ignored.
     Off,
-    /// This host only, over the loopback interface. Static peers widen it to those hosts, as in ROS 2.
+    /// This host only, over the loopback interface. Static peers add their hosts, as in ROS 2.
     LocalHost,
-    /// Whatever multicast on the default interface reaches, and the static peers.
+    /// Programs that multicast on the default interface reaches, and the static peers.
     #[default]
     Subnet,
-    /// Cyclone's own defaults and `CYCLONEDDS_URI`, nothing else; static peers are ignored.
+    /// Cyclone's own defaults and `CYCLONEDDS_URI` only. Static peers are ignored.
     SystemDefault,
 }
 
-/// Which DDS domain to join, and how.
+/// The configuration of a DDS domain and of this participant in it.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct DdsConfig {
     /// ROS domain id, at most [`DOMAIN_MAX`].
     pub domain: u32,
-    /// How far to look for others.
+    /// The range of discovery.
     pub discovery: DiscoveryRange,
-    /// Host names or IP addresses, optionally with `:port`, asked for participants by unicast. At most
+    /// Host names or IP addresses, optionally with `:port`, that are asked for participants by unicast. At most
     /// [`PEERS_MAX`].
     pub static_peers: Vec<String>,
-    /// Name of the SGC node. It is written into the USER_DATA of every endpoint made here, as
-    /// `sgc=<tag>;`, and endpoints that carry any such tag are not reported by discovery. `None` makes
-    /// a plain DDS participant that marks nothing and sees everybody but itself.
+    /// Name of the SGC node. It goes as `sgc=<tag>;` into the USER_DATA of every endpoint created here, and discovery
+    /// does not report endpoints that carry any such tag. `None` makes a plain DDS participant that marks nothing and
+    /// sees every other one.
     pub tag: Option<String>,
-    /// True if ROS 2 nodes are told of, both ways. The participant is then one of ROS 2 for every rmw.
+    /// `true` if ROS 2 nodes are reported and announced. Every rmw then sees a ROS 2 participant.
     pub graph: bool,
-    /// The user's `CYCLONEDDS_URI`: XML fragments or `file://` names, separated by commas. It comes
-    /// after the configuration made here, so what it sets wins, as in rmw_cyclonedds; lists (peers)
-    /// add up. A `<Domain Id="7">` in it applies to the first network that this process opens on
-    /// domain 7. If it selects network interfaces, [`DiscoveryRange::LocalHost`] selects none.
+    /// The user's `CYCLONEDDS_URI`: XML fragments or `file://` names, separated by commas. It comes after the
+    /// configuration made here, so its settings win, as in rmw_cyclonedds; lists (peers) add up. A `<Domain Id="7">`
+    /// in it applies to the first network that this process opens on domain 7. If it selects network interfaces,
+    /// [`DiscoveryRange::LocalHost`] selects none.
     pub cyclonedds_uri: Option<String>,
     /// The enclave with which the participant joins a network that DDS Security protects.
     pub security: Option<Security>,
@@ -54,37 +54,38 @@ pub struct DdsConfig {
 /// Largest ROS domain id: above, the RTPS port numbers (RTPS 2.5, 9.6.2.3) pass 65535.
 pub const DOMAIN_MAX: u32 = 232;
 
-/// Bound on static peers.
+/// Most static peers.
 pub const PEERS_MAX: usize = 64;
 
-/// Bound on the length of one static peer, bytes (rmw: `RMW_DISCOVERY_OPTIONS_STATIC_PEERS_MAX_LENGTH` − 1).
+/// Longest static peer, in bytes (rmw: `RMW_DISCOVERY_OPTIONS_STATIC_PEERS_MAX_LENGTH` − 1).
 pub const PEER_BYTES_MAX: usize = 255;
 
 /// Bytes of payload in one RTPS fragment. With Cyclone's default of 1344, 13 MB is ten thousand packets,
 /// and a Fast DDS reader with stock socket buffers never completes it.
 pub const FRAGMENT_BYTES: u32 = 14_000;
 
-/// Bytes of one RTPS message: a fragment and its headers. Larger would only group fragments, which makes
-/// bursts that stock socket buffers do not hold.
+/// Bytes of one RTPS message: a fragment and its headers. A larger one would only group fragments, which makes bursts
+/// beyond stock socket buffers.
 pub const MESSAGE_BYTES_MAX: u32 = 14_720;
 
-/// Milliseconds from a write to the heartbeat that asks for acknowledgement, the same reason.
+/// Milliseconds from a write to the heartbeat that asks for acknowledgement, short for the same reason.
 pub const HEARTBEAT_MS: u32 = 5;
 
-/// Milliseconds after which a reader asks again for a message that it lacks, without a heartbeat. A Fast DDS writer ignores a request
-/// for a message that it is about to send, and sends its next heartbeat after three seconds, Cyclone's default here.
+/// Milliseconds after which a reader asks again for a missing message without a heartbeat. A Fast DDS writer ignores
+/// a request for a message that it is about to send, and sends its next heartbeat after three seconds, which is also
+/// Cyclone's default.
 pub const ASK_AGAIN_MS: u32 = 500;
 
-/// Bytes of socket receive buffer asked for; the kernel's limit is accepted silently.
+/// Requested socket receive buffer in bytes. The kernel's limit is accepted silently.
 pub const RECEIVE_BUFFER_BYTES: u32 = 8 << 20;
 
-/// Bound on the addresses of this host that are asked for participants: each costs a hundred packets in 30 s.
+/// Most addresses of this host that are asked for participants. Each costs a hundred packets in 30 s.
 pub const HOST_ADDRESSES_MAX: usize = 8;
 
-/// Bound on the interfaces that lead to static peers: Cyclone takes four, of which one is the loopback interface.
+/// Most interfaces that lead to static peers. Cyclone accepts four, one of which is the loopback interface.
 const OUTWARD_MAX: usize = 3;
 
-/// How many participants of one host unicast discovery reaches.
+/// Number of participants of one host that unicast discovery reaches.
 const PARTICIPANT_INDEX_MAX: u32 = 99;
 
 impl DdsConfig {
@@ -110,32 +111,32 @@ impl DdsConfig {
     }
 }
 
-/// What distinguishes one Cyclone domain object from the others of this process.
+/// The properties of one Cyclone domain object among those of this process.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Instance {
     /// Process id.
     pub process: u32,
     /// Number of the network within the process.
     pub number: u32,
-    /// True if Cyclone's own domain id had to differ from the ROS domain, because this process has
-    /// joined that domain already; the ROS domain is then given as `ExternalDomainId`.
+    /// `true` if Cyclone's own domain id must differ from the ROS domain, because this process has joined that domain
+    /// already. The ROS domain then goes into `ExternalDomainId`.
     pub aliased: bool,
-    /// True if the user's `CYCLONEDDS_URI` selects network interfaces.
+    /// `true` if the user's `CYCLONEDDS_URI` selects network interfaces.
     pub interfaces_chosen: bool,
     /// This host's addresses other than loopback; see [`local_addresses`].
     pub host_addresses: Vec<Ipv4Addr>,
-    /// Addresses of this host from which static peers are reached.
+    /// The addresses of this host from which static peers are reached.
     pub towards_peers: Vec<Ipv4Addr>,
 }
 
-/// True if a peer can stand in Cyclone's XML and names a host: letters, digits and `.-_:[]%`.
+/// Returns `true` if a peer is valid in Cyclone's XML and names a host: letters, digits and `.-_:[]%`.
 pub fn is_peer(peer: &str) -> bool {
     !peer.is_empty()
         && peer.len() <= PEER_BYTES_MAX
         && peer.bytes().all(|b| b.is_ascii_alphanumeric() || b".-_:[]%".contains(&b))
 }
 
-/// True if the peer is this host by loopback: `localhost`, `127.0.0.0/8`, `::1`; a port does not matter.
+/// Returns `true` if the peer is this host by loopback: `localhost`, `127.0.0.0/8`, `::1`, with any port.
 fn is_loopback(peer: &str) -> bool {
     let host = match peer.rsplit_once(':') {
         Some((host, port)) if !host.contains(':') && port.bytes().all(|b| b.is_ascii_digit()) => host,
@@ -145,7 +146,7 @@ fn is_loopback(peer: &str) -> bool {
     host.eq_ignore_ascii_case("localhost") || host.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }
 
-/// The largest participant index whose ports (7400 + 250 d + 11 + 2 i) still fit, at most
+/// Returns the largest participant index whose ports (7400 + 250 d + 11 + 2 i) still fit, at most
 /// [`PARTICIPANT_INDEX_MAX`].
 fn participant_index_max(domain: u32) -> u32 {
     let first = 7400 + 250 * domain.min(DOMAIN_MAX) + 11;
@@ -244,7 +245,7 @@ pub fn cyclone_config(config: &DdsConfig, instance: &Instance) -> Result<String,
     Ok(xml)
 }
 
-/// Returns `true` if the network is to reach other hosts.
+/// Returns `true` if the network should reach other hosts.
 pub(crate) fn reaches_out(config: &DdsConfig) -> bool {
     match config.discovery {
         DiscoveryRange::Off => false,
@@ -253,13 +254,13 @@ pub(crate) fn reaches_out(config: &DdsConfig) -> bool {
     }
 }
 
-/// True within the loopback interface.
+/// Returns `true` if the network stays on the loopback interface.
 fn is_loopback_only(config: &DdsConfig) -> bool {
     config.discovery == DiscoveryRange::LocalHost && config.static_peers.iter().all(|p| is_loopback(p))
 }
 
-/// The interfaces to take: those that discovery reaches by, and the loopback interface, by which this host's programs are spoken to
-/// whatever becomes of its addresses. The others come first: static peers are asked by the first.
+/// Returns the interfaces to use: those for discovery, and the loopback interface, by which programs on this host
+/// stay reachable when its addresses change. The others come first, because the first one asks static peers.
 fn interfaces(config: &DdsConfig, instance: &Instance) -> String {
     const LOOPBACK: &str = "<NetworkInterface address=\"127.0.0.1\" presence_required=\"false\"/>";
     let before = "priority=\"3\"";
@@ -282,7 +283,7 @@ fn interfaces(config: &DdsConfig, instance: &Instance) -> String {
     format!("<Interfaces>{outward}{LOOPBACK}</Interfaces>")
 }
 
-/// The hosts of the peers that are not this one by loopback, without their ports.
+/// Returns the hosts of the peers that are not this one by loopback, without their ports.
 pub fn far_hosts(peers: &[String]) -> impl Iterator<Item = &str> {
     peers.iter().filter(|p| !is_loopback(p)).map(|peer| match peer.rsplit_once(':') {
         Some((host, port)) if !host.contains(':') && port.bytes().all(|b| b.is_ascii_digit()) => host,
@@ -290,7 +291,7 @@ pub fn far_hosts(peers: &[String]) -> impl Iterator<Item = &str> {
     })
 }
 
-/// The IPv4 addresses of this host that are not loopback, from the text of Linux's `/proc/net/fib_trie`; at most `max`.
+/// Returns this host's IPv4 addresses except loopback, from the text of Linux's `/proc/net/fib_trie`, at most `max`.
 pub fn local_addresses(fib_trie: &str, max: usize) -> Vec<Ipv4Addr> {
     let mut found = Vec::new();
     let mut last = None;
@@ -308,8 +309,8 @@ pub fn local_addresses(fib_trie: &str, max: usize) -> Vec<Ipv4Addr> {
     found
 }
 
-/// True if a `CYCLONEDDS_URI` names network interfaces, in itself or in a file that it refers to;
-/// `read` returns the text of a file, or `None`.
+/// Returns `true` if a `CYCLONEDDS_URI` names network interfaces, in itself or in a file that it refers to. `read`
+/// returns the text of a file, or `None`.
 pub fn chooses_interfaces(uri: &str, read: impl Fn(&str) -> Option<String>) -> bool {
     let names_them = |text: &str| {
         let text = text.to_ascii_lowercase();

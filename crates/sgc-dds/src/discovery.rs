@@ -1,8 +1,9 @@
-//! The endpoints of the local network: a thread that reads DCPSPublication, DCPSSubscription and DCPSParticipant.
+//! Discovery of the local network's endpoints: a thread that reads DCPSPublication, DCPSSubscription and
+//! DCPSParticipant.
 //!
-//! Reports each endpoint once when it appears, once when it is gone, and as gone and new when what it
-//! offers changes. Endpoints of this participant are never reported, those of other SGC nodes only to a
-//! network without a tag. Decides nothing else.
+//! It reports each endpoint once when it appears and once when it is gone. An endpoint whose offer changes is
+//! reported as gone and new. Endpoints of this participant are never reported, those of other SGC nodes only to a
+//! network without a tag.
 
 use std::collections::HashMap;
 use std::ffi::{CStr, c_char, c_void};
@@ -27,18 +28,18 @@ use crate::{qos, strangers, user_data};
 /// Samples taken at once.
 const BATCH: usize = 32;
 
-/// Bound on endpoints reported and not yet gone; more are ignored.
+/// Most endpoints that are reported and not yet gone. Further ones are ignored.
 const ENDPOINTS_MAX: usize = 65_536;
 
-/// Bound on a topic or type name, bytes (ROS 2 and DDS stop at 256).
+/// Longest topic or type name, in bytes (ROS 2 and DDS stop at 256).
 const NAME_BYTES_MAX: usize = 512;
 
-/// Discovery under way; dropping it ends it, and waits for its threads.
+/// Running discovery. Dropping it ends it and waits for its threads.
 #[derive(Debug)]
 pub(crate) struct Running {
     stop: Arc<Stop>,
     thread: Option<thread::JoinHandle<()>>,
-    /// What the participants say of their nodes.
+    /// The reader of participants' announcements of their nodes.
     _nodes: Option<CycloneReader>,
 }
 
@@ -51,7 +52,7 @@ impl Drop for Running {
     }
 }
 
-/// Starts the thread; what is there already is reported first. With an announcer, nodes are reported, too.
+/// Starts the thread, which first reports existing endpoints. With an announcer, nodes are reported, too.
 pub(crate) fn start(
     participant: Arc<Participant>,
     handler: DiscoveryHandler,
@@ -61,8 +62,8 @@ pub(crate) fn start(
     participant.watch(&handler);
     let graph = announcer.map(|announcer| Listener::new(Arc::clone(&handler), announcer));
     let stop = Stop::new(&participant)?;
-    let endpoints = [EndpointKind::Writer, EndpointKind::Reader].map(Told::Endpoint);
-    let told = endpoints.into_iter().chain([Told::Participant]);
+    let endpoints = [EndpointKind::Writer, EndpointKind::Reader].map(Subject::Endpoint);
+    let told = endpoints.into_iter().chain([Subject::Participant]);
     let readers: Vec<_> =
         told.map(|told| BuiltinReader::new(&participant, told)).collect::<Result<_, _>>()?;
     let conditions: Vec<&Entity> = readers.iter().map(|r| &r.condition).collect();
@@ -76,7 +77,7 @@ pub(crate) fn start(
     Ok(Running { stop, thread: Some(thread), _nodes: nodes })
 }
 
-/// What the thread owns. Fields drop in this order: children first.
+/// The thread's state. Fields drop in this order: children first.
 struct Discovery {
     wait_set: WaitSet,
     readers: Vec<BuiltinReader>,
@@ -89,29 +90,29 @@ struct Discovery {
 struct BuiltinReader {
     condition: Entity,
     reader: Entity,
-    told: Told,
+    told: Subject,
 }
 
-/// What the samples of a reader describe.
+/// The subject of a reader's samples.
 #[derive(Clone, Copy)]
-enum Told {
+enum Subject {
     Endpoint(EndpointKind),
     Participant,
 }
 
-/// What one of them says.
+/// A change that a sample reports.
 enum Change {
     Endpoint(Guid, Option<Announcement>),
-    /// Its USER_DATA, if it is there.
+    /// The participant's USER_DATA, or `None` if the participant is gone.
     Participant(Guid, Option<Vec<u8>>),
 }
 
 impl BuiltinReader {
-    fn new(participant: &Participant, told: Told) -> Result<Self, String> {
+    fn new(participant: &Participant, told: Subject) -> Result<Self, String> {
         let topic: dds_entity_t = match told {
-            Told::Endpoint(EndpointKind::Reader) => DDS_BUILTIN_TOPIC_DCPSSUBSCRIPTION,
-            Told::Endpoint(EndpointKind::Writer) => DDS_BUILTIN_TOPIC_DCPSPUBLICATION,
-            Told::Participant => DDS_BUILTIN_TOPIC_DCPSPARTICIPANT,
+            Subject::Endpoint(EndpointKind::Reader) => DDS_BUILTIN_TOPIC_DCPSSUBSCRIPTION,
+            Subject::Endpoint(EndpointKind::Writer) => DDS_BUILTIN_TOPIC_DCPSPUBLICATION,
+            Subject::Participant => DDS_BUILTIN_TOPIC_DCPSPARTICIPANT,
         };
         // SAFETY: the topic is a constant of Cyclone's; null means its own QoS and no listener.
         let reader = Entity::new(unsafe {
@@ -120,7 +121,7 @@ impl BuiltinReader {
         Ok(Self { condition: reader.read_condition()?, reader, told })
     }
 
-    /// Takes what there is, up to a batch; `None` for an endpoint that is not alive or cannot be bridged.
+    /// Takes samples, up to a batch. An endpoint that is not alive or cannot be bridged has no announcement.
     fn take(&self, changes: &mut Vec<Change>) -> Result<usize, String> {
         let mut samples: [*mut c_void; BATCH] = [std::ptr::null_mut(); BATCH];
         let mut infos: [MaybeUninit<dds_sample_info_t>; BATCH] = [const { MaybeUninit::uninit() }; BATCH];
@@ -139,12 +140,12 @@ impl BuiltinReader {
             // SAFETY: Cyclone filled the first `taken` of both arrays.
             let info = unsafe { info.assume_init_ref() };
             let alive = info.instance_state == dds_instance_state_DDS_IST_ALIVE;
-            // A sample that only tells a change of state has a key and nothing else.
+            // A sample that only reports a change of state has nothing but a key.
             if alive && !info.valid_data {
                 continue;
             }
             changes.push(match self.told {
-                Told::Endpoint(kind) => {
+                Subject::Endpoint(kind) => {
                     // SAFETY: samples of these two topics are of this type.
                     let endpoint = unsafe { &*sample.cast::<dds_builtintopic_endpoint_t>() };
                     // SAFETY: valid data has valid names and QoS while the loan lasts.
@@ -152,7 +153,7 @@ impl BuiltinReader {
                     let announcement = if alive { read() } else { None };
                     Change::Endpoint(Guid(endpoint.key.v), announcement)
                 }
-                Told::Participant => {
+                Subject::Participant => {
                     // SAFETY: samples of this topic are of this type.
                     let participant = unsafe { &*sample.cast::<dds_builtintopic_participant_t>() };
                     let qos = participant.qos;
@@ -264,12 +265,12 @@ impl Discovery {
         lock(&self.handler)(DiscoveryEvent::Appeared(endpoint));
     }
 
-    /// Notes a participant in case that it cannot be joined.
+    /// Records a participant in case that it cannot be joined.
     fn note_stranger(&self, guid: Guid, user_data: Option<&[u8]>) {
         let Some(data) = user_data.filter(|data| !user_data::is_tagged(data)) else {
             return strangers::forget(&guid);
         };
-        // Of others than ROS 2 it is known only if Cyclone refuses them.
+        // A participant outside of ROS 2 is recorded only if Cyclone refuses it.
         if let Some(enclave) = user_data::enclave(data)
             && !self.known.keys().any(|endpoint| endpoint.prefix() == guid.prefix())
         {
@@ -284,7 +285,7 @@ impl Discovery {
         self.note_stranger(guid, user_data);
         let Some(graph) = &self.graph else { return };
         match user_data {
-            // What SGC nodes say of the nodes that they stand for is for ROS 2, not for SGC nodes.
+            // Announcements of SGC nodes for remote nodes are for ROS 2, not for other SGC nodes.
             Some(data) if user_data::is_tagged(data) && self.participant.ignores_tagged() => {}
             Some(data) => graph.change(|view| view.participant_there(guid, user_data::enclave(data))),
             None => graph.change(|view| view.participant_gone(&guid)),

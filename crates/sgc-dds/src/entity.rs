@@ -1,7 +1,7 @@
 //! Ownership of DDS entities: [`Entity`] deletes on drop.
 //!
-//! Knows no topic and no sample. Owners declare their fields so that children drop before parents:
-//! Cyclone deletes the children of a deleted entity, and a handle must not be deleted twice.
+//! Owners declare their fields so that children drop before parents, because Cyclone deletes the children of a
+//! deleted entity, and a handle must not be deleted twice.
 
 use std::ffi::{CStr, CString};
 
@@ -19,17 +19,17 @@ pub(crate) const INFINITE: i64 = i64::MAX;
 pub(crate) struct Entity(dds_entity_t);
 
 impl Entity {
-    /// Takes the handle that a create function returned, or says why it returned none.
+    /// Wraps the handle that a create function returned, or returns the reason why it failed.
     pub(crate) fn new(handle: dds_entity_t) -> Result<Self, String> {
         if handle > 0 { Ok(Self(handle)) } else { Err(reason(handle)) }
     }
 
-    /// The handle, for calls into Cyclone while `self` lives.
+    /// Returns the handle, for calls into Cyclone while `self` lives.
     pub(crate) fn handle(&self) -> dds_entity_t {
         self.0
     }
 
-    /// The GUID of a participant, reader or writer.
+    /// Returns the GUID of a participant, reader or writer.
     pub(crate) fn guid(&self) -> Result<Guid, String> {
         let mut guid = dds_guid_t { v: [0; 16] };
         // SAFETY: the handle is checked by Cyclone, and `guid` is a valid place for the result.
@@ -37,7 +37,7 @@ impl Entity {
         Ok(Guid(guid.v))
     }
 
-    /// A condition that is true while the reader `self` holds samples of any state.
+    /// Returns a condition that is true while the reader `self` holds samples of any state.
     pub(crate) fn read_condition(&self) -> Result<Self, String> {
         // SAFETY: takes two numbers; the handle is checked by Cyclone.
         Self::new(unsafe { dds_create_readcondition(self.0, cyclors::DDS_ANY_STATE) })
@@ -54,19 +54,19 @@ impl Drop for Entity {
     }
 }
 
-/// `Err` with the reason if a return code is negative.
+/// Converts a negative return code to an error with the reason.
 pub(crate) fn check(ret: dds_return_t) -> Result<(), String> {
     if ret < 0 { Err(reason(ret)) } else { Ok(()) }
 }
 
-/// What Cyclone calls a return code.
+/// Returns Cyclone's text for a return code.
 pub(crate) fn reason(ret: dds_return_t) -> String {
     // SAFETY: returns a pointer to a string constant for every argument, never null.
     let text = unsafe { CStr::from_ptr(dds_strretcode(ret)) };
     text.to_string_lossy().into_owned()
 }
 
-/// A C string, or what is wrong with the text.
+/// Converts a text to a C string, or returns the reason why it cannot be one.
 pub(crate) fn c_string(text: &str) -> Result<CString, String> {
     CString::new(text).map_err(|_| format!("{text:?} contains a NUL"))
 }

@@ -1,22 +1,23 @@
 //! The first messages of Fast DDS writers.
 //!
-//! A Fast DDS writer sends its first message in the moment in which it matches a reader: a ROS client calls as soon as it sees a service.
-//! The message and the heartbeat in front of it may arrive before Cyclone knows the writer. Cyclone drops both, and takes all that is
-//! older than the first heartbeat that it handles for history, which a volatile reader does not get (`handle_Heartbeat` in
-//! `ddsi_receive.c`). So the message is lost, although its writer keeps it until it is acknowledged.
+//! A Fast DDS writer sends its first message at the moment it matches a reader; a ROS client calls as soon as it sees
+//! a service. The message and the preceding heartbeat may arrive before Cyclone knows the writer. Cyclone drops both.
+//! It treats everything older than the first heartbeat that it handles as history, which a volatile reader does not
+//! get (`handle_Heartbeat` in `ddsi_receive.c`). So the message is lost, although its writer keeps it until it is
+//! acknowledged.
 //!
-//! Two things are done when Cyclone discovers a reliable writer of Fast DDS, see [`install`]:
-//! - A volatile writer counts as one whose heartbeat was seen. Then the first heartbeat skips nothing: Cyclone asks for all messages that
-//!   it announces. Fast DDS answers with a GAP for those that it wrote before it matched the reader (`ReaderProxy::requested_changes_set`),
-//!   as RTPS 2.5, 8.4.2.2.5 wants it. Writers of Cyclone rely on the skip, and what others answer is not known, so they are left alone. So
-//!   are transient-local writers: their readers ask for everything anyway, and Cyclone learns from the first heartbeat where history
-//!   ends.
-//! - Each reliable reader that matches the writer asks for a heartbeat at once, with an ACKNACK of base 0, as the readers of Fast DDS do.
-//!   Fast DDS answers that at once, and an ACKNACK of base 1, which is Cyclone's first, with its next periodic heartbeat: after up to
-//!   three seconds.
+//! This module does two things when Cyclone discovers a reliable writer of Fast DDS, see [`install`]:
+//! - A volatile writer counts as one whose heartbeat was seen. Then the first heartbeat skips nothing, and Cyclone
+//! asks for all messages that it announces. Fast DDS answers with a GAP for those written before it matched the
+//! reader (`ReaderProxy::requested_changes_set`), as RTPS 2.5, 8.4.2.2.5 demands. Writers of Cyclone rely on the
+//! skip, and the answer of others is unknown, so both are left alone. So are transient-local writers: their readers
+//! ask for everything anyway, and Cyclone learns the end of history from the first heartbeat.
+//! - Each reliable reader that matches the writer asks for a heartbeat at once, with an ACKNACK of base 0, as readers
+//! of Fast DDS do. Fast DDS answers that at once. It answers an ACKNACK of base 1, which is Cyclone's first, with its
+//! next periodic heartbeat, after up to three seconds.
 //!
-//! That takes structs and functions of the C code of `cyclors` =0.4.0: `CYCLORS` in `sample.rs`. Each struct is compared with what it
-//! must hold in that moment, and everything is left alone where it does not.
+//! This needs structs and functions of the C code of `cyclors` =0.4.0: `CYCLORS` in `sample.rs`. Each struct is
+//! compared with its expected content at that moment, and everything is left alone if it differs.
 
 use std::cell::Cell;
 use std::ffi::{c_int, c_void};
@@ -35,12 +36,13 @@ use crate::entity::{Entity, check};
 use crate::identity::FAST_DDS;
 use crate::manual_leases::{self, Lease};
 
-/// How long after a match a reader asks for a heartbeat, nanoseconds. Cyclone tells of the match a few instructions before it would
-/// handle a heartbeat for the reader. On a busy machine the first answer may come in between; the second request is counted as if it
-/// were Cyclone's first ACKNACK, so Fast DDS ignores it once Cyclone has sent one.
+/// Delays after a match with which a reader asks for a heartbeat, in nanoseconds. Cyclone reports the match a few
+/// instructions before it would handle a heartbeat for the reader, so on a busy machine the first answer may come too
+/// early. The second request is counted as if it were Cyclone's first ACKNACK, so Fast DDS ignores it once Cyclone
+/// has sent one.
 const ASK_DELAYS_NS: [i64; 2] = [1_000_000, 50_000_000];
 
-/// Bytes of `struct dds_domain` in front of the structs that are looked at here; there are some 600.
+/// Bytes of `struct dds_domain` before the structs that are examined here; there are some 600.
 const DOMAIN_HEAD_BYTES_MAX: usize = 4096;
 
 /// `DDSI_EK_PROXY_WRITER` (`ddsi_entity.h`).
@@ -52,13 +54,14 @@ const NOT_OF_USERS: u32 = 0xc0;
 /// Lengths of `struct ddsi_security_info` (`ddsi_plist.h`), without and with security in Cyclone, bytes.
 const SECURITY_BYTES: [usize; 2] = [0, 8];
 
-/// Flags of a proxy writer, by the order of its bit fields. Compilers begin with the lowest bit on little-endian machines.
+/// Flags of a proxy writer, in the order of its bit fields. Compilers begin with the lowest bit on little-endian
+/// machines.
 const HAVE_SEEN_HEARTBEAT: u32 = 1 << 1;
 const LOCAL_MATCHING_IN_PROGRESS: u32 = 1 << 2;
 const ALIVE: u32 = 1 << 3;
 const FILTERED: u32 = 1 << 4;
 
-/// `struct ddsi_builtin_topic_interface` (`ddsi_builtin_topic_if.h`), by which `ddsi` tells `ddsc` of endpoints.
+/// `struct ddsi_builtin_topic_interface` (`ddsi_builtin_topic_if.h`), by which `ddsi` reports endpoints to `ddsc`.
 #[repr(C)]
 struct BuiltinTopics {
     domain: *mut c_void,
@@ -80,7 +83,7 @@ type WriteEndpoint = unsafe extern "C" fn(*const EntityCommon, Time, bool, *mut 
 #[repr(C)]
 struct EntityCommon {
     kind: c_int,
-    /// In the byte order of this machine.
+    /// The GUID, in the byte order of this machine.
     guid: [u32; 4],
     updated: i64,
     instance: u64,
@@ -110,7 +113,7 @@ struct Locator {
     connection: *const c_void,
 }
 
-/// `struct ddsi_proxy_writer` (`ddsi_proxy_endpoint.h`) as far as it is the same with security and without.
+/// The part of `struct ddsi_proxy_writer` (`ddsi_proxy_endpoint.h`) that is the same with and without security.
 #[repr(C)]
 struct ProxyWriter {
     common: EntityCommon,
@@ -126,7 +129,7 @@ struct ProxyWriter {
     type_pair: *const c_void,
 }
 
-/// The rest of it, as far as it is used.
+/// The used part of the rest of that struct.
 #[repr(C)]
 struct ProxyWriterState {
     readers: *const c_void,
@@ -196,25 +199,26 @@ unsafe extern "C" {
     fn ddsrt_time_monotonic() -> Time;
 }
 
-/// `dds__builtin_write_endpoint` of Cyclone, which all its domains have.
+/// The function `dds__builtin_write_endpoint` of Cyclone, which all its domains share.
 static WRITE_ENDPOINT: AtomicPtr<c_void> = AtomicPtr::new(std::ptr::null_mut());
 
 thread_local! {
-    /// The writer that this thread of Cyclone's discovered last.
-    static DISCOVERED: Cell<Option<Discovered>> = const { Cell::new(None) };
+    /// The writer that this thread of Cyclone discovered last.
+    static DISCOVERED: Cell<Option<NewWriter>> = const { Cell::new(None) };
 }
 
 #[derive(Clone, Copy)]
-struct Discovered {
+struct NewWriter {
     instance: dds_instance_handle_t,
     guid: [u32; 4],
     unicast: Locator,
     events: *mut c_void,
 }
 
-/// Has Cyclone tell this module of the endpoints that it discovers in a domain from now on, by taking the place of the function with
-/// which it publishes them to the built-in topics. It calls that once a writer is known, under the writer's lock, before it
-/// matches readers and before it handles a heartbeat. Returns what identifies the domain to [`manual_leases`].
+/// Makes Cyclone report the endpoints that it discovers in a domain to this module, by replacing the function with
+/// which it publishes them to the built-in topics. Cyclone calls that function once a writer is known, under the
+/// writer's lock, before it matches readers and before it handles a heartbeat. Returns the id of the domain for
+/// [`manual_leases`].
 pub(crate) fn install(domain: &Entity, participant: &Entity) -> Result<usize, String> {
     // SAFETY: the topic is a constant of Cyclone's; null means its own QoS and no listener.
     let reader = Entity::new(unsafe {
@@ -263,17 +267,17 @@ pub(crate) fn install(domain: &Entity, participant: &Entity) -> Result<usize, St
     Ok(gv)
 }
 
-/// Adds to a listener of a reliable reader that it asks writers for a heartbeat.
+/// Makes the listener of a reliable reader ask writers for a heartbeat.
 ///
 /// # Safety
 /// The listener must be valid.
 pub(crate) unsafe fn listen(listener: *mut dds_listener_t) {
-    // The status stays as it is for those who wait for it.
+    // The status stays set for threads that wait for it.
     // SAFETY: valid by contract; the function takes no argument.
     unsafe { dds_lset_subscription_matched_arg(listener, Some(matched), std::ptr::null_mut(), false) };
 }
 
-/// Takes the place of `dds__builtin_write_endpoint`.
+/// Replaces `dds__builtin_write_endpoint`.
 unsafe extern "C" fn endpoint_changed(
     entity: *const EntityCommon,
     time: Time,
@@ -295,11 +299,12 @@ unsafe extern "C" fn endpoint_changed(
     }
 }
 
-/// Has the lease of a new reliable writer looked at, and returns the writer if it is of Fast DDS, whose first heartbeat is let skip nothing.
+/// Keeps the lease of a new reliable writer if necessary. Returns the writer if it is one of Fast DDS, whose first
+/// heartbeat then skips nothing.
 ///
 /// # Safety
 /// `entity` must be a `struct ddsi_entity_common` that may be written to, `domain` the `struct dds_domain` that it belongs to.
-unsafe fn discover(entity: *const EntityCommon, domain: *mut c_void) -> Option<Discovered> {
+unsafe fn discover(entity: *const EntityCommon, domain: *mut c_void) -> Option<NewWriter> {
     // SAFETY: valid by contract, and every entity begins with these.
     let (kind, guid, gv) = unsafe { ((*entity).kind, (*entity).guid, (*entity).gv) };
     let is_of_domain = (gv as usize).wrapping_sub(domain as usize) <= DOMAIN_HEAD_BYTES_MAX;
@@ -333,10 +338,10 @@ unsafe fn discover(entity: *const EntityCommon, domain: *mut c_void) -> Option<D
     }
     // SAFETY: as above.
     let events = unsafe { (*state).events };
-    Some(Discovered { instance, guid, unicast, events })
+    Some(NewWriter { instance, guid, unicast, events })
 }
 
-/// Returns `true` for exactly what `ddsi_new_proxy_writer` writes for a reliable writer.
+/// Returns `true` for exactly the state that `ddsi_new_proxy_writer` writes for a reliable writer.
 fn is_new_and_reliable(state: &ProxyWriterState) -> bool {
     let flags = state.flags & (HAVE_SEEN_HEARTBEAT | LOCAL_MATCHING_IN_PROGRESS | ALIVE | FILTERED);
     let queues = [state.defragmenter, state.reorder, state.delivery_queue, state.events.cast_const()];
@@ -351,14 +356,15 @@ fn is_new_and_reliable(state: &ProxyWriterState) -> bool {
 /// The arguments of an event that asks for a heartbeat.
 #[derive(Clone, Copy)]
 #[repr(C)]
-struct Asking {
+struct AskArguments {
     reader: [u32; 4],
     writer: [u32; 4],
     to: Locator,
     count: u32,
 }
 
-/// The listener for matches. Cyclone calls it on the thread that discovered the writer, while the writer cannot go.
+/// The listener for matches. Cyclone calls it on the thread that discovered the writer, while the writer cannot be
+/// deleted.
 unsafe extern "C" fn matched(
     reader: dds_entity_t,
     status: dds_subscription_matched_status_t,
@@ -376,12 +382,12 @@ unsafe extern "C" fn matched(
     let word = |at: usize| u32::from_be_bytes([guid.v[at], guid.v[at + 1], guid.v[at + 2], guid.v[at + 3]]);
     let reader = [word(0), word(4), word(8), word(12)];
     for (count, delay_ns) in (0..).zip(ASK_DELAYS_NS) {
-        let asking = Asking { reader, writer: writer.guid, to: writer.unicast, count };
+        let asking = AskArguments { reader, writer: writer.guid, to: writer.unicast, count };
         // SAFETY: the queue of events lives as long as the domain; the argument is copied.
         unsafe {
             let at = Time(ddsrt_time_monotonic().0.saturating_add(delay_ns));
             let arg = (&raw const asking).cast();
-            ddsi_qxev_callback(writer.events, at, ask, arg, size_of::<Asking>(), false);
+            ddsi_qxev_callback(writer.events, at, ask, arg, size_of::<AskArguments>(), false);
         }
     }
 }
@@ -405,9 +411,9 @@ const ACKNACK: u8 = 0x06;
 const LITTLE_ENDIAN: u8 = 0x01;
 const SUBMESSAGE_HEAD_BYTES: usize = offset_of!(AckNack, reader);
 
-/// Sends it, once.
+/// Sends the ACKNACK once.
 unsafe extern "C" fn ask(gv: *mut c_void, event: *mut c_void, pack: *mut c_void, arg: *mut c_void, _: Time) {
-    /// Where messages come from and go back to; it is never freed, since they may be under way at any time.
+    /// The pool of messages. It is never freed, because messages may be in transit at any time.
     struct Pool(*mut c_void);
     // SAFETY: Cyclone locks it for every use.
     unsafe impl Send for Pool {}
@@ -416,7 +422,7 @@ unsafe extern "C" fn ask(gv: *mut c_void, event: *mut c_void, pack: *mut c_void,
     static POOL: OnceLock<Pool> = OnceLock::new();
 
     // SAFETY: the copy of what the event was made with, which has no alignment of its own.
-    let Asking { reader, writer, to, count } = unsafe { arg.cast::<Asking>().read_unaligned() };
+    let AskArguments { reader, writer, to, count } = unsafe { arg.cast::<AskArguments>().read_unaligned() };
     let acknack = AckNack {
         kind: ACKNACK,
         flags: LITTLE_ENDIAN,

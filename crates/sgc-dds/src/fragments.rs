@@ -1,11 +1,11 @@
-//! Fragments of received samples, as Cyclone hands them to a type of samples.
+//! Fragments of received samples, as Cyclone hands them to a sample type.
 //!
-//! Cyclone takes a sample for complete once its fragments reach the length that the first one announces. It does not compare
-//! that length with the other fragments, which announce one each: a fragment that announces more may reach beyond it. What
-//! compares them in Cyclone are assertions, which are not compiled in. [`cover_exactly`] does it here, and [`guard_discovery`] has Cyclone's own
-//! types of samples do it.
+//! Cyclone considers a sample complete once its fragments reach the length that the first one announces. It does not
+//! compare that length with those that the other fragments announce, so a fragment may reach beyond it. Cyclone
+//! checks this only by assertions, which are not compiled in. [`cover_exactly`] checks it here, and
+//! [`guard_discovery`] makes Cyclone's own sample types check it.
 //!
-//! The submessages behind a sample in its packet are read here as well: [`kept_by_writer`].
+//! This module also reads the submessages behind a sample in its packet: [`kept_by_writer`].
 //!
 //! The structs are those of the C code of `cyclors` =0.4.0: `CYCLORS` in `sample.rs`.
 
@@ -19,16 +19,16 @@ use crate::inline_qos::{DATA, DATA_FRAG, FLAG_LITTLE_ENDIAN};
 use crate::network::read_file;
 use crate::payload::HEADER_BYTES;
 
-/// Submessages behind a sample's that are looked at.
+/// Most submessages behind a sample that are examined.
 const SUBMESSAGES_MAX: usize = 4;
 
-/// A heartbeat (RTPS 2.5, 9.4.5.7): its kind, and its length up to the last number, bytes.
+/// The kind of a heartbeat (RTPS 2.5, 9.4.5.7), and its length up to the last number in bytes.
 const HEARTBEAT: (u8, usize) = (0x07, 28);
 
-/// INFO_TS and INFO_DST (RTPS 2.5, 9.4.5.11 and 9.4.5.9), which may stand in front of it.
+/// INFO_TS and INFO_DST (RTPS 2.5, 9.4.5.11 and 9.4.5.9), which may precede the heartbeat.
 const INFO: [u8; 2] = [0x09, 0x0e];
 
-/// Where the writer's entity id begins in a sample and in a heartbeat, bytes from the beginning of the submessage.
+/// Positions of the writer's entity id in a sample and in a heartbeat, in bytes from the beginning of the submessage.
 const WRITER_OFFSETS: [usize; 2] = [12, 8];
 
 /// Length of the header of a submessage, bytes.
@@ -101,13 +101,13 @@ type FromSer = unsafe extern "C" fn(
 /// Cyclone's own functions, by table.
 static FROM_SER: [AtomicPtr<c_void>; 3] = [const { AtomicPtr::new(std::ptr::null_mut()) }; 3];
 
-/// Has Cyclone's own types of samples refuse fragments that do not cover their sample exactly, for the whole process and for ever. To be called
-/// before there is a domain.
+/// Makes Cyclone's own sample types refuse fragments that do not cover their sample exactly, for the lifetime of the
+/// process. Call this before a domain exists.
 ///
-/// The tables are constants, in memory that is protected against writing: it is opened for a moment.
+/// The tables are constants in write-protected memory, whose protection is lifted for a moment.
 ///
 /// # Errors
-/// The reason, where the memory is not as it should be.
+/// The memory is not as expected.
 pub(crate) fn guard_discovery() -> Result<(), &'static str> {
     static DONE: OnceLock<Result<(), &'static str>> = OnceLock::new();
     *DONE.get_or_init(|| {
@@ -151,7 +151,7 @@ unsafe fn replace(field: *mut *mut c_void, with: *mut c_void) -> Result<(), &'st
     // SAFETY: by contract, and writable now. An aligned pointer is in one page.
     unsafe { AtomicPtr::from_ptr(field) }.store(with, Ordering::Release);
     if !is_writable {
-        // If that fails the page stays writable, as it is where the linker does not protect it.
+        // On failure the page stays writable, as it is where the linker does not protect it.
         protect(READ);
     }
     Ok(())
@@ -167,7 +167,7 @@ fn protection(maps: &str, address: usize) -> Option<&str> {
     })
 }
 
-/// Takes the place of Cyclone's own function of a table.
+/// Replaces Cyclone's own function of a table.
 unsafe extern "C" fn covered<const TABLE: usize>(
     sertype: *const ddsi_sertype,
     kind: ddsi_serdata_kind,
@@ -183,11 +183,11 @@ unsafe extern "C" fn covered<const TABLE: usize>(
     unsafe { std::mem::transmute::<*mut c_void, FromSer>(original)(sertype, kind, fragments, bytes) }
 }
 
-/// Returns the number of messages that the writer of a sample keeps, if a heartbeat follows in the packet and says that the writer has
-/// dropped older ones.
+/// Returns the number of messages that the writer of a sample keeps, if a heartbeat follows in the packet and shows
+/// that the writer has dropped older ones.
 ///
 /// Fast DDS puts a heartbeat behind each sample of a reliable writer once its history is full, into the same packet
-/// (`StatefulWriter::send_heartbeat_piggyback_nts_`). Its numbers are a row that begins with 1.
+/// (`StatefulWriter::send_heartbeat_piggyback_nts_`). Its numbers are consecutive and begin with 1.
 ///
 /// # Safety
 /// `fragment` must be one that Cyclone hands to a type of samples, while it does so.
@@ -204,20 +204,20 @@ pub(crate) unsafe fn kept_by_writer(fragment: &ReceivedFragment) -> Option<u64> 
     kept_behind(packet, usize::from(fragment.submessage_offset))
 }
 
-/// Does so for the sample whose submessage begins there in a packet.
+/// Returns that number for the sample whose submessage begins at `at` in a packet.
 fn kept_behind(packet: &[u8], mut at: usize) -> Option<u64> {
     let read = |at: usize, bytes: usize| packet.get(at..at.checked_add(bytes)?);
     let head = read(at, DATA.1)?;
     if ![DATA.0, DATA_FRAG.0].contains(&head[0]) {
         return None;
     }
-    // Cyclone has put the header of the sample into the byte order of this machine; those behind it are as they came. It goes on with them
-    // after this or at the same time.
+    // Cyclone has put the header of the sample into the byte order of this machine. The later submessages are still
+    // as received, because Cyclone handles them after this or at the same time.
     let writer = u32::from_ne_bytes(*head[WRITER_OFFSETS[0]..].first_chunk()?);
     let mut length = usize::from(u16::from_ne_bytes([head[2], head[3]]));
     for _ in 0..SUBMESSAGES_MAX {
         if length == 0 {
-            // It is the last one.
+            // The submessage is the last one.
             return None;
         }
         at += SUBMESSAGE_HEAD_BYTES + length;
@@ -240,7 +240,7 @@ fn kept_behind(packet: &[u8], mut at: usize) -> Option<u64> {
     None
 }
 
-/// Returns the number of messages that a heartbeat announces, if they do not begin with the first of all.
+/// Returns the number of messages that a heartbeat announces, unless they begin with the very first.
 fn kept(heartbeat: &[u8]) -> Option<u64> {
     let number = |at: usize| {
         let (high, low) = (heartbeat[at..].first_chunk::<4>()?, heartbeat[at + 4..].first_chunk::<4>()?);
@@ -257,9 +257,9 @@ mod tests {
 
     use super::*;
 
-    /// A message of Cyclone's with a packet of one sample and what follows it.
+    /// A message of Cyclone with a packet of one sample and the submessages behind it.
     #[repr(C)]
-    struct Received {
+    struct TestPacket {
         message: ReceivedMessage,
         packet: [u8; 128],
     }
@@ -278,7 +278,7 @@ mod tests {
             chunk_next: std::ptr::null_mut(),
             chunk_bytes: all.len().min(fragments) as u64,
         };
-        let received = Received { message, packet };
+        let received = TestPacket { message, packet };
         let fragment = ReceivedFragment {
             message: &raw const received.message,
             next: std::ptr::null(),

@@ -1,6 +1,6 @@
 //! The ROS graph on DDS: a writer and a reader of `ros_discovery_info`, as every rmw has them.
 //!
-//! Moves messages; what they say is read and kept in [`sgc_ros::graph`].
+//! This module moves messages; [`sgc_ros::graph`] interprets them.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -12,20 +12,20 @@ use crate::network::Participant;
 use crate::reader::CycloneReader;
 use crate::writer::CycloneWriter;
 
-/// A handler that several threads tell, one at a time.
+/// A handler that several threads call, one at a time.
 pub(crate) type SharedHandler = Arc<Mutex<DiscoveryHandler>>;
 
-/// Says what nodes this participant has.
+/// The writer that announces this participant's nodes.
 #[derive(Debug)]
 pub(crate) struct Announcer {
     writer: CycloneWriter,
     participant: Guid,
-    said: Mutex<Said>,
+    said: Mutex<AnnouncedNodes>,
 }
 
 #[derive(Debug, Default)]
-struct Said {
-    /// Nothing is said before there is something to say.
+struct AnnouncedNodes {
+    /// The announced nodes; `None` until the first announcement.
     nodes: Option<Vec<GraphNode>>,
     gid_bytes: GidBytes,
 }
@@ -36,7 +36,7 @@ impl Announcer {
         Ok(Self { writer, participant: participant.guid(), said: Mutex::default() })
     }
 
-    /// These nodes from now on.
+    /// Announces these nodes, and no others, from now on.
     pub(crate) fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError> {
         let mut said = lock(&self.said);
         if said.nodes.as_deref() == Some(nodes) {
@@ -46,7 +46,7 @@ impl Announcer {
         self.write(&said)
     }
 
-    /// The network's ids are that long from now on: what was said is said again if it was said otherwise.
+    /// Sets the length of ids in the network, and repeats the announcement if the length changed.
     fn set_gid_bytes(&self, gid_bytes: GidBytes) {
         let mut said = lock(&self.said);
         if std::mem::replace(&mut said.gid_bytes, gid_bytes) != gid_bytes
@@ -56,7 +56,7 @@ impl Announcer {
         }
     }
 
-    fn write(&self, said: &Said) -> Result<(), RosError> {
+    fn write(&self, said: &AnnouncedNodes) -> Result<(), RosError> {
         let Some(nodes) = &said.nodes else { return Ok(()) };
         let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let stamp = unix.as_nanos().try_into().unwrap_or(0);
@@ -65,7 +65,7 @@ impl Announcer {
     }
 }
 
-/// What the other participants say of theirs, and whom to tell.
+/// The listener to other participants' announcements, which forwards them to a handler.
 pub(crate) struct Listener {
     view: Mutex<GraphView>,
     handler: SharedHandler,
@@ -77,7 +77,7 @@ impl Listener {
         Arc::new(Self { view: Mutex::default(), handler, announcer })
     }
 
-    /// Starts listening; ends when what it returns is dropped.
+    /// Starts to listen. Dropping the result ends it.
     pub(crate) fn listen(self: &Arc<Self>, participant: &Arc<Participant>) -> Result<CycloneReader, String> {
         let listener = Arc::clone(self);
         CycloneReader::new(
@@ -95,7 +95,7 @@ impl Listener {
         )
     }
 
-    /// Takes in what changed, and tells what follows from it.
+    /// Applies a change and reports the event that follows from it.
     pub(crate) fn change(&self, change: impl FnOnce(&mut GraphView) -> Option<DiscoveryEvent>) {
         let mut view = lock(&self.view);
         if let Some(event) = change(&mut view) {

@@ -1,6 +1,6 @@
-//! The IPv4 addresses of this host: those that it has, and those that it had since this process follows them.
+//! The IPv4 addresses of this host: the present ones, and former ones since this process follows them.
 //!
-//! A thread of the process is told by the kernel when something changes, and lives as long as the process.
+//! The kernel reports changes to a thread, which lives as long as the process.
 
 use std::net::Ipv4Addr;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,17 +16,17 @@ use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, bind, recv,
 use crate::config::local_addresses;
 use crate::network::read_file;
 
-/// Bound on addresses that this host has, and on all that are remembered; the oldest are forgotten.
+/// Most present addresses, and most remembered ones. The oldest are forgotten.
 const HERE_MAX: usize = 64;
 const KNOWN_MAX: usize = 256;
-/// The kernel tells of a link before it withdraws its addresses: pauses after which they are read.
+/// Pauses before the addresses are read, because the kernel reports a link before it withdraws its addresses.
 const PAUSES: [Duration; 2] = [Duration::from_millis(50), Duration::from_millis(450)];
 /// Kernel messages about links and IPv4 addresses (`RTMGRP_LINK` and `RTMGRP_IPV4_IFADDR`, rtnetlink(7)).
 const GROUPS: u32 = 0x1 | 0x10;
 const MESSAGE_BYTES_MAX: usize = 8192;
 
 static ADDRESSES: RwLock<Addresses> = RwLock::new(Addresses::NONE);
-/// An address that this host had is gone.
+/// `true` once a former address of this host is gone.
 static ANY_GONE: AtomicBool = AtomicBool::new(false);
 
 struct Addresses {
@@ -35,7 +35,7 @@ struct Addresses {
     changes: Changes,
 }
 
-/// How often this host's addresses changed since they are followed, and when they did last.
+/// The number of address changes since they are followed, and the time of the last.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Changes {
     pub(crate) number: u64,
@@ -62,7 +62,7 @@ impl Addresses {
     }
 }
 
-/// Begins to follow this host's addresses, if this process does not yet.
+/// Begins to follow this host's addresses, unless this process does already.
 pub(crate) fn follow() {
     static FOLLOWED: Once = Once::new();
     FOLLOWED.call_once(|| {
@@ -70,7 +70,7 @@ pub(crate) fn follow() {
         refresh(false);
         let started = kernel.and_then(|kernel| {
             thread::Builder::new().name("sgc-dds-host".into()).spawn(move || {
-                // Between the first look and the thread's beginning something may have changed, which the kernel kept.
+                // A change before the thread began is kept by the kernel.
                 let ended = loop {
                     if let Err(error) = wait_for_change(&kernel) {
                         break error;
@@ -93,17 +93,17 @@ fn warn_not_followed(error: &io::Error) {
     tracing::warn!(%error, "this host's addresses are not followed: local programs are lost when they change");
 }
 
-/// Returns `true` if an address that this host had is gone. Cheap.
+/// Returns `true` if a former address of this host is gone. Cheap.
 pub(crate) fn any_gone() -> bool {
     ANY_GONE.load(Ordering::Relaxed)
 }
 
-/// Returns `true` if an address is this host's or was.
+/// Returns `true` for a present or former address of this host.
 pub(crate) fn is_known(address: Ipv4Addr) -> bool {
     address.is_loopback() || read(|addresses| addresses.known.contains(&address))
 }
 
-/// Returns `true` if this host has an address now.
+/// Returns `true` for a present address of this host.
 pub(crate) fn is_here(address: Ipv4Addr) -> bool {
     address.is_loopback() || read(|addresses| addresses.here.contains(&address))
 }
@@ -113,7 +113,7 @@ pub(crate) fn has_any() -> bool {
     read(|addresses| !addresses.here.is_empty())
 }
 
-/// Returns how often and when the addresses changed.
+/// Returns the number of address changes and the time of the last.
 pub(crate) fn changes() -> Changes {
     read(|addresses| addresses.changes)
 }
@@ -122,9 +122,9 @@ fn read<T>(look: impl FnOnce(&Addresses) -> T) -> T {
     look(&ADDRESSES.read().unwrap_or_else(PoisonError::into_inner))
 }
 
-/// Reads the addresses; what is other than before is a change, except for the first time.
+/// Reads the addresses. A difference counts as a change, except for the first time.
 fn refresh(is_change: bool) {
-    // A table that cannot be read does not mean that all addresses are gone.
+    // An unreadable table does not mean that all addresses are gone.
     let Some(table) = read_file("/proc/net/fib_trie") else { return };
     let here = local_addresses(&table, HERE_MAX);
     let mut addresses = ADDRESSES.write().unwrap_or_else(PoisonError::into_inner);
@@ -139,7 +139,7 @@ fn refresh(is_change: bool) {
     }
 }
 
-/// Has this host lose an address.
+/// Makes this host lose an address.
 #[cfg(test)]
 pub(crate) fn lose(address: Ipv4Addr) {
     let mut addresses = ADDRESSES.write().unwrap_or_else(PoisonError::into_inner);
@@ -158,7 +158,7 @@ fn wait_for_change(kernel: &OwnedFd) -> io::Result<()> {
     let mut flags = RecvFlags::empty();
     loop {
         match recv(kernel, &mut message[..], flags) {
-            // There was more than the kernel had room for, which says as much as a message.
+            // The kernel ran out of buffer space, which also means that something changed.
             Ok(_) | Err(Errno::NOBUFS) => flags = RecvFlags::DONTWAIT,
             Err(Errno::INTR) => {}
             Err(Errno::AGAIN) => return Ok(()),
@@ -200,7 +200,7 @@ mod tests {
     fn loopback_is_always_here() {
         follow();
         assert!(is_here(Ipv4Addr::LOCALHOST) && is_known(Ipv4Addr::LOCALHOST));
-        // Of documentation (RFC 5737).
+        // This address is for documentation (RFC 5737).
         assert!(!is_known(Ipv4Addr::new(192, 0, 2, 77)));
     }
 }

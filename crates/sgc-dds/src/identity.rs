@@ -1,14 +1,16 @@
-//! Which request a message belongs to: [`SampleIdentity`], and both places where vendors put it.
+//! The request that a message belongs to: [`SampleIdentity`], and the two places where vendors put it.
 //!
-//! Pure. RPC over DDS 1.0 (7.8.2) puts it into the inline QoS of the RTPS DATA submessage, in front of the payload:
-//! Fast DDS and RustDDS do that. rmw_cyclonedds puts 16 bytes into the payload, in front of the body. [`Mapping`] says which.
+//! The module is pure. RPC over DDS 1.0 (7.8.2) puts the identity into the inline QoS of the RTPS DATA submessage, in
+//! front of the payload; Fast DDS and RustDDS do that. rmw_cyclonedds puts 16 bytes into the payload, in front of the
+//! body. [`Mapping`] distinguishes the two.
 
 use sgc_ros::{Guid, KeyHash};
 
 /// PID_RELATED_SAMPLE_IDENTITY of RPC over DDS 1.0 (7.8.2, table 7.11).
 pub const PID_RELATED: u16 = 0x0083;
 
-/// The same, as Fast DDS numbered it before; 2.9 knows no other, and newer ones write both.
+/// The former number of the same parameter in Fast DDS. Version 2.9 knows only this one, and newer versions write
+/// both.
 pub const PID_RELATED_FAST: u16 = 0x800f;
 
 /// PID_KEY_HASH (RTPS 2.5, 9.6.4.8): the key of a sample, hashed.
@@ -17,9 +19,9 @@ pub const PID_KEY_HASH: u16 = 0x0070;
 /// PID_STATUS_INFO (RTPS 2.5, 9.6.4.9): the end of an instance.
 pub(crate) const PID_STATUS_INFO: u16 = 0x0071;
 
-/// A parameter that nobody knows, vendor-specific and "must be understood" (RTPS 2.5, 9.6.3.1): Cyclone drops
-/// a sample of a Cyclone participant that carries it, without a word, which keeps a message in the other mapping
-/// from a program that would read its first 16 bytes as an id. Other vendors skip what is specific to Cyclone.
+/// A vendor-specific parameter that must be understood and that no implementation knows (RTPS 2.5, 9.6.3.1). Cyclone
+/// silently drops a sample of a Cyclone participant that carries it. This keeps a message in the other mapping from a
+/// program that would read its first 16 bytes as an id. Other vendors skip parameters specific to Cyclone.
 pub const PID_NOT_FOR_CYCLONE: u16 = 0xcfff;
 
 /// End of a parameter list (RTPS 2.5, 9.4.2.11).
@@ -28,7 +30,7 @@ pub(crate) const PID_SENTINEL: u16 = 0x0001;
 /// Length of a sample identity in a parameter, bytes: a GUID and a sequence number.
 pub const IDENTITY_BYTES: usize = 24;
 
-/// Sequence number that stands for none: high −1, low 0 (RTPS 2.5, 9.3.2.2).
+/// The sequence number that stands for an unknown one: high −1, low 0 (RTPS 2.5, 9.3.2.2).
 pub const NUMBER_UNKNOWN: i64 = -1 << 32;
 
 /// Vendor id of Cyclone DDS.
@@ -37,33 +39,33 @@ pub(crate) const CYCLONE: [u8; 2] = [0x01, 0x10];
 /// The vendor id of Fast DDS (RTPS 2.5, 9.3.1.2; list of the OMG).
 pub(crate) const FAST_DDS: [u8; 2] = [0x01, 0x0f];
 
-/// Where a program puts the identity of a request.
+/// The place where a program puts the identity of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Mapping {
-    /// In front of the body, as rmw_cyclonedds.
+    /// In front of the body, as in rmw_cyclonedds.
     Body,
-    /// In the inline QoS, as everybody else.
+    /// In the inline QoS, as in other implementations.
     InlineQos,
 }
 
 impl Mapping {
-    /// The mapping of the programs of a vendor.
-    pub fn of(vendor: [u8; 2]) -> Self {
+    /// Returns the mapping of a vendor's programs.
+    pub fn for_vendor(vendor: [u8; 2]) -> Self {
         if vendor == CYCLONE { Self::Body } else { Self::InlineQos }
     }
 }
 
-/// A message: who wrote it, or stands for who did, and its number there.
+/// The identity of a message: its writer, or the reader for the answer, and its number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SampleIdentity {
-    /// A writer, or the reader to which the answer shall go.
+    /// A writer, or the reader that the answer goes to.
     pub guid: Guid,
-    /// Sequence number.
+    /// The sequence number.
     pub number: i64,
 }
 
 impl SampleIdentity {
-    /// As a parameter holds it, in the byte order of this machine.
+    /// Encodes the identity as a parameter, in the byte order of this machine.
     pub(crate) fn to_bytes(self) -> [u8; IDENTITY_BYTES] {
         let mut bytes = [0; IDENTITY_BYTES];
         bytes[..16].copy_from_slice(&self.guid.0);
@@ -72,8 +74,8 @@ impl SampleIdentity {
         bytes
     }
 
-    /// The related identity in the inline QoS of a submessage: parameters up to the sentinel. `None` if there is
-    /// none or the list is broken.
+    /// Returns the related identity in the inline QoS of a submessage, a list of parameters up to the sentinel.
+    /// Returns `None` if there is none or the list is malformed.
     pub fn related(inline_qos: &[u8], big_endian: bool) -> Option<Self> {
         let u32_at = |b: [u8; 4]| if big_endian { u32::from_be_bytes(b) } else { u32::from_le_bytes(b) };
         let mut older = None;
@@ -96,14 +98,15 @@ impl SampleIdentity {
     }
 }
 
-/// The hash of a sample's key in the inline QoS of a submessage. `None` if there is none or the list is broken before it.
+/// Returns the key hash in the inline QoS of a submessage, or `None` if there is none or the list is malformed before
+/// it.
 pub fn key_hash(inline_qos: &[u8], big_endian: bool) -> Option<KeyHash> {
     Parameters::new(inline_qos, big_endian)
         .map_while(|parameter| parameter)
         .find_map(|(pid, value)| value.first_chunk().filter(|_| pid == PID_KEY_HASH).copied())
 }
 
-/// The parameters of a list up to its sentinel (RTPS 2.5, 9.4.2.11); `None` where the list is broken, and nothing after it.
+/// The parameters of a list up to its sentinel (RTPS 2.5, 9.4.2.11). A malformed list yields `None` and then ends.
 pub(crate) struct Parameters<'a> {
     rest: Option<&'a [u8]>,
     big_endian: bool,

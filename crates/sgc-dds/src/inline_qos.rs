@@ -1,9 +1,9 @@
-//! Parameters in the inline QoS of a message under construction, which Cyclone has no call for.
+//! Additional parameters in the inline QoS of a message under construction, for which Cyclone has no call.
 //!
-//! Cyclone asks a sample for its payload when the header of the submessage is in the message, with the parameters of Cyclone's own, and
-//! before the length of the submessage is set, so parameters can still be added. That reaches into `struct ddsi_xmsg` of the Cyclone
-//! that `cyclors` =0.4.0 builds (`sample.rs`, `CYCLORS`); [`add`] states its assumptions, and leaves the message alone where they do not
-//! hold.
+//! Cyclone asks a sample for its payload after it has written the header of the submessage with its own parameters,
+//! and before it sets the length of the submessage. At that point parameters can still be added. This needs `struct
+//! ddsi_xmsg` of the Cyclone that `cyclors` =0.4.0 builds (`sample.rs`, `CYCLORS`). [`add`] states its assumptions,
+//! and leaves the message alone if they do not hold.
 
 use std::ffi::{c_int, c_void};
 use std::mem::offset_of;
@@ -34,7 +34,7 @@ struct Xmsg {
     payload_view: ddsrt_iovec_t,
 }
 
-/// `struct ddsi_xmsg_marker`: where in a message a submessage begins.
+/// `struct ddsi_xmsg_marker`: the beginning of a submessage in a message.
 #[repr(C)]
 struct XmsgMarker {
     offset: usize,
@@ -44,7 +44,7 @@ struct XmsgMarker {
 pub(crate) const DATA: (u8, usize) = (0x15, 24);
 pub(crate) const DATA_FRAG: (u8, usize) = (0x16, 36);
 
-/// Where `octetsToInlineQos` ends, which it counts from: bytes from the beginning of the submessage.
+/// Position from which `octetsToInlineQos` counts, in bytes from the beginning of the submessage.
 pub(crate) const INLINE_QOS_BASE: usize = 8;
 
 /// The flag of submessages with inline QoS (RTPS 2.5, 9.4.5.4.1).
@@ -56,19 +56,20 @@ pub(crate) const FLAG_LITTLE_ENDIAN: u8 = 0x01;
 /// Length of the sentinel that ends a list of parameters, bytes.
 const SENTINEL_BYTES: usize = 4;
 
-/// Lengths of the lists that Cyclone writes: none; its status info, the hash of its key, both; and the sentinel, bytes.
+/// Lengths of the lists that Cyclone writes: none; its status info, its key hash, or both, with the sentinel, in
+/// bytes.
 const LIST_BYTES: [usize; 4] = [0, 8 + SENTINEL_BYTES, 20 + SENTINEL_BYTES, 28 + SENTINEL_BYTES];
 
-/// A submessage whose header is the last thing in a message.
+/// A submessage whose header is at the end of a message.
 struct Submessage {
     offset: usize,
-    /// Whether Cyclone began its inline QoS.
+    /// `true` if Cyclone began its inline QoS.
     has_list: bool,
     has_key_hash: bool,
 }
 
-/// Adds parameters to a message, into which the header of the submessage of a sample has just been written. `view` is the place of
-/// the payload in the message. A hash of the key that Cyclone has written stays.
+/// Adds parameters to a message that ends with the header of a sample's submessage. `view` is the place of the
+/// payload in the message. A key hash that Cyclone has written stays.
 ///
 /// # Safety
 /// `view` must be the `refd_payload_iov` of a `struct ddsi_xmsg` of Cyclone DDS 11 as `cyclors` =0.4.0 builds it:
@@ -84,7 +85,7 @@ pub(crate) unsafe fn add(view: *mut ddsrt_iovec_t, parameters: &[Parameter<'_>])
         return false;
     };
     if has_list {
-        // The parameters that are added take the place of the sentinel.
+        // The added parameters replace the sentinel.
         // SAFETY: valid by contract; the list is in the message and ends with it.
         unsafe { (*message).bytes -= SENTINEL_BYTES };
     }
@@ -104,7 +105,8 @@ pub(crate) unsafe fn add(view: *mut ddsrt_iovec_t, parameters: &[Parameter<'_>])
     true
 }
 
-/// Finds the submessage that a message ends with: a header that says so, and no other parameters than Cyclone's own.
+/// Finds the submessage that a message ends with, by its header and by the absence of parameters other than Cyclone's
+/// own.
 ///
 /// # Safety
 /// `message` must be valid.

@@ -1,13 +1,16 @@
-//! [`Intake`]: a DDS reader, what waits between it and who receives its samples, and the thread that hands them over.
+//! [`Intake`]: a DDS reader, the queue between it and the receiver of its samples, and the thread that hands them
+//! over.
 //!
-//! Cyclone calls a listener on the thread that received a sample, which all readers of a domain share, with the writer's
-//! lock held. The listener takes the sample; what a [`Receiver`] can do without waiting is done right there, since to wake
-//! another thread takes longer than all the rest. Everything else is queued, within bounds of its own, for the reader's
-//! thread, which may block for as long as it likes: no other reader waits for that, and nothing behind it is taken out of order.
+//! Cyclone calls a listener on the thread that received a sample, which all readers of a domain share, with the
+//! writer's lock held. The listener takes the sample. Work of a [`Receiver`] that needs no waiting is done right
+//! there, because waking another thread takes longer than all the rest. Other samples are queued, within bounds, for
+//! the reader's thread. That thread may block for any time: no other reader waits for it, and the order of samples
+//! stays.
 //!
-//! A writer that keeps all waits for acknowledgements, and those for the receiving thread. So where much has gathered of a reliable
-//! topic, that thread waits for the reader's: while a queue is crowded, for moments and no more than half of the time; while it is half
-//! full of short samples, until there is room. Other readers lose at most half of that thread's time to one whose way is too thin.
+//! A `KEEP_ALL` writer waits for acknowledgements, and those for the receiving thread. So where many samples of a
+//! reliable topic are queued, the receiving thread waits for the reader's thread: briefly and at most half of the
+//! time while a queue is crowded; until there is room while the queue is half full of short samples. Other readers
+//! thus lose at most half of that thread's time to a slow one.
 
 use std::cell::Cell;
 use std::collections::VecDeque;
@@ -34,63 +37,65 @@ use crate::qos::history_of;
 /// Samples taken from Cyclone at once.
 const BATCH: usize = 16;
 
-/// Bytes of samples that may wait for one reader's thread; a single sample may be longer.
+/// Most queued bytes of one reader; a single sample may be longer.
 pub const WAITING_BYTES_MAX: usize = 64 << 20;
 
-/// Fewest samples that may wait for the thread of a reliable reader that asks for [`RELIABLE_READER_DEPTH_MIN`] or more. Fast DDS does
-/// not announce whether a publisher keeps all: if it does, it loses nothing to a reader on its own network, and is as much faster
-/// than this thread as a burst is long.
+/// Shortest queue of a reliable reader that asks for [`RELIABLE_READER_DEPTH_MIN`] or more. Fast DDS does not
+/// announce whether a publisher is `KEEP_ALL`. Such a publisher loses nothing to a reader on its own network, and may
+/// be faster than this thread by the length of a burst.
 const RELIABLE_WAITING_MIN: usize = 16_384;
 
-/// Changes of writers' liveliness that may wait for one reader's thread; the oldest give way.
+/// Most queued liveliness changes of one reader. The oldest give way.
 const LIVELINESS_CHANGES_MAX: usize = 1024;
 
-/// How long the receiving thread waits for a reader's at once while a queue is crowded.
+/// Longest wait of the receiving thread for a reader's thread at once while a queue is crowded.
 const HOLD_MAX: Duration = Duration::from_millis(2);
 
-/// How long it waits until there is room in a queue that is half full of samples. Fast DDS acknowledges late, and a way may stand still for
-/// that long.
+/// Longest wait of the receiving thread for room in a queue that is half full of samples. Fast DDS acknowledges late,
+/// and a path may stand still for that long.
 const ROOM_WAIT_MAX: Duration = Duration::from_millis(200);
 
-/// For so long it does not wait again after it waited for room in vain: the way is too thin for what is published.
+/// Pause after a wait for room in vain, because the path is too slow for the publisher.
 const ROOM_WAIT_PAUSE: Duration = Duration::from_millis(200);
 
-/// The receiving thread waits from time to time once a queue is full to this part, and until it has sunk to half of that.
+/// Divisor: the receiving thread waits from time to time once a queue is full to one part in this many, until it has
+/// sunk to half of that.
 const CROWDED_PART: usize = 8;
 
-/// The receiving thread takes no more than the reader's thread does while so many samples wait, of those that may: short ones that come
-/// by the thousand. Long ones of a camera are not worth that other readers wait.
+/// Divisor: the receiving thread takes no more than the reader's thread while more than one part in this many of the
+/// allowed samples is queued. Only short samples come by the thousand; other readers should not wait for long samples
+/// of a camera.
 const FULL_PART: usize = 2;
 
-/// The reader's thread takes at least so many samples before the receiving thread, which waits for room, is woken.
+/// Fewest samples that the reader's thread takes before it wakes a receiving thread that waits for room.
 const ROOM_SAMPLES: usize = 16;
 
-/// After handling a sample the receiving thread handles none for as long as that took, and for no less than this: what
-/// comes so fast is better handled by the reader's thread, several at a time.
+/// Shortest rest of the receiving thread after it handled a sample. It rests as long as that took; the reader's
+/// thread handles fast samples better, several at a time.
 const REST_MIN_NS: u64 = 20_000;
 
 thread_local! {
-    /// Whether this thread is in a listener.
+    /// `true` while this thread is in a listener.
     static IS_LISTENING: Cell<bool> = const { Cell::new(false) };
 }
 
-/// What is made of a sample of Cyclone's.
-pub(crate) trait Taken: Send + Sized {
-    /// Takes over a reference; nothing if it is no sample that anybody could use.
+/// A sample converted from Cyclone's.
+pub(crate) trait FromSerdata: Send + Sized {
+    /// Takes over a reference. Returns `None` for an unusable sample.
     ///
     /// # Safety
     /// The caller owns one reference to `sample`, which is of the type that `Self` is made of.
     unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self>;
 
-    /// Length of the payload, bytes.
+    /// Returns the length of the payload in bytes.
     fn bytes(&self) -> usize;
 }
 
-/// A sample, and what its reader says of it.
+/// A sample with the reader's information on it.
 #[derive(Debug)]
 pub(crate) struct Arrival<S> {
     pub(crate) sample: S,
-    /// Who wrote it, as the reader knows it.
+    /// The writer, by the reader's handle.
     pub(crate) writer: dds_instance_handle_t,
     pub(crate) source_timestamp_ns: i64,
 }
@@ -102,13 +107,13 @@ pub(crate) struct LivelinessChange {
     pub(crate) now: WriterState,
 }
 
-/// Whether a writer lives.
+/// The state of a writer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum WriterState {
     Alive,
-    /// Its lease ran out.
+    /// The lease expired.
     Lapsed,
-    /// It is not matched any more.
+    /// The writer is no longer matched.
     Gone,
 }
 
@@ -119,32 +124,32 @@ enum Next<S> {
     Liveliness(LivelinessChange),
 }
 
-/// Receives what an intake takes, one sample after the other.
+/// A receiver of an intake's samples, one after the other.
 pub(crate) trait Receiver: Send + 'static {
-    /// What the reader's topic is made of.
-    type Sample: Taken;
+    /// The samples of the reader's topic.
+    type Sample: FromSerdata;
 
-    /// Receives a sample of this reader; may wait.
+    /// Receives a sample of this reader. May block.
     fn receive(&mut self, reader: dds_entity_t, arrival: Arrival<Self::Sample>);
 
-    /// Receives a sample if that needs neither waiting nor any call of Cyclone's, or gives it back.
+    /// Receives a sample if that needs neither waiting nor a call into Cyclone, or returns it.
     fn receive_at_once(&mut self, arrival: Arrival<Self::Sample>) -> Result<(), Arrival<Self::Sample>> {
         Err(arrival)
     }
 
-    /// Receives a change of a writer's liveliness, behind the samples that came before it.
+    /// Receives a change of a writer's liveliness, after the samples that came before it.
     fn receive_liveliness(&mut self, reader: dds_entity_t, change: LivelinessChange) {
         let _ = (reader, change);
     }
 
-    /// Nothing more is at hand.
+    /// Signals that no more samples are at hand.
     fn rest(&mut self) {}
 
-    /// So many samples gave way to newer ones, since they came faster than they were received.
+    /// Reports samples that were dropped because newer ones arrived faster than they were received.
     fn overrun(&mut self, samples: u64);
 }
 
-/// How much of the time the receiving threads of a network may do something else than receive: half of it, no more.
+/// A limiter of the time for which a network's receiving threads do other work than receive: at most half.
 #[derive(Debug)]
 pub(crate) struct Pace {
     began: Instant,
@@ -160,7 +165,7 @@ impl Pace {
         self.began.elapsed().as_nanos() as u64
     }
 
-    /// When it is, if it may begin.
+    /// Returns the current time if other work may begin.
     fn begin(&self) -> Option<u64> {
         let now_ns = self.now_ns();
         self.may_begin(now_ns).then_some(now_ns)
@@ -180,27 +185,27 @@ impl Pace {
     }
 }
 
-/// What waits.
+/// The queue of a reader.
 #[derive(Debug)]
 struct Queue<S> {
     arrivals: VecDeque<Arrival<S>>,
     bytes: usize,
-    /// Samples that may wait.
+    /// Most queued samples.
     depth: usize,
-    /// Samples that came so far, and those that waited and do not any more.
+    /// The numbers of samples that were queued so far, and that left the queue.
     pushed: u64,
     popped: u64,
-    /// Changes of liveliness, each behind so many samples.
+    /// Changes of liveliness, each with the number of samples before it.
     changes: VecDeque<(u64, LivelinessChange)>,
     overrun: u64,
-    /// Whether the thread sleeps.
+    /// `true` while the thread sleeps.
     is_waiting: bool,
     is_stopped: bool,
-    /// The receiving thread waits until no more than this is there.
+    /// The level for which the receiving thread waits.
     held: Option<Level>,
-    /// Whether it did so in vain, and nothing was taken since.
+    /// `true` if it waited in vain and nothing was taken since.
     is_stuck: bool,
-    /// Until then it does not wait for room.
+    /// The time before which it does not wait for room again.
     no_wait_before: Option<Instant>,
 }
 
@@ -211,7 +216,7 @@ struct Level {
     bytes: usize,
 }
 
-impl<S: Taken> Queue<S> {
+impl<S: FromSerdata> Queue<S> {
     fn new(depth: usize) -> Self {
         Self {
             arrivals: VecDeque::new(),
@@ -229,12 +234,12 @@ impl<S: Taken> Queue<S> {
         }
     }
 
-    /// A part of what may wait: of so many.
+    /// Returns one part in `part` of the allowed amount.
     fn level(&self, part: usize) -> Level {
         Level { samples: self.depth / part, bytes: WAITING_BYTES_MAX / part }
     }
 
-    /// Returns `true` if more than this waits.
+    /// Returns `true` if the queue holds more than `level`.
     fn is_above(&self, level: Level) -> bool {
         self.arrivals.len() > level.samples || self.bytes > level.bytes
     }
@@ -243,7 +248,7 @@ impl<S: Taken> Queue<S> {
         self.is_above(self.level(part))
     }
 
-    /// Puts a sample behind the others; the oldest give way to what there is no room for.
+    /// Appends a sample. The oldest samples give way if there is no room.
     fn push(&mut self, arrival: Arrival<S>) {
         let bytes = arrival.sample.bytes();
         while (self.arrivals.len() >= self.depth || self.bytes + bytes > WAITING_BYTES_MAX)
@@ -256,7 +261,7 @@ impl<S: Taken> Queue<S> {
         self.arrivals.push_back(arrival);
     }
 
-    /// Puts a change of liveliness behind the samples that wait.
+    /// Appends a change of liveliness behind the queued samples.
     fn push_change(&mut self, change: LivelinessChange) {
         if self.changes.len() >= LIVELINESS_CHANGES_MAX {
             self.changes.pop_front();
@@ -276,7 +281,7 @@ impl<S: Taken> Queue<S> {
         Some(arrival)
     }
 
-    /// Takes the oldest to receive it, and says whether the receiving thread may go on.
+    /// Takes the oldest entry, and tells whether the receiving thread may continue.
     fn next(&mut self) -> (Option<Next<S>>, bool) {
         let is_due = self.changes.front().is_some_and(|(behind, _)| *behind <= self.popped);
         if let Some((_, change)) = is_due.then(|| self.changes.pop_front()).flatten() {
@@ -292,22 +297,22 @@ impl<S: Taken> Queue<S> {
     }
 }
 
-/// What the listener and the reader's thread share.
-struct Shared<R: Receiver> {
+/// The state that the listener and the reader's thread share.
+struct IntakeState<R: Receiver> {
     queue: Mutex<Queue<R::Sample>>,
     filled: Condvar,
-    /// That the receiving thread may go on.
+    /// Signals that the receiving thread may continue.
     eased: Condvar,
-    /// Whether writers are to wait rather than that anything gives way.
+    /// `true` if writers should wait rather than lose samples.
     holds_back: bool,
-    /// Locked by whoever handles samples, for as long as the order of samples is its own; always before the queue, or not
-    /// waited for. Nothing until it is started.
+    /// The receiver, `None` until the start. Locked while samples are handled, to keep their order. It is locked
+    /// before the queue or by `try_lock` only.
     receiver: Mutex<Option<R>>,
     participant: Arc<Participant>,
 }
 
-impl<R: Receiver> Shared<R> {
-    /// Takes what the reader has. In its listener.
+impl<R: Receiver> IntakeState<R> {
+    /// Takes the reader's samples. Called in its listener.
     fn take(&self, reader: dds_entity_t) {
         let mut samples: [*mut ddsi_serdata; BATCH] = [std::ptr::null_mut(); BATCH];
         let mut infos: [MaybeUninit<dds_sample_info_t>; BATCH] = [const { MaybeUninit::uninit() }; BATCH];
@@ -330,7 +335,7 @@ impl<R: Receiver> Shared<R> {
                 // SAFETY: Cyclone filled the first `taken` of both arrays and gave us a reference to each sample, whose
                 // type is that of this reader's topic.
                 let (sample, info) = unsafe { (R::Sample::from_raw(*sample), info.assume_init_ref()) };
-                // Changes of instance state: Cyclone makes them up without a payload.
+                // Cyclone makes up changes of instance state, without a payload.
                 if let Some(sample) = sample.filter(|_| info.valid_data) {
                     let (writer, source_timestamp_ns) = (info.publication_handle, info.source_timestamp);
                     self.arrive(Arrival { sample, writer, source_timestamp_ns });
@@ -342,7 +347,7 @@ impl<R: Receiver> Shared<R> {
         }
     }
 
-    /// Has a sample received at once, or queues it.
+    /// Lets the receiver handle a sample at once, or queues it.
     fn arrive(&self, arrival: Arrival<R::Sample>) {
         let mut queue = lock(&self.queue);
         let mut arrival = Some(arrival);
@@ -355,7 +360,7 @@ impl<R: Receiver> Shared<R> {
             drop(queue);
             arrival = arrival.and_then(|a| receiver.receive_at_once(a).err());
             self.participant.pace().end(began);
-            // Cyclone calls one listener of a reader at a time, so nothing has come in between.
+            // Cyclone calls one listener of a reader at a time, so no sample came in between.
             queue = lock(&self.queue);
         }
         let Some(arrival) = arrival.filter(|_| !queue.is_stopped) else { return };
@@ -371,7 +376,7 @@ impl<R: Receiver> Shared<R> {
         }
     }
 
-    /// Queues a change of liveliness. In the listener.
+    /// Queues a change of liveliness. Called in the listener.
     fn change_liveliness(&self, change: LivelinessChange) {
         let mut queue = lock(&self.queue);
         if queue.is_stopped {
@@ -384,7 +389,7 @@ impl<R: Receiver> Shared<R> {
         }
     }
 
-    /// Waits for the reader's thread for a moment, and with it the writer.
+    /// Makes the receiving thread, and so the writer, wait briefly for the reader's thread.
     fn hold_back(&self, queue: MutexGuard<'_, Queue<R::Sample>>) {
         let Some(began) = self.participant.holds().begin() else { return };
         let until = queue.level(2 * CROWDED_PART);
@@ -392,7 +397,7 @@ impl<R: Receiver> Shared<R> {
         self.participant.holds().end(began);
     }
 
-    /// Waits until there is room for a sample among many.
+    /// Waits until there is room for a sample in a queue of many.
     fn wait_for_room<'a>(&self, queue: MutexGuard<'a, Queue<R::Sample>>) -> MutexGuard<'a, Queue<R::Sample>> {
         let full = Level { bytes: usize::MAX, ..queue.level(FULL_PART) };
         let waits = queue.no_wait_before.is_none_or(|at| Instant::now() >= at);
@@ -405,7 +410,7 @@ impl<R: Receiver> Shared<R> {
         queue
     }
 
-    /// Waits until the reader's thread has left no more than this, for so long at most.
+    /// Waits until the queue has sunk to `level`, at most for the given time.
     fn wait_until<'a>(
         &self,
         mut queue: MutexGuard<'a, Queue<R::Sample>>,
@@ -419,7 +424,7 @@ impl<R: Receiver> Shared<R> {
         queue
     }
 
-    /// Hands over what waits, and waits for more, until it is stopped. On the reader's thread.
+    /// Hands queued samples over and waits for more, until it is stopped. Runs on the reader's thread.
     fn serve(&self, reader: dds_entity_t) {
         loop {
             if let Some(receiver) = lock(&self.receiver).as_mut() {
@@ -462,35 +467,35 @@ impl<R: Receiver> Shared<R> {
     }
 }
 
-/// Cyclone's own, and what they are called with. They drop in this order: children first, and what the listener uses when
-/// nothing calls it any more.
+/// Cyclone's entities and the argument of their listener. They drop in this order: children first, then the
+/// listener's argument when nothing calls it any more.
 struct Entities<R: Receiver> {
     reader: Entity,
     _group: Option<Entity>,
     _topic: Entity,
-    shared: Arc<Shared<R>>,
+    shared: Arc<IntakeState<R>>,
 }
 
 impl<R: Receiver> Entities<R> {
-    /// Hands samples over until it is stopped; with all of it, or it would go field by field.
+    /// Hands samples over until it is stopped. It takes `self` whole, because a closure would capture single fields.
     fn serve(self) {
         self.shared.serve(self.reader.handle());
     }
 }
 
-/// A reader and its thread. Dropping it ends the thread, waits for a receiver that is at work, and deletes the entities.
+/// A reader and its thread. Dropping it ends the thread, waits for a receiver at work, and deletes the entities.
 pub(crate) struct Intake<R: Receiver> {
     guid: Guid,
     handle: dds_entity_t,
-    shared: Arc<Shared<R>>,
-    /// The thread's, once there is one.
+    shared: Arc<IntakeState<R>>,
+    /// The entities, which the thread takes over.
     entities: Option<Entities<R>>,
     thread: Option<thread::JoinHandle<()>>,
 }
 
 impl<R: Receiver> Intake<R> {
-    /// A reader of `topic`, which is made of `R::Sample`; `user_data` is added to its USER_DATA. What it takes waits until
-    /// it is started.
+    /// Creates a reader of `topic`, whose samples are `R::Sample`. `user_data` is added to its USER_DATA. Samples are
+    /// queued until the start.
     pub(crate) fn new(
         participant: &Arc<Participant>,
         spec: &EndpointSpec,
@@ -502,9 +507,9 @@ impl<R: Receiver> Intake<R> {
         let parent = group.as_ref().unwrap_or(participant.entity()).handle();
         let (_, depth) = history_of(EndpointKind::Reader, spec.qos.history, spec.keyless);
         let (depth, deep) = (usize::try_from(depth).unwrap_or(1), RELIABLE_READER_DEPTH_MIN as usize);
-        // One that asks for less is to have the newest alone.
+        // A reader that asks for less wants the newest samples only.
         let is_deep = spec.qos.is_reliable() && depth >= deep;
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(IntakeState {
             queue: Mutex::new(Queue::new(if is_deep { depth.max(RELIABLE_WAITING_MIN) } else { depth })),
             filled: Condvar::new(),
             eased: Condvar::new(),
@@ -533,7 +538,7 @@ impl<R: Receiver> Intake<R> {
         Ok(Self { guid, handle, shared, entities: Some(entities), thread: None })
     }
 
-    /// Has samples received from now on, by a thread of this name unless it is at once.
+    /// Starts to receive samples, by a thread with this name unless it happens at once.
     pub(crate) fn start(&mut self, name: &str, receiver: R) -> Result<(), String> {
         let Some(entities) = self.entities.take() else { return Err("it is started".into()) };
         *lock(&self.shared.receiver) = Some(receiver);
@@ -545,12 +550,12 @@ impl<R: Receiver> Intake<R> {
         Ok(())
     }
 
-    /// GUID of the reader, as others discover it.
+    /// Returns the GUID of the reader, as others discover it.
     pub(crate) fn guid(&self) -> Guid {
         self.guid
     }
 
-    /// The reader's handle, for calls into Cyclone while `self` lives.
+    /// Returns the reader's handle, for calls into Cyclone while `self` lives.
     pub(crate) fn handle(&self) -> dds_entity_t {
         self.handle
     }
@@ -559,7 +564,7 @@ impl<R: Receiver> Intake<R> {
 impl<R: Receiver> Drop for Intake<R> {
     fn drop(&mut self) {
         self.shared.stop();
-        // The thread waits for the listener, so a listener that drops its own reader does not wait for the thread.
+        // The thread waits for the listener, so a listener that drops its own reader must not wait for the thread.
         if let Some(thread) = self.thread.take()
             && !IS_LISTENING.get()
         {
@@ -577,7 +582,7 @@ impl<R: Receiver> std::fmt::Debug for Intake<R> {
 /// The listener.
 unsafe extern "C" fn arrived<R: Receiver>(reader: dds_entity_t, arg: *mut c_void) {
     // SAFETY: what the listener was made with, which lives until the reader is deleted.
-    let shared = unsafe { &*arg.cast::<Shared<R>>() };
+    let shared = unsafe { &*arg.cast::<IntakeState<R>>() };
     IS_LISTENING.set(true);
     shared.take(reader);
     IS_LISTENING.set(false);
@@ -590,7 +595,7 @@ unsafe extern "C" fn liveliness_changed<R: Receiver>(
     arg: *mut c_void,
 ) {
     // SAFETY: what the listener was made with, which lives until the reader is deleted.
-    let shared = unsafe { &*arg.cast::<Shared<R>>() };
+    let shared = unsafe { &*arg.cast::<IntakeState<R>>() };
     let now = match (status.alive_count_change, status.not_alive_count_change) {
         (1.., _) => WriterState::Alive,
         (_, 1..) => WriterState::Lapsed,
@@ -607,7 +612,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 mod tests {
     use super::*;
 
-    impl Taken for usize {
+    impl FromSerdata for usize {
         unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self> {
             Some(sample as Self)
         }
@@ -617,7 +622,7 @@ mod tests {
         }
     }
 
-    /// The bytes of what waits of so many samples, and how many gave way.
+    /// Returns the lengths of the queued samples, and the number of dropped ones.
     fn waits(depth: usize, all: impl IntoIterator<Item = usize>) -> (Vec<usize>, u64) {
         let mut queue = Queue::new(depth);
         for bytes in all {
@@ -630,7 +635,7 @@ mod tests {
     }
 
     #[test]
-    fn what_waits_has_a_bound_in_samples_and_one_in_bytes() {
+    fn queue_is_bounded_in_samples_and_bytes() {
         assert_eq!(waits(3, 10..15), (vec![12, 13, 14], 2));
         const HALF: usize = WAITING_BYTES_MAX / 2;
         assert_eq!(waits(9, [5, HALF, HALF]), (vec![HALF, HALF], 1));
@@ -639,7 +644,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_held_goes_on_once_half_of_what_gathered_is_gone() {
+    fn held_reader_continues_once_half_of_the_queue_is_gone() {
         let mut queue = Queue::new(16 * CROWDED_PART);
         let push = |queue: &mut Queue<usize>, bytes| {
             queue.push(Arrival { sample: bytes, writer: 1, source_timestamp_ns: 0 });

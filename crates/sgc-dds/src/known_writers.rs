@@ -1,4 +1,4 @@
-//! [`KnownWriters`]: who wrote a sample, as its reader is told by a handle. Each is asked for once.
+//! [`KnownWriters`]: the writers of a reader's samples, by the handle that the reader gets. Each is looked up once.
 
 use std::collections::HashMap;
 
@@ -9,28 +9,28 @@ use sgc_ros::Guid;
 
 use crate::{qos, user_data};
 
-/// Bound on the writers that one reader remembers.
+/// Most writers that one reader remembers.
 const WRITERS_MAX: usize = 1024;
 
-/// Who wrote a sample.
+/// The writer of a sample.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct KnownWriter {
     pub(crate) guid: Guid,
-    /// True if it carries a tag: an SGC proxy made it, this one's or another's.
+    /// `true` if it carries a tag, so that an SGC proxy created it, this one or another.
     pub(crate) tagged: bool,
 }
 
-/// The writers that one reader has heard.
+/// The writers whose samples one reader has received.
 #[derive(Debug, Default)]
 pub(crate) struct KnownWriters(HashMap<dds_instance_handle_t, KnownWriter>);
 
 impl KnownWriters {
-    /// Who a writer is that was asked for before.
+    /// Returns a writer that was looked up before.
     pub(crate) fn known(&self, handle: dds_instance_handle_t) -> Option<KnownWriter> {
         self.0.get(&handle).copied()
     }
 
-    /// Who a writer of `reader` is; `None` if it is gone already and was never asked for.
+    /// Returns a writer of `reader`, or `None` if it is gone and was never looked up.
     pub(crate) fn find(
         &mut self,
         reader: dds_entity_t,

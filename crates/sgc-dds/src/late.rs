@@ -1,10 +1,11 @@
-//! The history of a writer for late joiners, made shorter after the writer was made.
+//! Shortening of a writer's history for late joiners after its creation.
 //!
-//! A writer for a publisher that did not announce its depth keeps what it can until the depth is known. Cyclone DDS 11 fixes both depths of a
-//! history when it makes the writer, and what a writer has said cannot be said again by another without repeating it to all who have it. So
-//! this reaches into `struct whc_impl` (`dds_whc.c`), the history cache, and has Cyclone's own code drop what is too old. Each pointer and number on
-//! the way there is compared with what it must be, and nothing is touched where one differs. Written for the Cyclone of `cyclors` =0.4.0, as
-//! [`crate::sample`] is.
+//! A writer for a publisher that did not announce its depth keeps as much as it can until the depth is known. Cyclone
+//! DDS 11 fixes both depths of a history at creation, and another writer could not repeat the samples without sending
+//! them again to every reader. So this module reaches into `struct whc_impl` (`dds_whc.c`), the history cache, and
+//! makes Cyclone's own code drop old samples. Each pointer and number on the way is compared with its expected value,
+//! and nothing is touched if one differs. The structs are those of the Cyclone of `cyclors` =0.4.0, as in
+//! [`crate::sample`].
 
 use std::ffi::{c_int, c_void};
 use std::ops::Range;
@@ -20,10 +21,10 @@ unsafe extern "C" {
     fn ddsi_writer_max_drop_seq(writer: *const c_void) -> u64;
 }
 
-/// Bytes of a pointer where the structures are as said here.
+/// Bytes of a pointer on the supported platforms.
 const WORD_BYTES: usize = 8;
-/// The words of `struct dds_writer` (`dds__types.h`) among which the pointer to its topic is. What is before and behind depends on the
-/// platform's mutexes.
+/// The words of `struct dds_writer` (`dds__types.h`) among which the pointer to its topic is. The exact place depends
+/// on the platform's mutexes.
 const TOPIC_WORDS: Range<usize> = 60..88;
 /// Words from that pointer to `m_wr` and to `m_whc`.
 const TOPIC_TO_WRITER: usize = 2;
@@ -31,7 +32,7 @@ const TOPIC_TO_CACHE: usize = 3;
 /// Bytes from the beginning of `struct ddsi_writer` to its GUID and to its lock (`struct ddsi_entity_common`).
 const ENTITY_GUID: usize = 4;
 const ENTITY_LOCK: usize = 48;
-/// The words of `struct whc_impl` among which the pointer to its domain is, likewise.
+/// The words of `struct whc_impl` among which the pointer to its domain is.
 const DOMAIN_WORDS: Range<usize> = 9..16;
 
 /// `struct ddsi_whc_ops` (`ddsi_whc.h`) up to its third function.
@@ -46,7 +47,7 @@ struct CacheOps {
 #[repr(C)]
 struct Cache {
     ops: *const CacheOps,
-    /// As long as a mutex of the platform is.
+    /// A mutex of the platform's length.
     lock: [u8; 0],
 }
 
@@ -66,17 +67,17 @@ struct Depths {
     history: u32,
     late: u32,
     longest: u32,
-    /// Up to here all has been dropped that may be.
+    /// The number up to which everything droppable was dropped.
     dropped: u64,
 }
 
 /// `is_transient_local`, the first of the flags.
 const IS_TRANSIENT_LOCAL: u32 = 1;
 
-/// A pinned entity of Cyclone's, which is not deleted meanwhile.
-struct Pinned(*mut c_void);
+/// A pinned entity of Cyclone, which is not deleted meanwhile.
+struct PinnedEntity(*mut c_void);
 
-impl Pinned {
+impl PinnedEntity {
     fn new(handle: dds_entity_t) -> Option<Self> {
         let mut entity = std::ptr::null_mut();
         // SAFETY: takes a number, checked by Cyclone, and a valid place for the result.
@@ -84,17 +85,17 @@ impl Pinned {
     }
 }
 
-impl Drop for Pinned {
+impl Drop for PinnedEntity {
     fn drop(&mut self) {
         // SAFETY: pinned once.
         unsafe { dds_entity_unpin(self.0) }
     }
 }
 
-/// A mutex of Cyclone's, locked.
-struct Locked(*mut c_void);
+/// A locked mutex of Cyclone.
+struct LockGuard(*mut c_void);
 
-impl Locked {
+impl LockGuard {
     /// # Safety
     /// A valid mutex that outlives the guard, and that this thread has not locked.
     unsafe fn new(mutex: *mut c_void) -> Self {
@@ -104,7 +105,7 @@ impl Locked {
     }
 }
 
-impl Drop for Locked {
+impl Drop for LockGuard {
     fn drop(&mut self) {
         // SAFETY: locked by this guard.
         unsafe { ddsrt_mutex_unlock(self.0) }
@@ -125,7 +126,8 @@ pub(crate) fn set_depth(
         return false;
     }
     let late = late.clamp(1, history);
-    let (Some(writer_there), Some(topic_there)) = (Pinned::new(writer), Pinned::new(topic)) else {
+    let (Some(writer_there), Some(topic_there)) = (PinnedEntity::new(writer), PinnedEntity::new(topic))
+    else {
         return false;
     };
     let mut guid = dds_guid_t { v: [0; 16] };
@@ -138,7 +140,7 @@ pub(crate) fn set_depth(
     }
     // SAFETY: the sertype of a writer that is pinned.
     let domain = unsafe { (*sertype).gv.v } as usize;
-    // SAFETY: both structures are longer than what is looked at, and live while the writer is pinned. What is found is a pointer of the kind
+    // SAFETY: both structures are longer than what is looked at, and live while the writer is pinned. A found word is a pointer of the kind
     // that it is used as, since its neighbours and its target are what they must be. The lock of the ddsi writer is held by all who change the
     // history cache, that of the cache by all who read it.
     unsafe {
@@ -152,7 +154,7 @@ pub(crate) fn set_depth(
         if !are_pointers || guid.v[12..] != entity_id(ddsi_writer) {
             return false;
         }
-        let _writer_lock = Locked::new(ddsi_writer.add(ENTITY_LOCK).cast());
+        let _writer_lock = LockGuard::new(ddsi_writer.add(ENTITY_LOCK).cast());
         let in_cache = cache.cast::<usize>();
         let is_domain = |at: &usize| in_cache.add(*at).read_volatile() == domain;
         let Some(at) = DOMAIN_WORDS.into_iter().find(is_domain) else { return false };
@@ -160,7 +162,7 @@ pub(crate) fn set_depth(
         let depths = in_cache.add(at + 2).cast::<Depths>();
         let acknowledged = ddsi_writer_max_drop_seq(ddsi_writer.cast());
         {
-            let _cache_lock = Locked::new((&raw mut (*cache).lock).cast());
+            let _cache_lock = LockGuard::new((&raw mut (*cache).lock).cast());
             let found = &mut *depths;
             if found.writer != writer_there.0
                 || found.flags & IS_TRANSIENT_LOCAL == 0
@@ -169,14 +171,14 @@ pub(crate) fn set_depth(
                 return false;
             }
             found.late = late;
-            // Cyclone looks at what was acknowledged since it did so last: here, at all.
+            // Cyclone considers only samples acknowledged since the last time. Zero makes it consider all.
             found.dropped = 0;
         }
         let newest = drop_up_to(cache, acknowledged);
         let gone = stay.and_then(|stay| newest.checked_sub(u64::from(stay.max(late))));
         if let Some(gone) = gone.filter(|gone| *gone > acknowledged) {
             drop_up_to(cache, gone);
-            let _cache_lock = Locked::new((&raw mut (*cache).lock).cast());
+            let _cache_lock = LockGuard::new((&raw mut (*cache).lock).cast());
             (*depths).dropped = acknowledged;
         }
     }

@@ -1,19 +1,19 @@
 //! The Cyclone DDS backend of SGC: [`CycloneNetwork`] implements [`sgc_ros::RosNetwork`] on `cyclors`.
 //!
-//! It joins one DDS domain, tells which endpoints are there, and moves serialised samples in and out
-//! for types that are unknown at compile time. It decides nothing about what is shared with whom, knows
-//! no ROS name mangling, never looks inside a payload beyond its encapsulation header, and uses no
-//! tokio: threads here are plain threads, which block until Cyclone or its listener has something for
-//! them.
+//! It joins one DDS domain, reports its endpoints, and moves serialised samples in and out for types that are unknown
+//! at compile time. It decides nothing about sharing, knows no ROS name mangling, never looks inside a payload beyond
+//! its encapsulation header, and uses no tokio. Its threads are plain threads, which block until Cyclone or its
+//! listener has something for them.
 //!
-//! This is the only crate with `unsafe`: everything that Cyclone hands out is owned by a type of
-//! `entity` or `sample`, whose `Drop` gives it back, and no raw pointer leaves the crate.
+//! This is the only crate with `unsafe`. Everything that Cyclone hands out is owned by a type of `entity` or
+//! `sample`, whose `Drop` returns it, and no raw pointer leaves the crate.
 //!
 //! # Keyed topics
-//! The type of samples here knows no keys: all samples of a keyed topic are one instance to Cyclone. Data of keyed topics
-//! flows both ways with the hash of its key, for which publishers are asked, and so do disposals and unregistrations, with their serialised key; a disposal that comes with nothing but a
-//! hash of its key (Fast DDS may send one) does not. A sample whose key has no known hash is not written. What is kept for late joiners is kept for
-//! each of up to [`qos::KEYED_INSTANCES_KEPT`] keys; other history is kept per topic rather than per instance, so it is made so many times as deep.
+//! SGC's sample type knows no keys, so all samples of a keyed topic are one instance to Cyclone. Data of keyed topics
+//! flows both ways with its key hash, which publishers are asked for. Disposals and unregistrations flow with their
+//! serialised key, but not a disposal with nothing but a key hash, which Fast DDS may send. A sample whose key hash
+//! is unknown is not written. Samples for late joiners are kept for each of up to [`qos::KEYED_INSTANCES_KEPT`] keys.
+//! Other history is kept per topic rather than per instance, so it is that many times as deep.
 
 #![allow(unsafe_code)]
 #![warn(clippy::undocumented_unsafe_blocks)]

@@ -1,9 +1,9 @@
 //! Cyclone's log, turned into `tracing` events and into the reasons of errors.
 //!
-//! Cyclone reports *why* a domain cannot be created only to its log. It also prints there what no operator
-//! needs to see on stderr. Tracing to a file, if the user's `CYCLONEDDS_URI` asks for it, is not touched.
+//! Cyclone reports *why* a domain cannot be created only in its log, beside much that no operator needs on stderr.
+//! Tracing to a file, if the user's `CYCLONEDDS_URI` asks for it, is not touched.
 //!
-//! Errors that repeat are counted: each kind is logged once in [`QUIET`], in the words of the operator where it is known.
+//! Repeated errors are counted: each kind is logged once in [`QUIET`], in the operator's words if the kind is known.
 
 use std::cell::RefCell;
 use std::ffi::{CStr, c_void};
@@ -19,7 +19,7 @@ use crate::strangers;
 
 use crate::host_addresses;
 
-/// Bound on what one failure may say, bytes.
+/// Longest reason of one failure, in bytes.
 const REASON_BYTES_MAX: usize = 1024;
 
 /// Shortest time between two log lines of a kind.
@@ -30,32 +30,32 @@ const QUIET: Duration = Duration::from_secs(60);
 pub struct Unsent {
     /// Their number since the beginning of this process.
     pub packets: u64,
-    /// The address that the last one was for.
+    /// The address of the last one.
     pub to: String,
     /// The time of the last one.
     pub last: Instant,
 }
 
 static UNSENT: Mutex<Option<Unsent>> = Mutex::new(None);
-/// The time of the last that was for a program of another host.
+/// The time of the last packet for a program on another host.
 static CUT_OFF: Mutex<Option<Instant>> = Mutex::new(None);
 
-/// Returns the packets of the local networks of this process that could not be sent, if there were any.
+/// Returns the packets of this process's local networks that could not be sent, if there were any.
 pub fn unsent() -> Option<Unsent> {
     UNSENT.lock().unwrap_or_else(PoisonError::into_inner).clone()
 }
 
-/// Returns `true` if since then a packet for a program of another host could not be sent.
+/// Returns `true` if a packet for a program on another host could not be sent since `begin`.
 pub(crate) fn is_cut_off_since(begin: Instant) -> bool {
     CUT_OFF.lock().unwrap_or_else(PoisonError::into_inner).is_some_and(|last| last >= begin)
 }
 
-/// Returns `true` for the address of a program of another host.
+/// Returns `true` for the address of a program on another host.
 fn is_elsewhere(to: &str) -> bool {
     to.parse::<SocketAddrV4>().is_ok_and(|to| !to.ip().is_multicast() && !host_addresses::is_known(*to.ip()))
 }
 
-/// Lines of one kind.
+/// The repeated lines of one kind.
 #[derive(Debug)]
 pub(crate) struct Repeats {
     logged: Option<Instant>,
@@ -65,12 +65,12 @@ pub(crate) struct Repeats {
 impl Repeats {
     pub(crate) const NONE: Self = Self { logged: None, since: 0 };
 
-    /// Counts a line; the number of earlier ones that were not logged if this one is to be.
+    /// Counts a line. If it should be logged, returns the number of earlier ones that were not.
     fn note(&mut self, now: Instant) -> Option<u64> {
         self.add(now, 1).map(|several| several - 1)
     }
 
-    /// Counts several of what a line is about; the number since the last line if this one is to be logged.
+    /// Counts several events of a kind. If a line should be logged, returns the number since the last line.
     pub(crate) fn add(&mut self, now: Instant, several: u64) -> Option<u64> {
         self.since += several;
         if self.logged.is_some_and(|logged| now.saturating_duration_since(logged) < QUIET) {
@@ -83,15 +83,15 @@ impl Repeats {
 
 static REPEATS: Mutex<[Repeats; 3]> = Mutex::new([Repeats::NONE; 3]);
 
-/// Returns the address of a packet that could not be sent, where Cyclone says so:
-/// `ddsi_udp_conn_write to udp/10.0.0.1:7411 failed with retcode -1`.
+/// Returns the address of a packet that could not be sent, from Cyclone's line: `ddsi_udp_conn_write to
+/// udp/10.0.0.1:7411 failed with retcode -1`.
 fn unsent_to(message: &str) -> Option<&str> {
     let (to, _) = message.strip_prefix("ddsi_udp_conn_write to ")?.split_once(" failed with retcode")?;
     Some(to.strip_prefix("udp/").unwrap_or(to))
 }
 
-/// Returns the probable cause where Cyclone says that it refuses a secured participant. The words are those of `ddsi_handshake.c`,
-/// `ddsi_security_omg.c` and `ddsi_proxy_participant.c`.
+/// Returns the probable cause if Cyclone's line refuses a secured participant. The words are those of
+/// `ddsi_handshake.c`, `ddsi_security_omg.c` and `ddsi_proxy_participant.c`.
 fn refused_program(message: &str) -> Option<&'static str> {
     let says = |words: &str| message.contains(words);
     if says("handshake reply failed") && says("ASN1 integer") {
@@ -113,8 +113,8 @@ fn refused_program(message: &str) -> Option<&'static str> {
     }
 }
 
-/// Returns the endpoint of a program without DDS Security that Cyclone refuses: `Non secure remote writer 110a1b2:3:4:103 is not allowed.`
-/// (`ddsi_security_omg.c`).
+/// Returns the endpoint of a program without DDS Security that Cyclone's line refuses: `Non secure remote writer
+/// 110a1b2:3:4:103 is not allowed.` (`ddsi_security_omg.c`).
 fn refused_endpoint(message: &str) -> Option<Guid> {
     let rest = message.strip_prefix("Non secure remote ")?;
     let rest = rest.strip_prefix("writer ").or_else(|| rest.strip_prefix("reader "))?;
@@ -126,14 +126,14 @@ fn refused_endpoint(message: &str) -> Option<Guid> {
     words.next().is_none().then_some(Guid(guid))
 }
 
-/// Networks that are being opened.
+/// The number of networks that are being opened.
 static OPENING: AtomicUsize = AtomicUsize::new(0);
 
-/// A network that is being opened. As long as its domain has no participant, Cyclone says of every secured one that it is not allowed.
+/// A network that is being opened. Until its domain has a participant, Cyclone refuses every secured participant.
 pub(crate) struct Opening(());
 
 impl Opening {
-    /// Begins.
+    /// Marks the beginning.
     pub(crate) fn begin() -> Self {
         OPENING.fetch_add(1, Ordering::Relaxed);
         Self(())
@@ -146,12 +146,12 @@ impl Drop for Opening {
     }
 }
 
-/// Returns `true` for words that mean nothing while a network is being opened (`ddsi_proxy_participant.c`).
+/// Returns `true` for lines without meaning while a network is being opened (`ddsi_proxy_participant.c`).
 fn is_premature(message: &str) -> bool {
     message.starts_with("Remote secure participant ") && OPENING.load(Ordering::Relaxed) > 0
 }
 
-/// Counts an error, and logs it if its kind was not logged of late.
+/// Counts an error, and logs it unless its kind was logged recently.
 fn complain(message: &str, now: Instant) {
     let to = unsent_to(message);
     if let Some(to) = to {
@@ -189,14 +189,14 @@ thread_local! {
     static HEARD: RefCell<Option<String>> = const { RefCell::new(None) };
 }
 
-/// Sends Cyclone's log to `tracing`, for the whole process and for ever.
+/// Sends Cyclone's log to `tracing`, for the lifetime of the process.
 pub(crate) fn install() {
     static INSTALLED: Once = Once::new();
     // SAFETY: the sink is a function that is valid for ever and ignores its user data.
     INSTALLED.call_once(|| unsafe { dds_set_log_sink(Some(sink), std::ptr::null_mut()) });
 }
 
-/// Runs `f` and returns what Cyclone logged as errors on this thread meanwhile, on one line.
+/// Runs `f` and returns the errors that Cyclone logged on this thread meanwhile, on one line.
 pub(crate) fn listen<T>(f: impl FnOnce() -> T) -> (T, String) {
     HEARD.set(Some(String::new()));
     let result = f();

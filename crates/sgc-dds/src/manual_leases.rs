@@ -1,14 +1,16 @@
-//! When writers whose liveliness is manual by topic renewed their leases.
+//! The times at which writers with liveliness manual by topic renewed their leases.
 //!
-//! Such a writer asserts that it lives by a message, or by a heartbeat with the liveliness flag (RTPS 2.5, 8.3.8.6), of which a DDS
-//! reader is told nothing: it says that a writer lives or does not. Cyclone takes note of each by moving the end of the writer's lease
-//! (`ddsi_lease_renew`), but of no heartbeat once a lease ran out: then its reader waits for a message.
+//! Such a writer asserts its liveliness by a message, or by a heartbeat with the liveliness flag (RTPS 2.5, 8.3.8.6).
+//! A DDS reader is told only whether a writer is alive. Cyclone records each assertion by moving the end of the
+//! writer's lease (`ddsi_lease_renew`), but ignores heartbeats once a lease has expired: then its reader waits for a
+//! message.
 //!
-//! So the leases of these writers are made too long to run out when they are discovered, see [`keep`]. Where a lease ends then says when it was
-//! renewed last, and readers here do not hear that such a writer's lease ran out. What becomes of that is decided where the writer's messages go.
+//! So when these writers are discovered, their leases are made too long to expire, see [`keep`]. The end of a lease
+//! then gives the time of its last renewal, and readers here are not told of an expiry. The place where the writer's
+//! messages go decides on its liveliness.
 //!
-//! That takes structs of the C code of `cyclors` =0.4.0, as [`crate::first_messages`] does. A lease is compared with the writer that it must be of,
-//! and left alone where it is another.
+//! This needs structs of the C code of `cyclors` =0.4.0, as [`crate::first_messages`] does. A lease is compared with
+//! its expected writer, and left alone if it belongs to another.
 
 use std::collections::BTreeMap;
 use std::ffi::c_void;
@@ -21,10 +23,10 @@ use sgc_ros::Guid;
 
 use crate::entity::INFINITE;
 
-/// How long the lease of a writer lasts that is looked at here, nanoseconds: 73 years.
+/// Length of a kept lease, in nanoseconds: 73 years.
 const LEASE_KEPT_NS: i64 = 1 << 61;
 
-/// Writers whose leases are looked at in a process. Beyond it a writer's messages alone say that it lives.
+/// Most kept leases in a process. Beyond that only messages show that a writer is alive.
 const LEASES_MAX: usize = 4096;
 
 /// `ddsrt_fibheap_node_t`.
@@ -47,26 +49,26 @@ pub(crate) struct Lease {
 
 // `ddsrt/time.h`.
 unsafe extern "C" {
-    /// Nanoseconds since the machine was started.
+    /// Returns the nanoseconds since the machine started.
     fn ddsrt_time_elapsed() -> i64;
 }
 
-/// A lease that is kept, and where it ended then.
-struct Kept {
+/// A kept lease, and its end when it was kept.
+struct KeptLease {
     lease: *const Lease,
     end_ns: i64,
 }
 
 // SAFETY: of a lease nothing but its end is looked at, which is atomic.
-unsafe impl Send for Kept {}
+unsafe impl Send for KeptLease {}
 
 /// Identifies a writer: the domain that discovered it, and its GUID.
 type Key = (usize, [u32; 4]);
 
-/// Those that are there. One that goes is taken out before Cyclone frees it, so that a lease is there while this is locked.
-static LEASES: Mutex<BTreeMap<Key, Kept>> = Mutex::new(BTreeMap::new());
+/// The kept leases. A lease is removed before Cyclone frees it, so it is valid while this is locked.
+static LEASES: Mutex<BTreeMap<Key, KeptLease>> = Mutex::new(BTreeMap::new());
 
-fn leases() -> MutexGuard<'static, BTreeMap<Key, Kept>> {
+fn leases() -> MutexGuard<'static, BTreeMap<Key, KeptLease>> {
     LEASES.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -102,29 +104,31 @@ pub(crate) unsafe fn keep(
         return;
     }
     found.duration_ns.store(LEASE_KEPT_NS, Ordering::Relaxed);
-    // Cyclone looks again when the lease would have run out, and finds that it did not. Nothing but its own renewal moves it meanwhile.
+    // Cyclone checks again when the lease would have expired, and finds that it has not. Meanwhile only Cyclone's own
+    // renewal moves it.
     let end_ns =
         found.end_ns.load(Ordering::Relaxed).saturating_sub(duration_ns).saturating_add(LEASE_KEPT_NS);
     let end_ns = found.end_ns.fetch_max(end_ns, Ordering::Relaxed).max(end_ns);
-    all.insert((domain as usize, guid), Kept { lease, end_ns });
+    all.insert((domain as usize, guid), KeptLease { lease, end_ns });
 }
 
-/// Forgets a writer that goes.
+/// Forgets a writer that is about to go.
 pub(crate) fn forget(domain: *const c_void, guid: [u32; 4]) {
     leases().remove(&(domain as usize, guid));
 }
 
-/// The leases of a domain's writers. Dropped behind the domain, which may end without a word of its writers.
+/// The leases of a domain's writers. Dropped after the domain, which may end without reporting its writers.
 #[derive(Debug)]
 pub(crate) struct Leases(pub(crate) usize);
 
 impl Leases {
-    /// Returns how long ago a writer renewed its lease. None if it did not since it was discovered, or is none of those that are looked at.
+    /// Returns the time since a writer renewed its lease. Returns `None` if it has not since its discovery, or if its
+    /// lease is not kept.
     pub(crate) fn renewed_ago(&self, writer: &Guid) -> Option<Duration> {
         let word = |at: usize| u32::from_be_bytes([0, 1, 2, 3].map(|byte| writer.0[at + byte]));
         let renewed_ns = {
             let all = leases();
-            let Kept { lease, end_ns } = all.get(&(self.0, [word(0), word(4), word(8), word(12)]))?;
+            let KeptLease { lease, end_ns } = all.get(&(self.0, [word(0), word(4), word(8), word(12)]))?;
             // SAFETY: it is not freed while it is listed and its domain lives.
             let now_ns = unsafe { &**lease }.end_ns.load(Ordering::Relaxed);
             (now_ns > *end_ns).then(|| now_ns.saturating_sub(LEASE_KEPT_NS))?

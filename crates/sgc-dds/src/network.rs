@@ -1,7 +1,7 @@
 //! [`CycloneNetwork`]: one participant in one DDS domain.
 //!
-//! Creates the domain and the participant, and hands them to readers, writers and discovery, which keep
-//! them alive as long as they need them. Moves no sample itself.
+//! It creates the domain and the participant, and hands them to readers, writers and discovery, which keep them
+//! alive. It moves no sample itself.
 
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use std::sync::atomic::{AtomicU32, AtomicU64, AtomicUsize, Ordering};
@@ -48,44 +48,45 @@ use crate::writer::CycloneWriter;
 /// above every ROS domain id.
 const ALIAS_FIRST: u32 = 0x5347_0000;
 
-/// Any port will do to ask for a route; this is the first that a participant of domain 0 listens at (RTPS 2.5, 9.6.2.3).
+/// A port for route lookups, for which any would do: the first that a participant of domain 0 listens on (RTPS 2.5,
+/// 9.6.2.3).
 const DISCOVERY_PORT: u16 = 7410;
 
-/// How long this host's addresses have to stand before it matters which they are: DHCP and a change of the interface take several steps.
+/// Time for which this host's addresses must be stable before they count. DHCP and a change of the interface take
+/// several steps.
 const SETTLED: Duration = Duration::from_secs(3);
 
-/// Bound on what is read of a file, bytes.
+/// Most bytes that are read of a file.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
 /// A local ROS 2 network, joined with Cyclone DDS.
 ///
-/// Each network is a participant of its own, in a Cyclone domain of its own: several domains in one
-/// process work, and so do several networks on one domain, which then talk over the loopback interface like
-/// strangers. Readers, writers and discovery keep the participant alive; dropping the network ends
-/// discovery only.
+/// Each network has its own participant in its own Cyclone domain. Several domains in one process work, and so do
+/// several networks on one domain, which then talk over the loopback interface like strangers. Readers, writers and
+/// discovery keep the participant alive; dropping the network ends discovery only.
 #[derive(Debug)]
 pub struct CycloneNetwork {
     discovery: Mutex<Option<Running>>,
-    /// If the ROS graph is told of, both ways.
+    /// The announcer of nodes, if the ROS graph is reported and announced.
     announcer: Option<Arc<Announcer>>,
     participant: Arc<Participant>,
     config: DdsConfig,
-    /// The changes of this host's addresses before it was opened.
+    /// The address changes before the network was opened.
     opened_after: Changes,
-    /// The number of changes that make no difference to it.
+    /// The number of address changes that do not affect the network.
     changes_seen: AtomicU64,
-    /// Told when everything made on it is dropped.
+    /// Disconnected when everything created on the network is dropped.
     all_dropped: Mutex<Option<Receiver<()>>>,
 }
 
-/// The participant and the domain it is in. Fields drop in this order.
+/// The participant and its domain. Fields drop in this order.
 #[derive(Debug)]
 pub(crate) struct Participant {
     entity: Entity,
-    /// Ends before the domain. None if it loses programs of this host when the host's addresses change.
+    /// Ends before the domain. `None` if the participant loses programs on this host when its addresses change.
     same_host: Option<SameHost>,
     domain: Entity,
-    /// If the leases of writers are looked at. Ends behind the domain.
+    /// The watch of writers' leases, if there is one. Ends after the domain.
     leases: Option<Leases>,
     guid: Guid,
     domain_id: u32,
@@ -95,9 +96,9 @@ pub(crate) struct Participant {
     holds: Pace,
     writers: AtomicUsize,
     late_writers: AtomicUsize,
-    /// The handler that discovery tells, while it is under way.
+    /// The handler of discovery events while discovery runs.
     watcher: Mutex<Weak<Mutex<DiscoveryHandler>>>,
-    /// Ends last.
+    /// Dropped last.
     _alive: Sender<()>,
 }
 
@@ -105,8 +106,8 @@ impl CycloneNetwork {
     /// Joins the domain.
     ///
     /// # Errors
-    /// [`RosError::Domain`] if the configuration is invalid or Cyclone refuses it; the reason is what Cyclone
-    /// logged: an interface that is not there, no free participant index, a peer that is not a host name.
+    /// [`RosError::Domain`] if the configuration is invalid or Cyclone refuses it. The reason is Cyclone's log line:
+    /// a missing interface, no free participant index, or a peer that is not a host name.
     pub fn open(config: &DdsConfig) -> Result<Self, RosError> {
         log::install();
         host_addresses::follow();
@@ -135,7 +136,7 @@ impl CycloneNetwork {
         }
         let named = security.map_or(user_data::DEFAULT_ENCLAVE, |security| &security.enclave);
         let enclave = config.graph.then_some(named);
-        let data = user_data::of_participant(config.tag.as_deref(), enclave);
+        let data = user_data::for_participant(config.tag.as_deref(), enclave);
         qos.set_user_data(&user_data::while_opening(&data));
         let silence = Silence::begin(&domain.entity);
         // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
@@ -174,9 +175,9 @@ impl CycloneNetwork {
             watcher: Mutex::default(),
             _alive: alive,
         };
-        // Before there are endpoints to announce.
+        // No endpoint has been announced yet.
         let completed = participant.complete_announcements().or_else(|reason| {
-            // Without a graph an enclave need not have the topic by which it is done.
+            // Without a graph an enclave need not have the topic that this needs.
             if config.graph {
                 Err(refused(participant.explain(&graph_writer().topic, reason)))
             } else {
@@ -189,7 +190,8 @@ impl CycloneNetwork {
             );
         }
         drop(silence);
-        // A change makes Cyclone announce the participant at once. By itself it would announce it to peers again after 30 s.
+        // The change makes Cyclone announce the participant at once. Without it Cyclone would repeat the announcement
+        // to peers after 30 s.
         qos.set_user_data(&data);
         // SAFETY: the QoS object outlives the call, which copies it; the handle is checked by Cyclone.
         check(unsafe { dds_set_qos(participant.entity.handle(), qos.as_ptr()) }).map_err(refused)?;
@@ -207,7 +209,7 @@ impl CycloneNetwork {
         })
     }
 
-    /// Returns the addresses from which a network opened now would speak to other hosts. Nobody hears of it.
+    /// Returns the addresses from which a network opened now would speak to other hosts, without sending anything.
     fn outward_now(&self) -> Result<Vec<Ipv4Addr>, RosError> {
         let refused = |reason| RosError::Domain { domain: self.config.domain, reason };
         let domain = create_domain(&self.config)?;
@@ -219,12 +221,12 @@ impl CycloneNetwork {
         Ok(same_host.map_err(refused)?.outward().to_vec())
     }
 
-    /// GUID of the participant; readers and writers made here share its first 12 bytes.
+    /// Returns the GUID of the participant. Readers and writers created here share its first 12 bytes.
     pub fn guid(&self) -> Guid {
         self.participant.guid
     }
 
-    /// Makes the network neither hear nor speak for a while, as when its cable is pulled. For tests.
+    /// Makes the network neither send nor receive for a while, as when its cable is pulled. For tests.
     #[doc(hidden)]
     pub fn set_deaf_mute(&self, duration: Duration) {
         let ns = i64::try_from(duration.as_nanos()).unwrap_or(crate::entity::INFINITE);
@@ -232,8 +234,8 @@ impl CycloneNetwork {
         unsafe { dds_domain_set_deafmute(self.participant.domain.handle(), true, true, ns) };
     }
 
-    /// How many DDS entities hang directly below the participant: topics, publishers, subscribers,
-    /// conditions. For tests and metrics; constant when nothing leaks.
+    /// Returns the number of DDS entities directly below the participant: topics, publishers, subscribers and
+    /// conditions. For tests and metrics; it is constant unless something leaks.
     pub fn entity_count(&self) -> usize {
         // SAFETY: with no room for handles the call only counts.
         let count = unsafe { dds_get_children(self.participant.entity.handle(), std::ptr::null_mut(), 0) };
@@ -328,7 +330,7 @@ impl RosNetwork for CycloneNetwork {
         }
         let outward = same_host.outward();
         let is_whole = !outward.is_empty() && outward.iter().all(|address| host_addresses::is_here(*address));
-        // One that took what was there after a change, or found nothing, goes where there is more.
+        // A network that was opened after a change or found no address moves to where there are more.
         if outward.is_empty() || self.opened_after.number > 0 {
             return Reach::CutOff;
         }
@@ -354,14 +356,14 @@ impl RosNetwork for CycloneNetwork {
         drop(lock(&self.discovery).take());
         let all_dropped = lock(&self.all_dropped).take();
         drop(self);
-        // Nobody sends.
+        // Nothing is sent on the channel; only its end matters.
         all_dropped.is_none_or(|dropped| dropped.recv_timeout(max) == Err(RecvTimeoutError::Disconnected))
     }
 }
 
 impl Drop for CycloneNetwork {
     fn drop(&mut self) {
-        // Ends with its threads, before the participant.
+        // Discovery ends with its threads before the participant.
         drop(self.discovery.get_mut().unwrap_or_else(PoisonError::into_inner).take());
     }
 }
@@ -375,32 +377,32 @@ impl Participant {
         self.guid
     }
 
-    /// True if the endpoint belongs to this participant.
+    /// Returns `true` if the endpoint belongs to this participant.
     pub(crate) fn owns(&self, endpoint: &Guid) -> bool {
         self.guid.0[..12] == endpoint.0[..12]
     }
 
-    /// How much its receiving threads handle themselves.
+    /// Returns the limiter of the work that receiving threads do themselves.
     pub(crate) fn pace(&self) -> &Pace {
         &self.pace
     }
 
-    /// Writers of samples that live.
+    /// Returns the number of open writers.
     pub(crate) fn writers(&self) -> &AtomicUsize {
         &self.writers
     }
 
-    /// Those of them whose publisher did not announce its depth.
+    /// Returns the number of open writers whose publisher did not announce its depth.
     pub(crate) fn late_writers(&self) -> &AtomicUsize {
         &self.late_writers
     }
 
-    /// Has readers tell this handler of writers' liveliness, for as long as discovery keeps it.
+    /// Sets the handler that readers inform of writers' liveliness, for as long as discovery keeps it.
     pub(crate) fn watch(&self, handler: &SharedHandler) {
         *lock(&self.watcher) = Arc::downgrade(handler);
     }
 
-    /// Tells whoever watches the network. May block.
+    /// Informs the handler of discovery events. May block.
     pub(crate) fn tell(&self, event: DiscoveryEvent) {
         let watcher = lock(&self.watcher).upgrade();
         if let Some(watcher) = watcher {
@@ -408,17 +410,17 @@ impl Participant {
         }
     }
 
-    /// How much they wait for readers' threads.
+    /// Returns the limiter of waits for readers' threads.
     pub(crate) fn holds(&self) -> &Pace {
         &self.holds
     }
 
-    /// Returns `true` if DDS Security protects it.
+    /// Returns `true` if DDS Security protects the participant.
     pub(crate) fn is_secured(&self) -> bool {
         self.security.is_some()
     }
 
-    /// Adds to the reason why an endpoint cannot be made that DDS Security forbids it, if it is that.
+    /// Explains the failure to create an endpoint if DDS Security forbids it.
     fn explain(&self, topic: &str, reason: String) -> String {
         match &self.security {
             Some(security) => security.explain(topic, reason),
@@ -426,13 +428,13 @@ impl Participant {
         }
     }
 
-    /// True if endpoints made by SGC are to be ignored.
+    /// Returns `true` if endpoints of SGC nodes are ignored.
     pub(crate) fn ignores_tagged(&self) -> bool {
         self.tag.is_some()
     }
 
-    /// Has announcements of endpoints say what Cyclone leaves out; false if this Cyclone is not as expected. For the thread that makes the
-    /// participant, before any other knows it.
+    /// Makes announcements of endpoints contain the parameters that Cyclone omits. Returns `false` if this Cyclone
+    /// differs from the expected one. Called by the thread that creates the participant, before any other knows it.
     fn complete_announcements(&self) -> Result<bool, String> {
         let topic = self.topic(&graph_writer())?;
         let mut sertype = std::ptr::null();
@@ -442,12 +444,12 @@ impl Participant {
         Ok(unsafe { announced::complete(sertype) })
     }
 
-    /// The topic of a spec. Each endpoint has a topic entity of its own, to be deleted with it.
+    /// Creates the topic of a spec. Each endpoint has a topic entity of its own, deleted with it.
     pub(crate) fn topic(&self, spec: &EndpointSpec) -> Result<Entity, String> {
         sample::topic(self, spec)
     }
 
-    /// The publisher or subscriber for a spec, if its partitions need one of their own.
+    /// Creates the publisher or subscriber of a spec, if its partitions need one.
     pub(crate) fn group(&self, kind: EndpointKind, spec: &EndpointSpec) -> Result<Option<Entity>, String> {
         if spec.qos.partitions.is_empty() {
             return Ok(None);
@@ -464,7 +466,7 @@ impl Participant {
         .map(Some)
     }
 
-    /// The QoS of an endpoint, USER_DATA included, to which `more` elements are added.
+    /// Returns the QoS of an endpoint with its USER_DATA, to which `more` elements are added.
     pub(crate) fn endpoint_qos(
         &self,
         kind: EndpointKind,
@@ -478,8 +480,8 @@ impl Participant {
         data.extend_from_slice(more.as_bytes());
         let qos = NativeQos::endpoint(kind, &spec.qos, spec.keyless, &data)?;
         if self.tag.is_some() {
-            // What a proxy writes must never come back to it through its own readers. Of any other network the parts belong
-            // to several programs, which hear each other.
+            // A proxy's samples must never return to it through its own readers. The parts of other networks belong
+            // to several programs, which receive from each other.
             qos.set_ignores_own();
         }
         Ok(qos)
@@ -495,19 +497,19 @@ impl CycloneNetwork {
 
 struct Domain {
     entity: Entity,
-    /// The id that Cyclone knows it by.
+    /// Cyclone's id of the domain.
     id: u32,
 }
 
 impl Domain {
-    /// Returns `true` if the id is none of ROS.
+    /// Returns `true` if the id is not that of a ROS domain.
     fn is_alias(&self) -> bool {
         self.id >= ALIAS_FIRST
     }
 }
 
-/// Creates the Cyclone domain: under the ROS domain's own id, so that `<Domain Id="…">` in the user's
-/// configuration finds it, or under another if this process has that one already.
+/// Creates the Cyclone domain under the ROS domain's own id, so that `<Domain Id="…">` in the user's configuration
+/// applies. Uses another id if this process has that one already.
 fn create_domain(config: &DdsConfig) -> Result<Domain, RosError> {
     static NUMBER: AtomicU32 = AtomicU32::new(0);
     let number = NUMBER.fetch_add(1, Ordering::Relaxed);
@@ -515,7 +517,7 @@ fn create_domain(config: &DdsConfig) -> Result<Domain, RosError> {
         config.cyclonedds_uri.as_deref().is_some_and(|uri| chooses_interfaces(uri, read_file));
     let host_addresses =
         local_addresses(&read_file("/proc/net/fib_trie").unwrap_or_default(), HOST_ADDRESSES_MAX);
-    // With one address there is nothing to choose.
+    // With a single address there is no choice.
     let towards_peers =
         if host_addresses.len() > 1 { addresses_towards(&config.static_peers) } else { Vec::new() };
     let process = std::process::id();
@@ -535,7 +537,7 @@ fn create_domain(config: &DdsConfig) -> Result<Domain, RosError> {
             continue;
         }
         if handle < 0 && config.discovery == DiscoveryRange::Subnet && !instance.interfaces_chosen {
-            // No interface but the loopback is up, for instance: Cyclone's own choice is better than none.
+            // The interface may be down, for instance. Cyclone's own choice is better than none.
             instance.interfaces_chosen = true;
             (handle, _) = create(&instance)?;
         }
@@ -548,7 +550,7 @@ fn create_domain(config: &DdsConfig) -> Result<Domain, RosError> {
     Err(refused("the domain could not be created".into()))
 }
 
-/// The addresses from which this host would speak to others: of the route to each, which takes no packet.
+/// Returns the addresses from which this host would reach the peers, by looking up routes without sending a packet.
 fn addresses_towards(peers: &[String]) -> Vec<Ipv4Addr> {
     let mut found = Vec::new();
     for host in far_hosts(peers).take(PEERS_MAX) {

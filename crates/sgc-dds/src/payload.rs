@@ -1,40 +1,39 @@
-//! Serialised samples as they go to Cyclone: checked, padded, and marked as padded.
+//! Serialised samples for Cyclone: checked, padded, and marked as padded.
 //!
-//! Pure, and copies nothing: a [`Frame`] says which pieces to write. It looks at the four bytes of the
-//! encapsulation header only (RTPS 2.5, 10.2).
+//! The module is pure and copies nothing: a [`Frame`] lists the pieces to write. It reads only the four bytes of the
+//! encapsulation header (RTPS 2.5, 10.2).
 
 use sgc_ros::RosError;
 
-/// Largest payload written or received, bytes, header and padding included.
+/// Longest payload written or received, in bytes, including header and padding.
 pub const PAYLOAD_BYTES_MAX: usize = 64 << 20;
 
 /// Length of the encapsulation header, bytes.
 pub const HEADER_BYTES: usize = 4;
 
-/// Length of what may stand between the header and the body, bytes.
+/// Length of a prefix between the header and the body, in bytes.
 pub const PREFIX_BYTES: usize = 16;
 
-/// A payload cut into what Cyclone is given: a header of its own, what stands in front of the body, the body, and
-/// zeros up to a multiple of four.
+/// A payload in pieces for Cyclone: a new header, a prefix, the body, and zeros up to a multiple of four.
 ///
-/// Cyclone sends samples in multiples of four bytes. Given a sample of another length it reads on past the end of
-/// the buffer, and what it finds there goes onto the network.
+/// Cyclone sends samples in multiples of four bytes. It would read a sample of another length past the end of the
+/// buffer and send those bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Frame<'a> {
-    /// The encapsulation header, its two pad bits saying how many of the last bytes are padding.
+    /// The encapsulation header. Its two pad bits hold the number of padding bytes.
     pub header: [u8; HEADER_BYTES],
-    /// Put in front of the body; a multiple of eight bytes, so that nothing in the body changes its alignment.
+    /// The prefix of the body, a multiple of eight bytes, so that the alignment of the body does not change.
     pub prefix: [u8; PREFIX_BYTES],
-    /// How many of those: none, or all.
+    /// The length of the prefix: 0 or all of it.
     pub prefix_bytes: usize,
-    /// The body, untouched.
+    /// The body, unchanged.
     pub body: &'a [u8],
-    /// How many zero bytes to append, 0 to 3.
+    /// The number of zero bytes to append, 0 to 3.
     pub pad: usize,
 }
 
 impl<'a> Frame<'a> {
-    /// Checks a payload and says how to write it.
+    /// Checks a payload and frames it.
     ///
     /// # Errors
     /// [`RosError::Payload`] if it is shorter than its header, longer than [`PAYLOAD_BYTES_MAX`] or of an
@@ -43,10 +42,11 @@ impl<'a> Frame<'a> {
         Self::with(payload, 0, |_| [0; PREFIX_BYTES])
     }
 
-    /// The same with a prefix, which is made for big endian (`false`) or little endian (`true`), as the payload is.
+    /// Frames a payload with a prefix. The prefix is made for the payload's byte order, big endian (`false`) or
+    /// little endian (`true`).
     ///
     /// # Errors
-    /// As [`Self::new`].
+    /// The errors of [`Self::new`].
     pub fn with_prefix(
         payload: &'a [u8],
         prefix: impl FnOnce(bool) -> [u8; PREFIX_BYTES],
@@ -69,19 +69,19 @@ impl<'a> Frame<'a> {
         }
         let mut frame = Self { header, prefix: prefix(is_little_endian(header)), prefix_bytes, body, pad };
         if pad > 0 {
-            // Bits set before said how an aligned payload was padded, so they mean nothing here.
+            // Former pad bits described the padding of an aligned payload and have no meaning here.
             frame.header[3] = (frame.header[3] & !3) | pad as u8;
         }
         Ok(frame)
     }
 
-    /// Length of header, body and padding, bytes: a multiple of four.
+    /// Returns the length of header, prefix, body and padding in bytes, a multiple of four.
     pub fn bytes(&self) -> usize {
         HEADER_BYTES + self.prefix_bytes + self.body.len() + self.pad
     }
 }
 
-/// The byte order of a payload: the encapsulation identifiers for little endian are the odd ones (RTPS 2.5, 10.2).
+/// Returns `true` for a little-endian payload, whose encapsulation identifier is odd (RTPS 2.5, 10.2).
 pub fn is_little_endian(header: [u8; HEADER_BYTES]) -> bool {
     header[1] & 1 == 1
 }
@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_sample_is_refused() {
+    fn invalid_payloads_are_refused() {
         for bytes in [&[][..], &[0], &[0, 1, 0], &[0x12, 0x34, 0, 0], &[0, 5, 0, 0]] {
             assert_eq!(Frame::new(bytes), Err(RosError::Payload { bytes: bytes.len() }));
         }

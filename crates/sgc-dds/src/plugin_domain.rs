@@ -1,12 +1,13 @@
-//! The number of the domain that the plugins of DDS Security know.
+//! The domain number that the plugins of DDS Security see.
 //!
-//! A second network of this process on a ROS domain has a Cyclone domain of another number ([`crate::network`]), and says the ROS domain's
-//! on the wire. Cyclone's plugins are given its own number, which no governance and no permissions name. This module has Cyclone give
-//! them the ROS domain's. Cyclone finds domains by a copy of the number, which stays as it is, and reads this one for nothing else
-//! than for its log.
+//! A second network of this process on a ROS domain has a Cyclone domain with another number ([`crate::network`]),
+//! and announces the ROS domain's number on the wire. Cyclone would pass its own number to the plugins, which no
+//! governance and no permissions contain. This module makes Cyclone pass the ROS domain's number. Cyclone finds
+//! domains by a copy of the number, which stays, and otherwise uses this field only for its log.
 //!
-//! That takes two neighbouring fields of `struct ddsi_config` (`ddsi_config.h`) of the Cyclone that `cyclors` =0.4.0 builds (`CYCLORS` in
-//! `sample.rs`), which hold exactly what this process has just written into the configuration.
+//! This needs two neighbouring fields of `struct ddsi_config` (`ddsi_config.h`) of the Cyclone that `cyclors` =0.4.0
+//! builds (`CYCLORS` in `sample.rs`). They are recognised by the values that this process has just written into the
+//! configuration.
 
 use std::ffi::c_void;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -15,7 +16,8 @@ use cyclors::{dds_entity_t, dds_return_t};
 
 use crate::entity::{Entity, check};
 
-/// Bytes of `struct dds_domain` that are looked at; the fields are some 900 bytes from its beginning, and it has some 6000.
+/// Bytes of `struct dds_domain` that are searched. The fields are some 900 bytes from its beginning, and it has some
+/// 6000.
 const LOOKED_AT_BYTES: usize = 2048;
 
 // `dds__entity.h`.
@@ -32,10 +34,10 @@ struct Numbers {
     announced: u32,
 }
 
-/// Has the plugins see the ROS domain in a new domain that has no participants yet.
+/// Makes the plugins see the ROS domain in a new domain without participants.
 ///
 /// # Errors
-/// Where Cyclone is not as this module knows it.
+/// Cyclone differs from the one that this module knows.
 pub(crate) fn install(domain: &Entity, own: u32, ros: u32) -> Result<(), String> {
     let mut entity = std::ptr::null_mut();
     // SAFETY: the handle is checked by Cyclone, and `entity` is a valid place for the result.
@@ -47,7 +49,7 @@ pub(crate) fn install(domain: &Entity, own: u32, ros: u32) -> Result<(), String>
     result
 }
 
-/// Replaces the domain's own number where it stands in front of the one that it announces.
+/// Replaces the domain's own number where it stands before the announced one.
 ///
 /// # Safety
 /// `domain` must be a `struct dds_domain` that no thread configures.

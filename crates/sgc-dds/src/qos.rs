@@ -1,8 +1,8 @@
-//! [`sgc_wire::Qos`] to and from Cyclone's QoS object.
+//! Conversion of [`sgc_wire::Qos`] from and to Cyclone's QoS object.
 //!
-//! Says what a policy is called, never what it should be; that is decided in `sgc-ros`.
+//! `sgc-ros` decides the policies; this module only translates them.
 
-// Cyclone's constants stand in patterns here under the names that bindgen gave them.
+// Cyclone's constants appear in patterns under the names that bindgen gave them.
 #![allow(non_upper_case_globals)]
 
 use std::ffi::{CStr, CString, c_char, c_void};
@@ -10,7 +10,7 @@ use std::sync::Once;
 
 use cyclors::*;
 use sgc_ros::EndpointKind;
-// Cyclone is not told the keys and takes all samples of a keyed topic for one instance.
+// Cyclone does not know the keys, and treats all samples of a keyed topic as one instance.
 pub use sgc_ros::KEYED_INSTANCES_KEPT;
 use sgc_ros::KEYED_SAMPLES_MAX;
 use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representations};
@@ -18,36 +18,37 @@ use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representation
 use crate::entity::{INFINITE, c_string};
 use crate::identity::{CYCLONE, FAST_DDS};
 
-/// Deepest history kept by an endpoint made here, and what a reader that asks for all is given: Cyclone's
-/// own bound on a reader stops delivery to *every* reader of the domain while it is reached, so a handler
-/// that is stuck would take the others with it. A writer that keeps all keeps all that is not acknowledged
-/// yet, and blocks beyond half a megabyte of it; of what is, late joiners get as much as said here.
+/// Deepest history of an endpoint created here, and the depth of a reader that asks for `KEEP_ALL`. Cyclone's own
+/// bound on a reader stops delivery to *every* reader of the domain while it is reached, so a stuck handler would
+/// stop the others. A `KEEP_ALL` writer keeps everything unacknowledged and blocks beyond half a megabyte of it; of
+/// acknowledged samples late joiners get this many.
 pub const HISTORY_DEPTH_MAX: u32 = 4096;
 
-/// How long a write waits for a reader that does not acknowledge, milliseconds. Only writers that keep all
-/// wait: one that keeps the last samples overwrites them, acknowledged or not.
+/// Longest wait of a write for a reader that does not acknowledge, in milliseconds. Only `KEEP_ALL` writers wait;
+/// others overwrite old samples.
 pub const WRITE_BLOCK_MAX_MS: u64 = 2000;
 
-/// Fewest samples that a reliable writer that keeps the last ones keeps until they are acknowledged. Fast DDS acknowledges some 7 ms
-/// after the heartbeat, and a publisher's own depth, ten by default, is for a reader on its network.
+/// Fewest unacknowledged samples that a reliable `KEEP_LAST` writer keeps. Fast DDS acknowledges some 7 ms after the
+/// heartbeat, and a publisher's own depth, ten by default, is meant for a reader on its own network.
 pub const UNACKNOWLEDGED_MIN: u32 = 16;
 
-/// Most samples of a writer, if they are short, that are kept for that.
+/// Most unacknowledged samples of a writer, if they are short.
 pub const UNACKNOWLEDGED_MAX: u32 = 1024;
 
-/// Bytes of one writer that are kept for that; [`UNACKNOWLEDGED_MIN`] samples may be more.
+/// Most unacknowledged bytes of a writer; [`UNACKNOWLEDGED_MIN`] samples may be more.
 pub const UNACKNOWLEDGED_BYTES_MAX: usize = 32 << 20;
 
-/// The same of all writers of a network together.
+/// Most unacknowledged bytes of all writers of a network together.
 pub const UNACKNOWLEDGED_BYTES_IN_ALL: usize = 256 << 20;
 
-/// History of a volatile endpoint that does not announce it: as ROS 2 has it by default. With the specification's single sample
-/// a writer here would overwrite what a reader that is late by one message has not acknowledged: of nine images of 1 MB from Fast
-/// DDS to a Fast DDS subscriber that stood still meanwhile, seven were lost, and with ten none are (`sgc/tests/peers.rs`).
+/// Depth of a volatile endpoint that does not announce it, ROS 2's default. With the specification's single sample a
+/// writer here would overwrite samples that a slightly late reader has not acknowledged: of nine images of 1 MB from
+/// Fast DDS to a stalled Fast DDS subscriber seven were lost, and with a depth of ten none are
+/// (`sgc/tests/peers.rs`).
 const UNSAID_DEPTH: i32 = 10;
 
-/// Shortest liveliness lease of an endpoint made here, nanoseconds. Cyclone says that writers live after each four fifths of the shortest
-/// lease, so that a lease of nothing would keep a processor and the network busy.
+/// Shortest liveliness lease of an endpoint created here, in nanoseconds. Cyclone renews leases after four fifths of
+/// the shortest one, so a lease of zero would keep a processor and the network busy.
 const LEASE_MIN_NS: i64 = 1_000_000;
 
 /// Data representations by their numbers (XTypes 1.3, 7.6.3.1.1).
@@ -57,22 +58,23 @@ const XCDR2: i16 = DDS_DATA_REPRESENTATION_XCDR2 as i16;
 /// Cyclone's QoS object, deleted on drop.
 pub(crate) struct NativeQos(*mut dds_qos_t);
 
-/// Whether Cyclone's tables of policies are made.
+/// Runs once when Cyclone's tables of policies are built.
 static TABLES: Once = Once::new();
 
 impl NativeQos {
     pub(crate) fn new() -> Result<Self, String> {
-        // SAFETY: no arguments; allocates. What is deleted was just made.
+        // SAFETY: no arguments; allocates. The deleted object was just made.
         let qos = unsafe {
-            // Cyclone makes its tables of policies when the first QoS object ends, and heeds no other thread meanwhile: who
-            // ends another one then frees parts of it twice. A domain makes them, too, but need not be there.
+            // Cyclone builds its tables of policies when the first QoS object is deleted, without a lock: a second
+            // thread that deletes another one would free parts twice. A domain builds them, too, but need not exist
+            // yet.
             TABLES.call_once(|| dds_delete_qos(dds_create_qos()));
             dds_create_qos()
         };
         if qos.is_null() { Err("out of memory".into()) } else { Ok(Self(qos)) }
     }
 
-    /// The QoS of an endpoint of ours.
+    /// Creates the QoS of an endpoint.
     pub(crate) fn endpoint(
         kind: EndpointKind,
         qos: &Qos,
@@ -103,7 +105,7 @@ impl NativeQos {
             );
             dds_qset_history(native.0, history, depth);
             if qos.is_transient_local() {
-                // What late joiners get is governed by this one, whose default is a single sample.
+                // This policy, whose default is a single sample, decides how much late joiners get.
                 let unlimited = DDS_LENGTH_UNLIMITED;
                 let last = dds_history_kind_DDS_HISTORY_KEEP_LAST;
                 dds_qset_durability_service(native.0, 0, last, depth, unlimited, unlimited, unlimited);
@@ -132,7 +134,7 @@ impl NativeQos {
         Ok(native)
     }
 
-    /// The QoS of a publisher or subscriber, which is where partitions are.
+    /// Creates the QoS of a publisher or subscriber, which holds the partitions.
     pub(crate) fn group(partitions: &[String]) -> Result<Self, String> {
         let native = Self::new()?;
         let names: Vec<CString> = partitions.iter().map(|p| c_string(p)).collect::<Result<_, _>>()?;
@@ -142,19 +144,19 @@ impl NativeQos {
         Ok(native)
     }
 
-    /// Has an endpoint match none of its own participant.
+    /// Makes an endpoint match none of its own participant.
     pub(crate) fn set_ignores_own(&self) {
         // SAFETY: the object is valid; the call takes a number.
         unsafe { dds_qset_ignorelocal(self.0, dds_ignorelocal_kind_DDS_IGNORELOCAL_PARTICIPANT) };
     }
 
-    /// Has a writer keep so many samples of each instance until they are acknowledged. Late joiners get as many as before.
-    pub(crate) fn set_unacknowledged(&self, kept: Unacknowledged) {
+    /// Makes a writer keep this many unacknowledged samples of each instance. Late joiners get as many as before.
+    pub(crate) fn set_unacknowledged(&self, kept: SendWindow) {
         // SAFETY: the object is valid.
         unsafe { dds_qset_history(self.0, dds_history_kind_DDS_HISTORY_KEEP_LAST, kept.depth as i32) };
     }
 
-    /// Lets a writer put samples into one packet until it is flushed.
+    /// Lets a writer gather samples in one packet until it is flushed.
     pub(crate) fn set_batching(&self) {
         // SAFETY: the object is valid.
         unsafe { dds_qset_writer_batching(self.0, true) };
@@ -165,7 +167,7 @@ impl NativeQos {
         unsafe { dds_qset_userdata(self.0, user_data.as_ptr().cast(), user_data.len()) };
     }
 
-    /// A writer offers one: XCDR2 if nothing else will do.
+    /// Sets the data representations. A writer offers one: XCDR2 only if nothing else is allowed.
     fn set_representations(&self, kind: EndpointKind, representations: Representations) {
         let ids: &[i16] = match (kind, representations) {
             (EndpointKind::Reader, Representations::BOTH) => &[XCDR1, XCDR2],
@@ -196,7 +198,7 @@ impl Drop for NativeQos {
     }
 }
 
-/// What a history is to Cyclone, and how many samples it holds.
+/// Returns Cyclone's kind and depth of a history.
 pub(crate) fn history_of(kind: EndpointKind, history: History, keyless: bool) -> (dds_history_kind_t, i32) {
     let wanted = match history {
         History::KeepLast(n) => n.max(1),
@@ -210,8 +212,8 @@ pub(crate) fn history_of(kind: EndpointKind, history: History, keyless: bool) ->
     (native, depth as i32)
 }
 
-/// Returns the number of keys whose samples a writer keeps apart, so that late joiners get the last ones of each; none where it keeps the
-/// last ones of all together.
+/// Returns the number of keys whose samples a writer keeps apart, so that late joiners get the last samples of each.
+/// Returns `None` if it keeps the last samples of all keys together.
 pub(crate) fn keys_kept(qos: &Qos, keyless: bool) -> Option<u32> {
     match qos.history {
         History::KeepLast(n) if !keyless && qos.is_transient_local() => {
@@ -221,38 +223,40 @@ pub(crate) fn keys_kept(qos: &Qos, keyless: bool) -> Option<u32> {
     }
 }
 
-/// The room for samples that are not acknowledged yet, of a reliable writer that keeps the last ones. It never waits, so they are a matter
-/// of memory, not of what its publisher keeps: Cyclone has so many of each instance, and a writer spreads its samples over as many
-/// instances as their size allows.
+/// The send window: the room for unacknowledged samples of a reliable `KEEP_LAST` writer. Such a writer never waits,
+/// so the window depends on memory and not on the publisher's depth. Cyclone keeps `depth` samples of each instance,
+/// and a writer spreads its samples over as many instances as their size allows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Unacknowledged {
+pub(crate) struct SendWindow {
     /// Samples of each instance.
     pub(crate) depth: u32,
-    /// Most instances. One where more would give late joiners too much, miss deadlines, or mean something to readers.
+    /// Most instances. It is 1 where more would give late joiners too much, miss deadlines, or change the meaning for
+    /// readers.
     pub(crate) instances_max: u32,
 }
 
-impl Unacknowledged {
-    /// Of a writer; none for one that keeps nothing for this, or waits.
-    pub(crate) fn of(qos: &Qos, keyless: bool) -> Option<Self> {
+impl SendWindow {
+    /// Returns the window of a writer, or `None` if the writer keeps nothing or waits.
+    pub(crate) fn for_writer(qos: &Qos, keyless: bool) -> Option<Self> {
         if qos.history == History::KeepAll || !qos.is_reliable() {
             return None;
         }
         let is_by_key = keys_kept(qos, keyless).is_some();
         let (_, depth) = history_of(EndpointKind::Writer, qos.history, keyless || is_by_key);
         let depth = u32::try_from(depth).unwrap_or(1);
-        // Late joiners get from Cyclone whatever is kept for others.
+        // Late joiners get everything from Cyclone that is kept for others.
         let depth = if qos.is_transient_local() { depth } else { depth.max(UNACKNOWLEDGED_MIN) };
         let is_one = qos.is_transient_local() || qos.deadline_ns.is_some() || !keyless;
         Some(Self { depth, instances_max: if is_one { 1 } else { (UNACKNOWLEDGED_MAX / depth).max(1) } })
     }
 
-    /// The same for a writer whose samples readers of its participant get as they are, instance by instance.
-    pub(crate) fn of_one_instance(self) -> Self {
+    /// Restricts the window to one instance, for a writer whose samples reach readers of its own participant
+    /// unchanged.
+    pub(crate) fn for_one_instance(self) -> Self {
         Self { instances_max: 1, ..self }
     }
 
-    /// Instances for samples of so many bytes, by one of so many writers.
+    /// Returns the number of instances for samples of this size, given the number of writers.
     pub(crate) fn instances(self, bytes: usize, writers: usize) -> u32 {
         let allowed = (UNACKNOWLEDGED_BYTES_IN_ALL / writers.max(1)).min(UNACKNOWLEDGED_BYTES_MAX);
         let of_one = bytes.max(1).saturating_mul(self.depth as usize);
@@ -268,13 +272,14 @@ fn finite(ns: i64) -> Option<u64> {
     u64::try_from(ns).ok().filter(|_| ns != INFINITE)
 }
 
-/// Reads the QoS of an endpoint that a program of this vendor announced; a policy that the announcement omits has the default of
-/// the specification (DDS 1.4, 2.2.3). `None` if it cannot be carried: too many or too long partitions.
+/// Reads the QoS that a program of this vendor announced for an endpoint. Omitted policies have the defaults of the
+/// specification (DDS 1.4, 2.2.3). Returns `None` if the QoS cannot be carried because of too many or too long
+/// partitions.
 ///
-/// Few vendors announce history, and Cyclone fills in what is missing before anybody sees it, so that it looks like a history of a
-/// single sample. Cyclone's own programs mean that; for others the depth of the durability service is taken for late joiners, and for
-/// volatile endpoints [`UNSAID_DEPTH`]. Reliable writers of Fast DDS on topics without keys tell the depth later, with their messages
-/// ([`crate::fragments::kept_by_writer`]): until then it is [`History::UNSAID`].
+/// Few vendors announce history, and Cyclone fills in a missing one, so that it looks like a history of a single
+/// sample. Cyclone's own programs mean that. For others the depth of the durability service is taken for late
+/// joiners, and [`UNSAID_DEPTH`] for volatile endpoints. Reliable writers of Fast DDS on topics without keys reveal
+/// the depth later, with their messages ([`crate::fragments::kept_by_writer`]); until then it is [`History::UNSAID`].
 ///
 /// # Safety
 /// `qos` must be a valid QoS object.
@@ -317,7 +322,7 @@ pub(crate) unsafe fn discovered(
                     max_instances,
                     max_per_instance,
                 );
-                // The messages of a keyed topic that a writer keeps are not a row, so no depth follows from them.
+                // The kept messages of a keyed topic are not consecutive, so no depth follows from them.
                 is_unsaid = kind == EndpointKind::Writer
                     && (vendor, keyless) == (FAST_DDS, true)
                     && reliability == dds_reliability_kind_DDS_RELIABILITY_RELIABLE
@@ -363,7 +368,8 @@ pub(crate) unsafe fn discovered(
     })
 }
 
-/// What an endpoint takes or offers: of a writer's list the first entry counts (XTypes 1.3, 7.6.3.1.1).
+/// Returns the representations that an endpoint accepts or offers. The first entry of a writer's list counts (XTypes
+/// 1.3, 7.6.3.1.1).
 ///
 /// # Safety
 /// `qos` must be a valid QoS object.
@@ -419,7 +425,7 @@ unsafe fn partitions(qos: *const dds_qos_t) -> Option<Vec<String>> {
     partitions.map(|list| if list == [""] { Vec::new() } else { list })
 }
 
-/// The USER_DATA of a discovered endpoint; empty if it has none.
+/// Returns the USER_DATA of a discovered endpoint, or nothing if it has none.
 ///
 /// # Safety
 /// `qos` must be a valid QoS object.
@@ -440,7 +446,7 @@ pub(crate) unsafe fn user_data(qos: *const dds_qos_t) -> Vec<u8> {
 mod tests {
     use super::*;
 
-    /// Reads back what was set, as discovery does with what was announced.
+    /// Sets a QoS and reads it back, as discovery does with an announced one.
     fn round_trip(kind: EndpointKind, qos: &Qos, keyless: bool) -> Qos {
         let native = NativeQos::endpoint(kind, qos, keyless, b"sgc=x;").unwrap();
         // SAFETY: a valid object that outlives the calls.
@@ -512,7 +518,7 @@ mod tests {
         assert_eq!((writer.durability, writer.lease_ns), (Durability::Volatile, None));
     }
 
-    /// Whoever omits its history is seen with the default of the specification, which Cyclone fills in.
+    /// An endpoint that omits its history appears with the default of the specification, which Cyclone fills in.
     #[test]
     fn a_single_sample_of_another_vendor_is_no_depth() {
         let read_of = |keyless, vendor, durability, history, service_depth| {
@@ -566,9 +572,9 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_acknowledged_is_kept_as_far_as_memory_goes() {
+    fn unacknowledged_samples_are_kept_within_memory() {
         let reliable = |n| Qos { history: History::KeepLast(n), ..Qos::default() };
-        let of = |n| Unacknowledged::of(&reliable(n), true).unwrap();
+        let of = |n| SendWindow::for_writer(&reliable(n), true).unwrap();
         let window = |n, bytes, writers| of(n).depth * of(n).instances(bytes, writers);
         assert_eq!(window(1, 100, 1), UNACKNOWLEDGED_MAX);
         assert_eq!(window(1, UNACKNOWLEDGED_BYTES_MAX / 64, 1), 64);
@@ -583,11 +589,11 @@ mod tests {
         let latched = Qos { durability: Durability::TransientLocal, ..reliable(1) };
         let timed = Qos { deadline_ns: Some(1), ..reliable(1) };
         for (qos, keyless) in [(latched, true), (timed, true), (reliable(1), false)] {
-            assert_eq!(Unacknowledged::of(&qos, keyless).unwrap().instances_max, 1, "{qos:?}");
+            assert_eq!(SendWindow::for_writer(&qos, keyless).unwrap().instances_max, 1, "{qos:?}");
         }
         let waits = Qos { history: History::KeepAll, ..Qos::default() };
         let best_effort = Qos { reliability: Reliability::BestEffort, ..Qos::default() };
-        assert_eq!([waits, best_effort].map(|qos| Unacknowledged::of(&qos, true)), [None, None]);
+        assert_eq!([waits, best_effort].map(|qos| SendWindow::for_writer(&qos, true)), [None, None]);
     }
 
     #[test]

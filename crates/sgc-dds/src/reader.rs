@@ -1,4 +1,4 @@
-//! [`CycloneReader`]: a raw reader, whose samples go to a handler as they were serialised.
+//! [`CycloneReader`]: a raw reader that passes serialised samples to a handler.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -8,19 +8,19 @@ use cyclors::{dds_entity_t, dds_instance_handle_t, ddsi_serdata};
 use sgc_ros::{DiscoveryEvent, EndpointSpec, Guid, KeyHash, Sample, SampleHandler, SampleKind};
 use sgc_wire::History;
 
-use crate::intake::{Arrival, Intake, LivelinessChange, Receiver, Taken, WriterState};
+use crate::intake::{Arrival, FromSerdata, Intake, LivelinessChange, Receiver, WriterState};
 use crate::known_writers::{KnownWriter, KnownWriters};
 use crate::network::Participant;
 use crate::payload::HEADER_BYTES;
 use crate::sample::SampleRef;
 
-/// Bound on the writers of one reader that are remembered as lapsed.
+/// Most writers of one reader that are remembered as lapsed.
 const LAPSED_MAX: usize = 1024;
 
-/// Bound on the writers of one reader whose depths are told.
+/// Most writers of one reader whose depths are reported.
 const DEPTHS_MAX: usize = 1024;
 
-/// A raw reader; dropping it ends its thread, waits for a handler that is at work, and deletes the entities.
+/// A raw reader. Dropping it ends its thread, waits for a handler at work, and deletes the entities.
 #[derive(Debug)]
 pub struct CycloneReader(Intake<Samples>);
 
@@ -45,22 +45,22 @@ impl CycloneReader {
         Ok(Self(intake))
     }
 
-    /// GUID of the reader, as others discover it.
+    /// Returns the GUID of the reader, as others discover it.
     pub fn guid(&self) -> Guid {
         self.0.guid()
     }
 }
 
-/// What a sample says.
+/// The content of a sample.
 struct Content {
     kind: SampleKind,
     key_hash: Option<KeyHash>,
     payload: Bytes,
-    /// The number of messages that its writer keeps, if that is told.
+    /// The number of messages that its writer keeps, if known.
     kept: Option<u64>,
 }
 
-impl Taken for Content {
+impl FromSerdata for Content {
     unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self> {
         // SAFETY: a reference to a sample of this crate's type, by contract and by the topic of this module's readers.
         let sample = unsafe { SampleRef::from_raw(sample) };
@@ -81,31 +81,31 @@ impl Taken for Content {
     }
 }
 
-/// Hands samples to the handler.
+/// The receiver that passes samples to the handler.
 struct Samples {
     ignores_tagged: bool,
-    /// Only the newest counts.
+    /// `true` if only the newest sample counts.
     newest_only: bool,
     writers: KnownWriters,
-    /// Writers whose lease ran out.
+    /// Writers whose lease expired.
     lapsed: HashSet<dds_instance_handle_t>,
-    /// Writers whose depth was told; none are if late joiners get nothing.
+    /// Writers whose depth was reported; `None` if late joiners get nothing.
     depths: Option<HashSet<dds_instance_handle_t>>,
     participant: Arc<Participant>,
-    /// Handed over when it is known whether another follows: after the look that finds the next one, or none. That the
-    /// handler hears of the last one is a promise.
+    /// A sample that is held until it is known whether another follows, because the handler must learn which sample
+    /// is the last one.
     held: Option<Sample>,
     handler: SampleHandler,
 }
 
 impl Samples {
-    /// DDS matches readers with writers of other proxies on this network too. What those wrote came through SGC already:
-    /// sharing it again would send it round and round.
+    /// Returns `true` for a sample of another proxy on this network, which came through SGC already. Sharing it again
+    /// would make it circulate.
     fn is_ignored(&self, writer: Option<KnownWriter>) -> bool {
         self.ignores_tagged && writer.is_some_and(|w| w.tagged)
     }
 
-    /// Returns the depth of a writer's history where that is news.
+    /// Returns the depth of a writer's history if it is new.
     fn new_depth(&self, arrival: &Arrival<Content>) -> Option<u32> {
         let told = self.depths.as_ref()?;
         let depth =
@@ -113,7 +113,7 @@ impl Samples {
         Some(u32::try_from(depth).unwrap_or(u32::MAX))
     }
 
-    /// Tells discovery of the depth of a writer's history where that is news.
+    /// Reports the depth of a writer's history to discovery if it is new.
     fn tell_depth(&mut self, arrival: &Arrival<Content>, writer: Option<KnownWriter>) {
         if let (Some(depth), Some(KnownWriter { guid, .. })) = (self.new_depth(arrival), writer) {
             self.depths.get_or_insert_default().insert(arrival.writer);
@@ -122,12 +122,12 @@ impl Samples {
         }
     }
 
-    /// Tells discovery of a writer's liveliness where that is news.
+    /// Reports a writer's liveliness to discovery if it changed.
     fn tell_liveliness(&mut self, reader: dds_entity_t, LivelinessChange { writer, now }: LivelinessChange) {
         let (is_news, is_alive) = match now {
             WriterState::Alive => (self.lapsed.remove(&writer), true),
             WriterState::Lapsed => (self.lapsed.len() < LAPSED_MAX && self.lapsed.insert(writer), false),
-            // Discovery tells of it by itself.
+            // Discovery reports this by itself.
             WriterState::Gone => {
                 self.lapsed.remove(&writer);
                 if let Some(depths) = &mut self.depths {
@@ -158,7 +158,7 @@ impl Receiver for Samples {
             return;
         }
         if self.lapsed.contains(&arrival.writer) {
-            // Cyclone may tell of two changes in the wrong order.
+            // Cyclone may report two changes in the wrong order.
             self.tell_liveliness(
                 reader,
                 LivelinessChange { writer: arrival.writer, now: WriterState::Alive },
@@ -167,7 +167,7 @@ impl Receiver for Samples {
         self.tell_depth(&arrival, writer);
         let next = sample_of(arrival.sample, writer, arrival.source_timestamp_ns);
         if self.newest_only {
-            // None is held that a handler that blocks would make old.
+            // No sample is held, because a handler that blocks would make it old.
             self.handler.handle(next);
         } else if let Some(before) = self.held.replace(next) {
             self.handler.handle(Sample { more: true, ..before });
@@ -175,7 +175,7 @@ impl Receiver for Samples {
     }
 
     fn receive_at_once(&mut self, arrival: Arrival<Content>) -> Result<(), Arrival<Content>> {
-        // To ask Cyclone who wrote it takes the lock under which this is called.
+        // Looking up the writer takes the lock under which this is called.
         let writer = self.writers.known(arrival.writer);
         if writer.is_none() || self.lapsed.contains(&arrival.writer) {
             return Err(arrival);
@@ -183,7 +183,7 @@ impl Receiver for Samples {
         if self.is_ignored(writer) {
             return Ok(());
         }
-        // To tell it may block.
+        // Reporting may block.
         if self.new_depth(&arrival).is_some() {
             return Err(arrival);
         }

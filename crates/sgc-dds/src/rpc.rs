@@ -1,6 +1,5 @@
-//! [`RpcReader`], [`RpcWriter`]: endpoints of a service, whose messages may say in their inline QoS to which request they
-//! belong ([`crate::sample`]). What they say elsewhere, and which of both a client or server expects, is for
-//! [`crate::service`] to know.
+//! [`RpcReader`], [`RpcWriter`]: endpoints of a service, whose messages may name their request in the inline QoS
+//! ([`crate::sample`]). [`crate::service`] knows the other mapping, and which one a client or server expects.
 
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -15,7 +14,7 @@ use sgc_ros::{EndpointKind, EndpointSpec, Guid, RosError};
 
 use crate::entity::{Entity, check, reason};
 use crate::identity::{Mapping, SampleIdentity};
-use crate::intake::{Arrival, Intake, Receiver, Taken};
+use crate::intake::{Arrival, FromSerdata, Intake, Receiver};
 use crate::known_writers::KnownWriters;
 use crate::network::Participant;
 use crate::payload::{Frame, HEADER_BYTES};
@@ -23,43 +22,43 @@ use crate::sample::{Extra, Origin, SampleRef};
 
 /// A message of a service, as it comes from the network.
 pub(crate) struct Message {
-    /// Who wrote it.
+    /// The writer of the message.
     pub(crate) writer: Guid,
-    /// What its packet says.
+    /// The origin of the message, from its packet.
     pub(crate) origin: Origin,
-    /// Encapsulation header and body; in front of the body an id, if the mapping puts it there.
+    /// Encapsulation header and body. An id precedes the body if the mapping puts it there.
     pub(crate) payload: Bytes,
 }
 
 impl Message {
-    /// Where it says to which request it belongs. Cyclone's participants are known by the header of their
-    /// packets as well: older ones do not begin their GUIDs with the vendor.
+    /// Returns the mapping of the message. Cyclone's participants are recognised by the header of their packets, too,
+    /// because older ones do not begin their GUIDs with the vendor.
     pub(crate) fn mapping(&self) -> Mapping {
-        match Mapping::of(self.origin.vendor) {
-            Mapping::InlineQos => Mapping::of(self.writer.vendor()),
+        match Mapping::for_vendor(self.origin.vendor) {
+            Mapping::InlineQos => Mapping::for_vendor(self.writer.vendor()),
             body => body,
         }
     }
 }
 
-/// Receives messages, on a thread of its reader alone.
+/// A handler of messages, on a thread of its reader alone.
 pub(crate) trait HandleMessages: Send + 'static {
-    /// Receives a message; may wait.
+    /// Handles a message. May block.
     fn handle(&mut self, message: Message);
 
-    /// So many messages gave way to newer ones.
+    /// Reports messages that gave way to newer ones.
     fn overrun(&mut self, messages: u64);
 }
 
-/// A reader of requests or replies; dropping it ends its thread, waits for a handler that is at work, and deletes the
-/// entities. What SGC wrote, this process or another, does not reach the handler.
+/// A reader of requests or replies. Dropping it ends its thread, waits for a handler at work, and deletes the
+/// entities. Messages written by SGC, in this process or another, do not reach the handler.
 pub(crate) struct RpcReader<H: HandleMessages> {
     intake: Intake<Messages<H>>,
     ignores_tagged: bool,
 }
 
 impl<H: HandleMessages> RpcReader<H> {
-    /// `more` elements are added to USER_DATA. Messages come once `start` is called.
+    /// Creates the reader, which receives once it is started. `more` elements are added to USER_DATA.
     pub(crate) fn new(
         participant: &Arc<Participant>,
         spec: &EndpointSpec,
@@ -69,18 +68,18 @@ impl<H: HandleMessages> RpcReader<H> {
         Ok(Self { intake, ignores_tagged: participant.ignores_tagged() })
     }
 
-    /// Hands messages over from now on.
+    /// Starts to hand messages over.
     pub(crate) fn start(&mut self, handler: H) -> Result<(), String> {
         let (ignores_tagged, writers) = (self.ignores_tagged, KnownWriters::default());
         self.intake.start("sgc-dds-rpc", Messages { ignores_tagged, writers, handler })
     }
 
-    /// GUID of the reader, as others discover it.
+    /// Returns the GUID of the reader, as others discover it.
     pub(crate) fn guid(&self) -> Guid {
         self.intake.guid()
     }
 
-    /// The reader's handle, for calls into Cyclone while `self` lives.
+    /// Returns the reader's handle, for calls into Cyclone while `self` lives.
     pub(crate) fn handle(&self) -> dds_entity_t {
         self.intake.handle()
     }
@@ -92,13 +91,13 @@ impl<H: HandleMessages> fmt::Debug for RpcReader<H> {
     }
 }
 
-/// What a message says, and its packet of it.
+/// The content of a message and its origin.
 struct Content {
     origin: Origin,
     payload: Bytes,
 }
 
-impl Taken for Content {
+impl FromSerdata for Content {
     unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self> {
         // SAFETY: a reference to a sample of this crate's type, by contract and by the topic of this module's readers.
         let sample = unsafe { SampleRef::from_raw(sample) };
@@ -115,7 +114,7 @@ impl Taken for Content {
     }
 }
 
-/// Hands messages to the handler.
+/// The receiver that passes messages to the handler.
 struct Messages<H> {
     ignores_tagged: bool,
     writers: KnownWriters,
@@ -127,7 +126,7 @@ impl<H: HandleMessages> Receiver for Messages<H> {
 
     fn receive(&mut self, reader: dds_entity_t, arrival: Arrival<Content>) {
         let Some(writer) = self.writers.find(reader, arrival.writer) else { return };
-        // Another proxy's client or server: what it has to say comes through SGC.
+        // Messages of another proxy's client or server come through SGC.
         if !(writer.tagged && self.ignores_tagged) {
             let Content { origin, payload } = arrival.sample;
             self.handler.handle(Message { writer: writer.guid, origin, payload });
@@ -139,20 +138,20 @@ impl<H: HandleMessages> Receiver for Messages<H> {
     }
 }
 
-/// A writer of requests or replies. Calls may block, like those of [`crate::CycloneWriter`]. Fields drop in this order:
-/// children first.
+/// A writer of requests or replies. Calls may block, like those of [`crate::CycloneWriter`]. Fields drop in this
+/// order: children first.
 #[derive(Debug)]
 pub(crate) struct RpcWriter {
     writer: Entity,
     _group: Option<Entity>,
     _topic: Entity,
     _participant: Arc<Participant>,
-    /// Sequence number of the last message.
+    /// The sequence number of the last message.
     written: Mutex<i64>,
 }
 
 impl RpcWriter {
-    /// `more` elements are added to USER_DATA.
+    /// Creates the writer. `more` elements are added to USER_DATA.
     pub(crate) fn new(
         participant: &Arc<Participant>,
         spec: &EndpointSpec,
@@ -170,21 +169,21 @@ impl RpcWriter {
         Ok(Self { writer, _group: group, _topic: topic, _participant: participant, written })
     }
 
-    /// The writer itself, for calls into Cyclone while `self` lives.
+    /// Returns the writer's entity, for calls into Cyclone while `self` lives.
     pub(crate) fn entity(&self) -> &Entity {
         &self.writer
     }
 
-    /// Writes what `make` returns for the sequence number that the message gets, with the identity to put into its inline
-    /// QoS. Returns that number.
+    /// Writes the frame that `make` returns for the message's sequence number, with an identity for its inline QoS.
+    /// Returns that number.
     pub(crate) fn write<'a>(
         &self,
         related: Option<SampleIdentity>,
         make: impl FnOnce(i64) -> Result<Frame<'a>, RosError>,
     ) -> Result<i64, RosError> {
         let failed = |reason: String| RosError::Write { reason };
-        // Held while writing, so that numbers are known as Cyclone gives them: from 1, one by one, none for a write that
-        // fails.
+        // The lock is held while writing, so that the numbers agree with Cyclone's: consecutive from 1, without one
+        // for a failed write.
         let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
         let number = *written + 1;
         let frame = make(number)?;

@@ -1,17 +1,17 @@
-//! Programs of this host stay reached whichever addresses the host has.
+//! Reachability of programs on this host when its addresses change.
 //!
-//! A participant announces the addresses that its host had when it started, and Cyclone sends from sockets that are bound to such an
-//! address. Once the address is gone neither leads anywhere, though nobody moved; Fast DDS keeps to the addresses that it heard first.
-//! Therefore this module takes the place of the function by which Cyclone sends a packet:
-//! - Participants are announced to programs of this host at 127.0.0.1 alone, and to others at the host's other address alone. One address
-//!   for each, because Fast DDS sends each message to all. A multicast announcement is sent twice: to other hosts without a copy for
-//!   this one, and to this host with a hop limit of zero.
-//! - When the address that a packet would leave with, or that it is for, is gone, and the receiver is on this host, the packet goes to
-//!   127.0.0.1. An address that this host had may be another's by now, so what is for it goes there as well.
+//! A participant announces the addresses that its host had when it started, and Cyclone sends from sockets that are
+//! bound to such an address. Once the address is gone, neither works, although no program moved; Fast DDS keeps to
+//! the addresses that it received first. This module therefore replaces the function by which Cyclone sends a packet:
+//! - Participants are announced to programs on this host at 127.0.0.1 alone, and to others at the host's other
+//! address alone. Each gets one address, because Fast DDS sends each message to all. A multicast announcement is sent
+//! twice: to other hosts without a copy for this one, and to this host with a hop limit of zero.
+//! - When the source or destination address of a packet is gone, and the receiver is on this host, the packet goes to
+//! 127.0.0.1. A former address of this host may belong to another host by now, so its packets go there as well.
 //!
-//! All other packets go as Cyclone sends them. This reaches into `struct ddsi_tran_conn` and `struct ddsi_tran_write_msgfrags` of the
-//! Cyclone that `cyclors` =0.4.0 builds (`CYCLORS` in `sample.rs`). A connection that does not refer to its domain, or whose socket is
-//! not bound to an address of this host, is left alone.
+//! All other packets go as Cyclone sends them. This needs `struct ddsi_tran_conn` and `struct
+//! ddsi_tran_write_msgfrags` of the Cyclone that `cyclors` =0.4.0 builds (`CYCLORS` in `sample.rs`). A connection
+//! that does not refer to its domain, or whose socket is not bound to an address of this host, is left alone.
 
 use std::ffi::{c_int, c_void};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
@@ -36,11 +36,12 @@ use crate::network::read_file;
 const UDP_V4: i32 = 1;
 /// `DDSI_TRAN_CONN`.
 const CONNECTION: u32 = 1;
-/// Bound on addresses of this host for which Cyclone may have a socket.
+/// Most addresses of this host for which Cyclone may have a socket.
 const ADDRESSES_MAX: usize = 64;
-/// Any port serves to ask Cyclone for a socket; this one is discard's (RFC 863). No packet is sent.
+/// The port with which Cyclone is asked for a socket. Any would do; this one is discard's (RFC 863). No packet is
+/// sent.
 const ANY_PORT: u32 = 9;
-/// Bound on the pieces of a packet, `IOV_MAX`.
+/// Most pieces of a packet, `IOV_MAX`.
 const PIECES_MAX: usize = 1024;
 
 type Write =
@@ -110,7 +111,7 @@ unsafe extern "C" {
     fn ddsi_unref_addrset(addresses: *mut c_void);
 }
 
-/// Cyclone's own function, which all its UDP connections have.
+/// Cyclone's own send function, which all its UDP connections share.
 static CYCLONES: AtomicPtr<c_void> = AtomicPtr::new(ptr::null_mut());
 /// The sockets beside each connection that sends by this module, by the connection's address.
 static BESIDE: RwLock<Vec<(usize, Arc<Beside>)>> = RwLock::new(Vec::new());
@@ -119,9 +120,9 @@ static BESIDE: RwLock<Vec<(usize, Arc<Beside>)>> = RwLock::new(Vec::new());
 struct Beside {
     /// The address that the connection is bound to.
     address: Ipv4Addr,
-    /// Bound to 127.0.0.1.
+    /// The socket bound to 127.0.0.1.
     loopback: UdpSocket,
-    /// For multicasts, unless the address is of the loopback interface.
+    /// The sockets for multicasts, unless the address is that of the loopback interface.
     multicast: Option<Multicast>,
 }
 
@@ -130,11 +131,11 @@ struct Multicast {
     to_this_host: UdpSocket,
 }
 
-/// A domain that sends by this module. Dropping it ends that.
+/// A domain that sends by this module, until dropped.
 #[derive(Debug)]
 pub(crate) struct SameHost {
     connections: Vec<usize>,
-    /// The addresses besides loopback that it sends from.
+    /// The addresses besides loopback that the domain sends from.
     outward: Vec<Ipv4Addr>,
 }
 
@@ -145,7 +146,7 @@ impl Drop for SameHost {
     }
 }
 
-/// Keeps a domain from hearing and from speaking until it is dropped.
+/// A domain that neither receives nor sends, until dropped.
 #[derive(Debug)]
 pub(crate) struct Silence {
     domain: dds_entity_t,
@@ -153,7 +154,7 @@ pub(crate) struct Silence {
 
 impl Silence {
     /// # Errors
-    /// Where Cyclone refuses.
+    /// Cyclone refuses.
     pub(crate) fn begin(domain: &Entity) -> Result<Self, String> {
         let silence = Self { domain: domain.handle() };
         check(silence.set(true))?;
@@ -168,16 +169,17 @@ impl Silence {
 
 impl Drop for Silence {
     fn drop(&mut self) {
-        // Fails only for a domain that is gone.
+        // This fails only for a domain that is gone.
         self.set(false);
     }
 }
 
 impl SameHost {
-    /// Makes the domain of a participant send by this module. Other participants should hear of it only afterwards: see [`Silence`].
+    /// Makes the domain of a participant send by this module. Other participants should discover it only afterwards:
+    /// see [`Silence`].
     ///
     /// # Errors
-    /// Where Cyclone is not as this module knows it, or does not use UDP over IPv4.
+    /// Cyclone differs from the one that this module knows, or does not use UDP over IPv4.
     pub(crate) fn install(participant: &Entity) -> Result<Self, String> {
         host_addresses::follow();
         install(inside(participant)?)
@@ -277,14 +279,14 @@ impl Beside {
         })
     }
 
-    /// Returns `true` if a packet to an address of this host has to go another way than Cyclone's.
+    /// Returns `true` if a packet to an address of this host must take another way than Cyclone's.
     fn is_cut_off_from(&self, to: Ipv4Addr) -> bool {
         host_addresses::any_gone()
             && host_addresses::is_known(to)
             && !(host_addresses::is_here(self.address) && host_addresses::is_here(to))
     }
 
-    /// Sends a packet that Cyclone would not send as it must be; `None` if Cyclone would.
+    /// Sends a packet that Cyclone would not deliver. Returns `None` if Cyclone would.
     fn send(&self, to: Ipv4Addr, port: u16, packet: &Packet<'_>) -> Option<std::io::Result<()>> {
         let is_cut_off = self.is_cut_off_from(to);
         let is_announcement = packet.is_announcement();
@@ -292,7 +294,7 @@ impl Beside {
         let sent_around = |here: &[u8], elsewhere: &[u8]| {
             if let Some(multicast) = self.multicast.as_ref().filter(|_| host_addresses::is_here(self.address))
             {
-                // Nobody needs to have the address.
+                // No program needs to have the address.
                 let _ = sent(&multicast.to_others, to, elsewhere);
             }
             sent(&self.loopback, Ipv4Addr::LOCALHOST, here)
@@ -309,7 +311,7 @@ impl Beside {
                 if !host_addresses::is_here(self.address) {
                     return None;
                 }
-                // Where either fails Cyclone sends it to both, or says why it cannot.
+                // If either fails, Cyclone sends to both or reports the error.
                 let here = sent(&multicast.to_this_host, to, &for_this_host);
                 Some(sent(&multicast.to_others, to, &for_others).and(here))
             }
@@ -323,7 +325,7 @@ impl Beside {
     }
 }
 
-/// A packet of Cyclone's.
+/// A packet of Cyclone.
 struct Packet<'a> {
     pieces: &'a [Piece],
 }
@@ -354,7 +356,7 @@ impl Packet<'_> {
     }
 }
 
-/// Sends a packet, in the place of Cyclone's `ddsi_udp_conn_write`.
+/// Sends a packet in place of Cyclone's `ddsi_udp_conn_write`.
 unsafe extern "C" fn write(
     connection: *const Connection,
     to: *const ddsi_locator,
@@ -381,7 +383,7 @@ unsafe extern "C" fn write(
         }
         return 0;
     }
-    // Also when the other way failed: Cyclone tries, and says why it cannot.
+    // If the other way failed, Cyclone tries, and reports the error.
     // SAFETY: the function was there before this one, which is in its place since `take_over` kept it.
     unsafe {
         let cyclones: Write = std::mem::transmute(CYCLONES.load(Ordering::Acquire));
@@ -389,7 +391,7 @@ unsafe extern "C" fn write(
     }
 }
 
-/// Sends a packet in another way than Cyclone's, if it has to.
+/// Sends a packet in another way than Cyclone's, if necessary.
 fn otherwise(connection: usize, to: &ddsi_locator, packet: &Packet<'_>) -> Option<std::io::Result<()>> {
     if to.kind != UDP_V4 || !(host_addresses::any_gone() || packet.is_announcement()) {
         return None;
@@ -434,7 +436,7 @@ mod tests {
 
     use super::*;
 
-    /// To Linux this address is the host itself, as 127.0.0.1 is (ip(7)), and here it is one that can be lost.
+    /// Linux treats this address as the host itself, like 127.0.0.1 (ip(7)), and the test may lose it.
     const LOST: Ipv4Addr = Ipv4Addr::UNSPECIFIED;
 
     fn socket() -> UdpSocket {

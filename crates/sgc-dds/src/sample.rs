@@ -1,16 +1,17 @@
-//! Samples: a sertype of our own, for every topic and service.
+//! Samples: SGC's own sertype, for every topic and service.
 //!
-//! Cyclone lets the type of a topic (de)serialise, and knows no more of a sample than that. This type
-//! - keeps the payload as it was serialised, received or to be sent, the latter without a copy where it is long;
-//! - tells what stands in the inline QoS of a received sample in front of the payload, since it is handed the packet: the hash of
-//!   its key, and the request that it belongs to;
-//! - puts into the inline QoS of what is sent the hash of its key, and the request that it belongs to;
+//! Cyclone lets the type of a topic serialise and deserialise, and knows nothing else about a sample. This type
+//! - keeps the payload as it was serialised, and sends long payloads without a copy;
+//! - reads the key hash and the related request from the inline QoS of a received sample, because it gets the whole
+//! packet;
+//! - puts the key hash and the related request into the inline QoS of a sent sample;
 //! - keeps the serialised key of a sample that has nothing else, for which Cyclone would look up the instance;
-//! - spreads the samples of a writer over instances that only that writer knows, so that its history is as deep as memory allows
-//!   ([`crate::writer`]).
+//! - spreads the samples of a writer over instances that only that writer knows, so that its history is as deep as
+//! memory allows ([`crate::writer`]).
 //!
-//! Cyclone DDS 11 writes the hash of a key for readers that ask for it in Cyclone's own way, and neither reads nor writes the parameter that says to
-//! which request a message belongs. [`crate::inline_qos`] adds both. Another version of `cyclors` does not compile: [`CYCLORS`].
+//! Cyclone DDS 11 writes a key hash only for readers that ask for it in Cyclone's own way, and neither reads nor
+//! writes the parameter that names the related request. [`crate::inline_qos`] adds both. Another version of `cyclors`
+//! does not compile: [`CYCLORS`].
 //!
 //! Everything else (discovery, matching, reliability, security) is Cyclone's, as for any other endpoint.
 
@@ -66,36 +67,37 @@ const fn contains(text: &[u8], part: &[u8]) -> bool {
     false
 }
 
-/// What a received message says besides its payload.
+/// The properties of a received message besides its payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Origin {
-    /// Vendor of the sender, from the header of the RTPS message.
+    /// The sender's vendor, from the header of the RTPS message.
     pub(crate) vendor: [u8; 2],
-    /// Sequence number of the message at its writer.
+    /// The sequence number of the message at its writer.
     pub(crate) number: i64,
-    /// Which message it refers to.
+    /// The related message, such as the request of a reply.
     pub(crate) related: Option<SampleIdentity>,
-    /// The hash of its key.
+    /// The key hash.
     pub(crate) key_hash: Option<KeyHash>,
-    /// The number of messages that its writer keeps, if the packet tells.
+    /// The number of messages that the writer keeps, if the packet contains it.
     pub(crate) kept: Option<u64>,
 }
 
-/// Facts that go with a payload that is sent.
+/// The properties of a sent sample besides its payload.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Extra {
-    /// True for a key alone.
+    /// `true` for a key alone.
     pub(crate) key_only: bool,
-    /// The hash of the key, where the topic has one and it is known.
+    /// The key hash, if the topic has a key and the hash is known.
     pub(crate) key_hash: Option<KeyHash>,
-    /// The identity to put into the inline QoS.
+    /// The identity for the inline QoS.
     pub(crate) related: Option<SampleIdentity>,
-    /// The number of its instance at its writer.
+    /// The number of the instance at the writer.
     pub(crate) instance: u32,
 }
 
 impl Extra {
-    /// Adds what the inline QoS of a message is to say; false if the message is not as Cyclone makes it.
+    /// Adds these properties to the inline QoS of a message. Returns `false` if the message is not as Cyclone makes
+    /// it.
     ///
     /// # Safety
     /// As of [`inline_qos::add`].
@@ -114,25 +116,25 @@ impl Extra {
     }
 }
 
-/// Shorter payloads are copied, so that they do not keep alive the larger block that they came in.
+/// Shortest payload that is shared. Shorter ones are copied, so that they do not keep alive a larger block.
 const SHARED_BYTES_MIN: usize = 16 << 10;
 
-/// A sample of the sertype made here, in one block of C's memory: the payload follows it, unless it is shared. `common` is first:
-/// Cyclone knows no more of it.
+/// A sample of SGC's sertype, in one block of C's memory. The payload follows it, unless it is shared. `common` is
+/// first, because Cyclone knows no other field.
 #[repr(C)]
 struct Content {
     common: ddsi_serdata,
-    /// Encapsulation header, body and padding: so many bytes.
+    /// Encapsulation header, body and padding, `bytes` long.
     payload: *const u8,
     bytes: usize,
-    /// The block that `payload` points into, if it does not follow.
+    /// The block that contains the payload, if the payload does not follow.
     shared: Option<Bytes>,
     extra: Extra,
-    /// What was in the message that it came in.
+    /// The properties of the received message.
     origin: Option<Origin>,
 }
 
-/// One reference to a sample of the sertype made here.
+/// A reference to a sample of SGC's sertype.
 #[derive(Debug)]
 pub(crate) struct SampleRef(*mut ddsi_serdata);
 
@@ -149,7 +151,7 @@ impl SampleRef {
         Self(sample)
     }
 
-    /// A sample to write: a payload, and the frame that was made of it. `None` if there is no memory.
+    /// Builds a sample to write from a payload and its frame. Returns `None` if memory is exhausted.
     ///
     /// # Safety
     /// `sertype` must be that of a topic that [`topic`] made; Cyclone keeps it while the sample is in use.
@@ -177,7 +179,7 @@ impl SampleRef {
         unsafe { Self::finish(sample, extra, source_timestamp_ns) }
     }
 
-    /// A sample to write that is framed otherwise than its payload is.
+    /// Builds a sample to write whose frame differs from its payload.
     ///
     /// # Safety
     /// As of [`Self::build`].
@@ -220,7 +222,7 @@ impl SampleRef {
             if extra.key_only {
                 (*sample).common.kind = ddsi_serdata_kind_SDK_KEY;
             }
-            // Readers of the same participant are given this very sample.
+            // Readers of the same participant get this very sample.
             let Extra { related, key_hash, .. } = extra;
             (*sample).origin = Some(Origin { vendor: CYCLONE, number: 0, related, key_hash, kept: None });
             (*sample).common.timestamp.v = source_timestamp_ns;
@@ -235,7 +237,7 @@ impl SampleRef {
         unsafe { (*self.0).statusinfo = statusinfo }
     }
 
-    /// Sets the number that a sample will get at its writer, which is not shared yet.
+    /// Sets the sequence number that a sample, which is not shared yet, will get at its writer.
     pub(crate) fn set_number(&mut self, number: i64) {
         // SAFETY: valid while the reference is held, which is the only one.
         if let Some(origin) = unsafe { &mut (*self.0.cast::<Content>()).origin } {
@@ -243,7 +245,7 @@ impl SampleRef {
         }
     }
 
-    /// Gives the reference away, to a call that consumes it.
+    /// Gives the reference away to a call that consumes it.
     pub(crate) fn into_raw(self) -> *mut ddsi_serdata {
         let sample = self.0;
         std::mem::forget(self);
@@ -255,12 +257,12 @@ impl SampleRef {
         unsafe { &*self.0.cast::<Content>() }
     }
 
-    /// Returns the contents of a received sample's packet beside its payload.
+    /// Returns the properties of a received sample besides its payload.
     pub(crate) fn origin(&self) -> Option<Origin> {
         self.content().origin
     }
 
-    /// Tells data from the end of an instance.
+    /// Returns the kind of the sample: data or the end of an instance.
     pub(crate) fn kind(&self) -> SampleKind {
         let content = self.content();
         match content.extra.key_only {
@@ -270,7 +272,7 @@ impl SampleRef {
         }
     }
 
-    /// The payload, which keeps the sample alive.
+    /// Returns the payload, which keeps the sample alive.
     pub(crate) fn into_payload(self) -> Bytes {
         Bytes::from_owner(self)
     }
@@ -289,7 +291,7 @@ impl Drop for SampleRef {
     }
 }
 
-/// Makes the topic of a spec with the sertype of this module.
+/// Creates the topic of a spec with SGC's sertype.
 pub(crate) fn topic(participant: &Participant, spec: &EndpointSpec) -> Result<Entity, String> {
     let (name, type_name) = (c_string(&spec.topic)?, c_string(&spec.type_name)?);
     // SAFETY: all zeros is a valid value of this plain C struct, and the call below fills it.
@@ -317,8 +319,8 @@ pub(crate) fn topic(participant: &Participant, spec: &EndpointSpec) -> Result<En
     Entity::new(handle)
 }
 
-/// Returns the number of messages that were sent without the identity or the hash of the key that they should carry, since the Cyclone
-/// that this was linked with is not the one that it was written for. Always 0 with the version that `Cargo.toml` asks for.
+/// Returns the number of messages sent without the identity or key hash that they should carry, because the linked
+/// Cyclone differs from the expected one. Always 0 with the version in `Cargo.toml`.
 pub fn unidentified_messages() -> u64 {
     UNIDENTIFIED.load(Ordering::Relaxed)
 }
@@ -331,19 +333,19 @@ unsafe extern "C" {
     fn ddsi_serdata_ref(sample: *const ddsi_serdata) -> *mut ddsi_serdata;
 }
 
-/// Where the sequence number is in either submessage: bytes from its beginning.
+/// Position of the sequence number in either submessage, in bytes.
 const NUMBER_OFFSET: usize = 16;
 
 /// Length of the RTPS header, bytes (RTPS 2.5, 9.4.4).
 const RTPS_HEADER_BYTES: usize = 20;
 
 impl Content {
-    /// A sample without anything, with room for a payload of so many bytes.
+    /// Allocates an empty sample with room for a payload of `room` bytes.
     ///
     /// # Safety
     /// `sertype` must be of this module and outlive the sample.
     unsafe fn allocate(sertype: *const ddsi_sertype, room: usize) -> Option<*mut Self> {
-        // Cyclone's own allocator zeroes what it gives, and ends the process where there is nothing to give.
+        // Cyclone's own allocator zeroes memory, and aborts the process when memory is exhausted.
         // SAFETY: takes a size; the block is freed by `free`, with its counterpart.
         let sample = unsafe { cyclors::malloc((size_of::<Self>() + room) as c_ulong) }.cast::<Self>();
         if sample.is_null() {
@@ -366,7 +368,7 @@ impl Content {
         Some(sample)
     }
 
-    /// Adds to a payload that follows its sample.
+    /// Appends to a payload that follows its sample.
     ///
     /// # Safety
     /// `sample` must be valid, not shared yet, and have been made with room for these bytes as well.
@@ -385,7 +387,7 @@ impl Content {
     }
 }
 
-/// Reads what the first fragment's message says of its origin.
+/// Reads the origin from the first fragment's message.
 ///
 /// # Safety
 /// `fragment` must be a fragment that Cyclone hands to a sertype: its message is valid, and both offsets are in it.
@@ -404,7 +406,7 @@ unsafe fn origin(fragment: &ReceivedFragment) -> Option<Origin> {
     if !head || !matches!(kind, 0x15 | 0x16) {
         return None;
     }
-    // Cyclone has put the fixed part into the byte order of this machine; the inline QoS is as it came.
+    // Cyclone has put the fixed part into the byte order of this machine. The inline QoS is as received.
     let number = submessage[NUMBER_OFFSET..].first_chunk::<8>()?;
     let (high, low) = (number.first_chunk::<4>()?, number.last_chunk::<4>()?);
     let number = i64::from(i32::from_ne_bytes(*high)) << 32 | i64::from(u32::from_ne_bytes(*low));
@@ -469,7 +471,7 @@ unsafe extern "C" fn sertype_free(sertype: *mut ddsi_sertype) {
     }
 }
 
-/// Nothing here goes beyond the fields that Cyclone has compared already.
+/// The type has no fields beyond those that Cyclone has compared already.
 unsafe extern "C" fn sertype_equal(_: *const ddsi_sertype, _: *const ddsi_sertype) -> bool {
     true
 }
@@ -478,7 +480,8 @@ unsafe extern "C" fn sertype_hash(_: *const ddsi_sertype) -> u32 {
     0
 }
 
-/// The type here knows no keys: what a writer wrote is spread over instances as it likes, and what is received is one.
+/// The type knows no keys: a writer spreads its samples over instances of its choice, and received samples are one
+/// instance.
 unsafe extern "C" fn eqkey(a: *const ddsi_serdata, b: *const ddsi_serdata) -> bool {
     // SAFETY: of this sertype.
     unsafe { (*a).hash == (*b).hash }
@@ -510,7 +513,7 @@ unsafe extern "C" fn from_ser(
                 (*sample).origin = origin(fragment);
             }
             let (first, end) = (fragment.first as usize, fragment.end as usize);
-            // They may overlap.
+            // Fragments may overlap.
             if end > had {
                 let start = fragment.message.add(1).cast::<u8>().add(usize::from(fragment.payload_offset));
                 Content::push(sample, std::slice::from_raw_parts(start.add(had - first), end - had));
@@ -522,7 +525,8 @@ unsafe extern "C" fn from_ser(
             }
             at = fragment.next;
         }
-        // To Cyclone the end of an instance is a sample like any other, which keeps its place and its payload, the serialised key.
+        // To Cyclone the end of an instance is an ordinary sample, which keeps its order and its payload, the
+        // serialised key.
         (*sample).extra.key_only = kind == ddsi_serdata_kind_SDK_KEY;
         sample.cast()
     }
@@ -574,7 +578,7 @@ unsafe extern "C" fn to_ser_ref(
     // message under construction asks a sample with an identity for its payload.
     unsafe {
         let content = &*sample.cast::<Content>();
-        // The first fragment carries them, as Cyclone has it for parameters of its own.
+        // The first fragment carries the parameters, like Cyclone's own.
         if offset == 0 && !content.extra.add_to(view) {
             UNIDENTIFIED.fetch_add(1, Ordering::Relaxed);
         }
@@ -611,8 +615,7 @@ unsafe extern "C" fn free(sample: *mut ddsi_serdata) {
     }
 }
 
-/// Shows nothing of a sample. Cyclone calls it without a look whether it is there, once a user has the content of samples written to
-/// its trace.
+/// Prints nothing of a sample. Cyclone calls it unconditionally once the user has the content of samples traced.
 unsafe extern "C" fn print(
     _: *const ddsi_sertype,
     _: *const ddsi_serdata,

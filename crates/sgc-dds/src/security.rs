@@ -1,7 +1,7 @@
 //! DDS Security of a local network: an enclave of a SROS2 keystore.
 //!
-//! Looks at the files of the enclave before Cyclone does, and says of Cyclone's refusals which file is meant and what to do. Cyclone's plugins
-//! read the files themselves, by their names.
+//! This module checks the files of the enclave before Cyclone does, and explains Cyclone's refusals by the file and
+//! the fix. Cyclone's plugins read the files themselves, by their names.
 
 #[cfg(feature = "sros2")]
 mod credentials;
@@ -17,19 +17,19 @@ use cyclors::DDS_RETCODE_NOT_ALLOWED_BY_SECURITY;
 use crate::entity::reason;
 use crate::qos::NativeQos;
 
-/// Bound on the enclaves that an error names.
+/// Most enclaves that an error names.
 const NAMED_MAX: usize = 8;
 
-/// Bound on the directories of a keystore that are looked at.
+/// Most directories of a keystore that are searched.
 const DIRECTORIES_MAX: usize = 256;
 
-/// Bound on the length of an enclave's name, bytes (rmw: `RMW_NAMESPACE_MAX_LENGTH`).
+/// Longest name of an enclave, in bytes (rmw: `RMW_NAMESPACE_MAX_LENGTH`).
 const NAME_BYTES_MAX: usize = 245;
 
-/// Bits of a file's mode for others than its owner.
+/// The bits of a file's mode for users other than its owner.
 const MODE_OF_OTHERS: u32 = 0o077;
 
-/// Bound on a file of an enclave, bytes.
+/// Longest file of an enclave, in bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
 const IDENTITY_CA: &str = "identity_ca.cert.pem";
@@ -39,7 +39,7 @@ const PERMISSIONS_CA: &str = "permissions_ca.cert.pem";
 const GOVERNANCE: &str = "governance.p7s";
 const PERMISSIONS: &str = "permissions.p7s";
 
-/// Files of an enclave, and the properties of a participant that name them (DDS Security 1.1, 9.3.1 and 9.4.1).
+/// The files of an enclave, and the participant properties that name them (DDS Security 1.1, 9.3.1 and 9.4.1).
 const FILES: [(&str, &str); 6] = [
     (IDENTITY_CA, "dds.sec.auth.identity_ca"),
     (CERTIFICATE, "dds.sec.auth.identity_certificate"),
@@ -49,10 +49,10 @@ const FILES: [(&str, &str); 6] = [
     (PERMISSIONS, "dds.sec.access.permissions"),
 ];
 
-/// The file that an enclave may have, with its property of Cyclone's own: certificates that were revoked.
+/// An optional file of an enclave, the list of revoked certificates, and Cyclone's property for it.
 const REVOKED: (&str, &str) = ("crl.pem", "org.eclipse.cyclonedds.sec.auth.crl");
 
-/// The plugins that Cyclone has built in, by the names of the libraries that it would load.
+/// Cyclone's built-in plugins, by the names of the libraries that it would load.
 const PLUGINS: [(&str, &str); 9] = [
     ("dds.sec.auth.library.path", "dds_security_auth"),
     ("dds.sec.auth.library.init", "init_authentication"),
@@ -65,7 +65,7 @@ const PLUGINS: [(&str, &str); 9] = [
     ("dds.sec.access.library.finalize", "finalize_access_control"),
 ];
 
-/// An enclave of a keystore, as `ros2 security create_enclave` makes it.
+/// An enclave of a keystore, as created by `ros2 security create_enclave`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Security {
     /// The directory that `ROS_SECURITY_KEYSTORE` names.
@@ -79,9 +79,9 @@ pub struct Security {
 pub enum SecurityError {
     /// This build has no plugins.
     NotBuilt,
-    /// The name is none.
+    /// The name is invalid.
     Name,
-    /// The keystore is not there, or cannot be read.
+    /// The keystore is missing or unreadable.
     Keystore {
         /// Its directory of enclaves.
         directory: PathBuf,
@@ -92,47 +92,47 @@ pub enum SecurityError {
     Missing {
         /// The directory in which it would be.
         directory: PathBuf,
-        /// Some that the keystore has.
+        /// Some enclaves that the keystore has.
         known: Vec<String>,
     },
-    /// A file of the enclave is not there, or cannot be read.
+    /// A file of the enclave is missing or unreadable.
     File {
         /// The file.
         file: PathBuf,
         /// The system's reason.
         reason: std::io::Error,
     },
-    /// A directory's name cannot stand in a property.
+    /// The name of a directory is not valid text for a property.
     NotText {
         /// The directory.
         directory: PathBuf,
     },
-    /// A file of the enclave holds something else.
+    /// A file of the enclave has the wrong content.
     Unreadable {
         /// The file.
         file: PathBuf,
-        /// The content that it must have.
+        /// The required content.
         kind: &'static str,
     },
-    /// The private key is not that of the certificate.
+    /// The private key does not belong to the certificate.
     KeyMismatch {
         /// The file of the key.
         key: PathBuf,
         /// The file of the certificate.
         certificate: PathBuf,
     },
-    /// A certificate or the permissions hold no longer.
+    /// A certificate or the permissions have expired.
     Ended {
         /// The file.
         file: PathBuf,
-        /// The end, as the file writes it.
+        /// The end, as written in the file.
         at: String,
     },
-    /// A certificate or the permissions do not hold yet.
+    /// A certificate or the permissions are not valid yet.
     NotBegun {
         /// The file.
         file: PathBuf,
-        /// The beginning, as the file writes it.
+        /// The beginning, as written in the file.
         at: String,
     },
     /// Another CA signed the certificate.
@@ -151,15 +151,15 @@ pub enum SecurityError {
         /// The file of the CA.
         ca: PathBuf,
     },
-    /// The permissions are those of other enclaves.
+    /// The permissions are for other enclaves.
     OtherSubject {
         /// The file of the permissions.
         permissions: PathBuf,
-        /// Some subjects that they grant something to.
+        /// Some subjects of the permissions.
         granted: Vec<String>,
         /// The file of the certificate.
         certificate: PathBuf,
-        /// Its subject, if it can be written.
+        /// The certificate's subject, if it can be written.
         subject: Option<String>,
     },
     /// Cyclone's plugins refuse the enclave.
@@ -169,13 +169,13 @@ pub enum SecurityError {
         /// The plugins' reason.
         said: String,
     },
-    /// This Cyclone DDS is another one, and does not take a second participant of this process.
+    /// This Cyclone DDS differs from the expected one and does not accept a second participant of this process.
     NotFirst,
 }
 
 impl SecurityError {
-    /// Returns `true` if there is no enclave to join with, rather than one with a mistake. rcl goes without security then, unless
-    /// `ROS_SECURITY_STRATEGY` is `Enforce`.
+    /// Returns `true` if there is no enclave, as opposed to an enclave with a mistake. Without one, rcl continues
+    /// without security unless `ROS_SECURITY_STRATEGY` is `Enforce`.
     pub fn is_absence(&self) -> bool {
         matches!(self, Self::NotBuilt | Self::Keystore { .. } | Self::Missing { .. } | Self::File { .. })
     }
@@ -262,7 +262,7 @@ impl fmt::Display for SecurityError {
 
 impl std::error::Error for SecurityError {}
 
-/// Returns how a file is made again.
+/// Returns the way to recreate a file.
 fn renewal(file: &Path) -> &'static str {
     match file.file_name().and_then(|name| name.to_str()) {
         Some(PERMISSIONS) => "let `ros2 security create_permission` sign permissions again",
@@ -272,7 +272,7 @@ fn renewal(file: &Path) -> &'static str {
     }
 }
 
-/// Returns what to do where the plugins' words leave it open. The words are those of `dds_security_api_err.h`.
+/// Returns the fix where the plugins' words leave it open. The words are those of `dds_security_api_err.h`.
 fn fix(said: &str) -> Option<&'static str> {
     const FIXES: [(&str, &str); 3] = [
         ("Can not parse governance", "Cyclone DDS reads governance.p7s strictly, with domains up to 230"),
@@ -292,7 +292,7 @@ fn read_bounded(file: &Path) -> Result<Vec<u8>, SecurityError> {
     }
 }
 
-/// Returns some subjects that signed permissions name.
+/// Returns some subjects in signed permissions.
 fn subjects(permissions: &str) -> Vec<String> {
     let named = permissions.split("<subject_name>").skip(1);
     let named = named.filter_map(|rest| Some(rest.split_once("</subject_name>")?.0.trim()));
@@ -300,7 +300,8 @@ fn subjects(permissions: &str) -> Vec<String> {
     plain.map(str::to_owned).take(NAMED_MAX).collect()
 }
 
-/// Returns `true` for names that rcl accepts as an enclave's: `/`, or tokens of letters, digits and `_`, each after a `/`.
+/// Returns `true` for names that rcl accepts for an enclave: `/`, or tokens of letters, digits and `_`, each after a
+/// `/`.
 pub fn is_enclave(name: &str) -> bool {
     let is_token = |token: &str| {
         !token.is_empty()
@@ -312,7 +313,7 @@ pub fn is_enclave(name: &str) -> bool {
 }
 
 impl Security {
-    /// Looks whether all is there that Cyclone reads.
+    /// Checks everything that Cyclone reads.
     ///
     /// # Errors
     /// The first mistake.
@@ -342,7 +343,7 @@ impl Security {
         Ok(())
     }
 
-    /// Returns the private key's file if others than its owner may read it.
+    /// Returns the private key's file if users other than its owner may read it.
     pub fn exposed_key(&self) -> Option<PathBuf> {
         let file = self.directory().join(KEY);
         let mode = fs::metadata(&file).ok()?.permissions().mode();
@@ -357,7 +358,7 @@ impl Security {
         self.root().join(self.enclave.trim_start_matches('/'))
     }
 
-    /// Makes a participant one of this enclave.
+    /// Makes a participant join with this enclave.
     pub(crate) fn apply(&self, qos: &NativeQos) -> Result<(), SecurityError> {
         self.check()?;
         let directory = self.directory();
@@ -374,8 +375,8 @@ impl Security {
         Ok(())
     }
 
-    /// Returns the error for the reason of Cyclone's plugins. They alone read the permissions: `validate_subject_name_in_permissions` in
-    /// `access_control.c`.
+    /// Returns the error for a reason of Cyclone's plugins, which alone read the permissions:
+    /// `validate_subject_name_in_permissions` in `access_control.c`.
     pub(crate) fn refused(&self, said: String) -> SecurityError {
         let directory = self.directory();
         let (permissions, certificate) = (self.permissions(), directory.join(CERTIFICATE));
@@ -397,7 +398,7 @@ impl Security {
         SecurityError::Refused { directory, said }
     }
 
-    /// Adds to Cyclone's reason for refusing an endpoint which file forbids it, if it is that.
+    /// Adds the file that forbids an endpoint to Cyclone's reason, if DDS Security forbids it.
     pub(crate) fn explain(&self, topic: &str, said: String) -> String {
         if !Self::forbids(&said) {
             return said;
@@ -410,19 +411,19 @@ impl Security {
         said.starts_with(&reason(DDS_RETCODE_NOT_ALLOWED_BY_SECURITY))
     }
 
-    /// Returns the file of its permissions.
+    /// Returns the file of the permissions.
     pub(crate) fn permissions(&self) -> PathBuf {
         self.directory().join(PERMISSIONS)
     }
 }
 
-/// Returns the text in the parentheses that begin with `open`, behind `words`.
+/// Returns the text in the parentheses that begin with `open`, after `words`.
 fn between(said: &str, words: &str, open: &str) -> Option<String> {
     let (_, rest) = said.split_once(words)?.1.split_once(open)?;
     Some(rest.split_once(')')?.0.to_owned())
 }
 
-/// The names of some enclaves below a directory, sorted.
+/// Returns the names of some enclaves below a directory, sorted.
 fn enclaves(root: &Path) -> Vec<String> {
     let (mut found, mut looked) = (Vec::new(), 0);
     let mut waiting = vec![root.to_owned()];

@@ -1,14 +1,14 @@
-//! [`CycloneClient`] and [`CycloneServer`]: services, for programs of any vendor.
+//! [`CycloneClient`] and [`CycloneServer`]: services for programs of any vendor.
 //!
-//! A service is two topics. Where a message says to which request it belongs depends on the vendor ([`Mapping`]). With
-//! Cyclone, in front of each body stand 16 bytes in the byte order of the payload: the client's id, 8
-//! bytes that mean nothing to anybody else, and the number of its request (`cdds_request_header_t` of
-//! rmw_cyclonedds_cpp). With others a request has its sequence number, and names the client's reader in its inline QoS or
-//! else is known by its writer; a reply repeats both there. A server answers each client as that one asks, a client
-//! calls servers as those expect: so vendors that do not understand each other on one network do so through SGC.
+//! A service is two topics. The place of the request id in a message depends on the vendor ([`Mapping`]). With
+//! Cyclone, each body is preceded by 16 bytes in the byte order of the payload: 8 bytes with the client's id, and the
+//! number of its request (`cdds_request_header_t` of rmw_cyclonedds_cpp). With others, a request has its sequence
+//! number, and names the client's reader in its inline QoS or else is known by its writer; a reply repeats both
+//! there. A server answers each client in the client's way, and a client calls servers in theirs, so vendors that do
+//! not understand each other on one network do so through SGC.
 //!
-//! What is written before the other side is matched is lost, since services are volatile: so both wait for that, on
-//! Cyclone's conditions.
+//! Services are volatile, so messages written before the other side is matched are lost. Both sides wait for the
+//! match, on Cyclone's conditions.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -32,37 +32,37 @@ use crate::rpc::{HandleMessages, Message, RpcReader, RpcWriter};
 use crate::wait::{READERS_MATCHED, WRITERS_MATCHED, wait_for_status};
 use crate::{qos, user_data};
 
-/// How long a request waits for a server, and a reply for its client, milliseconds.
+/// Longest wait of a request for a server, and of a reply for its client, in milliseconds.
 const MATCH_WAIT_MAX_MS: u64 = 1000;
 
-/// Matched endpoints that are looked at.
+/// Most matched endpoints that are examined.
 const MATCHES_MAX: usize = 1024;
 
 /// Bytes of a client's id in the header; the rest of [`RequestId::client`] is zero.
 const ID_BYTES: usize = 8;
 
-/// A client; dropping it ends the thread that reads its replies.
+/// A client. Dropping it ends the thread that reads its replies.
 #[derive(Debug)]
 pub struct CycloneClient {
     ends: Ends<Replies>,
     id: u64,
     mixed: AtomicBool,
-    /// Number of the last request in the mapping of Cyclone.
+    /// The number of the last request in Cyclone's mapping.
     last_in_body: Arc<AtomicI64>,
 }
 
-/// A server; dropping it ends the thread that reads requests.
+/// A server. Dropping it ends the thread that reads requests.
 #[derive(Debug)]
 pub struct CycloneServer {
     ends: Ends<Requests>,
 }
 
-/// Hands replies to a client's handler.
+/// The receiver of replies for a client's handler.
 struct Replies {
-    /// The client's reader, and its writer.
+    /// The GUIDs of the client's reader and writer.
     reading: [u8; 16],
     writing: [u8; 16],
-    /// The client's id in the mapping of Cyclone, and the number of its last request there.
+    /// The client's id in Cyclone's mapping, and the number of its last request there.
     id: u64,
     last_in_body: Arc<AtomicI64>,
     handler: RequestHandler,
@@ -75,8 +75,8 @@ impl HandleMessages for Replies {
         };
         // Replies to all clients are on one topic.
         let is_ours = if client == self.writing {
-            // The client that names the writer may have been matched just after a request was written in the other mapping,
-            // and have answered what nobody asked.
+            // A server that was matched just after a request in the other mapping may answer a request that was never
+            // sent.
             number > self.last_in_body.load(Relaxed)
         } else {
             client == self.reading || client == id_bytes(self.id)
@@ -91,7 +91,7 @@ impl HandleMessages for Replies {
     }
 }
 
-/// Hands requests to a server's handler.
+/// The receiver of requests for a server's handler.
 struct Requests {
     handler: RequestHandler,
 }
@@ -131,12 +131,12 @@ impl CycloneClient {
         Ok(Self { ends, id, mixed, last_in_body })
     }
 
-    /// Where servers look for the request's identity. Whoever reads requests counts, whether it can answer yet or not,
-    /// since only one way can be used: else somebody would read an id as part of the request. It is that of the others, which
-    /// Cyclone's servers leave out.
+    /// Returns the mapping that servers expect. Every reader of requests counts, even if it cannot answer yet,
+    /// because only one mapping can be used and a reader of the other one would read an id as part of the request. In
+    /// a mix it is that of the others, which Cyclone's servers skip.
     fn mapping(&self) -> Mapping {
         let readers = self.ends.readers();
-        let inline = readers.iter().filter(|r| Mapping::of(r.vendor()) == Mapping::InlineQos).count();
+        let inline = readers.iter().filter(|r| Mapping::for_vendor(r.vendor()) == Mapping::InlineQos).count();
         let is_mixed = inline > 0 && inline < readers.len();
         if self.mixed.swap(is_mixed, Relaxed) != is_mixed && is_mixed {
             tracing::warn!(
@@ -155,7 +155,7 @@ impl RosClient for CycloneClient {
                 self.last_in_body.store(number, Relaxed);
                 Frame::with_prefix(&payload, |little| prefix(self.id, number, little))
             })?,
-            // As rmw_fastrtps: which reader waits for the reply; the number is that of the message.
+            // As in rmw_fastrtps, the request names the reader for the reply, and its number is that of the message.
             Mapping::InlineQos => {
                 let related = SampleIdentity { guid: self.ends.reader.guid(), number: NUMBER_UNKNOWN };
                 self.ends.writer.write(Some(related), |_| Frame::new(&payload))?
@@ -181,7 +181,7 @@ impl CycloneServer {
         handler: RequestHandler,
     ) -> Result<Self, String> {
         let user_data = pair_mark("serviceid", participant);
-        // The writer first: who sees a server's reader may ask at once.
+        // The writer is created first, because clients may call as soon as they see the server's reader.
         let writer = RpcWriter::new(participant, &spec.reply, &user_data)?;
         let mut reader = RpcReader::new(participant, &spec.request, &user_data)?;
         reader.start(Requests { handler })?;
@@ -212,7 +212,7 @@ impl RosServer for CycloneServer {
 struct Ends<H: HandleMessages> {
     reader: RpcReader<H>,
     writer: RpcWriter,
-    /// Of both, in this order.
+    /// The GUIDs of reader and writer.
     guids: [Guid; 2],
     participant: Arc<Participant>,
 }
@@ -233,7 +233,7 @@ impl<H: HandleMessages> Ends<H> {
         Ok(Self { reader, writer, guids, participant: Arc::clone(participant) })
     }
 
-    /// Waits until something is so that changes with what is matched.
+    /// Waits until a condition holds that depends on matches.
     fn wait(&self, is_so: impl Fn() -> bool) -> Result<(), RosError> {
         if is_so() {
             return Ok(());
@@ -244,7 +244,7 @@ impl<H: HandleMessages> Ends<H> {
         loop {
             for (handle, matched) in handles.into_iter().zip([READERS_MATCHED, WRITERS_MATCHED]) {
                 let mut status = 0;
-                // What happens from here on wakes the wait below.
+                // Later changes wake the wait below.
                 // SAFETY: the handle is checked by Cyclone, and `status` is a valid place for the result.
                 unsafe { dds_take_status(handle, &mut status, matched) };
             }
@@ -260,13 +260,13 @@ impl<H: HandleMessages> Ends<H> {
         }
     }
 
-    /// Those that read what is written here.
+    /// Returns the matched readers.
     fn readers(&self) -> BTreeSet<Guid> {
         let writer = self.writer.entity().handle();
         self.matched(writer, dds_get_matched_subscriptions, dds_get_matched_subscription_data)
     }
 
-    /// Those that write what is read here.
+    /// Returns the matched writers.
     fn writers(&self) -> BTreeSet<Guid> {
         self.matched(self.reader.handle(), dds_get_matched_publications, dds_get_matched_publication_data)
     }
@@ -294,8 +294,8 @@ impl<H: HandleMessages> Ends<H> {
     }
 }
 
-/// The part of an endpoint's USER_DATA by which rmw_cyclonedds knows which two endpoints are one client or one server, and waits for
-/// both.
+/// Returns the part of an endpoint's USER_DATA by which rmw_cyclonedds recognises the two endpoints of one client or
+/// server and waits for both.
 fn pair_mark(key: &str, participant: &Participant) -> String {
     static NUMBER: AtomicU32 = AtomicU32::new(0);
     let prefix = participant.guid().prefix();
@@ -304,7 +304,7 @@ fn pair_mark(key: &str, participant: &Participant) -> String {
     format!("{key}={};", hex.join("."))
 }
 
-/// The participants of endpoints.
+/// Returns the participants of endpoints.
 fn prefixes(endpoints: BTreeSet<Guid>) -> BTreeSet<[u8; 12]> {
     endpoints.iter().map(Guid::prefix).collect()
 }
@@ -313,18 +313,19 @@ type ListMatches = unsafe extern "C" fn(dds_entity_t, *mut dds_instance_handle_t
 type DescribeMatch =
     unsafe extern "C" fn(dds_entity_t, dds_instance_handle_t) -> *mut dds_builtintopic_endpoint_t;
 
-/// Client, number and payload of a request; `None` if it is too short for its mapping.
+/// Returns client, number and payload of a request, or `None` if it is too short for its mapping.
 fn request_of(message: Message) -> Option<([u8; 16], i64, Bytes)> {
     if message.mapping() == Mapping::Body {
         return split(&message.payload);
     }
-    // Fast DDS names the reader that waits; RustDDS leaves it at the writer. What would pass for an id of Cyclone's is none.
+    // Fast DDS names the reader for the reply; RustDDS means the writer. An id in the form of Cyclone's is not
+    // accepted here.
     let named =
         message.origin.related.map(|related| related.guid).filter(|guid| cyclone_id(&guid.0).is_none());
     Some((named.unwrap_or(message.writer).0, message.origin.number, message.payload))
 }
 
-/// Client, number and payload of a reply; `None` if it says of no request.
+/// Returns client, number and payload of a reply, or `None` if it names no request.
 fn reply_of(message: Message) -> Option<([u8; 16], i64, Bytes)> {
     if message.mapping() == Mapping::Body {
         return split(&message.payload);
@@ -333,7 +334,7 @@ fn reply_of(message: Message) -> Option<([u8; 16], i64, Bytes)> {
     Some((related.guid.0, related.number, message.payload))
 }
 
-/// The same of a payload with an id of Cyclone's; `None` if it is too short to hold one.
+/// Splits a payload with Cyclone's header, or returns `None` if it is too short.
 fn split(payload: &Bytes) -> Option<([u8; 16], i64, Bytes)> {
     let (&header, rest) = payload.split_first_chunk::<HEADER_BYTES>()?;
     let (prefix, body) = rest.split_first_chunk::<PREFIX_BYTES>()?;
@@ -363,7 +364,7 @@ fn id_bytes(client: u64) -> [u8; 16] {
     id
 }
 
-/// The reverse; `None` for a GUID, which never ends with zeros.
+/// Returns Cyclone's id of a client, or `None` for a GUID, which never ends with zeros.
 fn cyclone_id(client: &[u8; 16]) -> Option<u64> {
     let (id, rest) = client.split_first_chunk::<ID_BYTES>()?;
     (*rest == [0; 16 - ID_BYTES]).then(|| u64::from_be_bytes(*id))

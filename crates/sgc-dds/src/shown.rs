@@ -1,10 +1,11 @@
-//! Endpoints that the local graph shows and that match none: a partition keeps them apart, of which the graph of ROS 2 says nothing.
+//! Endpoints that the local graph shows and that match no other: a partition, which the ROS 2 graph does not contain,
+//! keeps them apart.
 //!
-//! An endpoint that matches none gets no data, answers no heartbeat and keeps nothing. Neither Fast DDS nor Cyclone reports a
-//! partition as an incompatible QoS.
+//! An endpoint without matches gets no data, answers no heartbeat and keeps nothing. Neither Fast DDS nor Cyclone
+//! reports a partition as an incompatible QoS.
 //!
-//! Where DDS Security protects the network, the permissions of the enclave have to grant the partition, which those of SROS2 do not by
-//! themselves: they name no partitions, and that is the default one alone (DDS Security 1.1, 9.4.1.3.2.3).
+//! Where DDS Security protects the network, the permissions of the enclave must grant the partition. Those of SROS2
+//! do not by default: they name no partitions, which means the default one alone (DDS Security 1.1, 9.4.1.3.2.3).
 
 use std::sync::Arc;
 
@@ -16,11 +17,11 @@ use crate::entity::Entity;
 use crate::log;
 use crate::network::Participant;
 
-/// Partition of shown endpoints. Endpoints of ROS 2 are in none.
+/// The partition of shown endpoints. Endpoints of ROS 2 are in none.
 pub(crate) const PARTITION: &str = "sgc/shown";
 
 /// Fields drop in this order: children first.
-struct Shown {
+struct ShownEntities {
     _endpoint: Entity,
     _group: Option<Entity>,
     _topic: Entity,
@@ -39,7 +40,7 @@ pub(crate) fn create(
     let topic = participant.topic(&spec)?;
     let group = participant.group(kind, &spec)?;
     let parent = group.as_ref().unwrap_or(participant.entity()).handle();
-    // A refusal is the error's to tell, and no line in the log for each endpoint.
+    // The error reports a refusal, so no log line is needed for each endpoint.
     // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
     let (handle, _) = log::listen(|| unsafe {
         match kind {
@@ -52,6 +53,6 @@ pub(crate) fn create(
     let participant = Arc::clone(participant);
     Ok(ShownEndpoint::new(
         guid,
-        Shown { _endpoint: endpoint, _group: group, _topic: topic, _participant: participant },
+        ShownEntities { _endpoint: endpoint, _group: group, _topic: topic, _participant: participant },
     ))
 }

@@ -1,6 +1,6 @@
-//! Programs of the local networks of this process that cannot be joined: what discovery shows of them, and what keeps them apart.
+//! Programs on this process's local networks that cannot be joined, and the barrier that keeps them apart.
 //!
-//! Holds what [`crate::discovery`] and [`crate::log`] say, within bounds. Decides nothing.
+//! This module keeps the reports of [`crate::discovery`] and [`crate::log`], within bounds.
 
 use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -10,49 +10,49 @@ use sgc_ros::Guid;
 
 use crate::security::is_enclave;
 
-/// Bound on programs that are remembered.
+/// Most programs that are remembered.
 const PROGRAMS_MAX: usize = 64;
 
-/// Time after which a participant that announces no endpoint counts as silent. Those of ROS 2 announce theirs at once, which takes a
-/// second on a busy machine.
+/// Time after which a participant that announces no endpoint counts as silent. ROS 2 participants announce theirs at
+/// once, which takes a second on a busy machine.
 const SILENT_AFTER: Duration = Duration::from_secs(10);
 
-/// The bit that is set in the first byte of GUIDs that DDS Security derives from a certificate, and not in a vendor's id, with which
-/// all others begin (DDS Security 1.1, 9.3.3).
+/// The bit in the first byte of a GUID that DDS Security derives from a certificate. It is not set in a vendor's id,
+/// with which all other GUIDs begin (DDS Security 1.1, 9.3.3).
 const SECURED_BIT: u8 = 0x80;
 
-/// A reason why programs cannot be joined.
+/// The reason why programs cannot be joined.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Barrier {
-    /// DDS Security protects them, and this node has no enclave.
+    /// DDS Security protects the programs, and this node has no enclave.
     Protected,
-    /// DDS Security protects them and this node, and one does not admit the other.
+    /// DDS Security protects the programs and this node, and one does not admit the other.
     Refused,
-    /// They have no DDS Security, which protects this node.
+    /// DDS Security protects this node, but not the programs.
     Unprotected,
-    /// They announce themselves, and nothing else of them arrives. Neither side has DDS Security.
+    /// The programs announce themselves, but nothing else of them arrives. Neither side has DDS Security.
     Silent,
 }
 
-/// Programs that cannot be joined, for the same reason.
+/// Programs that cannot be joined for the same reason.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Strangers {
     /// The reason.
     pub barrier: Barrier,
-    /// The enclave that they name. `None` for [`Barrier::Unprotected`].
+    /// The enclave that the programs announce. `None` for [`Barrier::Unprotected`].
     pub enclave: Option<String>,
-    /// Their number, as far as they are remembered.
+    /// The number of remembered programs.
     pub programs: usize,
 }
 
-/// A participant that may be one of them: no endpoint of it is known.
+/// A participant without a known endpoint, which may be a stranger.
 #[derive(Debug)]
 struct Program {
     enclave: Option<String>,
     since: Instant,
-    /// `true` if Cyclone has refused one of its endpoints, which those of discovery are, too.
+    /// `true` if Cyclone has refused one of its endpoints, including those of discovery.
     is_refused: bool,
-    /// `true` if DDS Security protects the network of this process that it was seen on.
+    /// `true` if DDS Security protects the network on which it was seen.
     here_secured: bool,
 }
 
@@ -80,7 +80,7 @@ impl Program {
     }
 }
 
-/// Returns the programs on the local networks of this process that cannot be joined.
+/// Returns the programs on this process's local networks that cannot be joined.
 pub fn strangers() -> Vec<Strangers> {
     grouped(&programs(), Instant::now())
 }
@@ -101,7 +101,7 @@ fn grouped(programs: &Programs, now: Instant) -> Vec<Strangers> {
         .collect()
 }
 
-/// Notes a participant of ROS 2 that is announced and of which no endpoint is known.
+/// Records a ROS 2 participant without a known endpoint.
 pub(crate) fn note_participant(guid: &Guid, enclave: &str, here_secured: bool) {
     if is_enclave(enclave)
         && let Some(program) = entry(&mut programs(), guid.prefix(), here_secured)
@@ -110,19 +110,19 @@ pub(crate) fn note_participant(guid: &Guid, enclave: &str, here_secured: bool) {
     }
 }
 
-/// Notes an endpoint of a participant without DDS Security that Cyclone refuses.
+/// Records an endpoint of a participant without DDS Security that Cyclone refuses.
 pub(crate) fn note_refused(guid: &Guid) {
     if let Some(program) = entry(&mut programs(), guid.prefix(), true) {
         program.is_refused = true;
     }
 }
 
-/// Forgets a participant, which is gone or has an endpoint that is known.
+/// Forgets a participant that is gone or has a known endpoint.
 pub(crate) fn forget(guid: &Guid) {
     programs().remove(&guid.prefix());
 }
 
-/// Returns the entry of a participant if there is one, or room for one.
+/// Returns the entry of a participant, if it exists or there is room.
 fn entry(programs: &mut Programs, prefix: [u8; 12], here_secured: bool) -> Option<&mut Program> {
     if programs.len() >= PROGRAMS_MAX && !programs.contains_key(&prefix) {
         return None;
@@ -135,7 +135,7 @@ fn entry(programs: &mut Programs, prefix: [u8; 12], here_secured: bool) -> Optio
 mod tests {
     use super::*;
 
-    /// A participant. They have one place in the whole process, so each test has its own.
+    /// Returns a participant. The table is global, so each test has its own participants.
     fn guid(first: u8, number: u8) -> Guid {
         let mut guid = [number; 16];
         guid[0] = first;

@@ -1,39 +1,40 @@
 //! The USER_DATA of endpoints: `key=value;` elements, as rmw writes them.
 //!
-//! Pure. Three keys matter here: `typehash` (REP 2016, written by rmw from Iron on) of endpoints, `enclave` of
-//! participants, and `sgc` of both, by which SGC nodes know each other's endpoints and keep out of loops.
+//! The module is pure. Three keys matter here: `typehash` (REP 2016, written by rmw since Iron) of endpoints,
+//! `enclave` of participants, and `sgc` of both, by which SGC nodes recognise each other's endpoints and avoid loops.
 
 const TAG_KEY: &str = "sgc";
 const TYPE_HASH_KEY: &str = "typehash";
 const ENCLAVE_KEY: &str = "enclave";
 
-/// The enclave of a participant without security, of which every rmw wants to know: it takes no participant for one of
-/// ROS 2 that names none.
+/// The enclave of a participant without security. Every rmw needs it, because a participant without an enclave does
+/// not count as ROS 2.
 pub const DEFAULT_ENCLAVE: &str = "/";
 
-/// Bound on one value, bytes.
+/// Longest value, in bytes.
 pub const VALUE_BYTES_MAX: usize = 128;
 
-/// Bound on the USER_DATA that is looked at, bytes; what follows is ignored.
+/// Most bytes of USER_DATA that are examined. The rest is ignored.
 pub const USER_DATA_BYTES_MAX: usize = 4096;
 
-/// True if a text can be a value: printable ASCII without the separators, not empty, not too long.
+/// Returns `true` if a text is a valid value: printable ASCII without the separators, not empty and within the bound.
 pub fn is_value(text: &str) -> bool {
     (1..=VALUE_BYTES_MAX).contains(&text.len())
         && text.bytes().all(|b| (b.is_ascii_graphic() || b == b' ') && b != b';' && b != b'=')
 }
 
-/// The USER_DATA of an endpoint made here. The caller has checked both values with [`is_value`].
+/// Returns the USER_DATA of an endpoint created here. The caller has checked both values with [`is_value`].
 pub fn build(tag: Option<&str>, type_hash: Option<&str>) -> Vec<u8> {
     joined([(TAG_KEY, tag), (TYPE_HASH_KEY, type_hash)])
 }
 
-/// The USER_DATA of a participant made here; the same holds for its values.
-pub fn of_participant(tag: Option<&str>, enclave: Option<&str>) -> Vec<u8> {
+/// Returns the USER_DATA of a participant created here. The caller has checked both values with [`is_value`].
+pub fn for_participant(tag: Option<&str>, enclave: Option<&str>) -> Vec<u8> {
     joined([(ENCLAVE_KEY, enclave), (TAG_KEY, tag)])
 }
 
-/// The USER_DATA of a participant while it is opened: different from what it has later, so that Cyclone announces the change.
+/// Returns the USER_DATA of a participant while it is opened. It differs from the later one, so that Cyclone
+/// announces the change.
 pub fn while_opening(later: &[u8]) -> Vec<u8> {
     [later, b"opening=1;"].concat()
 }
@@ -51,12 +52,12 @@ fn joined(elements: [(&str, Option<&str>); 2]) -> Vec<u8> {
     text.into_bytes()
 }
 
-/// True if an SGC node made the endpoint, whichever node it was.
+/// Returns `true` if any SGC node created the endpoint.
 pub fn is_tagged(user_data: &[u8]) -> bool {
     elements(user_data).any(|(key, _)| key == TAG_KEY.as_bytes())
 }
 
-/// The type hash (`RIHS01_…`) of an endpoint, if it carries a plausible one.
+/// Returns the type hash (`RIHS01_…`) of an endpoint, if it carries a plausible one.
 pub fn type_hash(user_data: &[u8]) -> Option<String> {
     elements(user_data)
         .find(|(key, _)| *key == TYPE_HASH_KEY.as_bytes())
@@ -65,7 +66,7 @@ pub fn type_hash(user_data: &[u8]) -> Option<String> {
         .map(str::to_owned)
 }
 
-/// The enclave of a participant, if it names one: then it is one of ROS 2.
+/// Returns the enclave of a participant. Only ROS 2 participants have one.
 pub fn enclave(user_data: &[u8]) -> Option<&str> {
     let (_, value) = elements(user_data).find(|(key, _)| *key == ENCLAVE_KEY.as_bytes())?;
     std::str::from_utf8(value).ok()
@@ -84,13 +85,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_built_is_read() {
+    fn user_data_is_parsed_as_built() {
         let data = build(Some("arm-1"), Some("RIHS01_ab"));
         assert_eq!(data, b"sgc=arm-1;typehash=RIHS01_ab;");
         assert!(is_tagged(&data));
         assert_eq!(type_hash(&data).as_deref(), Some("RIHS01_ab"));
         assert!(build(None, None).is_empty());
-        let participant = of_participant(Some("arm-1"), Some(DEFAULT_ENCLAVE));
+        let participant = for_participant(Some("arm-1"), Some(DEFAULT_ENCLAVE));
         assert_eq!(participant, b"enclave=/;sgc=arm-1;");
         assert!(is_tagged(&participant));
         assert_eq!((enclave(&participant), enclave(&data)), (Some("/"), None));

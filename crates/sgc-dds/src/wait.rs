@@ -1,6 +1,6 @@
-//! How the threads of this crate sleep and end: [`WaitSet`], [`Stop`], [`join`].
+//! Sleeping and ending of this crate's threads: [`WaitSet`], [`Stop`], [`join`].
 //!
-//! No thread polls and none sleeps for a time: each blocks until a condition of Cyclone's is true.
+//! No thread polls or sleeps for a time: each blocks until a condition of Cyclone is true.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,17 +16,16 @@ use cyclors::{
 use crate::entity::{Entity, INFINITE, check};
 use crate::network::Participant;
 
-/// Cyclone's status bits for what changes with matches.
+/// Cyclone's status bits for changes of matches.
 pub(crate) const READERS_MATCHED: u32 = 1 << dds_status_id_DDS_PUBLICATION_MATCHED_STATUS_ID;
 pub(crate) const WRITERS_MATCHED: u32 = 1 << dds_status_id_DDS_SUBSCRIPTION_MATCHED_STATUS_ID;
 
-/// Ends a thread that waits: a flag for when it works, a guard condition for when it sleeps.
+/// A request to end a thread: a flag for a working thread, a guard condition for a sleeping one.
 #[derive(Debug)]
 pub(crate) struct Stop {
     flag: AtomicBool,
     guard: Entity,
-    /// The guard condition must go before the participant does, and whoever asks a thread to end holds this
-    /// longer than the thread.
+    /// The guard condition must be deleted before the participant, and the owner of this may outlive the thread.
     _participant: Arc<Participant>,
 }
 
@@ -37,7 +36,7 @@ impl Stop {
         Ok(Arc::new(Self { flag: AtomicBool::new(false), guard, _participant: Arc::clone(participant) }))
     }
 
-    /// Asks the thread to end, for ever.
+    /// Asks the thread to end.
     pub(crate) fn request(&self) {
         self.flag.store(true, Ordering::Release);
         // SAFETY: takes a number, checked by Cyclone.
@@ -51,7 +50,7 @@ impl Stop {
     }
 }
 
-/// Sleeps until a condition is true or the thread is asked to end.
+/// A set of conditions that a thread waits for, together with the request to end.
 #[derive(Debug)]
 pub(crate) struct WaitSet {
     set: Entity,
@@ -59,7 +58,7 @@ pub(crate) struct WaitSet {
 }
 
 impl WaitSet {
-    /// The conditions must belong to the participant and outlive the wait set.
+    /// Creates the set. The conditions must belong to the participant and outlive the set.
     pub(crate) fn new(
         participant: &Participant,
         stop: Arc<Stop>,
@@ -74,7 +73,7 @@ impl WaitSet {
         Ok(Self { set, stop })
     }
 
-    /// Blocks without limit; `false` when the thread shall end.
+    /// Blocks without limit. Returns `false` when the thread should end.
     pub(crate) fn wait(&self) -> bool {
         // SAFETY: no attachments are asked for, so the null pointer with length 0 is not written to.
         let ret = unsafe { dds_waitset_wait(self.set.handle(), std::ptr::null_mut(), 0, INFINITE) };
@@ -86,7 +85,7 @@ impl WaitSet {
     }
 }
 
-/// Joins a thread, unless it is the calling one: a handler may drop what calls it.
+/// Joins a thread, unless it is the calling one: a handler may drop its own caller.
 pub(crate) fn join(thread: JoinHandle<()>) {
     if thread.thread().id() == std::thread::current().id() {
         return;
@@ -96,7 +95,7 @@ pub(crate) fn join(thread: JoinHandle<()>) {
     }
 }
 
-/// Sleeps until a status of one of these entities changes that its mask lets through, or that long.
+/// Sleeps until a status in the mask of one of these entities changes, at most for `longest`.
 pub(crate) fn wait_for_status(
     participant: &Participant,
     entities: &[dds_entity_t],

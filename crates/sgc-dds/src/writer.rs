@@ -1,7 +1,7 @@
 //! [`CycloneWriter`]: a raw writer.
 //!
-//! Writes on the caller's thread, which may block for [`crate::qos::WRITE_BLOCK_MAX_MS`]; it must not be a
-//! thread of Cyclone's or of an async runtime.
+//! It writes on the caller's thread, which may block for [`crate::qos::WRITE_BLOCK_MAX_MS`]. That must not be a
+//! thread of Cyclone or of an async runtime.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
@@ -21,16 +21,16 @@ use crate::entity::{Entity, INFINITE, check, reason};
 use crate::late;
 use crate::network::Participant;
 use crate::payload::Frame;
-use crate::qos::{Unacknowledged, history_of, keys_kept};
+use crate::qos::{SendWindow, history_of, keys_kept};
 use crate::sample::{Extra, SampleRef};
 use crate::wait::{READERS_MATCHED, wait_for_status};
 
-/// Latest source time stamp that RTPS can say, nanoseconds since the Unix epoch: seconds are 32 bits
-/// (RTPS 2.5, 9.3.2.1).
+/// Latest source timestamp that RTPS can express, in nanoseconds since the Unix epoch: seconds have 32 bits (RTPS
+/// 2.5, 9.3.2.1).
 const TIMESTAMP_MAX_NS: i64 = 4_294_967_295_999_999_999;
 
-/// A raw writer; dropping it deletes the entities. With reliable readers that lack data, Cyclone keeps
-/// sending for up to a second.
+/// A raw writer. Dropping it deletes the entities. If reliable readers lack data, Cyclone keeps sending for up to a
+/// second.
 ///
 /// Fields drop in this order: children first.
 #[derive(Debug)]
@@ -41,41 +41,41 @@ pub struct CycloneWriter {
     participant: Arc<Participant>,
     guid: Guid,
     keyless: bool,
-    /// The room for samples until they are acknowledged, if the writer does not wait.
-    unacknowledged: Option<Unacknowledged>,
-    /// Samples written so far, which wraps.
+    /// The send window, if the writer does not wait.
+    unacknowledged: Option<SendWindow>,
+    /// The number of samples written so far, which wraps.
     written: AtomicU32,
-    /// The instances of keys, where those are kept apart.
+    /// The instances of keys, if keys are kept apart.
     keys: Option<Mutex<Keys>>,
-    /// The history for late joiners, if it may turn out to be shorter than it is.
-    late: Option<(Mutex<Late>, Counted)>,
-    _counted: Counted,
+    /// The history for late joiners, if it may have to shrink.
+    late: Option<(Mutex<LateHistory>, WriterCount)>,
+    _counted: WriterCount,
 }
 
-/// Bytes of samples that a writer whose publisher did not announce its depth keeps, for late joiners and for readers that have not
-/// acknowledged them; one sample may be longer.
+/// Most bytes that a writer keeps whose publisher did not announce its depth, for late joiners and for readers that
+/// have not acknowledged them. A single sample may be longer.
 const LATE_BYTES_MAX: usize = 64 << 20;
 
-/// The same of all such writers of a network together.
+/// Most such bytes of all these writers of a network together.
 const LATE_BYTES_IN_ALL: usize = 256 << 20;
 
 /// The history of a transient-local writer whose publisher did not announce its depth.
 #[derive(Debug)]
-struct Late {
-    /// The depth that it was made with.
+struct LateHistory {
+    /// The depth at creation.
     history: u32,
-    /// The publisher's.
+    /// The publisher's depth.
     wanted: u32,
-    /// Samples that late joiners get.
+    /// The number of samples that late joiners get.
     depth: u32,
-    /// The lengths of the samples that it keeps, whether readers have acknowledged them or not.
+    /// The lengths of the kept samples, acknowledged or not.
     lengths: VecDeque<usize>,
     bytes: usize,
-    /// Bytes that it may keep.
+    /// Most bytes that the writer may keep.
     bytes_max: usize,
 }
 
-impl Late {
+impl LateHistory {
     fn new(spec: &EndpointSpec) -> Option<Self> {
         if !spec.qos.is_transient_local() || !spec.qos.is_reliable() || !spec.qos.history.is_unsaid() {
             return None;
@@ -86,7 +86,8 @@ impl Late {
         Some(Self { history, wanted, depth, lengths: VecDeque::new(), bytes: 0, bytes_max })
     }
 
-    /// Takes note of a sample of so many bytes, by one of so many writers. Returns the number of samples that may stay, if older ones may not.
+    /// Records a sample of this length, given the number of such writers. Returns the number of samples that may stay
+    /// if older ones may not.
     fn note(&mut self, bytes: usize, writers: usize) -> Option<u32> {
         self.bytes_max = (LATE_BYTES_IN_ALL / writers.max(1)).min(LATE_BYTES_MAX);
         self.bytes += bytes;
@@ -94,7 +95,7 @@ impl Late {
         self.trim()
     }
 
-    /// Takes note of the publisher's depth. Returns the same.
+    /// Records the publisher's depth. Returns the number of samples that may stay if older ones may not.
     fn want(&mut self, depth: u32) -> Option<u32> {
         self.wanted = depth.clamp(1, self.wanted);
         self.trim()
@@ -103,50 +104,51 @@ impl Late {
     fn trim(&mut self) -> Option<u32> {
         let (mut is_over, depth) = (false, self.wanted as usize);
         while self.lengths.len() > depth || (self.bytes > self.bytes_max && self.lengths.len() > 1) {
-            // Cyclone itself drops what is beyond the depth that the writer was made with.
+            // Cyclone itself drops samples beyond the depth at creation.
             is_over |= self.bytes > self.bytes_max || self.wanted < self.history;
             self.bytes -= self.lengths.pop_front().unwrap_or(0);
         }
         is_over.then(|| u32::try_from(self.lengths.len()).unwrap_or(self.wanted))
     }
 
-    /// Samples that late joiners may get.
+    /// Returns the number of samples that late joiners may get.
     fn allowed(&self) -> u32 {
         let newest = self.lengths.back().copied().unwrap_or(0);
-        // Another like it would push one out.
+        // Another sample of the same length would push one out.
         let is_full = self.bytes.saturating_add(newest) > self.bytes_max;
         let kept = u32::try_from(self.lengths.len()).unwrap_or(self.wanted).max(1);
         if is_full { kept.min(self.wanted) } else { self.wanted }
     }
 
-    /// Samples of so many bytes that it keeps for readers.
+    /// Returns the number of samples of this length that the writer keeps for readers.
     fn kept(&self, bytes: usize) -> u32 {
         u32::try_from(self.bytes_max / bytes.max(1)).unwrap_or(u32::MAX).clamp(1, self.wanted)
     }
 }
 
-/// Counts a writer of its network for as long as it lives.
+/// Counts a writer of its network until dropped.
 #[derive(Debug)]
-struct Counted(Arc<Participant>, fn(&Participant) -> &AtomicUsize);
+struct WriterCount(Arc<Participant>, fn(&Participant) -> &AtomicUsize);
 
-impl Counted {
+impl WriterCount {
     fn new(participant: &Arc<Participant>, counter: fn(&Participant) -> &AtomicUsize) -> Self {
         counter(participant).fetch_add(1, Ordering::Relaxed);
         Self(Arc::clone(participant), counter)
     }
 }
 
-impl Drop for Counted {
+impl Drop for WriterCount {
     fn drop(&mut self) {
         (self.1)(&self.0).fetch_sub(1, Ordering::Relaxed);
     }
 }
 
-/// The instance of each key that was written, up to a bound: then a new key takes that of the key not written for the longest time.
+/// The instance of each written key, up to a bound. Beyond it a new key takes the instance of the key that was not
+/// written for the longest time.
 #[derive(Debug)]
 struct Keys {
     max: u32,
-    /// With the number of the latest write of each.
+    /// The instance of each key, with the number of its latest write.
     instances: HashMap<KeyHash, (u32, u64)>,
     writes: u64,
 }
@@ -177,11 +179,11 @@ impl CycloneWriter {
     pub(crate) fn new(participant: &Arc<Participant>, spec: &EndpointSpec) -> Result<Self, String> {
         let qos = participant.endpoint_qos(EndpointKind::Writer, spec, "")?;
         qos.set_batching();
-        // Readers of a participant that ignores none of its own endpoints get what is written here as it is.
+        // Readers of a participant that ignores none of its own endpoints receive these samples unchanged.
         let has_own_readers = !participant.ignores_tagged();
-        let unacknowledged = Unacknowledged::of(&spec.qos, spec.keyless);
+        let unacknowledged = SendWindow::for_writer(&spec.qos, spec.keyless);
         let unacknowledged =
-            unacknowledged.map(|kept| if has_own_readers { kept.of_one_instance() } else { kept });
+            unacknowledged.map(|kept| if has_own_readers { kept.for_one_instance() } else { kept });
         if let Some(kept) = unacknowledged {
             qos.set_unacknowledged(kept);
         }
@@ -194,8 +196,8 @@ impl CycloneWriter {
         })?;
         // SAFETY: takes numbers, checked by Cyclone.
         check(unsafe { dds_set_status_mask(writer.handle(), READERS_MATCHED) })?;
-        let late = Late::new(spec);
-        if let Some(Late { history, depth, .. }) = late
+        let late = LateHistory::new(spec);
+        if let Some(LateHistory { history, depth, .. }) = late
             && !late::set_depth(writer.handle(), topic.handle(), history, [depth; 2], None)
         {
             tracing::warn!(
@@ -216,20 +218,21 @@ impl CycloneWriter {
             unacknowledged,
             written: AtomicU32::new(0),
             keys: keys_kept(&spec.qos, spec.keyless).map(|max| Mutex::new(Keys::new(max))),
-            late: late.map(|late| (Mutex::new(late), Counted::new(participant, Participant::late_writers))),
-            _counted: Counted::new(participant, Participant::writers),
+            late: late
+                .map(|late| (Mutex::new(late), WriterCount::new(participant, Participant::late_writers))),
+            _counted: WriterCount::new(participant, Participant::writers),
         })
     }
 
-    /// Over how many instances samples of so many bytes are spread.
+    /// Returns the number of instances over which samples of this length are spread.
     fn instances(&self, bytes: usize) -> u32 {
         let writers = self.participant.writers().load(Ordering::Relaxed);
         self.unacknowledged.map_or(1, |kept| kept.instances(bytes, writers))
     }
 
-    /// Changes the history for late joiners, given the number of writers like this one, and brings Cyclone's in line with it. The change returns the
-    /// number of samples that may stay, if others may not.
-    fn change_late(&self, change: impl FnOnce(&mut Late, usize) -> Option<u32>) {
+    /// Changes the history for late joiners and updates Cyclone's. The change gets the number of writers like this
+    /// one and returns the number of samples that may stay, if others may not.
+    fn change_late(&self, change: impl FnOnce(&mut LateHistory, usize) -> Option<u32>) {
         let Some((late, _)) = &self.late else { return };
         let mut late = lock(late);
         let stay = change(&mut late, self.participant.late_writers().load(Ordering::Relaxed));
@@ -242,7 +245,7 @@ impl CycloneWriter {
         }
     }
 
-    /// GUID of the writer, as others discover it.
+    /// Returns the GUID of the writer, as others discover it.
     pub fn guid(&self) -> Guid {
         self.guid
     }
@@ -332,7 +335,7 @@ impl RosWriter for CycloneWriter {
 
     fn wait_acknowledged(&self, max: Duration) -> bool {
         let ns = i64::try_from(max.as_nanos()).unwrap_or(INFINITE);
-        // What has not left cannot be acknowledged.
+        // Unsent samples cannot be acknowledged.
         self.flush();
         // SAFETY: takes numbers; the handle is checked by Cyclone.
         unsafe { dds_wait_for_acks(self.writer.handle(), ns) >= 0 }
@@ -356,7 +359,7 @@ impl RosWriter for CycloneWriter {
         let until = Instant::now() + max;
         loop {
             let mut status = 0;
-            // What happens from here on wakes the wait below.
+            // Later changes wake the wait below.
             // SAFETY: the handle is checked by Cyclone, and `status` is a valid place for the result.
             unsafe { dds_take_status(handle, &mut status, READERS_MATCHED) };
             let matched = self.matched_readers();

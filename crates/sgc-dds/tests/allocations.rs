@@ -1,5 +1,5 @@
-//! How often this side of Cyclone allocates for a sample: once where it is taken, for the reference to it, and not at all
-//! where it is written. What Cyclone takes itself, in C, is not counted.
+//! The number of allocations in Rust for a sample: one where it is received, for the reference to it, and none where
+//! it is written. Allocations of Cyclone in C are not counted.
 #![allow(clippy::unwrap_used)]
 
 use std::sync::mpsc::{Sender, channel};
@@ -16,7 +16,7 @@ static COUNTING: CountingAllocator = CountingAllocator;
 
 const DOMAIN: u32 = 99;
 const PATIENCE: Duration = Duration::from_secs(30);
-/// Who wrote the first is looked up.
+/// Allows for the lookup of the first sample's writer.
 const WARM_UP: usize = 100;
 const SAMPLES: usize = 1000;
 
@@ -25,9 +25,10 @@ fn open() -> CycloneNetwork {
     CycloneNetwork::open(&config).unwrap()
 }
 
-/// Tells how often the thread that receives and the reader's own have allocated so far; the channel's own blocks are in it.
+/// A handler that reports the allocations of the receiving thread and of the reader's thread so far, including blocks
+/// of the channel itself.
 struct Tells {
-    /// The one that receives, when it was seen last: it is not while it rests.
+    /// The receiving thread's count when it was last seen, which is not while it rests.
     receiving: usize,
     tell: Sender<usize>,
 }

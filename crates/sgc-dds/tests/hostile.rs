@@ -1,6 +1,7 @@
-//! [`CycloneNetwork`] beside a program of the local network that lies: it speaks RTPS by hand, over a socket of its own.
+//! [`CycloneNetwork`] beside a hostile program on the local network, which speaks RTPS by hand over its own socket.
 //!
-//! The process and the topics of others go on, whatever the peer says. It calls itself one of Fast DDS, of whose writers most is believed.
+//! The process and the topics of others continue, whatever the peer sends. It poses as Fast DDS, whose writers are
+//! trusted most.
 
 #![allow(clippy::unwrap_used)]
 
@@ -25,7 +26,7 @@ const PARTICIPANTS: u16 = 4;
 const DATA: u8 = 0x15;
 const DATA_FRAG: u8 = 0x16;
 const HEARTBEAT: u8 = 0x07;
-/// Little endian, with a payload.
+/// Flags for little endian with a payload.
 const DATA_FLAGS: u8 = 0x05;
 const FRAG_FLAGS: u8 = 0x01;
 
@@ -50,7 +51,7 @@ fn parameter(pid: u16, value: &[u8]) -> Vec<u8> {
     [&pid.to_le_bytes()[..], &(value.len() as u16).to_le_bytes(), &value].concat()
 }
 
-/// A sequence of bytes, or a string with the zero behind it.
+/// Encodes a sequence of bytes, or a string with its terminator.
 fn counted(bytes: &[u8]) -> Vec<u8> {
     [&(bytes.len() as u32).to_le_bytes()[..], bytes].concat()
 }
@@ -60,7 +61,7 @@ fn list(parameters: &[Vec<u8>]) -> Vec<u8> {
 }
 
 fn submessage(kind: u8, flags: u8, content: &[u8]) -> Vec<u8> {
-    // A length that does not fit stands for all that follows.
+    // A length that does not fit means all that follows.
     let length = u16::try_from(content.len()).unwrap_or(0);
     [&[kind, flags][..], &length.to_le_bytes(), content].concat()
 }
@@ -74,7 +75,7 @@ fn heartbeat(reader: [u8; 4], writer: [u8; 4], [first, last]: [i64; 2], count: u
     submessage(HEARTBEAT, 0x03, &[&reader[..], &writer, &numbers, &count.to_le_bytes()].concat())
 }
 
-/// A fragment of a sample of so many bytes.
+/// Returns a fragment of a sample of `bytes` bytes.
 fn fragment(writer: [u8; 4], n: i64, at: u32, bytes: u32, payload: &[u8]) -> Vec<u8> {
     let head = [&[0, 0, 28, 0][..], &ANY, &writer, &number(n), &at.to_le_bytes()].concat();
     let size =
@@ -82,7 +83,7 @@ fn fragment(writer: [u8; 4], n: i64, at: u32, bytes: u32, payload: &[u8]) -> Vec
     submessage(DATA_FRAG, FRAG_FLAGS, &[&head[..], &size, payload].concat())
 }
 
-/// A program that lies.
+/// A hostile program.
 struct Liar {
     socket: UdpSocket,
     domain: u16,
@@ -104,7 +105,8 @@ impl Liar {
         [&Self::prefix(participant)[..], &entity].concat()
     }
 
-    /// Sends a message to the discovery ports or to those of samples. What does not fit a datagram is not sent.
+    /// Sends a message to the discovery ports or to those for samples. A message that does not fit a datagram is not
+    /// sent.
     fn say(&self, participant: u32, is_discovery: bool, submessages: &[Vec<u8>]) {
         let header = [&b"RTPS\x02\x03\x01\x0f"[..], &Self::prefix(participant)].concat();
         let message = [header, submessages.concat()].concat();
@@ -182,7 +184,8 @@ fn discover(network: &CycloneNetwork) -> Receiver<DiscoveryEvent> {
     rx
 }
 
-/// Waits for a writer of a liar to be found, which says so until it is: participants are known a moment after they announce themselves.
+/// Waits until a hostile writer is discovered, and repeats its announcement meanwhile, because participants are known
+/// only a moment after their own announcement.
 fn found(events: &Receiver<DiscoveryEvent>, guid: &[u8], say: impl Fn()) {
     let deadline = Instant::now() + PATIENCE;
     while Instant::now() < deadline {
@@ -196,7 +199,7 @@ fn found(events: &Receiver<DiscoveryEvent>, guid: &[u8], say: impl Fn()) {
     panic!("the liar is not found");
 }
 
-/// A proxy, an honest program, and a liar whose writer the proxy knows.
+/// A proxy, an honest program, and a hostile program whose writer the proxy knows.
 struct Scene {
     proxy: CycloneNetwork,
     events: Receiver<DiscoveryEvent>,
@@ -226,7 +229,7 @@ impl Scene {
         scene
     }
 
-    /// Asserts that the honest program is heard.
+    /// Asserts that the honest program's samples arrive.
     fn assert_goes_on(&mut self, when: &str) {
         let begun = Instant::now();
         self.said += 1;
@@ -286,7 +289,8 @@ fn fragments_that_never_end_hold_up_nobody() {
     }
 }
 
-/// Four bytes beyond its end are in what the allocator gives for an announcement: this would harm nobody, and be seen as an endpoint.
+/// The allocator gives more than an announcement needs, so four bytes beyond its end would do no harm here, and
+/// appear as an endpoint.
 #[test]
 fn fragments_that_reach_beyond_their_announcement_are_refused() {
     let mut scene = Scene::new(194);
@@ -334,7 +338,7 @@ fn hostile_names_are_bounded_and_hold_up_nobody() {
             &[parameter(0x2c, if n == 2 { &[] } else { &user_data })],
         );
     }
-    // Lengths and counts that nothing backs.
+    // Lengths and counts exceed the data.
     for (n, pid) in (8..).zip([0x05_u16, 0x07, 0x2c, 0x29, 0x75, 0x1a, 0x50, 0x5a]) {
         for value in [&u32::MAX.to_le_bytes()[..], &[0xff; 16], &[]] {
             scene.liar.announce_writer(0, n, [0, 2, n as u8, 3], b"rt/x", &[parameter(pid, value)]);
@@ -345,7 +349,7 @@ fn hostile_names_are_bounded_and_hold_up_nobody() {
     scene.assert_goes_on("after hostile names");
 }
 
-/// Waits for a writer, and looks at the names of those in front of it.
+/// Waits for a writer, and checks the names of the endpoints before it.
 fn found_bounded(events: &Receiver<DiscoveryEvent>, guid: &[u8]) {
     let deadline = Instant::now() + PATIENCE;
     while let Ok(event) = events.recv_timeout(deadline.saturating_duration_since(Instant::now())) {

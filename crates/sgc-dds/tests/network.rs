@@ -1,7 +1,7 @@
 //! Behaviour of [`CycloneNetwork`] between participants that talk over the loopback interface.
 //!
-//! Each test has a ROS domain of its own, so that they run side by side. An untagged network stands in for
-//! a plain ROS 2 process: each network is a Cyclone domain of its own, so everything here crosses sockets.
+//! Each test has its own ROS domain, so that tests run side by side. An untagged network stands for a plain ROS 2
+//! process. Each network is its own Cyclone domain, so everything here crosses sockets.
 
 #![allow(clippy::unwrap_used)]
 
@@ -24,7 +24,7 @@ use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representation
 /// Longest wait for an event, far beyond what any takes.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// How long nothing must happen where nothing may; events that would be wrong come within milliseconds.
+/// Time for which nothing must happen. Wrong events would come within milliseconds.
 const QUIET: Duration = Duration::from_millis(300);
 
 fn config(domain: u32, tag: Option<&str>) -> DdsConfig {
@@ -66,7 +66,7 @@ fn string_cdr(text: &str) -> Bytes {
     payload.into()
 }
 
-/// What a reader gets for a payload: zeros up to a multiple of four, and how many in the pad bits.
+/// Returns a payload as a reader receives it: with zeros up to a multiple of four, and their number in the pad bits.
 fn padded(payload: &[u8]) -> Vec<u8> {
     let mut payload = payload.to_vec();
     let pad = payload.len().wrapping_neg() % 4;
@@ -88,7 +88,7 @@ fn read(network: &CycloneNetwork, spec: &EndpointSpec) -> (CycloneReader, Receiv
     (reader, rx)
 }
 
-/// A writer that `readers` readers are matched with.
+/// Returns a writer that matches this many readers.
 fn writer(network: &CycloneNetwork, spec: &EndpointSpec, readers: u32) -> CycloneWriter {
     let writer = network.create_writer(spec).unwrap();
     matched(&writer, readers);
@@ -108,7 +108,7 @@ fn eventually(what: &str, mut done: impl FnMut() -> bool) {
 }
 
 fn write(writer: &CycloneWriter, payload: &Bytes) {
-    // Of a topic without keys nobody sends it.
+    // Writers send no key hash on a topic without keys.
     let head = SampleHead { key_hash: Some([1; 16]), ..SampleHead::new(SampleKind::Write, 1_000_000_000) };
     writer.write_ahead(head, payload.clone()).unwrap();
     writer.flush();
@@ -271,7 +271,7 @@ fn a_network_does_not_hear_itself() {
     assert_eq!(writer.matched_readers(), 1, "its own reader is no match");
 }
 
-/// The programs of a gateway are of one participant.
+/// The programs behind a gateway share one participant.
 #[test]
 fn programs_behind_one_network_without_tag_hear_each_other() {
     let ros = open(147, None);
@@ -299,9 +299,9 @@ fn readers_are_waited_for_until_they_are_there_or_the_time_is_over() {
     assert_eq!(waits, 2);
 }
 
-/// The proof against loops: DDS matches the two, SGC must not pass on what the other wrote.
+/// Proof against loops: DDS matches the two, but SGC must not forward samples of the other.
 #[test]
-fn what_another_sgc_node_wrote_is_not_read_again() {
+fn samples_of_other_sgc_nodes_are_skipped() {
     let (first, second, ros) = (open(94, Some("a")), open(94, Some("b")), open(94, None));
     let (_reader, samples) = read(&first, &spec("loop"));
     let other = writer(&second, &spec("loop"), 1);
@@ -339,10 +339,11 @@ fn large_messages_arrive_intact() {
     }
 }
 
-/// Length of the fragments of [`fragment`], bytes.
+/// Length of the fragments of [`fragment`], in bytes.
 const FRAGMENT_BYTES: u16 = 52;
 
-/// An RTPS message with one fragment of a best-effort writer's sample (RTPS 2.5, 9.4.5.5); fragments count from 1.
+/// Returns an RTPS message with one fragment of a best-effort writer's sample (RTPS 2.5, 9.4.5.5). Fragments count
+/// from 1.
 fn fragment(writer: Guid, number: u32, fragment: u32, sample_bytes: u32) -> Vec<u8> {
     let body = 32 + FRAGMENT_BYTES;
     let mut packet = b"RTPS\x02\x01\x01\x10".to_vec();
@@ -350,7 +351,7 @@ fn fragment(writer: Guid, number: u32, fragment: u32, sample_bytes: u32) -> Vec<
     // DATA_FRAG, little endian.
     packet.extend([0x16, 1]);
     packet.extend(body.to_le_bytes());
-    // No extra flags; the payload is 28 bytes behind this field; for any reader.
+    // No extra flags; the payload begins 28 bytes behind this field; for any reader.
     packet.extend([0, 0, 28, 0, 0, 0, 0, 0]);
     packet.extend(&writer.0[12..]);
     packet.extend([0; 4]);
@@ -365,14 +366,15 @@ fn fragment(writer: Guid, number: u32, fragment: u32, sample_bytes: u32) -> Vec<
     packet
 }
 
-/// Cyclone and `cyclors` copy a sample's fragments into memory of the length that the first one announces. Four bytes beyond
-/// it are in what the allocator gives for 100: this would harm nobody, and be seen as a sample.
+/// Cyclone and `cyclors` copy a sample's fragments into memory of the length that the first one announces. The
+/// allocator gives more than 100 bytes, so four bytes beyond the end would do no harm here, and appear as a sample.
 #[test]
 fn fragments_that_reach_beyond_their_sample_are_refused() {
     const DOMAIN: u32 = 100;
     let (ros, sgc) = (open(DOMAIN, None), open(DOMAIN, Some("arm-1")));
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
-    // Ports of the first participants of a host (RTPS 2.5, 9.6.2.3). Cyclone takes the one of discovery for data as well.
+    // Ports of the first participants of a host (RTPS 2.5, 9.6.2.3). Cyclone accepts data on the discovery port as
+    // well.
     let send = |packet: &[u8]| {
         for participant in 0..8 {
             let port = (7400 + 250 * DOMAIN + 10 + 2 * participant) as u16;
@@ -385,7 +387,7 @@ fn fragments_that_reach_beyond_their_sample_are_refused() {
         });
         let (_reader, samples) = read(&sgc, &spec);
         let writer = writer(&ros, &spec, 1);
-        // A best-effort sample is lost until the reader's side knows the writer.
+        // A best-effort sample is lost until the reader knows the writer.
         eventually("the reader hears the writer", || {
             write(&writer, &string_cdr("known"));
             samples.recv_timeout(QUIET).is_ok()
@@ -412,7 +414,7 @@ fn odd_lengths_are_padded_with_zeros_and_say_so() {
     let (_reader, samples) = read(&ros, &spec("odd"));
     let writer = writer(&sgc, &spec("odd"), 1);
     for body in 0..9 {
-        // The payload lies in the middle of a buffer full of what must not get out.
+        // The payload lies in the middle of a buffer whose other bytes must not be sent.
         let mut buffer = vec![0xaa; 64];
         buffer[16..20].copy_from_slice(&[0, 1, 0, 0]);
         buffer[20..20 + body].fill(0x55);
@@ -426,7 +428,7 @@ fn odd_lengths_are_padded_with_zeros_and_say_so() {
 }
 
 #[test]
-fn what_is_no_sample_is_refused() {
+fn invalid_payloads_are_refused() {
     let sgc = open(79, Some("arm-1"));
     let writer = sgc.create_writer(&spec("bad")).unwrap();
     let write = |ts, payload: &'static [u8]| writer.write(SampleKind::Write, ts, Bytes::from_static(payload));
@@ -475,7 +477,7 @@ fn latched(topic: &str, history: History) -> EndpointSpec {
     with(spec(topic), |qos| (qos.durability, qos.history) = (Durability::TransientLocal, history))
 }
 
-/// A publisher that announced no depth is written for with one that is set later.
+/// The depth is set later for a publisher that announced none.
 #[test]
 fn late_joiners_get_history_of_a_depth_that_is_set_later() {
     let (ros, sgc) = (open(57, None), open(57, Some("arm-1")));
@@ -498,14 +500,14 @@ fn late_joiners_get_history_of_a_depth_that_is_set_later() {
     for text in &texts[10..20] {
         write(&writer, &string_cdr(text));
     }
-    // Readers of one participant get what is under way to any of them.
+    // Readers of one participant receive samples in transit to any of them.
     for text in &texts[..20] {
         assert_eq!(next(&early).payload, padded(&string_cdr(text)), "all come, once");
     }
     assert_late(15, 20);
 }
 
-/// However many such writers there are, and however long their samples.
+/// The bound holds for any number of such writers and any length of samples.
 #[test]
 fn history_of_unknown_depth_is_bounded_in_bytes() {
     const LONG_BYTES: usize = 4 << 20;
@@ -535,7 +537,7 @@ fn source_time_and_writer_are_preserved() {
     let (_reader, samples) = read(&sgc, &spec("stamped"));
     let writer = writer(&ros, &spec("stamped"), 1);
     let seen = appeared(&events);
-    // RTPS carries 2⁻³² s, so what comes out may be off by a nanosecond.
+    // RTPS carries units of 2⁻³² s, so the result may be off by a nanosecond.
     for ns in [0, 1, 1_700_000_000_123_456_789, 4_294_967_295_999_999_999] {
         writer.write(SampleKind::Write, ns, string_cdr("x")).unwrap();
         let sample = next(&samples);
@@ -546,7 +548,7 @@ fn source_time_and_writer_are_preserved() {
 }
 
 #[test]
-fn one_that_blocks_delays_no_other_reader_where_writers_are_to_wait_either() {
+fn blocked_keep_all_reader_delays_no_other_reader() {
     const SAMPLES: usize = 2000;
     let (ros, sgc) = (open(99, None), open(99, Some("arm-1")));
     let (release, gate) = channel::<()>();
@@ -563,7 +565,7 @@ fn one_that_blocks_delays_no_other_reader_where_writers_are_to_wait_either() {
         .unwrap();
     let (_free, free) = read(&sgc, &spec("free"));
     let (w_stuck, w_free) = (writer(&ros, &all, 1), writer(&ros, &spec("free"), 1));
-    // More than are let gather, and fewer than may wait.
+    // More samples than the crowded level, and fewer than may be queued.
     for i in 0..SAMPLES {
         write(&w_stuck, &string_cdr(&format!("stuck {i}")));
         if i % 20 == 0 {
@@ -604,7 +606,7 @@ fn a_handler_that_blocks_delays_no_other_reader() {
     release.send(()).unwrap();
     assert_eq!(next(&entered), padded(&string_cdr("stuck 49")), "only the newest was kept");
 
-    // Dropping the reader waits for its handler, which the closed gate lets go.
+    // Dropping the reader waits for its handler, which continues when the gate closes.
     drop(release);
     drop(stuck);
     assert_eq!(entered.recv_timeout(PATIENCE), Err(RecvTimeoutError::Disconnected), "the handler is gone");
@@ -630,8 +632,8 @@ fn a_reader_says_whether_more_is_at_hand_and_never_at_the_end() {
     };
     let _witness = sgc.create_reader(&spec("burst"), Box::new(arrives)).unwrap();
     let writer = writer(&ros, &spec("burst"), 2);
-    // What gathered behind the gate is at hand together; the witness may be a moment ahead of the reader, so that
-    // the gate opens too early now and then.
+    // The samples behind the gate are at hand together. The witness may be a moment ahead of the reader, so the gate
+    // sometimes opens too early.
     let together = (0..20).any(|_| {
         write(&writer, &string_cdr("first"));
         assert!(!next(&seen), "nothing else was there");
@@ -647,24 +649,24 @@ fn a_reader_says_whether_more_is_at_hand_and_never_at_the_end() {
     assert!(together);
 }
 
-/// What became of a sample.
+/// The way in which a sample was handled.
 #[derive(Debug, PartialEq, Eq)]
-enum Handled {
+enum Outcome {
     AtOnce(Bytes),
     OnItsThread(Bytes),
     Overrun(u64),
 }
 
-/// Handles at once what it may, and waits at a gate otherwise.
+/// A handler that handles samples at once while it may, and waits at a gate otherwise.
 struct Choosy {
     may: Arc<AtomicBool>,
     gate: Receiver<()>,
-    handled: Sender<Handled>,
+    handled: Sender<Outcome>,
 }
 
 impl HandleSamples for Choosy {
     fn handle(&mut self, sample: Sample) {
-        let _ = self.handled.send(Handled::OnItsThread(sample.payload));
+        let _ = self.handled.send(Outcome::OnItsThread(sample.payload));
         let _ = self.gate.recv();
     }
 
@@ -672,17 +674,17 @@ impl HandleSamples for Choosy {
         if !self.may.load(Relaxed) {
             return Err(sample);
         }
-        let _ = self.handled.send(Handled::AtOnce(sample.payload));
+        let _ = self.handled.send(Outcome::AtOnce(sample.payload));
         Ok(())
     }
 
     fn overrun(&mut self, samples: u64) {
-        let _ = self.handled.send(Handled::Overrun(samples));
+        let _ = self.handled.send(Outcome::Overrun(samples));
     }
 }
 
 #[test]
-fn what_needs_no_waiting_is_handled_where_it_is_received_and_in_its_order() {
+fn samples_are_handled_on_the_receiving_thread_in_order() {
     let (ros, sgc) = (open(111, None), open(111, Some("arm-1")));
     let may = Arc::new(AtomicBool::new(true));
     let ((release, gate), (tell, handled)) = (channel(), channel());
@@ -690,17 +692,17 @@ fn what_needs_no_waiting_is_handled_where_it_is_received_and_in_its_order() {
     let five = with(spec("prompt"), |qos| qos.history = History::KeepLast(5));
     let _reader = sgc.create_reader(&five, Box::new(choosy)).unwrap();
     let writer = writer(&ros, &with(spec("prompt"), |qos| qos.history = History::KeepAll), 1);
-    // Who the writer is has to be asked first, and after each the receiving thread rests a little.
+    // The first sample waits for the lookup of its writer, and after each sample the receiving thread rests briefly.
     let is_at_once = (0..1000).any(|i| {
         let text = string_cdr(&i.to_string());
         write(&writer, &text);
         match next(&handled) {
-            Handled::AtOnce(payload) => {
+            Outcome::AtOnce(payload) => {
                 assert_eq!(payload, padded(&text));
                 true
             }
             other => {
-                assert_eq!(other, Handled::OnItsThread(padded(&text).into()));
+                assert_eq!(other, Outcome::OnItsThread(padded(&text).into()));
                 release.send(()).unwrap();
                 false
             }
@@ -708,25 +710,25 @@ fn what_needs_no_waiting_is_handled_where_it_is_received_and_in_its_order() {
     });
     assert!(is_at_once, "a thousand were woken for");
 
-    // What the thread has is not overtaken, and what there is no room for is counted.
+    // Samples of the reader's thread are not overtaken, and samples without room are counted.
     may.store(false, Relaxed);
     write(&writer, &string_cdr("blocks"));
-    assert_eq!(next(&handled), Handled::OnItsThread(padded(&string_cdr("blocks")).into()));
+    assert_eq!(next(&handled), Outcome::OnItsThread(padded(&string_cdr("blocks")).into()));
     may.store(true, Relaxed);
     (0..20).for_each(|i| write(&writer, &string_cdr(&format!("behind {i}"))));
     assert!(writer.wait_acknowledged(PATIENCE));
     quiet(&handled);
     (0..6).for_each(|_| release.send(()).unwrap());
-    assert_eq!(next(&handled), Handled::Overrun(15));
+    assert_eq!(next(&handled), Outcome::Overrun(15));
     for i in 15..20 {
         let text = string_cdr(&format!("behind {i}"));
-        assert_eq!(next(&handled), Handled::OnItsThread(padded(&text).into()));
+        assert_eq!(next(&handled), Outcome::OnItsThread(padded(&text).into()));
     }
 }
 
 #[test]
 fn a_reader_may_be_dropped_where_its_samples_are_received() {
-    /// Drops the reader at once.
+    /// A handler that drops its reader at once.
     struct Drops(Arc<Mutex<Option<CycloneReader>>>, Sender<bool>);
 
     impl HandleSamples for Drops {
@@ -789,7 +791,7 @@ fn dropping_a_network_ends_its_threads_and_endpoints() {
     let mut guids = [appeared(&events).guid, appeared(&events).guid];
     guids.sort();
 
-    // Endpoints outlive the network that made them; discovery does not.
+    // Endpoints outlive the network that created them; discovery does not.
     drop(ros);
     assert_eq!(ros_events.recv_timeout(PATIENCE), Err(RecvTimeoutError::Disconnected));
     quiet(&events);
@@ -839,7 +841,7 @@ fn samples_are_freed_when_their_bytes_are() {
     let before = resident_bytes();
     pass(400);
     let grown = resident_bytes().saturating_sub(before);
-    // 400 MB have passed; other tests of this process may hold some tens of megabytes meanwhile.
+    // 400 MB have passed. Other tests of this process may hold some tens of megabytes meanwhile.
     assert!(grown < 200_000_000, "{grown} bytes more are resident");
 }
 
@@ -880,7 +882,7 @@ fn keyed_data_passes_in_both_directions_and_so_does_the_end_of_instances() {
             let sample = next(&samples);
             assert_eq!(sample.payload, padded(&string_cdr(&i.to_string())), "instances are not told apart");
         }
-        // Each in its place, with its key.
+        // Each event keeps its place and its key.
         let said = [
             (SampleKind::Dispose, "1"),
             (SampleKind::Write, "again"),
@@ -899,7 +901,7 @@ fn keyed_data_passes_in_both_directions_and_so_does_the_end_of_instances() {
         }
     }
 
-    // A keyless reader is no match for a keyed writer.
+    // A keyless reader does not match a keyed writer.
     let (_keyless, _) = read(&ros, &spec("k2"));
     let w2 = sgc.create_writer(&keyed("k2")).unwrap();
     let (_match, _samples) = read(&ros, &keyed("k2b"));
@@ -920,7 +922,7 @@ fn partitions_keep_endpoints_apart() {
 }
 
 #[test]
-fn what_is_written_ahead_leaves_with_the_next_and_when_it_is_waited_for() {
+fn queued_samples_leave_with_the_next_or_a_flush() {
     let (ros, sgc) = (open(110, None), open(110, Some("arm-1")));
     let many = with(spec("ahead"), |qos| qos.history = History::KeepLast(1000));
     let (_reader, samples) = read(&ros, &many);
@@ -932,7 +934,7 @@ fn what_is_written_ahead_leaves_with_the_next_and_when_it_is_waited_for() {
             assert_eq!(next(&samples).payload, padded(&string_cdr(&i.to_string())));
         }
     };
-    // More than one packet of them, and one behind which none follows.
+    // There is more than one packet of samples, and then a last sample without successor.
     (0..900).for_each(|i| ahead(&i.to_string()));
     write(&writer, &string_cdr("900"));
     arrive(0..901);
@@ -972,7 +974,7 @@ fn discovery_tells_of_a_lapsed_writer_and_of_its_return() {
     ros.set_deaf_mute(Duration::from_millis(1000));
     let liveliness = |is_alive| DiscoveryEvent::Liveliness { guid: writer.guid(), is_alive };
     assert_eq!(next(&events), liveliness(false));
-    // A lapsed writer lives again once it writes.
+    // A lapsed writer is alive again once it writes.
     eventually("a message after the silence", || {
         write(&writer, &string_cdr("again"));
         samples.recv_timeout(Duration::from_millis(50)).is_ok()
@@ -1010,7 +1012,7 @@ fn assertions_of_a_writer_that_is_manual_by_topic_are_seen_without_messages() {
     }
     write(&writers[1], &string_cdr("alive"));
     assert_eq!(of_automatic(), None);
-    // Its lease runs out where its messages go.
+    // The lease expires where the messages go.
     quiet(&events);
     drop(writers);
     eventually("it is forgotten", || ago().is_none());
@@ -1018,8 +1020,8 @@ fn assertions_of_a_writer_that_is_manual_by_topic_are_seen_without_messages() {
 
 #[test]
 fn rmw_cyclonedds_on_localhost_is_found() {
-    // What rmw_cyclonedds makes of ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST (from Iron on), and of
-    // ROS_LOCALHOST_ONLY=1 (up to Humble).
+    // The configuration that rmw_cyclonedds derives from ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST (since Iron), and
+    // from ROS_LOCALHOST_ONLY=1 (up to Humble).
     let iron = "<General><AllowMulticast>false</AllowMulticast></General><Discovery>\
                 <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>\
                 <Peers><Peer address=\"localhost\"/></Peers></Discovery>";
@@ -1057,7 +1059,7 @@ fn off_is_seen_by_nobody() {
 }
 
 #[test]
-fn what_cyclone_refuses_is_an_error_with_its_reason() {
+fn cyclone_errors_carry_their_reason() {
     let open = |config: DdsConfig| CycloneNetwork::open(&config).unwrap_err().to_string();
     let xml = DdsConfig { cyclonedds_uri: Some("<NoSuchElement/>".into()), ..config(94, None) };
     assert!(open(xml).contains("NoSuchElement"));
@@ -1080,7 +1082,8 @@ fn the_users_configuration_overrides_ours() {
     quiet(&events);
 }
 
-/// Cyclone 11 takes what others announce for received, and never hears of it, if a second participant of the domain goes meanwhile.
+/// Cyclone 11 considers others' announcements received, and never gets them again, if a second participant of the
+/// domain is deleted meanwhile.
 #[test]
 fn network_has_one_participant_from_the_beginning() {
     let directory = tempfile::tempdir().unwrap();
@@ -1117,7 +1120,7 @@ fn graph_node(name: &str, readers: &[Guid], writers: &[Guid]) -> GraphNode {
     GraphNode { node, readers: readers.to_vec(), writers: writers.to_vec() }
 }
 
-/// The next event about nodes, past those about endpoints.
+/// Returns the next event about nodes, and skips those about endpoints.
 fn nodes(events: &Receiver<DiscoveryEvent>) -> (Guid, Vec<GraphNode>) {
     loop {
         if let DiscoveryEvent::Nodes { participant, nodes } = next(events) {
@@ -1141,7 +1144,7 @@ fn nodes_and_their_endpoints_are_told_and_gone_with_their_participant() {
     let participant = ros.guid();
     drop((talker, ros));
     assert_eq!(nodes(&events), (participant, vec![]));
-    // Who comes late is told what there is, but nothing of what is another participant's.
+    // A late listener learns of existing nodes, but of no endpoint that belongs to another participant.
     let ros = open_graph(96, None);
     ros.announce(&announced).unwrap();
     let late = open_graph(96, Some("late"));
@@ -1149,7 +1152,7 @@ fn nodes_and_their_endpoints_are_told_and_gone_with_their_participant() {
 }
 
 #[test]
-fn what_proxies_announce_is_for_ros_and_not_for_other_proxies() {
+fn announcements_of_proxies_are_hidden_from_other_proxies() {
     let (ros, sgc, other) =
         (open_graph(97, None), open_graph(97, Some("arm-1")), open_graph(97, Some("arm-2")));
     let (seen, other_seen) = (discover(&ros), discover(&other));
@@ -1157,10 +1160,10 @@ fn what_proxies_announce_is_for_ros_and_not_for_other_proxies() {
     sgc.announce(&[graph_node("talker", &[], &[mirrored.guid()])]).unwrap();
     let told = nodes(&seen);
     assert_eq!((told.0, &told.1[0].writers[..]), (sgc.guid(), &[mirrored.guid()][..]));
-    // Beside it a node of ROS, which every proxy hears of.
+    // Every proxy reports a ROS node beside it.
     ros.announce(&[graph_node("local", &[], &[])]).unwrap();
     assert_eq!(nodes(&other_seen).0, ros.guid());
-    // Switched off, a participant neither tells nor hears.
+    // Without a graph a participant neither announces nor reports nodes.
     let off = open(97, Some("arm-3"));
     let off_seen = discover(&off);
     off.announce(&[graph_node("x", &[], &[])]).unwrap();
@@ -1187,7 +1190,7 @@ fn shown_endpoints_are_seen_with_type_and_qos_and_match_none() {
         assert_eq!(vanished(&seen), found.guid);
     }
     let _shown = [EndpointKind::Reader, EndpointKind::Writer].map(|kind| sgc.show(kind, &shown).unwrap());
-    // One that matches comes later, so that those that do not have been looked at.
+    // A matching endpoint comes later, so the others have been considered before.
     let (_reader, samples) = read(&sgc, &spec("chatter"));
     matched(&talker, 2);
     write(&talker, &string_cdr("once"));
@@ -1200,7 +1203,7 @@ fn ids_are_as_long_as_those_of_the_network() {
     let sgc = open_graph(98, Some("arm-1"));
     let events = discover(&sgc);
     sgc.announce(&[graph_node("talker", &[], &[])]).unwrap();
-    // A plain participant that reads and writes the topic itself, as an older ROS 2 would.
+    // A plain participant reads and writes the topic itself, like an older ROS 2.
     let old = open(98, None);
     let (_reader, said) = read(&old, &graph_reader());
     let writer = writer(&old, &graph_writer(), 2);
@@ -1218,7 +1221,7 @@ fn ids_are_as_long_as_those_of_the_network() {
         (again.gid_bytes, again.participant, again.nodes.len()),
         (GidBytes::TwentyFour, sgc.guid(), 1)
     );
-    // What nobody can read, or is about somebody else, changes nothing.
+    // Invalid messages, and messages about another participant, change nothing.
     write(&writer, &Bytes::from_static(&[0, 1, 0, 0, 1, 2, 3, 4]));
     write(&writer, &encode_nodes(&sgc.guid(), &[graph_node("forged", &[], &[])], GidBytes::Sixteen));
     write(&writer, &encode_nodes(&old.guid(), &[graph_node("new", &[], &[])], GidBytes::Sixteen));
@@ -1233,7 +1236,7 @@ fn late_joiners_get_the_last_samples_of_each_key() {
         qos.durability = Durability::TransientLocal;
         qos.history = History::KeepLast(2);
     });
-    // Long ones come in fragments, of which the first one says the hash.
+    // Long samples come in fragments, the first of which carries the hash.
     let text = |n: usize, key: u8| format!("{n} of {key}").repeat(if n == 3 { 10_000 } else { 1 });
     let latched = writer(&sgc, &keyed, 0);
     for n in 0..4 {
@@ -1252,7 +1255,7 @@ fn late_joiners_get_the_last_samples_of_each_key() {
         }
     }
     quiet(&samples);
-    // A topic without keys has none.
+    // A topic without keys has no hash.
     let (_reader, samples) = read(&ros, &spec("h0"));
     write(&writer(&sgc, &spec("h0"), 1), &string_cdr("a"));
     assert_eq!(next(&samples).key_hash, None);
@@ -1262,7 +1265,7 @@ fn late_joiners_get_the_last_samples_of_each_key() {
 #[test]
 fn a_reliable_writer_keeps_what_is_not_acknowledged_as_far_as_memory_goes() {
     let (ros, sgc) = (open(152, None), open(152, Some("arm-1")));
-    // Its publisher keeps one.
+    // The publisher keeps one sample.
     let one = |topic| with(spec(topic), |qos| qos.history = History::KeepLast(1));
     let (_reader, samples) = read(&ros, &with(spec("deaf"), |qos| qos.history = History::KeepAll));
     let writer = writer(&sgc, &one("deaf"), 1);
@@ -1273,7 +1276,7 @@ fn a_reliable_writer_keeps_what_is_not_acknowledged_as_far_as_memory_goes() {
     for payload in &short {
         assert_eq!(next(&samples).payload, padded(payload));
     }
-    // Of long ones as many as there is room for, and they are the last.
+    // Of long samples the last ones are kept, as many as there is room for.
     let bytes = 4 << 20;
     let kept = writer.kept(bytes).unwrap();
     assert_eq!(kept, UNACKNOWLEDGED_MIN);

@@ -1,5 +1,5 @@
-//! Behaviour of [`CycloneNetwork`] in a network that DDS Security protects: several participants of one process, with a keystore that is
-//! not ours (`tests/peers/keystore.sh`).
+//! [`CycloneNetwork`] in a network that DDS Security protects: several participants of one process, with a keystore in
+//! SROS2's layout that `tests/peers/keystore.sh` makes.
 
 #![cfg(feature = "sros2")]
 #![allow(clippy::unwrap_used)]
@@ -23,7 +23,8 @@ const PATIENCE: Duration = Duration::from_secs(60);
 
 const DOMAIN: u32 = 219;
 
-/// A keystore with the enclaves `/one` and `/two`, of which the first may be in the partition of shown endpoints.
+/// Returns a keystore with the enclaves `/one` and `/two`, of which the first may use the partition of shown
+/// endpoints.
 fn keystore() -> TempDir {
     let directory = tempfile::tempdir().unwrap();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/peers/keystore.sh");
@@ -71,7 +72,7 @@ fn several_participants_of_one_process_are_secured() {
     let (tx, seen) = channel();
     two.discover(Box::new(move |event| drop(tx.send(event)))).unwrap();
 
-    // An endpoint that is shown.
+    // This endpoint is only shown.
     let shown = one.show(EndpointKind::Reader, &spec()).unwrap();
     let found = loop {
         if let DiscoveryEvent::Appeared(endpoint) = next(&seen) {
@@ -85,7 +86,7 @@ fn several_participants_of_one_process_are_secured() {
         "{refused}"
     );
 
-    // Data from the network whose Cyclone domain has another number, and to it.
+    // Data flows from and to the network whose Cyclone domain has another number.
     for (from, to) in [(&two, &one), (&one, &two)] {
         let (tx, samples) = channel();
         let _reader =
@@ -102,7 +103,7 @@ fn several_participants_of_one_process_are_secured() {
         assert_eq!(next(&samples).payload[4..10], payload[4..10]);
     }
 
-    // Permissions name the ROS domain, not that of Cyclone, and they grant one topic.
+    // The permissions name the ROS domain, not Cyclone's, and grant one topic.
     let other = EndpointSpec { topic: "rt/other".into(), ..spec() };
     for network in [&one, &two] {
         let error = network.create_writer(&other).err().unwrap().to_string();

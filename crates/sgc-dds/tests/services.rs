@@ -1,5 +1,5 @@
 //! Services of [`CycloneNetwork`] between participants that talk over the loopback interface. An untagged network
-//! stands in for a plain ROS 2 process.
+//! stands for a plain ROS 2 process.
 
 #![allow(clippy::unwrap_used)]
 
@@ -16,7 +16,7 @@ use sgc_ros::{
 
 /// Longest wait for an event, far beyond what any takes.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// How long nothing must happen where nothing may.
+/// Time for which nothing must happen.
 const QUIET: Duration = Duration::from_millis(300);
 
 fn open(domain: u32, tag: Option<&str>) -> CycloneNetwork {
@@ -46,29 +46,29 @@ fn spec() -> ServiceSpec {
     ServiceSpec { request: half(ServiceTopic::Request), reply: half(ServiceTopic::Reply) }
 }
 
-type Heard = Receiver<(RequestId, Bytes)>;
+type CallReceiver = Receiver<(RequestId, Bytes)>;
 
-fn client(network: &CycloneNetwork) -> (CycloneClient, Heard) {
+fn client(network: &CycloneNetwork) -> (CycloneClient, CallReceiver) {
     let (tx, rx) = channel();
     let handler = Box::new(move |id, payload| drop(tx.send((id, payload))));
     (network.create_client(&spec(), handler).unwrap(), rx)
 }
 
-fn server(network: &CycloneNetwork) -> (CycloneServer, Heard) {
+fn server(network: &CycloneNetwork) -> (CycloneServer, CallReceiver) {
     let (tx, rx) = channel();
     let handler = Box::new(move |id, payload| drop(tx.send((id, payload))));
     (network.create_server(&spec(), handler).unwrap(), rx)
 }
 
-fn next(heard: &Heard) -> (RequestId, Bytes) {
+fn next(heard: &CallReceiver) -> (RequestId, Bytes) {
     heard.recv_timeout(PATIENCE).expect("a request or a reply")
 }
 
-fn quiet(heard: &Heard) {
+fn quiet(heard: &CallReceiver) {
     assert_eq!(heard.recv_timeout(QUIET), Err(RecvTimeoutError::Timeout));
 }
 
-/// Asks until there is a server.
+/// Sends a request once there is a server.
 fn ask(client: &CycloneClient, payload: &[u8]) -> RequestId {
     for _ in 0..PATIENCE.as_secs() {
         match client.request(Bytes::copy_from_slice(payload)) {
@@ -151,7 +151,7 @@ fn the_header_is_that_of_rmw_cyclonedds() {
         server.reply(&id, vec![0, u8::from(little), 0, 0, 5, 5, 5, 5].into()).unwrap();
         assert_eq!(replies.recv_timeout(PATIENCE).unwrap(), [header(little), vec![5; 4]].concat());
     }
-    // What is too short to hold one is dropped.
+    // A payload that is too short for an id is dropped.
     writer.write(SampleKind::Write, 1, vec![0, 1, 0, 0, 1, 2, 3, 4].into()).unwrap();
     quiet(&requests);
 }
@@ -167,7 +167,7 @@ fn a_request_without_a_server_says_so_and_sgc_does_not_call_itself() {
     quiet(&requests);
 }
 
-/// The programs of a gateway are of one participant.
+/// The programs behind a gateway share one participant.
 #[test]
 fn programs_behind_one_network_without_tag_call_each_other() {
     let ros = open(148, None);
@@ -197,7 +197,7 @@ fn a_server_made_anew_answers_what_the_one_before_was_asked() {
     second.reply(&id, Bytes::from_static(&[0, 1, 0, 0, 7, 7, 7, 7])).unwrap();
     assert_eq!(next(&replies), (asked, Bytes::from_static(&[0, 1, 0, 0, 7, 7, 7, 7])));
     drop(client);
-    // Once its participant has heard of it.
+    // The new server answers once its participant has discovered the client.
     let end = std::time::Instant::now() + PATIENCE;
     let gone = loop {
         match second.reply(&id, Bytes::from_static(&[0, 1, 0, 0])) {
@@ -208,7 +208,7 @@ fn a_server_made_anew_answers_what_the_one_before_was_asked() {
     assert!(matches!(gone, Err(RosError::NoPeer { .. })), "{gone:?}");
 }
 
-/// Requests are made on the thread of a caller while replies come on another.
+/// Requests are sent on the caller's thread while replies arrive on another.
 #[test]
 fn many_calls_at_once_are_each_answered_once() {
     const CALLS: usize = 300;

@@ -1,5 +1,5 @@
-//! Services of [`CycloneNetwork`] with programs of other DDS vendors: the peers of `tests/peers`, which put the identity of
-//! requests where rmw_fastrtps and ros2-client do.
+//! Services of [`CycloneNetwork`] with programs of other DDS vendors: the peers of `tests/peers`, which put the
+//! identity of requests where rmw_fastrtps and ros2-client do.
 
 #![allow(clippy::unwrap_used)]
 
@@ -20,7 +20,7 @@ use sgc_ros::{
 /// Longest wait for an event, far beyond what any takes.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Longer than a fragment, and than several.
+/// Length of a message of several fragments, in bytes.
 const LONG_BYTES: usize = 50_001;
 
 fn open(domain: u32, tag: Option<&str>) -> CycloneNetwork {
@@ -54,25 +54,31 @@ fn blob() -> ServiceSpec {
     spec("/blob", "sgc_test_msgs/srv/Blob")
 }
 
-type Heard = Receiver<(RequestId, Bytes)>;
+type CallReceiver = Receiver<(RequestId, Bytes)>;
 
-fn server(network: &CycloneNetwork, spec: &ServiceSpec) -> (<CycloneNetwork as RosNetwork>::Server, Heard) {
+fn server(
+    network: &CycloneNetwork,
+    spec: &ServiceSpec,
+) -> (<CycloneNetwork as RosNetwork>::Server, CallReceiver) {
     let (tx, rx) = channel();
     let handler = Box::new(move |id, payload| drop(tx.send((id, payload))));
     (network.create_server(spec, handler).unwrap(), rx)
 }
 
-fn client(network: &CycloneNetwork, spec: &ServiceSpec) -> (<CycloneNetwork as RosNetwork>::Client, Heard) {
+fn client(
+    network: &CycloneNetwork,
+    spec: &ServiceSpec,
+) -> (<CycloneNetwork as RosNetwork>::Client, CallReceiver) {
     let (tx, rx) = channel();
     let handler = Box::new(move |id, payload| drop(tx.send((id, payload))));
     (network.create_client(spec, handler).unwrap(), rx)
 }
 
-fn next(heard: &Heard) -> (RequestId, Bytes) {
+fn next(heard: &CallReceiver) -> (RequestId, Bytes) {
     heard.recv_timeout(PATIENCE).expect("a request or a reply")
 }
 
-/// Asks until there is a server.
+/// Sends a request once there is a server.
 fn ask(client: &<CycloneNetwork as RosNetwork>::Client, payload: &[u8]) -> RequestId {
     let until = Instant::now() + PATIENCE;
     while Instant::now() < until {
@@ -84,7 +90,7 @@ fn ask(client: &<CycloneNetwork as RosNetwork>::Client, payload: &[u8]) -> Reque
     panic!("no server was found");
 }
 
-/// A peer; ends with the test.
+/// A peer program, ended with the test.
 struct Peer {
     child: Child,
     lines: Receiver<String>,
@@ -107,7 +113,7 @@ impl Peer {
         Self { child, lines }
     }
 
-    /// The first line of that kind.
+    /// Returns the peer's first line of this kind.
     fn line(&self, event: &str) -> Value {
         loop {
             let line = self.lines.recv_timeout(PATIENCE).expect(event);
@@ -146,7 +152,7 @@ fn read_noise(payload: &[u8]) -> (u64, &[u8]) {
     (seq, &payload[16..16 + length])
 }
 
-/// Two clients of a vendor at once, whose GUIDs begin as `id` says.
+/// Checks two simultaneous clients of a vendor, whose GUIDs begin with `id`.
 fn clients_are_answered(vendor: &str, id: [u8; 2], domain: u32) {
     let network = open(domain, Some("arm-1"));
     let (server, requests) = server(&network, &add());
@@ -232,8 +238,8 @@ fn messages_of_many_fragments_keep_their_identity() {
     }
 }
 
-/// Each gets the replies to its own requests, in its own mapping. A Cyclone reader does not see those in the other, whose
-/// first bytes it would take for an id.
+/// Each client gets the replies to its own requests, in its own mapping. A Cyclone reader does not see replies in the
+/// other one, whose first bytes it would take for an id.
 #[test]
 fn clients_of_both_kinds_share_a_server() {
     let (ros, sgc) = (open(133, None), open(133, Some("arm-1")));
@@ -246,7 +252,7 @@ fn clients_of_both_kinds_share_a_server() {
     let mut asked = Vec::new();
     let mut answered = 0;
     while answered < 60 {
-        // As many of either, so that both are at it at once.
+        // Both kinds send the same number of requests, so that they run at the same time.
         if asked.len() < 30 && asked.len() * 2 <= answered {
             asked.push(ask(&cyclone, &i64s(&[asked.len() as i64, -1])));
         }
@@ -260,7 +266,7 @@ fn clients_of_both_kinds_share_a_server() {
         assert_eq!((&id, read_i64s(&reply)), (asked, vec![n as i64 - 1]));
     }
     assert_answered(&fast.line("summary"), 30);
-    // Behind all others, so that whatever came before has come.
+    // This request is behind all others, so earlier replies have arrived.
     ask(&cyclone, &i64s(&[5, 6]));
     let (id, _) = next(&requests);
     server.reply(&id, i64s(&[11]).into()).unwrap();

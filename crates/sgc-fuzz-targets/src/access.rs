@@ -5,8 +5,8 @@ use std::sync::OnceLock;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_gateway::{
-    ACCESS_TOKEN_PREFIX, Access, AccessGrant, AccessRules, AccessToken, Admission, PageOrigin, Right, Scope,
-    TokenId,
+    ACCESS_TOKEN_PREFIX, Access, AccessGrant, AccessRules, AccessToken, AdmissionRequest, PageOrigin, Right,
+    Scope, TokenId,
 };
 use sgc_trust::{EnrollRequest, Fleet, Identity};
 use sgc_wire::UnixMillis;
@@ -67,7 +67,7 @@ pub fn run(input: &[u8]) {
             let peer = "127.0.0.1:1".parse().unwrap();
             let token = Some(altered.as_str());
             let admission =
-                Admission { peer, encrypted: true, origin: None, token, certificate: None, now: NOW };
+                AdmissionRequest { peer, encrypted: true, origin: None, token, certificate: None, now: NOW };
             assert_eq!(access.admit(&admission).is_ok(), altered == cast.token);
         }
         2 => {

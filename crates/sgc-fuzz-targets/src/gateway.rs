@@ -6,7 +6,7 @@ use std::time::Duration;
 use futures_util::{SinkExt, StreamExt};
 use sgc_gateway::rosbridge::RosbridgeOptions;
 use sgc_gateway::{
-    Client, Hub, HubOptions, Scope, Session, SessionLimits, Shipped, Types, foxglove, rosbridge,
+    Client, Hub, HubOptions, Scope, Session, SessionLimits, ShippedDefinitions, Types, foxglove, rosbridge,
 };
 use sgc_testkit::{FakeDomain, FakeRos};
 use tokio::runtime::{Builder, Runtime};
@@ -31,7 +31,8 @@ fn place() -> &'static Place {
         let runtime = Builder::new_current_thread().enable_all().build().unwrap();
         let domain = FakeDomain::default();
         let (own, other) = (Arc::new(domain.join(false)), domain.join(false));
-        let hub = runtime.block_on(Hub::start(own, Types::new(Shipped), HubOptions::default())).unwrap();
+        let hub =
+            runtime.block_on(Hub::start(own, Types::new(ShippedDefinitions), HubOptions::default())).unwrap();
         Place { runtime, hub, _domain: domain, _other: other }
     })
 }

@@ -1,9 +1,9 @@
-//! [`AccessWatch`]: the rules in force, and the moment at which a client's right ends: by revocation, by expiry, by a reload, or by
-//! the revocation of a certificate.
+//! [`AccessWatch`]: the rules in force, and the time at which a client's rights end: by revocation of a token or
+//! certificate, by expiry or by a reload.
 //!
-//! This is the only mechanism that ends sessions for their rights. Every protocol waits for it by
-//! [`Session::until_denied`](crate::Session::until_denied). Nothing is polled: rules tell that they changed, and a timer ends
-//! when a right does.
+//! No other mechanism ends sessions for their rights. Every protocol waits for it by
+//! [`Session::until_denied`](crate::Session::until_denied). Nothing is polled: the rules announce changes, and a
+//! timer ends with a right.
 
 use std::fmt;
 use std::sync::Arc;
@@ -11,10 +11,10 @@ use std::sync::Arc;
 use sgc_wire::UnixMillis;
 use tokio::sync::watch;
 
-use crate::access::{Access, Client, Denied};
+use crate::access::{Access, Client, Denial};
 use crate::clock::WallClock;
 
-/// The rules in force. Cloning shares.
+/// The rules in force. Clones share.
 #[derive(Clone)]
 pub struct AccessWatch {
     rules: Arc<watch::Sender<Access>>,
@@ -28,12 +28,12 @@ impl fmt::Debug for AccessWatch {
 }
 
 impl AccessWatch {
-    /// Creates a watch of these rules, by that clock.
+    /// Creates a watch of these rules with this clock.
     pub fn new(access: Access, clock: WallClock) -> Self {
         Self { rules: Arc::new(watch::Sender::new(access)), clock }
     }
 
-    /// Returns the rules as they are now.
+    /// Returns the current rules.
     pub fn current(&self) -> Access {
         self.rules.borrow().clone()
     }
@@ -48,8 +48,8 @@ impl AccessWatch {
         self.clock.now()
     }
 
-    /// Waits until a client's right ends, and says why it has.
-    pub async fn until_denied(&self, client: &Client) -> Denied {
+    /// Waits until a client's rights end and returns the reason.
+    pub async fn until_denied(&self, client: &Client) -> Denial {
         let mut rules = self.rules.subscribe();
         loop {
             let current = rules.borrow_and_update().clone();
@@ -63,7 +63,7 @@ impl AccessWatch {
                 }
             };
             tokio::select! {
-                // The sender is as old as this.
+                // The sender lives as long as `self`, so it cannot be gone.
                 _ = rules.changed() => {}
                 () = expires => {}
             }

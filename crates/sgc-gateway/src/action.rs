@@ -1,7 +1,7 @@
-//! Actions (the ROS 2 design article "Actions"): [`Goal`] is one that a client has sent, [`ActionServing`] an action that a
-//! client serves.
+//! Actions (ROS 2 design article "Actions"): [`Goal`] is a goal that a client sent, [`ActionServing`] an action that
+//! a client serves.
 //!
-//! An action is three services and two topics, which are used here as any other: nothing below knows of actions.
+//! An action consists of three services and two topics. The layers below treat these like any others.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -17,60 +17,60 @@ use tokio::sync::mpsc;
 use tokio::time::Instant;
 
 use crate::access::Right;
-use crate::aside::aside_if_long;
 use crate::content::{Content, Form, serialise, write};
+use crate::definitions::InterfaceType;
 use crate::error::GatewayError;
 use crate::feed::Subscription;
-use crate::hub::{Shared, lock};
+use crate::hub::{HubState, lock};
+use crate::offload::offload_if_long;
 use crate::publisher::{Account, Publication};
-use crate::quota::{Charge, Quota, Resource, Waiting};
+use crate::quota::{Charge, PendingBytes, Quota, Resource};
 use crate::service::{Caller, Replier, Request, Serving};
 use crate::session::{Session, Subscribe};
-use crate::types::InterfaceType;
 
-/// How long a server may take to say whether it takes a goal, or cancels one.
+/// Time within which a server must answer a goal or a cancel request.
 const ANSWER_MAX: Duration = Duration::from_secs(10);
-/// Messages of feedback that wait for a client.
+/// Feedback messages that may be queued for a client.
 const FEEDBACK_DEPTH: usize = 100;
-/// What waits for a client that serves.
+/// Events that may be queued for a client that serves an action.
 const EVENTS_MAX: usize = 256;
-/// Goals that an action remembers; the oldest that ended give way.
+/// Most goals of an action. The goal that ended first gives way.
 const GOALS_MAX: usize = 1024;
-/// Bytes that a kept result costs beside its payload.
+/// Cost of a kept result in bytes, beside its payload.
 const RESULT_COST_BYTES: usize = 256;
-/// How long the result of a goal is kept (`rcl_action`'s default).
+/// Time for which results are kept (the default of `rcl_action`).
 const RESULT_KEPT: Duration = Duration::from_secs(900);
-/// How long an action that nobody serves any more says how its goals ended.
+/// Time for which an action still answers requests for results after its client stopped serving.
 const FAREWELL: Duration = Duration::from_secs(2);
-/// Where the id of a goal is in a message of feedback: behind the encapsulation header.
+/// Position of the goal id in a feedback message: behind the encapsulation header.
 const GOAL_ID_AT: std::ops::Range<usize> = 4..20;
 
-/// Id of a goal (`unique_identifier_msgs/msg/UUID`).
+/// The id of a goal (`unique_identifier_msgs/msg/UUID`).
 pub type GoalId = [u8; 16];
 
-/// How a goal stands (`action_msgs/msg/GoalStatus`).
+/// The status of a goal (`action_msgs/msg/GoalStatus`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(i8)]
 pub enum GoalStatus {
-    /// Nobody knows of it.
+    /// The goal is not known.
     Unknown = 0,
-    /// It was taken.
+    /// The server accepted the goal.
     Accepted = 1,
-    /// It is worked on.
+    /// The server executes the goal.
     Executing = 2,
-    /// It is to be given up.
+    /// A client asked to cancel the goal.
     Canceling = 3,
-    /// It is done.
+    /// The goal succeeded.
     Succeeded = 4,
-    /// It was given up as somebody wished.
+    /// The goal was cancelled on request.
     Canceled = 5,
-    /// It was given up.
+    /// The server aborted the goal.
     Aborted = 6,
 }
 
 impl GoalStatus {
-    /// Of its number.
-    pub fn of(number: i64) -> Self {
+    /// Returns the status with this number, or [`Self::Unknown`].
+    pub fn from_number(number: i64) -> Self {
         match number {
             1 => Self::Accepted,
             2 => Self::Executing,
@@ -82,39 +82,39 @@ impl GoalStatus {
         }
     }
 
-    /// Whether it has ended.
+    /// Returns `true` if the goal has ended.
     pub fn is_end(self) -> bool {
         self >= Self::Succeeded
     }
 }
 
-/// What a server says to the wish that a goal be given up (`action_msgs/srv/CancelGoal`).
+/// The answer to a cancel request (`action_msgs/srv/CancelGoal`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(i8)]
 pub enum CancelAnswer {
-    /// It is being given up.
+    /// The goal is being cancelled.
     Taken = 0,
-    /// It goes on.
+    /// The request was rejected and the goal continues.
     Rejected = 1,
-    /// Nobody knows of it.
+    /// The goal is not known.
     UnknownGoal = 2,
-    /// It has ended.
+    /// The goal has ended.
     Ended = 3,
 }
 
-/// How a goal ended.
+/// The outcome of a goal.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Outcome {
-    /// How.
+    /// The final status.
     pub status: GoalStatus,
-    /// The result, in the form that was asked for.
+    /// The result in the requested form.
     pub result: Bytes,
 }
 
-/// A goal that a client has sent and a server has taken.
+/// A goal that a client sent and a server accepted.
 #[derive(Clone)]
 pub struct Goal {
-    shared: Arc<Shared>,
+    shared: Arc<HubState>,
     action: Arc<str>,
     id: GoalId,
     result: Arc<Layout>,
@@ -123,7 +123,7 @@ pub struct Goal {
     _charge: Arc<Charge>,
 }
 
-/// What a server tells of a goal while it works on it.
+/// The feedback of a goal.
 #[derive(Debug)]
 pub struct Feedback {
     id: GoalId,
@@ -132,7 +132,7 @@ pub struct Feedback {
 }
 
 impl Session {
-    /// The type of an action: as it is said, else as the network has it.
+    /// Returns the type of an action: the given one if it agrees with the network, else the one on the network.
     pub fn action_type(&self, action: &str, said: Option<&str>) -> Result<String, GatewayError> {
         let graph = self.hub().graph();
         let actual = graph.actions.get(action).map(|info| info.type_name.clone());
@@ -150,7 +150,7 @@ impl Session {
         }
     }
 
-    /// Sends a goal, and waits until a server has taken it; feedback is heard from before that.
+    /// Sends a goal and waits until a server accepts it. The subscription to feedback exists before that.
     pub async fn send_goal(
         &self,
         action: &str,
@@ -180,7 +180,7 @@ impl Session {
         let subscription = self.subscribe_checked(wanted).await?;
         let mut id = [0; 16];
         rand::fill(&mut id).map_err(|_| GatewayError::Stopping)?;
-        // A UUID of random bits (RFC 9562, 5.4).
+        // The id is a random UUID (RFC 9562, 5.4).
         id[6] = id[6] & 0x0f | 0x40;
         id[8] = id[8] & 0x3f | 0x80;
         let goal = goal.value(&layouts.goal)?;
@@ -219,25 +219,25 @@ impl Session {
 }
 
 impl Goal {
-    /// Its id.
+    /// Returns the id of the goal.
     pub fn id(&self) -> &GoalId {
         &self.id
     }
 
-    /// Waits for its end, so long at most.
+    /// Waits for the end of the goal, at most for `max`.
     pub async fn outcome(&self, form: Form, max: Duration) -> Result<Outcome, GatewayError> {
         let request = record([("goal_id", uuid(&self.id))]);
         let payload = write(&self.get_result.halves.request, &request, Form::Cdr)?;
         let reply = self.get_result.call(payload, max, &self.quota).await?;
-        aside_if_long(reply.len(), || {
+        offload_if_long(reply.len(), || {
             let reply = self.get_result.halves.reply.decode(&reply).map_err(GatewayError::Decode)?;
-            let status = GoalStatus::of(integer(&reply, "status"));
+            let status = GoalStatus::from_number(integer(&reply, "status"));
             let result = reply.at("result").unwrap_or(Value::Record(Vec::new()));
             Ok(Outcome { status, result: write(&self.result, &result, form)? })
         })
     }
 
-    /// Asks the server to give it up.
+    /// Asks the server to cancel the goal.
     pub async fn cancel(&self) -> Result<CancelAnswer, GatewayError> {
         let service = format!("{}/_action/cancel_goal", self.action);
         let caller =
@@ -263,24 +263,24 @@ impl fmt::Debug for Goal {
 }
 
 impl Feedback {
-    /// Waits for the next word of this goal; `None` once the gateway stops.
+    /// Waits for the next feedback of this goal. Returns `None` once the gateway stops.
     pub async fn next(&mut self, form: Form) -> Option<Result<Bytes, GatewayError>> {
         loop {
             let delivery = self.subscription.next().await?;
             let payload = &delivery.message.payload;
-            // Those of other goals are not decoded, but where the sizes of what is within come first.
+            // Feedback of other goals is skipped without decoding, except in encodings that put a size before the id.
             let is_delimited = payload.get(1).is_some_and(|id| *id >= 8);
             if !is_delimited && payload.get(GOAL_ID_AT) != Some(&self.id) {
                 continue;
             }
             let read = || self.read(payload, form);
-            if let Some(said) = aside_if_long(payload.len(), read) {
+            if let Some(said) = offload_if_long(payload.len(), read) {
                 return Some(said);
             }
         }
     }
 
-    /// What a message says of this goal.
+    /// Returns the feedback in a message, or `None` if it belongs to another goal.
     fn read(&self, payload: &Bytes, form: Form) -> Option<Result<Bytes, GatewayError>> {
         let said = match self.subscription.layout().decode(payload) {
             Ok(said) => said,
@@ -294,7 +294,7 @@ impl Feedback {
     }
 }
 
-/// What goals, results and feedback of an action look like.
+/// The layouts of an action's goals, results and feedback.
 #[derive(Clone, Debug)]
 struct Layouts {
     goal: Arc<Layout>,
@@ -303,38 +303,38 @@ struct Layouts {
 }
 
 impl Layouts {
-    fn find(shared: &Shared, of: &str) -> Result<Self, GatewayError> {
+    fn find(shared: &HubState, of: &str) -> Result<Self, GatewayError> {
         let layout = |part: &str| shared.types.layout(&format!("{of}_{part}"), None);
         Ok(Self { goal: layout("Goal")?, result: layout("Result")?, feedback: layout("Feedback")? })
     }
 }
 
-/// What a client that serves an action is told.
+/// An event for a client that serves an action.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ActionEvent {
-    /// A goal, which is to be taken or rejected.
+    /// A goal to accept or reject.
     Goal {
-        /// Its id.
+        /// The id of the goal.
         id: GoalId,
-        /// What is wanted.
+        /// The goal itself.
         goal: Value,
     },
-    /// A goal that was taken is to be given up: it is the client's to end it.
+    /// A request to cancel an accepted goal, which the client then ends.
     Cancel {
-        /// Its id.
+        /// The id of the goal.
         id: GoalId,
     },
 }
 
-/// An action that a client serves; ends when dropped, and with it goals that were taken: they are aborted, and who asks within
-/// two seconds is told so.
+/// An action that a client serves. Dropping it aborts accepted goals; clients that ask for their results within two
+/// seconds learn of that.
 #[derive(Debug)]
 pub struct ActionServing {
     events: mpsc::Receiver<ActionEvent>,
     server: Arc<ActionServer>,
 }
 
-/// What answers at an action that a client serves.
+/// The handle that answers goals of a served action.
 #[derive(Clone, Debug)]
 pub struct ActionReplier(Arc<ActionServer>);
 
@@ -343,8 +343,8 @@ struct ActionServer {
     action: String,
     layouts: Layouts,
     goals: Mutex<Goals>,
-    /// Bytes of results that are kept.
-    kept: Arc<Waiting>,
+    /// The bytes of kept results.
+    kept: Arc<PendingBytes>,
     send_goal: Replier,
     get_result: Replier,
     cancel_goal: Replier,
@@ -353,26 +353,26 @@ struct ActionServer {
     telling: tokio::sync::Mutex<()>,
 }
 
-type Goals = BTreeMap<GoalId, Served>;
+type Goals = BTreeMap<GoalId, GoalState>;
 
 #[derive(Debug)]
-struct Served {
+struct GoalState {
     status: GoalStatus,
-    /// The request that has not been answered yet.
+    /// The goal request that has not been answered yet.
     asked: Option<RequestId>,
     taken_ns: i64,
     result: Option<KeptResult>,
-    /// Those who wait for the result.
+    /// Requests that wait for the result.
     waiting: Vec<RequestId>,
     ended: Option<Instant>,
 }
 
-/// The result of a goal, for those that ask later. It takes room among the bytes that wait for the client that serves.
+/// The result of a goal, kept for later requests. It counts as queued bytes of the client that serves the action.
 #[derive(Debug)]
 struct KeptResult {
-    /// The result, serialised.
+    /// The serialised result.
     payload: Bytes,
-    waiting: Arc<Waiting>,
+    waiting: Arc<PendingBytes>,
 }
 
 impl Drop for KeptResult {
@@ -383,7 +383,7 @@ impl Drop for KeptResult {
 
 impl ActionServing {
     async fn new(
-        shared: &Arc<Shared>,
+        shared: &Arc<HubState>,
         action: &str,
         of: &str,
         (quota, charge): (Quota, Charge),
@@ -400,7 +400,7 @@ impl ActionServing {
         let account = || Account { quota: quota.clone(), charge: None, kept: None };
         let feedback =
             Publication::new(shared, part("feedback"), feedback_type, Qos::default(), account()).await?;
-        let kept = Arc::new(Waiting::new(results_bytes_max, quota.clone()));
+        let kept = Arc::new(PendingBytes::new(results_bytes_max, quota.clone()));
         let latched =
             Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() };
         let status_type = "action_msgs/msg/GoalStatusArray".to_owned();
@@ -422,29 +422,29 @@ impl ActionServing {
         Ok(Self { events, server })
     }
 
-    /// The action.
+    /// Returns the name of the action.
     pub fn action(&self) -> &str {
         &self.server.action
     }
 
-    /// Waits for what comes next; `None` once the gateway stops.
+    /// Waits for the next event. Returns `None` once the gateway stops.
     pub async fn next(&mut self) -> Option<ActionEvent> {
         self.events.recv().await
     }
 
-    /// A goal in a form.
+    /// Converts a goal to a form.
     pub fn write(&self, goal: &Value, form: Form) -> Result<Bytes, GatewayError> {
         write(&self.server.layouts.goal, goal, form)
     }
 
-    /// What answers.
+    /// Returns the handle that answers goals.
     pub fn replier(&self) -> ActionReplier {
         ActionReplier(Arc::clone(&self.server))
     }
 }
 
 impl ActionReplier {
-    /// Takes a goal, which is worked on from now on, or rejects it.
+    /// Accepts a goal, which is then executing, or rejects it.
     pub async fn answer(&self, id: &GoalId, is_taken: bool) -> Result<(), GatewayError> {
         let server = &self.0;
         let (asked, taken_ns) = {
@@ -463,7 +463,7 @@ impl ActionReplier {
         if is_taken { server.publish_status().await } else { Ok(()) }
     }
 
-    /// Tells of a goal that is worked on.
+    /// Publishes feedback of an executing goal.
     pub async fn feedback(&self, id: &GoalId, content: &Content) -> Result<(), GatewayError> {
         let server = &self.0;
         if lock(&server.goals).get(id).is_none_or(|goal| goal.status.is_end()) {
@@ -511,7 +511,7 @@ impl ActionServer {
             }
             waiting
         };
-        // Who has the result finds the status as it says.
+        // A client that has the result must find the status that matches it.
         let published = self.publish_status().await;
         for asked in waiting {
             self.reply_result(asked, status, result.clone()).await;
@@ -519,11 +519,11 @@ impl ActionServer {
         published
     }
 
-    /// Keeps the result of a goal, if there is room once the results of goals that ended before have given way.
+    /// Keeps the result of a goal if there is room. Results of goals that ended earlier give way.
     fn keep(&self, goals: &mut Goals, id: &GoalId, payload: Bytes) -> Option<KeptResult> {
         let bytes = payload.len() + RESULT_COST_BYTES;
         while !self.kept.has_room(bytes) {
-            let ended = |(other, goal): (&GoalId, &Served)| {
+            let ended = |(other, goal): (&GoalId, &GoalState)| {
                 Some((goal.ended?, *other)).filter(|(_, other)| other != id && goal.result.is_some())
             };
             let (_, oldest) = goals.iter().filter_map(ended).min()?;
@@ -549,7 +549,7 @@ impl ActionServer {
     }
 
     async fn publish_status(&self) -> Result<(), GatewayError> {
-        // One at a time, so that what is said last is how they stand.
+        // Publications take turns, so that the last one has the current state.
         let _turn = self.telling.lock().await;
         let list = lock(&self.goals)
             .iter()
@@ -562,9 +562,9 @@ impl ActionServer {
         self.status.publish_value(&record([("status_list", Value::List(list))])).await
     }
 
-    /// Makes room for one more; false if all are worked on.
+    /// Makes room for one more goal. Returns `false` if all goals are active.
     fn has_room(goals: &mut Goals) -> bool {
-        let is_old = |goal: &Served| goal.ended.is_some_and(|ended| ended.elapsed() >= RESULT_KEPT);
+        let is_old = |goal: &GoalState| goal.ended.is_some_and(|ended| ended.elapsed() >= RESULT_KEPT);
         goals.retain(|_, goal| !is_old(goal));
         if goals.len() >= GOALS_MAX
             && let Some((_, oldest)) = goals.iter().filter_map(|(id, goal)| Some((goal.ended?, *id))).min()
@@ -584,7 +584,7 @@ impl ActionServer {
                 let taken_ns = now_ns();
                 let (asked, status) = (Some(request.id), GoalStatus::Unknown);
                 let (result, waiting, ended) = (None, Vec::new(), None);
-                goals.insert(*id, Served { status, asked, taken_ns, result, waiting, ended });
+                goals.insert(*id, GoalState { status, asked, taken_ns, result, waiting, ended });
             }
             is_new
         });
@@ -614,7 +614,7 @@ impl ActionServer {
                 Some(goal) if goal.ended.is_some() => {
                     let kept = goal.result.as_ref();
                     let result = kept.and_then(|kept| self.layouts.result.decode(&kept.payload).ok());
-                    // A result that found no room is forgotten, and so is its goal.
+                    // A result without room is forgotten together with its goal.
                     let forgotten = || (GoalStatus::Unknown, self.no_result());
                     Some(result.map_or_else(forgotten, |result| (goal.status, result)))
                 }
@@ -642,7 +642,8 @@ impl ActionServer {
             let is_all = id == GoalId::default();
             let mut chosen = Vec::new();
             for (goal, served) in goals.iter_mut() {
-                // All, all until then, or the one: and with a time, those until then beside it.
+                // An empty request means all goals; a time alone means all goals until then; an id means one goal;
+                // both mean the goal and all until then.
                 let is_meant = if is_all && until == 0 {
                     true
                 } else {
@@ -675,7 +676,8 @@ impl ActionServer {
     }
 }
 
-/// Takes what comes at the three services of an action, until nobody works on goals any more; then for a while to say so.
+/// Handles the three services of an action until the client stops serving, and answers requests for results a little
+/// longer.
 async fn serve(
     server: Arc<ActionServer>,
     [mut goals, mut results, mut cancels]: [Serving; 3],
@@ -709,7 +711,7 @@ fn uuid(id: &GoalId) -> Value {
     record([("uuid", Value::Octets(Bytes::copy_from_slice(id)))])
 }
 
-/// A `builtin_interfaces/msg/Time`.
+/// Returns a `builtin_interfaces/msg/Time`.
 fn stamp(ns: i64) -> Value {
     let (sec, nanosec) = (ns.div_euclid(1_000_000_000), ns.rem_euclid(1_000_000_000));
     record([("sec", Value::Int(sec)), ("nanosec", Value::Uint(nanosec.unsigned_abs()))])

@@ -1,4 +1,4 @@
-//! [`Budget`]: room for long messages of one client, so that many that are not read take no more than a few.
+//! [`Budget`]: room for one client's long messages, so that unread ones take bounded memory.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -8,7 +8,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use crate::error::GatewayError;
 use crate::quota::{Permits, Quota};
 
-/// Messages up to that length need no room, since they are counted; that of longer ones is in multiples of it.
+/// The unit of room, in bytes. Messages up to one unit need no room, because their number is bounded.
 pub(crate) const UNIT_BYTES: usize = 64 << 10;
 
 /// Room for long messages.
@@ -18,33 +18,33 @@ pub(crate) struct Budget {
     units: usize,
     /// The bounds that the client shares with others.
     quota: Quota,
-    /// Of replies that are there, and wait for room.
+    /// The units of replies that wait for room.
     waiting_units: AtomicUsize,
 }
 
 /// A reply that waits for room.
-struct Waits<'a>(&'a AtomicUsize, usize);
+struct WaitingReply<'a>(&'a AtomicUsize, usize);
 
-impl Drop for Waits<'_> {
+impl Drop for WaitingReply<'_> {
     fn drop(&mut self) {
         self.0.fetch_sub(self.1, Ordering::Relaxed);
     }
 }
 
-/// What a message takes of it, until it is dropped.
+/// The room of one message, returned on drop.
 #[derive(Debug)]
 pub(crate) struct Room(
     #[expect(dead_code, reason = "they are for their end")] (OwnedSemaphorePermit, Permits),
 );
 
 impl Budget {
-    /// Creates room for so many bytes of one client, within its quota.
+    /// Creates room for `bytes_max` bytes of one client, within its quota.
     pub(crate) fn new(bytes_max: usize, quota: Quota) -> Self {
         let units = (bytes_max / UNIT_BYTES).clamp(1, Semaphore::MAX_PERMITS);
         Self { room: Arc::new(Semaphore::new(units)), units, quota, waiting_units: AtomicUsize::new(0) }
     }
 
-    /// Waits for room for a message; one that is longer than all there is waits for all. Short ones need none.
+    /// Waits for room for a message. A message longer than the budget waits for all of it. Short messages need none.
     pub(crate) async fn take(&self, bytes: usize) -> Option<Room> {
         if bytes <= UNIT_BYTES {
             return None;
@@ -54,14 +54,14 @@ impl Budget {
         Some(Room((own, self.quota.room(units).await?)))
     }
 
-    /// The same for a reply, which nobody holds back while it waits: of those no more wait than there is room in all.
+    /// Waits for room for a reply, whose memory is taken already. Fails if waiting replies exceed the budget.
     pub(crate) async fn take_for_reply(&self, bytes: usize) -> Result<Option<Room>, GatewayError> {
         if bytes <= UNIT_BYTES {
             return Ok(None);
         }
         let units = self.units_of(bytes);
         let before = self.waiting_units.fetch_add(units, Ordering::Relaxed);
-        let _waits = Waits(&self.waiting_units, units);
+        let _waits = WaitingReply(&self.waiting_units, units);
         if before + units > self.units {
             let max = self.units * UNIT_BYTES;
             return Err(GatewayError::TooMany { what: "bytes of replies that it does not read", max });
@@ -69,7 +69,7 @@ impl Budget {
         Ok(self.take(bytes).await)
     }
 
-    /// Room for a message that nobody can wait with.
+    /// Takes room for a message without waiting.
     pub(crate) fn take_at_once(&self, bytes: usize) -> Result<Option<Room>, GatewayError> {
         if bytes <= UNIT_BYTES {
             return Ok(None);
@@ -104,7 +104,7 @@ mod tests {
         let waits = tokio::time::timeout(Duration::from_millis(20), budget.take(200 << 10)).await;
         assert!(waits.is_err());
         drop(first);
-        // Replies wait for it as well, as many as there is room in all.
+        // Replies wait too, up to the whole budget.
         let all = budget.take(1 << 20).await;
         let waits = budget.take_for_reply(900 << 10);
         tokio::pin!(waits);
@@ -113,7 +113,7 @@ mod tests {
         assert!(budget.take_for_reply(1000).await.unwrap().is_none());
         drop(all);
         assert!(waits.await.unwrap().is_some());
-        // What is longer than all takes all.
+        // A message longer than the budget takes all of it.
         assert!(budget.take(50 << 20).await.is_some());
     }
 }

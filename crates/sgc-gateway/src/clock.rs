@@ -1,4 +1,4 @@
-//! [`WallClock`]: the time of day, by which rights end. Waits for a moment of it, and hears when somebody sets it.
+//! [`WallClock`]: the time of day, by which rights end. It waits for a time and notices when the clock is set.
 
 use std::fmt;
 use std::io;
@@ -15,25 +15,25 @@ use tokio::net::unix::pipe::Receiver;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
-/// Longest sleep, where the system says when the clock is set. A longer wait is several sleeps.
+/// Longest sleep if the system reports changes of the clock. A longer wait takes several sleeps.
 const SLEEP_MAX: Duration = Duration::from_secs(86_400);
-/// Longest sleep where the system does not say so: a clock that was set is noticed this late.
+/// Longest sleep otherwise, and so the delay with which a change of the clock is noticed.
 const SLEEP_BLIND_MAX: Duration = Duration::from_secs(60);
-/// Seconds from the epoch at which the timer would end that hears of the clock: about the year 5138.
+/// Expiry of the timer that reports changes of the clock, in seconds since the epoch: about the year 5138.
 const NEVER_SECS: i64 = 100_000_000_000;
 
 type Now = Arc<dyn Fn() -> UnixMillis + Send + Sync>;
 
-/// The time of day. Cloning shares.
+/// The time of day. Clones share.
 #[derive(Clone)]
 pub struct WallClock {
     now: Now,
-    /// Changes whenever somebody sets the clock; none if the system does not say so.
+    /// Changes whenever the clock is set; `None` if the system does not report that.
     sets: Option<watch::Receiver<u64>>,
     _listener: Option<Arc<Listener>>,
 }
 
-/// The task that hears of the clock.
+/// The task that receives reports of clock changes.
 struct Listener(AbortHandle);
 
 impl Drop for Listener {
@@ -71,7 +71,7 @@ impl WallClock {
         Self { now: Arc::new(now), sets, _listener }
     }
 
-    /// Creates a clock that shows `now`; `sets` changes whenever somebody sets it.
+    /// Creates a clock that shows `now`. `sets` must change whenever the clock is set.
     pub fn new(
         now: impl Fn() -> UnixMillis + Send + Sync + 'static,
         sets: Option<watch::Receiver<u64>>,
@@ -79,12 +79,12 @@ impl WallClock {
         Self { now: Arc::new(now), sets, _listener: None }
     }
 
-    /// Returns the time that it shows.
+    /// Returns the current time.
     pub fn now(&self) -> UnixMillis {
         (self.now)()
     }
 
-    /// Waits until it shows more than `end`.
+    /// Waits until the time is later than `end`.
     pub async fn passes(&self, end: UnixMillis) {
         let mut sets = self.sets.clone();
         let max = if sets.is_some() { SLEEP_MAX } else { SLEEP_BLIND_MAX };
@@ -111,11 +111,12 @@ impl WallClock {
     }
 }
 
-/// A timer that never ends, and says when the clock is set, or the machine wakes (timerfd_create(2), `TFD_TIMER_CANCEL_ON_SET`).
+/// Creates a timer that never expires, and becomes readable when the clock is set or the machine wakes
+/// (timerfd_create(2), `TFD_TIMER_CANCEL_ON_SET`).
 fn sets_of_the_system() -> io::Result<Receiver> {
     let timer = timerfd_create(TimerfdClockId::Realtime, TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC)?;
     arm(&timer)?;
-    // Read as what it is: bytes that come by themselves.
+    // A `Receiver` reads any descriptor that becomes readable by itself.
     Receiver::from_owned_fd_unchecked(timer)
 }
 
@@ -150,7 +151,7 @@ mod tests {
 
     use super::*;
 
-    /// A clock that goes as the runtime's does, and can be set.
+    /// Returns a clock that follows the runtime's time and can be set.
     fn clock() -> (WallClock, Arc<AtomicU64>, watch::Sender<u64>) {
         let (set, sets) = watch::channel(0);
         let (began, ahead) = (tokio::time::Instant::now(), Arc::new(AtomicU64::new(1_000_000)));
@@ -187,7 +188,7 @@ mod tests {
     #[tokio::test]
     async fn the_system_says_when_its_clock_is_set() {
         let timer = sets_of_the_system().unwrap();
-        // Nobody sets it here.
+        // Nothing sets the clock here.
         let quiet = tokio::time::timeout(Duration::from_millis(20), next_set(&timer)).await;
         assert!(quiet.is_err());
         assert!(WallClock::system().sets.is_some());

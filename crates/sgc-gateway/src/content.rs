@@ -1,73 +1,73 @@
-//! [`Content`]: a message in the form in which a client gives or takes it.
+//! [`Content`]: a message in the form that a client sends or receives.
 
 use bytes::Bytes;
 use sgc_cdr::{Encoding, Layout, Value};
 
-use crate::aside::aside_if_long;
 use crate::error::GatewayError;
+use crate::offload::offload_if_long;
 
-/// How a message is written.
+/// The form of a message.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Form {
-    /// As ROS 2 serialises it: encapsulation header and body (RTPS 2.5, 10.2).
+    /// The serialisation of ROS 2: encapsulation header and body (RTPS 2.5, 10.2).
     #[default]
     Cdr,
-    /// As `docs/spec/json.md` has it.
+    /// JSON as in `docs/spec/json.md`.
     Json,
-    /// As the same page has it.
+    /// CBOR as in `docs/spec/json.md`.
     Cbor,
 }
 
 /// A message in one of the forms.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Content {
-    /// Which.
+    /// The form.
     pub form: Form,
     /// The message.
     pub bytes: Bytes,
 }
 
 impl Content {
-    /// A serialised message.
+    /// Creates content from a serialised message.
     pub fn cdr(bytes: impl Into<Bytes>) -> Self {
         Self { form: Form::Cdr, bytes: bytes.into() }
     }
 
-    /// One in JSON.
+    /// Creates content from JSON.
     pub fn json(bytes: impl Into<Bytes>) -> Self {
         Self { form: Form::Json, bytes: bytes.into() }
     }
 
-    /// One in CBOR.
+    /// Creates content from CBOR.
     pub fn cbor(bytes: impl Into<Bytes>) -> Self {
         Self { form: Form::Cbor, bytes: bytes.into() }
     }
 
-    /// What it says.
+    /// Decodes the message.
     pub fn value(&self, layout: &Layout) -> Result<Value, GatewayError> {
-        aside_if_long(self.bytes.len(), || match self.form {
+        offload_if_long(self.bytes.len(), || match self.form {
             Form::Cdr => layout.decode(&self.bytes).map_err(GatewayError::Decode),
             Form::Json => layout.from_json(&self.bytes).map_err(GatewayError::Value),
             Form::Cbor => layout.from_cbor(&self.bytes).map_err(GatewayError::Value),
         })
     }
 
-    /// The same, serialised: what is serialised already is believed to be of its type, as it is of any ROS 2 publisher.
+    /// Serialises the message. A message in CDR is passed on unchecked, like that of any ROS 2 publisher.
     pub fn to_cdr(&self, layout: &Layout) -> Result<Bytes, GatewayError> {
         match self.form {
             Form::Cdr => Ok(self.bytes.clone()),
-            _ => aside_if_long(self.bytes.len(), || serialise(layout, &self.value(layout)?)),
+            _ => offload_if_long(self.bytes.len(), || serialise(layout, &self.value(layout)?)),
         }
     }
 }
 
-/// A value, serialised as ROS 2 does by default.
+/// Serialises a value in the default encoding of ROS 2.
 pub(crate) fn serialise(layout: &Layout, value: &Value) -> Result<Bytes, GatewayError> {
     let bytes = layout.encode_as(value, Encoding::default()).map_err(GatewayError::Value)?;
     Ok(bytes.into())
 }
 
-/// A value in a form; `layout` is of its type.
+/// Converts a value to a form. `layout` is the layout of its type.
 pub(crate) fn write(layout: &Layout, value: &Value, form: Form) -> Result<Bytes, GatewayError> {
     Ok(match form {
         Form::Cdr => serialise(layout, value)?,
@@ -76,11 +76,11 @@ pub(crate) fn write(layout: &Layout, value: &Value, form: Form) -> Result<Bytes,
     })
 }
 
-/// A serialised message in a form.
+/// Converts a serialised message to a form.
 pub(crate) fn convert(layout: &Layout, payload: &Bytes, form: Form) -> Result<Bytes, GatewayError> {
     match form {
         Form::Cdr => Ok(payload.clone()),
-        _ => aside_if_long(payload.len(), || {
+        _ => offload_if_long(payload.len(), || {
             write(layout, &layout.decode(payload).map_err(GatewayError::Decode)?, form)
         }),
     }

@@ -1,4 +1,4 @@
-//! [`GatewayError`]: why a client does not get what it asks for, in words for its user.
+//! [`GatewayError`]: the reason why a client's request fails, in words for its user.
 
 use sgc_cdr::{DecodeError, TypeError, ValueError};
 use sgc_ros::RosError;
@@ -6,78 +6,78 @@ use sgc_ros::RosError;
 use crate::access::Right;
 use crate::quota::Pool;
 
-/// Why a client does not get what it asks for.
+/// The reason why a request fails.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum GatewayError {
-    /// No name of ROS 2.
+    /// The name is not a valid ROS 2 name.
     #[error("{name:?} is no name of a topic, service or action: write an absolute one, such as /arm/state")]
     Name {
-        /// What was said.
+        /// The given name.
         name: String,
     },
-    /// No type of ROS 2, or of the wrong kind.
+    /// The name is not a type of this kind of interface.
     #[error("{name:?} is no type of a {what}: write one such as {example}")]
     TypeName {
-        /// What was said.
+        /// The given name.
         name: String,
-        /// What it was to be of.
+        /// The kind of interface.
         what: &'static str,
-        /// One that is right.
+        /// A valid example.
         example: &'static str,
     },
-    /// Nobody has said what type it is.
+    /// The type is not given and not known.
     #[error("the type of {name} is not known, since nobody has it yet: say it")]
     TypeUnknown {
         /// The topic, service or action.
         name: String,
     },
-    /// It is there with another type.
+    /// The interface exists with another type.
     #[error("{name} is of type {actual}, not {wanted}")]
     OtherType {
         /// The topic, service or action.
         name: String,
-        /// What the network has.
+        /// The type on the network.
         actual: String,
-        /// What was said.
+        /// The given type.
         wanted: String,
     },
-    /// The scope does not have it.
+    /// The client's scope does not include the right.
     #[error("{client} may not {} {name}: its scope does not have it", word(*right))]
     Denied {
-        /// Who.
+        /// The client.
         client: String,
-        /// What.
+        /// The missing right.
         right: Right,
-        /// With what.
+        /// The interface.
         name: String,
     },
-    /// It was asked for by who the client was then.
+    /// The client authenticated as another one after the request.
     #[error("you are {client} now, who may other things: ask again")]
     OtherClient {
-        /// Who the client is now.
+        /// The current client.
         client: String,
     },
-    /// The definition is not found, or not right.
+    /// The type definition is missing or invalid.
     #[error("no definition: {0}; name a directory that has it with `definitions` in [ros]")]
     Definition(TypeError),
-    /// What the client sent is no such message.
+    /// The client's message does not have the type.
     #[error("not a message of that type: {0}")]
     Value(ValueError),
-    /// What came is not what its type says.
+    /// A message from the network does not have its type.
     #[error("a message is not what its type says: {0}")]
     Decode(DecodeError),
-    /// A payload of the wrong kind or length.
+    /// A message is too long.
     #[error("a message of {bytes} bytes: at most {max}")]
     TooLong {
-        /// Its length.
+        /// The length in bytes.
         bytes: usize,
-        /// What is taken.
+        /// The longest accepted length in bytes.
         max: usize,
     },
-    /// A client wants more than one is given.
+    /// The client has reached a bound.
     #[error("{max} {what} at most for a client")]
     TooMany {
-        /// Of what.
+        /// The bounded resource.
         what: &'static str,
         /// The bound.
         max: usize,
@@ -85,88 +85,88 @@ pub enum GatewayError {
     /// Clients that share a bound have reached it.
     #[error("{max} {what} at most for {pool}")]
     Crowded {
-        /// Of what.
+        /// The bounded resource.
         what: &'static str,
         /// The bound.
         max: usize,
-        /// Whose it is.
+        /// The clients that share the bound.
         pool: Pool,
     },
-    /// Nothing in the client's view of the graph has the type, whether there is such a type or not.
+    /// No interface in the client's view has the type. The error does not reveal whether the type exists.
     #[error("nothing that this client may use has type {name}")]
     TypeNotSeen {
         /// The type.
         name: String,
     },
-    /// Something is asked for twice.
+    /// The client repeats a request that is in effect.
     #[error("{name} is {what} by this client already")]
     Twice {
-        /// With what.
+        /// The interface.
         name: String,
-        /// What is.
+        /// The state of the interface.
         what: &'static str,
     },
-    /// Something was not asked for.
+    /// The client ends something that it did not begin.
     #[error("{name} is not {what} by this client")]
     NotThere {
-        /// With what.
+        /// The interface.
         name: String,
-        /// What is not.
+        /// The state that the interface lacks.
         what: &'static str,
     },
-    /// Nobody serves it.
+    /// The service or action has no server.
     #[error("nobody serves {name}")]
     NoServer {
         /// The service or action.
         name: String,
     },
-    /// Nobody answered in time.
+    /// No answer came in time.
     #[error("no answer of {name} within {waited_ms} ms")]
     Timeout {
         /// The service or action.
         name: String,
-        /// How long was waited.
+        /// The time waited.
         waited_ms: u64,
     },
-    /// Its server does not take a goal.
+    /// The server rejected the goal.
     #[error("the server of {name} rejected the goal")]
     GoalRejected {
         /// The action.
         name: String,
     },
-    /// The local network refused.
+    /// The local network failed.
     #[error(transparent)]
     Ros(#[from] RosError),
-    /// The gateway is going down.
+    /// The gateway is stopping.
     #[error("the gateway is stopping")]
     Stopping,
 }
 
-/// What sort of refusal it is: protocols have codes for these.
+/// The kind of an error, which protocols map to their codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ErrorKind {
-    /// What was asked for cannot be right.
+    /// The request is invalid.
     Invalid,
-    /// It is not there.
+    /// The interface does not exist.
     NotFound,
-    /// It is there already.
+    /// The client has it already.
     Exists,
-    /// The client may not.
+    /// The client lacks the right.
     Denied,
-    /// The client has too much.
+    /// A bound is reached.
     Exhausted,
-    /// Who was asked does not want to.
+    /// The server refused.
     Refused,
-    /// Nobody is there to do it.
+    /// No server or no gateway is available.
     Unavailable,
-    /// It took too long.
+    /// The request timed out.
     Timeout,
     /// The network or the gateway failed.
     Internal,
 }
 
 impl GatewayError {
-    /// What sort it is.
+    /// Returns the kind of the error.
     pub fn kind(&self) -> ErrorKind {
         match self {
             Self::Name { .. } | Self::TypeName { .. } | Self::OtherType { .. } | Self::Value(_) => {

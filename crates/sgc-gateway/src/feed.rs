@@ -1,4 +1,4 @@
-//! [`Feed`]: a reader of a topic, and all who hear it. Each topic is read once for everybody who takes it as it is offered.
+//! [`Feed`]: a reader of a topic and its subscribers. Subscribers with the same requirements share one reader.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
@@ -15,45 +15,45 @@ use tokio::time::Instant;
 use crate::content::Form;
 use crate::error::GatewayError;
 use crate::graph::Graph;
-use crate::hub::Shared;
+use crate::hub::HubState;
 use crate::message::Message;
 use crate::queue::{Overflow, Queue, cost};
-use crate::quota::{Charge, Held, Payer, Waiting};
+use crate::quota::{ByteReservation, Charge, Payer, PendingBytes};
 use crate::ros::LocalReader;
-use crate::session::Waits;
+use crate::session::WaitPlace;
 
-/// Messages of one writer that are kept for later subscribers, of a topic whose writers do so too.
+/// Most messages of one writer that are kept for later subscribers of a transient-local topic.
 pub(crate) const LATCHED_DEPTH_MAX: usize = 100;
-/// Bytes of them, of all writers that one reader hears, each message with its cost.
+/// Most bytes of these messages over all writers of one reader, including the cost of each message.
 const LATCHED_BYTES_MAX: usize = 64 << 20;
 
-/// Which reader a subscriber shares.
+/// The properties by which subscribers share a reader.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct FeedKey {
     pub(crate) topic: String,
     pub(crate) type_name: String,
-    /// What to request; none takes each publisher as it is.
+    /// The requested QoS; `None` adapts to what the publishers offer.
     pub(crate) qos: Option<Qos>,
-    /// Whether its only subscriber is waited for.
+    /// `true` if writers wait for the only subscriber.
     pub(crate) waits: bool,
 }
 
 /// A reader and its subscribers.
 pub(crate) struct Feed {
     pub(crate) key: FeedKey,
-    hub: Weak<Shared>,
+    hub: Weak<HubState>,
     outlets: Mutex<Outlets>,
-    /// The reader, and what it requests. Locked by who changes it, which may take a while.
+    /// The reader and its request. The lock may be held for long while the reader changes.
     reader: Mutex<Option<(LocalReader, EndpointSpec)>>,
 }
 
 struct Outlets {
     subscribers: Vec<Subscriber>,
-    /// The charge of the reader: of a session that subscribes with it, of the last one if none does.
+    /// The charge of the reader, paid by a session that subscribes, or by the last one that did.
     charge: Charge,
-    /// The session that has the charge.
+    /// The session that pays the charge.
     payer: Payer,
-    latched: Latched,
+    latched: LatchedMessages,
 }
 
 /// A subscription that shares a reader.
@@ -67,13 +67,14 @@ impl Outlets {
         self.subscribers.iter().filter_map(|subscriber| subscriber.queue.upgrade())
     }
 
-    /// Has those pay who subscribe, if anybody does. The number is that of messages for which none of them has room.
+    /// Moves charges to sessions that subscribe, if there are any. Returns the number of messages that were dropped
+    /// because no session has room for them.
     fn pass_charges(&mut self) -> u64 {
         let payers = || self.subscribers.iter().map(|subscriber| &subscriber.payer);
         let Some(first) = payers().next() else { return 0 };
         if !payers().any(|payer| payer.is_same(&self.payer)) {
             let taken = payers().find_map(|payer| Some((payer.take_reader_if_room()?, payer)));
-            // Each of them has a subscription with this reader, and would have a reader for it if it were alone.
+            // Each of these sessions subscribes with this reader, and would have its own reader if it were alone.
             let (charge, payer) = taken.unwrap_or_else(|| (first.take_reader_anyway(), first));
             (self.charge, self.payer) = (charge, payer.clone());
         }
@@ -83,23 +84,23 @@ impl Outlets {
 
 /// Messages that are kept for later subscribers.
 #[derive(Default)]
-struct Latched {
+struct LatchedMessages {
     is_on: bool,
-    /// Messages of each writer, the newest last.
-    writers: BTreeMap<Option<Guid>, VecDeque<Kept>>,
+    /// The messages of each writer, the newest last.
+    writers: BTreeMap<Option<Guid>, VecDeque<KeptMessage>>,
     depth: usize,
-    /// True if a message was left out since no subscriber had room for it.
+    /// `true` if a message was left out because no subscriber had room for it.
     is_short: bool,
 }
 
 /// A message that is kept.
-struct Kept {
+struct KeptMessage {
     message: Message,
-    /// Room of the subscriber to which it is charged.
-    room: Held,
+    /// The reservation in the budget of the subscriber that pays for the message.
+    room: ByteReservation,
 }
 
-impl Latched {
+impl LatchedMessages {
     fn bytes(&self) -> usize {
         self.writers.values().map(bytes_of).sum()
     }
@@ -108,13 +109,13 @@ impl Latched {
         self.writers.values().flatten().map(|kept| &kept.message)
     }
 
-    /// Hands out each message once more. Forms in which it is written last no longer than it waits.
+    /// Delivers each kept message again. The copies cache their encodings only while they are queued.
     fn replay(&self, queue: &Queue) {
         self.messages().for_each(|message| queue.push(&Arc::new(message.unwritten())));
     }
 
-    /// Keeps a message in room of one of the sessions. The number is that of messages that were left out for want of it:
-    /// the oldest ones of the writer that has most bytes, or the message itself.
+    /// Keeps a message in the room of one of the sessions. Returns the number of messages left out for lack of room:
+    /// the oldest ones of the writer with the most bytes, or the message itself.
     fn add<'p, P: Iterator<Item = &'p Payer>>(
         &mut self,
         message: &Arc<Message>,
@@ -131,13 +132,13 @@ impl Latched {
         loop {
             let is_within = self.bytes() + bytes <= LATCHED_BYTES_MAX;
             if is_within && let Some(room) = payers().find_map(|payer| payer.take_history(bytes)) {
-                let kept = Kept { message: message.unwritten(), room };
+                let kept = KeptMessage { message: message.unwritten(), room };
                 self.writers.entry(message.writer).or_default().push_back(kept);
                 return dropped;
             }
             self.is_short |= is_within;
             dropped += 1;
-            let with_new = |(writer, kept): &(&Option<Guid>, &mut VecDeque<Kept>)| {
+            let with_new = |(writer, kept): &(&Option<Guid>, &mut VecDeque<KeptMessage>)| {
                 bytes_of(kept) + if **writer == message.writer { bytes } else { 0 }
             };
             let heaviest = self.writers.iter_mut().max_by_key(with_new);
@@ -147,12 +148,13 @@ impl Latched {
         }
     }
 
-    /// Charges what is charged to sessions that do not subscribe any more to others that do, the newest messages first. The
-    /// number is that of messages for which none of them has room: these go, and the older ones of the same writer.
+    /// Moves charges from sessions that left to sessions that subscribe, the newest messages first. Returns the
+    /// number of messages dropped because no session has room: the message that does not fit and older ones of the
+    /// same writer.
     fn pass_charges(&mut self, subscribers: &[Subscriber]) -> u64 {
         let mut dropped = 0;
         for kept in self.writers.values_mut() {
-            let has_room = |kept: &mut Kept| {
+            let has_room = |kept: &mut KeptMessage| {
                 if !subscribers.iter().any(|subscriber| subscriber.payer.has_room(&kept.room)) {
                     let bytes = kept.room.bytes();
                     let room = subscribers.iter().find_map(|subscriber| subscriber.payer.take_history(bytes));
@@ -170,10 +172,10 @@ impl Latched {
         dropped
     }
 
-    /// Returns `true` if it was heard before: a reader that is made anew hears again what writers kept. By time and content,
-    /// since clocks are set back.
+    /// Returns `true` for a message that is kept already, because a recreated reader receives again what writers
+    /// keep. Compares time and content, because clocks may be set back.
     fn has(&self, sample: &Sample) -> bool {
-        let is_it = |kept: &Kept| {
+        let is_it = |kept: &KeptMessage| {
             kept.message.source_timestamp_ns == sample.source_timestamp_ns
                 && kept.message.payload == sample.payload
         };
@@ -185,7 +187,7 @@ impl Latched {
     }
 }
 
-fn bytes_of(kept: &VecDeque<Kept>) -> usize {
+fn bytes_of(kept: &VecDeque<KeptMessage>) -> usize {
     kept.iter().map(|kept| kept.room.bytes()).sum()
 }
 
@@ -195,10 +197,10 @@ impl std::fmt::Debug for Feed {
     }
 }
 
-/// What comes from a feed's reader.
-struct Intake(Arc<Feed>);
+/// The handler of samples from a feed's reader.
+struct FeedHandler(Arc<Feed>);
 
-impl HandleSamples for Intake {
+impl HandleSamples for FeedHandler {
     fn handle(&mut self, sample: Sample) {
         self.0.hand_out(sample);
     }
@@ -219,8 +221,8 @@ impl HandleSamples for Intake {
 }
 
 impl Feed {
-    pub(crate) fn new(key: FeedKey, hub: &Arc<Shared>, charge: Charge, payer: Payer) -> Arc<Self> {
-        let outlets = Outlets { subscribers: Vec::new(), charge, payer, latched: Latched::default() };
+    pub(crate) fn new(key: FeedKey, hub: &Arc<HubState>, charge: Charge, payer: Payer) -> Arc<Self> {
+        let outlets = Outlets { subscribers: Vec::new(), charge, payer, latched: LatchedMessages::default() };
         let (outlets, reader) = (Mutex::new(outlets), Mutex::new(None));
         Arc::new(Self { key, hub: Arc::downgrade(hub), outlets, reader })
     }
@@ -256,7 +258,7 @@ impl Feed {
         }
     }
 
-    /// Adds a subscriber, who hears first what is kept.
+    /// Adds a subscriber, which gets the kept messages first.
     fn join(&self, queue: &Arc<Queue>, payer: Payer) {
         let mut outlets = self.outlets();
         outlets.latched.replay(queue);
@@ -266,7 +268,7 @@ impl Feed {
         self.count_dropped(dropped);
     }
 
-    /// Hands out what is kept, once more.
+    /// Delivers the kept messages again.
     fn replay(&self, queue: &Queue) {
         self.outlets().latched.replay(queue);
     }
@@ -279,13 +281,13 @@ impl Feed {
         self.count_dropped(dropped);
     }
 
-    /// Returns `true` if nothing of its history was left out for want of subscribers' room, or if that session is one of them.
+    /// Returns `true` if the history is complete, or if the session subscribes already.
     pub(crate) fn has_history_for(&self, payer: &Payer) -> bool {
         let outlets = self.outlets();
         !outlets.latched.is_short || outlets.subscribers.iter().any(|other| other.payer.is_same(payer))
     }
 
-    /// What its reader is to request, as the graph is.
+    /// Returns the reader that suits the current graph.
     fn wanted(&self, graph: &Graph) -> EndpointSpec {
         let FeedKey { topic, type_name, qos, waits } = &self.key;
         let info = graph.topics.get(topic);
@@ -294,7 +296,8 @@ impl Feed {
         let qos = qos.clone().unwrap_or_else(|| {
             let offers = weakest(publishers.iter().map(|publisher| &publisher.qos));
             match offers {
-                // Heard are those who say so; with any other reliability, who comes first would not be.
+                // A best-effort reader matches every publisher; with another reliability the first one might not
+                // match.
                 None => Qos {
                     reliability: Reliability::BestEffort,
                     history: History::KeepLast(10),
@@ -302,7 +305,8 @@ impl Feed {
                 },
                 Some(offer) => {
                     let taken = reader_for(&offer, publishers.len());
-                    // Who waits for its subscriber leaves out nothing that it has room for.
+                    // A writer that waits for its subscriber must not lose messages for which the subscriber has
+                    // room.
                     let keeps_all = *waits && taken.is_reliable();
                     let history = if keeps_all { History::KeepAll } else { taken.history };
                     Qos { history, ..taken }
@@ -319,7 +323,7 @@ impl Feed {
         }
     }
 
-    /// Makes the reader, or makes it anew if what is offered has changed. May block.
+    /// Creates the reader, or recreates it if the offers have changed. May block.
     pub(crate) fn adapt(self: &Arc<Self>) -> Result<(), GatewayError> {
         let hub = self.hub.upgrade().ok_or(GatewayError::Stopping)?;
         let mut reader = self.reader.lock().unwrap_or_else(PoisonError::into_inner);
@@ -345,23 +349,23 @@ impl Feed {
         }
         if let Some((old, _)) = reader.take() {
             hub.forget(&[old.guid()]);
-            // Its end waits for its thread, which may wait for a subscriber.
+            // Dropping the reader waits for its thread, which may wait for a subscriber.
             let queues: Vec<_> = self.outlets().queues().collect();
             queues.iter().for_each(|queue| queue.let_pass(true));
             drop(old);
             queues.iter().for_each(|queue| queue.let_pass(false));
         }
-        // Writers say again what they keep.
+        // Writers send what they keep again.
         self.outlets().latched.is_short = false;
-        let made = hub.ros.reader(&wanted, Box::new(Intake(Arc::clone(self))))?;
+        let made = hub.ros.reader(&wanted, Box::new(FeedHandler(Arc::clone(self))))?;
         hub.know(own_endpoint(EndpointKind::Reader, made.guid(), &wanted));
         *reader = Some((made, wanted));
         Ok(())
     }
 
-    /// Ends the reader, which holds the feed. May block.
+    /// Drops the reader, which holds the feed. May block.
     pub(crate) fn end(&self) {
-        // Who waits for room would be waited for.
+        // A subscriber without room would hold up the reader's thread.
         let subscribers = std::mem::take(&mut self.outlets().subscribers);
         subscribers.iter().filter_map(|other| other.queue.upgrade()).for_each(|queue| queue.close());
         let reader = self.reader.lock().unwrap_or_else(PoisonError::into_inner).take();
@@ -375,7 +379,7 @@ impl Feed {
     }
 }
 
-/// An endpoint of the gateway's own, as discovery would tell of it.
+/// Describes an endpoint of the gateway as discovery would.
 pub(crate) fn own_endpoint(kind: EndpointKind, guid: Guid, spec: &EndpointSpec) -> DiscoveredEndpoint {
     DiscoveredEndpoint {
         kind,
@@ -391,78 +395,79 @@ pub(crate) fn own_endpoint(kind: EndpointKind, guid: Guid, spec: &EndpointSpec) 
 /// A message for one subscriber.
 #[derive(Clone, Debug)]
 pub struct Delivery {
-    /// The message, shared with others.
+    /// The message, shared with other subscribers.
     pub message: Arc<Message>,
-    /// How many were left out for this subscriber until now: it took them too slowly.
+    /// Messages that this subscriber has lost so far because it reads too slowly.
     pub dropped: u64,
 }
 
-/// How much one subscriber takes.
+/// The options of a new subscription.
 #[derive(Debug)]
-pub(crate) struct Intaking {
+pub(crate) struct SubscriptionOptions {
     pub(crate) depth: usize,
-    /// Bytes that may wait of one that is waited for: it does not share its bound, since nobody else makes room for it.
+    /// Most queued bytes of a subscription that holds up writers. It has a bound of its own, because no other queue
+    /// makes room for it.
     pub(crate) bytes_max: usize,
-    /// Bytes that wait for the client in all its subscriptions.
-    pub(crate) waiting: Arc<Waiting>,
+    /// The bytes that are queued for the client in all its subscriptions.
+    pub(crate) waiting: Arc<PendingBytes>,
     pub(crate) interval_min: Option<Duration>,
     pub(crate) overflow: Overflow,
-    /// Its place among those that are waited for, if it is.
-    pub(crate) waits: Option<Waits>,
-    /// Its place among the subscriptions of its client's credential.
+    /// The place among subscriptions that hold up writers, if it is one.
+    pub(crate) waits: Option<WaitPlace>,
+    /// The charge of the subscription to the client's credential.
     pub(crate) charge: Charge,
-    /// To whom the reader can be charged.
+    /// The session that can be charged for the reader.
     pub(crate) payer: Payer,
 }
 
-/// What one client hears of a topic; ends when dropped.
+/// A client's subscription to a topic, ended by dropping it.
 pub struct Subscription {
     feed: Arc<Feed>,
     queue: Arc<Queue>,
     layout: Arc<Layout>,
     interval_min: Option<Duration>,
     not_before: Option<Instant>,
-    _waits: Option<Waits>,
+    _waits: Option<WaitPlace>,
     _charge: Charge,
 }
 
 impl Subscription {
-    pub(crate) fn new(feed: Arc<Feed>, layout: Arc<Layout>, taking: Intaking) -> Self {
-        let queue = Arc::new(Queue::new(taking.depth, taking.bytes_max, taking.waiting, taking.overflow));
-        feed.join(&queue, taking.payer);
+    pub(crate) fn new(feed: Arc<Feed>, layout: Arc<Layout>, options: SubscriptionOptions) -> Self {
+        let queue = Arc::new(Queue::new(options.depth, options.bytes_max, options.waiting, options.overflow));
+        feed.join(&queue, options.payer);
         Self {
             feed,
             queue,
             layout,
-            interval_min: taking.interval_min,
+            interval_min: options.interval_min,
             not_before: None,
-            _waits: taking.waits,
-            _charge: taking.charge,
+            _waits: options.waits,
+            _charge: options.charge,
         }
     }
 
-    /// The topic.
+    /// Returns the topic.
     pub fn topic(&self) -> &str {
         &self.feed.key.topic
     }
 
-    /// Its ROS type.
+    /// Returns the ROS type.
     pub fn type_name(&self) -> &str {
         &self.feed.key.type_name
     }
 
-    /// What its messages look like.
+    /// Returns the layout of the messages.
     pub fn layout(&self) -> &Arc<Layout> {
         &self.layout
     }
 
-    /// A message in a form.
+    /// Converts a message to a form.
     pub fn write(&self, message: &Message, form: Form) -> Result<bytes::Bytes, GatewayError> {
         message.written(form, &self.layout)
     }
 
-    /// Waits for the next message, and for the time at which one may come; `None` once the gateway stops. It may be given up
-    /// at any time, and nothing is lost.
+    /// Waits for the next message and for the minimum interval. Returns `None` once the gateway stops. Cancelling
+    /// loses no message.
     pub async fn next(&mut self) -> Option<Delivery> {
         if let Some(at) = self.not_before {
             tokio::time::sleep_until(at).await;
@@ -472,17 +477,17 @@ impl Subscription {
         Some(Delivery { message, dropped })
     }
 
-    /// What ends it whoever holds it.
+    /// Returns a handle that ends the subscription.
     pub(crate) fn ender(&self) -> SubscriptionEnd {
         SubscriptionEnd { feed: Arc::downgrade(&self.feed), queue: Arc::downgrade(&self.queue) }
     }
 
-    /// How many messages were left out until now.
+    /// Returns the number of messages lost so far.
     pub fn dropped(&self) -> u64 {
         self.queue.dropped()
     }
 
-    /// Takes messages at another pace from now on, as [`Subscribe`](crate::Subscribe) has it.
+    /// Sets depth and interval, as in [`Subscribe`](crate::Subscribe).
     pub fn set_pace(&mut self, depth: usize, interval_min: Option<Duration>) {
         self.queue.set_depth(depth);
         let before = std::mem::replace(&mut self.interval_min, interval_min);
@@ -490,13 +495,13 @@ impl Subscription {
         self.not_before = last.zip(interval_min).map(|(last, interval)| last + interval);
     }
 
-    /// Has what is kept for who subscribes later come once more, for another part of the same client.
+    /// Delivers the kept messages again, for another part of the same client.
     pub fn replay(&self) {
         self.feed.replay(&self.queue);
     }
 }
 
-/// Ends a [`Subscription`] that somebody else holds: one that is waited for, for example, by who does not look at it.
+/// A handle that ends a [`Subscription`] held elsewhere, for example one whose holder does not read it.
 #[derive(Debug)]
 pub(crate) struct SubscriptionEnd {
     feed: Weak<Feed>,
@@ -504,7 +509,7 @@ pub(crate) struct SubscriptionEnd {
 }
 
 impl SubscriptionEnd {
-    /// Nothing comes any more, and nothing waits any more.
+    /// Ends delivery and drops queued messages.
     pub(crate) fn end(&self) {
         if let (Some(feed), Some(queue)) = (self.feed.upgrade(), self.queue.upgrade()) {
             feed.leave(&queue);
@@ -516,7 +521,7 @@ impl SubscriptionEnd {
         }
     }
 
-    /// Whether the subscription is dropped.
+    /// Returns `true` if the subscription was dropped.
     pub(crate) fn has_ended(&self) -> bool {
         self.queue.strong_count() == 0
     }
@@ -544,11 +549,11 @@ mod tests {
     use sgc_wire::UnixMillis;
 
     use super::*;
-    use crate::access::{Access, AccessRules, Admission, Anonymous, Client};
+    use crate::access::{Access, AccessRules, AdmissionRequest, Anonymous, Client};
+    use crate::definitions::{ShippedDefinitions, Types};
     use crate::hub::{Hub, HubOptions};
     use crate::quota::{Quota, Resource};
     use crate::session::SessionLimits;
-    use crate::types::{Shipped, Types};
 
     const MESSAGE_BYTES: usize = 1000;
     const COST: usize = MESSAGE_BYTES + crate::queue::MESSAGE_COST_BYTES;
@@ -563,10 +568,10 @@ mod tests {
         waits_max: 2,
     };
 
-    /// One session of a client, with what it has.
+    /// One session of a client and its accounts.
     struct Viewer {
         quota: Quota,
-        history: Arc<Waiting>,
+        history: Arc<PendingBytes>,
         payer: Payer,
     }
 
@@ -575,15 +580,15 @@ mod tests {
             let access = Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
             let (peer, now) = (peer.parse().unwrap(), UnixMillis(1_795_000_000_000));
             let admission =
-                Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now };
+                AdmissionRequest { peer, encrypted: true, origin: None, token: None, certificate: None, now };
             let client: Client = access.admit(&admission).unwrap();
             let quota = hub.shared.quotas.quota(&client);
-            let history = Arc::new(Waiting::new(LIMITS.waiting_bytes_max, quota.clone()));
+            let history = Arc::new(PendingBytes::new(LIMITS.waiting_bytes_max, quota.clone()));
             let payer = Payer::new(quota.clone(), LIMITS, Arc::clone(&history));
             Self { quota, history, payer }
         }
 
-        /// Returns the number of messages that are kept in its room.
+        /// Returns the number of messages kept in the session's room.
         fn keeps(&self) -> usize {
             assert_eq!(self.history.bytes() % COST, 0);
             self.history.bytes() / COST
@@ -600,7 +605,7 @@ mod tests {
             feed
         }
 
-        /// Returns the number of readers that it may still have made for it.
+        /// Returns the number of further readers that the session may have created.
         fn readers_left(&self) -> usize {
             let mut held = Vec::new();
             while let Some(charge) = self.payer.take_reader_if_room() {
@@ -611,14 +616,14 @@ mod tests {
         }
     }
 
-    /// One whose messages count for nobody here.
+    /// Creates a queue whose messages are not charged to a session.
     fn queue() -> Arc<Queue> {
-        Arc::new(Queue::new(1000, 1 << 20, Waiting::of_own(1 << 20), Overflow::DropOldest))
+        Arc::new(Queue::new(1000, 1 << 20, PendingBytes::for_own_client(1 << 20), Overflow::DropOldest))
     }
 
     async fn hub() -> Hub {
         let own = Arc::new(FakeDomain::default().join(false));
-        Hub::start(own, Types::new(Shipped), HubOptions::default()).await.unwrap()
+        Hub::start(own, Types::new(ShippedDefinitions), HubOptions::default()).await.unwrap()
     }
 
     fn say(feed: &Feed, writer: u8, numbers: std::ops::Range<i64>) {
@@ -634,7 +639,7 @@ mod tests {
         }
     }
 
-    /// Returns the numbers that a later subscriber hears first.
+    /// Returns the messages that a later subscriber would get first.
     fn heard(feed: &Feed) -> Vec<i64> {
         feed.outlets().latched.messages().map(|message| message.source_timestamp_ns).collect()
     }
@@ -643,7 +648,7 @@ mod tests {
     async fn messages_that_are_kept_take_room_of_a_subscriber_and_the_oldest_go() {
         let hub = hub().await;
         let sessions: Vec<_> = (0..5).map(|_| Viewer::new(&hub, "10.0.0.1:1")).collect();
-        // Many topics, one session.
+        // One session subscribes to many topics.
         let queues: Vec<_> = sessions.iter().map(|_| queue()).collect();
         let feeds: Vec<_> = (0..3).map(|_| sessions[0].feed(&hub)).collect();
         for feed in &feeds {
@@ -653,14 +658,14 @@ mod tests {
         say(&feeds[1], 1, 0..6);
         assert_eq!((sessions[0].keeps(), heard(&feeds[1])), (ROOM, vec![2, 3, 4, 5]));
         assert_eq!(hub.shared.quotas.history_dropped(), 2);
-        // Another topic has no room left, and takes none from others.
+        // A further topic has no room left and takes none from the others.
         say(&feeds[2], 1, 0..3);
         assert_eq!((heard(&feeds[2]), heard(&feeds[0]).len()), (vec![], 6));
         assert_eq!(hub.shared.quotas.history_dropped(), 5);
-        // Of one topic the writer that has most gives way.
+        // Within a topic the writer with the most bytes gives way.
         say(&feeds[0], 2, 10..11);
         assert_eq!(heard(&feeds[0]), [1, 2, 3, 4, 5, 10]);
-        // Many sessions of one credential have no more than a few.
+        // The sessions of one credential together have the room of four.
         let more: Vec<_> = sessions[1..].iter().map(|session| session.feed(&hub)).collect();
         for ((feed, session), queue) in more.iter().zip(&sessions[1..]).zip(&queues[1..]) {
             feed.join(queue, session.payer.clone());
@@ -686,7 +691,7 @@ mod tests {
         feed.leave(&queues[0]);
         assert_eq!([first.keeps(), second.keeps()], [0, 4]);
         assert_eq!([first.readers_left(), second.readers_left()], [all, all - 1]);
-        // The last one keeps them until the reader ends, or somebody comes.
+        // The last subscriber pays until the reader ends or another session subscribes.
         feed.leave(&queues[1]);
         say(&feed, 1, 4..5);
         assert_eq!((second.keeps(), second.readers_left()), (5, all - 1));
@@ -712,11 +717,11 @@ mod tests {
         say(&shared, 1, 0..9);
         assert_eq!([leaver.keeps(), victim.keeps()], [9, 7]);
         shared.leave(&queues[0]);
-        // The newest have room, and what the victim had stays.
+        // The newest messages have room, and the victim's own messages stay.
         assert_eq!((leaver.keeps(), victim.keeps()), (0, ROOM));
         assert_eq!((heard(&shared), heard(&own).len()), (vec![6, 7, 8], 7));
         assert_eq!(hub.shared.quotas.history_dropped(), 6);
-        // Others do not suffer by it: they have readers of their own.
+        // Other clients do not suffer: they have their own readers.
         assert!(shared.has_history_for(&victim.payer) && !shared.has_history_for(&third.payer));
         assert!(own.has_history_for(&third.payer));
     }
@@ -730,7 +735,7 @@ mod tests {
         let queues = [queue(), queue()];
         feed.join(&queues[0], victim.payer.clone());
         feed.join(&queues[1], other.payer.clone());
-        // Readers that it has left a moment ago take all of the other's places.
+        // Readers that linger after their use take all places of the other session.
         let mut lingering = Vec::new();
         while let Some(charge) = other.payer.take_reader_if_room() {
             lingering.push(charge);

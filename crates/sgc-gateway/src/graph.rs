@@ -1,4 +1,4 @@
-//! [`Graph`]: what is on the local network, as clients ask for it. [`GraphState`] follows discovery and makes it.
+//! [`Graph`]: the local network as clients see it. [`GraphState`] follows discovery and builds the graph.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -8,42 +8,42 @@ use sgc_ros::{
 };
 use sgc_wire::Qos;
 
-/// Suffixes of the topics and services that make an action.
+/// Suffixes of the topics and services of an action.
 const ACTION_FEEDBACK: &str = "/_action/feedback";
 const ACTION_GOAL: &str = "/_action/send_goal";
 const FEEDBACK_TYPE: &str = "_FeedbackMessage";
 const GOAL_TYPE: &str = "_SendGoal";
 
-/// One end of a topic.
+/// An endpoint of a topic.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct EndpointInfo {
-    /// Its GUID.
+    /// The GUID.
     pub guid: Guid,
-    /// Full name of its node, if the network tells.
+    /// The full name of its ROS 2 node, if the network announces it.
     pub node: Option<String>,
-    /// ROS type.
+    /// The ROS type.
     pub type_name: String,
-    /// `RIHS01_…`, if it says.
+    /// The type hash (`RIHS01_…`), if the endpoint announces one.
     pub type_hash: Option<String>,
-    /// What it offers or requests.
+    /// The offered or requested QoS.
     pub qos: Qos,
-    /// Whether its type has no key.
+    /// `true` if the type has no key.
     pub keyless: bool,
-    /// Whether it is this gateway's.
+    /// `true` if the endpoint belongs to this gateway.
     pub is_own: bool,
 }
 
 /// A topic.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct TopicInfo {
-    /// Who writes.
+    /// The publishers.
     pub publishers: Vec<EndpointInfo>,
-    /// Who reads.
+    /// The subscribers.
     pub subscribers: Vec<EndpointInfo>,
 }
 
 impl TopicInfo {
-    /// The type that most of its ends have; of several the first by name.
+    /// Returns the type that most endpoints have; in a tie the first by name.
     pub fn type_name(&self) -> Option<&str> {
         let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
         for end in self.publishers.iter().chain(&self.subscribers) {
@@ -53,7 +53,7 @@ impl TopicInfo {
         counts.into_iter().find(|(_, count)| *count == most).map(|(name, _)| name)
     }
 
-    /// The hash that its ends say of a type.
+    /// Returns the hash that endpoints announce for a type.
     pub fn type_hash(&self, type_name: &str) -> Option<&str> {
         let ends = self.publishers.iter().chain(&self.subscribers);
         ends.filter(|end| end.type_name == type_name).find_map(|end| end.type_hash.as_deref())
@@ -63,44 +63,44 @@ impl TopicInfo {
 /// A service.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ServiceInfo {
-    /// ROS type.
+    /// The ROS type.
     pub type_name: String,
-    /// Those that serve it: full names of their nodes, if the network tells.
+    /// The servers, by the full names of their ROS 2 nodes, if the network announces these.
     pub servers: Vec<Option<String>>,
-    /// Those that call it.
+    /// The clients, by the full names of their ROS 2 nodes.
     pub clients: Vec<Option<String>>,
 }
 
 /// An action.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ActionInfo {
-    /// ROS type.
+    /// The ROS type.
     pub type_name: String,
-    /// Those that serve it.
+    /// The servers, by the full names of their ROS 2 nodes.
     pub servers: Vec<Option<String>>,
-    /// Those that use it.
+    /// The clients, by the full names of their ROS 2 nodes.
     pub clients: Vec<Option<String>>,
 }
 
-/// A node: names of what it has.
+/// A ROS 2 node and the names of its interfaces.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct NodeInfo {
-    /// Topics that it publishes.
+    /// Published topics.
     pub publishes: BTreeSet<String>,
-    /// Topics that it subscribes to.
+    /// Subscribed topics.
     pub subscribes: BTreeSet<String>,
-    /// Services that it serves.
+    /// Served services.
     pub serves: BTreeSet<String>,
-    /// Services that it calls.
+    /// Called services.
     pub calls: BTreeSet<String>,
 }
 
-/// What is on the local network.
+/// The graph of the local network.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Graph {
-    /// Topics by name, those of actions among them.
+    /// Topics by name, including those of actions.
     pub topics: BTreeMap<String, TopicInfo>,
-    /// Services by name, those of actions among them.
+    /// Services by name, including those of actions.
     pub services: BTreeMap<String, ServiceInfo>,
     /// Actions by name.
     pub actions: BTreeMap<String, ActionInfo>,
@@ -109,7 +109,7 @@ pub struct Graph {
 }
 
 impl Graph {
-    /// The same with what a client may see of it: topics and services that are not permitted are left out.
+    /// Returns the graph without topics, services and actions that the filters refuse.
     #[must_use]
     pub fn filtered(&self, topic: impl Fn(&str) -> bool, service: impl Fn(&str) -> bool) -> Self {
         let mut graph = self.clone();
@@ -126,17 +126,17 @@ impl Graph {
     }
 }
 
-/// Whether a topic or service is hidden, as those that make an action are.
+/// Returns `true` for a hidden topic or service, such as those of an action.
 pub fn is_hidden(name: &str) -> bool {
     name.contains("/_")
 }
 
-/// What discovery told, and what the gateway has itself.
+/// The endpoints and nodes that discovery reported, and the gateway's own.
 #[derive(Debug, Default)]
 pub(crate) struct GraphState {
     endpoints: BTreeMap<Guid, (DiscoveredEndpoint, bool)>,
     nodes: BTreeMap<Guid, Vec<GraphNode>>,
-    /// Of the present state, once it was asked for.
+    /// The graph of the current state, built on demand.
     made: Option<Arc<Graph>>,
 }
 
@@ -150,7 +150,7 @@ impl GraphState {
             DiscoveryEvent::Vanished { guid } => {
                 self.endpoints.remove(&guid);
             }
-            // The graph shows endpoints for as long as they are there, as in ROS 2.
+            // The graph shows endpoints as long as they exist, as in ROS 2.
             DiscoveryEvent::Liveliness { .. } | DiscoveryEvent::HistoryDepth { .. } => {}
             DiscoveryEvent::Nodes { participant, nodes } if nodes.is_empty() => {
                 self.nodes.remove(&participant);
@@ -171,7 +171,7 @@ impl GraphState {
         self.endpoints.remove(guid);
     }
 
-    /// The gateway's own endpoints: readers, then writers.
+    /// Returns the gateway's own readers and writers.
     pub(crate) fn own(&self) -> (Vec<Guid>, Vec<Guid>) {
         let own = |kind| {
             let all = self.endpoints.values().filter(move |(end, is_own)| *is_own && end.kind == kind);
@@ -180,12 +180,12 @@ impl GraphState {
         (own(EndpointKind::Reader), own(EndpointKind::Writer))
     }
 
-    /// Whether a writer is there still.
+    /// Returns `true` if the endpoint still exists.
     pub(crate) fn is_there(&self, guid: &Guid) -> bool {
         self.endpoints.contains_key(guid)
     }
 
-    /// `own_node` is what the gateway's node is called.
+    /// Returns the graph. `own_node` is the name of the gateway's node.
     pub(crate) fn graph(&mut self, own_node: &str) -> Arc<Graph> {
         if let Some(made) = &self.made {
             return Arc::clone(made);
@@ -254,10 +254,10 @@ fn add(graph: &mut Graph, endpoint: &DiscoveredEndpoint, is_own: bool, node: Opt
         }
         return;
     }
-    let Some((half, service, type_name)) = ServiceTopic::of(&endpoint.topic, &endpoint.type_name) else {
+    let Some((half, service, type_name)) = ServiceTopic::parse(&endpoint.topic, &endpoint.type_name) else {
         return;
     };
-    // A server reads requests; a client writes them. The other halves say nothing new.
+    // A server reads requests and a client writes them, so the replies add no information.
     if half == ServiceTopic::Reply {
         return;
     }

@@ -1,4 +1,4 @@
-//! [`Hub`]: the gateway's node on the local network, which all clients share.
+//! [`Hub`]: the gateway's ROS 2 node on the local network, which all clients share.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -11,27 +11,27 @@ use tokio::runtime::Handle;
 use tokio::sync::{Notify, Semaphore, watch};
 use tokio::task::JoinHandle;
 
+use crate::definitions::Types;
 use crate::error::GatewayError;
-use crate::feed::{Feed, FeedKey, Intaking, Subscription};
+use crate::feed::{Feed, FeedKey, Subscription, SubscriptionOptions};
 use crate::graph::{Graph, GraphState};
 use crate::quota::Quotas;
 use crate::ros::LocalRos;
 use crate::service::Caller;
-use crate::types::Types;
 
-/// How long changes of the graph are gathered before readers are adapted to them.
+/// Time for which graph changes are gathered before readers are adapted.
 const SETTLE: Duration = Duration::from_millis(20);
-/// How long a reader that nobody uses is kept: a page that is loaded again finds it.
+/// Time for which an unused reader is kept, so that a reloaded page finds it.
 const LINGER: Duration = Duration::from_secs(2);
-/// Writers at their end that are waited for at a time.
+/// Most writers that wait for acknowledgements at their end at a time.
 const FAREWELLS_MAX: usize = 32;
-/// Clients of services that are kept for further calls.
+/// Most service clients that are kept for further calls.
 const CALLERS_MAX: usize = 256;
 
-/// What a hub is to be.
+/// The options of a hub.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct HubOptions {
-    /// Name of its ROS 2 node, of letters, digits and `_`.
+    /// The name of the ROS 2 node, of letters, digits and `_`.
     pub node: String,
 }
 
@@ -41,10 +41,10 @@ impl Default for HubOptions {
     }
 }
 
-/// The gateway's node. Clones are the same one; it ends with [`Hub::stop`].
+/// The gateway's node. Clones share it; [`Hub::stop`] ends it.
 #[derive(Clone)]
 pub struct Hub {
-    pub(crate) shared: Arc<Shared>,
+    pub(crate) shared: Arc<HubState>,
     keeper: Arc<Keeper>,
 }
 
@@ -68,16 +68,16 @@ impl Feeds {
     }
 }
 
-/// Readers that there are.
+/// All feeds.
 #[derive(Default)]
 struct Feeds {
     all: Vec<Arc<Feed>>,
-    /// None is made any more.
+    /// `true` once no further feed is created.
     is_stopped: bool,
 }
 
-/// What all clients share.
-pub(crate) struct Shared {
+/// The state that all clients share.
+pub(crate) struct HubState {
     pub(crate) ros: Arc<dyn LocalRos>,
     pub(crate) types: Types,
     pub(crate) runtime: Handle,
@@ -88,9 +88,9 @@ pub(crate) struct Shared {
     feeds: Mutex<Feeds>,
     unused: Notify,
     callers: Mutex<VecDeque<Arc<Caller>>>,
-    /// Counts of all that clients have, and the threads on which calls and writes may wait.
+    /// The counts of all clients, and the threads on which calls and writes may wait.
     pub(crate) quotas: Arc<Quotas>,
-    /// Writers that wait for acknowledgements before they end.
+    /// Permits for writers that wait for acknowledgements before they end.
     pub(crate) farewells: Arc<Semaphore>,
 }
 
@@ -101,10 +101,10 @@ impl fmt::Debug for Hub {
 }
 
 impl Hub {
-    /// Joins the network, which has to be the hub's own.
+    /// Joins the network, which must be the hub's own.
     ///
     /// # Errors
-    /// What discovery says.
+    /// The error of discovery.
     pub async fn start(
         ros: Arc<dyn LocalRos>,
         types: Types,
@@ -112,7 +112,7 @@ impl Hub {
     ) -> Result<Self, GatewayError> {
         let node = RosNode::new("/", &options.node, None);
         let node_name = node.as_ref().map_or_else(|| format!("/{}", options.node), ToString::to_string);
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(HubState {
             ros,
             types,
             runtime: Handle::current(),
@@ -144,32 +144,32 @@ impl Hub {
         Ok(Self { shared, keeper: Arc::new(Keeper([adapting, sweeping])) })
     }
 
-    /// What is on the network.
+    /// Returns the graph of the local network.
     pub fn graph(&self) -> Arc<Graph> {
         self.shared.graph()
     }
 
-    /// Marked as changed whenever the graph has changed.
+    /// Returns a receiver that is marked as changed whenever the graph changes.
     pub fn graph_changes(&self) -> watch::Receiver<u64> {
         self.shared.changed.subscribe()
     }
 
-    /// What messages look like.
+    /// Returns the message types.
     pub fn types(&self) -> &Types {
         &self.shared.types
     }
 
-    /// Full name of the gateway's node.
+    /// Returns the full name of the gateway's node.
     pub fn node_name(&self) -> &str {
         &self.shared.node_name
     }
 
-    /// How many readers there are, shared by all who subscribe.
+    /// Returns the number of readers, shared by all subscribers.
     pub fn readers(&self) -> usize {
         lock(&self.shared.feeds).all.len()
     }
 
-    /// Leaves the network: subscriptions end, and calls are not answered any more.
+    /// Leaves the network. Subscriptions end, and calls get no answer any more.
     pub async fn stop(&self) {
         self.keeper.end();
         let _ = self
@@ -187,11 +187,12 @@ impl Hub {
 }
 
 /// Adapts readers to the graph.
-async fn adapt(shared: Weak<Shared>, mut changed: watch::Receiver<u64>) {
+async fn adapt(shared: Weak<HubState>, mut changed: watch::Receiver<u64>) {
     while changed.changed().await.is_ok() {
         let Some(shared) = shared.upgrade() else { return };
         tokio::time::sleep(SETTLE).await;
-        // What changes from here on is looked at again, what is made here among it: there is nothing to do then.
+        // Later changes trigger another round. That round covers the readers created here and finds nothing to do for
+        // them.
         changed.mark_unchanged();
         let done = shared.blocking(|shared| {
             let feeds = lock(&shared.feeds).all.clone();
@@ -207,8 +208,8 @@ async fn adapt(shared: Weak<Shared>, mut changed: watch::Receiver<u64>) {
     }
 }
 
-/// Ends readers that nobody uses.
-async fn sweep(shared: Weak<Shared>) {
+/// Drops unused readers.
+async fn sweep(shared: Weak<HubState>) {
     loop {
         let Some(shared) = shared.upgrade() else { return };
         shared.unused.notified().await;
@@ -229,7 +230,7 @@ async fn sweep(shared: Weak<Shared>) {
     }
 }
 
-impl Shared {
+impl HubState {
     fn state(&self) -> MutexGuard<'_, GraphState> {
         lock(&self.state)
     }
@@ -246,19 +247,19 @@ impl Shared {
         self.changed.send_modify(|version| *version += 1);
     }
 
-    /// Counts an endpoint of the gateway's own as there.
+    /// Adds an endpoint of the gateway to the graph.
     pub(crate) fn know(&self, endpoint: DiscoveredEndpoint) {
         self.state().add_own(endpoint);
         self.tell();
     }
 
-    /// The opposite.
+    /// Removes endpoints of the gateway from the graph.
     pub(crate) fn forget(&self, guids: &[Guid]) {
         guids.iter().for_each(|guid| self.state().remove_own(guid));
         self.tell();
     }
 
-    /// Has the local graph show the gateway's node. May block.
+    /// Announces the gateway's node in the ROS graph. May block.
     fn announce(&self) {
         let Some(node) = self.node.clone() else { return };
         let (readers, writers) = self.state().own();
@@ -267,12 +268,12 @@ impl Shared {
         }
     }
 
-    /// Something may be unused from now on.
+    /// Schedules a search for unused readers.
     pub(crate) fn sweep(&self) {
         self.unused.notify_one();
     }
 
-    /// Runs what may block on a thread that may.
+    /// Runs blocking work on a thread where it may block.
     pub(crate) async fn blocking<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&Arc<Self>) -> Result<T, RosError> + Send + 'static,
@@ -280,7 +281,7 @@ impl Shared {
         self.run(move |shared| work(shared).map_err(GatewayError::Ros)).await
     }
 
-    /// The same for what fails in more ways.
+    /// Runs blocking work that may fail in other ways than ROS errors.
     pub(crate) async fn run<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&Arc<Self>) -> Result<T, GatewayError> + Send + 'static,
@@ -290,12 +291,12 @@ impl Shared {
         done.unwrap_or(Err(GatewayError::Stopping))
     }
 
-    /// Subscribes, with the reader that others have if there is one. A reader whose history was cut short for want of its
-    /// subscribers' room is not shared with another client that has room for a reader of its own.
+    /// Subscribes, by an existing reader if one suits. A reader whose history is incomplete for lack of its
+    /// subscribers' room is not shared with a client that has room for its own reader.
     pub(crate) async fn subscribe(
         self: &Arc<Self>,
         key: FeedKey,
-        taking: Intaking,
+        options: SubscriptionOptions,
     ) -> Result<Subscription, GatewayError> {
         self.run(move |shared| {
             let layout = shared.layout_of(&key)?;
@@ -304,8 +305,8 @@ impl Shared {
                 if feeds.is_stopped {
                     return Err(GatewayError::Stopping);
                 }
-                // A subscriber that is waited for has a reader of its own.
-                let payer = &taking.payer;
+                // A subscriber that holds up writers gets its own reader.
+                let payer = &options.payer;
                 let known = || feeds.all.iter().filter(|feed| !key.waits && feed.key == key);
                 let whole = known().find(|feed| feed.has_history_for(payer)).map(Arc::clone);
                 let feed = match (whole, known().next().map(Arc::clone)) {
@@ -325,8 +326,9 @@ impl Shared {
                         }
                     }
                 };
-                // Before anybody finds it unused, and before a new reader hears what is for who made it.
-                (Arc::clone(&feed), Subscription::new(feed, layout, taking))
+                // The subscription exists before a sweep finds the feed unused, and before a new reader delivers the
+                // first messages.
+                (Arc::clone(&feed), Subscription::new(feed, layout, options))
             };
             feed.adapt()?;
             Ok(subscription)
@@ -340,7 +342,7 @@ impl Shared {
         self.types.layout(&key.type_name, hash)
     }
 
-    /// What calls a service, made if nobody has called it lately. May block.
+    /// Returns the client of a service, created unless a recent call left one. May block.
     pub(crate) fn caller(
         self: &Arc<Self>,
         service: &str,
@@ -355,7 +357,7 @@ impl Shared {
         if let Some(caller) = known(&mut lock(&self.callers)) {
             return Ok(caller);
         }
-        // Others are not kept waiting meanwhile; of two that are made at once the second goes.
+        // The lock is not held while a client is created. If two are created at once, the second is dropped.
         let made = Arc::new(Caller::new(self, service, type_name)?);
         let mut callers = lock(&self.callers);
         if let Some(caller) = known(&mut callers) {

@@ -1,7 +1,7 @@
-//! [`Inflow`]: bytes of WebSocket messages that are not done yet. They take room of their client's quota from the first byte on, so
-//! that many connections which each begin a message of the longest kind take no more memory than the quota has.
+//! [`Inflow`]: the bytes of unfinished WebSocket messages. They are charged to the client's quota from the first byte
+//! on, so that many connections with unfinished long messages take no more memory than the quota allows.
 //!
-//! gRPC has its own way to do this (`grpc::incoming`), since its messages say their length first.
+//! gRPC has its own accounting (`grpc::incoming`), because its messages begin with their length.
 
 use std::io;
 use std::pin::Pin;
@@ -15,28 +15,28 @@ use crate::error::GatewayError;
 use crate::hub::lock;
 use crate::quota::{Permits, Quota};
 
-/// Bytes of messages that are not done yet.
+/// The bytes of unfinished messages of one connection.
 #[derive(Debug, Default)]
 pub(crate) struct Inflow {
-    /// The quota of the client, once it was admitted. The upgrade bounds all that comes before.
+    /// The quota of the client after its admission. Before that the upgrade bounds the bytes.
     quota: OnceLock<Quota>,
-    held: Mutex<Held>,
+    held: Mutex<UnfinishedBytes>,
 }
 
 #[derive(Debug, Default)]
-struct Held {
+struct UnfinishedBytes {
     bytes: usize,
-    /// One for each [`UNIT_BYTES`] beyond the first.
+    /// One unit for each [`UNIT_BYTES`] beyond the first.
     room: Vec<Permits>,
 }
 
 impl Inflow {
-    /// Takes room of this quota from now on.
+    /// Charges bytes to this quota from now on.
     pub(crate) fn admit(&self, quota: &Quota) {
         let _ = self.quota.set(quota.clone());
     }
 
-    /// Takes room for bytes that came.
+    /// Charges received bytes.
     pub(crate) fn add(&self, bytes: usize) -> Result<(), GatewayError> {
         let Some(quota) = self.quota.get() else { return Ok(()) };
         let mut held = lock(&self.held);
@@ -48,7 +48,7 @@ impl Inflow {
         Ok(())
     }
 
-    /// Gives back the room of so many bytes that were kept.
+    /// Releases bytes that were kept.
     pub(crate) fn give_back(&self, bytes: usize) {
         let mut held = lock(&self.held);
         held.bytes = held.bytes.saturating_sub(bytes);
@@ -56,28 +56,28 @@ impl Inflow {
         held.room.truncate(places);
     }
 
-    /// Gives back the room of a message that is done, but for so many bytes that are still kept.
-    pub(crate) fn done_but(&self, kept: usize) {
+    /// Releases the bytes of a finished message, except for `kept` bytes.
+    pub(crate) fn finish_keeping(&self, kept: usize) {
         let mut held = lock(&self.held);
         held.bytes = kept;
         held.room.truncate(kept.saturating_sub(1) / UNIT_BYTES);
     }
 }
 
-/// A stream of bytes whose reader takes room for what it reads.
+/// A stream that charges the bytes that are read from it.
 #[derive(Debug)]
-pub(crate) struct Metered<S> {
+pub(crate) struct MeteredStream<S> {
     stream: S,
     inflow: Arc<Inflow>,
 }
 
-impl<S> Metered<S> {
+impl<S> MeteredStream<S> {
     pub(crate) fn new(stream: S, inflow: Arc<Inflow>) -> Self {
         Self { stream, inflow }
     }
 }
 
-impl<S: AsyncRead + Unpin> AsyncRead for Metered<S> {
+impl<S: AsyncRead + Unpin> AsyncRead for MeteredStream<S> {
     fn poll_read(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -90,7 +90,7 @@ impl<S: AsyncRead + Unpin> AsyncRead for Metered<S> {
     }
 }
 
-impl<S: AsyncWrite + Unpin> AsyncWrite for Metered<S> {
+impl<S: AsyncWrite + Unpin> AsyncWrite for MeteredStream<S> {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         Pin::new(&mut self.stream).poll_write(cx, buf)
     }
@@ -142,14 +142,14 @@ mod tests {
         };
         assert!(matches!(refused, GatewayError::Crowded { pool: Pool::Total, .. }), "{refused}");
         assert_eq!(begun.len(), (2048 << 20) / BEGUN + 1);
-        // Short messages need no room, and finished ones give theirs back.
+        // Short messages need no room, and finished ones release theirs.
         let short = Inflow::default();
         short.admit(&quota);
         short.add(UNIT_BYTES).unwrap();
         assert!(short.add(1 << 20).is_err());
-        short.done_but(0);
-        begun.iter().for_each(|inflow| inflow.done_but(0));
-        let mut stream = Metered::new(&[7; 200_000][..], Arc::new(short));
+        short.finish_keeping(0);
+        begun.iter().for_each(|inflow| inflow.finish_keeping(0));
+        let mut stream = MeteredStream::new(&[7; 200_000][..], Arc::new(short));
         assert_eq!(stream.read_to_end(&mut Vec::new()).await.unwrap(), 200_000);
         assert_eq!(lock(&stream.inflow.held).room.len(), (200_000 - 1) / UNIT_BYTES);
     }

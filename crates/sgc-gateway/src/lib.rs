@@ -1,22 +1,21 @@
-//! Programs without ROS on a ROS 2 network: what they may do, and what it takes to do it.
+//! Access to a ROS 2 network for programs without ROS.
 //!
-//! A [`Hub`] is an ordinary node of the local ROS 2 network, which many clients share: it reads each topic once for all who
-//! subscribe, knows the graph, and finds definitions. A [`Session`] is one client's part in it, which holds it to its
-//! [`Scope`] and to bounds of its own. Protocols stand on sessions and on nothing below: [`rosbridge`], [`foxglove`],
-//! [`grpc`].
+//! A [`Hub`] is an ordinary node of the local ROS 2 network that many clients share. It reads each topic once for all
+//! subscribers, follows the graph and finds definitions. A [`Session`] is one client's use of the hub, bounded by a
+//! [`Scope`] and limits. The protocols [`rosbridge`], [`foxglove`] and [`grpc`] build on sessions only.
 //!
-//! The hub knows of no other SGC node: what it writes is shared by the proxy beside it like what any program writes, by the
-//! same rules. Sockets are opened by `server` alone, and the network behind [`LocalRos`] is for others to open.
+//! The hub knows no other SGC node: the proxy beside it shares its publications by the same rules as those of any
+//! program. Only the module `server` opens sockets, and other crates open the network behind [`LocalRos`].
 #![forbid(unsafe_code)]
 
 mod access;
 mod access_watch;
 mod action;
-mod aside;
+mod admission;
 mod budget;
 mod clock;
 mod content;
-mod door;
+mod definitions;
 mod error;
 mod feed;
 pub mod foxglove;
@@ -25,6 +24,7 @@ pub mod grpc;
 mod hub;
 mod inflow;
 mod message;
+mod offload;
 mod publisher;
 mod queue;
 mod quota;
@@ -34,22 +34,22 @@ mod server;
 mod service;
 mod session;
 mod tls;
-mod types;
 mod ws;
 
 pub use access::{
     ACCESS_LABEL_BYTES_MAX, ACCESS_TOKEN_PREFIX, ACCESS_TOKEN_TEXT_BYTES_MAX, ACCESS_VALID_MS_MAX, Access,
-    AccessGrant, AccessRules, AccessToken, AccessTokenError, Admission, AdmittedBy, Anonymous, Client,
-    ClientRule, Denied, HearRefusals, ORIGIN_BYTES_MAX, PageOrigin, PageOriginError, Right, SCOPE_BYTES_MAX,
-    SCOPE_PATTERNS_MAX, Scope, ScopeError, TokenId, TokenIdError, check_access_label,
+    AccessGrant, AccessRules, AccessToken, AccessTokenError, AdmissionRequest, AdmittedBy, Anonymous, Client,
+    ClientRule, Denial, ORIGIN_BYTES_MAX, PageOrigin, PageOriginError, RefusalListener, Right,
+    SCOPE_BYTES_MAX, SCOPE_PATTERNS_MAX, Scope, ScopeError, TokenId, TokenIdError, check_access_label,
 };
 pub use access_watch::AccessWatch;
 pub use action::{
     ActionEvent, ActionReplier, ActionServing, CancelAnswer, Feedback, Goal, GoalId, GoalStatus, Outcome,
 };
+pub use admission::{ClientStatus, GatewayStatus};
 pub use clock::WallClock;
 pub use content::{Content, Form};
-pub use door::{ClientStatus, GatewayStatus};
+pub use definitions::{FindDefinitions, InterfaceType, ShippedDefinitions, Types};
 pub use error::{ErrorKind, GatewayError};
 pub use feed::{Delivery, Subscription};
 pub use graph::{ActionInfo, EndpointInfo, Graph, NodeInfo, ServiceInfo, TopicInfo, is_hidden};
@@ -62,4 +62,3 @@ pub use server::{ListenAt, Protocol, Server, ServerError, ServerOptions};
 pub use service::{Replier, Request, Serving};
 pub use session::{Advertise, Session, SessionLimits, Subscribe};
 pub use tls::{TlsError, certified_key};
-pub use types::{FindDefinitions, InterfaceType, Shipped, Types};

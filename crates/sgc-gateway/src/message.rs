@@ -1,4 +1,4 @@
-//! [`Message`]: what came on a topic, written once in each form however many clients want it.
+//! [`Message`]: a message of a topic, converted once to each form for all clients.
 
 use std::sync::OnceLock;
 
@@ -6,45 +6,45 @@ use bytes::Bytes;
 use sgc_cdr::Layout;
 use sgc_ros::Guid;
 
-use crate::aside::aside_if_long;
 use crate::content::{Form, convert};
 use crate::error::GatewayError;
+use crate::offload::offload_if_long;
 
-type Written = OnceLock<Result<Bytes, GatewayError>>;
+type CachedEncoding = OnceLock<Result<Bytes, GatewayError>>;
 
-/// A message that came on a topic.
+/// A message received on a topic.
 #[derive(Debug)]
 pub struct Message {
-    /// Its serialised form.
+    /// The serialised message.
     pub payload: Bytes,
-    /// When it was published, nanoseconds since the Unix epoch, by its publisher's clock.
+    /// The time of publication by the publisher's clock, in nanoseconds since the Unix epoch.
     pub source_timestamp_ns: i64,
-    /// When it came here, by this host's clock.
+    /// The time of reception by this host's clock.
     pub received_ns: i64,
-    /// Its writer on the local network, if that tells.
+    /// The writer on the local network, if known.
     pub writer: Option<Guid>,
-    json: Written,
-    cbor: Written,
+    json: CachedEncoding,
+    cbor: CachedEncoding,
 }
 
 impl Message {
     pub(crate) fn new(payload: Bytes, writer: Option<Guid>, source_timestamp_ns: i64) -> Self {
         let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         let received_ns = since.map_or(0, |since| since.as_nanos().try_into().unwrap_or(i64::MAX));
-        let (json, cbor) = (Written::new(), Written::new());
+        let (json, cbor) = (CachedEncoding::new(), CachedEncoding::new());
         Self { payload, source_timestamp_ns, received_ns, writer, json, cbor }
     }
 
-    /// Returns the message without the forms in which it was written.
+    /// Returns the message without its cached conversions.
     pub(crate) fn unwritten(&self) -> Self {
-        let (json, cbor) = (Written::new(), Written::new());
+        let (json, cbor) = (CachedEncoding::new(), CachedEncoding::new());
         let payload = self.payload.clone();
         let (source_timestamp_ns, received_ns, writer) =
             (self.source_timestamp_ns, self.received_ns, self.writer);
         Self { payload, source_timestamp_ns, received_ns, writer, json, cbor }
     }
 
-    /// The message in a form; `layout` is of its topic's type.
+    /// Returns the message in a form. `layout` is the layout of the topic's type.
     pub fn written(&self, form: Form, layout: &Layout) -> Result<Bytes, GatewayError> {
         let written = match form {
             Form::Cdr => return Ok(self.payload.clone()),
@@ -54,8 +54,8 @@ impl Message {
         if let Some(written) = written.get() {
             return written.clone();
         }
-        // Who wants the same meanwhile waits for it, and is to hold up nobody either.
+        // A second client that needs the same form waits here, and must not hold up others either.
         let make = || written.get_or_init(|| convert(layout, &self.payload, form));
-        aside_if_long(self.payload.len(), make).clone()
+        offload_if_long(self.payload.len(), make).clone()
     }
 }

@@ -1,4 +1,4 @@
-//! [`Publication`]: what one client publishes on a topic.
+//! [`Publication`]: a client's publisher on a topic.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -15,41 +15,41 @@ use tokio::time::Instant;
 use crate::content::{Content, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
-use crate::hub::{Shared, lock};
-use crate::quota::{Charge, Quota, Waiting};
+use crate::hub::{HubState, lock};
+use crate::quota::{Charge, PendingBytes, Quota};
 
-/// How long readers may take to acknowledge what was written last before its writer ends.
+/// Time within which readers must acknowledge the last messages before the writer ends.
 const FAREWELL_MAX: Duration = Duration::from_secs(1);
-/// How long a thread waits for readers before it is looked whether anybody still wants that.
+/// Time for which a thread waits for readers before it checks whether the result is still wanted.
 const MATCH_WAIT_MAX: Duration = Duration::from_secs(1);
-/// Longest payload that the local network takes, bytes (`sgc-dds` refuses more).
+/// Longest payload that `sgc-dds` accepts, in bytes.
 const PAYLOAD_BYTES_MAX: usize = 64 << 20;
 
-/// Messages that are written by one thread in one go, and their bytes: what is more waits until these are written.
+/// Most messages and bytes that one thread writes in one go. Further messages wait until these are written.
 const AHEAD_MAX: usize = 64;
 const AHEAD_BYTES_MAX: usize = 64 << 10;
-/// A reliable writer that keeps its last messages does not wait for readers while these have not more bytes than that: Cyclone
-/// lets 30 kB be unacknowledged when it begins, more later.
+/// A reliable writer that keeps its last messages never blocks while these have at most this many bytes. Cyclone
+/// first allows 30 kB unacknowledged, later more.
 const UNACKNOWLEDGED_BYTES_MIN: usize = 24 << 10;
 
-/// Messages that a transient-local writer of a topic with keys keeps, of all instances (`sgc-dds`).
+/// Most messages that a transient-local writer of a keyed topic keeps over all instances (`sgc-dds`).
 const KEYED_KEPT_MAX: usize = 4096;
 
-/// Whom a [`Publication`] counts for.
+/// The accounts to which a [`Publication`] is charged.
 #[derive(Debug)]
 pub(crate) struct Account {
-    /// The quota of its client.
+    /// The quota of the client.
     pub(crate) quota: Quota,
-    /// Its place among the publications of its client's credential, if it has one of its own.
+    /// The charge of the publication to the client's credential, if it is not part of a served action.
     pub(crate) charge: Option<Charge>,
-    /// Bytes of messages that the client's transient-local writers keep, if its messages are counted.
-    pub(crate) kept: Option<Arc<Waiting>>,
+    /// The bytes of messages that the client's transient-local writers keep, if they are counted.
+    pub(crate) kept: Option<Arc<PendingBytes>>,
 }
 
-/// Lengths of the messages that a transient-local writer keeps for readers that come later.
+/// The lengths of the messages that a transient-local writer keeps for later readers.
 #[derive(Debug)]
-struct Kept {
-    waiting: Arc<Waiting>,
+struct WriterHistory {
+    waiting: Arc<PendingBytes>,
     depth: usize,
     lengths: Mutex<Lengths>,
 }
@@ -61,12 +61,12 @@ struct Lengths {
     sum: usize,
 }
 
-impl Kept {
-    fn new(waiting: Arc<Waiting>, depth: usize) -> Self {
+impl WriterHistory {
+    fn new(waiting: Arc<PendingBytes>, depth: usize) -> Self {
         Self { waiting, depth: depth.max(1), lengths: Mutex::default() }
     }
 
-    /// Takes room for a message, which takes the place of the oldest one if the writer keeps as many as it may.
+    /// Reserves room for a message, which replaces the oldest one if the writer is at its depth.
     fn take(&self, bytes: usize) -> Result<(), GatewayError> {
         let mut lengths = lock(&self.lengths);
         let is_full = lengths.each.len() >= self.depth;
@@ -84,55 +84,55 @@ impl Kept {
     }
 }
 
-impl Drop for Kept {
+impl Drop for WriterHistory {
     fn drop(&mut self) {
         self.waiting.sub(lock(&self.lengths).sum);
     }
 }
 
-/// What one client publishes on a topic; ends when dropped, once reliable readers have what was written.
+/// A client's publisher on a topic. Dropping it ends the writer after reliable readers have the last messages.
 pub struct Publication {
-    shared: Arc<Shared>,
-    line: Arc<Line>,
+    shared: Arc<HubState>,
+    line: Arc<WriteQueue>,
     layout: Arc<Layout>,
     topic: String,
     type_name: String,
-    /// Longest message that is written without ever waiting for readers.
+    /// Longest message that never waits for readers.
     bytes_at_once_max: usize,
-    /// Whether a write may wait for readers, since one before it may: they keep their order.
+    /// `true` if writes go through the queue because an earlier write may block; this keeps their order.
     may_block: AtomicBool,
-    /// The quota of its client.
+    /// The quota of the client.
     quota: Quota,
     _charge: Option<Charge>,
 }
 
-/// A writer, and what waits to be written by a thread that may wait.
-struct Line {
+/// A writer and the messages that a thread will write to it.
+struct WriteQueue {
     writer: Arc<dyn RosWriter>,
-    ahead: Mutex<Ahead>,
-    /// Held by who writes what waits, so that it keeps its order.
+    ahead: Mutex<PendingWrites>,
+    /// Held while the queue is written, which keeps the order.
     turn: Mutex<()>,
     published: AtomicU64,
-    /// The count of the messages that the writer keeps, until the writer ends.
-    kept: Option<Kept>,
+    /// The lengths of the messages that the writer keeps, until it ends.
+    kept: Option<WriterHistory>,
 }
 
 #[derive(Default)]
-struct Ahead {
-    /// Source time stamps, nanoseconds since the Unix epoch, and payloads.
+struct PendingWrites {
+    /// Source timestamps in nanoseconds since the Unix epoch, and payloads.
     messages: VecDeque<(i64, Bytes)>,
     bytes: usize,
 }
 
-impl Line {
-    /// Writes one message, which leaves with those that follow, or when the writer is flushed.
+impl WriteQueue {
+    /// Writes one message, which is sent with the messages that follow or at the next flush.
     fn write(&self, stamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
         self.writer.write_ahead(SampleHead::new(SampleKind::Write, stamp_ns), payload)?;
         self.published.fetch_add(1, Ordering::Relaxed);
         Ok(())
     }
 
-    /// Writes what waits, up to the first message that cannot be written. May block.
+    /// Writes queued messages up to the first one that fails. May block.
     fn write_out(&self) -> Result<(), RosError> {
         let _turn = lock(&self.turn);
         let next = || {
@@ -154,7 +154,7 @@ impl Line {
 
 impl Publication {
     pub(crate) async fn new(
-        shared: &Arc<Shared>,
+        shared: &Arc<HubState>,
         topic: String,
         type_name: String,
         qos: Qos,
@@ -177,11 +177,11 @@ impl Publication {
                     qos,
                 };
                 let kept = account.kept.filter(|_| spec.qos.is_transient_local());
-                let kept = kept.map(|kept| Kept::new(kept, kept_max(&spec)));
+                let kept = kept.map(|kept| WriterHistory::new(kept, kept_max(&spec)));
                 let writer: Arc<dyn RosWriter> = Arc::from(shared.ros.writer(&spec)?);
                 shared.know(own_endpoint(EndpointKind::Writer, writer.guid(), &spec));
                 let (ahead, turn, published) = (Mutex::default(), Mutex::default(), AtomicU64::new(0));
-                let line = Arc::new(Line { writer, ahead, turn, published, kept });
+                let line = Arc::new(WriteQueue { writer, ahead, turn, published, kept });
                 let bytes_at_once_max = bytes_at_once_max(&spec);
                 let may_block = AtomicBool::new(bytes_at_once_max == 0);
                 let shared = Arc::clone(shared);
@@ -200,39 +200,39 @@ impl Publication {
             .await
     }
 
-    /// The topic.
+    /// Returns the topic.
     pub fn topic(&self) -> &str {
         &self.topic
     }
 
-    /// Its ROS type.
+    /// Returns the ROS type.
     pub fn type_name(&self) -> &str {
         &self.type_name
     }
 
-    /// What its messages look like.
+    /// Returns the layout of the messages.
     pub fn layout(&self) -> &Arc<Layout> {
         &self.layout
     }
 
-    /// Publishes a message; waits for readers if the quality of service says so.
+    /// Publishes a message. Waits for readers if the QoS demands it.
     pub async fn publish(&self, content: &Content) -> Result<(), GatewayError> {
         self.publish_ahead(content).await?;
         self.flush().await
     }
 
-    /// The same, but the message need not leave before [`Self::flush`]: those that follow share packets with it, and changes
-    /// of threads. If readers are waited for, what fails may be a message before it.
+    /// Publishes a message that may stay queued until [`Self::flush`], so that later messages share its packets and
+    /// thread switches. If the writer waits for readers, an error may belong to an earlier message.
     pub async fn publish_ahead(&self, content: &Content) -> Result<(), GatewayError> {
         self.write_ahead(content.to_cdr(&self.layout)?).await
     }
 
-    /// The same with a value.
+    /// Publishes a value as [`Self::publish_ahead`] does a message.
     pub(crate) async fn publish_value_ahead(&self, value: &Value) -> Result<(), GatewayError> {
         self.write_ahead(serialise(&self.layout, value)?).await
     }
 
-    /// Publishes a value; waits for readers if the quality of service says so.
+    /// Publishes a value. Waits for readers if the QoS demands it.
     pub(crate) async fn publish_value(&self, value: &Value) -> Result<(), GatewayError> {
         self.publish_value_ahead(value).await?;
         self.flush().await
@@ -262,8 +262,8 @@ impl Publication {
         if is_full { self.flush().await } else { Ok(()) }
     }
 
-    /// Has what was published ahead leave. After an error, which is of one message, that is lost, what is behind it waits for
-    /// the next call.
+    /// Sends queued messages. An error means that one message is lost; the messages behind it stay queued for the
+    /// next call.
     pub async fn flush(&self) -> Result<(), GatewayError> {
         if !self.may_block.load(Ordering::Relaxed) {
             self.line.writer.flush();
@@ -277,22 +277,22 @@ impl Publication {
         self.shared.blocking(move |_| line.write_out()).await
     }
 
-    /// Whether messages wait that were published ahead.
+    /// Returns `true` if messages are queued.
     pub fn has_ahead(&self) -> bool {
         !lock(&self.line.ahead).messages.is_empty()
     }
 
-    /// How many messages were published: those that wait are not counted yet.
+    /// Returns the number of published messages, without queued ones.
     pub fn published(&self) -> u64 {
         self.line.published.load(Ordering::Relaxed)
     }
 
-    /// How many local readers hear it at present.
+    /// Returns the number of matched local readers.
     pub fn matched_readers(&self) -> u32 {
         self.line.writer.matched_readers()
     }
 
-    /// Waits until so many readers hear it, or for so long; says how many do.
+    /// Waits for this many matched readers, at most for `max`, and returns their number.
     pub async fn wait_for_readers(&self, readers: u32, max: Duration) -> u32 {
         let until = Instant::now() + max;
         loop {
@@ -313,8 +313,8 @@ impl Publication {
         }
     }
 
-    /// Waits, not long, until those readers are matched that the graph shows: what is written to others before is lost,
-    /// as with any writer that is new.
+    /// Waits, at most for `max`, until the readers in the graph are matched. A new writer's messages are lost to
+    /// readers that are not matched yet.
     pub async fn settle(&self, max: Duration) {
         let graph = self.shared.graph();
         let readers = graph.topics.get(&self.topic).map_or(0, |info| {
@@ -336,7 +336,7 @@ impl Drop for Publication {
         let (shared, line) = (Arc::clone(&self.shared), Arc::clone(&self.line));
         let place = Arc::clone(&shared.farewells).try_acquire_owned();
         self.shared.runtime.spawn_blocking(move || {
-            // Where many end at once, not all can be waited for.
+            // If many writers end at once, not all of them wait for acknowledgements.
             if place.is_ok() {
                 if let Err(error) = line.write_out() {
                     tracing::debug!(%error, "what was published last is lost");
@@ -349,7 +349,7 @@ impl Drop for Publication {
     }
 }
 
-/// Returns the most messages that a transient-local writer keeps.
+/// Returns the number of messages that a transient-local writer keeps at most.
 fn kept_max(spec: &EndpointSpec) -> usize {
     match &spec.qos.history {
         History::KeepLast(depth) if spec.keyless => *depth as usize,
@@ -357,11 +357,11 @@ fn kept_max(spec: &EndpointSpec) -> usize {
     }
 }
 
-/// Longest message that a writer never has to wait with; 0 if it may with any.
+/// Returns the longest message with which a write never blocks, or 0 if any write may block.
 fn bytes_at_once_max(spec: &EndpointSpec) -> usize {
     match (spec.qos.is_reliable(), &spec.qos.history) {
         (false, _) => usize::MAX,
-        // Of each instance of a topic with keys so many are kept.
+        // A keyed topic keeps `depth` messages of each instance.
         (true, History::KeepLast(depth)) if spec.keyless => {
             UNACKNOWLEDGED_BYTES_MIN / (*depth as usize).max(1)
         }

@@ -1,4 +1,4 @@
-//! [`Queue`]: what waits for one subscriber, bounded by number and bytes.
+//! [`Queue`]: the messages queued for one subscriber, bounded by number and bytes.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -7,18 +7,18 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use tokio::sync::Notify;
 
 use crate::message::Message;
-use crate::quota::Waiting;
+use crate::quota::PendingBytes;
 
-/// Bytes that a message costs beside its payload: queues of very short messages are not free.
+/// Cost of a message in bytes beside its payload, because queues of very short messages are not free.
 pub(crate) const MESSAGE_COST_BYTES: usize = 256;
 
-/// What is done with a message that there is no room for.
+/// The treatment of a message without room.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Overflow {
-    /// The oldest gives way, and is counted.
+    /// The oldest message is dropped and counted.
     #[default]
     DropOldest,
-    /// The reader waits, and with it everybody who subscribes with it: so only for those who have one of their own.
+    /// The reader waits, and all its subscribers with it. Only for a subscriber that has its own reader.
     Wait,
 }
 
@@ -28,11 +28,11 @@ struct State {
     bytes: usize,
     dropped: u64,
     is_closed: bool,
-    /// Nobody is waited for at the moment.
+    /// `true` while a full queue does not hold up its reader.
     lets_pass: bool,
 }
 
-/// What waits for one subscriber.
+/// The messages queued for one subscriber.
 #[derive(Debug)]
 pub(crate) struct Queue {
     state: Mutex<State>,
@@ -40,21 +40,26 @@ pub(crate) struct Queue {
     room: Condvar,
     depth: AtomicUsize,
     bytes_max: usize,
-    /// Bytes that wait in all queues of the client, this one among them.
-    waiting: Arc<Waiting>,
+    /// The bytes in all queues of the client, including this one.
+    waiting: Arc<PendingBytes>,
     overflow: Overflow,
 }
 
 impl Queue {
-    /// Creates one of the queues that share `waiting`. `bytes_max` bounds a queue whose reader waits: nobody else makes room
-    /// for it.
-    pub(crate) fn new(depth: usize, bytes_max: usize, waiting: Arc<Waiting>, overflow: Overflow) -> Self {
+    /// Creates a queue that shares `waiting` with the client's other queues. `bytes_max` bounds a queue that holds up
+    /// its reader, because no other queue makes room for it.
+    pub(crate) fn new(
+        depth: usize,
+        bytes_max: usize,
+        waiting: Arc<PendingBytes>,
+        overflow: Overflow,
+    ) -> Self {
         let (state, filled, room) = (Mutex::default(), Notify::new(), Condvar::new());
         let depth = AtomicUsize::new(depth.max(1));
         Self { state, filled, room, depth, bytes_max, waiting, overflow }
     }
 
-    /// How many messages may wait from now on.
+    /// Sets the number of messages that may be queued.
     pub(crate) fn set_depth(&self, depth: usize) {
         self.depth.store(depth.max(1), Ordering::Relaxed);
     }
@@ -70,11 +75,11 @@ impl Queue {
         };
         let depth = self.depth.load(Ordering::Relaxed);
         let fits = state.messages.len() < depth && has_bytes;
-        // One that is longer than the bound alone passes alone.
+        // A message longer than the bound passes alone.
         fits || state.messages.is_empty()
     }
 
-    /// Whether a message of that length would have to wait.
+    /// Returns `true` if a message of this length would have to wait.
     pub(crate) fn would_wait(&self, bytes: usize) -> bool {
         if self.overflow == Overflow::DropOldest {
             return false;
@@ -83,13 +88,13 @@ impl Queue {
         !state.is_closed && !state.lets_pass && !self.has_room(&state, bytes + MESSAGE_COST_BYTES)
     }
 
-    /// Whether what there is no room for comes all the same, rather than waiting.
+    /// Sets whether messages without room are queued all the same instead of waiting.
     pub(crate) fn let_pass(&self, lets_pass: bool) {
         self.lock().lets_pass = lets_pass;
         self.room.notify_all();
     }
 
-    /// Puts a message behind the others.
+    /// Appends a message.
     pub(crate) fn push(&self, message: &Arc<Message>) {
         let bytes = cost(message);
         let mut state = self.lock();
@@ -116,12 +121,12 @@ impl Queue {
         self.filled.notify_one();
     }
 
-    /// Counts what was lost before it came here.
+    /// Counts messages lost before they reached the queue.
     pub(crate) fn add_dropped(&self, messages: u64) {
         self.lock().dropped += messages;
     }
 
-    /// The oldest, if any waits, and how many were dropped until now.
+    /// Returns the oldest message, if any, and the number of dropped messages so far.
     pub(crate) fn pop(&self) -> Option<(Arc<Message>, u64)> {
         let mut state = self.lock();
         let message = state.messages.pop_front()?;
@@ -135,7 +140,7 @@ impl Queue {
         Some((message, dropped))
     }
 
-    /// Waits for one; `None` once it is closed and empty.
+    /// Waits for a message. Returns `None` once the queue is closed and empty.
     pub(crate) async fn next(&self) -> Option<(Arc<Message>, u64)> {
         loop {
             let filled = self.filled.notified();
@@ -153,14 +158,14 @@ impl Queue {
         self.lock().dropped
     }
 
-    /// Forgets what waits.
+    /// Drops all queued messages.
     pub(crate) fn clear(&self) {
         let mut state = self.lock();
         self.waiting.sub(state.bytes);
         (state.messages, state.bytes) = (VecDeque::new(), 0);
     }
 
-    /// Nothing comes any more; who waits for room goes on.
+    /// Closes the queue. A reader that waits for room continues.
     pub(crate) fn close(&self) {
         self.lock().is_closed = true;
         self.room.notify_all();
@@ -193,14 +198,14 @@ mod tests {
 
     #[test]
     fn queues_of_a_client_share_what_may_wait() {
-        let waiting = Waiting::of_own(ROOM);
+        let waiting = PendingBytes::for_own_client(ROOM);
         let queue = || Queue::new(9, ROOM, Arc::clone(&waiting), Overflow::DropOldest);
         let (one, other) = (queue(), queue());
         one.push(&message(80));
         for _ in 0..3 {
             other.push(&message(30));
         }
-        // One message each is there in any case.
+        // Each queue may hold one message in any case.
         assert_eq!((one.dropped(), other.dropped(), waiting.bytes()), (0, 2, 110 + 2 * MESSAGE_COST_BYTES));
         drop(one);
         other.push(&message(30));
@@ -209,13 +214,13 @@ mod tests {
 
     #[tokio::test]
     async fn the_oldest_gives_way_and_is_counted() {
-        let queue = Queue::new(2, ROOM, Waiting::of_own(ROOM), Overflow::DropOldest);
+        let queue = Queue::new(2, ROOM, PendingBytes::for_own_client(ROOM), Overflow::DropOldest);
         for bytes in [10, 20, 30] {
             queue.push(&message(bytes));
         }
         let lengths = |next: Option<(Arc<Message>, u64)>| next.map(|(m, dropped)| (m.payload.len(), dropped));
         assert_eq!(lengths(queue.next().await), Some((20, 1)));
-        // By bytes, too; what is longer than all there may be comes alone.
+        // The bound in bytes holds, too. A message longer than the bound passes alone.
         queue.push(&message(90));
         assert_eq!((lengths(queue.pop()), queue.dropped()), (Some((90, 2)), 2));
         queue.push(&message(1));
@@ -226,8 +231,8 @@ mod tests {
     }
 
     #[test]
-    fn who_waits_for_room_goes_on_when_there_is_some_or_the_end() {
-        let queue = Arc::new(Queue::new(1, ROOM, Waiting::of_own(ROOM), Overflow::Wait));
+    fn waiting_push_continues_with_room_or_at_the_end() {
+        let queue = Arc::new(Queue::new(1, ROOM, PendingBytes::for_own_client(ROOM), Overflow::Wait));
         queue.push(&message(1));
         assert!(queue.would_wait(1));
         let pusher = {
@@ -244,8 +249,8 @@ mod tests {
     }
 
     #[test]
-    fn who_waits_for_room_is_let_pass() {
-        let queue = Arc::new(Queue::new(1, ROOM, Waiting::of_own(ROOM), Overflow::Wait));
+    fn waiting_push_can_be_let_pass() {
+        let queue = Arc::new(Queue::new(1, ROOM, PendingBytes::for_own_client(ROOM), Overflow::Wait));
         queue.push(&message(1));
         let pusher = {
             let queue = queue.clone();

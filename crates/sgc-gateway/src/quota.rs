@@ -1,10 +1,10 @@
 //! [`Quota`]: the bounds of a credential over all its sessions, beside the bounds of each session.
 //!
-//! One credential, with however many connections, has [`CREDENTIAL_SHARE`] times what one session may have; all clients of
-//! other hosts together have [`REMOTE_SHARE`] times as much, and all clients of this gateway [`TOTAL_SHARE`] times. The
-//! difference of the last two is for programs of this host: no client of another host takes that.
+//! One credential may hold [`CREDENTIAL_SHARE`] times the bounds of a session, however many connections it has. All
+//! clients of other hosts together may hold [`REMOTE_SHARE`] times, and all clients of this gateway [`TOTAL_SHARE`]
+//! times. The difference between the last two is reserved for programs on this host.
 //!
-//! `door` decides whether a connection has a place at all.
+//! The module `admission` decides whether a connection gets a place at all.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -18,25 +18,25 @@ use crate::error::GatewayError;
 use crate::hub::lock;
 use crate::session::SessionLimits;
 
-/// Sessions' worth that one credential has.
+/// Bound of one credential, in sessions.
 const CREDENTIAL_SHARE: usize = 4;
-/// Sessions' worth that all clients of other hosts have together.
+/// Bound of all clients of other hosts together, in sessions.
 const REMOTE_SHARE: usize = 12;
-/// Sessions' worth that all clients have together.
+/// Bound of all clients together, in sessions.
 const TOTAL_SHARE: usize = 16;
-/// Threads that wait for local programs at a time: of one credential, of all clients of other hosts, in all.
+/// Most threads that wait for local programs: of one credential, of all clients of other hosts, of all clients.
 const THREADS: [usize; 3] = [16, 48, 64];
-/// Bytes of long messages that are under way between the gateway and clients: of one credential, of all clients of other
-/// hosts, in all.
+/// Most bytes of long messages in transit between gateway and clients: of one credential, of all clients of other
+/// hosts, of all clients.
 const LONG_BYTES: [usize; 3] = [512 << 20, 1536 << 20, 2048 << 20];
 
-/// Something that a quota bounds.
+/// A resource that a quota bounds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Resource {
     Subscriptions,
-    /// Subscriptions that the local network waits for.
+    /// Subscriptions for which writers on the local network wait.
     Waits,
-    /// Readers on the local network that were made for the client.
+    /// Readers on the local network that were created for the client.
     Readers,
     Publications,
     Servings,
@@ -60,7 +60,7 @@ impl Resource {
         }
     }
 
-    /// Returns how many one session may have.
+    /// Returns the bound of one session.
     fn session_max(self, limits: &SessionLimits) -> usize {
         match self {
             Self::Subscriptions | Self::Readers => limits.subscriptions_max,
@@ -75,7 +75,7 @@ impl Resource {
 /// Clients that share a bound.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Pool {
-    /// All clients that show the same token or certificate, or come without one from the same address.
+    /// All clients that show the same token or certificate, or that come from the same address without one.
     Credential,
     /// All clients of other hosts.
     Remote,
@@ -93,12 +93,12 @@ impl fmt::Display for Pool {
     }
 }
 
-/// Counts of all that the clients of a pool have.
+/// The counts of everything that the clients of a pool hold.
 #[derive(Debug)]
 struct Counts {
     pool: Pool,
     resources: [AtomicUsize; RESOURCES],
-    /// Bytes of messages that wait.
+    /// Bytes of queued messages.
     bytes: AtomicUsize,
     permits: [Arc<Semaphore>; PERMITS],
 }
@@ -117,7 +117,7 @@ impl Counts {
         }
     }
 
-    /// Takes all that a session has, or nothing of it: an error names the bound that it is beyond.
+    /// Takes everything that a session holds, or nothing. An error names the exceeded bound.
     fn take_all(&self, holdings: &Holdings, limits: &SessionLimits) -> Result<(), (&'static str, usize)> {
         let mut taken = Holdings::default();
         let refused = self.take_each(holdings, limits, &mut taken);
@@ -127,7 +127,7 @@ impl Counts {
         refused
     }
 
-    /// Takes one sort after the other, and notes in `taken` which it has.
+    /// Takes one resource after the other, and notes in `taken` what it took.
     fn take_each(
         &self,
         holdings: &Holdings,
@@ -168,19 +168,19 @@ impl Counts {
     }
 }
 
-/// Adds to a count, unless it would be more than `max` then. Nothing more is always within it.
+/// Adds to a count, unless the sum exceeds `max`. Adding zero always succeeds.
 fn add_within(count: &AtomicUsize, more: usize, max: usize) -> bool {
     let fits = |now: usize| now.checked_add(more).filter(|sum| more == 0 || *sum <= max);
     count.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits).is_ok()
 }
 
-/// Counts of all that the clients of a hub have.
+/// The counts of everything that the clients of a hub hold.
 #[derive(Debug)]
 pub(crate) struct Quotas {
     total: Arc<Counts>,
     remote: Arc<Counts>,
     of: Mutex<BTreeMap<Credential, Weak<Counts>>>,
-    /// Refusals, by the pool whose bound it was.
+    /// Refusals by the pool whose bound was reached.
     refused: Mutex<BTreeMap<Pool, u64>>,
     /// Messages that were not kept for later subscribers.
     history_dropped: AtomicU64,
@@ -200,7 +200,7 @@ impl Default for Quotas {
 }
 
 impl Quotas {
-    /// Returns the quota of a session, which shares its bounds with all that have its client's credential.
+    /// Returns the quota of a session. It shares its bounds with all sessions of the client's credential.
     pub(crate) fn quota(self: &Arc<Self>, client: &Client) -> Quota {
         Quota(Arc::new(Ledger {
             quotas: Arc::clone(self),
@@ -229,7 +229,7 @@ impl Quotas {
         [own, remote, Some(Arc::clone(&self.total))].into_iter().flatten().collect()
     }
 
-    /// Returns the number of refusals for the bound of each pool.
+    /// Returns the number of refusals by pool.
     pub(crate) fn refused(&self) -> BTreeMap<Pool, u64> {
         lock(&self.refused).clone()
     }
@@ -251,7 +251,7 @@ impl Quotas {
 /// The pools of a client, the smallest first.
 type Pools = Arc<[Arc<Counts>]>;
 
-/// Units that a session has of each sort.
+/// The units of each resource that a session holds.
 #[derive(Debug, Default)]
 struct Holdings {
     resources: [usize; RESOURCES],
@@ -259,13 +259,13 @@ struct Holdings {
     permits: [usize; PERMITS],
 }
 
-/// All that one session has of its pools. It moves as a whole when the session shows another credential.
+/// Everything that one session holds of its pools. It moves as a whole when the session shows another credential.
 #[derive(Debug)]
 struct Ledger {
     quotas: Arc<Quotas>,
-    /// Locked for writing while what the session has moves, for reading while that changes.
+    /// Locked for writing while the holdings move to other pools, and for reading while they change.
     pools: RwLock<Pools>,
-    /// Wakes those who wait for permits of the pools before.
+    /// Wakes tasks that wait for permits of the former pools.
     moved: Notify,
     resources: [AtomicUsize; RESOURCES],
     bytes: AtomicUsize,
@@ -287,11 +287,11 @@ impl Ledger {
     }
 }
 
-/// The quota of one session, which shares the bounds of its credential with other sessions. Clones are the same one.
+/// The quota of one session, which shares the bounds of its credential with other sessions. Clones share the quota.
 #[derive(Clone, Debug)]
 pub(crate) struct Quota(Arc<Ledger>);
 
-/// One unit of a resource, until dropped.
+/// One unit of a resource, returned on drop.
 #[derive(Debug)]
 pub(crate) struct Charge {
     quota: Quota,
@@ -313,17 +313,17 @@ fn give_back(resource: Resource, pools: &[Arc<Counts>]) {
 }
 
 impl Quota {
-    /// Returns `true` if it is the quota of the same session.
+    /// Returns `true` if both are the quota of the same session.
     fn is_same(&self, other: &Self) -> bool {
         Arc::ptr_eq(&self.0, &other.0)
     }
 
-    /// Takes one unit of a resource, of which one session may have as many as `limits` say.
+    /// Takes one unit of a resource. `limits` holds the bound of one session.
     pub(crate) fn take(&self, resource: Resource, limits: &SessionLimits) -> Result<Charge, GatewayError> {
         self.try_take(resource, limits).map_err(|(pool, max)| self.refuse(resource.what(), pool, max))
     }
 
-    /// The same; a refusal is not counted, and names the bound.
+    /// Takes one unit without counting a refusal. An error names the bound.
     fn try_take(&self, resource: Resource, limits: &SessionLimits) -> Result<Charge, (Pool, usize)> {
         let pools = self.0.pools();
         for (at, counts) in pools.iter().enumerate() {
@@ -337,7 +337,7 @@ impl Quota {
         Ok(Charge { quota: self.clone(), resource })
     }
 
-    /// Takes one unit of a resource, also beyond the bounds.
+    /// Takes one unit of a resource even beyond the bounds.
     fn take_anyway(&self, resource: Resource) -> Charge {
         let pools = self.0.pools();
         for count in pools.iter().map(|counts| &counts.resources).chain([&self.0.resources]) {
@@ -346,7 +346,7 @@ impl Quota {
         Charge { quota: self.clone(), resource }
     }
 
-    /// Moves all that the session has to the credential of another client. An error leaves everything as it was.
+    /// Moves everything that the session holds to the credential of another client. An error changes nothing.
     pub(crate) fn move_to(&self, client: &Client, limits: &SessionLimits) -> Result<(), GatewayError> {
         let mut pools = self.0.pools.write().unwrap_or_else(PoisonError::into_inner);
         let wanted = self.0.quotas.pools(client);
@@ -371,17 +371,17 @@ impl Quota {
         GatewayError::Crowded { what, max, pool }
     }
 
-    /// Waits for a thread that may wait for local programs.
+    /// Waits for a permit to run a thread that waits for local programs.
     pub(crate) async fn thread(&self) -> Result<Permits, GatewayError> {
         self.acquire(PermitKind::Threads, 1).await.ok_or(GatewayError::Stopping)
     }
 
-    /// Waits for so many units of room for long messages.
+    /// Waits for room for long messages, in units.
     pub(crate) async fn room(&self, units: u32) -> Option<Permits> {
         self.acquire(PermitKind::LongBytes, units).await
     }
 
-    /// Takes so many units of room for long messages, unless a pool has less.
+    /// Takes room for long messages, in units, or fails if a pool has less.
     pub(crate) fn room_at_once(&self, units: u32) -> Result<Permits, GatewayError> {
         let (kind, pools) = (PermitKind::LongBytes, self.0.pools());
         let units = kind.limited(units, &pools);
@@ -398,7 +398,8 @@ impl Quota {
         Ok(self.keep(kind, units, held))
     }
 
-    /// Takes permits of all pools, the smallest first: a client that waits for its own pool holds nothing of a larger one.
+    /// Takes permits of all pools, the smallest first, so that a client that waits for its own pool holds nothing of
+    /// a larger one.
     async fn acquire(&self, kind: PermitKind, units: u32) -> Option<Permits> {
         loop {
             let moved = self.0.moved.notified();
@@ -423,7 +424,7 @@ impl Quota {
         }
     }
 
-    /// Counts permits as the session's. The caller holds the lock of its pools.
+    /// Counts permits for the session. The caller holds the lock of its pools.
     fn keep(&self, kind: PermitKind, units: u32, held: Vec<OwnedSemaphorePermit>) -> Permits {
         held.into_iter().for_each(OwnedSemaphorePermit::forget);
         let units = units as usize;
@@ -432,7 +433,7 @@ impl Quota {
     }
 }
 
-/// Something that a client waits for if there is none.
+/// A resource for which a client waits if none is free.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum PermitKind {
     Threads,
@@ -451,7 +452,7 @@ impl PermitKind {
         }
     }
 
-    /// Returns how many of what it is called by one permit stands for.
+    /// Returns the quantity that one permit stands for.
     fn unit(self) -> usize {
         match self {
             Self::Threads => 1,
@@ -459,7 +460,7 @@ impl PermitKind {
         }
     }
 
-    /// Returns the number of permits that a pool has.
+    /// Returns the number of permits of a pool.
     fn max(self, pool: Pool) -> usize {
         match self {
             Self::Threads => THREADS[pool as usize],
@@ -467,14 +468,14 @@ impl PermitKind {
         }
     }
 
-    /// Limits permits to those that the smallest pool has: a longer message takes all.
+    /// Limits permits to those of the smallest pool, so that a longer message takes all of it.
     fn limited(self, wanted: u32, pools: &Pools) -> u32 {
         let all = pools.iter().map(|counts| self.max(counts.pool)).min().unwrap_or(0);
         wanted.min(u32::try_from(all).unwrap_or(u32::MAX))
     }
 }
 
-/// Permits of each pool of a session, until dropped.
+/// Permits of each pool of a session, returned on drop.
 #[derive(Debug)]
 pub(crate) struct Permits {
     quota: Quota,
@@ -490,17 +491,17 @@ impl Drop for Permits {
     }
 }
 
-/// Bytes that wait, until dropped.
+/// A reservation for queued bytes, returned on drop.
 #[derive(Debug)]
-pub(crate) struct Held {
-    waiting: Arc<Waiting>,
+pub(crate) struct ByteReservation {
+    waiting: Arc<PendingBytes>,
     bytes: usize,
 }
 
-impl Held {
-    /// Takes room for so many bytes, unless the client or one of its pools has less.
+impl ByteReservation {
+    /// Reserves bytes, unless the client or one of its pools has less room.
     pub(crate) fn new(
-        waiting: &Arc<Waiting>,
+        waiting: &Arc<PendingBytes>,
         what: &'static str,
         bytes: usize,
     ) -> Result<Self, GatewayError> {
@@ -509,9 +510,9 @@ impl Held {
     }
 }
 
-impl Held {
-    /// Takes room for so many bytes, unless there is less; a refusal is not counted.
-    pub(crate) fn if_room(waiting: &Arc<Waiting>, bytes: usize) -> Option<Self> {
+impl ByteReservation {
+    /// Reserves bytes if there is room. A refusal is not counted.
+    pub(crate) fn if_room(waiting: &Arc<PendingBytes>, bytes: usize) -> Option<Self> {
         waiting.try_take(bytes).ok()?;
         Some(Self { waiting: Arc::clone(waiting), bytes })
     }
@@ -521,81 +522,81 @@ impl Held {
     }
 }
 
-impl Drop for Held {
+impl Drop for ByteReservation {
     fn drop(&mut self) {
         self.waiting.sub(self.bytes);
     }
 }
 
-/// A session to which the shared reader of a subscription can be charged, and the messages that are kept with it.
+/// A session that can be charged for the shared reader of a subscription and for its kept messages.
 #[derive(Clone, Debug)]
 pub(crate) struct Payer {
     quota: Quota,
     limits: SessionLimits,
     /// Bytes of messages that are kept for later subscribers.
-    history: Arc<Waiting>,
+    history: Arc<PendingBytes>,
 }
 
 impl Payer {
-    pub(crate) fn new(quota: Quota, limits: SessionLimits, history: Arc<Waiting>) -> Self {
+    pub(crate) fn new(quota: Quota, limits: SessionLimits, history: Arc<PendingBytes>) -> Self {
         Self { quota, limits, history }
     }
 
-    /// Takes the charge of a reader.
+    /// Charges the session for a reader.
     pub(crate) fn take_reader(&self) -> Result<Charge, GatewayError> {
         self.quota.take(Resource::Readers, &self.limits)
     }
 
-    /// The same; a refusal is not counted.
+    /// Charges the session for a reader if its bounds permit. A refusal is not counted.
     pub(crate) fn take_reader_if_room(&self) -> Option<Charge> {
         self.quota.try_take(Resource::Readers, &self.limits).ok()
     }
 
-    /// Takes the charge of a reader that is there already, also beyond the bounds.
+    /// Charges the session for an existing reader, even beyond its bounds.
     pub(crate) fn take_reader_anyway(&self) -> Charge {
         self.quota.take_anyway(Resource::Readers)
     }
 
-    /// Takes room for a message that is kept; a refusal is not counted.
-    pub(crate) fn take_history(&self, bytes: usize) -> Option<Held> {
-        Held::if_room(&self.history, bytes)
+    /// Reserves room for a kept message. A refusal is not counted.
+    pub(crate) fn take_history(&self, bytes: usize) -> Option<ByteReservation> {
+        ByteReservation::if_room(&self.history, bytes)
     }
 
-    /// Returns `true` if it is the same session.
+    /// Returns `true` if both are the same session.
     pub(crate) fn is_same(&self, other: &Self) -> bool {
         self.quota.is_same(&other.quota)
     }
 
-    /// Returns `true` if the room is this session's.
-    pub(crate) fn has_room(&self, held: &Held) -> bool {
+    /// Returns `true` if the reservation is this session's.
+    pub(crate) fn has_room(&self, held: &ByteReservation) -> bool {
         Arc::ptr_eq(&held.waiting, &self.history)
     }
 }
 
-/// Bytes of messages that wait for one client, within its own bound and those of its pools.
+/// The bytes of messages that are queued for one client, within its own bound and those of its pools.
 #[derive(Debug)]
-pub(crate) struct Waiting {
+pub(crate) struct PendingBytes {
     bytes: AtomicUsize,
     bytes_max: usize,
     quota: Quota,
 }
 
-impl Waiting {
+impl PendingBytes {
     pub(crate) fn new(bytes_max: usize, quota: Quota) -> Self {
         Self { bytes: AtomicUsize::new(0), bytes_max, quota }
     }
 
-    /// Returns the number of bytes that wait.
+    /// Returns the number of queued bytes.
     pub(crate) fn bytes(&self) -> usize {
         self.bytes.load(Ordering::Relaxed)
     }
 
-    /// Returns `true` if there is room for so many more.
+    /// Returns `true` if there is room for this many more bytes.
     pub(crate) fn has_room(&self, bytes: usize) -> bool {
         self.bytes().saturating_add(bytes) <= self.bytes_max && self.pools_have_room(bytes)
     }
 
-    /// Returns `true` if the pools have room for so many more.
+    /// Returns `true` if the pools have room for this many more bytes.
     pub(crate) fn pools_have_room(&self, bytes: usize) -> bool {
         self.quota.0.pools().iter().all(|counts| {
             let max = self.bytes_max.saturating_mul(counts.share());
@@ -603,7 +604,7 @@ impl Waiting {
         })
     }
 
-    /// Takes room for so many bytes, unless the client or one of its pools has less.
+    /// Takes room for bytes, unless the client or one of its pools has less.
     pub(crate) fn take(&self, what: &'static str, bytes: usize) -> Result<(), GatewayError> {
         self.try_take(bytes).map_err(|(pool, max)| match pool {
             None => GatewayError::TooMany { what, max },
@@ -611,7 +612,8 @@ impl Waiting {
         })
     }
 
-    /// The same; a refusal is not counted. It names the pool, none if the bound is the client's own, and the bound.
+    /// Takes room without counting a refusal. An error has the bound and its pool, or no pool for the client's own
+    /// bound.
     fn try_take(&self, bytes: usize) -> Result<(), (Option<Pool>, usize)> {
         if !add_within(&self.bytes, bytes, self.bytes_max) {
             return Err((None, self.bytes_max));
@@ -650,9 +652,9 @@ impl Waiting {
 }
 
 #[cfg(test)]
-impl Waiting {
-    /// Of a client of this program.
-    pub(crate) fn of_own(bytes_max: usize) -> Arc<Self> {
+impl PendingBytes {
+    /// Creates a count for a client of this program.
+    pub(crate) fn for_own_client(bytes_max: usize) -> Arc<Self> {
         let quotas: Arc<Quotas> = Arc::default();
         Arc::new(Self::new(bytes_max, quotas.quota(&Client::own("test"))))
     }
@@ -665,7 +667,7 @@ mod tests {
     use sgc_wire::UnixMillis;
 
     use super::*;
-    use crate::access::{Access, AccessRules, Admission, Anonymous};
+    use crate::access::{Access, AccessRules, AdmissionRequest, Anonymous};
 
     const LIMITS: SessionLimits = SessionLimits {
         waiting_bytes_max: 100,
@@ -681,7 +683,7 @@ mod tests {
         let peer: SocketAddr = peer.parse().unwrap();
         let now = UnixMillis(1_795_000_000_000);
         let admission =
-            Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now };
+            AdmissionRequest { peer, encrypted: true, origin: None, token: None, certificate: None, now };
         access.admit(&admission).unwrap()
     }
 
@@ -697,9 +699,9 @@ mod tests {
     }
 
     #[test]
-    fn one_address_has_its_share_over_all_its_sessions() {
+    fn sessions_of_an_address_share_its_bound() {
         let quotas: Arc<Quotas> = Arc::default();
-        // One host of IPv6, whatever address of its network it takes.
+        // All addresses of an IPv6 network are one host.
         let (held, why) = take_all(&quotas.quota(&client("[2001:db8::1]:1")));
         assert_eq!(held.len(), 40);
         let crowded = |pool, max| GatewayError::Crowded { what: "subscriptions", max, pool };
@@ -730,13 +732,13 @@ mod tests {
     #[test]
     fn bytes_that_wait_are_bounded_in_all_pools() {
         let quotas: Arc<Quotas> = Arc::default();
-        let waiting = |peer: &str| Waiting::new(100, quotas.quota(&client(peer)));
+        let waiting = |peer: &str| PendingBytes::new(100, quotas.quota(&client(peer)));
         let sessions: Vec<_> = (0..4).map(|_| waiting("10.0.0.1:1")).collect();
         sessions.iter().for_each(|session| session.add(100));
         let fifth = waiting("10.0.0.1:1");
         assert!(!fifth.has_room(1) && waiting("10.0.0.2:1").has_room(100));
         drop(sessions);
-        // Whoever counts gives back.
+        // A counted subtraction returns the bytes.
         fifth.sub(0);
         assert_eq!(fifth.bytes(), 0);
     }
@@ -744,7 +746,7 @@ mod tests {
     #[test]
     fn bytes_that_are_refused_leave_nothing_behind() {
         let quotas: Arc<Quotas> = Arc::default();
-        let waiting = |peer: &str| Waiting::new(100, quotas.quota(&client(peer)));
+        let waiting = |peer: &str| PendingBytes::new(100, quotas.quota(&client(peer)));
         let first = Arc::new(waiting("10.0.0.1:1"));
         let refused = first.take("bytes", 101).unwrap_err();
         assert_eq!(refused, GatewayError::TooMany { what: "bytes", max: 100 });
@@ -755,8 +757,8 @@ mod tests {
         assert_eq!(first.take("bytes", 1).unwrap_err(), crowded(Pool::Remote, 1200));
         assert_eq!(first.bytes(), 0);
         sessions.iter().for_each(|session| session.sub(100));
-        let held = Held::new(&first, "bytes", 100).unwrap();
-        assert!(Held::new(&first, "bytes", 1).is_err());
+        let held = ByteReservation::new(&first, "bytes", 100).unwrap();
+        assert!(ByteReservation::new(&first, "bytes", 1).is_err());
         drop(held);
         assert_eq!(first.bytes(), 0);
     }
@@ -766,9 +768,9 @@ mod tests {
         let quotas: Arc<Quotas> = Arc::default();
         let [before, after] = ["10.0.0.1:1", "10.0.0.2:1"].map(client);
         let moving = quotas.quota(&before);
-        let waiting = Arc::new(Waiting::new(100, moving.clone()));
+        let waiting = Arc::new(PendingBytes::new(100, moving.clone()));
         let charge = moving.take(Resource::Subscriptions, &LIMITS).unwrap();
-        let held = Held::new(&waiting, "bytes", 30).unwrap();
+        let held = ByteReservation::new(&waiting, "bytes", 30).unwrap();
         let permits = (moving.thread().await.unwrap(), moving.room(2).await.unwrap());
         moving.move_to(&after, &LIMITS).unwrap();
         let counts = |client: &Client| {
@@ -781,9 +783,9 @@ mod tests {
         assert_eq!(counts(&before), (0, 0, all));
         assert_eq!(counts(&after), (1, 30, [all[0] - 1, all[1] - 2]));
         assert_eq!(counts(&client("10.0.0.1:2")).0, 0);
-        // The pool of all other hosts has it once.
+        // The pool of all other hosts counts it once.
         assert_eq!(quotas.remote.bytes.load(Ordering::Relaxed), 30);
-        // Anything that it takes from now on is the other's, too, and the other gets everything back.
+        // Later charges go to the new credential, which gets everything back in the end.
         let more = moving.take(Resource::Subscriptions, &LIMITS).unwrap();
         assert_eq!(counts(&after).0, 2);
         drop((charge, held, permits, more));

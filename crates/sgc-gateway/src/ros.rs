@@ -1,4 +1,4 @@
-//! [`LocalRos`]: a local ROS 2 network as the hub uses it, whichever it is.
+//! [`LocalRos`]: a local ROS 2 network of any implementation, as the hub uses it.
 
 use std::any::Any;
 use std::fmt;
@@ -8,14 +8,14 @@ use sgc_ros::{
     RosServer, RosWriter, SampleHandler, ServiceSpec,
 };
 
-/// A reader of some network; lives until dropped, which may block.
+/// A reader on the local network. Dropping it may block.
 pub struct LocalReader {
     guid: Guid,
     _reader: Box<dyn Any + Send>,
 }
 
 impl LocalReader {
-    /// Its GUID.
+    /// Returns the GUID.
     pub fn guid(&self) -> Guid {
         self.guid
     }

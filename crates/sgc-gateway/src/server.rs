@@ -1,4 +1,4 @@
-//! [`Server`]: the gateway's sockets. Accepts, ends TLS, finds out who it is and what it speaks, and hands it on.
+//! [`Server`]: the gateway's sockets. Accepts connections, terminates TLS, admits clients and starts their protocol.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -21,45 +21,45 @@ use tokio::time::{Instant, Sleep};
 use tokio_rustls::TlsAcceptor;
 use tokio_stream::wrappers::ReceiverStream;
 
-use crate::access::{Access, Denied};
-use crate::door::{Arrival, Door, Engagement, GatewayStatus, Handshake, Handshakes, Place};
+use crate::access::{Access, Denial};
+use crate::admission::{Admission, Arrival, Engagement, GatewayStatus, Handshake, Handshakes, Place};
 use crate::foxglove::{self, FoxgloveError};
-use crate::grpc::{Accepted, Connection, Grpc, GrpcOptions};
+use crate::grpc::{AcceptedStream, Connection, Grpc, GrpcOptions};
 use crate::hub::Hub;
-use crate::inflow::{Inflow, Metered};
+use crate::inflow::{Inflow, MeteredStream};
 use crate::rosbridge::{self, Authenticate, RosbridgeError, RosbridgeOptions};
 use crate::session::{Session, SessionLimits};
 use crate::tls::{TlsError, server_config};
-use crate::ws::{UpgradeError, Upgraded, upgrade};
+use crate::ws::{Upgrade, UpgradeError, upgrade};
 
-/// How long TLS and the upgrade may take together; of gRPC, TLS and the first call that is admitted.
+/// Time for TLS and the WebSocket upgrade together, or for TLS and the first admitted call of gRPC.
 const HANDSHAKE_MAX: Duration = Duration::from_secs(10);
-/// How long is waited after the system refused to accept, for instance since there are no more file descriptors.
+/// Pause after the system refused to accept, for instance for lack of file descriptors.
 const ACCEPT_RETRY: Duration = Duration::from_millis(100);
-/// Time for the last words on a gRPC connection on which no client is admitted any more.
+/// Time to deliver the last answers on a gRPC connection on which no client is admitted any more.
 const GRPC_FAREWELL_MAX: Duration = Duration::from_secs(2);
-/// Connections that wait to be served by gRPC.
+/// Most connections that wait for the gRPC server.
 const GRPC_WAITING_MAX: usize = 64;
-/// How the status calls messages that were not kept for later subscribers.
+/// Status key for messages that were not kept for later subscribers.
 const HISTORY_DROPPED: &str = "messages not kept for later subscribers";
 
-/// What is spoken at an address.
+/// The protocol of a listening address.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Protocol {
-    /// WebSocket: the rosbridge protocol, or Foxglove's where its subprotocol is asked for.
+    /// WebSocket: the rosbridge protocol, or Foxglove's if the client requests its subprotocol.
     WebSocket,
     /// gRPC.
     Grpc,
 }
 
-/// Where to listen, and for what.
+/// A listening address and its protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct ListenAt {
-    /// For what.
+    /// The protocol.
     pub protocol: Protocol,
-    /// Whether within TLS.
+    /// `true` for TLS.
     pub is_encrypted: bool,
-    /// Where; port 0 lets the system choose.
+    /// The address; port 0 lets the system choose.
     pub addr: SocketAddr,
 }
 
@@ -75,23 +75,23 @@ impl fmt::Display for ListenAt {
     }
 }
 
-/// What a server is to be.
+/// The options of a server.
 pub struct ServerOptions {
-    /// What programs show it as.
+    /// The name that programs display.
     pub name: String,
-    /// Where to listen.
+    /// The listening addresses.
     pub listen: Vec<ListenAt>,
-    /// Who may come in.
+    /// The access rules.
     pub access: Access,
-    /// What shows who the gateway is, within TLS.
+    /// The certificate and key of the gateway for TLS.
     pub key: Option<Arc<CertifiedKey>>,
-    /// Clients at a time.
+    /// Most clients at a time.
     pub clients_max: usize,
-    /// What each may have.
+    /// The limits of each session.
     pub limits: SessionLimits,
 }
 
-/// Why a server does not start.
+/// The reason why a server does not start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
     /// An address could not be bound.
@@ -99,97 +99,97 @@ pub enum ServerError {
     Listen {
         /// The address.
         at: ListenAt,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
-    /// There is no certificate to show, or it cannot be used.
+    /// The certificate is missing or unusable.
     #[error("the gateway's certificate: {0}")]
     Tls(#[from] TlsError),
-    /// TLS is wanted, and there is no certificate.
+    /// A TLS address is configured without a certificate.
     #[error("the gateway is to listen with TLS, and has no certificate")]
     NoKey,
 }
 
-/// TLS of both protocols.
+/// The TLS configurations of both protocols.
 #[derive(Clone)]
 struct Tls {
     ws: Arc<ServerConfig>,
     grpc: Arc<ServerConfig>,
-    /// The certificates that both show, the gateway's own first.
+    /// The certificates of both, the gateway's own first.
     chain: Vec<CertificateDer<'static>>,
 }
 
-struct Shared {
+struct ServerState {
     hub: Hub,
-    door: Arc<Door>,
+    admission: Arc<Admission>,
     tls: watch::Sender<Option<Tls>>,
     limits: SessionLimits,
     foxglove: foxglove::Options,
     handshakes: Arc<Handshakes>,
-    grpc: mpsc::Sender<Accepted<Placed>>,
+    grpc: mpsc::Sender<AcceptedStream<GrpcStream>>,
 }
 
-/// A stream of bytes, whichever it is.
-trait Bytes: AsyncRead + AsyncWrite + Send + Unpin {}
+/// Any stream of bytes.
+trait ByteStream: AsyncRead + AsyncWrite + Send + Unpin {}
 
-impl<S: AsyncRead + AsyncWrite + Send + Unpin> Bytes for S {}
+impl<S: AsyncRead + AsyncWrite + Send + Unpin> ByteStream for S {}
 
-/// A stream of bytes of gRPC. Its client has a place for as long as somebody is admitted on it, and has to be admitted in
-/// time.
-struct Placed {
-    stream: Box<dyn Bytes>,
-    door: Arc<Door>,
+/// The byte stream of a gRPC connection. Its client must be admitted in time, and occupies a place while a client is
+/// admitted on it.
+struct GrpcStream {
+    stream: Box<dyn ByteStream>,
+    admission: Arc<Admission>,
     connection: Connection,
     standing: Standing,
 }
 
-/// How far a client of gRPC has come.
+/// The admission state of a gRPC connection.
 enum Standing {
-    /// It has not shown yet who it is, and has until then to do so.
+    /// The client has not been admitted yet and must be by the deadline.
     Unproven { deadline: Pin<Box<Sleep>>, handshake: Handshake },
-    /// It was admitted.
+    /// The client was admitted.
     Proven(#[expect(dead_code, reason = "it is for its end")] Place),
-    /// Nobody is admitted on it any more. It has until then to hear so, or to show something else.
+    /// No client is admitted any more. Until the deadline the client may read the refusal or show another credential.
     Denied { deadline: Pin<Box<Sleep>> },
-    /// It has to go; it was counted why.
+    /// The connection must close. The reason has been counted.
     Refused,
 }
 
-impl Placed {
+impl GrpcStream {
     fn new(
-        stream: Box<dyn Bytes>,
-        door: Arc<Door>,
+        stream: Box<dyn ByteStream>,
+        admission: Arc<Admission>,
         connection: Connection,
         deadline: Instant,
         handshake: Handshake,
     ) -> Self {
         let deadline = Box::pin(tokio::time::sleep_until(deadline));
-        Self { stream, door, connection, standing: Standing::Unproven { deadline, handshake } }
+        Self { stream, admission, connection, standing: Standing::Unproven { deadline, handshake } }
     }
 
-    /// Fails once the client may not stay. To be asked before reading as before writing: who does not read what it is
-    /// sent is not read from either.
+    /// Fails once the client may not stay. Called before reads and writes, because a client that does not read its
+    /// answers must not send either.
     fn check(&mut self, cx: &mut Context<'_>) -> io::Result<()> {
         let admitted = self.connection.poll_admitted(cx);
         let (standing, result) = match (&mut self.standing, admitted) {
             (Standing::Refused, _) => return Err(io::ErrorKind::ConnectionAborted.into()),
             (Standing::Proven(_), Some(_)) => return Ok(()),
             (Standing::Proven(_), None) => {
-                self.door.count("no longer admitted");
+                self.admission.count("no longer admitted");
                 let deadline = Box::pin(tokio::time::sleep(GRPC_FAREWELL_MAX));
                 self.standing = Standing::Denied { deadline };
                 return self.check(cx);
             }
-            (_, Some(client)) => match self.door.enter(&client, "grpc", self.connection.peer()) {
+            (_, Some(client)) => match self.admission.enter(&client, "grpc", self.connection.peer()) {
                 Some(place) => (Standing::Proven(place), Ok(())),
                 None => (Standing::Refused, Err(io::Error::other("too many clients"))),
             },
             (Standing::Unproven { deadline, handshake }, None) => {
                 if handshake.poll_evicted(cx).is_ready() {
-                    self.door.count("handshake gave way");
+                    self.admission.count("handshake gave way");
                     (Standing::Refused, Err(io::ErrorKind::ConnectionAborted.into()))
                 } else if deadline.as_mut().poll(cx).is_ready() {
-                    self.door.count("handshake too slow");
+                    self.admission.count("handshake too slow");
                     (Standing::Refused, Err(io::ErrorKind::TimedOut.into()))
                 } else {
                     return Ok(());
@@ -205,7 +205,7 @@ impl Placed {
     }
 }
 
-impl AsyncRead for Placed {
+impl AsyncRead for GrpcStream {
     fn poll_read(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -216,7 +216,7 @@ impl AsyncRead for Placed {
     }
 }
 
-impl AsyncWrite for Placed {
+impl AsyncWrite for GrpcStream {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         self.check(cx)?;
         Pin::new(&mut self.stream).poll_write(cx, buf)
@@ -228,7 +228,7 @@ impl AsyncWrite for Placed {
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        // One that has to go is not waited for to take its farewell.
+        // A connection that must close does not wait until its farewell is sent.
         self.check(cx)?;
         Pin::new(&mut self.stream).poll_shutdown(cx)
     }
@@ -247,14 +247,14 @@ impl AsyncWrite for Placed {
     }
 }
 
-/// The gateway's sockets, and who came in by them. All of it ends when dropped.
+/// The gateway's sockets and connections. All of them end when it is dropped.
 pub struct Server {
-    shared: Arc<Shared>,
+    shared: Arc<ServerState>,
     local: Vec<ListenAt>,
     _tasks: JoinSet<()>,
 }
 
-fn tls_of(key: Option<&Arc<CertifiedKey>>, access: &Access) -> Result<Option<Tls>, TlsError> {
+fn tls_config(key: Option<&Arc<CertifiedKey>>, access: &Access) -> Result<Option<Tls>, TlsError> {
     let asks = access.takes_certificates();
     key.map(|key| {
         let ws = server_config(key, asks, &[b"http/1.1"])?;
@@ -264,25 +264,25 @@ fn tls_of(key: Option<&Arc<CertifiedKey>>, access: &Access) -> Result<Option<Tls
 }
 
 impl Server {
-    /// Binds all addresses, and serves.
+    /// Binds all addresses and serves clients.
     pub async fn start(hub: Hub, options: ServerOptions) -> Result<Self, ServerError> {
-        let tls = tls_of(options.key.as_ref(), &options.access)?;
+        let tls = tls_config(options.key.as_ref(), &options.access)?;
         if tls.is_none() && options.listen.iter().any(|at| at.is_encrypted) {
             return Err(ServerError::NoKey);
         }
-        let door = Door::new(options.access, options.clients_max);
+        let admission = Admission::new(options.access, options.clients_max);
         let (grpc, accepted) = mpsc::channel(GRPC_WAITING_MAX);
         let mut tasks = JoinSet::new();
         let grpc_options = GrpcOptions { session: options.limits, ..GrpcOptions::default() };
-        let front = Grpc::new(hub.clone(), door.rules().clone(), grpc_options);
+        let front = Grpc::new(hub.clone(), admission.rules().clone(), grpc_options);
         tasks.spawn(async move {
             if let Err(error) = front.serve(ReceiverStream::new(accepted)).await {
                 tracing::error!(%error, "gRPC is not served any more");
             }
         });
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(ServerState {
             hub,
-            door,
+            admission,
             tls: watch::Sender::new(tls),
             limits: options.limits,
             foxglove: foxglove::Options { name: options.name, ..foxglove::Options::default() },
@@ -303,57 +303,57 @@ impl Server {
         Ok(Self { shared, local, _tasks: tasks })
     }
 
-    /// Where it listens.
+    /// Returns the listening addresses.
     pub fn local(&self) -> &[ListenAt] {
         &self.local
     }
 
-    /// Other rules, and another certificate, from now on; who is no longer admitted is disconnected.
+    /// Applies other rules and another certificate. Clients that the rules no longer admit are disconnected.
     pub fn reconfigure(&self, access: Access, key: Option<&Arc<CertifiedKey>>) -> Result<(), ServerError> {
-        let tls = tls_of(key, &access)?;
+        let tls = tls_config(key, &access)?;
         if tls.is_none() && self.local.iter().any(|at| at.is_encrypted) {
             return Err(ServerError::NoKey);
         }
         self.shared.tls.send_replace(tls);
-        self.shared.door.rules().change(|before| access.after(before));
+        self.shared.admission.rules().change(|before| access.after(before));
         Ok(())
     }
 
-    /// Shows another certificate to new connections; present ones stay.
+    /// Shows another certificate to new connections. Existing connections stay.
     pub fn show(&self, key: &Arc<CertifiedKey>) -> Result<(), ServerError> {
-        let tls = tls_of(Some(key), &self.shared.door.access())?;
+        let tls = tls_config(Some(key), &self.shared.admission.access())?;
         self.shared.tls.send_replace(tls);
         Ok(())
     }
 
-    /// Returns the certificates that new connections are shown, the gateway's own first; none without TLS.
+    /// Returns the certificates for new connections, the gateway's own first. The list is empty without TLS.
     pub fn shown(&self) -> Vec<CertificateDer<'static>> {
         self.shared.tls.borrow().as_ref().map(|tls| tls.chain.clone()).unwrap_or_default()
     }
 
     /// Verifies tokens with this certificate of the gateway from now on.
     pub fn set_gateway(&self, gateway: VerifiedPeer) {
-        self.shared.door.rules().change(|access| access.clone().with_gateway(gateway));
+        self.shared.admission.rules().change(|access| access.clone().with_gateway(gateway));
     }
 
-    /// Other CAs, or other revocation lists of theirs.
+    /// Verifies certificates against other CAs or revocation lists from now on.
     pub fn set_anchors(&self, anchors: TrustAnchors) {
-        self.shared.door.rules().change(|access| access.clone().with_anchors(anchors));
+        self.shared.admission.rules().change(|access| access.clone().with_anchors(anchors));
     }
 
-    /// What goes on.
+    /// Returns the status of the gateway.
     pub fn status(&self) -> GatewayStatus {
         GatewayStatus {
             listen: self.local.iter().map(ToString::to_string).collect(),
-            clients: self.shared.door.clients(),
+            clients: self.shared.admission.clients(),
             refused: self.refused(),
             readers: self.shared.hub.readers(),
         }
     }
 
-    /// Returns the number of refusals by their reasons.
+    /// Returns the number of refusals by reason.
     fn refused(&self) -> BTreeMap<String, u64> {
-        let mut refused = self.shared.door.refused();
+        let mut refused = self.shared.admission.refused();
         let crowded = self.shared.hub.shared.quotas.refused();
         refused.extend(crowded.into_iter().map(|(pool, count)| (format!("too much for {pool}"), count)));
         let not_kept = self.shared.hub.shared.quotas.history_dropped();
@@ -361,7 +361,7 @@ impl Server {
         refused
     }
 
-    /// The hub.
+    /// Returns the hub.
     pub fn hub(&self) -> &Hub {
         &self.shared.hub
     }
@@ -373,8 +373,8 @@ impl fmt::Debug for Server {
     }
 }
 
-async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<Shared>) {
-    // Ends all of them with the listener.
+async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<ServerState>) {
+    // The set ends all connections when the listener ends.
     let mut connections = JoinSet::new();
     loop {
         tokio::select! {
@@ -393,38 +393,39 @@ async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<Shared>
     }
 }
 
-async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<Shared>) {
-    let door = &shared.door;
+async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<ServerState>) {
+    let admission = &shared.admission;
     let Some(mut handshake) = Handshakes::begin(&shared.handshakes, peer.ip()) else {
-        return door.count("too many handshakes");
+        return admission.count("too many handshakes");
     };
     let deadline = Instant::now() + HANDSHAKE_MAX;
     let engagement = handshake.engagement();
     let arriving = arrive(stream, peer, at, &shared, &engagement);
     let arrived = tokio::select! {
         arrived = tokio::time::timeout_at(deadline, arriving) => arrived,
-        () = handshake.evicted() => return door.count("handshake gave way"),
+        () = handshake.evicted() => return admission.count("handshake gave way"),
     };
     let (stream, arrival) = match arrived {
         Ok(Some(arrived)) => arrived,
         Ok(None) => return,
-        Err(_) => return door.count("handshake too slow"),
+        Err(_) => return admission.count("handshake too slow"),
     };
     match at.protocol {
         Protocol::Grpc => {
-            // Its clients say who they are with each call.
+            // A gRPC client shows its credential with each call.
             let Arrival { peer, is_encrypted, certificate } = arrival;
             let connection =
                 if is_encrypted { Connection::encrypted(peer, certificate) } else { Connection::plain(peer) };
-            let placed = Placed::new(stream, Arc::clone(door), connection.clone(), deadline, handshake);
-            let _ = shared.grpc.send(Accepted::new(placed, connection)).await;
+            let placed =
+                GrpcStream::new(stream, Arc::clone(admission), connection.clone(), deadline, handshake);
+            let _ = shared.grpc.send(AcceptedStream::new(placed, connection)).await;
         }
         Protocol::WebSocket => {
             let inflow: Arc<Inflow> = Arc::default();
-            let stream = Metered::new(stream, Arc::clone(&inflow));
+            let stream = MeteredStream::new(stream, Arc::clone(&inflow));
             let upgraded = tokio::select! {
-                upgraded = tokio::time::timeout_at(deadline, upgrade(stream, &arrival, door, &foxglove::SUBPROTOCOLS)) => upgraded,
-                () = handshake.evicted() => return door.count("handshake gave way"),
+                upgraded = tokio::time::timeout_at(deadline, upgrade(stream, &arrival, admission, &foxglove::SUBPROTOCOLS)) => upgraded,
+                () = handshake.evicted() => return admission.count("handshake gave way"),
             };
             drop(handshake);
             match upgraded {
@@ -432,23 +433,23 @@ async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<Sh
                 Ok(Err(UpgradeError::NotAdmitted)) => {}
                 Ok(Err(UpgradeError::Socket(error))) => {
                     tracing::debug!(%peer, %error, "no WebSocket");
-                    door.count("no WebSocket");
+                    admission.count("no WebSocket");
                 }
-                Err(_) => door.count("handshake too slow"),
+                Err(_) => admission.count("handshake too slow"),
             }
         }
     }
 }
 
-/// Waits for the first bytes, and ends TLS.
+/// Waits for the first bytes and completes the TLS handshake.
 async fn arrive(
     stream: TcpStream,
     peer: SocketAddr,
     at: ListenAt,
-    shared: &Shared,
+    shared: &ServerState,
     engagement: &Engagement,
-) -> Option<(Box<dyn Bytes>, Arrival)> {
-    // In all that is spoken here the client speaks first.
+) -> Option<(Box<dyn ByteStream>, Arrival)> {
+    // In every protocol of the gateway the client speaks first.
     stream.readable().await.ok()?;
     engagement.begin();
     if !at.is_encrypted {
@@ -462,17 +463,17 @@ async fn arrive(
     let stream = match TlsAcceptor::from(config).accept(stream).await {
         Ok(stream) => stream,
         Err(error) => {
-            shared.door.count("TLS failed");
+            shared.admission.count("TLS failed");
             tracing::debug!(%peer, %error, "a client's TLS failed");
             return None;
         }
     };
     let chain = stream.get_ref().1.peer_certificates().unwrap_or_default();
-    let access = shared.door.access();
-    let certificate = match Door::judge_certificate(access.rules().anchors.as_ref(), chain) {
+    let access = shared.admission.access();
+    let certificate = match Admission::judge_certificate(access.rules().anchors.as_ref(), chain) {
         Ok(certificate) => certificate,
         Err(error) => {
-            shared.door.count("certificate does not hold");
+            shared.admission.count("certificate does not hold");
             tracing::debug!(%peer, %error, "a client's certificate does not hold");
             None
         }
@@ -480,55 +481,55 @@ async fn arrive(
     Some((Box::new(stream), Arrival { peer, is_encrypted: true, certificate }))
 }
 
-/// Serves a client until it goes, or its right ends.
+/// Serves a client until it leaves or its rights end.
 async fn speak(
-    upgraded: Upgraded<Metered<Box<dyn Bytes>>>,
+    upgraded: Upgrade<MeteredStream<Box<dyn ByteStream>>>,
     arrival: Arrival,
     inflow: Arc<Inflow>,
-    shared: &Shared,
+    shared: &ServerState,
 ) {
-    let (door, peer, client) = (&shared.door, arrival.peer, upgraded.client);
+    let (admission, peer, client) = (&shared.admission, arrival.peer, upgraded.client);
     let protocol = if upgraded.subprotocol.is_some() { "foxglove" } else { "rosbridge" };
-    let Some(place) = door.enter(&client, protocol, peer) else { return };
+    let Some(place) = admission.enter(&client, protocol, peer) else { return };
     let place = Arc::new(place);
     let name = Arc::clone(&client.name);
-    let session = Session::new(&shared.hub, client, shared.limits).admitted_by(door.rules().clone());
+    let session = Session::new(&shared.hub, client, shared.limits).admitted_by(admission.rules().clone());
     let session = session.metered_by(inflow);
     let ended = if upgraded.subprotocol.is_some() {
         let served = foxglove::serve(upgraded.socket, Arc::new(session), shared.foxglove.clone());
-        served.await.map_err(Ended::from)
+        served.await.map_err(EndReason::from)
     } else {
-        let (asked, place) = (Arc::clone(door), Arc::clone(&place));
-        // A token that comes later than the upgrade says who the client is from then on.
+        let (asked, place) = (Arc::clone(admission), Arc::clone(&place));
+        // A token after the upgrade changes the credential of the client.
         let authenticate: Authenticate = Arc::new(move |token| {
             let admitted = asked.admit(&arrival, None, Some(token));
-            let client = admitted.map_err(|denied| denied.told().to_owned())?;
+            let client = admitted.map_err(|denied| denied.client_message().to_owned())?;
             place.rename(&client).map_err(|why| why.to_string())?;
             Ok(client)
         });
         let options = RosbridgeOptions { authenticate: Some(authenticate), ..RosbridgeOptions::default() };
         let served = rosbridge::serve(upgraded.socket, Arc::new(session), options);
-        served.await.map_err(Ended::from)
+        served.await.map_err(EndReason::from)
     };
     match ended {
         Ok(()) => {}
-        Err(Ended::Denied(denied)) => {
-            door.count("no longer admitted");
+        Err(EndReason::Denied(denied)) => {
+            admission.count("no longer admitted");
             tracing::info!(client = %name, %denied, "a client is disconnected");
         }
-        Err(Ended::Failed(error)) => tracing::debug!(%peer, %error, "a client's connection failed"),
+        Err(EndReason::Failed(error)) => tracing::debug!(%peer, %error, "a client's connection failed"),
     }
 }
 
-/// Why a client's connection ended, other than by its wish.
-enum Ended {
-    /// Its right ended.
-    Denied(Denied),
-    /// It failed, in these words.
+/// The reason why a connection ended without the client's wish.
+enum EndReason {
+    /// The client's rights ended.
+    Denied(Denial),
+    /// The connection failed.
     Failed(String),
 }
 
-impl From<RosbridgeError> for Ended {
+impl From<RosbridgeError> for EndReason {
     fn from(error: RosbridgeError) -> Self {
         match error {
             RosbridgeError::Denied(denied) => Self::Denied(denied),
@@ -537,7 +538,7 @@ impl From<RosbridgeError> for Ended {
     }
 }
 
-impl From<FoxgloveError> for Ended {
+impl From<FoxgloveError> for EndReason {
     fn from(error: FoxgloveError) -> Self {
         match error {
             FoxgloveError::Denied(denied) => Self::Denied(denied),
@@ -553,25 +554,28 @@ mod tests {
     use super::*;
     use crate::access::Access;
 
-    /// A stream of gRPC from another host, and the other end of it.
-    fn placed(door: &Arc<Door>, handshakes: &Arc<Handshakes>) -> (Placed, tokio::io::DuplexStream) {
+    /// Returns a gRPC stream from another host and its far end.
+    fn placed(
+        admission: &Arc<Admission>,
+        handshakes: &Arc<Handshakes>,
+    ) -> (GrpcStream, tokio::io::DuplexStream) {
         let peer: SocketAddr = "192.0.2.1:1000".parse().unwrap();
         let (near, far) = duplex(16);
         let handshake = Handshakes::begin(handshakes, peer.ip()).unwrap();
-        let (door, deadline) = (Arc::clone(door), Instant::now() + HANDSHAKE_MAX);
-        (Placed::new(Box::new(near), door, Connection::plain(peer), deadline, handshake), far)
+        let (admission, deadline) = (Arc::clone(admission), Instant::now() + HANDSHAKE_MAX);
+        (GrpcStream::new(Box::new(near), admission, Connection::plain(peer), deadline, handshake), far)
     }
 
     #[tokio::test(start_paused = true)]
-    async fn who_does_not_show_who_it_is_goes_and_has_had_no_place() {
-        let (door, handshakes) = (Door::new(Access::default(), 1), Arc::default());
-        let (mut silent, _far) = placed(&door, &handshakes);
-        let (mut deaf, _other) = placed(&door, &handshakes);
+    async fn unproven_client_is_disconnected_without_a_place() {
+        let (admission, handshakes) = (Admission::new(Access::default(), 1), Arc::default());
+        let (mut silent, _far) = placed(&admission, &handshakes);
+        let (mut deaf, _other) = placed(&admission, &handshakes);
         let began = Instant::now();
         let mut buf = [0; 16];
         let read = silent.read(&mut buf);
         let written = async {
-            // More than fits.
+            // These bytes exceed the buffer.
             deaf.write_all(&[0; 64]).await
         };
         let (read, written) = tokio::join!(read, written);
@@ -579,7 +583,7 @@ mod tests {
         assert_eq!(written.unwrap_err().kind(), io::ErrorKind::TimedOut);
         assert!(began.elapsed() >= HANDSHAKE_MAX && began.elapsed() < 2 * HANDSHAKE_MAX);
         assert!(silent.read(&mut buf).await.is_err() && silent.shutdown().await.is_err());
-        assert_eq!(door.refused(), [("handshake too slow".to_owned(), 2)].into());
-        assert!(door.clients().is_empty());
+        assert_eq!(admission.refused(), [("handshake too slow".to_owned(), 2)].into());
+        assert!(admission.clients().is_empty());
     }
 }

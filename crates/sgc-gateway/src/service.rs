@@ -1,4 +1,4 @@
-//! [`Caller`] calls a service for all clients; [`Serving`] serves one for a client.
+//! [`Caller`] calls a service for all clients; [`Serving`] serves a service for one client.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
@@ -16,15 +16,15 @@ use tokio::sync::{mpsc, oneshot};
 use crate::content::{Content, Form, convert, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
-use crate::hub::{Shared, lock};
+use crate::hub::{HubState, lock};
 use crate::quota::{Charge, Quota};
 
-/// Replies that came before it was known what they answer.
+/// Most replies that arrive before their request number is known.
 const EARLY_MAX: usize = 64;
-/// Requests that wait for a client that serves; then those who ask wait.
+/// Most requests that are queued for a client that serves. Beyond that the callers wait.
 const REQUESTS_MAX: usize = 256;
 
-/// Layouts of both halves of a service.
+/// The layouts of a service's request and reply.
 #[derive(Clone, Debug)]
 pub(crate) struct Halves {
     pub(crate) request: Arc<Layout>,
@@ -32,8 +32,8 @@ pub(crate) struct Halves {
 }
 
 impl Halves {
-    /// Of a service's type; may read files.
-    pub(crate) fn find(shared: &Shared, type_name: &str) -> Result<Self, GatewayError> {
+    /// Finds the layouts of a service type. May read files.
+    pub(crate) fn find(shared: &HubState, type_name: &str) -> Result<Self, GatewayError> {
         let layout = |half: &str| shared.types.layout(&format!("{type_name}_{half}"), None);
         Ok(Self { request: layout("Request")?, reply: layout("Response")? })
     }
@@ -55,42 +55,42 @@ fn spec(service: &str, type_name: &str, halves: &Halves) -> ServiceSpec {
 }
 
 #[derive(Default)]
-struct Pending {
+struct PendingCalls {
     asked: BTreeMap<i64, oneshot::Sender<Bytes>>,
-    /// Requests that are being sent: their numbers are not known yet.
+    /// Requests that are being sent, whose numbers are not known yet.
     sending: usize,
-    /// Replies that may be theirs.
+    /// Replies that may belong to these requests.
     early: VecDeque<(i64, Bytes)>,
 }
 
-/// A client of a service, shared by all who call it.
+/// A client of a service, shared by all callers.
 pub(crate) struct Caller {
     service: String,
     type_name: String,
     pub(crate) halves: Halves,
-    /// There until the end, which may block.
+    /// The client; `None` only while it is dropped, which may block.
     client: Option<Box<dyn RosClient>>,
-    pending: Arc<Mutex<Pending>>,
-    shared: Weak<Shared>,
+    pending: Arc<Mutex<PendingCalls>>,
+    shared: Weak<HubState>,
 }
 
-/// A call under way: nobody waits for its reply once this is dropped.
-struct Asked {
+/// A call in progress. Its reply is discarded after this is dropped.
+struct CallGuard {
     caller: Arc<Caller>,
     number: i64,
 }
 
-impl Drop for Asked {
+impl Drop for CallGuard {
     fn drop(&mut self) {
         lock(&self.caller.pending).asked.remove(&self.number);
     }
 }
 
 impl Caller {
-    /// May block.
-    pub(crate) fn new(shared: &Arc<Shared>, service: &str, type_name: &str) -> Result<Self, GatewayError> {
+    /// Creates the client of a service. May block.
+    pub(crate) fn new(shared: &Arc<HubState>, service: &str, type_name: &str) -> Result<Self, GatewayError> {
         let halves = Halves::find(shared, type_name)?;
-        let pending: Arc<Mutex<Pending>> = Arc::default();
+        let pending: Arc<Mutex<PendingCalls>> = Arc::default();
         let answered = Arc::clone(&pending);
         let spec = spec(service, type_name, &halves);
         let client = shared.ros.client(
@@ -99,7 +99,7 @@ impl Caller {
                 let mut pending = lock(&answered);
                 match pending.asked.remove(&id.number) {
                     Some(waiting) => drop(waiting.send(payload)),
-                    // Nobody waits for it, or will.
+                    // No call waits for this reply.
                     None if pending.sending == 0 => {}
                     None => {
                         pending.early.push_back((id.number, payload));
@@ -122,8 +122,8 @@ impl Caller {
         self.service == service && self.type_name == type_name
     }
 
-    /// Sends a request; its reply comes to who holds what this gives. May block.
-    fn ask(self: &Arc<Self>, payload: Bytes) -> Result<(Asked, oneshot::Receiver<Bytes>), RosError> {
+    /// Sends a request and returns a guard and a receiver for the reply. May block.
+    fn ask(self: &Arc<Self>, payload: Bytes) -> Result<(CallGuard, oneshot::Receiver<Bytes>), RosError> {
         let client = self.client.as_ref().ok_or(RosError::NoPeer { waited_ms: 0 })?;
         lock(&self.pending).sending += 1;
         let sent = client.request(payload);
@@ -143,10 +143,10 @@ impl Caller {
             None => drop(pending.asked.insert(number, send)),
         }
         drop(pending);
-        Ok((Asked { caller: Arc::clone(self), number }, reply))
+        Ok((CallGuard { caller: Arc::clone(self), number }, reply))
     }
 
-    /// Asks, and waits for the reply.
+    /// Calls the service and waits for the reply.
     pub(crate) async fn call(
         self: &Arc<Self>,
         payload: Bytes,
@@ -185,18 +185,18 @@ impl Drop for Caller {
     }
 }
 
-/// What a client that serves is asked.
+/// A request to a client that serves a service.
 #[derive(Debug)]
 pub struct Request {
-    /// By this it is answered.
+    /// The id for the reply.
     pub id: RequestId,
     /// The serialised request.
     pub payload: Bytes,
 }
 
-/// A service that a client serves; ends when dropped.
+/// A service that a client serves, until dropped.
 pub struct Serving {
-    shared: Arc<Shared>,
+    shared: Arc<HubState>,
     server: Arc<dyn RosServer>,
     halves: Halves,
     requests: mpsc::Receiver<Request>,
@@ -204,16 +204,16 @@ pub struct Serving {
     _charge: Option<Charge>,
 }
 
-/// Answers requests of a [`Serving`], wherever they are worked on.
+/// A handle that answers requests of a [`Serving`] from any task.
 #[derive(Clone)]
 pub struct Replier {
-    shared: Arc<Shared>,
+    shared: Arc<HubState>,
     server: Arc<dyn RosServer>,
     halves: Halves,
 }
 
 impl Replier {
-    /// What replies look like.
+    /// Returns the layout of replies.
     pub fn reply_layout(&self) -> &Arc<Layout> {
         &self.halves.reply
     }
@@ -224,7 +224,7 @@ impl Replier {
         self.send(id, payload).await
     }
 
-    /// The same with a value.
+    /// Answers a request with a value.
     pub(crate) async fn reply_value(&self, id: RequestId, value: &Value) -> Result<(), GatewayError> {
         let payload = serialise(&self.halves.reply, value)?;
         self.send(id, payload).await
@@ -244,7 +244,7 @@ impl fmt::Debug for Replier {
 
 impl Serving {
     pub(crate) async fn new(
-        shared: &Arc<Shared>,
+        shared: &Arc<HubState>,
         service: String,
         type_name: String,
         charge: Option<Charge>,
@@ -254,7 +254,7 @@ impl Serving {
                 let halves = Halves::find(shared, &type_name)?;
                 let spec = spec(&service, &type_name, &halves);
                 let (send, requests) = mpsc::channel(REQUESTS_MAX);
-                // It waits for room on the server's own thread.
+                // The handler waits for room on the server's own thread.
                 let handler = Box::new(move |id: RequestId, payload: Bytes| {
                     drop(send.blocking_send(Request { id, payload }));
                 });
@@ -268,27 +268,27 @@ impl Serving {
             .await
     }
 
-    /// The service.
+    /// Returns the name of the service.
     pub fn service(&self) -> &str {
         &self.service
     }
 
-    /// Waits for a request; `None` once the gateway stops.
+    /// Waits for a request. Returns `None` once the gateway stops.
     pub async fn next(&mut self) -> Option<Request> {
         self.requests.recv().await
     }
 
-    /// A request in a form.
+    /// Converts a request to a form.
     pub fn write(&self, request: &Request, form: Form) -> Result<Bytes, GatewayError> {
         convert(&self.halves.request, &request.payload, form)
     }
 
-    /// What requests look like.
+    /// Returns the layout of requests.
     pub fn request_layout(&self) -> &Arc<Layout> {
         &self.halves.request
     }
 
-    /// What answers.
+    /// Returns a handle that answers requests.
     pub fn replier(&self) -> Replier {
         let (shared, server) = (Arc::clone(&self.shared), Arc::clone(&self.server));
         Replier { shared, server, halves: self.halves.clone() }
@@ -303,7 +303,7 @@ impl fmt::Debug for Serving {
 
 impl Drop for Serving {
     fn drop(&mut self) {
-        // Who waits for room in there goes on.
+        // A handler that waits for room continues.
         self.requests.close();
         let (shared, server) = (Arc::clone(&self.shared), Arc::clone(&self.server));
         self.shared.runtime.spawn_blocking(move || {

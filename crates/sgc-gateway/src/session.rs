@@ -1,4 +1,4 @@
-//! [`Session`]: one client's part in the hub, within its scope and its bounds.
+//! [`Session`]: one client's use of the hub, within its scope and limits.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -10,41 +10,41 @@ use sgc_cdr::{Library, TypeName};
 use sgc_ros::{TOPIC_BYTES_MAX, is_topic_name};
 use sgc_wire::{History, Qos};
 
-use crate::access::{Client, Denied, Right, Scope};
+use crate::access::{Client, Denial, Right, Scope};
 use crate::access_watch::AccessWatch;
 use crate::content::{Content, Form, convert};
+use crate::definitions::InterfaceType;
 use crate::error::GatewayError;
-use crate::feed::{FeedKey, Intaking, LATCHED_DEPTH_MAX, Subscription};
+use crate::feed::{FeedKey, LATCHED_DEPTH_MAX, Subscription, SubscriptionOptions};
 use crate::graph::Graph;
 use crate::hub::Hub;
 use crate::inflow::Inflow;
 use crate::publisher::{Account, Publication};
 use crate::queue::Overflow;
-use crate::quota::{Charge, Held, Payer, Quota, Resource, Waiting};
+use crate::quota::{ByteReservation, Charge, Payer, PendingBytes, Quota, Resource};
 use crate::service::Serving;
-use crate::types::InterfaceType;
 
-/// How small a part of a client's bytes a subscription has that the local network waits for.
+/// Divisor: a subscription that holds up writers gets one part in this many of the client's bytes.
 const WAITING_PARTS: usize = 16;
-/// Messages that may wait for one subscription, whatever its client says.
+/// Most messages that may be queued for one subscription, whatever the client asks for.
 const DEPTH_MAX: usize = 10_000;
 
-/// What one client may have at a time.
+/// The limits of one session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SessionLimits {
-    /// Bytes that wait for it in all its subscriptions together; of each topic one message may wait in any case. Its
-    /// transient-local writers keep so many, too, the arguments of its calls and goals have so many, and so have the messages
-    /// that are kept for later subscribers and charged to it.
+    /// Most bytes queued in all subscriptions together; one message of each topic is always allowed. The same bound
+    /// applies separately to messages kept by transient-local writers, to arguments of calls and goals, and to
+    /// messages that are kept for later subscribers and charged to the session.
     pub waiting_bytes_max: usize,
-    /// Subscriptions.
+    /// Most subscriptions.
     pub subscriptions_max: usize,
-    /// Topics that it publishes.
+    /// Most published topics.
     pub publications_max: usize,
-    /// Services and actions that it serves.
+    /// Most served services and actions.
     pub servings_max: usize,
-    /// Calls under way.
+    /// Most concurrent calls.
     pub calls_max: usize,
-    /// Subscriptions that the local network waits for: each has a reader and a part of the bytes of its own.
+    /// Most subscriptions that hold up writers. Each has its own reader and its own part of the bytes.
     pub waits_max: usize,
 }
 
@@ -61,84 +61,86 @@ impl Default for SessionLimits {
     }
 }
 
-/// What to hear.
+/// A request to subscribe.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Subscribe {
-    /// ROS topic.
+    /// The ROS topic.
     pub topic: String,
-    /// ROS type, `std_msgs/msg/String` or `std_msgs/String`; none takes that of the topic's publishers.
+    /// The ROS type, such as `std_msgs/msg/String` or `std_msgs/String`. `None` takes the type of the topic's
+    /// publishers.
     pub type_name: Option<String>,
-    /// What to request; none takes each publisher as it is.
+    /// The requested QoS; `None` adapts to what the publishers offer.
     pub qos: Option<Qos>,
-    /// Messages that may wait; 0 is 1.
+    /// Most queued messages; 0 counts as 1.
     pub depth: usize,
-    /// At most one message in that time.
+    /// Shortest time between two messages.
     pub interval_min: Option<Duration>,
-    /// Rather than leaving messages out, the local network is made to wait, as far as it can be: it takes a reader of its own.
+    /// `true` if writers on the local network wait, as far as their QoS permits, so that no message is dropped. Such
+    /// a subscription has its own reader.
     pub waits: bool,
 }
 
-/// What to publish.
+/// A request to publish.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Advertise {
-    /// ROS topic.
+    /// The ROS topic.
     pub topic: String,
-    /// ROS type; none takes that which the topic has already.
+    /// The ROS type; `None` takes the type that the topic already has.
     pub type_name: Option<String>,
-    /// What to offer.
+    /// The offered QoS.
     pub qos: Qos,
 }
 
-/// One client's part in the hub.
+/// One client's use of the hub.
 #[derive(Debug)]
 pub struct Session {
     hub: Hub,
     client: Client,
-    /// The rules that end its right; none for a part of this program.
+    /// The rules that may end the client's rights; `None` for a part of this program.
     access: Option<AccessWatch>,
     limits: SessionLimits,
     calls: Arc<AtomicUsize>,
-    waiting: Arc<Waiting>,
-    /// Bytes of messages that its transient-local writers keep.
-    kept: Arc<Waiting>,
-    /// Bytes of arguments of its calls and goals, until these are done or sent.
-    arguments: Arc<Waiting>,
-    /// Bytes of messages of its topics that are kept for later subscribers and charged to it.
-    history: Arc<Waiting>,
+    waiting: Arc<PendingBytes>,
+    /// The bytes of messages that the client's transient-local writers keep.
+    kept: Arc<PendingBytes>,
+    /// The bytes of arguments of calls and goals, until these are done or sent.
+    arguments: Arc<PendingBytes>,
+    /// The bytes of messages that are kept for later subscribers and charged to the client.
+    history: Arc<PendingBytes>,
     waits: Arc<AtomicUsize>,
-    /// The quota of its credential.
+    /// The quota of the client's credential.
     quota: Quota,
-    /// Bytes of messages that are still to come in full, where the protocol counts them.
+    /// The bytes of incoming messages that are incomplete, if the protocol counts them.
     inflow: Arc<Inflow>,
 }
 
-/// A subscription that is waited for, counted while it lasts.
+/// A place among subscriptions that hold up writers, returned on drop.
 #[derive(Debug)]
-pub(crate) struct Waits {
+pub(crate) struct WaitPlace {
     waits: Arc<AtomicUsize>,
     _charge: Charge,
 }
 
-impl Drop for Waits {
+impl Drop for WaitPlace {
     fn drop(&mut self) {
         self.waits.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
-/// A call of a client's, counted while it lasts.
-struct Counted<'s>(&'s AtomicUsize);
+/// A call in progress, counted until dropped.
+struct ActiveCall<'s>(&'s AtomicUsize);
 
-impl Drop for Counted<'_> {
+impl Drop for ActiveCall<'_> {
     fn drop(&mut self) {
         self.0.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
 impl Session {
-    /// A client's.
+    /// Creates the session of a client.
     pub fn new(hub: &Hub, client: Client, limits: SessionLimits) -> Self {
         let quota = hub.shared.quotas.quota(&client);
-        let waiting = || Arc::new(Waiting::new(limits.waiting_bytes_max, quota.clone()));
+        let waiting = || Arc::new(PendingBytes::new(limits.waiting_bytes_max, quota.clone()));
         Self {
             hub: hub.clone(),
             client,
@@ -155,14 +157,14 @@ impl Session {
         }
     }
 
-    /// Has these rules end the client's right.
+    /// Sets the rules that may end the client's rights.
     #[must_use]
     pub fn admitted_by(mut self, access: AccessWatch) -> Self {
         self.access = Some(access);
         self
     }
 
-    /// Has incoming messages take room of the client's quota.
+    /// Charges incoming messages to the client's quota.
     #[must_use]
     pub(crate) fn metered_by(mut self, inflow: Arc<Inflow>) -> Self {
         inflow.admit(&self.quota);
@@ -170,34 +172,35 @@ impl Session {
         self
     }
 
-    /// Gives back the room of a message that is done.
-    pub(crate) fn message_is_done(&self) {
-        self.message_is_done_but(0);
+    /// Releases the room of a message that was handled.
+    pub(crate) fn finish_message(&self) {
+        self.finish_message_keeping(0);
     }
 
-    /// The same where so many bytes of what came are still kept.
-    pub(crate) fn message_is_done_but(&self, kept: usize) {
-        self.inflow.done_but(kept);
+    /// Releases the room of a message that was handled, except for `kept` bytes.
+    pub(crate) fn finish_message_keeping(&self, kept: usize) {
+        self.inflow.finish_keeping(kept);
     }
 
-    /// Waits until the client's right ends, and says why it has. Whoever serves the client ends all that it has then.
-    pub async fn until_denied(&self) -> Denied {
+    /// Waits until the client's rights end and returns the reason. The caller then ends everything that the client
+    /// has.
+    pub async fn until_denied(&self) -> Denial {
         match &self.access {
             Some(access) => access.until_denied(&self.client).await,
             None => std::future::pending().await,
         }
     }
 
-    /// Gives back the room of so many bytes that were kept beyond the message that they came with.
+    /// Releases bytes that were kept after the message that carried them.
     pub(crate) fn forget_kept(&self, bytes: usize) {
         self.inflow.give_back(bytes);
     }
 
-    /// Returns the session of the same program, now that it is another client. All that it has counts against the bounds of
-    /// that client's credential from now on.
+    /// Returns the session of the same program under another client. Everything that the session holds is charged to
+    /// the new client's credential.
     ///
     /// # Errors
-    /// The bound of the other credential that has no room for what the session has. Nothing has changed then.
+    /// The bound of the new credential that lacks room. Nothing has changed then.
     pub fn again(&self, client: Client) -> Result<Self, GatewayError> {
         self.quota.move_to(&client, &self.limits)?;
         let (hub, access, limits) = (self.hub.clone(), self.access.clone(), self.limits);
@@ -221,37 +224,37 @@ impl Session {
         })
     }
 
-    /// Who it is.
+    /// Returns the client.
     pub fn client(&self) -> &Client {
         &self.client
     }
 
-    /// The hub.
+    /// Returns the hub.
     pub fn hub(&self) -> &Hub {
         &self.hub
     }
 
-    /// Bytes of messages that wait for it in all its subscriptions.
+    /// Returns the bytes queued in all subscriptions.
     pub fn waiting_bytes(&self) -> usize {
         self.waiting.bytes()
     }
 
-    /// Takes room for the arguments of a call or a goal that is under way.
-    pub(crate) fn hold_arguments(&self, bytes: usize) -> Result<Held, GatewayError> {
-        Held::new(&self.arguments, "bytes of arguments that wait", bytes)
+    /// Reserves room for the arguments of a call or goal.
+    pub(crate) fn hold_arguments(&self, bytes: usize) -> Result<ByteReservation, GatewayError> {
+        ByteReservation::new(&self.arguments, "bytes of arguments that wait", bytes)
     }
 
-    /// Returns the quota of its credential.
+    /// Returns the quota of the client's credential.
     pub(crate) fn quota(&self) -> &Quota {
         &self.quota
     }
 
-    /// What it may have. Protocols count what they hold by [`Session::check_count`].
+    /// Returns the limits. Protocols check their own counts by [`Session::check_count`].
     pub fn limits(&self) -> &SessionLimits {
         &self.limits
     }
 
-    /// What the client may see of the graph: what it may use in one way or another.
+    /// Returns the part of the graph that the client has any right to.
     pub fn graph(&self) -> Graph {
         let scope = &self.client.scope;
         let any = |rights: [Right; 2], name: &str| rights.iter().any(|right| scope.permits(*right, name));
@@ -265,9 +268,9 @@ impl Session {
         )
     }
 
-    /// Refuses types that the client does not see: they would tell of others on the network. A client sees types that ship
-    /// with ROS 2, types of topics, services and actions in its scope that others have, and types within these. May read
-    /// files.
+    /// Fails for types outside the client's view, because they would reveal other interfaces on the network. The view
+    /// has the types that ship with ROS 2, the types of topics, services and actions in the client's scope that other
+    /// nodes have, and the types within these. May read files.
     pub fn check_type(&self, type_name: &str) -> Result<(), GatewayError> {
         if *self.client.scope == Scope::everything() {
             return Ok(());
@@ -298,7 +301,7 @@ impl Session {
         if seen.contains(&wanted) || seen.iter().any(contains) { Ok(()) } else { Err(not_seen()) }
     }
 
-    /// Refuses what is beyond a bound of [`SessionLimits`].
+    /// Fails if a count reaches a bound of [`SessionLimits`].
     pub fn check_count(&self, what: &'static str, now: usize, max: usize) -> Result<(), GatewayError> {
         if now >= max { Err(GatewayError::TooMany { what, max }) } else { Ok(()) }
     }
@@ -307,11 +310,11 @@ impl Session {
         if is_topic_name(name) {
             return Ok(());
         }
-        // What is no name may be of any length.
+        // An invalid name may have any length, so it is cut.
         Err(GatewayError::Name { name: name.chars().take(TOPIC_BYTES_MAX).collect() })
     }
 
-    /// Refuses names that are none, and what the scope does not have.
+    /// Fails for invalid names and for interfaces outside the scope.
     pub fn check(&self, right: Right, name: &str) -> Result<(), GatewayError> {
         self.check_name(name)?;
         if !self.client.scope.permits(right, name) {
@@ -321,7 +324,7 @@ impl Session {
         Ok(())
     }
 
-    /// The type of a topic: as it is said, else as the network has it.
+    /// Returns the type of a topic: the given one if it agrees with the network, else the one on the network.
     fn topic_type(&self, topic: &str, said: Option<&str>) -> Result<String, GatewayError> {
         let graph = self.hub.graph();
         let actual = graph.topics.get(topic).and_then(|info| info.type_name());
@@ -344,7 +347,7 @@ impl Session {
         }
     }
 
-    /// The type of a service: as it is said, else as the network has it.
+    /// Returns the type of a service: the given one if it agrees with the network, else the one on the network.
     pub fn service_type(&self, service: &str, said: Option<&str>) -> Result<String, GatewayError> {
         let graph = self.hub.graph();
         let actual = graph.services.get(service).map(|info| info.type_name.clone());
@@ -362,19 +365,19 @@ impl Session {
         }
     }
 
-    /// Subscribes.
+    /// Subscribes to a topic.
     pub async fn subscribe(&self, wanted: Subscribe) -> Result<Subscription, GatewayError> {
         self.check(Right::Subscribe, &wanted.topic)?;
         self.subscribe_checked(wanted).await
     }
 
-    /// Subscribes to what belongs to something that the client may use.
+    /// Subscribes to a topic that belongs to an interface whose use was checked.
     pub(crate) async fn subscribe_checked(&self, wanted: Subscribe) -> Result<Subscription, GatewayError> {
         let type_name = self.topic_type(&wanted.topic, wanted.type_name.as_deref())?;
         let charge = self.quota.take(Resource::Subscriptions, &self.limits)?;
         let waits = if wanted.waits { Some(self.take_wait()?) } else { None };
         let key = FeedKey { topic: wanted.topic, type_name, qos: wanted.qos, waits: wanted.waits };
-        let taking = Intaking {
+        let options = SubscriptionOptions {
             depth: wanted.depth.min(DEPTH_MAX),
             bytes_max: self.limits.waiting_bytes_max / WAITING_PARTS,
             waiting: Arc::clone(&self.waiting),
@@ -384,25 +387,25 @@ impl Session {
             charge,
             payer: Payer::new(self.quota.clone(), self.limits, Arc::clone(&self.history)),
         };
-        self.hub.shared.subscribe(key, taking).await
+        self.hub.shared.subscribe(key, options).await
     }
 
-    /// A place for one more subscription that is waited for.
-    fn take_wait(&self) -> Result<Waits, GatewayError> {
+    /// Takes a place for one more subscription that holds up writers.
+    fn take_wait(&self) -> Result<WaitPlace, GatewayError> {
         let charge = self.quota.take(Resource::Waits, &self.limits)?;
         let before = self.waits.fetch_add(1, Ordering::Relaxed);
-        let place = Waits { waits: Arc::clone(&self.waits), _charge: charge };
+        let place = WaitPlace { waits: Arc::clone(&self.waits), _charge: charge };
         self.check_count("subscriptions that are waited for", before, self.limits.waits_max)?;
         Ok(place)
     }
 
-    /// Becomes a publisher.
+    /// Starts to publish on a topic.
     pub async fn advertise(&self, wanted: Advertise) -> Result<Publication, GatewayError> {
         self.check(Right::Publish, &wanted.topic)?;
         self.advertise_checked(wanted).await
     }
 
-    /// Becomes a publisher of what belongs to something that the client may serve.
+    /// Starts to publish on a topic that belongs to an interface whose use was checked.
     pub(crate) async fn advertise_checked(&self, wanted: Advertise) -> Result<Publication, GatewayError> {
         let type_name = self.topic_type(&wanted.topic, wanted.type_name.as_deref())?;
         let charge = self.quota.take(Resource::Publications, &self.limits)?;
@@ -412,7 +415,7 @@ impl Session {
         Publication::new(&self.hub.shared, wanted.topic, type_name, qos, account).await
     }
 
-    /// Calls a service and waits for its reply, which comes in the form that is asked for.
+    /// Calls a service and waits for its reply, which comes in the requested form.
     pub async fn call(
         &self,
         service: &str,
@@ -426,7 +429,7 @@ impl Session {
         let type_name = self.service_type(service, type_name)?;
         self.check_count("calls under way", self.calls.load(Ordering::Relaxed), self.limits.calls_max)?;
         self.calls.fetch_add(1, Ordering::Relaxed);
-        let _counted = Counted(&self.calls);
+        let _counted = ActiveCall(&self.calls);
         let _charge = self.quota.take(Resource::Calls, &self.limits)?;
         let name = service.to_owned();
         let caller = self.hub.shared.run(move |shared| shared.caller(&name, &type_name)).await?;
@@ -445,7 +448,7 @@ impl Session {
     }
 }
 
-/// Bounds the number of messages that a transient-local writer keeps for readers that come later.
+/// Bounds the number of messages that a transient-local writer keeps for later readers.
 fn kept_within_bounds(qos: Qos) -> Qos {
     if !qos.is_transient_local() {
         return qos;
@@ -458,7 +461,7 @@ fn kept_within_bounds(qos: Qos) -> Qos {
     Qos { history: History::KeepLast(depth), ..qos }
 }
 
-/// The action that a topic or service is a part of; any other is itself.
+/// Returns the action that a topic or service belongs to, or the name itself.
 pub(crate) fn action_of(name: &str) -> &str {
     name.split_once("/_action/").map_or(name, |(action, _)| action)
 }

@@ -1,7 +1,7 @@
-//! TLS at the gateway's door: its certificate, and whether it asks for the client's.
+//! TLS of the gateway: its certificate, and the request for client certificates.
 //!
-//! Certificates of clients are those of fleets, which are judged by [`sgc_trust::TrustAnchors`] once the handshake has
-//! proven that the client has the key.
+//! Client certificates belong to fleets. [`sgc_trust::TrustAnchors`] verifies them after the handshake has proven
+//! that the client has the key.
 
 use std::fmt;
 use std::sync::Arc;
@@ -17,19 +17,19 @@ use rustls::{
 use rustls_pki_types::pem::PemObject as _;
 use rustls_pki_types::{CertificateDer, PrivateKeyDer, UnixTime};
 
-/// Why a certificate and its key cannot be used.
+/// The reason why a certificate and key cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum TlsError {
-    /// The certificates are not.
+    /// The certificate is not PEM.
     #[error("the certificate is not PEM: {0}")]
     Certificate(rustls_pki_types::pem::Error),
-    /// There is none.
+    /// The file contains no certificate.
     #[error("there is no certificate in it")]
     NoCertificate,
-    /// The key is not.
+    /// The key is not PEM.
     #[error("the private key is not PEM: {0}")]
     Key(rustls_pki_types::pem::Error),
-    /// They do not belong together, or are of no kind that TLS takes.
+    /// The certificate and key do not match, or TLS does not support them.
     #[error("the certificate and its key cannot be used: {0}")]
     Unusable(Error),
 }
@@ -38,7 +38,7 @@ fn provider() -> Arc<CryptoProvider> {
     Arc::new(rustls::crypto::aws_lc_rs::default_provider())
 }
 
-/// A certificate with the chain that leads to it, and its key, of PEM texts.
+/// Parses a certificate with its chain and its key from PEM texts.
 pub fn certified_key(certificate: &[u8], key: &[u8]) -> Result<Arc<CertifiedKey>, TlsError> {
     let chain: Vec<CertificateDer<'static>> = CertificateDer::pem_slice_iter(certificate)
         .collect::<Result<_, _>>()
@@ -50,7 +50,7 @@ pub fn certified_key(certificate: &[u8], key: &[u8]) -> Result<Arc<CertifiedKey>
     CertifiedKey::from_der(chain, key, &provider()).map(Arc::new).map_err(TlsError::Unusable)
 }
 
-/// TLS 1.3 with that certificate; asks for the client's if certificates of clients mean anything here.
+/// Creates a configuration of TLS 1.3 with this certificate. `asks` requests a client certificate.
 pub(crate) fn server_config(
     key: &Arc<CertifiedKey>,
     asks: bool,
@@ -62,37 +62,37 @@ pub(crate) fn server_config(
         .with_protocol_versions(&[&rustls::version::TLS13])
         .map_err(TlsError::Unusable)?;
     let builder = if asks {
-        builder.with_client_cert_verifier(Arc::new(Prover { algorithms }))
+        builder.with_client_cert_verifier(Arc::new(KeyProofVerifier { algorithms }))
     } else {
         builder.with_no_client_auth()
     };
-    let mut config = builder.with_cert_resolver(Arc::new(Always(Arc::clone(key))));
+    let mut config = builder.with_cert_resolver(Arc::new(FixedCertResolver(Arc::clone(key))));
     config.alpn_protocols = protocols.iter().map(|protocol| protocol.to_vec()).collect();
     Ok(Arc::new(config))
 }
 
-/// The same certificate for every name.
-struct Always(Arc<CertifiedKey>);
+/// A resolver that returns the same certificate for every name.
+struct FixedCertResolver(Arc<CertifiedKey>);
 
-impl fmt::Debug for Always {
+impl fmt::Debug for FixedCertResolver {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("Always")
     }
 }
 
-impl ResolvesServerCert for Always {
+impl ResolvesServerCert for FixedCertResolver {
     fn resolve(&self, _hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
         Some(Arc::clone(&self.0))
     }
 }
 
-/// Has a client prove that it has the key of its certificate, if it shows one.
+/// A verifier that makes a client prove possession of the key of its certificate, if it shows one.
 #[derive(Debug)]
-struct Prover {
+struct KeyProofVerifier {
     algorithms: WebPkiSupportedAlgorithms,
 }
 
-impl ClientCertVerifier for Prover {
+impl ClientCertVerifier for KeyProofVerifier {
     fn client_auth_mandatory(&self) -> bool {
         false
     }

@@ -1,4 +1,4 @@
-//! The upgrade to WebSocket (RFC 6455): who asks, with what credentials, and for which protocol.
+//! The upgrade to WebSocket (RFC 6455), which reads origin, credentials and subprotocol.
 
 use std::sync::Arc;
 
@@ -10,42 +10,42 @@ use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::{WebSocketStream, tungstenite};
 
 use crate::access::Client;
-use crate::door::{Arrival, Door};
+use crate::admission::{Admission, Arrival};
 
-/// Longest message that a client may send, bytes: an image of 13 MB in base64 fits twice over.
+/// Longest message of a client, in bytes. An image of 13 MB in base64 fits three times.
 pub(crate) const MESSAGE_BYTES_MAX: usize = 64 << 20;
-/// Parameters of a URL that may hold a token, for programs that cannot send headers.
+/// URL parameters that may hold a token, for programs that cannot send headers.
 const TOKEN_PARAMETERS: [&str; 2] = ["token", "access_token"];
 
-/// What a client asked for.
+/// An upgraded connection.
 #[derive(Debug)]
-pub(crate) struct Upgraded<S> {
+pub(crate) struct Upgrade<S> {
     pub(crate) socket: WebSocketStream<S>,
     pub(crate) client: Client,
-    /// The subprotocol that was chosen.
+    /// The negotiated subprotocol.
     pub(crate) subprotocol: Option<&'static str>,
 }
 
-/// Why a connection is not upgraded.
+/// The reason why a connection is not upgraded.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum UpgradeError {
-    /// Its client is not admitted, which the door has counted.
+    /// The client is not admitted; the refusal has been counted.
     #[error("not admitted")]
     NotAdmitted,
-    /// What came is no upgrade, or the connection ended.
+    /// The request is not an upgrade, or the connection ended.
     #[error("no WebSocket: {0}")]
     Socket(Box<tungstenite::Error>),
 }
 
-/// Upgrades a connection, if its client is admitted; `known` are subprotocols, the best first.
+/// Upgrades a connection if its client is admitted. `known` are the subprotocols, the preferred one first.
 pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
     stream: S,
     arrival: &Arrival,
-    door: &Arc<Door>,
+    admission: &Arc<Admission>,
     known: &[&'static str],
-) -> Result<Upgraded<S>, UpgradeError> {
+) -> Result<Upgrade<S>, UpgradeError> {
     let (mut found, mut is_refused) = (None, false);
-    // The size of what it returns is the library's choice.
+    // The library determines the size of the error.
     #[allow(clippy::result_large_err)]
     let decide = |request: &Request, mut response: Response| -> Result<Response, ErrorResponse> {
         let header = |name| request.headers().get(name).and_then(|value| value.to_str().ok());
@@ -54,11 +54,11 @@ pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
             scheme.eq_ignore_ascii_case("bearer").then(|| token.trim().to_owned())
         });
         let token = bearer.or_else(|| request.uri().query().and_then(token_in));
-        // What is no text is no page that is known.
+        // An origin that is not text matches no listed origin.
         let origin = request.headers().get(ORIGIN).map(|value| value.to_str().unwrap_or("?"));
-        let client = door.admit(arrival, origin, token.as_deref()).map_err(|denied| {
+        let client = admission.admit(arrival, origin, token.as_deref()).map_err(|denied| {
             is_refused = true;
-            refusal(StatusCode::UNAUTHORIZED, denied.told())
+            refusal(StatusCode::UNAUTHORIZED, denied.client_message())
         })?;
         let offered: Vec<&str> = request
             .headers()
@@ -86,10 +86,10 @@ pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
     let Some((client, subprotocol)) = found else {
         return Err(UpgradeError::Socket(Box::new(tungstenite::Error::ConnectionClosed)));
     };
-    Ok(Upgraded { socket, client, subprotocol })
+    Ok(Upgrade { socket, client, subprotocol })
 }
 
-/// Returns the part of a reason that fits into a close frame, which has room for 123 bytes of words (RFC 6455, 5.5).
+/// Cuts a reason to the 123 bytes that a close frame has room for (RFC 6455, 5.5).
 pub(crate) fn close_reason(why: &str) -> &str {
     let mut end = why.len().min(123);
     while !why.is_char_boundary(end) {
@@ -111,7 +111,7 @@ fn token_in(query: &str) -> Option<String> {
     })
 }
 
-/// Text of a URL (RFC 3986, 2.1); what is no escape stays as it is.
+/// Decodes percent escapes (RFC 3986, 2.1). Invalid escapes stay as they are.
 fn percent_decoded(text: &str) -> String {
     let mut out = Vec::with_capacity(text.len());
     let mut rest = text.as_bytes();
@@ -132,14 +132,14 @@ mod tests {
     use crate::access::Access;
 
     #[tokio::test]
-    async fn who_is_not_admitted_is_told_so_and_counted_once() {
-        let door = Door::new(Access::default(), 1);
+    async fn refused_client_is_told_and_counted_once() {
+        let admission = Admission::new(Access::default(), 1);
         let peer = "192.0.2.1:1000".parse().unwrap();
         let arrival = Arrival { peer, is_encrypted: false, certificate: None };
         let ask = async |text: &str| {
             let (near, mut far) = duplex(4096);
             far.write_all(text.as_bytes()).await.unwrap();
-            let refused = upgrade(near, &arrival, &door, &[]).await.unwrap_err();
+            let refused = upgrade(near, &arrival, &admission, &[]).await.unwrap_err();
             let mut told = String::new();
             far.read_to_string(&mut told).await.unwrap();
             (refused, told)
@@ -149,7 +149,7 @@ mod tests {
         let (refused, told) = ask(upgrade).await;
         assert!(matches!(refused, UpgradeError::NotAdmitted), "{refused}");
         assert!(told.starts_with("HTTP/1.1 401") && told.contains("not admitted: "), "{told}");
-        assert_eq!(door.refused(), [("not admitted".to_owned(), 1)].into());
+        assert_eq!(admission.refused(), [("not admitted".to_owned(), 1)].into());
         let (refused, _) = ask("SSH-2.0-x\r\n\r\n").await;
         assert!(matches!(refused, UpgradeError::Socket(_)), "{refused}");
     }

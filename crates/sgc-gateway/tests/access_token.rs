@@ -1,7 +1,8 @@
-//! The bytes of an access token, as `docs/spec/gateway.md` has them and `scripts/access-vectors.py` checks them.
+//! The bytes of an access token, as `docs/spec/gateway.md` specifies them and `scripts/access-vectors.py` checks
+//! them.
 //!
-//! The vector was made by
-//! `cargo test -p sgc-gateway --test access_token -- --ignored --nocapture | grep '^{' > crates/sgc-gateway/tests/vectors/access.json`.
+//! The vector was made by `cargo test -p sgc-gateway --test access_token -- --ignored --nocapture | grep '^{' >
+//! crates/sgc-gateway/tests/vectors/access.json`.
 
 #![allow(clippy::unwrap_used)]
 

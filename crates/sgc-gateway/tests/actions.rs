@@ -16,7 +16,7 @@ const ACTION: &str = "/fibonacci";
 const TYPE: &str = "example_interfaces/action/Fibonacci";
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Serves goals: negative orders are rejected, those below ten done at once, others when they are canceled.
+/// Serves goals: negative orders are rejected, those below ten succeed at once, others end when they are cancelled.
 async fn serve(session: Session) {
     let mut serving = session.serve_action(ACTION, Some(TYPE)).await.unwrap();
     let replier = serving.replier();
@@ -80,7 +80,7 @@ async fn a_goal_is_given_up_as_its_client_wishes() {
     };
     assert_eq!(goal.cancel().await.unwrap(), CancelAnswer::Taken);
     assert_eq!(waiting.await.unwrap().status, GoalStatus::Canceled);
-    // Who comes later sees how it stands.
+    // A late subscriber sees the current status.
     let wanted = Subscribe { topic: format!("{ACTION}/_action/status"), depth: 1, ..Subscribe::default() };
     let mut heard = client.subscribe(wanted).await.unwrap();
     let status = heard.next().await.unwrap();
@@ -115,7 +115,7 @@ async fn results_that_are_kept_are_bounded_in_bytes() {
     let mut serving = server.serve_action(ACTION, Some(TYPE)).await.unwrap();
     let client = site.session("client");
     let mut goals = Vec::new();
-    // Of results of 2 kB and more one fits, and of such as have 8 kB none.
+    // There is room for one result of 2 kB or more, and for none of 8 kB.
     for numbers in [500, 501, 2000] {
         let wanted = order(7);
         let (sent, taken) = tokio::join!(client.send_goal(ACTION, None, &wanted), async {

@@ -1,5 +1,5 @@
-//! A page in a browser: Chromium with npm's roslib shows a camera through a gateway's own sockets. Both have to be installed, as
-//! `make deps-test peers` does.
+//! A page in a browser: Chromium with npm's roslib shows a camera through a gateway's own sockets. `make deps-test
+//! peers` installs both.
 #![allow(clippy::unwrap_used)]
 
 mod support;
@@ -16,7 +16,7 @@ use rand_chacha::rand_core::SeedableRng as _;
 use serde_json::json;
 use sgc_gateway::{
     Access, AccessGrant, AccessRules, Advertise, Client, Content, Hub, HubOptions, ListenAt, Protocol, Scope,
-    Server, ServerOptions, Session, SessionLimits, Shipped, TokenId, Types,
+    Server, ServerOptions, Session, SessionLimits, ShippedDefinitions, TokenId, Types,
 };
 use sgc_trust::{EnrollRequest, Fleet, Identity};
 use sgc_wire::{Qos, Reliability, UnixMillis};
@@ -25,17 +25,17 @@ use tokio::task::JoinSet;
 
 use crate::support::{Site, eventually};
 
-/// Longest that all of it takes, with much to spare.
+/// Longest duration of the test, with much to spare.
 const PATIENCE: Duration = Duration::from_secs(120);
-/// Between two pictures of the camera.
+/// Pause between two pictures of the camera.
 const PICTURE: Duration = Duration::from_millis(20);
-/// Of a picture, pixels.
+/// Width and height of a picture in pixels.
 const WIDTH: usize = 64;
 const HEIGHT: usize = 48;
-/// Bytes of a row: those of its pixels, and some that are none.
+/// Bytes of a row: those of its pixels, and padding.
 const STEP: usize = 3 * WIDTH + 8;
 
-/// A robot with a camera and wheels, a program of its own on the network of a site.
+/// A robot with a camera and wheels, as a separate program on the network of a site.
 struct Robot {
     _hub: Hub,
     _talks: JoinSet<()>,
@@ -44,7 +44,9 @@ struct Robot {
 impl Robot {
     async fn new(site: &Site) -> Self {
         let own = Arc::new(site.domain.join(false));
-        let hub = Hub::start(own, Types::new(Shipped), HubOptions { node: "robot".into() }).await.unwrap();
+        let hub = Hub::start(own, Types::new(ShippedDefinitions), HubOptions { node: "robot".into() })
+            .await
+            .unwrap();
         let session = Session::new(&hub, Client::own("robot"), SessionLimits::default());
         let advertise = |topic: &str, type_name: &str| {
             let qos = Qos { reliability: Reliability::BestEffort, ..Qos::default() };
@@ -70,7 +72,7 @@ impl Robot {
     }
 }
 
-/// A picture in colours that depend on its number; `tests/js/camera.js` knows them, too.
+/// Returns a picture whose colours depend on its number. `tests/js/camera.js` knows them, too.
 fn picture(number: usize) -> String {
     let mut data = vec![0xff; HEIGHT * STEP];
     for (y, row) in data.chunks_mut(STEP).enumerate() {
@@ -103,7 +105,7 @@ fn identity() -> Identity {
     fleet.enroll(&EnrollRequest::new("arm-1".parse().unwrap(), began), &mut rng).unwrap()
 }
 
-/// A token for pictures, and nothing else.
+/// Returns a token for pictures only.
 fn token(of: &Identity) -> String {
     let scope = Scope { subscribe: vec!["/camera/**".into()], ..Scope::default() };
     let grant = AccessGrant {
@@ -151,7 +153,7 @@ async fn a_page_shows_a_camera_if_it_is_of_this_host_or_has_a_token() {
     let output = output.expect("it should have ended by now").unwrap();
     let (said, errors) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success() && said.ends_with("all is well\n"), "{said}\n{errors}");
-    // The page of elsewhere without a token, and nobody else.
+    // Only the page from elsewhere without a token was refused.
     assert_eq!(server.status().refused.get("not admitted"), Some(&1));
 }
 

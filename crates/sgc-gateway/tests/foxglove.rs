@@ -1,4 +1,4 @@
-//! Foxglove's protocol on loopback, beside programs of a network in memory.
+//! Tests of Foxglove's protocol on loopback, beside programs of a network in memory.
 #![allow(clippy::unwrap_used)]
 
 mod support;
@@ -13,7 +13,8 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use sgc_gateway::foxglove::{FoxgloveError, Options};
 use sgc_gateway::{
-    Advertise, Client, Content, Form, Hub, HubOptions, Scope, Session, SessionLimits, Shipped, Types,
+    Advertise, Client, Content, Form, Hub, HubOptions, Scope, Session, SessionLimits, ShippedDefinitions,
+    Types,
 };
 use sgc_ros::{EndpointKind, RosNetwork, RosWriter, SampleKind};
 use sgc_wire::{Durability, History, Qos};
@@ -23,14 +24,14 @@ use tokio_tungstenite::tungstenite::Message as Frame;
 use support::{Site, eventually, spec, string};
 use viewer::{Viewer, serve_one};
 
-/// Another program of the network, whose types the gateway's own code knows.
+/// Another program on the network, whose types the gateway knows by itself.
 struct Program {
     session: Arc<Session>,
 }
 
 impl Program {
     async fn new(site: &Site, node: &str) -> Self {
-        let types = Types::new(Shipped);
+        let types = Types::new(ShippedDefinitions);
         let options = HubOptions { node: node.to_owned() };
         let hub = Hub::start(Arc::new(site.domain.join(false)), types, options).await.unwrap();
         let client = Client::own(node);
@@ -55,7 +56,7 @@ impl Program {
         });
     }
 
-    /// Has parameters, `exposure` and `frame`, and tells of changes.
+    /// Serves the parameters `exposure` and `frame`, and announces changes.
     async fn with_parameters(self, node: &str) -> Self {
         let exposure = Arc::new(std::sync::Mutex::new(json!({"type": 3, "double_value": 0.5})));
         let wanted = Advertise {
@@ -73,7 +74,7 @@ impl Program {
                 "frame" => Some(json!({"type": 4, "string_value": "lens"})),
                 _ => None,
             };
-            // As nodes of ROS 2 do: nothing at all if one is not declared.
+            // Like ROS 2 nodes, it returns nothing at all if one name is not declared.
             let values: Option<Vec<_>> = asked["names"].as_array().unwrap().iter().map(value).collect();
             json!({"values": values.unwrap_or_default()})
         };
@@ -155,7 +156,7 @@ async fn messages_come_as_they_are_and_latched_ones_to_who_comes_late() {
     assert!((bytes[0], &bytes[12..]) == (8, &string("hello")[..]) && received_ns > 1_600_000_000_000_000_000);
     viewer.say(json!({"op": "unsubscribe", "subscriptionIds": [8]})).await;
     eventually(|| talker.matched_readers() == 0).await;
-    // A number may be used again, and another client's is another.
+    // A number may be reused, and another client's numbers are independent.
     let (mut other, _) = Viewer::new(site.session("other")).await;
     let map = other.channel("/map").await;
     other.subscribe(8, &map).await;
@@ -180,7 +181,7 @@ async fn clients_publish_in_json_and_as_it_is() {
     for expected in ["left", "right"] {
         assert_eq!(texts.recv_timeout(Duration::from_secs(5)).unwrap(), string(expected));
     }
-    // What is wrong is said once, until it is right again.
+    // An error is reported once, until the messages are valid again.
     for _ in 0..3 {
         viewer.binary(1, &[1], br#"{"date":"left"}"#).await;
     }
@@ -254,14 +255,14 @@ async fn parameters_are_those_of_nodes() {
     viewer.say(json!({"op": "getParameters", "parameterNames": [], "id": "all"})).await;
     let all = json!({"op": "parameterValues", "parameters": [exposure(0.5), frame], "id": "all"});
     assert_eq!(viewer.text("parameterValues").await, all);
-    // One that is not there is told as not set.
+    // A missing parameter is reported as not set.
     let names = ["/camera.exposure", "/camera.none"];
     viewer.say(json!({"op": "getParameters", "parameterNames": names})).await;
     let some = json!({"op": "parameterValues", "parameters": [exposure(0.5), {"name": "/camera.none"}]});
     assert_eq!(viewer.text("parameterValues").await, some);
 
     viewer.say(json!({"op": "subscribeParameterUpdates", "parameterNames": ["/camera.exposure"]})).await;
-    // A whole number for what is none, as a browser has it; and one that the node refuses.
+    // The values are an integer for a double, as a browser sends it, and one that the node refuses.
     let wanted = json!([{"name": "/camera.exposure", "value": 2}, {"name": "/camera.frame", "value": "x"}]);
     viewer.say(json!({"op": "setParameters", "parameters": wanted, "id": "set"})).await;
     viewer.status("parameters of /camera.frame: it is fixed").await;
@@ -281,7 +282,7 @@ async fn parameters_are_those_of_nodes() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_is_connected_with_what_is_told_to_who_asks() {
+async fn connection_graph_is_sent_on_request() {
     let site = Site::new().await;
     let program = Program::new(&site, "arm").await;
     program.serve("/switch", "std_srvs/srv/SetBool", |_| json!({})).await;
@@ -309,7 +310,7 @@ async fn who_is_connected_with_what_is_told_to_who_asks() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_the_scope_does_not_have_is_not_there() {
+async fn interfaces_outside_the_scope_are_invisible() {
     let site = Site::new().await;
     let _talkers = [site.writer("/odom", Qos::default()), site.writer("/secret", Qos::default())];
     let _camera = Program::new(&site, "camera").await.with_parameters("/camera").await;
@@ -336,7 +337,7 @@ async fn what_the_scope_does_not_have_is_not_there() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_wrong_is_said_and_the_rest_goes_on() {
+async fn errors_are_reported_and_the_connection_continues() {
     let site = Site::new().await;
     let talker = site.writer("/chatter", Qos::default());
     let (mut viewer, _) = Viewer::new(site.session("desk")).await;
@@ -369,7 +370,7 @@ async fn what_is_wrong_is_said_and_the_rest_goes_on() {
     talker.write(SampleKind::Write, 1, string("still there")).unwrap();
     assert_eq!(viewer.message().await, (1, string("still there")));
     assert_eq!(other.message().await, (1, string("still there")));
-    // What is no WebSocket any more ends this one, and no other.
+    // Data that is not WebSocket ends this connection only.
     viewer
         .send(Frame::Frame(tokio_tungstenite::tungstenite::protocol::frame::Frame::message(
             vec![255, 254],
@@ -399,7 +400,7 @@ async fn types_that_nobody_knows_are_shown_and_what_to_do_is_said() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_stops_reading_loses_the_oldest_and_others_nothing() {
+async fn client_that_stops_reading_loses_only_its_oldest_messages() {
     const MESSAGES: usize = 600;
     const BYTES: usize = 60_000;
     let site = Site::new().await;
@@ -424,7 +425,7 @@ async fn who_stops_reading_loses_the_oldest_and_others_nothing() {
     while slow.message().await.1 != text(MESSAGES - 1) {
         heard += 1;
     }
-    // What the kernel holds for it comes as well, 6 MB at most.
+    // The buffers of the kernel, 6 MB at most, arrive as well.
     assert!(heard < MESSAGES / 2, "{heard} of {MESSAGES}");
     let said = slow.status("/fast: messages are left out").await;
     assert_eq!(said["level"], 1);
@@ -433,14 +434,14 @@ async fn who_stops_reading_loses_the_oldest_and_others_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_asks_and_does_not_read_is_not_read_from() {
+async fn client_that_does_not_read_is_not_read_from() {
     const ASKED: u32 = 2000;
     const STUCK: Duration = Duration::from_secs(1);
     let site = Site::new().await;
     let (mut viewer, _) = Viewer::new(site.session("desk")).await;
     let uri = "x".repeat(60_000);
     let mut asked = 0;
-    // Each answer is as long as its question, so all that may wait on the way are 120 MB.
+    // Each answer is as long as its question, so at most 120 MB wait on the way.
     let mut is_stuck = false;
     while asked < ASKED && !is_stuck {
         let question = json!({"op": "fetchAsset", "uri": uri, "requestId": asked}).to_string();
@@ -456,7 +457,7 @@ async fn who_asks_and_does_not_read_is_not_read_from() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_command_has_few_answers_however_much_it_asks_for() {
+async fn answers_to_a_command_are_bounded() {
     let site = Site::new().await;
     let (mut viewer, _) = Viewer::new(site.session("desk")).await;
     let subscriptions: Vec<_> = (0..1000).map(|id| json!({"id": id, "channelId": 9})).collect();
@@ -469,7 +470,7 @@ async fn one_command_has_few_answers_however_much_it_asks_for() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_leaves_leaves_nothing_behind() {
+async fn leaving_client_leaves_nothing_behind() {
     let site = Site::new().await;
     let _talker = site.writer("/chatter", Qos::default());
     let _camera = Program::new(&site, "camera").await.with_parameters("/camera").await;
@@ -493,7 +494,7 @@ async fn who_leaves_leaves_nothing_behind() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_falls_silent_is_left() {
+async fn silent_client_is_disconnected() {
     let site = Site::new().await;
     let options = Options {
         ping_interval: Duration::from_millis(100),
@@ -502,7 +503,7 @@ async fn who_falls_silent_is_left() {
     };
     let (viewer, _) = Viewer::with(site.session("gone"), options.clone()).await;
     let (mut there, _) = Viewer::with(site.session("there"), options).await;
-    // Who reads answers pings, if nothing else.
+    // A client that reads answers pings, if nothing else.
     let reads = async {
         loop {
             there.text_that("never", |_| false).await;
@@ -518,7 +519,7 @@ async fn who_falls_silent_is_left() {
     assert!(!there.ended.is_finished());
 }
 
-/// The real client: npm's `@foxglove/ws-protocol`, with Foxglove's own reader of definitions.
+/// Runs the real client: npm's `@foxglove/ws-protocol`, with Foxglove's own reader of definitions.
 async fn real_client(subprotocol: &str) {
     let site = Site::new().await;
     let program = Program::new(&site, "arm").await;

@@ -1,5 +1,5 @@
-//! Clients that send anything: whole conversations, mutated with fixed seeds, of the rosbridge protocol and of Foxglove's. A short
-//! run of what the fuzz target `gateway` searches at length.
+//! Hostile clients: conversations of the rosbridge and Foxglove protocols, mutated with fixed seeds. A short run of
+//! the fuzz target `gateway`.
 #![allow(clippy::unwrap_used)]
 
 mod support;
@@ -28,7 +28,7 @@ const MESSAGES: u32 = 12;
 const PATIENCE: Duration = Duration::from_secs(20);
 const PIPE_BYTES: usize = 1 << 20;
 
-/// What a client of rosbridge may say.
+/// Valid messages of a rosbridge client.
 const OPS: &[&str] = &[
     r#"{"op":"subscribe","id":"s1","topic":"/chatter","type":"std_msgs/String","throttle_rate":10,"queue_length":5}"#,
     r#"{"op":"subscribe","topic":"/chatter","compression":"cbor-raw","fragment_size":20}"#,
@@ -54,7 +54,7 @@ const OPS: &[&str] = &[
     r#"{"op":"call_service","service":"/rosapi/get_param","args":{"name":"/n:p","default":"1"}}"#,
 ];
 
-/// What one of Foxglove's may say; bytes begin with an opcode.
+/// Valid messages of a Foxglove client. Binary ones begin with an opcode.
 const COMMANDS: &[&str] = &[
     r#"{"op":"subscribe","subscriptions":[{"id":1,"channelId":1},{"id":2,"channelId":2}]}"#,
     r#"{"op":"unsubscribe","subscriptionIds":[1]}"#,
@@ -71,7 +71,7 @@ const COMMANDS: &[&str] = &[
     "\u{2}\u{1}\0\0\0\u{9}\0\0\0\u{4}\0\0\0json{\"data\":true}",
 ];
 
-/// Changes bytes, cuts, repeats, or puts numbers and texts where they are not expected.
+/// Changes, cuts or repeats bytes, or puts numbers and texts where they are not expected.
 fn mutated(rng: &mut ChaCha8Rng, valid: &[u8]) -> Vec<u8> {
     const PIECES: [&[u8]; 9] =
         [b"-1", b"1e999", b"null", b"\"\"", b"[]", b"{}", b"18446744073709551616", b"\\u0000", b"\"/**\""];
@@ -92,7 +92,7 @@ fn mutated(rng: &mut ChaCha8Rng, valid: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// Lets clients say such things, and counts how often a task of the gateway's has panicked.
+/// Runs clients with mutated messages and returns the number of panics in the gateway's tasks.
 async fn converse<F>(
     words: &[&str],
     serve: impl Fn(WebSocketStream<DuplexStream>, Arc<Session>) -> F,
@@ -129,7 +129,7 @@ where
             }
         }
         talker.write(SampleKind::Write, 1, string("hello")).unwrap();
-        // Half of them just go.
+        // Half of the clients close in good order.
         if conversation % 2 == 0 {
             let _ = say.close().await;
         }
@@ -139,7 +139,7 @@ where
         let ended = tokio::time::timeout(PATIENCE, served).await;
         ended.unwrap_or_else(|_| panic!("conversation {conversation} does not end")).unwrap();
     }
-    // Everybody else is served as ever, and nothing of them is left.
+    // Other clients are served as before, and nothing is left behind.
     let session = site.session("friend");
     let wanted = sgc_gateway::Subscribe { topic: "/chatter".into(), depth: 1, ..Default::default() };
     let mut heard = session.subscribe(wanted).await.unwrap();

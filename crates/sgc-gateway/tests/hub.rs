@@ -1,4 +1,4 @@
-//! Clients of a hub on a network in memory, beside ordinary programs.
+//! Tests of a hub's clients on a network in memory, beside ordinary programs.
 #![allow(clippy::unwrap_used)]
 
 mod support;
@@ -17,7 +17,7 @@ fn hear(topic: &str) -> Subscribe {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_programs_publish_is_heard_in_each_form_and_read_once_for_all() {
+async fn messages_of_programs_arrive_in_each_form_and_are_read_once() {
     let site = Site::new().await;
     let talker = site.writer("/chatter", Qos::default());
     let (one, other) = (site.session("one"), site.session("other"));
@@ -37,7 +37,7 @@ async fn what_programs_publish_is_heard_in_each_form_and_read_once_for_all() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_subscribes_takes_each_publisher_as_it_is_whenever_it_comes() {
+async fn subscription_adapts_to_each_publisher() {
     let site = Site::new().await;
     let session = site.session("desk");
     let wanted = Subscribe { type_name: Some(STRING.into()), ..hear("/late") };
@@ -63,7 +63,7 @@ async fn latched_messages_are_for_who_comes_later_too() {
         let mut heard = site.session(name).subscribe(hear("/map")).await.unwrap();
         assert_eq!(heard.next().await.unwrap().message.payload, string("map"), "{name}");
     }
-    // One that weakens what is offered has the reader made anew: nothing comes twice.
+    // A publisher that weakens the combined offer makes the reader be recreated, and no message comes twice.
     let mut heard = site.session("fourth").subscribe(hear("/map")).await.unwrap();
     assert_eq!(heard.next().await.unwrap().message.payload, string("map"));
     let other = site.writer("/map", Qos { history: History::KeepLast(7), ..latched });
@@ -91,7 +91,7 @@ async fn clients_publish_for_programs_and_for_each_other() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_published_ahead_keeps_its_order_and_each_loss_is_told() {
+async fn queued_publications_keep_their_order_and_report_each_loss() {
     let site = Site::new().await;
     let (texts, _reader) = site.reader("/log");
     let session = site.session("logger");
@@ -112,12 +112,12 @@ async fn what_is_published_ahead_keeps_its_order_and_each_loss_is_told() {
         }
         assert!(!publication.has_ahead());
         assert_eq!((lost, publication.published()), (1, 199), "{may_wait}");
-        // Longer ones are behind those that they follow.
+        // A long message keeps its place behind earlier ones.
         let long = string(&"x".repeat(100 << 10));
         publication.publish_ahead(&text(200)).await.unwrap();
         publication.publish_ahead(&Content::cdr(long.clone())).await.unwrap();
         publication.publish_ahead(&text(201)).await.unwrap();
-        // Its end is one of those that have it leave.
+        // Dropping the publication sends its queued messages.
         drop(publication);
         let heard = || texts.recv_timeout(Duration::from_secs(5)).unwrap();
         for number in (0..200).filter(|number| *number != 7) {
@@ -169,7 +169,7 @@ async fn a_slow_client_loses_the_oldest_and_is_told_how_many() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_is_waited_for_shares_a_reader_with_nobody_which_keeps_all() {
+async fn waiting_subscriber_has_its_own_reader_that_keeps_all() {
     let site = Site::new().await;
     let _talker = site.writer("/odom", Qos { history: History::KeepLast(5), ..Qos::default() });
     site.knows("/odom").await;
@@ -201,7 +201,7 @@ async fn latched_messages_survive_a_clock_that_is_set_back() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_the_scope_does_not_have_is_refused_and_not_seen() {
+async fn interfaces_outside_the_scope_are_refused_and_invisible() {
     let site = Site::new().await;
     let _talkers = [site.writer("/odom", Qos::default()), site.writer("/secret", Qos::default())];
     site.knows("/secret").await;
@@ -259,7 +259,7 @@ async fn subscriptions_that_are_waited_for_are_few_and_what_ends_makes_room() {
     let told = GatewayError::TooMany { what: "subscriptions that are waited for", max: 2 };
     assert_eq!(refused, Some(told));
     let _other = session.subscribe(wanted(false)).await.unwrap();
-    // It is the same program's, whoever it says it is.
+    // The new client is the same program and shares its bounds.
     let again = session.again(Client::own("again")).unwrap();
     assert!(again.subscribe(wanted(true)).await.is_err());
     drop(first);

@@ -1,4 +1,4 @@
-//! What is generated from `gateway.proto` and committed is what its text says. Run with `SGC_GENERATE=1` it is made anew.
+//! The committed code and descriptors match `gateway.proto`. With `SGC_GENERATE=1` they are generated anew.
 
 #![allow(clippy::unwrap_used)]
 
@@ -6,7 +6,7 @@ use std::fs;
 use std::path::Path;
 
 const PROTO: &str = "sgc/gateway/v1/gateway.proto";
-/// What is made, and where it is committed: the Python client takes the description as it is.
+/// The generated files and their places. The Python client uses the descriptor as it is.
 const FILES: [(&str, &str); 3] = [
     ("sgc.gateway.v1.rs", "src/grpc/generated/sgc.gateway.v1.rs"),
     (DESCRIPTOR, "src/grpc/generated/descriptor.bin"),
@@ -15,7 +15,7 @@ const FILES: [(&str, &str); 3] = [
 const DESCRIPTOR: &str = "descriptor.bin";
 
 #[test]
-fn what_is_generated_is_what_the_proto_says() {
+fn generated_code_matches_the_proto() {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut compiler = protox::Compiler::new([here.join("proto")]).unwrap();
     compiler.include_source_info(true).include_imports(true).open_file(PROTO).unwrap();
@@ -26,7 +26,7 @@ fn what_is_generated_is_what_the_proto_says() {
         .emit_rerun_if_changed(false)
         .compile_fds(compiler.file_descriptor_set())
         .unwrap();
-    // Comments are of no use to who asks by reflection, and three quarters of it.
+    // Reflection has no use for comments, which are three quarters of the descriptor.
     compiler.include_source_info(false);
     fs::write(made.path().join(DESCRIPTOR), compiler.encode_file_descriptor_set()).unwrap();
 

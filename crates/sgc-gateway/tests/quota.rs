@@ -1,5 +1,5 @@
-//! The share of one credential with however many connections, that of all other hosts together, and the rest for programs of
-//! this host.
+//! The bounds of one credential over all its connections, of all other hosts together, and the reserve for programs
+//! on this host.
 #![allow(clippy::unwrap_used)]
 
 mod support;
@@ -14,7 +14,7 @@ use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value as Json, json};
 use sgc_gateway::rosbridge::{self, RosbridgeOptions};
 use sgc_gateway::{
-    Access, AccessRules, Admission, Advertise, Anonymous, Content, Form, GatewayError, Pool, Server,
+    Access, AccessRules, AdmissionRequest, Advertise, Anonymous, Content, Form, GatewayError, Pool, Server,
     ServerOptions, Session, SessionLimits, Subscribe,
 };
 use sgc_ros::{RosWriter as _, SampleKind};
@@ -35,15 +35,15 @@ const LIMITS: SessionLimits = SessionLimits {
     calls_max: 2,
     waits_max: 2,
 };
-/// Sessions' worth of one credential, of all other hosts, and in all.
+/// Bounds in sessions: of one credential, of all other hosts, in total.
 const SHARES: [usize; 3] = [4, 12, 16];
 
-/// A connection of its own, from there.
+/// Returns a session on its own connection from `peer`.
 fn session(site: &Site, peer: &str) -> Session {
     let access = Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
     let peer: SocketAddr = peer.parse().unwrap();
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_millis() as u64;
-    let admission = Admission {
+    let admission = AdmissionRequest {
         peer,
         encrypted: true,
         origin: None,
@@ -54,7 +54,7 @@ fn session(site: &Site, peer: &str) -> Session {
     Session::new(&site.hub, access.admit(&admission).unwrap(), LIMITS)
 }
 
-/// Makes readers of its own by asking for another quality of service each time, on a connection of its own each time.
+/// Creates readers with a different QoS each, on a new connection each time.
 async fn flood(site: &Site, peer: &str) -> (Vec<sgc_gateway::Subscription>, GatewayError) {
     let mut held = Vec::new();
     loop {
@@ -82,14 +82,14 @@ async fn many_connections_of_one_host_have_no_more_readers_than_a_few() {
     assert_eq!(held.len(), SHARES[0] * LIMITS.subscriptions_max);
     assert!(is_of(&why, Pool::Credential), "{why}");
     assert_eq!(site.hub.readers(), held.len());
-    // Readers that are left are there for a moment, and count for as long: coming and going makes no more of them.
+    // Lingering readers still count, so leaving and returning creates no more of them.
     drop(held);
     let (again, why) = flood(&site, "10.0.0.1:1").await;
     assert!(is_of(&why, Pool::Credential), "{why}");
     assert!(site.hub.readers() <= SHARES[0] * LIMITS.subscriptions_max, "{}", site.hub.readers());
     drop(again);
     eventually(|| site.hub.readers() == 0).await;
-    // Other hosts have their own, and all of them leave something for this one.
+    // Other hosts have their own bounds, and all of them leave a reserve for this one.
     let mut all = Vec::new();
     for n in 2..=9 {
         let (held, why) = flood(&site, &format!("10.0.0.{n}:1")).await;
@@ -138,7 +138,7 @@ async fn topics_services_and_calls_of_one_host_are_bounded_over_its_connections(
         host.call("/silent", of, &request, Form::Json, Duration::from_secs(1)).await.unwrap_err(),
     ];
     assert!(refused.iter().all(|why| is_of(why, Pool::Credential)), "{refused:?}");
-    // Another host is another matter, and what ends makes room.
+    // Another host has its own bounds, and an ended publication makes room.
     let other = session(&site, "[2001:db8:0:1::1]:1");
     other.advertise(wanted.clone()).await.unwrap();
     topics.pop();
@@ -157,7 +157,7 @@ async fn messages_that_are_kept_for_later_readers_are_bounded_in_bytes() {
         type_name: Some(STRING.into()),
         qos: latched(history),
     };
-    // One session, whatever depth it says.
+    // One session is bounded, whatever its depth.
     let one = session(&site, "10.0.0.1:1");
     let publication = one.advertise(wanted("/all", History::KeepAll)).await.unwrap();
     let offered = || {
@@ -176,7 +176,7 @@ async fn messages_that_are_kept_for_later_readers_are_bounded_in_bytes() {
     assert_eq!(published, LIMITS.waiting_bytes_max / MESSAGE_BYTES);
     assert!(matches!(refused, GatewayError::TooMany { .. }), "{refused}");
     drop(publication);
-    // A writer keeps its last messages only, and many connections have a bound, too.
+    // A writer keeps its last messages only, and many connections together are bounded, too.
     let mut held = Vec::new();
     let refused = loop {
         let host = session(&site, "10.0.0.2:1");
@@ -196,7 +196,7 @@ async fn messages_that_are_kept_for_later_readers_are_bounded_in_bytes() {
     };
     assert!(is_of(&refused, Pool::Credential), "{refused}");
     assert_eq!(held.len(), SHARES[0] + 1);
-    // A publisher that goes makes room, once its writer has ended.
+    // A publisher that leaves makes room once its writer has ended.
     held.remove(0);
     let (_, last) = held.last().unwrap();
     let until_room = async {
@@ -207,13 +207,13 @@ async fn messages_that_are_kept_for_later_readers_are_bounded_in_bytes() {
     tokio::time::timeout(Duration::from_secs(20), until_room).await.unwrap();
 }
 
-/// The error where a credential has no room for more arguments of calls.
+/// Returns the error of a credential without room for more arguments of calls.
 fn arguments_crowded() -> String {
     let max = SHARES[0] * LIMITS.waiting_bytes_max;
     format!("{max} bytes of arguments that wait at most for {}", Pool::Credential)
 }
 
-/// Arguments of which one session has room for one, but not for two.
+/// Returns arguments of which one session has room for one copy, but not for two.
 fn long_arguments() -> String {
     let pad = " ".repeat(LIMITS.waiting_bytes_max - (64 << 10));
     format!(r#"{{"data": true{pad}}}"#)
@@ -252,7 +252,7 @@ async fn arguments_of_calls_that_wait_are_bounded_over_connections() {
     };
     assert_eq!(pages.len(), SHARES[0] + 1);
     assert!(refused["values"].as_str().unwrap().ends_with(&arguments_crowded()), "{refused}");
-    // A session has its own bound, and whoever goes makes room.
+    // A session has its own bound, and a client that leaves makes room.
     let (page, _) = &mut pages[0];
     page.send(Message::text(call(200))).await.unwrap();
     let told = page.next().await.unwrap().unwrap().into_text().unwrap();
@@ -304,7 +304,7 @@ async fn requests_of_viewers_that_wait_are_bounded_over_connections() {
     assert_eq!(refused["message"], arguments_crowded());
 }
 
-/// A page of one host that can become one of another: its token says the address.
+/// Connects a page from one host that can change to another: its token is the address.
 async fn page_that_changes(site: &Site, peer: &str) -> WebSocketStream<tokio::io::DuplexStream> {
     let (here, there) = tokio::io::duplex(1 << 20);
     let hub = site.hub.clone();
@@ -312,7 +312,7 @@ async fn page_that_changes(site: &Site, peer: &str) -> WebSocketStream<tokio::io
         let access = Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
         let (peer, now) = (peer.parse().unwrap(), UnixMillis(1_795_000_000_000));
         let admission =
-            Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now };
+            AdmissionRequest { peer, encrypted: true, origin: None, token: None, certificate: None, now };
         access.admit(&admission).unwrap()
     };
     let session = Session::new(&hub, admit(peer), LIMITS);
@@ -325,14 +325,14 @@ async fn page_that_changes(site: &Site, peer: &str) -> WebSocketStream<tokio::io
     page
 }
 
-/// Shows a token within the session, and has what is told.
+/// Shows a token within the session, and returns the answer.
 async fn auth(page: &mut WebSocketStream<tokio::io::DuplexStream>, token: &str) -> String {
     page.send(Message::text(format!(r#"{{"op": "auth", "token": "{token}"}}"#))).await.unwrap();
     page.next().await.unwrap().unwrap().into_text().unwrap().to_string()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_session_has_counts_for_the_credential_that_it_shows_last() {
+async fn session_counts_for_its_latest_credential() {
     let site = Site::new().await;
     let subscribe = |n: usize| format!(r#"{{"op": "subscribe", "topic": "/p{n}", "type": "{STRING}"}}"#);
     let share = SHARES[0] * LIMITS.subscriptions_max;
@@ -343,21 +343,21 @@ async fn what_a_session_has_counts_for_the_credential_that_it_shows_last() {
     eventually(|| site.hub.readers() == LIMITS.subscriptions_max).await;
     let told = auth(&mut first, "10.0.0.2:1").await;
     assert!(told.contains("you are"), "{told}");
-    // The first host has everything again, and the second one has what the session has.
+    // The first host has its whole bound again, and the session counts for the second one.
     let (own, why) = flood(&site, "10.0.0.1:1").await;
     assert_eq!(own.len(), share);
     assert!(is_of(&why, Pool::Credential), "{why}");
     let (others, why) = flood(&site, "10.0.0.2:1").await;
     assert_eq!(others.len(), share - LIMITS.subscriptions_max);
     assert!(is_of(&why, Pool::Credential), "{why}");
-    // Whose credential has no room does not become another.
+    // A session cannot change to a credential without room.
     let told = auth(&mut first, "10.0.0.1:1").await;
     let max = format!("{share} subscriptions at most for {}", Pool::Credential);
     assert!(told.contains(&max), "{told}");
     let end = first.next().await.unwrap().unwrap();
     assert!(matches!(&end, Message::Close(Some(why)) if u16::from(why.code) == 1013), "{end:?}");
     drop((own, first));
-    // The session's own are gone with it.
+    // The session's readers ended with it.
     let until_room = async {
         while flood(&site, "10.0.0.2:1").await.0.len() < LIMITS.subscriptions_max {
             tokio::time::sleep(Duration::from_millis(20)).await;
@@ -394,7 +394,7 @@ async fn a_client_without_room_for_history_does_not_cut_that_of_others() {
     };
     let server = Server::start(site.hub.clone(), options).await.unwrap();
     let wanted = |n: usize| Subscribe { topic: format!("/kept{n}"), depth: 10, ..Subscribe::default() };
-    // Its room is taken by the history of the first topic.
+    // The history of the first topic takes all of the client's room.
     let poor = session(&site, "10.0.0.1:1");
     let mut held = Vec::new();
     for n in 0..writers.len() {
@@ -413,7 +413,7 @@ async fn a_client_without_room_for_history_does_not_cut_that_of_others() {
         assert_eq!(delivery.message.source_timestamp_ns, number as i64);
     }
     assert_eq!(site.hub.readers(), 3);
-    // The next one shares the reader that has it all.
+    // The next client shares the reader with the complete history.
     let mut next = session(&site, "10.0.0.3:1").subscribe(wanted(1)).await.unwrap();
     tokio::time::timeout(Duration::from_secs(20), next.next()).await.unwrap().unwrap();
     assert_eq!(site.hub.readers(), 3);

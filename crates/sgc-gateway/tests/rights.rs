@@ -1,5 +1,5 @@
-//! Sessions end the moment their right does, whatever protocol they speak and whatever ends the right: through a server's own
-//! sockets, with the libraries that programs use.
+//! Sessions end at the moment their rights end, for every protocol and every cause: through a server's own sockets,
+//! with the libraries that programs use.
 #![allow(clippy::unwrap_used)]
 
 mod support;
@@ -36,7 +36,7 @@ use tonic::{Code, Request, Status, Streaming};
 use support::{STRING, Site, eventually, spec, string};
 
 const PATIENCE: Duration = Duration::from_secs(20);
-/// Far less than any interval at which something could be polled that was not told, and enough for a loaded machine.
+/// Longest delay of an end, far below any polling interval and enough for a loaded machine.
 const AT_ONCE: Duration = Duration::from_secs(3);
 const HOUR_MS: u64 = 3_600_000;
 
@@ -48,7 +48,7 @@ async fn within<T>(work: impl Future<Output = T>) -> T {
     tokio::time::timeout(PATIENCE, work).await.expect("it should have come by now")
 }
 
-/// Interfaces of a company, which do not ship.
+/// Interfaces of a company, which do not ship with SGC.
 struct Acme;
 
 impl FindDefinitions for Acme {
@@ -67,7 +67,7 @@ impl FindDefinitions for Acme {
     }
 }
 
-/// A gateway that admits nobody without a token or a certificate.
+/// A gateway that admits only clients with a token or a certificate.
 struct Place {
     site: Site,
     server: Server,
@@ -110,7 +110,7 @@ impl Place {
         self.server.local()[at].addr
     }
 
-    /// A token for `/odom` that ends then.
+    /// Returns a token for `/odom` with this time of expiry.
     fn token(&self, number: u8, expires: UnixMillis) -> String {
         let grant = AccessGrant {
             id: TokenId([number; 16]),
@@ -127,7 +127,7 @@ impl Place {
         grant.sign(&self.robot).unwrap().to_text().to_string()
     }
 
-    /// Takes these tokens back, as a reload after `sgc token revoke` does.
+    /// Revokes these tokens, like a reload after `sgc token revoke`.
     fn revoke(&self, numbers: &[u8]) {
         let key = self.robot.certified_key();
         self.server.reconfigure(rules(&self.robot, &self.desk, numbers), Some(&key)).unwrap();
@@ -142,7 +142,7 @@ impl Place {
         within(client_async(request, stream)).await.unwrap().0
     }
 
-    /// A client of rosbridge that has shown its token within the session.
+    /// Returns a rosbridge client that has shown its token within the session.
     async fn rosbridge(&self, token: &str, first: &str) -> WebSocketStream<TcpStream> {
         let mut socket = self.web_socket(&format!("/?token={first}"), None).await;
         say(&mut socket, &json!({"op": "set_level", "level": "info"})).await;
@@ -159,7 +159,7 @@ impl Place {
         socket
     }
 
-    /// Two long streams of one client of gRPC.
+    /// Returns two long streams of one gRPC client.
     async fn grpc(
         &self,
         token: &str,
@@ -220,7 +220,7 @@ where
     }
 }
 
-/// Waits for the end, and has the code and the reason.
+/// Waits for the close frame and returns its code and reason.
 async fn close<S>(mut socket: WebSocketStream<S>) -> (u16, String)
 where
     S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
@@ -249,13 +249,13 @@ async fn a_token_that_is_revoked_ends_sessions_of_all_protocols_at_once() {
     let place = Place::new().await;
     let ends = UnixMillis(now().0 + HOUR_MS);
     let [first, second, other] = [1, 2, 3].map(|number| place.token(number, ends));
-    // One that came with another token than that which it shows within.
+    // The rosbridge client connected with another token than it shows now.
     let rosbridge = place.rosbridge(&second, &first).await;
     let foxglove = place.foxglove(&second).await;
     let (heard, watched) = place.grpc(&second).await;
     let mut stays = place.rosbridge(&other, &second).await;
     eventually(|| place.server.status().clients.len() == 4).await;
-    // Also a client that never reads, whose way is full.
+    // Another client never reads, and its connection is full.
     let (unread, _watched) = place.grpc(&second).await;
     let mut number = 0;
     let mut talk = |text: &str| {
@@ -274,12 +274,12 @@ async fn a_token_that_is_revoked_ends_sessions_of_all_protocols_at_once() {
         assert_eq!((ended.code(), ended.message()), (Code::Unauthenticated, told));
     }
     assert!(began.elapsed() < AT_ONCE, "{:?}", began.elapsed());
-    // Their subscriptions are gone, and so are they, whether they read that or not.
+    // Subscriptions and clients are gone, whether the clients read the reason or not.
     let names = || place.server.status().clients.into_iter().map(|client| client.name).collect::<Vec<_>>();
     eventually(|| names() == ["token 3"]).await;
     eventually(|| place.site.hub.readers() == 1).await;
     drop(unread);
-    // A client that has become another by another token stays, though the one that it came with was revoked.
+    // A client that changed to another token stays, although its first one was revoked.
     talk("still here");
     while hear(&mut stays).await["msg"]["data"] != "still here" {}
     assert_eq!(place.server.status().refused["no longer admitted"], 4);
@@ -310,7 +310,7 @@ async fn a_token_that_expires_ends_sessions_of_all_protocols_in_that_moment() {
     eventually(|| place.server.status().clients.is_empty()).await;
 }
 
-/// A client's TLS, which shows a certificate, if it has one.
+/// Returns a client's TLS connector, which shows a certificate if it has one.
 fn connector(own: Option<&Identity>) -> TlsConnector {
     let provider = Arc::new(rustls::crypto::aws_lc_rs::default_provider());
     let builder = ClientConfig::builder_with_provider(provider)
@@ -328,7 +328,7 @@ fn connector(own: Option<&Identity>) -> TlsConnector {
     TlsConnector::from(Arc::new(config))
 }
 
-/// Believes any server: whom it shows is looked at by the tests.
+/// A verifier that accepts any server, because the tests check the certificate themselves.
 #[derive(Debug)]
 struct Anyone;
 
@@ -412,7 +412,7 @@ async fn a_renewed_certificate_is_shown_to_new_connections_and_tokens_go_on() {
     assert!(place.server.show(&another.certified_key()).is_ok());
     let after = place.wss(&connector, Some(&token)).await;
     assert_eq!(shown(&after), another.chain());
-    // A client from before stays.
+    // An existing client stays.
     say(&mut before, &json!({"op": "call_service", "id": "1", "service": "/rosapi/topics"})).await;
     assert_eq!(hear(&mut before).await["id"], "1");
 }
@@ -434,7 +434,7 @@ async fn types_of_what_a_client_does_not_see_are_not_told() {
         Ok(request)
     };
     let mut client = GatewayClient::with_interceptor(within(endpoint.connect()).await.unwrap(), bearer);
-    // It may make a topic of that type itself, and does not learn by that what the type is.
+    // The client may create a topic of that type, but does not learn the definition of the type.
     let mine = json!({"op": "advertise", "topic": "/mine", "type": "acme/msg/Secret"});
     say(&mut page, &mine).await;
     eventually(|| place.site.hub.graph().topics.contains_key("/mine")).await;
@@ -473,7 +473,7 @@ async fn a_client_learns_neither_names_nor_types_out_of_its_scope_by_asking_for_
     let _action = program.serve_action("/secret", Some("example_interfaces/action/Fibonacci")).await.unwrap();
     let token = place.token(1, UnixMillis(now().0 + HOUR_MS));
     let mut page = place.web_socket(&format!("/?token={token}"), None).await;
-    // A list of arguments needs the type for the names of its members.
+    // Arguments as a list need the type for the names of its members.
     for service in ["/hidden", "/none"] {
         for of in [json!(null), json!("acme/srv/Work"), json!("acme/srv/None"), json!("std_srvs/srv/SetBool")]
         {

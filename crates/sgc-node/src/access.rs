@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use sgc_gateway::{
-    ACCESS_VALID_MS_MAX, Access, AccessGrant, AccessRules, ClientRule, HearRefusals, Right, Scope, TokenId,
+    ACCESS_VALID_MS_MAX, Access, AccessGrant, AccessRules, ClientRule, RefusalListener, Right, Scope, TokenId,
 };
 use sgc_trust::{AnchorError, Identity};
 use sgc_wire::{Now, UnixMillis};
@@ -80,7 +80,7 @@ pub fn access_with(
 }
 
 /// Writes down each access token that is refused.
-pub(crate) fn refused_tokens(audit: Audit) -> HearRefusals {
+pub(crate) fn refused_tokens(audit: Audit) -> RefusalListener {
     Arc::new(move |peer, denied| {
         let record = AuditRecord::new(AuditEvent::TokenRefused);
         audit.write(record.remote(peer).reason(denied));
@@ -290,7 +290,7 @@ pub enum AccessError {
 mod tests {
     use rand_chacha::ChaCha20Rng;
     use rand_chacha::rand_core::SeedableRng as _;
-    use sgc_gateway::{Admission, Denied};
+    use sgc_gateway::{AdmissionRequest, Denial};
     use sgc_trust::{EnrollRequest, Fleet};
 
     use super::*;
@@ -329,16 +329,16 @@ mod tests {
         }
 
         /// What the desk may do, from another host, by its certificate.
-        fn desk_may(&self, gateway: &str) -> Result<String, Denied> {
+        fn desk_may(&self, gateway: &str) -> Result<String, Denial> {
             let access = self.access(gateway).unwrap().unwrap();
-            let admission = Admission { certificate: Some(self.desk.as_peer()), ..elsewhere() };
+            let admission = AdmissionRequest { certificate: Some(self.desk.as_peer()), ..elsewhere() };
             access.admit(&admission).map(|client| format!("{}: {}", client.name, client.scope))
         }
     }
 
-    fn elsewhere() -> Admission<'static> {
+    fn elsewhere() -> AdmissionRequest<'static> {
         let peer = "10.0.0.9:1".parse().unwrap();
-        Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now: NOW }
+        AdmissionRequest { peer, encrypted: true, origin: None, token: None, certificate: None, now: NOW }
     }
 
     #[test]
@@ -350,7 +350,7 @@ mod tests {
             assert!(cast.desk_may(&client(who)).unwrap().ends_with(": subscribe /odom"), "{who}");
         }
         for who in ["desk-2", "group:arms"] {
-            assert_eq!(cast.desk_may(&client(who)), Err(Denied::NotListed { node: cast.desk.node_id() }));
+            assert_eq!(cast.desk_may(&client(who)), Err(Denial::NotListed { node: cast.desk.node_id() }));
         }
         assert!(cast.access("").unwrap().is_none());
     }
@@ -370,14 +370,14 @@ mod tests {
         let admit = || {
             let access = cast.access("[gateway]").unwrap().unwrap();
             access
-                .admit(&Admission { token: Some(&text), ..elsewhere() })
+                .admit(&AdmissionRequest { token: Some(&text), ..elsewhere() })
                 .map(|client| client.name.to_string())
         };
         AccessRecords::change(cast.dir.path(), |records| records.add((&grant).into(), NOW)).unwrap();
         assert_eq!(AccessRecords::load(cast.dir.path()).unwrap().tokens[0].scope(), grant.scope);
         assert_eq!(admit().as_deref(), Ok("dashboard"));
         AccessRecords::change(cast.dir.path(), |records| records.revoke("0707", NOW)).unwrap();
-        assert_eq!(admit(), Err(Denied::TokenRevoked { id: grant.id }));
+        assert_eq!(admit(), Err(Denial::TokenRevoked { id: grant.id }));
         std::fs::write(cast.dir.path().join(RECORDS_FILE), "?").unwrap();
         assert!(cast.access("[gateway]").is_err(), "what was revoked is not known, so nobody is admitted");
     }
@@ -388,9 +388,9 @@ mod tests {
         let log = cast.dir.path().join("audit.jsonl");
         let (audit, writer) =
             Audit::open(&log, crate::config::AuditConfig::default().room, Default::default()).unwrap();
-        let access = cast.access("[gateway]").unwrap().unwrap().heard_by(refused_tokens(audit));
+        let access = cast.access("[gateway]").unwrap().unwrap().with_refusal_listener(refused_tokens(audit));
         let text = "sgc-access-1:AAAA";
-        assert!(access.admit(&Admission { token: Some(text), ..elsewhere() }).is_err());
+        assert!(access.admit(&AdmissionRequest { token: Some(text), ..elsewhere() }).is_err());
         drop(access);
         writer.finish();
         let mut records = Vec::new();

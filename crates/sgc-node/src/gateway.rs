@@ -272,7 +272,7 @@ pub(crate) fn listen_at(config: &GatewayConfig) -> Vec<ListenAt> {
 mod tests {
     use rand_chacha::ChaCha20Rng;
     use rand_chacha::rand_core::SeedableRng as _;
-    use sgc_gateway::Shipped;
+    use sgc_gateway::ShippedDefinitions;
     use sgc_testkit::FakeDomain;
     use sgc_trust::{EnrollRequest, Fleet};
     use sgc_wire::UnixMillis;
@@ -289,7 +289,7 @@ mod tests {
         let (first, renewed, file) = (enroll("one"), enroll("two"), enroll("file"));
         let domain = FakeDomain::default();
         let open: OpenLocalRos = Arc::new(move || Ok(Arc::new(domain.join(false)) as Arc<dyn LocalRos>));
-        let gateway = Gateway::new(Some(open), "arm-1", Shipped);
+        let gateway = Gateway::new(Some(open), "arm-1", ShippedDefinitions);
         let at =
             ListenAt { protocol: Protocol::WebSocket, is_encrypted: true, addr: ([127, 0, 0, 1], 0).into() };
         let sockets = Sockets {

@@ -438,7 +438,7 @@ async fn run_with<N: RosNetwork>(
         gateway
             .listen(Sockets {
                 listen: listen_at(wanted),
-                access: access.unwrap_or_default().heard_by(refused_tokens(audit.clone())),
+                access: access.unwrap_or_default().with_refusal_listener(refused_tokens(audit.clone())),
                 key: match key_of_files(wanted)? {
                     Some(key) => ShownKey::Files(key),
                     None => ShownKey::Own(identity.clone()),

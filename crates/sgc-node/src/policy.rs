@@ -65,7 +65,7 @@ pub fn share_rules(share: &ShareConfig, identity: &Identity, partners: &Partners
             type_name: part.type_name(share.type_name.as_deref()).unwrap_or_default(),
             ..whole.clone()
         },
-        naming: share.naming.of_part(part),
+        naming: share.naming.for_part(part),
         policy: match part.kind {
             // Who calls publishes; nobody hears what others ask.
             Kind::Service => Policy { subscribe: Grantees::default(), publish: policy.subscribe.clone() },

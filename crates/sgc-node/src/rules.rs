@@ -165,7 +165,7 @@ fn use_rules(rule: &UseConfig, identity: &Identity) -> Vec<UseRule> {
         owner_name: rule.from.to_string(),
         kind: part.kind,
         topic: part.name(&rule.topic),
-        naming: rule.naming.of_part(part),
+        naming: rule.naming.for_part(part),
         frame_prefix: rule.frame_prefix.clone(),
         type_name: part.type_name(rule.type_name.as_deref()),
         token: None,

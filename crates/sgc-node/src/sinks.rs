@@ -14,7 +14,8 @@ use std::time::{Duration, Instant};
 use arc_swap::{ArcSwap, ArcSwapOption};
 use sgc_endpoint::{AskAgain, Decompressor, Delivery, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
 use sgc_ros::{
-    EndpointSpec, Guid, RosError, RosWriter, SampleHead, SampleKind, Shaping, of_all_instances, prefix_frames,
+    EndpointSpec, Guid, RosError, RosWriter, SampleHead, SampleKind, Shaping, for_all_instances,
+    prefix_frames,
 };
 use sgc_router::LinkId;
 use sgc_wire::{
@@ -624,7 +625,7 @@ struct Recent {
 impl Recent {
     fn new(spec: &EndpointSpec) -> Option<Mutex<Self>> {
         let history = spec.qos.history;
-        let depth = match if spec.keyless { history } else { of_all_instances(history) } {
+        let depth = match if spec.keyless { history } else { for_all_instances(history) } {
             _ if !spec.qos.is_transient_local() => return None,
             History::KeepAll => RECENT_MAX,
             History::KeepLast(n) => (n as usize).min(RECENT_MAX),

@@ -1,34 +1,34 @@
-//! Frames of `tf2_msgs/msg/TFMessage` with a prefix: what tells two robots' `base_link` apart on one network.
+//! Prefixes for frames of `tf2_msgs/msg/TFMessage`, which distinguish the `base_link` of two robots on one network.
 //!
-//! The only CDR that is looked into here. Plain CDR (XCDR1, RTPS 2.5, 10.2) in both byte orders, which is what ROS 2's
-//! middlewares write for this type; of other messages, which carry frames as well, nothing is known here.
+//! This is the only CDR that SGC's routes look into: plain CDR (XCDR1, RTPS 2.5, 10.2) in both byte orders, which ROS
+//! 2's middlewares write for this type. Other messages, which carry frames as well, are not rewritten.
 
-/// The type that is rewritten, as DDS spells it.
+/// The DDS name of the type that is rewritten.
 pub const TF_MESSAGE: &str = "tf2_msgs::msg::dds_::TFMessage_";
-/// The longest message that comes of it, bytes.
+/// Longest rewritten message, in bytes.
 const REWRITTEN_BYTES_MAX: usize = sgc_wire::MESSAGE_BYTES_MAX as usize;
-/// A transform of two empty names: time, two strings, translation and rotation.
+/// Length of a transform with two empty names: time, two strings, translation and rotation.
 const TRANSFORM_BYTES_MIN: usize = 8 + 5 + 5 + POSE_BYTES;
-/// Translation (3) and rotation (4).
+/// Length of translation (3) and rotation (4).
 const POSE_BYTES: usize = 7 * 8;
 const HEADER_BYTES: usize = 4;
 
-/// Why a message is not written.
+/// The reason why a message cannot be rewritten.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum FrameError {
-    /// Another encapsulation than plain CDR.
+    /// The encapsulation is not plain CDR.
     #[error("a tf message in encapsulation {0:#06x}, which is not plain CDR")]
     Encapsulation(u16),
-    /// It ends too soon, or goes on too long, or a string has no end.
+    /// The message is truncated, has surplus bytes, or contains an unterminated string.
     #[error("a malformed tf message")]
     Malformed,
-    /// With the prefixes it would be longer than any message.
+    /// The message would become too long.
     #[error("a tf message that would become too long")]
     TooLong,
 }
 
-/// The message with `prefix` in front of the name of each frame. A slash that a name begins with (as before tf2) gives way
-/// to it, and an empty name stays empty.
+/// Returns the message with `prefix` before the name of each frame. The prefix replaces a leading slash (as before
+/// tf2), and an empty name stays empty.
 pub fn prefix_frames(payload: &[u8], prefix: &str) -> Result<Vec<u8>, FrameError> {
     let (header, body) = payload.split_first_chunk::<HEADER_BYTES>().ok_or(FrameError::Malformed)?;
     let little = match u16::from_be_bytes([header[0], header[1]]) {
@@ -36,7 +36,7 @@ pub fn prefix_frames(payload: &[u8], prefix: &str) -> Result<Vec<u8>, FrameError
         1 => true,
         other => return Err(FrameError::Encapsulation(other)),
     };
-    // The last two bits of the options say how much of the end is padding.
+    // The last two bits of the options give the length of the padding at the end.
     let padding = usize::from(header[3] & 3);
     let body = body.get(..body.len().saturating_sub(padding)).ok_or(FrameError::Malformed)?;
     let mut read = Reader { body, at: 0, little };
@@ -64,11 +64,11 @@ pub fn prefix_frames(payload: &[u8], prefix: &str) -> Result<Vec<u8>, FrameError
             return Err(FrameError::TooLong);
         }
     }
-    // Writers may pad without saying so.
+    // Writers may pad without saying so in the options.
     if read.body.len() - read.at >= HEADER_BYTES {
         return Err(FrameError::Malformed);
     }
-    // A pose ends at a multiple of four, so that nothing has to be padded.
+    // A pose ends at a multiple of four, so no padding is needed.
     Ok(write.out)
 }
 
@@ -96,7 +96,7 @@ impl<'b> Reader<'b> {
         Ok(if self.little { u32::from_le_bytes(bytes) } else { u32::from_be_bytes(bytes) })
     }
 
-    /// A string without its end. One of no bytes at all, which some write for an empty one, is empty.
+    /// Reads a string without its terminator. A string of no bytes at all, which some writers produce, is empty.
     fn string(&mut self) -> Result<&'b [u8], FrameError> {
         match self.u32()? as usize {
             0 => Ok(&[]),
@@ -135,7 +135,7 @@ impl Writer {
 mod tests {
     use super::*;
 
-    /// A message with these frames, written by hand as XCDR1 has it.
+    /// Returns a message with these frames, written by hand in XCDR1.
     fn message(little: bool, frames: &[(&str, &str)]) -> Vec<u8> {
         let mut write = Writer { out: vec![0, u8::from(little), 0, 0], little };
         write.u32(frames.len() as u32);
@@ -165,7 +165,7 @@ mod tests {
                 assert_eq!(rewritten, Ok(message(little, &after[..n])), "{little} {n}");
             }
         }
-        // The bytes by themselves: one transform, little endian.
+        // The exact bytes of one transform, little endian.
         let bytes = prefix_frames(&message(true, &[("a", "b")]), "r/").unwrap();
         assert_eq!(bytes[..8], [0, 1, 0, 0, 1, 0, 0, 0]);
         assert_eq!(bytes[16..32], [4, 0, 0, 0, b'r', b'/', b'a', 0, 4, 0, 0, 0, b'r', b'/', b'b', 0]);
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_malformed_is_refused_wherever_it_ends() {
+    fn malformed_messages_are_refused_wherever_they_end() {
         let whole = message(true, &[("map", "odom"), ("odom", "base_link")]);
         for end in 0..whole.len() {
             assert_eq!(prefix_frames(&whole[..end], "r/"), Err(FrameError::Malformed), "{end}");
@@ -207,7 +207,7 @@ mod tests {
         for (at, value) in [(4, 3), (7, 0xff), (16, 0xff), (19, 0x7f), (16, 5), (20, 0)] {
             assert_eq!(changed(at, value), Err(FrameError::Malformed), "{at} {value}");
         }
-        // No byte of it makes it panic or claim memory.
+        // No changed byte makes it panic or allocate much.
         for at in 0..whole.len() {
             for value in [0, 1, 2, 0x7f, 0x80, 0xff] {
                 let _ = changed(at, value);
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn what_would_be_too_long_is_refused() {
+    fn messages_that_become_too_long_are_refused() {
         let frames = vec![("a", "b"); 600_000];
         let prefix = "p".repeat(64);
         assert_eq!(prefix_frames(&message(true, &frames), &prefix), Err(FrameError::TooLong));

@@ -1,8 +1,8 @@
-//! The ROS graph: which nodes there are, and which endpoints are whose.
+//! The ROS graph: nodes and their endpoints.
 //!
-//! Every ROS 2 participant says so on the topic `ros_discovery_info`
-//! (`rmw_dds_common/msg/ParticipantEntitiesInfo`). This is the codec of that message, and [`GraphView`], which keeps what
-//! the participants of a network said. Who reads and writes the topic is the network's business.
+//! Every ROS 2 participant announces its nodes on the topic `ros_discovery_info`
+//! (`rmw_dds_common/msg/ParticipantEntitiesInfo`). This module has the codec of that message, and [`GraphView`],
+//! which tracks the nodes of all participants. The network reads and writes the topic.
 
 use std::collections::BTreeMap;
 
@@ -11,32 +11,32 @@ use sgc_wire::{Durability, History, Qos, RosNode};
 
 use crate::network::{DiscoveryEvent, EndpointSpec, GraphNode, Guid};
 
-/// DDS topic on which participants tell of their nodes.
+/// The DDS topic on which participants announce their nodes.
 pub const GRAPH_TOPIC: &str = "ros_discovery_info";
-/// Its DDS type.
+/// The DDS type of the topic.
 const GRAPH_TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
-/// Bytes of one message that is looked at.
+/// Longest message that is decoded, in bytes.
 pub const GRAPH_MESSAGE_BYTES_MAX: usize = 4 << 20;
-/// Nodes of one participant.
+/// Most nodes of one participant.
 pub const NODES_PER_PARTICIPANT_MAX: usize = 4096;
-/// Participants remembered.
+/// Most participants that are tracked.
 pub const PARTICIPANTS_MAX: usize = 4096;
-/// Endpoints of one participant that belong to a node.
+/// Most endpoints of one participant that belong to a node.
 const GIDS_PER_PARTICIPANT_MAX: usize = 65_536;
 
-/// How long the ids of endpoints are in the messages of a ROS 2 distribution (`rmw_dds_common/msg/Gid`). Nothing in the
-/// message says so.
+/// The length of endpoint ids in the messages of a ROS 2 distribution (`rmw_dds_common/msg/Gid`). The message does
+/// not contain it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub enum GidBytes {
-    /// In newer distributions, Jazzy among them: the GUID.
+    /// Newer distributions, such as Jazzy: the GUID.
     #[default]
     Sixteen,
-    /// In older ones, Humble among them: the GUID and eight zeros.
+    /// Older distributions, such as Humble: the GUID and eight zeros.
     TwentyFour,
 }
 
 impl GidBytes {
-    /// The number.
+    /// Returns the number of bytes.
     pub fn count(self) -> usize {
         match self {
             Self::Sixteen => 16,
@@ -45,25 +45,25 @@ impl GidBytes {
     }
 }
 
-/// Why a message about the graph says nothing.
+/// The reason why a message about the graph is rejected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum GraphError {
-    /// It is no serialised message of that type, with ids of either length.
+    /// The message is not of that type, with ids of either length.
     #[error("no message of nodes and endpoints")]
     Malformed,
-    /// It is one with ids of both lengths.
+    /// The message can be decoded with ids of both lengths.
     #[error("a message that can be read with ids of 16 and of 24 bytes")]
     Ambiguous,
-    /// It is about another participant than the one that wrote it.
+    /// The message describes another participant than its writer's.
     #[error("a message about another participant than its writer's")]
     Foreign,
-    /// More participants than are remembered.
+    /// There are too many participants.
     #[error("more than {PARTICIPANTS_MAX} participants")]
     TooMany,
 }
 
 impl GraphError {
-    /// A short, stable name for counters.
+    /// Returns a short, stable name for counters.
     pub fn key(&self) -> &'static str {
         match self {
             Self::Malformed => "graph_malformed",
@@ -74,18 +74,19 @@ impl GraphError {
     }
 }
 
-/// What a participant says of itself. The enclave is not in it.
+/// A participant's announcement of its nodes, without the enclave.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ParticipantNodes {
     /// The participant.
     pub participant: Guid,
-    /// How long ids are there.
+    /// The length of ids in the message.
     pub gid_bytes: GidBytes,
-    /// Its nodes; those whose names are none are left out.
+    /// The nodes; those with invalid names are left out.
     pub nodes: Vec<GraphNode>,
 }
 
-/// The writer of this topic as rmw has it (`rmw_cyclonedds_cpp`, `rmw_fastrtps_shared_cpp`: `init_context`).
+/// Returns the spec of the topic's writer as in rmw (`rmw_cyclonedds_cpp`, `rmw_fastrtps_shared_cpp`:
+/// `init_context`).
 pub fn graph_writer() -> EndpointSpec {
     EndpointSpec {
         topic: GRAPH_TOPIC.into(),
@@ -97,14 +98,14 @@ pub fn graph_writer() -> EndpointSpec {
     }
 }
 
-/// The reader of this topic as rmw has it.
+/// Returns the spec of the topic's reader as in rmw.
 pub fn graph_reader() -> EndpointSpec {
     let spec = graph_writer();
     EndpointSpec { qos: Qos { history: History::KeepAll, ..spec.qos }, ..spec }
 }
 
-/// The message that a participant has these nodes, as CDR with its encapsulation header. What is beyond the bounds that
-/// readers here have is left out.
+/// Encodes the announcement of a participant's nodes as CDR with its encapsulation header. Nodes and endpoints beyond
+/// the bounds of the decoder are left out.
 pub fn encode_nodes(participant: &Guid, nodes: &[GraphNode], gid_bytes: GidBytes) -> Bytes {
     let mut w = CdrWriter { out: vec![0, 1, 0, 0] };
     w.gid(participant, gid_bytes);
@@ -124,7 +125,7 @@ pub fn encode_nodes(participant: &Guid, nodes: &[GraphNode], gid_bytes: GidBytes
     w.out.into()
 }
 
-/// Reads such a message. It is tried with both lengths of ids, of which exactly one has to use it up.
+/// Decodes an announcement. Both lengths of ids are tried, and exactly one of them must fit.
 pub fn decode_nodes(payload: &[u8]) -> Result<ParticipantNodes, GraphError> {
     let found = [GidBytes::Sixteen, GidBytes::TwentyFour].map(|gid_bytes| decode_with(payload, gid_bytes));
     match found {
@@ -136,7 +137,8 @@ pub fn decode_nodes(payload: &[u8]) -> Result<ParticipantNodes, GraphError> {
 
 fn decode_with(payload: &[u8], gid_bytes: GidBytes) -> Option<ParticipantNodes> {
     let (header, body) = payload.split_at_checked(4).filter(|_| payload.len() <= GRAPH_MESSAGE_BYTES_MAX)?;
-    // CDR and plain CDR2 differ in the alignment of 8-byte values alone (DDS-XTypes 1.3, 7.4.3.4), of which there are none.
+    // CDR and plain CDR2 differ only in the alignment of 8-byte values (DDS-XTypes 1.3, 7.4.3.4), which do not occur
+    // here.
     let big_endian = match header[..2] {
         [0, 0 | 6] => true,
         [0, 1 | 7] => false,
@@ -154,7 +156,7 @@ fn decode_with(payload: &[u8], gid_bytes: GidBytes) -> Option<ParticipantNodes> 
             (0..count).map(|_| r.gid(gid_bytes)).collect::<Option<Vec<_>>>()
         };
         let (mut readers, mut writers) = (gids()?, gids()?);
-        // A participant speaks for what is its own.
+        // A participant may announce only its own endpoints.
         let is_own = |gid: &Guid| gid.prefix() == participant.prefix();
         readers.retain(is_own);
         writers.retain(is_own);
@@ -174,9 +176,9 @@ impl CdrWriter {
         self.out.resize(self.out.len() + gid_bytes.count() - gid.0.len(), 0);
     }
 
-    /// What is counted here has bounds far below 4 GiB.
+    /// Counts here are bounded far below 4 GiB.
     fn u32(&mut self, n: usize) {
-        // The header has four bytes, so that alignment may be counted with it.
+        // The header has four bytes, so counting it does not change the alignment.
         self.out.resize(self.out.len().next_multiple_of(4), 0);
         self.out.extend((n as u32).to_le_bytes());
     }
@@ -223,15 +225,15 @@ impl<'a> CdrReader<'a> {
         std::str::from_utf8(text.strip_suffix(&[0])?).ok()
     }
 
-    /// True if nothing is left but padding.
+    /// Returns `true` if only padding is left.
     fn is_at_end(&self) -> bool {
         self.body.len() - self.at < 4
     }
 }
 
-/// What a network's participants say of their nodes.
+/// The nodes of a network's participants.
 ///
-/// A participant's nodes are told once the participant is there, and gone with it.
+/// A participant's nodes are reported while the participant exists.
 #[derive(Debug, Default)]
 pub struct GraphView {
     participants: BTreeMap<[u8; 12], Participant>,
@@ -246,7 +248,7 @@ struct Participant {
 }
 
 impl GraphView {
-    /// A participant is there, of this enclave.
+    /// Handles a new participant of an enclave.
     pub fn participant_there(&mut self, guid: Guid, enclave: Option<&str>) -> Option<DiscoveryEvent> {
         let participant = self.participant(&guid)?;
         participant.guid = Some(guid);
@@ -254,14 +256,14 @@ impl GraphView {
         participant.tell()
     }
 
-    /// A participant is gone, and its nodes with it.
+    /// Handles the end of a participant and its nodes.
     pub fn participant_gone(&mut self, guid: &Guid) -> Option<DiscoveryEvent> {
         let gone = self.participants.remove(&guid.prefix())?;
         let participant = gone.guid.filter(|_| !gone.told.is_empty())?;
         Some(DiscoveryEvent::Nodes { participant, nodes: Vec::new() })
     }
 
-    /// A participant says what nodes it has; `writer` is who wrote it.
+    /// Handles a participant's announcement, written by `writer`.
     pub fn handle_message(
         &mut self,
         writer: Option<Guid>,
@@ -277,7 +279,7 @@ impl GraphView {
         Ok(participant.tell())
     }
 
-    /// How long ids are in what most participants say.
+    /// Returns the length of ids in the announcements of most participants.
     pub fn gid_bytes(&self) -> GidBytes {
         let all = self.participants.values().filter(|p| p.guid.is_some());
         let (mut short, mut long) = (0, 0);
@@ -290,7 +292,7 @@ impl GraphView {
     fn participant(&mut self, guid: &Guid) -> Option<&mut Participant> {
         let prefix = guid.prefix();
         if self.participants.len() >= PARTICIPANTS_MAX && !self.participants.contains_key(&prefix) {
-            // One that was never there said something, or did after its end.
+            // An announcement without its participant came early or late, and gives way.
             let absent = self.participants.iter().find(|(_, p)| p.guid.is_none()).map(|(prefix, _)| *prefix);
             self.participants.remove(&absent?);
         }
@@ -299,7 +301,7 @@ impl GraphView {
 }
 
 impl Participant {
-    /// Tells its nodes, if it is there and they are others than before.
+    /// Reports the nodes if the participant exists and they have changed.
     fn tell(&mut self) -> Option<DiscoveryEvent> {
         let (participant, said) = (self.guid?, self.said.as_ref()?);
         let enclave = self.enclave.as_deref();
@@ -342,7 +344,7 @@ mod tests {
         digits.chunks(2).map(byte).collect()
     }
 
-    /// By `scripts/graph-vectors.py`, with PyPI's `rosbags`, from rmw_dds_common's message definitions.
+    /// Made by `scripts/graph-vectors.py`, with PyPI's `rosbags`, from rmw_dds_common's message definitions.
     const GOLDEN: [(GidBytes, &str); 2] = [
         (GidBytes::Sixteen, include_str!("../tests/vectors/graph-16.hex")),
         (GidBytes::TwentyFour, include_str!("../tests/vectors/graph-24.hex")),
@@ -380,7 +382,7 @@ mod tests {
         for (_, golden) in GOLDEN {
             let golden = hex(golden);
             for n in 0..golden.len() - 3 {
-                // Cut behind its first zeros, one with long ids is one with short ones and nothing in it.
+                // A message with long ids that is cut behind its first zeros equals an empty one with short ids.
                 let read = decode_nodes(&golden[..n]);
                 let is_empty = (24..28).contains(&n) && read.as_ref().is_ok_and(|said| said.nodes.is_empty());
                 assert!(read.is_err() || is_empty, "{n}");
@@ -393,11 +395,11 @@ mod tests {
                 }
             }
         }
-        // Counts that nothing backs take no memory.
+        // Counts beyond the data allocate nothing.
         let mut huge = encode_nodes(&guid(7, 0), &[], GidBytes::Sixteen).to_vec();
         huge[20..24].copy_from_slice(&u32::MAX.to_le_bytes());
         assert_eq!(decode_nodes(&huge), Err(GraphError::Malformed));
-        // What is another participant's is not taken on its word.
+        // Endpoints of another participant are not believed.
         let stranger = GraphNode { writers: vec![guid(8, 1)], ..node("/", "a", &[1], &[]) };
         let read = decode_nodes(&encode_nodes(&guid(7, 0), &[stranger], GidBytes::Sixteen)).unwrap();
         assert_eq!(read.nodes, [node("/", "a", &[1], &[])]);
@@ -429,7 +431,7 @@ mod tests {
         assert_eq!(in_enclave[0].node.enclave(), Some("/arm"));
         assert_eq!(view.handle_message(Some(guid(8, 9)), &said(&[])), Err(GraphError::Foreign));
         assert!(told(view.participant_gone(&guid(7, 0xc1))).unwrap().is_empty());
-        // What comes late leaves no ghost.
+        // A late announcement does not bring the participant back.
         assert_eq!(view.handle_message(writer, &said(&nodes())), Ok(None));
         assert_eq!(view.gid_bytes(), GidBytes::Sixteen);
         assert_eq!(view.participant_gone(&guid(7, 0xc1)), None);

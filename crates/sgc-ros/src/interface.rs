@@ -1,4 +1,4 @@
-//! What a user can name, and what it is made of: topics and services, each of which is a route.
+//! The interfaces that a user can name, and their parts: topics and services, each of which becomes a route.
 
 use sgc_wire::Kind;
 
@@ -10,7 +10,7 @@ pub enum Interface {
     Topic,
     /// A service.
     Service,
-    /// An action: three services and two topics (the ROS 2 design article "Actions").
+    /// An action: three services and two topics (ROS 2 design article "Actions").
     Action,
     /// The parameters of a node: six services (`rcl_interfaces`).
     Parameters,
@@ -19,19 +19,19 @@ pub enum Interface {
 /// One topic or service of an interface.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Part {
-    /// Which of the two.
+    /// Topic or service.
     pub kind: Kind,
-    /// What stands behind the interface's name.
+    /// The suffix behind the interface's name.
     suffix: &'static str,
     of_type: PartType,
 }
 
-/// What type a part has.
+/// The type of a part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum PartType {
-    /// That of the interface, with this behind it.
+    /// The type of the interface with this suffix.
     Own(&'static str),
-    /// Always this.
+    /// A fixed type.
     Always(&'static str),
 }
 
@@ -62,7 +62,7 @@ const PARAMETERS: [Part; 6] = [
 ];
 
 impl Interface {
-    /// What it is made of.
+    /// Returns the parts of the interface.
     pub fn parts(self) -> &'static [Part] {
         match self {
             Self::Topic => &TOPIC,
@@ -72,7 +72,7 @@ impl Interface {
         }
     }
 
-    /// The word for it in a configuration.
+    /// Returns the key of the interface in a configuration.
     pub fn key(self) -> &'static str {
         match self {
             Self::Topic => "topic",
@@ -84,12 +84,12 @@ impl Interface {
 }
 
 impl Part {
-    /// Its ROS name, of that of the interface.
+    /// Returns the ROS name of the part, from that of the interface.
     pub fn name(&self, interface: &str) -> String {
         format!("{interface}{}", self.suffix)
     }
 
-    /// Its ROS type, of that of the interface; `None` if it takes one that is not known.
+    /// Returns the ROS type of the part, from that of the interface; `None` if it depends on an unknown one.
     pub fn type_name(&self, interface: Option<&str>) -> Option<String> {
         match self.of_type {
             PartType::Own(suffix) => interface.map(|of| format!("{of}{suffix}")),

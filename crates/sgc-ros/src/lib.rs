@@ -1,7 +1,8 @@
-//! The ROS 2 side of SGC, without any DDS: the local network's seam, names, QoS mapping and routes.
+//! The ROS 2 side of SGC without DDS: the interface to the local network, names, QoS mapping and routes.
 //!
-//! [`Routes`] is a pure machine that decides what has to exist on the local network; [`RosNetwork`] is the seam
-//! behind which a DDS implementation provides it (`sgc-dds`). No CDR is looked into but that of tf messages ([`prefix_frames`]).
+//! [`Routes`] is a pure machine that decides which endpoints exist on the local network. [`RosNetwork`] is the
+//! interface that a DDS implementation provides (`sgc-dds`). Only the CDR of tf messages is looked into
+//! ([`prefix_frames`]).
 #![forbid(unsafe_code)]
 
 mod frames;
@@ -23,7 +24,7 @@ pub use network::{
 };
 pub use qos::{
     KEYED_INSTANCES_KEPT, KEYED_SAMPLES_MAX, QosMismatch, QosOverride, QosPolicy, RELIABLE_READER_DEPTH_MIN,
-    SERVICE_DEPTH, mismatches, of_all_instances, reader_for, service_qos, weakest,
+    SERVICE_DEPTH, for_all_instances, mismatches, reader_for, service_qos, weakest,
 };
 pub use routes::{
     Command, Consumers, Direction, GLOBAL_TOPICS, LITERAL_TOPICS, Naming, OfferView, Problem,

@@ -1,18 +1,18 @@
-//! ROS 2 names and types as DDS spells them (the ROS 2 design article "Topic and Service name mapping to DDS").
+//! ROS 2 names and types as DDS spells them (ROS 2 design article "Topic and Service name mapping to DDS").
 
-/// Prefix of DDS topics that carry ROS topics.
+/// The prefix of DDS topics that carry ROS topics.
 const TOPIC_PREFIX: &str = "rt";
-/// Prefix and suffix of DDS topics that carry requests of services, and of their types.
+/// The prefix and suffix of DDS topics for requests of services, and the suffix of their types.
 const REQUEST: (&str, &str, &str) = ("rq", "Request", "_Request_");
-/// The same for replies.
+/// The prefix and suffixes of replies.
 const REPLY: (&str, &str, &str) = ("rr", "Reply", "_Response_");
 
-/// Which half of a service a DDS topic carries.
+/// The half of a service that a DDS topic carries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum ServiceTopic {
-    /// What clients write and servers read.
+    /// Requests, from clients to servers.
     Request,
-    /// What servers write and clients read.
+    /// Replies, from servers to clients.
     Reply,
 }
 
@@ -26,21 +26,21 @@ impl ServiceTopic {
         }
     }
 
-    /// The DDS topic of a service: `/add` → `rq/addRequest`.
+    /// Returns the DDS topic of a service: `/add` → `rq/addRequest`.
     pub fn dds_topic(self, service: &str) -> String {
         let (prefix, suffix, _) = self.affixes();
         format!("{prefix}{service}{suffix}")
     }
 
-    /// The DDS type of this half of a service's: `a/srv/B` → `a::srv::dds_::B_Request_`.
+    /// Returns the DDS type of this half of a service type: `a/srv/B` → `a::srv::dds_::B_Request_`.
     pub fn dds_type(self, ros_type: &str) -> String {
         let (_, _, suffix) = self.affixes();
         let whole = dds_type(ros_type);
         format!("{}{suffix}", whole.strip_suffix('_').unwrap_or(&whole))
     }
 
-    /// Which half of which service a DDS topic carries, and the service's ROS type; `None` for any other.
-    pub fn of<'a>(dds_topic: &'a str, dds_type: &str) -> Option<(Self, &'a str, String)> {
+    /// Parses a DDS topic and type into half, service and ROS type; `None` if it carries no service.
+    pub fn parse<'a>(dds_topic: &'a str, dds_type: &str) -> Option<(Self, &'a str, String)> {
         Self::ALL.into_iter().find_map(|half| {
             let (prefix, suffix, type_suffix) = half.affixes();
             let service = dds_topic.strip_prefix(prefix)?.strip_suffix(suffix)?;
@@ -51,10 +51,10 @@ impl ServiceTopic {
     }
 }
 
-/// The longest ROS topic: 256 bytes of DDS less a terminator and 8 for the prefixes that rmw adds.
+/// Longest ROS topic in bytes: 256 of DDS less a terminator and 8 for the prefixes that rmw adds.
 pub const TOPIC_BYTES_MAX: usize = 247;
 
-/// Whether it is a fully qualified name of ROS 2 (`rmw_validate_full_topic_name`).
+/// Returns `true` for a fully qualified ROS 2 name (`rmw_validate_full_topic_name`).
 pub fn is_topic_name(name: &str) -> bool {
     let is_word = |word: &str| {
         word.starts_with(|c: char| c.is_ascii_alphabetic() || c == '_')
@@ -63,18 +63,18 @@ pub fn is_topic_name(name: &str) -> bool {
     name.len() <= TOPIC_BYTES_MAX && name.strip_prefix('/').is_some_and(|words| words.split('/').all(is_word))
 }
 
-/// The DDS topic of an absolute ROS topic: `/chatter` → `rt/chatter`.
+/// Returns the DDS topic of an absolute ROS topic: `/chatter` → `rt/chatter`.
 pub fn dds_topic(ros_topic: &str) -> String {
     format!("{TOPIC_PREFIX}{ros_topic}")
 }
 
-/// The ROS topic of a DDS topic; `None` if it carries no ROS topic.
+/// Returns the ROS topic of a DDS topic, or `None` if it carries no ROS topic.
 pub fn ros_topic(dds_topic: &str) -> Option<&str> {
     dds_topic.strip_prefix(TOPIC_PREFIX).filter(|t| t.starts_with('/'))
 }
 
-/// The DDS type of a ROS type: `std_msgs/msg/String` → `std_msgs::msg::dds_::String_`. A type outside ROS
-/// naming is the same on both sides.
+/// Returns the DDS type of a ROS type: `std_msgs/msg/String` → `std_msgs::msg::dds_::String_`. A type outside ROS
+/// naming stays the same.
 pub fn dds_type(ros_type: &str) -> String {
     match ros_type.split('/').collect::<Vec<_>>()[..] {
         [package, kind @ ("msg" | "srv" | "action"), name] if !name.is_empty() && !package.is_empty() => {
@@ -84,7 +84,7 @@ pub fn dds_type(ros_type: &str) -> String {
     }
 }
 
-/// The ROS type of a DDS type, the reverse of [`dds_type`].
+/// Returns the ROS type of a DDS type, the reverse of [`dds_type`].
 pub fn ros_type(dds_type: &str) -> String {
     match dds_type.split("::").collect::<Vec<_>>()[..] {
         [package, kind @ ("msg" | "srv" | "action"), "dds_", name] if !package.is_empty() => {
@@ -110,9 +110,10 @@ mod tests {
                 (half.dds_topic("/ns/add"), half.dds_type("a/srv/B")),
                 (topic.into(), type_name.into())
             );
-            assert_eq!(ServiceTopic::of(topic, type_name), Some((half, "/ns/add", "a/srv/B".into())));
+            assert_eq!(ServiceTopic::parse(topic, type_name), Some((half, "/ns/add", "a/srv/B".into())));
         }
-        let goal = ServiceTopic::of("rq/go/_action/send_goalRequest", "a::action::dds_::B_SendGoal_Request_");
+        let goal =
+            ServiceTopic::parse("rq/go/_action/send_goalRequest", "a::action::dds_::B_SendGoal_Request_");
         assert_eq!(
             goal,
             Some((ServiceTopic::Request, "/go/_action/send_goal", "a/action/B_SendGoal".into()))
@@ -120,7 +121,7 @@ mod tests {
         for (topic, type_name) in
             [("rt/a", request.1), ("rq/a", request.1), ("rq/Request", request.1), (request.0, reply.1)]
         {
-            assert_eq!(ServiceTopic::of(topic, type_name), None);
+            assert_eq!(ServiceTopic::parse(topic, type_name), None);
         }
     }
 

@@ -1,8 +1,8 @@
-//! The seam between SGC and a local ROS 2 network: discovery in, raw samples in and out.
+//! The interface between SGC and a local ROS 2 network: discovery events in, raw samples in and out.
 //!
-//! Nothing here knows a DDS implementation; `sgc-dds` implements [`RosNetwork`] with Cyclone DDS,
-//! `sgc-testkit` in memory for tests. Payloads are serialised samples: the four-byte encapsulation
-//! header (RTPS 2.5, 10.2) and the body, untouched.
+//! Nothing here depends on a DDS implementation. `sgc-dds` implements [`RosNetwork`] with Cyclone DDS, `sgc-testkit`
+//! in memory for tests. Payloads are serialised samples: the encapsulation header of four bytes (RTPS 2.5, 10.2) and
+//! the body, unchanged.
 
 use std::any::Any;
 use std::collections::BTreeSet;
@@ -13,31 +13,31 @@ use std::time::Duration;
 use bytes::Bytes;
 use sgc_wire::{Qos, RosNode};
 
-/// GUID of a DDS entity: 12 bytes of prefix, 4 of entity id (RTPS 2.5, 9.3.1).
+/// The GUID of a DDS entity: 12 bytes of prefix, 4 of entity id (RTPS 2.5, 9.3.1).
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Guid(pub [u8; 16]);
 
 impl Guid {
-    /// True if the endpoint's type has no key: entity kind ends in 3 (writer) or 4 (reader)
-    /// (RTPS 2.5, table 9.1).
+    /// Returns `true` if the endpoint's type has no key: the entity kind ends in 3 (writer) or 4 (reader) (RTPS 2.5,
+    /// table 9.1).
     pub fn is_keyless(&self) -> bool {
         matches!(self.0[15] & 0x0f, 3 | 4)
     }
 
-    /// The prefix that all entities of one participant share.
+    /// Returns the prefix that all entities of one participant share.
     pub fn prefix(&self) -> [u8; 12] {
         let mut prefix = [0; 12];
         prefix.copy_from_slice(&self.0[..12]);
         prefix
     }
 
-    /// True if the endpoint is of a participant of Cyclone DDS, by its [`Self::vendor`].
+    /// Returns `true` if the endpoint belongs to a participant of Cyclone DDS, by its [`Self::vendor`].
     pub fn is_of_cyclone(&self) -> bool {
         self.vendor() == [0x01, 0x10]
     }
 
-    /// Vendor of the DDS implementation, as RTPS 2.5 (9.3.1.1) asks it to begin its prefixes: `[1, 0x0f]` is Fast DDS,
-    /// `[1, 0x10]` Cyclone, `[1, 0x12]` RustDDS.
+    /// Returns the vendor id with which the prefix begins (RTPS 2.5, 9.3.1.1): `[1, 0x0f]` for Fast DDS, `[1, 0x10]`
+    /// for Cyclone, `[1, 0x12]` for RustDDS.
     pub fn vendor(&self) -> [u8; 2] {
         [self.0[0], self.0[1]]
     }
@@ -55,7 +55,7 @@ impl fmt::Debug for Guid {
     }
 }
 
-/// Which end of a topic an endpoint is.
+/// The kind of a DDS endpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum EndpointKind {
     /// A DDS data reader.
@@ -70,83 +70,85 @@ pub enum EndpointKind {
 pub struct DiscoveredEndpoint {
     /// Reader or writer.
     pub kind: EndpointKind,
-    /// Its GUID, unique on the network while it lives.
+    /// The GUID, unique on the network while the endpoint exists.
     pub guid: Guid,
     /// DDS topic name.
     pub topic: String,
     /// DDS type name.
     pub type_name: String,
-    /// True if the type has no key.
+    /// `true` if the type has no key.
     pub keyless: bool,
     /// `RIHS01_…` type hash from USER_DATA, if the endpoint carries one (REP 2016).
     pub type_hash: Option<String>,
-    /// What it offers or requests.
+    /// The offered or requested QoS.
     pub qos: Qos,
 }
 
 /// A ROS 2 node and its endpoints.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct GraphNode {
-    /// Its names.
+    /// The name of the node.
     pub node: RosNode,
-    /// Its data readers.
+    /// The data readers.
     pub readers: Vec<Guid>,
-    /// Its data writers.
+    /// The data writers.
     pub writers: Vec<Guid>,
 }
 
-/// What happens in the local graph. Endpoints and nodes made by SGC, this process's or another's, never appear.
+/// A change of the local graph. Endpoints and nodes that SGC creates, in this process or another, never appear.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum DiscoveryEvent {
-    /// An endpoint is there.
+    /// An endpoint appeared.
     Appeared(DiscoveredEndpoint),
-    /// An endpoint is gone.
+    /// An endpoint vanished.
     Vanished {
-        /// Which.
+        /// The endpoint.
         guid: Guid,
     },
-    /// A writer's lease ran out, or the writer lives again. Told of writers that a reader made here is matched with.
+    /// A writer's liveliness lease expired, or the writer is alive again. Reported for writers that match a reader
+    /// created here.
     Liveliness {
         /// The writer.
         guid: Guid,
-        /// Whether it lives.
+        /// `true` if the writer is alive.
         is_alive: bool,
     },
-    /// The depth of the history of a writer that announced none is known. Told of writers that a reader made here is matched with.
+    /// The history depth of a writer that announced none became known. Reported for writers that match a reader
+    /// created here.
     HistoryDepth {
         /// The writer.
         guid: Guid,
-        /// Messages that it keeps for late joiners.
+        /// The number of samples that the writer keeps for late joiners.
         depth: u32,
     },
-    /// All nodes that a participant has from now on; none if it is gone. Their endpoints may appear before or after.
+    /// A participant has these nodes from now on, none if it is gone. Their endpoints may appear before or after.
     Nodes {
         /// The participant.
         participant: Guid,
-        /// Its nodes.
+        /// The nodes.
         nodes: Vec<GraphNode>,
     },
 }
 
-/// What to create on the local network.
+/// The spec of an endpoint to create on the local network.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct EndpointSpec {
     /// DDS topic name.
     pub topic: String,
     /// DDS type name.
     pub type_name: String,
-    /// True if the type has no key; must agree with the remote side or nothing matches.
+    /// `true` if the type has no key. The other side must agree, or the endpoints do not match.
     pub keyless: bool,
-    /// True for a reader that asks writers for the hashes of keys (RTPS 2.5, 9.6.4.8), which those of Fast DDS 2 do not tell otherwise. Writers
-    /// of Cyclone tell theirs anyway, and do not match a reader that asks in this way.
+    /// `true` for a reader that asks writers for key hashes (RTPS 2.5, 9.6.4.8), which Fast DDS 2 sends only on
+    /// request. Cyclone's writers always send them, and do not match a reader that asks in this way.
     pub asks_key_hash: bool,
-    /// Type hash to put in USER_DATA, as rmw does from Iron on.
+    /// The type hash for USER_DATA, as rmw sets it since Iron.
     pub type_hash: Option<String>,
-    /// Quality of service to offer or request.
+    /// The QoS to offer or request.
     pub qos: Qos,
 }
 
-/// What a received sample says about its instance.
+/// The kind of a sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SampleKind {
     /// Data.
@@ -157,22 +159,22 @@ pub enum SampleKind {
     Unregister,
 }
 
-/// The key of a sample, hashed (RTPS 2.5, 9.6.4.8).
+/// The hash of a sample's key (RTPS 2.5, 9.6.4.8).
 pub type KeyHash = [u8; 16];
 
 /// A sample without its payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SampleHead {
-    /// Data or the end of an instance.
+    /// The kind of the sample.
     pub kind: SampleKind,
-    /// Source time stamp, nanoseconds since the Unix epoch.
+    /// Source timestamp, nanoseconds since the Unix epoch.
     pub source_timestamp_ns: i64,
-    /// The hash of its key, where the topic has one and its writer told.
+    /// The hash of the key, if the topic has a key and the writer sent the hash.
     pub key_hash: Option<KeyHash>,
 }
 
 impl SampleHead {
-    /// The head of a sample without a key.
+    /// Creates the head of a sample without a key.
     pub const fn new(kind: SampleKind, source_timestamp_ns: i64) -> Self {
         Self { kind, source_timestamp_ns, key_hash: None }
     }
@@ -181,33 +183,33 @@ impl SampleHead {
 /// One serialised sample taken from a reader.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Sample {
-    /// Data or the end of an instance.
+    /// The kind of the sample.
     pub kind: SampleKind,
-    /// GUID of the writer, if the network tells.
+    /// The GUID of the writer, if the network provides it.
     pub writer: Option<Guid>,
-    /// Source time stamp, nanoseconds since the Unix epoch.
+    /// Source timestamp, nanoseconds since the Unix epoch.
     pub source_timestamp_ns: i64,
-    /// The hash of its key, where the topic has one and the writer told.
+    /// The hash of the key, if the topic has a key and the writer sent the hash.
     pub key_hash: Option<KeyHash>,
     /// Encapsulation header and body.
     pub payload: Bytes,
-    /// True if the handler gets another sample at once: it may then put off what is cheaper for several.
-    /// After the last one that is at hand it is false.
+    /// `true` if the handler gets another sample at once, so that it may defer work that is cheaper for several
+    /// samples. It is `false` for the last sample at hand.
     pub more: bool,
 }
 
-/// Receives the samples of one reader, one after the other. A closure that takes samples is one.
+/// A handler that receives the samples of one reader in order. Closures that take samples implement it.
 pub trait HandleSamples: Send {
-    /// Handles a sample on a thread of that reader alone: it may block, and while it does nothing but that reader waits.
+    /// Handles a sample on the reader's own thread. It may block, which holds up only this reader.
     fn handle(&mut self, sample: Sample);
 
-    /// Handles a sample on a thread that receives for all readers of the network if that needs no waiting, or else gives
-    /// it back, to be handled on the reader's own. None is at hand behind it.
+    /// Handles a sample on the thread that receives for all readers, or returns it if that could block; the sample is
+    /// then handled on the reader's own thread. No other sample is at hand behind it.
     fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
         Err(sample)
     }
 
-    /// So many samples gave way to newer ones, since they came faster than they were handled.
+    /// Reports samples that were dropped because newer ones arrived faster than they were handled.
     fn overrun(&mut self, samples: u64) {
         let _ = samples;
     }
@@ -219,48 +221,49 @@ impl<F: FnMut(Sample) + Send> HandleSamples for F {
     }
 }
 
-/// Handles the samples of a reader.
+/// The handler of a reader's samples.
 pub type SampleHandler = Box<dyn HandleSamples>;
 
-/// Who asked a service, and the number of its request: the sample identity of RPC over DDS 1.0 (7.5.1.1.1).
+/// The client of a service and the number of its request: the sample identity of RPC over DDS 1.0 (7.5.1.1.1).
 ///
-/// It holds all that a reply needs, so that one server may answer what another of the same service was asked.
+/// It holds everything that a reply needs, so that one server may answer a request that another server of the same
+/// service received.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct RequestId {
-    /// The client: GUID of its request writer, or what stands in its place in the mapping that it uses.
+    /// The GUID of the client's request writer, or the id in its place in the client's RPC mapping.
     pub client: [u8; 16],
-    /// Its number there.
+    /// The number of the request.
     pub number: i64,
-    /// At a server, the endpoint of the client that its end is to be noticed by, if the network tells: one that
-    /// discovery says is gone.
+    /// At a server, the endpoint whose end in discovery means the end of the client, if the network provides it.
     pub asker: Option<Guid>,
 }
 
 /// Both topics of a service, at its client or at its server.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ServiceSpec {
-    /// Where requests go.
+    /// The topic of requests.
     pub request: EndpointSpec,
-    /// Where replies go.
+    /// The topic of replies.
     pub reply: EndpointSpec,
 }
 
 /// The reason for which a request or a reply of the local network is not handed over.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum UnhandledCall {
-    /// Newer ones took its place, since they came faster than they were handled.
+    /// Newer messages took its place, because they arrived faster than they were handled.
     Overrun,
-    /// It does not say to which call it belongs.
+    /// The message does not name its call.
     Unreadable,
 }
 
-/// Receives requests at a server, replies at a client. A closure that takes both arguments of [`Self::handle`] is one.
+/// A handler of requests at a server, or of replies at a client. Closures with both arguments of [`Self::handle`]
+/// implement it.
 pub trait HandleCalls: Send {
-    /// Handles a message: encapsulation header and body, without the request's id, which vendors put in different places.
-    /// On a thread of its own: it may block.
+    /// Handles a message: encapsulation header and body, without the request id, which vendors encode in different
+    /// places. It runs on a thread of its own and may block.
     fn handle(&mut self, id: RequestId, payload: Bytes);
 
-    /// So many messages are not handed over.
+    /// Reports messages that are not handed over.
     fn unhandled(&mut self, why: UnhandledCall, messages: u64) {
         let _ = (why, messages);
     }
@@ -272,46 +275,46 @@ impl<F: FnMut(RequestId, Bytes) + Send> HandleCalls for F {
     }
 }
 
-/// Handles the requests of a server, or the replies to a client.
+/// The handler of a server's requests, or of the replies to a client.
 pub type RequestHandler = Box<dyn HandleCalls>;
 
-/// A client of a local service; lives until dropped. Calls may block, like those of [`RosWriter`].
+/// A client of a local service, until dropped. Calls may block, like those of [`RosWriter`].
 pub trait RosClient: Send + Sync + 'static {
-    /// Sends a request; its reply comes to the handler under the id that this returns, maybe before this does. Waits
-    /// a little for a server, and is [`RosError::NoPeer`] if there is none.
+    /// Sends a request. The handler gets the reply under the returned id, possibly before this function returns.
+    /// Waits briefly for a server, and fails with [`RosError::NoPeer`] if there is none.
     fn request(&self, payload: Bytes) -> Result<RequestId, RosError>;
 
-    /// Returns the request readers of the servers that there are at present. A request reaches no other than those that are there
-    /// before it is sent.
+    /// Returns the request readers of the current servers. A request reaches only servers that exist before it is
+    /// sent.
     fn servers(&self) -> BTreeSet<Guid>;
 
-    /// How many servers there are at present.
+    /// Returns the current number of servers.
     fn matched_servers(&self) -> u32 {
         self.servers().len() as u32
     }
 
-    /// GUIDs of its reader and its writer.
+    /// Returns the GUIDs of the reader and the writer.
     fn guids(&self) -> [Guid; 2];
 }
 
-/// A server for local clients; lives until dropped. Calls may block, like those of [`RosWriter`].
+/// A server for local clients, until dropped. Calls may block, like those of [`RosWriter`].
 pub trait RosServer: Send + Sync + 'static {
-    /// Answers the request of this id. Waits a little for the client to be able to hear it.
+    /// Answers a request. Waits briefly until the client can receive the reply.
     fn reply(&self, request: &RequestId, payload: Bytes) -> Result<(), RosError>;
 
-    /// GUIDs of its reader and its writer.
+    /// Returns the GUIDs of the reader and the writer.
     fn guids(&self) -> [Guid; 2];
 }
 
-/// An endpoint that the local graph shows and that no other matches; lives until dropped, which may block.
+/// An endpoint that is shown in the local graph and matches no other, until dropped, which may block.
 pub struct ShownEndpoint {
-    /// Its GUID.
+    /// The GUID.
     pub guid: Guid,
     _endpoint: Box<dyn Any + Send>,
 }
 
 impl ShownEndpoint {
-    /// Wraps the entities that have the endpoint shown until they are dropped.
+    /// Wraps the entities that keep the endpoint in the graph until they are dropped.
     pub fn new(guid: Guid, entities: impl Any + Send) -> Self {
         Self { guid, _endpoint: Box::new(entities) }
     }
@@ -323,152 +326,155 @@ impl fmt::Debug for ShownEndpoint {
     }
 }
 
-/// Receives discovery events on a thread of the network; must not block.
+/// A handler of discovery events. It runs on a thread of the network and must not block.
 pub type DiscoveryHandler = Box<dyn FnMut(DiscoveryEvent) + Send>;
 
-/// Why the local network refused.
+/// The reason why the local network failed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum RosError {
     /// The DDS domain could not be joined.
     #[error("cannot join ROS domain {domain}: {reason}")]
     Domain {
-        /// Domain id.
+        /// The domain id.
         domain: u32,
-        /// What the implementation said.
+        /// The error of the implementation.
         reason: String,
     },
-    /// An endpoint could not be made.
+    /// An endpoint could not be created.
     #[error("cannot create a {kind} on {topic} [{type_name}]: {reason}")]
     Create {
         /// `"reader"` or `"writer"`.
         kind: &'static str,
-        /// DDS topic.
+        /// The DDS topic.
         topic: String,
-        /// DDS type.
+        /// The DDS type.
         type_name: String,
-        /// What the implementation said.
+        /// The error of the implementation.
         reason: String,
     },
-    /// DDS Security forbids an endpoint of the graph.
+    /// DDS Security forbids an endpoint that is shown in the graph.
     #[error("{file} grants enclave {enclave} no partition {partition} on {topic}")]
     ForbiddenPartition {
-        /// The permissions.
+        /// The permissions file.
         file: String,
         /// The enclave.
         enclave: String,
         /// The partition of endpoints that are only shown.
         partition: &'static str,
-        /// DDS topic.
+        /// The DDS topic.
         topic: String,
     },
-    /// A payload that is no serialised sample: shorter than its header, or too large.
+    /// The payload is not a serialised sample: it is shorter than its header or too long.
     #[error("a payload of {bytes} bytes is not a serialised sample")]
     Payload {
-        /// Its length.
+        /// The length in bytes.
         bytes: usize,
     },
-    /// A reliable write was not accepted in time: a local reader does not acknowledge.
+    /// A reliable write was not accepted in time, because a local reader does not acknowledge.
     #[error("the local network accepted no sample for {waited_ms} ms")]
     WriteTimeout {
-        /// How long the write blocked.
+        /// The time for which the write blocked.
         waited_ms: u64,
     },
-    /// A sample of a topic with a key whose hash nobody told: subscribers of ROS 2 Kilted end with a segmentation fault at one.
+    /// The sample of a keyed topic lacks its key hash. Subscribers of ROS 2 Kilted crash with a segmentation fault
+    /// without it.
     #[error(
         "the hash of its key is not known, without which subscribers of Fast DDS 3 end with a segmentation fault"
     )]
     KeyUnknown,
-    /// Nobody is there to hear a request or a reply.
+    /// No endpoint is there to receive a request or a reply.
     #[error("nobody on the local network was there to hear it for {waited_ms} ms")]
     NoPeer {
-        /// How long was waited.
+        /// The time waited.
         waited_ms: u64,
     },
-    /// Any other failure of a write.
+    /// A write failed for another reason.
     #[error("write failed: {reason}")]
     Write {
-        /// What the implementation said.
+        /// The error of the implementation.
         reason: String,
     },
 }
 
-/// How far a network reaches, compared with when it was opened.
+/// The reach of a network, compared with the time when it was opened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reach {
-    /// As far.
+    /// The reach is unchanged.
     Whole,
-    /// Perhaps not as far: this host's addresses are others. No program of another host is known to be cut off, or they still change.
+    /// The reach may be smaller, because this host's addresses have changed. No program on another host is known to
+    /// be cut off, or the addresses are still changing.
     Doubtful,
-    /// Programs of other hosts are cut off, or may be, until the network is opened again.
+    /// Programs on other hosts are or may be cut off until the network is reopened.
     CutOff,
 }
 
 /// A local ROS 2 network.
 ///
-/// Dropping the network ends discovery and waits for its threads; dropping a reader or writer deletes
-/// the entity and its topic, and waits for the thread that served it.
+/// Dropping the network ends discovery and waits for its threads. Dropping a reader or writer deletes the entity and
+/// its topic, and waits for the thread that served it.
 pub trait RosNetwork: Send + Sync + 'static {
-    /// A reader; lives until dropped.
+    /// A reader, until dropped.
     type Reader: Send + 'static;
-    /// A writer; lives until dropped.
+    /// A writer, until dropped.
     type Writer: RosWriter;
-    /// A client of a service; lives until dropped.
+    /// A client of a service, until dropped.
     type Client: RosClient;
-    /// A server of a service; lives until dropped.
+    /// A server of a service, until dropped.
     type Server: RosServer;
 
-    /// Starts discovery; each endpoint already there is told as an appearance. Call once.
+    /// Starts discovery, and reports existing endpoints as appearances. Call once.
     fn discover(&self, handler: DiscoveryHandler) -> Result<(), RosError>;
 
-    /// Creates a reader whose samples go to `handler`. Samples of writers made by SGC, this process's or
-    /// another's, never do: what they wrote came through SGC already.
+    /// Creates a reader whose samples go to `handler`. Samples of writers that SGC created, in this process or
+    /// another, are skipped, because they came through SGC already.
     fn create_reader(&self, spec: &EndpointSpec, handler: SampleHandler) -> Result<Self::Reader, RosError>;
 
     /// Creates a writer.
     fn create_writer(&self, spec: &EndpointSpec) -> Result<Self::Writer, RosError>;
 
-    /// Creates a client, which calls local servers; their replies go to `handler`. Servers made by SGC are none.
+    /// Creates a client that calls local servers. Replies go to `handler`. Servers that SGC created are ignored.
     fn create_client(&self, spec: &ServiceSpec, handler: RequestHandler) -> Result<Self::Client, RosError>;
 
-    /// Creates a server; requests of local clients go to `handler`, those of clients made by SGC do not.
+    /// Creates a server. Requests of local clients go to `handler`, except those of clients that SGC created.
     fn create_server(&self, spec: &ServiceSpec, handler: RequestHandler) -> Result<Self::Server, RosError>;
 
-    /// GUID of a reader made here.
+    /// Returns the GUID of a reader created here.
     fn reader_guid(&self, reader: &Self::Reader) -> Guid;
 
-    /// How long ago a writer of the local network renewed its liveliness lease, by a message or without one. None if it did not yet, and of
-    /// writers that are not reliable, not manual by topic, or made by SGC. Does not block.
+    /// Returns the time since a local writer renewed its liveliness lease, by a message or without one. Returns
+    /// `None` if it has not yet, and for writers that are not reliable, not manual by topic, or created by SGC. Does
+    /// not block.
     fn renewed_ago(&self, writer: &Guid) -> Option<Duration> {
         let _ = writer;
         None
     }
 
-    /// Returns `true` if nodes are told of and announced.
+    /// Returns `true` if nodes are reported and announced.
     fn has_graph(&self) -> bool;
 
-    /// Has the local graph show an endpoint that stands for one elsewhere: with its type, type hash and QoS but for history and
-    /// partitions. No endpoint matches it, so that it takes nothing, acknowledges nothing and gives nothing. May block.
+    /// Shows an endpoint that represents a remote one in the local graph, with its type, type hash and QoS except for
+    /// history and partitions. It matches no endpoint, so it exchanges no data. May block.
     fn show(&self, kind: EndpointKind, spec: &EndpointSpec) -> Result<ShownEndpoint, RosError>;
 
-    /// Has the local graph show these nodes, and no others, as this participant's. May block.
+    /// Announces these nodes in the local graph as this participant's, and no others. May block.
     fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError>;
 
-    /// Returns how far it reaches at present.
+    /// Returns the current reach.
     fn reach(&self) -> Reach {
         Reach::Whole
     }
 
-    /// Returns `true` if a network opened now, as this one was, would reach programs that this one does not. After `false` the network is
-    /// [`Reach::Whole`] until something changes. May block.
+    /// Returns `true` if a network that is opened now in the same way would reach programs that this one does not.
+    /// After `false` the network is [`Reach::Whole`] until something changes. May block.
     ///
     /// # Errors
-    /// The reason why none could be opened.
+    /// The reason why no network could be opened.
     fn gains_by_reopening(&self) -> Result<bool, RosError> {
         Ok(true)
     }
 
-    /// Ends discovery and the network, and waits until all that was made on it is dropped: so long at most, `false` if something is
-    /// left. May block.
+    /// Ends discovery and the network, and waits, at most for `max`, until everything that was created on it is
+    /// dropped. Returns `false` if something is left. May block.
     fn close(self: Arc<Self>, max: Duration) -> bool {
         let _ = max;
         true
@@ -477,48 +483,49 @@ pub trait RosNetwork: Send + Sync + 'static {
 
 /// A raw writer. Calls may block (DDS reliability), so they belong on a thread of the writer's own.
 pub trait RosWriter: Send + Sync + 'static {
-    /// Writes, disposes or unregisters. It need not leave before the next call of this kind, or of [`Self::flush`]: short samples
-    /// share packets.
+    /// Writes, disposes or unregisters. The sample may stay queued until the next call or [`Self::flush`], so that
+    /// short samples share packets.
     fn write_ahead(&self, head: SampleHead, payload: Bytes) -> Result<(), RosError>;
 
-    /// The same, with the given source time stamp (nanoseconds since the Unix epoch), and at once.
+    /// Writes, disposes or unregisters at once, with this source timestamp in nanoseconds since the Unix epoch.
     fn write(&self, kind: SampleKind, source_timestamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
         let written = self.write_ahead(SampleHead::new(kind, source_timestamp_ns), payload);
         self.flush();
         written
     }
 
-    /// Lets leave what was written ahead.
+    /// Sends queued samples.
     fn flush(&self) {}
 
-    /// Renews its liveliness lease at its readers without a sample, if it is manual by topic. May block.
+    /// Renews the liveliness lease without a sample, if it is manual by topic. May block.
     fn assert_liveliness(&self) {}
 
-    /// Gives late joiners the last samples, so many, from here on. Only a writer made with [`sgc_wire::History::UNSAID`] does, and never more
-    /// than before.
+    /// Sets the number of samples that late joiners get from now on. Only a writer created with
+    /// [`sgc_wire::History::UNSAID`] obeys, and never with more samples than before.
     fn set_late_depth(&self, depth: u32) {
         let _ = depth;
     }
 
-    /// Returns the number of samples of so many bytes that it keeps for reliable readers that have not acknowledged them yet. Beyond it each write
-    /// takes the place of the oldest, whether somebody lacks that or not. None if it waits for its readers rather.
+    /// Returns the number of samples of this size that the writer keeps unacknowledged for reliable readers. Beyond
+    /// it each write replaces the oldest sample, even if a reader lacks it. Returns `None` if the writer waits for
+    /// its readers instead.
     fn kept(&self, bytes: usize) -> Option<u32> {
         let _ = bytes;
         None
     }
 
-    /// Waits until all reliable readers have what was written; false if they have not after `max`.
+    /// Waits until all reliable readers have acknowledged everything. Returns `false` after `max`.
     fn wait_acknowledged(&self, max: Duration) -> bool {
         let _ = max;
         true
     }
 
-    /// How many local readers are matched at present.
+    /// Returns the current number of matched local readers.
     fn matched_readers(&self) -> u32;
 
-    /// Waits until so many local readers are matched, or for so long; says how many are.
+    /// Waits until this many local readers are matched, at most for `max`, and returns their number.
     fn wait_matched(&self, readers: u32, max: Duration) -> u32;
 
-    /// Its GUID.
+    /// Returns the GUID.
     fn guid(&self) -> Guid;
 }

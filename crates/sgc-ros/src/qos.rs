@@ -6,19 +6,18 @@ use std::time::Duration;
 
 use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representations};
 
-/// Fewest samples that a reliable reader of ours keeps: a moment without the processor must not lose what
-/// the network would have carried.
+/// Fewest samples that a reliable reader of SGC keeps, so that a moment without the processor loses nothing.
 pub const RELIABLE_READER_DEPTH_MIN: u32 = 32;
 
-/// How many instances' worth of history is kept of a keyed topic, whose keys nobody here knows: a writer keeps its last
-/// samples of each instance, we keep as many of all together.
+/// Number of instances whose history is kept of a keyed topic. SGC does not know the keys: a writer keeps its last
+/// samples of each instance, SGC as many of all instances together.
 pub const KEYED_INSTANCES_KEPT: u32 = 256;
 
-/// Most samples that are kept for that.
+/// Most samples that are kept for a keyed topic.
 pub const KEYED_SAMPLES_MAX: u32 = 4096;
 
-/// The history that holds what a writer of a keyed topic keeps, if it has not too many instances.
-pub fn of_all_instances(history: History) -> History {
+/// Returns the history that holds all instances of a keyed topic's writer, unless it has too many.
+pub fn for_all_instances(history: History) -> History {
     match history {
         History::KeepLast(n) => {
             History::KeepLast(n.saturating_mul(KEYED_INSTANCES_KEPT).min(KEYED_SAMPLES_MAX.max(n)))
@@ -27,32 +26,32 @@ pub fn of_all_instances(history: History) -> History {
     }
 }
 
-/// Requests and replies that an endpoint of ours keeps for who reads slowly.
+/// Depth of SGC's request and reply endpoints, for slow readers.
 pub const SERVICE_DEPTH: u32 = 1000;
 
-/// What both topics of a service offer and request: that of ROS 2 (`rmw_qos_profile_services_default`), deeper, so that
-/// calls which come at once are not lost.
+/// Returns the QoS of both topics of a service: that of ROS 2 (`rmw_qos_profile_services_default`) with more depth,
+/// so that simultaneous calls are not lost.
 pub fn service_qos() -> Qos {
     Qos { history: History::KeepLast(SERVICE_DEPTH), ..Qos::default() }
 }
 
-/// Policies that the user gives a topic in place of its publishers'.
+/// Policies that the user sets in place of the publishers'.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct QosOverride {
     /// Whether samples are acknowledged.
     pub reliability: Option<Reliability>,
-    /// Whether late joiners get what was said before.
+    /// Whether late joiners get earlier samples.
     pub durability: Option<Durability>,
-    /// How much of that.
+    /// The number of samples for late joiners.
     pub history: Option<History>,
-    /// How often something is said, nanoseconds.
+    /// Longest time between samples, in nanoseconds.
     pub deadline_ns: Option<u64>,
-    /// How long a sample is of use, nanoseconds.
+    /// Time for which a sample is valid, in nanoseconds.
     pub lifespan_ns: Option<u64>,
 }
 
 impl QosOverride {
-    /// The offer with these policies in the place of its own.
+    /// Returns the offer with these policies replaced.
     #[must_use]
     pub fn apply(&self, qos: &Qos) -> Qos {
         Qos {
@@ -66,8 +65,8 @@ impl QosOverride {
     }
 }
 
-/// What a set of writers offers together: of each policy the weakest, so that every reader that matches the
-/// result would have matched each of them; of depth and lifespan the longest, of partitions and data representations all.
+/// Returns the combined offer of several writers: the weakest of each policy, so that a reader that matches the
+/// result matches each of them. Depth and lifespan are the longest; partitions and data representations are united.
 pub fn weakest<'a>(offers: impl IntoIterator<Item = &'a Qos>) -> Option<Qos> {
     let mut offers = offers.into_iter();
     let mut all = offers.next()?.clone();
@@ -94,8 +93,8 @@ pub fn weakest<'a>(offers: impl IntoIterator<Item = &'a Qos>) -> Option<Qos> {
     Some(all)
 }
 
-/// What a reader must request to match every writer behind `offer` and to lose nothing they keep.
-/// `writers` is how many there are: each one's history has to fit.
+/// Returns the QoS with which a reader matches all writers behind `offer` and loses nothing that they keep. `writers`
+/// is their number, because each one's history must fit.
 pub fn reader_for(offer: &Qos, writers: usize) -> Qos {
     let several = if offer.is_transient_local() { writers.clamp(1, 1000) as u32 } else { 1 };
     let history = match offer.history {
@@ -120,33 +119,33 @@ pub fn reader_for(offer: &Qos, writers: usize) -> Qos {
 pub enum QosPolicy {
     /// Whether samples are acknowledged.
     Reliability,
-    /// Whether late joiners get what was said before.
+    /// Whether late joiners get earlier samples.
     Durability,
-    /// How often something is said.
+    /// Longest time between samples.
     Deadline,
-    /// Who says that a publisher lives.
+    /// The way in which a publisher shows that it is alive.
     Liveliness,
-    /// How often it is said.
+    /// Longest time between signs of life.
     Lease,
-    /// Where both have to be.
+    /// The partitions of both.
     Partition,
-    /// How samples are serialised.
+    /// The serialisation of samples.
     Representation,
 }
 
-/// Where a subscriber asks for more than a publisher offers, so that DDS keeps them apart.
+/// A policy in which a subscriber requests more than a publisher offers, so that DDS does not match them.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct QosMismatch {
-    /// In what.
+    /// The policy.
     pub policy: QosPolicy,
-    /// What is offered.
+    /// The offered value.
     pub offered: String,
-    /// What is asked for.
+    /// The requested value.
     pub requested: String,
 }
 
 impl QosMismatch {
-    /// What makes the two meet; `owner` is where the publisher is.
+    /// Returns the fix in words. `owner` is the node of the publisher.
     pub fn fix(&self, owner: &str) -> String {
         let (subscriber, publisher) = match self.policy {
             QosPolicy::Reliability => ("best effort", "reliable"),
@@ -179,7 +178,7 @@ impl fmt::Display for QosMismatch {
     }
 }
 
-/// All policies in which a request goes beyond an offer.
+/// Returns all policies in which a request exceeds an offer.
 pub fn mismatches(offer: &Qos, request: &Qos) -> Vec<QosMismatch> {
     let mut found = Vec::new();
     let mut differ = |policy, offered: String, requested: String| {
@@ -219,7 +218,7 @@ pub fn mismatches(offer: &Qos, request: &Qos) -> Vec<QosMismatch> {
         let list = |p: &[String]| if p.is_empty() { "\"\"".into() } else { format!("{p:?}") };
         differ(QosPolicy::Partition, list(&offer.partitions), list(&request.partitions));
     }
-    // What is written here is of one, whatever the publishers there offer together.
+    // The local writer uses one representation, whatever the remote publishers offer together.
     let (written, taken) = (offer.representations.written(), request.representations);
     if !written.meets(taken) {
         differ(QosPolicy::Representation, format!("{written:?}"), format!("{taken:?}"));
@@ -227,8 +226,8 @@ pub fn mismatches(offer: &Qos, request: &Qos) -> Vec<QosMismatch> {
     found
 }
 
-/// Whether two lists of partitions have one in common: a name of one that a pattern of the other fits, or the same
-/// name. None is the default partition, whose name is empty.
+/// Returns `true` if two lists of partitions match: they share a name, or a pattern of one matches a name of the
+/// other. An empty list stands for the default partition, whose name is empty.
 fn partitions_meet(a: &[String], b: &[String]) -> bool {
     let or_default = |list: &[String]| if list.is_empty() { vec![String::new()] } else { list.to_vec() };
     let (a, b) = (or_default(a), or_default(b));
@@ -242,7 +241,7 @@ fn partitions_meet(a: &[String], b: &[String]) -> bool {
     a.iter().any(|a| b.iter().any(|b| meet(a, b)))
 }
 
-/// Whether a name fits a pattern of `*` and `?`. One step back is enough: what the last `*` takes is all that is open.
+/// Returns `true` if a name matches a pattern of `*` and `?`. Only the last `*` needs to be retried.
 fn fits(pattern: &[u8], name: &[u8]) -> bool {
     let (mut p, mut n) = (0, 0);
     let mut star: Option<(usize, usize)> = None;

@@ -1,13 +1,13 @@
-//! The route machine: which local topics are shared, which remote ones are brought here, and what has to
-//! exist on the local network for that.
+//! The route machine: decides which local topics are shared, which remote topics are brought here, and which
+//! endpoints the local network needs for that.
 //!
-//! Pure. Discovery, the endpoint's events and the time go in; [`Command`]s come out, for the driver to carry out on
-//! its endpoint and its local network. It never touches either.
+//! The machine is pure. Discovery, the endpoint's events and the time go in. [`Command`]s come out, which the driver
+//! carries out on its endpoint and its local network.
 //!
-//! A *share route* is one shared topic with one type: it exists from the first local writer of that type
-//! until the last one has been gone for a while. A *use route* is one entry of a followed owner's catalogue
-//! that a rule asks for: it exists from the catalogue that lists it until one that does not. A *token route* is a use
-//! route whose one entry comes with the grant, from an owner of another fleet whose catalogue this node cannot read.
+//! A *share route* is one shared topic with one type. It exists from the first local writer of that type until the
+//! last one has been gone for a while. A *use route* is one entry of a followed owner's catalogue that a rule asks
+//! for. It exists while the catalogue lists the entry. A *token route* is a use route whose entry comes with the
+//! grant, from an owner of another fleet whose catalogue this node cannot read.
 
 mod command;
 mod consumers;
@@ -50,56 +50,55 @@ pub use naming::{
 pub use settling::REDISCOVERY_HOLD;
 pub use view::{OfferView, ShareRouteView, ShareView, UseRouteView, UseView};
 
-/// How long a share outlives its last local writer, so that a restarted program finds its subscribers.
+/// Time for which a share outlives its last local writer, so that a restarted program finds its subscribers.
 pub const WRITERLESS_HOLD: Duration = Duration::from_secs(2);
-/// How long a local reader outlives its last remote sink, so that a restarted router costs no sample.
+/// Time for which a local reader outlives its last remote sink, so that a router restart costs no sample.
 pub const SINKLESS_HOLD: Duration = Duration::from_secs(10);
-/// How long a local writer outlives the way to its owner, so that a restarted router does not make the far
-/// network vanish from the local graph.
+/// Time for which a local writer outlives the path to its owner, so that the far network stays in the local graph
+/// when a router restarts.
 pub const UNREACHABLE_HOLD: Duration = Duration::from_secs(10);
-/// Interfaces of an owner that may answer to one rule: types and metadata of one topic.
+/// Most interfaces of an owner that match one rule: types and metadata of one topic.
 const ENTRIES_PER_RULE_MAX: usize = 8;
-/// Local endpoints remembered.
+/// Most local endpoints that are tracked.
 const LOCAL_ENDPOINTS_MAX: usize = 65_536;
 
-/// What the user shares.
+/// A `[[share]]` rule.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ShareRule {
-    /// Metadata, with the name or pattern of what it shares as that is called here; an empty type means whatever type
-    /// local writers have.
+    /// The metadata, with the local name or pattern. An empty type stands for any type of local writers.
     pub metadata: Metadata,
-    /// What is left out, and what the rest is called for others.
+    /// The exceptions, and the name for others.
     pub naming: Naming,
-    /// Who may join.
+    /// The policy that decides who may join.
     pub policy: Policy,
-    /// How payloads are protected.
+    /// The cipher suite of payloads.
     pub suite: Suite,
-    /// Class of its traffic.
+    /// The class of the packets.
     pub class: Class,
-    /// How much of it goes out.
+    /// The limits of the traffic.
     pub shaping: Shaping,
-    /// Policies in place of its publishers'.
+    /// Policies that replace those of the publishers.
     pub qos: QosOverride,
-    /// Whether it has a connection of its own to the next node.
+    /// `true` if the traffic has a lane of its own.
     pub dedicated: bool,
 }
 
-/// How much of a topic goes on. Nothing is set by default.
+/// The shaping of a topic, without limits by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Shaping {
-    /// The least time between two messages: the newest goes, the others are left out.
+    /// Shortest time between two messages. Only the newest message is sent; others are dropped.
     pub interval: Option<Duration>,
-    /// Most bits a second. What is best effort gives way to what is newer, what is reliable waits.
+    /// Most bits per second. Best-effort messages give way to newer ones, reliable ones wait.
     pub bits_per_s: Option<u64>,
-    /// How old a best-effort message may be when it leaves.
+    /// Most age of a best-effort message when it leaves.
     pub max_age: Option<Duration>,
-    /// How messages are compressed when they leave, if that makes them shorter.
+    /// The compression of outgoing messages, used if it shortens them.
     pub compression: PayloadEncoding,
-    /// What messages are written in when they leave.
+    /// The form of outgoing messages.
     pub form: PayloadForm,
 }
 
-/// Which way messages go.
+/// The direction of messages.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Direction {
     /// From the owner's network to this one.
@@ -109,44 +108,44 @@ pub enum Direction {
     Publish,
 }
 
-/// What the user brings here, or publishes on elsewhere.
+/// A `[[use]]` rule.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct UseRule {
-    /// Which way.
+    /// The direction of messages.
     pub direction: Direction,
-    /// Whose it is.
+    /// The owner of the interface.
     pub owner: NodeId,
     /// The owner's name, for people.
     pub owner_name: String,
-    /// What kind of interface it asks for.
+    /// The kind of interface.
     pub kind: Kind,
-    /// Absolute ROS topic or pattern, as its owner calls it.
+    /// The absolute ROS topic or pattern by the owner's names.
     pub topic: String,
-    /// What is left out, and what the rest is called here.
+    /// The exceptions, and the name here.
     pub naming: Naming,
-    /// What the names of frames in tf messages get in front.
+    /// A prefix for the names of frames in tf messages.
     pub frame_prefix: Option<String>,
-    /// ROS type; `None` for whatever the owner shares.
+    /// The ROS type; `None` for any type that the owner shares.
     pub type_name: Option<String>,
-    /// The name that a token leads to, and what it says of it; the catalogue is not looked at then.
+    /// The name and metadata from a token, which replace the catalogue.
     pub token: Option<(Name, Metadata)>,
-    /// Class of what this node publishes on it; `None` for that of the share.
+    /// The class of messages that this node publishes; `None` for that of the share.
     pub class: Option<Class>,
-    /// How much of it goes on, whichever way.
+    /// The limits of the traffic in either direction.
     pub shaping: Shaping,
-    /// Policies of the writers here in place of the far publishers'.
+    /// Policies of the writers here that replace those of the far publishers.
     pub qos: QosOverride,
-    /// Whether it has a connection of its own to the next node.
+    /// `true` if the traffic has a lane of its own.
     pub dedicated: bool,
 }
 
 impl ShareRule {
-    /// Whether those who may publish on it call it.
+    /// Returns `true` for a service, whose callers are the nodes that may publish.
     fn is_service(&self) -> bool {
         self.metadata.kind == Kind::Service
     }
 
-    /// Whether it is there for what others publish, without anybody here.
+    /// Returns `true` if the share exists for messages of others, even without a local publisher.
     fn is_inbound(&self) -> bool {
         !self.is_service() && !self.policy.publish.is_empty()
     }
@@ -161,7 +160,7 @@ impl UseRule {
         self.owner == *owner && self.token.is_none()
     }
 
-    /// Whether it asks for the same as another, whatever the type.
+    /// Returns `true` if both rules ask for the same interface, whatever its type.
     fn is_same_place(&self, other: &Self) -> bool {
         let name = |rule: &Self| rule.token.as_ref().map(|(name, _)| *name);
         self.direction == other.direction
@@ -172,20 +171,20 @@ impl UseRule {
     }
 }
 
-/// Where a route stands, for status.
+/// The state of a route, for status.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RouteStatus {
     /// `"share"`, `"use"`, `"publish"`, `"serve"` or `"call"`.
     pub direction: &'static str,
-    /// ROS name of the topic or the service.
+    /// The ROS name of the topic or service.
     pub topic: String,
-    /// ROS type, once it is known.
+    /// The ROS type, once it is known.
     pub type_name: Option<String>,
-    /// Name, once it is known.
+    /// The name, once it is known.
     pub name: Option<Name>,
-    /// Owner's node name.
+    /// The owner's node name.
     pub owner: String,
-    /// What it is doing, or waiting for.
+    /// The activity of the route, or the reason why it waits.
     pub state: String,
 }
 
@@ -193,7 +192,7 @@ pub struct RouteStatus {
 struct ShareRoute {
     name: Name,
     rule: usize,
-    /// What it is called on the local network.
+    /// The name on the local network.
     local_name: String,
     type_name: String,
     keyless: bool,
@@ -201,62 +200,62 @@ struct ShareRoute {
     own: BTreeMap<Guid, OwnSource>,
     sinks: BTreeSet<SinkId>,
     reader: Option<EndpointSpec>,
-    /// For what others publish on it.
+    /// The writer for messages that others publish on the share.
     writer: Option<EndpointSpec>,
-    /// If it is a service: what others call its servers with, which are its writers here.
+    /// The client that calls local servers, if it is a service. The servers are the route's writers.
     client: Option<ServiceSpec>,
     writerless_until: Option<Instant>,
     sinkless_until: Option<Instant>,
 }
 
-/// What publishes for a local writer.
+/// The source that publishes for a local writer.
 #[derive(Clone, Debug)]
 struct OwnSource {
     source: SourceId,
-    /// What the writer offers, as far as it is carried.
+    /// The writer's offer, as far as it is carried.
     qos: Qos,
-    /// Since when the writer is gone. A volatile one's source is kept a while: for what it wrote last, and for the
-    /// program that is restarted, whose subscribers then notice nothing.
+    /// The time at which the writer vanished. The source of a volatile writer is kept for a while: for its last
+    /// messages, and so that subscribers of a restarted program notice nothing.
     gone: Option<Instant>,
-    /// Whether the writer's liveliness lease ran out.
+    /// `true` if the writer's liveliness lease has expired.
     is_lapsed: bool,
 }
 
 #[derive(Debug)]
 struct UseRoute {
     rule: usize,
-    /// What it is called on the local network.
+    /// The name on the local network.
     local_name: String,
     entry: CatalogueEntry,
     granted: bool,
-    /// False while its owner, which started anew, does not list it (yet).
+    /// `false` while the owner, whose node restarted, does not list the entry yet.
     is_listed: bool,
     refused: Option<RefusedBy>,
-    /// Open writers, and what they offer.
+    /// Open writers and their specs.
     writers: BTreeMap<Option<SourceId>, EndpointSpec>,
-    /// Whose nodes they were said to be.
+    /// The nodes that the writers were announced as.
     nodes: BTreeMap<Option<SourceId>, RosNode>,
-    /// If it publishes: the local writers, and the reader of what they write.
+    /// The local writers and the reader of their messages, if the route publishes.
     local: BTreeMap<Guid, DiscoveredEndpoint>,
     reader: Option<EndpointSpec>,
-    /// If it is a service: what local clients call.
+    /// The server that local clients call, if it is a service.
     server: Option<ServiceSpec>,
     unreachable_until: Option<Instant>,
 }
 
 impl ShareRoute {
-    /// Whether writers of this topic and DDS type belong to it.
+    /// Returns `true` if writers of this topic and DDS type belong to the route.
     fn fits(&self, local_name: &str, type_name: &str) -> bool {
         self.local_name == local_name && self.type_name == type_name
     }
 
-    /// Two local publishers that have different definitions of its type.
+    /// Returns a problem if two local publishers have different definitions of the type.
     fn hashes_differ(&self) -> Option<Problem> {
         let mut hashes = self.writers.values().filter_map(|writer| writer.type_hash.as_ref());
         let one = hashes.next()?;
         let other = hashes.find(|hash| *hash != one)?;
         let (mut first, mut second) = (one.clone(), other.clone());
-        // In one order, whichever publisher came first.
+        // The order does not depend on which publisher came first.
         if first > second {
             std::mem::swap(&mut first, &mut second);
         }
@@ -264,7 +263,7 @@ impl ShareRoute {
         Some(Problem::ShareHash { topic, type_name, first, second })
     }
 
-    /// A share with this first writer, or with none.
+    /// Creates a share with a first writer, or without one.
     fn begin(
         name: Name,
         rule: usize,
@@ -322,7 +321,7 @@ impl UseRoute {
     }
 }
 
-/// A name that a token leads to, joined.
+/// A joined name from a token.
 #[derive(Debug)]
 struct TokenJoin {
     rule: usize,
@@ -330,7 +329,7 @@ struct TokenJoin {
     refused: Option<RefusedBy>,
 }
 
-/// The machine.
+/// The route machine.
 pub struct Routes<R> {
     secret: FleetSecret,
     node: NodeId,
@@ -338,30 +337,30 @@ pub struct Routes<R> {
     share_rules: Vec<ShareRule>,
     use_rules: Vec<UseRule>,
     endpoints: BTreeMap<Guid, DiscoveredEndpoint>,
-    /// The endpoints of each local participant that belong to a node, and which.
+    /// The endpoints of each local participant that belong to a ROS 2 node, with that node.
     nodes: BTreeMap<Guid, BTreeMap<Guid, RosNode>>,
     shares: BTreeMap<Name, ShareRoute>,
     uses: BTreeMap<Name, UseRoute>,
-    /// Names of tokens; there is a route besides from the first grant on.
+    /// The joined names of tokens. From the first grant on a use route exists, too.
     tokens: BTreeMap<Name, TokenJoin>,
-    /// What followed owners said last, for rules that come later.
+    /// The last catalogues of followed owners, kept for later rules.
     catalogues: BTreeMap<NodeId, Catalogue>,
-    /// Owners that are out of reach or refuse, for status.
+    /// Owners that are unreachable or refuse, for status.
     owners: BTreeMap<NodeId, String>,
-    /// Owners that were out of reach, or have just come back.
+    /// Owners that were unreachable, or have just returned.
     settling: BTreeMap<NodeId, Settling>,
     problems: Problems,
-    /// Something is not shared or brought for the sake of a route that runs.
+    /// `true` if an interface is not shared or brought because of a running route.
     waits: bool,
-    /// A route has ended since that was looked at.
+    /// `true` if a route has ended since the last check for waiting interfaces.
     freed: bool,
-    /// Local consumers, or what they use, may be others than before.
+    /// `true` if local consumers or the interfaces that they use may have changed.
     consumers_changed: bool,
     commands: VecDeque<Command>,
 }
 
 impl<R: RngCore> Routes<R> {
-    /// Routes for these rules; `node` is this node, `rng` gives source ids.
+    /// Creates the machine. `node` is this node, `rng` provides source ids.
     pub fn new(
         secret: FleetSecret,
         node: NodeId,
@@ -394,12 +393,12 @@ impl<R: RngCore> Routes<R> {
         routes
     }
 
-    /// Names of shares that begin later come from this secret; running ones keep theirs.
+    /// Sets the secret from which names of later shares are derived. Running shares keep their names.
     pub fn set_secret(&mut self, secret: FleetSecret) {
         self.secret = secret;
     }
 
-    /// The local graph changed.
+    /// Handles a change of the local graph.
     pub fn handle_discovery(&mut self, now: Instant, event: DiscoveryEvent) {
         self.consumers_changed = true;
         match event {
@@ -434,7 +433,7 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// Time passed.
+    /// Handles the passing of time.
     pub fn handle_timeout(&mut self, now: Instant) {
         let due = |at: Option<Instant>| at.is_some_and(|at| at <= now);
         for name in self.shares.keys().copied().collect::<Vec<_>>() {
@@ -470,7 +469,7 @@ impl<R: RngCore> Routes<R> {
         self.reconsider();
     }
 
-    /// The next thing to do.
+    /// Returns the next command.
     pub fn poll_command(&mut self) -> Option<Command> {
         if self.commands.is_empty() {
             self.check_stale();
@@ -478,7 +477,7 @@ impl<R: RngCore> Routes<R> {
         self.commands.pop_front()
     }
 
-    /// When time matters next.
+    /// Returns the time of the next timeout.
     pub fn poll_timeout(&self) -> Option<Instant> {
         let shares = self.shares.values().flat_map(|s| [s.writerless_until, s.sinkless_until]);
         let gone = self.shares.values().flat_map(|s| s.own.values()).filter_map(|own| own.gone);
@@ -488,7 +487,7 @@ impl<R: RngCore> Routes<R> {
         shares.chain(uses).chain(owners).chain(gone).flatten().min()
     }
 
-    /// The ROS topic behind a name that is shared or used here.
+    /// Returns the ROS topic of a name that is shared or used here.
     pub fn topic_of(&self, name: &Name) -> Option<&str> {
         let share = self.shares.get(name).map(|s| s.local_name.as_str());
         share.or_else(|| {
@@ -497,14 +496,14 @@ impl<R: RngCore> Routes<R> {
         })
     }
 
-    /// Whether the user wants a connection of its own for a name that is shared or used here.
+    /// Returns `true` if the traffic of a name that is shared or used here has a lane of its own.
     pub fn is_dedicated(&self, name: &Name) -> bool {
         let share = self.shares.get(name).map(|share| self.share_rules[share.rule].dedicated);
         let used = self.uses.get(name).map(|route| self.use_rules[route.rule].dedicated);
         share.or(used).unwrap_or(false)
     }
 
-    /// Where every rule stands.
+    /// Returns the state of every rule.
     pub fn status(&self) -> Vec<RouteStatus> {
         let mut all = Vec::new();
         for (index, rule) in self.share_rules.iter().enumerate() {
@@ -604,17 +603,17 @@ impl<R: RngCore> Routes<R> {
     }
 }
 
-/// What to say if it has another name elsewhere.
+/// Returns words about the name elsewhere if it differs.
 fn also_called(here: &str, verb: &str, there: &str) -> String {
     if here == there { String::new() } else { format!("{verb} {there}, ") }
 }
 
-/// Returns `true` if the reader of a topic is to ask these writers for the hashes of keys: if all of them match it then.
+/// Returns `true` if the reader of a topic asks writers for key hashes. It must not if a writer would then not match.
 fn asks_key_hash<'a>(keyless: bool, mut writers: impl Iterator<Item = &'a Guid>) -> bool {
     !keyless && !writers.any(Guid::is_of_cyclone)
 }
 
-/// A reader need not be made anew for a little more or less depth.
+/// Returns `true` if two readers differ at most in depth, for which a reader is not recreated.
 fn same_reader(a: Option<&EndpointSpec>, b: Option<&EndpointSpec>) -> bool {
     let key = |s: &EndpointSpec| {
         (
@@ -625,7 +624,7 @@ fn same_reader(a: Option<&EndpointSpec>, b: Option<&EndpointSpec>) -> bool {
     a.map(key) == b.map(key)
 }
 
-/// A fresh source for a local writer, known as its by who knows earlier ones.
+/// Returns a new source id for a local writer, by which receivers recognise the writer's earlier sources.
 fn source_of(secret: &FleetSecret, writer: &Guid, rng: &mut impl RngCore) -> SourceId {
     let mut random = [0; 8];
     rng.fill_bytes(&mut random);

@@ -1,4 +1,4 @@
-//! The route machine: what happens on the local network and at the owners goes in, commands come out.
+//! Tests of the route machine: events of the local network and of owners go in, commands come out.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods)]
 
@@ -73,7 +73,7 @@ fn use_of(owner: NodeId, topic: &str, type_name: Option<&str>) -> UseRule {
     }
 }
 
-/// A rule for the token of a topic of `OWNER`.
+/// Returns a rule for the token of a topic of `OWNER`.
 fn token(topic: &str) -> UseRule {
     let token = Some((theirs(topic, STRING), Metadata::topic("owner", topic, STRING)));
     UseRule { token, ..use_of(OWNER, topic, Some(STRING)) }
@@ -292,7 +292,7 @@ fn more_latched_publishers_than_can_be_told_apart_share_the_last_source() {
 }
 
 #[test]
-fn what_does_not_agree_is_said_once_with_both_values() {
+fn type_mismatch_is_reported_once_with_both_values() {
     let mut b = bench(&[("/a", "x_msgs/msg/Other"), ("/b", "")], &[("/c", Some("x_msgs/msg/Other"))]);
     let wrong = b.appears(writer(1, "/a", Qos::default()));
     let text = problems(&wrong)[0].to_string();
@@ -321,7 +321,7 @@ fn a_local_subscriber_that_cannot_hear_the_far_publisher_is_named() {
         "/a: owner offers durability volatile, but a local subscriber asks for transient local; it receives nothing \
          from there. Give the subscriber volatile or the publisher at owner transient local"
     );
-    // Another one that asks the same: it holds, and is not told again until it has ended.
+    // A second subscriber has the same problem, which is not reported again until it has ended.
     assert_eq!(b.appears(wants_more(3)), []);
     b.vanishes(2);
     assert_eq!(b.routes.problems().filter(|p| **p == told[0]).count(), 1);
@@ -330,7 +330,7 @@ fn a_local_subscriber_that_cannot_hear_the_far_publisher_is_named() {
     assert_eq!(problems(&b.appears(wants_more(2))), told);
     let content = endpoint(4, EndpointKind::Reader, "/a", STRING, Qos::default());
     assert_eq!(b.appears(content), []);
-    // The owner's publisher is made to offer more: nothing holds but the type.
+    // The owner's publisher offers more, so only the type still differs.
     b.catalogue(vec![entry("/a", STRING, latched(), &[7])]);
     assert!(matches!(b.routes.problems().collect::<Vec<_>>()[..], [Problem::LocalType { .. }]));
     b.catalogue(vec![]);
@@ -379,7 +379,7 @@ fn definitions_that_differ_are_named_by_their_hashes() {
         b.vanishes(n);
         assert_eq!(b.routes.problems().count(), 0);
     }
-    // Of one share.
+    // Two publishers of one share have different definitions.
     b.appears(with_hash("RIHS01_bb", writer(3, "/mine", Qos::default())));
     let told = problems(&b.appears(with_hash("RIHS01_aa", writer(4, "/mine", Qos::default()))));
     assert!(
@@ -392,7 +392,7 @@ fn definitions_that_differ_are_named_by_their_hashes() {
 }
 
 #[test]
-fn what_the_rules_no_longer_ask_for_is_no_problem() {
+fn problems_end_with_their_rules() {
     let mut b = bench(&[("/t", "p/msg/Wanted")], &[("/a", Some("p/msg/Wanted"))]);
     b.catalogue(vec![entry("/a", STRING, Qos::default(), &[])]);
     let told = problems(&b.appears(writer(1, "/t", Qos::default())));
@@ -412,17 +412,17 @@ fn a_used_topic_is_joined_written_held_and_dropped() {
     b.routes.handle_granted(&name, None);
     assert!(matches!(&b.commands()[..], [Command::OpenWriter { source: None, spec, .. }]
         if spec.topic == "rt/a" && spec.type_name == dds_type(STRING)));
-    // The way breaks and comes back in time: the local network notices nothing.
+    // The path breaks and returns in time, and the local network notices nothing.
     b.routes.handle_lost(b.now, &name);
     assert_eq!(b.passes(UNREACHABLE_HOLD / 2), []);
     b.routes.handle_granted(&name, None);
     assert_eq!([b.commands(), b.passes(UNREACHABLE_HOLD)].concat(), []);
-    // It breaks for longer: the writer goes, and comes back with the grant.
+    // The path breaks for longer: the writer closes, and opens again with the grant.
     b.routes.handle_lost(b.now, &name);
     assert_eq!(b.passes(UNREACHABLE_HOLD), [Command::CloseWriter { name, source: None }]);
     b.routes.handle_granted(&name, None);
     assert!(has(&b.commands(), |c| matches!(c, Command::OpenWriter { .. })));
-    // The owner no longer shares it: gone at once.
+    // The owner no longer shares the topic, which ends at once.
     let gone = b.catalogue(vec![]);
     assert_eq!(gone, [Command::CloseWriter { name, source: None }, Command::Leave { name }]);
 }
@@ -435,7 +435,7 @@ fn a_lost_catalogue_takes_no_topic_along() {
     b.catalogue(entries());
     b.routes.handle_granted(&name, None);
     b.commands();
-    // The topic's own way stands, so nothing will grant it again.
+    // The topic's own path stands, so no new grant will come.
     b.routes.handle_owner_lost(OWNER, LostReason::Unreachable);
     assert_eq!(b.passes(2 * UNREACHABLE_HOLD), []);
     assert_eq!(b.catalogue(entries()), []);
@@ -484,7 +484,7 @@ fn a_publisher_whose_node_started_anew_keeps_its_writer() {
     b.catalogue(list(&[source(1, 1), source(2, 1)]));
     b.routes.handle_granted(&name, None);
     assert_eq!(b.commands().len(), 2);
-    // The second ended while the node was away, a third began.
+    // The second publisher ended while the node was away, and a third began.
     let after = b.catalogue(list(&[source(1, 2), source(3, 2)]));
     assert_eq!(after[0], Command::MoveWriter { name, from: source(1, 1), to: source(1, 2) });
     assert_eq!(after[1], Command::CloseWriter { name, source: Some(source(2, 1)) });
@@ -492,7 +492,7 @@ fn a_publisher_whose_node_started_anew_keeps_its_writer() {
         matches!(after[2..], [Command::OpenWriter { source: Some(s), .. }] if s == source(3, 2)),
         "{after:?}"
     );
-    // One that offers something else is another writer; two that claim one predecessor get it once.
+    // A publisher with another offer gets another writer. Of two that claim one predecessor, one gets its writer.
     let mut other = list(&[source(1, 3)]);
     other[0].sources[0].qos.deadline_ns = Some(7);
     assert!(b.catalogue(other).iter().all(|c| !matches!(c, Command::MoveWriter { .. })));
@@ -520,9 +520,9 @@ fn a_depth_that_becomes_known_is_listed_and_replaces_no_source() {
     assert_eq!(mapped(&learned), [(source, History::KeepLast(5))]);
     let lists = |command: &Command| matches!(command, Command::UpdateShare { sources, .. } if sources[0].qos.history == History::KeepLast(5));
     assert!(has(&learned, lists) && !opens_reader(&learned), "{learned:?}");
-    // It does not change, and what was announced is not changed.
+    // The depth does not change, and an announced depth stays.
     assert_eq!(b.keeps(1, 6), []);
-    // Messages that expired look like dropped ones.
+    // Expired messages look like dropped ones.
     let mut b = bench(&[("/map", "")], &[]);
     b.appears(writer(1, "/map", Qos { lifespan_ns: Some(1), ..unsaid }));
     assert_eq!(b.keeps(1, 5), []);
@@ -542,7 +542,7 @@ fn policies_of_a_rule_are_offered_in_the_place_of_those_that_are_found() {
         &begun,
         |c| matches!(c, Command::UpdateShare { qos, sources, .. } if is_latched(qos) && is_latched(&sources[0].qos))
     ));
-    // It is read from the start, as it is.
+    // The topic is read from the start, with the QoS of its publisher.
     let reads = |c: &Command| matches!(c, Command::OpenReader { spec, .. } if !spec.qos.is_transient_local());
     assert!(has(&begun, reads), "{begun:?}");
     let careless = QosOverride { reliability: Some(Reliability::BestEffort), ..QosOverride::default() };
@@ -552,7 +552,7 @@ fn policies_of_a_rule_are_offered_in_the_place_of_those_that_are_found() {
         has(&changed, |c| matches!(c, Command::UpdateShare { qos, .. } if best_effort(qos))),
         "{changed:?}"
     );
-    // Policies of a use are those of the writers here.
+    // The policies of a use apply to the writers here.
     let rule = UseRule { qos: careless, ..use_of(OWNER, "/map", None) };
     let mut b = bench_of(vec![], vec![rule]);
     let name = theirs("/map", STRING);
@@ -583,11 +583,11 @@ fn a_depth_that_becomes_known_or_unknown_leaves_the_writer_open() {
         panic!("it is not resized")
     };
     assert_eq!((*of, spec.qos.history), (Some(source(1)), History::KeepLast(5)));
-    // Its node starts anew, does not know the depth any more, and learns it again.
+    // The publisher's node restarts, and learns the depth again.
     let moved = b.catalogue(list(2, History::UNSAID));
     assert_eq!(moved, [Command::MoveWriter { name, from: source(1), to: source(2) }]);
     assert_eq!(b.catalogue(list(2, History::KeepLast(5))), []);
-    // It starts anew before and after the depth is known.
+    // The node restarts before and after the depth is known.
     let mut b = bench(&[], &[("/map", None)]);
     b.catalogue(list(1, History::UNSAID));
     b.routes.handle_granted(&name, None);
@@ -598,7 +598,7 @@ fn a_depth_that_becomes_known_or_unknown_leaves_the_writer_open() {
         panic!("it is not moved and resized")
     };
     assert_eq!(*of, Some(source(2)));
-    // Another depth is another writer.
+    // Another depth needs another writer.
     let other = b.catalogue(list(2, History::KeepLast(6)));
     assert!(has(&other, |c| matches!(c, Command::OpenWriter { .. })), "{other:?}");
 }
@@ -633,25 +633,25 @@ fn an_owner_that_started_anew_may_find_its_publishers_one_by_one() {
     b.routes.handle_granted(&name, None);
     b.commands();
     assert_eq!(b.catalogue(vec![list("/tf_static", &[source(1, 2)])]), [moved(name, 1)]);
-    // A topic that was not listed at all is asked for anew.
+    // A topic that was missing in the catalogue is joined again.
     let found =
         b.catalogue(vec![list("/tf_static", &[source(1, 2), source(2, 2)]), list("/b", &[source(4, 2)])]);
     let again = Command::JoinAgain { name: name_b, owner: OWNER };
     assert_eq!(found, [moved(name, 2), again]);
     assert_eq!(b.granted(name_b, None), [moved(name_b, 4)]);
-    // What it has not found by then has ended.
+    // Publishers that were not rediscovered in time have ended.
     assert_eq!(b.passes(REDISCOVERY_HOLD), [Command::CloseWriter { name, source: Some(source(3, 1)) }]);
-    // As soon as it is there, a publisher that ends is gone at once.
+    // After rediscovery a publisher that ends is gone at once.
     let ended = b.catalogue(vec![list("/tf_static", &[source(1, 2)])]);
     assert_eq!(ended[0], Command::CloseWriter { name, source: Some(source(2, 2)) });
-    // An owner that was merely out of reach says what it means.
+    // The catalogue of an owner that was only unreachable is final.
     let mut b = flowing();
     away(&mut b);
     let lists = vec![list("/tf_static", &[source(1, 1)])];
     let commands = b.catalogue(lists);
     assert!(has(&commands, |c| *c == Command::Leave { name: name_b }), "{commands:?}");
     assert_eq!(b.granted(name, None).len(), 2, "two writers closed");
-    // One that never finds a topic again does not share it.
+    // A topic that is never rediscovered is no longer shared.
     let mut b = flowing();
     away(&mut b);
     assert_eq!(b.catalogue(vec![]), []);
@@ -686,7 +686,7 @@ fn status_says_what_each_rule_waits_for() {
 }
 
 #[test]
-fn what_is_configured_as_before_is_not_touched() {
+fn unchanged_rules_change_no_route() {
     let rules = || (vec![share("/a", ""), share("/b", STRING)], vec![use_of(OWNER, "/c", None), token("/d")]);
     let mut b = bench_of(rules().0, rules().1);
     b.appears(writer(1, "/a", latched()));
@@ -697,7 +697,7 @@ fn what_is_configured_as_before_is_not_touched() {
     b.granted(theirs("/d", STRING), Some(entry("/d", STRING, Qos::default(), &[])));
     let before = b.routes.status();
     assert_eq!(b.reconfigured(rules().0, rules().1), []);
-    // Neither does their order matter.
+    // The order of rules does not matter.
     let (mut shares, mut uses) = rules();
     shares.reverse();
     uses.reverse();
@@ -705,7 +705,7 @@ fn what_is_configured_as_before_is_not_touched() {
     let mut after = b.routes.status();
     after.sort_by_key(|s| (s.direction, s.topic.clone()));
     assert_eq!(after, before);
-    // Each still belongs to its rule: what leaves, leaves alone.
+    // Each route still belongs to its rule, so removing one rule ends only its routes.
     let gone = b.reconfigured(vec![share("/b", STRING)], vec![token("/d")]);
     let ends = |c: &Command, name| matches!(c, Command::Unshare { name: n } | Command::Leave { name: n } if *n == name);
     assert!(has(&gone, |c| ends(c, mine("/a"))) && has(&gone, |c| ends(c, theirs("/c", STRING))), "{gone:?}");
@@ -721,7 +721,7 @@ fn a_changed_policy_changes_the_policy_and_nothing_else() {
     let policy = admits(5);
     let commands = b.reconfigured(vec![changed.clone(), share("/b", "")], vec![]);
     assert_eq!(commands, [Command::UpdatePolicy { name: mine("/a"), policy }]);
-    // A share that begins later begins with it.
+    // A share that begins later begins with the new policy.
     b.vanishes(1);
     b.passes(WRITERLESS_HOLD);
     let begun = b.appears(writer(1, "/a", Qos::default()));
@@ -745,7 +745,7 @@ fn shares_begin_and_end_with_their_rules() {
 }
 
 #[test]
-fn what_cannot_change_in_a_running_share_ends_it_and_begins_it_anew() {
+fn incompatible_change_restarts_a_share() {
     let other_metadata = |topic: &str| {
         let mut rule = share(topic, "");
         rule.metadata.unique = "left".into();
@@ -763,7 +763,7 @@ fn what_cannot_change_in_a_running_share_ends_it_and_begins_it_anew() {
             |c: &Command| matches!(c, Command::Share(s) if s.metadata == expected && s.class == rule.class);
         assert!(begins(&commands[1]), "{what}: {commands:?}");
     }
-    // A type that says what is there already changes nothing; another one ends the share.
+    // A rule that now gives the present type changes nothing; another type ends the share.
     let mut b = bench(&[("/a", "")], &[]);
     b.appears(writer(1, "/a", Qos::default()));
     assert_eq!(b.reconfigured(vec![share("/a", STRING)], vec![]), []);
@@ -787,7 +787,7 @@ fn how_much_goes_on_changes_in_a_running_route() {
     let rule = UseRule { shaping: slow, ..use_of(OWNER, "/a", None) };
     assert_eq!(b.reconfigured(vec![], vec![rule]), [shaped(theirs("/a", STRING), slow)]);
 
-    // What is published in another class begins anew.
+    // Publishing in another class begins anew.
     let publish = |class| UseRule { class, shaping: slow, ..publish_rule("/cmd") };
     let mut b = bench_of(vec![], vec![publish(None)]);
     let listed =
@@ -805,7 +805,7 @@ fn uses_begin_and_end_with_their_rules() {
     let mut b = bench(&[], &[("/a", None)]);
     b.catalogue(vec![entry("/a", STRING, Qos::default(), &[]), entry("/b", STRING, Qos::default(), &[])]);
     b.granted(theirs("/a", STRING), None);
-    // The owner is followed already, so that the new topic is known at once.
+    // The owner is followed already, so the new topic is joined at once.
     let name = theirs("/b", STRING);
     let added = b.reconfigured(vec![], vec![use_of(OWNER, "/a", None), use_of(OWNER, "/b", None)]);
     assert_eq!(added, [Command::Join { name, owner: OWNER, transient_local: false, describe: false }]);
@@ -826,14 +826,14 @@ fn a_token_is_joined_without_a_catalogue_and_written_once_it_is_described() {
     assert_eq!(b.routes.status()[0].state, "waits for the owner's grant");
     b.routes.handle_refused(&name, RefusedBy::Owner(RefuseReason::NotPermitted));
     assert!(b.routes.status()[0].state.starts_with("refused"), "{:?}", b.routes.status());
-    // A catalogue of the same owner has no say in it.
+    // A catalogue of the same owner does not affect the token.
     assert_eq!(b.catalogue(vec![entry("/a", STRING, Qos::default(), &[])]), []);
     let granted = b.granted(name, Some(entry("/a", STRING, Qos::default(), &[])));
     assert!(matches!(&granted[..], [Command::OpenWriter { source: None, .. }]), "{granted:?}");
     assert_eq!(b.catalogue(vec![]), []);
     b.routes.handle_owner_lost(OWNER, LostReason::Withdrawn);
     assert_eq!(b.passes(UNREACHABLE_HOLD), []);
-    // Granted again, as after a new epoch: nothing changes.
+    // A second grant, as after a new epoch, changes nothing.
     assert_eq!(b.granted(name, Some(entry("/a", STRING, Qos::default(), &[]))), []);
     assert_eq!(b.granted(name, None), []);
     b.routes.handle_lost(b.now, &name);
@@ -855,7 +855,7 @@ fn a_latched_topic_of_a_token_is_joined_anew_with_its_history() {
 }
 
 #[test]
-fn what_is_not_as_the_token_says_is_not_brought_here() {
+fn grant_that_differs_from_the_token_is_not_brought() {
     let name = theirs("/a", STRING);
     let other_blind = entry("/b", STRING, Qos::default(), &[]).blind;
     let right = || entry("/a", STRING, Qos::default(), &[]);
@@ -894,7 +894,7 @@ fn a_topic_that_its_owner_lets_us_publish_on_is_read_while_someone_here_writes_i
     b.vanishes(1);
     assert!(matches!(b.vanishes(2)[..], [Command::CloseReader { .. }]));
     b.appears(writer(4, "/cmd", Qos::default()));
-    // Allowed no longer.
+    // The owner no longer permits publishing.
     let commands = b.catalogue(vec![CatalogueEntry { subscribe: true, publish: false, ..listed }]);
     assert!(matches!(commands[..], [Command::CloseReader { .. }, Command::Leave { .. }]), "{commands:?}");
 }
@@ -924,13 +924,13 @@ fn a_share_that_others_publish_on_is_there_without_a_local_publisher() {
     assert!(matches!(&commands[..], [Command::OpenWriter { source: None, .. }]), "{commands:?}");
     b.routes.handle_publishers(&name, true);
     assert_eq!(b.commands(), []);
-    // A publisher here comes and goes; the share stays.
+    // A local publisher appears and vanishes, and the share stays.
     b.appears(writer(1, "/cmd", Qos::default()));
     b.vanishes(1);
     assert!(!has(&b.passes(WRITERLESS_HOLD * 2), |c| matches!(c, Command::Unshare { .. })));
     b.routes.handle_publishers(&name, false);
     assert!(matches!(&b.commands()[..], [Command::CloseWriter { .. }]));
-    // Nobody may any more, and nobody here does.
+    // No node may publish any more, and no local program does.
     let commands = b.reconfigured(vec![share("/cmd", STRING)], Vec::new());
     assert!(has(&commands, |c| matches!(c, Command::Unshare { .. })), "{commands:?}");
 }
@@ -947,7 +947,7 @@ fn a_running_share_keeps_its_name_when_the_secret_of_names_is_replaced() {
 }
 
 #[test]
-fn of_a_keyed_topic_as_much_is_kept_as_its_instances_may_have() {
+fn history_of_a_keyed_topic_covers_its_instances() {
     let mut b = bench(&[("/a", ""), ("/b", "")], &[]);
     let depth_of = |commands: &[Command]| {
         let own = commands
@@ -957,7 +957,7 @@ fn of_a_keyed_topic_as_much_is_kept_as_its_instances_may_have() {
     };
     let commands = b.appears(DiscoveredEndpoint { keyless: false, ..writer(1, "/a", latched()) });
     assert_eq!(depth_of(&commands), History::KeepLast(sgc_ros::KEYED_INSTANCES_KEPT));
-    // What the far writer offers is what this one does: there it is made as deep again.
+    // The catalogue lists the depth of the writer itself; the far side applies the factor again.
     let offers =
         |c: &Command| matches!(c, Command::UpdateShare { sources, .. } if sources[0].qos == latched());
     assert!(has(&commands, offers), "{commands:?}");
@@ -985,7 +985,7 @@ fn readers_ask_for_hashes_of_keys_where_no_writer_is_of_cyclone() {
 }
 
 #[test]
-fn what_an_owner_lists_makes_nobody_use_what_it_did_not_ask_for() {
+fn catalogue_starts_only_requested_uses() {
     // This node may publish `/a`, uses `/used`, and shares `/own`.
     let uses = vec![publish_rule("/a"), use_of(OWNER, "/used", Some(STRING))];
     let mut b = bench_of(vec![share("/own", "")], uses);
@@ -1003,14 +1003,14 @@ fn what_an_owner_lists_makes_nobody_use_what_it_did_not_ask_for() {
     listed.push(entry("/used", "p/msg/Other", Qos::default(), &[1]));
     let commands = b.catalogue(listed);
     assert!(commands.iter().all(|c| matches!(c, Command::Report(_))), "{commands:?}");
-    // Nor does a catalogue of somebody whom it did not ask.
+    // The catalogue of an owner that is not followed changes nothing.
     b.routes.handle_catalogue(b.now, NodeId([7; 32]), Catalogue { version: 1, entries: vec![both("/used")] });
     assert_eq!(b.commands(), []);
-    // What it asked for it gets, in the direction that it asked for.
+    // The interfaces of the rules are joined, in their direction.
     let commands = b.catalogue(vec![both("/a"), both("/used")]);
     assert_eq!(commands.iter().filter(|c| matches!(c, Command::Publish { .. })).count(), 1);
     assert_eq!(commands.iter().filter(|c| matches!(c, Command::Join { .. })).count(), 1);
-    // A grant of what was never joined opens nothing.
+    // A grant without a join opens nothing.
     assert_eq!(b.granted(theirs("/b", STRING), Some(both("/b"))), []);
 }
 
@@ -1030,7 +1030,7 @@ fn shared(commands: &[Command]) -> Vec<String> {
     topics
 }
 
-/// What is joined, as its owner calls it.
+/// Returns the joined topics by their owner's names.
 fn joined(commands: &[Command], topics: &[&'static str]) -> Vec<&'static str> {
     let is_joined = |topic: &str| {
         has(commands, |c| matches!(c, Command::Join { name, .. } if *name == theirs(topic, STRING)))
@@ -1092,10 +1092,10 @@ fn a_share_may_have_another_name_for_others() {
     assert_eq!(shared(&begun), ["/r/b/c"]);
     let read = |c: &Command| matches!(c, Command::OpenReader { name, spec } if *name == mine("/r/b/c") && spec.topic == "rt/b/c");
     assert!(has(&begun, read), "{begun:?}");
-    // Two topics cannot be one.
+    // Two topics cannot have one name.
     let twice = b.appears(writer(3, "/r/cam", Qos::default()));
     assert!(matches!(problems(&twice)[..], [Problem::SharedAsOne { .. }]) && twice.len() == 1, "{twice:?}");
-    // Once the one has gone the other may have the name.
+    // Once the first topic is gone, the second may have the name.
     b.vanishes(1);
     assert_eq!(shared(&b.passes(WRITERLESS_HOLD)), ["/r/cam"]);
 }
@@ -1117,11 +1117,11 @@ fn a_wildcard_brings_what_is_listed_and_namespaces_it() {
     assert_eq!(here(&mut b, "/a/b"), ["/r1/a/b"]);
     assert_eq!(here(&mut b, "/clock"), ["/r1/clock"]);
     assert_eq!(b.routes.topic_of(&theirs("/a/b", STRING)), Some("/r1/a/b"));
-    // It goes and comes with the catalogue.
+    // The route follows the catalogue.
     let fewer = b.catalogue(list(&TOPICS[..1]));
     assert!(has(&fewer, |c| *c == Command::Leave { name: theirs("/a/b", STRING) }), "{fewer:?}");
     assert_eq!(joined(&b.catalogue(list(&TOPICS)), &TOPICS), ["/a/b", "/clock", "/parameter_events"]);
-    // A subscriber here is judged under the name here.
+    // A local subscriber is checked under the local name.
     let wrong = endpoint(1, EndpointKind::Reader, "/r1/a/b", "x_msgs/msg/Other", Qos::default());
     assert!(matches!(problems(&b.appears(wrong))[..], [Problem::LocalType { .. }]));
 }
@@ -1135,7 +1135,7 @@ fn names_that_are_none_are_not_brought() {
         let is_refused = matches!(&said[..], [Command::Report(Problem::NoName { .. })] | []);
         assert!(is_refused && b.routes.status()[0].name.is_none(), "{topic}: {said:?}");
     }
-    // A namespace may be what makes it too long.
+    // A namespace may make the name too long.
     let rule = UseRule { naming: in_namespace("/robot"), ..use_of(OWNER, "/**", None) };
     let mut b = bench_of(vec![], vec![rule]);
     let said = b.catalogue(vec![entry(&long[..245], STRING, Qos::default(), &[])]);
@@ -1143,12 +1143,12 @@ fn names_that_are_none_are_not_brought() {
 }
 
 #[test]
-fn what_is_brought_is_not_shared_on_by_a_wildcard() {
-    // By a rule that names it, from the beginning.
+fn wildcards_do_not_share_used_topics() {
+    // A rule that names the topic applies from the beginning.
     let mut b = bench_of(vec![share("/**", "")], vec![use_of(OWNER, "/a", None)]);
     let said = b.appears(writer(1, "/a", Qos::default()));
     assert!(matches!(problems(&said)[..], [Problem::UsedNotShared { .. }]) && said.len() == 1, "{said:?}");
-    // By a wildcard, while it is brought.
+    // A wildcard applies while its topic is brought.
     let mut b = bench_of(vec![share("/**", "")], vec![use_of(OWNER, "/**", None)]);
     b.catalogue(vec![entry("/a", STRING, Qos::default(), &[])]);
     let said = b.appears(writer(1, "/a", Qos::default()));
@@ -1156,14 +1156,14 @@ fn what_is_brought_is_not_shared_on_by_a_wildcard() {
     let text = problems(&said)[0].to_string();
     assert!(text.contains("except") && text.contains("owner"), "{text}");
     assert_eq!(shared(&b.catalogue(vec![])), ["/a"], "it is brought no longer");
-    // What is shared is not brought, until it is shared no longer.
+    // A shared topic is not brought until the share ends.
     let listed = || vec![entry("/a", STRING, Qos::default(), &[]), entry("/b", STRING, Qos::default(), &[])];
     let said = b.catalogue(listed());
     assert!(matches!(problems(&said)[..], [Problem::SharedNotUsed { .. }]), "{said:?}");
     assert_eq!(joined(&said, &["/a", "/b"]), ["/b"]);
     b.vanishes(1);
     assert_eq!(joined(&b.passes(WRITERLESS_HOLD), &["/a", "/b"]), ["/a"]);
-    // Under another name it is another topic.
+    // A topic with another name does not conflict.
     let rule = UseRule { naming: in_namespace("/r"), ..use_of(OWNER, "/**", None) };
     let mut b = bench_of(vec![share("/**", "")], vec![rule]);
     assert_eq!(shared(&b.appears(writer(1, "/a", Qos::default()))), ["/a"]);
@@ -1212,7 +1212,7 @@ fn a_wildcard_carries_so_many_and_says_so_once() {
     let joins = |commands: &[Command]| commands.iter().filter(|c| matches!(c, Command::Join { .. })).count();
     assert_eq!(joins(&all), ROUTES_PER_WILDCARD_MAX);
     assert!(matches!(problems(&all)[..], [Problem::TooManyMatches { .. }]));
-    // Those that come later find the room of those that went.
+    // Later topics find the room of former ones.
     let later = b.catalogue(entries(3..ROUTES_PER_WILDCARD_MAX + 5));
     let again = b.catalogue(entries(3..ROUTES_PER_WILDCARD_MAX + 5));
     assert_eq!((joins(&later) + joins(&again), problems(&later).len()), (3, 0));
@@ -1239,29 +1239,29 @@ fn a_route_goes_on_under_whichever_rule_covers_it_now() {
     let wider = b.reconfigured(vec![share("/*", "")], uses());
     assert_eq!(joined(&wider, &["/c", "/d"]), ["/d"], "{wider:?}");
     assert_eq!(wider.len(), 1, "{wider:?}");
-    // With an exception only what it is about ends.
+    // An exception ends only its own topic.
     let fewer = ShareRule { naming: naming(&["/b"], Rename::Keep), ..share("/*", "") };
     assert_eq!(b.reconfigured(vec![fewer.clone()], uses()), [Command::Unshare { name: mine("/b") }]);
-    // Under another name it is another writer.
+    // Another name needs another writer.
     let name = theirs("/c", STRING);
     let spaced = vec![UseRule { naming: in_namespace("/r"), ..use_of(OWNER, "/**", None) }];
     let moved = b.reconfigured(vec![fewer.clone()], spaced.clone());
     let ends = [Command::CloseWriter { name, source: None }, Command::Leave { name }];
     assert!(ends.iter().all(|end| moved.contains(end)), "{moved:?}");
     assert_eq!(joined(&moved, &["/c", "/d"]), ["/c", "/d"]);
-    // What prefixes frames changes while it runs.
+    // The frame prefix changes in a running route.
     let framed = vec![UseRule { frame_prefix: Some("r/".into()), ..spaced[0].clone() }];
     let told = b.reconfigured(vec![fewer.clone()], framed);
     let tells = |c: &Command| matches!(c, Command::Frames { prefix: Some(prefix), .. } if prefix == "r/");
     assert!(told.len() == 2 && told.iter().all(tells), "{told:?}");
-    // A rule that now names what is brought by a wildcard takes it over.
+    // A rule that names a topic takes it over from a wildcard.
     b.reconfigured(vec![fewer.clone()], uses());
     let claimed = b.reconfigured(vec![fewer, share("/c", "")], uses());
     assert!(has(&claimed, |c| *c == Command::Leave { name }), "{claimed:?}");
     assert!(matches!(problems(&claimed)[..], [Problem::SharedNotUsed { .. }]), "{claimed:?}");
 }
 
-/// What the last command of its kind says of a share's publishers: in the catalogue, and by local writer.
+/// Returns a share's publishers by the last commands: in the catalogue, and by local writer.
 fn published(commands: &[Command]) -> (Vec<CatalogueSource>, Vec<(Guid, SourceId)>) {
     let listed = commands.iter().rev().find_map(|c| match c {
         Command::UpdateShare { sources, .. } => Some(sources.clone()),
@@ -1307,12 +1307,12 @@ fn each_publisher_is_listed_with_what_it_offers_and_its_node() {
     };
     assert_eq!((of(&told, 1).node, of(&told, 2).node), (None, Some(node("talker"))));
     assert_eq!((of(&told, 1).qos, of(&told, 2).qos), (fast, Qos::default()));
-    // What concerns no share is nobody's business.
+    // Endpoints outside of shares have no effect.
     assert_eq!(
         named(&mut b, vec![talker("talker"), GraphNode { writers: vec![Guid([9; 16])], ..talker("x") }]),
         []
     );
-    // Nodes may be known before their endpoints are.
+    // Nodes may be known before their endpoints.
     let third = published(&b.appears(writer(9, "/a", Qos::default())));
     assert_eq!(of(&third, 9).node, None, "another participant's word counts for nothing");
     let gone = published(&named(&mut b, vec![]));
@@ -1324,14 +1324,14 @@ fn a_restarted_volatile_publisher_takes_its_source_over_and_a_gone_one_is_listed
     let mut b = bench(&[("/a", "")], &[]);
     b.appears(writer(1, "/a", Qos::default()));
     let before = published(&b.appears(writer(2, "/a", Qos::default())));
-    // What it wrote last is still published as its own.
+    // The last messages of the vanished publisher still go out under its source.
     let left = published(&b.vanishes(2));
     assert_eq!(left, before);
     let back = published(&b.appears(writer(3, "/a", Qos::default())));
     assert_eq!(back.0, before.0, "the far side notices nothing");
     let source = |told: &[(Guid, SourceId)], n: u8| told.iter().find(|(g, _)| *g == Guid([n; 16])).unwrap().1;
     assert_eq!(source(&back.1, 3), source(&before.1, 2));
-    // One that offers something else is another.
+    // A publisher with another offer gets another source.
     b.vanishes(3);
     let other =
         published(&b.appears(writer(4, "/a", Qos { history: History::KeepLast(1), ..Qos::default() })));
@@ -1339,7 +1339,7 @@ fn a_restarted_volatile_publisher_takes_its_source_over_and_a_gone_one_is_listed
     let later = published(&b.passes(WRITERLESS_HOLD));
     assert_eq!((later.0.len(), later.1.len()), (2, 2));
     assert_eq!(b.routes.poll_timeout(), None);
-    // Alone, too: it is found as it was until the share ends.
+    // A single publisher keeps its source until the share ends.
     let mut b = bench(&[("/a", "")], &[]);
     let alone = published(&b.appears(writer(1, "/a", Qos::default())));
     assert_eq!(b.vanishes(1), []);
@@ -1361,16 +1361,16 @@ fn a_lapsed_publisher_is_listed_as_such_until_it_lives_again() {
     assert_eq!((lapsed.0[0].source, &lapsed.1), (alive.0[0].source.lapsed(), &alive.1), "the same source");
     assert_eq!(b.told_of_liveliness(1, false), [], "it is known");
     assert_eq!(published(&b.told_of_liveliness(1, true)).0, alive.0);
-    // Its end is no return.
+    // A vanished publisher is still lapsed.
     b.told_of_liveliness(1, false);
     let other = published(&b.appears(writer(2, "/a", Qos::default())));
     assert_eq!(other.0.iter().filter(|s| s.source.is_lapsed()).count(), 1);
     let gone = published(&b.vanishes(1));
     assert_eq!(gone.0, other.0);
-    // A restarted program takes the source over, and lives.
+    // A restarted program takes over the source and is alive.
     let back = published(&b.appears(writer(3, "/a", leased(Liveliness::Automatic))));
     assert!(back.0.len() == 2 && !back.0.iter().any(|s| s.source.is_lapsed()), "{back:?}");
-    // Messages alone renew one that is manual by topic, on the far network as on its own.
+    // A publisher with liveliness manual by topic is renewed by its messages alone, on both networks.
     b.appears(writer(4, "/a", leased(Liveliness::ManualByTopic)));
     assert_eq!(b.told_of_liveliness(4, false), []);
     assert_eq!(b.told_of_liveliness(9, false), [], "nobody's");
@@ -1404,7 +1404,7 @@ fn a_lapsed_far_publisher_has_no_writer_here() {
 }
 
 #[test]
-fn what_is_read_of_a_publisher_is_what_is_said_of_it() {
+fn publishers_are_listed_with_the_qos_that_is_read() {
     let mut b = bench(&[("/a", "")], &[]);
     let reliable = published(&b.appears(writer(1, "/a", Qos::default())));
     let best_effort = Qos { reliability: Reliability::BestEffort, ..Qos::default() };
@@ -1446,7 +1446,7 @@ fn the_far_node_of_a_writer_is_told_when_it_is_known_and_changes_no_writer() {
     assert_eq!(b.catalogue(listed(Some(node("other")))), [set(Some(node("other")))]);
     assert_eq!(b.catalogue(listed(None)), [set(None)]);
     b.catalogue(listed(Some(node("talker"))));
-    // With the writer goes what was said of it.
+    // The node is forgotten with the writer.
     b.routes.handle_lost(b.now, &name);
     assert_eq!(b.passes(UNREACHABLE_HOLD), [Command::CloseWriter { name, source }]);
     let again = b.granted(name, None);

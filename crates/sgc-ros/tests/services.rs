@@ -1,4 +1,4 @@
-//! The route machine and services: servers and catalogues go in, clients and servers come out.
+//! Tests of the route machine with services: servers and catalogues go in, clients and servers come out.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods)]
 
@@ -46,7 +46,7 @@ fn served() -> (Routes<ChaCha8Rng>, Name) {
     (routes(vec![rule], vec![]), derive_name(&secret(), &ME, &metadata("me", Kind::Service)))
 }
 
-/// One end of a server or a client: number `entity` of a participant.
+/// Returns one end of a server or a client, `entity` being its number in the participant.
 fn end(participant: u8, entity: u8, kind: EndpointKind, half: ServiceTopic) -> DiscoveredEndpoint {
     let mut guid = [participant; 16];
     guid[12..].copy_from_slice(&[0, 0, entity, 3]);
@@ -65,7 +65,7 @@ fn commands(routes: &mut Routes<ChaCha8Rng>) -> Vec<Command> {
     std::iter::from_fn(|| routes.poll_command()).collect()
 }
 
-/// What they do, without what goes on at each change.
+/// Returns the names of commands, without those that follow each change.
 fn words(routes: &mut Routes<ChaCha8Rng>) -> Vec<String> {
     let word = |command: Command| format!("{command:?}").split([' ', '(']).next().unwrap().to_owned();
     let all = commands(routes).into_iter().map(word);
@@ -81,7 +81,7 @@ fn a_server_is_a_request_reader_and_a_reply_writer_of_one_participant() {
     let appears = |routes: &mut Routes<_>, e| routes.handle_discovery(now, DiscoveryEvent::Appeared(e));
     appears(&mut routes, end(1, 1, Reader, Request));
     appears(&mut routes, end(2, 1, Writer, Reply));
-    // A client, and somebody who would pass for a server as a whole.
+    // A client, and an endpoint that imitates a whole server.
     appears(&mut routes, end(3, 1, Writer, Request));
     appears(&mut routes, end(3, 2, Reader, Reply));
     let mut whole = end(4, 1, Writer, Reply);
@@ -92,7 +92,7 @@ fn a_server_is_a_request_reader_and_a_reply_writer_of_one_participant() {
     let begun = commands(&mut routes);
     let Some(Command::Share(spec)) = begun.first() else { panic!("{begun:?}") };
     assert_eq!(spec.metadata, metadata("me", Kind::Service));
-    // A second server is of the same service; it goes on without the first.
+    // A second server keeps the service available without the first.
     appears(&mut routes, end(2, 2, Reader, Request));
     let gone = |routes: &mut Routes<_>, e: DiscoveredEndpoint| {
         routes.handle_discovery(now, DiscoveryEvent::Vanished { guid: e.guid });
@@ -101,7 +101,7 @@ fn a_server_is_a_request_reader_and_a_reply_writer_of_one_participant() {
     assert_eq!(words(&mut routes), [""; 0]);
     gone(&mut routes, end(2, 2, Reader, Request));
     assert_eq!(words(&mut routes), ["ServersGone"]);
-    // One that is back at once finds its callers.
+    // A server that returns at once keeps its callers.
     appears(&mut routes, end(1, 2, Writer, Reply));
     routes.handle_timeout(now + WRITERLESS_HOLD);
     assert_eq!(words(&mut routes), [""; 0]);
@@ -175,7 +175,7 @@ fn a_remote_service_is_here_while_it_is_granted_and_a_topic_of_its_name_is_not()
     let name = derive_name(&secret(), &OWNER, &metadata("owner", Kind::Service));
     routes.handle_granted(&name, None);
     assert_eq!(words(&mut routes), ["OpenServer"]);
-    // A moment without the owner is not seen here.
+    // A short absence of the owner is not noticed here.
     routes.handle_lost(now, &name);
     routes.handle_granted(&name, None);
     routes.handle_timeout(now + UNREACHABLE_HOLD);

@@ -1,6 +1,7 @@
-//! Who showed tokens that do not hold, so that nobody goes on trying, nor makes this node check signatures all day.
+//! Counts failed tokens by address, so that an address cannot guess tokens or keep this node busy with signature
+//! checks.
 //!
-//! A table with a bound: what an attacker with many addresses can do is make it forget others.
+//! The table is bounded. An attacker with many addresses can only make it forget other addresses.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -9,14 +10,14 @@ use std::time::Duration;
 use sgc_trust::AddressPrefix;
 use sgc_wire::UnixMillis;
 
-/// Tokens of one address that may fail within [`WINDOW_MS`].
+/// Most tokens of one address that may fail within [`WINDOW_MS`].
 pub(super) const FAILURES_MAX: u32 = 10;
-/// How long failures count, milliseconds.
+/// Time for which failures count, in milliseconds.
 pub(super) const WINDOW_MS: u64 = 60_000;
-/// Addresses that are remembered.
+/// Most addresses in the table.
 pub(super) const ADDRESSES_MAX: usize = 1024;
 
-/// Failures, by address. Those of IPv6 count by their network of 64 bits, of which one host has all addresses.
+/// Failures by address. IPv6 failures count by /64 network, because one host owns all addresses of such a network.
 #[derive(Debug, Default)]
 pub(super) struct Attempts {
     of: BTreeMap<AddressPrefix, Failures>,
@@ -29,11 +30,11 @@ struct Failures {
 }
 
 impl Attempts {
-    /// Whether a token of this address is looked at; else how long it is not.
+    /// Returns `Ok` if a token of this address may be checked, else the time until then.
     pub(super) fn check(&mut self, address: IpAddr, now: UnixMillis) -> Result<(), Duration> {
         let key = AddressPrefix::from(address);
         let Some(Failures { count, since }) = self.of.get(&key) else { return Ok(()) };
-        // A clock that was set back must not keep anybody out.
+        // A clock that was set back must not lock an address out.
         let left = match now.0.checked_sub(since.0) {
             Some(age) if age < WINDOW_MS => WINDOW_MS - age,
             _ => {
@@ -44,7 +45,7 @@ impl Attempts {
         if *count < FAILURES_MAX { Ok(()) } else { Err(Duration::from_millis(left)) }
     }
 
-    /// A token of this address did not hold.
+    /// Counts a failed token of this address.
     pub(super) fn fail(&mut self, address: IpAddr, now: UnixMillis) {
         let key = AddressPrefix::from(address);
         if !self.of.contains_key(&key) && self.of.len() >= ADDRESSES_MAX {
@@ -91,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_remembered_has_a_bound() {
+    fn remembered_addresses_are_bounded() {
         let mut attempts = Attempts::default();
         for n in 0..2 * ADDRESSES_MAX as u32 {
             attempts.fail(IpAddr::V4(n.into()), UnixMillis(NOW.0 + u64::from(n)));

@@ -1,8 +1,8 @@
-//! Who may connect to a gateway, and what they may do there.
+//! Access control of a gateway: decides which clients may connect and which rights they get.
 //!
-//! A front end says what it knows of a connection ([`Admission`]) and is given a [`Client`] with its [`Scope`], or why not
-//! ([`Denied`]). This module reads no file, no clock and no socket: the node makes an [`Access`] of its configuration, anew
-//! at each reload, and hands it on. Certificates were verified before; tokens are verified here.
+//! A front end describes a connection in an [`AdmissionRequest`]. It gets a [`Client`] with a [`Scope`], or a [`Denial`]
+//! with the reason. This module reads no file, clock or socket: the node builds an [`Access`] from its configuration
+//! at each reload. Certificates are verified before they come here; tokens are verified here.
 
 mod attempts;
 mod origin;
@@ -28,57 +28,58 @@ pub use token::{
 
 use attempts::Attempts;
 
-/// Who is admitted without a token or a certificate, and then to everything.
+/// Clients that are admitted without a token or certificate. They may do everything.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Anonymous {
-    /// Programs of this host.
+    /// Programs on this host.
     #[default]
     Local,
-    /// Nobody.
+    /// No client.
     None,
-    /// Whoever reaches the gateway.
+    /// Every client that reaches the gateway.
     All,
 }
 
-/// What nodes may do whose certificates prove who they are.
+/// The scope of nodes that show a certificate.
 #[derive(Clone, Debug, Default)]
 pub struct ClientRule {
-    /// Who.
+    /// Nodes to which the rule applies.
     pub who: Grantees,
-    /// What.
+    /// Rights of these nodes.
     pub scope: Scope,
 }
 
-/// What a gateway's configuration comes to. By default programs of this host may do everything, and nobody else anything.
+/// The access rules from a gateway's configuration. By default programs on this host may do everything and other
+/// clients nothing.
 #[derive(Clone, Debug, Default)]
 pub struct AccessRules {
-    /// Who is admitted without proof.
+    /// Clients that are admitted without proof.
     pub anonymous: Anonymous,
-    /// Whose pages may connect by what a browser does unasked: without a token, or with a certificate.
+    /// Origins of pages that may connect without a token, or with the certificate of the browser.
     pub origins: Vec<PageOrigin>,
-    /// Whether tokens are taken that others on the way could have read.
+    /// `true` if tokens are accepted over connections that are not encrypted.
     pub plain: bool,
-    /// What certificates permit; of all rules that name a node it has the rights.
+    /// Rules for certificates. A node gets the rights of all rules that name it.
     pub clients: Vec<ClientRule>,
-    /// This node, which signs tokens; without it none holds.
+    /// The certificate of this node, which signs tokens. Without it no token is valid.
     pub gateway: Option<VerifiedPeer>,
-    /// The CAs that certificates are verified with, and what they have revoked.
+    /// The CAs that certificates are verified against, with their revocation lists.
     pub anchors: Option<TrustAnchors>,
-    /// Tokens that were taken back.
+    /// Revoked tokens.
     pub revoked: BTreeSet<TokenId>,
-    /// What nodes are called, as far as that is known.
+    /// Known names of nodes.
     pub names: BTreeMap<NodeId, String>,
 }
 
-/// Hears of refused tokens: the address, and the reason. It hears of at most ten a minute for one address.
-pub type HearRefusals = Arc<dyn Fn(SocketAddr, &Denied) + Send + Sync>;
+/// A callback for refused tokens, with address and reason. It is called at most ten times a minute for one address.
+pub type RefusalListener = Arc<dyn Fn(SocketAddr, &Denial) + Send + Sync>;
 
-/// Who may connect, and what they may do. Cloning shares.
+/// The access rules and their state. Clones share the state.
 #[derive(Clone, Default)]
 pub struct Access {
     rules: Arc<AccessRules>,
     attempts: Arc<Mutex<Attempts>>,
-    hears: Option<HearRefusals>,
+    listener: Option<RefusalListener>,
     denied: Arc<AtomicU64>,
 }
 
@@ -88,69 +89,69 @@ impl fmt::Debug for Access {
     }
 }
 
-/// What a front end knows of a connection.
+/// The properties of a connection that decide its admission.
 #[derive(Clone, Copy, Debug)]
-pub struct Admission<'a> {
-    /// Who is at the other end.
+pub struct AdmissionRequest<'a> {
+    /// The address of the client.
     pub peer: SocketAddr,
-    /// Whether nobody on the way could read what it says.
+    /// `true` if the connection is encrypted.
     pub encrypted: bool,
-    /// Its `Origin`, if it sent that header: then it is a page in a browser.
+    /// The `Origin` header. Only pages in browsers send one.
     pub origin: Option<&'a str>,
-    /// The token that it showed.
+    /// The token that the client showed.
     pub token: Option<&'a str>,
-    /// What its certificate proves.
+    /// The identity that the client's certificate proves.
     pub certificate: Option<&'a VerifiedPeer>,
-    /// The time.
+    /// The current time.
     pub now: UnixMillis,
 }
 
-/// Who is connected, and what it may do. Cloning shares.
+/// A connected client and its rights. Clones share.
 #[derive(Clone, Debug)]
 pub struct Client {
-    /// What to call it: the label of its token, the name of its node, or its address.
+    /// The label of the token, the name of the node, or the address.
     pub name: Arc<str>,
-    /// What it may do.
+    /// The rights of the client.
     pub scope: Arc<Scope>,
-    /// Last moment at which that holds; then it is to be disconnected.
+    /// The time at which the rights end and the client is disconnected.
     pub expires: Option<UnixMillis>,
-    /// Its token.
+    /// The id of the client's token.
     pub token: Option<TokenId>,
-    /// Because of what it is admitted.
+    /// The proof by which the client was admitted.
     pub how: AdmittedBy,
     evidence: Evidence,
     /// `true` if the connection comes from a loopback address.
     is_local: bool,
 }
 
-/// The proof by which sessions were admitted. Sessions with the same one share a quota.
+/// The proof by which sessions were admitted. Sessions with the same credential share a quota.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Credential {
-    /// Programs of this host without a token.
+    /// Programs on this host without a token.
     Local,
-    /// Programs of another host without a token.
+    /// Programs on another host without a token.
     Address(AddressPrefix),
-    /// Whoever shows this token.
+    /// Clients that show this token.
     Token(TokenId),
-    /// Whoever shows a certificate of this node.
+    /// Clients that show a certificate of this node.
     Certificate(NodeId),
 }
 
-/// Because of what a client is admitted.
+/// The proof by which a client was admitted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum AdmittedBy {
-    /// It is of this host, or everybody is admitted.
+    /// No proof: the client is on this host, or all clients are admitted.
     Anonymous,
-    /// The certificate of this node.
+    /// A certificate of this node.
     Certificate(NodeId),
     /// A token.
     Token(TokenId),
 }
 
-/// What is judged again when the rules have changed.
+/// The data that is judged again after the rules have changed.
 #[derive(Clone)]
 enum Evidence {
-    /// It came over no connection.
+    /// A part of this program, without a connection.
     Own,
     Anonymous {
         ip: IpAddr,
@@ -168,7 +169,7 @@ enum Evidence {
 }
 
 impl Client {
-    /// A part of this program, which may do everything.
+    /// Returns a client for a part of this program, with all rights.
     pub fn own(name: &str) -> Self {
         Self {
             name: name.into(),
@@ -181,7 +182,7 @@ impl Client {
         }
     }
 
-    /// Returns the proof by which it was admitted; none for a part of this program.
+    /// Returns the credential of the client, or `None` for a part of this program.
     pub(crate) fn credential(&self) -> Option<Credential> {
         Some(match &self.evidence {
             Evidence::Own => return None,
@@ -197,12 +198,12 @@ impl Client {
         self.is_local
     }
 
-    /// Whether it holds this right to the interface of this full name.
+    /// Returns `true` if the client holds this right to the interface with this full name.
     pub fn may(&self, right: Right, name: &str) -> bool {
         self.scope.permits(right, name)
     }
 
-    /// The same with another scope, for tests of what asks for rights.
+    /// Returns the client with another scope, for tests of rights.
     #[must_use]
     pub fn with_scope(mut self, scope: Scope) -> Self {
         self.scope = Arc::new(scope);
@@ -222,72 +223,72 @@ impl fmt::Debug for Evidence {
 }
 
 impl Access {
-    /// Access by these rules.
+    /// Creates an `Access` with these rules.
     pub fn new(rules: AccessRules) -> Self {
-        Self { rules: Arc::new(rules), attempts: Arc::default(), hears: None, denied: Arc::default() }
+        Self { rules: Arc::new(rules), attempts: Arc::default(), listener: None, denied: Arc::default() }
     }
 
-    /// The same with what is remembered of failed attempts before the rules changed, with who hears of them and how many were
-    /// refused.
+    /// Takes over the failed attempts, the listener and the refusal count of `before`, the `Access` under the former
+    /// rules.
     #[must_use]
     pub fn after(mut self, before: &Self) -> Self {
         self.attempts = Arc::clone(&before.attempts);
-        self.hears.clone_from(&before.hears);
+        self.listener.clone_from(&before.listener);
         self.denied = Arc::clone(&before.denied);
         self
     }
 
-    /// The same, and `hears` is told of tokens that are refused. It must not wait.
+    /// Sets a listener for refused tokens. The listener must not block.
     #[must_use]
-    pub fn heard_by(mut self, hears: HearRefusals) -> Self {
-        self.hears = Some(hears);
+    pub fn with_refusal_listener(mut self, listener: RefusalListener) -> Self {
+        self.listener = Some(listener);
         self
     }
 
-    /// The same with other CAs or newer revocation lists.
+    /// Returns the rules with other CAs or newer revocation lists.
     #[must_use]
     pub fn with_anchors(mut self, anchors: TrustAnchors) -> Self {
         Arc::make_mut(&mut self.rules).anchors = Some(anchors);
         self
     }
 
-    /// Returns the same rules with another certificate of this node.
+    /// Returns the rules with another certificate of this node.
     #[must_use]
     pub fn with_gateway(mut self, gateway: VerifiedPeer) -> Self {
         Arc::make_mut(&mut self.rules).gateway = Some(gateway);
         self
     }
 
-    /// The rules.
+    /// Returns the rules.
     pub fn rules(&self) -> &AccessRules {
         &self.rules
     }
 
-    /// Whether any certificate permits anything, so that front ends over TLS have to ask for one.
+    /// Returns `true` if a rule gives rights to certificates, so that TLS front ends must request one.
     pub fn takes_certificates(&self) -> bool {
         !self.rules.clients.is_empty()
     }
 
-    /// How often somebody was not admitted.
+    /// Returns the number of refusals.
     pub fn denied(&self) -> u64 {
         self.denied.load(Ordering::Relaxed)
     }
 
-    /// Who this is, and what it may do. A token decides if there is one: what it does not permit, a certificate beside it
-    /// does not either.
-    pub fn admit(&self, admission: &Admission<'_>) -> Result<Client, Denied> {
+    /// Admits a client and returns its rights. If the client shows a token, the token alone decides: a certificate
+    /// beside it adds no rights.
+    pub fn admit(&self, admission: &AdmissionRequest<'_>) -> Result<Client, Denial> {
         self.judge(admission).inspect_err(|_| {
             self.denied.fetch_add(1, Ordering::Relaxed);
         })
     }
 
-    fn judge(&self, admission: &Admission<'_>) -> Result<Client, Denied> {
+    fn judge(&self, admission: &AdmissionRequest<'_>) -> Result<Client, Denial> {
         if let Some(token) = admission.token {
-            // Whoever goes on trying has been heard often enough: the log is for others, too.
+            // The listener is not called again for an address that keeps trying: the log is for others, too.
             let is_heard = self.attempts().check(admission.peer.ip(), admission.now).is_ok();
             return self.admit_token(token, admission).inspect_err(|denied| {
-                if let Some(hears) = self.hears.as_ref().filter(|_| is_heard) {
-                    hears(admission.peer, denied);
+                if let Some(listener) = self.listener.as_ref().filter(|_| is_heard) {
+                    listener(admission.peer, denied);
                 }
             });
         }
@@ -309,8 +310,9 @@ impl Access {
                         is_local: ip.is_loopback(),
                     });
                 }
-                // One that permits nothing is like none: without it the same program may be admitted.
-                Err(why @ Denied::NotListed { .. }) => {
+                // A certificate without rights counts like no certificate, because the same program may be admitted
+                // without one.
+                Err(why @ Denial::NotListed { .. }) => {
                     return self.admit_anonymous(admission, origin).map_err(|_| why);
                 }
                 Err(why) => return Err(why),
@@ -319,39 +321,39 @@ impl Access {
         self.admit_anonymous(admission, origin)
     }
 
-    /// Whether a client that was admitted, maybe under other rules, is so still. If not, it is to be disconnected.
-    pub fn still_admits(&self, client: &Client, now: UnixMillis) -> Result<(), Denied> {
+    /// Fails if the current rules no longer admit this client. The caller then disconnects it.
+    pub fn still_admits(&self, client: &Client, now: UnixMillis) -> Result<(), Denial> {
         match &client.evidence {
             Evidence::Own => Ok(()),
             Evidence::Anonymous { ip, origin } => self.judge_anonymous(*ip, origin.as_deref()),
             Evidence::Certificate { peer, ip, origin } => {
                 let scope = self.judge_certificate(peer, *ip, origin.as_deref(), now)?;
-                if scope == *client.scope { Ok(()) } else { Err(Denied::Changed) }
+                if scope == *client.scope { Ok(()) } else { Err(Denial::Changed) }
             }
             Evidence::Token { id, is_exposed } => {
                 if *is_exposed && !self.rules.plain {
-                    return Err(Denied::PlainToken);
+                    return Err(Denial::PlainToken);
                 }
                 self.judge_time(*id, client.expires.unwrap_or(UnixMillis(0)), now)
             }
         }
     }
 
-    fn admit_token(&self, text: &str, admission: &Admission<'_>) -> Result<Client, Denied> {
+    fn admit_token(&self, text: &str, admission: &AdmissionRequest<'_>) -> Result<Client, Denial> {
         let ip = admission.peer.ip().to_canonical();
         let is_exposed = !admission.encrypted && !ip.is_loopback();
-        // This host is not locked out: behind a proxy of it are many.
+        // This host is never locked out, because a proxy on it may serve many clients.
         if !ip.is_loopback() {
             let checked = self.attempts().check(ip, admission.now);
-            checked.map_err(|wait| Denied::TooManyAttempts { ip, wait })?;
+            checked.map_err(|wait| Denial::TooManyAttempts { ip, wait })?;
         }
         if is_exposed && !self.rules.plain {
             self.attempts().fail(ip, admission.now);
-            return Err(Denied::PlainToken);
+            return Err(Denial::PlainToken);
         }
-        let result = AccessToken::parse(text).map_err(Denied::Token).and_then(|token| {
-            let gateway = self.rules.gateway.as_ref().ok_or(Denied::NoTokens)?;
-            let grant = token.verify(gateway).map_err(Denied::Token)?;
+        let result = AccessToken::parse(text).map_err(Denial::Token).and_then(|token| {
+            let gateway = self.rules.gateway.as_ref().ok_or(Denial::NoTokens)?;
+            let grant = token.verify(gateway).map_err(Denial::Token)?;
             self.judge_time(grant.id, grant.expires, admission.now)?;
             Ok(grant.clone())
         });
@@ -367,40 +369,44 @@ impl Access {
         })
     }
 
-    fn judge_time(&self, id: TokenId, expires: UnixMillis, now: UnixMillis) -> Result<(), Denied> {
+    fn judge_time(&self, id: TokenId, expires: UnixMillis, now: UnixMillis) -> Result<(), Denial> {
         if now > expires {
-            return Err(Denied::TokenExpired { id, expires });
+            return Err(Denial::TokenExpired { id, expires });
         }
-        if self.rules.revoked.contains(&id) { Err(Denied::TokenRevoked { id }) } else { Ok(()) }
+        if self.rules.revoked.contains(&id) { Err(Denial::TokenRevoked { id }) } else { Ok(()) }
     }
 
-    /// What a certificate permits.
+    /// Returns the scope that a certificate permits.
     fn judge_certificate(
         &self,
         peer: &VerifiedPeer,
         ip: IpAddr,
         origin: Option<&str>,
         now: UnixMillis,
-    ) -> Result<Scope, Denied> {
+    ) -> Result<Scope, Denial> {
         let node = peer.node_id;
         if now > peer.not_after {
-            return Err(Denied::CertificateExpired { node, expires: peer.not_after });
+            return Err(Denial::CertificateExpired { node, expires: peer.not_after });
         }
         if self.rules.anchors.as_ref().is_some_and(|anchors| !anchors.stands(peer)) {
-            return Err(Denied::CertificateRevoked { node });
+            return Err(Denial::CertificateRevoked { node });
         }
         let mut scope = Scope::default();
         let rules = self.rules.clients.iter().filter(|rule| rule.who.find(peer).is_some());
         rules.for_each(|rule| scope.add(&rule.scope));
         if scope.is_empty() {
-            return Err(Denied::NotListed { node });
+            return Err(Denial::NotListed { node });
         }
-        // A browser shows a certificate to whatever page asks it to connect.
+        // A browser shows its certificate for any page that connects, so the origin must be checked too.
         self.judge_origin(origin, ip)?;
         Ok(scope)
     }
 
-    fn admit_anonymous(&self, admission: &Admission<'_>, origin: Option<Arc<str>>) -> Result<Client, Denied> {
+    fn admit_anonymous(
+        &self,
+        admission: &AdmissionRequest<'_>,
+        origin: Option<Arc<str>>,
+    ) -> Result<Client, Denial> {
         let ip = admission.peer.ip().to_canonical();
         self.judge_anonymous(ip, admission.origin)?;
         Ok(Client {
@@ -414,23 +420,23 @@ impl Access {
         })
     }
 
-    fn judge_anonymous(&self, ip: IpAddr, origin: Option<&str>) -> Result<(), Denied> {
+    fn judge_anonymous(&self, ip: IpAddr, origin: Option<&str>) -> Result<(), Denial> {
         match self.rules.anonymous {
             Anonymous::Local if ip.is_loopback() => self.judge_origin(origin, ip),
             Anonymous::All => self.judge_origin(origin, ip),
-            Anonymous::Local | Anonymous::None => Err(Denied::NoCredentials { ip }),
+            Anonymous::Local | Anonymous::None => Err(Denial::NoCredentials { ip }),
         }
     }
 
-    /// Decides if a page of there may connect without a token; a program, which has no origin, may. In the browser of another
-    /// host, `http://localhost` is a page of that host.
-    fn judge_origin(&self, origin: Option<&str>, ip: IpAddr) -> Result<(), Denied> {
+    /// Fails if a page of this origin may not connect without a token. Programs have no origin and pass. In a browser
+    /// on another host, `http://localhost` is a page of that host.
+    fn judge_origin(&self, origin: Option<&str>, ip: IpAddr) -> Result<(), Denial> {
         let Some(text) = origin else { return Ok(()) };
         let parsed = text.parse::<PageOrigin>();
         match &parsed {
             Ok(origin) if ip.is_loopback() && origin.is_loopback() => Ok(()),
             Ok(origin) if self.rules.origins.contains(origin) => Ok(()),
-            _ => Err(Denied::Origin { origin: text.chars().take(ORIGIN_BYTES_MAX).collect() }),
+            _ => Err(Denial::Origin { origin: text.chars().take(ORIGIN_BYTES_MAX).collect() }),
         }
     }
 
@@ -439,97 +445,97 @@ impl Access {
     }
 }
 
-/// Why somebody is not admitted: for the log of the gateway. [`Denied::told`] is what the other end hears.
+/// The reason of a refusal, for the gateway's log. [`Denial::told`] is the text for the client.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Denied {
-    /// Neither a token nor a certificate, and none is needed from elsewhere only.
+pub enum Denial {
+    /// The client showed neither a token nor a certificate, and this address needs one.
     #[error(
         "a program at {ip} showed neither a token nor a certificate: make a token with `sgc token create`, name its \
          node in a [[gateway.client]], or see `anonymous` in [gateway]"
     )]
     NoCredentials {
-        /// Where it is.
+        /// The address of the client.
         ip: IpAddr,
     },
-    /// A page that is not of this host.
+    /// The origin of the page is neither this host nor listed.
     #[error(
         "a page of {origin:?} wants to connect through somebody's browser: if that is meant, list it in `origins` of \
          [gateway], or give the page a token"
     )]
     Origin {
-        /// Where the page is from.
+        /// The origin of the page.
         origin: String,
     },
-    /// A token that others could have read.
+    /// The token was shown over a connection that is not encrypted.
     #[error(
         "a token was shown over a connection that is not encrypted, where others may have read it: revoke it, make a new \
          one, and connect with wss:// or grpcs:// (or see `plain` in [gateway])"
     )]
     PlainToken,
-    /// A token that is none of this gateway.
+    /// The token is not valid at this gateway.
     #[error("a token was shown that does not hold: {0}")]
     Token(#[source] AccessTokenError),
-    /// No token holds here.
+    /// The gateway has no identity, so no token is valid.
     #[error("a token was shown, but this gateway has no identity to verify it with")]
     NoTokens,
-    /// It is over.
+    /// The token has expired.
     #[error("token {id} ended at {expires}: make a new one with `sgc token create`")]
     TokenExpired {
-        /// Which.
+        /// The id of the token.
         id: TokenId,
-        /// When.
+        /// The time of expiry.
         expires: UnixMillis,
     },
-    /// It was taken back.
+    /// The token was revoked.
     #[error("token {id} was revoked: if its holder may come back, make a new one with `sgc token create`")]
     TokenRevoked {
-        /// Which.
+        /// The id of the token.
         id: TokenId,
     },
-    /// Too many tokens that do not hold.
+    /// Too many tokens of this address failed.
     #[error(
         "{ip} showed too many tokens that do not hold and is not listened to for {} s: see the reasons before this one",
         wait.as_secs() + 1
     )]
     TooManyAttempts {
-        /// From where.
+        /// The address of the client.
         ip: IpAddr,
-        /// How long it has to wait.
+        /// The time until the address may try again.
         wait: Duration,
     },
-    /// A certificate that permits nothing.
+    /// No rule gives rights to the certificate.
     #[error(
         "no [[gateway.client]] names node {node}, a group of it or its fleet: add it to the `who` of one, or make a token \
          with `sgc token create`"
     )]
     NotListed {
-        /// Whose.
+        /// The node of the certificate.
         node: NodeId,
     },
-    /// It is over.
+    /// The certificate has expired.
     #[error("the certificate of node {node} ended at {expires}: renew it (docs/how-to/fleet.md)")]
     CertificateExpired {
-        /// Whose.
+        /// The node of the certificate.
         node: NodeId,
-        /// When.
+        /// The time of expiry.
         expires: UnixMillis,
     },
-    /// Its CA took it back.
+    /// The CA revoked the certificate.
     #[error(
         "the certificate of node {node} was revoked: if that is a mistake, the keeper of the fleet enrolls it again"
     )]
     CertificateRevoked {
-        /// Whose.
+        /// The node of the certificate.
         node: NodeId,
     },
-    /// It may do something else now.
+    /// The rights of the certificate have changed since the client was admitted.
     #[error("what the certificate permits has changed: it gets that when it connects again")]
     Changed,
 }
 
-impl Denied {
-    /// What the other end is told: what its user can do, and of a token that does not hold not why.
-    pub fn told(&self) -> &'static str {
+impl Denial {
+    /// Returns the text for the client. It says what the user can do, but not why a token is invalid.
+    pub fn client_message(&self) -> &'static str {
         match self {
             Self::NoCredentials { .. } | Self::NotListed { .. } => {
                 "not admitted: this gateway wants a token (`sgc token create` there makes one) or a certificate of its fleet"

@@ -1,24 +1,24 @@
-//! Where a page in a browser is from: the `Origin` that browsers put into requests and programs do not.
+//! The origin of a page in a browser: the `Origin` header, which browsers send and programs do not.
 //!
-//! A page of anywhere may open a WebSocket to any address that its browser reaches, this host among them (cross-site WebSocket
-//! hijacking). What keeps it out is this header, which a page cannot change.
+//! A page from anywhere may open a WebSocket to any address that its browser reaches, this host included (cross-site
+//! WebSocket hijacking). The `Origin` header, which a page cannot change, prevents that.
 
 use std::fmt;
 use std::net::{Ipv4Addr, Ipv6Addr};
 use std::str::FromStr;
 
-/// The longest, bytes.
+/// Longest origin, in bytes.
 pub const ORIGIN_BYTES_MAX: usize = 300;
 
 const FILE: &str = "file://";
 
-/// Whose pages: `https://app.example.org`, or `file://` for pages from files. In small letters, without a port that its
-/// scheme has anyway (RFC 6454, 6.1).
+/// An origin such as `https://app.example.org`, or `file://` for pages from files. It is in lower case and leaves out
+/// the default port of its scheme (RFC 6454, 6.1).
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct PageOrigin(Box<str>);
 
 impl PageOrigin {
-    /// Returns `true` for pages that a host serves to itself: the host of the browser, whichever that is.
+    /// Returns `true` for a page that the host of the browser serves to itself.
     pub fn is_loopback(&self) -> bool {
         let Some((scheme, authority)) = self.0.split_once("://") else { return false };
         let host = host_and_port(authority).map(|(host, _)| host);
@@ -56,7 +56,7 @@ impl FromStr for PageOrigin {
     }
 }
 
-/// Host and port, if both can be such; an IPv6 address in its brackets.
+/// Splits an authority into host and port, if both are valid. An IPv6 address keeps its brackets.
 fn host_and_port(authority: &str) -> Option<(&str, Option<u16>)> {
     let end = if authority.starts_with('[') { authority.find(']')? + 1 } else { 0 };
     let (host, port) = match authority[end..].find(':') {
@@ -96,25 +96,25 @@ impl fmt::Debug for PageOrigin {
     }
 }
 
-/// Why a text says of no pages where they are from.
+/// The reason why a text is not an origin.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PageOriginError {
-    /// Too long.
+    /// The text is too long.
     #[error("it has {bytes} bytes, at most {ORIGIN_BYTES_MAX} are allowed")]
     TooLong {
-        /// Its length.
+        /// The length in bytes.
         bytes: usize,
     },
-    /// What every page can make its browser say.
+    /// The origin `null`, which every page can make its browser send.
     #[error("\"null\" is what pages of anywhere can be made to say: name where the page is from")]
     Null,
-    /// More than an origin.
+    /// The text continues after the host or port.
     #[error("an origin ends with its host or port: \"{right}\"")]
     Path {
-        /// What was meant.
+        /// The part that is an origin.
         right: String,
     },
-    /// Something else.
+    /// The text has another form.
     #[error(
         "it is no origin of pages: write \"https://dashboard.example.org\", with :PORT behind it if there is one"
     )]
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn one_origin_is_written_in_one_way() {
+    fn origins_are_normalised() {
         for (text, shown) in [
             ("HTTPS://App.Example.org:443", "https://app.example.org"),
             ("http://robot.local:80", "http://robot.local"),
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_origin_is_said() {
+    fn invalid_origins_are_explained() {
         let refused = |text: &str| text.parse::<PageOrigin>().unwrap_err();
         assert_eq!(refused("null"), PageOriginError::Null);
         let right = "https://a.example".to_owned();

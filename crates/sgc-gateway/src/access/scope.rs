@@ -1,37 +1,37 @@
-//! What a client may do: four lists of names and patterns, as those of a `[[share]]`.
+//! The rights of a client: four lists of names and patterns, like those of a `[[share]]`.
 //!
-//! Whether a client has a scope at all, and where it is from, is the business of [`super::Access`].
+//! [`super::Access`] decides which scope a client gets.
 
 use std::fmt;
 
 use sgc_ros::{TOPIC_BYTES_MAX, is_topic_name, matches};
 use sgc_wire::{DecodeError, Reader, Writer};
 
-/// Most patterns of one scope, all four rights together.
+/// Most patterns of one scope, for all four rights together.
 pub const SCOPE_PATTERNS_MAX: usize = 128;
-/// Most bytes of all patterns of one scope together: a token stays short enough for a header of HTTP.
+/// Most bytes of all patterns of one scope, so that a token fits an HTTP header.
 pub const SCOPE_BYTES_MAX: usize = 4096;
 
 const EVERYTHING: &str = "/**";
 
-/// What a client does with an interface.
+/// An action of a client on an interface.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Right {
-    /// Receives what is published on a topic.
+    /// Receive messages of a topic.
     Subscribe,
-    /// Publishes on a topic.
+    /// Publish on a topic.
     Publish,
-    /// Calls a service, sends goals to an action, under its own name; sets and reads a node's parameters.
+    /// Call a service, send goals to an action, or set and read a node's parameters under its own name.
     Call,
-    /// Answers calls of a service, carries out goals of an action.
+    /// Answer calls of a service, or carry out goals of an action.
     Serve,
 }
 
 impl Right {
-    /// All of them, in the order in which tokens have them.
+    /// All rights, in the order in which tokens store them.
     pub const ALL: [Self; 4] = [Self::Subscribe, Self::Publish, Self::Call, Self::Serve];
 
-    /// What it is called in a configuration and on the command line.
+    /// Returns the key of the right in a configuration and on the command line.
     pub fn key(self) -> &'static str {
         match self {
             Self::Subscribe => "subscribe",
@@ -48,33 +48,34 @@ impl fmt::Display for Right {
     }
 }
 
-/// What a client may do; nothing by default. Each entry is the full name of an interface, or a pattern of such: `*` is one
-/// word, `**` any number of them.
+/// The rights of a client, empty by default. Each entry is the full name of an interface or a pattern: `*` matches
+/// one word, `**` any number of words.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Scope {
-    /// Topics that it may receive.
+    /// Topics that the client may receive.
     pub subscribe: Vec<String>,
-    /// Topics that it may publish on.
+    /// Topics that the client may publish on.
     pub publish: Vec<String>,
-    /// Services and actions that it may call.
+    /// Services and actions that the client may call.
     pub call: Vec<String>,
-    /// Services and actions that it may serve.
+    /// Services and actions that the client may serve.
     pub serve: Vec<String>,
 }
 
 impl Scope {
-    /// All that there is.
+    /// Returns the scope that permits everything.
     pub fn everything() -> Self {
         let all = || vec![EVERYTHING.to_owned()];
         Self { subscribe: all(), publish: all(), call: all(), serve: all() }
     }
 
-    /// Whether it holds this right to the interface of this full name. What is no name of ROS 2 nobody has a right to.
+    /// Returns `true` if the scope gives this right to the interface with this full name. Nothing permits an invalid
+    /// ROS 2 name.
     pub fn permits(&self, right: Right, name: &str) -> bool {
         is_topic_name(name) && self.patterns(right).iter().any(|pattern| matches(pattern, name))
     }
 
-    /// The names and patterns to which it gives a right.
+    /// Returns the names and patterns of a right.
     pub fn patterns(&self, right: Right) -> &[String] {
         match right {
             Right::Subscribe => &self.subscribe,
@@ -84,7 +85,7 @@ impl Scope {
         }
     }
 
-    /// Adds what another permits; no pattern twice.
+    /// Adds the rights of another scope, without duplicates.
     pub fn add(&mut self, other: &Self) {
         for right in Right::ALL {
             let own = self.patterns_mut(right);
@@ -96,12 +97,12 @@ impl Scope {
         }
     }
 
-    /// True if it permits nothing.
+    /// Returns `true` if the scope permits nothing.
     pub fn is_empty(&self) -> bool {
         Right::ALL.iter().all(|right| self.patterns(*right).is_empty())
     }
 
-    /// Whether it is within the bounds, permits something, and all of it are names and patterns.
+    /// Fails if the scope exceeds its bounds, permits nothing or contains an invalid pattern.
     pub fn check(&self) -> Result<(), ScopeError> {
         let all = || Right::ALL.into_iter().flat_map(|right| self.patterns(right));
         let (count, bytes) = (all().count(), all().map(String::len).sum());
@@ -160,40 +161,40 @@ impl fmt::Display for Scope {
     }
 }
 
-/// Where a word may stand a wildcard may; one is a whole word.
+/// Returns `true` for a valid name in which wildcards may stand for whole words.
 fn is_scope_pattern(pattern: &str) -> bool {
     let words = pattern.split('/').map(|word| if matches!(word, "*" | "**") { "w" } else { word });
     pattern.len() <= TOPIC_BYTES_MAX && is_topic_name(&words.collect::<Vec<_>>().join("/"))
 }
 
-/// Why a scope is none.
+/// The reason why a scope is invalid.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ScopeError {
-    /// It permits nothing.
+    /// The scope permits nothing.
     #[error("it permits nothing: name at least one interface to subscribe to, publish on, call or serve")]
     Nothing,
-    /// Too many patterns.
+    /// The scope has too many patterns.
     #[error(
         "it has {count} names and patterns, at most {SCOPE_PATTERNS_MAX} are allowed: use patterns, such as \"/arm/**\""
     )]
     TooMany {
-        /// How many.
+        /// The number of patterns.
         count: usize,
     },
-    /// Too many bytes.
+    /// The patterns have too many bytes.
     #[error(
         "its names and patterns have {bytes} bytes, at most {SCOPE_BYTES_MAX} are allowed: use patterns, such as \"/arm/**\""
     )]
     TooLong {
-        /// How many, all together.
+        /// The bytes of all patterns together.
         bytes: usize,
     },
-    /// Neither a name nor a pattern.
+    /// An entry is neither a name nor a pattern.
     #[error(
         "{pattern:?} is neither the full name of an interface (\"/arm/odom\") nor a pattern of such (\"/arm/*\", \"/**\")"
     )]
     Pattern {
-        /// What stands there.
+        /// The entry.
         pattern: String,
     },
 }
@@ -240,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_scope_is_said() {
+    fn invalid_scopes_are_explained() {
         assert_eq!(Scope::default().check(), Err(ScopeError::Nothing));
         for wrong in ["", "odom", "/arm*", "/a/", "/a b", "~/x", "/***", &format!("/{}", "a".repeat(300))] {
             assert_eq!(

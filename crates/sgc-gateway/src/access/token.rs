@@ -1,8 +1,8 @@
-//! Access tokens: what a program without a certificate shows to the gateway of one node.
+//! Access tokens: proofs that a program without a certificate shows to the gateway of one node.
 //!
-//! A token holds what it permits and is signed by the node that it is for, with the key of the node's identity: there is no
-//! other secret, and nothing has to be kept for a token to hold. Text and bytes are those of `docs/spec/gateway.md`. Which
-//! tokens were made, and which were taken back, is kept by the node.
+//! A token contains its rights. The node signs it with the key of its identity, so tokens need no other secret and no
+//! storage to be valid. `docs/spec/gateway.md` specifies text and bytes. The node keeps the lists of issued and
+//! revoked tokens.
 
 use std::fmt;
 use std::str::FromStr;
@@ -17,22 +17,23 @@ use zeroize::Zeroizing;
 
 use super::scope::{Scope, ScopeError};
 
-/// What the text of an access token begins with; the number is the version.
+/// Prefix of an access token's text. The number is the version.
 pub const ACCESS_TOKEN_PREFIX: &str = "sgc-access-1:";
-/// Longest text of an access token, bytes: one with every field at its bound fits, and HTTP servers take it as a header.
+/// Longest text of an access token, in bytes. A token with every field at its bound fits, and HTTP servers accept it
+/// as a header.
 pub const ACCESS_TOKEN_TEXT_BYTES_MAX: usize = 8 * 1024;
-/// Longest label, bytes.
+/// Longest label, in bytes.
 pub const ACCESS_LABEL_BYTES_MAX: usize = 64;
-/// Longest time for which a token may be made, milliseconds: 3650 days.
+/// Longest validity of a token, in milliseconds: 3650 days.
 pub const ACCESS_VALID_MS_MAX: u64 = 3650 * 86_400_000;
 
-/// What access tokens of any version begin with.
+/// Prefix of access tokens of any version.
 const ANY_PREFIX: &str = "sgc-access-";
 const VERSION: u8 = 1;
-/// Keeps the signature from passing for one of another purpose.
+/// Signature context. It keeps a signature of another purpose from being accepted here.
 const CONTEXT: &str = "sgc access token v1";
 
-/// Which token it is: random, shown as 32 hexadecimal digits. No secret.
+/// The random id of a token, shown as 32 hexadecimal digits. It is not secret.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TokenId(pub [u8; 16]);
 
@@ -58,29 +59,29 @@ impl FromStr for TokenId {
     }
 }
 
-/// No id of a token.
+/// The text is not a token id.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the id of a token is 32 hexadecimal digits in small letters: `sgc token list` shows them")]
 pub struct TokenIdError;
 
-/// What a token says.
+/// The content of a token.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct AccessGrant {
-    /// Which token it is.
+    /// The id of the token.
     pub id: TokenId,
-    /// The node at whose gateway it holds.
+    /// The node whose gateway accepts the token.
     pub gateway: NodeId,
-    /// For whom it is, for people: 1 to [`ACCESS_LABEL_BYTES_MAX`] bytes without control characters.
+    /// A label for people, 1 to [`ACCESS_LABEL_BYTES_MAX`] bytes without control characters.
     pub label: String,
-    /// What it permits; not empty.
+    /// The rights of the token; not empty.
     pub scope: Scope,
-    /// When it was made.
+    /// The time of issue.
     pub issued: UnixMillis,
-    /// Last moment at which it holds; at most [`ACCESS_VALID_MS_MAX`] after it was made.
+    /// The time of expiry, at most [`ACCESS_VALID_MS_MAX`] after the issue.
     pub expires: UnixMillis,
 }
 
-/// A token: what it says, and who says so. Debug shows nothing secret.
+/// A token: its content and its signature. `Debug` shows nothing secret.
 #[derive(Clone, PartialEq, Eq)]
 pub struct AccessToken {
     grant: AccessGrant,
@@ -88,7 +89,7 @@ pub struct AccessToken {
 }
 
 impl AccessGrant {
-    /// The token that says this, signed by the gateway's own identity.
+    /// Signs the grant with the gateway's identity.
     pub fn sign(self, identity: &Identity) -> Result<AccessToken, AccessTokenError> {
         self.check()?;
         if self.gateway != identity.node_id() {
@@ -98,7 +99,7 @@ impl AccessGrant {
         Ok(AccessToken { grant: self, signature })
     }
 
-    /// Whether the fields are those of a token; what is refused when read must not be written.
+    /// Fails if a field is invalid. A token that a reader would refuse must not be written.
     pub fn check(&self) -> Result<(), AccessTokenError> {
         check_access_label(&self.label)?;
         let valid = self.expires.0.checked_sub(self.issued.0).filter(|ms| *ms <= ACCESS_VALID_MS_MAX);
@@ -138,7 +139,7 @@ impl AccessGrant {
 }
 
 impl AccessToken {
-    /// Reads a token; white space around it does not count. Nothing is believed by that: see [`AccessToken::verify`].
+    /// Parses a token and ignores white space around it. The result is not verified; see [`AccessToken::verify`].
     pub fn parse(text: &str) -> Result<Self, AccessTokenError> {
         let text = text.trim();
         if text.len() > ACCESS_TOKEN_TEXT_BYTES_MAX {
@@ -159,7 +160,7 @@ impl AccessToken {
         Ok(Self { grant, signature })
     }
 
-    /// What it says, if `gateway` signed it and it is for there. Whether it ended or was taken back is not asked.
+    /// Returns the content if `gateway` signed the token and is its audience. Expiry and revocation are not checked.
     pub fn verify(&self, gateway: &VerifiedPeer) -> Result<&AccessGrant, AccessTokenError> {
         if self.grant.gateway != gateway.node_id {
             return Err(AccessTokenError::Elsewhere { gateway: self.grant.gateway });
@@ -168,9 +169,9 @@ impl AccessToken {
         signed.map(|()| &self.grant).map_err(|_| AccessTokenError::Signature)
     }
 
-    /// The text of the token. It is a secret: whoever holds it may do what it permits.
+    /// Returns the text of the token. It is a secret: its holder has all rights of the token.
     pub fn to_text(&self) -> Zeroizing<String> {
-        // Capacity up front: what grows leaves copies of the secret behind.
+        // The capacity is reserved up front, because reallocation would leave copies of the secret behind.
         let head = self.grant.encode();
         let mut bytes = Zeroizing::new(Vec::with_capacity(head.len() + 4 + self.signature.len()));
         bytes.extend_from_slice(&head);
@@ -182,7 +183,7 @@ impl AccessToken {
         text
     }
 
-    /// Which token it says it is, unverified.
+    /// Returns the unverified id of the token.
     pub fn id(&self) -> TokenId {
         self.grant.id
     }
@@ -194,7 +195,7 @@ impl fmt::Debug for AccessToken {
     }
 }
 
-/// Whether somebody can be called so: in lists, in the log, in status.
+/// Fails if the text is not valid as a label in lists, the log and status.
 pub fn check_access_label(label: &str) -> Result<(), AccessTokenError> {
     let fits = (1..=ACCESS_LABEL_BYTES_MAX).contains(&label.len());
     match fits && label.trim() == label && !label.chars().any(char::is_control) {
@@ -203,45 +204,46 @@ pub fn check_access_label(label: &str) -> Result<(), AccessTokenError> {
     }
 }
 
-/// Why a text is no token, or not one of this gateway. None of them repeats the text, which may be one but for a letter.
+/// The reason why a text is not a valid token of this gateway. No variant repeats the text, which may be a mistyped
+/// secret.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum AccessTokenError {
-    /// Too long.
+    /// The text is too long.
     #[error("it has {bytes} bytes, a token has at most {ACCESS_TOKEN_TEXT_BYTES_MAX}")]
     TooLong {
-        /// Its length.
+        /// The length in bytes.
         bytes: usize,
     },
-    /// Something else altogether.
+    /// The text lacks the prefix of a token.
     #[error("it is no access token: one begins with \"{ACCESS_TOKEN_PREFIX}\"")]
     Prefix,
-    /// Of a version that is not known here.
+    /// The version is unknown.
     #[error("its version is not known here: \"{ACCESS_TOKEN_PREFIX}\" is")]
     Version,
-    /// Characters that tokens do not have.
+    /// The text contains characters that tokens do not have.
     #[error("it was cut or mistyped: behind \"{ACCESS_TOKEN_PREFIX}\" are letters, digits, '-' and '_' only")]
     NotBase64,
-    /// Bytes that are not the fields of a token.
+    /// The bytes are not the fields of a token.
     #[error("it was cut or mistyped: {0}")]
     Malformed(#[from] DecodeError),
-    /// No label.
+    /// The label is invalid.
     #[error(
         "its label is not 1 to {ACCESS_LABEL_BYTES_MAX} bytes of text on one line without space around it, such as \"dashboard\""
     )]
     Label,
-    /// It ends before it begins, or too long after.
+    /// The token expires before its issue or too long after.
     #[error("it ends before it was made, or more than 3650 days after")]
     Time,
-    /// What it permits is no scope.
+    /// The scope is invalid.
     #[error("its scope is wrong: {0}")]
     Scope(ScopeError),
-    /// It is for another gateway.
+    /// The token is for another gateway.
     #[error("it is for the gateway of node {gateway}, not for this one: `sgc token create` there made it")]
     Elsewhere {
-        /// Whose.
+        /// The node of that gateway.
         gateway: NodeId,
     },
-    /// This gateway did not make it.
+    /// The signature is not one of this gateway.
     #[error(
         "this node did not sign it: it was altered or forged, or the node has had another key since: make a new one with \
          `sgc token create`"

@@ -1,4 +1,4 @@
-//! [`Connection`]: one client's, from what it asks for to what it is told.
+//! [`Connection`]: one client's connection, with its subscriptions, publications and jobs.
 
 mod catalogue;
 
@@ -23,68 +23,70 @@ use crate::session::{Advertise, Session, Subscribe};
 use super::connections::Connections;
 use super::listing::Listing;
 use super::outbox::{LANE_MESSAGES_MAX, Outbox};
-use super::parameters::{self, ASKED_MAX, Answer, Parameters, Watched};
-use super::protocol::{self, ClientChannel, Command, Metadata, Parameter, Sent, Told, Wanted};
+use super::parameters::{self, ASKED_MAX, Answer, Parameters, WatchList};
+use super::protocol::{
+    self, BinaryMessage, ClientChannel, Command, Metadata, Parameter, ServerMessage, SubscribeRequest,
+};
 use super::refusal::{Refusal, Refusals};
 use super::{FoxgloveError, Options};
 
-/// How messages are encoded: as ROS 2 has them, or as `docs/spec/json.md` has them; topics are always the former.
+/// Encodings of messages and calls: that of ROS 2, and that of `docs/spec/json.md`. Topics are always sent as CDR.
 const ENCODINGS: [&str; 2] = [CDR, JSON];
 const CDR: &str = "cdr";
 const JSON: &str = "json";
-/// Encapsulation header of a serialised message, bytes (RTPS 2.5, 10.2).
+/// Length of the encapsulation header of a serialised message, in bytes (RTPS 2.5, 10.2).
 const CDR_HEADER_BYTES: usize = 4;
 
-/// How long changes of the graph are gathered.
+/// Time for which graph changes are gathered.
 const SETTLE: Duration = Duration::from_millis(100);
-/// How often definitions are looked for anew that nobody had.
+/// Pause between searches for missing type definitions.
 const LOOK_AGAIN: Duration = Duration::from_secs(10);
-/// How often it is looked what was left out.
+/// Pause between reports of dropped messages.
 const REPORT: Duration = Duration::from_secs(2);
-/// How long readers of what a client begins to publish may take to be matched.
+/// Time within which the readers of a client's new topic should be matched.
 const MATCH_MAX: Duration = Duration::from_millis(200);
-/// Calls and questions for parameters under way; then nothing more is read.
+/// Most calls and parameter requests in progress. At the bound the connection is not read.
 const JOBS_MAX: usize = 512;
-/// Questions for parameters under way.
+/// Most parameter requests in progress.
 const PARAMETER_JOBS_MAX: usize = 8;
-/// Statuses that are remembered, so that none is said twice.
+/// Most statuses that are remembered to avoid repetition.
 const STATUSES_MAX: usize = 1024;
-/// Messages of a topic of events that may wait.
+/// Most queued parameter events.
 const EVENTS_MAX: usize = 256;
 
-/// How bad a status is, as the protocol numbers it.
+/// The severity of a status, as the protocol numbers it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Level {
     Warning = 1,
     Error = 2,
 }
 
-/// What a client subscribes to.
-struct Heard {
+/// A subscription of the client.
+struct TopicSubscription {
     channel: u32,
     topic: String,
     end: AbortHandle,
-    /// Left out before it came to the outbox.
+    /// Messages dropped before they reached the outbox.
     dropped_before: u64,
-    /// Left out in all when it was looked at last.
+    /// The number of dropped messages at the last report.
     reported: u64,
 }
 
-/// What a client publishes.
-struct Published {
+/// A topic that the client publishes.
+struct ClientPublication {
     publication: Publication,
     form: Form,
 }
 
 type Deliveries = SelectAll<BoxStream<'static, (u32, Delivery)>>;
 
-/// What nodes are asked.
-enum Question {
+/// A request to nodes about their parameters.
+enum ParameterRequest {
     Get(Vec<String>),
     Set(Vec<Parameter>),
 }
 
-impl Question {
+impl ParameterRequest {
     fn names(&self) -> usize {
         match self {
             Self::Get(names) => names.len(),
@@ -93,16 +95,16 @@ impl Question {
     }
 }
 
-/// What came of work that was done beside.
-enum Done {
+/// The result of a job that ran beside the connection.
+enum JobResult {
     Called { service: u32, call: u32, encoding: String, reply: Result<Bytes, Refusal> },
     Parameters { id: Option<String>, is_asked: bool, answer: Answer },
 }
 
-/// What a connection waits for.
+/// An event that the connection waits for.
 enum Event {
     Frame(Option<Result<Frame, SocketError>>),
-    Done(Done),
+    JobDone(JobResult),
     Message(u32, Delivery),
     ParametersChanged(Option<Delivery>),
     GraphChanged,
@@ -118,19 +120,19 @@ pub(super) struct Connection<'o> {
     outbox: &'o Outbox,
     channels: Listing,
     services: Listing,
-    /// How often definitions were looked for.
+    /// The number of searches for missing type definitions.
     attempt: u64,
     looked_at: Instant,
     is_first: bool,
-    heard: BTreeMap<u32, Heard>,
+    heard: BTreeMap<u32, TopicSubscription>,
     heard_channels: HashSet<u32>,
     deliveries: Deliveries,
-    published: BTreeMap<u32, Published>,
-    jobs: FuturesUnordered<BoxFuture<'static, Done>>,
+    published: BTreeMap<u32, ClientPublication>,
+    jobs: FuturesUnordered<BoxFuture<'static, JobResult>>,
     parameter_jobs: usize,
     connections: Option<Connections>,
     parameters: Arc<Parameters>,
-    watched: Watched,
+    watched: WatchList,
     events: Option<Subscription>,
     statuses: BTreeMap<String, String>,
 }
@@ -154,13 +156,13 @@ impl<'o> Connection<'o> {
             jobs: FuturesUnordered::new(),
             parameter_jobs: 0,
             connections: None,
-            watched: Watched::default(),
+            watched: WatchList::default(),
             events: None,
             statuses: BTreeMap::new(),
         }
     }
 
-    /// Serves until the client goes, or has to.
+    /// Serves the client until it leaves or must leave.
     pub(super) async fn run<R>(&mut self, frames: &mut R) -> Result<(), FoxgloveError>
     where
         R: Stream<Item = Result<Frame, SocketError>> + Unpin + Send,
@@ -176,7 +178,7 @@ impl<'o> Connection<'o> {
             let at = tell_at.unwrap_or_else(Instant::now);
             let event = tokio::select! {
                 frame = frames.next(), if has_room && self.jobs.len() < JOBS_MAX => Event::Frame(frame),
-                Some(done) = self.jobs.next(), if has_room => Event::Done(done),
+                Some(done) = self.jobs.next(), if has_room => Event::JobDone(done),
                 Some((id, delivery)) = self.deliveries.next() => Event::Message(id, delivery),
                 event = next_event(&mut self.events), if has_room => Event::ParametersChanged(event),
                 _ = graph.changed(), if tell_at.is_none() => Event::GraphChanged,
@@ -191,7 +193,7 @@ impl<'o> Connection<'o> {
                         None | Some(Ok(Frame::Close(_))) => return Ok(()),
                         Some(Ok(frame)) => {
                             self.frame(frame).await;
-                            self.session.message_is_done();
+                            self.session.finish_message();
                         }
                         Some(Err(error)) => {
                             self.status(Level::Error, &error.to_string(), None);
@@ -199,7 +201,7 @@ impl<'o> Connection<'o> {
                         }
                     }
                 }
-                Event::Done(done) => self.done(done),
+                Event::JobDone(done) => self.done(done),
                 Event::Message(id, delivery) => self.message(id, delivery),
                 Event::ParametersChanged(Some(delivery)) => self.parameter_event(&delivery),
                 Event::ParametersChanged(None) => self.events = None,
@@ -233,7 +235,7 @@ impl<'o> Connection<'o> {
         }
     }
 
-    fn tell(&self, told: &Told<'_>) {
+    fn tell(&self, told: &ServerMessage<'_>) {
         self.outbox.answer(Frame::text(told.to_json()));
     }
 
@@ -246,7 +248,7 @@ impl<'o> Connection<'o> {
         if !scope.call.is_empty() {
             capabilities.extend(["services", "parameters", "parametersSubscribe"]);
         }
-        self.tell(&Told::ServerInfo {
+        self.tell(&ServerMessage::ServerInfo {
             name: &self.options.name,
             capabilities: &capabilities,
             supported_encodings: &ENCODINGS,
@@ -255,7 +257,7 @@ impl<'o> Connection<'o> {
         });
     }
 
-    /// Says something to the user. With an id it is said once, until it is another or taken back.
+    /// Sends a status to the user. A status with an id is sent once, until its text changes or it is removed.
     fn status(&mut self, level: Level, message: &str, id: Option<String>) {
         if let Some(id) = &id {
             if self.statuses.get(id).is_some_and(|said| said == message) {
@@ -266,13 +268,13 @@ impl<'o> Connection<'o> {
             }
             self.statuses.insert(id.clone(), message.to_owned());
         }
-        self.tell(&Told::Status { level: level as u8, message, id: id.as_deref() });
+        self.tell(&ServerMessage::Status { level: level as u8, message, id: id.as_deref() });
     }
 
-    /// Takes back what was said.
+    /// Removes a status.
     fn remove_status(&mut self, id: &str) {
         if self.statuses.remove(id).is_some() {
-            self.tell(&Told::RemoveStatus { status_ids: &[id] });
+            self.tell(&ServerMessage::RemoveStatus { status_ids: &[id] });
         }
     }
 
@@ -283,8 +285,8 @@ impl<'o> Connection<'o> {
                 Err(error) => self.status(Level::Error, &error.to_string(), None),
             },
             Frame::Binary(bytes) => match protocol::read_binary(bytes) {
-                Ok(Sent::Message { channel, payload }) => self.publish(channel, payload).await,
-                Ok(Sent::Call { service, call, encoding, payload }) => {
+                Ok(BinaryMessage::Message { channel, payload }) => self.publish(channel, payload).await,
+                Ok(BinaryMessage::Call { service, call, encoding, payload }) => {
                     self.call(service, call, encoding, payload);
                 }
                 Err(error) => self.status(Level::Error, &error.to_string(), None),
@@ -302,7 +304,7 @@ impl<'o> Connection<'o> {
                 }
                 self.refused(&refused);
             }
-            // A channel that went took its subscription along, and clients end it all the same.
+            // Clients also end subscriptions whose channel is gone, so a missing subscription is no error.
             Command::Unsubscribe { subscription_ids } => {
                 subscription_ids.into_iter().for_each(|id| self.unsubscribe(id));
             }
@@ -322,11 +324,11 @@ impl<'o> Connection<'o> {
                 self.refused(&refused);
             }
             Command::GetParameters { parameter_names, id } => {
-                self.ask_parameters(id, true, Question::Get(parameter_names));
+                self.ask_parameters(id, true, ParameterRequest::Get(parameter_names));
             }
             Command::SetParameters { parameters: wanted, id } => {
                 let is_asked = id.is_some();
-                self.ask_parameters(id, is_asked, Question::Set(wanted));
+                self.ask_parameters(id, is_asked, ParameterRequest::Set(wanted));
             }
             Command::SubscribeParameterUpdates { parameter_names } => {
                 if let Err(error) = self.watch(parameter_names).await {
@@ -348,7 +350,7 @@ impl<'o> Connection<'o> {
         }
     }
 
-    /// Says what was refused of a command.
+    /// Reports the refusals of a command.
     fn refused(&mut self, refused: &Refusals) {
         for refusal in &refused.shown {
             self.status(Level::Error, &refusal.to_string(), None);
@@ -358,8 +360,8 @@ impl<'o> Connection<'o> {
         }
     }
 
-    async fn subscribe(&mut self, wanted: Wanted) -> Result<(), Refusal> {
-        let Wanted { id, channel_id } = wanted;
+    async fn subscribe(&mut self, wanted: SubscribeRequest) -> Result<(), Refusal> {
+        let SubscribeRequest { id, channel_id } = wanted;
         if self.heard.contains_key(&id) {
             return Err(Refusal::SubscriptionTwice(id));
         }
@@ -389,7 +391,7 @@ impl<'o> Connection<'o> {
         let (end, registration) = AbortHandle::new_pair();
         self.deliveries.push(Abortable::new(messages, registration).boxed());
         self.heard_channels.insert(channel_id);
-        let heard = Heard { channel: channel_id, topic, end, dropped_before: 0, reported: 0 };
+        let heard = TopicSubscription { channel: channel_id, topic, end, dropped_before: 0, reported: 0 };
         self.heard.insert(id, heard);
         Ok(())
     }
@@ -410,7 +412,7 @@ impl<'o> Connection<'o> {
         }
     }
 
-    /// Tells of topics whose messages were left out lately, and takes it back where none were.
+    /// Reports topics that lost messages lately, and removes the report for others.
     fn report(&mut self) {
         let mut said = Vec::new();
         for (id, heard) in &mut self.heard {
@@ -447,7 +449,7 @@ impl<'o> Connection<'o> {
         let wanted = Advertise { topic, type_name: Some(schema_name), qos: Qos::default() };
         let publication = self.session.advertise(wanted).await?;
         publication.settle(MATCH_MAX).await;
-        self.published.insert(id, Published { publication, form });
+        self.published.insert(id, ClientPublication { publication, form });
         Ok(())
     }
 
@@ -455,10 +457,10 @@ impl<'o> Connection<'o> {
         let id = format!("publish:{channel}");
         let result = match self.published.get(&channel) {
             None => Err(Refusal::NotAdvertised(channel)),
-            Some(Published { form: Form::Cdr, .. }) if payload.len() < CDR_HEADER_BYTES => {
+            Some(ClientPublication { form: Form::Cdr, .. }) if payload.len() < CDR_HEADER_BYTES => {
                 Err(Refusal::NotSerialised(payload.len()))
             }
-            Some(Published { publication, form }) => {
+            Some(ClientPublication { publication, form }) => {
                 let content = Content { form: *form, bytes: payload };
                 publication.publish(&content).await.map_err(Refusal::Gateway)
             }
@@ -490,15 +492,15 @@ impl<'o> Connection<'o> {
             let reply = session.call(&name, Some(&type_name), &request, form, max).await;
             let reply = reply.map_err(Refusal::Gateway);
             drop(held);
-            Done::Called { service, call, encoding, reply }
+            JobResult::Called { service, call, encoding, reply }
         }));
     }
 
     fn call_failed(&self, service_id: u32, call_id: u32, error: &Refusal) {
-        self.tell(&Told::ServiceCallFailure { service_id, call_id, message: &error.to_string() });
+        self.tell(&ServerMessage::ServiceCallFailure { service_id, call_id, message: &error.to_string() });
     }
 
-    fn ask_parameters(&mut self, id: Option<String>, is_asked: bool, question: Question) {
+    fn ask_parameters(&mut self, id: Option<String>, is_asked: bool, question: ParameterRequest) {
         let (under_way, names) = (self.parameter_jobs, question.names());
         let session = &self.session;
         let bounded = session
@@ -511,23 +513,23 @@ impl<'o> Connection<'o> {
         let parameters = Arc::clone(&self.parameters);
         self.jobs.push(Box::pin(async move {
             let answer = match question {
-                Question::Get(names) => parameters.get(&names).await,
-                Question::Set(wanted) => parameters.set(wanted).await,
+                ParameterRequest::Get(names) => parameters.get(&names).await,
+                ParameterRequest::Set(wanted) => parameters.set(wanted).await,
             };
-            Done::Parameters { id, is_asked, answer }
+            JobResult::Parameters { id, is_asked, answer }
         }));
     }
 
-    fn done(&mut self, done: Done) {
+    fn done(&mut self, done: JobResult) {
         match done {
-            Done::Called { service, call, encoding, reply } => match reply {
+            JobResult::Called { service, call, encoding, reply } => match reply {
                 Ok(reply) => {
                     let response = protocol::service_call_response(service, call, &encoding, &reply);
                     self.outbox.answer(Frame::Binary(response));
                 }
                 Err(error) => self.call_failed(service, call, &error),
             },
-            Done::Parameters { id, is_asked, answer } => {
+            JobResult::Parameters { id, is_asked, answer } => {
                 self.parameter_jobs -= 1;
                 for node in &answer.answered {
                     self.remove_status(&parameters_id(node));
@@ -541,7 +543,10 @@ impl<'o> Connection<'o> {
                     self.status(Level::Warning, &message, None);
                 }
                 if is_asked {
-                    self.tell(&Told::ParameterValues { parameters: &answer.parameters, id: id.as_deref() });
+                    self.tell(&ServerMessage::ParameterValues {
+                        parameters: &answer.parameters,
+                        id: id.as_deref(),
+                    });
                 }
             }
         }
@@ -557,7 +562,7 @@ impl<'o> Connection<'o> {
                 depth: EVENTS_MAX,
                 ..Subscribe::default()
             };
-            // Who may ask a node may hear of it, whatever topics it has: what others changed is left out.
+            // A client that may ask a node may get its events from any topic. Events of other nodes are filtered out.
             self.events = Some(self.session.subscribe_checked(wanted).await?);
         }
         Ok(())
@@ -566,15 +571,15 @@ impl<'o> Connection<'o> {
     fn parameter_event(&mut self, delivery: &Delivery) {
         let event = self.events.as_ref().map(|events| events.write(&delivery.message, Form::Json));
         if let Some(Ok(event)) = event {
-            let parameters = self.parameters.of_event(&event, &self.watched);
+            let parameters = self.parameters.changes_in_event(&event, &self.watched);
             if !parameters.is_empty() {
-                self.tell(&Told::ParameterValues { parameters: &parameters, id: None });
+                self.tell(&ServerMessage::ParameterValues { parameters: &parameters, id: None });
             }
         }
     }
 }
 
-/// The next event of a subscription, if there is one.
+/// Waits for the next event of a subscription, or forever without one.
 async fn next_event(events: &mut Option<Subscription>) -> Option<Delivery> {
     match events {
         Some(events) => events.next().await,

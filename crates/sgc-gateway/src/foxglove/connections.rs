@@ -1,14 +1,14 @@
-//! [`Connections`]: who publishes, subscribes and serves what, as a client was told, and what has changed since.
+//! [`Connections`]: publishers, subscribers and servers as the client knows them, and the changes since.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::graph::Graph;
 
-use super::protocol::{Providers, Publishers, Subscribers, Told};
+use super::protocol::{Providers, Publishers, ServerMessage, Subscribers};
 
 type Ends = BTreeMap<String, BTreeSet<String>>;
 
-/// What a client was told of who is connected with what.
+/// The connection graph that was sent to a client.
 #[derive(Debug, Default)]
 pub(super) struct Connections {
     publishers: Ends,
@@ -17,9 +17,10 @@ pub(super) struct Connections {
 }
 
 impl Connections {
-    /// Takes the present state; gives what to tell, if anything changed. Of what is left out nothing is said.
+    /// Stores the current state and returns the changes as a message, if there are any. Names for which `is_shown` is
+    /// false are left out.
     pub(super) fn update(&mut self, graph: &Graph, is_shown: impl Fn(&str) -> bool) -> Option<String> {
-        let now = Self::of(graph, is_shown);
+        let now = Self::from_graph(graph, is_shown);
         let published = changes(&self.publishers, &now.publishers);
         let subscribed = changes(&self.subscribers, &now.subscribers);
         let served = changes(&self.servers, &now.servers);
@@ -29,7 +30,7 @@ impl Connections {
         let gone = self.servers.keys().filter(|name| !now.servers.contains_key(*name));
         let removed_services: Vec<_> = gone.cloned().collect();
         *self = now;
-        // What has gone altogether is removed, and not said to have nobody.
+        // A removed topic is listed as removed, not as one without endpoints.
         let stays = |(name, _): &(String, Vec<String>)| removed_topics.binary_search(name).is_err();
         let published = published.into_iter().filter(stays);
         let subscribed = subscribed.into_iter().filter(stays);
@@ -43,7 +44,7 @@ impl Connections {
         if nothing && removed_topics.is_empty() && removed_services.is_empty() {
             return None;
         }
-        let told = Told::ConnectionGraphUpdate {
+        let told = ServerMessage::ConnectionGraphUpdate {
             published_topics: &published,
             subscribed_topics: &subscribed,
             advertised_services: &served,
@@ -53,10 +54,10 @@ impl Connections {
         Some(told.to_json())
     }
 
-    fn of(graph: &Graph, is_shown: impl Fn(&str) -> bool) -> Self {
+    fn from_graph(graph: &Graph, is_shown: impl Fn(&str) -> bool) -> Self {
         let mut all = Self::default();
         for (name, info) in graph.topics.iter().filter(|(name, _)| is_shown(name)) {
-            // An end whose node the network does not tell is told apart by its GUID.
+            // An endpoint whose node is unknown is identified by its GUID.
             let ends = |ends: &[crate::graph::EndpointInfo]| {
                 ends.iter().map(|end| end.node.clone().unwrap_or_else(|| guid_text(&end.guid.0))).collect()
             };
@@ -77,7 +78,7 @@ impl Connections {
     }
 }
 
-/// What is new or other, and what has nobody any more.
+/// Returns the new and changed entries, and the removed entries with an empty list.
 fn changes(before: &Ends, now: &Ends) -> Vec<(String, Vec<String>)> {
     let changed = now.iter().filter(|(name, ends)| before.get(*name) != Some(ends));
     let left = before.keys().filter(|name| !now.contains_key(*name)).map(|name| (name.clone(), Vec::new()));

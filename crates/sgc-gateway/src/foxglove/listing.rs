@@ -1,18 +1,18 @@
-//! [`Listing`]: what a client was told that there is, and how that differs from what there is now. Once for channels, once
-//! for services. A number is never used again.
+//! [`Listing`]: the channels or services that were sent to a client, and how they differ from those that exist now. A
+//! number is never reused.
 
 use std::collections::BTreeMap;
 
-/// What there is to be told of a topic or service.
+/// The type of a topic or service.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Offer {
     pub(super) type_name: String,
-    /// Hash of the type, if the network tells.
+    /// The hash of the type, if the network announces it.
     pub(super) hash: Option<String>,
 }
 
 impl Offer {
-    /// Whether messages look the same, as far as is known.
+    /// Returns `true` if both have the same type, as far as is known.
     fn agrees(&self, other: &Self) -> bool {
         let hashes = self.hash.as_ref().zip(other.hash.as_ref());
         self.type_name == other.type_name && hashes.is_none_or(|(one, other)| one == other)
@@ -22,13 +22,13 @@ impl Offer {
 #[derive(Clone, Debug)]
 struct Entry {
     offer: Offer,
-    /// Its number, if the client was told of it.
+    /// The number, if the client knows the entry.
     id: Option<u32>,
-    /// If nobody knew what it looks like: at which attempt.
+    /// The attempt at which no definition was found.
     unknown_at: Option<u64>,
 }
 
-/// What a client was told that there is.
+/// The topics or services that a client knows.
 #[derive(Debug, Default)]
 pub(super) struct Listing {
     next: u32,
@@ -37,7 +37,7 @@ pub(super) struct Listing {
 }
 
 impl Listing {
-    /// Forgets what is not there any more, or is another now; gives the numbers that this ends.
+    /// Removes entries that are gone or have changed their type. Returns their numbers.
     pub(super) fn retain(&mut self, there: &BTreeMap<String, Offer>) -> Vec<u32> {
         let mut gone = Vec::new();
         self.entries.retain(|name, entry| {
@@ -51,7 +51,7 @@ impl Listing {
         gone
     }
 
-    /// Some of what is to be told: what is new, and what nobody knew at an earlier attempt.
+    /// Returns up to `max` entries to send: new ones, and ones without a definition at an earlier attempt.
     pub(super) fn untold(
         &self,
         there: &BTreeMap<String, Offer>,
@@ -66,7 +66,7 @@ impl Listing {
         untold.map(|(name, offer)| (name.clone(), offer.clone())).collect()
     }
 
-    /// The client is told of something that is known: its number, and the one that it had while it was not.
+    /// Adds an entry whose definition is known. Returns its number and the number it had without a definition.
     pub(super) fn tell(&mut self, name: &str, offer: Offer) -> (u32, Option<u32>) {
         let old = self.entries.get(name).and_then(|entry| entry.id);
         if let Some(old) = old {
@@ -77,7 +77,7 @@ impl Listing {
         (id, old)
     }
 
-    /// Nobody knows what it looks like; with a number it is told of all the same. The number, if it is new.
+    /// Adds an entry whose definition is unknown. If `numbered`, it gets a number. Returns the number if it is new.
     pub(super) fn tell_unknown(
         &mut self,
         name: &str,
@@ -100,18 +100,18 @@ impl Listing {
         self.next
     }
 
-    /// Name and type of what has a number.
+    /// Returns name and type of an entry by its number.
     pub(super) fn get(&self, id: u32) -> Option<(&str, &str)> {
         let name = self.names.get(&id)?;
         Some((name, &self.entries.get(name)?.offer.type_name))
     }
 
-    /// Whether there is something that nobody knew.
+    /// Returns `true` if an entry lacks its definition.
     pub(super) fn has_unknown(&self) -> bool {
         self.entries.values().any(|entry| entry.unknown_at.is_some())
     }
 
-    /// Whether something of a type is among what nobody knew.
+    /// Returns `true` if an entry with this type lacks its definition.
     pub(super) fn is_unknown(&self, type_name: &str) -> bool {
         self.entries.values().any(|entry| entry.unknown_at.is_some() && entry.offer.type_name == type_name)
     }
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_another_gets_another_number() {
+    fn changed_offers_get_new_numbers() {
         let mut listing = Listing::default();
         let now = there(&[("/a", "T"), ("/b", "T")]);
         assert!(listing.retain(&now).is_empty());
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_knew_is_looked_for_again() {
+    fn unknown_definitions_are_looked_up_again() {
         let mut listing = Listing::default();
         let now = there(&[("/a", "T")]);
         let id = listing.tell_unknown("/a", offer("T", None), 1, true).unwrap();

@@ -1,14 +1,15 @@
-//! Foxglove's WebSocket protocol: Foxglove and Lichtblick show a robot, publish, call services and set parameters.
+//! Foxglove's WebSocket protocol, by which Foxglove and Lichtblick show a robot, publish, call services and set
+//! parameters.
 //!
-//! [`serve`] is one client's connection, from the first message on: what leads to it, the upgrade, TLS and who is let in,
-//! is for `server`. The protocol is spoken here rather than by the crate `foxglove`, which has a listener and a hub of
-//! its own: neither a scope for each client nor bounds in bytes can be put into it, and schemas and MCAP come with it.
+//! [`serve`] runs one client's connection from the first message on. The module `server` does the upgrade, TLS and
+//! admission. The crate `foxglove` is not used: it has its own listener and hub, offers neither a scope for each
+//! client nor bounds in bytes, and brings schemas and MCAP with it.
 //!
-//! A connection is one task. It holds nothing that grows with what a client does not take: answers bound what is read,
-//! and messages give way, which the client is told ([`SessionLimits::waiting_bytes_max`](crate::SessionLimits)).
+//! A connection is one task with bounded memory. Unsent answers stop it from reading more requests. Messages beyond
+//! [`SessionLimits::waiting_bytes_max`](crate::SessionLimits) are dropped, and the client learns of that.
 //!
-//! `foxglove.sdk.v1` and `foxglove.websocket.v1` are the same on the wire but for the name: the former adds control of
-//! playback, which is an offer of servers that play recordings.
+//! `foxglove.sdk.v1` and `foxglove.websocket.v1` differ on the wire only by name: the former adds playback control,
+//! which servers of recordings offer.
 
 mod connection;
 mod connections;
@@ -29,36 +30,37 @@ use tokio_tungstenite::tungstenite::Message as Frame;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
-use crate::access::Denied;
-use crate::quota::Waiting;
+use crate::access::Denial;
+use crate::quota::PendingBytes;
 use crate::session::Session;
 use crate::ws::close_reason;
 
 use connection::Connection;
 use outbox::Outbox;
 
-/// WebSocket subprotocols that are this protocol, the one to prefer first.
+/// WebSocket subprotocols of this protocol, the preferred one first.
 pub const SUBPROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 
-/// How long a client has for what waits for it when the connection ends.
+/// Time in which queued answers may be written when the connection ends.
 const FAREWELL_MAX: Duration = Duration::from_secs(1);
 
-/// What connections are to be.
+/// The options of connections.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Options {
-    /// What the server is called; shown beside its address.
+    /// The name of the server, shown beside its address.
     pub name: String,
-    /// ROS 2 distribution that clients are told of: by it Studio knows that this is ROS 2, and the common types.
+    /// The ROS 2 distribution that clients are told. Foxglove learns from it that this is ROS 2, and which common
+    /// types exist.
     pub ros_distro: String,
-    /// By this a client knows again that it came back to the same server.
+    /// An id by which a client recognises the same server after it reconnects.
     pub session_id: String,
-    /// Whether topics and services with a name that begins with `_` are shown, those of actions among them.
+    /// `true` if topics and services whose name has a part that begins with `_` are shown, such as those of actions.
     pub shows_hidden: bool,
-    /// How long a service may take for its reply.
+    /// Time within which a service must reply.
     pub call_max: Duration,
-    /// How often a client is asked whether it is there.
+    /// Interval of pings to the client.
     pub ping_interval: Duration,
-    /// How long nothing may come from a client.
+    /// Longest silence of a client.
     pub silence_max: Duration,
 }
 
@@ -77,27 +79,27 @@ impl Default for Options {
     }
 }
 
-/// Why a connection ended that the client did not end.
+/// The reason why a connection ended without the client's wish.
 #[derive(Debug, thiserror::Error)]
 pub enum FoxgloveError {
-    /// The WebSocket failed, or what came was none.
+    /// The WebSocket failed, or the data was not a WebSocket message.
     #[error("the connection failed: {0}")]
     Socket(#[from] SocketError),
-    /// The client neither sends nor takes anything.
+    /// The client neither sends nor receives anything.
     #[error("nothing came from the client for {silence_ms} ms")]
     Silent {
-        /// For how long.
+        /// The duration of the silence.
         silence_ms: u64,
     },
-    /// The client's right has ended.
+    /// The client's rights ended.
     #[error("the client's right has ended: {0}")]
-    Denied(#[source] Denied),
+    Denied(#[source] Denial),
 }
 
-/// Serves a client until it leaves. To end it earlier, drop the future: what the client had ends with it.
+/// Serves a client until it leaves. Dropping the future ends the connection and everything that the client has.
 ///
 /// # Errors
-/// If the connection fails or the client falls silent; that the client went is none.
+/// The connection failed, the client fell silent or its rights ended. A client that leaves is no error.
 pub async fn serve<S>(
     socket: WebSocketStream<S>,
     session: Arc<Session>,
@@ -107,7 +109,7 @@ where
     S: AsyncRead + AsyncWrite + Unpin + Send,
 {
     let (mut sink, mut frames) = socket.split();
-    let waiting = Waiting::new(session.limits().waiting_bytes_max, session.quota().clone());
+    let waiting = PendingBytes::new(session.limits().waiting_bytes_max, session.quota().clone());
     let outbox = Outbox::new(waiting);
     let mut connection = Connection::new(Arc::clone(&session), options, &outbox);
     let ended = tokio::select! {
@@ -119,7 +121,8 @@ where
     drop(connection);
     let farewell = async {
         if let Err(FoxgloveError::Denied(denied)) = &ended {
-            let reason = CloseFrame { code: CloseCode::Policy, reason: close_reason(denied.told()).into() };
+            let reason =
+                CloseFrame { code: CloseCode::Policy, reason: close_reason(denied.client_message()).into() };
             return sink.send(Frame::Close(Some(reason))).await;
         }
         while let Some(answer) = outbox.pop_answer() {
@@ -134,7 +137,7 @@ where
     }
 }
 
-/// Writes what waits, for as long as that can be.
+/// Writes queued frames until the socket fails.
 async fn write<K>(sink: &mut K, outbox: &Outbox) -> SocketError
 where
     K: Sink<Frame, Error = SocketError> + Unpin,

@@ -1,5 +1,5 @@
-//! [`Outbox`]: what waits for one client to take it. What was asked for goes first, and bounds what is read; messages of
-//! topics wait in lanes, one a subscription, and give way.
+//! [`Outbox`]: the frames queued for one client. Answers go first and limit how much is read. Messages of topics wait
+//! in one lane per subscription and may be dropped.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -9,24 +9,24 @@ use tokio_tungstenite::tungstenite::Message as Frame;
 
 use crate::message::Message;
 use crate::queue::MESSAGE_COST_BYTES;
-use crate::quota::Waiting;
+use crate::quota::PendingBytes;
 
 use super::protocol::message_data;
 
-/// Answers that may wait before nothing more is read from the client.
+/// Most queued answers. At the bound nothing more is read from the client.
 const ANSWERS_MAX: usize = 256;
-/// Bytes of them.
+/// Most bytes of queued answers.
 const ANSWER_BYTES_MAX: usize = 4 << 20;
-/// Messages that may wait for one subscription.
+/// Most queued messages of one subscription.
 pub(super) const LANE_MESSAGES_MAX: usize = 1024;
 
-/// What waits for one client.
+/// The frames queued for one client.
 #[derive(Debug)]
 pub(super) struct Outbox {
     state: Mutex<State>,
-    /// Told when there is something to write.
+    /// Notified when there is a frame to write.
     filled: Notify,
-    /// Told when there is room for answers again.
+    /// Notified when there is room for answers again.
     drained: Notify,
 }
 
@@ -34,11 +34,11 @@ pub(super) struct Outbox {
 struct State {
     answers: VecDeque<Frame>,
     answer_bytes: usize,
-    /// Messages in the order in which they came.
-    messages: BTreeMap<u64, Queued>,
+    /// Messages in the order of their arrival.
+    messages: BTreeMap<u64, QueuedMessage>,
     lanes: BTreeMap<u32, Lane>,
     next: u64,
-    message_bytes: Waiting,
+    message_bytes: PendingBytes,
 }
 
 impl Drop for State {
@@ -48,12 +48,12 @@ impl Drop for State {
 }
 
 #[derive(Debug)]
-struct Queued {
+struct QueuedMessage {
     subscription: u32,
     message: Arc<Message>,
 }
 
-/// What waits for one subscription.
+/// The messages queued for one subscription.
 #[derive(Debug, Default)]
 struct Lane {
     numbers: VecDeque<u64>,
@@ -62,8 +62,8 @@ struct Lane {
 }
 
 impl Outbox {
-    /// Creates an outbox whose messages wait within that.
-    pub(super) fn new(message_bytes: Waiting) -> Self {
+    /// Creates an outbox whose messages are bounded by `message_bytes`.
+    pub(super) fn new(message_bytes: PendingBytes) -> Self {
         let state = State {
             answers: VecDeque::new(),
             answer_bytes: 0,
@@ -79,7 +79,7 @@ impl Outbox {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Puts an answer behind the others, whether there is room or not: who reads looks first.
+    /// Appends an answer even without room. The reader checks for room before it reads.
     pub(super) fn answer(&self, frame: Frame) {
         let mut state = self.lock();
         state.answer_bytes += frame.len();
@@ -88,7 +88,7 @@ impl Outbox {
         self.filled.notify_one();
     }
 
-    /// Whether more may be read, which may need answers.
+    /// Returns `true` if requests may be read that need answers.
     pub(super) fn has_room(&self) -> bool {
         let state = self.lock();
         state.answers.len() < ANSWERS_MAX && state.answer_bytes < ANSWER_BYTES_MAX
@@ -101,7 +101,7 @@ impl Outbox {
         }
     }
 
-    /// Puts a message behind the others of its subscription. Who waits with the most gives way, its oldest first.
+    /// Appends a message of a subscription. For lack of room the lane with the most bytes loses its oldest message.
     pub(super) fn message(&self, subscription: u32, message: Arc<Message>) {
         let cost = cost(&message);
         let mut state = self.lock();
@@ -112,7 +112,7 @@ impl Outbox {
             let most = state.lanes.iter().max_by_key(|(_, lane)| lane.bytes);
             match most.filter(|(_, lane)| lane.bytes > 0).map(|(fullest, _)| *fullest) {
                 Some(fullest) => state.drop_oldest(fullest),
-                // One that is longer than all there may be passes alone.
+                // A message longer than the bound passes alone.
                 None => break,
             }
         }
@@ -122,12 +122,12 @@ impl Outbox {
         let lane = state.lanes.entry(subscription).or_default();
         lane.numbers.push_back(number);
         lane.bytes += cost;
-        state.messages.insert(number, Queued { subscription, message });
+        state.messages.insert(number, QueuedMessage { subscription, message });
         drop(state);
         self.filled.notify_one();
     }
 
-    /// Nothing that waits for a subscription is wanted any more.
+    /// Drops all messages of a subscription.
     pub(super) fn forget(&self, subscription: u32) {
         let mut state = self.lock();
         let Some(lane) = state.lanes.remove(&subscription) else { return };
@@ -137,12 +137,12 @@ impl Outbox {
         }
     }
 
-    /// How many messages of a subscription gave way until now.
+    /// Returns the number of dropped messages of a subscription.
     pub(super) fn dropped(&self, subscription: u32) -> u64 {
         self.lock().lanes.get(&subscription).map_or(0, |lane| lane.dropped)
     }
 
-    /// What is to be written next, if anything waits.
+    /// Returns the next frame to write, if any.
     pub(super) fn pop(&self) -> Option<Frame> {
         let mut state = self.lock();
         if let Some(answer) = state.answers.pop_front() {
@@ -151,7 +151,7 @@ impl Outbox {
             self.drained.notify_one();
             return Some(answer);
         }
-        let (_, Queued { subscription, message }) = state.messages.pop_first()?;
+        let (_, QueuedMessage { subscription, message }) = state.messages.pop_first()?;
         let cost = cost(&message);
         state.message_bytes.sub(cost);
         if let Some(lane) = state.lanes.get_mut(&subscription) {
@@ -162,7 +162,7 @@ impl Outbox {
         Some(Frame::Binary(message_data(subscription, message.received_ns, &message.payload)))
     }
 
-    /// The next answer, if one waits.
+    /// Returns the next answer, if any.
     pub(super) fn pop_answer(&self) -> Option<Frame> {
         let mut state = self.lock();
         let answer = state.answers.pop_front()?;
@@ -170,7 +170,7 @@ impl Outbox {
         Some(answer)
     }
 
-    /// Waits until something may have come since it was asked for last. For one who writes.
+    /// Waits until a frame may have been queued since the last call. Only one task may wait.
     pub(super) async fn filled(&self) {
         self.filled.notified().await;
     }
@@ -204,7 +204,7 @@ mod tests {
     fn outbox(message_bytes_max: usize) -> Outbox {
         let quotas: Arc<crate::quota::Quotas> = Arc::default();
         let quota = quotas.quota(&crate::access::Client::own("test"));
-        Outbox::new(Waiting::new(message_bytes_max, quota))
+        Outbox::new(PendingBytes::new(message_bytes_max, quota))
     }
 
     fn popped(outbox: &Outbox) -> Option<(u8, usize)> {
@@ -229,14 +229,14 @@ mod tests {
     }
 
     #[test]
-    fn who_waits_with_the_most_gives_way() {
+    fn longest_lane_gives_way() {
         let outbox = outbox(4 * (1000 + MESSAGE_COST_BYTES));
         outbox.message(7, message(10));
         for _ in 0..5 {
             outbox.message(1, message(1000));
         }
         assert_eq!((outbox.dropped(1), outbox.dropped(7)), (2, 0));
-        // One that is longer than all there may be comes alone.
+        // A message longer than the bound passes alone.
         outbox.message(2, message(100_000));
         assert_eq!((outbox.dropped(1), outbox.dropped(7)), (5, 1));
         assert_eq!(popped(&outbox), Some((2, 100_000)));
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn one_subscription_has_so_many_at_most() {
+    fn messages_of_a_subscription_are_bounded() {
         let outbox = outbox(usize::MAX);
         for _ in 0..LANE_MESSAGES_MAX + 3 {
             outbox.message(1, message(0));

@@ -1,7 +1,7 @@
-//! Parameters of nodes, by the services that each node has for its own (`rcl_interfaces`). A parameter is called
-//! `/node.name`, as Foxglove's own bridge calls it.
+//! Parameters of nodes, by the services that each node offers for them (`rcl_interfaces`). A parameter is named
+//! `/node.name`, as in Foxglove's own bridge.
 //!
-//! A client may have those of a node whose services it may call.
+//! A client may access the parameters of a node whose services it may call.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -22,58 +22,58 @@ use crate::session::Session;
 use super::protocol::{Parameter, ParameterKind};
 use super::refusal::Refusal;
 
-/// Topic on which nodes tell of changes, and its type.
+/// The topic on which nodes announce changes, and its type.
 pub(super) const EVENTS: (&str, &str) = ("/parameter_events", "rcl_interfaces/msg/ParameterEvent");
 const LIST: (&str, &str) = ("/list_parameters", "rcl_interfaces/srv/ListParameters");
 const GET: (&str, &str) = ("/get_parameters", "rcl_interfaces/srv/GetParameters");
 const SET: (&str, &str) = ("/set_parameters", "rcl_interfaces/srv/SetParameters");
 
-/// How long a node may take for an answer.
+/// Time within which a node must answer.
 const ANSWER_MAX: Duration = Duration::from_secs(3);
-/// How long all nodes together may take; those that took longer are left out.
+/// Time for all nodes together. Slower ones are left out.
 const ALL_MAX: Duration = Duration::from_secs(8);
-/// How long a node that did not answer is not asked for all of its parameters again.
+/// Time for which a node that did not answer is left out of requests for all parameters.
 const SILENT_FOR: Duration = Duration::from_secs(60);
-/// Nodes asked at a time.
+/// Most nodes that are asked at a time.
 const NODES_AT_ONCE: usize = 8;
-/// Nodes of one request.
+/// Most nodes of one request.
 const NODES_MAX: usize = 1024;
-/// Parameters of one node.
+/// Most parameters of one node.
 const NODE_PARAMETERS_MAX: usize = 4096;
-/// Parameters of one question, and of one answer.
+/// Most parameters of one request, and of one answer.
 pub(super) const ASKED_MAX: usize = 16_384;
-/// Parameters asked for at once: an answer has all of their values.
+/// Most parameters asked of a node at once, because the answer holds all their values.
 const ASKED_AT_ONCE: usize = 128;
-/// Failures of one question that are said, each for itself.
+/// Most failures of one request that are listed individually.
 const FAILURES_MAX: usize = 16;
-/// Longest name and longest reason that are said of one, characters.
+/// Longest name and longest reason of a failure, in characters.
 const FAILURE_MAX: usize = 512;
-/// Parameters that a client may hear of; with all, any number.
+/// Most parameters that a client may watch by name.
 pub(super) const WATCHED_MAX: usize = 16_384;
 
 /// Gets and sets parameters for one client.
 #[derive(Debug)]
 pub(super) struct Parameters {
     session: Arc<Session>,
-    /// Nodes that did not answer, and since when.
+    /// Nodes that did not answer, with the time of the attempt.
     silent: Mutex<BTreeMap<String, Instant>>,
 }
 
-/// What came of asking nodes.
+/// The result of asking nodes.
 #[derive(Debug, Default)]
 pub(super) struct Answer {
     pub(super) parameters: Vec<Parameter>,
-    /// Nodes that answered all they were asked.
+    /// Nodes that answered the request in full.
     pub(super) answered: Vec<String>,
-    /// What did not succeed.
+    /// The failures.
     pub(super) failed: Failures,
 }
 
-/// Nodes that did not answer, parameters that are none or that a node did not set, and why.
+/// Failures with their reasons: nodes that did not answer, invalid names, and values that a node refused.
 #[derive(Debug, Default)]
 pub(super) struct Failures {
     pub(super) shown: Vec<(String, String)>,
-    /// Those that are only counted.
+    /// The number of failures that are not listed.
     pub(super) more: usize,
 }
 
@@ -91,7 +91,7 @@ impl Failures {
     }
 }
 
-/// The beginning of a text.
+/// Returns the beginning of a text.
 fn clip(text: &str) -> String {
     match text.char_indices().nth(FAILURE_MAX) {
         Some((end, _)) => format!("{}…", text.get(..end).unwrap_or_default()),
@@ -100,22 +100,22 @@ fn clip(text: &str) -> String {
 }
 
 #[derive(Deserialize)]
-struct Listed {
-    result: ListedResult,
+struct ListResponse {
+    result: ListResult,
 }
 
 #[derive(Deserialize)]
-struct ListedResult {
+struct ListResult {
     names: Vec<String>,
 }
 
 #[derive(Deserialize)]
-struct Got {
+struct GetResponse {
     values: Vec<RosValue>,
 }
 
 #[derive(Deserialize)]
-struct SetAnswer {
+struct SetResponse {
     results: Vec<SetResult>,
 }
 
@@ -156,7 +156,7 @@ struct RosValue {
     string_array_value: Vec<String>,
 }
 
-// Of `rcl_interfaces/msg/ParameterType`.
+// Values of `rcl_interfaces/msg/ParameterType`.
 const NOT_SET: u8 = 0;
 const BOOL: u8 = 1;
 const INTEGER: u8 = 2;
@@ -168,7 +168,7 @@ const INTEGER_ARRAY: u8 = 7;
 const DOUBLE_ARRAY: u8 = 8;
 const STRING_ARRAY: u8 = 9;
 
-/// A full name's node and parameter.
+/// Splits a full name into node and parameter.
 pub(super) fn split(full: &str) -> Option<(&str, &str)> {
     full.split_once('.').filter(|(node, name)| node.starts_with('/') && node.len() > 1 && !name.is_empty())
 }
@@ -182,7 +182,7 @@ impl Parameters {
         Self { session, silent: Mutex::default() }
     }
 
-    /// Whether the client may have the parameters of a node.
+    /// Returns `true` if the client may access the parameters of a node.
     fn may_get(&self, node: &str) -> bool {
         self.session.check(Right::Call, &format!("{node}{}", GET.0)).is_ok()
     }
@@ -195,11 +195,11 @@ impl Parameters {
     ) -> Result<T, Refusal> {
         let (service, request) = (format!("{node}{suffix}"), Content::json(request.to_string()));
         let reply = self.session.call(&service, Some(type_name), &request, Form::Json, ANSWER_MAX).await?;
-        // It is of that type, so it fails for texts that are not UTF-8.
+        // The text is valid JSON of this type, except for strings that are not UTF-8.
         serde_json::from_slice(&reply).map_err(|_| Refusal::Text)
     }
 
-    /// Nodes that have parameters, and are not known to be silent.
+    /// Returns the nodes that have parameters and are not known to be silent.
     fn nodes(&self) -> Vec<String> {
         let services = self.session.hub().graph();
         let names =
@@ -215,7 +215,7 @@ impl Parameters {
         nodes.take(NODES_MAX).map(str::to_owned).collect()
     }
 
-    /// The parameters of these names, or all that the client may have.
+    /// Gets parameters by name, or all that the client may access if no name is given.
     pub(super) async fn get(&self, names: &[String]) -> Answer {
         let mut answer = Answer::default();
         let mut nodes: BTreeMap<String, Option<Vec<String>>> = BTreeMap::new();
@@ -234,7 +234,7 @@ impl Parameters {
         let until = Instant::now() + ALL_MAX;
         let mut left: BTreeSet<String> = nodes.keys().cloned().collect();
         let ask = |(node, names): (String, Option<Vec<String>>)| async move {
-            let got = self.of_node(&node, names).await;
+            let got = self.get_of_node(&node, names).await;
             (node, got)
         };
         let mut asked = stream::iter(nodes).map(ask).buffer_unordered(NODES_AT_ONCE);
@@ -254,7 +254,7 @@ impl Parameters {
                         Refusal::Gateway(GatewayError::Timeout { .. } | GatewayError::NoServer { .. })
                     ) {
                         let mut silent = self.silent.lock().unwrap_or_else(PoisonError::into_inner);
-                        // Of nodes that are only made up there are as many as a client likes.
+                        // A client can invent any number of nodes, so the table is bounded.
                         if silent.len() < NODES_MAX {
                             silent.insert(node.clone(), Instant::now());
                         }
@@ -268,12 +268,12 @@ impl Parameters {
         answer
     }
 
-    async fn of_node(&self, node: &str, names: Option<Vec<String>>) -> Result<Vec<Parameter>, Refusal> {
+    async fn get_of_node(&self, node: &str, names: Option<Vec<String>>) -> Result<Vec<Parameter>, Refusal> {
         let mut names = match names {
             Some(names) => names,
             None => {
                 let request = json!({"prefixes": [], "depth": 0});
-                let listed: Listed = self.ask(node, LIST, &request).await?;
+                let listed: ListResponse = self.ask(node, LIST, &request).await?;
                 listed.result.names
             }
         };
@@ -287,22 +287,22 @@ impl Parameters {
         Ok(parameters)
     }
 
-    /// Values of parameters in that order; what is not there is not set.
+    /// Returns values in the order of their names. A missing parameter counts as not set.
     async fn values(&self, node: &str, names: &[String]) -> Result<Vec<RosValue>, Refusal> {
-        let got: Got = self.ask(node, GET, &json!({"names": names})).await?;
+        let got: GetResponse = self.ask(node, GET, &json!({"names": names})).await?;
         if got.values.len() == names.len() {
             return Ok(got.values);
         }
-        // Nodes answer with nothing at all if one of the names is not declared.
+        // A node answers with an empty list if one of the names is not declared.
         let mut values = Vec::with_capacity(names.len());
         for name in names {
-            let got: Got = self.ask(node, GET, &json!({"names": [name]})).await?;
+            let got: GetResponse = self.ask(node, GET, &json!({"names": [name]})).await?;
             values.push(got.values.into_iter().next().unwrap_or_default());
         }
         Ok(values)
     }
 
-    /// Sets parameters, and answers with what they are then.
+    /// Sets parameters and returns their values afterwards.
     pub(super) async fn set(&self, wanted: Vec<Parameter>) -> Answer {
         let mut answer = Answer::default();
         let mut nodes: BTreeMap<String, Vec<(String, Parameter)>> = BTreeMap::new();
@@ -334,14 +334,14 @@ impl Parameters {
         answer
     }
 
-    /// Gives those that were refused, and why.
+    /// Sets parameters of one node and returns the refused ones with the reasons.
     async fn set_of_node(
         &self,
         node: &str,
         parameters: Vec<(String, Parameter)>,
     ) -> Result<Failures, Refusal> {
         let names: Vec<_> = parameters.iter().map(|(name, _)| name.clone()).collect();
-        // What a number is meant to be is known by what is there: JSON has one kind of them.
+        // JSON has one kind of number, so the current value decides between integer and double.
         let present = self.values(node, &names).await.unwrap_or_default();
         let (mut refused, mut sent, mut request) = (Failures::default(), Vec::new(), Vec::new());
         for (at, (name, parameter)) in parameters.into_iter().enumerate() {
@@ -354,15 +354,15 @@ impl Parameters {
             }
         }
         if !request.is_empty() {
-            let set: SetAnswer = self.ask(node, SET, &json!({"parameters": request})).await?;
+            let set: SetResponse = self.ask(node, SET, &json!({"parameters": request})).await?;
             let results = sent.into_iter().zip(set.results).filter(|(_, result)| !result.successful);
             refused.extend(results.map(|(name, result)| (name, result.reason)));
         }
         Ok(refused)
     }
 
-    /// What an event says of what the client hears of, and may have.
-    pub(super) fn of_event(&self, event: &[u8], watched: &Watched) -> Vec<Parameter> {
+    /// Returns the changes in an event that the client watches and may see.
+    pub(super) fn changes_in_event(&self, event: &[u8], watched: &WatchList) -> Vec<Parameter> {
         let Ok(event) = serde_json::from_slice::<RosEvent>(event) else { return Vec::new() };
         if !self.may_get(&event.node) {
             return Vec::new();
@@ -384,15 +384,15 @@ fn not_a_parameter(name: &str) -> String {
     format!("{name:?} is no parameter: write one such as /camera.exposure")
 }
 
-/// Of which parameters a client hears.
+/// The parameters that a client watches.
 #[derive(Debug, Default)]
-pub(super) struct Watched {
+pub(super) struct WatchList {
     names: BTreeSet<String>,
     all: bool,
 }
 
-impl Watched {
-    /// Adds some; none of them is all. Refuses those beyond [`WATCHED_MAX`].
+impl WatchList {
+    /// Adds names; an empty list means all parameters. Fails beyond [`WATCHED_MAX`].
     pub(super) fn add(&mut self, names: Vec<String>) -> Result<(), GatewayError> {
         self.all |= names.is_empty();
         for name in names {
@@ -407,7 +407,7 @@ impl Watched {
         Ok(())
     }
 
-    /// Takes some away; none of them is all.
+    /// Removes names; an empty list means all parameters.
     pub(super) fn remove(&mut self, names: &[String]) {
         if names.is_empty() {
             *self = Self::default();
@@ -442,7 +442,8 @@ fn to_parameter(name: String, value: RosValue) -> Parameter {
     Parameter { name, value, kind }
 }
 
-/// A value as nodes take it. What JSON does not tell is told by the client, else by what is there.
+/// Converts a value to the form that nodes take. The client's type, else the current type, resolves what JSON leaves
+/// open.
 fn to_ros(parameter: Parameter, present: Option<u8>) -> Result<Value, String> {
     let Parameter { name, value, kind } = parameter;
     let wrong = |what: &str| Err(format!("{name} cannot be {what}"));
@@ -457,7 +458,7 @@ fn to_ros(parameter: Parameter, present: Option<u8>) -> Result<Value, String> {
         Some(value @ Value::Number(_)) => of(INTEGER, "integer_value", value),
         Some(value @ Value::String(_)) => match kind {
             Some(ParameterKind::ByteArray) => of(BYTE_ARRAY, "byte_array_value", value),
-            // What is no number in JSON is a text.
+            // A value such as `NaN` is a string in JSON.
             Some(ParameterKind::Float64) => of(DOUBLE, "double_value", value),
             _ => of(STRING, "string_value", value),
         },
@@ -555,8 +556,8 @@ mod tests {
     }
 
     #[test]
-    fn what_is_listened_to_is_bounded_and_none_is_all() {
-        let mut watched = Watched::default();
+    fn watch_list_is_bounded_and_an_empty_one_means_all() {
+        let mut watched = WatchList::default();
         watched.add(vec!["/n.a".into()]).unwrap();
         assert!(watched.has("/n.a") && !watched.has("/n.b"));
         watched.add(Vec::new()).unwrap();

@@ -1,63 +1,63 @@
-//! What client and server say to each other (Foxglove WebSocket protocol, version 1): texts of JSON with an `op`, and
-//! binary messages with an opcode, little endian. It knows no socket and no topic.
+//! The messages of the Foxglove WebSocket protocol, version 1: JSON texts with an `op`, and binary messages with an
+//! opcode, little endian. This module knows no socket and no topic.
 
 use bytes::{BufMut, Bytes, BytesMut};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-/// Longest text that is read, bytes: what is long comes in binary messages.
+/// Longest accepted text, in bytes. Long data travels in binary messages.
 const TEXT_BYTES_MAX: usize = 1 << 20;
-/// Longest name of a parameter, bytes.
+/// Longest name of a parameter, in bytes.
 const PARAMETER_NAME_BYTES_MAX: usize = 1024;
-/// Opcodes of binary messages of the server.
+/// Opcodes of binary messages from the server.
 const MESSAGE_DATA: u8 = 1;
 const SERVICE_CALL_RESPONSE: u8 = 3;
 const FETCH_ASSET_RESPONSE: u8 = 4;
-/// Opcodes of binary messages of clients.
+/// Opcodes of binary messages from clients.
 const CLIENT_MESSAGE_DATA: u8 = 1;
 const SERVICE_CALL_REQUEST: u8 = 2;
-/// Status of an answer that has no asset.
+/// The status of an answer without an asset.
 const ASSET_ERROR: u8 = 1;
 
-/// Why what a client sent is nothing of the protocol.
+/// The reason why a client's message is invalid.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub(super) enum ProtocolError {
-    /// A text that is none of its messages.
+    /// The text is not a message of the protocol.
     #[error("not a message of this protocol: {0}")]
     Json(String),
-    /// A text that is too long.
+    /// The text is too long.
     #[error("a text of {bytes} bytes: at most {TEXT_BYTES_MAX}")]
     TooLong {
-        /// Its length.
+        /// The length in bytes.
         bytes: usize,
     },
-    /// The name of a parameter that is too long.
+    /// The name of a parameter is too long.
     #[error("the name of a parameter has {bytes} bytes: at most {PARAMETER_NAME_BYTES_MAX}")]
     ParameterName {
-        /// Its length.
+        /// The length in bytes.
         bytes: usize,
     },
-    /// A binary message with another opcode.
+    /// The opcode is unknown.
     #[error(
         "no binary message has opcode {0}: clients send {CLIENT_MESSAGE_DATA} (a message) and {SERVICE_CALL_REQUEST} (a call)"
     )]
     Opcode(u8),
-    /// A binary message that ends too early.
+    /// The binary message is truncated.
     #[error("a binary message of {bytes} bytes, which says that there are more")]
     TooShort {
-        /// Its length.
+        /// The length in bytes.
         bytes: usize,
     },
-    /// An encoding is no text.
+    /// The name of an encoding is not UTF-8.
     #[error("the name of an encoding is not UTF-8")]
     Encoding,
 }
 
-/// What a client asks for in a text.
+/// A request in a text message of a client.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(tag = "op", rename_all = "camelCase", rename_all_fields = "camelCase")]
 pub(super) enum Command {
-    Subscribe { subscriptions: Vec<Wanted> },
+    Subscribe { subscriptions: Vec<SubscribeRequest> },
     Unsubscribe { subscription_ids: Vec<u32> },
     Advertise { channels: Vec<ClientChannel> },
     Unadvertise { channel_ids: Vec<u32> },
@@ -71,7 +71,7 @@ pub(super) enum Command {
 }
 
 impl Command {
-    /// The parameters that it is about.
+    /// Returns the parameter names in the request.
     fn parameter_names(&self) -> impl Iterator<Item = &str> {
         let (names, parameters): (&[String], &[Parameter]) = match self {
             Self::GetParameters { parameter_names, .. }
@@ -84,15 +84,15 @@ impl Command {
     }
 }
 
-/// A subscription that is asked for.
+/// A requested subscription.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "camelCase")]
-pub(super) struct Wanted {
+pub(super) struct SubscribeRequest {
     pub(super) id: u32,
     pub(super) channel_id: u32,
 }
 
-/// What a client is going to publish.
+/// A channel on which a client will publish.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct ClientChannel {
@@ -106,37 +106,37 @@ pub(super) struct ClientChannel {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Parameter {
     pub(super) name: String,
-    /// None where it is not set.
+    /// The value; `None` if the parameter is not set.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) value: Option<Value>,
-    /// Where JSON does not tell the type.
+    /// The type, where JSON leaves it open.
     #[serde(rename = "type", default, skip_serializing_if = "Option::is_none")]
     pub(super) kind: Option<ParameterKind>,
 }
 
-/// Types of parameters that JSON does not tell.
+/// The types of parameters that JSON does not distinguish.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum ParameterKind {
-    /// Text in base64.
+    /// Bytes as text in base64.
     ByteArray,
-    /// A number, whole or not.
+    /// A number, with or without a fraction.
     Float64,
-    /// Numbers, whole or not.
+    /// Numbers, with or without fractions.
     Float64Array,
 }
 
-/// What a client sends in a binary message.
+/// A binary message from a client.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Sent {
+pub(super) enum BinaryMessage {
     Message { channel: u32, payload: Bytes },
     Call { service: u32, call: u32, encoding: String, payload: Bytes },
 }
 
-/// What the server says in a text.
+/// A text message from the server.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "op", rename_all = "camelCase", rename_all_fields = "camelCase")]
-pub(super) enum Told<'a> {
+pub(super) enum ServerMessage<'a> {
     ServerInfo {
         name: &'a str,
         capabilities: &'a [&'static str],
@@ -184,9 +184,9 @@ pub(super) enum Told<'a> {
     },
 }
 
-impl Told<'_> {
+impl ServerMessage<'_> {
     pub(super) fn to_json(&self) -> String {
-        // Nothing in it has keys that are no texts.
+        // Serialisation cannot fail, because all keys are strings.
         serde_json::to_string(self).unwrap_or_default()
     }
 }
@@ -197,7 +197,7 @@ pub(super) struct Metadata<'a> {
     pub(super) ros_distro: &'a str,
 }
 
-/// A channel: a topic that may be subscribed to.
+/// A channel: a topic that clients may subscribe to.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Channel {
@@ -209,7 +209,7 @@ pub(super) struct Channel {
     pub(super) schema_encoding: &'static str,
 }
 
-/// A service that may be called.
+/// A service that clients may call.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(super) struct Service {
     pub(super) id: u32,
@@ -220,7 +220,7 @@ pub(super) struct Service {
     pub(super) response: Half,
 }
 
-/// What one half of a service looks like.
+/// The schema of a request or reply.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Half {
@@ -251,7 +251,7 @@ pub(super) struct Providers {
     pub(super) provider_ids: Vec<String>,
 }
 
-/// Reads a text.
+/// Parses a text.
 pub(super) fn read_text(text: &str) -> Result<Command, ProtocolError> {
     if text.len() > TEXT_BYTES_MAX {
         return Err(ProtocolError::TooLong { bytes: text.len() });
@@ -265,8 +265,8 @@ pub(super) fn read_text(text: &str) -> Result<Command, ProtocolError> {
     }
 }
 
-/// Reads a binary message, whose payload is not copied.
-pub(super) fn read_binary(mut bytes: Bytes) -> Result<Sent, ProtocolError> {
+/// Parses a binary message without copying its payload.
+pub(super) fn read_binary(mut bytes: Bytes) -> Result<BinaryMessage, ProtocolError> {
     let length = bytes.len();
     let too_short = ProtocolError::TooShort { bytes: length };
     let mut take = |count: usize| {
@@ -278,19 +278,19 @@ pub(super) fn read_binary(mut bytes: Bytes) -> Result<Sent, ProtocolError> {
         word.as_ref().try_into().map(u32::from_le_bytes).map_err(|_| too_short.clone())
     };
     match opcode.first().copied() {
-        Some(CLIENT_MESSAGE_DATA) => Ok(Sent::Message { channel: word()?, payload: bytes }),
+        Some(CLIENT_MESSAGE_DATA) => Ok(BinaryMessage::Message { channel: word()?, payload: bytes }),
         Some(SERVICE_CALL_REQUEST) => {
             let (service, call, length) = (word()?, word()?, word()?);
             let encoding = take(usize::try_from(length).unwrap_or(usize::MAX))?;
             let encoding = String::from_utf8(encoding.into()).map_err(|_| ProtocolError::Encoding)?;
-            Ok(Sent::Call { service, call, encoding, payload: bytes })
+            Ok(BinaryMessage::Call { service, call, encoding, payload: bytes })
         }
         Some(other) => Err(ProtocolError::Opcode(other)),
         None => Err(too_short),
     }
 }
 
-/// A message for a subscription, received at that time, nanoseconds since the Unix epoch.
+/// Encodes a message for a subscription. `received_ns` is in nanoseconds since the Unix epoch.
 pub(super) fn message_data(subscription: u32, received_ns: i64, payload: &[u8]) -> Bytes {
     let mut bytes = BytesMut::with_capacity(13 + payload.len());
     bytes.put_u8(MESSAGE_DATA);
@@ -300,7 +300,7 @@ pub(super) fn message_data(subscription: u32, received_ns: i64, payload: &[u8]) 
     bytes.freeze()
 }
 
-/// The answer to a call, in the encoding that the call came in.
+/// Encodes the reply to a call, in the encoding of the call.
 pub(super) fn service_call_response(service: u32, call: u32, encoding: &str, payload: &[u8]) -> Bytes {
     let mut bytes = BytesMut::with_capacity(13 + encoding.len() + payload.len());
     bytes.put_u8(SERVICE_CALL_RESPONSE);
@@ -312,7 +312,7 @@ pub(super) fn service_call_response(service: u32, call: u32, encoding: &str, pay
     bytes.freeze()
 }
 
-/// The answer to who asks for an asset that it is not given.
+/// Encodes the refusal of an asset.
 pub(super) fn asset_refusal(request: u32, message: &str) -> Bytes {
     let mut bytes = BytesMut::with_capacity(10 + message.len());
     bytes.put_u8(FETCH_ASSET_RESPONSE);
@@ -332,7 +332,7 @@ mod tests {
         let read = |text: &str| read_text(text).unwrap();
         assert_eq!(
             read(r#"{"op":"subscribe","subscriptions":[{"id":0,"channelId":7}]}"#),
-            Command::Subscribe { subscriptions: vec![Wanted { id: 0, channel_id: 7 }] }
+            Command::Subscribe { subscriptions: vec![SubscribeRequest { id: 0, channel_id: 7 }] }
         );
         assert_eq!(
             read(r#"{"op":"getParameters","parameterNames":[]}"#),
@@ -373,12 +373,12 @@ mod tests {
         let read = |bytes: &[u8]| read_binary(Bytes::copy_from_slice(bytes));
         assert_eq!(
             read(&[1, 2, 0, 0, 0, 9, 9]).unwrap(),
-            Sent::Message { channel: 2, payload: vec![9, 9].into() }
+            BinaryMessage::Message { channel: 2, payload: vec![9, 9].into() }
         );
         let call = [2, 1, 0, 0, 0, 2, 0, 0, 0, 3, 0, 0, 0, b'c', b'd', b'r', 5];
         assert_eq!(
             read(&call).unwrap(),
-            Sent::Call { service: 1, call: 2, encoding: "cdr".into(), payload: vec![5].into() }
+            BinaryMessage::Call { service: 1, call: 2, encoding: "cdr".into(), payload: vec![5].into() }
         );
         for end in 0..call.len() - 1 {
             assert_eq!(read(&call[..end]), Err(ProtocolError::TooShort { bytes: end }));
@@ -391,10 +391,10 @@ mod tests {
     }
 
     #[test]
-    fn what_is_said_is_as_the_protocol_has_it() {
-        let status = Told::Status { level: 1, message: "slow", id: Some("dropped:/a") };
+    fn messages_are_encoded_as_specified() {
+        let status = ServerMessage::Status { level: 1, message: "slow", id: Some("dropped:/a") };
         assert_eq!(status.to_json(), r#"{"op":"status","level":1,"message":"slow","id":"dropped:/a"}"#);
-        let gone = Told::Unadvertise { channel_ids: &[1, 2] };
+        let gone = ServerMessage::Unadvertise { channel_ids: &[1, 2] };
         assert_eq!(gone.to_json(), r#"{"op":"unadvertise","channelIds":[1,2]}"#);
         assert_eq!(message_data(1, 2, &[3])[..], [1, 1, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 3]);
         assert_eq!(

@@ -1,22 +1,22 @@
-//! [`Refusal`]: why a client does not get what it asks for, beyond what the gateway refuses to any.
+//! [`Refusal`]: the reasons specific to this protocol for which a request is refused.
 
 use crate::error::GatewayError;
 
-/// Things of one command that are said to be refused, each for itself.
+/// Most refusals of one command that are listed individually.
 const SHOWN_MAX: usize = 16;
-/// Longest name of an encoding that is echoed, characters.
+/// Longest echoed name of an encoding, in characters.
 const ENCODING_MAX: usize = 64;
 
-/// What was refused of one command, which may have asked for any number of things.
+/// The refusals of one command, which may hold any number of requests.
 #[derive(Debug, Default)]
 pub(super) struct Refusals {
     pub(super) shown: Vec<Refusal>,
-    /// Those that are only counted.
+    /// The number of refusals that are not listed.
     pub(super) more: usize,
 }
 
 impl Refusals {
-    /// Notes what did not succeed.
+    /// Records a result if it is a refusal.
     pub(super) fn note(&mut self, done: Result<(), Refusal>) {
         match done {
             Ok(()) => {}
@@ -26,40 +26,40 @@ impl Refusals {
     }
 }
 
-/// Why a client does not get what it asks for.
+/// The reason why a request is refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub(super) enum Refusal {
-    /// A number that no channel has, or none any more.
+    /// No channel has this number.
     #[error("there is no channel {0}")]
     Channel(u32),
-    /// A number that no service has, or none any more.
+    /// No service has this number.
     #[error("there is no service {0}")]
     Service(u32),
-    /// A number of a channel that the client has not advertised.
+    /// The client has not advertised a channel with this number.
     #[error("channel {0} is not advertised by this client")]
     NotAdvertised(u32),
-    /// A number of a channel that it has.
+    /// The client has already advertised a channel with this number.
     #[error("channel {0} is advertised by this client already")]
     AdvertisedTwice(u32),
-    /// A number of a subscription that it has.
+    /// The client has already a subscription with this number.
     #[error("subscription {0} is in use already")]
     SubscriptionTwice(u32),
-    /// An encoding of another system.
+    /// The encoding is not supported.
     #[error("{0:?} is no encoding of this server: it takes \"cdr\" and \"json\"")]
     Encoding(String),
-    /// No serialised message.
+    /// The payload is not a serialised message.
     #[error("{0} bytes are no serialised message: it begins with a header of four")]
     NotSerialised(usize),
-    /// An answer of a node that is no JSON.
+    /// The answer of a node contains a string that is not UTF-8.
     #[error("a text among its parameters is not UTF-8")]
     Text,
-    /// What the gateway refuses.
+    /// The gateway refuses the request.
     #[error(transparent)]
     Gateway(#[from] GatewayError),
 }
 
 impl Refusal {
-    /// An encoding of another system, whatever its length.
+    /// Creates a refusal for an encoding and cuts its name.
     pub(super) fn encoding(name: &str) -> Self {
         Self::Encoding(name.chars().take(ENCODING_MAX).collect())
     }

@@ -1,4 +1,4 @@
-//! `SendGoal` and `ServeAction`: goals that a client sends, and those that it serves.
+//! `SendGoal` and `ServeAction`: goals that a client sends, and actions that it serves.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -6,8 +6,8 @@ use std::time::Duration;
 use futures_util::FutureExt as _;
 use tonic::{Response, Status, Streaming};
 
-use super::client::{Guest, Place, Taken};
-use super::conversation::{Conversation, Told, begin, first};
+use super::client::{Guest, Place, StreamKind};
+use super::conversation::{Conversation, Responder, begin, first};
 use super::fault::Fault;
 use super::proto::send_goal_request::{Goal as GoalSaid, Kind as Asked};
 use super::proto::send_goal_response as sent;
@@ -22,20 +22,20 @@ use crate::action::{
 use crate::content::{Content, Form};
 use crate::error::GatewayError;
 
-/// How long the end of a goal is waited for.
+/// Time for which the outcome of a goal is awaited.
 const OUTCOME_WAIT_MAX: Duration = Duration::from_secs(30 * 24 * 3600);
-/// Feedback that was there when a goal ended and is told before that.
+/// Most feedback messages that are sent after the goal ended and before its outcome.
 const LAST_FEEDBACK_MAX: usize = 64;
-/// What is to come first.
+/// The required first requests of the streams.
 const ORDER_GOAL: Fault = Fault::Order { what: "the goal" };
 const ORDER_ACTION: Fault = Fault::Order { what: "the action" };
 
-/// Sends a goal, and tells of it until it has ended.
+/// Sends a goal and streams its progress until it ends.
 pub(super) async fn send_goal(
     guest: Arc<Guest>,
     mut requests: Streaming<SendGoalRequest>,
 ) -> Result<Response<Responses<SendGoalResponse>>, Status> {
-    let place = guest.take(Taken::Goal)?;
+    let place = guest.take(StreamKind::Goal)?;
     let Some(SendGoalRequest { kind: Some(Asked::Goal(said)) }) = first(&guest, &mut requests).await? else {
         return Err(ORDER_GOAL.into());
     };
@@ -50,18 +50,18 @@ pub(super) async fn send_goal(
     let (type_name, (goal, feedback)) = guest.admitted(sent).await?;
     let taken = sent::Taken { goal_id: goal.id().to_vec().into(), r#type: type_name };
     let taken = SendGoalResponse { kind: Some(sent::Kind::Taken(taken)) };
-    Ok(begin(Sent { place, goal, feedback, form }, requests, taken))
+    Ok(begin(GoalConversation { place, goal, feedback, form }, requests, taken))
 }
 
-/// A goal that a server has taken.
-struct Sent {
+/// A goal that a server has accepted.
+struct GoalConversation {
     place: Place,
     goal: Goal,
     feedback: Feedback,
     form: Form,
 }
 
-impl Conversation for Sent {
+impl Conversation for GoalConversation {
     type Request = SendGoalRequest;
     type Response = SendGoalResponse;
 
@@ -72,7 +72,7 @@ impl Conversation for Sent {
     async fn work(
         &mut self,
         mut requests: Streaming<SendGoalRequest>,
-        told: &Told<SendGoalResponse>,
+        told: &Responder<SendGoalResponse>,
     ) -> Result<(), Status> {
         let Self { place, goal, feedback, form } = self;
         let tell = async |kind: sent::Kind| {
@@ -129,12 +129,12 @@ fn to_proto(status: GoalStatus) -> proto::GoalStatus {
     }
 }
 
-/// Serves an action for as long as its client listens and speaks.
+/// Serves an action until its client closes the stream.
 pub(super) async fn serve(
     guest: Arc<Guest>,
     mut requests: Streaming<ServeActionRequest>,
 ) -> Result<Response<Responses<ServeActionResponse>>, Status> {
-    let place = guest.take(Taken::Serving)?;
+    let place = guest.take(StreamKind::Serving)?;
     let Some(ServeActionRequest { kind: Some(Said::Server(server)) }) = first(&guest, &mut requests).await?
     else {
         return Err(ORDER_ACTION.into());
@@ -150,18 +150,18 @@ pub(super) async fn serve(
     let replier = serving.replier();
     let taken = served::Kind::Served(served::Served { r#type: type_name });
     let taken = ServeActionResponse { kind: Some(taken) };
-    Ok(begin(Served { place, serving, replier, form }, requests, taken))
+    Ok(begin(ActionConversation { place, serving, replier, form }, requests, taken))
 }
 
 /// An action that a client serves.
-struct Served {
+struct ActionConversation {
     place: Place,
     serving: ActionServing,
     replier: ActionReplier,
     form: Form,
 }
 
-impl Conversation for Served {
+impl Conversation for ActionConversation {
     type Request = ServeActionRequest;
     type Response = ServeActionResponse;
 
@@ -172,7 +172,7 @@ impl Conversation for Served {
     async fn work(
         &mut self,
         mut requests: Streaming<ServeActionRequest>,
-        told: &Told<ServeActionResponse>,
+        told: &Responder<ServeActionResponse>,
     ) -> Result<(), Status> {
         loop {
             tokio::select! {
@@ -213,7 +213,7 @@ impl Conversation for Served {
     }
 }
 
-impl Served {
+impl ActionConversation {
     async fn hear(&self, said: Said) -> Result<(), Fault> {
         let content = |bytes| Content { form: self.form, bytes };
         match said {

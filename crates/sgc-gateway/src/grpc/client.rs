@@ -1,5 +1,5 @@
-//! [`Clients`]: who was admitted. A [`Guest`] is one credential on one connection: it has a session, whose bounds all its
-//! streams share, and ends all of them once it is not admitted any more.
+//! [`Clients`]: the admission of gRPC clients. A [`Guest`] is one credential on one connection. Its streams share the
+//! bounds of one session, and all of them end when its rights end.
 
 use std::future::Future;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -13,7 +13,7 @@ use tonic::{Request, Status};
 use super::GrpcOptions;
 use super::connection::{Connection, WeakConnection};
 use super::fault::Fault;
-use crate::access::{Admission, Client, Denied, ORIGIN_BYTES_MAX};
+use crate::access::{AdmissionRequest, Client, Denial, ORIGIN_BYTES_MAX};
 use crate::access_watch::AccessWatch;
 use crate::budget::Budget;
 use crate::error::GatewayError;
@@ -21,12 +21,12 @@ use crate::feed::{Subscription, SubscriptionEnd};
 use crate::hub::{Hub, lock};
 use crate::session::Session;
 
-/// Credentials that may be in use on one connection at a time.
+/// Most credentials in use on one connection at a time.
 const CREDENTIALS_MAX: usize = 16;
-/// Streams on which one client hears of the graph at a time: each makes its view of it anew with every change.
+/// Most graph watches of one client at a time, because each computes its view anew with every change.
 const WATCHES_MAX: usize = 16;
 
-/// Admits clients.
+/// The admission of clients.
 pub(super) struct Clients {
     hub: Hub,
     access: AccessWatch,
@@ -34,20 +34,20 @@ pub(super) struct Clients {
     stopping: watch::Receiver<bool>,
 }
 
-/// The credential that was shown: of a token its hash, so that none is kept. Beside a token the origin is not looked at.
+/// The credential of a request. A token is kept as a hash only. With a token the origin does not matter.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Shown {
+struct Proof {
     token: Option<[u8; 32]>,
     origin: Option<Box<str>>,
 }
 
-/// Who was admitted on a connection because of what.
-pub(super) struct Known {
-    shown: Shown,
+/// A guest and the credential that admitted it.
+pub(super) struct GuestEntry {
+    shown: Proof,
     guest: Arc<Guest>,
 }
 
-impl Known {
+impl GuestEntry {
     pub(super) fn client(&self) -> &Client {
         self.guest.session.client()
     }
@@ -71,13 +71,13 @@ impl Clients {
         &self.hub
     }
 
-    /// Who makes a request.
+    /// Returns the guest that makes a request.
     pub(super) fn admit(&self, request: &Request<()>) -> Result<Arc<Guest>, Status> {
         Ok(self.find(request)?)
     }
 
     fn find(&self, request: &Request<()>) -> Result<Arc<Guest>, Fault> {
-        // Also once nobody can say that it is, since the front end is gone.
+        // A dropped sender means that the front end is gone.
         if *self.stopping.borrow() || self.stopping.has_changed().is_err() {
             return Err(GatewayError::Stopping.into());
         }
@@ -87,12 +87,12 @@ impl Clients {
             Some(header) => Some(bearer(header).ok_or(Fault::Authorization)?),
             None => None,
         };
-        // One that is no text is one all the same, and of nobody.
+        // An origin that is not text counts as an unknown origin.
         let origin = text("origin").map(|origin| origin.unwrap_or("?"));
         if token.is_none() && origin.is_some_and(|origin| origin.len() > ORIGIN_BYTES_MAX) {
             return Err(Fault::Origin { max: ORIGIN_BYTES_MAX });
         }
-        let shown = Shown {
+        let shown = Proof {
             origin: origin.filter(|_| token.is_none()).map(Box::from),
             token: token.map(|token| {
                 let mut hash = [0; 32];
@@ -107,11 +107,11 @@ impl Clients {
             match access.still_admits(guest.session.client(), self.access.now()) {
                 Ok(()) if !guest.has_ended() => return Ok(Arc::clone(guest)),
                 Ok(()) => drop(known.remove(at)),
-                // By the rules as they are now it may be admitted anew.
+                // The current rules may admit the client anew.
                 Err(why) => known.remove(at).guest.end(why),
             }
         }
-        let client = access.admit(&Admission {
+        let client = access.admit(&AdmissionRequest {
             peer: connection.peer(),
             encrypted: connection.is_encrypted(),
             origin,
@@ -142,19 +142,19 @@ impl Clients {
                 session: session.admitted_by(self.access.clone()),
             }
         });
-        known.push(Known { shown, guest: Arc::clone(&guest) });
+        known.push(GuestEntry { shown, guest: Arc::clone(&guest) });
         Ok(guest)
     }
 }
 
-/// The token in a header.
+/// Returns the token in an `authorization` header.
 fn bearer(header: &str) -> Option<&str> {
     let (scheme, token) = header.split_once(' ')?;
     let token = token.trim();
     (scheme.eq_ignore_ascii_case("bearer") && !token.is_empty()).then_some(token)
 }
 
-/// Ends a guest the moment its right ends, or the front end stops. The guest aborts this task when it is dropped.
+/// Ends a guest when its rights end or the front end stops. Dropping the guest aborts this task.
 async fn watch_over(
     guest: Weak<Guest>,
     access: AccessWatch,
@@ -165,7 +165,7 @@ async fn watch_over(
         denied = access.until_denied(&client) => Some(denied),
         _ = stopping.wait_for(|is_stopping| *is_stopping) => None,
     };
-    // One that is being made is there in a moment, and one that goes ends this.
+    // A guest under construction appears shortly, and a dropped guest aborts this task.
     let guest = loop {
         match guest.upgrade() {
             Some(guest) => break guest,
@@ -178,7 +178,7 @@ async fn watch_over(
     }
 }
 
-/// What a guest has at present.
+/// The numbers of a guest's streams.
 #[derive(Debug, Default)]
 struct Counts {
     subscriptions: AtomicUsize,
@@ -189,9 +189,9 @@ struct Counts {
     watches: AtomicUsize,
 }
 
-/// Of which of its bounds a stream takes one.
+/// The kind of a stream, which decides the bound that it counts against.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Taken {
+pub(super) enum StreamKind {
     Subscription,
     Publication,
     Serving,
@@ -204,22 +204,23 @@ pub(super) enum Taken {
 pub(super) struct Guest {
     pub(super) session: Session,
     connection: WeakConnection,
-    /// The task that ends it with its right.
+    /// The task that ends the guest with its rights.
     watcher: AbortHandle,
     counts: Counts,
     ended: watch::Sender<Option<Fault>>,
-    /// Its subscriptions: each is held by a stream, which is not looked at while its client does not read.
+    /// The guest's subscriptions. Their streams are not polled while the client does not read, so they are ended
+    /// here.
     heard: Mutex<Vec<SubscriptionEnd>>,
-    /// Long messages that are written for it and under way.
+    /// Room for long messages that are sent to the guest and unread.
     pub(super) unread: Budget,
-    /// Those that it sends.
+    /// Room for long messages that the guest sends.
     pub(super) incoming: Budget,
 }
 
-/// A stream of a guest's, counted while it lasts.
+/// A stream of a guest, counted until dropped.
 pub(super) struct Place {
     pub(super) guest: Arc<Guest>,
-    taken: Taken,
+    taken: StreamKind,
 }
 
 impl Drop for Place {
@@ -235,25 +236,27 @@ impl Drop for Guest {
 }
 
 impl Guest {
-    /// Who makes a request that was admitted.
-    pub(super) fn of<T>(request: &Request<T>) -> Result<Arc<Self>, Fault> {
+    /// Returns the guest of an admitted request.
+    pub(super) fn from_request<T>(request: &Request<T>) -> Result<Arc<Self>, Fault> {
         request.extensions().get::<Arc<Self>>().cloned().ok_or(Fault::NoConnection)
     }
 
-    fn count(&self, taken: Taken) -> (&AtomicUsize, &'static str, usize) {
+    fn count(&self, taken: StreamKind) -> (&AtomicUsize, &'static str, usize) {
         let limits = self.session.limits();
         match taken {
-            Taken::Subscription => (&self.counts.subscriptions, "subscriptions", limits.subscriptions_max),
-            Taken::Publication => (&self.counts.publications, "publishers", limits.publications_max),
-            Taken::Watching => (&self.counts.watches, "watches of the graph", WATCHES_MAX),
-            Taken::Call => (&self.counts.calls, "calls under way", limits.calls_max),
-            Taken::Goal => (&self.counts.goals, "goals", limits.calls_max),
-            Taken::Serving => (&self.counts.servings, "services and actions", limits.servings_max),
+            StreamKind::Subscription => {
+                (&self.counts.subscriptions, "subscriptions", limits.subscriptions_max)
+            }
+            StreamKind::Publication => (&self.counts.publications, "publishers", limits.publications_max),
+            StreamKind::Watching => (&self.counts.watches, "watches of the graph", WATCHES_MAX),
+            StreamKind::Call => (&self.counts.calls, "calls under way", limits.calls_max),
+            StreamKind::Goal => (&self.counts.goals, "goals", limits.calls_max),
+            StreamKind::Serving => (&self.counts.servings, "services and actions", limits.servings_max),
         }
     }
 
-    /// Counts a stream; refuses one too many.
-    pub(super) fn take(self: &Arc<Self>, taken: Taken) -> Result<Place, Fault> {
+    /// Counts a stream, or fails at the bound.
+    pub(super) fn take(self: &Arc<Self>, taken: StreamKind) -> Result<Place, Fault> {
         let (count, what, max) = self.count(taken);
         let place = Place { guest: Arc::clone(self), taken };
         let before = count.fetch_add(1, Ordering::Relaxed);
@@ -261,7 +264,7 @@ impl Guest {
         Ok(place)
     }
 
-    fn end(&self, why: Denied) {
+    fn end(&self, why: Denial) {
         tracing::debug!(client = %self.session.client().name, %why, "a gRPC client is not admitted any more");
         self.end_with(Fault::Denied(why));
     }
@@ -276,7 +279,7 @@ impl Guest {
         self.ended.borrow().is_some()
     }
 
-    /// Has a subscription end with the guest, even if its client does not read.
+    /// Makes a subscription end with the guest, even if its client does not read.
     pub(super) fn holds(&self, subscription: &Subscription) {
         let mut heard = lock(&self.heard);
         heard.retain(|other| !other.has_ended());
@@ -287,7 +290,7 @@ impl Guest {
         }
     }
 
-    /// Waits until it is not admitted any more, and says why.
+    /// Waits until the guest is no longer admitted and returns the reason.
     pub(super) async fn ended(&self) -> Fault {
         let mut ended = self.ended.subscribe();
         match ended.wait_for(Option::is_some).await.map(|why| why.clone()) {
@@ -296,7 +299,7 @@ impl Guest {
         }
     }
 
-    /// Something that takes a while, while it is admitted.
+    /// Runs work while the guest is admitted.
     pub(super) async fn admitted<T>(&self, work: impl Future<Output = Result<T, Fault>>) -> Result<T, Fault> {
         tokio::select! {
             biased;

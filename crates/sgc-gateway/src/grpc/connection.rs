@@ -1,4 +1,4 @@
-//! [`Connection`]: what is known of one, and who was admitted on it; [`Accepted`]: its stream of bytes.
+//! [`Connection`]: the peer of a connection and its guests; [`AcceptedStream`]: its byte stream.
 
 use std::fmt;
 use std::net::SocketAddr;
@@ -11,11 +11,11 @@ use sgc_trust::VerifiedPeer;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tonic::transport::server::Connected;
 
-use super::client::Known;
+use super::client::GuestEntry;
 use crate::access::Client;
 use crate::hub::lock;
 
-/// A connection, as whoever accepted it knows it. Clones are the same one.
+/// A connection as its acceptor knows it. Clones share it.
 #[derive(Clone)]
 pub struct Connection(Arc<Inner>);
 
@@ -23,18 +23,18 @@ struct Inner {
     peer: SocketAddr,
     is_encrypted: bool,
     certificate: Option<VerifiedPeer>,
-    known: Mutex<Vec<Known>>,
-    /// Woken when the right of a client on it ends.
+    known: Mutex<Vec<GuestEntry>>,
+    /// Woken when the rights of a client on the connection end.
     serving: AtomicWaker,
 }
 
 impl Connection {
-    /// One from there.
+    /// Creates a connection without TLS.
     pub fn plain(peer: SocketAddr) -> Self {
         Self::new(peer, false, None)
     }
 
-    /// One over TLS, with what the certificate of its client proves, if it showed one.
+    /// Creates a connection over TLS, with the identity that the client's certificate proves, if there is one.
     pub fn encrypted(peer: SocketAddr, certificate: Option<VerifiedPeer>) -> Self {
         Self::new(peer, true, certificate)
     }
@@ -44,40 +44,40 @@ impl Connection {
         Self(Arc::new(Inner { peer, is_encrypted, certificate, known, serving }))
     }
 
-    /// Who is at the other end.
+    /// Returns the address of the client.
     pub fn peer(&self) -> SocketAddr {
         self.0.peer
     }
 
-    /// Whether nobody on the way can read it.
+    /// Returns `true` if the connection is encrypted.
     pub fn is_encrypted(&self) -> bool {
         self.0.is_encrypted
     }
 
-    /// What its certificate proves.
+    /// Returns the identity that the client's certificate proves.
     pub fn certificate(&self) -> Option<&VerifiedPeer> {
         self.0.certificate.as_ref()
     }
 
-    /// Returns the first client on it whose right has not ended. The task is woken when one ends.
+    /// Returns the first client whose rights have not ended. The task is woken when rights end.
     pub(crate) fn poll_admitted(&self, cx: &mut Context<'_>) -> Option<Client> {
         self.0.serving.register(cx.waker());
         let known = lock(&self.0.known);
         known.iter().find(|known| known.is_admitted()).map(|known| known.client().clone())
     }
 
-    /// Returns a handle that wakes the task which serves the connection.
+    /// Returns a handle that wakes the task that serves the connection.
     pub(super) fn waker(&self) -> WeakConnection {
         WeakConnection(Arc::downgrade(&self.0))
     }
 
-    /// Who was admitted on it.
-    pub(super) fn known(&self) -> &Mutex<Vec<Known>> {
+    /// Returns the guests of the connection.
+    pub(super) fn known(&self) -> &Mutex<Vec<GuestEntry>> {
         &self.0.known
     }
 }
 
-/// A handle of a connection, which may be gone.
+/// A weak handle of a connection.
 pub(super) struct WeakConnection(Weak<Inner>);
 
 impl WeakConnection {
@@ -95,21 +95,21 @@ impl fmt::Debug for Connection {
     }
 }
 
-/// A stream of bytes that was accepted. What `IO` holds besides is dropped when the connection has ended.
+/// An accepted byte stream. Dropping it at the end of the connection drops everything that `IO` holds.
 #[derive(Debug)]
-pub struct Accepted<IO> {
+pub struct AcceptedStream<IO> {
     io: IO,
     connection: Connection,
 }
 
-impl<IO> Accepted<IO> {
-    /// One, and what is known of it.
+impl<IO> AcceptedStream<IO> {
+    /// Combines a byte stream with its connection.
     pub fn new(io: IO, connection: Connection) -> Self {
         Self { io, connection }
     }
 }
 
-impl<IO> Connected for Accepted<IO> {
+impl<IO> Connected for AcceptedStream<IO> {
     type ConnectInfo = Connection;
 
     fn connect_info(&self) -> Connection {
@@ -117,7 +117,7 @@ impl<IO> Connected for Accepted<IO> {
     }
 }
 
-impl<IO: AsyncRead + Unpin> AsyncRead for Accepted<IO> {
+impl<IO: AsyncRead + Unpin> AsyncRead for AcceptedStream<IO> {
     fn poll_read(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -127,7 +127,7 @@ impl<IO: AsyncRead + Unpin> AsyncRead for Accepted<IO> {
     }
 }
 
-impl<IO: AsyncWrite + Unpin> AsyncWrite for Accepted<IO> {
+impl<IO: AsyncWrite + Unpin> AsyncWrite for AcceptedStream<IO> {
     fn poll_write(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,

@@ -1,4 +1,4 @@
-//! [`Conversation`]: what goes on for as long as a client listens and speaks, by a stream each way.
+//! [`Conversation`]: an exchange by one stream in each direction.
 
 use std::sync::Arc;
 
@@ -9,37 +9,37 @@ use super::client::{Guest, Place};
 use super::service::Responses;
 use super::tracking::{self, respond};
 
-/// Responses that wait for a client: what comes beyond them waits where it comes from.
+/// Most queued responses. At the bound the source of further responses waits.
 const RESPONSES_MAX: usize = 16;
 
-/// Where responses go, each with the room that it takes.
-pub(super) type Told<T> = mpsc::Sender<tracking::Told<T>>;
+/// The sender of responses, each with its room.
+pub(super) type Responder<T> = mpsc::Sender<tracking::TrackedResponse<T>>;
 
-/// What goes on between a client and the hub.
+/// An exchange between a client and the hub.
 pub(super) trait Conversation: Send + Sized + 'static {
-    /// What the client says.
+    /// A message of the client.
     type Request: Send + 'static;
-    /// What it hears.
+    /// A message to the client.
     type Response: Send + 'static;
 
-    /// Its place among what the client has.
+    /// Returns the stream's place among those of the client.
     fn place(&self) -> &Place;
 
-    /// Goes on until either has no more to say.
+    /// Runs until either side ends.
     fn work(
         &mut self,
         requests: Streaming<Self::Request>,
-        told: &Told<Self::Response>,
+        told: &Responder<Self::Response>,
     ) -> impl Future<Output = Result<(), Status>> + Send;
 }
 
-/// The first that a client says, while it is admitted.
+/// Reads the first request while the client is admitted.
 pub(super) async fn first<T>(guest: &Guest, requests: &mut Streaming<T>) -> Result<Option<T>, Status> {
     let first = async { Ok(requests.message().await) };
     guest.admitted(first).await?
 }
 
-/// Goes on by itself from now on; `taken` is heard first.
+/// Runs the conversation in a task of its own. `taken` is the first response.
 pub(super) fn begin<C: Conversation>(
     conversation: C,
     requests: Streaming<C::Request>,
@@ -51,16 +51,21 @@ pub(super) fn begin<C: Conversation>(
     respond(responses)
 }
 
-async fn run<C: Conversation>(mut conversation: C, requests: Streaming<C::Request>, told: Told<C::Response>) {
+async fn run<C: Conversation>(
+    mut conversation: C,
+    requests: Streaming<C::Request>,
+    told: Responder<C::Response>,
+) {
     let guest = Arc::clone(&conversation.place().guest);
     let why = tokio::select! {
         biased;
         why = guest.ended() => Err(Status::from(why)),
-        // Its client has gone.
+        // The client has left.
         () = told.closed() => return,
         done = conversation.work(requests, &told) => done,
     };
-    // It ends before its client hears so: who does not read may take as long as it likes.
+    // The conversation is dropped before its client learns of the end, because a client that does not read may delay
+    // that forever.
     drop(conversation);
     if let Err(why) = why {
         let _ = told.send((Err(why), None)).await;

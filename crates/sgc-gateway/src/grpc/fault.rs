@@ -1,23 +1,23 @@
-//! [`Fault`]: why a call fails, and by which status of gRPC that is told.
+//! [`Fault`]: the reason why a call fails, with its gRPC status.
 
 use tonic::{Code, Status};
 
-use crate::access::Denied;
+use crate::access::Denial;
 use crate::error::{ErrorKind, GatewayError};
 
-/// Why a call fails.
+/// The reason why a call fails.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum Fault {
-    /// Who calls is not admitted, or no more.
-    #[error("{}", .0.told())]
-    Denied(Denied),
-    /// Metadata that are no text of that form.
+    /// The client is not admitted, or no longer.
+    #[error("{}", .0.client_message())]
+    Denied(Denial),
+    /// The `authorization` header is malformed.
     #[error("`authorization` is not of the form `Bearer TOKEN`")]
     Authorization,
-    /// An `origin` that no browser sends.
+    /// The `origin` is longer than any browser sends.
     #[error("`origin` has {max} bytes at most")]
     Origin {
-        /// The bound.
+        /// The bound in bytes.
         max: usize,
     },
     /// Too many credentials are in use on one connection.
@@ -26,69 +26,69 @@ pub enum Fault {
         /// The bound.
         max: usize,
     },
-    /// A stream that begins with something else, or goes on with a second beginning.
+    /// The stream begins with the wrong request, or repeats its first request.
     #[error("the first request of this stream, and no other, names {what}")]
     Order {
-        /// What is named.
+        /// The subject of the first request.
         what: &'static str,
     },
-    /// A number of an enumeration that this gateway does not know.
+    /// The number is not one of the enumeration.
     #[error("{number} is no {what} that this gateway knows")]
     Enumeration {
-        /// Of which.
+        /// The enumeration.
         what: &'static str,
-        /// What was said.
+        /// The given number.
         number: i32,
     },
-    /// Contradicts itself.
+    /// A QoS has both `keep_all` and a depth.
     #[error("a quality of service either keeps all or has a depth")]
     KeepAllWithDepth,
-    /// More may not wait.
+    /// The depth exceeds the bound.
     #[error("a depth of {depth}: at most {max} messages may wait")]
     Depth {
-        /// What was said.
+        /// The given depth.
         depth: u32,
         /// The bound.
         max: u32,
     },
-    /// No rate.
+    /// The rate is invalid.
     #[error("{rate} is no rate: write how many messages a second at most, from {min} on, or 0 for all")]
     Rate {
-        /// What was said.
+        /// The given rate.
         rate: f64,
-        /// The least.
+        /// The lowest rate.
         min: f64,
     },
-    /// A call is answered that is not open.
+    /// The answered call is not open.
     #[error("call {id} is not open: it was answered, or is too old")]
     NotOpen {
-        /// What was said.
+        /// The given id.
         id: u64,
     },
-    /// Not the id of a goal.
+    /// The length of a goal id is wrong.
     #[error("an id of a goal has 16 bytes, not {bytes}")]
     GoalId {
-        /// What was said.
+        /// The given length in bytes.
         bytes: usize,
     },
-    /// Which message of a stream it was.
+    /// A message of a stream failed.
     #[error("message {number} of this stream: {error}")]
     Message {
-        /// The first is 1.
+        /// The number of the message, from 1.
         number: u64,
-        /// What is wrong with it.
+        /// The error.
         error: Box<GatewayError>,
     },
-    /// The hub refuses.
+    /// The hub refuses the call.
     #[error(transparent)]
     Gateway(Box<GatewayError>),
-    /// What serves these requests does not say where they come from.
+    /// The server lacks the [`Connection`](super::Connection) of a request.
     #[error("the gateway does not know where this call comes from")]
     NoConnection,
-    /// The committed descriptor cannot be read.
+    /// The embedded descriptor is invalid.
     #[error("the description of the protocol: {0}")]
     Descriptor(String),
-    /// HTTP/2 cannot be served.
+    /// HTTP/2 failed.
     #[error("HTTP/2: {0}")]
     Transport(String),
 }

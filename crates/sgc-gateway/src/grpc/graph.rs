@@ -1,4 +1,4 @@
-//! `GetGraph` and `WatchGraph`: what is on the network, and what changes, within the scope of a client.
+//! `GetGraph` and `WatchGraph`: the graph and its changes, within the scope of a client.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -15,10 +15,11 @@ use super::qos;
 use super::service::Responses;
 use crate::graph::{ActionInfo, EndpointInfo, Graph, NodeInfo, ServiceInfo, TopicInfo, is_hidden};
 
-/// Least time between two changes that are told.
+/// Shortest time between two updates.
 const CHANGES_INTERVAL_MIN: Duration = Duration::from_millis(100);
 
-/// What a client sees: of nodes those that have something in its scope, and the gateway's own.
+/// Returns the graph that a client sees. Nodes without an interface in its scope are left out, except the gateway's
+/// own.
 fn seen(guest: &Guest, with_hidden: bool) -> Graph {
     let mut graph = guest.session.graph();
     let own = guest.session.hub().node_name();
@@ -32,25 +33,25 @@ fn seen(guest: &Guest, with_hidden: bool) -> Graph {
     graph.filtered(is_shown, is_shown)
 }
 
-/// All of it.
+/// Returns the whole graph.
 pub(super) fn graph(guest: &Guest, with_hidden: bool) -> GetGraphResponse {
     let graph = changed(&Graph::default(), &seen(guest, with_hidden));
     let gateway_node = guest.session.hub().node_name().to_owned();
     GetGraphResponse { graph: Some(graph), gateway_node }
 }
 
-/// A client that is told of changes.
-struct Watching {
+/// A client that watches the graph.
+struct GraphWatch {
     place: Place,
     with_hidden: bool,
     changes: watch::Receiver<u64>,
     told: Option<Graph>,
 }
 
-/// All of it, and then what changes.
+/// Streams the whole graph and then its changes.
 pub(super) fn watch(place: Place, with_hidden: bool) -> Responses<WatchGraphResponse> {
     let changes = place.guest.session.hub().graph_changes();
-    let watching = Watching { place, with_hidden, changes, told: None };
+    let watching = GraphWatch { place, with_hidden, changes, told: None };
     Box::pin(stream::unfold(Some(watching), |watching| async {
         let mut watching = watching?;
         let guest = Arc::clone(&watching.place.guest);
@@ -62,7 +63,7 @@ pub(super) fn watch(place: Place, with_hidden: bool) -> Responses<WatchGraphResp
     }))
 }
 
-impl Watching {
+impl GraphWatch {
     async fn next(&mut self) -> Option<WatchGraphResponse> {
         loop {
             if self.told.is_some() {
@@ -89,7 +90,7 @@ impl Watching {
     }
 }
 
-/// What is new or different.
+/// Returns the new and changed entries.
 fn changed(before: &Graph, now: &Graph) -> proto::Graph {
     proto::Graph {
         topics: differing(&before.topics, &now.topics, topic),
@@ -99,7 +100,7 @@ fn changed(before: &Graph, now: &Graph) -> proto::Graph {
     }
 }
 
-/// What is there no more.
+/// Returns the removed entries.
 fn gone(before: &Graph, now: &Graph) -> Gone {
     Gone {
         topics: missing(&before.topics, &now.topics),

@@ -1,6 +1,6 @@
-//! [`Incoming`]: what a client sends on a stream. Each long message takes room of its client's from its head on, before the
-//! rest of it is there; a stream that finds none is refused, since streams that wait would fill the window of the connection
-//! that those which have room need.
+//! [`Incoming`]: the messages that a client sends on a stream. Each long message reserves room from its head on,
+//! before the rest has arrived. A stream without room fails, because waiting streams would fill the connection's
+//! window, which the streams with room need.
 
 use std::collections::VecDeque;
 use std::pin::Pin;
@@ -17,27 +17,28 @@ use crate::budget::{Budget, Room};
 use crate::error::GatewayError;
 use crate::hub::lock;
 
-/// Before each message: whether it is compressed, and its length (gRPC over HTTP/2, Length-Prefixed-Message).
+/// Length of the head of each message: the compression flag and the length (gRPC over HTTP/2,
+/// Length-Prefixed-Message).
 const HEAD_BYTES: usize = 5;
 
-/// Room of messages that have come, for as long as they are worked on.
-pub(super) type Kept = Arc<Mutex<Vec<Room>>>;
+/// The room of received messages until they are handled.
+pub(super) type KeptRooms = Arc<Mutex<Vec<Room>>>;
 
-/// The messages of a stream, and their room.
+/// The messages of a stream and their room.
 #[derive(Debug, Default)]
 struct Messages {
-    /// What there is of a head.
+    /// The received part of a head.
     head: VecDeque<u8>,
-    /// What is to come of a message.
+    /// The missing bytes of the current message.
     left: usize,
-    /// Its room.
+    /// The room of the current message.
     room: Option<Room>,
-    /// Room of those that have come.
+    /// The room of complete messages.
     come: Vec<Room>,
 }
 
 impl Messages {
-    /// Takes room for what begins in here.
+    /// Reserves room for messages that begin in `data`.
     fn take(&mut self, mut data: &[u8], budget: &Budget) -> Result<(), GatewayError> {
         while !data.is_empty() {
             if self.left == 0 {
@@ -50,7 +51,7 @@ impl Messages {
                 }
                 self.left =
                     self.head.drain(..).skip(1).fold(0, |length, byte| length << 8 | usize::from(byte));
-                // What is too long is refused by its head.
+                // The server refuses a message beyond the bound by its head.
                 if self.left <= MESSAGE_BYTES_MAX {
                     self.room = budget.take_at_once(self.left)?;
                 }
@@ -66,17 +67,17 @@ impl Messages {
     }
 }
 
-/// The body of a request, within the bounds of who sends it.
+/// The body of a request, within the bounds of its guest.
 pub(super) struct Incoming<B> {
     body: B,
     guest: Arc<Guest>,
     messages: Messages,
-    /// Where room stays though all of the stream was read.
-    kept: Option<Kept>,
+    /// Keeps room for longer than the stream is read.
+    kept: Option<KeptRooms>,
 }
 
 impl<B> Incoming<B> {
-    pub(super) fn new(body: B, guest: Arc<Guest>, kept: Option<Kept>) -> Self {
+    pub(super) fn new(body: B, guest: Arc<Guest>, kept: Option<KeptRooms>) -> Self {
         Self { body, guest, messages: Messages::default(), kept }
     }
 }
@@ -89,7 +90,7 @@ impl<B: http_body::Body<Data = Bytes, Error = Status> + Unpin> http_body::Body f
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
     ) -> Poll<Option<Result<http_body::Frame<Bytes>, Status>>> {
-        // Who reads on has done with what came before.
+        // The reader has handled earlier messages when it reads on.
         let come = std::mem::take(&mut self.messages.come);
         if let Some(kept) = &self.kept {
             lock(kept).extend(come);
@@ -131,14 +132,14 @@ mod tests {
         let quotas: Arc<crate::quota::Quotas> = Arc::default();
         let budget = Budget::new(1 << 20, quotas.quota(&crate::access::Client::own("test")));
         let (mut first, mut second) = (Messages::default(), Messages::default());
-        // A head in two parts, and nothing of its message.
+        // The head comes in two parts, without its message.
         let long = head(LONG);
         first.take(&long[..3], &budget).unwrap();
         assert!(first.room.is_none());
         first.take(&long[3..], &budget).unwrap();
         let refused = second.take(&long, &budget).unwrap_err();
         assert!(matches!(refused, GatewayError::TooMany { max, .. } if max == 1 << 20), "{refused}");
-        // Short ones come all the same, and before another.
+        // Short messages pass without room.
         let mut third = Messages::default();
         let mut short = [head(3), b"abc".to_vec(), head(0), head(2)].concat();
         short.push(b'x');
@@ -146,13 +147,13 @@ mod tests {
         assert_eq!(third.left, 1);
         first.take(&vec![0; LONG - 1], &budget).unwrap();
         assert!(first.come.is_empty());
-        // Its last byte, and the next head: for both there is no room.
+        // The last byte and the next head, for which there is no room.
         assert!(first.take(&[&[0][..], &long].concat(), &budget).is_err());
         assert_eq!(first.come.len(), 1);
         drop(first);
         let mut fourth = Messages::default();
         fourth.take(&long, &budget).unwrap();
-        // What is longer than may come is not waited for.
+        // A message beyond the bound takes no room.
         let mut fifth = Messages::default();
         fifth.take(&head(MESSAGE_BYTES_MAX + 1), &budget).unwrap();
         assert!(fifth.room.is_none());

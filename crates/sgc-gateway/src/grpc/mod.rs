@@ -1,19 +1,19 @@
-//! The gRPC front end: `sgc.gateway.v1`, with reflection and health beside it.
+//! The gRPC front end: `sgc.gateway.v1`, with reflection and health.
 //!
-//! [`Grpc`] serves streams of bytes that others have accepted, each with what is known of its other end ([`Connection`]).
-//! [`AccessWatch`] decides whom it admits, before anything of a request is read, and ends all that a client has when its right
-//! ends. Each connection has one
-//! [`Session`](crate::Session) for each credential that is shown on it, so bounds are those of a program, however many
-//! streams it has. Reflection and health tell nothing of the network and are for everybody who can connect.
+//! [`Grpc`] serves byte streams that others have accepted, each with its [`Connection`]. [`AccessWatch`] decides on
+//! admission before a request is read, and ends all streams of a client when its rights end. Each credential on a
+//! connection has one [`Session`](crate::Session), so the bounds hold for a program with any number of streams.
+//! Reflection and health reveal nothing about the network and serve every client that can connect.
 //!
-//! It opens no socket, makes no TLS handshake and counts no connections: `server` does. What comes and goes on the network is
-//! the business of sessions.
+//! This module opens no socket, does no TLS handshake and counts no connections: `server` does. Sessions deal with
+//! the network.
 
 mod action;
 mod client;
 mod connection;
 mod conversation;
 mod fault;
+mod get_type;
 mod graph;
 mod incoming;
 mod publish;
@@ -22,16 +22,15 @@ mod serve;
 mod service;
 mod subscribe;
 mod tracking;
-mod types;
 
-/// What is generated from `proto/sgc/gateway/v1/gateway.proto`, whose words explain it.
+/// Code generated from `proto/sgc/gateway/v1/gateway.proto`, which documents it.
 pub mod proto {
     #![allow(missing_docs, unreachable_pub, rustdoc::all, reason = "generated")]
     #![allow(clippy::all, clippy::disallowed_types, reason = "generated")]
 
     include!("generated/sgc.gateway.v1.rs");
 
-    /// The file itself, as reflection tells it.
+    /// The descriptor that reflection serves.
     pub const DESCRIPTOR: &[u8] = include_bytes!("generated/descriptor.bin");
 }
 
@@ -46,7 +45,7 @@ use tonic::service::Routes;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::Server;
 
-pub use connection::{Accepted, Connection};
+pub use connection::{AcceptedStream, Connection};
 pub use fault::Fault;
 
 use crate::access_watch::AccessWatch;
@@ -57,37 +56,38 @@ use proto::gateway_server::GatewayServer;
 use service::Service;
 use tracking::Tracking;
 
-/// Longest message of gRPC, either way, bytes: images take 13 MB.
+/// Longest gRPC message in either direction, in bytes. Images take 13 MB.
 pub const MESSAGE_BYTES_MAX: usize = 64 << 20;
-/// Streams of a connection. More than a session may have of everything, so that who has too much is told so; what waits for
-/// a stream is told nothing.
+/// Most streams of a connection. It exceeds the sum of a session's bounds, so that a client at a bound gets an error
+/// instead of a stream that waits silently.
 pub const STREAMS_MAX: u32 = 2048;
-/// All headers of a request, bytes; a token is at most a quarter of it.
+/// Most bytes of all headers of a request. A token takes at most a quarter.
 const HEADER_BYTES_MAX: u32 = 32 << 10;
-/// What a client may send on a stream before it is read, bytes.
+/// Bytes that a client may send on a stream before they are read.
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
-/// The same of all streams of a connection: so many may stand still before others do.
+/// Bytes that a client may send on all streams of a connection before they are read. A single stalled stream does not
+/// use them up.
 const CONNECTION_WINDOW_BYTES: u32 = 16 << 20;
-/// Longest request for health, bytes: whoever can connect may send it.
+/// Longest health request, in bytes, because every client that can connect may send one.
 const HEALTH_BYTES_MAX: usize = 4 << 10;
-/// The same of reflection.
+/// Longest reflection request, in bytes.
 const REFLECTION_BYTES_MAX: usize = 64 << 10;
-/// After so long without a sign of life a client is asked for one.
+/// Silence after which a client is pinged.
 const PING_INTERVAL: Duration = Duration::from_secs(20);
-/// So long it may take to give it.
+/// Time within which a ping must be answered.
 const PING_WAIT: Duration = Duration::from_secs(20);
-/// Streams that a client opened and reset before they were served: more are an attack (CVE-2023-44487).
+/// Most streams that a client may open and reset before they are served. More are an attack (CVE-2023-44487).
 const RESETS_MAX: usize = 64;
 
-/// What a front end is to be.
+/// The options of the front end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GrpcOptions {
-    /// What a client may have at a time: one credential on one connection.
+    /// The limits of one credential on one connection.
     pub session: SessionLimits,
-    /// Bytes of long messages that a client has not read yet though they were sent, of all its streams: further ones wait.
+    /// Most bytes of long messages that are sent to a client and unread, over all its streams. Further messages wait.
     pub unread_bytes_max: usize,
-    /// Bytes of long messages that a client may send at a time, on all its streams: from the head of each until it is worked
-    /// on. Streams that would send more are refused.
+    /// Most bytes of long messages that a client sends at a time, over all its streams, from the head of each until
+    /// it is handled. Streams that exceed it fail.
     pub incoming_bytes_max: usize,
 }
 
@@ -101,7 +101,7 @@ impl Default for GrpcOptions {
     }
 }
 
-/// The front end. Clones are the same one; when the last is dropped, as with [`Grpc::stop`], streams end.
+/// The front end. Clones share it. [`Grpc::stop`] or dropping the last clone ends all streams.
 #[derive(Clone)]
 pub struct Grpc {
     clients: Arc<Clients>,
@@ -109,17 +109,17 @@ pub struct Grpc {
 }
 
 impl Grpc {
-    /// Serves a hub to those whom `access` admits. A client loses its streams the moment its right ends.
+    /// Serves a hub to clients that `access` admits. A client's streams end when its rights end.
     pub fn new(hub: Hub, access: AccessWatch, options: GrpcOptions) -> Self {
         let stopping = Arc::new(watch::Sender::new(false));
         let clients = Arc::new(Clients::new(hub, access, options, stopping.subscribe()));
         Self { clients, stopping }
     }
 
-    /// All services, for whoever has an HTTP/2 server: requests must have a [`Connection`] among their extensions.
+    /// Returns all services for an HTTP/2 server. Requests need a [`Connection`] among their extensions.
     ///
     /// # Errors
-    /// None but that the descriptor which this was built with is broken.
+    /// The embedded descriptor is invalid.
     pub async fn routes(&self) -> Result<Routes, Fault> {
         let gateway = GatewayServer::new(Service::default())
             .max_decoding_message_size(MESSAGE_BYTES_MAX)
@@ -139,7 +139,7 @@ impl Grpc {
         let v1 = described().build_v1().map_err(broken)?;
         let v1alpha = described().build_v1alpha().map_err(broken)?;
         let (reporter, health) = tonic_health::server::health_reporter();
-        // Before the first request, which a client would otherwise see answered with NOT_FOUND.
+        // The status is set before the first request, which would otherwise be answered with NOT_FOUND.
         reporter.set_serving::<GatewayServer<Service>>().await;
         let mut stopping = self.stopping.subscribe();
         self.clients.hub().shared.runtime.spawn(async move {
@@ -153,12 +153,11 @@ impl Grpc {
             .prepare())
     }
 
-    /// Serves connections for as long as there are new ones, and until those that are there have ended: [`Grpc::stop`] ends
-    /// both.
+    /// Serves connections until no more arrive and the existing ones have ended. [`Grpc::stop`] ends both.
     ///
     /// # Errors
-    /// As [`Grpc::routes`]; what fails on one connection ends that one.
-    pub async fn serve<IO>(&self, incoming: impl Stream<Item = Accepted<IO>>) -> Result<(), Fault>
+    /// The errors of [`Grpc::routes`]. An error on a connection ends only that connection.
+    pub async fn serve<IO>(&self, incoming: impl Stream<Item = AcceptedStream<IO>>) -> Result<(), Fault>
     where
         IO: AsyncRead + AsyncWrite + Unpin + Send + 'static,
     {
@@ -172,13 +171,13 @@ impl Grpc {
         served.map_err(|error| Fault::Transport(error.to_string()))
     }
 
-    /// Ends all streams, and connections once they are empty; takes in nothing new.
+    /// Ends all streams, closes idle connections and accepts nothing new.
     pub fn stop(&self) {
         self.stopping.send_replace(true);
     }
 }
 
-/// HTTP/2 within bounds.
+/// Returns an HTTP/2 server within the bounds.
 fn builder() -> Server {
     Server::builder()
         .max_concurrent_streams(STREAMS_MAX)

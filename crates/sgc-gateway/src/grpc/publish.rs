@@ -1,5 +1,5 @@
-//! `Publish`: a stream of messages on a topic. What is not read yet holds up its client: by HTTP/2, and so by what
-//! publishing waits for.
+//! `Publish`: a stream of messages on a topic. Flow control of HTTP/2 slows the client down when publishing waits for
+//! readers.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -7,7 +7,7 @@ use std::time::Duration;
 use futures_util::FutureExt as _;
 use tonic::{Status, Streaming};
 
-use super::client::{Guest, Taken};
+use super::client::{Guest, StreamKind};
 use super::fault::Fault;
 use super::proto::publish_request::{Kind, Publisher};
 use super::proto::{PublishRequest, PublishResponse};
@@ -16,17 +16,17 @@ use crate::content::Content;
 use crate::error::GatewayError;
 use crate::session::Advertise;
 
-/// How long those readers are waited for that are there already: what is published before they are matched is lost to them.
+/// Time to wait for existing readers, which lose messages published before they are matched.
 const SETTLE_MAX: Duration = Duration::from_secs(1);
-/// What is to come first.
+/// The required first request.
 const ORDER: Fault = Fault::Order { what: "the topic" };
 
-/// Publishes what a client sends; says how much it was.
+/// Publishes a client's messages and returns their number.
 pub(super) async fn publish(
     guest: Arc<Guest>,
     mut requests: Streaming<PublishRequest>,
 ) -> Result<PublishResponse, Status> {
-    let _place = guest.take(Taken::Publication)?;
+    let _place = guest.take(StreamKind::Publication)?;
     let next = async |requests: &mut Streaming<PublishRequest>| {
         tokio::select! {
             biased;
@@ -45,11 +45,11 @@ pub(super) async fn publish(
         Ok(publication)
     };
     let publication = guest.admitted(advertised).await?;
-    // Those that are there already leave together.
+    // Messages that have already arrived are sent together.
     let mut taken = 0;
     let failed = |taken: u64, error: GatewayError| {
         let number = match error {
-            // Which may be one before that which was taken last.
+            // The failed message may be an earlier one than the last one read.
             GatewayError::Ros(_) => publication.published() + 1,
             _ => taken,
         };

@@ -1,4 +1,4 @@
-//! Quality of service and encodings, from the words of the protocol and into them.
+//! Conversion of QoS and encodings from and to the protocol.
 
 use sgc_wire::{Durability, History, Liveliness, Qos, Reliability};
 
@@ -6,12 +6,12 @@ use super::fault::Fault;
 use super::proto;
 use crate::content::Form;
 
-/// What the protocol says is an unknown number, refused by name.
+/// Converts a number to its enumeration; the error names the enumeration.
 fn known<E: TryFrom<i32>>(what: &'static str, number: i32) -> Result<E, Fault> {
     E::try_from(number).map_err(|_| Fault::Enumeration { what, number })
 }
 
-/// By an encoding.
+/// Returns the form of an encoding.
 pub(super) fn form(encoding: i32) -> Result<Form, Fault> {
     Ok(match known("encoding", encoding)? {
         proto::Encoding::Unspecified | proto::Encoding::Cdr => Form::Cdr,
@@ -20,7 +20,7 @@ pub(super) fn form(encoding: i32) -> Result<Form, Fault> {
     })
 }
 
-/// What a client wants.
+/// Converts the QoS in a request.
 pub(super) fn from_proto(said: &proto::Qos) -> Result<Qos, Fault> {
     use proto::qos;
     let some = |ns: u64| Some(ns).filter(|ns| *ns > 0);
@@ -53,7 +53,7 @@ pub(super) fn from_proto(said: &proto::Qos) -> Result<Qos, Fault> {
     })
 }
 
-/// What somebody offers or requests.
+/// Converts an offered or requested QoS to the protocol.
 pub(super) fn to_proto(qos: &Qos) -> proto::Qos {
     use proto::qos;
     let reliability = match qos.reliability {
@@ -87,7 +87,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_said_of_a_qos_is_what_was_meant() {
+    fn qos_survives_conversion() {
         assert_eq!(from_proto(&proto::Qos::default()).unwrap(), Qos::default());
         let wanted = Qos {
             reliability: Reliability::BestEffort,

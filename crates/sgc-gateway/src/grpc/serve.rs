@@ -1,4 +1,4 @@
-//! `Serve`: a service that a client serves. Calls go to it as they come; it answers them in any order.
+//! `Serve`: a service that a client serves. The client gets calls as they arrive and answers them in any order.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -6,8 +6,8 @@ use std::sync::Arc;
 use sgc_ros::RequestId;
 use tonic::{Response, Status, Streaming};
 
-use super::client::{Guest, Place, Taken};
-use super::conversation::{Conversation, Told, begin, first};
+use super::client::{Guest, Place, StreamKind};
+use super::conversation::{Conversation, Responder, begin, first};
 use super::fault::Fault;
 use super::proto::serve_request::{Kind as Said, Reply, Server};
 use super::proto::serve_response::{Kind, Refused, Request, Served};
@@ -18,9 +18,9 @@ use crate::content::{Content, Form};
 use crate::error::GatewayError;
 use crate::service::{Replier, Serving};
 
-/// Calls that were not answered and are remembered: of more the oldest cannot be answered any more.
+/// Most unanswered calls. Beyond that the oldest can no longer be answered.
 const OPEN_MAX: usize = 4096;
-/// What is to come first.
+/// The required first request.
 const ORDER: Fault = Fault::Order { what: "the service" };
 
 /// A service that a client serves.
@@ -33,12 +33,12 @@ struct Work {
     last: u64,
 }
 
-/// Serves a service for as long as its client listens and speaks.
+/// Serves a service until its client closes the stream.
 pub(super) async fn serve(
     guest: Arc<Guest>,
     mut requests: Streaming<ServeRequest>,
 ) -> Result<Response<Responses<ServeResponse>>, Status> {
-    let place = guest.take(Taken::Serving)?;
+    let place = guest.take(StreamKind::Serving)?;
     let Some(ServeRequest { kind: Some(Said::Server(server)) }) = first(&guest, &mut requests).await? else {
         return Err(ORDER.into());
     };
@@ -65,10 +65,10 @@ impl Conversation for Work {
     async fn work(
         &mut self,
         mut requests: Streaming<ServeRequest>,
-        told: &Told<ServeResponse>,
+        told: &Responder<ServeResponse>,
     ) -> Result<(), Status> {
         loop {
-            // A place for what may come of it is taken first, so that nothing is lost by being given up.
+            // The place for a response is reserved first, so that cancellation loses nothing.
             tokio::select! {
                 said = requests.message() => {
                     let Some(said) = said? else { return Ok(()) };

@@ -1,4 +1,4 @@
-//! [`Service`]: the calls of `gateway.proto`, each handed to what does it.
+//! [`Service`]: the methods of `gateway.proto`, each passed to its module.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -8,7 +8,7 @@ use tokio_stream::Stream;
 use tonic::metadata::MetadataMap;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::client::{Guest, Taken};
+use super::client::{Guest, StreamKind};
 use super::fault::Fault;
 use super::proto::gateway_server::Gateway;
 use super::proto::{
@@ -18,19 +18,19 @@ use super::proto::{
     WatchGraphResponse,
 };
 use super::tracking::{Slot, with_slot};
-use super::{action, graph, publish, qos, serve, subscribe, types};
+use super::{action, get_type, graph, publish, qos, serve, subscribe};
 use crate::content::Content;
 
-/// How long a reply is waited for by who says nothing of it.
+/// Time to wait for a reply if the client sets no deadline.
 const CALL_WAIT_MAX: Duration = Duration::from_secs(3600);
-/// So long before the deadline of its client a call is given up, a tenth of it at most: for the client to be told by whom it
-/// was not answered.
+/// A call ends this long before the client's deadline, but at most a tenth of it, so that the client learns which
+/// server did not answer.
 const CALL_MARGIN_MAX: Duration = Duration::from_millis(100);
 
-/// What a client hears as a stream.
+/// A stream of responses to a client.
 pub(super) type Responses<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
-/// All that a program may do. Who asks is among the extensions of each request.
+/// The methods of the gateway. Each request has its guest among its extensions.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Service(());
 
@@ -46,7 +46,7 @@ impl Gateway for Service {
         &self,
         request: Request<GetGraphRequest>,
     ) -> Result<Response<GetGraphResponse>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         Ok(Response::new(graph::graph(&guest, request.get_ref().include_hidden)))
     }
 
@@ -54,17 +54,17 @@ impl Gateway for Service {
         &self,
         request: Request<WatchGraphRequest>,
     ) -> Result<Response<Self::WatchGraphStream>, Status> {
-        let guest = Guest::of(&request)?;
-        let place = guest.take(Taken::Watching)?;
+        let guest = Guest::from_request(&request)?;
+        let place = guest.take(StreamKind::Watching)?;
         Ok(Response::new(graph::watch(place, request.get_ref().include_hidden)))
     }
 
     async fn get_type(&self, request: Request<GetTypeRequest>) -> Result<Response<GetTypeResponse>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         let (asked, name) = (Arc::clone(&guest), request.into_inner().r#type);
         let described = guest.session.hub().shared.run(move |shared| {
             asked.session.check_type(&name)?;
-            Ok(types::describe(&shared.types, &name))
+            Ok(get_type::describe(&shared.types, &name))
         });
         let described = described.await;
         Ok(Response::new(described.map_err(Fault::from)??))
@@ -74,7 +74,7 @@ impl Gateway for Service {
         &self,
         request: Request<Streaming<PublishRequest>>,
     ) -> Result<Response<PublishResponse>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         Ok(Response::new(publish::publish(guest, request.into_inner()).await?))
     }
 
@@ -82,20 +82,20 @@ impl Gateway for Service {
         &self,
         request: Request<SubscribeRequest>,
     ) -> Result<Response<Self::SubscribeStream>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         Ok(subscribe::subscribe(guest, request.into_inner()).await?)
     }
 
     async fn call(&self, request: Request<CallRequest>) -> Result<Response<CallResponse>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         let max = deadline(request.metadata()).unwrap_or(CALL_WAIT_MAX).min(CALL_WAIT_MAX);
         let max = max.saturating_sub(CALL_MARGIN_MAX.min(max / 10));
         let CallRequest { service, r#type, encoding, payload } = request.into_inner();
         let form = qos::form(encoding)?;
         let content = Content { form, bytes: payload };
         let type_name = Some(&*r#type).filter(|name| !name.is_empty());
-        // It counts until there is room for its reply.
-        let _place = guest.take(Taken::Call)?;
+        // The call counts until there is room for its reply.
+        let _place = guest.take(StreamKind::Call)?;
         let called = async {
             let payload = guest.session.call(&service, type_name, &content, form, max).await?;
             let room = guest.unread.take_for_reply(payload.len()).await?;
@@ -111,7 +111,7 @@ impl Gateway for Service {
         &self,
         request: Request<Streaming<ServeRequest>>,
     ) -> Result<Response<Self::ServeStream>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         serve::serve(guest, request.into_inner()).await
     }
 
@@ -119,7 +119,7 @@ impl Gateway for Service {
         &self,
         request: Request<Streaming<SendGoalRequest>>,
     ) -> Result<Response<Self::SendGoalStream>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         action::send_goal(guest, request.into_inner()).await
     }
 
@@ -127,12 +127,12 @@ impl Gateway for Service {
         &self,
         request: Request<Streaming<ServeActionRequest>>,
     ) -> Result<Response<Self::ServeActionStream>, Status> {
-        let guest = Guest::of(&request)?;
+        let guest = Guest::from_request(&request)?;
         action::serve(guest, request.into_inner()).await
     }
 }
 
-/// How long a client waits, as it says (`grpc-timeout`: at most eight digits and a unit).
+/// Returns the time that a client waits, from its `grpc-timeout` header: at most eight digits and a unit.
 fn deadline(metadata: &MetadataMap) -> Option<Duration> {
     let text = metadata.get("grpc-timeout")?.to_str().ok()?;
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;

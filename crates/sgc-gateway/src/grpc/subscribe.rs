@@ -1,5 +1,5 @@
-//! `Subscribe`: a topic as a stream. Nothing is in between: the connection asks for a message while it has one at most that
-//! it cannot send, so what waits, waits in the subscription.
+//! `Subscribe`: a topic as a stream. The connection polls for a message only if at most one is unsent, so that
+//! messages queue in the subscription alone.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -10,7 +10,7 @@ use sgc_ros::Guid;
 use tokio::sync::watch;
 use tonic::{Response, Status};
 
-use super::client::{Guest, Place, Taken};
+use super::client::{Guest, Place, StreamKind};
 use super::fault::Fault;
 use super::proto::subscribe_response::{Kind, Message, Subscribed, Unreadable};
 use super::proto::{SubscribeRequest, SubscribeResponse};
@@ -23,26 +23,26 @@ use crate::feed::{Delivery, Subscription};
 use crate::hub::Hub;
 use crate::session::Subscribe;
 
-/// Messages that wait for a client that does not say how many.
+/// Queued messages for a client that sets no depth.
 const DEPTH_DEFAULT: u32 = 10;
-/// Messages that may wait for a client.
+/// Most queued messages for a client.
 const DEPTH_MAX: u32 = 10_000;
-/// Lowest rate, messages a second: about one a day.
+/// Lowest rate in messages per second: about one a day.
 const RATE_MIN_HZ: f64 = 1e-5;
 
-/// A topic that a client hears.
-struct Hearing {
+/// A client's stream of a topic.
+struct TopicStream {
     place: Place,
     subscription: Subscription,
     form: Form,
     sources: Sources,
-    /// What comes before the first message.
+    /// The response before the first message.
     first: Option<Subscribed>,
-    /// For the room that the next message takes.
+    /// The slot for the room of the next message.
     slot: Slot,
 }
 
-/// What a client asks for.
+/// Converts a request.
 fn wanted(request: SubscribeRequest) -> Result<(Subscribe, Form), Fault> {
     let form = qos::form(request.encoding)?;
     let depth = if request.depth == 0 { DEPTH_DEFAULT } else { request.depth };
@@ -66,13 +66,13 @@ fn wanted(request: SubscribeRequest) -> Result<(Subscribe, Form), Fault> {
     Ok((wanted, form))
 }
 
-/// Hears a topic for a client.
+/// Subscribes to a topic for a client.
 pub(super) async fn subscribe(
     guest: Arc<Guest>,
     request: SubscribeRequest,
 ) -> Result<Response<Responses<SubscribeResponse>>, Fault> {
     let (wanted, form) = wanted(request)?;
-    let place = guest.take(Taken::Subscription)?;
+    let place = guest.take(StreamKind::Subscription)?;
     let subscribed = async { Ok(guest.session.subscribe(wanted).await?) };
     let subscription = guest.admitted(subscribed).await?;
     guest.holds(&subscription);
@@ -82,7 +82,7 @@ pub(super) async fn subscribe(
     };
     let sources = Sources::new(guest.session.hub());
     let slot = Slot::default();
-    let hearing = Hearing { place, subscription, form, sources, first: Some(first), slot: slot.clone() };
+    let hearing = TopicStream { place, subscription, form, sources, first: Some(first), slot: slot.clone() };
     let responses: Responses<_> = Box::pin(stream::unfold(Some(hearing), |hearing| async {
         let mut hearing = hearing?;
         match hearing.next().await {
@@ -93,7 +93,7 @@ pub(super) async fn subscribe(
     Ok(with_slot(responses, slot))
 }
 
-impl Hearing {
+impl TopicStream {
     async fn next(&mut self) -> Result<Kind, Fault> {
         if let Some(first) = self.first.take() {
             return Ok(Kind::Subscribed(first));
@@ -125,11 +125,11 @@ impl Hearing {
     }
 }
 
-/// Whose messages they are, as the graph has it.
+/// The nodes of the topic's publishers, from the graph.
 struct Sources {
     hub: Hub,
     changes: watch::Receiver<u64>,
-    /// Of the graph that was seen last.
+    /// The nodes in the last graph.
     nodes: BTreeMap<Guid, Option<String>>,
 }
 

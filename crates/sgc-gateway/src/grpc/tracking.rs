@@ -1,5 +1,5 @@
-//! [`Tracking`]: what streams tell takes room of their client's [`Budget`](crate::budget::Budget) until it has left, and what they
-//! are sent until it was worked on.
+//! [`Tracking`]: outgoing messages of streams hold room in their client's [`Budget`](crate::budget::Budget) until
+//! they are sent, incoming ones until they are handled.
 
 use std::convert::Infallible;
 use std::pin::Pin;
@@ -16,13 +16,13 @@ use tonic::server::NamedService;
 use tonic::{Response, Status};
 
 use super::client::Guest;
-use super::incoming::{Incoming, Kept};
+use super::incoming::{Incoming, KeptRooms};
 use super::proto::gateway_server::GatewayServer;
 use super::service::{Responses, Service};
 use crate::budget::Room;
 use crate::hub::lock;
 
-/// Where a stream puts the room of the message that it gives next, for the body to take along.
+/// A slot in which a stream passes the room of its next message to the body.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Slot(Arc<Mutex<Option<Room>>>);
 
@@ -32,11 +32,11 @@ impl Slot {
     }
 }
 
-/// A response of a stream, and the room that it takes.
-pub(super) type Told<T> = (Result<T, Status>, Option<Room>);
+/// A response of a stream and its room.
+pub(super) type TrackedResponse<T> = (Result<T, Status>, Option<Room>);
 
-/// A stream of what is told, each with its room.
-pub(super) fn respond<T: Send + 'static>(told: mpsc::Receiver<Told<T>>) -> Response<Responses<T>> {
+/// Creates a stream of responses, each with its room.
+pub(super) fn respond<T: Send + 'static>(told: mpsc::Receiver<TrackedResponse<T>>) -> Response<Responses<T>> {
     let slot = Slot::default();
     let next = slot.clone();
     let responses: Responses<T> = Box::pin(ReceiverStream::new(told).map(move |(response, room)| {
@@ -48,15 +48,15 @@ pub(super) fn respond<T: Send + 'static>(told: mpsc::Receiver<Told<T>>) -> Respo
     with_slot(responses, slot)
 }
 
-/// A response whose messages have their room from there.
+/// Creates a response whose messages take their room from `slot`.
 pub(super) fn with_slot<T>(message: T, slot: Slot) -> Response<T> {
     let mut response = Response::new(message);
     response.extensions_mut().insert(slot);
     response
 }
 
-/// Has messages hold their room, those that come from their heads on until they were worked on, and those that go until they
-/// have left: the connection drops what it has written.
+/// A service whose messages hold their room: incoming ones from their heads until they are handled, outgoing ones
+/// until the connection has written and dropped them.
 #[derive(Clone, Debug)]
 pub(super) struct Tracking(GatewayServer<Service>);
 
@@ -80,8 +80,8 @@ impl tonic::codegen::Service<http::Request<Body>> for Tracking {
     }
 
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
-        // The one message of a call is worked on until that has its reply.
-        let kept: Option<Kept> = request.uri().path().ends_with("/Call").then(Kept::default);
+        // The only message of a call keeps its room until the reply is ready.
+        let kept: Option<KeptRooms> = request.uri().path().ends_with("/Call").then(KeptRooms::default);
         let guest = request.extensions().get::<Arc<Guest>>().cloned();
         let request = match guest {
             Some(guest) => request.map(|body| Body::new(Incoming::new(body, guest, kept.clone()))),
@@ -93,32 +93,32 @@ impl tonic::codegen::Service<http::Request<Body>> for Tracking {
             drop(kept);
             let slot = response.extensions_mut().remove::<Slot>();
             Ok(match slot {
-                Some(slot) => response.map(|body| Body::new(Tracked { body, slot })),
+                Some(slot) => response.map(|body| Body::new(TrackedBody { body, slot })),
                 None => response,
             })
         })
     }
 }
 
-/// What is written of a stream, with the room that it takes.
-struct Tracked {
+/// The body of a response, with the room of its messages.
+struct TrackedBody {
     body: Body,
     slot: Slot,
 }
 
-/// Bytes, and their room.
-struct Held {
+/// Bytes and their room.
+struct BytesWithRoom {
     bytes: Bytes,
     _room: Room,
 }
 
-impl AsRef<[u8]> for Held {
+impl AsRef<[u8]> for BytesWithRoom {
     fn as_ref(&self) -> &[u8] {
         &self.bytes
     }
 }
 
-impl http_body::Body for Tracked {
+impl http_body::Body for TrackedBody {
     type Data = Bytes;
     type Error = Status;
 
@@ -128,7 +128,7 @@ impl http_body::Body for Tracked {
     ) -> Poll<Option<Result<http_body::Frame<Bytes>, Status>>> {
         let frame = ready!(Pin::new(&mut self.body).poll_frame(cx));
         let with_room = |bytes| match lock(&self.slot.0).take() {
-            Some(_room) => Bytes::from_owner(Held { bytes, _room }),
+            Some(_room) => Bytes::from_owner(BytesWithRoom { bytes, _room }),
             None => bytes,
         };
         Poll::Ready(frame.map(|frame| frame.map(|frame| frame.map_data(with_room))))

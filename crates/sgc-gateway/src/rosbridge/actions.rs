@@ -1,4 +1,4 @@
-//! Actions of a client: [`Sent`] is a goal that it has sent, [`ServedAction`] an action that it serves.
+//! Actions of a client: [`pursue`] sends a goal, [`ServedAction`] is an action that the client serves.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -20,22 +20,22 @@ use crate::action::{ActionEvent, ActionReplier, ActionServing, Feedback, Goal, G
 use crate::content::{Content, Form};
 use crate::error::GatewayError;
 use crate::hub::lock;
-use crate::quota::Held;
+use crate::quota::ByteReservation;
 use crate::session::Session;
 
-/// How long a goal is waited for: as good as for ever.
+/// Time to wait for a goal, practically forever.
 const OUTCOME_MAX: Duration = Duration::from_secs(30 * 24 * 3600);
-/// How long an action may have no server before its goals are given up: one that starts anew knows them no more, but
+/// Time without a server after which an action's goals are given up. A restarted server no longer knows them, but
 /// discovery may be late.
 const SERVER_GONE_MAX: Duration = Duration::from_secs(5);
-/// Feedback that is told once the outcome is there.
+/// Most feedback messages that are sent after the outcome is known.
 const FEEDBACK_REST_MAX: usize = 1024;
-/// Goals that a client that serves has not ended; the oldest is forgotten for one more.
+/// Most unfinished goals at a client that serves. Beyond that the oldest is forgotten.
 const GOALS_MAX: usize = 1024;
 
-/// A goal as a client sends it.
+/// A client's request to send a goal.
 #[derive(Clone, Debug)]
-pub(super) struct Wanted {
+pub(super) struct GoalRequest {
     pub(super) id: Option<OpId>,
     pub(super) action: String,
     pub(super) type_name: Option<String>,
@@ -44,12 +44,12 @@ pub(super) struct Wanted {
     pub(super) compression: Compression,
 }
 
-impl Wanted {
+impl GoalRequest {
     fn envelope(&self, op: &str, bytes: usize) -> Envelope {
         Envelope::new(op, self.compression, bytes).id(self.id.as_ref()).text("action", &self.action)
     }
 
-    /// What is said if there is no outcome.
+    /// Sends the result of a goal that has no outcome.
     pub(super) async fn fail(&self, why: &str, outbox: &Outbox) {
         let failed = self.envelope("action_result", why.len()).text("values", why);
         let failed = failed.value("status", &Json::from(GoalStatus::Unknown as i8));
@@ -57,12 +57,12 @@ impl Wanted {
     }
 }
 
-/// Sends a goal and tells of it until it has ended; `cancel` is told when it is to be given up, `end` when its client may not
-/// have it any more.
+/// Sends a goal and reports on it until it ends. `cancel` asks to cancel it; `end` means that the client may not have
+/// it any more.
 pub(super) async fn pursue(
     session: Arc<Session>,
-    wanted: Wanted,
-    args: (String, Held),
+    wanted: GoalRequest,
+    args: (String, ByteReservation),
     (cancel, mut end): (Arc<Notify>, oneshot::Receiver<GatewayError>),
     outbox: Outbox,
 ) {
@@ -71,7 +71,7 @@ pub(super) async fn pursue(
         async move { session.send_goal(&wanted.action, wanted.type_name.as_deref(), &goal).await }
     };
     let sending = async {
-        // They wait no more once they are sent.
+        // The arguments are dropped once they are sent.
         let args = args;
         input::tolerate_later(&args.0, send).await
     };
@@ -80,7 +80,7 @@ pub(super) async fn pursue(
         biased;
         why = ended(&mut end) => {
             let why = told(&why);
-            // What was taken before that is known only now.
+            // A goal accepted in the meantime is known only now.
             let (sent, ()) = tokio::join!(sending, wanted.fail(&why, &outbox));
             if let Ok((goal, _)) = sent {
                 give_up(&wanted, &goal, &outbox).await;
@@ -109,7 +109,7 @@ pub(super) async fn pursue(
 
 async fn follow(
     session: &Session,
-    wanted: &Wanted,
+    wanted: &GoalRequest,
     goal: &Goal,
     mut feedback: Feedback,
     cancel: &Notify,
@@ -127,7 +127,7 @@ async fn follow(
             Some(said) = feedback.next(form), if wanted.has_feedback => {
                 let telling = tell(wanted, said, outbox);
                 tokio::pin!(telling);
-                // A client that does not take what it is told can give it up all the same.
+                // A client that does not read feedback can still cancel the goal.
                 loop {
                     tokio::select! {
                         biased;
@@ -139,7 +139,7 @@ async fn follow(
             () = &mut gone => return Err(GatewayError::NoServer { name: wanted.action.clone() }),
         }
     };
-    // What was said of it before comes first.
+    // Earlier feedback comes before the result.
     for _ in 0..FEEDBACK_REST_MAX {
         let Some(Some(said)) = feedback.next(form).now_or_never().filter(|_| wanted.has_feedback) else {
             break;
@@ -154,14 +154,14 @@ async fn follow(
     outbox.say_reply(result.finish_in_pieces(wanted.fragment_size, fragment_id)).await
 }
 
-async fn give_up(wanted: &Wanted, goal: &Goal, outbox: &Outbox) {
+async fn give_up(wanted: &GoalRequest, goal: &Goal, outbox: &Outbox) {
     if let Err(error) = goal.cancel().await {
-        // Nothing is waited for here: it may be that the client takes nothing.
+        // Nothing waits here, because the client may not read.
         outbox.try_status(Level::Error, &told(&format!("cancel_action_goal: {error}")), wanted.id.as_ref());
     }
 }
 
-async fn tell(wanted: &Wanted, said: Result<bytes::Bytes, GatewayError>, outbox: &Outbox) {
+async fn tell(wanted: &GoalRequest, said: Result<bytes::Bytes, GatewayError>, outbox: &Outbox) {
     match said {
         Ok(values) => {
             let said = wanted.envelope("action_feedback", values.len()).content("values", &values);
@@ -192,10 +192,10 @@ async fn server_gone(session: &Session, action: &str) {
     }
 }
 
-/// Goals of an action that were passed on to a client, by their number.
+/// The goals that were forwarded to a client, by number.
 type Goals = BTreeMap<u64, GoalId>;
 
-/// An action that a client serves; ends when dropped.
+/// An action that a client serves, until dropped.
 #[derive(Debug)]
 pub(super) struct ServedAction {
     replier: ActionReplier,
@@ -215,7 +215,8 @@ impl ServedAction {
         let replier = serving.replier();
         let goals = Arc::default();
         let prefix: Arc<str> = format!("action_goal:{}:", serving.action()).into();
-        let told = Told { type_name, goals: Arc::clone(&goals), prefix: Arc::clone(&prefix), outbox };
+        let told =
+            GoalForwarder { type_name, goals: Arc::clone(&goals), prefix: Arc::clone(&prefix), outbox };
         let task = tokio::spawn(told.pass_on(serving));
         Self { replier, goals, prefix, task }
     }
@@ -229,12 +230,12 @@ impl ServedAction {
         id.strip_prefix(&*self.prefix)?.parse().ok()
     }
 
-    /// The goal of an id.
+    /// Returns the goal with an id.
     pub(super) fn goal(&self, id: Option<&OpId>) -> Option<GoalId> {
         lock(&self.goals).get(&self.number(id)?).copied()
     }
 
-    /// A goal has ended.
+    /// Removes a goal that has ended.
     pub(super) fn forget(&self, id: Option<&OpId>) {
         if let Some(number) = self.number(id) {
             lock(&self.goals).remove(&number);
@@ -242,15 +243,15 @@ impl ServedAction {
     }
 }
 
-/// What passes goals on to a client.
-struct Told {
+/// The task that forwards goals to a client.
+struct GoalForwarder {
     type_name: String,
     goals: Arc<Mutex<Goals>>,
     prefix: Arc<str>,
     outbox: Outbox,
 }
 
-impl Told {
+impl GoalForwarder {
     async fn pass_on(self, mut serving: ActionServing) {
         let replier = serving.replier();
         while let Some(event) = serving.next().await {
@@ -258,7 +259,7 @@ impl Told {
             let frame = match event {
                 ActionEvent::Goal { id, goal } => {
                     let Ok(args) = serving.write(&goal, Form::Json) else { continue };
-                    // Clients of this protocol take every goal.
+                    // Clients of this protocol accept every goal.
                     if replier.answer(&id, true).await.is_err() {
                         continue;
                     }

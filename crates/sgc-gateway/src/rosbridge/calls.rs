@@ -1,4 +1,4 @@
-//! [`Call`]: a service that a client calls, on the network or of the gateway's own `rosapi`.
+//! [`Call`]: a client's call of a service, on the network or of the gateway's own `rosapi`.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -18,7 +18,7 @@ use crate::content::Content;
 use crate::error::GatewayError;
 use crate::session::{Session, action_of};
 
-/// A service that a client calls.
+/// A client's call of a service.
 #[derive(Clone, Debug)]
 pub(super) struct Call {
     pub(super) id: Option<OpId>,
@@ -30,26 +30,26 @@ pub(super) struct Call {
     pub(super) compression: Compression,
 }
 
-/// What is answered to a call that is refused before it begins.
+/// Answers a call that is refused before it begins.
 pub(super) async fn refuse(id: &OpId, service: &str, why: &str, outbox: &Outbox) {
     let refused = Envelope::json("service_response").id(Some(id)).text("service", service);
     let refused = refused.text("values", why).value("result", &Json::Bool(false));
     let _ = outbox.say(refused.finish()).await;
 }
 
-/// Ends a call or a goal that its client may not have any more.
+/// A handle that ends a call or goal to which the client has lost its right.
 pub(super) type End = oneshot::Sender<GatewayError>;
 
-/// Waits until something is to end, and has why.
+/// Waits for the end of a call or goal and returns the reason.
 pub(super) async fn ended(end: &mut oneshot::Receiver<GatewayError>) -> GatewayError {
     match end.await {
         Ok(why) => why,
-        // Nobody will say so.
+        // The sender is gone, so no end will come.
         Err(_) => std::future::pending().await,
     }
 }
 
-/// Calls it and tells what came of it, or why it has to end.
+/// Calls the service and sends the reply, or the reason for which the call ended.
 pub(super) async fn answer(
     session: Arc<Session>,
     options: Arc<RosbridgeOptions>,

@@ -1,4 +1,4 @@
-//! [`Connection`]: what one client has, and what becomes of what it sends.
+//! [`Connection`]: the state of one client, and the execution of its ops.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -8,65 +8,65 @@ use tokio::sync::{Notify, oneshot, watch};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 
-use super::actions::{ServedAction, Wanted, pursue};
+use super::actions::{GoalRequest, ServedAction, pursue};
 use super::calls::{Call, End, answer, refuse};
 use super::envelope::Compression;
 use super::fragments::Fragments;
 use super::input;
 use super::op::{Op, OpError, OpId, told};
 use super::options::{RosbridgeError, RosbridgeOptions};
-use super::outbox::{Gone, Level, Outbox};
-use super::qos::Said;
+use super::outbox::{ConnectionClosed, Level, Outbox};
+use super::qos::QosMember;
 use super::rosapi::local_name;
-use super::services::Served;
-use super::topics::{Topic, Wish};
+use super::services::ServedService;
+use super::topics::{SubscriptionRequest, Topic};
 use crate::access::Right;
 use crate::action::GoalStatus;
-use crate::aside::aside_if_long;
 use crate::content::Content;
+use crate::definitions::InterfaceType;
 use crate::error::GatewayError;
+use crate::offload::offload_if_long;
 use crate::publisher::Publication;
-use crate::quota::Held;
+use crate::quota::ByteReservation;
 use crate::session::{Advertise, Session, Subscribe, action_of};
-use crate::types::InterfaceType;
 
-/// How long a client that begins to publish waits for readers that the graph shows, so that these have its first message.
+/// Time for which a new publisher waits for the readers in the graph, so that these get its first message.
 const SETTLE_MAX: Duration = Duration::from_millis(500);
-/// Longest time that a call waits for its reply, whatever its client says.
+/// Longest wait for a reply, whatever the client asks for.
 const TIMEOUT_MAX: Duration = Duration::from_secs(3600);
-/// Errors that a client may make at once, and a second: who makes more is disconnected.
+/// Errors that a client may make in a burst, and per second. A client beyond that is disconnected.
 const ERRORS_BURST: u32 = 200;
 const ERRORS_PER_SECOND: u32 = 100;
-/// The text for a client whose message lacks pieces that have not come in time.
+/// The error text for a message whose fragments are late.
 const PIECES_LATE: &str = "pieces of the message did not come in time, and it is given up";
-/// Things that a client which has become another may not have any more, each said for itself; further ones are counted.
+/// Most individual reports about interfaces that a client lost by a change of its credential.
 const ENDED_SHOWN_MAX: usize = 16;
 
-/// What a client publishes on a topic.
-struct Published {
+/// A topic that a client publishes.
+struct ClientPublication {
     publication: Publication,
     ids: BTreeSet<Option<OpId>>,
 }
 
-/// A call or a goal under way.
-struct UnderWay {
-    /// What is called.
+/// A call or goal in progress.
+struct PendingJob {
+    /// The name of the service or action.
     name: String,
     end: End,
 }
 
-/// Errors that a client may still make.
-struct Patience {
+/// The number of errors that a client may still make.
+struct ErrorBudget {
     left: u32,
     since: Instant,
 }
 
-impl Patience {
+impl ErrorBudget {
     fn new() -> Self {
         Self { left: ERRORS_BURST, since: Instant::now() }
     }
 
-    /// Counts one; false if there were too many.
+    /// Counts an error. Returns `false` if there were too many.
     fn count(&mut self, now: Instant) -> bool {
         let earned =
             now.saturating_duration_since(self.since).as_millis() * u128::from(ERRORS_PER_SECOND) / 1000;
@@ -81,32 +81,32 @@ impl Patience {
     }
 }
 
-/// What one client has.
+/// The state of one client.
 pub(super) struct Connection {
     session: Arc<Session>,
-    /// Holds the present session of the client.
+    /// The current session of the client.
     sessions: watch::Sender<Arc<Session>>,
     options: Arc<RosbridgeOptions>,
     outbox: Outbox,
     is_admitted: bool,
     topics: BTreeMap<String, Topic>,
-    publications: BTreeMap<String, Published>,
-    /// Topics with messages that are still to leave.
+    publications: BTreeMap<String, ClientPublication>,
+    /// Topics with unsent messages.
     unflushed: Vec<String>,
-    services: BTreeMap<String, Served>,
+    services: BTreeMap<String, ServedService>,
     actions: BTreeMap<String, ServedAction>,
     goals: BTreeMap<OpId, Arc<Notify>>,
-    /// Calls and goals under way, by their numbers; ended with the connection.
+    /// Calls and goals in progress by number, aborted with the connection.
     tasks: JoinSet<(u64, Option<OpId>)>,
-    under_way: BTreeMap<u64, UnderWay>,
+    under_way: BTreeMap<u64, PendingJob>,
     next_number: u64,
     fragments: Fragments,
-    patience: Patience,
+    patience: ErrorBudget,
 }
 
-/// How an op can end.
+/// The failure of an op.
 enum Failure {
-    /// The client is told.
+    /// The error is reported to the client.
     Op(OpError),
     /// The connection ends.
     End(RosbridgeError),
@@ -118,14 +118,14 @@ impl From<OpError> for Failure {
     }
 }
 
-impl From<Gone> for Failure {
-    fn from(_: Gone) -> Self {
+impl From<ConnectionClosed> for Failure {
+    fn from(_: ConnectionClosed) -> Self {
         let closed = tokio_tungstenite::tungstenite::Error::ConnectionClosed;
         Self::End(RosbridgeError::Socket(Box::new(closed)))
     }
 }
 
-type Done = Result<(), Failure>;
+type OpResult = Result<(), Failure>;
 
 impl Connection {
     pub(super) fn new(session: Arc<Session>, options: Arc<RosbridgeOptions>, outbox: Outbox) -> Self {
@@ -146,7 +146,7 @@ impl Connection {
             under_way: BTreeMap::new(),
             next_number: 0,
             fragments,
-            patience: Patience::new(),
+            patience: ErrorBudget::new(),
         }
     }
 
@@ -159,10 +159,10 @@ impl Connection {
         self.sessions.subscribe()
     }
 
-    /// Does what a client asks for; only what ends the connection is an error.
+    /// Executes an op. Only an error that ends the connection is returned.
     pub(super) async fn take(&mut self, text: &str) -> Result<(), RosbridgeError> {
         let taken = self.take_op(text).await;
-        self.session.message_is_done_but(self.fragments.bytes());
+        self.session.finish_message_keeping(self.fragments.bytes());
         taken
     }
 
@@ -174,11 +174,11 @@ impl Connection {
                 self.goals.remove(&id);
             }
         }
-        let (done, id) = match aside_if_long(text.len(), || Op::parse(text)) {
+        let (done, id) = match offload_if_long(text.len(), || Op::parse(text)) {
             Ok(op) if op.name == "fragment" && self.is_admitted => match self.put_together(&op) {
                 Ok(None) => (Ok(()), None),
-                Ok(Some(whole)) => match aside_if_long(whole.len(), || Op::parse(&whole)) {
-                    // It is told with the id of the pieces if it has none.
+                Ok(Some(whole)) => match offload_if_long(whole.len(), || Op::parse(&whole)) {
+                    // An inner message without an id is answered with the id of its fragments.
                     Ok(inner) => (self.run(&inner).await, inner.id.or(op.id)),
                     Err(error) => (Err(error.into()), op.id),
                 },
@@ -207,12 +207,12 @@ impl Connection {
         }
     }
 
-    /// Lets leave what was published since the last time.
+    /// Sends messages that were published since the last flush.
     pub(super) async fn flush(&mut self) -> Result<(), RosbridgeError> {
         while let Some(topic) = self.unflushed.pop() {
             let Some(published) = self.publications.get(&topic) else { continue };
             let flushed = published.publication.flush().await;
-            // The client is told of each that is lost.
+            // Each lost message is reported to the client.
             if published.publication.has_ahead() {
                 self.unflushed.push(topic.clone());
             }
@@ -223,7 +223,7 @@ impl Connection {
         Ok(())
     }
 
-    async fn run(&mut self, op: &Op<'_>) -> Done {
+    async fn run(&mut self, op: &Op<'_>) -> OpResult {
         if !self.is_admitted && op.name != "auth" {
             let how = r#"say who you are first: {"op":"auth","token":"…"}"#;
             return Err(op.refused(how).into());
@@ -259,11 +259,11 @@ impl Connection {
         }
     }
 
-    async fn auth(&mut self, op: &Op<'_>) -> Done {
+    async fn auth(&mut self, op: &Op<'_>) -> OpResult {
         let Some(authenticate) = &self.options.authenticate else {
             return Err(op.refused("this gateway takes no tokens here").into());
         };
-        // Where clients can only say what the `rosauth` of ROS 1 wanted, the token stands for the code.
+        // Some clients know only the fields of ROS 1's `rosauth`, so a token may stand in its code field.
         let token = match op.text("token")? {
             Some(token) => token,
             None => op.text("mac")?.ok_or_else(|| op.refused("\"token\" is missing"))?,
@@ -287,7 +287,7 @@ impl Connection {
                 Ok(self.end_what_is_not_permitted(is_as_before).await?)
             }
             Err(why) => {
-                // Whoever guesses makes a connection for each guess.
+                // A client that guesses must open a connection for each guess.
                 let error = op.refused(why.clone());
                 self.outbox.status(Level::Error, &told(&error), op.id.as_ref()).await?;
                 Err(Failure::End(RosbridgeError::NotAdmitted(why)))
@@ -295,9 +295,9 @@ impl Connection {
         }
     }
 
-    /// Ends what a client has that it may not have, now that it is another, and says so. Calls and goals say it for
-    /// themselves.
-    async fn end_what_is_not_permitted(&mut self, is_as_before: bool) -> Result<(), Gone> {
+    /// Ends publications, services and other uses to which the client's new credential has no right, and reports
+    /// them. Calls and goals report for themselves.
+    async fn end_what_is_not_permitted(&mut self, is_as_before: bool) -> Result<(), ConnectionClosed> {
         let (session, mut ended) = (&self.session, Vec::new());
         let mut may = |right, name: &str| {
             let checked = session.check(right, name);
@@ -308,7 +308,7 @@ impl Connection {
         self.services.retain(|name, _| may(Right::Serve, action_of(name)));
         self.actions.retain(|name, _| may(Right::Serve, name));
         let why = |name: &str| match local_name(name) {
-            // It sees what the client saw.
+            // The new client may see everything that the former one saw.
             Some(_) if is_as_before => None,
             Some(_) => Some(GatewayError::OtherClient { client: session.client().name.to_string() }),
             None => session.check(Right::Call, action_of(name)).err(),
@@ -317,7 +317,7 @@ impl Connection {
             self.under_way.iter().filter_map(|(number, of)| Some((*number, why(&of.name)?))).collect();
         for (number, why) in over {
             if let Some(under_way) = self.under_way.remove(&number) {
-                // One that has ended by itself is not there to hear it.
+                // A job that has ended no longer listens.
                 let _ = under_way.end.send(why);
             }
         }
@@ -331,23 +331,23 @@ impl Connection {
         Ok(())
     }
 
-    /// A number for a call or a goal, and what tells it to end.
+    /// Registers a call or goal. Returns its number and the receiver that tells it to end.
     fn begin(&mut self, name: &str) -> (u64, oneshot::Receiver<GatewayError>) {
         self.next_number += 1;
         let (end, ended) = oneshot::channel();
-        self.under_way.insert(self.next_number, UnderWay { name: name.to_owned(), end });
+        self.under_way.insert(self.next_number, PendingJob { name: name.to_owned(), end });
         (self.next_number, ended)
     }
 
-    fn set_level(&mut self, op: &Op<'_>) -> Done {
+    fn set_level(&mut self, op: &Op<'_>) -> OpResult {
         let name = op.needed_name("level")?;
-        let level = Level::of(&name);
+        let level = Level::from_name(&name);
         let level = level.ok_or_else(|| op.refused("\"level\" is none, error, warning or info"))?;
         self.outbox.set_level(level);
         Ok(())
     }
 
-    /// The message of which this is the last piece, if it is.
+    /// Adds a fragment and returns the message if it is complete.
     fn put_together(&mut self, op: &Op<'_>) -> Result<Option<String>, OpError> {
         let id = op.id.as_ref().ok_or_else(|| op.refused("\"id\" is missing"))?;
         let number = op.count("num")?.ok_or_else(|| op.refused("\"num\" is missing"))?;
@@ -357,12 +357,12 @@ impl Connection {
         taken.map_err(|error| op.refused(error.to_string()))
     }
 
-    /// Returns when the next message of which pieces are missing is given up.
+    /// Returns the time at which the next incomplete message is given up.
     pub(super) fn fragments_end(&self) -> Option<Instant> {
         self.fragments.next_end()
     }
 
-    /// Gives up messages whose pieces have not come in time, and says so.
+    /// Gives up incomplete messages whose fragments are late, and reports them.
     pub(super) async fn give_up_fragments(&mut self) -> Result<(), RosbridgeError> {
         let before = self.fragments.bytes();
         let given_up: Vec<_> = std::iter::from_fn(|| self.fragments.give_up(Instant::now())).collect();
@@ -374,12 +374,12 @@ impl Connection {
         Ok(())
     }
 
-    async fn advertise(&mut self, op: &Op<'_>) -> Done {
+    async fn advertise(&mut self, op: &Op<'_>) -> OpResult {
         let topic = op.needed_name("topic")?;
         let type_name = op.name("type")?;
         let said = match op.object("qos")? {
-            Some(raw) => Said::read(raw).map_err(|why| op.refused(why))?,
-            None => Said::default(),
+            Some(raw) => QosMember::read(raw).map_err(|why| op.refused(why))?,
+            None => QosMember::default(),
         };
         let qos = said.offer(op.bool("latch")?.unwrap_or(false), op.count("queue_size")?);
         if let Some(published) = self.publications.get_mut(&topic) {
@@ -406,7 +406,7 @@ impl Connection {
         self.begin_publishing(op, wanted).await
     }
 
-    async fn begin_publishing(&mut self, op: &Op<'_>, wanted: Advertise) -> Done {
+    async fn begin_publishing(&mut self, op: &Op<'_>, wanted: Advertise) -> OpResult {
         let max = self.session.limits().publications_max;
         let topic = wanted.topic.clone();
         let made = async {
@@ -415,13 +415,13 @@ impl Connection {
         };
         let publication = made.await.map_err(|error| op.gateway(error))?;
         publication.settle(SETTLE_MAX).await;
-        // Published without being advertised, the topic goes with whatever is unadvertised next.
+        // A topic published without an advertisement ends with any `unadvertise`.
         let ids = (op.name == "advertise").then(|| op.id.clone()).into_iter().collect();
-        self.publications.insert(topic, Published { publication, ids });
+        self.publications.insert(topic, ClientPublication { publication, ids });
         Ok(())
     }
 
-    fn unadvertise(&mut self, op: &Op<'_>) -> Done {
+    fn unadvertise(&mut self, op: &Op<'_>) -> OpResult {
         let topic = op.needed_name("topic")?;
         let Some(published) = self.publications.get_mut(&topic) else {
             let error = GatewayError::NotThere { name: topic, what: "advertised" };
@@ -437,11 +437,11 @@ impl Connection {
         Ok(())
     }
 
-    async fn publish(&mut self, op: &Op<'_>) -> Done {
+    async fn publish(&mut self, op: &Op<'_>) -> OpResult {
         let topic = op.needed_name("topic")?;
         let raw = op.needed_object("msg")?;
         if !self.publications.contains_key(&topic) {
-            let qos = Said::default().offer(op.bool("latch")?.unwrap_or(false), None);
+            let qos = QosMember::default().offer(op.bool("latch")?.unwrap_or(false), None);
             let wanted = Advertise { topic: topic.clone(), type_name: op.name("type")?, qos };
             self.begin_publishing(op, wanted).await?;
         }
@@ -459,16 +459,16 @@ impl Connection {
         Ok(done?)
     }
 
-    async fn subscribe(&mut self, op: &Op<'_>) -> Done {
+    async fn subscribe(&mut self, op: &Op<'_>) -> OpResult {
         let topic = op.needed_name("topic")?;
         let type_name = op.name("type")?;
         let said = match op.object("qos")? {
-            Some(raw) => Said::read(raw).map_err(|why| op.refused(why))?,
-            None => Said::default(),
+            Some(raw) => QosMember::read(raw).map_err(|why| op.refused(why))?,
+            None => QosMember::default(),
         };
         let throttle_ms = op.count("throttle_rate")?.unwrap_or(0);
         let queue_length = op.count("queue_length")?.unwrap_or(0);
-        let wish = Wish {
+        let wish = SubscriptionRequest {
             throttle: Duration::from_millis(throttle_ms as u64),
             queue_length: said.depth.map_or(queue_length, |depth| depth as usize),
             fragment_size: fragment_size(op)?,
@@ -503,7 +503,7 @@ impl Connection {
         Ok(())
     }
 
-    fn unsubscribe(&mut self, op: &Op<'_>) -> Done {
+    fn unsubscribe(&mut self, op: &Op<'_>) -> OpResult {
         let topic = op.needed_name("topic")?;
         let Some(heard) = self.topics.get_mut(&topic) else {
             let error = GatewayError::NotThere { name: topic, what: "subscribed to" };
@@ -515,8 +515,8 @@ impl Connection {
         Ok(())
     }
 
-    /// A call that is refused before it begins is answered, too: who has made it waits for that.
-    async fn call_service(&mut self, op: &Op<'_>) -> Done {
+    /// Calls a service. A refusal is also sent as a reply, because the caller waits for one.
+    async fn call_service(&mut self, op: &Op<'_>) -> OpResult {
         let begun = self.begin_call(op);
         if let (Err(error), Some(id)) = (&begun, &op.id) {
             let service = op.name("service").ok().flatten().unwrap_or_default();
@@ -537,7 +537,7 @@ impl Connection {
             fragment_size: fragment_size(op)?,
             compression: match compression(op)? {
                 Compression::None => Compression::None,
-                // There is no form of its own for replies.
+                // Replies have no raw form.
                 Compression::Cbor | Compression::CborRaw => Compression::Cbor,
             },
         };
@@ -552,28 +552,28 @@ impl Connection {
         Ok(())
     }
 
-    /// Calls and goals are tasks of their own, so there is a bound on them before they are made.
+    /// Fails at the bound of calls and goals, which are tasks of their own.
     fn check_tasks(&self, op: &Op<'_>) -> Result<(), OpError> {
         let max = self.session.limits().calls_max;
         let checked = self.session.check_count("calls and goals under way", self.tasks.len(), max);
         checked.map_err(|error| op.gateway(error))
     }
 
-    /// There is a bound on the bytes of their arguments, too.
-    fn hold(&self, op: &Op<'_>) -> Result<Held, OpError> {
+    /// Reserves room for arguments, whose bytes are bounded, too.
+    fn hold(&self, op: &Op<'_>) -> Result<ByteReservation, OpError> {
         let bytes = op.raw("args").map_or(0, str::len);
         self.session.hold_arguments(bytes).map_err(|error| op.gateway(error))
     }
 
-    async fn advertise_service(&mut self, op: &Op<'_>) -> Done {
+    async fn advertise_service(&mut self, op: &Op<'_>) -> OpResult {
         let service = op.needed_name("service")?;
         let type_name = op.needed_name("type")?;
         self.check_servings(op)?;
-        // Who advertises again means the new one.
+        // A second advertisement replaces the first.
         self.services.remove(&service);
         let serving = self.session.serve(&service, Some(&type_name)).await;
         let serving = serving.map_err(|error| op.gateway(error))?;
-        self.services.insert(service, Served::new(serving, self.outbox.clone()));
+        self.services.insert(service, ServedService::new(serving, self.outbox.clone()));
         Ok(())
     }
 
@@ -583,7 +583,7 @@ impl Connection {
         checked.map_err(|error| op.gateway(error))
     }
 
-    fn unadvertise_service(&mut self, op: &Op<'_>) -> Done {
+    fn unadvertise_service(&mut self, op: &Op<'_>) -> OpResult {
         let service = op.needed_name("service")?;
         match self.services.remove(&service) {
             Some(_) => Ok(()),
@@ -594,7 +594,7 @@ impl Connection {
         }
     }
 
-    async fn service_response(&mut self, op: &Op<'_>) -> Done {
+    async fn service_response(&mut self, op: &Op<'_>) -> OpResult {
         let service = op.needed_name("service")?;
         let is_done = op.bool("result")?.unwrap_or(true);
         let Some(served) = self.services.get(&service) else {
@@ -606,7 +606,7 @@ impl Connection {
             request.ok_or_else(|| op.refused(format!("{service}: no request waits under that id")))?;
         let values = op.raw("values").filter(|raw| raw.starts_with(['{', '[']));
         if !is_done && values.is_none() {
-            // ROS 2 has no reply that says so: whoever called hears nothing.
+            // ROS 2 has no reply for failures, so the caller gets none.
             let why = op.raw("values").map_or_else(|| "no reason given".to_owned(), super::op::short);
             tracing::debug!(%service, %why, "a client failed to answer");
             served.answered(op.id.as_ref());
@@ -621,16 +621,16 @@ impl Connection {
         Ok(())
     }
 
-    /// A goal that is refused before it is sent has an outcome, too: who has sent it waits for that.
-    async fn send_action_goal(&mut self, op: &Op<'_>) -> Done {
+    /// Sends a goal. A refusal is also sent as a result, because the client waits for one.
+    async fn send_action_goal(&mut self, op: &Op<'_>) -> OpResult {
         let is_known = op.id.as_ref().is_some_and(|id| self.goals.contains_key(id));
         if is_known {
-            // An outcome would be taken for that of the other.
+            // The result would be taken for that of the other goal.
             return Err(op.refused("a goal of that id is under way").into());
         }
         let begun = self.begin_goal(op);
         if let (Err(error), Some(_)) = (&begun, &op.id) {
-            let wanted = Wanted {
+            let wanted = GoalRequest {
                 id: op.id.clone(),
                 action: op.name("action").ok().flatten().unwrap_or_default(),
                 type_name: None,
@@ -651,7 +651,7 @@ impl Connection {
             Some(name) => Some(name),
             None => op.name("type")?,
         };
-        let wanted = Wanted {
+        let wanted = GoalRequest {
             id: op.id.clone(),
             action,
             type_name,
@@ -682,14 +682,14 @@ impl Connection {
         Ok(())
     }
 
-    fn cancel_action_goal(&mut self, op: &Op<'_>) -> Done {
+    fn cancel_action_goal(&mut self, op: &Op<'_>) -> OpResult {
         let goal = op.id.as_ref().and_then(|id| self.goals.get(id));
         let goal = goal.ok_or_else(|| op.refused("no goal of that id is under way"))?;
         goal.notify_one();
         Ok(())
     }
 
-    async fn advertise_action(&mut self, op: &Op<'_>) -> Done {
+    async fn advertise_action(&mut self, op: &Op<'_>) -> OpResult {
         let action = op.needed_name("action")?;
         let type_name = op.needed_name("type")?;
         self.check_servings(op)?;
@@ -702,7 +702,7 @@ impl Connection {
         Ok(())
     }
 
-    fn unadvertise_action(&mut self, op: &Op<'_>) -> Done {
+    fn unadvertise_action(&mut self, op: &Op<'_>) -> OpResult {
         let action = op.needed_name("action")?;
         match self.actions.remove(&action) {
             Some(_) => Ok(()),
@@ -710,14 +710,14 @@ impl Connection {
         }
     }
 
-    /// The action that an op is of, which the client serves.
+    /// Returns the action of an op, which the client must serve.
     fn served_action(&self, op: &Op<'_>) -> Result<&ServedAction, OpError> {
         let action = op.needed_name("action")?;
         let served = self.actions.get(&action);
         served.ok_or_else(|| op.gateway(GatewayError::NotThere { name: action, what: "served" }))
     }
 
-    async fn action_feedback(&mut self, op: &Op<'_>) -> Done {
+    async fn action_feedback(&mut self, op: &Op<'_>) -> OpResult {
         let served = self.served_action(op)?;
         let goal =
             served.goal(op.id.as_ref()).ok_or_else(|| op.refused("no goal of that id is under way"))?;
@@ -727,14 +727,14 @@ impl Connection {
         input::tolerate_later(values, tell).await.map_err(|error| op.gateway(error).into())
     }
 
-    async fn action_result(&mut self, op: &Op<'_>) -> Done {
+    async fn action_result(&mut self, op: &Op<'_>) -> OpResult {
         let served = self.served_action(op)?;
         let goal =
             served.goal(op.id.as_ref()).ok_or_else(|| op.refused("no goal of that id is under way"))?;
         let is_done = op.bool("result")?.unwrap_or(true);
         let status = match (is_done, op.integer("status")?) {
             (true, None) => GoalStatus::Succeeded,
-            (_, Some(status)) if GoalStatus::of(status).is_end() => GoalStatus::of(status),
+            (_, Some(status)) if GoalStatus::from_number(status).is_end() => GoalStatus::from_number(status),
             (false, _) => GoalStatus::Aborted,
             (true, Some(status)) => {
                 return Err(op.refused(format!("status {status} is no end of a goal")).into());
@@ -748,8 +748,8 @@ impl Connection {
         Ok(())
     }
 
-    /// What a client says of a goal that it works on; ROS 2 is told by the gateway itself.
-    fn action_status(&mut self, op: &Op<'_>) -> Done {
+    /// Checks the status that a client reports for its goal. The gateway itself reports to ROS 2.
+    fn action_status(&mut self, op: &Op<'_>) -> OpResult {
         let served = self.served_action(op)?;
         served.goal(op.id.as_ref()).ok_or_else(|| op.refused("no goal of that id is under way"))?;
         Ok(())
@@ -762,10 +762,10 @@ fn unpublished(op: &str, topic: &str, error: &GatewayError) -> OpError {
 
 fn compression(op: &Op<'_>) -> Result<Compression, OpError> {
     let name = op.name("compression")?.unwrap_or_default();
-    Compression::of(&name).map_err(|why| op.refused(why))
+    Compression::from_name(&name).map_err(|why| op.refused(why))
 }
 
-/// At least one byte.
+/// Reads the fragment size, at least one byte.
 fn fragment_size(op: &Op<'_>) -> Result<Option<usize>, OpError> {
     match op.count("fragment_size")? {
         Some(0) => Err(op.refused("\"fragment_size\" is 1 or more")),
@@ -785,12 +785,12 @@ mod tests {
     use tokio_tungstenite::tungstenite::protocol::Role;
 
     use super::*;
-    use crate::access::{Access, AccessRules, Admission, Anonymous, Client};
+    use crate::access::{Access, AccessRules, AdmissionRequest, Anonymous, Client};
     use crate::budget::UNIT_BYTES;
+    use crate::definitions::{ShippedDefinitions, Types};
     use crate::hub::{Hub, HubOptions};
-    use crate::inflow::{Inflow, Metered};
+    use crate::inflow::{Inflow, MeteredStream};
     use crate::session::SessionLimits;
-    use crate::types::{Shipped, Types};
 
     /// Returns a client of another host.
     fn remote_client() -> Client {
@@ -798,7 +798,7 @@ mod tests {
         let peer: SocketAddr = "10.0.0.1:1".parse().unwrap();
         let now = UnixMillis(1_795_000_000_000);
         let admission =
-            Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now };
+            AdmissionRequest { peer, encrypted: true, origin: None, token: None, certificate: None, now };
         access.admit(&admission).unwrap()
     }
 
@@ -808,7 +808,7 @@ mod tests {
         const LEFT_BYTES: usize = 8 << 20;
         const PIECE_BYTES: usize = 1 << 20;
         let own = Arc::new(FakeDomain::default().join(false));
-        let hub = Hub::start(own, Types::new(Shipped), HubOptions::default()).await.unwrap();
+        let hub = Hub::start(own, Types::new(ShippedDefinitions), HubOptions::default()).await.unwrap();
         let client = remote_client();
         let quota = hub.shared.quotas.quota(&client);
         let units = |bytes: usize| u32::try_from(bytes / UNIT_BYTES).unwrap();
@@ -836,7 +836,7 @@ mod tests {
             matches!(refused, GatewayError::Crowded { pool: crate::quota::Pool::Credential, .. });
         assert!(is_of_credential, "{refused}");
         assert_eq!(begun.len(), LEFT_BYTES / PIECE_BYTES);
-        // A message that is whole gives all its room back.
+        // A complete message returns all its room.
         let before = begun.len();
         begun.truncate(1);
         assert!(quota.room_at_once(units((before - 1) * PIECE_BYTES)).is_ok());
@@ -852,14 +852,14 @@ mod tests {
     async fn pieces_that_do_not_come_in_time_are_given_up_with_their_room() {
         const PIECE_BYTES: usize = 4 << 20;
         let own = Arc::new(FakeDomain::default().join(false));
-        let hub = Hub::start(own, Types::new(Shipped), HubOptions::default()).await.unwrap();
+        let hub = Hub::start(own, Types::new(ShippedDefinitions), HubOptions::default()).await.unwrap();
         let client = remote_client();
         let inflow: Arc<Inflow> = Arc::default();
         let session = Session::new(&hub, client.clone(), SessionLimits::default());
         let session = Arc::new(session.metered_by(Arc::clone(&inflow)));
         let (here, there) = tokio::io::duplex(1 << 20);
         let options = RosbridgeOptions::default();
-        let there = Metered::new(there, inflow);
+        let there = MeteredStream::new(there, inflow);
         let there = WebSocketStream::from_raw_socket(there, Role::Server, Some(options.websocket())).await;
         let _served = tokio::spawn(super::super::serve(there, session, options));
         let mut page = WebSocketStream::from_raw_socket(here, Role::Client, None).await;
@@ -875,7 +875,7 @@ mod tests {
             }
             held.len() * UNIT_BYTES
         };
-        // Whoever reads answers pings.
+        // Reading also answers pings.
         let mut kept = 0;
         let told = loop {
             match page.next().await.unwrap().unwrap() {
@@ -892,8 +892,8 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn who_errs_now_and_then_is_forgiven() {
-        let mut patience = Patience::new();
+    async fn occasional_errors_are_forgiven() {
+        let mut patience = ErrorBudget::new();
         for _ in 0..10_000 {
             assert!(patience.count(Instant::now()));
             tokio::time::advance(Duration::from_millis(11)).await;

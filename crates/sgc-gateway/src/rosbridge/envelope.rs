@@ -1,4 +1,4 @@
-//! [`Envelope`]: what is sent to a client, as JSON or CBOR; [`Frame`]: the same as it goes into the WebSocket.
+//! [`Envelope`]: a message to a client in JSON or CBOR; [`Frame`]: its form in the WebSocket.
 
 use std::fmt::Write as _;
 use std::time::Duration;
@@ -10,21 +10,21 @@ use tokio_tungstenite::tungstenite::{Message, Utf8Bytes};
 use super::op::OpId;
 use crate::content::Form;
 
-/// How a client wants what it is sent.
+/// The encoding that a client requests for its messages.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Compression {
-    /// JSON, as text.
+    /// JSON text.
     #[default]
     None,
-    /// CBOR, binary.
+    /// Binary CBOR.
     Cbor,
     /// CBOR around the serialised message.
     CborRaw,
 }
 
 impl Compression {
-    /// By its name; why not, for those that are not offered.
-    pub(super) fn of(name: &str) -> Result<Self, &'static str> {
+    /// Parses the name of a compression. The error explains why one is not offered.
+    pub(super) fn from_name(name: &str) -> Result<Self, &'static str> {
         Ok(match name {
             "none" | "" => Self::None,
             "cbor" => Self::Cbor,
@@ -34,7 +34,7 @@ impl Compression {
         })
     }
 
-    /// The form of contents within.
+    /// Returns the form of the content.
     pub(super) fn form(self) -> Form {
         match self {
             Self::None => Form::Json,
@@ -44,12 +44,12 @@ impl Compression {
     }
 }
 
-/// What goes into the WebSocket.
+/// A message for the WebSocket.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Frame {
     Text(Utf8Bytes),
     Binary(Bytes),
-    /// A text in pieces of so many bytes, which are made one after the other.
+    /// A text in fragments of `size` bytes, made one after the other.
     Fragments {
         id: String,
         text: Utf8Bytes,
@@ -65,7 +65,7 @@ impl Frame {
         }
     }
 
-    /// What it is sent as.
+    /// Returns the WebSocket messages.
     pub(super) fn messages(self) -> impl Iterator<Item = Message> {
         let (whole, pieces) = match self {
             Self::Text(text) => (Some(Message::Text(text)), None),
@@ -76,7 +76,7 @@ impl Frame {
     }
 }
 
-/// The texts of the op `fragment`. Pieces end between characters.
+/// Splits a text into ops `fragment`, between characters.
 fn pieces(id: String, text: Utf8Bytes, size: usize) -> impl Iterator<Item = Message> {
     let total = cuts(&text, size).count();
     let mut at = 0;
@@ -100,7 +100,7 @@ fn cuts(text: &str, size: usize) -> impl Iterator<Item = usize> {
     })
 }
 
-/// Where a piece ends that begins here: at least one character on.
+/// Returns the end of the fragment that begins at `at`. A fragment has at least one character.
 fn cut(text: &str, at: usize, size: usize) -> usize {
     let mut end = at.saturating_add(size).min(text.len());
     while end > at && !text.is_char_boundary(end) {
@@ -120,7 +120,7 @@ pub(super) enum Envelope {
 }
 
 impl Envelope {
-    /// An op in JSON.
+    /// Begins an op in JSON.
     pub(super) fn json(op: &str) -> Self {
         Self::Json(format!(r#"{{"op":"{op}""#))
     }
@@ -134,14 +134,14 @@ impl Envelope {
             }
             _ => {
                 let mut out = Vec::with_capacity(content_bytes + 256);
-                // The head, in which the number of members is said once it is known.
+                // The head gets the number of members at the end.
                 out.push(0);
                 Self::Cbor { members: 0, out }.text("op", op)
             }
         }
     }
 
-    /// The same begin again, with room for content.
+    /// Returns a copy of the envelope with room for content.
     pub(super) fn again(&self, content_bytes: usize) -> Self {
         match self {
             Self::Json(begin) => {
@@ -188,7 +188,7 @@ impl Envelope {
         }
     }
 
-    /// What is written in the form of the envelope already.
+    /// Adds content that has the envelope's encoding already.
     pub(super) fn content(mut self, key: &str, content: &[u8]) -> Self {
         self.key(key);
         match &mut self {
@@ -198,7 +198,7 @@ impl Envelope {
         self
     }
 
-    /// A serialised message, as `cbor-raw` has it, with the time at which it came.
+    /// Adds a serialised message with its time of reception, as `cbor-raw` demands.
     pub(super) fn raw_message(mut self, key: &str, payload: &[u8], received: Duration) -> Self {
         self.key(key);
         if let Self::Cbor { out, .. } = &mut self {
@@ -221,7 +221,7 @@ impl Envelope {
                 Frame::Text(out.into())
             }
             Self::Cbor { members, mut out } => {
-                // Fewer than 24 members: their number is in the head.
+                // The head has room for the number of fewer than 24 members.
                 if let Some(head) = out.first_mut() {
                     *head = 0xa0 | members.min(23);
                 }
@@ -230,7 +230,7 @@ impl Envelope {
         }
     }
 
-    /// In pieces, if it is longer than what the client takes at once. CBOR is not sent in pieces.
+    /// Finishes the message, in fragments if it exceeds `size`. CBOR is never split.
     pub(super) fn finish_in_pieces(self, size: Option<usize>, id: impl FnOnce() -> String) -> Frame {
         match (self.finish(), size) {
             (Frame::Text(text), Some(size)) if text.len() > size => Frame::Fragments { id: id(), text, size },
@@ -264,7 +264,7 @@ fn cbor_text(out: &mut Vec<u8>, text: &str) {
     out.extend_from_slice(text.as_bytes());
 }
 
-/// JSON as CBOR (RFC 8949, 6.2). What is written here is the gateway's own, so it is not deep.
+/// Writes JSON as CBOR (RFC 8949, 6.2). The recursion is shallow, because the values are the gateway's own.
 fn cbor_value(out: &mut Vec<u8>, value: &Value) {
     match value {
         Value::Null => out.push(0xf6),

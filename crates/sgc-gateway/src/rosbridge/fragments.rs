@@ -1,4 +1,4 @@
-//! [`Fragments`]: messages that clients send in pieces (op `fragment`), put together within bounds.
+//! [`Fragments`]: messages that clients send in fragments (op `fragment`), assembled within bounds.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
@@ -7,18 +7,18 @@ use tokio::time::Instant;
 
 use super::op::OpId;
 
-/// Messages of which pieces are there; with one more the oldest is given up.
+/// Most incomplete messages. Beyond that the oldest is given up.
 const MESSAGES_MAX: usize = 16;
-/// Pieces of one message.
+/// Most fragments of one message.
 const PIECES_MAX: usize = 65_536;
-/// How long a message may lack pieces after the last new one (`fragment_timeout` of `rosbridge_suite`).
+/// Longest wait after the last new fragment (`fragment_timeout` of `rosbridge_suite`).
 pub(super) const PIECE_WAIT_MAX: Duration = Duration::from_secs(600);
-/// How long a message may lack pieces after the first one, however many come.
+/// Longest wait after the first fragment.
 pub(super) const MESSAGE_WAIT_MAX: Duration = Duration::from_secs(3600);
-/// What a piece is counted for beyond its bytes.
+/// Cost of a fragment in bytes beside its text.
 const PIECE_OVERHEAD_BYTES: usize = 64;
 
-/// Why a piece is refused.
+/// The reason why a fragment is refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub(super) enum FragmentError {
     #[error("a message of {0} pieces: 1 to {PIECES_MAX}")]
@@ -31,12 +31,12 @@ pub(super) enum FragmentError {
     TooLong(usize),
 }
 
-/// What came in pieces so far.
+/// The incomplete messages.
 #[derive(Debug)]
 pub(super) struct Fragments {
     bytes_max: usize,
     bytes: usize,
-    /// The oldest first.
+    /// The oldest message first.
     messages: VecDeque<Partial>,
 }
 
@@ -47,12 +47,12 @@ struct Partial {
     bytes: usize,
     pieces: BTreeMap<usize, String>,
     began: Instant,
-    /// When the last new piece came.
+    /// The time of the last new fragment.
     grew: Instant,
 }
 
 impl Partial {
-    /// Returns when it is given up.
+    /// Returns the time at which the message is given up.
     fn ends(&self) -> Instant {
         (self.grew + PIECE_WAIT_MAX).min(self.began + MESSAGE_WAIT_MAX)
     }
@@ -63,13 +63,13 @@ impl Fragments {
         Self { bytes_max, bytes: 0, messages: VecDeque::new() }
     }
 
-    /// Returns the number of bytes that are kept.
+    /// Returns the number of kept bytes.
     pub(super) fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// Takes a piece; the message, if it is whole now. A piece that came before is left out. After an error all of the
-    /// message is forgotten.
+    /// Adds a fragment and returns the message if it is complete. A repeated fragment is ignored. An error drops the
+    /// whole message.
     pub(super) fn take(
         &mut self,
         id: &OpId,
@@ -121,12 +121,12 @@ impl Fragments {
         Ok(None)
     }
 
-    /// Returns when the next message is given up.
+    /// Returns the time at which the next message is given up.
     pub(super) fn next_end(&self) -> Option<Instant> {
         self.messages.iter().map(Partial::ends).min()
     }
 
-    /// Gives up a message whose pieces have not come in time, and returns its id.
+    /// Gives up a message whose fragments are late, and returns its id.
     pub(super) fn give_up(&mut self, now: Instant) -> Option<OpId> {
         let at = self.messages.iter().position(|partial| partial.ends() <= now)?;
         self.remove(at).map(|partial| partial.id)
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_kept_is_bounded() {
+    fn kept_fragments_are_bounded() {
         let (mut fragments, now) = (Fragments::new(1000), Instant::now());
         for number in 0..100 {
             assert_eq!(fragments.take(&id(number), 0, 2, "x".repeat(200), now), Ok(None));
@@ -183,7 +183,7 @@ mod tests {
         let data = || "x".repeat(10);
         assert_eq!(fragments.next_end(), None);
         fragments.take(&id(1), 0, 100, data(), began).unwrap();
-        // A piece that came before is no news, a new one is.
+        // A repeated fragment does not extend the wait; a new one does.
         fragments.take(&id(1), 0, 100, data(), began + 500 * second).unwrap();
         assert_eq!(fragments.next_end(), Some(began + PIECE_WAIT_MAX));
         fragments.take(&id(2), 0, 2, data(), began + 500 * second).unwrap();
@@ -193,7 +193,7 @@ mod tests {
         assert_eq!(fragments.bytes(), data().len() + PIECE_OVERHEAD_BYTES);
         assert_eq!(fragments.give_up(began + 500 * second + PIECE_WAIT_MAX), Some(id(2)));
         assert_eq!((fragments.bytes(), fragments.next_end()), (0, None));
-        // Pieces that trickle do not keep a message for good.
+        // Fragments that trickle in do not keep a message forever.
         let mut now = began;
         let pieces = (0..100).take_while(|number| {
             fragments.take(&id(3), *number, 100, data(), now).unwrap();

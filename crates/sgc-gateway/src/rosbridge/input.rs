@@ -1,6 +1,7 @@
-//! Messages as rosbridge's clients write them: times of ROS 1, arguments in a list, headers without a stamp.
+//! Conversion of messages as rosbridge clients write them: times of ROS 1, arguments as a list, headers without a
+//! stamp.
 //!
-//! What `docs/spec/json.md` says is tried first, and taken as it is; only what is not right by it is looked at again.
+//! The form of `docs/spec/json.md` is tried first. Only a message that does not match it is converted.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -11,28 +12,29 @@ use serde_json::value::RawValue;
 use serde_json::{Map, Value as Json};
 use sgc_cdr::{Layout, Value};
 
-use crate::aside::aside_if_long;
 use crate::content::Content;
 use crate::error::GatewayError;
+use crate::offload::offload_if_long;
 
-/// Values of a text that is read again, at most, as far as its commas and brackets tell: each takes far more memory than
-/// it has bytes.
+/// Most values of a text that is converted, estimated by its commas and brackets, because a parsed value takes far
+/// more memory than its text.
 const VALUES_MAX: usize = 1 << 20;
 
-/// A message of a topic. If its type begins with a header whose stamp is left out, that is now.
+/// Reads a message of a topic. If its type begins with a header and the stamp is missing, the stamp is set to the
+/// current time.
 pub(super) fn message(layout: &Layout, raw: &str) -> Result<Value, GatewayError> {
     let read = |raw: &str| layout.from_json(raw.as_bytes()).map_err(GatewayError::Value);
-    let mut value = aside_if_long(raw.len(), || tolerate(raw, read))?;
+    let mut value = offload_if_long(raw.len(), || tolerate(raw, read))?;
     if layout.begins_with_header() && !has_stamp(raw) {
         stamp(&mut value, now());
     }
     Ok(value)
 }
 
-/// Reads something; if it is no message of its type, it is read again as ROS 1 would have written it.
+/// Reads a message, and on failure once more as ROS 1 would have written it.
 fn tolerate<T>(raw: &str, read: impl Fn(&str) -> Result<T, GatewayError>) -> Result<T, GatewayError> {
     match read(raw) {
-        Err(error @ GatewayError::Value(_)) => match of_ros_1(raw) {
+        Err(error @ GatewayError::Value(_)) => match from_ros_1(raw) {
             Some(other) => read(&other),
             None => Err(error),
         },
@@ -40,13 +42,13 @@ fn tolerate<T>(raw: &str, read: impl Fn(&str) -> Result<T, GatewayError>) -> Res
     }
 }
 
-/// The same for what is read by something that waits.
+/// Reads a message asynchronously, and on failure once more as ROS 1 would have written it.
 pub(super) async fn tolerate_later<T, F>(raw: &str, read: impl Fn(Content) -> F) -> Result<T, GatewayError>
 where
     F: Future<Output = Result<T, GatewayError>>,
 {
     match read(Content::json(raw.to_owned())).await {
-        Err(error @ GatewayError::Value(_)) => match aside_if_long(raw.len(), || of_ros_1(raw)) {
+        Err(error @ GatewayError::Value(_)) => match offload_if_long(raw.len(), || from_ros_1(raw)) {
             Some(other) => read(Content::json(other)).await,
             None => Err(error),
         },
@@ -54,7 +56,7 @@ where
     }
 }
 
-/// Arguments, which may be an object, or a list of its members in their order, or left out.
+/// Returns arguments as an object. They may be an object, a list of its members in order, or missing.
 pub(super) fn arguments(
     raw: Option<&str>,
     layout: impl FnOnce() -> Result<Arc<Layout>, GatewayError>,
@@ -69,15 +71,15 @@ pub(super) fn arguments(
         Value::Record(members) => members.iter().map(|(name, _)| name.to_string()).collect(),
         _ => Vec::new(),
     };
-    // What is too much has a name that the type has not, so it is refused as such.
+    // A surplus argument gets a name that the type does not have, so that reading refuses it.
     let name = |index: usize| names.get(index).cloned().unwrap_or_else(|| format!("[{index}]"));
     let members = list.iter().enumerate().map(|(index, raw)| format!("{}:{raw}", Json::from(name(index))));
     Ok(format!("{{{}}}", members.collect::<Vec<_>>().join(",")))
 }
 
-/// The same JSON with `secs` and `nsecs` as ROS 2 calls them, and without stamps that are null. None if there are none, or
+/// Returns the JSON with ROS 2's names for `secs` and `nsecs` and without null stamps, or `None` if there are none or
 /// it has more than [`VALUES_MAX`] values.
-fn of_ros_1(raw: &str) -> Option<String> {
+fn from_ros_1(raw: &str) -> Option<String> {
     if raw.bytes().filter(|byte| matches!(byte, b',' | b'[' | b'{')).nth(VALUES_MAX).is_some() {
         return None;
     }
@@ -107,8 +109,8 @@ fn rename_time(members: &mut Map<String, Json>) -> bool {
     if !is_time || members.is_empty() {
         return false;
     }
-    for (of_ros_1, of_ros_2) in [("secs", "sec"), ("nsecs", "nanosec")] {
-        if let Some(value) = members.remove(of_ros_1) {
+    for (from_ros_1, of_ros_2) in [("secs", "sec"), ("nsecs", "nanosec")] {
+        if let Some(value) = members.remove(from_ros_1) {
             members.insert(of_ros_2.to_owned(), value);
         }
     }
@@ -116,20 +118,20 @@ fn rename_time(members: &mut Map<String, Json>) -> bool {
 }
 
 #[derive(Deserialize)]
-struct Headed<'a> {
+struct WithHeader<'a> {
     #[serde(borrow)]
     header: Option<&'a RawValue>,
 }
 
 #[derive(Deserialize)]
-struct Stamped<'a> {
+struct WithStamp<'a> {
     #[serde(borrow)]
     stamp: Option<&'a RawValue>,
 }
 
 fn has_stamp(raw: &str) -> bool {
-    let header = serde_json::from_str::<Headed<'_>>(raw).ok().and_then(|headed| headed.header);
-    let stamped = header.and_then(|header| serde_json::from_str::<Stamped<'_>>(header.get()).ok());
+    let header = serde_json::from_str::<WithHeader<'_>>(raw).ok().and_then(|headed| headed.header);
+    let stamped = header.and_then(|header| serde_json::from_str::<WithStamp<'_>>(header.get()).ok());
     stamped.is_some_and(|stamped| stamped.stamp.is_some())
 }
 
@@ -143,7 +145,7 @@ fn stamp(value: &mut Value, now: Duration) {
     ]);
 }
 
-/// This host's time, since the Unix epoch.
+/// Returns this host's time since the Unix epoch.
 pub(super) fn now() -> Duration {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
 }
@@ -151,10 +153,10 @@ pub(super) fn now() -> Duration {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::types::{Shipped, Types};
+    use crate::definitions::{ShippedDefinitions, Types};
 
     fn layout(name: &str) -> Arc<Layout> {
-        Types::new(Shipped).layout(name, None).unwrap()
+        Types::new(ShippedDefinitions).layout(name, None).unwrap()
     }
 
     #[test]
@@ -164,10 +166,10 @@ mod tests {
         let read = message(&layout, raw).unwrap();
         assert_eq!(read.at("header.stamp.sec"), Some(Value::Int(3)));
         assert_eq!(read.at("header.stamp.nanosec"), Some(Value::Uint(4)));
-        // Not in what has a great many values.
+        // A text with very many values is not converted.
         let many = format!(r#"{{"secs":3,"a":[0{}]}}"#, ",0".repeat(VALUES_MAX));
-        assert_eq!((of_ros_1(&many), of_ros_1(r#"{"secs":3}"#)), (None, Some(r#"{"sec":3}"#.to_owned())));
-        // Members that only look like it stay wrong.
+        assert_eq!((from_ros_1(&many), from_ros_1(r#"{"secs":3}"#)), (None, Some(r#"{"sec":3}"#.to_owned())));
+        // A member that only looks like a time stays wrong.
         let wrong = message(&layout, r#"{"point":{"secs":1,"x":2}}"#).unwrap_err();
         assert_eq!(wrong.to_string(), "not a message of that type: point: there is no member \"secs\"");
     }

@@ -1,7 +1,7 @@
-//! The rosbridge protocol (version 2, as `rosbridge_suite` of ROS 2 speaks it): what roslibjs and roslibpy talk.
+//! The rosbridge protocol, version 2, as `rosbridge_suite` of ROS 2 speaks it. Its clients are roslibjs and roslibpy.
 //!
-//! [`serve`] serves one WebSocket. It listens to nothing and admits nobody by itself: the socket comes accepted, with the
-//! session of who was admitted. What the protocol does here, op by op, is in `docs/reference/gateway-rosbridge.md`.
+//! [`serve`] serves one WebSocket. It neither listens nor admits: the socket comes accepted, with the session of its
+//! client. `docs/reference/gateway-rosbridge.md` describes the supported ops.
 
 mod actions;
 mod calls;
@@ -30,7 +30,7 @@ use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 
-use crate::access::Denied;
+use crate::access::Denial;
 use crate::session::Session;
 use crate::ws::close_reason;
 use connection::Connection;
@@ -38,20 +38,21 @@ pub use options::{
     Authenticate, ROSBRIDGE_ADMISSION_MAX, ROSBRIDGE_CALL_MAX, ROSBRIDGE_MESSAGE_BYTES_MAX,
     ROSBRIDGE_SILENCE_MAX, RosbridgeError, RosbridgeOptions,
 };
-use outbox::{Outbox, Outgoing, Pulse, write_all, write_rest};
+use outbox::{Outbox, Outgoing, PingState, write_all, write_rest};
 
-/// Between two pings at least.
+/// Shortest interval of pings.
 const PING_INTERVAL_MIN: Duration = Duration::from_millis(10);
-/// Messages that are taken before what was published leaves, and whatever else there is is looked after.
+/// Most messages that are read before published messages are flushed and other events are handled.
 const TOGETHER_MAX: usize = 64;
-/// How long a client may take to hear why its connection ends.
+/// Time in which a client may receive the reason for the end of its connection.
 const FAREWELL_MAX: Duration = Duration::from_secs(2);
 
-/// Serves a client until it leaves; with it ends all that it had. Accept the socket with
-/// [`RosbridgeOptions::websocket`], so that bounds hold from its first byte. May be dropped at any time.
+/// Serves a client until it leaves, and ends everything that it has. Accept the socket with
+/// [`RosbridgeOptions::websocket`], so that the bounds hold from the first byte. Dropping the future is safe at any
+/// time.
 ///
 /// # Errors
-/// Why the connection ended, if it was not by the client's wish.
+/// The reason why the connection ended without the client's wish.
 pub async fn serve<S>(
     socket: WebSocketStream<S>,
     session: Arc<Session>,
@@ -62,7 +63,7 @@ where
 {
     let options = Arc::new(options);
     let (outbox, mut outgoing) = Outbox::new(session.limits().waiting_bytes_max, session.quota().clone());
-    let pulse = Pulse::default();
+    let pulse = PingState::default();
     let (mut sink, mut stream) = socket.split();
     let mut connection = Connection::new(session, Arc::clone(&options), outbox);
     let denied = until_denied(connection.sessions());
@@ -83,15 +84,15 @@ where
         }
         let farewell = farewell(&mut sink, &mut outgoing, code, why);
         let _ = tokio::time::timeout(FAREWELL_MAX, farewell).await;
-        // What the client sent meanwhile is taken from the socket, so that it hears this before the connection is gone.
+        // Pending input is read from the socket, since closing it with unread data could discard the last message.
         let until_closed = async { while let Some(Ok(_)) = stream.next().await {} };
         let _ = tokio::time::timeout(FAREWELL_MAX, until_closed).await;
     }
     ended
 }
 
-/// Waits until the right of the client ends: the right by which it was admitted last.
-async fn until_denied(mut sessions: watch::Receiver<Arc<Session>>) -> Denied {
+/// Waits until the current rights of the client end.
+async fn until_denied(mut sessions: watch::Receiver<Arc<Session>>) -> Denial {
     loop {
         let session = Arc::clone(&sessions.borrow_and_update());
         tokio::select! {
@@ -116,11 +117,11 @@ where
     }
 }
 
-/// Takes what the client sends until it leaves.
+/// Handles the client's messages until it leaves.
 async fn read_all<R>(
     stream: &mut R,
     connection: &mut Connection,
-    pulse: &Pulse,
+    pulse: &PingState,
     options: &RosbridgeOptions,
 ) -> Result<(), RosbridgeError>
 where
@@ -130,7 +131,7 @@ where
     let mut looks = tokio::time::interval(ping_interval(options.silence_max));
     let mut together = 0;
     loop {
-        // What is there already is published together.
+        // Messages that have already arrived are published together.
         let ready = if together < TOGETHER_MAX { stream.next().now_or_never() } else { None };
         together = if ready.is_some() { together + 1 } else { 0 };
         let message = match ready {
@@ -157,10 +158,10 @@ where
         pulse.heard();
         match message.map_err(|error| RosbridgeError::socket(error, options.message_bytes_max))? {
             Message::Text(text) => connection.take(&text).await?,
-            // As `rosbridge_suite` has it, JSON may come as bytes.
+            // JSON may also come as bytes, as in `rosbridge_suite`.
             Message::Binary(bytes) => match std::str::from_utf8(&bytes) {
                 Ok(text) => connection.take(text).await?,
-                // It is no JSON, and said to be none.
+                // Bytes that are not UTF-8 are not JSON, and the error says so.
                 Err(_) => connection.take("\u{fffd}").await?,
             },
             Message::Close(_) => return Ok(()),
@@ -169,7 +170,7 @@ where
     }
 }
 
-/// Waits until then; for ever without a time.
+/// Waits until a time, or forever without one.
 async fn sleep_until(end: Option<Instant>) {
     match end {
         Some(end) => tokio::time::sleep_until(end).await,
@@ -177,13 +178,13 @@ async fn sleep_until(end: Option<Instant>) {
     }
 }
 
-/// How often a client is pinged, and looked after.
+/// Returns the interval of pings and checks.
 fn ping_interval(silence_max: Duration) -> Duration {
     (silence_max / 4).max(PING_INTERVAL_MIN)
 }
 
-/// Refuses a client that leaves pings without an answer.
-fn look(pulse: &Pulse, options: &RosbridgeOptions) -> Result<(), RosbridgeError> {
+/// Fails if a ping is unanswered for too long.
+fn look(pulse: &PingState, options: &RosbridgeOptions) -> Result<(), RosbridgeError> {
     match pulse.unanswered() {
         Some(since) if since.elapsed() >= options.silence_max => {
             Err(RosbridgeError::Silent(options.silence_max))

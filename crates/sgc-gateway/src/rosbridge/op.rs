@@ -1,4 +1,4 @@
-//! [`Op`]: what a client sends, as its members; nothing of it is believed before it is asked for.
+//! [`Op`]: a client's message as its members, which are validated on access.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -11,22 +11,22 @@ use serde_json::value::RawValue;
 
 use crate::error::GatewayError;
 
-/// Longest id that is echoed, bytes.
+/// Longest echoed id, in bytes.
 const ID_BYTES_MAX: usize = 1024;
-/// Longest name of a topic, a type or anything else, bytes: names are echoed, too.
+/// Longest name of a topic, type or other item, in bytes, because names are echoed, too.
 const NAME_BYTES_MAX: usize = 1024;
-/// Members of an op: the most that one has is a dozen.
+/// Most members of an op; a valid op has at most a dozen.
 const MEMBERS_MAX: usize = 64;
-/// Longest name of an op that is echoed whole, bytes.
+/// Longest echoed name of an op, in bytes.
 const OP_BYTES_MAX: usize = 64;
-/// Longest text that a client is told of an error, bytes: several names fit in.
+/// Longest error text for a client, in bytes. Several names fit.
 const TOLD_BYTES_MAX: usize = 4096;
-/// Characters of what somebody wrote that are shown.
+/// Most characters of input that are shown in an error.
 const SHOWN_MAX: usize = 80;
-/// Longest time that a client can say, seconds.
+/// Longest time that a client can give, in seconds.
 const SECONDS_MAX: f64 = 1e9;
 
-/// The id of an op, by which what comes of it is known.
+/// The id of an op, which its answers repeat.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum OpId {
     Number(i64),
@@ -42,7 +42,7 @@ impl fmt::Display for OpId {
     }
 }
 
-/// Why an op is refused, in words for the client's user.
+/// The reason why an op is refused, in words for the client's user.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub(super) enum OpError {
     #[error("not JSON: {0}")]
@@ -65,7 +65,7 @@ pub(super) enum OpError {
     Refused { op: String, why: String },
 }
 
-/// What a client sent.
+/// A message of a client.
 #[derive(Debug)]
 pub(super) struct Op<'a> {
     pub(super) name: Cow<'a, str>,
@@ -73,7 +73,7 @@ pub(super) struct Op<'a> {
     members: BTreeMap<Cow<'a, str>, &'a RawValue>,
 }
 
-/// The members of an object, no more than [`MEMBERS_MAX`].
+/// The members of an object, at most [`MEMBERS_MAX`].
 struct Members<'a>(BTreeMap<Cow<'a, str>, &'a RawValue>);
 
 impl<'de: 'a, 'a> Deserialize<'de> for Members<'a> {
@@ -89,7 +89,7 @@ impl<'de: 'a, 'a> Deserialize<'de> for Members<'a> {
 
             fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Self::Value, A::Error> {
                 let mut members = BTreeMap::new();
-                // Members that come twice count, too.
+                // Repeated members count, too.
                 let mut count = 0;
                 while let Some((key, value)) = map.next_entry::<Cow<'de, str>, &'de RawValue>()? {
                     count += 1;
@@ -107,7 +107,7 @@ impl<'de: 'a, 'a> Deserialize<'de> for Members<'a> {
 }
 
 impl<'a> Op<'a> {
-    /// Reads the members, and none of their values but the op and its id.
+    /// Parses the members, but no values except the op and its id.
     pub(super) fn parse(text: &'a str) -> Result<Self, OpError> {
         let Members(members) = serde_json::from_str(text).map_err(|error| {
             let is_object = text.trim_start().starts_with('{');
@@ -133,7 +133,7 @@ impl<'a> Op<'a> {
         Ok(Some(OpId::Text(text.into())))
     }
 
-    /// Its name as it is echoed.
+    /// Returns the name for echoing.
     pub(super) fn shown(&self) -> String {
         clip(&self.name, OP_BYTES_MAX)
     }
@@ -154,7 +154,7 @@ impl<'a> Op<'a> {
         OpError::Missing { op: self.shown(), member }
     }
 
-    /// A member as it was sent; `null` is none.
+    /// Returns a member as it was sent, or `None` for `null`.
     pub(super) fn raw(&self, member: &str) -> Option<&'a str> {
         self.members.get(member).map(|raw| raw.get()).filter(|raw| *raw != "null")
     }
@@ -165,7 +165,7 @@ impl<'a> Op<'a> {
         Ok(Some(text))
     }
 
-    /// A text that is no longer than a name can be.
+    /// Returns a text within the length of a name.
     pub(super) fn name(&self, member: &'static str) -> Result<Option<String>, OpError> {
         match self.text(member)? {
             Some(name) if name.len() > NAME_BYTES_MAX => Err(OpError::TooLong { op: self.shown(), member }),
@@ -181,7 +181,7 @@ impl<'a> Op<'a> {
         self.text(member)?.ok_or_else(|| self.missing(member))
     }
 
-    /// An object, as it was sent.
+    /// Returns an object as it was sent.
     pub(super) fn object(&self, member: &'static str) -> Result<Option<&'a str>, OpError> {
         match self.raw(member) {
             Some(raw) if !raw.starts_with('{') => Err(self.no(member, "object", raw)),
@@ -202,7 +202,7 @@ impl<'a> Op<'a> {
         }
     }
 
-    /// A number that is not negative. Whole ones may come as floats.
+    /// Returns a number that is not negative. Integers may be written as floats.
     pub(super) fn count(&self, member: &'static str) -> Result<Option<usize>, OpError> {
         let Some(raw) = self.raw(member) else { return Ok(None) };
         if let Ok(count) = raw.parse() {
@@ -221,7 +221,7 @@ impl<'a> Op<'a> {
         raw.parse().map(Some).map_err(|_| self.no(member, "integer", raw))
     }
 
-    /// Seconds; what is not positive is none.
+    /// Returns a time in seconds, or `None` if it is not positive.
     pub(super) fn seconds(&self, member: &'static str) -> Result<Option<Duration>, OpError> {
         let Some(raw) = self.raw(member) else { return Ok(None) };
         let seconds: f64 = raw.parse().map_err(|_| self.no(member, "number of seconds", raw))?;
@@ -237,12 +237,12 @@ fn text_of<'a>(raw: &'a RawValue) -> Option<Cow<'a, str>> {
     }
 }
 
-/// What a client is told of an error.
+/// Returns the text of an error for a client.
 pub(super) fn told(error: &impl fmt::Display) -> String {
     clip(&error.to_string(), TOLD_BYTES_MAX)
 }
 
-/// The beginning of a text.
+/// Returns the beginning of a text.
 fn clip(text: &str, bytes_max: usize) -> String {
     if text.len() <= bytes_max {
         return text.to_owned();
@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_echoed_is_short() {
+    fn echoed_text_is_short() {
         let text = format!(r#"{{"op":"{}","n":"{}"}}"#, "ä".repeat(10_000), "x".repeat(10_000));
         let op = Op::parse(&text).unwrap();
         let errors =
@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_op_is_told_as_such() {
+    fn invalid_ops_are_reported() {
         for wrong in ["[]", "3", "null", "{}", r#"{"op":3}"#] {
             assert_eq!(Op::parse(wrong).unwrap_err(), OpError::NoOp, "{wrong}");
         }

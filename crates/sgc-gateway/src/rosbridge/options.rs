@@ -1,4 +1,5 @@
-//! [`RosbridgeOptions`]: bounds of a connection and how clients say who they are; [`RosbridgeError`]: why one ended.
+//! [`RosbridgeOptions`]: the bounds of a connection and the authentication of its client; [`RosbridgeError`]: the
+//! reason for its end.
 
 use std::fmt;
 use std::sync::Arc;
@@ -7,35 +8,35 @@ use std::time::Duration;
 use tokio_tungstenite::tungstenite;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 
-use crate::access::{Client, Denied};
+use crate::access::{Client, Denial};
 use crate::error::GatewayError;
 
-/// Longest message that a client may send, bytes, in one frame or in fragments.
+/// Longest message of a client, in bytes, in one frame or in fragments.
 pub const ROSBRIDGE_MESSAGE_BYTES_MAX: usize = 64 << 20;
-/// How long a client may leave a ping without an answer, or a frame untaken.
+/// Time for which a client may leave a ping unanswered or a frame unread.
 pub const ROSBRIDGE_SILENCE_MAX: Duration = Duration::from_secs(60);
-/// How long a call waits for its reply if the client says no time.
+/// Time to wait for a reply if the client gives no time.
 pub const ROSBRIDGE_CALL_MAX: Duration = Duration::from_secs(60);
-/// How long a client has to say who it is, where it has to.
+/// Time within which a client must authenticate, if it must.
 pub const ROSBRIDGE_ADMISSION_MAX: Duration = Duration::from_secs(10);
 
-/// Says who a token is for; else why it is nobody's, in words for its user.
+/// A function that returns the client of a token, or the reason why the token is invalid, in words for its user.
 pub type Authenticate = Arc<dyn Fn(&str) -> Result<Client, String> + Send + Sync>;
 
-/// Bounds of a connection, and how its client says who it is.
+/// The bounds of a connection and the authentication of its client.
 #[derive(Clone)]
 pub struct RosbridgeOptions {
-    /// Longest message that a client may send, bytes.
+    /// Longest message of a client, in bytes.
     pub message_bytes_max: usize,
-    /// How long a client may leave a ping without an answer, or a frame untaken. It is pinged four times as often.
+    /// Time for which a client may leave a ping unanswered or a frame unread. Pings are sent four times as often.
     pub silence_max: Duration,
-    /// How long a call waits for its reply if the client says no time.
+    /// Time to wait for a reply if the client gives no time.
     pub call_max: Duration,
-    /// What the op `auth` asks; none: it is refused.
+    /// The check for the op `auth`; without one the op is refused.
     pub authenticate: Option<Authenticate>,
-    /// Whether nothing but `auth` is taken until a token was shown. The session that it came with is not used then.
+    /// `true` if only `auth` is accepted until a token was shown. The initial session is not used then.
     pub is_token_needed: bool,
-    /// What `/rosapi/get_ros_version` says.
+    /// The answer to `/rosapi/get_ros_version`.
     pub ros_distro: String,
 }
 
@@ -53,7 +54,8 @@ impl Default for RosbridgeOptions {
 }
 
 impl RosbridgeOptions {
-    /// What the WebSocket is to be accepted with: longer frames are refused by their heads, before they are there.
+    /// Returns the configuration with which to accept the WebSocket. Longer frames are refused by their heads, before
+    /// they arrive.
     pub fn websocket(&self) -> WebSocketConfig {
         WebSocketConfig::default()
             .max_message_size(Some(self.message_bytes_max))
@@ -71,37 +73,37 @@ impl fmt::Debug for RosbridgeOptions {
     }
 }
 
-/// Why a connection ended, other than by its client's wish.
+/// The reason why a connection ended without the client's wish.
 #[derive(Debug, thiserror::Error)]
 pub enum RosbridgeError {
-    /// The client sent what is no WebSocket, or the way to it broke.
+    /// The socket failed, or the client sent something that is not a WebSocket message.
     #[error("the WebSocket failed")]
     Socket(#[source] Box<tungstenite::Error>),
-    /// A message is longer than what is taken.
+    /// A message is too long.
     #[error("the client sent a message of more than {max} bytes")]
     TooLong {
-        /// What is taken.
+        /// The longest accepted length in bytes.
         max: usize,
     },
-    /// No ping was answered, or no frame was taken.
+    /// A ping was not answered, or a frame was not read, in time.
     #[error("the client was silent for {} s", .0.as_secs_f32())]
     Silent(Duration),
-    /// It did wrong too often.
+    /// The client made too many errors.
     #[error("the client did wrong too often")]
     TooManyErrors,
-    /// It has not said who it is, not in time or not rightly.
+    /// The client did not authenticate, or not in time.
     #[error("the client was not admitted: {0}")]
     NotAdmitted(String),
-    /// The credential that it showed in the session has no room for what the session has.
+    /// The new credential has no room for what the session holds.
     #[error("the client's new credential has no room for what it has")]
     NoRoom(#[source] GatewayError),
-    /// Its right has ended.
+    /// The client's rights ended.
     #[error("the client's right has ended: {0}")]
-    Denied(#[source] Denied),
+    Denied(#[source] Denial),
 }
 
 impl RosbridgeError {
-    /// How the client is told: a close code of RFC 6455, 7.4.1, and words.
+    /// Returns the close code (RFC 6455, 7.4.1) and the text for the client.
     pub(super) fn close(&self) -> Option<(u16, String)> {
         Some(match self {
             Self::Socket(_) | Self::Silent(_) => return None,
@@ -109,7 +111,7 @@ impl RosbridgeError {
             Self::TooManyErrors => (1008, "too many errors".to_owned()),
             Self::NotAdmitted(why) => (1008, why.clone()),
             Self::NoRoom(why) => (1013, why.to_string()),
-            Self::Denied(why) => (1008, why.told().to_owned()),
+            Self::Denied(why) => (1008, why.client_message().to_owned()),
         })
     }
 

@@ -1,9 +1,9 @@
-//! [`Outbox`]: what waits to be written to a client, in two lanes, and [`write_all`], which writes it.
+//! [`Outbox`]: the frames queued for a client in two lanes, and [`write_all`], which writes them.
 //!
-//! Replies, requests and status go before messages of topics. Both lanes are short: who has something to say waits for a
-//! place, so that of a client that does not read nothing gathers here, and its subscriptions drop what is old. Long replies
-//! and requests wait for room as well, of which a client has so many bytes; replies, which nobody can hold back, are
-//! refused beyond as many more.
+//! Replies, requests and status go before messages of topics. Both lanes are short and senders wait for a place, so
+//! that for a client that does not read, frames do not pile up here and its subscriptions drop old messages. Long
+//! replies and requests also wait for room in bytes. Nothing holds back replies, so they are refused once waiting
+//! ones exceed the room.
 
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -21,16 +21,16 @@ use crate::budget::{Budget, Room};
 use crate::error::GatewayError;
 use crate::quota::Quota;
 
-/// Replies, requests and status that wait.
+/// Most queued replies, requests and status frames.
 const CONTROL_MAX: usize = 64;
-/// Batches of messages that wait.
+/// Most queued batches of messages.
 const BATCHES_MAX: usize = 4;
-/// What is written before it is flushed, bytes.
+/// Most bytes that are written before a flush.
 const FLUSH_BYTES: usize = 256 << 10;
-/// Bytes a second that a client has to take in the long run.
+/// Lowest rate at which a client must read in the long run, in bytes per second.
 const PACE_BYTES_MIN: u64 = 16 << 10;
 
-/// How much a client is told.
+/// The severity of statuses that a client receives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u8)]
 pub(super) enum Level {
@@ -41,7 +41,7 @@ pub(super) enum Level {
 }
 
 impl Level {
-    pub(super) fn of(name: &str) -> Option<Self> {
+    pub(super) fn from_name(name: &str) -> Option<Self> {
         Some(match name {
             "none" => Self::None,
             "error" => Self::Error,
@@ -61,10 +61,10 @@ impl Level {
     }
 }
 
-/// What waits to be written to a client.
+/// The frames queued for a client.
 #[derive(Clone, Debug)]
 pub(super) struct Outbox {
-    control: mpsc::Sender<Said>,
+    control: mpsc::Sender<ControlFrame>,
     batches: mpsc::Sender<Vec<Frame>>,
     level: Arc<AtomicU8>,
     room: Arc<Budget>,
@@ -73,26 +73,26 @@ pub(super) struct Outbox {
 
 /// A frame of the first lane, and its room until it is written.
 #[derive(Debug)]
-struct Said {
+struct ControlFrame {
     frame: Frame,
     room: Option<Room>,
 }
 
-impl Said {
+impl ControlFrame {
     fn frames(self) -> (Vec<Frame>, Option<Room>) {
         (vec![self.frame], self.room)
     }
 }
 
-/// The other end of it.
+/// The receiving end of an [`Outbox`].
 #[derive(Debug)]
 pub(super) struct Outgoing {
-    control: mpsc::Receiver<Said>,
+    control: mpsc::Receiver<ControlFrame>,
     batches: mpsc::Receiver<Vec<Frame>>,
 }
 
 impl Outgoing {
-    /// Forgets what waits to be said.
+    /// Drops all queued frames.
     pub(super) fn clear(&mut self) {
         self.batches.close();
         self.control.close();
@@ -101,12 +101,12 @@ impl Outgoing {
     }
 }
 
-/// The connection has ended.
+/// The error of an ended connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Gone;
+pub(super) struct ConnectionClosed;
 
 impl Outbox {
-    /// One whose long replies and requests have so many bytes.
+    /// Creates an outbox with `bytes_max` bytes of room for long replies and requests.
     pub(super) fn new(bytes_max: usize, quota: Quota) -> (Self, Outgoing) {
         let (control, control_out) = mpsc::channel(CONTROL_MAX);
         let (batches, batches_out) = mpsc::channel(BATCHES_MAX);
@@ -122,23 +122,23 @@ impl Outbox {
         self.level.store(level as u8, Ordering::Relaxed);
     }
 
-    /// Says something once there is room.
-    pub(super) async fn say(&self, frame: Frame) -> Result<(), Gone> {
+    /// Queues a frame once there is room.
+    pub(super) async fn say(&self, frame: Frame) -> Result<(), ConnectionClosed> {
         let room = self.room.take(frame.bytes()).await;
-        self.control.send(Said { frame, room }).await.map_err(|_| Gone)
+        self.control.send(ControlFrame { frame, room }).await.map_err(|_| ConnectionClosed)
     }
 
-    /// The same of what came by itself, and waits here until there is room.
+    /// Queues a reply, whose memory is taken already, once there is room.
     ///
     /// # Errors
-    /// If too much waits already. That the connection has ended is none: nobody is there to be told.
+    /// Too many bytes of replies wait. An ended connection is no error, because there is no client to inform.
     pub(super) async fn say_reply(&self, frame: Frame) -> Result<(), GatewayError> {
         let room = self.room.take_for_reply(frame.bytes()).await?;
-        let _ = self.control.send(Said { frame, room }).await;
+        let _ = self.control.send(ControlFrame { frame, room }).await;
         Ok(())
     }
 
-    /// Waits for the turn to write out a request that is to be said: of a client that does not read, one waits.
+    /// Waits for the turn to write a request, so that a client that does not read has one unsent request.
     pub(super) async fn turn(&self) -> Turn<'_, ()> {
         self.turns.lock().await
     }
@@ -149,37 +149,42 @@ impl Outbox {
         is_wanted.then(|| status().finish())
     }
 
-    /// Tells of something, if the client wants to be told.
-    pub(super) async fn status(&self, level: Level, told: &str, id: Option<&OpId>) -> Result<(), Gone> {
+    /// Sends a status if the client's level asks for it.
+    pub(super) async fn status(
+        &self,
+        level: Level,
+        told: &str,
+        id: Option<&OpId>,
+    ) -> Result<(), ConnectionClosed> {
         match self.status_frame(level, told, id) {
             Some(frame) => self.say(frame).await,
             None => Ok(()),
         }
     }
 
-    /// The same from where nothing may be waited for: left out if there is no room.
+    /// Sends a status without waiting. It is dropped if there is no room.
     pub(super) fn try_status(&self, level: Level, told: &str, id: Option<&OpId>) {
         if let Some(frame) = self.status_frame(level, told, id) {
-            let _ = self.control.try_send(Said { frame, room: None });
+            let _ = self.control.try_send(ControlFrame { frame, room: None });
         }
     }
 
-    /// A place for messages, once there is one: so that they are written out only then.
-    pub(super) async fn place(&self) -> Result<mpsc::Permit<'_, Vec<Frame>>, Gone> {
-        self.batches.reserve().await.map_err(|_| Gone)
+    /// Waits for a place for messages, so that messages are encoded only when there is one.
+    pub(super) async fn place(&self) -> Result<mpsc::Permit<'_, Vec<Frame>>, ConnectionClosed> {
+        self.batches.reserve().await.map_err(|_| ConnectionClosed)
     }
 }
 
-/// Since when a ping has not been answered.
+/// The time since which a ping has not been answered.
 #[derive(Debug, Default)]
-pub(super) struct Pulse(Mutex<Option<Instant>>);
+pub(super) struct PingState(Mutex<Option<Instant>>);
 
-impl Pulse {
+impl PingState {
     fn asked(&self) {
         self.lock().get_or_insert_with(Instant::now);
     }
 
-    /// Something came.
+    /// Records that a message arrived.
     pub(super) fn heard(&self) {
         *self.lock() = None;
     }
@@ -193,11 +198,11 @@ impl Pulse {
     }
 }
 
-/// Writes until the connection ends.
+/// Writes frames until the connection ends.
 pub(super) async fn write_all<W>(
     sink: &mut W,
     outgoing: &mut Outgoing,
-    pulse: &Pulse,
+    pulse: &PingState,
     silence_max: Duration,
 ) -> RosbridgeError
 where
@@ -228,7 +233,7 @@ where
                 if bytes >= FLUSH_BYTES {
                     break;
                 }
-                let next = outgoing.control.try_recv().map(Said::frames);
+                let next = outgoing.control.try_recv().map(ControlFrame::frames);
                 let next = next.or_else(|_| outgoing.batches.try_recv().map(|batch| (batch, None)));
                 drop(room);
                 (frames, room) = match next {
@@ -244,7 +249,7 @@ where
     }
 }
 
-/// Writes what is still to be said, and nothing of topics.
+/// Writes the remaining frames of the first lane, and no messages of topics.
 pub(super) async fn write_rest<W>(sink: &mut W, outgoing: &mut Outgoing) -> Result<(), tungstenite::Error>
 where
     W: Sink<Message, Error = tungstenite::Error> + Unpin,
@@ -271,7 +276,7 @@ where
     Ok(bytes)
 }
 
-/// So long a write may take.
+/// Limits the duration of a write.
 async fn timed(
     silence_max: Duration,
     bytes: usize,

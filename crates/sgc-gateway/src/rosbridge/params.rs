@@ -1,4 +1,4 @@
-//! Parameters of nodes, by the services that every node has for them. Clients call them `/node:parameter`.
+//! Parameters of nodes, by the services that every node offers for them. Clients name them `/node:parameter`.
 
 use std::time::Duration;
 
@@ -9,11 +9,11 @@ use crate::content::{Content, Form};
 use crate::error::GatewayError;
 use crate::session::Session;
 
-/// How long a node may take to answer: clients wait for 3 s.
+/// Time within which a node must answer; clients wait for 3 s.
 const ANSWER_MAX: Duration = Duration::from_secs(2);
-/// Nodes that are asked at a time.
+/// Most nodes that are asked at a time.
 const NODES_AT_ONCE: usize = 32;
-/// `rcl_interfaces/msg/ParameterType`: as many as there are members of a value, and which is a float.
+/// The members of a value by `rcl_interfaces/msg/ParameterType`.
 const TYPES: [&str; 10] = [
     "",
     "bool_value",
@@ -29,7 +29,7 @@ const TYPES: [&str; 10] = [
 const DOUBLE: usize = 3;
 const DOUBLES: usize = 8;
 
-/// Why a parameter is not told or set.
+/// The reason why a parameter cannot be read or set.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub(super) enum ParamError {
     #[error("{0:?} is no name of a parameter: write /node:parameter")]
@@ -44,7 +44,7 @@ pub(super) enum ParamError {
     Gateway(#[from] GatewayError),
 }
 
-/// Node and parameter of a name.
+/// Splits a name into node and parameter.
 fn split(name: &str) -> Result<(String, &str), ParamError> {
     let wrong = || ParamError::Name(name.to_owned());
     let (node, parameter) = name.split_once(':').filter(|(node, _)| !node.is_empty()).ok_or_else(wrong)?;
@@ -59,7 +59,7 @@ async fn ask(session: &Session, node: &str, what: &str, of: &str, request: Json)
     Ok(serde_json::from_slice(&reply).unwrap_or_default())
 }
 
-/// All parameters of all nodes that the client may ask.
+/// Returns all parameters of all nodes that the client may ask.
 pub(super) async fn names(session: &Session) -> Vec<String> {
     let graph = session.graph();
     let is_listing = |service: &str| service.strip_suffix("/list_parameters").map(str::to_owned);
@@ -78,7 +78,7 @@ pub(super) async fn names(session: &Session) -> Vec<String> {
     names
 }
 
-/// The kind of a parameter, and its value.
+/// Returns the type of a parameter and its value.
 async fn look_up(session: &Session, name: &str) -> Result<(usize, Json), ParamError> {
     let (node, parameter) = split(name)?;
     let reply =
@@ -91,25 +91,25 @@ async fn look_up(session: &Session, name: &str) -> Result<(usize, Json), ParamEr
     }
 }
 
-/// A parameter's value.
+/// Returns the value of a parameter.
 pub(super) async fn get(session: &Session, name: &str) -> Result<Json, ParamError> {
     look_up(session, name).await.map(|(_, value)| value)
 }
 
-/// Sets a parameter. The value is JSON, maybe in a text, as clients send it.
+/// Sets a parameter. The value is JSON, possibly as text, as clients send it.
 pub(super) async fn set(session: &Session, name: &str, value: &Json) -> Result<(), ParamError> {
     let (node, parameter) = split(name)?;
     let value = match value {
         Json::String(text) => serde_json::from_str(text).unwrap_or_else(|_| value.clone()),
         value => value.clone(),
     };
-    // JavaScript writes 1 for 1.0: what it is at present decides.
+    // JavaScript writes 1 for 1.0, so the current type decides.
     let kind = look_up(session, name).await.map_or(0, |(kind, _)| kind);
     let value = as_parameter(kind, value).ok_or_else(|| ParamError::Kind(name.to_owned()))?;
     write(session, &node, parameter, value).await
 }
 
-/// Undeclares a parameter, where the node permits it.
+/// Undeclares a parameter if the node permits it.
 pub(super) async fn delete(session: &Session, name: &str) -> Result<(), ParamError> {
     let (node, parameter) = split(name)?;
     look_up(session, name).await?;
@@ -129,7 +129,8 @@ async fn write(session: &Session, node: &str, parameter: &str, value: Json) -> R
     }
 }
 
-/// JSON as `rcl_interfaces/msg/ParameterValue`; `kind` is what the parameter is at present, 0 if that is not known.
+/// Converts JSON to `rcl_interfaces/msg/ParameterValue`. `kind` is the current type of the parameter, or 0 if
+/// unknown.
 fn as_parameter(kind: usize, value: Json) -> Option<Json> {
     let all = |values: &[Json], is: fn(&Json) -> bool| values.iter().all(is);
     let guess = match &value {
@@ -137,7 +138,7 @@ fn as_parameter(kind: usize, value: Json) -> Option<Json> {
         Json::Number(number) if number.is_f64() || kind == DOUBLE => DOUBLE,
         Json::Number(_) => 2,
         Json::String(_) => 4,
-        // Nothing says of what an empty list is.
+        // An empty list has no type of its own.
         Json::Array(values) if values.is_empty() && kind >= 5 => kind,
         Json::Array(values) if all(values, Json::is_boolean) && !values.is_empty() => 6,
         Json::Array(values) if kind == 5 && all(values, Json::is_u64) => 5,

@@ -1,4 +1,4 @@
-//! Quality of service as clients of rosbridge say it.
+//! QoS as rosbridge clients write it.
 
 use std::collections::BTreeMap;
 
@@ -6,13 +6,13 @@ use serde::Deserialize;
 use serde_json::Value as Json;
 use sgc_wire::{Durability, History, Qos, Reliability};
 
-/// Depth of a publisher that says none, and the most that one can say.
+/// The default depth of a publisher, and the largest one.
 const DEPTH_DEFAULT: u32 = 100;
 const DEPTH_MAX: u32 = 10_000;
 
 /// The member `qos`.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct Said {
+pub(super) struct QosMember {
     reliability: Option<Reliability>,
     durability: Option<Durability>,
     keeps_all: bool,
@@ -29,8 +29,9 @@ enum Span {
     Word(String),
 }
 
-impl Said {
-    /// Reads it, or says what is wrong. What it says `best_available` of is as if it was not there.
+impl QosMember {
+    /// Parses the member; an error explains what is wrong. A policy with the value `best_available` counts as
+    /// missing.
     pub(super) fn read(raw: &str) -> Result<Self, String> {
         let members: BTreeMap<String, Json> =
             serde_json::from_str(raw).map_err(|_| "\"qos\" is no object".to_owned())?;
@@ -61,7 +62,7 @@ impl Said {
         Ok(said)
     }
 
-    /// What a publisher offers: reliable, unless something else is said.
+    /// Returns the QoS that a publisher offers, reliable by default.
     pub(super) fn offer(&self, is_latched: bool, queue_size: Option<usize>) -> Qos {
         let latched = if is_latched { Durability::TransientLocal } else { Durability::Volatile };
         let said = queue_size.and_then(|size| u32::try_from(size).ok()).filter(|size| *size > 0);
@@ -76,7 +77,7 @@ impl Said {
         }
     }
 
-    /// What a subscriber requests; none, if it takes publishers as they are.
+    /// Returns the QoS that a subscriber requests, or `None` if it adapts to the publishers.
     pub(super) fn request(&self) -> Option<Qos> {
         if self.reliability.is_none() && self.durability.is_none() {
             return None;
@@ -118,8 +119,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_said_is_offered_and_requested() {
-        let said = Said::read(
+    fn qos_member_decides_offer_and_request() {
+        let said = QosMember::read(
             r#"{"reliability":"best_effort","durability":"TRANSIENT_LOCAL","depth":5,"history":"keep_last",
             "deadline":0.5,"lifespan":{"secs":1,"nsecs":2}}"#,
         )
@@ -132,13 +133,13 @@ mod tests {
         assert_eq!((offer.history, offer.deadline_ns), (History::KeepLast(5), Some(500_000_000)));
         assert_eq!(offer.lifespan_ns, Some(1_000_000_002));
         assert_eq!(said.request().unwrap().durability, Durability::TransientLocal);
-        let none = Said::read(r#"{"reliability":"best_available","deadline":"infinite"}"#).unwrap();
+        let none = QosMember::read(r#"{"reliability":"best_available","deadline":"infinite"}"#).unwrap();
         assert_eq!((none.request(), none.offer(true, Some(7)).history), (None, History::KeepLast(1)));
-        assert_eq!(Said::default().offer(false, Some(7)).history, History::KeepLast(7));
+        assert_eq!(QosMember::default().offer(false, Some(7)).history, History::KeepLast(7));
     }
 
     #[test]
-    fn what_is_wrong_is_told() {
+    fn invalid_qos_is_explained() {
         for (raw, told) in [
             ("3", "\"qos\" is no object"),
             (r#"{"reliability":"often"}"#, r#""qos": "reliability" cannot be "often""#),
@@ -146,7 +147,7 @@ mod tests {
             (r#"{"deadline":"soon"}"#, r#""qos": "deadline" is no time: "soon""#),
             (r#"{"colour":"red"}"#, r#""qos" has no member "colour""#),
         ] {
-            assert_eq!(Said::read(raw).unwrap_err(), told);
+            assert_eq!(QosMember::read(raw).unwrap_err(), told);
         }
     }
 }

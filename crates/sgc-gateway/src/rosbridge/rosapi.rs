@@ -1,5 +1,5 @@
-//! [`RosApi`]: the services of the `rosapi` node, answered by the gateway itself within what the client may see. A `rosapi`
-//! node on the network is not asked.
+//! [`RosApi`]: the services of the `rosapi` node, answered by the gateway within the client's view. A `rosapi` node
+//! on the network is not asked.
 
 use std::collections::BTreeSet;
 
@@ -11,20 +11,20 @@ use super::input;
 use super::options::RosbridgeOptions;
 use super::params::ParamError;
 use super::{params, typedefs};
-use crate::aside::aside;
+use crate::definitions::InterfaceType;
 use crate::graph::{Graph, NodeInfo, is_hidden};
+use crate::offload::offload;
 use crate::session::Session;
-use crate::types::InterfaceType;
 
-/// Longest arguments, bytes: what is wrong in them is echoed.
+/// Longest arguments, in bytes, because errors echo them.
 const ARGS_BYTES_MAX: usize = 64 << 10;
 
-/// The name of a service within `rosapi`, if it is one. Clients call `rosapi/topics`, too.
+/// Returns the name of a service within `rosapi`, or `None` for other services. The leading slash is optional.
 pub(super) fn local_name(service: &str) -> Option<&str> {
     service.strip_prefix('/').unwrap_or(service).strip_prefix("rosapi/")
 }
 
-/// Arguments of all its services.
+/// The arguments of all services.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 struct Args {
@@ -39,14 +39,14 @@ struct Args {
     default: String,
 }
 
-/// What answers in place of the `rosapi` node.
+/// The gateway's replacement of the `rosapi` node.
 pub(super) struct RosApi<'s> {
     pub(super) session: &'s Session,
     pub(super) options: &'s RosbridgeOptions,
 }
 
 impl RosApi<'_> {
-    /// The answer; none if there is no such service, which may be one of the network then.
+    /// Answers a call, or returns `None` if there is no such service here; the network may have it.
     pub(super) async fn answer(&self, service: &str, args: &str) -> Option<Result<Json, String>> {
         let known = [
             "topics",
@@ -86,7 +86,7 @@ impl RosApi<'_> {
         if args.len() > ARGS_BYTES_MAX {
             return Some(Err(format!("the arguments are longer than {ARGS_BYTES_MAX} bytes")));
         }
-        // No arguments are an empty list, too.
+        // Clients may send no arguments as an empty list.
         let args = if args.starts_with('[') { "{}" } else { args };
         let args: Args = match serde_json::from_str(args) {
             Ok(args) => args,
@@ -106,20 +106,20 @@ impl RosApi<'_> {
             "action_goal_details" => self.typedefs(InterfaceType::Action, &args.type_name, "_Goal"),
             "action_result_details" => self.typedefs(InterfaceType::Action, &args.type_name, "_Result"),
             "action_feedback_details" => self.typedefs(InterfaceType::Action, &args.type_name, "_Feedback"),
-            _ => Ok(self.of_graph(service, &args)),
+            _ => Ok(self.graph_answer(service, &args)),
         })
     }
 
     fn typedefs(&self, of: InterfaceType, type_name: &str, part: &str) -> Result<Json, String> {
         let full = of.full_name(type_name).map_err(|error| error.to_string())?;
-        let found = aside(|| {
+        let found = offload(|| {
             self.session.check_type(&full)?;
             typedefs::typedefs(self.session.hub().types(), &format!("{full}{part}"))
         });
         found.map(|typedefs| json!({ "typedefs": typedefs })).map_err(|error| error.to_string())
     }
 
-    fn of_graph(&self, service: &str, args: &Args) -> Json {
+    fn graph_answer(&self, service: &str, args: &Args) -> Json {
         let graph = self.session.graph();
         let shown = |name: &&String| !is_hidden(name);
         let topics = || {
@@ -148,7 +148,7 @@ impl RosApi<'_> {
                 let (names, types): (Vec<_>, Vec<_>) = topics().unzip();
                 let types_known = self.session.hub().types();
                 let read = || types.iter().map(|of| typedefs::full_text(types_known, of)).collect::<Vec<_>>();
-                let texts = aside(read);
+                let texts = offload(read);
                 json!({ "topics": names, "types": types, "typedefs_full_text": texts })
             }
             "topics_for_type" => {
@@ -198,7 +198,7 @@ impl RosApi<'_> {
         }
     }
 
-    /// Nodes of which the client sees something, and the gateway's own.
+    /// Returns the nodes with a visible interface, and the gateway's own.
     fn nodes(&self, graph: &Graph) -> Vec<String> {
         let own = self.session.hub().node_name();
         let is_seen = |info: &NodeInfo| {
@@ -210,7 +210,7 @@ impl RosApi<'_> {
     }
 }
 
-/// Types that ship inside, and those that the client sees on the network.
+/// Returns the types that ship, and those that the client sees on the network.
 fn interfaces(graph: &Graph) -> BTreeSet<String> {
     let mut all: BTreeSet<String> = Library::shipped_files().map(|file| file.to_string()).collect();
     all.extend(graph.topics.values().filter_map(|info| info.type_name().map(str::to_owned)));
@@ -220,7 +220,7 @@ fn interfaces(graph: &Graph) -> BTreeSet<String> {
     all
 }
 
-/// As ROS 2 has it and as ROS 1 had it, which roslibpy 2 reads.
+/// Returns the time with the names of ROS 2 and of ROS 1, which roslibpy 2 reads.
 fn time() -> Json {
     let now = input::now();
     let (sec, nanosec) = (now.as_secs(), now.subsec_nanos());
@@ -234,7 +234,7 @@ fn done(result: Result<(), ParamError>) -> Json {
     }
 }
 
-/// The value is JSON in a text.
+/// Returns the answer of `get_param`, whose value is JSON as text.
 fn get_param(found: Result<Json, ParamError>, default: &str) -> Json {
     match found {
         Ok(value) => json!({ "value": value.to_string(), "successful": true, "reason": "" }),

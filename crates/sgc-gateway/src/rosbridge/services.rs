@@ -1,5 +1,5 @@
-//! [`Served`]: a service that a client serves. Requests go to it as the op `call_service`, and what it answers comes back as
-//! `service_response`.
+//! [`ServedService`]: a service that a client serves. Requests go to the client as op `call_service`, and answers come back
+//! as `service_response`.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -15,35 +15,34 @@ use crate::content::Form;
 use crate::hub::lock;
 use crate::service::{Replier, Serving};
 
-/// Requests that a client has not answered; the oldest is given up for one more.
+/// Most unanswered requests. Beyond that the oldest is given up.
 const PENDING_MAX: usize = 1024;
 
-/// Requests that were passed on, by their number.
+/// The forwarded requests by number.
 type Pending = BTreeMap<u64, RequestId>;
 
-/// A number for what is passed on to a client, which nothing else of the process has: what is answered too late is of
-/// nothing that waits.
+/// Returns a number that is unique in the process, so that a late answer matches no other request.
 pub(super) fn next_number() -> u64 {
     static NEXT: AtomicU64 = AtomicU64::new(0);
     NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
-/// A service that a client serves; ends when dropped.
+/// A service that a client serves, until dropped.
 #[derive(Debug)]
-pub(super) struct Served {
+pub(super) struct ServedService {
     replier: Replier,
     pending: Arc<Mutex<Pending>>,
     prefix: Arc<str>,
     task: JoinHandle<()>,
 }
 
-impl Drop for Served {
+impl Drop for ServedService {
     fn drop(&mut self) {
         self.task.abort();
     }
 }
 
-impl Served {
+impl ServedService {
     pub(super) fn new(serving: Serving, outbox: Outbox) -> Self {
         let replier = serving.replier();
         let pending = Arc::default();
@@ -61,12 +60,12 @@ impl Served {
         id.strip_prefix(&*self.prefix)?.parse().ok()
     }
 
-    /// The request that an answer is for.
+    /// Returns the request that an answer belongs to.
     pub(super) fn request(&self, id: Option<&OpId>) -> Option<RequestId> {
         lock(&self.pending).get(&self.number(id)?).copied()
     }
 
-    /// A request has its answer.
+    /// Removes a request that was answered.
     pub(super) fn answered(&self, id: Option<&OpId>) {
         if let Some(number) = self.number(id) {
             lock(&self.pending).remove(&number);
@@ -74,7 +73,7 @@ impl Served {
     }
 }
 
-/// Passes requests on as fast as the client takes them.
+/// Forwards requests as fast as the client reads them.
 async fn ask(mut serving: Serving, pending: Arc<Mutex<Pending>>, prefix: Arc<str>, outbox: Outbox) {
     while let Some(request) = serving.next().await {
         let _turn = outbox.turn().await;

@@ -1,5 +1,5 @@
-//! [`Topic`]: what one client hears of a topic. Of several subscriptions of the client one is made, whose messages it gets
-//! once.
+//! [`Topic`]: a client's subscriptions to one topic. They share one subscription at the hub, and the client gets each
+//! message once.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -16,41 +16,41 @@ use super::outbox::{Level, Outbox};
 use crate::error::GatewayError;
 use crate::feed::{Delivery, Subscription};
 
-/// Messages that wait for a client that has not said how many, and no rate.
+/// Queued messages for a client that gives neither a number nor a rate.
 const QUEUE_DEFAULT: usize = 1000;
-/// The most that a client can say.
+/// The largest queue length that a client can give.
 const QUEUE_MAX: usize = 10_000;
-/// Messages that are written out at once, and their bytes.
+/// Most messages and bytes that are encoded at once.
 const BATCH_MAX: usize = 64;
 const BATCH_BYTES: usize = 64 << 10;
-/// How often a client is told at most that it misses messages of a topic.
+/// Shortest time between warnings about lost messages of a topic.
 const WARN_INTERVAL: Duration = Duration::from_secs(1);
 
-/// What one subscription of a client asks for.
+/// The request of one subscription.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Wish {
+pub(super) struct SubscriptionRequest {
     pub(super) throttle: Duration,
     pub(super) queue_length: usize,
     pub(super) fragment_size: Option<usize>,
     pub(super) compression: Compression,
 }
 
-/// What suits all subscriptions of a client to a topic.
+/// The settings that suit all subscriptions of a client to a topic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Pace {
     interval_min: Option<Duration>,
     depth: usize,
     fragment_size: Option<usize>,
     compression: Compression,
-    /// How often what is kept for who subscribes later is to come once more.
+    /// The number of replays of kept messages so far.
     replays: u64,
 }
 
-/// What a client hears of a topic.
+/// A client's subscriptions to a topic.
 #[derive(Debug)]
 pub(super) struct Topic {
     type_name: String,
-    wishes: BTreeMap<Option<OpId>, Wish>,
+    wishes: BTreeMap<Option<OpId>, SubscriptionRequest>,
     pace: watch::Sender<Pace>,
     task: JoinHandle<()>,
 }
@@ -62,12 +62,17 @@ impl Drop for Topic {
 }
 
 impl Topic {
-    /// Messages that may wait, by what is wished.
-    pub(super) fn depth(wish: &Wish) -> usize {
+    /// Returns the queue length for a request.
+    pub(super) fn depth(wish: &SubscriptionRequest) -> usize {
         wish.depth()
     }
 
-    pub(super) fn new(subscription: Subscription, id: Option<OpId>, wish: Wish, outbox: Outbox) -> Self {
+    pub(super) fn new(
+        subscription: Subscription,
+        id: Option<OpId>,
+        wish: SubscriptionRequest,
+        outbox: Outbox,
+    ) -> Self {
         let wishes = BTreeMap::from([(id, wish)]);
         let (pace, followed) = watch::channel(pace(wishes.values(), 0));
         let type_name = subscription.type_name().to_owned();
@@ -79,23 +84,23 @@ impl Topic {
         &self.type_name
     }
 
-    /// Whether it goes on: it does not once the gateway has stopped.
+    /// Returns `true` until the gateway stops.
     pub(super) fn is_alive(&self) -> bool {
         !self.task.is_finished()
     }
 
-    /// How many subscriptions it stands for.
+    /// Returns the number of subscriptions.
     pub(super) fn len(&self) -> usize {
         self.wishes.len()
     }
 
-    /// One more subscription, or another wish of one.
-    pub(super) fn add(&mut self, id: Option<OpId>, wish: Wish) {
+    /// Adds a subscription, or changes the request of one.
+    pub(super) fn add(&mut self, id: Option<OpId>, wish: SubscriptionRequest) {
         let is_new = self.wishes.insert(id, wish).is_none();
         self.change(u64::from(is_new));
     }
 
-    /// Ends a subscription, or all without an id; false if nothing is left.
+    /// Removes a subscription, or all without an id. Returns `false` if none is left.
     pub(super) fn remove(&mut self, id: Option<&OpId>) -> bool {
         match id {
             Some(_) => drop(self.wishes.remove(&id.cloned())),
@@ -110,35 +115,35 @@ impl Topic {
     }
 }
 
-impl Wish {
-    /// Messages that may wait.
+impl SubscriptionRequest {
+    /// Returns the queue length.
     fn depth(&self) -> usize {
         match self.queue_length {
             0 if self.throttle.is_zero() => QUEUE_DEFAULT,
-            // The latest, once its time has come.
+            // Only the latest message matters when its time has come.
             0 => 1,
             length => length.min(QUEUE_MAX),
         }
     }
 }
 
-/// The shortest interval, the smallest pieces and the longest queue, and CBOR before JSON.
-fn pace<'w>(wishes: impl Iterator<Item = &'w Wish> + Clone, replays: u64) -> Pace {
+/// Returns the shortest interval, the smallest fragments and the longest queue, and prefers CBOR to JSON.
+fn pace<'w>(wishes: impl Iterator<Item = &'w SubscriptionRequest> + Clone, replays: u64) -> Pace {
     let throttle = wishes.clone().map(|wish| wish.throttle).min().unwrap_or_default();
     Pace {
         interval_min: (!throttle.is_zero()).then_some(throttle),
-        depth: wishes.clone().map(Wish::depth).max().unwrap_or(1),
+        depth: wishes.clone().map(SubscriptionRequest::depth).max().unwrap_or(1),
         fragment_size: wishes.clone().filter_map(|wish| wish.fragment_size).min(),
         compression: wishes.map(|wish| wish.compression).max().unwrap_or_default(),
         replays,
     }
 }
 
-/// Carries messages from a subscription to the client, as fast as that takes them.
+/// Forwards messages from a subscription to the client, as fast as it reads them.
 async fn pump(mut subscription: Subscription, mut followed: watch::Receiver<Pace>, outbox: Outbox) {
     let mut pace = *followed.borrow_and_update();
     subscription.set_pace(pace.depth, pace.interval_min);
-    let mut told = Told::default();
+    let mut told = WarningState::default();
     let begin_of =
         |pace: &Pace, topic: &str| Envelope::new("publish", pace.compression, 0).text("topic", topic);
     let mut begin = begin_of(&pace, subscription.topic());
@@ -189,7 +194,7 @@ async fn pump(mut subscription: Subscription, mut followed: watch::Receiver<Pace
     }
 }
 
-/// What is written to the client of a message.
+/// Encodes a message for the client.
 fn frame(
     subscription: &Subscription,
     delivery: &Delivery,
@@ -210,20 +215,20 @@ fn frame(
     Ok(envelope.finish_in_pieces(pace.fragment_size, fragment_id))
 }
 
-/// An id for the pieces of a message, which no other message of the process has.
+/// Returns an id for the fragments of a message that is unique in the process.
 pub(super) fn fragment_id() -> String {
     static NEXT: AtomicU64 = AtomicU64::new(0);
     format!("fragment:{}", NEXT.fetch_add(1, Ordering::Relaxed))
 }
 
-/// What a client was told of a topic, so that it is not told too often.
+/// The warnings sent for a topic, kept to limit their rate.
 #[derive(Debug, Default)]
-struct Told {
+struct WarningState {
     dropped: u64,
     at: Option<Instant>,
 }
 
-impl Told {
+impl WarningState {
     fn may(&mut self) -> bool {
         let may = self.at.is_none_or(|at| at.elapsed() >= WARN_INTERVAL);
         if may {
@@ -256,15 +261,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn of_several_wishes_the_one_that_suits_all_is_made() {
-        let wish = |throttle, queue_length, fragment_size, compression| Wish {
+    fn pace_suits_all_requests() {
+        let wish = |throttle, queue_length, fragment_size, compression| SubscriptionRequest {
             throttle: Duration::from_millis(throttle),
             queue_length,
             fragment_size,
             compression,
         };
         let slow = wish(500, 0, Some(1000), Compression::None);
-        assert_eq!((pace([&slow].into_iter(), 0).depth, Topic::depth(&Wish::default())), (1, QUEUE_DEFAULT));
+        assert_eq!(
+            (pace([&slow].into_iter(), 0).depth, Topic::depth(&SubscriptionRequest::default())),
+            (1, QUEUE_DEFAULT)
+        );
         let queued = wish(100, 5, Some(300), Compression::Cbor);
         let both = pace([&slow, &queued].into_iter(), 0);
         assert_eq!((both.interval_min, both.depth), (Some(Duration::from_millis(100)), 5));

@@ -1,14 +1,14 @@
-//! Types as `rosapi` tells of them: a list of members for each type, or the text of the definitions.
+//! Types as `rosapi` describes them: a list of members for each type, or the text of the definitions.
 
 use std::collections::BTreeSet;
 
 use serde::Serialize;
 use sgc_cdr::{Base, DUMMY_MEMBER, Definition, Field, Library, Primitive, Shape, TypeName};
 
+use crate::definitions::Types;
 use crate::error::GatewayError;
-use crate::types::Types;
 
-/// What stands between definitions in one text.
+/// The separator between definitions in one text.
 const RULE: &str = "================================================================================";
 
 /// `rosapi_msgs/msg/TypeDef`.
@@ -18,20 +18,20 @@ pub(super) struct TypeDef {
     type_name: String,
     fieldnames: Vec<String>,
     fieldtypes: Vec<String>,
-    /// -1 of one element, 0 of a sequence, else that of an array.
+    /// -1 for a single element, 0 for a sequence, else the length of the array.
     fieldarraylen: Vec<i64>,
     examples: Vec<String>,
     constnames: Vec<String>,
     constvalues: Vec<String>,
 }
 
-/// A type, and after it those that it contains, each once. May read files.
+/// Returns a type and the types that it contains, each once. May read files.
 pub(super) fn typedefs(types: &Types, type_name: &str) -> Result<Vec<TypeDef>, GatewayError> {
     let (library, all) = within(types, type_name)?;
     Ok(all.iter().filter_map(|name| library.definition(name)).map(typedef).collect())
 }
 
-/// The text of a type's definition, followed by those of the types that it contains, as bag files have it.
+/// Returns the text of a type's definition and of the types that it contains, as in bag files.
 pub(super) fn full_text(types: &Types, type_name: &str) -> String {
     let texts = || {
         let (_, all) = within(types, type_name)?;
@@ -47,7 +47,7 @@ pub(super) fn full_text(types: &Types, type_name: &str) -> String {
     texts().unwrap_or_else(|error| format!("# {error}"))
 }
 
-/// Definitions of a type and all that it contains, and their names, itself first.
+/// Returns the definitions of a type and of the types that it contains, and their names, beginning with the type.
 fn within(types: &Types, type_name: &str) -> Result<(Library, Vec<TypeName>), GatewayError> {
     let name: TypeName = type_name.parse().map_err(|_| GatewayError::TypeName {
         name: type_name.to_owned(),
@@ -95,12 +95,12 @@ fn typedef(definition: &Definition) -> TypeDef {
     made
 }
 
-/// As `rosapi` calls types: `std_msgs/String`.
+/// Returns a type name in the form of `rosapi`: `std_msgs/String`.
 fn short_name(name: &TypeName) -> String {
     format!("{}/{}", name.package(), name.name())
 }
 
-/// As the Python of ROS 2 calls them.
+/// Returns the name of a base type as in the Python packages of ROS 2.
 fn base_name(base: &Base) -> String {
     match base {
         Base::Primitive(Primitive::Bool) => "boolean".to_owned(),
@@ -134,11 +134,11 @@ fn example(field: &Field) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::types::Shipped;
+    use crate::definitions::ShippedDefinitions;
 
     #[test]
     fn types_are_told_with_all_that_they_contain() {
-        let types = Types::new(Shipped);
+        let types = Types::new(ShippedDefinitions);
         let all = typedefs(&types, "sensor_msgs/msg/BatteryState").unwrap();
         let names: Vec<_> = all.iter().map(|def| def.type_name.as_str()).collect();
         assert_eq!(names, ["sensor_msgs/BatteryState", "std_msgs/Header", "builtin_interfaces/Time"]);
@@ -167,10 +167,12 @@ mod tests {
 
     #[test]
     fn texts_are_as_in_bag_files() {
-        let text = full_text(&Types::new(Shipped), "geometry_msgs/msg/PointStamped");
+        let text = full_text(&Types::new(ShippedDefinitions), "geometry_msgs/msg/PointStamped");
         let parts: Vec<_> = text.split(RULE).collect();
         assert_eq!(parts.len(), 4);
         assert!(parts[1].starts_with("\nMSG: std_msgs/Header\n"), "{text}");
-        assert!(full_text(&Types::new(Shipped), "nobody/msg/Knows").starts_with("# no definition"));
+        assert!(
+            full_text(&Types::new(ShippedDefinitions), "nobody/msg/Knows").starts_with("# no definition")
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! A gateway of gRPC on a network in memory, and clients of it over TCP.
+//! A gRPC gateway on a network in memory, and clients over TCP.
 
 #![allow(dead_code, reason = "each test program uses a part")]
 
@@ -8,7 +8,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use rand_chacha::ChaCha20Rng;
 use rand_chacha::rand_core::SeedableRng as _;
 use sgc_gateway::grpc::proto::gateway_client::GatewayClient;
-use sgc_gateway::grpc::{Accepted, Connection, Grpc, GrpcOptions, MESSAGE_BYTES_MAX};
+use sgc_gateway::grpc::{AcceptedStream, Connection, Grpc, GrpcOptions, MESSAGE_BYTES_MAX};
 use sgc_gateway::{
     Access, AccessGrant, AccessRules, AccessWatch, Anonymous, ClientRule, Scope, TokenId, WallClock,
 };
@@ -25,7 +25,7 @@ use tonic::{Request, Status};
 
 use crate::support::Site;
 
-/// A gateway, and the network that it is on.
+/// A gateway and its network.
 pub(crate) struct Gateway {
     pub(crate) site: Site,
     pub(crate) grpc: Grpc,
@@ -38,7 +38,7 @@ pub(crate) struct Gateway {
 
 pub(crate) type Client = GatewayClient<InterceptedService<Channel, Bearer>>;
 
-/// Shows a token with each call.
+/// An interceptor that adds a token to each call.
 #[derive(Clone)]
 pub(crate) struct Bearer(Option<AsciiMetadataValue>);
 
@@ -57,7 +57,7 @@ pub(crate) fn now() -> UnixMillis {
 }
 
 impl Gateway {
-    /// One that admits programs of this host.
+    /// Creates a gateway that admits programs on this host.
     pub(crate) async fn new() -> Self {
         Self::with(GrpcOptions::default()).await
     }
@@ -77,7 +77,7 @@ impl Gateway {
         tokio::spawn(async move {
             while let Ok((stream, peer)) = listener.accept().await {
                 stream.set_nodelay(true).unwrap();
-                if send.send(Accepted::new(stream, Connection::plain(peer))).await.is_err() {
+                if send.send(AcceptedStream::new(stream, Connection::plain(peer))).await.is_err() {
                     return;
                 }
             }
@@ -89,24 +89,24 @@ impl Gateway {
         gateway
     }
 
-    /// Has the gateway admit these from now on, and whoever has a token.
+    /// Makes the gateway admit these clients and those with a token.
     pub(crate) fn admit(&self, anonymous: Anonymous) {
         self.access.change(|_| self.access_of(anonymous, Vec::new()));
     }
 
-    /// Access for these, for these nodes, and for whoever has a token.
+    /// Returns access for these clients, for these nodes, and for clients with a token.
     pub(crate) fn access_of(&self, anonymous: Anonymous, clients: Vec<ClientRule>) -> Access {
         let (gateway, anchors) =
             (Some(self.identity.as_peer().clone()), Some(self.identity.anchors().clone()));
         Access::new(AccessRules { anonymous, clients, gateway, anchors, ..AccessRules::default() })
     }
 
-    /// Another node of the gateway's fleet.
+    /// Returns another node of the gateway's fleet.
     pub(crate) fn desk(&self) -> &Identity {
         &self.desk
     }
 
-    /// A token for a client of this name.
+    /// Returns a token for a client with this name.
     pub(crate) fn token(&self, label: &str, scope: Scope, expires: UnixMillis) -> String {
         let (id, gateway, issued) = (TokenId([7; 16]), self.identity.node_id(), UnixMillis(now().0 - 1));
         let grant = AccessGrant { id, gateway, label: label.into(), scope, issued, expires };
@@ -117,7 +117,7 @@ impl Gateway {
         Endpoint::from_shared(format!("http://{}", self.address)).unwrap()
     }
 
-    /// A client without a token, on a connection of its own.
+    /// Returns a client without a token, on its own connection.
     pub(crate) async fn client(&self) -> Client {
         client(self.endpoint().connect().await.unwrap(), None)
     }

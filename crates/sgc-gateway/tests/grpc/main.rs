@@ -1,4 +1,4 @@
-//! Clients of gRPC on a network in memory, over TCP: one connection each, as it is written in `gateway.proto`.
+//! Tests of gRPC clients on a network in memory, over TCP with one connection each, by `gateway.proto`.
 #![allow(clippy::unwrap_used)]
 
 mod gateway;
@@ -35,7 +35,7 @@ async fn within<T>(work: impl Future<Output = T>) -> T {
     tokio::time::timeout(PATIENCE, work).await.expect("it should have come by now")
 }
 
-/// Subscribes, and waits until it is so.
+/// Subscribes, and waits for the confirmation.
 async fn subscribe(client: &mut Client, request: SubscribeRequest) -> Streaming<SubscribeResponse> {
     let mut heard = within(client.subscribe(request)).await.unwrap().into_inner();
     let first = within(heard.message()).await.unwrap().unwrap();
@@ -51,7 +51,7 @@ async fn next(heard: &mut Streaming<SubscribeResponse>) -> Message {
     }
 }
 
-/// How a stream ends.
+/// Returns the code with which a stream ends.
 async fn end<T: std::fmt::Debug>(heard: &mut Streaming<T>) -> Option<Code> {
     loop {
         match within(heard.message()).await {
@@ -107,14 +107,14 @@ async fn a_topic_is_heard_in_each_encoding() {
         assert_eq!((message.source_time_ns, message.dropped), (5, 0));
         assert!(message.received_time_ns > 0);
     }
-    // What is not of its type is told of, and the stream goes on.
+    // A malformed message is reported, and the stream continues.
     talker.write(SampleKind::Write, 6, Bytes::from_static(&[0, 1, 0, 0, 9])).unwrap();
     talker.write(SampleKind::Write, 7, string("again")).unwrap();
     let unreadable = within(heard[2].message()).await.unwrap().unwrap();
     assert!(matches!(unreadable.kind, Some(Heard::Unreadable(_))), "{unreadable:?}");
     assert_eq!(next(&mut heard[2]).await.payload, r#"{"data":"again"}"#);
 
-    // Nothing is left of a client that goes.
+    // A client that leaves leaves nothing behind.
     drop((heard, client));
     eventually(|| gateway.site.hub.readers() == 0).await;
 }
@@ -128,7 +128,7 @@ async fn a_client_that_stops_reading_loses_the_oldest_and_holds_up_nobody() {
     let mut client = gateway.client().await;
     let slow_request = SubscribeRequest { depth: 5, ..hear("/fast") };
     let mut slow = subscribe(&mut client, slow_request).await;
-    // On the same connection, and it has room for all.
+    // The second subscription is on the same connection and has room for all messages.
     let quick_request = SubscribeRequest { depth: 10_000, ..hear("/fast") };
     let mut quick = subscribe(&mut client, quick_request).await;
     let text = string(&"x".repeat(1000));
@@ -152,7 +152,7 @@ async fn a_client_that_stops_reading_loses_the_oldest_and_holds_up_nobody() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_waits_holds_up_the_publisher_and_loses_nothing() {
+async fn waiting_subscriber_holds_up_the_publisher_and_loses_nothing() {
     const MESSAGES: usize = 500;
     let gateway = Gateway::new().await;
     let keeps = RosQos { history: History::KeepAll, ..RosQos::default() };
@@ -169,7 +169,7 @@ async fn who_waits_holds_up_the_publisher_and_loses_nothing() {
             counted.store(n + 1, Ordering::Relaxed);
         }
     });
-    // It stands still: once for longer than all takes that is written meanwhile.
+    // The publisher stands still, for longer than writing everything would take.
     let mut before = 0;
     eventually(|| {
         let now = written.load(Ordering::Relaxed);
@@ -208,7 +208,7 @@ async fn the_newest_come_at_the_rate_that_is_wanted() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_client_publishes_is_heard_by_programs() {
+async fn messages_of_a_client_reach_programs() {
     let gateway = Gateway::new().await;
     let (texts, _reader) = gateway.site.reader("/cmd");
     let mut client = gateway.client().await;
@@ -235,7 +235,7 @@ async fn what_a_client_publishes_is_heard_by_programs() {
         let refused = within(client.publish(tokio_stream::iter(wrong))).await.unwrap_err();
         assert_eq!(refused.code(), Code::InvalidArgument);
     }
-    // Nothing is left of any of them.
+    // No publisher is left behind.
     let own = || {
         let graph = gateway.site.hub.graph();
         graph.topics.get("/cmd").map_or(0, |topic| topic.publishers.len())
@@ -267,7 +267,7 @@ async fn images_of_13_mb_pass_both_ways() {
     drop(send);
     assert_eq!(within(publishing).await.unwrap().unwrap().into_inner().published, 3);
 
-    // What is longer than all there may be is refused, and the connection goes on.
+    // A message beyond the bound is refused, and the connection continues.
     let long = vec![publisher("/image", Encoding::Cdr), payload(vec![0; 65 << 20])];
     let mut unbounded = client.clone().max_encoding_message_size(usize::MAX);
     let refused = within(unbounded.publish(tokio_stream::iter(long))).await.unwrap_err();
@@ -316,7 +316,7 @@ async fn services_are_called_and_served_over_one_connection() {
             other => panic!("{other:?}"),
         }
     }
-    // Answered in another order; what cannot be sent is told of, and may be said again.
+    // The calls are answered in another order. A reply that cannot be sent is reported, and may be sent again.
     let reply = |id, text: &'static str| say_kind(Kind::Reply(Reply { id, payload: text.into() }));
     for (id, why) in [(ids[7], "not a message of that type"), (99, "call 99 is not open")] {
         say.send(reply(id, r#"{"success":7}"#)).await.unwrap();
@@ -331,7 +331,7 @@ async fn services_are_called_and_served_over_one_connection() {
     for call in calls {
         assert_eq!(within(call).await.unwrap(), r#"{"success":true,"message":"on"}"#);
     }
-    // Who is not answered is told by whom.
+    // A caller without an answer learns which service did not answer.
     let mut late = Request::new(call("false"));
     late.set_timeout(Duration::from_millis(300));
     let refused = within(client.call(late)).await.unwrap_err();
@@ -361,7 +361,7 @@ async fn goals_are_sent_and_served() {
     let mut serving = client.serve_action(ReceiverStream::new(requests)).await.unwrap().into_inner();
     let first = within(serving.message()).await.unwrap().unwrap();
     assert!(matches!(first.kind, Some(Told::Served(_))), "{first:?}");
-    // Orders below zero are rejected, those below ten done, others worked on until they are to be given up.
+    // The server rejects negative orders, completes those below ten, and executes others until they are cancelled.
     tokio::spawn(async move {
         let tell = async |kind| to_gateway.send(request(kind)).await.unwrap();
         while let Ok(Some(told)) = serving.message().await {
@@ -509,7 +509,7 @@ async fn streams_end_with_the_token_even_of_a_client_that_does_not_read() {
         let mut partner = partner.clone();
         tokio::spawn(async move { partner.publish(ReceiverStream::new(requests)).await })
     };
-    // Its window is full, and the publisher stands still until it ends.
+    // The client's window is full, and the publisher stands still until the stream ends.
     let writing = std::thread::spawn(move || {
         let text = string(&"x".repeat(50_000));
         for n in 0..200 {
@@ -530,7 +530,7 @@ async fn streams_end_with_the_token_even_of_a_client_that_does_not_read() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_is_not_admitted_by_new_rules_is_disconnected() {
+async fn new_rules_disconnect_clients_they_do_not_admit() {
     let gateway = Gateway::new().await;
     let _talker = gateway.site.writer("/odom", RosQos::default());
     gateway.site.knows("/odom").await;
@@ -543,7 +543,7 @@ async fn who_is_not_admitted_by_new_rules_is_disconnected() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_cannot_be_is_refused_in_words_for_the_user() {
+async fn invalid_requests_are_refused_with_an_explanation() {
     let gateway = Gateway::new().await;
     let _talker = gateway.site.writer("/chatter", RosQos::default());
     gateway.site.knows("/chatter").await;
@@ -585,7 +585,7 @@ async fn a_client_has_its_bounds_over_all_its_streams() {
         (refused.code(), refused.message()),
         (Code::ResourceExhausted, "2 subscriptions at most for a client")
     );
-    // Another client has its own, and what ends makes room.
+    // Another client has its own bounds, and an ended subscription makes room.
     subscribe(&mut gateway.client().await, hear("/chatter")).await;
     drop(heard);
     let began = tokio::time::Instant::now();
@@ -604,14 +604,15 @@ async fn long_messages_that_a_client_does_not_read_are_not_written_for_it() {
     let wanted = SubscribeRequest { waits: true, depth: 1, ..hear("/image") };
     let unread = subscribe(&mut client, wanted).await;
     let image = string(&"x".repeat(13 << 20));
-    // The second returns once the first is taken: it fills the window of its stream, and of the room half and more.
+    // The second write returns once the first message is taken, which fills the stream's window and more than half of
+    // the room.
     for n in 1..=2 {
         talker.write(SampleKind::Write, n, image.clone()).unwrap();
     }
     let mut heard = subscribe(&mut client, hear("/image")).await;
     let mut other = subscribe(&mut gateway.client().await, hear("/image")).await;
     talker.write(SampleKind::Write, 3, image.clone()).unwrap();
-    // Another client has its own, and what is short needs none.
+    // Another client has its own room, and short messages need none.
     assert_eq!(next(&mut other).await.payload, image);
     assert!(client.get_graph(GetGraphRequest::default()).await.is_ok());
     let waited = tokio::time::timeout(Duration::from_millis(300), heard.message()).await;
@@ -636,11 +637,11 @@ async fn long_requests_that_are_under_way_are_bounded_in_bytes_for_each_client()
     let mut first = client.clone();
     let first = tokio::spawn(async move { first.call(call(1500 << 10)).await });
     let asked = within(serving.next()).await.unwrap();
-    // It is worked on, so there is no room for another of that length, in no stream.
+    // The first request is being handled, so no stream has room for another one of that length.
     let told = "2097152 bytes of requests that come or are worked on at most for a client";
     let refused = within(client.call(call(1500 << 10))).await.unwrap_err();
     assert_eq!((refused.code(), refused.message()), (Code::ResourceExhausted, told));
-    // There is for short ones, and for other clients.
+    // There is room for short requests, and for other clients.
     let (mut short, mut other) = (client.clone(), gateway.client().await);
     let all = [
         tokio::spawn(async move { short.call(call(60 << 10)).await }),
@@ -655,7 +656,7 @@ async fn long_requests_that_are_under_way_are_bounded_in_bytes_for_each_client()
     for answered in all {
         within(answered).await.unwrap().unwrap();
     }
-    // What has its reply makes room.
+    // An answered request makes room.
     let again = tokio::spawn(async move { client.call(call(1500 << 10)).await });
     let asked = within(serving.next()).await.unwrap();
     serving.replier().reply(asked.id, &Content::cdr(reply)).await.unwrap();
@@ -726,7 +727,7 @@ async fn connections_without_a_client_take_no_place_of_clients() {
     let mut second = client(endpoint.connect().await.unwrap(), None);
     assert!(within(second.get_graph(GetGraphRequest::default())).await.is_err());
     assert_eq!(server.status().refused, [("too many clients".to_owned(), 1)].into());
-    // It is served as before.
+    // The connection still works.
     within(first.get_graph(GetGraphRequest::default())).await.unwrap();
 }
 

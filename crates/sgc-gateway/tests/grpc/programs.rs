@@ -1,5 +1,5 @@
-//! Programs of others as clients: Python's grpcio with the client of `clients/python`, and Node's grpc-js with nothing but
-//! `gateway.proto`. Both have to be installed, as `make peers` does.
+//! Independent programs as clients: Python's grpcio with the client of `clients/python`, and Node's grpc-js with only
+//! `gateway.proto`. `make peers` installs both.
 
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -20,12 +20,12 @@ use tokio::process::Command;
 use crate::gateway::{Gateway, now};
 use crate::support::{spec, string};
 
-/// Longest that all of it takes, with much to spare.
+/// Longest duration of a whole test, with much to spare.
 const PATIENCE: Duration = Duration::from_secs(120);
-/// Between two messages of the talker.
+/// Pause between two messages of the talker.
 const TALK: Duration = Duration::from_millis(10);
 
-/// What the programs find on the network.
+/// The interfaces that the programs find on the network.
 struct Scene {
     gateway: Gateway,
     token: String,
@@ -81,12 +81,12 @@ impl Scene {
         Self { gateway, token, talks, commands, _held }
     }
 
-    /// Runs a program to its end, which has to be a good one.
+    /// Runs a program and checks that it succeeds.
     async fn run(&self, command: Command) -> String {
         self.run_at(self.gateway.address.port(), command).await
     }
 
-    /// The same with another door of the same gateway.
+    /// Runs a program against another port of the same gateway.
     async fn run_at(&self, port: u16, mut command: Command) -> String {
         command.arg(port.to_string()).arg(&self.token);
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).kill_on_drop(true);
@@ -114,7 +114,7 @@ fn python() -> Command {
     Command::new(repository(".venv/bin/python"))
 }
 
-/// The wheel of the Python client, built in a directory from what its users get.
+/// Builds the wheel of the Python client in a directory, from the files that its users get.
 async fn wheel(dir: &Path) -> PathBuf {
     let source = dir.join("source");
     let copied = Command::new("cp").arg("-r").args([&repository("clients/python"), &source]).status().await;
@@ -146,7 +146,7 @@ async fn python_does_all_that_there_is() {
     python.arg(repository("clients/python/tests/against_gateway.py"));
     let said = scene.run(python).await;
     assert!(said.ends_with("all is well\n"), "{said}");
-    // The wheels turned, and stand.
+    // The wheels turned, and stand still now.
     let commands: Vec<_> = scene.commands.try_iter().collect();
     let speed = |payload: &Bytes| f64::from_le_bytes(payload[4..12].try_into().unwrap());
     assert!(commands.len() >= 3 && speed(&commands[0]) == 0.2, "{commands:?}");

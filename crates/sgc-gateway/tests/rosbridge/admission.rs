@@ -1,4 +1,4 @@
-//! Who a client is, and what it may do.
+//! Admission and rights of clients.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -29,7 +29,7 @@ async fn nothing_is_taken_before_a_token_is_shown() {
     let site = Site::new().await;
     let talker = site.writer("/odom", Qos::default());
     site.knows("/odom").await;
-    // roslibpy has only the words of `rosauth`; anybody else may say it plainly.
+    // roslibpy has only the fields of `rosauth`; other clients use the plain field.
     for auth in [json!({"op": "auth", "token": "right"}), json!({"op": "auth", "mac": "right", "client": ""})]
     {
         let mut browser = connect(site.session("nobody"), options()).await;
@@ -47,7 +47,7 @@ async fn nothing_is_taken_before_a_token_is_shown() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_becomes_another_keeps_what_that_one_may_have() {
+async fn new_credential_keeps_permitted_subscriptions() {
     let site = Site::new().await;
     let options = RosbridgeOptions { is_token_needed: false, ..options() };
     let mut browser = connect(site.session("desk"), options).await;
@@ -76,7 +76,7 @@ async fn who_becomes_another_keeps_what_that_one_may_have() {
     browser.settle_amid().await;
 }
 
-/// Whatever token is shown, it permits to call `/allowed`.
+/// Returns options by which any token permits calls of `/allowed`.
 fn becomes_partner() -> RosbridgeOptions {
     RosbridgeOptions {
         authenticate: Some(Arc::new(|_: &str| {
@@ -96,7 +96,7 @@ async fn within<T>(work: impl Future<Output = T>) -> T {
 }
 
 #[tokio::test]
-async fn who_becomes_another_loses_calls_under_way_and_what_stays_counts() {
+async fn new_credential_ends_calls_and_counts_what_stays() {
     let site = Site::new().await;
     let program = site.session("program");
     let mut silent = program.serve("/silent", Some("std_srvs/srv/SetBool")).await.unwrap();
@@ -112,7 +112,7 @@ async fn who_becomes_another_loses_calls_under_way_and_what_stays_counts() {
     let ended =
         json!({"op": "service_response", "id": "1", "service": "/silent", "values": told, "result": false});
     assert_eq!(browser.next().await, ended);
-    // Of two there is room for one.
+    // There is room for one of two calls.
     browser.send(call("3", "/allowed")).await;
     within(allowed.next()).await.unwrap();
     browser.send(call("4", "/allowed")).await;
@@ -125,7 +125,7 @@ async fn who_becomes_another_loses_calls_under_way_and_what_stays_counts() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn who_becomes_another_loses_goals_under_way_which_are_canceled() {
+async fn new_credential_cancels_goals() {
     let site = Site::new().await;
     let of = "example_interfaces/action/Fibonacci";
     let mut action = site.session("program").serve_action("/fib", Some(of)).await.unwrap();
@@ -152,7 +152,7 @@ async fn a_wrong_token_ends_the_connection() {
 }
 
 #[tokio::test]
-async fn who_says_nothing_is_not_waited_for() {
+async fn client_that_does_not_authenticate_is_disconnected() {
     let site = Site::new().await;
     tokio::time::pause();
     let mut browser = pipe(site.session("nobody"), options(), 4096).await;
@@ -162,7 +162,7 @@ async fn who_says_nothing_is_not_waited_for() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_the_scope_does_not_have_is_refused_and_not_seen() {
+async fn interfaces_outside_the_scope_are_refused_and_invisible() {
     let site = Site::new().await;
     let _talkers = [site.writer("/odom", Qos::default()), site.writer("/secret", Qos::default())];
     site.knows("/secret").await;

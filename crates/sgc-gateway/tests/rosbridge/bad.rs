@@ -1,4 +1,4 @@
-//! Input that is wrong: each is told in words, and nobody else notices.
+//! Invalid input: each error is explained, and other clients are not affected.
 
 use futures_util::SinkExt as _;
 use serde_json::json;
@@ -13,7 +13,7 @@ use crate::support::{STRING, Site, string};
 use sgc_ros::{RosWriter as _, SampleKind};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_no_op_is_told_and_the_connection_goes_on() {
+async fn invalid_op_is_reported_and_the_connection_continues() {
     let site = Site::new().await;
     let mut browser = client(&site).await;
     for (text, told) in [
@@ -30,7 +30,7 @@ async fn what_is_no_op_is_told_and_the_connection_goes_on() {
     }
     browser.socket.send(Message::Binary(vec![0xff, 0xfe].into())).await.unwrap();
     assert!(browser.status().await.0.starts_with("not JSON"));
-    // JSON as bytes is taken.
+    // JSON as bytes is accepted.
     let bytes = json!({"op": "set_level", "level": "none"}).to_string().into_bytes();
     browser.socket.send(Message::Binary(bytes.into())).await.unwrap();
     browser.send(json!({"op": "dance"})).await;
@@ -95,7 +95,7 @@ async fn members_of_the_wrong_kind_are_named() {
     assert_eq!(browser.status().await.0, r#"publish: "id" is no text or integer: {"a":1}"#);
     let told = browser.told(json!({"op": "subscribe", "topic": "/a".repeat(1000)})).await;
     assert_eq!(told, r#"subscribe: "topic" is longer than 1024 bytes"#);
-    // An unknown type, by whose definition it fails.
+    // The definition of this type is unknown.
     let told = browser.told(json!({"op": "advertise", "topic": "/a", "type": "nobody/Knows"})).await;
     assert!(told.starts_with("advertise: no definition: no definition of nobody/msg/Knows"), "{told}");
 }
@@ -128,7 +128,7 @@ async fn a_frame_of_a_gigabyte_is_refused_by_its_head() {
     let talker = site.writer("/chatter", Qos::default());
     let (mut bad, mut good) = (client(&site).await, client(&site).await);
     good.subscribe("/chatter").await;
-    // FIN and text, masked, 127: the length follows; then the mask.
+    // The head: FIN and text, masked, 127; the length and the mask follow.
     let mut head = vec![0x81, 0xff];
     head.extend((1_u64 << 30).to_be_bytes());
     head.extend([0; 4]);
@@ -194,7 +194,7 @@ async fn a_frame_that_never_ends_is_not_waited_for() {
     let site = Site::new().await;
     tokio::time::pause();
     let mut browser = pipe(site.session("loris"), RosbridgeOptions::default(), 1 << 16).await;
-    // A text of 100 bytes, of which one comes a minute.
+    // A text of 100 bytes arrives at one byte a minute.
     browser.socket.get_mut().write_all(&[0x81, 0x80 | 100, 0, 0, 0, 0]).await.unwrap();
     let drip = async {
         loop {
@@ -219,7 +219,7 @@ async fn a_client_has_no_more_than_it_may() {
         ..SessionLimits::default()
     };
     let mut browser = connect(bounded(&site, limits), RosbridgeOptions::default()).await;
-    // Several subscriptions to one topic count each.
+    // Several subscriptions to one topic count separately.
     for (id, topic) in [(1, "/a"), (2, "/a")] {
         browser.send(json!({"op": "subscribe", "id": id, "topic": topic, "type": STRING})).await;
     }
@@ -228,7 +228,7 @@ async fn a_client_has_no_more_than_it_may() {
     browser.send(json!({"op": "advertise", "topic": "/a", "type": STRING})).await;
     let told = browser.told(json!({"op": "advertise", "topic": "/b", "type": STRING})).await;
     assert_eq!(told, "advertise: 1 topics that are published at most for a client");
-    // As often as it likes by the same id, and by no more ids than it may publish topics.
+    // The same id may be advertised any number of times, but only as many ids as topics may be published.
     browser.send(json!({"op": "advertise", "topic": "/a", "type": STRING})).await;
     let told = browser.told(json!({"op": "advertise", "id": 2, "topic": "/a", "type": STRING})).await;
     assert_eq!(told, "advertise: 1 advertisements of a topic at most for a client");
@@ -242,7 +242,7 @@ async fn a_client_has_no_more_than_it_may() {
     }
     let told = browser.told(json!({"op": "call_service", "service": "/silent"})).await;
     assert_eq!(told, "call_service: 2 calls and goals under way at most for a client");
-    // Who waits for an answer by its id has one.
+    // A client that waits for an answer by its id gets one.
     for (op, member, answer) in
         [("call_service", "service", "service_response"), ("send_action_goal", "action", "action_result")]
     {

@@ -1,4 +1,4 @@
-//! A client of the rosbridge protocol, and a gateway for it to talk to.
+//! A client of the rosbridge protocol, and a gateway for it.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -24,23 +24,23 @@ pub(crate) struct Client<S = TcpStream> {
     pub(crate) served: JoinHandle<Result<(), RosbridgeError>>,
 }
 
-/// A client that may do everything.
+/// Returns a client with all rights.
 pub(crate) async fn client(site: &Site) -> Client {
     connect(site.session("browser"), RosbridgeOptions::default()).await
 }
 
-/// One that may do something.
+/// Returns a client with this scope.
 pub(crate) async fn client_with(site: &Site, scope: Scope) -> Client {
     connect(site.session_with("browser", scope), RosbridgeOptions::default()).await
 }
 
-/// A session with bounds.
+/// Returns a session with these limits.
 pub(crate) fn bounded(site: &Site, limits: SessionLimits) -> Arc<Session> {
     let session = site.session("browser");
     Arc::new(Session::new(&site.hub, session.client().clone(), limits))
 }
 
-/// Over TCP on loopback, with both handshakes.
+/// Connects over TCP on loopback, with both handshakes.
 pub(crate) async fn connect(session: impl Into<Arc<Session>>, options: RosbridgeOptions) -> Client {
     let session = session.into();
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -57,7 +57,7 @@ pub(crate) async fn connect(session: impl Into<Arc<Session>>, options: Rosbridge
     Client { socket, served }
 }
 
-/// Over a pipe that holds so many bytes, without handshakes: no time passes on it.
+/// Connects over a pipe with this capacity, without handshakes and without passing time.
 pub(crate) async fn pipe(
     session: impl Into<Arc<Session>>,
     options: RosbridgeOptions,
@@ -83,7 +83,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         self.socket.send(Message::Text(text.into())).await.unwrap();
     }
 
-    /// What comes next, whatever it is.
+    /// Returns the next message of any kind.
     pub(crate) async fn message(&mut self) -> Message {
         loop {
             let next = tokio::time::timeout(PATIENCE, self.socket.next()).await;
@@ -109,20 +109,20 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         }
     }
 
-    /// The text of the status that comes next, and its id.
+    /// Returns text and id of the next message, which must be an error status.
     pub(crate) async fn status(&mut self) -> (String, Json) {
         let next = self.next().await;
         assert_eq!((&next["op"], &next["level"]), (&json!("status"), &json!("error")), "{next}");
         (next["msg"].as_str().unwrap().to_owned(), next["id"].clone())
     }
 
-    /// Sends what is wrong, and has what it is told of it.
+    /// Sends an invalid op and returns the error text.
     pub(crate) async fn told(&mut self, op: Json) -> String {
         self.send(op).await;
         self.status().await.0
     }
 
-    /// Calls a service: `values` and `result` of its answer.
+    /// Calls a service and returns `values` and `result` of the answer.
     pub(crate) async fn call(&mut self, service: &str, args: Json) -> (Json, bool) {
         let id = format!("call_service:{service}:1");
         self.send(json!({ "op": "call_service", "id": id, "service": service, "args": args })).await;
@@ -132,13 +132,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         (answer["values"].clone(), answer["result"].as_bool().unwrap())
     }
 
-    /// Waits until everything that was sent has been done.
+    /// Waits until everything sent so far was handled.
     pub(crate) async fn settle(&mut self) {
         let (_, is_done) = self.call("/rosapi/get_time", json!({})).await;
         assert!(is_done);
     }
 
-    /// The same where other things come, too.
+    /// Waits until everything sent so far was handled, and skips other messages.
     pub(crate) async fn settle_amid(&mut self) {
         self.send(json!({ "op": "call_service", "id": "settle", "service": "/rosapi/get_time" })).await;
         while self.next().await["id"] != "settle" {}
@@ -149,7 +149,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         self.settle().await;
     }
 
-    /// The close code and reason with which the gateway ended.
+    /// Returns the code and reason with which the gateway closed the connection.
     pub(crate) async fn closed(&mut self) -> (u16, String) {
         loop {
             match self.message().await {

@@ -1,4 +1,4 @@
-//! The rosbridge protocol through real WebSockets, on a network in memory.
+//! Tests of the rosbridge protocol through real WebSockets, on a network in memory.
 #![allow(clippy::unwrap_used)]
 
 #[path = "../support/mod.rs"]

@@ -1,4 +1,5 @@
-//! How fast clients take what they subscribe to, and what becomes of what they do not take. Where time matters it is virtual.
+//! The pace at which clients read their subscriptions, and the fate of unread messages. Time is virtual where it
+//! matters.
 
 use std::time::Duration;
 
@@ -24,7 +25,7 @@ fn subscribe(id: &str, throttle_ms: u32, queue_length: u32) -> Json {
         "queue_length": queue_length})
 }
 
-/// What comes, and how many milliseconds after now.
+/// Returns the next messages, with the milliseconds until each came.
 async fn come<S>(browser: &mut Client<S>, count: usize) -> Vec<(String, u128)>
 where
     S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
@@ -75,7 +76,7 @@ async fn a_rate_with_a_queue_spreads_messages_and_drops_the_oldest() {
 }
 
 #[tokio::test]
-async fn of_two_rates_the_faster_is_taken_until_it_is_unsubscribed() {
+async fn faster_of_two_rates_applies_until_it_is_unsubscribed() {
     let site = Site::new().await;
     let talker = site.writer("/fast", Qos::default());
     tokio::time::pause();
@@ -92,7 +93,7 @@ async fn of_two_rates_the_faster_is_taken_until_it_is_unsubscribed() {
     for text in ["d", "e"] {
         write(&talker, text);
     }
-    // The last one came a moment ago, and now it is a second until the next.
+    // The previous message came a moment ago, so the next one comes after a second.
     assert_eq!(come(&mut browser, 1).await, at(&[("e", 1000)]));
 }
 
@@ -115,7 +116,7 @@ async fn a_client_that_does_not_read_is_bounded_and_another_hears_all() {
         waiting_bytes_most = waiting_bytes_most.max(session.waiting_bytes());
     }
     assert!((BYTES_MAX / 2..=BYTES_MAX).contains(&waiting_bytes_most), "{waiting_bytes_most}");
-    // It reads again: what it missed is the oldest but for what was on its way, and it is told how much.
+    // The client reads again. It missed old messages, except those in transit, and learns how many.
     let (mut heard, mut missed, mut last) = (0, 0, String::new());
     while last != format!("{:01000}", 1999) || missed == 0 {
         let next = stopped.next().await;
@@ -155,7 +156,7 @@ async fn a_client_that_answers_no_ping_is_given_up_and_one_that_does_stays() {
     tokio::time::pause();
     let silent = pipe(site.session("silent"), RosbridgeOptions::default(), PIPE_BYTES).await;
     let mut quiet = pipe(site.session("quiet"), RosbridgeOptions::default(), PIPE_BYTES).await;
-    // It reads, so it answers pings, and says nothing itself.
+    // The client reads, so it answers pings, but sends nothing else.
     let heard = tokio::time::timeout(20 * ROSBRIDGE_SILENCE_MAX, quiet.message());
     let begun = Instant::now();
     let ended = async { (silent.served.await.unwrap(), begun.elapsed()) };

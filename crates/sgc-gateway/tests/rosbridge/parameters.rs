@@ -1,4 +1,4 @@
-//! Parameters of nodes, by what `rosapi` calls them.
+//! Parameters of nodes, by the services of `rosapi`.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -11,7 +11,7 @@ use crate::support::Site;
 
 pub(crate) type Parameters = Arc<Mutex<BTreeMap<String, Json>>>;
 
-/// A node with the services that every node has for its parameters.
+/// Serves the services that every node has for its parameters.
 pub(crate) async fn serve_parameters(site: &Site, node: &str, parameters: &Parameters) {
     for (service, of) in [
         ("list_parameters", "ListParameters"),
@@ -78,7 +78,7 @@ async fn parameters_are_listed_told_set_and_deleted() {
         ),
         ("has_param", json!({"name": "arm:speed"}), json!({"exists": true})),
         ("has_param", json!({"name": "/arm:other"}), json!({"exists": false})),
-        // A whole number stays a float, since the parameter is one.
+        // An integer stays a double, because the parameter is one.
         ("set_param", json!({"name": "/arm:speed", "value": "2"}), done.clone()),
         (
             "get_param",

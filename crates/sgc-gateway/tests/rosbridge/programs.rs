@@ -1,5 +1,4 @@
-//! Programs of others as clients: npm's roslib, PyPI's roslibpy and its own tests. They have to be installed, as `make peers`
-//! does.
+//! Independent programs as clients: npm's roslib, and PyPI's roslibpy with its own tests. `make peers` installs them.
 
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -18,14 +17,14 @@ use tokio::process::Command;
 use crate::parameters::{Parameters, serve_parameters};
 use crate::support::{Site, eventually, spec, string};
 
-/// Longest that all of it takes, with much to spare.
+/// Longest duration of a whole test, with much to spare.
 const PATIENCE: Duration = Duration::from_secs(180);
-/// Between two messages of the talker.
+/// Pause between two messages of the talker.
 const TALK: Duration = Duration::from_millis(10);
-/// Goals of this order and above are worked on until they are canceled.
+/// Goals of at least this order are executed until they are cancelled.
 const ORDER_ENDLESS: i64 = 10;
 
-/// A robot, and a gateway on its network that listens.
+/// A robot, and a listening gateway on its network.
 struct Scene {
     port: u16,
     talks: Arc<AtomicBool>,
@@ -74,7 +73,7 @@ impl Scene {
         Self { port, talks, _held }
     }
 
-    /// Runs a program to its end, which has to be a good one.
+    /// Runs a program and checks that it succeeds.
     async fn run(&self, command: &mut Command) -> String {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).kill_on_drop(true);
         let program = format!("{command:?}");
@@ -104,7 +103,7 @@ async fn serve_switch(site: &Site) {
     });
 }
 
-/// As the tutorial has it: an order of 4 is 0, 1, 1, 2, 3, told number by number.
+/// Serves Fibonacci as in the tutorial: an order of 4 is 0, 1, 1, 2, 3, reported number by number.
 async fn serve_fibonacci(site: &Site) {
     let session = site.session("program");
     let of = "example_interfaces/action/Fibonacci";
@@ -121,7 +120,7 @@ async fn serve_fibonacci(site: &Site) {
                 }
                 ActionEvent::Cancel { id } => {
                     let result = Content::json(r#"{"sequence":[0]}"#);
-                    // One that is canceled once more has ended.
+                    // A goal that is cancelled twice has ended.
                     let _ = replier.finish(&id, GoalStatus::Canceled, &result).await;
                 }
             }
@@ -174,10 +173,10 @@ async fn roslibpy_does_so_by_its_other_transport_too() {
     roslibpy("asyncio").await;
 }
 
-/// Its tests know one port, which is written into a copy of them.
+/// Runs roslibpy's own tests. They know one port, which is replaced in a copy of them.
 async fn own_tests_of_roslibpy(transport: &str) {
     let scene = Scene::new().await;
-    // They talk on its topic themselves.
+    // The tests publish on the topic themselves.
     scene.talks.store(false, Ordering::Relaxed);
     let dir = tempfile::tempdir().unwrap();
     let from = repository(".peers/roslibpy/tests");

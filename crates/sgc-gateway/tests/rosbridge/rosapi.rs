@@ -1,4 +1,4 @@
-//! What the gateway answers in place of a `rosapi` node.
+//! The gateway's answers in place of a `rosapi` node.
 
 use std::sync::{Arc, Mutex, mpsc};
 use std::time::Duration;
@@ -111,14 +111,14 @@ async fn types_are_told() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_the_gateway_does_not_know_is_a_service_like_any_other() {
+async fn unknown_rosapi_services_are_called_on_the_network() {
     let site = Site::new().await;
     let mut browser = client(&site).await;
     let (told, is_done) = browser.call("/rosapi/search_param", json!({})).await;
     assert!(!is_done && told.as_str().unwrap().contains("/rosapi/search_param is not known"), "{told}");
 }
 
-/// Finds a type once it is told to, and says that it waits for that.
+/// A source of definitions that signals a request and answers when told.
 struct Slow(Mutex<mpsc::Receiver<()>>, Arc<Notify>);
 
 impl FindDefinitions for Slow {
@@ -137,7 +137,7 @@ impl FindDefinitions for Slow {
     }
 }
 
-/// On the one thread that there is, whoever reads a file would be waited for by the one who has it read.
+/// There is only one thread, so a blocking read would stop the task that makes it continue.
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn files_that_are_read_hold_up_nobody() {
     let site = Site::new().await;
@@ -151,7 +151,7 @@ async fn files_that_are_read_hold_up_nobody() {
         begun.notified().await;
         other.settle().await;
         told.send(()).unwrap();
-        // The file is looked at once for the type, and once for each that it contains.
+        // The file is read once for the type, and once for each type that it contains.
         told.send(()).unwrap();
     });
     let answer = browser.next().await;

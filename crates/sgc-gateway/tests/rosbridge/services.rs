@@ -1,4 +1,4 @@
-//! Services and actions, both ways.
+//! Services and actions, in both directions.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ use crate::support::{Site, eventually};
 const SET_BOOL: &str = "std_srvs/srv/SetBool";
 const FIBONACCI: &str = "example_interfaces/action/Fibonacci";
 
-/// A service that a program of another protocol serves.
+/// Serves a service by a program without this protocol.
 async fn serve_switch(site: &Site) {
     let mut serving = site.session("program").serve("/switch", Some(SET_BOOL)).await.unwrap();
     tokio::spawn(async move {
@@ -36,7 +36,7 @@ async fn services_of_the_network_are_called() {
         let message = json!({ "data": heard }).to_string();
         assert_eq!((values, is_done), (json!({"success": true, "message": message}), true));
     }
-    // Without an id the answer has none.
+    // A call without an id gets an answer without one.
     browser.send(json!({"op": "call_service", "service": "/switch"})).await;
     let answer = browser.next().await;
     assert!(answer["op"] == "service_response" && answer.get("id").is_none(), "{answer}");
@@ -68,7 +68,7 @@ async fn calls_that_fail_say_why() {
     assert_eq!(wrong, (json!(told), false));
     let nobody = browser.call("/nobody", json!({})).await;
     assert_eq!(nobody, (json!("the type of /nobody is not known, since nobody has it yet: say it"), false));
-    // One that does not answer.
+    // The next service does not answer.
     let _silent = site.session("silent").serve("/silent", Some(SET_BOOL)).await.unwrap();
     browser.send(json!({"op": "call_service", "id": "c", "service": "/silent", "timeout": 0.05})).await;
     let answer = browser.next().await;
@@ -90,18 +90,18 @@ async fn a_client_serves_a_service() {
     assert_eq!(call["args"], json!({"data": true}));
     let id = call["id"].clone();
     let response = |id: &Json, values: Json, result: bool| json!({"op": "service_response", "id": id, "service": "/switch", "values": values, "result": result});
-    // One that is wrong can be said again.
+    // After an error the client may answer again.
     server.send(response(&id, json!({"success": 3}), true)).await;
     let told = server.status().await.0;
     assert_eq!(told, "service_response: not a message of that type: success: 3, not bool");
     server.send(response(&id, json!({"success": true, "message": "on"}), true)).await;
     assert_eq!(caller.next().await["values"], json!({"success": true, "message": "on"}));
-    // Answered once, it is not waiting any more.
+    // An answered request no longer waits.
     server.send(response(&id, json!({}), true)).await;
     let told = server.status().await;
     let waits = "service_response: /switch: no request waits under that id";
     assert_eq!(told, (waits.to_owned(), id));
-    // Again: the second takes the place of the first.
+    // A second advertisement replaces the first.
     server.send(advertise).await;
     server.settle().await;
     eventually(|| site.hub.graph().services["/switch"].servers.len() == 1).await;
@@ -178,12 +178,12 @@ async fn goals_are_canceled_aborted_and_given_up_with_their_server() {
     client.send(goal("left", 2)).await;
     server.next().await;
     drop(server);
-    // It is aborted, or its server is gone before it could say so.
+    // The goal is aborted, or its server is gone before it could report that.
     let told = client.next().await;
     assert!(told["status"] == 6 || told["result"] == false, "{told}");
     let told = client.told(json!({"op": "cancel_action_goal", "id": "none", "action": "/fib"})).await;
     assert_eq!(told, "cancel_action_goal: no goal of that id is under way");
-    // Nobody serves it now.
+    // No client serves the action now.
     eventually(|| site.hub.graph().actions.get("/fib").is_none_or(|info| info.servers.is_empty())).await;
     client.send(goal("late", 2)).await;
     let told = client.next().await;
@@ -226,7 +226,7 @@ async fn long_answers_that_are_not_read_are_bounded_in_bytes_and_the_rest_are_re
         browser.send(json!({"op": "call_service", "id": id, "service": "/long"})).await;
     }
     tokio::time::timeout(PATIENCE, answered).await.unwrap().unwrap();
-    // It reads nothing until nobody has anything left to do but wait for it: only then time goes on.
+    // The client reads only when all others wait for it, because only then the paused clock advances.
     tokio::time::pause();
     tokio::time::sleep(Duration::from_millis(1)).await;
     let (mut whole, mut refused) = (0, 0);

@@ -1,4 +1,4 @@
-//! Topics: advertise, publish, subscribe, in each form.
+//! Topics: advertise, publish and subscribe, in each form.
 
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ fn write(talker: &impl sgc_ros::RosWriter, text: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_programs_publish_comes_as_json() {
+async fn messages_of_programs_arrive_as_json() {
     let site = Site::new().await;
     let talker = site.writer("/chatter", Qos::default());
     let mut browser = client(&site).await;
@@ -81,7 +81,7 @@ async fn png_is_refused_with_what_to_take_instead() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_clients_publish_is_heard_by_programs_from_the_first_message_on() {
+async fn messages_of_clients_reach_programs_from_the_first_on() {
     let site = Site::new().await;
     let (texts, _reader) = site.reader("/cmd");
     eventually(|| site.hub.graph().topics.contains_key("/cmd")).await;
@@ -93,7 +93,7 @@ async fn what_clients_publish_is_heard_by_programs_from_the_first_message_on() {
         browser.send(json!({"op": "publish", "topic": "/cmd", "msg": {"data": text}, "latch": false})).await;
         assert_eq!(texts.recv_timeout(SOON).unwrap(), string(text));
     }
-    // Advertised twice, it goes on until both are unadvertised.
+    // After two advertisements the topic stays until both are unadvertised.
     browser.send(json!({"op": "advertise", "id": 2, "topic": "/cmd", "type": STRING})).await;
     browser.send(json!({"op": "unadvertise", "id": "advertise:/cmd:1", "topic": "/cmd"})).await;
     browser.settle().await;
@@ -125,7 +125,7 @@ async fn latched_messages_are_for_who_subscribes_later() {
     robot.settle().await;
     let qos = site.hub.graph().topics["/map"].publishers[0].qos.clone();
     assert_eq!((qos.durability, qos.history), (Durability::TransientLocal, History::KeepLast(1)));
-    // Each part of a page that subscribes has it.
+    // Each part of a page that subscribes gets the message.
     for id in ["one", "two"] {
         page.send(json!({"op": "subscribe", "id": id, "topic": "/map", "type": STRING})).await;
         assert_eq!(page.next().await["msg"]["data"], "map", "{id}");
@@ -176,7 +176,7 @@ async fn several_subscriptions_of_a_client_are_one() {
     browser.settle().await;
     let told = browser.told(json!({"op": "unsubscribe", "topic": "/chatter"})).await;
     assert_eq!(told, "unsubscribe: /chatter is not subscribed to by this client");
-    // Without an id all end.
+    // Without an id all subscriptions end.
     for id in [1, 2] {
         browser.send(json!({"op": "subscribe", "id": id, "topic": "/chatter", "type": STRING})).await;
     }
@@ -222,7 +222,7 @@ async fn bytes_come_as_base64_and_are_taken_as_a_list_too() {
     let lie = json!({"op": "publish", "id": "p", "topic": "/image", "msg": {"data": "AQL/A"}});
     let told = browser.told(lie).await;
     assert_eq!(told, "publish: /image: not a message of that type: data: the text is not base64");
-    // Floats that are no numbers are as docs/spec/json.md has them.
+    // Floats that are not numbers follow docs/spec/json.md.
     browser.send(json!({"op": "subscribe", "topic": "/f", "type": "std_msgs/Float64"})).await;
     browser.send(json!({"op": "advertise", "topic": "/f", "type": "std_msgs/Float64"})).await;
     browser.send(json!({"op": "publish", "topic": "/f", "msg": {"data": null}})).await;
@@ -240,7 +240,7 @@ async fn long_messages_go_and_come_in_pieces() {
     let whole = json!({"op": "publish", "topic": "/long", "msg": {"data": text}}).to_string();
     let characters: Vec<char> = whole.chars().collect();
     let pieces: Vec<String> = characters.chunks(64).map(|piece| piece.iter().collect()).collect();
-    // In whatever order.
+    // The fragments may come in any order.
     for (num, data) in pieces.iter().enumerate().rev() {
         let piece = json!({"op": "fragment", "id": "f", "num": num, "total": pieces.len(), "data": data});
         browser.send(piece).await;
@@ -257,7 +257,7 @@ async fn long_messages_go_and_come_in_pieces() {
         }
     }
     assert_eq!(serde_json::from_str::<Json>(&heard).unwrap()["msg"]["data"], text);
-    // What is short enough comes whole.
+    // A short message is not split.
     browser.send(json!({"op": "publish", "topic": "/long", "msg": {"data": "short"}})).await;
     assert_eq!(browser.next().await["msg"]["data"], "short");
 }
@@ -300,7 +300,7 @@ async fn clients_that_come_and_go_leave_nothing_behind() {
         drop(browser.socket);
         let _ = browser.served.await.unwrap();
     }
-    // But for what calls the service, which is kept for others who call.
+    // Only the client of the service remains, kept for other callers.
     let is_clean = || {
         let graph = site.hub.graph();
         graph.topics == before.topics && graph.services.values().all(|info| info.servers.is_empty())

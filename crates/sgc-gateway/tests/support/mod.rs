@@ -6,7 +6,7 @@ use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
 use bytes::Bytes;
-use sgc_gateway::{Client, Hub, HubOptions, Scope, Session, SessionLimits, Shipped, Types};
+use sgc_gateway::{Client, Hub, HubOptions, Scope, Session, SessionLimits, ShippedDefinitions, Types};
 use sgc_ros::{EndpointSpec, RosNetwork, Sample, dds_topic, dds_type};
 use sgc_testkit::{FakeDomain, FakeReader, FakeRos, FakeWriter};
 use sgc_wire::Qos;
@@ -17,17 +17,17 @@ const PATIENCE: Duration = Duration::from_secs(10);
 /// A network with a hub on it.
 pub(crate) struct Site {
     pub(crate) hub: Hub,
-    /// Another program's part of the network.
+    /// The participant of another program.
     pub(crate) ros: FakeRos,
     pub(crate) domain: FakeDomain,
 }
 
 impl Site {
     pub(crate) async fn new() -> Self {
-        Self::with_types(Types::new(Shipped)).await
+        Self::with_types(Types::new(ShippedDefinitions)).await
     }
 
-    /// One whose gateway knows these types.
+    /// Creates a site whose gateway knows these types.
     pub(crate) async fn with_types(types: Types) -> Self {
         let domain = FakeDomain::default();
         let own = Arc::new(domain.join(false));
@@ -44,12 +44,12 @@ impl Site {
         Session::new(&self.hub, client, SessionLimits::default())
     }
 
-    /// A program's writer of texts.
+    /// Creates a program's writer of texts.
     pub(crate) fn writer(&self, topic: &str, qos: Qos) -> FakeWriter {
         self.ros.create_writer(&spec(topic, STRING, qos)).unwrap()
     }
 
-    /// A program's reader of texts.
+    /// Creates a program's reader of texts.
     pub(crate) fn reader(&self, topic: &str) -> (mpsc::Receiver<Bytes>, FakeReader) {
         let (send, received) = mpsc::channel();
         let handler = Box::new(move |sample: Sample| drop(send.send(sample.payload)));
@@ -57,7 +57,7 @@ impl Site {
         (received, reader)
     }
 
-    /// Waits until the hub knows of a topic's publishers.
+    /// Waits until the hub knows a publisher of the topic.
     pub(crate) async fn knows(&self, topic: &str) {
         eventually(|| self.hub.graph().topics.get(topic).is_some_and(|info| !info.publishers.is_empty()))
             .await;
@@ -75,7 +75,7 @@ pub(crate) fn spec(topic: &str, type_name: &str, qos: Qos) -> EndpointSpec {
     }
 }
 
-/// A `std_msgs/msg/String`, serialised.
+/// Returns a serialised `std_msgs/msg/String`.
 pub(crate) fn string(text: &str) -> Bytes {
     let mut payload = vec![0, 1, 0, 0];
     payload.extend((text.len() as u32 + 1).to_le_bytes());
@@ -84,7 +84,7 @@ pub(crate) fn string(text: &str) -> Bytes {
     payload.into()
 }
 
-/// Waits until something is so.
+/// Waits until a condition holds.
 pub(crate) async fn eventually(mut is_so: impl FnMut() -> bool) {
     let looked = async {
         while !is_so() {

@@ -23,7 +23,7 @@ const PATIENCE: Duration = Duration::from_secs(10);
 
 pub(crate) type Ended = JoinHandle<Result<(), FoxgloveError>>;
 
-/// Serves the next who connects.
+/// Serves the next client.
 pub(crate) async fn serve_one(session: Session, options: Options) -> (SocketAddr, Ended) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
@@ -45,16 +45,16 @@ pub(crate) async fn serve_one(session: Session, options: Options) -> (SocketAddr
     (address, ended)
 }
 
-/// A client.
+/// A Foxglove client.
 pub(crate) struct Viewer {
     socket: WebSocketStream<TcpStream>,
-    /// What came and was not asked for yet.
+    /// Frames that came and were not asked for yet.
     kept: Vec<Frame>,
     pub(crate) ended: Ended,
 }
 
 impl Viewer {
-    /// Connects, and takes what the server says of itself.
+    /// Connects, and returns the client with the server's description.
     pub(crate) async fn new(session: Session) -> (Self, Value) {
         Self::with(session, Options::default()).await
     }
@@ -76,12 +76,12 @@ impl Viewer {
         self.socket.send(frame).await.unwrap();
     }
 
-    /// Sends if it can be sent in that time; else it is still sent, with what is received next.
+    /// Sends a frame, at most for `max`. An unsent frame is sent later, while receiving.
     pub(crate) async fn try_send(&mut self, frame: Frame, max: Duration) -> bool {
         tokio::time::timeout(max, self.socket.send(frame)).await.is_ok_and(|sent| sent.is_ok())
     }
 
-    /// Sends an opcode, numbers, and a payload behind them.
+    /// Sends an opcode, numbers and a payload.
     pub(crate) async fn binary(&mut self, opcode: u8, numbers: &[u32], payload: &[u8]) {
         let mut bytes = vec![opcode];
         numbers.iter().for_each(|number| bytes.extend(number.to_le_bytes()));
@@ -89,14 +89,14 @@ impl Viewer {
         self.send(Frame::Binary(bytes.into())).await;
     }
 
-    /// The next frame that is so.
+    /// Returns the next frame that matches.
     async fn next(&mut self, what: &str, is: impl Fn(&Frame) -> bool) -> Frame {
         if let Some(at) = self.kept.iter().position(&is) {
             return self.kept.remove(at);
         }
         loop {
             let socket = &mut self.socket;
-            // What could not be sent is sent meanwhile.
+            // Unsent frames are sent meanwhile.
             let next = poll_fn(|cx| {
                 let _ = socket.poll_flush_unpin(cx);
                 socket.poll_next_unpin(cx)
@@ -111,7 +111,7 @@ impl Viewer {
         }
     }
 
-    /// The next text of such an op that is so.
+    /// Returns the next text with this op that matches.
     pub(crate) async fn text_that(&mut self, op: &str, is: impl Fn(&Value) -> bool) -> Value {
         let read =
             |frame: &Frame| frame.to_text().ok().and_then(|text| serde_json::from_str::<Value>(text).ok());
@@ -124,19 +124,19 @@ impl Viewer {
         self.text_that(op, |_| true).await
     }
 
-    /// The channel of a topic, once there is one.
+    /// Returns the channel of a topic, once it exists.
     pub(crate) async fn channel(&mut self, topic: &str) -> Value {
         self.listed("advertise", "channels", "topic", topic).await
     }
 
-    /// A service, once there is one.
+    /// Returns a service, once it exists.
     pub(crate) async fn service(&mut self, name: &str) -> Value {
         self.listed("advertiseServices", "services", "name", name).await
     }
 
     async fn listed(&mut self, op: &str, list: &str, by: &str, name: &str) -> Value {
         let find = |value: &Value| value[list].as_array()?.iter().find(|one| one[by] == name).cloned();
-        // Others may be looked for in the same text, so it stays.
+        // The text may list others that are looked for later, so it stays.
         loop {
             let value = self.text_that(op, |value| find(value).is_some()).await;
             self.kept.push(Frame::text(value.to_string()));
@@ -146,18 +146,18 @@ impl Viewer {
         }
     }
 
-    /// Forgets what came.
+    /// Drops all kept frames.
     pub(crate) fn forget(&mut self) {
         self.kept.clear();
     }
 
-    /// The next binary message of such an opcode, without it.
+    /// Returns the next binary message with this opcode, without the opcode.
     pub(crate) async fn binary_of(&mut self, opcode: u8) -> Bytes {
         let is = |frame: &Frame| matches!(frame, Frame::Binary(bytes) if bytes.first() == Some(&opcode));
         self.next(&format!("binary message {opcode}"), is).await.into_data().slice(1..)
     }
 
-    /// The next message of a topic: its subscription and payload.
+    /// Returns subscription and payload of the next message of a topic.
     pub(crate) async fn message(&mut self) -> (u32, Bytes) {
         let bytes = self.binary_of(1).await;
         (u32::from_le_bytes(bytes[..4].try_into().unwrap()), bytes.slice(12..))
@@ -168,13 +168,13 @@ impl Viewer {
         self.say(serde_json::json!({"op": "subscribe", "subscriptions": [wanted]})).await;
     }
 
-    /// The next status that has such words in it.
+    /// Returns the next status that contains these words.
     pub(crate) async fn status(&mut self, words: &str) -> Value {
         self.text_that("status", |value| value["message"].as_str().is_some_and(|said| said.contains(words)))
             .await
     }
 
-    /// Leaves, and waits for the gateway's end to have ended.
+    /// Disconnects, and waits until the gateway's end has ended.
     pub(crate) async fn leave(mut self) -> Result<(), FoxgloveError> {
         self.socket.close(None).await.unwrap();
         tokio::time::timeout(PATIENCE, self.ended).await.expect("it should have ended").unwrap()

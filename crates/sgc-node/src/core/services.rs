@@ -206,7 +206,7 @@ impl<N: RosNetwork> Core<N> {
     ) {
         self.service_ends.insert(name, spec.clone());
         if let (Some(calls), Some((_, service, _))) =
-            (self.calls.get(&name), ServiceTopic::of(&spec.request.topic, &spec.request.type_name))
+            (self.calls.get(&name), ServiceTopic::parse(&spec.request.topic, &spec.request.type_name))
         {
             calls.ledger().set_topic(service);
         }

@@ -1,4 +1,4 @@
-//! What the route machine asks of its driver, and what it has to say to the user.
+//! The commands of the route machine to its driver, and the problems that it reports to the user.
 
 use sgc_endpoint::ShareSpec;
 use sgc_trust::Policy;
@@ -8,35 +8,35 @@ use super::{ENTRIES_PER_RULE_MAX, LOCAL_ENDPOINTS_MAX, ROUTES_PER_WILDCARD_MAX, 
 use crate::network::{EndpointSpec, Guid, ServiceSpec};
 use crate::qos::QosMismatch;
 
-/// What the driver has to do.
+/// A command to the driver.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Command {
-    /// Share it with the endpoint.
+    /// Share an interface at the endpoint.
     Share(ShareSpec),
-    /// Tell the endpoint what the share offers now.
+    /// Update the offer of a share at the endpoint.
     UpdateShare {
         /// The share.
         name: Name,
-        /// Offer of all its writers.
+        /// The offer of all writers together.
         qos: Qos,
-        /// Its writers.
+        /// The writers.
         sources: Vec<CatalogueSource>,
     },
-    /// Tell the endpoint who may join the share now; who may no longer is to be cut off.
+    /// Update the policy of a share. Nodes that lose their right are cut off.
     UpdatePolicy {
         /// The share.
         name: Name,
-        /// Who may join.
+        /// The policy.
         policy: Policy,
     },
-    /// How much goes on under a name that is shared, published or joined here; nothing is set until it is told.
+    /// Shape the traffic of a name that is shared, published or joined here. Without this command there is no limit.
     Shape {
         /// The name.
         name: Name,
         /// The settings.
         shaping: Shaping,
     },
-    /// What the names of frames in tf messages of this name get in front, if anything; nothing does until it is told.
+    /// Set the prefix for frames in tf messages of this name. Without this command there is none.
     Frames {
         /// The joined name.
         name: Name,
@@ -45,169 +45,169 @@ pub enum Command {
     },
     /// End the share.
     Unshare {
-        /// Which.
+        /// The share.
         name: Name,
     },
     /// Read a local topic and publish it under `name`.
     OpenReader {
         /// The share.
         name: Name,
-        /// What to create.
+        /// The reader to create.
         spec: EndpointSpec,
     },
-    /// Which source publishes for which local writer.
+    /// Map local writers to sources.
     MapSources {
         /// The share.
         name: Name,
-        /// Class of their packets.
+        /// The class of their packets.
         class: Class,
-        /// The writers, each with its own source as long as there are not too many, and what that offers. Some may be
-        /// gone: what they wrote last is still published.
+        /// The writers with their sources and offers. Each has its own source unless there are too many. A writer may
+        /// be gone while its last messages are still published.
         own: Vec<(Guid, SourceId, Qos)>,
     },
-    /// Read it no longer.
+    /// Close the reader.
     CloseReader {
         /// The share.
         name: Name,
     },
     /// Follow an owner's catalogue.
     Follow {
-        /// Its name in the fleet.
+        /// The owner's name in the fleet.
         owner_name: String,
     },
-    /// Follow it no longer.
+    /// Stop following the catalogue.
     Unfollow {
-        /// Whose.
+        /// The owner.
         owner: NodeId,
     },
     /// Join a name.
     Join {
-        /// Which.
+        /// The name.
         name: Name,
-        /// Whose it must be.
+        /// The required owner.
         owner: NodeId,
-        /// True if histories are to be asked for.
+        /// `true` to request histories.
         transient_local: bool,
-        /// True if the grant has to say what the name stands for.
+        /// `true` if the grant must describe the interface.
         describe: bool,
     },
-    /// Ask anew for a name that is joined, and go on with what is there for it.
+    /// Repeat the join of a name, and keep its local endpoints.
     JoinAgain {
-        /// Which.
+        /// The name.
         name: Name,
-        /// Whose it must be.
+        /// The required owner.
         owner: NodeId,
     },
-    /// Join a name to publish under it what is read locally.
+    /// Join a name to publish local messages under it.
     Publish {
-        /// Which.
+        /// The name.
         name: Name,
-        /// Whose it must be.
+        /// The required owner.
         owner: NodeId,
-        /// Cipher suite id.
+        /// The id of the cipher suite.
         suite: u8,
-        /// Class of its packets.
+        /// The class of the packets.
         class: Class,
-        /// Whether they push back.
+        /// `true` if a full path slows the reader down.
         reliable: bool,
     },
     /// Join a service to call it for local clients.
     Call {
-        /// Which.
+        /// The name.
         name: Name,
-        /// Whose it must be.
+        /// The required owner.
         owner: NodeId,
-        /// Cipher suite id.
+        /// The id of the cipher suite.
         suite: u8,
-        /// Class of its packets.
+        /// The class of the packets.
         class: Class,
     },
-    /// Call the local servers of a shared service for those who call it under `name`.
+    /// Call the local servers of a shared service for remote callers under `name`.
     OpenClient {
         /// The share.
         name: Name,
-        /// What to create.
+        /// The client to create.
         spec: ServiceSpec,
     },
-    /// Call them no longer, once what they were asked is answered.
+    /// Close the client once pending calls are answered.
     CloseClient {
         /// The share.
         name: Name,
     },
-    /// All local servers of a shared service are gone: what they were asked will not be answered.
+    /// All local servers of a shared service are gone, so pending calls will get no answer.
     ServersGone {
         /// The share.
         name: Name,
     },
-    /// Take calls of local clients for a service that is joined.
+    /// Accept calls of local clients for a joined service.
     OpenServer {
         /// The joined name.
         name: Name,
-        /// What to create.
+        /// The server to create.
         spec: ServiceSpec,
     },
-    /// Take them no longer.
+    /// Close the server.
     CloseServer {
         /// The joined name.
         name: Name,
     },
     /// Leave a name.
     Leave {
-        /// Which.
+        /// The name.
         name: Name,
     },
-    /// Write what comes under `name` to the local network.
+    /// Write messages under `name` to the local network.
     OpenWriter {
         /// The joined name.
         name: Name,
-        /// The one source that it is for; `None` for all that have no writer of their own.
+        /// The source of the messages; `None` for all sources without a writer of their own.
         source: Option<SourceId>,
-        /// What to create.
+        /// The writer to create.
         spec: EndpointSpec,
     },
-    /// A writer gives late joiners fewer samples from here on, and goes on with what it has otherwise.
+    /// Reduce the depth that an open writer gives late joiners. Nothing else changes.
     ResizeWriter {
         /// The joined name.
         name: Name,
-        /// The source that it is for, by now.
+        /// The current source of the writer.
         source: Option<SourceId>,
-        /// As it would be opened now.
+        /// The spec with the new depth.
         spec: EndpointSpec,
     },
-    /// A writer is for another source from here on: its publisher is the same, and what it has written already is not to be
-    /// written again.
+    /// Assign a writer to another source. The publisher is the same, so samples that the writer has written must not
+    /// be written again.
     MoveWriter {
         /// The joined name.
         name: Name,
-        /// The source that it was for.
+        /// The former source.
         from: SourceId,
-        /// The one that it is for now.
+        /// The new source.
         to: SourceId,
     },
-    /// The local graph shows an open writer as that of this node; until it is told, and if there is none, as that of
-    /// this proxy. Holds until the writer is closed.
+    /// Show a writer in the local graph as part of this node. By default, and for `None`, it is shown as part of this
+    /// proxy. Valid until the writer is closed.
     SetNode {
         /// The joined name.
         name: Name,
-        /// As it was opened.
+        /// The source for which the writer was opened.
         source: Option<SourceId>,
-        /// Whose node it is.
+        /// The owner of the node.
         owner: NodeId,
         /// The node, under its local name.
         node: Option<RosNode>,
     },
-    /// Write it no longer.
+    /// Close the writer.
     CloseWriter {
         /// The joined name.
         name: Name,
-        /// As it was opened.
+        /// The source for which the writer was opened.
         source: Option<SourceId>,
     },
-    /// Something that the user should know, told once.
+    /// Report a problem to the user, once.
     Report(Problem),
 }
 
-/// What is wrong between two sides, with both values and the fix.
+/// A mismatch between two sides, with both values and the fix.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum Problem {
     /// A local writer's type is not the one that the share names.
@@ -268,7 +268,7 @@ pub enum Problem {
         /// Hash of the local endpoint's.
         local: String,
     },
-    /// Two publishers of one share do so.
+    /// Two publishers of one share have different definitions of the type.
     #[error(
         "{topic}: local publishers have different definitions of {type_name}, with the hashes {first} and {second}; subscribers read some messages wrong. Build both from one definition"
     )]
@@ -299,10 +299,10 @@ pub enum Problem {
     MixedQos {
         /// Topic.
         topic: String,
-        /// What is offered.
+        /// The combined offer.
         offered: String,
     },
-    /// An owner shares one topic in more forms than are brought here.
+    /// An owner shares one topic in too many forms.
     #[error(
         "{topic}: {owner} shares it in more than {ENTRIES_PER_RULE_MAX} forms; the rest is not brought here"
     )]
@@ -320,16 +320,16 @@ pub enum Problem {
     MergedTypes {
         /// Topic here.
         topic: String,
-        /// Owner of the one.
+        /// The first owner.
         owner: String,
         /// Its type.
         found: String,
-        /// Owner of the other.
+        /// The second owner.
         other: String,
         /// Its type.
         known: String,
     },
-    /// A wildcard would share what this node uses.
+    /// A wildcard would share an interface that this node uses.
     #[error(
         "{topic}: a wildcard would share it, but this node uses it from {owner}, so that it is not shared. Put it into \
          `except` of the [[share]], or give what {owner} shares another name here, with `as` or `namespace` in the [[use]]"
@@ -337,10 +337,10 @@ pub enum Problem {
     UsedNotShared {
         /// Topic here.
         topic: String,
-        /// Whose.
+        /// The owner.
         owner: String,
     },
-    /// A wildcard would bring what this node shares.
+    /// A wildcard would bring an interface that this node shares.
     #[error(
         "{topic}: {owner} shares it, but so does this node, so that it is not brought here. Put it into `except` of the \
          [[use]], or give it another name here, with `as` or `namespace`"
@@ -348,10 +348,10 @@ pub enum Problem {
     SharedNotUsed {
         /// Topic here.
         topic: String,
-        /// Whose.
+        /// The owner.
         owner: String,
     },
-    /// Two local topics would be shared as one.
+    /// Two local topics would be shared under one name.
     #[error(
         "{topic}: would be shared as {called}, as which {other} is shared already; it is not shared. Change `as` or \
          `namespace` in one [[share]]"
@@ -359,12 +359,12 @@ pub enum Problem {
     SharedAsOne {
         /// Topic here.
         topic: String,
-        /// What both would be called.
+        /// The shared name of both.
         called: String,
-        /// The one that is shared.
+        /// The topic that is shared already.
         other: String,
     },
-    /// No name that ROS 2 allows.
+    /// The name is invalid in ROS 2.
     #[error(
         "{topic:?} of {owner} is no name for a topic of ROS 2, or too long a one; it is not brought here"
     )]
@@ -374,17 +374,17 @@ pub enum Problem {
         /// Owner.
         owner: String,
     },
-    /// A shared name that ROS 2 does not allow.
+    /// The shared name is invalid in ROS 2.
     #[error(
         "{topic}: shared as {called:?} it would have too long a name; it is not shared. Take a shorter one"
     )]
     NoSharedName {
         /// Topic here.
         topic: String,
-        /// What it would be called.
+        /// The shared name.
         called: String,
     },
-    /// More matches a wildcard than is carried.
+    /// A wildcard matches too many interfaces.
     #[error(
         "{topic}: more than {ROUTES_PER_WILDCARD_MAX} topics match; the rest is not {verb}. Leave some out with \
          `except`, or split it into several rules"
@@ -395,7 +395,7 @@ pub enum Problem {
         /// `"shared"` or `"brought here"`.
         verb: &'static str,
     },
-    /// What came for a token is not what the token says.
+    /// The granted interface differs from the token.
     #[error(
         "{topic}: {owner} gives something else for the token than it says; it is not brought here. Ask for a new token"
     )]
@@ -405,12 +405,12 @@ pub enum Problem {
         /// Owner.
         owner: String,
     },
-    /// More local endpoints than are looked at.
+    /// The local network has too many endpoints.
     #[error(
         "the local network has more than {LOCAL_ENDPOINTS_MAX} endpoints; those beyond are not looked at"
     )]
     TooManyEndpoints,
-    /// More writers than can be told apart.
+    /// A topic has too many publishers to tell apart.
     #[error("{topic}: more than {ENTRY_SOURCES_MAX} publishers; the rest pass for one, with one history")]
     TooManySources {
         /// Topic.

@@ -1,5 +1,5 @@
-//! Consumers: which local subscribers, publishers and service clients use what others own, and the endpoints that stand for those of
-//! others.
+//! Consumers: local subscribers, publishers and service clients of interfaces that others own, and the endpoints that
+//! represent remote consumers.
 
 use std::collections::BTreeMap;
 
@@ -13,16 +13,17 @@ use super::{Direction, Routes, UseRoute};
 use crate::names::{ServiceTopic, dds_topic, dds_type, ros_type};
 use crate::network::{EndpointKind, EndpointSpec};
 
-/// Local consumers of what others own.
+/// Local consumers of interfaces that others own.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Consumers {
-    /// The consumers, by the owner of what they use.
+    /// The consumers by the owner of the interface.
     pub by_owner: BTreeMap<NodeId, Vec<Consumer>>,
-    /// How many there are beyond [`CONSUMERS_PER_INTERFACE_MAX`] of an interface and [`CONSUMERS_MAX`] of an owner.
+    /// The number of consumers beyond [`CONSUMERS_PER_INTERFACE_MAX`] of an interface and [`CONSUMERS_MAX`] of an
+    /// owner.
     pub left_out: u64,
 }
 
-/// The endpoint that each consumer of an interface has.
+/// The kind of endpoint that consumers of an interface have.
 struct ConsumingEnd {
     kind: EndpointKind,
     type_name: String,
@@ -31,12 +32,13 @@ struct ConsumingEnd {
 }
 
 impl<R: RngCore> Routes<R> {
-    /// Returns `true` if consumers may have changed since this was asked.
+    /// Returns `true` if consumers may have changed since the last call.
     pub fn take_consumers_changed(&mut self) -> bool {
         std::mem::take(&mut self.consumers_changed)
     }
 
-    /// Returns the local subscribers, publishers and service clients that belong to a node and use what is granted to this one.
+    /// Returns the local subscribers, publishers and service clients that belong to a ROS 2 node and use granted
+    /// interfaces.
     pub fn consumers(&self) -> Consumers {
         let mut used = BTreeMap::<String, Vec<ConsumingEnd>>::new();
         for (name, route) in &self.uses {
@@ -85,7 +87,7 @@ impl<R: RngCore> Routes<R> {
         consumers
     }
 
-    /// The kind, topic and type of the endpoint by which a program consumes what a use brings here.
+    /// Returns kind, topic and type of the endpoints by which programs consume a used interface.
     fn consuming_end(&self, route: &UseRoute) -> Option<(EndpointKind, String, String)> {
         if !route.granted && route.unreachable_until.is_none() {
             return None;
@@ -108,11 +110,12 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// Returns the endpoints by which the local network sees a consumer of a share that is elsewhere: a reader, a writer, or both
-    /// ends of a service client. None if there is no such share, or no writer of what others publish.
+    /// Returns the endpoints that represent a remote consumer of a share in the local graph: a reader, a writer, or
+    /// both ends of a service client. The list is empty without such a share, or without the writer for messages of
+    /// others.
     pub fn consumer_ends(&self, consumer: &Consumer) -> Vec<(EndpointKind, EndpointSpec)> {
         let Some(share) = self.shares.get(&consumer.interface) else { return Vec::new() };
-        // It goes into a text of `key=value;` elements.
+        // The hash goes into a text of `key=value;` elements.
         let is_plain = |hash: &&String| hash.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_');
         let type_hash = consumer.type_hash.as_ref().filter(is_plain);
         if self.share_rules[share.rule].is_service() {
@@ -121,7 +124,7 @@ impl<R: RngCore> Routes<R> {
             return vec![(EndpointKind::Writer, spec.request), (EndpointKind::Reader, spec.reply)];
         }
         if consumer.role == Role::Publish {
-            // Its messages come from that writer, with the QoS of that.
+            // The consumer's messages come from that writer with its QoS.
             let spec =
                 |writer: &EndpointSpec| EndpointSpec { type_hash: type_hash.cloned(), ..writer.clone() };
             return share.writer.iter().map(|writer| (EndpointKind::Writer, spec(writer))).collect();

@@ -1,4 +1,4 @@
-//! Nodes: which local endpoint belongs to which, and which far node a writer here stands for.
+//! Nodes: the local node of each endpoint, and the far node that each local writer represents.
 
 use std::collections::BTreeMap;
 
@@ -9,18 +9,18 @@ use super::{Command, LOCAL_ENDPOINTS_MAX, Rename, Routes, UseRule};
 use crate::network::{GraphNode, Guid};
 
 impl UseRule {
-    /// What a node is called here that a route of this rule brings.
+    /// Returns the local name of a node whose interfaces this rule brings.
     pub(super) fn local_node(&self, node: &RosNode) -> RosNode {
         let Rename::Namespace(namespace) = &self.naming.rename else { return node.clone() };
         let below = node.namespace().trim_end_matches('/');
-        // One that gets too long keeps its own.
+        // A name that becomes too long stays as it is.
         let named = RosNode::new(&format!("{namespace}{below}"), node.name(), node.enclave());
         named.unwrap_or_else(|| node.clone())
     }
 }
 
 impl<R: RngCore> Routes<R> {
-    /// A local participant has these nodes from now on.
+    /// Replaces the nodes of a local participant.
     pub(super) fn handle_nodes(&mut self, participant: Guid, nodes: Vec<GraphNode>) {
         let before = self.nodes.remove(&participant).unwrap_or_default();
         let mut after = BTreeMap::new();
@@ -43,9 +43,9 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// The local node that an endpoint belongs to, if it is known.
+    /// Returns the local node that an endpoint belongs to, if it is known.
     pub fn node_of(&self, endpoint: &Guid) -> Option<&RosNode> {
-        // Its participant has the same prefix.
+        // The participant has the same prefix as its endpoints.
         let mut first = Guid([0; 16]);
         first.0[..12].copy_from_slice(&endpoint.prefix());
         let mut last = Guid([0xff; 16]);
@@ -53,7 +53,7 @@ impl<R: RngCore> Routes<R> {
         self.nodes.range(first..=last).find_map(|(_, nodes)| nodes.get(endpoint))
     }
 
-    /// Says which far nodes the open writers of a use stand for, where that is news.
+    /// Announces the far nodes that the open writers of a use represent, where they changed.
     pub(super) fn name_writers(&mut self, name: Name) {
         let Some(route) = self.uses.get_mut(&name) else { return };
         let rule = &self.use_rules[route.rule];
@@ -64,7 +64,7 @@ impl<R: RngCore> Routes<R> {
         };
         route.nodes.retain(|source, _| is_here(source));
         for listed in &route.entry.sources {
-            // One server here stands for all of there: it is shown as that of the first of them.
+            // One local server represents all remote ones and is shown as part of the first one's node.
             let source = listed.source.told_apart().filter(|_| route.server.is_none());
             let node = listed.node.as_ref().map(|node| rule.local_node(node));
             let is_first = source.is_some() || listed.source == route.entry.sources[0].source;

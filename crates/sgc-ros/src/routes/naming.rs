@@ -1,7 +1,8 @@
-//! Which rule an interface falls under, and what it is called on the other side. Whatever begins a route asks here.
+//! Naming: selects the rule for an interface, and its name on the other side.
 //!
-//! A rule names one interface, or with `*` and `**` those that match. Names are judged here as well: one that a wildcard
-//! would both share and bring is carried one way only, and nothing is brought under a name that ROS 2 has no room for.
+//! A rule names one interface, or matches several with `*` and `**`. This module also resolves conflicts: an
+//! interface that wildcards would both share and bring is carried one way only, and nothing is brought under a name
+//! that ROS 2 does not allow.
 
 use sgc_wire::{CatalogueEntry, Kind, Metadata, NodeId};
 
@@ -9,37 +10,37 @@ use super::{Direction, Problem, Routes, ShareRule, UseRule};
 use crate::interface::Part;
 use crate::names::is_topic_name;
 
-/// Interfaces that one rule with a wildcard shares, or brings.
+/// Most interfaces that one wildcard rule shares or brings.
 pub const ROUTES_PER_WILDCARD_MAX: usize = 512;
-/// Names that `namespace` leaves as they are: programs look for them under exactly these, for all robots together
-/// (tf2's listeners; rqt_console). `/clock` is not one of them: two of it would make time jump.
+/// Names that `namespace` does not change, because programs look for exactly these for all robots together (tf2's
+/// listeners; rqt_console). `/clock` is not among them, because two clocks would make time jump.
 pub const GLOBAL_TOPICS: [&str; 3] = ["/tf", "/tf_static", "/rosout"];
-/// Names that no wildcard shares: every node of a ROS 2 network publishes on them.
+/// Names that no wildcard shares, because every ROS 2 node publishes on them.
 pub const LITERAL_TOPICS: [&str; 2] = ["/rosout", "/parameter_events"];
 
-/// What a rule leaves out of what its wildcard covers, and what it calls the rest.
+/// The exceptions of a rule and its renaming.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Naming {
     /// Names and patterns that the rule does not cover.
     pub except: Vec<String>,
-    /// The other name.
+    /// The renaming.
     pub rename: Rename,
 }
 
-/// What an interface is called on the other side: for others if it is shared, here if it is used.
+/// The name of an interface on the other side: for others if it is shared, here if it is used.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Rename {
-    /// The same.
+    /// The same name.
     #[default]
     Keep,
-    /// This. If the rule's topic ends in a wildcard so does this, and stands for the same words.
+    /// This name. If the rule's topic ends in a wildcard, this does too, and it stands for the same words.
     As(String),
-    /// The same behind this, but for [`GLOBAL_TOPICS`].
+    /// The same name below this namespace, except for [`GLOBAL_TOPICS`].
     Namespace(String),
 }
 
 impl Naming {
-    /// What `name` is called on the other side, under a rule for `topic`.
+    /// Returns the name of `name` on the other side, under a rule for `topic`.
     pub fn renamed(&self, topic: &str, name: &str) -> String {
         match &self.rename {
             Rename::Keep => name.to_owned(),
@@ -54,8 +55,8 @@ impl Naming {
         }
     }
 
-    /// The same for a part of the interface that the rule is for.
-    pub fn of_part(&self, part: &Part) -> Self {
+    /// Returns the naming for a part of the rule's interface.
+    pub fn for_part(&self, part: &Part) -> Self {
         let rename = match &self.rename {
             Rename::As(other) => Rename::As(part.name(other)),
             other => other.clone(),
@@ -63,12 +64,12 @@ impl Naming {
         Self { except: self.except.clone(), rename }
     }
 
-    /// Whether a share of `topic` shares the local interface of this name, if no other rule stands above it.
+    /// Returns `true` if a share of `topic` covers the local interface `name`, unless another rule takes precedence.
     pub fn shares(&self, topic: &str, name: &str) -> bool {
         self.covers(topic, name) && (!is_pattern(topic) || is_for_wildcards(name))
     }
 
-    /// Whether a rule for `topic` covers `name`.
+    /// Returns `true` if a rule for `topic` covers `name`.
     fn covers(&self, topic: &str, name: &str) -> bool {
         match is_pattern(topic) {
             true => matches(topic, name) && !self.except.iter().any(|pattern| matches(pattern, name)),
@@ -77,12 +78,13 @@ impl Naming {
     }
 }
 
-/// Whether a rule for it may cover several interfaces.
+/// Returns `true` if a rule for `topic` may cover several interfaces.
 pub fn is_pattern(topic: &str) -> bool {
     topic.contains('*')
 }
 
-/// Whether a name falls under a pattern: `*` is one word, `**` any number of them, at the end at least one.
+/// Returns `true` if a name matches a pattern. `*` stands for one word, `**` for any number, but at least one at the
+/// end.
 pub fn matches(pattern: &str, name: &str) -> bool {
     let mut pattern: Vec<&str> = pattern.split('/').collect();
     if let Some(last) = pattern.last_mut().filter(|last| **last == "**") {
@@ -90,7 +92,7 @@ pub fn matches(pattern: &str, name: &str) -> bool {
         pattern.push("**");
     }
     let name: Vec<&str> = name.split('/').collect();
-    // Only the last `**` has to be tried at other places: what the ones before it took need never be more.
+    // Only the last `**` is tried at other places, because an earlier one never needs to match more.
     let (mut at, mut word, mut retry) = (0, 0, None);
     while word < name.len() {
         match pattern.get(at) {
@@ -112,32 +114,32 @@ pub fn matches(pattern: &str, name: &str) -> bool {
     pattern[at..].iter().all(|token| *token == "**")
 }
 
-/// Whether a wildcard shares it: not what every node publishes, nor what ROS 2 hides, of which the topics within an action
-/// are a part (`/_action/`).
+/// Returns `true` if wildcards share the name. They skip topics that every node publishes, and names that ROS 2
+/// hides, such as the parts of actions (`/_action/`).
 pub fn is_for_wildcards(name: &str) -> bool {
     !LITERAL_TOPICS.contains(&name) && !name.split('/').any(|word| word.starts_with('_'))
 }
 
 impl ShareRule {
-    /// Whether it shares the local interface of this name.
+    /// Returns `true` if the rule covers the local interface with this name.
     pub(super) fn covers(&self, kind: Kind, local_name: &str) -> bool {
         self.metadata.kind == kind && self.naming.shares(&self.metadata.ros_name, local_name)
     }
 
-    /// What it is shared as.
+    /// Returns the metadata under which an interface is shared.
     pub fn metadata_of(&self, local_name: &str, type_name: &str) -> Metadata {
         let ros_name = self.naming.renamed(&self.metadata.ros_name, local_name);
         Metadata { ros_name, type_name: type_name.to_owned(), ..self.metadata.clone() }
     }
 
-    /// Whether it may share several interfaces.
+    /// Returns `true` if the rule may share several interfaces.
     pub fn is_pattern(&self) -> bool {
         is_pattern(&self.metadata.ros_name)
     }
 }
 
 impl UseRule {
-    /// Whether it asks for what its owner lists so.
+    /// Returns `true` if the rule asks for this entry of the owner's catalogue.
     pub(super) fn covers(&self, owner: &NodeId, entry: &CatalogueEntry) -> bool {
         let may = match self.direction {
             Direction::Bring => entry.subscribe,
@@ -151,25 +153,25 @@ impl UseRule {
             && (!self.is_pattern() || is_of_type())
     }
 
-    /// What it is called on the local network.
+    /// Returns the name on the local network.
     pub fn local_name(&self, metadata: &Metadata) -> String {
         self.naming.renamed(&self.topic, &metadata.ros_name)
     }
 
-    /// Whether it may ask for several interfaces.
+    /// Returns `true` if the rule may use several interfaces.
     pub fn is_pattern(&self) -> bool {
         is_pattern(&self.topic)
     }
 
-    /// Whether it is for this one name on the local network, whatever its owner lists.
+    /// Returns `true` if the rule reserves exactly this local name, whatever the owner lists.
     fn claims(&self, kind: Kind, local_name: &str) -> bool {
         self.kind == kind && !self.is_pattern() && self.naming.renamed(&self.topic, &self.topic) == local_name
     }
 }
 
 impl<R> Routes<R> {
-    /// The rule that shares a local interface: the first that names it, else the first whose wildcard covers it, of those
-    /// that are for its type where that is known.
+    /// Returns the rule that shares a local interface: the first that names it, else the first wildcard that covers
+    /// it. Where the type is known, wildcard rules for other types are skipped.
     pub(super) fn share_rule(&self, kind: Kind, local_name: &str, type_name: Option<&str>) -> Option<usize> {
         let literal = |rule: &ShareRule| !rule.is_pattern() && rule.covers(kind, local_name);
         let named = self.share_rules.iter().position(literal);
@@ -189,7 +191,7 @@ impl<R> Routes<R> {
         self.share_rules.iter().position(covers)
     }
 
-    /// The rule that asks for what an owner lists: the first that names it, else the first whose wildcard covers it.
+    /// Returns the rule for an owner's entry: the first that names it, else the first wildcard that covers it.
     pub(super) fn use_rule(&self, owner: &NodeId, entry: &CatalogueEntry) -> Option<usize> {
         let find = |pattern| {
             let asks = |rule: &UseRule| rule.is_pattern() == pattern && rule.covers(owner, entry);
@@ -198,7 +200,7 @@ impl<R> Routes<R> {
         find(false).or_else(|| find(true))
     }
 
-    /// Whose interface has this name here, by a rule that names it or one that is brought or published on at present.
+    /// Returns the owner whose interface has this local name, by a rule that names it or a running route.
     fn used_as(&self, kind: Kind, local_name: &str) -> Option<&str> {
         let named = self.use_rules.iter().find(|rule| rule.claims(kind, local_name));
         let running = || {
@@ -209,21 +211,22 @@ impl<R> Routes<R> {
         named.or_else(running).map(|rule| rule.owner_name.as_str())
     }
 
-    /// Whether this name is shared here, by a rule that names it or at present.
+    /// Returns `true` if this local name is shared by a rule that names it or by a running route.
     fn is_shared_as(&self, kind: Kind, local_name: &str) -> bool {
         let literal = |rule: &ShareRule| !rule.is_pattern() && rule.covers(kind, local_name);
         let running = || kind == Kind::Topic && self.shares.values().any(|s| s.local_name == local_name);
         self.share_rules.iter().any(literal) || running()
     }
 
-    /// Why a local interface that a wildcard covers is not shared, if it is because it is used.
+    /// Returns the problem if a local interface that a wildcard covers is not shared because the name is used.
     pub(super) fn why_not_shared(&self, kind: Kind, local_name: &str, type_name: &str) -> Option<Problem> {
         self.wildcard_share(kind, local_name, Some(type_name))?;
         let owner = self.used_as(kind, local_name)?.to_owned();
         Some(Problem::UsedNotShared { topic: local_name.to_owned(), owner })
     }
 
-    /// Why what an owner lists cannot be here under the name that a rule gives it. Rules that name it were judged before.
+    /// Returns the problem that keeps an owner's entry from having its local name. Rules that name it were checked
+    /// before.
     pub(super) fn why_not_used(&self, rule: usize, metadata: &Metadata) -> Option<Problem> {
         let rule = &self.use_rules[rule];
         if !rule.is_pattern() {
@@ -257,7 +260,7 @@ mod tests {
             assert!(yes.iter().all(|name| matches(pattern, name)), "{pattern} {yes:?}");
             assert!(!no.iter().any(|name| matches(pattern, name)), "{pattern} {no:?}");
         }
-        // What takes time to refuse takes little.
+        // A mismatch is found quickly even in a hard case.
         let (pattern, name) = ("/**/a".repeat(40), "/a".repeat(120) + "/b");
         assert!(!matches(&pattern, &name));
     }

@@ -1,7 +1,8 @@
-//! What is wrong between the two sides: found from what is there, told when it begins, forgotten when it ends.
+//! Problems between the two sides: derived from the current state, reported when they begin, and forgotten when they
+//! end.
 //!
-//! Each problem has a cause, the endpoint or route that it is about. A cause is looked at again when it changes, and what
-//! is said of it then takes the place of what was said before.
+//! Each problem has a cause, the endpoint or route that it concerns. When a cause changes, it is checked again, and
+//! its new problems replace the old ones.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -13,40 +14,40 @@ use crate::names::{ros_topic, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, Guid};
 use crate::qos::mismatches;
 
-/// Problems that hold at once and are known; those beyond are not told.
+/// Most problems that are tracked at once. Further ones are not reported.
 const PROBLEMS_MAX: usize = 4096;
 
-/// What a problem is about.
+/// The cause of a problem.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Cause {
-    /// The local network as a whole.
+    /// The local network.
     Network,
     /// A local endpoint.
     Endpoint(Guid),
-    /// A local publisher that a rule is for and that is not shared.
+    /// A local publisher that a rule covers and that is not shared.
     Unshared(Guid),
-    /// Shares that are there for what others publish.
+    /// The shares that exist for messages of others.
     Inbound,
     /// A share route.
     Share(Name),
-    /// What an owner lists.
+    /// An owner's catalogue.
     Catalogue(NodeId),
-    /// What came for a token.
+    /// The grant for a token.
     Token(Name),
 }
 
-/// The problems that hold.
+/// The current problems.
 #[derive(Debug, Default)]
 pub(super) struct Problems {
     by_cause: BTreeMap<Cause, BTreeSet<Problem>>,
-    /// Of how many causes each is.
+    /// The number of causes of each problem.
     holding: BTreeMap<Problem, usize>,
-    /// True if what local endpoints are compared with has changed.
+    /// `true` if the state that local endpoints are compared with has changed.
     is_stale: bool,
 }
 
 impl Problems {
-    /// Adds one; true if it did not hold before.
+    /// Adds a problem. Returns `true` if it is new.
     fn add(&mut self, cause: Cause, problem: Problem) -> bool {
         if !self.holding.contains_key(&problem) && self.holding.len() >= PROBLEMS_MAX {
             return false;
@@ -59,7 +60,7 @@ impl Problems {
         *holders == 1
     }
 
-    /// Replaces all of a cause; those that did not hold before.
+    /// Replaces the problems of a cause and returns the new ones.
     fn settle(&mut self, cause: Cause, problems: BTreeSet<Problem>) -> Vec<Problem> {
         let before = self.take(cause);
         let begun =
@@ -68,12 +69,13 @@ impl Problems {
         begun
     }
 
-    /// What held of a cause; it still does until [`Self::release`], so that what is added again meanwhile is no news.
+    /// Removes and returns the problems of a cause. They hold until [`Self::release`], so that a problem added again
+    /// meanwhile is not new.
     pub(super) fn take(&mut self, cause: Cause) -> BTreeSet<Problem> {
         self.by_cause.remove(&cause).unwrap_or_default()
     }
 
-    /// What was taken holds no more, but for what was added since.
+    /// Ends the taken problems, except those that were added again.
     pub(super) fn release(&mut self, taken: BTreeSet<Problem>) {
         for problem in taken {
             if let Some(holders) = self.holding.get_mut(&problem) {
@@ -87,31 +89,32 @@ impl Problems {
 }
 
 impl<R: RngCore> Routes<R> {
-    /// What is wrong at present, each once, in a fixed order.
+    /// Returns the current problems, each once, in a fixed order.
     pub fn problems(&self) -> impl Iterator<Item = &Problem> {
         self.problems.holding.keys()
     }
 
-    /// Adds a problem to those of its cause, and tells it unless it holds already.
+    /// Adds a problem to a cause and reports it if it is new.
     pub(super) fn report(&mut self, cause: Cause, problem: Problem) {
         if self.problems.add(cause, problem.clone()) {
             self.commands.push_back(Command::Report(problem));
         }
     }
 
-    /// Replaces the problems of a cause, and tells those that did not hold before.
+    /// Replaces the problems of a cause and reports the new ones.
     pub(super) fn settle(&mut self, cause: Cause, problems: BTreeSet<Problem>) {
         let begun = self.problems.settle(cause, problems);
         self.commands.extend(begun.into_iter().map(Command::Report));
     }
 
-    /// Looks at a local endpoint: it is new, or what it is to talk to has changed.
+    /// Checks a local endpoint that is new or whose counterpart has changed.
     pub(super) fn check_local(&mut self, endpoint: &DiscoveredEndpoint) {
         let problems = self.problems_of(endpoint);
         self.settle(Cause::Endpoint(endpoint.guid), problems);
     }
 
-    /// Looks at all local endpoints again before the next command is asked for in vain: routes have changed.
+    /// Schedules a check of all local endpoints, because routes have changed. It runs when the commands are
+    /// exhausted.
     pub(super) fn check_later(&mut self) {
         self.problems.is_stale = true;
     }
@@ -141,7 +144,7 @@ impl<R: RngCore> Routes<R> {
             let rule = &self.use_rules[route.rule];
             let entry = &route.entry;
             let publishes = self.publishes(route.rule);
-            // What this node publishes elsewhere concerns its publishers only.
+            // An interface on which this node publishes elsewhere concerns local publishers only.
             if route.local_name != topic || rule.is_service() || (publishes && is_reader) {
                 continue;
             }
@@ -166,7 +169,7 @@ impl<R: RngCore> Routes<R> {
             if !is_reader {
                 continue;
             }
-            // What writers there are, or will be.
+            // The offers of all present writers, or the expected one if there are none.
             let offers = entry.sources.iter().map(|source| &source.qos);
             let offers = offers.chain(entry.sources.is_empty().then_some(&entry.qos));
             let set = self.use_rules[route.rule].qos;
@@ -180,7 +183,7 @@ impl<R: RngCore> Routes<R> {
         problems
     }
 
-    /// What others publish on a share of this node comes here too.
+    /// Returns the problems of a local reader with messages that others publish on a share.
     fn problems_with_publishers(&self, topic: &str, reader: &DiscoveredEndpoint) -> BTreeSet<Problem> {
         let offers = |qos: &Qos| mismatches(qos, &reader.qos);
         let shares = self.shares.values().filter(|s| s.fits(topic, &reader.type_name));
@@ -201,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn one_of_several_causes_holds_until_the_last_ends_and_is_told_again() {
+    fn problem_holds_until_its_last_cause_ends_and_is_reported_again() {
         let mut problems = Problems::default();
         let [a, b] = [1, 2].map(|n| Cause::Endpoint(Guid([n; 16])));
         assert!(problems.add(a, problem(1)) && !problems.add(a, problem(1)));

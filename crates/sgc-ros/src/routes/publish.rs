@@ -1,7 +1,7 @@
-//! The other way: local publishers on a name that another node owns, and remote publishers on one of ours.
+//! Publishing: local publishers on names of other nodes, and remote publishers on shares of this node.
 //!
-//! A use route whose rule says so does not bring a topic here but takes local messages there, while its owner lets
-//! this node publish. A share route on which others may publish has a local writer while any of them is there.
+//! A use route whose rule publishes carries local messages to the owner, while the owner permits it. A share route on
+//! which others may publish has a local writer while at least one of them is present.
 
 use rand_core::RngCore;
 use sgc_wire::{History, Metadata, Name, Qos};
@@ -11,12 +11,12 @@ use crate::names::{dds_topic, dds_type, ros_topic, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec};
 use crate::qos::{reader_for, weakest};
 
-/// Messages of others that the owner's local writer keeps for reliable readers. Whoever writes waits for acknowledgements once
-/// so many came at once, some 15 ms with Cyclone; and so many are held for a reader that stands still.
+/// Depth of the owner's local writer for messages of others. Writers wait for acknowledgements, some 15 ms with
+/// Cyclone, once this many arrive at once. As many are kept for a reader that stands still.
 const PUBLISHERS_DEPTH: u32 = 100;
 
 impl<R: RngCore> Routes<R> {
-    /// Others than this node publish on one of its shares, or none any more.
+    /// Handles the arrival of the first other publisher on a share, or the end of the last.
     pub fn handle_publishers(&mut self, name: &Name, any: bool) {
         let Some(share) = self.shares.get_mut(name) else { return };
         if self.share_rules[share.rule].is_service() {
@@ -43,8 +43,8 @@ impl<R: RngCore> Routes<R> {
         self.check_later();
     }
 
-    /// Begins the shares that are there for what others publish, whether anyone here does or not. Their type has to be
-    /// given, since no local publisher shows it.
+    /// Begins the shares that exist for messages of others. Their rules must give the type, because no local
+    /// publisher shows it.
     pub(super) fn begin_inbound(&mut self) {
         for rule in 0..self.share_rules.len() {
             let share = &self.share_rules[rule];
@@ -60,21 +60,21 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// What begins goes unshaped unless it is told otherwise.
+    /// Shapes a name. A new name has no limits, so the default needs no command.
     pub(super) fn shape(&mut self, name: Name, shaping: Shaping) {
         if shaping != Shaping::default() {
             self.commands.push_back(Command::Shape { name, shaping });
         }
     }
 
-    /// Frames have no prefix unless it is told.
+    /// Sets the prefix of frames. A new name has none, so `None` needs no command.
     pub(super) fn frames(&mut self, name: Name, prefix: Option<String>) {
         if prefix.is_some() {
             self.commands.push_back(Command::Frames { name, prefix });
         }
     }
 
-    /// A local writer may be one whose messages another node's topic is for.
+    /// Adds a local writer to the routes that publish its topic elsewhere.
     pub(super) fn publisher_there(&mut self, writer: &DiscoveredEndpoint) {
         let names: Vec<_> =
             self.uses.iter().filter(|(_, u)| self.publishes(u.rule)).map(|(n, _)| *n).collect();
@@ -99,7 +99,7 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// Looks for the local writers of a route that just began.
+    /// Adds the existing local writers to routes that have just begun.
     pub(super) fn find_publishers(&mut self) {
         for endpoint in self.endpoints.values().cloned().collect::<Vec<_>>() {
             if endpoint.kind == EndpointKind::Writer {
@@ -112,7 +112,7 @@ impl<R: RngCore> Routes<R> {
         self.use_rules[rule].direction == Direction::Publish
     }
 
-    /// Brings the local reader of a route that publishes in line with its local writers.
+    /// Updates the local reader of a publishing route to match its local writers.
     pub(super) fn refresh_publisher(&mut self, name: Name) {
         let Some(route) = self.uses.get_mut(&name).filter(|u| u.granted) else { return };
         if self.use_rules[route.rule].is_service() {

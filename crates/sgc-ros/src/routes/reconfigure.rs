@@ -1,6 +1,6 @@
-//! Other rules for a running machine: what differs is begun, ended or told, what does not is left alone.
+//! Reconfiguration of a running machine. Routes that differ begin, end or are updated; others are left alone.
 //!
-//! What the user wrote is judged before it comes here.
+//! The rules are validated before they come here.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
@@ -13,11 +13,11 @@ use crate::names::ros_type;
 use crate::network::{DiscoveredEndpoint, EndpointKind, Guid};
 
 impl<R: RngCore> Routes<R> {
-    /// The user wants something else from now on. What is as it was is not touched.
+    /// Replaces the rules.
     ///
-    /// Each route goes on under whichever rule covers its interface now, if that rule wants it as it is.
+    /// A route continues under the rule that now covers its interface, unless that rule demands a different route.
     pub fn reconfigure(&mut self, now: Instant, shares: Vec<ShareRule>, uses: Vec<UseRule>) {
-        // Uses are judged by what is shared from now on, and shares by what is used then.
+        // Uses are judged by the new shares, and shares then by the new uses.
         let old = std::mem::replace(&mut self.share_rules, shares);
         self.reconfigure_uses(uses);
         self.reconfigure_shares(now, &old);
@@ -60,7 +60,7 @@ impl<R: RngCore> Routes<R> {
             }
         }
         self.begin_inbound();
-        // Publishers that are there already, for what is new; those of a kept share are in it.
+        // Existing publishers are offered to new shares. Those of a kept share are in it already.
         let shared: BTreeSet<Guid> = self.shares.values().flat_map(|s| s.writers.keys().copied()).collect();
         let is_new = |e: &&DiscoveredEndpoint| e.kind == EndpointKind::Writer && !shared.contains(&e.guid);
         for writer in self.endpoints.values().filter(is_new).cloned().collect::<Vec<_>>() {
@@ -93,7 +93,7 @@ impl<R: RngCore> Routes<R> {
                             && rule.local_name(metadata) == route.local_name
                     })
             };
-            // What is published begins anew in another class.
+            // Publishing in another class begins anew.
             let same_class =
                 |rule: &UseRule| rule.direction == Direction::Bring || rule.class == old[index].class;
             let stays = |place: &usize| fits(&self.use_rules[*place]) && same_class(&self.use_rules[*place]);
@@ -140,7 +140,7 @@ impl<R: RngCore> Routes<R> {
             if !before.contains_key(&owner) {
                 self.commands.push_back(Command::Follow { owner_name });
             } else if let Some(catalogue) = self.catalogues.get(&owner).cloned() {
-                // What the owner lists already may be what a new rule asks for. Known entries change nothing.
+                // The catalogue is applied again for new rules. Known entries change nothing.
                 self.list(owner, catalogue);
             }
         }
@@ -148,7 +148,7 @@ impl<R: RngCore> Routes<R> {
     }
 }
 
-/// Whether a share of this type goes on under a changed rule: only its policy, shaping and QoS may differ.
+/// Returns `true` if a share of this type continues under a changed rule: only policy, shaping and QoS may differ.
 fn continues(before: &ShareRule, after: &ShareRule, local_name: &str, type_name: &str) -> bool {
     let wanted = &after.metadata.type_name;
     (wanted.is_empty() || wanted == type_name)

@@ -1,8 +1,8 @@
-//! Services: what is different from topics. They go through the same two kinds of routes.
+//! Services: their differences from topics. They use the same two kinds of routes.
 //!
-//! Where a topic has writers a service has servers: a request reader and a reply writer of one participant. What a
-//! share route is told of them is one endpoint for both, the reader's, on the topic `rs/…`, which no other has. Where
-//! others publish on a topic they call a service: a share's route has a local client then, a use's a local server.
+//! In place of writers a service has servers, each with a request reader and a reply writer of one participant. A
+//! share route sees a server as one endpoint, its reader, on the reserved topic `rs/…`. Where others publish on a
+//! topic, they call a service: the share's route then has a local client, the use's a local server.
 
 use std::time::Instant;
 
@@ -14,16 +14,16 @@ use crate::names::{ServiceTopic, dds_type, ros_topic, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec, ServiceSpec};
 use crate::qos::service_qos;
 
-/// What the ROS 2 design reserves for services as a whole ("Topic and Service name mapping to DDS").
+/// The prefix that ROS 2 reserves for services as a whole ("Topic and Service name mapping to DDS").
 const SERVICE_PREFIX: &str = "rs";
 
-/// The kind of interface that an endpoint provides, and its name.
+/// Returns the kind and name of the interface that an endpoint provides.
 pub(super) fn interface(topic: &str) -> Option<(Kind, &str)> {
     let service = topic.strip_prefix(SERVICE_PREFIX).filter(|service| service.starts_with('/'));
     service.map(|service| (Kind::Service, service)).or_else(|| Some((Kind::Topic, ros_topic(topic)?)))
 }
 
-/// Both topics of a service.
+/// Returns the spec of both topics of a service.
 pub(super) fn service_spec(local_name: &str, type_name: &str, type_hash: Option<&str>) -> ServiceSpec {
     let half = |half: ServiceTopic, type_hash: Option<&str>| EndpointSpec {
         topic: half.dds_topic(local_name),
@@ -37,23 +37,23 @@ pub(super) fn service_spec(local_name: &str, type_name: &str, type_hash: Option<
 }
 
 impl<R: RngCore> Routes<R> {
-    /// Whether a name that is shared or used here is that of a service.
+    /// Returns `true` if a name that is shared or used here belongs to a service.
     pub fn is_service(&self, name: &Name) -> bool {
         let shared = self.shares.get(name).map(|share| self.share_rules[share.rule].is_service());
         let used = || self.uses.get(name).map(|route| self.use_rules[route.rule].is_service());
         shared.or_else(used).unwrap_or(false)
     }
 
-    /// One end of a service, of a server or a client; false if it is of a topic. It may make a server whole.
+    /// Handles a new endpoint of a service, which may complete a server. Returns `false` for an endpoint of a topic.
     pub(super) fn service_end_there(&mut self, endpoint: &DiscoveredEndpoint) -> bool {
-        let Some((half, name, _)) = ServiceTopic::of(&endpoint.topic, &endpoint.type_name) else {
-            // Nobody else is to pass for a server.
+        let Some((half, name, _)) = ServiceTopic::parse(&endpoint.topic, &endpoint.type_name) else {
+            // A topic with the reserved prefix must not pass for a server.
             return matches!(interface(&endpoint.topic), Some((Kind::Service, _)));
         };
         let other = match (half, endpoint.kind) {
             (ServiceTopic::Request, EndpointKind::Reader) => (ServiceTopic::Reply, EndpointKind::Writer),
             (ServiceTopic::Reply, EndpointKind::Writer) => (ServiceTopic::Request, EndpointKind::Reader),
-            // A client's.
+            // The endpoint belongs to a client.
             _ => return true,
         };
         let topic = other.0.dds_topic(name);
@@ -70,9 +70,9 @@ impl<R: RngCore> Routes<R> {
         true
     }
 
-    /// What is gone may have been one end of a server, which is none without it.
+    /// Handles the end of an endpoint, which may have been part of a server.
     pub(super) fn service_end_gone(&mut self, now: Instant, endpoint: &DiscoveredEndpoint) {
-        let Some((half, name, _)) = ServiceTopic::of(&endpoint.topic, &endpoint.type_name) else { return };
+        let Some((half, name, _)) = ServiceTopic::parse(&endpoint.topic, &endpoint.type_name) else { return };
         if half == ServiceTopic::Request {
             return self
                 .writer_gone(now, &DiscoveredEndpoint { kind: EndpointKind::Writer, ..endpoint.clone() });
@@ -80,7 +80,7 @@ impl<R: RngCore> Routes<R> {
         if endpoint.kind == EndpointKind::Reader {
             return;
         }
-        // As many servers of a service as the participant has reply writers left.
+        // A participant has as many servers of a service as it has reply writers.
         let (prefix, topic) = (endpoint.guid.prefix(), ServiceTopic::Request.dds_topic(name));
         let of_it = |e: &&DiscoveredEndpoint| e.guid.prefix() == prefix;
         let left = self
@@ -99,7 +99,7 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// Brings the local client of a shared service in line with who may call it.
+    /// Updates the local client of a shared service to match its callers.
     pub(super) fn refresh_client(&mut self, name: Name) {
         let Some(share) = self.shares.get_mut(&name) else { return };
         let wanted = !share.sinks.is_empty() || share.sinkless_until.is_some();
@@ -118,7 +118,7 @@ impl<R: RngCore> Routes<R> {
         share.client = spec;
     }
 
-    /// Brings the local server of a service that is called in line with its catalogue entry.
+    /// Updates the local server of a called service to match its catalogue entry.
     pub(super) fn refresh_server(&mut self, name: Name) {
         let Some(route) = self.uses.get_mut(&name).filter(|u| u.granted) else { return };
         let rule = &self.use_rules[route.rule];
@@ -141,9 +141,9 @@ impl<R: RngCore> Routes<R> {
     }
 }
 
-/// A server as a share route is told of it, by its request reader.
+/// Returns the endpoint that represents a server in a share route, from its request reader.
 fn server(request: &DiscoveredEndpoint) -> Option<DiscoveredEndpoint> {
-    let (_, name, type_name) = ServiceTopic::of(&request.topic, &request.type_name)?;
+    let (_, name, type_name) = ServiceTopic::parse(&request.topic, &request.type_name)?;
     Some(DiscoveredEndpoint {
         kind: EndpointKind::Writer,
         topic: format!("{SERVICE_PREFIX}{name}"),

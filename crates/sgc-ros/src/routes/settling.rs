@@ -1,5 +1,5 @@
-//! Owners that come back: one whose node started anew finds its local network again publisher by publisher, so what its first
-//! catalogues do not list may be there all the same.
+//! Owners that return. A restarted owner rediscovers its local network step by step, so its first catalogues may omit
+//! interfaces that still exist.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -9,21 +9,21 @@ use sgc_wire::{Catalogue, Name, NodeId, SourceId};
 
 use super::{Command, Routes};
 
-/// How long an owner whose node started anew may take to find its local network. Until then what it listed before stands:
-/// Cyclone and Fast DDS take up to 3 s to tell a participant that is new of what was there before it.
+/// Time for which a restarted owner's former catalogue stands while it rediscovers its local network. Cyclone and
+/// Fast DDS take up to 3 s to announce existing endpoints to a new participant.
 pub const REDISCOVERY_HOLD: Duration = Duration::from_secs(10);
 
-/// An owner that was out of reach.
+/// The state of an owner that was unreachable.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Settling {
-    /// It still is.
+    /// The owner is unreachable.
     Away,
-    /// It is back, and was started anew.
+    /// The owner has returned after a restart.
     Until(Instant),
 }
 
 impl<R: RngCore> Routes<R> {
-    /// Judges the first catalogue of an owner that was out of reach.
+    /// Judges the first catalogue of an owner that was unreachable.
     pub(super) fn owner_is_back(&mut self, now: Instant, owner: NodeId, catalogue: &Catalogue) {
         if self.settling.get(&owner) != Some(&Settling::Away) {
             return;
@@ -31,7 +31,7 @@ impl<R: RngCore> Routes<R> {
         let rules = &self.use_rules;
         let of_owner = self.uses.values().filter(|u| rules[u.rule].is_of_catalogue(&owner));
         let known: BTreeSet<SourceId> = of_owner.flat_map(|u| u.writers.keys().copied().flatten()).collect();
-        // Ids of sources end with the run: one that is still there says that it is the same.
+        // Source ids change with a restart, so a known one proves that the owner's node did not restart.
         let same_run = catalogue.entries.iter().flat_map(|e| &e.sources).any(|s| known.contains(&s.source));
         if same_run {
             self.settling.remove(&owner);
@@ -40,7 +40,7 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// Until when what an owner does not list stands all the same.
+    /// Returns the time until which entries that an owner no longer lists are kept.
     pub(super) fn settles_at(&self, owner: &NodeId) -> Option<Instant> {
         match self.settling.get(owner) {
             Some(Settling::Until(at)) => Some(*at),
@@ -48,7 +48,7 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// A used topic is not listed: it ends, unless its owner has to find it first.
+    /// Ends a use that is no longer listed, unless its restarted owner may still rediscover it.
     pub(super) fn not_listed(&mut self, name: Name) {
         let Some(route) = self.uses.get_mut(&name) else { return };
         let owner = self.use_rules[route.rule].owner;
@@ -59,7 +59,8 @@ impl<R: RngCore> Routes<R> {
         route.is_listed = false;
     }
 
-    /// A used topic is listed. One that was not for a while is asked for at once, and not when a refusal of meanwhile says.
+    /// Handles an entry that is listed. If it was missing for a while, it is joined at once, without the pause after
+    /// a refusal.
     pub(super) fn listed_again(&mut self, name: Name) {
         if let Some(route) = self.uses.get_mut(&name)
             && !std::mem::replace(&mut route.is_listed, true)
@@ -69,7 +70,7 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// Ends what owners have not found by now.
+    /// Ends the uses that restarted owners have not rediscovered in time.
     pub(super) fn owners_have_settled(&mut self, now: Instant) {
         let settled = |s: &Settling| matches!(s, Settling::Until(at) if *at <= now);
         let owners: BTreeSet<NodeId> =

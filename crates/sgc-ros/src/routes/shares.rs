@@ -1,4 +1,4 @@
-//! Share routes: from local writers to what is shared.
+//! Share routes: from local writers to shares.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
@@ -14,10 +14,10 @@ use super::{
 };
 use crate::names::{dds_topic, is_topic_name, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec, Guid};
-use crate::qos::{of_all_instances, reader_for, service_qos, weakest};
+use crate::qos::{for_all_instances, reader_for, service_qos, weakest};
 
 impl<R: RngCore> Routes<R> {
-    /// A sink was granted one of our shares.
+    /// Handles the grant of a share to a sink.
     pub fn handle_sink_joined(&mut self, name: &Name, sink: SinkId) {
         if let Some(share) = self.shares.get_mut(name) {
             share.sinks.insert(sink);
@@ -25,7 +25,7 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// A sink of one of our shares is gone.
+    /// Handles the end of a sink of a share.
     pub fn handle_sink_left(&mut self, now: Instant, name: &Name, sink: &SinkId) {
         if let Some(share) = self.shares.get_mut(name)
             && share.sinks.remove(sink)
@@ -43,7 +43,7 @@ impl<R: RngCore> Routes<R> {
         self.share_writer(writer);
     }
 
-    /// Shares what a local writer writes, if a rule says so.
+    /// Shares the topic of a local writer if a rule covers it.
     pub(super) fn share_writer(&mut self, writer: DiscoveredEndpoint) {
         let guid = writer.guid;
         let problem = self.share_or_say_why_not(writer);
@@ -61,11 +61,11 @@ impl<R: RngCore> Routes<R> {
         };
         let share = &self.share_rules[rule];
         let expected = &share.metadata.type_name;
-        // `check_local` has said so.
+        // `check_local` has reported that.
         if !expected.is_empty() && *expected != found {
             return None;
         }
-        // One that runs keeps its name, also after the secret that names come from was replaced.
+        // A running share keeps its name even after the secret was replaced.
         if let Some(route) =
             self.shares.values_mut().find(|s| s.rule == rule && s.fits(&topic, &writer.type_name))
         {
@@ -78,7 +78,8 @@ impl<R: RngCore> Routes<R> {
         self.begin_share(rule, &topic, writer.type_name.clone(), writer.keyless, Some(writer))
     }
 
-    /// Begins a share with this first writer, or with none, unless its name or number forbids it: why.
+    /// Begins a share with a first writer, or without one. Returns a problem if its name or the number of shares
+    /// forbids it.
     pub(super) fn begin_share(
         &mut self,
         rule: usize,
@@ -125,14 +126,14 @@ impl<R: RngCore> Routes<R> {
             share.writers.remove(&endpoint.guid);
             match share.own.get_mut(&endpoint.guid) {
                 Some(own) if !own.qos.is_transient_local() => own.gone = Some(now),
-                // Late joiners are given nothing of a publisher that is no more. That all are gone is seen after the
+                // Late joiners get no history of a publisher that is gone. The last one counts as gone only after the
                 // hold.
                 _ if !share.writers.is_empty() => drop(share.own.remove(&endpoint.guid)),
                 _ => share.own.clear(),
             }
             if share.writers.is_empty() {
-                // What was offered stands until the hold ends: a restarted program finds it as it was.
-                // One that others publish on is there without.
+                // The offer stands until the hold ends, so that a restarted program finds the share unchanged. A
+                // share for messages of others needs no writer.
                 if !self.share_rules[share.rule].is_inbound() {
                     share.writerless_until = Some(now + WRITERLESS_HOLD);
                     if self.share_rules[share.rule].is_service() {
@@ -145,8 +146,8 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// A local writer's lease ran out, or the writer lives again. The far writer of one that is manual by topic is renewed by its
-    /// messages and assertions, and so expires by itself; all others live for as long as this node's.
+    /// Handles the expiry of a local writer's lease, or its renewal. A far writer with liveliness manual by topic is
+    /// renewed by messages and assertions and expires by itself. All others live as long as this node's writers.
     pub(super) fn handle_liveliness(&mut self, guid: Guid, is_alive: bool) {
         let is_concerned = |own: &OwnSource| {
             own.is_lapsed == is_alive && (is_alive || own.qos.liveliness != Liveliness::ManualByTopic)
@@ -163,8 +164,8 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// Lists the depth of a local publisher that did not announce it. Messages that expired look like dropped ones, so the depth of a publisher with
-    /// a lifespan is not known by that.
+    /// Updates the depth of a local publisher that did not announce it. Not for publishers with a lifespan, because
+    /// an expired message looks like a dropped one and makes the depth uncertain.
     pub(super) fn handle_depth(&mut self, writer: &Guid, depth: u32) {
         let is_unsaid = |qos: &Qos| qos.history.is_unsaid() && qos.lifespan_ns.is_none();
         let Some(endpoint) = self.endpoints.get_mut(writer).filter(|e| is_unsaid(&e.qos)) else { return };
@@ -182,21 +183,21 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// Brings catalogue, sources and reader of a share in line with its writers and sinks.
+    /// Updates catalogue entry, sources and reader of a share to match its writers and sinks.
     pub(super) fn refresh_share(&mut self, name: Name) {
         let Some(share) = self.shares.get_mut(&name) else { return };
         let wanted = self.share_rules[share.rule].qos;
-        // The reader asks for no more than the writers offer; the policies of the rule are offered elsewhere.
+        // The reader requests no more than the writers offer. The rule's policies are offered elsewhere.
         let found = weakest(share.writers.values().map(|w| &w.qos));
         let offers: Vec<_> = share.writers.values().map(|w| wanted.apply(&w.qos)).collect();
         let offer = match weakest(&offers) {
             Some(offer) => offer,
             None if !self.share_rules[share.rule].is_inbound() => return,
-            // What the publishers elsewhere offer is not known here; ROS 2's default serves commands well.
+            // The offers of remote publishers are unknown here. ROS 2's default serves commands well.
             None => Qos::default(),
         };
         let transient_local = offer.is_transient_local();
-        // Answers have one source for all servers.
+        // All servers answer under one source.
         let is_service = self.share_rules[share.rule].is_service();
         share.own.retain(|_, own| own.gone.is_none() || !transient_local);
         let mut problems = BTreeSet::new();
@@ -204,7 +205,7 @@ impl<R: RngCore> Routes<R> {
             let qos = carried(&wanted.apply(&writer.qos), &offer);
             let passed_on = was_passed_on(&share.own, guid);
             match share.own.get_mut(guid) {
-                // Another kind of source is another source.
+                // A source of another kind must be a new one.
                 Some(own) if !passed_on && same_kind(&own.qos, &qos) => {
                     own.qos = qos;
                     own.gone = None;
@@ -239,7 +240,7 @@ impl<R: RngCore> Routes<R> {
         let keyless = share.keyless;
         let kept = |qos: Qos| match keyless {
             true => qos,
-            false => Qos { history: of_all_instances(qos.history), ..qos },
+            false => Qos { history: for_all_instances(qos.history), ..qos },
         };
         let own = own.into_iter().map(|(writer, source, qos)| (writer, source, kept(qos))).collect();
         self.commands.push_back(Command::MapSources { name, class, own });
@@ -247,7 +248,7 @@ impl<R: RngCore> Routes<R> {
             self.settle(Cause::Share(name), problems);
             return self.refresh_client(name);
         }
-        // A transient-local topic is read from the start: late joiners are promised its history.
+        // A transient-local topic is read from the start, because late joiners are promised its history.
         let wanted = offer.is_transient_local() || !share.sinks.is_empty() || share.sinkless_until.is_some();
         let wanted = wanted && !share.writers.is_empty();
         let read = Qos {
@@ -280,14 +281,14 @@ impl<R: RngCore> Routes<R> {
         self.settle(Cause::Share(name), problems);
     }
 
-    /// The publishers behind a share, each source once.
+    /// Returns the publishers behind a share, each source once.
     fn listed(&self, share: &ShareRoute) -> Vec<CatalogueSource> {
         let mut listed = BTreeMap::<SourceId, Vec<(&Guid, &OwnSource)>>::new();
         for (guid, own) in &share.own {
             listed.entry(own.source).or_default().push((guid, own));
         }
         let listed = listed.into_iter().filter_map(|(source, mut all)| {
-            // One that took over the source of another is who it stands for.
+            // A source that passed to another writer stands for that writer.
             if all.iter().any(|(_, own)| own.gone.is_none()) {
                 all.retain(|(_, own)| own.gone.is_none());
             }
@@ -301,7 +302,7 @@ impl<R: RngCore> Routes<R> {
         listed.collect()
     }
 
-    /// The nodes that answer, each under an id that nothing is sent under.
+    /// Returns the nodes of the servers, each under an id that no message uses.
     fn listed_servers(&self, share: &ShareRoute) -> Vec<CatalogueSource> {
         let server = |guid: &Guid| CatalogueSource {
             source: SourceId::from_publisher(self.secret.publisher_tag(&guid.0), [0; 8]),
@@ -329,8 +330,8 @@ impl<R: RngCore> Routes<R> {
     }
 }
 
-/// A source for a writer that has none: that of a volatile writer like it that is gone, or a new one; `None` if there
-/// are too many.
+/// Returns the source for a writer without one: that of a similar volatile writer that is gone, or a new one. Returns
+/// `None` if there are too many.
 fn own_source(
     known: &mut BTreeMap<Guid, OwnSource>,
     qos: &Qos,
@@ -350,7 +351,7 @@ fn own_source(
     Some(new())
 }
 
-/// Returns `true` if the writer vanished and another has its source since.
+/// Returns `true` if the writer vanished and its source passed to another.
 fn was_passed_on(own: &BTreeMap<Guid, OwnSource>, writer: &Guid) -> bool {
     let Some(source) = own.get(writer).filter(|own| own.gone.is_some()).map(|own| own.source) else {
         return false;
@@ -358,7 +359,8 @@ fn was_passed_on(own: &BTreeMap<Guid, OwnSource>, writer: &Guid) -> bool {
     own.values().any(|other| other.source == source && other.gone.is_none())
 }
 
-/// What of a writer's offer is carried: what all together offer is read, and kept for who joins late.
+/// Returns the part of a writer's offer that is carried: the combined offer decides how it is read and kept for late
+/// joiners.
 fn carried(own: &Qos, offer: &Qos) -> Qos {
     Qos {
         reliability: own.reliability.min(offer.reliability),
@@ -367,7 +369,7 @@ fn carried(own: &Qos, offer: &Qos) -> Qos {
     }
 }
 
-/// Whether one source can stand for both.
+/// Returns `true` if one source can stand for both.
 fn same_kind(a: &Qos, b: &Qos) -> bool {
     (a.reliability, a.is_transient_local()) == (b.reliability, b.is_transient_local())
 }

@@ -1,4 +1,4 @@
-//! Token routes: names that are joined at once, and that the grant describes.
+//! Token routes: names that are joined at once and described by the grant.
 //!
 //! From the first grant on they are use routes like others.
 
@@ -11,7 +11,7 @@ use sgc_wire::{CatalogueEntry, Name};
 use super::{Cause, Command, Problem, Routes, Shaping, TokenJoin, UseRoute};
 
 impl<R: RngCore> Routes<R> {
-    /// What a token's name stands for, as its owner says with the grant: a catalogue of one entry.
+    /// Handles the owner's description of a token's name, a catalogue of one entry.
     pub(super) fn handle_described(&mut self, name: Name, entry: CatalogueEntry) {
         let Some(token) = self.tokens.get_mut(&name) else { return };
         token.refused = None;
@@ -28,7 +28,7 @@ impl<R: RngCore> Routes<R> {
         let Some(token) = self.tokens.get_mut(&name) else { return };
         let transient_local = entry.qos.is_transient_local();
         if token.transient_local != transient_local {
-            // Another durability is another kind of sink: start over, now that it is known.
+            // Another durability needs another kind of sink, so the join starts over with it.
             token.transient_local = transient_local;
             self.close_use(name);
             self.commands.push_back(Command::Leave { name });
@@ -46,7 +46,7 @@ impl<R: RngCore> Routes<R> {
         self.check_later();
     }
 
-    /// Joins the names of those tokens that are not joined.
+    /// Joins the names of tokens that are not joined yet.
     pub(super) fn join_tokens(&mut self) {
         for (index, rule) in self.use_rules.iter().enumerate() {
             let Some((name, _)) = &rule.token else { continue };

@@ -18,9 +18,9 @@ use crate::names::{dds_topic, dds_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec};
 
 impl<R: RngCore> Routes<R> {
-    /// An owner's catalogue arrived or changed.
+    /// Handles a new or changed catalogue of an owner.
     pub fn handle_catalogue(&mut self, now: Instant, owner: NodeId, mut catalogue: Catalogue) {
-        // Two entries with one name would replace each other's route whenever a catalogue comes.
+        // Two entries with one name would replace each other's route with every catalogue.
         let mut blinds = BTreeSet::new();
         catalogue.entries.retain(|entry| blinds.insert(entry.blind));
         self.owners.remove(&owner);
@@ -30,7 +30,7 @@ impl<R: RngCore> Routes<R> {
         self.reconsider();
     }
 
-    /// Brings the routes to an owner's interfaces in line with what it lists.
+    /// Updates the routes to an owner's interfaces to match its catalogue.
     pub(super) fn list(&mut self, owner: NodeId, catalogue: Catalogue) {
         let mut listed = BTreeSet::new();
         let said = self.problems.take(Cause::Catalogue(owner));
@@ -83,7 +83,7 @@ impl<R: RngCore> Routes<R> {
         self.report(Cause::Catalogue(owner_id), problem);
     }
 
-    /// Looks again at what was left out for the sake of a route that has ended since.
+    /// Reconsiders interfaces that were left out because of a route that has ended since.
     pub(super) fn reconsider(&mut self) {
         if !std::mem::take(&mut self.freed) || !std::mem::take(&mut self.waits) {
             return;
@@ -100,8 +100,8 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// The way to an owner's catalogue is lost, or the owner has gone in good order. Its topics have ways of their own,
-    /// which may well stand; what becomes of those [`Self::handle_lost`] is told.
+    /// Handles the loss of the path to an owner's catalogue, or an owner that leaves. Its topics have paths of their
+    /// own, which may still work; [`Self::handle_lost`] reports their loss.
     pub fn handle_owner_lost(&mut self, owner: NodeId, reason: LostReason) {
         if !matches!(reason, LostReason::Withdrawn | LostReason::Refused(_)) {
             self.owners.insert(owner, "is out of reach".into());
@@ -124,12 +124,12 @@ impl<R: RngCore> Routes<R> {
         self.reconsider();
     }
 
-    /// An owner does not let this node follow it.
+    /// Handles an owner's refusal of its catalogue.
     pub fn handle_owner_refused(&mut self, owner: NodeId, by: RefusedBy) {
         self.owners.insert(owner, format!("refuses its catalogue: {by}"));
     }
 
-    /// A join was granted. `entry` is what the name stands for, where that was asked for.
+    /// Handles the grant of a join. `entry` describes the interface if the join asked for that.
     pub fn handle_granted(&mut self, name: &Name, entry: Option<CatalogueEntry>) {
         if let (Some(entry), true) = (entry, self.tokens.contains_key(name)) {
             self.handle_described(*name, entry);
@@ -148,7 +148,7 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// A join was refused.
+    /// Handles the refusal of a join.
     pub fn handle_refused(&mut self, name: &Name, by: RefusedBy) {
         if let Some(route) = self.uses.get_mut(name) {
             route.refused = Some(by);
@@ -158,12 +158,12 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// A grant is void for now.
+    /// Handles the suspension of a grant.
     pub fn handle_lost(&mut self, now: Instant, name: &Name) {
         self.hold_use(now, *name);
     }
 
-    /// The rule that asks for a catalogue entry.
+    /// Returns the rule that asks for a catalogue entry.
     pub(super) fn rule_for(&mut self, owner: NodeId, entry: &CatalogueEntry) -> Option<usize> {
         let metadata = &entry.metadata;
         let index = self.use_rule(&owner, entry)?;
@@ -208,7 +208,7 @@ impl<R: RngCore> Routes<R> {
                     self.check_later();
                 }
             }
-            // Another durability is another kind of sink: start over.
+            // Another durability needs another kind of sink, so the route starts over.
             Some(_) => {
                 self.drop_use(name);
                 self.entry_there(name, rule, entry);
@@ -253,7 +253,7 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// Ends what a use has on the local network; its name stays joined.
+    /// Closes the local endpoints of a use. Its name stays joined.
     pub(super) fn close_use(&mut self, name: Name) {
         if let Some(route) = self.uses.remove(&name) {
             self.freed = true;
@@ -271,8 +271,8 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// Brings the local writers of a granted route in line with its catalogue entry: one for each publisher that it
-    /// lists, with that publisher's QoS, history and node, and one for all others where there are any.
+    /// Updates the local writers of a granted route to match its catalogue entry: one for each listed publisher, with
+    /// its QoS, history and node, and one for all others if there are any.
     pub(super) fn refresh_use(&mut self, name: Name) {
         let Some(route) = self.uses.get_mut(&name).filter(|u| u.granted) else { return };
         let entry = &route.entry;
@@ -285,14 +285,14 @@ impl<R: RngCore> Routes<R> {
             type_hash: entry.type_hash.clone(),
             qos: set.apply(qos),
         };
-        // One whose lease ran out is missed at once by who watches its liveliness.
+        // A writer without a valid lease is closed, so that subscribers that watch its liveliness notice at once.
         let alive = entry.sources.iter().filter(|s| !s.source.is_lapsed());
         let mut wanted: BTreeMap<Option<SourceId>, EndpointSpec> =
             alive.map(|s| (s.source.told_apart(), spec(&s.qos))).collect();
         if entry.sources.is_empty() || entry.sources.len() >= ENTRY_SOURCES_MAX {
             wanted.insert(None, spec(&entry.qos));
         }
-        // A publisher whose node started anew has another source. To the local network it is the one that it was.
+        // A publisher whose node restarted has a new source. Locally it keeps its writer.
         let (mut moved, mut resized) = (BTreeSet::new(), BTreeSet::new());
         let mut stand_ins = BTreeMap::new();
         for (to, spec) in wanted.iter().filter_map(|(to, spec)| Some(((*to)?, spec))) {
@@ -314,7 +314,7 @@ impl<R: RngCore> Routes<R> {
             let old = route.writers.get(stand_ins.get(source).unwrap_or(source));
             let Some(old) = old.filter(|old| *old != spec && serves(old, spec)) else { continue };
             if spec.qos.history.is_unsaid() {
-                // The depth of a publisher does not change. It was known before its node started anew.
+                // The depth of a publisher is constant and was known before its node restarted.
                 spec.qos.history = old.qos.history;
             } else {
                 let (source, spec) = (*source, spec.clone());
@@ -322,7 +322,7 @@ impl<R: RngCore> Routes<R> {
             }
             resized.insert(*source);
         }
-        // Those that their owner has to find first stay as they are.
+        // Writers that a restarted owner may still rediscover stay as they are.
         if matches!(self.settling.get(&self.use_rules[route.rule].owner), Some(Settling::Until(_))) {
             for (source, old) in &route.writers {
                 if source.is_some_and(|source| !moved.contains(&source)) {
@@ -347,7 +347,7 @@ impl<R: RngCore> Routes<R> {
         self.name_writers(name);
     }
 
-    /// Says so if what comes from several owners under one name cannot be one topic.
+    /// Reports a problem if interfaces of several owners under one name have different types.
     fn check_merged(&mut self, rule: usize, metadata: &Metadata) {
         let found = &metadata.type_name;
         let local_name = self.use_rules[rule].local_name(metadata);
@@ -374,8 +374,8 @@ impl<R: RngCore> Routes<R> {
     }
 }
 
-/// Whether an open writer can be used where this one is wanted: they are the same, or differ in a depth that was not known when the open one was
-/// made, or is not known again.
+/// Returns `true` if an open writer can serve as the wanted one: both are the same, or one of them has an unknown
+/// depth.
 fn serves(open: &EndpointSpec, wanted: &EndpointSpec) -> bool {
     let differ_in_depth = open.qos.history.is_unsaid() && matches!(wanted.qos.history, History::KeepLast(_))
         || wanted.qos.history.is_unsaid() && matches!(open.qos.history, History::KeepLast(_));

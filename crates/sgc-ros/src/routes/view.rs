@@ -1,4 +1,4 @@
-//! What the route machine knows, for who looks at it from outside. Nothing here changes anything.
+//! Read-only views of the route machine.
 
 use sgc_endpoint::RefusedBy;
 use sgc_trust::{Policy, name_of};
@@ -9,127 +9,127 @@ use crate::names::ros_type;
 use crate::network::{DiscoveredEndpoint, Guid};
 use crate::qos::weakest;
 
-/// A rule of what is shared, and what runs of it.
+/// A share rule and its routes.
 #[derive(Clone, Debug)]
 pub struct ShareView<'a> {
-    /// What the rule says.
+    /// The metadata of the rule.
     pub metadata: &'a Metadata,
-    /// Who may join.
+    /// The policy of the rule.
     pub policy: &'a Policy,
-    /// What runs.
+    /// The running routes.
     pub routes: Vec<ShareRouteView>,
 }
 
 /// A shared interface.
 #[derive(Clone, Debug)]
 pub struct ShareRouteView {
-    /// What it is called on the local network.
+    /// The name on the local network.
     pub local_name: String,
-    /// ROS type.
+    /// The ROS type.
     pub type_name: String,
-    /// Its name.
+    /// The name on the wire.
     pub name: Name,
-    /// Local publishers.
+    /// The number of local publishers.
     pub writers: usize,
-    /// Granted subscribers.
+    /// The number of granted subscribers.
     pub sinks: usize,
-    /// Whether the local publishers are read.
+    /// `true` if the local publishers are read.
     pub is_read: bool,
-    /// Whether what others publish is written here; whether others can call it, if it is a service.
+    /// `true` if messages of others are written here; for a service, if others can call it.
     pub is_written: bool,
-    /// What the local publishers offer together.
+    /// The combined offer of the local publishers.
     pub qos: Option<Qos>,
-    /// What their messages are written in on their way.
+    /// The form of their messages on the way.
     pub form: PayloadForm,
 }
 
-/// A rule of what is used, and what runs of it.
+/// A use rule and its routes.
 #[derive(Clone, Debug)]
 pub struct UseView<'a> {
-    /// Which way.
+    /// The direction of messages.
     pub direction: Direction,
-    /// What kind of interface.
+    /// The kind of interface.
     pub kind: Kind,
-    /// What it asks for.
+    /// The topic or pattern.
     pub topic: &'a str,
-    /// What that is called on the local network.
+    /// The topic or pattern by local names.
     pub local_topic: String,
-    /// The type that it asks for.
+    /// The required type.
     pub wanted_type: Option<&'a str>,
-    /// Whose.
+    /// The owner.
     pub owner: NodeId,
     /// The owner's name, for people.
     pub owner_name: &'a str,
-    /// What is wrong with the owner, if anything.
+    /// The problem with the owner, if any.
     pub owner_state: Option<&'a str>,
-    /// Whether the owner's catalogue is here.
+    /// `true` if the owner's catalogue has arrived.
     pub has_catalogue: bool,
-    /// The name that a token leads to, and why it was refused.
+    /// The name from a token, and the reason if it was refused.
     pub token: Option<(Name, Option<RefusedBy>)>,
-    /// What runs.
+    /// The running routes.
     pub routes: Vec<UseRouteView<'a>>,
 }
 
 /// An interface of another node.
 #[derive(Clone, Debug)]
 pub struct UseRouteView<'a> {
-    /// What it is called on the local network.
+    /// The name on the local network.
     pub local_name: String,
-    /// As its owner lists it.
+    /// The entry in the owner's catalogue.
     pub entry: &'a CatalogueEntry,
-    /// Its name.
+    /// The name on the wire.
     pub name: Name,
-    /// What this node's messages on it are written in, if it publishes.
+    /// The form of this node's messages, if it publishes.
     pub form: PayloadForm,
-    /// Whether its owner granted it.
+    /// `true` if the owner granted it.
     pub is_granted: bool,
-    /// Who refused it, and why.
+    /// The refusal, if any.
     pub refused: Option<RefusedBy>,
-    /// Writers for it on the local network; a server, if it is a service.
+    /// The number of local writers, or servers of a service.
     pub writers: usize,
-    /// Local publishers, if it publishes.
+    /// The number of local publishers, if the route publishes.
     pub publishers: usize,
-    /// Whether those are read.
+    /// `true` if the local publishers are read.
     pub is_read: bool,
 }
 
-/// What an owner lists for this node.
+/// An entry of an owner's catalogue.
 #[derive(Clone, Debug)]
 pub struct OfferView<'a> {
-    /// Whose.
+    /// The owner.
     pub owner: NodeId,
-    /// As listed.
+    /// The entry.
     pub entry: &'a CatalogueEntry,
-    /// Its name.
+    /// The name on the wire.
     pub name: Name,
-    /// Whether a rule asks for it.
+    /// `true` if a rule asks for it.
     pub is_used: bool,
 }
 
 impl<R> Routes<R> {
-    /// What was discovered on the local network.
+    /// Returns the endpoints discovered on the local network.
     pub fn local_endpoints(&self) -> impl Iterator<Item = &DiscoveredEndpoint> {
         self.endpoints.values()
     }
 
-    /// The local participants of which nodes are known.
+    /// Returns the local participants whose nodes are known.
     pub fn local_participants(&self) -> impl Iterator<Item = Guid> {
         self.nodes.keys().copied()
     }
 
-    /// The rule that shares a local interface, by its place among [`Self::share_views`].
+    /// Returns the rule that shares a local interface, by its index in [`Self::share_views`].
     pub fn shared_by(&self, kind: Kind, local_name: &str, type_name: &str) -> Option<usize> {
         let by_type = self.share_rule(kind, local_name, Some(type_name));
         by_type.or_else(|| self.share_rule(kind, local_name, None))
     }
 
-    /// An interface that is used, as its owner lists it, and the rule's word for whose it is.
+    /// Returns the entry of a used interface, and its owner.
     pub fn used_entry(&self, name: &Name) -> Option<(NodeId, &CatalogueEntry)> {
         let route = self.uses.get(name)?;
         Some((self.use_rules[route.rule].owner, &route.entry))
     }
 
-    /// Every rule of what is shared.
+    /// Returns all share rules.
     pub fn share_views(&self) -> Vec<ShareView<'_>> {
         let view = |(index, rule)| {
             let rule: &super::ShareRule = rule;
@@ -150,7 +150,7 @@ impl<R> Routes<R> {
         self.share_rules.iter().enumerate().map(view).collect()
     }
 
-    /// Every rule of what is used.
+    /// Returns all use rules.
     pub fn use_views(&self) -> Vec<UseView<'_>> {
         let view = |(index, rule)| {
             let rule: &super::UseRule = rule;
@@ -187,7 +187,7 @@ impl<R> Routes<R> {
         self.use_rules.iter().enumerate().map(view).collect()
     }
 
-    /// What the owners that are followed list for this node.
+    /// Returns the entries of all followed owners.
     pub fn offers(&self) -> impl Iterator<Item = OfferView<'_>> {
         self.catalogues.iter().flat_map(|(owner, catalogue)| {
             catalogue.entries.iter().map(|entry| OfferView {

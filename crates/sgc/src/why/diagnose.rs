@@ -201,11 +201,11 @@ fn walk_parts(graph: &Graph, topic: &str, steps: &mut Walk) -> bool {
     let kinds = [sgc_ros::Interface::Action, sgc_ros::Interface::Parameters];
     let mut is_any = false;
     for part in kinds.into_iter().flat_map(|kind| kind.parts()) {
-        let of_part = merged(walks(graph, &part.name(topic)));
-        is_any |= !of_part.is_empty();
+        let for_part = merged(walks(graph, &part.name(topic)));
+        is_any |= !for_part.is_empty();
         // The parts have most of the way in common.
         let known: BTreeSet<String> = steps.iter().map(|step| step.found.clone()).collect();
-        steps.extend(of_part.into_iter().filter(|step| !known.contains(&step.found)));
+        steps.extend(for_part.into_iter().filter(|step| !known.contains(&step.found)));
         if steps.iter().any(|step| step.verdict == Verdict::Wrong) {
             break;
         }

@@ -1,39 +1,39 @@
-//! What a client is told of the graph: channels, services, and who is connected with what.
+//! The part of the graph that a client sees: channels, services and the connection graph.
 
 use std::collections::BTreeMap;
 
 use tokio_tungstenite::tungstenite::Message as Frame;
 
 use crate::access::Right;
+use crate::definitions::Types;
 use crate::error::GatewayError;
 use crate::graph::{Graph, is_hidden};
 use crate::session::action_of;
-use crate::types::Types;
 
 use super::{CDR, Connection, Level};
 use crate::foxglove::connections::Connections;
 use crate::foxglove::listing::Offer;
-use crate::foxglove::protocol::{Channel, Half, Service, Told};
+use crate::foxglove::protocol::{Channel, Half, ServerMessage, Service};
 
-/// How definitions are written.
+/// The encoding of definitions.
 const SCHEMA_ENCODING: &str = "ros2msg";
-/// Topics, and services, that a client is told of at once.
+/// Most topics, and most services, that are announced at once.
 const TOLD_AT_ONCE: usize = 32;
 
-/// Definitions of both halves of a service.
+/// The definitions of a service's request and response.
 struct Halves {
     request: String,
     response: String,
 }
 
-type Described<T> = Vec<(String, Offer, Result<T, GatewayError>)>;
+type Descriptions<T> = Vec<(String, Offer, Result<T, GatewayError>)>;
 
 impl Connection<'_> {
     fn is_shown(&self, name: &str) -> bool {
         self.options.shows_hidden || !is_hidden(name)
     }
 
-    /// Tells all of who is connected with what, and what changes of it from now on.
+    /// Sends the whole connection graph, and its changes from now on.
     pub(super) fn begin_connections(&mut self) {
         self.connections = Some(Connections::default());
         self.tell_connections(&self.session.graph());
@@ -47,12 +47,12 @@ impl Connection<'_> {
         }
     }
 
-    /// Topics and services that the client may use.
+    /// Returns the topics and services that the client may use.
     fn offers(&self, graph: &Graph) -> (BTreeMap<String, Offer>, BTreeMap<String, Offer>) {
         let may = |right, name: &str| self.session.check(right, name).is_ok();
         let mut topics = BTreeMap::new();
         for (name, info) in graph.topics.iter().filter(|(name, _)| self.is_shown(name)) {
-            // A reader of the gateway's own is there for those who subscribe, and makes no topic.
+            // The gateway's own readers exist only for subscribers and do not make a topic.
             let is_there = !info.publishers.is_empty() || info.subscribers.iter().any(|end| !end.is_own);
             if let Some(type_name) = info.type_name().filter(|_| is_there && may(Right::Subscribe, name)) {
                 let hash = info.type_hash(type_name).map(str::to_owned);
@@ -68,7 +68,7 @@ impl Connection<'_> {
         (topics, services)
     }
 
-    /// Tells what has changed of the graph, a part at a time; false while there is more.
+    /// Sends a part of the graph's changes. Returns `false` while there are more.
     pub(super) async fn tell_graph(&mut self) -> bool {
         let graph = self.session.graph();
         self.tell_connections(&graph);
@@ -78,11 +78,11 @@ impl Connection<'_> {
         let heard: Vec<u32> = heard.map(|(id, _)| *id).collect();
         heard.into_iter().for_each(|id| self.unsubscribe(id));
         if !gone.is_empty() {
-            self.tell(&Told::Unadvertise { channel_ids: &gone });
+            self.tell(&ServerMessage::Unadvertise { channel_ids: &gone });
         }
         let gone = self.services.retain(&services);
         if !gone.is_empty() {
-            self.tell(&Told::UnadvertiseServices { service_ids: &gone });
+            self.tell(&ServerMessage::UnadvertiseServices { service_ids: &gone });
         }
         let topics = self.channels.untold(&topics, self.attempt, TOLD_AT_ONCE);
         let services = self.services.untold(&services, self.attempt, TOLD_AT_ONCE);
@@ -110,7 +110,7 @@ impl Connection<'_> {
         is_all
     }
 
-    fn tell_topics(&mut self, topics: Described<String>) {
+    fn tell_topics(&mut self, topics: Descriptions<String>) {
         let (mut channels, mut replaced) = (Vec::new(), Vec::new());
         for (topic, offer, schema) in topics {
             let schema_name = offer.type_name.clone();
@@ -130,7 +130,7 @@ impl Connection<'_> {
                     channels.push(channel(id, topic, schema_name, schema));
                 }
                 Err(error) => {
-                    // It is shown as there; that it cannot be subscribed to is said, and why.
+                    // The topic is shown, and a status says why it cannot be subscribed to.
                     let id = self.channels.tell_unknown(&topic, offer, self.attempt, true);
                     self.unknown(&schema_name, &error);
                     channels.extend(id.map(|id| channel(id, topic, schema_name, String::new())));
@@ -138,15 +138,15 @@ impl Connection<'_> {
             }
         }
         if !replaced.is_empty() {
-            self.tell(&Told::Unadvertise { channel_ids: &replaced });
+            self.tell(&ServerMessage::Unadvertise { channel_ids: &replaced });
         }
         if !channels.is_empty() || self.is_first {
             self.is_first = false;
-            self.tell(&Told::Advertise { channels: &channels });
+            self.tell(&ServerMessage::Advertise { channels: &channels });
         }
     }
 
-    fn tell_services(&mut self, services: Described<Halves>) {
+    fn tell_services(&mut self, services: Descriptions<Halves>) {
         let mut told = Vec::new();
         for (name, offer, schemas) in services {
             let type_name = offer.type_name.clone();
@@ -170,7 +170,7 @@ impl Connection<'_> {
             }
         }
         if !told.is_empty() {
-            self.tell(&Told::AdvertiseServices { services: &told });
+            self.tell(&ServerMessage::AdvertiseServices { services: &told });
         }
     }
 
@@ -186,7 +186,7 @@ impl Connection<'_> {
     }
 }
 
-/// What messages of a type look like, as text. May read files.
+/// Returns the definition of a message type as text. May read files.
 fn schema(types: &Types, type_name: &str, hash: Option<&str>) -> Result<String, GatewayError> {
     Ok(types.layout(type_name, hash)?.to_ros2msg())
 }

@@ -1,4 +1,4 @@
-//! [`Types`]: what messages look like, by the names of their types.
+//! [`Types`]: the layouts and definitions of message types, by name.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -6,26 +6,26 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use sgc_cdr::{Layout, Library, TypeError, TypeName};
 
-use crate::aside::aside;
 use crate::error::GatewayError;
+use crate::offload::offload;
 
-/// Types remembered; when there are more, all are looked up anew.
+/// Most cached types. Beyond that the cache is emptied.
 const TYPES_MAX: usize = 4096;
 
-/// Where definitions are found beyond those that ship inside. Calls may block for as long as reading a file takes.
+/// A source of definitions beyond those that ship with SGC. Calls may read files and block.
 pub trait FindDefinitions: Send + Sync + 'static {
-    /// The text of the file that defines this type.
+    /// Returns the text of the file that defines this type.
     fn text(&self, file: &TypeName) -> Option<String>;
 
-    /// The type as another node described it, if it has this hash.
+    /// Returns the type as another node described it, if it has this hash.
     fn described(&self, name: &TypeName, hash: Option<&str>) -> Option<Arc<Layout>>;
 }
 
-/// Nothing but what ships inside.
+/// A source without further definitions.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Shipped;
+pub struct ShippedDefinitions;
 
-impl FindDefinitions for Shipped {
+impl FindDefinitions for ShippedDefinitions {
     fn text(&self, _file: &TypeName) -> Option<String> {
         None
     }
@@ -35,14 +35,14 @@ impl FindDefinitions for Shipped {
     }
 }
 
-/// Which kind of interface a type is for.
+/// The kind of interface that a type belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum InterfaceType {
-    /// Of a topic.
+    /// A topic.
     Message,
-    /// Of a service.
+    /// A service.
     Service,
-    /// Of an action.
+    /// An action.
     Action,
 }
 
@@ -55,14 +55,15 @@ impl InterfaceType {
         }
     }
 
-    /// The full name of a type: `std_msgs/String`, as ROS 1 had it and programs still say it, is `std_msgs/msg/String`.
+    /// Returns the full name of a type. `std_msgs/String`, the form of ROS 1 that programs still use, becomes
+    /// `std_msgs/msg/String`.
     pub fn full_name(self, name: &str) -> Result<String, GatewayError> {
         let (kind, what, example) = self.words();
         let full = match name.split('/').collect::<Vec<_>>()[..] {
             [package, short] => format!("{package}/{kind}/{short}"),
             _ => name.to_owned(),
         };
-        // The parts of an action are services and messages of a package's actions.
+        // An action's services and messages have types of kind `action`.
         let fits = |name: &TypeName| name.kind() == kind || name.kind() == "action";
         match full.parse::<TypeName>() {
             Ok(parsed) if fits(&parsed) => Ok(full),
@@ -71,13 +72,13 @@ impl InterfaceType {
     }
 }
 
-/// By name, and by the hash that was asked for.
-type Known = BTreeMap<(String, Option<String>), Arc<Layout>>;
+/// Layouts by type name and requested hash.
+type LayoutCache = BTreeMap<(String, Option<String>), Arc<Layout>>;
 
-/// What messages look like.
+/// The layouts and definitions of message types.
 pub struct Types {
     finder: Box<dyn FindDefinitions>,
-    known: Mutex<Known>,
+    known: Mutex<LayoutCache>,
 }
 
 impl fmt::Debug for Types {
@@ -87,13 +88,13 @@ impl fmt::Debug for Types {
 }
 
 impl Types {
-    /// Asks `finder` first, then takes what ships inside.
+    /// Creates types that ask `finder` first and then use the definitions that ship.
     pub fn new(finder: impl FindDefinitions) -> Self {
         Self { finder: Box::new(finder), known: Mutex::default() }
     }
 
-    /// What messages of a type look like: by a definition here if it has that hash, else as another node described them.
-    /// Where no hash is said the first that is found is taken. May read files.
+    /// Returns the layout of a type: from a local definition with this hash, else from another node's description.
+    /// Without a hash the first one found is used. May read files.
     pub fn layout(&self, type_name: &str, hash: Option<&str>) -> Result<Arc<Layout>, GatewayError> {
         let key = (type_name.to_owned(), hash.map(str::to_owned));
         if let Some(known) = self.lock().get(&key) {
@@ -105,15 +106,15 @@ impl Types {
             example: "std_msgs/msg/String",
         })?;
         let find = || Library::empty().layout(&name, &mut |file| self.finder.text(file));
-        let found = aside(find).map(Arc::new);
+        let found = offload(find).map(Arc::new);
         let is_it = |layout: &Arc<Layout>| hash.is_none_or(|hash| layout.type_hash() == hash);
         let mut is_sure = true;
         let layout = match found {
             Ok(layout) if is_it(&layout) => layout,
-            found => match (aside(|| self.finder.described(&name, hash)), found) {
+            found => match (offload(|| self.finder.described(&name, hash)), found) {
                 (Some(described), _) => described,
-                // A hash that says otherwise may be of another way to compute it; what does not fit is found when decoding. Or
-                // the description is on its way.
+                // The hash may be computed in another way, or the description may still arrive. A wrong layout shows
+                // when decoding.
                 (None, Ok(layout)) => {
                     is_sure = false;
                     layout
@@ -132,7 +133,7 @@ impl Types {
         Ok(layout)
     }
 
-    /// The text of the file that defines a type, among it all of a service's or an action's parts.
+    /// Returns the text of the file that defines a type. A service or action has all its parts in one file.
     pub fn text(&self, type_name: &str) -> Result<String, GatewayError> {
         let unknown = |name: TypeName| GatewayError::Definition(TypeError::Unknown { name, needed_by: None });
         let name: TypeName = type_name.parse().map_err(|_| GatewayError::TypeName {
@@ -142,7 +143,7 @@ impl Types {
         })?;
         let file = TypeName::new(name.package(), name.kind(), name.file_stem());
         let file = file.ok_or_else(|| unknown(name.clone()))?;
-        aside(|| self.finder.text(&file)).or_else(|| Library::shipped(&file)).ok_or_else(|| unknown(name))
+        offload(|| self.finder.text(&file)).or_else(|| Library::shipped(&file)).ok_or_else(|| unknown(name))
     }
 
     /// Returns the file that defines an interface and the files that its parts need. May read them.
@@ -156,7 +157,7 @@ impl Types {
         let mut library = Library::empty();
         for part in parts {
             let Ok(part) = format!("{file}{part}").parse() else { continue };
-            // A type that is known by its description alone has no files.
+            // A type known only by its description has no files.
             let _ = library.layout(&part, &mut |needed| {
                 files.insert(needed.clone());
                 self.text(&needed.to_string()).ok()
@@ -165,7 +166,7 @@ impl Types {
         files
     }
 
-    fn lock(&self) -> MutexGuard<'_, Known> {
+    fn lock(&self) -> MutexGuard<'_, LayoutCache> {
         self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -189,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_found_comes_before_what_ships() {
+    fn found_definitions_precede_shipped_ones() {
         struct One;
         impl FindDefinitions for One {
             fn text(&self, file: &TypeName) -> Option<String> {

@@ -1,4 +1,4 @@
-//! [`Door`]: who comes in, whatever protocol it speaks; and whether those who are in may stay.
+//! [`Admission`]: admits clients of every protocol, bounds their number and disconnects those whose rights end.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
@@ -14,66 +14,66 @@ use sgc_trust::{AddressPrefix, PlaceDecision, PlaceLimits, Places, TrustAnchors,
 use sgc_wire::UnixMillis;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
-use crate::access::{Access, Admission, Client, Credential, Denied};
+use crate::access::{Access, AdmissionRequest, Client, Credential, Denial};
 use crate::access_watch::AccessWatch;
 use crate::clock::WallClock;
 use crate::error::GatewayError;
 use crate::hub::lock;
 use crate::quota::Pool;
 
-/// Connections of other hosts that may be in their handshake at a time.
+/// Most connections of other hosts in their handshake at a time.
 const HANDSHAKES_MAX: usize = 128;
-/// Handshakes of one source: an IPv4 address, or an IPv6 network.
+/// Most handshakes of one source, an IPv4 address or an IPv6 network.
 const HANDSHAKES_OF_HOST_MAX: usize = 16;
-/// The same of programs of this host: nobody else takes these.
+/// Most handshakes of programs on this host. Other hosts cannot use these.
 const HANDSHAKES_LOCAL_MAX: usize = 128;
-/// Part of the places of clients that is kept for programs of this host.
+/// Divisor: one part in this many of all places is reserved for programs on this host.
 const LOCAL_PART: usize = 8;
-/// Part of those of other hosts' clients that one credential may have.
+/// Divisor: one credential may hold one part in this many of the places for other hosts.
 const CREDENTIAL_PART: usize = 4;
-/// Longest token that is looked at, bytes.
+/// Longest token that is examined, in bytes.
 const TOKEN_BYTES_MAX: usize = 32 << 10;
 
-/// A client that is connected.
+/// A connected client, for status.
 #[derive(Clone, Debug, Serialize, PartialEq, Eq)]
 pub struct ClientStatus {
-    /// The name of the client: the label of its token, its node, or its address.
+    /// The name of the client.
     pub name: String,
     /// The protocol: `"rosbridge"`, `"foxglove"` or `"grpc"`.
     pub protocol: String,
     /// The address of the client.
     pub address: String,
-    /// The time of its connection, milliseconds since the Unix epoch.
+    /// The time of admission, in milliseconds since the Unix epoch.
     pub since: u64,
 }
 
-/// The state of the gateway.
+/// The status of the gateway.
 #[derive(Clone, Debug, Default, Serialize, PartialEq, Eq)]
 pub struct GatewayStatus {
-    /// The URLs that the gateway listens at.
+    /// The listening addresses.
     pub listen: Vec<String>,
-    /// The clients that are connected.
+    /// The connected clients.
     pub clients: Vec<ClientStatus>,
-    /// Counts of refused connections, by reason.
+    /// The number of refused connections by reason.
     pub refused: BTreeMap<String, u64>,
-    /// The number of readers on the local network, which all clients share.
+    /// The number of readers on the local network, shared by all clients.
     pub readers: usize,
 }
 
-/// What is known of a connection before its client has said anything.
+/// The properties of a connection before its client has sent anything.
 #[derive(Clone, Debug)]
 pub(crate) struct Arrival {
     pub(crate) peer: SocketAddr,
     pub(crate) is_encrypted: bool,
-    /// What its certificate proves.
+    /// The identity that the certificate proves.
     pub(crate) certificate: Option<VerifiedPeer>,
 }
 
-/// Who comes in.
+/// The admission of clients.
 #[derive(Debug)]
-pub(crate) struct Door {
+pub(crate) struct Admission {
     access: AccessWatch,
-    clients: Mutex<BTreeMap<u64, Entered>>,
+    clients: Mutex<BTreeMap<u64, ClientEntry>>,
     refused: Mutex<BTreeMap<&'static str, u64>>,
     next: AtomicU64,
     clients_max: usize,
@@ -81,27 +81,31 @@ pub(crate) struct Door {
 
 /// A client that has a place.
 #[derive(Debug)]
-struct Entered {
+struct ClientEntry {
     status: ClientStatus,
     credential: Option<Credential>,
     is_local: bool,
 }
 
-/// A place at the gateway; free again when dropped.
+/// A client's place at the gateway, freed on drop.
 #[derive(Debug)]
 pub(crate) struct Place {
-    door: Arc<Door>,
+    admission: Arc<Admission>,
     number: u64,
 }
 
 impl Place {
-    /// Gives the place to another client, unless the places of that client's credential are taken.
+    /// Gives the place to another client, unless all places of that client's credential are taken.
     pub(crate) fn rename(&self, client: &Client) -> Result<(), GatewayError> {
-        let mut clients = lock(&self.door.clients);
-        if let Err(pool) = self.door.check_places(&clients, client, Some(self.number)) {
+        let mut clients = lock(&self.admission.clients);
+        if let Err(pool) = self.admission.check_places(&clients, client, Some(self.number)) {
             drop(clients);
-            self.door.count(no_place(pool));
-            return Err(GatewayError::Crowded { what: "clients", max: self.door.places_max(pool), pool });
+            self.admission.count(no_place(pool));
+            return Err(GatewayError::Crowded {
+                what: "clients",
+                max: self.admission.places_max(pool),
+                pool,
+            });
         }
         if let Some(entered) = clients.get_mut(&self.number) {
             entered.status.name = client.name.to_string();
@@ -113,11 +117,11 @@ impl Place {
 
 impl Drop for Place {
     fn drop(&mut self) {
-        lock(&self.door.clients).remove(&self.number);
+        lock(&self.admission.clients).remove(&self.number);
     }
 }
 
-impl Door {
+impl Admission {
     pub(crate) fn new(access: Access, clients_max: usize) -> Arc<Self> {
         let access = AccessWatch::new(access, WallClock::system());
         let (clients, refused, next) = (Mutex::default(), Mutex::default(), AtomicU64::new(0));
@@ -133,7 +137,7 @@ impl Door {
         self.access.current()
     }
 
-    /// What a certificate proves; an error says why it proves nothing.
+    /// Verifies a certificate chain. Returns `None` if there is no chain or no trust anchor.
     pub(crate) fn judge_certificate(
         anchors: Option<&TrustAnchors>,
         chain: &[CertificateDer<'_>],
@@ -144,15 +148,15 @@ impl Door {
         }
     }
 
-    /// Who this is, if it may come in.
+    /// Admits a client.
     pub(crate) fn admit(
         &self,
         arrival: &Arrival,
         origin: Option<&str>,
         token: Option<&str>,
-    ) -> Result<Client, Denied> {
+    ) -> Result<Client, Denial> {
         let token = token.map(|token| token.get(..TOKEN_BYTES_MAX).unwrap_or(token));
-        let admission = Admission {
+        let admission = AdmissionRequest {
             peer: arrival.peer,
             encrypted: arrival.is_encrypted,
             origin,
@@ -170,7 +174,7 @@ impl Door {
         *lock(&self.refused).entry(why).or_default() += 1;
     }
 
-    /// A place for a client, if there is one.
+    /// Takes a place for a client, if one is free.
     pub(crate) fn enter(
         self: &Arc<Self>,
         client: &Client,
@@ -190,13 +194,15 @@ impl Door {
             address: peer.to_string(),
             since: now().0,
         };
-        clients
-            .insert(number, Entered { status, credential: client.credential(), is_local: client.is_local() });
+        clients.insert(
+            number,
+            ClientEntry { status, credential: client.credential(), is_local: client.is_local() },
+        );
         drop(clients);
-        Some(Place { door: Arc::clone(self), number })
+        Some(Place { admission: Arc::clone(self), number })
     }
 
-    /// Returns the number of places that the clients of a pool have.
+    /// Returns the number of places for the clients of a pool.
     fn places_max(&self, pool: Pool) -> usize {
         let remote = (self.clients_max - self.clients_max / LOCAL_PART).max(1);
         match pool {
@@ -206,15 +212,15 @@ impl Door {
         }
     }
 
-    /// Refuses a client if the places of its credential, of other hosts or of all are taken. `except` is the place that it
-    /// has already.
+    /// Fails if the places of the client's credential, of other hosts or of all clients are taken. `except` is the
+    /// place that the client already has.
     fn check_places(
         &self,
-        clients: &BTreeMap<u64, Entered>,
+        clients: &BTreeMap<u64, ClientEntry>,
         client: &Client,
         except: Option<u64>,
     ) -> Result<(), Pool> {
-        let count = |is_counted: &dyn Fn(&Entered) -> bool| {
+        let count = |is_counted: &dyn Fn(&ClientEntry) -> bool| {
             let others = clients.iter().filter(|(number, _)| Some(**number) != except);
             others.filter(|(_, entered)| is_counted(entered)).count()
         };
@@ -237,14 +243,14 @@ impl Door {
 
     pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
         let counted = lock(&self.refused);
-        // Whatever the protocol: of gRPC each call is admitted.
+        // The count covers all protocols, because gRPC admits each call.
         let denied = Some(("not admitted", self.access.current().denied())).filter(|(_, count)| *count > 0);
         let all = counted.iter().map(|(why, count)| (*why, *count)).chain(denied);
         all.map(|(why, count)| (why.to_owned(), count)).collect()
     }
 }
 
-/// Returns the name under which a refusal for want of a place is counted.
+/// Returns the status key of a refusal for lack of a place.
 fn no_place(pool: Pool) -> &'static str {
     match pool {
         Pool::Credential => "too many clients of one credential",
@@ -253,7 +259,8 @@ fn no_place(pool: Pool) -> &'static str {
     }
 }
 
-/// Connections that have not shown yet who they are: of this host, and of others, where the heaviest source gives way.
+/// Connections whose clients are not admitted yet. Those of this host have their own places; among other hosts the
+/// source with the most handshakes gives way.
 #[derive(Debug)]
 pub(crate) struct Handshakes {
     local: Arc<Semaphore>,
@@ -261,29 +268,29 @@ pub(crate) struct Handshakes {
     next: AtomicU64,
 }
 
-/// A handle by which a handshake of another host is ended.
+/// A handle that ends a handshake of another host.
 #[derive(Debug)]
 struct Holder {
     number: u64,
-    /// `true` once bytes have come.
+    /// `true` once bytes have arrived.
     is_engaged: Arc<AtomicBool>,
-    /// Tells by its end that another handshake has the place.
+    /// Dropping the sender tells the handshake that it lost its place.
     _evict: oneshot::Sender<()>,
 }
 
-/// One connection of these, until dropped.
+/// A connection during its handshake, counted until dropped.
 #[derive(Debug)]
 pub(crate) struct Handshake {
     handshakes: Arc<Handshakes>,
     place: HandshakePlace,
 }
 
-/// A flag that says whether bytes have come in a handshake.
+/// A flag for the arrival of the first bytes of a handshake.
 #[derive(Debug)]
 pub(crate) struct Engagement(Arc<AtomicBool>);
 
 impl Engagement {
-    /// Says that they have: the handshake keeps its place for a moment longer.
+    /// Sets the flag, after which the handshake keeps its place for a moment longer.
     pub(crate) fn begin(&self) {
         self.0.store(true, Ordering::Relaxed);
     }
@@ -291,9 +298,9 @@ impl Engagement {
 
 #[derive(Debug)]
 enum HandshakePlace {
-    /// One of this host's.
+    /// A place of this host.
     Local(#[expect(dead_code, reason = "it is for its end")] OwnedSemaphorePermit),
-    /// One of the others'.
+    /// A place of another host.
     Other { number: u64, is_engaged: Arc<AtomicBool>, evicted: oneshot::Receiver<()> },
 }
 
@@ -306,7 +313,7 @@ impl Default for Handshakes {
 }
 
 impl Handshakes {
-    /// Counts one from there, unless there are too many and none gives way.
+    /// Counts a handshake, unless all places are taken and none gives way.
     pub(crate) fn begin(this: &Arc<Self>, from: IpAddr) -> Option<Handshake> {
         let handshakes = Arc::clone(this);
         if from.to_canonical().is_loopback() {
@@ -316,7 +323,7 @@ impl Handshakes {
         let (prefix, now) = (AddressPrefix::from(from), Instant::now());
         let mut others = lock(&this.others);
         let room = others.make_room(prefix, now, |holder| holder.is_engaged.load(Ordering::Relaxed));
-        // One that gives way ends with what it held.
+        // A handshake that gives way has ended with its holder.
         if matches!(room, PlaceDecision::Refuse(_)) {
             return None;
         }
@@ -331,7 +338,7 @@ impl Handshakes {
 }
 
 impl Handshake {
-    /// Returns the flag by which the reader says that bytes have come.
+    /// Returns the flag that the reader sets when bytes arrive.
     pub(crate) fn engagement(&self) -> Engagement {
         Engagement(match &self.place {
             HandshakePlace::Local(_) => Arc::default(),
@@ -339,7 +346,7 @@ impl Handshake {
         })
     }
 
-    /// Is ready once another handshake has its place.
+    /// Is ready once another handshake has taken the place.
     pub(crate) fn poll_evicted(&mut self, cx: &mut Context<'_>) -> Poll<()> {
         match &mut self.place {
             HandshakePlace::Local(_) => Poll::Pending,
@@ -347,7 +354,7 @@ impl Handshake {
         }
     }
 
-    /// Waits until another handshake has its place.
+    /// Waits until another handshake has taken the place.
     pub(crate) async fn evicted(&mut self) {
         std::future::poll_fn(|cx| self.poll_evicted(cx)).await;
     }
@@ -372,8 +379,14 @@ mod tests {
     use crate::access::{AccessRules, Anonymous};
 
     fn client(access: &Access, peer: SocketAddr) -> Client {
-        let admission =
-            Admission { peer, encrypted: true, origin: None, token: None, certificate: None, now: now() };
+        let admission = AdmissionRequest {
+            peer,
+            encrypted: true,
+            origin: None,
+            token: None,
+            certificate: None,
+            now: now(),
+        };
         access.admit(&admission).unwrap()
     }
 
@@ -381,16 +394,16 @@ mod tests {
     fn silent_hosts_lock_out_neither_others_nor_programs_of_this_one() {
         let handshakes: Arc<Handshakes> = Arc::default();
         let begin = |from: IpAddr| Handshakes::begin(&handshakes, from);
-        // A host of IPv6 has as many addresses as it likes: it is one source, and displaces itself alone.
+        // An IPv6 host with many addresses is one source and displaces only itself.
         let host = |n: u128| IpAddr::from(std::net::Ipv6Addr::from_bits(0x2001_0db8 << 96 | n));
         let silent: Vec<_> = (0..1000).map(|n| begin(host(n)).unwrap()).collect();
         assert_eq!(lock(&handshakes.others).len(), HANDSHAKES_OF_HOST_MAX);
-        // Those who do more than connect are not displaced at once, not by others of the same address either.
+        // A handshake that has sent bytes is not displaced at once, not even by the same address.
         silent.iter().for_each(|handshake| handshake.engagement().begin());
         assert!(begin(host(1001)).is_none());
         let mut honest = begin([192, 0, 2, 7].into()).unwrap();
         honest.engagement().begin();
-        // Many networks, of which each has all that it may: the heaviest makes room, and not who has one.
+        // Among many networks at their limit the heaviest gives way, not a network with one handshake.
         let mut held = Vec::new();
         for network in 1..=20u128 {
             for n in 0..HANDSHAKES_OF_HOST_MAX as u128 {
@@ -408,14 +421,14 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn one_credential_and_other_hosts_leave_places() {
+    async fn credentials_and_other_hosts_leave_places() {
         let all = || Access::new(AccessRules { anonymous: Anonymous::All, ..AccessRules::default() });
-        let (access, door) = (all(), Door::new(all(), 64));
+        let (access, admission) = (all(), Admission::new(all(), 64));
         let enter = |peer: &str| {
             let peer = peer.parse().unwrap();
-            door.enter(&client(&access, peer), "rosbridge", peer)
+            admission.enter(&client(&access, peer), "rosbridge", peer)
         };
-        // Of 64 places 8 are kept for this host, and one credential has a quarter of the others.
+        // Of 64 places 8 are reserved for this host, and one credential may hold a quarter of the rest.
         let mut held: Vec<_> = std::iter::from_fn(|| enter("[2001:db8::1]:1")).collect();
         assert_eq!(held.len(), 14);
         assert!(enter("[2001:db8::2]:1").is_none(), "it is the same host");
@@ -425,7 +438,7 @@ mod tests {
         assert_eq!(held.len(), 56);
         let local: Vec<_> = std::iter::from_fn(|| enter("127.0.0.1:1")).collect();
         assert_eq!(local.len(), 8);
-        let counted = door.refused();
+        let counted = admission.refused();
         assert!(counted["too many clients of one credential"] >= 2, "{counted:?}");
         assert!(counted["too many clients of other hosts"] >= 1, "{counted:?}");
         assert_eq!(counted["too many clients"], 1);

@@ -1,18 +1,18 @@
-//! `GetType`: the text by which a type is defined, and of all that it needs.
+//! `GetType`: the definition of a type as text, with the definitions that it needs.
 
 use sgc_cdr::{Library, TypeName};
 
 use super::fault::Fault;
 use super::proto::GetTypeResponse;
 use super::proto::get_type_response::Definition;
+use crate::definitions::Types;
 use crate::error::GatewayError;
-use crate::types::Types;
 
-/// Parts of which services and actions are made.
+/// The parts of services and actions.
 const SERVICE: [&str; 2] = ["_Request", "_Response"];
 const ACTION: [&str; 3] = ["_Goal", "_Result", "_Feedback"];
 
-/// What a type is. May read files.
+/// Returns the definitions of a type. May read files.
 pub(super) fn describe(types: &Types, type_name: &str) -> Result<GetTypeResponse, Fault> {
     let name: TypeName = type_name.parse().map_err(|_| GatewayError::TypeName {
         name: type_name.to_owned(),
@@ -41,7 +41,7 @@ pub(super) fn describe(types: &Types, type_name: &str) -> Result<GetTypeResponse
             definitions.push(Definition { r#type: file, text: text.clone() });
             Some(text)
         };
-        // What is known as it was described alone has no text.
+        // A type known only by its description has no text.
         let _ = library.layout(&part, &mut look_up);
     }
     Ok(GetTypeResponse { type_hash, definitions })
@@ -50,11 +50,11 @@ pub(super) fn describe(types: &Types, type_name: &str) -> Result<GetTypeResponse
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::types::Shipped;
+    use crate::definitions::ShippedDefinitions;
 
     #[test]
     fn a_type_comes_with_all_that_it_needs() {
-        let types = Types::new(Shipped);
+        let types = Types::new(ShippedDefinitions);
         let twist = describe(&types, "geometry_msgs/msg/TwistStamped").unwrap();
         let names: Vec<_> = twist.definitions.iter().map(|definition| &*definition.r#type).collect();
         assert_eq!(names[0], "geometry_msgs/msg/TwistStamped");
