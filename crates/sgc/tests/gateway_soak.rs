@@ -167,7 +167,7 @@ impl Scene {
             self.until("who came has gone", |gateway| count(gateway) == self.clients + 2).await;
             self.until_unpublished(watcher.client.clone()).await;
             let held = self.node.held();
-            say(&format!("soak: round {}, {} have come and gone: {held:?}", round, self.of_round()));
+            say(&format!("soak: round {}, {} have come and gone: {held:?}", round, self.visits_per_round()));
             rounds.push(held);
         }
         let most = rounds.iter().map(|held| held.resident_kb).max().unwrap_or_default();
@@ -188,7 +188,7 @@ impl Scene {
         assert!(kb <= max, "it holds {kb} kB; {max} kB at most were to be");
     }
 
-    fn of_round(&self) -> usize {
+    fn visits_per_round(&self) -> usize {
         self.connects / ROUNDS
     }
 
@@ -296,8 +296,8 @@ impl Scene {
 
     /// A round of clients who hear something, publish something, and leave.
     async fn come_and_go(&self, round: usize) {
-        let first = round * self.of_round();
-        let visits = (first..first + self.of_round()).map(|number| async move {
+        let first = round * self.visits_per_round();
+        let visits = (first..first + self.visits_per_round()).map(|number| async move {
             match number % 2 {
                 0 => self.visit_by_rosbridge(number).await,
                 _ => self.visit_by_grpc(number).await,

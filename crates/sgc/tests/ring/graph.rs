@@ -63,7 +63,7 @@ impl Edge {
         (0..EDGES.len()).map(Self)
     }
 
-    pub(crate) fn of(node: Node) -> impl Iterator<Item = Self> {
+    pub(crate) fn touching(node: Node) -> impl Iterator<Item = Self> {
         Self::all().filter(move |edge| edge.end(End::Dialling) == node || edge.end(End::Listening) == node)
     }
 
@@ -119,7 +119,7 @@ impl Fault {
     pub(crate) fn edges(&self) -> Vec<Edge> {
         match self {
             Self::Cut { edge, .. } => vec![*edge],
-            Self::Isolate { proxy, cut: true } => Edge::of(*proxy).collect(),
+            Self::Isolate { proxy, cut: true } => Edge::touching(*proxy).collect(),
             Self::Kill { .. } | Self::Stop { .. } | Self::Isolate { .. } => Vec::new(),
         }
     }
@@ -129,7 +129,7 @@ impl Fault {
         match self {
             Self::Kill { router, .. } | Self::Stop { router } => vec![*router],
             Self::Isolate { proxy, cut: false } => {
-                Edge::of(*proxy).map(|edge| edge.end(End::Listening)).collect()
+                Edge::touching(*proxy).map(|edge| edge.end(End::Listening)).collect()
             }
             Self::Cut { .. } | Self::Isolate { .. } => Vec::new(),
         }
@@ -170,7 +170,7 @@ impl Graph {
             if std::mem::replace(&mut reached[node.0], true) || (node != start && !node.is_router()) {
                 continue;
             }
-            for edge in Edge::of(node).filter(|edge| self.edges[edge.0]) {
+            for edge in Edge::touching(node).filter(|edge| self.edges[edge.0]) {
                 let (a, b) = (edge.end(End::Dialling), edge.end(End::Listening));
                 let other = if a == node { b } else { a };
                 if !other.is_router() || self.routers[other.0] {

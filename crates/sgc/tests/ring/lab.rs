@@ -68,7 +68,7 @@ impl Lab {
 
     fn write_config(&self, node: Node, topics: &[&str]) {
         let name = node.name();
-        let urls: Vec<_> = Edge::of(node)
+        let urls: Vec<_> = Edge::touching(node)
             .filter(|edge| edge.end(End::Dialling) == node)
             .map(|edge| format!("\"{}\"", self.url(edge)))
             .collect();

@@ -117,7 +117,7 @@ pub(crate) struct Row {
 }
 
 impl Row {
-    pub(crate) fn of(numbers: impl IntoIterator<Item = u64>) -> Self {
+    pub(crate) fn from_numbers(numbers: impl IntoIterator<Item = u64>) -> Self {
         let mut row = Self::default();
         let mut seen = BTreeSet::new();
         for number in numbers {
@@ -143,10 +143,10 @@ impl Row {
 
 #[test]
 fn rows_are_judged() {
-    assert_eq!(Row::of([]), Row::default());
-    let whole = Row::of(3..9);
+    assert_eq!(Row::from_numbers([]), Row::default());
+    let whole = Row::from_numbers(3..9);
     assert_eq!((whole.first, whole.last, whole.received, whole.lost()), (3, 8, 6, 0));
     assert!(whole.doubled.is_empty() && whole.late.is_empty());
-    let row = Row::of([2, 3, 7, 5, 7, 3, 11]);
+    let row = Row::from_numbers([2, 3, 7, 5, 7, 3, 11]);
     assert_eq!((row.gaps, row.doubled, row.late), (vec![(4, 4), (6, 6), (8, 10)], vec![7, 3], vec![5]));
 }

@@ -309,7 +309,7 @@ impl Run {
             listener.peer.end();
             let summary = listener.peer.summary();
             // The peer counts for itself; that both counts agree speaks for ours.
-            let doubled = Row::of(listener.got.iter().map(|(_, seq)| *seq)).doubled.len() as u64;
+            let doubled = Row::from_numbers(listener.got.iter().map(|(_, seq)| *seq)).doubled.len() as u64;
             assert_eq!(summary["duplicated"].as_u64(), Some(doubled), "{}: {summary}", listener.name());
         }
         for talker in &mut self.talkers {
@@ -323,7 +323,7 @@ impl Run {
         for listener in &self.listeners {
             let talker = self.talkers.iter().find(|t| t.topic.name == listener.topic.name).unwrap();
             let (name, last) = (listener.name(), talker.last().unwrap());
-            let row = Row::of(listener.got.iter().map(|(_, seq)| *seq));
+            let row = Row::from_numbers(listener.got.iter().map(|(_, seq)| *seq));
             let sent = last + 1 - row.first;
             let share = row.received as f64 / sent as f64;
             report.push(format!(

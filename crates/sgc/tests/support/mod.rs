@@ -142,7 +142,7 @@ impl Running {
     }
 
     /// What it has of the system now.
-    pub(crate) fn held(&self) -> Held {
+    pub(crate) fn held(&self) -> ResourceUse {
         let pid = self.pid();
         let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
         let number = |key: &str| {
@@ -150,7 +150,7 @@ impl Running {
             line.split_whitespace().nth(1).unwrap().parse().unwrap()
         };
         let fds = fs::read_dir(format!("/proc/{pid}/fd")).unwrap().count();
-        Held { resident_kb: number("VmRSS:"), fds, threads: number("Threads:") as usize }
+        ResourceUse { resident_kb: number("VmRSS:"), fds, threads: number("Threads:") as usize }
     }
 }
 
@@ -163,7 +163,7 @@ impl Drop for Running {
 
 /// What a process has of the system.
 #[derive(Debug)]
-pub(crate) struct Held {
+pub(crate) struct ResourceUse {
     pub(crate) resident_kb: u64,
     pub(crate) fds: usize,
     pub(crate) threads: usize,

@@ -43,7 +43,7 @@ impl Topic {
 }
 
 #[derive(Default)]
-struct Shared {
+struct Exchange {
     said: AtomicU64,
     heard: Mutex<Vec<(Instant, u64)>>,
     /// Nothing more is to be said.
@@ -54,7 +54,7 @@ struct Shared {
 
 pub(crate) struct Flow {
     pub(crate) topic: Topic,
-    shared: Arc<Shared>,
+    exchange: Arc<Exchange>,
     talker: Option<JoinHandle<()>>,
     _reader: FakeReader,
     _net: FakeRos,
@@ -73,9 +73,9 @@ pub(crate) struct Verdict {
 
 impl Flow {
     pub(crate) fn start(topic: Topic, robot: &FakeDomain, desk: &FakeDomain) -> Self {
-        let shared = Arc::<Shared>::default();
+        let exchange = Arc::<Exchange>::default();
         let net = desk.join(false);
-        let hears = Arc::clone(&shared);
+        let hears = Arc::clone(&exchange);
         let handler = Box::new(move |sample: Sample| {
             let number = u64::from_le_bytes(sample.payload[4..12].try_into().unwrap());
             hears.heard.lock().unwrap().push((Instant::now(), number));
@@ -83,7 +83,7 @@ impl Flow {
         let reader = net.create_reader(&topic.spec(), handler).unwrap();
         let near = robot.join(false);
         let writer = near.create_writer(&topic.spec()).unwrap();
-        let its = Arc::clone(&shared);
+        let its = Arc::clone(&exchange);
         let talker = std::thread::spawn(move || {
             let _near = near;
             for number in 1.. {
@@ -101,27 +101,27 @@ impl Flow {
                 std::thread::sleep(topic.period);
             }
         });
-        Self { topic, shared, talker: Some(talker), _reader: reader, _net: net }
+        Self { topic, exchange, talker: Some(talker), _reader: reader, _net: net }
     }
 
     /// The number of what was said last.
     pub(crate) fn said(&self) -> u64 {
-        self.shared.said.load(SeqCst)
+        self.exchange.said.load(SeqCst)
     }
 
     /// Whether this, or something after it, was heard.
     pub(crate) fn has_heard(&self, number: u64) -> bool {
-        self.shared.heard.lock().unwrap().iter().rev().any(|(_, heard)| *heard >= number)
+        self.exchange.heard.lock().unwrap().iter().rev().any(|(_, heard)| *heard >= number)
     }
 
     /// Says no more.
     pub(crate) fn end(&self) {
-        self.shared.ends.store(true, SeqCst);
+        self.exchange.ends.store(true, SeqCst);
     }
 
     /// What became of it all; the outage is the longest one since then.
     pub(crate) fn judge(&self, since: Instant) -> Verdict {
-        let heard = self.shared.heard.lock().unwrap();
+        let heard = self.exchange.heard.lock().unwrap();
         let mut gap = Duration::ZERO;
         for pair in heard.windows(2).filter(|pair| pair[1].0 >= since) {
             gap = gap.max(pair[1].0 - pair[0].0);
@@ -151,7 +151,7 @@ impl Flow {
 impl Drop for Flow {
     fn drop(&mut self) {
         self.end();
-        self.shared.is_over.store(true, SeqCst);
+        self.exchange.is_over.store(true, SeqCst);
         let _ = self.talker.take().map(JoinHandle::join);
     }
 }
