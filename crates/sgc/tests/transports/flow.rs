@@ -1,4 +1,4 @@
-//! A stream of numbered messages from an application at the robot to one at the desk, and what became of them.
+//! A stream of numbered messages from an application at the robot to one at the desk, and its verdict.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::SeqCst};
 use std::sync::{Arc, Mutex};
@@ -10,7 +10,7 @@ use sgc_ros::{EndpointSpec, RosNetwork, RosWriter, Sample, SampleKind, dds_topic
 use sgc_testkit::{FakeDomain, FakeReader, FakeRos};
 use sgc_wire::{History, Qos, Reliability};
 
-/// What flows.
+/// A topic of the stream.
 #[derive(Clone, Copy)]
 pub(crate) struct Topic {
     pub(crate) name: &'static str,
@@ -46,9 +46,9 @@ impl Topic {
 struct Exchange {
     said: AtomicU64,
     heard: Mutex<Vec<(Instant, u64)>>,
-    /// Nothing more is to be said.
+    /// The talker sends no more messages.
     ends: AtomicBool,
-    /// Nor will be asked for what was.
+    /// The listener needs no more retransmissions.
     is_over: AtomicBool,
 }
 
@@ -60,13 +60,13 @@ pub(crate) struct Flow {
     _net: FakeRos,
 }
 
-/// What became of a flow around something that happened.
+/// The result of a flow around an event.
 pub(crate) struct Verdict {
-    /// The longest that nothing came, beyond what is usual.
+    /// Longest time without a message, beyond the usual gap.
     pub(crate) outage: Duration,
     pub(crate) lost: u64,
     pub(crate) doubled: u64,
-    /// Messages that came behind a later one.
+    /// Messages that came after a later one.
     pub(crate) late: u64,
     pub(crate) heard: u64,
 }
@@ -104,22 +104,22 @@ impl Flow {
         Self { topic, exchange, talker: Some(talker), _reader: reader, _net: net }
     }
 
-    /// The number of what was said last.
+    /// Returns the number of the last sent message.
     pub(crate) fn said(&self) -> u64 {
         self.exchange.said.load(SeqCst)
     }
 
-    /// Whether this, or something after it, was heard.
+    /// Returns `true` if this message or a later one was received.
     pub(crate) fn has_heard(&self, number: u64) -> bool {
         self.exchange.heard.lock().unwrap().iter().rev().any(|(_, heard)| *heard >= number)
     }
 
-    /// Says no more.
+    /// Ends the sending.
     pub(crate) fn end(&self) {
         self.exchange.ends.store(true, SeqCst);
     }
 
-    /// What became of it all; the outage is the longest one since then.
+    /// Judges all messages. The outage is the longest one since `since`.
     pub(crate) fn judge(&self, since: Instant) -> Verdict {
         let heard = self.exchange.heard.lock().unwrap();
         let mut gap = Duration::ZERO;
@@ -136,7 +136,7 @@ impl Flow {
         let all = numbers.len() as u64;
         numbers.dedup();
         let different = numbers.len() as u64;
-        // What was said before the first that was heard was said to nobody.
+        // Messages before the first received one had no subscriber.
         let span = numbers.last().map_or(0, |last| last - numbers[0] + 1);
         Verdict {
             outage: gap.saturating_sub(self.topic.period),

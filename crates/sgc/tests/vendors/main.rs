@@ -46,14 +46,14 @@ impl fmt::Display for Case {
     }
 }
 
-/// What became of a case.
+/// The outcome of a case.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Outcome {
-    /// All of it, once.
+    /// All messages arrived once.
     Whole,
-    /// Intact and once, but not all: where the vendors do no better with nothing between them.
+    /// Not all messages arrived, but each intact and once. Permitted where the vendors lose some without sgc as well.
     Part,
-    /// Nothing, where fragments that are lost are not sent again.
+    /// No message arrived. Permitted where lost fragments are not sent again.
     Nothing,
     Failed,
 }
@@ -87,7 +87,7 @@ impl Case {
         at(self.from) * VENDORS.len() + at(self.to)
     }
 
-    /// True for one quality of each pair and type, such that each quality meets each pair and each type.
+    /// Returns `true` for one quality of each pair and type, chosen so that each quality meets each pair and each type.
     fn is_in_the_short_run(&self) -> bool {
         (self.pair() + self.kind) % 4 == self.quality()
     }
@@ -96,14 +96,14 @@ impl Case {
         format!("/v/{self}")
     }
 
-    /// True where the vendors lose some with nothing between them but stock socket buffers (`tests/peers/README.md`,
-    /// `WEAK` in `check.py`): what comes is to be intact and once, and something is to come.
+    /// Returns `true` where the vendors lose messages without sgc, over stock socket buffers (`tests/peers/README.md`, `WEAK` in
+    /// `check.py`). Some messages must come, each intact and once.
     fn is_weak(&self) -> bool {
         self.from != "cyclone" && KINDS[self.kind] == "pointcloud"
     }
 
-    /// True where a lost fragment is a lost message, so that of several hundred fragments in one burst nothing may come through,
-    /// as happens with nothing in between, too.
+    /// Returns `true` where a lost fragment is a lost message, so that a burst of several hundred fragments may lose everything,
+    /// as it may without sgc.
     fn is_chance(&self) -> bool {
         !self.reliable && self.kind >= SMALL
     }
