@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use sgc_endpoint::{Event, JoinStatus, RefusedBy};
-use sgc_testkit::{Captured, DataDrop, Member, NodeKey, Sharing, What, World, identity};
+use sgc_testkit::{CapturedFrame, DataDrop, Member, NodeKey, Sharing, What, World, identity};
 use sgc_trust::{Identity, Suite};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Class, Control, Decode, JoinBody, NodeId, Packet, PacketHeader,
@@ -50,7 +50,7 @@ fn assert_flows(scene: &mut Scene) {
 
 /// The last frame from one node to another that `is` the one.
 fn last(world: &World, from: NodeKey, to: NodeKey, is: impl Fn(&Control) -> bool) -> Control {
-    let of_link = |c: &&Captured| (c.from, c.to) == (from, to) && is(&c.frame);
+    let of_link = |c: &&CapturedFrame| (c.from, c.to) == (from, to) && is(&c.frame);
     world.captured().iter().rev().find(of_link).expect("such a frame was sent").frame.clone()
 }
 
@@ -448,7 +448,7 @@ fn frames_before_the_greeting_and_a_second_greeting_close_the_link() {
     let hello = last(&world, mallory, east, |f| matches!(f, Control::Hello(_)));
     world.inject(mallory, east, &hello);
     world.run(ms(500));
-    let closed = |l: &&sgc_testkit::Logged| {
+    let closed = |l: &&sgc_testkit::LogEntry| {
         l.node == east && matches!(l.what, What::Closed { reason: sgc_router::LinkClose::Greeting })
     };
     assert_eq!(world.log().iter().filter(closed).count(), 1);

@@ -151,7 +151,7 @@ fn a_restarted_neighbour_supersedes_its_old_link_at_once() {
     world.run(ms(10));
     world.start(arm);
     world.run(ms(500));
-    let closed = |l: &&sgc_testkit::Logged| {
+    let closed = |l: &&sgc_testkit::LogEntry| {
         l.node == cloud
             && matches!(l.what, What::Closed { reason: LinkClose::Superseded { alive: false, .. } })
     };
@@ -519,7 +519,7 @@ fn a_flow_moves_to_a_shorter_way_without_a_gap() {
         world.run(ms(500));
         let received = world.received(desk, arm, "/chatter");
         assert_eq!(received[received.len() - published.len()..], published, "{}", world.trace());
-        assert_eq!(Model::of(&world).check(&world), Ok(()), "{}", world.trace());
+        assert_eq!(Model::from_world(&world).check(&world), Ok(()), "{}", world.trace());
     }
 }
 
@@ -681,5 +681,5 @@ fn a_slow_owner_is_given_up_in_time_and_asked_again() {
     world.thaw(arm);
     assert_flows(&mut world, arm, desk);
     world.run(ms(20_000));
-    assert_eq!(Model::of(&world).check(&world), Ok(()));
+    assert_eq!(Model::from_world(&world).check(&world), Ok(()));
 }

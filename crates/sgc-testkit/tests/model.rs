@@ -361,12 +361,12 @@ impl Run {
         let begin = self.world.elapsed();
         // What nobody noticed yet may look as it should.
         self.pass(IDLE_MAX + ms(500));
-        let mut model = Model::of(&self.world);
+        let mut model = Model::from_world(&self.world);
         while let Err(why) = model.check(&self.world) {
             let waited = self.world.elapsed() - begin;
             assert!(waited < QUIET_MAX, "after {waited:?} of quiet: {why}");
             self.pass(ms(500));
-            model = Model::of(&self.world);
+            model = Model::from_world(&self.world);
         }
         let took = self.world.elapsed() - begin;
         self.slowest = self.slowest.max(took);
@@ -409,7 +409,7 @@ impl Run {
     fn check_histories(&self, model: &Model) {
         let world = &self.world;
         for ((owner, topic), sharing) in &self.shared {
-            let of_topic = |p: &&sgc_testkit::Published| p.owner == *owner && p.topic == *topic;
+            let of_topic = |p: &&sgc_testkit::PublishedMessage| p.owner == *owner && p.topic == *topic;
             let Some(last) = world.all_published().iter().rev().find(of_topic) else { continue };
             let current = world.all_published().iter().filter(of_topic).filter(|p| p.source == last.source);
             let mut history: Vec<_> = current.map(|p| p.id).collect();

@@ -152,7 +152,7 @@ struct State {
 
 /// Which data a router passes on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Feed {
+enum FeedRule {
     /// What any granted or draining branch says.
     EveryBranch,
     /// The same, but nothing over a wire that is itself the way up of a branch.
@@ -217,7 +217,7 @@ struct Tree {
     gapless: bool,
     /// Whether changes may end, so that what is left can be looked at.
     settles: bool,
-    feed: Feed,
+    feed: FeedRule,
     broken: Option<Broken>,
 }
 
@@ -359,7 +359,7 @@ impl Tree {
         let feeding = |b: &&Branch| b.at == at && b.down == down && b.stage != Stage::Pending;
         if !s.branches.iter().any(|b| feeding(&b)) {
             s.fed.remove(&(at, down));
-        } else if self.feed == Feed::FallBack
+        } else if self.feed == FeedRule::FallBack
             && !s.branches.iter().filter(feeding).any(|b| b.up == up)
             && let Some(other) = s.branches.iter().rfind(feeding)
         {
@@ -493,9 +493,9 @@ impl Tree {
         b.stage != Stage::Pending
             && match self.feed {
                 _ if b.down == Port::Local => true,
-                Feed::EveryBranch => true,
-                Feed::NeverUp => !s.branches.iter().any(|other| other.at == b.at && other.up == b.down),
-                Feed::LastGranted | Feed::FallBack => s.fed.get(&(b.at, b.down)) == Some(&b.up),
+                FeedRule::EveryBranch => true,
+                FeedRule::NeverUp => !s.branches.iter().any(|other| other.at == b.at && other.up == b.down),
+                FeedRule::LastGranted | FeedRule::FallBack => s.fed.get(&(b.at, b.down)) == Some(&b.up),
             }
     }
 
@@ -817,7 +817,7 @@ impl Tree {
             budget: Budget::default(),
             gapless: false,
             settles: true,
-            feed: Feed::LastGranted,
+            feed: FeedRule::LastGranted,
             broken: None,
         }
     }
@@ -879,7 +879,7 @@ impl Tree {
         self
     }
 
-    fn fed(self, feed: Feed) -> Self {
+    fn fed(self, feed: FeedRule) -> Self {
         Tree { feed, ..self }
     }
 
@@ -949,9 +949,9 @@ fn a_change_of_the_way_alone_leaves_no_gap() {
 
 #[test]
 fn other_ways_to_feed_let_data_circulate() {
-    Tree::ring().fed(Feed::EveryBranch).refutes(NO_CIRCLE);
-    Tree::ring().fed(Feed::NeverUp).refutes(NO_CIRCLE);
-    Tree::ring().with(2, 1, 0, 1).fed(Feed::FallBack).refutes(NO_CIRCLE);
+    Tree::ring().fed(FeedRule::EveryBranch).refutes(NO_CIRCLE);
+    Tree::ring().fed(FeedRule::NeverUp).refutes(NO_CIRCLE);
+    Tree::ring().with(2, 1, 0, 1).fed(FeedRule::FallBack).refutes(NO_CIRCLE);
 }
 
 #[test]

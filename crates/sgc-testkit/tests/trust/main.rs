@@ -21,7 +21,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use sgc_endpoint::Event;
-use sgc_testkit::{Captured, Logged, MessageId, NodeKey, Sharing, What, World, WorldConfig};
+use sgc_testkit::{CapturedFrame, LogEntry, MessageId, NodeKey, Sharing, What, World, WorldConfig};
 use sgc_wire::{Control, Packet, SinkId, TopicGrant};
 
 const fn ms(n: u64) -> Duration {
@@ -126,7 +126,7 @@ fn assert_nothing_received(world: &World, user: NodeKey, owner: NodeKey, publish
 
 /// What happened at a node since a line of the log.
 fn events(world: &World, node: NodeKey, from: usize) -> impl Iterator<Item = (&Event, Duration)> {
-    world.log()[from..].iter().filter(move |l| l.node == node).filter_map(|l: &Logged| match &l.what {
+    world.log()[from..].iter().filter(move |l| l.node == node).filter_map(|l: &LogEntry| match &l.what {
         What::Event(event) => Some((event, l.at)),
         _ => None,
     })
@@ -150,7 +150,7 @@ fn packets(world: &World, from: NodeKey, to: NodeKey) -> Vec<Packet> {
 
 /// The frames that went from one node to another, in their order.
 fn frames(world: &World, from: NodeKey, to: NodeKey) -> Vec<Control> {
-    let of_link = |c: &&Captured| (c.from, c.to) == (from, to);
+    let of_link = |c: &&CapturedFrame| (c.from, c.to) == (from, to);
     world.captured().iter().filter(of_link).map(|c| c.frame.clone()).collect()
 }
 

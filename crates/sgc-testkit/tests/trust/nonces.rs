@@ -14,14 +14,14 @@ use crate::ms;
 type Slot = (Name, u8, u32, SourceId, Option<SinkId>, u64, u16);
 
 /// What a key and a nonce may be used for once: what was authenticated, and the sealed text.
-type Sealed = (PacketHeader, Vec<u8>);
+type SealedText = (PacketHeader, Vec<u8>);
 
 fn slot(header: &PacketHeader) -> Slot {
     let PacketHeader { name, suite, epoch, source, to, seq, index, .. } = *header;
     (name, suite, epoch, source, to, seq, index)
 }
 
-fn sealed(packet: &Packet) -> Sealed {
+fn sealed(packet: &Packet) -> SealedText {
     let mut payload = Vec::new();
     packet.payload.copy_into(&mut payload);
     // A signature may differ each time it is made.
@@ -66,7 +66,7 @@ fn key_of(packet: &Packet, keys: &[TopicGrant]) -> Option<usize> {
 /// Two packets that share key and nonce and are not the same.
 fn repeated(world: &World) -> Option<String> {
     let keys = keys(world);
-    let mut seen: BTreeMap<Slot, Vec<(Packet, Sealed)>> = BTreeMap::new();
+    let mut seen: BTreeMap<Slot, Vec<(Packet, SealedText)>> = BTreeMap::new();
     for captured in world.captured_packets() {
         let packet = &captured.packet;
         let slot = slot(&packet.header);
