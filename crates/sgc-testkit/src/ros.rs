@@ -17,7 +17,7 @@ use sgc_ros::{
 };
 use sgc_wire::{History, Qos};
 
-/// How often, at intervals of one millisecond, a request looks for its server.
+/// Number of times that a request looks for its server before it fails.
 const PEER_LOOKS: u64 = 100;
 const PEER_LOOK_MS: u64 = 10;
 /// Bytes of the encapsulation header, which client, number and body follow.

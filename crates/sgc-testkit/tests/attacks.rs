@@ -1,4 +1,4 @@
-//! What those who are in the network but not to be trusted try, and what comes of it: nothing, and it is counted.
+//! Attacks of untrusted nodes inside the network. Each achieves nothing and is counted.
 
 use std::time::Duration;
 
@@ -294,7 +294,7 @@ fn a_node_of_another_fleet_is_refused_by_routers_and_owner() {
 }
 
 #[test]
-fn who_asks_to_publish_is_told_that_it_is_not_offered() {
+fn request_to_publish_is_refused_where_it_is_not_offered() {
     let mut scene = scene(10);
     assert_flows(&mut scene);
     let Scene { world, arm, west, desk, .. } = &mut scene;

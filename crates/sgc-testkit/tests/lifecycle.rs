@@ -1,4 +1,4 @@
-//! What owners, users and routers live through: starts and ends in every order, cuts, leases, histories.
+//! The life of owners, users and routers: starts and ends in every order, cuts, leases, histories.
 
 use std::time::Duration;
 
@@ -187,7 +187,7 @@ fn clean_shutdown_withdraws_names_at_once() {
     });
     assert!(at - begin < ms(300), "{:?}", at - begin);
     world.run(ms(500));
-    // What is left is the operator's own catalogue.
+    // Only the operator's own catalogue is left.
     let stats = world.stats(cloud);
     assert_eq!((stats.routed_names, stats.branches, stats.tombstones), (1, 0, 2));
     assert_eq!(world.status(desk, arm, "/chatter"), Some(JoinStatus::Waiting));
@@ -214,7 +214,7 @@ fn an_owner_that_falls_silent_is_forgotten_when_its_lease_ends() {
 }
 
 #[test]
-fn who_is_not_listed_is_refused_with_the_reason_and_sees_nothing() {
+fn unlisted_node_is_refused_with_reason_and_sees_nothing() {
     let Line { mut world, arm, desk, .. } = line(7);
     world.share(arm, "/secret", Sharing::to(&[arm]));
     world.share(arm, "/chatter", Sharing::to(&[desk]));
@@ -543,7 +543,7 @@ fn an_owner_cut_off_from_a_ring_is_lost_at_once_without_counting_up() {
 }
 
 #[test]
-fn whoever_is_granted_is_near_enough_for_data_and_the_rest_has_no_route() {
+fn only_nodes_within_hop_limit_are_granted_and_others_have_no_route() {
     let mut world = World::new(40);
     let arm = world.proxy("arm-1");
     let mut chain = vec![arm];

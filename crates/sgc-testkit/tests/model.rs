@@ -77,16 +77,16 @@ struct Run {
     cables: Vec<(NodeKey, NodeKey)>,
     cut: BTreeSet<(NodeKey, NodeKey)>,
     shared: BTreeMap<(NodeKey, &'static str), Sharing>,
-    /// Who may get what: permitted when it was published, shortly before, or while it was history.
+    /// The nodes that may get each message: permitted when it was published, shortly before, or while it was history.
     permitted: BTreeMap<MessageId, BTreeSet<NodeKey>>,
-    /// Who lost a right a moment ago, and until when that may not be known everywhere: what goes to others may
-    /// overtake the word of it.
+    /// The nodes that just lost a right, and the time until which routers may not know it: messages to other nodes may overtake
+    /// the news.
     lapsing: Vec<(NodeKey, &'static str, BTreeSet<NodeKey>, Duration)>,
     revoked: Vec<NodeKey>,
     routers: Vec<NodeKey>,
     /// Nodes whose clocks are wrong.
     wrong_clocks: BTreeSet<NodeKey>,
-    /// True once any was.
+    /// Set once any clock was changed.
     clocks: bool,
     slowest: Duration,
 }
@@ -312,7 +312,7 @@ impl Run {
         self.note_lapsing();
         self.world.reshare(node, topic, sharing.clone());
         self.shared.insert((node, topic), sharing);
-        // Who may have the topic may have its history.
+        // A node that may have the topic may have its history.
         let permitted = Model::permitted(&self.world, node, topic);
         let published = self.world.all_published().iter();
         for p in published.filter(|p| p.owner == node && p.topic == topic) {
@@ -359,7 +359,7 @@ impl Run {
             self.world.set_ahead(node, Duration::ZERO);
         }
         let begin = self.world.elapsed();
-        // What nobody noticed yet may look as it should.
+        // A change that no node has noticed yet must not pass for a settled state.
         self.pass(IDLE_MAX + ms(500));
         let mut model = Model::from_world(&self.world);
         while let Err(why) = model.check(&self.world) {
@@ -405,7 +405,7 @@ impl Run {
         self.check_log();
     }
 
-    /// Whoever has a transient-local topic has the last messages of its source.
+    /// Checks that each subscriber of a transient-local topic has the last messages of its source.
     fn check_histories(&self, model: &Model) {
         let world = &self.world;
         for ((owner, topic), sharing) in &self.shared {
@@ -437,7 +437,7 @@ impl Run {
         }
     }
 
-    /// Of each source a use gets the messages in order, from the first that it got on, and leaves out none.
+    /// Checks that a use gets the messages of each source in order and without gaps from the first one on.
     fn check_order(&self) {
         let published = self.world.all_published();
         let mut numbers = BTreeMap::new();
@@ -484,7 +484,7 @@ impl Run {
                 },
                 What::DataDrop { why, .. } => match why {
                     DataDrop::HopLimit | DataDrop::Sink(SinkDrop::Head | SinkDrop::Inconsistent) => false,
-                    // Of an owner that started anew.
+                    // Packets of an earlier run of the owner.
                     DataDrop::Sink(SinkDrop::Open(why)) => {
                         matches!(why, OpenError::Forged | OpenError::Epoch { .. })
                     }

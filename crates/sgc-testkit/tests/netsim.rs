@@ -91,7 +91,7 @@ fn a_cut_path_passes_nothing_until_it_is_restored() {
 }
 
 #[test]
-fn what_a_relay_loses_is_counted() {
+fn relay_counts_lost_datagrams() {
     let profile = Profile { loss: Loss::Random(0.5), ..Profile::default() };
     let (relay, client, server) = udp_path(profile);
     for _ in 0..200 {

@@ -1,4 +1,4 @@
-//! Ways that break and heal while a reliable topic flows: every message, once, in order.
+//! Paths break and heal while a reliable topic flows. Every message arrives once and in order.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -83,7 +83,7 @@ impl Diamond {
     }
 }
 
-/// What may happen to the way, at both ends seen at once or late.
+/// Breaks the path in one of several ways, which its ends see at once or late.
 fn breaks(diamond: &mut Diamond, how: usize) {
     let (used, north, south) = (diamond.used(), diamond.north, diamond.south);
     let world = &mut diamond.world;
@@ -158,7 +158,7 @@ fn the_last_messages_before_a_silence_arrive_over_another_way() {
         for sharing in [Sharing::to_fleet(), Sharing::to_fleet().transient_local(1)] {
             let mut diamond = diamond(140 + how as u64, 2, sharing);
             diamond.publish(ms(5), ms(200), 8);
-            // What is on the way is lost with it, and nothing follows.
+            // Packets in flight are lost with the path, and no later message follows.
             breaks(&mut diamond, how);
             diamond.publish(ms(1), ms(3), 8);
             diamond.assert_all();
@@ -199,7 +199,7 @@ fn the_way_of_the_owner_itself_may_break() {
 }
 
 #[test]
-fn what_the_source_keeps_no_more_is_counted_and_the_rest_goes_on() {
+fn expired_messages_are_counted_as_lost_and_the_rest_goes_on() {
     let mut diamond = diamond(170, 2, Sharing::to_fleet().recovering(20));
     diamond.publish(ms(10), ms(200), 8);
     diamond.world.run(ms(200));
@@ -263,7 +263,7 @@ fn a_way_that_changes_sends_no_history_twice() {
     assert_eq!(replayed, 0, "nothing was lost");
 }
 
-/// Who was not there is sent nothing of a volatile topic, whatever it asks for, on whatever way.
+/// A late subscriber of a volatile topic gets no earlier message, whatever it asks for and over whatever path.
 #[test]
 fn nothing_older_than_the_grant_is_sent_again() {
     let mut diamond = diamond(210, 1, Sharing::to_fleet());
@@ -296,7 +296,7 @@ fn nothing_older_than_the_grant_is_sent_again() {
     ask(world);
     let all = sent(world);
     assert!(all.keys().all(|seq| *seq == 0 || *seq > 20) && all[&0] == 3, "{all:?}");
-    // What is published from then on it may have again, also on another way.
+    // It may get later messages again, also over another path.
     let first = world.publish(*arm, TOPIC);
     world.run(ms(300));
     for _ in 0..2 {

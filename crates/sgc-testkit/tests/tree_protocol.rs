@@ -119,7 +119,7 @@ impl Sink {
     }
 }
 
-/// What may still happen before things settle.
+/// The events that may still happen before the state settles.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 struct Budget {
     hops: u8,
@@ -139,7 +139,7 @@ struct State {
     /// Each router's next hop towards the owner.
     hops: Vec<Option<Port>>,
     sinks: Vec<Sink>,
-    /// Which sink each id was made for.
+    /// The sink for which each id was made.
     ids: Vec<u8>,
     /// At which node which port is fed from where.
     fed: BTreeMap<(Node, Port), Port>,
@@ -150,10 +150,10 @@ struct State {
     granted_again: bool,
 }
 
-/// Which data a router passes on.
+/// The rule by which a router passes on data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum FeedRule {
-    /// What any granted or draining branch says.
+    /// Data from any granted or draining branch.
     EveryBranch,
     /// The same, but nothing over a wire that is itself the way up of a branch.
     NeverUp,
@@ -192,7 +192,7 @@ enum Broken {
     NoDraining,
     /// Nothing ends a branch that drains: it has no deadline, and the sink does not leave it.
     NoEnd,
-    /// What is removed at its deadline is not told upwards.
+    /// A branch that is removed at its deadline sends no leave upwards.
     NoLeaveOnDeadline,
     /// The sink asks again with the id that it had.
     SameIdAgain,
@@ -535,7 +535,7 @@ impl Tree {
                 onward.entry((up, b.at)).or_default().insert((down, self.far_end(down, b.at)));
             }
         }
-        // What leads nowhere is on no circle.
+        // A node without a next hop is on no circle.
         loop {
             let before = onward.len();
             let begins: BTreeSet<(Wire, Node)> = onward.keys().copied().collect();
@@ -568,7 +568,7 @@ impl Tree {
         false
     }
 
-    /// What a state must be like in which nothing is left to do.
+    /// Checks a state in which no event is left.
     fn complete(&self, s: &State) -> bool {
         let hops = self.right_hops(s);
         let mut wanted = 0;
@@ -790,7 +790,7 @@ impl Model for Tree {
                 s.branches.iter().all(|b| b.stage != Stage::Pending) || !s.settled || !model.silent(s)
             }),
         ];
-        // What must happen, or the rest is true of nothing.
+        // The events that must occur, or the checks would hold trivially.
         if self.settles {
             properties.push(Property::sometimes("it comes to an end", |model: &Tree, s: &State| {
                 s.settled && model.actions_of(s).is_empty()

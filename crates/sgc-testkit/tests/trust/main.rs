@@ -1,4 +1,4 @@
-//! Keys that change, rights that end, and what recorded, forged and foreign things come to: the machines in a
+//! Keys that change, rights that end, and recorded, forged and foreign frames: the machines in a
 //! network with a virtual clock.
 //!
 //! Links, handshakes and files are tested where they are made; here a "router that colludes" is one whose links
@@ -110,21 +110,21 @@ fn publish_steadily(
     published
 }
 
-/// Of these messages `user` got each one exactly once, and in their order.
+/// Asserts that `user` got each of these messages exactly once and in order.
 fn assert_received(world: &World, user: NodeKey, owner: NodeKey, published: &[MessageId]) {
     let received: Vec<_> =
         world.received(user, owner, "/chatter").into_iter().filter(|id| published.contains(id)).collect();
     assert_eq!(received, published, "at {user:?}\n{}", world.trace());
 }
 
-/// Of these messages `user` got none.
+/// Asserts that `user` got none of these messages.
 fn assert_nothing_received(world: &World, user: NodeKey, owner: NodeKey, published: &[MessageId]) {
     let received = world.received(user, owner, "/chatter");
     let leaked: Vec<_> = published.iter().filter(|id| received.contains(id)).collect();
     assert!(leaked.is_empty(), "{user:?} got {leaked:?}\n{}", world.trace());
 }
 
-/// What happened at a node since a line of the log.
+/// Returns the events at a node since a line of the log.
 fn events(world: &World, node: NodeKey, from: usize) -> impl Iterator<Item = (&Event, Duration)> {
     world.log()[from..].iter().filter(move |l| l.node == node).filter_map(|l: &LogEntry| match &l.what {
         What::Event(event) => Some((event, l.at)),
@@ -159,7 +159,7 @@ fn drops(world: &World, node: NodeKey, key: &str) -> usize {
     world.router_drops(node).iter().filter(|d| **d == key).count()
 }
 
-/// What a node's sinks refused, by its counter, and how often.
+/// Returns how often a node's sinks refused packets, by counter.
 fn sink_drops(world: &World, node: NodeKey) -> BTreeMap<&'static str, usize> {
     let mut counts = BTreeMap::new();
     for dropped in world.data_drops(node) {

@@ -10,10 +10,10 @@ use sgc_wire::{Name, Packet, PacketHeader, SinkId, SourceId, TopicGrant};
 
 use crate::ms;
 
-/// What a key and a nonce are made of, as far as a packet shows it.
+/// The inputs of key and nonce that a packet shows.
 type Slot = (Name, u8, u32, SourceId, Option<SinkId>, u64, u16);
 
-/// What a key and a nonce may be used for once: what was authenticated, and the sealed text.
+/// The authenticated data and the sealed text, for which a key and a nonce may be used once.
 type SealedText = (PacketHeader, Vec<u8>);
 
 fn slot(header: &PacketHeader) -> Slot {
@@ -49,7 +49,7 @@ fn keys(world: &World) -> BTreeMap<(Name, u32), Vec<TopicGrant>> {
     keys
 }
 
-/// Which of the keys opens a packet.
+/// Returns the index of the key that opens a packet.
 fn key_of(packet: &Packet, keys: &[TopicGrant]) -> Option<usize> {
     let header = &packet.header;
     let mut payload = Vec::new();

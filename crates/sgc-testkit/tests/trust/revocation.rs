@@ -21,7 +21,7 @@ fn cut_and_rekeyed(world: &World, owner: NodeKey, from: usize) -> (Duration, Dur
 }
 
 #[test]
-fn who_is_taken_out_of_a_policy_is_cut_at_once_and_the_others_lose_nothing() {
+fn node_removed_from_policy_is_cut_at_once_and_others_lose_nothing() {
     for seed in 0..12 {
         let mut scene = flowing_with(slow(seed), |s| if seed % 2 == 0 { s.best_effort() } else { s });
         let users = scene.without(scene.tab);
@@ -107,7 +107,7 @@ fn a_removed_member_opens_nothing_of_the_new_epoch_with_the_keys_that_it_kept() 
 }
 
 #[test]
-fn who_is_taken_out_during_a_rotation_does_not_keep_the_key_under_way() {
+fn node_removed_during_rotation_cannot_use_the_pending_key() {
     // The epoch that was being granted when it was cut never begins: it has its key.
     let mut scene = flowing(22);
     let Scene { world, arm, desk, lap, tab, .. } = &mut scene;
@@ -136,7 +136,7 @@ fn who_is_taken_out_during_a_rotation_does_not_keep_the_key_under_way() {
 }
 
 #[test]
-fn who_left_before_it_was_taken_out_does_not_keep_the_key_in_use() {
+fn node_that_left_before_its_removal_does_not_keep_the_key_in_use() {
     for revoked in [true, false] {
         let mut scene = flowing(24);
         let Scene { world, arm, desk, lap, tab, .. } = &mut scene;
@@ -529,7 +529,7 @@ fn deafen(world: &mut World, from: NodeKey, to: NodeKey) {
 }
 
 #[test]
-fn one_router_that_knows_is_enough_to_cut_a_revoked_branch() {
+fn single_informed_router_cuts_revoked_branch() {
     let mut scene = flowing(46);
     let Scene { world, arm, east, west, tab, .. } = &mut scene;
     // Neither the owner nor the router in front of the thief hears of it.

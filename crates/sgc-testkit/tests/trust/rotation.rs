@@ -1,4 +1,4 @@
-//! A new epoch: a new key for those who stay, without one message lost or doubled.
+//! New epochs: the remaining members get a new key, and no message is lost or repeated.
 
 use std::time::Duration;
 
@@ -201,7 +201,7 @@ fn a_new_epoch_while_the_way_moves_leaves_all_with_its_key() {
             scene.world.until_granted(user, scene.arm, "/chatter");
         }
         scene.world.run(ms(6000));
-        // What was under way on a cut cable comes again from the history; once is guaranteed, and all.
+        // Packets in flight on a cut cable come again from the history; each message arrives exactly once.
         for user in scene.users() {
             let mut received = received_by(&scene.world, user, scene.arm, &published);
             received.sort_unstable();
@@ -212,7 +212,7 @@ fn a_new_epoch_while_the_way_moves_leaves_all_with_its_key() {
 }
 
 #[test]
-fn who_joins_between_two_epochs_gets_all_from_then_on() {
+fn node_that_joins_between_epochs_gets_all_later_messages() {
     for seed in 0..8 {
         let mut scene = flowing(seed);
         let Scene { world, arm, lap, tab, .. } = &mut scene;
