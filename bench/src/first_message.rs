@@ -1,4 +1,4 @@
-//! From the moment at which a publisher's link is up to its first message at a subscriber that waits for it.
+//! Measures the time from a publisher's link to its first message at a waiting subscriber.
 //!
 //! Subscriber and router are up. The publisher's node starts with an application on its local network that was there
 //! before: so each run has everything in it that a start has, the owner's advertisements, the subscriber's requests to
@@ -26,13 +26,13 @@ use crate::report::{Report, Spread, Table, digits};
 
 const TOPIC: &str = "/first";
 const MESSAGE_BYTES: usize = 1024;
-/// How often the application publishes that does not keep its messages: as finely is its first one timed.
+/// Period of a publisher without a history, which is the resolution of the measurement.
 const EVERY: Duration = Duration::from_micros(200);
 
 /// When this process logged last that a link is up.
 static LINK_UP: Mutex<Option<Instant>> = Mutex::new(None);
 
-/// What the publisher's application does.
+/// The kind of publisher.
 #[derive(Clone, Copy, Serialize)]
 #[serde(rename_all = "snake_case")]
 enum Publisher {

@@ -31,7 +31,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// What routing costs: the first three below, one after the other
+    /// Measure the cost of routing: the first three below, one after the other
     All(RunArgs),
     /// 1 KB through one router, beside a plain TCP relay and a zenoh router
     Forward(RunArgs),
@@ -74,24 +74,24 @@ enum Command {
     },
 }
 
-/// What is rendered, and where to.
+/// The arguments of `report`.
 #[derive(Args)]
 struct ReportArgs {
     /// The `compare.json` of a run
     #[arg(value_name = "FILE")]
     run: PathBuf,
-    /// Where `report.md` and its plots go
+    /// Directory for `report.md` and its plots
     #[arg(long, value_name = "DIR", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/results"))]
     out: PathBuf,
 }
 
-/// What every part is given.
+/// The arguments of every part.
 #[derive(Args, Clone)]
 struct RunArgs {
     /// The program whose router is measured
     #[arg(long, value_name = "FILE", default_value = "target/release/sgc")]
     sgc: PathBuf,
-    /// Where the JSON goes
+    /// Directory for the JSON
     #[arg(long, value_name = "DIR", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/results"))]
     out: PathBuf,
     /// Names in the router, for `rib`

@@ -1,4 +1,4 @@
-//! Whole nodes in this process, with local networks in memory instead of DDS: what is left is SGC and its links.
+//! Whole nodes in this process, with local networks in memory instead of DDS, so that only SGC and its links are measured.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -72,7 +72,7 @@ impl Node {
         status(&self.socket)
     }
 
-    /// What its only share or use is doing.
+    /// Returns the state of its only share or use.
     pub(crate) fn route_state(&self) -> Result<String> {
         Ok(self.status()?["routes"][0]["state"].as_str().unwrap_or_default().to_owned())
     }
@@ -112,7 +112,7 @@ pub(crate) fn share(topic: &str, to: &str, suite: Suite) -> Result<ShareConfig> 
     Ok(ShareConfig { suite, ..share })
 }
 
-/// The same topic at that node.
+/// Returns the use of the same topic at that node.
 pub(crate) fn usage(topic: &str, from: &str) -> Result<UseConfig> {
     let mut config = parse(&format!("[[use]]\nfrom = \"{from}\"\ntopic = \"{topic}\"\n"))?;
     config.uses.pop().context("a use")

@@ -1,4 +1,4 @@
-//! Processes that are measured: started, found by the address that they print, ended by closing their standard input.
+//! Measured processes: started, found by the address that they print, ended by closing their standard input.
 
 use std::collections::HashMap;
 use std::ffi::OsString;
@@ -83,7 +83,7 @@ pub(crate) fn until_stdin_closes() {
 /// `sgc run` as a router.
 pub(crate) struct SgcRouter {
     pub(crate) process: Server,
-    /// Where it listens.
+    /// The URL on which it listens.
     pub(crate) url: String,
     socket: PathBuf,
 }
@@ -112,13 +112,13 @@ impl SgcRouter {
         Ok(Self { process, url, socket })
     }
 
-    /// How many names it has a route for.
+    /// Returns the number of names for which it has a route.
     pub(crate) fn routed_names(&self) -> Result<u64> {
         let status = status(&self.socket)?;
         status["router"]["routed_names"].as_u64().context("a status without `routed_names`")
     }
 
-    /// How many links it has.
+    /// Returns the number of its links.
     pub(crate) fn links(&self) -> Result<usize> {
         Ok(status(&self.socket)?["links"].as_array().context("a status without `links`")?.len())
     }
@@ -144,7 +144,7 @@ impl SgcRouter {
     }
 }
 
-/// What a node says at its status socket.
+/// Asks a node for its status.
 pub(crate) fn status(socket: &Path) -> Result<serde_json::Value> {
     let mut stream = UnixStream::connect(socket).with_context(|| socket.display().to_string())?;
     stream.write_all(sgc_node::admin::AdminRequest::Status.to_line().as_bytes())?;

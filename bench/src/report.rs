@@ -1,4 +1,4 @@
-//! What comes out: tables for people, JSON for programs, and which machine it was.
+//! The output: tables for people, JSON for programs, and the description of the machine.
 
 use std::fs;
 use std::path::Path;
@@ -22,7 +22,7 @@ pub(crate) struct Table {
     pub(crate) rows: Vec<Vec<String>>,
 }
 
-/// Where it was measured: enough to compare by, nothing that tells whose machine it is.
+/// The machine, with enough detail for comparison and nothing that identifies it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Machine {
     cpu: String,
@@ -75,7 +75,7 @@ impl Report {
     }
 }
 
-/// What of `/proc/cpuinfo` decides how fast ciphers and hashes are.
+/// Flags of `/proc/cpuinfo` that decide the speed of ciphers and hashes.
 const INSTRUCTIONS: [&str; 7] = ["aes", "vaes", "pclmulqdq", "sha_ni", "avx2", "avx512f", "sha2"];
 
 impl Machine {
@@ -160,7 +160,7 @@ pub(crate) fn digits(figure: f64) -> String {
     }
 }
 
-/// The same for thousands.
+/// Formats a figure in thousands.
 pub(crate) fn thousands(figure: f64) -> String {
     format!("{} k", digits(figure / 1000.0))
 }

@@ -1,4 +1,4 @@
-//! Driving a robot over a thin uplink while its camera wants three times what that carries.
+//! Measures driving a robot over a thin uplink while its camera sends three times the uplink's rate.
 //!
 //! Robot, router and desk are nodes of this process, so that one clock times all; the robot is in one network namespace, the
 //! others in another, and the emulated uplink is between them. Each run has nodes and an uplink of its own.
@@ -23,11 +23,11 @@ use crate::node::{Listener, Node, Talker, wait};
 use crate::report::{Report, Spread, Table, digits};
 use crate::uplink::{self, FAR, Uplink};
 
-/// What the uplink carries, bits a second.
+/// Rate of the uplink, in bits per second.
 const UPLINK_RATE: u64 = 5_000_000;
-/// What the way back carries.
+/// Rate of the way back, in bits per second.
 const DOWNLINK_RATE: u64 = 20_000_000;
-/// What may wait for either.
+/// Bound of either queue.
 const QUEUE: Duration = Duration::from_millis(200);
 /// One way, in each direction.
 const DELAYS: [Duration; 2] = [Duration::ZERO, Duration::from_millis(40)];
@@ -36,14 +36,14 @@ const PORT: u16 = 7447;
 const WARM_UP: Duration = Duration::from_secs(3);
 /// Afterwards, for what is under way.
 const SETTLE: Duration = Duration::from_secs(2);
-/// Where number and time of sending are in a payload: behind the CDR encapsulation header.
+/// Offset of number and time of sending in a payload, behind the CDR encapsulation header.
 const NUMBER_AT: usize = 4;
 const STAMP_AT: usize = 12;
 
 /// The zero of the time stamps.
 static EPOCH: LazyLock<Instant> = LazyLock::new(Instant::now);
 
-/// One of the three.
+/// One of the three topics.
 struct Topic {
     name: &'static str,
     /// Towards the robot.
@@ -81,7 +81,7 @@ const TOPICS: [Topic; 3] = [
     },
 ];
 
-/// What became of a topic.
+/// The result of a topic.
 #[derive(Clone, Copy, Default, Serialize)]
 struct Outcome {
     /// From publishing to the subscriber, milliseconds.
@@ -102,7 +102,7 @@ struct Figures {
     camera: Outcome,
     /// The longest that a packet waited at the uplink, milliseconds.
     queue_ms_max: f64,
-    /// What the uplink dropped because its queue was full.
+    /// Packets that the uplink dropped because its queue was full.
     overflowed: u64,
     uplink_mbit_per_second: f64,
 }
@@ -305,7 +305,7 @@ impl Flow {
         self.shared.arrivals.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Of what was said from one number on until another.
+    /// Summarises the messages from one number up to another.
     fn outcome(&self, from: u64, to: u64, time: Duration) -> Outcome {
         let arrivals = self.arrivals();
         let ages: Vec<_> = arrivals

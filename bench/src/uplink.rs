@@ -1,4 +1,4 @@
-//! Two places joined by one bad path: network namespaces, with the emulator of `sgc_testkit::netsim` between them.
+//! Two network namespaces joined by one bad path, the emulator of `sgc_testkit::netsim`.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};

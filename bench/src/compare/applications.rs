@@ -1,6 +1,6 @@
-//! Table `applications`: those of the paper, as requests and answers of their sizes.
+//! Table `applications`: the paper's applications, as requests and answers of their sizes.
 //!
-//! What they compute takes no time here: it would be the same in every row, and hide what is compared.
+//! Their computation takes no time here, because it would be the same in every row and hide the differences.
 
 use std::time::Duration;
 
@@ -23,7 +23,7 @@ const CONNECT_MAX: Duration = Duration::from_secs(30);
 /// How much longer than it may take is waited for what a program says.
 const SPARE: Duration = Duration::from_secs(5);
 
-/// What goes there and what comes back.
+/// Sizes of requests and answers.
 struct Application {
     name: &'static str,
     /// Bytes.
@@ -109,13 +109,13 @@ impl Turn {
         let most = plan.patience * (1 + plan.warm_up) + Duration::from_secs_f64(plan.seconds) + SPARE;
         let answered = self.ask.until("answered", most).with_context(|| application.name)?;
         let answered: Answered = serde_json::from_value(answered).context("what a program was answered")?;
-        // What was given up still fills the path.
+        // Abandoned messages still fill the path.
         let goes_on = answered.lost == 0;
         Ok((answered, goes_on.then_some(self)))
     }
 }
 
-/// What a program that asks says of its answers.
+/// The asking program's report.
 #[derive(Deserialize)]
 struct Answered {
     round_trips_us: Vec<f64>,

@@ -1,4 +1,4 @@
-//! One way: a program that sends and some that count, at the two ends of a system, and what came of their runs.
+//! One-way flows: a sending program and counting ones at the two ends of a system, and the results of their runs.
 
 use std::time::Duration;
 
@@ -17,12 +17,12 @@ const QUIET: Duration = Duration::from_secs(3);
 /// How much longer than it may take is waited for an answer.
 const SPARE: Duration = Duration::from_secs(10);
 
-/// Who sends what to whom.
+/// The ends and the topic of a flow.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FlowSpec {
     /// The topic.
     pub(crate) topic: &'static str,
-    /// Where it is sent from; it is counted at the other place.
+    /// The sending place. The other place counts.
     pub(crate) from: Side,
     /// Readers there, all of one process in each local network.
     pub(crate) readers: usize,
@@ -45,7 +45,7 @@ pub(crate) struct Order {
     pub(crate) rate: Option<f64>,
 }
 
-/// What came of it.
+/// The result of a run.
 #[derive(Clone, Debug)]
 pub(crate) struct Outcome {
     /// Messages written.
@@ -102,7 +102,7 @@ impl Flow {
         Self::start_between(lab, &running.dds[spec.from as usize], &there, spec)
     }
 
-    /// The same from a local network here to several there.
+    /// Starts a flow from a local network here to several there.
     pub(crate) fn start_between(lab: &Lab, here: &Dds, there: &[Dds], spec: &FlowSpec) -> Result<Self> {
         let (depth, readers) = (spec.depth.to_string(), spec.readers.to_string());
         let mut args = vec!["--topic", spec.topic, "--depth", &depth];

@@ -30,10 +30,10 @@ const TABLE: &str = "footprint";
 const TOPICS: [usize; 5] = [0, 1, 10, 100, 1000];
 const NAMES: [usize; 4] = [0, 10_000, 100_000, 1_000_000];
 const LINKS: [usize; 4] = [1, 10, 100, 1000];
-/// What only takes long stays out of a run that shows that all works.
+/// Most topics, links or names in a quick run, which only shows that all works.
 const QUICK_MAX: usize = 100;
 const QUICK_NAMES_MAX: usize = 10_000;
-/// What the topics' names begin with.
+/// Prefix of the topics' names.
 const TOPIC: &str = "/footprint/t";
 /// ROS domains of the two ends.
 const DOMAINS: [u32; 2] = [41, 42];
@@ -74,7 +74,7 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     Ok(())
 }
 
-/// What is the same for all.
+/// The parts that all measurements share.
 struct Stage {
     program: PathBuf,
     is_quick: bool,

@@ -27,7 +27,7 @@ pub(crate) enum Stroke {
     Dotted,
 }
 
-/// What numbers on an axis are.
+/// The unit of an axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Unit {
     /// A number without a unit.
@@ -254,7 +254,7 @@ impl Unit {
         join(&three_digits(value / scale), unit)
     }
 
-    /// What numbers of this size are divided by, and what then stands behind them.
+    /// Returns the divisor for numbers of this size, and the unit that follows them.
     pub(crate) fn scale(self, value: f64) -> (f64, &'static str) {
         // A number that would be written as 1000 of the smaller unit is one of the larger.
         let value = value.abs() * 1.0005;
@@ -353,7 +353,7 @@ impl Scale {
         (value - self.low) / (self.high - self.low)
     }
 
-    /// Where lines go, in the unit of the axis: decades, or round steps of which there are four to nine.
+    /// Returns the positions of grid lines in the unit of the axis: decades, or four to nine round steps.
     fn ticks(&self) -> Vec<f64> {
         if self.is_logarithmic {
             let decades = self.low.floor() as i32..=self.high.floor() as i32;

@@ -215,7 +215,7 @@ impl Measurement {
 struct Scene {
     running: Running,
     lab: Lab,
-    /// Where the program at the right end is: at the left place if both are on one host.
+    /// Place of the program at the right end, which is the left place if both are on one host.
     far: Side,
     /// The environments of both ends.
     environments: [PathBuf; 2],
@@ -330,7 +330,7 @@ fn library_of(environment: &Path) -> PathBuf {
 #[derive(Debug, Deserialize)]
 struct Published {
     sent: u64,
-    /// Of those, messages that DDS did not take.
+    /// Messages that DDS did not take.
     refused: u64,
 }
 

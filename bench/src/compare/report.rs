@@ -17,7 +17,7 @@ use super::real_ros2;
 use super::round_trip::GAVE_UP;
 use crate::report::Machine;
 
-/// What a run leaves behind.
+/// The results of a run.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Run {
     machine: Machine,
@@ -36,7 +36,7 @@ pub(crate) struct Page {
 }
 
 impl Run {
-    /// What was measured here and now.
+    /// Returns the results of a run on this machine.
     pub(crate) fn here(figures: Figures, is_quick: bool) -> Self {
         Self { machine: Machine::here(), is_quick, figures }
     }
@@ -110,13 +110,13 @@ longest. `group`, `standard` and `paper` are SGC's cipher suites: sealed with a 
 source (the default); the paper's choices. *with a router*: through an `sgc` router process, otherwise one node dials the \
 other. A dash is what was not measured.\n\n";
 
-/// What is known of a table.
+/// The description of a table.
 struct About<'a> {
     table: &'a str,
     title: &'a str,
     /// A paragraph, and an empty line.
     says: &'a str,
-    /// What `at` counts; nothing if it counts nothing.
+    /// The meaning of `at`; empty if it has none.
     at: &'static str,
     at_unit: Unit,
     plot: Plot,
@@ -296,7 +296,7 @@ fn distinct<'a>(names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
     distinct
 }
 
-/// What stands beside goals.
+/// The note beside goals.
 const BESIDE: &str = "Ours is by QUIC, the default; *by TCP* is the same suite over the transport that most peers use here. \
                       *Bare relay* is what two programs reach that do nothing but carry messages between DDS and a TCP \
                       connection, in the clear: with short messages little is left to gain below it.";
@@ -414,7 +414,7 @@ struct Family<'a> {
     metrics: Vec<&'a str>,
 }
 
-/// What a metric is of a distribution, in the order of a cell.
+/// The quantiles of a distribution, in the order of a cell.
 const QUANTILES: [&str; 3] = ["p50", "p99", "max"];
 
 /// A metric without its quantile, if it has one: `state_p50_us` is `state_?_us`.
@@ -494,7 +494,7 @@ impl Family<'_> {
     }
 }
 
-/// What a metric's name says: the unit, the factor to it, and the name in words.
+/// Parses a metric's name to its unit, the factor to it, and the name in words.
 fn measure(metric: &str) -> (Unit, f64, String) {
     const SUFFIXES: [(&str, Unit, f64); 7] = [
         ("us", Unit::Seconds, 1e-6),
@@ -676,7 +676,7 @@ fn curve_plots(figures: &Figures, about: &About<'_>, path: &str) -> Vec<Page> {
                 .iter()
                 .filter_map(|system| {
                     let its = here.iter().filter(|f| f.system == *system && f.metric == metric);
-                    // What was measured last at a place counts, as in the tables.
+                    // The last measurement at a place counts, as in the tables.
                     let mut points: Vec<_> = its.rev().map(|f| (f.at, f.value * factor)).collect();
                     points.sort_by(|a, b| a.0.total_cmp(&b.0));
                     points.dedup_by_key(|point| point.0);
@@ -701,7 +701,7 @@ fn curve_plots(figures: &Figures, about: &About<'_>, path: &str) -> Vec<Page> {
     pages
 }
 
-/// What a vertical axis says.
+/// Returns the title of a vertical axis.
 fn axis_title(words: &str, unit: Unit) -> &str {
     match (words, unit) {
         ("p50" | "", Unit::Seconds) => "median time",

@@ -20,7 +20,7 @@ use crate::report::Spread;
 
 const PING: &str = "/bench/ping";
 const PONG: &str = "/bench/pong";
-/// Of a size that never came back: how long it was waited for, µs.
+/// The metric of a size that never came back: the length of the wait in µs.
 pub(crate) const GAVE_UP: &str = "gave_up_us";
 /// Bytes of a message.
 const SIZES: [usize; 7] = [16, 100, 1000, 8 << 10, 64 << 10, 1 << 20, 13 << 20];
@@ -87,7 +87,7 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     Ok(())
 }
 
-/// What is measured. A short run leaves out on thin paths what takes their time alone.
+/// Returns the measured sizes. A short run skips sizes that take long on thin paths.
 fn sizes(kind: &PathKind, quick: bool) -> &'static [usize] {
     match kind {
         PathKind::Bare => &SIZES,
@@ -99,7 +99,7 @@ fn sizes(kind: &PathKind, quick: bool) -> &'static [usize] {
 /// Samples by system and size.
 pub(crate) type Samples = BTreeMap<(String, usize), Sample>;
 
-/// What was measured of one size.
+/// The round trips of one size.
 #[derive(Debug, Default)]
 pub(crate) struct Sample {
     /// Each round trip, µs.
@@ -120,7 +120,7 @@ fn add(samples: &mut Samples, name: &str, sizes: &[usize], measured: Vec<Sample>
     }
 }
 
-/// Who has turns.
+/// The participants of the rounds.
 #[derive(Clone, Copy)]
 enum Who<'a> {
     System(&'a dyn System),
@@ -182,7 +182,7 @@ impl Turn {
         let round_trips = measured["round_trips_us"].as_array().context("no round trips")?;
         let round_trips_us = round_trips.iter().filter_map(serde_json::Value::as_f64).collect();
         let lost = measured["lost"].as_u64().context("no count of what was lost")?;
-        // What was given up still fills the path.
+        // Abandoned messages still fill the path.
         let goes_on = lost == 0 || size < LARGE_BYTES;
         Ok((Sample { round_trips_us, lost, patience: plan.patience }, goes_on.then_some(self)))
     }

@@ -3,10 +3,10 @@
 
 use anyhow::Result;
 
-/// What one of several came to.
+/// The result of one participant.
 #[derive(Debug)]
 pub(crate) struct Turn<R> {
-    /// Of each stage that it went through.
+    /// The results of its finished stages.
     pub(crate) stages: Vec<R>,
     /// Why there are no more.
     pub(crate) error: Option<anyhow::Error>,

@@ -29,16 +29,16 @@ const NUMBER_WITHIN_BYTES: usize = 160;
 const DEPTH: u32 = 1000;
 /// Messages that are handed to gRPC ahead.
 const AHEAD: usize = 64;
-/// What is given to the socket before it is flushed, bytes.
+/// Bytes passed to the socket before it is flushed.
 const FLUSH_BYTES: usize = 64 << 10;
-/// What may be under way to a client of gRPC, bytes: as much as TCP lets be.
+/// Most bytes in flight to a client of gRPC, as many as TCP permits.
 const WINDOW_BYTES: u32 = 16 << 20;
 
 /// A protocol and an encoding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Way {
     RosbridgeJson,
-    /// What is heard is CBOR with CDR in it; what is said is JSON, since clients can say nothing else.
+    /// Received messages are CBOR with CDR inside. Sent ones are JSON, because clients can send nothing else.
     RosbridgeCborRaw,
     GrpcCdr,
     GrpcJson,

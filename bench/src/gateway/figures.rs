@@ -1,4 +1,4 @@
-//! What came of it: figures by way and size, and tables of them.
+//! The figures by protocol and size, and their tables.
 
 use serde::Serialize;
 
@@ -15,7 +15,7 @@ pub(super) struct Figure {
     pub(super) size: usize,
     /// From the client to the DDS program and back, all rounds together, µs.
     pub(super) round_trip_us: Spread,
-    /// How many were timed.
+    /// Number of timed round trips.
     round_trips: usize,
     /// From the DDS program to the client.
     pub(super) down: Rate,
@@ -32,7 +32,7 @@ pub(super) struct Figure {
 pub(super) struct Rate {
     /// Messages a second that arrived.
     pub(super) per_second: f64,
-    /// Of those that were said, how many did not, of 100.
+    /// Percentage of sent messages that did not arrive.
     lost_percent: f64,
     /// CPU time of the gateway's process by messages that arrived, µs.
     cpu_us: f64,

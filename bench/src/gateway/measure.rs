@@ -1,4 +1,4 @@
-//! What is timed: a message to DDS and back, messages from DDS, messages to it.
+//! Times round trips to DDS, messages from DDS, and messages to DDS.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
@@ -12,20 +12,20 @@ use tokio::time::{Instant, sleep, timeout};
 use super::client::{Hearer, Sayer, Way};
 use super::scene::{DOWN, PING, PONG, Scene, UP, now_ns, numbered};
 
-/// How long the way may take to be through.
+/// Longest time until the path carries messages.
 const CONNECT_MAX: Duration = Duration::from_secs(30);
-/// How long a message is waited for before it is said again, while the way may not be through.
+/// Time after which a message is repeated while the path may not be up yet.
 const HELLO_EVERY: Duration = Duration::from_millis(200);
-/// How long an answer is waited for.
+/// Longest wait for an answer.
 const ANSWER_MAX: Duration = Duration::from_secs(10);
 /// A run is over when its last message is there, or when nothing has come for so long.
 const QUIET: Duration = Duration::from_secs(2);
-/// How often it is looked.
+/// Period of polling.
 const LOOK: Duration = Duration::from_millis(2);
-/// How much longer than it may take is waited for a program's answer.
+/// Additional wait for a program's answer, beyond its own limit.
 const SPARE: Duration = Duration::from_secs(20);
 
-/// How much is measured.
+/// The extent of a measurement.
 pub(super) struct Plan {
     warm_up: usize,
     round_trips: usize,
@@ -98,7 +98,7 @@ struct Sent {
     begun_ns: u64,
 }
 
-/// What the client has heard of a run.
+/// The messages of a run that the client has received.
 #[derive(Default)]
 struct Heard {
     run: AtomicU32,

@@ -17,7 +17,7 @@ use crate::process::status;
 
 /// A ROS domain that nobody else is likely to have.
 const DOMAIN: u32 = 91;
-/// What the client says, and what comes back of it.
+/// Topics of the client's messages and of their echoes.
 pub(super) const PING: &str = "/bench/ping";
 pub(super) const PONG: &str = "/bench/pong";
 /// From a DDS program to the client, and the other way.
@@ -26,18 +26,18 @@ pub(super) const UP: &str = "/bench/up";
 /// The type of the programs' messages.
 pub(super) const TYPE: &str = "sgc_bench/msg/Load";
 const DEFINITION: &str = "uint64 seq\nuint64 stamp_ns\nuint8[] data\n";
-/// How long a program may take until it is up.
+/// Longest time until a program is up.
 const UP_MAX: Duration = Duration::from_secs(20);
 
-/// What is measured, and who is at its other side. Fields go in this order.
+/// The measured node and the programs beside it. Fields are dropped in this order.
 pub(super) struct Scene {
     _pong: Program,
     source: Arc<Mutex<Program>>,
     sink: Arc<Mutex<Program>>,
     node: Program,
-    /// Where the rosbridge protocol is spoken.
+    /// Address of the rosbridge protocol.
     pub(super) rosbridge: SocketAddr,
-    /// Where gRPC is.
+    /// Address of gRPC.
     pub(super) grpc: SocketAddr,
     runs: AtomicU32,
     _dir: TempDir,
@@ -62,7 +62,7 @@ impl Scene {
         let mut command = Command::new(sgc);
         command.args(["run", "--print-ready", "--until-stdin-closes", "--log", "warn", "--config"]);
         command.arg(&config);
-        // What a user's shell says of ROS 2 is not to be measured.
+        // Variables of a user's shell must not affect the measurement.
         for variable in ["CYCLONEDDS_URI", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "SGC_LOG"] {
             command.env_remove(variable);
         }

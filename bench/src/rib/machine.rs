@@ -1,4 +1,4 @@
-//! The routing machine under the benchmark: the one place that knows its API.
+//! The routing machine under test. Only this file knows its API.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -28,7 +28,7 @@ impl Timed {
         self.took.as_secs_f64() * 1e6
     }
 
-    /// True if a frame was sent over that link.
+    /// Returns `true` if a frame was sent over that link.
     pub(super) fn went_to(&self, link: LinkId) -> bool {
         self.sent_to.contains(&link)
     }
@@ -37,7 +37,7 @@ impl Timed {
 impl Machine {
     pub(super) fn new(identity: &Arc<Identity>, now: Now) -> Self {
         let anchors = Arc::new(identity.anchors().clone());
-        // What guards against neighbours that ask too much is not what is measured.
+        // Limits against greedy neighbours are lifted, because they are not measured.
         let limits = Limits {
             joins_burst: u32::MAX,
             announcements_burst: u32::MAX,
@@ -82,7 +82,7 @@ impl Machine {
         Ok(Timed { took: begun.elapsed(), sent_to })
     }
 
-    /// How long verifying what is signed in this frame takes by itself, microseconds.
+    /// Times the verification of this frame's signature, in microseconds.
     pub(super) fn verify(&self, frame: &[u8]) -> Result<f64> {
         let frame = Control::from_slice(frame)?;
         let begun = Instant::now();
@@ -94,7 +94,7 @@ impl Machine {
         Ok(begun.elapsed().as_secs_f64() * 1e6)
     }
 
-    /// The same for an answer of this owner.
+    /// Times the verification of an answer of this owner.
     pub(super) fn verify_answer(&self, owner: &VerifiedPeer, frame: &[u8]) -> Result<f64> {
         let Control::Answer { signed } = Control::from_slice(frame)? else { bail!("no answer") };
         let begun = Instant::now();

@@ -1,4 +1,4 @@
-//! The same over real links into a router's process: owners publish, a subscriber joins and is answered.
+//! Measures the cost of names over real links to a router's process: owners publish, a subscriber joins and is answered.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -24,7 +24,7 @@ use crate::report::{Spread, Table, digits};
 /// takes from one link without pause.
 const SUBSCRIPTIONS: usize = 500;
 
-/// What one size came to.
+/// The figures of one size.
 #[derive(Serialize)]
 pub(super) struct OverSockets {
     names: usize,
@@ -179,7 +179,7 @@ impl Told {
         Ok(Self { owners, rng, runtime })
     }
 
-    /// How many links they have, one each.
+    /// Returns the number of their links, one each.
     pub(crate) fn links(&self) -> usize {
         self.owners.len()
     }

@@ -1,4 +1,4 @@
-//! Resident memory of a router's process by its links, each to a node of its own, over which nothing goes.
+//! Measures the resident memory of a router's process by the number of its idle links, each to a node of its own.
 
 use std::time::{Duration, Instant};
 
