@@ -166,8 +166,8 @@ fn measure_at(
         publisher,
         suite: suite.to_string(),
         starts,
-        after_link_ms: Spread::of(after_link),
-        after_start_ms: Spread::of(after_start),
+        after_link_ms: Spread::from_samples(after_link),
+        after_start_ms: Spread::from_samples(after_start),
     })
 }
 

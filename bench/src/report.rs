@@ -131,7 +131,7 @@ pub(crate) struct Spread {
 }
 
 impl Spread {
-    pub(crate) fn of(mut sample: Vec<f64>) -> Self {
+    pub(crate) fn from_samples(mut sample: Vec<f64>) -> Self {
         if sample.is_empty() {
             return Self::default();
         }
@@ -148,7 +148,7 @@ impl Spread {
 
 /// The middle one of a few figures.
 pub(crate) fn median(figures: impl IntoIterator<Item = f64>) -> f64 {
-    Spread::of(figures.into_iter().collect()).p50
+    Spread::from_samples(figures.into_iter().collect()).p50
 }
 
 /// A figure with about three digits, which is what it is good for.

@@ -243,7 +243,7 @@ fn load(dir: &Path, node: &str, routers: &str, rest: &str) -> Result<config::Con
 }
 
 #[derive(Default)]
-struct Shared {
+struct Exchange {
     said: AtomicU64,
     /// Number and age, milliseconds.
     arrivals: Mutex<Vec<(u64, f64)>>,
@@ -253,7 +253,7 @@ struct Shared {
 /// An application that publishes at its pace, and one that subscribes.
 struct Flow {
     name: &'static str,
-    shared: Arc<Shared>,
+    exchange: Arc<Exchange>,
     talker: Option<JoinHandle<Result<()>>>,
     _listener: Listener,
 }
@@ -263,8 +263,8 @@ impl Flow {
         let reliability =
             if reliable && !topic.is_camera { Reliability::Reliable } else { Reliability::BestEffort };
         let qos = Qos { reliability, history: History::KeepLast(5), ..Qos::default() };
-        let shared = Arc::<Shared>::default();
-        let hears = Arc::clone(&shared);
+        let exchange = Arc::<Exchange>::default();
+        let hears = Arc::clone(&exchange);
         let listener = Listener::new(to, topic.name, qos.clone(), move |payload| {
             let now = EPOCH.elapsed();
             let word = |at: usize| payload.get(at..at + 8).and_then(|w| w.try_into().ok());
@@ -275,7 +275,7 @@ impl Flow {
             arrivals.push((u64::from_le_bytes(number), age));
         })?;
         let talker = Talker::new(from, topic.name, qos)?;
-        let its = Arc::clone(&shared);
+        let its = Arc::clone(&exchange);
         let period = Duration::from_secs(1) / topic.per_second;
         let talker = std::thread::spawn(move || {
             let mut next = Instant::now();
@@ -294,15 +294,15 @@ impl Flow {
             }
             Ok(())
         });
-        Ok(Self { name: topic.name, shared, talker: Some(talker), _listener: listener })
+        Ok(Self { name: topic.name, exchange, talker: Some(talker), _listener: listener })
     }
 
     fn said(&self) -> u64 {
-        self.shared.said.load(SeqCst)
+        self.exchange.said.load(SeqCst)
     }
 
     fn arrivals(&self) -> std::sync::MutexGuard<'_, Vec<(u64, f64)>> {
-        self.shared.arrivals.lock().unwrap_or_else(PoisonError::into_inner)
+        self.exchange.arrivals.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Summarises the messages from one number up to another.
@@ -317,14 +317,14 @@ impl Flow {
             sent: (to - from) as usize,
             heard: ages.len(),
             per_second: ages.len() as f64 / time.as_secs_f64(),
-            age_ms: Spread::of(ages),
+            age_ms: Spread::from_samples(ages),
         }
     }
 }
 
 impl Drop for Flow {
     fn drop(&mut self) {
-        self.shared.ends.store(true, SeqCst);
+        self.exchange.ends.store(true, SeqCst);
         if let Some(Ok(Err(error))) = self.talker.take().map(JoinHandle::join) {
             eprintln!("{}: {error}", self.name);
         }

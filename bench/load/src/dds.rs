@@ -124,7 +124,7 @@ impl Qos {
         if qos.is_null() { bail!("out of memory") } else { Ok(Self(qos)) }
     }
 
-    fn of(quality: Quality, transient_local: bool) -> Result<Self> {
+    fn from_quality(quality: Quality, transient_local: bool) -> Result<Self> {
         let qos = Self::new()?;
         let reliability = match quality.reliable {
             true => dds_reliability_kind_DDS_RELIABILITY_RELIABLE,
@@ -163,24 +163,24 @@ pub(crate) struct Writer {
 impl Writer {
     /// Opens an endpoint on the ROS 2 topic `/name`.
     pub(crate) fn new(network: &Network, name: &str, quality: Quality) -> Result<Self> {
-        Self::of(network, &types::MESSAGE, &types::dds_name(name), Qos::of(quality, false)?)
+        Self::open(network, &types::MESSAGE, &types::dds_name(name), Qos::from_quality(quality, false)?)
     }
 
     /// Opens a writer whose messages may share packets until [`Self::flush`].
-    pub(crate) fn that_batches(network: &Network, name: &str, quality: Quality) -> Result<Self> {
-        let qos = Qos::of(quality, false)?;
+    pub(crate) fn with_batching(network: &Network, name: &str, quality: Quality) -> Result<Self> {
+        let qos = Qos::from_quality(quality, false)?;
         // SAFETY: the object is valid.
         unsafe { dds_qset_writer_batching(qos.0, true) };
-        Self::of(network, &types::MESSAGE, &types::dds_name(name), qos)
+        Self::open(network, &types::MESSAGE, &types::dds_name(name), qos)
     }
 
     /// Opens the writer of the ROS graph, which every node has.
-    pub(crate) fn of_graph(network: &Network) -> Result<Self> {
+    pub(crate) fn for_graph(network: &Network) -> Result<Self> {
         let quality = Quality { reliable: true, depth: 1 };
-        Self::of(network, &types::GRAPH, "ros_discovery_info", Qos::of(quality, true)?)
+        Self::open(network, &types::GRAPH, "ros_discovery_info", Qos::from_quality(quality, true)?)
     }
 
-    fn of(network: &Network, descriptor: &types::Descriptor, dds_name: &str, qos: Qos) -> Result<Self> {
+    fn open(network: &Network, descriptor: &types::Descriptor, dds_name: &str, qos: Qos) -> Result<Self> {
         let topic = network.topic(descriptor, dds_name)?;
         // SAFETY: Cyclone checks the handles; the QoS outlives the call.
         let handle = unsafe { dds_create_writer(network.participant.0, topic.0, qos.0, null()) };
@@ -219,7 +219,7 @@ impl Writer {
         check(unsafe { dds_write_flush(self.entity.0) })
     }
 
-    /// Announces the node to which the endpoints of this participant belong. Needs a writer of [`Self::of_graph`].
+    /// Announces the node to which the endpoints of this participant belong. Needs a writer of [`Self::for_graph`].
     pub(crate) fn announce(
         &self,
         network: &Network,
@@ -276,7 +276,7 @@ impl Reader {
         listener: *const dds_listener_t,
     ) -> Result<Self> {
         let topic = network.topic(&types::MESSAGE, &types::dds_name(name))?;
-        let qos = Qos::of(quality, false)?;
+        let qos = Qos::from_quality(quality, false)?;
         // SAFETY: Cyclone checks the handles; QoS and listener outlive the call, which copies them.
         let handle = unsafe { dds_create_reader(network.participant.0, topic.0, qos.0, listener) };
         let entity = Entity::new(handle).with_context(|| format!("a reader of {name}"))?;

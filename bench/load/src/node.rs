@@ -32,7 +32,7 @@ impl Node {
         write: impl IntoIterator<Item = String>,
     ) -> Result<Self> {
         let network = Network::join(common.domain)?;
-        let graph = Writer::of_graph(&network)?;
+        let graph = Writer::for_graph(&network)?;
         let quality = common.quality();
         let mut waiter = Waiter::new(&network)?;
         let mut readers = Vec::new();

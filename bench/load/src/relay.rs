@@ -58,7 +58,7 @@ pub(crate) fn relay(args: &RelayArgs) -> Result<()> {
     let mut waiter = Waiter::new(&network)?;
     let quality = Quality { reliable: true, depth: 0 };
     if let Some(topic) = &args.give {
-        let writer = Writer::that_batches(&network, topic, quality)?;
+        let writer = Writer::with_batching(&network, topic, quality)?;
         let mut stream = stream.try_clone()?;
         std::thread::spawn(move || {
             if let Err(error) = publish(&mut stream, &writer) {

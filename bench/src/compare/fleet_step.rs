@@ -73,7 +73,7 @@ fn push(figures: &mut Figures, system: &str, path: &str, steps_us: Result<Vec<f6
     match steps_us {
         Err(error) => figures.leave_out(&format!("fleet-step {system} on {path}"), format!("{error:#}")),
         Ok(steps) => {
-            let spread = Spread::of(steps);
+            let spread = Spread::from_samples(steps);
             let mut push = |metric, value| {
                 figures.push("fleet-step", system, path, ROBOTS as f64, metric, value);
             };

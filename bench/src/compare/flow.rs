@@ -83,13 +83,13 @@ pub(crate) struct Flow {
 }
 
 #[derive(Deserialize)]
-struct Sent {
+struct SourceReport {
     count: u32,
     begun_ns: u64,
 }
 
 #[derive(Deserialize)]
-struct Counted {
+struct SinkReport {
     received: Vec<u32>,
     ended_ns: u64,
     age_us: [f64; 3],
@@ -131,7 +131,7 @@ impl Flow {
             "rate": order.rate,
         }}))?;
         let most = Duration::from_secs_f64(order.seconds) + SPARE;
-        let sent: Sent = serde_json::from_value(self.source.until("sent", most)?)?;
+        let sent: SourceReport = serde_json::from_value(self.source.until("sent", most)?)?;
         for sink in &mut self.sinks {
             sink.order(&json!({ "count": {
                 "run": self.run, "last": sent.count, "quiet_seconds": QUIET.as_secs_f64(),
@@ -140,7 +140,7 @@ impl Flow {
         let (mut received, mut ended_ns, mut age_us) = (Vec::new(), 0, [0.0_f64; 3]);
         for sink in &mut self.sinks {
             let counted = sink.until("counted", most + QUIET)?;
-            let counted: Counted = serde_json::from_value(counted).context("what a sink counted")?;
+            let counted: SinkReport = serde_json::from_value(counted).context("what a sink counted")?;
             received.extend(counted.received);
             ended_ns = ended_ns.max(counted.ended_ns);
             for (worst, age) in age_us.iter_mut().zip(counted.age_us) {

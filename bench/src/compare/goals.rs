@@ -495,13 +495,13 @@ mod tests {
     }
 
     #[test]
-    fn one_part_beyond_the_bound_misses_it() {
+    fn goal_is_missed_if_any_part_exceeds_bound() {
         assert_eq!(verdict(&figures(&[70.0, 81.0, 71.0, 60.0]), WHAT).0, Verdict::Missed);
         assert_eq!(verdict(&figures(&[81.0]), WHAT).0, Verdict::Missed);
     }
 
     #[test]
-    fn what_is_missing_is_neither_met_nor_missed() {
+    fn goal_without_figures_is_neither_met_nor_missed() {
         let (verdict_of_three, reached) = verdict(&figures(&[70.0, 70.0, 70.0]), WHAT);
         assert_eq!(verdict_of_three, Verdict::NotMeasured);
         assert!(reached.ends_with("8 KB: –"), "{reached}");
@@ -509,7 +509,7 @@ mod tests {
     }
 
     #[test]
-    fn what_never_came_back_took_longer_than_it_was_waited_for() {
+    fn lost_round_trip_counts_as_longer_than_wait() {
         let what = "Round trip p50, every size, `paper`: `standard` to DDS over WireGuard";
         let mut figures = Figures::default();
         for at in SIZES {

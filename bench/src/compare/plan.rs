@@ -1,5 +1,5 @@
-//! What a whole run can afford: which of the many variants of `sgc` a table has, how often each system has its turn, and how many
-//! have it at the same time. The budget is in `bench/README.md`.
+//! The extent of a whole run: the variants of `sgc` in each table, the number of turns of each system, and the number of systems
+//! measured at the same time. The budget is in `bench/README.md`.
 
 use super::lab::PathKind;
 use super::tcp;

@@ -328,7 +328,7 @@ fn library_of(environment: &Path) -> PathBuf {
 
 /// The summary of a publisher.
 #[derive(Debug, Deserialize)]
-struct Published {
+struct PublisherReport {
     sent: u64,
     /// Messages that DDS did not take.
     refused: u64,
@@ -358,7 +358,7 @@ struct Latency {
 /// Messages one way.
 #[derive(Debug)]
 struct Flow {
-    publisher: Published,
+    publisher: PublisherReport,
     subscriber: Summary,
 }
 
@@ -396,7 +396,7 @@ mod tests {
     fn flow(sent: u64, refused: u64, received: u64, first: u64) -> Flow {
         let latency_us = Latency { p50: 1.0, p99: 1.0, max: 1.0 };
         let subscriber = Summary { sent: 0, received, first, duplicated: 0, seconds: 4.5, latency_us };
-        Flow { publisher: Published { sent, refused }, subscriber }
+        Flow { publisher: PublisherReport { sent, refused }, subscriber }
     }
 
     #[test]

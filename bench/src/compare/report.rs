@@ -79,7 +79,7 @@ impl Run {
         text.push_str(HOW_TO_READ);
         text.push_str(&goals_table(&self.figures));
         for table in tables(&self.figures) {
-            let about = About::of(table);
+            let about = About::for_table(table);
             let _ = writeln!(text, "## {}\n\n{}", about.title, about.says);
             let plots = plots(&self.figures, &about);
             for page in &plots {
@@ -134,7 +134,7 @@ enum Plot {
 }
 
 impl<'a> About<'a> {
-    fn of(table: &'a str) -> Self {
+    fn for_table(table: &'a str) -> Self {
         let (title, says, at, at_unit, plot) = match table {
             "round-trip" => (
                 "Round trip",
@@ -539,7 +539,7 @@ fn systems<'a>(names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
         "zenoh-bridge",
     ];
     let mut systems = distinct(names);
-    let place = |name: &&str| match Sgc::of(name) {
+    let place = |name: &&str| match Sgc::parse(name) {
         None => (PEERS.iter().position(|peer| peer == name).unwrap_or(PEERS.len()), 0, 0, false),
         Some(sgc) => {
             let at = |all: &[&str], it: &str| all.iter().position(|one| *one == it).unwrap_or(all.len());
@@ -561,7 +561,7 @@ struct Sgc<'a> {
 }
 
 impl<'a> Sgc<'a> {
-    fn of(system: &'a str) -> Option<Self> {
+    fn parse(system: &'a str) -> Option<Self> {
         let mut words = system.strip_prefix("sgc-")?.split('-');
         let (scheme, suite) = (words.next()?, words.next()?);
         let is_routed = match (words.next(), words.next()) {
@@ -575,7 +575,7 @@ impl<'a> Sgc<'a> {
 
 /// A system in words.
 fn system_name(system: &str) -> String {
-    if let Some(Sgc { scheme, suite, is_routed }) = Sgc::of(system) {
+    if let Some(Sgc { scheme, suite, is_routed }) = Sgc::parse(system) {
         let router = if is_routed { ", with a router" } else { "" };
         return format!("sgc {}, {suite}{router}", scheme.to_uppercase());
     }
@@ -601,7 +601,7 @@ fn system_name(system: &str) -> String {
 
 /// Colour by what carries it, line by how it is sealed.
 fn look(system: &str) -> (Hue, Stroke) {
-    if let Some(Sgc { scheme, suite, is_routed }) = Sgc::of(system) {
+    if let Some(Sgc { scheme, suite, is_routed }) = Sgc::parse(system) {
         let hue = match (scheme, is_routed) {
             (_, true) => Hue::Teal,
             ("quic", _) => Hue::Blue,
@@ -654,8 +654,8 @@ const NOT_DRAWN: [&str; 3] = ["samples", "lost", GAVE_UP];
 fn curve_plots(figures: &Figures, about: &About<'_>, path: &str) -> Vec<Page> {
     let here: Vec<_> = figures.figures.iter().filter(|f| f.table == about.table && f.path == path).collect();
     let names = systems(here.iter().map(|f| &*f.system));
-    let is_peer = |name: &&&str| Sgc::of(name).is_none_or(|s| s.scheme == "quic");
-    let is_direct = |name: &&&str| Sgc::of(name).is_some_and(|s| !s.is_routed);
+    let is_peer = |name: &&&str| Sgc::parse(name).is_none_or(|s| s.scheme == "quic");
+    let is_direct = |name: &&&str| Sgc::parse(name).is_some_and(|s| !s.is_routed);
     let choices: Vec<(&str, Vec<&str>)> = if names.len() <= LINES_MAX {
         vec![("", names)]
     } else {
@@ -835,7 +835,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_left_out_is_said() {
+    fn report_lists_omitted_measurements() {
         let mut figures = Figures::default();
         figures.leave_out("rosbridge", "no ROS 2 is installed here");
         let text = page(&run(figures), "report.md");

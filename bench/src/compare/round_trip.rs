@@ -56,7 +56,7 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
                     &together,
                     sizes,
                     |who| Turn::start(compare, &kind, who),
-                    |turn, size| turn.measure(size, &Plan::of(&kind, size, compare.is_quick())),
+                    |turn, size| turn.measure(size, &Plan::for_path(&kind, size, compare.is_quick())),
                 );
                 for (name, turn) in names.into_iter().zip(turns) {
                     add(&mut samples, &name, sizes, turn.stages);
@@ -75,7 +75,7 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
             push("lost", lost as f64);
             push("samples", round_trips_us.len() as f64);
             if !round_trips_us.is_empty() {
-                let spread = Spread::of(round_trips_us);
+                let spread = Spread::from_samples(round_trips_us);
                 push("p50_us", spread.p50);
                 push("p99_us", spread.p99);
                 push("max_us", spread.max);
@@ -199,7 +199,7 @@ pub(crate) fn measure(
     let mut turn = Some(Turn::start(compare, kind, Who::System(system))?);
     for &size in sizes {
         let Some(going) = turn.take() else { break };
-        let (sample, after) = going.measure(size, &Plan::of(kind, size, compare.is_quick()))?;
+        let (sample, after) = going.measure(size, &Plan::for_path(kind, size, compare.is_quick()))?;
         add(samples, &system.name(), &[size], vec![sample]);
         turn = after;
     }
@@ -220,7 +220,7 @@ pub(crate) struct Plan {
 }
 
 impl Plan {
-    fn of(kind: &PathKind, size: usize, quick: bool) -> Self {
+    fn for_path(kind: &PathKind, size: usize, quick: bool) -> Self {
         let is_large = size >= LARGE_BYTES;
         let is_huge = size >= HUGE_BYTES;
         let (count, seconds, warm_up, patience): (usize, f64, usize, u64) = match kind {

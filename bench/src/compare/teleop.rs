@@ -68,8 +68,8 @@ const FLOWS: [Flow; 3] = [
 /// Priorities that users of SGC configure.
 const PRIORITIES: &[(&str, &str)] = &[("/cmd_vel", "realtime"), ("/camera", "bulk")];
 
-/// What users of the Zenoh bridge can do: order topics, send small ones at once, send as many frames as the uplink carries
-/// (nine take 4.3 of its 5 Mbit/s; it has to be known), and keep the kernel's queue short.
+/// Returns settings for users of the Zenoh bridge: priorities of topics, small messages without batching, only as many frames as
+/// the uplink carries (nine take 4.3 of its 5 Mbit/s; the user has to know the rate), and a short kernel queue.
 fn zenoh_tuning() -> Value {
     json!({
         "plugins": { "ros2dds": {

@@ -202,7 +202,8 @@ impl Contestant {
     }
 
     fn figures(self) -> Figures {
-        let (through_us, direct_us) = (Spread::of(self.through_us), Spread::of(self.direct_us));
+        let (through_us, direct_us) =
+            (Spread::from_samples(self.through_us), Spread::from_samples(self.direct_us));
         let router_us = median(self.rushes.iter().map(|r| r.router_us));
         Figures {
             way: self.through.name,

@@ -39,7 +39,7 @@ pub(super) struct Rate {
 }
 
 impl Rate {
-    fn of(flows: &[Flow]) -> Self {
+    fn from_flows(flows: &[Flow]) -> Self {
         let each = |of: fn(&Flow) -> f64| median(flows.iter().map(of));
         let by = |sum: f64, count: f64| if count > 0.0 { sum / count } else { 0.0 };
         let received = |flow: &Flow| f64::from(flow.received);
@@ -82,9 +82,9 @@ impl Figure {
         figure.flows[0].push(down);
         figure.flows[1].push(up);
         figure.round_trips = figure.all_us.len();
-        figure.round_trip_us = Spread::of(figure.all_us.clone());
-        figure.down = Rate::of(&figure.flows[0]);
-        figure.up = Rate::of(&figure.flows[1]);
+        figure.round_trip_us = Spread::from_samples(figure.all_us.clone());
+        figure.down = Rate::from_flows(&figure.flows[0]);
+        figure.up = Rate::from_flows(&figure.flows[1]);
     }
 }
 

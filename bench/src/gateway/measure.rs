@@ -33,7 +33,7 @@ pub(super) struct Plan {
 }
 
 impl Plan {
-    pub(super) fn of(size: usize, quick: bool) -> Self {
+    pub(super) fn for_size(size: usize, quick: bool) -> Self {
         let (warm_up, round_trips) = if size >= 1 << 20 { (5, 200) } else { (100, 3000) };
         if quick {
             return Self { warm_up: warm_up / 5, round_trips: round_trips / 20, seconds: 0.3 };
@@ -93,14 +93,14 @@ async fn until(hearer: &mut Hearer, number: u64) -> Result<()> {
 }
 
 #[derive(Deserialize)]
-struct Sent {
+struct SourceReport {
     count: u32,
     begun_ns: u64,
 }
 
 /// The messages of a run that the client has received.
 #[derive(Default)]
-struct Heard {
+struct ClientArrivals {
     run: AtomicU32,
     received: AtomicU32,
     last: AtomicU32,
@@ -111,9 +111,9 @@ struct Heard {
 /// far as it does; what is beyond, and by rosbridge what is more than a queue, is dropped.
 pub(super) async fn down(scene: &Scene, way: Way, size: usize, plan: &Plan) -> Result<Flow> {
     let hearer = Hearer::new(scene, way, DOWN, size, true).await?;
-    let heard = Arc::new(Heard::default());
+    let heard = Arc::new(ClientArrivals::default());
     let hearing = tokio::spawn(hear(hearer, Arc::clone(&heard)));
-    let send = async |seconds: f64, count: u32, size: usize, rate: Option<f64>| -> Result<Sent> {
+    let send = async |seconds: f64, count: u32, size: usize, rate: Option<f64>| -> Result<SourceReport> {
         let run = scene.run();
         heard.received.store(0, Ordering::Relaxed);
         heard.last.store(0, Ordering::Relaxed);
@@ -151,7 +151,7 @@ pub(super) async fn down(scene: &Scene, way: Way, size: usize, plan: &Plan) -> R
 }
 
 /// Hears for as long as it can.
-async fn hear(mut hearer: Hearer, heard: Arc<Heard>) -> Result<()> {
+async fn hear(mut hearer: Hearer, heard: Arc<ClientArrivals>) -> Result<()> {
     loop {
         let number = hearer.next().await?;
         if (number >> 32) as u32 == heard.run.load(Ordering::Relaxed) {
@@ -163,7 +163,7 @@ async fn hear(mut hearer: Hearer, heard: Arc<Heard>) -> Result<()> {
 }
 
 /// Waits for the last message; false if nothing more comes.
-async fn until_quiet(heard: &Heard, last: u32, quiet: Duration) -> bool {
+async fn until_quiet(heard: &ClientArrivals, last: u32, quiet: Duration) -> bool {
     let (mut received, mut since) = (0, Instant::now());
     while heard.last.load(Ordering::Relaxed) < last {
         let now = heard.received.load(Ordering::Relaxed);
@@ -178,7 +178,7 @@ async fn until_quiet(heard: &Heard, last: u32, quiet: Duration) -> bool {
 }
 
 #[derive(Deserialize)]
-struct Counted {
+struct SinkReport {
     received: Vec<u32>,
     ended_ns: u64,
 }
@@ -196,7 +196,7 @@ pub(super) async fn up(scene: &Scene, way: Way, size: usize, plan: &Plan) -> Res
         sink.order(&order)?;
         sink.until("counted", SPARE)
     });
-    let counted: Counted = serde_json::from_value(counted.await?)?;
+    let counted: SinkReport = serde_json::from_value(counted.await?)?;
     let cpu_seconds = scene.cpu_seconds() - cpu;
     let received = counted.received.first().copied().unwrap_or_default();
     let seconds = counted.ended_ns.saturating_sub(begun_ns) as f64 / 1e9;

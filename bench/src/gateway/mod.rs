@@ -67,7 +67,7 @@ pub(crate) fn run(args: &GatewayArgs) -> Result<()> {
     for round in 0..if args.quick { 1 } else { ROUNDS } {
         for way in Way::ALL.into_iter().filter(wanted) {
             for &size in args.sizes.iter().filter(|&&size| way.has(size)) {
-                let plan = Plan::of(size, args.quick);
+                let plan = Plan::for_size(size, args.quick);
                 progress(&format!("round {round}: {}, {size} B", way.name()));
                 let measured = runtime.block_on(async {
                     Ok::<_, anyhow::Error>((

@@ -16,14 +16,14 @@ pub(super) struct Machine {
     links: u32,
 }
 
-/// A frame that was handled.
-pub(super) struct Timed {
+/// The cost of handling a frame.
+pub(super) struct FeedCost {
     took: Duration,
     sent_to: Vec<LinkId>,
 }
 
-impl Timed {
-    /// Decoding, handling, and handing out what came of it, microseconds.
+impl FeedCost {
+    /// Returns the time of decoding, handling and sending results, in microseconds.
     pub(super) fn micros(&self) -> f64 {
         self.took.as_secs_f64() * 1e6
     }
@@ -74,12 +74,12 @@ impl Machine {
     }
 
     /// Handles a frame as the driver does; an error if the router refuses it.
-    pub(super) fn feed(&mut self, link: LinkId, frame: &[u8]) -> Result<Timed> {
+    pub(super) fn feed(&mut self, link: LinkId, frame: &[u8]) -> Result<FeedCost> {
         let begun = Instant::now();
         let frame = Control::from_slice(frame)?;
         self.router.handle_frame(self.now, link, frame);
         let sent_to = self.drain()?;
-        Ok(Timed { took: begun.elapsed(), sent_to })
+        Ok(FeedCost { took: begun.elapsed(), sent_to })
     }
 
     /// Times the verification of this frame's signature, in microseconds.

@@ -8,7 +8,7 @@ mod frames;
 mod machine;
 mod socket;
 
-pub(crate) use socket::{Neighbour, Told};
+pub(crate) use socket::{LinkedOwners, Neighbour};
 
 use std::process::Command;
 use std::time::Instant;
@@ -155,12 +155,12 @@ fn measure(names: usize, samples: usize) -> Result<InMachine> {
     Ok(InMachine {
         names,
         bytes_per_name: bytes as f64 / names as f64,
-        batched_us_per_name: Spread::of(batched),
-        batched_verify_us_per_name: Spread::of(verified),
-        publish_us: Spread::of(publish),
-        publish_verify_us: Spread::of(publish_verify),
-        subscribe_us: Spread::of(subscribe),
-        subscribe_verify_us: Spread::of(subscribe_verify),
+        batched_us_per_name: Spread::from_samples(batched),
+        batched_verify_us_per_name: Spread::from_samples(verified),
+        publish_us: Spread::from_samples(publish),
+        publish_verify_us: Spread::from_samples(publish_verify),
+        subscribe_us: Spread::from_samples(subscribe),
+        subscribe_verify_us: Spread::from_samples(subscribe_verify),
     })
 }
 

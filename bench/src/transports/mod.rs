@@ -202,7 +202,7 @@ fn measure_sizes(place: &Place<'_>, kinds: &[String], quick: bool) -> Result<Vec
                 mbyte_per_second: median(rushes.iter().map(|r| r.bytes_per_second / 1e6)),
                 near_cpu_s_per_gb: median(rushes.iter().map(|r| r.near_cpu_s_per_gb)),
                 far_cpu_s_per_gb: median(rushes.iter().map(|r| r.far_cpu_s_per_gb)),
-                round_trip_us: Spread::of(trips),
+                round_trip_us: Spread::from_samples(trips),
             });
         }
     }
