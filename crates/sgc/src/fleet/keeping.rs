@@ -175,7 +175,7 @@ pub(super) fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
     let pushed = push_crl(&mut file, &list, &args.routers)?;
     match pushed.names.is_empty() {
         true => text.push_str(
-            "Nobody was told yet. Tell one node, and all will know:\n  sgc fleet revoke --router quic://…   \
+            "No node has the list yet. Push it to one, and it passes the list on:\n  sgc fleet revoke --router quic://…   \
              or, where a node runs:  sgc fleet revoke",
         ),
         false => {
