@@ -15,8 +15,7 @@ const fn ms(n: u64) -> Duration {
     Duration::from_millis(n)
 }
 
-/// A robot, two routers and an operator in a line, and a member of the fleet at the first router who is up to
-/// no good.
+/// A robot, two routers and an operator in a line, and a malicious member of the fleet at the first router.
 struct Scene {
     world: World,
     arm: NodeKey,
@@ -48,7 +47,7 @@ fn assert_flows(scene: &mut Scene) {
     assert_eq!(world.received(*desk, *arm, "/chatter").last(), Some(&id), "{}", world.trace());
 }
 
-/// The last frame from one node to another that `is` the one.
+/// Returns the last frame from one node to another for which `is` holds.
 fn last(world: &World, from: NodeKey, to: NodeKey, is: impl Fn(&Control) -> bool) -> Control {
     let of_link = |c: &&CapturedFrame| (c.from, c.to) == (from, to) && is(&c.frame);
     world.captured().iter().rev().find(of_link).expect("such a frame was sent").frame.clone()
@@ -67,7 +66,7 @@ fn altered(signed: &Signed) -> Signed {
     Signed { body: signed.body.clone(), signature: signature.into() }
 }
 
-/// How many frames or packets a node refused for that reason.
+/// Returns the number of frames or packets that a node refused for that reason.
 fn drops(world: &World, node: NodeKey, key: &str) -> usize {
     world.router_drops(node).iter().filter(|d| **d == key).count()
 }
@@ -82,7 +81,7 @@ fn a_proxy_cannot_advertise_anothers_names() {
     world.run(ms(500));
     assert_eq!(drops(world, *east, "not_owner"), 1);
     assert_eq!(world.next_hop(*east, &world.name(*arm, "/chatter")), Some(*arm));
-    // Nor when the owner is away, nor from farther than its own node.
+    // The same holds while the owner is away, and from farther than its own node.
     world.crash(*arm);
     world.run(ms(500));
     world.inject(*mallory, *east, &advert);
@@ -169,8 +168,7 @@ fn a_withdrawn_advertisement_cannot_be_replayed() {
     assert_eq!(world.distance(east, &world.name(arm, "/chatter")), None);
 }
 
-/// The answers that `west` passes on to the operator are replaced by what `forge` makes of them; nothing is
-/// granted on their word.
+/// Replaces the answers that `west` passes on to the operator by the results of `forge`, and checks that none is granted.
 fn check_forged_answers(seed: u64, forge: impl Fn(AnswerBody) -> Signed + 'static) {
     let mut scene = scene(seed);
     let Scene { world, arm, west, desk, .. } = &mut scene;
@@ -224,7 +222,7 @@ fn a_grant_for_another_request_does_not_open() {
     let mut scene = scene(7);
     assert_flows(&mut scene);
     let Scene { world, west, desk, arm, .. } = &mut scene;
-    // The owner's own answer to an earlier request, played again to a later one.
+    // A replay of the owner's answer to an earlier request.
     let old = last(world, *west, *desk, |f| matches!(f, Control::Answer { .. }));
     let granted =
         |w: &World| w.log().iter().filter(|l| matches!(l.what, What::Event(Event::Granted { .. }))).count();
@@ -322,7 +320,7 @@ fn a_captured_join_does_not_move_or_take_a_sinks_place() {
     let Control::Join { signed } = &captured else { unreachable!("picked as one") };
     let sink = JoinBody::from_slice(&signed.body).unwrap().sink;
     world.inject(*mallory, *east, &captured);
-    // A join of its own under the same sink id is no better.
+    // A join of its own under the same sink id does not help either.
     let own = join(world.identity(*mallory), world, *arm, sink, Role::Subscribe);
     world.inject(*mallory, *east, &own);
     world.inject(*mallory, *east, &Control::Leave { name, sink });
@@ -391,7 +389,7 @@ fn data_that_a_router_forges_reaches_the_sink_and_no_further() {
     world.inject_packet(*west, *desk, unknown.clone());
     world.run(ms(500));
     assert_eq!(world.data_drops(*desk), [why; 2].map(DataDrop::Sink));
-    // Of an epoch that is not known yet: it waits for a grant that explains it, in little room.
+    // Packets of an unknown epoch wait for its grant, within a small bound.
     unknown.header.epoch = 2;
     for _ in 0..sgc_endpoint::PARKED_PACKETS_MAX {
         world.inject_packet(*west, *desk, unknown.clone());

@@ -31,7 +31,7 @@ fn line_with(config: WorldConfig) -> Line {
     Line { world, arm, cloud, desk }
 }
 
-/// The same with `/chatter` shared with the fleet, used by the operator, and flowing.
+/// A robot, a router and an operator in a line, with `/chatter` flowing from robot to operator.
 fn flowing(seed: u64) -> Line {
     let mut line = line(seed);
     line.world.share(line.arm, "/chatter", Sharing::to_fleet());
@@ -40,7 +40,7 @@ fn flowing(seed: u64) -> Line {
     line
 }
 
-/// `/chatter` of `owner` comes through to `user`, once.
+/// Checks that `/chatter` of `owner` reaches `user` once.
 fn assert_flows(world: &mut World, owner: NodeKey, user: NodeKey) {
     world.until_granted(user, owner, "/chatter");
     world.run(ms(500));
@@ -160,7 +160,7 @@ fn a_restarted_neighbour_supersedes_its_old_link_at_once() {
 
 #[test]
 fn greetings_of_two_runs_that_cross_leave_the_newer_link() {
-    // The old run's greeting is still under way when the new run's arrives.
+    // The old run's greeting is still in flight when the new run's arrives.
     let mut config = WorldConfig::new(0);
     config.jitter = ms(0)..=ms(60);
     for seed in 0..40 {
@@ -312,7 +312,7 @@ fn a_late_joiner_gets_the_history_once_also_when_the_way_breaks() {
     world.run(ms(500));
     world.crash(cloud);
     world.run(ms(500));
-    // Nobody carries this one; the history does, once there is a way again.
+    // No path carries this message. It comes from the history once there is a path again.
     published.push(world.publish(arm, "/map"));
     world.run(ms(500));
     world.start(cloud);
@@ -450,7 +450,7 @@ fn a_ring_survives_the_loss_of_each_router_that_is_not_the_only_way() {
 
 #[test]
 fn a_flow_moves_to_a_shorter_way_and_back_without_a_circle() {
-    // A new topic advertised together with an old one must not tell neighbours what is not so of the old one.
+    // The advertisement of a new topic together with an old one must not say anything false about the old one.
     let Ring { mut world, arm, desk, routers: [north, _, south, _], .. } = ring(26);
     for round in 0..4 {
         world.cut(north, south);
@@ -642,7 +642,7 @@ fn routes_beyond_a_proxys_limit_are_refused_and_others_unharmed() {
     world.use_topic(desk, arm, "/chatter");
     assert_flows(&mut world, arm, desk);
     assert!(world.router_drops(cloud).contains(&"limit"));
-    // Three of the greedy one, two of the robot, one of the operator.
+    // Three names of the greedy node, two of the robot, one of the operator.
     assert_eq!(world.stats(cloud).routed_names, 3 + 2 + 1);
     world.run(ms(50_000));
     assert_eq!(world.stats(cloud).routed_names, 3 + 2 + 1, "renewals do not get around it");
@@ -661,7 +661,7 @@ fn interests_beyond_a_links_limit_are_refused_and_others_unharmed() {
     world.inject(desk, cloud, &sgc_wire::Control::Interest { names });
     world.run(ms(500));
     assert_eq!(world.router_drops(cloud).iter().filter(|d| **d == "limit").count(), 1);
-    // Two names of the robot, one of the operator, and two that were asked for and nobody has.
+    // Two names of the robot, one of the operator, and two requested names that do not exist.
     assert_eq!(world.stats(cloud).names, 3 + 2);
     assert_flows(&mut world, arm, desk);
 }

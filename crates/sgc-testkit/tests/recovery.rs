@@ -8,14 +8,14 @@ use sgc_trust::Suite;
 use sgc_wire::{Control, Recover};
 
 const TOPIC: &str = "/chatter";
-/// From a cut until all is made good: as long as the longest wait for another way.
+/// Longest recovery after a cut: the longest wait for another path.
 const HEALED: Duration = Duration::from_secs(30);
 
 const fn ms(n: u64) -> Duration {
     Duration::from_millis(n)
 }
 
-/// A robot behind `north`, operators behind `south`, and two ways between, over `east` and `west`.
+/// A robot behind `north`, operators behind `south`, and two paths between them, over `east` and `west`.
 struct Diamond {
     world: World,
     arm: NodeKey,
@@ -39,7 +39,7 @@ fn diamond_with(config: WorldConfig, users: usize, sharing: Sharing) -> Diamond 
         world.link(a, b);
     }
     let users: Vec<_> = (0..users).map(|n| world.proxy(&format!("desk-{n}"))).collect();
-    // Without signatures, which take most of the time and change nothing here.
+    // Without signatures, which would take most of the time and do not matter here.
     world.share(arm, TOPIC, Sharing { suite: Some(Suite::Group), ..sharing });
     for user in &users {
         world.link(south, *user);
@@ -62,12 +62,12 @@ impl Diamond {
         }
     }
 
-    /// The router between `north` and `south` that the topic flows over.
+    /// Returns the router between `north` and `south` over which the topic flows.
     fn used(&self) -> NodeKey {
         self.world.next_hop(self.south, &self.world.name(self.arm, TOPIC)).expect("it flows")
     }
 
-    /// Waits until every user has everything; then each has it once and in order.
+    /// Waits until every user has all messages, and checks that each has them once and in order.
     fn assert_all(&mut self) {
         let Self { world, arm, users, published, .. } = self;
         let has_all = |w: &World, user: NodeKey| w.received(user, *arm, TOPIC).len() >= published.len();
@@ -215,7 +215,7 @@ fn expired_messages_are_counted_as_lost_and_the_rest_goes_on() {
     assert!(received.is_sorted(), "in order");
     let (missing, lost) = (published.len() - received.len(), world.lost(user));
     assert!(missing > 50 && lost >= missing as u64, "{missing} missing, {lost} told");
-    // A number or two of those are marks.
+    // One or two of the numbers are marks.
     assert!(lost <= missing as u64 + 10, "{missing} missing, {lost} told");
     let gap: Vec<_> = published.iter().filter(|id| !received.contains(id)).collect();
     assert_eq!(gap.len() as u64, gap[gap.len() - 1].0 - gap[0].0 + 1, "one gap");

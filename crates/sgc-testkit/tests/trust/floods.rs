@@ -10,7 +10,7 @@ use sgc_wire::{Control, JoinBody, Name, RejectReason, Request, Signed, SinkId};
 
 use crate::{Scene, assert_received, closed, drops, events, flowing_with, frames, ms, publish_steadily};
 
-/// A join of `name`, valid or not, as the `n`th sink.
+/// Returns a join of `name`, valid or not, as the `n`th sink.
 fn join(world: &World, identity: &Identity, name: Name, n: u64, valid: bool) -> Control {
     let mut sink = [0x77; 16];
     sink[..8].copy_from_slice(&n.to_be_bytes());
@@ -29,7 +29,7 @@ fn join(world: &World, identity: &Identity, name: Name, n: u64, valid: bool) -> 
     Control::Join { signed: Signed { body, signature: signature.into() } }
 }
 
-/// The scene with one more member at the first router.
+/// Returns the scene with one more member at the first router.
 fn scene(config: WorldConfig) -> (Scene, NodeKey, Arc<Identity>) {
     let mut scene = flowing_with(config, |s| s);
     let mallory = scene.world.proxy("mallory");
@@ -126,7 +126,7 @@ fn flood_of_handshake_places_by_one_node_leaves_places_for_others() {
     let identity = sgc_testkit::identity(scene.world.member(scene.desk));
     let desk_id = &identity.node_id();
     let log = scene.world.log().len();
-    // An honest node gives back what it did not ask for.
+    // An honest node would give back places that it did not request.
     scene.world.tamper(scene.desk, scene.west, |frame| match frame {
         Control::Leave { .. } => vec![],
         frame => vec![frame.clone()],
@@ -166,7 +166,7 @@ fn flood_of_links_by_one_node_is_refused() {
     }
     scene.world.run(ms(500));
     assert_eq!(closed(&scene.world, scene.east), vec![LinkClose::TooMany; 6]);
-    // A node that has too many may still end some and come back.
+    // A node with too many links may still end some and come back.
     scene.world.crash(mallory);
     scene.world.run(ms(500));
     scene.world.start(mallory);

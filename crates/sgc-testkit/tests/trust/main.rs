@@ -34,7 +34,7 @@ struct Scene {
     arm: NodeKey,
     east: NodeKey,
     west: NodeKey,
-    /// Those who receive `/chatter`.
+    /// Returns the receivers of `/chatter`.
     desk: NodeKey,
     lap: NodeKey,
     tab: NodeKey,
@@ -45,13 +45,13 @@ impl Scene {
         [self.desk, self.lap, self.tab]
     }
 
-    /// The users but one.
+    /// Returns the users except one.
     fn without(&self, node: NodeKey) -> Vec<NodeKey> {
         self.users().into_iter().filter(|n| *n != node).collect()
     }
 }
 
-/// The scene without any topic.
+/// Returns the scene without any topic.
 fn scene_with(config: WorldConfig) -> Scene {
     let mut world = World::with(config);
     world.capture();
@@ -64,7 +64,7 @@ fn scene_with(config: WorldConfig) -> Scene {
     Scene { world, arm, east, west, desk, lap, tab }
 }
 
-/// The scene with `/chatter`, shared with the three and granted to them.
+/// Returns the scene with `/chatter`, shared with the three and granted to them.
 fn flowing_with(config: WorldConfig, sharing: impl FnOnce(Sharing) -> Sharing) -> Scene {
     let mut scene = scene_with(config);
     let users = scene.users();
@@ -83,7 +83,7 @@ fn flowing(seed: u64) -> Scene {
     flowing_with(WorldConfig::new(seed), |sharing| sharing)
 }
 
-/// A configuration with slow links whose latencies differ widely.
+/// Returns a configuration with slow links whose latencies differ widely.
 fn slow(seed: u64) -> WorldConfig {
     let mut config = WorldConfig::new(seed);
     config.latency = ms(2)..=ms(300);
@@ -132,7 +132,7 @@ fn events(world: &World, node: NodeKey, from: usize) -> impl Iterator<Item = (&E
     })
 }
 
-/// The grants that a node got of a name's topic, oldest first, with their sinks.
+/// Returns the grants that a node got of a name's topic, oldest first, with their sinks.
 fn grants(world: &World, node: NodeKey, owner: NodeKey) -> Vec<(SinkId, TopicGrant)> {
     let wanted = world.name(owner, "/chatter");
     let of_topic = |(event, _): (&Event, Duration)| match event {
@@ -142,19 +142,19 @@ fn grants(world: &World, node: NodeKey, owner: NodeKey) -> Vec<(SinkId, TopicGra
     events(world, node, 0).filter_map(of_topic).collect()
 }
 
-/// The packets that went from one node to another, in their order.
+/// Returns the packets that went from one node to another, in order.
 fn packets(world: &World, from: NodeKey, to: NodeKey) -> Vec<Packet> {
     let of_link = world.captured_packets().iter().filter(|c| (c.from, c.to) == (from, to));
     of_link.map(|c| c.packet.clone()).collect()
 }
 
-/// The frames that went from one node to another, in their order.
+/// Returns the frames that went from one node to another, in order.
 fn frames(world: &World, from: NodeKey, to: NodeKey) -> Vec<Control> {
     let of_link = |c: &&CapturedFrame| (c.from, c.to) == (from, to);
     world.captured().iter().filter(of_link).map(|c| c.frame.clone()).collect()
 }
 
-/// How many frames a node's router refused for that reason.
+/// Returns the number of frames that a node's router refused for that reason.
 fn drops(world: &World, node: NodeKey, key: &str) -> usize {
     world.router_drops(node).iter().filter(|d| **d == key).count()
 }
@@ -170,7 +170,7 @@ fn sink_drops(world: &World, node: NodeKey) -> BTreeMap<&'static str, usize> {
     counts
 }
 
-/// The links that a node closed, by why.
+/// Returns the reasons for which a node closed links.
 fn closed(world: &World, node: NodeKey) -> Vec<sgc_router::LinkClose> {
     let of_node = world.log().iter().filter(|l| l.node == node);
     of_node

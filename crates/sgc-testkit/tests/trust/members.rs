@@ -141,7 +141,7 @@ fn nobody_claims_the_names_of_another_owner() {
     let advert = Control::Advert { cost: 0, signed: thief.sign_advert(&body) };
     let withdrawal = AdvertBody { withdraw: true, seq: body.seq + 1, ..body.clone() };
     let withdrawal = Control::Advert { cost: 0, signed: thief.sign_advert(&withdrawal) };
-    // With the owner's certificate, which everyone has seen, and another key.
+    // With the owner's certificate, which is public, and another key.
     let borrowed = AdvertBody { chain: world.identity(*arm).chain_bytes(), ..body };
     let borrowed = Control::Advert { cost: 0, signed: thief.sign_advert(&borrowed) };
     for frame in [advert, withdrawal, borrowed] {
@@ -182,7 +182,7 @@ fn a_grant_for_another_or_for_an_altered_one_is_not_taken() {
     world.run(ms(500));
     assert_eq!(grants(world, *desk, *arm).len(), before);
     assert!(drops(world, *lap, "owner_key") > 0);
-    // A sink that was sent such asks again. The owner grants that; nothing came of what was altered.
+    // A sink that gets such a packet asks again, and the owner grants it. The altered packets have no effect.
     let sinks = world.granted_sinks(*arm, "/chatter");
     let again = &grants(world, *lap, *arm)[granted_to_lap..];
     assert!(again.iter().all(|(sink, _)| *sink != altered && sinks.contains(&(*sink, *lap))), "{again:?}");

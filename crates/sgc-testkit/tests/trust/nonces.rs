@@ -29,7 +29,7 @@ fn sealed(packet: &Packet) -> SealedText {
     (PacketHeader { hops: 0, ..packet.header.clone() }, payload)
 }
 
-/// The keys that were granted for a name and an epoch, over all runs of its owner.
+/// Returns the keys that were granted for a name and an epoch, over all runs of its owner.
 fn keys(world: &World) -> BTreeMap<(Name, u32), Vec<TopicGrant>> {
     let mut keys: BTreeMap<_, Vec<TopicGrant>> = BTreeMap::new();
     for logged in world.log() {
@@ -63,7 +63,7 @@ fn key_of(packet: &Packet, keys: &[TopicGrant]) -> Option<usize> {
     })
 }
 
-/// Two packets that share key and nonce and are not the same.
+/// Returns two different packets that share key and nonce.
 fn repeated(world: &World) -> Option<String> {
     let keys = keys(world);
     let mut seen: BTreeMap<Slot, Vec<(Packet, SealedText)>> = BTreeMap::new();
@@ -169,7 +169,7 @@ fn no_nonce_is_used_for_two_texts_over_restarts_rotations_and_histories() {
         packets += history.world.captured_packets().len();
         anew += keys(&history.world).values().filter(|k| k.len() > 1).count();
     }
-    // The histories were such that it could have gone wrong.
+    // The histories contained the cases in which nonces could repeat.
     assert!(packets > 5000, "{packets}");
     assert!(anew > 25, "{anew}");
 }

@@ -1,4 +1,4 @@
-//! Recorded packets and answers, played again at every later occasion.
+//! Replays of recorded packets and answers at every later occasion.
 
 use sgc_endpoint::{Sink, SinkLimits};
 use sgc_testkit::{Sharing, World, WorldConfig};
@@ -20,7 +20,7 @@ fn recorded(seed: u64) -> (Scene, Vec<Packet>) {
     (scene, recorded)
 }
 
-/// Plays packets to `desk`; nothing comes of them, and what they were refused for.
+/// Replays packets to `desk` and checks that none is delivered. Returns the reasons of the refusals.
 fn play(scene: &mut Scene, recorded: &[Packet]) -> Vec<(&'static str, usize)> {
     let Scene { world, arm, west, desk, .. } = scene;
     let (received, before) = (world.received(*desk, *arm, "/chatter").len(), sink_drops(world, *desk));
@@ -33,7 +33,7 @@ fn play(scene: &mut Scene, recorded: &[Packet]) -> Vec<(&'static str, usize)> {
     new.filter(|(_, n)| *n > 0).collect()
 }
 
-/// The topic still comes through.
+/// Checks that the topic still flows.
 fn assert_goes_on(scene: &mut Scene) {
     let Scene { world, arm, desk, .. } = scene;
     world.until_granted(*desk, *arm, "/chatter");
@@ -139,7 +139,7 @@ fn replay_of_history_to_same_or_other_sink_is_refused() {
     assert_goes_on(&mut scene);
 }
 
-/// The answers that went over a link, with their serials.
+/// Returns the answers that went over a link, with their serials.
 fn answers(world: &World, scene: (sgc_testkit::NodeKey, sgc_testkit::NodeKey)) -> Vec<(AnswerBody, Control)> {
     let all = frames(world, scene.0, scene.1).into_iter();
     all.filter_map(|frame| match &frame {

@@ -50,7 +50,7 @@ fn unknown_type_description_follows_once_owner_has_it() {
     let Scene { world, arm, desk, .. } = &mut scene;
     let topics = ["/chatter", "/other"];
     world.share(*arm, "/other", Sharing::to_fleet());
-    // Before the owner describes anything there is nobody to ask.
+    // Before the owner describes a type, no node can be asked.
     world.ask_types(*desk, *arm, &topics);
     world.run(ms(1000));
     assert!(told(world, *desk, *arm, &topics).is_empty());
