@@ -29,16 +29,16 @@ const MESSAGE_BYTES: usize = 1024;
 /// Period of a publisher without a history, which is the resolution of the measurement.
 const EVERY: Duration = Duration::from_micros(200);
 
-/// When this process logged last that a link is up.
+/// Time at which this process last logged that a link is up.
 static LINK_UP: Mutex<Option<Instant>> = Mutex::new(None);
 
 /// The kind of publisher.
 #[derive(Clone, Copy, Serialize)]
 #[serde(rename_all = "snake_case")]
 enum Publisher {
-    /// It has published one message, which it keeps for late joiners.
+    /// The application has published one message and keeps it for late joiners.
     Latched,
-    /// It publishes all the time.
+    /// The application publishes all the time.
     Stream,
 }
 
@@ -100,7 +100,7 @@ pub(crate) fn latched_after_link_ms(
     suite: Suite,
     starts: usize,
 ) -> Result<Spread> {
-    // If another part of this process watches, it sees the same.
+    // Another watcher in this process sees the same.
     let _ = watch_links();
     Ok(measure_at(router, fleet, dir, Publisher::Latched, suite, starts)?.after_link_ms)
 }
@@ -154,7 +154,7 @@ fn measure_at(
         let up = link_up().context("no link came up")?;
         after_link.push(arrived.saturating_duration_since(up).as_secs_f64() * 1e3);
         after_start.push((arrived - begun).as_secs_f64() * 1e3);
-        // The next start finds what the first one found: nobody has a name or a grant of this one.
+        // The next start meets the same state: no node has a name or a grant of this one.
         let granted = desk.route_state()?;
         drop(robot);
         wait("the publisher is forgotten", || {
@@ -171,7 +171,7 @@ fn measure_at(
     })
 }
 
-/// When the first message arrived, publishing meanwhile.
+/// Publishes until the first message arrives, and returns its time.
 fn first(
     heard: &Receiver<Instant>,
     begun: Instant,
@@ -205,7 +205,7 @@ impl<S: tracing::Subscriber> Layer<S> for LinkWatch {
     }
 }
 
-/// Whether it is that message.
+/// Returns `true` if it is that message.
 struct Message(bool);
 
 impl Visit for Message {

@@ -11,18 +11,18 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 
-/// Longer than anything takes that works.
+/// Time-out that no working process reaches.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A process that serves until it is dropped.
 pub(crate) struct Server {
     child: Child,
-    /// The first line that it printed.
+    /// The first line of its output.
     pub(crate) greeting: String,
 }
 
 impl Server {
-    /// Starts it, and waits for its first line. It has to end when its standard input does.
+    /// Starts a process and waits for its first line. The process has to end when its standard input does.
     pub(crate) fn start(command: &mut Command) -> Result<Self> {
         let mut child = command
             .stdin(Stdio::piped())
@@ -38,22 +38,22 @@ impl Server {
         Ok(Self { child, greeting: greeting.trim().to_owned() })
     }
 
-    /// This program once more, as `role`.
+    /// Starts this program once more, as `role`.
     pub(crate) fn own(role: &str) -> Result<Self> {
         Self::start(Command::new(std::env::current_exe()?).arg(role))
     }
 
-    /// Its process id.
+    /// Returns its process id.
     pub(crate) fn pid(&self) -> u32 {
         self.child.id()
     }
 
-    /// CPU time that its threads have taken, user and system, seconds.
+    /// Returns the CPU time of its threads, user and system, in seconds.
     pub(crate) fn cpu_seconds(&self) -> f64 {
         cpu_seconds(&format!("/proc/{}/task", self.child.id()))
     }
 
-    /// Its resident memory, bytes.
+    /// Returns its resident memory in bytes.
     pub(crate) fn resident_bytes(&self) -> u64 {
         resident_bytes(&format!("/proc/{}/status", self.child.id()))
     }
@@ -74,7 +74,7 @@ impl Drop for Server {
     }
 }
 
-/// Blocks until standard input ends: what a [`Server`] of this program does when it is up.
+/// Blocks until standard input ends, as a [`Server`] of this program does when it is up.
 pub(crate) fn until_stdin_closes() {
     let mut rest = Vec::new();
     let _ = std::io::stdin().lock().read_to_end(&mut rest);
@@ -89,12 +89,12 @@ pub(crate) struct SgcRouter {
 }
 
 impl SgcRouter {
-    /// Starts it in `dir`, with the identity in `router.identity` there.
+    /// Starts a router in `dir`, with the identity in `router.identity` there.
     pub(crate) fn start(sgc: &Path, dir: &Path) -> Result<Self> {
         Self::start_on("quic", sgc, dir)
     }
 
-    /// The same, with a listener of this scheme.
+    /// Starts a router with a listener of this scheme.
     pub(crate) fn start_on(scheme: &str, sgc: &Path, dir: &Path) -> Result<Self> {
         let (config, socket) = (dir.join("router.toml"), dir.join("router.sock"));
         let text = format!(
@@ -123,8 +123,8 @@ impl SgcRouter {
         Ok(status(&self.socket)?["links"].as_array().context("a status without `links`")?.len())
     }
 
-    /// Waits until it has a route for so many names, as long as there are ever more. Counting them takes the router's time,
-    /// so it is asked rarely when answers are slow.
+    /// Waits until the router has a route for so many names, while their number grows. Counting them takes the router's time, so
+    /// slow answers make it ask less often.
     pub(crate) fn until_routed(&self, names: u64) -> Result<()> {
         let (mut most, mut deadline) = (0, Instant::now() + PATIENCE);
         loop {

@@ -29,12 +29,12 @@ const UPLINK_RATE: u64 = 5_000_000;
 const DOWNLINK_RATE: u64 = 20_000_000;
 /// Bound of either queue.
 const QUEUE: Duration = Duration::from_millis(200);
-/// One way, in each direction.
+/// Delay in each direction.
 const DELAYS: [Duration; 2] = [Duration::ZERO, Duration::from_millis(40)];
 const PORT: u16 = 7447;
-/// Before measuring begins, with everything flowing.
+/// Time of flow before the measurement.
 const WARM_UP: Duration = Duration::from_secs(3);
-/// Afterwards, for what is under way.
+/// Time after the measurement for messages in flight.
 const SETTLE: Duration = Duration::from_secs(2);
 /// Offset of number and time of sending in a payload, behind the CDR encapsulation header.
 const NUMBER_AT: usize = 4;
@@ -100,7 +100,7 @@ struct Figures {
     commands: Outcome,
     state: Outcome,
     camera: Outcome,
-    /// The longest that a packet waited at the uplink, milliseconds.
+    /// Longest time that a packet waited at the uplink, in milliseconds.
     queue_ms_max: f64,
     /// Packets that the uplink dropped because its queue was full.
     overflowed: u64,
@@ -288,7 +288,7 @@ impl Flow {
                 payload[STAMP_AT..STAMP_AT + 8].copy_from_slice(&now.to_le_bytes());
                 talker.say(Bytes::from(payload))?;
                 its.said.store(number, SeqCst);
-                // Whoever was held up goes on at its pace, and makes up for nothing.
+                // A delayed publisher keeps its pace and skips missed messages.
                 next = (next + period).max(Instant::now());
                 sleep(next - Instant::now().min(next));
             }

@@ -1,8 +1,8 @@
-//! `compare`: SGC and what a user would pick instead, side by side in one run over one emulated network.
+//! `compare`: SGC and its alternatives, side by side in one run over one emulated network.
 //!
-//! What is compared is a [`System`](system::System) between two places of a [`Lab`](lab::Lab): it carries topics of programs
-//! that know nothing of it. A table is a module here and a row of [`TABLES`]; what it measures are [`figures::Figure`]s, which
-//! `report` turns into pages, plots and goals.
+//! A [`System`](system::System) joins two places of a [`Lab`](lab::Lab) and carries topics of programs that do not know it. A
+//! table is a module here and a row of [`TABLES`]. It measures [`figures::Figure`]s, which `report` turns into pages, plots and
+//! goals.
 
 mod applications;
 mod fan_out;

@@ -1,5 +1,5 @@
-//! Turns that several have at the same time, each in a lab of its own, where the path says how long things take and not the
-//! machine. Knows nothing of what is measured.
+//! Turns of several participants at the same time, each in a lab of its own, where the path and not the machine decides how long
+//! things take. This module does not know what is measured.
 
 use anyhow::Result;
 

@@ -47,7 +47,7 @@ impl Plan {
 pub(super) struct Flow {
     pub(super) sent: u32,
     pub(super) received: u32,
-    /// From before the first was said until the last had come.
+    /// Time from before the first message was sent until the last had arrived.
     pub(super) seconds: f64,
     /// CPU time of the gateway's process meanwhile, seconds.
     pub(super) cpu_seconds: f64,
@@ -107,8 +107,8 @@ struct ClientArrivals {
     last_ns: AtomicU64,
 }
 
-/// A DDS program says as much as it can, and the client hears. By gRPC the gateway keeps what the client does not take at once, as
-/// far as it does; what is beyond, and by rosbridge what is more than a queue, is dropped.
+/// Measures messages from a DDS program at full speed to the client. By gRPC the gateway buffers messages up to a bound. It drops
+/// messages beyond that, and by rosbridge those beyond a queue.
 pub(super) async fn down(scene: &Scene, way: Way, size: usize, plan: &Plan) -> Result<Flow> {
     let hearer = Hearer::new(scene, way, DOWN, size, true).await?;
     let heard = Arc::new(ClientArrivals::default());
@@ -162,7 +162,7 @@ async fn hear(mut hearer: Hearer, heard: Arc<ClientArrivals>) -> Result<()> {
     }
 }
 
-/// Waits for the last message; false if nothing more comes.
+/// Waits for the last message. Returns `false` if no more come.
 async fn until_quiet(heard: &ClientArrivals, last: u32, quiet: Duration) -> bool {
     let (mut received, mut since) = (0, Instant::now());
     while heard.last.load(Ordering::Relaxed) < last {
@@ -183,7 +183,7 @@ struct SinkReport {
     ended_ns: u64,
 }
 
-/// The client says as much as it can, and a DDS program counts. Nothing is lost: DDS keeps what is not acknowledged, and the
+/// Measures messages from the client at full speed to a DDS program. None is lost: DDS keeps unacknowledged messages, and the
 /// gateway lets the client wait.
 pub(super) async fn up(scene: &Scene, way: Way, size: usize, plan: &Plan) -> Result<Flow> {
     let mut sayer = Sayer::new(scene, way, UP, size, true).await?;

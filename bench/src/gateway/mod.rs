@@ -1,8 +1,8 @@
 //! `gateway`: programs without ROS beside a DDS program, through one `sgc run` with `[gateway]`: round trips and messages as fast as
 //! they go, by each protocol and encoding.
 //!
-//! [`scene`] starts what is measured, [`client`] is the program without ROS, [`measure`] times it, [`goals`] and
-//! [`figures`] say what came of it.
+//! [`scene`] starts the measured node, [`client`] is the program without ROS, [`measure`] times it, [`goals`] and
+//! [`figures`] hold the results.
 
 mod client;
 mod figures;

@@ -15,7 +15,7 @@ use crate::compare::{Dds, Program};
 use crate::fleet::BenchFleet;
 use crate::process::status;
 
-/// A ROS domain that nobody else is likely to have.
+/// A ROS domain that other programs rarely use.
 const DOMAIN: u32 = 91;
 /// Topics of the client's messages and of their echoes.
 pub(super) const PING: &str = "/bench/ping";
@@ -84,7 +84,7 @@ impl Scene {
             Ok::<_, anyhow::Error>(program)
         };
         let _pong = load("pong", &["--topic", PING, "--back", PONG, "--depth", "10"])?;
-        // All is kept that is not acknowledged: who is slow is waited for.
+        // DDS keeps all unacknowledged messages and waits for slow readers.
         let source = load("source", &["--topic", DOWN, "--depth", "0"])?;
         let sink = load("sink", &["--topic", UP, "--depth", "0"])?;
         let [source, sink] = [source, sink].map(|program| Arc::new(Mutex::new(program)));
@@ -101,7 +101,7 @@ impl Scene {
         self.node.cpu_seconds()
     }
 
-    /// Speaks with the source, on a thread that may wait.
+    /// Talks to the source, on a thread that may block.
     pub(super) async fn with_source<T: Send + 'static>(
         &self,
         talk: impl FnOnce(&mut Program) -> Result<T> + Send + 'static,
@@ -109,7 +109,7 @@ impl Scene {
         with(&self.source, talk).await
     }
 
-    /// The same with the sink.
+    /// Talks to the sink, on a thread that may block.
     pub(super) async fn with_sink<T: Send + 'static>(
         &self,
         talk: impl FnOnce(&mut Program) -> Result<T> + Send + 'static,
