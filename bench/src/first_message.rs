@@ -1,4 +1,4 @@
-//! From the moment at which a publisher's link is up to its first message at a subscriber that waits for it.
+//! Measures the time from a publisher's link to its first message at a waiting subscriber.
 //!
 //! Subscriber and router are up. The publisher's node starts with an application on its local network that was there
 //! before: so each run has everything in it that a start has, the owner's advertisements, the subscriber's requests to
@@ -26,19 +26,19 @@ use crate::report::{Report, Spread, Table, digits};
 
 const TOPIC: &str = "/first";
 const MESSAGE_BYTES: usize = 1024;
-/// How often the application publishes that does not keep its messages: as finely is its first one timed.
+/// Period of a publisher without a history, which is the resolution of the measurement.
 const EVERY: Duration = Duration::from_micros(200);
 
-/// When this process logged last that a link is up.
+/// Time at which this process last logged that a link is up.
 static LINK_UP: Mutex<Option<Instant>> = Mutex::new(None);
 
-/// What the publisher's application does.
+/// The kind of publisher.
 #[derive(Clone, Copy, Serialize)]
 #[serde(rename_all = "snake_case")]
 enum Publisher {
-    /// It has published one message, which it keeps for late joiners.
+    /// The application has published one message and keeps it for late joiners.
     Latched,
-    /// It publishes all the time.
+    /// The application publishes all the time.
     Stream,
 }
 
@@ -100,7 +100,7 @@ pub(crate) fn latched_after_link_ms(
     suite: Suite,
     starts: usize,
 ) -> Result<Spread> {
-    // If another part of this process watches, it sees the same.
+    // Another watcher in this process sees the same.
     let _ = watch_links();
     Ok(measure_at(router, fleet, dir, Publisher::Latched, suite, starts)?.after_link_ms)
 }
@@ -154,7 +154,7 @@ fn measure_at(
         let up = link_up().context("no link came up")?;
         after_link.push(arrived.saturating_duration_since(up).as_secs_f64() * 1e3);
         after_start.push((arrived - begun).as_secs_f64() * 1e3);
-        // The next start finds what the first one found: nobody has a name or a grant of this one.
+        // The next start meets the same state: no node has a name or a grant of this one.
         let granted = desk.route_state()?;
         drop(robot);
         wait("the publisher is forgotten", || {
@@ -166,12 +166,12 @@ fn measure_at(
         publisher,
         suite: suite.to_string(),
         starts,
-        after_link_ms: Spread::of(after_link),
-        after_start_ms: Spread::of(after_start),
+        after_link_ms: Spread::from_samples(after_link),
+        after_start_ms: Spread::from_samples(after_start),
     })
 }
 
-/// When the first message arrived, publishing meanwhile.
+/// Publishes until the first message arrives, and returns its time.
 fn first(
     heard: &Receiver<Instant>,
     begun: Instant,
@@ -205,7 +205,7 @@ impl<S: tracing::Subscriber> Layer<S> for LinkWatch {
     }
 }
 
-/// Whether it is that message.
+/// Returns `true` if it is that message.
 struct Message(bool);
 
 impl Visit for Message {

@@ -1,7 +1,7 @@
 //! Benchmarks on real sockets; `README.md` says what each part measures and how to read it.
 //!
 //! This file knows the command line. The parts are [`compare`], [`forward`], [`gateway`], [`rib`], [`first_message`], [`teleop`]
-//! and [`transports`]; what they share is in [`fleet`], [`node`], [`process`], [`report`] and [`uplink`].
+//! and [`transports`]; [`fleet`], [`node`], [`process`], [`report`] and [`uplink`] are shared.
 #![forbid(unsafe_code)]
 
 mod compare;
@@ -31,7 +31,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// What routing costs: the first three below, one after the other
+    /// Measure the cost of routing: the first three below, one after the other
     All(RunArgs),
     /// 1 KB through one router, beside a plain TCP relay and a zenoh router
     Forward(RunArgs),
@@ -49,7 +49,7 @@ enum Command {
     Gateway(gateway::GatewayArgs),
     /// The pages and plots of a run of `compare`, once more from its figures
     Report(ReportArgs),
-    /// SGC beside what users would pick instead, in one run over emulated paths; needs root
+    /// SGC beside its alternatives, in one run over emulated paths; needs root
     Compare(compare::CompareArgs),
     /// The far end of `transports`, in a process of its own
     #[command(hide = true)]
@@ -64,43 +64,43 @@ enum Command {
     #[cfg(feature = "zenoh")]
     #[command(hide = true)]
     ServeZenoh,
-    /// One size of `rib`, in a process of its own so that its memory can be told
+    /// One size of `rib`, in a process of its own so that its memory can be measured
     #[command(hide = true)]
     MeasureRib {
         /// Names that the router knows
         names: usize,
-        /// Single operations that are timed at that size
+        /// Number of single operations timed at that size
         samples: usize,
     },
 }
 
-/// What is rendered, and where to.
+/// The arguments of `report`.
 #[derive(Args)]
 struct ReportArgs {
     /// The `compare.json` of a run
     #[arg(value_name = "FILE")]
     run: PathBuf,
-    /// Where `report.md` and its plots go
+    /// Directory for `report.md` and its plots
     #[arg(long, value_name = "DIR", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/results"))]
     out: PathBuf,
 }
 
-/// What every part is given.
+/// The arguments of every part.
 #[derive(Args, Clone)]
 struct RunArgs {
     /// The program whose router is measured
     #[arg(long, value_name = "FILE", default_value = "target/release/sgc")]
     sgc: PathBuf,
-    /// Where the JSON goes
+    /// Directory for the JSON
     #[arg(long, value_name = "DIR", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/results"))]
     out: PathBuf,
     /// Names in the router, for `rib`
     #[arg(long, value_name = "N,N,…", value_delimiter = ',', default_values_t = [10_000, 1_000_000, 10_000_000])]
     names: Vec<usize>,
-    /// Transports, for `teleop`, `transports` and `router-memory`; those that this build does not know are left out
+    /// Transports, for `teleop`, `transports` and `router-memory`; those that this build lacks are skipped
     #[arg(long, value_name = "SCHEME,…", value_delimiter = ',', default_values = uplink::SCHEMES)]
     schemes: Vec<String>,
-    /// The state and the commands of `teleop` are reliable topics
+    /// Make the state and the commands of `teleop` reliable topics
     #[arg(long)]
     reliable: bool,
     /// Seconds of each run of `teleop`

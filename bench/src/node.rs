@@ -1,4 +1,4 @@
-//! Whole nodes in this process, with local networks in memory instead of DDS: what is left is SGC and its links.
+//! Whole nodes in this process, with local networks in memory instead of DDS, so that only SGC and its links are measured.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -27,13 +27,13 @@ pub(crate) struct Node {
 }
 
 impl Node {
-    /// Starts it; up when this returns, though not connected.
+    /// Starts a node, which is up on return, though not connected.
     pub(crate) fn start(config: Config, identity: Arc<Identity>, domain: &FakeDomain) -> Result<Self> {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
         Self::start_on(runtime, config, identity, Some(domain))
     }
 
-    /// The same, with its sockets in a network namespace, and perhaps without a local network.
+    /// Starts a node with its sockets in a network namespace, and optionally without a local network.
     pub(crate) fn start_in(
         home: &Arc<Namespace>,
         config: Config,
@@ -72,7 +72,7 @@ impl Node {
         status(&self.socket)
     }
 
-    /// What its only share or use is doing.
+    /// Returns the state of its only share or use.
     pub(crate) fn route_state(&self) -> Result<String> {
         Ok(self.status()?["routes"][0]["state"].as_str().unwrap_or_default().to_owned())
     }
@@ -112,13 +112,13 @@ pub(crate) fn share(topic: &str, to: &str, suite: Suite) -> Result<ShareConfig> 
     Ok(ShareConfig { suite, ..share })
 }
 
-/// The same topic at that node.
+/// Returns the use of the same topic at that node.
 pub(crate) fn usage(topic: &str, from: &str) -> Result<UseConfig> {
     let mut config = parse(&format!("[[use]]\nfrom = \"{from}\"\ntopic = \"{topic}\"\n"))?;
     config.uses.pop().context("a use")
 }
 
-/// Part of a configuration as users write it, so that what it does not say is as it is for them.
+/// Parses part of a configuration as users write it, so that omitted keys have their defaults.
 fn parse(tables: &str) -> Result<Config> {
     let text = format!("identity = \"x\"\n[node]\nrouters = [\"quic://router\"]\n{tables}");
     Ok(sgc_node::config::parse(&text, "benchmark", Path::new(""), &|_| None)?)
@@ -140,7 +140,7 @@ impl Talker {
         Ok(self.writer.write(SampleKind::Write, 1, payload)?)
     }
 
-    /// Several that a reader finds at hand together, as under load.
+    /// Publishes several messages that a reader finds together, as under load.
     pub(crate) fn say_all(&self, payloads: &[Bytes]) {
         self.writer.write_burst(payloads.iter().cloned());
     }
@@ -177,7 +177,7 @@ fn spec(topic: &str, qos: Qos) -> EndpointSpec {
     }
 }
 
-/// Waits until it is so, looking often enough for what is not timed.
+/// Waits until a condition holds. The period of polling is too long for timed waits.
 pub(crate) fn wait(what: &str, mut until: impl FnMut() -> Result<bool>) -> Result<()> {
     let begun = Instant::now();
     while !until()? {

@@ -1,4 +1,4 @@
-//! Processes that are measured: started, found by the address that they print, ended by closing their standard input.
+//! Measured processes: started, found by the address that they print, ended by closing their standard input.
 
 use std::collections::HashMap;
 use std::ffi::OsString;
@@ -11,18 +11,18 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 
-/// Longer than anything takes that works.
+/// Time-out that no working process reaches.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
 /// A process that serves until it is dropped.
 pub(crate) struct Server {
     child: Child,
-    /// The first line that it printed.
+    /// The first line of its output.
     pub(crate) greeting: String,
 }
 
 impl Server {
-    /// Starts it, and waits for its first line. It has to end when its standard input does.
+    /// Starts a process and waits for its first line. The process has to end when its standard input does.
     pub(crate) fn start(command: &mut Command) -> Result<Self> {
         let mut child = command
             .stdin(Stdio::piped())
@@ -38,22 +38,22 @@ impl Server {
         Ok(Self { child, greeting: greeting.trim().to_owned() })
     }
 
-    /// This program once more, as `role`.
+    /// Starts this program once more, as `role`.
     pub(crate) fn own(role: &str) -> Result<Self> {
         Self::start(Command::new(std::env::current_exe()?).arg(role))
     }
 
-    /// Its process id.
+    /// Returns its process id.
     pub(crate) fn pid(&self) -> u32 {
         self.child.id()
     }
 
-    /// CPU time that its threads have taken, user and system, seconds.
+    /// Returns the CPU time of its threads, user and system, in seconds.
     pub(crate) fn cpu_seconds(&self) -> f64 {
         cpu_seconds(&format!("/proc/{}/task", self.child.id()))
     }
 
-    /// Its resident memory, bytes.
+    /// Returns its resident memory in bytes.
     pub(crate) fn resident_bytes(&self) -> u64 {
         resident_bytes(&format!("/proc/{}/status", self.child.id()))
     }
@@ -74,7 +74,7 @@ impl Drop for Server {
     }
 }
 
-/// Blocks until standard input ends: what a [`Server`] of this program does when it is up.
+/// Blocks until standard input ends, as a [`Server`] of this program does when it is up.
 pub(crate) fn until_stdin_closes() {
     let mut rest = Vec::new();
     let _ = std::io::stdin().lock().read_to_end(&mut rest);
@@ -83,18 +83,18 @@ pub(crate) fn until_stdin_closes() {
 /// `sgc run` as a router.
 pub(crate) struct SgcRouter {
     pub(crate) process: Server,
-    /// Where it listens.
+    /// The URL on which it listens.
     pub(crate) url: String,
     socket: PathBuf,
 }
 
 impl SgcRouter {
-    /// Starts it in `dir`, with the identity in `router.identity` there.
+    /// Starts a router in `dir`, with the identity in `router.identity` there.
     pub(crate) fn start(sgc: &Path, dir: &Path) -> Result<Self> {
         Self::start_on("quic", sgc, dir)
     }
 
-    /// The same, with a listener of this scheme.
+    /// Starts a router with a listener of this scheme.
     pub(crate) fn start_on(scheme: &str, sgc: &Path, dir: &Path) -> Result<Self> {
         let (config, socket) = (dir.join("router.toml"), dir.join("router.sock"));
         let text = format!(
@@ -112,19 +112,19 @@ impl SgcRouter {
         Ok(Self { process, url, socket })
     }
 
-    /// How many names it has a route for.
+    /// Returns the number of names for which it has a route.
     pub(crate) fn routed_names(&self) -> Result<u64> {
         let status = status(&self.socket)?;
         status["router"]["routed_names"].as_u64().context("a status without `routed_names`")
     }
 
-    /// How many links it has.
+    /// Returns the number of its links.
     pub(crate) fn links(&self) -> Result<usize> {
         Ok(status(&self.socket)?["links"].as_array().context("a status without `links`")?.len())
     }
 
-    /// Waits until it has a route for so many names, as long as there are ever more. Counting them takes the router's time,
-    /// so it is asked rarely when answers are slow.
+    /// Waits until the router has a route for so many names, while their number grows. Counting them takes the router's time, so
+    /// slow answers make it ask less often.
     pub(crate) fn until_routed(&self, names: u64) -> Result<()> {
         let (mut most, mut deadline) = (0, Instant::now() + PATIENCE);
         loop {
@@ -144,7 +144,7 @@ impl SgcRouter {
     }
 }
 
-/// What a node says at its status socket.
+/// Asks a node for its status.
 pub(crate) fn status(socket: &Path) -> Result<serde_json::Value> {
     let mut stream = UnixStream::connect(socket).with_context(|| socket.display().to_string())?;
     stream.write_all(sgc_node::admin::AdminRequest::Status.to_line().as_bytes())?;

@@ -1,4 +1,4 @@
-//! What comes out: tables for people, JSON for programs, and which machine it was.
+//! The output: tables for people, JSON for programs, and the description of the machine.
 
 use std::fs;
 use std::path::Path;
@@ -22,22 +22,22 @@ pub(crate) struct Table {
     pub(crate) rows: Vec<Vec<String>>,
 }
 
-/// Where it was measured: enough to compare by, nothing that tells whose machine it is.
+/// The machine, with enough detail for comparison and nothing that identifies it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Machine {
     cpu: String,
     cores: usize,
-    /// Those instructions that ciphers and hashes are made of, as far as this CPU has them.
+    /// Instructions for ciphers and hashes that this CPU has.
     #[serde(default)]
     instructions: Vec<String>,
-    /// Whether a hypervisor is below.
+    /// The machine is virtual.
     #[serde(default)]
     is_virtual: bool,
     memory_gib: u64,
     kernel: String,
     #[serde(default)]
     system: String,
-    /// Processes that wanted a core, mean of the last minute; the benchmark's own count too.
+    /// Load average of the last minute, the benchmark's own processes included.
     load: f64,
 }
 
@@ -75,11 +75,11 @@ impl Report {
     }
 }
 
-/// What of `/proc/cpuinfo` decides how fast ciphers and hashes are.
+/// Flags of `/proc/cpuinfo` that decide the speed of ciphers and hashes.
 const INSTRUCTIONS: [&str; 7] = ["aes", "vaes", "pclmulqdq", "sha_ni", "avx2", "avx512f", "sha2"];
 
 impl Machine {
-    /// This one.
+    /// Describes this machine.
     pub(crate) fn here() -> Self {
         let read = |path| fs::read_to_string(path).unwrap_or_default();
         let cpu = read("/proc/cpuinfo");
@@ -107,7 +107,7 @@ impl Machine {
         }
     }
 
-    /// All of it in a line.
+    /// Formats the description in a line.
     pub(crate) fn sentence(&self) -> String {
         let Self { cpu, cores, instructions, is_virtual, memory_gib, kernel, system, load } = self;
         let cpu = if cpu.is_empty() { "a CPU without a name" } else { cpu };
@@ -121,7 +121,7 @@ impl Machine {
     }
 }
 
-/// Middle and tail of a sample, in its unit.
+/// Median and tail of a sample, in its unit.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Serialize)]
 pub(crate) struct Spread {
     pub(crate) mean: f64,
@@ -131,7 +131,7 @@ pub(crate) struct Spread {
 }
 
 impl Spread {
-    pub(crate) fn of(mut sample: Vec<f64>) -> Self {
+    pub(crate) fn from_samples(mut sample: Vec<f64>) -> Self {
         if sample.is_empty() {
             return Self::default();
         }
@@ -146,12 +146,12 @@ impl Spread {
     }
 }
 
-/// The middle one of a few figures.
+/// Returns the median of a few figures.
 pub(crate) fn median(figures: impl IntoIterator<Item = f64>) -> f64 {
-    Spread::of(figures.into_iter().collect()).p50
+    Spread::from_samples(figures.into_iter().collect()).p50
 }
 
-/// A figure with about three digits, which is what it is good for.
+/// Formats a figure with about three digits, which is its precision.
 pub(crate) fn digits(figure: f64) -> String {
     match figure.abs() {
         f if f >= 100.0 => format!("{figure:.0}"),
@@ -160,7 +160,7 @@ pub(crate) fn digits(figure: f64) -> String {
     }
 }
 
-/// The same for thousands.
+/// Formats a figure in thousands.
 pub(crate) fn thousands(figure: f64) -> String {
     format!("{} k", digits(figure / 1000.0))
 }

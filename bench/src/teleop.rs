@@ -1,4 +1,4 @@
-//! Driving a robot over a thin uplink while its camera wants three times what that carries.
+//! Measures driving a robot over a thin uplink while its camera sends three times the uplink's rate.
 //!
 //! Robot, router and desk are nodes of this process, so that one clock times all; the robot is in one network namespace, the
 //! others in another, and the emulated uplink is between them. Each run has nodes and an uplink of its own.
@@ -23,27 +23,27 @@ use crate::node::{Listener, Node, Talker, wait};
 use crate::report::{Report, Spread, Table, digits};
 use crate::uplink::{self, FAR, Uplink};
 
-/// What the uplink carries, bits a second.
+/// Rate of the uplink, in bits per second.
 const UPLINK_RATE: u64 = 5_000_000;
-/// What the way back carries.
+/// Rate of the way back, in bits per second.
 const DOWNLINK_RATE: u64 = 20_000_000;
-/// What may wait for either.
+/// Bound of either queue.
 const QUEUE: Duration = Duration::from_millis(200);
-/// One way, in each direction.
+/// Delay in each direction.
 const DELAYS: [Duration; 2] = [Duration::ZERO, Duration::from_millis(40)];
 const PORT: u16 = 7447;
-/// Before measuring begins, with everything flowing.
+/// Time of flow before the measurement.
 const WARM_UP: Duration = Duration::from_secs(3);
-/// Afterwards, for what is under way.
+/// Time after the measurement for messages in flight.
 const SETTLE: Duration = Duration::from_secs(2);
-/// Where number and time of sending are in a payload: behind the CDR encapsulation header.
+/// Offset of number and time of sending in a payload, behind the CDR encapsulation header.
 const NUMBER_AT: usize = 4;
 const STAMP_AT: usize = 12;
 
 /// The zero of the time stamps.
 static EPOCH: LazyLock<Instant> = LazyLock::new(Instant::now);
 
-/// One of the three.
+/// One of the three topics.
 struct Topic {
     name: &'static str,
     /// Towards the robot.
@@ -81,7 +81,7 @@ const TOPICS: [Topic; 3] = [
     },
 ];
 
-/// What became of a topic.
+/// The result of a topic.
 #[derive(Clone, Copy, Default, Serialize)]
 struct Outcome {
     /// From publishing to the subscriber, milliseconds.
@@ -100,9 +100,9 @@ struct Figures {
     commands: Outcome,
     state: Outcome,
     camera: Outcome,
-    /// The longest that a packet waited at the uplink, milliseconds.
+    /// Longest time that a packet waited at the uplink, in milliseconds.
     queue_ms_max: f64,
-    /// What the uplink dropped because its queue was full.
+    /// Packets that the uplink dropped because its queue was full.
     overflowed: u64,
     uplink_mbit_per_second: f64,
 }
@@ -243,7 +243,7 @@ fn load(dir: &Path, node: &str, routers: &str, rest: &str) -> Result<config::Con
 }
 
 #[derive(Default)]
-struct Shared {
+struct Exchange {
     said: AtomicU64,
     /// Number and age, milliseconds.
     arrivals: Mutex<Vec<(u64, f64)>>,
@@ -253,7 +253,7 @@ struct Shared {
 /// An application that publishes at its pace, and one that subscribes.
 struct Flow {
     name: &'static str,
-    shared: Arc<Shared>,
+    exchange: Arc<Exchange>,
     talker: Option<JoinHandle<Result<()>>>,
     _listener: Listener,
 }
@@ -263,8 +263,8 @@ impl Flow {
         let reliability =
             if reliable && !topic.is_camera { Reliability::Reliable } else { Reliability::BestEffort };
         let qos = Qos { reliability, history: History::KeepLast(5), ..Qos::default() };
-        let shared = Arc::<Shared>::default();
-        let hears = Arc::clone(&shared);
+        let exchange = Arc::<Exchange>::default();
+        let hears = Arc::clone(&exchange);
         let listener = Listener::new(to, topic.name, qos.clone(), move |payload| {
             let now = EPOCH.elapsed();
             let word = |at: usize| payload.get(at..at + 8).and_then(|w| w.try_into().ok());
@@ -275,7 +275,7 @@ impl Flow {
             arrivals.push((u64::from_le_bytes(number), age));
         })?;
         let talker = Talker::new(from, topic.name, qos)?;
-        let its = Arc::clone(&shared);
+        let its = Arc::clone(&exchange);
         let period = Duration::from_secs(1) / topic.per_second;
         let talker = std::thread::spawn(move || {
             let mut next = Instant::now();
@@ -288,24 +288,24 @@ impl Flow {
                 payload[STAMP_AT..STAMP_AT + 8].copy_from_slice(&now.to_le_bytes());
                 talker.say(Bytes::from(payload))?;
                 its.said.store(number, SeqCst);
-                // Whoever was held up goes on at its pace, and makes up for nothing.
+                // A delayed publisher keeps its pace and skips missed messages.
                 next = (next + period).max(Instant::now());
                 sleep(next - Instant::now().min(next));
             }
             Ok(())
         });
-        Ok(Self { name: topic.name, shared, talker: Some(talker), _listener: listener })
+        Ok(Self { name: topic.name, exchange, talker: Some(talker), _listener: listener })
     }
 
     fn said(&self) -> u64 {
-        self.shared.said.load(SeqCst)
+        self.exchange.said.load(SeqCst)
     }
 
     fn arrivals(&self) -> std::sync::MutexGuard<'_, Vec<(u64, f64)>> {
-        self.shared.arrivals.lock().unwrap_or_else(PoisonError::into_inner)
+        self.exchange.arrivals.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Of what was said from one number on until another.
+    /// Summarises the messages from one number up to another.
     fn outcome(&self, from: u64, to: u64, time: Duration) -> Outcome {
         let arrivals = self.arrivals();
         let ages: Vec<_> = arrivals
@@ -317,14 +317,14 @@ impl Flow {
             sent: (to - from) as usize,
             heard: ages.len(),
             per_second: ages.len() as f64 / time.as_secs_f64(),
-            age_ms: Spread::of(ages),
+            age_ms: Spread::from_samples(ages),
         }
     }
 }
 
 impl Drop for Flow {
     fn drop(&mut self) {
-        self.shared.ends.store(true, SeqCst);
+        self.exchange.ends.store(true, SeqCst);
         if let Some(Ok(Err(error))) = self.talker.take().map(JoinHandle::join) {
             eprintln!("{}: {error}", self.name);
         }

@@ -1,4 +1,4 @@
-//! Two places joined by one bad path: network namespaces, with the emulator of `sgc_testkit::netsim` between them.
+//! Two network namespaces joined by one bad path, the emulator of `sgc_testkit::netsim`.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use sgc_testkit::netsim::{Namespace, Profile, TunEnd, TunLink, TunOptions};
 use sgc_transport::LinkUrl;
 
-/// Every transport that there is to be.
+/// All transports.
 pub(crate) const SCHEMES: [&str; 7] = ["quic", "dtls", "udp", "tls", "tcp", "ws", "wss"];
 /// The address of the far end.
 pub(crate) const FAR: &str = "10.77.0.2";
@@ -18,7 +18,7 @@ const SEED: u64 = 9;
 
 static UPLINKS: AtomicU32 = AtomicU32::new(0);
 
-/// Those of these transports that this build knows.
+/// Returns the transports that this build has.
 pub(crate) fn known(schemes: &[String]) -> Vec<String> {
     let is_known = |scheme: &&String| format!("{scheme}://router").parse::<LinkUrl>().is_ok();
     let known: Vec<_> = schemes.iter().filter(is_known).cloned().collect();
@@ -30,14 +30,14 @@ pub(crate) fn known(schemes: &[String]) -> Vec<String> {
 
 /// Two places and the path between them, until it is dropped.
 pub(crate) struct Uplink {
-    /// Goes first, as its devices are in the namespaces.
+    /// Dropped first, because its devices are in the namespaces.
     pub(crate) path: TunLink,
     pub(crate) near: Arc<Namespace>,
     pub(crate) far: Arc<Namespace>,
 }
 
 impl Uplink {
-    /// With these profiles from the near end and from the far one.
+    /// Makes a path with these profiles from the near end and from the far one.
     pub(crate) fn new(profiles: [Profile; 2]) -> Result<Self> {
         let number = UPLINKS.fetch_add(1, Ordering::SeqCst);
         let make = |place: &str| {

@@ -1,4 +1,4 @@
-"""Lets the peers talk to each other with nothing in between, so that a failure elsewhere is not theirs.
+"""Runs the peers against each other without SGC, to show that a failure elsewhere is not theirs.
 
 Each case starts a subscriber and a publisher, waits until both say that they are matched, and only then lets the publisher
 send: DDS matches each side on its own, so a publisher alone cannot know. Even then a volatile Cyclone reader takes its
@@ -24,8 +24,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PEERS = ("cyclone", "fastdds", "rustdds")
 TIMEOUT_S = 60
-# What these do to each other with stock settings and stock socket buffers, without anybody's help: they lose some of a
-# stream of large messages, or fall behind it for good. Looked at with --long, and no failure.
+# These pairs lose some of a stream of large messages, or fall behind it for good, with stock settings and stock socket buffers.
+# They are run with --long and do not count as failures.
 WEAK = {
     ("fastdds", "cyclone", "pointcloud"),
     ("rustdds", "cyclone", "pointcloud"),
@@ -50,7 +50,7 @@ class Peer:
         self.lines.put(None)
 
     def until(self, event: str, good=lambda line: True) -> dict | None:
-        """The next line of this kind that is good; None when the peer ended or the time is up."""
+        """Returns the next matching line of this kind, or None when the peer ended or the time is up."""
         deadline = time.monotonic() + TIMEOUT_S
         while True:
             try:
@@ -75,7 +75,7 @@ class Peer:
 
 
 def run_case(pub: str, sub: str, kind: str, count: int, rate: float, size: int, where: tuple, more: list[str]) -> str | None:
-    """None when all went well, else what went wrong. Prints one line of figures."""
+    """Returns None, or the failure. Prints one line of figures."""
     same = ["--topic", "/peer_check", "--type", kind, "--domain", "91", *where[2], *more]
     listener = Peer(sub, "sub", where[1], *same, "--count", str(count), "--linger", "0.3")
     talker = Peer(pub, "pub", where[0], *same, "--rate", str(rate), "--size", str(size), "--wait-go")
@@ -103,7 +103,7 @@ def ip(*words: str) -> None:
 
 
 class Networks:
-    """Namespaces of this run, gone at the end."""
+    """Namespaces of this run, removed at the end."""
 
     def __init__(self) -> None:
         self.names = [f"sgct-{os.getpid()}-{i}" for i in range(3)]

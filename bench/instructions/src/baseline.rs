@@ -1,7 +1,7 @@
-//! What the hot functions took when somebody last looked, and whether they take more now.
+//! The committed instruction counts of the hot functions, and the comparison with new ones.
 //!
-//! Rust code is compared always. Cryptography and the C library choose their code by the processor, so these are
-//! compared only where valgrind shows the same one as when they were counted, and of the same version.
+//! Rust code is always compared. Cryptography and the C library choose their code by the processor, so these are compared
+//! only where valgrind shows the same processor as in the committed counts, and has the same version.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -12,15 +12,15 @@ use serde::{Deserialize, Serialize};
 
 use crate::profile::Parts;
 
-/// By how much a count may grow, and by how much it may shrink before the table says so.
+/// Fraction by which a count may grow, and by which it may shrink before the table reports it.
 const TOLERANCE: f64 = 0.05;
-/// What a count may differ by in any case: below, five per cent are a handful of instructions.
+/// Number of instructions by which any count may differ, because five per cent of a small count are a handful.
 const TOLERANCE_INSTRUCTIONS: u64 = 8;
 
-/// Instructions of each case, for one of what it does.
+/// Instructions of each case, for one repetition of its work.
 pub(crate) type Counts = BTreeMap<String, Parts>;
 
-/// What the counts depend on besides the code.
+/// The tools on which the counts depend besides the code.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Tools {
     /// The compiler.
@@ -38,17 +38,17 @@ pub(crate) struct Baseline {
     counts: Counts,
 }
 
-/// What a comparison came to.
+/// The result of a comparison.
 #[derive(Debug)]
 pub(crate) struct Verdict {
     /// For people.
     pub(crate) table: String,
-    /// Nothing grew, and nothing is missing.
+    /// No count grew, and none is missing.
     pub(crate) is_good: bool,
 }
 
 impl Baseline {
-    /// Reads it; an empty one if there is none.
+    /// Reads the file. Returns an empty baseline if there is none.
     pub(crate) fn read(file: &Path) -> Result<Self> {
         match std::fs::read(file) {
             Ok(text) => serde_json::from_slice(&text).with_context(|| format!("{}", file.display())),
@@ -57,13 +57,13 @@ impl Baseline {
         }
     }
 
-    /// Writes it.
+    /// Writes the file.
     pub(crate) fn write(&self, file: &Path) -> Result<()> {
         let text = serde_json::to_string_pretty(self)? + "\n";
         std::fs::write(file, text).with_context(|| format!("{}", file.display()))
     }
 
-    /// Takes these counts for what is right; all others go if these are all that there are.
+    /// Accepts these counts as the baseline. Removes all others if these are all cases.
     pub(crate) fn accept(&mut self, tools: Tools, counts: Counts, are_all: bool) {
         if are_all {
             self.counts.clear();
@@ -72,7 +72,7 @@ impl Baseline {
         self.counts.extend(counts);
     }
 
-    /// Compares. If these are all cases that there are, one that is here alone is a mistake.
+    /// Compares counts with the baseline. If these are all cases, one that only the baseline has is a mistake.
     pub(crate) fn compare(&self, tools: &Tools, counts: &Counts, are_all: bool) -> Verdict {
         let before = self.tools.as_ref();
         let is_same_cpu = before.is_some_and(|b| (&b.cpu, &b.valgrind) == (&tools.cpu, &tools.valgrind));
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn growth_beyond_the_tolerance_is_found_and_no_other() {
+    fn only_growth_beyond_tolerance_is_found() {
         let is_good = |now: Counts| baseline().compare(&tools("aes"), &now, true).is_good;
         assert!(is_good(counts(1050, 1050)));
         assert!(is_good(counts(10, 10)));
@@ -173,14 +173,14 @@ mod tests {
     }
 
     #[test]
-    fn on_another_processor_our_own_code_alone_is_compared() {
+    fn other_processor_limits_comparison_to_rust_code() {
         let verdict = baseline().compare(&tools("none"), &counts(1000, 9000), true);
         assert!(verdict.is_good && verdict.table.contains("other CPU"), "{}", verdict.table);
         assert!(!baseline().compare(&tools("none"), &counts(1100, 1000), true).is_good);
     }
 
     #[test]
-    fn what_is_new_or_gone_is_not_passed_over() {
+    fn new_and_missing_cases_are_reported() {
         let mut now = counts(1000, 1000);
         now.insert("other".into(), Parts::default());
         let verdict = baseline().compare(&tools("aes"), &now, true);
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_accepted_is_right() {
+    fn accepted_counts_become_baseline() {
         let mut baseline = baseline();
         baseline.accept(tools("aes"), counts(5000, 5000), true);
         assert!(baseline.compare(&tools("aes"), &counts(5000, 5000), true).is_good);

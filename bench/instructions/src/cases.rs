@@ -1,7 +1,7 @@
-//! The hot functions, each doing the same thing often enough that one time more or less does not show.
+//! The hot functions, each repeated often enough that one repetition more or less does not show.
 //!
-//! A case prepares, does what it counts once so that nothing is done for the first time, and counts. What it is given is
-//! the same each time but for keys, of which no Rust code takes more or less for their content.
+//! A case prepares, does its work once as a warm-up, and counts. Its input is the same each time but for keys, whose content
+//! does not change the path of any Rust code.
 
 use std::future::Future;
 use std::hint::black_box;
@@ -27,15 +27,15 @@ use crate::fleet::{BenchFleet, now};
 use crate::frames::{BATCH, Member};
 use crate::machine::Machine;
 
-/// Something that is counted.
+/// A counted function.
 pub(crate) struct Case {
-    /// What it is called, in the file too.
+    /// The case's name, also in the file.
     pub(crate) name: &'static str,
-    /// Does it, under callgrind.
+    /// Runs the case, under callgrind.
     pub(crate) run: fn(&mut Counter) -> Result<()>,
 }
 
-/// All of them, by name.
+/// All cases, by name.
 pub(crate) const CASES: &[Case] = &[
     Case { name: "dds: frame of a sample", run: frame },
     Case { name: "endpoint: open group 100 B", run: |c| open(c, Suite::Group, 100) },
@@ -69,7 +69,7 @@ const NAME: Name = Name([1; 32]);
 const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
 /// Names in the tables of the data path.
 const NAMES: u32 = 10_000;
-/// Packets that wait in a queue at once; fewer than it holds.
+/// Packets that wait in a queue, fewer than its bound.
 const QUEUED: u32 = 500;
 
 fn packet(name: Name, payload: usize) -> Packet {
@@ -133,7 +133,7 @@ fn replay(counter: &mut Counter) -> Result<()> {
     let (mut seq, mut fresh) = (0, 0);
     let mut work = || {
         for _ in 0..TIMES / 2 {
-            // Two that have changed places, as networks do.
+            // Two packets that the network reordered.
             for next in [seq + 2, seq + 1] {
                 fresh += u64::from(window.accept(black_box(next)) == Freshness::Fresh);
             }
@@ -192,7 +192,7 @@ impl Ends {
     }
 }
 
-/// How often what takes a signature or many bytes is done: under callgrind it is slow.
+/// Returns the number of repetitions, which is low for signatures and many bytes, because callgrind is slow.
 fn times(suite: Suite, bytes: usize) -> u64 {
     if suite.is_signed() || bytes > 10_000 { 32 } else { 500 }
 }
@@ -228,12 +228,12 @@ fn open(counter: &mut Counter, suite: Suite, bytes: usize) -> Result<()> {
 
 fn name(index: u32) -> Name {
     let mut name = [0; 32];
-    // Names are hashes: their first byte spreads them.
+    // Names are hashes, so their first byte is uniform.
     name[..4].copy_from_slice(&index.wrapping_mul(0x9e37_79b1).to_be_bytes());
     Name(name)
 }
 
-/// What is ready at once; an error if it waits.
+/// Returns the output of a future that is ready at once, or an error if it waits.
 fn at_once<T>(future: impl Future<Output = T>) -> Result<T> {
     match pin!(future).poll(&mut Context::from_waker(Waker::noop())) {
         Poll::Ready(value) => Ok(value),
@@ -274,7 +274,7 @@ fn take(counter: &mut Counter) -> Result<()> {
         }
         let mut work = || {
             for _ in 0..QUEUED {
-                // One that waits takes nothing, which the sum below shows.
+                // A future that waits takes no packet, which the sum below shows.
                 let _ =
                     at_once(forwarding.take(|packet| taken += u32::from(black_box(packet).header.seq == 1)));
             }

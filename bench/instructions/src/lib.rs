@@ -1,13 +1,13 @@
-//! How many instructions the hot functions take, under `valgrind --tool=callgrind`, and whether that grew.
+//! Counts the instructions of the hot functions under `valgrind --tool=callgrind`, and checks whether they grew.
 //!
 //! Each case of `cases.rs` runs in a process of its own under callgrind, which counts inside of [`counted`] alone;
-//! `profile.rs` reads what it wrote and tells our code, AWS-LC and the C library apart; `baseline.rs` compares with the
-//! committed `bench/instructions.json`. No time is measured here, and nothing is run that needs a network.
+//! `profile.rs` reads the output and separates Rust code, AWS-LC and the C library; `baseline.rs` compares with the
+//! committed `bench/instructions.json`. No case measures time or needs a network.
 
 mod baseline;
 mod cases;
 mod profile;
-// What owners and subscribers send, and the machine that takes it, are the same as in the benchmark of routing.
+// Frames of owners and subscribers, and the machine that takes them, are shared with the benchmark of routing.
 #[allow(dead_code)]
 #[path = "../../src/fleet.rs"]
 mod fleet;
@@ -33,21 +33,21 @@ use self::profile::Profile;
 /// Count the instructions of the hot functions, and compare them with bench/instructions.json.
 #[derive(Debug, Parser)]
 struct Args {
-    /// Write what is counted as what is right from now on
+    /// Write the counts as the new baseline
     #[arg(long)]
     accept: bool,
-    /// Only cases whose names contain this
+    /// Run only cases whose names contain this text
     #[arg(value_name = "PART")]
     only: Option<String>,
     /// Run this case, in this process
     #[arg(long, hide = true, value_name = "NAME")]
     case: Option<String>,
-    /// What cargo says to every benchmark
+    /// The flag that cargo passes to every benchmark
     #[arg(long, hide = true)]
     bench: bool,
 }
 
-/// Exit code 0: nothing grew; 1: something did, or it could not be counted; 2: wrong arguments.
+/// Returns exit code 0 if no count grew, 1 if one did or could not be counted, 2 for wrong arguments.
 pub fn main() -> ExitCode {
     match run(&Args::parse()) {
         Ok(true) => ExitCode::SUCCESS,
@@ -100,31 +100,31 @@ fn names() -> Vec<&'static str> {
     CASES.iter().map(|case| case.name).collect()
 }
 
-/// What a case counts with.
+/// The counter of a case.
 struct Counter {
-    /// How often what is counted was done.
+    /// Number of repetitions of the counted work.
     times: Option<u64>,
 }
 
 impl Counter {
-    /// Counts `work`, which does the same thing so many times. Once only; what is done before is not counted.
+    /// Counts `work`, which repeats its work `times` times. May be called once; earlier work is not counted.
     fn count(&mut self, times: u64, mut work: impl FnMut()) {
         assert!(self.times.replace(times).is_none(), "a case counts once");
         counted(&mut work);
     }
 }
 
-/// Callgrind counts from where this begins to where it ends.
+/// The function in which callgrind counts.
 #[inline(never)]
 fn counted(work: &mut dyn FnMut()) {
     work();
-    // So that the call above is no jump, which would not come back here.
+    // Keeps the call above from becoming a tail jump, which would not return here.
     black_box(());
 }
-/// [`counted`] as callgrind spells it.
+/// [`counted`] in callgrind's spelling.
 const COUNTED: &str = "*sgc_bench_instructions::counted*";
 
-/// Counts a case: instructions for each time that its work is done, and what processor it saw.
+/// Counts a case. Returns the instructions of one repetition and the processor that the case saw.
 fn count(case: &str) -> Result<(profile::Parts, String)> {
     let dir = tempfile::tempdir()?;
     let out: PathBuf = dir.path().join("callgrind.out");
@@ -155,8 +155,8 @@ fn valgrind_version() -> Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }
 
-/// Architecture and what the libraries below choose their code by, as this process sees it: valgrind's processor is not
-/// the machine's.
+/// Returns the architecture and the features by which libraries choose their code, as this process sees them: valgrind's
+/// processor differs from the machine's.
 fn features() -> String {
     let mut seen = vec![std::env::consts::ARCH];
     #[cfg(target_arch = "x86_64")]

@@ -1,12 +1,12 @@
-//! What callgrind wrote, as instructions by kind of code. Pure; of the format (`cl-format` in valgrind's manual) it
-//! reads the costs that functions have by themselves, and leaves out who called whom.
+//! Parses callgrind's output to instructions by kind of code. Pure. It reads only the self costs of functions from the format
+//! (`cl-format` in valgrind's manual) and ignores calls.
 
 use std::collections::HashMap;
 
 use anyhow::{Context as _, Result, bail};
 use serde::{Deserialize, Serialize};
 
-/// Whose code an instruction is of.
+/// The kind of code of an instruction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 enum Kind {
     /// Rust: ours, and the crates that are compiled into it.
@@ -17,32 +17,32 @@ enum Kind {
     Libc,
 }
 
-/// Instructions by whose they are.
+/// Instructions by kind of code.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Parts {
-    /// Of Rust code.
+    /// Instructions of Rust code.
     pub(crate) rust: u64,
-    /// Of AWS-LC.
+    /// Instructions of AWS-LC.
     pub(crate) cryptography: u64,
-    /// Of the C library.
+    /// Instructions of the C library.
     pub(crate) libc: u64,
 }
 
 impl Parts {
-    /// All of them.
+    /// Returns the sum of all kinds.
     pub(crate) fn sum(self) -> u64 {
         self.rust + self.cryptography + self.libc
     }
 }
 
-/// What was counted.
+/// The counts of a run.
 #[derive(Debug, Default)]
 pub(crate) struct Profile {
     counts: HashMap<Kind, u64>,
 }
 
 impl Profile {
-    /// Reads a file of callgrind's. An error if it counts anything but instructions, or is none.
+    /// Parses a file of callgrind. Fails if it is none, or counts anything but instructions.
     pub(crate) fn parse(text: &str) -> Result<Self> {
         let mut profile = Self::default();
         let (mut objects, mut functions) = (HashMap::new(), HashMap::new());
@@ -65,7 +65,7 @@ impl Profile {
             } else if line.starts_with("calls=") {
                 is_of_call = true;
             } else if line.starts_with(|c: char| c.is_ascii_digit() || "+-*".contains(c)) {
-                // The line behind a call is what was called, which is counted where it stands itself.
+                // The line after a call is the cost of the callee, which is counted at the callee itself.
                 if std::mem::take(&mut is_of_call) {
                     continue;
                 }
@@ -80,19 +80,19 @@ impl Profile {
         Ok(profile)
     }
 
-    /// All instructions.
+    /// Returns the number of all instructions.
     pub(crate) fn sum(&self) -> u64 {
         self.counts.values().sum()
     }
 
-    /// By whose they are, for one of so many times.
+    /// Returns the instructions by kind, for one of `times` repetitions.
     pub(crate) fn parts(&self, times: u64) -> Parts {
         let of = |kind| self.counts.get(&kind).copied().unwrap_or(0).div_ceil(times.max(1));
         Parts { rust: of(Kind::Rust), cryptography: of(Kind::Cryptography), libc: of(Kind::Libc) }
     }
 }
 
-/// `(7) name` says what 7 is, `(7)` means it.
+/// Resolves a name: `(7) name` defines 7, and `(7)` refers to it.
 fn resolve(text: &str, names: &mut HashMap<u32, String>) -> Result<String> {
     let (number, name) = text
         .strip_prefix('(')
@@ -116,11 +116,11 @@ fn kind(object: &str, function: &str) -> Kind {
     {
         return Kind::Libc;
     }
-    // Symbols of the C library that were not resolved yet stand under the loader's or the program's own name.
+    // Unresolved symbols of the C library appear under the loader's or the program's name.
     if function.starts_with("mem") || matches!(function, "malloc" | "free" | "calloc" | "realloc") {
         return Kind::Libc;
     }
-    // Paths have colons in Rust and nothing else here; what the compiler made up (`_R…`, `core::…`) is Rust as well.
+    // Only Rust paths have colons here. Symbols of the compiler (`_R…`, `core::…`) are Rust as well.
     let is_rust = function.contains("::") || function.starts_with("_R") || function.starts_with("__rust");
     if is_rust { Kind::Rust } else { Kind::Cryptography }
 }
@@ -135,14 +135,14 @@ mod tests {
         fn=(3) aws_lc_0_41_0_gcm_ghash\n0 400\n\nob=(2)\nfn=(2)\n0 60\n\nob=(1)\nfn=(1)\n0 3\n";
 
     #[test]
-    fn each_cost_is_counted_once_and_where_it_stands() {
+    fn each_cost_is_counted_once_at_its_function() {
         let profile = Profile::parse(TEXT).unwrap();
         assert_eq!(profile.sum(), 590);
         assert_eq!(profile.parts(10), Parts { rust: 13, cryptography: 40, libc: 6 });
     }
 
     #[test]
-    fn what_is_no_profile_is_an_error() {
+    fn invalid_profile_is_an_error() {
         assert!(Profile::parse("").is_err());
         assert!(Profile::parse("events: Ir Dr\n").is_err());
         assert!(Profile::parse("events: Ir\nfn=(4)\n").is_err());

@@ -1,7 +1,7 @@
-//! Questions and answers of different sizes: `ask` sends a request, at its pace, and waits for what `answer` has to say to it.
+//! Requests and answers of different sizes: `ask` sends requests at its rate, and `answer` answers them.
 //!
-//! A request says in its data how long its answer is to be. One that says nothing is hello, and answered at once. An
-//! `answer` of several topics answers all once it has a request on each: a fleet that goes step by step.
+//! A request names the length of its answer in its data. One without a length is hello, and answered at once. An `answer` of
+//! several topics answers all once it has a request on each, like a fleet that goes step by step.
 
 use std::time::{Duration, Instant};
 
@@ -15,7 +15,7 @@ use crate::ping::HEAD_BYTES;
 use crate::report::{Event, Next, Order, say};
 use crate::{Common, now_ns};
 
-/// Where the length of the answer is in a request's data: its first bytes, little endian.
+/// Bytes of the answer's length at the beginning of a request's data, little endian.
 const ANSWER_BYTES: usize = 4;
 /// The longest answer, bytes.
 const ANSWER_MAX: usize = 64 << 20;
@@ -36,12 +36,12 @@ pub(crate) struct AnswerArgs {
     /// The topic of answers
     #[arg(long, value_name = "/TOPIC")]
     back: String,
-    /// Of so many topics each, `/TOPIC_0` and so on, answered all together; without it of one, whose name is whole
+    /// Number of topics, `/TOPIC_0` and so on, answered together; without it, one topic with its plain name
     #[arg(long)]
     together: Option<usize>,
 }
 
-/// What one order asks for.
+/// The content of one order.
 struct Questions {
     size: usize,
     answer: usize,
@@ -86,7 +86,7 @@ fn questions(asker: &mut Caller, plan: &Questions) -> Result<Event> {
     let mut tick = 0;
     while round_trips_us.len() + lost < count && begun.elapsed().as_secs_f64() < seconds {
         if let Some(rate) = rate {
-            // What comes while an answer is waited for is left out, as a camera's frames are; the next is fresh.
+            // Requests that fall due during a wait are skipped, like frames of a camera; the next one is fresh.
             tick = tick.max((begun.elapsed().as_secs_f64() * rate).ceil() as u64);
             let due = Duration::from_secs_f64(tick as f64 / rate);
             std::thread::sleep(due.saturating_sub(begun.elapsed()));
@@ -142,7 +142,7 @@ pub(crate) fn answer(args: &AnswerArgs) -> Result<()> {
     }
 }
 
-/// What waits for an answer.
+/// A request that waits for an answer.
 struct Request {
     seq: u64,
     answer: usize,

@@ -1,5 +1,5 @@
-//! Who sends one message at a time and waits for what comes back: what [`crate::ping`] and [`crate::ask`] have in common. What is
-//! sent, and how often, they decide.
+//! The common part of [`crate::ping`] and [`crate::ask`]: sends one message at a time and waits for the answer. They decide on
+//! content and rate.
 
 use std::time::{Duration, Instant};
 
@@ -10,21 +10,21 @@ use crate::node::Node;
 use crate::report::{Event, Next, say};
 use crate::{Common, now_ns};
 
-/// A node that speaks on one topic and hears the answers on another.
+/// A node that publishes on one topic and receives the answers on another.
 pub(crate) struct Caller {
     pub(crate) node: Node,
     seq: u64,
 }
 
 impl Caller {
-    /// Up and heard by who answers, and says so; or none, if the program is to end.
+    /// Starts a node and waits until the answering program hears it. Returns `None` if the program has to end.
     pub(crate) fn connect(common: &Common, back: &str) -> Result<Option<Self>> {
         let node = Node::start(common, [back.to_owned()], [common.topic.clone()])?;
         if !node.until_matched()? {
             return Ok(None);
         }
         let mut seq = 0;
-        // Matched is what is near; whatever is in between may not be through yet, and forgets what nobody hears.
+        // A local match does not mean that the whole path is up, so early messages may be lost.
         while !node.is_heard(seq)? {
             seq += 1;
             if matches!(node.orders.next()?, Next::End) {
@@ -35,7 +35,7 @@ impl Caller {
         Ok(Some(Self { node, seq }))
     }
 
-    /// How long an answer with so many bytes of data took, unless it took longer than that.
+    /// Returns the time until an answer with so many bytes of data came, or `None` if it took too long.
     pub(crate) fn round_trip(
         &mut self,
         data: &[u8],
@@ -54,7 +54,7 @@ impl Caller {
         let mut came = None;
         loop {
             self.node.readers[0].take(|message| {
-                // Others are answers to those that were given up.
+                // Other numbers are late answers.
                 if message.seq == seq {
                     ensure!(message.data.len() == answer_bytes, "an answer of another length");
                     came = Some(begun.elapsed());

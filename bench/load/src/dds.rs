@@ -1,6 +1,6 @@
 //! Cyclone DDS as this program needs it: one participant, typed readers and writers of one type, a wait set.
 //!
-//! The only file with `unsafe`. Knows nothing of what is measured.
+//! The only file with `unsafe`. It does not know what is measured.
 
 use std::ffi::{CStr, CString, c_void};
 use std::ptr::{null, null_mut};
@@ -16,7 +16,7 @@ const TAKE_MAX: usize = 128;
 /// How long a write may wait for room before it is tried again.
 const WRITE_BLOCK_MAX: Duration = Duration::from_secs(1);
 
-/// Something of Cyclone's that is deleted on drop.
+/// An entity of Cyclone, deleted on drop.
 #[derive(Debug)]
 struct Entity(dds_entity_t);
 
@@ -41,7 +41,7 @@ impl Drop for Entity {
     }
 }
 
-/// What Cyclone says of a return code, unless it is well.
+/// Turns an error code of Cyclone into an error.
 fn check(code: dds_return_t) -> Result<()> {
     if code < 0 {
         // SAFETY: returns a constant string for every argument.
@@ -55,7 +55,7 @@ fn check(code: dds_return_t) -> Result<()> {
 pub(crate) struct Quality {
     /// Reliable, or best effort.
     pub(crate) reliable: bool,
-    /// The newest so many messages are kept; 0 keeps all that are not acknowledged yet, so that writing waits.
+    /// Number of newest messages kept; 0 keeps all unacknowledged ones, so that writing waits.
     pub(crate) depth: u32,
 }
 
@@ -124,7 +124,7 @@ impl Qos {
         if qos.is_null() { bail!("out of memory") } else { Ok(Self(qos)) }
     }
 
-    fn of(quality: Quality, transient_local: bool) -> Result<Self> {
+    fn from_quality(quality: Quality, transient_local: bool) -> Result<Self> {
         let qos = Self::new()?;
         let reliability = match quality.reliable {
             true => dds_reliability_kind_DDS_RELIABILITY_RELIABLE,
@@ -161,26 +161,26 @@ pub(crate) struct Writer {
 }
 
 impl Writer {
-    /// On the ROS 2 topic `/name`.
+    /// Opens an endpoint on the ROS 2 topic `/name`.
     pub(crate) fn new(network: &Network, name: &str, quality: Quality) -> Result<Self> {
-        Self::of(network, &types::MESSAGE, &types::dds_name(name), Qos::of(quality, false)?)
+        Self::open(network, &types::MESSAGE, &types::dds_name(name), Qos::from_quality(quality, false)?)
     }
 
-    /// The same, of which messages may share packets until [`Self::flush`].
-    pub(crate) fn that_batches(network: &Network, name: &str, quality: Quality) -> Result<Self> {
-        let qos = Qos::of(quality, false)?;
+    /// Opens a writer whose messages may share packets until [`Self::flush`].
+    pub(crate) fn with_batching(network: &Network, name: &str, quality: Quality) -> Result<Self> {
+        let qos = Qos::from_quality(quality, false)?;
         // SAFETY: the object is valid.
         unsafe { dds_qset_writer_batching(qos.0, true) };
-        Self::of(network, &types::MESSAGE, &types::dds_name(name), qos)
+        Self::open(network, &types::MESSAGE, &types::dds_name(name), qos)
     }
 
-    /// The writer of the ROS graph, as every node has one.
-    pub(crate) fn of_graph(network: &Network) -> Result<Self> {
+    /// Opens the writer of the ROS graph, which every node has.
+    pub(crate) fn for_graph(network: &Network) -> Result<Self> {
         let quality = Quality { reliable: true, depth: 1 };
-        Self::of(network, &types::GRAPH, "ros_discovery_info", Qos::of(quality, true)?)
+        Self::open(network, &types::GRAPH, "ros_discovery_info", Qos::from_quality(quality, true)?)
     }
 
-    fn of(network: &Network, descriptor: &types::Descriptor, dds_name: &str, qos: Qos) -> Result<Self> {
+    fn open(network: &Network, descriptor: &types::Descriptor, dds_name: &str, qos: Qos) -> Result<Self> {
         let topic = network.topic(descriptor, dds_name)?;
         // SAFETY: Cyclone checks the handles; the QoS outlives the call.
         let handle = unsafe { dds_create_writer(network.participant.0, topic.0, qos.0, null()) };
@@ -191,12 +191,12 @@ impl Writer {
         Ok(Self { entity, _topic: topic })
     }
 
-    /// Its GUID.
+    /// Returns the GUID.
     pub(crate) fn guid(&self) -> Result<[u8; 16]> {
         self.entity.guid()
     }
 
-    /// Readers that it has found.
+    /// Returns the number of matched readers.
     pub(crate) fn matched(&self) -> Result<u32> {
         // SAFETY: plain numbers, of which zeros are a value.
         let mut status: dds_publication_matched_status_t = unsafe { std::mem::zeroed() };
@@ -205,7 +205,7 @@ impl Writer {
         Ok(status.current_count)
     }
 
-    /// Writes. False if there was no room for a second, in which case nothing was written.
+    /// Writes a message. Returns `false` if there was no room for a second; then nothing was written.
     pub(crate) fn write(&self, message: &Message<'_>) -> Result<bool> {
         let sample =
             Sample { seq: message.seq, stamp_ns: message.stamp_ns, data: types::sequence(message.data) };
@@ -213,13 +213,13 @@ impl Writer {
         self.write_raw(unsafe { dds_write(self.entity.0, (&raw const sample).cast()) })
     }
 
-    /// Sends what was written and waits for others to share its packet.
+    /// Sends messages that wait for others to share their packet.
     pub(crate) fn flush(&self) -> Result<()> {
         // SAFETY: takes a number.
         check(unsafe { dds_write_flush(self.entity.0) })
     }
 
-    /// Says which node the endpoints of this participant belong to. For a writer [`Self::of_graph`].
+    /// Announces the node to which the endpoints of this participant belong. Needs a writer of [`Self::for_graph`].
     pub(crate) fn announce(
         &self,
         network: &Network,
@@ -248,7 +248,7 @@ impl Writer {
         Ok(true)
     }
 
-    /// Waits until the readers that it has found have acknowledged all. False if that took too long.
+    /// Waits until the matched readers have acknowledged all. Returns `false` if that took too long.
     pub(crate) fn until_acknowledged(&self, timeout: Duration) -> Result<bool> {
         // SAFETY: takes numbers.
         self.write_raw(unsafe { dds_wait_for_acks(self.entity.0, nanoseconds(timeout)) })
@@ -264,7 +264,7 @@ pub(crate) struct Reader {
 }
 
 impl Reader {
-    /// On the ROS 2 topic `/name`.
+    /// Opens an endpoint on the ROS 2 topic `/name`.
     pub(crate) fn new(network: &Network, name: &str, quality: Quality) -> Result<Self> {
         Self::with(network, name, quality, null())
     }
@@ -276,7 +276,7 @@ impl Reader {
         listener: *const dds_listener_t,
     ) -> Result<Self> {
         let topic = network.topic(&types::MESSAGE, &types::dds_name(name))?;
-        let qos = Qos::of(quality, false)?;
+        let qos = Qos::from_quality(quality, false)?;
         // SAFETY: Cyclone checks the handles; QoS and listener outlive the call, which copies them.
         let handle = unsafe { dds_create_reader(network.participant.0, topic.0, qos.0, listener) };
         let entity = Entity::new(handle).with_context(|| format!("a reader of {name}"))?;
@@ -289,8 +289,8 @@ impl Reader {
         Ok(Self { condition: Entity::new(condition)?, entity, _topic: topic })
     }
 
-    /// The same, which calls `arrived` on the thread of Cyclone's that received a message, one call at a time. `arrived`
-    /// stays until the process ends.
+    /// Opens a reader that calls `arrived` on Cyclone's receiving thread, one call at a time. `arrived` lives until the process
+    /// ends.
     pub(crate) fn with_listener<F: FnMut(Inbox) + Send + 'static>(
         network: &Network,
         name: &str,
@@ -314,12 +314,12 @@ impl Reader {
         }
     }
 
-    /// Its GUID.
+    /// Returns the GUID.
     pub(crate) fn guid(&self) -> Result<[u8; 16]> {
         self.entity.guid()
     }
 
-    /// Writers that it has found.
+    /// Returns the number of matched writers.
     pub(crate) fn matched(&self) -> Result<u32> {
         // SAFETY: plain numbers, of which zeros are a value.
         let mut status: dds_subscription_matched_status_t = unsafe { std::mem::zeroed() };
@@ -328,23 +328,23 @@ impl Reader {
         Ok(status.current_count)
     }
 
-    /// What waits to be taken.
+    /// Returns the inbox of the reader.
     pub(crate) fn inbox(&self) -> Inbox {
         Inbox(self.entity.0)
     }
 
-    /// Takes all that is there.
+    /// Takes all messages that are there.
     pub(crate) fn take(&self, handle: impl FnMut(Message<'_>) -> Result<()>) -> Result<()> {
         self.inbox().take(handle)
     }
 }
 
-/// What waits at a reader; nothing any more once that has gone.
+/// The messages that wait at a reader. Empty once the reader is gone.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Inbox(dds_entity_t);
 
 impl Inbox {
-    /// Takes all that is there.
+    /// Takes all messages that are there.
     pub(crate) fn take(self, mut handle: impl FnMut(Message<'_>) -> Result<()>) -> Result<()> {
         loop {
             let mut samples: [*mut c_void; TAKE_MAX] = [null_mut(); TAKE_MAX];
@@ -378,12 +378,12 @@ impl Inbox {
     }
 }
 
-/// Rings from any thread.
+/// A handle that wakes the waiter from any thread.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Bell(dds_entity_t);
 
 impl Bell {
-    /// Wakes whoever waits.
+    /// Wakes the waiter.
     pub(crate) fn ring(self) {
         // SAFETY: takes numbers; Cyclone refuses a handle that is gone.
         unsafe { dds_set_guardcondition(self.0, true) };
@@ -395,23 +395,23 @@ impl Bell {
 pub(crate) struct Waiter {
     set: Entity,
     bell: Entity,
-    /// Readers and writers, whose matches are waited for.
+    /// Readers and writers whose matches end the wait.
     endpoints: Vec<dds_entity_t>,
     sources: usize,
 }
 
-/// What a wait ended for.
+/// The reason why a wait ended.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Woken {
     /// Readers that have messages, by the number under which they were attached.
     pub(crate) readers: Vec<usize>,
 }
 
-/// The attachment of everything that is no reader's messages.
+/// The attachment of everything but the messages of readers.
 const OTHER: dds_attach_t = -1;
 
 impl Waiter {
-    /// Waits for nothing but its bell yet.
+    /// Returns a waiter that only waits for its bell.
     pub(crate) fn new(network: &Network) -> Result<Self> {
         let participant = network.participant.0;
         // SAFETY: take numbers.
@@ -430,25 +430,25 @@ impl Waiter {
         Ok(())
     }
 
-    /// Messages and matches of a reader.
+    /// Attaches the messages and matches of a reader.
     pub(crate) fn attach_reader(&mut self, reader: &Reader, number: usize) -> Result<()> {
         self.attach(reader.condition.0, dds_attach_t::try_from(number)?)?;
         self.endpoints.push(reader.entity.0);
         self.attach(reader.entity.0, OTHER)
     }
 
-    /// Matches of a writer.
+    /// Attaches the matches of a writer.
     pub(crate) fn attach_writer(&mut self, writer: &Writer) -> Result<()> {
         self.endpoints.push(writer.entity.0);
         self.attach(writer.entity.0, OTHER)
     }
 
-    /// What wakes it from other threads.
+    /// Returns the bell that wakes the waiter from other threads.
     pub(crate) fn bell(&self) -> Bell {
         Bell(self.bell.0)
     }
 
-    /// Waits for any of it, or until the time is over.
+    /// Waits for an attached event, at most for `timeout`.
     pub(crate) fn wait(&self, timeout: Duration) -> Result<Woken> {
         let mut woken: Vec<dds_attach_t> = vec![OTHER; self.sources];
         // SAFETY: `woken` has as many places as is said.
@@ -461,7 +461,7 @@ impl Waiter {
         if woken.iter().take(count as usize).any(|&w| w == OTHER) {
             for endpoint in &self.endpoints {
                 let mut status = 0;
-                // What is not taken ends the next wait at once, and every one after it.
+                // A status that is not taken would end every later wait at once.
                 // SAFETY: takes numbers and a valid place; 0 stands for every status.
                 check(unsafe { dds_take_status(*endpoint, &mut status, 0) })?;
             }
@@ -471,7 +471,7 @@ impl Waiter {
     }
 }
 
-/// What a sequence holds.
+/// Borrows the content of a sequence.
 ///
 /// # Safety
 /// The sequence is Cyclone's, and nobody writes to it meanwhile.

@@ -1,7 +1,7 @@
-//! One way: `source` sends, `sink` counts what comes and how old it is.
+//! One-way flows: `source` sends messages, `sink` counts them and their ages.
 //!
-//! A message's number is that of its run, above [`RUN_SHIFT`], and its own. Run 0 is hello, which is said until the first run
-//! begins and counts for nothing.
+//! A message's number consists of the number of its run, above [`RUN_SHIFT`], and its own. Run 0 is hello, which is sent until
+//! the first run begins and is not counted.
 
 use std::time::{Duration, Instant};
 
@@ -15,9 +15,9 @@ use crate::report::{Event, Next, Order, say};
 use crate::{Common, now_ns};
 
 const RUN_SHIFT: u32 = 32;
-/// Ages that a sink keeps, of all its readers together; of more, every n-th.
+/// Most ages that a sink keeps for all its readers. Beyond it, the sink keeps every n-th.
 const AGES_MAX: usize = 1 << 20;
-/// How long a source waits, in the end, until what it has found has acknowledged.
+/// Longest wait of a source for acknowledgements at its end.
 const ACKNOWLEDGE_MAX: Duration = Duration::from_secs(1);
 
 #[derive(Args)]
@@ -30,7 +30,7 @@ pub(crate) struct SourceArgs {
 pub(crate) struct SinkArgs {
     #[command(flatten)]
     common: Common,
-    /// How many readers, all of this process
+    /// Number of readers in this process
     #[arg(long, default_value_t = 1)]
     readers: usize,
 }
@@ -69,7 +69,7 @@ fn send(node: &Node, run: u32, data: &[u8], count: u32, seconds: f64, rate: Opti
     let mut sent = 0;
     while sent < count && begun.elapsed() < deadline {
         if let Some(rate) = rate {
-            // Whoever was held up goes on at its pace; ages count from when it was written.
+            // After a delay the source keeps its schedule; ages count from the time of writing.
             let due = Duration::from_secs_f64(f64::from(sent) / rate);
             if let Some(left) = due.checked_sub(begun.elapsed()) {
                 std::thread::sleep(left);
@@ -146,11 +146,11 @@ pub(crate) fn sink(args: &SinkArgs) -> Result<()> {
     }
 }
 
-/// What came of one run.
+/// The count of one run.
 struct Tally {
     run: u32,
     received: Vec<u32>,
-    /// When each reader's last came; 0 if none did.
+    /// Arrival of each reader's last message; 0 if none came.
     last_ns: Vec<u64>,
     silence_ns: u64,
     ended_ns: u64,

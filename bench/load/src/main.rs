@@ -1,8 +1,8 @@
-//! `load`: talkers and listeners for benchmarks. Plain Cyclone DDS programs with a ROS 2 node's names, which know nothing of
+//! `load`: talkers and listeners for benchmarks. They are plain Cyclone DDS programs with a ROS 2 node's names, and do not know
 //! what carries their topics.
 //!
-//! This file knows the command line. Each role says on standard output, in lines of JSON, what happened ([`report::Event`]),
-//! takes orders from standard input ([`report::Order`]), and ends when that does. It measures; it judges nothing.
+//! This file knows the command line. Each role prints events on standard output in lines of JSON ([`report::Event`]), takes
+//! orders from standard input ([`report::Order`]), and ends when that does. It measures and judges nothing.
 #![deny(unsafe_code)]
 
 mod ask;
@@ -21,7 +21,7 @@ use clap::{Args, Parser, Subcommand};
 
 use dds::Quality;
 
-/// Talkers and listeners for benchmarks, on Cyclone DDS. `CYCLONEDDS_URI` says how they join.
+/// Talkers and listeners for benchmarks, on Cyclone DDS. `CYCLONEDDS_URI` configures Cyclone.
 #[derive(Parser)]
 struct Cli {
     #[command(subcommand)]
@@ -32,7 +32,7 @@ struct Cli {
 enum Role {
     /// Sends messages and waits for each to come back
     Ping(ping::PingArgs),
-    /// Sends back what comes
+    /// Sends messages back
     Pong(ping::PingArgs),
     /// Sends requests and waits for the answer to each
     Ask(ask::AskArgs),
@@ -40,13 +40,13 @@ enum Role {
     Answer(ask::AnswerArgs),
     /// Sends messages
     Source(flow::SourceArgs),
-    /// Counts messages and how old they were
+    /// Counts messages and their ages
     Sink(flow::SinkArgs),
     /// Carries topics to another relay over TCP, as they are
     Relay(relay::RelayArgs),
 }
 
-/// What every role is given.
+/// The arguments of every role.
 #[derive(Args, Clone, Debug)]
 struct Common {
     /// The domain
@@ -61,7 +61,7 @@ struct Common {
     /// Reliable, instead of best effort
     #[arg(long)]
     reliable: bool,
-    /// How many messages are kept; 0 keeps all that are not acknowledged, and writing waits for room
+    /// Number of messages kept; 0 keeps all unacknowledged ones, and writing waits for room
     #[arg(long, default_value_t = 10)]
     depth: u32,
 }
@@ -84,7 +84,7 @@ fn main() -> Result<()> {
     }
 }
 
-/// The clock that all processes of a host share, nanoseconds.
+/// Reads the clock that all processes of a host share, in nanoseconds.
 fn now_ns() -> u64 {
     let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64

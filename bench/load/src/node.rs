@@ -1,4 +1,4 @@
-//! A ROS 2 node: a participant whose readers and writers are told of in `ros_discovery_info`.
+//! A ROS 2 node: a participant that announces its readers and writers in `ros_discovery_info`.
 
 use std::ffi::CString;
 use std::time::{Duration, Instant};
@@ -9,12 +9,12 @@ use crate::dds::{Message, Network, Reader, Waiter, Writer};
 use crate::report::{Event, Orders, say};
 use crate::{Common, now_ns};
 
-/// How long is waited where only an event ends the wait.
+/// Time-out of waits that only an event ends.
 pub(crate) const LONG: Duration = Duration::from_secs(3600);
-/// How often an unanswered first message is said again.
+/// How often an unanswered first message is repeated.
 pub(crate) const HELLO_EVERY: Duration = Duration::from_millis(20);
 
-/// Fields go in this order.
+/// A node. Fields are dropped in this order.
 pub(crate) struct Node {
     pub(crate) readers: Vec<Reader>,
     pub(crate) writers: Vec<Writer>,
@@ -25,14 +25,14 @@ pub(crate) struct Node {
 }
 
 impl Node {
-    /// Up, and told of, when this returns.
+    /// Starts a node, which is up and announced on return.
     pub(crate) fn start(
         common: &Common,
         read: impl IntoIterator<Item = String>,
         write: impl IntoIterator<Item = String>,
     ) -> Result<Self> {
         let network = Network::join(common.domain)?;
-        let graph = Writer::of_graph(&network)?;
+        let graph = Writer::for_graph(&network)?;
         let quality = common.quality();
         let mut waiter = Waiter::new(&network)?;
         let mut readers = Vec::new();
@@ -55,7 +55,7 @@ impl Node {
         Ok(Self { readers, writers, waiter, orders, _graph: graph, _network: network })
     }
 
-    /// Waits until every reader and writer has found somebody, and says so; or false, if the program is to end.
+    /// Waits until every reader and writer is matched, and reports it. Returns `false` if the program has to end.
     pub(crate) fn until_matched(&self) -> Result<bool> {
         loop {
             let readers = self.readers.iter().map(Reader::matched);
@@ -71,8 +71,8 @@ impl Node {
         }
     }
 
-    /// Says hello on the first topic, and whether anything came back on the first of the other way, an answer to an earlier
-    /// hello too: the way may take longer than the time between two.
+    /// Sends hello on the first topic. Returns whether an answer came on the first topic of the other way, also to an earlier
+    /// hello, because the path may take longer than the time between two.
     pub(crate) fn is_heard(&self, seq: u64) -> Result<bool> {
         self.writers[0].write(&Message { seq, stamp_ns: now_ns(), data: &[] })?;
         let deadline = Instant::now() + HELLO_EVERY;

@@ -10,7 +10,7 @@ use crate::caller::Caller;
 use crate::node::{LONG, Node};
 use crate::report::{Event, Next, Order, say};
 
-/// What `seq` and `stamp_ns` take of a message's size, bytes.
+/// Bytes of `seq` and `stamp_ns` in a message's size.
 pub(crate) const HEAD_BYTES: usize = 16;
 
 #[derive(Args)]

@@ -1,8 +1,7 @@
-//! The least that two programs between two DDS networks can be: what one reads it writes to a TCP connection as it is, what
-//! comes over that it publishes.
+//! A minimal relay between two DDS networks: it writes each message that it reads to a TCP connection, and publishes each that
+//! comes over it.
 //!
-//! It seals nothing, checks nobody, knows no names and bounds nothing. Nobody should use it: it is measured beside what does
-//! more.
+//! It has no encryption, authentication, names or bounds, and is not for use. It is a reference for systems that do more.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -17,17 +16,17 @@ use crate::report::{Event, Next, Orders, say};
 
 /// Bytes before the content: its length, the message's number, its time.
 const HEAD_BYTES: usize = 4 + 8 + 8;
-/// Up to that length a message is copied behind its head, so that both leave by one call.
+/// Longest message that is copied behind its head, so that one call sends both.
 const JOINED_BYTES_MAX: usize = 64 << 10;
-/// What is read at once.
+/// Bytes per read.
 const READ_BYTES: usize = 256 << 10;
 /// Longest message that is taken from the connection, bytes.
 const MESSAGE_BYTES_MAX: usize = 64 << 20;
-/// How long the other end may take to be there.
+/// Longest wait for the other end.
 const CONNECT_MAX: Duration = Duration::from_secs(10);
 const CONNECT_EVERY: Duration = Duration::from_millis(20);
 
-/// What a relay is given.
+/// The arguments of a relay.
 #[derive(Args)]
 #[group(id = "way", required = true, args = ["listen", "connect"])]
 pub(crate) struct RelayArgs {
@@ -40,18 +39,18 @@ pub(crate) struct RelayArgs {
     /// The topic that is read at the other end and published here
     #[arg(long, value_name = "/TOPIC")]
     give: Option<String>,
-    /// Where the other end is waited for
+    /// Address on which to wait for the other end
     #[arg(long, value_name = "ADDRESS")]
     listen: Option<SocketAddr>,
-    /// Where the other end is
+    /// Address of the other end
     #[arg(long, value_name = "ADDRESS")]
     connect: Option<SocketAddr>,
-    /// All that is there together, by a thread of its own, instead of each message where DDS receives it
+    /// Send all waiting messages together, on a separate thread, instead of each on DDS's receiving thread
     #[arg(long)]
     gathers: bool,
 }
 
-/// Takes no orders. What it carries is reliable, and nothing is left out.
+/// Runs a relay. It takes no orders, and carries every message reliably.
 pub(crate) fn relay(args: &RelayArgs) -> Result<()> {
     let stream = connect(args)?;
     stream.set_nodelay(true)?;
@@ -59,7 +58,7 @@ pub(crate) fn relay(args: &RelayArgs) -> Result<()> {
     let mut waiter = Waiter::new(&network)?;
     let quality = Quality { reliable: true, depth: 0 };
     if let Some(topic) = &args.give {
-        let writer = Writer::that_batches(&network, topic, quality)?;
+        let writer = Writer::with_batching(&network, topic, quality)?;
         let mut stream = stream.try_clone()?;
         std::thread::spawn(move || {
             if let Err(error) = publish(&mut stream, &writer) {
@@ -101,7 +100,7 @@ pub(crate) fn relay(args: &RelayArgs) -> Result<()> {
     }
 }
 
-/// The one that listens says that it does.
+/// Connects to the other end. The listening side reports that it listens.
 fn connect(args: &RelayArgs) -> Result<TcpStream> {
     if let Some(address) = args.listen {
         let listener = TcpListener::bind(address).with_context(|| address.to_string())?;
@@ -126,7 +125,7 @@ struct Sender {
 }
 
 impl Sender {
-    /// What the reader has, by as few calls as it takes.
+    /// Sends the messages of the inbox in as few calls as possible.
     fn send(&mut self, inbox: Inbox) -> Result<()> {
         let Self { stream, buffer } = self;
         inbox.take(|message| {
@@ -151,7 +150,7 @@ impl Sender {
     }
 }
 
-/// From the connection to the writer; what is there together shares packets.
+/// Publishes messages of the connection. Messages that are there together share packets.
 fn publish(stream: &mut TcpStream, writer: &Writer) -> Result<()> {
     let mut reader = BufReader::with_capacity(READ_BYTES, stream);
     let mut long = Vec::new();
@@ -178,7 +177,7 @@ fn publish(stream: &mut TcpStream, writer: &Writer) -> Result<()> {
     }
 }
 
-/// Readers that are slow hold it back.
+/// Writes a message, waiting for slow readers.
 fn until_written(writer: &Writer, message: &Message<'_>) -> Result<()> {
     while !writer.write(message)? {}
     Ok(())

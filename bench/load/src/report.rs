@@ -1,4 +1,4 @@
-//! What goes in and out: orders and events, one line of JSON each.
+//! Orders and events, one line of JSON each.
 
 use std::cell::RefCell;
 use std::collections::VecDeque;
@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::dds::Bell;
 
-/// What a role is told.
+/// An order to a role.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
 pub(crate) enum Order {
@@ -18,13 +18,13 @@ pub(crate) enum Order {
     Measure {
         /// Bytes of a message, at least 16.
         size: usize,
-        /// At most so many that count.
+        /// Most counted repetitions.
         count: usize,
-        /// None begins after so long.
+        /// Time after which no further one begins.
         seconds: f64,
-        /// How many come first and do not count.
+        /// Number of uncounted repetitions before.
         warm_up: usize,
-        /// How long each is waited for.
+        /// Longest wait for each.
         patience_seconds: f64,
     },
     /// `ask`: requests.
@@ -33,13 +33,13 @@ pub(crate) enum Order {
         size: usize,
         /// Bytes of an answer, at least 16.
         answer: usize,
-        /// At most so many that count.
+        /// Most counted repetitions.
         count: usize,
-        /// None begins after so long.
+        /// Time after which no further one begins.
         seconds: f64,
-        /// How many come first and do not count.
+        /// Number of uncounted repetitions before.
         warm_up: usize,
-        /// How long each answer is waited for.
+        /// Longest wait for each answer.
         patience_seconds: f64,
         /// Requests a second, of which those that fall due while an answer is awaited are left out; without it the next
         /// follows upon the answer.
@@ -53,7 +53,7 @@ pub(crate) enum Order {
         size: usize,
         /// At most so many.
         count: u32,
-        /// None begins after so long.
+        /// Time after which no further one begins.
         seconds: f64,
         /// Messages a second; without it as fast as writing goes.
         rate: Option<f64>,
@@ -64,12 +64,12 @@ pub(crate) enum Order {
         run: u32,
         /// Its last message.
         last: u32,
-        /// It is over when nothing has come for so long.
+        /// Time without a message after which the run is over.
         quiet_seconds: f64,
     },
 }
 
-/// What a role says.
+/// An event of a role.
 #[derive(Clone, Debug, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum Event {
@@ -77,9 +77,9 @@ pub(crate) enum Event {
     Up,
     /// `relay`: the other end may connect.
     Listening,
-    /// Somebody is there on the local network, on every topic.
+    /// Every topic is matched on the local network.
     Matched,
-    /// The first message has made its way.
+    /// The first message has passed the whole path.
     Connected,
     /// The answer to [`Order::Measure`].
     Measured {
@@ -87,7 +87,7 @@ pub(crate) enum Event {
         size: usize,
         /// Each round trip, in their order, µs.
         round_trips_us: Vec<f64>,
-        /// How many did not come back in time.
+        /// Number of messages that did not come back in time.
         lost: usize,
     },
     /// The answer to [`Order::Ask`].
@@ -96,7 +96,7 @@ pub(crate) enum Event {
         size: usize,
         /// From each request to its answer, in their order, µs.
         round_trips_us: Vec<f64>,
-        /// How many were not answered in time.
+        /// Number of requests without an answer in time.
         lost: usize,
         /// Before the first that counts, by the monotonic clock, ns.
         begun_ns: u64,
@@ -129,7 +129,7 @@ pub(crate) enum Event {
     },
 }
 
-/// Says it, at once.
+/// Prints an event at once.
 pub(crate) fn say(event: &Event) -> Result<()> {
     use std::io::Write as _;
     let mut line = serde_json::to_string(event)?;
@@ -147,14 +147,14 @@ pub(crate) struct Orders {
     kept: RefCell<VecDeque<Order>>,
 }
 
-/// What is there to do.
+/// The next action of a role.
 #[derive(Debug)]
 pub(crate) enum Next {
-    /// This.
+    /// Carry out an order.
     Do(Order),
-    /// Nothing yet.
+    /// Wait for an order.
     Wait,
-    /// To end.
+    /// End the program.
     End,
 }
 
@@ -178,7 +178,7 @@ impl Orders {
         Self { come: receiver, kept: RefCell::default() }
     }
 
-    /// Whether the program is to end: orders that come meanwhile are for later.
+    /// Returns whether the program has to end. Keeps orders that come meanwhile for later.
     pub(crate) fn have_ended(&self) -> Result<bool> {
         loop {
             match self.come.try_recv() {

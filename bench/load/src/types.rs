@@ -11,7 +11,7 @@
 //! }; }; };
 //! ```
 //!
-//! Layout only; reading and writing is [`crate::dds`]'s.
+//! Layout only; [`crate::dds`] reads and writes.
 
 use std::ffi::{CStr, c_char};
 use std::mem::{align_of, size_of};
@@ -32,7 +32,7 @@ const GID_BYTES: usize = 16;
 const SEQUENCE_BYTES: u32 = size_of::<dds_sequence_t>() as u32;
 const NODE_BYTES: u32 = size_of::<NodeEntities>() as u32;
 
-/// What Cyclone is told of a type.
+/// The description of a type for Cyclone.
 pub(crate) struct Descriptor {
     type_name: &'static CStr,
     bytes: u32,
@@ -41,7 +41,7 @@ pub(crate) struct Descriptor {
     instructions: &'static [u32],
 }
 
-/// What is measured with.
+/// The type of measured messages.
 pub(crate) static MESSAGE: Descriptor = Descriptor {
     type_name: c"sgc_bench::msg::dds_::Load_",
     bytes: 16 + SEQUENCE_BYTES,
@@ -50,7 +50,7 @@ pub(crate) static MESSAGE: Descriptor = Descriptor {
     instructions: &[ADR | EIGHT_BYTES, 0, ADR | EIGHT_BYTES, 8, ADR | SEQUENCE | OF_BYTES, 16, RTS],
 };
 
-/// What ROS 2 nodes tell of themselves.
+/// The type of `ros_discovery_info`.
 pub(crate) static GRAPH: Descriptor = Descriptor {
     type_name: c"rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_",
     bytes: size_of::<ParticipantEntities>() as u32,
@@ -137,7 +137,7 @@ pub(crate) fn sequence<T>(items: &[T]) -> dds_sequence_t {
     }
 }
 
-/// What DDS calls the ROS 2 topic `/name`.
+/// Returns the DDS name of the ROS 2 topic `/name`.
 pub(crate) fn dds_name(ros_name: &str) -> String {
     format!("rt{ros_name}")
 }

@@ -1,6 +1,6 @@
-//! Table `applications`: those of the paper, as requests and answers of their sizes.
+//! Table `applications`: the paper's applications, as requests and answers of their sizes.
 //!
-//! What they compute takes no time here: it would be the same in every row, and hide what is compared.
+//! Their computation takes no time here, because it would be the same in every row and hide the differences.
 
 use std::time::Duration;
 
@@ -23,7 +23,7 @@ const CONNECT_MAX: Duration = Duration::from_secs(30);
 /// How much longer than it may take is waited for what a program says.
 const SPARE: Duration = Duration::from_secs(5);
 
-/// What goes there and what comes back.
+/// Sizes of requests and answers.
 struct Application {
     name: &'static str,
     /// Bytes.
@@ -58,7 +58,7 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
                 &APPLICATIONS.each_ref(),
                 |system| Turn::start(compare, &kind, system),
                 |turn, application| {
-                    turn.measure(application, &Plan::of(&kind, application, compare.is_quick()))
+                    turn.measure(application, &Plan::for_path(&kind, application, compare.is_quick()))
                 },
             );
             for (name, turn) in names.into_iter().zip(turns) {
@@ -100,7 +100,7 @@ impl Turn {
     }
 
     /// One application; itself, unless there is no going on.
-    fn measure(mut self, application: &Application, plan: &Plan) -> Result<(Answered, Option<Self>)> {
+    fn measure(mut self, application: &Application, plan: &Plan) -> Result<(AskReport, Option<Self>)> {
         self.ask.order(&json!({ "ask": {
             "size": application.request, "answer": application.answer, "rate": application.rate,
             "count": plan.count, "seconds": plan.seconds, "warm_up": plan.warm_up,
@@ -108,16 +108,16 @@ impl Turn {
         }}))?;
         let most = plan.patience * (1 + plan.warm_up) + Duration::from_secs_f64(plan.seconds) + SPARE;
         let answered = self.ask.until("answered", most).with_context(|| application.name)?;
-        let answered: Answered = serde_json::from_value(answered).context("what a program was answered")?;
-        // What was given up still fills the path.
+        let answered: AskReport = serde_json::from_value(answered).context("what a program was answered")?;
+        // Abandoned messages still fill the path.
         let goes_on = answered.lost == 0;
         Ok((answered, goes_on.then_some(self)))
     }
 }
 
-/// What a program that asks says of its answers.
+/// The asking program's report.
 #[derive(Deserialize)]
-struct Answered {
+struct AskReport {
     round_trips_us: Vec<f64>,
     lost: u64,
     begun_ns: u64,
@@ -130,9 +130,9 @@ fn push(
     system: &str,
     kind: &PathKind,
     application: &Application,
-    answered: &Answered,
+    answered: &AskReport,
 ) {
-    let Answered { round_trips_us, lost, .. } = answered;
+    let AskReport { round_trips_us, lost, .. } = answered;
     let seconds = answered.ended_ns.saturating_sub(answered.begun_ns) as f64 / 1e9;
     let mut push = |metric: &str, value| {
         let metric = format!("{}_{metric}", application.name);
@@ -142,7 +142,7 @@ fn push(
         push("frames_per_second", round_trips_us.len() as f64 / seconds);
     }
     if !round_trips_us.is_empty() {
-        let spread = Spread::of(round_trips_us.clone());
+        let spread = Spread::from_samples(round_trips_us.clone());
         push("p50_us", spread.p50);
         push("p99_us", spread.p99);
     }
@@ -162,7 +162,7 @@ struct Plan {
 }
 
 impl Plan {
-    fn of(kind: &PathKind, application: &Application, quick: bool) -> Self {
+    fn for_path(kind: &PathKind, application: &Application, quick: bool) -> Self {
         let is_huge = application.request >= 1 << 20;
         let (count, seconds, warm_up, patience) = match kind {
             PathKind::Bare if is_huge => (12, 2.5, 1, 20),

@@ -1,4 +1,4 @@
-//! What was measured, one number a row, so that every table, plot and goal can be made of the same file.
+//! The measured figures, one number a row, so that every table, plot and goal derives from the same file.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,7 +8,7 @@ pub(crate) struct Figure {
     /// The table that it belongs to: `round-trip`, `throughput`, `real-ros2` and those that begin so, `start-up`, `applications`, `fleet-step`, `fan-out`, `multi-hop`,
     /// `teleop`, `roaming`, `footprint`.
     pub(crate) table: String,
-    /// What was measured: `direct`, `wireguard`, `dds-security`, `zenoh-tcp`, `zenoh-tls`, `sgc-quic-group`,
+    /// The measured system: `direct`, `wireguard`, `dds-security`, `zenoh-tcp`, `zenoh-tls`, `sgc-quic-group`,
     /// `sgc-dtls-standard`, …; `sgc-quic-group-router` with a router process between the proxies; `ssh`; `tcp`.
     pub(crate) system: String,
     /// Over which path: `bare`, `paper` (76 ms round trip, 5 Mbit/s), `lossy` (40 ms, 50 Mbit/s, 2 %), `jazzy-kilted` and `kilted-jazzy` over
@@ -16,7 +16,7 @@ pub(crate) struct Figure {
     pub(crate) path: String,
     /// At what: bytes of a message, messages a second, sinks, routers, records, runs, by the table.
     pub(crate) at: f64,
-    /// What the number is, with its unit last: `p50_us`, `p99_us`, `max_us`, `per_second`, `cpu_us_per_message`,
+    /// The metric, with its unit last: `p50_us`, `p99_us`, `max_us`, `per_second`, `cpu_us_per_message`,
     /// `rss_bytes`, `lost`, …
     pub(crate) metric: String,
     /// The number.
@@ -28,7 +28,7 @@ pub(crate) struct Figure {
 pub(crate) struct Figures {
     /// The numbers.
     pub(crate) figures: Vec<Figure>,
-    /// What could not be measured here, and why: shown in the report, never left out in silence.
+    /// Measurements that were impossible here, with the reasons, which the report shows.
     pub(crate) left_out: Vec<String>,
 }
 

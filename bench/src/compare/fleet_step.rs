@@ -24,14 +24,14 @@ use crate::report::Spread;
 const ROBOTS: usize = 4;
 const IMAGES: &str = "/fleet/image";
 const ACTIONS: &str = "/fleet/action";
-/// Of each robot: where its images and where its actions go.
+/// Topics of each robot's images and actions.
 const TOPICS: [(&str, &str); ROBOTS] = [
     ("/fleet/image_0", "/fleet/action_0"),
     ("/fleet/image_1", "/fleet/action_1"),
     ("/fleet/image_2", "/fleet/action_2"),
     ("/fleet/image_3", "/fleet/action_3"),
 ];
-/// What a robot is told to do: a header and a command for each of seven joints.
+/// Bytes of an action: a header and a command for each of seven joints.
 const ACTION_BYTES: usize = 128;
 /// One way.
 const NEAR: Duration = Duration::from_millis(5);
@@ -73,7 +73,7 @@ fn push(figures: &mut Figures, system: &str, path: &str, steps_us: Result<Vec<f6
     match steps_us {
         Err(error) => figures.leave_out(&format!("fleet-step {system} on {path}"), format!("{error:#}")),
         Ok(steps) => {
-            let spread = Spread::of(steps);
+            let spread = Spread::from_samples(steps);
             let mut push = |metric, value| {
                 figures.push("fleet-step", system, path, ROBOTS as f64, metric, value);
             };
@@ -173,11 +173,11 @@ fn over_ssh(compare: &Compare, kind: PathKind, steps: usize) -> Result<Vec<f64>>
     Ok(times.split_off(WARM_UP))
 }
 
-/// Where `sshd` listens.
+/// Port of `sshd`.
 const SSH_PORT: u16 = 2222;
 /// How often the server looks for files: it is on its own disk, and may as well be told by the kernel.
 const LOOK_EVERY: Duration = Duration::from_millis(1);
-/// Where Debian's `sshd` wants an empty directory to be.
+/// Empty directory that Debian's `sshd` needs.
 const SSHD_EMPTY: &str = "/run/sshd";
 const SSHD: &str = "/usr/sbin/sshd";
 

@@ -1,4 +1,4 @@
-//! One way: a program that sends and some that count, at the two ends of a system, and what came of their runs.
+//! One-way flows: a sending program and counting ones at the two ends of a system, and the results of their runs.
 
 use std::time::Duration;
 
@@ -17,12 +17,12 @@ const QUIET: Duration = Duration::from_secs(3);
 /// How much longer than it may take is waited for an answer.
 const SPARE: Duration = Duration::from_secs(10);
 
-/// Who sends what to whom.
+/// The ends and the topic of a flow.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FlowSpec {
     /// The topic.
     pub(crate) topic: &'static str,
-    /// Where it is sent from; it is counted at the other place.
+    /// The sending place. The other place counts.
     pub(crate) from: Side,
     /// Readers there, all of one process in each local network.
     pub(crate) readers: usize,
@@ -45,7 +45,7 @@ pub(crate) struct Order {
     pub(crate) rate: Option<f64>,
 }
 
-/// What came of it.
+/// The result of a run.
 #[derive(Clone, Debug)]
 pub(crate) struct Outcome {
     /// Messages written.
@@ -83,13 +83,13 @@ pub(crate) struct Flow {
 }
 
 #[derive(Deserialize)]
-struct Sent {
+struct SourceReport {
     count: u32,
     begun_ns: u64,
 }
 
 #[derive(Deserialize)]
-struct Counted {
+struct SinkReport {
     received: Vec<u32>,
     ended_ns: u64,
     age_us: [f64; 3],
@@ -102,7 +102,7 @@ impl Flow {
         Self::start_between(lab, &running.dds[spec.from as usize], &there, spec)
     }
 
-    /// The same from a local network here to several there.
+    /// Starts a flow from a local network here to several there.
     pub(crate) fn start_between(lab: &Lab, here: &Dds, there: &[Dds], spec: &FlowSpec) -> Result<Self> {
         let (depth, readers) = (spec.depth.to_string(), spec.readers.to_string());
         let mut args = vec!["--topic", spec.topic, "--depth", &depth];
@@ -131,7 +131,7 @@ impl Flow {
             "rate": order.rate,
         }}))?;
         let most = Duration::from_secs_f64(order.seconds) + SPARE;
-        let sent: Sent = serde_json::from_value(self.source.until("sent", most)?)?;
+        let sent: SourceReport = serde_json::from_value(self.source.until("sent", most)?)?;
         for sink in &mut self.sinks {
             sink.order(&json!({ "count": {
                 "run": self.run, "last": sent.count, "quiet_seconds": QUIET.as_secs_f64(),
@@ -140,7 +140,7 @@ impl Flow {
         let (mut received, mut ended_ns, mut age_us) = (Vec::new(), 0, [0.0_f64; 3]);
         for sink in &mut self.sinks {
             let counted = sink.until("counted", most + QUIET)?;
-            let counted: Counted = serde_json::from_value(counted).context("what a sink counted")?;
+            let counted: SinkReport = serde_json::from_value(counted).context("what a sink counted")?;
             received.extend(counted.received);
             ended_ns = ended_ns.max(counted.ended_ns);
             for (worst, age) in age_us.iter_mut().zip(counted.age_us) {

@@ -24,16 +24,16 @@ use super::turns::abreast;
 use super::{Compare, Figures};
 use crate::fleet::BenchFleet;
 use crate::process::{PATIENCE, SgcRouter, resident_bytes_of, status, status_field_of, thread_seconds_of};
-use crate::rib::Told;
+use crate::rib::LinkedOwners;
 
 const TABLE: &str = "footprint";
 const TOPICS: [usize; 5] = [0, 1, 10, 100, 1000];
 const NAMES: [usize; 4] = [0, 10_000, 100_000, 1_000_000];
 const LINKS: [usize; 4] = [1, 10, 100, 1000];
-/// What only takes long stays out of a run that shows that all works.
+/// Most topics, links or names in a quick run, which only shows that all works.
 const QUICK_MAX: usize = 100;
 const QUICK_NAMES_MAX: usize = 10_000;
-/// What the topics' names begin with.
+/// Prefix of the topics' names.
 const TOPIC: &str = "/footprint/t";
 /// ROS domains of the two ends.
 const DOMAINS: [u32; 2] = [41, 42];
@@ -74,7 +74,7 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     Ok(())
 }
 
-/// What is the same for all.
+/// The parts that all measurements share.
 struct Stage {
     program: PathBuf,
     is_quick: bool,
@@ -209,7 +209,7 @@ impl Stage {
         let mut there = 0;
         for &links in sizes {
             compare.note(&format!("footprint, {links} links"));
-            all.push(Told::connect(&router.url, &fleet, there..links)?);
+            all.push(LinkedOwners::connect(&router.url, &fleet, there..links)?);
             there = links;
             until("every link is up", || Ok(router.links()? == links))?;
             let rss = self.measure("sgc-router", "links", links, router.process.pid(), figures)?;
@@ -225,11 +225,11 @@ impl Stage {
         let (fleet, dir) = (BenchFleet::new()?, tempfile::tempdir()?);
         fleet.write_router(dir.path())?;
         let router = SgcRouter::start(&self.program, dir.path())?;
-        let mut told = Told::prepare(&router.url, &fleet, names)?;
-        until("every link is up", || Ok(router.links()? == told.links()))?;
+        let mut owners = LinkedOwners::prepare(&router.url, &fleet, names)?;
+        until("every link is up", || Ok(router.links()? == owners.links()))?;
         let before = router.process.resident_bytes() as f64;
         let known = router.routed_names()?;
-        told.tell()?;
+        owners.advertise_all()?;
         router.until_routed(known + names as u64)?;
         let rss = self.measure("sgc-router", "names", names, router.process.pid(), figures)?;
         if names > 0 {

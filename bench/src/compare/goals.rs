@@ -1,7 +1,7 @@
 //! The project's goals, each judged by the figures of one run: met, missed, or not measured.
 //!
-//! What is compared with another system is a ratio to what that system reached in the same run, since times differ from
-//! machine to machine. It judges and measures nothing.
+//! A goal against another system is a ratio to that system's figure in the same run, because times differ from machine to
+//! machine. This module judges and measures nothing.
 
 use super::figures::{Figure, Figures};
 use super::plot::Unit;
@@ -11,15 +11,15 @@ use super::round_trip::GAVE_UP;
 /// A goal and what became of it.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Goal {
-    /// What it is about.
+    /// The subject of the goal.
     pub(crate) what: String,
     /// The bound, with its unit.
     pub(crate) bound: String,
-    /// What was reached: the worst of the parts, or each of them.
+    /// The reached figures: the worst of the parts, or each of them.
     pub(crate) reached: String,
-    /// The same by TCP, where that was measured and the transport matters.
+    /// The figures over TCP, where they were measured and the transport matters.
     pub(crate) by_tcp: String,
-    /// What programs reach that do nothing but carry messages; empty where that says nothing.
+    /// The figures of programs that only carry messages; empty where they say nothing.
     pub(crate) by_relay: String,
     /// Whether that is within the bound.
     pub(crate) verdict: Verdict,
@@ -49,13 +49,13 @@ impl Verdict {
 
 /// The suite that costs least, over the default transport.
 const GROUP: &str = "sgc-quic-group";
-/// What users have who choose nothing.
+/// The system with default settings.
 const STANDARD: &str = "sgc-quic-standard";
 /// The same suites over the transport that the peers of most goals use.
 const GROUP_TCP: &str = "sgc-tcp-group";
 const STANDARD_TCP: &str = "sgc-tcp-standard";
 const ZENOH: &str = "zenoh-tcp";
-/// What every system with a program at each place does, and nothing else; the better of both counts.
+/// Minimal systems with a program at each place; the better of both counts.
 const RELAYS: [&str; 2] = ["relay", "relay-gathers"];
 /// Sizes of messages, bytes, that are small.
 const SMALL: [f64; 4] = [16.0, 100.0, 1e3, 8e3];
@@ -495,13 +495,13 @@ mod tests {
     }
 
     #[test]
-    fn one_part_beyond_the_bound_misses_it() {
+    fn goal_is_missed_if_any_part_exceeds_bound() {
         assert_eq!(verdict(&figures(&[70.0, 81.0, 71.0, 60.0]), WHAT).0, Verdict::Missed);
         assert_eq!(verdict(&figures(&[81.0]), WHAT).0, Verdict::Missed);
     }
 
     #[test]
-    fn what_is_missing_is_neither_met_nor_missed() {
+    fn goal_without_figures_is_neither_met_nor_missed() {
         let (verdict_of_three, reached) = verdict(&figures(&[70.0, 70.0, 70.0]), WHAT);
         assert_eq!(verdict_of_three, Verdict::NotMeasured);
         assert!(reached.ends_with("8 KB: –"), "{reached}");
@@ -509,7 +509,7 @@ mod tests {
     }
 
     #[test]
-    fn what_never_came_back_took_longer_than_it_was_waited_for() {
+    fn lost_round_trip_counts_as_longer_than_wait() {
         let what = "Round trip p50, every size, `paper`: `standard` to DDS over WireGuard";
         let mut figures = Figures::default();
         for at in SIZES {
@@ -529,7 +529,7 @@ mod tests {
         figures.push("throughput", "direct", "bare", 1000.0, "per_second", 100_000.0);
         figures.push("throughput", GROUP, "bare", 1000.0, "per_second", 96_000.0);
         assert_eq!(verdict(&figures, what), (Verdict::Missed, "0.96 ×".into()));
-        // What was measured last counts.
+        // The last measurement counts.
         figures.push("throughput", GROUP, "bare", 1000.0, "per_second", 97_000.0);
         assert_eq!(verdict(&figures, what).0, Verdict::Met);
     }

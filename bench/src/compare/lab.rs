@@ -1,4 +1,4 @@
-//! Two places and the path between them: network namespaces, where systems and programs are started. Knows no system.
+//! Two places and the path between them: network namespaces in which systems and programs are started. Knows no system.
 
 use std::ffi::OsStr;
 use std::net::IpAddr;
@@ -49,7 +49,7 @@ impl Side {
     }
 }
 
-/// What lies between the two places.
+/// The path between the two places.
 #[derive(Clone, Copy, Debug)]
 #[expect(clippy::large_enum_variant, reason = "there are a few in a run")]
 pub(crate) enum PathKind {
@@ -91,11 +91,11 @@ impl PathKind {
     }
 }
 
-/// The two places. What was started in them has to end before it is dropped.
+/// The two places. Programs in them have to end before it is dropped.
 pub(crate) struct Lab {
     /// Goes first, as its devices are in the namespaces. None on [`PathKind::Bare`].
     pub(crate) path: Option<TunLink>,
-    /// What it is.
+    /// The kind of path.
     pub(crate) kind: PathKind,
     /// The ROS networks that systems connect.
     pub(crate) networks: Networks,
@@ -168,7 +168,7 @@ impl Lab {
         self.load_in(&running.dds[side as usize], side, args)
     }
 
-    /// The same in any local network of a place.
+    /// Starts a load program in any local network of a place.
     pub(crate) fn load_in(&self, dds: &Dds, side: Side, args: &[&str]) -> Result<Program> {
         let mut command = self.command(side, dds.load.as_deref().unwrap_or(&self.load));
         command.args(args).args(["--domain", &dds.domain.to_string()]);

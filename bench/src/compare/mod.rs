@@ -1,8 +1,8 @@
-//! `compare`: SGC and what a user would pick instead, side by side in one run over one emulated network.
+//! `compare`: SGC and its alternatives, side by side in one run over one emulated network.
 //!
-//! What is compared is a [`System`](system::System) between two places of a [`Lab`](lab::Lab): it carries topics of programs
-//! that know nothing of it. A table is a module here and a row of [`TABLES`]; what it measures are [`figures::Figure`]s, which
-//! `report` turns into pages, plots and goals.
+//! A [`System`](system::System) joins two places of a [`Lab`](lab::Lab) and carries topics of programs that do not know it. A
+//! table is a module here and a row of [`TABLES`]. It measures [`figures::Figure`]s, which `report` turns into pages, plots and
+//! goals.
 
 mod applications;
 mod fan_out;
@@ -62,10 +62,10 @@ const TABLES: [(&str, Table); 11] = [
     ("footprint", footprint::run),
 ];
 
-/// Of the many variants of `sgc`, those that a short run has.
+/// The variants of `sgc` in a short run.
 const QUICK: [&str; 4] = ["sgc-quic-group", "sgc-quic-group-router", "sgc-dtls-paper", "sgc-tcp-standard"];
 
-/// What `compare` is given.
+/// The arguments of `compare`.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct CompareArgs {
     /// The program that is measured
@@ -74,7 +74,7 @@ pub(crate) struct CompareArgs {
     /// The program that talks and listens; without it the `load` beside this one
     #[arg(long, value_name = "FILE")]
     load: Option<PathBuf>,
-    /// Where the results go
+    /// Directory for the results
     #[arg(long, value_name = "DIR", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/results"))]
     out: PathBuf,
     #[command(flatten)]
@@ -138,7 +138,7 @@ impl Compare {
         Ok(Self { args, load, systems, relays, begun: Instant::now() })
     }
 
-    /// What is compared in this run.
+    /// Returns the systems of this run.
     pub(crate) fn systems(&self) -> &[Box<dyn System>] {
         &self.systems
     }
@@ -148,7 +148,7 @@ impl Compare {
         &self.relays
     }
 
-    /// Those that a table has, of what was asked for; what it has not is said. Who asks for systems by name gets them.
+    /// Returns the requested systems that a table has, and reports missing ones. Systems requested by name are always included.
     pub(crate) fn systems_of(
         &self,
         breadth: Breadth,
@@ -174,7 +174,7 @@ impl Compare {
         self.args.paths.is_empty() || self.args.paths.iter().any(|path| path == kind.name())
     }
 
-    /// What is compared where users configure more than the names of topics; see [`system::configured`].
+    /// Returns the systems where users configure more than the names of topics; see [`system::configured`].
     pub(crate) fn configured(
         &self,
         priorities: &'static [(&'static str, &'static str)],

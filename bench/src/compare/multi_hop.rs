@@ -42,7 +42,7 @@ fn measure(
     let mut samples = BTreeMap::new();
     round_trip::measure(compare, &kind, &system, &[BYTES], &mut samples)?;
     for round_trip::Sample { round_trips_us, .. } in samples.into_values() {
-        let spread = crate::report::Spread::of(round_trips_us);
+        let spread = crate::report::Spread::from_samples(round_trips_us);
         tally.add(name, kind.name(), routers as u64, "p50_us", spread.p50);
         tally.add(name, kind.name(), routers as u64, "p99_us", spread.p99);
         tally.add(name, kind.name(), routers as u64, "max_us", spread.max);

@@ -1,10 +1,10 @@
-//! What a whole run can afford: which of the many variants of `sgc` a table has, how often each system has its turn, and how many
-//! have it at the same time. The budget is in `bench/README.md`.
+//! The extent of a whole run: the variants of `sgc` in each table, the number of turns of each system, and the number of systems
+//! measured at the same time. The budget is in `bench/README.md`.
 
 use super::lab::PathKind;
 use super::tcp;
 
-/// Which variants of `sgc` are in a table. The other systems are in all.
+/// The variants of `sgc` in a table. The other systems are in all tables.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Breadth {
     /// Every transport with every suite, and with a router.
@@ -28,7 +28,7 @@ impl Breadth {
         }
     }
 
-    /// What is not in it.
+    /// Returns a description of the missing variants.
     pub(crate) fn lacks(self) -> &'static str {
         match self {
             Self::Whole => "nothing of sgc",
@@ -70,7 +70,7 @@ const ABREAST_PAPER: usize = 6;
 const ABREAST_LOSSY: usize = 2;
 const ABREAST_LOSSY_TCP: usize = 6;
 
-/// Who goes together, of these.
+/// Groups the systems that are measured at the same time.
 pub(crate) fn together<T>(kind: &PathKind, who: Vec<T>, name: impl Fn(&T) -> String) -> Vec<Vec<T>> {
     match kind {
         PathKind::Paper => chunks(who, ABREAST_PAPER),

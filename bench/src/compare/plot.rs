@@ -27,7 +27,7 @@ pub(crate) enum Stroke {
     Dotted,
 }
 
-/// What numbers on an axis are.
+/// The unit of an axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Unit {
     /// A number without a unit.
@@ -131,8 +131,8 @@ impl Stroke {
 pub(crate) fn curves(title: &str, x: &Axis<'_>, y: &Axis<'_>, series: &[Series]) -> Option<String> {
     let finite = |(x, y): &&(f64, f64)| x.is_finite() && y.is_finite();
     let points: Vec<_> = series.iter().flat_map(|s| &s.points).filter(finite).copied().collect();
-    let across = Scale::of(points.iter().map(|p| p.0), false)?;
-    let up = Scale::of(points.iter().map(|p| p.1), true)?;
+    let across = Scale::from_values(points.iter().map(|p| p.0), false)?;
+    let up = Scale::from_values(points.iter().map(|p| p.1), true)?;
     let width = WIDTH - LEFT - LEGEND_WIDTH;
     let height = PLOT_HEIGHT.max(series.len() as f64 * LEGEND_STEP);
     let total = TOP + height + BOTTOM;
@@ -254,7 +254,7 @@ impl Unit {
         join(&three_digits(value / scale), unit)
     }
 
-    /// What numbers of this size are divided by, and what then stands behind them.
+    /// Returns the divisor for numbers of this size, and the unit that follows them.
     pub(crate) fn scale(self, value: f64) -> (f64, &'static str) {
         // A number that would be written as 1000 of the smaller unit is one of the larger.
         let value = value.abs() * 1.0005;
@@ -325,7 +325,7 @@ struct Scale {
 impl Scale {
     /// Logarithmic where the numbers differ 20 times or more and all are above nothing; those of a vertical axis
     /// otherwise begin at nothing. `None` without numbers.
-    fn of(values: impl Iterator<Item = f64>, is_vertical: bool) -> Option<Self> {
+    fn from_values(values: impl Iterator<Item = f64>, is_vertical: bool) -> Option<Self> {
         let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
         if low > high {
             return None;
@@ -353,7 +353,7 @@ impl Scale {
         (value - self.low) / (self.high - self.low)
     }
 
-    /// Where lines go, in the unit of the axis: decades, or round steps of which there are four to nine.
+    /// Returns the positions of grid lines in the unit of the axis: decades, or four to nine round steps.
     fn ticks(&self) -> Vec<f64> {
         if self.is_logarithmic {
             let decades = self.low.floor() as i32..=self.high.floor() as i32;
@@ -438,17 +438,17 @@ mod tests {
 
     #[test]
     fn wide_ranges_are_logarithmic_and_others_begin_at_nothing() {
-        let wide = Scale::of([16.0, 13e6].into_iter(), false).unwrap();
+        let wide = Scale::from_values([16.0, 13e6].into_iter(), false).unwrap();
         assert!(wide.is_logarithmic);
         assert!((wide.part(16.0), wide.part(13e6)) == (0.0, 1.0));
-        let narrow = Scale::of([3.0, 9.0].into_iter(), true).unwrap();
+        let narrow = Scale::from_values([3.0, 9.0].into_iter(), true).unwrap();
         assert!(!narrow.is_logarithmic && narrow.part(0.0) == 0.0);
         assert_eq!(narrow.ticks(), [0.0, 2.0, 4.0, 6.0, 8.0]);
-        assert!(Scale::of(std::iter::empty(), true).is_none());
+        assert!(Scale::from_values(std::iter::empty(), true).is_none());
     }
 
     #[test]
-    fn what_has_no_place_on_an_axis_is_not_drawn() {
+    fn point_outside_axis_is_not_drawn() {
         let line = |points| Series { name: "a < b".into(), hue: Hue::Blue, stroke: Stroke::Solid, points };
         let axis = |title| Axis { title, unit: Unit::Plain };
         let draw = |points| curves("t", &axis("x"), &axis("y"), &[line(points)]);

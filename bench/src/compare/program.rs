@@ -23,7 +23,7 @@ const GRACE: Duration = Duration::from_secs(3);
 /// How often it is looked at meanwhile.
 const LOOK_EVERY: Duration = Duration::from_millis(5);
 
-/// A process. What it logs to standard error is in a file.
+/// A process. Its standard error goes to a file.
 #[derive(Debug)]
 pub(crate) struct Program {
     name: String,
@@ -64,7 +64,7 @@ impl Program {
         Ok(Self { name: name.to_owned(), child, orders, lines, log, ending: Ending::Input })
     }
 
-    /// The same for one that does not care for its standard input: it is killed.
+    /// Starts a process that ignores its standard input and is therefore killed at its end.
     pub(crate) fn start_daemon(name: &str, command: Command, dir: &Path) -> Result<Self> {
         let mut program = Self::start(name, command, dir)?;
         program.ending = Ending::Kill;

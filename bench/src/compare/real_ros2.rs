@@ -215,7 +215,7 @@ impl Measurement {
 struct Scene {
     running: Running,
     lab: Lab,
-    /// Where the program at the right end is: at the left place if both are on one host.
+    /// Place of the program at the right end, which is the left place if both are on one host.
     far: Side,
     /// The environments of both ends.
     environments: [PathBuf; 2],
@@ -328,9 +328,9 @@ fn library_of(environment: &Path) -> PathBuf {
 
 /// The summary of a publisher.
 #[derive(Debug, Deserialize)]
-struct Published {
+struct PublisherReport {
     sent: u64,
-    /// Of those, messages that DDS did not take.
+    /// Messages that DDS did not take.
     refused: u64,
 }
 
@@ -358,7 +358,7 @@ struct Latency {
 /// Messages one way.
 #[derive(Debug)]
 struct Flow {
-    publisher: Published,
+    publisher: PublisherReport,
     subscriber: Summary,
 }
 
@@ -396,7 +396,7 @@ mod tests {
     fn flow(sent: u64, refused: u64, received: u64, first: u64) -> Flow {
         let latency_us = Latency { p50: 1.0, p99: 1.0, max: 1.0 };
         let subscriber = Summary { sent: 0, received, first, duplicated: 0, seconds: 4.5, latency_us };
-        Flow { publisher: Published { sent, refused }, subscriber }
+        Flow { publisher: PublisherReport { sent, refused }, subscriber }
     }
 
     #[test]

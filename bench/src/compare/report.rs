@@ -17,7 +17,7 @@ use super::real_ros2;
 use super::round_trip::GAVE_UP;
 use crate::report::Machine;
 
-/// What a run leaves behind.
+/// The results of a run.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Run {
     machine: Machine,
@@ -36,7 +36,7 @@ pub(crate) struct Page {
 }
 
 impl Run {
-    /// What was measured here and now.
+    /// Returns the results of a run on this machine.
     pub(crate) fn here(figures: Figures, is_quick: bool) -> Self {
         Self { machine: Machine::here(), is_quick, figures }
     }
@@ -79,7 +79,7 @@ impl Run {
         text.push_str(HOW_TO_READ);
         text.push_str(&goals_table(&self.figures));
         for table in tables(&self.figures) {
-            let about = About::of(table);
+            let about = About::for_table(table);
             let _ = writeln!(text, "## {}\n\n{}", about.title, about.says);
             let plots = plots(&self.figures, &about);
             for page in &plots {
@@ -110,13 +110,13 @@ longest. `group`, `standard` and `paper` are SGC's cipher suites: sealed with a 
 source (the default); the paper's choices. *with a router*: through an `sgc` router process, otherwise one node dials the \
 other. A dash is what was not measured.\n\n";
 
-/// What is known of a table.
+/// The description of a table.
 struct About<'a> {
     table: &'a str,
     title: &'a str,
     /// A paragraph, and an empty line.
     says: &'a str,
-    /// What `at` counts; nothing if it counts nothing.
+    /// The meaning of `at`; empty if it has none.
     at: &'static str,
     at_unit: Unit,
     plot: Plot,
@@ -134,7 +134,7 @@ enum Plot {
 }
 
 impl<'a> About<'a> {
-    fn of(table: &'a str) -> Self {
+    fn for_table(table: &'a str) -> Self {
         let (title, says, at, at_unit, plot) = match table {
             "round-trip" => (
                 "Round trip",
@@ -296,7 +296,7 @@ fn distinct<'a>(names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
     distinct
 }
 
-/// What stands beside goals.
+/// The note beside goals.
 const BESIDE: &str = "Ours is by QUIC, the default; *by TCP* is the same suite over the transport that most peers use here. \
                       *Bare relay* is what two programs reach that do nothing but carry messages between DDS and a TCP \
                       connection, in the clear: with short messages little is left to gain below it.";
@@ -414,7 +414,7 @@ struct Family<'a> {
     metrics: Vec<&'a str>,
 }
 
-/// What a metric is of a distribution, in the order of a cell.
+/// The quantiles of a distribution, in the order of a cell.
 const QUANTILES: [&str; 3] = ["p50", "p99", "max"];
 
 /// A metric without its quantile, if it has one: `state_p50_us` is `state_?_us`.
@@ -494,7 +494,7 @@ impl Family<'_> {
     }
 }
 
-/// What a metric's name says: the unit, the factor to it, and the name in words.
+/// Parses a metric's name to its unit, the factor to it, and the name in words.
 fn measure(metric: &str) -> (Unit, f64, String) {
     const SUFFIXES: [(&str, Unit, f64); 7] = [
         ("us", Unit::Seconds, 1e-6),
@@ -539,7 +539,7 @@ fn systems<'a>(names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
         "zenoh-bridge",
     ];
     let mut systems = distinct(names);
-    let place = |name: &&str| match Sgc::of(name) {
+    let place = |name: &&str| match Sgc::parse(name) {
         None => (PEERS.iter().position(|peer| peer == name).unwrap_or(PEERS.len()), 0, 0, false),
         Some(sgc) => {
             let at = |all: &[&str], it: &str| all.iter().position(|one| *one == it).unwrap_or(all.len());
@@ -561,7 +561,7 @@ struct Sgc<'a> {
 }
 
 impl<'a> Sgc<'a> {
-    fn of(system: &'a str) -> Option<Self> {
+    fn parse(system: &'a str) -> Option<Self> {
         let mut words = system.strip_prefix("sgc-")?.split('-');
         let (scheme, suite) = (words.next()?, words.next()?);
         let is_routed = match (words.next(), words.next()) {
@@ -575,7 +575,7 @@ impl<'a> Sgc<'a> {
 
 /// A system in words.
 fn system_name(system: &str) -> String {
-    if let Some(Sgc { scheme, suite, is_routed }) = Sgc::of(system) {
+    if let Some(Sgc { scheme, suite, is_routed }) = Sgc::parse(system) {
         let router = if is_routed { ", with a router" } else { "" };
         return format!("sgc {}, {suite}{router}", scheme.to_uppercase());
     }
@@ -601,7 +601,7 @@ fn system_name(system: &str) -> String {
 
 /// Colour by what carries it, line by how it is sealed.
 fn look(system: &str) -> (Hue, Stroke) {
-    if let Some(Sgc { scheme, suite, is_routed }) = Sgc::of(system) {
+    if let Some(Sgc { scheme, suite, is_routed }) = Sgc::parse(system) {
         let hue = match (scheme, is_routed) {
             (_, true) => Hue::Teal,
             ("quic", _) => Hue::Blue,
@@ -654,8 +654,8 @@ const NOT_DRAWN: [&str; 3] = ["samples", "lost", GAVE_UP];
 fn curve_plots(figures: &Figures, about: &About<'_>, path: &str) -> Vec<Page> {
     let here: Vec<_> = figures.figures.iter().filter(|f| f.table == about.table && f.path == path).collect();
     let names = systems(here.iter().map(|f| &*f.system));
-    let is_peer = |name: &&&str| Sgc::of(name).is_none_or(|s| s.scheme == "quic");
-    let is_direct = |name: &&&str| Sgc::of(name).is_some_and(|s| !s.is_routed);
+    let is_peer = |name: &&&str| Sgc::parse(name).is_none_or(|s| s.scheme == "quic");
+    let is_direct = |name: &&&str| Sgc::parse(name).is_some_and(|s| !s.is_routed);
     let choices: Vec<(&str, Vec<&str>)> = if names.len() <= LINES_MAX {
         vec![("", names)]
     } else {
@@ -676,7 +676,7 @@ fn curve_plots(figures: &Figures, about: &About<'_>, path: &str) -> Vec<Page> {
                 .iter()
                 .filter_map(|system| {
                     let its = here.iter().filter(|f| f.system == *system && f.metric == metric);
-                    // What was measured last at a place counts, as in the tables.
+                    // The last measurement at a place counts, as in the tables.
                     let mut points: Vec<_> = its.rev().map(|f| (f.at, f.value * factor)).collect();
                     points.sort_by(|a, b| a.0.total_cmp(&b.0));
                     points.dedup_by_key(|point| point.0);
@@ -701,7 +701,7 @@ fn curve_plots(figures: &Figures, about: &About<'_>, path: &str) -> Vec<Page> {
     pages
 }
 
-/// What a vertical axis says.
+/// Returns the title of a vertical axis.
 fn axis_title(words: &str, unit: Unit) -> &str {
     match (words, unit) {
         ("p50" | "", Unit::Seconds) => "median time",
@@ -835,7 +835,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_left_out_is_said() {
+    fn report_lists_omitted_measurements() {
         let mut figures = Figures::default();
         figures.leave_out("rosbridge", "no ROS 2 is installed here");
         let text = page(&run(figures), "report.md");

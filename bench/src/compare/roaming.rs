@@ -14,7 +14,7 @@ use super::system::{System, Topic};
 use super::turns::abreast;
 use super::{Compare, Figures};
 
-/// What figures call the path.
+/// Name of the path in figures.
 const PATH: &str = "roam";
 /// The address that the left place moves to, in the network of the other.
 const NEW_ADDRESS: &str = "10.77.0.77";
@@ -25,16 +25,16 @@ const PER_SECOND: f64 = 50.0;
 const BYTES: usize = 700;
 /// Flows before the address changes.
 const CALM: Duration = Duration::from_secs(2);
-/// Flows afterwards. Who takes longer than that to come back is as good as gone.
+/// Duration of the flow after the change. A system that takes longer to come back counts as gone.
 const SECONDS_AFTER: f64 = 25.0;
 const QUICK_SECONDS_AFTER: f64 = 4.0;
-/// What is under way has come when nothing came for so long.
+/// Time without a message after which all messages in flight have arrived.
 const QUIET_SECONDS: f64 = 5.0;
 const CONNECT_MAX: Duration = Duration::from_secs(30);
 /// How much longer something may take than it says.
 const SPARE: Duration = Duration::from_secs(60);
 
-/// What users of the Zenoh bridge can do: let silence be noticed sooner than after ten seconds, and connect again sooner.
+/// Returns settings for users of the Zenoh bridge: it notices silence earlier than after ten seconds, and reconnects earlier.
 fn zenoh_tuning() -> Value {
     json!({
         "transport": { "link": { "tx": { "lease": 2000 } } },
@@ -86,7 +86,7 @@ fn measure(compare: &Compare, system: &dyn System, figures: &mut Figures) -> Res
         let counted = sink.until("counted", SPARE)?;
         let heard = counted["received"][0].as_u64().context("no count of what came")?;
         let ns = |value: &Value, what| value[what].as_u64().context("no time");
-        // Who never came back has been silent until the last message was sent.
+        // A flow that never came back was silent until the last message was sent.
         let heard_until = ns(&counted, "ended_ns")?.max(ns(&sent, "begun_ns")?);
         let unheard_us = ns(&sent, "ended_ns")?.saturating_sub(heard_until) as f64 / 1e3;
         let silence_us = counted["silence_us"].as_f64().context("no silence")?.max(unheard_us);

@@ -20,7 +20,7 @@ use crate::report::Spread;
 
 const PING: &str = "/bench/ping";
 const PONG: &str = "/bench/pong";
-/// Of a size that never came back: how long it was waited for, µs.
+/// The metric of a size that never came back: the length of the wait in µs.
 pub(crate) const GAVE_UP: &str = "gave_up_us";
 /// Bytes of a message.
 const SIZES: [usize; 7] = [16, 100, 1000, 8 << 10, 64 << 10, 1 << 20, 13 << 20];
@@ -56,7 +56,7 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
                     &together,
                     sizes,
                     |who| Turn::start(compare, &kind, who),
-                    |turn, size| turn.measure(size, &Plan::of(&kind, size, compare.is_quick())),
+                    |turn, size| turn.measure(size, &Plan::for_path(&kind, size, compare.is_quick())),
                 );
                 for (name, turn) in names.into_iter().zip(turns) {
                     add(&mut samples, &name, sizes, turn.stages);
@@ -75,7 +75,7 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
             push("lost", lost as f64);
             push("samples", round_trips_us.len() as f64);
             if !round_trips_us.is_empty() {
-                let spread = Spread::of(round_trips_us);
+                let spread = Spread::from_samples(round_trips_us);
                 push("p50_us", spread.p50);
                 push("p99_us", spread.p99);
                 push("max_us", spread.max);
@@ -87,7 +87,7 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     Ok(())
 }
 
-/// What is measured. A short run leaves out on thin paths what takes their time alone.
+/// Returns the measured sizes. A short run skips sizes that take long on thin paths.
 fn sizes(kind: &PathKind, quick: bool) -> &'static [usize] {
     match kind {
         PathKind::Bare => &SIZES,
@@ -99,7 +99,7 @@ fn sizes(kind: &PathKind, quick: bool) -> &'static [usize] {
 /// Samples by system and size.
 pub(crate) type Samples = BTreeMap<(String, usize), Sample>;
 
-/// What was measured of one size.
+/// The round trips of one size.
 #[derive(Debug, Default)]
 pub(crate) struct Sample {
     /// Each round trip, µs.
@@ -120,7 +120,7 @@ fn add(samples: &mut Samples, name: &str, sizes: &[usize], measured: Vec<Sample>
     }
 }
 
-/// Who has turns.
+/// The participants of the rounds.
 #[derive(Clone, Copy)]
 enum Who<'a> {
     System(&'a dyn System),
@@ -182,7 +182,7 @@ impl Turn {
         let round_trips = measured["round_trips_us"].as_array().context("no round trips")?;
         let round_trips_us = round_trips.iter().filter_map(serde_json::Value::as_f64).collect();
         let lost = measured["lost"].as_u64().context("no count of what was lost")?;
-        // What was given up still fills the path.
+        // Abandoned messages still fill the path.
         let goes_on = lost == 0 || size < LARGE_BYTES;
         Ok((Sample { round_trips_us, lost, patience: plan.patience }, goes_on.then_some(self)))
     }
@@ -199,7 +199,7 @@ pub(crate) fn measure(
     let mut turn = Some(Turn::start(compare, kind, Who::System(system))?);
     for &size in sizes {
         let Some(going) = turn.take() else { break };
-        let (sample, after) = going.measure(size, &Plan::of(kind, size, compare.is_quick()))?;
+        let (sample, after) = going.measure(size, &Plan::for_path(kind, size, compare.is_quick()))?;
         add(samples, &system.name(), &[size], vec![sample]);
         turn = after;
     }
@@ -220,7 +220,7 @@ pub(crate) struct Plan {
 }
 
 impl Plan {
-    fn of(kind: &PathKind, size: usize, quick: bool) -> Self {
+    fn for_path(kind: &PathKind, size: usize, quick: bool) -> Self {
         let is_large = size >= LARGE_BYTES;
         let is_huge = size >= HUGE_BYTES;
         let (count, seconds, warm_up, patience): (usize, f64, usize, u64) = match kind {

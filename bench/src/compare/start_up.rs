@@ -15,7 +15,7 @@ use super::{Compare, Figures};
 use crate::fleet::BenchFleet;
 use crate::process::SgcRouter;
 use crate::report::Spread;
-use crate::rib::{Neighbour, Told};
+use crate::rib::{LinkedOwners, Neighbour};
 
 const TABLE: &str = "start-up";
 /// Names that the router knows.
@@ -42,7 +42,7 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
         compare.note(&format!("start-up, {}", system.name()));
         match application(compare, system, starts) {
             Ok(times) => {
-                let spread = Spread::of(times);
+                let spread = Spread::from_samples(times);
                 figures.push(
                     TABLE,
                     &system.name(),
@@ -78,10 +78,10 @@ fn router(compare: &Compare, records: usize, figures: &mut Figures) -> Result<()
     let begun = Instant::now();
     let router = SgcRouter::start(compare.sgc(), dir.path())?;
     push("ready_us", us(begun));
-    let mut told = Told::prepare(&router.url, &fleet, records)?;
+    let mut owners = LinkedOwners::prepare(&router.url, &fleet, records)?;
     let known = router.routed_names()?;
     let begun = Instant::now();
-    told.tell()?;
+    owners.advertise_all()?;
     router.until_routed(known + records as u64)?;
     push("all_known_us", us(begun));
     let begun = Instant::now();
@@ -91,11 +91,11 @@ fn router(compare: &Compare, records: usize, figures: &mut Figures) -> Result<()
     let mut each = Vec::new();
     for _ in 0..adverts {
         let begun = Instant::now();
-        told.tell_one()?;
+        owners.advertise_one()?;
         neighbour.hears(1)?;
         each.push(us(begun));
     }
-    let each = Spread::of(each);
+    let each = Spread::from_samples(each);
     push("advert_known_p50_us", each.p50);
     push("advert_known_p99_us", each.p99);
     let first =

@@ -12,12 +12,12 @@ use crate::report::median;
 #[derive(Debug)]
 pub(crate) struct Tally {
     table: &'static str,
-    /// By system, path, at and metric. What it is at is a whole number in every table, and has an order as such.
+    /// Figures by system, path, at and metric. `at` is a whole number in every table and is ordered as such.
     rounds: BTreeMap<(String, &'static str, u64, &'static str), Vec<f64>>,
 }
 
 impl Tally {
-    /// Of one table.
+    /// Returns an empty tally of a table.
     pub(crate) fn new(table: &'static str) -> Self {
         Self { table, rounds: BTreeMap::new() }
     }
@@ -47,7 +47,7 @@ pub(crate) struct Round<'a> {
     compare: &'a Compare,
     figures: &'a mut Figures,
     tally: Tally,
-    /// Which it is, from 0.
+    /// Its number, from 0.
     pub(crate) number: usize,
 }
 

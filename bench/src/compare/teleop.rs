@@ -1,4 +1,4 @@
-//! Table `teleop`: driving a robot over a thin uplink while its camera wants three times what that carries.
+//! Table `teleop`: driving a robot over a thin uplink while its camera sends three times the uplink's rate.
 //!
 //! The programs are those of every table, with the QoS that ROS 2 gives them by default: commands and state reliable, the
 //! camera best effort as sensor data. Each system is configured as its users would for this, see [`PRIORITIES`] and [`zenoh_tuning`].
@@ -15,11 +15,11 @@ use super::system::{System, Topic};
 use super::turns::abreast;
 use super::{Compare, Figures};
 
-/// What the uplink carries, bits a second.
+/// Rate of the uplink, in bits per second.
 const UPLINK_RATE: u64 = 5_000_000;
-/// What the way to the robot carries.
+/// Rate of the way to the robot, in bits per second.
 const DOWNLINK_RATE: u64 = 20_000_000;
-/// What may wait for either.
+/// Bound of either queue.
 const QUEUE: Duration = Duration::from_millis(200);
 /// Names for the report, and one way, in each direction.
 const PATHS: [(&str, Duration); 2] = [("uplink", Duration::ZERO), ("uplink-40ms", Duration::from_millis(40))];
@@ -35,9 +35,9 @@ const QUIET_SECONDS: f64 = 3.0;
 /// How much longer something may take than it says.
 const SPARE: Duration = Duration::from_secs(60);
 
-/// One of the three.
+/// One of the three flows.
 struct Flow {
-    /// What its figures begin with.
+    /// Prefix of its figures.
     figures: &'static str,
     topic: Topic,
     per_second: f64,
@@ -65,11 +65,11 @@ const FLOWS: [Flow; 3] = [
     },
 ];
 
-/// What SGC's users write.
+/// Priorities that users of SGC configure.
 const PRIORITIES: &[(&str, &str)] = &[("/cmd_vel", "realtime"), ("/camera", "bulk")];
 
-/// What users of the Zenoh bridge can do: order topics, send small ones at once, send as many frames as the uplink carries
-/// (nine take 4.3 of its 5 Mbit/s; it has to be known), and keep the kernel's queue short.
+/// Returns settings for users of the Zenoh bridge: priorities of topics, small messages without batching, only as many frames as
+/// the uplink carries (nine take 4.3 of its 5 Mbit/s; the user has to know the rate), and a short kernel queue.
 fn zenoh_tuning() -> Value {
     json!({
         "plugins": { "ros2dds": {
@@ -159,7 +159,7 @@ fn measure(
         push("sent", outcome.sent as f64);
         push("lost", outcome.sent.saturating_sub(outcome.heard) as f64);
         push("per_second", outcome.heard as f64 / seconds);
-        // Of nothing there is no age.
+        // Without messages there is no age.
         for (metric, age) in ["p50_us", "p99_us", "max_us"].into_iter().zip(outcome.age_us) {
             if outcome.heard > 0 {
                 push(metric, age);
@@ -174,7 +174,7 @@ fn measure(
     Ok(())
 }
 
-/// What became of a flow.
+/// The result of a flow.
 struct Outcome {
     sent: u64,
     heard: u64,

@@ -20,7 +20,7 @@ const RUN_SECONDS: f64 = 2.0;
 const WARM_UP_SECONDS: f64 = 0.3;
 /// The size that goals ask about: it alone is measured in every round, and of every variant.
 const SIZE_ASKED: usize = 1000;
-/// What a run sends at most, bytes, so that its end is not far behind its last write.
+/// Most bytes that a run sends, so that its end soon follows its last write.
 const RUN_BYTES_MAX: usize = 2 << 30;
 
 /// Measures it.

@@ -1,12 +1,12 @@
-//! Turns that several have at the same time, each in a lab of its own, where the path says how long things take and not the
-//! machine. Knows nothing of what is measured.
+//! Turns of several participants at the same time, each in a lab of its own, where the path and not the machine decides how long
+//! things take. This module does not know what is measured.
 
 use anyhow::Result;
 
-/// What one of several came to.
+/// The result of one participant.
 #[derive(Debug)]
 pub(crate) struct Turn<R> {
-    /// Of each stage that it went through.
+    /// The results of its finished stages.
     pub(crate) stages: Vec<R>,
     /// Why there are no more.
     pub(crate) error: Option<anyhow::Error>,
@@ -27,8 +27,8 @@ pub(crate) fn abreast<W: Send, R: Send>(
     })
 }
 
-/// Starts everybody and lets them go through stages: each begins when all are through the one before, so that nobody's start or
-/// end is in what another one measures. Who fails is out, and so is who a stage leaves in no state to go on (`None`).
+/// Starts all participants and lets them go through stages. Each stage begins when all have finished the one before, so that no
+/// start or end disturbs a measurement. A participant is out if it fails, or if a stage leaves it unable to go on (`None`).
 pub(crate) fn by_stages<W: Copy + Send, T: Send, R: Send, S: Copy + Sync>(
     who: &[W],
     stages: &[S],
@@ -69,7 +69,7 @@ mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering::SeqCst};
 
     #[test]
-    fn who_fails_is_out_and_the_others_go_on() {
+    fn failed_participant_is_out_and_others_go_on() {
         let turns = by_stages(
             &["well", "never", "once"],
             &[1, 2],

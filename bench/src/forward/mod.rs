@@ -1,4 +1,4 @@
-//! Messages of 1 KB from a sender through one router to a receiver, beside other ways to do it.
+//! Measures messages of 1 KB from a sender through one router to a receiver, beside other systems.
 //!
 //! Sender and receiver are in this process, so that one clock times both; the router is a process of its own, whose CPU
 //! time the system counts. All ways stay up for the whole run and take turns, so that what else the machine does meets
@@ -29,10 +29,10 @@ const MESSAGE_BYTES: usize = 1024;
 const BURST: usize = 32;
 /// Messages a second when it is delays that are measured.
 const PACE: Duration = Duration::from_millis(1);
-/// Where the time of sending is in a payload: behind the CDR encapsulation header.
+/// Offset of the time of sending in a payload, behind the CDR encapsulation header.
 const STAMP_AT: usize = 4;
 
-/// What the ways by zenoh are called.
+/// Names of the rows with zenoh.
 const ZENOH: &str = "zenoh router";
 
 /// The zero of the time stamps.
@@ -45,7 +45,7 @@ struct Way {
     arrivals: Arc<Arrivals>,
     /// The process in the middle; none where the ends talk to each other.
     router: Option<Server>,
-    /// What has to live as long: dropped last.
+    /// Values that have to live as long, dropped last.
     _rest: Box<dyn Any>,
 }
 
@@ -55,11 +55,11 @@ trait Sender {
     fn send(&mut self, payloads: &[Bytes]) -> Result<()>;
 }
 
-/// What has arrived at the receiver.
+/// The arrivals at the receiver.
 #[derive(Default)]
 struct Arrivals {
     count: AtomicU64,
-    /// How long each was under way, microseconds, while somebody wants to know.
+    /// Delay of each message in microseconds, while it is recorded.
     delays: Mutex<Option<Vec<f64>>>,
 }
 
@@ -156,7 +156,7 @@ fn stamped() -> Bytes {
     payload.into()
 }
 
-/// What came of one [`Way::rush`].
+/// The result of one [`Way::rush`].
 #[derive(Clone, Copy)]
 struct Rush {
     per_second: f64,
@@ -202,7 +202,8 @@ impl Contestant {
     }
 
     fn figures(self) -> Figures {
-        let (through_us, direct_us) = (Spread::of(self.through_us), Spread::of(self.direct_us));
+        let (through_us, direct_us) =
+            (Spread::from_samples(self.through_us), Spread::from_samples(self.direct_us));
         let router_us = median(self.rushes.iter().map(|r| r.router_us));
         Figures {
             way: self.through.name,

@@ -13,7 +13,7 @@ use super::{Arrivals, Sender, Way};
 use crate::process::{Server, until_stdin_closes};
 
 pub(super) const NAME: &str = "TCP relay";
-/// What is read at once, at most; as large as the batches of zenoh.
+/// Most bytes per read, as large as zenoh's batches.
 const BUFFER_BYTES: usize = 64 << 10;
 const LENGTH_BYTES: usize = 4;
 
@@ -100,7 +100,7 @@ async fn relay() -> Result<()> {
     }
 }
 
-/// How many bytes of these are messages that are there as a whole.
+/// Returns the number of bytes that form complete messages.
 fn whole_messages(bytes: &[u8]) -> usize {
     let mut whole = 0;
     while let Some((length, rest)) = bytes[whole..].split_first_chunk::<LENGTH_BYTES>() {

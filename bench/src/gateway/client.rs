@@ -1,5 +1,5 @@
-//! A program without ROS: what it says and hears, by protocol and encoding. It reads of a message no more than its number, so
-//! that what is measured is the gateway and not this program.
+//! A program without ROS that sends and receives messages, by protocol and encoding. It reads only the number of a message, so
+//! that the gateway is measured and not this program.
 
 use anyhow::{Context, Result, bail, ensure};
 use base64::Engine as _;
@@ -29,16 +29,16 @@ const NUMBER_WITHIN_BYTES: usize = 160;
 const DEPTH: u32 = 1000;
 /// Messages that are handed to gRPC ahead.
 const AHEAD: usize = 64;
-/// What is given to the socket before it is flushed, bytes.
+/// Bytes passed to the socket before it is flushed.
 const FLUSH_BYTES: usize = 64 << 10;
-/// What may be under way to a client of gRPC, bytes: as much as TCP lets be.
+/// Most bytes in flight to a client of gRPC, as many as TCP permits.
 const WINDOW_BYTES: u32 = 16 << 20;
 
 /// A protocol and an encoding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Way {
     RosbridgeJson,
-    /// What is heard is CBOR with CDR in it; what is said is JSON, since clients can say nothing else.
+    /// Received messages are CBOR with CDR inside. Sent ones are JSON, because clients can send nothing else.
     RosbridgeCborRaw,
     GrpcCdr,
     GrpcJson,
@@ -222,7 +222,7 @@ impl Sayer {
         Ok(Self::Grpc { out, call, json_end, data_bytes: data })
     }
 
-    /// Says a message; it may leave with those that follow.
+    /// Queues a message, which may leave with later ones.
     pub(super) async fn say(&mut self, number: u64) -> Result<()> {
         let stamp = now_ns();
         match self {
@@ -257,7 +257,7 @@ impl Sayer {
         Ok(())
     }
 
-    /// Lets leave what was said.
+    /// Flushes queued messages.
     pub(super) async fn flush(&mut self) -> Result<()> {
         if let Self::Rosbridge { socket, unflushed, .. } = self {
             *unflushed = 0;
@@ -271,7 +271,7 @@ impl Sayer {
         self.flush().await?;
         match self {
             Self::Rosbridge { mut socket, .. } => {
-                // It is answered behind all that was said; anything before that is a complaint.
+                // The answer follows all sent messages; anything before it is an error.
                 tell(&mut socket, json!({"op": "call_service", "service": "/rosapi/get_time", "id": "end"}))
                     .await?;
                 while let Some(message) = socket.next().await {

@@ -1,4 +1,4 @@
-//! What came of it: figures by way and size, and tables of them.
+//! The figures by protocol and size, and their tables.
 
 use serde::Serialize;
 
@@ -15,7 +15,7 @@ pub(super) struct Figure {
     pub(super) size: usize,
     /// From the client to the DDS program and back, all rounds together, µs.
     pub(super) round_trip_us: Spread,
-    /// How many were timed.
+    /// Number of timed round trips.
     round_trips: usize,
     /// From the DDS program to the client.
     pub(super) down: Rate,
@@ -32,14 +32,14 @@ pub(super) struct Figure {
 pub(super) struct Rate {
     /// Messages a second that arrived.
     pub(super) per_second: f64,
-    /// Of those that were said, how many did not, of 100.
+    /// Percentage of sent messages that did not arrive.
     lost_percent: f64,
     /// CPU time of the gateway's process by messages that arrived, µs.
     cpu_us: f64,
 }
 
 impl Rate {
-    fn of(flows: &[Flow]) -> Self {
+    fn from_flows(flows: &[Flow]) -> Self {
         let each = |of: fn(&Flow) -> f64| median(flows.iter().map(of));
         let by = |sum: f64, count: f64| if count > 0.0 { sum / count } else { 0.0 };
         let received = |flow: &Flow| f64::from(flow.received);
@@ -82,9 +82,9 @@ impl Figure {
         figure.flows[0].push(down);
         figure.flows[1].push(up);
         figure.round_trips = figure.all_us.len();
-        figure.round_trip_us = Spread::of(figure.all_us.clone());
-        figure.down = Rate::of(&figure.flows[0]);
-        figure.up = Rate::of(&figure.flows[1]);
+        figure.round_trip_us = Spread::from_samples(figure.all_us.clone());
+        figure.down = Rate::from_flows(&figure.flows[0]);
+        figure.up = Rate::from_flows(&figure.flows[1]);
     }
 }
 

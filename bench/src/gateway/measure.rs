@@ -1,4 +1,4 @@
-//! What is timed: a message to DDS and back, messages from DDS, messages to it.
+//! Times round trips to DDS, messages from DDS, and messages to DDS.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
@@ -12,20 +12,20 @@ use tokio::time::{Instant, sleep, timeout};
 use super::client::{Hearer, Sayer, Way};
 use super::scene::{DOWN, PING, PONG, Scene, UP, now_ns, numbered};
 
-/// How long the way may take to be through.
+/// Longest time until the path carries messages.
 const CONNECT_MAX: Duration = Duration::from_secs(30);
-/// How long a message is waited for before it is said again, while the way may not be through.
+/// Time after which a message is repeated while the path may not be up yet.
 const HELLO_EVERY: Duration = Duration::from_millis(200);
-/// How long an answer is waited for.
+/// Longest wait for an answer.
 const ANSWER_MAX: Duration = Duration::from_secs(10);
 /// A run is over when its last message is there, or when nothing has come for so long.
 const QUIET: Duration = Duration::from_secs(2);
-/// How often it is looked.
+/// Period of polling.
 const LOOK: Duration = Duration::from_millis(2);
-/// How much longer than it may take is waited for a program's answer.
+/// Additional wait for a program's answer, beyond its own limit.
 const SPARE: Duration = Duration::from_secs(20);
 
-/// How much is measured.
+/// The extent of a measurement.
 pub(super) struct Plan {
     warm_up: usize,
     round_trips: usize,
@@ -33,7 +33,7 @@ pub(super) struct Plan {
 }
 
 impl Plan {
-    pub(super) fn of(size: usize, quick: bool) -> Self {
+    pub(super) fn for_size(size: usize, quick: bool) -> Self {
         let (warm_up, round_trips) = if size >= 1 << 20 { (5, 200) } else { (100, 3000) };
         if quick {
             return Self { warm_up: warm_up / 5, round_trips: round_trips / 20, seconds: 0.3 };
@@ -47,7 +47,7 @@ impl Plan {
 pub(super) struct Flow {
     pub(super) sent: u32,
     pub(super) received: u32,
-    /// From before the first was said until the last had come.
+    /// Time from before the first message was sent until the last had arrived.
     pub(super) seconds: f64,
     /// CPU time of the gateway's process meanwhile, seconds.
     pub(super) cpu_seconds: f64,
@@ -93,27 +93,27 @@ async fn until(hearer: &mut Hearer, number: u64) -> Result<()> {
 }
 
 #[derive(Deserialize)]
-struct Sent {
+struct SourceReport {
     count: u32,
     begun_ns: u64,
 }
 
-/// What the client has heard of a run.
+/// The messages of a run that the client has received.
 #[derive(Default)]
-struct Heard {
+struct ClientArrivals {
     run: AtomicU32,
     received: AtomicU32,
     last: AtomicU32,
     last_ns: AtomicU64,
 }
 
-/// A DDS program says as much as it can, and the client hears. By gRPC the gateway keeps what the client does not take at once, as
-/// far as it does; what is beyond, and by rosbridge what is more than a queue, is dropped.
+/// Measures messages from a DDS program at full speed to the client. By gRPC the gateway buffers messages up to a bound. It drops
+/// messages beyond that, and by rosbridge those beyond a queue.
 pub(super) async fn down(scene: &Scene, way: Way, size: usize, plan: &Plan) -> Result<Flow> {
     let hearer = Hearer::new(scene, way, DOWN, size, true).await?;
-    let heard = Arc::new(Heard::default());
+    let heard = Arc::new(ClientArrivals::default());
     let hearing = tokio::spawn(hear(hearer, Arc::clone(&heard)));
-    let send = async |seconds: f64, count: u32, size: usize, rate: Option<f64>| -> Result<Sent> {
+    let send = async |seconds: f64, count: u32, size: usize, rate: Option<f64>| -> Result<SourceReport> {
         let run = scene.run();
         heard.received.store(0, Ordering::Relaxed);
         heard.last.store(0, Ordering::Relaxed);
@@ -151,7 +151,7 @@ pub(super) async fn down(scene: &Scene, way: Way, size: usize, plan: &Plan) -> R
 }
 
 /// Hears for as long as it can.
-async fn hear(mut hearer: Hearer, heard: Arc<Heard>) -> Result<()> {
+async fn hear(mut hearer: Hearer, heard: Arc<ClientArrivals>) -> Result<()> {
     loop {
         let number = hearer.next().await?;
         if (number >> 32) as u32 == heard.run.load(Ordering::Relaxed) {
@@ -162,8 +162,8 @@ async fn hear(mut hearer: Hearer, heard: Arc<Heard>) -> Result<()> {
     }
 }
 
-/// Waits for the last message; false if nothing more comes.
-async fn until_quiet(heard: &Heard, last: u32, quiet: Duration) -> bool {
+/// Waits for the last message. Returns `false` if no more come.
+async fn until_quiet(heard: &ClientArrivals, last: u32, quiet: Duration) -> bool {
     let (mut received, mut since) = (0, Instant::now());
     while heard.last.load(Ordering::Relaxed) < last {
         let now = heard.received.load(Ordering::Relaxed);
@@ -178,12 +178,12 @@ async fn until_quiet(heard: &Heard, last: u32, quiet: Duration) -> bool {
 }
 
 #[derive(Deserialize)]
-struct Counted {
+struct SinkReport {
     received: Vec<u32>,
     ended_ns: u64,
 }
 
-/// The client says as much as it can, and a DDS program counts. Nothing is lost: DDS keeps what is not acknowledged, and the
+/// Measures messages from the client at full speed to a DDS program. None is lost: DDS keeps unacknowledged messages, and the
 /// gateway lets the client wait.
 pub(super) async fn up(scene: &Scene, way: Way, size: usize, plan: &Plan) -> Result<Flow> {
     let mut sayer = Sayer::new(scene, way, UP, size, true).await?;
@@ -196,7 +196,7 @@ pub(super) async fn up(scene: &Scene, way: Way, size: usize, plan: &Plan) -> Res
         sink.order(&order)?;
         sink.until("counted", SPARE)
     });
-    let counted: Counted = serde_json::from_value(counted.await?)?;
+    let counted: SinkReport = serde_json::from_value(counted.await?)?;
     let cpu_seconds = scene.cpu_seconds() - cpu;
     let received = counted.received.first().copied().unwrap_or_default();
     let seconds = counted.ended_ns.saturating_sub(begun_ns) as f64 / 1e9;

@@ -1,8 +1,8 @@
 //! `gateway`: programs without ROS beside a DDS program, through one `sgc run` with `[gateway]`: round trips and messages as fast as
 //! they go, by each protocol and encoding.
 //!
-//! [`scene`] starts what is measured, [`client`] is the program without ROS, [`measure`] times it, [`goals`] and
-//! [`figures`] say what came of it.
+//! [`scene`] starts the measured node, [`client`] is the program without ROS, [`measure`] times it, [`goals`] and
+//! [`figures`] hold the results.
 
 mod client;
 mod figures;
@@ -24,12 +24,12 @@ use scene::Scene;
 
 /// Bytes of a message's content, as in `compare`: CDR's own 8 are not counted.
 const SIZES: [usize; 4] = [16, 1000, 8 << 10, 1 << 20];
-/// Where the rosbridge of the paper was measured.
+/// Size of messages at which the paper measured rosbridge.
 const REFERENCE_BYTES: usize = 1000;
-/// How often each is measured.
+/// Number of measurements of each.
 const ROUNDS: usize = 3;
 
-/// What `gateway` is given.
+/// The arguments of `gateway`.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct GatewayArgs {
     /// The program that is measured
@@ -38,7 +38,7 @@ pub(crate) struct GatewayArgs {
     /// The program that talks and listens; without it the `load` beside this one
     #[arg(long, value_name = "FILE")]
     load: Option<PathBuf>,
-    /// Where the results go
+    /// Directory for the results
     #[arg(long, value_name = "DIR", default_value = concat!(env!("CARGO_MANIFEST_DIR"), "/results"))]
     out: PathBuf,
     /// These ways alone: rosbridge-json, rosbridge-cbor-raw, grpc-cdr, grpc-json
@@ -67,7 +67,7 @@ pub(crate) fn run(args: &GatewayArgs) -> Result<()> {
     for round in 0..if args.quick { 1 } else { ROUNDS } {
         for way in Way::ALL.into_iter().filter(wanted) {
             for &size in args.sizes.iter().filter(|&&size| way.has(size)) {
-                let plan = Plan::of(size, args.quick);
+                let plan = Plan::for_size(size, args.quick);
                 progress(&format!("round {round}: {}, {size} B", way.name()));
                 let measured = runtime.block_on(async {
                     Ok::<_, anyhow::Error>((

@@ -15,9 +15,9 @@ use crate::compare::{Dds, Program};
 use crate::fleet::BenchFleet;
 use crate::process::status;
 
-/// A ROS domain that nobody else is likely to have.
+/// A ROS domain that other programs rarely use.
 const DOMAIN: u32 = 91;
-/// What the client says, and what comes back of it.
+/// Topics of the client's messages and of their echoes.
 pub(super) const PING: &str = "/bench/ping";
 pub(super) const PONG: &str = "/bench/pong";
 /// From a DDS program to the client, and the other way.
@@ -26,18 +26,18 @@ pub(super) const UP: &str = "/bench/up";
 /// The type of the programs' messages.
 pub(super) const TYPE: &str = "sgc_bench/msg/Load";
 const DEFINITION: &str = "uint64 seq\nuint64 stamp_ns\nuint8[] data\n";
-/// How long a program may take until it is up.
+/// Longest time until a program is up.
 const UP_MAX: Duration = Duration::from_secs(20);
 
-/// What is measured, and who is at its other side. Fields go in this order.
+/// The measured node and the programs beside it. Fields are dropped in this order.
 pub(super) struct Scene {
     _pong: Program,
     source: Arc<Mutex<Program>>,
     sink: Arc<Mutex<Program>>,
     node: Program,
-    /// Where the rosbridge protocol is spoken.
+    /// Address of the rosbridge protocol.
     pub(super) rosbridge: SocketAddr,
-    /// Where gRPC is.
+    /// Address of gRPC.
     pub(super) grpc: SocketAddr,
     runs: AtomicU32,
     _dir: TempDir,
@@ -62,7 +62,7 @@ impl Scene {
         let mut command = Command::new(sgc);
         command.args(["run", "--print-ready", "--until-stdin-closes", "--log", "warn", "--config"]);
         command.arg(&config);
-        // What a user's shell says of ROS 2 is not to be measured.
+        // Variables of a user's shell must not affect the measurement.
         for variable in ["CYCLONEDDS_URI", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "SGC_LOG"] {
             command.env_remove(variable);
         }
@@ -84,7 +84,7 @@ impl Scene {
             Ok::<_, anyhow::Error>(program)
         };
         let _pong = load("pong", &["--topic", PING, "--back", PONG, "--depth", "10"])?;
-        // All is kept that is not acknowledged: who is slow is waited for.
+        // DDS keeps all unacknowledged messages and waits for slow readers.
         let source = load("source", &["--topic", DOWN, "--depth", "0"])?;
         let sink = load("sink", &["--topic", UP, "--depth", "0"])?;
         let [source, sink] = [source, sink].map(|program| Arc::new(Mutex::new(program)));
@@ -101,7 +101,7 @@ impl Scene {
         self.node.cpu_seconds()
     }
 
-    /// Speaks with the source, on a thread that may wait.
+    /// Talks to the source, on a thread that may block.
     pub(super) async fn with_source<T: Send + 'static>(
         &self,
         talk: impl FnOnce(&mut Program) -> Result<T> + Send + 'static,
@@ -109,7 +109,7 @@ impl Scene {
         with(&self.source, talk).await
     }
 
-    /// The same with the sink.
+    /// Talks to the sink, on a thread that may block.
     pub(super) async fn with_sink<T: Send + 'static>(
         &self,
         talk: impl FnOnce(&mut Program) -> Result<T> + Send + 'static,

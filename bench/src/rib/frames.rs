@@ -1,4 +1,4 @@
-//! What owners and subscribers send, encoded as it comes off a link.
+//! The frames of owners and subscribers, encoded as on a link.
 
 use std::sync::Arc;
 
@@ -15,7 +15,7 @@ pub(super) const BATCH: usize = ADVERT_NAMES_MAX;
 /// Names of one owner: a little less than a router takes from a proxy, so that there is room for those that are added
 /// one at a time.
 pub(super) const NAMES_PER_OWNER: usize = 60 * BATCH;
-/// As long as routers honour.
+/// The longest lease that routers accept.
 const LEASE_MS: u32 = 600_000;
 /// Sizes of what an X25519 grant of one topic holds.
 const REPLY_KEY_BYTES: usize = 32;

@@ -1,4 +1,4 @@
-//! The routing machine under the benchmark: the one place that knows its API.
+//! The routing machine under test. Only this file knows its API.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -16,19 +16,19 @@ pub(super) struct Machine {
     links: u32,
 }
 
-/// A frame that was handled.
-pub(super) struct Timed {
+/// The cost of handling a frame.
+pub(super) struct FeedCost {
     took: Duration,
     sent_to: Vec<LinkId>,
 }
 
-impl Timed {
-    /// Decoding, handling, and handing out what came of it, microseconds.
+impl FeedCost {
+    /// Returns the time of decoding, handling and sending results, in microseconds.
     pub(super) fn micros(&self) -> f64 {
         self.took.as_secs_f64() * 1e6
     }
 
-    /// True if a frame was sent over that link.
+    /// Returns `true` if a frame was sent over that link.
     pub(super) fn went_to(&self, link: LinkId) -> bool {
         self.sent_to.contains(&link)
     }
@@ -37,7 +37,7 @@ impl Timed {
 impl Machine {
     pub(super) fn new(identity: &Arc<Identity>, now: Now) -> Self {
         let anchors = Arc::new(identity.anchors().clone());
-        // What guards against neighbours that ask too much is not what is measured.
+        // Limits against greedy neighbours are lifted, because they are not measured.
         let limits = Limits {
             joins_burst: u32::MAX,
             announcements_burst: u32::MAX,
@@ -74,15 +74,15 @@ impl Machine {
     }
 
     /// Handles a frame as the driver does; an error if the router refuses it.
-    pub(super) fn feed(&mut self, link: LinkId, frame: &[u8]) -> Result<Timed> {
+    pub(super) fn feed(&mut self, link: LinkId, frame: &[u8]) -> Result<FeedCost> {
         let begun = Instant::now();
         let frame = Control::from_slice(frame)?;
         self.router.handle_frame(self.now, link, frame);
         let sent_to = self.drain()?;
-        Ok(Timed { took: begun.elapsed(), sent_to })
+        Ok(FeedCost { took: begun.elapsed(), sent_to })
     }
 
-    /// How long verifying what is signed in this frame takes by itself, microseconds.
+    /// Times the verification of this frame's signature, in microseconds.
     pub(super) fn verify(&self, frame: &[u8]) -> Result<f64> {
         let frame = Control::from_slice(frame)?;
         let begun = Instant::now();
@@ -94,7 +94,7 @@ impl Machine {
         Ok(begun.elapsed().as_secs_f64() * 1e6)
     }
 
-    /// The same for an answer of this owner.
+    /// Times the verification of an answer of this owner.
     pub(super) fn verify_answer(&self, owner: &VerifiedPeer, frame: &[u8]) -> Result<f64> {
         let Control::Answer { signed } = Control::from_slice(frame)? else { bail!("no answer") };
         let begun = Instant::now();

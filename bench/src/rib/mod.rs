@@ -1,4 +1,4 @@
-//! What a name costs at the router: time to publish it, time to subscribe to it, memory.
+//! Measures the cost of a name at the router: time to publish it, time to subscribe to it, memory.
 //!
 //! Each size is measured twice: in the routing machine alone, with frames as they come off a link (in a process of its
 //! own, so that its memory can be told), and over real links into a router's process. The machine's work is told apart
@@ -8,7 +8,7 @@ mod frames;
 mod machine;
 mod socket;
 
-pub(crate) use socket::{Neighbour, Told};
+pub(crate) use socket::{LinkedOwners, Neighbour};
 
 use std::process::Command;
 use std::time::Instant;
@@ -30,12 +30,12 @@ use machine::Machine;
 const BYTES_PER_NAME_EXPECTED: u64 = 1000;
 /// Nodes that subscribe, in turns.
 const JOINERS: usize = 16;
-/// Of so many advertisements one is verified once more by itself, to know what that takes.
+/// One in this many advertisements is verified once more separately, to time that.
 const VERIFIED_EVERY: usize = 16;
 /// Most names with which real links are measured.
 const SOCKET_NAMES_MAX: usize = 1_000_000;
 
-/// What one size came to in the machine.
+/// The figures of one size in the machine.
 #[derive(Serialize, Deserialize)]
 struct InMachine {
     names: usize,
@@ -155,12 +155,12 @@ fn measure(names: usize, samples: usize) -> Result<InMachine> {
     Ok(InMachine {
         names,
         bytes_per_name: bytes as f64 / names as f64,
-        batched_us_per_name: Spread::of(batched),
-        batched_verify_us_per_name: Spread::of(verified),
-        publish_us: Spread::of(publish),
-        publish_verify_us: Spread::of(publish_verify),
-        subscribe_us: Spread::of(subscribe),
-        subscribe_verify_us: Spread::of(subscribe_verify),
+        batched_us_per_name: Spread::from_samples(batched),
+        batched_verify_us_per_name: Spread::from_samples(verified),
+        publish_us: Spread::from_samples(publish),
+        publish_verify_us: Spread::from_samples(publish_verify),
+        subscribe_us: Spread::from_samples(subscribe),
+        subscribe_verify_us: Spread::from_samples(subscribe_verify),
     })
 }
 

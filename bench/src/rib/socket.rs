@@ -1,4 +1,4 @@
-//! The same over real links into a router's process: owners publish, a subscriber joins and is answered.
+//! Measures the cost of names over real links to a router's process: owners publish, a subscriber joins and is answered.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -24,7 +24,7 @@ use crate::report::{Spread, Table, digits};
 /// takes from one link without pause.
 const SUBSCRIPTIONS: usize = 500;
 
-/// What one size came to.
+/// The figures of one size.
 #[derive(Serialize)]
 pub(super) struct OverSockets {
     names: usize,
@@ -147,15 +147,15 @@ async fn tell_all(owners: &mut Owners) -> Result<()> {
     Ok(())
 }
 
-/// Nodes that are linked to a router for as long as this lasts, and the names that they own there.
-pub(crate) struct Told {
+/// Nodes that stay linked to a router while this lives, and the names that they own.
+pub(crate) struct LinkedOwners {
     owners: Owners,
     rng: ChaCha20Rng,
     runtime: tokio::runtime::Runtime,
 }
 
-impl Told {
-    /// Owners of so many names, which are signed and not told yet.
+impl LinkedOwners {
+    /// Connects owners of so many names, whose advertisements are signed and not sent yet.
     pub(crate) fn prepare(url: &str, fleet: &BenchFleet, names: usize) -> Result<Self> {
         let (runtime, mut rng) = (runtime()?, ChaCha20Rng::seed_from_u64(3));
         let ((heard, _), answers) = (mpsc::channel(1), Answers::default());
@@ -165,7 +165,7 @@ impl Told {
         Ok(Self { owners, rng, runtime })
     }
 
-    /// Nodes without names, numbered.
+    /// Connects nodes without names, by their numbers.
     pub(crate) fn connect(url: &str, fleet: &BenchFleet, nodes: std::ops::Range<usize>) -> Result<Self> {
         let (runtime, rng) = (runtime()?, ChaCha20Rng::seed_from_u64(4));
         let (heard, _) = mpsc::channel(1);
@@ -179,25 +179,25 @@ impl Told {
         Ok(Self { owners, rng, runtime })
     }
 
-    /// How many links they have, one each.
+    /// Returns the number of their links, one each.
     pub(crate) fn links(&self) -> usize {
         self.owners.len()
     }
 
-    /// Tells the router of the names.
-    pub(crate) fn tell(&mut self) -> Result<()> {
+    /// Advertises all names to the router.
+    pub(crate) fn advertise_all(&mut self) -> Result<()> {
         self.runtime.block_on(tell_all(&mut self.owners))
     }
 
-    /// Tells it of one more name.
-    pub(crate) fn tell_one(&mut self) -> Result<()> {
+    /// Advertises one more name.
+    pub(crate) fn advertise_one(&mut self) -> Result<()> {
         let (owner, _) = self.owners.first_mut().context("nobody owns a name")?;
         let advert = owner.advert(1, now().unix, &mut self.rng);
         self.runtime.block_on(owner.link.send(advert.bytes))
     }
 }
 
-/// Another router, which hears of every name and says nothing.
+/// Another router, which hears of every name and advertises none.
 pub(crate) struct Neighbour {
     told: mpsc::Receiver<usize>,
     _link: AnyLink,
@@ -306,7 +306,7 @@ async fn measure(sgc: &Path, names: usize) -> Result<OverSockets> {
         publish_us_per_name,
         publish_cpu_us_per_name,
         bytes_per_name,
-        subscribe_us: Spread::of(times),
+        subscribe_us: Spread::from_samples(times),
         subscribe_cpu_us,
     })
 }

@@ -15,7 +15,7 @@ use super::{Caller, NEVER, Wire};
 use crate::fleet::BenchFleet;
 use crate::node::runtime_in;
 
-/// As nodes cut messages.
+/// Size of the fragments into which nodes cut messages.
 const FRAGMENT_BYTES: usize = 16 * 1024;
 /// An epoch that asks for an answer when its message is complete.
 const ANSWER: u32 = 1;

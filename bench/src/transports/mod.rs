@@ -38,20 +38,20 @@ const PORT: u16 = 7447;
 pub(crate) struct ServeArgs {
     /// A scheme, or one of [`RAW`]
     kind: String,
-    /// Where to listen
+    /// Address to listen on
     listen: String,
-    /// Where the credentials are
+    /// Directory of the credentials
     dir: PathBuf,
 }
 
-/// Whose memory is measured.
+/// The arguments of the process whose memory is measured.
 #[derive(Args)]
 pub(crate) struct MemoryArgs {
     /// A scheme, or one of [`RAW`]
     kind: String,
-    /// How many links
+    /// Number of links
     links: usize,
-    /// Where the credentials are
+    /// Directory of the credentials
     dir: PathBuf,
 }
 
@@ -64,7 +64,7 @@ trait Wire {
     fn send(&mut self, bytes: usize, messages: u64) -> Result<()>;
 }
 
-/// Where ends meet, and where the credentials of both are.
+/// The address at which the ends meet, and the directory of their credentials.
 struct Place<'a> {
     dir: &'a Path,
     /// The namespaces of the near and the far end; none is this one.
@@ -99,7 +99,7 @@ trait Caller {
     fn call(&self) -> Result<Box<dyn Wire>>;
 }
 
-/// What was measured of one way at one size.
+/// The figures of one protocol at one size.
 #[derive(Serialize)]
 struct SizeFigures {
     transport: String,
@@ -123,7 +123,7 @@ struct MemoryFigures {
 struct LossFigures {
     transport: String,
     loss_percent: f64,
-    /// Of each transfer, milliseconds; none where it took longer than half a minute.
+    /// Duration of each transfer in milliseconds; `None` if it took longer than half a minute.
     transfers_ms: Vec<Option<f64>>,
     median_ms: Option<f64>,
 }
@@ -162,7 +162,7 @@ struct Way {
     kind: String,
     server: Server,
     wire: Box<dyn Wire>,
-    /// What keeps the link's sockets.
+    /// Keeps the link's sockets open.
     _caller: Box<dyn Caller>,
 }
 
@@ -202,7 +202,7 @@ fn measure_sizes(place: &Place<'_>, kinds: &[String], quick: bool) -> Result<Vec
                 mbyte_per_second: median(rushes.iter().map(|r| r.bytes_per_second / 1e6)),
                 near_cpu_s_per_gb: median(rushes.iter().map(|r| r.near_cpu_s_per_gb)),
                 far_cpu_s_per_gb: median(rushes.iter().map(|r| r.far_cpu_s_per_gb)),
-                round_trip_us: Spread::of(trips),
+                round_trip_us: Spread::from_samples(trips),
             });
         }
     }
@@ -257,7 +257,7 @@ fn memory_of(kind: &str, dir: &Path, links: usize) -> Result<MemoryFigures> {
     Ok(serde_json::from_slice(&output.stdout)?)
 }
 
-/// What a link that has carried something takes at each end.
+/// Measures the memory at each end of a link that has carried data.
 pub(crate) fn measure_memory_here(args: &MemoryArgs) -> Result<()> {
     let MemoryArgs { kind, links, dir } = args;
     let place = Place { dir, homes: None };

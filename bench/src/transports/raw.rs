@@ -19,7 +19,7 @@ pub(super) const TLS: &str = "raw rustls";
 const HOST: &str = "far.example";
 /// Length, and whether an answer is wanted.
 const HEAD_BYTES: usize = 5;
-/// What is read and written at once at least, if there is so much: small messages go together.
+/// Bytes per read and write, if so many are there, so that small messages go together.
 const BUFFER_BYTES: usize = 64 << 10;
 
 pub(super) fn write_credentials(dir: &Path) -> Result<()> {

@@ -1,4 +1,4 @@
-//! Resident memory of a router's process by its links, each to a node of its own, over which nothing goes.
+//! Measures the resident memory of a router's process by the number of its idle links, each to a node of its own.
 
 use std::time::{Duration, Instant};
 
@@ -9,7 +9,7 @@ use crate::RunArgs;
 use crate::fleet::BenchFleet;
 use crate::process::{PATIENCE, SgcRouter};
 use crate::report::{Report, Table, digits};
-use crate::rib::Told;
+use crate::rib::LinkedOwners;
 use crate::uplink;
 
 const LINKS: usize = 256;
@@ -51,7 +51,7 @@ fn measure(scheme: &str, links: usize, args: &RunArgs) -> Result<Figures> {
     let router = SgcRouter::start_on(scheme, &args.sgc, dir.path())?;
     std::thread::sleep(REST);
     let before_bytes = router.process.resident_bytes();
-    let _nodes = Told::connect(&router.url, &fleet, 0..links)?;
+    let _nodes = LinkedOwners::connect(&router.url, &fleet, 0..links)?;
     let begun = Instant::now();
     while router.links()? < links {
         ensure!(begun.elapsed() < PATIENCE, "{} of {links} links are up", router.links()?);

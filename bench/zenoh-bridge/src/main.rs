@@ -1,7 +1,7 @@
 //! Hosts the ROS 2 plugin of Zenoh in a Zenoh runtime, as `zenoh-bridge-ros2dds` does, so that the benchmarks can run it
 //! from crates.io without a release of that program.
 //!
-//! It adds nothing: no watchdog, no REST, no ROS arguments. What else there is to set comes with `--config`, in the form
+//! It adds nothing: no watchdog, no REST, no ROS arguments. Other settings come with `--config`, in the form
 //! that the bridge's own users write: <https://github.com/eclipse-zenoh/zenoh-plugin-ros2dds>.
 
 use std::error::Error;
@@ -17,14 +17,14 @@ use zenoh_plugin_ros2dds::ROS2Plugin;
 /// The name under which the plugin is started and configured.
 const PLUGIN: &str = "ros2dds";
 
-/// What the program is asked for.
+/// The arguments.
 #[derive(Parser)]
 #[command(about = "The Zenoh bridge for ROS 2, for the benchmarks of SGC")]
 struct Args {
-    /// Where to listen: `tcp/ADDRESS:PORT`, `tls/ADDRESS:PORT`.
+    /// Endpoint to listen on: `tcp/ADDRESS:PORT`, `tls/ADDRESS:PORT`.
     #[arg(long, value_name = "ENDPOINT")]
     listen: Vec<String>,
-    /// Which other bridge to connect to, again and again until it is there.
+    /// Endpoint of the other bridge. Connecting is repeated until it is there.
     #[arg(long, value_name = "ENDPOINT")]
     connect: Vec<String>,
     /// The DDS domain; without it what the configuration or `ROS_DOMAIN_ID` says, or 0.

@@ -1,4 +1,4 @@
-//! Writes valid inputs of each kind to `fuzz/corpus/`, from which a fuzzer gets farther than from nothing:
+//! Writes valid inputs of each kind to `fuzz/corpus/`, from which a fuzzer reaches more code than from an empty corpus:
 //! `cargo run -p sgc-fuzz-targets --example seeds`.
 
 use std::path::Path;
@@ -45,7 +45,7 @@ fn main() -> io::Result<()> {
     write("gateway", gateway())
 }
 
-/// Conversations: by the rosbridge protocol, and by Foxglove's.
+/// Returns conversations by the rosbridge protocol and by Foxglove's.
 fn gateway() -> Vec<Vec<u8>> {
     let conversations = [
         (
@@ -120,7 +120,7 @@ fn bodies() -> Vec<Vec<u8>> {
     };
     let offer = SourceOffer { source: SourceId([3; 16]), key: Bytes::from_static(&[5; 32]) };
     let reply_key = Bytes::from_static(&[5; 32]);
-    // A node is asked for its consumers with an empty question.
+    // An empty question asks a node for its consumers.
     let ask = Request::Ask { what: Bytes::new() };
     let joins =
         [Request::Subscribe { describe: true }, Request::Publish { offer }, ask].map(|request| JoinBody {
@@ -184,7 +184,7 @@ fn bodies() -> Vec<Vec<u8>> {
     all.into_iter().map(|(which, body)| [&[which], &body[..]].concat()).collect()
 }
 
-/// A subscriber or a publisher of a node at a desk.
+/// Returns a subscriber or a publisher of a node at a desk.
 fn consumer(node: &str, role: Role, type_hash: Option<&str>) -> Consumer {
     Consumer {
         interface: NAME,
@@ -196,14 +196,14 @@ fn consumer(node: &str, role: Role, type_hash: Option<&str>) -> Consumer {
     }
 }
 
-/// Of another key than the target of sinks grants: what is sealed under that one is genuine there in suites without
-/// signatures, though its source did not make it.
+/// Returns a grant with another key than that of the target `sink`. In suites without signatures, packets sealed under the
+/// same key would count as genuine there, though its source did not make them.
 fn grant(suite: Suite) -> TopicGrant {
     let key = SecretBytes::new([4; 32]);
     TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None }
 }
 
-/// To all, and addressed, in several fragments and in one, of each suite.
+/// Returns packets of each suite: to all and addressed, in several fragments and in one.
 fn packets(suites: &[Suite]) -> Vec<Vec<u8>> {
     let mut out = Vec::new();
     for suite in suites {
@@ -257,7 +257,7 @@ fn certs() -> Vec<Vec<u8>> {
     seeds.into_iter().map(|(which, seed)| [&[which], &seed[..]].concat()).collect()
 }
 
-/// Suite, size, cut, and what is altered: nothing, a byte of the header, one of the payload, a cut.
+/// Returns inputs of suite, size, cut and alteration: none, a byte of the header, a byte of the payload, or truncation.
 fn sink() -> Vec<Vec<u8>> {
     let edits: [&[u8]; 4] = [&[], &[0, 1, 1], &[0, 90, 1], &[0, 100, 0]];
     let mut out: Vec<_> = (0..Suite::ALL.len() as u8)
@@ -305,7 +305,7 @@ fn grants() -> Vec<Vec<u8>> {
     out
 }
 
-/// Tokens, alterations of one, origins of pages, and patterns with names.
+/// Returns tokens, alterations of one, origins of pages, and patterns with names.
 fn access() -> Vec<Vec<u8>> {
     let seeds: [(u8, &[u8]); 7] = [
         (0, b"AAAA"),
@@ -319,7 +319,7 @@ fn access() -> Vec<Vec<u8>> {
     seeds.into_iter().map(|(which, seed)| [&[which], seed].concat()).collect()
 }
 
-/// Definitions of a message, a service and an action, as `.msg` and as IDL, with `bytes` behind.
+/// Returns definitions of a message, a service and an action, as `.msg` and as IDL, followed by `bytes`.
 fn definitions(bytes: &[u8]) -> Vec<Vec<u8>> {
     let texts = [
         "int32[] a\nstring b\n",
@@ -333,14 +333,14 @@ fn definitions(bytes: &[u8]) -> Vec<Vec<u8>> {
     texts.into_iter().enumerate().map(seed).collect()
 }
 
-/// Records of DTLS as they begin: a handshake, application data, an alert, a record with a connection id (RFC 9146).
+/// Returns beginnings of DTLS records: a handshake, application data, an alert, a record with a connection id (RFC 9146).
 fn dtls() -> Vec<Vec<u8>> {
     [[22, 254, 253], [23, 254, 253], [21, 254, 255], [25, 254, 253]]
         .map(|head| [&head[..], &[0, 0, 0, 0, 0, 0, 0, 1, 0, 4, 1, 2, 3, 4]].concat())
         .into()
 }
 
-/// Operations of two ends, and bytes to one.
+/// Returns operations of two ends, and bytes to one.
 fn mux() -> Vec<Vec<u8>> {
     vec![(0..200).map(|n| n % 7 * 2).collect(), [&[1][..], &[0; 40]].concat(), (1..=255).collect()]
 }

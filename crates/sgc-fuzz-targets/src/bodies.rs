@@ -1,4 +1,4 @@
-//! Signed bodies, grants and metadata: no input panics, and what decodes encodes to the same bytes.
+//! Signed bodies, grants and metadata: no input panics, and decoded values encode to the same bytes.
 use sgc_endpoint::unpack_type;
 use sgc_wire::{
     AdvertBody, AnswerBody, Decode, DescribedType, Encode, GrantContent, JoinBody, MessageHead, Metadata,

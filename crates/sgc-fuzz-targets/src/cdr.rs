@@ -1,9 +1,9 @@
-//! Definitions and messages: no text and no payload panics, with a definition of the input's own or one that ships.
+//! Definitions and messages: no text and no payload panics, with a definition from the input or a built-in one.
 
 use bytes::Bytes;
 use sgc_cdr::{Library, TypeName, YamlStyle};
 
-/// Runs one input of the target: a byte that chooses, a text with its length (16 bits) in front, and bytes.
+/// Runs one input of the target: a selecting byte, a text with its length (16 bits) in front, and bytes.
 pub fn run(input: &[u8]) {
     let Some(input) = crate::choice_text_bytes(input) else { return };
     let (which, text, payload) = input;

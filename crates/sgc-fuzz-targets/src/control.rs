@@ -1,4 +1,4 @@
-//! Control frames: no input panics, and what decodes encodes to the same bytes.
+//! Control frames: no input panics, and decoded frames encode to the same bytes.
 use sgc_wire::{Control, Decode, Encode};
 
 /// Runs one input of the target.

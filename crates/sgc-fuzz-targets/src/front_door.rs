@@ -1,6 +1,6 @@
-//! Whole conversations with the front door of stream links (TLS, TCP, WebSocket). The first byte of an input chooses scheme and
-//! role: what a stranger says, what a member says inside of its TLS, or what becomes of the bytes between two honest ends. Shows
-//! panics of `rustls` and of the upgrade, strangers who get a link, and frames that were altered and are believed.
+//! Whole conversations with the front door of stream links (TLS, TCP, WebSocket). The first byte of an input selects scheme and
+//! role: bytes of a stranger, bytes of a member inside its TLS, or alterations between two honest ends. Finds panics of
+//! `rustls` and of the upgrade, strangers that get a link, and altered frames that are accepted.
 
 use std::sync::LazyLock;
 

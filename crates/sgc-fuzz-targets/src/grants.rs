@@ -1,5 +1,5 @@
-//! Grants, signed bodies, share tokens and requests for certificates, arbitrary and altered: no input panics, and of what
-//! is altered nothing opens or verifies.
+//! Grants, signed bodies, share tokens and requests for certificates, arbitrary and altered: no input panics, and no altered
+//! value opens or verifies.
 use std::sync::OnceLock;
 
 use bytes::Bytes;
@@ -22,7 +22,7 @@ const SERIAL: u64 = 3;
 struct Cast {
     fleet: Fleet,
     arm: Identity,
-    /// A key, and what a grant sealed to it is.
+    /// A key, and a grant sealed to it.
     grants: Vec<(ReplyKey, Bytes, Bytes)>,
     /// An advertisement, a join and an answer of the arm.
     signed: [SignedBody; 3],
@@ -81,7 +81,7 @@ fn cast() -> &'static Cast {
     })
 }
 
-/// Changes bytes, and cuts.
+/// Changes bytes and truncates.
 fn alter(good: &[u8], edits: &[u8]) -> Vec<u8> {
     let mut all = good.to_vec();
     for edit in edits.chunks_exact(3) {
@@ -124,7 +124,7 @@ pub fn run(input: &[u8]) {
             assert_eq!(opened.is_ok(), altered == all);
         }
         2 => {
-            // Any reply key, and one that was altered.
+            // An arbitrary reply key, and an altered one.
             drop(seal_grant(input, &NAME, &SINK, SERIAL, &content()));
             let altered = alter(cast.grants[kind % 2].0.public(), input);
             drop(seal_grant(&altered, &NAME, &SINK, SERIAL, &content()));
@@ -163,7 +163,7 @@ pub fn run(input: &[u8]) {
             let read = ShareToken::parse(&text);
             assert_eq!(read.is_ok(), text.trim() == *good);
             drop(read.map(|token| (token.name(), token.ca_fingerprint())));
-            // A check sum cannot tell fields that were made from good ones, only damaged ones.
+            // A checksum detects damage, not fields that were chosen on purpose.
             let mut made = cast.token.clone();
             if let Ok(metadata) = Metadata::from_slice(input) {
                 made.metadata = metadata;

@@ -2,9 +2,9 @@
 //!
 //! `fuzz/` links them to libFuzzer, which needs a nightly compiler. `cargo test` runs the same bodies over the committed
 //! inputs in `fuzz/corpus/` and over alterations of these from a fixed seed (`tests/corpus.rs`). A body panics if its
-//! input shows a defect. Long searches, and the choice of what to keep of them, are not here: `make fuzz`.
+//! input shows a defect. `make fuzz` runs long searches and adds their results to the corpus.
 #![forbid(unsafe_code)]
-// A panic is how a target reports a defect.
+// A target reports a defect by a panic.
 #![allow(clippy::unwrap_used)]
 
 use std::sync::Arc;
@@ -33,7 +33,7 @@ pub mod values;
 /// Body of a fuzz target.
 pub type Target = fn(&[u8]);
 
-/// Fuzz targets by name, in the order of their names. The name is also that of the target's folder in `fuzz/corpus/`.
+/// Fuzz targets, sorted by name. The name is also that of the target's folder in `fuzz/corpus/`.
 pub const TARGETS: &[(&str, Target)] = &[
     ("access", access::run),
     ("bodies", bodies::run),
@@ -63,8 +63,8 @@ fn members(names: [&str; 2]) -> [Arc<Identity>; 2] {
     })
 }
 
-/// Splits an input into a byte that chooses, a text with its length in front (16 bits, big-endian), and the bytes behind.
-/// A text ends early where it is not UTF-8. Returns `None` if the input is shorter than three bytes.
+/// Splits an input into a selecting byte, a text with its length in front (16 bits, big-endian), and the remaining bytes.
+/// The text ends early where it is not UTF-8. Returns `None` if the input is shorter than three bytes.
 fn choice_text_bytes(input: &[u8]) -> Option<(u8, &str, &[u8])> {
     let [choice, high, low, rest @ ..] = input else { return None };
     let text_bytes = usize::from(u16::from_be_bytes([*high, *low])).min(rest.len());

@@ -1,9 +1,9 @@
-//! Data packets, with names and under labels: no input panics, fragments stay within their message, and what decodes
-//! encodes to the same bytes, and as another form to the same header.
+//! Data packets, with names and under labels: no input panics, fragments stay within their message, and decoded packets encode
+//! to the same bytes, and in the other form to the same header.
 use bytes::Bytes;
 use sgc_wire::{Label, MESSAGE_BYTES_MAX, Name, Packet};
 
-/// Every other label stands for a name, and the name tells which.
+/// Resolves every other label to a name that contains the label.
 fn name_of(label: Label) -> Option<Name> {
     let mut name = [0xaa; 32];
     name[..4].copy_from_slice(&label.index().to_be_bytes());

@@ -1,5 +1,5 @@
-//! Arbitrary packets into a sink that holds a grant, in every suite: none panics, none is delivered that the source did
-//! not make, and what the source makes still is afterwards.
+//! Arbitrary packets into a sink that holds a grant, in every suite: none panics, none is delivered that the source did not
+//! make, and packets of the source are still delivered afterwards.
 use std::sync::OnceLock;
 
 use bytes::Bytes;
@@ -61,7 +61,7 @@ pub fn run(input: &[u8]) {
     }
     source.replay(SINK, 0, u64::MAX, |p| good.push(p));
 
-    // As it is, and as the alteration of what the source made.
+    // The input as it is, and as an alteration of a packet of the source.
     let raw = Packet::from_datagram(Bytes::copy_from_slice(edits)).ok().filter(|p| p.header.name == NAME);
     for mut packet in raw.into_iter().chain(good.iter().filter_map(|p| alter(p, edits))) {
         let same = |g: &&Packet| {

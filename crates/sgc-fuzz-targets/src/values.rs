@@ -1,9 +1,9 @@
-//! JSON, CBOR, IDL, descriptions and payloads: none panics, and what is read can be written and is the same again.
+//! JSON, CBOR, IDL, descriptions and payloads: none panics, and parsed values are the same after writing and reading.
 
 use bytes::Bytes;
 use sgc_cdr::{Layout, Library, TypeName, Value};
 
-/// Runs one input of the target: a byte that chooses, a text with its length (16 bits) in front, and bytes.
+/// Runs one input of the target: a selecting byte, a text with its length (16 bits) in front, and bytes.
 pub fn run(input: &[u8]) {
     let Some(input) = crate::choice_text_bytes(input) else { return };
     let (which, text, bytes) = input;
@@ -11,7 +11,7 @@ pub fn run(input: &[u8]) {
     let own: TypeName = ["p/msg/M", "p/srv/M_Request", "p/action/M_FeedbackMessage"][usize::from(which % 3)]
         .parse()
         .expect("a type");
-    // As text of the definition: a `.msg` file, or IDL.
+    // The text as a definition: a `.msg` file, or IDL.
     if let Ok(layout) = Library::empty().layout(&own, &mut |_| Some(text.to_owned())) {
         check(&layout, &bytes);
         if let Ok(description) = layout.describe() {
@@ -38,7 +38,7 @@ fn check(layout: &Layout, bytes: &Bytes) {
     ];
     for value in read.into_iter().flatten() {
         let payload = Bytes::from(layout.encode(&value).expect("what was read fits"));
-        // Behind CDR a `wstring` has no NUL at its end.
+        // A `wstring` in CDR has no NUL at its end.
         let value = layout.decode(&payload).expect("what was written");
         let payload = layout.encode(&value).expect("what was decoded fits");
         let same = |read: Value| assert_eq!(layout.encode(&read).expect("it fits").len(), payload.len());

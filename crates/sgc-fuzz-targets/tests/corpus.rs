@@ -1,4 +1,4 @@
-//! Every fuzz target over its committed inputs, and over alterations of them from a fixed seed.
+//! Runs every fuzz target over its committed inputs, and over alterations of them from a fixed seed.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -9,7 +9,7 @@ use rand_core::{RngCore, SeedableRng};
 use sgc_fuzz_targets::TARGETS;
 use sgc_wire::{Decode, DecodeError, GrantContent};
 
-/// Altered inputs for each target; `SGC_FUZZ_RUNS` sets another number.
+/// Number of altered inputs for each target, unless `SGC_FUZZ_RUNS` sets another.
 const RUNS: usize = 300;
 /// Longest altered input in bytes.
 const INPUT_BYTES_MAX: usize = 8192;

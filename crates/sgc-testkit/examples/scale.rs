@@ -1,9 +1,9 @@
-//! How the control protocol grows with routers and names: `make scale`.
+//! Measures how the control protocol scales with routers and names: `make scale`.
 //!
-//! Simulated networks of bare routers ([`sgc_testkit::mesh`]), growing; a table for each thing that can happen. Times in
-//! the tables are of the virtual clock, those of the processor are this machine's. `--full` goes to 1000 routers, 100 000
-//! flooded names and a million that are asked for; `--sizes 10,30` and `--only flood` or
-//! `query` choose; `--csv DIR` writes the tables there too.
+//! It simulates growing networks of bare routers ([`sgc_testkit::mesh`]) and prints a table for each kind of event. Times in
+//! the tables are of the virtual clock; processor times are of this machine. `--full` goes to 1000 routers, 100 000
+//! flooded names and a million queried ones. `--sizes 10,30` and `--only flood` or `query` select parts; `--csv DIR`
+//! also writes the tables there.
 #![allow(clippy::print_stdout, reason = "the tables are what it is for")]
 
 use std::path::PathBuf;
@@ -15,27 +15,27 @@ use sgc_testkit::{CountingAllocator, Member, identity, live_bytes};
 use sgc_trust::verify_link_state;
 use sgc_wire::{Adjacency, LinkStateBody, Name, NodeId, Now};
 
-/// Batches of an owner, flooded.
+/// Batches of an owner in the flood tables.
 const FLOOD_BATCHES: usize = 4;
-/// Batches of an owner, to be asked for.
+/// Batches of an owner in the query tables.
 const QUERY_BATCHES: usize = 16;
-/// Names to be asked for, per router.
+/// Queried names per router.
 const QUERY_NAMES_PER_ROUTER: usize = 1000;
 /// Questions for names of different owners.
 const QUESTIONS: usize = 10;
-/// Searches, link states that are timed.
+/// Number of timed searches and link states.
 const TIMED: u32 = 50;
 
 #[global_allocator]
 static COUNTING: CountingAllocator = CountingAllocator;
 
-/// Time of the processor that this thread has had.
+/// Returns the processor time of this thread.
 fn cpu() -> Duration {
     let time = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
     Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
 }
 
-/// A table, printed as it grows: a row each time.
+/// A table, printed row by row.
 struct Table {
     file: &'static str,
     head: &'static [&'static str],
@@ -170,7 +170,7 @@ fn kb(bytes: u64, by: usize) -> String {
     per(bytes as f64 / 1e3, by)
 }
 
-/// Bytes that the router that was written down would hold by itself.
+/// Returns the bytes that the recorded router holds by itself.
 fn held(mesh: &Mesh) -> i64 {
     let before = live_bytes();
     let router = mesh.recording().replay();
@@ -179,7 +179,7 @@ fn held(mesh: &Mesh) -> i64 {
     held
 }
 
-/// A network that has found itself, and what that took.
+/// Lets a network settle from the start. Returns the cost.
 fn cold_start(mesh: &mut Mesh) -> Tally {
     let probe = mesh.routers().len() / 2;
     mesh.record(probe);
@@ -204,7 +204,7 @@ fn event(table: &mut Table, mesh: &Mesh, what: &str, tally: &Tally) {
     ]);
 }
 
-/// What a search for ways takes a router: it is told that a link seems dead, and that it does not.
+/// Times a router's search for paths: reports a link as dead and as alive again.
 fn search_time(mesh: &mut Mesh) -> Duration {
     let at = mesh.routers()[0];
     let mut router = mesh.take_router(at);
@@ -222,13 +222,13 @@ fn search_time(mesh: &mut Mesh) -> Duration {
     (cpu() - began) / (router.route_stats().searches - searches).max(1) as u32
 }
 
-/// Cold start, changes, questions, requests.
+/// Measures cold start, changes, queries and joins.
 fn asking(tables: &mut Tables, routers: usize) {
     let mut mesh = Mesh::new(routers as u64, MappingKind::Query, cpu);
     mesh.add_routers(routers);
     let names = routers * QUERY_NAMES_PER_ROUTER;
     let batches = names / BATCH_NAMES;
-    // Owners are at routers 1, 5, 9…; those who ask are at others.
+    // Owners are at routers 1, 5, 9…; the asking proxies are at others.
     let owners: Vec<_> = (0..batches.div_ceil(QUERY_BATCHES))
         .map(|n| mesh.add_proxy(&format!("owner-{n}"), (1 + 4 * n) % routers))
         .collect();
@@ -260,7 +260,7 @@ fn asking(tables: &mut Tables, routers: usize) {
     mesh.check(8);
     event(&mut tables.events, &mesh, "it comes back", &tally);
 
-    // Questions, while all routers are there.
+    // Queries while all routers run.
     let mut batch = 0;
     for owner in &owners {
         for n in 0..QUERY_BATCHES.min(batches - batch) {
@@ -279,15 +279,15 @@ fn asking(tables: &mut Tables, routers: usize) {
             holders += usize::from(more > 0);
         }
         let kinds = ["query", "advert", "link state"];
-        let known: u64 = kinds.iter().map(|k| tally.of(k)).sum();
+        let known: u64 = kinds.iter().map(|k| tally.frames_of_kind(k)).sum();
         tables.query.row(vec![
             routers.to_string(),
             names.to_string(),
             what.to_owned(),
             after.map_or("–".to_owned(), ms),
-            tally.of("query").to_string(),
-            tally.of("advert").to_string(),
-            tally.of("link state").to_string(),
+            tally.frames_of_kind("query").to_string(),
+            tally.frames_of_kind("advert").to_string(),
+            tally.frames_of_kind("link state").to_string(),
             (tally.frames() - known).to_string(),
             kb(tally.bytes(), 1),
             elsewhere.to_string(),
@@ -365,7 +365,7 @@ fn asking(tables: &mut Tables, routers: usize) {
     tables.cold.row(cold);
 }
 
-/// Names that every router knows.
+/// Measures names that every router knows.
 fn flooding(table: &mut Table, routers: usize, names: &[usize]) {
     let mut mesh = Mesh::new(routers as u64, MappingKind::Flood, cpu);
     mesh.add_routers(routers);
@@ -403,7 +403,7 @@ fn flooding(table: &mut Table, routers: usize, names: &[usize]) {
             names.to_string(),
             ms(frames.last_frame),
             per(frames.frames() as f64, batches),
-            per(frames.of("advert") as f64, batches * mesh.edges()),
+            per(frames.frames_of_kind("advert") as f64, batches * mesh.edges()),
             kb(frames.bytes(), batches * routers),
             per(frames.cpu.as_secs_f64() * 1e6, routers * batches * BATCH_NAMES),
             per(held as f64 / 1e3, 1),
@@ -413,7 +413,7 @@ fn flooding(table: &mut Table, routers: usize, names: &[usize]) {
     }
 }
 
-/// One router with many proxies, each of which waits for ten names.
+/// Measures one router with many proxies, each of which waits for ten names.
 fn hub(table: &mut Table, proxies: usize) {
     let mut mesh = Mesh::new(proxies as u64, MappingKind::Query, cpu);
     mesh.add_routers(2);
@@ -441,7 +441,7 @@ fn hub(table: &mut Table, proxies: usize) {
     ]);
 }
 
-/// What it takes to believe a link state.
+/// Times the verification of a link state.
 fn verify_time() -> Duration {
     let node = identity(&Member { router: true, ..Member::new("router-0") });
     let now = Mesh::new(0, MappingKind::Flood, cpu).now();
@@ -477,7 +477,7 @@ fn main() {
             _ => panic!("--full, --sizes 10,30, --only flood, --only query or --csv DIR, not {arg}"),
         }
     }
-    // What is held of names in all: some 150 bytes each.
+    // Names take some 150 bytes each.
     let names_max = if full { 100_000_000 } else { 10_000_000 };
     let mut tables = Tables::new();
     for routers in sizes {
@@ -508,7 +508,7 @@ fn main() {
 mod tests {
     use super::*;
 
-    /// What a table has in the row that begins so, by the column's name.
+    /// Returns a cell of a table by its row and the name of its column.
     fn cell(table: &Table, row: usize, column: &str) -> f64 {
         let at = table.head.iter().position(|h| *h == column).expect("a column");
         table.rows[row][at].parse().expect("a number")
@@ -521,7 +521,7 @@ mod tests {
         let edges = cell(&tables.cold, 0, "links");
         assert!(cell(&tables.cold, 0, "ways final after ms") < 1000.0);
         for row in 0..tables.events.rows.len() - 1 {
-            // Two or three nodes say something new, in at most two steps, and that goes at most twice over each link.
+            // Two or three nodes change their state in at most two steps, and each change crosses each link at most twice.
             assert!(cell(&tables.events, row, "frames") <= 8.0 * 2.0 * edges);
         }
         assert!(cell(&tables.query, 2, "answered after ms") < 100.0);

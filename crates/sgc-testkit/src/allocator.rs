@@ -1,7 +1,6 @@
-//! An allocator that counts what is taken of it and hands every call on to the system's: for tests of how often something
-//! allocates, and how much. It limits nothing.
+//! An allocator that counts allocations and passes every call on to the system's, for tests of allocations. It has no limits.
 //!
-//! A test binary installs it with `#[global_allocator]`; without that everything counts as nothing.
+//! A test binary installs it with `#[global_allocator]`. Without that, all counts are 0.
 #![allow(unsafe_code, reason = "an allocator is unsafe by its nature; this one counts and hands on")]
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -13,12 +12,12 @@ use std::task::Poll;
 /// The allocator.
 pub struct CountingAllocator;
 
-/// What was allocated.
+/// A count of allocations.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Allocations {
-    /// Pieces; one that grew is another.
+    /// Number of allocations. Growing one counts as another.
     pub count: usize,
-    /// Bytes of all together, though they were given back since.
+    /// Bytes of all allocations, including freed ones.
     pub bytes: usize,
 }
 
@@ -38,24 +37,24 @@ thread_local! {
 
 static LIVE: AtomicI64 = AtomicI64::new(0);
 
-/// What the calling thread has allocated so far.
+/// Returns the allocations of the calling thread so far.
 pub fn allocated_here() -> Allocations {
     HERE.get()
 }
 
-/// Bytes that the process holds.
+/// Returns the bytes that the process has allocated and not freed.
 pub fn live_bytes() -> i64 {
     LIVE.load(Relaxed)
 }
 
-/// What the calling thread allocates while it does this.
+/// Counts the allocations of the calling thread while it does `work`.
 pub fn allocations<T>(work: impl FnOnce() -> T) -> (Allocations, T) {
     let before = allocated_here();
     let result = work();
     (allocated_here().since(before), result)
 }
 
-/// What this future allocates itself, not what other tasks of the thread do while it waits.
+/// Counts the allocations of this future, without those of other tasks of the thread while it waits.
 pub async fn allocations_of<T>(work: impl Future<Output = T>) -> (Allocations, T) {
     let mut work = pin!(work);
     let mut taken = Allocations::default();
@@ -72,7 +71,7 @@ pub async fn allocations_of<T>(work: impl Future<Output = T>) -> (Allocations, T
 
 fn take(bytes: usize) {
     LIVE.fetch_add(bytes as i64, Relaxed);
-    // After the thread's end nobody counts any more.
+    // Allocations after the thread's end are not counted.
     let _ = HERE.try_with(|here| here.set(here.get().and(Allocations { count: 1, bytes })));
 }
 
@@ -94,7 +93,7 @@ unsafe impl GlobalAlloc for CountingAllocator {
         unsafe { System.alloc_zeroed(layout) }
     }
 
-    // One that grows may move, so all of it counts again.
+    // A growing allocation may move, so its whole size counts again.
     unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
         take(new_size);
         give_back(layout.size());

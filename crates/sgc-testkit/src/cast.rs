@@ -1,4 +1,4 @@
-//! Who plays: fleets and identities, made once per process and the same in every process.
+//! The fleets and identities of all tests, made once per process and the same in every process.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
@@ -12,34 +12,34 @@ use sgc_wire::UnixMillis;
 
 use crate::clock::GENESIS;
 
-/// When the fleets were made: so long before the world that clocks may be wrong by days.
+/// Time at which the fleets were made, early enough before the world that clocks may be wrong by days.
 const BIRTH: UnixMillis = UnixMillis(GENESIS.0 - 30 * 86_400_000);
 
 /// A member of a fleet.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Member {
-    /// Its name.
+    /// The member's name.
     pub name: String,
-    /// Its fleet.
+    /// The member's fleet.
     pub fleet: String,
-    /// Its groups.
+    /// The member's groups.
     pub groups: Vec<String>,
-    /// True for an identity without the fleet secret.
+    /// The identity is a router's, without the fleet secret.
     pub router: bool,
-    /// True for a member that carries others' names.
+    /// The member may forward for others.
     pub may_route: bool,
-    /// How long after the world began its certificate was made; `None` for a month before.
+    /// Time of its certificate after the beginning of the world; `None` stands for a month before.
     pub from: Option<Duration>,
-    /// How long its certificate holds from then on; `None` for as long as any test lasts.
+    /// Validity of its certificate; `None` stands for longer than any test.
     pub valid: Option<Duration>,
-    /// Which certificate of the node this is; 0 for the first.
+    /// Number of the node's certificate, from 0.
     pub renewal: u32,
-    /// Number of times that it was enrolled again after a revocation.
+    /// Number of enrolments after a revocation.
     pub incarnation: u32,
 }
 
 impl Member {
-    /// A member of the fleet that tests use unless they need two, in no group.
+    /// Returns a member of the default fleet of tests, in no group.
     pub fn new(name: &str) -> Self {
         Self {
             name: name.to_owned(),
@@ -75,7 +75,7 @@ fn cast() -> MutexGuard<'static, Cast> {
     CAST.get_or_init(Mutex::default).lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The identity of a member; the same one whenever it is asked for.
+/// Returns the identity of a member, which is the same on every call.
 pub fn identity(member: &Member) -> Arc<Identity> {
     let mut cast = cast();
     if let Some(identity) = cast.identities.get(member) {
@@ -104,7 +104,7 @@ pub fn identity(member: &Member) -> Arc<Identity> {
     let made = match member.incarnation {
         0 => fleet.issue(&request, &mut rng(&seed)),
         again => {
-            // In a copy of the fleet's file, so that what is made of others does not depend on the order.
+            // In a copy of the fleet file, so that other members do not depend on the order of calls.
             let mut copy = Fleet::parse(&fleet.to_text()).expect("it was written by itself");
             let request = EnrollRequest { again: true, ..request };
             copy.enroll(&request, &mut rng(&seed)).expect("a fresh CA enrols");
@@ -121,14 +121,14 @@ pub fn identity(member: &Member) -> Arc<Identity> {
     identity
 }
 
-/// These CAs and that of a fleet.
+/// Returns these trust anchors with the CA of a fleet added.
 pub(crate) fn with_fleet(anchors: &TrustAnchors, fleet: &str) -> TrustAnchors {
     let ca = cast().fleet(fleet).ca_certificate().clone();
     anchors.with_anchors([ca]).expect("a CA that was made well")
 }
 
-/// A list of a fleet that revokes these members in their incarnations and says nothing of any other: also such as a copy
-/// of the fleet's file makes that does not know what another one revoked.
+/// Returns a list of a fleet that revokes only these members in their incarnations, like a list of a copy of the fleet file
+/// that does not know the revocations of another copy.
 pub fn revocation_list(fleet: &str, members: &[Member], number: u64) -> Bytes {
     let mut cast = cast();
     let fleet = cast.fleet(fleet);
@@ -140,7 +140,7 @@ pub fn revocation_list(fleet: &str, members: &[Member], number: u64) -> Bytes {
     fleet.revocation_list_of_nodes(&revoked, number, GENESIS).expect("a fresh CA signs").into()
 }
 
-/// A list of serial numbers, as a CA writes it that knows nothing of SGC.
+/// Returns a list of serial numbers, as a CA writes it that does not know SGC.
 pub fn serial_list(fleet: &str, members: &[Member], number: u64) -> Bytes {
     let revoked: Vec<_> =
         members.iter().map(|m| (identity(m).as_peer().cert.serial.clone(), GENESIS)).collect();
@@ -149,9 +149,9 @@ pub fn serial_list(fleet: &str, members: &[Member], number: u64) -> Bytes {
     fleet.revocation_list_of(&revoked, number, GENESIS).expect("a fresh CA signs").into()
 }
 
-/// A generator that depends on a text alone.
+/// Returns a generator seeded by a text.
 fn rng(text: &str) -> ChaCha20Rng {
-    // FNV-1a: only has to differ for different texts.
+    // FNV-1a: the seed only has to differ for different texts.
     let seed = text.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
     });

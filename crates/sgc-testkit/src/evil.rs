@@ -1,4 +1,4 @@
-//! What those do who do not follow the protocol: listen, inject, and alter what they send.
+//! Actions of nodes that break the protocol: they capture, inject and alter frames and packets.
 
 use std::time::Duration;
 
@@ -9,42 +9,42 @@ use crate::world::World;
 
 /// A frame that crossed a link while [`World::capture`] was on.
 #[derive(Clone, Debug)]
-pub struct Captured {
-    /// Who sent it.
+pub struct CapturedFrame {
+    /// The sender.
     pub from: NodeKey,
-    /// To whom.
+    /// The receiver.
     pub to: NodeKey,
-    /// What.
+    /// The frame.
     pub frame: Control,
 }
 
 /// A packet that crossed a link while [`World::capture`] was on.
 #[derive(Clone, Debug)]
 pub struct CapturedPacket {
-    /// Who sent it.
+    /// The sender.
     pub from: NodeKey,
-    /// To whom.
+    /// The receiver.
     pub to: NodeKey,
-    /// When, since the world began.
+    /// Time since the world began.
     pub at: Duration,
-    /// What.
+    /// The packet.
     pub packet: Packet,
 }
 
 impl World {
-    /// Sends a frame from one node to a neighbour, as if its router had.
+    /// Sends a frame from one node to a neighbour, as if its router sent it.
     pub fn inject(&mut self, from: NodeKey, to: NodeKey, frame: &Control) {
         let (wire, side) = self.wire_between(from, to);
         self.carry_frame(wire, side, frame);
     }
 
-    /// Sends a packet from one node to a neighbour, as if its data path had.
+    /// Sends a packet from one node to a neighbour, as if its data path sent it.
     pub fn inject_packet(&mut self, from: NodeKey, to: NodeKey, packet: Packet) {
         let (wire, side) = self.wire_between(from, to);
         self.carry_packet(wire, side, packet);
     }
 
-    /// Replaces every frame that `from` sends to `to` by what `tamper` makes of it.
+    /// Replaces every frame that `from` sends to `to` by the result of `tamper`.
     pub fn tamper(
         &mut self,
         from: NodeKey,
@@ -63,17 +63,17 @@ impl World {
         self.cables[cable].tampers[side] = None;
     }
 
-    /// Keeps all frames and packets from here on.
+    /// Starts to capture all frames and packets.
     pub fn capture(&mut self) {
         self.captured.get_or_insert_default();
     }
 
-    /// The frames kept.
-    pub fn captured(&self) -> &[Captured] {
+    /// Returns the captured frames.
+    pub fn captured(&self) -> &[CapturedFrame] {
         self.captured.as_deref().unwrap_or_default()
     }
 
-    /// The packets kept, in the order in which they were sent; those that the network loses among them.
+    /// Returns the captured packets in the order of sending, including those that the network loses.
     pub fn captured_packets(&self) -> &[CapturedPacket] {
         &self.captured_packets
     }

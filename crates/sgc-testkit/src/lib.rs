@@ -1,13 +1,13 @@
 //! A whole network of SGC nodes in one thread: virtual clock, seeded links, real machines, real cryptography.
 //!
 //! A [`World`] holds nodes (a `Router` and an `Endpoint` each, wired as the driver of `sgc-node` wires them),
-//! cables between them, and a queue of what is under way. Nothing happens but in [`World::run`] and its
-//! relatives, and the same seed gives the same run. Tests read what came of it: deliveries, events, drops.
-//! [`Model`] says what should have come of it, from the configuration alone. [`mesh`] has bare routers by the thousand.
+//! cables between them, and a queue of frames and packets in flight. Time passes only in [`World::run`] and its
+//! relatives, and the same seed gives the same run. Tests read its record: deliveries, events, drops.
+//! [`Model`] computes the expected outcome from the configuration. [`mesh`] has thousands of bare routers.
 //!
-//! There is no socket, no thread and no sleep here, and no ROS: what a node publishes is a numbered message.
-//! Sealing is as in production; the provider's own randomness in signatures decides nothing. [`netsim`] alone is
-//! different: it is a bad network for real processes, in real time. [`CountingAllocator`] is for tests of what allocates.
+//! There is no socket, no thread and no sleep here, and no ROS: nodes publish numbered messages.
+//! Sealing is as in production; the provider's own randomness in signatures decides nothing. Only [`netsim`] is
+//! different: it is a bad network for real processes, in real time. [`CountingAllocator`] is for tests of allocations.
 //!
 //! ```
 //! use std::time::Duration;
@@ -48,10 +48,10 @@ pub use allocator::{
 };
 pub use cast::{Member, identity, revocation_list, serial_list};
 pub use clock::Clock;
-pub use evil::{Captured, CapturedPacket};
+pub use evil::{CapturedFrame, CapturedPacket};
 pub use model::Model;
 pub use node::{NodeKey, Sharing};
-pub use record::{DataDrop, Logged, MessageId, Published, Received, What};
+pub use record::{DataDrop, LogEntry, MessageId, PublishedMessage, ReceivedMessage, What};
 pub use rng::Dice;
 pub use ros::{FakeClient, FakeDomain, FakeReader, FakeRos, FakeServer, FakeWriter};
 pub use seeds::run_seeds;

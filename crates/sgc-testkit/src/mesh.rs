@@ -1,9 +1,8 @@
-//! Bare routers by the thousand on a virtual clock: how the control protocol scales.
+//! Thousands of bare routers on a virtual clock, to measure how the control protocol scales.
 //!
-//! No endpoints, payloads or recovery ([`crate::World`] has those): a proxy here is a router machine that carries
-//! nobody else's names, with a few lines in place of its endpoint. Frames go from machine to machine as values, so that
-//! the bytes of what is signed exist once; everything is signed and verified as in production. The clock of the
-//! processor is the caller's to lend.
+//! It has no endpoints, payloads or recovery ([`crate::World`] has those): a proxy here is a router machine that carries no
+//! names of others, with a few lines in place of its endpoint. Frames go from machine to machine as values, so that signed
+//! bytes exist once. Everything is signed and verified as in production. The caller passes in a clock of processor time.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -22,55 +21,55 @@ use crate::{Clock, Dice};
 
 /// Names in one advertisement.
 pub const BATCH_NAMES: usize = 250;
-/// How long advertisements hold.
+/// Lease of advertisements.
 const LEASE: Duration = Duration::from_secs(600);
-/// A mesh in which nothing is to happen for so long has settled; it is longer than what routers wait between link
-/// states or searches, and shorter than what they wait before they ask or speak again.
+/// Time without an event after which a mesh has settled. It is longer than a router's pause between link states or searches,
+/// and shorter than its pause before it repeats a question or an advertisement.
 const SETTLED_AFTER: Duration = Duration::from_secs(1);
-/// No event takes longer to settle than this; one that does is a defect.
+/// Longest time to settle after an event. More is a defect.
 const SETTLE_MAX: Duration = Duration::from_secs(60);
-/// Signed bodies travel with a length before body and signature each.
+/// Bytes of a signed body beyond body and signature: a length before each.
 const SIGNED_OVERHEAD_BYTES: usize = 9;
 
-/// What came of an event, over all nodes.
+/// The cost of an event, over all nodes.
 #[derive(Clone, Debug, Default)]
 pub struct Tally {
     /// Frames by kind, and their bytes.
     pub frames: BTreeMap<&'static str, (u64, u64)>,
-    /// Time of the processor in all machines.
+    /// Processor time in all machines.
     pub cpu: Duration,
-    /// Searches for ways.
+    /// Searches for paths.
     pub searches: u64,
-    /// Until the last frame arrived.
+    /// Time until the last frame arrived.
     pub last_frame: Duration,
-    /// Until the last router found other ways to routers than before.
+    /// Time until the last router changed its paths to routers.
     pub ways: Duration,
-    /// Until the first proxy heard of what it had asked for.
+    /// Time until the first proxy heard of a name that it had asked for.
     pub heard: Option<Duration>,
-    /// Until the first proxy was granted what it had subscribed to.
+    /// Time until the first proxy got a grant.
     pub granted: Option<Duration>,
-    /// What was refused, by reason.
+    /// Refused frames, by reason.
     pub drops: BTreeMap<&'static str, u64>,
 }
 
 impl Tally {
-    /// Frames in all.
+    /// Returns the number of all frames.
     pub fn frames(&self) -> u64 {
         self.frames.values().map(|(frames, _)| frames).sum()
     }
 
-    /// Frames of one kind.
-    pub fn of(&self, kind: &str) -> u64 {
+    /// Returns the number of frames of one kind.
+    pub fn frames_of_kind(&self, kind: &str) -> u64 {
         self.frames.get(kind).map_or(0, |(frames, _)| *frames)
     }
 
-    /// Bytes in all.
+    /// Returns the bytes of all frames.
     pub fn bytes(&self) -> u64 {
         self.frames.values().map(|(_, bytes)| bytes).sum()
     }
 }
 
-/// What happened to one machine, with frames as they are on the wire; see [`Mesh::record`].
+/// An input of one machine, with frames as they are on the wire; see [`Mesh::record`].
 #[derive(Clone, Debug)]
 enum Input {
     Up(LinkId, Neighbour),
@@ -79,7 +78,7 @@ enum Input {
     Timeout,
 }
 
-/// Everything that happened to one machine, to be done to another by itself.
+/// All inputs of one machine, for a replay on another.
 #[derive(Debug)]
 pub struct Recording {
     config: RouterConfig,
@@ -88,7 +87,7 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// A machine to which the same happened; it shares no byte with any other.
+    /// Returns a machine with the same inputs. It shares no byte with any other.
     pub fn replay(&self) -> Router {
         let mut router = Router::new(self.config.clone(), self.began);
         let drain = |router: &mut Router, now| {
@@ -126,7 +125,7 @@ struct Station {
     links_made: u32,
     wake: Option<Instant>,
     seq: u64,
-    /// What it is to join once it hears of it.
+    /// The name to join once the proxy hears of it.
     joins: Option<(Name, SinkId)>,
 }
 
@@ -136,7 +135,7 @@ struct Cable {
     links: Option<[LinkId; 2]>,
 }
 
-/// Many routers, their proxies, and what is under way between them.
+/// Many routers, their proxies, and frames in flight between them.
 pub struct Mesh {
     clock: Clock,
     cpu: fn() -> Duration,
@@ -154,8 +153,7 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// Nothing yet. `cpu` says how much time of the processor this thread has had; a constant will do for who does not
-    /// care.
+    /// Returns an empty mesh. `cpu` returns the processor time of this thread; a constant serves callers that do not measure it.
     pub fn new(seed: u64, mapping: MappingKind, cpu: fn() -> Duration) -> Self {
         let clock = Clock::default();
         Self {
@@ -175,9 +173,9 @@ impl Mesh {
         }
     }
 
-    /// So many routers, scattered over a continent; each new one is linked to two that are there, the rather the more
-    /// links those have (Barabási and Albert), so the mean degree is 4. A link's latency is 1 ms and up to 40 ms by
-    /// distance. Nothing is linked yet.
+    /// Adds routers, scattered over a continent. Each new one gets cables to two existing ones with a probability proportional to
+    /// their degree (Barabási and Albert), so the mean degree is 4. A link's latency is 1 ms and up to 40 ms more by distance.
+    /// The cables are not plugged in.
     pub fn add_routers(&mut self, routers: usize) {
         for n in 0..routers {
             let router = self.add_station(format!("router-{n}"), true);
@@ -185,7 +183,7 @@ impl Mesh {
         }
     }
 
-    /// Cables of a new router to two others.
+    /// Lays the cables of a new router to two others.
     fn place_router(&mut self, router: usize) {
         let others: Vec<_> = (0..router).filter(|n| self.stations[*n].transit && self.is_up(*n)).collect();
         let mut ends: Vec<usize> = self.cables.iter().flat_map(|c| c.ends).collect();
@@ -235,25 +233,25 @@ impl Mesh {
         }
     }
 
-    /// A cable between two nodes; not plugged in.
+    /// Lays a cable between two nodes without plugging it in.
     pub fn add_cable(&mut self, a: usize, b: usize) -> usize {
         let (from, to) = (self.places[a], self.places[b]);
         let distance = ((from.0 - to.0).powi(2) + (from.1 - to.1).powi(2)).sqrt() / 2f64.sqrt();
         let proxy = !(self.stations[a].transit && self.stations[b].transit);
-        // Proxies are at home near their router.
+        // Proxies are near to their router.
         let micros = if proxy { 2000 } else { 1000 + (distance * 40_000.0) as u64 };
         self.cables.push(Cable { ends: [a, b], latency: Duration::from_micros(micros), links: None });
         self.cables.len() - 1
     }
 
-    /// A proxy with a cable to a router; not plugged in.
+    /// Adds a proxy with a cable to a router, not plugged in.
     pub fn add_proxy(&mut self, name: &str, router: usize) -> usize {
         let proxy = self.add_station(name.to_owned(), false);
         self.add_cable(proxy, router);
         proxy
     }
 
-    /// A router that was not there before, with cables to two others; plugged in.
+    /// Adds a router with cables to two others and plugs it in.
     pub fn join_router(&mut self) -> usize {
         let router = self.add_station(format!("late-{}", self.stations.len()), true);
         self.place_router(router);
@@ -271,7 +269,7 @@ impl Mesh {
         }
     }
 
-    /// Both ends of a cable are linked.
+    /// Links both ends of a cable.
     pub fn plug(&mut self, cable: usize) {
         let ends = self.cables[cable].ends;
         let links = ends.map(|end| {
@@ -289,7 +287,7 @@ impl Mesh {
         }
     }
 
-    /// Both ends of a cable see that the link is gone.
+    /// Takes the link of a cable down at both ends.
     pub fn unplug(&mut self, cable: usize) {
         let Some(links) = self.cables[cable].links.take() else { return };
         for (station, link) in self.cables[cable].ends.into_iter().zip(links) {
@@ -298,7 +296,7 @@ impl Mesh {
         }
     }
 
-    /// A node is gone, and its neighbours see that.
+    /// Removes a node. Its neighbours see its links go down.
     pub fn kill(&mut self, station: usize) {
         self.stations[station].router = None;
         if let Some(at) = self.stations[station].wake.take() {
@@ -307,7 +305,7 @@ impl Mesh {
         self.cables_of(station).into_iter().for_each(|cable| self.unplug(cable));
     }
 
-    /// A proxy leaves its router for another: the new link is up before the old one is gone.
+    /// Moves a proxy to another router. The new link is up before the old one is gone.
     pub fn roam(&mut self, proxy: usize, router: usize) {
         let old = self.cables_of(proxy);
         let new = self.add_cable(proxy, router);
@@ -315,12 +313,12 @@ impl Mesh {
         old.into_iter().for_each(|cable| self.unplug(cable));
     }
 
-    /// Cables of a node.
+    /// Returns the cables of a node.
     pub fn cables_of(&self, station: usize) -> Vec<usize> {
         (0..self.cables.len()).filter(|c| self.cables[*c].ends.contains(&station)).collect()
     }
 
-    /// A cable between routers that all can do without, and that is plugged in; and a router of the same kind.
+    /// Returns a plugged cable between routers and a router, without either of which the mesh stays connected.
     pub fn spare(&mut self) -> (usize, usize) {
         let routers = self.routers();
         loop {
@@ -350,12 +348,12 @@ impl Mesh {
         }
     }
 
-    /// The routers that run.
+    /// Returns the running routers.
     pub fn routers(&self) -> Vec<usize> {
         (0..self.stations.len()).filter(|n| self.stations[*n].transit && self.is_up(*n)).collect()
     }
 
-    /// Links between routers.
+    /// Returns the number of links between routers.
     pub fn edges(&self) -> usize {
         let plugged = self.cables.iter().filter(|c| c.links.is_some());
         plugged.filter(|c| c.ends.iter().all(|e| self.stations[*e].transit)).count()
@@ -365,35 +363,35 @@ impl Mesh {
         self.stations[station].router.is_some()
     }
 
-    /// A machine, to look at.
+    /// Returns a machine for inspection.
     pub fn router(&self, station: usize) -> &Router {
         self.stations[station].router.as_ref().expect("it runs")
     }
 
-    /// A machine, to do things to that the mesh need not know of.
+    /// Takes a machine out of the mesh, for experiments on it.
     pub fn take_router(&mut self, station: usize) -> Router {
         self.stations[station].router.take().expect("it runs")
     }
 
-    /// The present.
+    /// Returns the present.
     pub fn now(&self) -> sgc_wire::Now {
         self.clock.now()
     }
 
-    /// Seeded choice.
+    /// Returns the seeded generator.
     pub fn dice(&mut self) -> &mut Dice {
         &mut self.dice
     }
 
-    // ---- What proxies do.
+    // ---- Actions of proxies.
 
-    /// The names of an owner's batch.
+    /// Returns the names of an owner's batch.
     pub fn names(&self, owner: usize, batch: usize) -> Vec<Name> {
         let node = self.stations[owner].identity.node_id();
         blinds(batch).map(|blind| name_of(&node, &blind)).collect()
     }
 
-    /// An owner advertises a batch.
+    /// Lets an owner advertise a batch.
     pub fn advertise(&mut self, owner: usize, batch: usize) {
         let now = self.clock.now();
         let station = &mut self.stations[owner];
@@ -410,17 +408,17 @@ impl Mesh {
         self.local(owner, Control::Advert { cost: 0, signed });
     }
 
-    /// A proxy wants to hear where a name is.
+    /// Lets a proxy ask where a name is.
     pub fn ask(&mut self, proxy: usize, name: Name) {
         self.local(proxy, Control::Interest { names: vec![name] });
     }
 
-    /// A proxy does not want to hear of a name any more.
+    /// Ends a proxy's interest in a name.
     pub fn forget(&mut self, proxy: usize, name: Name) {
         self.local(proxy, Control::Uninterest { names: vec![name] });
     }
 
-    /// A proxy wants to subscribe: it asks, and joins once it hears.
+    /// Lets a proxy subscribe: it asks, and joins once it gets an answer.
     pub fn subscribe(&mut self, proxy: usize, name: Name) {
         let mut sink = [0; 16];
         sink[..8].copy_from_slice(&self.dice.number().to_be_bytes());
@@ -432,7 +430,7 @@ impl Mesh {
         self.input(station, Input::Frame(LinkId::LOCAL, Bytes::new()), Some(frame));
     }
 
-    /// What stands for a proxy's endpoint.
+    /// Answers a frame in place of a proxy's endpoint.
     fn endpoint(&mut self, station: usize, frame: Control) -> Option<Control> {
         let now = self.clock.now();
         let Station { identity, joins, .. } = &mut self.stations[station];
@@ -453,7 +451,7 @@ impl Mesh {
             }
             Control::Join { signed } => {
                 let JoinBody { name, sink, .. } = JoinBody::from_slice(&signed.body).ok()?;
-                // About what a topic's grant is.
+                // About the size of a topic's grant.
                 let answer = Answer::Grant {
                     enc: Bytes::from_static(&[1; 32]),
                     sealed: Bytes::from_static(&[1; 160]),
@@ -471,7 +469,7 @@ impl Mesh {
 
     // ---- Time.
 
-    /// Runs until nothing is to happen for a while, and says what came of it since the last time.
+    /// Runs until the mesh has settled. Returns the cost since the last call.
     pub fn settle(&mut self) -> Tally {
         let end = self.clock.instant() + SETTLE_MAX;
         while let Some(at) = self.next() {
@@ -487,7 +485,7 @@ impl Mesh {
         self.restart()
     }
 
-    /// Runs for so long, and says what came of it.
+    /// Runs for a time. Returns the cost.
     pub fn pass(&mut self, time: Duration) -> Tally {
         let end = self.clock.instant() + time;
         while let Some(at) = self.next().filter(|at| *at <= end) {
@@ -517,7 +515,7 @@ impl Mesh {
         self.input(station, Input::Frame(link, Bytes::new()), Some(frame));
     }
 
-    /// Something happens to a machine; a frame comes as a value.
+    /// Passes an input to a machine. A frame comes as a value.
     fn input(&mut self, station: usize, input: Input, frame: Option<Control>) {
         let now = self.clock.now();
         if let Some((of, recording)) = &mut self.recording
@@ -567,7 +565,7 @@ impl Mesh {
     }
 
     fn wake(&mut self, station: usize, at: Option<Instant>) {
-        // What is due now comes after what is under way now, or time would stand still.
+        // A deadline that is due now comes after frames in flight, or time would stand still.
         let at = at.map(|at| at.max(self.clock.instant() + Duration::from_nanos(1)));
         let old = std::mem::replace(&mut self.stations[station].wake, at);
         if old != at {
@@ -587,10 +585,10 @@ impl Mesh {
         self.under_way.insert((self.clock.instant() + *latency, self.frames_sent), (to, link, frame));
     }
 
-    // ---- What should come of it.
+    // ---- The reference model.
 
-    /// Costs of the cheapest ways from a router to all others, without this cable or that router, by another
-    /// algorithm than theirs (Bellman and Ford).
+    /// Computes the costs of the cheapest paths from a router to all others, without this cable or that router, by another
+    /// algorithm than the routers' (Bellman and Ford).
     fn reference(&self, from: usize, cable: Option<usize>, router: Option<usize>) -> BTreeMap<usize, u32> {
         let usable = |(n, c): &(usize, &Cable)| {
             c.links.is_some()
@@ -615,8 +613,8 @@ impl Mesh {
         costs
     }
 
-    /// Panics unless a number of routers, taken evenly, know the cheapest way to each other one that runs, and to no
-    /// more; and unless all know as many.
+    /// Panics unless an even sample of routers know the cheapest paths to exactly the running routers, and all routers know the
+    /// same number of routers.
     pub fn check(&self, sample: usize) {
         let routers = self.routers();
         for at in &routers {
@@ -631,7 +629,7 @@ impl Mesh {
         }
     }
 
-    /// Links on the way between two routers with the fewest, by the cables.
+    /// Returns the fewest links from a router to each other one, by the cables.
     pub fn hops(&self, from: usize) -> BTreeMap<usize, usize> {
         let mut hops = BTreeMap::from([(from, 0)]);
         let mut next = VecDeque::from([from]);
@@ -647,19 +645,19 @@ impl Mesh {
         hops
     }
 
-    /// Who a node is.
+    /// Returns a node's id.
     pub fn node(&self, station: usize) -> NodeId {
         self.stations[station].identity.node_id()
     }
 
-    /// Writes down what happens to a machine from its beginning; to be called before anything is plugged in.
+    /// Starts to record the inputs of a machine. Must be called before any cable is plugged in.
     pub fn record(&mut self, station: usize) {
         let recording =
             Recording { config: self.config(station), began: self.clock.now(), inputs: Vec::new() };
         self.recording = Some((station, recording));
     }
 
-    /// What was written down so far.
+    /// Returns the recording so far.
     pub fn recording(&self) -> &Recording {
         &self.recording.as_ref().expect("something is written down").1
     }
@@ -668,7 +666,7 @@ impl Mesh {
 fn blinds(batch: usize) -> impl Iterator<Item = Blind> {
     (batch * BATCH_NAMES..(batch + 1) * BATCH_NAMES).map(|n| {
         let mut blind = [0; 32];
-        // Blinds are spread evenly, as hashes are.
+        // Blinds are uniform, like hashes.
         let mut dice = Dice::new(n as u64);
         for part in blind.chunks_mut(8) {
             part.copy_from_slice(&dice.number().to_be_bytes());
@@ -677,7 +675,7 @@ fn blinds(batch: usize) -> impl Iterator<Item = Blind> {
     })
 }
 
-/// Kind and length of a frame.
+/// Returns the kind and the length of a frame.
 fn weigh(frame: &Control) -> (&'static str, usize) {
     let signed = |s: &SignedBody| SIGNED_OVERHEAD_BYTES + s.body.len() + s.signature.len();
     match frame {
@@ -697,9 +695,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_weigh_what_their_encoding_is_long() {
-        let signed =
-            SignedBody { body: Bytes::from_static(&[1; 700]), signature: Bytes::from_static(&[2; 71]) };
+    fn weight_of_frame_is_its_encoded_length() {
+        let signed = SignedBody { body: Bytes::from_static(&[1; 700]), signature: Bytes::from_static(&[2; 71]) };
         let names = vec![Name([3; 32]); 3];
         for frame in [
             Control::LinkState { signed: signed.clone() },

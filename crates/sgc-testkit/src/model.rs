@@ -1,5 +1,5 @@
-//! What should be: computed from cables, runs, shares, uses, and who has heard of which revocations; apart from those
-//! never from a machine's state.
+//! The reference model: the expected outcome, computed from cables, runs, shares, uses, and the revocations that nodes know.
+//! It reads no other state of a machine.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,21 +9,21 @@ use sgc_router::MappingKind;
 
 use crate::{NodeKey, Sharing, World};
 
-/// The reference model: who reaches whom, who may have what, and so who has what once all is quiet.
+/// The expected reachability, permissions, and grants of a world at rest.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Model {
-    /// The nodes that each running node reaches: neighbours, and what is behind nodes that carry others.
+    /// The nodes that each running node reaches: neighbours, and nodes behind those that forward.
     pub reached: BTreeMap<NodeKey, BTreeSet<NodeKey>>,
-    /// To whom each shared topic of a running owner is granted.
+    /// The nodes to which each shared topic of a running owner is granted.
     pub granted: BTreeMap<(NodeKey, String), BTreeSet<NodeKey>>,
-    /// Which nodes follow each running owner's catalogue and reach it.
+    /// The nodes that follow each running owner's catalogue and reach it.
     pub following: BTreeMap<NodeKey, BTreeSet<NodeKey>>,
 }
 
 impl Model {
-    /// What should come of a world as it is configured now.
-    pub fn of(world: &World) -> Self {
-        // Who has heard that it is revoked itself believes nothing of what it says, and is alone.
+    /// Computes the expected outcome of a world with its present configuration.
+    pub fn from_world(world: &World) -> Self {
+        // A node that knows of its own revocation does not believe its own certificate and is alone.
         let alive =
             |n: NodeKey| world.is_running(n) && world.nodes[n.0].frozen.is_none() && world.believes(n, n);
         let reached: BTreeMap<_, _> =
@@ -46,13 +46,13 @@ impl Model {
         Self { reached, granted, following }
     }
 
-    /// The nodes that may use a shared topic, whether they want to or not.
+    /// Returns the nodes that may use a shared topic, whether they want to or not.
     pub fn permitted(world: &World, owner: NodeKey, topic: &str) -> BTreeSet<NodeKey> {
         let Some(sharing) = world.nodes[owner.0].shares.get(topic) else { return BTreeSet::new() };
         world.nodes().filter(|user| permits(world, owner, sharing, *user)).collect()
     }
 
-    /// Where a quiet world differs from this.
+    /// Compares a world at rest with the model. The error describes the first difference.
     pub fn check(&self, world: &World) -> Result<(), String> {
         self.check_revocations(world)?;
         for ((owner, topic), expected) in &self.granted {
@@ -75,7 +75,7 @@ impl Model {
         Ok(())
     }
 
-    /// Whoever reach each other have heard of the same revocations.
+    /// Checks that nodes that reach each other know the same revocations.
     fn check_revocations(&self, world: &World) -> Result<(), String> {
         for (node, reached) in &self.reached {
             for other in reached {
@@ -87,7 +87,7 @@ impl Model {
         Ok(())
     }
 
-    /// A router holds what the living need and nothing of the departed.
+    /// Checks that a router holds the state that running nodes need, and none of nodes that are gone.
     fn check_tables(&self, world: &World, node: NodeKey) -> Result<(), String> {
         let mut named = BTreeMap::new();
         let mut routed = 0;
@@ -107,7 +107,8 @@ impl Model {
             }
         }
         let stats = world.stats(node);
-        // One that asks knows what it needs; one that is told all knows all, unless it is told by one that asks.
+        // A router with mapping `query` knows the names that it needs. One with `flood` knows all names, unless it learns them from a
+        // router with `query`.
         let floods = world.nodes.iter().all(|n| !n.transit || n.mapping == MappingKind::Flood);
         if world.nodes[node.0].transit
             && (stats.routed_names > routed || floods && stats.routed_names != routed)

@@ -1,6 +1,6 @@
 //! One node: a router and an endpoint, wired as the driver wires them, with the data path between.
 //!
-//! The node owns no time and no network: the world hands it what arrives and carries away its [`Effect`]s.
+//! The node owns no time and no network: the world passes in arrivals and carries out its [`Effect`]s.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt;
@@ -27,10 +27,10 @@ use crate::record::{DataDrop, MessageId, What};
 
 /// Type of every topic.
 const TYPE_NAME: &str = "sgc_testkit/msg/Numbered";
-/// How long a history is waited for before it is asked for again.
+/// Time after which a missing history is requested again.
 const HISTORY_RETRY: Duration = Duration::from_secs(2);
 const HISTORY_BYTES_MAX: usize = 1 << 20;
-/// How long packets of past epochs may take.
+/// Time for which packets of past epochs are still accepted.
 pub(crate) const EPOCH_GRACE: Duration = Duration::from_secs(5);
 
 /// A node of a world.
@@ -43,57 +43,57 @@ impl fmt::Debug for NodeKey {
     }
 }
 
-/// With whom and how a topic is shared.
+/// The recipients and the settings of a shared topic.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Sharing {
-    /// With every member of the owner's fleet.
+    /// Every member of the owner's fleet is permitted.
     pub fleet: bool,
-    /// With these nodes.
+    /// Permitted nodes.
     pub nodes: BTreeSet<NodeKey>,
-    /// With the members of these groups of the owner's fleet.
+    /// Groups of the owner's fleet whose members are permitted.
     pub groups: BTreeSet<String>,
     /// Messages that late joiners get; 0 for a volatile topic.
     pub depth: usize,
-    /// True if links may lose it.
+    /// The topic is best effort: links may lose its messages.
     pub best_effort: bool,
-    /// With every member of these fleets, which are not the owner's.
+    /// Other fleets whose members are all permitted.
     pub partners: BTreeSet<String>,
-    /// These nodes may publish too.
+    /// Nodes that may publish too.
     pub publishers: BTreeSet<NodeKey>,
-    /// How it is protected, unless as usual.
+    /// The suite, unless it is the default.
     pub suite: Option<Suite>,
-    /// What is kept for who loses something of it.
+    /// The limits of messages kept for recovery.
     pub recovery: RecoveryLimits,
 }
 
 impl Sharing {
-    /// With the whole fleet.
+    /// Shares with the whole fleet.
     pub fn to_fleet() -> Self {
         Self { fleet: true, ..Self::default() }
     }
 
-    /// With these nodes.
+    /// Shares with these nodes.
     pub fn to(nodes: &[NodeKey]) -> Self {
         Self { nodes: nodes.iter().copied().collect(), ..Self::default() }
     }
 
-    /// With these groups.
+    /// Shares with these groups.
     pub fn to_groups(groups: &[&str]) -> Self {
         Self { groups: groups.iter().map(|g| (*g).to_owned()).collect(), ..Self::default() }
     }
 
-    /// As a transient-local topic that keeps the last `depth` messages.
+    /// Makes the topic transient local with a history of `depth` messages.
     pub fn transient_local(self, depth: usize) -> Self {
         Self { depth, ..self }
     }
 
-    /// As one of which so many messages are kept for who loses some.
+    /// Keeps so many messages for recovery.
     pub fn recovering(self, messages_max: usize) -> Self {
         let recovery = RecoveryLimits { messages_max, ..self.recovery };
         Self { recovery, ..self }
     }
 
-    /// As a best-effort topic.
+    /// Makes the topic best effort.
     pub fn best_effort(self) -> Self {
         Self { best_effort: true, ..self }
     }
@@ -108,7 +108,7 @@ impl Sharing {
     }
 }
 
-/// What a node is, whether it runs or not: its configuration file, so to say.
+/// The configuration of a node, whether the node runs or not.
 pub(crate) struct Node {
     pub(crate) key: NodeKey,
     pub(crate) name: String,
@@ -119,30 +119,30 @@ pub(crate) struct Node {
     pub(crate) endpoint_limits: sgc_endpoint::Limits,
     pub(crate) shares: BTreeMap<String, Sharing>,
     pub(crate) uses: BTreeSet<(NodeKey, String)>,
-    /// Topics of others that it publishes on.
+    /// Topics of others on which it publishes.
     pub(crate) publishing: BTreeSet<(NodeKey, String)>,
     pub(crate) running: Option<Running>,
-    /// Starts so far.
+    /// Number of starts so far.
     pub(crate) runs: u64,
-    /// What arrived while it was stopped in its tracks; `None` while it is not.
+    /// Arrivals while the node is frozen; `None` while it is not.
     pub(crate) frozen: Option<VecDeque<Arrival>>,
-    /// By how much its clock is ahead, milliseconds.
+    /// Milliseconds by which its clock is ahead.
     pub(crate) skew_ms: i64,
-    /// Whom it believes, revocations included; kept over restarts. `None` for what its identity says.
+    /// Its trust anchors, revocations included, which survive restarts. `None` stands for those of its identity.
     pub(crate) anchors: Option<Arc<TrustAnchors>>,
 }
 
-/// What may arrive at a node.
+/// An input of a node.
 pub(crate) enum Arrival {
     Frame(LinkId, Control),
     Packet(LinkId, Packet),
-    /// True if the peer says that another run of this node has its place.
+    /// The link is down. The flag says that another run of this node took its place at the peer.
     LinkDown(LinkId, bool),
-    /// What its driver measures.
+    /// The driver's measurement of a link.
     Quality(LinkId, Duration, bool),
 }
 
-/// What the world has to do for a node.
+/// An action that the world carries out for a node.
 pub(crate) enum Effect {
     /// Carry a frame over a link.
     Frame(LinkId, Control),
@@ -150,15 +150,15 @@ pub(crate) enum Effect {
     Packet(LinkId, Packet),
     /// Take a link down.
     Close(LinkId, LinkClose),
-    /// A message came through.
+    /// A message was delivered.
     Delivered { owner: NodeKey, topic: String, id: MessageId, use_number: u64 },
-    /// Remember whom it believes.
+    /// Keep its trust anchors over restarts.
     Trust(Arc<TrustAnchors>),
-    /// Something a test may want to see.
+    /// Write an event to the log for tests.
     Log(What),
 }
 
-/// Names and ids of all nodes, for those who look each other up.
+/// Names and ids of all nodes, for lookups.
 #[derive(Default)]
 pub(crate) struct Directory {
     pub(crate) by_id: BTreeMap<NodeId, NodeKey>,
@@ -172,7 +172,7 @@ pub(crate) struct Running {
     pub(crate) router: Router,
     pub(crate) endpoint: Endpoint,
     identity: Arc<Identity>,
-    /// Whom it believes by now.
+    /// Its present trust anchors.
     pub(crate) anchors: Arc<TrustAnchors>,
     next_link: u32,
     /// Wire and side of each link that is up.
@@ -183,9 +183,9 @@ pub(crate) struct Running {
     pub(crate) catalogues: BTreeMap<NodeKey, Catalogue>,
     uses: BTreeSet<(NodeKey, String)>,
     pub(crate) publishing: BTreeSet<(NodeKey, String)>,
-    /// What this node publishes on others' topics.
+    /// This node's publishers on topics of others.
     pub(crate) publishers: BTreeMap<Name, Publisher>,
-    /// Owners that are followed.
+    /// Owners whose catalogues this node follows.
     owners: BTreeMap<NodeKey, NodeId>,
     uses_begun: u64,
     pub(crate) wake: Option<Instant>,
@@ -207,12 +207,12 @@ pub(crate) struct LocalSink {
     pub(crate) sources: Vec<SourceId>,
     pub(crate) sink: Option<Sink>,
     pub(crate) retry_at: Option<Instant>,
-    /// When the keys of past epochs are dropped.
+    /// Time at which the keys of past epochs are dropped.
     pub(crate) retire_at: Option<Instant>,
 }
 
 impl Node {
-    /// Starts it with what it is configured for.
+    /// Starts the node with its configuration.
     pub(crate) fn start(&mut self, now: Now, seed: u64, directory: &Directory) {
         self.runs += 1;
         self.frozen = None;
@@ -300,7 +300,7 @@ impl Running {
             Arrival::LinkDown(link, superseded) => {
                 if superseded {
                     self.router.handle_superseded();
-                    // Sinks that the other run gave to local programs are not to be asked for.
+                    // Sinks of the other run must not be requested again.
                     self.sinks.values_mut().for_each(|local| local.sink = None);
                 }
                 self.link_down(now, link);
@@ -404,7 +404,7 @@ impl Running {
     }
 
     pub(crate) fn follow(&mut self, now: Now, owner: NodeKey, directory: &Directory) {
-        // The owner may be of a fleet that this node cannot see; then there is nothing to follow.
+        // The owner may belong to a fleet that this node cannot see. Then there is no catalogue to follow.
         let owner_name = &directory.names[owner.0];
         if self.endpoint.follow(now, owner_name) {
             self.owners.extend(self.identity.node_id_of(owner_name).map(|id| (owner, id)));
@@ -434,14 +434,14 @@ impl Running {
 
     pub(crate) fn send_packets(&mut self, now: Now, packets: Vec<Packet>) {
         for packet in packets {
-            // As in the driver: what nobody asked for is not sent.
+            // As in the driver, packets without a forwarding entry are not sent.
             if self.fib.contains_key(&packet.header.name) {
                 self.forward(now, LinkId::LOCAL, packet);
             }
         }
     }
 
-    /// Everything that both machines and the data path want done, until they want nothing more.
+    /// Drains both machines and the data path. Returns all their effects.
     pub(crate) fn drain(&mut self, now: Now) -> Vec<Effect> {
         self.drain_endpoint(now);
         self.drain_router(now, None);
@@ -570,7 +570,7 @@ impl Running {
         }
     }
 
-    /// Joins what is wanted and in the owner's catalogue, leaves what is not.
+    /// Joins wanted topics in the owner's catalogue and leaves all others.
     fn reconcile(&mut self, now: Now, owner: NodeKey) {
         let Some(owner_id) = self.owners.get(&owner).copied() else { return };
         let mut wanted = BTreeMap::new();
@@ -618,12 +618,12 @@ impl Running {
         }
     }
 
-    /// Asks for all that is missing, if the name is granted.
+    /// Requests all missing messages, if the name is granted.
     fn ask_history(&mut self, now: Now, name: Name) {
         self.ask(now, name, |sink, source| sink.ask(source).map_or(AskAgain::No, AskAgain::From));
     }
 
-    /// The same, a while later.
+    /// Schedules another request for missing messages.
     fn ask_again(&mut self, now: Now, name: Name) {
         self.ask(now, name, Sink::ask_again);
     }
@@ -643,7 +643,7 @@ impl Running {
         }
     }
 
-    /// The data path, packet by packet.
+    /// Forwards one packet on the data path.
     pub(crate) fn forward(&mut self, now: Now, ingress: LinkId, mut packet: Packet) {
         let name = packet.header.name;
         let Some(entry) = self.fib.get(&name) else {
@@ -683,7 +683,7 @@ impl Running {
         }
     }
 
-    /// What a packet came to.
+    /// Handles the delivery of a packet.
     pub(crate) fn delivered(&mut self, now: Now, name: Name, delivery: Result<Delivery, SinkDrop>) {
         let Some(local) = self.sinks.get_mut(&name) else { return };
         match delivery {
@@ -724,7 +724,7 @@ pub(crate) fn sealed(source: &mut Source, id: MessageId, bytes: usize) -> Vec<Pa
     packets
 }
 
-/// Who may join, as a node's policy says it.
+/// Returns the policy that permits the recipients of a share.
 pub(crate) fn policy(owner: &Identity, sharing: &Sharing, directory: &Directory) -> Policy {
     let ca = owner.as_peer().ca;
     let id = |node: &NodeKey| {
@@ -750,7 +750,7 @@ pub(crate) fn policy(owner: &Identity, sharing: &Sharing, directory: &Directory)
     }
 }
 
-/// Metadata of a topic of a node.
+/// Returns the metadata of a node's topic.
 pub(crate) fn metadata(owner: &str, topic: &str) -> Metadata {
     Metadata::topic(owner, topic, TYPE_NAME)
 }

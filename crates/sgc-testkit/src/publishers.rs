@@ -1,4 +1,4 @@
-//! Topics on which others than the owner publish: this node's sources on others' topics, and its own sink of its own.
+//! Topics on which other nodes than the owner publish: a node's sources on topics of others, and the sink of its own topic.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +15,7 @@ pub(crate) struct Publisher {
     owner: NodeKey,
     config: SourceConfig,
     message_key: MessageKey,
-    /// The key that `source` seals with.
+    /// The grant with the key of `source`.
     grant: Option<TopicGrant>,
     pub(crate) source: Option<Source>,
 }
@@ -27,7 +27,7 @@ impl Running {
         self.follow(now, owner, directory);
     }
 
-    /// Publishes on another's topic; `None` while that is not granted.
+    /// Publishes on another's topic. Returns `None` while that is not granted.
     pub(crate) fn publish_as(
         &mut self,
         now: Now,
@@ -41,7 +41,7 @@ impl Running {
         Some(source)
     }
 
-    /// Joins what is to be published on, and leaves what no longer is.
+    /// Joins topics on which the node wants to publish, and leaves all others.
     pub(crate) fn reconcile_publishers(&mut self, now: Now, owner: NodeKey, owner_id: NodeId) {
         let mut wanted = BTreeMap::new();
         for entry in self.catalogues.get(&owner).iter().flat_map(|c| &c.entries).filter(|e| e.publish) {
@@ -80,7 +80,7 @@ impl Running {
     /// Feeds this node's own sink of a topic that others publish on.
     pub(crate) fn handle_own_grant(&mut self, now: Now, name: Name, grant: TopicGrant) {
         let Some(share) = self.sources.get(&name) else {
-            // The share is being made; what it was told is told again with its source.
+            // The share is still being made. The grant comes again with its source.
             return;
         };
         let mut released = Vec::new();
@@ -116,7 +116,7 @@ impl Publisher {
             Some(source) if self.grant.as_ref().is_some_and(of_same_run) => {
                 let _ = source.rekey(&grant, emit);
             }
-            // The first grant, or one of an owner that started anew, under whose keys nothing was sealed yet.
+            // The first grant, or one of a restarted owner, under whose keys no message was sealed yet.
             source => *source = Source::new(self.config.clone(), &grant, self.message_key.clone()),
         }
         self.grant = Some(grant);

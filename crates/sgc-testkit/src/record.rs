@@ -1,4 +1,4 @@
-//! What a run leaves for a test to look at.
+//! The record of a run, for tests to inspect.
 
 use std::time::Duration;
 
@@ -14,57 +14,57 @@ pub struct MessageId(pub u64);
 
 /// A message that was published.
 #[derive(Clone, Debug)]
-pub struct Published {
-    /// Its number.
+pub struct PublishedMessage {
+    /// The message's number.
     pub id: MessageId,
-    /// When, since the world began.
+    /// Time since the world began.
     pub at: Duration,
-    /// Whose topic.
+    /// The topic's owner.
     pub owner: NodeKey,
-    /// By whom; another node than the owner where that may publish.
+    /// The publishing node: the owner, or another node that may publish.
     pub by: NodeKey,
-    /// In which run of that node.
+    /// The run of that node.
     pub run: u64,
-    /// Under which topic.
+    /// The topic.
     pub topic: String,
-    /// By which source; another one after the topic was shared anew.
+    /// The source, which changes when the topic is shared anew.
     pub source: SourceId,
 }
 
 /// A message that was delivered.
 #[derive(Clone, Debug)]
-pub struct Received {
-    /// Its number.
+pub struct ReceivedMessage {
+    /// The message's number.
     pub id: MessageId,
-    /// When, since the world began.
+    /// Time since the world began.
     pub at: Duration,
-    /// To whom.
+    /// The receiving node.
     pub node: NodeKey,
-    /// To which run of that node.
+    /// The run of that node.
     pub run: u64,
-    /// Which use of the topic within that run: leaving and using it again begins another.
+    /// The number of the use within that run. Leaving the topic and using it again begins another.
     pub use_number: u64,
-    /// Whose topic.
+    /// The topic's owner.
     pub owner: NodeKey,
-    /// Which.
+    /// The topic.
     pub topic: String,
 }
 
-/// Something that happened at a node.
+/// An event at a node, with its time.
 #[derive(Clone, Debug)]
-pub struct Logged {
-    /// When, since the world began.
+pub struct LogEntry {
+    /// Time since the world began.
     pub at: Duration,
-    /// Where.
+    /// The node.
     pub node: NodeKey,
-    /// What.
+    /// The event.
     pub what: What,
 }
 
-/// What happened.
+/// The kind of a log entry.
 #[derive(Clone, Debug)]
 pub enum What {
-    /// The endpoint said so.
+    /// The endpoint emitted an event.
     Event(Event),
     /// The router refused a frame.
     RouterDrop(sgc_router::RouterDrop),
@@ -74,40 +74,40 @@ pub enum What {
     DataDrop {
         /// Its name.
         name: Name,
-        /// Where it came from.
+        /// The link on which it arrived.
         ingress: LinkId,
-        /// Why.
+        /// The reason.
         why: DataDrop,
     },
-    /// Messages that a sink will never get.
+    /// A sink lost messages for good.
     SinkLost {
-        /// Their name.
+        /// The name.
         name: Name,
-        /// How many.
+        /// The number of messages.
         messages: u64,
     },
     /// The router closed a link.
     Closed {
-        /// Why.
+        /// The reason.
         reason: LinkClose,
     },
 }
 
-/// Why the data path drops.
+/// The reason for a drop on the data path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum DataDrop {
-    /// Nobody asked for the name.
+    /// No node asked for the name.
     NoTree,
-    /// Data of this name may not come from there.
+    /// Data of this name may not come over that link.
     WrongWay,
-    /// It went too far.
+    /// The packet used up its hop limit.
     HopLimit,
-    /// It is for a sink that is not here.
+    /// The packet's sink is not here.
     NoSuchSink,
-    /// This node has no key for it.
+    /// This node has no key for the packet.
     NotGranted,
-    /// The sink refused it.
+    /// The sink refused the packet.
     Sink(SinkDrop),
-    /// The network lost it.
+    /// The network lost the packet.
     Lost,
 }

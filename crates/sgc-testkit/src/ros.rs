@@ -1,8 +1,8 @@
 //! A local ROS 2 network in memory: [`FakeRos`] implements [`sgc_ros::RosNetwork`].
 //!
-//! Domains are values that networks are opened on; networks on one domain see each other. Samples are delivered on
-//! the thread of whoever writes. Matching honours topic, type, keylessness, reliability and durability; what it does
-//! not do: depth of volatile history, loss, partitions, or anything that takes time.
+//! A domain is a value on which networks are opened. Networks of one domain see each other. Samples are delivered on the
+//! writer's thread. Matching honours topic, type, keylessness, reliability and durability. It has no depth of volatile
+//! history, no loss, no partitions and no delays.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::atomic::{AtomicI64, Ordering::Relaxed};
@@ -17,14 +17,14 @@ use sgc_ros::{
 };
 use sgc_wire::{History, Qos};
 
-/// How often, and how many milliseconds apart, it is looked for who is to hear a request.
+/// Number of times that a request looks for its server before it fails.
 const PEER_LOOKS: u64 = 100;
 const PEER_LOOK_MS: u64 = 10;
-/// Encapsulation header, then client and number, then the body.
+/// Bytes of the encapsulation header, which client, number and body follow.
 const HEADER_BYTES: usize = 4;
 const ID_BYTES: usize = 24;
 
-/// A domain: clone it to let several networks meet.
+/// A domain. Clones let several networks meet.
 #[derive(Clone, Default)]
 pub struct FakeDomain(Arc<Mutex<DomainState>>);
 
@@ -32,18 +32,18 @@ pub struct FakeDomain(Arc<Mutex<DomainState>>);
 struct DomainState {
     next: u32,
     endpoints: BTreeMap<Guid, Endpoint>,
-    /// What each network announces, and whether it is a proxy.
+    /// The nodes that each network announces, and whether it is a proxy.
     nodes: BTreeMap<u32, (bool, Vec<GraphNode>)>,
     watchers: Vec<Watcher>,
-    /// Topics and payloads that cannot be written.
+    /// Topics and payloads whose next write fails.
     refused: Vec<(String, Bytes)>,
-    /// The networks with these numbers and lower ones do not reach other hosts.
+    /// Networks up to this number do not reach other hosts.
     cut_off: u32,
 }
 
 struct Endpoint {
     discovered: DiscoveredEndpoint,
-    /// True if a proxy made it: invisible to proxies.
+    /// A proxy made it, so it is invisible to proxies.
     tagged: bool,
     network: u32,
     reader: Option<Arc<Mutex<SampleHandler>>>,
@@ -51,7 +51,7 @@ struct Endpoint {
 }
 
 impl Endpoint {
-    /// True if a reader of such a network hears this writer: no proxy hears a proxy, itself included.
+    /// Returns `true` if a reader of such a network hears this writer. No proxy hears a proxy, itself included.
     fn reaches(&self, tagged: bool) -> bool {
         !(self.tagged && tagged)
     }
@@ -70,26 +70,26 @@ pub struct FakeRos {
     tagged: bool,
 }
 
-/// A reader; ends when dropped.
+/// A reader, which ends when it is dropped.
 pub struct FakeReader {
     domain: FakeDomain,
     guid: Guid,
 }
 
 impl FakeReader {
-    /// Its GUID.
+    /// Returns its GUID.
     pub fn guid(&self) -> Guid {
         self.guid
     }
 }
 
-/// A writer; ends when dropped.
+/// A writer, which ends when it is dropped.
 pub struct FakeWriter {
     domain: FakeDomain,
     guid: Guid,
 }
 
-/// A client; ends when dropped.
+/// A client, which ends when it is dropped.
 pub struct FakeClient {
     requests: FakeWriter,
     answers: FakeReader,
@@ -97,21 +97,21 @@ pub struct FakeClient {
     next: AtomicI64,
 }
 
-/// A server; ends when dropped.
+/// A server, which ends when it is dropped.
 pub struct FakeServer {
     replies: FakeWriter,
     asked: FakeReader,
 }
 
 impl FakeDomain {
-    /// Joins; a tagged participant is a proxy, whose endpoints other proxies do not see.
+    /// Joins the domain. A tagged participant is a proxy, whose endpoints other proxies do not see.
     pub fn join(&self, tagged: bool) -> FakeRos {
         let mut state = self.lock();
         state.next += 1;
         FakeRos { domain: self.clone(), network: state.next, tagged }
     }
 
-    /// How many endpoints there are on a topic, by kind.
+    /// Returns the number of endpoints of a kind on a topic.
     pub fn count(&self, topic: &str, kind: EndpointKind) -> usize {
         self.lock()
             .endpoints
@@ -120,25 +120,25 @@ impl FakeDomain {
             .count()
     }
 
-    /// The endpoints on a topic, of a kind: which are still there, and which were made anew.
+    /// Returns the GUIDs of endpoints of a kind on a topic, which tell old from new ones.
     pub fn guids(&self, topic: &str, kind: EndpointKind) -> Vec<Guid> {
         let state = self.lock();
         let wanted = |e: &&Endpoint| e.discovered.topic == topic && e.discovered.kind == kind;
         state.endpoints.values().filter(wanted).map(|e| e.discovered.guid).collect()
     }
 
-    /// Has the next write of a payload on a topic fail, as if a reader did not acknowledge what was written before.
+    /// Lets the next write of a payload on a topic fail, as if a reader did not acknowledge earlier samples.
     pub fn refuse_write(&self, topic: &str, payload: Bytes) {
         self.lock().refused.push((topic.to_owned(), payload));
     }
 
-    /// Cuts the networks that have joined so far off from other hosts, as far as they can tell.
+    /// Reports to the networks that have joined so far that they do not reach other hosts.
     pub fn cut_off(&self) {
         let mut state = self.lock();
         state.cut_off = state.next;
     }
 
-    /// What the writers on a topic offer.
+    /// Returns the QoS that the writers on a topic offer.
     pub fn offers(&self, topic: &str) -> Vec<Qos> {
         let state = self.lock();
         let all = state.endpoints.values().map(|e| &e.discovered);
@@ -146,7 +146,7 @@ impl FakeDomain {
         writers.map(|e| e.qos.clone()).collect()
     }
 
-    /// The nodes that proxies announce, by full name, each with how many readers and writers of it are there.
+    /// Returns the nodes that proxies announce, by full name, with their numbers of readers and writers.
     pub fn mirrored(&self) -> Vec<(String, usize, usize)> {
         let state = self.lock();
         let here = |all: &[Guid]| all.iter().filter(|guid| state.endpoints.contains_key(guid)).count();
@@ -163,14 +163,14 @@ impl FakeDomain {
 
     fn add(&self, network: &FakeRos, spec: &EndpointSpec, reader: Option<SampleHandler>) -> Guid {
         let reader = reader.map(|r| Arc::new(Mutex::new(r)));
-        // Held until it has what it missed: what is written meanwhile comes behind that, as each writer's samples come in turn.
+        // Locked until the reader has the history, so that samples written meanwhile follow it and keep their order.
         let handler = reader.as_ref().map(|r| r.lock().unwrap_or_else(PoisonError::into_inner));
         let (guid, watchers, missed) = {
             let mut state = self.lock();
             state.next += 1;
             let kind = if reader.is_some() { EndpointKind::Reader } else { EndpointKind::Writer };
             let mut guid = [0; 16];
-            // The prefix is the participant's.
+            // The prefix identifies the participant.
             guid[..4].copy_from_slice(&network.network.to_be_bytes());
             guid[11..15].copy_from_slice(&state.next.to_be_bytes());
             guid[11] = 0;
@@ -248,7 +248,7 @@ impl FakeDomain {
 }
 
 impl DomainState {
-    /// Who hears of an endpoint of `network`.
+    /// Returns the discovery handlers that see an endpoint of `network`.
     fn watchers_of(&self, network: u32, tagged: bool) -> Vec<Arc<Mutex<DiscoveryHandler>>> {
         self.watchers
             .iter()
@@ -329,7 +329,7 @@ impl RosNetwork for FakeRos {
     }
 
     fn show(&self, kind: EndpointKind, spec: &EndpointSpec) -> Result<ShownEndpoint, RosError> {
-        // No other endpoint has the topic.
+        // A topic that no other endpoint has.
         let spec = EndpointSpec { topic: format!("shown:{}", spec.topic), ..spec.clone() };
         Ok(match kind {
             EndpointKind::Reader => {
@@ -379,7 +379,7 @@ impl RosServer for FakeServer {
     }
 }
 
-/// Stands for a network among nodes.
+/// Returns the GUID of a network's participant.
 fn participant(network: u32) -> Guid {
     let mut guid = [0; 16];
     guid[..4].copy_from_slice(&network.to_be_bytes());
@@ -387,7 +387,7 @@ fn participant(network: u32) -> Guid {
     Guid(guid)
 }
 
-/// Id and payload of a request or a reply.
+/// Splits a request or a reply into id and payload.
 fn split(sample: &Bytes, asker: Option<Guid>) -> Option<(RequestId, Bytes)> {
     let id = sample.get(HEADER_BYTES..HEADER_BYTES + ID_BYTES)?;
     let (client, number) = (id[..16].try_into().ok()?, i64::from_be_bytes(id[16..].try_into().ok()?));
@@ -416,7 +416,7 @@ impl Drop for FakeWriter {
 }
 
 impl FakeWriter {
-    /// Writes several at once: readers find them at hand together, as those of a real network do under load.
+    /// Writes several samples at once, so that readers find them together, as on a real network under load.
     pub fn write_burst(&self, payloads: impl IntoIterator<Item = Bytes>) {
         let mut payloads = payloads.into_iter().peekable();
         while let Some(payload) = payloads.next() {
@@ -435,7 +435,7 @@ impl FakeWriter {
         matched.map(|r| r.discovered.guid).collect()
     }
 
-    /// Writes a request or a reply once there is somebody to read it.
+    /// Writes a request or a reply once a reader is there.
     fn write_with(&self, id: &RequestId, payload: &Bytes) -> Result<(), RosError> {
         let Some((header, body)) = payload.split_first_chunk::<HEADER_BYTES>() else {
             return Err(RosError::Payload { bytes: payload.len() });

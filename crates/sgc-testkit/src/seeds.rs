@@ -1,4 +1,4 @@
-//! [`run_seeds`]: the loop of tests of random histories.
+//! [`run_seeds`]: runs tests of random histories over seeds.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -15,7 +15,7 @@ pub fn run_seeds<R, T>(
     execute: impl Fn(&mut R) -> T,
     trace: impl Fn(&R) -> String,
 ) -> Vec<T> {
-    // The trace stands in the place of a stack.
+    // The trace replaces the stack trace.
     std::panic::set_hook(Box::new(|_| {}));
     let (mut results, mut failed) = (Vec::new(), Vec::new());
     for seed in seeds(committed) {

@@ -1,4 +1,4 @@
-//! What is done to the trust between nodes: rights and certificates taken back, clocks that are wrong.
+//! Actions on the trust between nodes: changes of rights, certificates, revocations and clocks.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,7 +12,7 @@ use crate::node::{Node, NodeKey, Sharing, policy};
 use crate::world::World;
 
 impl World {
-    /// Shares a topic with others from here on; its name and sources stay.
+    /// Changes the recipients of a shared topic. Its name and sources stay.
     pub fn reshare(&mut self, node: NodeKey, topic: &str, sharing: Sharing) {
         self.note(format!("reshare {node:?} {topic} {sharing:?}"));
         let (now, name) = (self.now_at(node), self.name(node, topic));
@@ -33,7 +33,7 @@ impl World {
         self.trust(node, both);
     }
 
-    /// Takes every other fleet than its own out of those that a node trusts.
+    /// Removes all fleets but its own from those that a node trusts.
     pub fn trust_own_fleet_only(&mut self, node: NodeKey) {
         self.note(format!("{node:?} trusts its own fleet only"));
         let own = self.nodes[node.0].identity.anchors().clone();
@@ -51,7 +51,7 @@ impl World {
         self.settle(node);
     }
 
-    /// The newest epoch in which a topic is published by its owner.
+    /// Returns the newest epoch in which the owner publishes a topic.
     pub fn epoch(&self, owner: NodeKey, topic: &str) -> Option<u32> {
         let running = self.nodes[owner.0].running.as_ref()?;
         Some(running.sources.get(&self.name(owner, topic))?.source.epoch())
@@ -67,7 +67,7 @@ impl World {
         self.settle(node);
     }
 
-    /// Gives a node a fresh certificate; its links stay as they were made.
+    /// Gives a node a new certificate. Its links keep the old one.
     pub fn renew(&mut self, node: NodeKey) {
         self.note(format!("renew {node:?}"));
         let now = self.now_at(node);
@@ -82,7 +82,7 @@ impl World {
         self.settle(node);
     }
 
-    /// Makes a node one again that was revoked: it starts with an identity of its next incarnation.
+    /// Enrols a revoked node again: it starts with an identity of its next incarnation.
     pub fn enroll_again(&mut self, node: NodeKey) {
         self.note(format!("enroll {node:?} again"));
         let member = &mut self.members[node.0];
@@ -91,7 +91,7 @@ impl World {
         self.restart(node);
     }
 
-    /// Gives a node a revocation list, as its user would; true if it is news to it.
+    /// Gives a node a revocation list, as its user would. Returns `true` if the list is new to it.
     pub fn hand_crl(&mut self, node: NodeKey, der: &Bytes) -> bool {
         self.note(format!("hand a revocation list to {node:?}"));
         let now = self.now_at(node);
@@ -101,19 +101,19 @@ impl World {
         news
     }
 
-    /// True unless a node has heard that the certificate of `other` is revoked.
+    /// Returns `true` unless a node knows that the certificate of `other` is revoked.
     pub fn believes(&self, node: NodeKey, other: NodeKey) -> bool {
         let anchors = self.nodes[node.0].anchors.as_deref();
         anchors.is_none_or(|anchors| !anchors.is_peer_revoked(self.identity(other).as_peer()))
     }
 
-    /// The revocation lists that a node has.
+    /// Returns the revocation lists that a node has.
     pub fn revocations(&self, node: NodeKey) -> Vec<Bytes> {
         let anchors = self.nodes[node.0].anchors.as_deref();
         anchors.into_iter().flat_map(|anchors| anchors.crls().cloned()).collect()
     }
 
-    /// Makes a node forget what it remembers over restarts: a new disk.
+    /// Deletes the state that a node keeps over restarts, like a new disk.
     pub fn forget_disk(&mut self, node: NodeKey) {
         self.nodes[node.0].anchors = None;
     }
@@ -128,7 +128,7 @@ impl World {
         self.set_clock(node, -(by.as_millis() as i64));
     }
 
-    /// Sets a node's wall clock, which its driver looks at all the time.
+    /// Sets a node's wall clock.
     fn set_clock(&mut self, node: NodeKey, skew_ms: i64) {
         self.nodes[node.0].skew_ms = skew_ms;
         let now = self.now_at(node);
@@ -139,7 +139,7 @@ impl World {
         }
     }
 
-    /// The present, as a node's clocks show it.
+    /// Returns the present by a node's clocks.
     pub(crate) fn now_at(&self, node: NodeKey) -> Now {
         let Now { instant, unix } = self.clock.now();
         Now { instant, unix: UnixMillis(unix.0.saturating_add_signed(self.nodes[node.0].skew_ms)) }

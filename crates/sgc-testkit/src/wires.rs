@@ -1,4 +1,4 @@
-//! Cables, which say who could be connected to whom, and wires, the connections over them.
+//! Cables between nodes, and wires, the connections over them.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -8,18 +8,18 @@ use sgc_wire::{Control, Name};
 
 use crate::NodeKey;
 
-/// Replaces a frame by others, or by none.
+/// A function that replaces a frame by others, or by none.
 pub(crate) type Tamper = Box<dyn FnMut(&Control) -> Vec<Control>>;
 
-/// Two nodes that connect whenever both run and the cable is whole.
+/// A cable between two nodes, which connect whenever both run and the cable is not cut.
 pub(crate) struct Cable {
     pub(crate) ends: [NodeKey; 2],
     pub(crate) whole: bool,
     pub(crate) wire: Option<usize>,
     pub(crate) latency: Duration,
-    /// What an evil node at one end does to frames that it sends.
+    /// The alterations that an evil node at one end makes to frames that it sends.
     pub(crate) tampers: [Option<Tamper>; 2],
-    /// True for an end whose packets are lost while its frames arrive, as if a queue stood still for too long.
+    /// Ends whose packets are lost while their frames arrive, as behind a stalled queue.
     pub(crate) loses: [bool; 2],
 }
 
@@ -32,7 +32,7 @@ impl Cable {
 /// One connection, from its establishment to its end.
 pub(crate) struct Wire {
     pub(crate) cable: usize,
-    /// False once nothing gets through any more, whether or not its ends noticed.
+    /// The wire still carries frames. It may have stopped before its ends notice.
     pub(crate) carries: bool,
     pub(crate) ends: [WireEnd; 2],
 }
@@ -42,10 +42,10 @@ pub(crate) struct WireEnd {
     pub(crate) node: NodeKey,
     pub(crate) run: u64,
     pub(crate) link: LinkId,
-    /// True until this side knows that the link is down.
+    /// This side does not know yet that the link is down.
     pub(crate) up: bool,
-    /// When the last frame from this side arrives: those behind it arrive no earlier.
+    /// Arrival of the last frame from this side. Later frames arrive no earlier.
     pub(crate) control: Instant,
-    /// The same for packets, by name.
+    /// Arrival of the last packet of each name.
     pub(crate) data: BTreeMap<Name, Instant>,
 }

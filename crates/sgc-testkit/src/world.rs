@@ -1,4 +1,4 @@
-//! The network and its time: who is connected, what is under way, and what came of it.
+//! The network and its time: connections, frames and packets in flight, and a record of all events.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt::Write as _;
@@ -16,37 +16,36 @@ use sgc_wire::{
 
 use crate::cast::{Member, identity};
 use crate::clock::{Clock, GENESIS};
-use crate::evil::{Captured, CapturedPacket};
+use crate::evil::{CapturedFrame, CapturedPacket};
 use crate::node::{Arrival, Directory, Effect, Node, Sharing, metadata};
-use crate::record::{Logged, MessageId, Published, Received, What};
+use crate::record::{LogEntry, MessageId, PublishedMessage, ReceivedMessage, What};
 use crate::rng::Dice;
 use crate::wires::{Cable, Wire, WireEnd};
 use crate::{DataDrop, NodeKey};
 
-/// Deliveries of one call of [`World::run`] beyond which the network is taken to run in circles.
+/// Number of deliveries in one call of [`World::run`] above which the network counts as looping.
 const STEPS_MAX: usize = 300_000;
-/// How often [`World::run_until`] looks.
+/// Period in which [`World::run_until`] checks its condition.
 const LOOK: Duration = Duration::from_millis(20);
-/// After how long of silence a link seems dead.
+/// Silence after which a link seems dead.
 const SUSPECT_AFTER: Duration = Duration::from_millis(2500);
 /// Bound of the `until_…` methods: longer than a lease and the longest wait between attempts.
 const PATIENCE: Duration = Duration::from_secs(350);
 
-/// What a world is made of.
+/// The settings of a world.
 #[derive(Clone, Debug)]
 pub struct WorldConfig {
     /// Seed of everything that is drawn.
     pub seed: u64,
     /// Latency of a cable, drawn once for each.
     pub latency: RangeInclusive<Duration>,
-    /// What each frame or packet may take longer; frames of a link, and packets of one name on it, keep their
-    /// order.
+    /// Extra delay of each frame or packet. Frames of a link, and packets of one name on it, keep their order.
     pub jitter: RangeInclusive<Duration>,
-    /// How many of a hundred best-effort packets each link loses.
+    /// Percentage of best-effort packets that each link loses.
     pub loss_percent: usize,
-    /// How many of a hundred best-effort packets come twice, and how many are overtaken by later ones.
+    /// Percentage of best-effort packets that come twice, and of those that later ones overtake.
     pub repeat_percent: usize,
-    /// How routers come to know where names are, drawn for each.
+    /// Mappings by which routers learn owners of names; each router draws one.
     pub mappings: Vec<MappingKind>,
     /// Bounds of the routers.
     pub router_limits: sgc_router::Limits,
@@ -81,7 +80,7 @@ enum Pending {
         to: usize,
         packet: Packet,
     },
-    /// The far end is gone; `superseded` if it closed because another run of the node has its place.
+    /// The far end is gone. `superseded` says that it closed because another run of the node took its place.
     LinkDown {
         wire: usize,
         to: usize,
@@ -94,14 +93,14 @@ enum Pending {
     },
 }
 
-/// How much a trace holds; the environment variable `SGC_TRACE` may ask for more.
+/// The detail of a trace. The environment variable `SGC_TRACE` can raise it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Tracing {
-    /// What was done to the world.
+    /// Actions on the world.
     Transitions,
-    /// `SGC_TRACE=log`: and what happened at the nodes.
+    /// `SGC_TRACE=log`: also events at the nodes.
     Log,
-    /// `SGC_TRACE=frames`: and every frame.
+    /// `SGC_TRACE=frames`: also every frame.
     Frames,
 }
 
@@ -117,28 +116,28 @@ pub struct World {
     wires: Vec<Wire>,
     queue: BTreeMap<(Instant, u64), Pending>,
     queued: u64,
-    log: Vec<Logged>,
-    received: Vec<Received>,
-    published: Vec<Published>,
-    pub(crate) captured: Option<Vec<Captured>>,
+    log: Vec<LogEntry>,
+    received: Vec<ReceivedMessage>,
+    published: Vec<PublishedMessage>,
+    pub(crate) captured: Option<Vec<CapturedFrame>>,
     pub(crate) captured_packets: Vec<CapturedPacket>,
-    /// How often each packet went over each wire in each direction, if that is counted.
-    copies: Option<BTreeMap<Carried, usize>>,
+    /// Number of times that each packet crossed each wire in each direction, if it is counted.
+    copies: Option<BTreeMap<WireCrossing, usize>>,
     trace: Vec<String>,
     tracing: Tracing,
     steps: usize,
 }
 
 /// A packet on a wire: wire, sending side, source, message, fragment, addressee.
-type Carried = (usize, usize, SourceId, u64, u16, Option<SinkId>);
+type WireCrossing = (usize, usize, SourceId, u64, u16, Option<SinkId>);
 
 impl World {
-    /// A world of [`WorldConfig::new`].
+    /// Returns a world of [`WorldConfig::new`].
     pub fn new(seed: u64) -> Self {
         Self::with(WorldConfig::new(seed))
     }
 
-    /// A world without nodes.
+    /// Returns a world without nodes.
     pub fn with(config: WorldConfig) -> Self {
         Self {
             clock: Clock::default(),
@@ -179,7 +178,7 @@ impl World {
         self.node(Member::new(name), false)
     }
 
-    /// Adds and starts a node that is any member and carries others' names or not.
+    /// Adds and starts a node for a member, which carries names of others if `transit`.
     pub fn node(&mut self, member: Member, transit: bool) -> NodeKey {
         let key = NodeKey(self.nodes.len());
         let member = Member { may_route: member.may_route || transit, ..member };
@@ -212,7 +211,7 @@ impl World {
         key
     }
 
-    /// Starts a node that does not run, with what it is configured for, and connects its cables.
+    /// Starts a stopped node with its configuration and connects its cables.
     pub fn start(&mut self, node: NodeKey) {
         if self.is_running(node) {
             return;
@@ -226,12 +225,12 @@ impl World {
         }
     }
 
-    /// Kills a node; its neighbours see its links go down at once.
+    /// Kills a node. Its neighbours see its links go down at once.
     pub fn crash(&mut self, node: NodeKey) {
         self.crash_unseen(node, Duration::ZERO);
     }
 
-    /// Kills a node; its neighbours see its links go down only after `idle`, unless they hear of its restart.
+    /// Kills a node. Its neighbours see its links go down only after `idle`, unless they hear of its restart.
     pub fn crash_unseen(&mut self, node: NodeKey, idle: Duration) {
         if !self.is_running(node) {
             return;
@@ -240,14 +239,14 @@ impl World {
         self.stop(node, idle, false);
     }
 
-    /// Kills a node and starts it again 50 ms later; its neighbours see both at once.
+    /// Kills a node and starts it again 50 ms later. Its neighbours see both at once.
     pub fn restart(&mut self, node: NodeKey) {
         self.crash(node);
         self.run(Duration::from_millis(50));
         self.start(node);
     }
 
-    /// Ends a node in good order: its names are withdrawn, its neighbours told goodbye.
+    /// Ends a node cleanly: it withdraws its names and says goodbye to its neighbours.
     pub fn shut_down(&mut self, node: NodeKey) {
         if !self.is_running(node) {
             return;
@@ -264,14 +263,14 @@ impl World {
         self.stop(node, Duration::ZERO, true);
     }
 
-    /// Stops a node in its tracks, as SIGSTOP does: its links stay up, it does nothing.
+    /// Freezes a node, as SIGSTOP does: its links stay up, and it does nothing.
     pub fn freeze(&mut self, node: NodeKey) {
         self.note(format!("freeze {node:?}"));
         self.nodes[node.0].frozen.get_or_insert_default();
         self.tell_neighbours(node, SUSPECT_AFTER, true);
     }
 
-    /// Lets a frozen node go on, with all that arrived meanwhile.
+    /// Lets a frozen node go on and handle all that arrived meanwhile.
     pub fn thaw(&mut self, node: NodeKey) {
         self.note(format!("thaw {node:?}"));
         for arrival in self.nodes[node.0].frozen.take().into_iter().flatten() {
@@ -280,7 +279,7 @@ impl World {
         self.tell_neighbours(node, Duration::ZERO, false);
     }
 
-    /// What the neighbours measure of their links to a node, and when.
+    /// Reports the quality of links to a node to its neighbours, after a delay.
     fn tell_neighbours(&mut self, node: NodeKey, after: Duration, suspect: bool) {
         let links: Vec<_> =
             self.nodes[node.0].running.iter().flat_map(|r| r.links.values().copied()).collect();
@@ -289,19 +288,19 @@ impl World {
         }
     }
 
-    /// Takes from a node that does not run what it keeps over restarts: whom it has heard to be revoked.
+    /// Deletes the state that a stopped node keeps over restarts: the revocations that it knows.
     pub fn wipe(&mut self, node: NodeKey) {
         assert!(!self.is_running(node), "a running node keeps what it knows");
         self.note(format!("wipe {node:?}"));
         self.nodes[node.0].anchors = None;
     }
 
-    /// Counts from here on how often each packet goes over each wire.
+    /// Starts counting how often each packet crosses each wire.
     pub fn count_copies(&mut self) {
         self.copies = Some(BTreeMap::new());
     }
 
-    /// The packets that went over a wire in one direction more than once since [`Self::count_copies`], which ends.
+    /// Ends [`Self::count_copies`]. Returns the packets that crossed a wire more than once in one direction.
     pub fn copied(&mut self) -> Vec<String> {
         let copies = self.copies.take().unwrap_or_default();
         let name = |wire: usize, side: usize| {
@@ -336,12 +335,12 @@ impl World {
         self.connect(self.cables.len() - 1);
     }
 
-    /// Cuts a cable; both ends see it at once.
+    /// Cuts a cable. Both ends see it at once.
     pub fn cut(&mut self, a: NodeKey, b: NodeKey) {
         self.cut_unseen(a, b, Duration::ZERO, Duration::ZERO);
     }
 
-    /// Cuts a cable; `a` sees it after `a_idle`, `b` after `b_idle`.
+    /// Cuts a cable. `a` sees it after `a_idle`, `b` after `b_idle`.
     pub fn cut_unseen(&mut self, a: NodeKey, b: NodeKey, a_idle: Duration, b_idle: Duration) {
         self.note(format!("cut {a:?} {b:?}, seen after {a_idle:?} and {b_idle:?}"));
         let cable = self.cable(a, b);
@@ -355,7 +354,7 @@ impl World {
         }
     }
 
-    /// From now on packets from one node to another are lost, or no longer; frames still arrive.
+    /// Starts or ends the loss of packets from one node to another. Frames still arrive.
     pub fn lose_packets(&mut self, from: NodeKey, to: NodeKey, lose: bool) {
         self.note(format!("{} packets {from:?} {to:?}", if lose { "lose" } else { "carry" }));
         let cable = self.cable(from, to);
@@ -371,15 +370,15 @@ impl World {
         self.connect(cable);
     }
 
-    /// Returns true if a cable connects the two and both know it.
+    /// Returns `true` if a cable connects the two nodes and both know it.
     pub fn is_linked(&self, a: NodeKey, b: NodeKey) -> bool {
         let wire = self.cables[self.cable(a, b)].wire;
         wire.is_some_and(|wire| self.wires[wire].carries && self.wires[wire].ends.iter().all(|end| end.up))
     }
 
-    // ---- Wishes.
+    // ---- Shares, uses and messages.
 
-    /// Shares a topic, now and after every restart; the name it has.
+    /// Shares a topic, now and after every restart. Returns its name.
     pub fn share(&mut self, node: NodeKey, topic: &str, sharing: Sharing) -> Name {
         self.note(format!("share {node:?} {topic} {sharing:?}"));
         let now = self.now_at(node);
@@ -416,7 +415,7 @@ impl World {
         self.settle(node);
     }
 
-    /// Uses a topic no longer.
+    /// Ends the use of a topic.
     pub fn stop_using(&mut self, node: NodeKey, owner: NodeKey, topic: &str) {
         self.note(format!("stop using {node:?} {owner:?}:{topic}"));
         let now = self.now_at(node);
@@ -434,22 +433,22 @@ impl World {
         self.join_name(node, owner, self.name(owner, topic));
     }
 
-    /// Joins a name that a node came to know otherwise, until it stops.
+    /// Joins a name that a node learnt in another way, until the node stops.
     pub fn join_name(&mut self, node: NodeKey, owner: NodeKey, name: Name) {
         let (now, id) = (self.now_at(node), self.identity(owner).node_id());
         if let Some(running) = &mut self.nodes[node.0].running {
-            // As with a token, which says nothing of the topic but its name.
+            // Like the holder of a token, who knows only the name of the topic.
             running.endpoint.join(now, name, id, JoinKind::Subscribe { describe: true });
         }
         self.settle(node);
     }
 
-    /// Tells a node's endpoint what the type of a topic that it shares looks like.
+    /// Gives a node's endpoint the type description of a topic that it shares.
     pub fn describe(&mut self, node: NodeKey, topic: &str, type_hash: &str, description: &Bytes) {
         self.describe_all(node, &[topic], type_hash, description);
     }
 
-    /// The same of several, which become known at one time.
+    /// Gives a node's endpoint the type description of several topics at one time.
     pub fn describe_all(&mut self, node: NodeKey, topics: &[&str], type_hash: &str, description: &Bytes) {
         self.note(format!("describe {node:?} {topics:?}"));
         let now = self.now_at(node);
@@ -466,7 +465,7 @@ impl World {
         self.settle(node);
     }
 
-    /// Asks an owner what the types of these topics look like, and of no others any more.
+    /// Asks an owner for the type descriptions of these topics, and no longer for others.
     pub fn ask_types(&mut self, node: NodeKey, owner: NodeKey, topics: &[&str]) {
         self.note(format!("ask types {node:?} {owner:?}:{topics:?}"));
         let (now, id) = (self.now_at(node), self.identity(owner).node_id());
@@ -519,7 +518,7 @@ impl World {
         self.settle(node);
     }
 
-    /// Publishes a small message on a shared topic; its number.
+    /// Publishes a small message on a shared topic. Returns its number.
     pub fn publish(&mut self, node: NodeKey, topic: &str) -> MessageId {
         self.publish_bytes(node, topic, 8)
     }
@@ -533,7 +532,7 @@ impl World {
         let running = running.as_mut().expect("only a running node publishes");
         let source = running.publish(now, topic, id, bytes).expect("only what is shared is published");
         let (run, at, topic) = (running.run, self.clock.elapsed(), topic.to_owned());
-        self.published.push(Published { id, at, owner: node, by: node, run, topic, source });
+        self.published.push(PublishedMessage { id, at, owner: node, by: node, run, topic, source });
         self.settle(node);
         id
     }
@@ -550,14 +549,14 @@ impl World {
         self.settle(node);
     }
 
-    /// Publishes a small message on another's topic; `None` while that is not granted.
+    /// Publishes a small message on another's topic. Returns `None` while that is not granted.
     pub fn publish_as(&mut self, node: NodeKey, owner: NodeKey, topic: &str) -> Option<MessageId> {
         let (now, id) = (self.now_at(node), MessageId(self.published.len() as u64));
         let name = self.name(owner, topic);
         let running = self.nodes[node.0].running.as_mut()?;
         let source = running.publish_as(now, &name, id, 8)?;
         let (run, at, topic) = (running.run, self.clock.elapsed(), topic.to_owned());
-        self.published.push(Published { id, at, owner, by: node, run, topic, source });
+        self.published.push(PublishedMessage { id, at, owner, by: node, run, topic, source });
         self.settle(node);
         Some(id)
     }
@@ -572,7 +571,7 @@ impl World {
         self.clock.advance_to(until);
     }
 
-    /// Lets time pass until `done`, at most `bound`; whether it was.
+    /// Lets time pass until `done`, at most `bound`. Returns whether it was done.
     pub fn run_until(&mut self, bound: Duration, mut done: impl FnMut(&Self) -> bool) -> bool {
         let until = self.clock.instant() + bound;
         while !done(self) {
@@ -599,7 +598,7 @@ impl World {
         }
     }
 
-    /// Lets time pass until an event that `is` the one occurs at `node`, counting from now; when it did.
+    /// Lets time pass until an event for which `is` holds occurs at `node`, counting from now. Returns its time.
     ///
     /// # Panics
     /// If that takes longer than anything in the protocol takes.
@@ -622,89 +621,89 @@ impl World {
         at.expect("set when done")
     }
 
-    // ---- Looking.
+    // ---- Inspection.
 
-    /// Time since the world began.
+    /// Returns the time since the world began.
     pub fn elapsed(&self) -> Duration {
         self.clock.elapsed()
     }
 
-    /// The present.
+    /// Returns the present.
     pub fn now(&self) -> sgc_wire::Now {
         self.clock.now()
     }
 
-    /// All nodes.
+    /// Returns all nodes.
     pub fn nodes(&self) -> impl Iterator<Item = NodeKey> + '_ {
         self.nodes.iter().map(|n| n.key)
     }
 
-    /// True unless it crashed or was shut down.
+    /// Returns `true` unless the node crashed or was shut down.
     pub fn is_running(&self, node: NodeKey) -> bool {
         self.nodes[node.0].running.is_some()
     }
 
-    /// True while it is stopped in its tracks.
+    /// Returns `true` while the node is frozen.
     pub fn is_frozen(&self, node: NodeKey) -> bool {
         self.nodes[node.0].frozen.is_some()
     }
 
-    /// How often a node was started.
+    /// Returns how often a node was started.
     pub fn runs(&self, node: NodeKey) -> u64 {
         self.nodes[node.0].runs
     }
 
-    /// What a node was enrolled as.
+    /// Returns the member as which a node was enrolled.
     pub fn member(&self, node: NodeKey) -> &Member {
         &self.members[node.0]
     }
 
-    /// Who a node is.
+    /// Returns a node's identity.
     pub fn identity(&self, node: NodeKey) -> &Identity {
         &self.nodes[node.0].identity
     }
 
-    /// The name of a node's topic.
+    /// Returns the name of a node's topic.
     pub fn name(&self, owner: NodeKey, topic: &str) -> Name {
         self.name_of(owner, &metadata(&self.nodes[owner.0].name, topic))
     }
 
-    /// The name of a node's catalogue.
+    /// Returns the name of a node's catalogue.
     pub fn catalogue_name(&self, owner: NodeKey) -> Name {
         self.name_of(owner, &Metadata::catalogue(&self.nodes[owner.0].name))
     }
 
-    /// The blind of a node's topic, as its advertisements hold it.
+    /// Returns the blind of a node's topic, as in its advertisements.
     pub fn blind(&self, owner: NodeKey, topic: &str) -> sgc_wire::Blind {
         let secret = self.identity(owner).fleet_secret().expect("owners hold the fleet secret");
         TopicSecret::derive(secret, &metadata(&self.nodes[owner.0].name, topic)).blind()
     }
 
-    /// Where the join of a topic stands; `None` if the node does not run or does not want it (yet).
+    /// Returns the state of the join of a topic, or `None` if the node does not run or does not want it (yet).
     pub fn status(&self, node: NodeKey, owner: NodeKey, topic: &str) -> Option<JoinStatus> {
         self.nodes[node.0].running.as_ref()?.endpoint.join_status(&self.name(owner, topic))
     }
 
-    /// To which nodes a topic is granted, in ascending order, by what the owner knows.
+    /// Returns the nodes to which the owner has granted a topic, in ascending order.
     pub fn granted(&self, owner: NodeKey, topic: &str) -> Vec<NodeKey> {
         let mut nodes: Vec<_> = self.granted_sinks(owner, topic).into_iter().map(|(_, node)| node).collect();
         nodes.sort_unstable();
         nodes
     }
 
-    /// The sinks that a topic is granted to, by what the owner knows.
+    /// Returns the sinks to which the owner has granted a topic.
     pub fn granted_sinks(&self, owner: NodeKey, topic: &str) -> Vec<(SinkId, NodeKey)> {
         let Some(running) = &self.nodes[owner.0].running else { return Vec::new() };
         let granted = running.endpoint.granted(&self.name(owner, topic)).into_iter();
         granted.filter_map(|(sink, id)| Some((sink, *self.directory.by_id.get(&id)?))).collect()
     }
 
-    /// The last catalogue of an owner that a node received.
+    /// Returns the last catalogue of an owner that a node received.
     pub fn catalogue(&self, node: NodeKey, owner: NodeKey) -> Option<&Catalogue> {
         self.nodes[node.0].running.as_ref()?.catalogues.get(&owner)
     }
 
-    /// The topics in the last catalogue of an owner that a node received.
+    /// Returns the topics in the last catalogue of an owner that a node received.
     pub fn catalogue_topics(&self, node: NodeKey, owner: NodeKey) -> Vec<String> {
         let entries = self.catalogue(node, owner).map(|c| c.entries.as_slice()).unwrap_or_default();
         let mut topics: Vec<_> = entries.iter().map(|e| e.metadata.ros_name.clone()).collect();
@@ -712,12 +711,12 @@ impl World {
         topics
     }
 
-    /// What the router of a running node knows; all zero for one that does not run.
+    /// Returns the statistics of a node's router; all zero if the node does not run.
     pub fn stats(&self, node: NodeKey) -> RouterStats {
         self.nodes[node.0].running.as_ref().map(|r| r.router.stats()).unwrap_or_default()
     }
 
-    /// By how many milliseconds the clock of a neighbour is ahead of a node's, as the node was told.
+    /// Returns how many milliseconds the clock of a neighbour is ahead of a node's, as the node was told.
     pub fn clock_ahead_ms(&self, node: NodeKey, neighbour: NodeKey) -> Option<i64> {
         let running = self.nodes[node.0].running.as_ref()?;
         let is_there = |(wire, side): &(usize, usize)| self.wires[*wire].ends[1 - side].node == neighbour;
@@ -725,18 +724,18 @@ impl World {
         running.router.clock_ahead_ms(link)
     }
 
-    /// Names with a forwarding entry at a node.
+    /// Returns the names with a forwarding entry at a node.
     pub fn forwarding(&self, node: NodeKey) -> Vec<Name> {
         self.nodes[node.0].running.iter().flat_map(|r| r.fib.keys().copied()).collect()
     }
 
-    /// The sinks in the forwarding entry of a name at a node.
+    /// Returns the sinks in the forwarding entry of a name at a node.
     pub fn forwarding_sinks(&self, node: NodeKey, name: &Name) -> Vec<SinkId> {
         let entry = self.nodes[node.0].running.as_ref().and_then(|r| r.fib.get(name));
         entry.map(|e| e.sinks.iter().map(|(sink, _)| *sink).collect()).unwrap_or_default()
     }
 
-    /// How far the owner of a name is from a node, in links; `None` without a route.
+    /// Returns the distance from a node to the owner of a name in links, or `None` without a route.
     pub fn distance(&self, node: NodeKey, name: &Name) -> Option<u8> {
         let (mut here, mut links) = (node, 0);
         loop {
@@ -751,8 +750,8 @@ impl World {
         }
     }
 
-    /// The neighbour on a node's route to a name: the node itself for its own; `None` without a route, or if
-    /// the link is not there any more.
+    /// Returns the neighbour on a node's route to a name, or the node itself for its own. Returns `None` without a route, or if
+    /// the link is gone.
     pub fn next_hop(&self, node: NodeKey, name: &Name) -> Option<NodeKey> {
         let running = self.nodes[node.0].running.as_ref()?;
         let (link, _) = running.router.route(name)?;
@@ -765,8 +764,8 @@ impl World {
         (self.wires[wire].carries && far.up && there.run == far.run).then_some(far.node)
     }
 
-    /// Follows the data of a name from every node and link; the nodes of the first circle found. Routes may go in a
-    /// circle for a moment, while routers hear of a change one after the other; data may not.
+    /// Follows the data of a name from every node and link. Returns the nodes of the first circle. Routes may loop for a moment,
+    /// while routers learn a change one after the other; data may not.
     pub fn circle(&self, name: &Name) -> Option<Vec<NodeKey>> {
         let mut done = BTreeSet::new();
         for start in self.nodes() {
@@ -807,28 +806,28 @@ impl World {
         circle
     }
 
-    /// Numbers of the messages of a topic that a node received, over all its runs, in order of arrival.
+    /// Returns the numbers of a topic's messages that a node received, over all its runs, in order of arrival.
     pub fn received(&self, node: NodeKey, owner: NodeKey, topic: &str) -> Vec<MessageId> {
-        let of_topic = |r: &&Received| (r.node, r.owner) == (node, owner) && r.topic == topic;
+        let of_topic = |r: &&ReceivedMessage| (r.node, r.owner) == (node, owner) && r.topic == topic;
         self.received.iter().filter(of_topic).map(|r| r.id).collect()
     }
 
-    /// Everything that was received.
-    pub fn all_received(&self) -> &[Received] {
+    /// Returns all received messages.
+    pub fn all_received(&self) -> &[ReceivedMessage] {
         &self.received
     }
 
-    /// Everything that was published.
-    pub fn all_published(&self) -> &[Published] {
+    /// Returns all published messages.
+    pub fn all_published(&self) -> &[PublishedMessage] {
         &self.published
     }
 
-    /// Everything that happened.
-    pub fn log(&self) -> &[Logged] {
+    /// Returns the whole log.
+    pub fn log(&self) -> &[LogEntry] {
         &self.log
     }
 
-    /// The frames that a node's router refused, as the keys of their reasons.
+    /// Returns the reasons for which a node's router refused frames, as keys.
     pub fn router_drops(&self, node: NodeKey) -> Vec<&'static str> {
         let of_node = self.log.iter().filter(|l| l.node == node);
         of_node
@@ -839,7 +838,7 @@ impl World {
             .collect()
     }
 
-    /// The packets that a node's data path refused.
+    /// Returns the reasons for which a node's data path refused packets.
     pub fn data_drops(&self, node: NodeKey) -> Vec<DataDrop> {
         let of_node = self.log.iter().filter(|l| l.node == node);
         of_node
@@ -850,7 +849,7 @@ impl World {
             .collect()
     }
 
-    /// Messages that a node was told it will never get.
+    /// Returns the number of messages that a node knows it will never get.
     pub fn lost(&self, node: NodeKey) -> u64 {
         let of_node = self.log.iter().filter(|l| l.node == node);
         let lost = of_node.filter_map(|l| match &l.what {
@@ -860,7 +859,7 @@ impl World {
         lost.sum()
     }
 
-    /// What was done to this world, for a failing test's output.
+    /// Returns the trace of actions on this world, for the output of a failing test.
     pub fn trace(&self) -> String {
         let mut text = format!("seed {}\n", self.config.seed);
         for line in &self.trace {
@@ -875,13 +874,13 @@ impl World {
         self.trace.push(format!("{:>10.3} {line}", at.as_secs_f64()));
     }
 
-    // ---- Within.
+    // ---- Internals.
 
     fn name_of(&self, owner: NodeKey, metadata: &Metadata) -> Name {
         let identity = self.identity(owner);
         match identity.fleet_secret() {
             Some(secret) => derive_name(secret, &identity.node_id(), metadata),
-            // A router owns nothing: a name that nobody has.
+            // A router owns no name, so this is one that does not exist.
             None => name_of(&identity.node_id(), &sgc_wire::Blind([0; 32])),
         }
     }
@@ -901,7 +900,7 @@ impl World {
         (wire, side.expect("the wire of both"))
     }
 
-    /// Connects a whole cable whose ends both run and are not connected.
+    /// Connects a cable that is not cut and whose ends run and are not connected.
     fn connect(&mut self, cable: usize) {
         let Cable { ends, whole, wire, .. } = &self.cables[cable];
         let ends = *ends;
@@ -927,7 +926,7 @@ impl World {
         }
     }
 
-    /// Ends a node. In good order what it sent last still arrives.
+    /// Ends a node. If it ends in order, its last frames still arrive.
     fn stop(&mut self, node: NodeKey, idle: Duration, in_order: bool) {
         let Node { running, frozen, .. } = &mut self.nodes[node.0];
         *frozen = None;
@@ -946,7 +945,7 @@ impl World {
         }
     }
 
-    /// Tells the far end, behind all that was sent before, that this end closed.
+    /// Tells the far end that this end closed, after all frames sent before.
     fn hang_up(&mut self, wire: usize, side: usize, superseded: bool) {
         self.wires[wire].ends[side].up = false;
         if self.wires[wire].carries {
@@ -968,7 +967,7 @@ impl World {
         self.queue.insert((at, self.queued), pending);
     }
 
-    /// When a frame sent now arrives: not before those sent earlier.
+    /// Returns the time at which a frame sent now arrives, which is not before earlier ones.
     fn arrival(&mut self, wire: usize, side: usize) -> Instant {
         let Wire { cable, ends, .. } = &mut self.wires[wire];
         let takes = self.cables[*cable].latency + self.dice.time(&self.config.jitter);
@@ -998,7 +997,7 @@ impl World {
         let ends = &self.wires[wire].ends;
         let (from, to) = (ends[side].node, ends[1 - side].node);
         if let Some(captured) = &mut self.captured {
-            captured.push(Captured { from, to, frame: frame.clone() });
+            captured.push(CapturedFrame { from, to, frame: frame.clone() });
         }
         if self.tracing == Tracing::Frames {
             self.note(format!("  {from:?} -> {to:?} {}", frame_text(frame)));
@@ -1025,7 +1024,7 @@ impl World {
             *copies.entry((wire, side, header.source, header.seq, header.index, header.to)).or_default() += 1;
         }
         if !packet.header.reliable && self.dice.chance(self.config.repeat_percent) {
-            // As datagrams are: once more, later, and past the order.
+            // Datagrams may be repeated, delayed and reordered.
             let late = self.cables[self.wires[wire].cable].latency * self.dice.below(4) as u32;
             let at = self.clock.instant() + late;
             self.queue(at, Pending::Packet { wire, to: 1 - side, packet: packet.clone() });
@@ -1038,7 +1037,7 @@ impl World {
         self.queue(at, Pending::Packet { wire, to: 1 - side, packet });
     }
 
-    /// Does the next thing that is due by `until`; false if there is none.
+    /// Handles the next event due by `until`. Returns `false` if there is none.
     fn step(&mut self, until: Instant) -> bool {
         let due = self.queue.first_key_value().map(|((at, _), _)| *at);
         let wake = self
@@ -1122,7 +1121,7 @@ impl World {
         }
     }
 
-    /// Drains a node and does what it wants done.
+    /// Drains a node and carries out its effects.
     pub(crate) fn settle(&mut self, node: NodeKey) {
         let now = self.now_at(node);
         let mut effects = VecDeque::new();
@@ -1161,7 +1160,7 @@ impl World {
             }
             Effect::Delivered { owner, topic, id, use_number } => {
                 let (at, run) = (self.clock.elapsed(), self.nodes[node.0].runs);
-                self.received.push(Received { id, at, node, run, use_number, owner, topic });
+                self.received.push(ReceivedMessage { id, at, node, run, use_number, owner, topic });
             }
             Effect::Trust(anchors) => self.nodes[node.0].anchors = Some(anchors),
             Effect::Log(what) => self.write_log(node, what),
@@ -1172,7 +1171,7 @@ impl World {
         if self.tracing != Tracing::Transitions {
             self.note(format!("  {node:?} {what:?}"));
         }
-        self.log.push(Logged { at: self.clock.elapsed(), node, what });
+        self.log.push(LogEntry { at: self.clock.elapsed(), node, what });
     }
 }
 

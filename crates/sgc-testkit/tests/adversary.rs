@@ -1,9 +1,9 @@
-//! Random honest networks beside an adversary: a router of another fleet and a member of the own one, who have recorded all
+//! Random honest networks beside an adversary: a router of another fleet and a member of the same one, which have recorded all
 //! signed frames of the network, work together, and draw hostile actions from a grammar.
 //!
-//! The adversary's links are slower than any honest way, so no way between two honest nodes leads over it while an honest one is
-//! there; what a router may do to those behind it is in `docs/explanation/security.md`. With such a way, no honest pair loses its route, its
-//! allowance or a reliable message. `SGC_SEEDS=100..2000` runs those seeds instead of the committed ones and says which fail.
+//! The adversary's links are slower than any honest path, so no path between two honest nodes leads over it while an honest one
+//! exists; `docs/explanation/security.md` says how a router can harm nodes behind it. With an honest path, no honest pair loses its route,
+//! its allowance or a reliable message. `SGC_SEEDS=100..2000` runs those seeds instead of the committed ones and lists failures.
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
@@ -25,7 +25,7 @@ use sgc_wire::{
 
 /// Seeds that every run of the tests replays.
 const COMMITTED: &[u64] = &[1, 2, 3, 4, 5, 6, 7, 8];
-/// Latency of the adversary's links, one way: more than any honest way.
+/// One-way latency of the adversary's links, more than that of any honest path.
 const SLOW: Duration = Duration::from_millis(450);
 /// Interval of the adversary's actions and of looks at the network.
 const TICK: Duration = Duration::from_millis(500);
@@ -58,26 +58,26 @@ enum Honest {
 /// An action of the adversary, over one of its links.
 #[derive(Clone, Copy, Debug)]
 enum Hostile {
-    /// Plays recorded frames again, the last ones or any.
+    /// Replays recorded frames, the last ones or any.
     Replay(usize, bool),
     ReplayPackets(usize),
-    /// Plays recorded announcements of one owner again and again, to spend what it may announce.
+    /// Replays recorded announcements of one owner, to use up its allowance.
     Siege(NodeKey),
     /// Changes a recorded frame a little, or a packet.
     Spoil,
-    /// Says unsigned things about names and sinks of others.
+    /// Sends unsigned frames about names and sinks of others.
     Pretend,
-    /// Keeps back what its machines say; says it later, the other way round.
+    /// Holds back frames of its machines and sends them later in reverse order.
     Withhold,
     Release,
     BeHonest,
     /// Advertises and withdraws names of its own, many or with strange numbers.
     Advertise(usize),
-    /// Says that it is next to everybody.
+    /// Claims links to all nodes.
     ClaimAll,
     Ask(usize),
     Join(usize),
-    /// Hands around lists that know less, or of another CA.
+    /// Distributes older lists, or lists of another CA.
     OldList,
     Restart,
 }
@@ -202,7 +202,7 @@ impl Run {
         }
     }
 
-    // ---- The honest.
+    // ---- Honest nodes.
 
     /// Two different members.
     fn pair(&mut self) -> (NodeKey, NodeKey) {
@@ -243,7 +243,7 @@ impl Run {
                 self.pass(Duration::from_secs(5), true);
             }
             Honest::RestartMember(node) | Honest::RestartRouter(node) => {
-                // Messages under way to a node that stops need not arrive.
+                // Messages in flight to a stopping node need not arrive.
                 self.pass(MESSAGE_MAX, true);
                 self.world.restart(node);
                 self.pass(GRACE, false);
@@ -271,7 +271,7 @@ impl Run {
         self.uses.iter().map(|(_, owner, topic)| (*owner, topic.clone())).collect()
     }
 
-    /// A member shares a topic that nobody knows yet, and another one has it soon: the owner's allowance is whole.
+    /// Shares a new topic of a member and checks that another gets it soon, so the owner's allowance is not used up.
     fn share_new(&mut self) {
         let (owner, user) = self.pair();
         let topic = format!("/t{}", self.topics);
@@ -317,7 +317,7 @@ impl Run {
         }
     }
 
-    /// A link of the adversary that is up; one that is not is made again now and then.
+    /// Returns a link of the adversary that is up. Links that are down are made again now and then.
     fn line(&mut self) -> Option<(NodeKey, NodeKey)> {
         let (rogue, honest) = self.dice.pick(&self.attached)?;
         if self.world.is_linked(rogue, honest) {
@@ -382,7 +382,7 @@ impl Run {
         }
     }
 
-    /// Goes on with a siege.
+    /// Continues a siege.
     fn besiege(&mut self) {
         for captured in &self.world.captured()[self.announced_to..] {
             let is_announcement =
@@ -403,7 +403,7 @@ impl Run {
         }
     }
 
-    /// A signed frame that crossed any link, one of the last or any.
+    /// Returns a recorded signed frame, one of the last or any.
     fn recorded(&mut self, last: bool) -> Option<Control> {
         let all = self.world.captured();
         let from = if last { all.len().saturating_sub(200) } else { 0 };
@@ -441,7 +441,7 @@ impl Run {
         }
     }
 
-    /// An unsigned frame about what is others'.
+    /// Returns an unsigned frame about names or sinks of others.
     fn pretence(&mut self) -> Option<Control> {
         let uses: Vec<_> = self.uses.iter().cloned().collect();
         let (_, owner, topic) = uses.get(self.dice.below(uses.len().max(1)))?.clone();
@@ -527,7 +527,7 @@ impl Run {
         }
     }
 
-    /// A request of its own for a topic that it may not have.
+    /// Returns a join of its own for a topic that it may not have.
     fn join(&mut self, rogue: NodeKey) -> Option<Control> {
         let uses: Vec<_> = self.uses.iter().cloned().collect();
         let (_, owner, topic) = uses.get(self.dice.below(uses.len().max(1)))?.clone();
@@ -561,9 +561,9 @@ impl Run {
         Control::Crl { der }
     }
 
-    // ---- What must hold.
+    // ---- Invariants.
 
-    /// Lets time pass while the adversary acts; looks at what must hold, unless an honest node has just gone away.
+    /// Lets time pass while the adversary acts. Checks the invariants, unless an honest node has just gone away.
     fn pass(&mut self, time: Duration, strictly: bool) {
         let end = self.world.elapsed() + time;
         while self.world.elapsed() < end {
@@ -600,7 +600,7 @@ impl Run {
         }
     }
 
-    /// No honest node is refused anything by another one for want of an allowance, or held for a liar.
+    /// Checks that no honest node refuses another for lack of an allowance or as a liar.
     fn check_log(&mut self) {
         let honest: BTreeSet<_> = self
             .members
@@ -631,7 +631,7 @@ impl Run {
         self.looked_at = log.len();
     }
 
-    /// Reliable messages arrive in time, each once.
+    /// Checks that reliable messages arrive in time and once.
     fn check_messages(&mut self) {
         let now = self.world.elapsed();
         let due: Vec<_> =
@@ -664,7 +664,7 @@ impl Run {
     }
 }
 
-/// The same with a bit of body or signature changed.
+/// Returns the frame with one bit of body or signature changed.
 fn spoilt(frame: Control) -> Control {
     let spoil = |signed: SignedBody| {
         let mut body = signed.body.to_vec();

@@ -1,10 +1,10 @@
-//! What those who are in the network but not to be trusted try, and what comes of it: nothing, and it is counted.
+//! Attacks of untrusted nodes inside the network. Each achieves nothing and is counted.
 
 use std::time::Duration;
 
 use bytes::Bytes;
 use sgc_endpoint::{Event, JoinStatus, RefusedBy};
-use sgc_testkit::{Captured, DataDrop, Member, NodeKey, Sharing, What, World, identity};
+use sgc_testkit::{CapturedFrame, DataDrop, Member, NodeKey, Sharing, What, World, identity};
 use sgc_trust::{Identity, Suite};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Class, Control, Decode, JoinBody, NodeId, Packet, PacketHeader,
@@ -15,8 +15,7 @@ const fn ms(n: u64) -> Duration {
     Duration::from_millis(n)
 }
 
-/// A robot, two routers and an operator in a line, and a member of the fleet at the first router who is up to
-/// no good.
+/// A robot, two routers and an operator in a line, and a malicious member of the fleet at the first router.
 struct Scene {
     world: World,
     arm: NodeKey,
@@ -48,9 +47,9 @@ fn assert_flows(scene: &mut Scene) {
     assert_eq!(world.received(*desk, *arm, "/chatter").last(), Some(&id), "{}", world.trace());
 }
 
-/// The last frame from one node to another that `is` the one.
+/// Returns the last frame from one node to another for which `is` holds.
 fn last(world: &World, from: NodeKey, to: NodeKey, is: impl Fn(&Control) -> bool) -> Control {
-    let of_link = |c: &&Captured| (c.from, c.to) == (from, to) && is(&c.frame);
+    let of_link = |c: &&CapturedFrame| (c.from, c.to) == (from, to) && is(&c.frame);
     world.captured().iter().rev().find(of_link).expect("such a frame was sent").frame.clone()
 }
 
@@ -67,7 +66,7 @@ fn altered(signed: &SignedBody) -> SignedBody {
     SignedBody { body: signed.body.clone(), signature: signature.into() }
 }
 
-/// How many frames or packets a node refused for that reason.
+/// Returns the number of frames or packets that a node refused for that reason.
 fn drops(world: &World, node: NodeKey, key: &str) -> usize {
     world.router_drops(node).iter().filter(|d| **d == key).count()
 }
@@ -82,7 +81,7 @@ fn a_proxy_cannot_advertise_anothers_names() {
     world.run(ms(500));
     assert_eq!(drops(world, *east, "not_owner"), 1);
     assert_eq!(world.next_hop(*east, &world.name(*arm, "/chatter")), Some(*arm));
-    // Nor when the owner is away, nor from farther than its own node.
+    // The same holds while the owner is away, and from farther than its own node.
     world.crash(*arm);
     world.run(ms(500));
     world.inject(*mallory, *east, &advert);
@@ -169,8 +168,7 @@ fn a_withdrawn_advertisement_cannot_be_replayed() {
     assert_eq!(world.distance(east, &world.name(arm, "/chatter")), None);
 }
 
-/// The answers that `west` passes on to the operator are replaced by what `forge` makes of them; nothing is
-/// granted on their word.
+/// Replaces the answers that `west` passes on to the operator by the results of `forge`, and checks that none is granted.
 fn check_forged_answers(seed: u64, forge: impl Fn(AnswerBody) -> SignedBody + 'static) {
     let mut scene = scene(seed);
     let Scene { world, arm, west, desk, .. } = &mut scene;
@@ -224,7 +222,7 @@ fn a_grant_for_another_request_does_not_open() {
     let mut scene = scene(7);
     assert_flows(&mut scene);
     let Scene { world, west, desk, arm, .. } = &mut scene;
-    // The owner's own answer to an earlier request, played again to a later one.
+    // A replay of the owner's answer to an earlier request.
     let old = last(world, *west, *desk, |f| matches!(f, Control::Answer { .. }));
     let granted =
         |w: &World| w.log().iter().filter(|l| matches!(l.what, What::Event(Event::Granted { .. }))).count();
@@ -294,7 +292,7 @@ fn a_node_of_another_fleet_is_refused_by_routers_and_owner() {
 }
 
 #[test]
-fn who_asks_to_publish_is_told_that_it_is_not_offered() {
+fn request_to_publish_is_refused_where_it_is_not_offered() {
     let mut scene = scene(10);
     assert_flows(&mut scene);
     let Scene { world, arm, west, desk, .. } = &mut scene;
@@ -322,7 +320,7 @@ fn a_captured_join_does_not_move_or_take_a_sinks_place() {
     let Control::Join { signed } = &captured else { unreachable!("picked as one") };
     let sink = JoinBody::from_slice(&signed.body).unwrap().sink;
     world.inject(*mallory, *east, &captured);
-    // A join of its own under the same sink id is no better.
+    // A join of its own under the same sink id does not help either.
     let own = join(world.identity(*mallory), world, *arm, sink, Role::Subscribe);
     world.inject(*mallory, *east, &own);
     world.inject(*mallory, *east, &Control::Leave { name, sink });
@@ -391,7 +389,7 @@ fn data_that_a_router_forges_reaches_the_sink_and_no_further() {
     world.inject_packet(*west, *desk, unknown.clone());
     world.run(ms(500));
     assert_eq!(world.data_drops(*desk), [why; 2].map(DataDrop::Sink));
-    // Of an epoch that is not known yet: it waits for a grant that explains it, in little room.
+    // Packets of an unknown epoch wait for its grant, within a small bound.
     unknown.header.epoch = 2;
     for _ in 0..sgc_endpoint::PARKED_PACKETS_MAX {
         world.inject_packet(*west, *desk, unknown.clone());
@@ -448,7 +446,7 @@ fn frames_before_the_greeting_and_a_second_greeting_close_the_link() {
     let hello = last(&world, mallory, east, |f| matches!(f, Control::Hello(_)));
     world.inject(mallory, east, &hello);
     world.run(ms(500));
-    let closed = |l: &&sgc_testkit::Logged| {
+    let closed = |l: &&sgc_testkit::LogEntry| {
         l.node == east && matches!(l.what, What::Closed { reason: sgc_router::LinkClose::Greeting })
     };
     assert_eq!(world.log().iter().filter(closed).count(), 1);

@@ -1,4 +1,4 @@
-//! What owners, users and routers live through: starts and ends in every order, cuts, leases, histories.
+//! The life of owners, users and routers: starts and ends in every order, cuts, leases, histories.
 
 use std::time::Duration;
 
@@ -31,7 +31,7 @@ fn line_with(config: WorldConfig) -> Line {
     Line { world, arm, cloud, desk }
 }
 
-/// The same with `/chatter` shared with the fleet, used by the operator, and flowing.
+/// A robot, a router and an operator in a line, with `/chatter` flowing from robot to operator.
 fn flowing(seed: u64) -> Line {
     let mut line = line(seed);
     line.world.share(line.arm, "/chatter", Sharing::to_fleet());
@@ -40,7 +40,7 @@ fn flowing(seed: u64) -> Line {
     line
 }
 
-/// `/chatter` of `owner` comes through to `user`, once.
+/// Checks that `/chatter` of `owner` reaches `user` once.
 fn assert_flows(world: &mut World, owner: NodeKey, user: NodeKey) {
     world.until_granted(user, owner, "/chatter");
     world.run(ms(500));
@@ -151,7 +151,7 @@ fn a_restarted_neighbour_supersedes_its_old_link_at_once() {
     world.run(ms(10));
     world.start(arm);
     world.run(ms(500));
-    let closed = |l: &&sgc_testkit::Logged| {
+    let closed = |l: &&sgc_testkit::LogEntry| {
         l.node == cloud
             && matches!(l.what, What::Closed { reason: LinkClose::Superseded { alive: false, .. } })
     };
@@ -160,7 +160,7 @@ fn a_restarted_neighbour_supersedes_its_old_link_at_once() {
 
 #[test]
 fn greetings_of_two_runs_that_cross_leave_the_newer_link() {
-    // The old run's greeting is still under way when the new run's arrives.
+    // The old run's greeting is still in flight when the new run's arrives.
     let mut config = WorldConfig::new(0);
     config.jitter = ms(0)..=ms(60);
     for seed in 0..40 {
@@ -187,7 +187,7 @@ fn clean_shutdown_withdraws_names_at_once() {
     });
     assert!(at - begin < ms(300), "{:?}", at - begin);
     world.run(ms(500));
-    // What is left is the operator's own catalogue.
+    // Only the operator's own catalogue is left.
     let stats = world.stats(cloud);
     assert_eq!((stats.routed_names, stats.branches, stats.tombstones), (1, 0, 2));
     assert_eq!(world.status(desk, arm, "/chatter"), Some(JoinStatus::Waiting));
@@ -214,7 +214,7 @@ fn an_owner_that_falls_silent_is_forgotten_when_its_lease_ends() {
 }
 
 #[test]
-fn who_is_not_listed_is_refused_with_the_reason_and_sees_nothing() {
+fn unlisted_node_is_refused_with_reason_and_sees_nothing() {
     let Line { mut world, arm, desk, .. } = line(7);
     world.share(arm, "/secret", Sharing::to(&[arm]));
     world.share(arm, "/chatter", Sharing::to(&[desk]));
@@ -312,7 +312,7 @@ fn a_late_joiner_gets_the_history_once_also_when_the_way_breaks() {
     world.run(ms(500));
     world.crash(cloud);
     world.run(ms(500));
-    // Nobody carries this one; the history does, once there is a way again.
+    // No path carries this message. It comes from the history once there is a path again.
     published.push(world.publish(arm, "/map"));
     world.run(ms(500));
     world.start(cloud);
@@ -450,7 +450,7 @@ fn a_ring_survives_the_loss_of_each_router_that_is_not_the_only_way() {
 
 #[test]
 fn a_flow_moves_to_a_shorter_way_and_back_without_a_circle() {
-    // A new topic advertised together with an old one must not tell neighbours what is not so of the old one.
+    // The advertisement of a new topic together with an old one must not say anything false about the old one.
     let Ring { mut world, arm, desk, routers: [north, _, south, _], .. } = ring(26);
     for round in 0..4 {
         world.cut(north, south);
@@ -519,7 +519,7 @@ fn a_flow_moves_to_a_shorter_way_without_a_gap() {
         world.run(ms(500));
         let received = world.received(desk, arm, "/chatter");
         assert_eq!(received[received.len() - published.len()..], published, "{}", world.trace());
-        assert_eq!(Model::of(&world).check(&world), Ok(()), "{}", world.trace());
+        assert_eq!(Model::from_world(&world).check(&world), Ok(()), "{}", world.trace());
     }
 }
 
@@ -543,7 +543,7 @@ fn an_owner_cut_off_from_a_ring_is_lost_at_once_without_counting_up() {
 }
 
 #[test]
-fn whoever_is_granted_is_near_enough_for_data_and_the_rest_has_no_route() {
+fn only_nodes_within_hop_limit_are_granted_and_others_have_no_route() {
     let mut world = World::new(40);
     let arm = world.proxy("arm-1");
     let mut chain = vec![arm];
@@ -642,7 +642,7 @@ fn routes_beyond_a_proxys_limit_are_refused_and_others_unharmed() {
     world.use_topic(desk, arm, "/chatter");
     assert_flows(&mut world, arm, desk);
     assert!(world.router_drops(cloud).contains(&"limit"));
-    // Three of the greedy one, two of the robot, one of the operator.
+    // Three names of the greedy node, two of the robot, one of the operator.
     assert_eq!(world.stats(cloud).routed_names, 3 + 2 + 1);
     world.run(ms(50_000));
     assert_eq!(world.stats(cloud).routed_names, 3 + 2 + 1, "renewals do not get around it");
@@ -661,7 +661,7 @@ fn interests_beyond_a_links_limit_are_refused_and_others_unharmed() {
     world.inject(desk, cloud, &sgc_wire::Control::Interest { names });
     world.run(ms(500));
     assert_eq!(world.router_drops(cloud).iter().filter(|d| **d == "limit").count(), 1);
-    // Two names of the robot, one of the operator, and two that were asked for and nobody has.
+    // Two names of the robot, one of the operator, and two requested names that do not exist.
     assert_eq!(world.stats(cloud).names, 3 + 2);
     assert_flows(&mut world, arm, desk);
 }
@@ -681,5 +681,5 @@ fn a_slow_owner_is_given_up_in_time_and_asked_again() {
     world.thaw(arm);
     assert_flows(&mut world, arm, desk);
     world.run(ms(20_000));
-    assert_eq!(Model::of(&world).check(&world), Ok(()));
+    assert_eq!(Model::from_world(&world).check(&world), Ok(()));
 }

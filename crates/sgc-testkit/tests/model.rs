@@ -1,8 +1,8 @@
 //! Random networks and random histories against the reference model.
 //!
-//! A seed decides topology and transitions. After each burst of them the network is left alone until it is what
-//! [`Model`] says, within a bound; then messages are published and must reach exactly those who are granted.
-//! `SGC_SEEDS=100..2000` runs those seeds instead of the committed ones and says which fail.
+//! A seed decides topology and transitions. After each burst of them the network is left alone until it matches [`Model`],
+//! within a bound. Then messages are published and must reach exactly the granted nodes.
+//! `SGC_SEEDS=100..2000` runs those seeds instead of the committed ones and lists failures.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -25,7 +25,7 @@ const COMMITTED: &[u64] = &[
 /// was wrong or not heard of during a partition. All else takes seconds.
 const QUIET_MAX: Duration = Duration::from_secs(330);
 const IDLE_MAX: Duration = Duration::from_secs(10);
-/// How long the word that a right has ended may take to the farthest router.
+/// Longest time until the farthest router knows that a right has ended.
 const LAPSE_MAX: Duration = Duration::from_secs(2);
 const TOPICS: [&str; 3] = ["/a", "/b", "/c"];
 
@@ -36,7 +36,7 @@ const fn ms(n: u64) -> Duration {
 /// Everything that can happen to a network of honest nodes.
 #[derive(Clone, Debug)]
 enum Transition {
-    /// A wall clock is off by so many seconds, until all is quiet.
+    /// A wall clock is off by so many seconds until the network is at rest.
     Clock(NodeKey, i64),
     Crash(NodeKey),
     CrashUnseen(NodeKey, Duration),
@@ -46,7 +46,7 @@ enum Transition {
     Rejoin(NodeKey, NodeKey),
     Reshare(NodeKey, &'static str, Sharing),
     Restart(NodeKey),
-    /// With nothing that it had on disk.
+    /// A start without its state on disk.
     RestartWiped(NodeKey),
     Revoke(NodeKey, NodeKey),
     /// A proxy leaves one router for another.
@@ -69,7 +69,7 @@ fn sharing(dice: &mut Dice, other: NodeKey) -> Sharing {
     }
 }
 
-/// A network under test and what the test knows of it.
+/// A network under test, and the test's knowledge of it.
 struct Run {
     world: World,
     dice: Dice,
@@ -77,16 +77,16 @@ struct Run {
     cables: Vec<(NodeKey, NodeKey)>,
     cut: BTreeSet<(NodeKey, NodeKey)>,
     shared: BTreeMap<(NodeKey, &'static str), Sharing>,
-    /// Who may get what: permitted when it was published, shortly before, or while it was history.
+    /// The nodes that may get each message: permitted when it was published, shortly before, or while it was history.
     permitted: BTreeMap<MessageId, BTreeSet<NodeKey>>,
-    /// Who lost a right a moment ago, and until when that may not be known everywhere: what goes to others may
-    /// overtake the word of it.
+    /// The nodes that just lost a right, and the time until which routers may not know it: messages to other nodes may overtake
+    /// the news.
     lapsing: Vec<(NodeKey, &'static str, BTreeSet<NodeKey>, Duration)>,
     revoked: Vec<NodeKey>,
     routers: Vec<NodeKey>,
     /// Nodes whose clocks are wrong.
     wrong_clocks: BTreeSet<NodeKey>,
-    /// True once any was.
+    /// Set once any clock was changed.
     clocks: bool,
     slowest: Duration,
 }
@@ -160,7 +160,7 @@ impl Run {
         }
     }
 
-    /// A transition that is possible now; `None` if the one drawn is not.
+    /// Draws a transition. Returns `None` if it is not possible now.
     fn draw(&mut self) -> Option<Transition> {
         let dice = &mut self.dice;
         let world = &self.world;
@@ -299,7 +299,7 @@ impl Run {
         self.permitted.insert(id, permitted);
     }
 
-    /// Remembers who has what rights now, since someone is about to lose some.
+    /// Records the present rights before a node loses some.
     fn note_lapsing(&mut self) {
         let until = self.world.elapsed() + LAPSE_MAX;
         for (node, topic) in self.shared.keys().copied().collect::<Vec<_>>() {
@@ -312,7 +312,7 @@ impl Run {
         self.note_lapsing();
         self.world.reshare(node, topic, sharing.clone());
         self.shared.insert((node, topic), sharing);
-        // Who may have the topic may have its history.
+        // A node that may have the topic may have its history.
         let permitted = Model::permitted(&self.world, node, topic);
         let published = self.world.all_published().iter();
         for p in published.filter(|p| p.owner == node && p.topic == topic) {
@@ -323,7 +323,7 @@ impl Run {
     fn revoke(&mut self, thief: NodeKey, at: NodeKey) {
         self.note_lapsing();
         self.revoked.push(thief);
-        // Two copies of the fleet's file revoke by turns, and neither knows what the other one did.
+        // Two copies of the fleet file revoke in turns without knowing of each other.
         let last = self.revoked.len() - 1;
         let of_copy = self.revoked.iter().enumerate().filter(|(n, _)| n % 2 == last % 2);
         let members: Vec<_> = of_copy.map(|(_, node)| self.world.member(*node).clone()).collect();
@@ -332,7 +332,7 @@ impl Run {
         self.world.hand_crl(at, &list);
     }
 
-    /// Lets time pass and looks for circles now and then.
+    /// Lets time pass and checks for circles now and then.
     fn pass(&mut self, time: Duration) {
         let end = self.world.elapsed() + time;
         while self.world.elapsed() < end {
@@ -353,25 +353,25 @@ impl Run {
         }
     }
 
-    /// Waits until all is as the model says, then checks that messages go where they should.
+    /// Waits until the network matches the model, then checks that messages reach the right nodes.
     fn quiet(&mut self) {
         for node in std::mem::take(&mut self.wrong_clocks) {
             self.world.set_ahead(node, Duration::ZERO);
         }
         let begin = self.world.elapsed();
-        // What nobody noticed yet may look as it should.
+        // A change that no node has noticed yet must not pass for a settled state.
         self.pass(IDLE_MAX + ms(500));
-        let mut model = Model::of(&self.world);
+        let mut model = Model::from_world(&self.world);
         while let Err(why) = model.check(&self.world) {
             let waited = self.world.elapsed() - begin;
             assert!(waited < QUIET_MAX, "after {waited:?} of quiet: {why}");
             self.pass(ms(500));
-            model = Model::of(&self.world);
+            model = Model::from_world(&self.world);
         }
         let took = self.world.elapsed() - begin;
         self.slowest = self.slowest.max(took);
         self.world.note(format!("quiet after {took:?}"));
-        // A sink holds what it was granted a moment before the data path and its history follow.
+        // A sink has its grant a moment before its data path and history.
         self.pass(ms(2500));
         let mut expected = BTreeMap::new();
         self.world.count_copies();
@@ -405,11 +405,11 @@ impl Run {
         self.check_log();
     }
 
-    /// Whoever has a transient-local topic has the last messages of its source.
+    /// Checks that each subscriber of a transient-local topic has the last messages of its source.
     fn check_histories(&self, model: &Model) {
         let world = &self.world;
         for ((owner, topic), sharing) in &self.shared {
-            let of_topic = |p: &&sgc_testkit::Published| p.owner == *owner && p.topic == *topic;
+            let of_topic = |p: &&sgc_testkit::PublishedMessage| p.owner == *owner && p.topic == *topic;
             let Some(last) = world.all_published().iter().rev().find(of_topic) else { continue };
             let current = world.all_published().iter().filter(of_topic).filter(|p| p.source == last.source);
             let mut history: Vec<_> = current.map(|p| p.id).collect();
@@ -428,7 +428,7 @@ impl Run {
         }
     }
 
-    /// Nothing is delivered twice, or to one who was not permitted.
+    /// Checks that no message is delivered twice or to a node without permission.
     fn check_deliveries(&self) {
         let mut seen = BTreeSet::new();
         for r in self.world.all_received() {
@@ -437,7 +437,7 @@ impl Run {
         }
     }
 
-    /// Of each source a use gets the messages in order, from the first that it got on, and leaves out none.
+    /// Checks that a use gets the messages of each source in order and without gaps from the first one on.
     fn check_order(&self) {
         let published = self.world.all_published();
         let mut numbers = BTreeMap::new();
@@ -457,7 +457,7 @@ impl Run {
         }
     }
 
-    /// Honest nodes give each other no reason for suspicion, unless their clocks are wrong.
+    /// Checks that honest nodes do not suspect each other, unless their clocks are wrong.
     fn check_log(&self) {
         let clock = |why: &SignedError| self.clocks && matches!(why, SignedError::Clock { .. });
         for logged in self.world.log() {
@@ -468,7 +468,7 @@ impl Run {
                         DropReason::Unknown { .. }
                         | DropReason::WrongWay { .. }
                         | DropReason::Stale { .. }
-                        // Passed on by those who have not heard of it.
+                        // Nodes that do not know of it yet pass it on.
                         | DropReason::NotVerified { why: SignedError::Cert(CertError::Revoked { .. }), .. }
                     ) || match &dropped.reason {
                         DropReason::Clock { .. } => self.clocks,
@@ -484,7 +484,7 @@ impl Run {
                 },
                 What::DataDrop { why, .. } => match why {
                     DataDrop::HopLimit | DataDrop::Sink(SinkDrop::Head | SinkDrop::Inconsistent) => false,
-                    // Of an owner that started anew.
+                    // Packets of an earlier run of the owner.
                     DataDrop::Sink(SinkDrop::Open(why)) => {
                         matches!(why, OpenError::Forged | OpenError::Epoch { .. })
                     }
@@ -496,7 +496,7 @@ impl Run {
         }
     }
 
-    /// Once all owners and users are gone, nothing of them is left in any router.
+    /// Checks that no router keeps state of owners and users once all are gone.
     fn end(&mut self) {
         for node in self.members.clone() {
             match self.dice.below(3) {

@@ -1,5 +1,5 @@
-//! Paths between real sockets: what was asked for is what they meet. Times are never asserted from above: this machine
-//! may be busy.
+//! Tests that paths between real sockets have their configured properties. No test asserts an upper bound of time, because the
+//! machine may be busy.
 
 #![allow(clippy::unwrap_used)]
 
@@ -13,7 +13,7 @@ use sgc_testkit::netsim::{
 };
 
 const PATIENCE: Duration = Duration::from_secs(30);
-/// How long nothing must come for it to count as lost, once the relay has counted all.
+/// Time without a datagram after which it counts as lost, once the relay has counted all.
 const SILENCE: Duration = Duration::from_millis(200);
 
 fn any_port() -> SocketAddr {
@@ -61,7 +61,7 @@ fn rebinding_changes_the_port_that_is_seen() {
     client.send(b"1").unwrap();
     let before = receive(&server).1;
     relay.rebind();
-    // The first may still go by the old port.
+    // The first datagram may still use the old port.
     let deadline = Instant::now() + PATIENCE;
     let after = loop {
         client.send(b"2").unwrap();
@@ -91,7 +91,7 @@ fn a_cut_path_passes_nothing_until_it_is_restored() {
 }
 
 #[test]
-fn what_a_relay_loses_is_counted() {
+fn relay_counts_lost_datagrams() {
     let profile = Profile { loss: Loss::Random(0.5), ..Profile::default() };
     let (relay, client, server) = udp_path(profile);
     for _ in 0..200 {
@@ -173,7 +173,7 @@ fn end(namespace: &Namespace, address: &str) -> TunEnd {
     }
 }
 
-/// One test, since it takes a namespace for each end: a path that all sockets meet, changed while it runs.
+/// Tests a path between two namespaces that changes while it runs, in one test because of the cost of namespaces.
 #[test]
 fn sockets_in_two_namespaces_meet_the_path() {
     if let Err(why) = on_host() {
@@ -209,7 +209,7 @@ fn sockets_in_two_namespaces_meet_the_path() {
         assert!(begun.elapsed() >= 2 * delay, "faster than the path");
     }
 
-    // Kernel TCP recovers from what the path loses; a megabyte, both ends checked.
+    // Kernel TCP recovers from loss on the path. Both ends check a megabyte.
     let lossy = Profile { loss: Loss::Random(0.02), ..Profile::default() };
     Direction::BOTH.into_iter().for_each(|direction| path.set(direction, lossy));
     let listener = right.within(|| TcpListener::bind("10.93.0.2:7001").unwrap()).unwrap();

@@ -1,4 +1,4 @@
-//! Ways that break and heal while a reliable topic flows: every message, once, in order.
+//! Paths break and heal while a reliable topic flows. Every message arrives once and in order.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -8,14 +8,14 @@ use sgc_trust::Suite;
 use sgc_wire::{Control, Recover};
 
 const TOPIC: &str = "/chatter";
-/// From a cut until all is made good: as long as the longest wait for another way.
+/// Longest recovery after a cut: the longest wait for another path.
 const HEALED: Duration = Duration::from_secs(30);
 
 const fn ms(n: u64) -> Duration {
     Duration::from_millis(n)
 }
 
-/// A robot behind `north`, operators behind `south`, and two ways between, over `east` and `west`.
+/// A robot behind `north`, operators behind `south`, and two paths between them, over `east` and `west`.
 struct Diamond {
     world: World,
     arm: NodeKey,
@@ -39,7 +39,7 @@ fn diamond_with(config: WorldConfig, users: usize, sharing: Sharing) -> Diamond 
         world.link(a, b);
     }
     let users: Vec<_> = (0..users).map(|n| world.proxy(&format!("desk-{n}"))).collect();
-    // Without signatures, which take most of the time and change nothing here.
+    // Without signatures, which would take most of the time and do not matter here.
     world.share(arm, TOPIC, Sharing { suite: Some(Suite::Group), ..sharing });
     for user in &users {
         world.link(south, *user);
@@ -62,12 +62,12 @@ impl Diamond {
         }
     }
 
-    /// The router between `north` and `south` that the topic flows over.
+    /// Returns the router between `north` and `south` over which the topic flows.
     fn used(&self) -> NodeKey {
         self.world.next_hop(self.south, &self.world.name(self.arm, TOPIC)).expect("it flows")
     }
 
-    /// Waits until every user has everything; then each has it once and in order.
+    /// Waits until every user has all messages, and checks that each has them once and in order.
     fn assert_all(&mut self) {
         let Self { world, arm, users, published, .. } = self;
         let has_all = |w: &World, user: NodeKey| w.received(user, *arm, TOPIC).len() >= published.len();
@@ -83,7 +83,7 @@ impl Diamond {
     }
 }
 
-/// What may happen to the way, at both ends seen at once or late.
+/// Breaks the path in one of several ways, which its ends see at once or late.
 fn breaks(diamond: &mut Diamond, how: usize) {
     let (used, north, south) = (diamond.used(), diamond.north, diamond.south);
     let world = &mut diamond.world;
@@ -158,7 +158,7 @@ fn the_last_messages_before_a_silence_arrive_over_another_way() {
         for sharing in [Sharing::to_fleet(), Sharing::to_fleet().transient_local(1)] {
             let mut diamond = diamond(140 + how as u64, 2, sharing);
             diamond.publish(ms(5), ms(200), 8);
-            // What is on the way is lost with it, and nothing follows.
+            // Packets in flight are lost with the path, and no later message follows.
             breaks(&mut diamond, how);
             diamond.publish(ms(1), ms(3), 8);
             diamond.assert_all();
@@ -199,7 +199,7 @@ fn the_way_of_the_owner_itself_may_break() {
 }
 
 #[test]
-fn what_the_source_keeps_no_more_is_counted_and_the_rest_goes_on() {
+fn expired_messages_are_counted_as_lost_and_the_rest_goes_on() {
     let mut diamond = diamond(170, 2, Sharing::to_fleet().recovering(20));
     diamond.publish(ms(10), ms(200), 8);
     diamond.world.run(ms(200));
@@ -215,7 +215,7 @@ fn what_the_source_keeps_no_more_is_counted_and_the_rest_goes_on() {
     assert!(received.is_sorted(), "in order");
     let (missing, lost) = (published.len() - received.len(), world.lost(user));
     assert!(missing > 50 && lost >= missing as u64, "{missing} missing, {lost} told");
-    // A number or two of those are marks.
+    // One or two of the numbers are marks.
     assert!(lost <= missing as u64 + 10, "{missing} missing, {lost} told");
     let gap: Vec<_> = published.iter().filter(|id| !received.contains(id)).collect();
     assert_eq!(gap.len() as u64, gap[gap.len() - 1].0 - gap[0].0 + 1, "one gap");
@@ -263,7 +263,7 @@ fn a_way_that_changes_sends_no_history_twice() {
     assert_eq!(replayed, 0, "nothing was lost");
 }
 
-/// Who was not there is sent nothing of a volatile topic, whatever it asks for, on whatever way.
+/// A late subscriber of a volatile topic gets no earlier message, whatever it asks for and over whatever path.
 #[test]
 fn nothing_older_than_the_grant_is_sent_again() {
     let mut diamond = diamond(210, 1, Sharing::to_fleet());
@@ -296,7 +296,7 @@ fn nothing_older_than_the_grant_is_sent_again() {
     ask(world);
     let all = sent(world);
     assert!(all.keys().all(|seq| *seq == 0 || *seq > 20) && all[&0] == 3, "{all:?}");
-    // What is published from then on it may have again, also on another way.
+    // It may get later messages again, also over another path.
     let first = world.publish(*arm, TOPIC);
     world.run(ms(300));
     for _ in 0..2 {

@@ -1,8 +1,8 @@
-//! The tree protocol, checked: every interleaving of joins, answers, leaves, rejects and reroutes with changes of
+//! Checks the tree protocol in every interleaving of joins, answers, leaves, rejects and reroutes with changes of
 //! next hops and links, within bounds.
 //!
-//! This is a model of the protocol of `docs/spec/routing.md`, not the router machine: what it says of the protocol it
-//! does not say of the code. `docs/spec/tree-model.md` tells what is modelled, what must hold, and what is left out.
+//! This is a model of the protocol of `docs/spec/routing.md`, not the router machine: it proves properties of the protocol and
+//! not of the code. `docs/spec/tree-model.md` describes the model, its properties and its omissions.
 //! `make model-check` runs the larger bounds.
 
 #![allow(clippy::print_stdout, reason = "how much was looked at is for who runs it with --nocapture")]
@@ -18,8 +18,8 @@ type Id = u8;
 
 /// The node of the owner, to which all trees lead.
 const OWNER: Node = 0;
-/// Requests that each sink has once things are settled, on top of those before. More than it needs, so that a sink that
-/// runs out of them shows that it gets nowhere.
+/// Additional requests of each sink after the state settles. They are more than it needs, so a sink that uses them up makes no
+/// progress.
 const SETTLED_REQUESTS: u8 = 4;
 
 const NO_GRANTED_CIRCLE: &str = "granted branches, whatever is fed to whom, are no circle";
@@ -79,7 +79,7 @@ enum Kind {
     Reroute,
 }
 
-/// A control frame under way. Frames over one wire to one node stay in order.
+/// A control frame in flight. Frames over one wire to one node stay in order.
 #[derive(Clone, PartialEq, Eq, Hash)]
 struct Frame {
     wire: Wire,
@@ -94,22 +94,22 @@ impl Debug for Frame {
     }
 }
 
-/// A wire comes up once and goes down once. Two nodes that find each other again do so over another wire.
+/// The state of a wire, which comes up once and goes down once. Two nodes that link again use another wire.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 enum WireState {
     Fresh,
     Up,
-    /// Down, and which of its ends have seen that.
+    /// The wire is down. The flags say which ends have seen that.
     Down([bool; 2]),
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 struct Sink {
-    /// The present request, and whether it was granted.
+    /// The present request, and its grant.
     now: Option<(Id, bool)>,
-    /// The one before, on which the sink stays until the present one is granted.
+    /// The previous request, on which the sink stays until the present one is granted.
     before: Option<Id>,
-    /// It wants nothing any more.
+    /// The sink has left.
     stopped: bool,
 }
 
@@ -119,7 +119,7 @@ impl Sink {
     }
 }
 
-/// What may still happen before things settle.
+/// The events that may still happen before the state settles.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 struct Budget {
     hops: u8,
@@ -139,9 +139,9 @@ struct State {
     /// Each router's next hop towards the owner.
     hops: Vec<Option<Port>>,
     sinks: Vec<Sink>,
-    /// Which sink each id was made for.
+    /// The sink for which each id was made.
     ids: Vec<u8>,
-    /// At which node which port is fed from where.
+    /// The feeding wire of each port at each node.
     fed: BTreeMap<(Node, Port), Port>,
     left: Budget,
     /// No more changes, but next hops become right.
@@ -150,16 +150,16 @@ struct State {
     granted_again: bool,
 }
 
-/// Which data a router passes on.
+/// The rule by which a router passes on data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Feed {
-    /// What any granted or draining branch says.
+enum FeedRule {
+    /// Data from any granted or draining branch.
     EveryBranch,
-    /// The same, but nothing over a wire that is itself the way up of a branch.
+    /// Data from any granted or draining branch, except over a wire that is itself the upstream of a branch.
     NeverUp,
-    /// Each port gets what comes over the way up of the branch behind it that was granted last.
+    /// Each port gets data from the upstream of its branch that was granted last.
     LastGranted,
-    /// The same, but when that branch goes, it falls back to one that is left.
+    /// Each port gets data from the upstream of its branch granted last. When that branch ends, it falls back to a remaining one.
     FallBack,
 }
 
@@ -168,21 +168,21 @@ enum Feed {
 enum Broken {
     /// A change of the next hop leaves branches as they are.
     NoCutOnHopChange,
-    /// A join is taken though the sink has a branch.
+    /// A join is accepted although the sink has a branch.
     JoinTwice,
-    /// An answer is taken from any wire.
+    /// An answer is accepted from any wire.
     AnswerFromAnywhere,
-    /// An answer for nobody is just dropped.
+    /// An answer without a branch is dropped without a leave.
     NoLeaveBack,
-    /// An answer for a branch with another way up is just dropped.
+    /// An answer for a branch with another upstream is dropped without a leave.
     NoLeaveBackFromBranch,
-    /// A leave is taken from any wire.
+    /// A leave is accepted from any wire.
     LeaveFromAnywhere,
-    /// A reject is taken from any wire.
+    /// A reject is accepted from any wire.
     RejectFromAnywhere,
-    /// A wire that goes down is not told to those behind it.
+    /// Nodes behind a wire get no notice when it goes down.
     NoRejectOnDown,
-    /// A wire that goes down is not told to the owner.
+    /// The owner gets no notice when a wire goes down.
     NoLeaveOnDown,
     /// Branches stay on a wire that is down.
     KeepOnDown,
@@ -192,9 +192,9 @@ enum Broken {
     NoDraining,
     /// Nothing ends a branch that drains: it has no deadline, and the sink does not leave it.
     NoEnd,
-    /// What is removed at its deadline is not told upwards.
+    /// A branch that is removed at its deadline sends no leave upwards.
     NoLeaveOnDeadline,
-    /// The sink asks again with the id that it had.
+    /// The sink asks again with its old id.
     SameIdAgain,
     /// Frames over one wire overtake each other.
     FramesOvertake,
@@ -208,16 +208,16 @@ struct Tree {
     sinks: Vec<Node>,
     /// Next hops at the beginning, by wire; those of shortest paths where it is empty.
     hops: Vec<Wire>,
-    /// How many of the sinks are granted at the beginning.
+    /// Number of sinks that are granted at the beginning.
     warm: usize,
     /// Nodes whose next hops change; all but the owner's, if empty.
     movers: Vec<Node>,
     budget: Budget,
-    /// Whether what happens is so little that no sink may miss anything.
+    /// The events are so few that no sink may miss data.
     gapless: bool,
-    /// Whether changes may end, so that what is left can be looked at.
+    /// Changes may end, so that the settled state can be checked.
     settles: bool,
-    feed: Feed,
+    feed: FeedRule,
     broken: Option<Broken>,
 }
 
@@ -231,7 +231,7 @@ enum Action {
     Raise(Wire),
     /// A pending or draining branch has waited long enough.
     Expire(Node, Id),
-    /// The sink wants nothing any more.
+    /// The sink leaves.
     Stop(u8),
     Settle,
     /// The router's view becomes right.
@@ -359,7 +359,7 @@ impl Tree {
         let feeding = |b: &&Branch| b.at == at && b.down == down && b.stage != Stage::Pending;
         if !s.branches.iter().any(|b| feeding(&b)) {
             s.fed.remove(&(at, down));
-        } else if self.feed == Feed::FallBack
+        } else if self.feed == FeedRule::FallBack
             && !s.branches.iter().filter(feeding).any(|b| b.up == up)
             && let Some(other) = s.branches.iter().rfind(feeding)
         {
@@ -425,7 +425,7 @@ impl Tree {
         let moved: Vec<(Id, Stage)> =
             s.branches.iter().filter(|b| b.at == at && Some(b.up) != hop).map(|b| (b.id, b.stage)).collect();
         for (id, stage) in moved {
-            // Another one's removal can have taken it along.
+            // The removal of another branch may have removed this one too.
             let Some(i) = s.branch(at, id) else { continue };
             match stage {
                 Stage::Pending if self.is_broken(Broken::PendingOutlivesHop) => {}
@@ -460,7 +460,7 @@ impl Tree {
         }
     }
 
-    /// The next hops of the tree of shortest paths; of several the lowest wire.
+    /// Returns the next hops of the tree of shortest paths, with the lowest wire among equals.
     fn right_hops(&self, s: &State) -> Vec<Option<Port>> {
         let mut hops = vec![None; usize::from(self.nodes)];
         hops[usize::from(OWNER)] = Some(Port::Local);
@@ -481,25 +481,25 @@ impl Tree {
         hops
     }
 
-    /// Nothing is under way, and all routers know how things are.
+    /// Returns `true` if no frame is in flight and all routers know the present topology.
     fn silent(&self, s: &State) -> bool {
         s.frames.is_empty()
             && s.hops == self.right_hops(s)
             && s.wires.iter().all(|w| !matches!(w, WireState::Down(seen) if seen.contains(&false)))
     }
 
-    /// Whether data goes over the branch.
+    /// Returns `true` if data goes over the branch.
     fn flows(&self, s: &State, b: &Branch) -> bool {
         b.stage != Stage::Pending
             && match self.feed {
                 _ if b.down == Port::Local => true,
-                Feed::EveryBranch => true,
-                Feed::NeverUp => !s.branches.iter().any(|other| other.at == b.at && other.up == b.down),
-                Feed::LastGranted | Feed::FallBack => s.fed.get(&(b.at, b.down)) == Some(&b.up),
+                FeedRule::EveryBranch => true,
+                FeedRule::NeverUp => !s.branches.iter().any(|other| other.at == b.at && other.up == b.down),
+                FeedRule::LastGranted | FeedRule::FallBack => s.fed.get(&(b.at, b.down)) == Some(&b.up),
             }
     }
 
-    /// Whether data comes from the owner to the port, in at most so many steps.
+    /// Returns `true` if data comes from the owner to the port in at most so many steps.
     fn reaches(&self, s: &State, at: Node, down: Port, steps: Node) -> bool {
         steps > 0
             && s.branches.iter().any(|b| {
@@ -513,7 +513,7 @@ impl Tree {
             })
     }
 
-    /// Whether what the branch says is so at its other end, or it is about to hear that it is not.
+    /// Returns `true` if the branch agrees with its other end, or a frame that corrects it is in flight.
     fn continues(&self, s: &State, b: &Branch) -> bool {
         let Port::Over(wire) = b.up else { return true };
         let far = self.far_end(wire, b.at);
@@ -524,7 +524,7 @@ impl Tree {
             || s.frames.contains(&Frame { wire, to: b.at, kind: Kind::Reject, id: b.id })
     }
 
-    /// Whether data can go round in a circle by the branches that count.
+    /// Returns `true` if data can loop over the branches that count.
     fn circle(&self, s: &State, counts: impl Fn(&Branch) -> bool) -> bool {
         // From a wire and the node that it ends at, to those that the node sends on to.
         let mut onward: BTreeMap<(Wire, Node), BTreeSet<(Wire, Node)>> = BTreeMap::new();
@@ -535,7 +535,7 @@ impl Tree {
                 onward.entry((up, b.at)).or_default().insert((down, self.far_end(down, b.at)));
             }
         }
-        // What leads nowhere is on no circle.
+        // A node without a next hop is on no circle.
         loop {
             let before = onward.len();
             let begins: BTreeSet<(Wire, Node)> = onward.keys().copied().collect();
@@ -546,7 +546,7 @@ impl Tree {
         }
     }
 
-    /// Whether the sink hears the owner: granted, with granted branches all the way.
+    /// Returns `true` if the sink hears the owner: it is granted, with granted branches on the whole path.
     fn hears(&self, s: &State, sink: usize) -> bool {
         let Some((id, true)) = s.sinks[sink].now else { return false };
         let mut at = self.sinks[sink];
@@ -568,7 +568,7 @@ impl Tree {
         false
     }
 
-    /// What a state must be like in which nothing is left to do.
+    /// Checks a state in which no event is left.
     fn complete(&self, s: &State) -> bool {
         let hops = self.right_hops(s);
         let mut wanted = 0;
@@ -790,7 +790,7 @@ impl Model for Tree {
                 s.branches.iter().all(|b| b.stage != Stage::Pending) || !s.settled || !model.silent(s)
             }),
         ];
-        // What must happen, or the rest is true of nothing.
+        // The events that must occur, or the checks would hold trivially.
         if self.settles {
             properties.push(Property::sometimes("it comes to an end", |model: &Tree, s: &State| {
                 s.settled && model.actions_of(s).is_empty()
@@ -817,7 +817,7 @@ impl Tree {
             budget: Budget::default(),
             gapless: false,
             settles: true,
-            feed: Feed::LastGranted,
+            feed: FeedRule::LastGranted,
             broken: None,
         }
     }
@@ -879,7 +879,7 @@ impl Tree {
         self
     }
 
-    fn fed(self, feed: Feed) -> Self {
+    fn fed(self, feed: FeedRule) -> Self {
         Tree { feed, ..self }
     }
 
@@ -887,7 +887,7 @@ impl Tree {
         Tree { broken: Some(rule), ..self }
     }
 
-    /// Looks at every state there is.
+    /// Visits every state.
     fn check(self, name: &str, threads: usize) {
         let started = std::time::Instant::now();
         let checker = self.checker().threads(threads).spawn_bfs().join();
@@ -905,7 +905,7 @@ impl Tree {
         println!("{name}: {} states in {:.1?}", checker.unique_state_count(), started.elapsed());
     }
 
-    /// Looks for a way to a state of which the property is not true.
+    /// Searches for a path to a state that violates the property.
     fn refutes(self, property: &'static str) {
         let broken = self.broken.map_or_else(|| format!("{:?}", self.feed), |rule| format!("{rule:?}"));
         let until = HasDiscoveries::AnyOf([property].into());
@@ -949,9 +949,9 @@ fn a_change_of_the_way_alone_leaves_no_gap() {
 
 #[test]
 fn other_ways_to_feed_let_data_circulate() {
-    Tree::ring().fed(Feed::EveryBranch).refutes(NO_CIRCLE);
-    Tree::ring().fed(Feed::NeverUp).refutes(NO_CIRCLE);
-    Tree::ring().with(2, 1, 0, 1).fed(Feed::FallBack).refutes(NO_CIRCLE);
+    Tree::ring().fed(FeedRule::EveryBranch).refutes(NO_CIRCLE);
+    Tree::ring().fed(FeedRule::NeverUp).refutes(NO_CIRCLE);
+    Tree::ring().with(2, 1, 0, 1).fed(FeedRule::FallBack).refutes(NO_CIRCLE);
 }
 
 #[test]

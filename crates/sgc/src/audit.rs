@@ -1,7 +1,7 @@
-//! `sgc audit`: shows who was granted, refused and cut off by a node of this machine.
+//! `sgc audit`: shows whom a node of this machine granted, refused and cut off.
 //!
-//! It reads the log that the node writes, and the files of it that were put aside; the node need not run. What is in a log came from elsewhere: nothing of it
-//! reaches the terminal that could steer it.
+//! It reads the log that the node writes and its rotated files; the node need not run. Parts of a log come from other
+//! machines, so control characters never reach the terminal.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -17,7 +17,7 @@ use crate::{output, run, status};
 const FILE_NAME: &str = "audit.jsonl";
 const NODE_CHARS: usize = 8;
 
-/// Show who was granted, refused and cut off, who linked, and what was changed.
+/// Show the audit log of a node: grants, refusals, revocations, links, reloads and access tokens.
 #[derive(Debug, Args)]
 pub(crate) struct AuditArgs {
     /// The node's configuration; without it, the one node that has a log in the usual place
@@ -26,22 +26,22 @@ pub(crate) struct AuditArgs {
     /// The node's name, if its log is in the usual place
     #[arg(long, value_name = "NAME", conflicts_with = "file")]
     node: Option<String>,
-    /// The log
+    /// Audit log file
     #[arg(long, value_name = "FILE")]
     file: Option<PathBuf>,
-    /// Only this topic
+    /// Show only records of this topic
     #[arg(long, value_name = "/TOPIC")]
     topic: Option<String>,
-    /// Only this peer: what the node's configuration calls it, or how its node id begins
+    /// Show only records of this peer, by its name in the node's configuration or the first digits of its node id
     #[arg(long, value_name = "PEER")]
     peer: Option<String>,
-    /// Only this event, such as refused; may be repeated
+    /// Show only this event, such as refused; may be repeated
     #[arg(long = "event", value_name = "EVENT", value_parser = event)]
     events: Vec<String>,
-    /// Only the last of it, such as 90s, 15min, 1h, 7d
+    /// Show only records of the last TIME, such as 90s, 15min, 1h or 7d
     #[arg(long, value_name = "TIME", value_parser = time)]
     since: Option<Duration>,
-    /// Print lines of JSON, as in the log
+    /// Print the lines of JSON as they are in the log
     #[arg(long)]
     json: bool,
 }
@@ -174,12 +174,12 @@ fn row(record: &AuditRecord) -> Vec<String> {
     cells.into_iter().map(|cell| plain(&cell.unwrap_or_default())).collect()
 }
 
-/// Without what a terminal could take as a command, and without what turns the direction of text.
+/// Removes control characters and marks that change the direction of text.
 fn plain(text: &str) -> String {
     text.chars().filter(|c| !is_harmful(*c)).collect()
 }
 
-/// JSON that is the same to a program, and nothing to a terminal.
+/// Escapes the same characters in JSON: programs read the same value, and a terminal sees no command.
 fn harmless(json: &str) -> String {
     let escape = |c: char| match is_harmful(c) {
         true => format!("\\u{:04x}", u32::from(c)),
@@ -209,7 +209,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_came_from_elsewhere_cannot_steer_a_terminal() {
+    fn text_of_other_machines_cannot_steer_terminal() {
         let hostile = "a\u{1b}[2J\u{9b}31m\u{7f}\r\nb\u{202e}c";
         assert_eq!(plain(hostile), "a[2J31mbc");
         let json = serde_json::to_string(&AuditRecord::new(AuditEvent::Refused).reason(hostile)).unwrap();

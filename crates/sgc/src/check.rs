@@ -1,7 +1,7 @@
-//! `sgc check`: everything that is wrong with a configuration, or what a node with it would do.
+//! `sgc check`: lists all mistakes of a configuration, or describes the node that would run with it.
 //!
-//! It looks at the configuration and the identity that it names and binds nothing. Whether routers of these names exist is
-//! not known here; nodes and groups are, where the fleet's file is at hand.
+//! It reads the configuration and its identity, and binds no socket. It cannot know whether the named routers exist. It knows
+//! nodes and groups if the fleet file is at hand.
 
 use std::path::{Path, PathBuf};
 
@@ -22,13 +22,13 @@ use crate::error::CliError;
 use crate::fleet::{FLEET_EXTENSION, unix_now};
 use crate::{files, name, output, run};
 
-/// Say everything that is wrong with a configuration, or what a node with it would do. Binds nothing.
+/// List all mistakes of a configuration, or describe the node that would run with it. Binds no socket.
 ///
-/// Mistakes go to standard error as FILE:LINE: MISTAKE, with exit code 2. The identity is checked as well: whether it can
-/// be read by its owner alone, belongs to this node, and holds today.
+/// Mistakes go to standard error as FILE:LINE: MISTAKE, with exit code 2. The command also checks that the identity is readable
+/// by its owner alone, belongs to this node, and is valid today.
 #[derive(Debug, Args)]
 pub(crate) struct CheckArgs {
-    /// The configuration
+    /// Configuration file
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
 }
@@ -178,8 +178,8 @@ fn summary(config: &Config, identity: &Identity, file: &Path) -> Result<Vec<Vec<
     Ok(rows)
 }
 
-/// The members that rules name and that the fleet's file does not have, where that file is at hand: the authority's, or one
-/// in this directory, beside the configuration or beside the identity.
+/// Returns the members that rules name and the fleet file lacks, if that file is at hand: the authority's, or one in this
+/// directory, beside the configuration or beside the identity.
 fn unknown_members(config: &Config, identity: &Identity, file: &Path) -> Vec<UnknownMember> {
     let own = identity.as_peer().ca;
     let dirs = [Some(Path::new("")), file.parent(), config.identity.parent()].into_iter().flatten();
@@ -191,7 +191,7 @@ fn unknown_members(config: &Config, identity: &Identity, file: &Path) -> Vec<Unk
     fleet.map_or_else(Vec::new, |fleet| sgc_node::unknown_members(config, &fleet))
 }
 
-/// Where programs without ROS connect, who they may be, and what of it an operator should know.
+/// Returns the rows about the gateway: addresses, permitted clients, and notes for the operator.
 fn gateway_rows(gateway: &GatewayConfig) -> Vec<Vec<String>> {
     let mut rows = Vec::new();
     let mut row = |kind: &str, text: String| rows.push(vec![kind.to_owned(), text]);
@@ -225,7 +225,7 @@ fn gateway_rows(gateway: &GatewayConfig) -> Vec<Vec<String>> {
     rows
 }
 
-/// What travels as JSON needs a definition.
+/// Returns the note on sharing as JSON, which needs a definition of the type.
 fn json(config: &Config, type_name: Option<&str>) -> String {
     let dirs = config.ros.as_ref().map_or(&[][..], |ros| &ros.definitions);
     let found =
@@ -243,7 +243,7 @@ fn type_of(type_name: Option<&str>) -> String {
     type_name.map(|name| format!(" [{name}]")).unwrap_or_default()
 }
 
-/// What is no topic says so.
+/// Returns the name, preceded by its kind if it is no topic.
 fn called(interface: Interface, name: &str) -> String {
     match interface {
         Interface::Topic => name.to_owned(),
@@ -251,7 +251,7 @@ fn called(interface: Interface, name: &str) -> String {
     }
 }
 
-/// What topics are called on the other side, if that differs.
+/// Returns the topic's name on the other side, if it differs.
 fn renamed(naming: &Naming, word: &str) -> String {
     let except = match &naming.except[..] {
         [] => String::new(),
@@ -264,9 +264,9 @@ fn renamed(naming: &Naming, word: &str) -> String {
     }
 }
 
-/// The share's name, if it can be known yet: without a type it waits for a publisher.
+/// Returns the share's 256-bit name, or `None` if its type has to come from a publisher.
 fn name_of(config: &Config, identity: &Identity, share: &ShareConfig) -> Result<Option<String>, CliError> {
-    // What is made of several has as many names.
+    // A share of several interfaces has one name for each.
     let several = share.interface.parts().len() > 1 || share.topic.contains('*');
     if share.type_name.is_none() || several {
         return Ok(None);
@@ -280,7 +280,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_cannot_travel_as_json_is_said() {
+    fn check_reports_type_that_cannot_travel_as_json() {
         let said = |type_name| json(&Config::default(), type_name);
         assert_eq!(said(Some("std_msgs/msg/String")), "as JSON");
         assert!(said(None).contains("if a definition of its type is known"));

@@ -1,6 +1,6 @@
-//! Everything that ends a command: one variant per cause, with the culprit and what would be right.
+//! The errors that end a command: one variant per cause, with the culprit and the remedy.
 //!
-//! It knows exit codes and the shape of an error line; what went wrong is found elsewhere.
+//! This module defines exit codes and the form of an error line. Other modules detect the errors.
 
 use std::error::Error;
 use std::fmt::Write as _;
@@ -20,30 +20,30 @@ use crate::run::LogFilterError;
 
 /// Exit code for a failure while running.
 pub(crate) const EXIT_FAILURE: u8 = 1;
-/// Exit code for what cannot be right: arguments, configuration, identity.
+/// Exit code for wrong arguments, a wrong configuration or a wrong identity.
 pub(crate) const EXIT_USAGE: u8 = 2;
 
-/// Why a command ends early.
+/// An error that ends a command.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum CliError {
-    /// Mistakes in the configuration; each is printed by itself.
+    /// Mistakes in the configuration. Each is printed on a line of its own.
     #[error("{what}: {}", count(errors))]
     Config {
-        /// A file, or the command line.
+        /// The configuration file, or the command line.
         what: String,
         /// The mistakes.
         errors: ConfigErrors,
     },
-    /// Mistakes in the arguments that a configuration would have, too.
+    /// Mistakes in the arguments, by the rules of a configuration.
     #[error("{}", errors.iter().map(|e| e.mistake.to_string()).collect::<Vec<_>>().join("; "))]
     Arguments {
         /// The mistakes.
         errors: ConfigErrors,
     },
-    /// A name of a node, group or fleet that is none.
+    /// A text that is no name of a node, group or fleet.
     #[error(transparent)]
     Label(#[from] LabelError),
-    /// A router was not told of a revocation list.
+    /// A revocation list could not be pushed to a router.
     #[error("the revocation is in force here, but a router was not told: {0}")]
     Tell(#[from] sgc_node::TellError),
     /// A file cannot be read.
@@ -51,7 +51,7 @@ pub(crate) enum CliError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
     /// A file cannot be written.
@@ -59,7 +59,7 @@ pub(crate) enum CliError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
     /// A file that would be overwritten.
@@ -67,7 +67,7 @@ pub(crate) enum CliError {
     Exists {
         /// The file.
         path: PathBuf,
-        /// What can be done about it, with its separator.
+        /// The remedy, with its separator.
         hint: &'static str,
     },
     /// A file of secrets that others may read.
@@ -77,17 +77,17 @@ pub(crate) enum CliError {
         path: PathBuf,
         /// Its permission bits.
         mode: u32,
-        /// What is in it.
+        /// The content of the file.
         what: &'static str,
     },
-    /// A file that is not what was asked for.
+    /// A file without the expected content.
     #[error("{}: it holds no {what}: {hint}", path.display())]
     NotInFile {
         /// The file.
         path: PathBuf,
-        /// What is missing.
+        /// The missing content.
         what: &'static str,
-        /// What would be right.
+        /// The remedy.
         hint: &'static str,
     },
     /// A file of blocks that is broken.
@@ -95,15 +95,15 @@ pub(crate) enum CliError {
     Pem {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The cause.
         source: PemError,
     },
     /// Parts of an identity that do not fit together.
     #[error("{}: {source}", path.display())]
     Identity {
-        /// The file that they are from.
+        /// The file from which they come.
         path: PathBuf,
-        /// What is wrong.
+        /// The cause.
         source: IdentityError,
     },
     /// A fleet file that is broken, or a fleet that cannot enrol.
@@ -111,15 +111,15 @@ pub(crate) enum CliError {
     Fleet {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The cause.
         source: FleetError,
     },
-    /// A revocation list that is not believed.
+    /// A revocation list that is not valid here.
     #[error("{}: {source}", path.display())]
     List {
         /// The file.
         path: PathBuf,
-        /// Why not.
+        /// The cause.
         source: CrlError,
     },
     /// A fleet file that cannot be used.
@@ -140,12 +140,12 @@ pub(crate) enum CliError {
     /// The node refused or failed.
     #[error(transparent)]
     Node(#[from] NodeError),
-    /// A configuration whose identity will not do.
+    /// A configuration whose identity cannot be used.
     #[error("{what}: {source}")]
     CheckIdentity {
         /// The configuration file.
         what: String,
-        /// What is wrong.
+        /// The cause.
         source: NodeError,
     },
     /// A router's identity where names are to be derived.
@@ -158,7 +158,7 @@ pub(crate) enum CliError {
         /// The identity file.
         path: PathBuf,
     },
-    /// A log filter that is none.
+    /// A text that is no log filter.
     #[error("{from} is {value:?}: {reason}")]
     LogFilter {
         /// The argument or variable.
@@ -168,12 +168,12 @@ pub(crate) enum CliError {
         /// The fault.
         reason: LogFilterError,
     },
-    /// Nobody answers at a status socket.
+    /// No node answers at a status socket.
     #[error("no node runs at {}: {reason}", path.display())]
     NoNode {
         /// The socket.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         reason: String,
     },
     /// No status socket was named and none is in the usual place.
@@ -185,15 +185,15 @@ pub(crate) enum CliError {
     /// No status socket was named and several are in the usual place.
     #[error("which node? Name one with --node: {}", nodes.join(", "))]
     SeveralNodes {
-        /// Their names, as those of their sockets.
+        /// Their names, taken from the names of their sockets.
         nodes: Vec<String>,
     },
-    /// What came from a status socket is no status.
+    /// An answer from a status socket that is no status.
     #[error("what answers at {} is not a node's status: {reason}", path.display())]
     NotAStatus {
         /// The socket.
         path: PathBuf,
-        /// What the parser said.
+        /// The parser's error.
         reason: String,
     },
     /// No configuration was named and none is here.
@@ -205,10 +205,10 @@ pub(crate) enum CliError {
         /// Their names.
         files: Vec<String>,
     },
-    /// Partners or tokens given.
+    /// Partners, or tokens that were given to them.
     #[error(transparent)]
     Partner(#[from] PartnerError),
-    /// Partners or tokens used.
+    /// Partners, or tokens that the configuration uses.
     #[error(transparent)]
     Rules(#[from] RulesError),
     /// The state directory.
@@ -223,20 +223,20 @@ pub(crate) enum CliError {
     /// A text that is no token.
     #[error("the token cannot be used: {0}")]
     Token(#[from] TokenError),
-    /// A token stands on the command line.
+    /// A token was given on the command line.
     #[error(
         "a token on the command line is shown to every user of this host, and the shell remembers it: give it on standard \
          input (`sgc use -`), or name a file of mode 0600 that holds it; if others use this host, have its owner \
          withdraw it and make another"
     )]
     TokenShown,
-    /// What was asked for cannot be right.
+    /// A request that cannot be right.
     #[error("{reason}")]
     Cannot {
-        /// Why, with what would be right.
+        /// The cause, with the remedy.
         reason: String,
     },
-    /// Members would lose the names that they find others by.
+    /// Members would lose the secret by which they derive names of others.
     #[error(
         "{}: not handed generation {generation} of the secret yet: {}. They would find nothing any more: renew them, or \
          wait until they have asked the authority (`sgc fleet list`); --force retires it all the same",
@@ -250,34 +250,34 @@ pub(crate) enum CliError {
         /// The members.
         nodes: Vec<String>,
     },
-    /// A running node refused what it was asked for.
+    /// A running node refused a request.
     #[error("the node at {} refused, everything there is as it was: {}", path.display(), reason.lines().last().unwrap_or_default())]
     NodeRefused {
         /// Its socket.
         path: PathBuf,
-        /// Why, one line each.
+        /// The causes, one per line.
         reason: String,
     },
-    /// A running node cannot say or show what it was asked for.
+    /// A running node cannot answer a request.
     #[error("{reason}")]
     NotSeen {
-        /// Why.
+        /// The cause.
         reason: String,
     },
-    /// Nobody defines a type.
+    /// No definition of a type was found.
     #[error(
         "{type_name} cannot be decoded: {why}; source the workspace that defines it, name a directory with --msg-dir, or use --raw"
     )]
     NoDefinition {
         /// The type.
         type_name: String,
-        /// What is wrong.
+        /// The cause.
         why: String,
     },
     /// A message has no such member.
     #[error("its messages have no member {path:?}")]
     NoSuchField {
-        /// As asked for.
+        /// The path as given.
         path: String,
     },
     /// A message has no stamp.
@@ -291,31 +291,31 @@ pub(crate) enum CliError {
     NoAudit {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         reason: String,
     },
     /// The demo cannot go on.
     #[error("demo: {reason}")]
     Demo {
-        /// Why, with the culprit.
+        /// The cause, with the culprit.
         reason: String,
-        /// What is known beyond it, to be printed below.
+        /// Further facts, printed below the error.
         facts: Vec<String>,
     },
-    /// A measurement between two machines cannot begin, or not go on.
+    /// A measurement between two machines cannot begin or continue.
     #[error("bench: {reason}")]
     Bench {
-        /// Why, with the culprit and what to do.
+        /// The cause, with the culprit and the remedy.
         reason: String,
-        /// What is known beyond it, to be printed below.
+        /// Further facts, printed below the error.
         facts: Vec<String>,
     },
-    /// The system refused something without which nothing works.
+    /// The system refused something that the program needs.
     #[error("{what}: {source}")]
     System {
-        /// What was attempted.
+        /// The failed action.
         what: &'static str,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
     /// Standard output cannot be written.
@@ -324,10 +324,10 @@ pub(crate) enum CliError {
 }
 
 impl CliError {
-    /// Prints it and says how the process ends.
+    /// Prints the error and returns the exit code of the process.
     pub(crate) fn report(&self) -> ExitCode {
         match self {
-            // Whoever reads has enough, as with `sgc status | head -1`.
+            // The reader closed the pipe, as with `sgc status | head -1`.
             Self::Output(error) if error.kind() == io::ErrorKind::BrokenPipe => return ExitCode::SUCCESS,
             Self::Config { errors, .. } => {
                 for error in errors {
@@ -408,11 +408,11 @@ impl CliError {
     }
 }
 
-/// Prints what clap has to say of a call of `called`, help included, and says how the process ends.
+/// Prints clap's message about a call of `called`, help included. Returns the exit code of the process.
 pub(crate) fn usage(error: &clap::Error, called: &str) -> ExitCode {
     match error.kind() {
         ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => {
-            // Nobody is there to be told that the help could not be printed.
+            // A failure to print the help cannot be reported to anybody.
             let _ = error.print();
             ExitCode::SUCCESS
         }
@@ -427,7 +427,7 @@ pub(crate) fn usage(error: &clap::Error, called: &str) -> ExitCode {
     }
 }
 
-/// One line of clap's paragraphs: what is wrong and its tip, then where to read more.
+/// Joins clap's paragraphs to one line: the mistake, the tip, and the command that shows more.
 fn usage_line(text: &str, called: &str) -> String {
     let (about, rest) = text.split_once("Usage:").unwrap_or((text, ""));
     let about = about.split("For more information").next().unwrap_or_default();
@@ -436,12 +436,12 @@ fn usage_line(text: &str, called: &str) -> String {
     let is_command = |word: &&str| word.chars().all(|c| c.is_ascii_lowercase() || c == '-');
     let command: Vec<_> =
         rest.split_whitespace().take_while(is_command).take_while(|word| !word.starts_with('-')).collect();
-    // Of a bad value clap says no usage.
+    // Clap prints no usage for a bad value.
     let command = if command.is_empty() { called.to_owned() } else { command.join(" ") };
     format!("{line}; see `{command} --help`")
 }
 
-/// An error and its sources, each said once.
+/// Formats an error and its sources, each once.
 fn chain(error: &dyn Error) -> String {
     let mut text = error.to_string();
     let mut next = error.source();
@@ -459,7 +459,7 @@ fn one_line(text: &str) -> String {
     text.lines().map(str::trim).collect::<Vec<_>>().join(" ")
 }
 
-/// Names a few of these.
+/// Lists the first few names.
 fn some(names: &[String]) -> String {
     const SHOWN_MAX: usize = 10;
     let mut text = names.iter().take(SHOWN_MAX).map(String::as_str).collect::<Vec<_>>().join(", ");
@@ -481,7 +481,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn clap_is_brought_to_one_line() {
+    fn clap_message_becomes_one_line() {
         let text = "error: unrecognized subcommand 'flet'\n\n  tip: a similar subcommand exists: 'fleet'\n\n\
                     Usage: sgc <COMMAND>\n\nFor more information, try '--help'.\n";
         assert_eq!(
@@ -500,7 +500,7 @@ mod tests {
     }
 
     #[test]
-    fn a_source_is_not_said_twice() {
+    fn error_chain_names_each_source_once() {
         let inner = || io::Error::other("disk on fire");
         let outer = CliError::Read { path: "/x".into(), source: inner() };
         assert_eq!(chain(&outer), "cannot read /x: disk on fire");

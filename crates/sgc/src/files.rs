@@ -1,7 +1,6 @@
-//! Files that hold secrets: written whole or not at all, for their owner alone, and never over another by
-//! accident.
+//! Files that hold secrets: written atomically, readable by their owner alone, and never over another by accident.
 //!
-//! What is in them is the business of `sgc-trust`.
+//! `sgc-trust` defines their content.
 
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
@@ -13,26 +12,26 @@ use zeroize::Zeroizing;
 
 use crate::error::CliError;
 
-/// The largest file that is read.
+/// Largest file that is read.
 const SECRET_FILE_BYTES_MAX: u64 = FLEET_FILE_BYTES_MAX as u64;
 const PUBLIC_MODE: u32 = 0o644;
 const PERMISSION_BITS: u32 = 0o7777;
 const OTHERS_BITS: u32 = 0o077;
 
-/// Whether a file that is there may be replaced.
+/// The rule for an existing file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Existing {
-    /// It stays, and writing fails with this hint.
+    /// The file stays, and writing fails with this hint.
     Keep(&'static str),
-    /// It is replaced.
+    /// The file is replaced.
     Replace,
 }
 
-/// Writes a file of mode 0600: complete under its name, or not there.
+/// Writes a file of mode 0600 atomically.
 pub(crate) fn write_secret(path: &Path, text: &str, existing: Existing) -> Result<(), CliError> {
     let failed = |source| CliError::Write { path: path.to_owned(), source };
     let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    // 0600 from the beginning: that is how `tempfile` creates.
+    // `tempfile` creates files with mode 0600, so the secret is never readable by others.
     let mut file = tempfile::Builder::new().prefix(".sgc-").tempfile_in(dir).map_err(failed)?;
     file.write_all(text.as_bytes()).map_err(failed)?;
     file.as_file().sync_all().map_err(failed)?;
@@ -43,11 +42,11 @@ pub(crate) fn write_secret(path: &Path, text: &str, existing: Existing) -> Resul
             _ => failed(e.error),
         })?,
     };
-    // Without this the name may be gone after a power cut, though the file is whole.
+    // Without this sync, a power cut may lose the directory entry of a complete file.
     File::open(dir).and_then(|dir| dir.sync_all()).map_err(failed)
 }
 
-/// Writes a file that is no secret: complete under its name, or not there. One that is there is replaced.
+/// Writes a file that is no secret atomically. Replaces an existing file.
 pub(crate) fn write_public(path: &Path, content: &[u8]) -> Result<(), CliError> {
     let failed = |source| CliError::Write { path: path.to_owned(), source };
     let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -68,12 +67,12 @@ pub(crate) fn read_public(path: &Path) -> Result<String, CliError> {
     fs::read_to_string(path).map_err(failed)
 }
 
-/// True if there is something under this name.
+/// Returns `true` if the path exists.
 pub(crate) fn exists(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
 }
 
-/// Reads a file of secrets, which must be its owner's alone; `what` is in it.
+/// Reads a file of secrets. Fails if others than its owner may read it. `what` names its content in the error.
 pub(crate) fn read_secret(path: &Path, what: &'static str) -> Result<Zeroizing<String>, CliError> {
     let failed = |source| CliError::Read { path: path.to_owned(), source };
     let metadata = fs::metadata(path).map_err(failed)?;
@@ -98,7 +97,7 @@ pub(crate) fn read_limited(path: &Path, max: u64) -> Result<Vec<u8>, CliError> {
     Ok(content)
 }
 
-/// The configuration that is meant: as named, or the only one of this directory.
+/// Returns the named configuration, or the only one of this directory.
 pub(crate) fn config_here(named: Option<&Path>) -> Result<PathBuf, CliError> {
     let dir = Path::new(".");
     let found = match named {
@@ -117,7 +116,7 @@ pub(crate) fn config_here(named: Option<&Path>) -> Result<PathBuf, CliError> {
     }
 }
 
-/// The files of a directory with this extension, in order.
+/// Returns the files of a directory with this extension, sorted.
 pub(crate) fn with_extension(dir: &Path, extension: &str) -> io::Result<Vec<PathBuf>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(dir)? {

@@ -1,13 +1,13 @@
 //! `sgc`: the command line of SGC, secure global connectivity for ROS 2.
 //!
 //! It parses arguments, reads and writes files, prints, and hands everything else to `sgc-node` and
-//! `sgc-trust`. No protocol, no socket and no ROS network is touched here, except by `demo` and `bench`, whose
-//! programs are plain DDS participants.
+//! `sgc-trust`. It touches no protocol, socket or ROS network, except in `demo` and `bench`, whose programs are
+//! plain DDS participants.
 //!
 //! It is a library so that tests can compare documents with [`command_line`] and [`COUNTERS`]. The program is [`main`].
 //!
-//! Exit codes: 0 all is well, 1 it failed while running, 2 what was asked for cannot be right. An error is one line
-//! on standard error that starts with `sgc: `; mistakes in a configuration are listed above it.
+//! Exit codes: 0 for success, 1 for a failure while running, 2 for arguments or a configuration that cannot be right.
+//! An error is one line on standard error that starts with `sgc: `. Mistakes in a configuration are listed above it.
 #![deny(unsafe_code)]
 
 mod audit;
@@ -50,7 +50,7 @@ pub use crate::why::refusals::{COUNTERS, CounterTable, Refusal};
   sgc fleet enroll arm-1                    make a node's identity: arm-1.identity
   sgc run --identity arm-1.identity --router quic://router.lab.example --share /camera/image --to desk")]
 struct Cli {
-    /// Allow core dumps, and debuggers of the same user: the keys of the node are in its memory
+    /// Allow core dumps, and debuggers of the same user. Both can read the node's keys from its memory
     /// [env: SGC_ALLOW_CORE_DUMPS]
     #[arg(long, global = true, hide_short_help = true)]
     allow_core_dumps: bool,
@@ -101,7 +101,7 @@ pub fn command_line() -> clap::Command {
     Cli::command()
 }
 
-/// The command that arguments name, as far as there is one of that name: `sgc fleet enroll`, for example.
+/// Returns the command that the arguments name, as far as it exists: `sgc fleet enroll`, for example.
 fn called(args: impl Iterator<Item = String>) -> String {
     let mut command = &Cli::command();
     let mut called = command.get_name().to_owned();

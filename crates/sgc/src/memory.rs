@@ -5,8 +5,8 @@ use crate::output;
 /// The variable that allows core dumps and debuggers, if it is set and not empty.
 const ALLOW_VARIABLE: &str = "SGC_ALLOW_CORE_DUMPS";
 
-/// Forbids core dumps and tracing from now on, unless the user allows them by argument or variable. Children decide for
-/// themselves. That the system refuses is said and stops nothing.
+/// Forbids core dumps and tracing from now on, unless the user allows them by argument or variable. Child processes decide for
+/// themselves. A refusal of the system is only reported.
 pub(crate) fn close(allow: bool) {
     if allow || std::env::var_os(ALLOW_VARIABLE).is_some_and(|value| !value.is_empty()) {
         return;
@@ -16,7 +16,7 @@ pub(crate) fn close(allow: bool) {
     }
 }
 
-/// The files of the process in `/proc` become root's; it can still read its own.
+/// Makes the process not dumpable. Its files in `/proc` then belong to root, but the process can still read its own.
 #[cfg(target_os = "linux")]
 fn forbid() -> rustix::io::Result<()> {
     use rustix::process::{DumpableBehavior, Resource, Rlimit, getrlimit, set_dumpable_behavior, setrlimit};

@@ -1,6 +1,6 @@
-//! `sgc name`: the 256-bit name of a topic, by the derivation that the nodes use.
+//! `sgc name`: prints the 256-bit name of a topic, by the derivation that the nodes use.
 //!
-//! The arguments are judged by the rules of the configuration, so that what is refused there has no name here.
+//! The rules of the configuration apply to the arguments, so a share that a configuration cannot have has no name here.
 
 use std::path::{Path, PathBuf};
 
@@ -15,20 +15,20 @@ use crate::output;
 
 /// Print the 256-bit name of a topic.
 ///
-/// The name follows from the fleet's secret, the owner, and the topic with its type and other metadata; each of these
-/// changes it. It does not depend on where the owner is, nor on its key.
+/// The name follows from the fleet's secret, the owner, and the topic with its type and other metadata. It depends neither
+/// on the owner's address nor on its key.
 #[derive(Debug, Args)]
 pub(crate) struct NameArgs {
-    /// The node that shares the topic
+    /// Node that shares the topic
     #[arg(long, value_name = "NODE")]
     owner: String,
-    /// Its full ROS 2 name, such as /camera/image
+    /// Full ROS 2 name of the topic, such as /camera/image
     #[arg(long)]
     topic: String,
-    /// Its type, such as sensor_msgs/msg/Image
+    /// Type of the topic, such as sensor_msgs/msg/Image
     #[arg(long = "type", value_name = "TYPE")]
     type_name: String,
-    /// The identity of a member of the fleet
+    /// Identity file of a member of the fleet
     #[arg(long, value_name = "FILE")]
     identity: PathBuf,
     /// `node` of the share: the ROS node that provides it
@@ -63,7 +63,7 @@ pub(crate) fn name(args: &NameArgs) -> Result<(), CliError> {
     output::line(name_of(&identity, &args.identity, &owner, &share)?)
 }
 
-/// The name of a share of `owner`, by a member of its fleet. The share has to have a type.
+/// Derives the name of a share of `owner` with a member's secret. The share has to have a type.
 pub(crate) fn name_of(
     identity: &Identity,
     identity_path: &Path,
@@ -82,7 +82,7 @@ pub(crate) fn name_of(
 }
 
 impl NameArgs {
-    /// The share that the arguments describe, judged as one of a configuration.
+    /// Parses the arguments as a share of a configuration.
     fn share(&self) -> Result<ShareConfig, ConfigErrors> {
         let fields = [
             ("topic", &self.topic),
@@ -105,7 +105,7 @@ impl NameArgs {
     }
 }
 
-/// A basic string of TOML: what is not printable ASCII or could end it is escaped.
+/// Formats a basic string of TOML. Escapes quotes, backslashes and all but printable ASCII.
 pub(crate) fn toml_string(text: &str) -> String {
     let mut out = String::from("\"");
     for c in text.chars() {
@@ -139,14 +139,14 @@ mod tests {
     }
 
     #[test]
-    fn every_text_is_taken_as_it_is() {
+    fn share_keeps_every_text_unchanged() {
         for text in ["", "plain", "\"]\n[ros]", "back\\slash", "tab\tdel\u{7f}nul\0", "ü ☃ 🤖"] {
             assert_eq!(args(text).share().unwrap().metadata.description, text);
         }
     }
 
     #[test]
-    fn a_type_as_dds_spells_it_has_the_same_name() {
+    fn dds_spelling_of_type_gives_same_name() {
         assert_eq!(args("").share().unwrap().type_name.as_deref(), Some("p/msg/T"));
     }
 }

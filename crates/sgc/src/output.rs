@@ -1,6 +1,6 @@
-//! The one place where this program prints: standard output for results, standard error for everything else.
+//! The only place where this program prints: results to standard output, everything else to standard error.
 //!
-//! Unlike `println!` nothing here panics when a reader has gone away. What is printed is made elsewhere.
+//! Unlike `println!`, no function here panics when the reader has closed the pipe.
 
 use std::fmt::Display;
 use std::io::{self, Write};
@@ -13,7 +13,7 @@ pub(crate) fn line(text: impl Display) -> Result<(), CliError> {
     writeln!(out, "{text}").and_then(|()| out.flush()).map_err(CliError::Output)
 }
 
-/// A text from elsewhere without what a terminal would take for orders.
+/// Removes control characters from a text of another machine.
 pub(crate) fn clean(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect()
 }
@@ -23,18 +23,18 @@ pub(crate) fn several(count: u64, noun: &str) -> String {
     format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
 }
 
-/// Writes a part of the result as it is, control sequences included.
+/// Writes a part of the result unchanged, control sequences included.
 pub(crate) fn raw(text: &str) -> Result<(), CliError> {
     let mut out = io::stdout().lock();
     out.write_all(text.as_bytes()).and_then(|()| out.flush()).map_err(CliError::Output)
 }
 
-/// Writes a line that is no result. If that fails there is nobody left to tell.
+/// Writes a line that is no result. Ignores failures, because they could not be reported.
 pub(crate) fn diagnostic(text: &str) {
     let _ = writeln!(io::stderr().lock(), "{text}");
 }
 
-/// Lines of columns, each as wide as its widest cell; the last is not padded.
+/// Formats rows as columns, each as wide as its widest cell. The last column is not padded.
 pub(crate) fn columns(rows: &[Vec<String>]) -> Vec<String> {
     let count = rows.iter().map(Vec::len).max().unwrap_or(0);
     let cell_chars = |cell: &String| cell.chars().count();
@@ -49,7 +49,7 @@ pub(crate) fn columns(rows: &[Vec<String>]) -> Vec<String> {
         .collect()
 }
 
-/// `999 B`, `1.2 MB`: powers of ten.
+/// Formats bytes in powers of ten: `999 B`, `1.2 MB`.
 pub(crate) fn bytes(n: u64) -> String {
     const UNITS: [&str; 5] = ["kB", "MB", "GB", "TB", "PB"];
     if n < 1000 {
@@ -64,7 +64,7 @@ pub(crate) fn bytes(n: u64) -> String {
     format!("{value:.1} {}", UNITS[unit])
 }
 
-/// `1.24 ms` of microseconds.
+/// Formats microseconds as milliseconds: `1.24 ms`.
 pub(crate) fn millis(us: u64) -> String {
     let ms = us as f64 / 1000.0;
     if ms < 10.0 { format!("{ms:.2} ms") } else { format!("{ms:.0} ms") }
@@ -75,14 +75,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn columns_line_up() {
+    fn columns_are_aligned() {
         let row = |cells: &[&str]| cells.iter().map(|c| (*c).to_owned()).collect();
         assert_eq!(columns(&[row(&["a", "bb", "c"]), row(&["äöü", "d"])]), ["a    bb  c", "äöü  d"]);
         assert!(columns(&[]).is_empty());
     }
 
     #[test]
-    fn quantities_are_short() {
+    fn quantities_have_short_units() {
         for (n, text) in
             [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (999_960, "1.0 MB"), (1 << 50, "1.1 PB")]
         {

@@ -19,7 +19,7 @@ use crate::{files, output, run};
 
 const CERTIFICATE_BYTES_MAX: u64 = 64 * 1024;
 
-/// Ask who may join what.
+/// Test who may join a topic.
 #[derive(Debug, Args)]
 pub(crate) struct PolicyArgs {
     #[command(subcommand)]
@@ -31,35 +31,34 @@ enum PolicyCommand {
     Test(TestArgs),
 }
 
-/// Say whether a node may subscribe to a topic, or publish on it, and why.
+/// Test whether a node may subscribe to a topic or publish on it, and show why.
 ///
-/// It works from the configuration alone. Exit code 0 is yes, 1 is no.
+/// The command reads the configuration; no node has to run. Exit code 0 means yes, 1 means no.
 #[derive(Debug, Args)]
 #[command(group = clap::ArgGroup::new("who").required(true))]
 struct TestArgs {
-    /// A node of this fleet, by name
+    /// Name of a node of this fleet
     #[arg(long, value_name = "NODE", group = "who")]
     identity: Option<String>,
-    /// A group that the node is in: groups stand in certificates, so that a name alone says nothing of them; may be
-    /// repeated
+    /// Group of the node, because a name alone does not tell its groups; may be repeated
     #[arg(long = "group", value_name = "GROUP", requires = "identity")]
     groups: Vec<String>,
-    /// A node, by its identity file
+    /// Identity file of a node
     #[arg(long, value_name = "FILE", group = "who")]
     identity_file: Option<PathBuf>,
-    /// A node of any fleet, by its certificate, PEM, leaf first
+    /// Certificate chain of a node of any fleet, PEM, leaf first
     #[arg(long, value_name = "FILE", group = "who")]
     certificate: Option<PathBuf>,
-    /// The topic
+    /// Name of the topic
     #[arg(long, value_name = "/TOPIC")]
     topic: String,
-    /// Its type, where that matters
+    /// Type of the topic, if rules depend on it
     #[arg(long = "type", value_name = "TYPE")]
     type_name: Option<String>,
-    /// May it publish? Without this: may it subscribe?
+    /// Test the right to publish instead of the right to subscribe
     #[arg(long)]
     publish: bool,
-    /// The owner's configuration; without it, the one *.toml of this directory
+    /// Configuration of the owner; without it, the only *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Print the answer as JSON
@@ -84,7 +83,7 @@ pub(crate) fn policy(args: &PolicyArgs) -> Result<ExitCode, CliError> {
     }
 }
 
-/// What there is of a node besides its configuration: identity and partners, as it would have them now.
+/// Loads a configuration with the identity and the partners that a node with it would have now.
 pub(crate) fn load(path: &Path) -> Result<(Config, Identity, Partners), CliError> {
     let what = path.display().to_string();
     let config = config::load(path, &run::environment)
@@ -146,15 +145,15 @@ fn verdict(
     }
 }
 
-type Believed = Result<Subject, String>;
+type SubjectResult = Result<Subject, String>;
 
-/// What the node is called here, and what its certificate proves, if it proves anything.
+/// Returns the node's name for the output, and the subject that its certificate proves or the reason why it proves none.
 fn subject(
     args: &TestArgs,
     config: &Config,
     identity: &Identity,
     partners: &Partners,
-) -> Result<(String, Believed), CliError> {
+) -> Result<(String, SubjectResult), CliError> {
     let cannot = |reason: String| CliError::Cannot { reason };
     if let Some(name) = &args.identity {
         let name: NodeName = name.parse()?;

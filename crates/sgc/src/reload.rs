@@ -1,6 +1,6 @@
-//! `sgc reload`: has a running node read its configuration again.
+//! `sgc reload`: asks a running node to read its configuration again.
 //!
-//! The node judges and carries out; this asks and shows what it says.
+//! The node checks and applies the configuration; this module asks for it and prints the answer.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -12,22 +12,22 @@ use sgc_node::admin::AdminRequest;
 use crate::error::CliError;
 use crate::{output, status};
 
-/// How long a node may take to read files and to change what it shares.
+/// Longest time a node may take to read files and to change its shares.
 const ANSWER_MAX: Duration = Duration::from_secs(30);
 
-/// Have a running node read its configuration again, without a restart.
+/// Let a running node read its configuration again, without a restart.
 ///
-/// The whole file is judged first: with a mistake in it nothing changes. Then only what differs is touched. SIGHUP does the
-/// same, and says it in the log.
+/// The node checks the whole file first. If the file has a mistake, nothing changes; otherwise the node applies the
+/// differences. SIGHUP does the same and logs the result.
 #[derive(Debug, Args)]
 pub(crate) struct ReloadArgs {
-    /// The node's configuration; without it, the one node that this user runs here
+    /// Configuration of the node; without it, the only node that this user runs here
     #[arg(short, long, value_name = "FILE", conflicts_with_all = ["socket", "node"])]
     config: Option<PathBuf>,
-    /// The node's name, if its socket is in the usual place
+    /// Name of the node, if its socket is in the usual place
     #[arg(long, value_name = "NAME", conflicts_with = "socket")]
     node: Option<String>,
-    /// The node's status socket
+    /// Status socket of the node
     #[arg(long, value_name = "PATH")]
     socket: Option<PathBuf>,
     /// Print the answer as JSON
@@ -35,7 +35,7 @@ pub(crate) struct ReloadArgs {
     json: bool,
 }
 
-/// What a node says.
+/// A node's answer.
 #[derive(Debug, Deserialize)]
 enum Answer {
     #[serde(rename = "ok")]
@@ -63,7 +63,7 @@ pub(crate) fn reload(args: &ReloadArgs) -> Result<(), CliError> {
     lines(report, "nothing changed").into_iter().try_for_each(output::line)
 }
 
-/// Has the node at this socket read its configuration again, if one runs there; says what came of it.
+/// Asks the node at this socket to read its configuration again, if one runs there. Returns the lines that report the result.
 pub(crate) fn after_change(socket: &Path) -> Result<Vec<String>, CliError> {
     match ask(socket) {
         Ok(report) => Ok(lines(report, "The node that runs knows it.")),
@@ -86,7 +86,7 @@ fn ask(socket: &Path) -> Result<serde_json::Value, CliError> {
     }
 }
 
-/// What a report says, `unchanged` if nothing of the configuration has changed.
+/// Returns the lines of a report, or `unchanged` if the configuration has not changed.
 fn lines(report: serde_json::Value, unchanged: &str) -> Vec<String> {
     let Report { changed, needs_restart, warnings } = serde_json::from_value(report).unwrap_or_default();
     let mut lines = changed;

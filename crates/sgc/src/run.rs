@@ -1,7 +1,7 @@
-//! `sgc run` and `sgc router`: from arguments to a running node, and from a signal to its clean end.
+//! `sgc run` and `sgc router`: start a node from arguments and end it cleanly on a signal.
 //!
-//! The node is `sgc_node::run`, called in one place here. This file owns what surrounds it: the log, the signals, and
-//! the standard input that a parent may hold open.
+//! `sgc_node::run` is the node. This file owns its surroundings: the log, the signals, and the standard input that a
+//! parent may hold open.
 
 use std::io::{IsTerminal, Read};
 use std::path::PathBuf;
@@ -22,7 +22,7 @@ use crate::{heap, output};
 
 const LOG_VARIABLE: &str = "SGC_LOG";
 const LOG_DEFAULT: &str = "info";
-/// The crates that log, as targets are named.
+/// The log targets: the names of the crates that log.
 const LOG_TARGETS: [&str; 12] = [
     "sgc",
     "sgc_cdr",
@@ -37,85 +37,85 @@ const LOG_TARGETS: [&str; 12] = [
     "sgc_types",
     "sgc_wire",
 ];
-/// How long a process may take to end by itself once the parent that holds its standard input is gone.
+/// Time that a process has to end by itself once the parent that holds its standard input is gone.
 const ORPHAN_GRACE: Duration = Duration::from_secs(5);
-/// How long threads that still work may delay the end of the process.
+/// Time by which working threads may delay the end of the process.
 const RUNTIME_GRACE: Duration = Duration::from_secs(1);
 
-/// Run a node: with a configuration file, or with arguments alone.
+/// Run a node from a configuration file or from arguments alone.
 ///
-/// A node with shares or uses joins the local ROS 2 network as ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE say; one
-/// that listens is a router, and may be both. SIGINT and SIGTERM end it cleanly, a second one at once; SIGHUP has it read its configuration again.
+/// A node with shares or uses joins the local ROS 2 network that ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE select. A
+/// node that listens is a router; a node can be both. SIGINT and SIGTERM end the node cleanly, and a second signal ends it
+/// at once. On SIGHUP it reads its configuration again.
 #[derive(Debug, Args)]
 pub(crate) struct RunArgs {
-    /// The configuration
+    /// Configuration file
     #[arg(short, long, value_name = "FILE",
           conflicts_with_all = ["identity", "router", "share", "to", "uses", "listen", "announce", "gateway"])]
     config: Option<PathBuf>,
-    /// The identity that `sgc fleet enroll` made
+    /// Identity file, as `sgc fleet enroll` writes it
     #[arg(long, value_name = "FILE")]
     identity: Option<PathBuf>,
-    /// A router to connect to: where it is (quic://router.lab.example:7447), the domain whose DNS names it
-    /// (srv://lab.example), or any on the local network (mdns://); may be repeated
+    /// Router to connect to: its address (quic://router.lab.example:7447), a domain with DNS SRV records
+    /// (srv://lab.example), or any router on the local network (mdns://); may be repeated
     #[arg(long, value_name = "URL")]
     router: Vec<String>,
-    /// A topic to share, /TOPIC or /TOPIC=NODE,group:GROUP; with service:, action: or parameters: in front, that of such a
-    /// name; may be repeated
+    /// Topic to share, as /TOPIC or /TOPIC=NODE,group:GROUP; the prefix service:, action: or parameters: shares that kind
+    /// instead; may be repeated
     #[arg(long, value_name = "[KIND:]/NAME")]
     share: Vec<String>,
-    /// Who may subscribe to what is shared, or call it: NODE, group:GROUP or '*', which is every member of the fleet and the default;
-    /// may be repeated
+    /// Node or group that may subscribe to shared topics and call shared services: NODE, group:GROUP, or '*' for every member
+    /// of the fleet, which is the default; may be repeated
     #[arg(long, value_name = "WHO")]
     to: Vec<String>,
-    /// A topic of another node to bring here, or a service, an action or parameters, as in NODE:service:/NAME; may be
-    /// repeated
+    /// Topic of another node to use here; the prefix service:, action: or parameters: uses that kind instead, as in
+    /// NODE:service:/NAME; may be repeated
     #[arg(long = "use", value_name = "NODE:[KIND:]/NAME")]
     uses: Vec<String>,
-    /// Listen as a router, such as quic://0.0.0.0:7447; may be repeated
+    /// Address on which to listen as a router, such as quic://0.0.0.0:7447; may be repeated
     #[arg(long, value_name = "URL")]
     listen: Vec<String>,
-    /// Tell the local network by mDNS that a router is here
+    /// Announce this router on the local network by mDNS
     #[arg(long, requires = "listen")]
     announce: bool,
-    /// Let programs of this host without ROS connect: rosbridge protocol and Foxglove at 9090 and 8765, gRPC at 50051
+    /// Serve programs of this host that have no ROS: rosbridge protocol on port 9090, Foxglove on 8765, gRPC on 50051
     #[arg(long)]
     gateway: bool,
     #[command(flatten)]
     process: ProcessArgs,
 }
 
-/// Run a router, which passes packets on and can read none of them: short for `sgc run` with `--listen` alone.
+/// Run a router: it forwards packets and can read none of them. Short for `sgc run` with `--listen` alone.
 ///
-/// With `--peer` it joins other routers in a mesh; with `--accept` it serves the fleets that are named, and no other.
+/// With `--peer` it forms a mesh with other routers. With `--accept` it serves only the named fleets.
 #[derive(Debug, Args)]
 pub(crate) struct RouterArgs {
-    /// The identity that `sgc fleet enroll --router` made
+    /// Identity file, as `sgc fleet enroll --router` writes it
     #[arg(long, value_name = "FILE")]
     identity: PathBuf,
-    /// Where to listen, such as quic://0.0.0.0:7447; may be repeated
+    /// Address to listen on, such as quic://0.0.0.0:7447; may be repeated
     #[arg(long, value_name = "URL", required = true)]
     listen: Vec<String>,
-    /// Another router to connect to, so that both are one mesh: quic://HOST:PORT, srv://DOMAIN or mdns://; may be
-    /// repeated
+    /// Other router to connect to, so that both form one mesh: quic://HOST:PORT, srv://DOMAIN or mdns://; may be repeated
     #[arg(long, value_name = "URL")]
     peer: Vec<String>,
-    /// Tell the local network by mDNS that a router is here
+    /// Announce this router on the local network by mDNS
     #[arg(long)]
     announce: bool,
-    /// A file with CA certificates, PEM: only nodes of the CAs so named may connect, of whichever fleet; may be repeated
+    /// File with CA certificates, PEM: only nodes of these CAs may connect; may be repeated
     #[arg(long, value_name = "FILE")]
     accept: Vec<PathBuf>,
     #[command(flatten)]
     process: ProcessArgs,
 }
 
-/// What a node's process is given besides its configuration.
+/// Arguments of a node's process beside its configuration.
 #[derive(Debug, Args)]
 struct ProcessArgs {
-    /// What to log: error, warn, info, debug, trace, or a filter such as sgc_node=debug,info [env: SGC_LOG]
+    /// Log level: error, warn, info, debug, trace, or a filter such as sgc_node=debug,info [env: SGC_LOG]
     #[arg(long, value_name = "LEVEL")]
     log: Option<String>,
-    /// End when standard input does: a child that outlives no parent
+    /// End when standard input ends, so that a child does not outlive its parent
     #[arg(long, hide = true)]
     until_stdin_closes: bool,
     /// Print a line of JSON with the bound addresses once the node is up
@@ -123,10 +123,10 @@ struct ProcessArgs {
     print_ready: bool,
 }
 
-/// What `--print-ready` prints.
+/// The line that `--print-ready` prints.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct ReadyLine {
-    /// Addresses that are listened on, as URLs.
+    /// The addresses on which the node listens, as URLs.
     pub(crate) ready: Vec<String>,
 }
 
@@ -172,7 +172,7 @@ pub(crate) fn router(args: RouterArgs) -> Result<(), CliError> {
     run_node(source, None, "command line".to_owned(), &args.process)
 }
 
-/// Looks a variable up for the configuration.
+/// Looks up an environment variable for the configuration.
 pub(crate) fn environment(name: &str) -> Option<String> {
     std::env::var(name).ok()
 }
@@ -194,8 +194,8 @@ pub(crate) fn start_log(argument: Option<&str>) -> Result<(), CliError> {
     Ok(())
 }
 
-/// Reads `LEVEL` and `TARGET=LEVEL`, separated by commas. A bare word that is no level would be taken for a target, of which
-/// everything is logged, and nothing of all others: a typing error would silence the log.
+/// Reads `LEVEL` and `TARGET=LEVEL`, separated by commas. Refuses a bare word that is no level: the parser would take it for a
+/// target and log nothing of all others, so a typing error would silence the log.
 fn log_filter(text: &str) -> Result<EnvFilter, LogFilterError> {
     let directives: Vec<_> = text.split(',').map(str::trim).collect();
     for directive in &directives {
@@ -224,40 +224,40 @@ fn log_filter(text: &str) -> Result<EnvFilter, LogFilterError> {
 /// The mistake in a log filter.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum LogFilterError {
-    /// No level.
+    /// An unknown level.
     #[error(
         "{written:?} is no level: write off, error, warn, info, debug or trace, or TARGET=LEVEL, such as \
          sgc_node=debug,info"
     )]
     Level {
-        /// The text that stands in its place.
+        /// The text as written.
         written: String,
     },
-    /// No name of a crate or module.
+    /// A target that is no name of a crate or module.
     #[error("{written:?} is no target: write the name of a crate or a module, such as sgc_node=debug,info")]
     Target {
-        /// The text that stands in its place.
+        /// The text as written.
         written: String,
     },
-    /// A target that looks like a crate of SGC.
+    /// A target that looks like a crate of SGC and is none.
     #[error("{written:?} is no part of SGC: write one of {}", LOG_TARGETS.join(", "))]
     UnknownTarget {
-        /// The text that stands in its place.
+        /// The text as written.
         written: String,
     },
-    /// Something else that the parser refuses.
+    /// Another mistake that the parser refuses.
     #[error("{reason}; write info, debug or sgc_node=debug,info, for example")]
     Other {
-        /// Its message.
+        /// The parser's message.
         reason: String,
     },
 }
 
-/// Becomes ready when standard input ends, as it does when the parent that holds it dies by whatever means. Should
-/// the process be there long after, it is ended.
+/// Returns a receiver that becomes ready when standard input ends, which also happens when the parent dies. If the process
+/// still runs [`ORPHAN_GRACE`] later, it is ended.
 pub(crate) fn stdin_closed() -> oneshot::Receiver<()> {
     let (closed, when_closed) = oneshot::channel();
-    // A plain thread: a runtime would wait for one of its own.
+    // A plain thread, because a runtime would wait for one of its own at shutdown.
     std::thread::spawn(move || {
         let mut buffer = [0; 256];
         while !matches!(std::io::stdin().lock().read(&mut buffer), Ok(0) | Err(_)) {}
@@ -267,7 +267,7 @@ pub(crate) fn stdin_closed() -> oneshot::Receiver<()> {
     when_closed
 }
 
-/// Ends the process if it does not end by itself; blocks until then.
+/// Blocks for [`ORPHAN_GRACE`], then ends the process.
 pub(crate) fn exit_after_grace() {
     std::thread::sleep(ORPHAN_GRACE);
     std::process::exit(EXIT_FAILURE.into());
@@ -281,18 +281,18 @@ pub(crate) struct EndSignals {
 }
 
 impl EndSignals {
-    /// Listens from now on; needs a runtime.
+    /// Starts to listen for the signals. Needs a runtime.
     pub(crate) fn new() -> Result<Self, CliError> {
         Ok(Self { hang_up: Some(listen(SignalKind::hangup())?), ..Self::without_hang_up()? })
     }
 
-    /// The same for a process to which a hang-up means something else.
+    /// Starts to listen for the signals except SIGHUP, which means something else to a node.
     fn without_hang_up() -> Result<Self, CliError> {
         let (interrupt, terminate) = (listen(SignalKind::interrupt())?, listen(SignalKind::terminate())?);
         Ok(Self { interrupt, terminate, hang_up: None })
     }
 
-    /// Waits for the next one.
+    /// Waits for the next signal.
     pub(crate) async fn next(&mut self) {
         let Self { interrupt, terminate, hang_up } = self;
         let hung_up = async {
@@ -308,7 +308,7 @@ impl EndSignals {
         }
     }
 
-    /// Ends the process at the next one.
+    /// Ends the process at the next signal.
     pub(crate) fn end_at_once(mut self) {
         tokio::spawn(async move {
             self.next().await;
@@ -317,10 +317,10 @@ impl EndSignals {
     }
 }
 
-/// Hang-ups of a running node: the terminal went, which ends it, or somebody wants its configuration read again.
+/// Hang-ups of a running node. A hang-up ends the node if its terminal is gone; otherwise it asks for a reload.
 struct HangUps {
     signal: Signal,
-    /// It was started from a terminal.
+    /// The node was started from a terminal.
     has_terminal: bool,
 }
 
@@ -329,7 +329,7 @@ impl HangUps {
         Ok(Self { signal: listen(SignalKind::hangup())?, has_terminal: terminal_is_there() })
     }
 
-    /// Passes on each wish to reload; returns when the terminal went.
+    /// Passes on each request to reload. Returns when the terminal is gone.
     async fn serve(mut self, wishes: mpsc::Sender<()>) {
         loop {
             if self.signal.recv().await.is_none() {
@@ -338,7 +338,7 @@ impl HangUps {
             if self.has_terminal && !terminal_is_there() {
                 return;
             }
-            // One that waits is as good as two.
+            // One waiting request covers later ones.
             let _ = wishes.try_send(());
         }
     }
@@ -377,7 +377,7 @@ fn run_node(
             tokio::spawn(async move {
                 if let Ok(addresses) = when_ready.await {
                     let ready = addresses.iter().map(ToString::to_string).collect();
-                    // If the parent is gone, standard input says so.
+                    // A failure to print is ignored: if the parent is gone, standard input ends too.
                     let _ = serde_json::to_string(&ReadyLine { ready }).map(output::line);
                 }
             });
@@ -390,7 +390,7 @@ fn run_node(
     result
 }
 
-/// Ready at the first signal or at the end of standard input; from then on a signal ends the process at once.
+/// Becomes ready at the first signal or at the end of standard input. From then on a signal ends the process at once.
 async fn shutdown(
     mut signals: EndSignals,
     terminal_gone: impl Future<Output = ()>,
@@ -415,7 +415,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_log_filter_is_levels_and_targets() {
+    fn log_filter_consists_of_levels_and_targets() {
         for right in
             ["info", "WARN", "off", "sgc_node=debug,info", "sgc_node::core=trace, quinn=off", "sgc=info"]
         {
@@ -440,7 +440,7 @@ mod tests {
     }
 
     #[test]
-    fn each_crate_that_logs_is_a_target() {
+    fn log_targets_list_every_crate() {
         let crates = std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/..")).unwrap();
         let names = crates.map(|entry| entry.unwrap().file_name().to_string_lossy().replace('-', "_"));
         let mut names: Vec<_> =

@@ -1,4 +1,4 @@
-//! `sgc service`: services of the local network and of the far side, without a ROS 2 installation.
+//! `sgc service`: calls services of the local network and of the far side, without a ROS 2 installation.
 
 use std::process::ExitCode;
 use std::time::Duration;
@@ -12,12 +12,12 @@ use crate::error::CliError;
 use crate::topic::{NodeArgs, answer};
 use crate::{output, status, yaml};
 
-/// How long beyond the call itself the node may take to answer.
+/// Time that the node may take to answer beyond the call itself.
 const ANSWER_MAX: Duration = Duration::from_secs(5);
-/// How long a reply is waited for unless it is said.
+/// Default time to wait for a reply, in seconds.
 const TIMEOUT_DEFAULT_S: u64 = 10;
 
-/// Call services here and on the far side; no ROS 2 installation is needed
+/// Call services here and on the far side, without a ROS 2 installation
 #[derive(Debug, Args)]
 pub(crate) struct ServiceArgs {
     #[command(subcommand)]
@@ -29,23 +29,23 @@ enum ServiceCommand {
     Call(CallArgs),
 }
 
-/// Call a service with a request in JSON or YAML, and print its reply as JSON
+/// Call a service with a request in JSON or YAML and print its reply as JSON
 ///
-/// The node that runs here calls it on its local network, where services that it uses from the far side are, too.
+/// The node that runs here calls the service on its local network. Services that the node uses from the far side are there too.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   sgc service call /add_two_ints example_interfaces/srv/AddTwoInts '{a: 2, b: 3}'
   sgc service call /motors/enable '{data: true}'")]
 struct CallArgs {
-    /// The service
+    /// Name of the service
     service: String,
-    /// Its type; may be left out if somebody serves it
+    /// Type of the service; may be omitted if a server is there
     #[arg(value_name = "TYPE")]
     first: Option<String>,
-    /// The request; without it, all its members have their defaults
+    /// Request; omitted members have their defaults
     #[arg(value_name = "REQUEST")]
     second: Option<String>,
-    /// How long the reply is waited for, seconds
+    /// Longest time to wait for the reply
     #[arg(long, value_name = "SECONDS", default_value_t = TIMEOUT_DEFAULT_S)]
     timeout: u64,
     #[command(flatten)]

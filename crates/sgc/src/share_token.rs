@@ -1,6 +1,6 @@
-//! `sgc share-token`: hands one topic to a partner of another fleet, shows what was handed out, takes it back.
+//! `sgc share-token`: makes, lists and withdraws tokens that share one topic with a partner of another fleet.
 //!
-//! It writes to the state directory, where the node finds it, and asks a running node to look there.
+//! It writes to the state directory and asks a running node to read that again.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -21,35 +21,35 @@ use crate::{files, output, policy, reload};
 
 const VALID_MAX: Duration = Duration::from_secs(3650 * 86_400);
 
-/// Hand one topic to a partner of another fleet.
+/// Share one topic with a partner of another fleet by a token.
 ///
-/// The token is printed once and not kept: bring it to the partner on a private way; there, `sgc use FILE` takes it. It
-/// works for nodes of the CA that it was made for, until it ends or is withdrawn.
+/// The command prints the token once and does not keep it. Send it to the partner over a private channel; there,
+/// `sgc use FILE` takes it. It works for nodes of the CA that it was made for, until it expires or is withdrawn.
 #[derive(Debug, Args)]
 #[command(group = clap::ArgGroup::new("what").required(true))]
 pub(crate) struct ShareTokenArgs {
     /// The owner's configuration; without it, the one *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// The topic, which the configuration has to share
+    /// Topic; the configuration has to share it
     #[arg(long, value_name = "/TOPIC", group = "what", requires = "to")]
     topic: Option<String>,
-    /// Its type, if the configuration does not say it and no node runs that knows it
+    /// Type of the topic, if neither the configuration nor a running node knows it
     #[arg(long = "type", value_name = "TYPE", requires = "topic")]
     type_name: Option<String>,
-    /// For whom: the partner's CA certificate, PEM; with :NODE-ID behind it, that node alone
+    /// CA certificate of the partner, PEM; with :NODE-ID appended, the token is for that node alone
     #[arg(long, value_name = "CA.pem[:NODE-ID]", requires = "topic")]
     to: Option<String>,
-    /// How long it is to hold
+    /// How long the token is valid
     #[arg(long, value_name = "TIME", default_value = "90d", value_parser = valid)]
     valid: Duration,
-    /// A router at which the partner can reach this node; may be repeated [default: those of the configuration]
+    /// Router at which the partner can reach this node; may be repeated [default: those of the configuration]
     #[arg(long, value_name = "URL", requires = "topic")]
     router: Vec<String>,
-    /// Show the tokens in force
+    /// List the tokens in force
     #[arg(long, group = "what")]
     list: bool,
-    /// Take this one back, by its number
+    /// Withdraw the token with this number
     #[arg(long, value_name = "ID", group = "what")]
     withdraw: Option<u64>,
 }
@@ -121,7 +121,7 @@ fn give(
         created: now.0,
         expires: token.expires.0,
     };
-    // On the disk before it is printed: a token that the owner does not know of is of no use.
+    // The record is on disk before the token is printed: the owner refuses a token that it does not know.
     let id = TokenRecords::change(state, |records| records.add(record, now))?;
     output::diagnostic(&format!(
         "Token {id} for {topic} [{type_name}], until {}. Whoever has it and a certificate of that CA may subscribe: keep it secret.\n\
@@ -137,17 +137,18 @@ fn give(
     told
 }
 
-/// The types that programs on the local network have for a topic, as the running node sees them; `None` if none runs.
+/// Returns the types that programs on the local network use for a topic, as the running node sees them. Returns `None` if no
+/// node runs.
 pub(crate) fn seen_types(config: &Config, node: &str, topic: &str) -> Option<BTreeSet<String>> {
     let socket = sgc_node::admin_socket_path(config, node);
-    // Without its answer the type is asked of the user.
+    // Without an answer of the node, the user has to give the type.
     let graph = NodeArgs::at(&socket).graph(None).ok()?;
     let shared = graph.shares.iter().flat_map(|share| &share.routes).filter(|route| route.topic == topic);
     let seen = graph.endpoints.iter().filter(|end| end.is_ros_topic && end.topic == topic);
     Some(shared.map(|route| &route.type_name).chain(seen.map(|end| &end.type_name)).cloned().collect())
 }
 
-/// The share as the token is for it: with a type.
+/// Returns the share of the topic, with the type that the token is for.
 fn share(
     args: &ShareTokenArgs,
     topic: &str,
@@ -202,7 +203,7 @@ fn share(
     Ok(share)
 }
 
-/// What names of new shares follow from.
+/// Returns the newest naming secret, from which names of new shares follow.
 fn naming_secret(identity: &Identity) -> Option<&FleetSecret> {
     identity.naming_secrets().first().map(|newest| &newest.secret)
 }
@@ -236,7 +237,7 @@ fn recipient(to: &str) -> Result<(Vec<u8>, String, Option<NodeId>), CliError> {
 
 fn routers(args: &ShareTokenArgs, config: &Config) -> Result<Vec<String>, CliError> {
     if args.router.is_empty() {
-        // The partner is on another local network.
+        // A partner on another local network cannot find a router by mDNS.
         let routers = config.routers.iter().filter(|url| !matches!(url, RouterUrl::Mdns(_)));
         return Ok(routers.take(TOKEN_ROUTERS_MAX).map(ToString::to_string).collect());
     }

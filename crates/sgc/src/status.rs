@@ -1,7 +1,7 @@
-//! `sgc status`: asks a running node how it is doing, and shows it.
+//! `sgc status`: asks a running node for its status and prints it.
 //!
-//! The document is made by `sgc-node`; this file reads what it needs of it and passes over what it does not know, so
-//! that it understands older and newer nodes.
+//! `sgc-node` makes the document. This file reads the fields that it needs and ignores unknown ones, so it understands older
+//! and newer nodes.
 
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
@@ -23,23 +23,23 @@ use crate::topic::NodeArgs;
 use crate::why::refusals;
 use crate::{files, output, run};
 
-/// How long a node may take to answer.
+/// Longest time a node may take to answer.
 const ANSWER_MAX: Duration = Duration::from_secs(5);
-/// The largest answer that is read.
+/// Largest answer that is read.
 const STATUS_BYTES_MAX: u64 = 64 * 1024 * 1024;
 const SOCKET_EXTENSION: &str = "sock";
 
-/// Show how a running node is doing: links, shares and uses, names, drops.
+/// Show the status of a running node: links, shares and uses, names, drops.
 #[derive(Debug, Args)]
 pub(crate) struct StatusArgs {
     #[command(flatten)]
     node: NodeArgs,
-    /// Print the JSON document as the node gave it
+    /// Print the node's JSON document unchanged
     #[arg(long)]
     json: bool,
 }
 
-/// What a node says of itself.
+/// A node's status.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub(crate) struct Status {
@@ -59,13 +59,13 @@ pub(crate) struct Status {
     gateway: Option<Gateway>,
 }
 
-/// The answer of a node that gives none.
+/// A node's answer that reports an error.
 #[derive(Debug, Deserialize)]
-struct Refused {
+struct ErrorAnswer {
     error: String,
 }
 
-/// Programs without ROS at a node.
+/// The gateway of a node.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 struct Gateway {
@@ -75,14 +75,14 @@ struct Gateway {
     readers: usize,
 }
 
-/// One of them.
+/// A client of a gateway.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 struct GatewayClient {
     name: String,
     protocol: String,
     address: String,
-    /// Milliseconds since the Unix epoch.
+    /// Time of the connection, in milliseconds since the Unix epoch.
     since: u64,
 }
 
@@ -102,7 +102,7 @@ pub(crate) struct Link {
     peer_dropped: u64,
 }
 
-/// A router that a node looks for.
+/// A router that a node dials or searches.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub(crate) struct Router {
@@ -128,7 +128,7 @@ pub(crate) struct Route {
     owner: String,
     pub(crate) state: String,
     messages: u64,
-    /// Bytes before and after.
+    /// Bytes before and after compression.
     compressed: Option<(u64, u64)>,
 }
 
@@ -164,12 +164,12 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), CliError> {
     Ok(())
 }
 
-/// Asks the node at a socket; for programs that show a status in another way.
-pub(crate) fn of_node_at(socket: &Path) -> Result<Status, CliError> {
+/// Asks the node at a socket for its status, for programs that show it in another way.
+pub(crate) fn query_node(socket: &Path) -> Result<Status, CliError> {
     parse(socket, &ask(socket, &AdminRequest::Status, ANSWER_MAX)?)
 }
 
-/// The socket of the node that is meant: as named, as the configuration has it, or the only one.
+/// Returns the named socket, the socket of the configuration, or the only socket of this user.
 pub(crate) fn socket(config: Option<&Path>, socket: Option<&Path>) -> Result<PathBuf, CliError> {
     if let Some(socket) = socket {
         return Ok(socket.to_owned());
@@ -180,7 +180,7 @@ pub(crate) fn socket(config: Option<&Path>, socket: Option<&Path>) -> Result<Pat
     Ok(sgc_node::admin_socket_path(&config, &node_name(&config)?))
 }
 
-/// The name of the node that has this configuration.
+/// Returns the name of the node that has this configuration.
 pub(crate) fn node_name(config: &Config) -> Result<String, CliError> {
     match &config.node_name {
         Some(name) => Ok(name.to_string()),
@@ -188,14 +188,14 @@ pub(crate) fn node_name(config: &Config) -> Result<String, CliError> {
     }
 }
 
-/// The sockets of this user's nodes that are in their usual place, whether somebody answers there or not.
+/// Returns the sockets of this user's nodes in their usual place, whether a node answers there or not.
 pub(crate) fn usual_sockets() -> Vec<PathBuf> {
     let usual = sgc_node::default_socket_path("node");
     let dir = usual.parent().unwrap_or(Path::new("/"));
     files::with_extension(dir, SOCKET_EXTENSION).unwrap_or_default()
 }
 
-/// The socket of the one node that this user runs with nothing said about its socket.
+/// Returns the socket of the only node that this user runs with a default socket.
 fn only_socket() -> Result<PathBuf, CliError> {
     let mut found = usual_sockets();
     match found.len() {
@@ -211,14 +211,15 @@ fn only_socket() -> Result<PathBuf, CliError> {
     }
 }
 
-/// Tells a revocation list to every node that this user runs here; who took it. One of another fleet does not.
-pub(crate) fn tell_local(list: &[u8]) -> (Vec<String>, Vec<bytes::Bytes>) {
+/// Pushes a revocation list to every node that this user runs here. Returns the names of those that took it, and their lists.
+/// Nodes of other fleets do not take it.
+pub(crate) fn push_crl_local(list: &[u8]) -> (Vec<String>, Vec<bytes::Bytes>) {
     let request = AdminRequest::Crl(list.to_vec());
     let mut heard = Vec::new();
     let mut took = |socket: &PathBuf| {
         let answer = ask(socket, &request, ANSWER_MAX).ok()?;
         let answer: serde_json::Value = serde_json::from_str(&answer).ok()?;
-        // A node of an earlier version does not say which lists it has.
+        // A node of an earlier version does not report its lists.
         let lists = answer.get("ok")?.get("lists").and_then(serde_json::Value::as_array);
         let lists = lists.into_iter().flatten().filter_map(serde_json::Value::as_str);
         heard.extend(lists.filter_map(|text| STANDARD.decode(text).ok()).map(bytes::Bytes::from));
@@ -228,7 +229,7 @@ pub(crate) fn tell_local(list: &[u8]) -> (Vec<String>, Vec<bytes::Bytes>) {
     (names, heard)
 }
 
-/// Why nobody answers there.
+/// Explains why no node answers at this socket.
 pub(crate) fn no_node(socket: &Path, error: &std::io::Error, patience: Duration) -> CliError {
     CliError::NoNode {
         path: socket.to_owned(),
@@ -249,7 +250,7 @@ pub(crate) fn connect(socket: &Path, patience: Duration) -> Result<UnixStream, C
     })
 }
 
-/// Asks a node; gives its answer as it came.
+/// Asks a node and returns its raw answer.
 pub(crate) fn ask(socket: &Path, request: &AdminRequest, patience: Duration) -> Result<String, CliError> {
     let no_node = |error: std::io::Error| no_node(socket, &error, patience);
     let mut stream = connect(socket, patience)?;
@@ -263,7 +264,7 @@ pub(crate) fn ask(socket: &Path, request: &AdminRequest, patience: Duration) -> 
 }
 
 fn parse(socket: &Path, text: &str) -> Result<Status, CliError> {
-    if let Ok(Refused { error }) = serde_json::from_str(text) {
+    if let Ok(ErrorAnswer { error }) = serde_json::from_str(text) {
         return Err(CliError::NotSeen { reason: error });
     }
     serde_json::from_str(text)
@@ -372,7 +373,7 @@ impl Link {
             self.peer.chars().take(8).collect(),
             self.remote.clone(),
             output::millis(self.rtt_us),
-            // What silence adds is there to be counted with, not to be read.
+            // The cost that silence adds serves routing and means nothing to a reader.
             if self.silent { "silent".into() } else { output::millis(self.cost.into()) },
             output::bytes(self.sent_bytes),
             output::bytes(self.received_bytes),
@@ -446,7 +447,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_status_is_shown_in_tables() {
+    fn status_is_shown_in_tables() {
         let text = r#"{"node":"arm-1","version":"0.1.0","uptime_s":75,"new":{},
             "links":[{"id":1,"peer":"0123456789abcdef","remote":"127.0.0.1:7447","url":"quic://localhost:7447",
                       "rtt_us":420,"cost":1420,"sent_bytes":1500,"received_bytes":7}],

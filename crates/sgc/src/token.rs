@@ -1,7 +1,7 @@
-//! `sgc token`: access tokens for programs that connect to this node's gateway; shows what was made, takes it back.
+//! `sgc token`: makes, lists and revokes access tokens for programs that connect to this node's gateway.
 //!
-//! A token is signed with the node's identity, which this reads. It writes to the state directory, where the node finds what
-//! was revoked, and asks a running node to look there.
+//! It signs a token with the node's identity, writes the records of tokens to the state directory, and asks a running node to
+//! read them again.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -19,16 +19,16 @@ use crate::error::CliError;
 use crate::fleet::{system_rng, unix_now};
 use crate::{files, output, policy, reload};
 
-/// Digits of an id that a list shows.
+/// Number of digits of an id that a list shows.
 const ID_DIGITS: usize = 12;
 
-/// Make tokens for programs that connect to a node's gateway, show what was made, take them back.
+/// Make, list and revoke access tokens for programs that connect to a node's gateway.
 #[derive(Debug, Args)]
 #[command(after_help = "A dashboard in a browser, for twelve hours:
   sgc token create -c arm-1.toml --for dashboard --subscribe /odom --subscribe '/camera/**' --valid 12h
 A program that drives:
   sgc token create -c arm-1.toml --for teleop --subscribe /odom --publish /cmd_vel --out teleop.token
-Take it back:
+Revoke a token:
   sgc token revoke -c arm-1.toml 3f9c01aa52d4")]
 pub(crate) struct TokenArgs {
     #[command(subcommand)]
@@ -42,55 +42,56 @@ enum TokenCommand {
     Revoke(RevokeArgs),
 }
 
-/// Make a token that permits what is named, and nothing else.
+/// Make a token that permits only the named topics and services.
 ///
-/// It is printed once and not kept: bring it to the program on a private way. Whoever has it may do what it permits, at this
-/// node's gateway, until it ends or is revoked. Names may be patterns in quotes: '/arm/*', '/**'.
+/// The command prints the token once and does not keep it. Bring it to the program over a private channel. Anybody who has
+/// the token may use it at this node's gateway until it expires or is revoked. Names may be patterns in quotes: '/arm/*',
+/// '/**'.
 #[derive(Debug, Args)]
 struct CreateArgs {
-    /// The node's configuration; without it, the one *.toml of this directory
+    /// Configuration of the node; without it, the only *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// For whom it is: shown in lists and in the log
+    /// Label of the token, such as its holder, for lists and the log
     #[arg(long = "for", value_name = "LABEL")]
     label: String,
-    /// A topic that its holder may receive; may be repeated
+    /// Topic that the holder may receive; may be repeated
     #[arg(long, value_name = "/TOPIC")]
     subscribe: Vec<String>,
-    /// A topic that its holder may publish on; may be repeated
+    /// Topic that the holder may publish on; may be repeated
     #[arg(long, value_name = "/TOPIC")]
     publish: Vec<String>,
-    /// A service or an action that its holder may call; may be repeated
+    /// Service or action that the holder may call; may be repeated
     #[arg(long, value_name = "/NAME")]
     call: Vec<String>,
-    /// A service or an action that its holder may serve; may be repeated
+    /// Service or action that the holder may serve; may be repeated
     #[arg(long, value_name = "/NAME")]
     serve: Vec<String>,
-    /// How long it is to hold, at most 3650d
+    /// How long the token is valid, at most 3650d
     #[arg(long, value_name = "TIME", default_value = "30d", value_parser = valid)]
     valid: Duration,
-    /// Write it into this file, mode 0600, instead of printing it
+    /// Write the token into this file, mode 0600, instead of printing it
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
 }
 
-/// Show the tokens that have not ended.
+/// List the tokens that have not expired.
 #[derive(Debug, Args)]
 struct ListArgs {
-    /// The node's configuration; without it, the one *.toml of this directory
+    /// Configuration of the node; without it, the only *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Print them as JSON
+    /// Print JSON
     #[arg(long)]
     json: bool,
 }
 
-/// Take a token back: it holds no more, and who is connected with it is disconnected.
+/// Revoke a token and disconnect the programs that connected with it.
 #[derive(Debug, Args)]
 struct RevokeArgs {
-    /// Its id, or the first digits of that
+    /// Id of the token, or its first digits
     id: String,
-    /// The node's configuration; without it, the one *.toml of this directory
+    /// Configuration of the node; without it, the only *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
 }
@@ -129,7 +130,7 @@ fn create(args: &CreateArgs) -> Result<(), CliError> {
     };
     let token = grant.clone().sign(&identity)?;
     sgc_node::create_state_dir(&state)?;
-    // On the disk before it is printed: one that is in no list is overlooked.
+    // The record is on disk before the token is printed: a token that is in no list would be overlooked.
     AccessRecords::change(&state, |records| records.add(AccessRecord::from(&grant), now))?;
     let short = short(&grant.id.to_string());
     let (label, expires, scope) = (&grant.label, grant.expires, &grant.scope);
@@ -190,7 +191,7 @@ fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
     reload::after_change(&socket)?.into_iter().try_for_each(output::line)
 }
 
-/// Writes it into the audit log of the node. What was done is done, so a failure is said and no more.
+/// Writes a record into the audit log of the node. A failure is only reported, because the change itself is already made.
 fn note(config: &Config, state: &Path, event: AuditEvent, what: &str) {
     let path = audit::audit_path(config.audit.file.as_deref(), Some(state));
     let Some(path) = path.filter(|_| !config.audit.off) else { return };

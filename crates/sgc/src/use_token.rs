@@ -1,6 +1,6 @@
-//! `sgc use`: takes a token of another fleet's topic, and has the node use it.
+//! `sgc use`: takes a token of another fleet's topic and adds a `[[use]]` for it to the configuration.
 //!
-//! The token goes into a file of its own, for this user alone; the configuration gets three lines that name it.
+//! The token goes into a file of its own that only this user can read. The configuration gets three lines that name it.
 
 use std::fs;
 use std::io::{IsTerminal, Read, Write};
@@ -19,11 +19,11 @@ const TOKENS_DIR: &str = "tokens";
 
 /// Use a topic of another fleet, by the token that its owner gave.
 ///
-/// The token is kept in the node's state directory, and a `[[use]]` that names it is added to the configuration. What is in
-/// the file already stays as it is.
+/// The command writes the token into the node's state directory and adds a `[[use]]` that names it to the configuration.
+/// The other lines of the configuration stay as they are.
 #[derive(Debug, Args)]
 pub(crate) struct UseArgs {
-    /// The file that holds the token, or - for standard input
+    /// File that holds the token, or - for standard input
     #[arg(value_name = "FILE", required_unless_present = "token_file")]
     token: Option<String>,
     /// The same as FILE
@@ -32,7 +32,7 @@ pub(crate) struct UseArgs {
     /// The configuration; without it, the one *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Say what would be done, and do nothing
+    /// Print the changes without making them
     #[arg(long)]
     dry_run: bool,
 }
@@ -161,7 +161,7 @@ fn block(token: &ShareToken, file: &Path) -> String {
     )
 }
 
-/// Replaces the configuration whole or not at all, under the same mode; a link stays one.
+/// Replaces the configuration atomically. Its mode stays, and a symbolic link stays a link.
 fn replace(path: &Path, text: &str) -> Result<(), CliError> {
     let failed = |source| CliError::Write { path: path.to_owned(), source };
     let target = fs::canonicalize(path).map_err(failed)?;

@@ -1,19 +1,18 @@
-//! Messages as people type them: JSON, or the YAML that `ros2 topic pub` takes. Either becomes JSON (`docs/spec/json.md`).
+//! Parses messages as users type them, JSON or the YAML of `ros2 topic pub`, to JSON (`docs/spec/json.md`).
 
 use std::fmt;
 
 use serde::de::{Deserialize, Deserializer, MapAccess, SeqAccess, Visitor};
 
-/// How deep values may be in each other.
+/// Deepest nesting of values.
 const DEPTH_MAX: usize = 64;
 
-/// The JSON of a message that is JSON or YAML already; nothing is an empty message, all of whose members have their
-/// defaults.
+/// Converts a message in JSON or YAML to JSON. An empty text is a message whose members all have their defaults.
 pub(crate) fn json_of(text: &str) -> Result<String, String> {
     if text.trim().is_empty() {
         return Ok("{}".to_owned());
     }
-    // As it is where it can be: all digits stay.
+    // Valid JSON stays as it is, so that numbers keep all digits.
     if serde_json::from_str::<serde::de::IgnoredAny>(text).is_ok() {
         return Ok(text.split('\n').collect());
     }
@@ -25,7 +24,7 @@ pub(crate) fn json_of(text: &str) -> Result<String, String> {
     Ok(json)
 }
 
-/// A value of YAML.
+/// A YAML value.
 enum Node {
     Null,
     Plain(String),
@@ -143,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn json_stays_and_yaml_becomes_json() {
+    fn json_stays_unchanged_and_yaml_becomes_json() {
         let same = r#"{"a": 9007199254740993, "b": [1.50]}"#;
         assert_eq!(json_of(same).unwrap(), same);
         assert_eq!(json_of("  ").unwrap(), "{}");

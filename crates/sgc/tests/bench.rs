@@ -1,5 +1,5 @@
-//! `sgc bench` between two sides on the loopback interface: what it measures, whom it refuses, and that it ends, with the
-//! cause, when the other side does. No figure is compared: what is checked is that all is there and nothing was lost.
+//! Tests of `sgc bench` between two sides on the loopback interface: measurements, refusals, and the end with its cause when
+//! the other side ends. They check that all figures are there and nothing was lost, and compare no figures.
 
 #![allow(clippy::unwrap_used)]
 
@@ -21,7 +21,7 @@ use tempfile::TempDir;
 const PATIENCE: Duration = Duration::from_secs(90);
 static LABS: AtomicU32 = AtomicU32::new(0);
 
-/// Two fleets' identities, and a network that is nobody else's if there may be one.
+/// Identities of two fleets, and a private network where namespaces can be made.
 struct Lab {
     dir: TempDir,
     namespace: Option<Namespace>,
@@ -47,7 +47,7 @@ impl Lab {
         lab
     }
 
-    /// Where what both sides need for a time goes.
+    /// Returns the directory for temporary files of both sides.
     fn tmp(&self) -> std::path::PathBuf {
         self.dir.path().join("tmp")
     }
@@ -62,7 +62,7 @@ impl Lab {
         Side::start(self.sgc(&[&["bench", "answer", "--identity", "desk.identity"][..], args].concat()))
     }
 
-    /// A run to its end.
+    /// Runs `sgc bench run` to its end.
     fn run(&self, identity: &str, args: &[&str]) -> Output {
         let args = [&["bench", "run", "--identity", identity][..], args].concat();
         let child = self.sgc(&args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
@@ -70,7 +70,7 @@ impl Lab {
     }
 }
 
-/// What a process printed, once it ended, which it must within [`PATIENCE`].
+/// Returns the output of a process, which must end within [`PATIENCE`].
 fn end_of(child: Child) -> Output {
     let pid = Pid::from_child(&child);
     let (sender, ended) = channel();
@@ -103,7 +103,7 @@ impl Side {
         Self { child, lines }
     }
 
-    /// The rest of the next line that begins so.
+    /// Returns the rest of the next line with this beginning.
     fn said(&self, begins: &str) -> String {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -138,7 +138,7 @@ fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// Checks that each way was measured at each size, and lost nothing.
+/// Checks that each channel was measured at each size and lost nothing.
 fn check(report: &Value, sealed: &[&str], others: &[&str], sizes: &[u64]) {
     let trips = report["trips"].as_array().unwrap();
     for way in sealed.iter().chain(others) {
@@ -197,7 +197,7 @@ fn a_run_measures_every_way_and_loses_nothing() {
         "a place is nobody's business: {text}"
     );
 
-    // Ready for another, by another transport and in a suite of its own.
+    // The side is ready for another run, by another transport and with another suite.
     let args = ["--with", "desk", "--to", tcp, "--sizes", "16", "--seconds", "1", "--suites", "group-chacha"];
     let output = lab.run("robot.identity", &[&args[..], &["--json", "run.json"]].concat());
     assert!(output.status.success(), "{}", stderr(&output));
@@ -278,7 +278,7 @@ fn the_end_of_the_other_side_is_told_and_ends_a_run() {
 }
 
 #[test]
-fn what_cannot_be_right_is_said_before_anything_runs() {
+fn wrong_arguments_are_reported_before_anything_runs() {
     let lab = Lab::new();
     let url = "quic://127.0.0.1:9";
     for (args, part) in [

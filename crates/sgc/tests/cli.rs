@@ -1,4 +1,4 @@
-//! What the program does for its user: files, output, and exit codes, of the real binary.
+//! Tests of files, output and exit codes of the real binary.
 
 #![allow(clippy::unwrap_used)]
 
@@ -14,12 +14,12 @@ use tempfile::TempDir;
 const NAME_ARGS: [&str; 7] =
     ["name", "--topic", "/camera/image", "--type", "sensor_msgs/msg/Image", "--identity", "arm-1.identity"];
 
-/// A directory with `sgc` run in it, away from the user's environment.
+/// A directory in which `sgc` runs, without the user's environment.
 struct Place {
     dir: TempDir,
 }
 
-/// What a run came to.
+/// The result of a run.
 #[derive(Debug)]
 struct Ran {
     code: Option<i32>,
@@ -32,7 +32,7 @@ impl Place {
         Self { dir: tempfile::tempdir().unwrap() }
     }
 
-    /// With the fleet `lab`, the nodes `arm-1` and `desk`, and the router `cloud`.
+    /// Returns a place with the fleet `lab`, the nodes `arm-1` and `desk`, and the router `cloud`.
     fn with_fleet() -> Self {
         let place = Self::new();
         place.good(&["fleet", "create", "lab"]);
@@ -61,21 +61,21 @@ impl Place {
         Ran::from(self.command(args).output().unwrap())
     }
 
-    /// Standard output of a run that must succeed, and say nothing else.
+    /// Returns standard output of a run that must succeed and print nothing to standard error.
     fn good(&self, args: &[&str]) -> String {
         let ran = self.run(args);
         assert_eq!((ran.code, ran.stderr.as_str()), (Some(0), ""), "{args:?}");
         ran.stdout
     }
 
-    /// Standard error of a run that must fail with this code, and print nothing else.
+    /// Returns standard error of a run that must fail with this code and print nothing to standard output.
     fn bad(&self, code: i32, args: &[&str]) -> String {
         let ran = self.run(args);
         assert_eq!((ran.code, ran.stdout.as_str()), (Some(code), ""), "{args:?}: {}", ran.stderr);
         ran.stderr
     }
 
-    /// The one line, with its newline, that a run must fail with.
+    /// Checks that a run fails with exactly this line.
     fn says(&self, code: i32, args: &[&str], line: &str) {
         assert_eq!(self.bad(code, args), format!("sgc: {line}\n"), "{args:?}");
     }
@@ -197,7 +197,7 @@ fn an_identity_is_overwritten_only_by_force() {
 }
 
 #[test]
-fn which_fleet_is_meant_is_not_guessed() {
+fn ambiguous_fleet_is_refused() {
     let place = Place::new();
     place.says(
         2,
@@ -286,7 +286,7 @@ fn a_good_configuration_is_summed_up() {
          warning   `to` of /camera/image names \"group:operators\", and no node of the fleet is in that group\n"
     );
     assert_eq!(place.good(&["check", "-c", "node.toml"]), expected);
-    // A name that nobody has is nothing that the configuration alone could show.
+    // The configuration alone cannot show that no node has a name.
     let text = place.read("node.toml");
     place.write("node.toml", &text.replace("\"desk\"", "\"deks\"").replace("operators", "arms"));
     let said = place.good(&["check", "-c", "node.toml"]);
@@ -317,7 +317,7 @@ fn check_warns_of_a_state_directory_that_others_may_enter() {
 }
 
 #[test]
-fn how_routers_are_found_and_who_may_attach_is_summed_up() {
+fn check_lists_router_discovery_and_admission() {
     let place = Place::with_fleet();
     let ca = place.good(&["fleet", "ca"]);
     place.write("lab-ca.pem", &ca);
@@ -442,7 +442,7 @@ fn a_name_is_the_one_that_the_nodes_derive() {
     assert_eq!(name, format!("{}\n", derive_name(secret, &owner, &metadata)));
     assert_eq!(name.trim_end().len(), 64);
 
-    // Whoever asks, whenever, the type spelt either way, and after the owner has a new key.
+    // The name is the same for other nodes, for both spellings of the type, and after the owner has a new key.
     place.good(&["fleet", "enroll", "arm-1", "--force"]);
     assert_eq!(place.good(&args(&["--owner", "arm-1"])), name);
     let dds = "sensor_msgs::msg::dds_::Image_";
@@ -490,7 +490,7 @@ fn a_router_can_derive_no_name() {
 }
 
 #[test]
-fn what_no_node_could_share_has_no_name() {
+fn invalid_share_has_no_name() {
     let place = Place::with_fleet();
     let end = ["--owner", "arm-1", "--identity", "arm-1.identity"];
     for (topic, type_name, mistake) in [
@@ -524,7 +524,7 @@ fn usage_errors_are_one_line_and_code_2() {
         let said = place.bad(2, args);
         assert!(said.starts_with("sgc: ") && said.lines().count() == 1, "{args:?}: {said}");
     }
-    // With no command at all, help is what is missing.
+    // Without a command, sgc prints its help.
     assert!(place.bad(2, &[]).contains("Usage: sgc [OPTIONS] <COMMAND>"));
     assert!(place.good(&["--help"]).contains("Usage: sgc [OPTIONS] <COMMAND>"));
     assert_eq!(place.good(&["--version"]), format!("sgc {}\n", env!("CARGO_PKG_VERSION")));
@@ -542,7 +542,7 @@ fn arguments_that_make_no_node_are_told() {
         ["router", "--identity", "cloud.identity", "--listen", "quic://127.0.0.1:0", "--log", "loud=x=y"];
     let said = place.bad(2, &args);
     assert!(said.starts_with("sgc: --log is \"loud=x=y\": ") && said.lines().count() == 1, "{said}");
-    // A word that is no level would name a target instead, and silence the log.
+    // A word that is no level would be taken for a target and silence the log.
     let right = "\"verbose\" is no level: write off, error, warn, info, debug or trace";
     let said = place.bad(2, &["run", "--identity", "arm-1.identity", "--log", "verbose"]);
     assert!(said.starts_with(&format!("sgc: --log is \"verbose\": {right}")), "{said}");

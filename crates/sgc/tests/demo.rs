@@ -1,4 +1,4 @@
-//! `sgc demo` from the outside: what it prints, what it comes to, and that nothing is left of it however it ends.
+//! Tests of `sgc demo` from the outside: its output, its result, and that it leaves nothing behind however it ends.
 
 #![allow(clippy::unwrap_used)]
 
@@ -15,10 +15,10 @@ use tempfile::TempDir;
 
 /// Longest wait for an event, far beyond what any takes.
 const PATIENCE: Duration = Duration::from_secs(90);
-/// A router, two nodes, two talkers and listeners.
+/// Number of children: a router, two nodes and two peers.
 const CHILDREN: usize = 5;
 
-/// A demo whose temporary files go to a directory of the test's.
+/// A demo whose temporary files go to a directory of the test.
 struct Demo {
     child: Child,
     tmp: TempDir,
@@ -31,7 +31,7 @@ impl Demo {
             .arg("demo")
             .args(args)
             .env("TMPDIR", tmp.path())
-            // A user's environment must not lead the demo astray.
+            // Variables of the user must not affect the demo.
             .env("ROS_DOMAIN_ID", "3")
             .env("ROS_STATIC_PEERS", "192.0.2.1")
             .stdin(Stdio::null())
@@ -42,7 +42,7 @@ impl Demo {
         Self { child, tmp }
     }
 
-    /// Its children, once all of them are there.
+    /// Returns the demo's children once all of them exist.
     fn children(&mut self) -> BTreeSet<Process> {
         let parent = self.child.id();
         let mut children = BTreeSet::new();
@@ -63,14 +63,14 @@ impl Demo {
     }
 }
 
-/// A process, told apart from a later one of the same number by when it started.
+/// A process. Its start time distinguishes it from a later process with the same number.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Process {
     pid: u32,
     started: String,
 }
 
-/// Parent, and process, if it is alive: one that only waits to be collected is not.
+/// Returns a process and its parent if it is alive. A zombie is not.
 fn process(pid: u32) -> Option<(u32, Process)> {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
     // The program's name is in parentheses and may hold anything.
@@ -108,7 +108,7 @@ fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// Checks the document against the manual, all but the verdict.
+/// Checks the document, except for its verdict, against the manual.
 fn check_report(report: &Value, seconds_min: f64) {
     let keys = |value: &Value| value.as_object().unwrap().keys().cloned().collect::<BTreeSet<_>>();
     let set = |keys: &[&str]| keys.iter().map(|k| (*k).to_owned()).collect::<BTreeSet<_>>();
@@ -134,7 +134,7 @@ fn check_report(report: &Value, seconds_min: f64) {
             assert!(topic[count].is_u64(), "{count}: {topic}");
         }
         let sent = topic["sent"].as_u64().unwrap() as f64;
-        // A slow machine sends fewer, none sends more.
+        // A slow machine sends fewer messages, and none sends more.
         let most = rate * report["seconds"].as_f64().unwrap() + 2.0;
         assert!((most * 0.2..=most).contains(&sent), "{topic}");
         assert_eq!(keys(&topic["latency_us"]), set(&["p50", "p99"]));
@@ -150,7 +150,7 @@ fn everything_arrives_once_and_unaltered() {
     let children = demo.children();
     let (output, tmp) = demo.output();
     assert!(output.status.success(), "{}\n{}", String::from_utf8_lossy(&output.stdout), stderr(&output));
-    // One document and nothing else.
+    // Standard output is one document.
     let report: Value = serde_json::from_slice(&output.stdout).unwrap();
     check_report(&report, 3.0);
     assert_eq!(report["ok"], true);
@@ -161,7 +161,7 @@ fn everything_arrives_once_and_unaltered() {
         }
     }
     assert_eq!(stderr(&output), "");
-    // Not eventually: it has waited for them.
+    // The demo has waited for its children, so they are gone already.
     assert!(children.iter().all(|child| process(child.pid).is_none_or(|(_, now)| now != *child)));
     assert!(is_empty(&tmp), "files are left over");
 }
@@ -192,7 +192,7 @@ fn an_interrupt_ends_it_in_good_order() {
     for signal in [Signal::INT, Signal::TERM] {
         let mut demo = Demo::start(&["--seconds", "600", "--json"]);
         let children = demo.children();
-        // Once the secrets are off the disk, all nodes are up; whether it counts by then is left to chance.
+        // Once the secrets are removed, all nodes are up. The count may or may not have begun.
         eventually("the secrets are gone", || {
             let identities = || fs::read_dir(demo.tmp.path()).unwrap().flatten().map(|e| e.path());
             identities().count() == 1
@@ -238,7 +238,7 @@ fn two_demos_at_once_do_not_meet() {
 }
 
 #[test]
-fn what_is_kept_can_be_run_again() {
+fn kept_files_can_be_run_again() {
     let place = tempfile::tempdir().unwrap();
     let dir = place.path().join("kept");
     let name = dir.to_str().unwrap();
@@ -279,7 +279,7 @@ fn what_is_kept_can_be_run_again() {
         assert!(check.arg("check").arg("-c").arg(config).output().unwrap().status.success());
     }
 
-    // What is there is not written over.
+    // Existing files are not overwritten.
     let (output, _) = Demo::start(&["--seconds", "1", "--keep", name]).output();
     assert_eq!(output.status.code(), Some(2));
     assert_eq!(

@@ -1,4 +1,4 @@
-//! What the keeper of a fleet does with the real binary: requests, renewal, revocation, other people's CAs.
+//! Tests of a fleet's upkeep with the real binary: requests, renewal, revocation, existing CAs.
 
 #![allow(clippy::unwrap_used)]
 
@@ -13,7 +13,7 @@ use sgc_trust::{CertError, Fleet, Identity, TrustAnchors, requested_key_hash};
 use sgc_wire::UnixMillis;
 use tempfile::TempDir;
 
-/// A directory with `sgc` run in it, away from the user's environment.
+/// A directory in which `sgc` runs, without the user's environment.
 struct Place {
     dir: TempDir,
 }
@@ -23,7 +23,7 @@ impl Place {
         Self { dir: tempfile::tempdir().unwrap() }
     }
 
-    /// With the fleet `lab`.
+    /// Returns a place with the fleet `lab`.
     fn with_fleet() -> Self {
         let place = Self::new();
         place.good(&["fleet", "create", "lab"]);
@@ -51,7 +51,7 @@ impl Place {
         String::from_utf8(ran.stdout).unwrap()
     }
 
-    /// The one line that a run with what cannot be right must fail with.
+    /// Returns the line with which a wrong request must fail.
     fn bad(&self, args: &[&str]) -> String {
         let ran = self.run(args);
         let said = String::from_utf8(ran.stderr).unwrap();
@@ -148,7 +148,7 @@ fn a_key_stays_on_its_machine() {
         robot.bad(&["fleet", "accept", "a"]).contains("arm-1.identity exists already; --force replaces it")
     );
 
-    // Renewal the same way.
+    // Renewal works the same way.
     keeper.good(&["fleet", "renew", "arm-1", "--csr", "arm-1.csr", "-o", "b", "--valid", "100d"]);
     keeper.bring("b", &robot);
     robot.good(&["fleet", "accept", "b", "--force"]);
@@ -156,7 +156,7 @@ fn a_key_stays_on_its_machine() {
     assert_eq!((renewed.node_id(), renewed.groups()), (identity.node_id(), identity.groups()));
     assert!(renewed.not_after() > identity.not_after());
 
-    // Whose key is another's has no use for the answer.
+    // The answer is of no use with another key.
     let other = Place::new();
     other.good(&["fleet", "request", "arm-1"]);
     keeper.bring("a", &other);
@@ -223,7 +223,7 @@ fn a_revoked_node_is_out() {
         assert!(said.contains("`sgc fleet enroll arm-1 --again` makes it a node anew"), "{said}");
     }
     place.good(&["fleet", "enroll", "arm-1", "--again", "--force"]);
-    // The list can be written again; it says the same.
+    // The list can be written again, with the same content.
     fs::remove_file(place.path("lab.crl")).unwrap();
     place.good(&["fleet", "revoke"]);
     let anchors = place.anchors_with_list();
@@ -232,7 +232,7 @@ fn a_revoked_node_is_out() {
     assert!(place.files().iter().all(|f| !f.starts_with('.')), "{:?}", place.files());
 }
 
-/// Two copies of the fleet's file, each in a place of its own, and two nodes that both know.
+/// Returns two copies of the fleet file, each in a place of its own, with two nodes that both copies know.
 fn two_copies() -> (Place, Place) {
     let (new, old) = (Place::with_fleet(), Place::new());
     for node in ["va", "vb"] {
@@ -242,7 +242,7 @@ fn two_copies() -> (Place, Place) {
     (new, old)
 }
 
-/// Returns the anchors of a node that was told these lists in this order.
+/// Returns the anchors of a node that got these lists in this order.
 fn told(lists: &[&Place]) -> TrustAnchors {
     let anchors = lists[0].fleet().anchors().clone();
     lists.iter().fold(anchors, |anchors, place| {
@@ -298,14 +298,14 @@ fn copies_of_the_file_are_merged_and_nothing_is_lost() {
     let anchors = told(&[&new]);
     assert!(is_revoked(&anchors, &new, "va") && !is_revoked(&anchors, &new, "vb"));
     assert!(is_revoked(&anchors, &old, "vb"), "it was enrolled again with the other copy");
-    // Once more there is nothing to take, and the merged one has all that the other has.
+    // A second merge finds nothing new, because the merged copy has everything of the other.
     let said = new.good(&["fleet", "merge", "old.fleet"]);
     assert!(said.starts_with("lab.fleet: knows everything that old.fleet does\n"), "{said}");
     new.bring("lab.fleet", &old);
     fs::copy(new.path("lab.fleet"), old.path("new.fleet")).unwrap();
     let said = old.good(&["fleet", "merge", "new.fleet"]);
     assert!(said.contains("knows everything") && !said.contains("put a copy"), "{said}");
-    // A file of another fleet is none of its copies.
+    // A file of another fleet is no copy.
     let other = Place::with_fleet();
     fs::copy(other.path("lab.fleet"), new.path("other.fleet")).unwrap();
     let said = new.bad(&["fleet", "merge", "other.fleet", "--fleet", "lab.fleet"]);
@@ -325,14 +325,14 @@ fn an_old_copy_of_the_file_says_so_and_learns_from_the_list() {
     );
     assert!(said.contains("It revokes vb") && said.contains("sgc fleet merge OTHER.fleet"), "{said}");
     assert!(shown.lines().any(|l| l.starts_with("vb ") && l.contains("revoked")), "{shown}");
-    // A command that changes the file keeps what it learnt, and its list says it.
+    // A command that changes the file keeps the new revocations and puts them into its list.
     let ran = old.run(&["fleet", "revoke", "va"]);
     assert!(ran.status.success() && String::from_utf8(ran.stderr).unwrap().contains("not the newest"));
     let anchors = told(&[&old]);
     assert!(is_revoked(&anchors, &new, "va") && is_revoked(&anchors, &new, "vb"));
     old.good(&["fleet", "list"]);
     assert!(old.bad(&["fleet", "renew", "vb"]).contains("was revoked at"));
-    // A broken list is said and keeps nobody from anything.
+    // A broken list is reported and prevents nothing.
     let broken = new.run(&["fleet", "list"]);
     assert!(broken.stderr.is_empty());
     fs::write(new.path("lab.crl"), b"no list").unwrap();
@@ -342,7 +342,7 @@ fn an_old_copy_of_the_file_says_so_and_learns_from_the_list() {
         broken.status.success() && said.starts_with("Note: lab.crl: the revocation list cannot be read"),
         "{said}"
     );
-    // The list alone does for a merge, too.
+    // A merge also takes the list alone.
     fs::copy(old.path("lab.crl"), new.path("old.crl")).unwrap();
     let said = new.good(&["fleet", "merge", "old.crl"]);
     assert!(said.starts_with("lab.fleet: took over from old.crl\n  revoked: va\n"), "{said}");
@@ -466,7 +466,7 @@ fn a_fleet_file_that_was_altered_is_refused() {
     }
 }
 
-/// A CA of the kind that a company has already.
+/// Returns a CA as a company may have it already.
 fn company_ca(place: &Place) -> (CertificateParams, KeyPair) {
     let mut params = CertificateParams::default();
     params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
@@ -499,12 +499,12 @@ fn a_fleet_around_a_ca_that_exists() {
 fn a_certificate_of_a_ca_that_keeps_its_key() {
     let place = Place::new();
     let (params, key) = company_ca(&place);
-    // A fleet file stands for the secret; its CA is not used.
+    // A fleet file supplies the secret; its CA is not used.
     place.good(&["fleet", "create", "lab"]);
     let said = place.good(&["fleet", "request", "arm-1", "--secret", "lab.fleet"]);
     assert!(said.contains("sgc fleet accept CERTIFICATE --ca CA --node arm-1"), "{said}");
     let sign = |uri: &str, file: &str| {
-        // What a CA does with a request: its key, its alternative names.
+        // A CA takes the key and the alternative names from a request.
         let mut leaf = CertificateParams::default();
         leaf.subject_alt_names = vec![rcgen::SanType::URI(uri.try_into().unwrap())];
         let node_key = KeyPair::from_pem(&place.read("arm-1.key")).unwrap();
@@ -541,14 +541,14 @@ impl Place {
         String::from_utf8(ran.stdout).unwrap()
     }
 
-    /// Has a CA that `openssl` made sign `arm-1.csr`.
+    /// Signs `arm-1.csr` with a CA that `openssl` made.
     fn sign(&self, how: &[&str]) {
         let sign = ["x509", "-req", "-in", "arm-1.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-days", "90"];
         self.openssl(&[&sign[..], &["-out", "arm-1.pem"], how].concat());
     }
 }
 
-/// The recipe of docs/how-to/own-ca.md, and the request of a node that wants more than it is given.
+/// Follows the recipe of docs/how-to/own-ca.md with the request of a node that asks for too much.
 #[test]
 fn extensions_that_were_reviewed_make_a_node_and_nothing_more() {
     let place = Place::new();
@@ -626,7 +626,7 @@ fn extensions_that_were_reviewed_make_a_node_and_nothing_more() {
     assert_eq!((given.node_id(), given.groups()), (identity.node_id(), identity.groups()));
     assert!(!given.as_peer().may_route);
 
-    // The recipe that this page had: whatever the request says, the CA signs.
+    // An unsafe recipe: the CA signs all that the request asks for.
     place.sign(&["-copy_extensions", "copyall"]);
     let said = place.bad(&force);
     assert!(said.contains("is that of a CA as well") && said.contains("sgc fleet extensions"), "{said}");
@@ -727,7 +727,7 @@ fn an_operator_keeps_the_fleet_from_a_machine_without_its_file() {
     let key = |identity: &Identity| requested_key_hash(&identity.csr());
     assert_eq!(key(&renewed), key(&arm_4));
 
-    // Refusals say what is wrong.
+    // Refusals name their cause.
     let said = refused(&["revoke", "arm-2", "--at", "keeper", "--socket", "arm-1.sock"]);
     assert!(said.contains("keeper does not take this node for an operator"), "{said}");
     let said = refused(&["revoke", "arm-2", "--at", "keepr", "--socket", "desk.sock"]);
@@ -735,7 +735,7 @@ fn an_operator_keeps_the_fleet_from_a_machine_without_its_file() {
     let said = refused(&[&["revoke", "nobody"][..], &at].concat());
     assert!(said.contains("keeper refuses: the fleet's roster has no node nobody"), "{said}");
 
-    // The authority is killed with the operation under way: it has asked for the lock of the fleet's file.
+    // The authority is killed during the operation, while it waits for the lock of the fleet file.
     let held = sgc_node::LockedFleet::open(&place.path("lab.fleet")).unwrap();
     let command =
         place.command(&[&["fleet", "revoke", "arm-2"][..], &at].concat()).stderr(Stdio::piped()).spawn();

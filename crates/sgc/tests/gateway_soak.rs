@@ -1,8 +1,8 @@
-//! What the gateway holds while a client does not read, while there are many, and once very many have come and gone: a real
+//! Tests the gateway's memory while a client does not read, with many clients, and after very many have come and gone: a real
 //! `sgc run`, Cyclone's programs on its ROS network, and clients of both protocols over sockets.
 //!
-//! The suite runs a short one; `make gateway-soak` has as many clients as the issue asks for, and as many who come and go as
-//! one every two minutes makes in 26 days. Figures are printed.
+//! The suite has a short run. `make gateway-soak` has many more clients, and as many visits as one every two minutes makes in
+//! 26 days. It prints figures.
 
 #![allow(clippy::unwrap_used)]
 
@@ -29,38 +29,38 @@ use proto::gateway_client::GatewayClient;
 use proto::{publish_request, subscribe_response};
 use support::{PATIENCE, Peer, Running, say};
 
-/// Clients that are there all the time, and clients that come and go, of the suite's short run.
+/// Number of permanent clients and of visiting clients in the suite's short run.
 const CLIENTS: usize = 100;
 const CONNECTS: usize = 300;
-/// They come and go in so many rounds; the first is for what is made once.
+/// Number of rounds of visits. The first round allocates what is allocated only once.
 const ROUNDS: usize = 4;
-/// So many come at the same time.
+/// Number of clients that visit at the same time.
 const AT_ONCE: usize = 8;
-/// Where the network is not the test's own, its ROS domain.
+/// ROS domain where the network is shared with other programs.
 const DOMAIN: &str = "94";
-/// Seconds that peers live at most.
+/// Longest life of a peer in seconds.
 const PEER_LIFE: &str = "7200";
 /// Bytes of an image, and images a second.
 const IMAGE: &str = "1000000";
 const RATE: &str = "40";
-/// What may wait for a client that does not read.
+/// Bound of the queue for a client that does not read.
 const CLIENT_MIB: usize = 8;
-/// Images of which a client that does not read has none: more than may wait for it and than sockets hold.
+/// Number of images that exceeds the queue and the socket buffers of a client that does not read.
 const UNREAD: usize = 30;
 
-/// What may wait, the same in base64 of what is being written out, and what allocating leaves.
+/// Bound of memory for such a client: its queue, the base64 of a message being written, and the allocator's overhead.
 const UNREAD_KB_MAX: u64 = 4 * 1024 * CLIENT_MIB as u64;
-/// Of a client that is there: buffers of its socket and its protocol.
+/// Bound of memory per client, for buffers of its socket and its protocol.
 const CLIENT_KB_MAX: u64 = 256;
-/// All that rounds after the first may add together.
+/// Bound of memory that all rounds after the first may add.
 const ROUNDS_KB_MAX: u64 = 16 << 10;
-/// Files that may be open after all that were not open before: connections of the process that asks for the status.
+/// Bound of additional open files, which are connections of the process that asks for the status.
 const FDS_MAX: usize = 4;
 
 type Socket = WebSocketStream<TcpStream>;
 
 #[test]
-fn what_the_gateway_holds_is_bounded_whoever_comes_and_goes_and_does_not_read() {
+fn gateway_memory_is_bounded_with_many_visits_and_a_client_that_does_not_read() {
     let (scene, _talkers) = Scene::new();
     let run = || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
@@ -76,13 +76,13 @@ fn environment<T: FromStr>(key: &str, default: T) -> T {
     std::env::var(key).ok().and_then(|text| text.parse().ok()).unwrap_or(default)
 }
 
-/// What has to come.
+/// Waits for a future within the test's patience.
 async fn soon<T>(what: &str, future: impl Future<Output = T>) -> T {
     let came = tokio::time::timeout(PATIENCE, future).await;
     came.unwrap_or_else(|_| panic!("never: {what}"))
 }
 
-/// A node with a gateway, and where clients find it. Fields go in this order.
+/// A node with a gateway, and its addresses. Fields are dropped in this order.
 struct Scene {
     node: Running,
     rosbridge: SocketAddr,
@@ -94,7 +94,7 @@ struct Scene {
 }
 
 impl Scene {
-    /// And who talks on its ROS network.
+    /// Returns a scene and the talkers on its ROS network.
     fn new() -> (Self, [Peer; 2]) {
         let network = support::own_network(format!("sgcsoak-{}", std::process::id()));
         let domain = if network.is_some() { "0" } else { DOMAIN };
@@ -120,7 +120,7 @@ impl Scene {
             Peer::start(command)
         };
         let images = talk(&["--topic", "/image", "--type", "image", "--size", IMAGE, "--rate", RATE]);
-        // Latched, so that nobody who comes has to wait for the next.
+        // Latched, so that a new client need not wait for the next message.
         let chatter = talk(&["--topic", "/chatter", "--rate", "10", "--transient-local", "--depth", "1"]);
         let mut output = support::sgc(None, dir.path());
         let output = output.args(["status", "--json", "--socket", "desk.sock"]).output().unwrap();
@@ -160,14 +160,14 @@ impl Scene {
 
         let mut rounds = Vec::new();
         for round in 0..ROUNDS {
-            // Who does not read for a minute is disconnected.
+            // A client that does not read for a minute is disconnected.
             drop(std::mem::replace(&mut unread, self.leave_unread().await));
             self.come_and_go(round).await;
             images(&mut watcher, UNREAD).await;
             self.until("who came has gone", |gateway| count(gateway) == self.clients + 2).await;
             self.until_unpublished(watcher.client.clone()).await;
             let held = self.node.held();
-            say(&format!("soak: round {}, {} have come and gone: {held:?}", round, self.of_round()));
+            say(&format!("soak: round {}, {} have come and gone: {held:?}", round, self.visits_per_round()));
             rounds.push(held);
         }
         let most = rounds.iter().map(|held| held.resident_kb).max().unwrap_or_default();
@@ -188,11 +188,11 @@ impl Scene {
         assert!(kb <= max, "it holds {kb} kB; {max} kB at most were to be");
     }
 
-    fn of_round(&self) -> usize {
+    fn visits_per_round(&self) -> usize {
         self.connects / ROUNDS
     }
 
-    /// Waits until the status says so of the gateway.
+    /// Waits until the gateway's status meets the condition.
     async fn until(&self, what: &str, is_so: impl Fn(&Value) -> bool) {
         let mut last = Value::Null;
         let becomes_so = async {
@@ -227,7 +227,7 @@ impl Scene {
         .await;
     }
 
-    /// Waits until nothing is published by clients.
+    /// Waits until clients publish nothing any more.
     async fn until_unpublished(&self, mut client: GatewayClient<Channel>) {
         soon("what who came published has gone", async {
             let is_theirs = |topic: &proto::Topic| topic.name.starts_with("/soak");
@@ -252,14 +252,14 @@ impl Scene {
         socket
     }
 
-    /// A client that wants images and reads nothing.
+    /// Connects a client that subscribes to images and reads nothing.
     async fn leave_unread(&self) -> Socket {
         let mut socket = self.rosbridge().await;
         tell(&mut socket, json!({"op": "subscribe", "topic": "/image"})).await;
         socket
     }
 
-    /// Clients of both protocols who listen until it is dropped; all of them have heard something.
+    /// Connects clients of both protocols that listen until the set is dropped. Each has received a message on return.
     async fn crowd(&self) -> JoinSet<()> {
         let mut crowd = JoinSet::new();
         let (heard, mut hears) = tokio::sync::mpsc::unbounded_channel();
@@ -294,10 +294,10 @@ impl Scene {
         crowd
     }
 
-    /// A round of clients who hear something, publish something, and leave.
+    /// Runs a round of clients that receive a message, publish one, and leave.
     async fn come_and_go(&self, round: usize) {
-        let first = round * self.of_round();
-        let visits = (first..first + self.of_round()).map(|number| async move {
+        let first = round * self.visits_per_round();
+        let visits = (first..first + self.visits_per_round()).map(|number| async move {
             match number % 2 {
                 0 => self.visit_by_rosbridge(number).await,
                 _ => self.visit_by_grpc(number).await,
@@ -314,7 +314,7 @@ impl Scene {
         tell(&mut socket, json!({"op": "publish", "topic": topic, "msg": {"data": "here"}})).await;
         let said = soon("it hears something", text(&mut socket)).await;
         assert_eq!(said["topic"], "/chatter", "{said}");
-        // Some say that they leave.
+        // Some clients close their connection properly.
         if number.is_multiple_of(4) {
             let _ = socket.close(None).await;
         }
@@ -344,7 +344,7 @@ impl Scene {
                 }
             }
         };
-        // It leaves without a word.
+        // The others drop it.
         tokio::select! {
             ended = publishing => panic!("{ended:?}"),
             () = soon("it hears something", heard) => {}
@@ -352,12 +352,12 @@ impl Scene {
     }
 }
 
-/// How many clients are there.
+/// Returns the number of clients.
 fn count(gateway: &Value) -> usize {
     gateway["clients"].as_array().map_or(0, Vec::len)
 }
 
-/// Who takes images as they come.
+/// A client that reads images as they come.
 struct Watcher {
     client: GatewayClient<Channel>,
     stream: tonic::Streaming<proto::SubscribeResponse>,
@@ -388,7 +388,7 @@ async fn tell(socket: &mut Socket, op: Value) {
     soon("it is taken", socket.send(Message::text(op.to_string()))).await.unwrap();
 }
 
-/// The next text that comes.
+/// Returns the next text message.
 async fn text(socket: &mut Socket) -> Value {
     loop {
         if let Message::Text(text) = socket.next().await.unwrap().unwrap() {

@@ -1,5 +1,5 @@
-//! `sgc topic` and `sgc why` between two ROS 2 networks and a router: what they show of the messages of a program that is not
-//! ours, and what they name when a part is missing.
+//! Tests of `sgc topic` and `sgc why` between two ROS 2 networks and a router: messages of an independent program, and the
+//! fault that is named when a part is missing.
 
 #![allow(clippy::unwrap_used)]
 
@@ -19,7 +19,7 @@ const DOMAINS: [(&str, &str); 2] = [("robot", "93"), ("desk", "94")];
 
 struct Lab {
     dir: TempDir,
-    /// None where namespaces cannot be made.
+    /// `None` where namespaces cannot be made.
     namespace: Option<Namespace>,
     nodes: Vec<Running>,
 }
@@ -40,7 +40,7 @@ impl Lab {
         self.dir.path().join(name)
     }
 
-    /// Starts a node; gives the addresses that it listens on.
+    /// Starts a node and returns the addresses on which it listens.
     fn start(&mut self, node: &str, config: &str) -> Vec<String> {
         let text = format!("identity = \"{node}.identity\"\n[admin]\nsocket = \"{node}.sock\"\n{config}");
         fs::write(self.path(&format!("{node}.toml")), text).unwrap();
@@ -70,7 +70,7 @@ impl Lab {
         Peer::start(command)
     }
 
-    /// A server of `/add_two_ints`.
+    /// Starts a server of `/add_two_ints`.
     fn server(&self, node: &str) -> Peer {
         let domain = DOMAINS.iter().find(|(name, _)| *name == node).unwrap().1;
         let mut command = support::python(self.namespace.as_ref(), self.dir.path(), "services.py");
@@ -78,7 +78,7 @@ impl Lab {
         Peer::start(command)
     }
 
-    /// What `sgc why` came to: exit code, and the step that is wrong.
+    /// Returns the exit code of `sgc why` and the step with the fault.
     fn why(&self, node: &str, what: &[&str]) -> (i32, String) {
         let socket = format!("{node}.sock");
         let args = [&["why", "--json", "--socket", &socket], what].concat();
@@ -89,7 +89,7 @@ impl Lab {
         (output.status.code().unwrap(), found)
     }
 
-    /// Waits until that is what is wrong; nothing, if it is empty.
+    /// Waits until `sgc why` finds this fault, or no fault if the text is empty.
     fn finds(&self, node: &str, what: &[&str], found: &str) {
         let mut last = (0, String::new());
         let mut asked = 0;
@@ -119,7 +119,7 @@ impl Drop for Lab {
 }
 
 #[test]
-fn messages_are_shown_at_both_ends_and_what_is_missing_is_named() {
+fn messages_are_shown_at_both_ends_and_missing_parts_are_named() {
     let mut lab = Lab::new();
     assert_eq!(lab.why("robot", &["/chatter"]).0, 1, "no node runs");
     let router = lab.start("cloud", "[router]\nlisten = [\"quic://127.0.0.1:0\"]\n").remove(0);
@@ -169,7 +169,7 @@ fn messages_are_shown_at_both_ends_and_what_is_missing_is_named() {
     assert!(String::from_utf8(output.stdout).unwrap().contains("Message size mean"), "bandwidth");
     // A string has no header.
     assert_eq!(lab.topic("robot", &["delay", "/chatter"]).status.code(), Some(1));
-    // Nobody has it.
+    // No program has the topic.
     let output = lab.topic("robot", &["echo", "/other"]);
     assert_eq!(output.status.code(), Some(1));
     assert!(String::from_utf8(output.stderr).unwrap().contains("sgc why /other"));
@@ -180,7 +180,7 @@ fn messages_are_shown_at_both_ends_and_what_is_missing_is_named() {
     let info = String::from_utf8(lab.topic("desk", &["info", "-v", "/chatter"]).stdout).unwrap();
     assert!(info.contains("Reliability: RELIABLE") && info.contains("Shared by robot"), "{info}");
 
-    // The router knows its name alone.
+    // The router knows only the 256-bit name.
     let name = info.lines().find_map(|line| line.trim().strip_prefix("Name: ")).unwrap();
     lab.finds("cloud", &["--name", name], "");
     lab.finds("cloud", &["--name", &"0".repeat(64)], "nobody in reach advertises it");
@@ -188,7 +188,7 @@ fn messages_are_shown_at_both_ends_and_what_is_missing_is_named() {
 
     listener.end();
     lab.finds("desk", &["/chatter"], "nobody on this local network subscribes to /chatter");
-    // Asks for history, which nobody keeps.
+    // The subscriber asks for a history that no publisher keeps.
     let mut strict = lab.peer("desk", "sub", &["--type", "string", "--transient-local"]);
     lab.finds("desk", &["/chatter"], "by durability: VOLATILE is offered");
     strict.end();

@@ -1,4 +1,4 @@
-//! Running nodes as their user sees them: started, asked, and ended.
+//! Tests of running nodes as their user sees them: start, status and end.
 
 #![allow(clippy::unwrap_used)]
 
@@ -44,7 +44,7 @@ impl Router {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
 
-    /// Waits for its end, and gives its log.
+    /// Waits for the router's end and returns its log.
     fn end(mut self) -> (ExitStatus, String) {
         let status = wait(&mut self.child);
         let mut log = String::new();
@@ -85,7 +85,7 @@ fn a_router_says_where_it_listens_and_how_it_is() {
     assert!(router.address.starts_with("quic://127.0.0.1:"), "{}", router.address);
     assert!(!router.address.ends_with(":0"));
 
-    // It is the only one there, so it need not be named.
+    // The only node need not be named.
     let output = sgc(router.place.path(), &["status", "--json"]).output().unwrap();
     let status: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(status["node"], "cloud");

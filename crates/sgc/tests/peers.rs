@@ -1,5 +1,5 @@
-//! The whole thing between programs that are not ours: Cyclone DDS in Python and Fast DDS in C++, in networks that
-//! share nothing but an `sgc` router (`tests/peers/README.md`).
+//! Tests between independent programs, Cyclone DDS in Python and Fast DDS in C++, in networks that only an `sgc` router
+//! joins (`tests/peers/README.md`).
 //!
 //! Three network namespaces stand for a robot's network, the cloud and an operator's desk (`support/lab.rs`).
 
@@ -19,7 +19,7 @@ use support::{Peer, eventually, say};
 
 const PLAN: Plan = Plan { name: "sgct", domains: ["91", "92"], peer_life: "120" };
 
-/// How long a client waits for its calls, some tens at most.
+/// Longest wait of a client for its calls, of which there are some tens.
 const CALLS_WAIT: Duration = Duration::from_secs(20);
 
 fn service(kind: &str, server: &str, client: &str) -> String {
@@ -130,7 +130,7 @@ fn every_vendor_reaches_every_vendor_through_a_router() {
     }
     lab.carries("fastdds", "cyclone", "string", &["--best-effort"], 40, 20);
     lab.carries("cyclone", "fastdds", "image", &["--timeout", "90"], 5, 2);
-    // The router carried it all and knows none of it.
+    // The router carried all messages and knows none of them.
     let cloud = lab.status(Site::Cloud);
     assert_eq!(cloud["routes"], Value::Array(vec![]));
     assert!(
@@ -224,7 +224,7 @@ fn the_flow_resumes_after_every_kill_and_restart_without_a_duplicate() {
     for order in orders {
         order.iter().for_each(|site| lab.kill(*site));
         order.iter().for_each(|site| lab.start(*site));
-        // Only what is sent from now on shows that it resumed.
+        // Only messages sent from now on show that the flow resumed.
         while talker.events.try_recv().is_ok() {}
         let sent = talker.wait("news", |e| e["event"] == "sent")["seq"].as_u64().unwrap();
         listener.wait(&format!("what was sent after {order:?}"), |e| {
@@ -257,7 +257,7 @@ fn a_restarted_program_is_heard_at_its_own_rate_and_a_stopped_node_is_gone_at_on
         talker.end();
         talker.summary();
     }
-    // One that is there when the node stops.
+    // A talker that is there when the node stops.
     let mut talker = lab.peer(
         Site::Robot,
         "cyclone",
@@ -372,7 +372,7 @@ fn two_nodes_on_one_network_make_no_loop() {
     let summary = listener.summary();
     let (received, duplicated) =
         (summary["received"].as_u64().unwrap(), summary["duplicated"].as_u64().unwrap());
-    // Directly, and once more through the router: never a third time.
+    // Each message comes directly and once more through the router, never a third time.
     assert!(received >= 100 && duplicated > 0 && duplicated <= received, "{summary}");
     assert_eq!(summary["altered"], 0, "{summary}");
     talker.summary();
@@ -395,12 +395,12 @@ fn services_of_a_far_network_are_called_as_if_they_were_near() {
         there(client);
         (1..=20).for_each(|n| answered(client, n));
     }
-    // Killed: nobody says goodbye, and DDS notices after its lease, as it would without us.
+    // A killed server says no goodbye, and DDS notices after its lease, as it would without sgc.
     drop(server);
     clients.iter_mut().for_each(|client| drop(gone(client)));
     server = lab.service_peer(Site::Robot, "server", &["--hold"]);
     clients.iter_mut().for_each(|client| drop(there(client)));
-    // Open while the router is killed and started again: asked once, answered once.
+    // Calls that are open while the router restarts are carried out once and answered once.
     clients[0].go();
     server.wait("the request", |e| e["event"] == "request" && e["b"] == 21);
     lab.kill(Site::Cloud);
@@ -415,7 +415,7 @@ fn services_of_a_far_network_are_called_as_if_they_were_near() {
     server.go();
     answered(&mut clients[1], 21);
     let state = lab.status(Site::Desk)["routes"][0]["state"].as_str().unwrap().to_owned();
-    // Both servers' together.
+    // The counts of both servers together.
     assert!(state.contains("42 calls, 0 in progress, 42 answered, 0 refused, 0 lost"), "{state}");
     for client in &mut clients {
         client.end();
@@ -458,8 +458,8 @@ fn the_router_never_holds_what_it_carries() {
     for _ in 0..50 {
         listener.wait("messages", |e| e["event"] == "received");
     }
-    // What the listener holds in plain text is what the talker said: find it there first, or finding nothing in
-    // the router would say nothing.
+    // The listener holds the talker's words in plain text. Finding them there shows that the search works, so that finding
+    // nothing in the router means something.
     let words: [&[u8]; 4] = [b" fill=", b"std_msgs", b"rt/string", b"dds_::String_"];
     for word in words {
         assert!(
@@ -479,7 +479,7 @@ fn the_router_never_holds_what_it_carries() {
     listener.end();
 }
 
-/// True if the writable memory of a process holds these bytes.
+/// Returns `true` if the writable memory of a process holds these bytes.
 fn holds(pid: u32, word: &[u8]) -> bool {
     use std::os::unix::fs::FileExt;
     let memory = fs::File::open(format!("/proc/{pid}/mem")).expect("root may read its processes' memory");

@@ -1,5 +1,4 @@
-//! Who may do what, as its user asks, changes and looks it up: policy, reload, tokens and the audit log, of the real
-//! binary.
+//! Tests of rights with the real binary: policy, reload, tokens and the audit log.
 
 #![allow(clippy::unwrap_used)]
 
@@ -21,7 +20,7 @@ use tempfile::TempDir;
 const PATIENCE: Duration = Duration::from_secs(30);
 const POSE: &str = "geometry_msgs/msg/PoseStamped";
 
-/// A directory with the fleet `lab` (arm-1, desk in operators) and, beside it, the fleet `acme` (cart).
+/// A directory with the fleet `lab` (arm-1, desk in operators) and the fleet `acme` (cart).
 struct Place {
     dir: TempDir,
 }
@@ -143,7 +142,7 @@ impl Running {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
 
-    /// Ends it; gives its log.
+    /// Ends the node and returns its log.
     fn end(mut self) -> String {
         self.signal(Signal::TERM);
         let deadline = Instant::now() + PATIENCE;
@@ -172,7 +171,7 @@ fn wait(what: &str, done: impl Fn() -> bool) {
     }
 }
 
-/// The CA certificate of a fleet file, which holds no other.
+/// Returns the CA certificate of a fleet file, which holds no other.
 fn certificate_of(fleet: &str) -> String {
     let begin = fleet.find("-----BEGIN CERTIFICATE-----").unwrap();
     let end = "-----END CERTIFICATE-----\n";
@@ -191,7 +190,7 @@ fn policy_is_answered_from_the_configuration_alone() {
         0,
         "yes: desk may subscribe to /handoff/pose: `to` names \"desk\": that is this node",
     );
-    // Groups stand in certificates: the name alone does not say them.
+    // Groups are in certificates, so a name alone does not tell them.
     says(
         &["--identity", "desk", "--topic", "/cmd_vel"],
         1,
@@ -228,7 +227,7 @@ fn policy_is_answered_from_the_configuration_alone() {
     let json: Value = serde_json::from_str(&json).unwrap();
     assert_eq!((&json["permitted"], &json["role"]), (&Value::Bool(true), &Value::from("subscribe")));
     assert_eq!(json["node_id"], place.identity("desk.identity").node_id().to_string());
-    // A question that cannot be answered is neither yes nor no.
+    // A question without an answer gives neither yes nor no.
     place.bad(2, &["policy", "test", "-c", "arm-1.toml", "--topic", "/cmd_vel"]);
     place.bad(2, &["policy", "test", "-c", "arm-1.toml", "--identity", "No One", "--topic", "/cmd_vel"]);
 }
@@ -253,7 +252,7 @@ fn partners_are_known_by_their_certificates() {
     let (code, _) = place.policy(&["--certificate", "cart.pem", "--topic", "/map"]);
     assert_eq!(code, Some(0));
     assert_eq!(place.policy(&["--identity-file", "desk.identity", "--topic", "/map"]).0, Some(1));
-    // A list of nodes is a list of nodes, whatever else the CA certified.
+    // A list of nodes covers only these nodes, whatever else the CA certified.
     place.write("arm-1.toml", &format!("{base}{share}node = \"{}\"\n", "ab".repeat(32)));
     let (code, text) = place.policy(&of_cart);
     assert!(code == Some(1) && text.contains("not one of the nodes listed there"), "{text}");
@@ -281,7 +280,7 @@ fn a_running_node_takes_what_it_can_and_names_what_needs_a_restart() {
     let topics: Vec<_> = status["routes"].as_array().unwrap().iter().map(|r| r["topic"].clone()).collect();
     assert_eq!(topics, ["/cmd", "/handoff/pose"]);
 
-    // A mistake anywhere: nothing is touched, and all of it is told.
+    // With a mistake anywhere nothing changes, and all mistakes are reported.
     let good = place.read("arm-1.toml");
     place.write(
         "arm-1.toml",
@@ -303,7 +302,7 @@ fn a_running_node_takes_what_it_can_and_names_what_needs_a_restart() {
         "said until it is done"
     );
 
-    // SIGHUP does the same; the log tells when.
+    // SIGHUP does the same and logs the result.
     place.write("arm-1.toml", &good);
     node.signal(Signal::HUP);
     let deadline = Instant::now() + PATIENCE;
@@ -347,7 +346,7 @@ fn the_status_socket_answers_old_and_odd_questions() {
     }
     let long = ask(&vec![b'x'; 2 << 20]);
     assert!(long == Value::Null || long["error"].as_str().unwrap().contains("more than"), "{long}");
-    // One that asks and never ends its question holds up nobody.
+    // An unfinished request holds up no other.
     let mut slow = UnixStream::connect(place.path("arm.sock")).unwrap();
     slow.write_all(b"sgc/1 rel").unwrap();
     assert_eq!(ask(b"sgc/1 status\n")["node"], "arm-1");
@@ -391,7 +390,7 @@ fn a_directory_below_tmp_that_is_not_the_users_own_holds_no_status_socket() {
         let output = { output }.output().unwrap();
         String::from_utf8([output.stdout, output.stderr].concat()).unwrap()
     };
-    // Somebody was there first, and leads it elsewhere.
+    // Another user was there first and made a link to elsewhere.
     fs::create_dir(place.path("elsewhere")).unwrap();
     std::os::unix::fs::symlink(place.path("elsewhere"), &dir).unwrap();
     let node = place.start_with("cart.toml", with_tmp);
@@ -401,13 +400,13 @@ fn a_directory_below_tmp_that_is_not_the_users_own_holds_no_status_socket() {
     fs::remove_file(&dir).unwrap();
     wait("the node makes it", || status().starts_with("cart: "));
     assert_eq!(fs::metadata(&dir).unwrap().permissions().mode() & 0o7777, 0o700);
-    // Others are let in while it runs.
+    // The directory is opened to others while the node runs.
     fs::set_permissions(&dir, fs::Permissions::from_mode(0o755)).unwrap();
     assert!(status().contains("its mode 0755 lets others in; chmod 700 it"), "{}", status());
     node.end();
 }
 
-/// In the process of another user: asks the node at a socket, and prints the answer.
+/// Runs in the process of another user: asks the node at a socket and prints the answer.
 #[test]
 fn as_another_user() {
     let Some(socket) = std::env::var_os("SGC_TEST_SOCKET") else { return };
@@ -431,7 +430,7 @@ fn another_user_is_refused_at_a_status_socket_that_somebody_opened() {
     fs::set_permissions(place.path("."), fs::Permissions::from_mode(0o755)).unwrap();
     fs::set_permissions(&socket, fs::Permissions::from_mode(0o777)).unwrap();
     for _ in 0..2 {
-        // Nobody may not reach this program by its path.
+        // The user `nobody` may be unable to reach this program by its path.
         let mut command = Command::new("/proc/self/exe");
         command.args(["--exact", "as_another_user", "--nocapture"]).env("SGC_TEST_SOCKET", &socket);
         let output = command.uid(65534).gid(65534).output().unwrap();
@@ -447,7 +446,7 @@ fn another_user_is_refused_at_a_status_socket_that_somebody_opened() {
 #[test]
 fn a_process_with_keys_leaves_no_core_and_is_not_traced_unless_its_user_says_so() {
     let place = Place::new();
-    // Root's capabilities would let it see everything, so both processes run without them.
+    // Both processes run without root's capabilities, which would permit everything.
     let plain = |command: Command| {
         if !rustix::process::geteuid().is_root() {
             return command;
@@ -460,7 +459,7 @@ fn a_process_with_keys_leaves_no_core_and_is_not_traced_unless_its_user_says_so(
         plain.stdin(Stdio::null());
         plain
     };
-    // The memory that another process of the same user sees.
+    // Tries to read the memory from another process of the same user.
     let sees = |node: &Running| {
         let mut look = Command::new("cat");
         look.arg(format!("/proc/{}/maps", node.child.id()));
@@ -526,7 +525,7 @@ fn a_token_hands_over_one_topic_and_is_taken_back() {
     let said = place.bad(2, &["share-token", "-c", "arm-1.toml", "--withdraw", "1"]);
     assert!(said.contains("no token has the number 1"), "{said}");
     node.end();
-    // Numbers are not given twice; one node of the partner may be meant alone.
+    // Numbers are not reused, and a token may be for one node of the partner alone.
     let cart = place.identity("cart.identity").node_id();
     for (to, permitted) in
         [(format!("acme-ca.pem:{cart}"), 0), (format!("acme-ca.pem:{}", "ab".repeat(32)), 1)]
@@ -642,7 +641,7 @@ fn a_token_is_used_by_adding_three_lines() {
     place.write("pose.token", token);
     place.write("cut.token", &token[..token.len() - 3]);
     let before = place.read("cart.toml");
-    // Whoever may list processes would see it.
+    // Any user who lists processes would see the token.
     let said = place.bad(2, &["use", token, "-c", "cart.toml"]);
     assert!(said.contains("is shown to every user of this host") && !said.contains(&token[20..60]), "{said}");
     assert!(!place.path("cart-state").exists());
@@ -668,7 +667,7 @@ fn a_token_is_used_by_adding_three_lines() {
     let said = place.bad(2, &["use", "cut.token", "-c", "cart.toml"]);
     assert!(said.contains("cut or mistyped") && !said.contains(&token[20..60]), "{said}");
 
-    // The node joins that one name, and says what it waits for.
+    // The node joins that name and reports what it waits for.
     let node = place.start("cart.toml");
     let status: Value =
         serde_json::from_str(&place.good(&["status", "--socket", "cart.sock", "--json"])).unwrap();
@@ -677,13 +676,13 @@ fn a_token_is_used_by_adding_three_lines() {
     assert_eq!(route["name"], ShareToken::parse(token).unwrap().name().to_string());
     let log = node.end();
     assert!(!log.contains("sgc-token"), "{log}");
-    // Taken out again while the node runs.
+    // The rule is removed again while the node runs.
     let node = place.start("cart.toml");
     place.write("cart.toml", &before);
     let said = place.good(&["reload", "--socket", "cart.sock"]);
     assert!(said.starts_with("/handoff/pose of arm-1 is no longer used (by token)"), "{said}");
     node.end();
-    // A node that began without a rule takes one all the same, and dials the router that the token names.
+    // A node that started without a rule also takes one, and dials the router that the token names.
     let another = ["--router", "quic://127.0.0.1:10"];
     place.write("pose.token", place.good(&[&args[..], &another].concat()).trim());
     let node = place.start("cart.toml");
@@ -713,7 +712,7 @@ fn the_audit_log_is_found_filtered_and_read_over_what_is_broken() {
          \"peer\":\"{peer}\",\"reason\":\"\\u001b[2Jno\"}}\n{{\"time\":\"20"
     );
     file.write_all(line.as_bytes()).unwrap();
-    // A run later begins a new line.
+    // A later run begins a new line.
     place.start("arm-1.toml").end();
     let ran = place.run(&["audit", "-c", "arm-1.toml"]);
     let events: Vec<_> = ran.stdout.lines().filter_map(|line| line.split_whitespace().nth(1)).collect();
@@ -731,12 +730,12 @@ fn the_audit_log_is_found_filtered_and_read_over_what_is_broken() {
     assert!(said.contains("granted, refused"), "{said}");
     assert!(place.bad(1, &["audit", "--file", "none"]).contains("there is no such file"));
 
-    // The usual place is looked in, too.
+    // The log is also found in the usual place.
     place.write("arm-1.toml", &place.read("arm-1.toml").replace("state = \"state\"\n", ""));
     place.start("arm-1.toml").end();
     assert!(place.good(&["audit"]).contains("started"));
     assert!(place.good(&["audit", "--node", "arm-1"]).contains("started"));
-    // Off is off.
+    // With the audit log off there is nothing to show.
     place.write("arm-1.toml", &format!("{}\n[audit]\noff = true\n", place.read("arm-1.toml")));
     place.start("arm-1.toml").end();
     assert_eq!(place.good(&["audit", "--node", "arm-1"]).lines().count(), 3);

@@ -1,5 +1,5 @@
-// The message types of the peers and what each message must hold; the C++ twin of ../py/messages.py.
-// ../README.md is what the two agree on. CDR is written and read by libfastcdr, as a ROS 2 type support does.
+// The message types of the peers and the content of each message; the C++ counterpart of ../py/messages.py.
+// ../README.md specifies both. libfastcdr writes and reads CDR, as in a ROS 2 type support.
 #pragma once
 
 #include <fastcdr/Cdr.h>
@@ -88,7 +88,7 @@ private:
     uint32_t value_ = 0;
 };
 
-// What a received message says of itself.
+// The number and time inside a received message, and whether its content is intact.
 struct Reading {
     uint64_t seq;
     uint64_t stamp_ns;

@@ -1,8 +1,8 @@
-// A ROS 2-shaped talker and listener on Fast DDS, that knows nothing of SGC.
+// A ROS 2-shaped talker and listener on Fast DDS that does not know SGC.
 //
-// It is set up as rmw_fastrtps sets up a node (names, QoS, memory policy, asynchronous publishing) and reports in JSON
-// lines. The command line and the lines are those of ../README.md, which the Cyclone DDS peer shares. Nothing here
-// polls: discovery arrives by listener, data by wait set, signals by sigwait.
+// It has the settings of rmw_fastrtps (names, QoS, memory policy, asynchronous publishing) and reports in JSON lines.
+// ../README.md specifies the command line and the lines, which the Cyclone DDS peer shares. Nothing polls: discovery arrives
+// by listener, data by wait set, signals by sigwait.
 #include "messages.hpp"
 
 #include <fastdds/dds/core/condition/GuardCondition.hpp>
@@ -90,7 +90,7 @@ Duration_t dds_duration(Clock::duration left) {
     return Duration_t(std::max(seconds, 0.0L));
 }
 
-// Set once, by a signal or by the work being done; wakes whoever waits.
+// Set once, by a signal or at the end of the work; wakes all waiting threads.
 class Stop {
 public:
     // Call before any other thread starts: they all inherit the blocked signals.
@@ -131,13 +131,13 @@ public:
         return stopped;
     }
 
-    // True when stopped before `until`.
+    // Returns true when stopped before `until`.
     bool wait_until(Clock::time_point until) {
         std::unique_lock<std::mutex> lock(mutex);
         return changed.wait_until(lock, until, [this] { return stopped; });
     }
 
-    // Whether a line came on standard input before `until`, a signal or the end of the input. Called once.
+    // Returns whether a line came on standard input before `until`, a signal or the end of the input. Called once.
     bool wait_go(Clock::time_point until) {
         std::thread([this] {
             std::string line;
@@ -158,7 +158,7 @@ public:
     }
 };
 
-// What a ROS 2 type support gives Fast DDS: a keyless type with a ROS name, in plain CDR.
+// Type support like that of ROS 2: a keyless type with a ROS name, in plain CDR.
 template <typename M>
 class RosType : public TopicDataType {
 public:
@@ -276,7 +276,7 @@ struct Matching : DataWriterListener, DataReaderListener {
     Stop& stop;
 };
 
-// What a subscriber knows of what it got.
+// The record of received messages.
 class Tally {
 public:
     void add(const peer::Reading& reading) {
@@ -319,8 +319,8 @@ private:
     uint64_t first_ = 0, last_ = 0, reordered_ = 0;
 };
 
-// What a message says of itself; nothing that is intact if it cannot be read. A value that stands before the call for the case
-// that it throws will not do: GCC 12 (-fipa-modref) drops it, and what is on the stack counts as the message.
+// Reads the number and time inside a message. A message that cannot be read is not intact. A default value set before the call
+// does not cover an exception: GCC 12 (-fipa-modref) drops it, and stack content would count as the message.
 template <typename M>
 peer::Reading read(const M& message) {
     try {

@@ -1,4 +1,4 @@
-// A ROS 2-shaped client and server on Fast DDS: what rmw_fastrtps does for services.
+// A ROS 2-shaped client and server on Fast DDS, with the service mapping of rmw_fastrtps.
 //
 // The client puts the GUID of its reader into the related sample identity of a request, and takes the replies whose related
 // identity is that GUID and the request's sequence number. The server returns what the request said. Included by
@@ -71,7 +71,7 @@ struct Blob {
     }
 };
 
-// One request writer or reply writer, and the other way round: who is matched with both.
+// Counts counterparts that are matched with both the reader and the writer of this end.
 struct ServiceMatching : DataWriterListener, DataReaderListener {
     explicit ServiceMatching(Stop& stop) : stop(stop) {}
     void on_publication_matched(DataWriter*, const PublicationMatchedStatus& status) override {
@@ -82,7 +82,7 @@ struct ServiceMatching : DataWriterListener, DataReaderListener {
     void on_subscription_matched(DataReader*, const SubscriptionMatchedStatus& status) override {
         update(writers, status.current_count, 0, nullptr);
     }
-    // What rmw_fastrtps does before it replies: the client's reader may be matched a little later than its writer.
+    // Waits as rmw_fastrtps does before it replies: the client's reader may be matched a little later than its writer.
     bool wait_for(const GUID_t& reader) {
         std::unique_lock<std::mutex> lock(mutex);
         return changed.wait_for(lock, std::chrono::milliseconds(100), [&] {
@@ -167,7 +167,7 @@ int call(const Options& options, DomainParticipant* participant, Stop& stop, Clo
     emit("ready");
     bool matched = stop.wait_matched(options.wait_matched, deadline);
     if (matched && options.wait_go) matched = stop.wait_go(deadline);
-    // A server of another vendor may be matched with us later than we with it, and takes nothing of the meantime.
+    // A server of another vendor may match us later than we match it, and does not get earlier requests.
     if (matched) stop.wait_until(Clock::now() + in_seconds(1));
     uint64_t sent = 0, answered = 0, wrong = 0, foreign = 0;
     std::vector<int64_t> latency_us;

@@ -1,4 +1,4 @@
-"""Many nodes in one process, which announce themselves and say nothing.
+"""Many nodes in one process, which announce themselves and publish nothing.
 
     busy.py DOMAIN NODES SHARED
 

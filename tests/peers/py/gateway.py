@@ -69,7 +69,7 @@ def rosbridge(args: argparse.Namespace) -> None:
 
 
 def until_served(call: object) -> int:
-    """Calls until somebody answers: what is far away takes a moment to be known."""
+    """Repeats a call until a server answers, because a far server takes a moment to be known."""
     while True:
         try:
             return call()
@@ -79,7 +79,7 @@ def until_served(call: object) -> int:
 
 
 def publish(say: object) -> None:
-    """Says a text ten times a second, for as long as the program lives."""
+    """Publishes a text ten times a second until the program ends."""
 
     def run() -> None:
         for number in itertools.count():
@@ -102,7 +102,7 @@ def main() -> None:
     parser.add_argument("--server-name")
     parser.add_argument("--timeout", type=float, default=120.0, help="seconds, from the start")
     args = parser.parse_args()
-    # Whatever waits for whatever, nothing outlives its test.
+    # The program must not outlive its test, whatever it waits for.
     end = threading.Timer(args.timeout, os._exit, (0,))
     end.daemon = True
     end.start()

@@ -80,7 +80,7 @@ TYPES = {16: (Gid16, Node16, Info16), 24: (Gid24, Node24, Info24)}
 
 
 def participant(domain: int, node: str | None) -> DomainParticipant:
-    """One that every rmw takes for one of ROS 2, if it is to have a node."""
+    """Makes a participant that every rmw takes for one of ROS 2, if it has a node."""
     return DomainParticipant(domain, qos=Qos(Policy.Userdata(ENCLAVE)) if node else None)
 
 
@@ -95,7 +95,7 @@ def _qos(history: Policy.History) -> Qos:
 
 
 def announce(owner: DomainParticipant, node: str, gid_bytes: int, readers: list, writers: list) -> DataWriter:
-    """Says that these endpoints belong to a node of this full name. The writer has to be kept."""
+    """Announces that these endpoints belong to a node with this full name. The writer has to be kept."""
     gid, node_type, info = TYPES[gid_bytes]
     namespace, name = node.rsplit("/", 1)
 
@@ -109,7 +109,7 @@ def announce(owner: DomainParticipant, node: str, gid_bytes: int, readers: list,
 
 
 class Graph:
-    """What a ROS 2 process of this network would answer when it is asked for nodes and for a topic's endpoints."""
+    """The graph as a ROS 2 process of this network sees it: nodes, and endpoints of topics."""
 
     def __init__(self, owner: DomainParticipant, gid_bytes: int) -> None:
         info = TYPES[gid_bytes][2]
@@ -145,7 +145,7 @@ class Graph:
                 self.nodes[bytes(sample.gid.data[:16])] = sample.node_entities_info_seq
 
     def describe(self) -> dict:
-        """All nodes, and all endpoints of ROS topics with the node of each."""
+        """Returns all nodes, and all endpoints of ROS topics with their nodes."""
         owners = {}
         nodes = []
         for participant, infos in self.nodes.items():

@@ -1,4 +1,4 @@
-"""The message types of the peers and what each message must hold.
+"""The message types of the peers and the content of each message.
 
 Types carry the names that ROS 2 gives them on the wire. The content of a message follows from its sequence number, the
 time it was sent and a size alone, so a receiver rebuilds what it should have got and compares all of it. The C++ peer

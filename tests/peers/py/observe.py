@@ -1,4 +1,4 @@
-"""Says which DDS endpoints there are, as one who takes part in the domain and knows nothing of SGC.
+"""Lists DDS endpoints as a participant of the domain that does not know SGC.
 
 For each line on standard input it prints one of JSON: `{"event": "endpoints", "endpoints": [{"kind": "writer", "topic": …,
 "type": …, "qos": …}, …]}`. The end of the input, or SIGTERM, ends it.

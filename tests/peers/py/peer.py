@@ -1,4 +1,4 @@
-"""A ROS 2-shaped talker and listener on Cyclone DDS, that knows nothing of SGC.
+"""A ROS 2-shaped talker and listener on Cyclone DDS that does not know SGC.
 
 It speaks plain DDS with ROS 2's topic and type names and QoS, and reports in JSON lines. The command line and the lines
 are those of `../README.md`, which the Fast DDS peer shares. Nothing here polls: discovery arrives by listener, data by
@@ -40,7 +40,7 @@ def emit(event: str, **fields: object) -> None:
             sys.stdout.write(line + "\n")
             sys.stdout.flush()
         except BrokenPipeError:
-            # Nobody listens any more. An exception would end this thread only, and Cyclone's would keep us here.
+            # The reader of standard output is gone. An exception would end only this thread, and Cyclone's would keep the process.
             os._exit(EXIT_INCOMPLETE)
 
 
@@ -86,7 +86,7 @@ def configuration(args: argparse.Namespace) -> str:
 
 
 class Stop:
-    """Set once, by a signal or by the work being done; wakes whoever waits."""
+    """Set once, by a signal or at the end of the work; wakes all waiting threads."""
 
     def __init__(self) -> None:
         self.event = threading.Event()
@@ -110,8 +110,8 @@ def qos_of(args: argparse.Namespace):
     from cyclonedds.util import duration
 
     history = Policy.History.KeepLast(args.depth) if args.depth else Policy.History.KeepAll
-    # A late joiner is given what the durability service keeps: 1 by default, whatever the history depth says. As
-    # rmw_cyclonedds does, both get the same depth.
+    # A late joiner gets the samples of the durability service, which keeps 1 by default, whatever the history depth is. Both
+    # get the same depth, as in rmw_cyclonedds.
     service = [Policy.DurabilityService(0, history, -1, -1, -1)] if args.transient_local else []
     deadline = [Policy.Deadline(duration(nanoseconds=int(args.deadline * 1e9)))] if args.deadline else []
     return Qos(
@@ -125,7 +125,7 @@ def qos_of(args: argparse.Namespace):
 
 
 class Matches:
-    """How many counterparts there are now."""
+    """Returns the number of matched counterparts."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -167,7 +167,7 @@ def publish(args, stop: Stop, deadline: float) -> int:
     matched = matches.count >= args.wait_matched
     if matched and args.wait_go:
         matched = wait_go(stop, deadline)
-    # Set by whatever ends the sending; only `stop` ends the program.
+    # Set at the end of sending; only `stop` ends the program.
     enough = threading.Event()
     stop.hooks.append(enough.set)
     if stop.event.is_set():
@@ -212,7 +212,7 @@ def leave(participant) -> None:
 
 
 def wait_go(stop: Stop, deadline: float) -> bool:
-    """Whether a line came on standard input before the deadline, a signal or the end of the input."""
+    """Returns whether a line came on standard input before the deadline, a signal or the end of the input."""
     answer: list[bool] = []
     woken = threading.Event()
     stop.hooks.append(woken.set)
@@ -228,7 +228,7 @@ def wait_go(stop: Stop, deadline: float) -> bool:
 
 
 class Tally:
-    """What a subscriber knows of what it got."""
+    """The record of received messages."""
 
     def __init__(self) -> None:
         self.seen: set[int] = set()
@@ -311,7 +311,7 @@ def subscribe(args, stop: Stop, deadline: float) -> int:
 
 
 def watch_graph(args, stop: Stop, deadline: float) -> int:
-    """Says what nodes and endpoints there are, at each change."""
+    """Reports nodes and endpoints at each change."""
     import graph
     from cyclonedds.core import GuardCondition, WaitSet
     from cyclonedds.util import duration

@@ -1,4 +1,4 @@
-"""PyPI's roslibpy against a gateway: its documented examples, and what else its users rely on.
+"""PyPI's roslibpy against a gateway: its documented examples, and other behaviour that its users rely on.
 
 python rosbridge.py PORT; "all is well" and an exit code of 0 if all was right. ROSLIBPY_TRANSPORT says by which of its transports.
 """
@@ -14,7 +14,7 @@ PATIENCE = 20
 
 
 class Heard:
-    """What a callback was called with."""
+    """Records the arguments of a callback."""
 
     def __init__(self):
         self.all = []

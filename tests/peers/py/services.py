@@ -1,4 +1,4 @@
-"""ROS 2-shaped servers and clients of services and actions on Cyclone DDS, that know nothing of SGC.
+"""ROS 2-shaped servers and clients of services and actions on Cyclone DDS that do not know SGC.
 
 What is on the wire is rmw_cyclonedds' mapping: two topics for a service, in front of each request and reply the client's id
 and the number of the request. Reports in JSON lines as `peer.py` does, whose settings it shares; the command line is in
@@ -36,7 +36,7 @@ def struct(typename: str, **fields: object) -> type:
 
 
 def message(typename: str, **fields: object) -> type:
-    """The same with the header of rmw_cyclonedds in front."""
+    """A final type in plain CDR, with the header of rmw_cyclonedds in front."""
     return struct(typename, client=uint64, number=int64, **fields)
 
 
@@ -77,7 +77,7 @@ def qos(depth: int = 1000, transient_local: bool = False):
 
 
 class Node:
-    """A participant and a thread that hands what it reads to whom it is for."""
+    """A participant, and a thread that passes samples to their handlers."""
 
     def __init__(self, domain: int) -> None:
         from cyclonedds.core import WaitSet
@@ -130,7 +130,7 @@ class Node:
 
 
 class Client:
-    """A client, which knows its servers as rmw does: by both halves."""
+    """A client, which counts a server as matched like rmw: by both its reader and its writer."""
 
     def __init__(self, node: Node, name: str, request: type, reply: type) -> None:
         self.request, self.id, self.number = request, random.getrandbits(64), 0
@@ -178,7 +178,7 @@ def fibonacci(order: int) -> list[int]:
 
 
 def server(node: Node, args, deadline: float) -> None:
-    """Adds; with --hold, once a line on standard input says so."""
+    """Serves AddTwoInts; with --hold, replies after a line on standard input."""
     held: list = []
     lock = threading.Lock()
 
@@ -187,7 +187,7 @@ def server(node: Node, args, deadline: float) -> None:
         if args.hold:
             with lock:
                 held.append(answer)
-        # Who hears of it may say go at once.
+        # A reader of this report may send its line at once.
         emit("request", a=request.a, b=request.b)
         if not args.hold:
             answer()
@@ -207,7 +207,7 @@ def server(node: Node, args, deadline: float) -> None:
 
 
 def client(node: Node, args, deadline: float) -> None:
-    """Calls --count times, then reports when the service is gone and there again, and calls at each line it is told."""
+    """Calls --count times, then reports when the service goes and comes back, and calls at each line of standard input."""
     adds = Client(node, args.name, AddRequest, AddReply)
     threading.Thread(target=node.run, args=(deadline,), daemon=True).start()
     begun = threading.Lock()
@@ -391,7 +391,7 @@ def main() -> None:
     ROLES[args.role](node, args, time.monotonic() + args.timeout)
     node.ended.set()
     leave(node.participant)
-    # Threads that read standard input would keep the process.
+    # Threads that read standard input would keep the process alive.
     sys.stdout.flush()
     os._exit(0)
 

@@ -1,4 +1,4 @@
-"""Calls services, actions and parameters with the client library of Python, or serves them; the same for first messages of topics.
+"""Calls or serves services, actions and parameters with Python's client library, and tests first messages of topics.
 
 The command line and the JSON lines are those of ../README.md. Every call has a client of its own, which calls in the moment in which
 it sees the server, and every message a publisher of its own.
@@ -23,7 +23,7 @@ from test_msgs.action import Fibonacci
 from test_msgs.srv import BasicTypes
 
 POLL_S = 0.001
-# Python takes messages more slowly than they may come, and what comes then takes the place of what waits, natively as well.
+# Python may take messages more slowly than they come. Newer ones then replace waiting ones, natively as well.
 DEPTH = 1000
 PARAMETER = "answer"
 
@@ -74,7 +74,7 @@ def serve(options) -> int:
 
 
 class Calls:
-    """Calls under way, each of a client of its own."""
+    """Calls in progress, each of a client of its own."""
 
     def __init__(self, options):
         self.options = options
@@ -84,7 +84,7 @@ class Calls:
         self.open = []
 
     def renew(self) -> None:
-        """Begins a participant, unless there is one that may be used again."""
+        """Creates a participant, unless a free one can be used again."""
         if self.context is None or self.options.participants:
             self.context = rclpy.Context()
             rclpy.init(context=self.context)
@@ -185,7 +185,7 @@ def leave(options) -> int:
 
 
 def publish(options) -> int:
-    """Publishes a number with each of several publishers, in the moment in which it is matched."""
+    """Publishes a number with each of several publishers as soon as it is matched."""
     rclpy.init()
     node = rclpy.create_node(options.node, start_parameter_services=False)
     say("ready")
@@ -206,7 +206,7 @@ def publish(options) -> int:
 
 
 def listen(options) -> int:
-    """Tells which numbers came, until all have."""
+    """Reports received numbers until all have come."""
     rclpy.init()
     node = rclpy.create_node(options.node, start_parameter_services=False)
     came = []

@@ -1,4 +1,4 @@
-"""Many subscriptions one after the other, or many participants at once (../README.md)."""
+"""Makes many subscriptions one after the other, or many participants at once (../README.md)."""
 
 import argparse
 import json
@@ -16,7 +16,7 @@ def report(event: str, **facts: object) -> None:
 
 
 def subscriptions(args: argparse.Namespace) -> None:
-    """Makes and destroys subscriptions; again with each line on standard input."""
+    """Makes and destroys subscriptions, and repeats that at each line on standard input."""
     rclpy.init()
     node = rclpy.create_node("churn")
     while True:

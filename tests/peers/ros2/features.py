@@ -1,4 +1,4 @@
-"""What nodes of ROS 2 do besides topics and calls: lifecycles, simulated time, service introspection, transforms, images (../README.md).
+"""Features of ROS 2 beyond topics and calls: lifecycles, simulated time, service introspection, transforms, images (../README.md).
 """
 
 import argparse
@@ -42,7 +42,7 @@ def matched(status) -> None:
 
 
 def lines(act) -> None:
-    """Acts at each line of standard input."""
+    """Calls a function at each line of standard input."""
     threading.Thread(target=lambda: [act() for _ in sys.stdin], daemon=True).start()
 
 
@@ -70,7 +70,7 @@ class Camera(LifecycleNode):
 
 
 class Manager(Node):
-    """Leads a camera through its lifecycle, and says what its states, answers and events are."""
+    """Leads a camera through its lifecycle, and reports its states, answers and events."""
 
     STEPS = [
         Transition.TRANSITION_CONFIGURE,
@@ -156,7 +156,7 @@ class Simulator(Node):
 
 
 class Simulated(Node):
-    """Lives by the time of a simulator."""
+    """Runs a node on simulated time."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         use_sim_time = Parameter("use_sim_time", Parameter.Type.BOOL, True)
@@ -171,7 +171,7 @@ class Simulated(Node):
 
 
 class Server(Node):
-    """Answers, and publishes events of that."""
+    """Serves a service and publishes its introspection events."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         super().__init__("server")
@@ -186,7 +186,7 @@ class Server(Node):
 
 
 class Client(Node):
-    """Calls at each line, and publishes events of that."""
+    """Calls a service at each line and publishes the introspection events."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         super().__init__("client")
@@ -203,7 +203,7 @@ class Client(Node):
 
 
 class Watcher(Node):
-    """Says which events of a service it hears."""
+    """Reports the introspection events of a service."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         super().__init__("watcher")
@@ -262,7 +262,7 @@ def frames(cdr: bytes) -> list[list[object]]:
 
 
 def tf_message() -> type:
-    # The layout does not matter to who gives and takes CDR.
+    # The layout does not matter, because messages pass as CDR.
     return retyped(String, package="tf2_msgs", name="TFMessage")
 
 
@@ -277,7 +277,7 @@ class Broadcaster(Node):
 
 
 class Listener(Node):
-    """Says which frames it hears of."""
+    """Reports received frames."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         super().__init__("listener")
@@ -321,7 +321,7 @@ class ImagePublisher(Node):
 
 
 class ImageSubscriber(Node):
-    """Says which images come."""
+    """Reports received images."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         super().__init__("viewer")
@@ -372,7 +372,7 @@ def main() -> None:
     executor.add_node(node)
     while not ended.is_set():
         executor.spin_once(timeout_sec=0.1)
-    # Others shall know at once that it is gone.
+    # Lets others know at once that the node is gone.
     executor.shutdown()
     node.destroy_node()
     rclpy.shutdown()

@@ -1,4 +1,4 @@
-"""Shows what the graph says of the endpoints of a topic, or of a service. JSON lines as in ../README.md."""
+"""Prints the graph's endpoints of a topic, or of a service. JSON lines as in ../README.md."""
 
 import argparse
 import json

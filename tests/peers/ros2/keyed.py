@@ -86,7 +86,7 @@ def main() -> int:
         while not is_over() and not options.transient_local and min(matched.values()) == 0:
             rclpy.spin_once(node, timeout_sec=0.1)
         rounds = 0
-        # Once again for who was matched and did not know it yet.
+        # Repeated for a subscriber that was matched and did not know it yet.
         while not is_over():
             if rounds == 0 or not options.transient_local:
                 for topic, all_of_it in expected.items():

@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 MAP_CELLS = 100_000
 MAP_PAUSE_S = 0.3
 MAP_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# Takes all that there is.
+# Takes all available messages.
 HEAR_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LOG_QOS = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

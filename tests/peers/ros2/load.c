@@ -21,9 +21,9 @@ enum { EXIT_FINE = 0, EXIT_WRONG = 1, EXIT_USAGE = 2, EXIT_INCOMPLETE = 3 };
 enum { HEAD_BYTES = 24 };
 // The longest wait of a publisher for acknowledgements.
 #define ACKNOWLEDGED_WAIT_NS ((int64_t)20 * 1000000000)
-// Latencies that are kept; of more, each takes the place of another at random.
+// Most latencies kept. Beyond it, each replaces another at random.
 enum { LATENCIES_MAX = 100000 };
-// Sequence numbers that are told apart from those that came twice.
+// Sequence numbers for which repetitions are detected.
 #define SEQ_MAX ((uint64_t)64 << 20)
 
 typedef struct {
@@ -98,7 +98,7 @@ static rcl_subscription_t subscription_of(const char *topic) {
 }
 
 static uint64_t sum_of(const uint8_t *data, size_t bytes) {
-    // FNV-1a, by words: all of a message is looked at, at the speed of memory.
+    // FNV-1a by words, which reads a whole message at the speed of memory.
     uint64_t sum = 0xcbf29ce484222325;
     for (; bytes >= 8; data += 8, bytes -= 8) {
         uint64_t word;
@@ -194,7 +194,7 @@ static int publish(int64_t deadline) {
         }
         next += interval;
         int64_t early = next - monotonic_ns();
-        // A publisher that was held up catches up, as a timer does.
+        // A delayed publisher catches up, as a timer does.
         if (interval > 0 && early > 0) pause_for_ns(early);
     }
     double seconds = (double)(monotonic_ns() - begun) / 1e9;
@@ -271,7 +271,7 @@ static rcl_wait_set_t waiting_for(void) {
     return set;
 }
 
-// Waits for a message, at most so long.
+// Waits for a message until the time-out.
 static void wait_for(rcl_wait_set_t *set, const rcl_subscription_t *subscription, int64_t ns) {
     check(rcl_wait_set_clear(set), "wait set");
     check(rcl_wait_set_add_subscription(set, subscription, NULL), "wait set");
@@ -299,7 +299,7 @@ static bool is_enough(const Tally *tally) {
     return options.count != 0 && tally->received >= options.count;
 }
 
-// Listens to one topic; as `echo`, gives back on another what comes.
+// Subscribes to one topic. As `echo`, publishes each message on another.
 static int subscribe(int64_t deadline, bool echoes) {
     rcl_publisher_t back = rcl_get_zero_initialized_publisher();
     if (echoes) back = publisher_of(options.back);
@@ -360,7 +360,7 @@ static int ping(int64_t deadline) {
         fill(&message, seq);
         check(rcl_publish(&publisher, &message, NULL), "publish");
         bool is_back = false;
-        // The first may be lost, where one end is matched before the other.
+        // The first message may be lost if one end is matched before the other.
         int64_t patience = begun + 1000000000;
         while (!is_back && !is_over(patience)) {
             wait_for(&set, &subscription, 100000000);

@@ -31,11 +31,11 @@ PACKAGES = [
     "type_description_interfaces",
     "unique_identifier_msgs",
 ]
-# Those with keys, which Jazzy does not have, are for keyed.py.
+# Types with keys, which Jazzy does not have, are tested by keyed.py.
 KEYED = re.compile("Key")
-# Messages of each type. The first may be lost while its ends find each other.
+# Number of messages of each type. The first may be lost during discovery.
 VARIANTS = 3
-# Between the first messages and the others.
+# Pause between the first messages and the others.
 PAUSE_S = 0.5
 LINGER_S = 0.5
 INTEGER = re.compile(r"(u?)int(8|16|32|64)$")
@@ -83,7 +83,7 @@ def filled(kind: type, dice: random.Random) -> object:
 
 
 def fields(of: object, path: str = "") -> dict[str, object]:
-    """Returns each field with its path, without what differs in how Python holds it."""
+    """Returns each field with its path, without differences of representation in Python."""
     if hasattr(of, "get_fields_and_field_types"):
         parts = [fields(getattr(of, name), f"{path}.{name}") for name in of.get_fields_and_field_types()]
         return {name: part for each in parts for name, part in each.items()}
@@ -150,7 +150,7 @@ def main() -> int:
     def hear(name: str, message: object) -> None:
         found = fields(message)
         if found in expected[name]:
-            # Messages of types that have one value to show are all alike.
+            # All messages of a type with a single test value are alike.
             heard[name].append(max(i for i, one in enumerate(expected[name]) if one == found))
             return
         nearest = min(expected[name], key=lambda one: len(one.items() ^ found.items()))
@@ -168,7 +168,7 @@ def main() -> int:
     emit(event="ready", types=len(kinds))
 
     def missing() -> list[str]:
-        """Types of which the last message has not come, or another but the first."""
+        """Returns the types of which the last message, or any but the first, is missing."""
         return [name for name, which in heard.items() if len(which) < VARIANTS - 1 or which[-1] != VARIANTS - 1]
 
     while not is_over() and missing():
@@ -178,7 +178,7 @@ def main() -> int:
         rclpy.spin_once(node, timeout_sec=0.1)
 
     def is_wrong(which: list[int], name: str) -> bool:
-        """Says that messages came twice, or not in their order."""
+        """Reports repeated or reordered messages."""
         first, *_, last = expected[name]
         return len(which) > VARIANTS if first == last else which not in ([0, 1, 2], [1, 2])
 

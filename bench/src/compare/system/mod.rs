@@ -1,4 +1,4 @@
-//! What is compared: ways to join the DDS networks of two places. A system is a file here and a row of [`all`].
+//! The compared systems, which join the DDS networks of two places. A system is a file here and a row of [`all`].
 
 mod direct;
 mod relay;
@@ -34,7 +34,7 @@ pub(crate) trait System: Sync {
 pub(crate) struct Topic {
     /// Its name, as ROS 2 has it.
     pub(crate) name: &'static str,
-    /// Where its subscribers are.
+    /// The place of its subscribers.
     pub(crate) towards: Side,
     /// Whether its messages must not be lost.
     pub(crate) reliable: bool,
@@ -163,7 +163,7 @@ pub(crate) fn all(sgc: &Path, peers: &Peers) -> Result<Vec<Box<dyn System>>> {
     Ok(systems)
 }
 
-/// What is no system for users, but about the least that programs between two networks take; in tables of round trips and rates.
+/// Returns minimal relays between two networks, which are no systems for users, for tables of round trips and rates.
 pub(crate) fn relays() -> Vec<Box<dyn System>> {
     relay::all().map(|relay| Box::new(relay) as Box<dyn System>).into()
 }
@@ -192,8 +192,8 @@ pub(crate) fn configured(
     Ok(systems)
 }
 
-/// Why rosbridge is not compared. What the programs here say is of a type of their own, and it carries those only that are
-/// installed as packages of ROS 2, beside rosbridge itself.
+/// The reason why rosbridge is not compared: it carries only types that are installed as ROS 2 packages beside it, and the
+/// programs here have a type of their own.
 pub(crate) fn why_no_rosbridge() -> String {
     let installed = std::fs::read_dir("/opt/ros").into_iter().flatten().flatten();
     let installed: Vec<_> =

@@ -128,7 +128,7 @@ impl Keystore {
     }
 }
 
-/// What SROS2's default says: nobody without identity, all encrypted, packets signed.
+/// Returns SROS2's default governance: no participant without identity, all encrypted, packets signed.
 fn governance() -> String {
     let rules = "<allow_unauthenticated_participants>false</allow_unauthenticated_participants>\
          <enable_join_access_control>true</enable_join_access_control>\

@@ -61,7 +61,7 @@ impl Sgc {
         fs::write(&config, text)?;
         let mut command = lab.command(side, &self.program);
         command.args(["run", "--print-ready", "--until-stdin-closes", "--log", "warn", "--config"]);
-        // What a user's shell says of ROS 2 is not to be measured.
+        // Variables of a user's shell must not affect the measurement.
         for variable in ["CYCLONEDDS_URI", "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "SGC_LOG"] {
             command.env_remove(variable);
         }

@@ -21,11 +21,11 @@ use crate::compare::program::Program;
 const ADDRESSES: [Ipv4Addr; 2] = [Ipv4Addr::new(10, 99, 0, 1), Ipv4Addr::new(10, 99, 0, 2)];
 const BITS_PREFIX: u8 = 24;
 const PORT: u16 = 51820;
-/// What WireGuard's own tool sets where the path takes 1500 bytes.
+/// MTU that WireGuard's own tool sets on a path of 1500 bytes.
 const MTU: u16 = 1420;
-/// What its manual recommends to who is behind a NAT, seconds.
+/// Keep-alive interval in seconds that its manual recommends behind a NAT.
 const KEEP_ALIVE_SECONDS: u16 = 25;
-/// Where `wireguard-go` opens a socket for its tool, by the name of the interface. It is the same in all namespaces.
+/// Directory in which `wireguard-go` opens a socket for its tool, named by the interface. All namespaces share it.
 const SOCKETS: &str = "/var/run/wireguard";
 const PATIENCE: Duration = Duration::from_secs(10);
 const LOOK_EVERY: Duration = Duration::from_millis(10);
@@ -82,7 +82,7 @@ fn set_up(lab: &Lab, side: Side, interface: &str, keys: &[Keys; 2]) -> Result<()
     Ok(())
 }
 
-/// What one end is known by.
+/// The keys of one end.
 struct Keys {
     private_file: PathBuf,
     public: String,
@@ -103,7 +103,7 @@ impl Keys {
     }
 }
 
-/// What a tool says to this input, which is short.
+/// Returns the output of a tool for this short input.
 fn output(mut command: Command, input: &str) -> Result<String> {
     let name = format!("{command:?}");
     command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());

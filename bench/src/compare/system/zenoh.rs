@@ -1,4 +1,4 @@
-//! Zenoh bridges at both places, joined over TCP or TLS: what users of ROS 2 take today to leave their network.
+//! Zenoh bridges at both places, joined over TCP or TLS, as users of ROS 2 join networks today.
 //!
 //! The right bridge listens, the left one connects, as a robot's does. Configurations are the bridge's defaults, but for
 //! scouting, which both places do without as they know each other, and for what [`Zenoh::tuned`] says.
@@ -20,11 +20,11 @@ const PORT: u16 = 7447;
 pub(crate) struct Zenoh {
     program: PathBuf,
     over: Over,
-    /// What the bridge's users can set for their topics and their path, and its name.
+    /// Settings of the bridge for topics and path, and their name.
     tuning: Option<Value>,
 }
 
-/// What carries Zenoh's protocol.
+/// The transport of Zenoh's protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Over {
     Tcp,

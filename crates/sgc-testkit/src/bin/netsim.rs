@@ -1,4 +1,4 @@
-//! A bad network at the command line: `docs/how-to/netsim.md`.
+//! A bad network on the command line: `docs/how-to/netsim.md`.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "it is a program")]
 
 use std::io::BufRead as _;
@@ -14,16 +14,16 @@ use sgc_testkit::netsim::{
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
-/// How long a packet that is reordered is held back, if nothing else is said.
+/// Default time for which a reordered packet is held back.
 const HELD_BACK: Duration = Duration::from_millis(5);
 const STATS_INTERVAL: Duration = Duration::from_secs(1);
-/// Commands that wait to be carried out.
+/// Most commands in the queue.
 const COMMANDS_MAX: usize = 16;
 
 /// A bad network between real processes: rate, queue, delay, jitter, loss, reordering.
 ///
 /// While it runs it reads commands from standard input: `cut`, `restore`, `rebind` (udp), `stats`, and `forth`, `back` or
-/// `both` with options such as `both --rate 1mbit --loss 5%`, which replace all that were there.
+/// `both` with options such as `both --rate 1mbit --loss 5%`, which replace all earlier options.
 #[derive(Parser)]
 #[command(name = "netsim")]
 struct Cli {
@@ -33,7 +33,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Join two network namespaces; needs root. IP packets of all kinds meet the path.
+    /// Join two network namespaces, for IP packets of all kinds; needs root.
     Tun(TunArgs),
     /// Relay datagrams from one address to another.
     Udp(RelayArgs),
@@ -43,25 +43,25 @@ enum Command {
 
 #[derive(Args)]
 struct TunArgs {
-    /// The two namespaces, by name or path; `self` is this one
+    /// Two namespaces, by name or path; `self` is this one
     #[arg(long, num_args = 2, value_names = ["FIRST", "SECOND"], required = true)]
     between: Vec<String>,
-    /// What the devices are called
+    /// Names of the devices
     #[arg(long, num_args = 2, value_names = ["FIRST", "SECOND"], default_values = ["netsim0", "netsim1"])]
     interfaces: Vec<String>,
-    /// An address of the first end, with its prefix; may be repeated
+    /// Address of the first end, with its prefix; may be repeated
     #[arg(long, value_name = "ADDRESS/BITS", default_value = "10.200.0.1/24")]
     first: Vec<String>,
-    /// An address of the second end
+    /// Address of the second end, with its prefix; may be repeated
     #[arg(long, value_name = "ADDRESS/BITS", default_value = "10.200.0.2/24")]
     second: Vec<String>,
-    /// What the first end reaches through it beside the second, such as `default`; may be repeated
+    /// Further route of the first end through the path, such as `default`; may be repeated
     #[arg(long, value_name = "PREFIX")]
     first_routes: Vec<String>,
-    /// What the second end reaches through it
+    /// Further route of the second end through the path; may be repeated
     #[arg(long, value_name = "PREFIX")]
     second_routes: Vec<String>,
-    /// The longest IP packet
+    /// Longest IP packet in bytes
     #[arg(long, default_value_t = 1500, value_parser = clap::value_parser!(u16).range(68..))]
     mtu: u16,
     #[command(flatten)]
@@ -70,10 +70,10 @@ struct TunArgs {
 
 #[derive(Args)]
 struct RelayArgs {
-    /// Where to listen
+    /// Address to listen on
     #[arg(long, value_name = "ADDRESS:PORT")]
     listen: SocketAddr,
-    /// Where to send it
+    /// Address to send to
     #[arg(long, value_name = "ADDRESS:PORT")]
     to: SocketAddr,
     #[command(flatten)]
@@ -84,10 +84,10 @@ struct RelayArgs {
 struct PathArgs {
     #[command(flatten)]
     both: ProfileArgs,
-    /// Options for the way back alone, in one word: --back "--rate 20mbit --delay 40ms"
+    /// Options for the way back only, as one argument: --back "--rate 20mbit --delay 40ms"
     #[arg(long, value_name = "OPTIONS", allow_hyphen_values = true)]
     back: Option<String>,
-    /// Decides which packets are lost
+    /// Seed of loss, jitter and the other draws
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Print the counters each second
@@ -95,34 +95,34 @@ struct PathArgs {
     stats: bool,
 }
 
-/// What a direction is like.
+/// The properties of a direction.
 #[derive(Args, Clone)]
 struct ProfileArgs {
     /// Bits per second: 5mbit, 800kbit
     #[arg(long, value_parser = parse_rate)]
     rate: Option<u64>,
-    /// What may wait for the wire: 200ms (of the rate), 64kb
+    /// Bound of the queue: 200ms (at the rate), 64kb
     #[arg(long, value_parser = parse_queue, default_value = "200ms")]
     queue: QueueLimit,
-    /// How long packets take: 40ms
+    /// Delay of packets: 40ms
     #[arg(long, value_parser = parse_duration, default_value = "0ms")]
     delay: Duration,
-    /// By how much that varies, either way: 5ms
+    /// Variation of the delay, either way: 5ms
     #[arg(long, value_parser = parse_duration, default_value = "0ms")]
     jitter: Duration,
-    /// Packets lost at random: 2%
+    /// Fraction of packets lost at random: 2%
     #[arg(long, value_parser = parse_percent, conflicts_with = "bursts")]
     loss: Option<f64>,
-    /// Packets lost in bursts: how often one begins, ends, and how much it loses: 0.1%,10%,100%
+    /// Loss in bursts, as the probabilities that a burst begins and ends, and the fraction it loses: 0.1%,10%,100%
     #[arg(long, value_parser = parse_bursts)]
     bursts: Option<Loss>,
-    /// Packets that others overtake: 1%
+    /// Fraction of packets that others overtake: 1%
     #[arg(long, value_parser = parse_percent, default_value = "0%")]
     reorder: f64,
-    /// How long those are held back
+    /// Time for which overtaken packets are held back
     #[arg(long, value_parser = parse_duration)]
     reorder_by: Option<Duration>,
-    /// Packets that arrive twice: 1%
+    /// Fraction of packets that arrive twice: 1%
     #[arg(long, value_parser = parse_percent, default_value = "0%")]
     duplicate: f64,
     /// Bytes that each packet takes on the wire beyond its own
@@ -130,7 +130,7 @@ struct ProfileArgs {
     overhead: u32,
 }
 
-/// Options alone, as in a command.
+/// The options of a command on standard input.
 #[derive(Parser)]
 #[command(no_binary_name = true, disable_help_flag = true)]
 struct OptionsOnly {
@@ -174,7 +174,7 @@ fn parse_profile(options: &str) -> Result<Profile, String> {
     Ok(parsed.profile.profile())
 }
 
-/// What runs.
+/// The running path.
 enum Path {
     Tun(TunLink),
     Udp(UdpRelay),
@@ -248,7 +248,7 @@ impl Path {
         }
     }
 
-    /// Carries out a line of standard input.
+    /// Carries out a command of standard input.
     fn obey(&self, line: &str) -> Result<(), String> {
         let (word, options) = line.trim().split_once(' ').unwrap_or((line.trim(), ""));
         match (word, self) {
@@ -300,7 +300,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Until a signal comes.
+/// Serves the path until a signal comes.
 async fn serve(path: &Path, stats: bool) -> Result<(), Box<dyn std::error::Error>> {
     let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
     let (sender, mut lines) = mpsc::channel(COMMANDS_MAX);

@@ -1,4 +1,4 @@
-//! One direction of a path: a queue that drops at its tail, a wire of a certain rate, and what happens on the way.
+//! One direction of a path: a queue that drops at its tail, a wire of a certain rate, and impairments behind the wire.
 //!
 //! Pure: time is an argument, a [`Duration`] since an origin that the caller chooses, and must not go back. A packet
 //! waits in the queue, takes its time on the wire, and only then is lost or delayed: as over radio, a lost packet has
@@ -10,36 +10,36 @@ use std::time::Duration;
 
 use crate::rng::Dice;
 
-/// Most bytes that are under way at once, behind the wire. More are dropped as by a full queue.
+/// Most bytes in flight behind the wire. More are dropped as by a full queue.
 pub const FLYING_BYTES_MAX: u64 = 256 << 20;
 
-/// What a direction is like. The default is a perfect wire.
+/// The properties of a direction. The default is a perfect wire.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Profile {
-    /// Bits per second; without it nothing ever waits.
+    /// Bits per second. Without a rate no packet ever waits.
     pub rate: Option<u64>,
-    /// What may wait for the wire. It means nothing without a rate.
+    /// Bound of the queue before the wire, which matters only with a rate.
     pub queue: QueueLimit,
-    /// How long a packet takes beside its time on the wire.
+    /// Delay of a packet beyond its time on the wire.
     pub delay: Duration,
-    /// By how much that varies, either way, uniformly. Packets keep their order.
+    /// Uniform variation of the delay, either way. Packets keep their order.
     pub jitter: Duration,
-    /// Which packets do not arrive.
+    /// Loss of packets.
     pub loss: Loss,
-    /// Which packets others overtake.
+    /// Reordering of packets.
     pub reorder: Reorder,
-    /// The share of packets that arrive twice.
+    /// Fraction of packets that arrive twice.
     pub duplicate: f64,
-    /// What each packet takes on the wire beyond its own bytes.
+    /// Bytes that each packet takes on the wire beyond its own.
     pub overhead_bytes: u32,
 }
 
-/// What may wait for the wire.
+/// The bound of a queue.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum QueueLimit {
-    /// So many bytes.
+    /// A number of bytes.
     Bytes(u64),
-    /// As much as the rate carries in that time.
+    /// The bytes that the rate carries in this time.
     Time(Duration),
 }
 
@@ -49,45 +49,45 @@ impl Default for QueueLimit {
     }
 }
 
-/// Which packets do not arrive. Shares are between 0 and 1.
+/// A model of loss. Probabilities are between 0 and 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Loss {
-    /// All arrive.
+    /// All packets arrive.
     #[default]
     None,
-    /// Each is lost with this probability, whatever happened to the others.
+    /// Each packet is lost with this probability, independently of others.
     Random(f64),
-    /// In bursts (Gilbert and Elliott): a state in which all arrive, and one in which the share `in_burst` is lost.
-    /// `begin` and `end` are the probabilities, per packet, to go from the one to the other and back.
+    /// Packets are lost in bursts (Gilbert and Elliott): in one state all arrive, in the other the fraction `in_burst` is lost.
+    /// `begin` and `end` are the probabilities, per packet, of a change to the second state and back.
     Bursts {
-        /// That a burst begins with this packet.
+        /// Probability that a burst begins with a packet.
         begin: f64,
-        /// That it ends with this packet.
+        /// Probability that it ends with a packet.
         end: f64,
-        /// What is lost in it.
+        /// Fraction of packets lost in a burst.
         in_burst: f64,
     },
 }
 
-/// Which packets others overtake.
+/// A model of reordering.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Reorder {
-    /// The share of packets that are held back.
+    /// Fraction of packets that are held back.
     pub share: f64,
-    /// For how long, beyond the delay.
+    /// Time for which they are held back, beyond the delay.
     pub by: Duration,
 }
 
-/// What became of packets so far.
+/// Counters of packets so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
     /// Packets that came in.
     pub packets: u64,
     /// Bytes that came in.
     pub bytes: u64,
-    /// Packets that were handed on, copies included.
+    /// Packets that were delivered, copies included.
     pub passed: u64,
-    /// Bytes of those.
+    /// Bytes of delivered packets.
     pub passed_bytes: u64,
     /// Packets lost on the way.
     pub lost: u64,
@@ -99,9 +99,9 @@ pub struct Counters {
     pub duplicated: u64,
     /// Packets that were held back.
     pub reordered: u64,
-    /// The most bytes that waited at once.
+    /// Largest number of bytes in the queue.
     pub queue_bytes_max: u64,
-    /// The longest that a packet waited for the wire.
+    /// Longest time that a packet waited for the wire.
     pub queue_time_max: Duration,
 }
 
@@ -113,7 +113,7 @@ struct Waiting<P> {
 
 struct Flying<P> {
     at: Duration,
-    /// Breaks ties, so that packets of one moment keep their order.
+    /// Breaks ties, so that packets of the same time keep their order.
     number: u64,
     bytes: u64,
     packet: P,
@@ -139,7 +139,7 @@ impl<P> Ord for Flying<P> {
     }
 }
 
-/// One direction of a path. See the module.
+/// One direction of a path; see the module.
 pub struct Channel<P> {
     profile: Profile,
     dice: Dice,
@@ -147,18 +147,18 @@ pub struct Channel<P> {
     in_burst: bool,
     waiting: VecDeque<Waiting<P>>,
     waiting_bytes: u64,
-    /// When the wire has sent what it is sending.
+    /// Time at which the wire is free.
     wire_free: Duration,
     flying: BinaryHeap<Reverse<Flying<P>>>,
     flying_bytes: u64,
-    /// When the last arrives of those that keep their order.
+    /// Arrival of the last packet that keeps its order.
     last_at: Duration,
     number: u64,
     counters: Counters,
 }
 
 impl<P: Clone> Channel<P> {
-    /// The same seed and the same packets at the same times give the same.
+    /// Returns a channel. The same seed and the same packets at the same times give the same result.
     pub fn new(profile: Profile, seed: u64) -> Self {
         Self {
             profile,
@@ -176,12 +176,12 @@ impl<P: Clone> Channel<P> {
         }
     }
 
-    /// Changes what it is like, for what is not on the wire yet.
+    /// Changes the profile, for packets that are not on the wire yet.
     pub fn set(&mut self, profile: Profile) {
         self.profile = profile;
     }
 
-    /// Drops what is under way, and all that comes until [`Channel::restore`].
+    /// Drops packets in flight, and all that come until [`Channel::restore`].
     pub fn cut(&mut self) {
         self.is_cut = true;
         self.counters.cut += (self.waiting.len() + self.flying.len()) as u64;
@@ -195,7 +195,7 @@ impl<P: Clone> Channel<P> {
         self.is_cut = false;
     }
 
-    /// Takes a packet of so many bytes in; false if it is dropped at once.
+    /// Takes in a packet of so many bytes. Returns `false` if it is dropped at once.
     pub fn push(&mut self, now: Duration, bytes: usize, packet: P) -> bool {
         self.advance(now);
         self.counters.packets += 1;
@@ -215,7 +215,7 @@ impl<P: Clone> Channel<P> {
         true
     }
 
-    /// The next packet that has arrived, if any.
+    /// Returns the next packet that has arrived, if any.
     pub fn pop(&mut self, now: Duration) -> Option<P> {
         self.advance(now);
         if self.flying.peek()?.0.at > now {
@@ -228,7 +228,7 @@ impl<P: Clone> Channel<P> {
         Some(flying.packet)
     }
 
-    /// Puts what the wire has room for by then onto it.
+    /// Moves packets from the queue to the wire as far as the wire is free by then.
     fn advance(&mut self, now: Duration) {
         while let Some(front) = self.waiting.front() {
             let starts = self.wire_free.max(front.came);
@@ -244,7 +244,7 @@ impl<P: Clone> Channel<P> {
         }
     }
 
-    /// What happens to a packet behind the wire.
+    /// Applies loss, delay, reordering and duplication to a packet behind the wire.
     fn send(&mut self, sent: Duration, bytes: u64, packet: P) {
         if self.is_lost() {
             self.counters.lost += 1;
@@ -298,7 +298,7 @@ impl<P: Clone> Channel<P> {
         )
     }
 
-    /// Whether a packet of so many bytes would be taken in now. One is always, when none waits.
+    /// Returns `true` if a packet of so many bytes would be taken in now. An empty queue takes any packet.
     pub fn has_room(&self, bytes: usize) -> bool {
         if self.flying_bytes + self.waiting_bytes + bytes as u64 > FLYING_BYTES_MAX {
             return false;
@@ -306,7 +306,7 @@ impl<P: Clone> Channel<P> {
         self.waiting.is_empty() || self.waiting_bytes + bytes as u64 <= self.queue_bytes()
     }
 
-    /// What may wait, bytes.
+    /// Returns the bound of the queue in bytes.
     pub fn queue_bytes(&self) -> u64 {
         match (self.profile.queue, self.profile.rate) {
             (QueueLimit::Bytes(bytes), _) => bytes,
@@ -315,19 +315,19 @@ impl<P: Clone> Channel<P> {
         }
     }
 
-    /// When [`Channel::pop`] is worth a look next; `None` while nothing is under way.
+    /// Returns the time of the next call of [`Channel::pop`], or `None` while no packet is in flight.
     pub fn next_deadline(&self) -> Option<Duration> {
         let starts = self.waiting.front().map(|front| self.wire_free.max(front.came));
         let arrives = self.flying.peek().map(|flying| flying.0.at);
         starts.into_iter().chain(arrives).min()
     }
 
-    /// What it is like.
+    /// Returns the profile.
     pub fn profile(&self) -> Profile {
         self.profile
     }
 
-    /// What became of packets so far.
+    /// Returns the counters.
     pub fn counters(&self) -> Counters {
         self.counters
     }
@@ -339,7 +339,7 @@ mod tests {
 
     const MS: Duration = Duration::from_millis(1);
 
-    /// Drains a channel on a virtual clock: what arrives, and when.
+    /// Drains a channel on a virtual clock. Returns the packets with their times.
     fn drain(channel: &mut Channel<u32>) -> Vec<(Duration, u32)> {
         let mut arrived = Vec::new();
         while let Some(now) = channel.next_deadline() {
@@ -393,7 +393,7 @@ mod tests {
         for queue in [QueueLimit::Bytes(5000), QueueLimit::Time(5 * MS)] {
             let profile = Profile { rate: Some(8_000_000), queue, ..Profile::default() };
             let (channel, arrived) = fill(profile, 10);
-            // One is on the wire, five wait.
+            // One packet is on the wire, five wait.
             assert_eq!(arrived.iter().map(|(_, n)| *n).collect::<Vec<_>>(), [0, 1, 2, 3, 4, 5]);
             assert_eq!(channel.counters().overflowed, 4);
         }
@@ -406,7 +406,7 @@ mod tests {
     }
 
     #[test]
-    fn an_idle_wire_saves_nothing_up() {
+    fn idle_wire_accumulates_no_credit() {
         let mut channel = Channel::new(Profile { rate: Some(8_000_000), ..Profile::default() }, 1);
         channel.push(1000 * MS, 1000, 0);
         channel.push(1000 * MS, 1000, 1);
@@ -414,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn another_rate_holds_for_what_still_waits() {
+    fn new_rate_applies_to_waiting_packets() {
         let mut channel = Channel::new(Profile { rate: Some(8_000_000), ..Profile::default() }, 1);
         for n in 0..3 {
             channel.push(Duration::ZERO, 1000, n);
@@ -464,7 +464,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_held_back_is_overtaken_and_holds_nobody_up() {
+    fn delayed_packet_is_overtaken_and_delays_no_other() {
         let reorder = Reorder { share: 0.2, by: 10 * MS };
         let mut channel = Channel::new(Profile { reorder, ..unbounded() }, 5);
         for n in 0..1000 {
@@ -485,7 +485,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cut_path_drops_what_is_under_way_and_what_comes() {
+    fn cut_path_drops_packets_in_flight_and_later_ones() {
         let profile = Profile { rate: Some(8_000_000), delay: 10 * MS, ..Profile::default() };
         let mut channel = Channel::new(profile, 1);
         for n in 0..3 {
@@ -501,7 +501,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_under_way_is_bounded() {
+    fn bytes_in_flight_are_bounded() {
         let profile = Profile { delay: Duration::from_secs(3600), ..Profile::default() };
         let mut channel = Channel::new(profile, 1);
         let size = 1 << 20;
@@ -510,7 +510,7 @@ mod tests {
     }
 
     #[test]
-    fn the_same_seed_gives_the_same() {
+    fn same_seed_gives_same_result() {
         let profile = Profile { loss: Loss::Random(0.3), jitter: 5 * MS, delay: 9 * MS, ..unbounded() };
         assert_eq!(fill(profile, 500).1, fill(profile, 500).1);
     }

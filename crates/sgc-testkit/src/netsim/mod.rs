@@ -1,12 +1,12 @@
-//! A network that is worse than this machine's, between real processes: rate, queue, delay, jitter, loss, reordering.
+//! A bad network between real processes: rate, queue, delay, jitter, loss, reordering.
 //!
 //! [`Channel`] is the model of one direction, without clock or socket. [`TunLink`] joins two network namespaces through
-//! two channels, IP packet by IP packet, so that whatever runs there meets it; it needs root. [`UdpRelay`] and
+//! two channels, IP packet by IP packet, so that all programs there are affected; it needs root. [`UdpRelay`] and
 //! [`TcpRelay`] put the same channels between two addresses, without root. [`Namespace`] makes the namespaces that
 //! tests and benchmarks put their processes and threads in.
 //!
-//! Unlike the rest of this crate it lives in real time; the draws alone are seeded. The program `netsim` is all of it
-//! at the command line.
+//! Unlike the rest of this crate it runs in real time; only the draws are seeded. The program `netsim` offers all of it
+//! on the command line.
 
 mod channel;
 mod namespace;

@@ -1,4 +1,4 @@
-//! Network namespaces, as `ip netns` makes them: for processes, for threads, and gone with the value.
+//! Network namespaces, as `ip netns` makes them, for processes and threads. Dropping the value removes the namespace.
 
 use std::ffi::OsStr;
 use std::fs::{self, File};
@@ -9,31 +9,31 @@ use std::process::Command;
 
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
-/// Where `ip netns` keeps them.
+/// The directory in which `ip netns` keeps namespaces.
 const NAMESPACES: &str = "/run/netns";
 
-/// The folder of memory that programs share. Those of a namespace share it with each other alone: DDS implementations take each
-/// other for programs of one host by what is in it.
+/// The directory of shared memory. Each namespace has its own, because DDS implementations take programs that share one for
+/// programs of the same host.
 const SHARED_MEMORY: &str = "/dev/shm";
 
-/// Why a network could not be made.
+/// The reason why a network could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum NetsimError {
     /// A command of iproute2 or nftables failed.
     #[error("{command}: {why}")]
     Command {
-        /// What was run.
+        /// The command.
         command: String,
-        /// What it complained of.
+        /// Its error message.
         why: String,
     },
-    /// The folder for the memory that its programs share could not be made.
+    /// The directory for shared memory could not be made.
     #[error("cannot make the folder {0:?}: {1}")]
     SharedMemory(PathBuf, io::Error),
     /// There is no such namespace.
     #[error("no network namespace {0:?}: make it with `ip netns add {0}`")]
     NoNamespace(String),
-    /// The namespace is there, and this user may not enter it.
+    /// The namespace exists, and this user may not enter it.
     #[error("cannot enter the network namespace {0:?}: {1} (it takes root)")]
     Enter(String, io::Error),
     /// No TUN device could be made.
@@ -47,14 +47,14 @@ pub enum NetsimError {
     Thread(io::Error),
 }
 
-/// A namespace, and everything in it, that goes when this is dropped.
+/// A namespace. Dropping it removes the namespace and everything in it.
 #[derive(Debug)]
 pub struct Namespace {
     name: String,
 }
 
 impl Namespace {
-    /// Makes it, with its loopback interface up. There must be none of that name.
+    /// Makes a namespace with its loopback interface up. Fails if one of that name exists.
     pub fn create(name: impl Into<String>) -> Result<Self, NetsimError> {
         let namespace = Self { name: name.into() };
         ip(&["netns", "add", &namespace.name])?;
@@ -64,38 +64,39 @@ impl Namespace {
         Ok(namespace)
     }
 
-    /// Its name.
+    /// Returns the name.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Runs `ip` in it.
+    /// Runs `ip` in the namespace.
     pub fn ip(&self, args: &[&str]) -> Result<String, NetsimError> {
         ip(&[&["-n", &self.name], args].concat())
     }
 
-    /// Runs any program in it to its end; what it printed.
+    /// Runs a program in the namespace to its end. Returns its output.
     pub fn run(&self, program: &str, args: &[&str]) -> Result<String, NetsimError> {
         finish(self.command(program).args(args))
     }
 
-    /// A program in it. The process is the program's own: `ip` and the shell replace themselves by it.
+    /// Returns a command for a program in the namespace. The process is the program's own, because `ip` and the shell replace
+    /// themselves by it.
     pub fn command(&self, program: impl AsRef<OsStr>) -> Command {
         let mut command = Command::new("ip");
-        // `ip` has made the mounts the process's own.
+        // `ip` gives the process a mount namespace of its own.
         let script = format!("mount --bind \"$0\" {SHARED_MEMORY} && exec \"$@\"");
         command.args(["netns", "exec", &self.name, "sh", "-c", &script]);
         command.arg(self.shared_memory()).arg(program);
         command
     }
 
-    /// The folder that its programs have in the place of [`SHARED_MEMORY`].
+    /// Returns the directory that its programs see as [`SHARED_MEMORY`].
     fn shared_memory(&self) -> PathBuf {
         Path::new(SHARED_MEMORY).join(format!("netns-{}", self.name))
     }
 
-    /// A pair of interfaces, up: one here with this name and these addresses, one there. Addresses are with their
-    /// prefix: `10.1.0.1/24`.
+    /// Makes a pair of interfaces that are up: one here with this name and these addresses, one there. Addresses have their
+    /// prefix, as in `10.1.0.1/24`.
     pub fn veth(
         &self,
         ours: (&str, &[&str]),
@@ -117,12 +118,12 @@ impl Namespace {
         configure(Some(&self.name), interface, addresses, &[""; 0])
     }
 
-    /// Moves the calling thread here for the rest of its life: sockets that it opens are of this namespace.
+    /// Moves the calling thread into the namespace for the rest of its life. Sockets that it opens belong to the namespace.
     pub fn enter(&self) -> Result<(), NetsimError> {
         enter(&self.name)
     }
 
-    /// Runs a function in a thread in it.
+    /// Runs a function in a thread in the namespace.
     pub fn within<T: Send>(&self, function: impl FnOnce() -> T + Send) -> Result<T, NetsimError> {
         within(Some(&self.name), function)
     }
@@ -135,12 +136,12 @@ impl Drop for Namespace {
     }
 }
 
-/// Runs `ip` of iproute2; what it printed.
+/// Runs `ip` of iproute2. Returns its output.
 pub fn ip(args: &[&str]) -> Result<String, NetsimError> {
     finish(Command::new("ip").args(args))
 }
 
-/// Whether namespaces and TUN devices can be made here; if not, why not.
+/// Checks that namespaces and TUN devices can be made here. The error gives the reason.
 pub fn on_host() -> Result<(), NetsimError> {
     let name = format!("netsim-{}-{:?}", std::process::id(), std::thread::current().id());
     let name: String = name.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').collect();
@@ -204,7 +205,7 @@ pub(super) fn configure(
 ) -> Result<(), NetsimError> {
     within(namespace, || {
         for address in addresses.iter().map(AsRef::as_ref) {
-            // An IPv6 address would otherwise be of no use for its first second.
+            // Without `nodad`, an IPv6 address is unusable for its first second.
             let unchecked: &[&str] = if address.contains(':') { &["nodad"] } else { &[] };
             ip(&[&["address", "add", address, "dev", interface], unchecked].concat())?;
         }

@@ -1,6 +1,6 @@
-//! A bad path between two addresses, for where there is no root: datagrams, or the bytes of TCP connections.
+//! A bad path between two addresses that needs no root: for datagrams, or for the bytes of TCP connections.
 //!
-//! [`UdpRelay`] is also a NAT: those behind it are seen from a port that [`UdpRelay::rebind`] changes. [`TcpRelay`] ends
+//! [`UdpRelay`] is also a NAT: its clients appear at a port that [`UdpRelay::rebind`] changes. [`TcpRelay`] ends
 //! TCP on both of its sides, so it has rate, delay and a queue that pushes back, but neither loss nor reordering, and
 //! connecting takes no time; what TCP itself does on a bad path shows on a [`super::TunLink`] only.
 
@@ -17,16 +17,16 @@ use super::channel::{Channel, Counters, Loss, Profile, Reorder};
 use super::namespace::NetsimError;
 use super::pump::{BATCH_MAX, Direction, Ports, Pump, controls};
 
-/// Peers that a relay serves at once; those beyond it are not answered.
+/// Most peers that a relay serves at once. Further peers get no answer.
 const PEERS_MAX: usize = 256;
 const DATAGRAM_BYTES_MAX: usize = 65_535;
-/// What goes through a channel at once of a connection: a segment of an Ethernet.
+/// Bytes of a connection that pass a channel as one packet: an Ethernet segment.
 const PIECE_BYTES: usize = 1448;
-/// What may wait of a connection for a receiver that does not read.
+/// Most bytes of a connection that wait for a slow receiver.
 const UNREAD_BYTES_MAX: usize = 1 << 20;
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Datagrams to `local` come out at another address, and answers come back.
+/// A relay that sends datagrams to `local` on to another address, and answers back.
 pub struct UdpRelay {
     pump: Pump<Datagram>,
     local: SocketAddr,
@@ -35,7 +35,7 @@ pub struct UdpRelay {
 controls!(UdpRelay);
 
 impl UdpRelay {
-    /// Begins; port 0 lets the system choose.
+    /// Starts the relay. Port 0 lets the system choose.
     pub fn start(
         listen: SocketAddr,
         to: SocketAddr,
@@ -50,24 +50,24 @@ impl UdpRelay {
         Ok(Self { pump: Pump::start(ports, profiles, seed).map_err(NetsimError::Thread)?, local })
     }
 
-    /// Where it listens.
+    /// Returns the address on which it listens.
     pub fn local(&self) -> SocketAddr {
         self.local
     }
 
-    /// From now on those behind it are seen from other ports, and the old ones are closed, as when a NAT forgets.
+    /// Moves its clients to other ports and closes the old ones, like a NAT that loses its state.
     pub fn rebind(&self) {
         self.pump.rebind();
     }
 }
 
-/// The number of its peer, and what it holds.
+/// The number of the peer, and the content.
 type Datagram = (usize, Bytes);
 
 struct Datagrams {
     outer: UdpSocket,
     to: SocketAddr,
-    /// Who came, and the socket that stands for it on the far side.
+    /// The clients, each with its socket on the far side.
     peers: Vec<(SocketAddr, UdpSocket)>,
     buffer: Vec<u8>,
 }
@@ -107,7 +107,7 @@ impl Ports for Datagrams {
                     Ok(bytes) => {
                         back.push(now, bytes, (peer, Bytes::copy_from_slice(&self.buffer[..bytes])));
                     }
-                    // Nobody listens there, which is said once per datagram.
+                    // Nothing listens there, which the system reports once per datagram.
                     Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => {}
                     Err(_) => break,
                 }
@@ -117,7 +117,7 @@ impl Ports for Datagrams {
 
     fn deliver(&mut self, direction: Direction, (peer, datagram): Datagram) {
         let (from, socket) = &self.peers[peer];
-        // What cannot be sent is lost.
+        // A datagram that cannot be sent is lost.
         let _ = match direction {
             Direction::Forth => socket.send(&datagram),
             Direction::Back => self.outer.send_to(&datagram, from),
@@ -131,7 +131,7 @@ impl Ports for Datagrams {
 
     fn rebind(&mut self) {
         for (_, socket) in &mut self.peers {
-            // The new one is bound before the old one is closed, so the port is another.
+            // The new socket is bound before the old one is closed, so that its port differs.
             if let Ok(other) = far_socket(self.to) {
                 *socket = other;
             }
@@ -139,14 +139,14 @@ impl Ports for Datagrams {
     }
 }
 
-/// Connections to `local` come out at another address.
+/// A relay that passes connections to `local` on to another address.
 pub struct TcpRelay {
     pump: Pump<Piece>,
     local: SocketAddr,
 }
 
 impl TcpRelay {
-    /// Begins; port 0 lets the system choose. Losses, reordering and duplicates of the profiles are left out.
+    /// Starts the relay. Port 0 lets the system choose. Ignores loss, reordering and duplication of the profiles.
     pub fn start(
         listen: SocketAddr,
         to: SocketAddr,
@@ -162,28 +162,28 @@ impl TcpRelay {
         Ok(Self { pump, local })
     }
 
-    /// Where it listens.
+    /// Returns the address on which it listens.
     pub fn local(&self) -> SocketAddr {
         self.local
     }
 
-    /// Changes a direction while it runs, with the same left out.
+    /// Changes a direction while the relay runs, without loss, reordering and duplication.
     pub fn set(&self, direction: Direction, profile: Profile) {
         self.pump.set(direction, lossless(profile));
     }
 
-    /// What became of pieces of connections so far.
+    /// Returns the counters of a direction, whose packets are pieces of connections.
     pub fn counters(&self, direction: Direction) -> Counters {
         self.pump.counters(direction)
     }
 }
 
-/// A stream of which something is missing is none.
+/// Removes loss, reordering and duplication, which a stream cannot have.
 fn lossless(profile: Profile) -> Profile {
     Profile { loss: Loss::None, reorder: Reorder::default(), duplicate: 0.0, ..profile }
 }
 
-/// Bytes of a connection; none of them are its end in this direction.
+/// Bytes of a connection. An empty piece is its end in this direction.
 type Piece = (u64, Bytes);
 
 struct Streams {
@@ -196,9 +196,9 @@ struct Streams {
 
 struct Pair {
     number: u64,
-    /// By the direction that is read from each: the connecting side first.
+    /// Both sides, by the direction read from each: the connecting side first.
     sides: [Side; 2],
-    /// Its pieces in the channels.
+    /// Number of its pieces in the channels.
     flying: usize,
     is_dead: bool,
 }
@@ -212,7 +212,7 @@ impl Pair {
 
 struct Side {
     stream: TcpStream,
-    /// What is still to be written to it.
+    /// Bytes that are still to be written to it.
     unread: VecDeque<Bytes>,
     unread_bytes: usize,
     /// It has sent its end.

@@ -1,4 +1,4 @@
-//! Two TUN devices in two namespaces, and a bad path between them. Whatever runs there, kernel TCP included, meets it.
+//! Two TUN devices in two namespaces, and a bad path between them. It affects all programs there, kernel TCP included.
 
 use std::io;
 use std::os::fd::AsFd;
@@ -22,22 +22,22 @@ const PACKET_BYTES_MAX: usize = 65_535;
 pub struct TunEnd {
     /// The namespace, by name or path; `None` is the caller's.
     pub namespace: Option<String>,
-    /// What the device is called there, 15 characters at most.
+    /// Name of the device there, at most 15 characters.
     pub interface: String,
     /// Its addresses with their prefixes: `10.1.0.1/24`, `fd01::1/64`.
     pub addresses: Vec<String>,
-    /// What else is reached through it: prefixes, or `default`.
+    /// Further routes through it: prefixes, or `default`.
     pub routes: Vec<String>,
 }
 
 /// How a [`TunLink`] is made.
 #[derive(Clone, Debug)]
 pub struct TunOptions {
-    /// The longest IP packet that fits, bytes.
+    /// Longest IP packet, in bytes.
     pub mtu: u16,
-    /// What the directions are like: from the first end, and from the second.
+    /// The profiles of the directions: from the first end, and from the second.
     pub profiles: [Profile; 2],
-    /// Decides losses and the like.
+    /// Seed of loss, jitter and the other draws.
     pub seed: u64,
 }
 
@@ -47,7 +47,7 @@ impl Default for TunOptions {
     }
 }
 
-/// A path between two namespaces that lasts until it is dropped; the devices go with it.
+/// A path between two namespaces. Dropping it removes the devices.
 pub struct TunLink {
     pump: Pump<Bytes>,
 }
@@ -55,7 +55,7 @@ pub struct TunLink {
 controls!(TunLink);
 
 impl TunLink {
-    /// Makes the devices and begins.
+    /// Makes the devices and starts the path.
     pub fn start(ends: [TunEnd; 2], options: &TunOptions) -> Result<Self, NetsimError> {
         let [first, second] = &ends;
         let devices = [device(first, options.mtu)?, device(second, options.mtu)?];
@@ -77,7 +77,7 @@ fn device(end: &TunEnd, mtu: u16) -> Result<SyncDevice, NetsimError> {
     Ok(device)
 }
 
-/// A device in the namespace of the calling thread.
+/// Opens a device in the namespace of the calling thread.
 pub(super) fn open(interface: &str) -> Result<SyncDevice, NetsimError> {
     let make = || {
         let device = DeviceBuilder::new().name(interface).enable(false).build_sync()?;
@@ -98,7 +98,7 @@ impl Ports for Tuns {
     fn receive(&mut self, channels: &mut [Channel<Bytes>; 2], now: Duration) {
         for (device, channel) in self.devices.iter().zip(channels) {
             for _ in 0..BATCH_MAX {
-                // Nothing there, or the device is down; the latter is waited out.
+                // No packet is there, or the device is down for a while.
                 let Ok(bytes) = device.recv(&mut self.buffer) else { break };
                 channel.push(now, bytes, Bytes::copy_from_slice(&self.buffer[..bytes]));
             }
@@ -110,7 +110,7 @@ impl Ports for Tuns {
             Direction::Forth => &self.devices[1],
             Direction::Back => &self.devices[0],
         };
-        // Down, or out of memory: lost, as on any wire.
+        // If the device is down or out of memory, the packet is lost, as on any wire.
         let _ = device.send(&packet);
     }
 

@@ -1,10 +1,10 @@
-//! Rates, times, shares and sizes as people write them: `5mbit`, `40ms`, `2%`, `64kb`.
+//! Parses rates, times, percentages and sizes as users write them: `5mbit`, `40ms`, `2%`, `64kb`.
 
 use std::time::Duration;
 
 use super::channel::QueueLimit;
 
-/// A text that is no such quantity.
+/// The error of a text that is no such quantity.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{text:?} is no {what}: write {example}")]
 pub struct UnitError {
@@ -13,14 +13,14 @@ pub struct UnitError {
     example: &'static str,
 }
 
-/// Bits per second: `800kbit`, `5mbit`, `1gbit`.
+/// Parses bits per second: `800kbit`, `5mbit`, `1gbit`.
 pub fn parse_rate(text: &str) -> Result<u64, UnitError> {
     let units = [("gbit", 1e9), ("mbit", 1e6), ("kbit", 1e3), ("bit", 1.0)];
     let rate = scaled(text, &units).filter(|rate| *rate >= 1.0);
     rate.map(|rate| rate as u64).ok_or_else(|| error(text, "rate", "5mbit, 800kbit or 1gbit"))
 }
 
-/// A time: `40ms`, `500us`, `2s`.
+/// Parses a time: `40ms`, `500us`, `2s`.
 pub fn parse_duration(text: &str) -> Result<Duration, UnitError> {
     let seconds = scaled(text, &[("us", 1e-6), ("ms", 1e-3), ("s", 1.0)]);
     seconds
@@ -28,26 +28,26 @@ pub fn parse_duration(text: &str) -> Result<Duration, UnitError> {
         .ok_or_else(|| error(text, "time", "40ms, 500us or 2s"))
 }
 
-/// A share of all packets: `2%`, `0.1%`.
+/// Parses a fraction of all packets: `2%`, `0.1%`.
 pub fn parse_percent(text: &str) -> Result<f64, UnitError> {
     let share = scaled(text, &[("%", 0.01)]).filter(|share| *share <= 1.0);
     share.ok_or_else(|| error(text, "share", "2% (at most 100%)"))
 }
 
-/// A number of bytes: `9000b`, `64kb`, `1mb`.
+/// Parses a number of bytes: `9000b`, `64kb`, `1mb`.
 pub fn parse_bytes(text: &str) -> Result<u64, UnitError> {
     let bytes = scaled(text, &[("kb", 1e3), ("mb", 1e6), ("b", 1.0)]);
     bytes.map(|bytes| bytes as u64).ok_or_else(|| error(text, "size", "64kb, 1mb or 9000b"))
 }
 
-/// What may wait: a time of the rate, or bytes.
+/// Parses the bound of a queue: a time at the rate, or bytes.
 pub fn parse_queue(text: &str) -> Result<QueueLimit, UnitError> {
     let time = parse_duration(text).map(QueueLimit::Time);
     time.or_else(|_| parse_bytes(text).map(QueueLimit::Bytes))
         .map_err(|_| error(text, "queue", "200ms (of the rate) or 64kb"))
 }
 
-/// The number in front of the first unit that fits, times its factor.
+/// Returns the number before the first matching unit, times its factor.
 fn scaled(text: &str, units: &[(&str, f64)]) -> Option<f64> {
     let text = text.to_ascii_lowercase();
     let (number, factor) =
@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn quantities_are_read() {
+    fn quantities_are_parsed() {
         assert_eq!(parse_rate("5mbit"), Ok(5_000_000));
         assert_eq!(parse_rate("1.5Mbit"), Ok(1_500_000));
         assert_eq!(parse_rate("800kbit"), Ok(800_000));
@@ -78,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_none_is_named() {
+    fn invalid_quantity_is_named() {
         for text in ["", "5", "mbit", "-1mbit", "0bit", "nanmbit", "5 furlongs"] {
             assert!(parse_rate(text).is_err(), "{text}");
         }

@@ -1,4 +1,4 @@
-//! Time: certificates that end or have not begun, and clocks that are wrong.
+//! Time: certificates that have expired or have not begun, and wrong clocks.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ use crate::{Scene, assert_received, closed, drops, events, flowing, ms, publish_
 const DAY: Duration = Duration::from_secs(86_400);
 const MINUTE: Duration = Duration::from_secs(60);
 
-/// The scene and a guest at the second router whose certificate is as said; all may have `/chatter`.
+/// Returns the scene and a guest at the second router with this certificate; all may have `/chatter`.
 fn with_guest(seed: u64, guest: Member) -> (Scene, NodeKey) {
     let mut scene = scene_with(WorldConfig::new(seed));
     let guest = scene.world.node(guest, false);
@@ -55,7 +55,7 @@ fn a_link_ends_with_the_certificate_and_so_does_the_key() {
 fn the_owner_cuts_an_expired_sink_although_the_router_before_it_does_not() {
     let (mut scene, guest) = with_guest(91, short_lived());
     let Scene { world, arm, west, .. } = &mut scene;
-    // Its clock is wrong by less than is noticed.
+    // Its clock is wrong by too little to be noticed.
     world.set_behind(*west, 5 * MINUTE);
     world.link(*west, guest);
     world.until_granted(guest, *arm, "/chatter");
@@ -130,7 +130,7 @@ fn an_owners_names_end_with_its_certificate() {
 fn a_renewed_certificate_carries_what_was_granted_past_the_end_of_the_old_one() {
     let (mut scene, guest) = with_guest(95, short_lived());
     let Scene { world, arm, west, .. } = &mut scene;
-    // So that the link outlasts the old one: the driver makes another.
+    // The driver makes a new link, so that it outlasts the old certificate.
     world.set_behind(*west, 9 * MINUTE);
     world.link(*west, guest);
     world.until_granted(guest, *arm, "/chatter");
@@ -222,7 +222,7 @@ fn a_clock_two_hours_off_is_known_on_both_sides_and_works_soon_after_it_is_set()
     for ahead in [true, false] {
         let skew = if ahead { World::set_ahead } else { World::set_behind };
         let sign = if ahead { 1 } else { -1 };
-        // The owner, then a user: neither is believed, and neither believes.
+        // For the owner and for a user: no node believes it, and it believes no other.
         for who in 0..2 {
             let mut scene = scene_with(WorldConfig::new(98));
             let Scene { world, arm, east, west, tab, .. } = &mut scene;
@@ -240,7 +240,7 @@ fn a_clock_two_hours_off_is_known_on_both_sides_and_works_soon_after_it_is_set()
             assert!((off - sign * ms_of(TWO_HOURS)).abs() < 1000, "{off}");
             assert!((here.expect("the node was told") + off).abs() < 1000, "{here:?}");
 
-            // NTP sets it.
+            // NTP corrects the clock.
             skew(world, node, Duration::ZERO);
             let granted = |world: &World| world.status(*tab, *arm, "/chatter") == Some(JoinStatus::Granted);
             assert!(world.run_until(ms(5000), granted), "{}", world.trace());

@@ -1,4 +1,4 @@
-//! Consumers are told to the owner of what they use, sealed, and to nobody else.
+//! Only the owner of a topic learns its consumers, sealed.
 
 use sgc_endpoint::{Event, LostReason};
 use sgc_testkit::{NodeKey, Sharing, World};
@@ -6,7 +6,7 @@ use sgc_wire::RefuseReason;
 
 use crate::{Scene, flowing, ms};
 
-/// The names of ROS 2 nodes in each answer that a node was given.
+/// Returns the names of ROS 2 nodes in each answer that a node got.
 fn told(world: &World, node: NodeKey) -> Vec<Vec<String>> {
     let of_answer = |(event, _): (&Event, _)| {
         let Event::Consumers { consumers, .. } = event else { return None };
@@ -28,7 +28,7 @@ fn owner_is_told_its_own_consumers_and_told_again_when_they_change() {
     let mut scene = flowing(210);
     let Scene { world, arm, desk, lap, .. } = &mut scene;
     world.share(*lap, "/map", Sharing::to_fleet());
-    // Before there is a consumer there is nobody to ask.
+    // Before there is a consumer, no node can be asked.
     for owner in [*arm, *lap] {
         world.ask_consumers(owner, *desk);
     }

@@ -1,4 +1,4 @@
-//! More of something than anybody needs: bounded cost, and the others go on.
+//! Floods of frames: their cost is bounded, and other nodes go on.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use sgc_wire::{Control, JoinBody, Name, RejectReason, Request, SignedBody, SinkI
 
 use crate::{Scene, assert_received, closed, drops, events, flowing_with, frames, ms, publish_steadily};
 
-/// A join of `name`, valid or not, as the `n`th sink.
+/// Returns a join of `name`, valid or not, as the `n`th sink.
 fn join(world: &World, identity: &Identity, name: Name, n: u64, valid: bool) -> Control {
     let mut sink = [0x77; 16];
     sink[..8].copy_from_slice(&n.to_be_bytes());
@@ -29,7 +29,7 @@ fn join(world: &World, identity: &Identity, name: Name, n: u64, valid: bool) -> 
     Control::Join { signed: SignedBody { body, signature: signature.into() } }
 }
 
-/// The scene with one more member at the first router.
+/// Returns the scene with one more member at the first router.
 fn scene(config: WorldConfig) -> (Scene, NodeKey, Arc<Identity>) {
     let mut scene = flowing_with(config, |s| s);
     let mallory = scene.world.proxy("mallory");
@@ -65,7 +65,7 @@ fn flood(
 }
 
 #[test]
-fn of_forged_requests_ends_the_link_after_a_bounded_number_of_verifications() {
+fn flood_of_forged_joins_ends_link_after_bounded_number_of_verifications() {
     let mut config = WorldConfig::new(70);
     config.router_limits.forgeries_max = 20;
     let (mut scene, mallory, identity) = scene(config);
@@ -73,7 +73,7 @@ fn of_forged_requests_ends_the_link_after_a_bounded_number_of_verifications() {
     flood(&mut scene, mallory, 5, |world, n| join(world, &identity, name, n, false));
     let Scene { world, arm, east, .. } = &scene;
     assert_eq!(closed(world, *east), [LinkClose::Forgeries]);
-    // What was under way when the link ended is not looked at.
+    // Frames in flight when the link ended are not examined.
     let verified = drops(world, *east, "not_verified");
     assert!((20..=24).contains(&verified), "{verified}");
     let reached = frames(world, *east, *arm).iter().filter(|f| matches!(f, Control::Join { .. })).count();
@@ -81,7 +81,7 @@ fn of_forged_requests_ends_the_link_after_a_bounded_number_of_verifications() {
 }
 
 #[test]
-fn of_forged_revocation_lists_and_advertisements_ends_the_link_too() {
+fn flood_of_forged_revocation_lists_and_advertisements_ends_link() {
     let mut config = WorldConfig::new(71);
     config.router_limits.forgeries_max = 20;
     let (mut scene, mallory, _) = scene(config);
@@ -97,7 +97,7 @@ fn of_forged_revocation_lists_and_advertisements_ends_the_link_too() {
 }
 
 #[test]
-fn of_valid_requests_is_refused_beyond_what_a_link_may_ask_for() {
+fn flood_of_valid_joins_is_refused_beyond_limit_of_link() {
     let mut config = WorldConfig::new(72);
     config.router_limits.joins_burst = 40; // and five a second
     let (mut scene, mallory, identity) = scene(config);
@@ -119,14 +119,14 @@ fn of_valid_requests_is_refused_beyond_what_a_link_may_ask_for() {
 }
 
 #[test]
-fn of_places_by_one_node_leaves_places_for_others() {
+fn flood_of_handshake_places_by_one_node_leaves_places_for_others() {
     let mut scene = flowing_with(WorldConfig::new(73), |s| s);
     let max = sgc_endpoint::Limits::default().sinks_per_peer_max;
     let names = [scene.world.name(scene.arm, "/chatter"), scene.world.catalogue_name(scene.arm)];
     let identity = sgc_testkit::identity(scene.world.member(scene.desk));
     let desk_id = &identity.node_id();
     let log = scene.world.log().len();
-    // An honest node gives back what it did not ask for.
+    // An honest node would give back places that it did not request.
     scene.world.tamper(scene.desk, scene.west, |frame| match frame {
         Control::Leave { .. } => vec![],
         frame => vec![frame.clone()],
@@ -157,7 +157,7 @@ fn of_places_by_one_node_leaves_places_for_others() {
 }
 
 #[test]
-fn of_links_by_one_node_is_refused() {
+fn flood_of_links_by_one_node_is_refused() {
     let mut config = WorldConfig::new(74);
     config.router_limits.links_per_node_max = 4;
     let (mut scene, mallory, _) = scene(config);
@@ -166,7 +166,7 @@ fn of_links_by_one_node_is_refused() {
     }
     scene.world.run(ms(500));
     assert_eq!(closed(&scene.world, scene.east), vec![LinkClose::TooMany; 6]);
-    // A node that has too many may still end some and come back.
+    // A node with too many links may still end some and come back.
     scene.world.crash(mallory);
     scene.world.run(ms(500));
     scene.world.start(mallory);

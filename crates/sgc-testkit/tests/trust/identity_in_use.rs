@@ -1,5 +1,4 @@
-//! One identity in two processes: the one that was started last keeps the links, the other waits, and no message comes
-//! to both.
+//! One identity in two processes: the process that started last keeps the links, the other waits, and no message reaches both.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -44,7 +43,7 @@ fn twins(seed: u64, at_west: bool) -> Twins {
 }
 
 impl Twins {
-    /// Publishes for a while; who has no link dials all the time.
+    /// Publishes for a while. A process without a link keeps dialling.
     fn publish(&mut self, time: Duration, routers: [NodeKey; 2]) -> Vec<MessageId> {
         let Self { world, arm, desk, twin, .. } = self;
         crate::publish_steadily(world, *arm, REDIAL, time, |world, _| {
@@ -71,7 +70,7 @@ impl Twins {
         self.world.received(node, self.arm, "/chatter")
     }
 
-    /// No message was given to both, nor twice to one.
+    /// Checks that no message reached both processes, or one of them twice.
     fn assert_each_once(&self) {
         let mut times = BTreeMap::<MessageId, usize>::new();
         for id in self.received(self.desk).into_iter().chain(self.received(self.twin)) {

@@ -1,4 +1,4 @@
-//! Keys that change, rights that end, and what recorded, forged and foreign things come to: the machines in a
+//! Keys that change, rights that end, and recorded, forged and foreign frames: the machines in a
 //! network with a virtual clock.
 //!
 //! Links, handshakes and files are tested where they are made; here a "router that colludes" is one whose links
@@ -21,7 +21,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use sgc_endpoint::Event;
-use sgc_testkit::{Captured, Logged, MessageId, NodeKey, Sharing, What, World, WorldConfig};
+use sgc_testkit::{CapturedFrame, LogEntry, MessageId, NodeKey, Sharing, What, World, WorldConfig};
 use sgc_wire::{Control, Packet, SinkId, TopicGrant};
 
 const fn ms(n: u64) -> Duration {
@@ -34,7 +34,7 @@ struct Scene {
     arm: NodeKey,
     east: NodeKey,
     west: NodeKey,
-    /// Those who receive `/chatter`.
+    /// Returns the receivers of `/chatter`.
     desk: NodeKey,
     lap: NodeKey,
     tab: NodeKey,
@@ -45,13 +45,13 @@ impl Scene {
         [self.desk, self.lap, self.tab]
     }
 
-    /// The users but one.
+    /// Returns the users except one.
     fn without(&self, node: NodeKey) -> Vec<NodeKey> {
         self.users().into_iter().filter(|n| *n != node).collect()
     }
 }
 
-/// The scene without any topic.
+/// Returns the scene without any topic.
 fn scene_with(config: WorldConfig) -> Scene {
     let mut world = World::with(config);
     world.capture();
@@ -64,7 +64,7 @@ fn scene_with(config: WorldConfig) -> Scene {
     Scene { world, arm, east, west, desk, lap, tab }
 }
 
-/// The scene with `/chatter`, shared with the three and granted to them.
+/// Returns the scene with `/chatter`, shared with the three and granted to them.
 fn flowing_with(config: WorldConfig, sharing: impl FnOnce(Sharing) -> Sharing) -> Scene {
     let mut scene = scene_with(config);
     let users = scene.users();
@@ -83,7 +83,7 @@ fn flowing(seed: u64) -> Scene {
     flowing_with(WorldConfig::new(seed), |sharing| sharing)
 }
 
-/// A configuration with slow links whose latencies differ widely.
+/// Returns a configuration with slow links whose latencies differ widely.
 fn slow(seed: u64) -> WorldConfig {
     let mut config = WorldConfig::new(seed);
     config.latency = ms(2)..=ms(300);
@@ -110,29 +110,29 @@ fn publish_steadily(
     published
 }
 
-/// Of these messages `user` got each one exactly once, and in their order.
+/// Asserts that `user` got each of these messages exactly once and in order.
 fn assert_received(world: &World, user: NodeKey, owner: NodeKey, published: &[MessageId]) {
     let received: Vec<_> =
         world.received(user, owner, "/chatter").into_iter().filter(|id| published.contains(id)).collect();
     assert_eq!(received, published, "at {user:?}\n{}", world.trace());
 }
 
-/// Of these messages `user` got none.
+/// Asserts that `user` got none of these messages.
 fn assert_nothing_received(world: &World, user: NodeKey, owner: NodeKey, published: &[MessageId]) {
     let received = world.received(user, owner, "/chatter");
     let leaked: Vec<_> = published.iter().filter(|id| received.contains(id)).collect();
     assert!(leaked.is_empty(), "{user:?} got {leaked:?}\n{}", world.trace());
 }
 
-/// What happened at a node since a line of the log.
+/// Returns the events at a node since a line of the log.
 fn events(world: &World, node: NodeKey, from: usize) -> impl Iterator<Item = (&Event, Duration)> {
-    world.log()[from..].iter().filter(move |l| l.node == node).filter_map(|l: &Logged| match &l.what {
+    world.log()[from..].iter().filter(move |l| l.node == node).filter_map(|l: &LogEntry| match &l.what {
         What::Event(event) => Some((event, l.at)),
         _ => None,
     })
 }
 
-/// The grants that a node got of a name's topic, oldest first, with their sinks.
+/// Returns the grants that a node got of a name's topic, oldest first, with their sinks.
 fn grants(world: &World, node: NodeKey, owner: NodeKey) -> Vec<(SinkId, TopicGrant)> {
     let wanted = world.name(owner, "/chatter");
     let of_topic = |(event, _): (&Event, Duration)| match event {
@@ -142,24 +142,24 @@ fn grants(world: &World, node: NodeKey, owner: NodeKey) -> Vec<(SinkId, TopicGra
     events(world, node, 0).filter_map(of_topic).collect()
 }
 
-/// The packets that went from one node to another, in their order.
+/// Returns the packets that went from one node to another, in order.
 fn packets(world: &World, from: NodeKey, to: NodeKey) -> Vec<Packet> {
     let of_link = world.captured_packets().iter().filter(|c| (c.from, c.to) == (from, to));
     of_link.map(|c| c.packet.clone()).collect()
 }
 
-/// The frames that went from one node to another, in their order.
+/// Returns the frames that went from one node to another, in order.
 fn frames(world: &World, from: NodeKey, to: NodeKey) -> Vec<Control> {
-    let of_link = |c: &&Captured| (c.from, c.to) == (from, to);
+    let of_link = |c: &&CapturedFrame| (c.from, c.to) == (from, to);
     world.captured().iter().filter(of_link).map(|c| c.frame.clone()).collect()
 }
 
-/// How many frames a node's router refused for that reason.
+/// Returns the number of frames that a node's router refused for that reason.
 fn drops(world: &World, node: NodeKey, key: &str) -> usize {
     world.router_drops(node).iter().filter(|d| **d == key).count()
 }
 
-/// What a node's sinks refused, by its counter, and how often.
+/// Returns how often a node's sinks refused packets, by counter.
 fn sink_drops(world: &World, node: NodeKey) -> BTreeMap<&'static str, usize> {
     let mut counts = BTreeMap::new();
     for dropped in world.data_drops(node) {
@@ -170,7 +170,7 @@ fn sink_drops(world: &World, node: NodeKey) -> BTreeMap<&'static str, usize> {
     counts
 }
 
-/// The links that a node closed, by why.
+/// Returns the reasons for which a node closed links.
 fn closed(world: &World, node: NodeKey) -> Vec<sgc_router::LinkClose> {
     let of_node = world.log().iter().filter(|l| l.node == node);
     of_node

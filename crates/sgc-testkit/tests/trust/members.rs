@@ -1,4 +1,4 @@
-//! Members, and routers that help them, who act as somebody else.
+//! Members, and routers that help them, act as other nodes.
 
 use bytes::Bytes;
 use sgc_endpoint::{JoinStatus, PARKED_PACKETS_MAX, RecoveryLimits, Source, SourceConfig};
@@ -13,7 +13,7 @@ use crate::{
     scene_with, sink_drops,
 };
 
-/// What a member that holds a grant can seal under it with a key of its own, as `source`, from message `from` on.
+/// Returns packets that a member seals under its grant with a key of its own, as `source`, from message `from` on.
 fn forged(world: &World, owner: NodeKey, grant: &TopicGrant, source: SourceId, from: u64) -> Vec<Packet> {
     let config = SourceConfig {
         name: world.name(owner, "/chatter"),
@@ -35,7 +35,7 @@ fn forged(world: &World, owner: NodeKey, grant: &TopicGrant, source: SourceId, f
     packets.split_off(from as usize)
 }
 
-/// What comes of packets that a member forged with the topic's key, at each of the others, with a router's help.
+/// Delivers packets that a member forged with the topic's key, with a router's help. Returns the refusals at each other member.
 fn play_forged(scene: &mut Scene, source: SourceId) -> Vec<Vec<(&'static str, usize)>> {
     let Scene { world, arm, west, desk, lap, tab, .. } = scene;
     publish_steadily(world, *arm, ms(10), ms(50), |_, _| ());
@@ -107,7 +107,7 @@ fn a_member_that_publishes_as_a_source_of_its_own_is_not_believed() {
 }
 
 #[test]
-fn what_waits_for_an_announcement_is_bounded_and_does_no_harm() {
+fn packets_waiting_for_announcement_are_bounded_and_harmless() {
     let mut scene = flowing(62);
     source_of(&mut scene);
     let Scene { world, arm, west, desk, lap, .. } = &mut scene;
@@ -141,7 +141,7 @@ fn nobody_claims_the_names_of_another_owner() {
     let advert = Control::Advert { cost: 0, signed: thief.sign_advert(&body) };
     let withdrawal = AdvertBody { withdraw: true, seq: body.seq + 1, ..body.clone() };
     let withdrawal = Control::Advert { cost: 0, signed: thief.sign_advert(&withdrawal) };
-    // With the owner's certificate, which everyone has seen, and another key.
+    // With the owner's certificate, which is public, and another key.
     let borrowed = AdvertBody { chain: world.identity(*arm).chain_bytes(), ..body };
     let borrowed = Control::Advert { cost: 0, signed: thief.sign_advert(&borrowed) };
     for frame in [advert, withdrawal, borrowed] {
@@ -182,7 +182,7 @@ fn a_grant_for_another_or_for_an_altered_one_is_not_taken() {
     world.run(ms(500));
     assert_eq!(grants(world, *desk, *arm).len(), before);
     assert!(drops(world, *lap, "owner_key") > 0);
-    // A sink that was sent such asks again. The owner grants that; nothing came of what was altered.
+    // A sink that gets such a packet asks again, and the owner grants it. The altered packets have no effect.
     let sinks = world.granted_sinks(*arm, "/chatter");
     let again = &grants(world, *lap, *arm)[granted_to_lap..];
     assert!(again.iter().all(|(sink, _)| *sink != altered && sinks.contains(&(*sink, *lap))), "{again:?}");
@@ -230,7 +230,7 @@ fn an_acknowledgement_that_a_router_forges_harms_only_those_behind_it() {
 }
 
 #[test]
-fn who_says_that_it_is_a_router_and_is_not_certified_as_one_is_taken_for_a_proxy() {
+fn uncertified_router_counts_as_proxy() {
     let mut scene = scene_with(WorldConfig::new(66));
     let Scene { world, arm, east, desk, .. } = &mut scene;
     let liar = world.proxy("liar");

@@ -10,18 +10,18 @@ use sgc_wire::{Name, Packet, PacketHeader, SinkId, SourceId, TopicGrant};
 
 use crate::ms;
 
-/// What a key and a nonce are made of, as far as a packet shows it.
+/// The inputs of key and nonce that a packet shows.
 type Slot = (Name, u8, u32, SourceId, Option<SinkId>, u64, u16);
 
-/// What a key and a nonce may be used for once: what was authenticated, and the sealed text.
-type Sealed = (PacketHeader, Vec<u8>);
+/// The authenticated data and the sealed text, for which a key and a nonce may be used once.
+type SealedText = (PacketHeader, Vec<u8>);
 
 fn slot(header: &PacketHeader) -> Slot {
     let PacketHeader { name, suite, epoch, source, to, seq, index, .. } = *header;
     (name, suite, epoch, source, to, seq, index)
 }
 
-fn sealed(packet: &Packet) -> Sealed {
+fn sealed(packet: &Packet) -> SealedText {
     let mut payload = Vec::new();
     packet.payload.copy_into(&mut payload);
     // A signature may differ each time it is made.
@@ -29,7 +29,7 @@ fn sealed(packet: &Packet) -> Sealed {
     (PacketHeader { hops: 0, ..packet.header.clone() }, payload)
 }
 
-/// The keys that were granted for a name and an epoch, over all runs of its owner.
+/// Returns the keys that were granted for a name and an epoch, over all runs of its owner.
 fn keys(world: &World) -> BTreeMap<(Name, u32), Vec<TopicGrant>> {
     let mut keys: BTreeMap<_, Vec<TopicGrant>> = BTreeMap::new();
     for logged in world.log() {
@@ -49,7 +49,7 @@ fn keys(world: &World) -> BTreeMap<(Name, u32), Vec<TopicGrant>> {
     keys
 }
 
-/// Which of the keys opens a packet.
+/// Returns the index of the key that opens a packet.
 fn key_of(packet: &Packet, keys: &[TopicGrant]) -> Option<usize> {
     let header = &packet.header;
     let mut payload = Vec::new();
@@ -63,10 +63,10 @@ fn key_of(packet: &Packet, keys: &[TopicGrant]) -> Option<usize> {
     })
 }
 
-/// Two packets that share key and nonce and are not the same.
+/// Returns two different packets that share key and nonce.
 fn repeated(world: &World) -> Option<String> {
     let keys = keys(world);
-    let mut seen: BTreeMap<Slot, Vec<(Packet, Sealed)>> = BTreeMap::new();
+    let mut seen: BTreeMap<Slot, Vec<(Packet, SealedText)>> = BTreeMap::new();
     for captured in world.captured_packets() {
         let packet = &captured.packet;
         let slot = slot(&packet.header);
@@ -169,7 +169,7 @@ fn no_nonce_is_used_for_two_texts_over_restarts_rotations_and_histories() {
         packets += history.world.captured_packets().len();
         anew += keys(&history.world).values().filter(|k| k.len() > 1).count();
     }
-    // The histories were such that it could have gone wrong.
+    // The histories contained the cases in which nonces could repeat.
     assert!(packets > 5000, "{packets}");
     assert!(anew > 25, "{anew}");
 }

@@ -1,4 +1,4 @@
-//! A node of another fleet whose CA is trusted: it gets what it was named for, and nothing else.
+//! A node of another fleet whose CA is trusted gets only the topics that name it.
 
 use bytes::Bytes;
 use sgc_endpoint::{Event, JoinStatus, RefusedBy};

@@ -1,4 +1,4 @@
-//! Others that may publish on a topic: whom their messages reach, and when no longer.
+//! Other nodes that may publish on a topic: their messages reach all subscribers until the right ends.
 
 use std::time::Duration;
 
@@ -96,7 +96,7 @@ fn their_messages_survive_new_epochs() {
 }
 
 #[test]
-fn who_may_not_publish_is_refused() {
+fn unauthorised_publisher_is_refused() {
     let mut scene = scene(WorldConfig::new(82), None);
     let Scene { world, arm, desk, tab, .. } = &mut scene;
     world.stop_using(*tab, *arm, "/chatter");
@@ -152,7 +152,7 @@ fn a_source_id_that_is_taken_is_refused() {
 }
 
 #[test]
-fn who_may_publish_no_longer_is_cut_and_its_key_is_believed_no_more() {
+fn publisher_that_loses_its_right_is_cut_and_its_key_distrusted() {
     for revoked in [false, true] {
         let mut scene = scene(WorldConfig::new(84), None);
         let Scene { world, arm, west, desk, lap, tab, .. } = &mut scene;
@@ -197,10 +197,10 @@ fn who_may_publish_no_longer_is_cut_and_its_key_is_believed_no_more() {
     }
 }
 
-/// What was recorded of a publisher at another node than the owner's is past to a subscriber that begins anew, in the
-/// very epoch in which it was sealed.
+/// A subscriber that begins anew takes recorded packets of a publisher at another node than the owner's for past ones, even
+/// in the epoch in which they were sealed.
 #[test]
-fn recorded_packets_of_theirs_are_nothing_to_a_fresh_subscriber() {
+fn fresh_subscriber_ignores_recorded_packets_of_other_publishers() {
     for suite in [None, Some(Suite::Group)] {
         let mut scene = scene(WorldConfig::new(86), suite);
         let Scene { world, arm, west, desk, lap, tab, .. } = &mut scene;

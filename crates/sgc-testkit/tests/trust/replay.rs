@@ -1,4 +1,4 @@
-//! Recorded packets and answers, played again at every later occasion.
+//! Replays of recorded packets and answers at every later occasion.
 
 use sgc_endpoint::{Sink, SinkLimits};
 use sgc_testkit::{Sharing, World, WorldConfig};
@@ -20,7 +20,7 @@ fn recorded(seed: u64) -> (Scene, Vec<Packet>) {
     (scene, recorded)
 }
 
-/// Plays packets to `desk`; nothing comes of them, and what they were refused for.
+/// Replays packets to `desk` and checks that none is delivered. Returns the reasons of the refusals.
 fn play(scene: &mut Scene, recorded: &[Packet]) -> Vec<(&'static str, usize)> {
     let Scene { world, arm, west, desk, .. } = scene;
     let (received, before) = (world.received(*desk, *arm, "/chatter").len(), sink_drops(world, *desk));
@@ -33,7 +33,7 @@ fn play(scene: &mut Scene, recorded: &[Packet]) -> Vec<(&'static str, usize)> {
     new.filter(|(_, n)| *n > 0).collect()
 }
 
-/// The topic still comes through.
+/// Checks that the topic still flows.
 fn assert_goes_on(scene: &mut Scene) {
     let Scene { world, arm, desk, .. } = scene;
     world.until_granted(*desk, *arm, "/chatter");
@@ -44,7 +44,7 @@ fn assert_goes_on(scene: &mut Scene) {
 }
 
 #[test]
-fn in_the_same_session() {
+fn replay_in_same_session_is_refused() {
     let (mut scene, recorded) = recorded(50);
     assert_eq!(play(&mut scene, &recorded), [("sink_replayed", 20)]);
     // Long after, when they are older than any window.
@@ -55,7 +55,7 @@ fn in_the_same_session() {
 }
 
 #[test]
-fn after_a_new_link() {
+fn replay_after_new_link_is_refused() {
     let (mut scene, recorded) = recorded(51);
     let Scene { world, arm, west, desk, .. } = &mut scene;
     world.cut(*west, *desk);
@@ -68,7 +68,7 @@ fn after_a_new_link() {
 }
 
 #[test]
-fn after_the_subscriber_started_anew() {
+fn replay_after_restart_of_subscriber_is_refused() {
     let (mut scene, recorded) = recorded(52);
     scene.world.restart(scene.desk);
     scene.world.until_granted(scene.desk, scene.arm, "/chatter");
@@ -87,7 +87,7 @@ fn after_the_subscriber_started_anew() {
 }
 
 #[test]
-fn after_the_owner_started_anew() {
+fn replay_after_restart_of_owner_is_refused() {
     for both in [false, true] {
         let (mut scene, recorded) = recorded(53);
         scene.world.restart(scene.arm);
@@ -103,7 +103,7 @@ fn after_the_owner_started_anew() {
 }
 
 #[test]
-fn of_an_epoch_that_is_over() {
+fn replay_of_past_epoch_is_refused() {
     let (mut scene, recorded) = recorded(54);
     scene.world.rotate(scene.arm, "/chatter");
     scene.world.run(ms(1000));
@@ -114,7 +114,7 @@ fn of_an_epoch_that_is_over() {
 }
 
 #[test]
-fn a_history_again_or_to_another_sink() {
+fn replay_of_history_to_same_or_other_sink_is_refused() {
     let mut scene = flowing_with(WorldConfig::new(55), |s| s.transient_local(10));
     let Scene { world, arm, west, desk, .. } = &mut scene;
     publish_steadily(world, *arm, ms(10), ms(100), |_, _| ());
@@ -139,7 +139,7 @@ fn a_history_again_or_to_another_sink() {
     assert_goes_on(&mut scene);
 }
 
-/// The answers that went over a link, with their serials.
+/// Returns the answers that went over a link, with their serials.
 fn answers(world: &World, scene: (sgc_testkit::NodeKey, sgc_testkit::NodeKey)) -> Vec<(AnswerBody, Control)> {
     let all = frames(world, scene.0, scene.1).into_iter();
     all.filter_map(|frame| match &frame {
@@ -150,7 +150,7 @@ fn answers(world: &World, scene: (sgc_testkit::NodeKey, sgc_testkit::NodeKey)) -
 }
 
 #[test]
-fn an_answer_of_an_earlier_epoch() {
+fn replay_of_earlier_grant_is_refused() {
     let (mut scene, _) = recorded(56);
     let Scene { world, arm, west, desk, .. } = &mut scene;
     for _ in 0..3 {

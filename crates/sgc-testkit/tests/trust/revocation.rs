@@ -1,4 +1,4 @@
-//! Rights taken back while everything runs: from a policy, by a revocation list.
+//! Revocation of rights at run time, by a policy or a revocation list.
 
 use std::time::Duration;
 
@@ -13,7 +13,7 @@ use crate::{
     packets, publish_steadily, slow,
 };
 
-/// When the owner cut a sink, and when the epoch without it began.
+/// Returns the times at which the owner cut a sink and began the epoch without it.
 fn cut_and_rekeyed(world: &World, owner: NodeKey, from: usize) -> (Duration, Duration) {
     let cut = events(world, owner, from).find(|(e, _)| matches!(e, Event::SinkCut { .. }));
     let rekeyed = events(world, owner, from).find(|(e, _)| matches!(e, Event::Rekeyed { .. }));
@@ -21,7 +21,7 @@ fn cut_and_rekeyed(world: &World, owner: NodeKey, from: usize) -> (Duration, Dur
 }
 
 #[test]
-fn who_is_taken_out_of_a_policy_is_cut_at_once_and_the_others_lose_nothing() {
+fn node_removed_from_policy_is_cut_at_once_and_others_lose_nothing() {
     for seed in 0..12 {
         let mut scene = flowing_with(slow(seed), |s| if seed % 2 == 0 { s.best_effort() } else { s });
         let users = scene.without(scene.tab);
@@ -84,7 +84,7 @@ fn a_removed_member_opens_nothing_of_the_new_epoch_with_the_keys_that_it_kept() 
         })
         .collect();
     world.run(ms(500));
-    // A router that colludes hands it everything that it sees.
+    // A colluding router passes all packets to it.
     let seen: Vec<_> = packets(world, *west, *desk).into_iter().filter(|p| p.header.epoch == 2).collect();
     assert!(seen.len() >= of_new_epoch.len(), "messages, and marks");
     let mut sink = Sink::new(world.name(*arm, "/chatter"), id, grant.clone(), false, SinkLimits::default());
@@ -107,7 +107,7 @@ fn a_removed_member_opens_nothing_of_the_new_epoch_with_the_keys_that_it_kept() 
 }
 
 #[test]
-fn who_is_taken_out_during_a_rotation_does_not_keep_the_key_under_way() {
+fn node_removed_during_rotation_cannot_use_the_pending_key() {
     // The epoch that was being granted when it was cut never begins: it has its key.
     let mut scene = flowing(22);
     let Scene { world, arm, desk, lap, tab, .. } = &mut scene;
@@ -136,7 +136,7 @@ fn who_is_taken_out_during_a_rotation_does_not_keep_the_key_under_way() {
 }
 
 #[test]
-fn who_left_before_it_was_taken_out_does_not_keep_the_key_in_use() {
+fn node_that_left_before_its_removal_does_not_keep_the_key_in_use() {
     for revoked in [true, false] {
         let mut scene = flowing(24);
         let Scene { world, arm, desk, lap, tab, .. } = &mut scene;
@@ -278,7 +278,7 @@ fn a_router_that_was_off_too_learns_of_it_before_it_serves() {
         let mut scene = flowing(41);
         let Scene { world, arm, east, west, tab, .. } = &mut scene;
         if disk {
-            // It heard of it, forgot it with its memory, and starts with nobody in reach to tell it again.
+            // It knew the revocation, lost it with its state, and starts without a node in reach that could tell it again.
             let list = revoke(world, &[*tab], 1);
             world.hand_crl(*arm, &list);
             world.run(ms(500));
@@ -358,7 +358,7 @@ fn an_older_list_and_one_of_another_ca_change_nothing() {
     let members = [world.member(*desk).clone(), world.member(umbrella).clone()];
     let foreign = revocation_list("umbrella", &members, 99);
     world.inject(*desk, *west, &sgc_wire::Control::Crl { der: foreign });
-    // A list that somebody altered.
+    // An altered list.
     let list = revoke(world, &[*tab, *desk], 6);
     let mut altered = list.to_vec();
     let at = altered.len() - 3;
@@ -419,7 +419,7 @@ fn a_list_goes_over_a_net_with_rings_once_over_each_link_and_way() {
     assert_eq!(closed(&world, routers[2]), [LinkClose::Revoked]);
 }
 
-/// Links `node` to another router and lets it try what it can; true if it got the topic of `owner`.
+/// Links `node` to another router and lets it try to join. Returns `true` if it got the topic of `owner`.
 fn comes_back(world: &mut World, node: NodeKey, owner: NodeKey) -> bool {
     let published = publish_steadily(world, owner, ms(50), ms(20_000), |_, _| ());
     let heard = world.received(node, owner, "/chatter").iter().any(|id| published.contains(id));
@@ -433,7 +433,7 @@ fn a_certificate_that_was_renewed_elsewhere_is_revoked_with_its_node() {
         let staying = scene.without(scene.tab);
         let Scene { world, arm, east, west, tab, .. } = &mut scene;
         let before = world.identity(*tab).as_peer().cert.clone();
-        // The copy of the fleet's file that revokes the node has never heard of this certificate.
+        // The copy of the fleet file that revokes the node does not know this certificate.
         world.renew(*tab);
         assert_ne!(world.identity(*tab).as_peer().cert, before);
         if linked {
@@ -529,7 +529,7 @@ fn deafen(world: &mut World, from: NodeKey, to: NodeKey) {
 }
 
 #[test]
-fn one_router_that_knows_is_enough_to_cut_a_revoked_branch() {
+fn single_informed_router_cuts_revoked_branch() {
     let mut scene = flowing(46);
     let Scene { world, arm, east, west, tab, .. } = &mut scene;
     // Neither the owner nor the router in front of the thief hears of it.

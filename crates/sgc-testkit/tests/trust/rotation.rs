@@ -1,4 +1,4 @@
-//! A new epoch: a new key for those who stay, without one message lost or doubled.
+//! New epochs: the remaining members get a new key, and no message is lost or repeated.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use sgc_testkit::{MessageId, NodeKey, World, WorldConfig};
 
 use crate::{Scene, assert_received, events, flowing, flowing_with, grants, ms, publish_steadily, slow};
 
-/// When each epoch of `/chatter` began at its owner.
+/// Returns the times at which epochs of `/chatter` began at its owner.
 fn began(world: &World, owner: NodeKey) -> Vec<(u32, Duration)> {
     let rekeyed = |(event, at): (&Event, Duration)| match event {
         Event::Rekeyed { grant, .. } => Some((grant.epoch, at)),
@@ -83,7 +83,7 @@ fn late_joiners_get_the_whole_history_across_epochs() {
         world.run(ms(5000));
         let before = received_by(world, *tab, *arm, &published).len();
         assert_eq!(before, 20, "{}", world.trace());
-        // And once more by one who comes when all is over.
+        // A node that joins at the end gets them once more.
         world.restart(*tab);
         world.until_granted(*tab, *arm, "/chatter");
         world.run(ms(3000));
@@ -128,7 +128,7 @@ fn an_epoch_begins_as_soon_as_all_have_its_key() {
 
 #[test]
 fn rotations_that_overlap_do_not_put_each_other_off() {
-    // With one who never answers, each rotation alone would wait for all of its time.
+    // With a node that never answers, each rotation alone would wait its full time.
     let mut scene = flowing(9);
     let Scene { world, arm, tab, .. } = &mut scene;
     world.freeze(*tab);
@@ -179,7 +179,7 @@ fn a_new_epoch_while_the_way_moves_leaves_all_with_its_key() {
     for seed in 0..20 {
         let mut scene = flowing_with(slow(seed), |s| s.transient_local(1000));
         let Scene { world, arm, east, west, .. } = &mut scene;
-        // A second way, of which the first is then cut while keys are under way.
+        // There are two paths, and the first is cut while keys are in flight.
         let north = world.router("north");
         world.link(*east, north);
         world.link(north, *west);
@@ -201,7 +201,7 @@ fn a_new_epoch_while_the_way_moves_leaves_all_with_its_key() {
             scene.world.until_granted(user, scene.arm, "/chatter");
         }
         scene.world.run(ms(6000));
-        // What was under way on a cut cable comes again from the history; once is guaranteed, and all.
+        // Packets in flight on a cut cable come again from the history; each message arrives exactly once.
         for user in scene.users() {
             let mut received = received_by(&scene.world, user, scene.arm, &published);
             received.sort_unstable();
@@ -212,7 +212,7 @@ fn a_new_epoch_while_the_way_moves_leaves_all_with_its_key() {
 }
 
 #[test]
-fn who_joins_between_two_epochs_gets_all_from_then_on() {
+fn node_that_joins_between_epochs_gets_all_later_messages() {
     for seed in 0..8 {
         let mut scene = flowing(seed);
         let Scene { world, arm, lap, tab, .. } = &mut scene;

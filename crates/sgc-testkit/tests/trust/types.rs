@@ -1,4 +1,4 @@
-//! What types look like is told to those who may have the topic and ask, once, and to nobody else.
+//! A node gets type descriptions once, if it asks and may have the topic. No other node gets them.
 
 use bytes::Bytes;
 use sgc_endpoint::{Event, unpack_type};
@@ -12,7 +12,7 @@ fn description(n: u8) -> Bytes {
     vec![n; 3000].into()
 }
 
-/// What a node was told of types, answer by answer: the topics of the owner, among these, and what they look like.
+/// Returns the type descriptions that a node got, answer by answer, for these topics of the owner.
 fn told(world: &World, node: NodeKey, owner: NodeKey, topics: &[&str]) -> Vec<Vec<(String, Bytes)>> {
     let of_answer = |(event, _): (&Event, _)| {
         let Event::Types { types, .. } = event else { return None };
@@ -27,7 +27,7 @@ fn told(world: &World, node: NodeKey, owner: NodeKey, topics: &[&str]) -> Vec<Ve
 }
 
 #[test]
-fn who_asks_is_told_once_and_not_again_with_each_epoch() {
+fn type_description_is_sent_once_and_not_again_with_each_epoch() {
     let mut scene = flowing(200);
     let Scene { world, arm, desk, lap, .. } = &mut scene;
     world.describe(*arm, "/chatter", HASH, &description(1));
@@ -45,12 +45,12 @@ fn who_asks_is_told_once_and_not_again_with_each_epoch() {
 }
 
 #[test]
-fn what_the_owner_does_not_know_yet_is_told_when_it_does() {
+fn unknown_type_description_follows_once_owner_has_it() {
     let mut scene = flowing(201);
     let Scene { world, arm, desk, .. } = &mut scene;
     let topics = ["/chatter", "/other"];
     world.share(*arm, "/other", Sharing::to_fleet());
-    // Before the owner describes anything there is nobody to ask.
+    // Before the owner describes a type, no node can be asked.
     world.ask_types(*desk, *arm, &topics);
     world.run(ms(1000));
     assert!(told(world, *desk, *arm, &topics).is_empty());
@@ -65,7 +65,7 @@ fn what_the_owner_does_not_know_yet_is_told_when_it_does() {
 }
 
 #[test]
-fn what_becomes_known_at_one_time_is_told_at_one_time_and_again_to_who_asks_again() {
+fn simultaneous_type_descriptions_share_one_answer_and_are_repeated_on_request() {
     let mut scene = flowing(206);
     let Scene { world, arm, desk, .. } = &mut scene;
     let topics = ["/chatter", "/other"];
@@ -86,7 +86,7 @@ fn what_becomes_known_at_one_time_is_told_at_one_time_and_again_to_who_asks_agai
 }
 
 #[test]
-fn who_may_not_have_the_topic_is_not_told_what_it_looks_like() {
+fn unauthorised_node_gets_no_type_description() {
     let mut scene = scene_with(WorldConfig::new(202));
     let Scene { world, arm, desk, lap, .. } = &mut scene;
     world.share(*arm, "/chatter", Sharing::to(&[*desk]));
@@ -122,7 +122,7 @@ fn a_partner_is_told_of_its_topic_alone() {
 }
 
 #[test]
-fn who_is_revoked_while_it_waits_is_told_nothing_more() {
+fn node_revoked_while_it_waits_gets_no_type_description() {
     let mut scene = flowing(204);
     let Scene { world, arm, east, lap, .. } = &mut scene;
     world.share(*arm, "/other", Sharing::to_fleet());

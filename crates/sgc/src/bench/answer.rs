@@ -1,7 +1,7 @@
-//! `sgc bench answer`: the side that waits, sends back, counts, and opens the plain echo for the time of a run.
+//! `sgc bench answer`: the side that waits, echoes, counts, and opens the plain echo for the time of a run.
 //!
-//! It serves one run at a time and forgets one that is silent. What it opens beside the node is open for the address that
-//! is linked, and closed with the run.
+//! It serves one run at a time and drops a silent one. The plain echo is open only to the address of the linked peer, and is
+//! closed with the run.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
@@ -17,36 +17,36 @@ use sgc_trust::Suite;
 use super::echo::Echo;
 use super::machine::{Machine, cpu_us};
 use super::program::{End, Tally};
-use super::side::{self, Meeting, Side, Topics};
-use super::words::{Answer, Ask, Frame, Lane, PROTOCOL, Question, RunId, Tell};
+use super::side::{self, Rendezvous, Side, Topics};
+use super::words::{Answer, Ask, Channel, Frame, PROTOCOL, Question, Reply, RunId};
 use super::{EVENTS_MAX, Event, failed, listen_addr, next_event, router_url, wait_ready};
-use crate::demo::domains::{HeldDomain, hold_one};
+use crate::demo::domains::{DomainLock, lock_one};
 use crate::error::CliError;
 use crate::output;
 
-/// How long a run may be silent; then another may begin.
+/// Longest silence of a run. After it another run may begin.
 const RUN_SILENCE_MAX: Duration = Duration::from_secs(30);
-/// How often it is looked at.
+/// How often the silence is checked.
 const LOOK_PERIOD: Duration = Duration::from_secs(1);
-/// How far the domain of direct DDS is looked for from that of the node, so that both rarely want the same.
+/// Distance between the node's domain and the first candidate for direct DDS, so that both rarely want the same domain.
 const DIRECT_OFFSET: u32 = 17;
 
-/// Wait for `sgc bench run` on another machine, and answer it, until Ctrl-C
+/// Answer `sgc bench run` from another machine, until Ctrl-C
 ///
-/// Any member of the fleet may measure, and nobody else. While one does, a TCP and a UDP port that send back what comes are
-/// open to its address, and a DDS participant looks for its machine.
+/// Only members of the fleet may measure. While one does, a TCP and a UDP echo port are open to its address, and a DDS
+/// participant looks for its machine.
 #[derive(Debug, Args)]
 pub(crate) struct AnswerArgs {
-    /// The identity that `sgc fleet enroll` made, of another node than the measuring one
+    /// Identity file of a node, other than the measuring one's, as `sgc fleet enroll` writes it
     #[arg(long, value_name = "FILE")]
     identity: PathBuf,
-    /// Where to listen, such as quic://0.0.0.0:7448; several with commas
+    /// Address to listen on, such as quic://0.0.0.0:7448; several separated by commas
     #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = listen_addr, required_unless_present = "router")]
     listen: Vec<String>,
-    /// A router of yours instead, which the other side names as well; several with commas
+    /// Router of yours instead; the other side has to name it too; several separated by commas
     #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "listen")]
     router: Vec<String>,
-    /// The TCP and UDP port of the plain echo, if a firewall has to let it in; else the system chooses
+    /// TCP and UDP port of the plain echo, for a firewall that has to open it; 0 lets the system choose
     #[arg(long, value_name = "PORT", default_value_t = 0)]
     echo_port: u16,
 }
@@ -58,18 +58,18 @@ pub(crate) fn answer(args: &AnswerArgs) -> Result<(), CliError> {
     side::tell_of_signals(sender.clone())?;
     let is_direct = args.router.is_empty();
     let meeting = match is_direct {
-        true => Meeting::Listen(args.listen.clone()),
-        false => Meeting::Connect(args.router.clone()),
+        true => Rendezvous::Listen(args.listen.clone()),
+        false => Rendezvous::Connect(args.router.clone()),
     };
     let side = Side::start(&args.identity, &meeting, &Topics::Own, &sender)?;
     let urls = wait_ready(&events, &side)?;
     let network = side.join()?;
     let tally = Arc::default();
-    let control = End::answering(&network, Lane::Control, Arc::clone(&tally), sender.clone())
+    let control = End::answering(&network, Channel::Control, Arc::clone(&tally), sender.clone())
         .map_err(|error| failed(error.to_string()))?;
     introduce(&name, is_direct, if is_direct { &urls } else { &args.router })?;
     let echo_port = args.echo_port;
-    let mut answering = Answering {
+    let mut answer_side = AnswerSide {
         side,
         network,
         control,
@@ -80,14 +80,14 @@ pub(crate) fn answer(args: &AnswerArgs) -> Result<(), CliError> {
         run: None,
         refused: BTreeMap::new(),
     };
-    answering.serve(&events)
+    answer_side.serve(&events)
 }
 
 fn introduce(name: &str, is_direct: bool, urls: &[String]) -> Result<(), CliError> {
     let how = if is_direct { "--to" } else { "--router" };
     output::line(format!("{name} waits at {}", urls.join(",")))?;
     output::line("On the other machine, with the identity of another node of the fleet:")?;
-    // Who listens everywhere is reached somewhere, which is not known here.
+    // A node that listens on all addresses does not know the one at which it is reached.
     let reached = urls.iter().map(|url| {
         let anywhere = |url: &str, any: &str| url.replacen(any, "//THIS-MACHINE:", 1);
         anywhere(&anywhere(url, "//0.0.0.0:"), "//[::]:")
@@ -99,22 +99,22 @@ fn introduce(name: &str, is_direct: bool, urls: &[String]) -> Result<(), CliErro
     output::line("Ctrl-C ends it.")
 }
 
-/// A run that is served.
+/// The run that is being served.
 struct Run {
     id: RunId,
-    /// The other side has heard that it may begin.
+    /// The other side knows that it may begin.
     has_begun: bool,
     heard: Instant,
-    /// Its lanes; held so that they are there.
-    lanes: Vec<(Lane, End)>,
+    /// The channels of the run. They exist as long as they are held here.
+    channels: Vec<(Channel, End)>,
     echo: Option<Echo>,
-    /// How far the echo was when it was last looked at.
+    /// The bytes that the echo had moved at the last check.
     echo_moved: u64,
     direct: Option<Direct>,
 }
 
 impl Run {
-    /// Who uses the echo is there, though busy with it.
+    /// Takes traffic on the echo for a sign of life: a peer that uses the echo asks nothing meanwhile.
     fn look_at_echo(&mut self) {
         let moved = self.echo.as_ref().map_or(0, Echo::moved);
         if std::mem::replace(&mut self.echo_moved, moved) != moved {
@@ -125,14 +125,14 @@ impl Run {
 
 /// DDS without `sgc`.
 struct Direct {
-    // Before the network that they are of.
+    // Dropped before its network.
     _end: End,
     _network: CycloneNetwork,
-    domain: HeldDomain,
+    domain: DomainLock,
 }
 
-struct Answering {
-    // In the order in which they are to go: programs before their network, that before the node.
+struct AnswerSide {
+    // Fields in the order of dropping: programs before their network, the network before the node.
     run: Option<Run>,
     control: End,
     network: CycloneNetwork,
@@ -141,15 +141,15 @@ struct Answering {
     sender: SyncSender<Event>,
     is_direct: bool,
     echo_port: u16,
-    /// Peers refused at the door so far, by kind.
+    /// The number of peers refused at admission so far, by kind.
     refused: BTreeMap<String, u64>,
 }
 
-impl Answering {
+impl AnswerSide {
     fn serve(&mut self, events: &Receiver<Event>) -> Result<(), CliError> {
         loop {
             match next_event(events, &self.side, Instant::now() + LOOK_PERIOD) {
-                Ok(Some(Event::Frame(Lane::Control, frame, _))) => {
+                Ok(Some(Event::Frame(Channel::Control, frame, _))) => {
                     if let Some(question) = frame.said() {
                         self.handle(question)?;
                     }
@@ -169,7 +169,7 @@ impl Answering {
         }
     }
 
-    /// Who waits for somebody is told of those who came and were not let in.
+    /// Tells the waiting user about peers that were refused.
     fn tell_refused(&mut self) -> Result<(), CliError> {
         let Ok(status) = self.side.status() else { return Ok(()) };
         for (kind, count) in
@@ -190,14 +190,15 @@ impl Answering {
                 self.begin(&id, protocol, &version, &suites)
             }
             Ask::Hello { .. } => self.welcome(),
-            // Of a run that was forgotten, or never was.
-            _ if !is_known => Tell::Refused { reason: "this run is over here; start it again".to_owned() },
+            // The run is over or never existed.
+            _ if !is_known => Reply::Refused { reason: "this run is over here; start it again".to_owned() },
             Ask::Echo => self.open_echo(&id),
             Ask::Direct => self.open_direct(),
             Ask::Count { phase } => {
-                let mut counted = self.tally.lock().unwrap_or_else(PoisonError::into_inner).of(phase);
+                let mut counted =
+                    self.tally.lock().unwrap_or_else(PoisonError::into_inner).stream_count(phase);
                 counted.node_cpu_us = cpu_us(self.side.process()).unwrap_or(0);
-                Tell::Counted(counted)
+                Reply::Counted(counted)
             }
             Ask::Bye => {
                 self.run = None;
@@ -207,20 +208,20 @@ impl Answering {
         if let Some(run) = self.run.as_mut().filter(|run| run.id == id) {
             run.heard = Instant::now();
             if !is_hello && !std::mem::replace(&mut run.has_begun, true) {
-                let lanes: Vec<_> = run.lanes.iter().map(|(lane, _)| lane.name()).collect();
-                output::line(format!("a run goes on: {}", lanes.join(", ")))?;
+                let channels: Vec<_> = run.channels.iter().map(|(channel, _)| channel.name()).collect();
+                output::line(format!("a run goes on: {}", channels.join(", ")))?;
             }
         }
         let answer = Frame::words(&Answer { run: id, tell });
-        // The one who asked asks again, or gives up.
+        // The other side asks again or gives up.
         if let Err(error) = self.control.send(&answer) {
             output::diagnostic(&format!("sgc: an answer was not sent: {error}"));
         }
         Ok(())
     }
 
-    fn begin(&mut self, id: &RunId, protocol: u32, version: &str, suites: &[String]) -> Tell {
-        let refused = |reason: String| Tell::Refused { reason };
+    fn begin(&mut self, id: &RunId, protocol: u32, version: &str, suites: &[String]) -> Reply {
+        let refused = |reason: String| Reply::Refused { reason };
         if protocol != PROTOCOL {
             return refused(format!(
                 "`sgc bench` of version {} here does not understand that of version {}: use the same on both machines",
@@ -241,13 +242,13 @@ impl Answering {
                     .to_owned(),
             );
         };
-        let mut lanes = Vec::new();
-        for lane in suites.into_iter().map(Lane::Sealed) {
-            if lanes.iter().any(|(other, _)| *other == lane) {
+        let mut channels = Vec::new();
+        for channel in suites.into_iter().map(Channel::Sealed) {
+            if channels.iter().any(|(other, _)| *other == channel) {
                 continue;
             }
-            match End::answering(&self.network, lane, Arc::clone(&self.tally), self.sender.clone()) {
-                Ok(end) => lanes.push((lane, end)),
+            match End::answering(&self.network, channel, Arc::clone(&self.tally), self.sender.clone()) {
+                Ok(end) => channels.push((channel, end)),
                 Err(error) => return refused(error.to_string()),
             }
         }
@@ -256,7 +257,7 @@ impl Answering {
             id: id.clone(),
             has_begun: false,
             heard: Instant::now(),
-            lanes,
+            channels,
             echo: None,
             echo_moved: 0,
             direct: None,
@@ -264,16 +265,16 @@ impl Answering {
         self.welcome()
     }
 
-    fn welcome(&self) -> Tell {
-        Tell::Welcome { version: env!("CARGO_PKG_VERSION").to_owned(), machine: Machine::here() }
+    fn welcome(&self) -> Reply {
+        Reply::Welcome { version: env!("CARGO_PKG_VERSION").to_owned(), machine: Machine::here() }
     }
 
-    fn open_echo(&mut self, id: &RunId) -> Tell {
+    fn open_echo(&mut self, id: &RunId) -> Reply {
         let peer = match self.peer() {
             Ok(peer) => peer,
-            Err(reason) => return Tell::Without { reason },
+            Err(reason) => return Reply::Without { reason },
         };
-        let Some(run) = &mut self.run else { return Tell::Without { reason: "no run".to_owned() } };
+        let Some(run) = &mut self.run else { return Reply::Without { reason: "no run".to_owned() } };
         let echo = match run.echo.take() {
             Some(echo) => Ok(echo),
             None => Echo::open(peer, id, self.echo_port),
@@ -282,39 +283,39 @@ impl Answering {
             Ok(echo) => {
                 let (tcp, udp) = echo.ports();
                 run.echo = Some(echo);
-                Tell::Echo { tcp, udp }
+                Reply::Echo { tcp, udp }
             }
-            Err(error) => Tell::Without { reason: error.to_string() },
+            Err(error) => Reply::Without { reason: error.to_string() },
         }
     }
 
-    fn open_direct(&mut self) -> Tell {
+    fn open_direct(&mut self) -> Reply {
         let peer = match self.peer() {
             Ok(peer) => peer,
-            Err(reason) => return Tell::Without { reason },
+            Err(reason) => return Reply::Without { reason },
         };
-        let Some(run) = &mut self.run else { return Tell::Without { reason: "no run".to_owned() } };
+        let Some(run) = &mut self.run else { return Reply::Without { reason: "no run".to_owned() } };
         if let Some(direct) = &run.direct {
-            return Tell::Direct { domain: direct.domain.id() };
+            return Reply::Direct { domain: direct.domain.id() };
         }
-        let Some(domain) = hold_one(std::process::id().wrapping_add(DIRECT_OFFSET)) else {
-            return Tell::Without { reason: "no free ROS domain there".to_owned() };
+        let Some(domain) = lock_one(std::process::id().wrapping_add(DIRECT_OFFSET)) else {
+            return Reply::Without { reason: "no free ROS domain there".to_owned() };
         };
         let network = match side::join_directly(domain.id(), peer) {
             Ok(network) => network,
-            Err(error) => return Tell::Without { reason: error.to_string() },
+            Err(error) => return Reply::Without { reason: error.to_string() },
         };
-        match End::answering(&network, Lane::Direct, Arc::clone(&self.tally), self.sender.clone()) {
+        match End::answering(&network, Channel::Direct, Arc::clone(&self.tally), self.sender.clone()) {
             Ok(end) => {
                 let direct = Direct { _end: end, _network: network, domain };
                 let domain = run.direct.insert(direct).domain.id();
-                Tell::Direct { domain }
+                Reply::Direct { domain }
             }
-            Err(error) => Tell::Without { reason: error.to_string() },
+            Err(error) => Reply::Without { reason: error.to_string() },
         }
     }
 
-    /// The address of the one machine that is linked.
+    /// Returns the address of the only linked machine.
     fn peer(&self) -> Result<IpAddr, String> {
         if !self.is_direct {
             return Err("through a router it is not known where the two machines are: measure with --listen and --to \

@@ -1,8 +1,7 @@
-//! The bare path beside `sgc`: a plain echo over TCP and UDP, so that one sees what the network itself costs.
+//! The bare path beside `sgc`: a plain echo over TCP and UDP that shows the cost of the network itself.
 //!
-//! It is open for the time of one run, to one address, and for whoever says the number of the run, which only the other
-//! side has heard, through `sgc`. What it moves is bounded; what it is sent it sends back or counts, and looks at
-//! nothing of.
+//! It is open for the time of one run, to one address, and only for a peer that knows the id of the run, which the other side
+//! gets through `sgc`. It echoes or counts bytes up to a bound, and never interprets them.
 
 use std::io::{self, Read, Write};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, Shutdown, SocketAddr, TcpStream, UdpSocket};
@@ -23,23 +22,23 @@ use crate::error::CliError;
 const TOKEN_BYTES: usize = 32;
 /// Connections at once; the measuring side has one at a time.
 const CONNECTIONS_MAX: usize = 4;
-/// Bytes that one connection or the UDP socket takes, whatever they are for.
+/// Most bytes that one connection or the UDP socket takes.
 const BYTES_MAX: u64 = 16 << 30;
-/// How long a connection may say nothing.
+/// Longest silence of a connection.
 const SILENCE_MAX: Duration = Duration::from_secs(10);
-/// How long a port that does not answer is waited for.
+/// Longest wait for a connection.
 const CONNECT_MAX: Duration = Duration::from_secs(4);
-/// How long one UDP packet is waited for; then it is lost.
+/// Time after which a UDP packet counts as lost.
 const PACKET_MAX: Duration = Duration::from_secs(1);
-/// The largest content of a UDP packet here, which every path carries in one.
+/// Largest content of a UDP packet, which fits the MTU of every path.
 pub(crate) const UDP_BYTES_MAX: usize = 1100;
-/// What is read at once.
+/// Bytes per read.
 const PIECE_BYTES: usize = 256 << 10;
-/// What a connection is for.
+/// The first byte of a connection: its purpose.
 const ECHO: u8 = 1;
 const COUNT: u8 = 2;
 
-/// The answering end; closed when dropped.
+/// The answering end. Dropping it closes the ports.
 pub(crate) struct Echo {
     runtime: Option<Runtime>,
     moved: Arc<AtomicU64>,
@@ -48,7 +47,7 @@ pub(crate) struct Echo {
 }
 
 impl Echo {
-    /// Opens both ports, chosen by the system if `port` is 0, for this peer and this run.
+    /// Opens both ports for this peer and this run. The system chooses the ports if `port` is 0.
     pub(crate) fn open(peer: IpAddr, run: &RunId, port: u16) -> Result<Self, CliError> {
         let failed = |source| CliError::System { what: "cannot open the plain echo", source };
         let token = run.token().ok_or_else(|| failed(io::ErrorKind::InvalidInput.into()))?;
@@ -76,12 +75,12 @@ impl Echo {
         Ok(Self { runtime: Some(runtime), moved, tcp, udp })
     }
 
-    /// Grows with whatever comes: whether it is in use.
+    /// Returns the number of bytes moved so far, which shows whether the echo is in use.
     pub(crate) fn moved(&self) -> u64 {
         self.moved.load(Ordering::Relaxed)
     }
 
-    /// Its TCP port and its UDP port.
+    /// Returns the TCP port and the UDP port.
     pub(crate) fn ports(&self) -> (u16, u16) {
         (self.tcp, self.udp)
     }
@@ -108,7 +107,7 @@ async fn serve_tcp(
     let places = Arc::new(Semaphore::new(CONNECTIONS_MAX));
     loop {
         let Ok((stream, from)) = listener.accept().await else {
-            // Out of descriptors, as a rule: it passes.
+            // The usual cause is a lack of descriptors, which passes.
             tokio::time::sleep(Duration::from_millis(100)).await;
             continue;
         };
@@ -116,7 +115,7 @@ async fn serve_tcp(
         if is_peer(from, peer) {
             let moved = Arc::clone(&moved);
             tokio::spawn(async move {
-                // Whoever measures sees its own end of the connection.
+                // An error is ignored, because the measuring side sees its own end of the connection.
                 let _ = serve(stream, token, &moved).await;
                 drop(place);
             });
@@ -157,7 +156,7 @@ async fn serve(
             return Ok(());
         }
         message.clear();
-        // Memory for what has come, not for what is announced.
+        // Grows with received bytes, not with the announced length.
         while message.len() < bytes {
             let most = PIECE_BYTES.min(bytes - message.len());
             match timeout(SILENCE_MAX, stream.read(&mut piece[..most])).await?? {
@@ -181,7 +180,7 @@ async fn serve_udp(
 ) {
     let (mut packet, mut taken) = ([0; 2048], 0_u64);
     while taken < BYTES_MAX {
-        // What a packet before met on its way back comes as an error here.
+        // ICMP errors of earlier answers appear as errors here.
         let Ok((bytes, from)) = socket.recv_from(&mut packet).await else { continue };
         let shown = packet.get(..bytes.min(TOKEN_BYTES)).unwrap_or_default();
         if is_peer(from, peer) && verify_slices_are_equal(shown, &token).is_ok() {
@@ -203,7 +202,7 @@ impl Tcp {
         Self::connect(at, run, ECHO)
     }
 
-    /// Connects for a stream that is counted.
+    /// Connects for a counted stream.
     pub(crate) fn for_stream(at: SocketAddr, run: &RunId) -> io::Result<Self> {
         Self::connect(at, run, COUNT)
     }
@@ -218,11 +217,11 @@ impl Tcp {
         Ok(Self { stream })
     }
 
-    /// One message there and back: how long it took.
+    /// Sends one message there and back. Returns the time it took.
     pub(crate) fn round_trip(&mut self, message: &mut [u8]) -> io::Result<Duration> {
         let begun = Instant::now();
         let length = (message.len() as u32).to_le_bytes();
-        // In one write, as a small message would be.
+        // One write, so that a small message is one segment.
         self.stream.write_all(&[&length[..], message].concat())?;
         let mut back = [0; 4];
         self.stream.read_exact(&mut back)?;
@@ -230,8 +229,8 @@ impl Tcp {
         if back == length { Ok(begun.elapsed()) } else { Err(io::ErrorKind::InvalidData.into()) }
     }
 
-    /// Sends this again and again for so long: bytes that arrived, and the time from the first until the other end has
-    /// the last.
+    /// Sends `piece` again and again for `duration`. Returns the bytes that arrived, and the time from the first byte until the
+    /// other end has the last.
     pub(crate) fn stream(mut self, piece: &[u8], duration: Duration) -> io::Result<(u64, Duration)> {
         let (begun, mut sent) = (Instant::now(), 0_u64);
         while begun.elapsed() < duration && sent + (piece.len() as u64) < BYTES_MAX {
@@ -253,7 +252,7 @@ pub(crate) struct Udp {
 }
 
 impl Udp {
-    /// A socket for that port.
+    /// Opens a socket to that port.
     pub(crate) fn new(at: SocketAddr, run: &RunId) -> io::Result<Self> {
         let token = run.token().ok_or(io::ErrorKind::InvalidInput)?;
         let any = if at.is_ipv4() { IpAddr::V4(Ipv4Addr::UNSPECIFIED) } else { Ipv6Addr::UNSPECIFIED.into() };
@@ -262,7 +261,7 @@ impl Udp {
         Ok(Self { socket, token, seq: 0 })
     }
 
-    /// One packet there and back: how long it took; `None` if it was lost.
+    /// Sends one packet there and back. Returns the time it took, or `None` if it was lost.
     pub(crate) fn round_trip(&mut self, bytes: usize) -> io::Result<Option<Duration>> {
         self.seq += 1;
         let mut packet = self.token.to_vec();
@@ -279,10 +278,10 @@ impl Udp {
             self.socket.set_read_timeout(Some(left))?;
             match self.socket.recv(&mut back) {
                 Ok(n) if back[..n] == packet[..] => return Ok(Some(begun.elapsed())),
-                // One that was given up for lost.
+                // A late answer to a packet that counts as lost.
                 Ok(_) => {}
                 Err(e) if matches!(e.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {}
-                // The port is closed: the answer to an earlier packet.
+                // An ICMP answer to an earlier packet: the port is closed.
                 Err(error) => return Err(error),
             }
         }
@@ -300,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_sent_comes_back_or_is_counted() {
+    fn echo_returns_or_counts_bytes() {
         let run = RunId::new([7; 16]);
         let echo = Echo::open(HERE, &run, 0).unwrap();
         let (tcp, udp) = echo.ports();
@@ -319,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn who_does_not_know_the_run_or_comes_from_elsewhere_gets_nothing() {
+    fn echo_ignores_wrong_run_and_other_addresses() {
         let (run, other) = (RunId::new([7; 16]), RunId::new([8; 16]));
         let echo = Echo::open(HERE, &run, 0).unwrap();
         let (tcp, udp) = echo.ports();
@@ -332,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_closed_with_its_run() {
+    fn echo_closes_with_its_run() {
         let run = RunId::new([7; 16]);
         let echo = Echo::open(HERE, &run, 0).unwrap();
         let (tcp, _) = echo.ports();

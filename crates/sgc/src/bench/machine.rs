@@ -1,4 +1,4 @@
-//! What a machine is, without saying which: processor, cores, kernel; and what a process has used of it.
+//! Describes a machine anonymously by processor, cores and kernel, and measures the processor time of a process.
 
 use std::fs;
 
@@ -21,10 +21,10 @@ pub(crate) struct Machine {
 }
 
 impl Machine {
-    /// This one.
+    /// Describes this machine.
     pub(crate) fn here() -> Self {
         let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-        // ARM has no model name there.
+        // On ARM, /proc/cpuinfo has no model name.
         let cpu = info.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
         let cpu = cpu.map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned());
         let name = rustix::system::uname();
@@ -34,17 +34,17 @@ impl Machine {
         Self { cpu, cores, kernel }
     }
 
-    /// What the other side says of itself, cut and without what a terminal would take for orders.
+    /// Returns the other side's description, shortened and without control characters.
     pub(crate) fn cleaned(&self) -> Self {
         let clean = |text: &str| output::clean(&text.chars().take(TEXT_BYTES_MAX).collect::<String>());
         Self { cpu: clean(&self.cpu), cores: self.cores, kernel: clean(&self.kernel) }
     }
 }
 
-/// What a process has used of the processors so far, microseconds; `None` if it is gone.
+/// Returns the processor time that a process has used so far, in microseconds, or `None` if it is gone.
 pub(crate) fn cpu_us(process: u32) -> Option<u64> {
     let stat = fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
-    // The program's name is in parentheses and may hold anything (proc_pid_stat(5): utime and stime are 14 and 15).
+    // The program's name is in parentheses and may hold anything (proc_pid_stat(5): utime and stime are fields 14 and 15).
     let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
     let ticks = |field: usize| fields.get(field - 3)?.parse::<u64>().ok();
     Some((ticks(14)? + ticks(15)?) * 1_000_000 / rustix::param::clock_ticks_per_second().max(1))
@@ -55,10 +55,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn this_machine_has_a_processor_and_this_process_has_used_it() {
+    fn machine_has_processor_and_process_has_used_it() {
         let machine = Machine::here();
         assert!(!machine.cpu.is_empty() && machine.cores > 0 && machine.kernel.starts_with("Linux "));
-        // It ends once the kernel has counted one step more.
+        // The loop ends once the kernel has counted one more tick.
         let before = cpu_us(std::process::id()).unwrap();
         while cpu_us(std::process::id()).unwrap() <= before {
             std::hint::black_box((0..1000).sum::<u64>());
@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn what_another_machine_says_is_no_order_to_a_terminal() {
+    fn description_of_other_machine_cannot_steer_terminal() {
         let machine = Machine { cpu: "\x1b[2J".repeat(99), cores: 1, kernel: String::new() };
         let cleaned = machine.cleaned();
         assert!(!cleaned.cpu.contains('\x1b') && cleaned.cpu.chars().count() <= TEXT_BYTES_MAX);

@@ -1,7 +1,7 @@
 //! `sgc bench run`: the side that measures.
 //!
-//! One thing after the other, so that nothing disturbs another: each suite, then the bare path, then DDS without `sgc`.
-//! Every wait is bounded, and what it ends by is said with the cause, as far as this side knows it.
+//! It measures one thing after the other, so that none disturbs another: each suite, then the bare path, then DDS without
+//! `sgc`. Every wait is bounded, and its error names the cause as far as this side knows it.
 
 use std::collections::HashMap;
 use std::net::{IpAddr, SocketAddr};
@@ -19,79 +19,79 @@ use super::echo::{Tcp, UDP_BYTES_MAX, Udp};
 use super::machine::{Machine, cpu_us};
 use super::program::End;
 use super::report::{Flow, Path, Report, Trips};
-use super::side::{self, Meeting, Side, Topics};
-use super::words::{Answer, Ask, Counted, Frame, Kind, Lane, PROTOCOL, Question, RunId, Size, Tell};
+use super::side::{self, Rendezvous, Side, Topics};
+use super::words::{Answer, Ask, Channel, Frame, Kind, PROTOCOL, Question, Reply, RunId, Size, StreamCount};
 use super::{EVENTS_MAX, Event, failed, next_event, router_url, wait_ready};
 use crate::error::CliError;
 use crate::{fleet, output, status, why};
 
-/// How long the first answer may take.
+/// Longest wait for the first answer.
 const HELLO_MAX: Duration = Duration::from_secs(30);
-/// Refusals of the link in a row after which nothing else is waited for.
+/// Consecutive failures of the link after which waiting ends.
 const FAILURES_MAX: u32 = 3;
-/// How long other answers may take.
+/// Longest wait for other answers.
 const ANSWER_MAX: Duration = Duration::from_secs(15);
-/// A question without an answer is asked again after so long.
+/// Time after which an unanswered question is repeated.
 const ASK_AGAIN: Duration = Duration::from_millis(500);
-/// How often the other side hears that we are here.
+/// How often the other side gets a sign of life.
 const KEEP_PERIOD: Duration = Duration::from_secs(3);
-/// How long nothing may come before the link is looked at, and how often then.
+/// Time without a message after which, and from then on how often, the link is checked.
 const SILENCE: Duration = Duration::from_secs(3);
-/// How long nothing may come at all, beside what a slow path takes for the message.
+/// Longest time without a message, beyond the time that a slow path needs for the message itself.
 const SILENCE_MAX: Duration = Duration::from_secs(30);
-/// What the slowest path carries that is waited for, bytes a second.
+/// Rate of the slowest supported path, in bytes per second.
 const SLOWEST: u64 = 50_000;
-/// Round trips of one size at most.
+/// Most round trips of one size.
 const TRIPS_MAX: usize = 1000;
-/// Messages of a stream that are under way at most, and their bytes.
+/// Bounds of the window: fewest and most messages of a stream in flight.
 const WINDOW: (u64, u64) = (8, 1000);
 const WINDOW_BYTES: u64 = 8_000_000;
-/// Of so many parts of what may be under way one message each is answered.
+/// Number of messages per window that the other side answers.
 const WINDOW_MARKS: u64 = 8;
-/// How long a stream waits for word of its progress before it goes on without.
+/// Longest wait of a stream for an answer before it goes on without one.
 const PROGRESS_MAX: Duration = Duration::from_secs(2);
-/// How long what is missing at the end of a stream may still come.
+/// Longest wait for missing messages at the end of a stream.
 const DRAIN_MAX: Duration = Duration::from_secs(3);
-/// How often it is counted meanwhile.
+/// How often the count is asked for meanwhile.
 const COUNT_PERIOD: Duration = Duration::from_millis(200);
-/// How long direct DDS may take to find the other side.
+/// Longest time direct DDS may take to find the other side.
 const DIRECT_MAX: Duration = Duration::from_secs(8);
-/// What one write of the plain TCP stream takes.
+/// Bytes per write of the plain TCP stream.
 const TCP_PIECE_BYTES: usize = 64 << 10;
-/// Sizes at most.
+/// Most sizes in one run.
 const SIZES_MAX: usize = 16;
 
 /// Measure between this machine and one where `sgc bench answer` runs
 ///
-/// Prints a table and what it means; takes about twice --seconds for each suite and size. Exit code 0: it was measured;
-/// 1: it could not be, and why.
+/// The command prints a table and an interpretation. It takes about twice --seconds for each suite and size. Exit code 0 means
+/// that it measured; 1 means that it could not, and it prints the cause.
 #[derive(Debug, Args)]
 pub(crate) struct MeasureArgs {
-    /// The identity that `sgc fleet enroll` made, of another node than the answering one
+    /// Identity file of a node, other than the answering one's, as `sgc fleet enroll` writes it
     #[arg(long, value_name = "FILE")]
     identity: PathBuf,
-    /// The name of the node that answers
+    /// Name of the answering node
     #[arg(long, value_name = "NODE")]
     with: NodeName,
-    /// Where it listens, such as quic://desk.example:7448; several ways with commas
+    /// URL at which it listens, such as quic://desk.example:7448; several separated by commas
     #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, required_unless_present = "router")]
     to: Vec<String>,
-    /// A router of yours instead, which the other side names as well; several with commas
+    /// Router of yours instead; the other side has to name it too; several separated by commas
     #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "to")]
     router: Vec<String>,
-    /// Suites to measure, with commas
+    /// Suites to measure, separated by commas
     #[arg(long, value_name = "SUITES", value_delimiter = ',', default_value = "group,standard")]
     suites: Vec<Suite>,
-    /// Sizes of messages, with commas
+    /// Sizes of messages, separated by commas
     #[arg(long, value_name = "SIZES", value_delimiter = ',', default_value = "16,1000,1MB")]
     sizes: Vec<Size>,
-    /// How long each measurement lasts
+    /// Duration of each measurement in seconds
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=60))]
     seconds: u32,
-    /// Write the figures as JSON
+    /// File for the figures as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Write the tables as Markdown
+    /// File for the tables as Markdown
     #[arg(long, value_name = "FILE")]
     markdown: Option<PathBuf>,
 }
@@ -112,11 +112,11 @@ pub(crate) fn measure(args: &MeasureArgs) -> Result<(), CliError> {
     side::tell_of_signals(sender.clone())?;
     let mut bytes = [0; 16];
     fleet::system_rng()?.fill_bytes(&mut bytes);
-    let mut measuring = Measuring::start(args, events, sender, RunId::new(bytes))?;
-    let report = measuring.run()?;
-    // Nobody needs to hear it who is gone.
-    let _ = measuring.say(&Ask::Bye);
-    drop(measuring);
+    let mut measure_side = MeasureSide::start(args, events, sender, RunId::new(bytes))?;
+    let report = measure_side.run()?;
+    // A failure is ignored: the other side may be gone already.
+    let _ = measure_side.say(&Ask::Bye);
+    drop(measure_side);
     for line in report.lines() {
         output::line(line)?;
     }
@@ -136,9 +136,9 @@ pub(crate) fn measure(args: &MeasureArgs) -> Result<(), CliError> {
     Ok(())
 }
 
-struct Measuring<'a> {
-    // In the order in which they are to go: programs before their network, that before the node.
-    ends: HashMap<Lane, End>,
+struct MeasureSide<'a> {
+    // Fields in the order of dropping: programs before their network, the network before the node.
+    ends: HashMap<Channel, End>,
     direct: Option<CycloneNetwork>,
     network: CycloneNetwork,
     side: Side,
@@ -150,7 +150,7 @@ struct Measuring<'a> {
     kept: Instant,
 }
 
-impl<'a> Measuring<'a> {
+impl<'a> MeasureSide<'a> {
     fn start(
         args: &'a MeasureArgs,
         events: Receiver<Event>,
@@ -159,10 +159,10 @@ impl<'a> Measuring<'a> {
     ) -> Result<Self, CliError> {
         let urls = if args.router.is_empty() { &args.to } else { &args.router };
         let topics = Topics::Of(args.with.to_string(), args.suites.clone());
-        let side = Side::start(&args.identity, &Meeting::Connect(urls.clone()), &topics, &sender)?;
+        let side = Side::start(&args.identity, &Rendezvous::Connect(urls.clone()), &topics, &sender)?;
         wait_ready(&events, &side)?;
         let network = side.join()?;
-        let mut measuring = Self {
+        let mut measure_side = Self {
             ends: HashMap::new(),
             direct: None,
             network,
@@ -174,31 +174,32 @@ impl<'a> Measuring<'a> {
             phase: 0,
             kept: Instant::now(),
         };
-        for lane in measuring.lanes().into_iter().chain([Lane::Control]) {
-            let end = End::asking(&measuring.network, lane, measuring.sender.clone()).map_err(from_dds)?;
-            measuring.ends.insert(lane, end);
+        for channel in measure_side.channels().into_iter().chain([Channel::Control]) {
+            let end =
+                End::asking(&measure_side.network, channel, measure_side.sender.clone()).map_err(from_dds)?;
+            measure_side.ends.insert(channel, end);
         }
-        Ok(measuring)
+        Ok(measure_side)
     }
 
-    fn lanes(&self) -> Vec<Lane> {
-        let mut lanes = Vec::new();
+    fn channels(&self) -> Vec<Channel> {
+        let mut channels = Vec::new();
         for suite in &self.args.suites {
-            if !lanes.contains(&Lane::Sealed(*suite)) {
-                lanes.push(Lane::Sealed(*suite));
+            if !channels.contains(&Channel::Sealed(*suite)) {
+                channels.push(Channel::Sealed(*suite));
             }
         }
-        lanes
+        channels
     }
 
     fn run(&mut self) -> Result<Report, CliError> {
         let (version, there) = self.hello()?;
         let mut report = Report::new(self.path(), Machine::here(), there, version);
-        for lane in self.lanes() {
-            self.warm_up(lane, HELLO_MAX)?;
+        for channel in self.channels() {
+            self.warm_up(channel, HELLO_MAX)?;
             for size in self.args.sizes.clone() {
-                report.trips.push(self.trips(lane, size)?);
-                report.flows.push(self.flow(lane, size)?);
+                report.trips.push(self.trips(channel, size)?);
+                report.flows.push(self.flow(channel, size)?);
             }
         }
         report.path.rtt_us = self.link_rtt();
@@ -213,15 +214,15 @@ impl<'a> Measuring<'a> {
         Ok(report)
     }
 
-    // Talking.
+    // Questions and answers.
 
     fn say(&mut self, ask: &Ask) -> Result<(), CliError> {
         self.kept = Instant::now();
         let question = Frame::words(&Question { run: self.run.clone(), ask: ask.clone() });
-        self.ends[&Lane::Control].send(&question).map_err(from_dds)
+        self.ends[&Channel::Control].send(&question).map_err(from_dds)
     }
 
-    /// The next event until then; meanwhile the other side hears that we are here.
+    /// Returns the next event until then. Gives the other side signs of life meanwhile.
     fn next(&mut self, until: Instant) -> Result<Option<Event>, CliError> {
         if self.kept.elapsed() > KEEP_PERIOD {
             self.say(&Ask::Count { phase: 0 })?;
@@ -229,24 +230,24 @@ impl<'a> Measuring<'a> {
         next_event(&self.events, &self.side, until)
     }
 
-    /// Asks until there is an answer that fits; `None` if there is none in time.
+    /// Repeats a question until a fitting answer comes. Returns `None` if none comes in time.
     fn ask<T>(
         &mut self,
         ask: &Ask,
         max: Duration,
-        fits: impl Fn(Tell) -> Option<T>,
+        fits: impl Fn(Reply) -> Option<T>,
     ) -> Result<Option<T>, CliError> {
         let deadline = Instant::now() + max;
         while Instant::now() < deadline {
             self.say(ask)?;
             let again = deadline.min(Instant::now() + ASK_AGAIN);
             while let Some(event) = self.next(again)? {
-                let Event::Frame(Lane::Control, frame, _) = event else { continue };
+                let Event::Frame(Channel::Control, frame, _) = event else { continue };
                 let Some(Answer { run, tell }) = frame.said() else { continue };
                 if run != self.run {
                     continue;
                 }
-                if let Tell::Refused { reason } = &tell {
+                if let Reply::Refused { reason } = &tell {
                     let who = &self.args.with;
                     return Err(failed(format!("{who} refuses: {}", output::clean(reason))));
                 }
@@ -263,9 +264,9 @@ impl<'a> Measuring<'a> {
         let hello = Ask::Hello { protocol: PROTOCOL, version: env!("CARGO_PKG_VERSION").to_owned(), suites };
         let deadline = Instant::now() + HELLO_MAX;
         while Instant::now() < deadline {
-            // Shorter than the whole, so that a link that is refused again and again is noticed.
+            // Shorter than HELLO_MAX, so that repeated refusals of the link are noticed.
             let answer = self.ask(&hello, Duration::from_secs(1), |tell| match tell {
-                Tell::Welcome { version, machine } => Some((version, machine)),
+                Reply::Welcome { version, machine } => Some((version, machine)),
                 _ => None,
             })?;
             if let Some((version, machine)) = answer {
@@ -284,7 +285,7 @@ impl<'a> Measuring<'a> {
         Err(self.unreached())
     }
 
-    /// Why the other side was never heard.
+    /// Explains why the other side never answered.
     fn unreached(&self) -> CliError {
         let who = &self.args.with;
         let status = match self.side.status() {
@@ -312,8 +313,8 @@ impl<'a> Measuring<'a> {
                 "`sgc bench answer` prints the name of its node there: that belongs behind --with".to_owned();
             return CliError::Bench { reason, facts: vec![fact] };
         }
-        let mut facts = why::first_wrong(&self.side.socket(), &Lane::Control.answer())
-            .or_else(|| why::first_wrong(&self.side.socket(), &Lane::Control.ask()))
+        let mut facts = why::first_wrong(&self.side.socket(), &Channel::Control.answer())
+            .or_else(|| why::first_wrong(&self.side.socket(), &Channel::Control.ask()))
             .unwrap_or_default();
         facts.push(format!(
             "is --with right? `sgc bench answer` prints the name of its node; here it is {who}"
@@ -325,7 +326,7 @@ impl<'a> Measuring<'a> {
         CliError::Bench { reason, facts }
     }
 
-    /// A link straight to a node that is called otherwise than --with has it.
+    /// Returns a direct link to a node whose name differs from --with.
     fn another<'l>(&self, links: &'l [status::Link]) -> Option<&'l status::Link> {
         if !self.args.router.is_empty() {
             return None;
@@ -335,13 +336,13 @@ impl<'a> Measuring<'a> {
         links.iter().find(|link| link.peer != wanted)
     }
 
-    /// Why the other side is heard no more, or a lane does not carry.
-    fn silent(&self, lane: Lane, waited: Duration) -> CliError {
+    /// Explains why the other side fell silent, or why a channel carries nothing.
+    fn silent(&self, channel: Channel, waited: Duration) -> CliError {
         let who = &self.args.with;
         let mut facts = Vec::new();
         match self.side.status() {
             Ok(status) if status.links.iter().any(|link| !link.silent) => {
-                facts.extend(why::first_wrong(&self.side.socket(), &lane.ask()).unwrap_or_default());
+                facts.extend(why::first_wrong(&self.side.socket(), &channel.ask()).unwrap_or_default());
                 facts.push(
                     "the link of this side is up: look at what `sgc bench answer` said there".to_owned(),
                 );
@@ -356,7 +357,7 @@ impl<'a> Measuring<'a> {
             }
             Err(error) => facts.push(error.to_string()),
         }
-        let reason = format!("{who} is silent on {} for {:.0} s", lane.name(), waited.as_secs_f64());
+        let reason = format!("{who} is silent on {} for {:.0} s", channel.name(), waited.as_secs_f64());
         CliError::Bench { reason, facts }
     }
 
@@ -373,39 +374,39 @@ impl<'a> Measuring<'a> {
             true => ("direct", &self.args.to),
             false => ("router", &self.args.router),
         };
-        // The scheme alone: a host is nobody's business.
+        // Only the scheme, because a report must not reveal hosts.
         let transports =
             urls.iter().map(|url| url.split_once(':').map_or("", |(scheme, _)| scheme).to_owned());
         Path { via, transports: transports.collect(), rtt_us: None }
     }
 
-    // Measuring.
+    // Measurements.
 
-    /// Waits until a lane carries: a grant, and DDS on both sides.
-    fn warm_up(&mut self, lane: Lane, max: Duration) -> Result<(), CliError> {
-        self.progress(&format!("{}: waiting until it carries", lane.name()));
+    /// Waits until a channel carries messages: it needs a grant, and DDS discovery on both sides.
+    fn warm_up(&mut self, channel: Channel, max: Duration) -> Result<(), CliError> {
+        self.progress(&format!("{}: waiting until it carries", channel.name()));
         let begun = Instant::now();
         self.phase += 1;
         let ping = Frame { phase: self.phase, kind: Kind::Ping, seq: 0, data: vec![0; 16].into() };
         while begun.elapsed() < max {
-            if self.ends[&lane].is_heard() {
-                self.ends[&lane].send(&ping).map_err(from_dds)?;
+            if self.ends[&channel].is_heard() {
+                self.ends[&channel].send(&ping).map_err(from_dds)?;
             }
             let again = Instant::now() + ASK_AGAIN;
             while let Some(event) = self.next(again)? {
-                if self.is_pong(&event, lane).is_some() {
+                if self.is_pong(&event, channel).is_some() {
                     return Ok(());
                 }
             }
         }
-        Err(self.silent(lane, begun.elapsed()))
+        Err(self.silent(channel, begun.elapsed()))
     }
 
-    /// The number of the pong of this measurement that this is, and when it came.
-    fn is_pong(&self, event: &Event, of: Lane) -> Option<(u64, Instant)> {
+    /// Returns the number and time of a pong, if the event is one of this measurement.
+    fn is_pong(&self, event: &Event, of: Channel) -> Option<(u64, Instant)> {
         match event {
-            Event::Frame(lane, frame, at)
-                if *lane == of && frame.kind == Kind::Pong && frame.phase == self.phase =>
+            Event::Frame(channel, frame, at)
+                if *channel == of && frame.kind == Kind::Pong && frame.phase == self.phase =>
             {
                 Some((frame.seq, *at))
             }
@@ -413,14 +414,14 @@ impl<'a> Measuring<'a> {
         }
     }
 
-    /// Waits for a pong; an error if it never comes. What is in the way is looked at when it is late.
-    fn pong(&mut self, lane: Lane, size: Size) -> Result<(u64, Instant), CliError> {
+    /// Waits for a pong and fails if none comes. Checks the link when the pong is late.
+    fn pong(&mut self, channel: Channel, size: Size) -> Result<(u64, Instant), CliError> {
         let begun = Instant::now();
         let max = SILENCE_MAX + Duration::from_secs(2 * size.0 as u64 / SLOWEST);
         while begun.elapsed() < max {
             let until = Instant::now() + SILENCE;
             while let Some(event) = self.next(until)? {
-                if let Some(pong) = self.is_pong(&event, lane) {
+                if let Some(pong) = self.is_pong(&event, channel) {
                     return Ok(pong);
                 }
             }
@@ -428,11 +429,11 @@ impl<'a> Measuring<'a> {
                 break;
             }
         }
-        Err(self.silent(lane, begun.elapsed()))
+        Err(self.silent(channel, begun.elapsed()))
     }
 
-    fn trips(&mut self, lane: Lane, size: Size) -> Result<Trips, CliError> {
-        self.progress(&format!("{}, {size}: round trips", lane.name()));
+    fn trips(&mut self, channel: Channel, size: Size) -> Result<Trips, CliError> {
+        self.progress(&format!("{}, {size}: round trips", channel.name()));
         self.phase += 1;
         let data = bytes::Bytes::from(vec![0x5a; size.0]);
         let (begun, mut took) = (Instant::now(), Vec::new());
@@ -440,23 +441,23 @@ impl<'a> Measuring<'a> {
             let seq = took.len() as u64;
             let ping = Frame { phase: self.phase, kind: Kind::Ping, seq, data: data.clone() };
             let sent = Instant::now();
-            self.ends[&lane].send(&ping).map_err(from_dds)?;
+            self.ends[&channel].send(&ping).map_err(from_dds)?;
             loop {
-                let (number, at) = self.pong(lane, size)?;
+                let (number, at) = self.pong(channel, size)?;
                 if number == seq {
                     took.push(at.saturating_duration_since(sent));
                     break;
                 }
             }
         }
-        Ok(Trips::of(lane.name(), size, took, 0))
+        Ok(Trips::from_times(channel.name(), size, took, 0))
     }
 
-    fn flow(&mut self, lane: Lane, size: Size) -> Result<Flow, CliError> {
-        self.progress(&format!("{}, {size}: throughput", lane.name()));
+    fn flow(&mut self, channel: Channel, size: Size) -> Result<Flow, CliError> {
+        self.progress(&format!("{}, {size}: throughput", channel.name()));
         self.phase += 1;
         let phase = self.phase;
-        let before = self.count(lane, phase)?;
+        let before = self.count(channel, phase)?;
         let cpu_before = cpu_us(self.side.process());
         let data = bytes::Bytes::from(vec![0x5a; size.0]);
         let window = (WINDOW_BYTES / size.0 as u64).clamp(WINDOW.0, WINDOW.1);
@@ -468,54 +469,54 @@ impl<'a> Measuring<'a> {
                 let is_marked = sent % every == 0;
                 let kind = if is_marked { Kind::Marked } else { Kind::Stream };
                 let frame = Frame { phase, kind, seq: sent, data: data.clone() };
-                self.ends[&lane].send(&frame).map_err(from_dds)?;
+                self.ends[&channel].send(&frame).map_err(from_dds)?;
                 sent += 1;
                 if is_marked {
                     break;
                 }
             }
-            // All that is there, and if the window is full, the next.
+            // Takes the events that are there. If the window is full, waits for the next.
             let is_full = sent - known >= window;
             let until = Instant::now() + if is_full { PROGRESS_MAX } else { Duration::ZERO };
             match self.next(until)? {
                 Some(event) => {
-                    if let Some((seq, at)) = self.is_pong(&event, lane) {
+                    if let Some((seq, at)) = self.is_pong(&event, channel) {
                         known = known.max(seq + 1);
                         heard = at;
                     }
                 }
                 None if is_full => {
                     if !self.has_link() {
-                        return Err(self.silent(lane, heard.elapsed()));
+                        return Err(self.silent(channel, heard.elapsed()));
                     }
-                    // Word of the progress may be lost on a path that loses: go on, and let the count say what was.
+                    // Answers may be lost on a lossy path: go on, and let the final count decide.
                     known = sent;
                 }
                 None => {}
             }
         }
         let sending = begun.elapsed();
-        let after = self.drained(lane, phase, sent)?;
+        let after = self.drained(channel, phase, sent)?;
         let cpu_here = cpu_before.zip(cpu_us(self.side.process())).map(|(from, to)| to.saturating_sub(from));
         let cpu_there = after.node_cpu_us.saturating_sub(before.node_cpu_us);
-        let is_direct = lane == Lane::Direct;
-        Ok(Flow::of(lane.name(), size, sent, &after, sending)
+        let is_direct = channel == Channel::Direct;
+        Ok(Flow::from_count(channel.name(), size, sent, &after, sending)
             .with_cpu(cpu_here.filter(|_| !is_direct), Some(cpu_there).filter(|_| !is_direct)))
     }
 
-    fn count(&mut self, lane: Lane, phase: u32) -> Result<Counted, CliError> {
+    fn count(&mut self, channel: Channel, phase: u32) -> Result<StreamCount, CliError> {
         let counted = self.ask(&Ask::Count { phase }, ANSWER_MAX, |tell| match tell {
-            Tell::Counted(counted) if counted.phase == phase => Some(counted),
+            Reply::Counted(counted) if counted.phase == phase => Some(counted),
             _ => None,
         })?;
-        counted.ok_or_else(|| self.silent(lane, ANSWER_MAX))
+        counted.ok_or_else(|| self.silent(channel, ANSWER_MAX))
     }
 
-    /// What came of a stream once nothing more comes of it.
-    fn drained(&mut self, lane: Lane, phase: u32, sent: u64) -> Result<Counted, CliError> {
-        let (mut last, mut since) = (Counted::default(), Instant::now());
+    /// Returns the count of a stream once no more messages arrive.
+    fn drained(&mut self, channel: Channel, phase: u32, sent: u64) -> Result<StreamCount, CliError> {
+        let (mut last, mut since) = (StreamCount::default(), Instant::now());
         loop {
-            let counted = self.count(lane, phase)?;
+            let counted = self.count(channel, phase)?;
             if counted.received != last.received {
                 since = Instant::now();
             }
@@ -532,23 +533,23 @@ impl<'a> Measuring<'a> {
         Duration::from_secs(self.args.seconds.into())
     }
 
-    /// The address of the other machine, as this one reaches it.
+    /// Returns the address at which this machine reaches the other.
     fn peer(&self) -> Result<IpAddr, String> {
         let status = self.side.status().map_err(|error| error.to_string())?;
         let remote = status.links.first().and_then(|link| link.remote.parse::<SocketAddr>().ok());
         remote.map(|remote| remote.ip().to_canonical()).ok_or_else(|| "no link is up".to_owned())
     }
 
-    /// The bare path; the inner error is why there is none.
+    /// Measures the bare path. The inner error says why there is none.
     fn bare(&mut self, report: &mut Report) -> Result<Result<(), String>, CliError> {
         self.progress("the bare path: TCP and UDP");
         let opened = self.ask(&Ask::Echo, ANSWER_MAX, |tell| match tell {
-            Tell::Echo { tcp, udp } => Some(Ok((tcp, udp))),
-            Tell::Without { reason } => Some(Err(output::clean(&reason))),
+            Reply::Echo { tcp, udp } => Some(Ok((tcp, udp))),
+            Reply::Without { reason } => Some(Err(output::clean(&reason))),
             _ => None,
         })?;
         let (tcp, udp) = match opened {
-            None => return Err(self.silent(Lane::Control, ANSWER_MAX)),
+            None => return Err(self.silent(Channel::Control, ANSWER_MAX)),
             Some(Err(reason)) => return Ok(Err(reason)),
             Some(Ok(ports)) => ports,
         };
@@ -586,7 +587,7 @@ impl<'a> Measuring<'a> {
                 }
                 self.breathe()?;
             }
-            report.trips.push(Trips::of("TCP".to_owned(), size, took, 0));
+            report.trips.push(Trips::from_times("TCP".to_owned(), size, took, 0));
         }
         let duration = self.seconds();
         let streamed = Tcp::for_stream(at, &self.run)
@@ -613,27 +614,27 @@ impl<'a> Measuring<'a> {
                     return Ok(Err(std::io::Error::new(std::io::ErrorKind::TimedOut, "nothing comes back")));
                 }
             }
-            report.trips.push(Trips::of("UDP".to_owned(), size, took, lost));
+            report.trips.push(Trips::from_times("UDP".to_owned(), size, took, lost));
         }
         Ok(Ok(()))
     }
 
-    /// Takes what came meanwhile, so that nobody waits for it to be taken.
+    /// Empties the event queue, so that no sender blocks on it.
     fn breathe(&mut self) -> Result<(), CliError> {
         while self.next(Instant::now())?.is_some() {}
         Ok(())
     }
 
-    /// DDS without `sgc`; the inner error is why there is none.
+    /// Measures DDS without `sgc`. The inner error says why there is none.
     fn directly(&mut self, report: &mut Report) -> Result<Result<(), String>, CliError> {
         self.progress("DDS without sgc");
         let opened = self.ask(&Ask::Direct, ANSWER_MAX, |tell| match tell {
-            Tell::Direct { domain } => Some(Ok(domain)),
-            Tell::Without { reason } => Some(Err(output::clean(&reason))),
+            Reply::Direct { domain } => Some(Ok(domain)),
+            Reply::Without { reason } => Some(Err(output::clean(&reason))),
             _ => None,
         })?;
         let domain = match opened {
-            None => return Err(self.silent(Lane::Control, ANSWER_MAX)),
+            None => return Err(self.silent(Channel::Control, ANSWER_MAX)),
             Some(Err(reason)) => return Ok(Err(reason)),
             Some(Ok(domain)) => domain,
         };
@@ -643,10 +644,10 @@ impl<'a> Measuring<'a> {
             Ok(network) => network,
             Err(reason) => return Ok(Err(reason)),
         };
-        let end = End::asking(&network, Lane::Direct, self.sender.clone()).map_err(from_dds)?;
-        self.ends.insert(Lane::Direct, end);
+        let end = End::asking(&network, Channel::Direct, self.sender.clone()).map_err(from_dds)?;
+        self.ends.insert(Channel::Direct, end);
         self.direct = Some(network);
-        match self.warm_up(Lane::Direct, DIRECT_MAX) {
+        match self.warm_up(Channel::Direct, DIRECT_MAX) {
             Err(CliError::Bench { reason, .. }) if reason == "interrupted" => return Err(failed(reason)),
             Err(_) => {
                 return Ok(Err(format!(
@@ -659,9 +660,9 @@ impl<'a> Measuring<'a> {
             Ok(()) => {}
         }
         for size in self.args.sizes.clone() {
-            let measured = self.trips(Lane::Direct, size).and_then(|trips| {
+            let measured = self.trips(Channel::Direct, size).and_then(|trips| {
                 report.trips.push(trips);
-                self.flow(Lane::Direct, size)
+                self.flow(Channel::Direct, size)
             });
             match measured {
                 Ok(flow) => report.flows.push(flow),
@@ -674,7 +675,7 @@ impl<'a> Measuring<'a> {
         Ok(Ok(()))
     }
 
-    /// What goes on, for a person who waits.
+    /// Shows the current step to a waiting user.
     fn progress(&self, what: &str) {
         if std::io::IsTerminal::is_terminal(&std::io::stderr()) {
             output::diagnostic(&format!("… {what}"));

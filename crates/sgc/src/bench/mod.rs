@@ -1,8 +1,8 @@
-//! `sgc bench`: what two machines of one fleet get from `sgc` between them, beside what the network itself gives.
+//! `sgc bench`: measures throughput and latency between two machines of one fleet, through `sgc` and through the bare network.
 //!
-//! One side answers, the other measures. Both run a node with an ordinary identity and a DDS program in a private domain
-//! beside it, as in [`crate::demo`], so the whole way is measured: DDS, node, network, node, DDS, and back. They talk over
-//! topics that `sgc` carries, so nobody else is heard.
+//! One side answers, the other measures. Both run a node with an ordinary identity and a DDS program in a private domain, as
+//! in [`crate::demo`]. So the measurement covers the whole path: DDS, node, network, node, DDS, and back. The sides talk
+//! over topics that `sgc` carries, so they hear no other program.
 
 mod answer;
 mod echo;
@@ -22,18 +22,18 @@ use sgc_node::config::RouterUrl;
 use sgc_transport::ListenAddr;
 
 use self::side::Side;
-use self::words::{Frame, Lane};
+use self::words::{Channel, Frame};
 use crate::error::CliError;
 
-/// Events that wait to be looked at.
+/// Most events in the queue of one side.
 const EVENTS_MAX: usize = 4096;
-/// How long a node may take to start.
+/// Longest time a node may take to start.
 const READY_MAX: Duration = Duration::from_secs(30);
 
-/// Measure what sgc gives you between two of your machines, beside what the network itself gives
+/// Measure throughput and latency between two of your machines, through sgc and through the bare network
 ///
-/// On one machine `sgc bench answer`, on the other `sgc bench run`: round trips, throughput, loss and CPU, with DDS on both
-/// ends; beside it plain TCP and UDP, and DDS without sgc if it reaches.
+/// Run `sgc bench answer` on one machine and `sgc bench run` on the other. They measure round trips, throughput, loss and CPU
+/// with DDS on both ends, then plain TCP and UDP, and DDS without sgc if it can reach the other machine.
 #[derive(Debug, Args)]
 pub(crate) struct BenchArgs {
     #[command(subcommand)]
@@ -55,35 +55,35 @@ pub(crate) fn bench(args: BenchArgs) -> Result<ExitCode, CliError> {
     .map(|()| ExitCode::SUCCESS)
 }
 
-/// What happens to one side.
+/// An event at one side.
 #[derive(Debug)]
 enum Event {
-    /// A message came, and when.
-    Frame(Lane, Frame, Instant),
-    /// The user has had enough.
+    /// A message arrived at this time.
+    Frame(Channel, Frame, Instant),
+    /// The user interrupted the program.
     Interrupted,
     /// The node ended.
     NodeEnded,
-    /// The node is up, and listens at these URLs.
+    /// The node is up and listens at these URLs.
     NodeReady(Vec<String>),
 }
 
-/// Where a router or the other side is, as it will stand in a configuration.
+/// Checks the URL of a router or of the other side by the rules of a configuration.
 fn router_url(text: &str) -> Result<String, String> {
     text.parse::<RouterUrl>().map(|_| text.to_owned()).map_err(|fault| fault.to_string())
 }
 
-/// Where to listen, in the same way.
+/// Checks an address to listen on by the same rules.
 fn listen_addr(text: &str) -> Result<String, String> {
     text.parse::<ListenAddr>().map(|_| text.to_owned()).map_err(|fault| fault.to_string())
 }
 
-/// Why it does not go on, in one line.
+/// Returns an error with this reason, in one line.
 fn failed(reason: impl Into<String>) -> CliError {
     CliError::Bench { reason: reason.into(), facts: Vec::new() }
 }
 
-/// The next event, if there is one by then. That the user has had enough, or the node ended, is an error.
+/// Returns the next event, or `None` if there is none by then. Fails if the user interrupts the program or the node ends.
 fn next_event(events: &Receiver<Event>, side: &Side, until: Instant) -> Result<Option<Event>, CliError> {
     match events.recv_timeout(until.saturating_duration_since(Instant::now())) {
         Ok(Event::Interrupted) => Err(failed("interrupted")),
@@ -97,7 +97,7 @@ fn next_event(events: &Receiver<Event>, side: &Side, until: Instant) -> Result<O
     }
 }
 
-/// Waits for the node to be up: where it listens.
+/// Waits until the node is up. Returns the URLs at which it listens.
 fn wait_ready(events: &Receiver<Event>, side: &Side) -> Result<Vec<String>, CliError> {
     let deadline = Instant::now() + READY_MAX;
     loop {

@@ -1,7 +1,7 @@
-//! The DDS programs of `sgc bench`: plain participants, as ROS 2 programs would be, that know nothing of `sgc`.
+//! The DDS programs of `sgc bench`: plain participants that do not know `sgc`, like ROS 2 programs.
 //!
-//! One end of a lane writes on one topic and reads on the other. The answering end sends pings back and counts streams on
-//! the thread that reads them; everything else goes to whoever runs the measurement, as an [`Event`].
+//! One end of a channel writes on one topic and reads on the other. The answering end echoes pings and counts streams on the
+//! reading thread. Everything else goes to the measurement as an [`Event`].
 
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -12,14 +12,14 @@ use sgc_ros::{EndpointSpec, RosError, RosNetwork, RosWriter, Sample, SampleKind,
 use sgc_wire::{History, Qos};
 
 use super::Event;
-use super::words::{Counted, Frame, Kind, Lane, TYPE};
+use super::words::{Channel, Frame, Kind, StreamCount, TYPE};
 
-/// Messages that a reader holds: more than are ever under way.
+/// Depth of a reader, which exceeds the number of messages in flight.
 const READER_DEPTH: u32 = 4096;
-/// How long a message may wait until the local network takes it.
+/// Longest time a message may wait until the local network takes it.
 const WRITE_MAX: Duration = Duration::from_secs(10);
 
-/// Where a stream stands.
+/// The progress of a stream.
 #[derive(Debug, Default)]
 pub(crate) struct Tally {
     phase: u32,
@@ -30,12 +30,12 @@ pub(crate) struct Tally {
 }
 
 impl Tally {
-    /// Counts a message; one of another measurement begins a new count.
+    /// Counts a message. A message of another measurement begins a new count.
     fn count(&mut self, frame: &Frame, now: Instant) {
         if frame.phase != self.phase {
             *self = Self { phase: frame.phase, ..Self::default() };
         }
-        // They come in the order of their numbers, or not at all.
+        // Messages of a stream arrive in order or not at all, so a lower number is a repetition.
         if self.last_seq.is_some_and(|last| frame.seq <= last) {
             self.repeated += 1;
             return;
@@ -45,54 +45,54 @@ impl Tally {
         self.span = Some((self.span.map_or(now, |(first, _)| first), now));
     }
 
-    /// What came of a measurement; nothing if it is not the last one.
-    pub(crate) fn of(&self, phase: u32) -> Counted {
+    /// Returns the count of a measurement, which is empty unless the measurement is the latest.
+    pub(crate) fn stream_count(&self, phase: u32) -> StreamCount {
         if phase != self.phase {
-            return Counted { phase, ..Counted::default() };
+            return StreamCount { phase, ..StreamCount::default() };
         }
         let us = self.span.map_or(0, |(first, last)| last.duration_since(first).as_micros() as u64);
-        Counted { phase, received: self.received, repeated: self.repeated, us, node_cpu_us: 0 }
+        StreamCount { phase, received: self.received, repeated: self.repeated, us, node_cpu_us: 0 }
     }
 }
 
-/// One end of a lane.
+/// One end of a channel.
 pub(crate) struct End {
     writer: Arc<CycloneWriter>,
     _reader: CycloneReader,
 }
 
 impl End {
-    /// The end that asks and measures.
+    /// Opens the end that asks and measures.
     pub(crate) fn asking(
         network: &CycloneNetwork,
-        lane: Lane,
+        channel: Channel,
         events: SyncSender<Event>,
     ) -> Result<Self, RosError> {
-        let writer = Arc::new(network.create_writer(&spec(&lane.ask(), History::KeepAll))?);
+        let writer = Arc::new(network.create_writer(&spec(&channel.ask(), History::KeepAll))?);
         let reader = network.create_reader(
-            &spec(&lane.answer(), History::KeepLast(READER_DEPTH)),
+            &spec(&channel.answer(), History::KeepLast(READER_DEPTH)),
             Box::new(move |sample: Sample| {
                 let now = Instant::now();
                 if let Some(frame) = Frame::decode(&sample.payload) {
-                    // Whoever listened is gone if this fails, and this reader soon as well.
-                    let _ = events.send(Event::Frame(lane, frame, now));
+                    // A failure means that the measurement is over; this reader ends soon as well.
+                    let _ = events.send(Event::Frame(channel, frame, now));
                 }
             }),
         )?;
         Ok(Self { writer, _reader: reader })
     }
 
-    /// The end that answers and counts.
+    /// Opens the end that answers and counts.
     pub(crate) fn answering(
         network: &CycloneNetwork,
-        lane: Lane,
+        channel: Channel,
         tally: Arc<Mutex<Tally>>,
         events: SyncSender<Event>,
     ) -> Result<Self, RosError> {
-        let writer = Arc::new(network.create_writer(&spec(&lane.answer(), History::KeepAll))?);
+        let writer = Arc::new(network.create_writer(&spec(&channel.answer(), History::KeepAll))?);
         let back = Arc::clone(&writer);
         let reader = network.create_reader(
-            &spec(&lane.ask(), History::KeepLast(READER_DEPTH)),
+            &spec(&channel.ask(), History::KeepLast(READER_DEPTH)),
             Box::new(move |sample: Sample| {
                 let now = Instant::now();
                 let Some(frame) = Frame::decode(&sample.payload) else { return };
@@ -107,7 +107,7 @@ impl End {
                     }
                     Kind::Pong => return,
                     Kind::Words => {
-                        let _ = events.send(Event::Frame(lane, frame, now));
+                        let _ = events.send(Event::Frame(channel, frame, now));
                         return;
                     }
                 };
@@ -119,12 +119,12 @@ impl End {
         Ok(Self { writer, _reader: reader })
     }
 
-    /// Sends a message; waits while the local network does not take it.
+    /// Sends a message. Waits while the local network does not take it.
     pub(crate) fn send(&self, frame: &Frame) -> Result<(), RosError> {
         write(&self.writer, frame)
     }
 
-    /// True if somebody on its network listens.
+    /// Returns `true` if a reader on the local network matches.
     pub(crate) fn is_heard(&self) -> bool {
         self.writer.matched_readers() > 0
     }
@@ -164,15 +164,15 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_twice_is_counted_once_and_each_measurement_by_itself() {
+    fn repeated_messages_are_counted_once_and_each_measurement_separately() {
         let (begun, mut tally) = (Instant::now(), Tally::default());
         for (n, seq) in [0, 1, 1, 3, 2].into_iter().enumerate() {
             tally.count(&frame(4, seq), begun + Duration::from_millis(n as u64));
         }
-        let counted = Counted { phase: 4, received: 3, repeated: 2, us: 3000, node_cpu_us: 0 };
-        assert_eq!(tally.of(4), counted);
-        assert_eq!(tally.of(5), Counted { phase: 5, ..Counted::default() });
+        let counted = StreamCount { phase: 4, received: 3, repeated: 2, us: 3000, node_cpu_us: 0 };
+        assert_eq!(tally.stream_count(4), counted);
+        assert_eq!(tally.stream_count(5), StreamCount { phase: 5, ..StreamCount::default() });
         tally.count(&frame(5, 0), begun);
-        assert_eq!((tally.of(5).received, tally.of(4).received), (1, 0));
+        assert_eq!((tally.stream_count(5).received, tally.stream_count(4).received), (1, 0));
     }
 }

@@ -1,4 +1,4 @@
-//! What was measured between two machines: figures, tables, and what they mean in words. Pure.
+//! The report of a measurement between two machines: figures, tables and findings in words. Pure.
 
 use std::fmt::Write as _;
 use std::time::Duration;
@@ -6,22 +6,22 @@ use std::time::Duration;
 use serde::Serialize;
 
 use super::machine::Machine;
-use super::words::{Counted, Size};
+use super::words::{Size, StreamCount};
 use crate::output;
 
-/// Loss of UDP packets that is worth a word.
+/// Fraction of lost UDP packets from which the findings mention loss.
 const UDP_LOSS_TOLD: f64 = 0.005;
-/// A share of plain TCP's throughput below which it is not the network that limits.
+/// Fraction of plain TCP's throughput below which the network is not the limit.
 const NETWORK_BOUND: f64 = 0.8;
 
-/// How the two nodes met.
+/// The path between the two nodes.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(crate) struct Path {
     /// `"direct"` or `"router"`.
     pub(crate) via: &'static str,
-    /// Schemes of the URLs.
+    /// The schemes of the URLs.
     pub(crate) transports: Vec<String>,
-    /// Round trip of the link of this side, as its transport knows it, microseconds.
+    /// Round-trip time of this side's link, measured by its transport, in microseconds.
     pub(crate) rtt_us: Option<u64>,
 }
 
@@ -32,24 +32,24 @@ pub(crate) struct Trips {
     pub(crate) way: String,
     /// Bytes of the message.
     pub(crate) size: Size,
-    /// How many there were.
+    /// Number of round trips.
     pub(crate) count: usize,
-    /// Packets that did not come back; of UDP alone.
+    /// Packets that did not come back, for UDP only.
     pub(crate) lost: usize,
-    /// Half took no longer, microseconds.
+    /// Median in microseconds.
     pub(crate) p50_us: u64,
-    /// 99 of 100 took no longer.
+    /// 99th percentile in microseconds.
     pub(crate) p99_us: u64,
-    /// None took longer.
+    /// Maximum in microseconds.
     pub(crate) max_us: u64,
 }
 
 impl Trips {
-    /// Of what each took, in any order.
-    pub(crate) fn of(way: String, size: Size, mut took: Vec<Duration>, lost: usize) -> Self {
+    /// Summarises the times of round trips, given in any order.
+    pub(crate) fn from_times(way: String, size: Size, mut took: Vec<Duration>, lost: usize) -> Self {
         took.sort_unstable();
         let at = |percent: usize| {
-            // The smallest that so many do not exceed.
+            // The smallest value that so many per cent do not exceed.
             let rank = (took.len() * percent).div_ceil(100).max(1) - 1;
             took.get(rank).map_or(0, |took| took.as_micros() as u64)
         };
@@ -68,22 +68,28 @@ pub(crate) struct Flow {
     pub(crate) sent: u64,
     /// Messages that arrived.
     pub(crate) received: u64,
-    /// Messages that arrived once more.
+    /// Repeated messages.
     pub(crate) repeated: u64,
-    /// Messages a second that arrived, by the receiver's clock.
+    /// Messages received per second of the receiver's clock.
     pub(crate) per_s: f64,
-    /// The same in 10⁶ bits of content.
+    /// Throughput of content, in 10⁶ bits per second.
     pub(crate) mbit_s: f64,
-    /// Processor time of the node on this side, microseconds a message.
+    /// Processor time of the node on this side, in microseconds per message.
     pub(crate) cpu_us_here: Option<f64>,
-    /// The same of the other.
+    /// Processor time of the node on the other side, in microseconds per message.
     pub(crate) cpu_us_there: Option<f64>,
 }
 
 impl Flow {
-    /// Of what was counted; `sending` is how long it took where nothing else is known.
-    pub(crate) fn of(way: String, size: Size, sent: u64, counted: &Counted, sending: Duration) -> Self {
-        // Between the first and the last there are as many periods as messages, less one.
+    /// Summarises the count of a stream. `sending` is its duration where the count has none.
+    pub(crate) fn from_count(
+        way: String,
+        size: Size,
+        sent: u64,
+        counted: &StreamCount,
+        sending: Duration,
+    ) -> Self {
+        // n messages span n - 1 periods.
         let (periods, us) = match counted.us {
             0 => (counted.received, sending.as_micros().max(1) as u64),
             us => (counted.received.saturating_sub(1), us),
@@ -102,49 +108,49 @@ impl Flow {
         }
     }
 
-    /// With what both nodes used of their processors.
+    /// Adds the processor time that both nodes used.
     pub(crate) fn with_cpu(self, here: Option<u64>, there: Option<u64>) -> Self {
         let each = |us: Option<u64>| us.map(|us| us as f64 / self.received.max(1) as f64);
         let (cpu_us_here, cpu_us_there) = (each(here), each(there));
         Self { cpu_us_here, cpu_us_there, ..self }
     }
 
-    /// Messages that never arrived.
+    /// Returns the number of messages that never arrived.
     pub(crate) fn lost(&self) -> u64 {
         self.sent.saturating_sub(self.received)
     }
 }
 
-/// 10⁶ bits a second.
+/// Converts bytes and time to 10⁶ bits per second.
 pub(crate) fn mbit_s(bytes: u64, took: Duration) -> f64 {
     bytes as f64 * 8.0 / 1e6 / took.as_secs_f64().max(1e-6)
 }
 
-/// All of it.
+/// The whole report.
 #[derive(Debug, Serialize)]
 pub(crate) struct Report {
-    /// Version of the program here, and there.
+    /// Version of the program on this and on the other side.
     pub(crate) versions: [String; 2],
-    /// What measured.
+    /// The machine that measured.
     pub(crate) here: Machine,
-    /// What answered.
+    /// The machine that answered.
     pub(crate) there: Machine,
-    /// How they met.
+    /// The path between them.
     pub(crate) path: Path,
     /// Round trips.
     pub(crate) trips: Vec<Trips>,
     /// Streams from here to there.
     pub(crate) flows: Vec<Flow>,
-    /// What one plain TCP connection carries from here to there, 10⁶ bits a second.
+    /// Throughput of one plain TCP connection from here to there, in 10⁶ bits per second.
     pub(crate) tcp_mbit_s: Option<f64>,
-    /// Why the bare path was not measured, or not all of it.
+    /// The reason why the bare path was not measured, or only in part.
     pub(crate) bare_not: Option<String>,
-    /// Why DDS without `sgc` was not.
+    /// The reason why DDS without `sgc` was not measured.
     pub(crate) direct_not: Option<String>,
 }
 
 impl Report {
-    /// One without figures.
+    /// Returns a report without figures.
     pub(crate) fn new(path: Path, here: Machine, there: Machine, version_there: String) -> Self {
         Self {
             versions: [env!("CARGO_PKG_VERSION").to_owned(), version_there],
@@ -159,7 +165,7 @@ impl Report {
         }
     }
 
-    /// For a terminal.
+    /// Formats the report for a terminal.
     pub(crate) fn lines(&self) -> Vec<String> {
         let mut lines = self.machines();
         for (title, table) in self.tables() {
@@ -171,7 +177,7 @@ impl Report {
         lines
     }
 
-    /// For a page.
+    /// Formats the report as Markdown.
     pub(crate) fn markdown(&self) -> String {
         let mut text = "# sgc between two machines\n\n".to_owned();
         for line in self.machines() {
@@ -259,7 +265,7 @@ impl Report {
         ]
     }
 
-    /// What the figures mean, one finding a line.
+    /// Interprets the figures, one finding a line.
     fn findings(&self) -> Vec<String> {
         let mut findings = Vec::new();
         for trips in self.trips.iter().filter(|trips| trips.way.starts_with("sgc ")) {
@@ -337,7 +343,7 @@ impl Report {
     }
 }
 
-/// A text that means nothing to Markdown: what comes from the other machine may hold anything.
+/// Escapes Markdown in a text of the other machine, which may hold anything.
 fn escaped(text: &str) -> String {
     let special = |c: char| "\\`*_{}[]<>#|!".contains(c);
     text.chars().flat_map(|c| special(c).then_some('\\').into_iter().chain([c])).collect()
@@ -356,11 +362,11 @@ mod tests {
         let mut report = Report::new(path, machine("a"), machine("b|<c>"), "0.1.0".into());
         let trips = |way: &str, us: u64| {
             let took = (1..=100).map(|n| Duration::from_micros(us * n)).collect();
-            Trips::of(way.into(), Size(16), took, 0)
+            Trips::from_times(way.into(), Size(16), took, 0)
         };
         report.trips = vec![trips("sgc group", 20), trips("TCP", 5)];
-        let counted = Counted { phase: 1, received: 101, repeated: 0, us: 1_000_000, node_cpu_us: 0 };
-        let flow = Flow::of("sgc group".into(), Size(1000), 101, &counted, Duration::from_secs(1));
+        let counted = StreamCount { phase: 1, received: 101, repeated: 0, us: 1_000_000, node_cpu_us: 0 };
+        let flow = Flow::from_count("sgc group".into(), Size(1000), 101, &counted, Duration::from_secs(1));
         report.flows = vec![flow.with_cpu(Some(1010), Some(2020))];
         report.tcp_mbit_s = Some(100.0);
         report.direct_not = Some("it does not reach".into());
@@ -368,23 +374,23 @@ mod tests {
     }
 
     #[test]
-    fn percentiles_are_those_that_so_many_do_not_exceed() {
+    fn percentile_is_smallest_value_that_share_does_not_exceed() {
         let trips = &report().trips[0];
         assert_eq!((trips.p50_us, trips.p99_us, trips.max_us), (1000, 1980, 2000));
-        assert_eq!(Trips::of("TCP".into(), Size(1), Vec::new(), 3).max_us, 0);
+        assert_eq!(Trips::from_times("TCP".into(), Size(1), Vec::new(), 3).max_us, 0);
     }
 
     #[test]
-    fn rates_are_of_the_receivers_clock_and_loss_is_what_never_came() {
+    fn rates_use_receivers_clock_and_loss_counts_missing_messages() {
         let flow = &report().flows[0];
         assert!((flow.per_s - 100.0).abs() < 1e-9 && (flow.mbit_s - 0.8).abs() < 1e-9);
         assert_eq!((flow.cpu_us_here, flow.cpu_us_there), (Some(10.0), Some(20.0)));
-        let counted = Counted { received: 7, ..Counted::default() };
-        assert_eq!(Flow::of("x".into(), Size(1), 10, &counted, Duration::from_secs(1)).lost(), 3);
+        let counted = StreamCount { received: 7, ..StreamCount::default() };
+        assert_eq!(Flow::from_count("x".into(), Size(1), 10, &counted, Duration::from_secs(1)).lost(), 3);
     }
 
     #[test]
-    fn each_finding_is_said_in_words() {
+    fn findings_are_worded() {
         let said = report().lines().join("\n");
         for part in [
             "plain TCP takes 0.25 ms, so two nodes, sealing and DDS on both ends add 0.75 ms",
@@ -400,7 +406,7 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_from_elsewhere_is_text_in_markdown() {
+    fn markdown_escapes_text_of_other_machine() {
         let text = report().markdown();
         assert!(text.contains(r"there: b\|\<c\>, 2 cores"), "{text}");
         let rows: Vec<_> = text.lines().filter(|line| line.starts_with('|')).collect();

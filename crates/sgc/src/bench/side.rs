@@ -1,7 +1,7 @@
-//! One side of `sgc bench`: a node of its own in a process of its own, on a ROS domain that nobody else uses.
+//! One side of `sgc bench`: a separate node in a process of its own, on a ROS domain that no other program uses.
 //!
-//! The node is `sgc run` with a configuration as a user writes it, and the identity that the user named. What it needs
-//! besides is in a directory that goes when the side does; only revocation lists are taken over from the user's own node.
+//! The node is `sgc run` with a configuration as a user writes it and the identity that the user named. Its other files are in
+//! a directory that is removed with the side. It takes only revocation lists from the user's own node.
 
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader};
@@ -18,51 +18,51 @@ use sgc_trust::Suite;
 use tempfile::TempDir;
 
 use super::Event;
-use super::words::{Lane, TYPE};
-use crate::demo::domains::{HeldDomain, hold_one};
+use super::words::{Channel, TYPE};
+use crate::demo::domains::{DomainLock, lock_one};
 use crate::demo::processes::{ROS_VARIABLES, last_lines};
 use crate::error::CliError;
 use crate::run::{EndSignals, ReadyLine};
 use crate::status;
 
-/// How long a node may take to end in good order.
+/// Longest time a node may take to end cleanly.
 const END_MAX: Duration = Duration::from_secs(6);
-/// How often a node that ends is looked at.
+/// How often an ending node is polled.
 const END_PERIOD: Duration = Duration::from_millis(20);
-/// Revocation lists that are taken over, and bytes of each.
+/// Most revocation lists that are taken over.
 const CRLS_MAX: usize = 128;
 const CRL_BYTES_MAX: u64 = 1 << 20;
 
-/// How the two nodes meet.
+/// The way in which the two nodes meet.
 #[derive(Clone, Debug)]
-pub(crate) enum Meeting {
-    /// This one listens.
+pub(crate) enum Rendezvous {
+    /// This node listens.
     Listen(Vec<String>),
-    /// This one connects: to the other, or to a router between them.
+    /// This node connects to the other, or to a router between them.
     Connect(Vec<String>),
 }
 
-/// What a node is to carry.
+/// The topics that a node carries.
 #[derive(Clone, Debug)]
 pub(crate) enum Topics {
-    /// Lanes that are its own, for all members of its fleet.
+    /// Its own channels, for all members of its fleet.
     Own,
-    /// Lanes of that node.
+    /// The channels of that node.
     Of(String, Vec<Suite>),
 }
 
-/// A side: dropping it ends its node and removes its files.
+/// A side. Dropping it ends its node and removes its files.
 pub(crate) struct Side {
     dir: TempDir,
-    domain: HeldDomain,
+    domain: DomainLock,
     node: Child,
 }
 
 impl Side {
-    /// Starts the node. Whether and when it is up, and that it ended, comes as an event.
+    /// Starts the node. Events report that it is up and that it ended.
     pub(crate) fn start(
         identity: &Path,
-        meeting: &Meeting,
+        meeting: &Rendezvous,
         topics: &Topics,
         events: &SyncSender<Event>,
     ) -> Result<Self, CliError> {
@@ -70,7 +70,7 @@ impl Side {
             .prefix("sgc-bench-")
             .tempdir()
             .map_err(|source| CliError::Write { path: std::env::temp_dir(), source })?;
-        let domain = hold_one(std::process::id()).ok_or_else(|| {
+        let domain = lock_one(std::process::id()).ok_or_else(|| {
             super::failed(
                 "no free ROS domain among 20 to 69: other ROS 2 programs or demos run here; end one of them",
             )
@@ -80,7 +80,7 @@ impl Side {
         let text = configuration(&identity, meeting, topics, domain.id())?;
         let path = dir.path().join("bench.toml");
         fs::write(&path, text).map_err(|source| CliError::Write { path: path.clone(), source })?;
-        // What is wrong with what the user gave is said before anything runs.
+        // Mistakes in the user's arguments are reported before any process runs.
         let config = config::load(&path, &|_: &str| None).map_err(|errors| CliError::Arguments { errors })?;
         let what = identity.display().to_string();
         sgc_node::check_identity(&config).map_err(|source| CliError::CheckIdentity { what, source })?;
@@ -89,7 +89,7 @@ impl Side {
         Ok(Self { dir, domain, node })
     }
 
-    /// Joins the side's domain as a program of its own.
+    /// Joins the side's domain as a separate DDS program.
     pub(crate) fn join(&self) -> Result<CycloneNetwork, CliError> {
         let config = DdsConfig {
             domain: self.domain.id(),
@@ -99,22 +99,22 @@ impl Side {
         CycloneNetwork::open(&config).map_err(|error| super::failed(error.to_string()))
     }
 
-    /// How the node is doing.
+    /// Asks the node for its status.
     pub(crate) fn status(&self) -> Result<status::Status, CliError> {
-        status::of_node_at(&self.socket())
+        status::query_node(&self.socket())
     }
 
-    /// Where it is asked.
+    /// Returns the node's status socket.
     pub(crate) fn socket(&self) -> PathBuf {
         self.dir.path().join("bench.sock")
     }
 
-    /// Its process.
+    /// Returns the node's process id.
     pub(crate) fn process(&self) -> u32 {
         self.node.id()
     }
 
-    /// The last that it logged.
+    /// Returns the last lines of the node's log.
     pub(crate) fn last_words(&self) -> Vec<String> {
         last_lines(&self.dir.path().join("bench.log"))
     }
@@ -135,7 +135,7 @@ impl Drop for Side {
     }
 }
 
-/// A domain of both machines in which each looks for the other by unicast.
+/// Joins a domain in which both machines discover each other by unicast.
 pub(crate) fn join_directly(domain: u32, peer: std::net::IpAddr) -> Result<CycloneNetwork, CliError> {
     let config = DdsConfig {
         domain,
@@ -146,7 +146,7 @@ pub(crate) fn join_directly(domain: u32, peer: std::net::IpAddr) -> Result<Cyclo
     CycloneNetwork::open(&config).map_err(|error| super::failed(error.to_string()))
 }
 
-/// Has a signal of the user's come as an event; the next one ends the process at once.
+/// Turns the user's first signal into an event. The next signal ends the process at once.
 pub(crate) fn tell_of_signals(events: SyncSender<Event>) -> Result<(), CliError> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -178,7 +178,7 @@ fn start_node(dir: &Path, config: &Path, events: &SyncSender<Event>) -> Result<C
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .stderr(log)
-        // A Ctrl-C reaches this process only, which ends the node in order.
+        // In a process group of its own the node gets no Ctrl-C; this process ends it in order.
         .process_group(0);
     for variable in ROS_VARIABLES {
         command.env_remove(variable);
@@ -191,13 +191,13 @@ fn start_node(dir: &Path, config: &Path, events: &SyncSender<Event>) -> Result<C
                 let _ = events.send(Event::NodeReady(ready.ready));
             }
         }
-        // Its standard output ends with it.
+        // The node's standard output ends with the node.
         let _ = events.send(Event::NodeEnded);
     });
     Ok(node)
 }
 
-/// What the user's own node knows of certificates that were taken back counts here, too.
+/// Copies the revocation lists that the user's own node has.
 fn take_over_revocations(config: &config::Config, dir: &Path) {
     let mut usual = config.clone();
     usual.state = None;
@@ -210,7 +210,7 @@ fn take_over_revocations(config: &config::Config, dir: &Path) {
     }
     for list in lists.iter().take(CRLS_MAX) {
         let (Some(file), Ok(metadata)) = (list.file_name(), fs::metadata(list)) else { continue };
-        // One that is broken is not believed by the node.
+        // The node itself refuses a broken list.
         if metadata.is_file() && metadata.len() <= CRL_BYTES_MAX {
             let _ = fs::copy(list, state.join("crl").join(file));
         }
@@ -219,22 +219,22 @@ fn take_over_revocations(config: &config::Config, dir: &Path) {
 
 fn configuration(
     identity: &Path,
-    meeting: &Meeting,
+    meeting: &Rendezvous,
     topics: &Topics,
     domain: u32,
 ) -> Result<String, CliError> {
     let identity = identity.to_str().ok_or_else(|| CliError::Cannot {
         reason: format!("{}: the path of an identity must be UTF-8; copy it elsewhere", identity.display()),
     })?;
-    // A string of JSON is one of TOML.
+    // A JSON string is a valid TOML string.
     let quoted = |text: &str| serde_json::Value::from(text).to_string();
     let list = |texts: &[String]| {
         let texts: Vec<_> = texts.iter().map(|text| quoted(text)).collect();
         format!("[{}]", texts.join(", "))
     };
     let (routers, listen) = match meeting {
-        Meeting::Listen(urls) => (String::new(), format!("[router]\nlisten = {}\n\n", list(urls))),
-        Meeting::Connect(urls) => (format!("routers = {}\n", list(urls)), String::new()),
+        Rendezvous::Listen(urls) => (String::new(), format!("[router]\nlisten = {}\n\n", list(urls))),
+        Rendezvous::Connect(urls) => (format!("routers = {}\n", list(urls)), String::new()),
     };
     let mut text = format!(
         "identity = {}\n\n[node]\nstate = \"state\"\n{routers}\n{listen}\
@@ -244,11 +244,11 @@ fn configuration(
     );
     match topics {
         Topics::Own => {
-            let lanes = Suite::ALL.map(|suite| (Lane::Sealed(suite), suite));
-            for (lane, suite) in lanes.into_iter().chain([(Lane::Control, Suite::Standard)]) {
-                // Questions and answers overtake what is measured.
-                let priority = if lane == Lane::Control { "realtime" } else { "default" };
-                for (topic, publish) in [(lane.ask(), "publish = [\"*\"]\n"), (lane.answer(), "")] {
+            let channels = Suite::ALL.map(|suite| (Channel::Sealed(suite), suite));
+            for (channel, suite) in channels.into_iter().chain([(Channel::Control, Suite::Standard)]) {
+                // Questions and answers overtake measured messages.
+                let priority = if channel == Channel::Control { "realtime" } else { "default" };
+                for (topic, publish) in [(channel.ask(), "publish = [\"*\"]\n"), (channel.answer(), "")] {
                     text += &format!(
                         "\n[[share]]\ntopic = {}\ntype = {}\nto = [\"*\"]\nsuite = {}\npriority = {}\n{publish}",
                         quoted(&topic),
@@ -260,9 +260,9 @@ fn configuration(
             }
         }
         Topics::Of(owner, suites) => {
-            let lanes = suites.iter().map(|suite| Lane::Sealed(*suite));
-            for lane in lanes.chain([Lane::Control]) {
-                for (topic, publish) in [(lane.ask(), "publish = true\n"), (lane.answer(), "")] {
+            let channels = suites.iter().map(|suite| Channel::Sealed(*suite));
+            for channel in channels.chain([Channel::Control]) {
+                for (topic, publish) in [(channel.ask(), "publish = true\n"), (channel.answer(), "")] {
                     text += &format!(
                         "\n[[use]]\nfrom = {}\ntopic = {}\n{publish}",
                         quoted(owner),
@@ -279,7 +279,7 @@ fn configuration(
 mod tests {
     use super::*;
 
-    fn load(identity: &Path, meeting: &Meeting, topics: &Topics) -> config::Config {
+    fn load(identity: &Path, meeting: &Rendezvous, topics: &Topics) -> config::Config {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("bench.toml");
         let text = configuration(identity, meeting, topics, 42).unwrap();
@@ -288,15 +288,15 @@ mod tests {
     }
 
     #[test]
-    fn both_sides_are_configured_for_the_same_topics() {
-        let listen = Meeting::Listen(vec!["quic://0.0.0.0:7448".into(), "tls://[::]:7448".into()]);
+    fn both_sides_have_same_topics() {
+        let listen = Rendezvous::Listen(vec!["quic://0.0.0.0:7448".into(), "tls://[::]:7448".into()]);
         let place = tempfile::tempdir().unwrap();
         let identity = place.path().join("a \"b\".identity");
         crate::files::write_secret(&identity, "", crate::files::Existing::Keep("")).unwrap();
         let own = load(&identity, &listen, &Topics::Own);
         assert_eq!(own.identity, identity);
         assert_eq!((own.shares.len(), own.uses.len()), (2 * (Suite::ALL.len() + 1), 0));
-        let connect = Meeting::Connect(vec!["quic://desk.example:7448".into()]);
+        let connect = Rendezvous::Connect(vec!["quic://desk.example:7448".into()]);
         let used =
             load(&identity, &connect, &Topics::Of("desk".into(), vec![Suite::Group, Suite::PaperChacha]));
         assert_eq!(used.uses.len(), 6);

@@ -1,7 +1,7 @@
-//! What both sides of `sgc bench` say to each other, and the messages that are measured. Pure.
+//! The protocol between both sides of `sgc bench`, and the measured messages. Pure.
 //!
-//! All of it travels as ROS 2 messages of one made-up type, in plain CDR, over topics that `sgc` carries: so nobody is heard
-//! who is not of the fleet. Questions and answers are JSON inside of such a message.
+//! All messages have one private ROS 2 type, in plain CDR, and travel over topics that `sgc` carries, so only members of the
+//! fleet take part. Questions and answers are JSON inside such a message.
 
 use std::fmt;
 use std::str::FromStr;
@@ -12,7 +12,7 @@ use sgc_trust::Suite;
 
 use super::machine::Machine;
 
-/// What both programs must agree on; another number is another version of this file.
+/// Version of this protocol, on which both programs must agree.
 pub(crate) const PROTOCOL: u32 = 1;
 /// The type of all messages.
 pub(crate) const TYPE: &str = "sgc_bench/msg/Frame";
@@ -21,22 +21,22 @@ const WORDS_BYTES_MAX: usize = 16 << 10;
 /// Encapsulation of plain CDR, little endian (RTPS 2.5, 10.2), and the three fields and the length in front of the data.
 const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
 const FIELDS_BYTES: usize = 20;
-/// The largest message that is measured, bytes of data.
+/// Largest measured message, in bytes of data.
 pub(crate) const SIZE_MAX: usize = 32_000_000;
 
-/// A way of messages there and back.
+/// A pair of topics that carries messages there and back.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub(crate) enum Lane {
+pub(crate) enum Channel {
     /// Questions and answers.
     Control,
-    /// Sealed in this suite.
+    /// Messages sealed in this suite.
     Sealed(Suite),
     /// DDS between the two machines, without `sgc`.
     Direct,
 }
 
-impl Lane {
-    /// What a report calls it.
+impl Channel {
+    /// Returns the channel's name in reports.
     pub(crate) fn name(self) -> String {
         match self {
             Self::Control => "control".to_owned(),
@@ -45,12 +45,12 @@ impl Lane {
         }
     }
 
-    /// The ROS topic by which the measuring side is heard.
+    /// Returns the ROS topic on which the measuring side publishes.
     pub(crate) fn ask(self) -> String {
         format!("/sgc_bench/{}/ask", self.word())
     }
 
-    /// The ROS topic by which it is answered.
+    /// Returns the ROS topic on which the answering side publishes.
     pub(crate) fn answer(self) -> String {
         format!("/sgc_bench/{}/answer", self.word())
     }
@@ -58,23 +58,23 @@ impl Lane {
     fn word(self) -> String {
         match self {
             Self::Control => "control".to_owned(),
-            // No hyphen may stand in a topic's name.
+            // Topic names cannot contain hyphens.
             Self::Sealed(suite) => suite.name().replace('-', "_"),
             Self::Direct => "direct".to_owned(),
         }
     }
 }
 
-/// What a message is for.
+/// The purpose of a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
-    /// To be sent back.
+    /// A message to be echoed.
     Ping,
-    /// What was sent back.
+    /// The echo of a ping, or the answer to a marked message.
     Pong,
-    /// One of many that are counted.
+    /// A message of a stream, to be counted.
     Stream,
-    /// One of those that is also answered, without its data, so that whoever sends them knows how far they are.
+    /// A message of a stream that is also answered, without its data, so that the sender knows the progress.
     Marked,
     /// A question or an answer.
     Words,
@@ -87,18 +87,18 @@ impl Kind {
 /// A message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Frame {
-    /// Which measurement it belongs to.
+    /// The number of the measurement.
     pub(crate) phase: u32,
-    /// What it is for.
+    /// The purpose of the message.
     pub(crate) kind: Kind,
-    /// Its number there, from 0.
+    /// The message's number in the measurement, from 0.
     pub(crate) seq: u64,
-    /// As long as the size that is measured.
+    /// The content, as long as the measured size.
     pub(crate) data: Bytes,
 }
 
 impl Frame {
-    /// The serialised sample.
+    /// Serialises the message to a sample.
     pub(crate) fn encode(&self) -> Bytes {
         let mut bytes = Vec::with_capacity(ENCAPSULATION.len() + FIELDS_BYTES + self.data.len());
         bytes.extend(ENCAPSULATION);
@@ -110,7 +110,7 @@ impl Frame {
         bytes.into()
     }
 
-    /// Reads a sample, whose data it shares; `None` if it is none of ours.
+    /// Parses a sample without copying its data. Returns `None` if it is no such message.
     pub(crate) fn decode(sample: &Bytes) -> Option<Self> {
         let body = sample.get(ENCAPSULATION.len()..)?;
         let word = |at: usize| Some(u32::from_le_bytes(body.get(at..at + 4)?.try_into().ok()?));
@@ -122,101 +122,101 @@ impl Frame {
         let seq = u64::from_le_bytes(body.get(8..16)?.try_into().ok()?);
         let length = word(16)? as usize;
         let from = ENCAPSULATION.len() + FIELDS_BYTES;
-        // What follows is padding on the way, three bytes at most.
+        // DDS pads a sample with at most three bytes.
         let rest = sample.len().checked_sub(from.checked_add(length)?)?;
         (rest < 4).then_some(Self { phase: word(0)?, kind, seq, data: sample.slice(from..from + length) })
     }
 
-    /// A question or an answer.
+    /// Wraps a question or an answer.
     pub(crate) fn words(words: &impl Serialize) -> Self {
-        // Of these types every value has a JSON form.
+        // Every value of these types has a JSON form.
         let data = serde_json::to_vec(words).unwrap_or_default().into();
         Self { phase: 0, kind: Kind::Words, seq: 0, data }
     }
 
-    /// What it says; `None` if it is no such thing, or too long.
+    /// Parses a question or an answer. Returns `None` if the message is none, or too long.
     pub(crate) fn said<T: for<'a> Deserialize<'a>>(&self) -> Option<T> {
         let is_words = self.kind == Kind::Words && self.data.len() <= WORDS_BYTES_MAX;
         is_words.then(|| serde_json::from_slice(&self.data).ok()).flatten()
     }
 }
 
-/// The number of a run, which nobody can guess: also what opens the plain echo.
+/// The random id of a run. It also opens the plain echo.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct RunId(String);
 
 impl RunId {
     const BYTES: usize = 16;
 
-    /// One of random bytes.
+    /// Returns the id made of these random bytes.
     pub(crate) fn new(bytes: [u8; Self::BYTES]) -> Self {
         Self(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
     }
 
-    /// As it is said to the echo: always so many bytes.
+    /// Returns the id as sent to the echo, with a fixed length.
     pub(crate) fn token(&self) -> Option<[u8; Self::BYTES * 2]> {
         self.0.as_bytes().try_into().ok()
     }
 }
 
-/// From the side that measures.
+/// A question of the measuring side.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Question {
-    /// Of which run.
+    /// The run that it belongs to.
     pub(crate) run: RunId,
-    /// What.
+    /// The question itself.
     pub(crate) ask: Ask,
 }
 
-/// What is asked for.
+/// The content of a question.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Ask {
-    /// May we begin?
+    /// Asks to begin a run.
     Hello {
         /// [`PROTOCOL`].
         protocol: u32,
         /// Version of the program.
         version: String,
-        /// Suites that are to be measured.
+        /// Suites to measure.
         suites: Vec<String>,
     },
-    /// Open the plain echo for whoever is linked to you.
+    /// Asks to open the plain echo for the linked peer.
     Echo,
-    /// Join a DDS domain in which we find each other without `sgc`.
+    /// Asks to join a DDS domain in which both sides find each other without `sgc`.
     Direct,
-    /// What did you count?
+    /// Asks for the count of a measurement.
     Count {
-        /// Of which measurement.
+        /// The number of the measurement.
         phase: u32,
     },
-    /// That was all.
+    /// Ends the run.
     Bye,
 }
 
-/// From the side that answers.
+/// An answer of the answering side.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Answer {
-    /// Whom it answers.
+    /// The run that it belongs to.
     pub(crate) run: RunId,
-    /// What.
-    pub(crate) tell: Tell,
+    /// The answer itself.
+    pub(crate) tell: Reply,
 }
 
-/// What is answered.
+/// The content of an answer.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Tell {
-    /// Begin.
+pub(crate) enum Reply {
+    /// The run may begin.
     Welcome {
         /// Version of the program.
         version: String,
-        /// What it runs on.
+        /// The answering machine.
         machine: Machine,
     },
-    /// Not now, or not so.
+    /// The request is refused.
     Refused {
-        /// Why, and what to do.
+        /// The cause, with the remedy.
         reason: String,
     },
     /// The echo is open.
@@ -228,30 +228,30 @@ pub(crate) enum Tell {
     },
     /// The domain is joined.
     Direct {
-        /// Its number.
+        /// The domain's number.
         domain: u32,
     },
-    /// The echo or the domain is not.
+    /// The echo is not open, or the domain is not joined.
     Without {
-        /// Why, and what to do.
+        /// The cause, with the remedy.
         reason: String,
     },
-    /// So many came.
-    Counted(Counted),
+    /// The count of a measurement.
+    Counted(StreamCount),
 }
 
-/// What came of one measurement.
+/// The count of one measurement.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Counted {
-    /// Which.
+pub(crate) struct StreamCount {
+    /// The number of the measurement.
     pub(crate) phase: u32,
     /// Messages, each counted once.
     pub(crate) received: u64,
-    /// Messages that had come before.
+    /// Repeated messages.
     pub(crate) repeated: u64,
-    /// From the first to the last of them, microseconds of that side's clock.
+    /// Time from the first to the last message, in microseconds of that side's clock.
     pub(crate) us: u64,
-    /// What the node there has used of its processors so far, microseconds.
+    /// Processor time that the node there has used so far, in microseconds.
     pub(crate) node_cpu_us: u64,
 }
 
@@ -291,7 +291,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_are_read_as_they_were_made_also_with_padding() {
+    fn frames_survive_encoding_and_padding() {
         for kind in Kind::ALL {
             for length in [0, 1, 16, 1001] {
                 let frame = Frame { phase: 7, kind, seq: 1 << 40, data: vec![5; length].into() };
@@ -304,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_cut_or_foreign_is_no_frame() {
+    fn cut_or_foreign_sample_is_no_frame() {
         let frame = Frame { phase: 7, kind: Kind::Ping, seq: 1, data: vec![5; 9].into() };
         let sample = frame.encode();
         for length in 0..sample.len() {
@@ -322,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn words_survive_and_long_ones_are_not_read() {
+    fn questions_survive_encoding_and_long_ones_are_ignored() {
         let run = RunId::new([3; 16]);
         assert_eq!(run.token().map(|t| t.len()), Some(32));
         let question = Question { run, ask: Ask::Count { phase: 3 } };
@@ -332,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn sizes_are_read_and_shown() {
+    fn sizes_are_parsed_and_formatted() {
         let shown = |text: &str| text.parse::<Size>().map(|size| size.to_string());
         for (text, told) in [("16", "16 B"), ("64kB", "64 kB"), ("1MB", "1 MB"), ("1500000", "1.5 MB")] {
             assert_eq!(shown(text).as_deref(), Ok(told));

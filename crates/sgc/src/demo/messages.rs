@@ -1,8 +1,8 @@
-//! The demo's messages: real ROS 2 messages in CDR, each with a sequence number, the time at which it was sent, and a
-//! checksum over all of it *inside* the content, so that what arrives is known to be what was sent.
+//! The demo's messages: real ROS 2 messages in CDR. The content of each holds a sequence number, the time of sending and a
+//! checksum, so that a listener detects any alteration.
 //!
-//! Pure: times are arguments. The three types are written out here (`std_msgs/String`, `sensor_msgs/Image`,
-//! `geometry_msgs/Twist`; plain CDR, little endian: RTPS 2.5, 10; XTypes 1.3, 7.4.1); this is no general CDR library.
+//! Pure: times are arguments. This is no general CDR library: it knows three types (`std_msgs/String`, `sensor_msgs/Image`,
+//! `geometry_msgs/Twist`) in plain CDR, little endian (RTPS 2.5, 10; XTypes 1.3, 7.4.1).
 
 use aws_lc_rs::digest::{Context, SHA256, digest};
 use bytes::Bytes;
@@ -17,53 +17,53 @@ const ENCAPSULATION_BYTES: usize = 4;
 const IMAGE_SIDE: u32 = 500;
 const IMAGE_ENCODING: &str = "rgba8";
 const IMAGE_PIXEL_BYTES: usize = 4;
-/// The first pixels of an image are not seen but read: a mark, number, time, and checksum.
+/// The mark at the beginning of an image. The first pixels hold it, the number, the time and the checksum.
 const IMAGE_MARK: &[u8; 8] = b"sgc-demo";
 const IMAGE_STAMP_BYTES: usize = 24;
 const IMAGE_PLAIN_FROM: usize = IMAGE_STAMP_BYTES + DIGEST_BYTES;
 const DIGEST_BYTES: usize = 32;
 
-/// In a Twist, numbers stand in components that hardly move a robot: powers of two, so that nothing is rounded.
+/// Unit of the number in a Twist. It stands in components that hardly move a robot; a power of two avoids rounding.
 const TWIST_SEQ_UNIT: f64 = 1.0 / (1_u64 << 40) as f64;
 const TWIST_MICROS_UNIT: f64 = 1.0 / (1_u64 << 60) as f64;
 const TWIST_SUM_UNIT: f64 = 1.0 / (1_u64 << 40) as f64;
 /// Largest integer below which a double is exact.
 const EXACT_MAX: f64 = (1_u64 << 53) as f64;
 
-/// What a message says of itself.
+/// The number and time inside a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Stamp {
-    /// Counted from 1; 0 for messages that are not counted.
+    /// Sequence number from 1, or 0 for messages that are not counted.
     pub(crate) seq: u64,
-    /// When it was sent, nanoseconds of the monotonic clock that all processes of a host share. A Twist holds whole
+    /// Time of sending, in nanoseconds of the monotonic clock that all processes of a host share. A Twist holds whole
     /// microseconds.
     pub(crate) sent_ns: u64,
 }
 
-/// Why what arrived is not what was sent.
+/// The way in which a received message differs from a sent one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Damage {
-    /// It is not a message of the type.
+    /// The bytes are no message of the type.
     #[error("not a message of its type: {0}")]
     Malformed(&'static str),
-    /// It is one, but none that a talker of the demo made.
+    /// The message does not come from a talker of the demo.
     #[error("not a message of the demo: {0}")]
     Foreign(&'static str),
-    /// Its content does not belong together.
+    /// The checksum does not match the content.
     #[error("the checksum is wrong")]
     Checksum,
 }
 
-/// A message that lacks only its time: what takes long is done.
+/// A message that lacks only its time, so that finishing it is fast.
 pub(crate) enum Draft {
-    /// Text and Twist are made in no time.
+    /// A Text or Twist, which needs no preparation.
     Small {
-        /// Of which topic.
+        /// The topic.
         topic: Topic,
-        /// Its number.
+        /// The sequence number.
         seq: u64,
     },
-    /// An image, with places for the times and the checksum.
+    /// An image with room for the times and the checksum.
     Image(ImageDraft),
 }
 
@@ -84,7 +84,7 @@ impl Draft {
         }
     }
 
-    /// The serialised message. `unix_ns` is what ROS programs will see as the time of an image.
+    /// Returns the serialised message. `unix_ns` becomes the header stamp of an image.
     pub(crate) fn finish(self, sent_ns: u64, unix_ns: u64) -> Bytes {
         match self {
             Self::Small { topic: Topic::CmdVel, seq } => twist(seq, sent_ns).into(),
@@ -94,7 +94,7 @@ impl Draft {
     }
 }
 
-/// Reads a message and checks that it is whole.
+/// Parses a message and verifies its checksum.
 pub(crate) fn decode(topic: Topic, payload: &[u8]) -> Result<Stamp, Damage> {
     let mut r = CdrReader::new(payload)?;
     let stamp = match topic {
@@ -127,7 +127,7 @@ fn read_text(r: &mut CdrReader<'_>) -> Result<Stamp, Damage> {
 }
 
 fn twist(seq: u64, sent_ns: u64) -> Vec<u8> {
-    // A robot that listens goes slowly along a wave.
+    // A robot that obeys these commands moves slowly along a wave.
     let forward = 0.1 + (seq % 50) as f64 / 500.0;
     let turn = ((seq % 100) as f64 - 50.0) / 500.0;
     let linear = [forward, seq as f64 * TWIST_SEQ_UNIT, (sent_ns / 1000) as f64 * TWIST_MICROS_UNIT];
@@ -158,7 +158,7 @@ fn twist_sum(others: [f64; 5]) -> u32 {
     short_sum(&others.map(f64::to_le_bytes).concat())
 }
 
-/// The integer of which `value` is a multiple of `unit`.
+/// Returns the integer n with `value` = n × `unit`.
 fn integer(value: f64, unit: f64) -> Option<u64> {
     let n = value / unit;
     (n.fract() == 0.0 && (0.0..EXACT_MAX).contains(&n)).then_some(n as u64)
@@ -179,7 +179,7 @@ impl ImageDraft {
         w.u32(IMAGE_SIDE * IMAGE_PIXEL_BYTES as u32);
         w.u32(pixels_bytes as u32);
         let pixels_at = w.bytes.len();
-        // A pattern that wanders and changes with every image.
+        // A pattern that shifts with every image.
         let shift = seq as u32;
         for y in 0..IMAGE_SIDE {
             for x in 0..IMAGE_SIDE {
@@ -240,8 +240,7 @@ fn read_image(r: &mut CdrReader<'_>) -> Result<Stamp, Damage> {
     Ok(Stamp { seq: number(seq)?, sent_ns: number(sent_ns)? })
 }
 
-/// Over everything in an image but the checksum itself; the many pixels come in by their digest, which is known
-/// before the time is.
+/// Computes the checksum of an image. The pixels enter by their digest, which is known before the time is.
 fn image_sum(head: &[u8], stamp: &[u8], plain_digest: &[u8; DIGEST_BYTES]) -> [u8; DIGEST_BYTES] {
     let mut context = Context::new(&SHA256);
     for part in [head, stamp, plain_digest] {
@@ -293,7 +292,7 @@ impl CdrWriter {
         self.bytes.extend(value.to_le_bytes());
     }
 
-    /// Its length counts the zero at its end.
+    /// Writes a string. Its length includes the terminating zero.
     fn string(&mut self, text: &str) {
         self.u32(text.len() as u32 + 1);
         self.bytes.extend(text.as_bytes());
@@ -309,7 +308,7 @@ struct CdrReader<'a> {
 
 impl<'a> CdrReader<'a> {
     fn new(payload: &'a [u8]) -> Result<Self, Damage> {
-        // The options may differ: on its way a message is padded, and they say how far.
+        // The options may differ, because they hold the padding that is added on the way.
         match payload.split_first_chunk::<ENCAPSULATION_BYTES>() {
             Some(([0, 1, _, _], body)) => Ok(Self { body, at: 0 }),
             Some(_) => Err(Damage::Malformed("it is not plain CDR, little endian")),
@@ -350,12 +349,12 @@ impl<'a> CdrReader<'a> {
         }
     }
 
-    /// What has been read, the encapsulation apart.
+    /// Returns the bytes read so far, without the encapsulation.
     fn read(&self) -> &'a [u8] {
         &self.body[..self.at]
     }
 
-    /// Nothing may be left but padding to a multiple of four.
+    /// Checks that only padding to a multiple of four is left.
     fn finish(self) -> Result<(), Damage> {
         let rest = &self.body[self.at..];
         if rest.len() < 4 && rest.iter().all(|b| *b == 0) {
@@ -378,7 +377,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_made_is_read() {
+    fn messages_survive_encoding() {
         for topic in Topic::ALL {
             for seq in [0, 1, 42, 1 << 33] {
                 assert_eq!(
@@ -391,7 +390,7 @@ mod tests {
     }
 
     #[test]
-    fn padding_on_the_way_does_no_harm() {
+    fn padding_does_not_damage_message() {
         for topic in Topic::ALL {
             let mut payload = made(topic, 7);
             let pad = payload.len().wrapping_neg() % 4;
@@ -403,9 +402,9 @@ mod tests {
         }
     }
 
-    /// Every byte after the encapsulation, but padding between fields, which means nothing.
+    /// Alters every byte after the encapsulation except padding between fields.
     #[test]
-    fn any_altered_byte_is_found() {
+    fn altered_byte_is_detected() {
         for topic in [Topic::Chatter, Topic::CmdVel] {
             let good = made(topic, 7);
             for at in ENCAPSULATION_BYTES..good.len() {
@@ -426,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn any_cut_is_found() {
+    fn truncation_is_detected() {
         for topic in [Topic::Chatter, Topic::CmdVel] {
             let good = made(topic, 7);
             for end in 0..good.len() {
@@ -440,7 +439,7 @@ mod tests {
     }
 
     #[test]
-    fn the_text_reads_as_that_of_ros_does() {
+    fn text_has_layout_of_ros() {
         let payload = made(Topic::Chatter, 42);
         let text = String::from_utf8(payload[8..payload.len() - 1].to_vec()).unwrap();
         assert!(text.starts_with("Hello World: 42 [t=1234567891000 sum="), "{text}");
@@ -448,7 +447,7 @@ mod tests {
     }
 
     #[test]
-    fn the_image_is_laid_out_as_ros_does() {
+    fn image_has_layout_of_ros() {
         let payload = made(Topic::Image, 1);
         let expected: Vec<u8> = [
             &ENCAPSULATION[..],
@@ -471,7 +470,7 @@ mod tests {
     }
 
     #[test]
-    fn a_twist_hardly_moves_anything_sideways() {
+    fn twist_hardly_moves_robot_sideways() {
         let payload = made(Topic::CmdVel, 1_000_000);
         assert_eq!(payload.len(), ENCAPSULATION_BYTES + 48);
         let values: Vec<f64> = payload[ENCAPSULATION_BYTES..]
@@ -483,7 +482,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_of_others_are_told_apart() {
+    fn foreign_messages_are_recognised() {
         let mut w = CdrWriter::new();
         w.string("Hello World: 1");
         assert_eq!(decode(Topic::Chatter, &w.bytes), Err(Damage::Foreign("its text is another")));

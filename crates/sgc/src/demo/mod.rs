@@ -1,8 +1,8 @@
-//! `sgc demo`: two ROS 2 networks that cannot see each other, joined by a robot node, a router and an operator node,
-//! with talkers and listeners that count every message.
+//! `sgc demo`: joins two separate ROS 2 networks by a robot node, a router and an operator node. Talkers and listeners
+//! count every message.
 //!
-//! All of it is real: the nodes are `sgc run` with configurations as a user writes them, in processes of their own,
-//! and the talkers and listeners are DDS participants that know nothing of `sgc`. Nothing leaves this host.
+//! The nodes are `sgc run` processes with configurations as a user writes them. The talkers and listeners are DDS
+//! participants that do not know `sgc`. No packet leaves this host.
 
 pub(crate) mod domains;
 mod messages;
@@ -25,8 +25,8 @@ use tokio::time::{Instant, MissedTickBehavior, interval_at, sleep_until, timeout
 
 pub(crate) use peer::{PeerArgs, peer};
 
-use self::domains::HeldDomain;
-use self::processes::{ChildEvent, Processes, Who, last_lines};
+use self::domains::DomainLock;
+use self::processes::{ChildEvent, ProcessName, Processes, last_lines};
 use self::protocol::{PeerCommand, PeerEvent};
 use self::report::{Flow, Report};
 use self::screen::Screen;
@@ -36,35 +36,35 @@ use crate::error::{CliError, EXIT_FAILURE};
 use crate::run::{EndSignals, ReadyLine};
 use crate::{output, status};
 
-/// Longest demo: a week, so that [`tracker::SEQ_MAX`] is out of reach.
+/// Longest demo: one week, so that [`tracker::SEQ_MAX`] is out of reach.
 const SECONDS_MAX: i64 = 7 * 86_400;
-/// How long a node may take to start.
+/// Longest time a node may take to start.
 const READY_MAX: Duration = Duration::from_secs(30);
-/// How long the first messages may take to come through.
+/// Longest time until the first messages arrive.
 const PATH_MAX: Duration = Duration::from_secs(60);
-/// How long the last messages may be under way.
+/// Longest time the last messages may be in flight.
 const DRAIN_MAX: Duration = Duration::from_secs(5);
-/// How long processes may take to end.
+/// Longest time processes may take to end.
 const END_MAX: Duration = Duration::from_secs(6);
 
-const ROUTER: Who = Who(CLOUD);
-const PEERS: [Who; 2] = [Who("robot-peer"), Who("operator-peer")];
+const ROUTER: ProcessName = ProcessName(CLOUD);
+const PEERS: [ProcessName; 2] = [ProcessName("robot-peer"), ProcessName("operator-peer")];
 
-/// See it work: two ROS 2 networks on this machine that cannot see each other, joined by three sgc processes.
+/// Demonstrate sgc: join two separate ROS 2 networks on this machine by three sgc processes.
 ///
-/// It needs no ROS 2 and no configuration, and leaves nothing behind. A text, an image of 1 MB and a velocity command
-/// cross over at 10, 10 and 50 Hz; every message is numbered and checked. Exit code 0 means that all of them arrived, once
-/// each and unaltered.
+/// The demo needs no ROS 2 and no configuration, and leaves no files behind. A text, an image of 1 MB and a velocity command
+/// cross over at 10, 10 and 50 Hz. Every message is numbered and checked. Exit code 0 means that each message arrived
+/// once and unaltered.
 #[derive(Debug, Args)]
 pub(crate) struct DemoArgs {
-    /// How long to count messages
+    /// How long to count messages, in seconds
     #[arg(long, value_name = "N", default_value_t = 10,
           value_parser = clap::value_parser!(u32).range(1..=SECONDS_MAX))]
     seconds: u32,
-    /// Print one JSON document at the end, and nothing else
+    /// Print only one JSON document, at the end
     #[arg(long)]
     json: bool,
-    /// Keep configurations, identities and logs in this directory, which must be new or empty
+    /// Directory in which to keep configurations, identities and logs; must be new or empty
     #[arg(long, value_name = "DIR")]
     keep: Option<PathBuf>,
 }
@@ -97,7 +97,7 @@ async fn stage_and_perform(args: &DemoArgs) -> Result<Report, CliError> {
     result
 }
 
-/// A signal of the user's, once; the next ends the process at once.
+/// The user's first signal. A second one ends the process at once.
 struct Interruption {
     signals: Option<EndSignals>,
 }
@@ -114,30 +114,30 @@ impl Interruption {
     }
 }
 
-/// How waiting for something ended.
+/// How a wait ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Waited {
+enum WaitOutcome {
     Happened,
     Interrupted,
     InVain,
 }
 
-/// One demo.
+/// A running demo.
 struct Demo {
     stage: Stage,
-    domains: [HeldDomain; 2],
+    domains: [DomainLock; 2],
     processes: Processes,
     interruption: Interruption,
     screen: Screen,
-    /// Addresses of the nodes that are up.
-    ready: Vec<(Who, Vec<String>)>,
+    /// The addresses of the nodes that are up.
+    ready: Vec<(ProcessName, Vec<String>)>,
     flows: Vec<Flow>,
 }
 
 impl Demo {
     fn new(args: &DemoArgs, interruption: Interruption, screen: Screen) -> Result<Self, CliError> {
         let stage = Stage::set(args.keep.as_deref())?;
-        let domains = domains::hold_two(std::process::id()).ok_or_else(|| CliError::Demo {
+        let domains = domains::lock_two(std::process::id()).ok_or_else(|| CliError::Demo {
             reason: "no two free ROS domains: other ROS 2 programs or demos run here".into(),
             facts: Vec::new(),
         })?;
@@ -154,7 +154,7 @@ impl Demo {
         let begun = Instant::now();
         self.start_all().await?;
         match self.wait_for(PATH_MAX, |demo| demo.flows.iter().all(Flow::is_up)).await? {
-            Waited::Happened => {}
+            WaitOutcome::Happened => {}
             waited => return Err(self.no_path(waited).await),
         }
         self.check_names().await?;
@@ -162,7 +162,7 @@ impl Demo {
 
         let elapsed = self.measure(duration).await?;
         self.tell_peers(PeerCommand::Stop).await?;
-        // Whatever this ends by: what is missing then is lost.
+        // However this wait ends, messages that are still missing count as lost.
         self.wait_for(DRAIN_MAX, |demo| demo.flows.iter().all(Flow::is_complete)).await?;
         for flow in &mut self.flows {
             flow.stopped = true;
@@ -171,7 +171,7 @@ impl Demo {
         Ok(Report::new(elapsed.as_secs_f64(), &self.flows))
     }
 
-    /// Starts the router, and once its address is known everything else.
+    /// Starts the router, and everything else once the router's address is known.
     async fn start_all(&mut self) -> Result<(), CliError> {
         let config = self.stage.write_cloud("quic://127.0.0.1:0")?;
         self.start_node(ROUTER, &config.display().to_string())?;
@@ -182,32 +182,32 @@ impl Demo {
             facts: last_lines(&self.stage.log(CLOUD)),
         })?;
         if self.stage.is_kept() {
-            // So that `sgc run -c` with the files that are kept works as it did here.
+            // The kept files name the bound address, so that `sgc run -c` works with them.
             self.stage.write_cloud(&router)?;
         }
         for (role, peer) in Role::ALL.into_iter().zip(PEERS) {
             let domain = self.domain(role);
             let config = self.stage.write_end(role, domain, &router)?;
-            self.start_node(Who(role.name()), &config.display().to_string())?;
+            self.start_node(ProcessName(role.name()), &config.display().to_string())?;
             let domain = domain.to_string();
             let args = ["demo-peer", "--role", role.name(), "--domain", &domain];
             self.processes.start(peer, &args, &self.stage.log(peer.0))?;
         }
-        self.wait_ready(&Role::ALL.map(|role| Who(role.name()))).await?;
+        self.wait_ready(&Role::ALL.map(|role| ProcessName(role.name()))).await?;
         self.stage.forget_secrets()
     }
 
-    fn start_node(&mut self, who: Who, config: &str) -> Result<(), CliError> {
+    fn start_node(&mut self, who: ProcessName, config: &str) -> Result<(), CliError> {
         let args = ["run", "-c", config, "--until-stdin-closes", "--print-ready"];
         self.processes.start(who, &args, &self.stage.log(who.0))
     }
 
-    async fn wait_ready(&mut self, nodes: &[Who]) -> Result<(), CliError> {
-        let is_ready = |demo: &Self, node: &Who| demo.ready.iter().any(|(who, _)| who == node);
+    async fn wait_ready(&mut self, nodes: &[ProcessName]) -> Result<(), CliError> {
+        let is_ready = |demo: &Self, node: &ProcessName| demo.ready.iter().any(|(who, _)| who == node);
         match self.wait_for(READY_MAX, |demo| nodes.iter().all(|node| is_ready(demo, node))).await? {
-            Waited::Happened => Ok(()),
-            Waited::Interrupted => Err(interrupted()),
-            Waited::InVain => {
+            WaitOutcome::Happened => Ok(()),
+            WaitOutcome::Interrupted => Err(interrupted()),
+            WaitOutcome::InVain => {
                 let late: Vec<_> = nodes.iter().filter(|node| !is_ready(self, node)).map(|w| w.0).collect();
                 let facts = late.iter().flat_map(|node| last_lines(&self.stage.log(node))).collect();
                 let reason = format!("not up after {} s: {}", READY_MAX.as_secs(), late.join(", "));
@@ -216,7 +216,7 @@ impl Demo {
         }
     }
 
-    /// Has the talkers number their messages for a time, or until the user has had enough; says how long it was.
+    /// Lets the talkers number their messages for a time, or until the user interrupts. Returns the elapsed time.
     async fn measure(&mut self, duration: Duration) -> Result<Duration, CliError> {
         self.tell_peers(PeerCommand::Go).await?;
         let begun = Instant::now();
@@ -241,17 +241,21 @@ impl Demo {
         Ok(())
     }
 
-    /// Takes in what happens until `done`, for at most `limit`.
-    async fn wait_for(&mut self, limit: Duration, done: impl Fn(&Self) -> bool) -> Result<Waited, CliError> {
+    /// Handles events until `done`, for at most `limit`.
+    async fn wait_for(
+        &mut self,
+        limit: Duration,
+        done: impl Fn(&Self) -> bool,
+    ) -> Result<WaitOutcome, CliError> {
         let deadline = Instant::now() + limit;
         while !done(self) {
             tokio::select! {
                 event = self.processes.next() => self.handle(event)?,
-                () = self.interruption.wait() => return Ok(Waited::Interrupted),
-                () = sleep_until(deadline) => return Ok(Waited::InVain),
+                () = self.interruption.wait() => return Ok(WaitOutcome::Interrupted),
+                () = sleep_until(deadline) => return Ok(WaitOutcome::InVain),
             }
         }
-        Ok(Waited::Happened)
+        Ok(WaitOutcome::Happened)
     }
 
     fn handle(&mut self, event: ChildEvent) -> Result<(), CliError> {
@@ -273,7 +277,7 @@ impl Demo {
         }
     }
 
-    fn handle_peer(&mut self, who: Who, event: PeerEvent) -> Result<(), CliError> {
+    fn handle_peer(&mut self, who: ProcessName, event: PeerEvent) -> Result<(), CliError> {
         let topic = match &event {
             PeerEvent::Matched { topic, .. }
             | PeerEvent::Arrived { topic }
@@ -291,7 +295,7 @@ impl Demo {
         Ok(())
     }
 
-    /// The names that are shown are those that the nodes use.
+    /// Checks that the nodes use the names that the demo shows.
     async fn check_names(&self) -> Result<(), CliError> {
         for role in Role::ALL {
             let Ok(status) = self.status_of(role.name()).await else { continue };
@@ -308,9 +312,9 @@ impl Demo {
         Ok(())
     }
 
-    /// Why nothing came through, as far as the nodes can tell.
-    async fn no_path(&self, waited: Waited) -> CliError {
-        if waited == Waited::Interrupted {
+    /// Explains why no message arrived, as far as the nodes know.
+    async fn no_path(&self, waited: WaitOutcome) -> CliError {
+        if waited == WaitOutcome::Interrupted {
             return interrupted();
         }
         let missing: Vec<_> = self.flows.iter().filter(|f| !f.is_up()).map(|f| f.topic.ros_name()).collect();
@@ -339,18 +343,18 @@ impl Demo {
     fn status_of(&self, node: &str) -> impl Future<Output = Result<status::Status, CliError>> + use<> {
         let socket = self.stage.socket(node);
         async move {
-            tokio::task::spawn_blocking(move || status::of_node_at(&socket)).await.unwrap_or_else(|error| {
+            tokio::task::spawn_blocking(move || status::query_node(&socket)).await.unwrap_or_else(|error| {
                 Err(CliError::System { what: "cannot ask a node", source: std::io::Error::other(error) })
             })
         }
     }
 
-    /// Ends all processes: those that talk before those that carry, so that each can say goodbye.
+    /// Ends all processes: peers before nodes, so that each can leave the network cleanly.
     async fn take_down(&mut self) {
         let mut failures = Vec::new();
-        let [robot, operator] = Role::ALL.map(|role| Who(role.name()));
+        let [robot, operator] = Role::ALL.map(|role| ProcessName(role.name()));
         for group in [&PEERS[..], &[robot, operator], &[ROUTER]] {
-            // Those that do not end in time are killed below.
+            // Processes that do not end in time are killed below.
             let _ = timeout(END_MAX, self.processes.end(group, &mut failures)).await;
         }
         self.processes.kill().await;
@@ -398,7 +402,7 @@ fn interrupted() -> CliError {
     CliError::Demo { reason: "interrupted before anything was counted".into(), facts: Vec::new() }
 }
 
-fn strange(who: Who, line: &str) -> CliError {
+fn strange(who: ProcessName, line: &str) -> CliError {
     const SHOWN: usize = 200;
     let line: String = line.chars().take(SHOWN).collect();
     CliError::Demo { reason: format!("{} printed what was not expected: {line}", who.0), facts: Vec::new() }

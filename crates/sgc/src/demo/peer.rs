@@ -1,9 +1,7 @@
-//! A talker and listener of the demo: a plain DDS participant in one domain, as a ROS 2 program would be, that knows
-//! nothing of `sgc`.
+//! Talker and listener of the demo: a plain DDS participant in one domain that does not know `sgc`, like a ROS 2 program.
 //!
-//! It runs in a process of its own and obeys the demo over standard input; when that ends, so does it. Messages flow
-//! from the moment somebody listens; they are numbered, and count, between [`PeerCommand::Go`] and
-//! [`PeerCommand::Stop`] only.
+//! It runs in a process of its own, takes commands over standard input, and ends when that ends. Messages flow as soon as
+//! a listener is there. They are numbered and counted only between [`PeerCommand::Go`] and [`PeerCommand::Stop`].
 
 use std::io::{BufRead, Write};
 use std::process;
@@ -24,13 +22,13 @@ use super::tracker::Tracker;
 use crate::error::{CliError, EXIT_FAILURE};
 use crate::run;
 
-/// How often it tells how far it is.
+/// The period of its reports.
 const REPORT_PERIOD: Duration = Duration::from_millis(200);
 
 /// A talker and listener of `sgc demo`.
 #[derive(Debug, Args)]
 pub(crate) struct PeerArgs {
-    /// Which end
+    /// Role of this end
     #[arg(long)]
     role: Role,
     /// ROS domain
@@ -56,11 +54,11 @@ fn run_peer(args: &PeerArgs, events: &Events) -> Result<(), RosError> {
         ..DdsConfig::default()
     })?;
     let mut listeners = Vec::new();
-    for topic in Topic::of(args.role.other()) {
+    for topic in Topic::owned_by(args.role.other()) {
         listeners.push(Listener::start(&network, topic, events)?);
     }
     let (mut orders, mut talkers) = (Vec::new(), Vec::new());
-    for topic in Topic::of(args.role) {
+    for topic in Topic::owned_by(args.role) {
         let (order, taken) = channel();
         let talker =
             Talker { topic, writer: network.create_writer(&topic.writer())?, events: events.clone() };
@@ -69,8 +67,8 @@ fn run_peer(args: &PeerArgs, events: &Events) -> Result<(), RosError> {
     }
     obey(&orders);
 
-    // Standard input has ended. What follows leaves the network in good order, but the parent may be dead: it must
-    // not take for ever.
+    // Standard input has ended. The steps below leave the network in good order. They must not take for ever, because
+    // the parent may be dead.
     thread::spawn(run::exit_after_grace);
     drop(orders);
     for talker in talkers {
@@ -87,7 +85,7 @@ fn obey(orders: &[Sender<PeerCommand>]) {
         match serde_json::from_str::<PeerCommand>(&line) {
             Ok(command) => {
                 for order in orders {
-                    // A talker that is gone has said so itself.
+                    // A talker that is gone has reported its failure itself.
                     let _ = order.send(command);
                 }
             }
@@ -96,7 +94,7 @@ fn obey(orders: &[Sender<PeerCommand>]) {
     }
 }
 
-/// Tells the demo what happens.
+/// Reports events to the demo.
 #[derive(Clone, Default)]
 struct Events(Arc<Mutex<()>>);
 
@@ -107,7 +105,7 @@ impl Events {
         let _whole_lines = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let mut out = std::io::stdout().lock();
         if out.write_all(&line).and_then(|()| out.flush()).is_err() {
-            // Nobody is left to work for.
+            // The demo is gone, so there is nothing left to do.
             process::exit(EXIT_FAILURE.into());
         }
     }
@@ -126,7 +124,7 @@ impl<W: RosWriter> Talker<W> {
         let mut next = Instant::now();
         let mut reported = Instant::now();
         let mut readers = 0;
-        // Messages sent since `Go`; none before it and after `Stop`.
+        // Number of messages sent since `Go`; `None` before it and after `Stop`.
         let mut sent: Option<u64> = None;
         loop {
             match orders.recv_timeout(next.saturating_duration_since(Instant::now())) {
@@ -171,10 +169,10 @@ impl<W: RosWriter> Talker<W> {
     }
 }
 
-/// Subscribes to one topic, and tells how far it is.
+/// Subscribes to one topic and reports its progress.
 struct Listener<R> {
     _reader: R,
-    /// Its end is the end of the reporting thread.
+    /// Ends the reporting thread when it is dropped.
     _end: Sender<()>,
 }
 
@@ -214,7 +212,7 @@ impl<R> Listener<R> {
     }
 }
 
-/// The clock that all processes of this host share.
+/// Reads the clock that all processes of this host share.
 fn monotonic_ns() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64

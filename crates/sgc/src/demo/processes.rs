@@ -1,8 +1,8 @@
-//! The demo's processes: started from this very program, watched, and ended whatever happens.
+//! The demo's child processes: runs of this same program, watched and always ended.
 //!
-//! Each child reads a pipe whose other end is held here alone: when this process ends, in whatever way, the pipe
-//! closes and the child ends itself. Children are in process groups of their own, so that a Ctrl-C reaches this
-//! process only, which ends them in order.
+//! Each child reads a pipe whose other end only this process holds. When this process ends, however it does, the pipe closes
+//! and the child ends itself. Children are in process groups of their own, so a Ctrl-C reaches only this process, which
+//! ends them in order.
 
 use std::fs::{self, File};
 use std::io;
@@ -17,7 +17,7 @@ use tokio::task::JoinHandle;
 
 use crate::error::CliError;
 
-/// Variables that would change which network the children join.
+/// Environment variables that would change the network that children join.
 pub(crate) const ROS_VARIABLES: [&str; 5] = [
     "ROS_DOMAIN_ID",
     "ROS_LOCALHOST_ONLY",
@@ -25,27 +25,27 @@ pub(crate) const ROS_VARIABLES: [&str; 5] = [
     "ROS_STATIC_PEERS",
     "CYCLONEDDS_URI",
 ];
-/// Events of children that wait to be read.
+/// Most events of children in the queue.
 const EVENTS_MAX: usize = 1024;
-/// Lines at the end of a log that are shown when something went wrong.
+/// Number of lines at the end of a log that are shown after a failure.
 const LOG_LINES_SHOWN: usize = 5;
 
-/// Which process.
+/// The name of a child process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Who(pub(crate) &'static str);
+pub(crate) struct ProcessName(pub(crate) &'static str);
 
-/// What a child did.
+/// An event of a child.
 #[derive(Debug)]
 pub(crate) enum ChildEvent {
-    /// It printed a line.
-    Line(Who, String),
-    /// It ended.
-    Ended(Who, io::Result<ExitStatus>),
+    /// The child printed a line.
+    Line(ProcessName, String),
+    /// The child ended.
+    Ended(ProcessName, io::Result<ExitStatus>),
 }
 
 impl ChildEvent {
-    /// How a child ended, if not well.
-    fn failure(self) -> Option<(Who, String)> {
+    /// Returns the child and its failure, if it ended badly.
+    fn failure(self) -> Option<(ProcessName, String)> {
         match self {
             Self::Ended(_, Ok(status)) if status.success() => None,
             Self::Ended(who, Ok(status)) => Some((who, status.to_string())),
@@ -57,27 +57,27 @@ impl ChildEvent {
 
 /// All children of a demo. Dropping it ends them.
 pub(crate) struct Processes {
-    children: Vec<Running>,
+    children: Vec<ChildProcess>,
     events: mpsc::Sender<ChildEvent>,
     inbox: mpsc::Receiver<ChildEvent>,
 }
 
-struct Running {
-    who: Who,
+struct ChildProcess {
+    who: ProcessName,
     stdin: Option<ChildStdin>,
     kill: Option<oneshot::Sender<()>>,
     watcher: JoinHandle<()>,
 }
 
 impl Processes {
-    /// None yet.
+    /// Returns an empty set of children.
     pub(crate) fn new() -> Self {
         let (events, inbox) = mpsc::channel(EVENTS_MAX);
         Self { children: Vec::new(), events, inbox }
     }
 
-    /// Starts `sgc` with these arguments, its standard error going to a file.
-    pub(crate) fn start(&mut self, who: Who, args: &[&str], log: &Path) -> Result<(), CliError> {
+    /// Starts `sgc` with these arguments. Its standard error goes to a file.
+    pub(crate) fn start(&mut self, who: ProcessName, args: &[&str], log: &Path) -> Result<(), CliError> {
         let failed = |source| CliError::System { what: "cannot start a process of the demo", source };
         let log = File::create(log).map_err(|source| CliError::Write { path: log.to_owned(), source })?;
         let mut command = Command::new(std::env::current_exe().map_err(failed)?);
@@ -95,12 +95,12 @@ impl Processes {
         let stdin = child.stdin.take();
         let (kill, killed) = oneshot::channel();
         let watcher = tokio::spawn(watch(who, child, self.events.clone(), killed));
-        self.children.push(Running { who, stdin, kill: Some(kill), watcher });
+        self.children.push(ChildProcess { who, stdin, kill: Some(kill), watcher });
         Ok(())
     }
 
     /// Sends a child a line of JSON.
-    pub(crate) async fn tell(&mut self, who: Who, message: &impl Serialize) -> Result<(), CliError> {
+    pub(crate) async fn tell(&mut self, who: ProcessName, message: &impl Serialize) -> Result<(), CliError> {
         let failed = |source| CliError::System { what: "cannot speak to a process of the demo", source };
         let mut line = serde_json::to_vec(message).map_err(|e| failed(e.into()))?;
         line.push(b'\n');
@@ -111,28 +111,28 @@ impl Processes {
         }
     }
 
-    /// The next thing that a child does. Cancelling loses nothing.
+    /// Returns the next event of a child. Cancel safe.
     pub(crate) async fn next(&mut self) -> ChildEvent {
-        // Never `None`: a sender is held here.
+        // Never `None`, because `self` holds a sender.
         match self.inbox.recv().await {
             Some(event) => event,
             None => std::future::pending().await,
         }
     }
 
-    /// Asks these to end, by closing their standard input, and waits until they have; to be bounded by the caller.
-    /// Those that ended badly go to `failures`.
-    pub(crate) async fn end(&mut self, those: &[Who], failures: &mut Vec<(Who, String)>) {
+    /// Asks these children to end by closing their standard input, and waits until they have. The caller bounds the wait.
+    /// Appends children that ended badly to `failures`.
+    pub(crate) async fn end(&mut self, those: &[ProcessName], failures: &mut Vec<(ProcessName, String)>) {
         for child in self.children.iter_mut().filter(|c| those.contains(&c.who)) {
             child.stdin = None;
         }
         for child in self.children.iter_mut().filter(|c| those.contains(&c.who)) {
-            // One that is through must not be waited for again.
+            // A finished watcher must not be polled again.
             while !child.watcher.is_finished() {
                 tokio::select! {
                     // A watcher that panicked has dropped its child, which kills it.
                     _ = &mut child.watcher => break,
-                    // Last words are read as they come, for the channel is bounded.
+                    // Events are taken meanwhile, because the channel is bounded.
                     Some(event) = self.inbox.recv() => failures.extend(event.failure()),
                 }
             }
@@ -143,18 +143,23 @@ impl Processes {
         self.children.retain(|c| !those.contains(&c.who));
     }
 
-    /// Kills what is left.
+    /// Kills the remaining children.
     pub(crate) async fn kill(&mut self) {
         for child in &mut self.children {
             child.kill = None;
         }
-        let left: Vec<Who> = self.children.iter().map(|c| c.who).collect();
+        let left: Vec<ProcessName> = self.children.iter().map(|c| c.who).collect();
         self.end(&left, &mut Vec::new()).await;
     }
 }
 
-/// Waits for a child and passes on what it prints. When the other end of `killed` is gone, so is the child.
-async fn watch(who: Who, mut child: Child, events: mpsc::Sender<ChildEvent>, killed: oneshot::Receiver<()>) {
+/// Waits for a child and passes on its lines. Kills the child when the other end of `killed` is dropped.
+async fn watch(
+    who: ProcessName,
+    mut child: Child,
+    events: mpsc::Sender<ChildEvent>,
+    killed: oneshot::Receiver<()>,
+) {
     let lines = child.stdout.take().map(|out| BufReader::new(out).lines());
     let printed = async {
         let Some(mut lines) = lines else { return };
@@ -163,7 +168,7 @@ async fn watch(who: Who, mut child: Child, events: mpsc::Sender<ChildEvent>, kil
         }
     };
     let status = tokio::select! {
-        // Reading ends with the child; what it has printed comes before its end.
+        // Reading ends with the child, so its lines come before its end.
         status = async { printed.await; child.wait().await } => status,
         _ = killed => match child.start_kill() {
             Ok(()) => child.wait().await,
@@ -173,7 +178,7 @@ async fn watch(who: Who, mut child: Child, events: mpsc::Sender<ChildEvent>, kil
     let _ = events.send(ChildEvent::Ended(who, status)).await;
 }
 
-/// The last lines of a log, if there are any.
+/// Returns the last lines of a log, if it has any.
 pub(crate) fn last_lines(log: &Path) -> Vec<String> {
     let Ok(bytes) = fs::read(log) else { return Vec::new() };
     let text = String::from_utf8_lossy(&bytes);

@@ -1,60 +1,60 @@
-//! What the demo and its talkers and listeners say to each other: lines of JSON over standard input and output.
+//! The protocol between the demo and its peers: lines of JSON over standard input and output.
 
 use serde::{Deserialize, Serialize};
 
 use super::topics::Topic;
 use super::tracker::Counts;
 
-/// From the demo to a peer.
+/// A command of the demo to a peer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "do", rename_all = "snake_case")]
 pub(crate) enum PeerCommand {
     /// Number the messages from 1.
     Go,
-    /// Number them no longer, and say how many there were.
+    /// Stop numbering and report the total.
     Stop,
 }
 
-/// From a peer to the demo.
+/// An event that a peer reports to the demo.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "is", rename_all = "snake_case")]
 pub(crate) enum PeerEvent {
     /// A talker's number of subscribers on its network has changed.
     Matched {
-        /// Whose.
+        /// The talker's topic.
         topic: Topic,
-        /// How many there are.
+        /// The number of matched readers.
         readers: u32,
     },
     /// A listener has received its first message.
     Arrived {
-        /// Of which topic.
+        /// The listener's topic.
         topic: Topic,
     },
-    /// How far a talker is.
+    /// The progress of a talker.
     Sending {
-        /// Which.
+        /// The talker's topic.
         topic: Topic,
         /// Messages sent.
         sent: u64,
     },
     /// A talker has stopped numbering.
     Sent {
-        /// Which.
+        /// The talker's topic.
         topic: Topic,
         /// Messages sent in all.
         total: u64,
     },
-    /// How far a listener is.
+    /// The progress of a listener.
     Receiving {
-        /// Of which topic.
+        /// The listener's topic.
         topic: Topic,
-        /// What it has.
+        /// The listener's counts.
         counts: Counts,
     },
     /// A peer cannot go on.
     Failed {
-        /// Why.
+        /// The cause.
         reason: String,
     },
 }
@@ -64,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn events_survive_the_line() {
+    fn events_survive_encoding() {
         let events = [
             PeerEvent::Matched { topic: Topic::Image, readers: 2 },
             PeerEvent::Receiving { topic: Topic::CmdVel, counts: Counts::default() },

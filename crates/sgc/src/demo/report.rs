@@ -1,4 +1,4 @@
-//! What came of each topic: the document of `--json`, and the verdict that the exit code follows.
+//! The result of each topic: the document of `--json`, and the verdict that decides the exit code.
 
 use serde::Serialize;
 use sgc_wire::Name;
@@ -7,25 +7,25 @@ use super::protocol::PeerEvent;
 use super::topics::Topic;
 use super::tracker::Counts;
 
-/// One topic on its way, as far as the demo has been told.
+/// The progress of one topic, by the last reports of its peers.
 #[derive(Debug)]
 pub(crate) struct Flow {
     pub(crate) topic: Topic,
     pub(crate) name: Name,
-    /// Its talker has a subscriber on its own network: its owner's node.
+    /// The talker has a subscriber on its own network: the owner's node.
     pub(crate) matched: bool,
-    /// Its listener has received something.
+    /// The listener has received a message.
     pub(crate) arrived: bool,
-    /// Messages sent, as last told.
+    /// Messages sent, by the last report.
     pub(crate) sent: u64,
     /// `sent` is final.
     pub(crate) stopped: bool,
-    /// What its listener has.
+    /// The listener's counts.
     pub(crate) counts: Counts,
 }
 
 impl Flow {
-    /// Nothing has happened yet.
+    /// Returns a flow without any progress.
     pub(crate) fn new(topic: Topic, name: Name) -> Self {
         Self {
             topic,
@@ -38,7 +38,7 @@ impl Flow {
         }
     }
 
-    /// Takes in what its talker or listener says.
+    /// Handles an event of the talker or listener.
     pub(crate) fn handle(&mut self, event: &PeerEvent) {
         match event {
             PeerEvent::Matched { readers, .. } => self.matched = *readers > 0,
@@ -50,22 +50,22 @@ impl Flow {
         }
     }
 
-    /// Something has come all the way.
+    /// Returns `true` once a message has arrived.
     pub(crate) fn is_up(&self) -> bool {
         self.matched && self.arrived
     }
 
-    /// All that was sent has come, and what followed it as well, so that nothing of it is still under way.
+    /// Returns `true` once all numbered messages and a later one have arrived, so that none is in flight.
     pub(crate) fn is_complete(&self) -> bool {
         self.stopped && self.counts.ended && self.counts.received >= self.sent
     }
 
-    /// Messages that have not come, of those sent; while it runs, of those that a later one has overtaken.
+    /// Returns the number of missing messages: of all sent ones at the end, of those overtaken by a later one before.
     pub(crate) fn lost(&self) -> u64 {
         if self.stopped { self.sent.saturating_sub(self.counts.received) } else { self.counts.missing }
     }
 
-    /// What is wrong, if anything is.
+    /// Returns the fault of the flow, if it has one.
     pub(crate) fn fault(&self) -> Option<String> {
         let Counts { received, duplicated, corrupt, damage, .. } = &self.counts;
         let mut faults = Vec::new();
@@ -88,12 +88,12 @@ impl Flow {
 /// The document of `--json`.
 #[derive(Debug, Serialize)]
 pub(crate) struct Report {
-    /// How long messages were counted.
+    /// Duration of the count.
     seconds: f64,
     topics: Vec<TopicReport>,
-    /// Everything that was sent has been received, once and unaltered, and something was.
+    /// Messages were sent, and each was received once and unaltered.
     ok: bool,
-    /// Why nothing could be measured.
+    /// The reason why nothing could be measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<String>,
 }
@@ -119,7 +119,7 @@ struct LatencyReport {
 }
 
 impl Report {
-    /// Of a demo that ran.
+    /// Returns the report of a demo that ran.
     pub(crate) fn new(seconds: f64, flows: &[Flow]) -> Self {
         Self {
             seconds: (seconds * 1000.0).round() / 1000.0,
@@ -129,12 +129,12 @@ impl Report {
         }
     }
 
-    /// Of one that did not.
+    /// Returns the report of a demo that failed.
     pub(crate) fn failed(error: String) -> Self {
         Self { seconds: 0.0, topics: Vec::new(), ok: false, error: Some(error) }
     }
 
-    /// The verdict.
+    /// Returns the verdict.
     pub(crate) fn is_ok(&self) -> bool {
         self.ok
     }
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn the_document_has_the_shape_of_the_manual() {
+    fn json_report_has_documented_shape() {
         let counts = Counts { received: 99, p50_us: 1200, p99_us: 3400, ended: true, ..Counts::default() };
         let report = Report::new(10.000_04, &[flow(100, counts)]);
         let name = "ab".repeat(32);
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn anything_but_all_of_it_once_and_whole_is_a_fault() {
+    fn loss_repetition_and_damage_are_faults() {
         let good = Counts { received: 5, ended: true, ..Counts::default() };
         assert_eq!(flow(5, good.clone()).fault(), None);
         for (sent, counts, fault) in [

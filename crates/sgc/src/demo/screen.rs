@@ -1,7 +1,6 @@
-//! What a person sees of the demo: an introduction, a table that is redrawn while it runs, and a summary.
+//! The demo's display: an introduction, a table that is redrawn while the demo runs, and a summary.
 //!
-//! On a terminal the table stays in its place; elsewhere it is printed anew every two seconds; with `--json` there is
-//! none.
+//! On a terminal the table stays in its place. Elsewhere it is printed again every two seconds. With `--json` there is none.
 
 use std::io::IsTerminal;
 use std::time::Duration;
@@ -13,17 +12,17 @@ use crate::output;
 
 const REDRAW_PERIOD: Duration = Duration::from_secs(1);
 const REPRINT_PERIOD: Duration = Duration::from_secs(2);
-/// Lines that are too long for the terminal are cut, not wrapped: the table must keep its height.
+/// Switches wrapping off, so that long lines are cut and the table keeps its height.
 const WRAP_OFF: &str = "\x1b[?7l";
 const WRAP_ON: &str = "\x1b[?7h";
 const CLEAR_LINE: &str = "\x1b[2K";
 
-/// Where the demo is shown.
+/// The output of the demo.
 pub(crate) struct Screen {
     kind: Kind,
-    /// Lines of the table that stand on the terminal.
+    /// Number of table lines on the terminal.
     drawn: usize,
-    /// What each topic had received when it was last shown.
+    /// Messages that each topic had received at the last display.
     before: Vec<(Topic, u64)>,
     before_at: Duration,
 }
@@ -36,7 +35,7 @@ enum Kind {
 }
 
 impl Screen {
-    /// Chooses by what standard output is.
+    /// Chooses the kind of display by the type of standard output.
     pub(crate) fn new(json: bool) -> Self {
         let kind = match json {
             true => Kind::Nothing,
@@ -46,12 +45,12 @@ impl Screen {
         Self { kind, drawn: 0, before: Vec::new(), before_at: Duration::ZERO }
     }
 
-    /// How often the table is to be shown.
+    /// Returns the period of the table.
     pub(crate) fn period(&self) -> Duration {
         if self.kind == Kind::Terminal { REDRAW_PERIOD } else { REPRINT_PERIOD }
     }
 
-    /// What the demo is, and how to join it.
+    /// Prints the introduction, which says how to join the demo's networks.
     pub(crate) fn introduce(&self, robot_domain: u32, operator_domain: u32) -> Result<(), CliError> {
         self.say(&format!(
             "Two ROS 2 networks that cannot see each other, and three sgc processes that join them:\n\n  \
@@ -60,7 +59,7 @@ impl Screen {
              If you have ROS 2, join from another terminal (`--seconds 600` leaves more time):\n"
         ))?;
         for (domain, receives) in [(operator_domain, Role::Robot), (robot_domain, Role::Operator)] {
-            for topic in Topic::of(receives).filter(|topic| *topic != Topic::Image) {
+            for topic in Topic::owned_by(receives).filter(|topic| *topic != Topic::Image) {
                 let echo = format!("ros2 topic echo {}", topic.ros_name());
                 self.say(&format!(
                     "  ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST {echo}"
@@ -72,12 +71,12 @@ impl Screen {
         ))
     }
 
-    /// A line between introduction and table.
+    /// Prints a line between introduction and table.
     pub(crate) fn say(&self, text: &str) -> Result<(), CliError> {
         if self.kind == Kind::Nothing { Ok(()) } else { output::line(text) }
     }
 
-    /// Shows the table of a demo that runs.
+    /// Shows the table while the demo runs.
     pub(crate) fn show(&mut self, elapsed: Duration, flows: &[Flow]) -> Result<(), CliError> {
         let rates = self.rates(elapsed, flows);
         let lines = table(flows, &rates);
@@ -102,7 +101,7 @@ impl Screen {
         }
     }
 
-    /// The last table, and the verdict.
+    /// Prints the last table and the verdict.
     pub(crate) fn sum_up(&mut self, elapsed: Duration, flows: &[Flow]) -> Result<(), CliError> {
         if self.kind == Kind::Nothing {
             return Ok(());
@@ -110,7 +109,7 @@ impl Screen {
         let seconds = elapsed.as_secs_f64();
         let rates: Vec<f64> = flows.iter().map(|f| f.counts.received as f64 / seconds.max(0.001)).collect();
         if self.kind == Kind::Terminal && self.drawn > 0 {
-            // In place of the last one.
+            // Moves the cursor up, so that the new table replaces the last one.
             output::raw(&format!("\x1b[{}A\x1b[J", self.drawn))?;
         }
         output::line(format!("In {seconds:.1} s:\n"))?;
@@ -124,7 +123,7 @@ impl Screen {
         }
     }
 
-    /// Messages per second since the last time.
+    /// Returns the messages per second since the last display.
     fn rates(&mut self, elapsed: Duration, flows: &[Flow]) -> Vec<f64> {
         let seconds = elapsed.saturating_sub(self.before_at).as_secs_f64().max(0.001);
         let rate = |flow: &Flow| {
@@ -138,7 +137,7 @@ impl Screen {
     }
 }
 
-/// Two lines for each topic: what came of it, and its name.
+/// Formats two lines for each topic: its figures and its name.
 fn table(flows: &[Flow], rates: &[f64]) -> Vec<String> {
     let head = ["topic", "messages", "rate", "p50", "p99", "lost", "duplicated", "altered"];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
@@ -172,7 +171,7 @@ mod tests {
     use crate::demo::tracker::Counts;
 
     #[test]
-    fn the_table_fits_a_terminal_and_names_every_topic() {
+    fn table_fits_terminal_and_names_every_topic() {
         let flows = Topic::ALL.map(|topic| Flow {
             counts: Counts { received: 12_345, p50_us: 1234, p99_us: 123_456, ..Counts::default() },
             ..Flow::new(topic, Name([7; 32]))
@@ -185,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn rates_are_of_the_last_interval() {
+    fn rates_cover_last_interval() {
         let mut screen = Screen { kind: Kind::Nothing, ..Screen::new(true) };
         let mut flows = [Flow::new(Topic::Chatter, Name([7; 32]))];
         flows[0].counts.received = 10;

@@ -1,6 +1,6 @@
-//! The demo's files: a fleet minted for it, an identity and a configuration for each of three nodes, and their logs.
+//! The demo's files: a new fleet, an identity and a configuration for each of three nodes, and their logs.
 //!
-//! The configurations are what a user would write; nothing in them is of a kind that only the demo has.
+//! The configurations are as a user would write them and use no key that only the demo has.
 
 use std::fs;
 use std::io;
@@ -21,7 +21,7 @@ use crate::{fleet, name};
 pub(crate) const CLOUD: &str = "cloud";
 const FLEET: &str = "demo";
 
-/// The directory of one demo, and what was minted for it.
+/// The directory of one demo, with its fleet and identities.
 #[derive(Debug)]
 pub(crate) struct Stage {
     dir: PathBuf,
@@ -91,20 +91,20 @@ impl Stage {
              [ros]\ndomain_id = {domain}\ndiscovery_range = \"localhost\"\nstatic_peers = []\n\n\
              [admin]\nsocket = \"{node}.sock\"\n"
         );
-        for topic in Topic::of(role) {
+        for topic in Topic::owned_by(role) {
             text += &format!(
                 "\n[[share]]\ntopic = \"{}\"\nto = [\"{far}\"]\npriority = \"{}\"\n",
                 topic.ros_name(),
                 topic.priority()
             );
         }
-        for topic in Topic::of(role.other()) {
+        for topic in Topic::owned_by(role.other()) {
             text += &format!("\n[[use]]\nfrom = \"{far}\"\ntopic = \"{}\"\n", topic.ros_name());
         }
         self.write(node, &text)
     }
 
-    /// Takes the secrets off the disk, if they are not to be kept: a running node has read them.
+    /// Removes the secrets from disk unless they are kept. Running nodes have read them already.
     pub(crate) fn forget_secrets(&self) -> Result<(), CliError> {
         if self.is_kept() {
             return Ok(());
@@ -116,7 +116,7 @@ impl Stage {
         Ok(())
     }
 
-    /// The name of a topic, derived as its owner does.
+    /// Derives the name of a topic as its owner does.
     pub(crate) fn name_of(&self, topic: Topic) -> Result<Name, CliError> {
         let owner: NodeName = topic.owner().name().parse()?;
         let share = ShareConfig {
@@ -136,22 +136,22 @@ impl Stage {
         name::name_of(&self.robot, &self.dir, &owner, &share)
     }
 
-    /// Where a node's status socket is.
+    /// Returns the path of a node's status socket.
     pub(crate) fn socket(&self, node: &str) -> PathBuf {
         self.dir.join(format!("{node}.sock"))
     }
 
-    /// Where a process logs to.
+    /// Returns the path of a process's log.
     pub(crate) fn log(&self, process: &str) -> PathBuf {
         self.dir.join(format!("{process}.log"))
     }
 
-    /// The directory.
+    /// Returns the directory.
     pub(crate) fn dir(&self) -> &Path {
         &self.dir
     }
 
-    /// True if the user asked for the files.
+    /// Returns `true` if the user asked to keep the files.
     pub(crate) fn is_kept(&self) -> bool {
         self.temporary.is_none()
     }
@@ -200,7 +200,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_configurations_are_valid_and_say_what_the_table_says() {
+    fn configurations_are_valid_and_match_topic_table() {
         let stage = Stage::set(None).unwrap();
         let environment = |_: &str| None;
         let cloud = stage.write_cloud("quic://127.0.0.1:0").unwrap();
@@ -212,15 +212,15 @@ mod tests {
             let config = sgc_node::config::load(&path, &environment).unwrap();
             sgc_node::check_identity(&config).unwrap();
             assert_eq!(config.admin_socket, Some(stage.socket(role.name())));
-            assert_eq!(config.shares.len(), Topic::of(role).count());
-            assert_eq!(config.uses.len(), Topic::of(role.other()).count());
+            assert_eq!(config.shares.len(), Topic::owned_by(role).count());
+            assert_eq!(config.uses.len(), Topic::owned_by(role.other()).count());
         }
         stage.forget_secrets().unwrap();
         assert!(files::with_extension(stage.dir(), "identity").unwrap().is_empty());
     }
 
     #[test]
-    fn the_directory_goes_with_the_stage_unless_it_is_kept() {
+    fn directory_is_removed_with_stage_unless_kept() {
         let stage = Stage::set(None).unwrap();
         let dir = stage.dir().to_owned();
         assert!(dir.join("robot.identity").is_file());

@@ -1,6 +1,6 @@
-//! What the demo carries: three topics between two roles, as a table.
+//! The demo's topics: three topics between two roles, as a table.
 //!
-//! What the messages contain is in `messages`.
+//! The module `messages` defines their content.
 
 use std::time::Duration;
 
@@ -24,10 +24,10 @@ pub(crate) enum Role {
 }
 
 impl Role {
-    /// Both.
+    /// Both roles.
     pub(crate) const ALL: [Self; 2] = [Self::Robot, Self::Operator];
 
-    /// Also the name of its node.
+    /// Returns the role's name, which is also that of its node.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Robot => "robot",
@@ -35,7 +35,7 @@ impl Role {
         }
     }
 
-    /// The far end.
+    /// Returns the role of the other end.
     pub(crate) fn other(self) -> Self {
         match self {
             Self::Robot => Self::Operator,
@@ -57,15 +57,15 @@ pub(crate) enum Topic {
 }
 
 impl Topic {
-    /// All, in the order in which they are shown.
+    /// All topics, in the order of display.
     pub(crate) const ALL: [Self; 3] = [Self::Chatter, Self::Image, Self::CmdVel];
 
-    /// Those that a role owns and publishes.
-    pub(crate) fn of(owner: Role) -> impl Iterator<Item = Self> {
+    /// Returns the topics that a role owns and publishes.
+    pub(crate) fn owned_by(owner: Role) -> impl Iterator<Item = Self> {
         Self::ALL.into_iter().filter(move |topic| topic.owner() == owner)
     }
 
-    /// Its ROS name.
+    /// Returns the ROS name.
     pub(crate) fn ros_name(self) -> &'static str {
         match self {
             Self::Chatter => "/chatter",
@@ -74,7 +74,7 @@ impl Topic {
         }
     }
 
-    /// Its ROS type.
+    /// Returns the ROS type.
     pub(crate) fn type_name(self) -> &'static str {
         match self {
             Self::Chatter => "std_msgs/msg/String",
@@ -83,7 +83,7 @@ impl Topic {
         }
     }
 
-    /// Who owns and publishes it.
+    /// Returns the role that owns and publishes the topic.
     pub(crate) fn owner(self) -> Role {
         match self {
             Self::Chatter | Self::Image => Role::Robot,
@@ -91,7 +91,7 @@ impl Topic {
         }
     }
 
-    /// `priority` of its share.
+    /// Returns `priority` of the share.
     pub(crate) fn priority(self) -> &'static str {
         match self {
             Self::Chatter => "default",
@@ -100,7 +100,7 @@ impl Topic {
         }
     }
 
-    /// Time between two messages.
+    /// Returns the time between two messages.
     pub(crate) fn period(self) -> Duration {
         match self {
             Self::Chatter | Self::Image => Duration::from_millis(100),
@@ -108,7 +108,7 @@ impl Topic {
         }
     }
 
-    /// Its publisher on the local network, with ROS's default QoS: reliable, volatile, the last 10.
+    /// Returns the publisher on the local network, with ROS's default QoS: reliable, volatile, depth 10.
     pub(crate) fn writer(self) -> EndpointSpec {
         EndpointSpec {
             topic: dds_topic(self.ros_name()),
@@ -120,7 +120,7 @@ impl Topic {
         }
     }
 
-    /// Its subscriber on the local network.
+    /// Returns the subscriber on the local network.
     pub(crate) fn reader(self) -> EndpointSpec {
         let qos = Qos { history: History::KeepLast(LISTENER_DEPTH), ..Qos::default() };
         EndpointSpec { qos, ..self.writer() }

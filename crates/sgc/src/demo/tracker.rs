@@ -1,16 +1,15 @@
-//! What a listener has received of one topic: each number once, some twice, some not, some damaged; and how long
-//! they took.
+//! Counts what a listener receives of one topic: missing, repeated and damaged messages, and their latency.
 //!
-//! Pure: the driver hands in what it has read and when.
+//! Pure: the driver passes in each message and its time.
 
 use hdrhistogram::Histogram;
 use serde::{Deserialize, Serialize};
 
 use super::messages::{Damage, Stamp};
 
-/// Largest number that is counted: two weeks at 50 Hz, 8 MB of bits. A larger one is taken for damage.
+/// Largest sequence number: two weeks at 50 Hz, 8 MB of bits. A larger one counts as damage.
 pub(crate) const SEQ_MAX: u64 = 1 << 26;
-/// Longest latency that is told apart, microseconds.
+/// Longest latency that the histogram resolves, in microseconds.
 const LATENCY_US_MAX: u64 = 60_000_000;
 const LATENCY_DIGITS: u8 = 3;
 
@@ -28,7 +27,7 @@ pub(crate) struct Tracker {
     latency_us: Histogram<u64>,
 }
 
-/// What is told of it.
+/// The counts of one topic, as a peer reports them.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Counts {
     /// Numbers received at least once.
@@ -37,20 +36,20 @@ pub(crate) struct Counts {
     pub(crate) missing: u64,
     /// Messages whose number had been received already.
     pub(crate) duplicated: u64,
-    /// Messages that are not what was sent.
+    /// Damaged messages.
     pub(crate) corrupt: u64,
-    /// What was wrong with the first of them.
+    /// The damage of the first of them.
     pub(crate) damage: Option<String>,
-    /// A message that is not counted came after one that is: the topic's counting is over.
+    /// Set once an uncounted message follows a counted one: the talker has stopped numbering.
     pub(crate) ended: bool,
-    /// Median latency, microseconds.
+    /// Median latency in microseconds.
     pub(crate) p50_us: u64,
-    /// 99th percentile of it.
+    /// 99th percentile of the latency in microseconds.
     pub(crate) p99_us: u64,
 }
 
 impl Tracker {
-    /// Nothing received yet.
+    /// Returns a tracker without messages.
     pub(crate) fn new() -> Self {
         Self {
             seen: Vec::new(),
@@ -66,7 +65,7 @@ impl Tracker {
         }
     }
 
-    /// Takes a message that arrived at `now_ns` on the clock of its stamp.
+    /// Counts a message that arrived at `now_ns` on the clock of its stamp.
     pub(crate) fn handle(&mut self, message: Result<Stamp, Damage>, now_ns: u64) {
         match message {
             Ok(Stamp { seq: 0, .. }) => {
@@ -79,12 +78,12 @@ impl Tracker {
         }
     }
 
-    /// True once anything whole has arrived.
+    /// Returns `true` once an undamaged message has arrived.
     pub(crate) fn is_alive(&self) -> bool {
         self.received + self.uncounted > 0
     }
 
-    /// Everything so far.
+    /// Returns the counts so far.
     pub(crate) fn counts(&self) -> Counts {
         Counts {
             received: self.received,
@@ -132,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn gaps_repeats_and_late_ones_are_counted() {
+    fn gaps_repetitions_and_late_messages_are_counted() {
         let counts = tracked(&[0, 1, 2, 5, 5, 3, 1]);
         assert_eq!((counts.received, counts.missing, counts.duplicated), (4, 1, 2));
         assert!(!counts.ended);
@@ -140,13 +139,13 @@ mod tests {
     }
 
     #[test]
-    fn an_uncounted_message_ends_the_counting_only_after_a_counted_one() {
+    fn uncounted_message_ends_count_only_after_counted_one() {
         assert!(!tracked(&[0, 0]).ended);
         assert!(tracked(&[0, 1, 0]).ended);
     }
 
     #[test]
-    fn damage_is_counted_and_the_first_is_named() {
+    fn damage_is_counted_and_first_is_named() {
         let mut tracker = Tracker::new();
         tracker.handle(Err(Damage::Checksum), 0);
         tracker.handle(Ok(Stamp { seq: SEQ_MAX + 1, sent_ns: 0 }), 0);

@@ -1,6 +1,6 @@
-//! `sgc fleet merge`, and how any command notices that its copy of a fleet's file is not the newest.
+//! `sgc fleet merge`, and the notice of any command that its copy of a fleet file is not the newest.
 //!
-//! `sgc-trust` decides which parts of two copies count; this module finds out that there are two, and says so.
+//! This module detects a second copy and reports it. `sgc-trust` decides which parts of two copies count.
 
 use std::path::{Path, PathBuf};
 
@@ -11,19 +11,19 @@ use sgc_transport::LinkUrl;
 use sgc_trust::{CrlReport, Fleet, MergeReport, NodeName};
 use sgc_wire::{CRL_BYTES_MAX, UnixMillis};
 
-use super::keeping::{LIST_EXTENSION, list_path, tell, write_list};
+use super::keeping::{LIST_EXTENSION, list_path, push_crl, write_list};
 use super::{WhichFleet, fleet_here, unix_now};
 use crate::error::CliError;
 use crate::{files, output};
 
-/// Take over what another copy of the fleet's file knows, or a revocation list.
+/// Merge another copy of the fleet file, or a revocation list, into this one.
 ///
-/// No revocation, enrolment or renewal of either copy is lost. Use one copy from then on.
+/// No revocation, enrolment or renewal of either copy is lost. Use only one copy from then on.
 #[derive(Debug, Args)]
 pub(super) struct MergeArgs {
-    /// The other copy, or a revocation list that was made with it (.crl)
+    /// Other copy of the fleet file, or a revocation list that was made with it (.crl)
     other: PathBuf,
-    /// Tell this router what is revoked, too; repeat for more. Nodes of this user on this machine are told anyway
+    /// Push the revocation list to this router as well; may be repeated. Nodes of this user on this machine always get it
     #[arg(long = "router", value_name = "URL")]
     routers: Vec<LinkUrl>,
     #[command(flatten)]
@@ -64,12 +64,12 @@ pub(super) fn merge(args: &MergeArgs) -> Result<(), CliError> {
     file.save()?;
     let (list_path, list) = write_list(&file, now)?;
     text.push_str(&format!("{}: revocation list {}\n", list_path.display(), file.fleet.crl_number()));
-    let told = tell(&mut file, &list, &args.routers)?;
-    if !told.names.is_empty() {
-        text.push_str(&format!("Told {}: nodes tell it to each other.\n", told.names.join(", ")));
+    let pushed = push_crl(&mut file, &list, &args.routers)?;
+    if !pushed.names.is_empty() {
+        text.push_str(&format!("Pushed to {}: nodes pass it on to each other.\n", pushed.names.join(", ")));
     }
     output::line(text.trim_end())?;
-    told.failed.map_or(Ok(()), Err)
+    pushed.failed.map_or(Ok(()), Err)
 }
 
 fn gained_text(gained: &MergeReport) -> String {
@@ -99,8 +99,8 @@ fn gained_text(gained: &MergeReport) -> String {
     text
 }
 
-/// Looks at the list beside a fleet's file: another copy of the file may have made it. What it revokes is taken over; that
-/// there is another copy is said. Returns `true` if the fleet changed.
+/// Takes over the revocations of the list beside a fleet file. Another copy of the file may have made that list; if so, the
+/// user is told. Returns `true` if the fleet changed.
 pub(super) fn catch_up(fleet: &mut Fleet, file: &Path) -> Result<bool, CliError> {
     let path = list_path(file);
     if !files::exists(&path) {
@@ -111,7 +111,7 @@ pub(super) fn catch_up(fleet: &mut Fleet, file: &Path) -> Result<bool, CliError>
             say_behind(file, &path.display().to_string(), &absorbed);
             Ok(absorbed != CrlReport::default())
         }
-        // A file that is no list of this fleet must not keep anybody from revoking. The next list replaces it.
+        // A file that is no list of this fleet must not prevent a revocation. The next list replaces it.
         Err(error @ (CliError::List { .. } | CliError::Read { .. })) => {
             output::diagnostic(&format!("Note: {error}; it is left out"));
             Ok(false)
@@ -120,7 +120,7 @@ pub(super) fn catch_up(fleet: &mut Fleet, file: &Path) -> Result<bool, CliError>
     }
 }
 
-/// Takes over what a list revokes.
+/// Takes over the revocations of a list.
 fn take_list(fleet: &mut Fleet, path: &Path, now: UnixMillis) -> Result<CrlReport, CliError> {
     let list = files::read_limited(path, CRL_BYTES_MAX as u64)?;
     let anchors = fleet.anchors().with_crl(&list, now);
@@ -129,7 +129,7 @@ fn take_list(fleet: &mut Fleet, path: &Path, now: UnixMillis) -> Result<CrlRepor
     absorbed.map_err(|source| CliError::Fleet { path: path.to_owned(), source })
 }
 
-/// Takes over what the lists revoke that nodes have in force, which is then said. Returns `true` if the fleet changed.
+/// Takes over the revocations of the lists that nodes have in force and reports them. Returns `true` if the fleet changed.
 pub(super) fn take_heard(file: &mut LockedFleet, heard: &[Bytes], now: UnixMillis) -> Result<bool, CliError> {
     let mut anchors = file.fleet.anchors().clone();
     for list in heard {
@@ -157,7 +157,7 @@ fn say_behind(fleet: &Path, list: &str, absorbed: &CrlReport) {
     ));
 }
 
-/// Says that a certificate is none that this copy of the fleet's file made.
+/// Tells the user that another copy of the fleet file made a certificate.
 pub(super) fn say_unknown(fleet: &Path, identity: &Path) {
     let (fleet, identity) = (fleet.display(), identity.display());
     output::diagnostic(&format!(

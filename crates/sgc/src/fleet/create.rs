@@ -1,4 +1,4 @@
-//! `sgc fleet create`, `import`, `set`: fleets as such.
+//! `sgc fleet create`, `import` and `set`: make fleets and change their settings.
 
 use std::path::{Path, PathBuf};
 
@@ -15,59 +15,59 @@ const KEPT: &str = "; a fleet is never overwritten: its nodes would no longer be
 
 /// Make a fleet: a certificate authority and a secret, in the file NAME.fleet.
 ///
-/// Whoever holds the file can make nodes of the fleet. It is needed to enrol, renew and revoke nodes, not to run them:
-/// keep it off them, and keep a copy.
+/// Anybody who holds the file can make nodes of the fleet. The file is needed to enrol, renew and revoke nodes, not to run
+/// them: keep it off the nodes, and keep a copy.
 #[derive(Debug, Args)]
 pub(super) struct CreateArgs {
     /// Name of the fleet: a-z, 0-9, '-', '_' and '.'
     name: String,
-    /// Where to write the file
+    /// Directory for the file
     #[arg(long, value_name = "DIR", default_value = ".")]
     dir: PathBuf,
     #[command(flatten)]
     traits: Traits,
 }
 
-/// Make a fleet around a CA that exists already.
+/// Make a fleet around an existing CA.
 ///
-/// The CA stays what it was; the file NAME.fleet holds its key besides the fleet's secret and roster. If its key must
-/// stay where it is, have the CA sign what `sgc fleet request` makes instead.
+/// The CA does not change. The file NAME.fleet holds its key beside the fleet's secret and roster. If the key must stay where
+/// it is, let the CA sign the requests of `sgc fleet request` instead.
 #[derive(Debug, Args)]
 pub(super) struct ImportArgs {
     /// Name of the fleet: a-z, 0-9, '-', '_' and '.'
     name: String,
-    /// The CA's certificate, PEM
+    /// Certificate of the CA, PEM
     #[arg(long, value_name = "FILE")]
     ca_cert: PathBuf,
-    /// The CA's private key, PEM (PKCS #8): P-256, P-384, Ed25519 or RSA
+    /// Private key of the CA, PEM (PKCS #8): P-256, P-384, Ed25519 or RSA
     #[arg(long, value_name = "FILE")]
     ca_key: PathBuf,
-    /// Where to write the file
+    /// Directory for the file
     #[arg(long, value_name = "DIR", default_value = ".")]
     dir: PathBuf,
     #[command(flatten)]
     traits: Traits,
 }
 
-/// Change what nodes of the fleet are told; each learns it when it is enrolled or renewed.
+/// Change the settings of the fleet; each node learns them when it is enrolled or renewed.
 #[derive(Debug, Args)]
 pub(super) struct SetArgs {
     #[command(flatten)]
     which: WhichFleet,
-    /// The node that renews certificates for the others
+    /// Node that renews certificates for the others
     #[arg(long, value_name = "NODE", conflicts_with = "no_authority")]
     authority: Option<String>,
-    /// No node renews certificates for the others
+    /// Let no node renew certificates for the others
     #[arg(long)]
     no_authority: bool,
-    /// Whether links and grants resist quantum computers
+    /// Make links and grants resist quantum computers, or not
     #[arg(long, value_name = "true|false", action = ArgAction::Set)]
     post_quantum: Option<bool>,
 }
 
 #[derive(Debug, Args)]
 struct Traits {
-    /// The node that is to renew certificates for the others
+    /// Node that renews certificates for the others
     #[arg(long, value_name = "NODE")]
     authority: Option<String>,
     /// Make links and grants resist quantum computers

@@ -1,4 +1,4 @@
-//! `sgc fleet enroll` and `renew`: identities, with keys made here or by the node.
+//! `sgc fleet enroll` and `renew`: make identities, with keys made here or by the node.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -13,75 +13,75 @@ use sgc_trust::{
 use sgc_wire::{Operation, UnixMillis};
 use zeroize::Zeroizing;
 
-use super::remote::{Keeping, Remote};
+use super::remote::{FleetPlace, Remote};
 use super::{DAY, copies, parse_span, system_rng, unix_now};
 use crate::error::CliError;
 use crate::files::{self, Existing};
 use crate::output;
 
-/// Make the identity of a node, in one file for that node.
+/// Make the identity of a node, in one file.
 ///
-/// The file holds the node's private key. Bring it to the node's machine and keep it there with mode 0600. A node that
-/// made its key itself (`sgc fleet request`) is answered with --csr: the answer holds no key.
+/// The file holds the node's private key. Bring it to the node's machine and keep it there with mode 0600. If the node made
+/// its key itself (`sgc fleet request`), answer its request with --csr: the answer holds no key.
 #[derive(Debug, Args)]
 pub(super) struct EnrollArgs {
     /// Name of the node: a-z, 0-9, '-', '_' and '.'
     node: String,
     #[command(flatten)]
-    keeping: Keeping,
-    /// A group for the node to be in; may be repeated
+    place: FleetPlace,
+    /// Group of the node; may be repeated
     #[arg(long = "group", value_name = "GROUP")]
     groups: Vec<String>,
-    /// For a node that only routes: its identity lacks the fleet secret, so that it can read no payload
+    /// Make the identity of a node that only routes: it lacks the fleet secret, so that the node can read no payload
     #[arg(long, conflicts_with = "may_route")]
     router: bool,
-    /// Let a member route for others as well
+    /// Let a member also route for others
     #[arg(long)]
     may_route: bool,
-    /// Make a node again of one that was revoked
+    /// Enrol a revoked node again
     #[arg(long)]
     again: bool,
     /// Answer this request, which the node made with `sgc fleet request`
     #[arg(long, value_name = "FILE")]
     csr: Option<PathBuf>,
     #[command(flatten)]
-    made: Made,
+    output: OutputArgs,
 }
 
-/// Make a node's certificate anew, in its groups and with its role.
+/// Renew a node's certificate, with the same groups and role.
 ///
-/// An identity that is here keeps its key. Without it, and without a request (--csr), the node gets a new key.
+/// An existing identity file keeps its key. Without such a file and without a request (--csr), the node gets a new key.
 #[derive(Debug, Args)]
 pub(super) struct RenewArgs {
     /// Name of the node
     node: String,
     #[command(flatten)]
-    keeping: Keeping,
+    place: FleetPlace,
     /// Answer this request, which the node made with `sgc fleet request`
     #[arg(long, value_name = "FILE")]
     csr: Option<PathBuf>,
     #[command(flatten)]
-    made: Made,
+    output: OutputArgs,
 }
 
 #[derive(Debug, Args)]
-struct Made {
-    /// How long it is to hold, such as 90d or 12h [default: 90d]
+struct OutputArgs {
+    /// How long the certificate is valid, such as 90d or 12h [default: 90d]
     #[arg(long, value_name = "TIME", value_parser = parse_span)]
     valid: Option<Duration>,
-    /// The same in days
+    /// Validity in days
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..), hide = true,
           conflicts_with = "valid")]
     days: Option<u32>,
-    /// Where to write it [default: NODE.identity, or NODE.answer]
+    /// File to write [default: NODE.identity, or NODE.answer with --csr]
     #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Replace a file that is there
+    /// Replace an existing file
     #[arg(long)]
     force: bool,
 }
 
-impl Made {
+impl OutputArgs {
     fn valid(&self) -> Duration {
         self.valid.or(self.days.map(|days| DAY * days)).unwrap_or(LEAF_VALIDITY_DEFAULT)
     }
@@ -99,7 +99,7 @@ impl Made {
         }
     }
 
-    /// Before the roster says that something was made, which then cannot be written.
+    /// Fails if the file exists and may not be replaced. Runs before the roster records a certificate that would then be lost.
     fn check_free(&self, path: &Path) -> Result<(), CliError> {
         match self.existing() {
             Existing::Keep(hint) if files::exists(path) => {
@@ -110,21 +110,21 @@ impl Made {
     }
 }
 
-/// The maker of certificates: a fleet file here, or the authority.
+/// The issuer of certificates: a fleet file here, or the authority.
 enum Keeper {
     File(LockedFleet),
     Authority(Remote),
 }
 
 impl Keeper {
-    fn of(keeping: &Keeping) -> Result<Self, CliError> {
-        match keeping.remote()? {
+    fn open(place: &FleetPlace) -> Result<Self, CliError> {
+        match place.remote()? {
             Some(remote) => Ok(Self::Authority(remote)),
-            None => Ok(Self::File(keeping.which.open()?)),
+            None => Ok(Self::File(place.which.open()?)),
         }
     }
 
-    /// Enrols a node. The roster has it first: a certificate that it does not know cannot be revoked.
+    /// Enrols a node. The roster records it first, because only recorded certificates can be revoked.
     fn enroll(&mut self, csr: &[u8], request: &EnrollRequest) -> Result<Membership, CliError> {
         match self {
             Self::File(file) => {
@@ -170,49 +170,49 @@ fn millis(time: Duration) -> u64 {
 pub(super) fn enroll(args: &EnrollArgs) -> Result<(), CliError> {
     let node: NodeName = args.node.parse()?;
     let groups = args.groups.iter().map(|g| g.parse()).collect::<Result<Vec<GroupName>, _>>()?;
-    let mut keeper = Keeper::of(&args.keeping)?;
+    let mut keeper = Keeper::open(&args.place)?;
     let request = EnrollRequest {
         groups,
         router: args.router,
         may_route: args.may_route,
         again: args.again,
-        valid: args.made.valid(),
+        valid: args.output.valid(),
         ..EnrollRequest::new(node, unix_now())
     };
     if let Some(csr) = &args.csr {
-        let path = args.made.path(&request.node, "answer");
-        args.made.check_free(&path)?;
+        let path = args.output.path(&request.node, "answer");
+        args.output.check_free(&path)?;
         let member = keeper.enroll(&read_csr(csr)?, &request)?;
-        files::write_secret(&path, &member.to_text(), args.made.existing())?;
+        files::write_secret(&path, &member.to_text(), args.output.existing())?;
         return output::line(answered_text(&request.node, &path));
     }
-    let path = args.made.path(&request.node, "identity");
-    args.made.check_free(&path)?;
+    let path = args.output.path(&request.node, "identity");
+    args.output.check_free(&path)?;
     let key = new_key()?;
     let member = keeper.enroll(key.csr(), &request)?;
     let identity = with_key(member, &key, &path)?;
-    files::write_secret(&path, &identity.to_text(), args.made.existing())?;
+    files::write_secret(&path, &identity.to_text(), args.output.existing())?;
     output::line(enrolled_text(&identity, &request, &path))
 }
 
 pub(super) fn renew(args: &RenewArgs) -> Result<(), CliError> {
     let node: NodeName = args.node.parse()?;
-    let mut keeper = Keeper::of(&args.keeping)?;
-    let valid = args.made.valid();
+    let mut keeper = Keeper::open(&args.place)?;
+    let valid = args.output.valid();
     if let Some(csr) = &args.csr {
-        let path = args.made.path(&node, "answer");
-        args.made.check_free(&path)?;
+        let path = args.output.path(&node, "answer");
+        args.output.check_free(&path)?;
         let member = keeper.renew(&read_csr(csr)?, &node, valid)?;
-        files::write_secret(&path, &member.to_text(), args.made.existing())?;
+        files::write_secret(&path, &member.to_text(), args.output.existing())?;
         return output::line(answered_text(&node, &path));
     }
-    let path = args.made.path(&node, "identity");
+    let path = args.output.path(&node, "identity");
     let old = if files::exists(&path) { Some(sgc_node::load_identity(&path)?) } else { None };
     let is_of_node = |old: &Identity| match &keeper {
         Keeper::File(file) => old.node_id() == file.fleet.node_id_of(&node),
         Keeper::Authority(_) => *old.node_name() == node,
     };
-    let new = match old.filter(|old| !args.made.force && is_of_node(old)) {
+    let new = match old.filter(|old| !args.output.force && is_of_node(old)) {
         Some(old) => {
             if let Keeper::File(file) = &mut keeper {
                 let done = file.fleet.recognize(old.as_peer(), unix_now());
@@ -224,7 +224,7 @@ pub(super) fn renew(args: &RenewArgs) -> Result<(), CliError> {
             old.with_membership(member).map_err(|source| CliError::Identity { path: path.clone(), source })?
         }
         None => {
-            args.made.check_free(&path)?;
+            args.output.check_free(&path)?;
             let key = new_key()?;
             with_key(keeper.renew(key.csr(), &node, valid)?, &key, &path)?
         }
@@ -233,7 +233,7 @@ pub(super) fn renew(args: &RenewArgs) -> Result<(), CliError> {
     output::line(renewed_text(&path, &node, new.not_after()))
 }
 
-/// A key for a node, made here: no authority ever has it.
+/// Makes a key for a node here, so that no authority ever has it.
 fn new_key() -> Result<KeyRequest, CliError> {
     KeyRequest::generate(None, &mut system_rng()?).map_err(CliError::Making)
 }

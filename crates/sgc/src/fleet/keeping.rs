@@ -1,4 +1,4 @@
-//! `sgc fleet list`, `revoke`, `adopt`, `rotate-secret`, `retire-secret`: what a fleet's keeper does over the years.
+//! `sgc fleet list`, `ca`, `revoke`, `adopt`, `rotate-secret` and `retire-secret`: the upkeep of a fleet.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,66 +12,66 @@ use sgc_transport::LinkUrl;
 use sgc_trust::{EnrollRequest, Fleet, NodeName, pem_contents, pem_text};
 use sgc_wire::{RosterPage, RosterRow, UnixMillis};
 
-use super::remote::{Keeping, Remote};
+use super::remote::{FleetPlace, Remote};
 use super::{WhichFleet, copies, system_rng, unix_now};
 use crate::error::CliError;
 use crate::files;
 use crate::{output, status};
 
 pub(super) const LIST_EXTENSION: &str = "crl";
-/// What the keeper of a fleet calls itself when it tells a router something.
+/// The node name in the certificate with which the keeper of a fleet pushes a list to a router.
 const KEEPER_NAME: &str = "fleet-keeper";
-/// For how long that certificate holds.
+/// How long that certificate is valid.
 const KEEPER_VALID: Duration = Duration::from_secs(600);
 
-/// Show the nodes of a fleet: groups, role, until when their certificates hold, and who is revoked.
+/// List the nodes of a fleet with their groups, role, end of certificates, and revocation.
 #[derive(Debug, Args)]
 pub(super) struct ListArgs {
     #[command(flatten)]
-    keeping: Keeping,
+    place: FleetPlace,
     /// Print JSON
     #[arg(long)]
     json: bool,
 }
 
-/// Print the certificate of a fleet's CA, PEM: no secret, and what partners and their routers trust.
+/// Print the certificate of a fleet's CA, PEM. It is no secret; partners and their routers trust it.
 #[derive(Debug, Args)]
 pub(super) struct CaArgs {
     #[command(flatten)]
     which: WhichFleet,
 }
 
-/// Revoke nodes: all of their certificates, for good.
+/// Revoke all certificates of nodes, for good.
 ///
-/// Writes the revocation list of the fleet next to its file. Nodes that have it refuse the revoked ones at once and
-/// tell it to their neighbours. Without a node the list is written again.
+/// The command writes the fleet's revocation list next to its file. Nodes that have the list refuse the revoked nodes at once
+/// and pass the list on to their neighbours. Without a node, the command writes the list again.
 #[derive(Debug, Args)]
 pub(super) struct RevokeArgs {
     /// Names of the nodes
     nodes: Vec<String>,
-    /// Tell this router, too; repeat for more. Nodes of this user on this machine are told anyway
+    /// Push the list to this router as well; may be repeated. Nodes of this user on this machine always get it
     #[arg(long = "router", value_name = "URL")]
     routers: Vec<LinkUrl>,
     #[command(flatten)]
-    keeping: Keeping,
+    place: FleetPlace,
 }
 
-/// Enter a certificate in the roster that was made before the fleet had one, so that it can be revoked.
+/// Enter a certificate that is older than the fleet's roster into the roster, so that it can be revoked.
 #[derive(Debug, Args)]
 pub(super) struct AdoptArgs {
     /// Name of the node
     node: String,
-    /// Its certificate, PEM
+    /// Certificate of the node, PEM
     #[arg(long, value_name = "FILE")]
     certificate: PathBuf,
     #[command(flatten)]
     which: WhichFleet,
 }
 
-/// Make a new generation of the secret that names are derived from.
+/// Make a new generation of the secret from which names are derived.
 ///
-/// Who has left the fleet can recognise names of shares that were made before, and none that are made later by nodes
-/// that have the new secret. Nodes get it when they are renewed.
+/// A node that has left the fleet can recognise the names of older shares, but no names that nodes derive from the new
+/// secret. Nodes get the new secret when they are renewed.
 #[derive(Debug, Args)]
 pub(super) struct RotateArgs {
     #[command(flatten)]
@@ -81,10 +81,10 @@ pub(super) struct RotateArgs {
 /// Take old generations of the naming secret out of use, once every node has a newer one.
 #[derive(Debug, Args)]
 pub(super) struct RetireArgs {
-    /// Generations before this one
+    /// First generation to keep; older ones are retired
     #[arg(value_name = "GENERATION")]
     before: u32,
-    /// Even if members lack that generation that hold a certificate and were seen in the last 30 days
+    /// Retire even if members with a valid certificate lack that generation and were seen in the last 30 days
     #[arg(long)]
     force: bool,
     #[command(flatten)]
@@ -132,10 +132,10 @@ struct CertificateJson {
 }
 
 pub(super) fn list(args: &ListArgs) -> Result<(), CliError> {
-    let roster = match args.keeping.remote()? {
+    let roster = match args.place.remote()? {
         Some(remote) => remote.list()?,
         None => {
-            let (_, fleet) = args.keeping.which.read()?;
+            let (_, fleet) = args.place.which.read()?;
             let nodes = fleet.nodes().map(|node| roster_row(&fleet, node)).collect();
             RosterPage { nodes, ..roster_head(&fleet) }
         }
@@ -156,10 +156,10 @@ pub(super) fn ca(args: &CaArgs) -> Result<(), CliError> {
 
 pub(super) fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
     let nodes = args.nodes.iter().map(|n| n.parse()).collect::<Result<Vec<NodeName>, _>>()?;
-    if let Some(remote) = args.keeping.remote()? {
+    if let Some(remote) = args.place.remote()? {
         return revoke_at(&remote, &nodes);
     }
-    let mut file = args.keeping.which.open()?;
+    let mut file = args.place.which.open()?;
     let now = unix_now();
     if !nodes.is_empty() {
         let done = file.fleet.revoke(&nodes, now);
@@ -172,16 +172,18 @@ pub(super) fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
         text.push_str(&format!("{node}: revoked\n"));
     }
     text.push_str(&format!("{}: revocation list {}\n", path.display(), file.fleet.crl_number()));
-    let told = tell(&mut file, &list, &args.routers)?;
-    match told.names.is_empty() {
+    let pushed = push_crl(&mut file, &list, &args.routers)?;
+    match pushed.names.is_empty() {
         true => text.push_str(
-            "Nobody was told yet. Tell one node, and all will know:\n  sgc fleet revoke --router quic://…   \
+            "No node has the list yet. Push it to one, and it passes the list on:\n  sgc fleet revoke --router quic://…   \
              or, where a node runs:  sgc fleet revoke",
         ),
-        false => text.push_str(&format!("Told {}: nodes tell it to each other.", told.names.join(", "))),
+        false => {
+            text.push_str(&format!("Pushed to {}: nodes pass it on to each other.", pushed.names.join(", ")))
+        }
     }
     output::line(text)?;
-    told.failed.map_or(Ok(()), Err)
+    pushed.failed.map_or(Ok(()), Err)
 }
 
 fn revoke_at(remote: &Remote, nodes: &[NodeName]) -> Result<(), CliError> {
@@ -190,7 +192,7 @@ fn revoke_at(remote: &Remote, nodes: &[NodeName]) -> Result<(), CliError> {
     for node in nodes {
         text.push_str(&format!("{node}: revoked\n"));
     }
-    text.push_str(&format!("Revocation list {list} of {}: nodes tell it to each other.", remote.at()));
+    text.push_str(&format!("Revocation list {list} of {}: nodes pass it on to each other.", remote.at()));
     output::line(text)
 }
 
@@ -212,9 +214,9 @@ pub(super) fn rotate(args: &RotateArgs) -> Result<(), CliError> {
     let generation = file.fleet.rotate_secret(unix_now(), &mut system_rng()?);
     let generation = generation.map_err(|e| file.error(e))?;
     file.save()?;
-    // An authority that runs here looks into the file again when it is told a list.
+    // An authority that runs here reads the fleet file again when it gets a list.
     let (_, list) = write_list(&file, unix_now())?;
-    tell(&mut file, &list, &[])?;
+    push_crl(&mut file, &list, &[])?;
     output::line(format!(
         "{}: generation {generation} of the naming secret\n\
          Nodes get it when they are renewed (`sgc fleet renew NODE`, or by the authority). Once all have it:\n  \
@@ -237,25 +239,29 @@ pub(super) fn retire(args: &RetireArgs) -> Result<(), CliError> {
     output::line(format!("{}: generations in use: {}", file.path().display(), left.join(", ")))
 }
 
-/// The newest generation of a fleet's secret.
+/// Returns the newest generation of a fleet's secret.
 fn newest_of(fleet: &Fleet) -> u32 {
     fleet.generations().last().map_or(1, |newest| newest.number)
 }
 
-/// Whom a list was told.
-pub(super) struct Told {
+/// The result of pushing a revocation list.
+pub(super) struct PushReport {
     pub(super) names: Vec<String>,
-    /// The last router that could not be.
+    /// The error of the last router that did not take the list.
     pub(super) failed: Option<CliError>,
 }
 
-/// Tells a list to the nodes that this user runs here and to these routers. What they know besides is taken over: then
-/// the list is written once more, and those who were told know it anyway.
-pub(super) fn tell(file: &mut LockedFleet, list: &[u8], routers: &[LinkUrl]) -> Result<Told, CliError> {
-    let (mut names, mut heard) = status::tell_local(list);
+/// Pushes a list to the nodes that this user runs here and to these routers, and takes over revocations that only they know.
+/// In that case the list is written once more; the receivers need no second push, because they know its content.
+pub(super) fn push_crl(
+    file: &mut LockedFleet,
+    list: &[u8],
+    routers: &[LinkUrl],
+) -> Result<PushReport, CliError> {
+    let (mut names, mut heard) = status::push_crl_local(list);
     let mut failed = None;
     if !routers.is_empty() {
-        // A certificate for this errand alone; the roster does not know it.
+        // The certificate serves this push alone; the roster does not list it.
         let keeper = KEEPER_NAME.parse().map_err(CliError::Label)?;
         let request =
             EnrollRequest { router: true, valid: KEEPER_VALID, ..EnrollRequest::new(keeper, unix_now()) };
@@ -280,7 +286,7 @@ pub(super) fn tell(file: &mut LockedFleet, list: &[u8], routers: &[LinkUrl]) -> 
         file.save()?;
         write_list(file, now)?;
     }
-    Ok(Told { names, failed })
+    Ok(PushReport { names, failed })
 }
 
 pub(super) fn write_list(file: &LockedFleet, now: UnixMillis) -> Result<(PathBuf, Vec<u8>), CliError> {
@@ -311,7 +317,7 @@ fn state(node: &RosterRow, now: UnixMillis) -> String {
     }
 }
 
-/// The newest generation of the secret that a member was handed; unknown of nodes of earlier versions.
+/// Returns the newest generation of the secret that a member got; unknown for nodes of earlier versions.
 fn generation(node: &RosterRow) -> Option<u32> {
     (!node.router && node.generation > 0).then_some(node.generation)
 }

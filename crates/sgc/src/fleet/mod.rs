@@ -1,7 +1,6 @@
-//! `sgc fleet`: makes fleets, takes nodes in, renews them and takes them out.
+//! `sgc fleet`: makes fleets, and enrols, renews and revokes their nodes.
 //!
-//! The files stay where they are written; bringing them to their machines is the user's. What is in them is the
-//! business of `sgc-trust`.
+//! The files stay where they are written; the user brings them to their machines. `sgc-trust` defines their content.
 
 mod copies;
 mod create;
@@ -27,7 +26,7 @@ use crate::files;
 pub(crate) const FLEET_EXTENSION: &str = "fleet";
 const DAY: Duration = Duration::from_secs(86_400);
 
-/// Make a fleet, and identities for its nodes; renew and revoke them.
+/// Make a fleet, and enrol, renew and revoke its nodes.
 #[derive(Debug, Args)]
 pub(crate) struct FleetArgs {
     #[command(subcommand)]
@@ -74,10 +73,10 @@ pub(crate) fn fleet(args: FleetArgs) -> Result<(), CliError> {
     }
 }
 
-/// Which fleet a command is about.
+/// The fleet of a command.
 #[derive(Debug, Args)]
 struct WhichFleet {
-    /// The fleet; without it, the one *.fleet file of this directory
+    /// Fleet file; without it, the only *.fleet file of this directory
     #[arg(long, value_name = "FILE")]
     fleet: Option<PathBuf>,
 }
@@ -90,7 +89,7 @@ impl WhichFleet {
         }
     }
 
-    /// To be looked at.
+    /// Reads the fleet file without a lock.
     fn read(&self) -> Result<(PathBuf, Fleet), CliError> {
         let path = self.path()?;
         let mut fleet = sgc_node::read_fleet(&path)?;
@@ -98,7 +97,7 @@ impl WhichFleet {
         Ok((path, fleet))
     }
 
-    /// To be changed. What the revocation list beside it says is taken over.
+    /// Opens the fleet file for changes. Takes over the revocations of the list beside it.
     fn open(&self) -> Result<LockedFleet, CliError> {
         let mut file = LockedFleet::open(&self.path()?)?;
         let path = file.path().to_owned();
@@ -109,7 +108,7 @@ impl WhichFleet {
     }
 }
 
-/// A generator seeded by the system.
+/// Returns a random generator, seeded by the system.
 pub(crate) fn system_rng() -> Result<ChaCha20Rng, CliError> {
     let mut seed = [0; 32];
     OsRng.try_fill_bytes(&mut seed).map_err(|e| CliError::System {
@@ -121,13 +120,13 @@ pub(crate) fn system_rng() -> Result<ChaCha20Rng, CliError> {
     Ok(rng)
 }
 
-/// The time, for certificates.
+/// Returns the time, for certificates.
 pub(crate) fn unix_now() -> UnixMillis {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     UnixMillis(u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
 }
 
-/// The one fleet of this directory, apart from `other`.
+/// Returns the only fleet file of this directory, apart from `other`.
 fn fleet_here(other: Option<&Path>) -> Result<PathBuf, CliError> {
     let dir = Path::new(".");
     let mut found = files::with_extension(dir, FLEET_EXTENSION)
@@ -146,7 +145,7 @@ fn fleet_here(other: Option<&Path>) -> Result<PathBuf, CliError> {
     }
 }
 
-/// True of a path with a directory in it that is not this one.
+/// Returns `true` if the path names another directory than this one.
 fn is_elsewhere(path: &Path) -> bool {
     path.parent().is_some_and(|parent| parent != Path::new("") && parent != Path::new("."))
 }
@@ -160,7 +159,7 @@ fn parse_span(text: &str) -> Result<Duration, String> {
     }
 }
 
-/// `--fleet FILE`, as a hint repeats it, unless the fleet is found without it.
+/// Returns the `--fleet FILE` that a hint has to repeat, or nothing if the fleet is found without it.
 fn fleet_option(path: &Path) -> String {
     match path.parent() == Some(Path::new("")) {
         true => String::new(),

@@ -1,4 +1,4 @@
-//! `sgc fleet request` and `accept`: a node whose private key never leaves its machine.
+//! `sgc fleet request`, `extensions` and `accept`: identities whose private key never leaves the node's machine.
 
 use std::path::{Path, PathBuf};
 
@@ -17,79 +17,78 @@ use crate::output;
 
 const KEY_KEPT: &str = "; a key is never overwritten: an identity may need it";
 
-/// On a node's machine: make its private key, and a request for a certificate.
+/// On a node's machine: make its private key and a request for a certificate.
 ///
-/// The key is written to NODE.key and stays there; the request, NODE.csr, goes to the keeper of the fleet, who answers
-/// it with `sgc fleet enroll NODE --csr NODE.csr`.
+/// The command writes the key to NODE.key, where it stays, and the request to NODE.csr. The keeper of the fleet answers the
+/// request with `sgc fleet enroll NODE --csr NODE.csr`.
 #[derive(Debug, Args)]
 pub(super) struct RequestArgs {
     /// Name of the node: a-z, 0-9, '-', '_' and '.'
     node: String,
-    /// For a CA that takes names from requests: a file with the fleet's secret (a fleet file), so that the request
-    /// names the node as its certificate must
+    /// File with the fleet's secret (a fleet file), for a CA that takes names from requests: the request then names the
+    /// node as its certificate must
     #[arg(long, value_name = "FILE")]
     secret: Option<PathBuf>,
-    /// Where to write the two files
+    /// Directory for the two files
     #[arg(long, value_name = "DIR", default_value = ".")]
     dir: PathBuf,
 }
 
-/// On a node's machine: make its identity of its key and of the answer to its request.
+/// On a node's machine: make its identity from its key and the answer to its request.
 #[derive(Debug, Args)]
 pub(super) struct AcceptArgs {
-    /// The answer, from `sgc fleet enroll --csr`; or, with --ca, certificates of another CA, PEM
+    /// Answer of `sgc fleet enroll --csr`; with --ca, certificates from an existing CA, PEM
     answer: PathBuf,
-    /// The node's private key [default: NODE.key]
+    /// Private key of the node [default: NODE.key]
     #[arg(long, value_name = "FILE")]
     key: Option<PathBuf>,
-    /// Certificates of the CAs to trust, PEM: the answer is then a certificate that an existing CA made for the
-    /// request
+    /// Certificates of the CAs to trust, PEM; the answer is then a certificate that an existing CA made for the request
     #[arg(long, value_name = "FILE", requires = "node", requires = "fleet_name")]
     ca: Option<PathBuf>,
-    /// With --ca: the node's name
+    /// With --ca: name of the node
     #[arg(long, value_name = "NODE", requires = "ca")]
     node: Option<String>,
-    /// With --ca: the fleet's name, for people
+    /// With --ca: name of the fleet, for people
     #[arg(long, value_name = "NAME", requires = "ca")]
     fleet_name: Option<String>,
-    /// With --ca: a file with the fleet's secret; without it the identity is a router's
+    /// With --ca: file with the fleet's secret; without it, the identity is that of a router
     #[arg(long, value_name = "FILE", requires = "ca")]
     secret: Option<PathBuf>,
-    /// With --ca: a group that the certificate has to name, and no others; may be repeated
+    /// With --ca: group that the certificate has to name; it may name no others; may be repeated
     #[arg(long = "group", value_name = "GROUP", requires = "secret")]
     groups: Vec<String>,
-    /// With --ca: the certificate has to let the member route for others as well
+    /// With --ca: require that the certificate lets the member route for others
     #[arg(long, requires = "secret")]
     may_route: bool,
-    /// Where to write the identity [default: NODE.identity]
+    /// File for the identity [default: NODE.identity]
     #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Replace an identity that is there
+    /// Replace an existing identity
     #[arg(long)]
     force: bool,
 }
 
-/// For a CA that knows nothing of SGC: write the extensions that a node's certificate is to have.
+/// For a CA that does not know SGC: write the extensions of a node's certificate.
 ///
-/// The file is in the form of OpenSSL (`openssl x509 -req -extfile`) and holds no secret. The CA takes the extensions
-/// from it and none from the request, so that its keeper decides on name, groups and role.
+/// The file has OpenSSL's format (`openssl x509 -req -extfile`) and holds no secret. The CA takes the extensions from this
+/// file and none from the request, so its keeper decides on name, groups and role.
 #[derive(Debug, Args)]
 pub(super) struct ExtensionsArgs {
     /// Name of the node: a-z, 0-9, '-', '_' and '.'
     node: String,
-    /// A file with the fleet's secret (a fleet file)
+    /// File with the fleet's secret (a fleet file)
     #[arg(long, value_name = "FILE")]
     secret: PathBuf,
-    /// A group for the node to be in; may be repeated
+    /// Group of the node; may be repeated
     #[arg(long = "group", value_name = "GROUP")]
     groups: Vec<String>,
-    /// For a node that only routes
+    /// Write the extensions of a node that only routes
     #[arg(long, conflicts_with_all = ["may_route", "groups"])]
     router: bool,
-    /// Let a member route for others as well
+    /// Let a member also route for others
     #[arg(long)]
     may_route: bool,
-    /// Where to write them [default: NODE.ext]
+    /// File for the extensions [default: NODE.ext]
     #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
 }

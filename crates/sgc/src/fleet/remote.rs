@@ -1,5 +1,5 @@
-//! `--at AUTHORITY`: operations on a fleet that its authority carries out. A node of this user asks for them over the
-//! mesh, as an operator.
+//! `--at AUTHORITY`: fleet operations that the authority carries out. A node of this user requests them over the mesh as
+//! an operator.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -19,25 +19,25 @@ use super::WhichFleet;
 use crate::error::CliError;
 use crate::status;
 
-/// Longest wait for the node's answer: the node gives up before.
+/// Longest wait for the node's answer. The node gives up earlier.
 const ANSWER_MAX: Duration = Duration::from_secs(40);
 
-/// The place where the fleet is kept.
+/// The place of the fleet: a file here, or the authority.
 #[derive(Debug, Args)]
-pub(super) struct Keeping {
+pub(super) struct FleetPlace {
     #[command(flatten)]
     pub(super) which: WhichFleet,
-    /// Have the fleet's authority do it, over the mesh: the name of its node. Your node that runs here asks for it, and
-    /// has to be an operator there (`operators` in its configuration)
+    /// Let the fleet's authority do it, over the mesh: the name of its node. Your node that runs here sends the request; the
+    /// authority's configuration has to list it in `operators`
     #[arg(long, value_name = "AUTHORITY", conflicts_with = "fleet")]
     at: Option<String>,
-    /// With --at: the status socket of the node that asks, if it is not the only one here
+    /// With --at: status socket of the node that sends the request, if it is not the only one here
     #[arg(long, value_name = "PATH", requires = "at")]
     socket: Option<PathBuf>,
 }
 
-impl Keeping {
-    /// The authority, if it is to do it.
+impl FleetPlace {
+    /// Returns the authority, if `--at` names one.
     pub(super) fn remote(&self) -> Result<Option<Remote>, CliError> {
         let Some(at) = &self.at else { return Ok(None) };
         let at = at.parse()?;
@@ -45,13 +45,13 @@ impl Keeping {
     }
 }
 
-/// An authority, and the node that asks it.
+/// An authority, and the socket of the node that asks it.
 pub(super) struct Remote {
     at: NodeName,
     socket: PathBuf,
 }
 
-/// An answer of a node.
+/// A node's answer.
 #[derive(Deserialize)]
 enum Answer {
     #[serde(rename = "ok")]
@@ -61,7 +61,7 @@ enum Answer {
 }
 
 impl Remote {
-    /// The authority's name.
+    /// Returns the authority's name.
     pub(super) fn at(&self) -> &NodeName {
         &self.at
     }
@@ -84,7 +84,7 @@ impl Remote {
         }
     }
 
-    /// Revokes nodes; returns the number of the list that says so.
+    /// Revokes nodes. Returns the number of the new revocation list.
     pub(super) fn revoke(&self, nodes: &[NodeName]) -> Result<u64, CliError> {
         let mut last = 0;
         for nodes in nodes.chunks(REVOKED_AT_ONCE_MAX) {
@@ -97,7 +97,7 @@ impl Remote {
         Ok(last)
     }
 
-    /// Enrols or renews a node; returns everything of its identity but the key.
+    /// Enrols or renews a node. Returns its identity without the key.
     pub(super) fn certify(&self, operation: Operation) -> Result<Membership, CliError> {
         if let Operation::Enroll { csr, .. } | Operation::Renew { csr, .. } = &operation
             && csr.len() > CSR_BYTES_MAX

@@ -20,35 +20,35 @@ const RAW_LINE_BYTES: usize = 32;
 
 /// Show messages of a topic, decoded
 ///
-/// Definitions are looked for in `--msg-dir`, then in AMENT_PREFIX_PATH; the common interfaces of ROS 2 ship inside; what is
-/// found nowhere, or is another there, the node knows from who shares the topic. Looking
-/// slows nothing down: what is not shown in time is left out, and counted.
+/// The command looks for definitions in `--msg-dir`, then in AMENT_PREFIX_PATH. It has the common interfaces of ROS 2 built
+/// in. If a definition is missing or differs, the node has it from the publishing side. Showing messages never slows
+/// the topic down: messages that are not shown in time are skipped and counted.
 #[derive(Debug, Args)]
 pub(crate) struct EchoArgs {
     #[command(flatten)]
     tap: TapArgs,
-    /// Print JSON, a line for each message
+    /// Print each message as a line of JSON
     #[arg(long, conflicts_with = "raw")]
     json: bool,
     /// End after the first message
     #[arg(long, conflicts_with = "count")]
     once: bool,
-    /// End after so many messages
+    /// End after N messages
     #[arg(short = 'n', long, value_name = "N")]
     count: Option<u64>,
-    /// Show this member alone: `pose.position.x`, `transforms[0].header`
+    /// Show only this member, such as `pose.position.x` or `transforms[0].header`
     #[arg(long, value_name = "PATH", conflicts_with = "raw")]
     field: Option<String>,
     /// Show the serialised bytes
     #[arg(long)]
     raw: bool,
-    /// Show all elements of long sequences and texts, not the first 128
+    /// Show all elements of long sequences and texts, not only the first 128
     #[arg(long)]
     full_length: bool,
     /// Directory with packages that define messages: DIR/PACKAGE/msg/NAME.msg
     #[arg(long, value_name = "DIR")]
     msg_dir: Vec<PathBuf>,
-    /// End, as a failure, when nothing came for so long
+    /// Fail if no message comes for this time
     #[arg(long, value_name = "SECONDS")]
     timeout: Option<u64>,
 }
@@ -115,7 +115,7 @@ fn show(args: &EchoArgs, layout: &Layout, payload: Vec<u8>) -> Result<(), CliErr
     output::line("---")
 }
 
-/// What the messages that a tap shows look like.
+/// Returns the layout of the messages of a tap.
 pub(super) fn layout(tap: &Tap, dirs: &[PathBuf]) -> Result<Layout, CliError> {
     let type_name = &tap.shown.type_name;
     let unknown = |why: String| CliError::NoDefinition { type_name: type_name.clone(), why };
@@ -139,7 +139,7 @@ pub(super) fn layout(tap: &Tap, dirs: &[PathBuf]) -> Result<Layout, CliError> {
     Ok(layout)
 }
 
-/// What the node was told that the type looks like.
+/// Returns the node's description of the type, if it matches the announced hash.
 fn told(tap: &Tap, name: &TypeName) -> Option<ResolvedType> {
     let told = tap.shown.described.as_ref()?;
     let description = STANDARD.decode(&told.description).ok()?;
@@ -165,7 +165,7 @@ mod tests {
 
     use sgc_cdr::Library;
 
-    use super::super::{Shown, Told};
+    use super::super::{TapType, TypeInfo};
     use super::*;
 
     /// A type that is installed nowhere.
@@ -176,29 +176,29 @@ mod tests {
     }
 
     fn tap(type_name: &str, type_hash: Option<&str>, told: Option<&ResolvedType>) -> Tap {
-        let described = told.map(|told| Told {
+        let described = told.map(|told| TypeInfo {
             type_hash: told.type_hash().to_owned(),
             description: STANDARD.encode(told.description()),
         });
         let (type_name, type_hash) = (type_name.to_owned(), type_hash.map(str::to_owned));
         let (stream, _) = UnixStream::pair().unwrap();
-        Tap { socket: PathBuf::new(), stream, shown: Shown { type_name, type_hash, described } }
+        Tap { socket: PathBuf::new(), stream, shown: TapType { type_name, type_hash, described } }
     }
 
     #[test]
-    fn what_is_not_installed_is_decoded_by_what_the_node_was_told() {
+    fn missing_definition_is_taken_from_node() {
         let thing = thing();
         for announced in [None, Some(thing.type_hash())] {
             let layout = layout(&tap("mine/msg/Thing", announced, Some(&thing)), &[]).unwrap();
             assert_eq!(layout.type_hash(), thing.type_hash());
         }
-        // It is not believed for another hash, or another type.
+        // The description does not count for another hash or another type.
         let other = tap("mine/msg/Thing", Some("RIHS01_00"), Some(&thing));
         assert!(matches!(layout(&other, &[]), Err(CliError::NoDefinition { .. })));
         let other = tap("mine/msg/Other", None, Some(&thing));
         assert!(matches!(layout(&other, &[]), Err(CliError::NoDefinition { .. })));
         assert!(layout(&tap("mine/msg/Thing", None, None), &[]).is_err());
-        // What ships needs nobody to tell, as long as it is what is announced.
+        // Built-in definitions need no description while their hash is the announced one.
         assert!(layout(&tap("std_msgs/msg/String", None, None), &[]).is_ok());
     }
 }

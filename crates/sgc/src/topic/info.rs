@@ -1,4 +1,4 @@
-//! `sgc topic info`: who publishes and subscribes to a topic, here and on the far side.
+//! `sgc topic info`: shows publishers and subscribers of a topic, here and on the far side.
 
 use std::process::ExitCode;
 
@@ -9,12 +9,12 @@ use super::NodeArgs;
 use crate::error::{CliError, EXIT_FAILURE};
 use crate::output;
 
-/// Show a topic's publishers and subscribers, here and on the far side; with -v each with its QoS and type hash
+/// Show a topic's publishers and subscribers, here and on the far side
 #[derive(Debug, Args)]
 pub(crate) struct InfoArgs {
-    /// The topic
+    /// Name of the topic
     topic: String,
-    /// Each endpoint with its GUID, QoS and type hash
+    /// Show the GUID, QoS and type hash of each endpoint
     #[arg(short, long)]
     verbose: bool,
     #[command(flatten)]
@@ -110,7 +110,7 @@ fn endpoint(endpoint: &Endpoint) -> Vec<String> {
     lines
 }
 
-/// As `ros2 topic info -v` shows it.
+/// Formats QoS as `ros2 topic info -v` does.
 fn qos(qos: &Qos) -> Vec<String> {
     let time = |ns: Option<u64>| ns.map_or("Infinite".to_owned(), |ns| format!("{} s", ns as f64 / 1e9));
     let mut lines = vec![

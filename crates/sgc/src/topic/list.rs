@@ -12,7 +12,7 @@ use super::NodeArgs;
 use crate::error::CliError;
 use crate::output;
 
-/// List topics of the local network, and those that other nodes share with this one
+/// List topics of the local network and topics that other nodes share with this one
 #[derive(Debug, Args)]
 pub(crate) struct ListArgs {
     #[command(flatten)]
@@ -22,7 +22,7 @@ pub(crate) struct ListArgs {
     json: bool,
 }
 
-/// A topic of one place.
+/// A topic at one place: here or at an owner.
 #[derive(Debug, Serialize)]
 struct Line {
     topic: String,
@@ -32,7 +32,7 @@ struct Line {
     whose: String,
     publishers: usize,
     subscribers: usize,
-    /// What becomes of it.
+    /// How the topic is shared or used.
     state: String,
 }
 
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn every_topic_says_what_becomes_of_it() {
+    fn list_shows_state_of_every_topic() {
         let offer = |topic: &str, is_used| Offer {
             topic: topic.into(),
             type_name: "T".into(),

@@ -1,6 +1,6 @@
-//! `sgc topic`: what is on the local network and on the far side of it, without a ROS 2 installation.
+//! `sgc topic`: shows topics of the local network and of the far side, without a ROS 2 installation.
 //!
-//! The node that runs here says what there is and shows copies of messages; this makes tables, YAML and figures of it.
+//! The running node lists topics and copies messages. This module prints them as tables, YAML and figures.
 
 mod echo;
 mod info;
@@ -23,16 +23,16 @@ use sgc_node::graph::{Graph, Side};
 use crate::error::CliError;
 use crate::status;
 
-/// How long a node may take to answer.
+/// Longest time a node may take to answer.
 const ANSWER_MAX: Duration = Duration::from_secs(5);
-/// How long making a local reader may take.
+/// Longest time a node may take to create a local reader.
 const BEGIN_MAX: Duration = Duration::from_secs(30);
-/// Longest first line of what a tap says: a description in base64 fits.
+/// Longest first line of a tap. A type description in base64 fits.
 const FIRST_LINE_BYTES_MAX: usize = 4096 + DESCRIPTION_BYTES_MAX * 4 / 3;
-/// The largest message that is read: what a node carries is smaller.
+/// Largest message that is read. Nodes carry only smaller ones.
 const MESSAGE_BYTES_MAX: u32 = 256 << 20;
 
-/// List topics here and on the far side, show their messages and how often they come, publish; no ROS 2 installation is needed
+/// List, show, measure and publish topics here and on the far side, without a ROS 2 installation
 #[derive(Debug, Args)]
 pub(crate) struct TopicArgs {
     #[command(subcommand)]
@@ -50,28 +50,28 @@ enum TopicCommand {
     Delay(rates::DelayArgs),
 }
 
-/// Which node is asked.
+/// The node to ask.
 #[derive(Debug, Args)]
 pub(crate) struct NodeArgs {
-    /// The node's configuration; without it, the one node that this user runs here
+    /// Configuration of the node; without it, the only node that this user runs here
     #[arg(short, long, value_name = "FILE", conflicts_with_all = ["socket", "node"])]
     config: Option<PathBuf>,
-    /// The node's name, if its socket is in the usual place
+    /// Name of the node, if its socket is in the usual place
     #[arg(long, value_name = "NAME", conflicts_with = "socket")]
     node: Option<String>,
-    /// The node's status socket
+    /// Status socket of the node
     #[arg(long, value_name = "PATH")]
     socket: Option<PathBuf>,
 }
 
-/// Which messages of a topic are looked at.
+/// The side on which messages of a topic are copied.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 pub(crate) enum SideArg {
-    /// What is published on the local network
+    /// Messages published on the local network
     Local,
-    /// What comes from the far side and is given to the local network
+    /// Messages from the far side, as they are written to the local network
     Far,
-    /// What goes from here to the far side
+    /// Messages sent from here to the far side
     Sent,
 }
 
@@ -85,12 +85,12 @@ impl From<SideArg> for Side {
     }
 }
 
-/// A topic that is looked at.
+/// A topic whose messages are shown.
 #[derive(Debug, Args)]
 struct TapArgs {
-    /// The topic, as it is called on this node's local network
+    /// Topic, by its name on this node's local network
     topic: String,
-    /// Which of its messages; without it, those from the far side if the topic is used here, else the local ones
+    /// Side on which messages are copied; without it, the far side if the topic is used here, else the local network
     #[arg(long, value_enum)]
     side: Option<SideArg>,
     #[command(flatten)]
@@ -111,18 +111,18 @@ pub(crate) fn topic(args: &TopicArgs) -> Result<ExitCode, CliError> {
 }
 
 impl NodeArgs {
-    /// The node at this socket.
+    /// Names the node at this socket.
     pub(crate) fn at(socket: &Path) -> Self {
         Self { config: None, node: None, socket: Some(socket.to_owned()) }
     }
 
-    /// Where the node is asked.
+    /// Returns the node's status socket.
     pub(crate) fn socket(&self) -> Result<PathBuf, CliError> {
         let named = self.node.as_deref().map(sgc_node::default_socket_path);
         status::socket(self.config.as_deref(), named.as_deref().or(self.socket.as_deref()))
     }
 
-    /// What there is.
+    /// Returns the node's graph.
     pub(crate) fn graph(&self, name: Option<sgc_wire::Name>) -> Result<Graph, CliError> {
         let socket = self.socket()?;
         let text = status::ask(&socket, &AdminRequest::Graph(name), ANSWER_MAX)?;
@@ -138,7 +138,7 @@ enum Answer<T> {
     Refused(String),
 }
 
-/// What a node answered.
+/// Parses a node's answer.
 pub(crate) fn answer<T: serde::de::DeserializeOwned>(socket: &Path, text: &str) -> Result<T, CliError> {
     match serde_json::from_str(text) {
         Ok(Answer::Done(what)) => Ok(what),
@@ -150,33 +150,33 @@ pub(crate) fn answer<T: serde::de::DeserializeOwned>(socket: &Path, text: &str) 
     }
 }
 
-/// What a node says of a topic before it shows it.
+/// The first line of a tap: the type of the topic.
 #[derive(Debug, Deserialize)]
-struct Shown {
+struct TapType {
     #[serde(rename = "type")]
     type_name: String,
     type_hash: Option<String>,
-    described: Option<Told>,
+    described: Option<TypeInfo>,
 }
 
-/// What a node knows of a type.
+/// A type's hash and its description, as the node has it.
 #[derive(Debug, Deserialize)]
-struct Told {
+struct TypeInfo {
     type_hash: String,
     /// In base64.
     description: String,
 }
 
-/// A topic that is shown.
+/// A stream of copied messages from a node.
 #[derive(Debug)]
 struct Tap {
     socket: PathBuf,
     stream: UnixStream,
-    shown: Shown,
+    shown: TapType,
 }
 
 impl TapArgs {
-    /// Begins to look; at most so many bytes of each message.
+    /// Opens the tap. `bytes` limits how much of each message the node copies.
     fn begin(&self, bytes: u32) -> Result<Tap, CliError> {
         let socket = self.node.socket()?;
         let request = AdminRequest::Tap { topic: self.topic.clone(), side: self.side.map(Into::into), bytes };
@@ -185,7 +185,7 @@ impl TapArgs {
         stream.set_read_timeout(Some(BEGIN_MAX)).map_err(no_node)?;
         stream.write_all(request.to_line().as_bytes()).map_err(no_node)?;
         let mut line = Vec::new();
-        // What refuses has no end of line.
+        // A refusal has no end of line.
         while line.len() < FIRST_LINE_BYTES_MAX && line.last() != Some(&b'\n') {
             let mut byte = [0];
             if stream.read(&mut byte).map_err(no_node)? == 0 {
@@ -199,7 +199,7 @@ impl TapArgs {
 }
 
 impl Tap {
-    /// The next message, and what is carried of it; `None` once there is no more, or after `patience` without any.
+    /// Returns the next message and its copied bytes. Returns `None` at the end of the stream, or after `patience` without a message.
     fn next(&mut self, patience: Option<Duration>) -> Result<Option<(TapHead, Vec<u8>)>, CliError> {
         let broken = |socket: &Path, error: &std::io::Error| {
             status::no_node(socket, error, patience.unwrap_or_default())
@@ -230,7 +230,7 @@ impl Tap {
     }
 }
 
-/// A type and a message, either of which may have been left out: what is alone is a type if it looks like one.
+/// Splits the arguments into a type and a message; either may be left out. A single argument is a type if it looks like one.
 pub(crate) fn type_and_message<'a>(
     first: Option<&'a str>,
     second: Option<&'a str>,
@@ -249,7 +249,7 @@ mod tests {
     use super::type_and_message;
 
     #[test]
-    fn a_type_is_told_from_a_message() {
+    fn single_argument_is_type_or_message_by_its_form() {
         for name in ["std_msgs/String", "std_msgs/msg/String"] {
             assert_eq!(type_and_message(Some(name), None), (Some(name), None));
             assert_eq!(type_and_message(Some(name), Some("{}")), (Some(name), Some("{}")));

@@ -1,4 +1,4 @@
-//! `sgc topic pub`: publishes as `ros2 topic pub` does, by the node that runs here.
+//! `sgc topic pub`: publishes as `ros2 topic pub` does, through the running node.
 
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::os::unix::net::UnixStream;
@@ -14,7 +14,7 @@ use super::{ANSWER_MAX, BEGIN_MAX, NodeArgs, answer, type_and_message};
 use crate::error::{CliError, EXIT_FAILURE};
 use crate::{output, status, yaml};
 
-/// How long subscribers are waited for unless it is said.
+/// Default time to wait for subscribers, in seconds.
 const WAIT_DEFAULT_S: u64 = 10;
 
 #[derive(Clone, Copy, Debug, ValueEnum, PartialEq, Eq)]
@@ -31,48 +31,48 @@ enum DurabilityArg {
 
 /// Publish messages on a topic, in JSON or YAML
 ///
-/// The node that runs here publishes them on its local network, as a program of it would: what is shared goes to the far
-/// side. Members that are left out have their defaults. Without MESSAGE, a message a line is read from standard input.
+/// The node that runs here publishes the messages on its local network like any program there, and shared topics go to the
+/// far side. Omitted members have their defaults. Without MESSAGE, each line of standard input is a message.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   sgc topic pub /cmd_vel geometry_msgs/msg/Twist '{linear: {x: 0.5}}' --rate 10
   sgc topic pub --once /arm/mode 'data: hello'")]
 pub(crate) struct PubArgs {
-    /// The topic
+    /// Name of the topic
     topic: String,
-    /// Its type; may be left out if the topic is there already
+    /// Type of the topic; may be omitted if the topic exists already
     #[arg(value_name = "TYPE")]
     first: Option<String>,
-    /// The message
+    /// Message in JSON or YAML
     #[arg(value_name = "MESSAGE")]
     second: Option<String>,
-    /// Messages a second
+    /// Messages per second
     #[arg(short, long, value_name = "HZ", default_value_t = 1.0)]
     rate: f64,
-    /// Publish once, when there is a subscriber, and end
+    /// Wait for a subscriber, publish once and end
     #[arg(short = '1', long, conflicts_with = "count")]
     once: bool,
-    /// End after so many messages
+    /// End after N messages
     #[arg(short = 'n', long, value_name = "N")]
     count: Option<u64>,
-    /// Wait for so many subscribers on the local network first, the node's own for the far side among them [default: 1 with --once, else 0]
+    /// Wait first for N subscribers on the local network, including the node's own for the far side [default: 1 with --once, else 0]
     #[arg(short, long, value_name = "N")]
     wait: Option<u32>,
-    /// For so long at most, seconds
+    /// Longest time to wait for subscribers
     #[arg(long, value_name = "SECONDS", default_value_t = WAIT_DEFAULT_S)]
     timeout: u64,
     #[arg(long, value_enum, default_value = "reliable")]
     reliability: ReliabilityArg,
     #[arg(long, value_enum, default_value = "volatile")]
     durability: DurabilityArg,
-    /// Messages that are kept for who reads slowly or comes later
+    /// Number of messages kept for slow or late subscribers
     #[arg(long, value_name = "N")]
     depth: Option<u32>,
     #[command(flatten)]
     node: NodeArgs,
 }
 
-/// A node that publishes.
+/// A running node that publishes for this command.
 struct Publisher {
     socket: PathBuf,
     from: BufReader<UnixStream>,
@@ -106,7 +106,7 @@ impl Publisher {
         }
     }
 
-    /// Publishes a message; says how many subscribers there are.
+    /// Publishes a message and returns the number of subscribers.
     fn publish(&mut self, json: &str) -> Result<u32, CliError> {
         let written = self.into.write_all(json.as_bytes()).and_then(|()| self.into.write_all(b"\n"));
         written.map_err(|error| self.broken(&error))?;

@@ -1,4 +1,4 @@
-//! `sgc topic hz`, `bw` and `delay`: how often messages come, how large they are, and how old.
+//! `sgc topic hz`, `bw` and `delay`: measure rate, bandwidth and age of messages.
 
 use std::collections::VecDeque;
 use std::path::PathBuf;
@@ -13,24 +13,24 @@ use super::{TapArgs, echo};
 use crate::error::CliError;
 use crate::output;
 
-/// How often figures are shown.
+/// The period of the reports.
 const REPORT_EVERY: Duration = Duration::from_secs(1);
 
-/// Show how often messages of a topic come
+/// Measure the rate of a topic's messages
 #[derive(Debug, Args)]
 pub(crate) struct HzArgs {
     #[command(flatten)]
     rates: RateArgs,
 }
 
-/// Show how many bytes a second a topic has
+/// Measure the bandwidth of a topic in bytes per second
 #[derive(Debug, Args)]
 pub(crate) struct BwArgs {
     #[command(flatten)]
     rates: RateArgs,
 }
 
-/// Show how old the messages of a topic are by the stamp of their header, which is the clock of their publisher's host
+/// Measure the age of a topic's messages by the stamp of their header, which comes from the clock of the publisher's host
 #[derive(Debug, Args)]
 pub(crate) struct DelayArgs {
     #[command(flatten)]
@@ -44,10 +44,10 @@ pub(crate) struct DelayArgs {
 struct RateArgs {
     #[command(flatten)]
     tap: TapArgs,
-    /// Messages that figures are made of
+    /// Number of messages from which figures are computed
     #[arg(short, long, default_value_t = 1000, value_parser = clap::value_parser!(u32).range(2..=1_000_000))]
     window: u32,
-    /// End after so many reports
+    /// End after N reports
     #[arg(short = 'n', long, value_name = "N")]
     count: Option<u64>,
 }
@@ -72,7 +72,7 @@ pub(super) fn delay(args: &DelayArgs) -> Result<ExitCode, CliError> {
     report(&args.rates, HEADER_STAMP_BYTES as u32, old, ages)
 }
 
-/// What was measured of the last messages: when each was seen, seconds, and the figure.
+/// The last messages: for each, the time in seconds at which it was seen, and the figure.
 type Window = VecDeque<(f64, f64)>;
 
 fn report(
@@ -107,7 +107,7 @@ fn report(
                     }
                 }
             }
-            // Too early for its patience: there is no more.
+            // The tap gave up before its patience ended: the stream is over.
             None if Instant::now() < due => break,
             None => {}
         }
@@ -147,7 +147,7 @@ fn rate(window: &Window) -> Option<String> {
 fn bandwidth(window: &Window) -> Option<String> {
     let Spread { least, most, mean, .. } = spread(window.iter().map(|(_, bytes)| *bytes))?;
     let span = window.back()?.0 - window.front()?.0;
-    // The first message begins the time in which the others came.
+    // The first message only marks the beginning of the time span.
     let all: f64 = window.iter().skip(1).map(|(_, bytes)| bytes).sum();
     let second = if span > 0.0 { all / span } else { 0.0 };
     let [second, mean, least, most] = [second, mean, least, most].map(|bytes| output::bytes(bytes as u64));
@@ -170,7 +170,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn figures_are_those_of_the_window() {
+    fn figures_follow_from_window() {
         let window: Window = [(0.0, 100.0), (0.1, 200.0), (0.2, 300.0)].into();
         let rate = rate(&window).unwrap();
         assert_eq!(rate, "average rate: 10.000\n\tmin: 0.100s max: 0.100s std dev: 0.00000s window: 3");

@@ -1,6 +1,6 @@
-//! The walk: from the local end to the link, or from the link to the local end, up to the first thing that is wrong.
+//! The walk: follows a path from the local end to the link, or from the link to the local end, up to the first fault.
 //!
-//! Pure: a document in, steps out.
+//! Pure: takes a document and returns steps.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -14,14 +14,13 @@ use super::near::{hint, near};
 use super::refusals;
 use super::{Step, Verdict};
 
-/// Steps, of which one that is wrong is the last.
+/// The steps of a walk. A fault is the last of them.
 type Walk = Vec<Step>;
 
-/// Lost calls are a fault for so long, in seconds, unless calls are answered before.
+/// Time in seconds for which lost calls count as a fault, unless calls are answered before.
 const LOST_CALLS_FRESH_S: u64 = 600;
 
-/// The beginning of each walk: whether the node runs, and what an operator has to see to. `true` if that is why nothing
-/// flows.
+/// Begins a walk with the node itself and the alerts that need an operator. Returns `true` if one of them stops all traffic.
 fn begin(graph: &Graph) -> (Walk, bool) {
     let mut steps = vec![Step::fine(format!("{} runs, sgc {}", graph.node, graph.version))];
     let is_clock = |alert: &&Alert| matches!(alert, Alert::ClocksDiffer { .. });
@@ -34,7 +33,7 @@ fn begin(graph: &Graph) -> (Walk, bool) {
     (steps, !stopping.is_empty())
 }
 
-/// Why an interface of the local network does not flow.
+/// Explains why an interface of the local network does not flow.
 pub(super) fn interface(graph: &Graph, topic: &str) -> Walk {
     let (mut steps, is_over) = begin(graph);
     if is_over {
@@ -64,8 +63,8 @@ pub(super) fn interface(graph: &Graph, topic: &str) -> Walk {
     steps
 }
 
-/// Says which calls of a service, or of the parts of an action or of parameters, got no answer. That is a fault if nothing else is, until
-/// calls are answered again; ahead of another fault it is what that one led to.
+/// Reports unanswered calls of a service, or of the parts of an action or of parameters. They are a fault if there is no other,
+/// until calls are answered again. Ahead of another fault they are its consequence.
 fn lost_calls(graph: &Graph, topic: &str, steps: &mut Walk) {
     let kinds = [sgc_ros::Interface::Action, sgc_ros::Interface::Parameters];
     let parts = kinds.into_iter().flat_map(|kind| kind.parts()).map(|part| part.name(topic));
@@ -81,7 +80,7 @@ fn lost_calls(graph: &Graph, topic: &str, steps: &mut Walk) {
 }
 
 fn lost_step(calls: &ServiceCalls, lost: &LostCalls) -> Step {
-    let (means, fix) = refusals::of_calls(&lost.reason).unwrap_or(("for another reason", ""));
+    let (means, fix) = refusals::call_loss(&lost.reason).unwrap_or(("for another reason", ""));
     let side = if calls.is_served { "calls of others to the server here" } else { "calls of clients here" };
     let by: Vec<_> = lost.by.iter().map(|(caller, count)| format!("{count} of {caller}")).collect();
     let by = if by.is_empty() { String::new() } else { format!(", among them {}", by.join(", ")) };
@@ -89,7 +88,7 @@ fn lost_step(calls: &ServiceCalls, lost: &LostCalls) -> Step {
         "{}: {} {side} got no answer{by}, the last {} s ago: {} ({means})",
         calls.topic, lost.count, lost.last_s, lost.reason
     );
-    // A client may end whenever it likes.
+    // A client that ends before its reply is no fault.
     let is_fault =
         lost.since_answer > 0 && lost.last_s <= LOST_CALLS_FRESH_S && lost.reason != "call_client_gone";
     let step = if is_fault { Step::wrong(found, fix) } else { Step::unknown(found) };
@@ -99,8 +98,8 @@ fn lost_step(calls: &ServiceCalls, lost: &LostCalls) -> Step {
 /// The walk of one rule.
 struct RuleWalk {
     steps: Walk,
-    /// Whether the rule may be wrong for this interface while the interface flows by another rule: its wildcard covers more
-    /// than its owner offers, or nobody here takes part in this direction.
+    /// The rule may be wrong for this interface while the interface flows by another rule: its wildcard covers more than its
+    /// owner offers, or no program here takes part in this direction.
     is_optional: bool,
 }
 
@@ -110,7 +109,7 @@ impl RuleWalk {
     }
 }
 
-/// The walks of all rules that name an interface or by which it runs.
+/// Returns the walks of all rules that name an interface or carry it.
 fn walks(graph: &Graph, topic: &str) -> Vec<RuleWalk> {
     let shares = graph.shares.iter().enumerate().filter(|(at, share)| covers(graph, *at, share, topic));
     let shares = shares.map(|(_, share)| {
@@ -128,8 +127,8 @@ fn walks(graph: &Graph, topic: &str) -> Vec<RuleWalk> {
     shares.chain(uses).collect()
 }
 
-/// One walk of several rules. Where the interface flows by one of them, the faults of optional rules are no faults of the
-/// interface; where it flows by none, the first fault is enough.
+/// Merges the walks of several rules. If the interface flows by one of them, faults of optional rules do not count. If it
+/// flows by none, the first fault is enough.
 fn merged(walks: Vec<RuleWalk>) -> Walk {
     let (wrong, mut sound): (Vec<_>, Vec<_>) = walks.into_iter().partition(RuleWalk::is_wrong);
     let (optional, required): (Vec<_>, Vec<_>) =
@@ -144,7 +143,7 @@ fn merged(walks: Vec<RuleWalk>) -> Walk {
     sound.extend(required.into_iter().next());
     let mut steps = Walk::new();
     for step in sound.into_iter().flat_map(|walk| walk.steps) {
-        // Rules have most of the way in common.
+        // Rules share most of their steps.
         if step.verdict == Verdict::Wrong || !steps.contains(&step) {
             steps.push(step);
         }
@@ -152,7 +151,7 @@ fn merged(walks: Vec<RuleWalk>) -> Walk {
     steps
 }
 
-/// The walk of a rule whose wildcard covers an interface that does not run: the one whose owner offers it, else one that
+/// Returns the walk of a rule whose wildcard covers an idle interface. Prefers the rule whose owner offers it to a rule that
 /// programs here wait for.
 fn pattern_walk(graph: &Graph, topic: &str) -> Option<RuleWalk> {
     let covering =
@@ -172,7 +171,7 @@ fn pattern_walk(graph: &Graph, topic: &str) -> Option<RuleWalk> {
         let (providers, consumers) = ends(graph, kind, topic);
         !providers.is_empty() || !consumers.is_empty()
     });
-    // Programs here that the rule is not for are the question then.
+    // The local programs do not match the rule, so the missing offer is not the fault.
     if has_ends && !is_offered(used) && !is_here(used) {
         return None;
     }
@@ -181,7 +180,7 @@ fn pattern_walk(graph: &Graph, topic: &str) -> Option<RuleWalk> {
     Some(RuleWalk { steps, is_optional: true })
 }
 
-/// The owner's name of an interface that a use calls `topic` here.
+/// Returns the name at the owner of an interface that a use calls `topic` here.
 fn name_at_owner(used: &Use, topic: &str) -> String {
     if !is_pattern(&used.topic) {
         return used.topic.clone();
@@ -195,15 +194,14 @@ fn name_at_owner(used: &Use, topic: &str) -> String {
     }
 }
 
-/// Walks what an action, or the parameters of a node, are made of, up to the part that is wrong; false if no rule is for any
-/// of it.
+/// Walks the parts of an action or of a node's parameters, up to the first fault. Returns `false` if no rule covers any part.
 fn walk_parts(graph: &Graph, topic: &str, steps: &mut Walk) -> bool {
     let kinds = [sgc_ros::Interface::Action, sgc_ros::Interface::Parameters];
     let mut is_any = false;
     for part in kinds.into_iter().flat_map(|kind| kind.parts()) {
         let for_part = merged(walks(graph, &part.name(topic)));
         is_any |= !for_part.is_empty();
-        // The parts have most of the way in common.
+        // The parts share most of their steps.
         let known: BTreeSet<String> = steps.iter().map(|step| step.found.clone()).collect();
         steps.extend(for_part.into_iter().filter(|step| !known.contains(&step.found)));
         if steps.iter().any(|step| step.verdict == Verdict::Wrong) {
@@ -213,7 +211,7 @@ fn walk_parts(graph: &Graph, topic: &str, steps: &mut Walk) -> bool {
     is_any
 }
 
-/// Why a name does not flow, at a router.
+/// Explains why a name does not flow, at a router.
 pub(super) fn name(graph: &Graph, name: &str) -> Walk {
     let (mut steps, is_over) = begin(graph);
     if is_over {
@@ -261,19 +259,20 @@ pub(super) fn name(graph: &Graph, name: &str) -> Walk {
     steps
 }
 
-/// Whether a rule shares this, or what runs of it is called so here.
+/// Returns `true` if a share names this topic, or one of its routes is called so here.
 fn covers(graph: &Graph, at: usize, share: &Share, topic: &str) -> bool {
     let is_named = share.topic == topic || share.routes.iter().any(|route| route.topic == topic);
     is_named || graph.endpoints.iter().any(|e| e.topic == topic && e.shared_by == Some(at))
 }
 
-/// Whether a use names this, or it runs by it. A wildcard promises nothing: its owner may offer no such interface.
+/// Returns `true` if a use names this topic, or one of its routes carries it. A wildcard alone does not count, because its
+/// owner may not offer the interface.
 fn concerns(used: &Use, topic: &str) -> bool {
     let runs = used.routes.iter().any(|route| route.topic == topic);
     runs || used.routes.is_empty() && used.local_topic == topic
 }
 
-/// The local ends of an interface: who provides it, and who wants it.
+/// Returns the local endpoints that provide an interface, and those that want it.
 fn ends<'a>(graph: &'a Graph, kind: Interface, topic: &str) -> (Vec<&'a Endpoint>, Vec<&'a Endpoint>) {
     let dds = match kind {
         Interface::Topic => topic.to_owned(),
@@ -282,11 +281,11 @@ fn ends<'a>(graph: &'a Graph, kind: Interface, topic: &str) -> (Vec<&'a Endpoint
     };
     let is_topic = kind == Interface::Topic;
     let all = graph.endpoints.iter().filter(|e| e.topic == dds && e.is_ros_topic == is_topic);
-    // Who answers a service reads its requests.
+    // A server of a service reads its requests.
     all.partition(|e| e.writes == is_topic)
 }
 
-/// Type of an interface, of the type of its end.
+/// Returns the type of an interface by the type of its endpoint.
 fn type_of(kind: Interface, end: &Endpoint) -> &str {
     let suffix = match kind {
         Interface::Topic => "",
@@ -304,7 +303,7 @@ fn consumer(kind: Interface) -> &'static str {
     if kind == Interface::Topic { "subscriber" } else { "client" }
 }
 
-/// What to say of an interface that no rule names.
+/// Explains an interface that no rule names.
 fn uncovered(graph: &Graph, topic: &str) -> Step {
     let node = &graph.node;
     if let Some(offer) = graph.offers.iter().find(|offer| offer.topic == topic && !offer.is_used) {
@@ -371,7 +370,7 @@ fn uncovered(graph: &Graph, topic: &str) -> Step {
     )
 }
 
-/// From the local publishers to the far side, on what this node shares.
+/// Walks a share from the local publishers to the far side.
 fn walk_share(graph: &Graph, share: &Share, topic: &str, steps: &mut Walk) {
     let kind = share.kind;
     let (providers, _) = ends(graph, kind, topic);
@@ -416,7 +415,7 @@ fn walk_share(graph: &Graph, share: &Share, topic: &str, steps: &mut Walk) {
     steps.push(Step::fine(format!("a [[share]] covers it, for {}", whom(share.to))));
     let is_granted = routes.iter().any(|route| !route.granted.is_empty());
     for step in unheard(graph, share) {
-        // A misspelt name is why nobody has it, if nobody has it.
+        // A misspelt name explains that no node has the topic.
         let is_misspelt = step.fix.is_some();
         if is_misspelt && !is_granted {
             steps.push(Step { verdict: Verdict::Wrong, ..step });
@@ -442,7 +441,7 @@ fn walk_share(graph: &Graph, share: &Share, topic: &str, steps: &mut Walk) {
     }
 }
 
-/// Subscribers of another node have another definition of the type than the publishers here.
+/// Reports a type whose definition differs between subscribers of another node and the publishers here.
 fn definitions_differ(graph: &Graph, route: &ShareRoute) -> Option<Step> {
     let (publishers, _) = ends(graph, Interface::Topic, &route.topic);
     let ours = publishers.iter().find_map(|end| end.type_hash.as_deref())?;
@@ -460,7 +459,7 @@ fn definitions_differ(graph: &Graph, route: &ShareRoute) -> Option<Step> {
     ))
 }
 
-/// The members that a share names and of which this node has not heard; first those that are misspelt.
+/// Returns a step for each member that a share names and this node has never heard of, misspelt ones first.
 fn unheard(graph: &Graph, share: &Share) -> Vec<Step> {
     let misspelt = share.unheard.iter().filter_map(|member| Some((&member.name, member.meant.as_ref()?)));
     let misspelt = misspelt.map(|(name, meant)| {
@@ -578,7 +577,7 @@ fn walk_share_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: 
     }
     if route.is_written {
         if !readers(graph, kind, topic, &route.type_name, None, route.matched, steps) {
-            // Local publishers flow all the same; others may publish here, and need not.
+            // Messages of local publishers flow anyway; the permitted members need not publish here.
             if let Some(last) = steps.last_mut().filter(|_| provides && ends(graph, kind, topic).1.is_empty())
             {
                 last.verdict = Verdict::Unknown;
@@ -594,7 +593,7 @@ fn walk_share_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: 
     far_half(&route.granted.join(", "), topic, steps);
 }
 
-/// From the owner to the local subscribers, or from the local publishers to the owner.
+/// Walks a use from the owner to the local subscribers, or from the local publishers to the owner.
 fn walk_use(graph: &Graph, used: &Use, topic: &str, steps: &mut Walk) {
     let (node, owner, kind) = (&graph.node, &used.owner, used.kind);
     let wish = if used.publishes { "publishes on" } else { "brings" };
@@ -649,7 +648,7 @@ fn walk_use(graph: &Graph, used: &Use, topic: &str, steps: &mut Walk) {
     }
 }
 
-/// Why nothing of a rule runs, though its owner is known.
+/// Explains why a rule carries nothing although its owner is known.
 fn unlisted(graph: &Graph, used: &Use, topic: &str) -> Step {
     let (node, owner) = (&graph.node, &used.owner);
     if used.is_token {
@@ -844,7 +843,7 @@ fn walk_publishing(graph: &Graph, used: &Use, route: &UseRoute, line: &NameLine,
     far_half(owner, &used.topic, steps);
 }
 
-/// Whether local readers get what is written for them; false if something is wrong.
+/// Checks that local readers get the messages that are written for them. Returns `false` if there is a fault.
 fn readers(
     graph: &Graph,
     kind: Interface,
@@ -926,7 +925,7 @@ fn readers(
     true
 }
 
-/// Whether this node has a link that works; says so.
+/// Reports whether this node has a working link.
 fn linked(graph: &Graph, steps: &mut Walk) -> bool {
     if let Some(link) = graph.links.iter().find(|link| !link.silent) {
         steps.push(Step::fine(format!("linked: {}", link_of(graph, link.id))));
@@ -976,17 +975,17 @@ fn silent(graph: &Graph, link: u32) -> Step {
     )
 }
 
-/// What went by, and what was dropped of it and why.
+/// Reports the traffic of a name and its drops with their reasons.
 fn traffic(line: &NameLine, what: &str, steps: &mut Walk) {
     if line.packets > 0 {
         let bytes = crate::output::bytes(line.bytes);
         steps.push(Step::fine(format!("{} packets ({bytes}) {what}", line.packets)));
     }
-    // Packets that came before anybody asked, or after, are nobody's loss.
+    // Packets without a subscriber are no loss to anybody.
     let lost: BTreeMap<_, _> = line.dropped.iter().filter(|(reason, _)| *reason != "no_subscriber").collect();
     let Some((worst, _)) = lost.iter().max_by_key(|(_, count)| **count) else { return };
     let all: Vec<_> = lost.iter().map(|(reason, count)| format!("{reason} {count}")).collect();
-    let (means, fix) = refusals::of_packets(worst)
+    let (means, fix) = refusals::packet_drop(worst)
         .map_or(("for another reason", ""), |refusal| (refusal.means, refusal.fix));
     let fix = if fix.is_empty() { "`sgc status` shows all drops" } else { fix };
     let found = format!("dropped here: {} ({means})", all.join(", "));
@@ -1015,7 +1014,7 @@ fn far_half(who: &str, topic: &str, steps: &mut Walk) {
     );
 }
 
-/// What the user was told of a topic, or something else.
+/// Returns the problem that the node reports about a topic, or `otherwise`.
 fn told(graph: &Graph, topic: &str, otherwise: &str) -> String {
     let begin = format!("{topic}: ");
     graph.problems.iter().find_map(|p| p.strip_prefix(&begin)).unwrap_or(otherwise).to_owned()
@@ -1045,7 +1044,7 @@ fn millis(us: u32) -> String {
     crate::output::millis(us.into())
 }
 
-/// Enough of a hash to tell it from another.
+/// Shortens a hash to a length that still identifies it.
 fn short_hash(hash: &str) -> String {
     hash.chars().take("RIHS01_".len() + 12).collect()
 }

@@ -1,7 +1,7 @@
-//! `sgc why`: the first thing that is wrong on the way of a topic, service or action.
+//! `sgc why`: finds the first fault on the path of a topic, service or action.
 //!
-//! The node says what it knows ([`sgc_node::graph::Graph`]); [`diagnose`] walks the way in it, without asking anybody
-//! anything more.
+//! The node answers with its whole state ([`sgc_node::graph::Graph`]). [`diagnose`] follows the path in it and asks nothing
+//! else.
 
 mod diagnose;
 mod near;
@@ -22,16 +22,16 @@ use crate::error::{CliError, EXIT_FAILURE};
 use crate::topic::NodeArgs;
 use crate::{output, run};
 
-/// Say why a topic, service or action does not flow: walk its way and name the first thing that is wrong
+/// Explain why a topic, service or action does not flow: follow its path and name the first fault
 ///
-/// Each node knows its own half of the way: run it on the other side as well if all is well on this one. Exit code 0: nothing
-/// is wrong here; 1: something is, or no node runs.
+/// Each node knows its own half of the path. If this side is fine, run the command on the other side as well. Exit code 0
+/// means that nothing is wrong here; 1 means that something is, or that no node runs.
 #[derive(Debug, Args)]
 pub(crate) struct WhyArgs {
-    /// Topic, service or action, as it is called on this node's local network
+    /// Topic, service or action, by its name on this node's local network
     #[arg(required_unless_present = "name", conflicts_with = "name")]
     topic: Option<String>,
-    /// A 256-bit name instead, for routers, which know no other: what `sgc name` and `sgc status` show
+    /// 256-bit name in place of a topic, as `sgc name` and `sgc status` show it; routers know no other
     #[arg(long, value_name = "HEX")]
     name: Option<String>,
     #[command(flatten)]
@@ -41,25 +41,25 @@ pub(crate) struct WhyArgs {
     json: bool,
 }
 
-/// What a step came to.
+/// The result of a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Verdict {
-    /// It is as it should be.
+    /// The step is in order.
     Fine,
-    /// It is not.
+    /// The step has a fault.
     Wrong,
-    /// It cannot be known here, or need not be wrong.
+    /// This node cannot know, or the finding need not be a fault.
     Unknown,
 }
 
-/// A step of the way.
+/// One step of the path.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub(crate) struct Step {
     verdict: Verdict,
-    /// What was found.
+    /// The finding.
     found: String,
-    /// What to do about it.
+    /// The advice how to mend it.
     #[serde(skip_serializing_if = "Option::is_none")]
     fix: Option<String>,
 }
@@ -113,14 +113,14 @@ pub(crate) fn why(args: &WhyArgs) -> Result<ExitCode, CliError> {
     Ok(if is_wrong { ExitCode::from(EXIT_FAILURE) } else { ExitCode::SUCCESS })
 }
 
-/// The first thing that is wrong on the way of a topic of the node at this socket, with the fix, as one line each.
+/// Returns the first fault on the path of a topic of the node at this socket, and its fix, as one line each.
 pub(crate) fn first_wrong(socket: &Path, topic: &str) -> Option<Vec<String>> {
     let graph = NodeArgs::at(socket).graph(None).ok()?;
     let step = diagnose::interface(&graph, topic).into_iter().find(|step| step.verdict == Verdict::Wrong)?;
     Some([Some(step.found), step.fix].into_iter().flatten().map(|line| output::clean(&line)).collect())
 }
 
-/// The steps that the node's answer leads to; where none answers, that is the step.
+/// Returns the steps that follow from the node's answer. If no node answers, that is the only step.
 fn graph(
     args: &WhyArgs,
     name: Option<Name>,

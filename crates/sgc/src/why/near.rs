@@ -1,11 +1,11 @@
-//! Names that somebody may have meant.
+//! Finds names that a user may have meant by a misspelt one.
 
-/// Names that are shown at most.
+/// Most names shown.
 const SHOWN_MAX: usize = 3;
-/// Longest names that are compared letter by letter, bytes.
+/// Longest name that is compared letter by letter, in bytes.
 const COMPARED_BYTES_MAX: usize = 256;
 
-/// Those of `candidates` that are nearly `name`: in another namespace, in other letters, or a few letters away.
+/// Returns the `candidates` close to `name`: in another namespace, in other case, or a few letters away.
 pub(super) fn near<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> Vec<&'a str> {
     let mut found: Vec<(usize, &str)> = candidates
         .into_iter()
@@ -17,7 +17,7 @@ pub(super) fn near<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>
     found.into_iter().take(SHOWN_MAX).map(|(_, candidate)| candidate).collect()
 }
 
-/// `"; did you mean /a or /b?"`, or nothing.
+/// Formats `"; did you mean /a or /b?"`, or nothing.
 pub(super) fn hint(near: &[&str]) -> String {
     match near {
         [] => String::new(),
@@ -25,7 +25,7 @@ pub(super) fn hint(near: &[&str]) -> String {
     }
 }
 
-/// How far apart two names are; `None` if they are others.
+/// Returns the distance of two names, or `None` if they are too different.
 fn distance(a: &str, b: &str) -> Option<usize> {
     if a.len() > COMPARED_BYTES_MAX || b.len() > COMPARED_BYTES_MAX {
         return None;
@@ -41,7 +41,7 @@ fn distance(a: &str, b: &str) -> Option<usize> {
     (edits <= (a.len() / 5).clamp(1, 3)).then_some(edits + 1)
 }
 
-/// Letters to be put in, taken out or replaced (Levenshtein).
+/// Returns the number of insertions, deletions and replacements (Levenshtein).
 fn edits(a: &[u8], b: &[u8]) -> usize {
     let mut row: Vec<usize> = (0..=b.len()).collect();
     for (i, x) in a.iter().enumerate() {
@@ -61,7 +61,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_that_were_meant_are_found() {
+    fn similar_names_are_found() {
         let all = ["/chatter", "/robot/chatter", "/Chater", "/chat", "/scan", "/CHATTER"];
         assert_eq!(near("/chatter", all), ["/CHATTER", "/robot/chatter"]);
         assert_eq!(near("/chater", all), ["/Chater", "/chatter"]);

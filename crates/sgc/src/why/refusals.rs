@@ -1,4 +1,4 @@
-//! The meaning and the remedy of each refusal: the one table that `sgc why` and `sgc status` explain counters by.
+//! The meaning and the remedy of each refusal: the table from which `sgc why` and `sgc status` explain counters.
 //!
 //! The specification of routing lists the counters, and the node keeps them. `tests/documents` compares both with this table.
 
@@ -11,7 +11,7 @@ use sgc_wire::{RefuseReason, RejectReason};
 
 use super::{Step, diagnose};
 
-/// Most refusals that `sgc why` names before it walks: those that were counted most.
+/// Most refusals that `sgc why` reports before its walk, by descending count.
 const NAMED_MAX: usize = 8;
 
 /// A counter's explanation.
@@ -21,9 +21,9 @@ pub struct Refusal {
     pub key: &'static str,
     /// The meaning.
     pub means: &'static str,
-    /// The user's remedy; empty where nothing has to be done.
+    /// The user's remedy; empty if there is nothing to do.
     pub fix: &'static str,
-    /// True if an honest network never causes it, or somebody has to see to it: `sgc why` names it for any topic.
+    /// `sgc why` reports the refusal for any topic, because a sound network never causes it or an operator has to act.
     pub is_named: bool,
 }
 
@@ -67,12 +67,12 @@ pub const COUNTERS: [CounterTable; 5] = [
     },
 ];
 
-/// A refusal that somebody has to see to.
+/// Returns a refusal on which an operator has to act.
 const fn named(key: &'static str, means: &'static str, fix: &'static str) -> Refusal {
     Refusal { key, means, fix, is_named: true }
 }
 
-/// A refusal that happens where nothing is wrong, or that the walk of a topic names.
+/// Returns a refusal that happens in a sound network, or that the walk of a topic reports.
 const fn counted(key: &'static str, means: &'static str, fix: &'static str) -> Refusal {
     Refusal { key, means, fix, is_named: false }
 }
@@ -95,7 +95,7 @@ const FEWER: &str = "subscribe to and publish less in one client, or spread it o
 const SLOW_CLIENTS: &str = "if it is somebody who connects again and again, keep the address out by a firewall; programs of this \
                             host have places of their own";
 
-/// Control frames, the machines, the authority and the local network.
+/// Refusals of control frames, of the machines, of the authority and of the local network.
 const CONTROL: &[Refusal] = &[
     named(
         "not_verified",
@@ -378,7 +378,7 @@ const CONTROL: &[Refusal] = &[
     ),
 ];
 
-/// Packets and messages of a name.
+/// Refusals of packets and messages of a name.
 const PACKETS: &[Refusal] = &[
     counted("no_subscriber", "nobody asked for it yet, or any more", ""),
     counted(
@@ -504,7 +504,7 @@ const SINK: &[Refusal] = &[
     ),
 ];
 
-/// Peers that wanted a link.
+/// Refusals of peers that requested a link.
 const DOOR: &[Refusal] = &[
     named(
         "no_certificate",
@@ -561,7 +561,7 @@ const DOOR: &[Refusal] = &[
     counted("transport", "the connection broke while it was made", ""),
 ];
 
-/// Programs at the gateway.
+/// Refusals of programs at the gateway.
 const GATEWAY: &[Refusal] = &[
     named("too many clients", "all places for clients are taken", RAISE_CLIENTS),
     named(
@@ -623,10 +623,10 @@ const GATEWAY: &[Refusal] = &[
     ),
 ];
 
-/// Answers of an owner, or of a router on the way, to a node that asks for a topic; the remedy at the owner, and that at the
-/// node that asked.
+/// Refusals of a join by an owner, or by a router on the path, with the remedy at the owner and the one at the node that
+/// asked.
 const JOINS: &[(Answer, &str, &str)] = &[
-    // The walk itself says what to add to `to`.
+    // The walk itself names the entry to add to `to`.
     (Answer::Owner(RefuseReason::NotPermitted), "", ""),
     (Answer::Owner(RefuseReason::NotShared), "it asks for what is shared no more; it will hear of that", ""),
     (Answer::Owner(RefuseReason::NotVerified), SAME_VERSION, SAME_VERSION),
@@ -674,7 +674,7 @@ enum Answer {
 }
 
 impl Answer {
-    /// As nodes of this version say it.
+    /// Returns `true` if nodes of this version word the refusal like this.
     fn is_said_as(self, text: &str) -> bool {
         match self {
             Self::Owner(reason) => reason.to_string() == text,
@@ -683,12 +683,12 @@ impl Answer {
     }
 }
 
-/// Returns what the owner of a topic can do about a refusal of its own, unless the policy is why.
+/// Returns the remedy at the owner that refused a topic, unless its policy is the reason.
 pub(super) fn fix_at_owner(why: &str) -> Option<&'static str> {
     fixes(why).map(|(owner, _)| owner).filter(|fix| !fix.is_empty())
 }
 
-/// Returns what a node can do that a topic is refused to, unless the owner's policy is why.
+/// Returns the remedy at the node to which a topic is refused, unless the owner's policy is the reason.
 pub(super) fn fix_at_asker(why: &str) -> Option<&'static str> {
     fixes(why).map(|(_, asker)| asker).filter(|fix| !fix.is_empty())
 }
@@ -697,7 +697,7 @@ fn fixes(why: &str) -> Option<(&'static str, &'static str)> {
     JOINS.iter().find(|(answer, ..)| answer.is_said_as(why)).map(|(_, owner, asker)| (*owner, *asker))
 }
 
-/// Returns what this node's user can do about a link that is refused, at either end, for the reason that `why` ends with.
+/// Returns the remedy for a link that either end refused, by the reason at the end of `why`.
 pub(super) fn fix_of_link(why: &str) -> Option<&'static str> {
     let other_fleet = "`sgc check -c FILE` says of which fleet this node's identity is. If it is the wrong one, bring the right file here; if \
          the router is of another fleet on purpose, name this fleet's CA in `accept` there, and its CA in `trust` of [node] here";
@@ -718,13 +718,13 @@ pub(super) fn fix_of_link(why: &str) -> Option<&'static str> {
     fixes.into_iter().find(|(said, _)| why.ends_with(said.as_str())).map(|(_, fix)| fix)
 }
 
-/// Returns what a dropped packet or message of a name means.
-pub(super) fn of_packets(key: &str) -> Option<&'static Refusal> {
+/// Returns the explanation of a drop of packets or messages.
+pub(super) fn packet_drop(key: &str) -> Option<&'static Refusal> {
     find(PACKETS, key)
 }
 
-/// Returns the meaning and the remedy of a reason for which calls are lost.
-pub(super) fn of_calls(key: &str) -> Option<(&'static str, &'static str)> {
+/// Returns the meaning and the remedy of a reason for lost calls.
+pub(super) fn call_loss(key: &str) -> Option<(&'static str, &'static str)> {
     if key == "overrun" {
         let means = "requests or replies came faster than they were taken, more than may wait";
         return Some((means, "have the programs on the local network make fewer calls at a time"));
@@ -732,7 +732,7 @@ pub(super) fn of_calls(key: &str) -> Option<(&'static str, &'static str)> {
     find(CONTROL, key).map(|refusal| (refusal.means, refusal.fix))
 }
 
-/// Returns what a row of `sgc status`, Drops, means.
+/// Returns the meaning of a row of `sgc status`, Drops.
 pub(crate) fn drop_meaning(row: &str) -> String {
     let key = row.split(" from ").next().unwrap_or(row);
     let all = [CONTROL, PACKETS, SINK].map(|table| find(table, key));
@@ -741,17 +741,17 @@ pub(crate) fn drop_meaning(row: &str) -> String {
     all.join("; or ")
 }
 
-/// Returns what a row of `sgc status`, Refused peers, means.
+/// Returns the meaning of a row of `sgc status`, Refused peers.
 pub(crate) fn door_meaning(row: &str) -> String {
     find(DOOR, row).map_or_else(String::new, |refusal| refusal.means.to_owned())
 }
 
-/// Returns what a row of refused clients of the gateway means.
+/// Returns the meaning of a row of refused clients of the gateway.
 pub(crate) fn gateway_meaning(row: &str) -> String {
     find(GATEWAY, row).map_or_else(String::new, |refusal| refusal.means.to_owned())
 }
 
-/// Returns a step for each refusal that somebody has to see to, with the links that are up which cause it.
+/// Returns a step for each refusal on which an operator has to act, with the current links that cause it.
 pub(super) fn steps(graph: &Graph) -> Vec<Step> {
     let counts = [
         ("refused here", CONTROL, &graph.drops),
@@ -773,7 +773,7 @@ pub(super) fn steps(graph: &Graph) -> Vec<Step> {
     all.into_iter().take(NAMED_MAX).map(|(_, step)| step).collect()
 }
 
-/// The links that are up and cause a refusal, by whom they lead to.
+/// Returns the peers of current links that cause a refusal.
 fn culprits(graph: &Graph, key: &str) -> String {
     let of_link = |link: &sgc_node::graph::Link| {
         let count = graph.drops.get(&format!("{key} from link {}", link.id))?;
@@ -798,7 +798,7 @@ pub(super) mod tests {
     use super::*;
     use crate::why::Verdict;
 
-    /// Counters that are named whatever the topic.
+    /// Returns the refusals that are reported for any topic.
     pub(in crate::why) fn every_named_refusal() -> impl IntoIterator<Item = &'static str> {
         CONTROL.iter().filter(|refusal| refusal.is_named).map(|refusal| refusal.key)
     }
@@ -814,7 +814,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn every_answer_to_a_request_has_a_remedy() {
+    fn every_refused_join_has_remedy() {
         use RefuseReason as Refuse;
         use RejectReason as Reject;
         for reason in [
@@ -840,12 +840,12 @@ pub(super) mod tests {
         ] {
             assert!(fix_at_asker(&reason.to_string()).is_some(), "{reason}");
         }
-        // The walk says what to add to the policy.
+        // The walk names the entry to add to the policy.
         assert_eq!(fix_at_owner(&Refuse::NotPermitted.to_string()), None);
     }
 
     #[test]
-    fn each_refusal_is_named_with_its_remedy_and_those_of_a_sound_network_are_not() {
+    fn refusals_are_reported_with_remedy_unless_sound_network_causes_them() {
         for (place, table) in [CONTROL, DOOR, GATEWAY].into_iter().enumerate() {
             for refusal in table {
                 let mut graph = Graph::default();

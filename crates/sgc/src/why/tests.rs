@@ -1,4 +1,4 @@
-//! Every fault that a node can see, each in a document that is otherwise sound.
+//! Tests of every fault that a node can see, each in an otherwise sound document.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,7 @@ use super::{Verdict, diagnose};
 const STRING: &str = "std_msgs/msg/String";
 const NAME: &str = "aa";
 
-/// What is found, and the fault.
+/// The expected finding, and the fault to inject.
 type Case = (&'static str, fn(&mut Graph));
 
 fn end(topic: &str, writes: bool) -> Endpoint {
@@ -49,7 +49,7 @@ fn sound() -> Graph {
     }
 }
 
-/// A node that shares `/a`, and all is well.
+/// Returns the graph of a sound node that shares `/a`.
 fn owner() -> Graph {
     let route = ShareRoute {
         topic: "/a".into(),
@@ -68,7 +68,7 @@ fn owner() -> Graph {
     }
 }
 
-/// A node that uses `/a`, and all is well.
+/// Returns the graph of a sound node that uses `/a`.
 fn user() -> Graph {
     let route = UseRoute {
         topic: "/a".into(),
@@ -103,7 +103,7 @@ fn user() -> Graph {
     Graph { endpoints: vec![end("/a", false)], uses: vec![used], offers: vec![offer], ..sound() }
 }
 
-/// A node that publishes on `/a`, and all is well.
+/// Returns the graph of a sound node that publishes on `/a`.
 fn publisher() -> Graph {
     let mut graph = user();
     graph.endpoints = vec![end("/a", true)];
@@ -114,7 +114,7 @@ fn publisher() -> Graph {
     graph
 }
 
-/// The step that is wrong, and what to do.
+/// Returns the step with the fault, and its remedy.
 fn wrong(graph: &Graph, topic: &str) -> String {
     let steps = diagnose::interface(graph, topic);
     let wrong: Vec<_> = steps.iter().filter(|step| step.verdict == Verdict::Wrong).collect();
@@ -134,7 +134,7 @@ fn named(graph: &Graph) -> Vec<(Verdict, String)> {
 }
 
 #[test]
-fn nothing_is_wrong_where_nothing_is() {
+fn sound_node_has_no_fault() {
     for graph in [owner(), user(), publisher()] {
         let steps = diagnose::interface(&graph, "/a");
         assert!(steps.iter().all(|step| step.verdict != Verdict::Wrong), "{steps:?}");
@@ -144,7 +144,7 @@ fn nothing_is_wrong_where_nothing_is() {
 }
 
 #[test]
-fn each_fault_of_an_owner_is_named() {
+fn each_fault_of_owner_is_named() {
     let cases: Vec<Case> = vec![
         ("touches no ROS 2 network", |g| g.has_ros = false),
         ("no publisher of /a is on the local network (1 subscribers are there)", |g| {
@@ -214,7 +214,7 @@ fn each_fault_of_an_owner_is_named() {
 }
 
 #[test]
-fn each_fault_of_a_user_is_named() {
+fn each_fault_of_user_is_named() {
     let cases: Vec<Case> = vec![
         ("no link is up", |g| g.links.clear()),
         ("arm has not said yet what it shares: nobody in reach knows it", |g| {
@@ -318,7 +318,7 @@ fn each_fault_of_a_user_is_named() {
     }
 }
 
-/// The remedy of the step that is wrong.
+/// Returns the remedy of the step with the fault.
 fn fix(graph: &Graph) -> String {
     let steps = diagnose::interface(graph, "/a");
     let step = steps.into_iter().find(|step| step.verdict == Verdict::Wrong);
@@ -341,7 +341,7 @@ fn refused_link_has_the_remedy_of_its_reason() {
 }
 
 #[test]
-fn router_in_from_is_told_from_a_node_out_of_reach() {
+fn router_in_from_is_distinguished_from_unreachable_node() {
     let mut graph = user();
     graph.uses[0].has_catalogue = false;
     graph.links[0].name = Some("arm".into());
@@ -350,7 +350,7 @@ fn router_in_from_is_told_from_a_node_out_of_reach() {
 }
 
 #[test]
-fn pattern_that_would_cover_a_missing_topic_is_named() {
+fn pattern_that_would_cover_missing_topic_is_named() {
     let mut graph = owner();
     graph.endpoints.clear();
     graph.shares[0].topic = "/**".into();
@@ -363,7 +363,7 @@ fn pattern_that_would_cover_a_missing_topic_is_named() {
 }
 
 #[test]
-fn a_refused_topic_has_the_remedy_of_its_reason_at_both_ends() {
+fn refused_topic_has_remedy_of_its_reason_at_both_ends() {
     for (why, at_owner, at_asker) in [
         (RefuseReason::NotPermitted.to_string(), "add it to `to`", "names the entry that is missing"),
         (RefuseReason::Revoked.to_string(), "`sgc fleet enroll` it again", "`sgc fleet enroll` it again"),
@@ -386,7 +386,7 @@ fn a_refused_topic_has_the_remedy_of_its_reason_at_both_ends() {
 }
 
 #[test]
-fn refusals_are_named_before_the_way_with_the_peers_that_cause_them() {
+fn refusals_and_their_peers_precede_walk() {
     let mut graph = user();
     graph.drops = [
         ("crl_flood".to_owned(), 9),
@@ -410,11 +410,11 @@ fn refusals_are_named_before_the_way_with_the_peers_that_cause_them() {
         "{said:?}"
     );
     assert!(said[3].starts_with("peers refused a link: revoked 3"), "{said:?}");
-    // Refusals of a sound network are no news.
+    // Refusals that a sound network causes are not reported.
     assert!(!steps.iter().any(|step| step.found.contains("unknown 30")));
-    // The same at a router, which knows names alone.
+    // A router, which knows only names, reports the same.
     assert!(named(&graph).iter().any(|(_, found)| found.contains("crl_flood 9")));
-    // Of very many the worst are named.
+    // Only the most frequent refusals are reported.
     let all = crate::why::refusals::tests::every_named_refusal();
     graph.drops.extend(all.into_iter().map(|key| (key.to_owned(), 1)));
     let steps = diagnose::interface(&graph, "/a");
@@ -422,7 +422,7 @@ fn refusals_are_named_before_the_way_with_the_peers_that_cause_them() {
 }
 
 #[test]
-fn each_fault_of_a_publisher_elsewhere_is_named() {
+fn each_fault_of_remote_publisher_is_named() {
     let cases: Vec<Case> = vec![
         ("no publisher of /a is on the local network", |g| g.endpoints.clear()),
         ("arm shares /a with here, but does not let it publish", |g| {
@@ -444,7 +444,7 @@ fn each_fault_of_a_publisher_elsewhere_is_named() {
 }
 
 #[test]
-fn services_and_actions_have_their_own_ends() {
+fn services_and_actions_have_clients_and_servers() {
     for (kind, topic, type_name, shared) in [
         (Interface::Service, "rq/aRequest", "x/srv/S_Request", "x/srv/S"),
         (Interface::Action, "rq/a/_action/send_goalRequest", "x/action/A_SendGoal_Request", "x/action/A"),
@@ -471,7 +471,7 @@ fn services_and_actions_have_their_own_ends() {
 }
 
 #[test]
-fn an_action_is_walked_by_its_parts() {
+fn action_is_walked_by_its_parts() {
     let part = |suffix: &str| {
         let mut graph = user();
         let name = format!("/fib/_action/{suffix}");
@@ -492,7 +492,7 @@ fn an_action_is_walked_by_its_parts() {
 }
 
 #[test]
-fn wildcards_and_other_names_are_followed() {
+fn wildcards_and_renames_are_followed() {
     let mut graph = owner();
     graph.shares[0].topic = "/**".into();
     assert_eq!(wrong(&graph, "/a"), "");
@@ -511,7 +511,7 @@ fn wildcards_and_other_names_are_followed() {
     );
 }
 
-/// A use of all of a kind that `arm`, or another owner, shares.
+/// Returns a use of all interfaces of a kind that an owner shares.
 fn pattern(kind: Interface, owner: &str) -> Use {
     Use {
         kind,
@@ -525,19 +525,19 @@ fn pattern(kind: Interface, owner: &str) -> Use {
 }
 
 #[test]
-fn patterns_beside_that_of_a_healthy_topic_are_no_fault_of_it() {
+fn other_patterns_are_no_fault_of_healthy_topic() {
     let mut graph = user();
     graph.uses[0].topic = "/**".into();
     graph.uses[0].local_topic = "/**".into();
     graph.uses.insert(0, pattern(Interface::Service, "arm"));
     graph.uses.push(pattern(Interface::Topic, "leg"));
     graph.uses.push(Use { publishes: true, ..pattern(Interface::Topic, "arm") });
-    // The arm lets this node publish as well, and nobody here does.
+    // The arm also permits this node to publish, and no program here does.
     let mut there = graph.uses[1].routes[0].clone();
     (there.publishers, there.is_granted) = (0, true);
     graph.uses[3].routes.push(there);
     assert_eq!(wrong(&graph, "/a"), "");
-    // A fault of the topic itself is still its fault.
+    // A fault of the topic itself still counts.
     graph.uses[1].routes[0].writers = 0;
     assert!(wrong(&graph, "/a").contains("no writer for it is on the local network"));
 
@@ -554,13 +554,13 @@ fn patterns_beside_that_of_a_healthy_topic_are_no_fault_of_it() {
 }
 
 #[test]
-fn a_named_rule_that_does_not_hold_is_a_fault_beside_a_healthy_one() {
+fn broken_named_rule_is_fault_beside_healthy_one() {
     let mut graph = user();
     let literal =
         |owner| Use { topic: "/a".into(), local_topic: "/a".into(), ..pattern(Interface::Topic, owner) };
     graph.uses.push(literal("leg"));
     assert!(wrong(&graph, "/a").contains("leg is in reach and does not share /a with here"));
-    // It is not if nobody here takes part in that direction.
+    // It is no fault if no program here takes part in that direction.
     let mut both_ways = user();
     both_ways.uses.push(Use { publishes: true, ..literal("arm") });
     assert_eq!(wrong(&both_ways, "/a"), "");
@@ -573,7 +573,7 @@ fn a_named_rule_that_does_not_hold_is_a_fault_beside_a_healthy_one() {
 }
 
 #[test]
-fn patterns_that_cover_what_does_not_flow_are_asked_by_kind() {
+fn covering_patterns_are_chosen_by_kind() {
     let patterns = |graph: &mut Graph| {
         graph.uses = vec![pattern(Interface::Service, "arm"), pattern(Interface::Topic, "arm")];
         graph.uses[1].topic = "/robot/**".into();
@@ -587,7 +587,7 @@ fn patterns_that_cover_what_does_not_flow_are_asked_by_kind() {
         said.contains("arm is in reach and does not share /robot/a with here; did you mean /robot/b?"),
         "{said}"
     );
-    // Programs that no pattern is for are the question.
+    // The local programs match no pattern.
     graph.endpoints = vec![end("/a", true)];
     assert!(wrong(&graph, "/a").contains("1 local publishers have it, but no rule names it"));
     graph.endpoints = vec![end("/rosout", false)];
@@ -600,7 +600,7 @@ fn patterns_that_cover_what_does_not_flow_are_asked_by_kind() {
 }
 
 #[test]
-fn some_subscribers_that_do_not_match_are_no_fault_of_the_way() {
+fn incompatible_subscribers_beside_matched_ones_are_no_fault() {
     let mut graph = user();
     graph.endpoints.push(end("/a", false));
     graph.endpoints[1].qos.durability = 1;
@@ -626,14 +626,14 @@ fn routers_know_names() {
     assert!(last(&graph).1.contains("is silent"));
 }
 
-/// Returns the first finding of a walk that is wrong, or cannot be known.
+/// Returns the first finding of a walk with this verdict.
 fn found(graph: &Graph, verdict: Verdict) -> Option<String> {
     let steps = diagnose::interface(graph, "/a");
     steps.into_iter().find(|step| step.verdict == verdict).map(|step| step.found)
 }
 
 #[test]
-fn mistakes_of_operators_come_first() {
+fn operator_mistakes_come_first() {
     let place = || "203.0.113.5:7447".to_owned();
     let displaced = Alert::Displaced { node: "here".into(), place: place(), ago_s: 3 };
     let kept_out = Alert::IdentityInUse { node: "here".into(), place: place(), ago_s: 3 };
@@ -642,7 +642,7 @@ fn mistakes_of_operators_come_first() {
     for alert in [displaced, early] {
         let unlinked = Graph { alerts: vec![alert.clone()], links: vec![], ..owner() };
         assert_eq!(found(&unlinked, Verdict::Wrong), Some(alert.to_string()));
-        // With links all the same it is over, or about to be.
+        // With links up, the alert is over or about to end.
         let linked = Graph { alerts: vec![alert.clone()], ..owner() };
         assert_eq!(found(&linked, Verdict::Unknown), Some(alert.to_string()));
         assert_eq!(found(&linked, Verdict::Wrong), None);
@@ -652,7 +652,7 @@ fn mistakes_of_operators_come_first() {
         (found(&graph, Verdict::Unknown), found(&graph, Verdict::Wrong)),
         (Some(kept_out.to_string()), None)
     );
-    // The only peer, or one of two.
+    // The clock of the only peer, or of one of two.
     let graph = Graph { alerts: vec![clock.clone()], ..user() };
     assert_eq!(found(&graph, Verdict::Wrong), Some(clock.to_string()));
     let mut graph = Graph { alerts: vec![clock.clone()], ..user() };
@@ -669,7 +669,7 @@ fn mistakes_of_operators_come_first() {
 }
 
 #[test]
-fn names_of_members_that_nobody_has_are_pointed_out() {
+fn unknown_member_names_are_reported() {
     let named =
         |name: &str, meant: Option<&str>| UnheardMember { name: name.into(), meant: meant.map(Into::into) };
     let mut graph = owner();
@@ -684,7 +684,7 @@ fn names_of_members_that_nobody_has_are_pointed_out() {
     assert!(
         hints[1].starts_with("the [[share]] names \"lamp\", and no member of that name has been heard of")
     );
-    // Where nobody has it, that is why.
+    // If no node has the topic, the unknown name is the reason.
     graph.shares[0].routes[0].granted.clear();
     assert!(wrong(&graph, "/a").contains("names \"deks\", which nobody here is called"));
     assert!(fix(&graph).contains("if \"desk\" is meant, correct it in the file of here"));
@@ -693,7 +693,7 @@ fn names_of_members_that_nobody_has_are_pointed_out() {
 }
 
 #[test]
-fn lost_calls_are_a_fault_until_calls_are_answered() {
+fn lost_calls_are_fault_until_calls_are_answered() {
     let lost = |reason: &str, since_answer, last_s| {
         let mut graph = owner();
         let by = [("/caller".to_owned(), 2)].into();
@@ -716,7 +716,7 @@ fn lost_calls_are_a_fault_until_calls_are_answered() {
         let steps = diagnose::interface(&graph, "/a");
         assert!(steps.iter().any(|step| step.found.contains("3 calls of clients here got no answer")));
     }
-    // Another fault comes last, and alone.
+    // Another fault comes last, as the only one.
     let mut graph = lost("call_withdrawn", 3, 5);
     graph.links.clear();
     let fault = wrong(&graph);

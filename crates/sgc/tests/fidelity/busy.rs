@@ -1,5 +1,5 @@
-//! A network of many nodes, of which little is shared: what it costs a node to know them, and what its link carries while
-//! nothing is published.
+//! Measures a node in a network of many nodes of which little is shared: its cost, and the traffic of its link while no
+//! message is published.
 //!
 //! `SGC_GRAPH_NODES`, each of ten endpoints, `SGC_GRAPH_SHARED` and `SGC_GRAPH_SECONDS` make it larger (`make
 //! bench-graph`: the figures of benchmarks/graph.md).
@@ -14,12 +14,12 @@ use crate::{PLAN, environment, python};
 const NODES: u64 = 20;
 const SHARED: u64 = 10;
 const SECONDS: u64 = 3;
-/// What a node may hold for each endpoint of its network: names, QoS, and what Cyclone keeps of it.
+/// Bound of a node's memory per endpoint of its network: names, QoS and Cyclone's own state.
 const ENDPOINT_KB_MAX: u64 = 64;
-/// More than a link at rest ever needs; an idle topic that said something once a second would go beyond it.
+/// Bound of traffic on an idle link. One message per second and idle topic would exceed it.
 const IDLE_BYTES_PER_S_MAX: u64 = 500;
 
-/// Processor time of a process so far.
+/// Returns the processor time of a process so far.
 fn busy(pid: u32) -> Duration {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
     let after_name = stat.rsplit_once(')').unwrap().1;
@@ -54,7 +54,7 @@ fn a_busy_network_costs_little_and_its_silence_next_to_nothing() {
     eventually("all that is shared is at the desk", || granted() == shared);
     let there_after = begun.elapsed();
     let discovery = busy(pid) - idle;
-    // Until what discovery sets off has passed.
+    // Waits until the work that discovery causes is over.
     eventually("rest", || {
         let before = (busy(pid), carried(&lab));
         std::thread::sleep(Duration::from_secs(1));

@@ -1,5 +1,5 @@
-//! Programs and nodes that come and go at random, under traffic: afterwards nothing is there that was not before, and
-//! nothing comes twice.
+//! Programs and nodes come and go at random under traffic. Afterwards no route or endpoint is left over, and no message comes
+//! twice.
 //!
 //! `SGC_CHURN_SEED` and `SGC_CHURN_STEPS` make it another run, or a longer one (`make churn`); each step ends one
 //! program or node, with SIGKILL or SIGTERM, and starts it again.
@@ -17,11 +17,11 @@ use crate::{PLAN, environment};
 
 const SEED: u64 = 6;
 const STEPS: u32 = 20;
-/// Room for what a node may hold more than after its start, however much came and went since.
+/// Bound of the memory that a node may hold beyond that after its start.
 const RESIDENT_MORE_KB_MAX: u64 = 40_000;
 const FDS_MORE_MAX: usize = 12;
 const THREADS_MORE_MAX: usize = 12;
-/// Messages that tell at what rate a topic is heard.
+/// Number of messages from which the rate of a topic is computed.
 const COUNTED: u64 = 40;
 /// A publisher's numbers begin at its run times this.
 const RUN_NUMBERS: u64 = 1_000_000;
@@ -39,7 +39,7 @@ impl Rng {
     }
 }
 
-/// A program that is not ours, which is ended and started again.
+/// An independent program that is ended and started again.
 struct App {
     site: Site,
     vendor: &'static str,
@@ -48,7 +48,7 @@ struct App {
     latched: bool,
     runs: u64,
     peer: Option<Peer>,
-    /// What the present run heard, or said.
+    /// The numbers that the present run received or sent.
     seen: BTreeSet<u64>,
     twice: u64,
 }
@@ -91,7 +91,7 @@ impl App {
             peer.end();
             peer.summary();
         }
-        // SIGKILL, if it is not gone.
+        // Dropping kills the process if it still runs.
         drop(peer);
     }
 
@@ -111,7 +111,7 @@ impl App {
     }
 }
 
-/// Routes and names of each node, as far as they do not count anything.
+/// Returns the routes and names of each node, without counters.
 fn routes(lab: &Lab) -> Vec<Vec<String>> {
     let of_site = |site| {
         let status = lab.status(site);
@@ -127,7 +127,7 @@ fn routes(lab: &Lab) -> Vec<Vec<String>> {
     SITES.into_iter().map(of_site).collect()
 }
 
-/// Each listener hears each message of the present publishers of its topic, once.
+/// Checks that each listener receives each message of the present publishers of its topic once.
 fn assert_flows(apps: &mut [App]) {
     let topics: BTreeMap<&str, bool> = apps.iter().map(|a| (a.topic, a.latched)).collect();
     for (topic, latched) in topics {
@@ -140,7 +140,7 @@ fn assert_flows(apps: &mut [App]) {
             let begin = of_topic[talker].last();
             let run = begin / RUN_NUMBERS;
             let deadline = Instant::now() + PATIENCE;
-            // From a message on that all have heard.
+            // Checks from the first message that all listeners have.
             let mut from = None;
             loop {
                 of_topic.iter_mut().for_each(|app| app.look());
@@ -191,7 +191,7 @@ fn nothing_is_left_of_what_came_and_went() {
     let begun = SITES.map(|site| lab.node(site).held());
     for step in 0..steps {
         let signal = if rng.below(2) == 0 { Signal::KILL } else { Signal::TERM };
-        // Programs more often than nodes, so that these live through many of them.
+        // Programs restart more often than nodes, so that each node outlives many of them.
         let index = rng.below(apps.len() as u64 * 2 + 3) as usize;
         let pause = Duration::from_millis(rng.below(400));
         if let Some(site) = SITES.get(index) {
@@ -206,12 +206,12 @@ fn nothing_is_left_of_what_came_and_went() {
         }
         apps.iter_mut().for_each(App::look);
         if step % 10 == 9 {
-            // Whoever is there goes on hearing, at its own rate.
+            // The present programs still receive each message once.
             assert_flows(&mut apps);
         }
     }
     assert_flows(&mut apps);
-    // What was killed is missed when its lease is over.
+    // Killed programs vanish when their lease is over.
     eventually("the endpoints are those of the beginning", || {
         let now = look(&mut observers);
         let same = now == endpoints;
@@ -228,7 +228,7 @@ fn nothing_is_left_of_what_came_and_went() {
     let twice: Vec<u64> = apps.iter_mut().map(|app| app.twice).collect();
     assert_flows(&mut apps);
     for (app, before) in apps.iter().zip(twice) {
-        // A node that was started anew gives what is latched once more, as a publisher that was does.
+        // A restarted node delivers latched messages once more, as a restarted publisher does.
         assert!(
             app.twice == before && (app.latched || app.twice == 0),
             "{}: {} twice",

@@ -1,4 +1,4 @@
-//! One identity in two networks at a time, each with a program that is not ours.
+//! One identity runs in two networks at a time, each with an independent program.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -13,7 +13,7 @@ const COMMON: [&str; 4] = ["--type", "string", "--topic", "/chatter"];
 /// The ROS domain of the second process, which is in the robot's network.
 const DOMAIN: &str = "95";
 
-/// A subscriber at a site that says what it hears.
+/// Starts a subscriber at a site that reports each message.
 fn listener(lab: &Lab, site: Site, domain: &str) -> Peer {
     let mut command = support::command(lab.namespace(site), lab.dir(), &Peer::program("cyclone"));
     command.args(["sub", "--domain", domain, "--localhost", "--timeout", PLAN.peer_life, "--verbose"]);
@@ -21,7 +21,7 @@ fn listener(lab: &Lab, site: Site, domain: &str) -> Peer {
     Peer::start(command)
 }
 
-/// The second process of `desk`, with copies of all its files, in the robot's network.
+/// Starts the second process of `desk`, with copies of all its files, in the robot's network.
 fn start_twin(lab: &Lab) -> Running {
     fs::copy(lab.dir().join("desk.identity"), lab.dir().join("twin.identity")).unwrap();
     let text = fs::read_to_string(lab.dir().join("desk.toml")).unwrap();
@@ -69,7 +69,7 @@ fn end(mut listener: Peer, heard: &mut Vec<u64>) {
 }
 
 #[test]
-fn one_identity_in_two_networks_gives_nothing_twice_and_is_named_on_all_sides() {
+fn identity_in_two_networks_delivers_nothing_twice_and_is_named_on_all_sides() {
     let lab = Lab::with_topics(PLAN, ["/chatter"]);
     let mut at_desk = listener(&lab, Site::Desk, lab.domain(Site::Desk));
     let mut at_twin = listener(&lab, Site::Robot, DOMAIN);
@@ -83,7 +83,7 @@ fn one_identity_in_two_networks_gives_nothing_twice_and_is_named_on_all_sides() 
         Some(_) => ["10.92.1.2:", "", "10.92.2.2:"][site as usize],
         None => "127.0.0.1:",
     };
-    // Each is told where the other is; the twin is where the robot is.
+    // Each process learns the place of the other; the twin is in the robot's network.
     eventually("the desk names the cause", || alerts(&lab, "desk.sock", "displaced", here(Site::Robot)));
     eventually("the cloud names the cause", || {
         alerts(&lab, "cloud.sock", "peer_identity_in_use", here(Site::Robot))
@@ -105,7 +105,7 @@ fn one_identity_in_two_networks_gives_nothing_twice_and_is_named_on_all_sides() 
     while let Ok((_, event)) = at_desk.events.try_recv() {
         of_desk.extend(event["seq"].as_u64().filter(|_| event["event"] == "received"));
     }
-    // The twin goes, and the desk goes on by itself; what it missed meanwhile the twin had.
+    // The twin ends, and the desk goes on by itself. The twin had the messages that the desk missed meanwhile.
     drop(twin);
     hear(&mut at_desk, "messages at the desk again", 100, &mut of_desk);
     talker.end();

@@ -1,4 +1,4 @@
-//! What is not shared does not cross, in either direction, discovery included, whatever the other side asks for.
+//! Nothing that is not shared crosses in either direction, discovery included, whatever the other side asks for.
 
 use crate::PLAN;
 use crate::lab::{self, Lab, Site};
@@ -12,10 +12,10 @@ fn talker(lab: &Lab, site: Site, topic: &str) -> Peer {
 
 #[test]
 fn a_network_shows_what_is_used_and_nothing_else() {
-    // To this desk, to somebody else, and to nobody; one of which the desk has no use for.
+    // Shares with this desk, with another node and with none; the desk uses all but one of its own.
     let share = |topic: &str, to: &str| lab::share("topic", topic, to);
     let robot = share("/used", "desk") + &share("/unused", "desk") + &share("/others", "somebody");
-    // The desk asks for all of them, and wants to publish on what it may only hear.
+    // The desk asks for all of them, and to publish on a topic to which it may only subscribe.
     let uses = |topic: &str| lab::uses("topic", topic, "robot");
     let publish = |topic: &str| uses(topic) + "publish = true\n";
     let desk =
@@ -38,15 +38,15 @@ fn a_network_shows_what_is_used_and_nothing_else() {
         };
         ["/others", "/secret", "/unused", "/command"].into_iter().all(told)
     });
-    // The robot's network: its own publishers, and one reader of ours for what somebody hears.
+    // The robot's network has its own publishers, and one reader of sgc for the topic in use.
     let expected =
         ["reader rt/used", "writer rt/others", "writer rt/secret", "writer rt/unused", "writer rt/used"];
     assert_eq!(observers[0].endpoints(), expected);
-    // The desk's: its own programs, and one writer of ours.
+    // The desk's network has its own programs, and one writer of sgc.
     let expected =
         ["reader rt/used", "writer rt/command", "writer rt/private", "writer rt/unused", "writer rt/used"];
     assert_eq!(observers[1].endpoints(), expected);
-    // Nothing of what was not to be heard went past the robot's node either.
+    // No other name left the robot's node.
     let names = lab.status(Site::Cloud)["names"].as_array().unwrap().len();
     let robot = lab.status(Site::Robot);
     let messages = |topic: &str| {

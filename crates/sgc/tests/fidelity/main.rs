@@ -1,5 +1,5 @@
-//! What an unmodified program must not be able to tell, in the large: latched topics many to many, programs and nodes
-//! that come and go, a subscriber that stalls, and what is not shared.
+//! Tests in the large that an unmodified program cannot tell sgc from a plain network: latched topics many to many, programs
+//! and nodes that come and go, a subscriber that stalls, and isolation of topics that are not shared.
 
 #![allow(clippy::unwrap_used)]
 
@@ -22,12 +22,12 @@ use support::Peer;
 /// Peers live for as long as the longest of these tests.
 const PLAN: Plan = Plan { name: "sgcfi", domains: ["93", "94"], peer_life: "3000" };
 
-/// A Python program of `tests/peers/py`, whose first argument is its domain.
+/// Starts a Python program of `tests/peers/py`, whose first argument is its domain.
 fn python(lab: &Lab, site: Site, program: &str, args: &[&str]) -> Peer {
     lab.python(site, program, &[&[lab.domain(site)], args].concat())
 }
 
-/// A number from the environment, for longer runs.
+/// Reads a number from the environment, for longer runs.
 fn environment(key: &str, otherwise: u64) -> u64 {
     std::env::var(key).ok().and_then(|v| v.parse().ok()).unwrap_or(otherwise)
 }

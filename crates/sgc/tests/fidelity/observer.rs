@@ -1,4 +1,4 @@
-//! All DDS endpoints of a network, as somebody sees them who takes part in it.
+//! Lists all DDS endpoints of a network, as a participant of it sees them.
 
 use serde_json::Value;
 
@@ -6,7 +6,7 @@ use crate::lab::{Lab, Site};
 use crate::python;
 use crate::support::Peer;
 
-/// A program that looks.
+/// A program that observes the network.
 pub(crate) struct Observer(Peer);
 
 impl Observer {
@@ -16,7 +16,7 @@ impl Observer {
         Self(peer)
     }
 
-    /// Kind and topic of each, in order; what belongs to every DDS network left out.
+    /// Returns kind and topic of each endpoint, sorted, without those of DDS itself.
     pub(crate) fn endpoints(&mut self) -> Vec<String> {
         self.0.go();
         let seen = self.0.wait("the endpoints", |e| e["event"] == "endpoints");

@@ -1,5 +1,5 @@
-//! Images to a subscriber that stands still, and to a node that does: memory has a bound everywhere, other topics do not
-//! notice, and who goes on gets what is new.
+//! Images go to a subscriber that stalls, and to a node that stalls. Memory stays bounded everywhere, other topics flow on, and
+//! a subscriber that resumes gets new images.
 //!
 //! `SGC_STALL_SECONDS` is how long the subscriber stands still (`make stall`: ten minutes). A node stands still for less than
 //! the leases of DDS: after ten minutes all was with its writers at once, but the Fast DDS program beside it had not found
@@ -15,13 +15,12 @@ use crate::{PLAN, environment};
 
 const SECONDS: u64 = 6;
 const NODE_SECONDS_MAX: u64 = 8;
-/// More than any node may come to hold: its queues and histories have bounds of 64 MiB and less, and there are three of
-/// them on a topic's way through a node.
+/// Bound of a node's additional memory: a topic passes three queues or histories per node, each of at most 64 MiB.
 const RESIDENT_MORE_KB_MAX: u64 = 200_000;
 const IMAGE_BYTES: &str = "1000000";
 const IMAGES_PER_S: &str = "30";
 
-/// The last number that a program reported.
+/// Returns the last number that a program reported.
 fn last(peer: &Peer, before: u64) -> u64 {
     peer.events.try_iter().filter_map(|(_, e)| e["seq"].as_u64()).max().unwrap_or(0).max(before)
 }
@@ -61,8 +60,7 @@ impl Stall {
         Self { lab, camera, state, images, states, before }
     }
 
-    /// Looks at the memory of all nodes for the time that something stands still; how much more than before each held at
-    /// most.
+    /// Samples the memory of all nodes during the stall. Returns the largest increase of each.
     fn endures(&self, seconds: u64) -> [u64; 3] {
         let end = Instant::now() + Duration::from_secs(seconds);
         let mut most = [0; 3];
@@ -77,7 +75,7 @@ impl Stall {
         most
     }
 
-    /// What is said from now on is heard.
+    /// Waits until messages sent from now on are received.
     fn is_fresh(&mut self) {
         for (talker, listener) in [(&self.camera, &mut self.images), (&self.state, &mut self.states)] {
             let said = last(talker, 0);
@@ -91,7 +89,7 @@ impl Stall {
         }
     }
 
-    /// Of the small topic nothing may be missing, of neither anything twice or altered.
+    /// Ends the test. The small topic may miss nothing; neither topic may have repeated or altered messages.
     fn ends(mut self) {
         for (listener, loses) in [(&mut self.images, true), (&mut self.states, false)] {
             listener.end();

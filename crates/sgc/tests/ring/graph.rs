@@ -1,5 +1,5 @@
-//! The ring as a graph, and the faults that a seed leads to. Knows no process and no clock: a plan says after how long
-//! what is broken or mended, and [`Graph`] says what still has a way.
+//! The ring as a graph, and the faults that follow from a seed. Pure, without processes and clocks: a plan says what breaks or
+//! mends and when, and [`Graph`] says what is still connected.
 
 use std::fmt;
 use std::time::Duration;
@@ -16,11 +16,11 @@ pub(crate) const NODES: [Node; 8] =
 const ROUTERS: usize = 5;
 
 impl Node {
-    /// Publishes.
+    /// The proxy that publishes.
     pub(crate) const ROBOT: Self = Self(5);
-    /// Receives, behind two routers.
+    /// A proxy that receives, attached to two routers.
     pub(crate) const DESK: Self = Self(6);
-    /// Receives, behind one.
+    /// A proxy that receives, attached to one router.
     pub(crate) const LAB: Self = Self(7);
 
     pub(crate) fn name(self) -> &'static str {
@@ -42,7 +42,7 @@ impl fmt::Debug for Node {
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Edge(pub(crate) usize);
 
-/// Who dials whom: the ring, two chords, and how the proxies are attached.
+/// The links as (dialling, listening) pairs: the ring, two chords, and the links of the proxies.
 const EDGES: [(Node, Node); 12] = [
     (Node(0), Node(1)),
     (Node(1), Node(2)),
@@ -63,7 +63,7 @@ impl Edge {
         (0..EDGES.len()).map(Self)
     }
 
-    pub(crate) fn of(node: Node) -> impl Iterator<Item = Self> {
+    pub(crate) fn touching(node: Node) -> impl Iterator<Item = Self> {
         Self::all().filter(move |edge| edge.end(End::Dialling) == node || edge.end(End::Listening) == node)
     }
 
@@ -88,21 +88,21 @@ pub(crate) enum End {
     Listening,
 }
 
-/// Something broken.
+/// A fault.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub(crate) enum Fault {
-    /// Interfaces of a link are down; the other end, if it is up, has no carrier.
+    /// Interfaces of a link are down. An end that is still up has no carrier.
     Cut { edge: Edge, ends: Vec<End> },
-    /// SIGKILL; started again at its end, with what it remembered or without.
+    /// SIGKILL. The router is started again at the end of the fault, with its state or without.
     Kill { router: Node, forgets: bool },
     /// SIGSTOP.
     Stop { router: Node },
-    /// No way at all to a proxy: its links cut at its end, or the routers that it is attached to stopped.
+    /// No path leads to a proxy: its links are cut at its end, or its routers are stopped.
     Isolate { proxy: Node, cut: bool },
 }
 
 impl Fault {
-    /// What outages are told apart by.
+    /// Returns the label by which outages are grouped.
     pub(crate) fn kind(&self) -> &'static str {
         match self {
             Self::Cut { ends, .. } if ends.len() == 2 => "cut, both ends",
@@ -115,28 +115,28 @@ impl Fault {
         }
     }
 
-    /// The links that it takes.
+    /// Returns the links that the fault takes down.
     pub(crate) fn edges(&self) -> Vec<Edge> {
         match self {
             Self::Cut { edge, .. } => vec![*edge],
-            Self::Isolate { proxy, cut: true } => Edge::of(*proxy).collect(),
+            Self::Isolate { proxy, cut: true } => Edge::touching(*proxy).collect(),
             Self::Kill { .. } | Self::Stop { .. } | Self::Isolate { .. } => Vec::new(),
         }
     }
 
-    /// The routers that it takes.
+    /// Returns the routers that the fault takes down.
     pub(crate) fn routers(&self) -> Vec<Node> {
         match self {
             Self::Kill { router, .. } | Self::Stop { router } => vec![*router],
             Self::Isolate { proxy, cut: false } => {
-                Edge::of(*proxy).map(|edge| edge.end(End::Listening)).collect()
+                Edge::touching(*proxy).map(|edge| edge.end(End::Listening)).collect()
             }
             Self::Cut { .. } | Self::Isolate { .. } => Vec::new(),
         }
     }
 }
 
-/// What is whole.
+/// The working links and routers.
 #[derive(Clone)]
 pub(crate) struct Graph {
     pub(crate) edges: [bool; EDGES.len()],
@@ -148,7 +148,7 @@ impl Graph {
         Self { edges: [true; EDGES.len()], routers: [true; ROUTERS] }
     }
 
-    /// Without what faults take.
+    /// Removes the links and routers that faults take down.
     pub(crate) fn without<'a>(mut self, faults: impl IntoIterator<Item = &'a Fault>) -> Self {
         for fault in faults {
             fault.edges().into_iter().for_each(|edge| self.edges[edge.0] = false);
@@ -157,7 +157,7 @@ impl Graph {
         self
     }
 
-    /// True if the robot reaches both other proxies over routers.
+    /// Returns `true` if the robot reaches both other proxies over routers.
     pub(crate) fn connects(&self) -> bool {
         let reached = self.reached_from(Node::ROBOT);
         reached[Node::DESK.0] && reached[Node::LAB.0]
@@ -170,7 +170,7 @@ impl Graph {
             if std::mem::replace(&mut reached[node.0], true) || (node != start && !node.is_router()) {
                 continue;
             }
-            for edge in Edge::of(node).filter(|edge| self.edges[edge.0]) {
+            for edge in Edge::touching(node).filter(|edge| self.edges[edge.0]) {
                 let (a, b) = (edge.end(End::Dialling), edge.end(End::Listening));
                 let other = if a == node { b } else { a };
                 if !other.is_router() || self.routers[other.0] {
@@ -182,17 +182,17 @@ impl Graph {
     }
 }
 
-/// What to do next.
+/// The next step of a plan.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub(crate) enum Act {
     Break(Fault),
     Mend(Fault),
 }
 
-/// The faults of a seed, one after the other, without an end.
+/// The endless sequence of faults of a seed.
 pub(crate) struct Chaos {
     rng: ChaCha8Rng,
-    /// False where links cannot be cut.
+    /// Links can be cut.
     cuts: bool,
     now: Duration,
     next_fault: Duration,
@@ -200,14 +200,14 @@ pub(crate) struct Chaos {
     faults: u32,
 }
 
-/// Faults that are there at once.
+/// Most faults at a time.
 const ACTIVE_MAX: usize = 2;
-/// Of this many faults one is a partition, the first of them early enough for the shortest run.
+/// One fault in this many is a partition. The first comes early enough for the shortest run.
 const PARTITION_EVERY: u32 = 10;
 const PARTITION_FIRST: u32 = 5;
 /// Pause before and after a partition, so that its length is what the plan says.
 const PARTITION_PAUSE: Duration = Duration::from_secs(4);
-/// Draws in search of a fault that leaves a way.
+/// Most draws in search of a fault that leaves a path.
 const DRAWS_MAX: u32 = 64;
 
 impl Chaos {
@@ -216,7 +216,7 @@ impl Chaos {
         Self { rng, cuts, now: Duration::ZERO, next_fault: Duration::ZERO, active: Vec::new(), faults: 0 }
     }
 
-    /// How long to wait, and then what to do.
+    /// Returns the next step and the time to wait before it.
     pub(crate) fn next(&mut self) -> (Duration, Act) {
         let before = self.now;
         loop {
@@ -234,7 +234,7 @@ impl Chaos {
         }
     }
 
-    /// A fault for now, and when it is mended and the next one due.
+    /// Draws a fault, and sets the times of its end and of the next fault.
     fn fault(&mut self) -> Option<Fault> {
         if self.faults % PARTITION_EVERY == PARTITION_FIRST {
             if let Some(until) = self.active.iter().map(|(until, _)| *until).max() {
@@ -248,7 +248,7 @@ impl Chaos {
             self.active.push((until, fault.clone()));
             return Some(fault);
         }
-        // One in four comes together with the one before.
+        // One fault in four begins together with the previous one.
         let pause = if self.below(4) == 0 { Duration::ZERO } else { self.between(500, 5000) };
         self.next_fault = self.now + pause;
         if self.active.len() >= ACTIVE_MAX {
@@ -288,7 +288,7 @@ impl Chaos {
         }
     }
 
-    /// One in three is longer than a link waits for its peer (10 s idle), or near to it.
+    /// Draws a length. One in three is near to a link's idle limit of 10 s, or longer.
     fn length(&mut self) -> Duration {
         if self.below(3) == 0 { self.between(8000, 14_000) } else { self.between(500, 5000) }
     }

@@ -1,5 +1,5 @@
-//! The ring as processes: a namespace for each node, a cable for each link, and ways to break them. What is started
-//! here is ended here, by its process id, and namespaces go with the lab, also when a test panics.
+//! The ring as processes: a namespace for each node, a cable for each link, and functions that break them. The lab ends its
+//! processes by their process ids and removes its namespaces, also when a test panics.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -18,16 +18,16 @@ use crate::support::{self, Peer, Running, say_log};
 const PORT: u16 = 7447;
 /// Namespaces are `PREFIX-PID-NODE`, so that those of a run that was killed can be told and removed.
 const PREFIX: &str = "sgcring";
-/// How long a node may take to answer what it is asked.
+/// Longest time a node may take to answer.
 const STATUS_MAX: Duration = Duration::from_secs(2);
 
 pub(crate) struct Lab {
     dir: PathBuf,
-    /// How many seconds a peer lives at most, should nobody end it.
+    /// Longest life of a peer in seconds, should no test end it.
     peer_life: String,
     _temporary: Option<TempDir>,
     nodes: [Option<Running>; NODES.len()],
-    /// None where the kernel or the user cannot make them.
+    /// `None` where the kernel or the user cannot make namespaces.
     namespaces: Option<[Namespace; NODES.len()]>,
 }
 
@@ -57,7 +57,7 @@ impl Lab {
         lab
     }
 
-    /// False where networks are not apart, since there are no namespaces.
+    /// Returns `false` where networks are not separate for lack of namespaces.
     pub(crate) fn is_apart(&self) -> bool {
         self.namespaces.is_some()
     }
@@ -68,7 +68,7 @@ impl Lab {
 
     fn write_config(&self, node: Node, topics: &[&str]) {
         let name = node.name();
-        let urls: Vec<_> = Edge::of(node)
+        let urls: Vec<_> = Edge::touching(node)
             .filter(|edge| edge.end(End::Dialling) == node)
             .map(|edge| format!("\"{}\"", self.url(edge)))
             .collect();
@@ -180,13 +180,13 @@ impl Lab {
         self.nodes[node.0].as_ref().unwrap().signal(signal);
     }
 
-    /// Nodes that ended by themselves since they were asked last.
+    /// Returns the nodes that ended by themselves since the last call.
     pub(crate) fn fallen(&mut self) -> Vec<Node> {
         let fallen = |node: &mut Option<Running>| node.as_mut().is_some_and(|n| n.try_end().is_some());
         NODES.into_iter().filter(|node| fallen(&mut self.nodes[node.0])).collect()
     }
 
-    /// What a node tells of itself; nothing if it is not running or does not answer.
+    /// Returns a node's status, or null if the node is not running or does not answer.
     pub(crate) fn status(&self, node: Node) -> Value {
         let ask = || -> std::io::Result<Value> {
             let mut stream = UnixStream::connect(self.path(node, "sock"))?;
@@ -199,7 +199,7 @@ impl Lab {
         ask().unwrap_or(Value::Null)
     }
 
-    /// What of the ring is up, as far as no fault takes it and **both** ends of a link say so.
+    /// Returns the part of the ring that is up: no fault takes it down, and **both** ends of each link report it.
     pub(crate) fn told(&self, active: &[Fault]) -> Graph {
         let mut graph = Graph::whole().without(active);
         let runs = |node: Node| !node.is_router() || graph.routers[node.0];
@@ -209,7 +209,7 @@ impl Lab {
             let links = |node: Node| statuses[node.0]["links"].as_array().cloned().unwrap_or_default();
             let url = self.url(edge);
             let dialled = links(dialling).iter().any(|link| link["url"] == url.as_str());
-            // Without namespaces nothing tells who a link that was accepted is from.
+            // Without namespaces, an accepted link does not tell its origin.
             let remote = format!("{}:", address(edge, End::Dialling));
             let accepted = !self.is_apart()
                 || links(listening)
@@ -220,7 +220,7 @@ impl Lab {
         graph
     }
 
-    /// Resident memory of a node in kB; nothing if it is not running.
+    /// Returns the resident memory of a node in kB, or `None` if it is not running.
     pub(crate) fn resident(&self, node: Node) -> Option<u64> {
         let pid = self.nodes[node.0].as_ref()?.pid();
         let status = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;

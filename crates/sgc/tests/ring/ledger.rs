@@ -1,4 +1,4 @@
-//! What was sent, what came and when; and what that says.
+//! Records sent and received messages with their times, and judges them.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -10,9 +10,9 @@ use crate::support::Peer;
 pub(crate) struct Topic {
     pub(crate) name: &'static str,
     pub(crate) reliable: bool,
-    /// What both its publisher and its subscribers are started with.
+    /// Arguments of both its publisher and its subscribers.
     pub(crate) both: &'static [&'static str],
-    /// What the publisher is started with besides: rate, size, depth.
+    /// Further arguments of the publisher: rate, size, depth.
     pub(crate) talker: &'static [&'static str],
     pub(crate) listener: &'static [&'static str],
 }
@@ -22,7 +22,7 @@ pub(crate) struct Talker {
     pub(crate) topic: &'static Topic,
     pub(crate) peer: Peer,
     pub(crate) sent: Vec<(Instant, u64)>,
-    /// True once it sends no more.
+    /// The talker has sent its last message.
     pub(crate) done: bool,
 }
 
@@ -31,7 +31,7 @@ impl Talker {
         Self { topic, peer, sent: Vec::new(), done: false }
     }
 
-    /// Takes in what it reported.
+    /// Handles new reports of the peer.
     pub(crate) fn update(&mut self) {
         while let Ok((at, event)) = self.peer.events.try_recv() {
             match event["event"].as_str() {
@@ -53,11 +53,11 @@ pub(crate) struct Listener {
     pub(crate) at: Node,
     pub(crate) peer: Peer,
     pub(crate) got: Vec<(Instant, u64)>,
-    /// Content that nobody sent.
+    /// Number of altered messages.
     pub(crate) altered: u32,
-    /// How many writers it was matched with, and since when.
+    /// Numbers of matched writers, with the times of their changes.
     pub(crate) matched: Vec<(Instant, u64)>,
-    /// True if it ended, which none should while we listen.
+    /// The listener has ended, which is a failure while the test runs.
     pub(crate) ended: bool,
 }
 
@@ -66,7 +66,7 @@ impl Listener {
         Self { topic, at, peer, got: Vec::new(), altered: 0, matched: Vec::new(), ended: false }
     }
 
-    /// Takes in what it reported.
+    /// Handles new reports of the peer.
     pub(crate) fn update(&mut self) {
         while let Ok((at, event)) = self.peer.events.try_recv() {
             match event["event"].as_str() {
@@ -85,12 +85,12 @@ impl Listener {
         self.got.iter().rev().any(|(_, got)| *got == seq)
     }
 
-    /// How long nothing has come.
+    /// Returns the time since the last message.
     pub(crate) fn still(&self) -> Duration {
         self.got.last().map_or(Duration::MAX, |(at, _)| at.elapsed())
     }
 
-    /// The longest time without a message that began between two moments.
+    /// Returns the longest time without a message that began between two moments.
     pub(crate) fn outage(&self, from: Instant, to: Instant) -> Option<Duration> {
         let pauses = self.got.windows(2).filter(|pair| (from..to).contains(&pair[0].0));
         pauses.map(|pair| pair[1].0 - pair[0].0).max()
@@ -101,23 +101,23 @@ impl Listener {
     }
 }
 
-/// How numbers that came differ from a row without gap.
+/// The differences between received numbers and a sequence without gaps.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(crate) struct Row {
     pub(crate) first: u64,
     pub(crate) last: u64,
-    /// Different ones.
+    /// Number of distinct messages.
     pub(crate) received: u64,
-    /// Between the first and the last, first to last of each gap.
+    /// The gaps between the first and the last number, each as first and last missing number.
     pub(crate) gaps: Vec<(u64, u64)>,
-    /// Came again.
+    /// Numbers that came again.
     pub(crate) doubled: Vec<u64>,
-    /// Came for the first time, but after a greater one.
+    /// Numbers that came first after a greater one.
     pub(crate) late: Vec<u64>,
 }
 
 impl Row {
-    pub(crate) fn of(numbers: impl IntoIterator<Item = u64>) -> Self {
+    pub(crate) fn from_numbers(numbers: impl IntoIterator<Item = u64>) -> Self {
         let mut row = Self::default();
         let mut seen = BTreeSet::new();
         for number in numbers {
@@ -143,10 +143,10 @@ impl Row {
 
 #[test]
 fn rows_are_judged() {
-    assert_eq!(Row::of([]), Row::default());
-    let whole = Row::of(3..9);
+    assert_eq!(Row::from_numbers([]), Row::default());
+    let whole = Row::from_numbers(3..9);
     assert_eq!((whole.first, whole.last, whole.received, whole.lost()), (3, 8, 6, 0));
     assert!(whole.doubled.is_empty() && whole.late.is_empty());
-    let row = Row::of([2, 3, 7, 5, 7, 3, 11]);
+    let row = Row::from_numbers([2, 3, 7, 5, 7, 3, 11]);
     assert_eq!((row.gaps, row.doubled, row.late), (vec![(4, 4), (6, 6), (8, 10)], vec![7, 3], vec![5]));
 }

@@ -1,6 +1,6 @@
-//! A ring of routers that heals, with real processes: five routers with chords, three proxies and programs that are not
-//! ours, each network in a namespace of its own, while a seed cuts links and kills, restarts and stops routers. Three
-//! topics flow from the robot to the desk and the lab. Nothing reliable may be lost, doubled or come out of order.
+//! Tests that a ring of routers heals, with real processes: five routers with chords, three proxies and independent programs,
+//! each network in a namespace of its own. A seed cuts links and kills, restarts and stops routers. Three topics flow from
+//! the robot to the desk and the lab. No reliable message may be lost, repeated or reordered.
 //!
 //! `SGC_RING_SEED` and `SGC_RING_SECONDS` choose the faults and how long there are any, `SGC_RING_DIR` a directory that
 //! keeps the logs and the trace. A plan follows from the seed alone, its moments do not: no router is taken before
@@ -30,7 +30,7 @@ use support::{eventually, say};
 
 const SEED: u64 = 4;
 const SECONDS: u64 = 40;
-/// Looking again.
+/// Period of polling.
 const TICK: Duration = Duration::from_millis(50);
 /// Before the first fault, and after the last one is mended.
 const CALM: Duration = Duration::from_secs(4);
@@ -60,7 +60,7 @@ const GROWTH_KB_MAX: u64 = 64 * 1024;
 /// another; the log tells the two apart.
 const SUSPICIOUS: [&str; 7] =
     ["not_verified", "not_owner", "hop_limit", "limit", "crl", "not_router", "malformed_control"];
-/// What no log may say.
+/// Texts that no log may contain.
 const UNSPEAKABLE: [&str; 4] =
     ["panicked", " ERROR ", "a peer sends what it should not", "control frame refused; counted"];
 
@@ -88,12 +88,12 @@ static TOPICS: [Topic; 3] = [
     },
 ];
 
-/// Something that was broken or mended.
+/// The beginning or the end of a fault.
 struct Event {
     at: Instant,
     kind: String,
     what: String,
-    /// Broken: which of the events mended it.
+    /// For the beginning of a fault: the time of its end.
     mended: Option<Instant>,
 }
 
@@ -103,11 +103,11 @@ struct Run {
     begun: Instant,
     active: Vec<Fault>,
     events: Vec<Event>,
-    /// All that is wrong; told together at the end.
+    /// All failures, reported together at the end.
     problems: Vec<String>,
     /// The largest counts of drops that were seen, by node and key: a kill takes the counters along.
     drops: BTreeMap<(Node, String), u64>,
-    /// The last to go.
+    /// Dropped last.
     lab: Lab,
 }
 
@@ -309,7 +309,7 @@ impl Run {
             listener.peer.end();
             let summary = listener.peer.summary();
             // The peer counts for itself; that both counts agree speaks for ours.
-            let doubled = Row::of(listener.got.iter().map(|(_, seq)| *seq)).doubled.len() as u64;
+            let doubled = Row::from_numbers(listener.got.iter().map(|(_, seq)| *seq)).doubled.len() as u64;
             assert_eq!(summary["duplicated"].as_u64(), Some(doubled), "{}: {summary}", listener.name());
         }
         for talker in &mut self.talkers {
@@ -323,7 +323,7 @@ impl Run {
         for listener in &self.listeners {
             let talker = self.talkers.iter().find(|t| t.topic.name == listener.topic.name).unwrap();
             let (name, last) = (listener.name(), talker.last().unwrap());
-            let row = Row::of(listener.got.iter().map(|(_, seq)| *seq));
+            let row = Row::from_numbers(listener.got.iter().map(|(_, seq)| *seq));
             let sent = last + 1 - row.first;
             let share = row.received as f64 / sent as f64;
             report.push(format!(
@@ -458,7 +458,7 @@ impl Run {
     }
 }
 
-/// As many of them as a person reads.
+/// Limits a list to a readable length.
 fn shown<T>(all: &[T]) -> &[T] {
     &all[..all.len().min(20)]
 }

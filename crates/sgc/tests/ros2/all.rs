@@ -1,5 +1,5 @@
-//! All that nodes of ROS 2 do with each other, from one site to the other: every message type, lifecycles, simulated time, service
-//! introspection, transforms, images, high rates, partners.
+//! Tests features of ROS 2 nodes between sites: every message type, lifecycles, simulated time, service introspection,
+//! transforms, images, high rates, partners.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -15,7 +15,7 @@ fn start(lab: &Lab, site: Site, distribution: &str, args: &[&str]) -> Peer {
     lab.rclpy(site, distribution, "features.py", args)
 }
 
-/// Ends them, so that they take their leave.
+/// Ends the peers cleanly, so that they leave the network.
 fn end<const N: usize>(mut peers: [Peer; N]) {
     peers.iter_mut().for_each(Peer::end);
     for peer in &mut peers {
@@ -23,7 +23,7 @@ fn end<const N: usize>(mut peers: [Peer; N]) {
     }
 }
 
-/// Runs the publisher and the subscriber of all types, and returns what the latter sums up.
+/// Runs the publisher and the subscriber of all types. Returns the subscriber's summary.
 fn all_types(lab: &Lab, [talks, listens]: [&str; 2], talks_at: Site, [published, heard]: [&str; 2]) -> Value {
     let run = |site, distribution, role, namespace| {
         let args = [role, "--namespace", namespace, "--timeout", "30"];
@@ -81,7 +81,7 @@ fn lifecycle_of_a_far_node_is_led_as_that_of_a_near_one() {
     }
 }
 
-/// Simulated seconds at which a node with `use_sim_time` ticks, so many of them.
+/// Returns the simulated seconds of the next ticks of a node with `use_sim_time`.
 fn ticks(simulated: &mut Peer, times: usize) -> Vec<f64> {
     let is_tick = |e: &Value| e["event"] == "tick" && e["seconds"].as_f64() > Some(1_000.0);
     (0..times)
@@ -89,7 +89,7 @@ fn ticks(simulated: &mut Peer, times: usize) -> Vec<f64> {
         .collect()
 }
 
-/// The median of what lies between ticks.
+/// Returns the median time between ticks.
 fn step(ticks: &[f64]) -> f64 {
     let mut steps: Vec<_> = ticks.windows(2).map(|pair| pair[1] - pair[0]).collect();
     steps.sort_by(f64::total_cmp);
@@ -103,7 +103,7 @@ fn clocks_with_use_sim_time_follow_a_far_simulator_back_to_its_beginning_too() {
         let mut both = [Site::Robot, Site::Desk].map(|site| start(&lab, site, listens, &["simulated"]));
         let mut simulator = start(&lab, Site::Robot, talks, &["simulator"]);
         let what = format!("{talks} to {listens}");
-        // One of them a second of simulated time, ten a second.
+        // The timer ticks once a second of simulated time, which is ten times a second.
         let [near, far] = both.each_mut().map(|simulated| ticks(simulated, 20));
         for heard in [&near, &far] {
             assert!(heard.is_sorted() && heard[19] < 100_000.0, "{what}: {heard:?}");
@@ -121,7 +121,7 @@ fn clocks_with_use_sim_time_follow_a_far_simulator_back_to_its_beginning_too() {
     }
 }
 
-/// The events that come within a second of each other, without those who made the call.
+/// Returns the events that come within a second of each other, without the id of the caller.
 fn events_of_a_call(watcher: &Peer) -> Vec<Value> {
     let mut heard = Vec::new();
     while let Ok((_, mut event)) = watcher.events.recv_timeout(Duration::from_secs(1)) {
@@ -134,7 +134,7 @@ fn events_of_a_call(watcher: &Peer) -> Vec<Value> {
     heard
 }
 
-/// The events of a service tell the same of a call, but who made it: the server's are of the client that `sgc` is to it.
+/// The events of client and server agree on a call except for the caller: the server's events name the client of `sgc`.
 #[test]
 fn events_of_far_services_are_heard_with_their_contents() {
     let lab = with_service_and_topic("/add", "/add/_service_event");
@@ -166,7 +166,7 @@ fn events_of_far_services_are_heard_with_their_contents() {
     }
 }
 
-/// A frame as `frame_prefix` has it: a slash in front gives way, and what is empty stays empty.
+/// Returns a frame with `frame_prefix`: a leading slash is dropped, and an empty frame stays empty.
 fn prefixed(frame: &Value) -> Value {
     match frame.as_str().unwrap().trim_start_matches('/') {
         "" => json!(""),
@@ -218,7 +218,7 @@ fn images_of_one_six_and_thirteen_megabytes_arrive_whole() {
             sent
         };
         let is_image = |e: &Value| e["event"] == "received";
-        // The first may be lost while its ends find each other.
+        // The first message may be lost during discovery.
         let first = next();
         let second = next();
         for (viewer, place) in viewers.iter_mut().zip(["natively", "afar"]) {

@@ -18,7 +18,7 @@ fn start(lab: &Lab, site: Site, distribution: &str, program: &str, args: &[&str]
     Peer::start(command)
 }
 
-/// eclipse-zenoh/zenoh-plugin-ros2dds #700 and #570: after each restart of a publisher, or of a bridge, every message comes once more often.
+/// eclipse-zenoh/zenoh-plugin-ros2dds #700 and #570: after each restart of a publisher or a bridge, every message is repeated once more.
 #[test]
 fn subscriber_hears_each_message_once_however_often_publisher_and_nodes_restart() {
     /// Each publisher's numbers begin at its run times this.
@@ -68,7 +68,7 @@ fn subscriptions_that_come_and_go_leave_no_memory_behind() {
             resident.push(lab.node(Site::Desk).held().resident_kb);
             churn.go();
         }
-        // The first fill what is reused.
+        // The first subscriptions fill memory that later ones reuse.
         assert!(resident[3] <= resident[1] + MORE_KB_MAX, "{distribution}: {resident:?} KB");
     }
 }
@@ -89,14 +89,14 @@ fn topic_survives_thirteen_participants_that_join_at_once() {
             let event = crowd.wait("a message for another", |e| e["event"] == "hears");
             hear.insert(count(&event, "number"));
         }
-        // Whoever was there before still hears what is said now.
+        // The first subscriber still receives new messages.
         let before = listener.events.try_iter().filter_map(|(_, e)| e["seq"].as_u64()).max();
         listener.wait("a later message", |e| e["seq"].as_u64() > before);
     }
 }
 
-/// ros2/rmw_zenoh #425: where two distributions have different definitions of a type, topics are silent and nothing says why. Here they
-/// flow, as they do natively, and it is said.
+/// ros2/rmw_zenoh #425: where two distributions have different definitions of a type, topics are silent without a message. Here they
+/// flow, as they do natively, and the difference is reported.
 #[test]
 fn different_definitions_of_a_type_are_named_where_they_meet() {
     let lab = Lab::real(PLAN, robot_to_desk("topic", PAIRS.map(|[talks, _]| format!("/differs_{talks}"))));
@@ -117,7 +117,7 @@ fn different_definitions_of_a_type_are_named_where_they_meet() {
     }
 }
 
-/// The way between two namespaces, worse than any of this machine's.
+/// Joins two namespaces by a bad path.
 fn bad_way(robot: &Namespace, cloud: &Namespace) -> TunLink {
     let profile = Profile {
         delay: Duration::from_millis(20),
@@ -137,8 +137,8 @@ fn bad_way(robot: &Namespace, cloud: &Namespace) -> TunLink {
     TunLink::start(ends, &TunOptions { profiles: [profile; 2], ..TunOptions::default() }).unwrap()
 }
 
-/// eProsima/DDS-Router #397: over a bad network reliable messages are lost. The way loses, delays, doubles and reorders packets, and is
-/// cut for some seconds.
+/// eProsima/DDS-Router #397: over a bad network reliable messages are lost. The path loses, delays, repeats and reorders packets, and
+/// is cut for some seconds.
 #[test]
 fn reliable_messages_arrive_once_and_in_order_over_a_bad_network() {
     const CUT: Duration = Duration::from_secs(3);

@@ -1,5 +1,5 @@
-//! Services, actions and parameters of real ROS 2: calls made in the moment in which a server is seen, slow servers, servers that are
-//! started again. And the first messages of publishers, which meet the same fault of the transport.
+//! Services, actions and parameters of real ROS 2: calls right after discovery of a server, slow servers, restarted servers. Also
+//! the first messages of publishers, which the same fault of the transport affects.
 
 use rustix::process::Signal;
 use serde_json::Value;
@@ -12,11 +12,11 @@ const CLIENTS: u64 = 50;
 
 const DISTRIBUTIONS: [&str; 2] = ["jazzy", "kilted"];
 
-/// How many seconds a program tries before it says what it did not get.
+/// Seconds after which a program reports missing answers.
 const TRIES_S: &str = "20";
 
-/// How long a first call may take, seconds. A Fast DDS writer sends heartbeats every three seconds: a call that waits for one takes
-/// longer.
+/// Longest duration of a first call, in seconds. A Fast DDS writer sends heartbeats every three seconds, so a call that waits for
+/// one takes longer.
 const FIRST_CALL_MAX_S: f64 = 2.0;
 
 fn program(lab: &Lab, site: Site, distribution: &str, args: &[&str]) -> Peer {
@@ -62,13 +62,13 @@ fn calls_made_when_a_service_is_first_seen_are_answered() {
     for (distribution, client) in DISTRIBUTIONS.into_iter().zip(&mut clients) {
         assert_answered_at_once(&client.summary(), 2 * CLIENTS, distribution);
     }
-    // And each as the first of its participant.
+    // Each call is also made as the first of its participant.
     let participants = [&both[..], &["--participants"]].concat();
     let mut clients = DISTRIBUTIONS.map(|d| call(&lab, Site::Desk, d, PARTICIPANTS, &participants));
     for (distribution, client) in DISTRIBUTIONS.into_iter().zip(&mut clients) {
         assert_answered(&client.summary(), 2 * PARTICIPANTS, distribution);
     }
-    // The same with nothing in between.
+    // The same calls without sgc.
     let _native =
         [["jazzy", "/native_jazzy"], ["kilted", "/native_kilted"]].map(|server| serve_at(Site::Desk, server));
     let both = ["--service", "/native_jazzy", "--service", "/native_kilted"];
@@ -144,7 +144,7 @@ fn calls_of_a_server_that_was_started_again_are_answered() {
     let without = || {
         let routes = lab.status(Site::Robot)["routes"].take();
         let states = routes.as_array().into_iter().flatten().filter_map(|route| route["state"].as_str());
-        // The latter once the service is no longer offered.
+        // The second state comes once the service is no longer offered.
         let is_without = |state: &&str| {
             state.starts_with("0 local servers") || state.starts_with("waits for a local server")
         };
@@ -201,7 +201,7 @@ fn calls_of_a_server_that_was_killed_are_counted_and_explained_until_calls_are_a
     }
 }
 
-/// eclipse-zenoh/zenoh-plugin-ros2dds #382: a client that goes while there is no server stops everything.
+/// eclipse-zenoh/zenoh-plugin-ros2dds #382: a client that leaves while there is no server stops the bridge.
 #[test]
 fn clients_that_leave_before_a_server_is_there_stop_nothing() {
     let lab = Lab::real(PLAN, robot_to_desk("service", ["/early", "/other"]));

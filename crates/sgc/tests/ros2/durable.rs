@@ -13,7 +13,7 @@ const MESSAGES: u64 = 20;
 const LATCHED: [(&str, &str, u64); 4] =
     [("last", "1", 1), ("five", "5", 5), ("ten", "10", 10), ("all", "0", MESSAGES)];
 
-/// A publisher that has sent so many messages, once so many readers are matched, and stays.
+/// Starts a publisher that waits for readers, sends its messages and stays.
 fn latch(
     lab: &Lab,
     site: Site,
@@ -29,7 +29,7 @@ fn latch(
     started(lab.load(site, distribution, &[&said[..], &stays].concat()))
 }
 
-/// A program that has joined its network. Those of Fast DDS that join at the same instant do not all find others.
+/// Waits until a program has joined its network. Fast DDS programs that join at the same instant may miss others.
 fn started(mut program: Peer) -> Peer {
     program.wait("an endpoint", |event| event["event"] == "ready");
     program
@@ -39,7 +39,7 @@ fn has_sent(publisher: &mut Peer) {
     publisher.wait("all sent", |event| event["event"] == "all_sent");
 }
 
-/// A subscriber at the desk that waits for so many messages, and then for more.
+/// Starts a subscriber at the desk that waits for so many messages, and then for more.
 fn listen(lab: &Lab, distribution: &str, topic: &str, expected: u64) -> Peer {
     let expected = expected.to_string();
     let asks = ["sub", "--topic", topic, "--transient-local", "--depth", "0", "--count", &expected];
@@ -47,19 +47,19 @@ fn listen(lab: &Lab, distribution: &str, topic: &str, expected: u64) -> Peer {
     started(lab.load(Site::Desk, distribution, &[&asks[..], &stays].concat()))
 }
 
-/// Asserts that these came, once each and in their order.
+/// Asserts that these messages came once each and in order.
 fn assert_heard(summary: &Value, first: u64, expected: u64, what: &str) {
     let counts =
         ["received", "first", "last", "duplicated", "altered", "reordered"].map(|key| count(summary, key));
     assert_eq!(counts, [expected, first, MESSAGES - 1, 0, 0, 0], "{what}: {summary}");
 }
 
-/// A topic of these publishers alone: one that was killed is missed some time later.
+/// Returns a topic that only these publishers have, because a killed one is missed later.
 fn topic(under: &str, name: &str) -> String {
     format!("/{under}/{name}")
 }
 
-/// Publishers of all depths, which have sent all.
+/// Starts publishers of all depths, which have sent all messages.
 fn latch_all(lab: &Lab, site: Site, talks: &str, under: &str, matched: &str) -> [Peer; 4] {
     let latch = |(name, depth, _)| latch(lab, site, talks, &topic(under, name), depth, MESSAGES, matched);
     let mut publishers = LATCHED.map(latch);
@@ -89,7 +89,7 @@ fn late_joiners_get_as_much_as_their_publishers_keep() {
         PAIRS.iter().flat_map(|[talks, _]| LATCHED.map(|(name, ..)| topic(talks, name))).collect();
     let mut lab = Lab::real(PLAN, robot_to_desk("topic", topics));
     for [talks, listens] in PAIRS {
-        // Topics that `sgc` has nothing to do with.
+        // Topics that `sgc` does not carry.
         let under = format!("native/{talks}");
         let _publishers = latch_all(&lab, Site::Desk, talks, &under, "0");
         assert_late_joiners(&lab, listens, &under, "natively");
@@ -101,7 +101,7 @@ fn late_joiners_get_as_much_as_their_publishers_keep() {
             wait_for_last(&lab, listens, &topic(talks, name), MESSAGES);
         }
         assert_late_joiners(&lab, listens, talks, "late");
-        // The node at the robot comes back: a subscriber that heard it all does not hear it again, one that is late does.
+        // The node at the robot comes back. A subscriber that had all messages gets none again; a late one gets them.
         let repeated = || lab.status(Site::Desk)["drops"]["repeated"].as_u64().unwrap_or(0);
         let wanted = repeated() + LATCHED.iter().map(|(.., expected)| expected).sum::<u64>();
         lab.end(Site::Robot, Signal::KILL);
@@ -136,7 +136,7 @@ fn restart_beside_a_latched_subscriber_repeats_what_is_kept_once_and_loses_nothi
             (started(lab.rclpy(Site::Robot, talks, "events.py", &says)), listener, depth)
         })
         .collect();
-    // Everything that comes up to this number.
+    // Reads all messages up to this number.
     let heard = |listener: &mut Peer, last: u64| {
         let mut seqs = Vec::new();
         while seqs.last() != Some(&last) {
@@ -169,7 +169,7 @@ fn restart_beside_a_latched_subscriber_repeats_what_is_kept_once_and_loses_nothi
     }
 }
 
-/// Each latched publisher of a topic is heard by a late joiner, not the last of them alone.
+/// A late joiner gets messages of each latched publisher of a topic, not only of the last one.
 #[test]
 fn late_joiners_hear_each_latched_publisher_of_a_topic() {
     let topics = PAIRS.map(|[talks, _]| topic(talks, "tf_static"));
@@ -240,7 +240,7 @@ fn late_joiners_get_what_a_share_says() {
     let lab = Lab::real(PLAN, [shared + "durability = \"transient_local\"\ndepth = 3\n", used]);
     let talk =
         ["pub", "--topic", "/kept", "--count", "20", "--rate", "50", "--hold", "60", "--timeout", "90"];
-    // Volatile.
+    // A volatile publisher.
     let mut publisher = started(lab.load(Site::Robot, "jazzy", &talk));
     has_sent(&mut publisher);
     // It may have sent all before the desk was granted the topic.

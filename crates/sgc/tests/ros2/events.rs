@@ -9,7 +9,7 @@ use crate::lab::{Lab, Site, robot_to_desk};
 use crate::support::Peer;
 use crate::{PAIRS, PLAN};
 
-/// The longest time by which news may come later through `sgc` than from a publisher nearby.
+/// Longest additional delay of news through `sgc`, compared with a publisher nearby.
 const LATER_MAX: Duration = Duration::from_secs(1);
 
 /// Longest wait for an event that a test expects.
@@ -30,7 +30,7 @@ struct Pair {
 }
 
 impl Pair {
-    /// Starts both at these sites.
+    /// Starts both programs at these sites.
     fn start(
         lab: &Lab,
         topic: &str,
@@ -52,7 +52,7 @@ impl Pair {
         })
     }
 
-    /// Returns the next event of the subscriber that is like this, and its time.
+    /// Returns the next matching event of the subscriber, and its time.
     fn hears(&self, what: &str, is_it: impl Fn(&Value) -> bool) -> (Instant, Value) {
         let end = Instant::now() + PATIENCE;
         loop {
@@ -74,7 +74,7 @@ impl Pair {
         self.hears("a message", |e| e["event"] == "received").0
     }
 
-    /// Everything that the subscriber has reported and nobody has looked at.
+    /// Returns all unread reports of the subscriber.
     fn reported(&self) -> Vec<Value> {
         self.listener.events.try_iter().map(|(_, event)| event).collect()
     }
@@ -132,7 +132,7 @@ fn far_subscriber_hears_of_a_manual_publisher_and_of_a_missed_deadline_as_soon_a
     let lab = Lab::real(PLAN, carried(&["/carried"]));
     let qos: [&[&str]; 2] = [&["--lease", "2", "--kind", "manual", "--deadline", "1"]; 2];
     let mut all = Pair::start_all(&lab, ["/native", "/carried"], qos);
-    // Silence costs both, and the next message brings the publisher back.
+    // Silence ends liveliness and misses the deadline. The next message brings the publisher back.
     for _ in 0..2 {
         for pair in all.iter().flatten() {
             pair.hears_alive(1);

@@ -1,4 +1,4 @@
-//! Messages at full speed, large ones, and subscribers that stand still.
+//! Messages at full speed, large messages, and stalled subscribers.
 
 use std::thread;
 use std::time::Duration;
@@ -9,8 +9,8 @@ use serde_json::Value;
 use crate::lab::{Lab, Site, robot_to_desk};
 use crate::{PAIRS, PLAN, count};
 
-/// A publisher of so many messages, the second half a second after the first, and a subscriber, matched with each other or by `sgc`;
-/// what the subscriber sums up once it has the last.
+/// Runs a publisher of so many messages, the second half a second after the first, and a subscriber, matched directly or through
+/// `sgc`. Returns the subscriber's summary once it has the last message.
 fn carry(lab: &Lab, [talks, listens]: [&str; 2], sites: [Site; 2], messages: u64, extra: &[&str]) -> Value {
     let messages = messages.to_string();
     let common = [&["--topic", "/load", "--timeout", PLAN.peer_life][..], extra].concat();
@@ -27,8 +27,8 @@ fn carry(lab: &Lab, [talks, listens]: [&str; 2], sites: [Site; 2], messages: u64
     summary
 }
 
-/// Asserts that all of them came, once each, unaltered and in their order. The first may be lost: a reader is matched a moment before it
-/// knows (`tests/peers/README.md`).
+/// Asserts that all messages came once each, unaltered and in order. The first may be lost, because a reader is matched a moment
+/// before it knows (`tests/peers/README.md`).
 fn assert_whole(summary: &Value, messages: u64, what: &str) {
     let counts = ["last", "lost", "duplicated", "altered", "reordered"].map(|key| count(summary, key));
     assert_eq!(counts, [messages - 1, 0, 0, 0, 0], "{what}: {summary}");
@@ -62,8 +62,8 @@ fn large_messages_of_real_ros_2_arrive_whole() {
     }
 }
 
-/// A subscriber with default QoS keeps ten messages. Hundreds that come at once, because a router stood still, would overwrite each
-/// other there.
+/// A subscriber with default QoS keeps ten messages. Hundreds that come at once after a router stalled would overwrite each other
+/// there.
 #[test]
 fn subscriber_with_default_qos_receives_a_burst() {
     const MESSAGES: u64 = 2_000;
@@ -95,7 +95,7 @@ fn subscriber_with_default_qos_receives_a_burst() {
     assert!(lost < gathered / 10, "{lost} of {gathered}");
 }
 
-/// A subscriber that stands still holds up nobody else, and what its publisher keeps is there when it goes on.
+/// A stalled subscriber holds up no other, and gets the publisher's history when it goes on.
 #[test]
 fn a_subscriber_that_stands_still_holds_up_nobody_else() {
     const MESSAGES: u64 = 500;
@@ -127,7 +127,7 @@ fn a_subscriber_that_stands_still_holds_up_nobody_else() {
     quick.wait_matched("a match at the desk");
     frozen.wait_matched("another match at the desk");
     talker.go();
-    // Once it has the first.
+    // Waits until it has the first message.
     thread::sleep(Duration::from_millis(300));
     frozen.signal(Signal::STOP);
     assert_whole(&quick.summary(), MESSAGES, "the other");

@@ -10,15 +10,15 @@ use crate::lab::{Lab, Site, robot_to_desk, share, uses};
 use crate::support::Peer;
 use crate::{PAIRS, PLAN};
 
-/// The ends of a topic as a program of this distribution finds them at a site, once each has a node.
+/// Returns the ends of a topic as a program of this distribution sees them at a site, once each has a node.
 fn ends(lab: &Lab, site: Site, distribution: &str, publishers: &str, subscribers: &str) -> Value {
     let counts = ["--publishers", publishers, "--subscribers", subscribers];
-    // A far publisher is shown as one of the node of `sgc`, until its own is told.
+    // A far publisher appears under the node of `sgc` until its own node is known.
     let args = [&["--topic", "/load", "--node", "load", "--timeout", "30"][..], &counts].concat();
     lab.rclpy(site, distribution, "graph.py", &args).summary()
 }
 
-/// All that is said of an end, but for the id that it has in its own network.
+/// Returns the description of an end without the id in its own network.
 fn without_gid(end: &Value) -> Value {
     let mut end = end.clone();
     let gid = end.as_object_mut().unwrap().remove("gid").unwrap();
@@ -61,7 +61,7 @@ fn readers_of_sgc_are_shown_as_those_of_its_node() {
     }
 }
 
-/// The subscribers of a topic, once there are exactly so many, by the name of their node.
+/// Returns the subscribers of a topic by the name of their node, once there are exactly so many.
 fn subscribers(lab: &Lab, site: Site, distribution: &str, count: usize) -> BTreeMap<String, Value> {
     let wanted = count.to_string();
     let args =
@@ -99,7 +99,7 @@ fn far_subscribers_are_shown_with_node_type_qos_and_id_while_they_live() {
         recorder.end();
         let left = subscribers(&lab, Site::Robot, talks, 2);
         assert!(left.contains_key("map_view") && left.contains_key("sgc_robot"), "{left:?}");
-        // The publisher knows of one, however many are shown.
+        // The publisher matches one reader, however many are shown.
         talker.end();
         assert_eq!(talker.summary()["matched"], 1, "{talks}, {hears}");
     }
@@ -191,7 +191,7 @@ fn consumers_of_a_node_without_graph_are_not_shown() {
     lab.reconfigure(Site::Desk, "[ros]\n", "[ros]\ngraph = false\n");
     lab.start(Site::Desk);
     let mut listener = subscriber(&lab, "kilted", "map_view", &["--verbose"]);
-    // It hears messages for two seconds; one that is told is shown after less than one.
+    // It hears messages for two seconds. A known consumer would appear after less than one.
     for _ in 0..20 {
         listener.wait("a message", |event| event["event"] == "received");
     }

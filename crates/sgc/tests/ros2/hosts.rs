@@ -1,4 +1,4 @@
-//! How `sgc` finds and reaches programs of its own host, and says where it cannot.
+//! Tests how `sgc` finds and reaches programs of its own host, and reports where it cannot.
 
 use std::time::{Duration, Instant};
 
@@ -34,7 +34,7 @@ fn a_discovery_server_of_programs_is_named() {
 }
 
 #[test]
-fn packets_that_cannot_be_sent_are_said() {
+fn packets_that_cannot_be_sent_are_reported() {
     let [jazzy, kilted] = PAIRS[0];
     let lab = Lab::real(PLAN, robot_to_desk("topic", ["/load"]));
     let Some(robot) = lab.namespace(Site::Robot) else { return };
@@ -54,7 +54,7 @@ fn packets_that_cannot_be_sent_are_said() {
 /// Bound on the time from the end of a change to the next message.
 const RESUMED: Duration = Duration::from_secs(2);
 
-/// Variables that say how far a program is discovered: as ROS 2 ships, and two ways to keep to one's host.
+/// Environment variables that set the discovery range of a program: the default of ROS 2, and two ways to limit it to the host.
 type Environment = &'static [(&'static str, &'static str)];
 const SUBNET: Environment = &[];
 const LOCALHOST: Environment = &[("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")];
@@ -68,12 +68,12 @@ struct Flow {
     _talkers: [Peer; 2],
 }
 
-/// The topics of flows, from the site and to it.
+/// Returns the topics of flows, from the site and to it.
 fn topics<'a>(way: &str, labels: impl IntoIterator<Item = &'a str>) -> Vec<String> {
     labels.into_iter().map(|label| format!("/{way}_{label}")).collect()
 }
 
-/// Tables of the robot and of the desk by which flows of these labels go both ways.
+/// Returns the tables of the robot and of the desk by which flows of these labels go both ways.
 fn both_ways<'a>(labels: impl IntoIterator<Item = &'a str> + Clone) -> [String; 2] {
     let [mut robot, mut desk] = robot_to_desk("topic", topics("up", labels.clone()));
     for topic in topics("down", labels) {
@@ -167,7 +167,7 @@ fn topics_survive_an_outage_longer_than_leases_and_reach_programs_that_start_lat
     let Some(robot) = lab.namespace(Site::Robot) else { return };
     change(robot, "addr del 10.92.1.2/24 dev cloud");
     change(robot, "link set cloud down");
-    // Without an interface nothing reaches the desk; what the lease is about is that programs stay known.
+    // Without an interface nothing reaches the desk. Only the lease decides whether programs stay known.
     let until = Instant::now() + OUTAGE;
     while Instant::now() < until {
         let here = lab.status(Site::Robot)["routes"].to_string();
@@ -186,7 +186,7 @@ fn topics_survive_an_outage_longer_than_leases_and_reach_programs_that_start_lat
     assert_all(&mut flows, PATIENCE, "for programs that started after the change");
 }
 
-/// Bound on the time from a change of addresses to messages of programs of other hosts: until a packet to them fails, the addresses count as
+/// Bound on the time from a change of addresses to messages of programs of other hosts: until a packet to them fails, addresses count as
 /// settled, and the network is open again.
 const REOPENED: Duration = Duration::from_secs(30);
 
@@ -207,7 +207,7 @@ fn programs_of_other_hosts_come_back_after_an_address_change() {
         // Multicast leaves by the interface that a route names, on hosts with several.
         change(cloud, "route add 239.0.0.0/8 dev robot");
         // The cloud's host is on the robot's network, too: its programs are those of a second computer.
-        // The desk's programs do not hear it.
+        // The desk's programs do not hear this publisher.
         let mut flows = [
             Flow::start(&lab, Site::Robot, pair, "same", [LOCALHOST, LOCALHOST]),
             Flow::start(&lab, Site::Cloud, pair, "other", [SUBNET, LOCALHOST]),

@@ -1,4 +1,4 @@
-//! Topics with keys, which Kilted has and Jazzy does not. A Kilted subscriber ends with a segmentation fault at a message that comes without
+//! Topics with keys, which Kilted has and Jazzy does not. A Kilted subscriber ends with a segmentation fault at a message without
 //! the hash of its key (`docs/reference/compatibility.md`).
 
 use serde_json::{Value, json};
@@ -13,7 +13,7 @@ fn keyed(lab: &Lab, site: Site, role: &str, args: &[&str]) -> Peer {
     lab.rclpy(site, "kilted", "keyed.py", &[&[role, "--timeout", PLAN.peer_life], args].concat())
 }
 
-/// The summary of a subscriber that starts with the publisher.
+/// Returns the summary of a subscriber that starts with the publisher.
 fn live(lab: &Lab, talks: Site) -> Value {
     let mut listener = keyed(lab, Site::Desk, "sub", &[]);
     let talker = keyed(lab, talks, "pub", &[]);
@@ -22,7 +22,7 @@ fn live(lab: &Lab, talks: Site) -> Value {
     summary
 }
 
-/// The summary of a subscriber that starts once all is published.
+/// Returns the summary of a subscriber that starts after all messages are published.
 fn late(lab: &Lab, talks: Site) -> Value {
     let mut talker = keyed(lab, talks, "pub", &["--transient-local"]);
     talker.wait("messages", |event| event["event"] == "all_sent");

@@ -1,4 +1,4 @@
-//! Two companies, each with a fleet of its own: what they give each other by tokens, as `docs/how-to/partner.md` has it, crosses, and nothing else.
+//! Tests two companies with a fleet each: only the topics of their tokens cross, as in `docs/how-to/sharing.md`.
 
 use std::fs;
 use std::io::Write;
@@ -16,8 +16,8 @@ const CHATTER: &str = "/robot/chatter";
 /// The topic that the cart's company gives.
 const STATE: &str = "/cart/state";
 
-/// A robot of the fleet `lab` with these tables, and in the place of the desk a cart of the fleet `acme` with those, whose node knows
-/// no router yet. Each company has the CA of the other (`acme.pem`, `lab.pem`). None if networks are not apart.
+/// Returns a lab with a robot of the fleet `lab`, and a cart of the fleet `acme` in the place of the desk, whose node knows no router
+/// yet. Each company has the CA of the other (`acme.pem`, `lab.pem`). Returns `None` if networks are not separate.
 fn companies([robot, cart]: [&str; 2]) -> Option<Lab> {
     let lab = Lab::silent(PLAN, [robot.to_owned(), String::new()]);
     if lab.namespace(Site::Desk).is_none() {
@@ -71,7 +71,7 @@ fn give(lab: &Lab, site: Site, topic: &str) -> Vec<u8> {
     token
 }
 
-/// Takes a token, as the node runs; says what the command line does.
+/// Takes a token while the node runs. Returns the output of the command line.
 fn take(lab: &Lab, site: Site, token: &[u8]) -> String {
     let config = format!("{}.toml", site.name());
     let output = run(lab, &["use", "-", "-c", &config], token);
@@ -92,15 +92,15 @@ fn token_takes_its_type_from_the_robot_and_the_partner_needs_no_restart() {
     desk.wait("a message", |event| event["event"] == "received");
 }
 
-/// What is known at a site of the names that begin like this: nodes, and what some node publishes and serves; once the publishers of the
-/// topic there are those of this node.
+/// Returns the names with this beginning that a site knows: nodes, and topics and services of some node. Waits until the topic has only
+/// the publishers of this node.
 fn seen(lab: &Lab, site: Site, distribution: &str, [topic, node, begin]: [&str; 3]) -> [Vec<Value>; 3] {
     let args = ["--topic", topic, "--publishers", "1", "--node", node, "--timeout", "30"];
     let found = lab.rclpy(site, distribution, "graph.py", &args).summary();
     let is_below = |name: &&Value| name.as_str().unwrap().starts_with(begin);
     ["nodes", "published", "served"].map(|key| {
         let mut names: Vec<_> = found[key].as_array().unwrap().iter().filter(is_below).cloned().collect();
-        // A node that was killed may be there beside the next of its name.
+        // A killed node may still be listed beside the next one of its name.
         names.dedup();
         names
     })
@@ -108,7 +108,7 @@ fn seen(lab: &Lab, site: Site, distribution: &str, [topic, node, begin]: [&str; 
 
 #[test]
 fn partners_hear_the_topics_of_their_tokens_each_way_and_nothing_else() {
-    // Each company shares more with its own nodes, services, actions and parameters among that.
+    // Each company shares more with its own nodes, including services, actions and parameters.
     let [all, _] = everything();
     let cart = all.replace("\"desk\"", "\"*\"").replace("/robot/fibonacci", "/cart/fibonacci");
     let [robot, cart] = [(all, CHATTER), (cart, STATE)].map(|(all, topic)| all + &share("topic", topic, "*"));

@@ -1,7 +1,7 @@
 //! A local network that DDS Security (SROS2) protects, with a keystore as SROS2 lays it out: everything is encrypted, and permissions
 //! name each topic.
 //!
-//! The programs are Fast DDS as Debian builds it, with the properties that rmw_fastrtps sets. The wheels of ROS 2 are built without security.
+//! The programs are Fast DDS of Debian, with the properties that rmw_fastrtps sets. The wheels of ROS 2 are built without security.
 
 #![cfg_attr(
     not(feature = "sros2"),
@@ -73,7 +73,7 @@ fn secured(lab: &Lab, keystore: &Keystore, enclave: &str, role: &str, args: &[&s
 
 /// Runs the robot's node, which is expected to end at once, and returns its errors.
 fn refusal(lab: &Lab) -> String {
-    // One that starts all the same would end with its standard input, which is empty.
+    // A node that starts nevertheless ends with its empty standard input.
     let args = ["run", "-c", "robot.toml", "--until-stdin-closes"];
     let output = lab.sgc(Some(Site::Robot), &args).output().unwrap();
     assert!(!output.status.success(), "{output:?}");
@@ -86,7 +86,7 @@ fn check(lab: &Lab) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// A lab with a topic in each direction, before its nodes are started.
+/// Returns a lab with a topic in each direction, before its nodes are started.
 fn lab() -> Lab {
     let robot = share("topic", "/out", "desk") + &uses("topic", "/in", "desk");
     let desk = share("topic", "/in", "robot") + &uses("topic", "/out", "robot");

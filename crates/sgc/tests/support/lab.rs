@@ -21,14 +21,14 @@ use crate::support::{self, Peer, Running, say, say_log};
 static TURN: Mutex<()> = Mutex::new(());
 static LABS: AtomicU32 = AtomicU32::new(0);
 
-/// What labs of a test program have of their own.
+/// The settings of a test program's labs.
 #[derive(Clone, Copy)]
 pub(crate) struct Plan {
     /// Namespaces are `NAME-PID-LAB-SITE`.
     pub(crate) name: &'static str,
     /// ROS domains of the robot and of the desk where their networks are not apart.
     pub(crate) domains: [&'static str; 2],
-    /// How many seconds a peer lives at most, should nobody end it.
+    /// Longest life of a peer in seconds, should no test end it.
     pub(crate) peer_life: &'static str,
 }
 
@@ -72,7 +72,7 @@ pub(crate) struct Lab {
     number: u32,
     dir: TempDir,
     nodes: [Option<Running>; 3],
-    /// None where the kernel or the user cannot make them.
+    /// `None` where the kernel or the user cannot make namespaces.
     namespaces: Option<[Namespace; 3]>,
     _turn: MutexGuard<'static, ()>,
 }
@@ -140,7 +140,7 @@ impl Lab {
         self.end(site, Signal::KILL);
     }
 
-    /// Its process.
+    /// Returns the process of a node.
     pub(crate) fn node(&self, site: Site) -> &Running {
         self.nodes[site as usize].as_ref().unwrap()
     }
@@ -211,7 +211,7 @@ impl Lab {
         fs::read_to_string(self.path(site, "log")).unwrap_or_default()
     }
 
-    /// What a node says of itself; null while it does not answer.
+    /// Returns a node's status, or null while it does not answer.
     pub(crate) fn status(&self, site: Site) -> Value {
         let mut command = self.sgc(None, &["status", "--json", "--socket"]);
         let output = command.arg(self.path(site, "sock")).output().unwrap();

@@ -1,5 +1,5 @@
-//! What the tests with network namespaces and programs that are not ours have in common: namespaces, commands in them, nodes
-//! as processes, and the peers of `tests/peers/README.md`.
+//! Shared helpers of tests with network namespaces and independent programs: namespaces, commands in them, nodes as
+//! processes, and the peers of `tests/peers/README.md`.
 
 #![allow(dead_code, reason = "each test program uses a part")]
 
@@ -16,40 +16,40 @@ use sgc_testkit::netsim::{Namespace, NetsimError};
 
 /// Longest wait for an event, far beyond what any takes.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
-/// Lines of each log that are shown when a test fails.
+/// Number of lines of each log that are shown when a test fails.
 const LOG_LINES: usize = 40;
 
-/// To the terminal, past the test harness, which shows nothing of a test that passes.
+/// Prints to the terminal directly, because the test harness hides the output of passing tests.
 pub(crate) fn say(text: &str) {
     let _ = writeln!(std::io::stderr(), "{text}");
 }
 
-/// Says how a log ends.
+/// Prints the end of a log.
 pub(crate) fn say_log(whose: &str, log: &str) {
     let lines: Vec<_> = log.lines().collect();
     let tail = &lines[lines.len().saturating_sub(LOG_LINES)..];
     say(&format!("--- {whose}, last of {} lines ---\n{}", lines.len(), tail.join("\n")));
 }
 
-/// Namespaces, or nothing where the kernel or the user cannot make them; which is said, and what is used `instead`.
+/// Returns the namespaces, or `None` where the kernel or the user cannot make them. Prints the fallback in that case.
 pub(crate) fn namespaces<T>(made: Result<T, NetsimError>, instead: &str) -> Option<T> {
     made.inspect_err(|why| say(&format!("NO NETWORK NAMESPACES ({why}): {instead}"))).ok()
 }
 
-/// A network of the test's own, its loopback interface with multicast, or nothing, as [`namespaces`] says.
+/// Returns a private network whose loopback interface has multicast, or `None` as [`namespaces`] does.
 pub(crate) fn own_network(name: String) -> Option<Namespace> {
     let made = Namespace::create(name);
     let made = made.and_then(|own| own.ip(&["link", "set", "lo", "multicast", "on"]).map(|_| own));
     namespaces(made, "using this host's network")
 }
 
-/// A file of this repository.
+/// Returns the path of a file of this repository.
 pub(crate) fn repository(file: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap().join(file)
 }
 
-/// A command in a namespace, or on this host, in a directory and with nothing of our environment but `PATH` and
-/// `SGC_LOG`. Its process is the program's own: `ip` replaces itself by it.
+/// Returns a command in a namespace, or on this host, that runs in a directory with only `PATH` and `SGC_LOG` of our
+/// environment. Its process id is that of the program, because `ip` replaces itself by it.
 pub(crate) fn command(namespace: Option<&Namespace>, dir: &Path, program: &Path) -> Command {
     let mut command = namespace.map_or_else(|| Command::new(program), |namespace| namespace.command(program));
     let path = std::env::var_os("PATH").unwrap();
@@ -59,21 +59,22 @@ pub(crate) fn command(namespace: Option<&Namespace>, dir: &Path, program: &Path)
     command
 }
 
-/// The same of the program that is tested. Tests look into its memory and at its open files.
+/// Returns such a command for the tested program, with core dumps allowed, because tests read its memory and open files.
 pub(crate) fn sgc(namespace: Option<&Namespace>, dir: &Path) -> Command {
     let mut command = command(namespace, dir, Path::new(env!("CARGO_BIN_EXE_sgc")));
     command.env("SGC_ALLOW_CORE_DUMPS", "1");
     command
 }
 
-/// The same of a Python program of `tests/peers/py`.
+/// Returns such a command for a Python program of `tests/peers/py`.
 pub(crate) fn python(namespace: Option<&Namespace>, dir: &Path, program: &str) -> Command {
     let mut command = command(namespace, dir, &repository(".venv/bin/python"));
     command.arg("-B").arg(repository("tests/peers/py").join(program));
     command
 }
 
-/// The files of the fleet `lab` in a directory, and of its members: each a name, and what enrolling it takes besides.
+/// Writes the files of the fleet `lab` and of its members to a directory. Each member is a name and further arguments of
+/// `sgc fleet enroll`.
 pub(crate) fn enroll<'a>(dir: &Path, members: impl IntoIterator<Item = &'a str>) {
     let good = |command: &str| {
         let output = sgc(None, dir).args(command.split_whitespace()).output().unwrap();
@@ -83,7 +84,7 @@ pub(crate) fn enroll<'a>(dir: &Path, members: impl IntoIterator<Item = &'a str>)
     members.into_iter().for_each(|member| good(&format!("fleet enroll {member}")));
 }
 
-/// Waits for what will be so within [`PATIENCE`].
+/// Waits until a condition holds, which it must within [`PATIENCE`].
 pub(crate) fn eventually(what: &str, mut is_so: impl FnMut() -> bool) {
     let deadline = Instant::now() + PATIENCE;
     while !is_so() {
@@ -92,15 +93,15 @@ pub(crate) fn eventually(what: &str, mut is_so: impl FnMut() -> bool) {
     }
 }
 
-/// A node as a process of its own, which is ended with this.
+/// A node as a process, which ends when this is dropped.
 pub(crate) struct Running {
     child: Child,
-    /// What it listens on.
+    /// The addresses on which it listens.
     pub(crate) addresses: Vec<String>,
 }
 
 impl Running {
-    /// Starts one and waits until it is up; its log is appended to a file.
+    /// Starts a node and waits until it is up. Appends its log to a file.
     pub(crate) fn start(mut command: Command, log: &Path) -> Self {
         let file = fs::File::options().create(true).append(true).open(log).unwrap();
         command.args(["--print-ready", "--until-stdin-closes"]);
@@ -116,7 +117,7 @@ impl Running {
         node
     }
 
-    /// SIGKILL or SIGTERM, and what it ended with.
+    /// Sends SIGKILL or SIGTERM and returns the exit status.
     pub(crate) fn end(mut self, signal: Signal) -> ExitStatus {
         self.signal(signal);
         let mut ended = None;
@@ -127,12 +128,12 @@ impl Running {
         ended.unwrap()
     }
 
-    /// What it ended with, if it did.
+    /// Returns the exit status if the node has ended.
     pub(crate) fn try_end(&mut self) -> Option<ExitStatus> {
         self.child.try_wait().unwrap()
     }
 
-    /// A signal to a node that goes on living.
+    /// Sends a signal that does not end the node.
     pub(crate) fn signal(&self, signal: Signal) {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
@@ -141,8 +142,8 @@ impl Running {
         self.child.id()
     }
 
-    /// What it has of the system now.
-    pub(crate) fn held(&self) -> Held {
+    /// Returns the resources that the process uses now.
+    pub(crate) fn held(&self) -> ResourceUse {
         let pid = self.pid();
         let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
         let number = |key: &str| {
@@ -150,7 +151,7 @@ impl Running {
             line.split_whitespace().nth(1).unwrap().parse().unwrap()
         };
         let fds = fs::read_dir(format!("/proc/{pid}/fd")).unwrap().count();
-        Held { resident_kb: number("VmRSS:"), fds, threads: number("Threads:") as usize }
+        ResourceUse { resident_kb: number("VmRSS:"), fds, threads: number("Threads:") as usize }
     }
 }
 
@@ -161,31 +162,31 @@ impl Drop for Running {
     }
 }
 
-/// What a process has of the system.
+/// The system resources of a process.
 #[derive(Debug)]
-pub(crate) struct Held {
+pub(crate) struct ResourceUse {
     pub(crate) resident_kb: u64,
     pub(crate) fds: usize,
     pub(crate) threads: usize,
 }
 
-/// A program that is not ours.
+/// An independent program.
 pub(crate) struct Peer {
     child: Child,
     stdin: Option<ChildStdin>,
-    /// What it reports, and when we read it.
+    /// Its reports, with the times of reading.
     pub(crate) events: Receiver<(Instant, Value)>,
 }
 
 impl Peer {
-    /// The program of a vendor, `"cyclone"`, `"fastdds"` or `"rustdds"`.
+    /// Returns the program of a vendor, `"cyclone"`, `"fastdds"` or `"rustdds"`.
     pub(crate) fn program(vendor: &str) -> PathBuf {
         let program = repository(".peers").join(vendor);
         assert!(program.exists(), "{} is missing: run `make peers`", program.display());
         program
     }
 
-    /// Starts one, from a command with the program and all its arguments.
+    /// Starts a peer from a command with the program and all its arguments.
     pub(crate) fn start(mut command: Command) -> Self {
         let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
         let (sender, events) = channel();
@@ -201,7 +202,7 @@ impl Peer {
         Self { stdin: child.stdin.take(), child, events }
     }
 
-    /// The next event of a kind, which must come before the peer ends.
+    /// Returns the next event of a kind, which must come before the peer ends.
     pub(crate) fn wait(&mut self, what: &str, is_it: impl Fn(&Value) -> bool) -> Value {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -214,23 +215,23 @@ impl Peer {
         }
     }
 
-    /// Waits until it is matched. Not after what else it reports: it may be matched before it says that it is ready, since a far
-    /// writer stays for a while when its publisher has gone, and is the next one's if that is alike.
+    /// Waits until the peer is matched, in whatever order its reports come. It may be matched before it is ready: a writer on the
+    /// far side outlives its publisher for a while, and serves the next one with equal settings.
     pub(crate) fn wait_matched(&mut self, what: &str) {
         self.wait(what, |event| event["event"] == "matched" && event["count"].as_u64() >= Some(1));
     }
 
-    /// Lets it go on: one line on its standard input.
+    /// Lets the peer go on by a line on its standard input.
     pub(crate) fn go(&mut self) {
         self.tell("go");
     }
 
-    /// Gives it a line on its standard input.
+    /// Writes a line to the peer's standard input.
     pub(crate) fn tell(&mut self, line: &str) {
         writeln!(self.stdin.as_mut().unwrap(), "{line}").unwrap();
     }
 
-    /// SIGTERM; its summary follows.
+    /// Sends SIGTERM. The peer's summary follows.
     pub(crate) fn end(&mut self) {
         self.signal(Signal::TERM);
     }
@@ -239,7 +240,7 @@ impl Peer {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
 
-    /// What it sums up at its end.
+    /// Ends the peer and returns its summary.
     pub(crate) fn summary(&mut self) -> Value {
         let deadline = Instant::now() + 2 * PATIENCE;
         loop {

@@ -1,4 +1,4 @@
-//! A stream of numbered messages from an application at the robot to one at the desk, and what became of them.
+//! A stream of numbered messages from an application at the robot to one at the desk, and its verdict.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::SeqCst};
 use std::sync::{Arc, Mutex};
@@ -10,7 +10,7 @@ use sgc_ros::{EndpointSpec, RosNetwork, RosWriter, Sample, SampleKind, dds_topic
 use sgc_testkit::{FakeDomain, FakeReader, FakeRos};
 use sgc_wire::{History, Qos, Reliability};
 
-/// What flows.
+/// A topic of the stream.
 #[derive(Clone, Copy)]
 pub(crate) struct Topic {
     pub(crate) name: &'static str,
@@ -43,39 +43,39 @@ impl Topic {
 }
 
 #[derive(Default)]
-struct Shared {
+struct Exchange {
     said: AtomicU64,
     heard: Mutex<Vec<(Instant, u64)>>,
-    /// Nothing more is to be said.
+    /// The talker sends no more messages.
     ends: AtomicBool,
-    /// Nor will be asked for what was.
+    /// The listener needs no more retransmissions.
     is_over: AtomicBool,
 }
 
 pub(crate) struct Flow {
     pub(crate) topic: Topic,
-    shared: Arc<Shared>,
+    exchange: Arc<Exchange>,
     talker: Option<JoinHandle<()>>,
     _reader: FakeReader,
     _net: FakeRos,
 }
 
-/// What became of a flow around something that happened.
+/// The result of a flow around an event.
 pub(crate) struct Verdict {
-    /// The longest that nothing came, beyond what is usual.
+    /// Longest time without a message, beyond the usual gap.
     pub(crate) outage: Duration,
     pub(crate) lost: u64,
     pub(crate) doubled: u64,
-    /// Messages that came behind a later one.
+    /// Messages that came after a later one.
     pub(crate) late: u64,
     pub(crate) heard: u64,
 }
 
 impl Flow {
     pub(crate) fn start(topic: Topic, robot: &FakeDomain, desk: &FakeDomain) -> Self {
-        let shared = Arc::<Shared>::default();
+        let exchange = Arc::<Exchange>::default();
         let net = desk.join(false);
-        let hears = Arc::clone(&shared);
+        let hears = Arc::clone(&exchange);
         let handler = Box::new(move |sample: Sample| {
             let number = u64::from_le_bytes(sample.payload[4..12].try_into().unwrap());
             hears.heard.lock().unwrap().push((Instant::now(), number));
@@ -83,7 +83,7 @@ impl Flow {
         let reader = net.create_reader(&topic.spec(), handler).unwrap();
         let near = robot.join(false);
         let writer = near.create_writer(&topic.spec()).unwrap();
-        let its = Arc::clone(&shared);
+        let its = Arc::clone(&exchange);
         let talker = std::thread::spawn(move || {
             let _near = near;
             for number in 1.. {
@@ -101,27 +101,27 @@ impl Flow {
                 std::thread::sleep(topic.period);
             }
         });
-        Self { topic, shared, talker: Some(talker), _reader: reader, _net: net }
+        Self { topic, exchange, talker: Some(talker), _reader: reader, _net: net }
     }
 
-    /// The number of what was said last.
+    /// Returns the number of the last sent message.
     pub(crate) fn said(&self) -> u64 {
-        self.shared.said.load(SeqCst)
+        self.exchange.said.load(SeqCst)
     }
 
-    /// Whether this, or something after it, was heard.
+    /// Returns `true` if this message or a later one was received.
     pub(crate) fn has_heard(&self, number: u64) -> bool {
-        self.shared.heard.lock().unwrap().iter().rev().any(|(_, heard)| *heard >= number)
+        self.exchange.heard.lock().unwrap().iter().rev().any(|(_, heard)| *heard >= number)
     }
 
-    /// Says no more.
+    /// Ends the sending.
     pub(crate) fn end(&self) {
-        self.shared.ends.store(true, SeqCst);
+        self.exchange.ends.store(true, SeqCst);
     }
 
-    /// What became of it all; the outage is the longest one since then.
+    /// Judges all messages. The outage is the longest one since `since`.
     pub(crate) fn judge(&self, since: Instant) -> Verdict {
-        let heard = self.shared.heard.lock().unwrap();
+        let heard = self.exchange.heard.lock().unwrap();
         let mut gap = Duration::ZERO;
         for pair in heard.windows(2).filter(|pair| pair[1].0 >= since) {
             gap = gap.max(pair[1].0 - pair[0].0);
@@ -136,7 +136,7 @@ impl Flow {
         let all = numbers.len() as u64;
         numbers.dedup();
         let different = numbers.len() as u64;
-        // What was said before the first that was heard was said to nobody.
+        // Messages before the first received one had no subscriber.
         let span = numbers.last().map_or(0, |last| last - numbers[0] + 1);
         Verdict {
             outage: gap.saturating_sub(self.topic.period),
@@ -151,7 +151,7 @@ impl Flow {
 impl Drop for Flow {
     fn drop(&mut self) {
         self.end();
-        self.shared.is_over.store(true, SeqCst);
+        self.exchange.is_over.store(true, SeqCst);
         let _ = self.talker.take().map(JoinHandle::join);
     }
 }

@@ -23,7 +23,7 @@ use tempfile::TempDir;
 
 use crate::support::say;
 
-/// Every transport that there is to be. Those that this build does not know are named and left out.
+/// All transports. Those that this build lacks are reported and skipped.
 const SCHEMES: [&str; 7] = ["quic", "dtls", "udp", "tls", "tcp", "ws", "wss"];
 const PORT: u16 = 7447;
 const ROUTER: &str = "10.10.0.1";
@@ -41,19 +41,19 @@ pub(crate) fn schemes() -> Vec<&'static str> {
     known
 }
 
-/// What a NAT does with ports.
+/// The port mapping of a NAT.
 #[derive(Clone, Copy)]
 pub(crate) enum Nat {
-    /// Keeps them, and lets everyone in by them.
+    /// Keeps ports and admits any sender to them.
     FullCone,
-    /// Draws each anew from this range, and lets in who was written to.
+    /// Draws each port at random from this range and admits only contacted senders.
     RandomPort(&'static str),
 }
 
 /// Ranges for a NAT that forgets.
 pub(crate) const RANGES: [&str; 2] = ["20000-29999", "30000-39999"];
 
-/// What joins the robot to its NAT.
+/// The network between the robot and its NAT.
 pub(crate) enum Lan {
     Cable,
     Path(TunOptions),
@@ -99,15 +99,15 @@ impl Lab {
         for site in [&lab.near, &lab.far] {
             site.within(|| {
                 fs::write("/proc/sys/net/ipv4/ip_forward", "1").unwrap();
-                // Who sends with an address that is not of its network is not let out, as providers have it.
+                // Packets with a foreign source address are dropped, as providers do.
                 fs::write("/proc/sys/net/ipv4/conf/all/rp_filter", "1").unwrap();
             })
             .unwrap();
         }
         lab.robot
             .within(|| {
-                // Who asks for a gateway says who it is there. Otherwise a packet with the old address asks in its name, is
-                // not answered, and all wait a second.
+                // ARP requests use the address of their interface. Otherwise a packet with the old address asks in its name, gets no
+                // answer, and all packets wait a second.
                 fs::write("/proc/sys/net/ipv4/conf/all/arp_announce", "2").unwrap();
             })
             .unwrap();
@@ -131,12 +131,12 @@ impl Lab {
         Some(TunLink::start(ends, &options).unwrap())
     }
 
-    /// A second way out of the robot, over mobile radio, so to say; up, and not the default.
+    /// Adds a second uplink of the robot, like mobile radio. It is up but not the default route.
     pub(crate) fn add_lte(&self) {
         self.robot.veth(("lte", &["10.3.0.2/24"]), &self.near, ("lte", &["10.3.0.1/24"])).unwrap();
     }
 
-    /// The robot's default route moves.
+    /// Moves the robot's default route.
     pub(crate) fn route_by(&self, gateway: &str) {
         self.robot.ip(&["route", "replace", "default", "via", gateway]).unwrap();
     }
@@ -155,17 +155,17 @@ impl Lab {
         self.load_rules(site, "nat", &format!("flush ruleset\ntable ip nat {{\n{rules}\n}}\n"));
     }
 
-    /// The robot's NAT forgets what it knew, and draws ports from another range from now on.
+    /// Clears the state of the robot's NAT and lets it draw ports from another range.
     pub(crate) fn rebind(&self, range: &'static str) {
         self.set_nat(&self.near, Nat::RandomPort(range), "");
-        // What was masqueraded behind an address is forgotten when that goes.
+        // Removing an address drops the mappings that masquerade behind it.
         let near = &self.near;
         near.ip(&["address", "del", "10.10.1.2/24", "dev", "wan"]).unwrap();
         near.ip(&["address", "add", "10.10.1.2/24", "dev", "wan"]).unwrap();
         near.ip(&["route", "add", "default", "via", "10.10.1.1"]).unwrap();
     }
 
-    /// Nothing but TCP leaves the robot's network.
+    /// Lets only TCP leave the robot's network.
     pub(crate) fn block_udp(&self) {
         let rule = "chain through { type filter hook forward priority 0; ip protocol udp drop; }";
         self.load_rules(&self.near, "block", &format!("table ip block {{\n{rule}\n}}\n"));
@@ -185,7 +185,7 @@ impl Lab {
         self.dir.path()
     }
 
-    /// Where the router is, for a transport.
+    /// Returns the router's URL for a transport.
     pub(crate) fn url(&self, scheme: &str) -> String {
         format!("{scheme}://{ROUTER}:{}", port(scheme))
     }

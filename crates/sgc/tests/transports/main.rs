@@ -1,12 +1,12 @@
-//! What every transport must survive between real namespaces: NATs on both sides, a NAT that forgets, an address that
-//! changes, a route that moves, a narrow path, a bad one.
+//! Tests of every transport between real namespaces: NATs on both sides, a NAT that loses its state, an address that changes, a
+//! route that moves, a small MTU, a bad path.
 //!
-//! A robot publishes a reliable and a best-effort topic, a desk receives them, and in the middle something happens. Nothing
-//! reliable may be lost, doubled or out of order, and both topics must go on. How long nothing came is printed and never
-//! judged, since that depends on what else the machine does.
+//! A robot publishes a reliable and a best-effort topic, a desk receives them, and an event happens on the path. No reliable
+//! message may be lost, repeated or reordered, and both topics must go on. The tests print outages and never judge them,
+//! because they depend on the load of the machine.
 //!
-//! All transports go through each scenario beside each other. `SGC_TRANSPORTS_LONG=1` (`make transports`) takes them one at
-//! a time, repeats what happens, and has programs that are not ours at both ends of each.
+//! All transports run each scenario at the same time. `SGC_TRANSPORTS_LONG=1` (`make transports`) runs one at a time, repeats
+//! the event, and has independent programs at both ends.
 
 #![allow(clippy::unwrap_used)]
 
@@ -28,11 +28,11 @@ use sgc_testkit::FakeDomain;
 use sgc_testkit::netsim::{Loss, Profile, TunOptions, on_host};
 use support::{eventually, say};
 
-/// With nothing happening, before and after.
+/// Time without an event, before and after each.
 const CALM: Duration = Duration::from_millis(1000);
-/// How often something happens in the long run.
+/// Number of events in the long run.
 const ROUNDS_LONG: usize = 5;
-/// What tells most of a gap is what was there shortly before.
+/// Time before an event from which outages count, because a gap may begin just before the event.
 const JUST_BEFORE: Duration = Duration::from_millis(200);
 
 /// One scenario at a time: each fills the processors.
@@ -81,10 +81,10 @@ impl Pair {
     }
 }
 
-/// What happens, by the number of its round.
+/// The event of a round.
 type Event<'a> = &'a dyn Fn(usize);
 
-/// Lets all transports go through something, prints what it cost, and asserts what may not be.
+/// Runs a scenario with all transports, prints its cost, and asserts that no reliable message was affected.
 fn scenario(name: &str, lab: &Lab, event: Event<'_>) {
     let router = Node::start(&lab.cloud, &lab.router_config(), lab.enroll("cloud", true), None);
     let schemes = schemes();
@@ -99,7 +99,7 @@ fn scenario(name: &str, lab: &Lab, event: Event<'_>) {
     assert!(wrong.is_empty(), "{name}: {wrong:#?}");
 }
 
-/// What was wrong.
+/// Drives a scenario. Returns its failures.
 fn drive(name: &str, pairs: &[Pair], event: impl Fn(usize), rounds: usize) -> Vec<String> {
     for pair in pairs {
         pair.wait_for("never begins", |_| 1);
@@ -164,7 +164,7 @@ fn drive(name: &str, pairs: &[Pair], event: impl Fn(usize), rounds: usize) -> Ve
     wrong
 }
 
-/// Whether there is anything to do here.
+/// Returns `true` if the tests can run on this machine.
 fn can_run() -> bool {
     match on_host() {
         Ok(()) => true,

@@ -1,9 +1,9 @@
 //! The matrix of vendors: Cyclone DDS, Fast DDS and RustDDS, each to each through a router, every type with every
-//! quality of service; delivered, whole, once. The suite runs a part in which each vendor meets each with each type, and each
-//! quality with each of those; `make vendors` runs it all. A table is printed at the end.
+//! quality of service. Each message must arrive whole and once. The suite runs a part in which each pair of vendors has each
+//! type, and each quality has each pair and type; `make vendors` runs all. It prints a table at the end.
 //!
-//! `SGC_VENDORS=full`: everything. `SGC_VENDORS=direct`: everything, with no `sgc` in between, which says what is to be had at
-//! all. `SGC_VENDORS_ONLY`: only cases whose name contains it.
+//! `SGC_VENDORS=full` runs all cases. `SGC_VENDORS=direct` runs all without `sgc`, as the reference. `SGC_VENDORS_ONLY` selects
+//! cases whose name contains it.
 
 #![allow(clippy::unwrap_used)]
 
@@ -22,7 +22,7 @@ use support::{Peer, eventually, say};
 const PLAN: Plan = Plan { name: "sgcv", domains: ["93", "94"], peer_life: "60" };
 
 const VENDORS: [&str; 3] = ["cyclone", "fastdds", "rustdds"];
-/// The small ones first: those of a pair of vendors run at one time.
+/// The types, small ones first. The cases of a pair of vendors run at the same time.
 const KINDS: [&str; 6] = ["string", "wstring", "custom", "keyed", "image", "pointcloud"];
 const SMALL: usize = 4;
 
@@ -46,14 +46,14 @@ impl fmt::Display for Case {
     }
 }
 
-/// What became of a case.
+/// The outcome of a case.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Outcome {
-    /// All of it, once.
+    /// All messages arrived once.
     Whole,
-    /// Intact and once, but not all: where the vendors do no better with nothing between them.
+    /// Not all messages arrived, but each intact and once. Permitted where the vendors lose some without sgc as well.
     Part,
-    /// Nothing, where fragments that are lost are not sent again.
+    /// No message arrived. Permitted where lost fragments are not sent again.
     Nothing,
     Failed,
 }
@@ -77,7 +77,7 @@ impl Case {
         cases
     }
 
-    /// 0 to 3.
+    /// Returns the quality as a number from 0 to 3.
     fn quality(&self) -> usize {
         2 * usize::from(self.reliable) + usize::from(self.latched)
     }
@@ -87,7 +87,7 @@ impl Case {
         at(self.from) * VENDORS.len() + at(self.to)
     }
 
-    /// True for one quality of each pair and type, such that each quality meets each pair and each type.
+    /// Returns `true` for one quality of each pair and type, chosen so that each quality meets each pair and each type.
     fn is_in_the_short_run(&self) -> bool {
         (self.pair() + self.kind) % 4 == self.quality()
     }
@@ -96,14 +96,14 @@ impl Case {
         format!("/v/{self}")
     }
 
-    /// True where the vendors lose some with nothing between them but stock socket buffers (`tests/peers/README.md`,
-    /// `WEAK` in `check.py`): what comes is to be intact and once, and something is to come.
+    /// Returns `true` where the vendors lose messages without sgc, over stock socket buffers (`tests/peers/README.md`, `WEAK` in
+    /// `check.py`). Some messages must come, each intact and once.
     fn is_weak(&self) -> bool {
         self.from != "cyclone" && KINDS[self.kind] == "pointcloud"
     }
 
-    /// True where a lost fragment is a lost message, so that of several hundred fragments in one burst nothing may come through,
-    /// as happens with nothing in between, too.
+    /// Returns `true` where a lost fragment is a lost message, so that a burst of several hundred fragments may lose everything,
+    /// as it may without sgc.
     fn is_chance(&self) -> bool {
         !self.reliable && self.kind >= SMALL
     }
@@ -125,7 +125,7 @@ impl Case {
         options
     }
 
-    /// For the publisher.
+    /// Returns the publisher's arguments for the size.
     fn size(&self) -> Vec<String> {
         match KINDS[self.kind] {
             "image" => vec!["--size".to_owned(), "1000000".into()],
@@ -133,8 +133,8 @@ impl Case {
         }
     }
 
-    /// Both are there before the first message. A reader may be matched a moment before it knows, so from the first one heard on
-    /// all have to come.
+    /// Runs a case in which both ends exist before the first message. A reader may be matched a moment before it knows, so all
+    /// messages from the first received one on must come.
     fn live(&self, lab: &Lab, far: Site) -> Result<Outcome, String> {
         let (sent, wanted, rate) = if self.kind < SMALL { ("40", 20, "50") } else { ("15", 8, "10") };
         let wanted = if self.is_weak() { 1 } else { wanted };
@@ -171,7 +171,7 @@ impl Case {
         }
     }
 
-    /// A subscriber that comes when all has been said and heard gets what the publisher keeps, once.
+    /// Runs a case in which a late subscriber gets the publisher's history once.
     ///
     /// Only Cyclone announces how many it keeps; of others the last one is kept on the way (`docs/reference/compatibility.md`).
     fn late(&self, lab: &Lab, far: Site) -> Result<Outcome, String> {
@@ -248,7 +248,7 @@ fn every_vendor_reaches_every_vendor_with_every_type_and_quality() {
     assert!(failures.is_empty(), "{} of {} failed:\n{}", failures.len(), outcomes.len(), failures.join("\n"));
 }
 
-/// A line for each pair of vendors; for each type four signs, for best effort and reliable, each volatile and latched.
+/// Formats a line for each pair of vendors with four signs for each type: best effort and reliable, each volatile and latched.
 fn table(outcomes: &BTreeMap<Case, Outcome>) -> String {
     let mut text = format!("{:20}", "");
     KINDS.iter().for_each(|kind| text += &format!("{kind:>11}"));
@@ -302,7 +302,7 @@ fn xcdr2_stays_xcdr2_and_a_reader_that_cannot_take_it_is_named() {
     talker.summary();
 }
 
-/// Another host of the robot's network, on a wire that carries no multicast.
+/// Adds another host to the robot's network, on a wire without multicast.
 fn hall_beside(robot: &Namespace) -> Namespace {
     let hall = Namespace::create(format!("{}-hall", robot.name())).unwrap();
     hall.veth(("robot", &["10.92.3.2/24"]), robot, ("hall", &["10.92.3.1/24"])).unwrap();
@@ -311,7 +311,7 @@ fn hall_beside(robot: &Namespace) -> Namespace {
     hall
 }
 
-/// A peer in the hall, with all that its DDS does by default but shared memory, and what a Cyclone there is configured to.
+/// Starts a peer in the hall with the defaults of its DDS except shared memory, and with the configuration of a Cyclone there.
 fn peer_in_the_hall(lab: &Lab, hall: &Namespace, vendor: &str, args: &[&str]) -> Peer {
     let mut command = support::command(Some(hall), lab.dir(), &Peer::program(vendor));
     // As rmw_cyclonedds makes of ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, ROS_STATIC_PEERS=10.92.3.1.

@@ -1,7 +1,7 @@
-//! A ROS 2 talker and listener on `ros2-client` and RustDDS, that knows nothing of SGC.
+//! A ROS 2 talker and listener on `ros2-client` and RustDDS that does not know SGC.
 //!
-//! The command line and the lines that it prints are those of `../../README.md`. Everything that happens comes through one
-//! channel: discovery and data from streams, signals and standard input from threads. Nothing here polls.
+//! `../../README.md` specifies the command line and the printed lines. All events come through one channel: discovery and data
+//! from streams, signals and standard input from threads. Nothing polls.
 
 mod messages;
 mod options;
@@ -28,7 +28,7 @@ const WRONG: u8 = 1;
 const REFUSED: u8 = 2;
 const INCOMPLETE: u8 = 3;
 
-/// How long a reliable publisher stays for those who still listen: `ros2-client` does not tell what is acknowledged.
+/// Time that a reliable publisher stays for its subscribers, because `ros2-client` does not report acknowledgements.
 const SETTLE: Duration = Duration::from_secs(5);
 
 enum Event {
@@ -79,7 +79,7 @@ fn emit(event: &str, fields: Value) {
     }
     let mut out = std::io::stdout().lock();
     if writeln!(out, "{line}").and_then(|()| out.flush()).is_err() {
-        // Nobody listens any more.
+        // The reader of standard output is gone.
         std::process::exit(INCOMPLETE.into());
     }
 }
@@ -102,7 +102,7 @@ fn qos(options: &Options) -> QosProfile {
         })
 }
 
-/// A node, for as long as something is done with it.
+/// A running node.
 fn with_node(options: &Options, act: impl FnOnce(Node) -> Result<u8, String>) -> Result<u8, String> {
     let mut participant = DomainParticipantBuilder::new(options.domain);
     if options.localhost {
@@ -117,7 +117,7 @@ fn with_node(options: &Options, act: impl FnOnce(Node) -> Result<u8, String>) ->
     let spinner = node.spinner().map_err(|e| e.to_string())?;
     let spinning = std::thread::spawn(move || block_on(spinner.spin()));
     let code = act(node)?;
-    // The participant says farewell when the last who holds it is gone, and the spinner does until it has ended.
+    // The participant says farewell when its last owner is dropped. The spinner owns it until it has ended.
     let _ = spinning.join();
     drop(context);
     Ok(code)
@@ -166,7 +166,7 @@ impl Peer<'_> {
         self.node.create_topic(&name, kind, &qos(self.options)).map_err(|e| e.to_string())
     }
 
-    /// The next event before a moment and the end of everything; `None` if there is none, or a signal came.
+    /// Returns the next event before a deadline, or `None` if there is none or a signal came.
     fn next(&mut self, until: Instant) -> Option<Event> {
         if self.signalled {
             return None;
@@ -320,7 +320,7 @@ impl Peer<'_> {
     }
 }
 
-/// What a subscriber knows of what it got.
+/// The record of received messages.
 #[derive(Default)]
 struct Tally {
     seen: HashSet<u64>,

@@ -1,5 +1,5 @@
-//! The message types of the peers and what each message must hold; the Rust twin of `../../py/messages.py`.
-//! `../../README.md` is what they agree on. CDR is written and read by serde, as `ros2-client` does.
+//! The message types of the peers and the content of each message; the Rust counterpart of `../../py/messages.py`.
+//! `../../README.md` specifies both. serde writes and reads CDR, as in `ros2-client`.
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
@@ -25,7 +25,7 @@ impl Noise {
     }
 }
 
-/// What a received message says of itself.
+/// The number and time inside a received message, and whether its content is intact.
 pub struct Reading {
     pub seq: u64,
     pub stamp_ns: u64,
@@ -38,7 +38,7 @@ pub trait Message: Serialize + DeserializeOwned + Send + Sync + 'static {
 
     fn make(seq: u64, stamp_ns: u64, size: usize) -> Self;
 
-    /// `None` if it says nothing of itself.
+    /// `None` if the message holds none.
     fn read(&self) -> Option<Reading>;
 }
 

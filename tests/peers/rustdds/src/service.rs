@@ -81,7 +81,7 @@ fn call(
                 match within(deadline, client.async_receive_response(id)) {
                     None => break None,
                     Some(Ok(response)) => break Some(response),
-                    // What it cannot read.
+                    // A reply that cannot be parsed.
                     Some(Err(_)) => foreign += 1,
                 }
             };
@@ -134,7 +134,7 @@ fn serve(options: &Options, server: &Server<Request, Response>, deadline: Instan
     Ok(if served >= options.count { 0 } else { INCOMPLETE })
 }
 
-/// What a future comes to before a moment.
+/// Returns the output of a future, or `None` after a deadline.
 fn within<T>(deadline: Instant, future: impl Future<Output = T>) -> Option<T> {
     let left = deadline.saturating_duration_since(Instant::now());
     let (sender, timeout) = futures::channel::oneshot::channel::<()>();
