@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_revoked_is_kept_until_it_ends() {
+    fn revoked_token_stays_listed_until_it_expires() {
         let dir = tempfile::tempdir().unwrap();
         let later = UnixMillis(NOW.0 + 1000);
         let change = |change: &mut dyn FnMut(&mut AccessRecords) -> Result<(), AccessError>| {

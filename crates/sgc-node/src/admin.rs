@@ -32,8 +32,8 @@ use crate::core::CoreEvent;
 use crate::gateway::Gateway;
 use crate::graph::Side;
 use crate::reload::Reloader;
-use crate::shell::{self, CallWish, PublishWish};
-use crate::tap::{Tap, TapWish, Tapped};
+use crate::shell::{self, CallRequest, PublishRequest};
+use crate::tap::{Tap, TapMessage, TapRequest};
 
 /// What a line of a question begins with; the number is the version of the protocol.
 pub const ADMIN_PREFIX: &str = "sgc/1 ";
@@ -79,9 +79,9 @@ pub enum AdminRequest {
         bytes: u32,
     },
     /// Publish what follows: a message in JSON a line. Each is answered, as the question itself is.
-    Publish(PublishWish),
+    Publish(PublishRequest),
     /// Call a service.
-    Call(CallWish),
+    Call(CallRequest),
     /// Have an authority carry an operation on the fleet out; answered with an [`sgc_wire::OperationAnswer`], encoded.
     Operate {
         /// The authority's node name.
@@ -146,7 +146,7 @@ impl TapHead {
         }
     }
 
-    fn of(message: &Tapped, begun: Instant, dropped: u64, most: u32) -> Self {
+    fn from_message(message: &TapMessage, begun: Instant, dropped: u64, most: u32) -> Self {
         let bytes = message.payload.len().try_into().unwrap_or(u32::MAX);
         Self {
             kind: match message.kind {
@@ -389,7 +389,7 @@ async fn answer(
                 let _ = tokio::time::timeout(TRANSFER_MAX, stream.write_all(many.as_bytes())).await;
                 return;
             };
-            match begin_tap(TapWish { topic, side }, events).await {
+            match begin_tap(TapRequest { topic, side }, events).await {
                 Ok(tap) => return show(stream, tap, bytes).await,
                 Err(why) => envelope(Err(why)),
             }
@@ -451,7 +451,7 @@ async fn status(events: &mpsc::Sender<CoreEvent>, gateway: &Gateway) -> Option<S
     serde_json::to_string(&status).ok()
 }
 
-async fn begin_tap(wish: TapWish, events: &mpsc::Sender<CoreEvent>) -> Result<Tap, String> {
+async fn begin_tap(wish: TapRequest, events: &mpsc::Sender<CoreEvent>) -> Result<Tap, String> {
     let (reply, tap) = oneshot::channel();
     let stopping = || "the node is stopping".to_owned();
     events.send(CoreEvent::Tap(wish, reply)).await.map_err(|_| stopping())?;
@@ -481,7 +481,7 @@ async fn show(mut stream: UnixStream, mut tap: Tap, most: u32) {
                 true => tokio::task::spawn_blocking(|| message.read()).await.map_err(io::Error::other)?,
                 false => message,
             };
-            let head = TapHead::of(&message, begun, dropped, most);
+            let head = TapHead::from_message(&message, begun, dropped, most);
             let carried = message.payload.get(..head.carried as usize).unwrap_or_default();
             let write = async {
                 into.write_all(&head.to_bytes()).await?;
@@ -580,13 +580,13 @@ mod tests {
             AdminRequest::Graph(Some(Name([0xab; 32]))),
             tap(None),
             tap(Some(Side::Sent)),
-            AdminRequest::Publish(PublishWish {
+            AdminRequest::Publish(PublishRequest {
                 topic: "/a".into(),
                 wait_for: 1,
                 depth: Some(3),
                 ..Default::default()
             }),
-            AdminRequest::Call(CallWish { request: "{\"a\":\n1}".into(), ..Default::default() }),
+            AdminRequest::Call(CallRequest { request: "{\"a\":\n1}".into(), ..Default::default() }),
             AdminRequest::Operate {
                 at: "keeper".parse().unwrap(),
                 operation: Operation::Revoke { nodes: vec!["arm-1".into(), "desk".into()] },
@@ -616,7 +616,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_question_is_told_why() {
+    fn malformed_request_is_refused_with_its_reason() {
         for (line, error) in [
             (&b"reload"[..], AdminError::Version),
             (b"sgc/2 reload", AdminError::Version),

@@ -22,7 +22,7 @@ use tokio::sync::mpsc;
 
 use crate::dataplane::{DataPlane, Forward, Out};
 use crate::outflow::OutFlow;
-use crate::sinks::{Behind, LocalSink, WriterQueue};
+use crate::sinks::{LocalSink, WriterInfo, WriterQueue};
 use crate::sources::{LocalShare, SourceMap, SourceSlot};
 use crate::stats::Drops;
 
@@ -175,7 +175,7 @@ fn a_proxy_allocates_less_than_once_for_a_message_that_it_brings() {
         let drops = Arc::<Drops>::default();
         let queue = WriterQueue::spawn_with(
             "count",
-            Behind::default(),
+            WriterInfo::default(),
             Shaping::default(),
             drops.clone(),
             alive,

@@ -35,7 +35,7 @@ pub(crate) struct ManualLease {
 
 impl ManualLease {
     /// Returns the lease of a publisher whose assertions are looked for.
-    pub(crate) fn of(qos: &Qos, now: Instant) -> Option<Arc<Self>> {
+    pub(crate) fn from_qos(qos: &Qos, now: Instant) -> Option<Arc<Self>> {
         let lease = Duration::from_nanos(qos.lease_ns?);
         let is_manual = qos.liveliness == Liveliness::ManualByTopic && qos.is_reliable();
         (is_manual && lease >= ASSERTED_LEASE_MIN)
@@ -91,7 +91,7 @@ mod tests {
         let began = Instant::now();
         let at = |ms| began + Duration::from_millis(ms);
         let ago = Duration::from_millis;
-        let lease = ManualLease::of(&manual(2000), began).unwrap();
+        let lease = ManualLease::from_qos(&manual(2000), began).unwrap();
         assert!(lease.is_news(at(100), ago(50)));
         assert!(lease.is_news(at(100), ago(500)), "it was there before it was known here");
         assert!(!lease.is_news(at(100), ago(2000)));
@@ -106,14 +106,14 @@ mod tests {
     #[test]
     fn leases_that_are_automatic_short_endless_or_best_effort_are_not_looked_at() {
         let now = Instant::now();
-        let is_looked_at = |qos: Qos| ManualLease::of(&qos, now).is_some();
+        let is_looked_at = |qos: Qos| ManualLease::from_qos(&qos, now).is_some();
         assert!(is_looked_at(manual(100)) && !is_looked_at(manual(99)));
         assert!(!is_looked_at(Qos { lease_ns: None, ..manual(2000) }));
         assert!(!is_looked_at(Qos { reliability: sgc_wire::Reliability::BestEffort, ..manual(2000) }));
         for liveliness in [Liveliness::Automatic, Liveliness::ManualByParticipant] {
             assert!(!is_looked_at(Qos { liveliness, ..manual(2000) }));
         }
-        let every = |lease_ms| ManualLease::of(&manual(lease_ms), now).map(|lease| lease.look_every());
+        let every = |lease_ms| ManualLease::from_qos(&manual(lease_ms), now).map(|lease| lease.look_every());
         assert_eq!([100, 60_000].map(every), [25, 250].map(|ms| Some(Duration::from_millis(ms))));
     }
 }

@@ -281,11 +281,11 @@ pub type PeerNames = BTreeMap<NodeId, String>;
 /// Where records go; cheap to clone. One that is off takes them, too.
 #[derive(Clone, Debug, Default)]
 pub struct Audit {
-    shared: Option<Arc<Shared>>,
+    shared: Option<Arc<AuditInner>>,
 }
 
 #[derive(Debug)]
-struct Shared {
+struct AuditInner {
     records: SyncSender<Option<AuditRecord>>,
     lost: Arc<AtomicU64>,
     names: ArcSwap<PeerNames>,
@@ -293,7 +293,7 @@ struct Shared {
     lost_total: AtomicU64,
 }
 
-impl Shared {
+impl AuditInner {
     fn send(&self, record: AuditRecord) {
         match self.records.try_send(Some(record)) {
             Ok(()) => {}
@@ -312,7 +312,7 @@ fn lock(quotas: &Mutex<Quotas>) -> MutexGuard<'_, Quotas> {
 /// The thread that writes.
 #[derive(Debug)]
 pub struct AuditWriter {
-    shared: Arc<Shared>,
+    shared: Arc<AuditInner>,
     thread: JoinHandle<()>,
 }
 
@@ -323,7 +323,7 @@ impl Audit {
         let (records, waiting) = sync_channel(WAITING_MAX);
         // The thread holds no sender: it ends when nobody can write any more.
         let (lost, quotas) = (Arc::<AtomicU64>::default(), Arc::<Mutex<Quotas>>::default());
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(AuditInner {
             records,
             lost: lost.clone(),
             names: ArcSwap::from_pointee(names),

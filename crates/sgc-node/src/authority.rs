@@ -22,7 +22,7 @@ use tracing::{error, info, warn};
 
 use crate::credentials::{is_due, lasts, renewal_interval};
 use crate::fleet_file::{FleetFileError, LockedFleet};
-use crate::operators::{OPERATIONS_WAITING_MAX, OperationDone, OperationJob, Operators};
+use crate::operators::{OPERATIONS_WAITING_MAX, OperationJob, OperationOutcome, Operators};
 
 /// Shortest time for which a new certificate holds.
 const VALID_MIN: Duration = Duration::from_secs(60);
@@ -174,7 +174,7 @@ struct DeskBatch {
 /// The answers of a job.
 pub(crate) struct DeskAnswers {
     pub(crate) renewals: Vec<RenewalAnswer>,
-    pub(crate) operations: Vec<OperationDone>,
+    pub(crate) operations: Vec<OperationOutcome>,
 }
 
 /// This node's work as its fleet's authority.
@@ -233,7 +233,7 @@ struct FileStamp {
 }
 
 impl FileStamp {
-    fn of(file: &Path) -> Option<Self> {
+    fn read(file: &Path) -> Option<Self> {
         let metadata = fs::metadata(file).ok()?;
         let modified = metadata.modified().ok()?;
         Some(Self { inode: (metadata.dev(), metadata.ino()), bytes: metadata.len(), modified })
@@ -241,7 +241,7 @@ impl FileStamp {
 }
 
 /// The last answer to a node.
-struct Answered {
+struct LastAnswer {
     /// The certificate that the node asked with.
     cert: CertId,
     /// The key that it wants certified.
@@ -254,7 +254,7 @@ struct Answered {
     interval: Duration,
 }
 
-impl Answered {
+impl LastAnswer {
     /// The answer, if this request is the one that it answers, or is that of the certificate in it.
     fn answer_to(&self, peer: &VerifiedPeer, key: &[u8; 32]) -> Option<Result<Credentials, RenewalRefusal>> {
         if self.key != *key {
@@ -274,7 +274,7 @@ struct FleetDesk {
     file: PathBuf,
     /// The version of the file that the remembered answers come from.
     stamp: Option<FileStamp>,
-    answered: BTreeMap<NodeId, Answered>,
+    answered: BTreeMap<NodeId, LastAnswer>,
     /// Times that the file was read.
     reads: u64,
 }
@@ -288,7 +288,7 @@ impl FleetDesk {
     /// answer is empty. A new one holds for as long as the old one did.
     fn answer(&mut self, batch: Vec<RenewalRequest>, now: Now) -> Vec<RenewalAnswer> {
         self.answered.retain(|_, a| now.instant < a.at + a.interval);
-        let stamp = FileStamp::of(&self.file);
+        let stamp = FileStamp::read(&self.file);
         if stamp.is_none() || stamp != self.stamp {
             self.answered.clear();
             self.stamp = stamp;
@@ -324,7 +324,7 @@ impl FleetDesk {
         let mut found = match LockedFleet::open(&self.file) {
             Ok(mut locked) => {
                 // Whoever had the lock may have replaced the file.
-                self.stamp = FileStamp::of(&self.file);
+                self.stamp = FileStamp::read(&self.file);
                 let fleet = &mut locked.fleet;
                 let has_learnt = batch.iter().fold(false, |any, (r, _)| recognize(fleet, r, now) || any);
                 let found = batch.iter().map(|(r, _)| renew(fleet, r, now)).collect();
@@ -333,11 +333,11 @@ impl FleetDesk {
             Err(why) => refuse_all(&why, batch.len()),
         };
         let mut answers = Vec::with_capacity(batch.len());
-        for ((request, key), Found { answer, made, .. }) in batch.into_iter().zip(found.drain(..)) {
+        for ((request, key), FleetAnswer { answer, made, .. }) in batch.into_iter().zip(found.drain(..)) {
             let RenewalRequest { asker, peer, .. } = request;
             let interval = renewal_interval(&peer);
             let remembered =
-                Answered { cert: peer.cert, key, answer: answer.clone(), made, at: now.instant, interval };
+                LastAnswer { cert: peer.cert, key, answer: answer.clone(), made, at: now.instant, interval };
             self.answered.insert(peer.node_id, remembered);
             answers.push(RenewalAnswer { asker, node: peer.node_id, answer });
         }
@@ -345,12 +345,12 @@ impl FleetDesk {
     }
 
     /// Writes the file if the roster says something else: it has certificates before an answer leaves.
-    fn save(&mut self, locked: &LockedFleet, has_learnt: bool, found: Vec<Found>) -> Vec<Found> {
+    fn save(&mut self, locked: &LockedFleet, has_learnt: bool, found: Vec<FleetAnswer>) -> Vec<FleetAnswer> {
         if !has_learnt && found.iter().all(|found| !found.is_news) {
             return found;
         }
         let saved = locked.save();
-        self.stamp = FileStamp::of(&self.file);
+        self.stamp = FileStamp::read(&self.file);
         match saved {
             Ok(()) => found,
             Err(why) => refuse_all(&why, found.len()),
@@ -400,7 +400,7 @@ fn recognize(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> bool {
 }
 
 /// An answer from the file.
-struct Found {
+struct FleetAnswer {
     answer: Result<Credentials, RenewalRefusal>,
     /// The serial number of the certificate that was made for it.
     made: Option<Arc<[u8]>>,
@@ -408,42 +408,42 @@ struct Found {
     is_news: bool,
 }
 
-impl Found {
+impl FleetAnswer {
     fn refused(why: RenewalRefusal) -> Self {
         Self { answer: Err(why), made: None, is_news: false }
     }
 }
 
-fn refuse_all(why: &FleetFileError, requests: usize) -> Vec<Found> {
+fn refuse_all(why: &FleetFileError, requests: usize) -> Vec<FleetAnswer> {
     error!(requests, "cannot give credentials: {why}");
-    std::iter::repeat_with(|| Found::refused(RenewalRefusal::File)).take(requests).collect()
+    std::iter::repeat_with(|| FleetAnswer::refused(RenewalRefusal::File)).take(requests).collect()
 }
 
-fn renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Found {
+fn renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> FleetAnswer {
     match try_renew(fleet, request, now) {
         Ok(found) => found,
         Err(why) => {
             warn!(peer = %request.peer.node_id.short(), %why, "gives no credentials");
-            Found::refused(RenewalRefusal::from_fleet(&why))
+            FleetAnswer::refused(RenewalRefusal::from_fleet(&why))
         }
     }
 }
 
-fn try_renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Result<Found, FleetError> {
+fn try_renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Result<FleetAnswer, FleetError> {
     let RenewalRequest { peer, csr, .. } = request;
     let unknown = || FleetError::UnknownNode { node: peer.pseudonym.short() };
     let node = fleet.node_by_pseudonym(&peer.pseudonym).ok_or_else(unknown)?.name.clone();
     if !is_due(peer, now) {
         let credentials = fleet.credentials_for(&node, Vec::new())?;
         let is_news = fleet.note_handed(&node, now.unix)?;
-        return Ok(Found { answer: Ok(credentials), made: None, is_news });
+        return Ok(FleetAnswer { answer: Ok(credentials), made: None, is_news });
     }
     let valid = Duration::from_millis(lasts(peer)).max(VALID_MIN);
     let mut rng = OsRng.unwrap_err();
     let credentials = fleet.renew_csr(csr, &peer.pseudonym, valid, now.unix, &mut rng)?;
     let made = credentials.chain.first().and_then(|leaf| serial_of(leaf)).map(Arc::from);
     info!(%node, "renewed its certificate");
-    Ok(Found { answer: Ok(credentials), made, is_news: true })
+    Ok(FleetAnswer { answer: Ok(credentials), made, is_news: true })
 }
 
 #[cfg(test)]

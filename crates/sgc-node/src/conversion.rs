@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_of_the_type_is_refused() {
+    fn message_that_does_not_match_its_type_is_refused() {
         let layout = layout();
         let cut = to_json(&layout, &Bytes::from_static(b"\0\x01\0\0\x09\0\0\0abc")).unwrap_err();
         assert!(matches!(cut, ConversionError::FromCdr(_)), "{cut}");

@@ -6,6 +6,7 @@
 mod alerts;
 mod consumers;
 mod graph;
+mod interface_types;
 mod nodes;
 mod operations;
 mod outputs;
@@ -15,7 +16,6 @@ mod reopening;
 mod ros;
 mod services;
 mod trust;
-mod types;
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -42,16 +42,16 @@ use crate::call_ledger::CallLedger;
 use crate::calls::Calls;
 use crate::control_queue::{FrameRoom, Inbox, InboxShare};
 use crate::core::consumers::{ConsumerKey, FarConsumers};
+use crate::core::interface_types::{InterfaceTypes, TypeOutcome};
 use crate::core::nodes::LocalGraph;
 use crate::core::publish::{Offer, Publishing};
 use crate::core::reopening::Reopening;
-use crate::core::types::{TypeOutcome, Types};
-use crate::credentials::Keeper;
+use crate::credentials::StateWriter;
 use crate::dataplane::DataPlane;
-use crate::finding::Board;
+use crate::discovery::Board;
 use crate::gateway::Gateway;
 use crate::graph::Graph;
-use crate::heart::{Heart, Patience};
+use crate::keep_alive::{KeepAlive, KeepAlivePolicy};
 use crate::links::ControlTx;
 use crate::members::{MemberNames, Members};
 use crate::message_keys::MessageKeys;
@@ -65,7 +65,7 @@ use crate::sinks::{LocalSink, SinkRequest, WriterQueue};
 use crate::sources::{LocalShare, NewestSamples};
 use crate::stats::{Drops, NameStats};
 use crate::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
-use crate::tap::{Tap, TapError, TapQueue, TapWish};
+use crate::tap::{Tap, TapError, TapQueue, TapRequest};
 
 /// Events that may wait for the control task; who sends more waits.
 pub(crate) const INBOX_MAX: usize = 4096;
@@ -218,7 +218,7 @@ pub(crate) enum CoreEvent {
     /// Somebody asks what is there, and where it goes; also of a name that this node need not know.
     Graph(Option<Name>, oneshot::Sender<Graph>),
     /// Somebody wants to see what goes by.
-    Tap(TapWish, oneshot::Sender<Result<Tap, TapError>>),
+    Tap(TapRequest, oneshot::Sender<Result<Tap, TapError>>),
     /// Take nothing in any more; answered with what still leaves.
     Quiesce(oneshot::Sender<Vec<Arc<OutFlow>>>),
     /// Take back what is shared and say goodbye; answered with the links, which the peers then close.
@@ -260,7 +260,7 @@ struct LinkEntry {
     flows: HashMap<Name, Arc<OutFlow>>,
     /// Why this node closed it, if it did.
     closed_for: Option<String>,
-    heart: Heart,
+    keep_alive: KeepAlive,
 }
 
 /// The control task's state. `N` is the local network; a pure router has none.
@@ -276,7 +276,7 @@ pub(crate) struct Core<N: RosNetwork> {
     /// When to look at them.
     look_due: Option<Instant>,
     /// How often peers are asked that say nothing.
-    patience: Patience,
+    patience: KeepAlivePolicy,
     /// The peers that have to be asked sooner.
     impatient: BTreeMap<NodeId, Duration>,
     next_link: u32,
@@ -314,7 +314,7 @@ pub(crate) struct Core<N: RosNetwork> {
     authority: Option<Authority>,
     /// Operations that users of this node ask an authority for.
     operations: Operations,
-    keeper: Keeper,
+    keeper: StateWriter,
     /// When to ask for another certificate.
     renew_due: Option<Instant>,
     redial: watch::Sender<()>,
@@ -338,7 +338,7 @@ pub(crate) struct Core<N: RosNetwork> {
     refused: BTreeMap<Name, BTreeMap<NodeId, String>>,
     /// Who looks at the local network.
     local_taps: Vec<Arc<TapQueue>>,
-    types: Types,
+    types: InterfaceTypes,
     members: Members,
 }
 
@@ -359,7 +359,7 @@ pub(crate) struct CoreParts<N> {
     /// For the suites of its shares.
     pub(crate) message_keys: MessageKeys,
     /// Writes what outlives the process.
-    pub(crate) keeper: Keeper,
+    pub(crate) keeper: StateWriter,
     /// Tells the dialling tasks that there is another certificate.
     pub redial: watch::Sender<()>,
     /// The routing machine.
@@ -381,7 +381,7 @@ pub(crate) struct CoreParts<N> {
     /// How routers are being found.
     pub(crate) board: Board,
     /// How often peers are asked that say nothing.
-    pub(crate) patience: Patience,
+    pub(crate) patience: KeepAlivePolicy,
     /// Where types are kept that are known.
     pub types: Arc<TypeStore>,
     /// Where definitions of them are.
@@ -456,7 +456,7 @@ impl<N: RosNetwork> Core<N> {
             audit: parts.audit,
             board: parts.board,
             refused: BTreeMap::new(),
-            types: Types::new(parts.types, parts.definitions),
+            types: InterfaceTypes::new(parts.types, parts.definitions),
             members,
             local_taps: Vec::new(),
         };
@@ -517,10 +517,10 @@ impl<N: RosNetwork> Core<N> {
                 self.hear_of(link.peer());
                 let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
                 self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
-                let (flows, heart) = (HashMap::new(), self.heart_of(&link));
+                let (flows, keep_alive) = (HashMap::new(), self.keep_alive_for(&link));
                 self.control_drops.link_up(id);
                 self.data.drops().link_up(id);
-                self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, heart });
+                self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, keep_alive });
                 let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
                 if reply.send(Some(place)).is_err() {
                     debug!(%remote, "the link's task is gone");
@@ -533,7 +533,7 @@ impl<N: RosNetwork> Core<N> {
                 self.control_drops.link_down(id);
                 self.data.drops().link_down(id);
                 if let Some(entry) = self.links.remove(&id) {
-                    self.remember_patience(entry.link.peer().node_id, entry.heart.patience());
+                    self.remember_policy(entry.link.peer().node_id, entry.keep_alive.patience());
                     let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
                     let record = record.remote(entry.link.remote());
                     self.audit.write(match &entry.closed_for {
@@ -803,7 +803,7 @@ impl<N: RosNetwork> Core<N> {
                 rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
                 cost,
                 silent,
-                keep_alive_ms: entry.heart.step().as_millis().try_into().unwrap_or(u64::MAX),
+                keep_alive_ms: entry.keep_alive.step().as_millis().try_into().unwrap_or(u64::MAX),
                 sent_bytes: stats.sent_bytes,
                 received_bytes: stats.received_bytes,
                 lanes: entry.control.lanes().count(),

@@ -52,12 +52,12 @@ pub(crate) fn with_kept_crls(dir: Option<&Path>, anchors: TrustAnchors, now: Now
 }
 
 /// Writes what has to outlive the process, the newest only, off the control task.
-pub(crate) struct Keeper {
+pub(crate) struct StateWriter {
     anchors: watch::Sender<Option<Arc<TrustAnchors>>>,
     identity: watch::Sender<Option<Arc<Identity>>>,
 }
 
-impl Keeper {
+impl StateWriter {
     /// Tasks that write into the state directory and over the identity file; they end with this handle.
     pub(crate) fn spawn(
         dir: Option<PathBuf>,

@@ -13,10 +13,10 @@ use sgc_router::{FibEntry, LinkId};
 use sgc_wire::{Name, Packet};
 use tracing::{debug, warn};
 
-use crate::heart::Activity;
-use crate::hold::Holds;
+use crate::keep_alive::Activity;
 use crate::outflow::OutFlow;
 use crate::peer_rate::PeerRates;
+use crate::pending::PendingBytes;
 use crate::sinks::LocalSink;
 use crate::stats::{DataDrop, Drops, NameStats};
 
@@ -54,7 +54,7 @@ pub(crate) struct DataPlane {
     shards: [ArcSwap<HashMap<Name, Arc<Forward>>>; SHARDS],
     drops: Drops,
     rates: PeerRates,
-    holds: Arc<Holds>,
+    holds: Arc<PendingBytes>,
 }
 
 impl Default for DataPlane {
@@ -71,7 +71,7 @@ impl DataPlane {
     }
 
     /// What its topics hold for want of something to be known.
-    pub(crate) fn holds(&self) -> &Arc<Holds> {
+    pub(crate) fn holds(&self) -> &Arc<PendingBytes> {
         &self.holds
     }
 
@@ -98,11 +98,11 @@ impl DataPlane {
 
     /// True if a short message under `name` finds room on all its ways: none is near its bounds, so that what others send at
     /// the same moment does not fill it.
-    pub(crate) fn is_at_ease(&self, name: &Name) -> bool {
+    pub(crate) fn has_headroom(&self, name: &Name) -> bool {
         let tables = self.shard(name).load();
         tables.get(name).is_none_or(|forward| {
             forward.outs.iter().all(|(_, out)| match out {
-                Out::Link(flow, _) => flow.is_at_ease(),
+                Out::Link(flow, _) => flow.has_headroom(),
                 // It writes to the local network, which may take its time.
                 Out::Local(_) => false,
             })

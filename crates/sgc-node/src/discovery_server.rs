@@ -30,7 +30,7 @@ const LOOK_EVERY: Duration = Duration::from_secs(10);
 pub fn alerts(env: Environment<'_>) -> Vec<Alert> {
     let own = env(VARIABLE).filter(|server| !server.is_empty());
     let own = own.map(|server| Alert::DiscoveryServer { server: shortened(&server), program: None });
-    own.into_iter().chain(of_programs(Path::new("/proc"))).collect()
+    own.into_iter().chain(from_programs(Path::new("/proc"))).collect()
 }
 
 /// Looks again and again, and logs what is new. Ends with the runtime.
@@ -51,7 +51,7 @@ pub(crate) async fn watch() {
 }
 
 /// One for each server, with the first program that names it.
-fn of_programs(proc: &Path) -> Vec<Alert> {
+fn from_programs(proc: &Path) -> Vec<Alert> {
     let network = fs::read_link(proc.join("self/ns/net")).ok();
     let Ok(processes) = fs::read_dir(proc) else { return Vec::new() };
     let own = std::process::id();

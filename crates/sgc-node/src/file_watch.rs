@@ -178,7 +178,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_the_gateway_shows_is_watched_as_other_files_that_are_named() {
+    fn gateway_certificate_files_are_watched_like_other_files() {
         let text = "identity = 'x'\n[node]\nrouters = ['quic://r']\n[gateway]\nlisten = ['wss://0.0.0.0']\n\
                     certificate = 'a.pem'\nkey = 'a.key'\n";
         let config = crate::config::parse(text, "node.toml", Path::new("/etc/sgc"), &|_| None).unwrap();

@@ -113,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_waited_for_a_lock_gets_the_file_that_is_there_then() {
+    fn waiting_locker_reads_the_file_as_it_is_after_the_wait() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a");
         state::replace(&path, b"1").unwrap();

@@ -28,7 +28,7 @@ pub(crate) struct MemberNames {
 
 impl MemberNames {
     /// The names in a configuration.
-    pub(crate) fn of(config: &Config, identity: &Identity) -> Self {
+    pub(crate) fn from_config(config: &Config, identity: &Identity) -> Self {
         let mut names = Self::default();
         for recipient in config.shares.iter().flat_map(|share| share.to.iter().chain(&share.publish)) {
             match recipient {
@@ -282,7 +282,7 @@ mod tests {
         let mut fleet = fleet();
         let [arm, desk] = members(&mut fleet, [("arm", &[]), ("desk", &["ops"])]);
         let config = config(RULES);
-        let mut members = Members::new(MemberNames::of(&config, &arm), &arm);
+        let mut members = Members::new(MemberNames::from_config(&config, &arm), &arm);
         let grantees = crate::policy::grantees(&config.shares[0].to, &arm, &Default::default());
         let unheard = |members: &Members| -> BTreeMap<String, Option<String>> {
             members.unheard(&grantees).into_iter().map(|name| (name.written, name.meant)).collect()
@@ -301,7 +301,7 @@ mod tests {
         // Corrected, it is heard of already.
         let mut right = config.clone();
         right.shares[0].to = vec![Recipient::Node("desk".parse().unwrap())];
-        members.set_names(MemberNames::of(&right, &arm), &arm);
+        members.set_names(MemberNames::from_config(&right, &arm), &arm);
         assert!(members.misspelt().next().is_none());
         assert!(
             members

@@ -78,7 +78,7 @@ pub enum OperationError {
 
 /// An operation that a user wants.
 #[derive(Debug)]
-pub(crate) struct OperationWish {
+pub(crate) struct UserOperation {
     /// The authority, by name and id.
     pub(crate) at: String,
     pub(crate) authority: NodeId,
@@ -100,13 +100,13 @@ pub(crate) enum Step {
 /// Operations that wait, and the one under way.
 #[derive(Debug, Default)]
 pub(crate) struct Operations {
-    waiting: VecDeque<(OperationWish, Instant)>,
+    waiting: VecDeque<(UserOperation, Instant)>,
     current: Option<Current>,
 }
 
 #[derive(Debug)]
 struct Current {
-    wish: OperationWish,
+    wish: UserOperation,
     /// The name that it is asked at, once it is.
     name: Option<Name>,
     find_until: Instant,
@@ -125,7 +125,7 @@ enum State {
 
 impl Operations {
     /// Queues a wish; [`Operations::next`] begins it.
-    pub(crate) fn push(&mut self, now: Instant, wish: OperationWish) {
+    pub(crate) fn push(&mut self, now: Instant, wish: UserOperation) {
         if self.waiting.len() >= WAITING_MAX {
             let _ = wish.reply.send(Err(OperationError::Full));
             return;
@@ -262,10 +262,10 @@ mod tests {
         Operation::List { after: None }
     }
 
-    fn wish() -> (OperationWish, Reply) {
+    fn wish() -> (UserOperation, Reply) {
         let (reply, replied) = oneshot::channel();
         let at = "keeper".to_owned();
-        let wish = OperationWish { at, authority: KEEPER, is_named: true, operation: list(), reply };
+        let wish = UserOperation { at, authority: KEEPER, is_named: true, operation: list(), reply };
         (wish, replied)
     }
 
@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_answered_ends_in_time_and_says_what_may_have_been_done() {
+    fn unanswered_operation_times_out_and_says_if_it_may_have_run() {
         let begin = Instant::now();
         let at = || "keeper".to_owned();
         let (mut operations, replied) = begun(begin);
@@ -344,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn who_waits_is_bounded_and_who_went_away_is_passed_over() {
+    fn waiting_operations_are_bounded_and_abandoned_ones_are_skipped() {
         let now = Instant::now();
         let (mut operations, replied) = begun(now);
         let waiting: Vec<_> = (0..WAITING_MAX)

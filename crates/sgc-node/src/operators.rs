@@ -34,7 +34,7 @@ const PAGE_BYTES_MAX: usize = 512 * 1024;
 
 /// The next step for a request.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Asked {
+pub(crate) enum RequestStep {
     /// Give this answer at once.
     Answer(OperationAnswer),
     /// Give the answer that the same request got before.
@@ -56,7 +56,7 @@ pub(crate) struct OperationJob {
 }
 
 /// An operation that was carried out, or refused.
-pub(crate) struct OperationDone {
+pub(crate) struct OperationOutcome {
     challenge: Challenge,
     pub(crate) node: NodeId,
     /// The operation in words, for the audit log.
@@ -71,20 +71,20 @@ pub(crate) struct OperationDone {
 pub(crate) struct Operators {
     permitted: Grantees,
     /// Oldest first.
-    challenges: VecDeque<Issued>,
+    challenges: VecDeque<ChallengeRecord>,
     /// Oldest first.
-    executed: VecDeque<Executed>,
+    executed: VecDeque<ExecutionRecord>,
 }
 
 #[derive(Debug)]
-struct Issued {
+struct ChallengeRecord {
     challenge: Challenge,
     node: NodeId,
     until: Instant,
 }
 
 #[derive(Debug)]
-struct Executed {
+struct ExecutionRecord {
     challenge: Challenge,
     node: NodeId,
     operation: Operation,
@@ -108,17 +108,17 @@ impl Operators {
         sink: SinkId,
         request: &Bytes,
         rng: &mut impl RngCore,
-    ) -> Asked {
+    ) -> RequestStep {
         if self.permitted.find(peer).is_none() {
-            return Asked::NotPermitted;
+            return RequestStep::NotPermitted;
         }
         self.challenges.retain(|issued| now < issued.until);
         match OperationRequest::from_slice(request) {
-            Ok(OperationRequest::Challenge) => Asked::Answer(self.challenge(now, peer.node_id, rng)),
+            Ok(OperationRequest::Challenge) => RequestStep::Answer(self.challenge(now, peer.node_id, rng)),
             Ok(OperationRequest::Execute { challenge, operation }) => {
                 self.execute(peer.node_id, sink, challenge, operation)
             }
-            Err(why) => Asked::Answer(refused(OperationRefusal::Malformed, why)),
+            Err(why) => RequestStep::Answer(refused(OperationRefusal::Malformed, why)),
         }
     }
 
@@ -133,33 +133,39 @@ impl Operators {
         }
         let mut challenge = Challenge([0; 16]);
         rng.fill_bytes(&mut challenge.0);
-        self.challenges.push_back(Issued { challenge, node, until: now + CHALLENGE_TIME });
+        self.challenges.push_back(ChallengeRecord { challenge, node, until: now + CHALLENGE_TIME });
         OperationAnswer::Challenge(challenge)
     }
 
-    fn execute(&mut self, node: NodeId, sink: SinkId, challenge: Challenge, operation: Operation) -> Asked {
+    fn execute(
+        &mut self,
+        node: NodeId,
+        sink: SinkId,
+        challenge: Challenge,
+        operation: Operation,
+    ) -> RequestStep {
         if let Some(known) = self.executed.iter_mut().find(|e| e.challenge == challenge) {
             if known.node != node || known.operation != operation {
-                return Asked::Answer(refused(OperationRefusal::Stale, ""));
+                return RequestStep::Answer(refused(OperationRefusal::Stale, ""));
             }
             known.sink = sink;
-            return known.answer.clone().map_or(Asked::UnderWay, Asked::Again);
+            return known.answer.clone().map_or(RequestStep::UnderWay, RequestStep::Again);
         }
         let issued = self.challenges.iter().position(|i| i.challenge == challenge && i.node == node);
         let Some(issued) = issued else {
-            return Asked::Answer(refused(OperationRefusal::Stale, ""));
+            return RequestStep::Answer(refused(OperationRefusal::Stale, ""));
         };
         self.challenges.remove(issued);
         if self.executed.len() >= EXECUTED_MAX {
             self.executed.pop_front();
         }
         let (answer, doing) = (None, operation.clone());
-        self.executed.push_back(Executed { challenge, node, operation: doing, sink, answer });
-        Asked::Job(OperationJob { challenge, node, operation })
+        self.executed.push_back(ExecutionRecord { challenge, node, operation: doing, sink, answer });
+        RequestStep::Job(OperationJob { challenge, node, operation })
     }
 
     /// Remembers the answer of a job; returns the sink that waits for it.
-    pub(crate) fn done(&mut self, done: &OperationDone) -> Option<SinkId> {
+    pub(crate) fn done(&mut self, done: &OperationOutcome) -> Option<SinkId> {
         let known = self.executed.iter_mut().find(|e| e.challenge == done.challenge)?;
         known.answer = Some(done.answer.clone());
         Some(known.sink)
@@ -168,7 +174,7 @@ impl Operators {
 
 impl OperationJob {
     /// Its end, if it cannot even be queued.
-    pub(crate) fn busy(self) -> OperationDone {
+    pub(crate) fn busy(self) -> OperationOutcome {
         self.end(refused(OperationRefusal::Busy, ""), None)
     }
 
@@ -180,7 +186,7 @@ impl OperationJob {
         own: &NodeId,
         seen: &BTreeMap<NodeId, UnixMillis>,
         now: UnixMillis,
-    ) -> OperationDone {
+    ) -> OperationOutcome {
         let done = match &self.operation {
             Operation::List { after } => list(file, after.as_deref(), seen).map(|answer| (answer, None)),
             Operation::Revoke { nodes } => {
@@ -196,7 +202,7 @@ impl OperationJob {
         }
     }
 
-    fn end(self, answer: OperationAnswer, list: Option<Vec<u8>>) -> OperationDone {
+    fn end(self, answer: OperationAnswer, list: Option<Vec<u8>>) -> OperationOutcome {
         let Self { challenge, node, operation } = self;
         let outcome = match &answer {
             OperationAnswer::Refused { why, detail } if detail.is_empty() => format!("refused: {why}"),
@@ -209,7 +215,7 @@ impl OperationJob {
             Operation::Enroll { node, .. } => format!("enroll {node}"),
             Operation::Renew { node, .. } => format!("renew {node}"),
         };
-        OperationDone { challenge, node, said: format!("{said}: {outcome}"), answer, list }
+        OperationOutcome { challenge, node, said: format!("{said}: {outcome}"), answer, list }
     }
 }
 
@@ -413,19 +419,19 @@ mod tests {
             Self { _dir: dir, file, keeper, desk, guest, operators, rng, now: Instant::now() }
         }
 
-        fn ask(&mut self, of_guest: bool, sink: SinkId, request: &OperationRequest) -> Asked {
+        fn ask(&mut self, of_guest: bool, sink: SinkId, request: &OperationRequest) -> RequestStep {
             let peer = if of_guest { self.guest.as_peer() } else { self.desk.as_peer() };
             self.operators.ask(self.now, peer, sink, &request.to_bytes(), &mut self.rng)
         }
 
         fn challenge(&mut self) -> Challenge {
             match self.ask(false, A, &OperationRequest::Challenge) {
-                Asked::Answer(OperationAnswer::Challenge(challenge)) => challenge,
+                RequestStep::Answer(OperationAnswer::Challenge(challenge)) => challenge,
                 other => panic!("{other:?}"),
             }
         }
 
-        fn carry_out(&mut self, job: OperationJob) -> OperationDone {
+        fn carry_out(&mut self, job: OperationJob) -> OperationOutcome {
             let now = crate::core::now().unix;
             job.carry_out(&self.file, &self.keeper, &BTreeMap::new(), now)
         }
@@ -442,8 +448,8 @@ mod tests {
         OperationRequest::Execute { challenge, operation }
     }
 
-    fn is_stale(asked: &Asked) -> bool {
-        let Asked::Answer(OperationAnswer::Refused { why, .. }) = asked else { return false };
+    fn is_stale(asked: &RequestStep) -> bool {
+        let RequestStep::Answer(OperationAnswer::Refused { why, .. }) = asked else { return false };
         *why == OperationRefusal::Stale
     }
 
@@ -452,14 +458,14 @@ mod tests {
         let mut bench = Bench::new();
         let challenge = bench.challenge();
         let request = revoke_guest(challenge);
-        let Asked::Job(job) = bench.ask(false, A, &request) else { panic!("it is new") };
-        assert_eq!(bench.ask(false, B, &request), Asked::UnderWay);
+        let RequestStep::Job(job) = bench.ask(false, A, &request) else { panic!("it is new") };
+        assert_eq!(bench.ask(false, B, &request), RequestStep::UnderWay);
         let done = bench.carry_out(job);
         assert!(done.list.is_some() && bench.is_revoked("guest"));
         assert_eq!(done.said, "revoke guest: done");
         assert_eq!(bench.operators.done(&done), Some(B), "the newer sink is answered");
         for _ in 0..3 {
-            assert_eq!(bench.ask(false, A, &request), Asked::Again(done.answer.clone()));
+            assert_eq!(bench.ask(false, A, &request), RequestStep::Again(done.answer.clone()));
         }
         // The challenge is for that operation alone.
         let operation = Operation::Revoke { nodes: vec!["desk".into()] };
@@ -491,7 +497,7 @@ mod tests {
         let mut bench = Bench::new();
         let challenge = bench.challenge();
         for request in [OperationRequest::Challenge, revoke_guest(challenge)] {
-            assert_eq!(bench.ask(true, A, &request), Asked::NotPermitted);
+            assert_eq!(bench.ask(true, A, &request), RequestStep::NotPermitted);
         }
         assert_eq!(bench.operators.challenges.len(), 1);
         let malformed = bench.operators.ask(
@@ -501,7 +507,9 @@ mod tests {
             &Bytes::from_static(b"\xff"),
             &mut bench.rng,
         );
-        let Asked::Answer(OperationAnswer::Refused { why, .. }) = malformed else { panic!("{malformed:?}") };
+        let RequestStep::Answer(OperationAnswer::Refused { why, .. }) = malformed else {
+            panic!("{malformed:?}")
+        };
         assert_eq!(why, OperationRefusal::Malformed);
     }
 
@@ -516,18 +524,18 @@ mod tests {
         assert!(is_stale(&bench.ask(false, A, &revoke_guest(first))));
         for _ in 0..2 * EXECUTED_MAX {
             let challenge = bench.challenge();
-            assert!(matches!(bench.ask(false, A, &revoke_guest(challenge)), Asked::Job(_)));
+            assert!(matches!(bench.ask(false, A, &revoke_guest(challenge)), RequestStep::Job(_)));
         }
         assert_eq!(bench.operators.executed.len(), EXECUTED_MAX);
     }
 
     #[test]
-    fn what_the_fleet_refuses_is_said_in_words_and_changes_nothing() {
+    fn refused_operation_is_explained_and_changes_nothing() {
         let mut bench = Bench::new();
         let mut refusal = |operation| {
             let challenge = bench.challenge();
             let asked = bench.ask(false, A, &OperationRequest::Execute { challenge, operation });
-            let Asked::Job(job) = asked else { panic!("{asked:?}") };
+            let RequestStep::Job(job) = asked else { panic!("{asked:?}") };
             match bench.carry_out(job).answer {
                 OperationAnswer::Refused { why, detail } => (why, detail),
                 other => panic!("{other:?}"),
@@ -548,7 +556,7 @@ mod tests {
         std::fs::remove_file(&bench.file).unwrap();
         let challenge = bench.challenge();
         let asked = bench.ask(false, A, &revoke_guest(challenge));
-        let Asked::Job(job) = asked else { panic!("{asked:?}") };
+        let RequestStep::Job(job) = asked else { panic!("{asked:?}") };
         let answer = bench.carry_out(job).answer;
         assert!(matches!(answer, OperationAnswer::Refused { why: OperationRefusal::File, .. }), "{answer:?}");
     }

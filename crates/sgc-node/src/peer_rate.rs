@@ -55,11 +55,11 @@ impl PeerRates {
 
     /// The bucket of a peer that has a link now, if there is a limit. It outlives the link until what was sent is paid
     /// for, so that linking again gains nothing.
-    pub(crate) fn of(&self, peer: NodeId) -> Option<Arc<PeerRate>> {
-        self.of_at(self.limit?.now(), peer)
+    pub(crate) fn for_peer(&self, peer: NodeId) -> Option<Arc<PeerRate>> {
+        self.for_peer_at(self.limit?.now(), peer)
     }
 
-    fn of_at(&self, now: u64, peer: NodeId) -> Option<Arc<PeerRate>> {
+    fn for_peer_at(&self, now: u64, peer: NodeId) -> Option<Arc<PeerRate>> {
         let limit = self.limit?;
         let mut peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
         peers.retain(|id, rate| {
@@ -216,11 +216,11 @@ mod tests {
 
     /// 8 Mbit/s: a packet a millisecond, and 262 144 bytes at once.
     fn rate() -> Arc<PeerRate> {
-        PeerRates::new(Some(8_000_000)).of(NodeId([1; 32])).unwrap()
+        PeerRates::new(Some(8_000_000)).for_peer(NodeId([1; 32])).unwrap()
     }
 
     #[test]
-    fn what_cannot_wait_passes_at_the_rate_and_no_faster() {
+    fn packets_that_cannot_wait_pass_at_most_at_the_peer_rate() {
         let rate = rate();
         let passed = |now| (0..2000).filter(|_| rate.take_now_at(now, PACKET)).count();
         assert_eq!(passed(0), 262);
@@ -231,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn what_can_wait_takes_what_the_hasty_leave() {
+    fn packets_that_can_wait_use_the_remaining_rate() {
         let rate = rate();
         let mut now = 0;
         let mut hasty = 0;
@@ -258,7 +258,7 @@ mod tests {
     #[test]
     fn linking_again_gains_nothing() {
         let rates = PeerRates::new(Some(8_000_000));
-        let of = |now, id| rates.of_at(now, NodeId([id; 32])).unwrap();
+        let of = |now, id| rates.for_peer_at(now, NodeId([id; 32])).unwrap();
         let first = of(0, 1);
         assert!(Arc::ptr_eq(&first, &of(0, 1)));
         while first.take_now_at(0, PACKET) {}
@@ -274,6 +274,6 @@ mod tests {
             "and its drops are in the total"
         );
         let one = NodeId([1; 32]);
-        assert!(PeerRates::new(None).of(one).is_none());
+        assert!(PeerRates::new(None).for_peer(one).is_none());
     }
 }

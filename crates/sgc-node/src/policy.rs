@@ -123,7 +123,7 @@ pub fn explain(
         finds(&only)
     };
     if let Some(recipient) = entries.iter().find(admits) {
-        let because = format!("`{key}` names \"{recipient}\": {}", what_admits(recipient, partners));
+        let because = format!("`{key}` names \"{recipient}\": {}", admission_reason(recipient, partners));
         return Verdict { permitted, because };
     }
     let token = tokens_of(share, partners).find(|grant| match grant.node {
@@ -171,7 +171,7 @@ fn add(set: &mut Grantees, recipient: &Recipient, identity: &Identity, partners:
     }
 }
 
-fn what_admits(recipient: &Recipient, partners: &Partners) -> &'static str {
+fn admission_reason(recipient: &Recipient, partners: &Partners) -> &'static str {
     match recipient {
         Recipient::Everyone => "it is a member of this fleet",
         Recipient::Node(_) => "that is this node",

@@ -25,7 +25,7 @@ impl ProblemLog {
     pub(crate) fn note(&mut self, now: Instant, problem: &impl Display) {
         match self.line(now, problem) {
             Some(line) => warn!("{line}"),
-            None => debug!("{}", one_line(problem)),
+            None => debug!("{}", single_line(problem)),
         }
     }
 
@@ -36,7 +36,7 @@ impl ProblemLog {
             return None;
         }
         self.full_at = Some(full_at);
-        let line = one_line(problem);
+        let line = single_line(problem);
         Some(match std::mem::take(&mut self.left_out) {
             0 => line,
             more => format!("{line} (and {more} more since the last such line: see `sgc why`)"),
@@ -45,7 +45,7 @@ impl ProblemLog {
 }
 
 /// The text without what would begin another line, or what a terminal would take for orders: names of types are anybody's.
-fn one_line(problem: &impl Display) -> String {
+fn single_line(problem: &impl Display) -> String {
     problem
         .to_string()
         .chars()

@@ -134,7 +134,7 @@ impl<T> Queue<T> {
     }
 
     /// True while it is less than half full.
-    pub(crate) fn is_at_ease(&self, bytes_max: usize) -> bool {
+    pub(crate) fn has_headroom(&self, bytes_max: usize) -> bool {
         self.items.len() < self.items.capacity() / 2 && self.bytes.load(Ordering::Acquire) < bytes_max / 2
     }
 
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_is_queued_survives_the_close_and_nothing_else_does() {
+    async fn closed_queue_keeps_queued_items_and_takes_no_new_ones() {
         let queue = Queue::new(3);
         queue.push(1, 1, 10, PATIENCE).await.unwrap();
         queue.close();

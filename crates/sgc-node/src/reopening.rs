@@ -167,7 +167,7 @@ mod tests {
             }
         });
         let slot = NetworkSlot::new(Some(Arc::new(domain.join(true))), Some(again));
-        let (tell, changes) = Network::told();
+        let (tell, changes) = Network::channel();
         let (events, mut inbox) = mpsc::channel(8);
         let watching = tokio::spawn(watch(changes, slot.clone(), events));
         let change = || tell.send_modify(|change| *change += 1);

@@ -39,7 +39,7 @@ pub(crate) struct Network {
 impl Network {
     /// Hears of changes for as long as the runtime lives. Where the kernel does not tell, that is said, and nothing changes.
     pub(crate) fn watch() -> Self {
-        let (tell, network) = Self::told();
+        let (tell, network) = Self::channel();
         match open() {
             Ok(socket) => {
                 tokio::spawn(hear(socket, tell));
@@ -52,7 +52,7 @@ impl Network {
     }
 
     /// With whom to tell of changes.
-    pub(crate) fn told() -> (watch::Sender<u64>, Self) {
+    pub(crate) fn channel() -> (watch::Sender<u64>, Self) {
         let (tell, changes) = watch::channel(0);
         (tell, Self { changes, renewed: Arc::default() })
     }
@@ -100,7 +100,7 @@ pub(crate) struct Origin {
 
 impl Origin {
     /// That of a link to this peer, which is up.
-    pub(crate) fn of(remote: SocketAddr) -> Self {
+    pub(crate) fn from_remote(remote: SocketAddr) -> Self {
         let source = source_towards(remote);
         Self { source, is_there: source.is_some() }
     }
@@ -222,8 +222,8 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn one_renews_the_sockets_after_each_change() {
-        let (tell, mut network) = Network::told();
+    async fn single_task_renews_sockets_after_each_change() {
+        let (tell, mut network) = Network::channel();
         let mut other = network.clone();
         assert!(!network.is_first());
         for _ in 0..2 {

@@ -47,11 +47,11 @@ impl std::fmt::Display for Holder<'_> {
 #[derive(Clone, Debug)]
 pub(crate) struct RunLock {
     identity: PathBuf,
-    held: Arc<Mutex<Held>>,
+    held: Arc<Mutex<LockHandle>>,
 }
 
 #[derive(Debug)]
-struct Held {
+struct LockHandle {
     identity: Option<fs::File>,
     _state: Option<fs::File>,
 }
@@ -69,7 +69,7 @@ impl RunLock {
         loop {
             let taken = lock(identity, false).and_then(|identity| {
                 let state = state.as_deref().map_or(Ok(None), |state| lock(state, true))?;
-                Ok(Held { identity, _state: state })
+                Ok(LockHandle { identity, _state: state })
             });
             match taken {
                 Ok(held) => {
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_cannot_be_locked_keeps_nobody_from_starting() {
+    async fn node_starts_if_its_identity_cannot_be_locked() {
         let dir = tempfile::tempdir().unwrap();
         let (identity, state) = (dir.path().join("gone"), dir.path().join("gone too"));
         RunLock::take(&identity, Some(&state), node()).await.unwrap();

@@ -72,7 +72,7 @@ impl Shaper {
     /// Whether a message that its publisher dated so is too old to go, by the clock of this node; both in ns since 1970.
     pub(crate) fn is_too_old(&mut self, now_ns: i64, dated_ns: i64) -> bool {
         let Some(max) = self.shaping.max_age else { return false };
-        self.age.of(now_ns, dated_ns) > max
+        self.age.measure(now_ns, dated_ns) > max
     }
 }
 
@@ -83,7 +83,7 @@ struct Age {
 }
 
 impl Age {
-    fn of(&mut self, now_ns: i64, dated_ns: i64) -> Duration {
+    fn measure(&mut self, now_ns: i64, dated_ns: i64) -> Duration {
         // Undated.
         if dated_ns <= 0 {
             return Duration::ZERO;

@@ -23,7 +23,7 @@ const SETTLE_MAX: Duration = Duration::from_secs(2);
 
 /// What to publish, and how.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct PublishWish {
+pub struct PublishRequest {
     /// ROS topic.
     pub topic: String,
     /// ROS type; none takes that which the topic has.
@@ -43,7 +43,7 @@ pub struct PublishWish {
 
 /// What to ask a service.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct CallWish {
+pub struct CallRequest {
     /// ROS service.
     pub service: String,
     /// ROS type; none takes that which the service has.
@@ -57,7 +57,7 @@ pub struct CallWish {
 
 /// What is said once messages are taken.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Published {
+pub struct PublishReport {
     /// The topic's type.
     #[serde(rename = "type")]
     pub type_name: String,
@@ -70,7 +70,7 @@ fn wait(ms: u64) -> Duration {
 }
 
 /// Calls a service; gives its reply in JSON.
-pub(crate) async fn call(gateway: &Gateway, wish: &CallWish) -> Result<String, String> {
+pub(crate) async fn call(gateway: &Gateway, wish: &CallRequest) -> Result<String, String> {
     let reply = async {
         let session = gateway.own_session().await?;
         let request = Content::json(wish.request.clone());
@@ -84,7 +84,7 @@ pub(crate) async fn call(gateway: &Gateway, wish: &CallWish) -> Result<String, S
 /// Publishes each line that comes, and says of each how it went, until no more come.
 pub(crate) async fn publish(
     gateway: &Gateway,
-    wish: PublishWish,
+    wish: PublishRequest,
     mut stream: UnixStream,
     envelope: impl Fn(Result<String, String>) -> String,
 ) -> io::Result<()> {
@@ -102,7 +102,7 @@ pub(crate) async fn publish(
         Ok(begun) => begun,
         Err(error) => return into.write_all(envelope(Err(error.to_string())).as_bytes()).await,
     };
-    let published = Published { type_name: publication.type_name().to_owned(), subscribers };
+    let published = PublishReport { type_name: publication.type_name().to_owned(), subscribers };
     let published = serde_json::to_string(&published)?;
     into.write_all(format!("{}\n", envelope(Ok(published))).as_bytes()).await?;
     let mut line = Vec::new();
@@ -118,7 +118,7 @@ pub(crate) async fn publish(
     }
 }
 
-fn advertise(wish: PublishWish) -> Advertise {
+fn advertise(wish: PublishRequest) -> Advertise {
     let defaults = Qos::default();
     let durability = if wish.transient_local { Durability::TransientLocal } else { defaults.durability };
     let qos = Qos {

@@ -137,7 +137,7 @@ fn a_member_that_joins_and_leaves_for_ever_pushes_out_nothing() {
 }
 
 #[test]
-fn what_is_summed_up_is_counted_for_the_status() {
+fn summarised_audit_records_are_counted_in_the_status() {
     let place = Place::new();
     let (log, writer) = Audit::open(&place.path(), ROOM, PeerNames::new()).unwrap();
     crowd(2, &[AuditEvent::Left], 100).for_each(|record| log.write(record));
@@ -256,7 +256,7 @@ fn a_line_that_a_killed_run_left_is_ended_and_counted() {
 }
 
 #[test]
-fn what_is_lost_is_said() {
+fn lost_audit_records_are_reported() {
     let place = Place::new();
     let (audit, writer) = Audit::open(&place.path(), ROOM, PeerNames::new()).unwrap();
     // More than can wait, faster than a disk: whatever does not fit has to be accounted for.

@@ -20,7 +20,7 @@ fn compressed(node: &Node, topic: &str) -> Option<(u64, u64)> {
 }
 
 #[test]
-fn what_is_compressed_arrives_as_it_was_also_late() {
+fn compressed_messages_arrive_unchanged_also_for_late_joiners() {
     for (encoding, suite) in [(PayloadEncoding::Zstd, Suite::Group), (PayloadEncoding::Lz4, Suite::Standard)]
     {
         let trio = Trio::new();
@@ -68,7 +68,7 @@ fn what_is_compressed_arrives_as_it_was_also_late() {
 }
 
 #[test]
-fn who_publishes_on_anothers_topic_compresses_too() {
+fn far_publisher_compresses_too() {
     let trio = Trio::new();
     let robot = trio.robot(&["/cmd"], "desk");
     robot.reload(|config| {

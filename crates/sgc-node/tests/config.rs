@@ -348,7 +348,7 @@ fn names_may_be_patterns_and_others_elsewhere() {
 }
 
 #[test]
-fn what_leaves_may_be_compressed_and_nothing_else() {
+fn compression_applies_to_shares_only() {
     for (word, encoding) in
         [("zstd", PayloadEncoding::Zstd), ("lz4", PayloadEncoding::Lz4), ("none", PayloadEncoding::Plain)]
     {
@@ -517,7 +517,7 @@ fn tables_and_values_of_the_wrong_type_are_told() {
 }
 
 #[test]
-fn what_is_required_is_asked_for() {
+fn missing_required_keys_are_reported() {
     check_all(&[
         (
             "[[share]]",
@@ -876,7 +876,7 @@ fn suites_are_called_by_name() {
 }
 
 #[test]
-fn who_may_publish_is_said_as_who_may_subscribe() {
+fn publish_lists_use_the_syntax_of_subscribe_lists() {
     let config = good(&format!(
         "{NODE}[[share]]\ntopic = '/a'\ntype = 'p/msg/T'\nto = ['*', 'partner:acme']\npublish = ['desk', 'group:ops', 'partner:acme']\n\
          [[partner]]\nname = 'acme'\nca = 'acme.pem'"
@@ -1133,7 +1133,7 @@ fn files_with_certificates_and_tokens_are_read_before_anything_is_done() {
 }
 
 #[test]
-fn one_topic_has_one_place() {
+fn topic_may_be_configured_once() {
     check_all(&[
         (
             "[[share]]\ntopic = '/a'\nto = ['b']\n[[share]]\ntopic = '/a'\nto = ['c']",

@@ -25,7 +25,7 @@ fn best_effort() -> Qos {
 }
 
 /// What a node counts for its links to a peer.
-fn of_peer(node: &Node, peer: &str, what: &str) -> u64 {
+fn count_for_peer(node: &Node, peer: &str, what: &str) -> u64 {
     let status = node.status();
     let links = status["links"].as_array().unwrap().iter();
     links.filter(|l| l["peer"] == peer).map(|l| l[what].as_u64().unwrap()).sum()
@@ -47,7 +47,9 @@ fn a_peer_over_its_rate_is_slowed_where_it_can_wait_and_loses_what_cannot() {
         listener.hears_at_last(|n| talker.say(format!("warm {n}")));
     }
     let [robots, desks] = ["robot", "desk"].map(|node| identity(node, false).node_id().to_string());
-    let over = |peer: &str| (of_peer(&cloud, peer, "peer_slowed"), of_peer(&cloud, peer, "peer_dropped"));
+    let over = |peer: &str| {
+        (count_for_peer(&cloud, peer, "peer_slowed"), count_for_peer(&cloud, peer, "peer_dropped"))
+    };
     assert_eq!((over(&robots), over(&desks)), ((0, 0), (0, 0)));
 
     // Reliable: all of it, in order, and not before its time. Half a second's worth may have been saved up.

@@ -49,7 +49,7 @@ fn twin(lab: &Lab, node: &str, change: impl FnOnce(&mut Config)) -> Node {
 }
 
 #[test]
-fn one_identity_in_two_processes_is_named_on_all_sides_and_nothing_comes_twice() {
+fn identity_in_two_processes_is_reported_and_delivers_once() {
     let lab = Lab::new(&["robot", "desk"]);
     let cloud = lab.cloud();
     let _robot = lab.start("robot", |c| c.shares = vec![share("/chatter", &["desk"])]);

@@ -106,7 +106,7 @@ fn large_messages_cross_whole() {
 }
 
 #[test]
-fn whoever_is_killed_and_restarted_the_flow_resumes_without_duplicates() {
+fn flow_resumes_without_duplicates_after_any_node_restarts() {
     let trio = Trio::new();
     let mut cloud = trio.cloud();
     let mut robot = trio.robot(&["/chatter"], "desk");
@@ -254,7 +254,7 @@ fn a_clean_stop_withdraws_at_once_and_a_new_share_appears() {
 }
 
 #[test]
-fn who_is_not_permitted_gets_nothing_and_is_told() {
+fn unauthorised_node_gets_nothing_and_learns_why() {
     let trio = Trio::new();
     let _nodes = (trio.cloud(), trio.robot(&["/chatter"], "somebody-else"));
     let desk = trio.desk(&["/chatter"]);

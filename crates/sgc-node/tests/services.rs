@@ -284,7 +284,7 @@ fn a_call_under_way_is_answered_once_though_the_router_restarts() {
 }
 
 #[test]
-fn what_an_owner_that_started_anew_may_have_done_is_not_done_twice() {
+fn call_is_not_repeated_after_the_owner_restarts() {
     let lab = Lab::new(&["robot", "desk"]);
     let (_cloud, first, desk) = (lab.cloud(), robot(&lab, &["desk"]), caller(&lab, "desk"));
     let server = Server::new(&lab.net("robot"), "/add");

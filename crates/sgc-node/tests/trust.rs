@@ -443,7 +443,7 @@ fn an_operator_has_operations_carried_out_at_the_authority() {
 }
 
 #[test]
-fn who_is_no_operator_changes_nothing() {
+fn non_operator_changes_nothing() {
     let lab = Lab::with_operator(&["guest", "thief"]);
     let (_cloud, keeper) = (lab.cloud(), lab.keeper());
     let guest = lab.start("guest", |_| {});
@@ -596,7 +596,7 @@ fn telling_a_router_a_list_returns_those_that_it_has() {
     let keeper = Arc::new(old_copy.issue(&request, &mut OsRng.unwrap_err()).unwrap());
     let url = lab.url().parse().unwrap();
     let runtime = tokio::runtime::Runtime::new().unwrap();
-    let heard = runtime.block_on(sgc_node::tell_router(&url, keeper, ours.into())).unwrap();
+    let heard = runtime.block_on(sgc_node::push_crl(&url, keeper, ours.into())).unwrap();
     assert_eq!(heard, [theirs]);
     // So the copy knows now that it is not the newest, and both are revoked everywhere.
     let anchors = old_copy.anchors().with_crl(&heard[0], unix_now()).unwrap().unwrap();

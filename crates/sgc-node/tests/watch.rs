@@ -12,7 +12,7 @@ use sgc_node::config::{Config, parse};
 use sgc_trust::pem_text;
 use support::*;
 
-struct Watched {
+struct WatchBench {
     node: Node,
     _trio: Trio,
     dir: tempfile::TempDir,
@@ -20,7 +20,7 @@ struct Watched {
 }
 
 /// A node whose configuration is this file of the directory.
-fn start(dir: tempfile::TempDir, file: &Path) -> Watched {
+fn start(dir: tempfile::TempDir, file: &Path) -> WatchBench {
     let audit = dir.path().join("audit");
     let trio = Trio::new();
     let read = {
@@ -37,7 +37,7 @@ fn start(dir: tempfile::TempDir, file: &Path) -> Watched {
     };
     let (identity, domain) = (identity("robot", false), trio.robot_net.clone());
     let node = Node::start_watched(Arc::new(read), file, identity, &domain);
-    Watched { node, _trio: trio, dir, audit }
+    WatchBench { node, _trio: trio, dir, audit }
 }
 
 fn text(topics: &[&str]) -> String {
@@ -46,7 +46,7 @@ fn text(topics: &[&str]) -> String {
     format!("identity = 'x'\n[node]\nrouters = ['quic://127.0.0.1:1']\n{shares}")
 }
 
-impl Watched {
+impl WatchBench {
     fn shares(&self, topics: &[&str]) {
         wait(&format!("{topics:?}"), || {
             let status = self.node.status();
@@ -115,7 +115,7 @@ fn a_broken_file_changes_nothing_and_is_said() {
 }
 
 #[test]
-fn what_the_file_names_is_watched_with_it_and_what_stands_beside_it_is_not() {
+fn files_named_in_the_configuration_are_watched_and_others_are_not() {
     let dir = tempfile::tempdir().unwrap();
     let (file, ca) = (dir.path().join("node.toml"), dir.path().join("acme-ca.pem"));
     let certificate = |fleet: &str| {
@@ -144,7 +144,7 @@ fn what_the_file_names_is_watched_with_it_and_what_stands_beside_it_is_not() {
 }
 
 #[test]
-fn who_does_not_want_it_watched_asks() {
+fn watching_can_be_switched_off() {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("node.toml");
     let unwatched = |topics: &[&str]| text(topics).replace("[node]", "[node]\nwatch = false");

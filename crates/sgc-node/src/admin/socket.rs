@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn one_node_has_a_socket_and_removes_none_but_its_own() {
+    async fn node_removes_only_its_own_status_socket() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("sub/arm-1.sock");
         let first = StatusSocket::bind(&path).unwrap();

@@ -150,7 +150,7 @@ pub struct Unread {
 /// Reads the log at `path`, with all files that were put aside, from the oldest record to the newest; gives each record
 /// to `take`. Numbered files (`FILE.2`) and dated ones (`FILE-20261124`) belong to it.
 pub fn read(path: &Path, mut take: impl FnMut(AuditRecord)) -> io::Result<Unread> {
-    let Aside { files, mut unread } = Aside::of(path)?;
+    let RotatedFiles { files, mut unread } = RotatedFiles::list(path)?;
     // The newest is opened first: what is put aside meanwhile is met once more, and known by its inode.
     let (mut opened, mut met) = (Vec::new(), BTreeSet::new());
     for path in std::iter::once(path).chain(files.iter().map(PathBuf::as_path)) {
@@ -202,14 +202,14 @@ fn read_file(file: fs::File, take: &mut impl FnMut(AuditRecord)) -> io::Result<u
 
 /// The files of a log that were put aside.
 #[derive(Default)]
-struct Aside {
+struct RotatedFiles {
     /// The newest first.
     files: Vec<PathBuf>,
     unread: Unread,
 }
 
-impl Aside {
-    fn of(path: &Path) -> io::Result<Self> {
+impl RotatedFiles {
+    fn list(path: &Path) -> io::Result<Self> {
         let mut aside = Self::default();
         let entries = match fs::read_dir(directory(path)) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(aside),

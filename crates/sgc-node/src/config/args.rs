@@ -9,8 +9,8 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use super::draft::{
-    AuditDraft, Draft, GatewayDraft, Located, RosDraft, RotationDraft, ShareDraft, TransportDraft, UseDraft,
-    Words,
+    AuditDraft, Draft, GatewayDraft, RosDraft, RotationDraft, ShareDraft, TransportDraft, UseDraft,
+    WithOrigin, Words,
 };
 use super::error::{ConfigError, Mistake, Origin};
 use super::schema::nearest;
@@ -139,7 +139,7 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
 fn named(
     text: &str,
     key: fn((&'static str, &'static str, &'static str)) -> &'static str,
-) -> Result<Located<String>, Mistake> {
+) -> Result<WithOrigin<String>, Mistake> {
     // A name may be wrong in itself; a word before a slash is none of it.
     let (word, name) =
         text.split_once(':').filter(|(word, _)| !word.contains('/')).unwrap_or(("topic", text));
@@ -152,10 +152,10 @@ fn named(
     }
 }
 
-fn located<T>(key: &'static str, value: T) -> Located<T> {
-    Located { value, key, origin: Origin::Arguments }
+fn located<T>(key: &'static str, value: T) -> WithOrigin<T> {
+    WithOrigin { value, key, origin: Origin::Arguments }
 }
 
-fn all(key: &'static str, values: &[String]) -> Vec<Located<String>> {
+fn all(key: &'static str, values: &[String]) -> Vec<WithOrigin<String>> {
     values.iter().map(|value| located(key, value.clone())).collect()
 }

@@ -12,8 +12,8 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::draft::{
-    AuditDraft, Draft, GatewayClientDraft, GatewayDraft, Located, NamingDraft, PartnerDraft, QosDraft,
-    RosDraft, RotationDraft, ShapingDraft, ShareDraft, TransportDraft, UseDraft, Words,
+    AuditDraft, Draft, GatewayClientDraft, GatewayDraft, NamingDraft, PartnerDraft, QosDraft, RosDraft,
+    RotationDraft, ShapingDraft, ShareDraft, TransportDraft, UseDraft, WithOrigin, Words,
 };
 use super::error::{ConfigError, Mistake, Origin};
 use super::schema::{Table, nearest};
@@ -120,7 +120,7 @@ impl FileReader<'_> {
                 .iter()
                 .map(|share| self.share(share))
                 .collect(),
-            uses: self.repeated(&top, "use", Table::Use).iter().map(|one| self.one_use(one)).collect(),
+            uses: self.repeated(&top, "use", Table::Use).iter().map(|one| self.read_use(one)).collect(),
             admin_socket: self
                 .string(admin.as_ref(), "socket", "a string, such as \"/run/sgc/arm-1.sock\"")
                 .map(|socket| socket.map(PathBuf::from)),
@@ -167,7 +167,7 @@ impl FileReader<'_> {
         &mut self,
         top: &Section<'_, '_>,
         node: Option<&Section<'_, '_>>,
-    ) -> Option<Located<PathBuf>> {
+    ) -> Option<WithOrigin<PathBuf>> {
         const EXPECTED: &str = "a string, such as \"arm-1.identity\"";
         let above = self.string(Some(top), "identity", EXPECTED);
         let within = self.string(node, "identity", EXPECTED);
@@ -230,7 +230,7 @@ impl FileReader<'_> {
         }
     }
 
-    fn one_use(&mut self, one: &Section<'_, '_>) -> UseDraft {
+    fn read_use(&mut self, one: &Section<'_, '_>) -> UseDraft {
         // A token says whose topic it is, and which.
         if !one.entries.contains_key("token") && !one.meant.contains(&"token") {
             self.check_required(one, "from", "\"arm-1\"");
@@ -253,8 +253,8 @@ impl FileReader<'_> {
     }
 
     /// The name of what is shared or used; which key it stands under says what that is.
-    fn interface(&mut self, section: Option<&Section<'_, '_>>) -> Option<Located<String>> {
-        let mut first: Option<Located<String>> = None;
+    fn interface(&mut self, section: Option<&Section<'_, '_>>) -> Option<WithOrigin<String>> {
+        let mut first: Option<WithOrigin<String>> = None;
         for interface in INTERFACES {
             let key = interface.key();
             let Some(named) = self.string(section, key, "a string, such as \"/camera/image\"") else {
@@ -314,7 +314,7 @@ impl FileReader<'_> {
         }
     }
 
-    fn authority(&mut self, authority: Option<&Section<'_, '_>>) -> Option<Located<PathBuf>> {
+    fn authority(&mut self, authority: Option<&Section<'_, '_>>) -> Option<WithOrigin<PathBuf>> {
         self.check_required(authority?, "fleet", "\"lab.fleet\"");
         let fleet = self.string(authority, "fleet", "a string, such as \"lab.fleet\"");
         fleet.map(|fleet| fleet.map(PathBuf::from))
@@ -327,7 +327,7 @@ impl FileReader<'_> {
         let is_one = partner.entries.get("node").is_some_and(|node| node.get_ref().is_str());
         let partner = Some(partner);
         let node = match is_one {
-            true => self.string(partner, "node", NODE).map(|one| Located {
+            true => self.string(partner, "node", NODE).map(|one| WithOrigin {
                 key: one.key,
                 origin: one.origin.clone(),
                 value: vec![one],
@@ -481,7 +481,7 @@ impl FileReader<'_> {
         section: Option<&Section<'_, '_>>,
         key: &'static str,
         expected: &'static str,
-    ) -> Option<Located<String>> {
+    ) -> Option<WithOrigin<String>> {
         let value = section?.entries.get(key)?;
         self.typed(value, key, expected, |value| value.as_str().map(str::to_owned))
     }
@@ -491,7 +491,7 @@ impl FileReader<'_> {
         section: Option<&Section<'_, '_>>,
         key: &'static str,
         expected: &'static str,
-    ) -> Option<Located<bool>> {
+    ) -> Option<WithOrigin<bool>> {
         let value = section?.entries.get(key)?;
         self.typed(value, key, expected, DeValue::as_bool)
     }
@@ -501,7 +501,7 @@ impl FileReader<'_> {
         section: Option<&Section<'_, '_>>,
         key: &'static str,
         expected: &'static str,
-    ) -> Option<Located<i64>> {
+    ) -> Option<WithOrigin<i64>> {
         let value = section?.entries.get(key)?;
         self.typed(value, key, expected, |value| {
             let integer = value.as_integer()?;
@@ -514,7 +514,7 @@ impl FileReader<'_> {
         section: Option<&Section<'_, '_>>,
         key: &'static str,
         expected: &'static str,
-    ) -> Option<Located<Vec<Located<String>>>> {
+    ) -> Option<WithOrigin<Vec<WithOrigin<String>>>> {
         let value = section?.entries.get(key)?;
         let DeValue::Array(array) = value.get_ref() else {
             self.record_type(value, key, expected);
@@ -525,7 +525,7 @@ impl FileReader<'_> {
             items.extend(self.typed(item, key, expected, |item| item.as_str().map(str::to_owned)));
         }
         // A list of nothing but mistakes is not empty by the user's will.
-        (array.is_empty() || !items.is_empty()).then(|| Located {
+        (array.is_empty() || !items.is_empty()).then(|| WithOrigin {
             value: items,
             key,
             origin: self.origin(value.span()),
@@ -533,7 +533,7 @@ impl FileReader<'_> {
     }
 
     /// Strings, and arrays of strings that name the ways to one router.
-    fn routers(&mut self, node: Option<&Section<'_, '_>>) -> Vec<Located<String>> {
+    fn routers(&mut self, node: Option<&Section<'_, '_>>) -> Vec<WithOrigin<String>> {
         const KEY: &str = "routers";
         const EXPECTED: &str = "an array of strings, such as [\"quic://router.lab.example:7447\"], or of arrays of \
             strings that name the ways to one router";
@@ -561,7 +561,7 @@ impl FileReader<'_> {
         section: Option<&Section<'_, '_>>,
         key: &'static str,
         expected: &'static str,
-    ) -> Vec<Located<String>> {
+    ) -> Vec<WithOrigin<String>> {
         self.strings(section, key, expected).map(|list| list.value).unwrap_or_default()
     }
 
@@ -571,12 +571,12 @@ impl FileReader<'_> {
         key: &'static str,
         expected: &'static str,
         convert: impl FnOnce(&DeValue<'t>) -> Option<T>,
-    ) -> Option<Located<T>> {
+    ) -> Option<WithOrigin<T>> {
         let converted = convert(value.get_ref());
         if converted.is_none() {
             self.record_type(value, key, expected);
         }
-        Some(Located { value: converted?, key, origin: self.origin(value.span()) })
+        Some(WithOrigin { value: converted?, key, origin: self.origin(value.span()) })
     }
 
     /// The kind of a value and, if it is short, the value itself as written.

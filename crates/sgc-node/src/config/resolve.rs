@@ -18,7 +18,8 @@ use sgc_wire::{
 };
 
 use super::draft::{
-    Draft, Located, NamingDraft, PartnerDraft, QosDraft, RosDraft, ShapingDraft, ShareDraft, UseDraft, Words,
+    Draft, NamingDraft, PartnerDraft, QosDraft, RosDraft, ShapingDraft, ShareDraft, UseDraft, WithOrigin,
+    Words,
 };
 use super::error::{ConfigError, Mistake, Origin};
 use super::names::{self, Recipient};
@@ -184,7 +185,7 @@ impl Resolver<'_> {
     /// The checked value, or nothing and an error.
     fn keep<T>(
         &mut self,
-        located: &Located<String>,
+        located: &WithOrigin<String>,
         check: impl FnOnce(&'static str, &str) -> Result<T, Mistake>,
     ) -> Option<T> {
         check(located.key, &located.value).map_err(|mistake| self.errors.push(located.error(mistake))).ok()
@@ -224,7 +225,7 @@ impl Resolver<'_> {
 
     fn addresses<T: Ord + Clone>(
         &mut self,
-        written: &[Located<String>],
+        written: &[WithOrigin<String>],
         check: fn(&'static str, &str) -> Result<T, Mistake>,
         max: usize,
     ) -> Vec<T> {
@@ -247,8 +248,8 @@ impl Resolver<'_> {
 
     fn shares(&mut self, draft: &Draft, node_name: Option<&NodeName>) -> Vec<ShareConfig> {
         self.check_count(&draft.origin, self.words.share, draft.shares.len(), SHARES_MAX);
-        let mut first: BTreeMap<(&str, &str), &Located<String>> = BTreeMap::new();
-        let mut called: BTreeMap<(&str, String), &Located<String>> = BTreeMap::new();
+        let mut first: BTreeMap<(&str, &str), &WithOrigin<String>> = BTreeMap::new();
+        let mut called: BTreeMap<(&str, String), &WithOrigin<String>> = BTreeMap::new();
         let mut valid = Vec::new();
         for share in draft.shares.iter().take(SHARES_MAX) {
             let interface = interface_of(share.topic.as_ref());
@@ -345,7 +346,7 @@ impl Resolver<'_> {
 
     fn recipients(
         &mut self,
-        to: &Located<Vec<Located<String>>>,
+        to: &WithOrigin<Vec<WithOrigin<String>>>,
         node_name: Option<&NodeName>,
         partners: &[PartnerDraft],
     ) -> Vec<Recipient> {
@@ -380,7 +381,7 @@ impl Resolver<'_> {
         valid
     }
 
-    fn operators(&mut self, written: &Located<Vec<Located<String>>>) -> Vec<Recipient> {
+    fn operators(&mut self, written: &WithOrigin<Vec<WithOrigin<String>>>) -> Vec<Recipient> {
         if written.value.len() > RECIPIENTS_MAX {
             let (key, count) = (written.key, written.value.len());
             self.record(&written.origin, Mistake::TooManyEntries { key, count, max: RECIPIENTS_MAX });
@@ -402,7 +403,7 @@ impl Resolver<'_> {
         valid
     }
 
-    fn check_partner(&mut self, one: &Located<String>, partner: &FleetName, known: &[PartnerDraft]) {
+    fn check_partner(&mut self, one: &WithOrigin<String>, partner: &FleetName, known: &[PartnerDraft]) {
         let names: Vec<&str> =
             known.iter().filter_map(|p| p.name.as_ref()).map(|name| name.value.as_str()).collect();
         // A partner without a name has its own error, and may be this one.
@@ -415,7 +416,7 @@ impl Resolver<'_> {
 
     fn partners(&mut self, draft: &Draft) -> Vec<PartnerConfig> {
         self.check_count(&draft.origin, "[[partner]]", draft.partners.len(), PARTNERS_MAX);
-        let mut first: BTreeMap<FleetName, &Located<String>> = BTreeMap::new();
+        let mut first: BTreeMap<FleetName, &WithOrigin<String>> = BTreeMap::new();
         let mut valid = Vec::new();
         for partner in draft.partners.iter().take(PARTNERS_MAX) {
             let name = partner.name.as_ref().and_then(|name| self.keep(name, names::partner));
@@ -465,7 +466,7 @@ impl Resolver<'_> {
         self.ca_files(&accept.value, ACCEPT_MAX)
     }
 
-    fn ca_files(&mut self, written: &[Located<String>], max: usize) -> Vec<PathBuf> {
+    fn ca_files(&mut self, written: &[WithOrigin<String>], max: usize) -> Vec<PathBuf> {
         if let Some(first) = written.get(max) {
             let (key, count) = (first.key, written.len());
             self.record(&first.origin, Mistake::TooManyEntries { key, count, max });
@@ -482,7 +483,7 @@ impl Resolver<'_> {
         valid
     }
 
-    fn ca_file(&mut self, written: &Located<PathBuf>) -> Option<PathBuf> {
+    fn ca_file(&mut self, written: &WithOrigin<PathBuf>) -> Option<PathBuf> {
         let path = self.path(written, "\"acme-ca.pem\"")?;
         if let Some(Err(mistake)) = self.checks.map(|checks| (checks.ca)(written.key, &path)) {
             self.record(&written.origin, mistake);
@@ -490,7 +491,7 @@ impl Resolver<'_> {
         Some(path)
     }
 
-    fn fleet(&mut self, written: &Located<PathBuf>) -> Option<PathBuf> {
+    fn fleet(&mut self, written: &WithOrigin<PathBuf>) -> Option<PathBuf> {
         let path = self.path(written, "\"lab.fleet\"")?;
         if let Some(Err(mistake)) = self.checks.map(|checks| (checks.fleet)(written.key, &path)) {
             self.record(&written.origin, mistake);
@@ -498,7 +499,7 @@ impl Resolver<'_> {
         Some(path)
     }
 
-    fn path(&mut self, written: &Located<PathBuf>, example: &'static str) -> Option<PathBuf> {
+    fn path(&mut self, written: &WithOrigin<PathBuf>, example: &'static str) -> Option<PathBuf> {
         if written.value.as_os_str().is_empty() {
             self.record(&written.origin, Mistake::Empty { key: written.key, example });
             return None;
@@ -546,8 +547,8 @@ impl Resolver<'_> {
                 None => return None,
             },
         };
-        let in_environment = variable(ros_env::SECURITY_ENCLAVE_OVERRIDE);
-        let (key, enclave, origin) = match (&written.enclave, in_environment) {
+        let environment_error = variable(ros_env::SECURITY_ENCLAVE_OVERRIDE);
+        let (key, enclave, origin) = match (&written.enclave, environment_error) {
             (Some(enclave), _) => (enclave.key, enclave.value.clone(), enclave.origin.clone()),
             (None, Some(enclave)) => (ros_env::SECURITY_ENCLAVE_OVERRIDE, enclave, Origin::Environment),
             (None, None) => ("enclave", "/".to_owned(), Origin::Environment),
@@ -618,7 +619,12 @@ impl Resolver<'_> {
         AuditConfig { file, room, off }
     }
 
-    fn number(&mut self, written: &Located<i64>, what: &'static str, (min, max): (u64, u64)) -> Option<u64> {
+    fn number(
+        &mut self,
+        written: &WithOrigin<i64>,
+        what: &'static str,
+        (min, max): (u64, u64),
+    ) -> Option<u64> {
         let value = written.value;
         let valid = u64::try_from(value).ok().filter(|n| (min..=max).contains(n));
         if valid.is_none() {
@@ -629,7 +635,7 @@ impl Resolver<'_> {
     }
 
     fn tokens(&mut self, draft: &Draft) -> Vec<TokenConfig> {
-        let mut first: Vec<(TokenConfig, &Located<String>)> = Vec::new();
+        let mut first: Vec<(TokenConfig, &WithOrigin<String>)> = Vec::new();
         for one in &draft.uses {
             let Some(written) = &one.token else { continue };
             for beside in [
@@ -668,7 +674,7 @@ impl Resolver<'_> {
         first.into_iter().map(|(token, _)| token).collect()
     }
 
-    fn token(&mut self, written: &Located<String>) -> Option<TokenSource> {
+    fn token(&mut self, written: &WithOrigin<String>) -> Option<TokenSource> {
         if written.value.trim_start().starts_with(TOKEN_PREFIX) {
             let token = self.keep(written, |key, text| {
                 ShareToken::parse(text).map_err(|fault| Mistake::Token { key, fault })
@@ -683,11 +689,11 @@ impl Resolver<'_> {
     }
 
     /// Whether a topic has a connection of its own.
-    fn dedicated(&mut self, link: Option<&Located<String>>) -> bool {
+    fn dedicated(&mut self, link: Option<&WithOrigin<String>>) -> bool {
         link.and_then(|link| self.keep(link, is_dedicated)).unwrap_or_default()
     }
 
-    fn metadata(&mut self, text: Option<&Located<String>>) -> String {
+    fn metadata(&mut self, text: Option<&WithOrigin<String>>) -> String {
         let Some(text) = text else { return String::new() };
         let (bytes, max) = (text.value.len(), METADATA_FIELD_BYTES_MAX);
         if bytes > max {
@@ -698,17 +704,17 @@ impl Resolver<'_> {
 
     fn uses(&mut self, draft: &Draft, node_name: Option<&NodeName>) -> Vec<UseConfig> {
         self.check_count(&draft.origin, self.words.uses, draft.uses.len(), USES_MAX);
-        let shared: BTreeMap<(&str, &str), &Located<String>> = draft
+        let shared: BTreeMap<(&str, &str), &WithOrigin<String>> = draft
             .shares
             .iter()
             .filter_map(|share| share.topic.as_ref())
             .map(|topic| ((interface_of(Some(topic)).key(), topic.value.as_str()), topic))
             .rev()
             .collect();
-        let mut first: BTreeMap<(NodeName, &str, String, bool), &Located<String>> = BTreeMap::new();
+        let mut first: BTreeMap<(NodeName, &str, String, bool), &WithOrigin<String>> = BTreeMap::new();
         let mut valid = Vec::new();
         for one in draft.uses.iter().take(USES_MAX).filter(|one| one.token.is_none()) {
-            let resolved = self.one_use(one, node_name);
+            let resolved = self.resolve_use(one, node_name);
             if let (Some(resolved), Some(written)) = (&resolved, &one.topic) {
                 let (key, topic) = (written.key, resolved.topic.clone());
                 // Of what matches a pattern some may go one way and some the other.
@@ -732,7 +738,7 @@ impl Resolver<'_> {
         valid
     }
 
-    fn one_use(&mut self, one: &UseDraft, node_name: Option<&NodeName>) -> Option<UseConfig> {
+    fn resolve_use(&mut self, one: &UseDraft, node_name: Option<&NodeName>) -> Option<UseConfig> {
         let from = one.from.as_ref().and_then(|from| {
             let name = self.keep(from, names::node)?;
             if node_name == Some(&name) {
@@ -833,7 +839,7 @@ impl Resolver<'_> {
     }
 
     /// Whether `as` has the wildcard of the topic, or neither has any.
-    fn check_as(&mut self, written: &Located<String>, topic: &str) -> bool {
+    fn check_as(&mut self, written: &WithOrigin<String>, topic: &str) -> bool {
         let split = |name: &str| {
             let (stem, last) = name.rsplit_once('/').unwrap_or_default();
             (stem.to_owned(), last.to_owned())
@@ -902,7 +908,7 @@ impl Resolver<'_> {
             };
             self.record(origin, mistake);
         }
-        let mut ns = |time: &Option<Located<String>>| {
+        let mut ns = |time: &Option<WithOrigin<String>>| {
             let time = self.keep(time.as_ref()?, names::age)?;
             u64::try_from(time.as_nanos()).ok()
         };
@@ -933,7 +939,7 @@ impl Resolver<'_> {
         }
     }
 
-    fn socket(&mut self, socket: &Located<PathBuf>) -> Option<PathBuf> {
+    fn socket(&mut self, socket: &WithOrigin<PathBuf>) -> Option<PathBuf> {
         const EXAMPLE: &str = "\"/run/sgc/arm-1.sock\"";
         let path = self.base_dir.join(&socket.value);
         let (bytes, max) = (path.as_os_str().len(), SOCKET_PATH_BYTES_MAX);
@@ -950,7 +956,7 @@ impl Resolver<'_> {
 const HISTORY_DEPTH_MAX: u64 = 4096;
 
 /// The kind of a table's interface, after the key of its name, or after the last word of an argument's key.
-fn interface_of(named: Option<&Located<String>>) -> Interface {
+fn interface_of(named: Option<&WithOrigin<String>>) -> Interface {
     let key = named.and_then(|named| named.key.split(' ').next_back()).unwrap_or_default();
     let others = [Interface::Service, Interface::Action, Interface::Parameters];
     others.into_iter().find(|interface| interface.key() == key).unwrap_or_default()

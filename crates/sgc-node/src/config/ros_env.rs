@@ -3,7 +3,7 @@
 //! The variables mean what they mean to `rcl`, with one difference: where `rcl` warns about a value and goes
 //! on with another, this is an error. A key of the file stands above its variable, which is then not read.
 
-use super::draft::{Located, RosDraft};
+use super::draft::{RosDraft, WithOrigin};
 use super::error::{ConfigError, Mistake, Origin};
 use super::schema::nearest;
 use super::{DiscoveryRange, Environment, RosConfig, names};
@@ -71,11 +71,11 @@ fn variable(env: Environment<'_>, name: &str) -> Option<String> {
     env(name).filter(|value| !value.is_empty())
 }
 
-fn in_environment(mistake: Mistake) -> ConfigError {
+fn environment_error(mistake: Mistake) -> ConfigError {
     ConfigError::new(Origin::Environment, mistake)
 }
 
-fn file_domain_id(id: &Located<i64>) -> Result<u32, ConfigError> {
+fn file_domain_id(id: &WithOrigin<i64>) -> Result<u32, ConfigError> {
     match u32::try_from(id.value) {
         Ok(value) if value <= DOMAIN_ID_MAX => Ok(value),
         _ => {
@@ -88,7 +88,7 @@ fn env_domain_id(env: Environment<'_>) -> Result<u32, ConfigError> {
     let Some(value) = variable(env, DOMAIN_ID) else { return Ok(0) };
     match c_number(value.trim()) {
         Some(id) if id <= DOMAIN_ID_MAX => Ok(id),
-        _ => Err(in_environment(Mistake::DomainId {
+        _ => Err(environment_error(Mistake::DomainId {
             key: DOMAIN_ID,
             value: format!("{value:?}"),
             max: DOMAIN_ID_MAX,
@@ -158,18 +158,18 @@ fn env_range(env: Environment<'_>, read_switch: bool) -> Result<Range, ConfigErr
         None | Some("0") => {}
         Some(value) => {
             let value = value.to_owned();
-            return Err(in_environment(Mistake::Switch { key: LOCALHOST_ONLY, value }));
+            return Err(environment_error(Mistake::Switch { key: LOCALHOST_ONLY, value }));
         }
     }
     let Some(written) = variable(env, DISCOVERY_RANGE) else {
         return Ok(Range { value: DiscoveryRange::Subnet, set_by: None, only_localhost: false });
     };
-    match RANGES.iter().find(|(_, in_environment, _)| *in_environment == written) {
+    match RANGES.iter().find(|(_, environment_error, _)| *environment_error == written) {
         Some((.., value)) => {
             let set_by = Some((DISCOVERY_RANGE, format!("{written:?}")));
             Ok(Range { value: *value, set_by, only_localhost: false })
         }
-        None => Err(in_environment(Mistake::UnknownWord {
+        None => Err(environment_error(Mistake::UnknownWord {
             key: DISCOVERY_RANGE,
             nearest: nearest(&written, &RANGES_IN_ENVIRONMENT),
             value: written,
@@ -179,7 +179,7 @@ fn env_range(env: Environment<'_>, read_switch: bool) -> Result<Range, ConfigErr
 }
 
 fn file_peers(
-    peers: &Located<Vec<Located<String>>>,
+    peers: &WithOrigin<Vec<WithOrigin<String>>>,
     range: &Range,
     errors: &mut Vec<ConfigError>,
 ) -> Vec<String> {
@@ -218,14 +218,14 @@ fn env_peers(env: Environment<'_>) -> Result<Vec<String>, ConfigError> {
     let Some(written) = variable(env, STATIC_PEERS) else { return Ok(Vec::new()) };
     let mut peers: Vec<String> = Vec::new();
     for peer in written.split(';').map(str::trim).filter(|peer| !peer.is_empty()) {
-        let peer = names::peer(STATIC_PEERS, peer).map_err(in_environment)?;
+        let peer = names::peer(STATIC_PEERS, peer).map_err(environment_error)?;
         if !peers.contains(&peer) {
             peers.push(peer);
         }
     }
     if peers.len() > STATIC_PEERS_MAX {
         let (key, count) = (STATIC_PEERS, peers.len());
-        return Err(in_environment(Mistake::TooManyEntries { key, count, max: STATIC_PEERS_MAX }));
+        return Err(environment_error(Mistake::TooManyEntries { key, count, max: STATIC_PEERS_MAX }));
     }
     Ok(peers)
 }

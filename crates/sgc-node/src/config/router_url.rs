@@ -1,6 +1,6 @@
 //! Where a router is to be found: `quic://HOST:PORT`, `srv://DOMAIN`, `mdns://`.
 //!
-//! It parses and prints; looking up and dialling is the business of `crate::finding`.
+//! It parses and prints; looking up and dialling is the business of `crate::discovery`.
 
 use std::fmt;
 use std::net::IpAddr;

@@ -20,7 +20,7 @@ use crate::graph::{
     Endpoint, GRAPH_ENDPOINTS_MAX, Graph, Link, NameLine, Offer, Search, Share, ShareRoute, Side,
     UnheardMember, Use, UseRoute,
 };
-use crate::tap::{Tap, TapError, TapQueue, TapWish, Tapped, Taps};
+use crate::tap::{Tap, TapError, TapMessage, TapQueue, TapRequest, Taps};
 
 /// Names whose refusals are remembered.
 const REFUSED_NAMES_MAX: usize = 256;
@@ -277,8 +277,8 @@ impl<N: RosNetwork> Core<N> {
 
     /// Lets somebody look at what goes by. A topic that comes from the far side is looked at there, since what this node
     /// writes is hidden from its own readers.
-    pub(super) fn tap(&mut self, wish: TapWish, reply: oneshot::Sender<Result<Tap, TapError>>) {
-        let TapWish { topic, side } = wish;
+    pub(super) fn tap(&mut self, wish: TapRequest, reply: oneshot::Sender<Result<Tap, TapError>>) {
+        let TapRequest { topic, side } = wish;
         let Some(routes) = &self.routes else {
             let _ = reply.send(Err(TapError::NoTopic { topic }));
             return;
@@ -358,7 +358,7 @@ impl<N: RosNetwork> Core<N> {
         tokio::task::spawn_blocking(move || {
             let into = queue.clone();
             let handler: SampleHandler =
-                Box::new(move |sample: Sample| into.push(Tapped::of_sample(&sample)));
+                Box::new(move |sample: Sample| into.push(TapMessage::from_sample(&sample)));
             let type_hash = spec.type_hash.clone();
             let tap = network.create_reader(&spec, handler).map(|reader| {
                 let reader: Box<dyn std::any::Any + Send> = Box::new((reader, alive));

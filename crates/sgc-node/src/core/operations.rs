@@ -14,8 +14,8 @@ use tracing::{info, warn};
 
 use super::{Core, now};
 use crate::audit::{AuditEvent, AuditRecord};
-use crate::operations::{OperationError, OperationWish, Step};
-use crate::operators::{Asked, OperationDone};
+use crate::operations::{OperationError, Step, UserOperation};
+use crate::operators::{OperationOutcome, RequestStep};
 
 /// Counts operations that came again and were not carried out again.
 const REPEATED: &str = "operation_repeated";
@@ -39,7 +39,7 @@ impl<N: RosNetwork> Core<N> {
             return;
         }
         let is_named = self.identity.authority() == Some(authority);
-        let wish = OperationWish { at: at.to_string(), authority, is_named, operation, reply };
+        let wish = UserOperation { at: at.to_string(), authority, is_named, operation, reply };
         self.operations.push(Instant::now(), wish);
         self.next_operation();
     }
@@ -92,15 +92,15 @@ impl<N: RosNetwork> Core<N> {
         let asked = authority.operators.ask(now.instant, peer, sink, request, &mut OsRng.unwrap_err());
         let node = peer.node_id;
         match asked {
-            Asked::Answer(answer) => self.answer_operator(&node, sink, answer),
-            Asked::Again(answer) => {
+            RequestStep::Answer(answer) => self.answer_operator(&node, sink, answer),
+            RequestStep::Again(answer) => {
                 self.control_drops.count_from(REPEATED, node);
                 self.answer_operator(&node, sink, answer);
             }
-            Asked::UnderWay => {
+            RequestStep::UnderWay => {
                 self.control_drops.count_from(REPEATED, node);
             }
-            Asked::Job(job) => {
+            RequestStep::Job(job) => {
                 // Nodes that are here now are shown as present.
                 let here: Vec<_> = self.endpoint.renewing().map(|(_, peer, _)| peer.node_id).collect();
                 authority.note_seen(here, now.unix);
@@ -109,7 +109,7 @@ impl<N: RosNetwork> Core<N> {
                     Err(job) => self.operation_done(job.busy()),
                 }
             }
-            Asked::NotPermitted => {
+            RequestStep::NotPermitted => {
                 if self.control_drops.count_from(NOT_PERMITTED, node) {
                     warn!(peer = %node.short(), "is no operator and asks for operations; counted from here on");
                 }
@@ -121,7 +121,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     /// Answers an operation that was carried out or refused, and tells everyone whom it revoked.
-    pub(super) fn operation_done(&mut self, done: OperationDone) {
+    pub(super) fn operation_done(&mut self, done: OperationOutcome) {
         info!(operator = %done.node.short(), operation = done.said, "was asked for an operation");
         self.audit.write(AuditRecord::new(AuditEvent::Operation).peer(&done.node).reason(&done.said));
         let waits = self.authority.as_mut().and_then(|authority| authority.operators.done(&done));

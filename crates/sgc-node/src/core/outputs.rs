@@ -17,7 +17,7 @@ impl<N: RosNetwork> Core<N> {
             RouterOutput::Send { link: LinkId::LOCAL, frame } => self.endpoint.handle_frame(now(), frame),
             RouterOutput::Send { link, frame } => {
                 let Some(entry) = self.links.get_mut(&link) else { return };
-                entry.heart.stir();
+                entry.keep_alive.stir();
                 if !entry.control.send(frame) {
                     self.close_overloaded(link);
                 }

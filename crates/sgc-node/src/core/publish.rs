@@ -65,7 +65,7 @@ impl<N: RosNetwork> Core<N> {
         let offer = SourceOffer { source: id, key: message_key.public().clone() };
         self.endpoint.join(now(), name, owner, Wish::Publish(offer));
         if calls {
-            self.begin_called(name);
+            self.begin_far(name);
         }
     }
 

@@ -1,5 +1,5 @@
 //! What the links measure: the router machine weighs ways by it, and leaves those that have fallen silent before
-//! their time-outs end them. When to ask a peer whether it is there is for [`crate::heart`] to say.
+//! their time-outs end them. When to ask a peer whether it is there is for [`crate::keep_alive`] to say.
 
 use std::time::{Duration, Instant};
 
@@ -10,7 +10,7 @@ use sgc_wire::{Control, NodeId};
 use tracing::info;
 
 use super::{Core, LinkEntry, now};
-use crate::heart::{Heart, Patience, Seen};
+use crate::keep_alive::{KeepAlive, KeepAlivePolicy, LinkObservation};
 
 /// How often links are looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
@@ -19,14 +19,14 @@ const IMPATIENT_MAX: usize = 1024;
 
 impl<N: RosNetwork> Core<N> {
     /// How a link to this peer begins.
-    pub(super) fn heart_of(&self, link: &AnyLink) -> Heart {
+    pub(super) fn keep_alive_for(&self, link: &AnyLink) -> KeepAlive {
         let known = self.impatient.get(&link.peer().node_id);
-        let patience = Patience { max: known.copied().unwrap_or(self.patience.max), ..self.patience };
-        Heart::new(Instant::now(), patience, link.stats().received_bytes, link.remote())
+        let patience = KeepAlivePolicy { max: known.copied().unwrap_or(self.patience.max), ..self.patience };
+        KeepAlive::new(Instant::now(), patience, link.stats().received_bytes, link.remote())
     }
 
     /// Remembers of a link that ends how soon its peer has to be asked.
-    pub(super) fn remember_patience(&mut self, node: NodeId, patience: Patience) {
+    pub(super) fn remember_policy(&mut self, node: NodeId, patience: KeepAlivePolicy) {
         let is_known = self.impatient.contains_key(&node);
         if patience.max < self.patience.max && (is_known || self.impatient.len() < IMPATIENT_MAX) {
             self.impatient.insert(node, patience.max);
@@ -60,7 +60,7 @@ impl LinkEntry {
     /// Looks at it, and asks the peer or gives it up if need be; true if it seems dead.
     fn look(&mut self, at: Instant, received_bytes: u64, rtt: Duration) -> bool {
         let (activity, remote) = (self.control.activity(), self.link.remote());
-        let verdict = self.heart.look(at, Seen { received_bytes, activity, remote, rtt });
+        let verdict = self.keep_alive.look(at, LinkObservation { received_bytes, activity, remote, rtt });
         if verdict.asks {
             // If there is no room the peer does not take what is there, which is seen elsewhere.
             self.control.send(Control::Pulse { answers: false });

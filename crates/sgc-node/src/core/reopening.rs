@@ -44,12 +44,12 @@ impl<N: RosNetwork> Core<N> {
         }
         for calls in self.calls.values() {
             ending.extend(match calls {
-                Calls::Served(served) => {
+                Calls::LocalService(served) => {
                     // Answers of a server reach nobody from here on.
                     served.servers_gone();
                     served.set_client(None)
                 }
-                Calls::Called(called) => called.set_server(None),
+                Calls::FarService(called) => called.set_server(None),
             });
         }
         ending.extend(self.consumers.take_shown());
@@ -85,8 +85,8 @@ impl<N: RosNetwork> Core<N> {
         }
         for (name, spec) in services {
             match self.calls.get(&name) {
-                Some(Calls::Served(_)) => self.open_client(name, spec),
-                Some(Calls::Called(_)) => self.open_server(name, spec),
+                Some(Calls::LocalService(_)) => self.open_client(name, spec),
+                Some(Calls::FarService(_)) => self.open_server(name, spec),
                 None => {}
             }
         }

@@ -46,7 +46,7 @@ impl<N: RosNetwork> Core<N> {
                         self.shares.insert(name, Arc::new(share));
                         self.need_type(name, &metadata, type_hash, None);
                         if is_service {
-                            self.begin_served(name);
+                            self.begin_local(name);
                         }
                     }
                     Err(why) => error!("{topic} is not shared: {why}"),
@@ -188,7 +188,7 @@ impl<N: RosNetwork> Core<N> {
                 recovery: RecoveryLimits { bytes_max: share_of(recovery.bytes_max, sources), ..recovery },
             };
             let source = Source::new(config, &grant, message_key.clone())?;
-            let manual = ManualLease::of(qos, Instant::now());
+            let manual = ManualLease::from_qos(qos, Instant::now());
             let slot = SourceSlot::new(source, keeps_history, qos.is_reliable());
             Some(SourceSlot { depth, manual, ..slot })
         };

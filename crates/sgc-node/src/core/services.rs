@@ -11,28 +11,28 @@ use tracing::error;
 
 use super::{Core, CoreEvent, EPOCH_GRACE, ServiceEnd, drop_elsewhere};
 use crate::call_ledger::{CallLedger, CallerId, LEDGERS_MAX};
-use crate::calls::{Answers, Called, Calls, Requests, Served};
+use crate::calls::{Answers, Calls, FarService, LocalService, Requests};
 use crate::graph::{LostCalls, ServiceCalls};
-use crate::sinks::{Behind, LocalSink, WriterQueue};
+use crate::sinks::{LocalSink, WriterInfo, WriterQueue};
 
 impl<N: RosNetwork> Core<N> {
     /// A share is a service: what comes is calls, not what others publish.
-    pub(super) fn begin_served(&mut self, name: Name) {
+    pub(super) fn begin_local(&mut self, name: Name) {
         let Some(share) = self.shares.get(&name) else { return };
         let (share, ledger) = (share.clone(), self.call_ledger(name, true));
-        let served = Arc::new(Served::new(share, self.ros_failures.clone(), ledger));
+        let served = Arc::new(LocalService::new(share, self.ros_failures.clone(), ledger));
         let takes = served.clone();
-        self.begin_calls(name, Calls::Served(served), move |message| takes.take(message));
+        self.begin_calls(name, Calls::LocalService(served), move |message| takes.take(message));
     }
 
     /// A name that this node publishes under is a service: what comes is answers.
-    pub(super) fn begin_called(&mut self, name: Name) {
+    pub(super) fn begin_far(&mut self, name: Name) {
         let Some(share) = self.shares.get(&name) else { return };
         let (share, ledger) = (share.clone(), self.call_ledger(name, false));
-        let called = Called::new(share, self.ros_failures.clone(), ledger, self.epoch_over.clone());
+        let called = FarService::new(share, self.ros_failures.clone(), ledger, self.epoch_over.clone());
         let called = Arc::new(called);
         let takes = called.clone();
-        self.begin_calls(name, Calls::Called(called), move |message| takes.take(message));
+        self.begin_calls(name, Calls::FarService(called), move |message| takes.take(message));
     }
 
     /// The lost calls of a service, of this route and of those before it.
@@ -57,7 +57,7 @@ impl<N: RosNetwork> Core<N> {
         let (alive, failures) = (self.alive.clone(), self.ros_failures.clone());
         let queue = match WriterQueue::spawn_with(
             "sgc-calls",
-            Behind::default(),
+            WriterInfo::default(),
             Shaping::default(),
             failures,
             alive,
@@ -97,7 +97,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// The owner of a service granted that this node calls it.
     pub(super) fn call_granted(&mut self, now: Now, name: Name, sink: SinkId, grant: TopicGrant, anew: bool) {
-        let (Some(Calls::Called(called)), Some(local)) = (self.calls.get(&name), self.sinks.get(&name))
+        let (Some(Calls::FarService(called)), Some(local)) = (self.calls.get(&name), self.sinks.get(&name))
         else {
             return;
         };
@@ -113,14 +113,14 @@ impl<N: RosNetwork> Core<N> {
                 name
             }
             Event::Lost { name, .. } => {
-                if let Some(Calls::Called(called)) = self.calls.get(name) {
+                if let Some(Calls::FarService(called)) = self.calls.get(name) {
                     called.lost();
                 }
                 return;
             }
             _ => return,
         };
-        if let Some(Calls::Served(served)) = self.calls.get(name) {
+        if let Some(Calls::LocalService(served)) = self.calls.get(name) {
             served.set_callers(self.endpoint.publishers(name));
         }
     }
@@ -130,8 +130,8 @@ impl<N: RosNetwork> Core<N> {
         let DiscoveryEvent::Vanished { guid } = event else { return };
         for calls in self.calls.values() {
             match calls {
-                Calls::Called(called) => called.endpoint_gone(guid),
-                Calls::Served(served) => served.endpoint_gone(guid),
+                Calls::FarService(called) => called.endpoint_gone(guid),
+                Calls::LocalService(served) => served.endpoint_gone(guid),
             }
         }
     }
@@ -139,7 +139,7 @@ impl<N: RosNetwork> Core<N> {
     /// Asks what became of calls that have been quiet for long.
     pub(super) fn calls_due(&self, now: Instant) {
         for calls in self.calls.values() {
-            if let Calls::Called(called) = calls {
+            if let Calls::FarService(called) = calls {
                 called.ask_due(now);
             }
         }
@@ -147,20 +147,20 @@ impl<N: RosNetwork> Core<N> {
 
     pub(super) fn calls_deadline(&self) -> Option<Instant> {
         let deadline = |calls: &Calls| match calls {
-            Calls::Called(called) => called.deadline(),
-            Calls::Served(_) => None,
+            Calls::FarService(called) => called.deadline(),
+            Calls::LocalService(_) => None,
         };
         self.calls.values().filter_map(deadline).min()
     }
 
     pub(super) fn servers_gone(&self, name: &Name) {
-        if let Some(Calls::Served(served)) = self.calls.get(name) {
+        if let Some(Calls::LocalService(served)) = self.calls.get(name) {
             served.servers_gone();
         }
     }
 
     pub(super) fn open_client(&mut self, name: Name, spec: ServiceSpec) {
-        let Some(Calls::Served(served)) = self.calls.get(&name).cloned() else { return };
+        let Some(Calls::LocalService(served)) = self.calls.get(&name).cloned() else { return };
         if served.keep_client() {
             return;
         }
@@ -172,7 +172,7 @@ impl<N: RosNetwork> Core<N> {
 
     pub(super) fn close_client(&mut self, name: &Name) {
         self.service_ends.remove(name);
-        if let Some(Calls::Served(served)) = self.calls.get(name)
+        if let Some(Calls::LocalService(served)) = self.calls.get(name)
             && let Some(old) = served.end_client()
         {
             self.graph.service_gone(name);
@@ -181,7 +181,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn open_server(&mut self, name: Name, spec: ServiceSpec) {
-        let Some(Calls::Called(called)) = self.calls.get(&name).cloned() else { return };
+        let Some(Calls::FarService(called)) = self.calls.get(&name).cloned() else { return };
         self.make_service_end(name, spec, move |network, spec| {
             let handler = Box::new(Requests(called));
             network.create_server(spec, handler).map(|server| ServiceEnd::Server(Arc::new(server)))
@@ -191,7 +191,7 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn close_service_end(&mut self, name: &Name) {
         self.service_ends.remove(name);
         self.graph.service_gone(name);
-        if let Some(Calls::Called(called)) = self.calls.get(name)
+        if let Some(Calls::FarService(called)) = self.calls.get(name)
             && let Some(old) = called.set_server(None)
         {
             drop_elsewhere(old);
@@ -236,8 +236,10 @@ impl<N: RosNetwork> Core<N> {
             );
         }
         let old = match (self.calls.get(&name).filter(|_| wanted), end) {
-            (Some(Calls::Served(served)), ServiceEnd::Client(client)) => served.set_client(Some(client)),
-            (Some(Calls::Called(called)), ServiceEnd::Server(server)) => called.set_server(Some(server)),
+            (Some(Calls::LocalService(served)), ServiceEnd::Client(client)) => {
+                served.set_client(Some(client))
+            }
+            (Some(Calls::FarService(called)), ServiceEnd::Server(server)) => called.set_server(Some(server)),
             (_, ServiceEnd::Client(client)) => Some(Box::new(client) as _),
             (_, ServiceEnd::Server(server)) => Some(Box::new(server) as _),
         };

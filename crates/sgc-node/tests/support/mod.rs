@@ -45,7 +45,7 @@ pub fn identity(name: &str, router: bool) -> Arc<Identity> {
 }
 
 /// The end of a node.
-type Stopped = std::pin::Pin<Box<dyn Future<Output = ()> + Send>>;
+type StopFuture = std::pin::Pin<Box<dyn Future<Output = ()> + Send>>;
 
 /// A node in a runtime of its own.
 pub struct Node {
@@ -123,7 +123,7 @@ impl Node {
         config: Config,
         options: RunOptions,
         file: Arc<Mutex<Config>>,
-        run: impl FnOnce(Config, RunOptions, Stopped) -> F,
+        run: impl FnOnce(Config, RunOptions, StopFuture) -> F,
     ) -> Self
     where
         F: Future<Output = Result<(), NodeError>> + Send + 'static,
@@ -136,7 +136,7 @@ impl Node {
         let socket = config.admin_socket.clone().unwrap();
         let types = Arc::new(TypeStore::default());
         let options = RunOptions { ready: Some(ready), types: Some(types.clone()), ..options };
-        let stopped: Stopped = Box::pin(async move {
+        let stopped: StopFuture = Box::pin(async move {
             let _ = stopped.await;
         });
         let running = run(config, options, stopped);
@@ -366,10 +366,10 @@ pub struct Talker {
 
 impl Talker {
     pub fn new(domain: &FakeDomain, topic: &str, qos: Qos) -> Self {
-        Self::of(domain, &spec(topic, qos))
+        Self::with_spec(domain, &spec(topic, qos))
     }
 
-    pub fn of(domain: &FakeDomain, spec: &EndpointSpec) -> Self {
+    pub fn with_spec(domain: &FakeDomain, spec: &EndpointSpec) -> Self {
         let net = domain.join(false);
         Self { writer: net.create_writer(spec).unwrap(), _net: net }
     }
@@ -393,10 +393,10 @@ pub struct Listener {
 
 impl Listener {
     pub fn new(domain: &FakeDomain, topic: &str, qos: Qos) -> Self {
-        Self::of(domain, &spec(topic, qos))
+        Self::with_spec(domain, &spec(topic, qos))
     }
 
-    pub fn of(domain: &FakeDomain, spec: &EndpointSpec) -> Self {
+    pub fn with_spec(domain: &FakeDomain, spec: &EndpointSpec) -> Self {
         let net = domain.join(false);
         let (sender, samples) = channel();
         let handler = Box::new(move |s: sgc_ros::Sample| drop(sender.send(s.payload)));

@@ -266,7 +266,7 @@ pub(super) fn tell(file: &mut LockedFleet, list: &[u8], routers: &[LinkUrl]) -> 
             runtime.map_err(|source| CliError::System { what: "the runtime does not start", source })?;
         for url in routers {
             let list = bytes::Bytes::copy_from_slice(list);
-            match runtime.block_on(sgc_node::tell_router(url, identity.clone(), list)) {
+            match runtime.block_on(sgc_node::push_crl(url, identity.clone(), list)) {
                 Ok(lists) => {
                     names.push(url.to_string());
                     heard.extend(lists);

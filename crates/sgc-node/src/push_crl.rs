@@ -15,7 +15,7 @@ const ANSWER_MAX: Duration = Duration::from_secs(5);
 
 /// Why a router was not told.
 #[derive(Debug, thiserror::Error)]
-pub enum TellError {
+pub enum PushCrlError {
     /// No link.
     #[error(transparent)]
     Dial(#[from] DialError),
@@ -40,19 +40,19 @@ const HEARD_MAX: usize = sgc_trust::ANCHORS_MAX * (sgc_trust::FLEET_LISTS_MAX + 
 
 /// Dials a router, greets it, gives it the list, and leaves. It has the list once this returns. Returns the lists that
 /// the router has, which it gives every neighbour.
-pub async fn tell_router(
+pub async fn push_crl(
     url: &LinkUrl,
     identity: Arc<Identity>,
     list: Bytes,
-) -> Result<Vec<Bytes>, TellError> {
+) -> Result<Vec<Bytes>, PushCrlError> {
     let dialer = Dialer::new(identity, LinkOptions::default(), Arc::new(TransportMetrics::default()));
     let link = dialer.dial(url).await?;
     let told = tokio::time::timeout(ANSWER_MAX, tell(&link, list)).await;
     dialer.close(CloseReason::Goodbye).await;
     match told {
         Ok(Ok(heard)) => Ok(heard),
-        Ok(Err(source)) => Err(TellError::Link { url: url.clone(), source }),
-        Err(_) => Err(TellError::Silent { url: url.clone() }),
+        Ok(Err(source)) => Err(PushCrlError::Link { url: url.clone(), source }),
+        Err(_) => Err(PushCrlError::Silent { url: url.clone() }),
     }
 }
 

@@ -67,7 +67,7 @@ pub(crate) fn routers<'u>(urls: impl IntoIterator<Item = &'u RouterUrl>) -> Vec<
 
 /// A way that was passed over, and why.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Passed {
+pub(crate) struct SkippedUrl {
     pub(crate) way: LinkUrl,
     pub(crate) why: String,
 }
@@ -78,7 +78,7 @@ pub(crate) struct Passed {
 pub(crate) async fn first<T, E, F>(
     ways: &[LinkUrl],
     mut dial: impl FnMut(LinkUrl) -> F,
-) -> Result<(T, LinkUrl, Vec<Passed>), Vec<(LinkUrl, E)>>
+) -> Result<(T, LinkUrl, Vec<SkippedUrl>), Vec<(LinkUrl, E)>>
 where
     T: Send + 'static,
     E: std::fmt::Display + Send + 'static,
@@ -114,7 +114,7 @@ where
                     let passed = others.map(|other| {
                         let error = failed.iter().find(|(failed, _)| failed == other);
                         let why = error.map_or_else(|| silence(other), |(_, error)| error.to_string());
-                        Passed { way: other.clone(), why }
+                        SkippedUrl { way: other.clone(), why }
                     });
                     let passed = passed.collect();
                     return Ok((made, way, passed));
@@ -143,12 +143,12 @@ pub(crate) fn is_over_udp(scheme: Scheme) -> bool {
 
 /// When a way that is better than the one in use is tried again.
 #[derive(Debug)]
-pub(crate) struct Climb {
+pub(crate) struct Failback {
     failures: u32,
     due: Option<Instant>,
 }
 
-impl Climb {
+impl Failback {
     /// A link is up by the way of this rank; 0 is the best, from which there is nowhere to climb.
     pub(crate) fn new(rank: usize, now: Instant, rng: &mut ChaCha20Rng) -> Self {
         let due = (rank > 0).then(|| now + jittered(CLIMB_MIN, rng));
@@ -180,13 +180,13 @@ impl Climb {
 
 /// Which way to each router worked last, kept over restarts. Clones share.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct WayBook {
+pub(crate) struct WorkingUrls {
     /// By the best way to the router.
     worked: Arc<Mutex<BTreeMap<String, String>>>,
     write: Option<watch::Sender<()>>,
 }
 
-impl WayBook {
+impl WorkingUrls {
     /// What is kept in this state directory; without one it is forgotten at the end. A book that cannot be read is said
     /// and left out: everything is found again without it.
     pub(crate) fn open(dir: Option<&Path>) -> Self {
@@ -293,7 +293,8 @@ mod tests {
                 does.map(|_| ()).map_err(|_| "refused")
             }
         });
-        let said = |passed: Vec<Passed>| passed.into_iter().map(|p| format!("{}: {}", p.way.scheme, p.why));
+        let said =
+            |passed: Vec<SkippedUrl>| passed.into_iter().map(|p| format!("{}: {}", p.way.scheme, p.why));
         match made.await {
             Ok(((), way, passed)) => Ok((way.scheme, start.elapsed().as_millis(), said(passed).collect())),
             Err(failed) => {
@@ -344,24 +345,24 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn a_better_way_is_tried_again_with_growing_patience() {
         let mut rng = ChaCha20Rng::seed_from_u64(1);
-        let mut climb = Climb::new(1, Instant::now(), &mut rng);
+        let mut failback = Failback::new(1, Instant::now(), &mut rng);
         let mut waits = Vec::new();
         for _ in 0..10 {
             let before = Instant::now();
-            climb.is_due().await;
+            failback.is_due().await;
             waits.push(before.elapsed().as_secs_f64());
-            climb.failed(Instant::now(), &mut rng);
+            failback.failed(Instant::now(), &mut rng);
         }
         for (n, wait) in waits.iter().enumerate() {
             let most = f64::from(30 << n.min(5)).min(600.0);
             assert!((most / 2.0 - 0.01..=most + 0.01).contains(wait), "{n}: {waits:?}");
         }
-        let at_best = Climb::new(0, Instant::now(), &mut rng);
+        let at_best = Failback::new(0, Instant::now(), &mut rng);
         assert!(tokio::time::timeout(Duration::from_secs(86_400), at_best.is_due()).await.is_err());
     }
 
     #[tokio::test]
-    async fn what_worked_is_tried_first_after_a_restart() {
+    async fn working_url_is_tried_first_after_a_restart() {
         use Scheme::{Quic, Tls, Wss};
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join(FILE);
@@ -374,24 +375,25 @@ mod tests {
             };
             tokio::time::timeout(Duration::from_secs(30), arrives).await.expect(until);
         };
-        let order = |book: &WayBook| book.in_order(&ways).iter().map(|way| way.scheme).collect::<Vec<_>>();
-        let book = WayBook::open(Some(dir.path()));
+        let order =
+            |book: &WorkingUrls| book.in_order(&ways).iter().map(|way| way.scheme).collect::<Vec<_>>();
+        let book = WorkingUrls::open(Some(dir.path()));
         assert_eq!(order(&book), [Quic, Tls, Wss]);
         book.worked_by(&ways, &ways[1]);
         written("quic://r:7447 tls://r:7447\n").await;
-        let next = WayBook::open(Some(dir.path()));
+        let next = WorkingUrls::open(Some(dir.path()));
         assert_eq!(order(&next), [Tls, Quic, Wss]);
         next.worked_by(&ways, &ways[0]);
         written("").await;
-        assert_eq!(order(&WayBook::open(Some(dir.path()))), [Quic, Tls, Wss]);
+        assert_eq!(order(&WorkingUrls::open(Some(dir.path()))), [Quic, Tls, Wss]);
         // What a file says is no more than an order.
         std::fs::write(&path, "quic://r:7447 tls://other:7447\nnonsense\n\u{0} \n").unwrap();
-        assert_eq!(order(&WayBook::open(Some(dir.path()))), [Quic, Tls, Wss]);
+        assert_eq!(order(&WorkingUrls::open(Some(dir.path()))), [Quic, Tls, Wss]);
     }
 
     #[tokio::test]
     async fn the_book_is_bounded() {
-        let book = WayBook::default();
+        let book = WorkingUrls::default();
         for n in 0..2 * KEPT_MAX {
             let ways = [way(Scheme::Quic, &format!("r{n}")), way(Scheme::Tls, &format!("r{n}"))];
             book.worked_by(&ways, &ways[1]);

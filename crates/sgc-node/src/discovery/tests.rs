@@ -13,7 +13,7 @@ use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
 
 use super::dns::DnsError;
-use super::local::Heard;
+use super::local::Sighting;
 use super::srv::{SrvAnswer, SrvTarget};
 use super::*;
 
@@ -45,7 +45,7 @@ struct World {
 
 impl World {
     fn new() -> Self {
-        let (tell, network) = Network::told();
+        let (tell, network) = Network::channel();
         Self {
             start: Instant::now(),
             hosts: Arc::default(),
@@ -97,9 +97,14 @@ impl World {
     }
 }
 
-impl Hold for World {
-    async fn hold(&self, mut aim: watch::Receiver<Aim>, wish: &Wish, _line: &Line) -> Outcome {
-        let url = aim.borrow_and_update().url.clone();
+impl KeepLink for World {
+    async fn hold(
+        &self,
+        mut target: watch::Receiver<DialTarget>,
+        wish: &LinkRequest,
+        _line: &StatusRow,
+    ) -> Outcome {
+        let url = target.borrow_and_update().url.clone();
         let mut host = url.host.clone();
         self.dialled.lock().unwrap().push((self.start.elapsed(), host.clone()));
         {
@@ -124,9 +129,9 @@ impl Hold for World {
                 loop {
                     tokio::select! {
                         () = &mut end => break,
-                        Ok(()) = aim.changed() => {
+                        Ok(()) = target.changed() => {
                             self.up.lock().unwrap().remove(&host);
-                            host = aim.borrow_and_update().url.host.clone();
+                            host = target.borrow_and_update().url.host.clone();
                             self.up.lock().unwrap().insert(host.clone());
                         }
                     }
@@ -198,7 +203,7 @@ async fn a_dead_router_is_dialled_with_growing_patience_and_never_given_up() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn what_failed_is_tried_at_once_on_another_network_but_not_without_a_pause() {
+async fn failed_target_is_retried_soon_after_a_network_change() {
     let world = World::new();
     let line = Board::default().line("quic://a", "static");
     let task = tokio::spawn(keep_at(at("a"), world.clone(), line, ChaCha20Rng::seed_from_u64(1)));
@@ -331,7 +336,7 @@ async fn a_link_moves_when_its_router_is_named_no_more() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn what_dns_said_last_serves_while_it_is_silent_but_not_against_its_word() {
+async fn last_dns_answer_serves_while_dns_is_silent_until_it_denies() {
     let world = World::new();
     world.answers(10 * SECOND, &[(10, "a")]);
     world.set("a", Host::Up(30 * SECOND));
@@ -369,15 +374,15 @@ async fn a_set_whose_router_has_a_link_already_stands_back_until_that_ends() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn of_many_that_are_announced_two_are_linked_and_four_dialled_at_once() {
+async fn many_announcements_lead_to_two_links_and_at_most_four_dials() {
     let world = World::new();
     let (tell, heard) = mpsc::channel(64);
     let board = Board::default();
-    let holder = world.clone();
+    let keeper = world.clone();
     let task = tokio::spawn(async move {
         let line = board.line("mdns://", "mdns");
-        let wanted = Wanted { written: "mdns://".into(), nodes: None };
-        mdns::keep_links(heard, wanted, holder, &board, &line, ChaCha20Rng::seed_from_u64(1)).await;
+        let wanted = RouterFilter { written: "mdns://".into(), nodes: None };
+        mdns::keep_links(heard, wanted, keeper, &board, &line, ChaCha20Rng::seed_from_u64(1)).await;
     });
     let ip = |n: u8| format!("10.0.0.{n}");
     for n in 1..=20u8 {
@@ -385,7 +390,7 @@ async fn of_many_that_are_announced_two_are_linked_and_four_dialled_at_once() {
         let is = if n % 5 == 0 { Host::Up(60 * SECOND) } else { Host::Dead };
         world.set(&ip(n), is);
         let addresses = vec![SocketAddr::from(([10, 0, 0, n], 7447))];
-        tell.send(Heard::Announced { instance: n.to_string(), addresses }).await.unwrap();
+        tell.send(Sighting::Announced { instance: n.to_string(), addresses }).await.unwrap();
     }
     sleep(20 * SECOND).await;
     assert_eq!(world.up().len(), mdns::LINKS_MAX);
@@ -397,7 +402,7 @@ async fn of_many_that_are_announced_two_are_linked_and_four_dialled_at_once() {
     // That they are said to be gone ends no link; but when it ends, they are dialled no more.
     let up = world.up();
     for n in 1..=20u8 {
-        tell.send(Heard::Vanished { instance: n.to_string() }).await.unwrap();
+        tell.send(Sighting::Vanished { instance: n.to_string() }).await.unwrap();
     }
     sleep(SECOND).await;
     assert_eq!(world.up(), up);
@@ -411,15 +416,15 @@ async fn a_router_that_is_reached_otherwise_is_dialled_again_when_it_no_longer_i
     let world = World::new();
     let (tell, heard) = mpsc::channel(64);
     let board = Board::default();
-    let holder = world.clone();
+    let keeper = world.clone();
     let task = tokio::spawn(async move {
         let line = board.line("mdns://", "mdns");
-        let wanted = Wanted { written: "mdns://".into(), nodes: None };
-        mdns::keep_links(heard, wanted, holder, &board, &line, ChaCha20Rng::seed_from_u64(1)).await;
+        let wanted = RouterFilter { written: "mdns://".into(), nodes: None };
+        mdns::keep_links(heard, wanted, keeper, &board, &line, ChaCha20Rng::seed_from_u64(1)).await;
     });
     world.set("10.0.0.1", Host::Reached(50 * SECOND));
     let addresses = vec![SocketAddr::from(([10, 0, 0, 1], 7447))];
-    tell.send(Heard::Announced { instance: "a".into(), addresses }).await.unwrap();
+    tell.send(Sighting::Announced { instance: "a".into(), addresses }).await.unwrap();
     sleep(40 * SECOND).await;
     assert_eq!(world.dialled().len(), 1);
     world.set("10.0.0.1", Host::Up(3600 * SECOND));

@@ -11,7 +11,8 @@ use tokio::time::{Instant, sleep_until};
 use tracing::{info, warn};
 
 use super::{
-    Aim, BACKOFF_MAX, Backoff, Failure, Hold, Line, Names, Outcome, Wish, another_network, pause, take_note,
+    BACKOFF_MAX, Backoff, DialTarget, Failure, KeepLink, LinkRequest, Names, Outcome, StatusRow,
+    another_network, pause, take_note,
 };
 use crate::config::{RouterUrl, SrvDomain};
 
@@ -79,7 +80,7 @@ pub(crate) fn in_order(targets: &[SrvTarget], rng: &mut impl RngCore) -> Vec<Srv
 }
 
 /// What is known of a domain.
-struct Known {
+struct SrvState {
     /// The last good answer; an old one is better than none.
     answer: Option<SrvAnswer>,
     /// When to ask again.
@@ -88,13 +89,13 @@ struct Known {
     asking: Backoff,
 }
 
-impl Known {
+impl SrvState {
     /// Asks DNS, and keeps what it says.
     async fn ask<N: Names>(
         &mut self,
         domain: &SrvDomain,
         names: &N,
-        line: &Line,
+        line: &StatusRow,
         rng: &mut ChaCha20Rng,
     ) -> bool {
         let asked = names.routers(domain).await;
@@ -125,17 +126,17 @@ impl Known {
 
 /// Keeps one link to one of the routers of a domain: to the best that can be reached, and when that link ends, again to
 /// the best.
-pub(crate) async fn keep_one_of<N: Names, H: Hold>(
+pub(crate) async fn keep_one_of<N: Names, H: KeepLink>(
     domain: SrvDomain,
     names: N,
-    holder: H,
-    line: Line,
+    keeper: H,
+    line: StatusRow,
     mut rng: ChaCha20Rng,
 ) {
     let mut known =
-        Known { answer: None, expires: Instant::now(), asked: None, asking: Backoff::new(BACKOFF_MAX) };
+        SrvState { answer: None, expires: Instant::now(), asked: None, asking: Backoff::new(BACKOFF_MAX) };
     let mut tried: BTreeMap<LinkUrl, Backoff> = BTreeMap::new();
-    let mut network = holder.network();
+    let mut network = keeper.network();
     loop {
         if known.expires <= Instant::now() {
             line.looking_up();
@@ -150,11 +151,11 @@ pub(crate) async fn keep_one_of<N: Names, H: Hold>(
             if !backoff.is_due(Instant::now()) {
                 continue;
             }
-            let outcome = match aim(&target, &names).await {
-                Ok(aim) => hold(&domain, &mut known, aim, &names, &holder, &line, &mut rng).await,
+            let outcome = match dial_target(&target, &names).await {
+                Ok(target) => hold(&domain, &mut known, target, &names, &keeper, &line, &mut rng).await,
                 Err(failure) => Outcome::Failed(failure),
             };
-            if holder.is_over() {
+            if keeper.is_over() {
                 return;
             }
             take_note(&outcome, backoff, &line, &mut rng);
@@ -162,14 +163,14 @@ pub(crate) async fn keep_one_of<N: Names, H: Hold>(
                 Outcome::Ended { .. } => break,
                 // The set has its link, by another way.
                 Outcome::Failed(Failure::Reached(_)) => {
-                    pause(&holder, &outcome, backoff.due(), &mut network).await;
+                    pause(&keeper, &outcome, backoff.due(), &mut network).await;
                     *backoff = Backoff::new(BACKOFF_MAX);
                     break;
                 }
                 Outcome::Failed(_) => has_failed = true,
             }
         }
-        if holder.is_over() {
+        if keeper.is_over() {
             return;
         }
         // What failed may stand in DNS no more.
@@ -193,20 +194,20 @@ pub(crate) async fn keep_one_of<N: Names, H: Hold>(
 }
 
 /// Where a target is now.
-async fn aim<N: Names>(target: &SrvTarget, names: &N) -> Result<Aim, Failure> {
+async fn dial_target<N: Names>(target: &SrvTarget, names: &N) -> Result<DialTarget, Failure> {
     let addresses = names.addresses(&target.host, target.port).await?;
-    Ok(Aim { addresses, ..Aim::from(target.url()) })
+    Ok(DialTarget { addresses, ..DialTarget::from(target.url()) })
 }
 
 /// Keeps a link to a target, and asks DNS meanwhile whether it still is one. If not, the link moves to one that is; as
 /// long as that cannot be reached, it stays.
-async fn hold<N: Names, H: Hold>(
+async fn hold<N: Names, H: KeepLink>(
     domain: &SrvDomain,
-    known: &mut Known,
-    first: Aim,
+    known: &mut SrvState,
+    first: DialTarget,
     names: &N,
-    holder: &H,
-    line: &Line,
+    keeper: &H,
+    line: &StatusRow,
     rng: &mut ChaCha20Rng,
 ) -> Outcome {
     let (move_to, at) = watch::channel(first);
@@ -223,17 +224,17 @@ async fn hold<N: Names, H: Hold>(
                 continue;
             }
             for target in targets {
-                if let Ok(aim) = aim(&target, names).await {
-                    info!("{} names {now} no more; moving to {}", RouterUrl::Srv(domain.clone()), aim.url);
-                    move_to.send_replace(aim);
+                if let Ok(target) = dial_target(&target, names).await {
+                    info!("{} names {now} no more; moving to {}", RouterUrl::Srv(domain.clone()), target.url);
+                    move_to.send_replace(target);
                     break;
                 }
             }
         }
     };
-    let wish = Wish::default();
+    let wish = LinkRequest::default();
     tokio::select! {
-        outcome = holder.hold(at, &wish, line) => outcome,
+        outcome = keeper.hold(at, &wish, line) => outcome,
         never = refresh => never,
     }
 }
@@ -291,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn one_seed_is_one_order() {
+    fn same_seed_gives_same_srv_order() {
         let targets: Vec<_> = ["a", "b", "c", "d"].iter().map(|host| target(1, 10, host)).collect();
         let order = |seed| hosts(&in_order(&targets, &mut ChaCha20Rng::seed_from_u64(seed)));
         assert_eq!(order(7), order(7));
@@ -305,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_dialled_is_no_target() {
+    fn undiallable_srv_record_is_no_target() {
         assert!(target(0, 0, "router.lab.example").is_usable());
         assert!(!SrvTarget { port: 0, ..target(0, 0, "a") }.is_usable());
         for host in ["", "a b", "a\\046b", "a/b", &"a".repeat(254)] {

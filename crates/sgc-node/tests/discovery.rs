@@ -91,7 +91,7 @@ fn the_router_that_dns_names_is_found_and_the_next_when_it_goes() {
 }
 
 #[test]
-fn what_is_wrong_with_the_dns_is_said() {
+fn dns_faults_are_reported() {
     let lab = Lab::new(&["seeker"]);
     let dns = DnsServer::start();
     let node = seeker(&lab, "seeker", &["srv://lab.example"], Some(&dns), None);
