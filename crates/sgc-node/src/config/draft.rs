@@ -1,34 +1,34 @@
-//! What the user wrote, well-formed but not yet judged: texts and numbers, each with its place.
+//! [`Draft`]: the user's input, well-formed but not yet judged: texts and numbers, each with its origin.
 //!
-//! `file` makes a draft from TOML, `args` from the command line; `resolve` makes a `Config` of either. So each
-//! rule about values is written once.
+//! `file` makes a draft from TOML, and `args` makes one from the command line. `resolve` makes a `Config` of either, so
+//! each rule about values is written once.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use super::error::{ConfigError, Mistake, Origin};
 
-/// A value and where it came from.
+/// A value with its origin.
 #[derive(Clone, Debug)]
 pub(super) struct WithOrigin<T> {
     pub(super) value: T,
-    /// What the user knows it by: `to`, `--to`, `ROS_DOMAIN_ID`.
+    /// Name of the value in the user's words: `to`, `--to`, `ROS_DOMAIN_ID`.
     pub(super) key: &'static str,
     pub(super) origin: Origin,
 }
 
 impl<T> WithOrigin<T> {
-    /// An error in this place.
+    /// Returns an error with this origin.
     pub(super) fn error(&self, mistake: Mistake) -> ConfigError {
         ConfigError::new(self.origin.clone(), mistake)
     }
 
-    /// The same place, another value.
+    /// Converts the value and keeps the origin.
     pub(super) fn map<U>(self, convert: impl FnOnce(T) -> U) -> WithOrigin<U> {
         WithOrigin { value: convert(self.value), key: self.key, origin: self.origin }
     }
 
-    /// How another error refers to this place.
+    /// Returns a reference to this value for another error.
     pub(super) fn reference(&self) -> String {
         match &self.origin {
             Origin::File { line: Some(line), .. } => format!("line {line}"),
@@ -40,11 +40,11 @@ impl<T> WithOrigin<T> {
 /// A whole configuration.
 #[derive(Debug)]
 pub(super) struct Draft {
-    /// The place of what is missing altogether.
+    /// Origin of mistakes about missing values.
     pub(super) origin: Origin,
-    /// How the missing things are called here.
+    /// Names of settings in this source.
     pub(super) words: Words,
-    /// Keys that were meant but not understood; each has an error, so that their absence needs none.
+    /// Keys that were present but not understood. Each has an error, so that its absence needs none.
     pub(super) attempted: BTreeSet<&'static str>,
     pub(super) identity: Option<WithOrigin<PathBuf>>,
     pub(super) name: Option<WithOrigin<String>>,
@@ -55,7 +55,7 @@ pub(super) struct Draft {
     pub(super) peer_rate: Option<WithOrigin<String>>,
     pub(super) mapping: Option<WithOrigin<String>>,
     pub(super) announce: Option<WithOrigin<bool>>,
-    /// The whole list is located too, since an empty one would be a mistake.
+    /// The list has an origin of its own, since an empty one is a mistake.
     pub(super) accept: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(super) ros: Option<RosDraft>,
     pub(super) shares: Vec<ShareDraft>,
@@ -73,7 +73,7 @@ pub(super) struct Draft {
     pub(super) gateway: Option<GatewayDraft>,
 }
 
-/// How a source of configuration names the settings that an error may ask for.
+/// Names of settings in one source of configuration, for errors that ask for them.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Words {
     pub(super) no_identity: &'static str,
@@ -90,7 +90,7 @@ pub(super) struct RosDraft {
     pub(super) domain_id: Option<WithOrigin<i64>>,
     pub(super) localhost_only: Option<WithOrigin<bool>>,
     pub(super) discovery_range: Option<WithOrigin<String>>,
-    /// The whole list is located too, since an empty one is a choice.
+    /// The list has an origin of its own, since an empty one is a choice.
     pub(super) static_peers: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(super) graph: Option<WithOrigin<bool>>,
     pub(super) definitions: Option<WithOrigin<Vec<WithOrigin<String>>>>,
@@ -98,10 +98,10 @@ pub(super) struct RosDraft {
     pub(super) security_root: Option<WithOrigin<String>>,
 }
 
-/// `[[share]]`. What is required is `None` only where an error has been recorded already.
+/// `[[share]]`. Required fields are `None` only if an error was recorded.
 #[derive(Debug, Default)]
 pub(super) struct ShareDraft {
-    /// Or the name of something else, as its key says.
+    /// Topic, or the name of another interface, as its key says.
     pub(super) topic: Option<WithOrigin<String>>,
     pub(super) to: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(super) publish: Option<WithOrigin<Vec<WithOrigin<String>>>>,
@@ -120,7 +120,7 @@ pub(super) struct ShareDraft {
     pub(super) naming: NamingDraft,
 }
 
-/// Policies in place of the publishers'.
+/// QoS policies that replace those of publishers.
 #[derive(Debug, Default)]
 pub(super) struct QosDraft {
     pub(super) reliability: Option<WithOrigin<String>>,
@@ -132,7 +132,7 @@ pub(super) struct QosDraft {
 }
 
 impl QosDraft {
-    /// Where each policy that is set stands.
+    /// Iterates over the policies that are set, with their origins.
     pub(super) fn written(&self) -> impl Iterator<Item = (&'static str, &Origin)> {
         let texts = [&self.reliability, &self.durability, &self.history, &self.deadline, &self.lifespan];
         let texts = texts.into_iter().flatten().map(|one| (one.key, &one.origin));
@@ -140,7 +140,7 @@ impl QosDraft {
     }
 }
 
-/// What is left out, and other names.
+/// Exceptions and other names.
 #[derive(Clone, Debug, Default)]
 pub(super) struct NamingDraft {
     pub(super) except: Option<WithOrigin<Vec<WithOrigin<String>>>>,
@@ -148,7 +148,7 @@ pub(super) struct NamingDraft {
     pub(super) namespace: Option<WithOrigin<String>>,
 }
 
-/// How much of a topic goes on.
+/// Limits of rate, bandwidth and age.
 #[derive(Debug, Default)]
 pub(super) struct ShapingDraft {
     pub(super) max_rate: Option<WithOrigin<String>>,
@@ -158,11 +158,11 @@ pub(super) struct ShapingDraft {
     pub(super) encoding: Option<WithOrigin<String>>,
 }
 
-/// `[[use]]`. What is required is `None` only where an error has been recorded already.
+/// `[[use]]`. Required fields are `None` only if an error was recorded.
 #[derive(Debug, Default)]
 pub(super) struct UseDraft {
     pub(super) from: Option<WithOrigin<String>>,
-    /// Or the name of something else, as its key says.
+    /// Topic, or the name of another interface, as its key says.
     pub(super) topic: Option<WithOrigin<String>>,
     pub(super) type_name: Option<WithOrigin<String>>,
     pub(super) publish: Option<WithOrigin<bool>>,
@@ -205,7 +205,7 @@ pub(super) struct TransportDraft {
 /// `[gateway]`.
 #[derive(Debug, Default)]
 pub(super) struct GatewayDraft {
-    /// The whole list is located too, since an empty one would be a mistake.
+    /// The list has an origin of its own, since an empty one is a mistake.
     pub(super) listen: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(super) certificate: Option<WithOrigin<PathBuf>>,
     pub(super) key: Option<WithOrigin<PathBuf>>,
@@ -217,21 +217,21 @@ pub(super) struct GatewayDraft {
     pub(super) clients: Vec<GatewayClientDraft>,
 }
 
-/// `[[gateway.client]]`. What is required is `None` only where an error has been recorded already.
+/// `[[gateway.client]]`. Required fields are `None` only if an error was recorded.
 #[derive(Debug)]
 pub(super) struct GatewayClientDraft {
-    /// The place of what is missing.
+    /// Origin of mistakes about missing values.
     pub(super) origin: Origin,
     pub(super) who: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(super) subscribe: Vec<WithOrigin<String>>,
     pub(super) publish: Vec<WithOrigin<String>>,
     pub(super) call: Vec<WithOrigin<String>>,
     pub(super) serve: Vec<WithOrigin<String>>,
-    /// A list of patterns is there, but could not be read.
+    /// A list of patterns is present but could not be read.
     pub(super) is_broken: bool,
 }
 
-/// `[[partner]]`. What is required is `None` only where an error has been recorded already.
+/// `[[partner]]`. Required fields are `None` only if an error was recorded.
 #[derive(Debug, Default)]
 pub(super) struct PartnerDraft {
     pub(super) name: Option<WithOrigin<String>>,

@@ -1,7 +1,7 @@
-//! The ways to one router: by which transport it is tried first, when the next is tried beside it, which one worked, and
-//! when a better one is tried again.
+//! The URLs of one router: order of attempts, parallel attempts, memory of the URL that worked, and [`Failback`] to a
+//! better one.
 //!
-//! It dials nothing; who is dialled and how is an argument.
+//! It dials nothing. The caller passes the targets and a function that dials.
 
 use std::collections::BTreeMap;
 use std::future::Future;
@@ -20,27 +20,27 @@ use super::backoff::jittered;
 use crate::config::{RouterUrl, WAYS_MAX};
 use crate::state;
 
-/// How long a way may be silent before the next is tried beside it: two round trips of a bad link to the other end of the
-/// world, and little enough that a node without UDP is up within 3 s.
+/// Time after which a silent URL gets a parallel attempt at the next. It covers two round trips of a bad link around
+/// the world, and is short enough that a node without UDP is up within 3 s.
 pub(crate) const SILENT_AFTER: Duration = Duration::from_millis(700);
-/// How long those that are silent are waited for once all were begun and one has failed: what failed may work again soon,
-/// as where a router restarts, and is to be tried again.
+/// Longest wait for silent URLs once all were tried and one has failed. A failed URL may work again soon, for example
+/// after a restart of the router, so it has to be tried again.
 const SILENT_MAX: Duration = Duration::from_millis(2500);
-/// When a better way is tried again, at first and at most.
+/// First wait before failback, and the longest.
 const CLIMB_MIN: Duration = Duration::from_secs(30);
 const CLIMB_MAX: Duration = Duration::from_secs(600);
 
-/// Where is kept what worked, below the state directory.
+/// File below the state directory that remembers working URLs.
 const FILE: &str = "ways";
 /// Most routers that are remembered, and the most bytes of the file.
 const KEPT_MAX: usize = 64;
 const FILE_BYTES_MAX: u64 = 64 << 10;
 
-/// The routers among what the user wrote, each with its ways in their order. Entries of one host that differ in their
-/// transport are ways to one router; a second entry of one transport is another router.
+/// Groups the user's entries by router, keeping their order. Entries of one host with different transports are one
+/// router. A second entry of the same transport is another router.
 pub(crate) fn routers<'u>(urls: impl IntoIterator<Item = &'u RouterUrl>) -> Vec<Vec<LinkUrl>> {
     let mut routers: Vec<Vec<LinkUrl>> = Vec::new();
-    // What was written as one stays as it is.
+    // An entry with several URLs stays as it is.
     let mut open = Vec::new();
     for url in urls {
         match url {
@@ -65,16 +65,16 @@ pub(crate) fn routers<'u>(urls: impl IntoIterator<Item = &'u RouterUrl>) -> Vec<
     routers
 }
 
-/// A way that was passed over, and why.
+/// A URL that was skipped, and the reason.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct SkippedUrl {
     pub(crate) way: LinkUrl,
     pub(crate) why: String,
 }
 
-/// The first way that succeeds, and what became of those that were tried before it. They are begun in this order, each
-/// when those before have failed or the last has been silent for [`SILENT_AFTER`]. Where one has failed, those that are
-/// silent for [`SILENT_MAX`] more are given up, and stand in no list.
+/// Dials the URLs in order and returns the first success, with the URLs that were tried before it. Each attempt begins
+/// when the earlier ones have failed, or when the last one has been silent for [`SILENT_AFTER`]. Once one has failed,
+/// attempts that stay silent for [`SILENT_MAX`] more are abandoned and not listed.
 pub(crate) async fn first<T, E, F>(
     ways: &[LinkUrl],
     mut dial: impl FnMut(LinkUrl) -> F,
@@ -108,7 +108,7 @@ where
         tokio::select! {
             biased;
             Some(done) = racing.join_next() => match done {
-                // The others are dropped with the set.
+                // The other attempts end with the set.
                 Ok((way, Ok(made))) => {
                     let others = begun.into_iter().filter(|other| **other != way);
                     let passed = others.map(|other| {
@@ -130,18 +130,18 @@ where
     }
 }
 
-/// What to think of a way that says nothing.
+/// Returns the explanation for a silent URL.
 fn silence(way: &LinkUrl) -> String {
     let silent = format!("no answer within {:.1} s", SILENT_AFTER.as_secs_f64());
     if is_over_udp(way.scheme) { format!("{silent}; is UDP blocked?") } else { silent }
 }
 
-/// Whether a transport is made of datagrams.
+/// Returns `true` if a transport uses UDP.
 pub(crate) fn is_over_udp(scheme: Scheme) -> bool {
     matches!(scheme, Scheme::Quic | Scheme::Dtls | Scheme::Udp)
 }
 
-/// When a way that is better than the one in use is tried again.
+/// Schedule of attempts at a better URL than the one in use.
 #[derive(Debug)]
 pub(crate) struct Failback {
     failures: u32,
@@ -149,27 +149,27 @@ pub(crate) struct Failback {
 }
 
 impl Failback {
-    /// A link is up by the way of this rank; 0 is the best, from which there is nowhere to climb.
+    /// Starts for a link by the URL of this rank. Rank 0 is the best, so it schedules nothing.
     pub(crate) fn new(rank: usize, now: Instant, rng: &mut ChaCha20Rng) -> Self {
         let due = (rank > 0).then(|| now + jittered(CLIMB_MIN, rng));
         Self { failures: 0, due }
     }
 
-    /// No better way works yet.
+    /// Notes that no better URL works yet.
     pub(crate) fn failed(&mut self, now: Instant, rng: &mut ChaCha20Rng) {
         self.failures = self.failures.saturating_add(1);
         let doubled = CLIMB_MIN.saturating_mul(2u32.saturating_pow(self.failures.min(16)));
         self.due = Some(now + jittered(doubled.min(CLIMB_MAX), rng));
     }
 
-    /// The network is another: what was blocked may not be here.
+    /// Makes an attempt due, because another network may not block the better URL.
     pub(crate) fn network_changed(&mut self, now: Instant) {
         if self.due.is_some() {
             *self = Self { failures: 0, due: Some(now) };
         }
     }
 
-    /// When to try; never if there is nothing.
+    /// Waits until an attempt is due; for ever if none is scheduled.
     pub(crate) async fn is_due(&self) {
         match self.due {
             Some(due) => sleep_until(due).await,
@@ -178,17 +178,17 @@ impl Failback {
     }
 }
 
-/// Which way to each router worked last, kept over restarts. Clones share.
+/// The URL that worked last for each router, kept over restarts. Clones share the state.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct WorkingUrls {
-    /// By the best way to the router.
+    /// The working URL by the router's best URL.
     worked: Arc<Mutex<BTreeMap<String, String>>>,
     write: Option<watch::Sender<()>>,
 }
 
 impl WorkingUrls {
-    /// What is kept in this state directory; without one it is forgotten at the end. A book that cannot be read is said
-    /// and left out: everything is found again without it.
+    /// Opens the memory in this state directory; without one it ends with the process. An unreadable file is reported
+    /// and ignored, since everything in it can be found again.
     pub(crate) fn open(dir: Option<&Path>) -> Self {
         let Some(path) = dir.map(|dir| dir.join(FILE)) else { return Self::default() };
         let read = state::read(&path, FILE_BYTES_MAX)
@@ -206,7 +206,7 @@ impl WorkingUrls {
         book
     }
 
-    /// The order in which to try: what worked last, then the rest as the user put it.
+    /// Returns the order of attempts: the URL that worked last, then the others as the user listed them.
     pub(crate) fn in_order(&self, ways: &[LinkUrl]) -> Vec<LinkUrl> {
         let last = ways.first().and_then(|best| self.worked().get(&best.to_string()).cloned());
         let (mut ordered, rest): (Vec<_>, Vec<_>) =
@@ -215,12 +215,12 @@ impl WorkingUrls {
         ordered
     }
 
-    /// This one of them works.
+    /// Notes that this URL works.
     pub(crate) fn worked_by(&self, ways: &[LinkUrl], way: &LinkUrl) {
         let Some(best) = ways.first() else { return };
         let mut worked = self.worked();
         let (best, way) = (best.to_string(), way.to_string());
-        // The best one is what is tried first without a word.
+        // The best URL is tried first anyway, so it needs no entry.
         let is_news = if best == way {
             worked.remove(&best).is_some()
         } else if worked.len() >= KEPT_MAX && !worked.contains_key(&best) {
@@ -239,7 +239,7 @@ impl WorkingUrls {
     }
 }
 
-/// Writes the book when it changes, where that may block.
+/// Writes the file when the memory changes, on a blocking thread.
 async fn keep_written(
     path: PathBuf,
     worked: Arc<Mutex<BTreeMap<String, String>>>,
@@ -278,10 +278,10 @@ mod tests {
         schemes.iter().map(|scheme| way(*scheme, "r")).collect()
     }
 
-    /// What a way does, and after how long; an error after a year is silence.
+    /// Behaviour of a URL: success or failure after milliseconds. An error after a year is silence.
     type Does = (Scheme, Result<u64, u64>);
 
-    /// Which one made it, when, and what is said of the others.
+    /// Returns the winner, its time, and the explanations for the others.
     async fn race(does: &[Does]) -> Result<(Scheme, u128, Vec<String>), Vec<String>> {
         let start = Instant::now();
         let ways: Vec<_> = does.iter().map(|(scheme, _)| way(*scheme, "r")).collect();
@@ -313,11 +313,11 @@ mod tests {
         assert_eq!(both, Ok((Tls, 1500, vec![format!("quic: {blocked}"), format!("dtls: {blocked}")])));
         let failed = race(&[(Quic, Err(10)), (Tls, Ok(20))]).await;
         assert_eq!(failed, Ok((Tls, 30, vec!["quic: refused".into()])));
-        // A slow one that comes before the next still counts.
+        // A slow attempt still counts if it succeeds before the next.
         assert_eq!(race(&[(Quic, Ok(800)), (Tls, Ok(5000))]).await.unwrap().0, Quic);
         let none = race(&[(Quic, Err(2000)), (Tls, Err(10))]).await;
         assert_eq!(none, Err(vec!["tls: refused".into(), "quic: refused".into()]));
-        // Where one is only down for a moment, a silent one does not keep it from being tried again.
+        // A silent attempt does not delay the retry of a router that is down for a moment.
         let begun = Instant::now();
         let down = race(&[(Quic, Err(NEVER)), (Tls, Err(10))]).await;
         assert_eq!((down, begun.elapsed().as_millis()), (Err(vec!["tls: refused".into()]), 3210));
@@ -330,7 +330,7 @@ mod tests {
         let of = |urls: &[RouterUrl]| routers(urls);
         let one = of(&[at(Quic, "a"), at(Quic, "b"), at(Tls, "a")]);
         assert_eq!(one, [vec![way(Quic, "a"), way(Tls, "a")], vec![way(Quic, "b")]]);
-        // The second of one transport is another router, which the next may belong to.
+        // A second entry of one transport is another router, and later entries may belong to it.
         let two = of(&[at(Quic, "a"), at(Quic, "a"), at(Tls, "a"), at(Tls, "a")]);
         assert_eq!(
             two,
@@ -386,7 +386,7 @@ mod tests {
         next.worked_by(&ways, &ways[0]);
         written("").await;
         assert_eq!(order(&WorkingUrls::open(Some(dir.path()))), [Quic, Tls, Wss]);
-        // What a file says is no more than an order.
+        // The file influences the order only.
         std::fs::write(&path, "quic://r:7447 tls://other:7447\nnonsense\n\u{0} \n").unwrap();
         assert_eq!(order(&WorkingUrls::open(Some(dir.path()))), [Quic, Tls, Wss]);
     }
