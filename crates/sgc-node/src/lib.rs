@@ -1,8 +1,8 @@
 //! The driver of SGC: the one place where machines, sockets, the local ROS 2 network, files and clocks meet.
 //!
-//! It decides nothing that a machine can decide. [`config`] makes a [`config::Config`] of what the user wrote;
-//! [`run`] runs it. Inside, one control task owns the machines (`core`), and the data path (`dataplane`) runs
-//! beside it, on the tasks and threads that receive.
+//! It decides nothing that a machine can decide. [`config`] turns the user's input into a [`config::Config`], and
+//! [`run`] runs it. One control task owns the machines (`core`). The data path (`dataplane`) runs beside it, on the
+//! receiving tasks and threads.
 #![forbid(unsafe_code)]
 
 mod access;

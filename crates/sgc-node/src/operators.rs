@@ -1,8 +1,8 @@
 //! Operations that a fleet's authority carries out for operators: revoke, enrol, renew, list.
 //!
-//! A request is a join, so its author is known by its certificate. That alone would let a router repeat it: each
-//! operation therefore names a challenge that this run of the authority gave to the same node before, and is carried out
-//! once. A repeated request gets the first answer, sealed to the key of the request.
+//! A request is a join, so its author is known by its certificate. A router could repeat it, so each operation names a
+//! challenge that this run of the authority gave the same node, and is carried out once. A repeated request gets the
+//! first answer, sealed to the key of the new request.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -19,35 +19,36 @@ use sgc_wire::{
 
 use crate::fleet_file::{FleetFileError, LockedFleet, read_fleet};
 
-/// Most operations that wait for the fleet's file.
+/// Most operations that wait for the fleet file.
 pub(crate) const OPERATIONS_WAITING_MAX: usize = 16;
-/// Most challenges of one operator that hold; a further one takes the place of the oldest.
+/// Most valid challenges of one operator. A further one replaces the oldest.
 const CHALLENGES_PER_NODE_MAX: usize = 4;
-/// Most challenges that hold.
+/// Most valid challenges.
 const CHALLENGES_MAX: usize = 256;
 /// Validity of a challenge.
 const CHALLENGE_TIME: Duration = Duration::from_secs(60);
-/// Most operations whose answers are remembered: more than may wait, so that one under way is never forgotten.
+/// Most operations whose answers are remembered. It exceeds the number that may wait, so that none under way is
+/// forgotten.
 const EXECUTED_MAX: usize = 2 * OPERATIONS_WAITING_MAX;
 /// Most bytes of the rows in one page of a roster.
 const PAGE_BYTES_MAX: usize = 512 * 1024;
 
-/// The next step for a request.
+/// Next step for a request.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum RequestStep {
-    /// Give this answer at once.
+    /// Send this answer.
     Answer(OperationAnswer),
-    /// Give the answer that the same request got before.
+    /// Send the answer that the same request got before.
     Again(OperationAnswer),
-    /// Queue this job; its answer follows.
+    /// Queue this job. Its answer follows.
     Job(OperationJob),
-    /// It is under way already; its answer goes to the sink that asked last.
+    /// The operation is under way. Its answer goes to the sink that asked last.
     UnderWay,
     /// The node is no operator.
     NotPermitted,
 }
 
-/// An operation that is to be carried out.
+/// An operation to be carried out.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct OperationJob {
     challenge: Challenge,
@@ -55,24 +56,24 @@ pub(crate) struct OperationJob {
     operation: Operation,
 }
 
-/// An operation that was carried out, or refused.
+/// The outcome of an operation.
 pub(crate) struct OperationOutcome {
     challenge: Challenge,
     pub(crate) node: NodeId,
     /// The operation in words, for the audit log.
     pub(crate) said: String,
     pub(crate) answer: OperationAnswer,
-    /// The revocation list that came of it, DER.
+    /// The resulting revocation list, DER.
     pub(crate) list: Option<Vec<u8>>,
 }
 
-/// The operators of a fleet, and what they asked for.
+/// Operators of a fleet, with their challenges and operations.
 #[derive(Debug)]
 pub(crate) struct Operators {
     permitted: Grantees,
-    /// Oldest first.
+    /// Challenges, the oldest first.
     challenges: VecDeque<ChallengeRecord>,
-    /// Oldest first.
+    /// Operations, the oldest first.
     executed: VecDeque<ExecutionRecord>,
 }
 
@@ -90,12 +91,12 @@ struct ExecutionRecord {
     operation: Operation,
     /// The sink that asked last.
     sink: SinkId,
-    /// Absent while it is under way.
+    /// The answer; `None` while the operation is under way.
     answer: Option<OperationAnswer>,
 }
 
 impl Operators {
-    /// An authority that does what these nodes ask for.
+    /// Creates the state of an authority with these operators.
     pub(crate) fn new(permitted: Grantees) -> Self {
         Self { permitted, challenges: VecDeque::new(), executed: VecDeque::new() }
     }
@@ -164,7 +165,7 @@ impl Operators {
         RequestStep::Job(OperationJob { challenge, node, operation })
     }
 
-    /// Remembers the answer of a job; returns the sink that waits for it.
+    /// Records the outcome of a job. Returns the sink that waits for it.
     pub(crate) fn done(&mut self, done: &OperationOutcome) -> Option<SinkId> {
         let known = self.executed.iter_mut().find(|e| e.challenge == done.challenge)?;
         known.answer = Some(done.answer.clone());
@@ -173,13 +174,13 @@ impl Operators {
 }
 
 impl OperationJob {
-    /// Its end, if it cannot even be queued.
+    /// Returns the outcome of an operation that cannot be queued.
     pub(crate) fn busy(self) -> OperationOutcome {
         self.end(refused(OperationRefusal::Busy, ""), None)
     }
 
-    /// Carries the operation out; blocks on the fleet's file. `own` is the authority, `seen` when members were last
-    /// here.
+    /// Carries the operation out. Blocks on the fleet file. `own` is the authority, `seen` the times at which members
+    /// were last present.
     pub(crate) fn carry_out(
         self,
         file: &Path,
@@ -219,7 +220,7 @@ impl OperationJob {
     }
 }
 
-/// Why an operation failed.
+/// Reasons why an operation failed.
 enum Failure {
     File(FleetFileError),
     Fleet(FleetError),
@@ -284,7 +285,7 @@ fn revoke(
     Ok((OperationAnswer::Revoked { list: locked.fleet.crl_number() }, list))
 }
 
-/// Enrols or renews; the file has the certificate before the answer leaves.
+/// Enrols or renews. The file has the certificate before the answer leaves.
 fn certify(file: &Path, operation: &Operation, now: UnixMillis) -> Result<OperationAnswer, Failure> {
     let mut rng = OsRng.unwrap_err();
     let mut locked = LockedFleet::open(file)?;
@@ -332,7 +333,7 @@ fn list(
     Ok(OperationAnswer::Roster(page))
 }
 
-/// Returns what people see of a fleet's roster, without its nodes.
+/// Returns the public part of a fleet's roster, without its nodes.
 pub fn roster_head(fleet: &Fleet) -> RosterPage {
     RosterPage {
         fleet: fleet.name().to_string(),
@@ -347,7 +348,7 @@ pub fn roster_head(fleet: &Fleet) -> RosterPage {
     }
 }
 
-/// Returns what people see of a node of a fleet's roster.
+/// Returns the public part of a roster's node.
 pub fn roster_row(fleet: &Fleet, node: &RosterNode) -> RosterRow {
     let certificates = node.certificates.iter().take(ROW_CERTIFICATES_MAX);
     let revocation = fleet.revocation_of(&node.name);
@@ -401,7 +402,7 @@ mod tests {
     }
 
     impl Bench {
-        /// A fleet of which the node `desk` is the operator.
+        /// Creates a fleet whose operator is the node `desk`.
         fn new() -> Self {
             let dir = tempfile::tempdir().unwrap();
             let file = dir.path().join("lab.fleet");
@@ -467,7 +468,7 @@ mod tests {
         for _ in 0..3 {
             assert_eq!(bench.ask(false, A, &request), RequestStep::Again(done.answer.clone()));
         }
-        // The challenge is for that operation alone.
+        // The challenge is valid for that operation only.
         let operation = Operation::Revoke { nodes: vec!["desk".into()] };
         assert!(is_stale(&bench.ask(false, A, &OperationRequest::Execute { challenge, operation })));
     }
@@ -477,7 +478,7 @@ mod tests {
         let mut bench = Bench::new();
         let challenge = bench.challenge();
         assert!(is_stale(&bench.ask(false, A, &revoke_guest(Challenge([9; 16])))));
-        // The authority was restarted: it knows of no challenge, nor of what it did.
+        // The restarted authority knows no earlier challenges or operations.
         let nodes = [bench.desk.node_id(), bench.guest.node_id()].into();
         let first = std::mem::replace(
             &mut bench.operators,

@@ -1,5 +1,5 @@
-//! Latched topics (`transient_local`) many to many, over real nodes with local networks in memory: whoever is late, and
-//! whatever restarts, each subscriber gets what ROS 2 would have given it, once.
+//! Latched topics (`transient_local`), many to many, over real nodes with local networks in memory. However late a
+//! subscriber is, and whatever restarts, it gets the messages that ROS 2 would give it, each once.
 
 #![allow(clippy::unwrap_used)]
 
@@ -19,7 +19,7 @@ fn deep(depth: u32) -> Qos {
     Qos { history: History::KeepLast(depth), ..latched() }
 }
 
-/// What a subscriber heard: how often each.
+/// Payloads that a subscriber received, with counts.
 #[derive(Default)]
 struct Receptions(BTreeMap<String, usize>);
 
@@ -30,7 +30,7 @@ impl Receptions {
         }
     }
 
-    /// Waits until all of these were heard, and fails if anything else was, or anything twice.
+    /// Waits until all of these arrived. Fails on any other or repeated message.
     fn are(&mut self, listener: &Listener, expected: &[&str]) {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -49,14 +49,14 @@ impl Receptions {
     }
 }
 
-/// A subscriber that comes now hears exactly these.
+/// Checks that a subscriber that joins now receives exactly these. Returns it.
 fn late_listener_hears(trio: &Trio, qos: Qos, expected: &[&str]) -> Listener {
     let listener = Listener::new(&trio.desk_net, TOPIC, qos);
     Receptions::default().are(&listener, expected);
     listener
 }
 
-/// After something that is known to have crossed, nothing else came.
+/// Checks that no other message came before one that is published now.
 fn and_nothing_more(talkers: &[&Talker], heard: &mut Receptions, listener: &Listener, before: &[&str]) {
     let fence: Vec<String> = (0..talkers.len()).map(|n| format!("fence {n} {}", heard.0.len())).collect();
     talkers.iter().zip(&fence).for_each(|(talker, text)| talker.say(text.clone()));
@@ -85,7 +85,7 @@ fn publishers_of_different_depths_each_give_their_own_history() {
     let _desk = trio.desk(&[TOPIC]);
     wait("three writers", || writers(&trio.desk_net, TOPIC) == 3);
     let early = late_listener_hears(&trio, deep(100), &expected);
-    // One more, now that the writers at the desk have it all.
+    // The late joiner comes when the writers at the desk have everything.
     late_listener_hears(&trio, deep(100), &expected);
     let mut heard = Receptions::default();
     and_nothing_more(&[&shallow, &deeper, &all], &mut heard, &early, &[]);
@@ -105,7 +105,7 @@ fn latched_messages_end_with_their_publisher() {
     late_listener_hears(&trio, latched(), &["stays"]);
     drop(stays);
     wait("no writer", || writers(&trio.desk_net, TOPIC) == 0);
-    // It comes back with something else.
+    // The publisher returns with other messages.
     let back = Talker::new(&trio.robot_net, TOPIC, latched());
     back.say("back");
     late_listener_hears(&trio, latched(), &["back"]);
@@ -163,7 +163,7 @@ fn an_owners_node_that_restarts_makes_nobody_hear_it_again() {
             assert!(heard.0.is_empty(), "{:?}", heard.0);
             and_nothing_more(&all, &mut heard, &early, &[]);
         } else {
-            // A node that stops in good order takes along what it brought, as if all its publishers had ended.
+            // A node that stops orderly withdraws its messages, as if all its publishers had ended.
             heard.are(&early, &expected);
             and_nothing_more(&all, &mut heard, &early, &expected);
         }

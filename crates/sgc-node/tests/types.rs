@@ -1,4 +1,4 @@
-//! Types over the wire, and messages that travel as JSON: across whole nodes, of which one alone has the definitions.
+//! Types over the wire, and messages that travel as JSON, across whole nodes of which only one has the definitions.
 
 #![allow(clippy::unwrap_used)]
 
@@ -19,7 +19,7 @@ use support::*;
 const THING: &str = "mine/msg/Thing";
 const TEXT: &str = r#"{"label":"a \"thing\"","position":{"x":0.1,"y":-2.5,"z":"NaN"},"raw":"AAEC","count":9007199254740993}"#;
 
-/// A directory with what only one of the nodes has.
+/// A directory with a definition that only one node has.
 struct Package(tempfile::TempDir);
 
 impl Package {
@@ -42,19 +42,19 @@ impl Package {
         definitions.layout(&type_name.parse().unwrap()).unwrap()
     }
 
-    /// A message as a local publisher writes it.
+    /// Returns a message as a local publisher writes it.
     fn thing(&self, json: &str) -> Bytes {
         let layout = self.layout(THING);
         layout.encode(&layout.from_json(json.as_bytes()).unwrap()).unwrap().into()
     }
 
-    /// A node that has it.
+    /// Makes the definition available to a node.
     fn is_at(&self, config: &mut Config) {
         config.ros = Some(RosConfig { definitions: vec![self.0.path().to_owned()], ..RosConfig::default() });
     }
 }
 
-/// A robot that shares `/thing`.
+/// Starts a robot that shares `/thing`.
 fn robot(trio: &Trio, package: Option<&Package>, change: impl FnOnce(&mut Config)) -> Node {
     start(trio, "robot", |config| {
         config.shares = vec![shared_topic("/thing")];
@@ -65,7 +65,7 @@ fn robot(trio: &Trio, package: Option<&Package>, change: impl FnOnce(&mut Config
     })
 }
 
-/// A desk that uses it.
+/// Starts a desk that uses `/thing`.
 fn desk(trio: &Trio, package: Option<&Package>, change: impl FnOnce(&mut Config)) -> Node {
     start(trio, "desk", |config| {
         config.uses = vec![used_topic("/thing")];
@@ -99,7 +99,7 @@ fn name(text: &str) -> TypeName {
 fn a_user_without_definitions_is_told_what_a_type_looks_like() {
     let package = Package::new();
     let hash = package.layout(THING).type_hash();
-    // Older distributions announce no hash: then the owner's counts.
+    // Older distributions announce no hash. The owner's hash counts then.
     for announced in [Some(hash.clone()), None] {
         let trio = Trio::new();
         let (_cloud, _robot) = (trio.cloud(), robot(&trio, Some(&package), |_| {}));
@@ -108,7 +108,7 @@ fn a_user_without_definitions_is_told_what_a_type_looks_like() {
         wait("the type", || desk.types.layout(&name(THING), Some(&hash)).is_some());
         let layout = desk.types.layout(&name(THING), None).unwrap();
         assert_eq!(layout.decode(&package.thing(TEXT)).unwrap().to_json(), TEXT);
-        // Who looks at the topic there is told, too.
+        // A tap of the topic gets the description, too.
         let tap = AdminRequest::Tap { topic: "/thing".into(), side: None, bytes: 64 };
         let first = desk.begin(&tap);
         assert_eq!(first["ok"]["described"]["type_hash"], *hash, "{first}");
@@ -128,7 +128,7 @@ fn a_definition_that_is_another_than_the_announced_one_is_not_told() {
     let talker = Talker::with_spec(&trio.robot_net, &thing_spec(Qos::default(), Some(other)));
     let listener = Listener::with_spec(&trio.desk_net, &thing_spec(Qos::default(), None));
     wait("the count", || robot.drops("type_differs") == 1);
-    // Messages are carried all the same.
+    // Messages are forwarded regardless.
     listener.hears_at_last(|_| talker.say(package.thing(TEXT)));
     assert!(desk.types.layout(&name(THING), None).is_none());
     let tap = AdminRequest::Tap { topic: "/thing".into(), side: None, bytes: 64 };
@@ -175,7 +175,7 @@ fn json_payloads_arrive_as_cdr_also_late_and_compressed() {
         let shaping = Shaping { compression, ..json() };
         let (_cloud, robot) =
             (trio.cloud(), robot(&trio, Some(&package), |config| config.shares[0].shaping = shaping));
-        // Published before anybody listens, and before anybody there knows the type.
+        // The message is published before anybody subscribes, and before anybody there knows the type.
         let talker = Talker::with_spec(&trio.robot_net, &thing_spec(latched(), None));
         talker.wait_for_readers(1);
         let long = TEXT.replace("a \\\"thing\\\"", &"label ".repeat(500));
@@ -188,14 +188,14 @@ fn json_payloads_arrive_as_cdr_also_late_and_compressed() {
         let compressed = &robot.status()["routes"][0]["compressed"];
         match compression {
             PayloadEncoding::Plain => assert!(compressed.is_null(), "{compressed}"),
-            // What is compressed is the JSON.
+            // The JSON is compressed.
             _ => assert_eq!(compressed[0], long.len() + TEXT.len()),
         }
         for node in [&robot, &desk] {
             assert_eq!(["no_definition", "not_converted"].map(|reason| node.drops(reason)), [0, 0]);
             assert_eq!(node.status()["problems"], serde_json::json!([]));
         }
-        // It goes on as CDR as soon as that is wanted.
+        // Messages leave as CDR as soon as the configuration asks for it.
         robot.reload(|config| config.shares[0].shaping = Shaping::default());
         talker.say(package.thing(&long));
         listener.hears(package.thing(&long));
@@ -284,12 +284,12 @@ fn messages_of_an_unknown_type_arrive_once_the_owner_describes_it() {
     talker.say(package.thing(TEXT));
     let lacks = "/thing: its messages travel as JSON, and no definition of mine/msg/Thing";
     wait("what is wrong", || desk.status()["problems"].to_string().contains(lacks));
-    // It may become known.
+    // The type may still become known.
     assert_eq!(desk.drops("no_definition"), 0);
     first.kill();
-    // Somebody installs the definition.
+    // The definition is installed.
     let _robot = robot(&trio, Some(&package), shared);
-    // What was said last, or what is said now.
+    // Either the last message or a new one arrives.
     listener.hears_at_last(|_| talker.say(package.thing(TEXT)));
     assert_eq!(desk.drops("not_converted"), 0);
     wait("that nothing is wrong", || desk.status()["problems"] == serde_json::json!([]));

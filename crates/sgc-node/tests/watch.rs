@@ -1,4 +1,4 @@
-//! A configuration that is watched: however its file changes, the running node follows, and what is wrong changes nothing.
+//! A watched configuration: the running node follows each change of its file, and mistakes change nothing.
 
 #![allow(clippy::unwrap_used)]
 
@@ -19,7 +19,7 @@ struct WatchBench {
     audit: PathBuf,
 }
 
-/// A node whose configuration is this file of the directory.
+/// Starts a node whose configuration is this file of the directory.
 fn start(dir: tempfile::TempDir, file: &Path) -> WatchBench {
     let audit = dir.path().join("audit");
     let trio = Trio::new();
@@ -56,7 +56,7 @@ impl WatchBench {
         });
     }
 
-    /// How often the configuration was read again with this outcome.
+    /// Returns the number of reloads with this outcome.
     fn reloads(&self, outcome: &str) -> usize {
         let log = fs::read_to_string(&self.audit).unwrap_or_default();
         log.lines().filter(|line| line.contains("\"reload\"") && line.contains(outcome)).count()
@@ -70,21 +70,21 @@ fn however_a_file_changes_the_node_follows() {
     fs::write(&file, text(&["/a"])).unwrap();
     let watched = start(dir, &file);
     watched.shares(&["/a"]);
-    // In place.
+    // The file is overwritten.
     fs::write(&file, text(&["/a", "/b"])).unwrap();
     watched.shares(&["/a", "/b"]);
-    // By another file in its place, as most editors do.
+    // Another file replaces it, as most editors do.
     let other = watched.dir.path().join(".node.toml.swp");
     fs::write(&other, text(&["/b"])).unwrap();
     fs::rename(&other, &file).unwrap();
     watched.shares(&["/b"]);
-    // Away for a while.
+    // The file is missing for a while.
     fs::remove_file(&file).unwrap();
     fs::write(&other, text(&["/c"])).unwrap();
     watched.shares(&["/b"]);
     fs::rename(&other, &file).unwrap();
     watched.shares(&["/c"]);
-    // By a link that comes to lead elsewhere, and by what it leads to.
+    // A symbolic link gets another target, and the target changes.
     for (n, topic) in ["/d", "/e"].into_iter().enumerate() {
         let there = watched.dir.path().join(format!("there{n}"));
         fs::create_dir(&there).unwrap();
@@ -130,12 +130,12 @@ fn files_named_in_the_configuration_are_watched_and_others_are_not() {
     fs::write(&file, text(&["/a"])).unwrap();
     let watched = start(dir, &file);
     watched.shares(&["/a"]);
-    // A partner that comes by a reload brings a file to watch.
+    // A partner that a reload adds brings a file to watch.
     let partner = "[[partner]]\nname = 'acme'\nca = 'acme-ca.pem'\n";
     fs::write(&file, text(&["/a"]) + partner).unwrap();
     let links = "nodes of another CA may link";
     wait("the partner", || watched.reloads(links) == 1);
-    // Once more after what is watched has changed; what stands beside is nothing to it.
+    // The files are compared again after a change. Other files of the directory do not matter.
     wait("another look", || watched.reloads("nothing changed") == 1);
     fs::write(watched.dir.path().join("beside"), "anything").unwrap();
     fs::write(&ca, certificate("other")).unwrap();
@@ -154,7 +154,7 @@ fn watching_can_be_switched_off() {
     fs::write(&file, unwatched(&["/b"])).unwrap();
     watched.node.reload(|_| {});
     watched.shares(&["/b"]);
-    // It is in the log a little later than in effect.
+    // The log shows the reload a little after it takes effect.
     wait("the log", || watched.reloads("") > 0);
     assert_eq!(watched.reloads(""), 1);
 }

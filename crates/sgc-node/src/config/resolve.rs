@@ -1,7 +1,6 @@
-//! Draft → configuration: the values, and what they have to do with each other.
+//! Draft to configuration: values, and their relations.
 //!
-//! All mistakes are collected. One that follows from another is not reported: a value that is wrong in itself
-//! takes no part in comparisons.
+//! All mistakes are collected. Consequential mistakes are not reported: an invalid value takes no part in comparisons.
 
 mod gateway_table;
 
@@ -31,31 +30,31 @@ use super::{
 };
 use crate::audit::AuditRoom;
 
-/// Shares of one node.
+/// Most shares of one node.
 pub const SHARES_MAX: usize = 1024;
-/// Uses of one node.
+/// Most uses of one node.
 pub const USES_MAX: usize = 1024;
-/// Exceptions of one share or use.
+/// Most exceptions of one share or use.
 pub const EXCEPT_MAX: usize = 256;
-/// Recipients of one share.
+/// Most recipients of one share.
 pub const RECIPIENTS_MAX: usize = 1024;
-/// Routers that one node dials.
+/// Most routers that one node dials.
 pub const ROUTERS_MAX: usize = 16;
-/// Files with CAs whose nodes may attach to one router.
+/// Most files with CAs whose nodes may attach to one router.
 pub const ACCEPT_MAX: usize = 16;
-/// Addresses that one node listens at.
+/// Most listen addresses of one node.
 pub const LISTEN_MAX: usize = 16;
-/// Partners of one node.
+/// Most partners of one node.
 pub const PARTNERS_MAX: usize = 32;
-/// Files with more CAs that one node trusts.
+/// Most files with further CAs that one node trusts.
 pub const TRUST_MAX: usize = 16;
-/// Directories with definitions.
+/// Most directories with definitions.
 pub const DEFINITIONS_MAX: usize = 64;
-/// Path of a Unix socket: `sun_path` less its terminator.
+/// Longest path of a Unix socket: `sun_path` without its terminator.
 pub const SOCKET_PATH_BYTES_MAX: usize = 107;
 
 const PRIORITIES: [&str; 3] = ["realtime", "default", "bulk"];
-/// How suites are called, in the order of their ids from 1.
+/// Names of suites, in the order of their ids from 1.
 pub const SUITES: [&str; 8] = [
     "group",
     "group-chacha",
@@ -67,16 +66,16 @@ pub const SUITES: [&str; 8] = [
     "paper-3072-chacha",
 ];
 
-/// An identity file and what an error about it needs to know.
+/// An identity file, with details for errors.
 pub(super) struct IdentityFile<'i> {
     pub(super) path: &'i Path,
     pub(super) key: &'static str,
-    /// Not written down but following from the name.
+    /// Whether the path follows from the name instead of being written down.
     pub(super) implied: bool,
     pub(super) node_name: Option<&'i NodeName>,
 }
 
-/// Checks of the files that a configuration names; an argument because they look at the file system.
+/// Checks of named files. They are an argument, since they read the file system.
 pub(super) struct FileChecks {
     pub(super) identity: fn(&IdentityFile<'_>) -> Result<(), Mistake>,
     pub(super) ca: fn(&'static str, &Path) -> Result<(), Mistake>,
@@ -87,7 +86,7 @@ pub(super) struct FileChecks {
     pub(super) directory: fn(&'static str, &Path) -> Result<(), Mistake>,
 }
 
-/// Judges a draft whose reader found `errors` already. Relative paths are taken from `base_dir`.
+/// Resolves a draft whose reader found `errors`. Relative paths are resolved against `base_dir`.
 pub(super) fn resolve(
     draft: &Draft,
     errors: Vec<ConfigError>,
@@ -182,7 +181,7 @@ impl Resolver<'_> {
         self.errors.push(ConfigError::new(origin.clone(), mistake));
     }
 
-    /// The checked value, or nothing and an error.
+    /// Returns the value of a check, or records its error.
     fn keep<T>(
         &mut self,
         located: &WithOrigin<String>,
@@ -367,7 +366,7 @@ impl Resolver<'_> {
                 self.record(&one.origin, Mistake::Repeated { key: one.key, value: one.value.clone() });
             }
         }
-        // Everyone is every member of this fleet: partners stand beside it.
+        // `*` covers every member of this fleet but no partners, which may stand beside it.
         let other = valid.iter().find(|r| !matches!(r, Recipient::Everyone | Recipient::Partner(_)));
         if let Some(other) = other.filter(|_| seen.contains(&Recipient::Everyone)) {
             let other = other.to_string();
@@ -406,7 +405,7 @@ impl Resolver<'_> {
     fn check_partner(&mut self, one: &WithOrigin<String>, partner: &FleetName, known: &[PartnerDraft]) {
         let names: Vec<&str> =
             known.iter().filter_map(|p| p.name.as_ref()).map(|name| name.value.as_str()).collect();
-        // A partner without a name has its own error, and may be this one.
+        // A partner with an invalid name has its own error, and may be the one meant.
         if !names.contains(&partner.as_str()) && names.len() == known.len() {
             let nearest = nearest(partner.as_str(), &names).map(str::to_owned);
             let partner = partner.to_string();
@@ -456,7 +455,7 @@ impl Resolver<'_> {
         let Some(accept) = &draft.accept else { return Vec::new() };
         let key = accept.key;
         if accept.value.is_empty() {
-            // Read as a list it would let nobody in, read as the default everybody.
+            // As a list it would admit nobody, as the default everybody.
             let example =
                 "accept = [\"lab-ca.pem\"], or leave it out to accept every CA that is trusted here";
             self.record(&accept.origin, Mistake::Empty { key, example });
@@ -527,7 +526,7 @@ impl Resolver<'_> {
         valid
     }
 
-    /// The enclave that the file names, or else the environment, as rcl reads that.
+    /// Returns the enclave of the file, or else of the environment as rcl reads it.
     fn security(&mut self, written: &RosDraft, env: Environment<'_>) -> Option<SecurityConfig> {
         let variable = |name| env(name).filter(|value| !value.is_empty());
         let is_written = written.enclave.is_some() || written.security_root.is_some();
@@ -657,7 +656,7 @@ impl Resolver<'_> {
             if let Some(except) = &one.naming.except {
                 self.record(&except.origin, Mistake::TokenAndMore { key: except.key });
             }
-            // Which topic it is, the token says; one it is.
+            // The token determines the single topic.
             let unnamed = NamingDraft { except: None, ..one.naming.clone() };
             let naming = self.naming(&unnamed, Some("/topic")).unwrap_or_default();
             let frame_prefix = self.frame_prefix(one);
@@ -688,7 +687,7 @@ impl Resolver<'_> {
         Some(TokenSource::File(path))
     }
 
-    /// Whether a topic has a connection of its own.
+    /// Returns `true` if a topic has a lane.
     fn dedicated(&mut self, link: Option<&WithOrigin<String>>) -> bool {
         link.and_then(|link| self.keep(link, is_dedicated)).unwrap_or_default()
     }
@@ -717,7 +716,7 @@ impl Resolver<'_> {
             let resolved = self.resolve_use(one, node_name);
             if let (Some(resolved), Some(written)) = (&resolved, &one.topic) {
                 let (key, topic) = (written.key, resolved.topic.clone());
-                // Of what matches a pattern some may go one way and some the other.
+                // Topics that match a pattern may go in different directions.
                 let is_other_way = is_pattern(&topic) && resolved.publish;
                 let what = resolved.interface.key();
                 let pair = (resolved.from.clone(), what, topic.clone(), is_other_way);
@@ -796,7 +795,7 @@ impl Resolver<'_> {
         one.frame_prefix.as_ref().and_then(|prefix| self.keep(prefix, names::frame_prefix))
     }
 
-    /// What a rule for this topic leaves out, and other names; nothing if the topic is not known.
+    /// Resolves exceptions and other names. Returns `None` if the topic is unknown.
     fn naming(&mut self, written: &NamingDraft, topic: Option<&str>) -> Option<Naming> {
         let except = written.except.as_ref().map(|except| {
             if let Some(topic) = topic.filter(|topic| !is_pattern(topic)) {
@@ -838,7 +837,7 @@ impl Resolver<'_> {
         Some(naming)
     }
 
-    /// Whether `as` has the wildcard of the topic, or neither has any.
+    /// Checks that `as` and the topic both have a wildcard, or neither has.
     fn check_as(&mut self, written: &WithOrigin<String>, topic: &str) -> bool {
         let split = |name: &str| {
             let (stem, last) = name.rsplit_once('/').unwrap_or_default();
@@ -858,7 +857,7 @@ impl Resolver<'_> {
         false
     }
 
-    /// Says so of settings that mean nothing for services.
+    /// Reports settings that services do not have.
     fn check_topics_only(
         &mut self,
         interface: Interface,
@@ -952,10 +951,10 @@ impl Resolver<'_> {
     }
 }
 
-/// The deepest history that can be set.
+/// The deepest history that can be configured.
 const HISTORY_DEPTH_MAX: u64 = 4096;
 
-/// The kind of a table's interface, after the key of its name, or after the last word of an argument's key.
+/// Returns the kind of a table's interface from the key of its name, or from the last word of an argument's key.
 fn interface_of(named: Option<&WithOrigin<String>>) -> Interface {
     let key = named.and_then(|named| named.key.split(' ').next_back()).unwrap_or_default();
     let others = [Interface::Service, Interface::Action, Interface::Parameters];

@@ -1,5 +1,4 @@
-//! Operations on the fleet: those that users of this node ask an authority for, and those that this authority carries out
-//! for operators.
+//! Operations on the fleet: requests of this node's users to an authority, and requests of operators to this authority.
 
 use std::time::Instant;
 
@@ -17,12 +16,12 @@ use crate::audit::{AuditEvent, AuditRecord};
 use crate::operations::{OperationError, Step, UserOperation};
 use crate::operators::{OperationOutcome, RequestStep};
 
-/// Counts operations that came again and were not carried out again.
+/// Counts repeated operations, which were not carried out again.
 const REPEATED: &str = "operation_repeated";
 /// Counts operations of nodes that are no operators.
 const NOT_PERMITTED: &str = "operation_not_permitted";
 
-/// As a node whose user is an operator.
+/// Requests of this node's users.
 impl<N: RosNetwork> Core<N> {
     pub(super) fn operate(
         &mut self,
@@ -83,9 +82,9 @@ impl<N: RosNetwork> Core<N> {
     }
 }
 
-/// As the authority.
+/// Requests to this authority.
 impl<N: RosNetwork> Core<N> {
-    /// Judges an operator's request, and queues what it asks for.
+    /// Judges an operator's request and queues its operation.
     pub(super) fn operation_asked(&mut self, sink: SinkId, peer: &VerifiedPeer, request: &Bytes) {
         let Some(authority) = &mut self.authority else { return };
         let now = now();
@@ -101,7 +100,7 @@ impl<N: RosNetwork> Core<N> {
                 self.control_drops.count_from(REPEATED, node);
             }
             RequestStep::Job(job) => {
-                // Nodes that are here now are shown as present.
+                // Nodes that are connected now count as present.
                 let here: Vec<_> = self.endpoint.renewing().map(|(_, peer, _)| peer.node_id).collect();
                 authority.note_seen(here, now.unix);
                 match authority.queue.push_operation(job) {
@@ -120,7 +119,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Answers an operation that was carried out or refused, and tells everyone whom it revoked.
+    /// Answers an operation that was carried out or refused, and announces a revocation to everyone.
     pub(super) fn operation_done(&mut self, done: OperationOutcome) {
         info!(operator = %done.node.short(), operation = done.said, "was asked for an operation");
         self.audit.write(AuditRecord::new(AuditEvent::Operation).peer(&done.node).reason(&done.said));

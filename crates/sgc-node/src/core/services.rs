@@ -1,4 +1,4 @@
-//! Services: what local clients call elsewhere, and local servers for others.
+//! Services: calls of local clients to other nodes, and calls of other nodes to local servers.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -16,7 +16,7 @@ use crate::graph::{LostCalls, ServiceCalls};
 use crate::sinks::{LocalSink, WriterInfo, WriterQueue};
 
 impl<N: RosNetwork> Core<N> {
-    /// A share is a service: what comes is calls, not what others publish.
+    /// Starts a shared service. Incoming messages are calls, not messages of publishers.
     pub(super) fn begin_local(&mut self, name: Name) {
         let Some(share) = self.shares.get(&name) else { return };
         let (share, ledger) = (share.clone(), self.call_ledger(name, true));
@@ -25,7 +25,7 @@ impl<N: RosNetwork> Core<N> {
         self.begin_calls(name, Calls::LocalService(served), move |message| takes.take(message));
     }
 
-    /// A name that this node publishes under is a service: what comes is answers.
+    /// Starts a used service. Incoming messages are replies.
     pub(super) fn begin_far(&mut self, name: Name) {
         let Some(share) = self.shares.get(&name) else { return };
         let (share, ledger) = (share.clone(), self.call_ledger(name, false));
@@ -35,7 +35,7 @@ impl<N: RosNetwork> Core<N> {
         self.begin_calls(name, Calls::FarService(called), move |message| takes.take(message));
     }
 
-    /// The lost calls of a service, of this route and of those before it.
+    /// Returns the ledger of a service's lost calls, over all its routes so far.
     fn call_ledger(&mut self, name: Name, is_served: bool) -> Arc<CallLedger> {
         if self.call_ledgers.len() >= LEDGERS_MAX && !self.call_ledgers.contains_key(&name) {
             let ended = self.call_ledgers.keys().find(|name| !self.calls.contains_key(*name)).copied();
@@ -73,7 +73,7 @@ impl<N: RosNetwork> Core<N> {
         self.calls.insert(name, calls);
     }
 
-    /// A service is shared or used no more.
+    /// Ends a service that is no longer shared or used.
     pub(super) fn end_calls(&mut self, name: &Name) {
         if let Some(calls) = self.calls.get(name) {
             calls.withdraw();
@@ -95,7 +95,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// The owner of a service granted that this node calls it.
+    /// Handles the owner's grant to call a service.
     pub(super) fn call_granted(&mut self, now: Now, name: Name, sink: SinkId, grant: TopicGrant, anew: bool) {
         let (Some(Calls::FarService(called)), Some(local)) = (self.calls.get(&name), self.sinks.get(&name))
         else {
@@ -106,7 +106,7 @@ impl<N: RosNetwork> Core<N> {
         called.granted(sink, anew);
     }
 
-    /// What happened to services.
+    /// Handles endpoint events about services.
     pub(super) fn calls_event(&self, event: &Event) {
         let name = match event {
             Event::SinkJoined { name, .. } | Event::SinkLeft { name, .. } | Event::SinkCut { name, .. } => {
@@ -125,7 +125,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// A local client that is gone waits for nothing, and a local server that is gone answers nothing.
+    /// Ends the calls of a local client or server that disappeared.
     pub(super) fn calls_discovery(&self, event: &DiscoveryEvent) {
         let DiscoveryEvent::Vanished { guid } = event else { return };
         for calls in self.calls.values() {
@@ -136,7 +136,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Asks what became of calls that have been quiet for long.
+    /// Asks for the state of calls without news for long.
     pub(super) fn calls_due(&self, now: Instant) {
         for calls in self.calls.values() {
             if let Calls::FarService(called) = calls {
@@ -248,7 +248,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Adds to a route's state what became of its calls.
+    /// Adds the statistics of calls to a route's status.
     pub(super) fn describe_calls(&self, route: &mut RouteStatus) {
         if let Some(calls) = route.name.and_then(|name| self.calls.get(&name)) {
             let CallStats { calls: now, open, answered: answered_now } = calls.stats();
@@ -263,7 +263,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// The services of which calls were lost.
+    /// Returns the services with lost calls.
     pub(super) fn lost_calls(&self) -> Vec<ServiceCalls> {
         let of_service = |(name, ledger): (&Name, &Arc<CallLedger>)| {
             let (topic, _, losses) = ledger.read();
@@ -290,7 +290,7 @@ impl<N: RosNetwork> Core<N> {
         named
     }
 
-    /// The name of who called, if it is still there.
+    /// Returns the caller's name, if the caller still exists.
     fn caller_name(&self, name: &Name, of: CallerId) -> Option<String> {
         match of {
             CallerId::Client(guid) => {

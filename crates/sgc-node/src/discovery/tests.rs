@@ -1,4 +1,4 @@
-//! When what is tried, on a clock that stands still: who is dialled and what DNS says are the tests' own.
+//! Timing of the searches on a paused clock. The tests replace dialling and DNS.
 
 #![allow(clippy::unwrap_used)]
 
@@ -19,24 +19,24 @@ use super::*;
 
 const SECOND: Duration = Duration::from_secs(1);
 
-/// What happens to who dials a host.
+/// Behaviour of a host that is dialled.
 #[derive(Clone, Copy, Debug)]
 enum Host {
     Dead,
-    /// A link is up for so long.
+    /// A link comes up and lasts this long.
     Up(Duration),
-    /// There is a link already, for so long.
+    /// Another link to the router exists for this long.
     Reached(Duration),
 }
 
-/// Hosts, and what was dialled when.
+/// Simulated hosts, and the times at which they were dialled.
 #[derive(Clone)]
 struct World {
     start: Instant,
     hosts: Arc<Mutex<BTreeMap<String, Host>>>,
     dialled: Arc<Mutex<Vec<(Duration, String)>>>,
     up: Arc<Mutex<BTreeSet<String>>>,
-    /// Most that were being dialled at once, and are now.
+    /// Parallel dials: the maximum, and the current number.
     dials: Arc<Mutex<(usize, usize)>>,
     answer: Arc<Mutex<Result<SrvAnswer, DnsError>>>,
     asked: Arc<Mutex<Vec<Duration>>>,
@@ -196,7 +196,7 @@ async fn a_dead_router_is_dialled_with_growing_patience_and_never_given_up() {
     let waits: Vec<_> = dialled.windows(2).map(|two| (two[1].0 - two[0].0).as_millis()).collect();
     for (n, wait) in waits.iter().enumerate() {
         let most = (250u128 << n.min(10)).min(10_000);
-        // A millisecond is what an attempt takes, and the clock's grain.
+        // An attempt takes a millisecond, which is also the clock's resolution.
         assert!((most / 2..=most + 2).contains(wait), "{n}: {waits:?}");
     }
     assert!(waits.len() >= 20 && waits.iter().collect::<BTreeSet<_>>().len() > 10, "{waits:?}");
@@ -215,7 +215,7 @@ async fn failed_target_is_retried_soon_after_a_network_change() {
     let last = world.dialled().last().unwrap().0;
     assert!(last >= changed && last - changed < SECOND / 2 && world.up() == ["a"], "{last:?} {changed:?}");
     task.abort();
-    // A network that changes all the time.
+    // The network changes all the time.
     let world = World::new();
     let line = Board::default().line("quic://a", "static");
     let task = tokio::spawn(keep_at(at("a"), world.clone(), line, ChaCha20Rng::seed_from_u64(1)));
@@ -266,7 +266,7 @@ async fn the_best_target_is_linked_and_the_next_when_it_fails() {
     let (task, _board) = world.keep_one();
     sleep(SECOND).await;
     assert_eq!((world.hosts_dialled(), world.up()), ("ab".into(), vec!["b".into()]));
-    // When that link ends, it begins again with the best.
+    // When that link ends, the search begins with the best again.
     world.set("a", Host::Up(3600 * SECOND));
     sleep(31 * SECOND).await;
     assert_eq!((world.hosts_dialled(), world.up()), ("aba".into(), vec!["a".into()]));
@@ -325,7 +325,7 @@ async fn a_link_moves_when_its_router_is_named_no_more() {
     let (task, _board) = world.keep_one();
     sleep(5 * SECOND).await;
     assert_eq!(world.up(), ["a"]);
-    // A better one alone moves nothing.
+    // A better target alone moves no link.
     world.answers(10 * SECOND, &[(5, "c"), (10, "a"), (20, "b")]);
     sleep(20 * SECOND).await;
     assert_eq!(world.up(), ["a"]);
@@ -351,7 +351,7 @@ async fn last_dns_answer_serves_while_dns_is_silent_until_it_denies() {
     assert_eq!((world.hosts_dialled(), world.up()), ("aa".into(), vec![]));
     let line = &board.snapshot()[0];
     assert!(line.last_failure.as_ref().is_some_and(|why| why.contains("offers no routers")), "{line:?}");
-    // It goes on asking.
+    // The search goes on asking.
     world.answers(10 * SECOND, &[(10, "a")]);
     sleep(15 * SECOND).await;
     assert_eq!(world.hosts_dialled(), "aaa");
@@ -386,7 +386,7 @@ async fn many_announcements_lead_to_two_links_and_at_most_four_dials() {
     });
     let ip = |n: u8| format!("10.0.0.{n}");
     for n in 1..=20u8 {
-        // Most of them are lies.
+        // Most announcements are false.
         let is = if n % 5 == 0 { Host::Up(60 * SECOND) } else { Host::Dead };
         world.set(&ip(n), is);
         let addresses = vec![SocketAddr::from(([10, 0, 0, n], 7447))];
@@ -395,11 +395,11 @@ async fn many_announcements_lead_to_two_links_and_at_most_four_dials() {
     sleep(20 * SECOND).await;
     assert_eq!(world.up().len(), mdns::LINKS_MAX);
     assert!(world.dials.lock().unwrap().0 <= mdns::DIALS_MAX);
-    // As long as there are two, nobody else is tried.
+    // While two links are up, no other router is dialled.
     let before = world.dialled().len();
     sleep(10 * SECOND).await;
     assert_eq!(world.dialled().len(), before);
-    // That they are said to be gone ends no link; but when it ends, they are dialled no more.
+    // A withdrawal ends no link. After the link ends, the router is not dialled again.
     let up = world.up();
     for n in 1..=20u8 {
         tell.send(Sighting::Vanished { instance: n.to_string() }).await.unwrap();

@@ -1,4 +1,4 @@
-//! `[gateway]`: the draft of one → its configuration.
+//! Resolves the draft of `[gateway]`.
 
 use sgc_gateway::{Anonymous, Scope};
 
