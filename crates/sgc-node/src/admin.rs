@@ -352,7 +352,7 @@ async fn serve(socket: &StatusSocket, desk: &Desk) {
                 }
                 // The socket's mode keeps others out already, unless somebody changed it.
                 Ok(uid) => refuse(&mut stream, uid, &refused).await,
-                Err(error) => debug!(%error, "who asks at the status socket cannot be told"),
+                Err(error) => debug!(%error, "the user of a client of the status socket is unknown"),
             }
             drop(place);
         });
@@ -362,7 +362,7 @@ async fn serve(socket: &StatusSocket, desk: &Desk) {
 /// Refuses a client of another user.
 async fn refuse(stream: &mut UnixStream, uid: u32, was_said: &AtomicBool) {
     if !was_said.swap(true, Relaxed) {
-        warn!(uid, "another user asks at the status socket and is refused; said once");
+        warn!(uid, "refused another user at the status socket; logged once");
     }
     let own = rustix::process::geteuid().as_raw();
     let text =
@@ -401,7 +401,7 @@ async fn answer(
                 return;
             };
             if let Err(error) = shell::publish(gateway, wish, stream, envelope).await {
-                debug!(%error, "who published at the status socket went away");
+                debug!(%error, "a publishing client of the status socket disconnected");
             }
             return;
         }
@@ -413,7 +413,7 @@ async fn answer(
         stream.shutdown().await
     };
     if !matches!(tokio::time::timeout(TRANSFER_MAX, write).await, Ok(Ok(()))) {
-        debug!("who asked at the status socket did not read the answer");
+        debug!("a client of the status socket did not read the answer");
     }
 }
 

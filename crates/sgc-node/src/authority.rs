@@ -378,7 +378,7 @@ impl FleetDesk {
                 );
             }
             Ok(_) => {}
-            Err(why) => error!("the fleet's file does not learn what was revoked elsewhere: {why}"),
+            Err(why) => error!("cannot record revocations by other copies of the fleet file: {why}"),
         }
     }
 }
@@ -389,11 +389,11 @@ fn recognize(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> bool {
     match fleet.recognize(&request.peer, now.unix) {
         Ok(false) => false,
         Ok(true) => {
-            warn!(%peer, "another copy of the fleet's file made its certificate; the file here knows it now");
+            warn!(%peer, "recorded a certificate that another copy of the fleet file made");
             true
         }
         Err(why) => {
-            error!(%peer, %why, "the fleet's file does not take its certificate");
+            error!(%peer, %why, "cannot record a certificate in the fleet file");
             false
         }
     }
@@ -423,7 +423,7 @@ fn renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> FleetAnswer {
     match try_renew(fleet, request, now) {
         Ok(found) => found,
         Err(why) => {
-            warn!(peer = %request.peer.node_id.short(), %why, "gives no credentials");
+            warn!(peer = %request.peer.node_id.short(), %why, "refused credentials");
             FleetAnswer::refused(RenewalRefusal::from_fleet(&why))
         }
     }
@@ -442,7 +442,7 @@ fn try_renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Result<Fl
     let mut rng = OsRng.unwrap_err();
     let credentials = fleet.renew_csr(csr, &peer.pseudonym, valid, now.unix, &mut rng)?;
     let made = credentials.chain.first().and_then(|leaf| serial_of(leaf)).map(Arc::from);
-    info!(%node, "renewed its certificate");
+    info!(%node, "renewed a certificate");
     Ok(FleetAnswer { answer: Ok(credentials), made, is_news: true })
 }
 

@@ -394,7 +394,7 @@ impl FarService {
         match number {
             Ok(Some(number)) => self.publish(MessageKind::Request, number, payload),
             Ok(None) => {}
-            Err(why) => debug!(%why, "a call is not taken"),
+            Err(why) => debug!(%why, "refused a call"),
         }
     }
 

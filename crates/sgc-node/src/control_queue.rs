@@ -40,7 +40,7 @@ impl ControlQueue {
         self.0.try_send(Outgoing::Frame(frame)).is_ok()
     }
 
-    /// Queues a frame once there is room; false if the link has ended.
+    /// Queues a frame once there is room. Returns `false` if the link has ended.
     pub(crate) async fn push_later(&self, frame: Control) -> bool {
         self.0.send(Outgoing::Frame(frame)).await.is_ok()
     }

@@ -78,7 +78,7 @@ impl LaneAdmission {
         match found.and_then(|e| Some((e.lanes.upgrade()?, e.name))) {
             Some((lanes, name)) => lanes.attach(name, lane),
             None => {
-                warn!(remote = %lane.remote(), peer = %lane.peer().node_id.short(), "a connection as a lane that was not agreed on; it is closed");
+                warn!(remote = %lane.remote(), peer = %lane.peer().node_id.short(), "closed an unexpected lane");
                 lane.close(CloseReason::Denied("no such lane was agreed on".into()));
             }
         }
@@ -189,7 +189,7 @@ impl Lanes {
             return;
         }
         if !self.admit(&mut table, name) {
-            warn!(remote = %self.link.remote(), "a topic is to have a connection of its own and {LANES_MAX} others have; it shares the link");
+            warn!(remote = %self.link.remote(), "a topic gets no lane, because {LANES_MAX} others have one; it shares the link");
             return;
         }
         if let Some(lane) = table.lanes.get_mut(&name) {
@@ -197,7 +197,7 @@ impl Lanes {
         }
         drop(table);
         if self.dial.is_none() && !self.frames.push(Control::LaneWanted { name }) {
-            debug!(name = %name.short(), "the peer takes no control frames; no lane is asked for");
+            debug!(name = %name.short(), "the peer takes no control frames; no lane is requested");
         }
     }
 
@@ -229,7 +229,7 @@ impl Lanes {
             (Control::LaneWanted { name }, Some(_)) => {
                 let mut table = self.table();
                 if !self.admit(&mut table, *name) {
-                    debug!(name = %name.short(), "the peer wants more lanes than there may be");
+                    debug!(name = %name.short(), "the peer requests too many lanes");
                 }
                 Ok(())
             }
@@ -283,14 +283,14 @@ impl Lanes {
                 }
                 Err(LaneFailure::Refused) => {
                     if refusals == 0 {
-                        info!(remote = %self.link.remote(), "{}; the topic shares the link, and one is asked for again seldom", LaneFailure::Refused);
+                        info!(remote = %self.link.remote(), "{}; the topic shares the link, and a lane is requested again later", LaneFailure::Refused);
                     }
                     refusals = refusals.saturating_add(1);
                     sleep(doubled(REFUSED_MIN, refusals, REFUSED_MAX, &mut rng)).await;
                     continue;
                 }
                 Err(why) if failures == 0 => {
-                    warn!(remote = %self.link.remote(), "no connection of its own for a topic: {why}; it shares the link and it is tried again");
+                    warn!(remote = %self.link.remote(), "no lane for a topic: {why}; the topic shares the link until the next attempt");
                 }
                 Err(why) => debug!("no lane: {why}"),
             }

@@ -171,7 +171,7 @@ pub(crate) async fn keep_renewed(
             before = passed(doubted) => {
                 doubted = None;
                 if current.link.stats().received_bytes == before {
-                    info!(%url, "nothing comes since the network changed; connecting anew beside it");
+                    info!(%url, "nothing arrives since the network changed; connecting again in parallel");
                     is_wanted = true;
                 }
             }
@@ -188,7 +188,7 @@ pub(crate) async fn keep_renewed(
                             tokio::spawn(old.retire(core.clone()));
                         }
                         end = next.end(core) => {
-                            warn!("the link that was to take over ended: {end}; the old one stays and it is tried again");
+                            warn!("the replacement link ended: {end}; the old link stays until the next attempt");
                             failures = Some(failures.unwrap_or(0).saturating_add(1));
                             continue;
                         }
@@ -206,13 +206,13 @@ pub(crate) async fn keep_renewed(
                     }
                 }
                 Err((why, true)) => {
-                    debug!("no better way yet: {why}");
+                    debug!("no better URL works yet: {why}");
                     failback.failed(Instant::now(), &mut rng);
                 }
                 Err((why, false)) => {
                     is_wanted = false;
                     if failures.is_none() {
-                        warn!("cannot connect anew: {why}; the old link stays and it is tried again");
+                        warn!("cannot reconnect: {why}; the old link stays until the next attempt");
                     }
                     line.noted(&why.to_string());
                     failures = Some(failures.unwrap_or(0).saturating_add(1));
@@ -392,7 +392,7 @@ impl ReportedLink {
         let _ = timeout(GOODBYE_MAX, goodbye).await;
         self.link.close(CloseReason::Replaced);
         self.end(&core).await;
-        info!(remote = %self.link.remote(), "a newer link took the place of this one");
+        info!(remote = %self.link.remote(), "a newer link replaced this one");
     }
 }
 

@@ -90,7 +90,7 @@ impl OutFlow {
                 messages: VecDeque::new(),
             };
             if let Err(error) = task.empty(&mut sender, limits).await {
-                debug!(name = %name.short(), %error, "no more is sent over this link");
+                debug!(name = %name.short(), %error, "stopped sending over this link");
             }
             task.close();
             sender.finish().await;

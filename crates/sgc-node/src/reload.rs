@@ -290,7 +290,7 @@ impl Reloader {
                     self.audit.write(record.reason(report.changed.join("; ")));
                 }
                 Err(error) => {
-                    warn!("a token ended, but its holder stays: {error}");
+                    warn!("a token expired, but its holder keeps access: {error}");
                     drop(running);
                     tokio::time::sleep(EXPIRY_CHECK_MAX).await;
                 }

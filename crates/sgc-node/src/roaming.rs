@@ -47,7 +47,7 @@ impl Network {
                 tokio::spawn(hear(socket, tell));
             }
             Err(error) => {
-                warn!(%error, "the kernel does not tell of changes of the network; links move when they fall silent");
+                warn!(%error, "the kernel does not report changes of the network; links move when they fall silent");
             }
         }
         network
@@ -152,7 +152,7 @@ async fn hear(socket: UnixDatagram, tell: watch::Sender<u64>) {
             heard = heard => match heard {
                 Ok(()) => tell.send_modify(|change| *change += 1),
                 Err(error) => {
-                    warn!(%error, "the kernel tells no more of changes of the network; links move when they fall silent");
+                    warn!(%error, "the kernel no longer reports changes of the network; links move when they fall silent");
                     return;
                 }
             },
@@ -184,7 +184,7 @@ pub(crate) fn report(remote: SocketAddr, source: Option<IpAddr>, moves: Move) {
     match moves {
         Move::Stay => {}
         Move::Rebind => info!(%remote, %source, "the network changed; the link goes on from here"),
-        Move::Redial => info!(%remote, %source, "the network changed; connecting anew from here"),
+        Move::Redial => info!(%remote, %source, "the network changed; reconnecting from here"),
     }
 }
 

@@ -426,7 +426,7 @@ impl LocalSink {
             Ok(Delivery::Lost(_, messages)) => {
                 debug!(name = %self.name.short(), messages, "lost for good");
                 if drops.add("sink_lost", messages) {
-                    warn!(messages, "a source keeps no more what was lost on the way; counted from here on");
+                    warn!(messages, "a source no longer keeps messages that were lost; counted from here on");
                 }
                 Some((DataDrop::Sink, messages))
             }
@@ -694,7 +694,7 @@ impl WriterQueue {
                 Ok(payload) => payload,
                 Err(error) => {
                     if counted.count("decompress") {
-                        warn!(%in_topic, %error, "a message is not given to the local network; counted from here on");
+                        warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
                     }
                     return None;
                 }
@@ -720,7 +720,7 @@ impl WriterQueue {
                         Ok(payload) => payload,
                         Err(error) => {
                             if counted.count("json_refused") {
-                                warn!(%in_topic, %error, "a message is not given to the local network; counted from here on");
+                                warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
                             }
                             return None;
                         }
@@ -734,7 +734,7 @@ impl WriterQueue {
                     Ok(rewritten) => rewritten.into(),
                     Err(error) => {
                         if counted.count("frames") {
-                            warn!(%in_topic, %error, "a message is not given to the local network; counted from here on");
+                            warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
                         }
                         return None;
                     }

@@ -807,7 +807,7 @@ pub enum Mistake {
         /// The share.
         other: String,
     },
-    /// A use of one's own topic.
+    /// A use of this node's own topic.
     #[error("`{key}` is {name:?}, which is this node: name the node that shares the topic")]
     UseFromItself {
         /// The key.
@@ -841,19 +841,19 @@ pub enum Mistake {
         /// The first.
         other: String,
     },
-    /// A token, and what it says already.
+    /// A token beside a key whose value it determines.
     #[error("`{key}` stands beside `token`, which says it already: take `{key}` out")]
     TokenAndMore {
         /// The key beside it.
         key: &'static str,
     },
-    /// A token's topic, which cannot be shaped.
+    /// Shaping of a token's topic.
     #[error("`{key}` cannot stand beside `token` in this version: ask the owner to set it for the share")]
     TokenUnshaped {
         /// The key beside it.
         key: &'static str,
     },
-    /// A priority of what is not published here.
+    /// A priority for a topic that is not published here.
     #[error(
         "`{key}` is for what this node publishes there: what comes here has the priority of the owner's share; set `publish = true`, or take it out"
     )]
@@ -861,7 +861,7 @@ pub enum Mistake {
         /// The key.
         key: &'static str,
     },
-    /// How what comes from elsewhere is compressed.
+    /// Compression of a topic that is received.
     #[error(
         "`{key}` is for what this node publishes there: what comes here is compressed as the owner's share says; set `publish = true`, or take it out"
     )]
@@ -1007,16 +1007,16 @@ pub enum Mistake {
 /// The rules of a fully qualified ROS 2 topic name (`rmw_validate_full_topic_name`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum TopicRule {
-    /// It has at least one token.
+    /// The name has at least one token.
     #[error("a topic name has at least one word after a '/'")]
     NotEmpty,
     /// `~` depends on the ROS node.
     #[error("'~' stands for the name of a ROS node, which is not known here: write the name in full")]
     NotPrivate,
-    /// It starts with a slash.
+    /// The name starts with a slash.
     #[error("a topic name starts with '/'")]
     Absolute,
-    /// It does not end with one.
+    /// The name does not end with a slash.
     #[error("a topic name does not end with '/'")]
     NoTrailingSlash,
     /// No empty token.

@@ -236,7 +236,7 @@ pub struct ShareConfig {
     pub shaping: Shaping,
     /// QoS policies that replace those of its publishers.
     pub qos: QosOverride,
-    /// Whether it has a lane to the next node.
+    /// Whether the topic has a lane to the next node.
     pub dedicated: bool,
     /// Suite that seals its payloads.
     pub suite: Suite,
@@ -284,7 +284,7 @@ pub struct UseConfig {
     pub shaping: Shaping,
     /// Local QoS policies that replace those of the far publishers.
     pub qos: QosOverride,
-    /// Whether it has a lane to the next node.
+    /// Whether the topic has a lane to the next node.
     pub dedicated: bool,
 }
 
@@ -299,7 +299,7 @@ pub struct TokenConfig {
     pub frame_prefix: Option<String>,
     /// Local QoS policies that replace those of the far publishers.
     pub qos: QosOverride,
-    /// Whether it has a lane to the next node.
+    /// Whether the topic has a lane to the next node.
     pub dedicated: bool,
 }
 

@@ -327,13 +327,13 @@ impl<N: RosNetwork> Core<N> {
                     Ok(ends) => ends,
                     Err(error @ RosError::ForbiddenPartition { .. }) => {
                         if failures.count("consumers_forbidden") {
-                            info!("programs elsewhere are not shown in the local graph: {error}");
+                            info!("far programs are not shown in the local graph: {error}");
                         }
                         continue;
                     }
                     Err(error) => {
                         failures.count("show_consumer");
-                        debug!(%error, "the local graph does not show a subscriber or client elsewhere");
+                        debug!(%error, "the local graph does not show a far subscriber or client");
                         continue;
                     }
                 };

@@ -690,15 +690,15 @@ mod tests {
             assert!(run(job(TWIST, announced, Some(told))).is_ok());
         }
         let lies = [
-            // It is not of the hash that is announced, nor of the one that it is said to have.
+            // The description has neither the announced hash nor its own claimed one.
             (TWIST, Some(other), plain(hash)),
             (TWIST, None, plain(other)),
-            // It is of another type.
+            // The description is of another type.
             ("std_msgs/msg/String", Some(hash), plain(hash)),
             ("std_msgs/msg/String", None, plain(hash)),
-            // It is none.
+            // The bytes are no description.
             (TWIST, None, told(hash, PayloadEncoding::Plain, &Bytes::from_static(b"no description"))),
-            // It is longer than it may be, packed or not.
+            // The description exceeds the limit, packed or not.
             (TWIST, None, told(hash, PayloadEncoding::Plain, &vec![0; 300 << 10].into())),
             (TWIST, None, told(hash, PayloadEncoding::Zstd, &vec![0xff; 100].into())),
         ];
@@ -712,7 +712,7 @@ mod tests {
         InterfaceTypes::new(Arc::new(TypeStore::with_limits(types_max, usize::MAX)), Definitions::default())
     }
 
-    /// An interface of a type; what it looks like is looked for.
+    /// Adds an interface, whose type is then searched.
     fn need(types: &mut InterfaceTypes, name: u8, type_name: &str, owner: Option<NodeId>) -> Name {
         let (name, type_name) = (Name([name; 32]), type_name.parse().unwrap());
         let state = NeedState::Looking;
@@ -721,7 +721,7 @@ mod tests {
         name
     }
 
-    /// What becomes of the next job, as the control task has it.
+    /// Runs the next job and applies its result, as the control task does.
     fn step(types: &mut InterfaceTypes) -> Result<Arc<Described>, TypeMiss> {
         let job = types.jobs.pop_front().expect("something to do");
         let TypeOutcome { of, found } = job.run(&TypeStore::default(), &Definitions::default());
@@ -796,7 +796,7 @@ mod tests {
         assert!(said.len() == 1 && said[0].contains("of one node this one keeps 512 types"), "{said:?}");
         assert!(said[0].contains(&owner.short()), "{said:?}");
         assert!(types.keep(Err(twist()), Some(&other)).is_ok() && types.keep(Err(twist()), None).is_ok());
-        // It has fewer.
+        // The owner has fewer types now.
         types.forget(&name(0));
         assert_eq!(types.jobs.front().map(|job| job.name), Some(late));
     }
@@ -823,7 +823,7 @@ mod tests {
         let (mut types, owner) = (types(1), NodeId([1; 32]));
         let name = need(&mut types, 1, TWIST, Some(owner));
         let job = types.jobs.pop_front().unwrap();
-        // Its owner lists another type by now.
+        // Its owner now lists another type.
         assert_eq!(types.forget(&name), Some(owner));
         need(&mut types, 1, "std_msgs/msg/String", Some(owner));
         let outcome = job.run(&TypeStore::default(), &Definitions::default());

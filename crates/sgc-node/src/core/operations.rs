@@ -110,7 +110,7 @@ impl<N: RosNetwork> Core<N> {
             }
             RequestStep::NotPermitted => {
                 if self.control_drops.count_from(NOT_PERMITTED, node) {
-                    warn!(peer = %node.short(), "is no operator and asks for operations; counted from here on");
+                    warn!(peer = %node.short(), "refused an operation of a node that is no operator; counted from here on");
                 }
                 let reason = "an operation: it is no operator";
                 self.audit.write(AuditRecord::new(AuditEvent::Refused).peer(&node).reason(reason));
@@ -130,7 +130,7 @@ impl<N: RosNetwork> Core<N> {
         if let Some(list) = done.list.map(Bytes::from)
             && let Err(why) = self.router.add_crl(now(), &list)
         {
-            warn!(%why, "the revocation list that this authority made is not usable here");
+            warn!(%why, "this authority cannot use its own new revocation list");
         }
     }
 

@@ -89,7 +89,7 @@ impl<N: RosNetwork> Core<N> {
         if let Err(why) = &answer
             && self.control_drops.count_from(why.key(), node)
         {
-            warn!(peer = %node.short(), %why, "gives no credentials; counted from here on");
+            warn!(peer = %node.short(), %why, "refused credentials; counted from here on");
         }
         if answer.is_ok()
             && let Some(authority) = &mut self.authority

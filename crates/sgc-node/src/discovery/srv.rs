@@ -224,7 +224,7 @@ async fn hold<N: Names, H: KeepLink>(
             }
             for target in targets {
                 if let Ok(target) = dial_target(&target, names).await {
-                    info!("{} names {now} no more; moving to {}", RouterUrl::Srv(domain.clone()), target.url);
+                    info!("{} no longer names {now}; moving to {}", RouterUrl::Srv(domain.clone()), target.url);
                     move_to.send_replace(target);
                     break;
                 }

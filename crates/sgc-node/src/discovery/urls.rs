@@ -194,7 +194,7 @@ impl WorkingUrls {
         let read = state::read(&path, FILE_BYTES_MAX)
             .and_then(|content| content.map(String::from_utf8).transpose().map_err(std::io::Error::other));
         let text = read.unwrap_or_else(|error| {
-            warn!(path = %path.display(), %error, "what is kept of ways to routers cannot be read");
+            warn!(path = %path.display(), %error, "cannot read the remembered URLs of routers");
             None
         });
         let lines = text.iter().flat_map(|text| text.lines());
@@ -251,9 +251,9 @@ async fn keep_written(
             let known = worked.lock().unwrap_or_else(PoisonError::into_inner).clone();
             let text: String = known.iter().map(|(best, way)| format!("{best} {way}\n")).collect();
             match state::replace(&path, text.as_bytes()) {
-                Ok(()) => debug!(path = %path.display(), "which ways work is kept"),
+                Ok(()) => debug!(path = %path.display(), "saved the URLs of routers that work"),
                 Err(error) => {
-                    warn!(path = %path.display(), %error, "which ways work could not be kept for the next start")
+                    warn!(path = %path.display(), %error, "cannot save the URLs of routers that work")
                 }
             }
         };
