@@ -276,7 +276,7 @@ pub(crate) struct Core<N: RosNetwork> {
     /// Time of the next look at the links.
     look_due: Option<Instant>,
     /// Keep-alive policy of new links.
-    patience: KeepAlivePolicy,
+    keep_alive_policy: KeepAlivePolicy,
     /// Shorter intervals of peers behind NATs that forget soon.
     impatient: BTreeMap<NodeId, Duration>,
     next_link: u32,
@@ -381,7 +381,7 @@ pub(crate) struct CoreParts<N> {
     /// State of the searches for routers.
     pub(crate) board: Board,
     /// Keep-alive policy of new links.
-    pub(crate) patience: KeepAlivePolicy,
+    pub(crate) keep_alive_policy: KeepAlivePolicy,
     /// Store of known types.
     pub types: Arc<TypeStore>,
     /// Search paths of type definitions.
@@ -413,7 +413,7 @@ impl<N: RosNetwork> Core<N> {
             inbox: Inbox::default(),
             links: BTreeMap::new(),
             look_due: None,
-            patience: parts.patience,
+            keep_alive_policy: parts.keep_alive_policy,
             impatient: BTreeMap::new(),
             next_link: 1,
             entries: HashMap::new(),
@@ -533,7 +533,7 @@ impl<N: RosNetwork> Core<N> {
                 self.control_drops.link_down(id);
                 self.data.drops().link_down(id);
                 if let Some(entry) = self.links.remove(&id) {
-                    self.remember_policy(entry.link.peer().node_id, entry.keep_alive.patience());
+                    self.remember_policy(entry.link.peer().node_id, entry.keep_alive.policy());
                     let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
                     let record = record.remote(entry.link.remote());
                     self.audit.write(match &entry.closed_for {

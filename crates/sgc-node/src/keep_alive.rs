@@ -91,8 +91,8 @@ pub(crate) struct Verdict {
 /// Keep-alive state of one link.
 #[derive(Debug)]
 pub(crate) struct KeepAlive {
-    patience: KeepAlivePolicy,
-    /// Silence before the next probe, at most `patience.max`.
+    policy: KeepAlivePolicy,
+    /// Silence before the next probe, at most `policy.max`.
     step: Duration,
     received_bytes: u64,
     remote: SocketAddr,
@@ -109,12 +109,12 @@ impl KeepAlive {
     /// Starts the keep-alive of a link that is up.
     pub(crate) fn new(
         now: Instant,
-        patience: KeepAlivePolicy,
+        policy: KeepAlivePolicy,
         received_bytes: u64,
         remote: SocketAddr,
     ) -> Self {
         Self {
-            patience,
+            policy,
             step: ASK_MIN,
             received_bytes,
             remote,
@@ -132,8 +132,8 @@ impl KeepAlive {
     }
 
     /// Returns the policy, with the bound that the path has shown to bear.
-    pub(crate) fn patience(&self) -> KeepAlivePolicy {
-        self.patience
+    pub(crate) fn policy(&self) -> KeepAlivePolicy {
+        self.policy
     }
 
     /// Shortens the interval, because a frame is sent that expects an answer or a live peer.
@@ -184,14 +184,14 @@ impl KeepAlive {
         // A path that needed several probes lost the first one, because a NAT on it had forgotten the mapping.
         let was_lost = asked.is_some_and(|(first, last)| last > first);
         let gap = if asked.is_some() { self.gap } else { quiet };
-        if self.patience.adapts && gap >= ASK_FLOOR && (has_moved || was_lost) {
-            self.patience.max = self.patience.max.min(gap / 2).max(ASK_FLOOR);
+        if self.policy.adapts && gap >= ASK_FLOOR && (has_moved || was_lost) {
+            self.policy.max = self.policy.max.min(gap / 2).max(ASK_FLOOR);
         }
         // The peer answers, so the next probe may come later.
         if asked.is_some() && !was_lost && !is_active {
-            self.step = (self.step * 2).min(self.patience.max);
+            self.step = (self.step * 2).min(self.policy.max);
         }
-        self.step = self.step.min(self.patience.max);
+        self.step = self.step.min(self.policy.max);
         self.heard = now;
     }
 }
@@ -220,9 +220,9 @@ mod tests {
     }
 
     impl Bench {
-        fn new(patience: KeepAlivePolicy) -> Self {
+        fn new(policy: KeepAlivePolicy) -> Self {
             let (now, remote) = (Instant::now(), SocketAddr::from(([10, 0, 0, 1], 1000)));
-            let keep_alive = KeepAlive::new(now, patience, 0, remote);
+            let keep_alive = KeepAlive::new(now, policy, 0, remote);
             Self {
                 now,
                 keep_alive,
@@ -336,9 +336,9 @@ mod tests {
             bench.run(300);
             let port = bench.remote.port();
             assert!(
-                bench.keep_alive.patience().max.as_secs_f64() <= most,
+                bench.keep_alive.policy().max.as_secs_f64() <= most,
                 "{forgets}: {:?}",
-                bench.keep_alive.patience()
+                bench.keep_alive.policy()
             );
             assert!(port <= 1002, "{forgets}: {port}");
             bench.run(300);

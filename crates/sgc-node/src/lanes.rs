@@ -94,7 +94,7 @@ pub(crate) struct Lanes {
     frames: ControlQueue,
     /// Dialer; `None` if the peer dialled the link.
     dial: Option<Dial>,
-    door: LaneAdmission,
+    admission: LaneAdmission,
     /// Inflow for the packets of lanes. It is set once the link has its number.
     inflow: OnceLock<Inflow>,
     table: Mutex<Table>,
@@ -137,13 +137,13 @@ impl Lanes {
         link: AnyLink,
         frames: ControlQueue,
         dial: Option<Dial>,
-        door: LaneAdmission,
+        admission: LaneAdmission,
     ) -> Arc<Self> {
         Arc::new(Self {
             link,
             frames,
             dial,
-            door,
+            admission,
             inflow: OnceLock::new(),
             table: Mutex::default(),
             has_any: AtomicBool::new(false),
@@ -207,7 +207,7 @@ impl Lanes {
             (Control::LaneOffer { token, name }, None) => {
                 let mut table = self.table();
                 let has_room = table.lanes.contains_key(name) || table.lanes.len() < LANES_MAX;
-                let accepted = has_room && self.door.expect(*token, *name, self);
+                let accepted = has_room && self.admission.expect(*token, *name, self);
                 if accepted {
                     table.lanes.entry(*name).or_default();
                     self.has_any.store(true, Ordering::Relaxed);
@@ -393,7 +393,7 @@ mod tests {
     struct Bench {
         fleet: Fleet,
         listener: Listener,
-        door: LaneAdmission,
+        admission: LaneAdmission,
     }
 
     /// Lanes at one end of a link, and the frames that this end sends.
@@ -405,7 +405,7 @@ mod tests {
             let router = Self::credentials(&fleet, "router");
             let addr = "quic://127.0.0.1:0".parse().unwrap();
             let listener = Listener::bind(&addr, router, LinkOptions::default(), Arc::default()).unwrap();
-            Self { fleet, listener, door: LaneAdmission::default() }
+            Self { fleet, listener, admission: LaneAdmission::default() }
         }
 
         fn credentials(fleet: &Fleet, node: &str) -> CredentialStore {
@@ -419,12 +419,12 @@ mod tests {
             let dialer = Arc::new(Dialer::new(store, LinkOptions::default(), Arc::default()));
             let url: LinkUrl = self.listener.local().to_string().parse().unwrap();
             let (near, far) = tokio::join!(dialer.dial(&url), self.listener.accept());
-            let end = |link, dial, door| {
+            let end = |link, dial, admission| {
                 let (frames, sent) = ControlQueue::new();
-                (Lanes::new(link, frames, dial, door), sent)
+                (Lanes::new(link, frames, dial, admission), sent)
             };
             let near = end(near.unwrap(), Some((dialer, url)), LaneAdmission::default());
-            (near, end(far.unwrap().unwrap(), None, self.door.clone()))
+            (near, end(far.unwrap().unwrap(), None, self.admission.clone()))
         }
     }
 

@@ -99,7 +99,7 @@ pub(crate) async fn keep_renewed(
     mut redial: watch::Receiver<()>,
     keeper: &LinkKeeper,
     mut claim: Claim,
-    line: &StatusRow,
+    row: &StatusRow,
 ) -> LinkError {
     let core = &keeper.core;
     let serve = |link, url: &LinkUrl| {
@@ -197,7 +197,7 @@ pub(crate) async fn keep_renewed(
                             (current, failures) = (next, None);
                         }
                     }
-                    keeper.linked(&target, &way, &passed, &node, line);
+                    keeper.linked(&target, &way, &passed, &node, row);
                     failback = failback_from(&target, &way, &mut rng);
                     origin = Origin::from_remote(current.link.remote());
                     url = way;
@@ -214,7 +214,7 @@ pub(crate) async fn keep_renewed(
                     if failures.is_none() {
                         warn!("cannot reconnect: {why}; the old link stays until the next attempt");
                     }
-                    line.noted(&why.to_string());
+                    row.noted(&why.to_string());
                     failures = Some(failures.unwrap_or(0).saturating_add(1));
                 }
             }
@@ -258,8 +258,12 @@ pub(crate) struct Admission {
 }
 
 /// Accepts links until the node ends.
-pub(crate) async fn keep_accepting(mut listener: Listener, door: Admission, mut stop: oneshot::Receiver<()>) {
-    let Admission { core, credentials, claims, audit, lanes } = door;
+pub(crate) async fn keep_accepting(
+    mut listener: Listener,
+    admission: Admission,
+    mut stop: oneshot::Receiver<()>,
+) {
+    let Admission { core, credentials, claims, audit, lanes } = admission;
     let mut refusals = RefusalLog::default();
     loop {
         let accepted = tokio::select! {
@@ -317,7 +321,7 @@ impl ReportedLink {
     async fn start(
         link: AnyLink,
         dial: Option<Dial>,
-        door: LaneAdmission,
+        admission: LaneAdmission,
         core: &mpsc::Sender<CoreEvent>,
     ) -> Self {
         let (frames, outgoing) = ControlQueue::new();
@@ -326,7 +330,7 @@ impl ReportedLink {
         let progress = Arc::<Progress>::default();
         let activity = Arc::<Activity>::default();
         let url = dial.as_ref().map(|(_, url)| url.to_string());
-        let lanes = Lanes::new(link.clone(), frames.clone(), dial, door);
+        let lanes = Lanes::new(link.clone(), frames.clone(), dial, admission);
         let labels = LabelBook::new(progress.clone());
         let (activity_tx, lanes_tx) = (activity.clone(), lanes.clone());
         let control = ControlTx { frames: frames.clone(), labels, activity: activity_tx, lanes: lanes_tx };
@@ -744,7 +748,7 @@ mod tests {
         Arc::new(fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap())
     }
 
-    fn door(core: &mpsc::Sender<CoreEvent>, credentials: &CredentialStore) -> Admission {
+    fn admission(core: &mpsc::Sender<CoreEvent>, credentials: &CredentialStore) -> Admission {
         let (core, credentials) = (core.clone(), credentials.clone());
         Admission {
             core,
@@ -761,7 +765,7 @@ mod tests {
         }
 
         /// Creates a bench with better URLs than the one that works.
-        fn by(mut ways: Vec<LinkUrl>) -> Self {
+        fn by(mut urls: Vec<LinkUrl>) -> Self {
             let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
             let arm = CredentialStore::new(enroll(&fleet, "arm"));
             let router = CredentialStore::new(enroll(&fleet, "router"));
@@ -775,7 +779,7 @@ mod tests {
             let (far_core, far) = control_task(far_closes.clone(), mute.clone(), closing);
             let (near_core, near) = control_task(Arc::default(), mute.clone(), mpsc::channel(1).1);
             let (stop, stopped) = oneshot::channel();
-            tokio::spawn(keep_accepting(listener, door(&far_core, &router), stopped));
+            tokio::spawn(keep_accepting(listener, admission(&far_core, &router), stopped));
             let (redial, on_redial) = watch::channel(());
             let dialer = Arc::new(Dialer::new(arm.clone(), options, Arc::default()));
             let me = arm.identity().node_id();
@@ -791,13 +795,13 @@ mod tests {
                 redial: on_redial,
                 claims,
                 network,
-                ways: book,
+                urls: book,
             };
             let board = Board::default();
-            let line = board.line(&url, "static");
+            let row = board.row(&url, "static");
             let rng = ChaCha20Rng::from_rng(&mut OsRng.unwrap_err());
-            ways.push(url);
-            tokio::spawn(keep_at(DialTarget::by(ways).unwrap(), keeper, line, rng));
+            urls.push(url);
+            tokio::spawn(keep_at(DialTarget::by(urls).unwrap(), keeper, row, rng));
             Self {
                 board,
                 change_network,
@@ -842,14 +846,14 @@ mod tests {
         let url = listener.local().to_string().parse().unwrap();
         let (core, _told) = control_task(Arc::default(), Arc::default(), mpsc::channel(1).1);
         let (_stop, stopped) = oneshot::channel();
-        let door = Admission {
+        let admission = Admission {
             core,
             credentials: router,
             claims: Claims::default(),
             audit: Audit::default(),
             lanes: LaneAdmission::default(),
         };
-        tokio::spawn(keep_accepting(listener, door, stopped));
+        tokio::spawn(keep_accepting(listener, admission, stopped));
         let dialer = Dialer::new(CredentialStore::new(arm), LinkOptions::default(), Arc::default());
         let link = soon(dialer.dial(&url)).await.unwrap();
         let hello = Hello { minor: 0, incarnation: 9, transit: false, yields: false, started: UnixMillis(1) };
@@ -883,7 +887,7 @@ mod tests {
         let url = listener.local().to_string().parse().unwrap();
         let (core, mut events) = mpsc::channel(4096);
         let (_stop, stopped) = oneshot::channel();
-        tokio::spawn(keep_accepting(listener, door(&core, &router), stopped));
+        tokio::spawn(keep_accepting(listener, admission(&core, &router), stopped));
         let inbox = Inbox::default();
         // Frames of a link that wait, since the control task takes none.
         let mut held = Vec::new();
@@ -935,7 +939,7 @@ mod tests {
         let url = listener.local().to_string().parse().unwrap();
         let (core, mut events) = mpsc::channel(64);
         let (_stop, stopped) = oneshot::channel();
-        tokio::spawn(keep_accepting(listener, door(&core, &router), stopped));
+        tokio::spawn(keep_accepting(listener, admission(&core, &router), stopped));
         let dialer =
             Dialer::new(CredentialStore::new(enroll(&fleet, "arm")), LinkOptions::default(), Arc::default());
         let link = soon(dialer.dial(&url)).await.unwrap();
@@ -1006,8 +1010,8 @@ mod tests {
         let listener = Listener::bind(&addr, bench.router.clone(), LinkOptions::default(), Arc::default());
         let (stop, stopped) = oneshot::channel();
         bench.stops.push(stop);
-        let door = door(&bench.far_core, &bench.router);
-        tokio::spawn(keep_accepting(listener.unwrap(), door, stopped));
+        let admission = admission(&bench.far_core, &bench.router);
+        tokio::spawn(keep_accepting(listener.unwrap(), admission, stopped));
         bench.change_network.send_modify(|change| *change += 1);
         bench.expect_up(2).await;
         bench.expect(LinkEvent::Down(LinkId(1)), LinkEvent::Down(LinkId(1))).await;

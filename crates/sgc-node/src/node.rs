@@ -359,12 +359,12 @@ async fn run_with<N: RosNetwork>(
     let credentials = CredentialStore::new(identity.clone());
     credentials.set_anchors(anchors.clone());
     credentials.set_admitted(rules.partners.admitted.clone());
-    let patience = config.keep_alive.map_or_else(KeepAlivePolicy::default, KeepAlivePolicy::fixed);
+    let keep_alive_policy = config.keep_alive.map_or_else(KeepAlivePolicy::default, KeepAlivePolicy::fixed);
     let link_options = LinkOptions {
         post_quantum: identity.post_quantum(),
         // The transport's keep-alive matters only for peers that our keep-alive no longer probes.
-        keep_alive: patience.max + KEEP_ALIVE_SLACK,
-        idle_timeout: IDLE_TIMEOUT_MIN.max(patience.max * 5 / 2),
+        keep_alive: keep_alive_policy.max + KEEP_ALIVE_SLACK,
+        idle_timeout: IDLE_TIMEOUT_MIN.max(keep_alive_policy.max * 5 / 2),
         congestion: config.transport.congestion,
         offload: config.transport.offload,
         mtu_discovery: config.transport.mtu_discovery,
@@ -465,7 +465,7 @@ async fn run_with<N: RosNetwork>(
         definitions,
         member_names: rules.members.clone(),
         board: board.clone(),
-        patience,
+        keep_alive_policy,
         message_keys,
         authority: config.authority.as_ref().map(|wanted| {
             let operators = grantees(&wanted.operators, &identity, &rules.partners);
@@ -511,7 +511,7 @@ async fn run_with<N: RosNetwork>(
         redial: on_redial,
         claims: claims.clone(),
         network: Network::watch(),
-        ways: WorkingUrls::open(state.as_deref()),
+        urls: WorkingUrls::open(state.as_deref()),
     };
     let heard = local.clone().zip(nearby);
     tasks.extend(discovery::start(&config.routers, &rules.routers, &keeper, &board, heard, &mut rng));
@@ -520,14 +520,14 @@ async fn run_with<N: RosNetwork>(
     for listener in listeners {
         info!("listening on {}", listener.local());
         let (stop, stopped) = oneshot::channel();
-        let door = Admission {
+        let admission = Admission {
             core: events.clone(),
             credentials: credentials.clone(),
             claims: claims.clone(),
             audit: audit.clone(),
             lanes: lanes.clone(),
         };
-        accepting.push((tokio::spawn(keep_accepting(listener, door, stopped)), stop));
+        accepting.push((tokio::spawn(keep_accepting(listener, admission, stopped)), stop));
     }
     let socket = admin_socket_path(&config, identity.node_name().as_str());
     tasks.push(tokio::spawn(reopening::watch(keeper.network.clone(), network.clone(), events.clone())));

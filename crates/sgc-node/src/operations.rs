@@ -106,7 +106,7 @@ pub(crate) struct Operations {
 
 #[derive(Debug)]
 struct Current {
-    wish: UserOperation,
+    operation_request: UserOperation,
     /// Name at which the authority is asked, once it is.
     name: Option<Name>,
     find_until: Instant,
@@ -125,12 +125,12 @@ enum State {
 
 impl Operations {
     /// Queues an operation. [`Operations::next`] begins it.
-    pub(crate) fn push(&mut self, now: Instant, wish: UserOperation) {
+    pub(crate) fn push(&mut self, now: Instant, operation_request: UserOperation) {
         if self.waiting.len() >= WAITING_MAX {
-            let _ = wish.reply.send(Err(OperationError::Full));
+            let _ = operation_request.reply.send(Err(OperationError::Full));
             return;
         }
-        self.waiting.push_back((wish, now + OPERATION_MAX));
+        self.waiting.push_back((operation_request, now + OPERATION_MAX));
     }
 
     /// Begins the next operation if none is under way.
@@ -139,11 +139,13 @@ impl Operations {
             return None;
         }
         // Some clients have left.
-        let next = std::iter::from_fn(|| self.waiting.pop_front()).find(|(wish, _)| !wish.reply.is_closed());
-        let (wish, until) = next?;
-        let step = Step::Ask(wish.authority, OperationRequest::Challenge);
+        let next = std::iter::from_fn(|| self.waiting.pop_front())
+            .find(|(operation_request, _)| !operation_request.reply.is_closed());
+        let (operation_request, until) = next?;
+        let step = Step::Ask(operation_request.authority, OperationRequest::Challenge);
         let (name, find_until) = (None, now + FIND_MAX);
-        self.current = Some(Current { wish, name, find_until, until, state: State::ExpectChallenge });
+        self.current =
+            Some(Current { operation_request, name, find_until, until, state: State::ExpectChallenge });
         Some(step)
     }
 
@@ -169,7 +171,7 @@ impl Operations {
     /// Handles a refusal of the authority or of a router before it.
     pub(crate) fn denied(&mut self, name: Name, by: RefusedBy) -> Option<Step> {
         let current = self.current.as_ref().filter(|c| c.name == Some(name))?;
-        let at = current.wish.at.clone();
+        let at = current.operation_request.at.clone();
         match (by, &current.state) {
             (RefusedBy::Owner(RefuseReason::NotPermitted), _) => {
                 self.end(Err(OperationError::NotOperator { at }))
@@ -196,10 +198,10 @@ impl Operations {
     /// Ends the operation if its time is over, or if the authority's name is not advertised for too long.
     pub(crate) fn look(&mut self, now: Instant, is_found: bool) -> Option<Step> {
         let current = self.current.as_mut()?;
-        let at = current.wish.at.clone();
+        let at = current.operation_request.at.clone();
         match current.state {
             State::ExpectChallenge if current.find_until <= now && !is_found => {
-                let hint = match current.wish.is_named {
+                let hint = match current.operation_request.is_named {
                     true => "",
                     false => ", whose identity names another authority or none",
                 };
@@ -222,15 +224,15 @@ impl Operations {
 
     /// Ends all operations, because the node stops.
     pub(crate) fn stop(&mut self) {
-        let waiting = self.waiting.drain(..).map(|(wish, _)| wish);
-        for wish in waiting.chain(self.current.take().map(|current| current.wish)) {
-            let _ = wish.reply.send(Err(OperationError::Stopping));
+        let waiting = self.waiting.drain(..).map(|(operation_request, _)| operation_request);
+        for operation_request in waiting.chain(self.current.take().map(|current| current.operation_request)) {
+            let _ = operation_request.reply.send(Err(OperationError::Stopping));
         }
     }
 
     fn end(&mut self, result: Result<OperationAnswer, OperationError>) -> Option<Step> {
-        let Current { wish, name, .. } = self.current.take()?;
-        let _ = wish.reply.send(result);
+        let Current { operation_request, name, .. } = self.current.take()?;
+        let _ = operation_request.reply.send(result);
         name.map(Step::Leave)
     }
 }
@@ -238,8 +240,8 @@ impl Operations {
 impl Current {
     fn execute(&mut self, challenge: Challenge) -> Step {
         self.state = State::ExpectOutcome;
-        let operation = self.wish.operation.clone();
-        Step::Ask(self.wish.authority, OperationRequest::Execute { challenge, operation })
+        let operation = self.operation_request.operation.clone();
+        Step::Ask(self.operation_request.authority, OperationRequest::Execute { challenge, operation })
     }
 }
 
@@ -262,18 +264,19 @@ mod tests {
         Operation::List { after: None }
     }
 
-    fn wish() -> (UserOperation, Reply) {
+    fn operation_request() -> (UserOperation, Reply) {
         let (reply, replied) = oneshot::channel();
         let at = "keeper".to_owned();
-        let wish = UserOperation { at, authority: KEEPER, is_named: true, operation: list(), reply };
-        (wish, replied)
+        let operation_request =
+            UserOperation { at, authority: KEEPER, is_named: true, operation: list(), reply };
+        (operation_request, replied)
     }
 
     /// Returns an operation under way that waits for a challenge.
     fn begun(now: Instant) -> (Operations, Reply) {
         let mut operations = Operations::default();
-        let (wish, replied) = wish();
-        operations.push(now, wish);
+        let (operation_request, replied) = operation_request();
+        operations.push(now, operation_request);
         assert_eq!(operations.next(now), Some(Step::Ask(KEEPER, OperationRequest::Challenge)));
         operations.asked(NAME);
         (operations, replied)
@@ -287,7 +290,7 @@ mod tests {
     fn an_operation_takes_a_challenge_and_is_asked_for_with_it() {
         let now = Instant::now();
         let (mut operations, replied) = begun(now);
-        let (second, waits) = wish();
+        let (second, waits) = operation_request();
         operations.push(now, second);
         assert_eq!(operations.next(now), None, "one at a time");
         let other = OperationAnswer::Challenge(Challenge([9; 16]));
@@ -349,12 +352,12 @@ mod tests {
         let (mut operations, replied) = begun(now);
         let waiting: Vec<_> = (0..WAITING_MAX)
             .map(|_| {
-                let (wish, replied) = wish();
-                operations.push(now, wish);
+                let (operation_request, replied) = operation_request();
+                operations.push(now, operation_request);
                 replied
             })
             .collect();
-        let (one_more, refused) = wish();
+        let (one_more, refused) = operation_request();
         operations.push(now, one_more);
         assert_eq!(end(refused), Err(OperationError::Full));
         drop((replied, waiting));

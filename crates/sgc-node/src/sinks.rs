@@ -128,7 +128,7 @@ impl LocalSink {
 
     /// Returns the largest number of local readers that one of its writers matches.
     pub(crate) fn matched(&self) -> u32 {
-        self.writers.load().values().map(|writer| (writer.behind.matched)()).max().unwrap_or(0)
+        self.writers.load().values().map(|writer| (writer.info.matched)()).max().unwrap_or(0)
     }
 
     /// Applies a grant. A task writes the packets that waited for it, since that may take a while.
@@ -576,7 +576,7 @@ pub(crate) struct WriterQueue {
     is_unshaped: AtomicBool,
     /// Held by the thread from before it takes a message until it has consumed it, so that no other message overtakes.
     take: Mutex<MessageConsumer>,
-    behind: WriterInfo,
+    info: WriterInfo,
     /// Whether liveliness was asserted just now, or is being asserted.
     is_asserted: Arc<AtomicBool>,
     /// Closed once the thread has consumed everything.
@@ -678,7 +678,7 @@ impl WriterQueue {
         let is_manual = spec.qos.liveliness == Liveliness::ManualByTopic && spec.qos.lease_ns.is_some();
         let assert = is_manual.then_some(assert as Box<dyn Fn() + Send + Sync>);
         let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
-        let behind =
+        let info =
             WriterInfo { guid: writer.guid(), recent: Recent::new(spec), matched, is_free, resize, assert };
         let (mut decompressor, offered) = (Decompressor::default(), spec.qos.representations);
         let mut prepare = move |message: Message| {
@@ -744,7 +744,7 @@ impl WriterQueue {
             Some((SampleHead { kind, source_timestamp_ns, key_hash }, payload))
         };
         let refused = failures.clone();
-        Self::spawn_with("sgc-write", behind, shaping, failures, alive, move |message, next| {
+        Self::spawn_with("sgc-write", info, shaping, failures, alive, move |message, next| {
             let source = message.source;
             let Some((head, payload)) = prepare(message) else {
                 return if !next.is_at_once() {
@@ -773,10 +773,10 @@ impl WriterQueue {
     }
 
     /// Starts a queue with another consumer, which also learns the state of the queue behind each message. The consumer
-    /// may block, except for a short message that `behind` declares free.
+    /// may block, except for a short message that `info` declares free.
     pub(crate) fn spawn_with(
         thread_name: &str,
-        behind: WriterInfo,
+        info: WriterInfo,
         shaping: Shaping,
         drops: Arc<Drops>,
         alive: mpsc::Sender<()>,
@@ -790,7 +790,7 @@ impl WriterQueue {
             shaper: shaper.into(),
             is_unshaped: AtomicBool::new(shaping == Shaping::default()),
             take: Mutex::new(Box::new(take)),
-            behind,
+            info,
             is_asserted: Arc::default(),
             thread: running,
         });
@@ -825,12 +825,12 @@ impl WriterQueue {
     fn at_once(&self, message: &Message) -> Option<MutexGuard<'_, MessageConsumer>> {
         let may = message.payload.len() <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
         let take = if may { self.take.try_lock().ok() } else { None };
-        take.filter(|_| self.queue.is_empty() && !self.queue.is_closed() && (self.behind.is_free)(message))
+        take.filter(|_| self.queue.is_empty() && !self.queue.is_closed() && (self.info.is_free)(message))
     }
 
     /// Returns the writer's GUID.
     pub(crate) fn guid(&self) -> Guid {
-        self.behind.guid
+        self.info.guid
     }
 
     /// Sets the limits of rate, bandwidth and age.
@@ -882,17 +882,17 @@ impl WriterQueue {
     /// Sets the number of messages that late joiners get. May block.
     pub(crate) fn resize(&self, depth: u32) {
         self.with_recent(|recent| recent.keep(depth as usize));
-        (self.behind.resize)(depth);
+        (self.info.resize)(depth);
     }
 
     /// Asserts the writer's liveliness, at most once in [`ASSERTION_SPACING`].
     fn assert_liveliness(self: &Arc<Self>) {
-        if self.behind.assert.is_none() || self.is_asserted.swap(true, Relaxed) {
+        if self.info.assert.is_none() || self.is_asserted.swap(true, Relaxed) {
             return;
         }
         let (this, is_asserted) = (self.clone(), self.is_asserted.clone());
         tokio::spawn(async move {
-            let assert = move || this.behind.assert.as_ref().map(|assert| assert());
+            let assert = move || this.info.assert.as_ref().map(|assert| assert());
             let _ = tokio::task::spawn_blocking(assert).await;
             tokio::time::sleep(ASSERTION_SPACING).await;
             is_asserted.store(false, Relaxed);
@@ -927,7 +927,7 @@ impl WriterQueue {
 
     /// Returns `None` if the publisher keeps nothing for late joiners.
     fn with_recent<T>(&self, look: impl FnOnce(&mut Recent) -> T) -> Option<T> {
-        let recent = self.behind.recent.as_ref()?;
+        let recent = self.info.recent.as_ref()?;
         Some(look(&mut recent.lock().unwrap_or_else(PoisonError::into_inner)))
     }
 
@@ -1147,9 +1147,9 @@ mod tests {
     }
 
     fn taking(take: impl FnMut(Message, NextMessage) + Send + 'static) -> Arc<WriterQueue> {
-        let behind = WriterInfo { is_free: Box::new(|_| true), ..WriterInfo::default() };
+        let info = WriterInfo { is_free: Box::new(|_| true), ..WriterInfo::default() };
         let (alive, _) = mpsc::channel(1);
-        WriterQueue::spawn_with("test", behind, Shaping::default(), Arc::default(), alive, take).unwrap()
+        WriterQueue::spawn_with("test", info, Shaping::default(), Arc::default(), alive, take).unwrap()
     }
 
     fn message(seq: u64, bytes: usize) -> Message {
@@ -1288,10 +1288,10 @@ mod tests {
         let assert = Box::new(move || {
             counted.fetch_add(1, Relaxed);
         });
-        let behind = WriterInfo { assert: Some(assert), ..WriterInfo::default() };
+        let info = WriterInfo { assert: Some(assert), ..WriterInfo::default() };
         let (alive, _) = mpsc::channel(1);
         let (shaping, drops) = (Shaping::default(), Arc::default());
-        let queue = WriterQueue::spawn_with("test", behind, shaping, drops, alive, |_, _| ()).unwrap();
+        let queue = WriterQueue::spawn_with("test", info, shaping, drops, alive, |_, _| ()).unwrap();
         let begun = Instant::now();
         wait_until(|| {
             queue.assert_liveliness();

@@ -388,8 +388,8 @@ impl Config {
     /// Returns warnings about unencrypted links, one line for each address.
     pub fn warnings(&self) -> Vec<String> {
         let listens = self.listen.iter().filter(|addr| addr.scheme.is_readable()).map(ToString::to_string);
-        let ways = self.routers.iter().flat_map(RouterUrl::ways);
-        let dials = ways.filter(|url| url.scheme.is_readable()).map(ToString::to_string);
+        let urls = self.routers.iter().flat_map(RouterUrl::urls);
+        let dials = urls.filter(|url| url.scheme.is_readable()).map(ToString::to_string);
         let line = |address| {
             format!(
                 "{address} can be read by everybody on its way: who talks to whom, how much and when, and the hashes that stand \

@@ -374,7 +374,7 @@ pub(super) fn router(key: &'static str, value: &str) -> Result<RouterUrl, Mistak
         Err(RouterUrlError::Link(fault)) => return Err(url_mistake(key, value, fault)),
         Err(fault) => return Err(Mistake::Router { key, value: value.to_owned(), fault }),
     };
-    for url in router.ways() {
+    for url in router.urls() {
         let host = url.host.clone();
         if !is_host(&host) {
             return Err(url_mistake(key, value, UrlError::Host(host)));

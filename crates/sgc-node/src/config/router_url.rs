@@ -31,18 +31,18 @@ pub enum RouterUrl {
 
 impl RouterUrl {
     /// Returns the entry of a router with these URLs, at least one.
-    pub(crate) fn by(ways: &[LinkUrl]) -> Self {
-        match ways {
+    pub(crate) fn by(urls: &[LinkUrl]) -> Self {
+        match urls {
             [only] => Self::At(only.clone()),
-            ways => Self::Ways(ways.to_vec()),
+            urls => Self::Ways(urls.to_vec()),
         }
     }
 
     /// Returns the router's URLs; empty if they have to be found.
-    pub fn ways(&self) -> &[LinkUrl] {
+    pub fn urls(&self) -> &[LinkUrl] {
         match self {
             Self::At(url) => std::slice::from_ref(url),
-            Self::Ways(ways) => ways,
+            Self::Ways(urls) => urls,
             Self::Srv(_) | Self::Mdns(_) => &[],
         }
     }
@@ -109,7 +109,7 @@ impl FromStr for RouterUrl {
 
     fn from_str(text: &str) -> Result<Self, RouterUrlError> {
         if text.contains(',') {
-            return ways(text).map(Self::Ways);
+            return urls(text).map(Self::Ways);
         }
         match text.split_once("://") {
             Some(("srv", rest)) => domain(rest.strip_suffix('/').unwrap_or(rest)).map(Self::Srv),
@@ -126,22 +126,22 @@ impl FromStr for RouterUrl {
     }
 }
 
-fn ways(text: &str) -> Result<Vec<LinkUrl>, RouterUrlError> {
+fn urls(text: &str) -> Result<Vec<LinkUrl>, RouterUrlError> {
     let count = text.split(',').count();
     if count > WAYS_MAX {
         return Err(RouterUrlError::Ways(count));
     }
-    let mut ways = Vec::with_capacity(count);
+    let mut urls = Vec::with_capacity(count);
     for one in text.split(',') {
         match one.trim().parse()? {
-            RouterUrl::At(url) if ways.contains(&url) => {
+            RouterUrl::At(url) if urls.contains(&url) => {
                 return Err(RouterUrlError::WayTwice(url.to_string()));
             }
-            RouterUrl::At(url) => ways.push(url),
+            RouterUrl::At(url) => urls.push(url),
             other => return Err(RouterUrlError::WayFinds(other.to_string())),
         }
     }
-    Ok(ways)
+    Ok(urls)
 }
 
 fn domain(text: &str) -> Result<SrvDomain, RouterUrlError> {
@@ -185,8 +185,8 @@ impl fmt::Display for RouterUrl {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::At(url) => write!(f, "{url}"),
-            Self::Ways(ways) => {
-                for (index, way) in ways.iter().enumerate() {
+            Self::Ways(urls) => {
+                for (index, way) in urls.iter().enumerate() {
                     write!(f, "{}{way}", if index > 0 { "," } else { "" })?;
                 }
                 Ok(())

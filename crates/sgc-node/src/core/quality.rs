@@ -21,15 +21,20 @@ impl<N: RosNetwork> Core<N> {
     /// Starts the keep-alive of a link to this peer.
     pub(super) fn keep_alive_for(&self, link: &AnyLink) -> KeepAlive {
         let known = self.impatient.get(&link.peer().node_id);
-        let patience = KeepAlivePolicy { max: known.copied().unwrap_or(self.patience.max), ..self.patience };
-        KeepAlive::new(Instant::now(), patience, link.stats().received_bytes, link.remote())
+        let keep_alive_policy = KeepAlivePolicy {
+            max: known.copied().unwrap_or(self.keep_alive_policy.max),
+            ..self.keep_alive_policy
+        };
+        KeepAlive::new(Instant::now(), keep_alive_policy, link.stats().received_bytes, link.remote())
     }
 
     /// Remembers the keep-alive interval that an ending link had to use.
-    pub(super) fn remember_policy(&mut self, node: NodeId, patience: KeepAlivePolicy) {
+    pub(super) fn remember_policy(&mut self, node: NodeId, keep_alive_policy: KeepAlivePolicy) {
         let is_known = self.impatient.contains_key(&node);
-        if patience.max < self.patience.max && (is_known || self.impatient.len() < IMPATIENT_MAX) {
-            self.impatient.insert(node, patience.max);
+        if keep_alive_policy.max < self.keep_alive_policy.max
+            && (is_known || self.impatient.len() < IMPATIENT_MAX)
+        {
+            self.impatient.insert(node, keep_alive_policy.max);
         }
     }
 

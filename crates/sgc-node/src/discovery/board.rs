@@ -54,7 +54,7 @@ struct Rows {
 
 impl Board {
     /// Adds a row for a router. Dropping it removes the row.
-    pub(crate) fn line(&self, router: impl ToString, found_by: &'static str) -> StatusRow {
+    pub(crate) fn row(&self, router: impl ToString, found_by: &'static str) -> StatusRow {
         let mut rows = self.rows();
         let id = rows.next;
         rows.next += 1;

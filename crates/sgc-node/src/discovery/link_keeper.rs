@@ -21,11 +21,11 @@ use crate::roaming::Network;
 pub(crate) trait KeepLink: Clone + Send + Sync + 'static {
     /// Dials and, if the request is met, keeps the link until it ends. A new target replaces the link by one to that
     /// target.
-    fn hold(
+    fn keep_link(
         &self,
         target: watch::Receiver<DialTarget>,
-        wish: &LinkRequest,
-        line: &StatusRow,
+        request: &LinkRequest,
+        row: &StatusRow,
     ) -> impl Future<Output = Outcome> + Send;
     /// Waits until there is no link to this node.
     fn released(&self, node: &NodeId) -> impl Future<Output = ()> + Send;
@@ -113,7 +113,7 @@ pub(crate) struct LinkKeeper {
     /// Changes of the network.
     pub(crate) network: Network,
     /// The URLs that worked last.
-    pub(crate) ways: WorkingUrls,
+    pub(crate) urls: WorkingUrls,
 }
 
 /// A link that was dialled.
@@ -128,24 +128,24 @@ pub(crate) struct DialledLink {
 impl LinkKeeper {
     /// Dials once and returns the first link that succeeds, beginning with the URL that worked last.
     pub(crate) async fn dial(&self, target: &DialTarget) -> Result<DialledLink, Failure> {
-        if let [] | [_] = &target.ways[..] {
-            let link = self.dial_way(&target.url, &target.addresses).await?;
+        if let [] | [_] = &target.urls[..] {
+            let link = self.dial_url(&target.url, &target.addresses).await?;
             return Ok(DialledLink { link, url: target.url.clone(), passed: Vec::new() });
         }
-        self.dial_first(&self.ways.in_order(&target.ways)).await
+        self.dial_first(&self.urls.in_order(&target.urls)).await
     }
 
     /// Dials these URLs and returns the first link that succeeds.
-    pub(crate) async fn dial_first(&self, ways: &[LinkUrl]) -> Result<DialledLink, Failure> {
+    pub(crate) async fn dial_first(&self, urls: &[LinkUrl]) -> Result<DialledLink, Failure> {
         let dial = |way: LinkUrl| {
             let keeper = self.clone();
-            async move { keeper.dial_way(&way, &[]).await }
+            async move { keeper.dial_url(&way, &[]).await }
         };
-        let (link, url, passed) = urls::first(ways, dial).await.map_err(Failure::Ways)?;
+        let (link, url, passed) = urls::first(urls, dial).await.map_err(Failure::Ways)?;
         Ok(DialledLink { link, url, passed })
     }
 
-    async fn dial_way(&self, url: &LinkUrl, addresses: &[SocketAddr]) -> Result<AnyLink, Failure> {
+    async fn dial_url(&self, url: &LinkUrl, addresses: &[SocketAddr]) -> Result<AnyLink, Failure> {
         let addresses = match (addresses, self.dns.is_chosen()) {
             ([], false) => return Ok(self.dialer.dial(url).await?),
             ([], true) => self.dns.addresses(&url.host, url.port).await?,
@@ -173,12 +173,12 @@ impl LinkKeeper {
         url: &LinkUrl,
         passed: &[SkippedUrl],
         node: &NodeId,
-        line: &StatusRow,
+        row: &StatusRow,
     ) {
-        line.linked(url, node);
-        line.passed_over(target.better_than(url), passed);
-        if target.ways.len() > 1 {
-            self.ways.worked_by(&target.ways, url);
+        row.linked(url, node);
+        row.passed_over(target.better_than(url), passed);
+        if target.urls.len() > 1 {
+            self.urls.worked_by(&target.urls, url);
         }
     }
 
@@ -199,24 +199,24 @@ impl LinkKeeper {
     fn enter(
         &self,
         link: &AnyLink,
-        wish: &LinkRequest,
+        request: &LinkRequest,
     ) -> Result<(Claim, Option<OwnedSemaphorePermit>), Failure> {
         let peer = link.peer();
         let node = peer.node_id;
         if node == self.me {
             return Err(Failure::Itself);
         }
-        if wish.nodes.as_ref().is_some_and(|nodes| !nodes.contains(&node)) {
+        if request.nodes.as_ref().is_some_and(|nodes| !nodes.contains(&node)) {
             return Err(Failure::Other(node));
         }
-        if wish.hearsay && !peer.may_route {
+        if request.hearsay && !peer.may_route {
             return Err(Failure::NoRouter(node));
         }
-        if self.gives_way(wish, &node) && self.claims.has_come(&node) {
+        if self.gives_way(request, &node) && self.claims.has_come(&node) {
             return Err(Failure::Reached(node));
         }
         let claim = self.claims.claim(node).ok_or(Failure::Reached(node))?;
-        let place = match &wish.places {
+        let place = match &request.places {
             None => None,
             Some(places) => Some(places.clone().try_acquire_owned().map_err(|_| Failure::Enough)?),
         };
@@ -224,45 +224,45 @@ impl LinkKeeper {
     }
 
     /// Decides which of two crossing links stays: that of the node with the lesser id.
-    fn gives_way(&self, wish: &LinkRequest, node: &NodeId) -> bool {
-        wish.hearsay && self.me > *node
+    fn gives_way(&self, request: &LinkRequest, node: &NodeId) -> bool {
+        request.hearsay && self.me > *node
     }
 }
 
 impl KeepLink for LinkKeeper {
-    async fn hold(
+    async fn keep_link(
         &self,
         mut target: watch::Receiver<DialTarget>,
-        wish: &LinkRequest,
-        line: &StatusRow,
+        request: &LinkRequest,
+        row: &StatusRow,
     ) -> Outcome {
         // Subscribe before dialling, since a later subscription could miss a change during this attempt.
         let mut redial = self.redial.clone();
         redial.mark_unchanged();
         let first = target.borrow_and_update().clone();
-        line.connecting(&first);
+        row.connecting(&first);
         let DialledLink { link, url, passed } = match self.dial(&first).await {
             Ok(dialled) => dialled,
             Err(why) => return Outcome::Failed(why),
         };
         let (node, remote) = (link.peer().node_id, link.remote());
-        let (claim, _place) = match self.enter(&link, wish) {
+        let (claim, _place) = match self.enter(&link, request) {
             Ok(entered) => entered,
             Err(why) => {
                 link.close(CloseReason::Goodbye);
                 return Outcome::Failed(why);
             }
         };
-        self.linked(&first, &url, &passed, &node, line);
+        self.linked(&first, &url, &passed, &node, row);
         let overtaken = async {
-            if self.gives_way(wish, &node) {
+            if self.gives_way(request, &node) {
                 self.claims.arrived(&node).await;
                 link.close(CloseReason::Replaced);
             }
             std::future::pending::<Infallible>().await
         };
         tokio::select! {
-            end = keep_renewed(link.clone(), url, target, redial, self, claim, line) => Outcome::Ended { remote, end },
+            end = keep_renewed(link.clone(), url, target, redial, self, claim, row) => Outcome::Ended { remote, end },
             never = overtaken => match never {},
         }
     }

@@ -42,8 +42,8 @@ pub(crate) async fn keep_some<H: KeepLink>(
     let mut link_rng = rng.clone();
     // The two generators must not yield the same numbers.
     link_rng.set_stream(1);
-    let line = board.line(&wanted.written, "mdns");
-    let keep = keep_links(heard, wanted, keeper, &board, &line, link_rng);
+    let row = board.row(&wanted.written, "mdns");
+    let keep = keep_links(heard, wanted, keeper, &board, &row, link_rng);
     let listen = async {
         let mut failures = 0;
         loop {
@@ -64,7 +64,7 @@ pub(crate) async fn keep_some<H: KeepLink>(
                     if failures == 0 {
                         warn!("cannot look for routers on the local network: {why}; trying again");
                     }
-                    line.failed(&why.to_string());
+                    row.failed(&why.to_string());
                     failures += 1;
                 }
             }
@@ -98,11 +98,11 @@ pub(crate) async fn keep_links<H: KeepLink>(
     wanted: RouterFilter,
     keeper: H,
     board: &Board,
-    line: &StatusRow,
+    row: &StatusRow,
     mut rng: ChaCha20Rng,
 ) {
     let places = Arc::new(Semaphore::new(LINKS_MAX));
-    let wish = LinkRequest { hearsay: true, nodes: wanted.nodes, places: Some(places.clone()) };
+    let request = LinkRequest { hearsay: true, nodes: wanted.nodes, places: Some(places.clone()) };
     let mut found = Candidates::default();
     let mut attempts: JoinSet<AttemptResult> = JoinSet::new();
     // Routers with another link, until that link ends.
@@ -122,7 +122,7 @@ pub(crate) async fn keep_links<H: KeepLink>(
                 is_full = false;
                 break;
             };
-            attempts.spawn(attempt(addresses, wish.clone(), keeper.clone(), board.clone()));
+            attempts.spawn(attempt(addresses, request.clone(), keeper.clone(), board.clone()));
         }
         // Due candidates without a place wait for one.
         let next = found.next_due(now).filter(|_| !is_full);
@@ -152,7 +152,7 @@ pub(crate) async fn keep_links<H: KeepLink>(
                     return;
                 }
                 if let (Outcome::Failed(why), Some(first)) = (&outcome, addresses.first()) {
-                    line.noted(&format!("{first}: {why}"));
+                    row.noted(&format!("{first}: {why}"));
                 }
                 let verdict = judge(&outcome);
                 if let Outcome::Failed(Failure::Reached(node)) = outcome
@@ -187,7 +187,7 @@ pub(crate) async fn keep_links<H: KeepLink>(
 /// Dials an announced router and keeps the link.
 async fn attempt<H: KeepLink>(
     addresses: Vec<SocketAddr>,
-    wish: LinkRequest,
+    request: LinkRequest,
     keeper: H,
     board: Board,
 ) -> AttemptResult {
@@ -198,10 +198,10 @@ async fn attempt<H: KeepLink>(
         path: None,
         cost_ms: None,
     };
-    let line = board.line(&url, "mdns");
+    let row = board.row(&url, "mdns");
     let (_fixed, target) =
         watch::channel(DialTarget { addresses: addresses.clone(), ..DialTarget::from(url.clone()) });
-    let outcome = keeper.hold(target, &wish, &line).await;
+    let outcome = keeper.keep_link(target, &request, &row).await;
     match &outcome {
         Outcome::Ended { remote, end } => info!(%remote, "link ended: {end}"),
         Outcome::Failed(why) => debug!(%url, "a router on the local network: {why}"),

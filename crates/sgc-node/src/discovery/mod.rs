@@ -49,31 +49,31 @@ pub(crate) struct DialTarget {
     /// Addresses of the host, if known; otherwise the host is looked up.
     pub(crate) addresses: Vec<SocketAddr>,
     /// All URLs of the router, the best first, if it has several. `url` is the first.
-    pub(crate) ways: Vec<LinkUrl>,
+    pub(crate) urls: Vec<LinkUrl>,
 }
 
 impl DialTarget {
     /// Returns the target with these URLs, the best first; `None` without any.
-    pub(crate) fn by(ways: Vec<LinkUrl>) -> Option<Self> {
-        let url = ways.first()?.clone();
-        Some(Self { ways, ..Self::from(url) })
+    pub(crate) fn by(urls: Vec<LinkUrl>) -> Option<Self> {
+        let url = urls.first()?.clone();
+        Some(Self { urls, ..Self::from(url) })
     }
 
     /// Returns all URLs, the best first.
-    pub(crate) fn ways(&self) -> &[LinkUrl] {
-        if self.ways.is_empty() { std::slice::from_ref(&self.url) } else { &self.ways }
+    pub(crate) fn urls(&self) -> &[LinkUrl] {
+        if self.urls.is_empty() { std::slice::from_ref(&self.url) } else { &self.urls }
     }
 
     /// Returns the URLs that are better than this one; none if the target lacks it.
     pub(crate) fn better_than(&self, way: &LinkUrl) -> &[LinkUrl] {
-        let rank = self.ways().iter().position(|other| other == way);
-        &self.ways()[..rank.unwrap_or(0)]
+        let rank = self.urls().iter().position(|other| other == way);
+        &self.urls()[..rank.unwrap_or(0)]
     }
 }
 
 impl From<LinkUrl> for DialTarget {
     fn from(url: LinkUrl) -> Self {
-        Self { url, addresses: Vec::new(), ways: Vec::new() }
+        Self { url, addresses: Vec::new(), urls: Vec::new() }
     }
 }
 
@@ -89,19 +89,19 @@ pub(crate) fn start(
 ) -> Vec<JoinHandle<()>> {
     let mut tasks = Vec::new();
     for (urls, by) in [(configured, "static"), (of_tokens, "token")] {
-        for ways in urls::routers(urls) {
+        for urls in urls::routers(urls) {
             let (keeper, rng) = (keeper.clone(), ChaCha20Rng::from_rng(rng));
-            let Some(target) = DialTarget::by(ways) else { continue };
-            let written = RouterUrl::by(target.ways());
-            tasks.push(tokio::spawn(keep_at(target, keeper, board.line(written, by), rng)));
+            let Some(target) = DialTarget::by(urls) else { continue };
+            let written = RouterUrl::by(target.urls());
+            tasks.push(tokio::spawn(keep_at(target, keeper, board.row(written, by), rng)));
         }
     }
     for url in configured.iter().chain(of_tokens) {
         // One task below serves all entries of the local network.
         let RouterUrl::Srv(domain) = url else { continue };
         let (keeper, rng) = (keeper.clone(), ChaCha20Rng::from_rng(rng));
-        let (line, dns) = (board.line(url, "srv"), keeper.dns.clone());
-        tasks.push(tokio::spawn(srv::keep_one_of(domain.clone(), dns, keeper, line, rng)));
+        let (row, dns) = (board.row(url, "srv"), keeper.dns.clone());
+        tasks.push(tokio::spawn(srv::keep_one_of(domain.clone(), dns, keeper, row, rng)));
     }
     if let Some((local, wanted)) = local {
         let (keeper, rng) = (keeper.clone(), ChaCha20Rng::from_rng(rng));
@@ -114,18 +114,18 @@ pub(crate) fn start(
 pub(crate) async fn keep_at<H: KeepLink>(
     target: impl Into<DialTarget>,
     keeper: H,
-    line: StatusRow,
+    row: StatusRow,
     mut rng: ChaCha20Rng,
 ) {
     let (_fixed, target) = watch::channel(target.into());
     let mut backoff = Backoff::new(BACKOFF_MAX);
     let mut network = keeper.network();
     loop {
-        let outcome = keeper.hold(target.clone(), &LinkRequest::default(), &line).await;
+        let outcome = keeper.keep_link(target.clone(), &LinkRequest::default(), &row).await;
         if keeper.is_over() {
             return;
         }
-        take_note(&outcome, &mut backoff, &line, &mut rng);
+        take_note(&outcome, &mut backoff, &row, &mut rng);
         if pause(&keeper, &outcome, backoff.due(), &mut network).await == Pause::Cut {
             backoff = Backoff::new(BACKOFF_MAX);
         }
@@ -133,24 +133,24 @@ pub(crate) async fn keep_at<H: KeepLink>(
 }
 
 /// Applies the result of an attempt to the back-off and to the status row.
-fn take_note(outcome: &Outcome, backoff: &mut Backoff, line: &StatusRow, rng: &mut ChaCha20Rng) {
+fn take_note(outcome: &Outcome, backoff: &mut Backoff, row: &StatusRow, rng: &mut ChaCha20Rng) {
     let now = Instant::now();
     match outcome {
         Outcome::Ended { remote, end } if place_in_use(end).is_some() => {
             // The control task logs this once, in words for the operator.
             info!(%remote, "link ended: {end}");
-            line.ended(&end.to_string());
+            row.ended(&end.to_string());
             backoff.displaced(now, rng);
         }
         Outcome::Ended { remote, end } => {
             info!(%remote, "link ended: {end}");
-            line.ended(&end.to_string());
+            row.ended(&end.to_string());
             backoff.ended(now, rng);
         }
         Outcome::Failed(why) if why.stands_back() => {
             // Another link exists in its place, or no link can be made.
             info!("{why}; trying again in some minutes");
-            line.noted(&why.to_string());
+            row.noted(&why.to_string());
             backoff.stand_back(now, rng);
         }
         Outcome::Failed(why) => {
@@ -160,7 +160,7 @@ fn take_note(outcome: &Outcome, backoff: &mut Backoff, line: &StatusRow, rng: &m
             } else {
                 debug!("cannot connect: {why}");
             }
-            line.failed(&why.to_string());
+            row.failed(&why.to_string());
             backoff.failed(now, rng);
         }
     }
@@ -168,7 +168,7 @@ fn take_note(outcome: &Outcome, backoff: &mut Backoff, line: &StatusRow, rng: &m
         Outcome::Failed(why) => why.stands_back(),
         Outcome::Ended { end, .. } => place_in_use(end).is_some(),
     };
-    line.waits(backoff.due(), stands_back);
+    row.waits(backoff.due(), stands_back);
 }
 
 /// How a pause ended.

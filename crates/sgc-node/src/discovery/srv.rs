@@ -95,7 +95,7 @@ impl SrvState {
         &mut self,
         domain: &SrvDomain,
         names: &N,
-        line: &StatusRow,
+        row: &StatusRow,
         rng: &mut ChaCha20Rng,
     ) -> bool {
         let asked = names.routers(domain).await;
@@ -112,7 +112,7 @@ impl SrvState {
                 if self.asking.failures() == 0 {
                     warn!("cannot find a router: {why}; asking again until it works");
                 }
-                line.noted(&why.to_string());
+                row.noted(&why.to_string());
                 if why.is_final() {
                     self.answer = None;
                 }
@@ -129,7 +129,7 @@ pub(crate) async fn keep_one_of<N: Names, H: KeepLink>(
     domain: SrvDomain,
     names: N,
     keeper: H,
-    line: StatusRow,
+    row: StatusRow,
     mut rng: ChaCha20Rng,
 ) {
     let mut known =
@@ -138,8 +138,8 @@ pub(crate) async fn keep_one_of<N: Names, H: KeepLink>(
     let mut network = keeper.network();
     loop {
         if known.expires <= Instant::now() {
-            line.looking_up();
-            known.ask(&domain, &names, &line, &mut rng).await;
+            row.looking_up();
+            known.ask(&domain, &names, &row, &mut rng).await;
         }
         let targets = known.answer.as_ref().map(|answer| in_order(&answer.targets, &mut rng));
         let targets = targets.unwrap_or_default();
@@ -151,13 +151,13 @@ pub(crate) async fn keep_one_of<N: Names, H: KeepLink>(
                 continue;
             }
             let outcome = match dial_target(&target, &names).await {
-                Ok(target) => hold(&domain, &mut known, target, &names, &keeper, &line, &mut rng).await,
+                Ok(target) => keep_link(&domain, &mut known, target, &names, &keeper, &row, &mut rng).await,
                 Err(failure) => Outcome::Failed(failure),
             };
             if keeper.is_over() {
                 return;
             }
-            take_note(&outcome, backoff, &line, &mut rng);
+            take_note(&outcome, backoff, &row, &mut rng);
             match &outcome {
                 Outcome::Ended { .. } => break,
                 // Another search has a link to a router of the domain.
@@ -178,7 +178,7 @@ pub(crate) async fn keep_one_of<N: Names, H: KeepLink>(
         }
         let next = tried.values().map(|backoff| backoff.due().unwrap_or_else(Instant::now)).min();
         let next = next.map_or(known.expires, |next| next.min(known.expires));
-        line.waits(Some(next), false);
+        row.waits(Some(next), false);
         tokio::select! {
             () = sleep_until(next) => {}
             () = another_network(&mut network) => {
@@ -200,20 +200,20 @@ async fn dial_target<N: Names>(target: &SrvTarget, names: &N) -> Result<DialTarg
 
 /// Keeps a link to a target and meanwhile asks DNS whether the target is still listed. If not, the link moves to a
 /// listed target. While none can be reached, the link stays.
-async fn hold<N: Names, H: KeepLink>(
+async fn keep_link<N: Names, H: KeepLink>(
     domain: &SrvDomain,
     known: &mut SrvState,
     first: DialTarget,
     names: &N,
     keeper: &H,
-    line: &StatusRow,
+    row: &StatusRow,
     rng: &mut ChaCha20Rng,
 ) -> Outcome {
     let (move_to, at) = watch::channel(first);
     let refresh = async {
         loop {
             sleep_until(known.expires).await;
-            if !known.ask(domain, names, line, rng).await {
+            if !known.ask(domain, names, row, rng).await {
                 continue;
             }
             let targets =
@@ -224,16 +224,20 @@ async fn hold<N: Names, H: KeepLink>(
             }
             for target in targets {
                 if let Ok(target) = dial_target(&target, names).await {
-                    info!("{} no longer names {now}; moving to {}", RouterUrl::Srv(domain.clone()), target.url);
+                    info!(
+                        "{} no longer names {now}; moving to {}",
+                        RouterUrl::Srv(domain.clone()),
+                        target.url
+                    );
                     move_to.send_replace(target);
                     break;
                 }
             }
         }
     };
-    let wish = LinkRequest::default();
+    let request = LinkRequest::default();
     tokio::select! {
-        outcome = keeper.hold(at, &wish, line) => outcome,
+        outcome = keeper.keep_link(at, &request, row) => outcome,
         never = refresh => never,
     }
 }

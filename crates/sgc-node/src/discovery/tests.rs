@@ -91,17 +91,17 @@ impl World {
     fn keep_one(&self) -> (JoinHandle<()>, Board) {
         let RouterUrl::Srv(domain) = "srv://lab.example".parse().unwrap() else { panic!() };
         let board = Board::default();
-        let line = board.line("srv://lab.example", "srv");
+        let row = board.row("srv://lab.example", "srv");
         let rng = ChaCha20Rng::seed_from_u64(1);
-        (tokio::spawn(srv::keep_one_of(domain, self.clone(), self.clone(), line, rng)), board)
+        (tokio::spawn(srv::keep_one_of(domain, self.clone(), self.clone(), row, rng)), board)
     }
 }
 
 impl KeepLink for World {
-    async fn hold(
+    async fn keep_link(
         &self,
         mut target: watch::Receiver<DialTarget>,
-        wish: &LinkRequest,
+        request: &LinkRequest,
         _line: &StatusRow,
     ) -> Outcome {
         let url = target.borrow_and_update().url.clone();
@@ -119,7 +119,7 @@ impl KeepLink for World {
             Host::Dead => Outcome::Failed(DialError::NoAddress(url).into()),
             Host::Reached(_) => Outcome::Failed(Failure::Reached(NodeId([1; 32]))),
             Host::Up(time) => {
-                let place = wish.places.as_ref().map(|places| places.clone().try_acquire_owned());
+                let place = request.places.as_ref().map(|places| places.clone().try_acquire_owned());
                 if let Some(Err(_)) = place {
                     return Outcome::Failed(Failure::Enough);
                 }
@@ -189,8 +189,8 @@ async fn runs_for(time: Duration, task: impl Future<Output = ()>) {
 async fn a_dead_router_is_dialled_with_growing_patience_and_never_given_up() {
     let world = World::new();
     let board = Board::default();
-    let line = board.line("quic://a", "static");
-    let keep = keep_at(at("a"), world.clone(), line, ChaCha20Rng::seed_from_u64(1));
+    let row = board.row("quic://a", "static");
+    let keep = keep_at(at("a"), world.clone(), row, ChaCha20Rng::seed_from_u64(1));
     runs_for(200 * SECOND, keep).await;
     let dialled = world.dialled();
     let waits: Vec<_> = dialled.windows(2).map(|two| (two[1].0 - two[0].0).as_millis()).collect();
@@ -205,8 +205,8 @@ async fn a_dead_router_is_dialled_with_growing_patience_and_never_given_up() {
 #[tokio::test(start_paused = true)]
 async fn failed_target_is_retried_soon_after_a_network_change() {
     let world = World::new();
-    let line = Board::default().line("quic://a", "static");
-    let task = tokio::spawn(keep_at(at("a"), world.clone(), line, ChaCha20Rng::seed_from_u64(1)));
+    let row = Board::default().row("quic://a", "static");
+    let task = tokio::spawn(keep_at(at("a"), world.clone(), row, ChaCha20Rng::seed_from_u64(1)));
     sleep(100 * SECOND).await;
     world.set("a", Host::Up(3600 * SECOND));
     let changed = world.start.elapsed();
@@ -217,8 +217,8 @@ async fn failed_target_is_retried_soon_after_a_network_change() {
     task.abort();
     // The network changes all the time.
     let world = World::new();
-    let line = Board::default().line("quic://a", "static");
-    let task = tokio::spawn(keep_at(at("a"), world.clone(), line, ChaCha20Rng::seed_from_u64(1)));
+    let row = Board::default().row("quic://a", "static");
+    let task = tokio::spawn(keep_at(at("a"), world.clone(), row, ChaCha20Rng::seed_from_u64(1)));
     for _ in 0..10_000 {
         sleep(SECOND / 1000).await;
         world.network.0.send_modify(|change| *change += 1);
@@ -249,9 +249,9 @@ async fn nodes_that_lose_one_router_come_back_at_different_moments() {
     for seed in 0..20 {
         let world = World::new();
         world.set("a", Host::Up(SECOND));
-        let line = Board::default().line("quic://a", "static");
+        let row = Board::default().row("quic://a", "static");
         let rng = ChaCha20Rng::seed_from_u64(seed);
-        runs_for(2 * SECOND, keep_at(at("a"), world.clone(), line, rng)).await;
+        runs_for(2 * SECOND, keep_at(at("a"), world.clone(), row, rng)).await;
         second.insert(world.dialled()[1].0.as_millis());
     }
     assert!(second.len() > 10 && second.iter().all(|at| (1125..=1253).contains(at)), "{second:?}");
@@ -349,8 +349,8 @@ async fn last_dns_answer_serves_while_dns_is_silent_until_it_denies() {
     *world.answer.lock().unwrap() = Err(DnsError::NotOffered { name: "_sgc._udp.lab.example".into() });
     sleep(60 * SECOND).await;
     assert_eq!((world.hosts_dialled(), world.up()), ("aa".into(), vec![]));
-    let line = &board.snapshot()[0];
-    assert!(line.last_failure.as_ref().is_some_and(|why| why.contains("offers no routers")), "{line:?}");
+    let row = &board.snapshot()[0];
+    assert!(row.last_failure.as_ref().is_some_and(|why| why.contains("offers no routers")), "{row:?}");
     // The search goes on asking.
     world.answers(10 * SECOND, &[(10, "a")]);
     sleep(15 * SECOND).await;
@@ -380,9 +380,9 @@ async fn many_announcements_lead_to_two_links_and_at_most_four_dials() {
     let board = Board::default();
     let keeper = world.clone();
     let task = tokio::spawn(async move {
-        let line = board.line("mdns://", "mdns");
+        let row = board.row("mdns://", "mdns");
         let wanted = RouterFilter { written: "mdns://".into(), nodes: None };
-        mdns::keep_links(heard, wanted, keeper, &board, &line, ChaCha20Rng::seed_from_u64(1)).await;
+        mdns::keep_links(heard, wanted, keeper, &board, &row, ChaCha20Rng::seed_from_u64(1)).await;
     });
     let ip = |n: u8| format!("10.0.0.{n}");
     for n in 1..=20u8 {
@@ -418,9 +418,9 @@ async fn a_router_that_is_reached_otherwise_is_dialled_again_when_it_no_longer_i
     let board = Board::default();
     let keeper = world.clone();
     let task = tokio::spawn(async move {
-        let line = board.line("mdns://", "mdns");
+        let row = board.row("mdns://", "mdns");
         let wanted = RouterFilter { written: "mdns://".into(), nodes: None };
-        mdns::keep_links(heard, wanted, keeper, &board, &line, ChaCha20Rng::seed_from_u64(1)).await;
+        mdns::keep_links(heard, wanted, keeper, &board, &row, ChaCha20Rng::seed_from_u64(1)).await;
     });
     world.set("10.0.0.1", Host::Reached(50 * SECOND));
     let addresses = vec![SocketAddr::from(([10, 0, 0, 1], 7447))];

@@ -44,12 +44,12 @@ pub(crate) fn routers<'u>(urls: impl IntoIterator<Item = &'u RouterUrl>) -> Vec<
     let mut open = Vec::new();
     for url in urls {
         match url {
-            RouterUrl::Ways(ways) => routers.push(ways.clone()),
+            RouterUrl::Ways(urls) => routers.push(urls.clone()),
             RouterUrl::At(url) => {
                 let is_same = |at: &&usize| {
-                    let ways = &routers[**at];
-                    let is_new = ways.iter().all(|way: &LinkUrl| way.scheme != url.scheme);
-                    is_new && ways.len() < WAYS_MAX && ways.first().is_some_and(|way| way.host == url.host)
+                    let urls = &routers[**at];
+                    let is_new = urls.iter().all(|way: &LinkUrl| way.scheme != url.scheme);
+                    is_new && urls.len() < WAYS_MAX && urls.first().is_some_and(|way| way.host == url.host)
                 };
                 match open.iter().find(is_same) {
                     Some(at) => routers[*at].push(url.clone()),
@@ -76,7 +76,7 @@ pub(crate) struct SkippedUrl {
 /// when the earlier ones have failed, or when the last one has been silent for [`SILENT_AFTER`]. Once one has failed,
 /// attempts that stay silent for [`SILENT_MAX`] more are abandoned and not listed.
 pub(crate) async fn first<T, E, F>(
-    ways: &[LinkUrl],
+    urls: &[LinkUrl],
     mut dial: impl FnMut(LinkUrl) -> F,
 ) -> Result<(T, LinkUrl, Vec<SkippedUrl>), Vec<(LinkUrl, E)>>
 where
@@ -84,7 +84,7 @@ where
     E: std::fmt::Display + Send + 'static,
     F: Future<Output = Result<T, E>> + Send + 'static,
 {
-    let mut rest = ways.iter();
+    let mut rest = urls.iter();
     let mut begun: Vec<&LinkUrl> = Vec::new();
     let mut racing = JoinSet::new();
     let mut failed: Vec<(LinkUrl, E)> = Vec::new();
@@ -207,17 +207,17 @@ impl WorkingUrls {
     }
 
     /// Returns the order of attempts: the URL that worked last, then the others as the user listed them.
-    pub(crate) fn in_order(&self, ways: &[LinkUrl]) -> Vec<LinkUrl> {
-        let last = ways.first().and_then(|best| self.worked().get(&best.to_string()).cloned());
+    pub(crate) fn in_order(&self, urls: &[LinkUrl]) -> Vec<LinkUrl> {
+        let last = urls.first().and_then(|best| self.worked().get(&best.to_string()).cloned());
         let (mut ordered, rest): (Vec<_>, Vec<_>) =
-            ways.iter().cloned().partition(|way| last.as_ref().is_some_and(|last| *last == way.to_string()));
+            urls.iter().cloned().partition(|way| last.as_ref().is_some_and(|last| *last == way.to_string()));
         ordered.extend(rest);
         ordered
     }
 
     /// Notes that this URL works.
-    pub(crate) fn worked_by(&self, ways: &[LinkUrl], way: &LinkUrl) {
-        let Some(best) = ways.first() else { return };
+    pub(crate) fn worked_by(&self, urls: &[LinkUrl], way: &LinkUrl) {
+        let Some(best) = urls.first() else { return };
         let mut worked = self.worked();
         let (best, way) = (best.to_string(), way.to_string());
         // The best URL is tried first anyway, so it needs no entry.
@@ -274,7 +274,7 @@ mod tests {
         LinkUrl { scheme, host: host.into(), port: 7447, path: None, cost_ms: None }
     }
 
-    fn ways(schemes: &[Scheme]) -> Vec<LinkUrl> {
+    fn urls(schemes: &[Scheme]) -> Vec<LinkUrl> {
         schemes.iter().map(|scheme| way(*scheme, "r")).collect()
     }
 
@@ -284,9 +284,9 @@ mod tests {
     /// Returns the winner, its time, and the explanations for the others.
     async fn race(does: &[Does]) -> Result<(Scheme, u128, Vec<String>), Vec<String>> {
         let start = Instant::now();
-        let ways: Vec<_> = does.iter().map(|(scheme, _)| way(*scheme, "r")).collect();
+        let urls: Vec<_> = does.iter().map(|(scheme, _)| way(*scheme, "r")).collect();
         let does = does.to_vec();
-        let made = first(&ways, |way| {
+        let made = first(&urls, |way| {
             let (_, does) = *does.iter().find(|(scheme, _)| *scheme == way.scheme).unwrap();
             async move {
                 sleep(Duration::from_millis(does.unwrap_or_else(|after| after))).await;
@@ -334,8 +334,8 @@ mod tests {
         let two = of(&[at(Quic, "a"), at(Quic, "a"), at(Tls, "a"), at(Tls, "a")]);
         assert_eq!(
             two,
-            [ways(&[Quic, Tls]), ways(&[Quic, Tls])].map(|ways| {
-                ways.into_iter().map(|way| LinkUrl { host: "a".into(), ..way }).collect::<Vec<_>>()
+            [urls(&[Quic, Tls]), urls(&[Quic, Tls])].map(|urls| {
+                urls.into_iter().map(|way| LinkUrl { host: "a".into(), ..way }).collect::<Vec<_>>()
             })
         );
         let written = RouterUrl::Ways(vec![way(Quic, "a"), way(Tls, "b")]);
@@ -366,7 +366,7 @@ mod tests {
         use Scheme::{Quic, Tls, Wss};
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join(FILE);
-        let ways = ways(&[Quic, Tls, Wss]);
+        let urls = urls(&[Quic, Tls, Wss]);
         let written = async |until: &str| {
             let arrives = async {
                 while std::fs::read_to_string(&path).ok().as_deref() != Some(until) {
@@ -376,14 +376,14 @@ mod tests {
             tokio::time::timeout(Duration::from_secs(30), arrives).await.expect(until);
         };
         let order =
-            |book: &WorkingUrls| book.in_order(&ways).iter().map(|way| way.scheme).collect::<Vec<_>>();
+            |book: &WorkingUrls| book.in_order(&urls).iter().map(|way| way.scheme).collect::<Vec<_>>();
         let book = WorkingUrls::open(Some(dir.path()));
         assert_eq!(order(&book), [Quic, Tls, Wss]);
-        book.worked_by(&ways, &ways[1]);
+        book.worked_by(&urls, &urls[1]);
         written("quic://r:7447 tls://r:7447\n").await;
         let next = WorkingUrls::open(Some(dir.path()));
         assert_eq!(order(&next), [Tls, Quic, Wss]);
-        next.worked_by(&ways, &ways[0]);
+        next.worked_by(&urls, &urls[0]);
         written("").await;
         assert_eq!(order(&WorkingUrls::open(Some(dir.path()))), [Quic, Tls, Wss]);
         // The file influences the order only.
@@ -395,8 +395,8 @@ mod tests {
     async fn the_book_is_bounded() {
         let book = WorkingUrls::default();
         for n in 0..2 * KEPT_MAX {
-            let ways = [way(Scheme::Quic, &format!("r{n}")), way(Scheme::Tls, &format!("r{n}"))];
-            book.worked_by(&ways, &ways[1]);
+            let urls = [way(Scheme::Quic, &format!("r{n}")), way(Scheme::Tls, &format!("r{n}"))];
+            book.worked_by(&urls, &urls[1]);
         }
         assert_eq!(book.worked().len(), KEPT_MAX);
     }
