@@ -40,24 +40,24 @@ impl Calls {
     /// Returns the ledger of lost calls.
     pub(crate) fn ledger(&self) -> &CallLedger {
         match self {
-            Self::LocalService(served) => &served.ledger,
-            Self::FarService(called) => &called.ledger,
+            Self::LocalService(local) => &local.ledger,
+            Self::FarService(far) => &far.ledger,
         }
     }
 
     /// Ends the service: open calls stay without an answer.
     pub(crate) fn withdraw(&self) {
         match self {
-            Self::LocalService(served) => {
-                served.lock().answerer.withdraw();
-                served.count_lost();
+            Self::LocalService(local) => {
+                local.lock().answerer.withdraw();
+                local.count_lost();
             }
-            Self::FarService(called) => {
-                let mut state = called.lock();
+            Self::FarService(far) => {
+                let mut state = far.lock();
                 state.closed = true;
                 state.caller.withdraw();
                 drop(state);
-                called.count_lost();
+                far.count_lost();
             }
         }
         self.ledger().add_past(self.stats());
@@ -66,23 +66,23 @@ impl Calls {
     /// Returns the statistics of its calls.
     pub(crate) fn stats(&self) -> CallStats {
         match self {
-            Self::LocalService(served) => served.lock().answerer.stats(),
-            Self::FarService(called) => called.lock().caller.stats(),
+            Self::LocalService(local) => local.lock().answerer.stats(),
+            Self::FarService(far) => far.lock().caller.stats(),
         }
     }
 
     /// Closes it. Nothing waits for a local endpoint any more; the present one is returned.
     pub(crate) fn close(&self) -> Option<Box<dyn std::any::Any + Send>> {
         match self {
-            Self::LocalService(served) => {
-                served.lock().closed = true;
-                served.ready.notify_all();
-                served.set_client(None)
+            Self::LocalService(local) => {
+                local.lock().closed = true;
+                local.ready.notify_all();
+                local.set_client(None)
             }
-            Self::FarService(called) => {
-                called.lock().closed = true;
-                called.ready.notify_all();
-                called.set_server(None)
+            Self::FarService(far) => {
+                far.lock().closed = true;
+                far.ready.notify_all();
+                far.set_server(None)
             }
         }
     }

@@ -57,7 +57,7 @@ impl FileWatch {
         let Self { file, mut files, mut seen } = self;
         let mut bell = Bell::new(seen.directories.clone())?;
         loop {
-            let found = look_aside(&files).await?;
+            let found = look_blocking(&files).await?;
             if found.directories != bell.directories {
                 bell = Bell::new(found.directories.clone())?;
                 // A change may have preceded the watch.
@@ -127,7 +127,7 @@ fn look(files: &[PathBuf]) -> Look {
 }
 
 /// Looks at the files on a blocking thread.
-async fn look_aside(files: &[PathBuf]) -> io::Result<Look> {
+async fn look_blocking(files: &[PathBuf]) -> io::Result<Look> {
     let files = files.to_vec();
     tokio::task::spawn_blocking(move || look(&files)).await.map_err(io::Error::other)
 }

@@ -122,7 +122,7 @@ pub(crate) async fn keep_renewed(
     let mut doubted = None;
     loop {
         let next = async {
-            let climbs = match failures {
+            let fails_back = match failures {
                 _ if is_wanted => false,
                 None => tokio::select! {
                     () = changed(&mut redial) => false,
@@ -134,7 +134,7 @@ pub(crate) async fn keep_renewed(
                     false
                 }
             };
-            let dialled = if climbs {
+            let dialled = if fails_back {
                 let target = target.borrow().clone();
                 keeper.dial_first(target.better_than(&url)).await.map(|dialled| (dialled, target))
             } else {
@@ -148,7 +148,7 @@ pub(crate) async fn keep_renewed(
                 let claim = keeper.claim_again(&dialled.link, &claim)?;
                 Ok((dialled, target, claim))
             };
-            dialled.and_then(claimed).map_err(|why| (why, climbs))
+            dialled.and_then(claimed).map_err(|why| (why, fails_back))
         };
         tokio::select! {
             end = current.end(core) => return end,
@@ -178,9 +178,9 @@ pub(crate) async fn keep_renewed(
             dialled = next => match dialled {
                 Ok((dialled, target, other)) => {
                     (is_wanted, doubted) = (false, None);
-                    let DialledLink { link, url: way, passed } = dialled;
+                    let DialledLink { link, url: new_url, passed } = dialled;
                     let node = link.peer().node_id;
-                    let next = serve(link, &way).await;
+                    let next = serve(link, &new_url).await;
                     tokio::select! {
                         () = next.settled() => {
                             failures = None;
@@ -197,10 +197,10 @@ pub(crate) async fn keep_renewed(
                             (current, failures) = (next, None);
                         }
                     }
-                    keeper.linked(&target, &way, &passed, &node, row);
-                    failback = failback_from(&target, &way, &mut rng);
+                    keeper.linked(&target, &new_url, &passed, &node, row);
+                    failback = failback_from(&target, &new_url, &mut rng);
                     origin = Origin::from_remote(current.link.remote());
-                    url = way;
+                    url = new_url;
                     if let Some(other) = other {
                         claim = other;
                     }

@@ -1065,7 +1065,7 @@ mod tests {
         }
 
         fn kept(&self, bytes: usize) -> Option<u32> {
-            // Long messages count double.
+            // Half as many long messages are kept.
             self.kept.map(|kept| if bytes > 1000 { kept / 2 } else { kept })
         }
 

@@ -210,9 +210,9 @@ struct RotatedFiles {
 
 impl RotatedFiles {
     fn list(path: &Path) -> io::Result<Self> {
-        let mut aside = Self::default();
+        let mut rotated = Self::default();
         let entries = match fs::read_dir(directory(path)) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(aside),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(rotated),
             entries => entries?,
         };
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -234,7 +234,7 @@ impl RotatedFiles {
             let date = plain.strip_prefix('-').filter(is_date).map(str::to_owned);
             match (number, date) {
                 (None, None) => {}
-                _ if is_compressed => aside.unread.files.push(entry.path()),
+                _ if is_compressed => rotated.unread.files.push(entry.path()),
                 (Some(number), _) => numbered.push((number, entry.path())),
                 (None, Some(date)) => dated.push((date, entry.path())),
             }
@@ -242,9 +242,9 @@ impl RotatedFiles {
         numbered.sort();
         dated.sort();
         let dated = dated.into_iter().rev().map(|(_, path)| path);
-        aside.files = numbered.into_iter().map(|(_, path)| path).chain(dated).collect();
-        aside.unread.files.sort();
-        Ok(aside)
+        rotated.files = numbered.into_iter().map(|(_, path)| path).chain(dated).collect();
+        rotated.unread.files.sort();
+        Ok(rotated)
     }
 }
 
