@@ -132,12 +132,12 @@ impl StatusRow {
 
     /// Shows why URLs that are better than the one in use were skipped.
     pub(crate) fn passed_over(&self, better: &[LinkUrl], passed: &[SkippedUrl]) {
-        let of = |way: &LinkUrl| {
-            let why = passed.iter().find(|passed| passed.way == *way).map(|passed| passed.why.as_str());
+        let of = |url: &LinkUrl| {
+            let why = passed.iter().find(|passed| passed.url == *url).map(|passed| passed.why.as_str());
             // Messages of the transport already begin with the URL.
             let why = why.unwrap_or("did not work last time");
-            let why = why.strip_prefix(&format!("{way}: ")).unwrap_or(why);
-            format!("{}: {why}", way.scheme)
+            let why = why.strip_prefix(&format!("{url}: ")).unwrap_or(why);
+            format!("{}: {why}", url.scheme)
         };
         let why = better.iter().map(of).collect::<Vec<_>>().join("; ");
         self.change(|row, _| row.why_not_first = (!better.is_empty()).then_some(why));

@@ -137,9 +137,9 @@ impl LinkKeeper {
 
     /// Dials these URLs and returns the first link that succeeds.
     pub(crate) async fn dial_first(&self, urls: &[LinkUrl]) -> Result<DialledLink, Failure> {
-        let dial = |way: LinkUrl| {
+        let dial = |url: LinkUrl| {
             let keeper = self.clone();
-            async move { keeper.dial_url(&way, &[]).await }
+            async move { keeper.dial_url(&url, &[]).await }
         };
         let (link, url, passed) = urls::first(urls, dial).await.map_err(Failure::Ways)?;
         Ok(DialledLink { link, url, passed })

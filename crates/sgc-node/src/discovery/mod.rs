@@ -65,8 +65,8 @@ impl DialTarget {
     }
 
     /// Returns the URLs that are better than this one; none if the target lacks it.
-    pub(crate) fn better_than(&self, way: &LinkUrl) -> &[LinkUrl] {
-        let rank = self.urls().iter().position(|other| other == way);
+    pub(crate) fn better_than(&self, url: &LinkUrl) -> &[LinkUrl] {
+        let rank = self.urls().iter().position(|other| other == url);
         &self.urls()[..rank.unwrap_or(0)]
     }
 }

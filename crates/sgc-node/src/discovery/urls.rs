@@ -48,8 +48,10 @@ pub(crate) fn routers<'u>(urls: impl IntoIterator<Item = &'u RouterUrl>) -> Vec<
             RouterUrl::At(url) => {
                 let is_same = |at: &&usize| {
                     let urls = &routers[**at];
-                    let is_new = urls.iter().all(|way: &LinkUrl| way.scheme != url.scheme);
-                    is_new && urls.len() < WAYS_MAX && urls.first().is_some_and(|way| way.host == url.host)
+                    let is_new = urls.iter().all(|other: &LinkUrl| other.scheme != url.scheme);
+                    is_new
+                        && urls.len() < WAYS_MAX
+                        && urls.first().is_some_and(|other| other.host == url.host)
                 };
                 match open.iter().find(is_same) {
                     Some(at) => routers[*at].push(url.clone()),
@@ -68,7 +70,7 @@ pub(crate) fn routers<'u>(urls: impl IntoIterator<Item = &'u RouterUrl>) -> Vec<
 /// A URL that was skipped, and the reason.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct SkippedUrl {
-    pub(crate) way: LinkUrl,
+    pub(crate) url: LinkUrl,
     pub(crate) why: String,
 }
 
@@ -91,10 +93,10 @@ where
     let mut give_up = None;
     loop {
         match rest.next() {
-            Some(way) => {
-                begun.push(way);
-                let (attempt, way) = (dial(way.clone()), way.clone());
-                racing.spawn(async move { (way, attempt.await) });
+            Some(url) => {
+                begun.push(url);
+                let (attempt, url) = (dial(url.clone()), url.clone());
+                racing.spawn(async move { (url, attempt.await) });
             }
             None if racing.is_empty() => return Err(failed),
             None => {}
@@ -109,18 +111,18 @@ where
             biased;
             Some(done) = racing.join_next() => match done {
                 // The other attempts end with the set.
-                Ok((way, Ok(made))) => {
-                    let others = begun.into_iter().filter(|other| **other != way);
+                Ok((url, Ok(made))) => {
+                    let others = begun.into_iter().filter(|other| **other != url);
                     let passed = others.map(|other| {
                         let error = failed.iter().find(|(failed, _)| failed == other);
                         let why = error.map_or_else(|| silence(other), |(_, error)| error.to_string());
-                        SkippedUrl { way: other.clone(), why }
+                        SkippedUrl { url: other.clone(), why }
                     });
                     let passed = passed.collect();
-                    return Ok((made, way, passed));
+                    return Ok((made, url, passed));
                 }
-                Ok(failure) => if let (way, Err(error)) = failure {
-                    failed.push((way, error));
+                Ok(failure) => if let (url, Err(error)) = failure {
+                    failed.push((url, error));
                 },
                 Err(error) => tracing::error!(%error, "an attempt to connect ended abnormally"),
             },
@@ -131,9 +133,9 @@ where
 }
 
 /// Returns the explanation for a silent URL.
-fn silence(way: &LinkUrl) -> String {
+fn silence(url: &LinkUrl) -> String {
     let silent = format!("no answer within {:.1} s", SILENT_AFTER.as_secs_f64());
-    if is_over_udp(way.scheme) { format!("{silent}; is UDP blocked?") } else { silent }
+    if is_over_udp(url.scheme) { format!("{silent}; is UDP blocked?") } else { silent }
 }
 
 /// Returns `true` if a transport uses UDP.
@@ -199,7 +201,7 @@ impl WorkingUrls {
         });
         let lines = text.iter().flat_map(|text| text.lines());
         let worked = lines.filter_map(|line| line.split_once(' ')).take(KEPT_MAX);
-        let worked: BTreeMap<_, _> = worked.map(|(best, way)| (best.to_owned(), way.to_owned())).collect();
+        let worked: BTreeMap<_, _> = worked.map(|(best, url)| (best.to_owned(), url.to_owned())).collect();
         let (write, asked) = watch::channel(());
         let book = Self { worked: Arc::new(Mutex::new(worked)), write: Some(write) };
         tokio::spawn(keep_written(path, book.worked.clone(), asked));
@@ -210,23 +212,23 @@ impl WorkingUrls {
     pub(crate) fn in_order(&self, urls: &[LinkUrl]) -> Vec<LinkUrl> {
         let last = urls.first().and_then(|best| self.worked().get(&best.to_string()).cloned());
         let (mut ordered, rest): (Vec<_>, Vec<_>) =
-            urls.iter().cloned().partition(|way| last.as_ref().is_some_and(|last| *last == way.to_string()));
+            urls.iter().cloned().partition(|url| last.as_ref().is_some_and(|last| *last == url.to_string()));
         ordered.extend(rest);
         ordered
     }
 
     /// Notes that this URL works.
-    pub(crate) fn worked_by(&self, urls: &[LinkUrl], way: &LinkUrl) {
+    pub(crate) fn worked_by(&self, urls: &[LinkUrl], url: &LinkUrl) {
         let Some(best) = urls.first() else { return };
         let mut worked = self.worked();
-        let (best, way) = (best.to_string(), way.to_string());
+        let (best, url) = (best.to_string(), url.to_string());
         // The best URL is tried first anyway, so it needs no entry.
-        let is_news = if best == way {
+        let is_news = if best == url {
             worked.remove(&best).is_some()
         } else if worked.len() >= KEPT_MAX && !worked.contains_key(&best) {
             false
         } else {
-            worked.insert(best, way.clone()).is_none_or(|before| before != way)
+            worked.insert(best, url.clone()).is_none_or(|before| before != url)
         };
         drop(worked);
         if let Some(write) = self.write.as_ref().filter(|_| is_news) {
@@ -249,7 +251,7 @@ async fn keep_written(
         let (path, worked) = (path.clone(), worked.clone());
         let write = move || {
             let known = worked.lock().unwrap_or_else(PoisonError::into_inner).clone();
-            let text: String = known.iter().map(|(best, way)| format!("{best} {way}\n")).collect();
+            let text: String = known.iter().map(|(best, url)| format!("{best} {url}\n")).collect();
             match state::replace(&path, text.as_bytes()) {
                 Ok(()) => debug!(path = %path.display(), "saved the URLs of routers that work"),
                 Err(error) => {
@@ -270,12 +272,12 @@ mod tests {
 
     use super::*;
 
-    fn way(scheme: Scheme, host: &str) -> LinkUrl {
+    fn url(scheme: Scheme, host: &str) -> LinkUrl {
         LinkUrl { scheme, host: host.into(), port: 7447, path: None, cost_ms: None }
     }
 
     fn urls(schemes: &[Scheme]) -> Vec<LinkUrl> {
-        schemes.iter().map(|scheme| way(*scheme, "r")).collect()
+        schemes.iter().map(|scheme| url(*scheme, "r")).collect()
     }
 
     /// Behaviour of a URL: success or failure after milliseconds. An error after a year is silence.
@@ -284,21 +286,21 @@ mod tests {
     /// Returns the winner, its time, and the explanations for the others.
     async fn race(does: &[Does]) -> Result<(Scheme, u128, Vec<String>), Vec<String>> {
         let start = Instant::now();
-        let urls: Vec<_> = does.iter().map(|(scheme, _)| way(*scheme, "r")).collect();
+        let urls: Vec<_> = does.iter().map(|(scheme, _)| url(*scheme, "r")).collect();
         let does = does.to_vec();
-        let made = first(&urls, |way| {
-            let (_, does) = *does.iter().find(|(scheme, _)| *scheme == way.scheme).unwrap();
+        let made = first(&urls, |url| {
+            let (_, does) = *does.iter().find(|(scheme, _)| *scheme == url.scheme).unwrap();
             async move {
                 sleep(Duration::from_millis(does.unwrap_or_else(|after| after))).await;
                 does.map(|_| ()).map_err(|_| "refused")
             }
         });
         let said =
-            |passed: Vec<SkippedUrl>| passed.into_iter().map(|p| format!("{}: {}", p.way.scheme, p.why));
+            |passed: Vec<SkippedUrl>| passed.into_iter().map(|p| format!("{}: {}", p.url.scheme, p.why));
         match made.await {
-            Ok(((), way, passed)) => Ok((way.scheme, start.elapsed().as_millis(), said(passed).collect())),
+            Ok(((), url, passed)) => Ok((url.scheme, start.elapsed().as_millis(), said(passed).collect())),
             Err(failed) => {
-                Err(failed.into_iter().map(|(way, why)| format!("{}: {why}", way.scheme)).collect())
+                Err(failed.into_iter().map(|(url, why)| format!("{}: {why}", url.scheme)).collect())
             }
         }
     }
@@ -326,20 +328,20 @@ mod tests {
     #[test]
     fn entries_of_one_host_with_other_transports_are_one_router() {
         use Scheme::{Quic, Tls};
-        let at = |scheme, host: &str| RouterUrl::At(way(scheme, host));
+        let at = |scheme, host: &str| RouterUrl::At(url(scheme, host));
         let of = |urls: &[RouterUrl]| routers(urls);
         let one = of(&[at(Quic, "a"), at(Quic, "b"), at(Tls, "a")]);
-        assert_eq!(one, [vec![way(Quic, "a"), way(Tls, "a")], vec![way(Quic, "b")]]);
+        assert_eq!(one, [vec![url(Quic, "a"), url(Tls, "a")], vec![url(Quic, "b")]]);
         // A second entry of one transport is another router, and later entries may belong to it.
         let two = of(&[at(Quic, "a"), at(Quic, "a"), at(Tls, "a"), at(Tls, "a")]);
         assert_eq!(
             two,
             [urls(&[Quic, Tls]), urls(&[Quic, Tls])].map(|urls| {
-                urls.into_iter().map(|way| LinkUrl { host: "a".into(), ..way }).collect::<Vec<_>>()
+                urls.into_iter().map(|url| LinkUrl { host: "a".into(), ..url }).collect::<Vec<_>>()
             })
         );
-        let written = RouterUrl::Ways(vec![way(Quic, "a"), way(Tls, "b")]);
-        assert_eq!(of(&[written, at(Tls, "a")]), [vec![way(Quic, "a"), way(Tls, "b")], vec![way(Tls, "a")]]);
+        let written = RouterUrl::Ways(vec![url(Quic, "a"), url(Tls, "b")]);
+        assert_eq!(of(&[written, at(Tls, "a")]), [vec![url(Quic, "a"), url(Tls, "b")], vec![url(Tls, "a")]]);
     }
 
     #[tokio::test(start_paused = true)]
@@ -376,7 +378,7 @@ mod tests {
             tokio::time::timeout(Duration::from_secs(30), arrives).await.expect(until);
         };
         let order =
-            |book: &WorkingUrls| book.in_order(&urls).iter().map(|way| way.scheme).collect::<Vec<_>>();
+            |book: &WorkingUrls| book.in_order(&urls).iter().map(|url| url.scheme).collect::<Vec<_>>();
         let book = WorkingUrls::open(Some(dir.path()));
         assert_eq!(order(&book), [Quic, Tls, Wss]);
         book.worked_by(&urls, &urls[1]);
@@ -395,7 +397,7 @@ mod tests {
     async fn the_book_is_bounded() {
         let book = WorkingUrls::default();
         for n in 0..2 * KEPT_MAX {
-            let urls = [way(Scheme::Quic, &format!("r{n}")), way(Scheme::Tls, &format!("r{n}"))];
+            let urls = [url(Scheme::Quic, &format!("r{n}")), url(Scheme::Tls, &format!("r{n}"))];
             book.worked_by(&urls, &urls[1]);
         }
         assert_eq!(book.worked().len(), KEPT_MAX);
