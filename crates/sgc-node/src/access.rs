@@ -1,8 +1,8 @@
-//! Who may connect to this node's gateway: from what the user wrote, and the tokens that were made and revoked, to an
-//! [`Access`].
+//! Access to this node's gateway: builds an [`Access`] from the configuration and from the access tokens that were made
+//! and revoked.
 //!
-//! It decides nothing: the gateway does, when somebody connects. What was made is kept in the state directory, so that it can
-//! be shown and taken back; a token holds without that, since the node signed it.
+//! The gateway decides when a client connects. Records of tokens are kept in the state directory, so that users can
+//! list and revoke them. A token is valid without its record, since the node signed it.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -22,18 +22,17 @@ use crate::partners::{PartnerError, Partners};
 use crate::policy;
 use crate::records::{self, Records};
 
-/// Most tokens of one node that have not ended, revoked ones among them.
+/// Most tokens of one node that have not expired, revoked ones included.
 pub const ACCESS_TOKENS_MAX: usize = 1024;
-/// Largest file of tokens made, bytes: that many with the largest scopes fit.
+/// Largest file of records, bytes. It holds that many tokens with the largest scopes.
 const RECORDS_BYTES_MAX: u64 = 16 * 1024 * 1024;
 const RECORDS_FILE: &str = "access.json";
 const RECORDS_VERSION: u32 = 1;
-/// Fewest digits that stand for a token.
+/// Fewest digits that abbreviate a token id.
 const PREFIX_DIGITS_MIN: usize = 4;
 
-/// Who may connect to the gateway of `config`, and what they may do; `None` if it has none. The CAs are those that the
-/// configuration names, with the revocation lists kept in the state directory: a running node that knows newer ones hands them
-/// on with [`Access::with_anchors`].
+/// Returns the access rules for the gateway of `config`; `None` if it has none. The CAs are those of the configuration,
+/// with the revocation lists of the state directory. A running node passes newer lists with [`Access::with_anchors`].
 pub fn access_of(
     config: &Config,
     identity: &Identity,
@@ -47,7 +46,7 @@ pub fn access_of(
     access_with(config, identity, &partners, state, now)
 }
 
-/// The same for partners that were read already.
+/// Returns the access rules with partners that were loaded before.
 pub fn access_with(
     config: &Config,
     identity: &Identity,
@@ -79,7 +78,7 @@ pub fn access_with(
     })))
 }
 
-/// Writes down each access token that is refused.
+/// Returns a handler that logs each refused access token.
 pub(crate) fn refused_tokens(audit: Audit) -> RefusalListener {
     Arc::new(move |peer, denied| {
         let record = AuditRecord::new(AuditEvent::TokenRefused);
@@ -87,11 +86,12 @@ pub(crate) fn refused_tokens(audit: Audit) -> RefusalListener {
     })
 }
 
-/// The access tokens that a node made, `access.json` in its state directory. No token is in it.
+/// Records of the access tokens that a node made, `access.json` in its state directory. The tokens themselves are not
+/// kept.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AccessRecords {
     version: u32,
-    /// Those that have not ended, in the order in which they were made; ended ones leave when another is added.
+    /// Tokens that have not expired, in order of creation. Expired ones are removed when another is added.
     pub tokens: Vec<AccessRecord>,
 }
 
@@ -101,26 +101,26 @@ impl Default for AccessRecords {
     }
 }
 
-/// One token. The token itself is not kept.
+/// Record of one token, without the token itself.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AccessRecord {
-    /// Which, in hexadecimal digits.
+    /// Token id, hexadecimal digits.
     pub id: String,
-    /// For whom.
+    /// Label for people.
     pub label: String,
     /// Topics that its holder may receive.
     pub subscribe: Vec<String>,
     /// Topics that its holder may publish on.
     pub publish: Vec<String>,
-    /// What its holder may call.
+    /// Services that its holder may call.
     pub call: Vec<String>,
-    /// What its holder may serve.
+    /// Services that its holder may serve.
     pub serve: Vec<String>,
-    /// When it was made, milliseconds since 1970.
+    /// Time of creation, milliseconds since 1970.
     pub created: u64,
-    /// Last moment at which it holds, milliseconds since 1970.
+    /// Last moment of validity, milliseconds since 1970.
     pub expires: u64,
-    /// When it was taken back, milliseconds since 1970.
+    /// Time of revocation, milliseconds since 1970.
     pub revoked: Option<u64>,
 }
 
@@ -142,14 +142,14 @@ impl From<&AccessGrant> for AccessRecord {
 }
 
 impl AccessRecord {
-    /// What its holder may do.
+    /// Returns the rights of its holder.
     pub fn scope(&self) -> Scope {
         let Self { subscribe, publish, call, serve, .. } = self.clone();
         Scope { subscribe, publish, call, serve }
     }
 
-    /// One that is not in the list: made before the state directory was lost, for example. It is kept for as long as any token
-    /// can hold.
+    /// Creates the record of a revoked token that the list lacks, for example because the state directory was lost. It
+    /// is kept for the longest validity of a token.
     fn unknown(id: TokenId, now: UnixMillis) -> Self {
         Self {
             id: id.to_string(),
@@ -181,12 +181,12 @@ impl Records for AccessRecords {
 }
 
 impl AccessRecords {
-    /// Reads them; none if there is no file. One that cannot be read is an error: it may hold what was revoked.
+    /// Loads the records; none if there is no file. An unreadable file is an error, since it may hold revocations.
     pub fn load(state: &Path) -> Result<Self, AccessError> {
         records::load(state)
     }
 
-    /// Changes them on the disk, as nobody else does at the same time.
+    /// Changes the file under its lock.
     pub fn change<T>(
         state: &Path,
         change: impl FnOnce(&mut Self) -> Result<T, AccessError>,
@@ -194,15 +194,15 @@ impl AccessRecords {
         records::change(state, change)
     }
 
-    /// Adds one; those that ended before `now` leave.
+    /// Adds a record and removes those that expired before `now`.
     pub fn add(&mut self, record: AccessRecord, now: UnixMillis) -> Result<(), AccessError> {
         self.make_room(now)?;
         self.tokens.push(record);
         Ok(())
     }
 
-    /// Takes one back: by its id, or by the first digits of that if no other begins so. One that is not in the list needs the
-    /// whole id.
+    /// Revokes a token by its id, or by the first digits if they are unique. A token without a record needs the whole
+    /// id.
     pub fn revoke(&mut self, digits: &str, now: UnixMillis) -> Result<AccessRecord, AccessError> {
         let begins = |record: &AccessRecord| {
             digits.len() >= PREFIX_DIGITS_MIN && record.id.starts_with(digits) && record.expires >= now.0
@@ -223,7 +223,7 @@ impl AccessRecords {
         Ok(record.clone())
     }
 
-    /// Those that were taken back.
+    /// Returns the ids of revoked tokens.
     pub fn revoked(&self) -> Result<impl Iterator<Item = TokenId>, AccessError> {
         let revoked = self.tokens.iter().filter(|record| record.revoked.is_some());
         let id = |record: &AccessRecord| {
@@ -238,32 +238,32 @@ impl AccessRecords {
     }
 }
 
-/// Why it cannot be said who may connect.
+/// Reasons why the access rules cannot be built.
 #[derive(Debug, thiserror::Error)]
 pub enum AccessError {
-    /// Partners.
+    /// The partners are invalid.
     #[error(transparent)]
     Partner(#[from] PartnerError),
-    /// The CAs of partners.
+    /// The CAs of partners are invalid.
     #[error("the CAs that are trusted: {0}")]
     Anchors(#[from] AnchorError),
-    /// The file of tokens made.
+    /// The file of records cannot be used.
     #[error("access tokens made, {}: {source}", path.display())]
     Records {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         source: io::Error,
     },
-    /// One token of it.
+    /// A record is invalid.
     #[error(
         "{RECORDS_FILE} in the state directory has a token {id:?}, which is no id: it was changed by hand; correct it"
     )]
     Record {
-        /// What stands there.
+        /// The invalid id.
         id: String,
     },
-    /// Too many tokens.
+    /// There are too many tokens.
     #[error(
         "{ACCESS_TOKENS_MAX} access tokens have not ended, which is the limit: make them for a shorter time, or name nodes \
          in a [[gateway.client]]"
@@ -275,13 +275,13 @@ pub enum AccessError {
          of one that is not listed"
     )]
     NoSuchToken {
-        /// What was asked for.
+        /// The given digits.
         digits: String,
     },
-    /// Several have.
+    /// Several tokens begin with these digits.
     #[error("several access tokens begin with {digits:?}: add digits; `sgc token list` shows them")]
     Ambiguous {
-        /// What was asked for.
+        /// The given digits.
         digits: String,
     },
 }
@@ -320,7 +320,7 @@ mod tests {
             Self { dir: tempfile::tempdir().unwrap(), gateway, desk: fleet.enroll(&desk, rng).unwrap() }
         }
 
-        /// Access under a configuration with this `[gateway]`.
+        /// Returns the access rules under a configuration with this `[gateway]`.
         fn access(&self, gateway: &str) -> Result<Option<Access>, AccessError> {
             let text = format!("identity = 'x'\nnode.routers = ['quic://r']\n{gateway}");
             let config = crate::config::parse(&text, "node.toml", Path::new(""), &|_| None).unwrap();
@@ -328,7 +328,7 @@ mod tests {
             access_of(&config, &self.gateway, Some(self.dir.path()), now)
         }
 
-        /// What the desk may do, from another host, by its certificate.
+        /// Returns the rights of the desk's certificate from another host.
         fn desk_may(&self, gateway: &str) -> Result<String, Denial> {
             let access = self.access(gateway).unwrap().unwrap();
             let admission = AdmissionRequest { certificate: Some(self.desk.as_peer()), ..elsewhere() };
@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_revoked_is_kept_until_it_ends() {
+    fn revoked_token_stays_listed_until_it_expires() {
         let dir = tempfile::tempdir().unwrap();
         let later = UnixMillis(NOW.0 + 1000);
         let change = |change: &mut dyn FnMut(&mut AccessRecords) -> Result<(), AccessError>| {
@@ -433,7 +433,7 @@ mod tests {
         assert_eq!(records.revoked().unwrap().count(), 0);
         assert_eq!(records.revoke("bbbb", NOW).unwrap().revoked, Some(NOW.0));
         assert_eq!(records.revoke("bbbb", UnixMillis(NOW.0 + 1)).unwrap().revoked, Some(NOW.0));
-        // One that this list does not know, after it was lost.
+        // The list was lost and does not have this token.
         let whole = "e".repeat(32);
         records.revoke(&whole, NOW).unwrap();
         assert!(records.revoked().unwrap().any(|id| id.to_string() == whole));

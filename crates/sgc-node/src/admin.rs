@@ -1,9 +1,9 @@
-//! The status socket: how users and programs ask a running node something.
+//! The status socket: questions of users and programs to a running node.
 //!
-//! One question a connection. Who asks nothing gets the status, as one JSON document; this is what the first version
-//! did. Otherwise one line, `sgc/1 WORD [ARGUMENT]`, is answered with `{"ok": …}` or `{"error": "…"}`, except for
-//! `status`, whose answer is the document itself, and for `tap`, whose answer is that line and then a stream of
-//! [`TapHead`]s with what is seen; the line has the description of the type, if the node knows it. What is asked is carried out elsewhere.
+//! Each connection asks one question. A silent client gets the status as one JSON document, as in the first version.
+//! Otherwise one line, `sgc/1 WORD [ARGUMENT]`, is answered with `{"ok": …}` or `{"error": "…"}`. Exceptions are
+//! `status`, whose answer is the document itself, and `tap`: a stream of [`TapHead`]s and messages follows its answer,
+//! which has the description of the type, if the node knows it. Other modules carry out the requests.
 
 mod socket;
 
@@ -32,57 +32,57 @@ use crate::core::CoreEvent;
 use crate::gateway::Gateway;
 use crate::graph::Side;
 use crate::reload::Reloader;
-use crate::shell::{self, CallWish, PublishWish};
-use crate::tap::{Tap, TapWish, Tapped};
+use crate::shell::{self, CallRequest, PublishRequest};
+use crate::tap::{Tap, TapMessage, TapRequest};
 
-/// What a line of a question begins with; the number is the version of the protocol.
+/// Prefix of a request line. The number is the version of the protocol.
 pub const ADMIN_PREFIX: &str = "sgc/1 ";
-/// Longest question, bytes: a revocation list in base64 fits.
+/// Longest request, bytes: a revocation list in base64 fits.
 pub const ADMIN_LINE_BYTES_MAX: usize = CRL_BYTES_MAX * 4 / 3 + 64;
 
-/// Questions that are answered at one time; who comes later waits.
+/// Most requests that are answered at one time. Later ones wait.
 const CONNECTIONS_MAX: usize = 16;
-/// How long a question is waited for before its absence counts as one for the status.
+/// Time after which a silent client gets the status.
 const SILENCE: Duration = Duration::from_millis(250);
-/// Taps at one time; they last, so they leave places for others.
+/// Most taps at one time. They last, so places remain for other requests.
 const TAPS_MAX: usize = 8;
-/// How long who looks at a topic may leave what there is to see.
+/// Longest time for which the reader of a tap may stall.
 const TAP_STALL_MAX: Duration = Duration::from_secs(30);
-/// Longest ROS name that is asked for, bytes: DDS topics have at most 256, with a prefix.
+/// Longest ROS name in a request, bytes. DDS topics have at most 256 with a prefix.
 const TOPIC_BYTES_MAX: usize = 254;
 /// First and longest time between two attempts to have the socket.
 const BIND_AGAIN_MIN: Duration = Duration::from_millis(100);
 const BIND_AGAIN_MAX: Duration = Duration::from_secs(5);
-/// Interval of looks for a socket whose path somebody may have removed, as programs that tidy `/tmp` do.
+/// Interval of checks that the socket's path still exists, since programs that tidy `/tmp` may remove it.
 const LOOK_EVERY: Duration = Duration::from_secs(5);
-/// How long a question that was begun may take, and how long its answer may be in being read.
+/// Longest time for the rest of a request, and for reading an answer.
 const TRANSFER_MAX: Duration = Duration::from_secs(5);
 
-/// What can be asked.
+/// A request to a node.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum AdminRequest {
-    /// How things are.
+    /// Return the status.
     Status,
-    /// Read the configuration again.
+    /// Reload the configuration.
     Reload,
-    /// Take this revocation list, DER.
+    /// Apply this revocation list, DER.
     Crl(Vec<u8>),
-    /// What is there and where it goes: a [`Graph`](crate::graph::Graph). Also of this name, if it is not in use here.
+    /// Return the [`Graph`](crate::graph::Graph), also for this name if it is not in use here.
     Graph(Option<Name>),
-    /// Show the messages of a topic, until the connection ends.
+    /// Send the messages of a topic until the connection ends.
     Tap {
-        /// ROS topic, as it is called here.
+        /// ROS topic on the local network.
         topic: String,
-        /// Which; what comes from the far side if it is used here, else what is published here.
+        /// Side of the topic. The default is far if the topic is used here, else local.
         side: Option<Side>,
-        /// Most bytes of a payload that are sent; the rest is cut off.
+        /// Most bytes of a payload that are sent. The rest is cut off.
         bytes: u32,
     },
-    /// Publish what follows: a message in JSON a line. Each is answered, as the question itself is.
-    Publish(PublishWish),
+    /// Publish the following lines, one JSON message each. Each line is answered.
+    Publish(PublishRequest),
     /// Call a service.
-    Call(CallWish),
-    /// Have an authority carry an operation on the fleet out; answered with an [`sgc_wire::OperationAnswer`], encoded.
+    Call(CallRequest),
+    /// Have an authority carry out an operation on the fleet. Answered with an encoded [`sgc_wire::OperationAnswer`].
     Operate {
         /// The authority's node name.
         at: NodeName,
@@ -91,31 +91,31 @@ pub enum AdminRequest {
     },
 }
 
-/// What precedes each message of a tap: [`TapHead::BYTES`] bytes, numbers big endian in this order. So many bytes
-/// of payload as `carried` says follow it.
+/// Header of each message of a tap: [`TapHead::BYTES`] bytes, big endian, in this order. `carried` bytes of payload
+/// follow.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TapHead {
-    /// 0: data; 1: its instance was disposed of; 2: unregistered.
+    /// 0: data; 1: disposed; 2: unregistered.
     pub kind: u8,
-    /// When its publisher dated it, nanoseconds since the Unix epoch.
+    /// The publisher's time stamp, nanoseconds since the Unix epoch.
     pub source_timestamp_ns: i64,
-    /// When it went by, likewise.
+    /// Wall-clock time at which the message passed, nanoseconds since the Unix epoch.
     pub seen_unix_ns: i64,
-    /// Since the tap began, by a clock that only goes forward.
+    /// Time since the tap began by a monotonic clock, nanoseconds.
     pub seen_ns: u64,
-    /// Messages that were not looked at in time so far.
+    /// Messages dropped so far because they were not read in time.
     pub dropped: u64,
     /// Bytes of the payload.
     pub bytes: u32,
-    /// Bytes of it that follow.
+    /// Bytes of the payload that follow.
     pub carried: u32,
 }
 
 impl TapHead {
-    /// Its bytes.
+    /// Length of the encoded header.
     pub const BYTES: usize = 41;
 
-    /// As it is sent.
+    /// Encodes the header.
     pub fn to_bytes(&self) -> [u8; Self::BYTES] {
         let mut bytes = [0; Self::BYTES];
         bytes[0] = self.kind;
@@ -128,7 +128,7 @@ impl TapHead {
         bytes
     }
 
-    /// As it was sent.
+    /// Decodes the header.
     pub fn from_bytes(bytes: &[u8; Self::BYTES]) -> Self {
         let long = |at: usize| {
             let part: [u8; 8] = std::array::from_fn(|i| bytes[at + i]);
@@ -146,7 +146,7 @@ impl TapHead {
         }
     }
 
-    fn of(message: &Tapped, begun: Instant, dropped: u64, most: u32) -> Self {
+    fn from_message(message: &TapMessage, begun: Instant, dropped: u64, most: u32) -> Self {
         let bytes = message.payload.len().try_into().unwrap_or(u32::MAX);
         Self {
             kind: match message.kind {
@@ -165,12 +165,12 @@ impl TapHead {
 }
 
 impl AdminRequest {
-    /// Reads a line, without its end.
+    /// Parses a request line without its end.
     pub fn parse(line: &[u8]) -> Result<Self, AdminError> {
         let text = std::str::from_utf8(line).map_err(|_| AdminError::NotText)?;
         let text = text.trim_end_matches(['\r', '\n']);
         let Some(question) = text.strip_prefix(ADMIN_PREFIX) else {
-            // The bare words are for people with a terminal.
+            // Bare words without the prefix serve people at a terminal.
             return match text {
                 "" | "status" => Ok(Self::Status),
                 _ => Err(AdminError::Version),
@@ -220,7 +220,7 @@ impl AdminRequest {
         fits.then(|| Self::Tap { topic: topic.to_owned(), side, bytes })
     }
 
-    /// The line to send, with its end.
+    /// Returns the request line with its end.
     pub fn to_line(&self) -> String {
         match self {
             Self::Status => format!("{ADMIN_PREFIX}status\n"),
@@ -240,33 +240,33 @@ impl AdminRequest {
     }
 }
 
-/// A wish in one line.
+/// Encodes a request as one line of JSON.
 fn json(wish: &impl Serialize) -> String {
     serde_json::to_string(wish).expect("texts and numbers have a JSON form")
 }
 
-/// Why a question is none.
+/// Reasons why a request is malformed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum AdminError {
-    /// Not UTF-8.
+    /// It is not UTF-8.
     #[error("the question is not text")]
     NotText,
-    /// Too long.
+    /// It is too long.
     #[error("the question has more than {ADMIN_LINE_BYTES_MAX} bytes")]
     TooLong,
-    /// Begun and not ended.
+    /// It ended before the end of the line.
     #[error("the question was not ended with a new line in time")]
     Unfinished,
-    /// Another version.
+    /// It has another version.
     #[error("the question does not begin with {ADMIN_PREFIX:?}: this node speaks version 1")]
     Version,
-    /// An argument that is none.
+    /// An argument is invalid.
     #[error("{word:?} lacks a usable argument")]
     Argument {
-        /// What was asked.
+        /// The word of the request.
         word: &'static str,
     },
-    /// A word that is not known.
+    /// The word is unknown.
     #[error(
         "{word:?} is nothing that this node can be asked: status, reload, crl, graph, tap, publish, call and operate are"
     )]
@@ -284,8 +284,8 @@ pub(crate) struct Desk {
     pub(crate) gateway: Arc<Gateway>,
 }
 
-/// Binds the socket at `path`, and answers there until the task that is returned is aborted. While another has the socket,
-/// a predecessor that still stops for example, it tries again.
+/// Binds the socket at `path` and answers there until the returned task is aborted. It retries while another process
+/// has the socket, for example a predecessor that is still stopping.
 pub(crate) fn begin(path: PathBuf, desk: Desk) -> JoinHandle<()> {
     let first = StatusSocket::bind(&path);
     tokio::spawn(keep_socket(path, first, desk))
@@ -318,14 +318,14 @@ async fn keep_socket(path: PathBuf, first: Result<StatusSocket, SocketError>, de
     }
 }
 
-/// Waits until the path of the socket leads to it no more.
+/// Waits until the path no longer leads to the socket.
 async fn removed(socket: &StatusSocket) {
     while socket.is_in_place() {
         tokio::time::sleep(LOOK_EVERY).await;
     }
 }
 
-/// Answers until the node ends.
+/// Answers requests until the node ends.
 async fn serve(socket: &StatusSocket, desk: &Desk) {
     let places = Arc::new(Semaphore::new(CONNECTIONS_MAX));
     let taps = Arc::new(Semaphore::new(TAPS_MAX));
@@ -338,7 +338,7 @@ async fn serve(socket: &StatusSocket, desk: &Desk) {
         let mut stream = match accepted {
             Ok((stream, _)) => stream,
             Err(error) => {
-                // No more files may be open, for example.
+                // The process may have too many open files, for example.
                 debug!(%error, "the status socket takes no connection");
                 tokio::time::sleep(BIND_AGAIN_MIN).await;
                 continue;
@@ -350,19 +350,19 @@ async fn serve(socket: &StatusSocket, desk: &Desk) {
                 Ok(uid) if may_ask(uid) => {
                     answer(stream, &desk.events, &desk.reloader, &taps, &desk.gateway).await;
                 }
-                // The mode of the socket keeps others out already, unless somebody changed it.
+                // The socket's mode keeps others out already, unless somebody changed it.
                 Ok(uid) => refuse(&mut stream, uid, &refused).await,
-                Err(error) => debug!(%error, "who asks at the status socket cannot be told"),
+                Err(error) => debug!(%error, "the user of a client of the status socket is unknown"),
             }
             drop(place);
         });
     }
 }
 
-/// Tells another user that it gets no answer.
+/// Refuses a client of another user.
 async fn refuse(stream: &mut UnixStream, uid: u32, was_said: &AtomicBool) {
     if !was_said.swap(true, Relaxed) {
-        warn!(uid, "another user asks at the status socket and is refused; said once");
+        warn!(uid, "refused another user at the status socket; logged once");
     }
     let own = rustix::process::geteuid().as_raw();
     let text =
@@ -389,7 +389,7 @@ async fn answer(
                 let _ = tokio::time::timeout(TRANSFER_MAX, stream.write_all(many.as_bytes())).await;
                 return;
             };
-            match begin_tap(TapWish { topic, side }, events).await {
+            match begin_tap(TapRequest { topic, side }, events).await {
                 Ok(tap) => return show(stream, tap, bytes).await,
                 Err(why) => envelope(Err(why)),
             }
@@ -401,7 +401,7 @@ async fn answer(
                 return;
             };
             if let Err(error) = shell::publish(gateway, wish, stream, envelope).await {
-                debug!(%error, "who published at the status socket went away");
+                debug!(%error, "a publishing client of the status socket disconnected");
             }
             return;
         }
@@ -413,7 +413,7 @@ async fn answer(
         stream.shutdown().await
     };
     if !matches!(tokio::time::timeout(TRANSFER_MAX, write).await, Ok(Ok(()))) {
-        debug!("who asked at the status socket did not read the answer");
+        debug!("a client of the status socket did not read the answer");
     }
 }
 
@@ -451,14 +451,14 @@ async fn status(events: &mpsc::Sender<CoreEvent>, gateway: &Gateway) -> Option<S
     serde_json::to_string(&status).ok()
 }
 
-async fn begin_tap(wish: TapWish, events: &mpsc::Sender<CoreEvent>) -> Result<Tap, String> {
+async fn begin_tap(wish: TapRequest, events: &mpsc::Sender<CoreEvent>) -> Result<Tap, String> {
     let (reply, tap) = oneshot::channel();
     let stopping = || "the node is stopping".to_owned();
     events.send(CoreEvent::Tap(wish, reply)).await.map_err(|_| stopping())?;
     tap.await.map_err(|_| stopping())?.map_err(|why| why.to_string())
 }
 
-/// Shows what goes by until nobody looks any more or there is no more.
+/// Sends the messages of a tap until the reader leaves or the topic ends.
 async fn show(mut stream: UnixStream, mut tap: Tap, most: u32) {
     let begun = Instant::now();
     let described = tap.described.as_ref().map(|described| {
@@ -481,7 +481,7 @@ async fn show(mut stream: UnixStream, mut tap: Tap, most: u32) {
                 true => tokio::task::spawn_blocking(|| message.read()).await.map_err(io::Error::other)?,
                 false => message,
             };
-            let head = TapHead::of(&message, begun, dropped, most);
+            let head = TapHead::from_message(&message, begun, dropped, most);
             let carried = message.payload.get(..head.carried as usize).unwrap_or_default();
             let write = async {
                 into.write_all(&head.to_bytes()).await?;
@@ -499,12 +499,12 @@ async fn show(mut stream: UnixStream, mut tap: Tap, most: u32) {
     }
     tap.queue.close();
     if let Some(reader) = tap.reader.take() {
-        // It waits for the thread that served it.
+        // Dropping the reader waits for its thread.
         tokio::task::spawn_blocking(move || drop(reader));
     }
 }
 
-/// Gives JSON, or what went wrong.
+/// Carries out a request. Returns JSON or an error message.
 async fn carry_out(
     request: AdminRequest,
     events: &mpsc::Sender<CoreEvent>,
@@ -521,7 +521,7 @@ async fn carry_out(
             graph.gateway_refused = gateway.status().map(|status| status.refused).unwrap_or_default();
             serde_json::to_string(&graph).map_err(|error| error.to_string())
         }
-        // They are not answered in one line.
+        // These requests have more than one line of answer.
         AdminRequest::Tap { .. } => Err(AdminError::Argument { word: "tap" }.to_string()),
         AdminRequest::Publish(_) => Err(AdminError::Argument { word: "publish" }.to_string()),
         AdminRequest::Call(wish) => shell::call(gateway, &wish).await,
@@ -580,13 +580,13 @@ mod tests {
             AdminRequest::Graph(Some(Name([0xab; 32]))),
             tap(None),
             tap(Some(Side::Sent)),
-            AdminRequest::Publish(PublishWish {
+            AdminRequest::Publish(PublishRequest {
                 topic: "/a".into(),
                 wait_for: 1,
                 depth: Some(3),
                 ..Default::default()
             }),
-            AdminRequest::Call(CallWish { request: "{\"a\":\n1}".into(), ..Default::default() }),
+            AdminRequest::Call(CallRequest { request: "{\"a\":\n1}".into(), ..Default::default() }),
             AdminRequest::Operate {
                 at: "keeper".parse().unwrap(),
                 operation: Operation::Revoke { nodes: vec!["arm-1".into(), "desk".into()] },
@@ -616,7 +616,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_question_is_told_why() {
+    fn malformed_request_is_refused_with_its_reason() {
         for (line, error) in [
             (&b"reload"[..], AdminError::Version),
             (b"sgc/2 reload", AdminError::Version),

@@ -1,7 +1,7 @@
-//! Alerts for an operator: mistakes outside of this program that look like its faults, or like attacks.
+//! Alerts for the operator: mistakes outside of this program that look like its faults, or like attacks.
 //!
-//! Each is known on every node that it concerns, and `Alerts` remembers those that no state of a machine shows. They
-//! are shown by `sgc status` and `sgc why`; nothing is decided by them.
+//! Every affected node knows of a mistake. `Alerts` remembers those that no machine's state shows. `sgc status` and
+//! `sgc why` display them; no decision depends on them.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -12,22 +12,23 @@ use serde::{Deserialize, Serialize};
 use sgc_trust::Identity;
 use sgc_wire::{NodeId, UnixMillis};
 
-/// Peers that are remembered because two processes use their identity; of more the one seen longest ago goes.
+/// Most peers that are remembered because two processes use their identity. Beyond it, the one seen longest ago is
+/// dropped.
 const PEERS_MAX: usize = 1024;
-/// Bound on what is shown of the mistakes of a configuration, characters.
+/// Most characters that are shown of a configuration's mistakes.
 const MISTAKES_CHARS_MAX: usize = 1000;
-/// Time for which an identity's use at another place is shown. A process that waits tries again sooner than that.
+/// Time for which a foreign use of an identity is shown. A waiting process tries again sooner than that.
 const SHOWN_FOR: Duration = Duration::from_secs(660);
 
 /// A mistake of an operator.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum Alert {
-    /// Another process uses this node's identity, and has its links.
+    /// Another process uses this node's identity and has its links.
     Displaced {
         /// This node's name.
         node: String,
-        /// The place of the other process, as far as it is known.
+        /// The place of the other process, as far as known.
         place: String,
         /// Seconds since it was seen.
         ago_s: u64,
@@ -52,39 +53,39 @@ pub enum Alert {
         /// Seconds since it was seen.
         ago_s: u64,
     },
-    /// This node and a peer do not believe each other, for their clocks.
+    /// The clocks of this node and a peer differ so much that certificates are refused.
     ClocksDiffer {
         /// The peer.
         peer: String,
         /// Its address.
         remote: String,
-        /// By how many milliseconds its clock is ahead of the one here.
+        /// Milliseconds by which the peer's clock is ahead of this node's.
         ahead_ms: i64,
     },
-    /// By the clock here this node's certificate has not begun.
+    /// This node's clock is before the beginning of its certificate.
     ClockBeforeCertificate {
         /// Beginning of the certificate, RFC 3339.
         not_before: String,
-        /// The time here, RFC 3339.
+        /// This node's time, RFC 3339.
         now: String,
     },
-    /// Programs find each other by a Discovery Server of Fast DDS, which this node cannot join.
+    /// Programs use a Discovery Server of Fast DDS, which this node cannot join.
     DiscoveryServer {
         /// The server, as `ROS_DISCOVERY_SERVER` names it.
         server: String,
-        /// The program that has the variable set; none for this one.
+        /// The program with the variable; `None` for this one.
         program: Option<String>,
     },
     /// Packets to programs of the local ROS 2 network cannot be sent.
     LocalNetworkFails {
-        /// The address that the last one was for.
+        /// The destination of the last one.
         to: String,
-        /// The number of them since the node's start.
+        /// Their number since the node's start.
         packets: u64,
         /// Seconds since the last one.
         ago_s: u64,
     },
-    /// The local ROS 2 network was closed since this host's addresses changed, and cannot be opened again.
+    /// The local ROS 2 network was closed after this host's addresses changed, and cannot be opened again.
     LocalNetworkClosed {
         /// The reason.
         reason: String,
@@ -94,24 +95,24 @@ pub enum Alert {
         /// The enclave that they name, `/` if they have none of their own.
         enclave: String,
     },
-    /// The configuration was changed, and what it says now has mistakes: the node runs with what it said before.
+    /// The changed configuration has mistakes, so the node keeps running with the previous one.
     ConfigurationRefused {
-        /// The mistakes, as `sgc check` says them.
+        /// The mistakes, as `sgc check` reports them.
         mistakes: String,
         /// Seconds since the node read it.
         ago_s: u64,
     },
-    /// DDS Security protects programs of the local ROS 2 network and this node, and one does not admit the other.
+    /// DDS Security protects both this node and local programs, and one does not admit the other.
     RefusedPrograms {
         /// The enclave that they name, `/` if they have none of their own.
         enclave: String,
     },
-    /// DDS Security protects this node, and programs of the local ROS 2 network have none.
+    /// DDS Security protects this node, but not all local programs.
     UnprotectedPrograms {
         /// Their number.
         programs: usize,
     },
-    /// Programs of the local ROS 2 network announce themselves, and nothing else of them arrives.
+    /// Local programs announce themselves, but nothing else arrives from them.
     SilentPrograms {
         /// The enclave that they name, `/` if they have none of their own.
         enclave: String,
@@ -122,7 +123,7 @@ pub enum Alert {
 }
 
 impl Alert {
-    /// Returns `true` if nothing flows over this node while it stands.
+    /// Returns `true` if nothing flows over this node because of the alert.
     pub fn stops_all(&self) -> bool {
         matches!(
             self,
@@ -130,7 +131,7 @@ impl Alert {
         )
     }
 
-    /// Returns what to do about it.
+    /// Returns the fix.
     pub fn fix(&self) -> &'static str {
         match self {
             Self::Displaced { .. } | Self::IdentityInUse { .. } | Self::PeerIdentityInUse { .. } => {
@@ -248,7 +249,7 @@ impl fmt::Display for Alert {
     }
 }
 
-/// Returns what is wrong with the clock, if it says that this identity's certificate has not begun.
+/// Returns an alert if this node's certificate begins later than its clock shows.
 pub fn clock_alert(identity: &Identity, now: UnixMillis) -> Option<Alert> {
     let not_before = identity.as_peer().not_before;
     let is_early = now < not_before;
@@ -256,7 +257,7 @@ pub fn clock_alert(identity: &Identity, now: UnixMillis) -> Option<Alert> {
         .then(|| Alert::ClockBeforeCertificate { not_before: not_before.to_string(), now: now.to_string() })
 }
 
-/// A time as a person says it: the two largest units.
+/// Formats a duration for people: the two largest units.
 fn duration(ms: i64) -> String {
     let s = ms.unsigned_abs() / 1000;
     match (s / 86_400, s / 3600 % 24, s / 60 % 60) {
@@ -266,7 +267,7 @@ fn duration(ms: i64) -> String {
     }
 }
 
-/// The place at which another process was seen that uses an identity.
+/// The place of another process that uses an identity.
 #[derive(Clone, Debug)]
 struct Sighting {
     place: String,
@@ -284,37 +285,38 @@ impl Sighting {
     }
 }
 
-/// Identities that were seen at two places lately, and a configuration that was refused.
+/// Recent foreign uses of identities, and a refused configuration.
 #[derive(Debug, Default)]
 pub(crate) struct Alerts {
-    /// The mistakes of the configuration that was read last, and when that was.
+    /// The mistakes of the last read configuration, and the time of reading.
     refused: Option<(String, Instant)>,
     /// The process that has the links of this node.
     displaced: Option<Sighting>,
-    /// The process that is kept out for this node.
+    /// The process that is kept out in favour of this node.
     kept_out: Option<Sighting>,
     peers: BTreeMap<NodeId, Sighting>,
 }
 
 impl Alerts {
-    /// Notes the mistakes of the configuration that was read; `None` if it has none.
+    /// Notes the mistakes of the last read configuration; `None` if it has none.
     pub(crate) fn configuration_read(&mut self, mistakes: Option<&str>, now: Instant) {
         self.refused = mistakes.map(|text| (text.chars().take(MISTAKES_CHARS_MAX).collect(), now));
     }
 
-    /// Notes that another process has the links of this node; `true` if that is news.
+    /// Notes that another process has the links of this node. Returns `true` if that is news.
     pub(crate) fn displaced(&mut self, place: &str, now: Instant) -> bool {
         self.kept_out = None;
         note(&mut self.displaced, place, "", now)
     }
 
-    /// Notes that another process is kept out for this node; `true` if that is news.
+    /// Notes that another process is kept out in favour of this node. Returns `true` if that is news.
     pub(crate) fn kept_out(&mut self, place: SocketAddr, now: Instant) -> bool {
         self.displaced = None;
         note(&mut self.kept_out, &place.to_string(), "", now)
     }
 
-    /// Notes that `other` is kept out for `place`, and both use the identity of a peer; `true` if that is news.
+    /// Notes that `other` is kept out in favour of `place`, where both use the identity of a peer. Returns `true` if
+    /// that is news.
     pub(crate) fn peer_in_use(&mut self, peer: NodeId, place: &str, other: SocketAddr, now: Instant) -> bool {
         if self.peers.len() >= PEERS_MAX
             && !self.peers.contains_key(&peer)
@@ -328,7 +330,7 @@ impl Alerts {
         is_news
     }
 
-    /// Returns what is to be shown now.
+    /// Returns the current alerts.
     pub(crate) fn shown(&self, node: &str, called: impl Fn(&NodeId) -> String, now: Instant) -> Vec<Alert> {
         let own = |seen: &Option<Sighting>| seen.clone().filter(|seen| seen.is_shown(now));
         let mut alerts = Vec::new();
@@ -355,7 +357,7 @@ impl Alerts {
     }
 }
 
-/// Notes a sighting; `true` if there was none that is shown.
+/// Notes a sighting. Returns `true` if none was shown.
 fn note(noted: &mut Option<Sighting>, place: &str, other: &str, now: Instant) -> bool {
     let seen = Sighting { place: place.to_owned(), other: other.to_owned(), at: now };
     !noted.replace(seen).is_some_and(|old| old.is_shown(now))
@@ -381,7 +383,7 @@ mod tests {
         assert!(text.starts_with("the identity robot is in use at another place: 203.0.113.5:2"), "{text}");
         assert_eq!(shown(&alerts, now + 2 * SHOWN_FOR), []);
         assert!(alerts.displaced("203.0.113.5:1", now + 2 * SHOWN_FOR));
-        // A node that has its links again says so in the place of the other alert.
+        // A node that has its links again replaces the other alert.
         assert!(alerts.kept_out(at(3), now + 2 * SHOWN_FOR));
         assert!(matches!(shown(&alerts, now + 2 * SHOWN_FOR)[..], [Alert::IdentityInUse { .. }]));
     }

@@ -1,5 +1,5 @@
-//! How often the data path allocates once it runs: a router not at all, a proxy less than once for a message, and once
-//! more for a signature. What transports and DDS take is counted where they are driven (`sgc-transport`, `sgc-dds`).
+//! Allocations of the data path in steady state: none in a router, less than one per message in a proxy, and one more
+//! per signature. `sgc-transport` and `sgc-dds` count the allocations of transports and DDS.
 
 use std::collections::HashMap;
 use std::pin::pin;
@@ -22,7 +22,7 @@ use tokio::sync::mpsc;
 
 use crate::dataplane::{DataPlane, Forward, Out};
 use crate::outflow::OutFlow;
-use crate::sinks::{Behind, LocalSink, WriterQueue};
+use crate::sinks::{LocalSink, WriterInfo, WriterQueue};
 use crate::sources::{LocalShare, SourceMap, SourceSlot};
 use crate::stats::Drops;
 
@@ -33,10 +33,10 @@ const NAME: Name = Name([1; 32]);
 const WRITER: Guid = Guid([3; 16]);
 const MESSAGES: usize = 1000;
 const MESSAGE_BYTES: usize = 1000;
-/// Containers grow to their size first.
+/// Messages during which containers grow to their size.
 const WARM_UP: usize = 2 * MESSAGES;
 
-/// What is ready at once, without a runtime that counts with it.
+/// Polls a future that is ready at once, since a runtime would allocate too.
 fn now<T>(future: impl Future<Output = T>) -> T {
     match pin!(future).poll(&mut Context::from_waker(Waker::noop())) {
         Poll::Ready(result) => result,
@@ -48,7 +48,7 @@ fn runtime() -> Runtime {
     Builder::new_current_thread().enable_all().build().expect("a runtime")
 }
 
-/// A name that goes from one link to these.
+/// Adds a name that is forwarded from one link to others.
 fn forwards(data: &DataPlane, up: LinkId, outs: Vec<(LinkId, Out)>) {
     let down: Vec<_> = outs.iter().map(|(link, _)| *link).collect();
     let tree = Tree { up, down: down.into(), publishers: [].as_slice().into() };
@@ -66,7 +66,7 @@ fn source(suite: Suite) -> (Source, TopicGrant) {
         reliable: true,
         history_depth: 0,
         history_bytes_max: 0,
-        // Fewer than are published before it is counted, so that what it keeps has grown to its size.
+        // The limit is reached before counting begins, so that the history has grown to its size.
         recovery: RecoveryLimits { messages_max: MESSAGES, ..RecoveryLimits::default() },
     };
     let source = Source::new(config, &grant, MessageKey::generate(suite)).expect("a key of the suite");
@@ -82,7 +82,7 @@ fn a_router_allocates_nothing_for_a_packet() {
         let data = DataPlane::default();
         let ways = outs.iter().map(|(link, flow)| (*link, Out::Link(flow.clone(), Arc::default())));
         forwards(&data, up, ways.collect());
-        // As a transport hands it out: a part of what it received, in two pieces.
+        // A transport hands out parts of its receive buffers, such as this one in two pieces.
         let received = Bytes::from(vec![7; 2 * MESSAGE_BYTES]);
         let packet = |seq| {
             let header = PacketHeader {
@@ -120,7 +120,8 @@ fn a_router_allocates_nothing_for_a_packet() {
 fn a_proxy_allocates_less_than_once_for_a_sample_that_it_shares() {
     let runtime = runtime();
     let _inside = runtime.enter();
-    // How many are at hand together: with one a signature each, which the provider makes in memory of its own.
+    // Number of messages that are ready together. A single one needs a signature of its own, for which the provider
+    // allocates.
     for (suite, at_once, most) in
         [(Suite::Group, 1, 0.5), (Suite::Standard, 1, 1.0), (Suite::Standard, 20, 0.5)]
     {
@@ -132,7 +133,7 @@ fn a_proxy_allocates_less_than_once_for_a_sample_that_it_shares() {
         let own = HashMap::from([(WRITER, slot)]);
         share.set_map(SourceMap { per_writer: true, own, ..SourceMap::default() });
         let payload = Bytes::from(vec![7; MESSAGE_BYTES]);
-        // Shared from the beginning, as samples of a DDS reader are.
+        // The payload is shared from the beginning, as samples of a DDS reader are.
         let _other = payload.clone();
         let publish = |messages: usize| {
             for n in 1..=messages {
@@ -175,7 +176,7 @@ fn a_proxy_allocates_less_than_once_for_a_message_that_it_brings() {
         let drops = Arc::<Drops>::default();
         let queue = WriterQueue::spawn_with(
             "count",
-            Behind::default(),
+            WriterInfo::default(),
             Shaping::default(),
             drops.clone(),
             alive,
@@ -193,7 +194,7 @@ fn a_proxy_allocates_less_than_once_for_a_message_that_it_brings() {
                 .expect("it can be published");
         }
         let counted = packets.split_off(WARM_UP);
-        // One after the other, so that what waits for its writer is no matter here.
+        // Messages are written one by one, so that queueing plays no part.
         let mut by_writer = Vec::with_capacity(MESSAGES);
         let bring = |packets: Vec<Packet>, by_writer: &mut Vec<usize>| {
             for packet in packets {
@@ -206,7 +207,7 @@ fn a_proxy_allocates_less_than_once_for_a_message_that_it_brings() {
         let each = taken.count as f64 / MESSAGES as f64;
         assert!(each <= most, "{suite}, {at_once} at once: {each} allocations a message");
         let writers = by_writer[MESSAGES - 1] - by_writer[0];
-        // That is this test's channel to itself.
+        // These allocations belong to this test's channel.
         assert!(writers <= MESSAGES / 16, "{suite}: {writers} at the writer");
         assert_eq!(sink.delivered() as usize, WARM_UP + MESSAGES);
         sink.close();

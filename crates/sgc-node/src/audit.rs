@@ -1,12 +1,12 @@
-//! The audit log: who was granted, refused and cut off, who linked, and what was changed, one JSON line each.
+//! The audit log: grants, refusals, revocations, links and changes of configuration, one JSON line each.
 //!
-//! Writing never delays the control task: records go through a bounded channel to a thread of their own, and what
-//! does not fit is counted and said in the log itself. Lines are handed to the system at once, so that a killed
-//! process loses none that were written; they are forced to the disk when a file is put aside and when the node
-//! stops, so that a loss of power may cost the last seconds. No key, token or message comes here.
+//! Writing never delays the control task. Records go through a bounded channel to a thread; records that do not fit are
+//! counted, and the log itself reports them. Lines are passed to the system at once, so a killed process loses none
+//! that were written. They are synced to the disk when a file is rotated and when the node stops, so a loss of power
+//! may cost the last seconds. The log holds no key, token or message.
 //!
-//! Each peer has quotas for the records that it can cause (`quota`): nobody pushes older records out of the files by
-//! joining and leaving. Files are the business of `file`.
+//! Each peer has quotas for the records that it causes (`quota`), so nobody displaces older records by joining and
+//! leaving. `file` handles the files.
 
 mod file;
 mod quota;
@@ -41,28 +41,28 @@ const FIELD_BYTES_MAX: usize = 512;
 const SUMMARY_DELAY: Duration = Duration::from_secs(60);
 const FILE_NAME: &str = "audit.jsonl";
 
-/// What happened.
+/// Kind of event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum AuditEvent {
     /// The node started.
     Started,
-    /// The node stopped in good order.
+    /// The node stopped orderly.
     Stopped,
-    /// Somebody was granted a share.
+    /// A node was granted a share.
     Granted,
-    /// Somebody was refused a share.
+    /// A node was refused a share.
     Refused,
-    /// Somebody left a share.
+    /// A node left a share.
     Left,
-    /// Somebody's certificate was revoked.
+    /// A certificate was revoked.
     Revoked,
-    /// Somebody lost a share that was granted.
+    /// A node lost a share that was granted.
     Cut,
     /// A share has a new key.
     Epoch,
     /// A link was made.
     LinkUp,
-    /// A peer was refused at the door.
+    /// A connecting peer was refused.
     LinkRefused,
     /// A link ended.
     LinkClosed,
@@ -70,24 +70,24 @@ pub enum AuditEvent {
     Crl,
     /// This node's certificate was renewed, or it renewed another's.
     Renewed,
-    /// An operator had this authority carry an operation out, or was refused.
+    /// This authority carried out or refused an operation of an operator.
     Operation,
     /// The configuration was read again.
     Reload,
     /// An access token was made for the gateway.
     TokenMade,
-    /// One was taken back.
+    /// An access token was revoked.
     TokenRevoked,
-    /// One was shown at the gateway that does not hold.
+    /// An invalid access token was presented at the gateway.
     TokenRefused,
-    /// One peer caused more records of one event than are written in an hour: the last of those, and their number.
+    /// Stands for records beyond a peer's hourly quota: the last of them, and their number.
     Summary,
     /// Records were lost.
     Lost,
 }
 
 impl AuditEvent {
-    /// All of them.
+    /// All events.
     pub const ALL: [Self; 20] = [
         Self::Started,
         Self::Stopped,
@@ -111,7 +111,7 @@ impl AuditEvent {
         Self::Lost,
     ];
 
-    /// As it stands in the log.
+    /// Returns the event's name in the log.
     pub fn label(self) -> &'static str {
         match self {
             Self::Started => "started",
@@ -137,7 +137,7 @@ impl AuditEvent {
         }
     }
 
-    /// Returns who causes it where a record names no peer.
+    /// Returns the cause of a record that names no peer.
     fn cause(self) -> Cause {
         match self {
             Self::Crl | Self::Epoch | Self::Renewed => Cause::Fleet,
@@ -146,15 +146,15 @@ impl AuditEvent {
     }
 }
 
-/// One line. What does not concern an event is absent.
+/// One line of the log. Fields that do not apply are absent.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct AuditRecord {
-    /// When, RFC 3339, UTC.
+    /// Time, RFC 3339, UTC.
     pub time: String,
-    /// When, milliseconds since 1970.
+    /// Time, milliseconds since 1970.
     pub unix_ms: u64,
-    /// What: [`AuditEvent::label`], or what a later version knows.
+    /// Event: [`AuditEvent::label`], or an event of a later version.
     pub event: String,
     /// The ROS topic.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -165,31 +165,31 @@ pub struct AuditRecord {
     /// The peer's node id, hexadecimal digits.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub peer: Option<String>,
-    /// What the configuration calls the peer.
+    /// The peer's name in the configuration.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub peer_name: Option<String>,
     /// The peer's address.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub remote: Option<String>,
-    /// Why.
+    /// The reason.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
-    /// What caused it: an entry of the policy, a user, a CA.
+    /// The cause: an entry of the policy, a user, a CA.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub by: Option<String>,
     /// The epoch.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub epoch: Option<u32>,
-    /// Records that were lost.
+    /// Number of lost records.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lost: Option<u64>,
-    /// Of a summary: the event of the records that it stands for.
+    /// Event of the summarised records.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub of: Option<String>,
-    /// Of a summary: how many records it stands for.
+    /// Number of the summarised records.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub count: Option<u64>,
-    /// Of a summary: the time of the first of them. `time` is that of the last.
+    /// Time of the first summarised record. `time` is that of the last.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub from: Option<String>,
     #[serde(skip)]
@@ -201,26 +201,26 @@ pub struct AuditRecord {
 }
 
 impl AuditRecord {
-    /// Something that happens now.
+    /// Creates a record of the current time.
     pub fn new(event: AuditEvent) -> Self {
         Self::at(event, now().unix)
     }
 
-    /// Something that happened at `unix`.
+    /// Creates a record of the time `unix`.
     pub fn at(event: AuditEvent, unix: UnixMillis) -> Self {
         let (label, cause) = (event.label().to_owned(), event.cause());
         let (time, kind) = (unix.to_string(), Some(event));
         Self { time, unix_ms: unix.0, event: label, kind, cause, ..Self::default() }
     }
 
-    /// On this topic.
+    /// Sets the topic.
     #[must_use]
     pub fn topic(mut self, topic: Option<&str>) -> Self {
         self.topic = topic.map(bounded);
         self
     }
 
-    /// Under this name.
+    /// Sets the name.
     #[must_use]
     pub fn name(mut self, name: &Name) -> Self {
         self.name = Some(name.to_string());
@@ -228,7 +228,7 @@ impl AuditRecord {
         self
     }
 
-    /// By, or with, this peer.
+    /// Sets the peer.
     #[must_use]
     pub fn peer(mut self, peer: &NodeId) -> Self {
         self.peer = Some(peer.to_string());
@@ -236,7 +236,7 @@ impl AuditRecord {
         self
     }
 
-    /// At this address.
+    /// Sets the address.
     #[must_use]
     pub fn remote(mut self, remote: SocketAddr) -> Self {
         self.remote = Some(remote.to_string());
@@ -246,28 +246,28 @@ impl AuditRecord {
         self
     }
 
-    /// Because of a user of this machine: no quota counts it.
+    /// Marks a user of this machine as the cause, so that no quota counts the record.
     #[must_use]
     pub fn by_user(mut self) -> Self {
         self.cause = Cause::Local;
         self.by("a user")
     }
 
-    /// For this reason.
+    /// Sets the reason.
     #[must_use]
     pub fn reason(mut self, reason: impl ToString) -> Self {
         self.reason = Some(bounded(&reason.to_string()));
         self
     }
 
-    /// Because of this.
+    /// Sets the cause.
     #[must_use]
     pub fn by(mut self, by: impl ToString) -> Self {
         self.by = Some(bounded(&by.to_string()));
         self
     }
 
-    /// Of this epoch.
+    /// Sets the epoch.
     #[must_use]
     pub fn epoch(mut self, epoch: u32) -> Self {
         self.epoch = Some(epoch);
@@ -275,17 +275,17 @@ impl AuditRecord {
     }
 }
 
-/// What peers are called.
+/// Names of peers.
 pub type PeerNames = BTreeMap<NodeId, String>;
 
-/// Where records go; cheap to clone. One that is off takes them, too.
+/// Handle of the log, cheap to clone. A log that is switched off accepts records and drops them.
 #[derive(Clone, Debug, Default)]
 pub struct Audit {
-    shared: Option<Arc<Shared>>,
+    shared: Option<Arc<AuditInner>>,
 }
 
 #[derive(Debug)]
-struct Shared {
+struct AuditInner {
     records: SyncSender<Option<AuditRecord>>,
     lost: Arc<AtomicU64>,
     names: ArcSwap<PeerNames>,
@@ -293,7 +293,7 @@ struct Shared {
     lost_total: AtomicU64,
 }
 
-impl Shared {
+impl AuditInner {
     fn send(&self, record: AuditRecord) {
         match self.records.try_send(Some(record)) {
             Ok(()) => {}
@@ -309,21 +309,21 @@ fn lock(quotas: &Mutex<Quotas>) -> MutexGuard<'_, Quotas> {
     quotas.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The thread that writes.
+/// The writing thread.
 #[derive(Debug)]
 pub struct AuditWriter {
-    shared: Arc<Shared>,
+    shared: Arc<AuditInner>,
     thread: JoinHandle<()>,
 }
 
 impl Audit {
-    /// Opens the log at `path`; a line that an earlier run left unfinished is ended.
+    /// Opens the log at `path` and completes a line that an earlier run left unfinished.
     pub fn open(path: &Path, room: AuditRoom, names: PeerNames) -> io::Result<(Self, AuditWriter)> {
         let file = LogFile::open(path, room)?;
         let (records, waiting) = sync_channel(WAITING_MAX);
-        // The thread holds no sender: it ends when nobody can write any more.
+        // The thread holds no sender, so it ends with the last handle.
         let (lost, quotas) = (Arc::<AtomicU64>::default(), Arc::<Mutex<Quotas>>::default());
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(AuditInner {
             records,
             lost: lost.clone(),
             names: ArcSwap::from_pointee(names),
@@ -337,7 +337,7 @@ impl Audit {
         Ok((audit, AuditWriter { shared, thread }))
     }
 
-    /// Hands a record over; never waits.
+    /// Queues a record. Never waits.
     pub fn write(&self, mut record: AuditRecord) {
         let Some(shared) = &self.shared else { return };
         if let Cause::Peer(peer) = &record.cause {
@@ -348,45 +348,46 @@ impl Audit {
         records.into_iter().for_each(|record| shared.send(record));
     }
 
-    /// Peers are called otherwise from now on.
+    /// Replaces the names of peers.
     pub fn set_names(&self, names: PeerNames) {
         if let Some(shared) = &self.shared {
             shared.names.store(Arc::new(names));
         }
     }
 
-    /// What a peer is called, if it is known by a name.
+    /// Returns the name of a peer, if it has one.
     pub fn name_of(&self, peer: &NodeId) -> Option<String> {
         self.shared.as_ref()?.names.load().get(peer).cloned()
     }
 
-    /// Records that did not fit, since the node started.
+    /// Returns the number of records lost since the node started.
     pub fn lost_total(&self) -> u64 {
         self.shared.as_ref().map_or(0, |shared| shared.lost_total.load(Relaxed))
     }
 
-    /// Records that stand in summaries only, since the node started.
+    /// Returns the number of records that only summaries hold, since the node started.
     pub fn summed_up_total(&self) -> u64 {
         self.shared.as_ref().map_or(0, |shared| lock(&shared.quotas).left_out())
     }
 
-    /// Records that were lost and not yet said to be.
+    /// Returns the number of lost records that the log has not reported yet.
     pub fn lost(&self) -> u64 {
         self.shared.as_ref().map_or(0, |shared| shared.lost.load(Relaxed))
     }
 }
 
 impl AuditWriter {
-    /// Waits until everything is written and on the disk. What comes later is lost.
+    /// Waits until all records are on the disk. Later records are lost.
     pub fn finish(self) {
         let _ = self.shared.records.send(None);
         let _ = self.thread.join();
     }
 }
 
-/// Adds a record to the log at `path` from beside the node that writes it, which may run or not. It is on the disk then.
+/// Appends a record to the log at `path` from another process than the node's, and syncs it to the disk. The node may
+/// be running.
 pub fn append(path: &Path, record: &AuditRecord) -> io::Result<()> {
-    // The node alone puts its log aside.
+    // Only the node rotates its log.
     let mut file = LogFile::open(path, AuditRoom { max_bytes: u64::MAX, files: 1 })?;
     let mut line = String::new();
     push_line(&mut line, record);
@@ -394,7 +395,7 @@ pub fn append(path: &Path, record: &AuditRecord) -> io::Result<()> {
     file.sync()
 }
 
-/// Where a node with this state directory keeps its log.
+/// Returns the path of the log of a node with this state directory.
 pub fn audit_path(configured: Option<&Path>, state: Option<&Path>) -> Option<PathBuf> {
     configured.map(Path::to_owned).or_else(|| Some(state?.join(FILE_NAME)))
 }

@@ -1,8 +1,8 @@
-//! The fleet's authority: looks members up in the fleet's file, and gives them certificates and the secrets in use.
+//! The fleet's authority: looks members up in the fleet file and gives them certificates and the current secrets.
 //!
-//! Members ask whenever they like, and the file is slow: it is locked, read, signed and replaced as a whole. So the
-//! control task queues requests ([`DeskQueue`], pure) and hands them in batches to one blocking job at a time
-//! ([`FleetDesk`]), which reads the file once a batch and only for requests that it has not answered before.
+//! Members ask at any time, and the file is slow: it is locked, read, signed and replaced as a whole. So the control
+//! task queues requests ([`DeskQueue`], pure) and hands them in batches to one blocking job at a time ([`FleetDesk`]).
+//! The job reads the file once per batch, and only for requests that it has not answered before.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs;
@@ -22,23 +22,23 @@ use tracing::{error, info, warn};
 
 use crate::credentials::{is_due, lasts, renewal_interval};
 use crate::fleet_file::{FleetFileError, LockedFleet};
-use crate::operators::{OPERATIONS_WAITING_MAX, OperationDone, OperationJob, Operators};
+use crate::operators::{OPERATIONS_WAITING_MAX, OperationJob, OperationOutcome, Operators};
 
-/// Shortest time for which a new certificate holds.
+/// Shortest validity of a new certificate.
 const VALID_MIN: Duration = Duration::from_secs(60);
-/// Most nodes whose requests wait for the fleet's file; as many as may stay joined at the renewal name.
+/// Most nodes whose requests wait for the fleet file; as many as may stay joined at the renewal name.
 const RENEWALS_WAITING_MAX: usize = 4096;
-/// Most requests that one job answers, so that the lock on the file is not held for long.
+/// Most requests that one job answers, to keep the lock on the file short.
 const RENEWAL_BATCH_MAX: usize = 256;
 /// Most nodes whose last answers are remembered.
 const RENEWALS_ANSWERED_MAX: usize = 4096;
 
-/// The place of a request's answer.
+/// Recipient of an answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Asker {
-    /// The authority itself: no route leads from a node to itself.
+    /// The authority itself, since no route leads from a node to itself.
     Own,
-    /// A member, by the sink that it asked with.
+    /// A member, by the sink of its request.
     Member(SinkId),
 }
 
@@ -57,7 +57,7 @@ pub(crate) struct RenewalAnswer {
     pub(crate) answer: Result<Credentials, RenewalRefusal>,
 }
 
-/// Why a request for credentials is refused.
+/// Reasons to refuse a request for credentials.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub(crate) enum RenewalRefusal {
     /// Another request of the same node was answered a moment ago.
@@ -66,13 +66,13 @@ pub(crate) enum RenewalRefusal {
     /// Too many nodes wait.
     #[error("{RENEWALS_WAITING_MAX} nodes wait for the fleet's file already")]
     QueueFull,
-    /// The fleet's file could not be read or written.
+    /// The fleet file could not be read or written.
     #[error("the fleet's file cannot be used")]
     File,
     /// The roster lacks the node.
     #[error("the fleet's roster lacks the node")]
     UnknownNode,
-    /// The roster says that the node is revoked.
+    /// The node is revoked in the roster.
     #[error("the node is revoked")]
     Revoked,
     /// The signing request is unusable, or no certificate can be made for it.
@@ -81,7 +81,7 @@ pub(crate) enum RenewalRefusal {
 }
 
 impl RenewalRefusal {
-    /// A short, stable name for counters.
+    /// Returns a short, stable name for counters.
     pub(crate) fn key(self) -> &'static str {
         match self {
             Self::TooSoon => "renewal_too_soon",
@@ -93,7 +93,7 @@ impl RenewalRefusal {
         }
     }
 
-    /// The reason that the node is told.
+    /// Returns the reason that the node is told.
     pub(crate) fn refuse_reason(self) -> RefuseReason {
         match self {
             Self::TooSoon | Self::QueueFull | Self::File => RefuseReason::Limit,
@@ -112,8 +112,8 @@ impl RenewalRefusal {
     }
 }
 
-/// Requests that wait for the fleet's file: one for each node, first come, first served, one batch at a time; and
-/// operations, each by itself.
+/// Requests that wait for the fleet file: one for each node, in order of arrival, in batches; and operations, each by
+/// itself.
 #[derive(Debug, Default)]
 pub(crate) struct DeskQueue {
     waiting: BTreeMap<NodeId, RenewalRequest>,
@@ -123,7 +123,7 @@ pub(crate) struct DeskQueue {
 }
 
 impl DeskQueue {
-    /// Queues a request. A newer request of a node takes the place of its older one.
+    /// Queues a request. It replaces an older one of the same node.
     pub(crate) fn push(&mut self, request: RenewalRequest) -> Result<(), RenewalRefusal> {
         let node = request.peer.node_id;
         if let Some(older) = self.waiting.get_mut(&node) {
@@ -138,7 +138,7 @@ impl DeskQueue {
         Ok(())
     }
 
-    /// Queues an operation, or gives it back if too many wait.
+    /// Queues an operation, or returns it if too many wait.
     pub(crate) fn push_operation(&mut self, job: OperationJob) -> Result<(), Box<OperationJob>> {
         if self.operations.len() >= OPERATIONS_WAITING_MAX {
             return Err(Box::new(job));
@@ -147,7 +147,7 @@ impl DeskQueue {
         Ok(())
     }
 
-    /// Returns what is to be done next, unless a batch is under way.
+    /// Returns the next work, unless a batch is under way.
     fn next_batch(&mut self) -> Option<DeskBatch> {
         if self.is_busy || (self.order.is_empty() && self.operations.is_empty()) {
             return None;
@@ -158,7 +158,7 @@ impl DeskQueue {
         Some(DeskBatch { renewals, operations: self.operations.drain(..).collect() })
     }
 
-    /// Ends the batch that is under way.
+    /// Ends the batch under way.
     pub(crate) fn end_batch(&mut self) {
         self.is_busy = false;
     }
@@ -174,28 +174,28 @@ struct DeskBatch {
 /// The answers of a job.
 pub(crate) struct DeskAnswers {
     pub(crate) renewals: Vec<RenewalAnswer>,
-    pub(crate) operations: Vec<OperationDone>,
+    pub(crate) operations: Vec<OperationOutcome>,
 }
 
-/// This node's work as its fleet's authority.
+/// Role of this node as its fleet's authority.
 pub(crate) struct Authority {
     pub(crate) queue: DeskQueue,
     pub(crate) operators: Operators,
-    /// Times at which members were last given something, in this run; at most as many as a roster has.
+    /// Times at which members last got an answer in this run; at most as many as a roster has.
     seen: BTreeMap<NodeId, UnixMillis>,
     own: NodeId,
     desk: Arc<Mutex<FleetDesk>>,
 }
 
 impl Authority {
-    /// The authority `own`, which keeps this fleet file and does what these nodes say.
+    /// Creates the authority `own` with this fleet file and these operators.
     pub(crate) fn new(file: PathBuf, operators: Grantees, own: NodeId) -> Self {
         let (queue, operators) = (DeskQueue::default(), Operators::new(operators));
         let desk = Arc::new(Mutex::new(FleetDesk::new(file)));
         Self { queue, operators, seen: BTreeMap::new(), own, desk }
     }
 
-    /// Remembers that members were here.
+    /// Notes that members are present.
     pub(crate) fn note_seen(&mut self, nodes: impl IntoIterator<Item = NodeId>, now: UnixMillis) {
         for node in nodes {
             if self.seen.len() < ROSTER_NODES_MAX || self.seen.contains_key(&node) {
@@ -204,7 +204,7 @@ impl Authority {
         }
     }
 
-    /// Returns a blocking job that does what is next, unless one is under way or nobody waits.
+    /// Returns a blocking job with the next work, unless one is under way or nothing waits.
     pub(crate) fn next_job(&mut self) -> Option<impl FnOnce(Now) -> DeskAnswers + Send + use<>> {
         let batch = self.queue.next_batch()?;
         let (desk, own) = (self.desk.clone(), self.own);
@@ -217,14 +217,14 @@ impl Authority {
         })
     }
 
-    /// Returns a blocking job that lets the file learn what these lists revoke.
+    /// Returns a blocking job that records the revocations of these lists in the file.
     pub(crate) fn catch_up_job(&self, anchors: Arc<TrustAnchors>) -> impl FnOnce(Now) + Send + use<> {
         let desk = self.desk.clone();
         move |now| desk.lock().unwrap_or_else(PoisonError::into_inner).catch_up(&anchors, now)
     }
 }
 
-/// A version of a file, which another writer replaces as a whole.
+/// Version of a file that other writers replace as a whole.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct FileStamp {
     inode: (u64, u64),
@@ -233,7 +233,7 @@ struct FileStamp {
 }
 
 impl FileStamp {
-    fn of(file: &Path) -> Option<Self> {
+    fn read(file: &Path) -> Option<Self> {
         let metadata = fs::metadata(file).ok()?;
         let modified = metadata.modified().ok()?;
         Some(Self { inode: (metadata.dev(), metadata.ino()), bytes: metadata.len(), modified })
@@ -241,21 +241,21 @@ impl FileStamp {
 }
 
 /// The last answer to a node.
-struct Answered {
-    /// The certificate that the node asked with.
+struct LastAnswer {
+    /// Certificate with which the node asked.
     cert: CertId,
-    /// The key that it wants certified.
+    /// Key to be certified.
     key: [u8; 32],
     answer: Result<Credentials, RenewalRefusal>,
-    /// The serial number of the certificate in the answer.
+    /// Serial number of the certificate in the answer.
     made: Option<Arc<[u8]>>,
     at: Instant,
-    /// Time for which it is remembered, and nothing else is done for the node.
+    /// Time for which the answer is remembered and the node gets no other.
     interval: Duration,
 }
 
-impl Answered {
-    /// The answer, if this request is the one that it answers, or is that of the certificate in it.
+impl LastAnswer {
+    /// Returns the answer, if the request repeats the answered one or comes with the certificate of the answer.
     fn answer_to(&self, peer: &VerifiedPeer, key: &[u8; 32]) -> Option<Result<Credentials, RenewalRefusal>> {
         if self.key != *key {
             return None;
@@ -264,18 +264,18 @@ impl Answered {
             return Some(self.answer.clone());
         }
         let made = self.made.as_ref().is_some_and(|serial| *serial == peer.cert.serial);
-        // The node has taken it up: it keeps what it has.
+        // The node has adopted the certificate, so it keeps its chain.
         made.then(|| self.answer.clone().map(|c| Credentials { chain: Vec::new(), ..c }))
     }
 }
 
-/// Answers batches of requests from the fleet's file, or from memory while the file is unchanged.
+/// Answers batches of requests from the fleet file, or from memory while the file is unchanged.
 struct FleetDesk {
     file: PathBuf,
-    /// The version of the file that the remembered answers come from.
+    /// Version of the file from which the remembered answers come.
     stamp: Option<FileStamp>,
-    answered: BTreeMap<NodeId, Answered>,
-    /// Times that the file was read.
+    answered: BTreeMap<NodeId, LastAnswer>,
+    /// Number of times that the file was read.
     reads: u64,
 }
 
@@ -284,11 +284,11 @@ impl FleetDesk {
         Self { file, stamp: None, answered: BTreeMap::new(), reads: 0 }
     }
 
-    /// Answers a batch; blocks on the file. A certificate that has time left is not replaced: then the chain of the
-    /// answer is empty. A new one holds for as long as the old one did.
+    /// Answers a batch. Blocks on the file. A certificate with validity left is not replaced; the chain of the answer
+    /// is empty then. A new certificate has the validity of the old one.
     fn answer(&mut self, batch: Vec<RenewalRequest>, now: Now) -> Vec<RenewalAnswer> {
         self.answered.retain(|_, a| now.instant < a.at + a.interval);
-        let stamp = FileStamp::of(&self.file);
+        let stamp = FileStamp::read(&self.file);
         if stamp.is_none() || stamp != self.stamp {
             self.answered.clear();
             self.stamp = stamp;
@@ -323,8 +323,8 @@ impl FleetDesk {
         self.reads += 1;
         let mut found = match LockedFleet::open(&self.file) {
             Ok(mut locked) => {
-                // Whoever had the lock may have replaced the file.
-                self.stamp = FileStamp::of(&self.file);
+                // The previous holder of the lock may have replaced the file.
+                self.stamp = FileStamp::read(&self.file);
                 let fleet = &mut locked.fleet;
                 let has_learnt = batch.iter().fold(false, |any, (r, _)| recognize(fleet, r, now) || any);
                 let found = batch.iter().map(|(r, _)| renew(fleet, r, now)).collect();
@@ -333,24 +333,24 @@ impl FleetDesk {
             Err(why) => refuse_all(&why, batch.len()),
         };
         let mut answers = Vec::with_capacity(batch.len());
-        for ((request, key), Found { answer, made, .. }) in batch.into_iter().zip(found.drain(..)) {
+        for ((request, key), FleetAnswer { answer, made, .. }) in batch.into_iter().zip(found.drain(..)) {
             let RenewalRequest { asker, peer, .. } = request;
             let interval = renewal_interval(&peer);
             let remembered =
-                Answered { cert: peer.cert, key, answer: answer.clone(), made, at: now.instant, interval };
+                LastAnswer { cert: peer.cert, key, answer: answer.clone(), made, at: now.instant, interval };
             self.answered.insert(peer.node_id, remembered);
             answers.push(RenewalAnswer { asker, node: peer.node_id, answer });
         }
         answers
     }
 
-    /// Writes the file if the roster says something else: it has certificates before an answer leaves.
-    fn save(&mut self, locked: &LockedFleet, has_learnt: bool, found: Vec<Found>) -> Vec<Found> {
+    /// Writes the file if the roster changed, so that the file has each certificate before the answer leaves.
+    fn save(&mut self, locked: &LockedFleet, has_learnt: bool, found: Vec<FleetAnswer>) -> Vec<FleetAnswer> {
         if !has_learnt && found.iter().all(|found| !found.is_news) {
             return found;
         }
         let saved = locked.save();
-        self.stamp = FileStamp::of(&self.file);
+        self.stamp = FileStamp::read(&self.file);
         match saved {
             Ok(()) => found,
             Err(why) => refuse_all(&why, found.len()),
@@ -359,7 +359,7 @@ impl FleetDesk {
 }
 
 impl FleetDesk {
-    /// Takes over into the file what the lists in force revoke and it does not know: another copy of it made them.
+    /// Records in the file the revocations of the lists in force that it lacks. Another copy of the file made them.
     fn catch_up(&self, anchors: &TrustAnchors, now: Now) {
         let absorb = || -> Result<CrlReport, FleetFileError> {
             let mut locked = LockedFleet::open(&self.file)?;
@@ -378,72 +378,72 @@ impl FleetDesk {
                 );
             }
             Ok(_) => {}
-            Err(why) => error!("the fleet's file does not learn what was revoked elsewhere: {why}"),
+            Err(why) => error!("cannot record revocations by other copies of the fleet file: {why}"),
         }
     }
 }
 
-/// Enters the certificate that a node asks with, if another copy of the file made it; true if so.
+/// Records the certificate of a request if another copy of the file made it. Returns `true` if so.
 fn recognize(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> bool {
     let peer = request.peer.node_id.short();
     match fleet.recognize(&request.peer, now.unix) {
         Ok(false) => false,
         Ok(true) => {
-            warn!(%peer, "another copy of the fleet's file made its certificate; the file here knows it now");
+            warn!(%peer, "recorded a certificate that another copy of the fleet file made");
             true
         }
         Err(why) => {
-            error!(%peer, %why, "the fleet's file does not take its certificate");
+            error!(%peer, %why, "cannot record a certificate in the fleet file");
             false
         }
     }
 }
 
 /// An answer from the file.
-struct Found {
+struct FleetAnswer {
     answer: Result<Credentials, RenewalRefusal>,
-    /// The serial number of the certificate that was made for it.
+    /// Serial number of a certificate that was made for it.
     made: Option<Arc<[u8]>>,
-    /// True if the roster says something else since.
+    /// Whether the roster changed for this answer.
     is_news: bool,
 }
 
-impl Found {
+impl FleetAnswer {
     fn refused(why: RenewalRefusal) -> Self {
         Self { answer: Err(why), made: None, is_news: false }
     }
 }
 
-fn refuse_all(why: &FleetFileError, requests: usize) -> Vec<Found> {
+fn refuse_all(why: &FleetFileError, requests: usize) -> Vec<FleetAnswer> {
     error!(requests, "cannot give credentials: {why}");
-    std::iter::repeat_with(|| Found::refused(RenewalRefusal::File)).take(requests).collect()
+    std::iter::repeat_with(|| FleetAnswer::refused(RenewalRefusal::File)).take(requests).collect()
 }
 
-fn renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Found {
+fn renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> FleetAnswer {
     match try_renew(fleet, request, now) {
         Ok(found) => found,
         Err(why) => {
-            warn!(peer = %request.peer.node_id.short(), %why, "gives no credentials");
-            Found::refused(RenewalRefusal::from_fleet(&why))
+            warn!(peer = %request.peer.node_id.short(), %why, "refused credentials");
+            FleetAnswer::refused(RenewalRefusal::from_fleet(&why))
         }
     }
 }
 
-fn try_renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Result<Found, FleetError> {
+fn try_renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> Result<FleetAnswer, FleetError> {
     let RenewalRequest { peer, csr, .. } = request;
     let unknown = || FleetError::UnknownNode { node: peer.pseudonym.short() };
     let node = fleet.node_by_pseudonym(&peer.pseudonym).ok_or_else(unknown)?.name.clone();
     if !is_due(peer, now) {
         let credentials = fleet.credentials_for(&node, Vec::new())?;
         let is_news = fleet.note_handed(&node, now.unix)?;
-        return Ok(Found { answer: Ok(credentials), made: None, is_news });
+        return Ok(FleetAnswer { answer: Ok(credentials), made: None, is_news });
     }
     let valid = Duration::from_millis(lasts(peer)).max(VALID_MIN);
     let mut rng = OsRng.unwrap_err();
     let credentials = fleet.renew_csr(csr, &peer.pseudonym, valid, now.unix, &mut rng)?;
     let made = credentials.chain.first().and_then(|leaf| serial_of(leaf)).map(Arc::from);
-    info!(%node, "renewed its certificate");
-    Ok(Found { answer: Ok(credentials), made, is_news: true })
+    info!(%node, "renewed a certificate");
+    Ok(FleetAnswer { answer: Ok(credentials), made, is_news: true })
 }
 
 #[cfg(test)]
@@ -462,7 +462,7 @@ mod tests {
         crate::core::now()
     }
 
-    /// A fleet's file with members whose certificates are due.
+    /// A fleet file with members whose certificates are due.
     struct Bench {
         dir: tempfile::TempDir,
         desk: FleetDesk,
@@ -508,7 +508,7 @@ mod tests {
         RenewalRequest { asker, peer, csr: Bytes::copy_from_slice(csr) }
     }
 
-    /// A request for a key that was made for it.
+    /// Returns a request for another key.
     fn other_key() -> Vec<u8> {
         let made = KeyRequest::generate(None, &mut OsRng.unwrap_err()).unwrap();
         pem_contents(&made.csr_text(), &["CERTIFICATE REQUEST"]).unwrap().remove(0).to_vec()
@@ -522,12 +522,12 @@ mod tests {
         let first = bench.ask(&arm, &arm.csr(), began).unwrap();
         assert_eq!((bench.certificates("arm"), bench.desk.reads), (2, 1));
         for _ in 0..100 {
-            // Signed anew each time: what counts is the key.
+            // Each request is signed anew, so the key identifies it.
             assert_eq!(bench.ask(&arm, &arm.csr(), began).unwrap(), first);
         }
         assert_eq!((bench.certificates("arm"), bench.desk.reads), (2, 1));
 
-        // With what it was given it asks again, and keeps it.
+        // The node asks again with the new certificate and keeps it.
         let renewed = arm.with_credentials(&first).unwrap();
         let kept = bench.ask(&renewed, &renewed.csr(), began).unwrap();
         assert!(kept.chain.is_empty());

@@ -1,6 +1,6 @@
-//! The data path by itself, for benchmarks to count: tables of names, and queues that nobody but the benchmark empties.
+//! The data path in isolation, for benchmarks: forwarding tables, and queues that only the benchmark empties.
 //!
-//! No link, no socket, no task. What nodes do between these two ends is in `dataplane.rs` and `outflow.rs`.
+//! There is no link, socket or task. `dataplane.rs` and `outflow.rs` have the code of nodes between these two ends.
 
 use std::sync::Arc;
 
@@ -10,17 +10,17 @@ use sgc_wire::{Name, Packet};
 use crate::dataplane::{DataPlane, Forward, Out};
 use crate::outflow::OutFlow;
 
-/// The link that everything comes from.
+/// Link from which all packets come.
 const UP: LinkId = LinkId(1);
 
-/// Names that all come over one link and go out over the same others.
+/// Names that come over one link and leave over the same others.
 pub struct Forwarding {
     data: DataPlane,
     outs: Vec<Arc<OutFlow>>,
 }
 
 impl Forwarding {
-    /// Tables of these names, each with so many ways out.
+    /// Creates tables of these names with `ways` destinations each.
     pub fn new(names: impl IntoIterator<Item = Name>, ways: u32) -> Self {
         let links: Vec<_> = (0..ways).map(|way| LinkId(UP.0 + 1 + way)).collect();
         let outs: Vec<_> = links.iter().map(|_| OutFlow::idle()).collect();
@@ -35,12 +35,12 @@ impl Forwarding {
         Self { data, outs }
     }
 
-    /// Sends a packet on, as the task that read it from its link does.
+    /// Forwards a packet, as a receiving task does.
     pub async fn forward(&self, packet: Packet) {
         self.data.forward(UP, packet).await;
     }
 
-    /// Takes the oldest packet from the queue of every way out; waits where there is none.
+    /// Takes the oldest packet from the queue of each destination. Waits if there is none.
     pub async fn take(&self, mut sink: impl FnMut(Packet)) {
         for out in &self.outs {
             sink(out.queued().await);

@@ -1,5 +1,5 @@
-//! [`CallLedger`]: the calls of one service that got no answer, by reason and by caller. It outlasts the route, since a service
-//! whose server stays away has none. Who called is known by id here; names are the reader's business.
+//! [`CallLedger`]: the calls of one service that got no answer, by reason and by caller. It outlives the route, since a
+//! service whose server stays away has none. Callers are known by id; the reader finds their names.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -12,12 +12,12 @@ use tracing::{debug, warn};
 
 use crate::stats::Drops;
 
-/// Services whose calls are remembered after their routes ended.
+/// Most services whose calls are remembered after their routes ended.
 pub(crate) const LEDGERS_MAX: usize = 1024;
-/// Callers that are told apart for each reason.
+/// Most callers that are distinguished for each reason.
 const CALLERS_MAX: usize = 64;
 
-/// The maker of a call.
+/// The caller.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum CallerId {
     /// A client of the local network, by its request writer.
@@ -26,14 +26,14 @@ pub(crate) enum CallerId {
     Source(SourceId),
 }
 
-/// The calls that were lost for one reason.
+/// Calls that were lost for one reason.
 #[derive(Clone, Debug)]
 pub(crate) struct Losses {
-    /// All of them.
+    /// Number of lost calls.
     pub(crate) count: u64,
-    /// Those since a call was answered last.
+    /// Number of lost calls since a call was last answered.
     pub(crate) since_answer: u64,
-    /// By caller, as far as it is known.
+    /// Lost calls by caller, if known.
     pub(crate) by: BTreeMap<CallerId, u64>,
     /// The time of the last one.
     pub(crate) last: Instant,
@@ -42,10 +42,10 @@ pub(crate) struct Losses {
 #[derive(Debug, Default)]
 struct State {
     topic: String,
-    /// Calls of routes that have ended.
+    /// Calls of earlier routes.
     past: CallStats,
     losses: BTreeMap<CallLoss, Losses>,
-    /// True if something was lost since a call was answered last.
+    /// Whether a call was lost since one was last answered.
     is_lossy: bool,
 }
 
@@ -59,14 +59,14 @@ pub(crate) struct CallLedger {
 }
 
 impl CallLedger {
-    /// Nothing is lost yet.
+    /// Creates a ledger without losses.
     pub(crate) fn new(is_served: bool, failures: Arc<Drops>) -> Self {
         Self { is_served, failures, state: Mutex::default() }
     }
 
-    /// Counts calls that are lost.
+    /// Counts lost calls.
     pub(crate) fn count(&self, loss: CallLoss, of: Option<CallerId>, calls: u64) {
-        // That one is a counter of the data path, where it is counted.
+        // The data path counts overruns itself.
         let is_first = loss != CallLoss::Overrun && self.failures.add(loss.key(), calls);
         let mut state = self.lock();
         state.is_lossy = true;
@@ -86,7 +86,7 @@ impl CallLedger {
         }
     }
 
-    /// A call was answered.
+    /// Notes that a call was answered.
     pub(crate) fn answered(&self) {
         let mut state = self.lock();
         if std::mem::take(&mut state.is_lossy) {
@@ -94,7 +94,7 @@ impl CallLedger {
         }
     }
 
-    /// Names the service, as it is called on the local network.
+    /// Sets the service's name on the local network.
     pub(crate) fn set_topic(&self, topic: &str) {
         topic.clone_into(&mut self.lock().topic);
     }
@@ -106,7 +106,7 @@ impl CallLedger {
         past.answered += stats.answered;
     }
 
-    /// Returns the service's name, the calls of routes that have ended, and what was lost.
+    /// Returns the service's name, the calls of earlier routes, and the losses.
     pub(crate) fn read(&self) -> (String, CallStats, BTreeMap<CallLoss, Losses>) {
         let state = self.lock();
         (state.topic.clone(), state.past, state.losses.clone())
@@ -142,7 +142,7 @@ mod tests {
         assert_eq!(counted.into_iter().collect::<Vec<_>>(), [("call_server_gone".to_owned(), 203)]);
     }
 
-    /// Each key of the specification has a sentence in `sgc why` and `sgc status`.
+    /// Checks that each key of the specification has a sentence in `sgc why` and `sgc status`.
     #[test]
     fn every_reason_is_in_the_specification() {
         let spec = include_str!("../../../docs/spec/routing.md");

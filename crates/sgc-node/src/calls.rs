@@ -1,8 +1,8 @@
-//! Services at this node: local calls that go elsewhere, and calls from elsewhere of a local server.
+//! Services at this node: calls of local clients to other nodes, and calls of other nodes to local servers.
 //!
-//! What is remembered of a call is with the machines of `sgc-endpoint`; here are the threads between them and the local
-//! network. Whatever may block does so on the thread of one service, and nobody calls the local network under a lock:
-//! it may answer on the thread that asks.
+//! The machines of `sgc-endpoint` remember the state of calls. This module has the threads between them and the local
+//! network. Each service has a thread for everything that may block. No lock is held while the local network is called,
+//! since it may answer on the same thread.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -22,103 +22,103 @@ use crate::sinks::failure_key;
 use crate::sources::{IsTooLarge, LocalShare};
 use crate::stats::Drops;
 
-/// How long a message about a call waits for the local endpoint that is being made.
+/// Longest wait of a message about a call for its local endpoint.
 const ENDPOINT_WAIT: Duration = Duration::from_secs(10);
-/// Answers kept that come before it is known what they answer.
+/// Most replies that are kept until their request id is known.
 const EARLY_MAX: usize = 64;
 
 /// One service at this node.
 #[derive(Clone)]
 pub(crate) enum Calls {
-    /// Others call it here.
-    Served(Arc<Served>),
-    /// It is called from here.
-    Called(Arc<Called>),
+    /// Its server is on this network.
+    LocalService(Arc<LocalService>),
+    /// Its server is elsewhere, and local clients call it.
+    FarService(Arc<FarService>),
 }
 
 impl Calls {
-    /// The calls that were lost.
+    /// Returns the ledger of lost calls.
     pub(crate) fn ledger(&self) -> &CallLedger {
         match self {
-            Self::Served(served) => &served.ledger,
-            Self::Called(called) => &called.ledger,
+            Self::LocalService(local) => &local.ledger,
+            Self::FarService(far) => &far.ledger,
         }
     }
 
-    /// The service ended: what is open will not be answered.
+    /// Ends the service: open calls stay without an answer.
     pub(crate) fn withdraw(&self) {
         match self {
-            Self::Served(served) => {
-                served.lock().answerer.withdraw();
-                served.count_lost();
+            Self::LocalService(local) => {
+                local.lock().answerer.withdraw();
+                local.count_lost();
             }
-            Self::Called(called) => {
-                let mut state = called.lock();
+            Self::FarService(far) => {
+                let mut state = far.lock();
                 state.closed = true;
                 state.caller.withdraw();
                 drop(state);
-                called.count_lost();
+                far.count_lost();
             }
         }
         self.ledger().add_past(self.stats());
     }
 
-    /// What became of its calls.
+    /// Returns the statistics of its calls.
     pub(crate) fn stats(&self) -> CallStats {
         match self {
-            Self::Served(served) => served.lock().answerer.stats(),
-            Self::Called(called) => called.lock().caller.stats(),
+            Self::LocalService(local) => local.lock().answerer.stats(),
+            Self::FarService(far) => far.lock().caller.stats(),
         }
     }
 
-    /// Ends it: nothing waits for a local endpoint any more, and the one that is there goes.
+    /// Closes it. Nothing waits for a local endpoint any more; the present one is returned.
     pub(crate) fn close(&self) -> Option<Box<dyn std::any::Any + Send>> {
         match self {
-            Self::Served(served) => {
-                served.lock().closed = true;
-                served.ready.notify_all();
-                served.set_client(None)
+            Self::LocalService(local) => {
+                local.lock().closed = true;
+                local.ready.notify_all();
+                local.set_client(None)
             }
-            Self::Called(called) => {
-                called.lock().closed = true;
-                called.ready.notify_all();
-                called.set_server(None)
+            Self::FarService(far) => {
+                far.lock().closed = true;
+                far.ready.notify_all();
+                far.set_server(None)
             }
         }
     }
 }
 
-/// Somebody who may block when dropped.
-type Old = Option<Box<dyn std::any::Any + Send>>;
+/// A value whose drop may block.
+type DeferredDrop = Option<Box<dyn std::any::Any + Send>>;
 
-struct ServedState {
+struct LocalServiceState {
     answerer: Answerer<RequestId, Guid>,
     client: Option<Arc<dyn RosClient>>,
-    /// True if the client is to go once nothing is open.
+    /// Whether the client ends once no call is open.
     ending: bool,
-    /// True while the local network is being asked: an answer may come before its id is known.
+    /// Whether a request is being sent. Its reply may arrive before its id is known.
     asking: bool,
-    /// Servers that went meanwhile.
+    /// Servers that disappeared meanwhile.
     gone: BTreeSet<Guid>,
     early: Vec<(RequestId, Bytes)>,
     sinks: BTreeMap<SourceId, SinkId>,
     closed: bool,
 }
 
-/// A service of the local network that others call.
-pub(crate) struct Served {
+/// A service of the local network that other nodes call.
+pub(crate) struct LocalService {
     share: Arc<LocalShare>,
     failures: Arc<Drops>,
     ledger: Arc<CallLedger>,
-    state: Mutex<ServedState>,
-    /// Told when there is a client, or it is closed.
+    state: Mutex<LocalServiceState>,
+    /// Notified when there is a client, and on closing.
     ready: Condvar,
 }
 
-impl Served {
-    /// Nobody calls it yet. What is said goes out as the share's.
+impl LocalService {
+    /// Creates the service without callers. Messages leave through the share.
     pub(crate) fn new(share: Arc<LocalShare>, failures: Arc<Drops>, ledger: Arc<CallLedger>) -> Self {
-        let state = ServedState {
+        let state = LocalServiceState {
             answerer: Answerer::new(CallLimits::default()),
             client: None,
             ending: false,
@@ -131,13 +131,13 @@ impl Served {
         Self { share, failures, ledger, state: Mutex::new(state), ready: Condvar::new() }
     }
 
-    /// Who may call now.
+    /// Sets the callers.
     pub(crate) fn set_callers(&self, sinks: BTreeMap<SourceId, SinkId>) {
         self.lock().sinks = sinks;
     }
 
-    /// What local servers are called with; the one before may block when it is dropped.
-    pub(crate) fn set_client(&self, client: Option<Arc<dyn RosClient>>) -> Old {
+    /// Sets the client of local servers. Returns the previous one, whose drop may block.
+    pub(crate) fn set_client(&self, client: Option<Arc<dyn RosClient>>) -> DeferredDrop {
         let mut state = self.lock();
         state.ending = false;
         let old = std::mem::replace(&mut state.client, client);
@@ -145,27 +145,27 @@ impl Served {
         old.map(|old| Box::new(old) as _)
     }
 
-    /// Ends the client once nothing is open; what it is now, if nothing is.
-    pub(crate) fn end_client(&self) -> Old {
+    /// Ends the client once no call is open. Returns it if none is.
+    pub(crate) fn end_client(&self) -> DeferredDrop {
         let mut state = self.lock();
         state.ending = true;
         state.take_ended()
     }
 
-    /// True if there is a client, which goes on then: somebody calls again.
+    /// Keeps the client, because a caller is back. Returns `true` if there is one.
     pub(crate) fn keep_client(&self) -> bool {
         let mut state = self.lock();
         state.ending = false;
         state.client.is_some()
     }
 
-    /// All local servers are gone.
+    /// Handles that no local server is left.
     pub(crate) fn servers_gone(self: &Arc<Self>) {
         let lost = self.lock().answerer.servers_gone();
         self.tell_lost(lost);
     }
 
-    /// An endpoint of the local network is gone, which may be a server's.
+    /// Handles the end of a local endpoint, which may be a server's.
     pub(crate) fn endpoint_gone(self: &Arc<Self>, guid: &Guid) {
         let lost = {
             let mut state = self.lock();
@@ -177,7 +177,7 @@ impl Served {
         self.tell_lost(lost);
     }
 
-    /// Tells who called that these calls will not be answered; on a thread that may block.
+    /// Tells callers, on a blocking thread, that these calls get no answer.
     fn tell_lost(self: &Arc<Self>, lost: Vec<(SourceId, u64, Bytes)>) {
         self.count_lost();
         if lost.is_empty() {
@@ -196,7 +196,7 @@ impl Served {
         lost.into_iter().for_each(|lost| self.ledger.count(lost.loss, Some(CallerId::Source(lost.of)), 1));
     }
 
-    /// Takes what somebody elsewhere says of a call; on the thread of the service.
+    /// Handles a message about a call from another node. Runs on the thread of the service.
     pub(crate) fn take(self: &Arc<Self>, message: Message) {
         let (source, number) = (message.source, message.head.call());
         let what = self.lock().answerer.handle(source, message.head.kind, number);
@@ -210,7 +210,7 @@ impl Served {
         }
     }
 
-    /// Asks the local server.
+    /// Sends a request to the local server.
     fn ask(self: &Arc<Self>, source: SourceId, number: u64, payload: Bytes) {
         let Some(client) = self.client() else { return self.lock().answerer.not_asked(source, number) };
         self.lock().asking = true;
@@ -236,7 +236,7 @@ impl Served {
         self.tell_lost(lost);
     }
 
-    /// The client, once it is there.
+    /// Waits for the client and returns it.
     fn client(&self) -> Option<Arc<dyn RosClient>> {
         let until = Instant::now() + ENDPOINT_WAIT;
         let mut state = self.lock();
@@ -249,7 +249,7 @@ impl Served {
         }
     }
 
-    /// Takes an answer of the local server; on the thread of the client.
+    /// Handles a reply of the local server. Runs on the thread of the client.
     pub(crate) fn answer(&self, id: RequestId, payload: Bytes) {
         let (answered, ended) = {
             let mut state = self.lock();
@@ -270,14 +270,14 @@ impl Served {
         } else {
             self.failures.count("reply_to_nothing");
         }
-        // It cannot end on its own thread.
+        // The client cannot be dropped on its own thread.
         if let Some(ended) = ended {
             self.share.run_blocking(move || drop(ended));
         }
     }
 
     fn tell(&self, source: SourceId, kind: MessageKind, number: u64, payload: Bytes) -> IsTooLarge {
-        // Who is gone asks again when it is back.
+        // A caller that is gone asks again when it is back.
         let Some(sink) = self.lock().sinks.get(&source).copied() else { return IsTooLarge::No };
         self.share.publish_call(&MessageHead::for_call(kind, number), payload, Some(sink))
     }
@@ -288,21 +288,21 @@ impl Served {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, ServedState> {
+    fn lock(&self) -> MutexGuard<'_, LocalServiceState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl ServedState {
-    fn take_ended(&mut self) -> Old {
+impl LocalServiceState {
+    fn take_ended(&mut self) -> DeferredDrop {
         let ends = self.ending && self.answerer.open() == 0 && !self.asking;
         let client = if ends { self.client.take() } else { None };
         client.map(|client| Box::new(client) as _)
     }
 }
 
-/// Takes the replies of local servers.
-pub(crate) struct Answers(pub(crate) Arc<Served>);
+/// Takes replies of local servers.
+pub(crate) struct Answers(pub(crate) Arc<LocalService>);
 
 impl HandleCalls for Answers {
     fn handle(&mut self, id: RequestId, payload: Bytes) {
@@ -314,8 +314,8 @@ impl HandleCalls for Answers {
     }
 }
 
-/// Takes the requests of local clients.
-pub(crate) struct Requests(pub(crate) Arc<Called>);
+/// Takes requests of local clients.
+pub(crate) struct Requests(pub(crate) Arc<FarService>);
 
 impl HandleCalls for Requests {
     fn handle(&mut self, id: RequestId, payload: Bytes) {
@@ -337,7 +337,7 @@ fn count_unhandled(share: &LocalShare, ledger: &CallLedger, why: UnhandledCall, 
     }
 }
 
-struct CalledState {
+struct FarServiceState {
     caller: Caller<RequestId>,
     server: Option<Arc<dyn RosServer>>,
     sink: Option<SinkId>,
@@ -345,19 +345,19 @@ struct CalledState {
 }
 
 /// A service of another node that local clients call.
-pub(crate) struct Called {
+pub(crate) struct FarService {
     share: Arc<LocalShare>,
     failures: Arc<Drops>,
     ledger: Arc<CallLedger>,
-    state: Mutex<CalledState>,
-    /// Told when there is a server, or it is closed.
+    state: Mutex<FarServiceState>,
+    /// Notified when there is a server, and on closing.
     ready: Condvar,
-    /// Wakes the control task, which asks what became of calls.
+    /// Wakes the control task, which asks for the state of calls.
     wake: Arc<Notify>,
 }
 
-impl Called {
-    /// No call yet. What is asked goes out as the share's.
+impl FarService {
+    /// Creates the service without calls. Requests leave through the share.
     pub(crate) fn new(
         share: Arc<LocalShare>,
         failures: Arc<Drops>,
@@ -365,18 +365,18 @@ impl Called {
         wake: Arc<Notify>,
     ) -> Self {
         let caller = Caller::new(CallLimits::default());
-        let state = CalledState { caller, server: None, sink: None, closed: false };
+        let state = FarServiceState { caller, server: None, sink: None, closed: false };
         Self { share, failures, ledger, state: Mutex::new(state), ready: Condvar::new(), wake }
     }
 
-    /// What local clients call; the one before may block when it is dropped.
-    pub(crate) fn set_server(&self, server: Option<Arc<dyn RosServer>>) -> Old {
+    /// Sets the server for local clients. Returns the previous one, whose drop may block.
+    pub(crate) fn set_server(&self, server: Option<Arc<dyn RosServer>>) -> DeferredDrop {
         let old = std::mem::replace(&mut self.lock().server, server);
         self.ready.notify_all();
         old.map(|old| Box::new(old) as _)
     }
 
-    /// Takes a call of a local client; on the thread of the server.
+    /// Handles a request of a local client. Runs on the thread of the server.
     pub(crate) fn call(&self, id: RequestId, payload: Bytes) {
         let (number, wakes) = {
             let mut state = self.lock();
@@ -394,11 +394,11 @@ impl Called {
         match number {
             Ok(Some(number)) => self.publish(MessageKind::Request, number, payload),
             Ok(None) => {}
-            Err(why) => debug!(%why, "a call is not taken"),
+            Err(why) => debug!(%why, "refused a call"),
         }
     }
 
-    /// The owner granted it, as this sink; `anew` if it knows nothing of what was before.
+    /// Handles the owner's grant for this sink. `anew` says that the owner knows no earlier call.
     pub(crate) fn granted(self: &Arc<Self>, sink: SinkId, anew: bool) {
         let open = {
             let mut state = self.lock();
@@ -411,35 +411,35 @@ impl Called {
         self.publish_elsewhere(MessageKind::Request, open);
     }
 
-    /// The way to the owner is lost for now.
+    /// Handles that the path to the owner is lost for now.
     pub(crate) fn lost(&self) {
         let mut state = self.lock();
         state.sink = None;
         state.caller.lost();
     }
 
-    /// A local endpoint is gone: its calls are over if it was a client.
+    /// Handles the end of a local endpoint. Its calls end if it was a client.
     pub(crate) fn endpoint_gone(self: &Arc<Self>, guid: &Guid) {
         let over = self.lock().caller.client_gone(|id| id.asker == Some(*guid));
         self.count_lost();
         self.publish_elsewhere(MessageKind::Forget, over.into_iter().map(|n| (n, Bytes::new())).collect());
     }
 
-    /// Asks what became of the calls that have been quiet for long.
+    /// Asks for the state of calls without news for long.
     pub(crate) fn ask_due(self: &Arc<Self>, now: Instant) {
         let due = self.lock().caller.ask_due(now);
         self.publish_elsewhere(MessageKind::Ask, due.into_iter().map(|n| (n, Bytes::new())).collect());
     }
 
-    /// When to do so.
+    /// Returns the time of the next such question.
     pub(crate) fn deadline(&self) -> Option<Instant> {
         self.lock().caller.deadline()
     }
 
-    /// Takes what the owner says of a call; on the thread of the service.
+    /// Handles the owner's message about a call. Runs on the thread of the service.
     pub(crate) fn take(&self, message: Message) {
         let (kind, number) = (message.head.kind, message.head.call());
-        // Without anybody to give it to an answer waits where it is.
+        // Without a server to deliver it, a reply waits where it is.
         let server = match kind {
             MessageKind::Reply => match self.server() {
                 Some(server) => Some(server),
@@ -470,7 +470,7 @@ impl Called {
         }
     }
 
-    /// The server, once it is there.
+    /// Waits for the server and returns it.
     fn server(&self) -> Option<Arc<dyn RosServer>> {
         let until = Instant::now() + ENDPOINT_WAIT;
         let mut state = self.lock();
@@ -498,7 +498,7 @@ impl Called {
         }
     }
 
-    /// The same for several, on a thread that may block.
+    /// Publishes several messages on a blocking thread.
     fn publish_elsewhere(self: &Arc<Self>, kind: MessageKind, calls: Vec<(u64, Bytes)>) {
         if calls.is_empty() {
             return;
@@ -509,7 +509,7 @@ impl Called {
         });
     }
 
-    fn lock(&self) -> MutexGuard<'_, CalledState> {
+    fn lock(&self) -> MutexGuard<'_, FarServiceState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

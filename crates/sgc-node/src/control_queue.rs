@@ -1,27 +1,27 @@
-//! Control frames that wait: [`ControlQueue`] for a link to send them, [`Inbox`] for the control task to take them.
+//! Queues of control frames: [`ControlQueue`] in front of a link, and [`Inbox`] in front of the control task.
 //!
-//! The inbox is bounded in bytes, for each link and in all. A link beyond its share is not read, so flow control holds back
-//! the peer that sends.
+//! The inbox is bounded in bytes per link and in total. A link beyond its share is not read, so flow control slows the
+//! sending peer.
 
 use std::sync::Arc;
 
 use sgc_wire::{CONTROL_FRAME_BYTES_MAX, Control};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 
-/// Control frames that may wait for one link. A peer that takes so long is not one to keep in step with.
+/// Most control frames that wait for one link. A peer that lags further loses its link.
 pub(crate) const CONTROL_FRAMES_MAX: usize = 8192;
-/// Bytes of control frames of one link that may wait for the control task: one of the longest, at least.
+/// Most bytes of one link's frames that wait for the control task: room for one of the longest.
 pub(crate) const LINK_INBOX_BYTES_MAX: usize = CONTROL_FRAME_BYTES_MAX + FRAME_BYTES;
-/// The same of all links.
+/// Most bytes of all links' frames that wait for the control task.
 pub(crate) const INBOX_BYTES_MAX: usize = 32 << 20;
-/// Bytes that a frame takes beside its encoding, about.
+/// Approximate memory of a frame beside its encoding.
 const FRAME_BYTES: usize = 256;
 
 /// An item that waits for a link.
 #[derive(Debug)]
 pub(crate) enum Outgoing {
     Frame(Control),
-    /// The control task is to hear that the link has taken everything before.
+    /// Notify the control task when the link has taken everything before.
     Flush,
 }
 
@@ -35,34 +35,35 @@ impl ControlQueue {
         (Self(queue), outgoing)
     }
 
-    /// Queues a frame; false if the peer is too far behind, or the link has ended.
+    /// Queues a frame. Returns `false` if the peer is too far behind, or the link has ended.
     pub(crate) fn push(&self, frame: Control) -> bool {
         self.0.try_send(Outgoing::Frame(frame)).is_ok()
     }
 
-    /// Queues a frame once there is room; false if the link has ended.
+    /// Queues a frame once there is room. Returns `false` if the link has ended.
     pub(crate) async fn push_later(&self, frame: Control) -> bool {
         self.0.send(Outgoing::Frame(frame)).await.is_ok()
     }
 
-    /// Has the control task told when the link has taken what is queued; false if the peer is too far behind.
+    /// Queues a flush, which notifies the control task when the link has taken everything before. Returns `false` if
+    /// the peer is too far behind.
     pub(crate) fn flush(&self) -> bool {
         self.0.try_send(Outgoing::Flush).is_ok()
     }
 }
 
-/// Room for control frames in the inbox of the control task.
+/// Room for control frames in the control task's inbox.
 #[derive(Clone, Debug)]
 pub(crate) struct Inbox(Arc<Semaphore>);
 
-/// The room that a frame takes, until the control task has handled it.
+/// Room of one frame, held until the control task has handled it.
 #[derive(Debug)]
 pub(crate) struct FrameRoom {
     _of_link: OwnedSemaphorePermit,
     _of_all: OwnedSemaphorePermit,
 }
 
-/// The part of it that one link may use.
+/// One link's share of the inbox.
 #[derive(Debug)]
 pub(crate) struct InboxShare {
     of_link: Arc<Semaphore>,
@@ -82,7 +83,7 @@ impl Inbox {
 }
 
 impl InboxShare {
-    /// Waits until there is room for a frame of so many bytes. Links that wait are served in their order.
+    /// Waits for room for a frame of this encoded length. Waiting links are served in order.
     pub(crate) async fn take(&self, encoded_bytes: usize) -> Option<FrameRoom> {
         let bytes = (encoded_bytes + FRAME_BYTES).min(LINK_INBOX_BYTES_MAX).try_into().unwrap_or(u32::MAX);
         let of_link = self.of_link.clone().acquire_many_owned(bytes).await.ok()?;

@@ -1,7 +1,7 @@
-//! Messages that travel as JSON: CDR to JSON before they are sealed, and back behind the seal.
+//! Messages that travel as JSON: CDR becomes JSON before sealing, and JSON becomes CDR after opening.
 //!
-//! Both need to know what messages of the type look like, which may become known later than the first of them comes: those
-//! are held (`hold.rs`) by the ends of the topic. What JSON of a message is, `sgc-cdr` says (docs/spec/json.md).
+//! Both directions need the type, which may become known after the first message. Until then the ends of the topic hold
+//! the messages (`pending.rs`). `sgc-cdr` defines the JSON (docs/spec/json.md).
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -9,22 +9,22 @@ use bytes::Bytes;
 use sgc_cdr::{CdrVersion, DecodeError, Encoding, Layout, ValueError};
 use sgc_wire::Representations;
 
-/// What is known of a type.
+/// State of the search for a type.
 #[derive(Clone, Debug, Default)]
 pub(crate) enum KnownType {
-    /// It is being found out.
+    /// The search is under way.
     #[default]
     Awaited,
-    /// There is no definition here; its owner is asked, and may not know either.
+    /// There is no local definition. The owner is asked and may not know the type either.
     Asked,
-    /// What its messages look like.
+    /// The type is known.
     Known(Arc<Layout>),
-    /// It is not known: there is no definition here, and nobody is asked for one.
+    /// There is no local definition, and no node is asked.
     Lacking,
 }
 
 impl KnownType {
-    /// What messages look like, if that is known.
+    /// Returns the layout of a known type.
     pub(crate) fn layout(&self) -> Option<&Arc<Layout>> {
         match self {
             Self::Known(layout) => Some(layout),
@@ -32,28 +32,28 @@ impl KnownType {
         }
     }
 
-    /// Whether it may become known.
+    /// Returns `true` if the type may still become known.
     pub(crate) fn is_awaited(&self) -> bool {
         matches!(self, Self::Awaited | Self::Asked)
     }
 
-    /// Whether there is no definition here, and none may come.
+    /// Returns `true` if the type is unknown and stays so.
     pub(crate) fn is_lacking(&self) -> bool {
         matches!(self, Self::Asked | Self::Lacking)
     }
 }
 
-/// What is known of the type of an interface, for its end at this node.
+/// State of the type of an interface at its end on this node.
 #[derive(Debug, Default)]
 pub(crate) struct TypeSlot(Mutex<KnownType>);
 
 impl TypeSlot {
-    /// It stays so until it is something else.
+    /// Sets the state.
     pub(crate) fn set(&self, known: KnownType) {
         *self.lock() = known;
     }
 
-    /// What is known now.
+    /// Returns the state.
     pub(crate) fn now(&self) -> KnownType {
         self.lock().clone()
     }
@@ -63,23 +63,23 @@ impl TypeSlot {
     }
 }
 
-/// Why a message was not converted.
+/// Reasons why a message was not converted.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum ConversionError {
-    /// A local publisher wrote something else than its type says.
+    /// A local publisher wrote bytes that do not match the type.
     #[error("the message is not what its type says: {0}")]
     FromCdr(#[from] DecodeError),
-    /// What came is not JSON of the type.
+    /// The received text is no JSON of the type.
     #[error("the JSON is none of the type: {0}")]
     FromJson(#[from] ValueError),
 }
 
-/// The JSON of a message.
+/// Converts a CDR payload to JSON.
 pub(crate) fn to_json(layout: &Layout, payload: &Bytes) -> Result<Bytes, ConversionError> {
     Ok(layout.decode(payload)?.to_json().into())
 }
 
-/// The message of a JSON, as a writer that offers this representation writes it.
+/// Converts JSON to a CDR payload in a representation that the writer offers.
 pub(crate) fn from_json(
     layout: &Layout,
     json: &[u8],
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_of_the_type_is_refused() {
+    fn message_that_does_not_match_its_type_is_refused() {
         let layout = layout();
         let cut = to_json(&layout, &Bytes::from_static(b"\0\x01\0\0\x09\0\0\0abc")).unwrap_err();
         assert!(matches!(cut, ConversionError::FromCdr(_)), "{cut}");

@@ -1,11 +1,12 @@
-//! The control task: owns the three machines, feeds them what happens, and carries out what they decide.
+//! The control task: owns the three machines, feeds them events, and carries out their outputs.
 //!
-//! It blocks on nothing but its inbox and its timer. What may block, on the local network or on a slow peer,
-//! happens in tasks and threads of its own.
+//! It blocks on nothing but its inbox and its timer. Work that may block, on the local network or on a slow peer, runs
+//! in other tasks and threads.
 
 mod alerts;
 mod consumers;
 mod graph;
+mod interface_types;
 mod nodes;
 mod operations;
 mod outputs;
@@ -15,7 +16,6 @@ mod reopening;
 mod ros;
 mod services;
 mod trust;
-mod types;
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -42,16 +42,16 @@ use crate::call_ledger::CallLedger;
 use crate::calls::Calls;
 use crate::control_queue::{FrameRoom, Inbox, InboxShare};
 use crate::core::consumers::{ConsumerKey, FarConsumers};
+use crate::core::interface_types::{InterfaceTypes, TypeOutcome};
 use crate::core::nodes::LocalGraph;
 use crate::core::publish::{Offer, Publishing};
 use crate::core::reopening::Reopening;
-use crate::core::types::{TypeOutcome, Types};
-use crate::credentials::Keeper;
+use crate::credentials::StateWriter;
 use crate::dataplane::DataPlane;
-use crate::finding::Board;
+use crate::discovery::Board;
 use crate::gateway::Gateway;
 use crate::graph::Graph;
-use crate::heart::{Heart, Patience};
+use crate::keep_alive::{KeepAlive, KeepAlivePolicy};
 use crate::links::ControlTx;
 use crate::members::{MemberNames, Members};
 use crate::message_keys::MessageKeys;
@@ -65,36 +65,36 @@ use crate::sinks::{LocalSink, SinkRequest, WriterQueue};
 use crate::sources::{LocalShare, NewestSamples};
 use crate::stats::{Drops, NameStats};
 use crate::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
-use crate::tap::{Tap, TapError, TapQueue, TapWish};
+use crate::tap::{Tap, TapError, TapQueue, TapRequest};
 
-/// Events that may wait for the control task; who sends more waits.
+/// Events that may wait for the control task. Senders wait while it is full.
 pub(crate) const INBOX_MAX: usize = 4096;
-/// Events handled before the timers are looked at again.
+/// Events handled before the timers are checked again.
 const BATCH_MAX: usize = 256;
-/// How often sources are looked at that may have fallen silent.
+/// Interval of checks for sources that may have fallen silent.
 const SILENCE_LOOK: Duration = Duration::from_secs(1);
-/// How long nothing may come of what was asked for before it is asked for again.
+/// Time without progress after which a history is asked for again.
 const HISTORY_RETRY: Duration = Duration::from_secs(2);
 /// Bytes of history kept for late joiners of one publisher.
 const HISTORY_BYTES_MAX: usize = 64 << 20;
-/// Messages of history kept where the publisher keeps all.
+/// Messages of history kept for a publisher that keeps all.
 const HISTORY_KEEP_ALL_MAX: usize = 4096;
-/// How many instances' worth of history a transient-local source of a keyed topic keeps, as the writers of `sgc-dds` do.
+/// Instances for which a transient-local source of a keyed topic keeps its history, as the writers of `sgc-dds` do.
 const KEYED_INSTANCES_KEPT: usize = 256;
-/// How long packets of past epochs may be under way.
+/// Time for which packets of past epochs may be under way.
 const EPOCH_GRACE: Duration = Duration::from_secs(5);
 
-/// What happens to the control task.
+/// Event for the control task.
 pub(crate) enum CoreEvent {
     /// A link was made.
     LinkUp {
         /// The link.
         link: AnyLink,
-        /// The URL dialled, if this node dialled.
+        /// URL, if this node dialled.
         url: Option<String>,
-        /// Where its control frames go.
+        /// Queue of its control frames.
         control: ControlTx,
-        /// Its place here, or nothing if the node is stopping.
+        /// Receives the link's place, or `None` if the node is stopping.
         reply: oneshot::Sender<Option<LinkPlace>>,
     },
     /// The configuration was read again.
@@ -104,96 +104,96 @@ pub(crate) enum CoreEvent {
     },
     /// A link ended.
     LinkDown {
-        /// Which.
+        /// The link.
         id: LinkId,
-        /// The place of another process with this node's identity, if the peer closed the link for it.
+        /// Place of another process with this node's identity, if the peer closed the link for it.
         in_use: Option<String>,
     },
-    /// A control frame came.
+    /// A control frame arrived.
     Frame {
-        /// Over which link.
+        /// The link.
         link: LinkId,
-        /// What.
+        /// The frame.
         frame: Control,
         /// Its room in the inbox.
         room: FrameRoom,
     },
     /// A link has taken all control frames before a flush.
     Flushed {
-        /// Which.
+        /// The link.
         link: LinkId,
     },
-    /// A malformed control frame came.
+    /// A malformed control frame arrived.
     Malformed {
-        /// Over which link.
+        /// The link.
         link: LinkId,
     },
     /// The local graph changed.
     Discovery(DiscoveryEvent),
-    /// The local network was taken away to be opened again; answered once nothing here holds it.
+    /// The local network is about to close and to open again. Answered once the control task holds nothing of it.
     CloseNetwork(oneshot::Sender<()>),
-    /// It is open again; what is discovered follows.
+    /// The local network is open again. Its discovery events follow.
     NetworkReopened,
-    /// It could not be opened again so far, for this reason.
+    /// The local network could not be opened again so far, for this reason.
     NetworkStaysClosed(String),
-    /// A local writer was made, or not.
+    /// A local writer was created, or failed.
     WriterReady {
         /// The joined name.
         name: Name,
-        /// The source that it is for.
+        /// The source whose messages it writes.
         source: Option<SourceId>,
-        /// As it was asked for.
+        /// The requested endpoint.
         spec: EndpointSpec,
         /// Its queue.
         writer: Option<Arc<WriterQueue>>,
     },
-    /// A local reader was made.
+    /// A local reader was created.
     ReaderReady {
         /// The share.
         name: Name,
-        /// As it was asked for.
+        /// The requested endpoint.
         spec: EndpointSpec,
         /// Its GUID on the local network.
         guid: Guid,
-        /// Dropping it ends it.
+        /// Owner of the reader. Dropping it closes the reader.
         reader: Box<dyn std::any::Any + Send>,
     },
-    /// Endpoints that stand for a consumer elsewhere were made, or not.
+    /// The local endpoints that stand for a far consumer were created, or failed.
     ConsumerShown {
         /// The consumer.
         key: ConsumerKey,
-        /// As they were asked for, each with its endpoint.
+        /// The requested endpoints with the created ones.
         ends: Vec<(EndpointKind, EndpointSpec, ShownEndpoint)>,
     },
-    /// What calls local servers for others was made, or what local clients call.
+    /// A service's local client or server was created.
     ServiceReady {
         /// The share or the joined name.
         name: Name,
-        /// As it was asked for.
+        /// The requested service.
         spec: ServiceSpec,
-        /// Either.
+        /// The client or server.
         end: ServiceEnd,
     },
-    /// The node joined the local network after its start; its rules follow.
+    /// The node joined the local network after its start. The rules follow.
     NetworkJoined(Box<Routes<ChaCha20Rng>>),
-    /// The user wants something else from now on; answered when it is under way.
+    /// The configuration changed. Answered when the change is under way.
     Reload {
-        /// What is shared.
+        /// The new shares.
         shares: Vec<ShareRule>,
-        /// What is brought here.
+        /// The new uses.
         uses: Vec<UseRule>,
-        /// Whom to believe, if that changes: the CAs, and what is kept of their lists.
+        /// The new trust anchors with kept revocation lists, if they change.
         anchors: Option<TrustAnchors>,
         /// Keys for suites that were not in use.
         message_keys: MessageKeys,
         /// The names of members in these rules.
         member_names: MemberNames,
-        /// Told when it is done.
+        /// Notified when the change is under way.
         reply: oneshot::Sender<()>,
     },
-    /// Answers from the fleet's file to those who asked this authority, and results of operations.
+    /// The authority's desk answered requests for renewal and carried out operations.
     DeskAnswered(DeskAnswers),
-    /// A user wants an operation on the fleet to be carried out at its authority.
+    /// A user asks an authority for an operation on the fleet.
     Operate {
         /// The authority's name.
         at: NodeName,
@@ -202,26 +202,26 @@ pub(crate) enum CoreEvent {
         /// The channel for the answer.
         reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
     },
-    /// The user brings a revocation list; answered with whether it is news, and with the lists that were in force before.
+    /// A user brings a revocation list. Answered with whether it is new, and with the lists that were in force before.
     Crl {
         /// The list, DER.
         der: bytes::Bytes,
         /// The channel for the answer.
         reply: oneshot::Sender<Result<(bool, Vec<bytes::Bytes>), CrlError>>,
     },
-    /// Keys that messages of these suites are signed with are made.
+    /// Signing keys of these suites were created.
     MessageKeys(MessageKeys),
-    /// A type was looked for.
+    /// A search for a type ended.
     TypeLookedFor(TypeOutcome),
-    /// Somebody asks how things are.
+    /// Asks for the status.
     Status(oneshot::Sender<Status>),
-    /// Somebody asks what is there, and where it goes; also of a name that this node need not know.
+    /// Asks for the graph, also of a name that is not in use here.
     Graph(Option<Name>, oneshot::Sender<Graph>),
-    /// Somebody wants to see what goes by.
-    Tap(TapWish, oneshot::Sender<Result<Tap, TapError>>),
-    /// Take nothing in any more; answered with what still leaves.
+    /// Asks for a tap.
+    Tap(TapRequest, oneshot::Sender<Result<Tap, TapError>>),
+    /// Stop receiving. Answered with the queues that still have to drain.
     Quiesce(oneshot::Sender<Vec<Arc<OutFlow>>>),
-    /// Take back what is shared and say goodbye; answered with the links, which the peers then close.
+    /// Withdraw the shares and say goodbye. Answered with the links, which the peers then close.
     Stop(oneshot::Sender<Vec<AnyLink>>),
 }
 
@@ -229,27 +229,27 @@ pub(crate) enum CoreEvent {
 pub(crate) struct LinkPlace {
     /// Its number.
     pub(crate) id: LinkId,
-    /// The destination of its packets.
+    /// Data path for its packets.
     pub(crate) data: Arc<DataPlane>,
-    /// Its control frames' share of the inbox.
+    /// Its share of the inbox.
     pub(crate) inbox: InboxShare,
 }
 
-/// A reader of the local network, for a name.
+/// A local reader for a name.
 struct LocalReader {
-    /// As it is wanted.
+    /// The requested endpoint.
     spec: EndpointSpec,
-    /// Dropping it ends it. None while it is being made.
+    /// Owner of the reader; `None` while it is being created. Dropping it closes the reader.
     opened: Option<Box<dyn std::any::Any + Send>>,
-    /// The newest samples that it took.
+    /// Time stamps of the newest samples that it took.
     newest: Option<Arc<NewestSamples>>,
 }
 
 /// This node's end of a service on the local network.
 pub(crate) enum ServiceEnd {
-    /// It calls local servers.
+    /// A client that calls local servers.
     Client(Arc<dyn RosClient>),
-    /// Local clients call it.
+    /// A server that local clients call.
     Server(Arc<dyn RosServer>),
 }
 
@@ -258,9 +258,9 @@ struct LinkEntry {
     url: Option<String>,
     control: ControlTx,
     flows: HashMap<Name, Arc<OutFlow>>,
-    /// Why this node closed it, if it did.
+    /// Reason, if this node closed it.
     closed_for: Option<String>,
-    heart: Heart,
+    keep_alive: KeepAlive,
 }
 
 /// The control task's state. `N` is the local network; a pure router has none.
@@ -273,53 +273,53 @@ pub(crate) struct Core<N: RosNetwork> {
     data: Arc<DataPlane>,
     inbox: Inbox,
     links: BTreeMap<LinkId, LinkEntry>,
-    /// When to look at them.
+    /// Time of the next look at the links.
     look_due: Option<Instant>,
-    /// How often peers are asked that say nothing.
-    patience: Patience,
-    /// The peers that have to be asked sooner.
+    /// Keep-alive policy of new links.
+    keep_alive_policy: KeepAlivePolicy,
+    /// Shorter intervals of peers behind NATs that forget soon.
     impatient: BTreeMap<NodeId, Duration>,
     next_link: u32,
     entries: HashMap<Name, (FibEntry, Arc<NameStats>)>,
     shares: HashMap<Name, Arc<LocalShare>>,
     readers: HashMap<Name, LocalReader>,
     sinks: HashMap<Name, Arc<LocalSink>>,
-    /// Names of services, shared or joined.
+    /// Shared and joined services.
     calls: BTreeMap<Name, Calls>,
-    /// Their lost calls, which outlast them.
+    /// Lost calls by service. They outlive the services.
     call_ledgers: BTreeMap<Name, Arc<CallLedger>>,
-    /// Their ends on the local network, as they are wanted.
+    /// Requested local clients and servers of the services.
     service_ends: HashMap<Name, ServiceSpec>,
     writers: HashMap<(Name, Option<SourceId>), EndpointSpec>,
-    /// Which nodes the local graph shows for them.
+    /// Far nodes that the local graph shows.
     graph: LocalGraph,
     reopening: Reopening,
-    /// The subscribers, publishers and service clients that owners are told, and those elsewhere that are shown here.
+    /// Local consumers that owners are told, and far consumers that are shown here.
     consumers: FarConsumers,
     history_due: BTreeMap<(Name, SourceId), Instant>,
-    /// When the keys of past epochs of a joined name are dropped.
+    /// Times at which the keys of past epochs are dropped.
     retire_due: BTreeMap<Name, Instant>,
-    /// What the messages of this node are signed with, by suite.
+    /// Signing keys of this node's messages, by suite.
     message_keys: MessageKeys,
     publishing: BTreeMap<Name, Publishing>,
-    /// Topics of others that wait for a key to be made.
+    /// Offers to publish on, which wait for a signing key.
     keyless: BTreeMap<Name, Offer>,
     /// Messages of one source under one key.
     epoch_messages_max: u64,
-    /// Told when a source has published as many.
+    /// Notified when a source reaches that number.
     epoch_over: Arc<Notify>,
     credentials: CredentialStore,
     gateway: Arc<Gateway>,
     /// Set if this node is the authority of its fleet.
     authority: Option<Authority>,
-    /// Operations that users of this node ask an authority for.
+    /// Operations that users of this node request.
     operations: Operations,
-    keeper: Keeper,
-    /// When to ask for another certificate.
+    keeper: StateWriter,
+    /// Time of the next request for renewal.
     renew_due: Option<Instant>,
     redial: watch::Sender<()>,
     replays: Arc<Replays>,
-    /// When to look again for sources that fell silent; `None` until one publishes.
+    /// Time of the next check for silent sources; `None` until one publishes.
     silence_due: Option<Instant>,
     requests: mpsc::Sender<SinkRequest>,
     control_drops: Drops,
@@ -328,76 +328,76 @@ pub(crate) struct Core<N: RosNetwork> {
     events: mpsc::WeakSender<CoreEvent>,
     started: Instant,
     alerts: Alerts,
-    /// True until the clock has come to where this node's certificate begins.
+    /// Whether the clock is still before the start of this node's certificate.
     awaits_clock: bool,
     transport: Arc<sgc_transport::TransportMetrics>,
     alive: mpsc::Sender<()>,
     audit: Audit,
     board: Board,
-    /// Who asked for a share and was refused, and why.
+    /// Refused nodes of each share, with the reason.
     refused: BTreeMap<Name, BTreeMap<NodeId, String>>,
-    /// Who looks at the local network.
+    /// Taps of the local network.
     local_taps: Vec<Arc<TapQueue>>,
-    types: Types,
+    types: InterfaceTypes,
     members: Members,
 }
 
-/// What a [`Core`] is made of.
+/// Parts from which a [`Core`] is built.
 pub(crate) struct CoreParts<N> {
-    /// This node.
+    /// Identity of this node.
     pub identity: Arc<Identity>,
-    /// What links are made with.
+    /// Credentials of links.
     pub credentials: CredentialStore,
-    /// Whose clients' certificates follow what this node trusts.
+    /// Gateway, whose client certificates follow this node's trust anchors.
     pub gateway: Arc<Gateway>,
-    /// What peers may send into this node.
+    /// Rate limits of peers.
     pub(crate) rates: PeerRates,
     /// Set if this node is the authority of its fleet.
     pub authority: Option<Authority>,
     /// Messages of one source under one key.
     pub epoch_messages_max: u64,
-    /// For the suites of its shares.
+    /// Signing keys for the suites of its shares.
     pub(crate) message_keys: MessageKeys,
-    /// Writes what outlives the process.
-    pub(crate) keeper: Keeper,
-    /// Tells the dialling tasks that there is another certificate.
+    /// Writes state that outlives the process.
+    pub(crate) keeper: StateWriter,
+    /// Notifies the dialling tasks of a new certificate.
     pub redial: watch::Sender<()>,
     /// The routing machine.
     pub router: Router,
     /// The endpoint machine.
     pub endpoint: Endpoint,
-    /// The route machine, where there is a local network.
+    /// The route machine, if there is a local network.
     pub routes: Option<Routes<ChaCha20Rng>>,
     /// The local network.
     pub(crate) network: NetworkSlot<N>,
-    /// Its own inbox.
+    /// Sender to its own inbox.
     pub events: mpsc::WeakSender<CoreEvent>,
-    /// Held by every thread and blocking task, for as long as it uses the runtime.
+    /// Clone held by every thread and blocking task while it uses the runtime.
     pub(crate) alive: mpsc::Sender<()>,
     /// Transport counters.
     pub transport: Arc<sgc_transport::TransportMetrics>,
-    /// Where is kept who was granted what.
+    /// Audit log.
     pub audit: Audit,
-    /// How routers are being found.
+    /// State of the searches for routers.
     pub(crate) board: Board,
-    /// How often peers are asked that say nothing.
-    pub(crate) patience: Patience,
-    /// Where types are kept that are known.
+    /// Keep-alive policy of new links.
+    pub(crate) keep_alive_policy: KeepAlivePolicy,
+    /// Store of known types.
     pub types: Arc<TypeStore>,
-    /// Where definitions of them are.
+    /// Search paths of type definitions.
     pub definitions: Definitions,
     /// The names of members in rules.
     pub(crate) member_names: MemberNames,
 }
 
-/// The present, by both clocks.
+/// Returns the current time of both clocks.
 pub(crate) fn now() -> Now {
     let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     Now { instant: Instant::now(), unix: UnixMillis(unix.as_millis().try_into().unwrap_or(u64::MAX)) }
 }
 
 impl<N: RosNetwork> Core<N> {
-    /// The control task and the inbox of its sinks.
+    /// Creates the control task and the inbox of its sinks.
     pub(crate) fn new(parts: CoreParts<N>) -> (Self, mpsc::Receiver<SinkRequest>) {
         let (requests, requested) = mpsc::channel(INBOX_MAX);
         let graph = LocalGraph::new(parts.identity.node_name().as_str());
@@ -413,7 +413,7 @@ impl<N: RosNetwork> Core<N> {
             inbox: Inbox::default(),
             links: BTreeMap::new(),
             look_due: None,
-            patience: parts.patience,
+            keep_alive_policy: parts.keep_alive_policy,
             impatient: BTreeMap::new(),
             next_link: 1,
             entries: HashMap::new(),
@@ -456,14 +456,14 @@ impl<N: RosNetwork> Core<N> {
             audit: parts.audit,
             board: parts.board,
             refused: BTreeMap::new(),
-            types: Types::new(parts.types, parts.definitions),
+            types: InterfaceTypes::new(parts.types, parts.definitions),
             members,
             local_taps: Vec::new(),
         };
         (core, requested)
     }
 
-    /// Runs until stopped or until nobody can send events any more.
+    /// Runs until it is stopped or all senders are gone.
     pub(crate) async fn run(
         mut self,
         mut inbox: mpsc::Receiver<CoreEvent>,
@@ -517,10 +517,10 @@ impl<N: RosNetwork> Core<N> {
                 self.hear_of(link.peer());
                 let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
                 self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
-                let (flows, heart) = (HashMap::new(), self.heart_of(&link));
+                let (flows, keep_alive) = (HashMap::new(), self.keep_alive_for(&link));
                 self.control_drops.link_up(id);
                 self.data.drops().link_up(id);
-                self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, heart });
+                self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, keep_alive });
                 let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
                 if reply.send(Some(place)).is_err() {
                     debug!(%remote, "the link's task is gone");
@@ -533,7 +533,7 @@ impl<N: RosNetwork> Core<N> {
                 self.control_drops.link_down(id);
                 self.data.drops().link_down(id);
                 if let Some(entry) = self.links.remove(&id) {
-                    self.remember_patience(entry.link.peer().node_id, entry.heart.patience());
+                    self.remember_policy(entry.link.peer().node_id, entry.keep_alive.policy());
                     let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
                     let record = record.remote(entry.link.remote());
                     self.audit.write(match &entry.closed_for {
@@ -609,14 +609,14 @@ impl<N: RosNetwork> Core<N> {
                 let taken = self.router.add_crl(now(), &der);
                 let record = AuditRecord::new(AuditEvent::Crl).by_user();
                 match &taken {
-                    // Written where it comes into force.
+                    // The list is logged where it comes into force.
                     Ok(true) => {}
                     Ok(false) => self.audit.write(record.reason("known already")),
                     Err(why) => self.audit.write(record.reason(format!("refused: {why}"))),
                 }
                 let lists = self.credentials.anchors().crls().cloned().collect();
                 let _ = reply.send(taken.map(|is_news| (is_news, lists)));
-                // Whoever brings a list may have changed the fleet's file.
+                // A user who brings a list may have changed the fleet file.
                 self.answer_renewals();
             }
             CoreEvent::MessageKeys(keys) => self.add_message_keys(keys),
@@ -665,7 +665,7 @@ impl<N: RosNetwork> Core<N> {
         }
         if self.silence_due.is_none_or(|at| at <= now.instant) {
             let looks = self.shares.values().map(|share| share.look_for_silence(now.instant));
-            // All of them, not up to the first.
+            // `fold` looks at all of them, where `any` would stop at the first.
             let busy = looks.fold(false, |any, busy| any | busy);
             self.silence_due = busy.then(|| now.instant + SILENCE_LOOK);
         }
@@ -692,7 +692,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Carries out everything the machines want until they want nothing more; returns when to look again.
+    /// Carries out the outputs of the machines until there are none. Returns the time of the next timer.
     fn drain(&mut self) -> Option<Instant> {
         loop {
             let router = loop {
@@ -731,12 +731,12 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// What the user wants from now on, and whom the node trusts if that changed.
+    /// Applies new rules, and new trust anchors if they changed.
     fn reconfigure(&mut self, shares: Vec<ShareRule>, uses: Vec<UseRule>, anchors: Option<TrustAnchors>) {
         if let Some(routes) = &mut self.routes {
             routes.reconfigure(Instant::now(), shares, uses);
         }
-        // Who may no longer join is told so before its link goes.
+        // Revoked nodes are told before their links close.
         self.drain();
         if let Some(anchors) = anchors {
             self.trust(anchors);
@@ -746,7 +746,7 @@ impl<N: RosNetwork> Core<N> {
         self.want_all_lanes();
     }
 
-    /// Hears of a member, and says which names were misspelt that are meant for it.
+    /// Notes a member that was heard. Reports names in rules that are probably misspellings of it.
     fn hear_of(&mut self, peer: &VerifiedPeer) {
         for (written, meant) in self.members.heard(peer, &self.identity) {
             warn!(
@@ -755,7 +755,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Stops taking in; what is queued still leaves.
+    /// Stops receiving. Queued packets still leave.
     fn quiesce(&mut self) -> Vec<Arc<OutFlow>> {
         self.routes = None;
         self.end_consumers();
@@ -774,7 +774,7 @@ impl<N: RosNetwork> Core<N> {
         flows
     }
 
-    /// Takes back what was shared, and says goodbye.
+    /// Withdraws the shares and says goodbye.
     fn stop(&mut self) -> Vec<AnyLink> {
         self.operations.stop();
         self.endpoint.withdraw_all(now());
@@ -803,7 +803,7 @@ impl<N: RosNetwork> Core<N> {
                 rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
                 cost,
                 silent,
-                keep_alive_ms: entry.heart.step().as_millis().try_into().unwrap_or(u64::MAX),
+                keep_alive_ms: entry.keep_alive.step().as_millis().try_into().unwrap_or(u64::MAX),
                 sent_bytes: stats.sent_bytes,
                 received_bytes: stats.received_bytes,
                 lanes: entry.control.lanes().count(),
@@ -848,7 +848,7 @@ impl<N: RosNetwork> Core<N> {
                 routed_names: router.routed_names,
                 branches: router.branches,
             },
-            // The core knows nothing of it.
+            // The caller adds it, since the core knows nothing of the gateway.
             gateway: None,
         }
     }
@@ -879,7 +879,7 @@ impl<N: RosNetwork> Core<N> {
     }
 }
 
-/// Drops something whose end may block, on a thread where it may.
+/// Drops a value on a blocking thread, since the drop may block.
 fn drop_elsewhere(thing: Box<dyn std::any::Any + Send>) {
     tokio::task::spawn_blocking(move || drop(thing));
 }

@@ -1,4 +1,4 @@
-//! What a node keeps of trust over restarts: the revocation lists that it knows, and its own renewed credentials.
+//! Trust that a node keeps over restarts: revocation lists, and its renewed credentials.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -14,18 +14,18 @@ use tracing::{debug, warn};
 use crate::run_lock::RunLock;
 use crate::state;
 
-/// Where revocation lists are kept, below the state directory.
+/// Folder of revocation lists in the state directory.
 const CRL_DIR: &str = "crl";
-/// Most files that are looked at: all lists of all CAs that can be trusted.
+/// Most files that are read: all lists of all CAs that can be trusted.
 const CRL_FILES_MAX: usize = sgc_trust::ANCHORS_MAX * (sgc_trust::FLEET_LISTS_MAX + 1);
-/// Bytes of a list's digest that are in the name of its file, to tell the lists of one CA apart.
+/// Bytes of a list's digest in the name of its file, to distinguish the lists of one CA.
 const CRL_NAME_BYTES: usize = 8;
-/// Part of a certificate's time that is left when it is renewed: a third.
+/// Divisor of a certificate's validity: it is renewed when a third is left.
 const RENEW_PART: u64 = 3;
 /// Shortest time between two requests for a certificate.
 const RENEW_MIN: Duration = Duration::from_secs(60);
 
-/// `anchors` with the lists that were kept. One that cannot be read is said and left out: neighbours have it too.
+/// Adds the kept lists to `anchors`. An unreadable list is reported and skipped, since neighbours have it too.
 pub(crate) fn with_kept_crls(dir: Option<&Path>, anchors: TrustAnchors, now: Now) -> TrustAnchors {
     let Some(dir) = dir.map(|d| d.join(CRL_DIR)) else { return anchors };
     let entries = match std::fs::read_dir(&dir) {
@@ -51,14 +51,14 @@ pub(crate) fn with_kept_crls(dir: Option<&Path>, anchors: TrustAnchors, now: Now
     anchors
 }
 
-/// Writes what has to outlive the process, the newest only, off the control task.
-pub(crate) struct Keeper {
+/// Writes state that outlives the process, always the newest version, off the control task.
+pub(crate) struct StateWriter {
     anchors: watch::Sender<Option<Arc<TrustAnchors>>>,
     identity: watch::Sender<Option<Arc<Identity>>>,
 }
 
-impl Keeper {
-    /// Tasks that write into the state directory and over the identity file; they end with this handle.
+impl StateWriter {
+    /// Starts the tasks that write the state directory and the identity file. They end with this handle.
     pub(crate) fn spawn(
         dir: Option<PathBuf>,
         identity_file: PathBuf,
@@ -77,18 +77,18 @@ impl Keeper {
         Self { anchors, identity }
     }
 
-    /// Keeps the lists of these.
+    /// Saves the revocation lists of these anchors.
     pub(crate) fn anchors(&self, anchors: Arc<TrustAnchors>) {
         self.anchors.send_replace(Some(anchors));
     }
 
-    /// Keeps this in place of the identity that was read at start.
+    /// Saves this identity over the one that was read at start.
     pub(crate) fn identity(&self, identity: Arc<Identity>) {
         self.identity.send_replace(Some(identity));
     }
 }
 
-/// A task that writes whatever it was given last, where that may block.
+/// Starts a task that writes the newest value on a blocking thread.
 fn keep_newest<T: Send + Sync + 'static>(
     alive: mpsc::Sender<()>,
     write: impl Fn(&T) + Send + Sync + 'static,
@@ -105,8 +105,8 @@ fn keep_newest<T: Send + Sync + 'static>(
     give
 }
 
-/// Writes the lists in force that are not on the disk yet, then removes those of the same CAs that are in force no more:
-/// whenever the process ends, what is there says at least as much as before.
+/// Writes new lists first, and then removes outdated ones of the same CAs, so that the files never lose a revocation,
+/// whenever the process ends.
 fn keep_crls(dir: &Path, anchors: &TrustAnchors) {
     let dir = dir.join(CRL_DIR);
     let made = state::create_state_dir(&dir).map_err(|e| e.to_string());
@@ -136,7 +136,7 @@ fn keep_crls(dir: &Path, anchors: &TrustAnchors) {
     }
 }
 
-/// By CA and content, so that each of several lists has a name of its own, and always the same.
+/// Returns a stable file name that is unique to a CA and the content of a list.
 fn crl_file_name(ca: &CaFingerprint, digest: &[u8; 32]) -> String {
     let digits: String = digest.iter().take(CRL_NAME_BYTES).map(|byte| format!("{byte:02x}")).collect();
     format!("{ca}-{digits}.crl")
@@ -151,34 +151,34 @@ fn keep_identity(file: &Path, identity: &Identity) {
     }
 }
 
-/// How long a certificate was made to hold, milliseconds. Fleets let theirs begin [`CLOCK_SKEW`] early, which is not of
-/// that time: counted in, short ones would be due from their first moment on.
+/// Returns the validity of a certificate in milliseconds. It excludes [`CLOCK_SKEW`], by which fleets start
+/// certificates early: with it, short ones would be due at once.
 pub(crate) fn lasts(peer: &VerifiedPeer) -> u64 {
     let whole = peer.not_after.0.saturating_sub(peer.not_before.0);
     let early = CLOCK_SKEW.as_millis() as u64;
     if whole > early { whole - early } else { whole }
 }
 
-/// When to ask for the next certificate: when a third of the time of this one is left.
+/// Returns the time to ask for the next certificate: when a third of the validity is left.
 pub(crate) fn renew_at(identity: &Identity, now: Now) -> Instant {
     let own = identity.as_peer();
     let due = own.not_after.0.saturating_sub(lasts(own) / RENEW_PART);
     now.instant + Duration::from_millis(due.saturating_sub(now.unix.0)).max(renewal_interval(own))
 }
 
-/// Shortest time between two requests of a node for a certificate: at most half of the time that is left when one is
-/// due.
+/// Returns the least time between two requests of a node: at most half of the validity that is left when a certificate
+/// is due.
 pub(crate) fn renewal_interval(peer: &VerifiedPeer) -> Duration {
     RENEW_MIN.min(Duration::from_millis(lasts(peer) / (2 * RENEW_PART)))
 }
 
-/// True if a certificate that holds from and until then has less than a third of its time left.
+/// Returns `true` if less than a third of the certificate's validity is left.
 pub(crate) fn is_due(peer: &VerifiedPeer, now: Now) -> bool {
     peer.not_after.0.saturating_sub(now.unix.0) < lasts(peer) / RENEW_PART
 }
 
-/// The identity with what its authority sent; `None` if that is what it has already. An empty chain stands for the
-/// certificates that the node has.
+/// Returns the identity with the authority's answer; `None` if it has that already. An empty chain stands for the
+/// node's present certificates.
 pub(crate) fn renewed(
     identity: &Identity,
     mut credentials: Credentials,

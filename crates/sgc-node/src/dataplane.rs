@@ -1,8 +1,7 @@
-//! The data path: from the link or local reader that a packet came from to all that it goes to.
+//! The data path: from the link or local reader of a packet to all its destinations.
 //!
-//! Readers call [`DataPlane::forward`] themselves. The lookup is one atomic load of an immutable table;
-//! payloads are shared, not copied. The control task alone changes tables, by putting a new one in place of
-//! the old.
+//! Receiving tasks call [`DataPlane::forward`] themselves. The look-up is one atomic load of an immutable table, and
+//! payloads are shared, not copied. Only the control task changes tables, by replacing them.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -13,33 +12,33 @@ use sgc_router::{FibEntry, LinkId};
 use sgc_wire::{Name, Packet};
 use tracing::{debug, warn};
 
-use crate::heart::Activity;
-use crate::hold::Holds;
+use crate::keep_alive::Activity;
 use crate::outflow::OutFlow;
 use crate::peer_rate::PeerRates;
+use crate::pending::PendingBytes;
 use crate::sinks::LocalSink;
 use crate::stats::{DataDrop, Drops, NameStats};
 
-/// Tables that the names are spread over, so that a change copies a part only.
+/// Number of tables over which names are spread, so that a change copies only a part.
 const SHARDS: usize = 64;
 
-/// Where packets of one name go.
+/// Destinations of the packets of one name.
 pub(crate) struct Forward {
     entry: FibEntry,
     outs: Vec<(LinkId, Out)>,
     stats: Arc<NameStats>,
 }
 
-/// One way out.
+/// One destination.
 pub(crate) enum Out {
-    /// Over a link.
+    /// A link.
     Link(Arc<OutFlow>, Arc<Activity>),
-    /// To this node's own subscriber.
+    /// This node's own subscriber.
     Local(Arc<LocalSink>),
 }
 
 impl Forward {
-    /// `outs` must hold a way for every link of `entry` that data can leave on.
+    /// Creates an entry. `outs` must have a destination for every link on which `entry` sends data.
     pub(crate) fn new(entry: FibEntry, outs: Vec<(LinkId, Out)>, stats: Arc<NameStats>) -> Self {
         Self { entry, outs, stats }
     }
@@ -49,12 +48,12 @@ impl Forward {
     }
 }
 
-/// The tables.
+/// Forwarding tables of a node.
 pub(crate) struct DataPlane {
     shards: [ArcSwap<HashMap<Name, Arc<Forward>>>; SHARDS],
     drops: Drops,
     rates: PeerRates,
-    holds: Arc<Holds>,
+    holds: Arc<PendingBytes>,
 }
 
 impl Default for DataPlane {
@@ -64,23 +63,23 @@ impl Default for DataPlane {
 }
 
 impl DataPlane {
-    /// Empty tables.
+    /// Creates empty tables.
     pub(crate) fn new(rates: PeerRates) -> Self {
         let (drops, holds) = (Drops::default(), Arc::default());
         Self { shards: std::array::from_fn(|_| ArcSwap::default()), drops, rates, holds }
     }
 
-    /// What its topics hold for want of something to be known.
-    pub(crate) fn holds(&self) -> &Arc<Holds> {
+    /// Returns the count of bytes that topics keep pending.
+    pub(crate) fn holds(&self) -> &Arc<PendingBytes> {
         &self.holds
     }
 
-    /// What peers may send into it.
+    /// Returns the rate limits of peers.
     pub(crate) fn rates(&self) -> &PeerRates {
         &self.rates
     }
 
-    /// Puts the forwarding of a name in place, or ends it.
+    /// Sets or removes the entry of a name.
     pub(crate) fn set(&self, name: Name, forward: Option<Forward>) {
         let shard = self.shard(&name);
         let mut table = HashMap::clone(&shard.load());
@@ -91,25 +90,26 @@ impl DataPlane {
         shard.store(Arc::new(table));
     }
 
-    /// True if anybody gets what is published under `name`.
+    /// Returns `true` if a packet under `name` has a destination.
     pub(crate) fn is_wanted(&self, name: &Name) -> bool {
         self.shard(name).load().contains_key(name)
     }
 
-    /// True if a short message under `name` finds room on all its ways: none is near its bounds, so that what others send at
-    /// the same moment does not fill it.
-    pub(crate) fn is_at_ease(&self, name: &Name) -> bool {
+    /// Returns `true` if all destinations of `name` have headroom for a short message, even if others send at the same
+    /// moment.
+    pub(crate) fn has_headroom(&self, name: &Name) -> bool {
         let tables = self.shard(name).load();
         tables.get(name).is_none_or(|forward| {
             forward.outs.iter().all(|(_, out)| match out {
-                Out::Link(flow, _) => flow.is_at_ease(),
-                // It writes to the local network, which may take its time.
+                Out::Link(flow, _) => flow.has_headroom(),
+                // A local sink may take its time to write.
                 Out::Local(_) => false,
             })
         })
     }
 
-    /// Sends a packet on its ways. Waits while a reliable one is full; the others of the same name wait with it.
+    /// Sends a packet to its destinations. Waits while a reliable one is full; the others of the same name wait with
+    /// it.
     pub(crate) async fn forward(&self, ingress: LinkId, mut packet: Packet) {
         let Some(forward) = self.shard(&packet.header.name).load().get(&packet.header.name).cloned() else {
             return self.drop_packet(ingress, &packet, DataDrop::NoTree);
@@ -143,25 +143,25 @@ impl DataPlane {
         }
     }
 
-    /// Counts what could not be sent on, and says so the first time.
+    /// Counts a dropped packet, and logs the first one.
     pub(crate) fn drop_packet(&self, ingress: LinkId, packet: &Packet, reason: DataDrop) {
         self.count(ingress, &packet.header.name, reason);
     }
 
-    /// Counts a drop of something of `name` that came over `ingress`.
+    /// Counts a drop under `name` from `ingress`.
     pub(crate) fn count(&self, ingress: LinkId, name: &Name, reason: DataDrop) {
         debug!(%ingress, name = %name.short(), ?reason, "dropped");
         if let Some(forward) = self.shard(name).load().get(name) {
             forward.stats.count_drops(reason, 1);
         }
-        // What comes the wrong way may still have been under way when the way changed.
+        // A packet from the wrong link may have been under way while the path changed, so it is not suspicious.
         let suspicious = matches!(reason, DataDrop::HopLimit | DataDrop::Malformed);
         if self.drops.count_from(reason.key(), ingress) && suspicious {
-            warn!(%ingress, ?reason, "a peer sends what it should not; dropped and counted from here on");
+            warn!(%ingress, ?reason, "dropped an invalid packet of a peer; counted from here on");
         }
     }
 
-    /// Counts several drops of `name` at this node itself.
+    /// Counts several drops under `name` at this node itself.
     pub(crate) fn count_here(&self, name: &Name, reason: DataDrop, several: u64) {
         if let Some(forward) = self.shard(name).load().get(name) {
             forward.stats.count_drops(reason, several);
@@ -171,7 +171,7 @@ impl DataPlane {
         }
     }
 
-    /// Drops by reason and link, and by reason of this node's sinks.
+    /// Returns drops by reason and link, and by reason for this node's sinks.
     pub(crate) fn drops(&self) -> &Drops {
         &self.drops
     }
@@ -192,7 +192,7 @@ impl DataPlane {
     }
 
     fn shard(&self, name: &Name) -> &ArcSwap<HashMap<Name, Arc<Forward>>> {
-        // Names are hashes: any byte spreads them evenly.
+        // Names are hashes, so any byte spreads them evenly.
         &self.shards[usize::from(name.0[0]) % SHARDS]
     }
 }

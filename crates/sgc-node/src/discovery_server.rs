@@ -1,7 +1,8 @@
-//! Fast DDS's Discovery Server, which this node cannot join: programs that use one are found by nobody else.
+//! Detects Fast DDS's Discovery Server, which this node cannot join: participants that use one are invisible to all
+//! others.
 //!
-//! Looks for `ROS_DISCOVERY_SERVER` in this program's environment and, where Linux lets it, in those of others on the same network.
-//! Decides nothing: what is found is said.
+//! It looks for `ROS_DISCOVERY_SERVER` in this process's environment and, where Linux permits, in those of processes on
+//! the same network. It reports findings and decides nothing.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -15,25 +16,25 @@ use crate::alerts::Alert;
 use crate::config::Environment;
 
 const VARIABLE: &str = "ROS_DISCOVERY_SERVER";
-/// Bound on the processes that are looked at.
+/// Most processes that are examined.
 const PROCESSES_MAX: usize = 4096;
-/// Bound on what is read of one environment, bytes.
+/// Most bytes that are read of one environment.
 const ENVIRONMENT_BYTES_MAX: u64 = 64 << 10;
-/// Bound on different servers that are told.
+/// Most servers that are reported.
 const FOUND_MAX: usize = 8;
-/// Bound on characters of a server that are told.
+/// Most characters of a server that are reported.
 const SERVER_CHARS_MAX: usize = 200;
-/// Time between two looks of a node.
+/// Interval of looks.
 const LOOK_EVERY: Duration = Duration::from_secs(10);
 
 /// Returns an alert for each Discovery Server that this environment or a program on the same network names.
 pub fn alerts(env: Environment<'_>) -> Vec<Alert> {
     let own = env(VARIABLE).filter(|server| !server.is_empty());
     let own = own.map(|server| Alert::DiscoveryServer { server: shortened(&server), program: None });
-    own.into_iter().chain(of_programs(Path::new("/proc"))).collect()
+    own.into_iter().chain(from_programs(Path::new("/proc"))).collect()
 }
 
-/// Looks again and again, and logs what is new. Ends with the runtime.
+/// Looks periodically and logs news. Ends with the runtime.
 pub(crate) async fn watch() {
     let mut known = BTreeSet::new();
     loop {
@@ -50,8 +51,8 @@ pub(crate) async fn watch() {
     }
 }
 
-/// One for each server, with the first program that names it.
-fn of_programs(proc: &Path) -> Vec<Alert> {
+/// Returns one alert for each server, with the first program that names it.
+fn from_programs(proc: &Path) -> Vec<Alert> {
     let network = fs::read_link(proc.join("self/ns/net")).ok();
     let Ok(processes) = fs::read_dir(proc) else { return Vec::new() };
     let own = std::process::id();
@@ -84,7 +85,7 @@ fn read(file: &Path) -> Option<Vec<u8>> {
 fn server_in(environment: &[u8]) -> Option<String> {
     environment.split(|byte| *byte == 0).find_map(|variable| {
         let value = variable.strip_prefix(VARIABLE.as_bytes())?.strip_prefix(b"=")?;
-        // To Fast DDS an empty variable is one that is not set.
+        // Fast DDS treats an empty variable as unset.
         (!value.is_empty()).then(|| shortened(&String::from_utf8_lossy(value)))
     })
 }

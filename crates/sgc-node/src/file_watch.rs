@@ -1,8 +1,7 @@
-//! Reads the configuration again when its file changes, or one of those that it names.
+//! Reloads the configuration when its file, or a file that it names, changes.
 //!
-//! The kernel's messages are a bell: what changed is seen by looking at the files, whatever an editor did to them: wrote
-//! them, put others in their place, or turned a link that leads to them. It decides nothing: [`Reloader`] judges and
-//! carries out.
+//! A message of the kernel is only a trigger. The files themselves show the change, whether an editor wrote them,
+//! replaced them, or changed a symbolic link to them. [`Reloader`] judges and applies the configuration.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -20,18 +19,18 @@ use tracing::{debug, warn};
 use crate::config::{Config, TokenSource};
 use crate::reload::Reloader;
 
-/// How long nothing may happen before files are looked at: editors take several steps.
+/// Quiet time before the files are read, since editors take several steps.
 const QUIET: Duration = Duration::from_millis(200);
-/// How long is waited for quiet, in a directory where something always happens.
+/// Longest wait for quiet, in a directory with constant changes.
 const UNQUIET_MAX: Duration = Duration::from_secs(2);
-/// What is done to a file that may be another then. Not that something is written to it: it is when it is closed.
+/// Events after which a file may have changed. Writing is not among them, since closing follows it.
 const CHANGES: WatchFlags = WatchFlags::CLOSE_WRITE
     .union(WatchFlags::CREATE)
     .union(WatchFlags::DELETE)
     .union(WatchFlags::MOVED_FROM)
     .union(WatchFlags::MOVED_TO);
 
-/// A configuration's file and what it names, as they were when it was read.
+/// The files of a configuration, with their state when they were read.
 pub(crate) struct FileWatch {
     file: PathBuf,
     files: Vec<PathBuf>,
@@ -39,14 +38,14 @@ pub(crate) struct FileWatch {
 }
 
 impl FileWatch {
-    /// `file` holds `config`, as of now.
+    /// Starts to watch the files of `config`, which was read from `file`.
     pub(crate) fn begin(file: PathBuf, config: &Config) -> Self {
         let files = files_of(&file, config);
         let seen = look(&files);
         Self { file, files, seen }
     }
 
-    /// Has it read again when something changes, for as long as the node runs.
+    /// Reloads after each change, for as long as the node runs.
     pub(crate) async fn run(self, reloader: Arc<Reloader>) {
         let file = self.file.display().to_string();
         if let Err(error) = self.try_run(&reloader).await {
@@ -58,22 +57,22 @@ impl FileWatch {
         let Self { file, mut files, mut seen } = self;
         let mut bell = Bell::new(seen.directories.clone())?;
         loop {
-            let found = look_aside(&files).await?;
+            let found = look_blocking(&files).await?;
             if found.directories != bell.directories {
                 bell = Bell::new(found.directories.clone())?;
-                // Something may have happened there before.
+                // A change may have preceded the watch.
                 continue;
             }
-            // While a file is being replaced there may be none.
+            // While a file is being replaced, it may be missing.
             if found.prints != seen.prints && found.prints.iter().all(Option::is_some) {
                 debug!(file = %file.display(), "changed");
                 seen = found;
-                // What is wrong is in the log; nobody waits for an answer.
+                // The log has the error; nobody waits for the result.
                 let _ = reloader.reload("the file's change").await;
                 let named = files_of(&file, &reloader.config().await);
                 if named != files {
                     files = named;
-                    // What is new may have changed since it was read: once more.
+                    // A newly named file may have changed since it was read, so the files are compared again.
                     seen.prints.clear();
                 }
                 continue;
@@ -89,7 +88,7 @@ impl FileWatch {
     }
 }
 
-/// The configuration's file and those that it names and that count while the node runs.
+/// Returns the files that a running node's configuration depends on.
 fn files_of(file: &Path, config: &Config) -> Vec<PathBuf> {
     let tokens = config.tokens.iter().filter_map(|token| match &token.source {
         TokenSource::File(path) => Some(path),
@@ -102,15 +101,15 @@ fn files_of(file: &Path, config: &Config) -> Vec<PathBuf> {
     std::iter::once(file.to_owned()).chain(named).collect()
 }
 
-/// Files as they are at one moment.
+/// State of the files at one moment.
 struct Look {
-    /// What tells whether a file is another; nothing if it is not there.
+    /// Fingerprint of each file; `None` if it is missing.
     prints: Vec<Option<Print>>,
-    /// Where something may happen to them: where they are, and where links lead.
+    /// Directories of the files, and of the targets of symbolic links.
     directories: BTreeSet<PathBuf>,
 }
 
-/// Device, number, length, and when it was written in seconds and nanoseconds.
+/// Device, inode, length, and time of modification in seconds and nanoseconds.
 type Print = (u64, u64, u64, i64, i64);
 
 fn look(files: &[PathBuf]) -> Look {
@@ -127,15 +126,15 @@ fn look(files: &[PathBuf]) -> Look {
     Look { prints: files.iter().map(print).collect(), directories: directories.collect() }
 }
 
-/// The same where it may take a while.
-async fn look_aside(files: &[PathBuf]) -> io::Result<Look> {
+/// Looks at the files on a blocking thread.
+async fn look_blocking(files: &[PathBuf]) -> io::Result<Look> {
     let files = files.to_vec();
     tokio::task::spawn_blocking(move || look(&files)).await.map_err(io::Error::other)
 }
 
-/// Rings when something happens in one of the directories.
+/// Notifies of events in the watched directories.
 struct Bell {
-    /// It is read as a pipe is, and as little as of one is asked of it.
+    /// The inotify descriptor, read like a pipe.
     inotify: Receiver,
     directories: BTreeSet<PathBuf>,
 }
@@ -144,7 +143,7 @@ impl Bell {
     fn new(directories: BTreeSet<PathBuf>) -> io::Result<Self> {
         let inotify = inotify::init(CreateFlags::CLOEXEC | CreateFlags::NONBLOCK)?;
         for directory in &directories {
-            // One that is gone says nothing; that it comes back is not noticed before something else happens.
+            // A missing directory cannot be watched. Its return is noticed at the next other event.
             match inotify::add_watch(&inotify, directory, CHANGES) {
                 Ok(_) | Err(Errno::NOENT | Errno::NOTDIR) => {}
                 Err(error) => return Err(error.into()),
@@ -153,9 +152,9 @@ impl Bell {
         Ok(Self { inotify: Receiver::from_owned_fd_unchecked(inotify)?, directories })
     }
 
-    /// Waits for the next ring; those that came together are one.
+    /// Waits for the next event. Simultaneous events count as one.
     async fn rings(&self) -> io::Result<()> {
-        // Names of files are up to 255 bytes.
+        // File names have up to 255 bytes.
         let mut buffer = [0; 4096];
         let mut rang = false;
         while !rang {
@@ -178,7 +177,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_the_gateway_shows_is_watched_as_other_files_that_are_named() {
+    fn gateway_certificate_files_are_watched_like_other_files() {
         let text = "identity = 'x'\n[node]\nrouters = ['quic://r']\n[gateway]\nlisten = ['wss://0.0.0.0']\n\
                     certificate = 'a.pem'\nkey = 'a.key'\n";
         let config = crate::config::parse(text, "node.toml", Path::new("/etc/sgc"), &|_| None).unwrap();

@@ -1,4 +1,4 @@
-//! A fleet's file: read and changed under a lock, so that two programs do not undo each other's revocations.
+//! The fleet file: read and changed under a lock, so that two programs do not undo each other's revocations.
 
 use std::fs;
 use std::io;
@@ -11,18 +11,18 @@ use zeroize::Zeroizing;
 
 use crate::state;
 
-/// Why a fleet file cannot be used.
+/// Reasons why a fleet file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum FleetFileError {
-    /// It cannot be read or locked.
+    /// The file cannot be read or locked.
     #[error("cannot read {}: {source}", path.display())]
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the operating system.
         source: io::Error,
     },
-    /// Others can read it.
+    /// Others can read the file.
     #[error("{}: its mode {mode:04o} lets others at the CA's private key: chmod 600 {}", path.display(), path.display())]
     Exposed {
         /// The file.
@@ -30,25 +30,25 @@ pub enum FleetFileError {
         /// Its permission bits.
         mode: u32,
     },
-    /// It holds no fleet.
+    /// The file holds no fleet.
     #[error("{}: {source}", path.display())]
     Content {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         source: FleetError,
     },
-    /// It cannot be replaced; nothing changed.
+    /// The file cannot be replaced. Nothing changed.
     #[error("{}: it could not be written, and is as it was: {source}", path.display())]
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the operating system.
         source: io::Error,
     },
 }
 
-/// A fleet, and its file locked against other programs for as long as this lives.
+/// A fleet with its file, which stays locked against other programs while this lives.
 #[derive(Debug)]
 pub struct LockedFleet {
     /// The fleet.
@@ -58,35 +58,35 @@ pub struct LockedFleet {
 }
 
 impl LockedFleet {
-    /// Waits for the lock, then reads the file.
+    /// Waits for the lock and reads the file.
     pub fn open(path: &Path) -> Result<Self, FleetFileError> {
         let lock = lock(path).map_err(|source| FleetFileError::Read { path: path.to_owned(), source })?;
         Ok(Self { fleet: read_fleet(path)?, path: path.to_owned(), _lock: lock })
     }
 
-    /// The file.
+    /// Returns the path.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// What went wrong with the fleet, said of its file.
+    /// Adds the path to an error of the fleet.
     pub fn error(&self, source: FleetError) -> FleetFileError {
         FleetFileError::Content { path: self.path.clone(), source }
     }
 
-    /// Replaces the file with the fleet as it is now, whole or not at all.
+    /// Replaces the file by the current fleet, whole or not at all.
     pub fn save(&self) -> Result<(), FleetFileError> {
         state::replace(&self.path, self.fleet.to_text().as_bytes())
             .map_err(|source| FleetFileError::Write { path: self.path.clone(), source })
     }
 }
 
-/// Opens a file for changes that no other program makes at the same time: it is locked until it is closed.
+/// Opens and locks a file until it is closed.
 fn lock(path: &Path) -> io::Result<fs::File> {
     loop {
         let file = fs::File::open(path)?;
         flock(&file, FlockOperation::LockExclusive)?;
-        // Whoever had the lock may have put another file in the place of this one meanwhile.
+        // The previous holder of the lock may have replaced the file.
         let (locked, named) = (file.metadata()?, fs::metadata(path)?);
         if (locked.dev(), locked.ino()) == (named.dev(), named.ino()) {
             return Ok(file);
@@ -94,7 +94,7 @@ fn lock(path: &Path) -> io::Result<fs::File> {
     }
 }
 
-/// Reads a fleet's file, which must be its owner's alone.
+/// Reads a fleet file, which only its owner may read.
 pub fn read_fleet(path: &Path) -> Result<Fleet, FleetFileError> {
     let failed = |source| FleetFileError::Read { path: path.to_owned(), source };
     if let Some(mode) = state::exposed(&fs::metadata(path).map_err(failed)?) {
@@ -113,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_waited_for_a_lock_gets_the_file_that_is_there_then() {
+    fn waiting_locker_reads_the_file_as_it_is_after_the_wait() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a");
         state::replace(&path, b"1").unwrap();
@@ -122,7 +122,7 @@ mod tests {
             let path = path.clone();
             move || lock(&path).unwrap().metadata().unwrap().ino()
         });
-        // The kernel shows who waits with an arrow; the inode is the last of three numbers.
+        // `/proc/locks` marks waiters with an arrow. The inode is the last of three numbers.
         let inode = format!(":{} ", first.metadata().unwrap().ino());
         let waits = |line: &str| line.contains("->") && line.contains(&inode);
         while !fs::read_to_string("/proc/locks").unwrap().lines().any(waits) {

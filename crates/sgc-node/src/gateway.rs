@@ -1,8 +1,8 @@
-//! [`Gateway`]: programs without ROS at this node. Opens the hub when it is first needed, and its sockets where the
-//! configuration has some.
+//! [`Gateway`]: the part of a node that serves programs without ROS. It opens the hub when it is first needed, and its
+//! sockets if the configuration has some.
 //!
-//! What clients do is the business of `sgc-gateway`. Its part of the local network is one of its own, which the node's
-//! own sees as any program's: so shares and uses hold for its topics as for others.
+//! `sgc-gateway` serves the clients. The gateway is a participant of its own, which the node's own participant sees
+//! like any program, so shares and uses apply to its topics as well.
 
 use std::fs;
 use std::io;
@@ -24,13 +24,13 @@ use zeroize::Zeroizing;
 
 use crate::config::{GatewayConfig, GatewayScheme, GatewayUrl};
 
-/// Opens the gateway's part of the local network; may block.
+/// Opens the gateway's part of the local network. May block.
 pub type OpenLocalRos = Arc<dyn Fn() -> Result<Arc<dyn LocalRos>, RosError> + Send + Sync>;
 
-/// What the gateway's ROS 2 node is called, before the name of the SGC node.
+/// Prefix of the gateway's ROS 2 node, before the name of the SGC node.
 const NODE_PREFIX: &str = "sgc_gateway_";
 
-/// Definitions of types as this node finds them: in files, and as others described them.
+/// Type definitions of this node: from files, and from other nodes' descriptions.
 pub(crate) struct NodeDefinitions {
     pub(crate) files: Definitions,
     pub(crate) described: Arc<TypeStore>,
@@ -46,7 +46,7 @@ impl FindDefinitions for NodeDefinitions {
     }
 }
 
-/// What the sockets are to be.
+/// Settings of the sockets.
 pub(crate) struct Sockets {
     pub(crate) listen: Vec<ListenAt>,
     pub(crate) access: Access,
@@ -55,20 +55,20 @@ pub(crate) struct Sockets {
     pub(crate) client_bytes_max: usize,
 }
 
-/// Programs without ROS at this node.
+/// The gateway of this node.
 pub(crate) struct Gateway {
-    /// None where there is no local network.
+    /// Opens the local network; `None` if there is none.
     open: std::sync::Mutex<Option<OpenLocalRos>>,
     types: Mutex<Option<Types>>,
-    /// The SGC node's name.
+    /// Name of the SGC node.
     name: String,
-    /// The ROS 2 node's.
+    /// Name of the ROS 2 node.
     node: String,
     hub: OnceCell<Hub>,
     server: std::sync::Mutex<Option<Arc<Server>>>,
-    /// Held by whoever changes the certificates that are shown, so that a reload does not undo a renewal.
+    /// Held while the shown certificates change, so that a reload does not undo a renewal.
     showing: std::sync::Mutex<()>,
-    /// `true` if these are the node's own, and not those of files that the configuration names.
+    /// Whether the shown certificate is the node's own, not one of the configuration.
     shows_own: AtomicBool,
 }
 
@@ -88,7 +88,7 @@ impl Gateway {
         Arc::new(Self { open, types, name, node, hub, server, showing, shows_own })
     }
 
-    /// Takes the way to a local network that the node joined after its start.
+    /// Sets how to open a local network that the node joined after its start.
     pub(crate) fn set_local_network(&self, open: Option<OpenLocalRos>) {
         *self.lock_open() = open;
     }
@@ -97,7 +97,7 @@ impl Gateway {
         self.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The hub, which joins the local network if it has not yet.
+    /// Returns the hub, and opens it first if needed.
     pub(crate) async fn hub(&self) -> Result<&Hub, GatewayError> {
         self.hub
             .get_or_try_init(|| async {
@@ -113,7 +113,7 @@ impl Gateway {
             .await
     }
 
-    /// A session of the user that runs the node, who may everything.
+    /// Opens a session with all rights for the user who runs the node.
     pub(crate) async fn own_session(&self) -> Result<Session, GatewayError> {
         Ok(Session::new(self.hub().await?, Client::own("the command line"), SessionLimits::default()))
     }
@@ -135,8 +135,8 @@ impl Gateway {
         Ok(())
     }
 
-    /// Replaces the rules and the certificate; returns `true` if the certificate is another one. `key` is called in the moment
-    /// in which the certificate is replaced.
+    /// Replaces the rules and the certificate. Returns `true` if the certificate changed. `key` is called at the moment
+    /// of replacement.
     pub(crate) fn reconfigure(
         &self,
         access: Access,
@@ -153,7 +153,7 @@ impl Gateway {
         Ok(server.shown() != before)
     }
 
-    /// Takes a renewed certificate of the node: new connections are shown it, unless the configuration names another.
+    /// Shows the node's renewed certificate to new connections, unless the configuration names another.
     pub(crate) fn set_identity(&self, identity: &Identity) {
         let Some(server) = self.server() else { return };
         let _showing = self.lock_showing();
@@ -170,12 +170,12 @@ impl Gateway {
         self.showing.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What goes on, if there are sockets.
+    /// Returns the status, if there are sockets.
     pub(crate) fn status(&self) -> Option<GatewayStatus> {
         self.server().map(|server| server.status())
     }
 
-    /// Other CAs, or other revocation lists of theirs: whose certificate was revoked is disconnected.
+    /// Replaces the trust anchors. Clients with a revoked certificate are disconnected.
     pub(crate) fn set_anchors(&self, anchors: &TrustAnchors) {
         if let Some(server) = self.server() {
             server.set_anchors(anchors.clone());
@@ -190,7 +190,7 @@ impl Gateway {
         self.server.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Ends the sockets, and leaves the local network.
+    /// Closes the sockets and leaves the local network.
     pub(crate) async fn stop(&self) {
         drop(self.lock().take());
         if let Some(hub) = self.hub.get() {
@@ -199,36 +199,36 @@ impl Gateway {
     }
 }
 
-/// Why the gateway does not start.
+/// Reasons why the gateway does not start.
 #[derive(Debug, thiserror::Error)]
 pub enum GatewayStartError {
-    /// The local network, or what is on it.
+    /// The hub cannot be opened.
     #[error(transparent)]
     Hub(#[from] GatewayError),
-    /// Its sockets.
+    /// The sockets cannot be opened.
     #[error(transparent)]
     Server(#[from] ServerError),
-    /// Its certificate, or the key of that.
+    /// The certificate or key file cannot be read.
     #[error("the gateway's {}: {source}", path.display())]
     File {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the operating system.
         source: io::Error,
     },
-    /// They are not what TLS takes.
+    /// TLS cannot use the certificate or key.
     #[error("the gateway's {}: {source}", path.display())]
     Certificate {
         /// The certificate.
         path: PathBuf,
-        /// What is wrong.
+        /// The fault.
         source: TlsError,
     },
 }
 
 /// The certificate that the gateway shows within TLS.
 pub(crate) enum ShownKey {
-    /// The one that the configuration names.
+    /// The certificate that the configuration names.
     Files(Arc<CertifiedKey>),
     /// The certificate of the node itself.
     Own(Arc<Identity>),
@@ -243,7 +243,7 @@ impl ShownKey {
     }
 }
 
-/// The certificate and the key that the configuration names; none if the node's own are shown. Reads files.
+/// Reads the certificate and key that the configuration names; `None` if the node's own are shown.
 pub(crate) fn key_of_files(config: &GatewayConfig) -> Result<Option<Arc<CertifiedKey>>, GatewayStartError> {
     let Some(tls) = &config.tls else { return Ok(None) };
     let read = |path: &Path| {
@@ -255,7 +255,7 @@ pub(crate) fn key_of_files(config: &GatewayConfig) -> Result<Option<Arc<Certifie
     Ok(Some(key))
 }
 
-/// Where to listen, as the gateway has it.
+/// Returns the listen addresses in the form of `sgc-gateway`.
 pub(crate) fn listen_at(config: &GatewayConfig) -> Vec<ListenAt> {
     let at = |url: &GatewayUrl| ListenAt {
         protocol: match url.scheme {
@@ -306,7 +306,7 @@ mod tests {
         assert_eq!(shown(), renewed.chain());
         let reload = |key: ShownKey| gateway.reconfigure(Access::default(), || key).unwrap();
         assert!(!reload(ShownKey::Own(Arc::clone(&renewed))), "it is the same");
-        // The node's certificate is not shown where the configuration names another one.
+        // The node's certificate is not shown if the configuration names another one.
         assert!(reload(ShownKey::Files(file.certified_key())));
         gateway.set_identity(&first);
         assert_eq!(shown(), file.chain());

@@ -1,5 +1,5 @@
-//! What is there and where it goes, as the status socket tells it: local endpoints, what is shared and used and how that
-//! goes, links and names. One document, from which `sgc topic` and `sgc why` make what they show.
+//! The document behind `sgc topic` and `sgc why`: local endpoints, shares and uses with their state, links and names.
+//! The status socket sends it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -12,7 +12,7 @@ use crate::alerts::Alert;
 /// Local endpoints in one document.
 pub const GRAPH_ENDPOINTS_MAX: usize = 16_384;
 
-/// Everything.
+/// The whole document.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Graph {
@@ -20,21 +20,21 @@ pub struct Graph {
     pub node: String,
     /// Version of the program.
     pub version: String,
-    /// Whether it touches a local ROS 2 network.
+    /// Whether the node touches a local ROS 2 network.
     pub has_ros: bool,
-    /// What is on it, without what this and other nodes made there.
+    /// Endpoints of the local network, except those that nodes made there.
     pub endpoints: Vec<Endpoint>,
-    /// How many are not listed.
+    /// Number of endpoints that are not listed.
     pub endpoints_left_out: usize,
-    /// Rules of what is shared.
+    /// Rules that share interfaces.
     pub shares: Vec<Share>,
-    /// Rules of what is used.
+    /// Rules that use interfaces.
     pub uses: Vec<Use>,
-    /// What the owners that are followed list for this node.
+    /// Entries that followed owners list for this node.
     pub offers: Vec<Offer>,
     /// Links that are up.
     pub links: Vec<Link>,
-    /// Routers that are looked for.
+    /// Searches for routers.
     pub routers: Vec<Search>,
     /// Names that are shared, used, carried or asked for here.
     pub names: BTreeMap<String, NameLine>,
@@ -46,7 +46,7 @@ pub struct Graph {
     pub calls: Vec<ServiceCalls>,
     /// Programs refused at the gateway, by kind.
     pub gateway_refused: BTreeMap<String, u64>,
-    /// What the user was told once.
+    /// Problems that the log reported once.
     pub problems: Vec<String>,
     /// Alerts for an operator.
     pub alerts: Vec<Alert>,
@@ -56,11 +56,11 @@ pub struct Graph {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ServiceCalls {
-    /// As it is called on the local network.
+    /// Name on the local network.
     pub topic: String,
-    /// Whether its servers are here, and not its clients.
+    /// Whether its servers, and not its clients, are on this network.
     pub is_served: bool,
-    /// By reason.
+    /// Lost calls by reason.
     pub lost: Vec<LostCalls>,
 }
 
@@ -68,19 +68,19 @@ pub struct ServiceCalls {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct LostCalls {
-    /// The counter of the reason.
+    /// Counter of the reason.
     pub reason: String,
-    /// All of them.
+    /// Number of lost calls since the start.
     pub count: u64,
-    /// Those since a call was answered last.
+    /// Number of lost calls since a call was last answered.
     pub since_answer: u64,
-    /// Those of ROS 2 nodes here, or of nodes elsewhere, that are still there, by their names.
+    /// Lost calls by caller: names of local ROS 2 nodes, or of other nodes, that still exist.
     pub by: BTreeMap<String, u64>,
     /// Seconds since the last one.
     pub last_s: u64,
 }
 
-/// What an interface is.
+/// Kind of an interface.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Interface {
@@ -113,20 +113,20 @@ impl fmt::Display for Interface {
     }
 }
 
-/// Which messages of a topic are meant.
+/// Selects which messages of a topic are counted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Side {
-    /// What is published on the local network.
+    /// Messages published on the local network.
     Local,
-    /// What comes from the far side and is given to the local network.
+    /// Messages that come from the far side and are written to the local network.
     Far,
-    /// What goes from here to the far side, after what the user limits.
+    /// Messages that leave for the far side, after shaping.
     Sent,
 }
 
 impl Side {
-    /// As the command line and the status socket spell it.
+    /// Returns the spelling of the command line and the status socket.
     pub fn label(self) -> &'static str {
         match self {
             Self::Local => "local",
@@ -135,7 +135,7 @@ impl Side {
         }
     }
 
-    /// The side that is spelt so.
+    /// Returns the side with this spelling.
     pub fn from_label(label: &str) -> Option<Self> {
         [Self::Local, Self::Far, Self::Sent].into_iter().find(|side| side.label() == label)
     }
@@ -204,27 +204,27 @@ impl Qos {
         History::KeepAll => None,
     };
 
-    /// Reliability as ROS 2 spells it.
+    /// Returns the reliability as ROS 2 spells it.
     pub fn reliability(&self) -> &'static str {
         if self.reliable { "RELIABLE" } else { "BEST_EFFORT" }
     }
 
-    /// Durability, likewise.
+    /// Returns the durability as ROS 2 spells it.
     pub fn durability(&self) -> &'static str {
         ["VOLATILE", "TRANSIENT_LOCAL", "TRANSIENT", "PERSISTENT"]
             .get(usize::from(self.durability))
             .unwrap_or(&"?")
     }
 
-    /// Liveliness, likewise.
+    /// Returns the liveliness as ROS 2 spells it.
     pub fn liveliness(&self) -> &'static str {
         ["AUTOMATIC", "MANUAL_BY_PARTICIPANT", "MANUAL_BY_TOPIC"]
             .get(usize::from(self.liveliness))
             .unwrap_or(&"?")
     }
 
-    /// The first policy by which a reader that asks for this does not match a writer that offers `offered` (DDS 1.4,
-    /// 2.2.3), with what is offered and what is asked for.
+    /// Returns the first policy by which a reader that requests `self` does not match a writer that offers `offered`
+    /// (DDS 1.4, 2.2.3), with the offered and the requested value.
     pub fn mismatch(&self, offered: &Self) -> Option<(&'static str, String, String)> {
         let time = |ns: Option<u64>| ns.map_or("infinite".to_owned(), |ns| format!("{} s", ns as f64 / 1e9));
         let longer = |asked: Option<u64>, offered: Option<u64>| {
@@ -245,7 +245,7 @@ impl Qos {
         if longer(self.lease_ns, offered.lease_ns) {
             return Some(("liveliness lease", time(offered.lease_ns), time(self.lease_ns)));
         }
-        // Patterns may match anything; they are left to DDS.
+        // DDS alone decides on partition patterns, since they may match anything.
         let is_pattern = |p: &String| p.contains(['*', '?', '[']);
         let all =
             |qos: &Self| if qos.partitions.is_empty() { vec![String::new()] } else { qos.partitions.clone() };
@@ -254,7 +254,7 @@ impl Qos {
         if !meets && !asked.iter().chain(&offers).any(is_pattern) {
             return Some(("partition", format!("{offers:?}"), format!("{asked:?}")));
         }
-        // What is written here is of one representation: plain CDR, if it is among those that are offered.
+        // This node writes one representation: plain CDR, if it is offered.
         let taken = self.representations();
         let written = offered.representations().into_iter().min().unwrap_or_default();
         if !taken.contains(&written) {
@@ -275,54 +275,54 @@ impl Qos {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Endpoint {
-    /// ROS topic; the DDS topic where it is none.
+    /// ROS topic, or DDS topic if it is no ROS topic.
     pub topic: String,
-    /// Whether it is a topic of ROS 2 that is no part of a service.
+    /// Whether it is a ROS 2 topic that is no part of a service.
     pub is_ros_topic: bool,
     /// ROS type.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// `RIHS01_…`, if it says so.
+    /// `RIHS01_…`, if the endpoint announces it.
     pub type_hash: Option<String>,
-    /// Whether it writes.
+    /// Whether it is a writer.
     pub writes: bool,
-    /// Its node with its namespace, if it is known.
+    /// Its ROS 2 node with its namespace, if known.
     pub node: Option<String>,
-    /// Its GUID, hexadecimal.
+    /// GUID, hexadecimal.
     pub guid: String,
-    /// What it offers or asks for.
+    /// Its offered or requested QoS.
     pub qos: Qos,
-    /// The rule that shares its topic, by its place in [`Graph::shares`].
+    /// Index in [`Graph::shares`] of the rule that shares its topic.
     pub shared_by: Option<usize>,
 }
 
-/// A rule of what is shared.
+/// A rule that shares interfaces.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Share {
-    /// What kind of interface.
+    /// Kind of the interface.
     pub kind: Interface,
-    /// As the rule names it.
+    /// Topic or pattern of the rule.
     pub topic: String,
-    /// The type that the rule names.
+    /// Type that the rule names.
     pub wanted_type: Option<String>,
-    /// Who may subscribe, and who may publish: how many nodes, groups and fleets are named.
+    /// Numbers of nodes, groups and fleets that may subscribe.
     pub to: [usize; 3],
-    /// Likewise.
+    /// Numbers of nodes, groups and fleets that may publish.
     pub publish: [usize; 3],
-    /// Nodes and groups among them of which no member was heard since the node started.
+    /// Recipients of which no member was heard since the node started.
     pub unheard: Vec<UnheardMember>,
-    /// What runs of it.
+    /// Interfaces that the rule shares now.
     pub routes: Vec<ShareRoute>,
 }
 
-/// A node or a group that a rule names and of which no member was heard.
+/// A node or a group of a rule of which no member was heard.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct UnheardMember {
-    /// Its name as the rule has it, behind `group:` if it is a group.
+    /// Its name in the rule, after `group:` if it is a group.
     pub name: String,
-    /// The name of a member that was heard of, if that is nearly the same.
+    /// A similar name of a member that was heard.
     pub meant: Option<String>,
 }
 
@@ -330,109 +330,109 @@ pub struct UnheardMember {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ShareRoute {
-    /// As it is called on the local network.
+    /// Name on the local network.
     pub topic: String,
     /// ROS type.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// Its name, hexadecimal.
+    /// Name on the wire, hexadecimal.
     pub name: String,
     /// Local publishers.
     pub writers: usize,
-    /// Whether they are read.
+    /// Whether this node reads the local publishers.
     pub is_read: bool,
-    /// Whether what others publish is written here; whether others can call it, if it is a service.
+    /// Whether messages of far publishers are written here. For a service: whether others can call it.
     pub is_written: bool,
-    /// What the local publishers offer together.
+    /// Common QoS of the local publishers.
     pub qos: Option<Qos>,
     /// Granted nodes.
     pub granted: Vec<String>,
-    /// The type hashes that subscribers, or clients, of other nodes announce, as far as those tell it.
+    /// Type hashes that far subscribers or clients announce.
     pub consumer_hashes: BTreeMap<String, BTreeSet<String>>,
-    /// Refused nodes, and why.
+    /// Refused nodes with the reason.
     pub refused: BTreeMap<String, String>,
-    /// Messages published.
+    /// Number of published messages.
     pub messages: u64,
-    /// Messages of others given to the local network, and the local readers that get them.
+    /// Number of far messages that were written to the local network.
     pub written: u64,
-    /// Likewise.
+    /// Number of local readers that get far messages.
     pub matched: u32,
-    /// Whether what is published here travels as JSON.
+    /// Whether messages published here travel as JSON.
     pub is_json: bool,
-    /// Whether messages travel as JSON, and what they look like is not known here.
+    /// Whether messages travel as JSON although their type is unknown here.
     pub lacks_definition: bool,
 }
 
-/// A rule of what is used.
+/// A rule that uses interfaces.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Use {
-    /// What kind of interface.
+    /// Kind of the interface.
     pub kind: Interface,
-    /// Whether this node publishes on it.
+    /// Whether this node publishes on the topic.
     pub publishes: bool,
-    /// As the rule names it: what the owner calls it.
+    /// Topic in the rule, as the owner names it.
     pub topic: String,
-    /// What that is called on the local network.
+    /// Its name on the local network.
     pub local_topic: String,
-    /// The type that the rule asks for.
+    /// Type that the rule names.
     pub wanted_type: Option<String>,
     /// Owner's node id.
     pub owner_id: String,
     /// Owner's name.
     pub owner: String,
-    /// What is wrong with the owner, if anything.
+    /// Fault of the owner, if there is one.
     pub owner_state: Option<String>,
-    /// Where following the owner stands: `"waiting"`, `"asked"`, `"refused"`, `"granted"`.
+    /// State of following the owner: `"waiting"`, `"asked"`, `"refused"`, `"granted"`.
     pub follow: Option<String>,
-    /// Whether the owner's catalogue is here.
+    /// Whether the owner's catalogue has arrived.
     pub has_catalogue: bool,
-    /// Whether a token leads to it.
+    /// Whether the rule is a token.
     pub is_token: bool,
-    /// Its name, if a token leads to it.
+    /// Name on the wire, for a token.
     pub name: Option<String>,
-    /// Why the token was refused.
+    /// Reason why the token was refused.
     pub refused: Option<String>,
-    /// What runs of it.
+    /// Interfaces that the rule uses now.
     pub routes: Vec<UseRoute>,
 }
 
-/// An interface of another node.
+/// An interface of another node that is used here.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct UseRoute {
-    /// As it is called on the local network.
+    /// Name on the local network.
     pub topic: String,
     /// ROS type.
     #[serde(rename = "type")]
     pub type_name: String,
     /// `RIHS01_…`, if the owner knows it.
     pub type_hash: Option<String>,
-    /// Its name, hexadecimal.
+    /// Name on the wire, hexadecimal.
     pub name: String,
-    /// What the owner offers.
+    /// QoS that the owner offers.
     pub qos: Qos,
     /// Whether the owner granted it.
     pub is_granted: bool,
-    /// Who refused it, and why.
+    /// Refusing node and reason, if it was refused.
     pub refused: Option<String>,
-    /// Where asking for it stands, as in [`Use::follow`].
+    /// State of the join, as in [`Use::follow`].
     pub join: Option<String>,
-    /// Writers for it on the local network; a server, if it is a service.
+    /// Writers on the local network, or a server for a service.
     pub writers: usize,
-    /// Local readers that they are matched with.
+    /// Local readers that match those writers.
     pub matched: u32,
     /// Local publishers, if this node publishes on it.
     pub publishers: usize,
-    /// Whether they are read.
+    /// Whether this node reads the local publishers.
     pub is_read: bool,
-    /// Messages given to the local network, or published.
+    /// Number of messages that were written to the local network, or published.
     pub messages: u64,
-    /// Whether messages travel as JSON, and what they look like is not known here.
+    /// Whether messages travel as JSON although their type is unknown here.
     pub lacks_definition: bool,
 }
 
-/// What an owner lists for this node.
+/// An entry of an owner's catalogue for this node.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Offer {
@@ -440,32 +440,32 @@ pub struct Offer {
     pub owner_id: String,
     /// Owner's name, if a rule names it.
     pub owner: Option<String>,
-    /// What kind of interface.
+    /// Kind of the interface.
     pub kind: Interface,
-    /// As the owner calls it.
+    /// Name at the owner.
     pub topic: String,
     /// ROS type.
     #[serde(rename = "type")]
     pub type_name: String,
     /// `RIHS01_…`, if the owner knows it.
     pub type_hash: Option<String>,
-    /// What the owner offers.
+    /// QoS that the owner offers.
     pub qos: Qos,
-    /// Its name, hexadecimal.
+    /// Name on the wire, hexadecimal.
     pub name: String,
     /// Whether this node may subscribe.
     pub subscribe: bool,
     /// Whether this node may publish.
     pub publish: bool,
-    /// Whether a rule asks for it.
+    /// Whether a rule uses it.
     pub is_used: bool,
 }
 
-/// A link.
+/// A link to another node.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Link {
-    /// Its number.
+    /// Number of the link.
     pub id: u32,
     /// Node id of the peer.
     pub peer: String,
@@ -475,38 +475,38 @@ pub struct Link {
     pub remote: String,
     /// Round trip, microseconds.
     pub rtt_us: u64,
-    /// True while nothing comes over it although something should.
+    /// Whether the peer is overdue with an answer.
     pub silent: bool,
 }
 
-/// A router that is looked for.
+/// A search for a router.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Search {
-    /// As the configuration names it.
+    /// Entry of the configuration.
     pub router: String,
-    /// How that goes.
+    /// State of the search.
     pub state: String,
-    /// Why it failed last.
+    /// The last failure.
     pub last_failure: Option<String>,
 }
 
-/// What this node knows of a name.
+/// State of a name at this node.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct NameLine {
-    /// The way to its owner: number of a link, 0 for this node, and microseconds of round trip.
+    /// Next hop towards the owner: number of a link, or 0 for this node; and microseconds of round trip.
     pub way: Option<(u32, u32)>,
-    /// Links that packets leave on; 0 for this node.
+    /// Links on which packets leave; 0 is this node.
     pub out: Vec<u32>,
-    /// Links that they come from.
+    /// Links from which packets come.
     pub up: Vec<u32>,
-    /// Whether packets are forwarded at all: there is a branch.
+    /// Whether the name has a branch here, so that packets are forwarded.
     pub has_branch: bool,
-    /// Packets taken in.
+    /// Number of received packets.
     pub packets: u64,
     /// Bytes of their payloads.
     pub bytes: u64,
-    /// What was dropped, by reason.
+    /// Drops by reason.
     pub dropped: BTreeMap<String, u64>,
 }

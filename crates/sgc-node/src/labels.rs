@@ -1,5 +1,5 @@
-//! Labels that this node gives to names on one link, for the packets that it sends (`docs/spec/wire.md`, labels). What
-//! the peer's labels stand for is with the link itself.
+//! Labels that this node gives to names on one link, for packets that it sends (`docs/spec/wire.md`, labels). The link
+//! itself keeps the peer's labels.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use sgc_wire::{Label, Name};
 
-/// How far both sides are: given by this node, and known to the peer.
+/// Numbers of labels given by this node, and known to the peer.
 #[derive(Debug, Default)]
 pub(crate) struct Progress {
     given: AtomicU32,
@@ -15,7 +15,7 @@ pub(crate) struct Progress {
 }
 
 impl Progress {
-    /// The peer knows this label and all before it; false if it was never given.
+    /// Notes that the peer knows this label and all before it. Returns `false` if it was never given.
     pub(crate) fn acknowledge(&self, label: Label) -> bool {
         let is_given = label.index() < self.given.load(Relaxed);
         if is_given {
@@ -24,7 +24,7 @@ impl Progress {
         is_given
     }
 
-    /// How many labels the peer knows.
+    /// Returns the number of labels that the peer knows.
     pub(crate) fn known(&self) -> u32 {
         self.known.load(Relaxed)
     }
@@ -38,14 +38,14 @@ pub(crate) struct NameLabel {
 }
 
 impl NameLabel {
-    /// The label, once the peer knows it.
+    /// Returns the label, once the peer knows it.
     pub(crate) fn known(&self) -> Option<Label> {
         (self.label.index() < self.progress.known()).then_some(self.label)
     }
 }
 
-/// Gives the labels of one link: in order, one to a name for as long as the link lives, so that none ever means two
-/// names to packets that are under way.
+/// Gives the labels of one link in order. A label belongs to one name for the life of the link, so it stays unambiguous
+/// for packets under way.
 #[derive(Debug, Default)]
 pub(crate) struct LabelBook {
     names: HashMap<Name, Label>,
@@ -53,25 +53,25 @@ pub(crate) struct LabelBook {
 }
 
 impl LabelBook {
-    /// The book of a link on which the peer's acknowledgements are taken down in `progress`.
+    /// Creates the book of a link. Acknowledgements of the peer are recorded in `progress`.
     pub(crate) fn new(progress: Arc<Progress>) -> Self {
         Self { names: HashMap::new(), progress }
     }
 
-    /// How many the peer knows.
+    /// Returns the number of labels that the peer knows.
     pub(crate) fn known(&self) -> u32 {
         self.progress.known()
     }
 
-    /// The label of a name. A new one has to be told to the peer by `tell`, which may fail; without one, also where
-    /// there are no more, packets carry the name.
+    /// Returns the label of a name. `tell` announces a new label to the peer and may fail. Without a label, as when all
+    /// are used, packets carry the name.
     pub(crate) fn label(&mut self, name: Name, tell: impl FnOnce(Label) -> bool) -> Option<NameLabel> {
         let label = match self.names.get(&name) {
             Some(label) => *label,
             None => {
                 let next = self.progress.given.load(Relaxed);
                 let label = Label::new(next)?;
-                // Before it is told: the answer may be here at once.
+                // The count is raised before the announcement, since the answer may arrive at once.
                 self.progress.given.store(next + 1, Relaxed);
                 if !tell(label) {
                     self.progress.given.store(next, Relaxed);
@@ -107,7 +107,7 @@ mod tests {
         assert!(labels.iter().all(|l| l.known().is_none()));
         assert!(progress.acknowledge(Label::new(1).unwrap()));
         assert_eq!(labels.iter().filter_map(NameLabel::known).map(Label::index).collect::<Vec<_>>(), [0, 1]);
-        // The name goes and comes back.
+        // The name is released and requested again.
         assert_eq!(book.label(name(1), |_| panic!("told already")).unwrap().known(), Label::new(1));
         for index in 3..LABELS_MAX {
             assert!(book.label(name(index), |_| true).is_some());

@@ -1,8 +1,8 @@
-//! Lanes: connections beside a link, each for the packets of one name, so that a camera has a congestion controller and a
-//! queue of its own (`link = "dedicated"`; `docs/spec/wire.md`, lanes).
+//! Lanes: connections beside a link, each for the packets of one name, so that a camera has its own congestion
+//! controller and queue (`link = "dedicated"`; `docs/spec/wire.md`, lanes).
 //!
-//! The node that dialled the link dials its lanes, since the other may be unable to. To everyone else a lane is a part of
-//! its link: what comes by it came over the link, and without it the link carries its name as well.
+//! The node that dialled the link dials its lanes, since the other node may be unable to. Everything else treats a lane
+//! as part of its link: packets of a lane came over the link, and without the lane the link carries its name as well.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -19,38 +19,38 @@ use tokio::time::{sleep, timeout};
 use tracing::{debug, info, warn};
 
 use crate::control_queue::ControlQueue;
-use crate::finding::{BACKOFF_MAX, doubled, wait};
+use crate::discovery::{BACKOFF_MAX, doubled, wait};
 use crate::links::Inflow;
 
-/// Lanes of one link.
+/// Most lanes of one link.
 pub(crate) const LANES_MAX: usize = 8;
-/// Lanes of all links together that were agreed on and have not come.
+/// Most agreed lanes of all links that have not arrived.
 const EXPECTED_MAX: usize = 1024;
-/// How long the answer to an offer may take.
+/// Time for the answer to an offer.
 const ANSWER_MAX: Duration = Duration::from_secs(5);
-/// How long a lane may take to come once it was agreed on.
+/// Time for an agreed lane to arrive.
 const ARRIVAL_MAX: Duration = Duration::from_secs(15);
 /// The first wait, before jitter, after the peer refused a lane for lack of places. It is doubled each time.
 const REFUSED_MIN: Duration = Duration::from_secs(30);
 /// The longest such wait, before jitter.
 const REFUSED_MAX: Duration = Duration::from_secs(600);
 
-/// The lanes that this node was told to await. Clones share.
+/// Agreed lanes that have not arrived. Clones share the state.
 #[derive(Clone, Default)]
-pub(crate) struct LaneDoor {
-    expected: Arc<Mutex<BTreeMap<LaneToken, Expected>>>,
+pub(crate) struct LaneAdmission {
+    expected: Arc<Mutex<BTreeMap<LaneToken, ExpectedLane>>>,
 }
 
 /// A lane that was agreed on.
-struct Expected {
+struct ExpectedLane {
     node: NodeId,
     name: Name,
     lanes: Weak<Lanes>,
     until: Instant,
 }
 
-impl LaneDoor {
-    /// Awaits a lane; false if too many are awaited.
+impl LaneAdmission {
+    /// Expects a lane. Returns `false` if too many are expected.
     fn expect(&self, token: LaneToken, name: Name, lanes: &Arc<Lanes>) -> bool {
         let now = Instant::now();
         let mut expected = self.expected.lock().unwrap_or_else(PoisonError::into_inner);
@@ -58,47 +58,49 @@ impl LaneDoor {
         if expected.len() >= EXPECTED_MAX || expected.contains_key(&token) {
             return false;
         }
-        // One that offers again and again leaves room for other links' lanes.
+        // The bound per link leaves room for lanes of other links.
         let of_link = expected.values().filter(|lane| std::ptr::eq(lane.lanes.as_ptr(), Arc::as_ptr(lanes)));
         if of_link.count() >= LANES_MAX {
             return false;
         }
         let node = lanes.link.peer().node_id;
-        expected
-            .insert(token, Expected { node, name, lanes: Arc::downgrade(lanes), until: now + ARRIVAL_MAX });
+        expected.insert(
+            token,
+            ExpectedLane { node, name, lanes: Arc::downgrade(lanes), until: now + ARRIVAL_MAX },
+        );
         true
     }
 
-    /// Brings a lane that came to its link. One that nobody awaits, or of another node, is closed.
+    /// Passes an incoming lane to its link. Closes a lane that is not expected, or that comes from another node.
     pub(crate) fn enter(&self, token: LaneToken, lane: AnyLink) {
         let found = self.expected.lock().unwrap_or_else(PoisonError::into_inner).remove(&token);
         let found = found.filter(|e| e.node == lane.peer().node_id && e.until > Instant::now());
         match found.and_then(|e| Some((e.lanes.upgrade()?, e.name))) {
             Some((lanes, name)) => lanes.attach(name, lane),
             None => {
-                warn!(remote = %lane.remote(), peer = %lane.peer().node_id.short(), "a connection as a lane that was not agreed on; it is closed");
+                warn!(remote = %lane.remote(), peer = %lane.peer().node_id.short(), "closed an unexpected lane");
                 lane.close(CloseReason::Denied("no such lane was agreed on".into()));
             }
         }
     }
 }
 
-/// How lanes of a link are dialled.
+/// Dialer and URL for the lanes of a link.
 pub(crate) type Dial = (Arc<Dialer>, LinkUrl);
 
 /// The lanes of one link.
 pub(crate) struct Lanes {
     link: AnyLink,
     frames: ControlQueue,
-    /// Nothing if the peer dialled the link.
+    /// Dialer; `None` if the peer dialled the link.
     dial: Option<Dial>,
-    door: LaneDoor,
-    /// What packets of a lane go through; there once the link has its number.
+    admission: LaneAdmission,
+    /// Inflow for the packets of lanes. It is set once the link has its number.
     inflow: OnceLock<Inflow>,
     table: Mutex<Table>,
-    /// Whether the table holds any, so that links without lanes take no lock for a packet.
+    /// Whether the table holds any lane, so that links without lanes take no lock for a packet.
     has_any: AtomicBool,
-    /// The number of the last lane that came up.
+    /// Number of the last lane that came up.
     number: AtomicU64,
 }
 
@@ -112,11 +114,11 @@ struct Table {
 struct Lane {
     up: Option<(u64, AnyLink)>,
     wanted_here: bool,
-    /// Dials it; there if this node dials.
+    /// Task that dials the lane, if this node dials.
     keeper: Option<AbortHandle>,
 }
 
-/// Why there is no lane.
+/// Reasons why a lane is missing.
 #[derive(Debug, thiserror::Error)]
 enum LaneFailure {
     #[error("the peer takes no more lanes")]
@@ -130,13 +132,18 @@ enum LaneFailure {
 }
 
 impl Lanes {
-    /// Of a link without any so far; `dial` if this node dialled it.
-    pub(crate) fn new(link: AnyLink, frames: ControlQueue, dial: Option<Dial>, door: LaneDoor) -> Arc<Self> {
+    /// Creates the table of a link without lanes. `dial` is set if this node dialled the link.
+    pub(crate) fn new(
+        link: AnyLink,
+        frames: ControlQueue,
+        dial: Option<Dial>,
+        admission: LaneAdmission,
+    ) -> Arc<Self> {
         Arc::new(Self {
             link,
             frames,
             dial,
-            door,
+            admission,
             inflow: OnceLock::new(),
             table: Mutex::default(),
             has_any: AtomicBool::new(false),
@@ -144,26 +151,26 @@ impl Lanes {
         })
     }
 
-    /// From here on packets of lanes are taken in.
+    /// Accepts packets of lanes from here on.
     pub(crate) fn start(&self, inflow: Inflow) {
-        // It is called once.
+        // The function is called once, so this cannot fail.
         let _ = self.inflow.set(inflow);
     }
 
-    /// The lane of a name, if one is up, and a number that no other lane of the link had.
-    pub(crate) fn of(&self, name: &Name) -> Option<(u64, AnyLink)> {
+    /// Returns the lane of a name, if one is up, and its number, which is unique within the link.
+    pub(crate) fn for_name(&self, name: &Name) -> Option<(u64, AnyLink)> {
         if !self.has_any.load(Ordering::Relaxed) {
             return None;
         }
         self.table().lanes.get(name)?.up.clone()
     }
 
-    /// How many are up.
+    /// Returns the number of lanes that are up.
     pub(crate) fn count(&self) -> usize {
         self.table().lanes.values().filter(|lane| lane.up.is_some()).count()
     }
 
-    /// Wants a lane for a name, or no longer.
+    /// Starts or stops to want a lane for a name.
     pub(crate) fn set_wanted(self: &Arc<Self>, name: Name, wanted: bool) {
         if !wanted && !self.has_any.load(Ordering::Relaxed) {
             return;
@@ -182,7 +189,7 @@ impl Lanes {
             return;
         }
         if !self.admit(&mut table, name) {
-            warn!(remote = %self.link.remote(), "a topic is to have a connection of its own and {LANES_MAX} others have; it shares the link");
+            warn!(remote = %self.link.remote(), "a topic gets no lane, because {LANES_MAX} others have one; it shares the link");
             return;
         }
         if let Some(lane) = table.lanes.get_mut(&name) {
@@ -190,17 +197,17 @@ impl Lanes {
         }
         drop(table);
         if self.dial.is_none() && !self.frames.push(Control::LaneWanted { name }) {
-            debug!(name = %name.short(), "the peer takes no control frames; no lane is asked for");
+            debug!(name = %name.short(), "the peer takes no control frames; no lane is requested");
         }
     }
 
-    /// Takes in what the peer says of lanes; the error is its mistake.
+    /// Handles a frame about lanes. The error is a mistake of the peer.
     pub(crate) fn handle(self: &Arc<Self>, frame: &Control) -> Result<(), String> {
         match (frame, &self.dial) {
             (Control::LaneOffer { token, name }, None) => {
                 let mut table = self.table();
                 let has_room = table.lanes.contains_key(name) || table.lanes.len() < LANES_MAX;
-                let accepted = has_room && self.door.expect(*token, *name, self);
+                let accepted = has_room && self.admission.expect(*token, *name, self);
                 if accepted {
                     table.lanes.entry(*name).or_default();
                     self.has_any.store(true, Ordering::Relaxed);
@@ -213,7 +220,7 @@ impl Lanes {
                 }
             }
             (Control::LaneAnswer { token, accepted }, Some(_)) => {
-                // One that nobody waits for came too late.
+                // A late answer has no waiter any more.
                 if let Some(waiting) = self.table().answers.remove(token) {
                     let _ = waiting.send(*accepted);
                 }
@@ -222,7 +229,7 @@ impl Lanes {
             (Control::LaneWanted { name }, Some(_)) => {
                 let mut table = self.table();
                 if !self.admit(&mut table, *name) {
-                    debug!(name = %name.short(), "the peer wants more lanes than there may be");
+                    debug!(name = %name.short(), "the peer requests too many lanes");
                 }
                 Ok(())
             }
@@ -231,14 +238,14 @@ impl Lanes {
         }
     }
 
-    /// Ends all lanes, with the link.
+    /// Ends all lanes together with the link.
     pub(crate) fn close(&self) {
         let lanes = std::mem::take(&mut self.table().lanes);
         self.has_any.store(false, Ordering::Relaxed);
         lanes.into_values().for_each(end);
     }
 
-    /// Makes a place for a lane, and dials it if this node does; false if there is none.
+    /// Adds a lane to the table, and dials it if this node does. Returns `false` if there is no room.
     fn admit(self: &Arc<Self>, table: &mut Table, name: Name) -> bool {
         if !table.lanes.contains_key(&name) && table.lanes.len() >= LANES_MAX {
             return false;
@@ -254,9 +261,9 @@ impl Lanes {
         true
     }
 
-    /// Dials a lane, and again whenever it ends, until it is no longer wanted.
+    /// Dials a lane, and dials again whenever it ends, until it is no longer wanted.
     async fn keep(self: Arc<Self>, name: Name, dial: Dial) {
-        // For jitter alone.
+        // The generator serves jitter only.
         let mut rng = ChaCha20Rng::seed_from_u64(OsRng.try_next_u64().unwrap_or(0));
         let (mut failures, mut refusals) = (0, 0u32);
         loop {
@@ -276,14 +283,14 @@ impl Lanes {
                 }
                 Err(LaneFailure::Refused) => {
                     if refusals == 0 {
-                        info!(remote = %self.link.remote(), "{}; the topic shares the link, and one is asked for again seldom", LaneFailure::Refused);
+                        info!(remote = %self.link.remote(), "{}; the topic shares the link, and a lane is requested again later", LaneFailure::Refused);
                     }
                     refusals = refusals.saturating_add(1);
                     sleep(doubled(REFUSED_MIN, refusals, REFUSED_MAX, &mut rng)).await;
                     continue;
                 }
                 Err(why) if failures == 0 => {
-                    warn!(remote = %self.link.remote(), "no connection of its own for a topic: {why}; it shares the link and it is tried again");
+                    warn!(remote = %self.link.remote(), "no lane for a topic: {why}; the topic shares the link until the next attempt");
                 }
                 Err(why) => debug!("no lane: {why}"),
             }
@@ -292,7 +299,7 @@ impl Lanes {
         }
     }
 
-    /// Agrees on a lane and dials it.
+    /// Agrees on a lane with the peer and dials it.
     async fn open(&self, name: Name, (dialer, url): &Dial) -> Result<AnyLink, LaneFailure> {
         let mut token = [0; 16];
         OsRng.try_fill_bytes(&mut token).map_err(|_| LaneFailure::NoAnswer)?;
@@ -350,7 +357,7 @@ impl Lanes {
             return;
         };
         lane.up = None;
-        // Here it is only known as long as it is up: who dials offers it again.
+        // The accepting side forgets a lane that ends, since the dialling side offers it again.
         if self.dial.is_none() && !lane.wanted_here {
             table.lanes.remove(name);
         }
@@ -382,14 +389,14 @@ mod tests {
     use crate::control_queue::Outgoing;
     use crate::core::now;
 
-    /// A router that nodes of its fleet dial.
+    /// A router, with nodes of its fleet that dial it.
     struct Bench {
         fleet: Fleet,
         listener: Listener,
-        door: LaneDoor,
+        admission: LaneAdmission,
     }
 
-    /// The lanes of one end of a link, and the frames that it sends.
+    /// Lanes at one end of a link, and the frames that this end sends.
     type End = (Arc<Lanes>, mpsc::Receiver<Outgoing>);
 
     impl Bench {
@@ -398,7 +405,7 @@ mod tests {
             let router = Self::credentials(&fleet, "router");
             let addr = "quic://127.0.0.1:0".parse().unwrap();
             let listener = Listener::bind(&addr, router, LinkOptions::default(), Arc::default()).unwrap();
-            Self { fleet, listener, door: LaneDoor::default() }
+            Self { fleet, listener, admission: LaneAdmission::default() }
         }
 
         fn credentials(fleet: &Fleet, node: &str) -> CredentialStore {
@@ -406,18 +413,18 @@ mod tests {
             CredentialStore::new(Arc::new(fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap()))
         }
 
-        /// A link of this node to the router: the node's end, and the router's.
+        /// Links a node to the router. Returns the node's end and the router's end.
         async fn link(&mut self, node: &str) -> (End, End) {
             let store = Self::credentials(&self.fleet, node);
             let dialer = Arc::new(Dialer::new(store, LinkOptions::default(), Arc::default()));
             let url: LinkUrl = self.listener.local().to_string().parse().unwrap();
             let (near, far) = tokio::join!(dialer.dial(&url), self.listener.accept());
-            let end = |link, dial, door| {
+            let end = |link, dial, admission| {
                 let (frames, sent) = ControlQueue::new();
-                (Lanes::new(link, frames, dial, door), sent)
+                (Lanes::new(link, frames, dial, admission), sent)
             };
-            let near = end(near.unwrap(), Some((dialer, url)), LaneDoor::default());
-            (near, end(far.unwrap().unwrap(), None, self.door.clone()))
+            let near = end(near.unwrap(), Some((dialer, url)), LaneAdmission::default());
+            (near, end(far.unwrap().unwrap(), None, self.admission.clone()))
         }
     }
 
@@ -432,11 +439,11 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn one_link_that_offers_again_and_again_leaves_places_for_the_lanes_of_others() {
+    async fn link_with_repeated_offers_leaves_room_for_lanes_of_others() {
         let mut bench = Bench::new();
         let (_, (greedy, mut to_greedy)) = bench.link("greedy").await;
         let (_, (other, mut to_other)) = bench.link("other").await;
-        // Each offer of one name has a token of its own, and none of the lanes comes.
+        // Each offer has its own token, and none of the lanes arrives.
         let offers = 0..u16::try_from(2 * EXPECTED_MAX).unwrap();
         let accepted = offers.filter(|n| offer(&greedy, &mut to_greedy, *n, Name([1; 32]))).count();
         assert_eq!(accepted, LANES_MAX);

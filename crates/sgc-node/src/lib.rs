@@ -1,8 +1,8 @@
 //! The driver of SGC: the one place where machines, sockets, the local ROS 2 network, files and clocks meet.
 //!
-//! It decides nothing that a machine can decide. [`config`] makes a [`config::Config`] of what the user wrote;
-//! [`run`] runs it. Inside, one control task owns the machines (`core`), and the data path (`dataplane`) runs
-//! beside it, on the tasks and threads that receive.
+//! It decides nothing that a machine can decide. [`config`] turns the user's input into a [`config::Config`], and
+//! [`run`] runs it. One control task owns the machines (`core`). The data path (`dataplane`) runs beside it, on the
+//! receiving tasks and threads.
 #![forbid(unsafe_code)]
 
 mod access;
@@ -24,14 +24,13 @@ mod conversion;
 mod core;
 mod credentials;
 mod dataplane;
+mod discovery;
 pub mod discovery_server;
 mod file_watch;
-mod finding;
 mod fleet_file;
 mod gateway;
 pub mod graph;
-mod heart;
-mod hold;
+mod keep_alive;
 mod labels;
 mod lanes;
 mod links;
@@ -44,8 +43,10 @@ mod operators;
 mod outflow;
 pub mod partners;
 mod peer_rate;
+mod pending;
 pub mod policy;
 mod problem_log;
+mod push_crl;
 mod queue;
 mod records;
 mod rediscovery;
@@ -66,12 +67,11 @@ mod stats;
 mod status;
 mod strangers;
 mod tap;
-mod tell;
 mod type_questions;
 
 pub use access::{ACCESS_TOKENS_MAX, AccessError, AccessRecord, AccessRecords, access_of, access_with};
 pub use admin::{SocketError, default_socket_path};
-pub use finding::RouterStatus;
+pub use discovery::RouterStatus;
 pub use fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use gateway::{GatewayStartError, OpenLocalRos};
 pub use members::{UnknownMember, unknown_members};
@@ -81,9 +81,9 @@ pub use node::{
 };
 pub use operations::OperationError;
 pub use operators::{roster_head, roster_row};
+pub use push_crl::{PushCrlError, push_crl};
 pub use reload::{ConfigSource, ReloadReport};
 pub use rules::{RulesError, read_token};
 pub use run_lock::IdentityInUse;
 pub use state::{StateError, check_state_dir, create_state_dir, state_dir};
 pub use status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
-pub use tell::{TellError, tell_router};

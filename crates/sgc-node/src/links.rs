@@ -1,6 +1,6 @@
-//! The tasks around a link: dialling and accepting, and moving what comes in to where it belongs.
+//! Tasks of a link: they dial, accept, and pass on received frames and packets.
 //!
-//! Control frames go to the control task; packets go straight to the data path, on the task that read them.
+//! Control frames go to the control task. The task that reads a packet passes it straight to the data path.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -21,24 +21,26 @@ use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::control_queue::{ControlQueue, InboxShare, Outgoing};
 use crate::core::{CoreEvent, LinkPlace};
 use crate::dataplane::DataPlane;
-use crate::finding::{Aim, BACKOFF_MAX, Claim, Claims, Climb, Dialled, Holder, Line, is_over_udp, wait};
-use crate::heart::Activity;
+use crate::discovery::{
+    BACKOFF_MAX, Claim, Claims, DialTarget, DialledLink, Failback, LinkKeeper, StatusRow, is_over_udp, wait,
+};
+use crate::keep_alive::Activity;
 use crate::labels::{LabelBook, NameLabel, Progress};
-use crate::lanes::{Dial, LaneDoor, Lanes};
+use crate::lanes::{Dial, LaneAdmission, Lanes};
 use crate::peer_rate::PeerRate;
 use crate::refusal_log::RefusalLog;
 use crate::roaming::{self, Move, Origin, source_towards};
 use crate::stats::DataDrop;
 
-/// How long a link that replaces another may take until the other goes.
+/// Time for a replacement link to settle before the old one goes.
 const SETTLE_MAX: Duration = Duration::from_secs(5);
-/// How long no control frame comes on it when both sides have said what there is, at least, and in round trips.
+/// Silence of control frames after which both sides have said everything: at least this long, and at least this many
+/// round trips.
 const QUIET_MIN: Duration = Duration::from_millis(100);
 const QUIET_RTTS: u32 = 4;
-/// How long nothing may come by a new socket until another link is tried beside it: what the transport is may be blocked
-/// where the node is now.
+/// Silence on a new socket after which another link is tried beside it, since the new network may block the transport.
 const DOUBT_AFTER: Duration = Duration::from_millis(1500);
-/// How long it may take to answer a goodbye.
+/// Time for the peer to answer a goodbye.
 const GOODBYE_MAX: Duration = Duration::from_secs(1);
 
 /// Sends frames of the control task over a link, in order.
@@ -50,102 +52,103 @@ pub(crate) struct ControlTx {
 }
 
 impl ControlTx {
-    /// The label of a name on this link, if it has one; a new one is told to the peer.
+    /// Returns the label of a name on this link, if it has one. A new label is announced to the peer.
     pub(crate) fn label(&mut self, name: Name) -> Option<NameLabel> {
         let frames = &self.frames;
         self.labels.label(name, |label| frames.push(Control::Label { label, name }))
     }
 
-    /// Whether packets go over the link.
+    /// Returns the flag of packets that crossed the link.
     pub(crate) fn activity(&self) -> &Arc<Activity> {
         &self.activity
     }
 
-    /// The lanes of the link.
+    /// Returns the lanes of the link.
     pub(crate) fn lanes(&self) -> &Arc<Lanes> {
         &self.lanes
     }
 
-    /// How many labels the peer knows.
+    /// Returns the number of labels that the peer knows.
     pub(crate) fn labels_known(&self) -> u32 {
         self.labels.known()
     }
 
-    /// Queues a frame; false if the peer is too far behind.
+    /// Queues a frame. Returns `false` if the peer is too far behind.
     pub(crate) fn send(&self, frame: Control) -> bool {
         self.frames.push(frame)
     }
 
-    /// Has the control task told when the link has taken what is queued; false if the peer is too far behind.
+    /// Queues a flush: the control task is notified when the link has taken all earlier frames. Returns `false` if the
+    /// peer is too far behind.
     pub(crate) fn flush(&self) -> bool {
         self.frames.flush()
     }
 }
 
-/// Serves a link, and in its place each one that is made because the credentials changed (`redial`), or because it is
-/// to lead elsewhere (`aim`), because a better way than the one in use (`url`) works, or because the network is another and
-/// the transport cannot follow; returns when the last of them has
-/// ended.
+/// Serves a link and its replacements, and returns when the last of them has ended.
 ///
-/// The new link is made while the old one is up, which is taken down only when both sides have told each other what they
-/// know on the new one. As long as that fails, the old one stays.
+/// A link is replaced when the credentials change (`redial`), when the target changes (`target`), when a better URL
+/// than the current one (`url`) works, or when the network changes and the transport cannot follow.
+///
+/// The new link is made while the old one is up. The old one is closed once both sides have sent each other their state
+/// on the new one. If that fails, the old one stays.
 pub(crate) async fn keep_renewed(
     link: AnyLink,
     mut url: LinkUrl,
-    mut aim: watch::Receiver<Aim>,
+    mut target: watch::Receiver<DialTarget>,
     mut redial: watch::Receiver<()>,
-    holder: &Holder,
+    keeper: &LinkKeeper,
     mut claim: Claim,
-    line: &Line,
+    row: &StatusRow,
 ) -> LinkError {
-    let core = &holder.core;
+    let core = &keeper.core;
     let serve = |link, url: &LinkUrl| {
-        let dial = (holder.lane_dialer.clone(), url.clone());
-        async move { Served::start(link, Some(dial), LaneDoor::default(), core).await }
+        let dial = (keeper.lane_dialer.clone(), url.clone());
+        async move { ReportedLink::start(link, Some(dial), LaneAdmission::default(), core).await }
     };
     let mut current = serve(link, &url).await;
-    // For jitter alone.
+    // The generator serves jitter only.
     let mut rng = ChaCha20Rng::seed_from_u64(OsRng.try_next_u64().unwrap_or(0));
     let mut failures = None;
-    let climb_from = |aim: &Aim, url: &LinkUrl, rng: &mut ChaCha20Rng| {
-        Climb::new(aim.better_than(url).len(), Instant::now(), rng)
+    let failback_from = |target: &DialTarget, url: &LinkUrl, rng: &mut ChaCha20Rng| {
+        Failback::new(target.better_than(url).len(), Instant::now(), rng)
     };
-    let mut climb = climb_from(&aim.borrow(), &url, &mut rng);
-    let mut network = holder.network.onward();
-    let mut origin = Origin::of(current.link.remote());
-    // Whether a link is wanted in place of this one without anything else having to happen.
+    let mut failback = failback_from(&target.borrow(), &url, &mut rng);
+    let mut network = keeper.network.onward();
+    let mut origin = Origin::from_remote(current.link.remote());
+    // Whether a replacement is wanted without a further event.
     let mut is_wanted = false;
-    // When to look whether anything came since a change of the network, and how much had come before.
+    // Time at which to check for receipts after a network change, and the bytes received before.
     let mut doubted = None;
     loop {
         let next = async {
-            let climbs = match failures {
+            let fails_back = match failures {
                 _ if is_wanted => false,
                 None => tokio::select! {
                     () = changed(&mut redial) => false,
-                    () = changed(&mut aim) => false,
-                    () = climb.is_due() => true,
+                    () = changed(&mut target) => false,
+                    () = failback.is_due() => true,
                 },
                 Some(failures) => {
                     tokio::time::sleep(wait(failures, BACKOFF_MAX, &mut rng)).await;
                     false
                 }
             };
-            let dialled = if climbs {
-                let aim = aim.borrow().clone();
-                holder.dial_first(aim.better_than(&url)).await.map(|dialled| (dialled, aim))
+            let dialled = if fails_back {
+                let target = target.borrow().clone();
+                keeper.dial_first(target.better_than(&url)).await.map(|dialled| (dialled, target))
             } else {
-                // Until there is one, whatever cuts this attempt short.
+                // Stays set until a replacement exists, whatever interrupts this attempt.
                 is_wanted = true;
                 redial.mark_unchanged();
-                let aim = aim.borrow_and_update().clone();
-                holder.dial(&aim).await.map(|dialled| (dialled, aim))
+                let target = target.borrow_and_update().clone();
+                keeper.dial(&target).await.map(|dialled| (dialled, target))
             };
-            let claimed = |(dialled, aim): (Dialled, Aim)| {
-                let claim = holder.claim_again(&dialled.link, &claim)?;
-                Ok((dialled, aim, claim))
+            let claimed = |(dialled, target): (DialledLink, DialTarget)| {
+                let claim = keeper.claim_again(&dialled.link, &claim)?;
+                Ok((dialled, target, claim))
             };
-            dialled.and_then(claimed).map_err(|why| (why, climbs))
+            dialled.and_then(claimed).map_err(|why| (why, fails_back))
         };
         tokio::select! {
             end = current.end(core) => return end,
@@ -157,27 +160,27 @@ pub(crate) async fn keep_renewed(
                 match moves {
                     Move::Stay => {}
                     Move::Rebind => {
-                        holder.rebind();
+                        keeper.rebind();
                         doubted = Some((Instant::now() + DOUBT_AFTER, current.link.stats().received_bytes));
                     }
                     Move::Redial => is_wanted = true,
                 }
                 failures = failures.map(|_| 0);
-                climb.network_changed(Instant::now());
+                failback.network_changed(Instant::now());
             }
             before = passed(doubted) => {
                 doubted = None;
                 if current.link.stats().received_bytes == before {
-                    info!(%url, "nothing comes since the network changed; connecting anew beside it");
+                    info!(%url, "nothing arrives since the network changed; connecting again in parallel");
                     is_wanted = true;
                 }
             }
             dialled = next => match dialled {
-                Ok((dialled, aim, other)) => {
+                Ok((dialled, target, other)) => {
                     (is_wanted, doubted) = (false, None);
-                    let Dialled { link, url: way, passed } = dialled;
+                    let DialledLink { link, url: new_url, passed } = dialled;
                     let node = link.peer().node_id;
-                    let next = serve(link, &way).await;
+                    let next = serve(link, &new_url).await;
                     tokio::select! {
                         () = next.settled() => {
                             failures = None;
@@ -185,7 +188,7 @@ pub(crate) async fn keep_renewed(
                             tokio::spawn(old.retire(core.clone()));
                         }
                         end = next.end(core) => {
-                            warn!("the link that was to take over ended: {end}; the old one stays and it is tried again");
+                            warn!("the replacement link ended: {end}; the old link stays until the next attempt");
                             failures = Some(failures.unwrap_or(0).saturating_add(1));
                             continue;
                         }
@@ -194,24 +197,24 @@ pub(crate) async fn keep_renewed(
                             (current, failures) = (next, None);
                         }
                     }
-                    holder.linked(&aim, &way, &passed, &node, line);
-                    climb = climb_from(&aim, &way, &mut rng);
-                    origin = Origin::of(current.link.remote());
-                    url = way;
+                    keeper.linked(&target, &new_url, &passed, &node, row);
+                    failback = failback_from(&target, &new_url, &mut rng);
+                    origin = Origin::from_remote(current.link.remote());
+                    url = new_url;
                     if let Some(other) = other {
                         claim = other;
                     }
                 }
                 Err((why, true)) => {
-                    debug!("no better way yet: {why}");
-                    climb.failed(Instant::now(), &mut rng);
+                    debug!("no better URL works yet: {why}");
+                    failback.failed(Instant::now(), &mut rng);
                 }
                 Err((why, false)) => {
                     is_wanted = false;
                     if failures.is_none() {
-                        warn!("cannot connect anew: {why}; the old link stays and it is tried again");
+                        warn!("cannot reconnect: {why}; the old link stays until the next attempt");
                     }
-                    line.noted(&why.to_string());
+                    row.noted(&why.to_string());
                     failures = Some(failures.unwrap_or(0).saturating_add(1));
                 }
             }
@@ -219,7 +222,7 @@ pub(crate) async fn keep_renewed(
     }
 }
 
-/// Waits until its time has come, and returns what was noted then; for ever if there is nothing.
+/// Waits until the noted time, and returns the noted count. Waits for ever if there is none.
 async fn passed(noted: Option<(Instant, u64)>) -> u64 {
     match noted {
         Some((at, what)) => {
@@ -230,7 +233,7 @@ async fn passed(noted: Option<(Instant, u64)>) -> u64 {
     }
 }
 
-/// Returns the place of another process with this node's identity, if a peer closed a link for it.
+/// Returns the place of another process with this node's identity, if the peer closed the link for it.
 pub(crate) fn place_in_use(end: &LinkError) -> Option<&str> {
     match end {
         LinkError::Closed { by_peer: true, reason: CloseReason::InUse(place) } => Some(place),
@@ -238,25 +241,29 @@ pub(crate) fn place_in_use(end: &LinkError) -> Option<&str> {
     }
 }
 
-/// Waits for a change; for ever if there can be none any more.
+/// Waits for a change. Waits for ever if the sender is gone.
 async fn changed<T>(watched: &mut watch::Receiver<T>) {
     if watched.changed().await.is_err() {
         std::future::pending().await
     }
 }
 
-/// What those who come are let in by.
-pub(crate) struct Door {
+/// Checks and registers incoming links.
+pub(crate) struct Admission {
     pub(crate) core: mpsc::Sender<CoreEvent>,
     pub(crate) credentials: CredentialStore,
     pub(crate) claims: Claims,
     pub(crate) audit: Audit,
-    pub(crate) lanes: LaneDoor,
+    pub(crate) lanes: LaneAdmission,
 }
 
 /// Accepts links until the node ends.
-pub(crate) async fn keep_accepting(mut listener: Listener, door: Door, mut stop: oneshot::Receiver<()>) {
-    let Door { core, credentials, claims, audit, lanes } = door;
+pub(crate) async fn keep_accepting(
+    mut listener: Listener,
+    admission: Admission,
+    mut stop: oneshot::Receiver<()>,
+) {
+    let Admission { core, credentials, claims, audit, lanes } = admission;
     let mut refusals = RefusalLog::default();
     loop {
         let accepted = tokio::select! {
@@ -279,8 +286,9 @@ pub(crate) async fn keep_accepting(mut listener: Listener, door: Door, mut stop:
                 tokio::spawn(async move {
                     let _arrival = claims.note_arrival(link.peer().node_id);
                     let remote = link.remote();
-                    let served = Served::start(link.clone(), None, lanes, &core).await;
-                    // What changed since the handshake; the control task knows of the link from here on.
+                    let served = ReportedLink::start(link.clone(), None, lanes, &core).await;
+                    // The credentials may have changed since the handshake. From here on the control task knows the
+                    // link and cuts it itself.
                     if !credentials.admits(link.peer()) {
                         link.close(CloseReason::not_admitted());
                     }
@@ -299,21 +307,21 @@ pub(crate) async fn keep_accepting(mut listener: Listener, door: Door, mut stop:
 }
 
 /// A link that was reported to the control task.
-struct Served {
+struct ReportedLink {
     link: AnyLink,
-    /// Nothing if the node is stopping.
+    /// Number of the link; `None` if the node is stopping.
     id: Option<LinkId>,
-    /// How many control frames came.
+    /// Number of control frames received.
     heard: watch::Receiver<u64>,
     lanes: Arc<Lanes>,
 }
 
-impl Served {
-    /// Reports it and starts to move what comes in.
+impl ReportedLink {
+    /// Reports the link to the control task and starts to receive.
     async fn start(
         link: AnyLink,
         dial: Option<Dial>,
-        door: LaneDoor,
+        admission: LaneAdmission,
         core: &mpsc::Sender<CoreEvent>,
     ) -> Self {
         let (frames, outgoing) = ControlQueue::new();
@@ -322,7 +330,7 @@ impl Served {
         let progress = Arc::<Progress>::default();
         let activity = Arc::<Activity>::default();
         let url = dial.as_ref().map(|(_, url)| url.to_string());
-        let lanes = Lanes::new(link.clone(), frames.clone(), dial, door);
+        let lanes = Lanes::new(link.clone(), frames.clone(), dial, admission);
         let labels = LabelBook::new(progress.clone());
         let (activity_tx, lanes_tx) = (activity.clone(), lanes.clone());
         let control = ControlTx { frames: frames.clone(), labels, activity: activity_tx, lanes: lanes_tx };
@@ -346,7 +354,7 @@ impl Served {
         Self { link, id, heard, lanes }
     }
 
-    /// Waits for its end and reports that. Dropping the future loses nothing: it is to be called again.
+    /// Waits for the end of the link and reports it. Dropping the future is safe: the caller calls it again.
     async fn end(&self, core: &mpsc::Sender<CoreEvent>) -> LinkError {
         let end = self.link.closed().await;
         self.lanes.close();
@@ -357,9 +365,11 @@ impl Served {
         end
     }
 
-    /// Waits until both sides have told each other what they know. No frame says so: routes follow the greetings and
-    /// what they call for follows the routes, each within a round trip, so a few of those in silence have to do.
-    /// Never ready on a link that has ended; one on which nothing is said is ended here.
+    /// Waits until both sides have sent each other their state. No frame marks that point. Routes follow the greetings,
+    /// and their consequences follow the routes, each within a round trip, so a few silent round trips are taken for
+    /// it.
+    ///
+    /// Never returns on a link that has ended. Ends a link on which no frame arrives.
     async fn settled(&self) {
         let mut heard = self.heard.clone();
         let deadline = Instant::now() + SETTLE_MAX;
@@ -376,7 +386,8 @@ impl Served {
         std::future::pending().await
     }
 
-    /// Takes it down. The goodbye makes the peer close it, and so tells that it has got everything before.
+    /// Retires the link. The peer closes it in answer to the goodbye, which shows that it has received everything
+    /// before.
     async fn retire(self, core: mpsc::Sender<CoreEvent>) {
         let goodbye = async {
             let _ = self.link.send_control(Control::Goodbye.to_bytes()).await;
@@ -385,7 +396,7 @@ impl Served {
         let _ = timeout(GOODBYE_MAX, goodbye).await;
         self.link.close(CloseReason::Replaced);
         self.end(&core).await;
-        info!(remote = %self.link.remote(), "a newer link took the place of this one");
+        info!(remote = %self.link.remote(), "a newer link replaced this one");
     }
 }
 
@@ -418,15 +429,16 @@ async fn send_control(
     }
 }
 
-/// Takes control frames in. Those about labels, lanes and pulses end here, the rest is the control task's.
+/// Receives control frames. It handles frames about labels, lanes and pulses itself and passes the others to the
+/// control task.
 struct ControlRx {
     link: AnyLink,
     id: LinkId,
-    /// For acknowledgements.
+    /// Queue for acknowledgements.
     frames: ControlQueue,
     progress: Arc<Progress>,
     lanes: Arc<Lanes>,
-    /// How many frames came.
+    /// Number of received frames.
     count: watch::Sender<u64>,
     core: mpsc::Sender<CoreEvent>,
     /// Share of the inbox for frames that wait for the control task.
@@ -449,7 +461,7 @@ impl ControlRx {
         }
     }
 
-    /// False if the peer is too far behind, and has no link any more.
+    /// Queues an answer. Returns `false` if the peer is too far behind; the link then ends.
     fn answer(&self, frame: Control) -> bool {
         let is_sent = self.frames.push(frame);
         if !is_sent {
@@ -459,10 +471,10 @@ impl ControlRx {
         is_sent
     }
 
-    /// False if no more is to be taken in; the error is the peer's.
+    /// Handles a frame. Returns `Ok(false)` to stop receiving, and an error for a mistake of the peer.
     async fn take(&self, bytes: usize, frame: Result<Control, DecodeError>) -> Result<bool, String> {
         let frame = frame.map_err(|error| error.to_string())?;
-        // What stands in the place of the greeting is the router's to judge.
+        // The router judges the first frame, which has to be the greeting.
         let is_greeted = *self.count.borrow() > 0;
         match frame {
             Control::Label { label, name } if is_greeted => {
@@ -472,7 +484,7 @@ impl ControlRx {
             Control::Probe { answers: false } if is_greeted => {
                 Ok(self.answer(Control::Probe { answers: true }))
             }
-            // That something came is the answer.
+            // The receipt itself is the answer.
             Control::Probe { answers: true } if is_greeted => Ok(true),
             Control::LabelAck { label } if is_greeted => match self.progress.acknowledge(label) {
                 true => Ok(true),
@@ -491,11 +503,11 @@ impl ControlRx {
     }
 }
 
-/// Brings what comes over a link into the data path, within what its peer may send.
+/// Passes received packets to the data path, within the peer's rate.
 #[derive(Clone)]
 pub(crate) struct Inflow {
     link: AnyLink,
-    /// The only name whose packets may come, if it is a lane.
+    /// The only accepted name, if the packets come over a lane.
     only: Option<Name>,
     id: LinkId,
     data: Arc<DataPlane>,
@@ -503,11 +515,11 @@ pub(crate) struct Inflow {
     activity: Arc<Activity>,
 }
 
-/// What becomes of a packet.
-enum Admission {
-    /// It goes on.
+/// Decision about a packet.
+enum PacketAdmission {
+    /// The packet is forwarded.
     Granted,
-    /// It is dropped, and so is what follows of its message.
+    /// The packet is dropped, and so is the rest of its message.
     OverRate,
     /// The link ended meanwhile.
     LinkEnded,
@@ -515,22 +527,22 @@ enum Admission {
 
 impl Inflow {
     fn new(link: &AnyLink, id: LinkId, data: Arc<DataPlane>, activity: Arc<Activity>) -> Self {
-        let rate = data.rates().of(link.peer().node_id);
+        let rate = data.rates().for_peer(link.peer().node_id);
         Self { link: link.clone(), only: None, id, data, rate, activity }
     }
 
-    /// The same for a lane of the link.
+    /// Returns an inflow for a lane of the link.
     pub(crate) fn by_lane(&self, lane: AnyLink, name: Name) -> Self {
         Self { link: lane, only: Some(name), ..self.clone() }
     }
 
-    /// Starts to take in.
+    /// Starts the receiving tasks.
     pub(crate) fn spawn(self) {
         tokio::spawn(self.clone().accept_flows());
         tokio::spawn(self.read_datagrams());
     }
 
-    /// True if a packet may come here; otherwise it is counted.
+    /// Returns `true` if a packet may come here, and counts it as a drop otherwise.
     fn belongs(&self, packet: &Packet) -> bool {
         let belongs = self.only.is_none_or(|only| only == packet.header.name);
         if !belongs {
@@ -539,21 +551,22 @@ impl Inflow {
         belongs
     }
 
-    /// A message that cannot wait is judged by its beginning; one that is under way is slowed like a reliable one.
-    async fn admit(&self, packet: &Packet) -> Admission {
+    /// Decides about a packet. A message that cannot wait is judged at its beginning; once it is under way it is slowed
+    /// like a reliable one.
+    async fn admit(&self, packet: &Packet) -> PacketAdmission {
         self.activity.note();
-        let Some(rate) = &self.rate else { return Admission::Granted };
+        let Some(rate) = &self.rate else { return PacketAdmission::Granted };
         let bytes = packet.encoded_bytes();
         if !packet.header.reliable && packet.header.index == 0 {
-            return if rate.take_now(bytes) { Admission::Granted } else { Admission::OverRate };
+            return if rate.take_now(bytes) { PacketAdmission::Granted } else { PacketAdmission::OverRate };
         }
         let wait = rate.take_later(bytes);
         if wait.is_zero() {
-            return Admission::Granted;
+            return PacketAdmission::Granted;
         }
         tokio::select! {
-            () = tokio::time::sleep(wait) => Admission::Granted,
-            _ = self.link.closed() => Admission::LinkEnded,
+            () = tokio::time::sleep(wait) => PacketAdmission::Granted,
+            _ = self.link.closed() => PacketAdmission::LinkEnded,
         }
     }
 
@@ -569,19 +582,20 @@ impl Inflow {
             match flow.recv().await {
                 Ok(Some(packet)) if !self.belongs(&packet) => return flow.stop(FlowEnd::Unwanted),
                 Ok(Some(packet)) => match self.admit(&packet).await {
-                    // One that comes by itself goes on by itself: nothing of what it wakes has anything else to do.
-                    Admission::Granted if flow.is_at_rest() && packet.header.fragments() == 1 => {
+                    // A single packet on an idle flow is forwarded right here, since the tasks that it wakes have no
+                    // other work.
+                    PacketAdmission::Granted if flow.is_at_rest() && packet.header.fragments() == 1 => {
                         prompt::poll_at_hand(data.forward(id, packet)).await;
                     }
-                    Admission::Granted => data.forward(id, packet).await,
-                    Admission::OverRate if packet.header.fragments() == 1 => {}
-                    Admission::OverRate => return flow.stop(FlowEnd::Stale),
-                    Admission::LinkEnded => return,
+                    PacketAdmission::Granted => data.forward(id, packet).await,
+                    PacketAdmission::OverRate if packet.header.fragments() == 1 => {}
+                    PacketAdmission::OverRate => return flow.stop(FlowEnd::Stale),
+                    PacketAdmission::LinkEnded => return,
                 },
                 Ok(None) => return,
                 Err(FlowError::Link(_) | FlowError::Ended(_)) => return,
                 Err(error) => {
-                    // Cut short is what a lost link looks like; anything else is the peer's doing.
+                    // A truncated flow is a sign of a lost link; any other error is the peer's mistake.
                     let reason = match &error {
                         FlowError::Truncated => None,
                         FlowError::Packet(error) => Some(malformed(error)),
@@ -601,7 +615,7 @@ impl Inflow {
         let (id, data) = (self.id, &self.data);
         while let Ok(received) = self.link.recv_datagram().await {
             match received {
-                // Whatever it says of itself, a datagram keeps those behind it waiting.
+                // A datagram is never delayed, whatever its header says, since it would delay those behind it.
                 Ok(packet) if !self.belongs(&packet) => {}
                 Ok(packet) => {
                     self.activity.note();
@@ -642,22 +656,22 @@ mod tests {
     use super::*;
     use crate::control_queue::{Inbox, LINK_INBOX_BYTES_MAX};
     use crate::core::now;
-    use crate::finding::{Board, Dns, WayBook, keep_at};
+    use crate::discovery::{Board, Dns, WorkingUrls, keep_at};
     use crate::roaming::Network;
 
-    /// What a control task was told, as far as links go.
+    /// Event that the test's control task reports about links.
     #[derive(Debug, PartialEq)]
-    enum Told {
+    enum LinkEvent {
         Up(LinkId, CertId),
         Down(LinkId),
     }
 
-    /// Greets on each link and closes those whose peers say goodbye, as the machines do.
+    /// Greets on each link and closes links whose peers say goodbye, as the machines do.
     fn control_task(
         closes: Arc<AtomicBool>,
         mute: Arc<AtomicBool>,
         mut close: mpsc::Receiver<LinkId>,
-    ) -> (mpsc::Sender<CoreEvent>, mpsc::Receiver<Told>) {
+    ) -> (mpsc::Sender<CoreEvent>, mpsc::Receiver<LinkEvent>) {
         let (events, mut inbox) = mpsc::channel(64);
         let (tell, told) = mpsc::channel(64);
         tokio::spawn(async move {
@@ -674,7 +688,7 @@ mod tests {
                 match event {
                     CoreEvent::LinkUp { link, control, reply, .. } => {
                         let id = LinkId(links.len() as u32 + 1);
-                        tell.send(Told::Up(id, link.peer().cert.clone())).await.unwrap();
+                        tell.send(LinkEvent::Up(id, link.peer().cert.clone())).await.unwrap();
                         if !mute.load(Relaxed) {
                             let hello = Hello {
                                 minor: 0,
@@ -689,7 +703,7 @@ mod tests {
                         let place = LinkPlace { id, data: Arc::default(), inbox: Inbox::default().share() };
                         assert!(reply.send(Some(place)).is_ok());
                     }
-                    CoreEvent::LinkDown { id, .. } => tell.send(Told::Down(id)).await.unwrap(),
+                    CoreEvent::LinkDown { id, .. } => tell.send(LinkEvent::Down(id)).await.unwrap(),
                     CoreEvent::Frame { link, frame: Control::Hello(_), .. }
                         if link.0 > 1 && closes.load(Relaxed) =>
                     {
@@ -709,7 +723,7 @@ mod tests {
         timeout(Duration::from_secs(30), future).await.expect("it hangs")
     }
 
-    /// A node that keeps a link to a router, both with control tasks of the test.
+    /// A node that keeps a link to a router. The test plays both control tasks.
     struct Bench {
         board: Board,
         change_network: watch::Sender<u64>,
@@ -717,12 +731,12 @@ mod tests {
         arm: CredentialStore,
         router: CredentialStore,
         redial: watch::Sender<()>,
-        near: mpsc::Receiver<Told>,
-        far: mpsc::Receiver<Told>,
+        near: mpsc::Receiver<LinkEvent>,
+        far: mpsc::Receiver<LinkEvent>,
         doors: Arc<TransportMetrics>,
-        /// Whether the router closes links but the first as soon as it is greeted on them.
+        /// Whether the router closes all links but the first right after the greeting.
         far_closes: Arc<AtomicBool>,
-        /// Whether nobody greets.
+        /// Whether neither side greets.
         mute: Arc<AtomicBool>,
         close_far: mpsc::Sender<LinkId>,
         far_core: mpsc::Sender<CoreEvent>,
@@ -734,14 +748,14 @@ mod tests {
         Arc::new(fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap())
     }
 
-    fn door(core: &mpsc::Sender<CoreEvent>, credentials: &CredentialStore) -> Door {
+    fn admission(core: &mpsc::Sender<CoreEvent>, credentials: &CredentialStore) -> Admission {
         let (core, credentials) = (core.clone(), credentials.clone());
-        Door {
+        Admission {
             core,
             credentials,
             claims: Claims::default(),
             audit: Audit::default(),
-            lanes: LaneDoor::default(),
+            lanes: LaneAdmission::default(),
         }
     }
 
@@ -750,8 +764,8 @@ mod tests {
             Self::by(Vec::new())
         }
 
-        /// With better ways to the router than the one that works.
-        fn by(mut ways: Vec<LinkUrl>) -> Self {
+        /// Creates a bench with better URLs than the one that works.
+        fn by(mut urls: Vec<LinkUrl>) -> Self {
             let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
             let arm = CredentialStore::new(enroll(&fleet, "arm"));
             let router = CredentialStore::new(enroll(&fleet, "router"));
@@ -765,14 +779,14 @@ mod tests {
             let (far_core, far) = control_task(far_closes.clone(), mute.clone(), closing);
             let (near_core, near) = control_task(Arc::default(), mute.clone(), mpsc::channel(1).1);
             let (stop, stopped) = oneshot::channel();
-            tokio::spawn(keep_accepting(listener, door(&far_core, &router), stopped));
+            tokio::spawn(keep_accepting(listener, admission(&far_core, &router), stopped));
             let (redial, on_redial) = watch::channel(());
             let dialer = Arc::new(Dialer::new(arm.clone(), options, Arc::default()));
             let me = arm.identity().node_id();
             let (dns, claims) = (Dns::default(), Claims::default());
-            let book = WayBook::default();
-            let (change_network, network) = Network::told();
-            let holder = Holder {
+            let book = WorkingUrls::default();
+            let (change_network, network) = Network::channel();
+            let keeper = LinkKeeper {
                 me,
                 lane_dialer: dialer.clone(),
                 dialer,
@@ -781,13 +795,13 @@ mod tests {
                 redial: on_redial,
                 claims,
                 network,
-                ways: book,
+                urls: book,
             };
             let board = Board::default();
-            let line = board.line(&url, "static");
+            let row = board.row(&url, "static");
             let rng = ChaCha20Rng::from_rng(&mut OsRng.unwrap_err());
-            ways.push(url);
-            tokio::spawn(keep_at(Aim::by(ways).unwrap(), holder, line, rng));
+            urls.push(url);
+            tokio::spawn(keep_at(DialTarget::by(urls).unwrap(), keeper, row, rng));
             Self {
                 board,
                 change_network,
@@ -810,18 +824,19 @@ mod tests {
             store.identity().as_peer().cert.clone()
         }
 
-        async fn expect(&mut self, near: Told, far: Told) {
+        async fn expect(&mut self, near: LinkEvent, far: LinkEvent) {
             assert_eq!(soon(self.near.recv()).await.unwrap(), near);
             assert_eq!(soon(self.far.recv()).await.unwrap(), far);
         }
 
         async fn expect_up(&mut self, id: u32) {
             let (near, far) = (Self::cert(&self.router), Self::cert(&self.arm));
-            self.expect(Told::Up(LinkId(id), near), Told::Up(LinkId(id), far)).await;
+            self.expect(LinkEvent::Up(LinkId(id), near), LinkEvent::Up(LinkId(id), far)).await;
         }
     }
 
-    /// Greets as another node and gives so many labels, which are acknowledged, and asks for a pulse; then sends this frame. How the link ends.
+    /// Greets as another node, gives `labels` labels, which are acknowledged, and asks for a pulse. Then sends `frame`
+    /// and returns how the link ends.
     async fn end_after(labels: u32, frame: Control) -> CloseReason {
         let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
         let addr = "quic://127.0.0.1:0".parse().unwrap();
@@ -831,14 +846,14 @@ mod tests {
         let url = listener.local().to_string().parse().unwrap();
         let (core, _told) = control_task(Arc::default(), Arc::default(), mpsc::channel(1).1);
         let (_stop, stopped) = oneshot::channel();
-        let door = Door {
+        let admission = Admission {
             core,
             credentials: router,
             claims: Claims::default(),
             audit: Audit::default(),
-            lanes: LaneDoor::default(),
+            lanes: LaneAdmission::default(),
         };
-        tokio::spawn(keep_accepting(listener, door, stopped));
+        tokio::spawn(keep_accepting(listener, admission, stopped));
         let dialer = Dialer::new(CredentialStore::new(arm), LinkOptions::default(), Arc::default());
         let link = soon(dialer.dial(&url)).await.unwrap();
         let hello = Hello { minor: 0, incarnation: 9, transit: false, yields: false, started: UnixMillis(1) };
@@ -850,7 +865,7 @@ mod tests {
             link.send_control(Control::Label { label, name: Name([1; 32]) }.to_bytes()).await.unwrap();
             assert_eq!(heard().await, Control::LabelAck { label });
         }
-        // What is an answer has none.
+        // An answer to a pulse has no answer itself.
         for answers in [true, false] {
             link.send_control(Control::Probe { answers }.to_bytes()).await.unwrap();
         }
@@ -872,9 +887,9 @@ mod tests {
         let url = listener.local().to_string().parse().unwrap();
         let (core, mut events) = mpsc::channel(4096);
         let (_stop, stopped) = oneshot::channel();
-        tokio::spawn(keep_accepting(listener, door(&core, &router), stopped));
+        tokio::spawn(keep_accepting(listener, admission(&core, &router), stopped));
         let inbox = Inbox::default();
-        // The frames of a link that wait for a control task that takes none.
+        // Frames of a link that wait, since the control task takes none.
         let mut held = Vec::new();
         let mut links = Vec::new();
         for (id, name, count) in [(1, "flooder", 40), (2, "other", 1)] {
@@ -924,14 +939,14 @@ mod tests {
         let url = listener.local().to_string().parse().unwrap();
         let (core, mut events) = mpsc::channel(64);
         let (_stop, stopped) = oneshot::channel();
-        tokio::spawn(keep_accepting(listener, door(&core, &router), stopped));
+        tokio::spawn(keep_accepting(listener, admission(&core, &router), stopped));
         let dialer =
             Dialer::new(CredentialStore::new(enroll(&fleet, "arm")), LinkOptions::default(), Arc::default());
         let link = soon(dialer.dial(&url)).await.unwrap();
         let CoreEvent::LinkUp { reply, control, .. } = soon(events.recv()).await.unwrap() else { panic!() };
         let place = LinkPlace { id: LinkId(7), data: Arc::default(), inbox: Inbox::default().share() };
         assert!(reply.send(Some(place)).is_ok());
-        // More than what may be under way unread.
+        // This exceeds the packets that may be under way unread.
         let many = 2000;
         for _ in 0..many {
             assert!(control.send(Control::Interest { names: vec![Name([1; 32]); 1000] }));
@@ -967,15 +982,15 @@ mod tests {
         for id in 1..4 {
             bench.arm.set_identity(enroll(&bench.fleet, "arm"));
             bench.redial.send_replace(());
-            // Up before down, on both sides.
+            // On both sides the new link comes up before the old one goes down.
             bench.expect_up(id + 1).await;
-            bench.expect(Told::Down(LinkId(id)), Told::Down(LinkId(id))).await;
+            bench.expect(LinkEvent::Down(LinkId(id)), LinkEvent::Down(LinkId(id))).await;
         }
     }
 
     #[tokio::test]
     async fn a_way_that_is_silent_is_passed_over_until_it_works_again() {
-        // Nobody answers there.
+        // This socket never answers.
         let mute = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
         let url: LinkUrl = format!("quic://{}", mute.local_addr().unwrap()).parse().unwrap();
         let mut bench = Bench::by(vec![url]);
@@ -989,17 +1004,17 @@ mod tests {
         let row = &bench.board.snapshot()[0];
         let why = "quic: no answer within 0.7 s; is UDP blocked?";
         assert_eq!((row.why_not_first.as_deref(), row.state), (Some(why), "linked"));
-        // The better way works again, and another network is a reason to try it.
+        // The better URL works again, and the network change makes the node try it.
         let addr = format!("quic://{}", mute.local_addr().unwrap()).parse().unwrap();
         drop(mute);
         let listener = Listener::bind(&addr, bench.router.clone(), LinkOptions::default(), Arc::default());
         let (stop, stopped) = oneshot::channel();
         bench.stops.push(stop);
-        let door = door(&bench.far_core, &bench.router);
-        tokio::spawn(keep_accepting(listener.unwrap(), door, stopped));
+        let admission = admission(&bench.far_core, &bench.router);
+        tokio::spawn(keep_accepting(listener.unwrap(), admission, stopped));
         bench.change_network.send_modify(|change| *change += 1);
         bench.expect_up(2).await;
-        bench.expect(Told::Down(LinkId(1)), Told::Down(LinkId(1))).await;
+        bench.expect(LinkEvent::Down(LinkId(1)), LinkEvent::Down(LinkId(1))).await;
         let row = &bench.board.snapshot()[0];
         assert_eq!(
             (row.why_not_first.as_deref(), row.at.as_deref()),
@@ -1014,17 +1029,17 @@ mod tests {
         bench.far_closes.store(true, Relaxed);
         bench.redial.send_replace(());
         bench.expect_up(2).await;
-        bench.expect(Told::Down(LinkId(2)), Told::Down(LinkId(2))).await;
+        bench.expect(LinkEvent::Down(LinkId(2)), LinkEvent::Down(LinkId(2))).await;
         bench.far_closes.store(false, Relaxed);
-        // Each attempt that fails is followed by another.
+        // Each failed attempt is followed by another.
         loop {
             let up = soon(bench.near.recv()).await.unwrap();
-            let Told::Up(id, _) = up else { panic!("{up:?}") };
-            assert!(matches!(soon(bench.far.recv()).await.unwrap(), Told::Up(..)));
+            let LinkEvent::Up(id, _) = up else { panic!("{up:?}") };
+            assert!(matches!(soon(bench.far.recv()).await.unwrap(), LinkEvent::Up(..)));
             let down = soon(bench.near.recv()).await.unwrap();
             soon(bench.far.recv()).await.unwrap();
-            if down != Told::Down(id) {
-                assert_eq!(down, Told::Down(LinkId(1)));
+            if down != LinkEvent::Down(id) {
+                assert_eq!(down, LinkEvent::Down(LinkId(1)));
                 return;
             }
         }
@@ -1037,11 +1052,11 @@ mod tests {
         bench.mute.store(true, Relaxed);
         bench.redial.send_replace(());
         bench.expect_up(2).await;
-        // The second has not settled, since nobody greets on it.
+        // The second link has not settled, since no greeting arrives on it.
         bench.close_far.send(LinkId(1)).await.unwrap();
-        bench.expect(Told::Down(LinkId(1)), Told::Down(LinkId(1))).await;
+        bench.expect(LinkEvent::Down(LinkId(1)), LinkEvent::Down(LinkId(1))).await;
         bench.close_far.send(LinkId(2)).await.unwrap();
-        bench.expect(Told::Down(LinkId(2)), Told::Down(LinkId(2))).await;
+        bench.expect(LinkEvent::Down(LinkId(2)), LinkEvent::Down(LinkId(2))).await;
         bench.expect_up(3).await;
     }
 
@@ -1063,9 +1078,9 @@ mod tests {
         };
         soon(is_refused).await;
         assert!(bench.near.is_empty() && bench.far.is_empty());
-        // It is tried again by itself.
+        // The node tries again by itself.
         bench.router.set_anchors(anchors.as_ref().clone());
         bench.expect_up(2).await;
-        bench.expect(Told::Down(LinkId(1)), Told::Down(LinkId(1))).await;
+        bench.expect(LinkEvent::Down(LinkId(1)), LinkEvent::Down(LinkId(1))).await;
     }
 }

@@ -1,8 +1,7 @@
-//! Members of the fleet that rules name: names that the fleet's file does not have, and names that nobody shows who asks this
-//! node for something.
+//! Members in rules: finds names that the fleet file lacks, and names of which no member was heard.
 //!
-//! Certificates prove a node and its groups by keyed hashes. So a node can tell whether a name is that of a member it has heard
-//! of, also one that was nearly written, but it cannot list names.
+//! Certificates prove a node and its groups by keyed hashes. So a node can check whether a name, or a similar one, is
+//! that of a member it has heard, but it cannot list names.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -12,14 +11,14 @@ use sgc_wire::{GroupTag, NodeId};
 
 use crate::config::{Config, Recipient, nearest};
 
-/// Members that are remembered as heard of.
+/// Most members that are remembered.
 const HEARD_MAX: usize = 4096;
-/// Spellings that are tried for one member: some milliseconds.
+/// Most spellings that are tried for one member, which takes some milliseconds.
 const SPELLINGS_MAX: usize = 4096;
 /// Letters of names (`sgc_trust` label rule).
 const LETTERS: &str = "abcdefghijklmnopqrstuvwxyz0123456789-_.";
 
-/// Names of members in `to` and `publish`.
+/// Names of members in the rules `to` and `publish`.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct MemberNames {
     nodes: BTreeMap<NodeId, String>,
@@ -27,8 +26,8 @@ pub(crate) struct MemberNames {
 }
 
 impl MemberNames {
-    /// The names in a configuration.
-    pub(crate) fn of(config: &Config, identity: &Identity) -> Self {
+    /// Collects the names of a configuration.
+    pub(crate) fn from_config(config: &Config, identity: &Identity) -> Self {
         let mut names = Self::default();
         for recipient in config.shares.iter().flat_map(|share| share.to.iter().chain(&share.publish)) {
             match recipient {
@@ -50,19 +49,19 @@ impl MemberNames {
 /// A name in a rule of which no member was heard.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct UnheardName {
-    /// The name as it is written.
+    /// Name in the rule.
     pub(crate) written: String,
-    /// The name of a member that was heard of, one letter away.
+    /// Name of a heard member that differs by one letter.
     pub(crate) meant: Option<String>,
 }
 
-/// The members that were heard of since the node started, and the names that rules have for members.
+/// Members that were heard since the start, and the names in rules.
 #[derive(Debug, Default)]
 pub(crate) struct Members {
     names: MemberNames,
     nodes: BTreeSet<NodeId>,
     groups: BTreeSet<GroupTag>,
-    /// Names that were written for these.
+    /// Misspelt names with the probable spelling.
     meant: BTreeMap<String, String>,
 }
 
@@ -71,14 +70,14 @@ impl Members {
         Self { names, nodes: [own.node_id()].into(), ..Self::default() }
     }
 
-    /// Takes the names of another configuration.
+    /// Replaces the names by those of another configuration.
     pub(crate) fn set_names(&mut self, names: MemberNames, own: &Identity) {
         self.names = names;
         self.meant.clear();
         self.compare(own);
     }
 
-    /// Hears of a member, and returns the names that were meant for it and misspelt, each with how it is spelt.
+    /// Notes a heard member. Returns newly found misspellings of its names, each with the right spelling.
     pub(crate) fn heard(&mut self, peer: &VerifiedPeer, own: &Identity) -> Vec<(String, String)> {
         if peer.ca != own.as_peer().ca || self.nodes.len() >= HEARD_MAX || !self.nodes.insert(peer.node_id) {
             return Vec::new();
@@ -91,12 +90,12 @@ impl Members {
         news.map(|(written, meant)| (written.clone(), meant.clone())).collect()
     }
 
-    /// Names that are misspelt, each with how it is spelt.
+    /// Iterates over the misspelt names with the right spelling.
     pub(crate) fn misspelt(&self) -> impl Iterator<Item = (&str, &str)> {
         self.meant.iter().map(|(written, meant)| (written.as_str(), meant.as_str()))
     }
 
-    /// Names among those who may join of which no member was heard.
+    /// Returns the names in a policy of which no member was heard.
     pub(crate) fn unheard(&self, grantees: &Grantees) -> Vec<UnheardName> {
         let nodes = grantees.nodes.iter().filter(|id| !self.nodes.contains(*id));
         let nodes = nodes.filter_map(|id| self.names.nodes.get(id).cloned());
@@ -106,7 +105,7 @@ impl Members {
         nodes.chain(groups).map(name).collect()
     }
 
-    /// Looks for spellings of names that members have who were heard of and that no rule names.
+    /// Compares spellings of the names in rules with heard members that no rule names.
     fn compare(&mut self, own: &Identity) {
         let mut left = SPELLINGS_MAX;
         let mut spelt = |name: &str, is_heard: &dyn Fn(&str) -> bool| {
@@ -141,7 +140,7 @@ fn group_word(group: &str) -> String {
     format!("group:{group}")
 }
 
-/// Names that are one letter away: swapped with its neighbour, left out, another, or one more.
+/// Iterates over names that differ by one letter: swapped, missing, replaced or added.
 fn spellings(name: &str) -> impl Iterator<Item = String> {
     let letters: Vec<char> = name.chars().collect();
     let with = move |change: &dyn Fn(&mut Vec<char>)| {
@@ -163,14 +162,14 @@ fn spellings(name: &str) -> impl Iterator<Item = String> {
     all.into_iter()
 }
 
-/// A name in a rule that the fleet's file does not have.
+/// A name in a rule that the fleet file lacks.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct UnknownMember {
-    /// The rule: the key, and the interface.
+    /// Key and interface of the rule.
     pub place: String,
-    /// The name, behind `group:` if it is one of a group.
+    /// The name, after `group:` if it is a group's.
     pub name: String,
-    /// A name of the fleet that is nearly this.
+    /// A similar name of the fleet.
     pub nearest: Option<String>,
 }
 
@@ -190,7 +189,7 @@ impl fmt::Display for UnknownMember {
     }
 }
 
-/// Names in a configuration that the fleet's file does not have. A file from before rosters has none, and says nothing.
+/// Returns the names in a configuration that the fleet file lacks. A file without a roster yields none.
 pub fn unknown_members(config: &Config, fleet: &Fleet) -> Vec<UnknownMember> {
     if !fleet.has_roster() {
         return Vec::new();
@@ -282,7 +281,7 @@ mod tests {
         let mut fleet = fleet();
         let [arm, desk] = members(&mut fleet, [("arm", &[]), ("desk", &["ops"])]);
         let config = config(RULES);
-        let mut members = Members::new(MemberNames::of(&config, &arm), &arm);
+        let mut members = Members::new(MemberNames::from_config(&config, &arm), &arm);
         let grantees = crate::policy::grantees(&config.shares[0].to, &arm, &Default::default());
         let unheard = |members: &Members| -> BTreeMap<String, Option<String>> {
             members.unheard(&grantees).into_iter().map(|name| (name.written, name.meant)).collect()
@@ -294,14 +293,14 @@ mod tests {
         assert_eq!(unheard(&members)["deks"].as_deref(), Some("desk"));
         assert_eq!(unheard(&members)["lamp"], None);
         assert!(members.heard(desk.as_peer(), &arm).is_empty(), "said once");
-        // Another fleet's node of that name is another node.
+        // A node of another fleet with this name is another node.
         let mut other = super::tests::fleet();
         let [_, stranger] = super::tests::members(&mut other, [("x", &[]), ("lamp", &["vision"])]);
         assert!(members.heard(stranger.as_peer(), &arm).is_empty() && unheard(&members).contains_key("lamp"));
-        // Corrected, it is heard of already.
+        // The corrected name belongs to a member that was heard before.
         let mut right = config.clone();
         right.shares[0].to = vec![Recipient::Node("desk".parse().unwrap())];
-        members.set_names(MemberNames::of(&right, &arm), &arm);
+        members.set_names(MemberNames::from_config(&right, &arm), &arm);
         assert!(members.misspelt().next().is_none());
         assert!(
             members

@@ -1,16 +1,16 @@
-//! The keys that this node signs messages with: one for each suite, made where it may take its time.
+//! Signing keys of this node's messages: one for each suite, created on a blocking thread.
 //!
-//! RSA keys take up to seconds. They never outlive the process.
+//! RSA keys take up to seconds. Keys never outlive the process.
 
 use std::collections::BTreeMap;
 
 use sgc_ros::ShareRule;
 use sgc_trust::{MessageKey, Suite};
 
-/// By suite.
+/// Signing keys by suite.
 pub(crate) type MessageKeys = BTreeMap<Suite, MessageKey>;
 
-/// Makes keys for the suites of these shares that are not among those `known`; blocks for as long as it takes.
+/// Creates keys for suites of these shares that are not `known`. Blocks until they exist.
 pub(crate) fn make_for(shares: &[ShareRule], known: impl Fn(Suite) -> bool) -> MessageKeys {
     let mut keys = MessageKeys::new();
     for suite in shares.iter().map(|share| share.suite).filter(|suite| !known(*suite)) {

@@ -1,10 +1,10 @@
-//! [`NetworkSlot`]: the local network of a node, which may join it long after its start, and open it again.
+//! [`NetworkSlot`]: the local network of a node, which may be joined after the start and reopened.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use sgc_ros::RosError;
 
-/// Opens a network as the present one was opened; may block.
+/// Opens a network with the settings of the present one. May block.
 pub(crate) type OpenAgain<N> = Arc<dyn Fn() -> Result<Arc<N>, RosError> + Send + Sync>;
 
 /// The local network, once the node has joined one.
@@ -22,7 +22,7 @@ impl<N> Clone for NetworkSlot<N> {
 }
 
 impl<N> NetworkSlot<N> {
-    /// A slot with a network, and how to open it again, as far as there is either.
+    /// Creates a slot with a network and a function that reopens it, if they exist.
     pub(crate) fn new(network: Option<Arc<N>>, again: Option<OpenAgain<N>>) -> Self {
         Self(Arc::new(Mutex::new(Place { network, again })))
     }
@@ -35,7 +35,7 @@ impl<N> NetworkSlot<N> {
         self.lock().network = Some(network);
     }
 
-    /// Returns how the network is opened again.
+    /// Returns the function that reopens the network.
     pub(crate) fn again(&self) -> Option<OpenAgain<N>> {
         self.lock().again.clone()
     }
@@ -44,7 +44,7 @@ impl<N> NetworkSlot<N> {
         self.lock().again = Some(again);
     }
 
-    /// Returns the network, so that it ends with its last holder.
+    /// Removes and returns the network, so that it closes with its last owner.
     pub(crate) fn take(&self) -> Option<Arc<N>> {
         self.lock().network.take()
     }

@@ -1,5 +1,5 @@
-//! A node from configuration to clean shutdown: wires machines, sockets and the local network, and takes them
-//! apart again.
+//! A node from configuration to clean shutdown: connects machines, sockets and the local network, and disconnects them
+//! again.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -32,16 +32,16 @@ use crate::audit::{self, Audit, AuditEvent, AuditRecord, AuditWriter};
 use crate::authority::Authority;
 use crate::config::{Config, DiscoveryRange, RosConfig, RouterUrl};
 use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
-use crate::credentials::{Keeper, with_kept_crls};
+use crate::credentials::{StateWriter, with_kept_crls};
+use crate::discovery::{self, Board, Claims, Dns, LinkKeeper, LocalNetwork, RouterFilter, WorkingUrls};
 use crate::discovery_server;
 use crate::file_watch::FileWatch;
-use crate::finding::{self, Board, Claims, Dns, Holder, LocalNetwork, Wanted, WayBook};
 use crate::gateway::{
     Gateway, GatewayStartError, NodeDefinitions, OpenLocalRos, ShownKey, Sockets, key_of_files, listen_at,
 };
-use crate::heart::Patience;
-use crate::lanes::LaneDoor;
-use crate::links::{Door, keep_accepting};
+use crate::keep_alive::KeepAlivePolicy;
+use crate::lanes::LaneAdmission;
+use crate::links::{Admission, keep_accepting};
 use crate::message_keys;
 use crate::network_slot::{NetworkSlot, OpenAgain};
 use crate::peer_rate::PeerRates;
@@ -54,18 +54,18 @@ use crate::run_lock::{IdentityInUse, RunLock};
 use crate::state::{self, StateError};
 use crate::strangers;
 
-/// How much later than a pulse the transport keeps a link alive by itself.
+/// Delay of the transport's own keep-alive behind ours.
 const KEEP_ALIVE_SLACK: Duration = Duration::from_secs(5);
-/// How long the transport keeps a link over which nothing comes, at least: two and a half of the longest times between pulses.
+/// Lower bound of the transport's idle timeout: two and a half of the longest probe intervals.
 const IDLE_TIMEOUT_MIN: Duration = Duration::from_secs(40);
-/// How long queues may take to empty at shutdown.
+/// Time for queues to drain at shutdown.
 const DRAIN_MAX: Duration = Duration::from_secs(2);
-/// From how long before its certificate's end a node warns of it.
+/// Time before its certificate's end at which a node starts to warn.
 const EXPIRY_WARNING: Duration = Duration::from_secs(14 * 86_400);
-/// How long peers may take to answer a goodbye.
+/// Time for peers to answer a goodbye.
 const GOODBYE_MAX: Duration = Duration::from_secs(1);
 
-/// Why a node does not start.
+/// Reasons why a node does not start.
 #[derive(Debug, thiserror::Error)]
 pub enum NodeError {
     /// The identity file could not be read.
@@ -73,7 +73,7 @@ pub enum NodeError {
     IdentityFile {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the operating system.
         source: io::Error,
     },
     /// The identity file may be read by others.
@@ -89,10 +89,10 @@ pub enum NodeError {
     Identity {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         source: IdentityError,
     },
-    /// The configuration names another node than the identity.
+    /// The name in the configuration is not that of the identity.
     #[error(
         "`name` is {configured:?}, but the identity is of {certified:?}: use that node's identity file or change `name`"
     )]
@@ -102,7 +102,7 @@ pub enum NodeError {
         /// Name in the identity.
         certified: String,
     },
-    /// Another process of this machine runs with the identity.
+    /// Another process of this machine uses the identity.
     #[error(
         "identity {}: {source}. One identity is for one process: stop that one, or enroll this node under a name of its own",
         path.display()
@@ -110,15 +110,15 @@ pub enum NodeError {
     IdentityInUse {
         /// The identity file.
         path: PathBuf,
-        /// Which process, and by which lock it is known.
+        /// The other process and its lock.
         source: IdentityInUse,
     },
-    /// The identity's certificate does not hold.
+    /// The identity's certificate is invalid.
     #[error("identity {}: {source}", path.display())]
     Certificate {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         source: sgc_trust::CertError,
     },
     /// A router's identity cannot share or use.
@@ -126,7 +126,7 @@ pub enum NodeError {
         "this identity is a router's and holds no fleet secret: it can neither share nor use. Enroll the node without --router"
     )]
     RouterIdentity,
-    /// A router's identity cannot tell nodes by their names.
+    /// `mdns://NODE` with a router's identity, which cannot recognise names.
     #[error(
         "`routers` names \"mdns://{node}\", but this identity is a router's and cannot tell nodes by their names: write \"mdns://\""
     )]
@@ -134,19 +134,19 @@ pub enum NodeError {
         /// The router that is wanted.
         node: String,
     },
-    /// A node that uses a topic of its own.
+    /// A use of the node's own topic.
     #[error("[[use]] from {node:?}: that is this node itself")]
     UseOfOwn {
         /// The node.
         node: String,
     },
-    /// The state directory will not do.
+    /// The state directory cannot be used.
     #[error(transparent)]
     State(#[from] StateError),
-    /// Partners or tokens will not do.
+    /// Partners or tokens cannot be used.
     #[error(transparent)]
     Rules(#[from] RulesError),
-    /// The CAs of the identity, of partners and of tokens are not CAs, or too many.
+    /// The CAs of the identity, of partners and of tokens are invalid, or too many.
     #[error("trusted CAs: {0}")]
     Anchors(#[from] AnchorError),
     /// The audit log cannot be written.
@@ -154,7 +154,7 @@ pub enum NodeError {
     Audit {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the operating system.
         source: io::Error,
     },
     /// An address could not be bound.
@@ -162,22 +162,22 @@ pub enum NodeError {
     Listen {
         /// The address.
         addr: ListenAddr,
-        /// What the system said.
+        /// The error of the operating system.
         source: io::Error,
     },
     /// The local network could not be joined.
     #[error(transparent)]
     Ros(#[from] RosError),
-    /// It cannot be said who may connect to the gateway.
+    /// The access records of the gateway cannot be used.
     #[error(transparent)]
     Access(#[from] AccessError),
     /// The gateway does not start.
     #[error(transparent)]
     Gateway(Box<GatewayStartError>),
-    /// The local network's threads did not start, or no keys could be made.
+    /// A thread of the local network did not start, or no key could be made.
     #[error("starting ended in a panic; this is a bug")]
     Panicked,
-    /// The system gives no randomness.
+    /// The system provides no random numbers.
     #[error("the system gives no randomness: {0}")]
     Randomness(String),
 }
@@ -188,26 +188,26 @@ impl From<GatewayStartError> for NodeError {
     }
 }
 
-/// What else a caller may want of a running node.
+/// Options of a running node.
 #[derive(Default)]
 pub struct RunOptions {
-    /// Told the addresses that are listened on, once the node is up.
+    /// Receives the listen addresses once the node is up.
     pub ready: Option<oneshot::Sender<Vec<ListenAddr>>>,
-    /// Reads the configuration again, for `sgc reload`.
+    /// Reads the configuration again for `sgc reload`.
     pub source: Option<ConfigSource>,
-    /// Each message has the configuration read again, as SIGHUP does.
+    /// Triggers of a reload, as SIGHUP is.
     pub reload: Option<mpsc::Receiver<()>>,
-    /// The file that `source` reads, to be read again when it changes, if its configuration does not say otherwise.
+    /// The file that `source` reads. It is watched, unless its configuration says otherwise.
     pub file: Option<PathBuf>,
-    /// Where the types of what is shared and used are kept, for others in this process that read messages of them.
+    /// Store of types, for other readers of messages in this process.
     pub types: Option<Arc<TypeStore>>,
-    /// The port of mDNS, if not its own: so that tests have a local network each.
+    /// Port of mDNS, if not the standard one, so that each test has its own local network.
     pub mdns_port: Option<u16>,
-    /// Opens the gateway's part of the local network; [`run`] sets it by itself.
+    /// Opens the gateway's part of the local network. [`run`] sets it by itself.
     pub gateway: Option<OpenLocalRos>,
 }
 
-/// Reads an identity file, which must be its owner's alone.
+/// Reads an identity file, which only its owner may read.
 pub fn load_identity(path: &Path) -> Result<Identity, NodeError> {
     let file = |source| NodeError::IdentityFile { path: path.to_owned(), source };
     if let Some(mode) = state::exposed(&fs::metadata(path).map_err(file)?) {
@@ -217,8 +217,8 @@ pub fn load_identity(path: &Path) -> Result<Identity, NodeError> {
     Identity::parse(&text).map_err(|source| NodeError::Identity { path: path.to_owned(), source })
 }
 
-/// Checks what [`run`] would need of the identity and binds nothing. A certificate that has not begun by the clock here is
-/// let pass, see [`clock_alert`](crate::alerts::clock_alert).
+/// Checks the identity as [`run`] does, and binds nothing. A certificate that is not valid yet passes, see
+/// [`clock_alert`](crate::alerts::clock_alert).
 pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
     let identity = load_identity(&config.identity)?;
     let certified = identity.node_name().as_str();
@@ -229,7 +229,7 @@ pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
         });
     }
     match identity.anchors().verify(identity.chain(), now().unix) {
-        // The clock is behind: it may be set later, as by NTP after the start of a machine without a battery.
+        // The clock may be behind and be set later, as NTP does after the start of a machine without a battery.
         Ok(_) | Err(CertError::NotYetValid { .. }) => {}
         Err(source) => return Err(NodeError::Certificate { path: config.identity.clone(), source }),
     }
@@ -244,8 +244,8 @@ pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
     Ok(identity)
 }
 
-/// Which routers of the local network are wanted, if any are.
-fn wanted_nearby(routers: &[RouterUrl], identity: &Identity) -> Result<Option<Wanted>, NodeError> {
+/// Returns the routers wanted on the local network, if any are.
+fn wanted_nearby(routers: &[RouterUrl], identity: &Identity) -> Result<Option<RouterFilter>, NodeError> {
     let mut any = false;
     let (mut written, mut nodes) = (Vec::new(), BTreeSet::new());
     for url in routers {
@@ -260,15 +260,15 @@ fn wanted_nearby(routers: &[RouterUrl], identity: &Identity) -> Result<Option<Wa
         }
     }
     let nodes = (!any).then(|| Arc::new(nodes));
-    Ok((!written.is_empty()).then(|| Wanted { written: written.join(", "), nodes }))
+    Ok((!written.is_empty()).then(|| RouterFilter { written: written.join(", "), nodes }))
 }
 
-/// Where a node's status socket is: as configured, or in the user's runtime directory.
+/// Returns the path of the status socket: as configured, or in the user's runtime directory.
 pub fn admin_socket_path(config: &Config, node: &str) -> PathBuf {
     config.admin_socket.clone().unwrap_or_else(|| admin::default_socket_path(node))
 }
 
-/// Runs a node until `shutdown` is ready; then withdraws its names, lets its queues empty, and returns.
+/// Runs a node until `shutdown` is ready. Then it withdraws its names, drains its queues and returns.
 pub async fn run(
     config: Config,
     options: RunOptions,
@@ -290,7 +290,7 @@ pub async fn run(
     let is_watched = AtomicBool::new(false);
     let open: OpenNetwork<CycloneNetwork> = Arc::new(move |ros| {
         let config = dds_config(ros, &opener);
-        // An ordinary participant, whose topics the node's own sees as any program's.
+        // The gateway is an ordinary participant. The node's own participant sees its topics like any program's.
         let of_gateway = DdsConfig { tag: None, ..config.clone() };
         let gateway: OpenLocalRos = Arc::new(move || {
             CycloneNetwork::open(&of_gateway).map(|network| Arc::new(network) as Arc<dyn LocalRos>)
@@ -305,12 +305,12 @@ pub async fn run(
     run_opening(config, identity, open, options, shutdown).await
 }
 
-/// Opens the local network that a configuration describes, and the gateway's part of it; may block.
+/// Opens the local network of a configuration, and the gateway's part of it. May block.
 pub type OpenNetwork<N> =
     Arc<dyn Fn(&RosConfig) -> Result<(Arc<N>, Option<OpenLocalRos>), RosError> + Send + Sync>;
 
-/// [`run`] with an identity that is there already. `open` is called at start if the configuration wants a local network, else
-/// at the first reload that does.
+/// Runs a node with a given identity. `open` is called at start if the configuration wants a local network, else at the
+/// first reload that does.
 pub async fn run_opening<N: RosNetwork>(
     config: Config,
     identity: Arc<Identity>,
@@ -323,7 +323,7 @@ pub async fn run_opening<N: RosNetwork>(
     run_with(config, identity, network, Some(open), options, shutdown).await
 }
 
-/// [`run`] with an identity and a local network that are there already.
+/// Runs a node with a given identity and local network.
 pub async fn run_on<N: RosNetwork>(
     config: Config,
     identity: Arc<Identity>,
@@ -359,12 +359,12 @@ async fn run_with<N: RosNetwork>(
     let credentials = CredentialStore::new(identity.clone());
     credentials.set_anchors(anchors.clone());
     credentials.set_admitted(rules.partners.admitted.clone());
-    let patience = config.keep_alive.map_or_else(Patience::default, Patience::fixed);
+    let keep_alive_policy = config.keep_alive.map_or_else(KeepAlivePolicy::default, KeepAlivePolicy::fixed);
     let link_options = LinkOptions {
         post_quantum: identity.post_quantum(),
-        // Pulses come first; these are for peers that are asked by nobody any more.
-        keep_alive: patience.max + KEEP_ALIVE_SLACK,
-        idle_timeout: IDLE_TIMEOUT_MIN.max(patience.max * 5 / 2),
+        // The transport's keep-alive matters only for peers that our keep-alive no longer probes.
+        keep_alive: keep_alive_policy.max + KEEP_ALIVE_SLACK,
+        idle_timeout: IDLE_TIMEOUT_MIN.max(keep_alive_policy.max * 5 / 2),
         congestion: config.transport.congestion,
         offload: config.transport.offload,
         mtu_discovery: config.transport.mtu_discovery,
@@ -382,7 +382,7 @@ async fn run_with<N: RosNetwork>(
         .collect::<Result<Vec<_>, _>>()?;
     let listening: Vec<_> = listeners.iter().map(|l| l.local().clone()).collect();
     let dialer = Arc::new(Dialer::new(credentials.clone(), link_options.clone(), transport.clone()));
-    // Packets are marked by their socket.
+    // DSCP marks belong to sockets, so lanes with another mark need their own.
     let lane_dialer = match config.transport.lane_dscp {
         None => dialer.clone(),
         marked => {
@@ -450,7 +450,8 @@ async fn run_with<N: RosNetwork>(
     }
 
     let (events, inbox) = mpsc::channel(INBOX_MAX);
-    // Every thread and blocking task that uses this runtime holds a clone; it must outlive them all.
+    // Every thread and blocking task that uses this runtime holds a clone of `alive`, since the runtime must outlive
+    // them.
     let (alive, mut all_ended) = mpsc::channel(1);
     let (redial, on_redial) = watch::channel(());
     let wanted = rules.shares.clone();
@@ -464,7 +465,7 @@ async fn run_with<N: RosNetwork>(
         definitions,
         member_names: rules.members.clone(),
         board: board.clone(),
-        patience,
+        keep_alive_policy,
         message_keys,
         authority: config.authority.as_ref().map(|wanted| {
             let operators = grantees(&wanted.operators, &identity, &rules.partners);
@@ -472,7 +473,7 @@ async fn run_with<N: RosNetwork>(
         }),
         epoch_messages_max: config.rotation.messages,
         rates: PeerRates::new(config.peer_rate),
-        keeper: Keeper::spawn(state.clone(), config.identity.clone(), run_lock.clone(), alive.clone()),
+        keeper: StateWriter::spawn(state.clone(), config.identity.clone(), run_lock.clone(), alive.clone()),
         redial,
         alive,
         identity: identity.clone(),
@@ -501,7 +502,7 @@ async fn run_with<N: RosNetwork>(
             let failed = |why| warn!("mDNS on the local network cannot be used: {why}");
             opened.map(Arc::new).map_err(failed).ok()
         });
-    let holder = Holder {
+    let keeper = LinkKeeper {
         me: identity.node_id(),
         dialer: dialer.clone(),
         lane_dialer: lane_dialer.clone(),
@@ -510,31 +511,31 @@ async fn run_with<N: RosNetwork>(
         redial: on_redial,
         claims: claims.clone(),
         network: Network::watch(),
-        ways: WayBook::open(state.as_deref()),
+        urls: WorkingUrls::open(state.as_deref()),
     };
     let heard = local.clone().zip(nearby);
-    tasks.extend(finding::start(&config.routers, &rules.routers, &holder, &board, heard, &mut rng));
-    let lanes = LaneDoor::default();
+    tasks.extend(discovery::start(&config.routers, &rules.routers, &keeper, &board, heard, &mut rng));
+    let lanes = LaneAdmission::default();
     let mut accepting = Vec::new();
     for listener in listeners {
         info!("listening on {}", listener.local());
         let (stop, stopped) = oneshot::channel();
-        let door = Door {
+        let admission = Admission {
             core: events.clone(),
             credentials: credentials.clone(),
             claims: claims.clone(),
             audit: audit.clone(),
             lanes: lanes.clone(),
         };
-        accepting.push((tokio::spawn(keep_accepting(listener, door, stopped)), stop));
+        accepting.push((tokio::spawn(keep_accepting(listener, admission, stopped)), stop));
     }
     let socket = admin_socket_path(&config, identity.node_name().as_str());
-    tasks.push(tokio::spawn(reopening::watch(holder.network.clone(), network.clone(), events.clone())));
+    tasks.push(tokio::spawn(reopening::watch(keeper.network.clone(), network.clone(), events.clone())));
     let join = open.map(|open| join_late(open, network.clone(), events.clone(), gateway.clone()));
     let reloader = Arc::new(Reloader {
         source: options.source,
         join,
-        holder,
+        keeper,
         board,
         dialling: std::sync::Mutex::default(),
         identity: identity.clone(),
@@ -553,7 +554,7 @@ async fn run_with<N: RosNetwork>(
         let reloader = reloader.clone();
         tasks.push(tokio::spawn(async move {
             while asked.recv().await.is_some() {
-                // What is wrong is in the log; nobody waits for an answer.
+                // The log has the error; nobody waits for the result.
                 let _ = reloader.reload("SIGHUP").await;
             }
         }));
@@ -589,7 +590,7 @@ async fn run_with<N: RosNetwork>(
         let (reply, links) = oneshot::channel();
         let _ = events.send(CoreEvent::Stop(reply)).await;
         let links = links.await.unwrap_or_default();
-        // A peer that got the goodbye closes the link: then it has got everything before it, too.
+        // A peer closes the link after the goodbye, which shows that it has received everything before.
         let closed = async {
             for link in links {
                 link.closed().await;
@@ -601,14 +602,14 @@ async fn run_with<N: RosNetwork>(
     for task in tasks.into_iter().chain(reloader.take_dialling()) {
         task.abort();
     }
-    // A successor may have the socket when it is removed.
+    // A successor may own the socket by the time it is removed.
     socket.abort();
     let _ = socket.await;
     for (task, stop) in accepting {
         let _ = stop.send(());
         let _ = task.await;
     }
-    // Where it is the same, it has nothing to do the second time.
+    // If both are the same dialer, the second call does nothing.
     tokio::join!(dialer.close(CloseReason::Goodbye), lane_dialer.close(CloseReason::Goodbye));
     let _ = core.await;
     drop(reloader);
@@ -619,7 +620,7 @@ async fn run_with<N: RosNetwork>(
     if let Some(writer) = audit_writer {
         let _ = tokio::task::spawn_blocking(move || writer.finish()).await;
     }
-    // Ends discovery, and waits for its threads; the runtime waits for the rest.
+    // Closing ends discovery and waits for its threads. The runtime waits for the rest.
     if let Some(network) = network.take() {
         let _ = tokio::task::spawn_blocking(move || drop(network)).await;
     }
@@ -627,7 +628,7 @@ async fn run_with<N: RosNetwork>(
     Ok(())
 }
 
-/// The route machine of a member; a router's identity has none.
+/// Returns the route machine of a member. A router's identity has none.
 fn local_routes(
     identity: &Identity,
     shares: Vec<ShareRule>,
@@ -639,20 +640,20 @@ fn local_routes(
     Some(Routes::new(secret.clone(), identity.node_id(), shares, uses, ChaCha20Rng::from_rng(rng)))
 }
 
-/// Starts discovery, which the control task hears.
+/// Starts discovery, whose events go to the control task.
 pub(crate) fn discover<N: RosNetwork>(network: &N, events: mpsc::Sender<CoreEvent>) -> Result<(), RosError> {
     network.discover(Box::new(move |event| {
         let _ = events.blocking_send(CoreEvent::Discovery(event));
     }))
 }
 
-/// Returns how a network that was opened with this configuration is opened again. The gateway's part stays as it is.
+/// Returns a function that opens the network of this configuration again. The gateway's part stays open.
 fn open_again<N: RosNetwork>(open: &OpenNetwork<N>, ros: &RosConfig) -> OpenAgain<N> {
     let (open, ros) = (open.clone(), ros.clone());
     Arc::new(move || open(&ros).map(|(network, _)| network))
 }
 
-/// The way to the local network for a node that began without one.
+/// Returns a function that joins the local network later, for a node that began without one.
 fn join_late<N: RosNetwork>(
     open: OpenNetwork<N>,
     network: NetworkSlot<N>,
@@ -667,14 +668,14 @@ fn join_late<N: RosNetwork>(
         network.set_again(open_again(&open, ros));
         network.put(opened.clone());
         gateway.set_local_network(of_gateway);
-        // Ahead of what is discovered.
+        // The event has to precede the discovered endpoints.
         let stopping = |_| "the node is stopping".to_owned();
         events.blocking_send(CoreEvent::NetworkJoined(Box::new(routes))).map_err(stopping)?;
         discover(&*opened, events.clone()).map_err(|error| error.to_string())
     })
 }
 
-/// The state directory, made if need be. A node whose user has no place for one runs without.
+/// Returns the state directory and creates it if needed. A node whose user has no home runs without.
 fn state_dir(config: &Config, node: &str) -> Result<Option<PathBuf>, NodeError> {
     let Some(dir) = state::state_dir(config, node) else {
         warn!("{}; until then nothing is kept, and there is no audit log", StateError::Nowhere);

@@ -1,4 +1,4 @@
-//! Operations on the fleet that users of this node ask an authority for: one at a time, each within a deadline.
+//! Operations on the fleet that users of this node request from an authority: one at a time, each with a deadline.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -11,13 +11,13 @@ use tokio::sync::oneshot;
 const WAITING_MAX: usize = 16;
 /// Longest search for an authority.
 const FIND_MAX: Duration = Duration::from_secs(10);
-/// Longest time of an operation in all, waiting included.
+/// Longest total time of an operation, waiting included.
 pub(crate) const OPERATION_MAX: Duration = Duration::from_secs(30);
 
-/// Why an operation was not carried out, or may not have been.
+/// Reasons why an operation was not carried out, or may not have been.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum OperationError {
-    /// A router finds no node by its name.
+    /// A router cannot derive a node's name.
     #[error("this node is a router: it holds no secret of the fleet and finds no node by its name")]
     NoSecret,
     /// The node is the authority itself.
@@ -26,10 +26,10 @@ pub enum OperationError {
         /// The name.
         at: String,
     },
-    /// Too many wait.
+    /// Too many operations wait.
     #[error("{WAITING_MAX} operations wait at this node already")]
     Full,
-    /// Nobody of that name carries operations out.
+    /// The authority is out of reach.
     #[error(
         "no authority {at} is in reach of this node{hint}: it has to run, with `operators` in its [authority], and the \
          fleet's file names it by exactly that name (`sgc status` shows the links of this node)"
@@ -37,7 +37,7 @@ pub enum OperationError {
     NotFound {
         /// The name.
         at: String,
-        /// The cause, as far as this node knows it.
+        /// The probable cause.
         hint: &'static str,
     },
     /// This node is no operator.
@@ -53,10 +53,10 @@ pub enum OperationError {
     Denied {
         /// The authority.
         at: String,
-        /// By whom and why.
+        /// The refusing node, and its reason.
         by: RefusedBy,
     },
-    /// The authority did not answer before it was told the operation.
+    /// The authority did not answer before it got the operation.
     #[error("{at} does not answer: nothing was done")]
     Silent {
         /// The authority.
@@ -76,45 +76,45 @@ pub enum OperationError {
     Stopping,
 }
 
-/// An operation that a user wants.
+/// An operation that a user requests.
 #[derive(Debug)]
-pub(crate) struct OperationWish {
+pub(crate) struct UserOperation {
     /// The authority, by name and id.
     pub(crate) at: String,
     pub(crate) authority: NodeId,
-    /// True if this node's identity names that authority.
+    /// Whether this node's identity names that authority.
     pub(crate) is_named: bool,
     pub(crate) operation: Operation,
     pub(crate) reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
 }
 
-/// An action that the node has to do.
+/// Next action of the node.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Step {
     /// Ask this authority.
     Ask(NodeId, OperationRequest),
-    /// Leave the name that was asked at.
+    /// Leave the name of the authority.
     Leave(Name),
 }
 
-/// Operations that wait, and the one under way.
+/// Waiting operations, and the one under way.
 #[derive(Debug, Default)]
 pub(crate) struct Operations {
-    waiting: VecDeque<(OperationWish, Instant)>,
+    waiting: VecDeque<(UserOperation, Instant)>,
     current: Option<Current>,
 }
 
 #[derive(Debug)]
 struct Current {
-    wish: OperationWish,
-    /// The name that it is asked at, once it is.
+    operation_request: UserOperation,
+    /// Name at which the authority is asked, once it is.
     name: Option<Name>,
     find_until: Instant,
     until: Instant,
     state: State,
 }
 
-/// The event that the operation under way waits for.
+/// Event that the operation under way waits for.
 #[derive(Debug)]
 enum State {
     /// A challenge.
@@ -124,13 +124,13 @@ enum State {
 }
 
 impl Operations {
-    /// Queues a wish; [`Operations::next`] begins it.
-    pub(crate) fn push(&mut self, now: Instant, wish: OperationWish) {
+    /// Queues an operation. [`Operations::next`] begins it.
+    pub(crate) fn push(&mut self, now: Instant, operation_request: UserOperation) {
         if self.waiting.len() >= WAITING_MAX {
-            let _ = wish.reply.send(Err(OperationError::Full));
+            let _ = operation_request.reply.send(Err(OperationError::Full));
             return;
         }
-        self.waiting.push_back((wish, now + OPERATION_MAX));
+        self.waiting.push_back((operation_request, now + OPERATION_MAX));
     }
 
     /// Begins the next operation if none is under way.
@@ -138,23 +138,25 @@ impl Operations {
         if self.current.is_some() {
             return None;
         }
-        // Nobody waits any more for some.
-        let next = std::iter::from_fn(|| self.waiting.pop_front()).find(|(wish, _)| !wish.reply.is_closed());
-        let (wish, until) = next?;
-        let step = Step::Ask(wish.authority, OperationRequest::Challenge);
+        // Some clients have left.
+        let next = std::iter::from_fn(|| self.waiting.pop_front())
+            .find(|(operation_request, _)| !operation_request.reply.is_closed());
+        let (operation_request, until) = next?;
+        let step = Step::Ask(operation_request.authority, OperationRequest::Challenge);
         let (name, find_until) = (None, now + FIND_MAX);
-        self.current = Some(Current { wish, name, find_until, until, state: State::ExpectChallenge });
+        self.current =
+            Some(Current { operation_request, name, find_until, until, state: State::ExpectChallenge });
         Some(step)
     }
 
-    /// The authority is asked at this name.
+    /// Notes the name at which the authority is asked.
     pub(crate) fn asked(&mut self, name: Name) {
         if let Some(current) = &mut self.current {
             current.name = Some(name);
         }
     }
 
-    /// An answer came.
+    /// Handles an answer.
     pub(crate) fn answered(&mut self, name: Name, answer: OperationAnswer) -> Option<Step> {
         let current = self.current.as_mut().filter(|c| c.name == Some(name))?;
         match (&current.state, answer) {
@@ -166,21 +168,21 @@ impl Operations {
         }
     }
 
-    /// The authority, or a router before it, refused.
+    /// Handles a refusal of the authority or of a router before it.
     pub(crate) fn denied(&mut self, name: Name, by: RefusedBy) -> Option<Step> {
         let current = self.current.as_ref().filter(|c| c.name == Some(name))?;
-        let at = current.wish.at.clone();
+        let at = current.operation_request.at.clone();
         match (by, &current.state) {
             (RefusedBy::Owner(RefuseReason::NotPermitted), _) => {
                 self.end(Err(OperationError::NotOperator { at }))
             }
-            // Another request of this node took its place there, or a limit is reached.
+            // Another request of this node replaced this one there, or a limit is reached.
             (_, State::ExpectOutcome) => self.end(Err(OperationError::OutcomeUnknown { at })),
             (by, State::ExpectChallenge) => self.end(Err(OperationError::Denied { at, by })),
         }
     }
 
-    /// The name that the authority of the operation under way is asked at.
+    /// Returns the name at which the current authority is asked.
     pub(crate) fn name(&self) -> Option<Name> {
         self.current.as_ref()?.name
     }
@@ -193,13 +195,13 @@ impl Operations {
         })
     }
 
-    /// Ends the operation if its time is over, or if nobody advertises the authority's name for too long.
+    /// Ends the operation if its time is over, or if the authority's name is not advertised for too long.
     pub(crate) fn look(&mut self, now: Instant, is_found: bool) -> Option<Step> {
         let current = self.current.as_mut()?;
-        let at = current.wish.at.clone();
+        let at = current.operation_request.at.clone();
         match current.state {
             State::ExpectChallenge if current.find_until <= now && !is_found => {
-                let hint = match current.wish.is_named {
+                let hint = match current.operation_request.is_named {
                     true => "",
                     false => ", whose identity names another authority or none",
                 };
@@ -210,7 +212,7 @@ impl Operations {
                 self.end(Err(OperationError::OutcomeUnknown { at }))
             }
             State::ExpectChallenge => {
-                // It was found, and has the rest of the time to answer.
+                // The name was found, so the authority has the rest of the time to answer.
                 if current.find_until <= now {
                     current.find_until = current.until;
                 }
@@ -220,17 +222,17 @@ impl Operations {
         }
     }
 
-    /// Ends all of them: the node stops.
+    /// Ends all operations, because the node stops.
     pub(crate) fn stop(&mut self) {
-        let waiting = self.waiting.drain(..).map(|(wish, _)| wish);
-        for wish in waiting.chain(self.current.take().map(|current| current.wish)) {
-            let _ = wish.reply.send(Err(OperationError::Stopping));
+        let waiting = self.waiting.drain(..).map(|(operation_request, _)| operation_request);
+        for operation_request in waiting.chain(self.current.take().map(|current| current.operation_request)) {
+            let _ = operation_request.reply.send(Err(OperationError::Stopping));
         }
     }
 
     fn end(&mut self, result: Result<OperationAnswer, OperationError>) -> Option<Step> {
-        let Current { wish, name, .. } = self.current.take()?;
-        let _ = wish.reply.send(result);
+        let Current { operation_request, name, .. } = self.current.take()?;
+        let _ = operation_request.reply.send(result);
         name.map(Step::Leave)
     }
 }
@@ -238,8 +240,8 @@ impl Operations {
 impl Current {
     fn execute(&mut self, challenge: Challenge) -> Step {
         self.state = State::ExpectOutcome;
-        let operation = self.wish.operation.clone();
-        Step::Ask(self.wish.authority, OperationRequest::Execute { challenge, operation })
+        let operation = self.operation_request.operation.clone();
+        Step::Ask(self.operation_request.authority, OperationRequest::Execute { challenge, operation })
     }
 }
 
@@ -262,18 +264,19 @@ mod tests {
         Operation::List { after: None }
     }
 
-    fn wish() -> (OperationWish, Reply) {
+    fn operation_request() -> (UserOperation, Reply) {
         let (reply, replied) = oneshot::channel();
         let at = "keeper".to_owned();
-        let wish = OperationWish { at, authority: KEEPER, is_named: true, operation: list(), reply };
-        (wish, replied)
+        let operation_request =
+            UserOperation { at, authority: KEEPER, is_named: true, operation: list(), reply };
+        (operation_request, replied)
     }
 
-    /// One operation under way that waits for a challenge.
+    /// Returns an operation under way that waits for a challenge.
     fn begun(now: Instant) -> (Operations, Reply) {
         let mut operations = Operations::default();
-        let (wish, replied) = wish();
-        operations.push(now, wish);
+        let (operation_request, replied) = operation_request();
+        operations.push(now, operation_request);
         assert_eq!(operations.next(now), Some(Step::Ask(KEEPER, OperationRequest::Challenge)));
         operations.asked(NAME);
         (operations, replied)
@@ -287,7 +290,7 @@ mod tests {
     fn an_operation_takes_a_challenge_and_is_asked_for_with_it() {
         let now = Instant::now();
         let (mut operations, replied) = begun(now);
-        let (second, waits) = wish();
+        let (second, waits) = operation_request();
         operations.push(now, second);
         assert_eq!(operations.next(now), None, "one at a time");
         let other = OperationAnswer::Challenge(Challenge([9; 16]));
@@ -305,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_answered_ends_in_time_and_says_what_may_have_been_done() {
+    fn unanswered_operation_times_out_and_says_if_it_may_have_run() {
         let begin = Instant::now();
         let at = || "keeper".to_owned();
         let (mut operations, replied) = begun(begin);
@@ -344,17 +347,17 @@ mod tests {
     }
 
     #[test]
-    fn who_waits_is_bounded_and_who_went_away_is_passed_over() {
+    fn waiting_operations_are_bounded_and_abandoned_ones_are_skipped() {
         let now = Instant::now();
         let (mut operations, replied) = begun(now);
         let waiting: Vec<_> = (0..WAITING_MAX)
             .map(|_| {
-                let (wish, replied) = wish();
-                operations.push(now, wish);
+                let (operation_request, replied) = operation_request();
+                operations.push(now, operation_request);
                 replied
             })
             .collect();
-        let (one_more, refused) = wish();
+        let (one_more, refused) = operation_request();
         operations.push(now, one_more);
         assert_eq!(end(refused), Err(OperationError::Full));
         drop((replied, waiting));

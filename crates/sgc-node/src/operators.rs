@@ -1,8 +1,8 @@
 //! Operations that a fleet's authority carries out for operators: revoke, enrol, renew, list.
 //!
-//! A request is a join, so its author is known by its certificate. That alone would let a router repeat it: each
-//! operation therefore names a challenge that this run of the authority gave to the same node before, and is carried out
-//! once. A repeated request gets the first answer, sealed to the key of the request.
+//! A request is a join, so its author is known by its certificate. A router could repeat it, so each operation names a
+//! challenge that this run of the authority gave the same node, and is carried out once. A repeated request gets the
+//! first answer, sealed to the key of the new request.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -19,35 +19,36 @@ use sgc_wire::{
 
 use crate::fleet_file::{FleetFileError, LockedFleet, read_fleet};
 
-/// Most operations that wait for the fleet's file.
+/// Most operations that wait for the fleet file.
 pub(crate) const OPERATIONS_WAITING_MAX: usize = 16;
-/// Most challenges of one operator that hold; a further one takes the place of the oldest.
+/// Most valid challenges of one operator. A further one replaces the oldest.
 const CHALLENGES_PER_NODE_MAX: usize = 4;
-/// Most challenges that hold.
+/// Most valid challenges.
 const CHALLENGES_MAX: usize = 256;
 /// Validity of a challenge.
 const CHALLENGE_TIME: Duration = Duration::from_secs(60);
-/// Most operations whose answers are remembered: more than may wait, so that one under way is never forgotten.
+/// Most operations whose answers are remembered. It exceeds the number that may wait, so that none under way is
+/// forgotten.
 const EXECUTED_MAX: usize = 2 * OPERATIONS_WAITING_MAX;
 /// Most bytes of the rows in one page of a roster.
 const PAGE_BYTES_MAX: usize = 512 * 1024;
 
-/// The next step for a request.
+/// Next step for a request.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Asked {
-    /// Give this answer at once.
+pub(crate) enum RequestStep {
+    /// Send this answer.
     Answer(OperationAnswer),
-    /// Give the answer that the same request got before.
+    /// Send the answer that the same request got before.
     Again(OperationAnswer),
-    /// Queue this job; its answer follows.
+    /// Queue this job. Its answer follows.
     Job(OperationJob),
-    /// It is under way already; its answer goes to the sink that asked last.
+    /// The operation is under way. Its answer goes to the sink that asked last.
     UnderWay,
     /// The node is no operator.
     NotPermitted,
 }
 
-/// An operation that is to be carried out.
+/// An operation to be carried out.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct OperationJob {
     challenge: Challenge,
@@ -55,47 +56,47 @@ pub(crate) struct OperationJob {
     operation: Operation,
 }
 
-/// An operation that was carried out, or refused.
-pub(crate) struct OperationDone {
+/// The outcome of an operation.
+pub(crate) struct OperationOutcome {
     challenge: Challenge,
     pub(crate) node: NodeId,
     /// The operation in words, for the audit log.
     pub(crate) said: String,
     pub(crate) answer: OperationAnswer,
-    /// The revocation list that came of it, DER.
+    /// The resulting revocation list, DER.
     pub(crate) list: Option<Vec<u8>>,
 }
 
-/// The operators of a fleet, and what they asked for.
+/// Operators of a fleet, with their challenges and operations.
 #[derive(Debug)]
 pub(crate) struct Operators {
     permitted: Grantees,
-    /// Oldest first.
-    challenges: VecDeque<Issued>,
-    /// Oldest first.
-    executed: VecDeque<Executed>,
+    /// Challenges, the oldest first.
+    challenges: VecDeque<ChallengeRecord>,
+    /// Operations, the oldest first.
+    executed: VecDeque<ExecutionRecord>,
 }
 
 #[derive(Debug)]
-struct Issued {
+struct ChallengeRecord {
     challenge: Challenge,
     node: NodeId,
     until: Instant,
 }
 
 #[derive(Debug)]
-struct Executed {
+struct ExecutionRecord {
     challenge: Challenge,
     node: NodeId,
     operation: Operation,
     /// The sink that asked last.
     sink: SinkId,
-    /// Absent while it is under way.
+    /// The answer; `None` while the operation is under way.
     answer: Option<OperationAnswer>,
 }
 
 impl Operators {
-    /// An authority that does what these nodes ask for.
+    /// Creates the state of an authority with these operators.
     pub(crate) fn new(permitted: Grantees) -> Self {
         Self { permitted, challenges: VecDeque::new(), executed: VecDeque::new() }
     }
@@ -108,17 +109,17 @@ impl Operators {
         sink: SinkId,
         request: &Bytes,
         rng: &mut impl RngCore,
-    ) -> Asked {
+    ) -> RequestStep {
         if self.permitted.find(peer).is_none() {
-            return Asked::NotPermitted;
+            return RequestStep::NotPermitted;
         }
         self.challenges.retain(|issued| now < issued.until);
         match OperationRequest::from_slice(request) {
-            Ok(OperationRequest::Challenge) => Asked::Answer(self.challenge(now, peer.node_id, rng)),
+            Ok(OperationRequest::Challenge) => RequestStep::Answer(self.challenge(now, peer.node_id, rng)),
             Ok(OperationRequest::Execute { challenge, operation }) => {
                 self.execute(peer.node_id, sink, challenge, operation)
             }
-            Err(why) => Asked::Answer(refused(OperationRefusal::Malformed, why)),
+            Err(why) => RequestStep::Answer(refused(OperationRefusal::Malformed, why)),
         }
     }
 
@@ -133,33 +134,39 @@ impl Operators {
         }
         let mut challenge = Challenge([0; 16]);
         rng.fill_bytes(&mut challenge.0);
-        self.challenges.push_back(Issued { challenge, node, until: now + CHALLENGE_TIME });
+        self.challenges.push_back(ChallengeRecord { challenge, node, until: now + CHALLENGE_TIME });
         OperationAnswer::Challenge(challenge)
     }
 
-    fn execute(&mut self, node: NodeId, sink: SinkId, challenge: Challenge, operation: Operation) -> Asked {
+    fn execute(
+        &mut self,
+        node: NodeId,
+        sink: SinkId,
+        challenge: Challenge,
+        operation: Operation,
+    ) -> RequestStep {
         if let Some(known) = self.executed.iter_mut().find(|e| e.challenge == challenge) {
             if known.node != node || known.operation != operation {
-                return Asked::Answer(refused(OperationRefusal::Stale, ""));
+                return RequestStep::Answer(refused(OperationRefusal::Stale, ""));
             }
             known.sink = sink;
-            return known.answer.clone().map_or(Asked::UnderWay, Asked::Again);
+            return known.answer.clone().map_or(RequestStep::UnderWay, RequestStep::Again);
         }
         let issued = self.challenges.iter().position(|i| i.challenge == challenge && i.node == node);
         let Some(issued) = issued else {
-            return Asked::Answer(refused(OperationRefusal::Stale, ""));
+            return RequestStep::Answer(refused(OperationRefusal::Stale, ""));
         };
         self.challenges.remove(issued);
         if self.executed.len() >= EXECUTED_MAX {
             self.executed.pop_front();
         }
         let (answer, doing) = (None, operation.clone());
-        self.executed.push_back(Executed { challenge, node, operation: doing, sink, answer });
-        Asked::Job(OperationJob { challenge, node, operation })
+        self.executed.push_back(ExecutionRecord { challenge, node, operation: doing, sink, answer });
+        RequestStep::Job(OperationJob { challenge, node, operation })
     }
 
-    /// Remembers the answer of a job; returns the sink that waits for it.
-    pub(crate) fn done(&mut self, done: &OperationDone) -> Option<SinkId> {
+    /// Records the outcome of a job. Returns the sink that waits for it.
+    pub(crate) fn done(&mut self, done: &OperationOutcome) -> Option<SinkId> {
         let known = self.executed.iter_mut().find(|e| e.challenge == done.challenge)?;
         known.answer = Some(done.answer.clone());
         Some(known.sink)
@@ -167,20 +174,20 @@ impl Operators {
 }
 
 impl OperationJob {
-    /// Its end, if it cannot even be queued.
-    pub(crate) fn busy(self) -> OperationDone {
+    /// Returns the outcome of an operation that cannot be queued.
+    pub(crate) fn busy(self) -> OperationOutcome {
         self.end(refused(OperationRefusal::Busy, ""), None)
     }
 
-    /// Carries the operation out; blocks on the fleet's file. `own` is the authority, `seen` when members were last
-    /// here.
+    /// Carries the operation out. Blocks on the fleet file. `own` is the authority, `seen` the times at which members
+    /// were last present.
     pub(crate) fn carry_out(
         self,
         file: &Path,
         own: &NodeId,
         seen: &BTreeMap<NodeId, UnixMillis>,
         now: UnixMillis,
-    ) -> OperationDone {
+    ) -> OperationOutcome {
         let done = match &self.operation {
             Operation::List { after } => list(file, after.as_deref(), seen).map(|answer| (answer, None)),
             Operation::Revoke { nodes } => {
@@ -196,7 +203,7 @@ impl OperationJob {
         }
     }
 
-    fn end(self, answer: OperationAnswer, list: Option<Vec<u8>>) -> OperationDone {
+    fn end(self, answer: OperationAnswer, list: Option<Vec<u8>>) -> OperationOutcome {
         let Self { challenge, node, operation } = self;
         let outcome = match &answer {
             OperationAnswer::Refused { why, detail } if detail.is_empty() => format!("refused: {why}"),
@@ -209,11 +216,11 @@ impl OperationJob {
             Operation::Enroll { node, .. } => format!("enroll {node}"),
             Operation::Renew { node, .. } => format!("renew {node}"),
         };
-        OperationDone { challenge, node, said: format!("{said}: {outcome}"), answer, list }
+        OperationOutcome { challenge, node, said: format!("{said}: {outcome}"), answer, list }
     }
 }
 
-/// Why an operation failed.
+/// Reasons why an operation failed.
 enum Failure {
     File(FleetFileError),
     Fleet(FleetError),
@@ -278,7 +285,7 @@ fn revoke(
     Ok((OperationAnswer::Revoked { list: locked.fleet.crl_number() }, list))
 }
 
-/// Enrols or renews; the file has the certificate before the answer leaves.
+/// Enrols or renews. The file has the certificate before the answer leaves.
 fn certify(file: &Path, operation: &Operation, now: UnixMillis) -> Result<OperationAnswer, Failure> {
     let mut rng = OsRng.unwrap_err();
     let mut locked = LockedFleet::open(file)?;
@@ -326,7 +333,7 @@ fn list(
     Ok(OperationAnswer::Roster(page))
 }
 
-/// Returns what people see of a fleet's roster, without its nodes.
+/// Returns the public part of a fleet's roster, without its nodes.
 pub fn roster_head(fleet: &Fleet) -> RosterPage {
     RosterPage {
         fleet: fleet.name().to_string(),
@@ -341,7 +348,7 @@ pub fn roster_head(fleet: &Fleet) -> RosterPage {
     }
 }
 
-/// Returns what people see of a node of a fleet's roster.
+/// Returns the public part of a roster's node.
 pub fn roster_row(fleet: &Fleet, node: &RosterNode) -> RosterRow {
     let certificates = node.certificates.iter().take(ROW_CERTIFICATES_MAX);
     let revocation = fleet.revocation_of(&node.name);
@@ -395,7 +402,7 @@ mod tests {
     }
 
     impl Bench {
-        /// A fleet of which the node `desk` is the operator.
+        /// Creates a fleet whose operator is the node `desk`.
         fn new() -> Self {
             let dir = tempfile::tempdir().unwrap();
             let file = dir.path().join("lab.fleet");
@@ -413,19 +420,19 @@ mod tests {
             Self { _dir: dir, file, keeper, desk, guest, operators, rng, now: Instant::now() }
         }
 
-        fn ask(&mut self, of_guest: bool, sink: SinkId, request: &OperationRequest) -> Asked {
+        fn ask(&mut self, of_guest: bool, sink: SinkId, request: &OperationRequest) -> RequestStep {
             let peer = if of_guest { self.guest.as_peer() } else { self.desk.as_peer() };
             self.operators.ask(self.now, peer, sink, &request.to_bytes(), &mut self.rng)
         }
 
         fn challenge(&mut self) -> Challenge {
             match self.ask(false, A, &OperationRequest::Challenge) {
-                Asked::Answer(OperationAnswer::Challenge(challenge)) => challenge,
+                RequestStep::Answer(OperationAnswer::Challenge(challenge)) => challenge,
                 other => panic!("{other:?}"),
             }
         }
 
-        fn carry_out(&mut self, job: OperationJob) -> OperationDone {
+        fn carry_out(&mut self, job: OperationJob) -> OperationOutcome {
             let now = crate::core::now().unix;
             job.carry_out(&self.file, &self.keeper, &BTreeMap::new(), now)
         }
@@ -442,8 +449,8 @@ mod tests {
         OperationRequest::Execute { challenge, operation }
     }
 
-    fn is_stale(asked: &Asked) -> bool {
-        let Asked::Answer(OperationAnswer::Refused { why, .. }) = asked else { return false };
+    fn is_stale(asked: &RequestStep) -> bool {
+        let RequestStep::Answer(OperationAnswer::Refused { why, .. }) = asked else { return false };
         *why == OperationRefusal::Stale
     }
 
@@ -452,16 +459,16 @@ mod tests {
         let mut bench = Bench::new();
         let challenge = bench.challenge();
         let request = revoke_guest(challenge);
-        let Asked::Job(job) = bench.ask(false, A, &request) else { panic!("it is new") };
-        assert_eq!(bench.ask(false, B, &request), Asked::UnderWay);
+        let RequestStep::Job(job) = bench.ask(false, A, &request) else { panic!("it is new") };
+        assert_eq!(bench.ask(false, B, &request), RequestStep::UnderWay);
         let done = bench.carry_out(job);
         assert!(done.list.is_some() && bench.is_revoked("guest"));
         assert_eq!(done.said, "revoke guest: done");
         assert_eq!(bench.operators.done(&done), Some(B), "the newer sink is answered");
         for _ in 0..3 {
-            assert_eq!(bench.ask(false, A, &request), Asked::Again(done.answer.clone()));
+            assert_eq!(bench.ask(false, A, &request), RequestStep::Again(done.answer.clone()));
         }
-        // The challenge is for that operation alone.
+        // The challenge is valid for that operation only.
         let operation = Operation::Revoke { nodes: vec!["desk".into()] };
         assert!(is_stale(&bench.ask(false, A, &OperationRequest::Execute { challenge, operation })));
     }
@@ -471,7 +478,7 @@ mod tests {
         let mut bench = Bench::new();
         let challenge = bench.challenge();
         assert!(is_stale(&bench.ask(false, A, &revoke_guest(Challenge([9; 16])))));
-        // The authority was restarted: it knows of no challenge, nor of what it did.
+        // The restarted authority knows no earlier challenges or operations.
         let nodes = [bench.desk.node_id(), bench.guest.node_id()].into();
         let first = std::mem::replace(
             &mut bench.operators,
@@ -491,7 +498,7 @@ mod tests {
         let mut bench = Bench::new();
         let challenge = bench.challenge();
         for request in [OperationRequest::Challenge, revoke_guest(challenge)] {
-            assert_eq!(bench.ask(true, A, &request), Asked::NotPermitted);
+            assert_eq!(bench.ask(true, A, &request), RequestStep::NotPermitted);
         }
         assert_eq!(bench.operators.challenges.len(), 1);
         let malformed = bench.operators.ask(
@@ -501,7 +508,9 @@ mod tests {
             &Bytes::from_static(b"\xff"),
             &mut bench.rng,
         );
-        let Asked::Answer(OperationAnswer::Refused { why, .. }) = malformed else { panic!("{malformed:?}") };
+        let RequestStep::Answer(OperationAnswer::Refused { why, .. }) = malformed else {
+            panic!("{malformed:?}")
+        };
         assert_eq!(why, OperationRefusal::Malformed);
     }
 
@@ -516,18 +525,18 @@ mod tests {
         assert!(is_stale(&bench.ask(false, A, &revoke_guest(first))));
         for _ in 0..2 * EXECUTED_MAX {
             let challenge = bench.challenge();
-            assert!(matches!(bench.ask(false, A, &revoke_guest(challenge)), Asked::Job(_)));
+            assert!(matches!(bench.ask(false, A, &revoke_guest(challenge)), RequestStep::Job(_)));
         }
         assert_eq!(bench.operators.executed.len(), EXECUTED_MAX);
     }
 
     #[test]
-    fn what_the_fleet_refuses_is_said_in_words_and_changes_nothing() {
+    fn refused_operation_is_explained_and_changes_nothing() {
         let mut bench = Bench::new();
         let mut refusal = |operation| {
             let challenge = bench.challenge();
             let asked = bench.ask(false, A, &OperationRequest::Execute { challenge, operation });
-            let Asked::Job(job) = asked else { panic!("{asked:?}") };
+            let RequestStep::Job(job) = asked else { panic!("{asked:?}") };
             match bench.carry_out(job).answer {
                 OperationAnswer::Refused { why, detail } => (why, detail),
                 other => panic!("{other:?}"),
@@ -548,7 +557,7 @@ mod tests {
         std::fs::remove_file(&bench.file).unwrap();
         let challenge = bench.challenge();
         let asked = bench.ask(false, A, &revoke_guest(challenge));
-        let Asked::Job(job) = asked else { panic!("{asked:?}") };
+        let RequestStep::Job(job) = asked else { panic!("{asked:?}") };
         let answer = bench.carry_out(job).answer;
         assert!(matches!(answer, OperationAnswer::Refused { why: OperationRefusal::File, .. }), "{answer:?}");
     }

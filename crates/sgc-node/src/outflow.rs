@@ -1,7 +1,7 @@
-//! What leaves for one link under one name: a bounded queue and the task that empties it onto the link.
+//! [`OutFlow`]: the packets of one name for one link, in a bounded queue with the task that sends them.
 //!
-//! Reliable packets share one flow of the link; a best-effort message goes as a datagram if it fits one, else as a
-//! flow of its own. Of best-effort messages in several packets only the newest complete one waits.
+//! Reliable packets share one flow of the link. A best-effort message leaves as a datagram if it fits one, else on a
+//! flow of its own. Of best-effort messages in several packets, only the newest complete one waits.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -18,23 +18,23 @@ use crate::lanes::Lanes;
 use crate::queue::{PushError, Queue};
 use crate::stats::DataDrop;
 
-/// Packets that may wait for one link under one name.
+/// Most packets that wait for one link under one name.
 pub(crate) const OUTFLOW_PACKETS_MAX: usize = 1024;
-/// Bytes of reliable packets that may wait before the source is pushed back.
+/// Bytes of reliable packets that may wait before the source is blocked.
 pub(crate) const OUTFLOW_RELIABLE_BYTES_MAX: usize = 4 << 20;
-/// How long a reliable source is pushed back by a link that takes nothing at all.
+/// Longest time that a link without progress blocks a reliable source.
 pub(crate) const OUTFLOW_PATIENCE: Duration = Duration::from_secs(5);
-/// Bytes of best-effort packets that may wait; of larger messages only what fits is kept, and they are lost.
+/// Most bytes of best-effort packets that wait. Larger messages are cut there and lost.
 pub(crate) const OUTFLOW_BYTES_MAX: usize = 16 << 20;
-/// How long a best-effort packet may wait if nothing else is said; then it is worth nothing.
+/// Longest wait of a best-effort packet by default. Later it is useless.
 pub(crate) const OUTFLOW_AGE_MAX: Duration = Duration::from_secs(1);
 
-/// What becomes of best-effort packets that wait.
+/// Limits of waiting best-effort packets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct FlowLimits {
-    /// How long one may wait; judged at the beginning of a message.
+    /// Longest wait, judged at the beginning of a message.
     pub max_age: Duration,
-    /// Of messages in one packet, too, only the newest of each source waits.
+    /// Whether only the newest message of each source waits, also among messages of one packet.
     pub newest_only: bool,
 }
 
@@ -44,26 +44,27 @@ impl Default for FlowLimits {
     }
 }
 
-/// Bytes of reliable packets that are written together if they wait together. That is less than the path has under way where
-/// it is fast, and where it is thin the link takes them piece by piece.
+/// Bytes of waiting reliable packets that are written together. A fast path has more under way; a thin link takes them
+/// in parts.
 const TOGETHER_BYTES_MAX: usize = 16 << 10;
 
-/// A packet, and since when it waits.
+/// A packet and the time since which it waits.
 type Waiting = (Packet, Instant);
 
-/// Best-effort messages in several packets that are sent beside each other: of several sources, or since they came so.
+/// Most best-effort messages of several packets that are sent in parallel. Several sources, or interleaved arrival,
+/// lead to that.
 const MESSAGES_MAX: usize = 4;
 
-/// The queue's end that the data path sees.
+/// The data path's end of the queue.
 pub(crate) struct OutFlow {
     queue: Queue<Waiting>,
-    /// Complete best-effort messages of several packets in the queue.
+    /// Number of complete best-effort messages of several packets in the queue.
     complete: AtomicUsize,
     ended: watch::Sender<bool>,
 }
 
 impl OutFlow {
-    /// Starts the task that sends; it ends when the flow is closed and empty, or the link ends.
+    /// Starts the sending task. It ends when the queue is closed and empty, or the link ends.
     pub(crate) fn spawn(
         link: AnyLink,
         name: Name,
@@ -89,7 +90,7 @@ impl OutFlow {
                 messages: VecDeque::new(),
             };
             if let Err(error) = task.empty(&mut sender, limits).await {
-                debug!(name = %name.short(), %error, "no more is sent over this link");
+                debug!(name = %name.short(), %error, "stopped sending over this link");
             }
             task.close();
             sender.finish().await;
@@ -98,7 +99,7 @@ impl OutFlow {
         flow
     }
 
-    /// One that nobody empties but [`Self::queued`].
+    /// Creates a queue that only [`Self::queued`] empties.
     #[cfg(any(test, feature = "benchmarks"))]
     pub(crate) fn idle() -> Arc<Self> {
         Arc::new(Self {
@@ -108,13 +109,13 @@ impl OutFlow {
         })
     }
 
-    /// The oldest packet that waits; it must be there.
+    /// Waits for the oldest packet and returns it. The queue must not be closed.
     #[cfg(any(test, feature = "benchmarks"))]
     pub(crate) async fn queued(&self) -> Packet {
         self.queue.pop().await.expect("it is open").0
     }
 
-    /// Queues a packet; says what was dropped instead, and how many.
+    /// Queues a packet. Returns the kind and number of packets that were dropped for it.
     pub(crate) async fn push(&self, packet: Packet) -> Option<(DataDrop, u64)> {
         let bytes = packet.encoded_bytes();
         if packet.header.reliable {
@@ -144,37 +145,37 @@ impl OutFlow {
         (evicted > 0).then_some((DataDrop::Stale, evicted))
     }
 
-    /// True if it is far from pushing back.
-    pub(crate) fn is_at_ease(&self) -> bool {
-        self.queue.is_at_ease(OUTFLOW_RELIABLE_BYTES_MAX)
+    /// Returns `true` if the queue is far from blocking.
+    pub(crate) fn has_headroom(&self) -> bool {
+        self.queue.has_headroom(OUTFLOW_RELIABLE_BYTES_MAX)
     }
 
-    /// Ends it: what is queued is still sent.
+    /// Closes the queue. Queued packets are still sent.
     pub(crate) fn close(&self) {
         self.queue.close();
     }
 
-    /// Waits until it has ended.
+    /// Waits until the task has ended.
     pub(crate) async fn ended(&self) {
-        // The sender is this very flow, so it is there.
+        // This cannot fail, since `self` holds the sender.
         let _ = self.ended.subscribe().wait_for(|ended| *ended).await;
     }
 
-    /// Sends what is queued until the flow is closed and empty, or the link ends.
+    /// Sends packets until the queue is closed and empty, or the link ends.
     async fn empty(&self, sender: &mut Sender, limits: FlowLimits) -> Result<(), LinkError> {
-        // Of the message that is being sent, and what came between.
+        // The rest of the current message, and packets that came between.
         let mut taken = VecDeque::new();
         loop {
             let next = match self.at_hand(&mut taken) {
                 Some(next) => Some(next),
                 None => {
-                    // Nothing comes along.
+                    // No further packet is ready, so the kept ones leave.
                     sender.flush().await?;
                     self.queue.pop().await
                 }
             };
             let Some((packet, since)) = next else { return Ok(()) };
-            // Judged by its beginning: a large message that is under way goes on.
+            // Limits apply at the beginning: a large message that is under way continues.
             let begins = !packet.header.reliable && packet.header.index == 0;
             let stale = begins && since.elapsed() > limits.max_age;
             let newer = limits.newest_only && self.has_newer(&packet, &mut taken);
@@ -189,13 +190,13 @@ impl OutFlow {
         }
     }
 
-    /// What is sent next, if it is there.
+    /// Returns the next packet, if one is ready.
     fn at_hand(&self, taken: &mut VecDeque<Waiting>) -> Option<Waiting> {
         taken.pop_front().or_else(|| self.queue.try_pop())
     }
 
-    /// Takes what is queued of a message that begins, so that newer ones do not push out its end while it is sent: on a
-    /// link that is slow enough none would ever arrive whole.
+    /// Takes the queued rest of a message that begins. Otherwise newer messages could displace its end while it is
+    /// sent, and on a slow link none would ever arrive whole.
     fn take_rest(&self, first: &Packet, taken: &mut VecDeque<Waiting>) {
         let id = |packet: &Packet| (packet.header.source, packet.header.seq);
         let ends = |packet: &Packet| id(packet) == id(first) && packet.header.is_last();
@@ -207,7 +208,8 @@ impl OutFlow {
         }
     }
 
-    /// True if a best-effort message in one packet has a newer one of its source behind it. What waits is taken for that.
+    /// Returns `true` if a newer message of the same source waits behind this best-effort message of one packet. It
+    /// takes waiting packets for that.
     fn has_newer(&self, packet: &Packet, taken: &mut VecDeque<Waiting>) -> bool {
         let is_one = |packet: &Packet| !packet.header.reliable && packet.header.fragments() == 1;
         if !is_one(packet) {
@@ -221,7 +223,7 @@ impl OutFlow {
         taken.iter().any(|(next, _)| is_one(next) && next.header.source == packet.header.source)
     }
 
-    /// True if a packet begins or continues a best-effort message that a complete newer one overtakes.
+    /// Returns `true` if the packet belongs to a best-effort message that a complete newer one supersedes.
     fn is_superseded(&self, packet: &Packet) -> bool {
         if packet.header.reliable || packet.header.fragments() == 1 {
             return false;
@@ -239,32 +241,32 @@ fn ends_large_message(packet: &Packet) -> bool {
     !packet.header.reliable && packet.header.fragments() > 1 && packet.header.is_last()
 }
 
-/// A best-effort message in several packets that is being sent.
+/// A best-effort message of several packets that is being sent.
 struct Message {
     id: (SourceId, u64),
-    /// The index of the packet that comes next.
+    /// Index of the next packet.
     next: u16,
     flow: FlowTx,
 }
 
-/// The link's end.
+/// The link's end of the queue.
 struct Sender {
-    /// What is sent by: the link, or a lane of it.
+    /// The link, or a lane of it.
     by: AnyLink,
-    /// The number of the lane.
+    /// Number of the lane.
     lane: Option<u64>,
     name: Name,
     link: AnyLink,
     lanes: Arc<Lanes>,
-    /// Of the one name that all packets are of.
+    /// Label of the name of all packets.
     label: Option<NameLabel>,
     reliable: Option<FlowTx>,
-    /// Best-effort messages in several packets that are being sent, the oldest first.
+    /// Best-effort messages of several packets that are being sent, the oldest first.
     messages: VecDeque<Message>,
 }
 
 impl Sender {
-    /// Sends a packet, or keeps a reliable one for the next [`Self::flush`].
+    /// Sends a packet, or keeps a reliable one for [`Self::flush`].
     async fn send(&mut self, packet: Packet) -> Result<(), LinkError> {
         if packet.header.index == 0 {
             self.choose().await?;
@@ -276,13 +278,13 @@ impl Sender {
         self.outlive_lane(sent)
     }
 
-    /// Sends what is kept.
+    /// Sends the kept packets.
     async fn flush(&mut self) -> Result<(), LinkError> {
         let sent = self.flush_by().await;
         self.outlive_lane(sent)
     }
 
-    /// If the lane ended and the link did not, the next message goes over that.
+    /// Continues on the link if only the lane ended.
     fn outlive_lane(&mut self, sent: Result<(), LinkError>) -> Result<(), LinkError> {
         match sent {
             Err(error) if self.lane.is_some() && !error.is_link_alive() => {
@@ -294,9 +296,10 @@ impl Sender {
         }
     }
 
-    /// Takes the lane if there is one, else the link. What was sent by the other arrives first, or its lane is gone.
+    /// Chooses the lane if there is one, else the link. Earlier packets on the other connection arrive first, or their
+    /// lane is gone.
     async fn choose(&mut self) -> Result<(), LinkError> {
-        let lane = self.lanes.of(&self.name);
+        let lane = self.lanes.for_name(&self.name);
         if lane.as_ref().map(|(number, _)| *number) == self.lane {
             return Ok(());
         }
@@ -314,14 +317,14 @@ impl Sender {
         Ok(())
     }
 
-    /// From here on everything is sent over the link.
+    /// Sends everything over the link from here on.
     fn take_link(&mut self) {
         (self.by, self.lane) = (self.link.clone(), None);
         self.reliable = None;
         self.messages.clear();
     }
 
-    /// Labels are the link's own.
+    /// Returns the label. Lanes have none, since labels belong to the link.
     fn label(&self) -> Option<Label> {
         self.label.as_ref().filter(|_| self.lane.is_none()).and_then(NameLabel::known)
     }
@@ -341,7 +344,7 @@ impl Sender {
             && self.by.datagram_max().is_some_and(|max| packet.encoded_bytes_as(label) <= max)
         {
             return match self.by.send_datagram_as(&packet, label).await {
-                // The path's limit sank in between.
+                // The path's MTU shrank in between.
                 Err(LinkError::DatagramTooLong { .. }) => self.send_alone(&packet).await,
                 other => other,
             };
@@ -360,16 +363,16 @@ impl Sender {
             self.messages.push_back(Message { id, next: 0, flow });
         }
         let at = self.messages.iter().position(|m| (m.id, m.next) == (id, header.index));
-        // Without one its beginning was dropped: the rest is of no use to anyone.
+        // Without a flow, the beginning was dropped, and the rest is useless.
         let Some(message) = at.and_then(|at| self.messages.get_mut(at)) else { return Ok(()) };
         match message.flow.send_as(&packet, label).await {
             Ok(()) if !header.is_last() => message.next += 1,
             sent => {
                 let ended = at.and_then(|at| self.messages.remove(at));
                 match (sent, ended) {
-                    // All of it was let in by the link, which has room for the newest then.
+                    // The link has admitted the whole message, so it has room for the newest.
                     (Ok(()), Some(message)) => return message.flow.finish().await,
-                    // The far side gave up this flow, not the link.
+                    // The far side stopped this flow, not the link.
                     (Ok(()) | Err(LinkError::FlowStopped(_)), _) => {}
                     (Err(error), _) => return Err(error),
                 }
@@ -381,7 +384,7 @@ impl Sender {
     async fn flush_by(&mut self) -> Result<(), LinkError> {
         let Some(flow) = &mut self.reliable else { return Ok(()) };
         match flow.flush().await {
-            // The far side gave up this flow, not the link: begin another.
+            // The far side stopped this flow, not the link, so another begins.
             Err(LinkError::FlowStopped(_)) => {
                 self.reliable = None;
                 Ok(())
@@ -394,13 +397,13 @@ impl Sender {
         let mut flow = self.by.open_flow(packet.header.class).await?;
         match flow.send_as(packet, self.label()).await {
             Ok(()) => flow.finish().await,
-            // The far side gave up this flow, not the link.
+            // The far side stopped this flow, not the link.
             Err(LinkError::FlowStopped(_)) => Ok(()),
             Err(error) => Err(error),
         }
     }
 
-    /// A message that is not to be sent: its packets find no flow and go nowhere.
+    /// Drops a message. Its later packets find no flow and are dropped as well.
     fn abandon(&mut self, packet: &Packet) {
         let id = (packet.header.source, packet.header.seq);
         if let Some(at) = self.messages.iter().position(|m| m.id == id)
@@ -465,7 +468,7 @@ mod tests {
             assert_eq!((next.header.seq, next.header.index), (1, index));
             assert!(!flow.is_superseded(&next));
         }
-        // Of those that wait, only the newest is begun.
+        // Of the waiting messages, only the newest begins.
         let mut begun = vec![];
         while flow.queue.bytes() > 0 {
             let (next, _) = flow.at_hand(&mut taken).unwrap();
@@ -477,7 +480,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn of_messages_in_one_packet_the_newest_of_each_source_waits_if_so_wished() {
+    async fn newest_single_packet_message_of_each_source_waits_if_configured() {
         let one = |source: u8, seq| {
             let mut packet = packet(seq, 0);
             (packet.header.source, packet.header.total) = (SourceId([source; 16]), 1000);

@@ -1,6 +1,6 @@
-//! Other fleets: the CAs that the configuration names, and who holds tokens of this node's topics.
+//! Partners: the CAs of other fleets in the configuration, and the tokens of this node's topics.
 //!
-//! It reads and keeps; what follows for a share is the business of `policy`.
+//! It reads and keeps them. `policy` derives the rights at a share.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -18,14 +18,14 @@ use crate::records::{self, Records};
 
 /// Largest file of CA certificates, bytes.
 const CA_FILE_BYTES_MAX: u64 = 256 * 1024;
-/// Largest file of tokens given, bytes.
+/// Largest file of token records, bytes.
 const RECORDS_BYTES_MAX: u64 = 8 * 1024 * 1024;
-/// Most tokens of one node that are in force.
+/// Most valid tokens of one node.
 pub const TOKENS_MAX: usize = 1024;
 const RECORDS_FILE: &str = "partners.json";
 const RECORDS_VERSION: u32 = 1;
 
-/// Reads a file of CA certificates, PEM; what else is in it does not count.
+/// Reads the CA certificates of a PEM file. Other content is ignored.
 pub fn read_ca_file(path: &Path) -> Result<Vec<CertificateDer<'static>>, CaFileError> {
     let mut text = Vec::new();
     let file = fs::File::open(path).map_err(CaFileError::Read)?;
@@ -36,61 +36,61 @@ pub fn read_ca_file(path: &Path) -> Result<Vec<CertificateDer<'static>>, CaFileE
     certificates(&text)
 }
 
-/// The certificates of a PEM text, whatever they are for.
+/// Parses the certificates of a PEM text, whatever their purpose.
 pub fn chain(pem: &[u8]) -> Result<Vec<CertificateDer<'static>>, CaFileError> {
     let certificates = CertificateDer::pem_slice_iter(pem).collect::<Result<Vec<_>, _>>();
     certificates.map_err(|error| CaFileError::Pem(error.to_string()))
 }
 
-/// The CA certificates of a PEM text.
+/// Parses the CA certificates of a PEM text.
 pub fn certificates(pem: &[u8]) -> Result<Vec<CertificateDer<'static>>, CaFileError> {
     let certificates = chain(pem)?;
     TrustAnchors::new(certificates.iter().cloned()).map_err(CaFileError::Certificates)?;
     Ok(certificates)
 }
 
-/// What is wrong with a file of CA certificates.
+/// Reasons why a file of CA certificates cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum CaFileError {
-    /// It cannot be read.
+    /// The file cannot be read.
     #[error("it cannot be read: {0}")]
     Read(io::Error),
-    /// It is too large.
+    /// The file is too large.
     #[error("it has more than {CA_FILE_BYTES_MAX} bytes")]
     TooLarge,
-    /// It is not PEM.
+    /// The file is not PEM.
     #[error("it is not PEM: {0}")]
     Pem(String),
-    /// No CA can be made of it.
+    /// A certificate is no CA certificate.
     #[error("{0}")]
     Certificates(AnchorError),
 }
 
-/// A `[[partner]]`, its CA read.
+/// A `[[partner]]` with its CAs.
 #[derive(Clone, Debug)]
 pub struct Partner {
-    /// Its CAs; more than one where it has an old and a new one.
+    /// Its CAs; more than one during a change of CA.
     pub cas: Vec<CaFingerprint>,
-    /// The nodes that are meant; all of those CAs if there are none.
+    /// The partner's nodes; all nodes of those CAs if empty.
     pub nodes: Vec<NodeId>,
 }
 
-/// All other fleets that concern a node, as of one moment.
+/// All other fleets that concern a node, at one moment.
 #[derive(Clone, Debug, Default)]
 pub struct Partners {
-    /// Those of the configuration.
+    /// Partners of the configuration.
     pub configured: BTreeMap<FleetName, Partner>,
-    /// Tokens in force.
+    /// Valid tokens.
     pub tokens: Vec<TokenGrant>,
-    /// CAs that are to be trusted besides the fleet's own, each once.
+    /// Trusted CAs besides the fleet's own, without duplicates.
     pub certificates: Vec<CertificateDer<'static>>,
-    /// The CAs whose nodes may attach; all that are trusted if there is nothing.
+    /// CAs whose nodes may attach; `None` means all trusted ones.
     pub admitted: Option<BTreeSet<CaFingerprint>>,
-    /// When the first token ends.
+    /// Expiry of the first token.
     pub next_expiry: Option<UnixMillis>,
 }
 
-/// Who may subscribe to a topic because of a token.
+/// Right to subscribe to a topic by a token.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TokenGrant {
     /// Number of the token.
@@ -101,12 +101,12 @@ pub struct TokenGrant {
     pub type_name: String,
     /// The partner's CA.
     pub ca: CaFingerprint,
-    /// The one node that is meant; `None` for all of that CA.
+    /// The partner's node; `None` means all nodes of the CA.
     pub node: Option<NodeId>,
 }
 
 impl Partners {
-    /// Reads what `config` names and which tokens the state directory knows to be in force at `now`.
+    /// Loads the partners of `config` and the tokens of the state directory that are valid at `now`.
     pub fn load(config: &Config, state: Option<&Path>, now: UnixMillis) -> Result<Self, PartnerError> {
         let mut partners = Self::default();
         let read = |path: &Path| {
@@ -156,7 +156,7 @@ impl Partners {
         Ok(partners)
     }
 
-    /// Trusts more CAs.
+    /// Adds trusted CAs.
     pub fn trust(&mut self, certificates: Vec<CertificateDer<'static>>) {
         for certificate in certificates {
             if !self.certificates.contains(&certificate) {
@@ -165,19 +165,19 @@ impl Partners {
         }
     }
 
-    /// `identity`, with these CAs trusted besides its own.
+    /// Returns the trust anchors: those of `identity` and these CAs.
     pub fn extend(&self, identity: &Identity) -> Result<TrustAnchors, AnchorError> {
         identity.anchors().with_anchors(self.certificates.iter().cloned())
     }
 }
 
-/// The tokens that a node gave, `partners.json` in its state directory.
+/// Records of the tokens that a node issued, `partners.json` in its state directory.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TokenRecords {
     version: u32,
-    /// Number of the next token: none is used twice, so that `--withdraw` cannot hit another.
+    /// Number of the next token. Numbers are never reused, so that `--withdraw` cannot hit another.
     next_id: u64,
-    /// Those that were not withdrawn; expired ones leave when another is added.
+    /// Tokens that were not withdrawn. Expired ones are removed when another is added.
     pub tokens: Vec<TokenRecord>,
 }
 
@@ -187,7 +187,7 @@ impl Default for TokenRecords {
     }
 }
 
-/// One token. The token itself is not kept.
+/// Record of one token, without the token itself.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TokenRecord {
     /// Its number.
@@ -199,15 +199,15 @@ pub struct TokenRecord {
     pub type_name: String,
     /// The name that the token leads to, in hexadecimal digits.
     pub name: String,
-    /// SHA-256 of the public key of the partner's CA, in hexadecimal digits; for people.
+    /// SHA-256 of the public key of the partner's CA, hexadecimal digits, for people.
     pub ca: String,
     /// The partner's CA certificate.
     pub ca_pem: String,
-    /// The one node that is meant, in hexadecimal digits.
+    /// The partner's node, hexadecimal digits, if there is one.
     pub node: Option<String>,
-    /// When it was made, milliseconds since 1970.
+    /// Time of creation, milliseconds since 1970.
     pub created: u64,
-    /// Last moment at which it holds, milliseconds since 1970.
+    /// Last moment of validity, milliseconds since 1970.
     pub expires: u64,
 }
 
@@ -227,12 +227,12 @@ impl Records for TokenRecords {
 }
 
 impl TokenRecords {
-    /// Reads them; none if there is no file.
+    /// Loads the records; none if there is no file.
     pub fn load(state: &Path) -> Result<Self, PartnerError> {
         records::load(state)
     }
 
-    /// Changes them on the disk, as nobody else does at the same time.
+    /// Changes the file under its lock.
     pub fn change<T>(
         state: &Path,
         change: impl FnOnce(&mut Self) -> Result<T, PartnerError>,
@@ -240,7 +240,7 @@ impl TokenRecords {
         records::change(state, change)
     }
 
-    /// Adds one, and gives it its number; those that ended before `now` leave.
+    /// Adds a record under a new number and removes those that expired before `now`.
     pub fn add(&mut self, mut record: TokenRecord, now: UnixMillis) -> Result<u64, PartnerError> {
         self.tokens.retain(|known| known.expires > now.0);
         if self.tokens.len() >= TOKENS_MAX {
@@ -252,33 +252,33 @@ impl TokenRecords {
         Ok(self.next_id - 1)
     }
 
-    /// Takes one out.
+    /// Removes a record.
     pub fn withdraw(&mut self, id: u64) -> Result<TokenRecord, PartnerError> {
         let at = self.tokens.iter().position(|known| known.id == id);
         at.map(|at| self.tokens.remove(at)).ok_or(PartnerError::NoSuchToken { id })
     }
 }
 
-/// What is wrong with partners and tokens.
+/// Reasons why partners or tokens cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum PartnerError {
-    /// A file of CA certificates.
+    /// A file of CA certificates cannot be used.
     #[error("CA certificates {}: {source}", path.display())]
     Ca {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         source: CaFileError,
     },
-    /// The file of tokens given.
+    /// The file of records cannot be used.
     #[error("tokens given, {}: {source}", path.display())]
     Records {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         source: io::Error,
     },
-    /// One token of it.
+    /// A record is invalid.
     #[error(
         "token {id} in {RECORDS_FILE} has no usable CA or node; withdraw it: sgc share-token --withdraw {id}"
     )]
@@ -286,7 +286,7 @@ pub enum PartnerError {
         /// Its number.
         id: u64,
     },
-    /// Too many tokens.
+    /// There are too many tokens.
     #[error(
         "{TOKENS_MAX} tokens are in force, which is the limit: withdraw some, or name the partner in a [[partner]]"
     )]

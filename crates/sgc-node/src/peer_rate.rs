@@ -1,7 +1,7 @@
-//! How much data one peer may send into this node: a bucket for each node id, whatever number of links it has.
+//! Rate limit of each peer: one bucket per node id, whatever number of links it has.
 //!
-//! What can wait is slowed, so that the transport pushes back to the peer; what cannot is dropped. No lock on the way of
-//! a packet; without a limit nothing at all. Control frames are the router machine's to limit.
+//! Packets that can wait are delayed, so that the transport slows the peer; others are dropped. The packet path takes
+//! no lock, and does nothing without a limit. The router machine limits control frames.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
@@ -11,20 +11,20 @@ use std::time::{Duration, Instant};
 use sgc_wire::NodeId;
 use tracing::warn;
 
-/// How much of its rate a peer may save up: this much time's worth, at least [`BURST_BYTES_MIN`].
+/// Time's worth of rate that a peer may save up, at least [`BURST_BYTES_MIN`].
 const BURST: Duration = Duration::from_millis(250);
-/// Several of the longest packets.
+/// Room for several of the longest packets.
 const BURST_BYTES_MIN: u64 = 256 << 10;
-/// Peers that are remembered without a link, since they have not paid for what they sent; beyond it one is forgotten.
+/// Most peers without a link that are remembered until they have paid for their traffic. Beyond it, one is forgotten.
 const PEERS_MAX: usize = 4096;
 
 /// The buckets of all peers.
 #[derive(Debug)]
 pub(crate) struct PeerRates {
     limit: Option<Limit>,
-    /// Looked at when links begin, and for the status.
+    /// Buckets by peer. They are looked up when a link begins and for the status.
     peers: Mutex<BTreeMap<NodeId, Arc<PeerRate>>>,
-    /// Packets dropped of peers that are forgotten.
+    /// Packets dropped of forgotten peers.
     gone: AtomicU64,
 }
 
@@ -32,7 +32,7 @@ pub(crate) struct PeerRates {
 struct Limit {
     bits_per_second: u64,
     burst_ns: u64,
-    /// Of the clock below.
+    /// Origin of the nanosecond clock.
     origin: Instant,
 }
 
@@ -43,7 +43,7 @@ impl Default for PeerRates {
 }
 
 impl PeerRates {
-    /// The same limit for every peer, in bits a second.
+    /// Creates buckets with the same limit for every peer, in bits a second.
     pub(crate) fn new(limit: Option<u64>) -> Self {
         let limit = limit.map(|bits_per_second| {
             let mut limit = Limit { bits_per_second, burst_ns: 0, origin: Instant::now() };
@@ -53,13 +53,13 @@ impl PeerRates {
         Self { limit, peers: Mutex::default(), gone: AtomicU64::new(0) }
     }
 
-    /// The bucket of a peer that has a link now, if there is a limit. It outlives the link until what was sent is paid
-    /// for, so that linking again gains nothing.
-    pub(crate) fn of(&self, peer: NodeId) -> Option<Arc<PeerRate>> {
-        self.of_at(self.limit?.now(), peer)
+    /// Returns the bucket of a peer with a link, if there is a limit. It outlives the link until the traffic is paid
+    /// for, so that reconnecting gains nothing.
+    pub(crate) fn for_peer(&self, peer: NodeId) -> Option<Arc<PeerRate>> {
+        self.for_peer_at(self.limit?.now(), peer)
     }
 
-    fn of_at(&self, now: u64, peer: NodeId) -> Option<Arc<PeerRate>> {
+    fn for_peer_at(&self, now: u64, peer: NodeId) -> Option<Arc<PeerRate>> {
         let limit = self.limit?;
         let mut peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
         peers.retain(|id, rate| {
@@ -77,13 +77,13 @@ impl PeerRates {
         Some(peers.entry(peer).or_insert_with(|| Arc::new(PeerRate::new(peer, limit))).clone())
     }
 
-    /// What was slowed and dropped of a peer.
+    /// Returns the counts of delayed and dropped packets of a peer.
     pub(crate) fn over(&self, peer: &NodeId) -> Over {
         let peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
         peers.get(peer).map(|rate| rate.over()).unwrap_or_default()
     }
 
-    /// Drops: of all peers, and by peer of those that have a link.
+    /// Returns the drops of all peers, and of each peer with a link.
     pub(crate) fn drops(&self) -> BTreeMap<String, u64> {
         let peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
         let (mut drops, mut all) = (BTreeMap::new(), self.gone.load(Relaxed));
@@ -104,7 +104,7 @@ impl Limit {
         nanos(self.origin.elapsed())
     }
 
-    /// How long a peer takes to earn so many bytes.
+    /// Returns the time in which a peer earns this many bytes.
     fn cost_ns(&self, bytes: u64) -> u64 {
         let ns = u128::from(bytes) * 8_000_000_000 / u128::from(self.bits_per_second.max(1));
         ns.try_into().unwrap_or(u64::MAX)
@@ -115,23 +115,23 @@ fn nanos(time: Duration) -> u64 {
     time.as_nanos().try_into().unwrap_or(u64::MAX)
 }
 
-/// Packets of a peer that were over its rate.
+/// Packets of a peer beyond its rate.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Over {
-    /// Taken in later.
+    /// Delayed packets.
     pub slowed: u64,
-    /// Not taken in.
+    /// Dropped packets.
     pub dropped: u64,
 }
 
-/// The bucket of one peer, as the time at which all that was taken is paid for (the generic cell rate algorithm).
+/// The bucket of one peer: the time at which all received traffic is paid for (generic cell rate algorithm).
 #[derive(Debug)]
 pub(crate) struct PeerRate {
     peer: NodeId,
     limit: Limit,
-    /// For all packets.
+    /// Time at which all packets are paid for.
     all_ns: AtomicU64,
-    /// For those that could not wait: they go before the others, within the same rate.
+    /// Time at which the packets that cannot wait are paid for. They precede the others within the same rate.
     hasty_ns: AtomicU64,
     slowed: AtomicU64,
     dropped: AtomicU64,
@@ -151,12 +151,12 @@ impl PeerRate {
         }
     }
 
-    /// Takes bytes that cannot wait; false if they are to be dropped, which is counted.
+    /// Takes bytes that cannot wait. Returns `false` if they must be dropped, which is counted.
     pub(crate) fn take_now(&self, bytes: usize) -> bool {
         self.take_now_at(self.limit.now(), bytes)
     }
 
-    /// Takes bytes that can wait, for as long as is returned.
+    /// Takes bytes that can wait. Returns the delay.
     pub(crate) fn take_later(&self, bytes: usize) -> Duration {
         self.take_later_at(self.limit.now(), bytes)
     }
@@ -184,10 +184,10 @@ impl PeerRate {
         wait
     }
 
-    /// When all is paid for that was taken, this included.
+    /// Charges a cost. Returns the time at which everything is paid for, this included.
     fn charge(&self, now: u64, cost: u64) -> u64 {
         let after = |paid: u64| paid.max(now).saturating_add(cost);
-        // It never fails: the closure always has a value.
+        // This cannot fail, since the closure always returns a value.
         let before = self.all_ns.fetch_update(Relaxed, Relaxed, |paid| Some(after(paid)));
         after(before.unwrap_or_else(|paid| paid))
     }
@@ -214,30 +214,30 @@ mod tests {
     const PACKET: usize = 1000;
     const SECOND: u64 = 1_000_000_000;
 
-    /// 8 Mbit/s: a packet a millisecond, and 262 144 bytes at once.
+    /// 8 Mbit/s: one packet a millisecond, and 262 144 bytes at once.
     fn rate() -> Arc<PeerRate> {
-        PeerRates::new(Some(8_000_000)).of(NodeId([1; 32])).unwrap()
+        PeerRates::new(Some(8_000_000)).for_peer(NodeId([1; 32])).unwrap()
     }
 
     #[test]
-    fn what_cannot_wait_passes_at_the_rate_and_no_faster() {
+    fn packets_that_cannot_wait_pass_at_most_at_the_peer_rate() {
         let rate = rate();
         let passed = |now| (0..2000).filter(|_| rate.take_now_at(now, PACKET)).count();
         assert_eq!(passed(0), 262);
         assert_eq!(passed(SECOND / 10), 100);
-        // What is saved up is bounded.
+        // Savings are bounded.
         assert_eq!(passed(100 * SECOND), 262);
         assert_eq!(rate.over(), Over { slowed: 0, dropped: 3 * 2000 - 262 - 100 - 262 });
     }
 
     #[test]
-    fn what_can_wait_takes_what_the_hasty_leave() {
+    fn packets_that_can_wait_use_the_remaining_rate() {
         let rate = rate();
         let mut now = 0;
         let mut hasty = 0;
         for _ in 0..4000 {
             now += nanos(rate.take_later_at(now, PACKET));
-            // Half of the rate.
+            // These use half of the rate.
             while hasty < now / 2_000_000 {
                 assert!(rate.take_now_at(now, PACKET));
                 hasty += 1;
@@ -247,7 +247,7 @@ mod tests {
         let all = (4000 + hasty) as f64;
         assert!((all - 262.0 - seconds * 1000.0).abs() < 10.0, "{all} in {seconds} s");
         assert!(rate.over().slowed > 3000 && rate.over().dropped == 0);
-        // And it does not keep those from passing.
+        // The delayed packets do not keep the others from passing.
         for _ in 0..10_000 {
             rate.take_later_at(now, PACKET);
         }
@@ -258,7 +258,7 @@ mod tests {
     #[test]
     fn linking_again_gains_nothing() {
         let rates = PeerRates::new(Some(8_000_000));
-        let of = |now, id| rates.of_at(now, NodeId([id; 32])).unwrap();
+        let of = |now, id| rates.for_peer_at(now, NodeId([id; 32])).unwrap();
         let first = of(0, 1);
         assert!(Arc::ptr_eq(&first, &of(0, 1)));
         while first.take_now_at(0, PACKET) {}
@@ -266,7 +266,7 @@ mod tests {
         assert!(of(SECOND / 10, 2).take_now_at(SECOND / 10, 200 * PACKET));
         assert!(!of(SECOND / 10, 1).take_now_at(SECOND / 10, 200 * PACKET));
         assert_eq!((rates.drops()["over_rate"], rates.over(&NodeId([1; 32])).dropped), (2, 2));
-        // Who has paid is forgotten.
+        // A peer that has paid is forgotten.
         assert!(of(SECOND, 3).take_now_at(SECOND, PACKET));
         assert_eq!(
             rates.drops(),
@@ -274,6 +274,6 @@ mod tests {
             "and its drops are in the total"
         );
         let one = NodeId([1; 32]);
-        assert!(PeerRates::new(None).of(one).is_none());
+        assert!(PeerRates::new(None).for_peer(one).is_none());
     }
 }

@@ -1,6 +1,7 @@
-//! Who may join a share: from what the user wrote to a [`Policy`], and back to the words that admit somebody.
+//! Policies of shares: builds a [`Policy`] from the configuration, and explains a decision in the words of the
+//! configuration.
 //!
-//! It decides nothing: the policy does, at the owner, when a join arrives. [`explain`] asks the same policy.
+//! The owner's policy decides when a join arrives. [`explain`] asks the same policy.
 
 use std::fmt::Write as _;
 
@@ -11,12 +12,12 @@ use sgc_wire::{GroupTag, Kind, Metadata, NodeId, Role};
 use crate::config::{Recipient, ShareConfig};
 use crate::partners::Partners;
 
-/// Who is asked about: what a certificate proves of its node.
+/// A node as its certificate proves it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Subject {
     /// The node.
     pub node: NodeId,
-    /// The CA that vouches for it.
+    /// The CA that certified it.
     pub ca: CaFingerprint,
     /// Its groups, sorted.
     pub groups: Vec<GroupTag>,
@@ -28,20 +29,20 @@ impl From<&VerifiedPeer> for Subject {
     }
 }
 
-/// What becomes of a request, and why.
+/// Decision about a request, with its reason.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Verdict {
-    /// It is granted.
+    /// Whether it is granted.
     pub permitted: bool,
-    /// The entry that admits, or why none does.
+    /// The entry that admits the node, or the reason why none does.
     pub because: String,
 }
 
-/// The policy of a share.
+/// Returns the policy of a share.
 pub fn policy(share: &ShareConfig, identity: &Identity, partners: &Partners) -> Policy {
     let all = |recipients: &[Recipient]| grantees(recipients, identity, partners);
     let mut policy = Policy { subscribe: all(&share.to), publish: all(&share.publish) };
-    // Tokens are for topics.
+    // Tokens exist for topics only.
     if share.interface != Interface::Topic {
         return policy;
     }
@@ -54,7 +55,7 @@ pub fn policy(share: &ShareConfig, identity: &Identity, partners: &Partners) -> 
     policy
 }
 
-/// What the machine needs to know of a share: a rule for each topic and each service that it is made of.
+/// Returns the route rules of a share, one for each topic and service.
 pub fn share_rules(share: &ShareConfig, identity: &Identity, partners: &Partners) -> Vec<ShareRule> {
     let whole = metadata(share, identity.node_name().as_str());
     let policy = policy(share, identity, partners);
@@ -67,7 +68,7 @@ pub fn share_rules(share: &ShareConfig, identity: &Identity, partners: &Partners
         },
         naming: share.naming.for_part(part),
         policy: match part.kind {
-            // Who calls publishes; nobody hears what others ask.
+            // A client publishes requests, and nobody subscribes to them.
             Kind::Service => Policy { subscribe: Grantees::default(), publish: policy.subscribe.clone() },
             _ => policy.clone(),
         },
@@ -80,7 +81,7 @@ pub fn share_rules(share: &ShareConfig, identity: &Identity, partners: &Partners
     share.interface.parts().iter().map(rule).collect()
 }
 
-/// What the name of a share of `owner` follows from. One with a wildcard has as many names as there are topics that match.
+/// Returns the metadata of a share's name. A pattern has one name for each matching topic.
 pub fn metadata(share: &ShareConfig, owner: &str) -> Metadata {
     metadata_as(share, owner, &share.naming.renamed(&share.topic, &share.topic))
 }
@@ -99,7 +100,7 @@ fn metadata_as(share: &ShareConfig, owner: &str, topic: &str) -> Metadata {
     }
 }
 
-/// Whether `subject` may join a share as `role`, and which entry says so.
+/// Returns whether `subject` may join a share as `role`, and the deciding entry.
 pub fn explain(
     share: &ShareConfig,
     identity: &Identity,
@@ -123,7 +124,7 @@ pub fn explain(
         finds(&only)
     };
     if let Some(recipient) = entries.iter().find(admits) {
-        let because = format!("`{key}` names \"{recipient}\": {}", what_admits(recipient, partners));
+        let because = format!("`{key}` names \"{recipient}\": {}", admission_reason(recipient, partners));
         return Verdict { permitted, because };
     }
     let token = tokens_of(share, partners).find(|grant| match grant.node {
@@ -145,7 +146,7 @@ fn tokens_of<'p>(
     })
 }
 
-/// Whom these words name.
+/// Returns the grantees that these recipients name.
 pub(crate) fn grantees(recipients: &[Recipient], identity: &Identity, partners: &Partners) -> Grantees {
     let mut all = Grantees::default();
     recipients.iter().for_each(|recipient| add(&mut all, recipient, identity, partners));
@@ -171,7 +172,7 @@ fn add(set: &mut Grantees, recipient: &Recipient, identity: &Identity, partners:
     }
 }
 
-fn what_admits(recipient: &Recipient, partners: &Partners) -> &'static str {
+fn admission_reason(recipient: &Recipient, partners: &Partners) -> &'static str {
     match recipient {
         Recipient::Everyone => "it is a member of this fleet",
         Recipient::Node(_) => "that is this node",

@@ -1,31 +1,32 @@
-//! The log lines about what is wrong between the two sides: programs of the local network cannot fill the log with types and QoS that change all the time.
+//! Log of problems between the two sides. It is rate-limited, so that local programs with ever changing types and QoS
+//! cannot fill it.
 //!
-//! Present problems are in `status` and `why`, whether they were logged or not.
+//! `status` and `why` show current problems, whether they were logged or not.
 
 use std::fmt::Display;
 use std::time::{Duration, Instant};
 
 use tracing::{debug, warn};
 
-/// Problems logged at once.
+/// Most problems logged at once.
 const LINES_MAX: u32 = 64;
-/// Time in which one more may be.
+/// Time after which one more may be logged.
 const LINE_EVERY: Duration = Duration::from_secs(1);
 
-/// Lines about problems.
+/// Rate limiter of log lines about problems.
 #[derive(Debug, Default)]
 pub(crate) struct ProblemLog {
-    /// When all lines of [`LINES_MAX`] may be logged again.
+    /// Time at which all [`LINES_MAX`] lines are available again.
     full_at: Option<Instant>,
     left_out: u64,
 }
 
 impl ProblemLog {
-    /// Logs a problem, or counts it if there were too many of late.
+    /// Logs a problem, or only counts it if there were too many recently.
     pub(crate) fn note(&mut self, now: Instant, problem: &impl Display) {
         match self.line(now, problem) {
             Some(line) => warn!("{line}"),
-            None => debug!("{}", one_line(problem)),
+            None => debug!("{}", single_line(problem)),
         }
     }
 
@@ -36,7 +37,7 @@ impl ProblemLog {
             return None;
         }
         self.full_at = Some(full_at);
-        let line = one_line(problem);
+        let line = single_line(problem);
         Some(match std::mem::take(&mut self.left_out) {
             0 => line,
             more => format!("{line} (and {more} more since the last such line: see `sgc why`)"),
@@ -44,8 +45,8 @@ impl ProblemLog {
     }
 }
 
-/// The text without what would begin another line, or what a terminal would take for orders: names of types are anybody's.
-fn one_line(problem: &impl Display) -> String {
+/// Removes line breaks and control characters, since anybody can choose the names of types.
+fn single_line(problem: &impl Display) -> String {
     problem
         .to_string()
         .chars()

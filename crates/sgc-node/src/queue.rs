@@ -1,7 +1,7 @@
-//! A bounded queue between two tasks: bounded in items and in bytes, lock-free in the common case.
+//! A queue between two tasks, bounded in items and in bytes, lock-free in the common case, for one consumer.
 //!
-//! Who pushes decides what a full queue means: [`Queue::push`] waits for room (reliable traffic),
-//! [`Queue::push_evicting`] makes room by dropping the oldest (best effort). One consumer.
+//! The producer chooses the behaviour of a full queue: [`Queue::push`] waits for room (reliable traffic), and
+//! [`Queue::push_evicting`] drops the oldest items (best effort).
 
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
@@ -9,28 +9,28 @@ use std::time::Duration;
 use crossbeam_queue::ArrayQueue;
 use tokio::sync::Notify;
 
-/// Why an item was not queued.
+/// Reasons why an item was not queued.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum PushError {
     /// The consumer is gone.
     Closed,
-    /// The consumer took nothing for as long as the producer may wait.
+    /// The consumer took nothing during the producer's patience.
     Stalled,
 }
 
-/// The queue.
+/// A bounded queue with one consumer.
 pub(crate) struct Queue<T> {
     items: ArrayQueue<(T, usize)>,
     bytes: AtomicUsize,
     closed: AtomicBool,
-    /// Set when a producer gave up waiting; the next does not wait until the consumer moves again.
+    /// Set when a producer gave up waiting. Others do not wait until the consumer moves again.
     stalled: AtomicBool,
     filled: Notify,
     drained: Notify,
 }
 
 impl<T> Queue<T> {
-    /// A queue of at most `items_max` items. Bytes are bounded at each push; one item may exceed the bound.
+    /// Creates a queue of at most `items_max` items. Each push bounds the bytes; one item may exceed the bound.
     pub(crate) fn new(items_max: usize) -> Self {
         Self {
             items: ArrayQueue::new(items_max),
@@ -42,7 +42,7 @@ impl<T> Queue<T> {
         }
     }
 
-    /// Queues an item, waiting for at most `patience` until it and what is queued are within `bytes_max`.
+    /// Queues an item. Waits at most `patience` until everything fits into `bytes_max`.
     pub(crate) async fn push(
         &self,
         item: T,
@@ -59,7 +59,7 @@ impl<T> Queue<T> {
             let drained = self.drained.notified();
             tokio::pin!(drained);
             drained.as_mut().enable();
-            // Between the last try and `enable` the consumer may have moved.
+            // The consumer may have moved between the last attempt and `enable`.
             match self.try_push(item, bytes, bytes_max) {
                 Ok(()) => return Ok(()),
                 Err(back) => item = back,
@@ -74,8 +74,7 @@ impl<T> Queue<T> {
         }
     }
 
-    /// Queues an item; while there are more than `bytes_max`, what has waited longest makes room and is handed to
-    /// `evicted`.
+    /// Queues an item. While there are more than `bytes_max`, the oldest items are passed to `evicted`.
     pub(crate) fn push_evicting(&self, item: T, bytes: usize, bytes_max: usize, mut evicted: impl FnMut(T)) {
         while !self.has_room(bytes, bytes_max) {
             let Some(old) = self.take() else { break };
@@ -89,7 +88,7 @@ impl<T> Queue<T> {
         self.filled.notify_one();
     }
 
-    /// Takes the oldest item, waiting for one; `None` once the queue is closed and empty.
+    /// Waits for the oldest item and removes it. Returns `None` once the queue is closed and empty.
     pub(crate) async fn pop(&self) -> Option<T> {
         loop {
             if let Some(item) = self.take() {
@@ -102,7 +101,7 @@ impl<T> Queue<T> {
         }
     }
 
-    /// Waits until an item is there; false once the queue is closed and empty.
+    /// Waits for an item. Returns `false` once the queue is closed and empty.
     pub(crate) async fn wait(&self) -> bool {
         loop {
             let is_closed = self.is_closed();
@@ -116,40 +115,40 @@ impl<T> Queue<T> {
         }
     }
 
-    /// Takes the oldest item, if there is one.
+    /// Removes the oldest item, if there is one.
     pub(crate) fn try_pop(&self) -> Option<T> {
         self.take()
     }
 
-    /// Ends the queue: nothing more is accepted, what is in it can still be taken.
+    /// Closes the queue. It accepts no more items, and queued ones can still be taken.
     pub(crate) fn close(&self) {
         self.closed.store(true, Ordering::Release);
         self.filled.notify_one();
         self.drained.notify_waiters();
     }
 
-    /// True if nothing waits.
+    /// Returns `true` if the queue is empty.
     pub(crate) fn is_empty(&self) -> bool {
         self.items.is_empty()
     }
 
-    /// True while it is less than half full.
-    pub(crate) fn is_at_ease(&self, bytes_max: usize) -> bool {
+    /// Returns `true` if the queue is less than half full.
+    pub(crate) fn has_headroom(&self, bytes_max: usize) -> bool {
         self.items.len() < self.items.capacity() / 2 && self.bytes.load(Ordering::Acquire) < bytes_max / 2
     }
 
-    /// Bytes that wait.
+    /// Returns the number of queued bytes.
     #[cfg(test)]
     pub(crate) fn bytes(&self) -> usize {
         self.bytes.load(Ordering::Acquire)
     }
 
-    /// True once closed.
+    /// Returns `true` if the queue is closed.
     pub(crate) fn is_closed(&self) -> bool {
         self.closed.load(Ordering::Acquire)
     }
 
-    /// Queues an item if there is room; else gives it back.
+    /// Queues an item if there is room, or returns it.
     pub(crate) fn try_push(&self, item: T, bytes: usize, bytes_max: usize) -> Result<(), T> {
         if self.is_closed() || !self.has_room(bytes, bytes_max) {
             return Err(item);
@@ -199,7 +198,7 @@ mod tests {
             async move { queue.push(3, 6, 10, Duration::from_secs(60)).await }
         });
         assert_eq!(queue.pop().await, Some(1));
-        // It may have failed fast on the stall before the pop; after the pop it must succeed.
+        // This push may have failed at once, because of the stall before the pop. After the pop, one must succeed.
         if waiting.await.unwrap().is_err() {
             queue.push(3, 6, 10, Duration::from_secs(60)).await.unwrap();
         }
@@ -220,7 +219,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_is_queued_survives_the_close_and_nothing_else_does() {
+    async fn closed_queue_keeps_queued_items_and_takes_no_new_ones() {
         let queue = Queue::new(3);
         queue.push(1, 1, 10, PATIENCE).await.unwrap();
         queue.close();

@@ -1,6 +1,6 @@
-//! [`Records`]: what a node keeps of what it gave away, a JSON file with a version in its state directory.
+//! [`Records`]: records that a node keeps in its state directory, as a JSON file with a version.
 //!
-//! It reads and replaces such files; what stands in them, and what follows from it, those know who keep them.
+//! This module reads and replaces such files. The implementors know their content and its consequences.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -10,25 +10,25 @@ use serde::de::DeserializeOwned;
 
 use crate::state::{self, StateLock};
 
-/// A kind of records; without a file there are those of `default`.
+/// A kind of records. Without a file, they are those of `default`.
 pub(crate) trait Records: Default + Serialize + DeserializeOwned {
-    /// What goes wrong with them.
+    /// Error of this kind of records.
     type Error;
     /// Name of the file.
     const FILE: &str;
-    /// Its largest size, bytes.
+    /// Largest size of the file, bytes.
     const BYTES_MAX: u64;
-    /// The only version that is known here.
+    /// The supported version.
     const VERSION: u32;
 
-    /// The version that they say they have.
+    /// Returns the version of these records.
     fn version(&self) -> u32;
 
-    /// The file cannot be read or replaced.
+    /// Returns the error for a file that cannot be read or replaced.
     fn failed(path: PathBuf, source: io::Error) -> Self::Error;
 }
 
-/// Reads them; one that cannot be read is an error, since nobody knows then what was given or taken back.
+/// Loads the records. An unreadable file is an error, since grants and revocations are unknown then.
 pub(crate) fn load<R: Records>(state: &Path) -> Result<R, R::Error> {
     let path = state.join(R::FILE);
     let read = || {
@@ -42,7 +42,7 @@ pub(crate) fn load<R: Records>(state: &Path) -> Result<R, R::Error> {
     read().map_err(|source| R::failed(path.clone(), source))
 }
 
-/// Changes them on the disk, as nobody else does at the same time.
+/// Changes the file under its lock.
 pub(crate) fn change<R: Records, T>(
     state: &Path,
     change: impl FnOnce(&mut R) -> Result<T, R::Error>,

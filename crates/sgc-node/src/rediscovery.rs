@@ -1,7 +1,8 @@
-//! [`Rediscovery`]: what a node knew of its local network when it opened it again, until it finds it there again.
+//! [`Rediscovery`]: the endpoints and nodes that were known before the local network was reopened, until they are found
+//! again.
 //!
-//! Pure. An endpoint that is found as it was known is no news, so that its routes, sources and calls go on. What is not found in time is
-//! told as gone.
+//! A pure machine. An unchanged endpoint that is found again is no news, so its routes, sources and calls continue.
+//! Endpoints that are not found in time are reported as gone.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
@@ -17,7 +18,7 @@ pub(crate) struct Rediscovery {
 }
 
 impl Rediscovery {
-    /// Begins with what is known of a network that is closed.
+    /// Starts with the endpoints and nodes of a closed network.
     pub(crate) fn new(
         endpoints: impl IntoIterator<Item = DiscoveredEndpoint>,
         participants: impl IntoIterator<Item = Guid>,
@@ -31,7 +32,7 @@ impl Rediscovery {
         self.until = Some(now + REDISCOVERY_HOLD);
     }
 
-    /// Takes what is discovered, and returns it if it is news.
+    /// Handles a discovery event. Returns it if it is news.
     pub(crate) fn news(&mut self, event: DiscoveryEvent) -> Option<DiscoveryEvent> {
         match &event {
             DiscoveryEvent::Appeared(endpoint) => {
@@ -47,12 +48,12 @@ impl Rediscovery {
         Some(event)
     }
 
-    /// Returns when what is not found counts as gone.
+    /// Returns the time at which missing endpoints count as gone.
     pub(crate) fn deadline(&self) -> Option<Instant> {
         self.until
     }
 
-    /// Tells what is gone, once its time has come.
+    /// Returns the missing endpoints once their time is over.
     pub(crate) fn handle_timeout(&mut self, now: Instant) -> Vec<DiscoveryEvent> {
         if self.until.take_if(|until| *until <= now).is_none() {
             return Vec::new();
@@ -65,7 +66,7 @@ impl Rediscovery {
     }
 }
 
-/// Returns `true` if an endpoint is found as it was known. The depth of a history may have been learned besides what is announced.
+/// Returns `true` if an endpoint is unchanged. The depth of its history may have been learned beyond its announcement.
 fn is_same(known: &DiscoveredEndpoint, found: &DiscoveredEndpoint) -> bool {
     let mut found = found.clone();
     if found.qos.history.is_unsaid() {
@@ -104,7 +105,7 @@ mod tests {
         found.qos.history = History::UNSAID;
         let mut rediscovery = Rediscovery::new([known, endpoint(2)], []);
         assert_eq!(rediscovery.news(DiscoveryEvent::Appeared(found.clone())), None);
-        // The second time it is.
+        // The second time, it is news.
         let again = DiscoveryEvent::Appeared(found);
         assert_eq!(rediscovery.news(again.clone()), Some(again));
         let changed = DiscoveredEndpoint { type_hash: Some("RIHS01_0".into()), ..endpoint(2) };

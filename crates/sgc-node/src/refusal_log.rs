@@ -1,4 +1,4 @@
-//! The log lines about peers that are refused a link: strangers cannot fill the log by connecting again and again.
+//! Log of peers that are refused a link. It is rate-limited, so that strangers cannot fill it by reconnecting.
 //!
 //! Counters and the audit log are elsewhere (`sgc-transport` `metrics.rs`, `audit.rs`).
 
@@ -13,17 +13,17 @@ use tracing::{debug, warn};
 #[derive(Default)]
 pub(crate) struct RefusalLog {
     repeats: Repeats<RefusalKind>,
-    /// CAs whose nodes are not admitted, at most one for each CA that is trusted.
+    /// CAs whose refusal was logged, at most one for each trusted CA.
     strangers: BTreeSet<CaFingerprint>,
 }
 
 impl RefusalLog {
-    /// Logs a refusal, or counts it if the same address was refused for the same reason of late.
+    /// Logs a refusal, or only counts it if the same address was refused for the same reason recently.
     pub(crate) fn note(&mut self, refused: &RefusedPeer) {
         let prefix = AddressPrefix::from(refused.remote.ip());
         let is_first = self.repeats.note(prefix, refused.reason.kind(), Instant::now().into_std());
         let is_known_stranger = match &refused.reason {
-            // It is said once what to do about it.
+            // The log explains the fix once per CA.
             Refusal::Certificate(CertError::NotAdmitted { ca }) => !self.strangers.insert(*ca),
             _ => false,
         };
@@ -42,12 +42,12 @@ impl RefusalLog {
         }
     }
 
-    /// Logs how many refusals were counted.
+    /// Logs the number of counted refusals.
     pub(crate) fn summarise(&mut self) {
         for RepeatCount { source, count, within } in self.repeats.take_due(Instant::now().into_std()) {
             let seconds = within.as_secs();
             match source {
-                // They were named once, which is all there is to say.
+                // They were named once, and a count adds nothing.
                 Some((_, RefusalKind::NotAdmitted)) => {}
                 Some((prefix, kind)) => {
                     let kind = kind.label();
@@ -131,7 +131,7 @@ mod tests {
         assert_eq!(said.len(), 1, "{said:#?}");
         let expected = "10.0.0.66 is refused: … and 312 more like it in 10 s (timed_out)";
         assert!(said[0].ends_with(expected), "{said:?}");
-        // Nor does it with an address for each.
+        // Other addresses do not help it either.
         for n in 0..10_000_u32 {
             log.note(&refused(&std::net::Ipv4Addr::from(0x0b00_0000 + n).to_string(), late()));
         }

@@ -1,6 +1,7 @@
-//! Another configuration for a running node: read whole, judged whole, and only then what differs is carried out.
+//! Reload: applies another configuration to a running node. The whole configuration is read and judged before anything
+//! changes.
 //!
-//! It works out what changed; the route machine changes it.
+//! This module computes the differences; the route machine carries them out.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -27,30 +28,30 @@ use crate::audit::{Audit, AuditEvent, AuditRecord};
 use crate::config::{Config, ConfigErrors, GatewayConfig, RosConfig, RouterUrl};
 use crate::core::{CoreEvent, now};
 use crate::credentials::with_kept_crls;
-use crate::finding::{self, Board, Holder};
+use crate::discovery::{self, Board, LinkKeeper};
 use crate::gateway::{Gateway, ShownKey, key_of_files};
 use crate::message_keys::{MessageKeys, make_for};
 use crate::node::NodeError;
 use crate::rules::Rules;
 
-/// Reads the configuration again as it was read at start.
+/// Reads the configuration from the same source as at start.
 pub type ConfigSource = Arc<dyn Fn() -> Result<Config, ConfigErrors> + Send + Sync>;
 
-/// Longest wait before policies are looked at again: a wall clock that is set must not keep a token in force.
+/// Longest wait before expired tokens are searched again, so that setting the wall clock keeps no token in force.
 const EXPIRY_CHECK_MAX: Duration = Duration::from_secs(60);
 
-/// What a reload did.
+/// Result of a reload.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ReloadReport {
-    /// What changed, one line each; empty if nothing did.
+    /// Changes, one line each.
     pub changed: Vec<String>,
-    /// What the file says that holds only after a restart.
+    /// Changes that take effect only after a restart.
     pub needs_restart: Vec<String>,
-    /// What is wrong and stops nothing.
+    /// Warnings about the new configuration.
     pub warnings: Vec<String>,
 }
 
-/// The configuration that runs, and how to come to another.
+/// The running configuration, with everything that a reload needs.
 pub(crate) struct Reloader {
     pub(crate) source: Option<ConfigSource>,
     pub(crate) identity: Arc<Identity>,
@@ -58,38 +59,38 @@ pub(crate) struct Reloader {
     pub(crate) state: Option<PathBuf>,
     pub(crate) audit: Audit,
     pub(crate) events: mpsc::Sender<CoreEvent>,
-    /// Joins the local network if the node began without one; blocks. `None` where there is no way to one.
+    /// Joins the local network if the node began without one; blocks. `None` if the node cannot join one.
     pub(crate) join: Option<JoinNetwork>,
-    /// True if there is a local network to share with.
+    /// Whether there is a local network.
     pub(crate) has_ros: AtomicBool,
-    /// The dialler for routers of tokens that come later.
-    pub(crate) holder: Holder,
+    /// Dials the routers of tokens that are added later.
+    pub(crate) keeper: LinkKeeper,
     pub(crate) board: Board,
     pub(crate) dialling: std::sync::Mutex<Vec<JoinHandle<()>>>,
     pub(crate) gateway: Arc<Gateway>,
     pub(crate) running: Mutex<Running>,
-    /// Told when there is another time to wait for.
+    /// Notified when the time of the next expiry changes.
     pub(crate) changed: Notify,
 }
 
-/// Joins the local network that a configuration describes, as the node of an identity; blocks.
+/// Joins the local network of a configuration with an identity; blocks.
 pub(crate) type JoinNetwork = Arc<dyn Fn(&RosConfig, &Identity) -> Result<(), String> + Send + Sync>;
 
-/// What runs now.
+/// The current configuration and its consequences.
 pub(crate) struct Running {
-    /// What restart-only settings were at start, and the others are now.
+    /// Restart-only settings as they were at start, the others as they are now.
     pub(crate) config: Config,
     pub(crate) rules: Rules,
-    /// Routers of tokens that are dialled; no task of them ends before the node does.
+    /// Routers of tokens that are dialled. Their tasks end with the node.
     pub(crate) dialled: Vec<RouterUrl>,
-    /// For which there are keys to sign with.
+    /// Suites with a signing key.
     pub(crate) suites: BTreeSet<Suite>,
 }
 
-/// What has to be there before another configuration is carried out.
-struct Prepared {
+/// Everything that has to exist before a configuration is applied.
+struct PreparedReload {
     rules: Rules,
-    /// Whom to believe; nothing if that is as it was.
+    /// New trust anchors; `None` if they are unchanged.
     anchors: Option<TrustAnchors>,
     message_keys: MessageKeys,
     /// The gateway's access rules, and its certificate if that is not the node's own; `None` without a gateway.
@@ -97,16 +98,16 @@ struct Prepared {
 }
 
 impl Reloader {
-    /// What runs.
+    /// Returns the running configuration.
     pub(crate) async fn config(&self) -> Config {
         self.running.lock().await.config.clone()
     }
 
-    /// Reads the configuration again. An error means that nothing was touched.
+    /// Reads and applies the configuration. After an error nothing has changed.
     pub(crate) async fn reload(&self, by: &str) -> Result<ReloadReport, String> {
         let result = self.try_reload().await;
         let record = AuditRecord::new(AuditEvent::Reload).by(by);
-        // A node that stops shows nothing any more.
+        // A stopping node shows no alerts, so a failure to send is ignored.
         let read = CoreEvent::ConfigurationRead { mistakes: result.as_ref().err().cloned() };
         let _ = self.events.send(read).await;
         match &result {
@@ -130,7 +131,7 @@ impl Reloader {
 
     async fn try_reload(&self) -> Result<ReloadReport, String> {
         let source = self.source.clone().ok_or("this node cannot read its configuration again")?;
-        // One at a time: what was read first is not carried out last.
+        // Reloads run one at a time, so that the configuration that was read last is applied last.
         let mut running = self.running.lock().await;
         let read = tokio::task::spawn_blocking(move || source());
         let config =
@@ -148,7 +149,7 @@ impl Reloader {
         self.apply(&mut running, config).await
     }
 
-    /// Joins the local network that a configuration describes, if the node began without one.
+    /// Joins the local network if the node began without one.
     async fn join(&self, running: &mut Running, wanted: Option<&RosConfig>) -> Result<(), String> {
         let join = self.join.clone().filter(|_| !self.has_ros.load(Ordering::Relaxed));
         let Some((join, ros)) = join.zip(wanted.cloned()) else { return Ok(()) };
@@ -157,12 +158,12 @@ impl Reloader {
         joined.await.map_err(|_| "joining the local network ended in a panic")??;
         self.has_ros.store(true, Ordering::Relaxed);
         info!("joined the local ROS 2 network of domain {}", ros.domain_id);
-        // Definitions are read at start alone.
+        // Definitions are read only at start.
         running.config.ros = Some(RosConfig { definitions: Vec::new(), ..ros });
         Ok(())
     }
 
-    /// Dials the routers of tokens that are not dialled yet, and returns those.
+    /// Dials the routers of tokens that are not dialled yet, and returns them.
     fn dial(&self, running: &mut Running, of_tokens: &[RouterUrl]) -> Vec<RouterUrl> {
         let is_new = |url: &&RouterUrl| !running.dialled.contains(url);
         let new: Vec<_> = of_tokens.iter().filter(is_new).cloned().collect();
@@ -171,31 +172,31 @@ impl Reloader {
             return Vec::new();
         }
         let mut rng = ChaCha20Rng::from_seed(seed);
-        let tasks = finding::start(&[], &new, &self.holder, &self.board, None, &mut rng);
+        let tasks = discovery::start(&[], &new, &self.keeper, &self.board, None, &mut rng);
         self.dialling.lock().unwrap_or_else(PoisonError::into_inner).extend(tasks);
         running.dialled.extend(new.iter().cloned());
         new
     }
 
-    /// Returns the tasks that dial the routers of later tokens.
+    /// Removes and returns the tasks that dial routers of later tokens.
     pub(crate) fn take_dialling(&self) -> Vec<JoinHandle<()>> {
         std::mem::take(&mut self.dialling.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// Carries out `config`.
+    /// Applies `config`.
     async fn apply(&self, running: &mut Running, config: Config) -> Result<ReloadReport, String> {
-        // As it is now: it may have been renewed.
+        // The identity may have been renewed since the start.
         let (identity, state) = (self.credentials.identity(), self.state.clone());
         let (mut wanted, own, suites) =
             (config.clone(), self.identity.anchors().clone(), running.suites.clone());
         let running_gateway = running.config.gateway.clone();
         let trusted = running.rules.partners.certificates.clone();
-        let prepare = tokio::task::spawn_blocking(move || -> Result<Prepared, NodeError> {
+        let prepare = tokio::task::spawn_blocking(move || -> Result<PreparedReload, NodeError> {
             let rules = Rules::load(&wanted, &identity, state.as_deref(), now().unix)?;
             let certificates = &rules.partners.certificates;
             let anchors = match same(&trusted, certificates) {
                 true => None,
-                // Lists of a CA that was trusted once may be kept here.
+                // The state directory may hold lists of a CA that was trusted before.
                 false => Some(with_kept_crls(
                     state.as_deref(),
                     own.with_anchors(certificates.iter().cloned())?,
@@ -203,17 +204,18 @@ impl Reloader {
                 )),
             };
             let message_keys = make_for(&rules.shares, |suite| suites.contains(&suite));
-            // One that is no longer wanted runs until a restart, and who was revoked is not to stay there.
+            // A removed gateway runs until a restart, so its access rules are kept up to date: revoked clients lose
+            // access.
             wanted.gateway = wanted.gateway.or(running_gateway);
             let access = access_with(&wanted, &identity, &rules.partners, state.as_deref(), now())?;
             let gateway = match access.zip(wanted.gateway.as_ref()) {
                 Some((access, gateway)) => Some((access, key_of_files(gateway)?)),
                 None => None,
             };
-            Ok(Prepared { rules, anchors, message_keys, gateway })
+            Ok(PreparedReload { rules, anchors, message_keys, gateway })
         });
         let prepared = prepare.await.map_err(|_| "reading ended in a panic")?;
-        let Prepared { rules, anchors, message_keys, gateway } =
+        let PreparedReload { rules, anchors, message_keys, gateway } =
             prepared.map_err(|error| error.to_string())?;
         self.join(running, config.ros.as_ref()).await?;
         running.suites.extend(message_keys.keys().copied());
@@ -224,7 +226,7 @@ impl Reloader {
         };
         let dialled = self.dial(running, &rules.routers);
         report.changed.extend(dialled.iter().map(|url| format!("{url} is dialled, which a token names")));
-        // Before the control task looks at the links that are up.
+        // This precedes the control task's check of existing links.
         self.credentials.set_admitted(rules.partners.admitted.clone());
         let (reply, done) = oneshot::channel();
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
@@ -233,7 +235,7 @@ impl Reloader {
         let stopping = || "the node is stopping".to_owned();
         self.events.send(event).await.map_err(|_| stopping())?;
         done.await.map_err(|_| stopping())?;
-        // The control task knows the newest revocation lists.
+        // The control task has the newest revocation lists.
         if let Some((access, files)) = gateway {
             let access = access.with_anchors(TrustAnchors::clone(&self.credentials.anchors()));
             let key = || match files {
@@ -248,7 +250,7 @@ impl Reloader {
             }
         }
         self.audit.set_names(rules.names.clone());
-        // Restart-only settings stay as they run, so that the next reload says again what waits for a restart.
+        // Restart-only settings keep their running values, so that the next reload reports them again.
         let Config { shares, uses, tokens, partners, trust, accept, gateway, .. } = config;
         let before = running.config.clone();
         let gateway = match (&before.gateway, gateway) {
@@ -262,7 +264,7 @@ impl Reloader {
         Ok(report)
     }
 
-    /// Takes tokens out of the policies when they end; never returns.
+    /// Removes expired tokens from the policies. Never returns.
     pub(crate) async fn watch_expiry(&self) {
         loop {
             let next = self.running.lock().await.rules.partners.next_expiry;
@@ -288,7 +290,7 @@ impl Reloader {
                     self.audit.write(record.reason(report.changed.join("; ")));
                 }
                 Err(error) => {
-                    warn!("a token ended, but its holder stays: {error}");
+                    warn!("a token expired, but its holder keeps access: {error}");
                     drop(running);
                     tokio::time::sleep(EXPIRY_CHECK_MAX).await;
                 }
@@ -297,12 +299,12 @@ impl Reloader {
     }
 }
 
-/// What of a gateway may change while it runs.
+/// Returns the part of a gateway's configuration that may change at run time.
 fn access_part(gateway: &GatewayConfig) -> GatewayConfig {
     restarted(&GatewayConfig::default(), gateway)
 }
 
-/// What runs of a gateway after a reload: sockets and bounds as they were, the rest as it is wanted.
+/// Returns the gateway's configuration after a reload: running sockets and bounds, and new access rules.
 fn restarted(before: &GatewayConfig, after: &GatewayConfig) -> GatewayConfig {
     GatewayConfig {
         listen: before.listen.clone(),
@@ -319,7 +321,7 @@ fn needs_other_sockets(before: Option<&GatewayConfig>, after: Option<&GatewayCon
     }
 }
 
-/// What differs, one line for each topic.
+/// Lists the differences, one line for each topic.
 fn changes(old: &Rules, new: &Rules) -> Vec<String> {
     let mut lines = Vec::new();
     let shares = |rules: &Rules| -> BTreeMap<String, ShareRule> {
@@ -370,12 +372,12 @@ fn changes(old: &Rules, new: &Rules) -> Vec<String> {
     lines
 }
 
-/// What is no topic says so.
+/// Formats a name with its kind, unless it is a topic.
 fn called(kind: Kind, name: &str) -> String {
     if kind == Kind::Service { format!("service {name}") } else { name.to_owned() }
 }
 
-/// Whether the same CAs are in both, in whatever order.
+/// Returns `true` if both lists hold the same CAs in any order.
 fn same(a: &[CertificateDer<'_>], b: &[CertificateDer<'_>]) -> bool {
     a.len() == b.len() && a.iter().all(|ca| b.contains(ca))
 }
@@ -418,7 +420,7 @@ fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<Strin
         (now.peer_rate != config.peer_rate, "`peer_rate` in [router]"),
         (now.mapping != config.mapping, "`mapping` in [router]"),
         (now.announce != config.announce, "`announce` in [router]"),
-        // Shares and uses join the default network where the file says nothing of it.
+        // Shares and uses join the default network if the file has no `[ros]`.
         (now.ros != config.ros, "[ros]"),
         (needs_other_sockets(now.gateway.as_ref(), config.gateway.as_ref()), "[gateway]"),
         (now.state != config.state, "`state`"),

@@ -1,7 +1,7 @@
-//! Opens the local network again when programs of other hosts are cut off from it since this host's addresses changed.
+//! Reopens the local network when a change of this host's addresses has cut it off from programs on other hosts.
 //!
-//! [`Pace`] decides when, purely; [`watch`] looks at the network after each change of the host's, and only then. The control task
-//! (`core/reopening.rs`) ends and makes what is on the network.
+//! [`Pace`], a pure machine, decides when. [`watch`] looks at the network only after a change of addresses. The control
+//! task (`core/reopening.rs`) ends and creates the endpoints.
 
 use std::time::{Duration, Instant};
 
@@ -13,16 +13,16 @@ use crate::core::CoreEvent;
 use crate::network_slot::{NetworkSlot, OpenAgain};
 use crate::roaming::Network;
 
-/// How often the network is looked at while its reach is in doubt.
+/// Interval of looks while the network's reach is in doubt.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
-/// The shortest time between two openings, and between two attempts that fail; doubled after each failure.
+/// Least time between two reopenings, and between two failed attempts; doubled after each failure.
 const PAUSE_MIN: Duration = Duration::from_secs(30);
 const FAILED_PAUSE_MIN: Duration = Duration::from_secs(2);
 const FAILED_PAUSE_MAX: Duration = Duration::from_secs(60);
-/// How long it may take until all readers and writers of the old network have ended.
+/// Time for readers and writers of the old network to end.
 const CLOSE_MAX: Duration = Duration::from_secs(5);
 
-/// When the network may be opened again.
+/// Decides when the network may be reopened.
 #[derive(Debug, Default)]
 struct Pace {
     not_before: Option<Instant>,
@@ -38,7 +38,7 @@ impl Pace {
         *self = Self { not_before: Some(now + PAUSE_MIN), failures: 0 };
     }
 
-    /// Notes a failure, and returns how long to wait.
+    /// Notes a failure. Returns the wait.
     fn failed(&mut self, now: Instant) -> Duration {
         let pause = FAILED_PAUSE_MIN.saturating_mul(1 << self.failures.min(16)).min(FAILED_PAUSE_MAX);
         self.failures += 1;
@@ -47,7 +47,7 @@ impl Pace {
     }
 }
 
-/// Looks after the network for as long as the node runs.
+/// Watches the network for as long as the node runs.
 pub(crate) async fn watch<N: RosNetwork>(
     mut changes: Network,
     network: NetworkSlot<N>,
@@ -65,7 +65,7 @@ pub(crate) async fn watch<N: RosNetwork>(
                 Reach::CutOff if !pace.may_open(Instant::now()) => continue,
                 Reach::CutOff => {}
             }
-            // One that could not be opened would be missed more than one that does not reach other hosts.
+            // A network that cannot be opened is worse than one that does not reach other hosts.
             let gains = tokio::task::spawn_blocking(move || present.gains_by_reopening()).await;
             match gains {
                 Ok(Ok(true)) => reopen(&network, &open, &events, &mut pace).await,
@@ -84,7 +84,7 @@ pub(crate) async fn watch<N: RosNetwork>(
     }
 }
 
-/// Closes the network and opens it, again and again until it is open.
+/// Closes the network and opens it, repeatedly until it is open.
 async fn reopen<N: RosNetwork>(
     network: &NetworkSlot<N>,
     open: &OpenAgain<N>,
@@ -109,7 +109,7 @@ async fn reopen<N: RosNetwork>(
             Ok(Ok(opened)) => {
                 network.put(opened.clone());
                 pace.opened(Instant::now());
-                // Ahead of what is discovered.
+                // The event has to precede discovery events.
                 if events.send(CoreEvent::NetworkReopened).await.is_err() {
                     return;
                 }
@@ -167,12 +167,12 @@ mod tests {
             }
         });
         let slot = NetworkSlot::new(Some(Arc::new(domain.join(true))), Some(again));
-        let (tell, changes) = Network::told();
+        let (tell, changes) = Network::channel();
         let (events, mut inbox) = mpsc::channel(8);
         let watching = tokio::spawn(watch(changes, slot.clone(), events));
         let change = || tell.send_modify(|change| *change += 1);
         change();
-        // It reaches as far as before.
+        // The network reaches as far as before.
         tokio::time::sleep(10 * LOOK_EVERY).await;
         assert!(inbox.try_recv().is_err() && slot.get().is_some());
         domain.cut_off();

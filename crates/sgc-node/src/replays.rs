@@ -1,4 +1,4 @@
-//! Answers to sinks that ask for messages again: a bounded number at once, the others in turn.
+//! Answers to sinks that ask for missing messages: a bounded number at once, the others in turn.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -9,15 +9,15 @@ use crate::sources::LocalShare;
 
 /// Answers that may be sent at once.
 pub(crate) const REPLAYS_MAX: usize = 16;
-/// Requests that may wait; whose is refused asks again.
+/// Requests that may wait. A sink whose request is refused asks again.
 pub(crate) const REPLAYS_WAITING_MAX: usize = 4096;
 
-/// Who asked which source.
+/// A sink and the source that it asks.
 type Key = (Name, SourceId, SinkId);
 
 #[derive(Default)]
 struct State {
-    /// Sources that answer: one answer at a time, since each holds its source.
+    /// Sources that are answering. Each sends one answer at a time, since the answer locks the source.
     running: BTreeSet<(Name, SourceId)>,
     order: VecDeque<Key>,
     waiting: BTreeMap<Key, (Arc<LocalShare>, Recover)>,
@@ -28,7 +28,8 @@ struct State {
 pub(crate) struct Replays(Mutex<State>);
 
 impl Replays {
-    /// Answers a request, at once or in its turn; one that waits already is replaced. False if too many wait.
+    /// Answers a request, at once or in its turn. It replaces a waiting request of the same sink. Returns `false` if
+    /// too many wait.
     pub(crate) fn ask(self: &Arc<Self>, share: Arc<LocalShare>, recover: Recover) -> bool {
         {
             let mut state = self.lock();
@@ -46,7 +47,7 @@ impl Replays {
         true
     }
 
-    /// Starts what may run.
+    /// Starts the requests that may run.
     fn start(self: &Arc<Self>) {
         while let Some((share, recover)) = self.take() {
             let this = self.clone();
@@ -58,7 +59,7 @@ impl Replays {
         }
     }
 
-    /// The next request that may be answered now.
+    /// Removes and returns the next request that may run.
     fn take(&self) -> Option<(Arc<LocalShare>, Recover)> {
         let mut state = self.lock();
         if state.running.len() >= REPLAYS_MAX {
@@ -135,7 +136,7 @@ mod tests {
                     assert!(replays.ask(share.clone(), recover(sink, from)));
                 }
             }
-            // The first was taken at once; what it asked for since waits.
+            // The first request runs; later ones of the same sink wait.
             assert_eq!(under_way(&replays), (1, 100));
             assert!(replays.lock().waiting.values().all(|(_, r)| r.from == 3));
             for sink in 100..REPLAYS_WAITING_MAX as u16 {

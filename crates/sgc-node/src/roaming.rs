@@ -1,7 +1,8 @@
-//! What changes of the network are to a node: it hears of them from the kernel instead of waiting for a time-out.
+//! Changes of the network: a node learns of them from the kernel instead of waiting for a time-out.
 //!
-//! It says that something changed and what follows for a link; links are made and moved elsewhere. Messages of the kernel
-//! are not read: that there was one is enough, since what counts is asked for, the address that the route to a peer begins with.
+//! This module reports changes and decides what they mean for a link; other modules make and move links. It does not
+//! parse the kernel's messages. Their arrival is enough, because only the source address of the route to a peer
+//! matters, and that is queried.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
@@ -18,94 +19,95 @@ use tokio::sync::watch;
 use tokio::time::{Instant, timeout_at};
 use tracing::{info, warn};
 
-/// Changes come in bursts: how long it has to be quiet before one counts as over, and how long it may take.
+/// Quiet time after which a burst of changes counts as over, and the longest wait for that.
 const QUIET: Duration = Duration::from_millis(50);
 const BURST_MAX: Duration = Duration::from_millis(250);
-/// Messages read before others get their turn.
+/// Messages read before other tasks get their turn.
 const MESSAGES_MAX: usize = 64;
 const MESSAGE_BYTES_MAX: usize = 8192;
 
-/// What the kernel is asked to tell of (`RTMGRP_*` in rtnetlink(7)): links, addresses and routes of both families.
+/// Groups of kernel messages (`RTMGRP_*` in rtnetlink(7)): links, addresses and routes of both families.
 const GROUPS: u32 = 0x1 | 0x10 | 0x40 | 0x100 | 0x400;
 
-/// The network as it changes.
+/// Receiver of network changes.
 #[derive(Clone, Debug)]
 pub(crate) struct Network {
     changes: watch::Receiver<u64>,
-    /// The change after which sockets were renewed last.
+    /// Change after which the sockets were last renewed.
     renewed: Arc<AtomicU64>,
 }
 
 impl Network {
-    /// Hears of changes for as long as the runtime lives. Where the kernel does not tell, that is said, and nothing changes.
+    /// Watches the network for as long as the runtime lives. If the kernel does not report changes, that is logged, and
+    /// none occur.
     pub(crate) fn watch() -> Self {
-        let (tell, network) = Self::told();
+        let (tell, network) = Self::channel();
         match open() {
             Ok(socket) => {
                 tokio::spawn(hear(socket, tell));
             }
             Err(error) => {
-                warn!(%error, "the kernel does not tell of changes of the network; links move when they fall silent");
+                warn!(%error, "the kernel does not report changes of the network; links move when they fall silent");
             }
         }
         network
     }
 
-    /// With whom to tell of changes.
-    pub(crate) fn told() -> (watch::Sender<u64>, Self) {
+    /// Creates a sender of changes and a receiver.
+    pub(crate) fn channel() -> (watch::Sender<u64>, Self) {
         let (tell, changes) = watch::channel(0);
         (tell, Self { changes, renewed: Arc::default() })
     }
 
-    /// Waits for a change, for ever if there can be none any more. Dropping the future loses nothing.
+    /// Waits for a change, for ever if none can come any more. Dropping the future loses no change.
     pub(crate) async fn changed(&mut self) {
         if self.changes.changed().await.is_err() {
             std::future::pending().await
         }
     }
 
-    /// Another that hears of what changes from here on.
+    /// Returns a receiver of the changes from here on.
     pub(crate) fn onward(&self) -> Self {
         let mut later = self.clone();
         later.changes.mark_unchanged();
         later
     }
 
-    /// True for the first who asks after a change: sockets are shared, so one of those who use them renews them.
+    /// Returns `true` for the first caller after a change. Sockets are shared, so only one user renews them.
     pub(crate) fn is_first(&self) -> bool {
         let change = *self.changes.borrow();
         self.renewed.fetch_max(change, Relaxed) < change
     }
 }
 
-/// What a change comes to for a link that this node dialled.
+/// Consequence of a change for a link that this node dialled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Move {
-    /// It can stay as it is, or there is no way at present.
+    /// The link stays, or no route exists at present.
     Stay,
-    /// Its socket is to be another, by which it goes on.
+    /// The link continues on a new socket.
     Rebind,
-    /// It is bound to an address that leads there no more: another link has to take over.
+    /// The link is bound to an address that no longer reaches the peer, so another link has to replace it.
     Redial,
 }
 
-/// Where a link begins.
+/// Local address of a link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Origin {
-    /// The source address towards the peer when there last was one.
+    /// Last source address towards the peer.
     source: Option<IpAddr>,
-    /// Whether there is a route to it now.
+    /// Whether a route to the peer exists now.
     is_there: bool,
 }
 
 impl Origin {
-    /// That of a link to this peer, which is up.
-    pub(crate) fn of(remote: SocketAddr) -> Self {
+    /// Returns the origin of a link to this peer, which is up.
+    pub(crate) fn from_remote(remote: SocketAddr) -> Self {
         let source = source_towards(remote);
         Self { source, is_there: source.is_some() }
     }
 
-    /// The network has changed: what the source address is now, and what follows.
+    /// Handles a change with the present source address. Returns its consequence.
     pub(crate) fn moves(&mut self, source: Option<IpAddr>, over_udp: bool) -> Move {
         let came_back = !std::mem::replace(&mut self.is_there, source.is_some());
         let before = self.source;
@@ -119,7 +121,7 @@ impl Origin {
     }
 }
 
-/// The address that packets to this one leave with; nothing is sent. `None` if no way leads there.
+/// Returns the source address of packets to this peer without sending any; `None` if no route exists.
 pub(crate) fn source_towards(remote: SocketAddr) -> Option<IpAddr> {
     let any: IpAddr =
         if remote.is_ipv4() { Ipv4Addr::UNSPECIFIED.into() } else { Ipv6Addr::UNSPECIFIED.into() };
@@ -128,7 +130,7 @@ pub(crate) fn source_towards(remote: SocketAddr) -> Option<IpAddr> {
     Some(socket.local_addr().ok()?.ip())
 }
 
-/// The socket of the kernel's messages. That type reads from whatever socket keeps messages apart.
+/// Opens the socket of kernel messages. `UnixDatagram` reads from any socket that keeps message boundaries.
 fn open() -> io::Result<UnixDatagram> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let socket = socket_with(AddressFamily::NETLINK, SocketType::RAW, flags, None)?;
@@ -150,7 +152,7 @@ async fn hear(socket: UnixDatagram, tell: watch::Sender<u64>) {
             heard = heard => match heard {
                 Ok(()) => tell.send_modify(|change| *change += 1),
                 Err(error) => {
-                    warn!(%error, "the kernel tells no more of changes of the network; links move when they fall silent");
+                    warn!(%error, "the kernel no longer reports changes of the network; links move when they fall silent");
                     return;
                 }
             },
@@ -159,7 +161,7 @@ async fn hear(socket: UnixDatagram, tell: watch::Sender<u64>) {
     }
 }
 
-/// Waits for messages and takes what is there.
+/// Waits for messages and discards them.
 async fn take(socket: &UnixDatagram) -> io::Result<()> {
     let mut message = [0; MESSAGE_BYTES_MAX];
     socket.readable().await?;
@@ -168,7 +170,7 @@ async fn take(socket: &UnixDatagram) -> io::Result<()> {
             Ok(_) => {}
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => break,
             Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-            // There was more than the kernel had room for, which says as much.
+            // The kernel's buffer overflowed, which is a change as well.
             Err(error) if Errno::from_io_error(&error) == Some(Errno::NOBUFS) => {}
             Err(error) => return Err(error),
         }
@@ -176,13 +178,13 @@ async fn take(socket: &UnixDatagram) -> io::Result<()> {
     Ok(())
 }
 
-/// Says what a change came to.
+/// Logs the consequence of a change.
 pub(crate) fn report(remote: SocketAddr, source: Option<IpAddr>, moves: Move) {
     let source = source.map(|source| source.to_string()).unwrap_or_default();
     match moves {
         Move::Stay => {}
         Move::Rebind => info!(%remote, %source, "the network changed; the link goes on from here"),
-        Move::Redial => info!(%remote, %source, "the network changed; connecting anew from here"),
+        Move::Redial => info!(%remote, %source, "the network changed; reconnecting from here"),
     }
 }
 
@@ -202,7 +204,7 @@ mod tests {
             assert_eq!(sees(Some(wifi)), Move::Stay);
             assert_eq!(sees(Some(lte)), moved);
             assert_eq!(sees(Some(lte)), Move::Stay);
-            // No way at all, and then one.
+            // The route disappears, and another appears.
             assert_eq!(sees(None), Move::Stay);
             assert_eq!(sees(None), Move::Stay);
             assert_eq!(sees(Some(lte)), moved);
@@ -222,8 +224,8 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn one_renews_the_sockets_after_each_change() {
-        let (tell, mut network) = Network::told();
+    async fn single_task_renews_sockets_after_each_change() {
+        let (tell, mut network) = Network::channel();
         let mut other = network.clone();
         assert!(!network.is_first());
         for _ in 0..2 {
@@ -239,7 +241,7 @@ mod tests {
 
     #[tokio::test]
     async fn the_kernel_is_asked() {
-        // Whether it tells of a change is shown where networks can be made.
+        // Tests in network namespaces show that changes are reported.
         assert!(open().is_ok());
     }
 }

@@ -1,5 +1,5 @@
-//! What a configuration and the files that it names come to at one moment: rules for the route machine, more CAs,
-//! more routers. The same at start and at reload.
+//! [`Rules`]: everything that follows from a configuration and its files at one moment, such as rules for the route
+//! machine, CAs and routers. Start and reload use the same code.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -30,12 +30,12 @@ pub(crate) struct Rules {
     pub(crate) routers: Vec<RouterUrl>,
     pub(crate) names: PeerNames,
     pub(crate) members: MemberNames,
-    /// What is wrong and stops nothing.
+    /// Faults that prevent nothing.
     pub(crate) warnings: Vec<String>,
 }
 
 impl Rules {
-    /// Reads what `config` names and what the state directory holds.
+    /// Loads the files that `config` names, and those of the state directory.
     pub(crate) fn load(
         config: &Config,
         identity: &Identity,
@@ -60,11 +60,11 @@ impl Rules {
         let of_fleet = config.uses.iter().flat_map(|u| use_rules(u, identity));
         rules.uses.splice(0..0, of_fleet);
         rules.names = peer_names(config, identity, &rules);
-        rules.members = MemberNames::of(config, identity);
+        rules.members = MemberNames::from_config(config, identity);
         if let Some(authority) = &config.authority
             && let Ok(fleet) = read_fleet(&authority.fleet)
         {
-            // The authority says by itself where its file is of no use.
+            // The authority itself reports an unusable fleet file.
             rules.warnings.extend(unknown_members(config, &fleet).iter().map(ToString::to_string));
         }
         for grant in &rules.partners.tokens {
@@ -109,7 +109,7 @@ impl Rules {
         }
         for url in &token.routers {
             match url.parse::<RouterUrl>() {
-                // Of the owner's local network this node is no part.
+                // A search of the owner's local network is useless on this one.
                 Ok(RouterUrl::Mdns(_)) => {}
                 Ok(url) if config.routers.contains(&url) || self.routers.contains(&url) => {}
                 Ok(url) if self.routers.len() < TOKEN_ROUTERS_MAX => self.routers.push(url),
@@ -139,7 +139,7 @@ impl Rules {
     }
 }
 
-/// Reads a token, which must be its owner's alone.
+/// Reads a token file, which only its owner may read.
 pub fn read_token(path: &Path) -> Result<ShareToken, RulesError> {
     let failed = |source| RulesError::TokenFile { path: path.to_owned(), source };
     let file = fs::File::open(path).map_err(failed)?;
@@ -151,12 +151,12 @@ pub fn read_token(path: &Path) -> Result<ShareToken, RulesError> {
     ShareToken::parse(&text).map_err(|source| RulesError::Token { path: path.to_owned(), source })
 }
 
-/// A rule for each topic and each service that is used.
+/// Returns the rules for the topics and services of a use.
 fn use_rules(rule: &UseConfig, identity: &Identity) -> Vec<UseRule> {
     let Some(owner) = identity.node_id_of(rule.from.as_str()) else { return Vec::new() };
     let part = |part: &Part| UseRule {
         direction: match part.kind {
-            // What is called is sent requests.
+            // A client publishes requests.
             Kind::Service => Direction::Publish,
             _ if rule.publish => Direction::Publish,
             _ => Direction::Bring,
@@ -177,7 +177,7 @@ fn use_rules(rule: &UseConfig, identity: &Identity) -> Vec<UseRule> {
     rule.interface.parts().iter().map(part).collect()
 }
 
-/// What the configuration calls peers.
+/// Returns the names that the configuration has for peers.
 fn peer_names(config: &Config, identity: &Identity, rules: &Rules) -> PeerNames {
     let mut names = PeerNames::new();
     for (partner, resolved) in config.partners.iter().zip(rules.partners.configured.values()) {
@@ -194,10 +194,10 @@ fn peer_names(config: &Config, identity: &Identity, rules: &Rules) -> PeerNames 
     names
 }
 
-/// Why a configuration that is valid in itself cannot be carried out.
+/// Reasons why a valid configuration cannot be applied.
 #[derive(Debug, thiserror::Error)]
 pub enum RulesError {
-    /// Partners.
+    /// The partners are invalid.
     #[error(transparent)]
     Partner(#[from] PartnerError),
     /// A token cannot be read.
@@ -205,30 +205,30 @@ pub enum RulesError {
     TokenFile {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the operating system.
         source: io::Error,
     },
-    /// A token is none.
+    /// A token file holds no token.
     #[error("token {}: {source}", path.display())]
     Token {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         source: TokenError,
     },
-    /// Two tokens for the same.
+    /// Two tokens for the same topic.
     #[error("two tokens for {topic} of the same owner: take one [[use]] out")]
     TokenTwice {
         /// The topic.
         topic: String,
     },
-    /// A token of this node.
+    /// A token that this node issued itself.
     #[error("the token for {topic} is this node's own: it is for a partner")]
     OwnToken {
         /// The topic.
         topic: String,
     },
-    /// What a token brings has no name here.
+    /// The topic of a token has no valid local name.
     #[error(
         "a token brings {topic:?} here, which is no name for a topic of ROS 2, or too long a one: give another with `as`"
     )]
@@ -236,7 +236,7 @@ pub enum RulesError {
         /// The name here.
         topic: String,
     },
-    /// What would come back.
+    /// The topic of a token would return in a loop.
     #[error(
         "a token brings {topic} here, which a [[share]] shares: it would be shared again, in a loop; keep one"
     )]

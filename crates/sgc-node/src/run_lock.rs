@@ -1,8 +1,8 @@
-//! One process for each identity on a machine.
+//! Lock that allows one process per identity on a machine.
 //!
-//! A process holds two advisory locks: on the identity file, which every user and container that may read the file sees,
-//! and on a file in the state directory, which copies of the identity have in common. The kernel releases both when the
-//! process ends, whatever ends it. Two processes that see neither file of each other are told apart by the routers.
+//! A process holds two advisory locks: on the identity file, which every user and container with that file sees, and on
+//! a file in the state directory, which copies of the identity share. The kernel releases both when the process ends
+//! for any reason. Routers detect two processes that share neither file.
 
 use std::fs;
 use std::io;
@@ -17,18 +17,18 @@ use sgc_wire::NodeId;
 use tokio::time::{Instant, sleep};
 use tracing::{info, warn};
 
-/// Longest wait for the end of the process before.
+/// Longest wait for the previous process to end.
 const WAIT_MAX: Duration = Duration::from_secs(6);
-/// Interval of looks at it.
+/// Interval of attempts.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 
-/// The identity of this process is in use by another one of this machine.
+/// Another process of this machine uses the identity.
 #[derive(Debug, thiserror::Error)]
 #[error("{} is locked by {}", path.display(), Holder(*pid, path))]
 pub struct IdentityInUse {
-    /// The file that is locked.
+    /// The locked file.
     pub path: PathBuf,
-    /// The process, where it can be seen.
+    /// The other process, if it is visible.
     pub pid: Option<u32>,
 }
 
@@ -43,21 +43,21 @@ impl std::fmt::Display for Holder<'_> {
     }
 }
 
-/// Held for as long as a process uses an identity. Clones share it.
+/// Locks that a process holds while it uses an identity. Clones share them.
 #[derive(Clone, Debug)]
 pub(crate) struct RunLock {
     identity: PathBuf,
-    held: Arc<Mutex<Held>>,
+    held: Arc<Mutex<LockHandle>>,
 }
 
 #[derive(Debug)]
-struct Held {
+struct LockHandle {
     identity: Option<fs::File>,
     _state: Option<fs::File>,
 }
 
 impl RunLock {
-    /// Takes the locks of an identity and of its state directory, or waits a while for the process that has them to end.
+    /// Locks an identity and its state directory. Waits a while for another process to end.
     pub(crate) async fn take(
         identity: &Path,
         state: Option<&Path>,
@@ -69,7 +69,7 @@ impl RunLock {
         loop {
             let taken = lock(identity, false).and_then(|identity| {
                 let state = state.as_deref().map_or(Ok(None), |state| lock(state, true))?;
-                Ok(Held { identity, _state: state })
+                Ok(LockHandle { identity, _state: state })
             });
             match taken {
                 Ok(held) => {
@@ -86,7 +86,7 @@ impl RunLock {
         }
     }
 
-    /// Locks the identity file that was put in the place of the one before.
+    /// Locks the identity file that replaced the previous one.
     pub(crate) fn follow(&self) {
         match lock(&self.identity, false) {
             Ok(file) => self.held.lock().unwrap_or_else(PoisonError::into_inner).identity = file,
@@ -95,8 +95,8 @@ impl RunLock {
     }
 }
 
-/// Locks a file, made if `makes`. Nothing where the file or the file system does not allow it: then the other lock has to
-/// do, or the routers.
+/// Locks a file and creates it if `makes`. Returns `None` if the file or file system does not allow it; then the other
+/// lock or the routers have to suffice.
 fn lock(path: &Path, makes: bool) -> Result<Option<fs::File>, IdentityInUse> {
     let mut options = fs::OpenOptions::new();
     options.read(true);
@@ -119,15 +119,15 @@ fn lock(path: &Path, makes: bool) -> Result<Option<fs::File>, IdentityInUse> {
     }
 }
 
-/// The process that holds a lock on a file, as far as the kernel tells it to this one.
+/// Returns the process that locks a file, if the kernel shows it.
 fn holder(file: &fs::File) -> Option<u32> {
     let metadata = file.metadata().ok()?;
     let device = metadata.dev();
     holder_in(&fs::read_to_string("/proc/locks").ok()?, (major(device), minor(device)), metadata.ino())
 }
 
-/// The same from the text of `/proc/locks` (proc_locks(5)): `1: FLOCK ADVISORY WRITE PID MAJOR:MINOR:INODE 0 EOF`, the
-/// device in hexadecimal. A process of another PID namespace has the number 0.
+/// Finds the holder in the text of `/proc/locks` (proc_locks(5)): `1: FLOCK ADVISORY WRITE PID MAJOR:MINOR:INODE 0
+/// EOF`, the device in hexadecimal. A process of another PID namespace has the number 0.
 fn holder_in(locks: &str, (major, minor): (u32, u32), inode: u64) -> Option<u32> {
     let place = format!("{major:02x}:{minor:02x}:{inode}");
     let of = |line: &str| match line.split_whitespace().collect::<Vec<_>>()[..] {
@@ -157,20 +157,20 @@ mod tests {
         let own = Some(std::process::id());
         let refused = RunLock::take(&identity, None, node()).await.unwrap_err();
         assert_eq!((&refused.path, refused.pid), (&identity, own));
-        // A copy of the identity keeps its state in the same place.
+        // A copy of the identity uses the same state directory.
         let refused = RunLock::take(&copy, Some(dir.path()), node()).await.unwrap_err();
         assert_eq!(
             (refused.path.file_name().unwrap().to_str().unwrap(), refused.pid),
             ("run-07070707.lock", own)
         );
-        // Another identity is another matter.
+        // Another identity is not locked.
         RunLock::take(&copy, Some(dir.path()), NodeId([8; 32])).await.unwrap();
         // A renewed identity is another file.
         fs::write(dir.path().join("new"), "").unwrap();
         fs::rename(dir.path().join("new"), &identity).unwrap();
         first.follow();
         assert!(RunLock::take(&identity, None, node()).await.is_err());
-        // It waits for one that is about to end.
+        // A process waits for another that is about to end.
         let (waits, ends) = (RunLock::take(&identity, Some(dir.path()), node()), async {
             sleep(2 * LOOK_EVERY).await;
             drop(first);
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_cannot_be_locked_keeps_nobody_from_starting() {
+    async fn node_starts_if_its_identity_cannot_be_locked() {
         let dir = tempfile::tempdir().unwrap();
         let (identity, state) = (dir.path().join("gone"), dir.path().join("gone too"));
         RunLock::take(&identity, Some(&state), node()).await.unwrap();

@@ -1,53 +1,54 @@
-//! How much of a topic goes on: at most so often, at most so many bits a second, nothing that is too old.
+//! Shaping of a topic: limits its rate, its bandwidth and the age of its messages.
 //!
-//! It is told the time and says when the next message may go; who holds messages back meanwhile is not decided here.
+//! The caller passes in the time and holds messages back. This machine returns the time of the next message.
 
 use std::time::{Duration, Instant};
 
 use sgc_ros::Shaping;
 
-/// Messages may be late by so much without a topic losing bandwidth: what timers and schedulers take.
+/// Delay of timers and schedulers that costs a topic no bandwidth.
 const SLACK: Duration = Duration::from_millis(50);
 
-/// When the next message of a topic may go.
+/// Decides when the next message of a topic may leave.
 #[derive(Debug, Default)]
 pub(crate) struct Shaper {
     shaping: Shaping,
-    /// By the rate.
+    /// Time allowed by the rate.
     rate_due: Option<Instant>,
-    /// By the bandwidth.
+    /// Time allowed by the bandwidth.
     bandwidth_due: Option<Instant>,
     age: Age,
 }
 
 impl Shaper {
-    /// Goes by these settings from here on.
+    /// Replaces the settings.
     pub(crate) fn set(&mut self, shaping: Shaping) {
         *self = Self { shaping, ..Self::default() };
     }
 
-    /// What it goes by.
+    /// Returns the settings.
     pub(crate) fn shaping(&self) -> &Shaping {
         &self.shaping
     }
 
-    /// When a message may go. One that is waited for in vain by the rate is replaced by the next; by the bandwidth only if
-    /// it is best effort, since then nobody counts on it.
+    /// Returns the time at which a message may leave. A message that waits for the rate is replaced by the next. One
+    /// that waits for bandwidth is replaced only if it is best effort.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.rate_due.max(self.bandwidth_due)
     }
 
-    /// Whether a message that comes now may go.
+    /// Returns `true` if a message may leave now.
     pub(crate) fn is_due(&self, now: Instant) -> bool {
         self.due().is_none_or(|due| due <= now)
     }
 
-    /// Whether a message that has to wait gives way to the next one.
+    /// Returns `true` if a waiting message is replaced by the next one.
     pub(crate) fn gives_way(&self, now: Instant, reliable: bool) -> bool {
         !reliable || self.rate_due.is_some_and(|due| due > now)
     }
 
-    /// A message goes. The next is due as long after this one was, not after it went, so that the rate is what was set.
+    /// Charges a message that leaves. The next one is due relative to this one's due time, so that the configured rate
+    /// is met.
     pub(crate) fn takes(&mut self, now: Instant, bytes: usize) {
         if let Some(interval) = self.shaping.interval {
             let next = self.rate_due.map(|due| due + interval).filter(|next| *next > now);
@@ -61,7 +62,7 @@ impl Shaper {
         }
     }
 
-    /// What went was of another length than what was taken, once it was written as it leaves.
+    /// Corrects the charge, because the message's final length differs.
     pub(crate) fn corrects(&mut self, taken: usize, left: usize) {
         if let (Some(due), Some(bits_per_s)) = (&mut self.bandwidth_due, self.shaping.bits_per_s) {
             let took = Duration::from_secs_f64(taken.abs_diff(left) as f64 * 8.0 / bits_per_s.max(1) as f64);
@@ -69,22 +70,23 @@ impl Shaper {
         }
     }
 
-    /// Whether a message that its publisher dated so is too old to go, by the clock of this node; both in ns since 1970.
+    /// Returns `true` if a message is too old by its publisher's time stamp and this node's clock, both in ns since
+    /// 1970.
     pub(crate) fn is_too_old(&mut self, now_ns: i64, dated_ns: i64) -> bool {
         let Some(max) = self.shaping.max_age else { return false };
-        self.age.of(now_ns, dated_ns) > max
+        self.age.measure(now_ns, dated_ns) > max
     }
 }
 
-/// How old messages are. Clocks differ between hosts, so the youngest seen counts as new.
+/// Age of messages. Clocks of hosts differ, so the youngest message seen counts as new.
 #[derive(Debug, Default)]
 struct Age {
     least_ns: Option<i64>,
 }
 
 impl Age {
-    fn of(&mut self, now_ns: i64, dated_ns: i64) -> Duration {
-        // Undated.
+    fn measure(&mut self, now_ns: i64, dated_ns: i64) -> Duration {
+        // The message has no time stamp.
         if dated_ns <= 0 {
             return Duration::ZERO;
         }
@@ -109,7 +111,7 @@ mod tests {
         Duration::from_millis(n)
     }
 
-    /// Offers a message every so many ms for a minute, keeping the newest, and says when which went.
+    /// Offers a message every `every` ms for a minute, keeping the newest, and returns the times at which one left.
     fn went(shaper: &mut Shaper, begin: Instant, every: u64, bytes: usize) -> Vec<u64> {
         let (mut held, mut went) = (None, Vec::new());
         for at in 0..60_000 {
@@ -138,7 +140,7 @@ mod tests {
                 gaps.collect::<Vec<_>>()
             );
         }
-        // What is slower passes as it comes.
+        // A slower topic passes unchanged.
         let (mut shaper, begin) = shaper(Shaping { interval: Some(ms(100)), ..Shaping::default() });
         assert_eq!(went(&mut shaper, begin, 250, 1000).len(), 240);
     }
@@ -150,7 +152,7 @@ mod tests {
             let sent = went(&mut shaper, begin, every, bytes).len() as f64 * bytes as f64 * 8.0 / 60.0;
             let offered = bytes as f64 * 8.0 * 1000.0 / every as f64;
             let expected = offered.min(2_000_000.0);
-            // The last message may go beyond the minute.
+            // The last message may exceed the minute.
             let most = expected + bytes as f64 * 8.0 / 60.0 + 20_000.0;
             assert!(sent >= expected * 0.9 && sent <= most, "{every} {bytes}: {sent}");
         }
@@ -162,7 +164,7 @@ mod tests {
         shaper.takes(now, 1000);
         shaper.corrects(1000, 100);
         assert_eq!(shaper.due(), Some(now + ms(100)));
-        // JSON may be longer than what it was made of.
+        // JSON may be longer than its source.
         shaper.corrects(100, 300);
         assert_eq!(shaper.due(), Some(now + ms(300)));
     }

@@ -1,7 +1,7 @@
-//! What a user's shell does through the status socket: publish messages, and call services, without ROS.
+//! Publishing and service calls through the status socket, for users without ROS.
 //!
-//! Messages come and go as JSON (`docs/spec/json.md`). Who may open the socket may do all this; the node's clients have
-//! scopes, its user has not.
+//! Messages are JSON (`docs/spec/json.md`). Everyone who may open the socket may do all of this. Clients of the gateway
+//! have scopes; the node's user has none.
 
 use std::io;
 use std::time::Duration;
@@ -16,52 +16,52 @@ use crate::gateway::Gateway;
 
 /// Longest message in JSON, bytes.
 const MESSAGE_BYTES_MAX: u64 = 256 << 20;
-/// Longest time for which subscribers, or a reply, are waited for.
+/// Longest wait for subscribers or a reply.
 const WAIT_MAX: Duration = Duration::from_secs(3600);
-/// How long those subscribers may take to be found that the graph shows.
+/// Time to discover the subscribers that the graph shows.
 const SETTLE_MAX: Duration = Duration::from_secs(2);
 
-/// What to publish, and how.
+/// Request to publish.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct PublishWish {
+pub struct PublishRequest {
     /// ROS topic.
     pub topic: String,
-    /// ROS type; none takes that which the topic has.
+    /// ROS type; `None` takes the type of the topic.
     #[serde(rename = "type")]
     pub type_name: Option<String>,
-    /// Not reliable.
+    /// Whether to publish best effort.
     pub best_effort: bool,
-    /// Also for who comes later.
+    /// Whether late joiners get the messages.
     pub transient_local: bool,
-    /// Messages that are kept; none is rclcpp's 10.
+    /// History depth; `None` is rclcpp's 10.
     pub depth: Option<u32>,
-    /// Subscribers that are waited for before the first message is taken.
+    /// Number of subscribers to wait for before the first message.
     pub wait_for: u32,
-    /// For so long at most, milliseconds.
+    /// Longest wait for them, milliseconds.
     pub wait_ms: u64,
 }
 
-/// What to ask a service.
+/// Request to call a service.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct CallWish {
+pub struct CallRequest {
     /// ROS service.
     pub service: String,
-    /// ROS type; none takes that which the service has.
+    /// ROS type; `None` takes the type of the service.
     #[serde(rename = "type")]
     pub type_name: Option<String>,
     /// The request, JSON.
     pub request: String,
-    /// How long its reply is waited for, milliseconds.
+    /// Longest wait for the reply, milliseconds.
     pub timeout_ms: u64,
 }
 
-/// What is said once messages are taken.
+/// Answer to a request to publish, once messages are accepted.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Published {
+pub struct PublishReport {
     /// The topic's type.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// How many subscribers there are on the local network, the node's own for the far side among them.
+    /// Number of local subscribers, including the node's own for the far side.
     pub subscribers: u32,
 }
 
@@ -69,8 +69,8 @@ fn wait(ms: u64) -> Duration {
     Duration::from_millis(ms).min(WAIT_MAX)
 }
 
-/// Calls a service; gives its reply in JSON.
-pub(crate) async fn call(gateway: &Gateway, wish: &CallWish) -> Result<String, String> {
+/// Calls a service and returns its reply as JSON.
+pub(crate) async fn call(gateway: &Gateway, wish: &CallRequest) -> Result<String, String> {
     let reply = async {
         let session = gateway.own_session().await?;
         let request = Content::json(wish.request.clone());
@@ -81,10 +81,10 @@ pub(crate) async fn call(gateway: &Gateway, wish: &CallWish) -> Result<String, S
     Ok(String::from_utf8_lossy(&reply).into_owned())
 }
 
-/// Publishes each line that comes, and says of each how it went, until no more come.
+/// Publishes each received line and answers it, until the connection ends.
 pub(crate) async fn publish(
     gateway: &Gateway,
-    wish: PublishWish,
+    wish: PublishRequest,
     mut stream: UnixStream,
     envelope: impl Fn(Result<String, String>) -> String,
 ) -> io::Result<()> {
@@ -102,7 +102,7 @@ pub(crate) async fn publish(
         Ok(begun) => begun,
         Err(error) => return into.write_all(envelope(Err(error.to_string())).as_bytes()).await,
     };
-    let published = Published { type_name: publication.type_name().to_owned(), subscribers };
+    let published = PublishReport { type_name: publication.type_name().to_owned(), subscribers };
     let published = serde_json::to_string(&published)?;
     into.write_all(format!("{}\n", envelope(Ok(published))).as_bytes()).await?;
     let mut line = Vec::new();
@@ -118,7 +118,7 @@ pub(crate) async fn publish(
     }
 }
 
-fn advertise(wish: PublishWish) -> Advertise {
+fn advertise(wish: PublishRequest) -> Advertise {
     let defaults = Qos::default();
     let durability = if wish.transient_local { Durability::TransientLocal } else { defaults.durability };
     let qos = Qos {

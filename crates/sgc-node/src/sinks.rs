@@ -1,8 +1,8 @@
-//! This node's own subscribers: packets in, samples on the local network out.
+//! Local subscribers: packets in, samples on the local network out.
 //!
-//! [`LocalSink::deliver`] opens packets on the task that received them. Writing may block, so each local
-//! writer has a thread, behind a bounded queue. Where it cannot block, a short message that nothing is ahead of is written
-//! by who received it.
+//! [`LocalSink::deliver`] opens packets on the task that received them. Writing may block, so each local writer has a
+//! thread behind a bounded queue. If the writer cannot block and its queue is empty, the receiving task writes a short
+//! message itself.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::num::NonZeroU64;
@@ -28,60 +28,59 @@ use tracing::{debug, warn};
 
 use crate::conversion::{self, KnownType, TypeSlot};
 use crate::dataplane::DataPlane;
-use crate::hold::{Hold, Holds};
+use crate::pending::{PendingBytes, PendingQueue};
 use crate::queue::Queue;
 use crate::shaper::Shaper;
 use crate::spacing::Spacing;
 use crate::stats::{DataDrop, Drops};
-use crate::tap::{Tapped, Taps};
+use crate::tap::{TapMessage, Taps};
 
-/// Messages that may wait for one local writer.
+/// Most messages that wait for one local writer.
 const WRITER_MESSAGES_MAX: usize = 1024;
-/// Bytes that may wait for one local writer.
+/// Most bytes that wait for one local writer.
 const WRITER_BYTES_MAX: usize = 64 << 20;
-/// How long a burst waits for local readers to take what a writer keeps.
+/// Longest wait of a burst for acknowledgements of local readers.
 const ACKNOWLEDGED_WAIT_MAX: Duration = Duration::from_secs(1);
-/// How long nobody waits for a local reader that did not.
+/// Time during which no burst waits again after a local reader acknowledged nothing.
 const STALLED_READER_PAUSE: Duration = Duration::from_secs(10);
-/// How long what comes for a topic waits until a writer that was closed has written its queue.
+/// Longest wait of new messages for a closed writer that still writes its queue.
 const LAST_WRITES_MAX: Duration = Duration::from_secs(1);
-/// How much later than asked a writer's thread may be woken; Linux's default is 50 µs.
+/// Most delay of a wake-up of a writer's thread; Linux's default is 50 µs.
 const TIMER_SLACK_NS: u64 = 1_000;
-/// Messages of a transient-local writer that are known again.
+/// Messages of a transient-local writer that are remembered, to recognise repetitions.
 const RECENT_MAX: usize = 4096;
-/// The longest message that is written by who received it.
+/// The longest message that the receiving task writes itself.
 const AT_ONCE_BYTES_MAX: usize = 16 << 10;
-/// How long a writer's liveliness is not asserted again: shorter than any lease of those that are.
+/// Least time between two liveliness assertions of a writer. It is shorter than any lease that is asserted.
 const ASSERTION_SPACING: Duration = Duration::from_millis(20);
-/// How long the network is held back by a local writer that takes nothing.
+/// Longest time that a local writer may block the network.
 const WRITER_PATIENCE: Duration = Duration::from_secs(5);
 
-/// What a sink asks of the control task.
+/// Request of a sink to the control task.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum SinkRequest {
-    /// Ask a source for what is missing.
+    /// Ask a source for missing messages.
     History(Name, SourceId),
-    /// It is here.
+    /// The missing messages have arrived.
     Synced(Name, SourceId),
 }
 
 struct State {
     sink: Option<Sink>,
-    /// Messages, one or several that waited for a grant, that are not written yet.
+    /// Number of releases under way: messages that waited for a grant and are not written yet.
     releases: u32,
-    /// Sources of which something that can be asked for again was not taken, for want of a writer.
+    /// Sources whose recoverable messages were skipped, because they had no writer.
     missed: BTreeSet<SourceId>,
-    /// What came as JSON before its type was known, and what came behind it.
-    held: Hold<Message>,
+    /// Messages that wait for their type, and the messages behind them.
+    held: PendingQueue<Message>,
 }
 
-/// A joined name's end at this node.
+/// This node's end of a joined name.
 pub(crate) struct LocalSink {
     name: Name,
     transient_local: bool,
     state: Mutex<State>,
-    /// Held while messages are written that waited for a grant, or for their writer: what comes after them is written
-    /// after them.
+    /// Lock of a release: messages that waited for a grant or a writer are written before later ones.
     releasing: Arc<tokio::sync::Mutex<()>>,
     writers: ArcSwap<BTreeMap<Option<SourceId>, Arc<WriterQueue>>>,
     requests: mpsc::Sender<SinkRequest>,
@@ -90,22 +89,22 @@ pub(crate) struct LocalSink {
     taps: Taps,
     frames: FramePrefix,
     types: Arc<TypeSlot>,
-    /// Whether messages come as JSON.
+    /// Whether messages arrive as JSON.
     takes_json: AtomicBool,
 }
 
-/// What the names of frames get in front, if anything; shared with the writers.
+/// Prefix of frame names, if there is one. Writers share it.
 pub(crate) type FramePrefix = Arc<ArcSwapOption<String>>;
 
 impl LocalSink {
-    /// A sink without a grant.
+    /// Creates a sink without a grant.
     pub(crate) fn new(
         name: Name,
         transient_local: bool,
         requests: mpsc::Sender<SinkRequest>,
-        holds: Arc<Holds>,
+        holds: Arc<PendingBytes>,
     ) -> Self {
-        let held = Hold::new(WRITER_MESSAGES_MAX, holds);
+        let held = PendingQueue::new(WRITER_MESSAGES_MAX, holds);
         let state = State { sink: None, releases: 0, missed: BTreeSet::new(), held };
         Self {
             name,
@@ -123,18 +122,17 @@ impl LocalSink {
         }
     }
 
-    /// Who looks at what is given to the local network.
+    /// Returns the taps of messages for the local network.
     pub(crate) fn taps(&self) -> &Taps {
         &self.taps
     }
 
-    /// Local readers that its writers are matched with: the most of any of them.
+    /// Returns the largest number of local readers that one of its writers matches.
     pub(crate) fn matched(&self) -> u32 {
-        self.writers.load().values().map(|writer| (writer.behind.matched)()).max().unwrap_or(0)
+        self.writers.load().values().map(|writer| (writer.info.matched)()).max().unwrap_or(0)
     }
 
-    /// Takes a grant. Packets that waited for it are written by a task of their own, since that may take a
-    /// while.
+    /// Applies a grant. A task writes the packets that waited for it, since that may take a while.
     pub(crate) fn grant(self: &Arc<Self>, id: SinkId, grant: TopicGrant, data: &Arc<DataPlane>) {
         let mut released = Vec::new();
         let turn = {
@@ -148,7 +146,7 @@ impl LocalSink {
                         |source: &SourceId| sources.contains(source) && !self.has_writer(source);
                     state.missed.extend(sink.pass_over(is_writerless));
                     sink.regrant(id, grant, |result| released.push(result));
-                    // A sink forgets sources when there are too many.
+                    // A sink forgets sources when it has too many.
                     state.missed.retain(|source| sink.recovers(source));
                 }
                 sink => {
@@ -171,8 +169,8 @@ impl LocalSink {
         });
     }
 
-    /// Begins anew with the next grant, as a process that was just started does: what was published until then is not
-    /// asked for.
+    /// Starts anew with the next grant, like a process that just started: messages published until then are not
+    /// recovered.
     pub(crate) fn begin_anew(&self) {
         let mut state = self.lock();
         state.sink = None;
@@ -180,13 +178,13 @@ impl LocalSink {
         self.writers.load().values().for_each(|writer| writer.begin_again());
     }
 
-    /// Has what comes from here on wait behind what is released; the turn for that, unless another has it.
+    /// Makes later messages wait behind a release. Returns the lock of the release, unless another holds it.
     fn begin_release(&self, state: &mut State) -> Option<OwnedMutexGuard<()>> {
         state.releases += 1;
         self.releasing.clone().try_lock_owned().ok()
     }
 
-    /// Writes what is released once it is its turn.
+    /// Writes the released messages once the lock is free.
     fn release(
         self: &Arc<Self>,
         turn: Option<OwnedMutexGuard<()>>,
@@ -205,32 +203,32 @@ impl LocalSink {
         });
     }
 
-    /// How far it is with each source; `None` before the first grant.
+    /// Returns the progress of each source; `None` before the first grant.
     pub(crate) fn progress(&self) -> Option<Arc<SinkProgress>> {
         self.lock().sink.as_ref().map(Sink::progress)
     }
 
-    /// Drops the keys of all epochs but the present one.
+    /// Drops the keys of all epochs but the current one.
     pub(crate) fn retire_epochs(&self) {
         if let Some(sink) = &mut self.lock().sink {
             sink.retire_epochs();
         }
     }
 
-    /// Sources with a writer here of which something is missing.
+    /// Returns the sources with a local writer that lack messages.
     pub(crate) fn unsynced(&self) -> Vec<SourceId> {
         let state = self.lock();
         let sources = state.sink.iter().flat_map(Sink::unsynced);
         sources.filter(|source| self.has_writer(source)).collect()
     }
 
-    /// From which number on a source is to be asked for what is missing.
+    /// Returns the number from which a source is to be asked for missing messages.
     pub(crate) fn ask(&self, source: SourceId) -> Option<u64> {
-        // What came would go nowhere; it is asked for when there is a writer.
+        // Without a writer the messages would be dropped, so asking waits for one.
         self.has_writer(&source).then(|| self.lock().sink.as_mut()?.ask(source)).flatten()
     }
 
-    /// The same, some time after it was asked.
+    /// Returns whether to ask a source again, some time after it was asked.
     pub(crate) fn ask_again(&self, source: SourceId) -> AskAgain {
         if !self.has_writer(&source) {
             return AskAgain::No;
@@ -238,8 +236,8 @@ impl LocalSink {
         self.lock().sink.as_mut().map_or(AskAgain::No, |sink| sink.ask_again(source))
     }
 
-    /// Adds, replaces or removes a writer; the old one ends after what is queued. Messages that come from here on are written after
-    /// that, since their source may have taken over from the old writer's.
+    /// Adds, replaces or removes a writer. The old one ends after its queue. Later messages are written after that,
+    /// since their source may have replaced the old one's.
     pub(crate) fn set_writer(self: &Arc<Self>, source: Option<SourceId>, writer: Option<Arc<WriterQueue>>) {
         let mut state = self.lock();
         let mut writers = BTreeMap::clone(&self.writers.load());
@@ -265,8 +263,8 @@ impl LocalSink {
         });
     }
 
-    /// Gives a writer to another source of the same publisher; false if there is none. What it wrote already and the new
-    /// source has in its history is not written again.
+    /// Moves a writer to another source of the same publisher. Returns `false` if there is none. Messages in the new
+    /// source's history that were written already are not written again.
     pub(crate) fn move_writer(&self, from: SourceId, to: SourceId) -> bool {
         let mut writers = BTreeMap::clone(&self.writers.load());
         let Some(writer) = writers.remove(&Some(from)) else { return false };
@@ -281,12 +279,12 @@ impl LocalSink {
         true
     }
 
-    /// The writer that was opened for this source, or for all that have none of their own.
+    /// Returns the writer that was opened for this source, or for all sources without their own.
     pub(crate) fn open_writer(&self, source: Option<SourceId>) -> Option<Arc<WriterQueue>> {
         self.writers.load().get(&source).cloned()
     }
 
-    /// What was not taken for want of a writer has to be asked for where there is one now.
+    /// Asks for messages that were skipped for want of a writer, if there is a writer now.
     fn ask_for_missed(&self, state: &mut State) {
         for source in std::mem::take(&mut state.missed) {
             match &mut state.sink {
@@ -297,28 +295,28 @@ impl LocalSink {
         }
     }
 
-    /// Sets how much is written from here on.
+    /// Sets the limits of rate, bandwidth and age.
     pub(crate) fn set_shaping(&self, shaping: Shaping) {
         *self.shaping.lock().unwrap_or_else(PoisonError::into_inner) = shaping;
         self.writers.load().values().for_each(|writer| writer.set_shaping(shaping));
     }
 
-    /// How much is written.
+    /// Returns the limits of rate, bandwidth and age.
     pub(crate) fn shaping(&self) -> Shaping {
         *self.shaping.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What the names of frames in tf messages get in front from here on.
+    /// Sets the prefix of frame names in tf messages.
     pub(crate) fn set_frames(&self, prefix: Option<String>) {
         self.frames.store(prefix.map(Arc::new));
     }
 
-    /// What the names of frames get in front, now and later.
+    /// Returns the shared prefix of frame names.
     pub(crate) fn frames(&self) -> FramePrefix {
         self.frames.clone()
     }
 
-    /// What messages look like is known now, or is not; what waited for that is written, or given up.
+    /// Sets the state of the type. Messages that waited for it are written or dropped.
     pub(crate) fn set_type(self: &Arc<Self>, known: KnownType, data: &Arc<DataPlane>) {
         let (held, turn) = {
             let mut state = self.lock();
@@ -344,35 +342,35 @@ impl LocalSink {
         });
     }
 
-    /// Whether nobody is to hear late of a message: nobody keeps it for late joiners.
+    /// Returns `true` if a message is useless when late, because it is not kept for late joiners.
     fn is_given_up(&self, message: &Message) -> bool {
         !self.transient_local && message.head.kind == MessageKind::Write
     }
 
-    /// What is known of the type of what comes.
+    /// Returns the state of the type.
     pub(crate) fn types(&self) -> &Arc<TypeSlot> {
         &self.types
     }
 
-    /// Whether messages come as JSON that nobody here can read, for want of a definition.
+    /// Returns `true` if messages arrive as JSON and their type is unknown.
     pub(crate) fn lacks_definition(&self) -> bool {
         self.takes_json.load(Relaxed) && self.types.now().is_lacking()
     }
 
-    /// Ends all writers after what is queued.
+    /// Closes all writers. They end after their queues.
     pub(crate) fn close(&self) {
-        // Nobody tells any more.
+        // The type can no longer become known.
         drop(self.lock().held.take());
         self.writers.load().values().for_each(|w| w.close());
         self.taps.close();
     }
 
-    /// Messages given to the local network.
+    /// Returns the number of messages written to the local network.
     pub(crate) fn delivered(&self) -> u64 {
         self.delivered.load(Relaxed)
     }
 
-    /// Takes a packet; says what was dropped. Waits while a reliable topic's local writer is full.
+    /// Delivers a packet. Returns the drop, if there is one. Waits while the local writer of a reliable topic is full.
     pub(crate) async fn deliver(&self, packet: Packet, drops: &Drops) -> Option<(DataDrop, u64)> {
         let (result, behind, turn) = {
             let mut state = self.lock();
@@ -380,13 +378,13 @@ impl LocalSink {
             let Some(sink) = sink else { return Some((DataDrop::NotGranted, 1)) };
             let source = packet.header.source;
             if !self.has_writer(&source) && sink.recovers(&source) {
-                // Of those that it knows, which are not many.
+                // The sink bounds its sources, so this set is small.
                 missed.insert(source);
                 return Some((DataDrop::NoWriter, 1));
             }
             let behind = *releases > 0;
             match sink.handle_packet(&packet) {
-                // Under the lock, so that what comes over two links at once is written in the order of its numbers.
+                // Writing happens under the lock, so that messages from two links keep the order of their numbers.
                 Ok(Delivery::Message(message)) if !behind => match self.write_now(message, held) {
                     Ok(dropped) => return dropped,
                     Err(message) => {
@@ -407,7 +405,7 @@ impl LocalSink {
         self.finish(result, drops).await
     }
 
-    /// Does what a packet came to.
+    /// Completes a delivery after the lock is released.
     async fn finish(&self, result: Result<Delivery, SinkDrop>, drops: &Drops) -> Option<(DataDrop, u64)> {
         match result {
             Ok(Delivery::Incomplete | Delivery::Mark | Delivery::Parked) => None,
@@ -429,7 +427,7 @@ impl LocalSink {
             Ok(Delivery::Lost(_, messages)) => {
                 debug!(name = %self.name.short(), messages, "lost for good");
                 if drops.add("sink_lost", messages) {
-                    warn!(messages, "a source keeps no more what was lost on the way; counted from here on");
+                    warn!(messages, "a source no longer keeps messages that were lost; counted from here on");
                 }
                 Some((DataDrop::Sink, messages))
             }
@@ -460,12 +458,12 @@ impl LocalSink {
         }
     }
 
-    /// Queues a message for its writer, or holds it while its type is not known, and says what was dropped; gives it back if
-    /// it has to wait for room.
+    /// Queues a message for its writer, or holds it until its type is known. Returns the drop, or the message if it has
+    /// to wait for room.
     fn write_now(
         &self,
         message: Message,
-        held: &mut Hold<Message>,
+        held: &mut PendingQueue<Message>,
     ) -> Result<Option<(DataDrop, u64)>, Message> {
         let Some(writer) = self.writer(&message.source) else { return Ok(Some((DataDrop::NoWriter, 1))) };
         let (bytes, head) = (message.payload.len(), message.head);
@@ -486,11 +484,11 @@ impl LocalSink {
         }
         let mut evicted = 0;
         let tapped = self.taps.is_any().then(|| self.tapped(&message));
-        // Converting takes a while, and may have to wait for its type.
+        // Converting takes time, and may have to wait for the type.
         let at_once = head.form != PayloadForm::Json;
         let at_once = at_once.then(|| writer.at_once(&message)).flatten();
         if let Some(mut take) = at_once {
-            take(message, Next::Nothing);
+            take(message, NextMessage::Nothing);
         } else if message.reliable {
             writer.queue.try_push(message, bytes, WRITER_BYTES_MAX)?;
         } else {
@@ -504,16 +502,16 @@ impl LocalSink {
         Ok((evicted > 0).then_some((DataDrop::Stale, evicted)))
     }
 
-    /// Holds a message until its type is known, or not to be known. The oldest make room.
-    fn hold(&self, message: Message, held: &mut Hold<Message>) -> Option<(DataDrop, u64)> {
+    /// Holds a message until its type is known or given up. The oldest messages make room.
+    fn hold(&self, message: Message, held: &mut PendingQueue<Message>) -> Option<(DataDrop, u64)> {
         let now = Instant::now();
         let late = held.give_up_late(now, |message| self.is_given_up(message));
         let given_up = late + held.push(now, message.payload.len(), message);
         (given_up > 0).then_some((DataDrop::NoDefinition, given_up))
     }
 
-    fn tapped(&self, message: &Message) -> Tapped {
-        Tapped::of_message(message, self.types.now().layout())
+    fn tapped(&self, message: &Message) -> TapMessage {
+        TapMessage::from_message(message, self.types.now().layout())
     }
 
     fn has_writer(&self, source: &SourceId) -> bool {
@@ -521,7 +519,7 @@ impl LocalSink {
         writers.contains_key(&Some(*source)) || writers.contains_key(&None)
     }
 
-    /// The writer for a source's messages.
+    /// Returns the writer for a source's messages.
     fn writer(&self, source: &SourceId) -> Option<Arc<WriterQueue>> {
         let writers = self.writers.load();
         writers.get(&Some(*source)).or_else(|| writers.get(&None)).cloned()
@@ -533,13 +531,13 @@ impl LocalSink {
 }
 
 impl Drop for LocalSink {
-    /// Ends the writers, which nothing else ends where a node goes without leaving its topics.
+    /// Closes the writers when a node stops without leaving its topics.
     fn drop(&mut self) {
         self.close();
     }
 }
 
-/// Counts a release that is under way; the count holds whatever becomes of who waits.
+/// Guard of a release under way. It decrements the count even if the waiting task is cancelled.
 struct Releasing<'a>(&'a LocalSink);
 
 impl Drop for Releasing<'_> {
@@ -548,60 +546,60 @@ impl Drop for Releasing<'_> {
     }
 }
 
-/// What comes behind a message that is taken.
+/// State of the queue behind a message that is taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Next {
-    /// Nothing that is there.
+pub(crate) enum NextMessage {
+    /// The queue is empty.
     Nothing,
-    /// A message, when its time has come.
+    /// The next message waits for its time.
     Later,
-    /// A message, at once.
+    /// The next message follows at once.
     AtOnce,
-    /// A message, at once, of a queue that is closed: those of another writer wait for it.
+    /// The next message follows at once, and the queue is closed: messages of another writer wait for it.
     Last,
 }
 
-impl Next {
+impl NextMessage {
     /// Returns `true` if the next message is taken without a pause.
     fn is_at_once(self) -> bool {
         matches!(self, Self::AtOnce | Self::Last)
     }
 }
 
-/// Takes messages, one after the other.
-type Take = Box<dyn FnMut(Message, Next) + Send>;
+/// Consumes the messages of a queue one by one.
+type MessageConsumer = Box<dyn FnMut(Message, NextMessage) + Send>;
 
-/// The queue before a local writer's thread.
+/// The queue in front of a local writer's thread.
 pub(crate) struct WriterQueue {
     queue: Queue<Message>,
     shaper: Mutex<Shaper>,
-    /// Whether nothing is set of how much is written, to be seen without the lock.
+    /// Whether no shaping is configured, readable without the lock.
     is_unshaped: AtomicBool,
-    /// Held by the thread from before it takes a message from the queue until it has none in hand, so that nothing
-    /// overtakes what was queued.
-    take: Mutex<Take>,
-    behind: Behind,
-    /// Whether its liveliness was asserted just now, or is being.
+    /// Held by the thread from before it takes a message until it has consumed it, so that no other message overtakes.
+    take: Mutex<MessageConsumer>,
+    info: WriterInfo,
+    /// Whether liveliness was asserted just now, or is being asserted.
     is_asserted: Arc<AtomicBool>,
-    /// Closed once the thread has nothing more to take.
+    /// Closed once the thread has consumed everything.
     thread: mpsc::Sender<()>,
 }
 
-/// What is known of who takes the messages of a queue.
-pub(crate) struct Behind {
+/// Properties of the writer behind a queue.
+pub(crate) struct WriterInfo {
     guid: Guid,
     recent: Option<Mutex<Recent>>,
-    /// Local readers that it is matched with.
+    /// Returns the number of matched local readers.
     matched: Box<dyn Fn() -> u32 + Send + Sync>,
-    /// Returns `true` if a short message, taken now, waits for nobody, and overwrites none that a reader may lack.
+    /// Returns `true` if a short message can be written now without blocking and without overwriting one that a reader
+    /// may lack.
     is_free: Box<dyn Fn(&Message) -> bool + Send + Sync>,
-    /// Has it give late joiners so many messages. May block.
+    /// Sets the number of messages that late joiners get. May block.
     resize: Box<dyn Fn(u32) + Send + Sync>,
-    /// Renews its liveliness lease without a message, if that is manual by topic. May block.
+    /// Asserts liveliness without a message, if it is manual by topic. May block.
     assert: Option<Box<dyn Fn() + Send + Sync>>,
 }
 
-impl Default for Behind {
+impl Default for WriterInfo {
     fn default() -> Self {
         Self {
             guid: Guid([0; 16]),
@@ -614,11 +612,11 @@ impl Default for Behind {
     }
 }
 
-/// What a transient-local writer wrote last: as much as its publisher gives late joiners.
+/// Heads of the messages that a transient-local writer wrote last, as many as late joiners get.
 struct Recent {
     depth: usize,
     heads: VecDeque<MessageHead>,
-    /// True while what comes may have been written before: the history of a source that took over from another.
+    /// Whether messages may repeat: they come from the history of a source that replaced another.
     again: bool,
 }
 
@@ -640,8 +638,8 @@ impl Recent {
 }
 
 impl WriterQueue {
-    /// Starts the thread; it ends, and the writer with it, once the queue is closed and empty. `frames` is for tf messages,
-    /// `types` for what comes as JSON.
+    /// Starts the thread. It ends, and the writer with it, once the queue is closed and empty. `frames` applies to tf
+    /// messages, `types` to messages that arrive as JSON.
     pub(crate) fn spawn<W: RosWriter>(
         writer: W,
         spec: &EndpointSpec,
@@ -654,10 +652,10 @@ impl WriterQueue {
         let (counted, topic) = (failures.clone(), spec.topic.clone());
         let in_topic = topic.clone();
         let writer = Arc::new(writer);
-        // The thread alone keeps it: it ends there, where it may block.
+        // Only the thread owns the writer, so the writer is dropped where it may block.
         let weak = Arc::downgrade(&writer);
         let mut burst = Burst::default();
-        // Cyclone's writers block where they have to keep all until it is acknowledged, and nowhere else.
+        // Cyclone's writers block only if they have to keep all samples until they are acknowledged.
         let never_blocks = !spec.qos.is_reliable() || matches!(spec.qos.history, History::KeepLast(_));
         let (room, of_room) = (burst.room.clone(), weak.clone());
         let is_free = Box::new(move |message: &Message| {
@@ -681,8 +679,8 @@ impl WriterQueue {
         let is_manual = spec.qos.liveliness == Liveliness::ManualByTopic && spec.qos.lease_ns.is_some();
         let assert = is_manual.then_some(assert as Box<dyn Fn() + Send + Sync>);
         let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
-        let behind =
-            Behind { guid: writer.guid(), recent: Recent::new(spec), matched, is_free, resize, assert };
+        let info =
+            WriterInfo { guid: writer.guid(), recent: Recent::new(spec), matched, is_free, resize, assert };
         let (mut decompressor, offered) = (Decompressor::default(), spec.qos.representations);
         let mut prepare = move |message: Message| {
             let mut key_hash = None;
@@ -690,14 +688,14 @@ impl WriterQueue {
                 MessageKind::Write => SampleKind::Write,
                 MessageKind::Dispose => SampleKind::Dispose,
                 MessageKind::Unregister => SampleKind::Unregister,
-                // Nobody calls a topic.
+                // Topics carry no calls.
                 _ => return None,
             };
             let payload = match decompressor.decompress(message.head.encoding, message.payload) {
                 Ok(payload) => payload,
                 Err(error) => {
                     if counted.count("decompress") {
-                        warn!(%in_topic, %error, "a message is not given to the local network; counted from here on");
+                        warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
                     }
                     return None;
                 }
@@ -715,7 +713,7 @@ impl WriterQueue {
                 PayloadForm::Json => {
                     let known = types.now();
                     let Some(layout) = known.layout() else {
-                        // It was when the message was queued.
+                        // The type was known when the message was queued.
                         counted.count("json_unknown_type");
                         return None;
                     };
@@ -723,7 +721,7 @@ impl WriterQueue {
                         Ok(payload) => payload,
                         Err(error) => {
                             if counted.count("json_refused") {
-                                warn!(%in_topic, %error, "a message is not given to the local network; counted from here on");
+                                warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
                             }
                             return None;
                         }
@@ -737,7 +735,7 @@ impl WriterQueue {
                     Ok(rewritten) => rewritten.into(),
                     Err(error) => {
                         if counted.count("frames") {
-                            warn!(%in_topic, %error, "a message is not given to the local network; counted from here on");
+                            warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
                         }
                         return None;
                     }
@@ -747,17 +745,22 @@ impl WriterQueue {
             Some((SampleHead { kind, source_timestamp_ns, key_hash }, payload))
         };
         let refused = failures.clone();
-        Self::spawn_with("sgc-write", behind, shaping, failures, alive, move |message, next| {
+        Self::spawn_with("sgc-write", info, shaping, failures, alive, move |message, next| {
             let source = message.source;
             let Some((head, payload)) = prepare(message) else {
                 return if !next.is_at_once() {
                     writer.flush()
                 };
             };
-            if next != Next::Last {
+            if next != NextMessage::Last {
                 burst.room.space(&*writer, source, head.source_timestamp_ns);
             }
-            burst.before_next(&*writer, next == Next::Nothing, payload.len(), head.source_timestamp_ns);
+            burst.before_next(
+                &*writer,
+                next == NextMessage::Nothing,
+                payload.len(),
+                head.source_timestamp_ns,
+            );
             let written = writer.write_ahead(head, payload);
             if !next.is_at_once() {
                 writer.flush();
@@ -770,15 +773,15 @@ impl WriterQueue {
         })
     }
 
-    /// The same with somebody else who takes the messages, one after the other, and hears what is behind each. It may block,
-    /// except for a short message where `behind` says that nothing is in the way.
+    /// Starts a queue with another consumer, which also learns the state of the queue behind each message. The consumer
+    /// may block, except for a short message that `info` declares free.
     pub(crate) fn spawn_with(
         thread_name: &str,
-        behind: Behind,
+        info: WriterInfo,
         shaping: Shaping,
         drops: Arc<Drops>,
         alive: mpsc::Sender<()>,
-        take: impl FnMut(Message, Next) + Send + 'static,
+        take: impl FnMut(Message, NextMessage) + Send + 'static,
     ) -> std::io::Result<Arc<Self>> {
         let mut shaper = Shaper::default();
         shaper.set(shaping);
@@ -788,56 +791,57 @@ impl WriterQueue {
             shaper: shaper.into(),
             is_unshaped: AtomicBool::new(shaping == Shaping::default()),
             take: Mutex::new(Box::new(take)),
-            behind,
+            info,
             is_asserted: Arc::default(),
             thread: running,
         });
         let (task, runtime) = (this.clone(), tokio::runtime::Handle::current());
         thread::Builder::new().name(thread_name.into()).spawn(move || {
             let _alive = alive;
-            // Without it the pauses of a burst are late by as much as they are long.
+            // Without it, the pauses of a burst overrun by as much as they are long.
             let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(TIMER_SLACK_NS));
             while runtime.block_on(task.queue.wait()) {
                 let mut take = task.take.lock().unwrap_or_else(PoisonError::into_inner);
                 let mut behind = None;
                 while let Some(message) = runtime.block_on(task.next(&mut behind, &drops)) {
                     let next = match behind.is_none() && task.queue.is_empty() {
-                        true => Next::Nothing,
-                        false if task.queue.is_closed() => Next::Last,
-                        false if task.is_unshaped.load(Relaxed) => Next::AtOnce,
-                        false => Next::Later,
+                        true => NextMessage::Nothing,
+                        false if task.queue.is_closed() => NextMessage::Last,
+                        false if task.is_unshaped.load(Relaxed) => NextMessage::AtOnce,
+                        false => NextMessage::Later,
                     };
                     take(message, next);
                 }
             }
             drop(in_thread);
-            // What it holds, a writer, may block when it goes.
-            let end: Take = Box::new(|_, _| ());
+            // Dropping the consumer drops a writer, which may block.
+            let end: MessageConsumer = Box::new(|_, _| ());
             drop(std::mem::replace(&mut *task.take.lock().unwrap_or_else(PoisonError::into_inner), end));
         })?;
         Ok(this)
     }
 
-    /// The taker, if it takes a message now without blocking, and nothing is ahead of it. Only one caller queues at a time.
-    fn at_once(&self, message: &Message) -> Option<MutexGuard<'_, Take>> {
+    /// Returns the consumer if it takes a message now without blocking and the queue is empty. Only one caller queues
+    /// at a time.
+    fn at_once(&self, message: &Message) -> Option<MutexGuard<'_, MessageConsumer>> {
         let may = message.payload.len() <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
         let take = if may { self.take.try_lock().ok() } else { None };
-        take.filter(|_| self.queue.is_empty() && !self.queue.is_closed() && (self.behind.is_free)(message))
+        take.filter(|_| self.queue.is_empty() && !self.queue.is_closed() && (self.info.is_free)(message))
     }
 
-    /// The writer's.
+    /// Returns the writer's GUID.
     pub(crate) fn guid(&self) -> Guid {
-        self.behind.guid
+        self.info.guid
     }
 
-    /// Sets how much is written from here on.
+    /// Sets the limits of rate, bandwidth and age.
     pub(crate) fn set_shaping(&self, shaping: Shaping) {
         self.is_unshaped.store(shaping == Shaping::default(), Relaxed);
         self.shaper().set(shaping);
     }
 
-    /// The next message of the queue when its time has come, if there is one; the newest of those that came meanwhile where
-    /// one gives way to the next. `behind` is what was taken after it and may not overtake it.
+    /// Waits for the time of the next message and returns it, or the newest one if later messages replace it. `behind`
+    /// is a message that was taken after it and must not overtake it.
     async fn next(&self, behind: &mut Option<Message>, drops: &Drops) -> Option<Message> {
         let mut message = match behind.take() {
             Some(message) => message,
@@ -865,7 +869,7 @@ impl WriterQueue {
                     drops.count(DataDrop::Thinned.key());
                     message = newer;
                 }
-                // The end of an instance is not left out, nor is what was said before it.
+                // The end of an instance is never skipped, nor is the message before it.
                 Ok(Some(end)) => {
                     *behind = Some(end);
                     return Some(message);
@@ -876,33 +880,33 @@ impl WriterQueue {
         }
     }
 
-    /// Gives late joiners so many messages from here on. May block.
+    /// Sets the number of messages that late joiners get. May block.
     pub(crate) fn resize(&self, depth: u32) {
         self.with_recent(|recent| recent.keep(depth as usize));
-        (self.behind.resize)(depth);
+        (self.info.resize)(depth);
     }
 
-    /// Renews the writer's liveliness lease, at most once in [`ASSERTION_SPACING`].
+    /// Asserts the writer's liveliness, at most once in [`ASSERTION_SPACING`].
     fn assert_liveliness(self: &Arc<Self>) {
-        if self.behind.assert.is_none() || self.is_asserted.swap(true, Relaxed) {
+        if self.info.assert.is_none() || self.is_asserted.swap(true, Relaxed) {
             return;
         }
         let (this, is_asserted) = (self.clone(), self.is_asserted.clone());
         tokio::spawn(async move {
-            let assert = move || this.behind.assert.as_ref().map(|assert| assert());
+            let assert = move || this.info.assert.as_ref().map(|assert| assert());
             let _ = tokio::task::spawn_blocking(assert).await;
             tokio::time::sleep(ASSERTION_SPACING).await;
             is_asserted.store(false, Relaxed);
         });
     }
 
-    /// From here on what was written before may come once more.
+    /// Expects repetitions of written messages from here on.
     fn begin_again(&self) {
         self.with_recent(|recent| recent.again = true);
     }
 
-    /// Whether a message was written before. Told by its time: a publisher dates no two messages alike. Behind the first that
-    /// was not only news come.
+    /// Returns `true` if a message was written before. Its time stamp tells, since a publisher never uses one twice.
+    /// After the first new message, all are new.
     fn has_written(&self, head: &MessageHead) -> bool {
         let is_known = |recent: &mut Recent| {
             let is_it =
@@ -922,9 +926,9 @@ impl WriterQueue {
         });
     }
 
-    /// Nothing if its publisher keeps nothing for late joiners.
+    /// Returns `None` if the publisher keeps nothing for late joiners.
     fn with_recent<T>(&self, look: impl FnOnce(&mut Recent) -> T) -> Option<T> {
-        let recent = self.behind.recent.as_ref()?;
+        let recent = self.info.recent.as_ref()?;
         Some(look(&mut recent.lock().unwrap_or_else(PoisonError::into_inner)))
     }
 
@@ -932,38 +936,38 @@ impl WriterQueue {
         self.shaper.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Ends the thread after what is queued.
+    /// Closes the queue. The thread ends after it is empty.
     pub(crate) fn close(&self) {
         self.queue.close();
     }
 
-    /// Waits until all that was queued before it was closed is taken.
+    /// Waits until the thread has consumed everything.
     async fn ended(&self) {
         self.thread.closed().await;
     }
 }
 
-/// Keeps what comes at once, after a way was interrupted, from overwriting itself in a reliable writer that keeps the last
-/// samples, which never blocks. Its publisher said it in its own time, and its readers would have had it.
+/// Paces messages that arrive in a burst after an interruption. A reliable writer that keeps the last samples never
+/// blocks, so a burst would overwrite itself before readers take it. Its publisher spread the messages over time.
 #[derive(Default)]
 struct Burst {
     room: Arc<Room>,
-    /// A reader that stands still is not waited for again before.
+    /// No wait before this time, because a reader is stalled.
     not_before: Option<Instant>,
 }
 
-/// An upper bound of the samples that a writer keeps unacknowledged. Changed only by the holder of the turn to take messages.
+/// Upper bound of a writer's unacknowledged samples. Only the holder of the consumer's lock changes it.
 #[derive(Default)]
 struct Room {
     unacknowledged: AtomicU32,
-    /// When a message was written last, and when it was published.
+    /// When the last message was written, and its time stamp.
     last: Mutex<Option<(Instant, i64)>>,
     spacing: Mutex<Spacing>,
 }
 
 impl Room {
-    /// Returns `true` if a message of so many bytes and this time may be written without taking the place of one that somebody may lack; does
-    /// not wait.
+    /// Returns `true` if a message of this size and time can be written without overwriting one that a reader may lack.
+    /// Never waits.
     fn is_there(&self, writer: &impl RosWriter, bytes: usize, timestamp_ns: i64) -> bool {
         let Some(kept) = writer.kept(bytes) else { return true };
         if self.unacknowledged.load(Relaxed) < kept || self.is_in_its_time(timestamp_ns) {
@@ -976,15 +980,15 @@ impl Room {
         true
     }
 
-    /// Whether it is about as long since the last message was written as its publisher let pass: then readers have the time
-    /// that the publisher would have given them, and acknowledge as seldom as they do.
+    /// Returns `true` if the time since the last write is about the publisher's interval. Readers then have the time
+    /// that the publisher would have given them, and acknowledge no more often.
     fn is_in_its_time(&self, timestamp_ns: i64) -> bool {
         let Some((written, published_ns)) = *self.last() else { return false };
         let apart = timestamp_ns.checked_sub(published_ns).and_then(|ns| u64::try_from(ns).ok());
         apart.is_some_and(|ns| ns > 0 && written.elapsed() >= Duration::from_nanos(ns / 2))
     }
 
-    /// Waits until a message may be written, and notes that it is.
+    /// Waits until a message may be written, and records the write.
     fn space(&self, writer: &impl RosWriter, source: SourceId, published_ns: i64) {
         let wait = self.spacing().wait(Instant::now(), source, published_ns);
         if let Some(wait) = wait {
@@ -1004,12 +1008,12 @@ impl Room {
 }
 
 impl Burst {
-    /// Waits before a sample of so many bytes would take the place of one that somebody may lack. One that comes alone is written at
+    /// Waits while a sample of this size would overwrite one that a reader may lack. A single sample is written at
     /// once, as its publisher did.
     fn before_next(&mut self, writer: &impl RosWriter, is_alone: bool, bytes: usize, timestamp_ns: i64) {
         let Some(kept) = writer.kept(bytes) else { return };
         let mut unacknowledged = self.room.unacknowledged.load(Relaxed);
-        // One that is alone: by the next that comes with others it will have been acknowledged, or waited for.
+        // A single sample is acknowledged, or waited for, before the next burst.
         let waits = !is_alone && self.not_before.is_none_or(|at| Instant::now() >= at);
         if waits && unacknowledged >= kept {
             let acknowledged = writer.wait_acknowledged(ACKNOWLEDGED_WAIT_MAX);
@@ -1021,7 +1025,7 @@ impl Burst {
     }
 }
 
-/// A short, stable name of a failure for counters.
+/// Returns a short, stable name of a failure for counters.
 pub(crate) fn failure_key(error: &RosError) -> &'static str {
     match error {
         RosError::Payload { .. } => "write_payload",
@@ -1042,7 +1046,7 @@ mod tests {
     use sgc_wire::{Class, SecretBytes};
 
     use super::*;
-    use crate::hold::HOLD_BYTES_MAX;
+    use crate::pending::PENDING_BYTES_MAX;
 
     struct Slow {
         kept: Option<u32>,
@@ -1062,7 +1066,7 @@ mod tests {
         }
 
         fn kept(&self, bytes: usize) -> Option<u32> {
-            // Half as many where they are long.
+            // Half as many long messages are kept.
             self.kept.map(|kept| if bytes > 1000 { kept / 2 } else { kept })
         }
 
@@ -1118,7 +1122,7 @@ mod tests {
         }
         assert!(!burst.room.is_there(&writer, 8, 0), "ten are under way");
         assert!(Burst::default().room.is_there(&Slow::new(None), 8, 0));
-        // What comes as its publisher had it needs no more room than that had; what was held up on its way does.
+        // Messages at their publisher's pace need no more room than it had; messages in a burst do.
         let hour_ns = 3_600_000_000_000;
         assert!(!burst.room.is_there(&writer, 8, hour_ns) && !burst.room.is_there(&writer, 8, -1));
         let begun = Instant::now();
@@ -1129,12 +1133,12 @@ mod tests {
         assert!(!burst.room.is_there(&writer, 8, hour_ns));
     }
 
-    /// What was written, and by which thread.
-    type Written = Arc<Mutex<Vec<(u64, thread::ThreadId)>>>;
+    /// Number and thread of each written message.
+    type WriteLog = Arc<Mutex<Vec<(u64, thread::ThreadId)>>>;
 
-    /// A queue whose messages are noted with the thread that took them; each takes as long as the gate is closed.
-    fn noting(gate: &Arc<Mutex<()>>) -> (Arc<WriterQueue>, Written) {
-        let taken = Written::default();
+    /// Creates a queue that records the thread of each message. Each write lasts until the gate opens.
+    fn noting(gate: &Arc<Mutex<()>>) -> (Arc<WriterQueue>, WriteLog) {
+        let taken = WriteLog::default();
         let (note, gate) = (taken.clone(), gate.clone());
         let queue = taking(move |message, _| {
             drop(gate.lock().unwrap());
@@ -1143,10 +1147,10 @@ mod tests {
         (queue, taken)
     }
 
-    fn taking(take: impl FnMut(Message, Next) + Send + 'static) -> Arc<WriterQueue> {
-        let behind = Behind { is_free: Box::new(|_| true), ..Behind::default() };
+    fn taking(take: impl FnMut(Message, NextMessage) + Send + 'static) -> Arc<WriterQueue> {
+        let info = WriterInfo { is_free: Box::new(|_| true), ..WriterInfo::default() };
         let (alive, _) = mpsc::channel(1);
-        WriterQueue::spawn_with("test", behind, Shaping::default(), Arc::default(), alive, take).unwrap()
+        WriterQueue::spawn_with("test", info, Shaping::default(), Arc::default(), alive, take).unwrap()
     }
 
     fn message(seq: u64, bytes: usize) -> Message {
@@ -1154,16 +1158,16 @@ mod tests {
         Message { source: SourceId([1; 16]), seq, head, reliable: true, payload: vec![0; bytes].into() }
     }
 
-    /// As a sink does.
+    /// Queues a message as a sink does.
     fn give(queue: &WriterQueue, message: Message) {
         let bytes = message.payload.len();
         match queue.at_once(&message) {
-            Some(mut take) => take(message, Next::Nothing),
+            Some(mut take) => take(message, NextMessage::Nothing),
             None => queue.queue.try_push(message, bytes, WRITER_BYTES_MAX).unwrap(),
         }
     }
 
-    fn sink(transient_local: bool) -> (Arc<LocalSink>, Arc<DataPlane>, Written) {
+    fn sink(transient_local: bool) -> (Arc<LocalSink>, Arc<DataPlane>, WriteLog) {
         let (requests, _) = mpsc::channel(1);
         let sink = Arc::new(LocalSink::new(Name([1; 32]), transient_local, requests, Arc::default()));
         let (queue, taken) = noting(&Arc::default());
@@ -1182,7 +1186,7 @@ mod tests {
         KnownType::Known(Arc::new(layout.unwrap()))
     }
 
-    /// Until it is so, which has a bound.
+    /// Waits until `is_so`, with a bound.
     async fn wait_until(is_so: impl Fn() -> bool) {
         let begun = Instant::now();
         while !is_so() {
@@ -1192,7 +1196,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_comes_as_json_is_held_while_the_owner_is_asked_and_written_when_it_told() {
+    async fn received_json_waits_until_the_owner_describes_its_type() {
         let (sink, data, taken) = sink(false);
         let seqs = || taken.lock().unwrap().iter().map(|(seq, _)| *seq).collect::<Vec<_>>();
         sink.set_type(KnownType::Asked, &data);
@@ -1201,8 +1205,8 @@ mod tests {
             assert_eq!(lost, (seq >= WRITER_MESSAGES_MAX as u64).then_some((DataDrop::NoDefinition, 1)));
         }
         assert!(sink.lacks_definition());
-        // Large ones are bounded by their bytes; what comes behind them does not overtake them.
-        let lost = sink.write(json(5000, HOLD_BYTES_MAX)).await;
+        // Large messages are bounded by their bytes, and later ones do not overtake them.
+        let lost = sink.write(json(5000, PENDING_BYTES_MAX)).await;
         assert_eq!(lost, Some((DataDrop::NoDefinition, WRITER_MESSAGES_MAX as u64)));
         assert_eq!(sink.write(json(5001, 8)).await, Some((DataDrop::NoDefinition, 1)));
         assert_eq!(sink.write(message(5002, 8)).await, None);
@@ -1210,7 +1214,7 @@ mod tests {
         sink.set_type(any_type(), &data);
         wait_until(|| seqs().len() == 2).await;
         assert_eq!((seqs(), sink.delivered(), sink.lacks_definition()), (vec![5001, 5002], 2, false));
-        // Where it is not to be known, what can be read without it is written.
+        // If the type stays unknown, messages that need no conversion are written.
         sink.set_type(KnownType::Asked, &data);
         assert_eq!(sink.write(json(5003, 8)).await, None);
         assert_eq!(sink.write(message(5004, 8)).await, None);
@@ -1221,7 +1225,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_was_held_for_long_is_written_where_it_is_kept_for_late_joiners() {
+    async fn long_pending_message_is_written_only_if_kept_for_late_joiners() {
         for transient_local in [true, false] {
             let (sink, data, taken) = sink(transient_local);
             sink.set_type(KnownType::Asked, &data);
@@ -1253,13 +1257,13 @@ mod tests {
         };
         let (sink, _, _) = sink(false);
         let [killed, restarted] = [[1; 16], [2; 16]].map(SourceId);
-        // Stuck until the sender is gone.
+        // The consumer blocks until the sender is dropped.
         let (stuck, gate) = std::sync::mpsc::channel::<()>();
         let wait = move || {
             let _ = gate.recv();
         };
         sink.set_writer(Some(killed), Some(noted(Box::new(wait))));
-        // The long one keeps the thread busy, and the others wait behind it.
+        // The long message keeps the thread busy, so the others queue up.
         write(&sink, message(0, AT_ONCE_BYTES_MAX + 1));
         (1..50).for_each(|seq| write(&sink, message(seq, 16)));
         sink.set_writer(Some(killed), None);
@@ -1273,8 +1277,8 @@ mod tests {
         write(&sink, Message { source: restarted, ..message(50, 16) });
         let taken = taken.lock().unwrap();
         assert!(taken.iter().map(|(seq, _)| *seq).eq(0..=50), "{taken:?}");
-        // The first may have been taken before the queue was closed, and behind the last there is nothing.
-        assert!(taken[1..49].iter().all(|(_, next)| *next == Next::Last), "{taken:?}");
+        // The first message may be taken before the queue is closed, and the last one has none behind it.
+        assert!(taken[1..49].iter().all(|(_, next)| *next == NextMessage::Last), "{taken:?}");
         sink.close();
     }
 
@@ -1285,10 +1289,10 @@ mod tests {
         let assert = Box::new(move || {
             counted.fetch_add(1, Relaxed);
         });
-        let behind = Behind { assert: Some(assert), ..Behind::default() };
+        let info = WriterInfo { assert: Some(assert), ..WriterInfo::default() };
         let (alive, _) = mpsc::channel(1);
         let (shaping, drops) = (Shaping::default(), Arc::default());
-        let queue = WriterQueue::spawn_with("test", behind, shaping, drops, alive, |_, _| ()).unwrap();
+        let queue = WriterQueue::spawn_with("test", info, shaping, drops, alive, |_, _| ()).unwrap();
         let begun = Instant::now();
         wait_until(|| {
             queue.assert_liveliness();
@@ -1309,13 +1313,13 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn who_received_a_message_writes_it_unless_something_is_ahead_of_it() {
+    async fn receiving_task_writes_a_message_unless_others_are_ahead() {
         let gate = Arc::default();
         let (queue, taken) = noting(&gate);
         give(&queue, message(0, 16));
         assert_eq!(*taken.lock().unwrap(), [(0, thread::current().id())]);
         let is_stuck = gate.lock().unwrap();
-        // The long one is the thread's, and what follows does not overtake it, wherever it is by now.
+        // The thread writes the long message, and later ones do not overtake it.
         give(&queue, message(1, AT_ONCE_BYTES_MAX + 1));
         (2..100).for_each(|seq| give(&queue, message(seq, 16)));
         drop(is_stuck);

@@ -1,8 +1,8 @@
-//! This node's own publishers: samples of the local network in, packets out.
+//! Local publishers: samples of the local network in, packets out.
 //!
-//! Samples are sealed on the thread of the local reader that took them and pushed straight into the queues of
-//! the links: while a reliable one is full, that thread waits, and with it that topic alone. Samples that are
-//! at hand together share a signature; none waits for one that is not.
+//! The thread of the local reader seals the samples and pushes the packets into the queues of the links. While the
+//! queue of a reliable topic is full, only this thread waits, so other topics flow on. Samples that are ready together
+//! share a signature; none waits for a later one.
 
 use std::collections::{BTreeMap, HashMap};
 use std::pin::pin;
@@ -28,12 +28,12 @@ use tracing::{debug, warn};
 use crate::assertions::{ASSERTION_LOOK_MAX, ManualLease};
 use crate::conversion::{self, KnownType, TypeSlot};
 use crate::dataplane::DataPlane;
-use crate::hold::Hold;
+use crate::pending::PendingQueue;
 use crate::shaper::Shaper;
 use crate::stats::DataDrop;
-use crate::tap::{Tapped, Taps};
+use crate::tap::{TapMessage, Taps};
 
-/// The time stamps of the newest samples that readers of a transient-local topic took, by writer.
+/// Time stamps of the newest samples that readers of a transient-local topic took, by writer.
 #[derive(Debug, Default)]
 pub(crate) struct NewestSamples(Mutex<BTreeMap<Guid, i64>>);
 
@@ -47,28 +47,28 @@ impl NewestSamples {
     }
 }
 
-/// The local reader's end of a share.
+/// The consumer of a local reader, which publishes its samples on a share.
 pub(crate) struct Publisher {
     share: Arc<LocalShare>,
-    /// The newest that were taken before this reader was made, which its writers give it once more.
+    /// Time stamps of the newest samples before this reader, since its writers deliver them again.
     past: BTreeMap<Guid, i64>,
     newest: Option<Arc<NewestSamples>>,
 }
 
 impl Publisher {
-    /// The end of a reader; `newest` says what readers before it took, and is kept from here on.
+    /// Creates the consumer of a reader. `newest` holds the time stamps of earlier readers and is updated from here on.
     pub(crate) fn new(share: Arc<LocalShare>, newest: Option<Arc<NewestSamples>>) -> Self {
         let past = newest.as_ref().map(|newest| lock(&newest.0).clone()).unwrap_or_default();
         Self { share, past, newest }
     }
 
-    /// Returns `true` for a sample that a reader before this one took. A writer dates no two samples alike.
+    /// Returns `true` for a sample that an earlier reader took. A writer never gives two samples the same time stamp.
     fn is_past(&self, sample: &Sample) -> bool {
         let newest = sample.writer.and_then(|writer| self.past.get(&writer));
         newest.is_some_and(|newest| sample.source_timestamp_ns <= *newest)
     }
 
-    /// Leaves a sample out that was taken before, or else gives it to the share and notes it.
+    /// Skips a sample that was taken before. Otherwise it notes the sample and passes it to the share.
     fn take(
         &self,
         sample: Sample,
@@ -104,47 +104,47 @@ impl HandleSamples for Publisher {
     }
 }
 
-/// Whether a message is larger than any that is carried.
+/// Whether a message exceeds the largest size that SGC carries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum IsTooLarge {
-    /// It is not sent, however often it is tried.
+    /// The message is too large and is never sent.
     Yes,
-    /// It was sent, or may be later.
+    /// The message was sent, or may be sent later.
     No,
 }
 
-/// Samples that may wait for their writer to be discovered, or for what their type looks like.
+/// Samples that may wait until their writer is discovered or their type is known.
 const EARLY_SAMPLES_MAX: usize = 256;
 
-/// Writers of a topic whose newest samples are remembered.
+/// Writers of a topic whose newest time stamps are remembered.
 const NEWEST_WRITERS_MAX: usize = 1024;
 
-/// The longest message that the reader's thread sends itself, if nothing comes behind it.
+/// The longest message that the reader's thread sends by itself if no other follows.
 const AT_HAND_BYTES_MAX: usize = 16 << 10;
 
-/// A source and what it is for.
+/// A source with the properties of its publisher.
 #[derive(Clone)]
 pub(crate) struct SourceSlot {
-    /// Its id.
+    /// Source id.
     pub id: SourceId,
-    /// The source; locked by the reader's thread for each message.
+    /// The source. The reader's thread locks it for each message.
     pub source: Arc<Mutex<Source>>,
-    /// How far it is, to be seen without the lock.
+    /// Progress of the source, readable without the lock.
     pub progress: Arc<SourceProgress>,
-    /// True if late joiners may ask for its history.
+    /// Whether late joiners may ask for its history.
     pub keeps_history: bool,
-    /// True if its packets are reliable.
+    /// Whether its packets are reliable.
     pub reliable: bool,
-    /// How long its messages are of use.
+    /// Time after which its messages expire.
     pub lifespan: Option<Duration>,
-    /// Messages that it keeps for late joiners.
+    /// Number of messages kept for late joiners.
     pub depth: usize,
-    /// If its publisher may assert its liveliness without a message.
+    /// Lease of a publisher that asserts its liveliness without messages.
     pub manual: Option<Arc<ManualLease>>,
 }
 
 impl SourceSlot {
-    /// A source for a share.
+    /// Creates the slot of a source.
     pub(crate) fn new(source: Source, keeps_history: bool, reliable: bool) -> Self {
         let (id, progress) = (source.id(), source.progress());
         let source = Arc::new(Mutex::new(source));
@@ -152,48 +152,47 @@ impl SourceSlot {
     }
 }
 
-/// Which source publishes for which writer.
+/// The sources of a share by writer.
 #[derive(Default)]
 pub(crate) struct SourceMap {
-    /// For all, where writers are not told apart.
+    /// The one source of all writers, if writers are not distinguished.
     pub shared: Option<SourceSlot>,
-    /// True if each writer has a source of its own: a sample of a writer that is not listed yet waits until
-    /// it is.
+    /// Whether each writer has its own source. Samples of an unlisted writer then wait until it is listed.
     pub(crate) per_writer: bool,
-    /// By writer.
+    /// Sources by writer.
     pub own: HashMap<Guid, SourceSlot>,
-    /// The source that says that writers live which published nothing. It keeps nothing.
+    /// The source that asserts the liveliness of writers without messages. It keeps no history.
     pub assertions: Option<SourceSlot>,
 }
 
 impl SourceMap {
-    /// The slot of a source, if it is of this map.
+    /// Returns the slot of a source.
     pub(crate) fn slot(&self, id: &SourceId) -> Option<SourceSlot> {
         self.slots().find(|slot| slot.id == *id).cloned()
     }
 
-    /// Their ids.
+    /// Returns the ids of all sources.
     pub(crate) fn ids(&self) -> Vec<SourceId> {
         self.slots().map(|slot| slot.id).collect()
     }
 
-    /// All.
+    /// Iterates over all slots.
     pub(crate) fn slots(&self) -> impl Iterator<Item = &SourceSlot> {
         self.own.values().chain(&self.shared).chain(&self.assertions)
     }
 }
 
-/// What is held back of a topic that is not to go out as it comes.
+/// State of shaping: the sample that waits for its time.
 #[derive(Default)]
-struct Held {
+struct DelayedSample {
     shaper: Shaper,
-    /// The newest that waits for its time.
+    /// The newest waiting sample.
     sample: Option<Sample>,
-    /// Whether a task is to let it go.
+    /// Whether a task will publish it.
     is_timed: bool,
 }
 
-/// How messages are made shorter.
+/// Compression of messages, with its counters.
 #[derive(Default)]
 struct Compression {
     encoding: Mutex<(PayloadEncoding, Compressor)>,
@@ -201,19 +200,19 @@ struct Compression {
     after: AtomicU64,
 }
 
-/// What is between the local reader and the sources.
+/// Samples and sources that wait.
 struct Inbox {
-    /// Samples of writers whose discovery is still under way: DDS may deliver a late joiner's history before
-    /// it tells who wrote it. Also those that become JSON, while their type is looked for.
-    early: Hold<Sample>,
-    /// Sources that were told that more follows, and wait for it with what they have.
+    /// Samples without a source or a type. DDS may deliver a late joiner's history before it discovers the writer, and
+    /// samples to convert to JSON wait for their type.
+    early: PendingQueue<Sample>,
+    /// Sources that expect more messages and keep an unfinished batch.
     open: Vec<SourceSlot>,
 }
 
-/// Its writer has no source yet.
-struct NotListed;
+/// Error: the writer has no source yet.
+struct UnknownWriter;
 
-/// A shared topic's end at this node.
+/// This node's end of a topic that it shares or publishes on.
 pub(crate) struct LocalShare {
     name: Name,
     data: Arc<DataPlane>,
@@ -221,47 +220,47 @@ pub(crate) struct LocalShare {
     alive: mpsc::Sender<()>,
     pub map: ArcSwap<SourceMap>,
     inbox: Mutex<Inbox>,
-    /// Whether anything is set of how much goes out, to be seen without the lock.
+    /// Whether shaping is configured, readable without the lock.
     is_shaped: AtomicBool,
-    /// Whether anything is set of how it goes out, compression included.
+    /// Whether shaping or compression is configured.
     is_altered: AtomicBool,
     /// Whether messages leave as JSON.
     is_json: AtomicBool,
     types: TypeSlot,
-    held: Mutex<Held>,
+    held: Mutex<DelayedSample>,
     compression: Compression,
-    /// Told when it is closed, for who waits for his time.
+    /// Notified when the share closes, to wake a thread that waits for a sample's time.
     ended: Condvar,
-    /// Whether it was said that reliable messages do not age.
+    /// Whether the log has said that reliable messages do not age.
     aged: AtomicBool,
-    /// How many those are, to be seen without the lock, which a publisher holds while it is pushed back.
+    /// Number of waiting samples. It is readable without the lock, which a blocked publisher holds.
     waiting: AtomicUsize,
     closed: AtomicBool,
-    /// Messages of one source under one key, after which a new epoch begins.
+    /// Messages of one source under one key before a new epoch begins.
     epoch_messages_max: u64,
-    /// True while the epoch that is over by its number of messages has no successor yet.
+    /// Whether the message limit of the epoch is reached and the next epoch has not begun.
     rotating: AtomicBool,
-    /// True until the control task has seen that it is over.
+    /// Whether the control task has yet to see that the epoch is over.
     is_over: AtomicBool,
-    /// Wakes the control task, which nothing else may wake while messages flow.
+    /// Wakes the control task, which may otherwise sleep while messages flow.
     over: Arc<Notify>,
-    /// What the control task saw of each source that says what it published last.
+    /// Progress of each source at the last look for silence.
     marks: Mutex<BTreeMap<SourceId, Marks>>,
-    /// True while there is nothing to see: the next message says that there is.
+    /// Whether all sources are silent. The next message clears it.
     quiet: AtomicBool,
     published: AtomicU64,
     taps: Taps,
-    /// Whether it is looked for publishers that assert their liveliness.
+    /// Whether a task looks for liveliness assertions.
     is_watched: AtomicBool,
 }
 
 impl LocalShare {
-    /// The sources; replaced as a whole by [`Self::set_map`].
+    /// Returns the sources. [`Self::set_map`] replaces them as a whole.
     pub(crate) fn map(&self) -> Arc<SourceMap> {
         self.map.load_full()
     }
 
-    /// A share without sources.
+    /// Creates a share without sources.
     pub(crate) fn new(
         name: Name,
         data: Arc<DataPlane>,
@@ -269,7 +268,7 @@ impl LocalShare {
         epoch_messages_max: u64,
         over: Arc<Notify>,
     ) -> Self {
-        let early = Hold::new(EARLY_SAMPLES_MAX, data.holds().clone());
+        let early = PendingQueue::new(EARLY_SAMPLES_MAX, data.holds().clone());
         Self {
             name,
             data,
@@ -299,18 +298,18 @@ impl LocalShare {
         }
     }
 
-    /// Has a source keep so many messages for late joiners.
+    /// Sets the number of messages that a source keeps for late joiners.
     pub(crate) fn set_history_depth(&self, slot: &SourceSlot, depth: usize) {
         let source = slot.source.clone();
         self.run_blocking(move || lock(&source).set_history_depth(depth));
     }
 
-    /// Who looks at what is published.
+    /// Returns the taps of published messages.
     pub(crate) fn taps(&self) -> &Taps {
         &self.taps
     }
 
-    /// Sets how much goes out from here on.
+    /// Sets the limits of rate, bandwidth and age.
     pub(crate) fn set_shaping(self: &Arc<Self>, shaping: Shaping) {
         lock(&self.held).shaper.set(shaping);
         lock(&self.compression.encoding).0 = shaping.compression;
@@ -319,25 +318,25 @@ impl LocalShare {
         let limits = Shaping { compression, form, ..shaping };
         self.is_shaped.store(limits != Shaping::default(), SeqCst);
         if self.is_json.swap(shaping.form == PayloadForm::Json, SeqCst) {
-            // What waits to become JSON need not any more.
+            // Samples that waited for conversion need none any more.
             self.publish_waiting();
         }
     }
 
-    /// What its messages look like is known now, or is not; what waited for that is published, or given up.
+    /// Sets the state of the type. Samples that waited for it are published or dropped.
     pub(crate) fn set_type(self: &Arc<Self>, known: KnownType) {
         self.types.set(known);
         self.publish_waiting();
     }
 
-    /// How much goes out.
+    /// Returns the limits of rate, bandwidth and age.
     pub(crate) fn shaping(&self) -> Shaping {
         *lock(&self.held).shaper.shaping()
     }
 
-    /// Publishes a sample, now or when its time has come; called on the reader's thread.
+    /// Publishes a sample, at once or when its time has come. The reader's thread calls it.
     pub(crate) fn publish(self: &Arc<Self>, sample: Sample) {
-        // With others behind it, or in many packets, it is sent by the runtime while this thread seals.
+        // If more samples follow or the sample is long, the runtime sends packets while this thread seals.
         let is_alone = !sample.more && sample.payload.len() <= AT_HAND_BYTES_MAX;
         let _at_hand = is_alone.then(|| WakeBatch::begin(&self.runtime));
         if !self.is_shaped.load(Relaxed) {
@@ -346,21 +345,21 @@ impl LocalShare {
         let ends_batch = !sample.more;
         match self.shape(sample) {
             Some(sample) => self.publish_now(sample),
-            // What came before it is not to wait for what may never come.
+            // The last sample of the batch is not published, so the earlier ones must leave now.
             None if ends_batch => self.flush(&mut lock(&self.inbox)),
             None => {}
         }
     }
 
-    /// Publishes a sample if nothing has to be waited for, or gives it back; called on a thread that receives for others, too.
+    /// Publishes a sample if that needs no waiting, or returns it. Receive threads of several readers call it.
     fn publish_at_once(&self, sample: Sample) -> Result<(), Sample> {
         let is_short = sample.payload.len() <= AT_HAND_BYTES_MAX;
-        if !is_short || self.is_altered.load(Relaxed) || !self.data.is_at_ease(&self.name) {
+        if !is_short || self.is_altered.load(Relaxed) || !self.data.has_headroom(&self.name) {
             return Err(sample);
         }
-        // Its tasks are run when the locks are free again.
+        // The woken tasks run after the locks are released.
         let _at_hand = WakeBatch::begin(&self.runtime);
-        // Who has the locks may be pushed back.
+        // The holder of the lock may be blocked.
         let Ok(inbox) = self.inbox.try_lock() else { return Err(sample) };
         let Ok(slot) = self.slot_of(sample.writer) else { return Err(sample) };
         if !inbox.early.is_empty() || !inbox.open.is_empty() {
@@ -375,12 +374,12 @@ impl LocalShare {
         Ok(())
     }
 
-    /// A sample that may go now; others are held back until their time has come, or until there is a newer one. Waits
-    /// with one that may be neither dropped nor overtaken.
+    /// Returns a sample that may leave now, or holds it until its time comes or a newer one replaces it. Blocks with a
+    /// sample that may be neither dropped nor overtaken.
     fn shape(self: &Arc<Self>, sample: Sample) -> Option<Sample> {
         let mut held = lock(&self.held);
         if sample.kind != SampleKind::Write {
-            // The end of an instance comes behind what was said of it last, and is never left out.
+            // The end of an instance follows its last sample and is never dropped.
             if let Some(before) = held.sample.take() {
                 drop(held);
                 self.publish_now(Sample { more: true, ..before });
@@ -419,7 +418,7 @@ impl LocalShare {
         Some(sample)
     }
 
-    /// The sample that was held back, if its time has come.
+    /// Returns the held sample if its time has come.
     fn take_held(&self) -> Option<Sample> {
         let mut held = lock(&self.held);
         let now = Instant::now();
@@ -428,7 +427,7 @@ impl LocalShare {
         Some(Sample { more: false, ..sample })
     }
 
-    /// Publishes a sample.
+    /// Publishes a sample without shaping.
     fn publish_now(&self, sample: Sample) {
         let more = sample.more;
         let mut inbox = self.inbox.lock().unwrap_or_else(PoisonError::into_inner);
@@ -440,8 +439,7 @@ impl LocalShare {
                 self.data.count_here(&self.name, reason, given_up);
             }
             self.waiting.store(inbox.early.len(), SeqCst);
-            // Its source may have come between the two looks; whoever puts a map in place after this one sees
-            // that something waits.
+            // The source may have been added between the two checks. A later `set_map` sees the waiting sample.
             self.publish_early(&mut inbox);
         }
         if !more {
@@ -449,13 +447,13 @@ impl LocalShare {
         }
     }
 
-    /// Puts new sources in place, and publishes what waited for them.
+    /// Replaces the sources, and publishes samples that waited for them.
     pub(crate) fn set_map(self: &Arc<Self>, map: SourceMap) {
         self.map.store(Arc::new(map));
         self.publish_waiting();
     }
 
-    /// Publishes what waited and need not any more, on a thread of its own.
+    /// Publishes samples that need not wait any more, on a blocking thread.
     fn publish_waiting(self: &Arc<Self>) {
         fence(SeqCst);
         if self.waiting.load(SeqCst) == 0 {
@@ -470,8 +468,7 @@ impl LocalShare {
         });
     }
 
-    /// Publishes, in their order, the samples whose writers have a source by now. The caller flushes, or
-    /// publishes what follows.
+    /// Publishes in order the waiting samples whose writers have a source now. The caller flushes, or publishes more.
     fn publish_early(&self, inbox: &mut Inbox) {
         if inbox.early.is_empty() {
             return;
@@ -498,24 +495,24 @@ impl LocalShare {
         self.waiting.store(inbox.early.len(), SeqCst);
     }
 
-    /// Whether messages are to leave as JSON, and what they look like may become known.
+    /// Returns `true` if messages leave as JSON and their type may still become known.
     fn awaits_type(&self) -> bool {
         self.is_json.load(Relaxed) && self.types.now().is_awaited()
     }
 
-    /// Whether nobody is to hear late of a sample that was to become JSON: it is not kept for late joiners.
+    /// Returns `true` if a waiting sample is useless when late, because it is not kept for late joiners.
     fn is_given_up(&self, sample: &Sample) -> bool {
         self.is_json.load(Relaxed)
             && sample.kind == SampleKind::Write
             && matches!(self.slot_of(sample.writer), Ok(Some(slot)) if !slot.keeps_history)
     }
 
-    /// Publishes a sample, or gives it back if its writer's source, or what it is converted by, is not known yet. With
-    /// `more` the source may be left with packets that wait for others; then it is in `open`.
+    /// Publishes a sample, or returns it if its source or its type is unknown. With `more`, the source may keep an
+    /// unfinished batch and is then in `open`.
     fn try_publish(&self, sample: Sample, more: bool, open: &mut Vec<SourceSlot>) -> Result<(), Sample> {
         let awaits_type = self.awaits_type();
         match self.slot_of(sample.writer) {
-            Err(NotListed) => return Err(sample),
+            Err(UnknownWriter) => return Err(sample),
             Ok(Some(_)) if awaits_type => return Err(sample),
             Ok(None) => self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted),
             Ok(Some(slot)) => {
@@ -528,19 +525,19 @@ impl LocalShare {
         Ok(())
     }
 
-    /// Which source publishes for a writer, if any does.
-    fn slot_of(&self, writer: Option<Guid>) -> Result<Option<SourceSlot>, NotListed> {
+    /// Returns the source of a writer, if it has one.
+    fn slot_of(&self, writer: Option<Guid>) -> Result<Option<SourceSlot>, UnknownWriter> {
         let map = self.map.load();
         match writer.and_then(|w| map.own.get(&w)) {
             Some(slot) => Ok(Some(slot.clone())),
-            None if map.per_writer && writer.is_some() => Err(NotListed),
-            // Its writer was gone before anybody asked who it is.
+            None if map.per_writer && writer.is_some() => Err(UnknownWriter),
+            // The writer is gone and was never identified, so any source serves.
             None => Ok(map.shared.as_ref().or_else(|| map.own.values().min_by_key(|s| s.id)).cloned()),
         }
     }
 
-    /// Publishes a sample of a source, which is locked already or is to be waited for. True if it may be left with packets
-    /// that wait for others, as it may with `more`.
+    /// Publishes a sample by its source, which may be locked already. Returns `true` if the source keeps an unfinished
+    /// batch, which only `more` allows.
     fn publish_of(
         &self,
         slot: &SourceSlot,
@@ -556,8 +553,8 @@ impl LocalShare {
             self.data.count(LinkId::LOCAL, &self.name, DataDrop::NoTree);
             return false;
         }
-        self.taps.offer(|| Tapped::of_sample(&sample));
-        // What may never leave is not worth the time.
+        self.taps.offer(|| TapMessage::from_sample(&sample));
+        // Messages that cannot leave are not converted.
         let written = match wanted || slot.keeps_history {
             true => self.write(sample.kind, sample.key_hash, sample.payload),
             false => Ok((PayloadForm::Cdr, PayloadEncoding::Plain, sample.payload)),
@@ -580,10 +577,10 @@ impl LocalShare {
         }
         let mut source = source.unwrap_or_else(|| lock(&slot.source));
         let result = if wanted {
-            // Fragments leave as they are sealed: a large message is under way before its end is read.
+            // Fragments leave while later ones are sealed, so a large message is under way before its end is read.
             source.publish(&head, payload, more, self.emit())
         } else {
-            // For who joins later, or is on another way here.
+            // Nobody listens now, so the message is only kept for late joiners and rejoining sinks.
             source.record(&head, payload)
         };
         drop(source);
@@ -591,8 +588,7 @@ impl LocalShare {
         more
     }
 
-    /// Publishes a message about a call: what is asked and what is answered have one source each. Nothing becomes of it
-    /// while nobody would get it. May block.
+    /// Publishes a request or a reply. It has no effect while nobody would receive it. May block.
     pub(crate) fn publish_call(&self, head: &MessageHead, payload: Bytes, to: Option<SinkId>) -> IsTooLarge {
         let Some(slot) = self.map.load().shared.clone() else { return IsTooLarge::No };
         if self.closed.load(Relaxed) || !self.data.is_wanted(&self.name) {
@@ -612,7 +608,7 @@ impl LocalShare {
         is_too_large
     }
 
-    /// Counts messages of the local network that came faster than they were taken.
+    /// Counts local samples that were lost because they came too fast.
     pub(crate) fn count_overrun(&self, messages: u64) {
         self.data.count_here(&self.name, DataDrop::Overrun, messages);
     }
@@ -640,7 +636,7 @@ impl LocalShare {
         }
     }
 
-    /// The payload as it leaves: converted, then compressed.
+    /// Converts and compresses a payload.
     fn write(
         &self,
         kind: SampleKind,
@@ -691,50 +687,49 @@ impl LocalShare {
         (encoding, left)
     }
 
-    /// Bytes that were to be compressed, and what came of them; nothing while none were.
+    /// Returns the bytes before and after compression; `None` before the first message.
     pub(crate) fn compressed(&self) -> Option<(u64, u64)> {
         let before = self.compression.before.load(Relaxed);
         (before > 0).then(|| (before, self.compression.after.load(Relaxed)))
     }
 
-    /// Lets go what waits for more, which does not come.
+    /// Finishes open batches, because no more messages follow.
     fn flush(&self, inbox: &mut Inbox) {
         for slot in inbox.open.drain(..) {
             lock(&slot.source).flush(self.emit());
         }
     }
 
-    /// Sends packets on their ways, if there are any: a history without anyone to get it stays here.
+    /// Returns a function that forwards packets. Packets of a history without a sink stay here.
     fn emit(&self) -> impl FnMut(Packet) {
         let wanted = self.data.is_wanted(&self.name);
         move |packet| {
             if wanted && !self.closed.load(Relaxed) {
-                // By reference: tokio puts large futures on the heap.
+                // The future is passed by reference, since tokio boxes large futures.
                 prompt::block_on(&self.runtime, pin!(self.data.forward(LinkId::LOCAL, packet)));
             }
         }
     }
 
-    /// Publishes under the key of a new epoch from here on. A publisher that is pushed back takes it up after
-    /// its message.
+    /// Publishes under the key of a new epoch from here on. A blocked publisher takes it up after its message.
     pub(crate) fn rekey(self: &Arc<Self>, grant: TopicGrant) {
         let (share, alive) = (self.clone(), self.alive.clone());
         self.runtime.spawn_blocking(move || {
             let _alive = alive;
             for slot in share.map.load().slots() {
-                // A source that was made meanwhile has the key already, or that of a later epoch.
+                // A source that was created meanwhile has this key already, or a later one.
                 let _ = lock(&slot.source).rekey(&grant, share.emit());
             }
             share.rotating.store(false, Relaxed);
         });
     }
 
-    /// True, once per epoch, when a source has published so many messages that a new one shall begin.
+    /// Returns `true` once per epoch, when a source has reached the message limit.
     pub(crate) fn is_epoch_over(&self) -> bool {
         self.is_over.swap(false, SeqCst)
     }
 
-    /// Sends a sink what it asks for, in order with what is published meanwhile. Takes as long as that takes.
+    /// Sends a sink the requested history, in order with new messages. Blocks until it is sent.
     pub(crate) fn replay(&self, recover: &Recover) {
         let Some(slot) = self.map.load().slot(&recover.source) else { return };
         let mut source = lock(&slot.source);
@@ -748,13 +743,13 @@ impl LocalShare {
         });
     }
 
-    /// Returns `true`, once, if it is to be looked for publishers that assert their liveliness ([`crate::assertions::watch`]).
+    /// Returns `true` once if a task has to look for liveliness assertions ([`crate::assertions::watch`]).
     pub(crate) fn begins_watch(&self) -> bool {
         self.map.load().assertions.is_some() && !self.is_watched.swap(true, SeqCst)
     }
 
-    /// Lets publishers be heard that renewed their leases without a message. Returns how long to wait for the next look; None if there is
-    /// nobody to look for any more.
+    /// Passes on liveliness assertions of publishers without messages. Returns the wait until the next look; `None` if
+    /// no such publisher is left.
     pub(crate) fn look_for_assertions(
         self: &Arc<Self>,
         now: Instant,
@@ -766,7 +761,7 @@ impl LocalShare {
         let mut map = self.map();
         if map.assertions.is_none() {
             self.is_watched.store(false, SeqCst);
-            // One may have come between the two.
+            // A publisher may have been added between the two checks.
             if !self.begins_watch() {
                 return None;
             }
@@ -784,7 +779,7 @@ impl LocalShare {
         if let Some(slot) = map.assertions.clone().filter(|_| !news.is_empty()) {
             let share = self.clone();
             self.run_blocking(move || {
-                // The holder of the source is pushed back.
+                // The holder of the source is blocked.
                 let Ok(mut source) = slot.source.try_lock() else { return };
                 for (publisher, lease) in news {
                     if source.assert_publisher(publisher, share.emit()).is_ok() {
@@ -796,7 +791,7 @@ impl LocalShare {
         Some(wait)
     }
 
-    /// Does something that may block, on a thread where it may.
+    /// Runs work that may block on a blocking thread.
     pub(crate) fn run_blocking(&self, work: impl FnOnce() + Send + 'static) {
         let alive = self.alive.clone();
         self.runtime.spawn_blocking(move || {
@@ -805,8 +800,7 @@ impl LocalShare {
         });
     }
 
-    /// Lets sources that have fallen silent say what they published last. False if none will have to before the next
-    /// message.
+    /// Lets silent sources announce their last message. Returns `false` if none has to before the next message.
     pub(crate) fn look_for_silence(self: &Arc<Self>, now: Instant) -> bool {
         if self.quiet.load(SeqCst) {
             return false;
@@ -821,7 +815,7 @@ impl LocalShare {
                 if marks.is_due(now, &slot.progress) && self.data.is_wanted(&self.name) {
                     let (share, slot) = (self.clone(), slot.clone());
                     self.run_blocking(move || {
-                        // Who has the source is about to publish.
+                        // The holder of the source is about to publish.
                         if let Ok(mut source) = slot.source.try_lock() {
                             source.mark(share.emit());
                         }
@@ -835,7 +829,7 @@ impl LocalShare {
             return true;
         }
         self.quiet.store(true, SeqCst);
-        // A message may have come between the two.
+        // A message may have come between the two checks.
         let busy = look();
         if busy {
             self.quiet.store(false, SeqCst);
@@ -843,7 +837,7 @@ impl LocalShare {
         busy
     }
 
-    /// Ends it: a reader's thread that is publishing stops at the next packet.
+    /// Closes the share. A publishing reader's thread stops at the next packet.
     pub(crate) fn close(&self) {
         self.closed.store(true, Relaxed);
         self.taps.close();
@@ -851,23 +845,23 @@ impl LocalShare {
         self.ended.notify_all();
     }
 
-    /// Signatures that its present sources made: one for each batch of packets.
+    /// Returns the number of signatures of its present sources, one for each batch.
     pub(crate) fn signatures(&self) -> u64 {
         self.map.load().slots().map(|slot| slot.progress.signatures()).sum()
     }
 
-    /// Whether messages are to leave as JSON and cannot, for want of a definition.
+    /// Returns `true` if messages have to leave as JSON and their type is unknown.
     pub(crate) fn lacks_definition(&self) -> bool {
         self.is_json.load(Relaxed) && self.types.now().is_lacking()
     }
 
-    /// Messages published.
+    /// Returns the number of published messages.
     pub(crate) fn published(&self) -> u64 {
         self.published.load(Relaxed)
     }
 }
 
-/// Publishes what is held back when its time comes, until nothing is.
+/// Publishes held samples when their time comes, until none is left.
 async fn let_go(share: Weak<LocalShare>) {
     loop {
         let due = {
@@ -890,12 +884,12 @@ async fn let_go(share: Weak<LocalShare>) {
                 share.publish_now(sample);
             }
         };
-        // Pushing back takes its time.
+        // Publishing may block.
         let _ = runtime.spawn_blocking(publish).await;
     }
 }
 
-/// The clock that publishers date by.
+/// Returns the wall-clock time that publishers stamp samples with.
 fn unix_ns() -> i64 {
     let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     unix.as_nanos().try_into().unwrap_or(i64::MAX)
@@ -914,8 +908,8 @@ mod tests {
 
     use super::*;
     use crate::dataplane::{Forward, Out};
-    use crate::hold::HOLD_BYTES_MAX;
     use crate::outflow::OutFlow;
+    use crate::pending::PENDING_BYTES_MAX;
 
     const KNOWN: Guid = Guid([1; 16]);
     const STRANGER: Guid = Guid([2; 16]);
@@ -931,7 +925,7 @@ mod tests {
         TopicGrant { epoch, suite: Suite::Standard.id(), key, sources: Vec::new(), entry: None }
     }
 
-    /// A share with a source for one writer; samples of others wait until their writer is known.
+    /// Creates a share with a source for one writer. Samples of other writers wait until their writer is known.
     fn share() -> (Arc<LocalShare>, SourceSlot) {
         let (alive, _) = mpsc::channel(1);
         let share = Arc::new(LocalShare::new(Name([1; 32]), Arc::default(), alive, 2, Arc::default()));
@@ -962,7 +956,7 @@ mod tests {
         let runtime = tokio::runtime::Runtime::new().unwrap();
         let _inside = runtime.enter();
         let (share, slot) = share();
-        // Without anybody who listens nothing is sealed.
+        // Without a sink nothing is sealed.
         share.publish(sample(KNOWN, true));
         assert_eq!((share.published(), unflushed(&slot)), (1, 0));
         let nowhere = FibEntry { trees: [].as_slice().into(), sinks: vec![] };
@@ -970,7 +964,7 @@ mod tests {
         share.publish(sample(KNOWN, true));
         share.publish(sample(STRANGER, false));
         assert_eq!((share.published(), unflushed(&slot)), (2, 0));
-        // The same once the stranger is known and what waited for it is published.
+        // The stranger is known now and its waiting samples are published.
         share.publish(sample(KNOWN, true));
         assert_eq!(unflushed(&slot), 1, "it does wait while more is to come");
         share.publish(sample(KNOWN, true));
@@ -989,12 +983,12 @@ mod tests {
         let mut first = Publisher::new(share.clone(), newest.clone());
         [1, 2, 3].into_iter().for_each(|timestamp| first.handle(dated(timestamp)));
         assert_eq!(share.published(), 3);
-        // The same samples once more, and those that came meanwhile.
+        // The writer delivers the same samples again, and new ones.
         let mut second = Publisher::new(share.clone(), newest);
         [1, 2, 3, 4, 5].into_iter().for_each(|timestamp| second.handle(dated(timestamp)));
         assert_eq!(share.published(), 5);
         assert_eq!(share.data.drops().snapshot()["repeated"], 3);
-        // A reader does not compare what it takes itself.
+        // A reader does not skip samples that it took itself.
         second.handle(dated(5));
         assert_eq!(share.published(), 6);
     }
@@ -1013,7 +1007,7 @@ mod tests {
         assert!(newest.values().all(|timestamp| *timestamp == 7));
     }
 
-    /// Until it is so, which has a bound.
+    /// Waits until `is_so`, with a bound.
     fn wait_until(is_so: impl Fn() -> bool) {
         let end = Instant::now() + Duration::from_secs(30);
         while !is_so() {
@@ -1023,7 +1017,7 @@ mod tests {
     }
 
     #[test]
-    fn what_would_have_to_wait_is_given_back() {
+    fn sample_that_would_block_is_handed_back() {
         let runtime = tokio::runtime::Runtime::new().unwrap();
         let _inside = runtime.enter();
         let (share, slot) = share();
@@ -1036,8 +1030,8 @@ mod tests {
         let mut publisher = Publisher::new(share.clone(), None);
         let mut is_taken = |sample: Sample| publisher.handle_at_once(sample).is_ok();
         assert!(is_taken(sample(KNOWN, false)));
-        assert_eq!((share.published(), flow.is_at_ease()), (1, true));
-        // Its source is not known yet, or somebody else sends with it, or more of it waits for a batch to end.
+        assert_eq!((share.published(), flow.has_headroom()), (1, true));
+        // These cases wait: an unknown source, a locked source, or an unfinished batch.
         assert!(!is_taken(sample(STRANGER, false)));
         {
             let _replays = lock(&slot.source);
@@ -1046,24 +1040,24 @@ mod tests {
         share.publish(sample(KNOWN, true));
         assert!(!is_taken(sample(KNOWN, false)));
         share.publish(sample(KNOWN, false));
-        // It is long, or something is set of how it goes out.
+        // Long or shaped samples wait.
         let payload = Bytes::from(vec![0; AT_HAND_BYTES_MAX + 1]);
         assert!(!is_taken(Sample { payload, ..sample(KNOWN, false) }));
         share.set_shaping(Shaping { compression: PayloadEncoding::Lz4, ..Shaping::default() });
         assert!(!is_taken(sample(KNOWN, false)));
         share.set_shaping(Shaping::default());
         assert!(is_taken(sample(KNOWN, false)));
-        // The link has much to do.
-        while flow.is_at_ease() {
+        // A busy link makes it wait.
+        while flow.has_headroom() {
             share.publish(sample(KNOWN, false));
         }
         assert!(!is_taken(sample(KNOWN, false)));
-        // What came too fast is counted.
+        // Overruns are counted.
         publisher.overrun(7);
         assert_eq!(share.data.drops().snapshot()["overrun"], 7);
     }
 
-    /// A type of one text, and a message of it.
+    /// Returns a type with one string, and a message of it.
     fn text_type() -> (Arc<sgc_cdr::Layout>, Bytes) {
         let mut text = |_: &sgc_cdr::TypeName| Some("string a".to_owned());
         let layout = sgc_cdr::Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut text).unwrap();
@@ -1072,7 +1066,7 @@ mod tests {
     }
 
     #[test]
-    fn what_becomes_json_is_held_while_the_owner_is_asked_and_leaves_when_it_told() {
+    fn sample_to_convert_waits_until_the_owner_describes_its_type() {
         let runtime = tokio::runtime::Runtime::new().unwrap();
         let _inside = runtime.enter();
         let (share, mut slot) = share();
@@ -1084,15 +1078,15 @@ mod tests {
         (0..EARLY_SAMPLES_MAX + 3).for_each(|_| share.publish(sample()));
         let lost = |share: &LocalShare| share.data.drops().snapshot().get("no_definition").copied();
         assert_eq!((share.published(), lost(&share)), (0, Some(3)));
-        // Large ones are bounded by their bytes.
-        let large = Sample { payload: vec![0; HOLD_BYTES_MAX].into(), ..sample() };
+        // Large samples are bounded by their bytes.
+        let large = Sample { payload: vec![0; PENDING_BYTES_MAX].into(), ..sample() };
         share.publish(large);
         assert_eq!(lost(&share), Some(3 + EARLY_SAMPLES_MAX as u64));
         (0..2).for_each(|_| share.publish(sample()));
         assert_eq!(lost(&share), Some(4 + EARLY_SAMPLES_MAX as u64));
         share.set_type(KnownType::Known(layout.clone()));
         wait_until(|| share.published() == 2);
-        // What nobody keeps for late joiners is of no use after a while; the others are.
+        // Late samples are dropped unless they are kept for late joiners.
         for keeps_history in [true, false] {
             slot.keeps_history = keeps_history;
             let own = HashMap::from([(KNOWN, slot.clone())]);
@@ -1109,7 +1103,7 @@ mod tests {
             wait_until(|| share.published() == before + left);
             assert_eq!(lost(&share), lost_before.map(|n| n + 2 - left));
         }
-        // It goes out as it is where that is wanted.
+        // Samples leave unconverted where that is configured.
         share.set_type(KnownType::Asked);
         share.publish(sample());
         let before = share.published();
@@ -1118,7 +1112,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_topic_with_a_rate_the_newest_goes_and_the_last_is_not_forgotten() {
+    fn rate_limited_topic_sends_the_newest_sample_and_never_drops_the_last() {
         let runtime = tokio::runtime::Runtime::new().unwrap();
         let _inside = runtime.enter();
         let (share, slot) = share();
@@ -1131,11 +1125,11 @@ mod tests {
         assert!(begin.elapsed() >= Duration::from_millis(200));
         assert_eq!(share.data.drops().snapshot()["thinned"], 48);
         assert_eq!(unflushed(&slot), 0);
-        // The end of an instance is said at once, behind what is held back of it.
+        // The end of an instance leaves at once, after its held sample.
         share.publish(sample(KNOWN, false));
         share.publish(Sample { kind: SampleKind::Dispose, ..sample(KNOWN, false) });
         assert_eq!(share.published(), 4);
-        // What has no shape passes.
+        // Without shaping, samples pass.
         share.set_shaping(Shaping::default());
         (0..10).for_each(|_| share.publish(sample(KNOWN, false)));
         assert_eq!(share.published(), 14);
@@ -1148,7 +1142,7 @@ mod tests {
         let (share, _) = share();
         share.set_shaping(Shaping { bits_per_s: Some(8 * 80), ..Shaping::default() });
         let begin = Instant::now();
-        // 8 bytes each, at 80 a second.
+        // 8 bytes each, at 80 bytes a second.
         (0..4).for_each(|_| share.publish(sample(KNOWN, false)));
         assert!(share.published() == 4 && begin.elapsed() >= Duration::from_millis(250));
         share.set_shaping(Shaping { bits_per_s: Some(1), ..Shaping::default() });
@@ -1161,7 +1155,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_too_old_is_left_out_unless_it_is_reliable() {
+    fn stale_sample_is_dropped_unless_it_is_reliable() {
         let runtime = tokio::runtime::Runtime::new().unwrap();
         let _inside = runtime.enter();
         let dated = |age_s: i64| Sample {

@@ -1,31 +1,31 @@
-//! [`Spacing`]: the pace at which messages that came at once are written.
+//! [`Spacing`]: the pace at which messages that arrive in a burst are written.
 //!
-//! Packets are gathered on their way, and every pause of a process or of a link makes a burst. A subscriber of ROS 2 keeps its last ten
-//! messages by default and needs some time to wake up, so it loses of a burst whatever is more than it keeps. Its publisher let it
-//! have that time. A burst is therefore written twice as fast as it was published: few messages at once, then a pause. A message that
-//! comes as late after the one before as it was published is never held up.
+//! Batching, and every pause of a process or a link, causes bursts. A ROS 2 subscriber keeps the last ten messages by
+//! default and takes time to wake up, so it loses the rest of a burst, although the publisher spread the messages over
+//! time. A burst is therefore written twice as fast as it was published: a few messages at once, then a pause. A
+//! message with its publisher's distance from the one before is never delayed.
 
 use std::time::{Duration, Instant};
 
 use sgc_wire::SourceId;
 
-/// Messages of a burst are written so many times as fast as they were published.
+/// Factor by which a burst is written faster than it was published.
 const CATCH_UP: u64 = 2;
 
-/// A message is written ahead of its time by so many of its intervals: half of what a subscription with the default of ROS 2 for
-/// sensor data keeps (`rmw_qos_profile_sensor_data`, depth 5), and the one that is due.
+/// Intervals by which a message is written ahead of its time: half of the depth of ROS 2's default for sensor data
+/// (`rmw_qos_profile_sensor_data`, depth 5), and the message that is due.
 const AHEAD: u32 = 2;
 
-/// The longest interval: what gathered of a slow topic while a link was down is written within moments.
+/// Upper bound of an interval. Messages of a slow topic that gathered while a link was down are written within moments.
 const INTERVAL_MAX: Duration = Duration::from_micros(500);
 
-/// By so much a message that is written late is made up for by those behind it: about as much as sleeping takes too long.
+/// Delay of a written message that later messages make up for: about the overrun of a sleep.
 const LATE_MAX: Duration = Duration::from_micros(100);
 
-/// A shorter wait costs more than it gives: about the time that sleeping takes.
+/// Shortest wait that is worth a sleep.
 const WAIT_MIN: Duration = Duration::from_micros(20);
 
-/// The times of one writer's messages.
+/// Times of one writer's last message.
 #[derive(Debug, Default)]
 pub(crate) struct Spacing {
     last: Option<Last>,
@@ -34,21 +34,21 @@ pub(crate) struct Spacing {
 #[derive(Debug)]
 struct Last {
     source: SourceId,
-    /// When it was published, ns since the epoch by the publisher's clock.
+    /// Time of publishing, ns since the epoch by the publisher's clock.
     published_ns: i64,
-    /// When it was to be written.
+    /// Scheduled time of writing.
     scheduled: Instant,
 }
 
 impl Spacing {
-    /// Returns how long a message waits before it is written, nothing if it does not.
+    /// Returns the time that a message waits before it is written; `None` if it does not.
     pub(crate) fn wait(&self, now: Instant, source: SourceId, published_ns: i64) -> Option<Duration> {
         let (scheduled, interval) = self.schedule(now, source, published_ns);
         let ahead = scheduled.checked_sub(interval * AHEAD)?;
         if ahead.saturating_duration_since(now) < WAIT_MIN {
             return None;
         }
-        // Those behind it that are due by then need no wait of their own.
+        // Later messages that are due by then need no wait of their own.
         Some(scheduled.saturating_duration_since(now))
     }
 
@@ -58,9 +58,9 @@ impl Spacing {
         self.last = Some(Last { source, published_ns, scheduled });
     }
 
-    /// Returns when a message is to be written, and how long after the one before.
+    /// Returns the scheduled time of a message, and its interval after the one before.
     fn schedule(&self, now: Instant, source: SourceId, published_ns: i64) -> (Instant, Duration) {
-        // Clocks of two publishers say nothing about each other.
+        // Clocks of two publishers are not comparable.
         let last = self.last.as_ref().filter(|last| last.source == source);
         let Some(last) = last else { return (now, Duration::ZERO) };
         let apart_ns = published_ns.checked_sub(last.published_ns).and_then(|ns| u64::try_from(ns).ok());
@@ -78,7 +78,7 @@ mod tests {
     const A: SourceId = SourceId([1; 16]);
     const B: SourceId = SourceId([2; 16]);
 
-    /// Writes messages, all at hand at once, and returns when each was written. Writing one takes so long.
+    /// Writes messages that arrive together and returns the time of each. Writing one lasts `takes`.
     fn burst(published_ns: impl IntoIterator<Item = i64>, takes: Duration) -> Vec<Duration> {
         let (mut spacing, begun) = (Spacing::default(), Instant::now());
         let mut now = begun;
@@ -105,7 +105,7 @@ mod tests {
     fn messages_in_their_time_and_those_published_at_once_do_not_wait() {
         let (mut spacing, begun) = (Spacing::default(), Instant::now());
         for n in 0..100 {
-            // Each half an interval early or late.
+            // Each message is half an interval early or late.
             let now = begun + Duration::from_micros(1000 * n + 500 * (n % 2));
             assert_eq!(spacing.wait(now, A, n as i64 * MS_NS), None);
             spacing.note(now, A, n as i64 * MS_NS);

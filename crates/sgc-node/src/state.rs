@@ -1,7 +1,6 @@
-//! The state directory: what a node has to remember from one run to the next, for its user alone.
+//! The state directory: files that a node keeps from one run to the next, for its user alone.
 //!
-//! It knows where the directory is and how files in it are replaced; what they hold is the business of those who
-//! write them.
+//! This module finds the directory and replaces files in it. Their writers know their content.
 
 use std::fs;
 use std::io::{self, Read, Write};
@@ -16,7 +15,7 @@ const LOCK_FILE: &str = "lock";
 const PERMISSION_BITS: u32 = 0o7777;
 const OTHERS_BITS: u32 = 0o077;
 
-/// Where a node with this name keeps its state: as configured, or in the user's state directory. `None` where the
+/// Returns the state directory of a node with this name: as configured, or in the user's state directory. `None` if the
 /// user has none.
 pub fn state_dir(config: &Config, node: &str) -> Option<PathBuf> {
     let named = |variable: &str| std::env::var_os(variable).filter(|v| !v.is_empty()).map(PathBuf::from);
@@ -27,14 +26,14 @@ pub fn state_dir(config: &Config, node: &str) -> Option<PathBuf> {
     config.state.clone().or_else(|| Some(usual()?.join("sgc").join(node)))
 }
 
-/// Makes the directory if it is not there, 0700, and checks that it is this user's alone.
+/// Creates the directory if it is missing, 0700, and checks that it is this user's alone.
 pub fn create_state_dir(dir: &Path) -> Result<(), StateError> {
     let failed = |source| StateError::Directory { path: dir.to_owned(), source };
     fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
     check_owner(dir, &fs::metadata(dir).map_err(failed)?)
 }
 
-/// Whether the directory is this user's alone, if it is there; makes nothing.
+/// Checks that an existing directory is this user's alone. Creates nothing.
 pub fn check_state_dir(dir: &Path) -> Result<(), StateError> {
     match fs::metadata(dir) {
         Ok(metadata) => check_owner(dir, &metadata),
@@ -53,13 +52,13 @@ fn check_owner(dir: &Path, metadata: &fs::Metadata) -> Result<(), StateError> {
     Ok(())
 }
 
-/// The mode of a file or directory that others than its owner may read, change or enter.
+/// Returns the mode of a file or directory that others than its owner may read, change or enter.
 pub(crate) fn exposed(metadata: &fs::Metadata) -> Option<u32> {
     let mode = metadata.permissions().mode() & PERMISSION_BITS;
     (mode & OTHERS_BITS != 0).then_some(mode)
 }
 
-/// Replaces a file whole or not at all: 0600, on the disk before it has its name.
+/// Replaces a file whole or not at all. The new file has mode 0600 and is on the disk before it gets its name.
 pub(crate) fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
     let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -78,7 +77,7 @@ pub(crate) fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
     written
 }
 
-/// Reads a file of at most `max` bytes that is no symbolic link; `None` if there is none.
+/// Reads a file of at most `max` bytes that is no symbolic link; `None` if it is missing.
 pub(crate) fn read(path: &Path, max: u64) -> io::Result<Option<Vec<u8>>> {
     let flags = OFlags::NOFOLLOW.bits() as i32;
     let file = match fs::OpenOptions::new().read(true).custom_flags(flags).open(path) {
@@ -93,14 +92,14 @@ pub(crate) fn read(path: &Path, max: u64) -> io::Result<Option<Vec<u8>>> {
     Ok(Some(content))
 }
 
-/// Held while files of the directory are read and replaced, so that two programs do not undo each other's work.
+/// Lock for reading and replacing files of the directory, so that two programs do not undo each other's work.
 #[derive(Debug)]
 pub(crate) struct StateLock {
     _file: fs::File,
 }
 
 impl StateLock {
-    /// Waits for it.
+    /// Waits for the lock.
     pub(crate) fn take(dir: &Path) -> io::Result<Self> {
         let mut options = fs::OpenOptions::new();
         let flags = OFlags::NOFOLLOW.bits() as i32;
@@ -111,23 +110,23 @@ impl StateLock {
     }
 }
 
-/// What is wrong with a state directory.
+/// Reasons why a state directory cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum StateError {
-    /// The user has no place for it.
+    /// The user has no state directory.
     #[error(
         "there is no place for this node's state: neither XDG_STATE_HOME nor HOME is set; set `state` in [node]"
     )]
     Nowhere,
-    /// It cannot be made or read.
+    /// The directory cannot be created or read.
     #[error("state directory {}: {source}", path.display())]
     Directory {
         /// The directory.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the operating system.
         source: io::Error,
     },
-    /// Others may look into it.
+    /// Others may enter the directory.
     #[error("state directory {}: its mode {mode:04o} lets others in; chmod 700 it", path.display())]
     Exposed {
         /// The directory.
@@ -135,7 +134,7 @@ pub enum StateError {
         /// Its permission bits.
         mode: u32,
     },
-    /// It is another user's.
+    /// The directory belongs to another user.
     #[error("state directory {}: it belongs to another user; name another with `state` in [node]", path.display())]
     NotOurs {
         /// The directory.

@@ -1,4 +1,4 @@
-//! Counters of the data path, and the drops that they count.
+//! Counters of the data path, and reasons of drops.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::{self, Display};
@@ -35,7 +35,7 @@ impl NameStats {
         }
     }
 
-    /// Drops by reason, without those that there were none of.
+    /// Returns the nonzero drops by reason.
     pub(crate) fn reasons(&self) -> BTreeMap<String, u64> {
         let all = DataDrop::ALL.into_iter().zip(&self.reasons);
         let all = all.map(|(reason, count)| (reason.key().to_owned(), count.load(Relaxed)));
@@ -43,51 +43,51 @@ impl NameStats {
     }
 }
 
-/// Why the data path dropped something.
+/// Reasons why the data path drops a packet or a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum DataDrop {
-    /// No tree for the name: nobody asked.
+    /// The name has no tree, because nobody joined.
     NoTree,
-    /// It came over a link that is not on the tree towards its source.
+    /// The packet came over a link that is not on the tree towards its source.
     WrongWay,
-    /// Too many hops.
+    /// The hop limit is reached.
     HopLimit,
-    /// Addressed to a sink that is not here.
+    /// The packet is addressed to a sink that is not here.
     NoSuchSink,
-    /// A reliable consumer stood still for too long.
+    /// A reliable consumer was stalled for too long.
     Stalled,
-    /// Best effort: a newer one took its place.
+    /// A newer best-effort packet replaced it.
     Stale,
     /// The link ended.
     LinkClosed,
-    /// Malformed.
+    /// The packet is malformed.
     Malformed,
-    /// Under a label that stands for no name.
+    /// The packet has a label without a name.
     UnknownLabel,
-    /// No grant for the name (yet).
+    /// The name has no grant yet.
     NotGranted,
-    /// A sink refused it; the sink's own counter says why.
+    /// A sink refused the packet. The sink's own counter has the reason.
     Sink,
-    /// Nobody on the local network is to get it.
+    /// No local writer takes the message.
     NoWriter,
-    /// Too large to be carried.
+    /// The message exceeds the largest size.
     TooLarge,
-    /// More of it came than the user lets on: a newer one took its place.
+    /// A newer message replaced it because of the configured rate or bandwidth.
     Thinned,
-    /// Older than the user lets on.
+    /// The message exceeds the configured age.
     TooOld,
-    /// The publisher's history once more, after its node started anew.
+    /// The publisher's history was repeated after a restart of its node.
     Repeated,
-    /// A local publisher writes faster than this node can send: newer ones took its place.
+    /// A newer message replaced it because a local publisher writes faster than this node can send.
     Overrun,
-    /// It is, or was to become, JSON, and what its type looks like is not known here.
+    /// The message is or becomes JSON, and its type is unknown here.
     NoDefinition,
-    /// It was to become JSON, and is not what its type says.
+    /// The message does not match its type and was not converted to JSON.
     NotConverted,
 }
 
 impl DataDrop {
-    /// All, in the order of their numbers.
+    /// All reasons in the order of their numbers.
     const ALL: [Self; 19] = [
         Self::NoTree,
         Self::WrongWay,
@@ -110,7 +110,7 @@ impl DataDrop {
         Self::NotConverted,
     ];
 
-    /// A short, stable name for counters.
+    /// Returns a short, stable name for counters.
     pub(crate) fn key(self) -> &'static str {
         match self {
             Self::NoTree => "no_subscriber",
@@ -136,7 +136,7 @@ impl DataDrop {
     }
 }
 
-/// Rows of drops by culprit; beyond it the smallest one leaves.
+/// Most rows of drops by culprit. Beyond it, the smallest one is dropped.
 const ROWS_MAX: usize = 512;
 
 /// The cause of a drop.
@@ -169,8 +169,8 @@ impl Display for Culprit {
     }
 }
 
-/// Counts by kind, and by kind and culprit. Written on the rare path only. The count of a kind holds those of all its
-/// culprits, also of links that have ended.
+/// Counts by kind, and by kind and culprit. They are written on the rare path only. The count of a kind includes all
+/// its culprits, also of links that have ended.
 #[derive(Debug, Default)]
 pub(crate) struct Drops(Mutex<Counts>);
 
@@ -182,12 +182,12 @@ struct Counts {
 }
 
 impl Drops {
-    /// Counts one; true if it is the first of its kind.
+    /// Counts one drop. Returns `true` if it is the first of its kind.
     pub(crate) fn count(&self, kind: &'static str) -> bool {
         self.add(kind, 1)
     }
 
-    /// Counts several; true if they are the first of their kind.
+    /// Counts several drops. Returns `true` if they are the first of their kind.
     pub(crate) fn add(&self, kind: &'static str, several: u64) -> bool {
         let mut counts = self.lock();
         let n = counts.kinds.entry(kind).or_default();
@@ -195,8 +195,8 @@ impl Drops {
         *n == several
     }
 
-    /// Counts one of somebody's; true if it is the first of its kind from there. Of a link that is not up, only the kind is
-    /// counted.
+    /// Counts a drop of a culprit. Returns `true` if it is the culprit's first of its kind. For a link that is not up,
+    /// only the kind is counted.
     pub(crate) fn count_from(&self, kind: &'static str, culprit: impl Into<Culprit>) -> bool {
         let culprit = culprit.into();
         let mut counts = self.lock();
@@ -217,19 +217,19 @@ impl Drops {
         *n == 1
     }
 
-    /// From now on the drops of this link have rows of their own.
+    /// Gives the drops of a link rows of their own from here on.
     pub(crate) fn link_up(&self, link: LinkId) {
         self.lock().links.insert(link);
     }
 
-    /// The link ended, and with it its rows.
+    /// Removes the rows of a link that ended.
     pub(crate) fn link_down(&self, link: LinkId) {
         let mut counts = self.lock();
         counts.links.remove(&link);
         counts.rows.retain(|(culprit, _), _| *culprit != Culprit::Link(link));
     }
 
-    /// All counts.
+    /// Returns all counts.
     pub(crate) fn snapshot(&self) -> BTreeMap<String, u64> {
         let counts = self.lock();
         let kinds = counts.kinds.iter().map(|(kind, n)| ((*kind).to_owned(), *n));
@@ -282,7 +282,7 @@ mod tests {
         }
         drops.count_from("stale", Culprit::Peer(NodeId([7; 32])));
         drops.link_down(LinkId(1));
-        // A packet that was under way when its link ended.
+        // The packet was under way when its link ended.
         assert!(!drops.count_from("stale", LinkId(1)));
         let rows: Vec<_> = drops.snapshot().into_iter().collect();
         let row = |key: &str, n| (key.to_owned(), n);

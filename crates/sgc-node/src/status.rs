@@ -9,7 +9,7 @@ use sgc_ros::RouteStatus;
 use sgc_wire::Name;
 
 use crate::alerts::Alert;
-use crate::finding::RouterStatus;
+use crate::discovery::RouterStatus;
 use crate::stats::NameStats;
 
 /// The status document.

@@ -1,4 +1,4 @@
-//! Programs of the local ROS 2 network that this node cannot join. Decides nothing: what is found is said.
+//! Detects programs of the local ROS 2 network that this node cannot join. It reports them and decides nothing.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -8,9 +8,9 @@ use tracing::warn;
 
 use crate::alerts::Alert;
 
-/// Bound on alerts that are logged.
+/// Most alerts that are logged.
 const LOGGED_MAX: usize = 64;
-/// Time between two looks of a node.
+/// Interval of looks.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
 
 /// Returns an alert for each group of programs that cannot be joined for the same reason.
@@ -29,7 +29,7 @@ fn alert(strangers: Strangers) -> Alert {
     }
 }
 
-/// Looks again and again, and logs each alert once. Ends with the runtime.
+/// Looks periodically and logs each alert once. Ends with the runtime.
 pub(crate) async fn watch() {
     let mut known = BTreeSet::new();
     loop {

@@ -1,7 +1,7 @@
-//! Looking at what goes by: copies of messages for who asks at the status socket.
+//! Taps: copies of passing messages for readers at the status socket.
 //!
-//! A tap never holds anything up. What does not fit into its queue pushes out the oldest, and is counted; where nobody
-//! looks, a message costs the look at one flag.
+//! A tap never delays anything. A message that does not fit into its queue replaces the oldest, which is counted.
+//! Without a tap, a message costs one check of a flag.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -19,30 +19,30 @@ use tokio::sync::Notify;
 use crate::conversion;
 use crate::graph::Side;
 
-/// Messages that wait for who looks.
+/// Most messages that wait for one reader.
 const TAP_MESSAGES_MAX: usize = 256;
-/// Bytes of them, but for one message that is larger alone.
+/// Most bytes that wait for one reader. A single larger message is allowed alone.
 const TAP_BYTES_MAX: usize = 16 << 20;
-/// Who may look at one topic at one time.
+/// Most taps of one topic at a time.
 const TAPS_MAX: usize = 8;
 
-/// A message that went by.
+/// A copy of a passing message.
 #[derive(Clone, Debug)]
-pub(crate) struct Tapped {
+pub(crate) struct TapMessage {
     /// Data, or the end of an instance.
     pub kind: SampleKind,
-    /// When its publisher dated it, nanoseconds since the Unix epoch.
+    /// The publisher's time stamp, nanoseconds since the Unix epoch.
     pub source_timestamp_ns: i64,
-    /// When it went by, likewise.
+    /// Wall-clock time at which the message passed, nanoseconds since the Unix epoch.
     pub seen_unix_ns: i64,
-    /// When it went by.
+    /// Time at which the message passed.
     pub seen: Instant,
-    /// Encapsulation header and body; what came over the network, as that has it, until it is [read](Self::read).
+    /// Encapsulation header and body. A message from the network keeps its wire form until [`read`](Self::read).
     pub payload: Bytes,
     came: Option<Came>,
 }
 
-/// How a message came over the network.
+/// Wire form of a message from the network.
 #[derive(Clone, Debug)]
 struct Came {
     encoding: PayloadEncoding,
@@ -50,18 +50,18 @@ struct Came {
     layout: Option<Arc<Layout>>,
 }
 
-impl Tapped {
-    pub(crate) fn of_sample(sample: &Sample) -> Self {
+impl TapMessage {
+    pub(crate) fn from_sample(sample: &Sample) -> Self {
         Self::now(sample.kind, sample.source_timestamp_ns, sample.payload.clone())
     }
 
-    /// A message that came over the network; `layout` is what it looks like, if that is known. Who looks reads it, since that
-    /// takes its time.
-    pub(crate) fn of_message(message: &Message, layout: Option<&Arc<Layout>>) -> Self {
+    /// Copies a message from the network. `layout` is its type, if known. The reader of the tap decodes it, since that
+    /// takes time.
+    pub(crate) fn from_message(message: &Message, layout: Option<&Arc<Layout>>) -> Self {
         let kind = match message.head.kind {
             MessageKind::Dispose => SampleKind::Dispose,
             MessageKind::Unregister => SampleKind::Unregister,
-            // What is no sample is not offered.
+            // Messages of other kinds are no samples and are not offered.
             _ => SampleKind::Write,
         };
         let (encoding, form) = (message.head.encoding, message.head.form);
@@ -70,7 +70,8 @@ impl Tapped {
         Self { came: Some(came), ..tapped }
     }
 
-    /// As the local network gets it, if what it looks like is known. What cannot be read is shown as it is. Takes its time.
+    /// Decodes the message into the form that the local network gets, if its type is known. Otherwise it stays as it
+    /// is. Takes time.
     pub(crate) fn read(mut self) -> Self {
         let Some(Came { encoding, form, layout }) = self.came.take() else { return self };
         if let Ok(plain) = Decompressor::default().decompress(encoding, self.payload.clone()) {
@@ -89,7 +90,7 @@ impl Tapped {
         self
     }
 
-    /// Whether reading takes its time.
+    /// Returns `true` if decoding takes time.
     pub(crate) fn is_raw(&self) -> bool {
         self.came
             .as_ref()
@@ -103,7 +104,7 @@ impl Tapped {
     }
 }
 
-/// Who looks at one topic.
+/// The taps of one topic.
 #[derive(Debug, Default)]
 pub(crate) struct Taps {
     any: AtomicBool,
@@ -111,7 +112,7 @@ pub(crate) struct Taps {
 }
 
 impl Taps {
-    /// One more; `None` if there are too many.
+    /// Adds a tap. Returns `None` if there are too many.
     pub(crate) fn add(&self) -> Option<Arc<TapQueue>> {
         let mut all = lock(&self.all);
         all.retain(|tap| !tap.is_closed());
@@ -124,13 +125,13 @@ impl Taps {
         Some(tap)
     }
 
-    /// Whether anybody looks.
+    /// Returns `true` if there is a tap.
     pub(crate) fn is_any(&self) -> bool {
         self.any.load(Relaxed)
     }
 
-    /// Shows a message to who looks.
-    pub(crate) fn offer(&self, message: impl FnOnce() -> Tapped) {
+    /// Offers a message to all taps.
+    pub(crate) fn offer(&self, message: impl FnOnce() -> TapMessage) {
         if !self.is_any() {
             return;
         }
@@ -143,7 +144,7 @@ impl Taps {
         all.iter().for_each(|tap| tap.push(message.clone()));
     }
 
-    /// There is nothing more to see.
+    /// Closes all taps.
     pub(crate) fn close(&self) {
         lock(&self.all).drain(..).for_each(|tap| tap.close());
         self.any.store(false, Relaxed);
@@ -152,13 +153,13 @@ impl Taps {
 
 #[derive(Debug, Default)]
 struct Waiting {
-    messages: VecDeque<Tapped>,
+    messages: VecDeque<TapMessage>,
     bytes: usize,
     dropped: u64,
     is_closed: bool,
 }
 
-/// What waits for one who looks.
+/// Queue of messages for one reader.
 #[derive(Debug, Default)]
 pub(crate) struct TapQueue {
     waiting: Mutex<Waiting>,
@@ -166,8 +167,8 @@ pub(crate) struct TapQueue {
 }
 
 impl TapQueue {
-    /// Takes a message in; older ones give way.
-    pub(crate) fn push(&self, message: Tapped) {
+    /// Queues a message. Older ones make room.
+    pub(crate) fn push(&self, message: TapMessage) {
         let mut waiting = lock(&self.waiting);
         if waiting.is_closed {
             return;
@@ -187,8 +188,8 @@ impl TapQueue {
         self.changed.notify_one();
     }
 
-    /// The next message, and how many were dropped so far; `None` once there is no more.
-    pub(crate) async fn pop(&self) -> Option<(Tapped, u64)> {
+    /// Returns the next message and the number of drops so far; `None` once the queue is closed.
+    pub(crate) async fn pop(&self) -> Option<(TapMessage, u64)> {
         loop {
             let changed = self.changed.notified();
             {
@@ -205,47 +206,47 @@ impl TapQueue {
         }
     }
 
-    /// Nobody looks any more, or there is nothing more to see.
+    /// Closes the queue, because the reader left or the topic ended.
     pub(crate) fn close(&self) {
         lock(&self.waiting).is_closed = true;
         self.changed.notify_one();
     }
 
-    /// Whether it is.
+    /// Returns `true` if the queue is closed.
     pub(crate) fn is_closed(&self) -> bool {
         lock(&self.waiting).is_closed
     }
 }
 
-/// What somebody wants to see.
+/// Request for a tap.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct TapWish {
-    /// ROS topic, as it is called here.
+pub(crate) struct TapRequest {
+    /// ROS topic on the local network.
     pub topic: String,
-    /// Where.
+    /// Side of the topic.
     pub side: Option<Side>,
 }
 
-/// What is to be seen.
+/// A tap that was opened.
 pub(crate) struct Tap {
-    /// Where.
+    /// Side of the topic.
     pub side: Side,
     /// ROS type.
     pub type_name: String,
-    /// `RIHS01_…`, if it is known.
+    /// `RIHS01_…`, if known.
     pub type_hash: Option<String>,
-    /// What its messages look like, if that is known.
+    /// Description of the type, if known.
     pub described: Option<Arc<ResolvedType>>,
-    /// What goes by.
+    /// Queue of passing messages.
     pub queue: Arc<TapQueue>,
-    /// A local reader that is there for this alone.
+    /// Local reader that exists only for this tap.
     pub reader: Option<Box<dyn std::any::Any + Send>>,
 }
 
-/// Why there is nothing to see.
+/// Reasons why a tap is refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum TapError {
-    /// Neither used nor published here.
+    /// The topic is neither used nor published here.
     #[error(
         "nobody publishes {topic} on the local network, and this node does not use it; see `sgc why {topic}`"
     )]
@@ -253,15 +254,15 @@ pub(crate) enum TapError {
         /// The topic.
         topic: String,
     },
-    /// Not on that side.
+    /// The topic has no messages on that side.
     #[error("{topic} is not to be seen there: {why}")]
     NotThere {
         /// The topic.
         topic: String,
-        /// Why.
+        /// The reason.
         why: &'static str,
     },
-    /// Too many look.
+    /// The topic has too many taps.
     #[error("{topic} is looked at by {TAPS_MAX} already")]
     TooMany {
         /// The topic.
@@ -280,12 +281,12 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 mod tests {
     use super::*;
 
-    fn message(bytes: usize) -> Tapped {
-        Tapped::now(SampleKind::Write, 0, Bytes::from(vec![0; bytes]))
+    fn message(bytes: usize) -> TapMessage {
+        TapMessage::now(SampleKind::Write, 0, Bytes::from(vec![0; bytes]))
     }
 
     #[test]
-    fn what_came_is_read_by_who_looks_and_not_where_it_is_offered() {
+    fn tap_reader_decodes_messages_off_the_data_path() {
         let text = |_: &sgc_cdr::TypeName| Some("string a".to_owned());
         let layout = sgc_cdr::Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut { text }).unwrap();
         let json = Bytes::from(format!(r#"{{"a":"{}"}}"#, "long ".repeat(1000)));
@@ -298,19 +299,19 @@ mod tests {
         let source = sgc_wire::SourceId([1; 16]);
         let message = Message { source, seq: 1, head, reliable: true, payload: packed.clone() };
         let layout = Arc::new(layout);
-        let tapped = Tapped::of_message(&message, Some(&layout));
+        let tapped = TapMessage::from_message(&message, Some(&layout));
         assert!(tapped.payload == packed && tapped.is_raw());
         let read = tapped.read();
         assert!(!read.is_raw());
         assert_eq!(layout.decode(&read.payload).unwrap().to_json().as_bytes(), json);
-        // What it looks like is not known, or it is none: it is shown as it is.
-        assert_eq!(Tapped::of_message(&message, None).read().payload, json);
+        // Without a type, or with a message that does not match it, the payload is shown unchanged.
+        assert_eq!(TapMessage::from_message(&message, None).read().payload, json);
         let broken = Message { payload: Bytes::from_static(b"abc"), ..message };
-        assert_eq!(Tapped::of_message(&broken, Some(&layout)).read().payload, broken.payload);
+        assert_eq!(TapMessage::from_message(&broken, Some(&layout)).read().payload, broken.payload);
     }
 
     #[tokio::test]
-    async fn what_is_not_looked_at_in_time_gives_way() {
+    async fn tap_drops_messages_that_are_not_read_in_time() {
         let taps = Taps::default();
         taps.offer(|| unreachable!("nobody looks"));
         let tap = taps.add().unwrap();

@@ -1,59 +1,59 @@
-//! Which owner is asked for which types, and when: one question at a time for each owner, with as many names as it may have.
+//! [`TypeQuestions`]: decides which owner is asked for which types, and when. Each owner has one question at a time,
+//! with as many names as one question holds.
 //!
-//! A pure machine. It neither sends nor judges what is told, which `core/types.rs` does; it counts what is under way of an
-//! owner, so that what comes of that is gathered into one question, and has everything that is lacked asked for in its turn.
+//! A pure machine. `core/interface_types.rs` sends questions and verifies answers. This machine counts the running
+//! searches of an owner, so that their results are gathered into one question, and gives each missing type its turn.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use sgc_wire::{Name, NodeId, SEALED_BYTES_MAX, TYPES_PER_QUESTION_MAX};
 
-/// How long a question stays in which the owner knows nothing more, while others wait for their turn; twice as long after
-/// each round in which it told nothing.
+/// Time for a question that brings nothing new while other names wait. It doubles after each round without an answer.
 const TURN_MIN: Duration = Duration::from_secs(1);
-/// The longest of that.
+/// Upper bound of that time.
 const TURN_MAX: Duration = Duration::from_secs(60);
-/// Bytes of descriptions that wait to be judged: what several owners may tell at once.
+/// Most bytes of unverified descriptions, of all owners together.
 const TOLD_BYTES_MAX: usize = 4 << 20;
-/// The same of one owner: what one answer may have.
+/// Most bytes of unverified descriptions of one owner: those of one answer.
 const TOLD_BYTES_PER_OWNER_MAX: usize = SEALED_BYTES_MAX;
 
-/// What is asked of the owners.
+/// The questions to all owners.
 #[derive(Debug, Default)]
 pub(crate) struct TypeQuestions {
     owners: BTreeMap<NodeId, Owner>,
     told_bytes: usize,
-    /// Owners of which something that was told had no room.
+    /// Owners whose descriptions had no room.
     held_up: BTreeSet<NodeId>,
 }
 
 #[derive(Debug, Default)]
 struct Owner {
-    /// What is lacked, and in which question it was asked for last; 0 for none.
+    /// Missing types, each with the number of the last question that asked for it; 0 for none.
     lacking: BTreeMap<Name, u64>,
-    /// What the question that is out asks for.
+    /// Names in the open question.
     asked: BTreeSet<Name>,
     questions: u64,
-    /// What of its types is looked for in files, or judged.
+    /// Number of its types that are searched in files or verified.
     under_way: usize,
     told_bytes: usize,
-    /// Whether the question that is out was answered, if with nothing.
+    /// Whether the open question was answered, possibly with nothing.
     is_answered: bool,
-    /// Whether something was told in the answer, so that a new question may bring more.
+    /// Whether the answer brought a type, so that a new question may bring more.
     may_tell_more: bool,
-    /// Questions since it told something last.
+    /// Number of questions since an answer brought a type.
     in_vain: usize,
-    /// When it is the turn of others.
+    /// Time at which other names have their turn.
     next_turn: Option<Instant>,
 }
 
 impl TypeQuestions {
-    /// Something of this owner's is looked for, or judged.
+    /// Notes that a search or verification for this owner begins.
     pub(crate) fn begins(&mut self, owner: NodeId) {
         self.owners.entry(owner).or_default().under_way += 1;
     }
 
-    /// It is not any more; `told_bytes` of it were told.
+    /// Notes that it ends. `told_bytes` is the size of a received description.
     pub(crate) fn ends(&mut self, owner: &NodeId, told_bytes: usize) {
         self.told_bytes = self.told_bytes.saturating_sub(told_bytes);
         if let Some(of) = self.owners.get_mut(owner) {
@@ -62,27 +62,26 @@ impl TypeQuestions {
         }
     }
 
-    /// The owner is to be asked for this type.
+    /// Adds a type to ask the owner for.
     pub(crate) fn lacks(&mut self, owner: NodeId, name: Name) {
         self.owners.entry(owner).or_default().lacking.entry(name).or_default();
     }
 
-    /// It is known, or not to be asked for any more.
+    /// Removes a type, because it is known or no longer wanted.
     pub(crate) fn settled(&mut self, owner: &NodeId, name: &Name) {
         if let Some(of) = self.owners.get_mut(owner) {
             of.lacking.remove(name);
         }
     }
 
-    /// The owner answered the question that is out.
+    /// Notes that the owner answered the open question.
     pub(crate) fn answered(&mut self, owner: &NodeId) {
         if let Some(of) = self.owners.get_mut(owner) {
             of.is_answered = true;
         }
     }
 
-    /// Something of so many bytes that it told is to be judged; false if there is no room for it now. Then it is asked for
-    /// again.
+    /// Reserves room to verify a description. Returns `false` if there is none; the type is then asked for again.
     pub(crate) fn takes_told(&mut self, owner: &NodeId, bytes: usize) -> bool {
         let Some(of) = self.owners.get_mut(owner) else { return false };
         if of.told_bytes + bytes > TOLD_BYTES_PER_OWNER_MAX || self.told_bytes + bytes > TOLD_BYTES_MAX {
@@ -96,7 +95,7 @@ impl TypeQuestions {
         true
     }
 
-    /// Who is to be asked again for what had no room.
+    /// Removes and returns the owners to ask again, because there is room now.
     pub(crate) fn have_room(&mut self) -> BTreeSet<NodeId> {
         if self.held_up.is_empty() || self.told_bytes > TOLD_BYTES_MAX / 2 {
             return BTreeSet::new();
@@ -110,19 +109,19 @@ impl TypeQuestions {
         held_up
     }
 
-    /// Whose turn it is to be asked for other types.
+    /// Returns the owners to be asked for other types now.
     pub(crate) fn due(&self, now: Instant) -> Vec<NodeId> {
         let is_due = |of: &Owner| of.turn().is_some_and(|at| at <= now);
         self.owners.iter().filter(|(_, of)| is_due(of)).map(|(owner, _)| *owner).collect()
     }
 
-    /// When the next is.
+    /// Returns the time of the next such question.
     pub(crate) fn deadline(&self) -> Option<Instant> {
         self.owners.values().filter_map(Owner::turn).min()
     }
 
-    /// What the owner is to be asked for now, in place of what it was asked for; nothing where that stays as it is, and no
-    /// names where nothing is lacked any more.
+    /// Returns the names of a new question, which replaces the open one. `None` keeps the open question; no names means
+    /// that nothing is missing.
     pub(crate) fn next(&mut self, owner: NodeId, now: Instant) -> Option<Vec<Name>> {
         let of = self.owners.get_mut(&owner)?;
         if of.under_way > 0 {
@@ -137,7 +136,8 @@ impl TypeQuestions {
 }
 
 impl Owner {
-    /// When it is the turn of others; not while something is under way, behind which it is seen who is lacked.
+    /// Returns the time at which other names have their turn. There is none while searches run, since they decide what
+    /// is missing.
     fn turn(&self) -> Option<Instant> {
         self.next_turn.filter(|_| self.under_way == 0)
     }
@@ -150,7 +150,7 @@ impl Owner {
         }
         (self.questions, self.in_vain) = (self.questions + 1, self.in_vain.saturating_add(1));
         let mut names: Vec<_> = self.lacking.iter().map(|(name, asked)| (*asked, *name)).collect();
-        // What was not asked for yet, then what was longest ago.
+        // New names come first, then those that were asked for longest ago.
         names.sort_unstable();
         names.truncate(TYPES_PER_QUESTION_MAX);
         let names: Vec<_> = names.into_iter().map(|(_, name)| name).collect();
@@ -162,14 +162,14 @@ impl Owner {
         Some(names)
     }
 
-    /// Whether what is not in the question that is out is to be asked for now.
+    /// Returns `true` if names outside of the open question are to be asked for now.
     fn has_others(&mut self, now: Instant) -> bool {
         let mut others = self.lacking.iter().filter(|(name, _)| !self.asked.contains(*name)).peekable();
         if others.peek().is_none() {
             self.next_turn = None;
             return false;
         }
-        // All of it in one question can stay until the owner knows more.
+        // A question that holds all names can stay until the owner knows more.
         if self.lacking.len() <= TYPES_PER_QUESTION_MAX || others.any(|(_, asked)| *asked == 0) {
             return true;
         }
@@ -195,7 +195,7 @@ mod tests {
             .collect()
     }
 
-    /// Looks for all of them in files, and finds none.
+    /// Searches all names in files and finds none.
     fn lack(questions: &mut TypeQuestions, all: &[Name], now: Instant) -> Vec<Vec<Name>> {
         all.iter().for_each(|_| questions.begins(OWNER));
         let look = |name: &Name| {
@@ -214,7 +214,7 @@ mod tests {
         let mut told = 0;
         while let Some(question) = asked.last().filter(|names| !names.is_empty()).cloned() {
             assert!(question.len() <= TYPES_PER_QUESTION_MAX && asked.len() < 20);
-            // Half of it has room in an answer.
+            // One answer has room for half of them.
             questions.answered(&OWNER);
             let half: Vec<_> = question.iter().take(64).collect();
             half.iter().for_each(|_| assert!(questions.takes_told(&OWNER, 1000)));
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn what_an_owner_does_not_know_keeps_nobody_else_from_being_asked_for() {
+    fn type_unknown_to_one_owner_does_not_block_questions_to_others() {
         let (mut questions, now, all) = (TypeQuestions::default(), Instant::now(), names(400));
         let mut question = lack(&mut questions, &all, now).pop().unwrap();
         let mut asked = BTreeSet::new();
@@ -243,19 +243,19 @@ mod tests {
         asked.extend(question.clone());
         assert_eq!(asked.len(), 400);
         questions.answered(&OWNER);
-        // Then from time to time, the others first.
+        // Later questions alternate, the other names first.
         assert_eq!((questions.next(OWNER, now), questions.due(now)), (None, vec![]));
         let later = now + 2 * TURN_MIN;
         assert_eq!(questions.deadline(), Some(later));
         assert_eq!(questions.due(later), [OWNER]);
-        // Not while it is seen what else there is.
+        // While searches run, no turn comes.
         questions.begins(OWNER);
         assert_eq!((questions.due(later), questions.deadline()), (vec![], None));
         questions.ends(&OWNER, 0);
         let others = questions.next(OWNER, later).unwrap();
         assert!(others.len() == TYPES_PER_QUESTION_MAX && others.iter().all(|name| !question.contains(name)));
         assert_eq!(questions.deadline(), None);
-        // Ever more seldom, unless it tells something.
+        // The intervals grow until an answer brings a type.
         let mut turn = |told: bool| {
             questions.answered(&OWNER);
             if told {
@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn what_fits_into_one_question_stays_in_it_until_the_owner_knows_it() {
+    fn question_keeps_its_names_until_the_owner_answers() {
         let (mut questions, now, all) = (TypeQuestions::default(), Instant::now(), names(130));
         assert_eq!(lack(&mut questions, &all, now).len(), 1);
         questions.answered(&OWNER);
@@ -292,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_told_at_once_is_bounded_for_each_owner_and_for_all_and_asked_for_again() {
+    fn concurrent_type_answers_are_bounded_and_asked_for_again() {
         let (mut questions, now) = (TypeQuestions::default(), Instant::now());
         let owners: Vec<_> = (0..20).map(|n| NodeId([n; 32])).collect();
         let half = TOLD_BYTES_PER_OWNER_MAX / 2;
@@ -314,7 +314,7 @@ mod tests {
         for owner in again {
             assert_eq!(questions.next(owner, now), Some(vec![name]));
         }
-        // Nobody tells what was not asked for.
+        // Descriptions that nobody asked for are refused.
         assert!(!questions.takes_told(&NodeId([99; 32]), 1));
     }
 }

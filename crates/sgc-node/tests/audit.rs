@@ -1,4 +1,4 @@
-//! The audit log on the disk: what is in it, what becomes of it when it is full, torn or in the way.
+//! The audit log on the disk: its content, and its behaviour when it is full, torn or replaced.
 
 #![allow(clippy::unwrap_used)]
 
@@ -25,7 +25,7 @@ impl Place {
         self.dir.path().join("audit.jsonl")
     }
 
-    /// Writes through a log that is opened and finished.
+    /// Writes records through a log that is opened and finished.
     fn write(&self, room: AuditRoom, records: impl IntoIterator<Item = AuditRecord>) {
         let names = PeerNames::from([(NodeId([7; 32]), "desk".to_owned())]);
         let (audit, writer) = Audit::open(&self.path(), room, names).unwrap();
@@ -97,7 +97,7 @@ fn a_record_from_beside_comes_between_those_of_the_node_that_runs() {
     assert_eq!(fs::metadata(place.path()).unwrap().permissions().mode() & 0o7777, 0o600);
 }
 
-/// Records of peers that come and go, from their first second on.
+/// Returns records of peers that come and go, beginning in their first second.
 fn crowd(peers: u8, events: &[AuditEvent], times: u64) -> impl Iterator<Item = AuditRecord> {
     let one = move |at: u64, peer: u8, event: AuditEvent| {
         let record = AuditRecord::at(event, UnixMillis(1_795_000_000_000 + at));
@@ -119,7 +119,7 @@ fn a_member_that_joins_and_leaves_for_ever_pushes_out_nothing() {
     let (records, malformed) = place.read();
     let count = |event: &str| records.iter().filter(|r| r.event == event).count();
     assert_eq!((count("started"), count("granted"), count("left"), malformed), (1, 1 + 8, 8, 0));
-    // No record is gone without being counted, with its peer, topic and time.
+    // Every omitted record is counted with its peer, topic and time.
     let summaries: Vec<_> = records.iter().filter(|r| r.event == "summary").collect();
     let of = |event: &str| summaries.iter().find(|r| r.of.as_deref() == Some(event)).unwrap().count;
     assert_eq!((summaries.len(), of("granted"), of("left")), (2, Some(49_992), Some(49_992)));
@@ -137,7 +137,7 @@ fn a_member_that_joins_and_leaves_for_ever_pushes_out_nothing() {
 }
 
 #[test]
-fn what_is_summed_up_is_counted_for_the_status() {
+fn summarised_audit_records_are_counted_in_the_status() {
     let place = Place::new();
     let (log, writer) = Audit::open(&place.path(), ROOM, PeerNames::new()).unwrap();
     crowd(2, &[AuditEvent::Left], 100).for_each(|record| log.write(record));
@@ -185,7 +185,7 @@ fn a_full_log_is_put_aside_and_as_many_kept_as_are_asked_for() {
     let kept = peers();
     assert!(kept.len() > 15);
     assert_eq!(kept, expected(kept.len(), 100), "the newest, in order");
-    // If fewer are asked for, those beyond them leave.
+    // A smaller number of files removes the excess ones.
     write(1, 100..120);
     assert_eq!(place.files(), 2);
     assert_eq!(peers(), expected(peers().len(), 120));
@@ -256,10 +256,10 @@ fn a_line_that_a_killed_run_left_is_ended_and_counted() {
 }
 
 #[test]
-fn what_is_lost_is_said() {
+fn lost_audit_records_are_reported() {
     let place = Place::new();
     let (audit, writer) = Audit::open(&place.path(), ROOM, PeerNames::new()).unwrap();
-    // More than can wait, faster than a disk: whatever does not fit has to be accounted for.
+    // More records than the queue holds, faster than a disk. All that do not fit must be accounted for.
     const N: u64 = 50_000;
     (0..N).for_each(|_| audit.write(AuditRecord::new(AuditEvent::Reload)));
     writer.finish();
@@ -283,6 +283,6 @@ fn a_log_is_not_written_through_a_link_nor_into_what_is_no_file() {
     assert!(Audit::open(place.dir.path(), ROOM, PeerNames::new()).is_err());
     fs::remove_file(place.path()).unwrap();
     assert!(audit::read(&place.path(), |_| {}).is_err(), "there is none");
-    // One that is off takes everything and keeps nothing.
+    // A log that is switched off accepts everything and keeps nothing.
     Audit::default().write(granted(1));
 }

@@ -1,4 +1,4 @@
-//! Topics that are compressed before they are sealed: across whole nodes, for those who listen and those who come late.
+//! Compressed topics across whole nodes, for present subscribers and late joiners.
 
 #![allow(clippy::unwrap_used)]
 
@@ -20,7 +20,7 @@ fn compressed(node: &Node, topic: &str) -> Option<(u64, u64)> {
 }
 
 #[test]
-fn what_is_compressed_arrives_as_it_was_also_late() {
+fn compressed_messages_arrive_unchanged_also_for_late_joiners() {
     for (encoding, suite) in [(PayloadEncoding::Zstd, Suite::Group), (PayloadEncoding::Lz4, Suite::Standard)]
     {
         let trio = Trio::new();
@@ -30,7 +30,7 @@ fn what_is_compressed_arrives_as_it_was_also_late() {
         let desk = trio.desk(&["/map", "/text"]);
         let map = Talker::new(&trio.robot_net, "/map", latched());
         let text_talker = Talker::new(&trio.robot_net, "/text", Qos::default());
-        // Published before anyone elsewhere listens.
+        // This is published before any far subscriber exists.
         map.wait_for_readers(1);
         map.say(text(0, 500_000));
         let listener = Listener::new(&trio.desk_net, "/text", Qos::default());
@@ -57,7 +57,7 @@ fn what_is_compressed_arrives_as_it_was_also_late() {
         assert!(before == 500_000 && after < before / 10, "{before} {after}");
         let (before, after) = compressed(&robot, "/text").unwrap();
         assert!(before >= 1_020_000 && after < before / 10, "{before} {after}");
-        // It stops at once, and what was kept compressed still comes back.
+        // Compression stops at once, and kept compressed messages still arrive.
         robot.reload(|config| config.shares.iter_mut().for_each(|share| share.shaping = Shaping::default()));
         text_talker.say(text(9, 5000));
         listener.hears(text(9, 5000));
@@ -68,7 +68,7 @@ fn what_is_compressed_arrives_as_it_was_also_late() {
 }
 
 #[test]
-fn who_publishes_on_anothers_topic_compresses_too() {
+fn far_publisher_compresses_too() {
     let trio = Trio::new();
     let robot = trio.robot(&["/cmd"], "desk");
     robot.reload(|config| {

@@ -1,4 +1,4 @@
-//! What a configuration becomes, and what is said about one that is wrong.
+//! Configurations: their resolved values, and the messages about mistakes.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -35,7 +35,7 @@ fn good(text: &str) -> Config {
     parse_with(text, &[]).unwrap_or_else(|errors| panic!("{text}\n{errors}"))
 }
 
-/// All that is said about `text`, which has `NODE` in front: line 3 is its first.
+/// Returns all messages about `text`. `NODE` precedes it, so line 3 is its first.
 fn said_about(text: &str) -> Vec<String> {
     let text = format!("{NODE}{text}");
     match parse_with(&text, &[]) {
@@ -232,7 +232,7 @@ fn unknown_keys_are_answered_with_the_nearest() {
             &["node.toml:4: [ros] has no key `identity`; it belongs in the top level or [node]"],
         ),
     ]);
-    // What was only misspelt is not missed as well.
+    // A misspelt key is not reported as missing as well.
     assert_eq!(
         said_of_whole("[nod]\nname = 'a'"),
         ["node.toml:1: the top level has no key `nod`; did you mean `node`?"]
@@ -348,7 +348,7 @@ fn names_may_be_patterns_and_others_elsewhere() {
 }
 
 #[test]
-fn what_leaves_may_be_compressed_and_nothing_else() {
+fn compression_applies_to_shares_only() {
     for (word, encoding) in
         [("zstd", PayloadEncoding::Zstd), ("lz4", PayloadEncoding::Lz4), ("none", PayloadEncoding::Plain)]
     {
@@ -475,7 +475,7 @@ fn names_that_do_not_fit_together_are_told() {
             ],
         ),
     ]);
-    // It is the name here that would make a loop.
+    // The local name would make the loop.
     good(&format!("{NODE}[[share]]\ntopic = '/a'\nto = ['b']\n[[use]]\nfrom = 'b'\ntopic = '/a'\nas = '/b'"));
 }
 
@@ -517,7 +517,7 @@ fn tables_and_values_of_the_wrong_type_are_told() {
 }
 
 #[test]
-fn what_is_required_is_asked_for() {
+fn missing_required_keys_are_reported() {
     check_all(&[
         (
             "[[share]]",
@@ -876,7 +876,7 @@ fn suites_are_called_by_name() {
 }
 
 #[test]
-fn who_may_publish_is_said_as_who_may_subscribe() {
+fn publish_lists_use_the_syntax_of_subscribe_lists() {
     let config = good(&format!(
         "{NODE}[[share]]\ntopic = '/a'\ntype = 'p/msg/T'\nto = ['*', 'partner:acme']\npublish = ['desk', 'group:ops', 'partner:acme']\n\
          [[partner]]\nname = 'acme'\nca = 'acme.pem'"
@@ -1133,7 +1133,7 @@ fn files_with_certificates_and_tokens_are_read_before_anything_is_done() {
 }
 
 #[test]
-fn one_topic_has_one_place() {
+fn topic_may_be_configured_once() {
     check_all(&[
         (
             "[[share]]\ntopic = '/a'\nto = ['b']\n[[share]]\ntopic = '/a'\nto = ['c']",
@@ -1224,10 +1224,10 @@ fn the_environment_says_what_the_file_does_not() {
         ("", &[(RANGE, "LOCALHOST"), PEERS], 0, Localhost, two),
         ("", &[(RANGE, "OFF"), PEERS], 0, Off, &[]),
         ("", &[(RANGE, "SYSTEM_DEFAULT"), PEERS], 0, SystemDefault, &[]),
-        // The deprecated switch stands above the newer variables, but only when it is on.
+        // The deprecated switch overrides the newer variables, but only if it is on.
         ("", &[ONLY, (RANGE, "SUBNET"), PEERS], 0, Localhost, &[]),
         ("", &[("ROS_LOCALHOST_ONLY", "0"), (RANGE, "OFF")], 0, Off, &[]),
-        // The file stands above all of them.
+        // The file overrides all of them.
         ("discovery_range = 'subnet'", &[ONLY, PEERS], 0, Subnet, two),
         ("localhost_only = false", &[ONLY, PEERS], 0, Subnet, two),
         ("localhost_only = true", &[(RANGE, "SUBNET"), PEERS], 0, Localhost, &[]),

@@ -1,4 +1,4 @@
-//! The ROS graph over whole nodes: local networks in memory, each with nodes in it, and what the far ones show of them.
+//! The ROS graph over whole nodes: local networks in memory with ROS 2 nodes, and the far nodes that are shown there.
 
 #![allow(clippy::unwrap_used)]
 
@@ -12,7 +12,7 @@ use sgc_testkit::{FakeDomain, FakeReader, FakeRos, FakeWriter};
 use sgc_wire::{CONSUMERS_PER_INTERFACE_MAX, Qos, Reliability, RosNode};
 use support::*;
 
-/// A participant with one node of this name, which has a reader of a topic.
+/// A participant with one ROS 2 node of this name, which has a reader of a topic.
 struct ListeningProcess {
     net: FakeRos,
     reader: FakeReader,
@@ -34,7 +34,7 @@ impl ListeningProcess {
     }
 }
 
-/// Waits until proxies on a network announce exactly these nodes, each with so many readers and writers.
+/// Waits until the proxies on a network announce exactly these nodes, with these numbers of readers and writers.
 fn shows_ends(net: &FakeDomain, expected: &[(&str, usize, usize)]) {
     let expected: Vec<_> =
         expected.iter().map(|(node, readers, writers)| ((*node).to_owned(), *readers, *writers)).collect();
@@ -45,7 +45,7 @@ fn shows_ends(net: &FakeDomain, expected: &[(&str, usize, usize)]) {
     }
 }
 
-/// A participant with one node of this name, which has a writer on each topic.
+/// A participant with one ROS 2 node of this name, which has a writer on each topic.
 struct RosProcess {
     net: FakeRos,
     writers: Vec<FakeWriter>,
@@ -67,7 +67,7 @@ impl RosProcess {
     }
 }
 
-/// Waits until proxies on a network announce exactly these nodes, each with so many writers.
+/// Waits until the proxies on a network announce exactly these nodes, with these numbers of writers.
 fn shows(net: &FakeDomain, expected: &[(&str, usize)]) {
     let shown = || net.mirrored().into_iter().map(|(node, _, writers)| (node, writers)).collect::<Vec<_>>();
     let expected: Vec<_> = expected.iter().map(|(node, writers)| ((*node).to_owned(), *writers)).collect();
@@ -90,11 +90,11 @@ fn far_nodes_appear_with_what_is_shared_of_them_and_vanish() {
     shows(net, &[("/robot/talker", 2), ("/sgc_desk", 0)]);
     let second = RosProcess::new(&trio.robot_net, "second", &["/b"]);
     shows(net, &[("/robot/second", 1), ("/robot/talker", 2), ("/sgc_desk", 0)]);
-    // Another name is another node with the same writers.
+    // Under another name, it is another node with the same writers.
     second.is_called("renamed");
     shows(net, &[("/robot/renamed", 1), ("/robot/talker", 2), ("/sgc_desk", 0)]);
     assert_eq!((writers(net, "/a"), writers(net, "/b"), writers(net, "/other")), (1, 2, 0));
-    // The robot's own proxy stands for nobody, and has its readers.
+    // The robot's own proxy stands for no far node, and has its readers.
     shows(&trio.robot_net, &[("/sgc_robot", 0)]);
     drop(talker);
     shows(net, &[("/robot/renamed", 1), ("/sgc_desk", 0)]);
@@ -118,7 +118,7 @@ fn a_restarted_publisher_keeps_its_writer_and_is_heard_once() {
     say(writer, "end".into());
     wait("the end", || listener.drain().last().is_some_and(|b| b == "end"));
     drop(first);
-    // It comes back at once, and what it says first arrives: its writer at the desk has its readers already.
+    // The talker returns at once, and its first message arrives, since its writer at the desk still has its readers.
     for round in 0..5 {
         let again = RosProcess::new(&trio.robot_net, "talker", &["/a"]);
         say(&again.writers[0], format!("round {round}"));
@@ -146,7 +146,7 @@ fn no_restart_leaves_a_ghost() {
     shows(&trio.desk_net, &both);
     robot.kill();
     robot = trio.robot(&["/a"], "desk");
-    // The sources are others than before.
+    // The sources have changed.
     shows(&trio.desk_net, &both);
     wait("two writers", || writers(&trio.desk_net, "/a") == 2);
     robot.stop();
@@ -179,7 +179,7 @@ fn every_publisher_has_its_own_qos_and_others_may_publish_beside() {
         listener.hears_at_last(|n| talker.say(format!("warm {n}")));
     }
     wait("a writer for each", || writers(&watch, "/cmd") == 2);
-    // Who offers less than a subscriber asks for is not heard by it, and its neighbour is.
+    // A publisher that offers less than a subscriber requests does not match; its neighbour does.
     let strict = Qos { deadline_ns: Some(1_000_000_000), ..Qos::default() };
     let (_strict, _lax) = (Talker::new(&robot, "/a", strict), Talker::new(&robot, "/a", Qos::default()));
     wait("two writers", || writers(&watch, "/a") == 2);
@@ -213,12 +213,12 @@ fn subscribers_of_a_shared_topic_appear_at_its_owner_and_vanish() {
     drop(recorder);
     shows_ends(net, &[("/desk/view", 1, 0), ("/sgc_robot", 1, 0)]);
     assert!(gone.elapsed() < std::time::Duration::from_secs(1), "{:?}", gone.elapsed());
-    // A node that goes in good order takes its subscribers with it; one that comes back shows them again.
+    // A node that stops orderly takes its subscribers with it, and shows them again when it returns.
     desk.stop();
     shows_ends(net, &[("/sgc_robot", 1, 0)]);
     desk = trio.desk(&["/a"]);
     shows_ends(net, &[("/desk/view", 1, 0), ("/sgc_robot", 1, 0)]);
-    // Consumers of a use that is gone are told no longer.
+    // Consumers of a removed use are no longer announced.
     desk.reload(|config| config.uses.clear());
     shows_ends(net, &[("/sgc_robot", 1, 0)]);
     drop(view);

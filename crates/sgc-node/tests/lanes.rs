@@ -1,4 +1,4 @@
-//! Topics with connections of their own.
+//! Topics with lanes.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 #[path = "support/lab.rs"]
@@ -18,7 +18,7 @@ fn dedicated(topic: &str) -> ShareConfig {
     ShareConfig { dedicated: true, ..share(topic, &["desk"]) }
 }
 
-/// Once the way is there.
+/// Starts a stream once the path exists.
 fn begin_stream(lab: &Lab, topic: &str, listener: &Listener) -> Stream {
     let talker = lab.talker("robot", topic);
     warm_up(&talker, &[listener]);

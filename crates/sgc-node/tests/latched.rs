@@ -1,5 +1,5 @@
-//! Latched topics (`transient_local`) many to many, over real nodes with local networks in memory: whoever is late, and
-//! whatever restarts, each subscriber gets what ROS 2 would have given it, once.
+//! Latched topics (`transient_local`), many to many, over real nodes with local networks in memory. However late a
+//! subscriber is, and whatever restarts, it gets the messages that ROS 2 would give it, each once.
 
 #![allow(clippy::unwrap_used)]
 
@@ -19,18 +19,18 @@ fn deep(depth: u32) -> Qos {
     Qos { history: History::KeepLast(depth), ..latched() }
 }
 
-/// What a subscriber heard: how often each.
+/// Payloads that a subscriber received, with counts.
 #[derive(Default)]
-struct Heard(BTreeMap<String, usize>);
+struct Receptions(BTreeMap<String, usize>);
 
-impl Heard {
+impl Receptions {
     fn take(&mut self, listener: &Listener) {
         for sample in listener.drain() {
             *self.0.entry(String::from_utf8(sample.to_vec()).unwrap()).or_default() += 1;
         }
     }
 
-    /// Waits until all of these were heard, and fails if anything else was, or anything twice.
+    /// Waits until all of these arrived. Fails on any other or repeated message.
     fn are(&mut self, listener: &Listener, expected: &[&str]) {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -49,15 +49,15 @@ impl Heard {
     }
 }
 
-/// A subscriber that comes now hears exactly these.
+/// Checks that a subscriber that joins now receives exactly these. Returns it.
 fn late_listener_hears(trio: &Trio, qos: Qos, expected: &[&str]) -> Listener {
     let listener = Listener::new(&trio.desk_net, TOPIC, qos);
-    Heard::default().are(&listener, expected);
+    Receptions::default().are(&listener, expected);
     listener
 }
 
-/// After something that is known to have crossed, nothing else came.
-fn and_nothing_more(talkers: &[&Talker], heard: &mut Heard, listener: &Listener, before: &[&str]) {
+/// Checks that no other message came before one that is published now.
+fn and_nothing_more(talkers: &[&Talker], heard: &mut Receptions, listener: &Listener, before: &[&str]) {
     let fence: Vec<String> = (0..talkers.len()).map(|n| format!("fence {n} {}", heard.0.len())).collect();
     talkers.iter().zip(&fence).for_each(|(talker, text)| talker.say(text.clone()));
     let all: Vec<&str> = before.iter().copied().chain(fence.iter().map(String::as_str)).collect();
@@ -85,14 +85,14 @@ fn publishers_of_different_depths_each_give_their_own_history() {
     let _desk = trio.desk(&[TOPIC]);
     wait("three writers", || writers(&trio.desk_net, TOPIC) == 3);
     let early = late_listener_hears(&trio, deep(100), &expected);
-    // One more, now that the writers at the desk have it all.
+    // The late joiner comes when the writers at the desk have everything.
     late_listener_hears(&trio, deep(100), &expected);
-    let mut heard = Heard::default();
+    let mut heard = Receptions::default();
     and_nothing_more(&[&shallow, &deeper, &all], &mut heard, &early, &[]);
 }
 
 #[test]
-fn what_a_publisher_latched_goes_with_it() {
+fn latched_messages_end_with_their_publisher() {
     let trio = Trio::new();
     let _nodes = (trio.cloud(), trio.robot(&[TOPIC], "desk"), trio.desk(&[TOPIC]));
     let stays = Talker::new(&trio.robot_net, TOPIC, latched());
@@ -105,7 +105,7 @@ fn what_a_publisher_latched_goes_with_it() {
     late_listener_hears(&trio, latched(), &["stays"]);
     drop(stays);
     wait("no writer", || writers(&trio.desk_net, TOPIC) == 0);
-    // It comes back with something else.
+    // The publisher returns with other messages.
     let back = Talker::new(&trio.robot_net, TOPIC, latched());
     back.say("back");
     late_listener_hears(&trio, latched(), &["back"]);
@@ -121,7 +121,7 @@ fn a_publisher_that_restarts_while_the_router_is_away_replaces_what_it_said() {
     other.say("other");
     first.say("first run");
     let early = late_listener_hears(&trio, latched(), &["other", "first run"]);
-    let mut heard = Heard::default();
+    let mut heard = Receptions::default();
     cloud.kill();
     drop(first);
     let second = Talker::new(&trio.robot_net, TOPIC, latched());
@@ -155,7 +155,7 @@ fn an_owners_node_that_restarts_makes_nobody_hear_it_again() {
             robot.stop();
         }
         let _robot = trio.robot(&[TOPIC], "desk");
-        let mut heard = Heard::default();
+        let mut heard = Receptions::default();
         let all: Vec<&Talker> = talkers.iter().collect();
         if kill {
             wait("the history, known again", || desk.status()["drops"]["repeated"] == 10);
@@ -163,7 +163,7 @@ fn an_owners_node_that_restarts_makes_nobody_hear_it_again() {
             assert!(heard.0.is_empty(), "{:?}", heard.0);
             and_nothing_more(&all, &mut heard, &early, &[]);
         } else {
-            // A node that stops in good order takes along what it brought, as if all its publishers had ended.
+            // A node that stops orderly withdraws its messages, as if all its publishers had ended.
             heard.are(&early, &expected);
             and_nothing_more(&all, &mut heard, &early, &expected);
         }
@@ -181,7 +181,7 @@ fn a_late_node_and_a_restarted_one_give_the_history_once() {
     for _ in 0..3 {
         let desk = trio.desk(&[TOPIC]);
         let listener = late_listener_hears(&trio, deep(10), &["2", "3", "4"]);
-        let mut heard = Heard::default();
+        let mut heard = Receptions::default();
         heard.are(&listener, &[]);
         desk.stop();
         wait("no writer", || writers(&trio.desk_net, TOPIC) == 0);
@@ -189,7 +189,7 @@ fn a_late_node_and_a_restarted_one_give_the_history_once() {
 }
 
 #[test]
-fn who_is_late_gets_nothing_whose_lifespan_is_over() {
+fn late_joiner_gets_no_expired_message() {
     let trio = Trio::new();
     let _cloud = trio.cloud();
     let _robot = trio.robot(&[TOPIC], "desk");
@@ -207,7 +207,7 @@ fn who_is_late_gets_nothing_whose_lifespan_is_over() {
     let early = Listener::new(&trio.desk_net, TOPIC, deep(10));
     say(lifespan_ns as i64 / 2, "a while ago");
     say(0, "now");
-    Heard::default().are(&early, &["a while ago", "now"]);
+    Receptions::default().are(&early, &["a while ago", "now"]);
     desk.stop();
     let _desk = trio.desk(&[TOPIC]);
     late_listener_hears(&trio, deep(10), &["a while ago", "now"]);

@@ -1,4 +1,4 @@
-//! What happens where there is more to carry than may be, or can be, carried: whole nodes over real QUIC.
+//! Overload over real QUIC: whole nodes with more traffic than limits or links permit.
 
 #![allow(clippy::unwrap_used)]
 
@@ -15,7 +15,7 @@ use sgc_trust::Suite;
 use sgc_wire::{Class, History, Qos, Reliability};
 use support::*;
 
-/// Reliable, and nothing is forgotten.
+/// Returns a reliable QoS that keeps all messages.
 fn all() -> Qos {
     Qos { history: History::KeepAll, ..Qos::default() }
 }
@@ -24,8 +24,8 @@ fn best_effort() -> Qos {
     Qos { reliability: Reliability::BestEffort, ..all() }
 }
 
-/// What a node counts for its links to a peer.
-fn of_peer(node: &Node, peer: &str, what: &str) -> u64 {
+/// Returns a counter of a node's links to a peer.
+fn count_for_peer(node: &Node, peer: &str, what: &str) -> u64 {
     let status = node.status();
     let links = status["links"].as_array().unwrap().iter();
     links.filter(|l| l["peer"] == peer).map(|l| l[what].as_u64().unwrap()).sum()
@@ -47,10 +47,12 @@ fn a_peer_over_its_rate_is_slowed_where_it_can_wait_and_loses_what_cannot() {
         listener.hears_at_last(|n| talker.say(format!("warm {n}")));
     }
     let [robots, desks] = ["robot", "desk"].map(|node| identity(node, false).node_id().to_string());
-    let over = |peer: &str| (of_peer(&cloud, peer, "peer_slowed"), of_peer(&cloud, peer, "peer_dropped"));
+    let over = |peer: &str| {
+        (count_for_peer(&cloud, peer, "peer_slowed"), count_for_peer(&cloud, peer, "peer_dropped"))
+    };
     assert_eq!((over(&robots), over(&desks)), ((0, 0), (0, 0)));
 
-    // Reliable: all of it, in order, and not before its time. Half a second's worth may have been saved up.
+    // Reliable messages all arrive, in order and at the permitted rate. Half a second's worth may have been saved up.
     let begun = Instant::now();
     let payload = |n: u8| vec![n; 25_000];
     (0..40).for_each(|n| slow.say(payload(n)));
@@ -67,7 +69,7 @@ fn a_peer_over_its_rate_is_slowed_where_it_can_wait_and_loses_what_cannot() {
     let (slowed, dropped) = over(&robots);
     assert!(slowed > 0 && dropped == 0, "{slowed} slowed, {dropped} dropped");
 
-    // Best effort: what is over it is gone, and counted under the peer's name.
+    // Best-effort messages beyond the rate are dropped, and counted under the peer's name.
     let deadline = Instant::now() + PATIENCE;
     let mut said = 0;
     while over(&robots).1 == 0 {
@@ -85,7 +87,7 @@ fn a_peer_over_its_rate_is_slowed_where_it_can_wait_and_loses_what_cannot() {
     assert_eq!(over(&desks), (0, 0));
 }
 
-/// A path to a router that carries so many bits a second towards it, and holds a tenth of a second's worth.
+/// Starts a path to a router with this bandwidth towards it, and a buffer for a tenth of a second.
 fn narrow(router: u16, bits_per_second: u64) -> u16 {
     let (near, far) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
     far.connect(("127.0.0.1", router)).unwrap();
@@ -135,7 +137,7 @@ impl Drop for Ends<'_> {
 #[test]
 fn commands_overtake_images_on_a_full_link() {
     const IMAGE_BYTES: usize = 1_000_000;
-    /// Images that the link was given and has not delivered when the first command goes.
+    /// Images on the link that are not delivered when the first command leaves.
     const BACKLOG: u64 = 5;
     let mut trio = Trio::new();
     let _cloud = trio.cloud();
@@ -178,9 +180,9 @@ fn commands_overtake_images_on_a_full_link() {
     let is_over = AtomicBool::new(false);
     let (said, heard, is_over) = (&said, &heard, &is_over);
     std::thread::scope(|scope| {
-        // Also if something fails: the scope waits for its threads.
+        // The guard ends the threads on a failure as well, since the scope waits for them.
         let end = Ends(is_over);
-        // Reliable ones: as many as are taken.
+        // Reliable images are sent as fast as they are taken.
         scope.spawn(|| {
             while !is_over.load(SeqCst) {
                 let n = said.load(SeqCst);
@@ -188,7 +190,7 @@ fn commands_overtake_images_on_a_full_link() {
                 said.store(n + 1, SeqCst);
             }
         });
-        // Best effort: four times what the link carries.
+        // Best-effort images are sent at four times the link's bandwidth.
         scope.spawn(|| {
             while !is_over.load(SeqCst) {
                 videos.say(numbered(0));
@@ -225,7 +227,7 @@ fn commands_overtake_images_on_a_full_link() {
             waited += after - before;
             overtaken += given.saturating_sub(after);
         }
-        // Six images' worth of the same class, which would have to share the link with both kinds of images.
+        // Six images' worth of the same class would have to share the link with both kinds of images.
         let before = heard.load(SeqCst);
         const PARTS: usize = 60;
         (0..PARTS).for_each(|_| commands.say(vec![7; 100_000]));
@@ -236,11 +238,11 @@ fn commands_overtake_images_on_a_full_link() {
         let beside = heard.load(SeqCst) - before;
         drop(end);
         assert!(beside <= 2, "{beside} images arrived while 6 MB of realtime messages were under way");
-        // Meanwhile the network's own queue is emptied, half an image at most, and what two images share.
+        // The network's own queue drains meanwhile, half an image at most, and the two images under way.
         assert!(waited <= COMMANDS, "{waited} images arrived while {COMMANDS} commands were under way");
         assert!(overtaken >= 2 * COMMANDS, "{COMMANDS} commands overtook {overtaken} images");
     });
-    // The newest of the others get through beside the reliable ones.
+    // The newest best-effort images get through beside the reliable ones.
     let videos = hears_videos.drain().iter().filter(|v| v.len() == IMAGE_BYTES).count();
     assert!(videos >= 4, "{videos} videos beside {} images", heard.load(SeqCst));
     drop((robot, desk));

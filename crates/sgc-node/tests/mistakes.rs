@@ -1,4 +1,4 @@
-//! Mistakes of operators over real links: one identity in two processes, and clocks that are wrong.
+//! Operators' mistakes over real links: one identity in two processes, and wrong clocks.
 
 #![allow(clippy::unwrap_used)]
 
@@ -19,7 +19,7 @@ use support::*;
 
 const HOUR_MS: u64 = 3_600_000;
 
-/// The alerts of this kind that a node shows.
+/// Returns the alerts of this kind that a node shows.
 fn alerts(node: &Node, kind: &str) -> Vec<serde_json::Value> {
     let status = node.status();
     let all = status["alerts"].as_array().unwrap();
@@ -34,7 +34,7 @@ fn links(node: &Node) -> usize {
     node.status()["links"].as_array().unwrap().len()
 }
 
-/// A second process of a node, as on another machine of the same local network.
+/// Starts a second process of a node, as on another machine of the same local network.
 fn twin(lab: &Lab, node: &str, change: impl FnOnce(&mut Config)) -> Node {
     let identity = lab.path(&format!("{node}-twin.identity"));
     fs::copy(lab.config(node).identity, &identity).unwrap();
@@ -49,7 +49,7 @@ fn twin(lab: &Lab, node: &str, change: impl FnOnce(&mut Config)) -> Node {
 }
 
 #[test]
-fn one_identity_in_two_processes_is_named_on_all_sides_and_nothing_comes_twice() {
+fn identity_in_two_processes_is_reported_and_delivers_once() {
     let lab = Lab::new(&["robot", "desk"]);
     let cloud = lab.cloud();
     let _robot = lab.start("robot", |c| c.shares = vec![share("/chatter", &["desk"])]);
@@ -109,7 +109,7 @@ fn a_process_that_is_started_again_takes_over_at_once() {
     wait("a link", || links(&desk) == 1);
     let second = twin(&lab, "desk", |_| {});
     wait("it is displaced", || links(&desk) == 0 && !alerts(&cloud, "peer_identity_in_use").is_empty());
-    // Killed and started again, while the other lives: by now it would wait for seconds otherwise.
+    // It is killed and restarted while the other lives; without that, it would wait for seconds by now.
     desk.kill();
     let begun = Instant::now();
     let desk = lab.start("desk", |_| {});
@@ -123,7 +123,7 @@ fn a_node_whose_certificate_has_not_begun_waits_and_says_so() {
     const EARLY: Duration = Duration::from_secs(8);
     let lab = Lab::new(&[]);
     let cloud = lab.cloud();
-    // To a clock that is behind any certificate looks like this one. Fleets let theirs begin ten minutes early.
+    // To a clock that is behind, any certificate looks like this one. Fleets start certificates ten minutes early.
     let begins = unix_now().0 + (sgc_trust::CLOCK_SKEW + EARLY).as_millis() as u64;
     let request =
         |request: &mut EnrollRequest| *request = EnrollRequest::new(request.node.clone(), UnixMillis(begins));

@@ -1,4 +1,4 @@
-//! Names, patterns and prefixes of frames across whole nodes, and what of it changes while they run.
+//! Names, patterns and frame prefixes across whole nodes, and their changes at run time.
 
 #![allow(clippy::unwrap_used)]
 
@@ -12,7 +12,7 @@ use sgc_trust::Suite;
 use sgc_wire::Qos;
 use support::*;
 
-/// A second robot of the fleet, which owns all the names that the first one does.
+/// Starts a second robot of the fleet, which owns the same topics as the first.
 fn robot2(trio: &Trio, net: &FakeDomain, topic: &str) -> Node {
     let mut config = trio.config();
     config.shares = vec![share_of(topic)];
@@ -26,7 +26,7 @@ fn share_of(topic: &str) -> ShareConfig {
     sgc_node::config::parse(&text, "t", std::path::Path::new(""), &|_| None).unwrap().shares.remove(0)
 }
 
-/// A desk that brings all of both, each under a namespace of its own.
+/// Starts a desk that uses the topics of both, each under its own namespace.
 fn desk(trio: &Trio) -> Node {
     let of = |robot: &str| {
         format!(
@@ -38,7 +38,7 @@ fn desk(trio: &Trio) -> Node {
     Node::start(Config { uses: read.uses, ..trio.config() }, identity("desk", false), Some(&trio.desk_net))
 }
 
-/// A tf message of one transform in little-endian plain CDR.
+/// Returns a tf message of one transform in little-endian plain CDR.
 fn transform(frame: &str, child: &str) -> Bytes {
     let mut out = vec![1, 0, 0, 0, 7, 0, 0, 0, 8, 0, 0, 0];
     for name in [frame, child] {
@@ -77,7 +77,7 @@ fn two_robots_have_names_of_their_own_and_one_tree_of_frames() {
         Listener::new(&trio.desk_net, topic, latched()).hears(format!("scan {n}"));
     }
     wait("both robots' frames", || writers(&trio.desk_net, "/tf_static") == 2);
-    // A late joiner hears the last of each robot's, under the name that all listen to.
+    // A late joiner gets the last message of each robot under the common name.
     let net = trio.desk_net.join(false);
     let (sender, heard) = std::sync::mpsc::channel();
     let handler = Box::new(move |s: sgc_ros::Sample| drop(sender.send(s.payload)));
@@ -87,7 +87,7 @@ fn two_robots_have_names_of_their_own_and_one_tree_of_frames() {
     frames.sort();
     expected.sort();
     assert_eq!(frames, expected);
-    // What is no tf message is not written, and counted.
+    // A payload that is no tf message is dropped and counted.
     writers_of_tf[0]
         .0
         .write(SampleKind::Write, 3, Bytes::from_static(b"\0\x01\0\0\xff\xff\xff\xff"))
@@ -98,7 +98,7 @@ fn two_robots_have_names_of_their_own_and_one_tree_of_frames() {
     }
 }
 
-/// More than a router takes advertisements of one node at a time.
+/// There are more topics than a router takes advertisements of one node at a time.
 #[test]
 fn hundreds_of_topics_that_come_one_by_one_are_all_there() {
     const TOPICS: usize = 400;
@@ -138,7 +138,7 @@ fn topics_that_match_come_and_go_and_others_notice_nothing() {
     };
     let ends = made();
     assert_eq!((ends.0.len(), ends.1.len()), (1, 1));
-    // Another topic appears, is left out by a reload, and comes back by a rule of its own.
+    // Another topic appears, is excluded by a reload, and returns by a rule of its own.
     let other = Talker::new(&trio.robot_net, "/a/other", Qos::default());
     wait("the other", || writers(&trio.desk_net, "/a/other") == 1);
     let (mut said, mut heard) = (0, Vec::new());
@@ -165,7 +165,7 @@ fn topics_that_match_come_and_go_and_others_notice_nothing() {
     assert_eq!((name(&robot, "/a/kept"), made()), (before, ends), "neither name nor endpoint is another");
     drop(other);
     wait("the other gone", || writers(&trio.desk_net, "/a/other") == 0);
-    // Under another name it is another topic, and only there.
+    // Under another name it is another topic, and exists only there.
     desk.reload(|config| config.uses[0].naming.rename = Rename::Namespace("/r".into()));
     wait("the new name", || {
         (writers(&trio.desk_net, "/r/a/kept"), writers(&trio.desk_net, "/a/kept")) == (1, 0)

@@ -28,7 +28,7 @@ fn a_topic_crosses_a_router_and_leaves_no_loop() {
     talker.say("last");
     wait("the last message", || listener.drain().last().is_some_and(|b| b == "last"));
     listener.hears_nothing();
-    // The desk's own writer is not shared back, nor is there a reader for it.
+    // The desk's own writer is not shared back, and has no reader.
     assert_eq!((writers(&trio.robot_net, "/chatter"), writers(&trio.desk_net, "/chatter")), (1, 1));
     assert_eq!(trio.desk_net.count("rt/chatter", EndpointKind::Reader), 1);
 }
@@ -76,7 +76,7 @@ fn names_get_labels_on_every_link_that_they_cross() {
         let listener = Listener::new(&trio.desk_net, topic, Qos::default());
         talker.wait_for_readers(1);
         listener.hears_at_last(|n| talker.say(format!("warm {n}")));
-        // The catalogue has one, too.
+        // The catalogue has a source, too.
         let n = index as u64 + 2;
         wait("labels", || labels(&robot, "labels_sent") == n && labels(&cloud, "labels_sent") == n);
         assert_eq!((labels(&desk, "labels_received"), labels(&desk, "labels_sent")), (n, 0));
@@ -106,7 +106,7 @@ fn large_messages_cross_whole() {
 }
 
 #[test]
-fn whoever_is_killed_and_restarted_the_flow_resumes_without_duplicates() {
+fn flow_resumes_without_duplicates_after_any_node_restarts() {
     let trio = Trio::new();
     let mut cloud = trio.cloud();
     let mut robot = trio.robot(&["/chatter"], "desk");
@@ -139,7 +139,7 @@ fn whoever_is_killed_and_restarted_the_flow_resumes_without_duplicates() {
         }
         let before = said;
         let deadline = Instant::now() + PATIENCE;
-        // Until one that was said after the restart arrives.
+        // Messages are skipped until one of after the restart arrives.
         while heard.last().is_none_or(|last| *last <= before) {
             assert!(Instant::now() < deadline, "round {round}: the flow does not resume");
             said += 1;
@@ -175,13 +175,13 @@ fn a_router_that_is_killed_costs_a_reliable_topic_nothing() {
     };
     for _ in 0..3 {
         say(&talker, 200);
-        // What it has, and what is said until it is back, is nowhere but at the robot.
+        // Only the robot has the history and the messages published until the router is back.
         cloud.kill();
         say(&talker, 200);
         cloud = trio.cloud();
         say(&talker, 200);
     }
-    // The last ones, before a silence.
+    // The last message precedes a silence.
     let last = say(&talker, 1);
     let mut heard = Vec::new();
     while heard.last() != Some(&last) {
@@ -218,7 +218,7 @@ fn late_joiners_get_each_latched_publisher_once() {
     hears_all(&early);
     let late = Listener::new(&trio.desk_net, "/tf_static", latched());
     hears_all(&late);
-    // The router comes back: nothing is heard again, and news still is, once.
+    // After the router's return, no message is repeated, and new ones arrive once.
     cloud.kill();
     let _cloud = trio.cloud();
     talkers[0].say("news");
@@ -243,7 +243,7 @@ fn a_clean_stop_withdraws_at_once_and_a_new_share_appears() {
     let begun = Instant::now();
     robot.stop();
     wait("/a gone", || writers(&trio.desk_net, "/a") == 0);
-    // Without the withdrawal it would be the hold of ten seconds after the link is lost.
+    // Without a withdrawal it would take ten seconds after the loss of the link.
     assert!(begun.elapsed() < sgc_ros::UNREACHABLE_HOLD, "it was not withdrawn, it expired");
     wait("nothing left in the router", || {
         let router = &cloud.status()["router"];
@@ -254,7 +254,7 @@ fn a_clean_stop_withdraws_at_once_and_a_new_share_appears() {
 }
 
 #[test]
-fn who_is_not_permitted_gets_nothing_and_is_told() {
+fn unauthorised_node_gets_nothing_and_learns_why() {
     let trio = Trio::new();
     let _nodes = (trio.cloud(), trio.robot(&["/chatter"], "somebody-else"));
     let desk = trio.desk(&["/chatter"]);
@@ -267,7 +267,7 @@ fn who_is_not_permitted_gets_nothing_and_is_told() {
 #[test]
 fn two_proxies_on_one_network_make_no_loop() {
     let trio = Trio::new();
-    // Robot and desk stand on the same local network: what the desk writes must not be shared again.
+    // Robot and desk share a local network, so the desk's own messages must not be shared again.
     let net = &trio.robot_net;
     let _nodes = (trio.cloud(), trio.robot(&["/chatter"], "desk"), trio.desk_on(&["/chatter"], net));
     let talker = Talker::new(net, "/chatter", Qos::default());
@@ -276,7 +276,7 @@ fn two_proxies_on_one_network_make_no_loop() {
     for n in 0..50 {
         talker.say(format!("{n}"));
     }
-    // Each comes once from the talker and once through the router, never more.
+    // Each message comes once from the talker and at most once through the router.
     let mut count = 0;
     while listener.samples.recv_timeout(Duration::from_millis(500)).is_ok() {
         count += 1;
@@ -295,9 +295,9 @@ fn status_names_links_and_routes() {
     assert_eq!(status["node"], "robot");
     let never = status["routes"].as_array().unwrap().iter().find(|r| r["topic"] == "/never").unwrap();
     assert_eq!(never["state"], "waits for a local publisher");
-    // With the catalogue, and where the robot is asked for its types.
+    // The names include the catalogue and the robot's name for type questions.
     wait("chatter is routed", || cloud.status()["router"]["routed_names"] == 3);
-    // The document is what `Status` says.
+    // The document has the form of `Status`.
     let _: fn(Status) -> serde_json::Value = |s| serde_json::to_value(s).unwrap();
 }
 
@@ -326,8 +326,8 @@ fn signed_messages_pass_one_by_one_and_in_batches() {
     }
 }
 
-/// Not a test: how many messages of 1 KB pass from a local network over a robot, a cloud router and a desk to another
-/// local network, in one process, as fast as they go. `benchmarks/throughput.md` says how to run it.
+/// A measurement, not a test: messages of 1 KB a second from a local network over a robot, a cloud router and a desk to
+/// another local network, in one process. `benchmarks/throughput.md` says how to run it.
 #[test]
 #[ignore = "measures"]
 fn throughput_of_the_suites() {
@@ -370,7 +370,7 @@ fn throughput_of_the_suites() {
     }
 }
 
-/// Carries datagrams between one node and the router, and keeps all of them.
+/// Relays datagrams between one node and the router, and records them.
 struct Tap {
     port: u16,
     seen: std::sync::Arc<std::sync::Mutex<Vec<Vec<u8>>>>,
@@ -417,13 +417,13 @@ fn nothing_that_crosses_the_wire_tells_payload_topic_type_or_node() {
     let _robot = trio.robot(&["/wire/tapped"], "desk");
     let talker = Talker::new(&trio.robot_net, "/wire/tapped", latched());
     talker.say(SECRET);
-    // The desk goes to the router past the tap.
+    // The desk reaches the router without the tap.
     trio.port = past;
     let _desk = trio.desk(&["/wire/tapped"]);
     Listener::new(&trio.desk_net, "/wire/tapped", latched()).hears(SECRET);
     let seen = tap.seen.lock().unwrap();
     assert!(seen.len() > 10, "the tap carried {} datagrams", seen.len());
-    // Nothing shorter: noise spells any three letters now and then.
+    // The needles are long, since noise contains any three letters now and then.
     for needle in [SECRET, "/wire/tapped", "tapped", "std_msgs", "String", "robot", "nobody"] {
         let found = seen.iter().any(|d| d.windows(needle.len()).any(|w| w == needle.as_bytes()));
         assert!(!found, "{needle:?} is readable on the wire");
@@ -448,7 +448,7 @@ fn node_without_rules_joins_the_local_network_at_the_first_that_comes() {
     assert_eq!(report["needs_restart"], serde_json::json!([]));
     listener.hears("1");
     assert_eq!(graph(&desk)["has_ros"], true);
-    // Rules go and come as in any node.
+    // Rules come and go as in any node.
     desk.reload(|config| config.uses.clear());
     desk.reload(|config| config.uses = vec![used_topic("/chatter")]);
     talker.say("2");

@@ -1,4 +1,4 @@
-//! Services through whole nodes: real QUIC over the loopback interface, local networks in memory.
+//! Services across whole nodes: real QUIC on the loopback interface, local networks in memory.
 
 #![allow(clippy::unwrap_used)]
 
@@ -42,12 +42,12 @@ fn calls(name: &str) -> UseConfig {
     UseConfig { interface: Interface::Service, ..uses(name) }
 }
 
-/// How many servers of a service can be seen on a network.
+/// Returns the number of servers of a service on a network.
 fn servers(net: &FakeDomain, name: &str) -> usize {
     net.count(&ServiceTopic::Request.dds_topic(name), EndpointKind::Reader)
 }
 
-/// An application that has a server, which answers when it is told to.
+/// An application with a server, which answers on request of the test.
 struct Server {
     end: FakeServer,
     asked: Receiver<(RequestId, Bytes)>,
@@ -70,13 +70,13 @@ impl Server {
         assert!(self.asked.try_recv().is_err(), "a request too many");
     }
 
-    /// Answers a request with what was asked, and `mark` behind it.
+    /// Answers a request with its text and `mark`.
     fn answers(&self, (id, payload): &(RequestId, Bytes), mark: u8) {
         self.end.reply(id, [payload, &[mark][..]].concat().into()).unwrap();
     }
 }
 
-/// An application that calls.
+/// An application with a client.
 struct Client {
     end: FakeClient,
     answers: Receiver<(RequestId, Bytes)>,
@@ -114,7 +114,7 @@ fn body(text: &str) -> Bytes {
     [&[0, 1, 0, 0], text.as_bytes()].concat().into()
 }
 
-/// The robot has a service, for these others.
+/// Starts the robot with a service for these nodes.
 fn robot(lab: &Lab, to: &[&str]) -> Node {
     lab.start("robot", |c| c.shares = vec![shares("/add", to)])
 }
@@ -138,7 +138,7 @@ fn every_client_anywhere_gets_its_own_answers_and_no_other() {
             open[which].insert(client.calls(&text), text);
         }
     }
-    // Not in the order in which they came.
+    // The answers leave in another order than the requests came.
     let mut asked: Vec<_> = (0..3 * CALLS).map(|_| server.takes()).collect();
     asked.reverse();
     asked.iter().for_each(|call| server.answers(call, b'!'));
@@ -169,7 +169,7 @@ fn a_far_service_is_of_its_own_node_in_the_local_graph() {
     let node = RosNode::new("/arm", "adder", None).unwrap();
     server._net.announce(&[GraphNode { node, readers: vec![reader], writers: vec![writer] }]).unwrap();
     wait("a server of the adder", || shown("desk") == ["/arm/adder 1 1", "/sgc_desk 0 0"]);
-    // What calls it there is the proxy's.
+    // The proxy's client calls the service there.
     assert_eq!(shown("robot"), ["/sgc_robot 1 1"]);
     drop(server);
     wait("nothing", || shown("desk") == ["/sgc_desk 0 0"]);
@@ -203,7 +203,7 @@ fn a_server_that_dies_is_gone_for_remote_clients_too_and_may_come_back() {
         let call = client.calls("x");
         server.answers(&server.takes(), round);
         client.is_answered(call, "x", round);
-        // It takes this one with it.
+        // The service ends with an open call.
         client.calls("y");
         server.takes();
         drop(server);
@@ -221,7 +221,7 @@ fn call_asked_of_a_server_that_was_replaced_is_counted_at_both_ends() {
     let client = Client::new(&lab.net("desk"), "/add");
     client.calls("lost");
     first.takes();
-    // It is there before the end of the first is noticed, so the service is never without a server.
+    // The second server exists before the end of the first is noticed, so the service always has one.
     let second = Server::new(&lab.net("robot"), "/add");
     drop(first);
     for node in [&robot, &desk] {
@@ -275,7 +275,7 @@ fn a_call_under_way_is_answered_once_though_the_router_restarts() {
     answers.sort();
     let marks = answers.each_ref().map(|(id, answer)| (*id, *answer.last().unwrap()));
     assert_eq!(marks, [(before, 1), (after, 2), (meanwhile, 3)]);
-    // What would come twice comes before this.
+    // A repeated request would arrive before this one.
     let last = client.calls("last");
     server.answers(&server.takes(), 4);
     client.is_answered(last, "last", 4);
@@ -284,7 +284,7 @@ fn a_call_under_way_is_answered_once_though_the_router_restarts() {
 }
 
 #[test]
-fn what_an_owner_that_started_anew_may_have_done_is_not_done_twice() {
+fn call_is_not_repeated_after_the_owner_restarts() {
     let lab = Lab::new(&["robot", "desk"]);
     let (_cloud, first, desk) = (lab.cloud(), robot(&lab, &["desk"]), caller(&lab, "desk"));
     let server = Server::new(&lab.net("robot"), "/add");
@@ -316,7 +316,7 @@ fn the_call_of_a_client_that_is_gone_is_forgotten_at_both_ends() {
     let asked = server.takes();
     drop(client);
     for node in [&robot, &desk] {
-        // It is counted once it is no longer under way.
+        // The loss is counted once the call is no longer open.
         wait("it is forgotten", || {
             let state = node.route_state();
             state.contains("0 in progress") && state.contains("1 lost")

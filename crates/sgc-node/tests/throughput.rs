@@ -1,7 +1,7 @@
-//! Not a test: what passes between two ROS 2 networks, over a robot, a cloud router and a desk, as users have it: DDS at
-//! both ends, QUIC between. `benchmarks/throughput.md` says how to run it and what came out.
+//! A measurement, not a test: messages between two ROS 2 networks over a robot, a cloud router and a desk, with DDS at
+//! both ends and QUIC between. `benchmarks/throughput.md` says how to run it and has results.
 //!
-//! All run in one process, which the suites share in turns, so that what else the machine does meets both.
+//! All nodes run in one process, and the suites take turns, so that disturbances of the machine affect both.
 
 #![allow(clippy::unwrap_used)]
 
@@ -22,7 +22,7 @@ use sgc_trust::{EnrollRequest, Fleet, FleetName, Identity, NodeName, Suite};
 use sgc_wire::{Class, History, Qos, UnixMillis};
 use tokio::sync::oneshot;
 
-/// Longer than anything takes that works.
+/// Bound of all waits, longer than any working case takes.
 const PATIENCE: Duration = Duration::from_secs(40);
 
 /// ROS domains of robot and desk.
@@ -31,15 +31,15 @@ const DOMAINS: [u32; 2] = [191, 192];
 const TOPIC: &str = "/load";
 const MESSAGE_BYTES: usize = 1000;
 
-/// Messages that the application may be ahead of what has arrived: fewer than any reader keeps, so that none is lost, and
-/// more than the nodes take at once, so that they never lack one.
+/// Messages that the application may be ahead of those that arrived: fewer than a reader keeps, so that none is lost,
+/// and more than the nodes take at once, so that they never idle.
 const AHEAD_MAX: u64 = 3000;
 
-/// Rounds of each suite, and how long a round counts.
+/// Rounds of each suite, and the duration of a round.
 const ROUNDS: usize = 7;
 const ROUND: Duration = Duration::from_secs(4);
 
-/// Messages of a round at low rate, and their distance.
+/// Messages of a round at low rate, and their interval.
 const PINGS: usize = 150;
 const PING_EVERY: Duration = Duration::from_millis(10);
 
@@ -65,7 +65,7 @@ fn network(domain: u32, tag: Option<&str>) -> Arc<CycloneNetwork> {
     Arc::new(CycloneNetwork::open(&config).unwrap())
 }
 
-/// A node in a runtime of its own, as a process has.
+/// A node with its own runtime, as in a process.
 struct Node {
     _runtime: tokio::runtime::Runtime,
     stop: Option<oneshot::Sender<()>>,
@@ -112,7 +112,7 @@ impl Drop for Node {
     }
 }
 
-/// Applications and nodes. Fields drop in this order.
+/// The path: applications and nodes. Fields drop in this order.
 struct Way {
     writer: CycloneWriter,
     arrived: Arc<AtomicU64>,
@@ -211,7 +211,7 @@ impl Way {
         self.writer.write(SampleKind::Write, 1, payload.into()).unwrap();
     }
 
-    /// Until nothing comes any more.
+    /// Waits until no more messages arrive.
     fn settle(&self) {
         let mut before = u64::MAX;
         while before != self.arrived.load(SeqCst) {
@@ -220,14 +220,14 @@ impl Way {
         }
     }
 
-    /// Messages and signatures so far, at the robot.
+    /// Returns the numbers of messages and signatures so far, at the robot.
     fn published(&self) -> (u64, u64) {
         let status = self.robot.status();
         let route = status["routes"].as_array().unwrap().iter().find(|r| r["topic"] == TOPIC).unwrap();
         (route["messages"].as_u64().unwrap(), route["signatures"].as_u64().unwrap())
     }
 
-    /// As fast as it goes: messages a second.
+    /// Sends at full speed. Returns messages a second.
     fn rate(&self) -> f64 {
         let start = self.arrived.load(SeqCst);
         let (begun, mut said) = (Instant::now(), 0u64);
@@ -245,7 +245,7 @@ impl Way {
                     self.robot.status(),
                     self.desk.status()
                 );
-                // Short beside the time that what is under way takes.
+                // The sleep is short compared to the time of the messages under way.
                 std::thread::sleep(Duration::from_micros(500));
             }
         }
@@ -263,7 +263,7 @@ impl Way {
         arrived as f64 / took.as_secs_f64()
     }
 
-    /// One at a time: microseconds from application to application, each.
+    /// Sends one message at a time. Returns the microseconds from application to application of each.
     fn delays(&self) -> Vec<f64> {
         self.timing.store(true, SeqCst);
         let delays = (0..PINGS)
@@ -280,7 +280,7 @@ impl Way {
     }
 }
 
-/// CPU time that the threads of this process took until now, by thread and name, microseconds.
+/// Returns the CPU time of this process's threads so far, by thread and name, microseconds.
 fn cpu_times() -> BTreeMap<(u32, String), f64> {
     let mut times = BTreeMap::new();
     for task in std::fs::read_dir("/proc/self/task").unwrap().flatten() {
@@ -293,7 +293,7 @@ fn cpu_times() -> BTreeMap<(u32, String), f64> {
     times
 }
 
-/// The busiest threads between two looks: microseconds a message; and of all threads together.
+/// Returns the busiest threads since `before`, in microseconds a message, and the total of all threads.
 fn busiest(before: &BTreeMap<(u32, String), f64>, messages: f64) -> (String, f64) {
     let after = cpu_times();
     let spent = |(thread, t): (&(u32, String), &f64)| {
@@ -319,7 +319,7 @@ fn with_dds_at_both_ends() {
     let mut ratios = vec![];
     let dir = tempfile::tempdir().unwrap();
     for round in 0..ROUNDS {
-        // The second of a pair may find the machine in another state than the first: they change places.
+        // The machine's state may change between the two of a pair, so they swap places.
         for turn in 0..2 {
             let at = (round + turn) % 2;
             let way = Way::new(suites[at], dir.path());

@@ -1,4 +1,4 @@
-//! A topic handed to another fleet by token: whole nodes over real QUIC, with local networks in memory.
+//! A topic that is shared with another fleet by token: whole nodes over real QUIC, with local networks in memory.
 
 #![allow(clippy::unwrap_used)]
 
@@ -130,7 +130,7 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
         admin_socket: Some(at(&format!("{name}.sock"))),
         ..Config::default()
     };
-    // The router of the owner's fleet lets nodes of the partner in.
+    // The router of the owner's fleet accepts nodes of the partner.
     let addr = ListenAddr::new(Scheme::Quic, ([127, 0, 0, 1], 0).into());
     let config = Config { listen: vec![addr], trust: vec![at("acme.pem")], ..base("cloud") };
     let cloud = Node::start(config, identity(&mut lab, "cloud", true), None);
@@ -161,13 +161,13 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
         ca: lab.ca_certificate().clone(),
         secret: TopicSecret::derive(robot.fleet_secret().unwrap(), &metadata),
         metadata,
-        // The partner knows no router but the one that the token names.
+        // The partner knows only the router that the token names.
         routers: vec![url],
         expires: UnixMillis(unix_now().0 + 3_600_000),
     };
     let talkers = robot_net.join(false);
     let talker = talkers.create_writer(&spec()).unwrap();
-    // The owner runs already, and has not heard of the partner.
+    // The owner is running and has not heard of the partner.
     let state = at("robot-state");
     create_state_dir(&state).unwrap();
     let record = TokenRecord {
@@ -212,7 +212,7 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
     let log = audit_of(&state);
     assert!(log.contains("\"granted\"") && log.contains(&cart.node_id().to_string()), "{log}");
     assert!(!log.contains("sgc-token") && !log.contains(&STANDARD.encode(token.secret.expose())), "{log}");
-    // The writer at the partner's goes once the owner is known not to share with it any more, and nothing comes.
+    // The partner's writer ends once its node learns that the owner no longer shares, and no message arrives.
     while samples.try_recv().is_ok() {}
     wait("a new epoch", || audit_of(&state).contains("\"epoch\""));
     let came = (0..50).filter(|_| {

@@ -1,4 +1,4 @@
-//! Trust of whole nodes over real QUIC: who gets what, who no longer does, and that nobody else notices.
+//! Trust across whole nodes over real QUIC: access is granted and revoked, and other nodes notice nothing.
 
 #![allow(clippy::unwrap_used)]
 
@@ -75,7 +75,7 @@ fn a_revoked_member_is_cut_off_everywhere_and_the_others_lose_nothing() {
     assert!(one_heard.iter().zip(1..).all(|(n, expected)| *n == expected), "{one_heard:?}");
     assert!(one_heard.last().is_some_and(|n| *n <= mark), "it heard {:?}, of {mark}", one_heard.last());
 
-    // The router comes back with what it kept, and nobody is there yet who could tell it.
+    // The router returns with its kept lists while no node is there to tell it.
     let kept = lab.state("cloud").join("crl");
     wait("the list is kept", || fs::read_dir(&kept).is_ok_and(|files| files.count() == 1));
     wait("the robot keeps it, too", || fs::read_dir(lab.state("robot").join("crl")).is_ok());
@@ -86,7 +86,7 @@ fn a_revoked_member_is_cut_off_everywhere_and_the_others_lose_nothing() {
     wait("it is refused", || cloud.refused("revoked") > 0);
     assert_eq!(cloud.status()["links"].as_array().map(Vec::len), Some(0));
 
-    // A router that knows nothing hears of it from the robot.
+    // A router without lists gets them from the robot.
     cloud.kill();
     fs::remove_dir_all(lab.state("cloud")).unwrap();
     let cloud = lab.cloud();
@@ -198,7 +198,7 @@ fn every_suite_carries_messages() {
 fn certificates_and_secrets_are_renewed_while_messages_flow() {
     let lab = Lab::new(&["robot"]);
     lab.with_fleet(|fleet| fleet.set_authority(Some("keeper".parse().unwrap()), unix_now()).unwrap());
-    // Made ten minutes ago for fifteen: less than a third of their time is left.
+    // The certificates are ten minutes old and valid for fifteen, so less than a third is left.
     for node in ["keeper", "robot", "desk", "thief"] {
         lab.enroll(node, |request| {
             request.valid = Duration::from_secs(900);
@@ -228,7 +228,7 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
     wait("the authority renews its own", || lab.identity("keeper").chain() != old_keeper.chain());
     let new = lab.identity("desk");
     assert_eq!(fs::metadata(lab.path("desk.identity")).unwrap().permissions().mode() & 0o7777, 0o600);
-    // Ten minutes are not added to it each time.
+    // Renewal does not add the ten minutes each time.
     let lasts = |i: &Identity| i.not_after().0 - i.as_peer().not_before.0;
     assert!(lasts(&new).abs_diff(lasts(&old)) <= 2000, "{} and {} ms", lasts(&new), lasts(&old));
     let shown = |node: &str| {
@@ -245,7 +245,7 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
     };
     assert!(known("desk", &new.as_peer().cert.serial) && known("desk", &old.as_peer().cert.serial));
 
-    // What is new is not renewed again.
+    // A new certificate is not renewed again.
     let certificates = || {
         let read = sgc_node::read_fleet(&lab.fleet_file()).unwrap();
         read.nodes().map(|n| n.certificates.len()).collect::<Vec<_>>()
@@ -254,7 +254,7 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
     stream.more(500);
     assert_eq!(certificates(), before);
 
-    // Whoever was revoked gets nothing more, although its certificate still lets it in where nobody knows.
+    // A revoked node gets nothing more, although its certificate still admits it where the revocation is unknown.
     let list = lab.revoke("thief");
     let thief = lab.start("thief", use_it);
     wait("it is refused", || {
@@ -268,9 +268,9 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
     assert_eq!(keeper.ask(&AdminRequest::Crl(list))["ok"]["news"], true);
     wait("it is cut off", || cloud.refused("revoked") > 0);
 
-    // A revocation covers what was renewed, also by a copy of the fleet's file that knows nothing of it.
+    // A revocation covers renewed certificates, also if a copy of the fleet file made it that does not know them.
     let (_talker, last) = stream.end();
-    // Two ways are made anew, each within a few round trips; what is said meanwhile is not said again.
+    // Two paths are rebuilt, each within a few round trips. Messages published meanwhile are not repeated.
     let lost = hears_some(&listener, 1, last);
     eprintln!("renewal: {lost} of {last} messages lost while the links were replaced");
     listener.hears_nothing();
@@ -282,7 +282,7 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
     assert_eq!(answer["ok"]["lists"].as_array().map(Vec::len), Some(1), "the thief's");
     let id = lab.id("desk").to_string();
     wait("the renewed one is cut off, too", || !cloud.peers().contains(&id));
-    // The file of the authority learns of it, and keeps what it knew.
+    // The authority's file learns the revocation and keeps its own entries.
     wait("the authority's file knows", || {
         let fleet = sgc_node::read_fleet(&lab.fleet_file()).unwrap();
         fleet.nodes().filter(|n| fleet.revoked_at(n).is_some()).count() == 2
@@ -313,7 +313,7 @@ fn a_node_that_asks_again_gets_the_same_certificate() {
     };
     assert_eq!(certificates(), 2);
 
-    // For another key it has to wait, and is told so.
+    // A request for another key has to wait, and its node is told so.
     let request = EnrollRequest {
         valid: Duration::from_secs(3600),
         ..EnrollRequest::new("desk".parse().unwrap(), UnixMillis(unix_now().0 - 2_500_000))
@@ -326,7 +326,7 @@ fn a_node_that_asks_again_gets_the_same_certificate() {
     assert_eq!(keeper.status()["drops"]["renewal_too_soon"], 1, "{}", keeper.status());
     drop(desk);
 
-    // For the same key it gets the same again, as after a start from a copy.
+    // A request for the same key gets the same certificate, as after a start from a copy.
     for _ in 0..2 {
         write_secret(&lab.path("desk.identity"), &old.to_text());
         let desk = lab.start("desk", |_| {});
@@ -337,7 +337,7 @@ fn a_node_that_asks_again_gets_the_same_certificate() {
 }
 
 impl Lab {
-    /// A fleet with an authority, `keeper`, and an operator, `desk`.
+    /// Creates a fleet with an authority, `keeper`, and an operator, `desk`.
     fn with_operator(nodes: &[&str]) -> Self {
         let lab = Self::new(&[]);
         lab.with_fleet(|fleet| fleet.set_authority(Some("keeper".parse().unwrap()), unix_now()).unwrap());
@@ -360,7 +360,7 @@ impl Lab {
     }
 }
 
-/// Has an authority carry something out; the answer, or what the user is told.
+/// Requests an operation from an authority. Returns the answer, or the user's error message.
 fn operate(node: &Node, at: &str, operation: Operation) -> Result<OperationAnswer, String> {
     use base64::Engine as _;
     let answer = node.ask(&AdminRequest::Operate { at: at.parse().unwrap(), operation });
@@ -378,7 +378,7 @@ fn revoke(node: &str) -> Operation {
     Operation::Revoke { nodes: vec![node.to_owned()] }
 }
 
-/// A request of a node for a certificate, whose key nobody needs.
+/// Returns a request for a certificate whose key is thrown away.
 fn enroll(node: &str) -> Operation {
     let made = KeyRequest::generate(None, &mut OsRng.unwrap_err()).unwrap();
     Operation::Enroll {
@@ -413,7 +413,7 @@ fn an_operator_has_operations_carried_out_at_the_authority() {
     let Ok(OperationAnswer::Roster(rest)) = rest else { panic!("{rest:?}") };
     assert_eq!(rest.nodes.len(), 2);
 
-    // Whoever is revoked is out everywhere, at once.
+    // A revoked node loses access everywhere at once.
     let id = lab.id("thief").to_string();
     let done = operate(&desk, "keeper", revoke("thief"));
     assert!(matches!(done, Ok(OperationAnswer::Revoked { list: 1.. })), "{done:?}");
@@ -443,7 +443,7 @@ fn an_operator_has_operations_carried_out_at_the_authority() {
 }
 
 #[test]
-fn who_is_no_operator_changes_nothing() {
+fn non_operator_changes_nothing() {
     let lab = Lab::with_operator(&["guest", "thief"]);
     let (_cloud, keeper) = (lab.cloud(), lab.keeper());
     let guest = lab.start("guest", |_| {});
@@ -459,14 +459,14 @@ fn who_is_no_operator_changes_nothing() {
     assert_eq!(lab.certificates("mine"), 0);
     drop(keeper);
 
-    // Without operators an authority does not even offer it.
+    // Without operators, an authority does not even offer the name.
     let _keeper = lab.start("keeper", |c| c.authority = Some(AuthorityConfig::new(lab.fleet_file())));
     let desk = lab.start("desk", |_| {});
     let said = operate(&desk, "keeper", revoke("guest")).unwrap_err();
     assert!(said.starts_with("no authority keeper is in reach"), "{said}");
 }
 
-/// A member that speaks the protocol by hand.
+/// A member that speaks the protocol without a node.
 struct ByHand {
     runtime: tokio::runtime::Runtime,
     dialer: Dialer,
@@ -475,7 +475,7 @@ struct ByHand {
 }
 
 impl ByHand {
-    /// Links to the router, and has learned of `name`.
+    /// Links to the router and waits until it knows `name`.
     fn start(lab: &Lab, node: &str, name: Name) -> Self {
         let identity = lab.identity(node);
         let runtime = tokio::runtime::Runtime::new().unwrap();
@@ -508,7 +508,7 @@ impl ByHand {
         })
     }
 
-    /// A request to `name`, as it is signed, and what opens its answer.
+    /// Returns a signed request to `name`, and the key that opens its answer.
     fn request(&self, name: Name, sink: u8, request: &OperationRequest) -> (SignedBody, ReplyKey) {
         let reply_key = ReplyKey::generate(Kem::X25519);
         let body = JoinBody {
@@ -522,7 +522,7 @@ impl ByHand {
         (self.identity.sign_join(&body), reply_key)
     }
 
-    /// Sends it and opens the answer.
+    /// Sends the request and opens its answer.
     fn ask(&self, name: Name, sink: u8, signed: &SignedBody, reply_key: &ReplyKey) -> OperationAnswer {
         let id = SinkId([sink; 16]);
         let body = loop {
@@ -531,7 +531,7 @@ impl ByHand {
                 Control::Answer { signed } => {
                     Some(Some(AnswerBody::from_slice(&signed.body).unwrap()).filter(|body| body.sink == id))
                 }
-                // There is no way to the authority for a while after its start.
+                // For a while after its start, no route leads to the authority.
                 Control::Reject { sink, .. } if sink == id => Some(None),
                 _ => None,
             });
@@ -566,13 +566,13 @@ fn a_request_that_was_recorded_and_comes_again_is_not_carried_out_again() {
     assert!(matches!(first, OperationAnswer::Membership(_)), "{first:?}");
     assert_eq!(lab.certificates("arm"), 1);
 
-    // The frame, bit for bit, as a router on the way could play it; and its content in another request of the node.
+    // A router could replay the same frame, and another request of the same node could have its content.
     assert_eq!(desk.ask(name, 2, &recorded, &key), first);
     let (again, other_key) = desk.request(name, 3, &execute);
     assert_eq!(desk.ask(name, 3, &again, &other_key), first);
     assert_eq!((lab.certificates("arm"), keeper.drops("operation_repeated")), (1, 2));
 
-    // Another run knows nothing of it, and refuses.
+    // Another run of the authority does not know the challenge and refuses.
     keeper.kill();
     let keeper = lab.keeper();
     desk.hear(|frame| matches!(frame, Control::Advert { .. }).then_some(()));
@@ -596,9 +596,9 @@ fn telling_a_router_a_list_returns_those_that_it_has() {
     let keeper = Arc::new(old_copy.issue(&request, &mut OsRng.unwrap_err()).unwrap());
     let url = lab.url().parse().unwrap();
     let runtime = tokio::runtime::Runtime::new().unwrap();
-    let heard = runtime.block_on(sgc_node::tell_router(&url, keeper, ours.into())).unwrap();
+    let heard = runtime.block_on(sgc_node::push_crl(&url, keeper, ours.into())).unwrap();
     assert_eq!(heard, [theirs]);
-    // So the copy knows now that it is not the newest, and both are revoked everywhere.
+    // The copy knows now that it is outdated, and both nodes are revoked everywhere.
     let anchors = old_copy.anchors().with_crl(&heard[0], unix_now()).unwrap().unwrap();
     let absorbed = old_copy.absorb(&anchors, unix_now()).unwrap();
     assert_eq!(absorbed.revoked, ["desk"]);
@@ -650,7 +650,7 @@ fn a_new_secret_reaches_everyone_but_the_thief() {
     assert_eq!(name_of(&robot, "/chatter"), Some(before.clone()));
     assert_eq!(name_of(&desk, "/chatter"), Some(before));
 
-    // The name of the new share follows from the new secret, and not from the old one.
+    // The new share's name is derived from the new secret, not from the old one.
     let metadata = Metadata::topic("robot", "/later", "std_msgs/msg/String");
     let derived = |node: &str| {
         let secret = lab.identity(node).naming_secrets()[0].secret.clone();
@@ -662,7 +662,7 @@ fn a_new_secret_reaches_everyone_but_the_thief() {
     assert_ne!(derived("thief"), found);
     assert_eq!(writers(&lab.net("thief"), "/later"), 0);
 
-    // One that was off meanwhile gets it when it is back.
+    // A node that was off gets the secret when it returns.
     assert_eq!(generation("late"), 1);
     let _late = lab.start("late", both);
     wait("it holds generation 2", || generation("late") == 2);
@@ -696,12 +696,12 @@ fn a_member_publishes_on_a_topic_of_another() {
     hears_each(&at_desk2, 1, last);
     hears_each(&at_home, 1, last);
 
-    // Who may subscribe may not publish.
+    // The right to subscribe does not include the right to publish.
     let intruder = lab.talker("desk3", "/cmd");
     wait("it is told", || desk3.route_state().contains("does not let this node publish"));
     intruder.say("not a number");
 
-    // Whoever comes back, it goes on, and nothing comes twice.
+    // Whichever node restarts, messages continue and none is repeated.
     let mut talker = Some(talker);
     let mut first = last + 1;
     for round in ["robot", "desk1", "cloud"] {
@@ -735,7 +735,7 @@ fn a_member_publishes_on_a_topic_of_another() {
     drop((cloud, robot, desk1));
 }
 
-/// What the owner makes of one of its shares for a partner, as `sgc share-token` does.
+/// Returns an owner's token for a partner, as `sgc share-token` makes it.
 fn token_for(lab: &Lab, topic: &str, partner: &Lab, node: Option<&str>, recorded: bool) -> (ShareToken, u64) {
     let owner = lab.identity("robot");
     let mut share = share(topic, &["desk"]);
@@ -777,7 +777,7 @@ fn a_partner_gets_what_its_token_is_for_until_it_is_withdrawn() {
     let _desk = lab.start("desk", |c| c.uses = vec![uses("/pose")]);
     let (talker, private) = (lab.talker("robot", "/pose"), lab.talker("robot", "/private"));
     let (token, id) = token_for(&lab, "/pose", &acme, Some("arm"), true);
-    // As if the secret of another topic had become known: it admits nobody.
+    // A leaked topic secret alone admits nobody.
     let (leaked, _) = token_for(&lab, "/private", &acme, Some("arm"), false);
     assert_eq!(robot.reload(|_| {})["changed"][0], "/pose: who may subscribe changed");
     let with = |tokens: &[&ShareToken]| {
@@ -798,7 +798,7 @@ fn a_partner_gets_what_its_token_is_for_until_it_is_withdrawn() {
     let other = acme.start("other", with(&[&token]));
     let (arm_id, other_id) = (acme.id("arm").to_string(), acme.id("other").to_string());
 
-    // A router that does not trust that CA lets nobody in, until it is told to while it runs.
+    // A router that does not trust that CA refuses its nodes until a reload adds the CA.
     wait("they are refused", || cloud.refused("other_ca") >= 2);
     assert!(cloud.peers().is_disjoint(&[arm_id.clone(), other_id.clone()].into()));
     let report = cloud.reload(|c| c.trust = vec![acme.ca().0]);
@@ -826,7 +826,7 @@ fn a_partner_gets_what_its_token_is_for_until_it_is_withdrawn() {
     assert!(refused(&arm_id) && refused(&other_id));
     stream.more(100);
 
-    // Withdrawn: cut off at once, and nobody else notices.
+    // After a withdrawal the partner is cut off at once, and other nodes notice nothing.
     TokenRecords::change(&lab.state("robot"), |records| records.withdraw(id)).unwrap();
     robot.reload(|_| {});
     wait("a new epoch", || lab.epoch("robot") >= 2);
@@ -842,7 +842,7 @@ fn a_partner_gets_what_its_token_is_for_until_it_is_withdrawn() {
     at_other.hears_nothing();
     peeks.hears_nothing();
 
-    // The router forgets that CA: its nodes are cut off, and let in no more.
+    // The router no longer trusts that CA: it cuts its nodes off and refuses them.
     let before = cloud.refused("other_ca");
     cloud.reload(|c| c.trust = vec![]);
     wait("they are cut off", || cloud.peers().is_disjoint(&[arm_id.clone(), other_id.clone()].into()));
@@ -884,7 +884,7 @@ fn the_audit_log_tells_what_happened_and_no_secret() {
     assert_eq!(robot.ask(&AdminRequest::Crl(list))["ok"]["news"], true);
     wait("two new epochs", || lab.epoch("robot") == 3);
     wait("the router knows", || lab.audit("cloud").iter().any(|r| r.event == "crl"));
-    // What is queued is written once it has stopped.
+    // Queued records are written by the time the node has stopped.
     robot.stop();
     cloud.stop();
 
@@ -902,7 +902,7 @@ fn the_audit_log_tells_what_happened_and_no_secret() {
         assert!(lab.audit("robot").iter().any(|r| r.event == event), "{event} is not in the log");
     }
 
-    // Nothing that looks like a key is in it but the names of what is shared and of who is there.
+    // The log contains nothing that looks like a key, except names of shares and ids of nodes.
     let mut known: BTreeSet<String> =
         ["robot", "cloud", "desk1", "desk2", "desk3"].map(|node| lab.id(node).to_string()).into();
     known.insert(acme.id("arm").to_string());
@@ -944,7 +944,7 @@ fn nodes_of_a_post_quantum_fleet_link_and_grant_so() {
         let links = status["links"].as_array().unwrap();
         assert!(!links.is_empty() && links.iter().all(|l| l["kex"] == "X25519MLKEM768"), "{links:?}");
     }
-    // One whose identity does not know of it asks for grants that a recording could tell later.
+    // The identity of this node does not know of the requirement. A recording of its grants could be read later.
     wait("it gets nothing", || {
         cloud.refused("key_exchange") > 0
             || before.status()["routes"][0]["state"].as_str().unwrap().contains("refuse")

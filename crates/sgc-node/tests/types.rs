@@ -1,4 +1,4 @@
-//! Types over the wire, and messages that travel as JSON: across whole nodes, of which one alone has the definitions.
+//! Types over the wire, and messages that travel as JSON, across whole nodes of which only one has the definitions.
 
 #![allow(clippy::unwrap_used)]
 
@@ -19,7 +19,7 @@ use support::*;
 const THING: &str = "mine/msg/Thing";
 const TEXT: &str = r#"{"label":"a \"thing\"","position":{"x":0.1,"y":-2.5,"z":"NaN"},"raw":"AAEC","count":9007199254740993}"#;
 
-/// A directory with what only one of the nodes has.
+/// A directory with a definition that only one node has.
 struct Package(tempfile::TempDir);
 
 impl Package {
@@ -42,19 +42,19 @@ impl Package {
         definitions.layout(&type_name.parse().unwrap()).unwrap()
     }
 
-    /// A message as a local publisher writes it.
+    /// Returns a message as a local publisher writes it.
     fn thing(&self, json: &str) -> Bytes {
         let layout = self.layout(THING);
         layout.encode(&layout.from_json(json.as_bytes()).unwrap()).unwrap().into()
     }
 
-    /// A node that has it.
+    /// Makes the definition available to a node.
     fn is_at(&self, config: &mut Config) {
         config.ros = Some(RosConfig { definitions: vec![self.0.path().to_owned()], ..RosConfig::default() });
     }
 }
 
-/// A robot that shares `/thing`.
+/// Starts a robot that shares `/thing`.
 fn robot(trio: &Trio, package: Option<&Package>, change: impl FnOnce(&mut Config)) -> Node {
     start(trio, "robot", |config| {
         config.shares = vec![shared_topic("/thing")];
@@ -65,7 +65,7 @@ fn robot(trio: &Trio, package: Option<&Package>, change: impl FnOnce(&mut Config
     })
 }
 
-/// A desk that uses it.
+/// Starts a desk that uses `/thing`.
 fn desk(trio: &Trio, package: Option<&Package>, change: impl FnOnce(&mut Config)) -> Node {
     start(trio, "desk", |config| {
         config.uses = vec![used_topic("/thing")];
@@ -99,16 +99,16 @@ fn name(text: &str) -> TypeName {
 fn a_user_without_definitions_is_told_what_a_type_looks_like() {
     let package = Package::new();
     let hash = package.layout(THING).type_hash();
-    // Older distributions announce no hash: then the owner's counts.
+    // Older distributions announce no hash. The owner's hash counts then.
     for announced in [Some(hash.clone()), None] {
         let trio = Trio::new();
         let (_cloud, _robot) = (trio.cloud(), robot(&trio, Some(&package), |_| {}));
         let desk = desk(&trio, None, |_| {});
-        let _talker = Talker::of(&trio.robot_net, &thing_spec(Qos::default(), announced.clone()));
+        let _talker = Talker::with_spec(&trio.robot_net, &thing_spec(Qos::default(), announced.clone()));
         wait("the type", || desk.types.layout(&name(THING), Some(&hash)).is_some());
         let layout = desk.types.layout(&name(THING), None).unwrap();
         assert_eq!(layout.decode(&package.thing(TEXT)).unwrap().to_json(), TEXT);
-        // Who looks at the topic there is told, too.
+        // A tap of the topic gets the description, too.
         let tap = AdminRequest::Tap { topic: "/thing".into(), side: None, bytes: 64 };
         let first = desk.begin(&tap);
         assert_eq!(first["ok"]["described"]["type_hash"], *hash, "{first}");
@@ -125,10 +125,10 @@ fn a_definition_that_is_another_than_the_announced_one_is_not_told() {
     let (_cloud, robot) = (trio.cloud(), robot(&trio, Some(&package), |_| {}));
     let desk = desk(&trio, None, |_| {});
     let other = format!("RIHS01_{}", "0".repeat(64));
-    let talker = Talker::of(&trio.robot_net, &thing_spec(Qos::default(), Some(other)));
-    let listener = Listener::of(&trio.desk_net, &thing_spec(Qos::default(), None));
+    let talker = Talker::with_spec(&trio.robot_net, &thing_spec(Qos::default(), Some(other)));
+    let listener = Listener::with_spec(&trio.desk_net, &thing_spec(Qos::default(), None));
     wait("the count", || robot.drops("type_differs") == 1);
-    // Messages are carried all the same.
+    // Messages are forwarded regardless.
     listener.hears_at_last(|_| talker.say(package.thing(TEXT)));
     assert!(desk.types.layout(&name(THING), None).is_none());
     let tap = AdminRequest::Tap { topic: "/thing".into(), side: None, bytes: 64 };
@@ -168,34 +168,34 @@ fn a_user_of_a_service_is_told_what_is_asked_and_answered() {
 }
 
 #[test]
-fn what_travels_as_json_arrives_as_cdr_also_late_and_compressed() {
+fn json_payloads_arrive_as_cdr_also_late_and_compressed() {
     let package = Package::new();
     for compression in [PayloadEncoding::Plain, PayloadEncoding::Zstd] {
         let trio = Trio::new();
         let shaping = Shaping { compression, ..json() };
         let (_cloud, robot) =
             (trio.cloud(), robot(&trio, Some(&package), |config| config.shares[0].shaping = shaping));
-        // Published before anybody listens, and before anybody there knows the type.
-        let talker = Talker::of(&trio.robot_net, &thing_spec(latched(), None));
+        // The message is published before anybody subscribes, and before anybody there knows the type.
+        let talker = Talker::with_spec(&trio.robot_net, &thing_spec(latched(), None));
         talker.wait_for_readers(1);
         let long = TEXT.replace("a \\\"thing\\\"", &"label ".repeat(500));
         talker.say(package.thing(&long));
         let desk = desk(&trio, None, |_| {});
-        let listener = Listener::of(&trio.desk_net, &thing_spec(latched(), None));
+        let listener = Listener::with_spec(&trio.desk_net, &thing_spec(latched(), None));
         listener.hears(package.thing(&long));
         talker.say(package.thing(TEXT));
         listener.hears(package.thing(TEXT));
         let compressed = &robot.status()["routes"][0]["compressed"];
         match compression {
             PayloadEncoding::Plain => assert!(compressed.is_null(), "{compressed}"),
-            // What is compressed is the JSON.
+            // The JSON is compressed.
             _ => assert_eq!(compressed[0], long.len() + TEXT.len()),
         }
         for node in [&robot, &desk] {
             assert_eq!(["no_definition", "not_converted"].map(|reason| node.drops(reason)), [0, 0]);
             assert_eq!(node.status()["problems"], serde_json::json!([]));
         }
-        // It goes on as CDR as soon as that is wanted.
+        // Messages leave as CDR as soon as the configuration asks for it.
         robot.reload(|config| config.shares[0].shaping = Shaping::default());
         talker.say(package.thing(&long));
         listener.hears(package.thing(&long));
@@ -208,8 +208,8 @@ fn where_nobody_has_a_definition_nothing_flows_as_json_and_that_is_said() {
     let trio = Trio::new();
     let (_cloud, robot) = (trio.cloud(), robot(&trio, None, |config| config.shares[0].shaping = json()));
     let _desk = desk(&trio, None, |_| {});
-    let talker = Talker::of(&trio.robot_net, &thing_spec(Qos::default(), None));
-    let listener = Listener::of(&trio.desk_net, &thing_spec(Qos::default(), None));
+    let talker = Talker::with_spec(&trio.robot_net, &thing_spec(Qos::default(), None));
+    let listener = Listener::with_spec(&trio.desk_net, &thing_spec(Qos::default(), None));
     talker.wait_for_readers(1);
     wait("the count", || {
         talker.say(package.thing(TEXT));
@@ -226,14 +226,14 @@ fn where_nobody_has_a_definition_nothing_flows_as_json_and_that_is_said() {
 }
 
 #[test]
-fn what_is_not_what_its_type_says_is_counted_and_the_rest_flows() {
+fn messages_that_mismatch_their_type_are_counted_and_the_rest_flows() {
     let package = Package::new();
     let trio = Trio::new();
     let (_cloud, robot) =
         (trio.cloud(), robot(&trio, Some(&package), |config| config.shares[0].shaping = json()));
     let _desk = desk(&trio, None, |_| {});
-    let talker = Talker::of(&trio.robot_net, &thing_spec(Qos::default(), None));
-    let listener = Listener::of(&trio.desk_net, &thing_spec(Qos::default(), None));
+    let talker = Talker::with_spec(&trio.robot_net, &thing_spec(Qos::default(), None));
+    let listener = Listener::with_spec(&trio.desk_net, &thing_spec(Qos::default(), None));
     talker.wait_for_readers(1);
     listener.hears_at_last(|_| talker.say(package.thing(TEXT)));
     listener.drain();
@@ -243,7 +243,7 @@ fn what_is_not_what_its_type_says_is_counted_and_the_rest_flows() {
 }
 
 #[test]
-fn who_publishes_on_anothers_topic_converts_by_what_the_owner_told() {
+fn far_publisher_converts_with_the_owners_description() {
     let package = Arc::new(Package::new());
     let trio = Trio::new();
     let robot = robot(&trio, Some(&package), |config| {
@@ -255,8 +255,8 @@ fn who_publishes_on_anothers_topic_converts_by_what_the_owner_told() {
         config.uses[0].publish = true;
         config.uses[0].shaping = json();
     });
-    let talker = Talker::of(&trio.desk_net, &thing_spec(Qos::default(), None));
-    let listener = Listener::of(&trio.robot_net, &thing_spec(Qos::default(), None));
+    let talker = Talker::with_spec(&trio.desk_net, &thing_spec(Qos::default(), None));
+    let listener = Listener::with_spec(&trio.robot_net, &thing_spec(Qos::default(), None));
     wait("the type", || desk.types.layout(&name(THING), None).is_some());
     listener.hears_at_last(|_| talker.say(package.thing(TEXT)));
     for heard in listener.drain() {
@@ -266,7 +266,7 @@ fn who_publishes_on_anothers_topic_converts_by_what_the_owner_told() {
 }
 
 #[test]
-fn what_is_published_while_nobody_knows_the_type_arrives_when_the_owner_does() {
+fn messages_of_an_unknown_type_arrive_once_the_owner_describes_it() {
     let package = Package::new();
     let trio = Trio::new();
     let shared = |config: &mut Config| {
@@ -278,18 +278,18 @@ fn what_is_published_while_nobody_knows_the_type_arrives_when_the_owner_does() {
         config.uses[0].publish = true;
         config.uses[0].shaping = json();
     });
-    let talker = Talker::of(&trio.desk_net, &thing_spec(Qos::default(), None));
-    let listener = Listener::of(&trio.robot_net, &thing_spec(Qos::default(), None));
+    let talker = Talker::with_spec(&trio.desk_net, &thing_spec(Qos::default(), None));
+    let listener = Listener::with_spec(&trio.robot_net, &thing_spec(Qos::default(), None));
     talker.wait_for_readers(1);
     talker.say(package.thing(TEXT));
     let lacks = "/thing: its messages travel as JSON, and no definition of mine/msg/Thing";
     wait("what is wrong", || desk.status()["problems"].to_string().contains(lacks));
-    // It may become known.
+    // The type may still become known.
     assert_eq!(desk.drops("no_definition"), 0);
     first.kill();
-    // Somebody installs the definition.
+    // The definition is installed.
     let _robot = robot(&trio, Some(&package), shared);
-    // What was said last, or what is said now.
+    // Either the last message or a new one arrives.
     listener.hears_at_last(|_| talker.say(package.thing(TEXT)));
     assert_eq!(desk.drops("not_converted"), 0);
     wait("that nothing is wrong", || desk.status()["problems"] == serde_json::json!([]));
@@ -302,13 +302,13 @@ fn a_type_that_is_another_after_its_owner_starts_anew_is_asked_for() {
     let (_cloud, first) = (trio.cloud(), robot(&trio, Some(&package), |_| {}));
     let desk = desk(&trio, None, |_| {});
     let old = package.layout(THING).type_hash();
-    let talker = Talker::of(&trio.robot_net, &thing_spec(Qos::default(), Some(old.clone())));
+    let talker = Talker::with_spec(&trio.robot_net, &thing_spec(Qos::default(), Some(old.clone())));
     wait("the type", || desk.types.layout(&name(THING), Some(&old)).is_some());
     first.kill();
     drop(talker);
     fs::write(package.0.path().join("mine/msg/Thing.msg"), "int64 other").unwrap();
     let new = package.layout(THING).type_hash();
-    let _talker = Talker::of(&trio.robot_net, &thing_spec(Qos::default(), Some(new.clone())));
+    let _talker = Talker::with_spec(&trio.robot_net, &thing_spec(Qos::default(), Some(new.clone())));
     let _robot = robot(&trio, Some(&package), |_| {});
     wait("the new one", || desk.types.layout(&name(THING), Some(&new)).is_some());
 }

@@ -1,4 +1,4 @@
-//! A configuration that is watched: however its file changes, the running node follows, and what is wrong changes nothing.
+//! A watched configuration: the running node follows each change of its file, and mistakes change nothing.
 
 #![allow(clippy::unwrap_used)]
 
@@ -12,15 +12,15 @@ use sgc_node::config::{Config, parse};
 use sgc_trust::pem_text;
 use support::*;
 
-struct Watched {
+struct WatchBench {
     node: Node,
     _trio: Trio,
     dir: tempfile::TempDir,
     audit: PathBuf,
 }
 
-/// A node whose configuration is this file of the directory.
-fn start(dir: tempfile::TempDir, file: &Path) -> Watched {
+/// Starts a node whose configuration is this file of the directory.
+fn start(dir: tempfile::TempDir, file: &Path) -> WatchBench {
     let audit = dir.path().join("audit");
     let trio = Trio::new();
     let read = {
@@ -37,7 +37,7 @@ fn start(dir: tempfile::TempDir, file: &Path) -> Watched {
     };
     let (identity, domain) = (identity("robot", false), trio.robot_net.clone());
     let node = Node::start_watched(Arc::new(read), file, identity, &domain);
-    Watched { node, _trio: trio, dir, audit }
+    WatchBench { node, _trio: trio, dir, audit }
 }
 
 fn text(topics: &[&str]) -> String {
@@ -46,7 +46,7 @@ fn text(topics: &[&str]) -> String {
     format!("identity = 'x'\n[node]\nrouters = ['quic://127.0.0.1:1']\n{shares}")
 }
 
-impl Watched {
+impl WatchBench {
     fn shares(&self, topics: &[&str]) {
         wait(&format!("{topics:?}"), || {
             let status = self.node.status();
@@ -56,7 +56,7 @@ impl Watched {
         });
     }
 
-    /// How often the configuration was read again with this outcome.
+    /// Returns the number of reloads with this outcome.
     fn reloads(&self, outcome: &str) -> usize {
         let log = fs::read_to_string(&self.audit).unwrap_or_default();
         log.lines().filter(|line| line.contains("\"reload\"") && line.contains(outcome)).count()
@@ -70,21 +70,21 @@ fn however_a_file_changes_the_node_follows() {
     fs::write(&file, text(&["/a"])).unwrap();
     let watched = start(dir, &file);
     watched.shares(&["/a"]);
-    // In place.
+    // The file is overwritten.
     fs::write(&file, text(&["/a", "/b"])).unwrap();
     watched.shares(&["/a", "/b"]);
-    // By another file in its place, as most editors do.
+    // Another file replaces it, as most editors do.
     let other = watched.dir.path().join(".node.toml.swp");
     fs::write(&other, text(&["/b"])).unwrap();
     fs::rename(&other, &file).unwrap();
     watched.shares(&["/b"]);
-    // Away for a while.
+    // The file is missing for a while.
     fs::remove_file(&file).unwrap();
     fs::write(&other, text(&["/c"])).unwrap();
     watched.shares(&["/b"]);
     fs::rename(&other, &file).unwrap();
     watched.shares(&["/c"]);
-    // By a link that comes to lead elsewhere, and by what it leads to.
+    // A symbolic link gets another target, and the target changes.
     for (n, topic) in ["/d", "/e"].into_iter().enumerate() {
         let there = watched.dir.path().join(format!("there{n}"));
         fs::create_dir(&there).unwrap();
@@ -115,7 +115,7 @@ fn a_broken_file_changes_nothing_and_is_said() {
 }
 
 #[test]
-fn what_the_file_names_is_watched_with_it_and_what_stands_beside_it_is_not() {
+fn files_named_in_the_configuration_are_watched_and_others_are_not() {
     let dir = tempfile::tempdir().unwrap();
     let (file, ca) = (dir.path().join("node.toml"), dir.path().join("acme-ca.pem"));
     let certificate = |fleet: &str| {
@@ -130,12 +130,12 @@ fn what_the_file_names_is_watched_with_it_and_what_stands_beside_it_is_not() {
     fs::write(&file, text(&["/a"])).unwrap();
     let watched = start(dir, &file);
     watched.shares(&["/a"]);
-    // A partner that comes by a reload brings a file to watch.
+    // A partner that a reload adds brings a file to watch.
     let partner = "[[partner]]\nname = 'acme'\nca = 'acme-ca.pem'\n";
     fs::write(&file, text(&["/a"]) + partner).unwrap();
     let links = "nodes of another CA may link";
     wait("the partner", || watched.reloads(links) == 1);
-    // Once more after what is watched has changed; what stands beside is nothing to it.
+    // The files are compared again after a change. Other files of the directory do not matter.
     wait("another look", || watched.reloads("nothing changed") == 1);
     fs::write(watched.dir.path().join("beside"), "anything").unwrap();
     fs::write(&ca, certificate("other")).unwrap();
@@ -144,7 +144,7 @@ fn what_the_file_names_is_watched_with_it_and_what_stands_beside_it_is_not() {
 }
 
 #[test]
-fn who_does_not_want_it_watched_asks() {
+fn watching_can_be_switched_off() {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("node.toml");
     let unwatched = |topics: &[&str]| text(topics).replace("[node]", "[node]\nwatch = false");
@@ -154,7 +154,7 @@ fn who_does_not_want_it_watched_asks() {
     fs::write(&file, unwatched(&["/b"])).unwrap();
     watched.node.reload(|_| {});
     watched.shares(&["/b"]);
-    // It is in the log a little later than in effect.
+    // The log shows the reload a little after it takes effect.
     wait("the log", || watched.reloads("") > 0);
     assert_eq!(watched.reloads(""), 1);
 }

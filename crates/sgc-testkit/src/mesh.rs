@@ -696,7 +696,8 @@ mod tests {
 
     #[test]
     fn weight_of_frame_is_its_encoded_length() {
-        let signed = SignedBody { body: Bytes::from_static(&[1; 700]), signature: Bytes::from_static(&[2; 71]) };
+        let signed =
+            SignedBody { body: Bytes::from_static(&[1; 700]), signature: Bytes::from_static(&[2; 71]) };
         let names = vec![Name([3; 32]); 3];
         for frame in [
             Control::LinkState { signed: signed.clone() },

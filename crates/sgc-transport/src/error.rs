@@ -276,7 +276,9 @@ pub enum LinkError {
     )]
     Cut,
     /// Somebody altered the bytes on the way.
-    #[error("received bytes were altered on the way: an attacker or a broken device is between the two nodes")]
+    #[error(
+        "received bytes were altered on the way: an attacker or a broken device is between the two nodes"
+    )]
     Altered,
     /// The peer is there but has forgotten the link.
     #[error("the peer restarted and no longer knows this link")]

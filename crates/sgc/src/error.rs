@@ -45,7 +45,7 @@ pub(crate) enum CliError {
     Label(#[from] LabelError),
     /// A revocation list could not be pushed to a router.
     #[error("the revocation is in force here, but a router was not told: {0}")]
-    Tell(#[from] sgc_node::TellError),
+    Tell(#[from] sgc_node::PushCrlError),
     /// A file cannot be read.
     #[error("cannot read {}: {source}", path.display())]
     Read {

@@ -6,7 +6,7 @@ use std::time::Duration;
 use clap::{Args, Subcommand};
 use serde_json::value::RawValue;
 use sgc_node::admin::AdminRequest;
-use sgc_node::shell::CallWish;
+use sgc_node::shell::CallRequest;
 
 use crate::error::CliError;
 use crate::topic::{NodeArgs, answer};
@@ -58,7 +58,7 @@ pub(crate) fn service(args: &ServiceArgs) -> Result<ExitCode, CliError> {
     let (type_name, request) = crate::topic::type_and_message(args.first.as_deref(), args.second.as_deref());
     let request = yaml::json_of(request.unwrap_or_default())
         .map_err(|reason| CliError::Cannot { reason: format!("the request: {reason}") })?;
-    let wish = CallWish {
+    let wish = CallRequest {
         service: args.service.clone(),
         type_name: type_name.map(str::to_owned),
         request,

@@ -1,8 +1,8 @@
-//! The place of the status socket, and how both ends make sure of each other.
+//! Place of the status socket, and mutual verification of both ends.
 //!
-//! The node binds the socket in a directory of its own user and keeps a lock beside it for as long as it lives, so that
-//! one node has it and a successor waits. Both ends ask the system for the other's user (`SO_PEERCRED`): file modes
-//! alone would trust whoever made the directory first. What is said over a connection is the business of `admin`.
+//! The node binds the socket in a directory of its own user and holds a lock beside it for its lifetime, so that one
+//! node has the socket and a successor waits. Both ends ask the system for the other's user (`SO_PEERCRED`), since file
+//! modes alone would trust whoever made the directory first. `admin` has the protocol.
 
 use std::fs;
 use std::io;
@@ -13,15 +13,15 @@ use std::path::{Path, PathBuf};
 use rustix::fs::{FlockOperation, OFlags, flock};
 use tokio::net::UnixListener;
 
-/// Permission bits that let others than the owner in.
+/// Permission bits of others than the owner.
 const OTHERS_BITS: u32 = 0o077;
-/// The bit that lets anybody make and remove files.
+/// Permission bit that lets everyone create and remove files.
 const WORLD_WRITE_BIT: u32 = 0o002;
-/// The bit that lets none but their owners remove files.
+/// Permission bit that restricts removal to owners.
 const STICKY_BIT: u32 = 0o1000;
 const ROOT: u32 = 0;
 
-/// Why there is no connection to a status socket, or no status socket.
+/// Reasons why a status socket cannot be opened or used.
 #[derive(Debug, thiserror::Error)]
 pub enum SocketError {
     /// The system's error for the socket.
@@ -30,7 +30,7 @@ pub enum SocketError {
     /// Another node has the socket.
     #[error("another node has it; it is taken over when that one ends")]
     Taken,
-    /// The directory cannot be made or looked at.
+    /// The directory cannot be created or examined.
     #[error("directory {}: {source}", dir.display())]
     Directory {
         /// The directory.
@@ -44,7 +44,7 @@ pub enum SocketError {
         /// The path that should be a directory.
         dir: PathBuf,
     },
-    /// The directory is another user's.
+    /// The directory belongs to another user.
     #[error(
         "directory {} belongs to uid {uid}, who could replace the socket: remove it, or set XDG_RUNTIME_DIR or `socket` in [admin]",
         dir.display()
@@ -63,7 +63,7 @@ pub enum SocketError {
         /// Its permission bits.
         mode: u32,
     },
-    /// Another user's process has the socket.
+    /// A process of another user has the socket.
     #[error(
         "a process of uid {uid} answers there, and neither root nor uid {expected}: it is not trusted; nothing was asked"
     )]
@@ -80,7 +80,8 @@ pub fn default_socket_path(node: &str) -> PathBuf {
     usual_dir(&|name| std::env::var_os(name).map(PathBuf::from)).join(format!("{node}.sock"))
 }
 
-/// The directory of status sockets: the user's runtime directory, that of a systemd service, or one below `/tmp`.
+/// Returns the directory of status sockets: the user's runtime directory, that of a systemd service, or one below
+/// `/tmp`.
 fn usual_dir(variable: &dyn Fn(&str) -> Option<PathBuf>) -> PathBuf {
     let absolute = |name| variable(name).filter(|dir| dir.is_absolute());
     // Several directories of a service are separated by colons.
@@ -92,7 +93,7 @@ fn usual_dir(variable: &dyn Fn(&str) -> Option<PathBuf>) -> PathBuf {
     absolute("XDG_RUNTIME_DIR").map(|dir| dir.join("sgc")).or_else(service).unwrap_or_else(temporary_dir)
 }
 
-/// The directory below `/tmp`, where anybody may have made it before.
+/// Returns the directory below `/tmp`, which anybody may have created before.
 fn temporary_dir() -> PathBuf {
     std::env::temp_dir().join(format!("sgc-{}", own_uid()))
 }
@@ -101,9 +102,9 @@ fn own_uid() -> u32 {
     rustix::process::geteuid().as_raw()
 }
 
-/// Checks the directory that a status socket is in; makes nothing. One that anybody may have made, such as the usual one
-/// below `/tmp`, must be this user's alone. Another is the user's own choice: it is this user's or root's, and nobody else
-/// can replace files in it.
+/// Checks the directory of a status socket and creates nothing. A directory that anybody may have created, such as the
+/// one below `/tmp`, must be this user's alone. A configured directory must be this user's or root's, and nobody else
+/// may replace files in it.
 fn check_dir(dir: &Path, anybody_makes: bool) -> Result<(), SocketError> {
     let failed = |source| SocketError::Directory { dir: dir.to_owned(), source };
     let metadata =
@@ -122,8 +123,8 @@ fn check_dir(dir: &Path, anybody_makes: bool) -> Result<(), SocketError> {
     if is_exposed { Err(SocketError::Exposed { dir: dir.to_owned(), mode }) } else { Ok(()) }
 }
 
-/// Connects to the node at a status socket, if its process is this user's or root's. For root, it may also be that of the
-/// user whose directory the socket is in.
+/// Connects to a status socket, if its process belongs to this user or to root. Root may also connect to the process of
+/// the user who owns the socket's directory.
 pub fn connect(path: &Path) -> Result<UnixStream, SocketError> {
     let dir = directory(path);
     if dir == temporary_dir() && fs::symlink_metadata(dir).is_ok() {
@@ -135,7 +136,7 @@ pub fn connect(path: &Path) -> Result<UnixStream, SocketError> {
     if uid == expected || uid == ROOT { Ok(stream) } else { Err(SocketError::Stranger { uid, expected }) }
 }
 
-/// The user whose node should have a socket in this directory.
+/// Returns the user whose node should have a socket in this directory.
 fn expected_uid(dir: &Path) -> u32 {
     match (own_uid(), fs::metadata(dir)) {
         (ROOT, Ok(metadata)) => metadata.uid(),
@@ -143,31 +144,31 @@ fn expected_uid(dir: &Path) -> u32 {
     }
 }
 
-/// Returns `true` if a process of this user may ask this node.
+/// Returns `true` if a process of this user may send requests.
 pub(super) fn may_ask(uid: u32) -> bool {
     uid == own_uid() || uid == ROOT
 }
 
-/// A status socket that this node has. Dropping it removes the socket, if it is still this one, and lets a successor in.
+/// A status socket of this node. Dropping it removes the socket, if the path still leads to it, and releases the lock.
 #[derive(Debug)]
 pub(super) struct StatusSocket {
     path: PathBuf,
     listener: UnixListener,
     /// Device and inode of the socket.
     identity: (u64, u64),
-    /// Locked for as long as this lives. The kernel unlocks it when the process ends, however it does.
+    /// Lock, held while this lives. The kernel releases it when the process ends for any reason.
     _lock: fs::File,
 }
 
 impl StatusSocket {
-    /// Binds the socket for this user alone. One that a dead node left is replaced, a live one is not.
+    /// Binds the socket for this user alone. It replaces the socket of a dead node, but not of a live one.
     pub(super) fn bind(path: &Path) -> Result<Self, SocketError> {
         let dir = directory(path);
         let failed = |source| SocketError::Directory { dir: dir.to_owned(), source };
         fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
         check_dir(dir, dir == temporary_dir())?;
         let lock = lock(path)?;
-        // A node of an earlier version holds no lock.
+        // Nodes of earlier versions hold no lock.
         if UnixStream::connect(path).is_ok() {
             return Err(SocketError::Taken);
         }
@@ -186,7 +187,7 @@ impl StatusSocket {
         &self.listener
     }
 
-    /// Returns `true` while its path leads to it.
+    /// Returns `true` while the path leads to this socket.
     pub(super) fn is_in_place(&self) -> bool {
         identity(&self.path).is_ok_and(|there| there == self.identity)
     }
@@ -200,7 +201,7 @@ impl Drop for StatusSocket {
     }
 }
 
-/// Takes the lock of a socket, `SOCKET.lock`. The file stays when the node ends: who removed it could remove a successor's.
+/// Takes the lock `SOCKET.lock`. The file stays when the node ends, since removing it could remove a successor's.
 fn lock(path: &Path) -> Result<fs::File, SocketError> {
     let mut name = path.as_os_str().to_owned();
     name.push(".lock");
@@ -244,7 +245,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn one_node_has_a_socket_and_removes_none_but_its_own() {
+    async fn node_removes_only_its_own_status_socket() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("sub/arm-1.sock");
         let first = StatusSocket::bind(&path).unwrap();
@@ -300,7 +301,7 @@ mod tests {
     const NOBODY: u32 = 65534;
     const SOCKET_VARIABLE: &str = "SGC_TEST_SOCKET";
 
-    /// In the process of another user: has a socket until the test has seen it.
+    /// Runs in the process of another user: binds a socket until the test has seen it.
     #[test]
     fn another_users_socket() {
         let Some(path) = std::env::var_os(SOCKET_VARIABLE) else { return };
@@ -318,7 +319,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         fs::set_permissions(dir.path(), fs::Permissions::from_mode(0o1777)).unwrap();
         let path = dir.path().join("arm-1.sock");
-        // Nobody may not reach this program by its path.
+        // The user `nobody` may be unable to reach this program by its path.
         let mut command = std::process::Command::new("/proc/self/exe");
         command.args(["--exact", "admin::socket::tests::another_users_socket"]).env(SOCKET_VARIABLE, &path);
         let mut child = command.uid(NOBODY).gid(NOBODY).spawn().unwrap();

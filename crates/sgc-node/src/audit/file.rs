@@ -1,7 +1,7 @@
-//! The files of the audit log: how they are appended to, put aside and read.
+//! Files of the audit log: appending, rotating and reading.
 //!
-//! `FILE` is written; `FILE.1` is the last one that was put aside, `FILE.2` the one before it. Another program may
-//! rename or cut the file at any time, as logrotate does: the writer looks before each write.
+//! `FILE` is the current file, `FILE.1` the file rotated last, `FILE.2` the one before. Another program, such as
+//! logrotate, may rename or truncate the file at any time, so the writer checks before each write.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -13,19 +13,19 @@ use rustix::fs::OFlags;
 
 use super::AuditRecord;
 
-/// Longest line that is read, bytes; those written are shorter.
+/// Longest line that is read, bytes. Written lines are shorter.
 const LINE_BYTES_MAX: u64 = 16 * 1024;
-/// Files that are read, the newest ones.
+/// Most files that are read, the newest first.
 const READ_FILES_MAX: usize = 256;
-/// Endings of files that a log rotator compressed.
+/// Suffixes of files that a log rotator compressed.
 const COMPRESSED: [&str; 5] = [".gz", ".xz", ".zst", ".bz2", ".lz4"];
 
-/// The room that the log may take on the disk.
+/// Limits of the log's size on the disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct AuditRoom {
-    /// Most bytes of one file; at this size it is put aside.
+    /// Most bytes of one file. It is rotated at this size.
     pub max_bytes: u64,
-    /// Files that are kept beside the one that is written.
+    /// Number of rotated files that are kept.
     pub files: u32,
 }
 
@@ -36,20 +36,20 @@ pub fn rotated_path(path: &Path, n: u32) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// The log file that is written.
+/// The current log file.
 pub(super) struct LogFile {
     path: PathBuf,
     room: AuditRoom,
     file: fs::File,
     bytes: u64,
-    /// A line was begun and not ended.
+    /// Whether the last line is unfinished.
     is_torn: bool,
 }
 
 impl LogFile {
-    /// Opens or makes the file at `path`; what is no file of its own, such as a symbolic link, is an error.
+    /// Opens or creates the file at `path`. A path that is no regular file, such as a symbolic link, is an error.
     pub(super) fn open(path: &Path, room: AuditRoom) -> io::Result<Self> {
-        // A link could lead the log elsewhere; what is no file could hold up whoever opens it.
+        // A symbolic link could redirect the log, and opening a pipe could block.
         let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
         let mut options = fs::OpenOptions::new();
         let options = options.read(true).append(true).create(true).mode(0o600).custom_flags(flags);
@@ -69,12 +69,12 @@ impl LogFile {
         Ok(Self { path: path.to_owned(), room, file, bytes: metadata.len(), is_torn })
     }
 
-    /// Returns where it is.
+    /// Returns its path.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Appends whole lines, after putting the file aside if they do not fit.
+    /// Appends whole lines. Rotates the file first if they do not fit.
     pub(super) fn append(&mut self, lines: &str) -> io::Result<()> {
         self.follow()?;
         if self.bytes > 0 && self.bytes + lines.len() as u64 > self.room.max_bytes {
@@ -86,17 +86,17 @@ impl LogFile {
         self.write(lines.as_bytes())
     }
 
-    /// Forces the lines to the disk.
+    /// Syncs the lines to the disk.
     pub(super) fn sync(&self) -> io::Result<()> {
         self.file.sync_data()
     }
 
-    /// Opens the file anew if another program renamed, removed or cut it.
+    /// Reopens the file if another program renamed, removed or truncated it.
     fn follow(&mut self) -> io::Result<()> {
         let ours = self.file.metadata()?;
         match fs::symlink_metadata(&self.path) {
             Ok(there) if (there.dev(), there.ino()) == (ours.dev(), ours.ino()) => {
-                // The commands of a user append to it as well.
+                // Commands of a user append to the file as well.
                 self.bytes = ours.len();
                 Ok(())
             }
@@ -111,7 +111,7 @@ impl LogFile {
 
     fn rotate(&mut self) -> io::Result<()> {
         self.file.sync_data()?;
-        // More may be there of a time when more were kept.
+        // Earlier runs may have kept more files.
         for n in self.room.files.saturating_add(1).. {
             if fs::remove_file(rotated_path(&self.path, n)).is_err() {
                 break;
@@ -128,7 +128,7 @@ impl LogFile {
         fs::File::open(directory(&self.path))?.sync_all()
     }
 
-    /// A write that fails may have written a part.
+    /// Writes bytes. A failed write may have written a part of them.
     fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.is_torn = true;
         self.file.write_all(bytes)?;
@@ -143,15 +143,15 @@ impl LogFile {
 pub struct Unread {
     /// Lines that are no records.
     pub lines: u64,
-    /// Files that a log rotator compressed, and files beyond the newest 256.
+    /// Compressed files, and files beyond the newest 256.
     pub files: Vec<PathBuf>,
 }
 
-/// Reads the log at `path`, with all files that were put aside, from the oldest record to the newest; gives each record
-/// to `take`. Numbered files (`FILE.2`) and dated ones (`FILE-20261124`) belong to it.
+/// Reads the log at `path` with all rotated files, and passes each record to `take`, the oldest first. Numbered files
+/// (`FILE.2`) and dated ones (`FILE-20261124`) belong to it.
 pub fn read(path: &Path, mut take: impl FnMut(AuditRecord)) -> io::Result<Unread> {
-    let Aside { files, mut unread } = Aside::of(path)?;
-    // The newest is opened first: what is put aside meanwhile is met once more, and known by its inode.
+    let RotatedFiles { files, mut unread } = RotatedFiles::list(path)?;
+    // The newest file is opened first. A file that is rotated meanwhile appears again and is recognised by its inode.
     let (mut opened, mut met) = (Vec::new(), BTreeSet::new());
     for path in std::iter::once(path).chain(files.iter().map(PathBuf::as_path)) {
         if opened.len() == READ_FILES_MAX {
@@ -176,7 +176,7 @@ pub fn read(path: &Path, mut take: impl FnMut(AuditRecord)) -> io::Result<Unread
     Ok(unread)
 }
 
-/// Reads one file; returns how many of its lines are no records.
+/// Reads one file. Returns the number of lines that are no records.
 fn read_file(file: fs::File, take: &mut impl FnMut(AuditRecord)) -> io::Result<u64> {
     let mut malformed = 0;
     let mut reader = BufReader::new(file);
@@ -189,7 +189,7 @@ fn read_file(file: fs::File, take: &mut impl FnMut(AuditRecord)) -> io::Result<u
             return Ok(malformed);
         }
         let ends = line.last() == Some(&b'\n');
-        // The rest of a line that was too long belongs to it.
+        // The rest of an overlong line belongs to it.
         if !std::mem::replace(&mut is_tail, !ends) {
             match serde_json::from_slice::<AuditRecord>(&line) {
                 Ok(record) if !record.event.is_empty() => take(record),
@@ -200,19 +200,19 @@ fn read_file(file: fs::File, take: &mut impl FnMut(AuditRecord)) -> io::Result<u
     }
 }
 
-/// The files of a log that were put aside.
+/// The rotated files of a log.
 #[derive(Default)]
-struct Aside {
-    /// The newest first.
+struct RotatedFiles {
+    /// The files, the newest first.
     files: Vec<PathBuf>,
     unread: Unread,
 }
 
-impl Aside {
-    fn of(path: &Path) -> io::Result<Self> {
-        let mut aside = Self::default();
+impl RotatedFiles {
+    fn list(path: &Path) -> io::Result<Self> {
+        let mut rotated = Self::default();
         let entries = match fs::read_dir(directory(path)) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(aside),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(rotated),
             entries => entries?,
         };
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -234,7 +234,7 @@ impl Aside {
             let date = plain.strip_prefix('-').filter(is_date).map(str::to_owned);
             match (number, date) {
                 (None, None) => {}
-                _ if is_compressed => aside.unread.files.push(entry.path()),
+                _ if is_compressed => rotated.unread.files.push(entry.path()),
                 (Some(number), _) => numbered.push((number, entry.path())),
                 (None, Some(date)) => dated.push((date, entry.path())),
             }
@@ -242,9 +242,9 @@ impl Aside {
         numbered.sort();
         dated.sort();
         let dated = dated.into_iter().rev().map(|(_, path)| path);
-        aside.files = numbered.into_iter().map(|(_, path)| path).chain(dated).collect();
-        aside.unread.files.sort();
-        Ok(aside)
+        rotated.files = numbered.into_iter().map(|(_, path)| path).chain(dated).collect();
+        rotated.unread.files.sort();
+        Ok(rotated)
     }
 }
 

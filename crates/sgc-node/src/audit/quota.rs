@@ -1,8 +1,8 @@
-//! Limits the records that others can cause in the audit log.
+//! Quotas for the records that peers can cause in the audit log.
 //!
-//! A peer decides for itself how often it joins, leaves and connects, so each cause of records has a quota an hour.
-//! Quotas are kept apart by event and by name: a peer cannot hide one topic behind another, nor a refusal behind joins.
-//! Records beyond a quota are counted, and one summary of them is written when their hour ends. Nothing is left out
+//! A peer decides itself how often it joins, leaves and connects, so each cause of records has an hourly quota. Quotas
+//! are separate for each event and name: a peer cannot hide one topic behind another, nor a refusal behind joins.
+//! Records beyond a quota are counted, and one summary of them is written when their hour ends, so nothing is omitted
 //! without a trace.
 //!
 //! The clock is an argument: the time of the records.
@@ -21,15 +21,15 @@ const HOUR_MS: u64 = 3_600_000;
 const NAME_RECORDS_MAX: u32 = 8;
 /// Records an hour of one event of one peer about no name.
 const PEER_RECORDS_MAX: u32 = 32;
-/// Records an hour of one event of one address whose peer is not known.
+/// Records an hour of one event of one address with unknown peers.
 const ADDRESS_RECORDS_MAX: u32 = 16;
-/// Records an hour of one event of all addresses whose peers are not known.
+/// Records an hour of one event of all addresses with unknown peers.
 const STRANGERS_RECORDS_MAX: u32 = 256;
-/// Records an hour of one event that no peer can be blamed for, such as a revocation list.
+/// Records an hour of one event that no peer causes, such as a new revocation list.
 const FLEET_RECORDS_MAX: u32 = 64;
-/// Records an hour of one event of all peers that found no room for a quota of their own.
+/// Records an hour of one event of all peers without room for a quota of their own.
 const CROWD_RECORDS_MAX: u32 = 4096;
-/// Quotas at one time. One of a hundred bytes for each peer, event and name of the last hour.
+/// Most quotas at one time. Each takes about a hundred bytes per peer, event and name of the last hour.
 const QUOTAS_MAX: usize = 16_384;
 /// Shortest time between two searches for quotas whose hour has ended, milliseconds.
 const SWEEP_MS: u64 = 1000;
@@ -37,14 +37,14 @@ const SWEEP_MS: u64 = 1000;
 /// The cause of a record.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) enum Cause {
-    /// This node or its user. Such records are not limited.
+    /// This node or its user. Such records are unlimited.
     #[default]
     Local,
-    /// The fleet: its CA, its authority, or the course of time.
+    /// The fleet: its CA, its authority, or the passage of time.
     Fleet,
     /// A peer with a certificate.
     Peer(NodeId),
-    /// A peer at this address that showed no certificate that holds.
+    /// A peer at this address without a valid certificate.
     Address(IpAddr),
 }
 
@@ -52,7 +52,7 @@ pub(super) enum Cause {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Holder {
     Peer(NodeId),
-    /// A host, as far as its address tells.
+    /// A host, identified by its address.
     Host(AddressPrefix),
     Strangers,
     Fleet,
@@ -75,14 +75,14 @@ struct Quota {
     begun_ms: u64,
     written: u32,
     left_out: u64,
-    /// Time of the first record that was left out.
+    /// Time of the first omitted record.
     first: Option<String>,
-    /// The last record that was left out.
+    /// The last omitted record.
     last: Option<Box<AuditRecord>>,
 }
 
 impl Quotas {
-    /// Puts into `lines` what is to be written because of a record: the record, and summaries that are due.
+    /// Adds to `lines` the record, if its quota permits, and the summaries that are due.
     pub(super) fn handle(&mut self, record: AuditRecord, lines: &mut Vec<AuditRecord>) {
         let Some(event) = record.kind else { return lines.push(record) };
         let now_ms = record.unix_ms;
@@ -111,13 +111,13 @@ impl Quotas {
         }
         quota.written += 1;
         if is_stranger {
-            // Only what is written counts: one address does not use up the quota of all.
+            // Only written records count, so that one address does not use up the common quota.
             self.quota(strangers, now_ms, lines).written += 1;
         }
         lines.push(record);
     }
 
-    /// Puts into `lines` the summaries of all quotas whose hour has ended by `now_ms`.
+    /// Adds to `lines` the summaries of all quotas whose hour has ended by `now_ms`.
     pub(super) fn sweep(&mut self, now_ms: u64, lines: &mut Vec<AuditRecord>) {
         self.swept_ms = now_ms;
         self.quotas.retain(|(holder, ..), quota| {
@@ -129,18 +129,18 @@ impl Quotas {
         });
     }
 
-    /// Puts into `lines` the summaries of all quotas.
+    /// Adds to `lines` the summaries of all quotas.
     pub(super) fn finish(&mut self, lines: &mut Vec<AuditRecord>) {
         let quotas = std::mem::take(&mut self.quotas);
         lines.extend(quotas.into_iter().filter_map(|((holder, ..), mut quota)| quota.summary(holder)));
     }
 
-    /// Returns how many records were left out and counted instead.
+    /// Returns the number of records that were counted instead of written.
     pub(super) fn left_out(&self) -> u64 {
         self.left_out
     }
 
-    /// Returns the key itself, or that of the crowd if there is no room for one more.
+    /// Returns the key itself, or that of the crowd if there is no room for another.
     fn place(&mut self, key: Key, now_ms: u64, lines: &mut Vec<AuditRecord>) -> Key {
         let has_room = |quotas: &BTreeMap<Key, Quota>| quotas.len() < QUOTAS_MAX || quotas.contains_key(&key);
         if has_room(&self.quotas) {
@@ -176,7 +176,7 @@ impl Holder {
 }
 
 impl Quota {
-    /// Returns `true` if its hour is over, or lies in the future because the clock was set back.
+    /// Returns `true` if the hour is over, or lies in the future because the clock was set back.
     fn ends(&self, now_ms: u64) -> bool {
         now_ms.checked_sub(self.begun_ms).is_none_or(|age| age >= HOUR_MS)
     }
@@ -191,7 +191,7 @@ impl Quota {
         self.last = Some(Box::new(record));
     }
 
-    /// Makes one record of those that were left out: the last of them, with their number.
+    /// Returns a summary of the omitted records: the last of them, with their number.
     fn summary(&mut self, holder: Holder) -> Option<AuditRecord> {
         let last = *self.last.take()?;
         let mut summary = AuditRecord {
@@ -202,7 +202,7 @@ impl Quota {
             ..last
         };
         if matches!(holder, Holder::Strangers | Holder::Crowd) {
-            // They are of many: the last one stands for none of the others.
+            // The records belong to many peers, so the last one's details would mislead.
             (summary.peer, summary.peer_name, summary.remote, summary.reason) = (None, None, None, None);
             (summary.topic, summary.name, summary.epoch) = (None, None, None);
             summary.by = Some("many".to_owned());
@@ -249,7 +249,7 @@ mod tests {
             (lines[0].peer.as_ref(), lines[0].name.as_ref())
         );
         assert_eq!(lines.len(), 10, "and the next hour begins");
-        // A clock that was set back does not silence anybody for as long.
+        // A clock that was set back silences nobody for as long.
         quotas.handle(joined(1, 1, NOW), &mut lines);
         assert_eq!(lines.len(), 11);
         let mut rest = Vec::new();
@@ -300,7 +300,7 @@ mod tests {
         (0..peers).for_each(|peer| quotas.handle(joined(peer, 1, NOW), &mut lines));
         assert!(quotas.quotas.len() <= QUOTAS_MAX + AuditEvent::ALL.len());
         assert_eq!(lines.len() as u64 + quotas.left_out(), peers);
-        // Room comes back with time.
+        // Room returns with time.
         lines.clear();
         quotas.handle(joined(peers, 1, NOW + HOUR_MS), &mut lines);
         assert_eq!(summed(&lines), quotas.left_out());

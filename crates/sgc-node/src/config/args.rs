@@ -1,16 +1,16 @@
-//! Command line → draft: `sgc run --identity … --router … --share … --to … --use …` without a file.
+//! Command line to draft: `sgc run --identity … --router … --share … --to … --use …` without a file.
 //!
-//! `--share /topic --to desk --to group:operators` shares with all that `--to` names;
-//! `--share /topic=desk,group:operators` says it for one topic. A word in front of a name tells its kind, as the keys of a
-//! file do: `--share service:/add_two_ints`, `--use arm-1:action:/fibonacci`. Where nobody is named, every member of the fleet may
-//! subscribe, nobody else; `sgc run` says so.
+//! `--share /topic --to desk --to group:operators` shares with all recipients of `--to`; `--share
+//! /topic=desk,group:operators` names recipients of one topic. A word in front of a name selects the kind of interface,
+//! like the keys of a file: `--share service:/add_two_ints`, `--use arm-1:action:/fibonacci`. Without recipients, every
+//! member of the fleet may subscribe; `sgc run` reports that.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use super::draft::{
-    AuditDraft, Draft, GatewayDraft, Located, RosDraft, RotationDraft, ShareDraft, TransportDraft, UseDraft,
-    Words,
+    AuditDraft, Draft, GatewayDraft, RosDraft, RotationDraft, ShareDraft, TransportDraft, UseDraft,
+    WithOrigin, Words,
 };
 use super::error::{ConfigError, Mistake, Origin};
 use super::schema::nearest;
@@ -24,7 +24,7 @@ const WORDS: Words = Words {
     uses: "`--use`",
 };
 
-/// The words that tell the kind of an interface, each with the key of its share and of its use.
+/// Words for the kinds of interfaces, each with its key in a share and in a use.
 const KINDS: [(&str, &str, &str); 4] = [
     ("topic", "--share", "--use"),
     ("service", "--share service", "--use service"),
@@ -33,7 +33,7 @@ const KINDS: [(&str, &str, &str); 4] = [
 ];
 const KIND_WORDS: [&str; KINDS.len()] = [KINDS[0].0, KINDS[1].0, KINDS[2].0, KINDS[3].0];
 
-/// The arguments of `sgc run` that stand in for a file, as given.
+/// The arguments of `sgc run` that replace a file, as given.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ArgsConfig {
     /// `--identity FILE`
@@ -42,12 +42,12 @@ pub struct ArgsConfig {
     pub routers: Vec<String>,
     /// `--share [KIND:]/NAME` or `--share [KIND:]/NAME=NODE,group:GROUP`, any number.
     pub shares: Vec<String>,
-    /// `--to NODE`, `--to group:GROUP` or `--to '*'`, any number: who may subscribe to the shares that do not say it
-    /// themselves. None is the whole fleet.
+    /// `--to NODE`, `--to group:GROUP` or `--to '*'`, any number: recipients of the shares that name none. Without it,
+    /// the whole fleet.
     pub to: Vec<String>,
     /// `--use NODE:[KIND:]/NAME`, any number.
     pub uses: Vec<String>,
-    /// `--peer URL` of `sgc router`, any number: what `routers` is in a file.
+    /// `--peer URL` of `sgc router`, any number: the same as `routers` in a file.
     pub peers: Vec<String>,
     /// `--listen URL`, any number.
     pub listen: Vec<String>,
@@ -55,11 +55,11 @@ pub struct ArgsConfig {
     pub announce: bool,
     /// `--accept FILE`, any number.
     pub accept: Vec<PathBuf>,
-    /// `--gateway`: a `[gateway]` with nothing in it.
+    /// `--gateway`: an empty `[gateway]`.
     pub gateway: bool,
 }
 
-/// Takes the arguments apart.
+/// Parses the arguments.
 pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
     let mut errors = Vec::new();
     let mut record = |mistake| errors.push(ConfigError::new(Origin::Arguments, mistake));
@@ -98,7 +98,7 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
             ..UseDraft::default()
         });
     }
-    // A use that could not be read still makes this node more than a router.
+    // A use that could not be parsed still shows that this node is more than a router.
     let touches_ros = !args.shares.is_empty() || !args.uses.is_empty();
     let draft = Draft {
         origin: Origin::Arguments,
@@ -135,12 +135,12 @@ pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
     (draft, errors)
 }
 
-/// Takes the word for the kind from the front of a name, a topic's if there is none.
+/// Splits the word for the kind from a name. Without one, the kind is a topic.
 fn named(
     text: &str,
     key: fn((&'static str, &'static str, &'static str)) -> &'static str,
-) -> Result<Located<String>, Mistake> {
-    // A name may be wrong in itself; a word before a slash is none of it.
+) -> Result<WithOrigin<String>, Mistake> {
+    // The name may be invalid, but a word before its slash is no part of it.
     let (word, name) =
         text.split_once(':').filter(|(word, _)| !word.contains('/')).unwrap_or(("topic", text));
     match KINDS.into_iter().find(|(kind, ..)| *kind == word) {
@@ -152,10 +152,10 @@ fn named(
     }
 }
 
-fn located<T>(key: &'static str, value: T) -> Located<T> {
-    Located { value, key, origin: Origin::Arguments }
+fn located<T>(key: &'static str, value: T) -> WithOrigin<T> {
+    WithOrigin { value, key, origin: Origin::Arguments }
 }
 
-fn all(key: &'static str, values: &[String]) -> Vec<Located<String>> {
+fn all(key: &'static str, values: &[String]) -> Vec<WithOrigin<String>> {
     values.iter().map(|value| located(key, value.clone())).collect()
 }

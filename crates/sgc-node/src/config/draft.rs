@@ -1,34 +1,34 @@
-//! What the user wrote, well-formed but not yet judged: texts and numbers, each with its place.
+//! [`Draft`]: the user's input, well-formed but not yet judged: texts and numbers, each with its origin.
 //!
-//! `file` makes a draft from TOML, `args` from the command line; `resolve` makes a `Config` of either. So each
-//! rule about values is written once.
+//! `file` makes a draft from TOML, and `args` makes one from the command line. `resolve` makes a `Config` of either, so
+//! each rule about values is written once.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use super::error::{ConfigError, Mistake, Origin};
 
-/// A value and where it came from.
+/// A value with its origin.
 #[derive(Clone, Debug)]
-pub(super) struct Located<T> {
+pub(super) struct WithOrigin<T> {
     pub(super) value: T,
-    /// What the user knows it by: `to`, `--to`, `ROS_DOMAIN_ID`.
+    /// Name of the value in the user's words: `to`, `--to`, `ROS_DOMAIN_ID`.
     pub(super) key: &'static str,
     pub(super) origin: Origin,
 }
 
-impl<T> Located<T> {
-    /// An error in this place.
+impl<T> WithOrigin<T> {
+    /// Returns an error with this origin.
     pub(super) fn error(&self, mistake: Mistake) -> ConfigError {
         ConfigError::new(self.origin.clone(), mistake)
     }
 
-    /// The same place, another value.
-    pub(super) fn map<U>(self, convert: impl FnOnce(T) -> U) -> Located<U> {
-        Located { value: convert(self.value), key: self.key, origin: self.origin }
+    /// Converts the value and keeps the origin.
+    pub(super) fn map<U>(self, convert: impl FnOnce(T) -> U) -> WithOrigin<U> {
+        WithOrigin { value: convert(self.value), key: self.key, origin: self.origin }
     }
 
-    /// How another error refers to this place.
+    /// Returns a reference to this value for another error.
     pub(super) fn reference(&self) -> String {
         match &self.origin {
             Origin::File { line: Some(line), .. } => format!("line {line}"),
@@ -40,32 +40,32 @@ impl<T> Located<T> {
 /// A whole configuration.
 #[derive(Debug)]
 pub(super) struct Draft {
-    /// The place of what is missing altogether.
+    /// Origin of mistakes about missing values.
     pub(super) origin: Origin,
-    /// How the missing things are called here.
+    /// Names of settings in this source.
     pub(super) words: Words,
-    /// Keys that were meant but not understood; each has an error, so that their absence needs none.
+    /// Keys that were present but not understood. Each has an error, so that its absence needs none.
     pub(super) attempted: BTreeSet<&'static str>,
-    pub(super) identity: Option<Located<PathBuf>>,
-    pub(super) name: Option<Located<String>>,
-    pub(super) routers: Vec<Located<String>>,
-    pub(super) resolver: Option<Located<String>>,
-    pub(super) keep_alive: Option<Located<String>>,
-    pub(super) listen: Vec<Located<String>>,
-    pub(super) peer_rate: Option<Located<String>>,
-    pub(super) mapping: Option<Located<String>>,
-    pub(super) announce: Option<Located<bool>>,
-    /// The whole list is located too, since an empty one would be a mistake.
-    pub(super) accept: Option<Located<Vec<Located<String>>>>,
+    pub(super) identity: Option<WithOrigin<PathBuf>>,
+    pub(super) name: Option<WithOrigin<String>>,
+    pub(super) routers: Vec<WithOrigin<String>>,
+    pub(super) resolver: Option<WithOrigin<String>>,
+    pub(super) keep_alive: Option<WithOrigin<String>>,
+    pub(super) listen: Vec<WithOrigin<String>>,
+    pub(super) peer_rate: Option<WithOrigin<String>>,
+    pub(super) mapping: Option<WithOrigin<String>>,
+    pub(super) announce: Option<WithOrigin<bool>>,
+    /// The list has an origin of its own, since an empty one is a mistake.
+    pub(super) accept: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(super) ros: Option<RosDraft>,
     pub(super) shares: Vec<ShareDraft>,
     pub(super) uses: Vec<UseDraft>,
-    pub(super) admin_socket: Option<Located<PathBuf>>,
-    pub(super) state: Option<Located<PathBuf>>,
-    pub(super) trust: Vec<Located<String>>,
-    pub(super) watch: Option<Located<bool>>,
-    pub(super) authority: Option<Located<PathBuf>>,
-    pub(super) operators: Option<Located<Vec<Located<String>>>>,
+    pub(super) admin_socket: Option<WithOrigin<PathBuf>>,
+    pub(super) state: Option<WithOrigin<PathBuf>>,
+    pub(super) trust: Vec<WithOrigin<String>>,
+    pub(super) watch: Option<WithOrigin<bool>>,
+    pub(super) authority: Option<WithOrigin<PathBuf>>,
+    pub(super) operators: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(super) rotation: RotationDraft,
     pub(super) audit: AuditDraft,
     pub(super) transport: TransportDraft,
@@ -73,7 +73,7 @@ pub(super) struct Draft {
     pub(super) gateway: Option<GatewayDraft>,
 }
 
-/// How a source of configuration names the settings that an error may ask for.
+/// Names of settings in one source of configuration, for errors that ask for them.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Words {
     pub(super) no_identity: &'static str,
@@ -87,52 +87,52 @@ pub(super) struct Words {
 /// `[ros]`.
 #[derive(Debug, Default)]
 pub(super) struct RosDraft {
-    pub(super) domain_id: Option<Located<i64>>,
-    pub(super) localhost_only: Option<Located<bool>>,
-    pub(super) discovery_range: Option<Located<String>>,
-    /// The whole list is located too, since an empty one is a choice.
-    pub(super) static_peers: Option<Located<Vec<Located<String>>>>,
-    pub(super) graph: Option<Located<bool>>,
-    pub(super) definitions: Option<Located<Vec<Located<String>>>>,
-    pub(super) enclave: Option<Located<String>>,
-    pub(super) security_root: Option<Located<String>>,
+    pub(super) domain_id: Option<WithOrigin<i64>>,
+    pub(super) localhost_only: Option<WithOrigin<bool>>,
+    pub(super) discovery_range: Option<WithOrigin<String>>,
+    /// The list has an origin of its own, since an empty one is a choice.
+    pub(super) static_peers: Option<WithOrigin<Vec<WithOrigin<String>>>>,
+    pub(super) graph: Option<WithOrigin<bool>>,
+    pub(super) definitions: Option<WithOrigin<Vec<WithOrigin<String>>>>,
+    pub(super) enclave: Option<WithOrigin<String>>,
+    pub(super) security_root: Option<WithOrigin<String>>,
 }
 
-/// `[[share]]`. What is required is `None` only where an error has been recorded already.
+/// `[[share]]`. Required fields are `None` only if an error was recorded.
 #[derive(Debug, Default)]
 pub(super) struct ShareDraft {
-    /// Or the name of something else, as its key says.
-    pub(super) topic: Option<Located<String>>,
-    pub(super) to: Option<Located<Vec<Located<String>>>>,
-    pub(super) publish: Option<Located<Vec<Located<String>>>>,
-    pub(super) type_name: Option<Located<String>>,
-    pub(super) priority: Option<Located<String>>,
-    pub(super) link: Option<Located<String>>,
-    pub(super) suite: Option<Located<String>>,
-    pub(super) description: Option<Located<String>>,
-    pub(super) author: Option<Located<String>>,
-    pub(super) maintainer: Option<Located<String>>,
-    pub(super) interface: Option<Located<String>>,
-    pub(super) unique: Option<Located<String>>,
-    pub(super) node: Option<Located<String>>,
+    /// Topic, or the name of another interface, as its key says.
+    pub(super) topic: Option<WithOrigin<String>>,
+    pub(super) to: Option<WithOrigin<Vec<WithOrigin<String>>>>,
+    pub(super) publish: Option<WithOrigin<Vec<WithOrigin<String>>>>,
+    pub(super) type_name: Option<WithOrigin<String>>,
+    pub(super) priority: Option<WithOrigin<String>>,
+    pub(super) link: Option<WithOrigin<String>>,
+    pub(super) suite: Option<WithOrigin<String>>,
+    pub(super) description: Option<WithOrigin<String>>,
+    pub(super) author: Option<WithOrigin<String>>,
+    pub(super) maintainer: Option<WithOrigin<String>>,
+    pub(super) interface: Option<WithOrigin<String>>,
+    pub(super) unique: Option<WithOrigin<String>>,
+    pub(super) node: Option<WithOrigin<String>>,
     pub(super) shaping: ShapingDraft,
     pub(super) qos: QosDraft,
     pub(super) naming: NamingDraft,
 }
 
-/// Policies in place of the publishers'.
+/// QoS policies that replace those of publishers.
 #[derive(Debug, Default)]
 pub(super) struct QosDraft {
-    pub(super) reliability: Option<Located<String>>,
-    pub(super) durability: Option<Located<String>>,
-    pub(super) history: Option<Located<String>>,
-    pub(super) depth: Option<Located<i64>>,
-    pub(super) deadline: Option<Located<String>>,
-    pub(super) lifespan: Option<Located<String>>,
+    pub(super) reliability: Option<WithOrigin<String>>,
+    pub(super) durability: Option<WithOrigin<String>>,
+    pub(super) history: Option<WithOrigin<String>>,
+    pub(super) depth: Option<WithOrigin<i64>>,
+    pub(super) deadline: Option<WithOrigin<String>>,
+    pub(super) lifespan: Option<WithOrigin<String>>,
 }
 
 impl QosDraft {
-    /// Where each policy that is set stands.
+    /// Iterates over the policies that are set, with their origins.
     pub(super) fn written(&self) -> impl Iterator<Item = (&'static str, &Origin)> {
         let texts = [&self.reliability, &self.durability, &self.history, &self.deadline, &self.lifespan];
         let texts = texts.into_iter().flatten().map(|one| (one.key, &one.origin));
@@ -140,101 +140,101 @@ impl QosDraft {
     }
 }
 
-/// What is left out, and other names.
+/// Exceptions and other names.
 #[derive(Clone, Debug, Default)]
 pub(super) struct NamingDraft {
-    pub(super) except: Option<Located<Vec<Located<String>>>>,
-    pub(super) renamed: Option<Located<String>>,
-    pub(super) namespace: Option<Located<String>>,
+    pub(super) except: Option<WithOrigin<Vec<WithOrigin<String>>>>,
+    pub(super) renamed: Option<WithOrigin<String>>,
+    pub(super) namespace: Option<WithOrigin<String>>,
 }
 
-/// How much of a topic goes on.
+/// Limits of rate, bandwidth and age.
 #[derive(Debug, Default)]
 pub(super) struct ShapingDraft {
-    pub(super) max_rate: Option<Located<String>>,
-    pub(super) max_bandwidth: Option<Located<String>>,
-    pub(super) max_age: Option<Located<String>>,
-    pub(super) compress: Option<Located<String>>,
-    pub(super) encoding: Option<Located<String>>,
+    pub(super) max_rate: Option<WithOrigin<String>>,
+    pub(super) max_bandwidth: Option<WithOrigin<String>>,
+    pub(super) max_age: Option<WithOrigin<String>>,
+    pub(super) compress: Option<WithOrigin<String>>,
+    pub(super) encoding: Option<WithOrigin<String>>,
 }
 
-/// `[[use]]`. What is required is `None` only where an error has been recorded already.
+/// `[[use]]`. Required fields are `None` only if an error was recorded.
 #[derive(Debug, Default)]
 pub(super) struct UseDraft {
-    pub(super) from: Option<Located<String>>,
-    /// Or the name of something else, as its key says.
-    pub(super) topic: Option<Located<String>>,
-    pub(super) type_name: Option<Located<String>>,
-    pub(super) publish: Option<Located<bool>>,
-    pub(super) token: Option<Located<String>>,
-    pub(super) priority: Option<Located<String>>,
+    pub(super) from: Option<WithOrigin<String>>,
+    /// Topic, or the name of another interface, as its key says.
+    pub(super) topic: Option<WithOrigin<String>>,
+    pub(super) type_name: Option<WithOrigin<String>>,
+    pub(super) publish: Option<WithOrigin<bool>>,
+    pub(super) token: Option<WithOrigin<String>>,
+    pub(super) priority: Option<WithOrigin<String>>,
     pub(super) shaping: ShapingDraft,
     pub(super) qos: QosDraft,
     pub(super) naming: NamingDraft,
-    pub(super) frame_prefix: Option<Located<String>>,
-    pub(super) link: Option<Located<String>>,
+    pub(super) frame_prefix: Option<WithOrigin<String>>,
+    pub(super) link: Option<WithOrigin<String>>,
 }
 
 /// `[rotation]`.
 #[derive(Debug, Default)]
 pub(super) struct RotationDraft {
-    pub(super) every: Option<Located<String>>,
-    pub(super) messages: Option<Located<i64>>,
+    pub(super) every: Option<WithOrigin<String>>,
+    pub(super) messages: Option<WithOrigin<i64>>,
 }
 
 /// `[audit]`.
 #[derive(Debug, Default)]
 pub(super) struct AuditDraft {
-    pub(super) file: Option<Located<PathBuf>>,
-    pub(super) max_bytes: Option<Located<i64>>,
-    pub(super) files: Option<Located<i64>>,
-    pub(super) off: Option<Located<bool>>,
+    pub(super) file: Option<WithOrigin<PathBuf>>,
+    pub(super) max_bytes: Option<WithOrigin<i64>>,
+    pub(super) files: Option<WithOrigin<i64>>,
+    pub(super) off: Option<WithOrigin<bool>>,
 }
 
 /// `[transport]`.
 #[derive(Debug, Default)]
 pub(super) struct TransportDraft {
-    pub(super) congestion: Option<Located<String>>,
-    pub(super) offload: Option<Located<bool>>,
-    pub(super) mtu_discovery: Option<Located<bool>>,
-    pub(super) dtls_1_2: Option<Located<bool>>,
-    pub(super) dscp: Option<Located<String>>,
-    pub(super) lane_dscp: Option<Located<String>>,
+    pub(super) congestion: Option<WithOrigin<String>>,
+    pub(super) offload: Option<WithOrigin<bool>>,
+    pub(super) mtu_discovery: Option<WithOrigin<bool>>,
+    pub(super) dtls_1_2: Option<WithOrigin<bool>>,
+    pub(super) dscp: Option<WithOrigin<String>>,
+    pub(super) lane_dscp: Option<WithOrigin<String>>,
 }
 
 /// `[gateway]`.
 #[derive(Debug, Default)]
 pub(super) struct GatewayDraft {
-    /// The whole list is located too, since an empty one would be a mistake.
-    pub(super) listen: Option<Located<Vec<Located<String>>>>,
-    pub(super) certificate: Option<Located<PathBuf>>,
-    pub(super) key: Option<Located<PathBuf>>,
-    pub(super) anonymous: Option<Located<String>>,
-    pub(super) origins: Vec<Located<String>>,
-    pub(super) plain: Option<Located<bool>>,
-    pub(super) clients_max: Option<Located<i64>>,
-    pub(super) client_bytes_max: Option<Located<String>>,
+    /// The list has an origin of its own, since an empty one is a mistake.
+    pub(super) listen: Option<WithOrigin<Vec<WithOrigin<String>>>>,
+    pub(super) certificate: Option<WithOrigin<PathBuf>>,
+    pub(super) key: Option<WithOrigin<PathBuf>>,
+    pub(super) anonymous: Option<WithOrigin<String>>,
+    pub(super) origins: Vec<WithOrigin<String>>,
+    pub(super) plain: Option<WithOrigin<bool>>,
+    pub(super) clients_max: Option<WithOrigin<i64>>,
+    pub(super) client_bytes_max: Option<WithOrigin<String>>,
     pub(super) clients: Vec<GatewayClientDraft>,
 }
 
-/// `[[gateway.client]]`. What is required is `None` only where an error has been recorded already.
+/// `[[gateway.client]]`. Required fields are `None` only if an error was recorded.
 #[derive(Debug)]
 pub(super) struct GatewayClientDraft {
-    /// The place of what is missing.
+    /// Origin of mistakes about missing values.
     pub(super) origin: Origin,
-    pub(super) who: Option<Located<Vec<Located<String>>>>,
-    pub(super) subscribe: Vec<Located<String>>,
-    pub(super) publish: Vec<Located<String>>,
-    pub(super) call: Vec<Located<String>>,
-    pub(super) serve: Vec<Located<String>>,
-    /// A list of patterns is there, but could not be read.
+    pub(super) who: Option<WithOrigin<Vec<WithOrigin<String>>>>,
+    pub(super) subscribe: Vec<WithOrigin<String>>,
+    pub(super) publish: Vec<WithOrigin<String>>,
+    pub(super) call: Vec<WithOrigin<String>>,
+    pub(super) serve: Vec<WithOrigin<String>>,
+    /// A list of patterns is present but could not be read.
     pub(super) is_broken: bool,
 }
 
-/// `[[partner]]`. What is required is `None` only where an error has been recorded already.
+/// `[[partner]]`. Required fields are `None` only if an error was recorded.
 #[derive(Debug, Default)]
 pub(super) struct PartnerDraft {
-    pub(super) name: Option<Located<String>>,
-    pub(super) ca: Option<Located<PathBuf>>,
-    pub(super) node: Option<Located<Vec<Located<String>>>>,
+    pub(super) name: Option<WithOrigin<String>>,
+    pub(super) ca: Option<WithOrigin<PathBuf>>,
+    pub(super) node: Option<WithOrigin<Vec<WithOrigin<String>>>>,
 }

@@ -1,7 +1,6 @@
-//! What can be wrong with a configuration: one variant per mistake, each with the place, the value and what
-//! would be right.
+//! [`ConfigErrors`]: mistakes in a configuration, one variant for each, with the place, the value and the fix.
 //!
-//! Finding the mistakes is the business of the other files of this module.
+//! The other files of this module find the mistakes.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -17,7 +16,7 @@ use super::names::{duration_text, rate_text};
 use super::router_url::RouterUrlError;
 use super::{PEER_RATE_MAX, PEER_RATE_MIN};
 
-/// Everything that is wrong, in the order of the file; never empty.
+/// All mistakes, in the order of the file; never empty.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ConfigErrors {
     errors: Vec<ConfigError>,
@@ -31,7 +30,7 @@ impl ConfigErrors {
         Self { errors }
     }
 
-    /// The mistakes, one by one.
+    /// Iterates over the mistakes.
     pub fn iter(&self) -> std::slice::Iter<'_, ConfigError> {
         self.errors.iter()
     }
@@ -66,13 +65,13 @@ impl fmt::Display for ConfigErrors {
 
 impl std::error::Error for ConfigErrors {}
 
-/// One mistake and where it was made.
+/// One mistake with its place.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{origin}: {mistake}")]
 pub struct ConfigError {
-    /// Where.
+    /// The place of the mistake.
     pub origin: Origin,
-    /// What.
+    /// The mistake.
     pub mistake: Box<Mistake>,
 }
 
@@ -82,12 +81,12 @@ impl ConfigError {
     }
 }
 
-/// Where a value came from.
+/// The source of a value.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Origin {
-    /// A file; no line where the mistake is that something is missing from the whole.
+    /// A file. There is no line if something is missing from the whole file.
     File {
-        /// As the user named it.
+        /// The path as the user wrote it.
         file: Arc<str>,
         /// Counted from 1.
         line: Option<usize>,
@@ -119,17 +118,17 @@ impl fmt::Display for Origin {
     }
 }
 
-/// What is wrong. `key` is what the user knows the value by: a key, an argument or a variable.
+/// A mistake. `key` names the value in the user's words: a key, an argument or a variable.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Mistake {
     // The file.
     /// The file could not be read.
     #[error("cannot read the configuration: {reason}")]
     Unreadable {
-        /// What the system said.
+        /// The error of the operating system.
         reason: String,
     },
-    /// The file is too large to be one.
+    /// The file exceeds the size limit.
     #[error("the file has {bytes} bytes; a configuration has at most {max}")]
     TooLarge {
         /// Its size.
@@ -140,7 +139,7 @@ pub enum Mistake {
     /// The file is not TOML.
     #[error("not TOML: {message}")]
     Syntax {
-        /// What the parser said.
+        /// The error of the parser.
         message: String,
     },
 
@@ -152,19 +151,19 @@ pub enum Mistake {
         table: &'static str,
         /// The key.
         key: String,
-        /// What it may have been meant to be.
+        /// The nearest valid word.
         nearest: Option<&'static str>,
-        /// What the table has.
+        /// The keys of the table.
         known: &'static [&'static str],
     },
-    /// A key that another table has.
+    /// A key of another table.
     #[error("{table} has no key `{key}`; it belongs in {}", homes.join(" or "))]
     MisplacedKey {
-        /// Where it stands.
+        /// The table in which it stands.
         table: &'static str,
         /// The key.
         key: String,
-        /// Where it belongs.
+        /// The tables that have it.
         homes: Vec<&'static str>,
     },
     /// A key of the design that is not implemented yet.
@@ -173,42 +172,42 @@ pub enum Mistake {
         /// The key.
         key: String,
     },
-    /// A table about two things.
+    /// A table that names two interfaces.
     #[error("`{key}` stands beside `{other}`: a table is about one of them; make it two tables")]
     TwoInterfaces {
         /// The key.
         key: &'static str,
-        /// What came first.
+        /// The key that came first.
         other: &'static str,
     },
-    /// A key that means nothing for what the table is about.
+    /// A key that only topics have, in a table of another interface.
     #[error("`{key}` is for topics, and this is about `{interface}`: take it out")]
     TopicsOnly {
         /// The key.
         key: &'static str,
-        /// What the table is about.
+        /// The kind of interface that the table describes.
         interface: &'static str,
     },
-    /// A type of another kind.
+    /// A type of another kind of interface.
     #[error("`{key}` is {value:?}; the type of `{interface}` is spelt like {example:?}")]
     InterfaceType {
         /// The key.
         key: &'static str,
         /// The value.
         value: String,
-        /// What the table is about.
+        /// The kind of interface that the table describes.
         interface: &'static str,
-        /// A right value.
+        /// A valid value.
         example: &'static str,
     },
-    /// A key without which the table means nothing.
+    /// A required key is missing.
     #[error("{table} has no `{key}`; add one, such as {key} = {example}")]
     MissingKey {
         /// The table, brackets included.
         table: &'static str,
         /// The key.
         key: &'static str,
-        /// A right value.
+        /// A valid value.
         example: &'static str,
     },
     /// `[share]` for `[[share]]`.
@@ -222,7 +221,7 @@ pub enum Mistake {
     NotSingle {
         /// The table's name.
         key: &'static str,
-        /// What was found.
+        /// The value that was found.
         found: String,
     },
 
@@ -232,9 +231,9 @@ pub enum Mistake {
     WrongType {
         /// The key.
         key: &'static str,
-        /// What was found.
+        /// The value that was found.
         found: String,
-        /// What the key takes, with an example.
+        /// The expected value, with an example.
         expected: &'static str,
     },
     /// A text that may not be empty.
@@ -242,7 +241,7 @@ pub enum Mistake {
     Empty {
         /// The key.
         key: &'static str,
-        /// A right value.
+        /// A valid value.
         example: &'static str,
     },
     /// A text over its limit.
@@ -260,7 +259,7 @@ pub enum Mistake {
     TooMany {
         /// A table with its brackets, or an argument.
         what: &'static str,
-        /// How many there are.
+        /// The number of entries.
         count: usize,
         /// The limit.
         max: usize,
@@ -270,7 +269,7 @@ pub enum Mistake {
     TooManyEntries {
         /// The key.
         key: &'static str,
-        /// How many there are.
+        /// The number of entries.
         count: usize,
         /// The limit.
         max: usize,
@@ -283,19 +282,19 @@ pub enum Mistake {
         /// The entry.
         value: String,
     },
-    /// A word that is none of those allowed.
+    /// A word that is not in the list of valid words.
     #[error("`{key}` is {value:?}; {}", suggest_word(*nearest, known))]
     UnknownWord {
         /// The key.
         key: &'static str,
         /// The word.
         value: String,
-        /// What it may have been meant to be.
+        /// The nearest valid word.
         nearest: Option<&'static str>,
-        /// All that are allowed.
+        /// The valid words.
         known: &'static [&'static str],
     },
-    /// Not an enclave of SROS2.
+    /// A value that is no SROS2 enclave.
     #[error("`{key}` is {value:?}; an enclave is \"/\", or like \"/arm/sgc\": letters, digits and `_`")]
     Enclave {
         /// The key.
@@ -303,13 +302,13 @@ pub enum Mistake {
         /// The value.
         value: String,
     },
-    /// An enclave of no keystore.
+    /// An enclave without a keystore.
     #[error(
         "DDS Security is asked for without a keystore: set `security_root` in [ros], or ROS_SECURITY_KEYSTORE, to the directory that \
          `ros2 security create_keystore` made"
     )]
     NoKeystore,
-    /// Not a ROS 2 topic name.
+    /// A value that is no ROS 2 topic name.
     #[error("`{key}` is {value:?}; {rule}{}", suggest_value(right.as_deref()))]
     TopicName {
         /// The key.
@@ -318,10 +317,10 @@ pub enum Mistake {
         value: String,
         /// The rule that it breaks.
         rule: TopicRule,
-        /// What was probably meant.
+        /// The value that was probably meant.
         right: Option<String>,
     },
-    /// Not a ROS 2 message type.
+    /// A value that is no ROS 2 message type.
     #[error(
         "`{key}` is {value:?}; a message type is PACKAGE/msg/NAME: {}",
         right.as_ref().map_or_else(|| "\"std_msgs/msg/String\", for example".to_owned(), |r| format!("{r:?}"))
@@ -331,10 +330,10 @@ pub enum Mistake {
         key: &'static str,
         /// The value.
         value: String,
-        /// What was probably meant.
+        /// The value that was probably meant.
         right: Option<String>,
     },
-    /// Not the name of a node.
+    /// A value that is no node name.
     #[error(
         "`{key}` is {value:?}; a node's name is 1 to {max} of a-z, 0-9, '-', '_' and '.', the first a letter or \
          digit: {:?}",
@@ -347,10 +346,10 @@ pub enum Mistake {
         value: String,
         /// The longest name, in bytes.
         max: usize,
-        /// What was probably meant.
+        /// The value that was probably meant.
         right: Option<String>,
     },
-    /// Not the name of a partner.
+    /// A value that is no partner name.
     #[error(
         "`{key}` is {value:?}; a partner's name is 1 to {max} of a-z, 0-9, '-', '_' and '.', the first a letter or \
          digit: {:?}",
@@ -363,10 +362,10 @@ pub enum Mistake {
         value: String,
         /// The longest name, in bytes.
         max: usize,
-        /// What was probably meant.
+        /// The value that was probably meant.
         right: Option<String>,
     },
-    /// Not a node, a group, a partner or everyone.
+    /// A recipient that is no node, group, partner or `*`.
     #[error(
         "`{key}` names {value:?}; name nodes (\"desk\"), groups (\"group:operators\"), partners (\"partner:acme\") or \
          \"*\", names of 1 to {max} of a-z, 0-9, '-', '_' and '.'"
@@ -379,7 +378,7 @@ pub enum Mistake {
         /// The longest name, in bytes.
         max: usize,
     },
-    /// Not a node or a group of this fleet.
+    /// An operator that is no node or group of this fleet.
     #[error(
         "`{key}` names {value:?}: operators change the fleet itself, so each is a node (\"desk\") or a group \
          (\"group:operators\") of it"
@@ -390,7 +389,7 @@ pub enum Mistake {
         /// The value.
         value: String,
     },
-    /// Not the id of a node.
+    /// A value that is no node id.
     #[error("`{key}` names {value:?}; a node id is 64 hexadecimal digits: `sgc status` there shows it")]
     NodeId {
         /// The key.
@@ -398,7 +397,7 @@ pub enum Mistake {
         /// The value.
         value: String,
     },
-    /// Not a length of time, or out of bounds.
+    /// A value that is no duration, or out of bounds.
     #[error(
         "`{key}` is {value:?}; it takes a number with s, min, h or d, from \"{}\" to \"{}\"",
         duration_text(*min),
@@ -414,7 +413,7 @@ pub enum Mistake {
         /// The longest.
         max: Duration,
     },
-    /// Not a rate, or out of bounds.
+    /// A value that is no rate, or out of bounds.
     #[error(
         "`{key}` is {value:?}; it takes a number with kbps, Mbps or Gbps (bits a second), from \"{}\" to \"{}\"",
         rate_text(PEER_RATE_MIN),
@@ -433,24 +432,24 @@ pub enum Mistake {
         key: &'static str,
         /// The value.
         value: i64,
-        /// What is counted, such as `"a number of bytes"`.
+        /// The counted thing, such as `"a number of bytes"`.
         what: &'static str,
         /// The least.
         min: u64,
         /// The greatest.
         max: u64,
     },
-    /// Not a token; the text is not repeated.
+    /// A value that is no token. Its text is not repeated, since it may be secret.
     #[error(
         "`{key}` is no token: {fault}; ask the topic's owner for a new one, or name the file that holds it"
     )]
     Token {
         /// The key.
         key: &'static str,
-        /// What is wrong with it.
+        /// The fault.
         fault: TokenError,
     },
-    /// Not a ROS domain id.
+    /// A value that is no ROS domain id.
     #[error("`{key}` is {value}; a ROS domain id is a number from 0 to {max}")]
     DomainId {
         /// The key or variable.
@@ -460,7 +459,7 @@ pub enum Mistake {
         /// The greatest.
         max: u32,
     },
-    /// Not the address of a peer.
+    /// A value that is no static peer.
     #[error("`{key}` names {value:?}; a peer is a host name or an IP address: \"10.0.0.2\", for example")]
     StaticPeer {
         /// The key or variable.
@@ -468,27 +467,27 @@ pub enum Mistake {
         /// The value.
         value: String,
     },
-    /// Not the address of a node.
+    /// A value that is no URL of a node.
     #[error("`{key}` is {value:?}; {fault}")]
     Url {
         /// The key.
         key: &'static str,
         /// The value.
         value: String,
-        /// What is wrong with it.
+        /// The fault.
         fault: UrlError,
     },
-    /// Says of no router where it is.
+    /// A value that locates no router.
     #[error("`{key}` is {value:?}; {fault}")]
     Router {
         /// The key.
         key: &'static str,
         /// The value.
         value: String,
-        /// What is wrong with it.
+        /// The fault.
         fault: RouterUrlError,
     },
-    /// Not the address of a DNS server.
+    /// A value that is no DNS server.
     #[error(
         "`{key}` is {value:?}; it takes the IP address of a DNS server, with its port unless that is 53: \
          \"10.0.0.53\", \"127.0.0.1:5353\" or \"[::1]:5353\""
@@ -499,7 +498,7 @@ pub enum Mistake {
         /// The value.
         value: String,
     },
-    /// To listen at what finds routers.
+    /// A listen address that is a search for routers.
     #[error(
         "`{key}` is {value:?}, which finds routers: listen at an address (\"quic://0.0.0.0:7447\"), and be found on \
          the local network with `announce`"
@@ -510,7 +509,7 @@ pub enum Mistake {
         /// The value.
         value: String,
     },
-    /// To tell others of a router that is none.
+    /// An announcement by a node that does not listen.
     #[error(
         "`{key}` is on, but {listen} is not given, so nobody could connect: add an address, such as \
          \"quic://0.0.0.0:7447\""
@@ -518,20 +517,20 @@ pub enum Mistake {
     AnnouncesNothing {
         /// The key.
         key: &'static str,
-        /// How listening is asked for.
+        /// The key that enables listening.
         listen: &'static str,
     },
-    /// To say who may attach where nobody can.
+    /// `accept` in a node that does not listen.
     #[error(
         "`{key}` says whose nodes may attach, but {listen} is not given, so nobody can: take it out, or listen"
     )]
     AcceptsNobody {
         /// The key.
         key: &'static str,
-        /// How listening is asked for.
+        /// The key that enables listening.
         listen: &'static str,
     },
-    /// To dial an address that means "all of mine".
+    /// A router at an unspecified address, such as `0.0.0.0`.
     #[error("`{key}` is {value:?}; {host} can be listened at but not dialled: name the router's host")]
     UrlUnspecified {
         /// The key.
@@ -541,17 +540,17 @@ pub enum Mistake {
         /// The address.
         host: String,
     },
-    /// No address for a gateway.
+    /// A value that is no gateway address.
     #[error("`{key}` is {value:?}; {fault}")]
     GatewayUrl {
         /// The key.
         key: &'static str,
         /// The value.
         value: String,
-        /// What is wrong with it.
+        /// The fault.
         fault: GatewayUrlError,
     },
-    /// A gateway for other hosts that is not encrypted.
+    /// An unencrypted gateway that other hosts can reach.
     #[error(
         "`{key}` is {value:?}: other hosts may connect, and nothing is encrypted, so that anybody on the way can read and \
          change everything, tokens too: write \"{}s://{}\", listen at 127.0.0.1, or say `plain = true` if the network is \
@@ -564,20 +563,20 @@ pub enum Mistake {
         key: &'static str,
         /// The value.
         value: String,
-        /// What it means.
+        /// The parsed URL.
         url: GatewayUrl,
     },
-    /// No origin of pages.
+    /// A value that is no origin of web pages.
     #[error("`{key}` names {value:?}; {fault}")]
     PageOrigin {
         /// The key.
         key: &'static str,
         /// The value.
         value: String,
-        /// What is wrong with it.
+        /// The fault.
         fault: PageOriginError,
     },
-    /// Not a number of bytes, or out of bounds.
+    /// A value that is no size, or out of bounds.
     #[error(
         "`{key}` is {value:?}; it takes a number with KiB, MiB or GiB, from \"{}\" to \"{}\"",
         size_text(*min),
@@ -593,27 +592,27 @@ pub enum Mistake {
         /// The greatest, bytes.
         max: u64,
     },
-    /// Rights that are none.
+    /// A malformed right.
     #[error("[[gateway.client]]: {fault}")]
     Scope {
-        /// What is wrong.
+        /// The fault.
         fault: ScopeError,
     },
-    /// One of two keys that belong together.
+    /// One of two keys that need each other.
     #[error("`{key}` needs `{other}` beside it: give both, or neither for the node's own certificate")]
     Alone {
-        /// The one that is there.
+        /// The key that is present.
         key: &'static str,
-        /// The one that is missing.
+        /// The key that is missing.
         other: &'static str,
     },
-    /// A certificate that nobody is shown.
+    /// A gateway certificate without an encrypted address.
     #[error("`{key}` is for wss:// and grpcs://, and `listen` has neither: take it out, or listen there")]
     CertificateUnused {
         /// The key.
         key: &'static str,
     },
-    /// A value that only looks like on or off (ROS 2 reads only `1` as on).
+    /// A switch that ROS 2 reads differently than it looks (only `1` is on).
     #[error(
         "`{key}` is {value:?}; ROS 2 reads \"1\" as on and anything else as off: set \"1\" or \"0\", or unset it"
     )]
@@ -632,7 +631,7 @@ pub enum Mistake {
         value: String,
     },
 
-    // What belongs together.
+    // Combinations of values.
     /// Nobody is allowed to subscribe, so the share has no purpose.
     #[error(
         "`{key}` is empty, so nobody may subscribe: name nodes (\"desk\"), groups (\"group:operators\") or \"*\""
@@ -641,20 +640,20 @@ pub enum Mistake {
         /// The key.
         key: &'static str,
     },
-    /// `--to` that no `--share` takes.
+    /// `--to` without a `--share` before it.
     #[error("`--to` is given, but no `--share` takes it: add --share /TOPIC")]
     ToWithoutShare,
-    /// Everyone, and some by name.
+    /// `*` beside named recipients.
     #[error(
         "`{key}` names \"*\", which is every member of the fleet, and {other:?} beside it: keep one of them"
     )]
     EveryoneAndMore {
         /// The key.
         key: &'static str,
-        /// One of those named beside it.
+        /// A recipient named beside it.
         other: String,
     },
-    /// A share with this node alone.
+    /// A share whose only recipient is this node.
     #[error("`{key}` names only {name:?}, which is this node: name those who may subscribe from elsewhere")]
     OnlyItself {
         /// The key.
@@ -662,7 +661,7 @@ pub enum Mistake {
         /// This node.
         name: String,
     },
-    /// A share that others publish on, of a type that nobody knows.
+    /// A share that others publish on, without a type.
     #[error(
         "`{key}` lets others publish, so the share needs a `type`: no local publisher has to be there to show it; add one, such as type = \"geometry_msgs/msg/Twist\""
     )]
@@ -701,10 +700,10 @@ pub enum Mistake {
         key: &'static str,
         /// The value.
         value: String,
-        /// What was probably meant.
+        /// The value that was probably meant.
         right: String,
     },
-    /// Exceptions to a rule for one topic.
+    /// `except` in a rule for a single topic.
     #[error("`{key}` is for a `topic` with wildcards, and {topic:?} has none: take it out")]
     ExceptOfOne {
         /// The key.
@@ -712,7 +711,7 @@ pub enum Mistake {
         /// The topic.
         topic: String,
     },
-    /// An exception to nothing.
+    /// An exception that matches nothing of the pattern.
     #[error("`{key}` names {value:?}, which {topic:?} does not cover anyway: take it out, or correct it")]
     ExceptsNothing {
         /// The key.
@@ -722,7 +721,7 @@ pub enum Mistake {
         /// The topic.
         topic: String,
     },
-    /// Another name that does not have the wildcard of the topic.
+    /// A new name without the wildcard of the topic.
     #[error(
         "`{key}` is {value:?}, but the topic is {topic:?}: {}",
         right.as_ref().map_or_else(
@@ -737,26 +736,26 @@ pub enum Mistake {
         value: String,
         /// The topic.
         topic: String,
-        /// What was probably meant, if anything would be right.
+        /// The value that was probably meant, if any is valid.
         right: Option<String>,
     },
-    /// A name in full, and what stands before it.
+    /// A full name beside a namespace.
     #[error("`{key}` stands beside `as`, which gives the whole name: take one of them out")]
     AsAndNamespace {
         /// The key beside it.
         key: &'static str,
     },
-    /// Two topics that others would see as one.
+    /// Two shares with the same name for others.
     #[error("`{key}`: for others it would be {topic:?}, as which {other} is shared already: change one name")]
     SharedAsOne {
         /// The key.
         key: &'static str,
-        /// What both would be called.
+        /// The name that both would get.
         topic: String,
         /// The first share.
         other: String,
     },
-    /// A pattern that others may publish on: nobody knows which topics there are.
+    /// A pattern that others may publish on. Publishing needs a single topic.
     #[error(
         "`{key}` lets others publish, which needs the name of one topic, not {topic:?}: add a [[share]] for it"
     )]
@@ -766,7 +765,7 @@ pub enum Mistake {
         /// The topic.
         topic: String,
     },
-    /// A prefix that is none of frames.
+    /// A value that is no frame prefix.
     #[error(
         "`{key}` is {value:?}; it takes 1 to {max} letters, digits, '_', '-', '.' and '/', and no '/' at the beginning: \"robot1/\""
     )]
@@ -778,25 +777,25 @@ pub enum Mistake {
         /// The longest, in bytes.
         max: usize,
     },
-    /// Policies of what goes elsewhere.
+    /// QoS policies for a topic that leaves this network.
     #[error("`{key}` is for what comes here: take it out, or `publish`; the owner sets it in its [[share]]")]
     QosElsewhere {
         /// The key.
         key: &'static str,
     },
-    /// A history of so many messages, without the number.
+    /// `keep_last` history without a depth.
     #[error("`{key}` is keep_last, and there is no `depth`: say how many messages, such as depth = 10")]
     HistoryWithoutDepth {
         /// The key.
         key: &'static str,
     },
-    /// Frames of what goes elsewhere.
+    /// A frame prefix for a topic that leaves this network.
     #[error("`{key}` is for what comes here: take it out, or `publish`")]
     FramesElsewhere {
         /// The key.
         key: &'static str,
     },
-    /// A topic that would come back to where it came from.
+    /// A topic that would return to its origin in a loop.
     #[error(
         "`{key}` is {topic:?}, which {other} shares: what is used here would be shared again, in a loop; keep one"
     )]
@@ -808,7 +807,7 @@ pub enum Mistake {
         /// The share.
         other: String,
     },
-    /// A use of one's own topic.
+    /// A use of this node's own topic.
     #[error("`{key}` is {name:?}, which is this node: name the node that shares the topic")]
     UseFromItself {
         /// The key.
@@ -827,7 +826,7 @@ pub enum Mistake {
         key: &'static str,
         /// The partner.
         partner: String,
-        /// What it may have been meant to be.
+        /// The nearest valid word.
         nearest: Option<String>,
     },
     /// The same partner twice.
@@ -842,19 +841,19 @@ pub enum Mistake {
         /// The first.
         other: String,
     },
-    /// A token, and what it says already.
+    /// A token beside a key whose value it determines.
     #[error("`{key}` stands beside `token`, which says it already: take `{key}` out")]
     TokenAndMore {
         /// The key beside it.
         key: &'static str,
     },
-    /// A token's topic, which cannot be shaped.
+    /// Shaping of a token's topic.
     #[error("`{key}` cannot stand beside `token` in this version: ask the owner to set it for the share")]
     TokenUnshaped {
         /// The key beside it.
         key: &'static str,
     },
-    /// A priority of what is not published here.
+    /// A priority for a topic that is not published here.
     #[error(
         "`{key}` is for what this node publishes there: what comes here has the priority of the owner's share; set `publish = true`, or take it out"
     )]
@@ -862,7 +861,7 @@ pub enum Mistake {
         /// The key.
         key: &'static str,
     },
-    /// How what comes from elsewhere is compressed.
+    /// Compression of a topic that is received.
     #[error(
         "`{key}` is for what this node publishes there: what comes here is compressed as the owner's share says; set `publish = true`, or take it out"
     )]
@@ -870,7 +869,7 @@ pub enum Mistake {
         /// The key.
         key: &'static str,
     },
-    /// What comes from elsewhere is written in.
+    /// A key of publishers for a topic that is received.
     #[error(
         "`{key}` is for what this node publishes there: what comes here is written as the owner's share says, and every node reads both; set `publish = true`, or take it out"
     )]
@@ -878,14 +877,14 @@ pub enum Mistake {
         /// The key.
         key: &'static str,
     },
-    /// A setting of how much of a topic goes on.
+    /// An invalid shaping setting.
     #[error("`{key}` is {value:?}; it takes {what}")]
     Shaping {
         /// The key.
         key: &'static str,
         /// The value.
         value: String,
-        /// What would be right.
+        /// A description of valid values.
         what: &'static str,
     },
     /// The same token twice.
@@ -896,46 +895,46 @@ pub enum Mistake {
         /// The first use.
         other: String,
     },
-    /// Neither dials nor listens.
+    /// A node that neither dials nor listens.
     #[error(
         "neither {dial} nor {listen} is given, so this node connects to nobody: name a router \
          (\"quic://router.lab.example:7447\") or listen as one (\"quic://0.0.0.0:7447\")"
     )]
     ConnectsToNobody {
-        /// How a router is named.
+        /// The key that names a router.
         dial: &'static str,
-        /// How listening is asked for.
+        /// The key that enables listening.
         listen: &'static str,
     },
-    /// Two settings of which only one can hold.
+    /// Two settings that exclude each other.
     #[error("`{key}` is {value}, but `{other}` is {other_value}: {right}")]
     Contradiction {
-        /// The one.
+        /// The first key.
         key: &'static str,
         /// Its value.
         value: &'static str,
-        /// The other.
+        /// The second key.
         other: &'static str,
         /// Its value.
         other_value: String,
-        /// What to do.
+        /// The fix.
         right: &'static str,
     },
 
     // Other files.
-    /// A file that cannot be used as what it is named for.
+    /// A file whose content does not fit its key.
     #[error("`{key}` is {}: {reason}; it must be {expected}", path.display())]
     File {
         /// The key that names it.
         key: &'static str,
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The fault.
         reason: String,
-        /// What the key takes.
+        /// The expected content.
         expected: &'static str,
     },
-    /// Others than the owner may read a file of secrets.
+    /// A file of secrets that others than its owner may read.
     #[error("`{key}` is {}: its mode {mode:04o} lets others at {what}; `chmod 600 {}`", path.display(), path.display())]
     FileExposed {
         /// The key that names it.
@@ -949,10 +948,10 @@ pub enum Mistake {
     },
 
     // The identity.
-    /// Nothing says who this node is.
+    /// The identity is missing.
     #[error("{missing} is given: every link is authenticated, so a node needs an identity file")]
     NoIdentity {
-        /// What is not given, as the beginning of a sentence.
+        /// The missing keys, as the beginning of a sentence.
         missing: &'static str,
     },
     /// The identity is given at the top and in `[node]`.
@@ -961,7 +960,7 @@ pub enum Mistake {
         /// The line of the other.
         first: usize,
     },
-    /// There is no such file.
+    /// The identity file does not exist.
     #[error(
         "`{key}` is {}{}: no such file; `sgc fleet enroll {node} --out {}` makes one",
         path.display(),
@@ -971,24 +970,24 @@ pub enum Mistake {
     IdentityMissing {
         /// The key that names it.
         key: &'static str,
-        /// It is not written down but follows from the name.
+        /// Whether the path follows from the name instead of being written down.
         implied: bool,
         /// The file.
         path: PathBuf,
-        /// The node, or `NODE` where the name is not known.
+        /// The node, or `NODE` if the name is unknown.
         node: String,
     },
-    /// The file cannot be read.
+    /// The identity file cannot be read.
     #[error("`{key}` is {}: {reason}; it must be a file that this user may read", path.display())]
     IdentityUnreadable {
         /// The key that names it.
         key: &'static str,
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the operating system.
         reason: String,
     },
-    /// Others than the owner may read or write the private key.
+    /// Others than the owner may read or write the identity file.
     #[error(
         "`{key}` is {}: its mode {mode:04o} lets others at the private key; `chmod 600 {}` and, if others had access, \
          enrol again",
@@ -1008,16 +1007,16 @@ pub enum Mistake {
 /// The rules of a fully qualified ROS 2 topic name (`rmw_validate_full_topic_name`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum TopicRule {
-    /// It has at least one token.
+    /// The name has at least one token.
     #[error("a topic name has at least one word after a '/'")]
     NotEmpty,
     /// `~` depends on the ROS node.
     #[error("'~' stands for the name of a ROS node, which is not known here: write the name in full")]
     NotPrivate,
-    /// It starts with a slash.
+    /// The name starts with a slash.
     #[error("a topic name starts with '/'")]
     Absolute,
-    /// It does not end with one.
+    /// The name does not end with a slash.
     #[error("a topic name does not end with '/'")]
     NoTrailingSlash,
     /// No empty token.

@@ -1,6 +1,6 @@
-//! TOML text → draft: tables, keys and types of values, with the line of each.
+//! TOML to draft: reads tables, keys and types of values, with the line of each.
 //!
-//! What the values mean is not judged here but in `resolve`.
+//! `resolve` judges the values.
 
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -12,8 +12,8 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::draft::{
-    AuditDraft, Draft, GatewayClientDraft, GatewayDraft, Located, NamingDraft, PartnerDraft, QosDraft,
-    RosDraft, RotationDraft, ShapingDraft, ShareDraft, TransportDraft, UseDraft, Words,
+    AuditDraft, Draft, GatewayClientDraft, GatewayDraft, NamingDraft, PartnerDraft, QosDraft, RosDraft,
+    RotationDraft, ShapingDraft, ShareDraft, TransportDraft, UseDraft, WithOrigin, Words,
 };
 use super::error::{ConfigError, Mistake, Origin};
 use super::schema::{Table, nearest};
@@ -27,12 +27,12 @@ const WORDS: Words = Words {
     uses: "[[use]]",
 };
 
-/// What a table may be about.
+/// Kinds of interfaces that a table may describe.
 const INTERFACES: [Interface; 4] =
     [Interface::Topic, Interface::Service, Interface::Action, Interface::Parameters];
 
-/// Reads the text. A draft comes back even when there are errors, unless the text is not TOML at all, so that
-/// `resolve` can report its own beside them.
+/// Reads the text. Returns a draft even with errors, unless the text is no TOML, so that `resolve` can report its own
+/// errors as well.
 pub(super) fn read(text: &str, file: &str) -> (Option<Draft>, Vec<ConfigError>) {
     let line_starts =
         text.bytes().enumerate().filter(|(_, byte)| *byte == b'\n').map(|(at, _)| at + 1).collect();
@@ -56,7 +56,7 @@ struct FileReader<'t> {
     errors: Vec<ConfigError>,
 }
 
-/// A table of the file, on the way to becoming a draft.
+/// A table of the file while it is read.
 struct Section<'s, 't> {
     table: Table,
     entries: &'s DeTable<'t>,
@@ -72,7 +72,7 @@ impl FileReader<'_> {
         let mut last = None;
         for error in syntax {
             let origin = self.origin(error.span().unwrap_or_default());
-            // What follows in the same line is mostly a consequence of the first.
+            // Later errors in the same line are usually consequences of the first.
             if last.as_ref() != Some(&origin) {
                 let message = error.message().to_owned();
                 self.errors.push(ConfigError::new(origin.clone(), Mistake::Syntax { message }));
@@ -120,7 +120,7 @@ impl FileReader<'_> {
                 .iter()
                 .map(|share| self.share(share))
                 .collect(),
-            uses: self.repeated(&top, "use", Table::Use).iter().map(|one| self.one_use(one)).collect(),
+            uses: self.repeated(&top, "use", Table::Use).iter().map(|one| self.read_use(one)).collect(),
             admin_socket: self
                 .string(admin.as_ref(), "socket", "a string, such as \"/run/sgc/arm-1.sock\"")
                 .map(|socket| socket.map(PathBuf::from)),
@@ -167,7 +167,7 @@ impl FileReader<'_> {
         &mut self,
         top: &Section<'_, '_>,
         node: Option<&Section<'_, '_>>,
-    ) -> Option<Located<PathBuf>> {
+    ) -> Option<WithOrigin<PathBuf>> {
         const EXPECTED: &str = "a string, such as \"arm-1.identity\"";
         let above = self.string(Some(top), "identity", EXPECTED);
         let within = self.string(node, "identity", EXPECTED);
@@ -230,8 +230,8 @@ impl FileReader<'_> {
         }
     }
 
-    fn one_use(&mut self, one: &Section<'_, '_>) -> UseDraft {
-        // A token says whose topic it is, and which.
+    fn read_use(&mut self, one: &Section<'_, '_>) -> UseDraft {
+        // A token determines owner and topic.
         if !one.entries.contains_key("token") && !one.meant.contains(&"token") {
             self.check_required(one, "from", "\"arm-1\"");
             self.check_required(one, "topic", "\"/camera/image\"");
@@ -252,9 +252,9 @@ impl FileReader<'_> {
         }
     }
 
-    /// The name of what is shared or used; which key it stands under says what that is.
-    fn interface(&mut self, section: Option<&Section<'_, '_>>) -> Option<Located<String>> {
-        let mut first: Option<Located<String>> = None;
+    /// Reads the name of a shared or used interface. Its key determines the kind.
+    fn interface(&mut self, section: Option<&Section<'_, '_>>) -> Option<WithOrigin<String>> {
+        let mut first: Option<WithOrigin<String>> = None;
         for interface in INTERFACES {
             let key = interface.key();
             let Some(named) = self.string(section, key, "a string, such as \"/camera/image\"") else {
@@ -314,7 +314,7 @@ impl FileReader<'_> {
         }
     }
 
-    fn authority(&mut self, authority: Option<&Section<'_, '_>>) -> Option<Located<PathBuf>> {
+    fn authority(&mut self, authority: Option<&Section<'_, '_>>) -> Option<WithOrigin<PathBuf>> {
         self.check_required(authority?, "fleet", "\"lab.fleet\"");
         let fleet = self.string(authority, "fleet", "a string, such as \"lab.fleet\"");
         fleet.map(|fleet| fleet.map(PathBuf::from))
@@ -327,7 +327,7 @@ impl FileReader<'_> {
         let is_one = partner.entries.get("node").is_some_and(|node| node.get_ref().is_str());
         let partner = Some(partner);
         let node = match is_one {
-            true => self.string(partner, "node", NODE).map(|one| Located {
+            true => self.string(partner, "node", NODE).map(|one| WithOrigin {
                 key: one.key,
                 origin: one.origin.clone(),
                 value: vec![one],
@@ -386,7 +386,7 @@ impl FileReader<'_> {
         }
     }
 
-    /// The table `[key]`.
+    /// Reads the table `[key]`.
     fn single<'s, 't>(
         &mut self,
         top: &Section<'s, 't>,
@@ -405,7 +405,7 @@ impl FileReader<'_> {
         None
     }
 
-    /// The tables `[[key]]`, of which `top` knows the last word.
+    /// Reads the tables `[[key]]`. `top` has the last word of the key.
     fn repeated<'s, 't>(
         &mut self,
         top: &Section<'s, 't>,
@@ -433,7 +433,7 @@ impl FileReader<'_> {
         sections
     }
 
-    /// A section whose keys have been checked.
+    /// Creates a section after its keys were checked.
     fn section<'s, 't>(
         &mut self,
         table: Table,
@@ -446,7 +446,7 @@ impl FileReader<'_> {
             if table.keys().contains(&name) {
                 continue;
             }
-            // A table is told by its header, which is where the value's span begins.
+            // A table's span begins with its header, which identifies it.
             let span = if value.get_ref().is_table() { value.span() } else { key.span() };
             let key = name.to_owned();
             let mistake = if table.planned_keys().contains(&name) {
@@ -481,7 +481,7 @@ impl FileReader<'_> {
         section: Option<&Section<'_, '_>>,
         key: &'static str,
         expected: &'static str,
-    ) -> Option<Located<String>> {
+    ) -> Option<WithOrigin<String>> {
         let value = section?.entries.get(key)?;
         self.typed(value, key, expected, |value| value.as_str().map(str::to_owned))
     }
@@ -491,7 +491,7 @@ impl FileReader<'_> {
         section: Option<&Section<'_, '_>>,
         key: &'static str,
         expected: &'static str,
-    ) -> Option<Located<bool>> {
+    ) -> Option<WithOrigin<bool>> {
         let value = section?.entries.get(key)?;
         self.typed(value, key, expected, DeValue::as_bool)
     }
@@ -501,7 +501,7 @@ impl FileReader<'_> {
         section: Option<&Section<'_, '_>>,
         key: &'static str,
         expected: &'static str,
-    ) -> Option<Located<i64>> {
+    ) -> Option<WithOrigin<i64>> {
         let value = section?.entries.get(key)?;
         self.typed(value, key, expected, |value| {
             let integer = value.as_integer()?;
@@ -514,7 +514,7 @@ impl FileReader<'_> {
         section: Option<&Section<'_, '_>>,
         key: &'static str,
         expected: &'static str,
-    ) -> Option<Located<Vec<Located<String>>>> {
+    ) -> Option<WithOrigin<Vec<WithOrigin<String>>>> {
         let value = section?.entries.get(key)?;
         let DeValue::Array(array) = value.get_ref() else {
             self.record_type(value, key, expected);
@@ -524,16 +524,16 @@ impl FileReader<'_> {
         for item in array.iter() {
             items.extend(self.typed(item, key, expected, |item| item.as_str().map(str::to_owned)));
         }
-        // A list of nothing but mistakes is not empty by the user's will.
-        (array.is_empty() || !items.is_empty()).then(|| Located {
+        // A list of mistakes only is not meant to be empty.
+        (array.is_empty() || !items.is_empty()).then(|| WithOrigin {
             value: items,
             key,
             origin: self.origin(value.span()),
         })
     }
 
-    /// Strings, and arrays of strings that name the ways to one router.
-    fn routers(&mut self, node: Option<&Section<'_, '_>>) -> Vec<Located<String>> {
+    /// Reads strings, and arrays of strings with the URLs of one router.
+    fn routers(&mut self, node: Option<&Section<'_, '_>>) -> Vec<WithOrigin<String>> {
         const KEY: &str = "routers";
         const EXPECTED: &str = "an array of strings, such as [\"quic://router.lab.example:7447\"], or of arrays of \
             strings that name the ways to one router";
@@ -561,7 +561,7 @@ impl FileReader<'_> {
         section: Option<&Section<'_, '_>>,
         key: &'static str,
         expected: &'static str,
-    ) -> Vec<Located<String>> {
+    ) -> Vec<WithOrigin<String>> {
         self.strings(section, key, expected).map(|list| list.value).unwrap_or_default()
     }
 
@@ -571,15 +571,15 @@ impl FileReader<'_> {
         key: &'static str,
         expected: &'static str,
         convert: impl FnOnce(&DeValue<'t>) -> Option<T>,
-    ) -> Option<Located<T>> {
+    ) -> Option<WithOrigin<T>> {
         let converted = convert(value.get_ref());
         if converted.is_none() {
             self.record_type(value, key, expected);
         }
-        Some(Located { value: converted?, key, origin: self.origin(value.span()) })
+        Some(WithOrigin { value: converted?, key, origin: self.origin(value.span()) })
     }
 
-    /// The kind of a value and, if it is short, the value itself as written.
+    /// Describes the kind of a value, with the value itself if it is short.
     fn describe(&self, value: &Value<'_>) -> String {
         const WRITTEN_CHARS_MAX: usize = 40;
         let kind = match value.get_ref() {

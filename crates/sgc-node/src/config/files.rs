@@ -1,6 +1,6 @@
-//! The files that a configuration names: whether each is there, readable, and what its key takes.
+//! Checks the files that a configuration names: each exists, is readable, and has the content that its key takes.
 //!
-//! They are read to be judged only; the node reads them again when it starts.
+//! The checks keep nothing; the node reads the files again when it starts.
 
 use std::fs;
 use std::io::{self, Read};

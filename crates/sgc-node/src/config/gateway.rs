@@ -1,6 +1,6 @@
-//! `[gateway]`: where programs without ROS connect, who they may be, and what waits for them at most.
+//! The `[gateway]` table: listen addresses, access of programs without ROS, and bounds.
 //!
-//! It says what is valid. Who a connection is from and what it may do is judged in `sgc-gateway`.
+//! This module validates values. `sgc-gateway` authenticates and authorises connections.
 
 use std::fmt;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -12,9 +12,9 @@ use sgc_gateway::{Anonymous, PageOrigin, PageOriginError, Scope};
 use super::Recipient;
 use super::error::Mistake;
 
-/// Origins of pages that one gateway admits.
+/// Most origins of web pages that one gateway admits.
 pub const ORIGINS_MAX: usize = 64;
-/// `[[gateway.client]]` tables.
+/// Most `[[gateway.client]]` tables.
 pub const GATEWAY_CLIENTS_MAX: usize = 256;
 
 const WEBSOCKET_PORT: u16 = 9090;
@@ -26,21 +26,21 @@ const SIZE_UNITS: [(u64, &str); 3] = [(1 << 30, "GiB"), (MIB, "MiB"), (1 << 10, 
 /// A gateway for programs without ROS.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct GatewayConfig {
-    /// Where it listens; not empty, none twice.
+    /// Listen addresses; not empty, without duplicates.
     pub listen: Vec<GatewayUrl>,
-    /// What it shows to those who connect over TLS; the node's own certificate if there is nothing.
+    /// Certificate and key for TLS; `None` uses the node's own.
     pub tls: Option<GatewayTls>,
-    /// Who is admitted without a token or a certificate.
+    /// Rights of clients without a token or a certificate.
     pub anonymous: Anonymous,
-    /// Whose pages may connect without a token, besides those of this host.
+    /// Origins whose pages may connect without a token, besides those of this host.
     pub origins: Vec<PageOrigin>,
-    /// Whether it may be used unencrypted from other hosts.
+    /// Whether other hosts may connect unencrypted.
     pub plain: bool,
-    /// Clients that are connected at once; 1 to [`GatewayConfig::CLIENTS_MAX_MAX`].
+    /// Most clients at once; 1 to [`GatewayConfig::CLIENTS_MAX_MAX`].
     pub clients_max: usize,
-    /// Bytes that wait for one client; [`GatewayConfig::CLIENT_BYTES_MIN`] to [`GatewayConfig::CLIENT_BYTES_MAX`].
+    /// Most bytes that wait for one client; [`GatewayConfig::CLIENT_BYTES_MIN`] to [`GatewayConfig::CLIENT_BYTES_MAX`].
     pub client_bytes_max: u64,
-    /// What certificates permit.
+    /// Rights of clients with a certificate.
     pub clients: Vec<GatewayClientConfig>,
 }
 
@@ -49,28 +49,28 @@ pub struct GatewayConfig {
 pub struct GatewayTls {
     /// The certificates, leaf first.
     pub certificate: PathBuf,
-    /// The key of the first.
+    /// Private key of the leaf.
     pub key: PathBuf,
 }
 
-/// What nodes may do whose certificates prove who they are.
+/// Rights of nodes that authenticate by certificate.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct GatewayClientConfig {
-    /// Who; never empty.
+    /// The nodes; not empty.
     pub who: Vec<Recipient>,
-    /// What; never empty, within its bounds.
+    /// Their rights; not empty, within bounds.
     pub scope: Scope,
 }
 
 impl GatewayConfig {
-    /// Each client has a socket.
+    /// Bound of `clients_max`, since each client has a socket.
     pub const CLIENTS_MAX_MAX: u64 = 65_536;
-    /// One small message has to fit.
+    /// Lower bound of `client_bytes_max`, so that a small message fits.
     pub const CLIENT_BYTES_MIN: u64 = 64 << 10;
-    /// More than memory has.
+    /// Upper bound of `client_bytes_max`: more than memory has.
     pub const CLIENT_BYTES_MAX: u64 = 16 << 30;
 
-    /// Where a gateway listens that is not told: this host alone, where clients of each kind look first.
+    /// Returns the default listen addresses: this host only, at the ports that clients try first.
     pub fn default_listen() -> Vec<GatewayUrl> {
         let here = |scheme, port| GatewayUrl { scheme, address: (Ipv4Addr::LOCALHOST, port).into() };
         vec![
@@ -80,7 +80,7 @@ impl GatewayConfig {
         ]
     }
 
-    /// What an operator should know that is no mistake, one sentence each.
+    /// Returns warnings for the operator, one sentence each.
     pub fn warnings(&self) -> Vec<String> {
         let others = self.listen.iter().find(|url| !url.address.ip().is_loopback());
         let mut warnings = Vec::new();
@@ -119,37 +119,37 @@ impl Default for GatewayConfig {
     }
 }
 
-/// Where a gateway listens, and what is spoken there.
+/// A listen address of a gateway with its protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct GatewayUrl {
-    /// What is spoken.
+    /// The protocol.
     pub scheme: GatewayScheme,
-    /// Where; port 0 lets the system choose.
+    /// The address; port 0 lets the system choose.
     pub address: SocketAddr,
 }
 
 impl GatewayUrl {
-    /// True if others than this host may connect and nothing is encrypted.
+    /// Returns `true` if other hosts may connect and nothing is encrypted.
     pub fn is_open(&self) -> bool {
         !self.scheme.is_encrypted() && !self.address.ip().to_canonical().is_loopback()
     }
 }
 
-/// What is spoken.
+/// Protocol of a gateway address.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum GatewayScheme {
     /// gRPC over HTTP/2.
     Grpc,
-    /// The same over TLS.
+    /// gRPC over HTTP/2 over TLS.
     Grpcs,
-    /// The rosbridge protocol and Foxglove's over WebSocket; which of them, a client's WebSocket subprotocol tells.
+    /// rosbridge or Foxglove over WebSocket. The client's WebSocket subprotocol selects one.
     Ws,
-    /// The same over TLS.
+    /// rosbridge or Foxglove over WebSocket over TLS.
     Wss,
 }
 
 impl GatewayScheme {
-    /// What URLs begin with.
+    /// Returns the scheme of URLs.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Grpc => "grpc",
@@ -159,7 +159,7 @@ impl GatewayScheme {
         }
     }
 
-    /// Whether it is over TLS.
+    /// Returns `true` for protocols over TLS.
     pub fn is_encrypted(self) -> bool {
         matches!(self, Self::Grpcs | Self::Wss)
     }
@@ -172,21 +172,21 @@ impl GatewayScheme {
     }
 }
 
-/// Why a gateway cannot listen at a text.
+/// Reasons why a text is no listen address of a gateway.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum GatewayUrlError {
-    /// No scheme, or another.
+    /// The scheme is missing or unknown.
     #[error("it takes ws://, wss://, grpc:// and grpcs://, such as \"ws://127.0.0.1:9090\"")]
     Scheme,
-    /// A name where an address belongs.
+    /// The host is a name, not an IP address.
     #[error("it listens at an IP address, not at a name: \"{0}\"")]
     Name(String),
-    /// Neither.
+    /// The text is no IP address with a port.
     #[error(
         "behind the scheme comes an IP address with a port: \"{0}://127.0.0.1:{1}\" or \"{0}://[::1]:{1}\""
     )]
     Address(&'static str, u16),
-    /// A path.
+    /// The URL has a path.
     #[error("there is no path behind the port: clients may ask for any")]
     Path,
 }
@@ -226,12 +226,12 @@ impl fmt::Display for GatewayUrl {
     }
 }
 
-/// Checks where to listen.
+/// Parses a listen address.
 pub(super) fn listen(key: &'static str, value: &str) -> Result<GatewayUrl, Mistake> {
     value.parse().map_err(|fault| Mistake::GatewayUrl { key, value: value.to_owned(), fault })
 }
 
-/// Checks whose pages may connect.
+/// Parses an origin of web pages.
 pub(super) fn origin(key: &'static str, value: &str) -> Result<PageOrigin, Mistake> {
     value.parse().map_err(|fault: PageOriginError| Mistake::PageOrigin {
         key,
@@ -240,20 +240,20 @@ pub(super) fn origin(key: &'static str, value: &str) -> Result<PageOrigin, Mista
     })
 }
 
-/// Checks a number of bytes, `64MiB`.
+/// Parses a size such as `64MiB` and checks its bounds.
 pub(super) fn size(key: &'static str, value: &str, (min, max): (u64, u64)) -> Result<u64, Mistake> {
     let bytes = parse_size(value).filter(|bytes| (min..=max).contains(bytes));
     bytes.ok_or_else(|| Mistake::Size { key, value: value.to_owned(), min, max })
 }
 
-/// A number of bytes as the configuration has it: `512KiB`, `64MiB`, `1GiB`.
+/// Parses a size: `512KiB`, `64MiB`, `1GiB`.
 fn parse_size(text: &str) -> Option<u64> {
     let (number, unit) = text.split_at(text.find(|c: char| !c.is_ascii_digit())?);
     let unit = SIZE_UNITS.into_iter().find(|(_, name)| *name == unit.trim_start())?.0;
     number.parse::<u64>().ok()?.checked_mul(unit)
 }
 
-/// A number of bytes in the largest unit that divides it.
+/// Formats a size in the largest unit that divides it.
 pub(super) fn size_text(bytes: u64) -> String {
     let unit = SIZE_UNITS.into_iter().find(|(unit, _)| bytes.is_multiple_of(*unit) && bytes > 0);
     unit.map_or_else(|| format!("{bytes} bytes"), |(unit, name)| format!("{}{name}", bytes / unit))

@@ -1,12 +1,11 @@
-//! What the user wrote → a resolved, valid configuration, before any socket is bound.
+//! Configuration: turns the user's input into a valid, resolved [`Config`] before any socket is bound.
 //!
-//! Two sources, a TOML file and the command line, become a draft (`file`, `args`); one set of rules
-//! (`resolve`, `names`, `ros_env`) makes a [`Config`] of it or says everything that is wrong with it
-//! ([`ConfigErrors`]). The reference for users is `docs/reference/configuration.md`.
+//! Two sources, a TOML file (`file`) and the command line (`args`), become a draft. One set of rules (`resolve`,
+//! `names`, `ros_env`) turns the draft into a [`Config`], or reports all mistakes as [`ConfigErrors`]. The reference
+//! for users is `docs/reference/configuration.md`.
 //!
-//! Nothing here reads the environment or opens a socket: variables come through [`Environment`], and of files only
-//! [`load`] and [`load_args`] read any. Whether the identity file holds what it should, its owner's name
-//! included, is checked by the node when it opens it.
+//! This module reads no environment and opens no socket. Variables come through [`Environment`], and only [`load`] and
+//! [`load_args`] read files. The node checks the content of the identity file when it opens it.
 
 mod args;
 mod draft;
@@ -57,70 +56,70 @@ pub use sgc_ros::TOPIC_BYTES_MAX;
 /// The largest file that is read as a configuration: 1024 shares with all their metadata fit.
 pub const CONFIG_BYTES_MAX: u64 = 4 * 1024 * 1024;
 
-/// The shortest time between pulses of a link.
+/// The shortest configurable time between probes of a link.
 pub const KEEP_ALIVE_MIN: Duration = Duration::from_secs(1);
-/// The longest.
+/// The longest configurable time between probes of a link.
 pub const KEEP_ALIVE_MAX: Duration = Duration::from_secs(60);
 
-/// The least that a peer may be held to: below it a large message takes minutes.
+/// The lowest rate of a peer, in bits a second. Below it, a large message takes minutes.
 pub const PEER_RATE_MIN: u64 = 64_000;
-/// More than any network carries.
+/// The highest rate of a peer, in bits a second: more than any network carries.
 pub const PEER_RATE_MAX: u64 = 1_000_000_000_000;
 
-/// Looks up an environment variable; `&|name| std::env::var(name).ok()` outside of tests.
+/// Looks up an environment variable. It is `&|name| std::env::var(name).ok()` outside of tests.
 pub type Environment<'e> = &'e dyn Fn(&str) -> Option<String>;
 
 /// A node's configuration, valid in itself.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Config {
-    /// The name that the identity must have, if the user said one.
+    /// The required name in the identity, if the user gave one.
     pub node_name: Option<NodeName>,
     /// The identity file. Where only a name is given, it is `NAME.identity` beside the configuration.
     pub identity: PathBuf,
     /// Routers to connect to, and how each is found.
     pub routers: Vec<RouterUrl>,
-    /// The DNS server that host names and SRV records of routers are looked up at; none is the system's way.
+    /// DNS server for routers' host names and SRV records; `None` means the system's.
     pub resolver: Option<SocketAddr>,
-    /// How long nothing may come from a peer before it is asked whether it is there, at most; none finds out by itself.
-    /// [`KEEP_ALIVE_MIN`] to [`KEEP_ALIVE_MAX`].
+    /// Longest silence of a peer before it is probed, [`KEEP_ALIVE_MIN`] to [`KEEP_ALIVE_MAX`]; `None` adapts to the
+    /// path.
     pub keep_alive: Option<Duration>,
-    /// Where to listen; port 0 lets the system choose. Not empty: this node is a router.
+    /// Listen addresses; port 0 lets the system choose. If there are any, this node is a router.
     pub listen: Vec<ListenAddr>,
-    /// What one peer may send into this node, bits a second; [`PEER_RATE_MIN`] to [`PEER_RATE_MAX`].
+    /// Limit of one peer's traffic into this node, bits a second; [`PEER_RATE_MIN`] to [`PEER_RATE_MAX`].
     pub peer_rate: Option<u64>,
-    /// How this router comes to know where names are.
+    /// Mapping by which this router learns owners of names.
     pub mapping: MappingKind,
-    /// Tells the local network that a router is here.
+    /// Whether the router announces itself on the local network.
     pub announce: bool,
-    /// Files with the CAs whose nodes may attach; with none of them, every CA that is trusted here.
+    /// Files with the CAs whose nodes may attach; if empty, all trusted CAs.
     pub accept: Vec<PathBuf>,
-    /// The local ROS 2 network; none for a node that is only a router.
+    /// The local ROS 2 network; `None` for a node that is only a router.
     pub ros: Option<RosConfig>,
-    /// What this node offers, each topic once.
+    /// Shares of this node, each topic once.
     pub shares: Vec<ShareConfig>,
-    /// What this node wants, each topic of an owner once, none of them shared.
+    /// Uses of this node, each topic of an owner once, none of them shared.
     pub uses: Vec<UseConfig>,
-    /// What partners of other fleets handed to this node.
+    /// Tokens from partners.
     pub tokens: Vec<TokenConfig>,
     /// Other fleets, or some of their nodes, that shares may name.
     pub partners: Vec<PartnerConfig>,
-    /// Files with more CAs whose nodes may link to this one.
+    /// Files with further CAs whose nodes may link to this one.
     pub trust: Vec<PathBuf>,
-    /// Whether the file is read again when it changes.
+    /// Whether the configuration is reloaded when its file changes.
     pub watch: bool,
     /// Set if this node is its fleet's authority.
     pub authority: Option<AuthorityConfig>,
-    /// Where this node keeps what it has to remember, if not in its usual place.
+    /// State directory, if not the usual one.
     pub state: Option<PathBuf>,
-    /// When topics get new keys.
+    /// Bounds after which topics get new keys.
     pub rotation: RotationConfig,
-    /// Who was granted and refused what, as it is kept.
+    /// Audit log of grants and refusals.
     pub audit: AuditConfig,
-    /// How links are made.
+    /// Settings of links.
     pub transport: TransportConfig,
-    /// Programs without ROS on this node's network; none without `[gateway]`. Where it is there, so is `ros`.
+    /// Gateway for programs without ROS; `None` without `[gateway]`. With it, `ros` is set as well.
     pub gateway: Option<GatewayConfig>,
-    /// Where the status socket goes, if not in its usual place.
+    /// Path of the status socket, if not the usual one.
     pub admin_socket: Option<PathBuf>,
 }
 
@@ -129,31 +128,31 @@ pub struct Config {
 pub struct AuthorityConfig {
     /// The fleet file.
     pub fleet: PathBuf,
-    /// Nodes and groups that may have operations on the fleet carried out.
+    /// Nodes and groups that may carry out operations on the fleet.
     pub operators: Vec<Recipient>,
 }
 
 impl AuthorityConfig {
-    /// An authority without operators.
+    /// Creates an authority without operators.
     pub fn new(fleet: PathBuf) -> Self {
         Self { fleet, operators: Vec::new() }
     }
 }
 
-/// How links are made, whatever their transport can do of it.
+/// Settings of links. Each transport applies those that it supports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TransportConfig {
-    /// What decides how much may be under way.
+    /// Congestion controller.
     pub congestion: Congestion,
-    /// Whether the system may segment and gather datagrams.
+    /// Whether the system may segment and coalesce datagrams.
     pub offload: bool,
-    /// Whether the longest packet that a path carries is looked for.
+    /// Whether links search for the longest packet that the path carries.
     pub mtu_discovery: bool,
-    /// `true` to dial listeners that speak DTLS 1.2 only, to which certificates go in the clear.
+    /// Whether this node dials listeners that speak only DTLS 1.2, which see certificates in the clear.
     pub dtls12: bool,
-    /// What packets are marked with, 0 to 63.
+    /// DSCP mark of packets, 0 to 63.
     pub dscp: Option<u8>,
-    /// The same for connections of single topics that this node dials.
+    /// DSCP mark of lanes that this node dials.
     pub lane_dscp: Option<u8>,
 }
 
@@ -167,17 +166,17 @@ impl Default for TransportConfig {
 /// The local ROS 2 network.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RosConfig {
-    /// 0 to [`DOMAIN_ID_MAX`].
+    /// ROS domain id, 0 to [`DOMAIN_ID_MAX`].
     pub domain_id: u32,
-    /// How far to look for others.
+    /// Range of discovery.
     pub discovery: DiscoveryRange,
-    /// Host names and IP addresses to look at besides. Empty where the range is `Off` or `SystemDefault`.
+    /// Further host names and IP addresses to discover. Empty if the range is `Off` or `SystemDefault`.
     pub static_peers: Vec<String>,
     /// Whether far nodes appear in the local ROS graph, and local ones in far ones.
     pub graph: bool,
-    /// Directories with packages that define types, looked into before `AMENT_PREFIX_PATH` and what ships inside.
+    /// Directories of packages that define types, searched before `AMENT_PREFIX_PATH` and the built-in definitions.
     pub definitions: Vec<PathBuf>,
-    /// `CYCLONEDDS_URI` as it is: what users of that middleware have set for their network holds here too.
+    /// `CYCLONEDDS_URI` unchanged, so that a network's Cyclone DDS settings apply here too.
     pub cyclonedds_uri: Option<String>,
     /// The enclave of a network that DDS Security protects.
     pub security: Option<SecurityConfig>,
@@ -186,10 +185,10 @@ pub struct RosConfig {
 /// The enclave with which the local ROS 2 network is joined.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SecurityConfig {
-    /// The enclave and its keystore.
+    /// Enclave and keystore.
     pub enclave: Security,
-    /// `false` if the node goes without security where the keystore has no such enclave, as `ROS_SECURITY_STRATEGY` other than
-    /// `Enforce` means to ROS 2.
+    /// Whether a missing enclave is an error. `false` if `ROS_SECURITY_STRATEGY` is not `Enforce`: ROS 2 then goes on
+    /// without security.
     pub enforced: bool,
 }
 
@@ -201,147 +200,145 @@ impl Default for RosConfig {
     }
 }
 
-/// How far ROS 2 discovery reaches (`ROS_AUTOMATIC_DISCOVERY_RANGE`).
+/// Range of ROS 2 discovery (`ROS_AUTOMATIC_DISCOVERY_RANGE`).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum DiscoveryRange {
-    /// Nobody is discovered.
+    /// No discovery.
     Off,
-    /// This host.
+    /// This host only.
     Localhost,
-    /// As far as multicast reaches.
+    /// The reach of multicast.
     #[default]
     Subnet,
-    /// Whatever the middleware's own configuration says.
+    /// The middleware's own configuration.
     SystemDefault,
 }
 
-/// A topic that this node owns and lets others subscribe to.
+/// An interface that this node owns and lets others use.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ShareConfig {
-    /// What it is.
+    /// Kind of the interface.
     pub interface: Interface,
-    /// A fully qualified ROS 2 name, or a pattern of such.
+    /// Fully qualified ROS 2 name, or a pattern.
     pub topic: String,
-    /// What is left out, and what the rest is called for others.
+    /// Exceptions, and the name for others.
     pub naming: Naming,
-    /// `pkg/msg/Name`, or `srv` or `action` in the middle; taken from discovery where it is not given.
+    /// `pkg/msg/Name`, or `srv` or `action` in the middle; `None` takes it from DDS discovery.
     pub type_name: Option<String>,
-    /// Who may subscribe, or call; never empty, no one twice.
+    /// Recipients that may subscribe or call; not empty, without duplicates.
     pub to: Vec<Recipient>,
-    /// Who may publish besides this node; no one twice.
+    /// Nodes that may publish besides this one, without duplicates.
     pub publish: Vec<Recipient>,
-    /// What overtakes it.
+    /// Class of its packets.
     pub priority: Class,
-    /// How much of it goes out.
+    /// Limits of rate, bandwidth and age.
     pub shaping: Shaping,
-    /// Policies in place of its publishers'.
+    /// QoS policies that replace those of its publishers.
     pub qos: QosOverride,
-    /// Whether it has a connection of its own to the next node.
+    /// Whether the topic has a lane to the next node.
     pub dedicated: bool,
-    /// How its payloads are sealed.
+    /// Suite that seals its payloads.
     pub suite: Suite,
-    /// What else goes into its name.
+    /// Further metadata of its name.
     pub metadata: ShareMetadata,
 }
 
-/// The metadata fields of a share; those not given are empty. Each is at most
-/// [`sgc_wire::METADATA_FIELD_BYTES_MAX`] bytes.
+/// Metadata fields of a share. Missing fields are empty. Each has at most [`sgc_wire::METADATA_FIELD_BYTES_MAX`] bytes.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ShareMetadata {
     /// Free text.
     pub description: String,
-    /// Who wrote it.
+    /// Author.
     pub author: String,
-    /// Who looks after it.
+    /// Maintainer.
     pub maintainer: String,
     /// Interface description.
     pub interface: String,
-    /// Tells apart what is otherwise alike.
+    /// Text that distinguishes otherwise equal metadata.
     pub unique: String,
     /// The ROS node that provides it.
     pub node: String,
 }
 
-/// A topic of another node that is to appear here, or that this node publishes on.
+/// An interface of another node that this node receives, or publishes on.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct UseConfig {
-    /// The node that shares it.
+    /// The owner.
     pub from: NodeName,
-    /// What it is.
+    /// Kind of the interface.
     pub interface: Interface,
-    /// A fully qualified ROS 2 name there, or a pattern of such.
+    /// Fully qualified ROS 2 name at the owner, or a pattern.
     pub topic: String,
-    /// What is left out, and what the rest is called here.
+    /// Exceptions, and the local name.
     pub naming: Naming,
-    /// What the names of frames in tf messages get in front.
+    /// Prefix of frame names in tf messages.
     pub frame_prefix: Option<String>,
-    /// `pkg/msg/Name`, if the user insists on one; otherwise the owner's catalogue says.
+    /// `pkg/msg/Name`, if the user insists on a type; otherwise the owner's catalogue decides.
     pub type_name: Option<String>,
-    /// True if local messages go there, false if it appears here.
+    /// Whether this node publishes on the topic instead of receiving it.
     pub publish: bool,
-    /// What overtakes that which is published there; as the owner says if not given.
+    /// Class of published packets; `None` follows the owner.
     pub priority: Option<Class>,
-    /// How much of it goes on, whichever way.
+    /// Limits of rate, bandwidth and age, in either direction.
     pub shaping: Shaping,
-    /// Policies here in place of the far publishers'.
+    /// Local QoS policies that replace those of the far publishers.
     pub qos: QosOverride,
-    /// Whether it has a connection of its own to the next node.
+    /// Whether the topic has a lane to the next node.
     pub dedicated: bool,
 }
 
-/// A topic that is used by a token.
+/// A topic that is used through a share token.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TokenConfig {
-    /// Where the token is.
+    /// Source of the token.
     pub source: TokenSource,
-    /// What its topic is called here.
+    /// Local name of the topic.
     pub naming: Naming,
-    /// What the names of frames in tf messages get in front.
+    /// Prefix of frame names in tf messages.
     pub frame_prefix: Option<String>,
-    /// Policies here in place of the far publishers'.
+    /// Local QoS policies that replace those of the far publishers.
     pub qos: QosOverride,
-    /// Whether it has a connection of its own to the next node.
+    /// Whether the topic has a lane to the next node.
     pub dedicated: bool,
 }
 
-/// Where a token is.
+/// Source of a token.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum TokenSource {
-    /// In a file of its own, for its owner alone.
+    /// A file that only its owner may read.
     File(PathBuf),
-    /// In the configuration.
+    /// The configuration itself.
     Text(Box<ShareToken>),
 }
 
 /// Another fleet.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PartnerConfig {
-    /// What shares call it.
+    /// Name of the partner in shares.
     pub name: FleetName,
-    /// The file with its CA certificate, PEM.
+    /// PEM file with its CA certificate.
     pub ca: PathBuf,
-    /// The nodes that are meant; all of that CA if there are none.
+    /// The partner's nodes; all nodes of the CA if empty.
     pub nodes: Vec<NodeId>,
 }
 
-/// When a topic gets a new key besides when somebody loses the right to it.
+/// Bounds after which a topic gets a new key. Revoking a right starts a new epoch regardless.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RotationConfig {
-    /// After this time; [`RotationConfig::EVERY_MIN`] to [`RotationConfig::EVERY_MAX`].
+    /// Age of the key; [`RotationConfig::EVERY_MIN`] to [`RotationConfig::EVERY_MAX`].
     pub every: Duration,
-    /// After this many messages of one source; [`RotationConfig::MESSAGES_MIN`] to
-    /// [`RotationConfig::MESSAGES_MAX`].
+    /// Messages of one source under one key; [`RotationConfig::MESSAGES_MIN`] to [`RotationConfig::MESSAGES_MAX`].
     pub messages: u64,
 }
 
 impl RotationConfig {
-    /// Each rotation costs a grant for each sink.
+    /// Lower bound of the age, since each rotation costs one grant per sink.
     pub const EVERY_MIN: Duration = Duration::from_secs(10);
-    /// A key that is older is none that rotates.
+    /// Upper bound of the age.
     pub const EVERY_MAX: Duration = Duration::from_secs(30 * 86_400);
-    /// Each rotation costs a grant for each sink.
+    /// Lower bound of the count, since each rotation costs one grant per sink.
     pub const MESSAGES_MIN: u64 = 1024;
-    /// Within what AES-GCM may seal under one key (NIST SP 800-38D, 8.3).
+    /// Upper bound of the count. It is within the limit of AES-GCM under one key (NIST SP 800-38D, 8.3).
     pub const MESSAGES_MAX: u64 = 1 << 32;
 }
 
@@ -354,22 +351,22 @@ impl Default for RotationConfig {
 /// The audit log.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct AuditConfig {
-    /// The file; none is `audit.jsonl` in the state directory.
+    /// Path of the log; `None` is `audit.jsonl` in the state directory.
     pub file: Option<PathBuf>,
-    /// The room that it may take.
+    /// Limits of its size.
     pub room: AuditRoom,
-    /// Nothing is written.
+    /// Whether the log is switched off.
     pub off: bool,
 }
 
 impl AuditConfig {
-    /// Some hundred records.
+    /// Smallest size of one file: some hundred records.
     pub const MAX_BYTES_MIN: u64 = 64 << 10;
-    /// As much as any disk has.
+    /// Largest size of one file.
     pub const MAX_BYTES_MAX: u64 = 1 << 40;
-    /// One file that was put aside, so that no record is gone as soon as a file is full.
+    /// Fewest rotated files. One remains, so that no record is lost as soon as a file is full.
     pub const FILES_MIN: u32 = 1;
-    /// A number of files that is read at once.
+    /// Most rotated files, since all of them are read at once.
     pub const FILES_MAX: u32 = 99;
 }
 
@@ -380,18 +377,18 @@ impl Default for AuditConfig {
 }
 
 impl DiscoveryRange {
-    /// Whether static peers count for anything.
+    /// Returns `true` if static peers have an effect.
     fn asks_peers(self) -> bool {
         matches!(self, Self::Localhost | Self::Subnet)
     }
 }
 
 impl Config {
-    /// Returns what to tell the user about links that can be read on their way, one line for each address.
+    /// Returns warnings about unencrypted links, one line for each address.
     pub fn warnings(&self) -> Vec<String> {
         let listens = self.listen.iter().filter(|addr| addr.scheme.is_readable()).map(ToString::to_string);
-        let ways = self.routers.iter().flat_map(RouterUrl::ways);
-        let dials = ways.filter(|url| url.scheme.is_readable()).map(ToString::to_string);
+        let urls = self.routers.iter().flat_map(RouterUrl::urls);
+        let dials = urls.filter(|url| url.scheme.is_readable()).map(ToString::to_string);
         let line = |address| {
             format!(
                 "{address} can be read by everybody on its way: who talks to whom, how much and when, and the hashes that stand \
@@ -401,32 +398,32 @@ impl Config {
         listens.chain(dials).map(line).collect()
     }
 
-    /// Takes part in ROS 2 not at all and only passes packets on.
+    /// Returns `true` if the node only forwards and takes no part in ROS 2.
     pub fn is_pure_router(&self) -> bool {
         self.ros.is_none()
     }
 
-    /// The share of a local topic: the one that names it, else the first whose pattern covers it.
+    /// Returns the share of a local topic: the one that names it, else the first whose pattern matches.
     pub fn share_of(&self, topic: &str) -> Option<&ShareConfig> {
         let named = self.shares.iter().find(|share| share.topic == topic);
         named.or_else(|| self.shares.iter().find(|share| share.naming.shares(&share.topic, topic)))
     }
 
-    /// Resolves the command line without looking at any file. The ROS environment counts as it does with a file.
+    /// Resolves the command line without reading any file. The ROS environment applies as with a file.
     pub fn from_args(args: &ArgsConfig, env: Environment<'_>) -> Result<Self, ConfigErrors> {
         let (draft, errors) = args::read(args);
         resolve::resolve(&draft, errors, Path::new(""), env, None).map_err(ConfigErrors::new)
     }
 }
 
-/// Checks a message type that stands outside of a configuration, and gives it as `pkg/msg/Name`.
+/// Checks a message type from outside of a configuration. Returns it as `pkg/msg/Name`.
 pub fn message_type(value: &str) -> Result<String, Mistake> {
     names::message_type("--type", value)
 }
 
-/// Reads and resolves a file, and checks that the identity file is there, readable, and its owner's alone.
+/// Reads and resolves a file, and checks that the identity file exists, is readable, and is its owner's alone.
 ///
-/// Relative paths in it are taken from its directory.
+/// Relative paths are resolved against the file's directory.
 pub fn load(path: &Path, env: Environment<'_>) -> Result<Config, ConfigErrors> {
     let file_name = path.display().to_string();
     let text = read_limited(path).map_err(|mistake| {
@@ -443,7 +440,7 @@ pub fn load_args(args: &ArgsConfig, env: Environment<'_>) -> Result<Config, Conf
     resolve::resolve(&draft, errors, Path::new(""), env, Some(&files::FILES)).map_err(ConfigErrors::new)
 }
 
-/// Resolves the text of a file that errors call `file_name`, without looking at any file.
+/// Resolves the text of a configuration without reading any file. Errors call it `file_name`.
 pub fn parse(
     text: &str,
     file_name: &str,

@@ -1,7 +1,7 @@
-//! The rules for what a user may call things: topics, message types, nodes, recipients, peers, addresses.
+//! Rules for single values: topics, message types, nodes, recipients, peers, addresses.
 //!
-//! Each function takes a text and gives the valid thing or the mistake; where the text comes from and what it
-//! has to do with other settings is the business of `resolve`.
+//! Each function takes a text and returns the valid value or the mistake. `resolve` knows where the text comes from and
+//! how it relates to other settings.
 
 use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
@@ -15,17 +15,17 @@ use super::error::{Mistake, TopicRule};
 use super::router_url::{RouterUrl, RouterUrlError};
 use super::{PEER_RATE_MAX, PEER_RATE_MIN};
 
-/// The longest prefix of frames.
+/// The longest frame prefix.
 pub const FRAME_PREFIX_BYTES_MAX: usize = 64;
 /// The longest message type: 256 bytes of DDS less a terminator and what `::dds_::` and `_` add.
 pub const TYPE_BYTES_MAX: usize = 240;
-/// The longest peer address, as `rmw` has it.
+/// The longest peer address in `rmw`.
 pub const PEER_BYTES_MAX: usize = 255;
 
 const HOST_BYTES_MAX: usize = 253;
 const DNS_PORT: u16 = 53;
 
-/// Who may subscribe to a share, or publish on it.
+/// A recipient that may subscribe to a share, or publish on it.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Recipient {
     /// `"*"`: every member of the fleet.
@@ -34,7 +34,7 @@ pub enum Recipient {
     Group(GroupName),
     /// `"desk"`: one node.
     Node(NodeName),
-    /// `"partner:acme"`: the nodes that the `[[partner]]` of that name stands for.
+    /// `"partner:acme"`: the nodes of the `[[partner]]` with that name.
     Partner(FleetName),
 }
 
@@ -49,7 +49,7 @@ impl std::fmt::Display for Recipient {
     }
 }
 
-/// Checks a topic, or a pattern of topics in which `*` and `**` stand for words.
+/// Checks a topic, or a pattern with `*` and `**` in place of words.
 pub(super) fn pattern(key: &'static str, value: &str) -> Result<String, Mistake> {
     if !value.contains('*') {
         return topic(key, value);
@@ -60,7 +60,7 @@ pub(super) fn pattern(key: &'static str, value: &str) -> Result<String, Mistake>
         let right = value.split('/').map(whole).collect::<Vec<_>>().join("/");
         return Err(Mistake::Wildcard { key, value: value.to_owned(), right });
     }
-    // Where a word may stand a wildcard may.
+    // A wildcard may stand wherever a word may.
     let words: Vec<_> = value.split('/').map(|word| if is_wildcard(&word) { "w" } else { word }).collect();
     let name = words.join("/");
     match broken_topic_rule(&name) {
@@ -69,7 +69,7 @@ pub(super) fn pattern(key: &'static str, value: &str) -> Result<String, Mistake>
     }
 }
 
-/// Checks what the names of frames get in front.
+/// Checks a frame prefix.
 pub(super) fn frame_prefix(key: &'static str, value: &str) -> Result<String, Mistake> {
     let allowed = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'_' | b'-' | b'.' | b'/');
     let fits = (1..=FRAME_PREFIX_BYTES_MAX).contains(&value.len());
@@ -79,7 +79,7 @@ pub(super) fn frame_prefix(key: &'static str, value: &str) -> Result<String, Mis
     Err(Mistake::FramePrefix { key, value: value.to_owned(), max: FRAME_PREFIX_BYTES_MAX })
 }
 
-/// How an interface is named: one that is made of several has no wildcard.
+/// Returns the check of an interface's name. Interfaces of several topics take no wildcard.
 pub(super) fn interface_name(interface: Interface) -> fn(&'static str, &str) -> Result<String, Mistake> {
     match interface {
         Interface::Topic | Interface::Service => pattern,
@@ -87,7 +87,7 @@ pub(super) fn interface_name(interface: Interface) -> fn(&'static str, &str) -> 
     }
 }
 
-/// Checks a fully qualified topic name as rmw does; repeated underscores are allowed as it allows them.
+/// Checks a fully qualified topic name like rmw, which permits repeated underscores.
 pub(super) fn topic(key: &'static str, value: &str) -> Result<String, Mistake> {
     match broken_topic_rule(value) {
         None => Ok(value.to_owned()),
@@ -121,7 +121,7 @@ fn broken_topic_rule(value: &str) -> Option<TopicRule> {
     }
 }
 
-/// The valid topic that is nearest to `value`, if there is one to be guessed.
+/// Returns the valid topic that is nearest to `value`, if one can be guessed.
 fn repaired_topic(value: &str) -> Option<String> {
     let value = value.trim();
     let words = value.strip_prefix("rt/").unwrap_or(value).split('/').filter(|word| !word.is_empty());
@@ -159,7 +159,7 @@ pub(super) fn interface_type(
     }
 }
 
-/// Checks a message type and gives it as `pkg/msg/Name`, also from DDS's `pkg::msg::dds_::Name_`.
+/// Checks a message type and returns it as `pkg/msg/Name`, also from DDS's `pkg::msg::dds_::Name_`.
 pub(super) fn message_type(key: &'static str, value: &str) -> Result<String, Mistake> {
     let other = || Mistake::InterfaceType {
         key,
@@ -223,7 +223,7 @@ pub(super) fn node_id(key: &'static str, value: &str) -> Result<NodeId, Mistake>
     value.parse().map_err(|_| Mistake::NodeId { key, value: value.to_owned() })
 }
 
-/// Checks a length of time, `NUMBER` and `s`, `min`, `h` or `d`, within bounds.
+/// Checks a duration, `NUMBER` and `s`, `min`, `h` or `d`, and its bounds.
 pub(super) fn duration(
     key: &'static str,
     value: &str,
@@ -233,7 +233,7 @@ pub(super) fn duration(
     duration.ok_or_else(|| Mistake::Duration { key, value: value.to_owned(), min, max })
 }
 
-/// A length of time as the configuration has it: `90s`, `15min`, `1h`, `30d`.
+/// Parses a duration: `90s`, `15min`, `1h`, `30d`.
 pub fn parse_duration(text: &str) -> Option<Duration> {
     let (number, unit) = text.split_at(text.find(|c: char| !c.is_ascii_digit())?);
     let unit = match unit.trim_start() {
@@ -246,7 +246,7 @@ pub fn parse_duration(text: &str) -> Option<Duration> {
     number.parse::<u64>().ok()?.checked_mul(unit).map(Duration::from_secs)
 }
 
-/// A length of time in the largest unit that divides it.
+/// Formats a duration in the largest unit that divides it.
 pub(super) fn duration_text(duration: Duration) -> String {
     let seconds = duration.as_secs();
     let units = [(86_400, "d"), (3600, "h"), (60, "min")];
@@ -254,20 +254,20 @@ pub(super) fn duration_text(duration: Duration) -> String {
     unit.map_or_else(|| format!("{seconds}s"), |(unit, text)| format!("{}{text}", seconds / unit))
 }
 
-/// Checks what a peer may send.
+/// Checks the rate limit of a peer.
 pub(super) fn rate(key: &'static str, value: &str) -> Result<u64, Mistake> {
     let rate = parse_rate(value).filter(|rate| (PEER_RATE_MIN..=PEER_RATE_MAX).contains(rate));
     rate.ok_or_else(|| Mistake::Rate { key, value: value.to_owned() })
 }
 
-/// A rate as the configuration has it: `500kbps`, `50Mbps`, `1Gbps`; in bits a second.
+/// Parses a rate: `500kbps`, `50Mbps`, `1Gbps`. Returns bits a second.
 pub fn parse_rate(text: &str) -> Option<u64> {
     let (number, unit) = text.split_at(text.find(|c: char| !c.is_ascii_digit())?);
     let unit = RATE_UNITS.into_iter().find(|(_, name)| *name == unit.trim_start())?.0;
     number.parse::<u64>().ok()?.checked_mul(unit)
 }
 
-/// Checks what packets are marked with: a class of differentiated services (RFC 2474, 2597, 3246), or its number.
+/// Checks a DSCP mark: a class of differentiated services (RFC 2474, 2597, 3246), or its number.
 pub(super) fn dscp(key: &'static str, value: &str) -> Result<u8, Mistake> {
     const WHAT: &str = "a class of differentiated services: \"CS0\" to \"CS7\", \"AF11\" to \"AF43\", \"EF\", or \"0\" to \"63\"";
     let digit = |byte: u8, max: u8| Some(byte.checked_sub(b'0')?).filter(|digit| *digit <= max);
@@ -284,7 +284,7 @@ pub(super) fn dscp(key: &'static str, value: &str) -> Result<u8, Mistake> {
     mark.ok_or_else(|| shaping_mistake(key, value, WHAT))
 }
 
-/// Checks how often messages of a topic may go, and says how long there is between two.
+/// Checks a message rate. Returns the time between two messages.
 pub(super) fn interval(key: &'static str, value: &str) -> Result<Duration, Mistake> {
     const WHAT: &str = "messages a second, 0.001 to 10000: \"10Hz\", \"0.5Hz\"";
     let number = |text: &str| {
@@ -296,14 +296,14 @@ pub(super) fn interval(key: &'static str, value: &str) -> Result<Duration, Mista
     hz.map(|hz| Duration::from_secs_f64(1.0 / hz)).ok_or_else(|| shaping_mistake(key, value, WHAT))
 }
 
-/// Checks how many bits a second of a topic may go.
+/// Checks a bandwidth in bits a second.
 pub(super) fn bandwidth(key: &'static str, value: &str) -> Result<u64, Mistake> {
     const WHAT: &str = "bits a second, \"1kbps\" to \"1000Gbps\": \"500kbps\", \"2Mbps\"";
     let rate = parse_rate(value).filter(|rate| (1000..=PEER_RATE_MAX).contains(rate));
     rate.ok_or_else(|| shaping_mistake(key, value, WHAT))
 }
 
-/// Checks how old messages of a topic may be.
+/// Checks the greatest age of messages.
 pub(super) fn age(key: &'static str, value: &str) -> Result<Duration, Mistake> {
     const WHAT: &str = "a length of time, \"1ms\" to \"1h\": \"500ms\", \"2s\"";
     let millis = |text: &str| {
@@ -319,7 +319,7 @@ fn shaping_mistake(key: &'static str, value: &str, what: &'static str) -> Mistak
     Mistake::Shaping { key, value: value.to_owned(), what }
 }
 
-/// A rate in the largest unit that divides it.
+/// Formats a rate in the largest unit that divides it.
 pub(super) fn rate_text(rate: u64) -> String {
     let unit = RATE_UNITS.into_iter().find(|(unit, _)| rate.is_multiple_of(*unit));
     unit.map_or_else(|| format!("{rate}bps"), |(unit, name)| format!("{}{name}", rate / unit))
@@ -339,7 +339,7 @@ pub(super) fn recipient(key: &'static str, value: &str) -> Result<Recipient, Mis
     recipient.ok_or_else(|| Mistake::Recipient { key, value: value.to_owned(), max: LABEL_BYTES_MAX })
 }
 
-/// The valid name that is nearest to `value`, if there is one to be guessed.
+/// Returns the valid name that is nearest to `value`, if one can be guessed.
 fn repaired_label(value: &str) -> Option<String> {
     let repaired = value.trim().trim_start_matches('/').to_lowercase().replace([' ', '/'], "-");
     repaired.parse::<NodeName>().is_ok().then_some(repaired)
@@ -361,20 +361,20 @@ fn is_host(value: &str) -> bool {
             && !label.starts_with('-')
             && !label.ends_with('-')
     };
-    // Four numbers that are no address are a mistyped address, not a name: no top-level domain is a number.
+    // No top-level domain is numeric, so a numeric last label means a mistyped address.
     let numeric = value.rsplit('.').next().is_some_and(|last| last.chars().all(|c| c.is_ascii_digit()));
     value.parse::<IpAddr>().is_ok()
         || (!numeric && value.len() <= HOST_BYTES_MAX && value.split('.').all(is_label))
 }
 
-/// Checks where a router is to be found: `quic://HOST[:PORT]`, `srv://DOMAIN`, `mdns://[NODE]`.
+/// Checks an entry of `routers`: `quic://HOST[:PORT]`, `srv://DOMAIN`, `mdns://[NODE]`.
 pub(super) fn router(key: &'static str, value: &str) -> Result<RouterUrl, Mistake> {
     let router: RouterUrl = match value.parse() {
         Ok(router) => router,
         Err(RouterUrlError::Link(fault)) => return Err(url_mistake(key, value, fault)),
         Err(fault) => return Err(Mistake::Router { key, value: value.to_owned(), fault }),
     };
-    for url in router.ways() {
+    for url in router.urls() {
         let host = url.host.clone();
         if !is_host(&host) {
             return Err(url_mistake(key, value, UrlError::Host(host)));
@@ -395,7 +395,7 @@ pub(super) fn resolver(key: &'static str, value: &str) -> Result<SocketAddr, Mis
         .ok_or_else(|| Mistake::Resolver { key, value: value.to_owned() })
 }
 
-/// Checks where to listen, `SCHEME://ADDRESS[:PORT]`.
+/// Checks a listen address, `SCHEME://ADDRESS[:PORT]`.
 pub(super) fn listen(key: &'static str, value: &str) -> Result<ListenAddr, Mistake> {
     if matches!(value.split_once("://"), Some(("srv" | "mdns", _))) {
         return Err(Mistake::ListenFinds { key, value: value.to_owned() });

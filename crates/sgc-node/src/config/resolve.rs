@@ -1,7 +1,6 @@
-//! Draft → configuration: the values, and what they have to do with each other.
+//! Draft to configuration: values, and their relations.
 //!
-//! All mistakes are collected. One that follows from another is not reported: a value that is wrong in itself
-//! takes no part in comparisons.
+//! All mistakes are collected. Consequential mistakes are not reported: an invalid value takes no part in comparisons.
 
 mod gateway_table;
 
@@ -18,7 +17,8 @@ use sgc_wire::{
 };
 
 use super::draft::{
-    Draft, Located, NamingDraft, PartnerDraft, QosDraft, RosDraft, ShapingDraft, ShareDraft, UseDraft, Words,
+    Draft, NamingDraft, PartnerDraft, QosDraft, RosDraft, ShapingDraft, ShareDraft, UseDraft, WithOrigin,
+    Words,
 };
 use super::error::{ConfigError, Mistake, Origin};
 use super::names::{self, Recipient};
@@ -30,31 +30,31 @@ use super::{
 };
 use crate::audit::AuditRoom;
 
-/// Shares of one node.
+/// Most shares of one node.
 pub const SHARES_MAX: usize = 1024;
-/// Uses of one node.
+/// Most uses of one node.
 pub const USES_MAX: usize = 1024;
-/// Exceptions of one share or use.
+/// Most exceptions of one share or use.
 pub const EXCEPT_MAX: usize = 256;
-/// Recipients of one share.
+/// Most recipients of one share.
 pub const RECIPIENTS_MAX: usize = 1024;
-/// Routers that one node dials.
+/// Most routers that one node dials.
 pub const ROUTERS_MAX: usize = 16;
-/// Files with CAs whose nodes may attach to one router.
+/// Most files with CAs whose nodes may attach to one router.
 pub const ACCEPT_MAX: usize = 16;
-/// Addresses that one node listens at.
+/// Most listen addresses of one node.
 pub const LISTEN_MAX: usize = 16;
-/// Partners of one node.
+/// Most partners of one node.
 pub const PARTNERS_MAX: usize = 32;
-/// Files with more CAs that one node trusts.
+/// Most files with further CAs that one node trusts.
 pub const TRUST_MAX: usize = 16;
-/// Directories with definitions.
+/// Most directories with definitions.
 pub const DEFINITIONS_MAX: usize = 64;
-/// Path of a Unix socket: `sun_path` less its terminator.
+/// Longest path of a Unix socket: `sun_path` without its terminator.
 pub const SOCKET_PATH_BYTES_MAX: usize = 107;
 
 const PRIORITIES: [&str; 3] = ["realtime", "default", "bulk"];
-/// How suites are called, in the order of their ids from 1.
+/// Names of suites, in the order of their ids from 1.
 pub const SUITES: [&str; 8] = [
     "group",
     "group-chacha",
@@ -66,16 +66,16 @@ pub const SUITES: [&str; 8] = [
     "paper-3072-chacha",
 ];
 
-/// An identity file and what an error about it needs to know.
+/// An identity file, with details for errors.
 pub(super) struct IdentityFile<'i> {
     pub(super) path: &'i Path,
     pub(super) key: &'static str,
-    /// Not written down but following from the name.
+    /// Whether the path follows from the name instead of being written down.
     pub(super) implied: bool,
     pub(super) node_name: Option<&'i NodeName>,
 }
 
-/// Checks of the files that a configuration names; an argument because they look at the file system.
+/// Checks of named files. They are an argument, since they read the file system.
 pub(super) struct FileChecks {
     pub(super) identity: fn(&IdentityFile<'_>) -> Result<(), Mistake>,
     pub(super) ca: fn(&'static str, &Path) -> Result<(), Mistake>,
@@ -86,7 +86,7 @@ pub(super) struct FileChecks {
     pub(super) directory: fn(&'static str, &Path) -> Result<(), Mistake>,
 }
 
-/// Judges a draft whose reader found `errors` already. Relative paths are taken from `base_dir`.
+/// Resolves a draft whose reader found `errors`. Relative paths are resolved against `base_dir`.
 pub(super) fn resolve(
     draft: &Draft,
     errors: Vec<ConfigError>,
@@ -181,10 +181,10 @@ impl Resolver<'_> {
         self.errors.push(ConfigError::new(origin.clone(), mistake));
     }
 
-    /// The checked value, or nothing and an error.
+    /// Returns the value of a check, or records its error.
     fn keep<T>(
         &mut self,
-        located: &Located<String>,
+        located: &WithOrigin<String>,
         check: impl FnOnce(&'static str, &str) -> Result<T, Mistake>,
     ) -> Option<T> {
         check(located.key, &located.value).map_err(|mistake| self.errors.push(located.error(mistake))).ok()
@@ -224,7 +224,7 @@ impl Resolver<'_> {
 
     fn addresses<T: Ord + Clone>(
         &mut self,
-        written: &[Located<String>],
+        written: &[WithOrigin<String>],
         check: fn(&'static str, &str) -> Result<T, Mistake>,
         max: usize,
     ) -> Vec<T> {
@@ -247,8 +247,8 @@ impl Resolver<'_> {
 
     fn shares(&mut self, draft: &Draft, node_name: Option<&NodeName>) -> Vec<ShareConfig> {
         self.check_count(&draft.origin, self.words.share, draft.shares.len(), SHARES_MAX);
-        let mut first: BTreeMap<(&str, &str), &Located<String>> = BTreeMap::new();
-        let mut called: BTreeMap<(&str, String), &Located<String>> = BTreeMap::new();
+        let mut first: BTreeMap<(&str, &str), &WithOrigin<String>> = BTreeMap::new();
+        let mut called: BTreeMap<(&str, String), &WithOrigin<String>> = BTreeMap::new();
         let mut valid = Vec::new();
         for share in draft.shares.iter().take(SHARES_MAX) {
             let interface = interface_of(share.topic.as_ref());
@@ -345,7 +345,7 @@ impl Resolver<'_> {
 
     fn recipients(
         &mut self,
-        to: &Located<Vec<Located<String>>>,
+        to: &WithOrigin<Vec<WithOrigin<String>>>,
         node_name: Option<&NodeName>,
         partners: &[PartnerDraft],
     ) -> Vec<Recipient> {
@@ -366,7 +366,7 @@ impl Resolver<'_> {
                 self.record(&one.origin, Mistake::Repeated { key: one.key, value: one.value.clone() });
             }
         }
-        // Everyone is every member of this fleet: partners stand beside it.
+        // `*` covers every member of this fleet but no partners, which may stand beside it.
         let other = valid.iter().find(|r| !matches!(r, Recipient::Everyone | Recipient::Partner(_)));
         if let Some(other) = other.filter(|_| seen.contains(&Recipient::Everyone)) {
             let other = other.to_string();
@@ -380,7 +380,7 @@ impl Resolver<'_> {
         valid
     }
 
-    fn operators(&mut self, written: &Located<Vec<Located<String>>>) -> Vec<Recipient> {
+    fn operators(&mut self, written: &WithOrigin<Vec<WithOrigin<String>>>) -> Vec<Recipient> {
         if written.value.len() > RECIPIENTS_MAX {
             let (key, count) = (written.key, written.value.len());
             self.record(&written.origin, Mistake::TooManyEntries { key, count, max: RECIPIENTS_MAX });
@@ -402,10 +402,10 @@ impl Resolver<'_> {
         valid
     }
 
-    fn check_partner(&mut self, one: &Located<String>, partner: &FleetName, known: &[PartnerDraft]) {
+    fn check_partner(&mut self, one: &WithOrigin<String>, partner: &FleetName, known: &[PartnerDraft]) {
         let names: Vec<&str> =
             known.iter().filter_map(|p| p.name.as_ref()).map(|name| name.value.as_str()).collect();
-        // A partner without a name has its own error, and may be this one.
+        // A partner with an invalid name has its own error, and may be the one meant.
         if !names.contains(&partner.as_str()) && names.len() == known.len() {
             let nearest = nearest(partner.as_str(), &names).map(str::to_owned);
             let partner = partner.to_string();
@@ -415,7 +415,7 @@ impl Resolver<'_> {
 
     fn partners(&mut self, draft: &Draft) -> Vec<PartnerConfig> {
         self.check_count(&draft.origin, "[[partner]]", draft.partners.len(), PARTNERS_MAX);
-        let mut first: BTreeMap<FleetName, &Located<String>> = BTreeMap::new();
+        let mut first: BTreeMap<FleetName, &WithOrigin<String>> = BTreeMap::new();
         let mut valid = Vec::new();
         for partner in draft.partners.iter().take(PARTNERS_MAX) {
             let name = partner.name.as_ref().and_then(|name| self.keep(name, names::partner));
@@ -455,7 +455,7 @@ impl Resolver<'_> {
         let Some(accept) = &draft.accept else { return Vec::new() };
         let key = accept.key;
         if accept.value.is_empty() {
-            // Read as a list it would let nobody in, read as the default everybody.
+            // As a list it would admit nobody, as the default everybody.
             let example =
                 "accept = [\"lab-ca.pem\"], or leave it out to accept every CA that is trusted here";
             self.record(&accept.origin, Mistake::Empty { key, example });
@@ -465,7 +465,7 @@ impl Resolver<'_> {
         self.ca_files(&accept.value, ACCEPT_MAX)
     }
 
-    fn ca_files(&mut self, written: &[Located<String>], max: usize) -> Vec<PathBuf> {
+    fn ca_files(&mut self, written: &[WithOrigin<String>], max: usize) -> Vec<PathBuf> {
         if let Some(first) = written.get(max) {
             let (key, count) = (first.key, written.len());
             self.record(&first.origin, Mistake::TooManyEntries { key, count, max });
@@ -482,7 +482,7 @@ impl Resolver<'_> {
         valid
     }
 
-    fn ca_file(&mut self, written: &Located<PathBuf>) -> Option<PathBuf> {
+    fn ca_file(&mut self, written: &WithOrigin<PathBuf>) -> Option<PathBuf> {
         let path = self.path(written, "\"acme-ca.pem\"")?;
         if let Some(Err(mistake)) = self.checks.map(|checks| (checks.ca)(written.key, &path)) {
             self.record(&written.origin, mistake);
@@ -490,7 +490,7 @@ impl Resolver<'_> {
         Some(path)
     }
 
-    fn fleet(&mut self, written: &Located<PathBuf>) -> Option<PathBuf> {
+    fn fleet(&mut self, written: &WithOrigin<PathBuf>) -> Option<PathBuf> {
         let path = self.path(written, "\"lab.fleet\"")?;
         if let Some(Err(mistake)) = self.checks.map(|checks| (checks.fleet)(written.key, &path)) {
             self.record(&written.origin, mistake);
@@ -498,7 +498,7 @@ impl Resolver<'_> {
         Some(path)
     }
 
-    fn path(&mut self, written: &Located<PathBuf>, example: &'static str) -> Option<PathBuf> {
+    fn path(&mut self, written: &WithOrigin<PathBuf>, example: &'static str) -> Option<PathBuf> {
         if written.value.as_os_str().is_empty() {
             self.record(&written.origin, Mistake::Empty { key: written.key, example });
             return None;
@@ -526,7 +526,7 @@ impl Resolver<'_> {
         valid
     }
 
-    /// The enclave that the file names, or else the environment, as rcl reads that.
+    /// Returns the enclave of the file, or else of the environment as rcl reads it.
     fn security(&mut self, written: &RosDraft, env: Environment<'_>) -> Option<SecurityConfig> {
         let variable = |name| env(name).filter(|value| !value.is_empty());
         let is_written = written.enclave.is_some() || written.security_root.is_some();
@@ -546,8 +546,8 @@ impl Resolver<'_> {
                 None => return None,
             },
         };
-        let in_environment = variable(ros_env::SECURITY_ENCLAVE_OVERRIDE);
-        let (key, enclave, origin) = match (&written.enclave, in_environment) {
+        let environment_error = variable(ros_env::SECURITY_ENCLAVE_OVERRIDE);
+        let (key, enclave, origin) = match (&written.enclave, environment_error) {
             (Some(enclave), _) => (enclave.key, enclave.value.clone(), enclave.origin.clone()),
             (None, Some(enclave)) => (ros_env::SECURITY_ENCLAVE_OVERRIDE, enclave, Origin::Environment),
             (None, None) => ("enclave", "/".to_owned(), Origin::Environment),
@@ -618,7 +618,12 @@ impl Resolver<'_> {
         AuditConfig { file, room, off }
     }
 
-    fn number(&mut self, written: &Located<i64>, what: &'static str, (min, max): (u64, u64)) -> Option<u64> {
+    fn number(
+        &mut self,
+        written: &WithOrigin<i64>,
+        what: &'static str,
+        (min, max): (u64, u64),
+    ) -> Option<u64> {
         let value = written.value;
         let valid = u64::try_from(value).ok().filter(|n| (min..=max).contains(n));
         if valid.is_none() {
@@ -629,7 +634,7 @@ impl Resolver<'_> {
     }
 
     fn tokens(&mut self, draft: &Draft) -> Vec<TokenConfig> {
-        let mut first: Vec<(TokenConfig, &Located<String>)> = Vec::new();
+        let mut first: Vec<(TokenConfig, &WithOrigin<String>)> = Vec::new();
         for one in &draft.uses {
             let Some(written) = &one.token else { continue };
             for beside in [
@@ -651,7 +656,7 @@ impl Resolver<'_> {
             if let Some(except) = &one.naming.except {
                 self.record(&except.origin, Mistake::TokenAndMore { key: except.key });
             }
-            // Which topic it is, the token says; one it is.
+            // The token determines the single topic.
             let unnamed = NamingDraft { except: None, ..one.naming.clone() };
             let naming = self.naming(&unnamed, Some("/topic")).unwrap_or_default();
             let frame_prefix = self.frame_prefix(one);
@@ -668,7 +673,7 @@ impl Resolver<'_> {
         first.into_iter().map(|(token, _)| token).collect()
     }
 
-    fn token(&mut self, written: &Located<String>) -> Option<TokenSource> {
+    fn token(&mut self, written: &WithOrigin<String>) -> Option<TokenSource> {
         if written.value.trim_start().starts_with(TOKEN_PREFIX) {
             let token = self.keep(written, |key, text| {
                 ShareToken::parse(text).map_err(|fault| Mistake::Token { key, fault })
@@ -682,12 +687,12 @@ impl Resolver<'_> {
         Some(TokenSource::File(path))
     }
 
-    /// Whether a topic has a connection of its own.
-    fn dedicated(&mut self, link: Option<&Located<String>>) -> bool {
+    /// Returns `true` if a topic has a lane.
+    fn dedicated(&mut self, link: Option<&WithOrigin<String>>) -> bool {
         link.and_then(|link| self.keep(link, is_dedicated)).unwrap_or_default()
     }
 
-    fn metadata(&mut self, text: Option<&Located<String>>) -> String {
+    fn metadata(&mut self, text: Option<&WithOrigin<String>>) -> String {
         let Some(text) = text else { return String::new() };
         let (bytes, max) = (text.value.len(), METADATA_FIELD_BYTES_MAX);
         if bytes > max {
@@ -698,20 +703,20 @@ impl Resolver<'_> {
 
     fn uses(&mut self, draft: &Draft, node_name: Option<&NodeName>) -> Vec<UseConfig> {
         self.check_count(&draft.origin, self.words.uses, draft.uses.len(), USES_MAX);
-        let shared: BTreeMap<(&str, &str), &Located<String>> = draft
+        let shared: BTreeMap<(&str, &str), &WithOrigin<String>> = draft
             .shares
             .iter()
             .filter_map(|share| share.topic.as_ref())
             .map(|topic| ((interface_of(Some(topic)).key(), topic.value.as_str()), topic))
             .rev()
             .collect();
-        let mut first: BTreeMap<(NodeName, &str, String, bool), &Located<String>> = BTreeMap::new();
+        let mut first: BTreeMap<(NodeName, &str, String, bool), &WithOrigin<String>> = BTreeMap::new();
         let mut valid = Vec::new();
         for one in draft.uses.iter().take(USES_MAX).filter(|one| one.token.is_none()) {
-            let resolved = self.one_use(one, node_name);
+            let resolved = self.resolve_use(one, node_name);
             if let (Some(resolved), Some(written)) = (&resolved, &one.topic) {
                 let (key, topic) = (written.key, resolved.topic.clone());
-                // Of what matches a pattern some may go one way and some the other.
+                // Topics that match a pattern may go in different directions.
                 let is_other_way = is_pattern(&topic) && resolved.publish;
                 let what = resolved.interface.key();
                 let pair = (resolved.from.clone(), what, topic.clone(), is_other_way);
@@ -732,7 +737,7 @@ impl Resolver<'_> {
         valid
     }
 
-    fn one_use(&mut self, one: &UseDraft, node_name: Option<&NodeName>) -> Option<UseConfig> {
+    fn resolve_use(&mut self, one: &UseDraft, node_name: Option<&NodeName>) -> Option<UseConfig> {
         let from = one.from.as_ref().and_then(|from| {
             let name = self.keep(from, names::node)?;
             if node_name == Some(&name) {
@@ -790,7 +795,7 @@ impl Resolver<'_> {
         one.frame_prefix.as_ref().and_then(|prefix| self.keep(prefix, names::frame_prefix))
     }
 
-    /// What a rule for this topic leaves out, and other names; nothing if the topic is not known.
+    /// Resolves exceptions and other names. Returns `None` if the topic is unknown.
     fn naming(&mut self, written: &NamingDraft, topic: Option<&str>) -> Option<Naming> {
         let except = written.except.as_ref().map(|except| {
             if let Some(topic) = topic.filter(|topic| !is_pattern(topic)) {
@@ -832,8 +837,8 @@ impl Resolver<'_> {
         Some(naming)
     }
 
-    /// Whether `as` has the wildcard of the topic, or neither has any.
-    fn check_as(&mut self, written: &Located<String>, topic: &str) -> bool {
+    /// Checks that `as` and the topic both have a wildcard, or neither has.
+    fn check_as(&mut self, written: &WithOrigin<String>, topic: &str) -> bool {
         let split = |name: &str| {
             let (stem, last) = name.rsplit_once('/').unwrap_or_default();
             (stem.to_owned(), last.to_owned())
@@ -852,7 +857,7 @@ impl Resolver<'_> {
         false
     }
 
-    /// Says so of settings that mean nothing for services.
+    /// Reports settings that services do not have.
     fn check_topics_only(
         &mut self,
         interface: Interface,
@@ -902,7 +907,7 @@ impl Resolver<'_> {
             };
             self.record(origin, mistake);
         }
-        let mut ns = |time: &Option<Located<String>>| {
+        let mut ns = |time: &Option<WithOrigin<String>>| {
             let time = self.keep(time.as_ref()?, names::age)?;
             u64::try_from(time.as_nanos()).ok()
         };
@@ -933,7 +938,7 @@ impl Resolver<'_> {
         }
     }
 
-    fn socket(&mut self, socket: &Located<PathBuf>) -> Option<PathBuf> {
+    fn socket(&mut self, socket: &WithOrigin<PathBuf>) -> Option<PathBuf> {
         const EXAMPLE: &str = "\"/run/sgc/arm-1.sock\"";
         let path = self.base_dir.join(&socket.value);
         let (bytes, max) = (path.as_os_str().len(), SOCKET_PATH_BYTES_MAX);
@@ -946,11 +951,11 @@ impl Resolver<'_> {
     }
 }
 
-/// The deepest history that can be set.
+/// The deepest history that can be configured.
 const HISTORY_DEPTH_MAX: u64 = 4096;
 
-/// The kind of a table's interface, after the key of its name, or after the last word of an argument's key.
-fn interface_of(named: Option<&Located<String>>) -> Interface {
+/// Returns the kind of a table's interface from the key of its name, or from the last word of an argument's key.
+fn interface_of(named: Option<&WithOrigin<String>>) -> Interface {
     let key = named.and_then(|named| named.key.split(' ').next_back()).unwrap_or_default();
     let others = [Interface::Service, Interface::Action, Interface::Parameters];
     others.into_iter().find(|interface| interface.key() == key).unwrap_or_default()

@@ -1,16 +1,16 @@
-//! `[ros]` and the ROS 2 environment variables → what the local ROS 2 network is.
+//! Resolves `[ros]` and the ROS 2 environment variables into the settings of the local ROS 2 network.
 //!
-//! The variables mean what they mean to `rcl`, with one difference: where `rcl` warns about a value and goes
-//! on with another, this is an error. A key of the file stands above its variable, which is then not read.
+//! The variables have their meaning in `rcl`, with one difference: a value that `rcl` replaces with a warning is an
+//! error here. A key of the file overrides its variable, which is then not read.
 
-use super::draft::{Located, RosDraft};
+use super::draft::{RosDraft, WithOrigin};
 use super::error::{ConfigError, Mistake, Origin};
 use super::schema::nearest;
 use super::{DiscoveryRange, Environment, RosConfig, names};
 
 /// The greatest domain id for which DDS's formula gives valid ports (RTPS 2.5, 9.6.2.3).
 pub const DOMAIN_ID_MAX: u32 = 232;
-/// Peers that are contacted without having been discovered.
+/// Most peers that are contacted without discovery.
 pub const STATIC_PEERS_MAX: usize = 64;
 
 const DOMAIN_ID: &str = "ROS_DOMAIN_ID";
@@ -32,7 +32,7 @@ const RANGES: [(&str, &str, DiscoveryRange); 4] = [
 const RANGES_IN_FILE: [&str; 4] = [RANGES[0].0, RANGES[1].0, RANGES[2].0, RANGES[3].0];
 const RANGES_IN_ENVIRONMENT: [&str; 4] = [RANGES[0].1, RANGES[1].1, RANGES[2].1, RANGES[3].1];
 
-/// Resolves both; mistakes go to `errors` and leave a default behind.
+/// Resolves the settings. Mistakes are added to `errors` and leave defaults.
 pub(super) fn resolve(ros: &RosDraft, env: Environment<'_>, errors: &mut Vec<ConfigError>) -> RosConfig {
     let domain_id = match &ros.domain_id {
         Some(id) => keep(file_domain_id(id), errors),
@@ -42,7 +42,7 @@ pub(super) fn resolve(ros: &RosDraft, env: Environment<'_>, errors: &mut Vec<Con
         Some(range) => keep(range, errors),
         None => keep(env_range(env, ros.localhost_only.is_none()), errors),
     };
-    // After a mistake the widest guess, so that the mistake leads to no others.
+    // After a mistake the widest range is assumed, so that the mistake causes no others.
     let range = range.unwrap_or(Range { value: DiscoveryRange::Subnet, set_by: None, only_localhost: false });
     let static_peers = match &ros.static_peers {
         Some(peers) => file_peers(peers, &range, errors),
@@ -54,10 +54,10 @@ pub(super) fn resolve(ros: &RosDraft, env: Environment<'_>, errors: &mut Vec<Con
         discovery: range.value,
         static_peers,
         graph: ros.graph.as_ref().is_none_or(|graph| graph.value),
-        // Where paths are taken from is not known here.
+        // The directory of relative paths is unknown here.
         definitions: Vec::new(),
         cyclonedds_uri: variable(env, CYCLONEDDS_URI),
-        // Neither is where its keystore is.
+        // The keystore's place is unknown here as well.
         security: None,
     }
 }
@@ -67,15 +67,15 @@ fn keep<T>(result: Result<T, ConfigError>, errors: &mut Vec<ConfigError>) -> Opt
 }
 
 fn variable(env: Environment<'_>, name: &str) -> Option<String> {
-    // To ROS 2 an empty variable is one that is not set.
+    // ROS 2 treats an empty variable as unset.
     env(name).filter(|value| !value.is_empty())
 }
 
-fn in_environment(mistake: Mistake) -> ConfigError {
+fn environment_error(mistake: Mistake) -> ConfigError {
     ConfigError::new(Origin::Environment, mistake)
 }
 
-fn file_domain_id(id: &Located<i64>) -> Result<u32, ConfigError> {
+fn file_domain_id(id: &WithOrigin<i64>) -> Result<u32, ConfigError> {
     match u32::try_from(id.value) {
         Ok(value) if value <= DOMAIN_ID_MAX => Ok(value),
         _ => {
@@ -88,7 +88,7 @@ fn env_domain_id(env: Environment<'_>) -> Result<u32, ConfigError> {
     let Some(value) = variable(env, DOMAIN_ID) else { return Ok(0) };
     match c_number(value.trim()) {
         Some(id) if id <= DOMAIN_ID_MAX => Ok(id),
-        _ => Err(in_environment(Mistake::DomainId {
+        _ => Err(environment_error(Mistake::DomainId {
             key: DOMAIN_ID,
             value: format!("{value:?}"),
             max: DOMAIN_ID_MAX,
@@ -96,7 +96,7 @@ fn env_domain_id(env: Environment<'_>) -> Result<u32, ConfigError> {
     }
 }
 
-/// A number as C's `strtoul` reads it with base 0, which is what `rcl` does: `0x10` and `020` are 16.
+/// Parses a number as C's `strtoul` does with base 0, since `rcl` uses it: `0x10` and `020` are 16.
 fn c_number(text: &str) -> Option<u32> {
     let text = text.strip_prefix('+').unwrap_or(text);
     let (digits, radix) = if let Some(hex) = text.strip_prefix("0x").or_else(|| text.strip_prefix("0X")) {
@@ -109,12 +109,12 @@ fn c_number(text: &str) -> Option<u32> {
     if digits.starts_with(['+', '-']) { None } else { u32::from_str_radix(digits, radix).ok() }
 }
 
-/// A range and who chose it.
+/// A range with its origin.
 struct Range {
     value: DiscoveryRange,
-    /// Key or variable, and its value; none for the default.
+    /// Key or variable with its value; `None` for the default.
     set_by: Option<(&'static str, String)>,
-    /// Chosen by the older switch, which also turns static peers off.
+    /// Whether the older switch selected it, which also disables static peers.
     only_localhost: bool,
 }
 
@@ -150,7 +150,7 @@ fn file_range(ros: &RosDraft) -> Option<Result<Range, ConfigError>> {
 fn env_range(env: Environment<'_>, read_switch: bool) -> Result<Range, ConfigError> {
     let switch = variable(env, LOCALHOST_ONLY).filter(|_| read_switch);
     match switch.as_deref() {
-        // Deprecated, but when it is on it stands above the range and the peers.
+        // The variable is deprecated, but if it is on, it overrides the range and the peers.
         Some("1") => {
             let set_by = Some((LOCALHOST_ONLY, "\"1\"".to_owned()));
             return Ok(Range { value: DiscoveryRange::Localhost, set_by, only_localhost: true });
@@ -158,18 +158,18 @@ fn env_range(env: Environment<'_>, read_switch: bool) -> Result<Range, ConfigErr
         None | Some("0") => {}
         Some(value) => {
             let value = value.to_owned();
-            return Err(in_environment(Mistake::Switch { key: LOCALHOST_ONLY, value }));
+            return Err(environment_error(Mistake::Switch { key: LOCALHOST_ONLY, value }));
         }
     }
     let Some(written) = variable(env, DISCOVERY_RANGE) else {
         return Ok(Range { value: DiscoveryRange::Subnet, set_by: None, only_localhost: false });
     };
-    match RANGES.iter().find(|(_, in_environment, _)| *in_environment == written) {
+    match RANGES.iter().find(|(_, environment_error, _)| *environment_error == written) {
         Some((.., value)) => {
             let set_by = Some((DISCOVERY_RANGE, format!("{written:?}")));
             Ok(Range { value: *value, set_by, only_localhost: false })
         }
-        None => Err(in_environment(Mistake::UnknownWord {
+        None => Err(environment_error(Mistake::UnknownWord {
             key: DISCOVERY_RANGE,
             nearest: nearest(&written, &RANGES_IN_ENVIRONMENT),
             value: written,
@@ -179,7 +179,7 @@ fn env_range(env: Environment<'_>, read_switch: bool) -> Result<Range, ConfigErr
 }
 
 fn file_peers(
-    peers: &Located<Vec<Located<String>>>,
+    peers: &WithOrigin<Vec<WithOrigin<String>>>,
     range: &Range,
     errors: &mut Vec<ConfigError>,
 ) -> Vec<String> {
@@ -197,7 +197,7 @@ fn file_peers(
     if count > STATIC_PEERS_MAX {
         errors.push(peers.error(Mistake::TooManyEntries { key: peers.key, count, max: STATIC_PEERS_MAX }));
     }
-    // ROS 2 goes on without the peers in these cases. What is written in the file is meant.
+    // ROS 2 ignores the peers in these cases. Peers in the file are meant, so they are an error.
     if let Some((other, other_value)) = &range.set_by
         && (!range.value.asks_peers() || *other == "localhost_only")
         && !peers.value.is_empty()
@@ -218,14 +218,14 @@ fn env_peers(env: Environment<'_>) -> Result<Vec<String>, ConfigError> {
     let Some(written) = variable(env, STATIC_PEERS) else { return Ok(Vec::new()) };
     let mut peers: Vec<String> = Vec::new();
     for peer in written.split(';').map(str::trim).filter(|peer| !peer.is_empty()) {
-        let peer = names::peer(STATIC_PEERS, peer).map_err(in_environment)?;
+        let peer = names::peer(STATIC_PEERS, peer).map_err(environment_error)?;
         if !peers.contains(&peer) {
             peers.push(peer);
         }
     }
     if peers.len() > STATIC_PEERS_MAX {
         let (key, count) = (STATIC_PEERS, peers.len());
-        return Err(in_environment(Mistake::TooManyEntries { key, count, max: STATIC_PEERS_MAX }));
+        return Err(environment_error(Mistake::TooManyEntries { key, count, max: STATIC_PEERS_MAX }));
     }
     Ok(peers)
 }

@@ -1,6 +1,6 @@
-//! Where a router is to be found: `quic://HOST:PORT`, `srv://DOMAIN`, `mdns://`.
+//! [`RouterUrl`]: an entry of `routers`, such as `quic://HOST:PORT`, `srv://DOMAIN` or `mdns://`.
 //!
-//! It parses and prints; looking up and dialling is the business of `crate::finding`.
+//! This module parses and prints. `crate::discovery` resolves and dials.
 
 use std::fmt;
 use std::net::IpAddr;
@@ -9,51 +9,51 @@ use std::str::FromStr;
 use sgc_transport::{LinkUrl, UrlError};
 use sgc_trust::NodeName;
 
-/// Most ways to one router: one by each transport.
+/// Most URLs of one router: one for each transport.
 pub const WAYS_MAX: usize = 7;
 /// The longest name in DNS, in text.
 const NAME_BYTES_MAX: usize = 253;
-/// What DNS knows the routers of a domain by (RFC 2782): service and protocol.
+/// Service and protocol of routers in SRV records (RFC 2782).
 pub const SRV_SERVICE: &str = "_sgc._udp";
 
-/// How a router is found.
+/// A way to find a router.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum RouterUrl {
-    /// `quic://HOST:PORT`: it is there.
+    /// `quic://HOST:PORT`: the router's address.
     At(LinkUrl),
-    /// `quic://HOST:PORT,tls://HOST:PORT`: ways to one router, the best first; 2 to [`WAYS_MAX`], none twice.
+    /// `quic://HOST:PORT,tls://HOST:PORT`: URLs of one router, the best first; 2 to [`WAYS_MAX`], without duplicates.
     Ways(Vec<LinkUrl>),
-    /// `srv://DOMAIN`: DNS names those of the domain, of which one is wanted.
+    /// `srv://DOMAIN`: one of the routers that DNS names for the domain.
     Srv(SrvDomain),
-    /// `mdns://`, any on the local network that this node trusts, or `mdns://NODE`, the one of that name.
+    /// `mdns://`: any trusted router on the local network; `mdns://NODE`: the one with that name.
     Mdns(Option<NodeName>),
 }
 
 impl RouterUrl {
-    /// A router that is reached in one of these ways; at least one.
-    pub(crate) fn by(ways: &[LinkUrl]) -> Self {
-        match ways {
+    /// Returns the entry of a router with these URLs, at least one.
+    pub(crate) fn by(urls: &[LinkUrl]) -> Self {
+        match urls {
             [only] => Self::At(only.clone()),
-            ways => Self::Ways(ways.to_vec()),
+            urls => Self::Ways(urls.to_vec()),
         }
     }
 
-    /// Where it is, if the user said so, in every way; otherwise nothing.
-    pub fn ways(&self) -> &[LinkUrl] {
+    /// Returns the router's URLs; empty if they have to be found.
+    pub fn urls(&self) -> &[LinkUrl] {
         match self {
             Self::At(url) => std::slice::from_ref(url),
-            Self::Ways(ways) => ways,
+            Self::Ways(urls) => urls,
             Self::Srv(_) | Self::Mdns(_) => &[],
         }
     }
 }
 
-/// A domain whose SRV records name routers; absolute, in small letters, without its last dot.
+/// A domain whose SRV records name routers. Lower case, without its final dot.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct SrvDomain(Box<str>);
 
 impl SrvDomain {
-    /// What DNS is asked for: `_sgc._udp.DOMAIN.`, absolute, so that no search list counts.
+    /// Returns the name of the SRV query: `_sgc._udp.DOMAIN.`. It is absolute, so that no search list applies.
     pub fn query(&self) -> String {
         format!("{SRV_SERVICE}.{}.", self.0)
     }
@@ -65,39 +65,39 @@ impl fmt::Display for SrvDomain {
     }
 }
 
-/// Why a text says of no router where it is.
+/// Reasons why a text is no entry of `routers`.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum RouterUrlError {
-    /// It is no URL of a link either.
+    /// It is no URL of a link.
     #[error(transparent)]
     Link(#[from] UrlError),
-    /// No way of finding routers has that name.
+    /// The scheme is unknown.
     #[error("{0}:// is not known: it takes quic://HOST:PORT, srv://DOMAIN and mdns://")]
     Scheme(String),
-    /// Too many ways to one router.
+    /// There are too many URLs of one router.
     #[error("{0} ways to one router; it takes at most {WAYS_MAX}")]
     Ways(usize),
-    /// One way twice.
+    /// A URL occurs twice.
     #[error("{0} stands there twice")]
     WayTwice(String),
-    /// What is found otherwise is no way to a router.
+    /// A search stands among the URLs of one router.
     #[error(
         "{0} finds a router by itself: only addresses, such as \"quic://HOST:PORT,tls://HOST:443\", can stand together"
     )]
     WayFinds(String),
-    /// Not a domain.
+    /// It is no domain.
     #[error("after srv:// comes the domain whose {SRV_SERVICE} records name routers: \"srv://lab.example\"")]
     Domain,
-    /// An address, which has no SRV records.
+    /// It is an address, which has no SRV records.
     #[error("{0} is an address, which DNS has no SRV records of: write \"quic://{0}\"")]
     DomainIsAddress(IpAddr),
-    /// The labels of the query are in front already.
+    /// It already has the labels of the query.
     #[error("{SRV_SERVICE} is put in front by itself: write \"srv://{0}\"")]
     DomainIsQuery(String),
-    /// A port, which the record says.
+    /// It has a port, which the SRV record defines.
     #[error("the SRV records say the port: write \"srv://{0}\"")]
     DomainPort(String),
-    /// Not the name of a node.
+    /// It is no node name.
     #[error(
         "after mdns:// comes nothing, for any router that this node trusts, or a router's name: \"mdns://cloud\""
     )]
@@ -109,7 +109,7 @@ impl FromStr for RouterUrl {
 
     fn from_str(text: &str) -> Result<Self, RouterUrlError> {
         if text.contains(',') {
-            return ways(text).map(Self::Ways);
+            return urls(text).map(Self::Ways);
         }
         match text.split_once("://") {
             Some(("srv", rest)) => domain(rest.strip_suffix('/').unwrap_or(rest)).map(Self::Srv),
@@ -126,22 +126,22 @@ impl FromStr for RouterUrl {
     }
 }
 
-fn ways(text: &str) -> Result<Vec<LinkUrl>, RouterUrlError> {
+fn urls(text: &str) -> Result<Vec<LinkUrl>, RouterUrlError> {
     let count = text.split(',').count();
     if count > WAYS_MAX {
         return Err(RouterUrlError::Ways(count));
     }
-    let mut ways = Vec::with_capacity(count);
+    let mut urls = Vec::with_capacity(count);
     for one in text.split(',') {
         match one.trim().parse()? {
-            RouterUrl::At(url) if ways.contains(&url) => {
+            RouterUrl::At(url) if urls.contains(&url) => {
                 return Err(RouterUrlError::WayTwice(url.to_string()));
             }
-            RouterUrl::At(url) => ways.push(url),
+            RouterUrl::At(url) => urls.push(url),
             other => return Err(RouterUrlError::WayFinds(other.to_string())),
         }
     }
-    Ok(ways)
+    Ok(urls)
 }
 
 fn domain(text: &str) -> Result<SrvDomain, RouterUrlError> {
@@ -161,7 +161,7 @@ fn domain(text: &str) -> Result<SrvDomain, RouterUrlError> {
     {
         return Err(RouterUrlError::DomainIsQuery(rest.to_owned()));
     }
-    // The labels in front count.
+    // The length includes the labels of the query.
     let fits = text.len() + SRV_SERVICE.len() < NAME_BYTES_MAX;
     if fits && is_domain(&text) { Ok(SrvDomain(text.into())) } else { Err(RouterUrlError::Domain) }
 }
@@ -185,8 +185,8 @@ impl fmt::Display for RouterUrl {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::At(url) => write!(f, "{url}"),
-            Self::Ways(ways) => {
-                for (index, way) in ways.iter().enumerate() {
+            Self::Ways(urls) => {
+                for (index, way) in urls.iter().enumerate() {
                     write!(f, "{}{way}", if index > 0 { "," } else { "" })?;
                 }
                 Ok(())

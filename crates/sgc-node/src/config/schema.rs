@@ -1,7 +1,6 @@
-//! Which tables and keys a configuration has, which are planned, and which one a misspelt key was meant to be.
+//! Tables and keys of a configuration, planned keys, and suggestions for misspelt ones.
 //!
-//! This table is the one place where a key becomes known; `docs/reference/configuration.md` is tested against it.
-//! What the values may be is the business of `resolve`.
+//! A key is defined here only; `docs/reference/configuration.md` is tested against this table. `resolve` checks the values.
 
 /// A table of the file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,7 +36,7 @@ pub enum Table {
 }
 
 impl Table {
-    /// All of them, in the order in which the reference lists them.
+    /// All tables, in the order of the reference.
     pub const ALL: [Self; 14] = [
         Self::Top,
         Self::Node,
@@ -55,7 +54,7 @@ impl Table {
         Self::Admin,
     ];
 
-    /// How the table is written, brackets included.
+    /// Returns the table's header, brackets included.
     pub fn header(self) -> &'static str {
         match self {
             Self::Top => "the top level",
@@ -75,7 +74,7 @@ impl Table {
         }
     }
 
-    /// The keys that this version implements.
+    /// Returns the supported keys.
     pub fn keys(self) -> &'static [&'static str] {
         match self {
             Self::Top => &[
@@ -187,7 +186,7 @@ impl Table {
         }
     }
 
-    /// The keys that the design names and a later version brings.
+    /// Returns the keys of the design that are not implemented yet.
     pub fn planned_keys(self) -> &'static [&'static str] {
         match self {
             Self::Top => &["profile"],
@@ -206,8 +205,8 @@ impl Table {
         }
     }
 
-    /// The tables in which `key` is known, and the key. Tables within tables do not count: a `router` in `[node]`
-    /// is not a misplaced `[router]`.
+    /// Returns the tables that have `key`, with the key. Tables within tables do not count: a `router` in `[node]` is
+    /// no misplaced `[router]`.
     pub(super) fn homes(key: &str) -> Option<(&'static str, Vec<&'static str>)> {
         let has = |table: &&Self| table.keys().contains(&key) && (**table != Self::Top || key == "identity");
         let homes: Vec<Self> = Self::ALL.iter().filter(has).copied().collect();
@@ -216,8 +215,8 @@ impl Table {
     }
 }
 
-/// The candidate that `word` was most likely meant to be: at most one edit in three characters away, or with the
-/// word as a part of it. Upper and lower case are alike.
+/// Returns the candidate that `word` was probably meant to be: at most one edit per three characters away, or
+/// containing the word. Case is ignored.
 pub(crate) fn nearest<'c>(word: &str, candidates: &[&'c str]) -> Option<&'c str> {
     const PART_CHARS_MIN: usize = 4;
     let word = word.to_lowercase();
@@ -234,8 +233,8 @@ pub(crate) fn nearest<'c>(word: &str, candidates: &[&'c str]) -> Option<&'c str>
     close.or_else(|| candidates.iter().find(has_part).copied())
 }
 
-/// Insertions, deletions, substitutions and swaps of neighbours that turn `a` into `b` (optimal string
-/// alignment). Long words are not compared, so the cost is bounded.
+/// Returns the number of insertions, deletions, substitutions and swaps of neighbours that turn `a` into `b` (optimal
+/// string alignment). Long words are not compared, to bound the cost.
 fn edits(a: &str, b: &str) -> usize {
     const WORD_CHARS_MAX: usize = 64;
     let (a, b): (Vec<char>, Vec<char>) = (a.chars().collect(), b.chars().collect());

@@ -1,4 +1,4 @@
-//! Alerts for an operator, as this node comes to know of them.
+//! Alerts for the operator, raised by events of the control task.
 
 use std::net::SocketAddr;
 use std::time::Instant;
@@ -14,15 +14,16 @@ use super::{Core, now};
 use crate::alerts::{Alert, clock_alert};
 use crate::strangers;
 
-/// The place of a process that is linked to another router of the mesh.
+/// Place of a process that is linked to another router.
 const ELSEWHERE: &str = "another router";
 
-/// Seconds for which a failure to send to the local network is shown: longer than participants' announcements are apart.
+/// Seconds for which a failure to send to the local network is shown. It exceeds the interval of participants'
+/// announcements.
 const UNSENT_SHOWN_S: u64 = 60;
 
 impl<N: RosNetwork> Core<N> {
-    /// Closes the link of a run whose place another one has. One that came back after it was told so is a second
-    /// process; the first is told of it, and whoever keeps this node.
+    /// Closes the link of a run that another run of the same node superseded. A run that returns after it was told so
+    /// is a second process; both it and the operator are told.
     pub(super) fn close_superseded(&mut self, link: LinkId, by: Option<LinkId>, alive: bool) {
         let holder = by.and_then(|by| self.links.get(&by));
         let place = holder.map_or(ELSEWHERE.to_owned(), |entry| entry.link.remote().to_string());
@@ -36,7 +37,7 @@ impl<N: RosNetwork> Core<N> {
             return;
         }
         if let Some(holder) = by.and_then(|by| self.links.get(&by)) {
-            // A peer that does not take frames finds its link closed for that elsewhere.
+            // If the queue is full, the link closes for that reason elsewhere.
             holder.control.send(Control::IdentityInUse { place: Place::from(remote) });
         }
         self.control_drops.count_from("identity_in_use", node);
@@ -52,11 +53,11 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// A peer closed a link because another process with this node's identity has its place.
+    /// Handles a link that a peer closed because another process with this node's identity took its place.
     pub(super) fn displaced(&mut self, place: &str) {
         self.router.handle_superseded();
-        // Joins that the link carried are lost by now. What comes to them meanwhile comes to the other process, and
-        // from there perhaps to the very same programs.
+        // Joins over that link are lost. Their data goes to the other process now, and from there perhaps to the same
+        // programs.
         self.drain();
         for (name, sink) in &self.sinks {
             if self.endpoint.join_status(name) != Some(JoinStatus::Granted) {
@@ -72,10 +73,10 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// A peer says that it keeps another process with this node's identity out.
+    /// Handles a peer's report that it keeps out another process with this node's identity.
     pub(super) fn kept_out(&mut self, link: LinkId, place: Place) {
         let Some(entry) = self.links.get(&link) else { return };
-        // Others have no links to be kept out of.
+        // Other peers have no links from which a process could be kept out.
         if !entry.link.peer().may_route && entry.url.is_none() {
             self.control_drops.count_from("unknown", link);
             return;
@@ -88,7 +89,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// A peer told its time.
+    /// Compares the clock with the time that a peer told.
     pub(super) fn compare_clocks(&self, link: LinkId) {
         let Some(entry) = self.links.get(&link) else { return };
         let ahead_ms = self.router.clock_ahead_ms(link).filter(|ms| clocks_differ(*ms));
@@ -100,7 +101,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Looks whether the clock has come to where this node's certificate begins.
+    /// Checks whether the clock has reached the beginning of this node's certificate.
     pub(super) fn await_clock(&mut self, unix: UnixMillis) {
         if clock_alert(&self.identity, unix).is_none() {
             self.awaits_clock = false;
@@ -108,7 +109,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Returns the alerts that an operator has to see to now.
+    /// Returns the current alerts.
     pub(super) fn alerts(&self) -> Vec<Alert> {
         let now = now();
         let mut alerts = Vec::from_iter(clock_alert(&self.identity, now.unix));

@@ -1,9 +1,9 @@
-//! Subscribers, publishers and service clients across nodes: those here are told to the owners of what they use, and those elsewhere that
-//! use what this node shares are shown on its local network.
+//! Consumers across nodes: local subscribers, publishers and service clients are announced to the owners of what they
+//! use, and far ones that use our shares are shown on the local network.
 //!
-//! One reader takes the messages of a shared topic, however many subscribers there are elsewhere; those are shown by endpoints that
-//! nothing matches ([`RosNetwork::show`]). One writer gives the messages of all publishers elsewhere: it is shown as that of the first of
-//! them, and each other one by an endpoint that nothing matches.
+//! One reader takes the messages of a shared topic, however many far subscribers there are. Each of them is shown by an
+//! endpoint that nothing matches ([`RosNetwork::show`]). One writer writes the messages of all far publishers. It is
+//! shown as the first of them, and each other one by an endpoint that nothing matches.
 
 use std::any::Any;
 use std::collections::{BTreeMap, BTreeSet};
@@ -16,42 +16,43 @@ use tracing::{debug, info};
 
 use super::{Core, CoreEvent, drop_elsewhere};
 
-/// How long changes of the local consumers are gathered before owners are told.
+/// Delay for gathering changes of local consumers before owners are told.
 const TELL_AFTER: Duration = Duration::from_millis(100);
-/// How long changes of the consumers elsewhere are gathered before they are shown.
+/// Delay for gathering changes of far consumers before they are shown.
 const SHOW_AFTER: Duration = Duration::from_millis(100);
-/// How long what a node tells next waits for each consumer that it told anew: to show one has all programs of the local network told.
+/// Delay of a node's next announcement for each new consumer, since showing one informs all programs of the local
+/// network.
 const SHOW_EACH: Duration = Duration::from_millis(20);
-/// Nodes that are asked for their consumers.
+/// Most nodes that are asked for their consumers.
 const ASKED_NODES_MAX: usize = 64;
-/// Consumers elsewhere that are shown, of all nodes and interfaces.
+/// Most far consumers that are shown, of all nodes and interfaces.
 const SHOWN_MAX: usize = 512;
 
-/// A consumer elsewhere.
+/// Key of a far consumer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct ConsumerKey {
     /// The share that it uses.
     pub(super) interface: Name,
-    /// Its SGC node.
+    /// SGC node of the consumer.
     pub(super) peer: NodeId,
-    /// Its id there.
+    /// Id of the consumer at its node.
     pub(super) id: [u8; 8],
 }
 
-/// The local endpoints that stand for one consumer.
+/// The local endpoints that stand for a far consumer.
 struct ShownConsumer {
     node: RosNode,
     ends: Vec<(EndpointKind, EndpointSpec)>,
-    /// None while they are being made.
+    /// The endpoints; `None` while they are being created.
     endpoints: Option<Vec<(EndpointKind, ShownEndpoint)>>,
 }
 
-/// The consumers that a node told of.
+/// The consumers that a node announced.
 struct PeerConsumers {
     current: Vec<Consumer>,
-    /// Its last answer, until that is taken over.
+    /// Its last announcement, until that is applied.
     next: Option<Vec<Consumer>>,
-    /// When that may be.
+    /// Time at which it may be applied.
     ready_at: Instant,
 }
 
@@ -59,24 +60,24 @@ struct PeerConsumers {
 #[derive(Default)]
 struct Sinks {
     granted: BTreeSet<SinkId>,
-    /// Until when the node counts as granted without any.
+    /// Time until which a node without sinks still counts as granted.
     until: Option<Instant>,
 }
 
-/// The consumers of other nodes, and when those of this one are told.
+/// The far consumers, and the schedule of announcing the local ones.
 #[derive(Default)]
 pub(super) struct FarConsumers {
-    /// When owners are told of the local consumers.
+    /// Time at which owners are told of local consumers.
     tell_due: Option<Instant>,
-    /// When the local network is brought in line with what was told.
+    /// Time at which far consumers are shown.
     show_due: Option<Instant>,
     sinks: BTreeMap<NodeId, BTreeMap<(Name, Role), Sinks>>,
     asked: BTreeSet<NodeId>,
     told: BTreeMap<NodeId, PeerConsumers>,
-    /// Nodes that are out of reach, and until when their consumers stay.
+    /// Unreachable nodes, and the time until which their consumers stay.
     lost: BTreeMap<NodeId, Instant>,
     shown: BTreeMap<ConsumerKey, ShownConsumer>,
-    /// How many there was no room for the last time: local ones to tell, and those elsewhere to show.
+    /// Numbers of consumers without room at the last attempt: local ones to announce, and far ones to show.
     left_out: [u64; 2],
 }
 
@@ -88,7 +89,7 @@ impl FarConsumers {
         self.show_soon(now);
     }
 
-    /// A sink is gone. Without another one its node counts as granted until then, so that a restarted router changes nothing.
+    /// Removes a sink. Its node still counts as granted until `until`, so that a restart of a router changes nothing.
     pub(super) fn sink_left(&mut self, peer: NodeId, name: Name, sink: SinkId, until: Instant) {
         let of_peer = self.sinks.get_mut(&peer).into_iter().flatten();
         for (_, sinks) in of_peer.filter(|((of, _), _)| *of == name) {
@@ -104,7 +105,7 @@ impl FarConsumers {
         left.chain(told).chain(self.lost.values().copied()).chain(self.tell_due).chain(self.show_due).min()
     }
 
-    /// Takes what a node tells, to be shown soon, or later if there was much to show of that node.
+    /// Stores a node's announcement. It is applied soon, or later if the node announced many new consumers.
     fn tell(&mut self, now: Instant, peer: NodeId, consumers: Vec<Consumer>) {
         let soon = now + SHOW_AFTER;
         let new = || PeerConsumers { current: Vec::new(), next: None, ready_at: soon };
@@ -114,7 +115,7 @@ impl FarConsumers {
         }
     }
 
-    /// Takes over what nodes told whose time has come; true if something was.
+    /// Applies the announcements that are due. Returns `true` if there was one.
     fn take_over(&mut self, now: Instant) -> bool {
         let mut took = false;
         for told in self.told.values_mut().filter(|told| told.ready_at <= now) {
@@ -131,13 +132,13 @@ impl FarConsumers {
         self.show_due.get_or_insert(now + SHOW_AFTER);
     }
 
-    /// Returns the endpoints of all consumers that are shown, which are not from here on.
+    /// Removes and returns the endpoints of all shown consumers.
     pub(super) fn take_shown(&mut self) -> Vec<Box<dyn Any + Send>> {
         let shown = std::mem::take(&mut self.shown).into_values();
         shown.filter_map(|shown| Some(Box::new(shown.endpoints?) as _)).collect()
     }
 
-    /// The type hashes that the subscribers or clients of a share announce, with their SGC nodes.
+    /// Returns the type hashes that a share's far subscribers or clients announce, with their SGC nodes.
     pub(super) fn hashes(&self, interface: Name, role: Role) -> impl Iterator<Item = (NodeId, &str)> {
         let of = (interface, role);
         self.told
@@ -150,7 +151,7 @@ impl FarConsumers {
             })
     }
 
-    /// Forgets what is over; true if something was.
+    /// Forgets expired entries. Returns `true` if there was one.
     fn forget(&mut self, now: Instant) -> bool {
         let mut forgot = false;
         let mut is_over = |until: Option<Instant>| {
@@ -161,7 +162,7 @@ impl FarConsumers {
         self.lost.retain(|peer, until| {
             let is_over = is_over(Some(*until));
             if is_over && let Some(told) = self.told.get_mut(peer) {
-                // Its pace stays: it may come back at once.
+                // The pace is kept, since the node may return at once.
                 (told.current, told.next) = (Vec::new(), None);
             }
             !is_over
@@ -173,7 +174,7 @@ impl FarConsumers {
         forgot
     }
 
-    /// The consumers to be shown, and how many there is no room for. Each node has as many places as every other.
+    /// Returns the consumers to show, and the number without room. All nodes have the same share of places.
     fn wanted(&self) -> (BTreeMap<ConsumerKey, &Consumer>, u64) {
         let (mut ranked, mut left_out) = (Vec::new(), 0);
         for (peer, told) in &self.told {
@@ -202,14 +203,14 @@ impl FarConsumers {
 }
 
 impl<N: RosNetwork> Core<N> {
-    /// Has owners told if local consumers may have changed.
+    /// Schedules an announcement, since local consumers may have changed.
     pub(super) fn note_consumers(&mut self) {
         if self.routes.as_mut().is_some_and(|routes| routes.take_consumers_changed()) {
             self.consumers.tell_due.get_or_insert_with(|| Instant::now() + TELL_AFTER);
         }
     }
 
-    /// A node told its consumers.
+    /// Handles a node's announcement of its consumers.
     pub(super) fn consumers_told(&mut self, now: Now, peer: NodeId, consumers: Vec<Consumer>) {
         if self.consumers.asked.contains(&peer) {
             self.consumers.lost.remove(&peer);
@@ -217,7 +218,8 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// A node tells its consumers no longer: at once if that is its will, or after a while if it is out of reach.
+    /// Handles that a node no longer announces its consumers. They go at once if it withdrew them, or after a while if
+    /// it is out of reach.
     pub(super) fn consumers_lost(&mut self, now: Now, peer: NodeId, reason: LostReason) {
         let hold = match reason {
             LostReason::Withdrawn | LostReason::Refused(_) => Duration::ZERO,
@@ -244,7 +246,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Asks the nodes that were granted something, and no others.
+    /// Asks the granted nodes for their consumers, and no others.
     fn ask_consumers(&mut self, now: Now) {
         let has_graph = self.network.get().is_some_and(|network| network.has_graph());
         let consumers = &mut self.consumers;
@@ -264,7 +266,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Brings the local network in line with the consumers elsewhere.
+    /// Shows the far consumers on the local network.
     fn show_consumers(&mut self) {
         let (Some(routes), Some(network)) = (&self.routes, self.network.get()) else { return };
         let (wanted, left_out) = self.consumers.wanted();
@@ -274,7 +276,7 @@ impl<N: RosNetwork> Core<N> {
             .map(|(key, consumer)| (key, (consumer.node.clone(), routes.consumer_ends(consumer))))
             .filter(|(_, (_, ends))| !ends.is_empty())
             .collect();
-        // The ends of a service client are two.
+        // A service client has two endpoints.
         wanted.retain(|key, (node, ends)| {
             let is_writer = ends.iter().all(|(kind, _)| *kind == EndpointKind::Writer);
             let is_first = is_writer && !publishers.contains_key(&key.interface);
@@ -312,7 +314,8 @@ impl<N: RosNetwork> Core<N> {
         }
         let Some(events) = self.events.upgrade().filter(|_| !fresh.is_empty()) else { return };
         let (network, alive, failures) = (network.clone(), self.alive.clone(), self.ros_failures.clone());
-        // One after the other: each takes a lock of the local network, and others need such threads, too.
+        // The endpoints are created one after the other: each takes a lock of the local network, and others need
+        // blocking threads, too.
         tokio::task::spawn_blocking(move || {
             let _alive = alive;
             for (key, ends) in fresh {
@@ -324,13 +327,13 @@ impl<N: RosNetwork> Core<N> {
                     Ok(ends) => ends,
                     Err(error @ RosError::ForbiddenPartition { .. }) => {
                         if failures.count("consumers_forbidden") {
-                            info!("programs elsewhere are not shown in the local graph: {error}");
+                            info!("far programs are not shown in the local graph: {error}");
                         }
                         continue;
                     }
                     Err(error) => {
                         failures.count("show_consumer");
-                        debug!(%error, "the local graph does not show a subscriber or client elsewhere");
+                        debug!(%error, "the local graph does not show a far subscriber or client");
                         continue;
                     }
                 };
@@ -341,7 +344,7 @@ impl<N: RosNetwork> Core<N> {
         });
     }
 
-    /// Endpoints were made for a consumer, which may be another by now.
+    /// Handles new endpoints of a consumer, which may have changed meanwhile.
     pub(super) fn consumer_shown(
         &mut self,
         key: ConsumerKey,
@@ -358,7 +361,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Counts by how many more there is no room for than the last time.
+    /// Counts the increase of consumers without room.
     fn count_left_out(&mut self, which: usize, kind: &'static str, left_out: u64) {
         let before = std::mem::replace(&mut self.consumers.left_out[which], left_out);
         if left_out > before {
@@ -366,7 +369,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Shows no consumers any more.
+    /// Removes all shown consumers.
     pub(super) fn end_consumers(&mut self) {
         drop_elsewhere(Box::new(std::mem::take(&mut self.consumers).take_shown()));
     }
@@ -382,7 +385,7 @@ mod tests {
 
     use super::*;
 
-    /// The consumers of a node that uses every interface as much as it may; each telling has others.
+    /// Returns other consumers at each call, as many as a node may announce.
     fn all_places(telling: u8) -> Vec<Consumer> {
         let node = RosNode::new("/", "view", None).unwrap();
         let consumer = |n: usize| {
@@ -420,7 +423,7 @@ mod tests {
                 let wanted: BTreeSet<_> = consumers.wanted().0.into_keys().collect();
                 made += wanted.difference(&shown).count();
                 shown = wanted;
-                // A node that withdraws them does not begin anew.
+                // A node that withdraws its consumers does not start over.
                 consumers.lost.insert(peer, now);
                 assert!(consumers.forget(now));
                 consumers.lost.clear();
@@ -433,7 +436,7 @@ mod tests {
     #[test]
     fn change_of_one_consumer_is_shown_without_delay() {
         let (mut consumers, start, peer) = (FarConsumers::default(), Instant::now(), NodeId([1; 32]));
-        // Nothing is granted yet, which would be shown soon itself.
+        // Nothing is granted yet; a grant alone would cause a change soon.
         for n in 0..20_u8 {
             let now = start + u32::from(n) * 2 * SHOW_AFTER;
             consumers.tell(now, peer, all_places(n).into_iter().take(1).collect());

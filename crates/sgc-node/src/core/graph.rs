@@ -1,4 +1,4 @@
-//! What is there and where it goes, put together for who asks; and what they want to see.
+//! Builds the graph document and opens taps for the status socket.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -20,7 +20,7 @@ use crate::graph::{
     Endpoint, GRAPH_ENDPOINTS_MAX, Graph, Link, NameLine, Offer, Search, Share, ShareRoute, Side,
     UnheardMember, Use, UseRoute,
 };
-use crate::tap::{Tap, TapError, TapQueue, TapWish, Tapped, Taps};
+use crate::tap::{Tap, TapError, TapMessage, TapQueue, TapRequest, Taps};
 
 /// Names whose refusals are remembered.
 const REFUSED_NAMES_MAX: usize = 256;
@@ -30,7 +30,7 @@ const REFUSED_NODES_MAX: usize = 16;
 /// Refusals by name and node.
 type Refusals = BTreeMap<Name, BTreeMap<NodeId, String>>;
 
-/// Keeps who was refused, for who asks why nothing flows.
+/// Remembers a refusal, to explain later why nothing flows.
 pub(super) fn remember_refusal(all: &mut Refusals, name: Name, peer: NodeId, reason: &impl ToString) {
     if all.len() >= REFUSED_NAMES_MAX && !all.contains_key(&name) {
         all.pop_first();
@@ -42,7 +42,7 @@ pub(super) fn remember_refusal(all: &mut Refusals, name: Name, peer: NodeId, rea
     of_name.insert(peer, reason.to_string());
 }
 
-/// It may by now.
+/// Forgets a refusal, because it may no longer hold.
 pub(super) fn forget_refusal(all: &mut Refusals, name: &Name, peer: &NodeId) {
     if let Some(of_name) = all.get_mut(name) {
         of_name.remove(peer);
@@ -110,7 +110,7 @@ impl<N: RosNetwork> Core<N> {
                 kind: view.metadata.kind.into(),
                 topic: view.metadata.ros_name.clone(),
                 wanted_type: Some(view.metadata.type_name.clone()).filter(|t| !t.is_empty()),
-                // Who may call a service publishes under its name; to its users that is no publishing.
+                // Callers of a service publish under its name. Users do not call that publishing.
                 to: count(if is_service { &view.policy.publish } else { &view.policy.subscribe }),
                 publish: if is_service { [0; 3] } else { count(&view.policy.publish) },
                 unheard: self.unheard(view.policy),
@@ -214,7 +214,7 @@ impl<N: RosNetwork> Core<N> {
         graph.offers = routes.offers().map(offer).collect();
     }
 
-    /// The members that a policy names and that were not heard of.
+    /// Returns the members of a policy that were not heard.
     fn unheard(&self, policy: &Policy) -> Vec<UnheardMember> {
         let mut all = self.members.unheard(&policy.subscribe);
         for name in self.members.unheard(&policy.publish) {
@@ -225,13 +225,13 @@ impl<N: RosNetwork> Core<N> {
         all.into_iter().map(|name| UnheardMember { name: name.written, meant: name.meant }).collect()
     }
 
-    /// Whether messages of an interface would be JSON, or come as JSON, and what they look like is not known here.
+    /// Returns `true` if an interface's messages are converted to or from JSON and their type is unknown here.
     fn lacks_definition(&self, name: &Name, form: PayloadForm) -> bool {
         let writes = form == PayloadForm::Json && self.shares.get(name).is_some_and(|s| s.lacks_definition());
         writes || self.sinks.get(name).is_some_and(|sink| sink.lacks_definition())
     }
 
-    /// Everything that the user should know.
+    /// Returns all problems that the user should know.
     pub(super) fn problems(&self) -> Vec<String> {
         let Some(routes) = &self.routes else { return Vec::new() };
         let mut problems: Vec<_> = routes.problems().map(ToString::to_string).collect();
@@ -270,15 +270,15 @@ impl<N: RosNetwork> Core<N> {
         line
     }
 
-    /// A peer's name, or the beginning of its id.
+    /// Returns a peer's name, or the beginning of its id.
     pub(super) fn called(&self, peer: &NodeId) -> String {
         called(&self.audit, peer)
     }
 
-    /// Lets somebody look at what goes by. A topic that comes from the far side is looked at there, since what this node
-    /// writes is hidden from its own readers.
-    pub(super) fn tap(&mut self, wish: TapWish, reply: oneshot::Sender<Result<Tap, TapError>>) {
-        let TapWish { topic, side } = wish;
+    /// Opens a tap. A topic from the far side is tapped there, since this node's writers are hidden from its own
+    /// readers.
+    pub(super) fn tap(&mut self, wish: TapRequest, reply: oneshot::Sender<Result<Tap, TapError>>) {
+        let TapRequest { topic, side } = wish;
         let Some(routes) = &self.routes else {
             let _ = reply.send(Err(TapError::NoTopic { topic }));
             return;
@@ -286,7 +286,7 @@ impl<N: RosNetwork> Core<N> {
         let views = routes.use_views();
         let brought = views.iter().filter(|view| view.direction == Direction::Bring).flat_map(|v| &v.routes);
         let brought = brought.filter(|route| route.local_name == topic);
-        // What is granted comes first, then what may be.
+        // Granted routes take precedence.
         let brought = brought.max_by_key(|route| route.is_granted);
         let shares = routes.share_views();
         let shared = shares.iter().flat_map(|view| &view.routes).find(|route| route.local_name == topic);
@@ -327,14 +327,14 @@ impl<N: RosNetwork> Core<N> {
         let _ = reply.send(result);
     }
 
-    /// Makes a reader on the local network that matches every publisher there is.
+    /// Creates a local reader that matches every publisher of a topic.
     fn tap_local(&mut self, topic: String, reply: oneshot::Sender<Result<Tap, TapError>>) {
         let (Some(routes), Some(network)) = (&self.routes, self.network.get()) else { return };
         let writers: Vec<_> = routes
             .local_endpoints()
             .filter(|e| e.kind == EndpointKind::Writer && ros_topic(&e.topic) == Some(topic.as_str()))
             .collect();
-        // Of several types that of the first publisher.
+        // If publishers have several types, the first one counts.
         let Some(first) = writers.first() else {
             let _ = reply.send(Err(TapError::NoTopic { topic }));
             return;
@@ -358,19 +358,18 @@ impl<N: RosNetwork> Core<N> {
         tokio::task::spawn_blocking(move || {
             let into = queue.clone();
             let handler: SampleHandler =
-                Box::new(move |sample: Sample| into.push(Tapped::of_sample(&sample)));
+                Box::new(move |sample: Sample| into.push(TapMessage::from_sample(&sample)));
             let type_hash = spec.type_hash.clone();
             let tap = network.create_reader(&spec, handler).map(|reader| {
                 let reader: Box<dyn std::any::Any + Send> = Box::new((reader, alive));
                 Tap { side: Side::Local, type_name, type_hash, described, queue, reader: Some(reader) }
             });
-            // Who asked may have gone; then the reader ends here, where it may block.
+            // The client may have left. The reader then ends on this blocking thread.
             let _ = reply.send(tap.map_err(|why| TapError::Network(why.to_string())));
         });
     }
 }
 
-/// Whether it is for calling.
 /// Returns a peer's name, or the beginning of its id.
 pub(super) fn called(audit: &Audit, peer: &NodeId) -> String {
     audit.name_of(peer).unwrap_or_else(|| peer.short())

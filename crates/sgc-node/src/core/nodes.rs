@@ -1,5 +1,5 @@
-//! The nodes of this proxy in the local ROS graph: the far nodes that its endpoints stand for, and one of its own for the
-//! rest.
+//! ROS 2 nodes that this proxy shows in the local ROS graph: far nodes for the endpoints that stand for them, and one
+//! node of its own for the rest.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -11,36 +11,36 @@ use tracing::debug;
 use super::Core;
 use super::consumers::ConsumerKey;
 
-/// A local writer: the joined name, and the source that it is for.
+/// Key of a local writer: the joined name and the source.
 type WriterKey = (Name, Option<SourceId>);
 
-/// The endpoints that stand for one consumer, and its node.
+/// The endpoints that stand for one consumer, with its node.
 struct ConsumerEnds {
     node: (NodeId, RosNode),
     readers: Vec<Guid>,
     writers: Vec<Guid>,
 }
 
-/// Which endpoints are here, and whose.
+/// Endpoints of this proxy, by node.
 pub(super) struct LocalGraph {
     own: Option<RosNode>,
     writers: BTreeMap<WriterKey, Guid>,
-    /// Each with the node of SGC that it is of: nodes of two robots may have one name.
+    /// Node of each writer. The SGC node is included, since nodes of two robots may have the same name.
     nodes: BTreeMap<WriterKey, (NodeId, RosNode)>,
     readers: BTreeMap<Name, Guid>,
-    /// Whose the writer of a share is that gives what others publish, where that is known.
+    /// Node of the writer that writes a share's far messages, if known.
     publishers: BTreeMap<Name, (NodeId, RosNode)>,
-    /// Endpoints that stand for consumers elsewhere.
+    /// Endpoints that stand for far consumers.
     consumers: BTreeMap<ConsumerKey, ConsumerEnds>,
     has_changed: bool,
-    /// What is to be shown, for the thread that shows it; `None` once that has taken it.
+    /// The next graph for the thread that shows it; `None` once the thread has taken it.
     wanted: Arc<Mutex<Option<Vec<GraphNode>>>>,
-    /// Held while something is shown, so that the newest is shown last.
+    /// Held while the graph is shown, so that the newest is shown last.
     showing: Arc<Mutex<()>>,
 }
 
 impl LocalGraph {
-    /// The graph of the SGC node of this name, without any endpoint.
+    /// Creates the graph of the SGC node with this name, without endpoints.
     pub(super) fn new(node: &str) -> Self {
         Self {
             own: own_node(node),
@@ -59,13 +59,13 @@ impl LocalGraph {
         self.has_changed |= self.writers.insert(key, guid) != Some(guid);
     }
 
-    /// A writer is closed, and stands for nobody.
+    /// Removes a writer.
     pub(super) fn writer_gone(&mut self, key: &WriterKey) {
         self.nodes.remove(key);
         self.has_changed |= self.writers.remove(key).is_some();
     }
 
-    /// A writer is for another source from here on, and for nobody until it is told.
+    /// Moves a writer to another source. Its node is unknown until it is set.
     pub(super) fn writer_moved(&mut self, name: Name, from: SourceId, to: SourceId) {
         let guid = self.writers.get(&(name, Some(from))).copied();
         self.writer_gone(&(name, Some(from)));
@@ -82,7 +82,7 @@ impl LocalGraph {
         self.has_changed |= self.readers.remove(name).is_some();
     }
 
-    /// An end of a service, of its reader and its writer.
+    /// Adds the reader and the writer of a service.
     pub(super) fn service_there(&mut self, name: Name, [reader, writer]: [Guid; 2]) {
         self.reader_there(name, reader);
         self.writer_there((name, None), writer);
@@ -93,7 +93,7 @@ impl LocalGraph {
         self.writer_gone(&(*name, None));
     }
 
-    /// No endpoint is there any more; which nodes they are of stays.
+    /// Removes all endpoints and keeps the nodes that they stand for.
     pub(super) fn endpoints_gone(&mut self) {
         self.readers.clear();
         self.writers.clear();
@@ -101,7 +101,8 @@ impl LocalGraph {
         self.has_changed = true;
     }
 
-    /// Whose node a writer, here or on its way, stands for; the reader of the name with it, if it is for all sources.
+    /// Sets the node of a present or future writer. The name's reader gets the same node if the writer serves all
+    /// sources.
     pub(super) fn set_node(&mut self, key: WriterKey, owner: NodeId, node: Option<RosNode>) {
         self.has_changed |= match node {
             Some(node) => {
@@ -112,12 +113,12 @@ impl LocalGraph {
         };
     }
 
-    /// Whose the writers for what others publish are, and no others'.
+    /// Replaces the nodes of the writers of far messages.
     pub(super) fn set_publishers(&mut self, publishers: BTreeMap<Name, (NodeId, RosNode)>) {
         self.has_changed |= std::mem::replace(&mut self.publishers, publishers.clone()) != publishers;
     }
 
-    /// Endpoints stand for a consumer of this node from here on.
+    /// Adds the endpoints of a consumer of this node.
     pub(super) fn consumer_there(&mut self, key: ConsumerKey, node: RosNode, ends: &[(EndpointKind, Guid)]) {
         let of = |kind| ends.iter().filter(move |(of, _)| *of == kind).map(|(_, guid)| *guid).collect();
         let node = (key.peer, node);
@@ -131,7 +132,7 @@ impl LocalGraph {
         self.has_changed |= self.consumers.remove(key).is_some();
     }
 
-    /// All nodes, each of one owner once, if something changed since this was asked.
+    /// Returns all nodes, each of one owner once, if they changed since the last call.
     fn changed(&mut self) -> Option<Vec<GraphNode>> {
         if !std::mem::take(&mut self.has_changed) {
             return None;
@@ -166,7 +167,7 @@ impl LocalGraph {
     }
 }
 
-/// The ROS 2 node that stands for the SGC node of this name.
+/// Returns the ROS 2 node that stands for the SGC node with this name.
 fn own_node(node: &str) -> Option<RosNode> {
     let word: String = node.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
     let word = &word[..word.len().min(RosNode::NAME_BYTES_MAX - 4)];
@@ -174,7 +175,7 @@ fn own_node(node: &str) -> Option<RosNode> {
 }
 
 impl<N: RosNetwork> Core<N> {
-    /// Has the local graph show what changed, on a thread where that may block.
+    /// Shows changes in the local graph on a blocking thread.
     pub(super) fn show_graph(&mut self) {
         let Some(network) = self.network.get() else { return };
         let Some(nodes) = self.graph.changed() else { return };
@@ -220,7 +221,7 @@ mod tests {
         assert_eq!(shown(&mut graph), None);
         graph.reader_there(name, guid(1));
         graph.writer_there((name, None), guid(2));
-        // Which node it is may be known before the writer is there, and two robots may have one of a name.
+        // The node may be known before the writer exists, and two robots may have nodes of one name.
         graph.set_node((name, source(1)), NodeId([1; 32]), talker());
         graph.set_node((name, source(2)), NodeId([2; 32]), talker());
         assert_eq!(shown(&mut graph).unwrap(), [of("/sgc_arm_1_lab", 1, 1)]);
@@ -228,21 +229,22 @@ mod tests {
         graph.writer_there((name, source(2)), guid(4));
         let talkers = [of("/talker", 0, 1), of("/talker", 0, 1)];
         assert_eq!(shown(&mut graph).unwrap()[1..], talkers);
-        // One node with several endpoints is one node.
+        // One node may have several endpoints.
         graph.writer_there((name, source(3)), guid(5));
         graph.set_node((name, source(3)), NodeId([2; 32]), talker());
         assert_eq!(shown(&mut graph).unwrap()[1..], [of("/talker", 0, 1), of("/talker", 0, 2)]);
         graph.writer_gone(&(name, source(1)));
         graph.set_node((name, source(3)), NodeId([2; 32]), None);
         assert_eq!(shown(&mut graph).unwrap(), [of("/sgc_arm_1_lab", 1, 2), of("/talker", 0, 1)]);
-        // A node that publishes and subscribes is one node.
+        // A node that publishes and subscribes counts once.
         let of_two = ConsumerKey { interface: name, peer: NodeId([2; 32]), id: [1; 8] };
         graph.writer_there((name, source(2)), guid(4));
         graph.consumer_there(of_two, talker().unwrap(), &[(EndpointKind::Reader, guid(6))]);
         assert_eq!(shown(&mut graph).unwrap()[1..], [of("/talker", 1, 1)]);
         graph.consumer_gone(&of_two);
         assert_eq!(shown(&mut graph).unwrap()[1..], [of("/talker", 0, 1)]);
-        // What others publish on a share is one writer, which is that of one of them; its reader is of this proxy.
+        // One writer writes all far messages of a share and stands for one of their publishers. Its reader belongs to
+        // this proxy.
         graph.set_publishers([(name, (NodeId([2; 32]), talker().unwrap()))].into());
         assert_eq!(shown(&mut graph).unwrap(), [of("/sgc_arm_1_lab", 1, 1), of("/talker", 0, 2)]);
         graph.set_publishers(BTreeMap::new());

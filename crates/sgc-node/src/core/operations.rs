@@ -1,5 +1,4 @@
-//! Operations on the fleet: those that users of this node ask an authority for, and those that this authority carries out
-//! for operators.
+//! Operations on the fleet: requests of this node's users to an authority, and requests of operators to this authority.
 
 use std::time::Instant;
 
@@ -14,15 +13,15 @@ use tracing::{info, warn};
 
 use super::{Core, now};
 use crate::audit::{AuditEvent, AuditRecord};
-use crate::operations::{OperationError, OperationWish, Step};
-use crate::operators::{Asked, OperationDone};
+use crate::operations::{OperationError, Step, UserOperation};
+use crate::operators::{OperationOutcome, RequestStep};
 
-/// Counts operations that came again and were not carried out again.
+/// Counts repeated operations, which were not carried out again.
 const REPEATED: &str = "operation_repeated";
 /// Counts operations of nodes that are no operators.
 const NOT_PERMITTED: &str = "operation_not_permitted";
 
-/// As a node whose user is an operator.
+/// Requests of this node's users.
 impl<N: RosNetwork> Core<N> {
     pub(super) fn operate(
         &mut self,
@@ -39,7 +38,7 @@ impl<N: RosNetwork> Core<N> {
             return;
         }
         let is_named = self.identity.authority() == Some(authority);
-        let wish = OperationWish { at: at.to_string(), authority, is_named, operation, reply };
+        let wish = UserOperation { at: at.to_string(), authority, is_named, operation, reply };
         self.operations.push(Instant::now(), wish);
         self.next_operation();
     }
@@ -83,25 +82,25 @@ impl<N: RosNetwork> Core<N> {
     }
 }
 
-/// As the authority.
+/// Requests to this authority.
 impl<N: RosNetwork> Core<N> {
-    /// Judges an operator's request, and queues what it asks for.
+    /// Judges an operator's request and queues its operation.
     pub(super) fn operation_asked(&mut self, sink: SinkId, peer: &VerifiedPeer, request: &Bytes) {
         let Some(authority) = &mut self.authority else { return };
         let now = now();
         let asked = authority.operators.ask(now.instant, peer, sink, request, &mut OsRng.unwrap_err());
         let node = peer.node_id;
         match asked {
-            Asked::Answer(answer) => self.answer_operator(&node, sink, answer),
-            Asked::Again(answer) => {
+            RequestStep::Answer(answer) => self.answer_operator(&node, sink, answer),
+            RequestStep::Again(answer) => {
                 self.control_drops.count_from(REPEATED, node);
                 self.answer_operator(&node, sink, answer);
             }
-            Asked::UnderWay => {
+            RequestStep::UnderWay => {
                 self.control_drops.count_from(REPEATED, node);
             }
-            Asked::Job(job) => {
-                // Nodes that are here now are shown as present.
+            RequestStep::Job(job) => {
+                // Nodes that are connected now count as present.
                 let here: Vec<_> = self.endpoint.renewing().map(|(_, peer, _)| peer.node_id).collect();
                 authority.note_seen(here, now.unix);
                 match authority.queue.push_operation(job) {
@@ -109,9 +108,9 @@ impl<N: RosNetwork> Core<N> {
                     Err(job) => self.operation_done(job.busy()),
                 }
             }
-            Asked::NotPermitted => {
+            RequestStep::NotPermitted => {
                 if self.control_drops.count_from(NOT_PERMITTED, node) {
-                    warn!(peer = %node.short(), "is no operator and asks for operations; counted from here on");
+                    warn!(peer = %node.short(), "refused an operation of a node that is no operator; counted from here on");
                 }
                 let reason = "an operation: it is no operator";
                 self.audit.write(AuditRecord::new(AuditEvent::Refused).peer(&node).reason(reason));
@@ -120,8 +119,8 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Answers an operation that was carried out or refused, and tells everyone whom it revoked.
-    pub(super) fn operation_done(&mut self, done: OperationDone) {
+    /// Answers an operation that was carried out or refused, and announces a revocation to everyone.
+    pub(super) fn operation_done(&mut self, done: OperationOutcome) {
         info!(operator = %done.node.short(), operation = done.said, "was asked for an operation");
         self.audit.write(AuditRecord::new(AuditEvent::Operation).peer(&done.node).reason(&done.said));
         let waits = self.authority.as_mut().and_then(|authority| authority.operators.done(&done));
@@ -131,7 +130,7 @@ impl<N: RosNetwork> Core<N> {
         if let Some(list) = done.list.map(Bytes::from)
             && let Err(why) = self.router.add_crl(now(), &list)
         {
-            warn!(%why, "the revocation list that this authority made is not usable here");
+            warn!(%why, "this authority cannot use its own new revocation list");
         }
     }
 

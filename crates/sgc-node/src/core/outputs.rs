@@ -1,4 +1,4 @@
-//! What router and endpoint want done, and what happened that somebody has to know.
+//! Carries out the outputs of the router and the endpoint, and reports their events.
 
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Event, Output as EndpointOutput};
@@ -17,7 +17,7 @@ impl<N: RosNetwork> Core<N> {
             RouterOutput::Send { link: LinkId::LOCAL, frame } => self.endpoint.handle_frame(now(), frame),
             RouterOutput::Send { link, frame } => {
                 let Some(entry) = self.links.get_mut(&link) else { return };
-                entry.heart.stir();
+                entry.keep_alive.stir();
                 if !entry.control.send(frame) {
                     self.close_overloaded(link);
                 }
@@ -69,7 +69,7 @@ impl<N: RosNetwork> Core<N> {
             }
             RouterOutput::Dropped(dropped) => {
                 let first = self.control_drops.count_from(dropped.reason.key(), dropped.link);
-                // A neighbour may be honest and bring what a partner's CA makes too much of.
+                // Honest neighbours may forward statements of which a partner's CA makes too many.
                 let is_told =
                     dropped.reason.is_suspicious() || matches!(dropped.reason, DropReason::ListFlood { .. });
                 if first && is_told {
@@ -158,7 +158,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// What concerns the routes alone.
+    /// Handles events for the route machine only.
     pub(super) fn route_event(&mut self, now: Now, event: Event) {
         self.calls_event(&event);
         let Some(routes) = &mut self.routes else { return };
@@ -240,7 +240,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Keeps what concerns who gets what of this node.
+    /// Writes events about access to this node's shares into the audit log.
     pub(super) fn audit_event(&self, event: &Event) {
         let about = |event, name| {
             let topic = self.routes.as_ref().and_then(|routes| routes.topic_of(name));

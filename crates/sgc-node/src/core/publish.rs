@@ -1,4 +1,4 @@
-//! Publishing on names that other nodes own, and what others publish on ours.
+//! Publishing on names of other nodes, and messages of other publishers on our shares.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -14,35 +14,35 @@ use crate::message_keys::MessageKeys;
 use crate::sinks::LocalSink;
 use crate::sources::{LocalShare, SourceMap, SourceSlot};
 
-/// How long a publisher goes on under the old key of a topic that is not its own: the owner gives the others as long
-/// to get the new one.
+/// Time for which a publisher keeps the old key of another node's topic. The owner gives the others as long to get the
+/// new one.
 const REKEY_WAIT: Duration = Duration::from_secs(1);
 
-/// A topic of another node that this one is to publish on.
+/// A topic of another node that this node wants to publish on.
 pub(super) struct Offer {
     pub(super) owner: NodeId,
-    /// Its id on the wire.
+    /// Suite id on the wire.
     pub(super) suite: u8,
     pub(super) class: Class,
     pub(super) reliable: bool,
     pub(super) shaping: Shaping,
-    /// True if it is a service, which is called.
+    /// Whether it is a service.
     pub(super) calls: bool,
 }
 
-/// What this node publishes under another's name.
+/// State of publishing under another node's name.
 pub(super) struct Publishing {
     id: SourceId,
     class: Class,
     reliable: bool,
-    /// What the source was made with, or rekeyed to; `None` until the owner granted it.
+    /// Grant of the source's current key; `None` until the owner granted it.
     grant: Option<TopicGrant>,
-    /// The key of the next epoch, and when it begins.
+    /// Key of the next epoch, and its beginning.
     next: Option<(Instant, TopicGrant)>,
 }
 
 impl<N: RosNetwork> Core<N> {
-    /// Asks the owner of `name` to let this node publish under it, at once or when there is a key to sign with.
+    /// Asks the owner of `name` for permission to publish, at once or when there is a signing key.
     pub(super) fn publish_under(&mut self, name: Name, wanted: Offer) {
         let Offer { owner, suite, class, reliable, shaping, calls } = wanted;
         let Some(suite) = Suite::from_id(suite) else {
@@ -65,7 +65,7 @@ impl<N: RosNetwork> Core<N> {
         let offer = SourceOffer { source: id, key: message_key.public().clone() };
         self.endpoint.join(now(), name, owner, JoinKind::Publish(offer));
         if calls {
-            self.begin_called(name);
+            self.begin_far(name);
         }
     }
 
@@ -79,7 +79,7 @@ impl<N: RosNetwork> Core<N> {
         });
     }
 
-    /// Takes keys that are made; one that is there already stays.
+    /// Adds signing keys. Existing keys stay.
     pub(super) fn add_message_keys(&mut self, keys: MessageKeys) {
         for (suite, key) in keys {
             self.message_keys.entry(suite).or_insert(key);
@@ -89,8 +89,8 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// The owner lets this node publish, or begins a new epoch; `None` if this node does not publish under `name`, and
-    /// true if the owner knows nothing of what was published before.
+    /// Handles a grant to publish, or a new epoch. Returns `None` if this node does not publish under `name`, and
+    /// `true` if the owner knows nothing of earlier messages.
     pub(super) fn publishing_granted(&mut self, now: Now, name: Name, grant: &TopicGrant) -> Option<bool> {
         let publishing = self.publishing.get_mut(&name)?;
         match &publishing.grant {
@@ -99,11 +99,11 @@ impl<N: RosNetwork> Core<N> {
                 publishing.next = Some((now.instant + REKEY_WAIT, grant.clone()));
                 Some(false)
             }
-            // The owner started anew: another key, under which numbers begin again.
+            // The owner restarted: numbers begin again under another key.
             Some(_) | None => {
                 publishing.grant = Some(grant.clone());
                 publishing.next = None;
-                // Nobody can ask a source that is not the owner's.
+                // Only sources of the owner can be asked for missing messages.
                 let (id, class, reliable) = (publishing.id, publishing.class, publishing.reliable);
                 let config = SourceConfig {
                     name,
@@ -125,7 +125,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Publishes under the keys whose time has come.
+    /// Switches to the keys whose epoch begins now.
     pub(super) fn rekey_due(&mut self, now: Now) {
         for (name, publishing) in &mut self.publishing {
             let due = publishing.next.take_if(|(at, _)| *at <= now.instant);
@@ -149,7 +149,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Key and publishers of a share of ours on which others may publish.
+    /// Handles the key and the publishers of our own share on which others may publish.
     pub(super) fn own_grant(&mut self, name: Name, grant: TopicGrant) {
         let own: Vec<_> = self.shares.get(&name).iter().flat_map(|s| s.map().ids()).collect();
         let others = grant.sources.iter().any(|s| !own.contains(&s.source));
@@ -161,7 +161,7 @@ impl<N: RosNetwork> Core<N> {
             })
             .clone();
         self.apply_type(&name);
-        // What this node publishes itself does not come back to it: it is nobody's sink but its own.
+        // This node's own messages do not come back to it, since its sink receives only others'.
         sink.grant(SinkId([0; 16]), grant, &self.data);
         if let Some(progress) = sink.progress() {
             self.endpoint.set_own_sink(&name, progress);

@@ -1,5 +1,5 @@
-//! What the links measure: the router machine weighs ways by it, and leaves those that have fallen silent before
-//! their time-outs end them. When to ask a peer whether it is there is for [`crate::heart`] to say.
+//! Measures links, so that the router machine can weigh them and leave silent ones before they time out.
+//! [`crate::keep_alive`] decides when to probe a peer.
 
 use std::time::{Duration, Instant};
 
@@ -10,26 +10,31 @@ use sgc_wire::{Control, NodeId};
 use tracing::info;
 
 use super::{Core, LinkEntry, now};
-use crate::heart::{Heart, Patience, Seen};
+use crate::keep_alive::{KeepAlive, KeepAlivePolicy, LinkObservation};
 
-/// How often links are looked at.
+/// Interval of looks at the links.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
-/// Most peers of which it is remembered how soon their NATs forget.
+/// Most peers whose shorter keep-alive interval is remembered.
 const IMPATIENT_MAX: usize = 1024;
 
 impl<N: RosNetwork> Core<N> {
-    /// How a link to this peer begins.
-    pub(super) fn heart_of(&self, link: &AnyLink) -> Heart {
+    /// Starts the keep-alive of a link to this peer.
+    pub(super) fn keep_alive_for(&self, link: &AnyLink) -> KeepAlive {
         let known = self.impatient.get(&link.peer().node_id);
-        let patience = Patience { max: known.copied().unwrap_or(self.patience.max), ..self.patience };
-        Heart::new(Instant::now(), patience, link.stats().received_bytes, link.remote())
+        let keep_alive_policy = KeepAlivePolicy {
+            max: known.copied().unwrap_or(self.keep_alive_policy.max),
+            ..self.keep_alive_policy
+        };
+        KeepAlive::new(Instant::now(), keep_alive_policy, link.stats().received_bytes, link.remote())
     }
 
-    /// Remembers of a link that ends how soon its peer has to be asked.
-    pub(super) fn remember_patience(&mut self, node: NodeId, patience: Patience) {
+    /// Remembers the keep-alive interval that an ending link had to use.
+    pub(super) fn remember_policy(&mut self, node: NodeId, keep_alive_policy: KeepAlivePolicy) {
         let is_known = self.impatient.contains_key(&node);
-        if patience.max < self.patience.max && (is_known || self.impatient.len() < IMPATIENT_MAX) {
-            self.impatient.insert(node, patience.max);
+        if keep_alive_policy.max < self.keep_alive_policy.max
+            && (is_known || self.impatient.len() < IMPATIENT_MAX)
+        {
+            self.impatient.insert(node, keep_alive_policy.max);
         }
     }
 
@@ -47,7 +52,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// A link is up: its handshake has measured it, and it is looked at from here on.
+    /// Measures a link that is up, and looks at it from here on.
     pub(super) fn begin_to_look(&mut self, id: LinkId) {
         self.look_due.get_or_insert_with(|| Instant::now() + LOOK_EVERY);
         if let Some(entry) = self.links.get(&id) {
@@ -57,12 +62,12 @@ impl<N: RosNetwork> Core<N> {
 }
 
 impl LinkEntry {
-    /// Looks at it, and asks the peer or gives it up if need be; true if it seems dead.
+    /// Looks at a link, and probes the peer or marks it silent if needed. Returns `true` if the link seems dead.
     fn look(&mut self, at: Instant, received_bytes: u64, rtt: Duration) -> bool {
         let (activity, remote) = (self.control.activity(), self.link.remote());
-        let verdict = self.heart.look(at, Seen { received_bytes, activity, remote, rtt });
+        let verdict = self.keep_alive.look(at, LinkObservation { received_bytes, activity, remote, rtt });
         if verdict.asks {
-            // If there is no room the peer does not take what is there, which is seen elsewhere.
+            // A full queue means that the peer takes nothing, which is detected elsewhere.
             self.control.send(Control::Probe { answers: false });
         }
         if verdict.is_dead && self.closed_for.is_none() {

@@ -1,6 +1,6 @@
-//! The local network closed and opened again: what was on it ends with the old one, and is made on the new one as it was wanted.
+//! Closing and reopening the local network: endpoints end with the old network and are created again on the new one.
 //!
-//! Routes, sources, sinks and calls stay, so nodes elsewhere notice no more than a pause.
+//! Routes, sources, sinks and calls stay, so other nodes notice only a pause.
 
 use std::any::Any;
 
@@ -11,21 +11,21 @@ use super::{Core, drop_elsewhere, now};
 use crate::calls::Calls;
 use crate::rediscovery::Rediscovery;
 
-/// The local network as far as it was opened again.
+/// State of reopening the local network.
 #[derive(Default)]
 pub(super) struct Reopening {
-    /// True from the moment at which it is closed until it is open.
+    /// Whether the network is closed and not open again yet.
     pub(super) is_closed: bool,
-    /// The reason why it could not be opened.
+    /// Reason of the last failure to open it.
     pub(super) failed: Option<String>,
     pub(super) rediscovery: Rediscovery,
-    /// When it was opened last, and how often.
+    /// Time of the last reopening, and their number.
     pub(super) last: Option<std::time::Instant>,
     pub(super) times: u64,
 }
 
 impl<N: RosNetwork> Core<N> {
-    /// Ends all that is on the local network, which the caller has taken.
+    /// Ends all endpoints of the local network, which the caller has taken.
     pub(super) fn close_network(&mut self) {
         let (endpoints, participants) = match &self.routes {
             Some(routes) => {
@@ -44,12 +44,12 @@ impl<N: RosNetwork> Core<N> {
         }
         for calls in self.calls.values() {
             ending.extend(match calls {
-                Calls::Served(served) => {
-                    // Answers of a server reach nobody from here on.
+                Calls::LocalService(served) => {
+                    // Replies of servers reach nobody from here on.
                     served.servers_gone();
                     served.set_client(None)
                 }
-                Calls::Called(called) => called.set_server(None),
+                Calls::FarService(called) => called.set_server(None),
             });
         }
         ending.extend(self.consumers.take_shown());
@@ -58,7 +58,7 @@ impl<N: RosNetwork> Core<N> {
         drop_elsewhere(Box::new(ending));
     }
 
-    /// Makes on the network that is open now what was on the one before.
+    /// Creates the endpoints of the old network on the new one.
     pub(super) fn network_reopened(&mut self) {
         let now = now().instant;
         self.reopening.is_closed = false;
@@ -85,15 +85,15 @@ impl<N: RosNetwork> Core<N> {
         }
         for (name, spec) in services {
             match self.calls.get(&name) {
-                Some(Calls::Served(_)) => self.open_client(name, spec),
-                Some(Calls::Called(_)) => self.open_server(name, spec),
+                Some(Calls::LocalService(_)) => self.open_client(name, spec),
+                Some(Calls::FarService(_)) => self.open_server(name, spec),
                 None => {}
             }
         }
         self.consumers.show_soon(now);
     }
 
-    /// Takes what was discovered, unless it is of a network that is closed.
+    /// Handles a discovery event, unless the network is closed.
     pub(super) fn discovered(&mut self, event: DiscoveryEvent) {
         if self.reopening.is_closed {
             return;
@@ -103,7 +103,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Counts as gone what the network had and has not any more.
+    /// Reports endpoints that the new network lacks as gone.
     pub(super) fn rediscovery_due(&mut self, now: std::time::Instant) {
         for event in self.reopening.rediscovery.handle_timeout(now) {
             self.handle_discovery(event);

@@ -1,4 +1,4 @@
-//! What the routes want done: shares, joins, readers, writers, and the forwarding of their names.
+//! Carries out the outputs of the route machine: shares, joins, readers, writers, and forwarding.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -22,7 +22,7 @@ use crate::outflow::{self, OUTFLOW_AGE_MAX, OutFlow};
 use crate::sinks::{LocalSink, WriterQueue};
 use crate::sources::{LocalShare, Publisher, SourceMap, SourceSlot};
 
-/// Bytes of recovery kept of one publisher among many of a topic.
+/// Least bytes of recovery kept for one of a topic's many publishers.
 const RECOVERY_BYTES_MIN: usize = 1 << 20;
 
 impl<N: RosNetwork> Core<N> {
@@ -46,7 +46,7 @@ impl<N: RosNetwork> Core<N> {
                         self.shares.insert(name, Arc::new(share));
                         self.need_type(name, &metadata, type_hash, None);
                         if is_service {
-                            self.begin_served(name);
+                            self.begin_local(name);
                         }
                     }
                     Err(why) => error!("{topic} is not shared: {why}"),
@@ -63,7 +63,7 @@ impl<N: RosNetwork> Core<N> {
                 if let Some(wanted) = self.keyless.get_mut(&name) {
                     wanted.shaping = shaping;
                 }
-                // What others publish on a share of this node comes as they shape it.
+                // Messages of other publishers on our share are shaped by those publishers.
                 if let Some(sink) = self.sinks.get(&name).filter(|_| !self.shares.contains_key(&name)) {
                     sink.set_shaping(shaping);
                 }
@@ -164,12 +164,13 @@ impl<N: RosNetwork> Core<N> {
         };
         let Some(message_key) = self.message_key(grant.suite) else { return };
         let old = share.map();
-        // What is answered is for one, and remembered call by call.
+        // A reply is for one caller, and the call machine remembers it.
         let is_service = self.calls.contains_key(&name);
         let recovery = if is_service { RecoveryLimits::NONE } else { RecoveryLimits::default() };
-        // What is kept of a topic is not to grow with its publishers.
+        // The memory of a topic must not grow with its publishers.
         let share_of = |bytes: usize, sources: usize| (bytes / sources).max(RECOVERY_BYTES_MIN);
-        // Keys are in payloads, at which nobody looks here: what several instances keep is one row, as in the local writers.
+        // Keys of instances are inside payloads, which are not parsed here, so all instances share one history as in
+        // the local writers.
         let instances = if self.endpoint.is_keyed(&name) { KEYED_INSTANCES_KEPT } else { 1 };
         let depth_of = |qos: &Qos| match qos.history {
             _ if !qos.is_transient_local() => 0,
@@ -188,17 +189,17 @@ impl<N: RosNetwork> Core<N> {
                 recovery: RecoveryLimits { bytes_max: share_of(recovery.bytes_max, sources), ..recovery },
             };
             let source = Source::new(config, &grant, message_key.clone())?;
-            let manual = ManualLease::of(qos, Instant::now());
+            let manual = ManualLease::from_qos(qos, Instant::now());
             let slot = SourceSlot::new(source, keeps_history, qos.is_reliable());
             Some(SourceSlot { depth, manual, ..slot })
         };
-        // Some publishers may have one source together, which keeps what the deepest of them does.
+        // Publishers that share a source keep the deepest of their histories.
         let mut depths = BTreeMap::<SourceId, usize>::new();
         for (_, id, qos) in &own {
             let depth = depths.entry(*id).or_default();
             *depth = depth_of(qos).max(*depth);
         }
-        // A source is never made twice under one id: its sequence numbers are nonces.
+        // No two sources have the same id, since sequence numbers are nonces.
         let mut map = SourceMap { per_writer: !own.is_empty(), ..SourceMap::default() };
         for (guid, id, qos) in own {
             let kept = map.slot(&id).or_else(|| old.slot(&id));
@@ -209,7 +210,7 @@ impl<N: RosNetwork> Core<N> {
                     share.set_history_depth(&slot, depth);
                     slot.depth = depth;
                 }
-                // Unlike reliability and durability it can change while the source goes on.
+                // The lifespan, unlike reliability and durability, can change while the source exists.
                 slot.lifespan = qos.lifespan_ns.map(Duration::from_nanos);
                 map.own.insert(guid, slot);
             }
@@ -236,15 +237,15 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// The key that messages are signed with in this suite: one for the whole node. Those that take long to make are
-    /// there before they are needed.
+    /// Returns the signing key of a suite, one for the whole node. Keys that take long to create exist before they are
+    /// needed.
     pub(super) fn message_key(&mut self, suite: u8) -> Option<MessageKey> {
         let suite = Suite::from_id(suite)?;
         Some(self.message_keys.entry(suite).or_insert_with(|| MessageKey::generate(suite)).clone())
     }
 
-    /// Makes a reader; while the network is closed it is noted alone. One that takes the place of another does not take again what that
-    /// one had.
+    /// Creates a reader. While the network is closed, it is only noted. A reader that replaces another skips samples
+    /// that the other took.
     pub(super) fn open_reader(&mut self, name: Name, spec: EndpointSpec) {
         let Some(share) = self.shares.get(&name).cloned() else { return };
         let newest = self.readers.remove(&name).and_then(|old| old.newest);
@@ -294,11 +295,11 @@ impl<N: RosNetwork> Core<N> {
         });
     }
 
-    /// Has a writer give late joiners fewer messages.
+    /// Reduces the number of messages that a writer gives late joiners.
     fn resize_writer(&mut self, name: Name, source: Option<SourceId>, spec: EndpointSpec) {
         let History::KeepLast(depth) = spec.qos.history else { return };
         let Some(writer) = self.sinks.get(&name).and_then(|sink| sink.open_writer(source)) else {
-            // It is not there yet: whoever makes it finds that it is not wanted any more.
+            // The writer does not exist yet. When it is ready, it is found to be outdated.
             return self.open_writer(name, source, spec);
         };
         self.writers.insert((name, source), spec);
@@ -309,7 +310,7 @@ impl<N: RosNetwork> Core<N> {
         });
     }
 
-    /// Goes on with a writer for another source of the same publisher.
+    /// Moves a writer to another source of the same publisher.
     fn move_writer(&mut self, name: Name, from: SourceId, to: SourceId) {
         let Some(spec) = self.writers.remove(&(name, Some(from))) else { return };
         self.history_due.remove(&(name, from));
@@ -318,11 +319,11 @@ impl<N: RosNetwork> Core<N> {
             self.writers.insert((name, Some(to)), spec);
             return self.ask_history(name, to);
         }
-        // It is not there yet: whoever makes it finds that it is not wanted any more.
+        // The writer does not exist yet. When it is ready, it is found to be outdated.
         self.open_writer(name, Some(to), spec);
     }
 
-    /// Asks for all that a sink's writers still lack.
+    /// Asks for all messages that a sink's writers lack.
     pub(super) fn ask_histories(&mut self, name: Name) {
         let Some(sink) = self.sinks.get(&name) else { return };
         for source in sink.unsynced() {
@@ -335,7 +336,7 @@ impl<N: RosNetwork> Core<N> {
         self.recover(name, source, from.map_or(AskAgain::No, AskAgain::From));
     }
 
-    /// The same, a while later.
+    /// Asks for a history again after a while.
     pub(super) fn ask_history_again(&mut self, name: Name, source: SourceId) {
         let again = self.sinks.get(&name).map_or(AskAgain::No, |sink| sink.ask_again(source));
         self.recover(name, source, again);
@@ -350,7 +351,7 @@ impl<N: RosNetwork> Core<N> {
         self.history_due.insert((name, source), Instant::now() + HISTORY_RETRY);
     }
 
-    /// Has what waits for links wait by other settings; what is queued is still sent.
+    /// Applies new settings to the queues of a name. Queued packets are still sent.
     fn begin_flows_anew(&mut self, name: Name) {
         let Some((entry, _)) = self.entries.get(&name) else { return };
         let entry = entry.clone();
@@ -407,7 +408,7 @@ impl<N: RosNetwork> Core<N> {
         self.want_lanes(name);
     }
 
-    /// Brings the lanes in line with where a name's packets go, and with what the user wants.
+    /// Adjusts the lanes of a name to its links and to the configuration.
     fn want_lanes(&self, name: Name) {
         let dedicated = self.routes.as_ref().is_some_and(|routes| routes.is_dedicated(&name));
         let entry = self.entries.get(&name).map(|(entry, _)| entry);
@@ -419,7 +420,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// The same for all names.
+    /// Adjusts the lanes of all names.
     pub(super) fn want_all_lanes(&self) {
         self.entries.keys().for_each(|name| self.want_lanes(*name));
     }

@@ -1,4 +1,4 @@
-//! Services: what local clients call elsewhere, and local servers for others.
+//! Services: calls of local clients to other nodes, and calls of other nodes to local servers.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -11,31 +11,31 @@ use tracing::error;
 
 use super::{Core, CoreEvent, EPOCH_GRACE, ServiceEnd, drop_elsewhere};
 use crate::call_ledger::{CallLedger, CallerId, LEDGERS_MAX};
-use crate::calls::{Answers, Called, Calls, Requests, Served};
+use crate::calls::{Answers, Calls, FarService, LocalService, Requests};
 use crate::graph::{LostCalls, ServiceCalls};
-use crate::sinks::{Behind, LocalSink, WriterQueue};
+use crate::sinks::{LocalSink, WriterInfo, WriterQueue};
 
 impl<N: RosNetwork> Core<N> {
-    /// A share is a service: what comes is calls, not what others publish.
-    pub(super) fn begin_served(&mut self, name: Name) {
+    /// Starts a shared service. Incoming messages are calls, not messages of publishers.
+    pub(super) fn begin_local(&mut self, name: Name) {
         let Some(share) = self.shares.get(&name) else { return };
         let (share, ledger) = (share.clone(), self.call_ledger(name, true));
-        let served = Arc::new(Served::new(share, self.ros_failures.clone(), ledger));
+        let served = Arc::new(LocalService::new(share, self.ros_failures.clone(), ledger));
         let takes = served.clone();
-        self.begin_calls(name, Calls::Served(served), move |message| takes.take(message));
+        self.begin_calls(name, Calls::LocalService(served), move |message| takes.take(message));
     }
 
-    /// A name that this node publishes under is a service: what comes is answers.
-    pub(super) fn begin_called(&mut self, name: Name) {
+    /// Starts a used service. Incoming messages are replies.
+    pub(super) fn begin_far(&mut self, name: Name) {
         let Some(share) = self.shares.get(&name) else { return };
         let (share, ledger) = (share.clone(), self.call_ledger(name, false));
-        let called = Called::new(share, self.ros_failures.clone(), ledger, self.epoch_over.clone());
+        let called = FarService::new(share, self.ros_failures.clone(), ledger, self.epoch_over.clone());
         let called = Arc::new(called);
         let takes = called.clone();
-        self.begin_calls(name, Calls::Called(called), move |message| takes.take(message));
+        self.begin_calls(name, Calls::FarService(called), move |message| takes.take(message));
     }
 
-    /// The lost calls of a service, of this route and of those before it.
+    /// Returns the ledger of a service's lost calls, over all its routes so far.
     fn call_ledger(&mut self, name: Name, is_served: bool) -> Arc<CallLedger> {
         if self.call_ledgers.len() >= LEDGERS_MAX && !self.call_ledgers.contains_key(&name) {
             let ended = self.call_ledgers.keys().find(|name| !self.calls.contains_key(*name)).copied();
@@ -57,7 +57,7 @@ impl<N: RosNetwork> Core<N> {
         let (alive, failures) = (self.alive.clone(), self.ros_failures.clone());
         let queue = match WriterQueue::spawn_with(
             "sgc-calls",
-            Behind::default(),
+            WriterInfo::default(),
             Shaping::default(),
             failures,
             alive,
@@ -73,7 +73,7 @@ impl<N: RosNetwork> Core<N> {
         self.calls.insert(name, calls);
     }
 
-    /// A service is shared or used no more.
+    /// Ends a service that is no longer shared or used.
     pub(super) fn end_calls(&mut self, name: &Name) {
         if let Some(calls) = self.calls.get(name) {
             calls.withdraw();
@@ -95,9 +95,9 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// The owner of a service granted that this node calls it.
+    /// Handles the owner's grant to call a service.
     pub(super) fn call_granted(&mut self, now: Now, name: Name, sink: SinkId, grant: TopicGrant, anew: bool) {
-        let (Some(Calls::Called(called)), Some(local)) = (self.calls.get(&name), self.sinks.get(&name))
+        let (Some(Calls::FarService(called)), Some(local)) = (self.calls.get(&name), self.sinks.get(&name))
         else {
             return;
         };
@@ -106,40 +106,40 @@ impl<N: RosNetwork> Core<N> {
         called.granted(sink, anew);
     }
 
-    /// What happened to services.
+    /// Handles endpoint events about services.
     pub(super) fn calls_event(&self, event: &Event) {
         let name = match event {
             Event::SinkJoined { name, .. } | Event::SinkLeft { name, .. } | Event::SinkCut { name, .. } => {
                 name
             }
             Event::Lost { name, .. } => {
-                if let Some(Calls::Called(called)) = self.calls.get(name) {
+                if let Some(Calls::FarService(called)) = self.calls.get(name) {
                     called.lost();
                 }
                 return;
             }
             _ => return,
         };
-        if let Some(Calls::Served(served)) = self.calls.get(name) {
+        if let Some(Calls::LocalService(served)) = self.calls.get(name) {
             served.set_callers(self.endpoint.publishers(name));
         }
     }
 
-    /// A local client that is gone waits for nothing, and a local server that is gone answers nothing.
+    /// Ends the calls of a local client or server that disappeared.
     pub(super) fn calls_discovery(&self, event: &DiscoveryEvent) {
         let DiscoveryEvent::Vanished { guid } = event else { return };
         for calls in self.calls.values() {
             match calls {
-                Calls::Called(called) => called.endpoint_gone(guid),
-                Calls::Served(served) => served.endpoint_gone(guid),
+                Calls::FarService(called) => called.endpoint_gone(guid),
+                Calls::LocalService(served) => served.endpoint_gone(guid),
             }
         }
     }
 
-    /// Asks what became of calls that have been quiet for long.
+    /// Asks for the state of calls without news for long.
     pub(super) fn calls_due(&self, now: Instant) {
         for calls in self.calls.values() {
-            if let Calls::Called(called) = calls {
+            if let Calls::FarService(called) = calls {
                 called.ask_due(now);
             }
         }
@@ -147,20 +147,20 @@ impl<N: RosNetwork> Core<N> {
 
     pub(super) fn calls_deadline(&self) -> Option<Instant> {
         let deadline = |calls: &Calls| match calls {
-            Calls::Called(called) => called.deadline(),
-            Calls::Served(_) => None,
+            Calls::FarService(called) => called.deadline(),
+            Calls::LocalService(_) => None,
         };
         self.calls.values().filter_map(deadline).min()
     }
 
     pub(super) fn servers_gone(&self, name: &Name) {
-        if let Some(Calls::Served(served)) = self.calls.get(name) {
+        if let Some(Calls::LocalService(served)) = self.calls.get(name) {
             served.servers_gone();
         }
     }
 
     pub(super) fn open_client(&mut self, name: Name, spec: ServiceSpec) {
-        let Some(Calls::Served(served)) = self.calls.get(&name).cloned() else { return };
+        let Some(Calls::LocalService(served)) = self.calls.get(&name).cloned() else { return };
         if served.keep_client() {
             return;
         }
@@ -172,7 +172,7 @@ impl<N: RosNetwork> Core<N> {
 
     pub(super) fn close_client(&mut self, name: &Name) {
         self.service_ends.remove(name);
-        if let Some(Calls::Served(served)) = self.calls.get(name)
+        if let Some(Calls::LocalService(served)) = self.calls.get(name)
             && let Some(old) = served.end_client()
         {
             self.graph.service_gone(name);
@@ -181,7 +181,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn open_server(&mut self, name: Name, spec: ServiceSpec) {
-        let Some(Calls::Called(called)) = self.calls.get(&name).cloned() else { return };
+        let Some(Calls::FarService(called)) = self.calls.get(&name).cloned() else { return };
         self.make_service_end(name, spec, move |network, spec| {
             let handler = Box::new(Requests(called));
             network.create_server(spec, handler).map(|server| ServiceEnd::Server(Arc::new(server)))
@@ -191,7 +191,7 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn close_service_end(&mut self, name: &Name) {
         self.service_ends.remove(name);
         self.graph.service_gone(name);
-        if let Some(Calls::Called(called)) = self.calls.get(name)
+        if let Some(Calls::FarService(called)) = self.calls.get(name)
             && let Some(old) = called.set_server(None)
         {
             drop_elsewhere(old);
@@ -236,8 +236,10 @@ impl<N: RosNetwork> Core<N> {
             );
         }
         let old = match (self.calls.get(&name).filter(|_| wanted), end) {
-            (Some(Calls::Served(served)), ServiceEnd::Client(client)) => served.set_client(Some(client)),
-            (Some(Calls::Called(called)), ServiceEnd::Server(server)) => called.set_server(Some(server)),
+            (Some(Calls::LocalService(served)), ServiceEnd::Client(client)) => {
+                served.set_client(Some(client))
+            }
+            (Some(Calls::FarService(called)), ServiceEnd::Server(server)) => called.set_server(Some(server)),
             (_, ServiceEnd::Client(client)) => Some(Box::new(client) as _),
             (_, ServiceEnd::Server(server)) => Some(Box::new(server) as _),
         };
@@ -246,7 +248,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Adds to a route's state what became of its calls.
+    /// Adds the statistics of calls to a route's status.
     pub(super) fn describe_calls(&self, route: &mut RouteStatus) {
         if let Some(calls) = route.name.and_then(|name| self.calls.get(&name)) {
             let CallStats { calls: now, open, answered: answered_now } = calls.stats();
@@ -261,7 +263,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// The services of which calls were lost.
+    /// Returns the services with lost calls.
     pub(super) fn lost_calls(&self) -> Vec<ServiceCalls> {
         let of_service = |(name, ledger): (&Name, &Arc<CallLedger>)| {
             let (topic, _, losses) = ledger.read();
@@ -288,7 +290,7 @@ impl<N: RosNetwork> Core<N> {
         named
     }
 
-    /// The name of who called, if it is still there.
+    /// Returns the caller's name, if the caller still exists.
     fn caller_name(&self, name: &Name, of: CallerId) -> Option<String> {
         match of {
             CallerId::Client(guid) => {

@@ -1,5 +1,5 @@
-//! Trust that changes while the node runs: its own credentials, those of members if it is the authority, and
-//! revocations.
+//! Trust that changes while the node runs: its own credentials, revocations, and as an authority the credentials of
+//! members.
 
 use std::sync::Arc;
 
@@ -16,7 +16,7 @@ use crate::authority::{Asker, DeskAnswers, RenewalAnswer, RenewalRefusal, Renewa
 use crate::credentials::{renew_at, renewed};
 
 impl<N: RosNetwork> Core<N> {
-    /// Asks the authority for what this node needs, if its identity names one or it is the authority itself.
+    /// Asks the authority for credentials, if the identity names one or this node is the authority.
     pub(super) fn ask_renewal(&mut self) {
         let now = now();
         let asked = if self.authority.is_some() {
@@ -30,13 +30,13 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Queues a member's request for the fleet's file.
+    /// Queues a member's request for the fleet file.
     pub(super) fn answer_renewal(&mut self, sink: SinkId, peer: VerifiedPeer, csr: Bytes) {
         self.queue_renewal(RenewalRequest { asker: Asker::Member(sink), peer, csr });
         self.answer_next_batch();
     }
 
-    /// Queues this authority's own request: no way leads from a node to itself.
+    /// Queues this authority's own request, since no route leads from a node to itself.
     fn renew_own(&mut self) {
         let (peer, csr) = (self.identity.as_peer().clone(), self.identity.csr().into());
         self.queue_renewal(RenewalRequest { asker: Asker::Own, peer, csr });
@@ -51,7 +51,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Has the requests that wait answered where that may block, unless others are being answered.
+    /// Answers the waiting requests on a blocking thread, unless a batch is under way.
     pub(super) fn answer_next_batch(&mut self) {
         let (Some(authority), Some(events)) = (&mut self.authority, self.events.upgrade()) else { return };
         let Some(job) = authority.next_job() else { return };
@@ -62,7 +62,7 @@ impl<N: RosNetwork> Core<N> {
         });
     }
 
-    /// Lets the fleet's file learn what these lists revoke, if this node is the authority.
+    /// Records the revocations of these lists in the fleet file, if this node is the authority.
     fn catch_up_file(&self, anchors: Arc<TrustAnchors>) {
         let Some(job) = self.authority.as_ref().map(|authority| authority.catch_up_job(anchors)) else {
             return;
@@ -74,7 +74,7 @@ impl<N: RosNetwork> Core<N> {
         });
     }
 
-    /// Gives everyone of a batch what the fleet's file says.
+    /// Sends the answers of a batch.
     pub(super) fn desk_answered(&mut self, answers: DeskAnswers) {
         let DeskAnswers { renewals, operations } = answers;
         operations.into_iter().for_each(|done| self.operation_done(done));
@@ -89,7 +89,7 @@ impl<N: RosNetwork> Core<N> {
         if let Err(why) = &answer
             && self.control_drops.count_from(why.key(), node)
         {
-            warn!(peer = %node.short(), %why, "gives no credentials; counted from here on");
+            warn!(peer = %node.short(), %why, "refused credentials; counted from here on");
         }
         if answer.is_ok()
             && let Some(authority) = &mut self.authority
@@ -114,7 +114,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Gives a member what the fleet's file says.
+    /// Sends a member its credentials, or a refusal.
     fn give_credentials(&mut self, sink: SinkId, answer: Result<Credentials, RefuseReason>) {
         let peer = self.endpoint.renewing().find(|(id, ..)| *id == sink).map(|(_, peer, _)| peer.node_id);
         if let Some(peer) = peer {
@@ -128,7 +128,7 @@ impl<N: RosNetwork> Core<N> {
         self.endpoint.answer_renewal(now(), sink, answer);
     }
 
-    /// Closes the links of nodes that came and may attach no more.
+    /// Closes incoming links of nodes that may no longer attach.
     pub(super) fn close_not_admitted(&mut self) {
         for (link, entry) in &mut self.links {
             let peer = entry.link.peer();
@@ -141,7 +141,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Answers every member once more: the fleet's file may have changed.
+    /// Answers every member again, since the fleet file may have changed.
     pub(super) fn answer_renewals(&mut self) {
         if self.authority.is_none() {
             return;
@@ -174,10 +174,10 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Is this from here on: with another certificate, or other secrets for names made later.
+    /// Switches to a renewed identity, with another certificate or with secrets for later names.
     pub(super) fn set_identity(&mut self, identity: Arc<Identity>) {
         let now = now();
-        // A link shows a certificate and no secret: it stays if that is the same.
+        // A link shows the certificate only, so it stays if the certificate is the same.
         let shows_another = self.identity.chain() != identity.chain();
         self.identity = identity.clone();
         self.renew_due = Some(renew_at(&identity, now));
@@ -185,7 +185,7 @@ impl<N: RosNetwork> Core<N> {
             routes.set_secret(newest.secret.clone());
         }
         self.credentials.set_identity(identity.clone());
-        // It asks the credentials for the present identity when it is reloaded.
+        // The gateway reads the current identity itself at a reload.
         self.gateway.set_identity(&identity);
         self.router.set_identity(now, identity.clone());
         self.endpoint.set_identity(now, identity);
@@ -194,14 +194,14 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Trusts these CAs from here on and no others; what they have revoked stays so.
+    /// Trusts these CAs and no others. Their revocations stay in force.
     pub(super) fn trust(&mut self, anchors: TrustAnchors) {
         let anchors = Arc::new(anchors.with_lists_of(&self.credentials.anchors()));
         self.router.set_anchors(now(), anchors.clone());
         self.set_anchors(anchors);
     }
 
-    /// Believes others from here on, everywhere.
+    /// Replaces the trust anchors everywhere.
     pub(super) fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
         self.keeper.anchors(anchors.clone());
         self.catch_up_file(anchors.clone());

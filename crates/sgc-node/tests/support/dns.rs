@@ -1,4 +1,4 @@
-//! A DNS server on the loopback interface that says what a test wants.
+//! A DNS server on the loopback interface with records of the test.
 
 #![allow(clippy::unwrap_used, dead_code, unreachable_pub)]
 
@@ -23,7 +23,7 @@ impl Record {
 
 type Zone = Arc<Mutex<BTreeMap<String, Vec<Record>>>>;
 
-/// Ends with the process.
+/// The server, which ends with the process.
 pub struct DnsServer {
     pub addr: SocketAddr,
     zone: Zone,
@@ -45,7 +45,7 @@ impl DnsServer {
         server
     }
 
-    /// What it says of a name, the last dot included.
+    /// Sets the records of a name, which ends with a dot.
     pub fn set(&self, name: &str, records: Vec<Record>) {
         self.zone.lock().unwrap().insert(name.to_owned(), records);
     }
@@ -62,7 +62,7 @@ fn name(text: &str) -> Vec<u8> {
     bytes
 }
 
-/// RFC 1035, 4: header, the question as it came, answers whose names point to it.
+/// Builds an answer (RFC 1035, 4): header, the question unchanged, and records whose names point to it.
 fn answer(query: &[u8], zone: &Zone) -> Option<Vec<u8>> {
     let mut at = 12;
     let mut asked = String::new();

@@ -1,5 +1,5 @@
-//! A fleet on the disk with nodes that keep their identities, state and sockets over restarts, and streams of numbered
-//! messages through them.
+//! A fleet on the disk, whose nodes keep identities, state and sockets over restarts, and streams of numbered messages
+//! through them.
 
 #![allow(clippy::unwrap_used, dead_code, unreachable_pub)]
 
@@ -36,7 +36,7 @@ pub struct Lab {
 }
 
 impl Lab {
-    /// A fleet of these nodes, and of the router `cloud`.
+    /// Creates a fleet with these nodes and the router `cloud`.
     pub fn new(nodes: &[&str]) -> Self {
         let lab = Self::empty("lab", begin());
         lab.enroll("cloud", |request| request.router = true);
@@ -44,18 +44,18 @@ impl Lab {
         lab
     }
 
-    /// A fleet without nodes, whose router is at that port of this machine.
+    /// Creates a fleet without nodes. Its router listens on this port of the loopback interface.
     pub fn empty(name: &str, port: u16) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let fleet = dir.path().join("lab.fleet");
-        // A day old, so that certificates of it can be.
+        // The fleet is a day old, so that its certificates can be, too.
         let made = UnixMillis(unix_now().0 - 86_400_000);
         let new = Fleet::create(name.parse().unwrap(), made, &mut OsRng.unwrap_err()).unwrap();
         write_secret(&fleet, &new.to_text());
         Self { dir, fleet, port, nets: Mutex::default() }
     }
 
-    /// Another fleet, for whose nodes the router of this one is theirs.
+    /// Creates another fleet, whose nodes use the router of this one.
     pub fn beside(&self, name: &str) -> Self {
         Self::empty(name, self.port)
     }
@@ -68,7 +68,7 @@ impl Lab {
         self.fleet.clone()
     }
 
-    /// The file with its CA certificate, PEM, and the CA's fingerprint.
+    /// Writes the CA certificate to a PEM file. Returns its path and the CA's fingerprint.
     pub fn ca(&self) -> (PathBuf, String) {
         let path = self.path("ca.pem");
         let fleet = sgc_node::read_fleet(&self.fleet).unwrap();
@@ -78,7 +78,7 @@ impl Lab {
         (path, fleet.anchors().fingerprints().next().unwrap().to_string())
     }
 
-    /// Changes the fleet's file, as `sgc fleet` does.
+    /// Changes the fleet file, as `sgc fleet` does.
     pub fn with_fleet<T>(&self, change: impl FnOnce(&mut Fleet) -> T) -> T {
         let mut locked = LockedFleet::open(&self.fleet).unwrap();
         let done = change(&mut locked.fleet);
@@ -86,7 +86,7 @@ impl Lab {
         done
     }
 
-    /// Enrols a node; its identity file is where its configuration looks for it.
+    /// Enrols a node. Its identity file has the path of its configuration.
     pub fn enroll(&self, node: &str, change: impl FnOnce(&mut EnrollRequest)) {
         let mut request = EnrollRequest::new(node.parse().unwrap(), unix_now());
         change(&mut request);
@@ -94,7 +94,7 @@ impl Lab {
         write_secret(&self.path(&format!("{node}.identity")), &identity.to_text());
     }
 
-    /// What the node's identity file holds now.
+    /// Returns the identity in the node's file.
     pub fn identity(&self, node: &str) -> Arc<Identity> {
         Arc::new(sgc_node::load_identity(&self.path(&format!("{node}.identity"))).unwrap())
     }
@@ -103,7 +103,7 @@ impl Lab {
         self.identity(node).node_id()
     }
 
-    /// The list that is in force once this node is revoked.
+    /// Revokes a node. Returns the new revocation list.
     pub fn revoke(&self, node: &str) -> Vec<u8> {
         self.with_fleet(|fleet| {
             fleet.revoke(&[node.parse().unwrap()], unix_now()).unwrap();
@@ -111,7 +111,7 @@ impl Lab {
         })
     }
 
-    /// The local network of a node.
+    /// Returns the local network of a node.
     pub fn net(&self, node: &str) -> FakeDomain {
         self.nets.lock().unwrap().entry(node.to_owned()).or_default().clone()
     }
@@ -159,7 +159,7 @@ impl Lab {
         Listener::new(&self.net(node), topic, all())
     }
 
-    /// What a node's audit log says so far.
+    /// Returns the records of a node's audit log.
     pub fn audit(&self, node: &str) -> Vec<AuditRecord> {
         let mut records = Vec::new();
         match audit::read(&self.state(node).join("audit.jsonl"), |record| records.push(record)) {
@@ -169,7 +169,7 @@ impl Lab {
         records
     }
 
-    /// The number of the newest epoch that a node has begun.
+    /// Returns the number of the newest epoch that a node has begun.
     pub fn epoch(&self, node: &str) -> u32 {
         self.audit(node).iter().filter(|r| r.event == "epoch").filter_map(|r| r.epoch).max().unwrap_or(1)
     }
@@ -181,7 +181,7 @@ pub fn write_secret(path: &Path, text: &str) {
     file.write_all(text.as_bytes()).unwrap();
 }
 
-/// Reliable, and nothing is forgotten.
+/// Returns a reliable QoS that keeps all messages.
 pub fn all() -> Qos {
     Qos { history: History::KeepAll, ..Qos::default() }
 }
@@ -227,7 +227,7 @@ pub fn uses(topic: &str) -> UseConfig {
     }
 }
 
-/// Says 1, 2, 3, … about a thousand times a second, until it is told to end.
+/// Publishes 1, 2, 3, … about a thousand times a second until it is ended.
 pub struct Stream {
     said: Arc<AtomicU64>,
     end: Sender<()>,
@@ -256,18 +256,18 @@ impl Stream {
         Self { said, end, thread }
     }
 
-    /// How far it is.
+    /// Returns the last number.
     pub fn said(&self) -> u64 {
         self.said.load(SeqCst)
     }
 
-    /// Lets it go on for as many more.
+    /// Waits until it has published `n` more.
     pub fn more(&self, n: u64) {
         let until = self.said() + n;
         wait("the stream goes on", || self.said() >= until);
     }
 
-    /// Ends it; the talker and its last number.
+    /// Ends the stream. Returns the talker and its last number.
     pub fn end(self) -> (Talker, u64) {
         self.end.send(()).unwrap();
         let talker = self.thread.join().unwrap();
@@ -275,7 +275,7 @@ impl Stream {
     }
 }
 
-/// Says 0 until each of them has heard it, so that the way is there.
+/// Publishes 0 until each listener has received it, so that the path exists.
 pub fn warm_up(talker: &Talker, listeners: &[&Listener]) {
     for listener in listeners {
         listener.hears_at_last(|_| talker.say("0"));
@@ -286,12 +286,13 @@ fn number(payload: &[u8]) -> u64 {
     std::str::from_utf8(payload).unwrap().parse().unwrap()
 }
 
-/// What was heard so far of a stream.
+/// Returns the numbers that a listener has received so far.
 pub fn heard(listener: &Listener) -> Vec<u64> {
     listener.drain().iter().map(|b| number(b)).filter(|n| *n > 0).collect()
 }
 
-/// Hears the rest of a stream up to `last`, each number once and in order; how many do not come.
+/// Waits for the rest of a stream up to `last`, and checks that no number is repeated or out of order. Returns the
+/// number of missing ones.
 pub fn hears_some(listener: &Listener, first: u64, last: u64) -> u64 {
     let (mut next, mut lost) = (first, 0);
     while next <= last {
@@ -305,7 +306,7 @@ pub fn hears_some(listener: &Listener, first: u64, last: u64) -> u64 {
     lost
 }
 
-/// Hears every number from `first` to `last` once and in order.
+/// Waits for every number from `first` to `last`, each once and in order.
 pub fn hears_each(listener: &Listener, first: u64, last: u64) {
     let deadline = Instant::now() + PATIENCE;
     let mut next = first;

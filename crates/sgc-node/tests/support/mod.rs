@@ -1,4 +1,4 @@
-//! What tests of whole nodes share: nodes in this process, each with a runtime of its own, real QUIC on the loopback
+//! Helpers for tests of whole nodes: nodes in this process, each with its own runtime, real QUIC on the loopback
 //! interface, and local networks in memory with applications on them.
 
 #![allow(clippy::unwrap_used, dead_code, unreachable_pub)]
@@ -22,7 +22,7 @@ use sgc_types::TypeStore;
 use sgc_wire::{Class, Durability, History, Qos, UnixMillis};
 use tokio::sync::oneshot;
 
-/// Longer than anything takes that works.
+/// Bound of all waits, longer than any working case takes.
 pub const PATIENCE: Duration = Duration::from_secs(40);
 
 pub fn fleet() -> &'static Fleet {
@@ -44,19 +44,19 @@ pub fn identity(name: &str, router: bool) -> Arc<Identity> {
     Arc::new(fleet().issue(&request, &mut OsRng.unwrap_err()).unwrap())
 }
 
-/// The end of a node.
-type Stopped = std::pin::Pin<Box<dyn Future<Output = ()> + Send>>;
+/// Future that stops a node.
+type StopFuture = std::pin::Pin<Box<dyn Future<Output = ()> + Send>>;
 
-/// A node in a runtime of its own.
+/// A node with its own runtime.
 pub struct Node {
     runtime: Option<tokio::runtime::Runtime>,
     stop: Option<oneshot::Sender<()>>,
     ended: Receiver<()>,
     pub addr: Option<SocketAddr>,
     socket: std::path::PathBuf,
-    /// The types that it knows.
+    /// Types that the node knows.
     pub types: Arc<TypeStore>,
-    /// What a reload reads.
+    /// Configuration that a reload reads.
     config: Arc<Mutex<Config>>,
 }
 
@@ -65,7 +65,7 @@ impl Node {
         Self::start_near(config, identity, domain, None)
     }
 
-    /// With its local network, as mDNS sees it, on a port of its own.
+    /// Starts a node with mDNS on a port of its own.
     pub fn start_near(
         config: Config,
         identity: Arc<Identity>,
@@ -79,7 +79,7 @@ impl Node {
         Self::start_with(config, identity, domain, options, file)
     }
 
-    /// As `source` reads it from `file`, which it watches.
+    /// Starts a node with a configuration that `source` reads from the watched `file`.
     pub fn start_watched(
         source: ConfigSource,
         file: &std::path::Path,
@@ -93,7 +93,7 @@ impl Node {
         Self::start_with(config, identity, Some(domain), options, unused)
     }
 
-    /// Without a local network, which it joins when a reload wants one.
+    /// Starts a node without a local network. It joins one at a reload.
     pub fn start_apart(config: Config, identity: Arc<Identity>, domain: &FakeDomain) -> Self {
         let file = Arc::new(Mutex::new(config.clone()));
         let read = file.clone();
@@ -123,7 +123,7 @@ impl Node {
         config: Config,
         options: RunOptions,
         file: Arc<Mutex<Config>>,
-        run: impl FnOnce(Config, RunOptions, Stopped) -> F,
+        run: impl FnOnce(Config, RunOptions, StopFuture) -> F,
     ) -> Self
     where
         F: Future<Output = Result<(), NodeError>> + Send + 'static,
@@ -136,7 +136,7 @@ impl Node {
         let socket = config.admin_socket.clone().unwrap();
         let types = Arc::new(TypeStore::default());
         let options = RunOptions { ready: Some(ready), types: Some(types.clone()), ..options };
-        let stopped: Stopped = Box::pin(async move {
+        let stopped: StopFuture = Box::pin(async move {
             let _ = stopped.await;
         });
         let running = run(config, options, stopped);
@@ -149,15 +149,15 @@ impl Node {
         Self { runtime: Some(runtime), stop: Some(stop), ended, addr, socket, types, config: file }
     }
 
-    /// As SIGTERM does.
+    /// Stops the node like SIGTERM.
     pub fn stop(mut self) {
         let _ = self.stop.take().unwrap().send(());
         self.ended.recv_timeout(PATIENCE).expect("the node stops");
     }
 
-    /// As SIGKILL does, as far as the others can tell.
+    /// Kills the node like SIGKILL, as far as other nodes can tell.
     pub fn kill(mut self) {
-        // Waits until the sockets are closed, which the system does for a killed process.
+        // The sockets must be closed, as the system does for a killed process.
         self.runtime.take().unwrap().shutdown_timeout(PATIENCE);
     }
 
@@ -165,7 +165,7 @@ impl Node {
         self.ask(&AdminRequest::Status)
     }
 
-    /// Asks at the status socket.
+    /// Sends a request to the status socket and returns the answer.
     pub fn ask(&self, request: &AdminRequest) -> serde_json::Value {
         use std::io::{Read, Write};
         let mut text = String::new();
@@ -175,7 +175,7 @@ impl Node {
         serde_json::from_str(&text).unwrap()
     }
 
-    /// Asks at the status socket for something whose answer goes on; the first line of it.
+    /// Sends a request with a lasting answer to the status socket. Returns its first line.
     pub fn begin(&self, request: &AdminRequest) -> serde_json::Value {
         use std::io::{BufRead, BufReader, Write};
         let mut stream = std::os::unix::net::UnixStream::connect(&self.socket).unwrap();
@@ -185,12 +185,12 @@ impl Node {
         serde_json::from_str(&line).unwrap()
     }
 
-    /// How many were dropped for this reason.
+    /// Returns the number of drops for this reason.
     pub fn drops(&self, reason: &str) -> u64 {
         self.status()["drops"][reason].as_u64().unwrap_or(0)
     }
 
-    /// Changes the configuration and has it read again; what the report says changed.
+    /// Changes the configuration and reloads it. Returns the reported changes.
     pub fn reload(&self, change: impl FnOnce(&mut Config)) -> serde_json::Value {
         change(&mut self.config.lock().unwrap());
         let answer = self.ask(&AdminRequest::Reload);
@@ -198,18 +198,18 @@ impl Node {
         answer["ok"].clone()
     }
 
-    /// Node ids of those that it has links to, each once.
+    /// Returns the ids of linked nodes.
     pub fn peers(&self) -> BTreeSet<String> {
         let status = self.status();
         status["links"].as_array().unwrap().iter().map(|l| l["peer"].as_str().unwrap().to_owned()).collect()
     }
 
-    /// How many connections it refused for this reason, or was refused.
+    /// Returns the number of connections that were refused for this reason, in either direction.
     pub fn refused(&self, kind: &str) -> u64 {
         self.status()["refused"][kind].as_u64().unwrap_or(0)
     }
 
-    /// What its only route says of itself.
+    /// Returns the state of the node's only route.
     pub fn route_state(&self) -> String {
         self.status()["routes"][0]["state"].as_str().unwrap_or_default().to_owned()
     }
@@ -223,7 +223,7 @@ impl Drop for Node {
     }
 }
 
-/// Lets nodes speak (`SGC_LOG=debug cargo test …` shows what they say), and finds a port for a router.
+/// Starts logging (`SGC_LOG=debug cargo test …` shows it) and returns a free port for a router.
 pub fn begin() -> u16 {
     let filter = tracing_subscriber::EnvFilter::from_env("SGC_LOG");
     let _ = tracing_subscriber::fmt().with_env_filter(filter).with_test_writer().try_init();
@@ -231,7 +231,7 @@ pub fn begin() -> u16 {
     socket.local_addr().unwrap().port()
 }
 
-/// The three of the demo: a robot, a cloud router, an operator, each network its own.
+/// The three nodes of the demo: a robot, a cloud router and an operator's desk, each with its own network.
 pub struct Trio {
     pub robot_net: FakeDomain,
     pub desk_net: FakeDomain,
@@ -308,7 +308,7 @@ impl Trio {
     }
 }
 
-/// A topic that a robot shares with the desk.
+/// Returns a share of a topic with the desk.
 pub fn shared_topic(topic: &str) -> ShareConfig {
     ShareConfig {
         interface: Default::default(),
@@ -326,7 +326,7 @@ pub fn shared_topic(topic: &str) -> ShareConfig {
     }
 }
 
-/// A topic of the robot that a desk uses.
+/// Returns a use of the robot's topic.
 pub fn used_topic(topic: &str) -> UseConfig {
     UseConfig {
         interface: Default::default(),
@@ -358,7 +358,7 @@ pub fn latched() -> Qos {
     Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() }
 }
 
-/// An application that publishes.
+/// A publishing application.
 pub struct Talker {
     pub writer: FakeWriter,
     _net: FakeRos,
@@ -366,10 +366,10 @@ pub struct Talker {
 
 impl Talker {
     pub fn new(domain: &FakeDomain, topic: &str, qos: Qos) -> Self {
-        Self::of(domain, &spec(topic, qos))
+        Self::with_spec(domain, &spec(topic, qos))
     }
 
-    pub fn of(domain: &FakeDomain, spec: &EndpointSpec) -> Self {
+    pub fn with_spec(domain: &FakeDomain, spec: &EndpointSpec) -> Self {
         let net = domain.join(false);
         Self { writer: net.create_writer(spec).unwrap(), _net: net }
     }
@@ -384,7 +384,7 @@ impl Talker {
     }
 }
 
-/// An application that subscribes.
+/// A subscribing application.
 pub struct Listener {
     pub samples: Receiver<Bytes>,
     _reader: FakeReader,
@@ -393,10 +393,10 @@ pub struct Listener {
 
 impl Listener {
     pub fn new(domain: &FakeDomain, topic: &str, qos: Qos) -> Self {
-        Self::of(domain, &spec(topic, qos))
+        Self::with_spec(domain, &spec(topic, qos))
     }
 
-    pub fn of(domain: &FakeDomain, spec: &EndpointSpec) -> Self {
+    pub fn with_spec(domain: &FakeDomain, spec: &EndpointSpec) -> Self {
         let net = domain.join(false);
         let (sender, samples) = channel();
         let handler = Box::new(move |s: sgc_ros::Sample| drop(sender.send(s.payload)));
@@ -410,7 +410,7 @@ impl Listener {
         assert!(heard == payload, "{} bytes instead of {}", heard.len(), payload.len());
     }
 
-    /// Nothing, for as long as something that is known to come takes: `until` makes and awaits it.
+    /// Checks that nothing has arrived. The caller first waits for a later event.
     pub fn hears_nothing(&self) {
         match self.samples.try_recv() {
             Err(std::sync::mpsc::TryRecvError::Empty) => {}
@@ -418,7 +418,7 @@ impl Listener {
         }
     }
 
-    /// Skips what comes until `payload` does; fails if anything comes twice.
+    /// Publishes with `say` until a message arrives.
     pub fn hears_at_last(&self, say: impl Fn(u32)) {
         let deadline = Instant::now() + PATIENCE;
         for n in 0.. {

@@ -272,7 +272,7 @@ pub(super) fn push_crl(
             runtime.map_err(|source| CliError::System { what: "the runtime does not start", source })?;
         for url in routers {
             let list = bytes::Bytes::copy_from_slice(list);
-            match runtime.block_on(sgc_node::tell_router(url, identity.clone(), list)) {
+            match runtime.block_on(sgc_node::push_crl(url, identity.clone(), list)) {
                 Ok(lists) => {
                     names.push(url.to_string());
                     heard.extend(lists);

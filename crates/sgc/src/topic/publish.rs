@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use clap::{Args, ValueEnum};
 use sgc_node::admin::AdminRequest;
-use sgc_node::shell::{PublishWish, Published};
+use sgc_node::shell::{PublishReport, PublishRequest};
 
 use super::{ANSWER_MAX, BEGIN_MAX, NodeArgs, answer, type_and_message};
 use crate::error::{CliError, EXIT_FAILURE};
@@ -80,7 +80,7 @@ struct Publisher {
 }
 
 impl Publisher {
-    fn begin(socket: PathBuf, wish: PublishWish) -> Result<(Self, Published), CliError> {
+    fn begin(socket: PathBuf, wish: PublishRequest) -> Result<(Self, PublishReport), CliError> {
         let patience = BEGIN_MAX + Duration::from_millis(wish.wait_ms);
         let no_node = |error: std::io::Error| status::no_node(&socket, &error, patience);
         let mut into = status::connect(&socket, patience)?;
@@ -121,7 +121,7 @@ pub(super) fn publish(args: &PubArgs) -> Result<ExitCode, CliError> {
     let period = Duration::try_from_secs_f64(1.0 / args.rate)
         .map_err(|_| CliError::Cannot { reason: "--rate: more than 0 messages a second".to_owned() })?;
     let wait_for = args.wait.unwrap_or(u32::from(args.once));
-    let wish = PublishWish {
+    let wish = PublishRequest {
         topic: args.topic.clone(),
         type_name: type_name.map(str::to_owned),
         best_effort: args.reliability == ReliabilityArg::BestEffort,

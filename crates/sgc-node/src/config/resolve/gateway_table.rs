@@ -1,8 +1,8 @@
-//! `[gateway]`: the draft of one → its configuration.
+//! Resolves the draft of `[gateway]`.
 
 use sgc_gateway::{Anonymous, Scope};
 
-use super::super::draft::{GatewayClientDraft, GatewayDraft, Located, PartnerDraft};
+use super::super::draft::{GatewayClientDraft, GatewayDraft, PartnerDraft, WithOrigin};
 use super::super::error::Mistake;
 use super::super::gateway::{
     self, GATEWAY_CLIENTS_MAX, GatewayClientConfig, GatewayConfig, GatewayTls, GatewayUrl, ORIGINS_MAX,
@@ -107,7 +107,7 @@ impl Resolver<'_> {
             self.recipients(who, None, partners)
         });
         let errors = self.errors.len();
-        let mut patterns = |list: &[Located<String>]| -> Vec<String> {
+        let mut patterns = |list: &[WithOrigin<String>]| -> Vec<String> {
             list.iter().filter_map(|one| self.keep(one, names::pattern)).collect()
         };
         let scope = Scope {

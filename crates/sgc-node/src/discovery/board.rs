@@ -1,4 +1,4 @@
-//! How each router is being found, for `sgc status`. It shows; it decides nothing.
+//! State of the search for each router, for `sgc status`. It displays and decides nothing.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -8,7 +8,7 @@ use sgc_transport::LinkUrl;
 use sgc_wire::NodeId;
 use tokio::time::Instant;
 
-use super::{Aim, Passed};
+use super::{DialTarget, SkippedUrl};
 use crate::stats::Drops;
 
 /// A router that the node looks for, or a place where it looks for routers.
@@ -34,14 +34,14 @@ pub struct RouterStatus {
     pub again_in_s: Option<u64>,
 }
 
-/// Where a task says how it is doing.
+/// Table of all searches for routers. Each task owns one row.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Board {
-    shared: Arc<Shared>,
+    shared: Arc<BoardInner>,
 }
 
 #[derive(Debug, Default)]
-struct Shared {
+struct BoardInner {
     rows: Mutex<Rows>,
     drops: Drops,
 }
@@ -53,8 +53,8 @@ struct Rows {
 }
 
 impl Board {
-    /// A line for a router; it is there until it is dropped.
-    pub(crate) fn line(&self, router: impl ToString, found_by: &'static str) -> Line {
+    /// Adds a row for a router. Dropping it removes the row.
+    pub(crate) fn row(&self, router: impl ToString, found_by: &'static str) -> StatusRow {
         let mut rows = self.rows();
         let id = rows.next;
         rows.next += 1;
@@ -71,10 +71,10 @@ impl Board {
         };
         rows.rows.insert(id, (status, None));
         drop(rows);
-        Line { id, board: self.clone() }
+        StatusRow { id, board: self.clone() }
     }
 
-    /// Everything, in the order in which it began.
+    /// Returns all rows in the order in which they were added.
     pub(crate) fn snapshot(&self) -> Vec<RouterStatus> {
         let now = Instant::now();
         let shown = |(status, due): &(RouterStatus, Option<Instant>)| RouterStatus {
@@ -84,7 +84,7 @@ impl Board {
         self.rows().rows.values().map(shown).collect()
     }
 
-    /// What was left aside while looking.
+    /// Counts announcements that were ignored.
     pub(crate) fn drops(&self) -> &Drops {
         &self.shared.drops
     }
@@ -94,15 +94,15 @@ impl Board {
     }
 }
 
-/// What one task says.
+/// The row of one task.
 #[derive(Debug)]
-pub(crate) struct Line {
+pub(crate) struct StatusRow {
     id: u64,
     board: Board,
 }
 
-impl Line {
-    /// DNS is being asked.
+impl StatusRow {
+    /// Shows that DNS is being asked.
     pub(crate) fn looking_up(&self) {
         self.change(|row, due| {
             row.state = "looking up";
@@ -110,16 +110,16 @@ impl Line {
         });
     }
 
-    /// This is being dialled.
-    pub(crate) fn connecting(&self, aim: &Aim) {
+    /// Shows that this target is being dialled.
+    pub(crate) fn connecting(&self, target: &DialTarget) {
         self.change(|row, due| {
-            row.at = Some(aim.url.to_string());
+            row.at = Some(target.url.to_string());
             row.state = "connecting";
             *due = None;
         });
     }
 
-    /// A link is up.
+    /// Shows that a link is up.
     pub(crate) fn linked(&self, url: &LinkUrl, node: &NodeId) {
         self.change(|row, due| {
             row.at = Some(url.to_string());
@@ -130,20 +130,20 @@ impl Line {
         });
     }
 
-    /// What became of the ways that are better than the one in use.
-    pub(crate) fn passed_over(&self, better: &[LinkUrl], passed: &[Passed]) {
-        let of = |way: &LinkUrl| {
-            let why = passed.iter().find(|passed| passed.way == *way).map(|passed| passed.why.as_str());
-            // In a message of the transport the URL is in front already.
+    /// Shows why URLs that are better than the one in use were skipped.
+    pub(crate) fn passed_over(&self, better: &[LinkUrl], passed: &[SkippedUrl]) {
+        let of = |url: &LinkUrl| {
+            let why = passed.iter().find(|passed| passed.url == *url).map(|passed| passed.why.as_str());
+            // Messages of the transport already begin with the URL.
             let why = why.unwrap_or("did not work last time");
-            let why = why.strip_prefix(&format!("{way}: ")).unwrap_or(why);
-            format!("{}: {why}", way.scheme)
+            let why = why.strip_prefix(&format!("{url}: ")).unwrap_or(why);
+            format!("{}: {why}", url.scheme)
         };
         let why = better.iter().map(of).collect::<Vec<_>>().join("; ");
         self.change(|row, _| row.why_not_first = (!better.is_empty()).then_some(why));
     }
 
-    /// The link ended.
+    /// Shows that the link ended.
     pub(crate) fn ended(&self, why: &str) {
         self.change(|row, _| {
             row.state = "trying again";
@@ -153,7 +153,7 @@ impl Line {
         });
     }
 
-    /// Something went wrong.
+    /// Shows that an attempt failed.
     pub(crate) fn failed(&self, why: &str) {
         self.change(|row, _| {
             row.failures = row.failures.saturating_add(1);
@@ -161,12 +161,12 @@ impl Line {
         });
     }
 
-    /// Something is amiss that is no failure of a link: DNS while a link is up.
+    /// Shows a fault that is no failure of a link, such as a DNS fault while a link is up.
     pub(crate) fn noted(&self, why: &str) {
         self.change(|row, _| row.last_failure = Some(why.to_owned()));
     }
 
-    /// Nothing happens until then.
+    /// Shows that the task waits until `until`.
     pub(crate) fn waits(&self, until: Option<Instant>, stands_back: bool) {
         self.change(|row, due| {
             row.state = if stands_back { "standing back" } else { "trying again" };
@@ -181,7 +181,7 @@ impl Line {
     }
 }
 
-impl Drop for Line {
+impl Drop for StatusRow {
     fn drop(&mut self) {
         self.board.rows().rows.remove(&self.id);
     }

@@ -1,4 +1,4 @@
-//! How nodes find routers: by DNS from a server of the test, by mDNS on the loopback interface, and each router once.
+//! Searches for routers: by DNS from a test server, by mDNS on the loopback interface, and one link per router.
 
 #![allow(clippy::unwrap_used)]
 
@@ -23,7 +23,7 @@ fn urls(urls: &[&str]) -> Vec<RouterUrl> {
     urls.iter().map(|url| url.parse().unwrap()).collect()
 }
 
-/// A router of the lab on a port of its own, or on this one.
+/// Starts a router of the lab.
 fn router(lab: &Lab, node: &str, port: u16, mdns: Option<u16>, change: impl FnOnce(&mut Config)) -> Node {
     let ip = if mdns.is_some() { [0, 0, 0, 0] } else { [127, 0, 0, 1] };
     let listen = vec![ListenAddr::new(Scheme::Quic, (ip, port).into())];
@@ -32,14 +32,14 @@ fn router(lab: &Lab, node: &str, port: u16, mdns: Option<u16>, change: impl FnOn
     Node::start_near(config, lab.identity(node), None, mdns)
 }
 
-/// A node that only looks for these routers.
+/// Starts a node that only searches for these routers.
 fn seeker(lab: &Lab, node: &str, routers: &[&str], resolver: Option<&DnsServer>, mdns: Option<u16>) -> Node {
     let resolver = resolver.map(|dns| dns.addr);
     let config = Config { routers: urls(routers), resolver, ..lab.config(node) };
     Node::start_near(config, lab.identity(node), None, mdns)
 }
 
-/// A lab with a router more, and one that only looks.
+/// Creates a lab with a second router, and a node that only searches.
 fn lab_of_two_routers() -> Lab {
     let lab = Lab::new(&["seeker"]);
     lab.enroll("cloud2", |request| request.router = true);
@@ -50,7 +50,7 @@ fn links(node: &Node) -> usize {
     node.status()["links"].as_array().unwrap().len()
 }
 
-/// The lines about routers that were found so.
+/// Returns the status rows of searches of this kind.
 fn found_by(node: &Node, by: &str) -> Vec<Value> {
     let status = node.status();
     status["routers"].as_array().unwrap().iter().filter(|line| line["found_by"] == by).cloned().collect()
@@ -83,7 +83,7 @@ fn the_router_that_dns_names_is_found_and_the_next_when_it_goes() {
 
     first.stop();
     wait("a link to the next", || is_linked_to(&node, &lab, "cloud2"));
-    // It goes too, and the best is back.
+    // The second one ends too, and the best is back.
     let first = router(&lab, "cloud", ports[0], None, |_| {});
     second.stop();
     wait("a link to the best again", || is_linked_to(&node, &lab, "cloud"));
@@ -91,7 +91,7 @@ fn the_router_that_dns_names_is_found_and_the_next_when_it_goes() {
 }
 
 #[test]
-fn what_is_wrong_with_the_dns_is_said() {
+fn dns_faults_are_reported() {
     let lab = Lab::new(&["seeker"]);
     let dns = DnsServer::start();
     let node = seeker(&lab, "seeker", &["srv://lab.example"], Some(&dns), None);
@@ -104,7 +104,7 @@ fn what_is_wrong_with_the_dns_is_said() {
     wait("useless", || says("name no host and port that can be dialled"));
     dns.set("_sgc._udp.lab.example.", vec![Record::srv(0, 0, 7447, "nowhere.lab.example.")]);
     wait("no address", || says("nowhere.lab.example, which an SRV record names, has no address"));
-    // More than are taken, and all of them wrong but one that is among the best.
+    // DNS lists more targets than are kept, and only one of the best works.
     let cloud = router(&lab, "cloud", 0, None, |_| {});
     dns.set_host("r1.lab.example.", [127, 0, 0, 1]);
     let wrong = |n: u16| Record::srv(100 + n, 0, 7447, &format!("n{n}.lab.example."));
@@ -144,7 +144,7 @@ fn two_ways_to_one_router_make_one_link_and_the_other_takes_over() {
     cloud.stop();
     wait("neither", || links(&node) == 0);
     let cloud = router(&lab, "cloud", port, None, |_| {});
-    // Whichever it was, the one that stood back did not wait for its minutes to pass.
+    // Whichever link ended, the search that stood back did not wait for its full time.
     wait("one is linked again", || states() == both);
     assert_eq!((links(&node), links(&cloud)), (1, 1));
 }
@@ -160,10 +160,10 @@ fn a_router_on_the_local_network_is_found_lost_and_found_again() {
     assert_eq!(line["peer"], lab.id("cloud").to_string());
     cloud.stop();
     wait("it is gone", || links(&node) == 0 && found_by(&node, "mdns").len() == 1);
-    // Elsewhere, as after a restart with another port.
+    // The router returns at another port, as after a restart.
     let cloud = router(&lab, "cloud", 0, mdns, |_| {});
     wait("it is found again", || is_linked_to(&node, &lab, "cloud"));
-    // It dies without a word, and another one is there.
+    // The router is killed, and another one appears.
     cloud.kill();
     let cloud2 = router(&lab, "cloud2", 0, mdns, |_| {});
     wait("the other is found", || is_linked_to(&node, &lab, "cloud2"));
@@ -176,7 +176,7 @@ fn strangers_and_proxies_on_the_local_network_are_not_linked() {
     lab.enroll("liar", |_| {});
     let other = Lab::new(&[]);
     let mdns = Some(begin());
-    // A router of another fleet, and a member that is no router.
+    // One is a router of another fleet, the other a member that is no router.
     let stranger = router(&other, "cloud", 0, mdns, |_| {});
     let liar = router(&lab, "liar", 0, mdns, |_| {});
     let node = seeker(&lab, "seeker", &["mdns://"], None, mdns);
@@ -189,7 +189,7 @@ fn strangers_and_proxies_on_the_local_network_are_not_linked() {
     });
     let cloud = router(&lab, "cloud", 0, mdns, |_| {});
     wait("the router is found", || is_linked_to(&node, &lab, "cloud"));
-    // Once at each of its addresses.
+    // Each address is tried once.
     assert!(links(&stranger) == 0 && stranger.refused("other_ca") <= 8);
     drop(cloud);
 }
@@ -234,7 +234,7 @@ fn routers_that_find_each_other_make_one_link_and_none_finds_itself() {
     let dialled =
         |node: &Node| found_by(node, "mdns").iter().filter(|line| line["state"] == "linked").count();
     let (less, more) = if lab.id("cloud") < lab.id("cloud2") { (&one, &two) } else { (&two, &one) };
-    // Whoever was first.
+    // The order of the links does not matter.
     wait("by one link of the lesser", || {
         (dialled(less), dialled(more), links(less), links(more)) == (1, 0, 1, 1)
     });
@@ -249,7 +249,7 @@ fn a_shared_router_serves_the_fleets_that_it_accepts_and_keeps_them_apart() {
         lab.enroll("desk", |_| {});
     }
     let ca_of = |lab: &Lab| lab.ca().0;
-    // The router is enrolled with `a` and serves `a` and `b`; it believes `c` too, whose nodes do not come to it.
+    // The router is enrolled with `a`, serves `a` and `b`, and trusts `c`, whose nodes it does not accept.
     let (accept, trust) = (vec![ca_of(&a), ca_of(&b)], vec![ca_of(&c)]);
     let cloud = a.cloud_with(|config| (config.accept, config.trust) = (accept, trust));
     let trusting = |config: &mut Config| config.trust = vec![ca_of(&a)];
@@ -275,7 +275,7 @@ fn a_shared_router_serves_the_fleets_that_it_accepts_and_keeps_them_apart() {
     for (talker, listener) in talkers.iter().zip(&listeners) {
         warm_up(talker, &[listener]);
     }
-    // Alike in owner's name, topic and type; each gets its own fleet's.
+    // Owner name, topic and type are equal, and each desk gets its own fleet's message.
     talkers[0].say("of a");
     talkers[1].say("of b");
     for (listener, expected) in listeners.iter().zip(["of a", "of b"]) {
@@ -283,7 +283,7 @@ fn a_shared_router_serves_the_fleets_that_it_accepts_and_keeps_them_apart() {
         listener.hears_nothing();
     }
 
-    // The third is not let in.
+    // The third fleet is not accepted.
     let stranger = c.start("robot", |config| {
         trusting(config);
         share_all(config);
@@ -299,7 +299,7 @@ fn a_shared_router_serves_the_fleets_that_it_accepts_and_keeps_them_apart() {
     };
     wait("the log says what to do", || a.audit("cloud").iter().any(refusal));
 
-    // It is let in, and out again.
+    // The third fleet is accepted, and then refused again.
     let wider = vec![ca_of(&a), ca_of(&b), ca_of(&c)];
     let report = cloud.reload(|config| config.accept = wider);
     assert!(report["changed"].as_array().unwrap().iter().any(|c| c == "whose nodes may attach changed"));
@@ -315,7 +315,7 @@ fn a_node_of_one_fleet_behind_a_shared_router_cannot_join_a_name_of_the_other() 
     let (ops, b) = shared_router();
     let a = ops.beside("a");
     a.enroll("spy", |_| {});
-    // The owner does not even believe the spy's CA.
+    // The owner does not even trust the spy's CA.
     spy_gets_nothing(&ops, &a, &b, |robot, _| {
         let status = robot.status();
         status["drops"].as_object().unwrap().iter().any(|(key, n)| key.contains("not_verified") && n != 0)
@@ -326,13 +326,13 @@ fn a_node_of_one_fleet_behind_a_shared_router_cannot_join_a_name_of_the_other() 
 fn a_node_of_the_routers_own_fleet_cannot_join_a_name_of_another() {
     let (ops, b) = shared_router();
     ops.enroll("spy", |_| {});
-    // The owner believes that CA, since the router is of it; "*" is its own fleet alone.
+    // The owner trusts that CA, since it is the router's. `*` covers the owner's fleet alone.
     spy_gets_nothing(&ops, &ops, &b, |_, spy| {
         spy.route_state() == "refused: the owner does not share it with this node"
     });
 }
 
-/// A fleet with a router, and one with a robot and a desk.
+/// Creates the fleet of a router, and a fleet with a robot and a desk.
 fn shared_router() -> (Lab, Lab) {
     let ops = Lab::new(&[]);
     let b = ops.beside("b");
@@ -341,7 +341,7 @@ fn shared_router() -> (Lab, Lab) {
     (ops, b)
 }
 
-/// A spy of fleet `a` asks for a topic that a robot shares with all of fleet `b`, over the router of `ops`.
+/// A spy of fleet `a` asks, over the router of `ops`, for a topic that a robot shares with all of fleet `b`.
 fn spy_gets_nothing(ops: &Lab, a: &Lab, b: &Lab, is_refused: impl Fn(&Node, &Node) -> bool) {
     let accept = vec![a.ca().0, b.ca().0];
     let cloud = ops.cloud_with(|config| config.accept = accept);
@@ -361,8 +361,8 @@ fn spy_gets_nothing(ops: &Lab, a: &Lab, b: &Lab, is_refused: impl Fn(&Node, &Nod
     talker.wait_for_readers(1);
     warm_up(&talker, &[&listener]);
 
-    // The spy knows even what only the fleet knows: the secret of this topic. No token was given, so nobody of its CA is
-    // in the owner's policy.
+    // The spy even knows the topic's secret, which only the fleet should know. The owner's policy has nobody of the
+    // spy's CA, since no token was given.
     let owner = b.identity("robot");
     let metadata = sgc_node::policy::metadata(&shared, "robot");
     let token = ShareToken {
@@ -395,7 +395,7 @@ fn spy_gets_nothing(ops: &Lab, a: &Lab, b: &Lab, is_refused: impl Fn(&Node, &Nod
     stolen.hears_nothing();
     assert_eq!(writers(&a.net("spy"), "/chatter"), 0);
     assert!(links(&spy) == 1 && cloud.peers().len() == 3);
-    // No packet came near it, and no branch is left that would bring one.
+    // No packet reached the spy, and no branch towards it is left.
     let status = spy.status();
     assert!(
         status["names"].as_array().unwrap().iter().all(|n| n["name"] != name.as_str() || n["packets"] == 0)

@@ -1,7 +1,7 @@
-//! What the local network tells of routers: which of it is worth dialling, and when.
+//! Candidates: decides which announcements on the local network are worth dialling, and when.
 //!
-//! Anybody there can tell anything, so all of it is bounded, patience is kept for each address whatever it is announced
-//! as, and what is told never ends a link. It dials nothing.
+//! Anybody on the local network can announce anything. So all tables are bounded, back-off is kept per address whatever
+//! name announces it, and an announcement never ends a link. This module dials nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, SocketAddr};
@@ -14,36 +14,36 @@ use super::Backoff;
 
 /// Most announcements that are remembered at once.
 pub(crate) const CANDIDATES_MAX: usize = 32;
-/// Most addresses of one of them.
+/// Most addresses of one announcement.
 pub(crate) const ADDRESSES_MAX: usize = 8;
 /// Most addresses whose failures are remembered.
 const TRIED_MAX: usize = 256;
-/// The longest wait for an address that the network told of.
+/// The longest wait for an announced address.
 const BACKOFF_MAX: Duration = Duration::from_secs(60);
 
 /// The routers that are announced now.
 #[derive(Debug, Default)]
 pub(crate) struct Candidates {
     known: BTreeMap<String, Vec<SocketAddr>>,
-    /// What became of addresses; it outlives the announcement, or each new one would be a new beginning.
+    /// Back-off of each address. It outlives the announcement, since each new announcement would otherwise reset it.
     tried: BTreeMap<SocketAddr, Backoff>,
-    /// Being dialled, or linked.
+    /// Addresses that are being dialled or linked.
     busy: BTreeSet<SocketAddr>,
 }
 
-/// What became of an attempt.
+/// Result of an attempt at a candidate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Verdict {
     /// A link was up, and ended.
     Ended,
-    /// Nobody answered.
+    /// The attempt failed.
     Failed,
-    /// Trying again soon is of no use.
+    /// An early attempt cannot succeed.
     StandBack,
 }
 
 impl Candidates {
-    /// A router is announced, or elsewhere than before; false if there is no room for it.
+    /// Adds an announced router or its new addresses. Returns `false` if there is no room.
     pub(crate) fn announced(
         &mut self,
         instance: &str,
@@ -67,12 +67,12 @@ impl Candidates {
         true
     }
 
-    /// It is announced no more. A link to it stays as long as it works.
+    /// Removes an announcement. A link to the router stays as long as it works.
     pub(crate) fn vanished(&mut self, instance: &str) {
         self.known.remove(instance);
     }
 
-    /// Forgets the announcement that has failed most, if one has at all.
+    /// Drops the announcement with the most failures, if any has failed.
     fn make_room(&mut self) -> bool {
         let worst = self.known.iter().filter(|(_, addresses)| !self.is_busy(addresses));
         let worst = worst.map(|(instance, addresses)| (self.failures(addresses), instance)).max();
@@ -85,7 +85,7 @@ impl Candidates {
         }
     }
 
-    /// What to dial now: of what is due, that which failed least. It is busy until [`Candidates::done`].
+    /// Returns the due candidate with the fewest failures. It is busy until [`Candidates::done`].
     pub(crate) fn next(&mut self, now: Instant) -> Option<Vec<SocketAddr>> {
         let due = |addresses: &&Vec<SocketAddr>| !self.is_busy(addresses) && self.due(addresses) <= Some(now);
         let best = self.known.values().filter(due).min_by_key(|addresses| self.failures(addresses))?;
@@ -95,13 +95,13 @@ impl Candidates {
         Some(addresses)
     }
 
-    /// When to ask for the next one, if time alone brings one.
+    /// Returns the time at which the next candidate becomes due.
     pub(crate) fn next_due(&self, now: Instant) -> Option<Instant> {
         let idle = self.known.values().filter(|addresses| !self.is_busy(addresses));
         idle.map(|addresses| self.due(addresses).unwrap_or(now)).min()
     }
 
-    /// What became of what was dialled; when it may be again.
+    /// Records the result of an attempt and schedules the next.
     pub(crate) fn done(
         &mut self,
         addresses: &[SocketAddr],
@@ -112,7 +112,7 @@ impl Candidates {
         for address in addresses {
             self.busy.remove(address);
             if !self.tried.contains_key(address) && self.tried.len() >= TRIED_MAX {
-                // What may be tried soonest loses least.
+                // The entry that is due soonest loses the least.
                 let soonest = self.tried.iter().min_by_key(|(_, tried)| tried.due()).map(|(a, _)| *a);
                 soonest.map(|soonest| self.tried.remove(&soonest));
             }
@@ -125,19 +125,19 @@ impl Candidates {
         }
     }
 
-    /// The reason to stand back is gone.
+    /// Makes addresses due again, because the reason to stand back is gone.
     pub(crate) fn forgive(&mut self, addresses: &[SocketAddr]) {
         for address in addresses {
             self.tried.remove(address);
         }
     }
 
-    /// The network is another: what failed there may work here.
+    /// Makes all addresses due again, because the network changed.
     pub(crate) fn forgive_all(&mut self) {
         self.tried.clear();
     }
 
-    /// How many are announced.
+    /// Returns the number of announcements.
     #[cfg(test)]
     pub(crate) fn len(&self) -> usize {
         self.known.len()
@@ -147,7 +147,7 @@ impl Candidates {
         addresses.iter().any(|address| self.busy.contains(address))
     }
 
-    /// When the first of these may be tried; `None` is at once.
+    /// Returns when the first of these addresses is due; `None` means at once.
     fn due(&self, addresses: &[SocketAddr]) -> Option<Instant> {
         addresses.iter().map(|address| self.tried.get(address).and_then(Backoff::due)).min().flatten()
     }
@@ -175,12 +175,12 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn what_is_announced_is_dialled_once_and_forgotten_when_it_vanishes() {
+    async fn announced_router_is_dialled_once_and_forgotten_when_it_vanishes() {
         let (mut found, mut rng, now) = start();
         assert!(found.announced("a", [at(1)]));
         assert_eq!(found.next(now), Some(vec![at(1)]));
         assert_eq!(found.next(now), None);
-        // Told again, also under another name: it is busy.
+        // A repeated announcement, even under another name, does not make a busy address due.
         assert!(found.announced("a", [at(1)]) && found.announced("b", [at(1)]));
         assert_eq!((found.next(now), found.next_due(now)), (None, None));
         found.vanished("b");
@@ -200,7 +200,7 @@ mod tests {
         let mut attempts = 0;
         let end = now + Duration::from_secs(600);
         while now < end {
-            // A liar announces one address under ever new names, and takes the old ones back.
+            // An attacker announces one address under ever new names and withdraws the old ones.
             let name = format!("liar {attempts}");
             found.announced(&name, [at(1)]);
             if let Some(addresses) = found.next(now) {
@@ -210,7 +210,7 @@ mod tests {
             found.vanished(&name);
             now += Duration::from_millis(100);
         }
-        // Ten that double, then one in 30 to 60 seconds.
+        // Ten doubling waits, then one every 30 to 60 seconds.
         assert!((15..35).contains(&attempts), "{attempts}");
     }
 
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn who_stands_back_comes_again_when_forgiven() {
+    async fn candidate_that_stood_back_returns_after_forgiveness() {
         let (mut found, mut rng, now) = start();
         found.announced("a", [at(1), at(2)]);
         let addresses = found.next(now).unwrap();

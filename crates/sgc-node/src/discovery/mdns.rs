@@ -1,4 +1,4 @@
-//! Links to routers that the local network tells of: a few at once, each to another router.
+//! Links to routers that announce themselves on the local network: a few at once, each to another router.
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
@@ -14,34 +14,36 @@ use tokio::time::{Instant, sleep, sleep_until};
 use tracing::{debug, info, warn};
 
 use super::candidates::{CANDIDATES_MAX, Candidates, Verdict};
-use super::local::Heard;
+use super::local::Sighting;
 use crate::links::place_in_use;
 
-use super::{Aim, BACKOFF_MAX, Board, Failure, Hold, Line, LocalNetwork, Outcome, Wish, wait};
+use super::{
+    BACKOFF_MAX, Board, DialTarget, Failure, KeepLink, LinkRequest, LocalNetwork, Outcome, StatusRow, wait,
+};
 
-/// Most links to routers that were found so.
+/// Most links to announced routers.
 pub(crate) const LINKS_MAX: usize = 2;
-/// Most that are dialled at once.
+/// Most announced routers that are dialled at once.
 pub(crate) const DIALS_MAX: usize = 4;
-/// How often failures may be forgotten because the network changed, which neighbours can bring about.
+/// Least time between two resets of all back-offs after network changes, which neighbours can provoke.
 const FORGIVE_EVERY: Duration = Duration::from_secs(10);
-/// What was heard and not looked at yet.
+/// Announcements that may wait to be judged.
 const HEARD_MAX: usize = 64;
 
-/// Hears of routers, and keeps links to some of them.
-pub(crate) async fn keep_some<H: Hold>(
+/// Listens for announcements and keeps links to some of the routers.
+pub(crate) async fn keep_some<H: KeepLink>(
     local: Arc<LocalNetwork>,
-    wanted: Wanted,
-    holder: H,
+    wanted: RouterFilter,
+    keeper: H,
     board: Board,
     mut rng: ChaCha20Rng,
 ) {
     let (tell, heard) = mpsc::channel(HEARD_MAX);
-    let mut keeper = rng.clone();
-    // Another stream than the one above.
-    keeper.set_stream(1);
-    let line = board.line(&wanted.written, "mdns");
-    let keep = keep_links(heard, wanted, holder, &board, &line, keeper);
+    let mut link_rng = rng.clone();
+    // The two generators must not yield the same numbers.
+    link_rng.set_stream(1);
+    let row = board.row(&wanted.written, "mdns");
+    let keep = keep_links(heard, wanted, keeper, &board, &row, link_rng);
     let listen = async {
         let mut failures = 0;
         loop {
@@ -55,14 +57,14 @@ pub(crate) async fn keep_some<H: Hold>(
                             return;
                         }
                     }
-                    // Too much was announced for this node to keep up with; what counts is announced again.
+                    // The queue overflowed. Routers repeat their announcements, so none is lost for good.
                     board.drops().count("mdns_overrun");
                 }
                 Err(why) => {
                     if failures == 0 {
                         warn!("cannot look for routers on the local network: {why}; trying again");
                     }
-                    line.failed(&why.to_string());
+                    row.failed(&why.to_string());
                     failures += 1;
                 }
             }
@@ -75,39 +77,39 @@ pub(crate) async fn keep_some<H: Hold>(
     }
 }
 
-/// Which of the routers on the local network are wanted.
+/// The routers on the local network that are wanted.
 #[derive(Clone, Debug)]
-pub(crate) struct Wanted {
+pub(crate) struct RouterFilter {
     /// As the user wrote it.
     pub(crate) written: String,
-    /// Only these; all that are trusted if there is nothing.
+    /// The only nodes that are wanted; `None` means all trusted ones.
     pub(crate) nodes: Option<Arc<BTreeSet<NodeId>>>,
 }
 
-/// What an attempt came to.
-struct Done {
+/// Result of an attempt at an announced router.
+struct AttemptResult {
     addresses: Vec<SocketAddr>,
     outcome: Outcome,
 }
 
-/// Dials what is heard of, [`DIALS_MAX`] at once, until [`LINKS_MAX`] links are up.
-pub(crate) async fn keep_links<H: Hold>(
-    mut heard: mpsc::Receiver<Heard>,
-    wanted: Wanted,
-    holder: H,
+/// Dials announced routers, [`DIALS_MAX`] at once, until [`LINKS_MAX`] links are up.
+pub(crate) async fn keep_links<H: KeepLink>(
+    mut heard: mpsc::Receiver<Sighting>,
+    wanted: RouterFilter,
+    keeper: H,
     board: &Board,
-    line: &Line,
+    row: &StatusRow,
     mut rng: ChaCha20Rng,
 ) {
     let places = Arc::new(Semaphore::new(LINKS_MAX));
-    let wish = Wish { hearsay: true, nodes: wanted.nodes, places: Some(places.clone()) };
+    let request = LinkRequest { hearsay: true, nodes: wanted.nodes, places: Some(places.clone()) };
     let mut found = Candidates::default();
-    let mut attempts: JoinSet<Done> = JoinSet::new();
-    // Routers that were reached in another way, until they are not.
+    let mut attempts: JoinSet<AttemptResult> = JoinSet::new();
+    // Routers with another link, until that link ends.
     let mut elsewhere: JoinSet<Vec<SocketAddr>> = JoinSet::new();
-    // Of each one waits at most, however often it is tried meanwhile.
+    // At most one task waits per router, however often it is tried.
     let mut waiting = BTreeSet::new();
-    let (mut network, mut forgiven) = (holder.network(), None::<Instant>);
+    let (mut network, mut forgiven) = (keeper.network(), None::<Instant>);
     loop {
         let now = Instant::now();
         let mut is_full = true;
@@ -120,9 +122,9 @@ pub(crate) async fn keep_links<H: Hold>(
                 is_full = false;
                 break;
             };
-            attempts.spawn(attempt(addresses, wish.clone(), holder.clone(), board.clone()));
+            attempts.spawn(attempt(addresses, request.clone(), keeper.clone(), board.clone()));
         }
-        // What is due and has no place waits for one.
+        // Due candidates without a place wait for one.
         let next = found.next_due(now).filter(|_| !is_full);
         let timer = async {
             match next {
@@ -132,34 +134,34 @@ pub(crate) async fn keep_links<H: Hold>(
         };
         tokio::select! {
             event = heard.recv() => match event {
-                Some(Heard::Announced { instance, addresses }) => {
+                Some(Sighting::Announced { instance, addresses }) => {
                     debug!(%instance, ?addresses, "a router is announced on the local network");
                     if !found.announced(&instance, addresses) {
                         board.drops().count("mdns_crowded");
                     }
                 }
-                Some(Heard::Vanished { instance }) => found.vanished(&instance),
-                Some(Heard::Unknown) => {
+                Some(Sighting::Vanished { instance }) => found.vanished(&instance),
+                Some(Sighting::Unknown) => {
                     board.drops().count("mdns_unknown");
                 }
                 None => return,
             },
             Some(done) = attempts.join_next() => {
-                let Ok(Done { addresses, outcome }) = done else { continue };
-                if holder.is_over() {
+                let Ok(AttemptResult { addresses, outcome }) = done else { continue };
+                if keeper.is_over() {
                     return;
                 }
                 if let (Outcome::Failed(why), Some(first)) = (&outcome, addresses.first()) {
-                    line.noted(&format!("{first}: {why}"));
+                    row.noted(&format!("{first}: {why}"));
                 }
                 let verdict = judge(&outcome);
                 if let Outcome::Failed(Failure::Reached(node)) = outcome
                     && waiting.len() < CANDIDATES_MAX
                     && waiting.insert(addresses.clone())
                 {
-                    let (holder, addresses) = (holder.clone(), addresses.clone());
+                    let (keeper, addresses) = (keeper.clone(), addresses.clone());
                     elsewhere.spawn(async move {
-                        holder.released(&node).await;
+                        keeper.released(&node).await;
                         addresses
                     });
                 }
@@ -182,8 +184,13 @@ pub(crate) async fn keep_links<H: Hold>(
     }
 }
 
-/// Dials what was announced, and keeps the link.
-async fn attempt<H: Hold>(addresses: Vec<SocketAddr>, wish: Wish, holder: H, board: Board) -> Done {
+/// Dials an announced router and keeps the link.
+async fn attempt<H: KeepLink>(
+    addresses: Vec<SocketAddr>,
+    request: LinkRequest,
+    keeper: H,
+    board: Board,
+) -> AttemptResult {
     let url = LinkUrl {
         scheme: Scheme::Quic,
         host: addresses.first().map(|first| first.ip().to_string()).unwrap_or_default(),
@@ -191,23 +198,24 @@ async fn attempt<H: Hold>(addresses: Vec<SocketAddr>, wish: Wish, holder: H, boa
         path: None,
         cost_ms: None,
     };
-    let line = board.line(&url, "mdns");
-    let (_fixed, aim) = watch::channel(Aim { addresses: addresses.clone(), ..Aim::from(url.clone()) });
-    let outcome = holder.hold(aim, &wish, &line).await;
+    let row = board.row(&url, "mdns");
+    let (_fixed, target) =
+        watch::channel(DialTarget { addresses: addresses.clone(), ..DialTarget::from(url.clone()) });
+    let outcome = keeper.keep_link(target, &request, &row).await;
     match &outcome {
         Outcome::Ended { remote, end } => info!(%remote, "link ended: {end}"),
         Outcome::Failed(why) => debug!(%url, "a router on the local network: {why}"),
     }
-    Done { addresses, outcome }
+    AttemptResult { addresses, outcome }
 }
 
 fn judge(outcome: &Outcome) -> Verdict {
     match outcome {
         Outcome::Ended { end, .. } if place_in_use(end).is_some() => Verdict::StandBack,
         Outcome::Ended { .. } => Verdict::Ended,
-        // One of another fleet stays one.
+        // A router of another fleet stays one.
         Outcome::Failed(Failure::Dial(why)) if why.is_refusal() => Verdict::StandBack,
-        // There will be a place when a link ends, not before.
+        // A place becomes free only when a link ends.
         Outcome::Failed(Failure::Enough) => Verdict::Failed,
         Outcome::Failed(why) if why.stands_back() => Verdict::StandBack,
         Outcome::Failed(_) => Verdict::Failed,

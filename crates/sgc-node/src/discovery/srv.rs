@@ -1,4 +1,4 @@
-//! One link to one of the routers that the SRV records of a domain name, in the order of RFC 2782.
+//! Keeps one link to one router of a domain, in the order of its SRV records (RFC 2782).
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -11,31 +11,32 @@ use tokio::time::{Instant, sleep_until};
 use tracing::{info, warn};
 
 use super::{
-    Aim, BACKOFF_MAX, Backoff, Failure, Hold, Line, Names, Outcome, Wish, another_network, pause, take_note,
+    BACKOFF_MAX, Backoff, DialTarget, Failure, KeepLink, LinkRequest, Names, Outcome, StatusRow,
+    another_network, pause, take_note,
 };
 use crate::config::{RouterUrl, SrvDomain};
 
-/// Most targets of a domain that are taken, the best of them.
+/// Most targets of a domain that are kept, the best of them.
 pub(crate) const TARGETS_MAX: usize = 16;
-/// An answer holds as long as it says, within these bounds.
+/// Bounds of the validity of an answer.
 pub(crate) const TTL_MIN: Duration = Duration::from_secs(10);
 pub(crate) const TTL_MAX: Duration = Duration::from_secs(3600);
 const HOST_BYTES_MAX: usize = 253;
 
-/// A record: a router of a domain.
+/// An SRV record: a router of a domain.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct SrvTarget {
-    /// The least is tried first.
+    /// Priority. The least is tried first.
     pub(crate) priority: u16,
-    /// Its share among those of one priority.
+    /// Weight among targets of the same priority.
     pub(crate) weight: u16,
-    /// A host name, without its last dot.
+    /// Host name without its final dot.
     pub(crate) host: String,
     pub(crate) port: u16,
 }
 
 impl SrvTarget {
-    /// Whether it can be dialled at all.
+    /// Returns `true` if the target can be dialled.
     pub(crate) fn is_usable(&self) -> bool {
         let is_name = |c: u8| c.is_ascii_alphanumeric() || matches!(c, b'-' | b'.' | b'_');
         self.port != 0 && (1..=HOST_BYTES_MAX).contains(&self.host.len()) && self.host.bytes().all(is_name)
@@ -46,27 +47,27 @@ impl SrvTarget {
     }
 }
 
-/// What DNS said of a domain.
+/// The SRV records of a domain.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct SrvAnswer {
-    /// At least one, at most [`TARGETS_MAX`].
+    /// Targets, 1 to [`TARGETS_MAX`].
     pub(crate) targets: Vec<SrvTarget>,
-    /// How long it holds, [`TTL_MIN`] to [`TTL_MAX`].
+    /// Validity, [`TTL_MIN`] to [`TTL_MAX`].
     pub(crate) ttl: Duration,
 }
 
-/// The order in which to try them: by priority, and within one at random, each with a probability in proportion to its
-/// weight of coming before the rest (RFC 2782).
+/// Returns the targets in the order of attempts: by priority, and within a priority at random, in proportion to their
+/// weights (RFC 2782).
 pub(crate) fn in_order(targets: &[SrvTarget], rng: &mut impl RngCore) -> Vec<SrvTarget> {
     let mut rest = targets.to_vec();
-    // Those of weight 0 first, which leaves them a small chance only.
+    // Weight 0 comes first, so that such targets keep a small chance.
     rest.sort_by_key(|target| (target.priority, target.weight != 0));
     let mut ordered = Vec::with_capacity(rest.len());
     while let Some(first) = rest.first() {
         let priority = first.priority;
         let peers = || rest.iter().take_while(|target| target.priority == priority);
         let total: u64 = peers().map(|target| u64::from(target.weight)).sum();
-        // At most 16 weights of 16 bits, so the bias of a remainder of 64 bits is nothing.
+        // At most 16 weights of 16 bits are summed, so the modulo bias of 64 random bits is negligible.
         let drawn = rng.next_u64() % (total + 1);
         let mut sum = 0;
         let chosen = peers().position(|target| {
@@ -78,23 +79,23 @@ pub(crate) fn in_order(targets: &[SrvTarget], rng: &mut impl RngCore) -> Vec<Srv
     ordered
 }
 
-/// What is known of a domain.
-struct Known {
-    /// The last good answer; an old one is better than none.
+/// Knowledge about a domain.
+struct SrvState {
+    /// The last good answer. An old one is better than none.
     answer: Option<SrvAnswer>,
-    /// When to ask again.
+    /// Time of the next question.
     expires: Instant,
     asked: Option<Instant>,
     asking: Backoff,
 }
 
-impl Known {
-    /// Asks DNS, and keeps what it says.
+impl SrvState {
+    /// Asks DNS and stores the answer.
     async fn ask<N: Names>(
         &mut self,
         domain: &SrvDomain,
         names: &N,
-        line: &Line,
+        row: &StatusRow,
         rng: &mut ChaCha20Rng,
     ) -> bool {
         let asked = names.routers(domain).await;
@@ -111,7 +112,7 @@ impl Known {
                 if self.asking.failures() == 0 {
                     warn!("cannot find a router: {why}; asking again until it works");
                 }
-                line.noted(&why.to_string());
+                row.noted(&why.to_string());
                 if why.is_final() {
                     self.answer = None;
                 }
@@ -123,23 +124,22 @@ impl Known {
     }
 }
 
-/// Keeps one link to one of the routers of a domain: to the best that can be reached, and when that link ends, again to
-/// the best.
-pub(crate) async fn keep_one_of<N: Names, H: Hold>(
+/// Keeps one link to the best reachable router of a domain, and searches again when it ends.
+pub(crate) async fn keep_one_of<N: Names, H: KeepLink>(
     domain: SrvDomain,
     names: N,
-    holder: H,
-    line: Line,
+    keeper: H,
+    row: StatusRow,
     mut rng: ChaCha20Rng,
 ) {
     let mut known =
-        Known { answer: None, expires: Instant::now(), asked: None, asking: Backoff::new(BACKOFF_MAX) };
+        SrvState { answer: None, expires: Instant::now(), asked: None, asking: Backoff::new(BACKOFF_MAX) };
     let mut tried: BTreeMap<LinkUrl, Backoff> = BTreeMap::new();
-    let mut network = holder.network();
+    let mut network = keeper.network();
     loop {
         if known.expires <= Instant::now() {
-            line.looking_up();
-            known.ask(&domain, &names, &line, &mut rng).await;
+            row.looking_up();
+            known.ask(&domain, &names, &row, &mut rng).await;
         }
         let targets = known.answer.as_ref().map(|answer| in_order(&answer.targets, &mut rng));
         let targets = targets.unwrap_or_default();
@@ -150,40 +150,40 @@ pub(crate) async fn keep_one_of<N: Names, H: Hold>(
             if !backoff.is_due(Instant::now()) {
                 continue;
             }
-            let outcome = match aim(&target, &names).await {
-                Ok(aim) => hold(&domain, &mut known, aim, &names, &holder, &line, &mut rng).await,
+            let outcome = match dial_target(&target, &names).await {
+                Ok(target) => keep_link(&domain, &mut known, target, &names, &keeper, &row, &mut rng).await,
                 Err(failure) => Outcome::Failed(failure),
             };
-            if holder.is_over() {
+            if keeper.is_over() {
                 return;
             }
-            take_note(&outcome, backoff, &line, &mut rng);
+            take_note(&outcome, backoff, &row, &mut rng);
             match &outcome {
                 Outcome::Ended { .. } => break,
-                // The set has its link, by another way.
+                // Another search has a link to a router of the domain.
                 Outcome::Failed(Failure::Reached(_)) => {
-                    pause(&holder, &outcome, backoff.due(), &mut network).await;
+                    pause(&keeper, &outcome, backoff.due(), &mut network).await;
                     *backoff = Backoff::new(BACKOFF_MAX);
                     break;
                 }
                 Outcome::Failed(_) => has_failed = true,
             }
         }
-        if holder.is_over() {
+        if keeper.is_over() {
             return;
         }
-        // What failed may stand in DNS no more.
+        // DNS may no longer list the failed targets.
         if has_failed && let Some(asked) = known.asked {
             known.expires = known.expires.min(asked + TTL_MIN);
         }
         let next = tried.values().map(|backoff| backoff.due().unwrap_or_else(Instant::now)).min();
         let next = next.map_or(known.expires, |next| next.min(known.expires));
-        line.waits(Some(next), false);
+        row.waits(Some(next), false);
         tokio::select! {
             () = sleep_until(next) => {}
             () = another_network(&mut network) => {
                 tried.clear();
-                // An answer that is there stays good; that there was none says nothing of this network.
+                // A good answer stays valid. A missing one says nothing about the new network.
                 if known.answer.is_none() {
                     known.expires = Instant::now();
                 }
@@ -192,28 +192,28 @@ pub(crate) async fn keep_one_of<N: Names, H: Hold>(
     }
 }
 
-/// Where a target is now.
-async fn aim<N: Names>(target: &SrvTarget, names: &N) -> Result<Aim, Failure> {
+/// Resolves a target.
+async fn dial_target<N: Names>(target: &SrvTarget, names: &N) -> Result<DialTarget, Failure> {
     let addresses = names.addresses(&target.host, target.port).await?;
-    Ok(Aim { addresses, ..Aim::from(target.url()) })
+    Ok(DialTarget { addresses, ..DialTarget::from(target.url()) })
 }
 
-/// Keeps a link to a target, and asks DNS meanwhile whether it still is one. If not, the link moves to one that is; as
-/// long as that cannot be reached, it stays.
-async fn hold<N: Names, H: Hold>(
+/// Keeps a link to a target and meanwhile asks DNS whether the target is still listed. If not, the link moves to a
+/// listed target. While none can be reached, the link stays.
+async fn keep_link<N: Names, H: KeepLink>(
     domain: &SrvDomain,
-    known: &mut Known,
-    first: Aim,
+    known: &mut SrvState,
+    first: DialTarget,
     names: &N,
-    holder: &H,
-    line: &Line,
+    keeper: &H,
+    row: &StatusRow,
     rng: &mut ChaCha20Rng,
 ) -> Outcome {
     let (move_to, at) = watch::channel(first);
     let refresh = async {
         loop {
             sleep_until(known.expires).await;
-            if !known.ask(domain, names, line, rng).await {
+            if !known.ask(domain, names, row, rng).await {
                 continue;
             }
             let targets =
@@ -223,17 +223,21 @@ async fn hold<N: Names, H: Hold>(
                 continue;
             }
             for target in targets {
-                if let Ok(aim) = aim(&target, names).await {
-                    info!("{} names {now} no more; moving to {}", RouterUrl::Srv(domain.clone()), aim.url);
-                    move_to.send_replace(aim);
+                if let Ok(target) = dial_target(&target, names).await {
+                    info!(
+                        "{} no longer names {now}; moving to {}",
+                        RouterUrl::Srv(domain.clone()),
+                        target.url
+                    );
+                    move_to.send_replace(target);
                     break;
                 }
             }
         }
     };
-    let wish = Wish::default();
+    let request = LinkRequest::default();
     tokio::select! {
-        outcome = holder.hold(at, &wish, line) => outcome,
+        outcome = keeper.keep_link(at, &request, row) => outcome,
         never = refresh => never,
     }
 }
@@ -285,13 +289,13 @@ mod tests {
             let found = share(&first, host);
             assert!((found - expected).abs() < 0.02, "{host} is first in {found} of all");
         }
-        // Not never, as the RFC wants it.
+        // The share is small but not zero, as the RFC demands.
         assert!((0.001..0.03).contains(&share(&first, "z")), "{first:?}");
         assert!((share(&second_after_c, "b") - 0.75).abs() < 0.03, "{second_after_c:?}");
     }
 
     #[test]
-    fn one_seed_is_one_order() {
+    fn same_seed_gives_same_srv_order() {
         let targets: Vec<_> = ["a", "b", "c", "d"].iter().map(|host| target(1, 10, host)).collect();
         let order = |seed| hosts(&in_order(&targets, &mut ChaCha20Rng::seed_from_u64(seed)));
         assert_eq!(order(7), order(7));
@@ -305,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_dialled_is_no_target() {
+    fn undiallable_srv_record_is_no_target() {
         assert!(target(0, 0, "router.lab.example").is_usable());
         assert!(!SrvTarget { port: 0, ..target(0, 0, "a") }.is_usable());
         for host in ["", "a b", "a\\046b", "a/b", &"a".repeat(254)] {

@@ -1,7 +1,7 @@
-//! The ways to one router: by which transport it is tried first, when the next is tried beside it, which one worked, and
-//! when a better one is tried again.
+//! The URLs of one router: order of attempts, parallel attempts, memory of the URL that worked, and [`Failback`] to a
+//! better one.
 //!
-//! It dials nothing; who is dialled and how is an argument.
+//! It dials nothing. The caller passes the targets and a function that dials.
 
 use std::collections::BTreeMap;
 use std::future::Future;
@@ -20,36 +20,38 @@ use super::backoff::jittered;
 use crate::config::{RouterUrl, WAYS_MAX};
 use crate::state;
 
-/// How long a way may be silent before the next is tried beside it: two round trips of a bad link to the other end of the
-/// world, and little enough that a node without UDP is up within 3 s.
+/// Time after which a silent URL gets a parallel attempt at the next. It covers two round trips of a bad link around
+/// the world, and is short enough that a node without UDP is up within 3 s.
 pub(crate) const SILENT_AFTER: Duration = Duration::from_millis(700);
-/// How long those that are silent are waited for once all were begun and one has failed: what failed may work again soon,
-/// as where a router restarts, and is to be tried again.
+/// Longest wait for silent URLs once all were tried and one has failed. A failed URL may work again soon, for example
+/// after a restart of the router, so it has to be tried again.
 const SILENT_MAX: Duration = Duration::from_millis(2500);
-/// When a better way is tried again, at first and at most.
+/// First wait before failback, and the longest.
 const CLIMB_MIN: Duration = Duration::from_secs(30);
 const CLIMB_MAX: Duration = Duration::from_secs(600);
 
-/// Where is kept what worked, below the state directory.
+/// File below the state directory that remembers working URLs.
 const FILE: &str = "ways";
 /// Most routers that are remembered, and the most bytes of the file.
 const KEPT_MAX: usize = 64;
 const FILE_BYTES_MAX: u64 = 64 << 10;
 
-/// The routers among what the user wrote, each with its ways in their order. Entries of one host that differ in their
-/// transport are ways to one router; a second entry of one transport is another router.
+/// Groups the user's entries by router, keeping their order. Entries of one host with different transports are one
+/// router. A second entry of the same transport is another router.
 pub(crate) fn routers<'u>(urls: impl IntoIterator<Item = &'u RouterUrl>) -> Vec<Vec<LinkUrl>> {
     let mut routers: Vec<Vec<LinkUrl>> = Vec::new();
-    // What was written as one stays as it is.
+    // An entry with several URLs stays as it is.
     let mut open = Vec::new();
     for url in urls {
         match url {
-            RouterUrl::Ways(ways) => routers.push(ways.clone()),
+            RouterUrl::Ways(urls) => routers.push(urls.clone()),
             RouterUrl::At(url) => {
                 let is_same = |at: &&usize| {
-                    let ways = &routers[**at];
-                    let is_new = ways.iter().all(|way: &LinkUrl| way.scheme != url.scheme);
-                    is_new && ways.len() < WAYS_MAX && ways.first().is_some_and(|way| way.host == url.host)
+                    let urls = &routers[**at];
+                    let is_new = urls.iter().all(|other: &LinkUrl| other.scheme != url.scheme);
+                    is_new
+                        && urls.len() < WAYS_MAX
+                        && urls.first().is_some_and(|other| other.host == url.host)
                 };
                 match open.iter().find(is_same) {
                     Some(at) => routers[*at].push(url.clone()),
@@ -65,36 +67,36 @@ pub(crate) fn routers<'u>(urls: impl IntoIterator<Item = &'u RouterUrl>) -> Vec<
     routers
 }
 
-/// A way that was passed over, and why.
+/// A URL that was skipped, and the reason.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Passed {
-    pub(crate) way: LinkUrl,
+pub(crate) struct SkippedUrl {
+    pub(crate) url: LinkUrl,
     pub(crate) why: String,
 }
 
-/// The first way that succeeds, and what became of those that were tried before it. They are begun in this order, each
-/// when those before have failed or the last has been silent for [`SILENT_AFTER`]. Where one has failed, those that are
-/// silent for [`SILENT_MAX`] more are given up, and stand in no list.
+/// Dials the URLs in order and returns the first success, with the URLs that were tried before it. Each attempt begins
+/// when the earlier ones have failed, or when the last one has been silent for [`SILENT_AFTER`]. Once one has failed,
+/// attempts that stay silent for [`SILENT_MAX`] more are abandoned and not listed.
 pub(crate) async fn first<T, E, F>(
-    ways: &[LinkUrl],
+    urls: &[LinkUrl],
     mut dial: impl FnMut(LinkUrl) -> F,
-) -> Result<(T, LinkUrl, Vec<Passed>), Vec<(LinkUrl, E)>>
+) -> Result<(T, LinkUrl, Vec<SkippedUrl>), Vec<(LinkUrl, E)>>
 where
     T: Send + 'static,
     E: std::fmt::Display + Send + 'static,
     F: Future<Output = Result<T, E>> + Send + 'static,
 {
-    let mut rest = ways.iter();
+    let mut rest = urls.iter();
     let mut begun: Vec<&LinkUrl> = Vec::new();
     let mut racing = JoinSet::new();
     let mut failed: Vec<(LinkUrl, E)> = Vec::new();
     let mut give_up = None;
     loop {
         match rest.next() {
-            Some(way) => {
-                begun.push(way);
-                let (attempt, way) = (dial(way.clone()), way.clone());
-                racing.spawn(async move { (way, attempt.await) });
+            Some(url) => {
+                begun.push(url);
+                let (attempt, url) = (dial(url.clone()), url.clone());
+                racing.spawn(async move { (url, attempt.await) });
             }
             None if racing.is_empty() => return Err(failed),
             None => {}
@@ -108,19 +110,19 @@ where
         tokio::select! {
             biased;
             Some(done) = racing.join_next() => match done {
-                // The others are dropped with the set.
-                Ok((way, Ok(made))) => {
-                    let others = begun.into_iter().filter(|other| **other != way);
+                // The other attempts end with the set.
+                Ok((url, Ok(made))) => {
+                    let others = begun.into_iter().filter(|other| **other != url);
                     let passed = others.map(|other| {
                         let error = failed.iter().find(|(failed, _)| failed == other);
                         let why = error.map_or_else(|| silence(other), |(_, error)| error.to_string());
-                        Passed { way: other.clone(), why }
+                        SkippedUrl { url: other.clone(), why }
                     });
                     let passed = passed.collect();
-                    return Ok((made, way, passed));
+                    return Ok((made, url, passed));
                 }
-                Ok(failure) => if let (way, Err(error)) = failure {
-                    failed.push((way, error));
+                Ok(failure) => if let (url, Err(error)) = failure {
+                    failed.push((url, error));
                 },
                 Err(error) => tracing::error!(%error, "an attempt to connect ended abnormally"),
             },
@@ -130,46 +132,46 @@ where
     }
 }
 
-/// What to think of a way that says nothing.
-fn silence(way: &LinkUrl) -> String {
+/// Returns the explanation for a silent URL.
+fn silence(url: &LinkUrl) -> String {
     let silent = format!("no answer within {:.1} s", SILENT_AFTER.as_secs_f64());
-    if is_over_udp(way.scheme) { format!("{silent}; is UDP blocked?") } else { silent }
+    if is_over_udp(url.scheme) { format!("{silent}; is UDP blocked?") } else { silent }
 }
 
-/// Whether a transport is made of datagrams.
+/// Returns `true` if a transport uses UDP.
 pub(crate) fn is_over_udp(scheme: Scheme) -> bool {
     matches!(scheme, Scheme::Quic | Scheme::Dtls | Scheme::Udp)
 }
 
-/// When a way that is better than the one in use is tried again.
+/// Schedule of attempts at a better URL than the one in use.
 #[derive(Debug)]
-pub(crate) struct Climb {
+pub(crate) struct Failback {
     failures: u32,
     due: Option<Instant>,
 }
 
-impl Climb {
-    /// A link is up by the way of this rank; 0 is the best, from which there is nowhere to climb.
+impl Failback {
+    /// Starts for a link by the URL of this rank. Rank 0 is the best, so it schedules nothing.
     pub(crate) fn new(rank: usize, now: Instant, rng: &mut ChaCha20Rng) -> Self {
         let due = (rank > 0).then(|| now + jittered(CLIMB_MIN, rng));
         Self { failures: 0, due }
     }
 
-    /// No better way works yet.
+    /// Notes that no better URL works yet.
     pub(crate) fn failed(&mut self, now: Instant, rng: &mut ChaCha20Rng) {
         self.failures = self.failures.saturating_add(1);
         let doubled = CLIMB_MIN.saturating_mul(2u32.saturating_pow(self.failures.min(16)));
         self.due = Some(now + jittered(doubled.min(CLIMB_MAX), rng));
     }
 
-    /// The network is another: what was blocked may not be here.
+    /// Makes an attempt due, because another network may not block the better URL.
     pub(crate) fn network_changed(&mut self, now: Instant) {
         if self.due.is_some() {
             *self = Self { failures: 0, due: Some(now) };
         }
     }
 
-    /// When to try; never if there is nothing.
+    /// Waits until an attempt is due; for ever if none is scheduled.
     pub(crate) async fn is_due(&self) {
         match self.due {
             Some(due) => sleep_until(due).await,
@@ -178,55 +180,55 @@ impl Climb {
     }
 }
 
-/// Which way to each router worked last, kept over restarts. Clones share.
+/// The URL that worked last for each router, kept over restarts. Clones share the state.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct WayBook {
-    /// By the best way to the router.
+pub(crate) struct WorkingUrls {
+    /// The working URL by the router's best URL.
     worked: Arc<Mutex<BTreeMap<String, String>>>,
     write: Option<watch::Sender<()>>,
 }
 
-impl WayBook {
-    /// What is kept in this state directory; without one it is forgotten at the end. A book that cannot be read is said
-    /// and left out: everything is found again without it.
+impl WorkingUrls {
+    /// Opens the memory in this state directory; without one it ends with the process. An unreadable file is reported
+    /// and ignored, since everything in it can be found again.
     pub(crate) fn open(dir: Option<&Path>) -> Self {
         let Some(path) = dir.map(|dir| dir.join(FILE)) else { return Self::default() };
         let read = state::read(&path, FILE_BYTES_MAX)
             .and_then(|content| content.map(String::from_utf8).transpose().map_err(std::io::Error::other));
         let text = read.unwrap_or_else(|error| {
-            warn!(path = %path.display(), %error, "what is kept of ways to routers cannot be read");
+            warn!(path = %path.display(), %error, "cannot read the remembered URLs of routers");
             None
         });
         let lines = text.iter().flat_map(|text| text.lines());
         let worked = lines.filter_map(|line| line.split_once(' ')).take(KEPT_MAX);
-        let worked: BTreeMap<_, _> = worked.map(|(best, way)| (best.to_owned(), way.to_owned())).collect();
+        let worked: BTreeMap<_, _> = worked.map(|(best, url)| (best.to_owned(), url.to_owned())).collect();
         let (write, asked) = watch::channel(());
         let book = Self { worked: Arc::new(Mutex::new(worked)), write: Some(write) };
         tokio::spawn(keep_written(path, book.worked.clone(), asked));
         book
     }
 
-    /// The order in which to try: what worked last, then the rest as the user put it.
-    pub(crate) fn in_order(&self, ways: &[LinkUrl]) -> Vec<LinkUrl> {
-        let last = ways.first().and_then(|best| self.worked().get(&best.to_string()).cloned());
+    /// Returns the order of attempts: the URL that worked last, then the others as the user listed them.
+    pub(crate) fn in_order(&self, urls: &[LinkUrl]) -> Vec<LinkUrl> {
+        let last = urls.first().and_then(|best| self.worked().get(&best.to_string()).cloned());
         let (mut ordered, rest): (Vec<_>, Vec<_>) =
-            ways.iter().cloned().partition(|way| last.as_ref().is_some_and(|last| *last == way.to_string()));
+            urls.iter().cloned().partition(|url| last.as_ref().is_some_and(|last| *last == url.to_string()));
         ordered.extend(rest);
         ordered
     }
 
-    /// This one of them works.
-    pub(crate) fn worked_by(&self, ways: &[LinkUrl], way: &LinkUrl) {
-        let Some(best) = ways.first() else { return };
+    /// Notes that this URL works.
+    pub(crate) fn worked_by(&self, urls: &[LinkUrl], url: &LinkUrl) {
+        let Some(best) = urls.first() else { return };
         let mut worked = self.worked();
-        let (best, way) = (best.to_string(), way.to_string());
-        // The best one is what is tried first without a word.
-        let is_news = if best == way {
+        let (best, url) = (best.to_string(), url.to_string());
+        // The best URL is tried first anyway, so it needs no entry.
+        let is_news = if best == url {
             worked.remove(&best).is_some()
         } else if worked.len() >= KEPT_MAX && !worked.contains_key(&best) {
             false
         } else {
-            worked.insert(best, way.clone()).is_none_or(|before| before != way)
+            worked.insert(best, url.clone()).is_none_or(|before| before != url)
         };
         drop(worked);
         if let Some(write) = self.write.as_ref().filter(|_| is_news) {
@@ -239,7 +241,7 @@ impl WayBook {
     }
 }
 
-/// Writes the book when it changes, where that may block.
+/// Writes the file when the memory changes, on a blocking thread.
 async fn keep_written(
     path: PathBuf,
     worked: Arc<Mutex<BTreeMap<String, String>>>,
@@ -249,11 +251,11 @@ async fn keep_written(
         let (path, worked) = (path.clone(), worked.clone());
         let write = move || {
             let known = worked.lock().unwrap_or_else(PoisonError::into_inner).clone();
-            let text: String = known.iter().map(|(best, way)| format!("{best} {way}\n")).collect();
+            let text: String = known.iter().map(|(best, url)| format!("{best} {url}\n")).collect();
             match state::replace(&path, text.as_bytes()) {
-                Ok(()) => debug!(path = %path.display(), "which ways work is kept"),
+                Ok(()) => debug!(path = %path.display(), "saved the URLs of routers that work"),
                 Err(error) => {
-                    warn!(path = %path.display(), %error, "which ways work could not be kept for the next start")
+                    warn!(path = %path.display(), %error, "cannot save the URLs of routers that work")
                 }
             }
         };
@@ -270,34 +272,35 @@ mod tests {
 
     use super::*;
 
-    fn way(scheme: Scheme, host: &str) -> LinkUrl {
+    fn url(scheme: Scheme, host: &str) -> LinkUrl {
         LinkUrl { scheme, host: host.into(), port: 7447, path: None, cost_ms: None }
     }
 
-    fn ways(schemes: &[Scheme]) -> Vec<LinkUrl> {
-        schemes.iter().map(|scheme| way(*scheme, "r")).collect()
+    fn urls(schemes: &[Scheme]) -> Vec<LinkUrl> {
+        schemes.iter().map(|scheme| url(*scheme, "r")).collect()
     }
 
-    /// What a way does, and after how long; an error after a year is silence.
+    /// Behaviour of a URL: success or failure after milliseconds. An error after a year is silence.
     type Does = (Scheme, Result<u64, u64>);
 
-    /// Which one made it, when, and what is said of the others.
+    /// Returns the winner, its time, and the explanations for the others.
     async fn race(does: &[Does]) -> Result<(Scheme, u128, Vec<String>), Vec<String>> {
         let start = Instant::now();
-        let ways: Vec<_> = does.iter().map(|(scheme, _)| way(*scheme, "r")).collect();
+        let urls: Vec<_> = does.iter().map(|(scheme, _)| url(*scheme, "r")).collect();
         let does = does.to_vec();
-        let made = first(&ways, |way| {
-            let (_, does) = *does.iter().find(|(scheme, _)| *scheme == way.scheme).unwrap();
+        let made = first(&urls, |url| {
+            let (_, does) = *does.iter().find(|(scheme, _)| *scheme == url.scheme).unwrap();
             async move {
                 sleep(Duration::from_millis(does.unwrap_or_else(|after| after))).await;
                 does.map(|_| ()).map_err(|_| "refused")
             }
         });
-        let said = |passed: Vec<Passed>| passed.into_iter().map(|p| format!("{}: {}", p.way.scheme, p.why));
+        let said =
+            |passed: Vec<SkippedUrl>| passed.into_iter().map(|p| format!("{}: {}", p.url.scheme, p.why));
         match made.await {
-            Ok(((), way, passed)) => Ok((way.scheme, start.elapsed().as_millis(), said(passed).collect())),
+            Ok(((), url, passed)) => Ok((url.scheme, start.elapsed().as_millis(), said(passed).collect())),
             Err(failed) => {
-                Err(failed.into_iter().map(|(way, why)| format!("{}: {why}", way.scheme)).collect())
+                Err(failed.into_iter().map(|(url, why)| format!("{}: {why}", url.scheme)).collect())
             }
         }
     }
@@ -312,11 +315,11 @@ mod tests {
         assert_eq!(both, Ok((Tls, 1500, vec![format!("quic: {blocked}"), format!("dtls: {blocked}")])));
         let failed = race(&[(Quic, Err(10)), (Tls, Ok(20))]).await;
         assert_eq!(failed, Ok((Tls, 30, vec!["quic: refused".into()])));
-        // A slow one that comes before the next still counts.
+        // A slow attempt still counts if it succeeds before the next.
         assert_eq!(race(&[(Quic, Ok(800)), (Tls, Ok(5000))]).await.unwrap().0, Quic);
         let none = race(&[(Quic, Err(2000)), (Tls, Err(10))]).await;
         assert_eq!(none, Err(vec!["tls: refused".into(), "quic: refused".into()]));
-        // Where one is only down for a moment, a silent one does not keep it from being tried again.
+        // A silent attempt does not delay the retry of a router that is down for a moment.
         let begun = Instant::now();
         let down = race(&[(Quic, Err(NEVER)), (Tls, Err(10))]).await;
         assert_eq!((down, begun.elapsed().as_millis()), (Err(vec!["tls: refused".into()]), 3210));
@@ -325,47 +328,47 @@ mod tests {
     #[test]
     fn entries_of_one_host_with_other_transports_are_one_router() {
         use Scheme::{Quic, Tls};
-        let at = |scheme, host: &str| RouterUrl::At(way(scheme, host));
+        let at = |scheme, host: &str| RouterUrl::At(url(scheme, host));
         let of = |urls: &[RouterUrl]| routers(urls);
         let one = of(&[at(Quic, "a"), at(Quic, "b"), at(Tls, "a")]);
-        assert_eq!(one, [vec![way(Quic, "a"), way(Tls, "a")], vec![way(Quic, "b")]]);
-        // The second of one transport is another router, which the next may belong to.
+        assert_eq!(one, [vec![url(Quic, "a"), url(Tls, "a")], vec![url(Quic, "b")]]);
+        // A second entry of one transport is another router, and later entries may belong to it.
         let two = of(&[at(Quic, "a"), at(Quic, "a"), at(Tls, "a"), at(Tls, "a")]);
         assert_eq!(
             two,
-            [ways(&[Quic, Tls]), ways(&[Quic, Tls])].map(|ways| {
-                ways.into_iter().map(|way| LinkUrl { host: "a".into(), ..way }).collect::<Vec<_>>()
+            [urls(&[Quic, Tls]), urls(&[Quic, Tls])].map(|urls| {
+                urls.into_iter().map(|url| LinkUrl { host: "a".into(), ..url }).collect::<Vec<_>>()
             })
         );
-        let written = RouterUrl::Ways(vec![way(Quic, "a"), way(Tls, "b")]);
-        assert_eq!(of(&[written, at(Tls, "a")]), [vec![way(Quic, "a"), way(Tls, "b")], vec![way(Tls, "a")]]);
+        let written = RouterUrl::Ways(vec![url(Quic, "a"), url(Tls, "b")]);
+        assert_eq!(of(&[written, at(Tls, "a")]), [vec![url(Quic, "a"), url(Tls, "b")], vec![url(Tls, "a")]]);
     }
 
     #[tokio::test(start_paused = true)]
     async fn a_better_way_is_tried_again_with_growing_patience() {
         let mut rng = ChaCha20Rng::seed_from_u64(1);
-        let mut climb = Climb::new(1, Instant::now(), &mut rng);
+        let mut failback = Failback::new(1, Instant::now(), &mut rng);
         let mut waits = Vec::new();
         for _ in 0..10 {
             let before = Instant::now();
-            climb.is_due().await;
+            failback.is_due().await;
             waits.push(before.elapsed().as_secs_f64());
-            climb.failed(Instant::now(), &mut rng);
+            failback.failed(Instant::now(), &mut rng);
         }
         for (n, wait) in waits.iter().enumerate() {
             let most = f64::from(30 << n.min(5)).min(600.0);
             assert!((most / 2.0 - 0.01..=most + 0.01).contains(wait), "{n}: {waits:?}");
         }
-        let at_best = Climb::new(0, Instant::now(), &mut rng);
+        let at_best = Failback::new(0, Instant::now(), &mut rng);
         assert!(tokio::time::timeout(Duration::from_secs(86_400), at_best.is_due()).await.is_err());
     }
 
     #[tokio::test]
-    async fn what_worked_is_tried_first_after_a_restart() {
+    async fn working_url_is_tried_first_after_a_restart() {
         use Scheme::{Quic, Tls, Wss};
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join(FILE);
-        let ways = ways(&[Quic, Tls, Wss]);
+        let urls = urls(&[Quic, Tls, Wss]);
         let written = async |until: &str| {
             let arrives = async {
                 while std::fs::read_to_string(&path).ok().as_deref() != Some(until) {
@@ -374,27 +377,28 @@ mod tests {
             };
             tokio::time::timeout(Duration::from_secs(30), arrives).await.expect(until);
         };
-        let order = |book: &WayBook| book.in_order(&ways).iter().map(|way| way.scheme).collect::<Vec<_>>();
-        let book = WayBook::open(Some(dir.path()));
+        let order =
+            |book: &WorkingUrls| book.in_order(&urls).iter().map(|url| url.scheme).collect::<Vec<_>>();
+        let book = WorkingUrls::open(Some(dir.path()));
         assert_eq!(order(&book), [Quic, Tls, Wss]);
-        book.worked_by(&ways, &ways[1]);
+        book.worked_by(&urls, &urls[1]);
         written("quic://r:7447 tls://r:7447\n").await;
-        let next = WayBook::open(Some(dir.path()));
+        let next = WorkingUrls::open(Some(dir.path()));
         assert_eq!(order(&next), [Tls, Quic, Wss]);
-        next.worked_by(&ways, &ways[0]);
+        next.worked_by(&urls, &urls[0]);
         written("").await;
-        assert_eq!(order(&WayBook::open(Some(dir.path()))), [Quic, Tls, Wss]);
-        // What a file says is no more than an order.
+        assert_eq!(order(&WorkingUrls::open(Some(dir.path()))), [Quic, Tls, Wss]);
+        // The file influences the order only.
         std::fs::write(&path, "quic://r:7447 tls://other:7447\nnonsense\n\u{0} \n").unwrap();
-        assert_eq!(order(&WayBook::open(Some(dir.path()))), [Quic, Tls, Wss]);
+        assert_eq!(order(&WorkingUrls::open(Some(dir.path()))), [Quic, Tls, Wss]);
     }
 
     #[tokio::test]
     async fn the_book_is_bounded() {
-        let book = WayBook::default();
+        let book = WorkingUrls::default();
         for n in 0..2 * KEPT_MAX {
-            let ways = [way(Scheme::Quic, &format!("r{n}")), way(Scheme::Tls, &format!("r{n}"))];
-            book.worked_by(&ways, &ways[1]);
+            let urls = [url(Scheme::Quic, &format!("r{n}")), url(Scheme::Tls, &format!("r{n}"))];
+            book.worked_by(&urls, &urls[1]);
         }
         assert_eq!(book.worked().len(), KEPT_MAX);
     }

@@ -1,4 +1,4 @@
-//! Tells a router of a revocation list and hears of its own ones, for one who keeps a fleet and runs no node.
+//! Pushes a revocation list to a router and receives the router's lists, for a fleet keeper who runs no node.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,13 +10,13 @@ use sgc_transport::{
 use sgc_trust::Identity;
 use sgc_wire::{Control, Decode, Encode, Hello, UnixMillis};
 
-/// How long a router may take to greet and to say goodbye.
+/// Time for a router to greet and to answer a goodbye.
 const ANSWER_MAX: Duration = Duration::from_secs(5);
 
-/// Why a router was not told.
+/// Reasons why a list was not pushed.
 #[derive(Debug, thiserror::Error)]
-pub enum TellError {
-    /// No link.
+pub enum PushCrlError {
+    /// The router could not be dialled.
     #[error(transparent)]
     Dial(#[from] DialError),
     /// The link ended.
@@ -24,10 +24,10 @@ pub enum TellError {
     Link {
         /// The router.
         url: LinkUrl,
-        /// Why.
+        /// The reason.
         source: LinkError,
     },
-    /// It did not answer.
+    /// The router did not answer.
     #[error("{url} did not answer within {} s", ANSWER_MAX.as_secs())]
     Silent {
         /// The router.
@@ -35,30 +35,30 @@ pub enum TellError {
     },
 }
 
-/// Most lists that are heard of a router: all that it can have of as many CAs as can be trusted.
+/// Most lists that are received of a router: all lists of as many CAs as can be trusted.
 const HEARD_MAX: usize = sgc_trust::ANCHORS_MAX * (sgc_trust::FLEET_LISTS_MAX + 1);
 
-/// Dials a router, greets it, gives it the list, and leaves. It has the list once this returns. Returns the lists that
-/// the router has, which it gives every neighbour.
-pub async fn tell_router(
+/// Dials a router, greets it, sends the list and leaves. The router has the list once this returns. Returns the
+/// router's lists, which it sends every neighbour.
+pub async fn push_crl(
     url: &LinkUrl,
     identity: Arc<Identity>,
     list: Bytes,
-) -> Result<Vec<Bytes>, TellError> {
+) -> Result<Vec<Bytes>, PushCrlError> {
     let dialer = Dialer::new(identity, LinkOptions::default(), Arc::new(TransportMetrics::default()));
     let link = dialer.dial(url).await?;
     let told = tokio::time::timeout(ANSWER_MAX, tell(&link, list)).await;
     dialer.close(CloseReason::Goodbye).await;
     match told {
         Ok(Ok(heard)) => Ok(heard),
-        Ok(Err(source)) => Err(TellError::Link { url: url.clone(), source }),
-        Err(_) => Err(TellError::Silent { url: url.clone() }),
+        Ok(Err(source)) => Err(PushCrlError::Link { url: url.clone(), source }),
+        Err(_) => Err(PushCrlError::Silent { url: url.clone() }),
     }
 }
 
 async fn tell(link: &impl Link, list: Bytes) -> Result<Vec<Bytes>, LinkError> {
     let mut incarnation = [0; 8];
-    // Another number than any run of a node has; nothing rests on it.
+    // The incarnation differs from that of any run of a node. No decision depends on it.
     incarnation.copy_from_slice(&link.peer().node_id.0[..8]);
     let hello = Hello {
         minor: 0,
@@ -68,11 +68,12 @@ async fn tell(link: &impl Link, list: Bytes) -> Result<Vec<Bytes>, LinkError> {
         started: UnixMillis::default(),
     };
     link.send_control(Control::Hello(hello).to_bytes()).await?;
-    // Its greeting comes first: then it is a node that speaks this protocol.
+    // The greeting comes first and shows that the peer is a node of this protocol version.
     while !matches!(Control::from_slice(&link.recv_control().await?), Ok(Control::Hello(_))) {}
     link.send_control(Control::Crl { der: list }.to_bytes()).await?;
     link.send_control(Control::Goodbye.to_bytes()).await?;
-    // It gave its lists behind its greeting. It answers a goodbye by closing, and took what came before.
+    // The router sends its lists after its greeting. It answers the goodbye by closing, after it has handled everything
+    // before.
     let mut heard = Vec::new();
     while let Ok(frame) = link.recv_control().await {
         if let Ok(Control::Crl { der }) = Control::from_slice(&frame)

@@ -1,6 +1,6 @@
-//! Which nodes this one has links to, so that two ways to one router make one link.
+//! Claims: the nodes that this node has links to, so that two searches for one router make one link.
 //!
-//! It decides nothing: who finds a node taken stands back, which is for the caller.
+//! It decides nothing. A caller that finds a node claimed stands back.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -8,14 +8,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use sgc_wire::NodeId;
 use tokio::sync::watch;
 
-/// Nodes that this one dialled, each by one of its tasks, and nodes that came by themselves. Clones share.
+/// Nodes that this node dialled, each claimed by one task, and nodes that dialled this one. Clones share the state.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Claims {
-    shared: Arc<Shared>,
+    shared: Arc<ClaimsInner>,
 }
 
 #[derive(Debug, Default)]
-struct Shared {
+struct ClaimsInner {
     table: Mutex<Table>,
     changed: watch::Sender<()>,
 }
@@ -23,35 +23,35 @@ struct Shared {
 #[derive(Debug, Default)]
 struct Table {
     dialled: BTreeSet<NodeId>,
-    /// How many links each has here.
+    /// Number of incoming links of each node.
     came: BTreeMap<NodeId, usize>,
 }
 
 impl Claims {
-    /// Takes a node that was dialled, unless another task has it.
+    /// Claims a dialled node, unless another task has claimed it.
     pub(crate) fn claim(&self, node: NodeId) -> Option<Claim> {
         let is_free = self.table().dialled.insert(node);
         is_free.then(|| Claim { node, claims: self.clone() })
     }
 
-    /// Notes that a node came, until the result is dropped.
+    /// Notes an incoming link of a node until the result is dropped.
     pub(crate) fn note_arrival(&self, node: NodeId) -> Arrival {
         *self.table().came.entry(node).or_default() += 1;
         self.shared.changed.send_replace(());
         Arrival { node, claims: self.clone() }
     }
 
-    /// True if a node came by itself and is here.
+    /// Returns `true` if a node has an incoming link here.
     pub(crate) fn has_come(&self, node: &NodeId) -> bool {
         self.table().came.contains_key(node)
     }
 
-    /// Waits until there is no link to this node.
+    /// Waits until no link to this node is left.
     pub(crate) async fn released(&self, node: &NodeId) {
         self.until(|table| !table.dialled.contains(node) && !table.came.contains_key(node)).await;
     }
 
-    /// Waits until this node came by itself.
+    /// Waits for an incoming link of this node.
     pub(crate) async fn arrived(&self, node: &NodeId) {
         self.until(|table| table.came.contains_key(node)).await;
     }
@@ -59,7 +59,7 @@ impl Claims {
     async fn until(&self, is_so: impl Fn(&Table) -> bool) {
         let mut changed = self.shared.changed.subscribe();
         while !is_so(&self.table()) {
-            // Never an error: this holds the sender.
+            // This cannot fail, since `self` holds the sender.
             let _ = changed.changed().await;
         }
     }
@@ -69,7 +69,7 @@ impl Claims {
     }
 }
 
-/// The right to keep a link to a node; dropping it gives it back.
+/// The right of one task to keep a link to a node. Dropping it releases the node.
 #[derive(Debug)]
 pub(crate) struct Claim {
     node: NodeId,
@@ -77,7 +77,7 @@ pub(crate) struct Claim {
 }
 
 impl Claim {
-    /// Whose it is.
+    /// Returns the claimed node.
     pub(crate) fn node(&self) -> NodeId {
         self.node
     }
@@ -90,7 +90,7 @@ impl Drop for Claim {
     }
 }
 
-/// A link of a node that came.
+/// An incoming link of a node.
 #[derive(Debug)]
 pub(crate) struct Arrival {
     node: NodeId,
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn who_came_twice_is_here_until_both_links_are_gone() {
+    async fn node_with_two_links_counts_as_present_until_both_end() {
         let (claims, node) = (Claims::default(), NodeId([1; 32]));
         assert!(timeout(Duration::from_secs(1), claims.arrived(&node)).await.is_err());
         let (first, second) = (claims.note_arrival(node), claims.note_arrival(node));

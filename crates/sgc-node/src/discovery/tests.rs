@@ -1,4 +1,4 @@
-//! When what is tried, on a clock that stands still: who is dialled and what DNS says are the tests' own.
+//! Timing of the searches on a paused clock. The tests replace dialling and DNS.
 
 #![allow(clippy::unwrap_used)]
 
@@ -13,30 +13,30 @@ use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
 
 use super::dns::DnsError;
-use super::local::Heard;
+use super::local::Sighting;
 use super::srv::{SrvAnswer, SrvTarget};
 use super::*;
 
 const SECOND: Duration = Duration::from_secs(1);
 
-/// What happens to who dials a host.
+/// Behaviour of a host that is dialled.
 #[derive(Clone, Copy, Debug)]
 enum Host {
     Dead,
-    /// A link is up for so long.
+    /// A link comes up and lasts this long.
     Up(Duration),
-    /// There is a link already, for so long.
+    /// Another link to the router exists for this long.
     Reached(Duration),
 }
 
-/// Hosts, and what was dialled when.
+/// Simulated hosts, and the times at which they were dialled.
 #[derive(Clone)]
 struct World {
     start: Instant,
     hosts: Arc<Mutex<BTreeMap<String, Host>>>,
     dialled: Arc<Mutex<Vec<(Duration, String)>>>,
     up: Arc<Mutex<BTreeSet<String>>>,
-    /// Most that were being dialled at once, and are now.
+    /// Parallel dials: the maximum, and the current number.
     dials: Arc<Mutex<(usize, usize)>>,
     answer: Arc<Mutex<Result<SrvAnswer, DnsError>>>,
     asked: Arc<Mutex<Vec<Duration>>>,
@@ -45,7 +45,7 @@ struct World {
 
 impl World {
     fn new() -> Self {
-        let (tell, network) = Network::told();
+        let (tell, network) = Network::channel();
         Self {
             start: Instant::now(),
             hosts: Arc::default(),
@@ -91,15 +91,20 @@ impl World {
     fn keep_one(&self) -> (JoinHandle<()>, Board) {
         let RouterUrl::Srv(domain) = "srv://lab.example".parse().unwrap() else { panic!() };
         let board = Board::default();
-        let line = board.line("srv://lab.example", "srv");
+        let row = board.row("srv://lab.example", "srv");
         let rng = ChaCha20Rng::seed_from_u64(1);
-        (tokio::spawn(srv::keep_one_of(domain, self.clone(), self.clone(), line, rng)), board)
+        (tokio::spawn(srv::keep_one_of(domain, self.clone(), self.clone(), row, rng)), board)
     }
 }
 
-impl Hold for World {
-    async fn hold(&self, mut aim: watch::Receiver<Aim>, wish: &Wish, _line: &Line) -> Outcome {
-        let url = aim.borrow_and_update().url.clone();
+impl KeepLink for World {
+    async fn keep_link(
+        &self,
+        mut target: watch::Receiver<DialTarget>,
+        request: &LinkRequest,
+        _line: &StatusRow,
+    ) -> Outcome {
+        let url = target.borrow_and_update().url.clone();
         let mut host = url.host.clone();
         self.dialled.lock().unwrap().push((self.start.elapsed(), host.clone()));
         {
@@ -114,7 +119,7 @@ impl Hold for World {
             Host::Dead => Outcome::Failed(DialError::NoAddress(url).into()),
             Host::Reached(_) => Outcome::Failed(Failure::Reached(NodeId([1; 32]))),
             Host::Up(time) => {
-                let place = wish.places.as_ref().map(|places| places.clone().try_acquire_owned());
+                let place = request.places.as_ref().map(|places| places.clone().try_acquire_owned());
                 if let Some(Err(_)) = place {
                     return Outcome::Failed(Failure::Enough);
                 }
@@ -124,9 +129,9 @@ impl Hold for World {
                 loop {
                     tokio::select! {
                         () = &mut end => break,
-                        Ok(()) = aim.changed() => {
+                        Ok(()) = target.changed() => {
                             self.up.lock().unwrap().remove(&host);
-                            host = aim.borrow_and_update().url.host.clone();
+                            host = target.borrow_and_update().url.host.clone();
                             self.up.lock().unwrap().insert(host.clone());
                         }
                     }
@@ -184,24 +189,24 @@ async fn runs_for(time: Duration, task: impl Future<Output = ()>) {
 async fn a_dead_router_is_dialled_with_growing_patience_and_never_given_up() {
     let world = World::new();
     let board = Board::default();
-    let line = board.line("quic://a", "static");
-    let keep = keep_at(at("a"), world.clone(), line, ChaCha20Rng::seed_from_u64(1));
+    let row = board.row("quic://a", "static");
+    let keep = keep_at(at("a"), world.clone(), row, ChaCha20Rng::seed_from_u64(1));
     runs_for(200 * SECOND, keep).await;
     let dialled = world.dialled();
     let waits: Vec<_> = dialled.windows(2).map(|two| (two[1].0 - two[0].0).as_millis()).collect();
     for (n, wait) in waits.iter().enumerate() {
         let most = (250u128 << n.min(10)).min(10_000);
-        // A millisecond is what an attempt takes, and the clock's grain.
+        // An attempt takes a millisecond, which is also the clock's resolution.
         assert!((most / 2..=most + 2).contains(wait), "{n}: {waits:?}");
     }
     assert!(waits.len() >= 20 && waits.iter().collect::<BTreeSet<_>>().len() > 10, "{waits:?}");
 }
 
 #[tokio::test(start_paused = true)]
-async fn what_failed_is_tried_at_once_on_another_network_but_not_without_a_pause() {
+async fn failed_target_is_retried_soon_after_a_network_change() {
     let world = World::new();
-    let line = Board::default().line("quic://a", "static");
-    let task = tokio::spawn(keep_at(at("a"), world.clone(), line, ChaCha20Rng::seed_from_u64(1)));
+    let row = Board::default().row("quic://a", "static");
+    let task = tokio::spawn(keep_at(at("a"), world.clone(), row, ChaCha20Rng::seed_from_u64(1)));
     sleep(100 * SECOND).await;
     world.set("a", Host::Up(3600 * SECOND));
     let changed = world.start.elapsed();
@@ -210,10 +215,10 @@ async fn what_failed_is_tried_at_once_on_another_network_but_not_without_a_pause
     let last = world.dialled().last().unwrap().0;
     assert!(last >= changed && last - changed < SECOND / 2 && world.up() == ["a"], "{last:?} {changed:?}");
     task.abort();
-    // A network that changes all the time.
+    // The network changes all the time.
     let world = World::new();
-    let line = Board::default().line("quic://a", "static");
-    let task = tokio::spawn(keep_at(at("a"), world.clone(), line, ChaCha20Rng::seed_from_u64(1)));
+    let row = Board::default().row("quic://a", "static");
+    let task = tokio::spawn(keep_at(at("a"), world.clone(), row, ChaCha20Rng::seed_from_u64(1)));
     for _ in 0..10_000 {
         sleep(SECOND / 1000).await;
         world.network.0.send_modify(|change| *change += 1);
@@ -244,9 +249,9 @@ async fn nodes_that_lose_one_router_come_back_at_different_moments() {
     for seed in 0..20 {
         let world = World::new();
         world.set("a", Host::Up(SECOND));
-        let line = Board::default().line("quic://a", "static");
+        let row = Board::default().row("quic://a", "static");
         let rng = ChaCha20Rng::seed_from_u64(seed);
-        runs_for(2 * SECOND, keep_at(at("a"), world.clone(), line, rng)).await;
+        runs_for(2 * SECOND, keep_at(at("a"), world.clone(), row, rng)).await;
         second.insert(world.dialled()[1].0.as_millis());
     }
     assert!(second.len() > 10 && second.iter().all(|at| (1125..=1253).contains(at)), "{second:?}");
@@ -261,7 +266,7 @@ async fn the_best_target_is_linked_and_the_next_when_it_fails() {
     let (task, _board) = world.keep_one();
     sleep(SECOND).await;
     assert_eq!((world.hosts_dialled(), world.up()), ("ab".into(), vec!["b".into()]));
-    // When that link ends, it begins again with the best.
+    // When that link ends, the search begins with the best again.
     world.set("a", Host::Up(3600 * SECOND));
     sleep(31 * SECOND).await;
     assert_eq!((world.hosts_dialled(), world.up()), ("aba".into(), vec!["a".into()]));
@@ -320,7 +325,7 @@ async fn a_link_moves_when_its_router_is_named_no_more() {
     let (task, _board) = world.keep_one();
     sleep(5 * SECOND).await;
     assert_eq!(world.up(), ["a"]);
-    // A better one alone moves nothing.
+    // A better target alone moves no link.
     world.answers(10 * SECOND, &[(5, "c"), (10, "a"), (20, "b")]);
     sleep(20 * SECOND).await;
     assert_eq!(world.up(), ["a"]);
@@ -331,7 +336,7 @@ async fn a_link_moves_when_its_router_is_named_no_more() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn what_dns_said_last_serves_while_it_is_silent_but_not_against_its_word() {
+async fn last_dns_answer_serves_while_dns_is_silent_until_it_denies() {
     let world = World::new();
     world.answers(10 * SECOND, &[(10, "a")]);
     world.set("a", Host::Up(30 * SECOND));
@@ -344,9 +349,9 @@ async fn what_dns_said_last_serves_while_it_is_silent_but_not_against_its_word()
     *world.answer.lock().unwrap() = Err(DnsError::NotOffered { name: "_sgc._udp.lab.example".into() });
     sleep(60 * SECOND).await;
     assert_eq!((world.hosts_dialled(), world.up()), ("aa".into(), vec![]));
-    let line = &board.snapshot()[0];
-    assert!(line.last_failure.as_ref().is_some_and(|why| why.contains("offers no routers")), "{line:?}");
-    // It goes on asking.
+    let row = &board.snapshot()[0];
+    assert!(row.last_failure.as_ref().is_some_and(|why| why.contains("offers no routers")), "{row:?}");
+    // The search goes on asking.
     world.answers(10 * SECOND, &[(10, "a")]);
     sleep(15 * SECOND).await;
     assert_eq!(world.hosts_dialled(), "aaa");
@@ -369,35 +374,35 @@ async fn a_set_whose_router_has_a_link_already_stands_back_until_that_ends() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn of_many_that_are_announced_two_are_linked_and_four_dialled_at_once() {
+async fn many_announcements_lead_to_two_links_and_at_most_four_dials() {
     let world = World::new();
     let (tell, heard) = mpsc::channel(64);
     let board = Board::default();
-    let holder = world.clone();
+    let keeper = world.clone();
     let task = tokio::spawn(async move {
-        let line = board.line("mdns://", "mdns");
-        let wanted = Wanted { written: "mdns://".into(), nodes: None };
-        mdns::keep_links(heard, wanted, holder, &board, &line, ChaCha20Rng::seed_from_u64(1)).await;
+        let row = board.row("mdns://", "mdns");
+        let wanted = RouterFilter { written: "mdns://".into(), nodes: None };
+        mdns::keep_links(heard, wanted, keeper, &board, &row, ChaCha20Rng::seed_from_u64(1)).await;
     });
     let ip = |n: u8| format!("10.0.0.{n}");
     for n in 1..=20u8 {
-        // Most of them are lies.
+        // Most announcements are false.
         let is = if n % 5 == 0 { Host::Up(60 * SECOND) } else { Host::Dead };
         world.set(&ip(n), is);
         let addresses = vec![SocketAddr::from(([10, 0, 0, n], 7447))];
-        tell.send(Heard::Announced { instance: n.to_string(), addresses }).await.unwrap();
+        tell.send(Sighting::Announced { instance: n.to_string(), addresses }).await.unwrap();
     }
     sleep(20 * SECOND).await;
     assert_eq!(world.up().len(), mdns::LINKS_MAX);
     assert!(world.dials.lock().unwrap().0 <= mdns::DIALS_MAX);
-    // As long as there are two, nobody else is tried.
+    // While two links are up, no other router is dialled.
     let before = world.dialled().len();
     sleep(10 * SECOND).await;
     assert_eq!(world.dialled().len(), before);
-    // That they are said to be gone ends no link; but when it ends, they are dialled no more.
+    // A withdrawal ends no link. After the link ends, the router is not dialled again.
     let up = world.up();
     for n in 1..=20u8 {
-        tell.send(Heard::Vanished { instance: n.to_string() }).await.unwrap();
+        tell.send(Sighting::Vanished { instance: n.to_string() }).await.unwrap();
     }
     sleep(SECOND).await;
     assert_eq!(world.up(), up);
@@ -411,15 +416,15 @@ async fn a_router_that_is_reached_otherwise_is_dialled_again_when_it_no_longer_i
     let world = World::new();
     let (tell, heard) = mpsc::channel(64);
     let board = Board::default();
-    let holder = world.clone();
+    let keeper = world.clone();
     let task = tokio::spawn(async move {
-        let line = board.line("mdns://", "mdns");
-        let wanted = Wanted { written: "mdns://".into(), nodes: None };
-        mdns::keep_links(heard, wanted, holder, &board, &line, ChaCha20Rng::seed_from_u64(1)).await;
+        let row = board.row("mdns://", "mdns");
+        let wanted = RouterFilter { written: "mdns://".into(), nodes: None };
+        mdns::keep_links(heard, wanted, keeper, &board, &row, ChaCha20Rng::seed_from_u64(1)).await;
     });
     world.set("10.0.0.1", Host::Reached(50 * SECOND));
     let addresses = vec![SocketAddr::from(([10, 0, 0, 1], 7447))];
-    tell.send(Heard::Announced { instance: "a".into(), addresses }).await.unwrap();
+    tell.send(Sighting::Announced { instance: "a".into(), addresses }).await.unwrap();
     sleep(40 * SECOND).await;
     assert_eq!(world.dialled().len(), 1);
     world.set("10.0.0.1", Host::Up(3600 * SECOND));

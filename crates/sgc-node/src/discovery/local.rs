@@ -1,8 +1,7 @@
-//! The local network by mDNS (RFC 6762, 6763): telling that a router is here, and hearing of others.
+//! mDNS on the local network (RFC 6762, 6763): announces a router here and hears of others.
 //!
-//! What is told is a random name that is another at each start, the port, and the version of what is told: nothing of
-//! fleet, node or topics, and not the name of the machine. What is heard is passed on as it is; what is worth
-//! dialling is the business of `candidates`.
+//! An announcement holds a random name, which is another at each start, the port, and its version. It holds nothing of
+//! fleet, node, topics or host name. Announcements of others are passed on unjudged; `candidates` judges them.
 
 use std::collections::BTreeSet;
 use std::net::{IpAddr, SocketAddr, SocketAddrV6};
@@ -18,43 +17,43 @@ use sgc_transport::ListenAddr;
 use tokio::time::timeout;
 use tracing::{debug, warn};
 
-/// What routers announce themselves as.
+/// Service type of routers.
 pub(crate) const SERVICE: &str = "_sgc._udp.local.";
-/// Key and value that say what an announcement means.
+/// Key and value of the announcement's version.
 const VERSION_KEY: &str = "v";
 const VERSION: &str = "1";
-/// How long taking an announcement back may take.
+/// Time for withdrawing an announcement.
 const GOODBYE_MAX: Duration = Duration::from_millis(500);
 
-/// What was heard.
+/// News about a router on the local network.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Heard {
-    /// A router says that it is there.
+pub(crate) enum Sighting {
+    /// A router announces itself.
     Announced {
         /// Its name in mDNS.
         instance: String,
-        /// Where it says it is.
+        /// Its announced addresses.
         addresses: Vec<SocketAddr>,
     },
-    /// Something in an announcement is not understood.
+    /// The announcement is not understood.
     Unknown,
-    /// A router says that it leaves, or has not said for long that it is there.
+    /// A router withdraws its announcement, or did not repeat it in time.
     Vanished {
         /// Its name in mDNS.
         instance: String,
     },
 }
 
-/// This node on the local network; ends with it.
+/// This node's mDNS daemon. Dropping it ends the announcement.
 pub(crate) struct LocalNetwork {
     daemon: ServiceDaemon,
-    /// What this node told, so that it does not take itself for another.
+    /// Names that this node announced, so that it ignores itself.
     own: BTreeSet<String>,
 }
 
 impl LocalNetwork {
-    /// Opens it, and announces a router that listens at these addresses, none if there are none. `port` is mDNS's own
-    /// unless a test has one of its own.
+    /// Starts the daemon and announces a router at these addresses, if there are any. `port` overrides mDNS's own in
+    /// tests.
     pub(crate) fn open(
         port: Option<u16>,
         announce: &[ListenAddr],
@@ -73,24 +72,24 @@ impl LocalNetwork {
         Ok(local)
     }
 
-    /// Begins to listen.
+    /// Starts to listen for announcements.
     pub(crate) fn browse(&self) -> Result<Receiver<ServiceEvent>, Error> {
         self.daemon.browse(SERVICE)
     }
 
-    /// What an event says of other routers, if anything.
-    pub(crate) fn heard(&self, event: ServiceEvent) -> Option<Heard> {
+    /// Returns the news in an event, if it is about another router.
+    pub(crate) fn heard(&self, event: ServiceEvent) -> Option<Sighting> {
         match event {
             ServiceEvent::ServiceResolved(service) => {
                 let is_own = self.own.contains(service.get_fullname());
                 (!is_own).then(|| announced(&service))
             }
-            ServiceEvent::ServiceRemoved(_, instance) => Some(Heard::Vanished { instance }),
+            ServiceEvent::ServiceRemoved(_, instance) => Some(Sighting::Vanished { instance }),
             _ => None,
         }
     }
 
-    /// Takes back what was announced, so that nobody dials any more.
+    /// Withdraws the announcement, so that nobody dials any more.
     pub(crate) async fn say_goodbye(&self) {
         let told: Vec<_> = self.own.iter().filter_map(|name| self.daemon.unregister(name).ok()).collect();
         for done in told {
@@ -101,7 +100,7 @@ impl LocalNetwork {
 
 impl Drop for LocalNetwork {
     fn drop(&mut self) {
-        // Its thread lives until it is told.
+        // The daemon's thread lives until it is shut down.
         let _ = self.daemon.shutdown();
     }
 }
@@ -125,16 +124,16 @@ fn announcement(addr: &ListenAddr, rng: &mut ChaCha20Rng) -> Result<ServiceInfo,
     let properties = [(VERSION_KEY, VERSION)];
     let (ip, port) = (addr.addr.ip(), addr.addr.port());
     if ip.is_unspecified() {
-        // Whatever addresses this machine has, from time to time.
+        // The library fills in the machine's addresses and keeps them current.
         let info = ServiceInfo::new(SERVICE, &name, &host, "", port, &properties[..])?;
         return Ok(info.enable_addr_auto());
     }
     ServiceInfo::new(SERVICE, &name, &host, ip, port, &properties[..])
 }
 
-fn announced(service: &ResolvedService) -> Heard {
+fn announced(service: &ResolvedService) -> Sighting {
     if service.get_property_val_str(VERSION_KEY) != Some(VERSION) {
-        return Heard::Unknown;
+        return Sighting::Unknown;
     }
     let port = service.get_port();
     let address = |ip: &ScopedIp| match ip {
@@ -144,7 +143,7 @@ fn announced(service: &ResolvedService) -> Heard {
         ip => SocketAddr::new(IpAddr::to_canonical(&ip.to_ip_addr()), port),
     };
     let addresses = service.get_addresses().iter().map(address).collect();
-    Heard::Announced { instance: service.get_fullname().to_owned(), addresses }
+    Sighting::Announced { instance: service.get_fullname().to_owned(), addresses }
 }
 
 #[cfg(test)]

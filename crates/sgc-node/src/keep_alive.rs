@@ -1,59 +1,59 @@
-//! Whether the other end of a link is there: when to ask, when its silence counts, and how rarely a link that carries
-//! nothing may be asked without a NAT on the way forgetting it.
+//! Keep-alive of one link: decides when to probe the peer, when its silence counts, and how rarely an idle link may be
+//! probed without a NAT on the path forgetting it.
 //!
-//! It is told the time and what was seen, and says what follows; it sends nothing.
+//! The caller passes in the time and its observations and carries out the verdict. This module sends nothing.
 
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
-/// How long nothing may come over a link that carries something, or seems dead, before the peer is asked.
+/// Longest silence on an active or suspect link before the peer is probed.
 const ASK_MIN: Duration = Duration::from_secs(1);
-/// The same for one that has long carried nothing: mobile carriers forget UDP after 20 to 30 s.
+/// Longest silence on a link that has been idle for long. Mobile carriers forget UDP mappings after 20 to 30 s.
 pub(crate) const ASK_MAX: Duration = Duration::from_secs(15);
-/// To where that is shortened if a NAT forgets sooner.
+/// Lower bound of the interval when a NAT forgets sooner than that.
 const ASK_FLOOR: Duration = Duration::from_secs(5);
-/// A link carries something for so long after the last packet.
+/// Time after the last packet during which a link counts as active.
 const ACTIVE_FOR: Duration = Duration::from_secs(30);
-/// How long an answer may take until the link seems dead, at least, at most, and in round trips.
+/// Time for an answer before the link counts as silent: lower bound, upper bound, and multiple of the round-trip time.
 const ANSWER_MIN: Duration = Duration::from_millis(1500);
 const ANSWER_MAX: Duration = Duration::from_secs(5);
 const ANSWER_RTTS: u32 = 4;
-/// How long until it is.
+/// Time for an answer before the link counts as dead.
 const DEAD_AFTER: Duration = Duration::from_millis(8500);
-/// Who did not look for so long was not running, and has missed what came.
+/// A gap this long between two looks means that this node was suspended and has missed packets.
 const ASLEEP_AFTER: Duration = Duration::from_secs(3);
 
-/// How often a link that carries nothing is asked.
+/// Longest interval between probes on an idle link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Patience {
-    /// At most so long after the last that came.
+pub(crate) struct KeepAlivePolicy {
+    /// Upper bound of the silence before a probe.
     pub(crate) max: Duration,
-    /// Whether that is shortened where it is too long.
+    /// Whether the bound shrinks when a NAT turns out to forget sooner.
     pub(crate) adapts: bool,
 }
 
-impl Default for Patience {
+impl Default for KeepAlivePolicy {
     fn default() -> Self {
         Self { max: ASK_MAX, adapts: true }
     }
 }
 
-impl Patience {
-    /// What the user set.
+impl KeepAlivePolicy {
+    /// Returns the policy for an interval that the user configured.
     pub(crate) fn fixed(every: Duration) -> Self {
         Self { max: every.max(ASK_MIN), adapts: false }
     }
 }
 
-/// Whether packets went over a link since it was looked at last. Written by every task that moves some.
+/// Flag that packets crossed a link since the last look. Every task that moves packets sets it.
 #[derive(Debug, Default)]
 pub(crate) struct Activity(AtomicBool);
 
 impl Activity {
-    /// One goes.
+    /// Notes that a packet crosses the link.
     pub(crate) fn note(&self) {
-        // Mostly it is known already: then nobody else's cache has to hear of it.
+        // The flag is usually set already. Reading first avoids invalidating the cache line of other cores.
         if !self.0.load(Relaxed) {
             self.0.store(true, Relaxed);
         }
@@ -64,52 +64,57 @@ impl Activity {
     }
 }
 
-/// What is seen of a link at one moment.
+/// State of a link at one moment.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Seen<'a> {
-    /// Bytes that have come, whatever they are.
+pub(crate) struct LinkObservation<'a> {
+    /// Bytes received so far, of any kind.
     pub(crate) received_bytes: u64,
-    /// Whether packets went.
+    /// Flag of packets that crossed the link.
     pub(crate) activity: &'a Activity,
-    /// Where the peer is.
+    /// Current address of the peer.
     pub(crate) remote: SocketAddr,
     /// Smoothed round-trip time.
     pub(crate) rtt: Duration,
 }
 
-/// What follows.
+/// Decision after one look at a link.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Verdict {
-    /// The peer is to be asked now.
+    /// The peer is to be probed now.
     pub(crate) asks: bool,
-    /// Something should have come and did not.
+    /// An answer is overdue.
     pub(crate) is_silent: bool,
-    /// So long that the link is to end.
+    /// The answer is overdue for so long that the link ends.
     pub(crate) is_dead: bool,
 }
 
-/// The pulse of one link.
+/// Keep-alive state of one link.
 #[derive(Debug)]
-pub(crate) struct Heart {
-    patience: Patience,
-    /// How long nothing may come before the peer is asked; at most `patience.max`.
+pub(crate) struct KeepAlive {
+    policy: KeepAlivePolicy,
+    /// Silence before the next probe, at most `policy.max`.
     step: Duration,
     received_bytes: u64,
     remote: SocketAddr,
     heard: Instant,
     active: Instant,
     looked: Instant,
-    /// The first question since the last that came, and the last one.
+    /// Times of the first and the last probe since something was last received.
     asked: Option<(Instant, Instant)>,
-    /// How long it was quiet before the present question or the last one.
+    /// Silence before the current or the last probe.
     gap: Duration,
 }
 
-impl Heart {
-    /// A link is up.
-    pub(crate) fn new(now: Instant, patience: Patience, received_bytes: u64, remote: SocketAddr) -> Self {
+impl KeepAlive {
+    /// Starts the keep-alive of a link that is up.
+    pub(crate) fn new(
+        now: Instant,
+        policy: KeepAlivePolicy,
+        received_bytes: u64,
+        remote: SocketAddr,
+    ) -> Self {
         Self {
-            patience,
+            policy,
             step: ASK_MIN,
             received_bytes,
             remote,
@@ -121,25 +126,25 @@ impl Heart {
         }
     }
 
-    /// How long nothing may come before the peer is asked.
+    /// Returns the silence after which the peer is probed.
     pub(crate) fn step(&self) -> Duration {
         self.step
     }
 
-    /// How long that may grow to be, as far as is known of the way.
-    pub(crate) fn patience(&self) -> Patience {
-        self.patience
+    /// Returns the policy, with the bound that the path has shown to bear.
+    pub(crate) fn policy(&self) -> KeepAlivePolicy {
+        self.policy
     }
 
-    /// Something is sent that calls for an answer, or for the peer to be there: it is looked at closely.
+    /// Shortens the interval, because a frame is sent that expects an answer or a live peer.
     pub(crate) fn stir(&mut self) {
         self.step = ASK_MIN;
     }
 
-    /// Looks at it; to be called a few times a second.
-    pub(crate) fn look(&mut self, now: Instant, seen: Seen<'_>) -> Verdict {
+    /// Observes the link. The caller calls this a few times a second.
+    pub(crate) fn look(&mut self, now: Instant, seen: LinkObservation<'_>) -> Verdict {
         if now.saturating_duration_since(self.looked) >= ASLEEP_AFTER {
-            // It was this node that was silent.
+            // This node was suspended, so its own silence counts for nothing.
             (self.asked, self.heard) = (None, now);
         }
         self.looked = now;
@@ -172,21 +177,21 @@ impl Heart {
         Verdict { asks, is_silent, is_dead: waited >= DEAD_AFTER }
     }
 
-    /// Something came after it was quiet for so long.
+    /// Handles a receipt after `quiet` of silence.
     fn hear(&mut self, now: Instant, quiet: Duration, remote: SocketAddr, is_active: bool) {
         let has_moved = std::mem::replace(&mut self.remote, remote) != remote;
         let asked = self.asked.take();
-        // A way that had to be asked more than once lost what came first: something on it had forgotten it.
+        // A path that needed several probes lost the first one, because a NAT on it had forgotten the mapping.
         let was_lost = asked.is_some_and(|(first, last)| last > first);
         let gap = if asked.is_some() { self.gap } else { quiet };
-        if self.patience.adapts && gap >= ASK_FLOOR && (has_moved || was_lost) {
-            self.patience.max = self.patience.max.min(gap / 2).max(ASK_FLOOR);
+        if self.policy.adapts && gap >= ASK_FLOOR && (has_moved || was_lost) {
+            self.policy.max = self.policy.max.min(gap / 2).max(ASK_FLOOR);
         }
-        // It answers: so the next question may come later.
+        // The peer answers, so the next probe may come later.
         if asked.is_some() && !was_lost && !is_active {
-            self.step = (self.step * 2).min(self.patience.max);
+            self.step = (self.step * 2).min(self.policy.max);
         }
-        self.step = self.step.min(self.patience.max);
+        self.step = self.step.min(self.policy.max);
         self.heard = now;
     }
 }
@@ -197,17 +202,17 @@ mod tests {
 
     const LOOK: Duration = Duration::from_millis(500);
 
-    /// A link, its peer and what lies between, in steps of a look.
+    /// Simulates a link, its peer and the path between them, in steps of one look.
     struct Bench {
         now: Instant,
-        heart: Heart,
+        keep_alive: KeepAlive,
         activity: Activity,
         received: u64,
         remote: SocketAddr,
         /// Whether the peer answers.
         answers: bool,
-        /// After how long without a packet the NAT forgets: what the peer sends is lost then, and what leaves gets
-        /// another port.
+        /// Idle time after which the NAT forgets the mapping. It then loses packets of the peer, and packets to the
+        /// peer leave from another port.
         forgets: Option<Duration>,
         passed: Instant,
         asked: Vec<Instant>,
@@ -215,12 +220,12 @@ mod tests {
     }
 
     impl Bench {
-        fn new(patience: Patience) -> Self {
+        fn new(policy: KeepAlivePolicy) -> Self {
             let (now, remote) = (Instant::now(), SocketAddr::from(([10, 0, 0, 1], 1000)));
-            let heart = Heart::new(now, patience, 0, remote);
+            let keep_alive = KeepAlive::new(now, policy, 0, remote);
             Self {
                 now,
-                heart,
+                keep_alive,
                 activity: Activity::default(),
                 received: 0,
                 remote,
@@ -234,13 +239,13 @@ mod tests {
 
         fn look(&mut self) {
             self.now += LOOK;
-            let seen = Seen {
+            let seen = LinkObservation {
                 received_bytes: self.received,
                 activity: &self.activity,
                 remote: self.remote,
                 rtt: Duration::from_millis(40),
             };
-            self.verdict = self.heart.look(self.now, seen);
+            self.verdict = self.keep_alive.look(self.now, seen);
             if !self.verdict.asks {
                 return;
             }
@@ -262,7 +267,7 @@ mod tests {
             (last - before).as_secs_f64()
         }
 
-        /// Looks until it is so, and how many seconds that took.
+        /// Looks until the verdict satisfies `is_so`, and returns the seconds that took.
         fn until(&mut self, is_so: impl Fn(Verdict) -> bool) -> f64 {
             let start = self.now;
             while !is_so(self.verdict) {
@@ -275,7 +280,7 @@ mod tests {
 
     #[test]
     fn questions_become_rare_when_nothing_flows_and_frequent_when_something_does() {
-        let mut bench = Bench::new(Patience::default());
+        let mut bench = Bench::new(KeepAlivePolicy::default());
         bench.run(30);
         assert!(bench.last_wait() <= 2.0 && bench.asked.len() >= 15, "{}", bench.asked.len());
         bench.run(120);
@@ -284,7 +289,7 @@ mod tests {
         let before = bench.asked.len();
         bench.run(10);
         assert!(bench.asked.len() >= before + 5, "{before} {}", bench.asked.len());
-        // Whoever hears something need not ask.
+        // A peer that sends need not be probed.
         let before = bench.asked.len();
         for _ in 0..100 {
             bench.received += 1;
@@ -296,25 +301,25 @@ mod tests {
 
     #[test]
     fn a_dead_peer_is_noticed_in_three_seconds_while_something_flows() {
-        let mut bench = Bench::new(Patience::default());
+        let mut bench = Bench::new(KeepAlivePolicy::default());
         bench.run(10);
         bench.answers = false;
         assert!((2.0..=3.5).contains(&bench.until(|v| v.is_silent)));
         assert!((6.0..=8.0).contains(&bench.until(|v| v.is_dead)));
-        // And one that has carried nothing for long, as soon as something is to go over it.
-        let mut bench = Bench::new(Patience::default());
+        // A link that was idle for long notices it as soon as a packet is to cross it.
+        let mut bench = Bench::new(KeepAlivePolicy::default());
         bench.run(200);
         bench.answers = false;
         bench.activity.note();
         assert!(bench.until(|v| v.is_silent) <= 3.5);
-        let mut bench = Bench::new(Patience::default());
+        let mut bench = Bench::new(KeepAlivePolicy::default());
         bench.run(200);
         bench.answers = false;
-        bench.heart.stir();
-        // An answer under way may still make it patient once.
+        bench.keep_alive.stir();
+        // An answer under way may extend the interval once more.
         assert!(bench.until(|v| v.is_silent) <= 4.5);
-        // Otherwise when it is asked again.
-        let mut bench = Bench::new(Patience::default());
+        // An idle link notices it at its next probe.
+        let mut bench = Bench::new(KeepAlivePolicy::default());
         bench.run(200);
         bench.answers = false;
         assert!(bench.until(|v| v.is_silent) <= 18.0);
@@ -326,14 +331,14 @@ mod tests {
     #[test]
     fn a_nat_that_forgets_is_learnt_of_once() {
         for (forgets, most) in [(12, 7.5), (10, 7.5), (6, 5.0), (60, 15.0)] {
-            let mut bench = Bench::new(Patience::default());
+            let mut bench = Bench::new(KeepAlivePolicy::default());
             bench.forgets = Some(Duration::from_secs(forgets));
             bench.run(300);
             let port = bench.remote.port();
             assert!(
-                bench.heart.patience().max.as_secs_f64() <= most,
+                bench.keep_alive.policy().max.as_secs_f64() <= most,
                 "{forgets}: {:?}",
-                bench.heart.patience()
+                bench.keep_alive.policy()
             );
             assert!(port <= 1002, "{forgets}: {port}");
             bench.run(300);
@@ -343,17 +348,17 @@ mod tests {
     }
 
     #[test]
-    fn what_the_user_set_stays() {
-        let mut bench = Bench::new(Patience::fixed(Duration::from_secs(10)));
+    fn configured_interval_does_not_adapt() {
+        let mut bench = Bench::new(KeepAlivePolicy::fixed(Duration::from_secs(10)));
         bench.forgets = Some(Duration::from_secs(8));
         bench.run(300);
         assert!((10.0..=11.0).contains(&bench.last_wait()), "{}", bench.last_wait());
-        assert_eq!(Patience::fixed(Duration::ZERO).max, ASK_MIN);
+        assert_eq!(KeepAlivePolicy::fixed(Duration::ZERO).max, ASK_MIN);
     }
 
     #[test]
-    fn who_was_stopped_itself_takes_nobody_for_dead() {
-        let mut bench = Bench::new(Patience::default());
+    fn suspended_node_takes_no_peer_for_dead() {
+        let mut bench = Bench::new(KeepAlivePolicy::default());
         bench.answers = false;
         bench.until(|v| v.is_silent);
         bench.now += Duration::from_secs(60);
@@ -364,16 +369,16 @@ mod tests {
 
     #[test]
     fn a_long_way_is_given_time() {
-        let mut bench = Bench::new(Patience::default());
-        let seen = |rtt| Seen {
+        let mut bench = Bench::new(KeepAlivePolicy::default());
+        let seen = |rtt| LinkObservation {
             received_bytes: 0,
             activity: &bench.activity,
             remote: bench.remote,
             rtt: Duration::from_millis(rtt),
         };
         let silent = |rtt| {
-            let mut heart = Heart::new(bench.now, Patience::default(), 0, bench.remote);
-            (1..).find(|n| heart.look(bench.now + LOOK * *n, seen(rtt)).is_silent)
+            let mut keep_alive = KeepAlive::new(bench.now, KeepAlivePolicy::default(), 0, bench.remote);
+            (1..).find(|n| keep_alive.look(bench.now + LOOK * *n, seen(rtt)).is_silent)
         };
         assert_eq!((silent(1), silent(700), silent(60_000)), (Some(5), Some(8), Some(12)));
         bench.run(1);

@@ -1,4 +1,4 @@
-//! One attempt: dial, see who answers, and keep the link until it ends.
+//! One attempt at a router: dial, judge the peer, and keep the link until it ends.
 
 use std::collections::BTreeSet;
 use std::convert::Infallible;
@@ -12,85 +12,86 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
 use tracing::warn;
 
 use super::dns::DnsError;
-use super::{Aim, Claim, Claims, Dns, Line, Names as _, Passed, WayBook, ways};
+use super::{Claim, Claims, DialTarget, Dns, Names as _, SkippedUrl, StatusRow, WorkingUrls, urls};
 use crate::core::CoreEvent;
 use crate::links::keep_renewed;
 use crate::roaming::Network;
 
-/// How a link is made and kept; tests put something else in its place.
-pub(crate) trait Hold: Clone + Send + Sync + 'static {
-    /// Dials and, if the wish is met, keeps the link until it ends. Another aim has a link made there in place of the
-    /// one that is up.
-    fn hold(
+/// Makes and keeps links. Tests replace it.
+pub(crate) trait KeepLink: Clone + Send + Sync + 'static {
+    /// Dials and, if the request is met, keeps the link until it ends. A new target replaces the link by one to that
+    /// target.
+    fn keep_link(
         &self,
-        aim: watch::Receiver<Aim>,
-        wish: &Wish,
-        line: &Line,
+        target: watch::Receiver<DialTarget>,
+        request: &LinkRequest,
+        row: &StatusRow,
     ) -> impl Future<Output = Outcome> + Send;
     /// Waits until there is no link to this node.
     fn released(&self, node: &NodeId) -> impl Future<Output = ()> + Send;
-    /// How the network changes from here on.
+    /// Returns a receiver of changes of the network.
     fn network(&self) -> Network;
-    /// True once the node is stopping.
+    /// Returns `true` once the node is stopping.
     fn is_over(&self) -> bool;
 }
 
-/// Whom a link is wanted to.
+/// Conditions that a link has to meet.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Wish {
-    /// What was dialled is the word of a stranger: only a router will do, and one that came here by itself goes before.
+pub(crate) struct LinkRequest {
+    /// The target comes from an unauthenticated announcement. Only a router is accepted, and an incoming link of the
+    /// node has precedence.
     pub(crate) hearsay: bool,
-    /// Only these; all if there is nothing.
+    /// The only nodes that are accepted; `None` accepts all.
     pub(crate) nodes: Option<Arc<BTreeSet<NodeId>>>,
-    /// A link takes one of these places; if none is free there is to be none.
+    /// Places that links take. Without a free place no link is made.
     pub(crate) places: Option<Arc<Semaphore>>,
 }
 
-/// What came of an attempt.
+/// Result of an attempt.
 #[derive(Debug)]
 pub(crate) enum Outcome {
     /// A link was up, and ended.
     Ended {
-        /// Where it led.
+        /// Address of the peer.
         remote: SocketAddr,
-        /// Why.
+        /// Reason of the end.
         end: LinkError,
     },
-    /// There was none.
+    /// No link was made.
     Failed(Failure),
 }
 
-/// Why an attempt led to no link.
+/// Reasons why an attempt made no link.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Failure {
-    /// Nobody is there, or it was refused.
+    /// The target did not answer, or refused.
     #[error(transparent)]
     Dial(#[from] DialError),
-    /// Its name cannot be looked up.
+    /// The host's name could not be resolved.
     #[error(transparent)]
     Dns(#[from] DnsError),
-    /// None of several ways works.
+    /// None of several URLs works.
     #[error("{}", .0.iter().map(|(_, why)| why.to_string()).collect::<Vec<_>>().join("; "))]
     Ways(Vec<(LinkUrl, Failure)>),
     /// Every place is taken.
     #[error("as many links as are wanted are up")]
     Enough,
-    /// It leads here.
+    /// The target is this node.
     #[error("this node itself answers there")]
     Itself,
-    /// It is not a router.
+    /// The peer is not a router.
     #[error("node {} answers there, whose certificate does not make it a router", .0.short())]
     NoRouter(NodeId),
-    /// It is not the one that is wanted.
+    /// The peer is not one of the accepted nodes.
     #[error("node {} answers there, which is not the one that is wanted", .0.short())]
     Other(NodeId),
-    /// Another link leads there.
+    /// Another link leads to the peer.
     #[error("node {} answers there, to which there is a link already", .0.short())]
     Reached(NodeId),
 }
 
 impl Failure {
-    /// True if trying again soon is of no use.
+    /// Returns `true` if an early attempt cannot succeed.
     pub(crate) fn stands_back(&self) -> bool {
         !matches!(self, Self::Dial(_) | Self::Dns(_) | Self::Ways(_))
     }
@@ -98,53 +99,53 @@ impl Failure {
 
 /// Makes and keeps links over the network.
 #[derive(Clone)]
-pub(crate) struct Holder {
-    /// This node.
+pub(crate) struct LinkKeeper {
+    /// Node id of this node.
     pub(crate) me: NodeId,
     pub(crate) dialer: Arc<Dialer>,
-    /// What connections of single topics are dialled with; mostly the same.
+    /// Dialer of lanes, usually the same as `dialer`.
     pub(crate) lane_dialer: Arc<Dialer>,
     pub(crate) dns: Dns,
     pub(crate) core: mpsc::Sender<CoreEvent>,
-    /// Each change says that the credentials changed.
+    /// Changes when the credentials change.
     pub(crate) redial: watch::Receiver<()>,
     pub(crate) claims: Claims,
-    /// How the network changes.
+    /// Changes of the network.
     pub(crate) network: Network,
-    /// Which ways worked.
-    pub(crate) ways: WayBook,
+    /// The URLs that worked last.
+    pub(crate) urls: WorkingUrls,
 }
 
 /// A link that was dialled.
-pub(crate) struct Dialled {
+pub(crate) struct DialledLink {
     pub(crate) link: AnyLink,
-    /// By which way.
+    /// The URL that worked.
     pub(crate) url: LinkUrl,
-    /// The ways that were tried before.
-    pub(crate) passed: Vec<Passed>,
+    /// The URLs that were tried before.
+    pub(crate) passed: Vec<SkippedUrl>,
 }
 
-impl Holder {
-    /// Dials once, by whichever way works, beginning with the one that did last.
-    pub(crate) async fn dial(&self, aim: &Aim) -> Result<Dialled, Failure> {
-        if let [] | [_] = &aim.ways[..] {
-            let link = self.dial_way(&aim.url, &aim.addresses).await?;
-            return Ok(Dialled { link, url: aim.url.clone(), passed: Vec::new() });
+impl LinkKeeper {
+    /// Dials once and returns the first link that succeeds, beginning with the URL that worked last.
+    pub(crate) async fn dial(&self, target: &DialTarget) -> Result<DialledLink, Failure> {
+        if let [] | [_] = &target.urls[..] {
+            let link = self.dial_url(&target.url, &target.addresses).await?;
+            return Ok(DialledLink { link, url: target.url.clone(), passed: Vec::new() });
         }
-        self.dial_first(&self.ways.in_order(&aim.ways)).await
+        self.dial_first(&self.urls.in_order(&target.urls)).await
     }
 
-    /// Dials by the first of these ways that works.
-    pub(crate) async fn dial_first(&self, ways: &[LinkUrl]) -> Result<Dialled, Failure> {
-        let dial = |way: LinkUrl| {
-            let holder = self.clone();
-            async move { holder.dial_way(&way, &[]).await }
+    /// Dials these URLs and returns the first link that succeeds.
+    pub(crate) async fn dial_first(&self, urls: &[LinkUrl]) -> Result<DialledLink, Failure> {
+        let dial = |url: LinkUrl| {
+            let keeper = self.clone();
+            async move { keeper.dial_url(&url, &[]).await }
         };
-        let (link, url, passed) = ways::first(ways, dial).await.map_err(Failure::Ways)?;
-        Ok(Dialled { link, url, passed })
+        let (link, url, passed) = urls::first(urls, dial).await.map_err(Failure::Ways)?;
+        Ok(DialledLink { link, url, passed })
     }
 
-    async fn dial_way(&self, url: &LinkUrl, addresses: &[SocketAddr]) -> Result<AnyLink, Failure> {
+    async fn dial_url(&self, url: &LinkUrl, addresses: &[SocketAddr]) -> Result<AnyLink, Failure> {
         let addresses = match (addresses, self.dns.is_chosen()) {
             ([], false) => return Ok(self.dialer.dial(url).await?),
             ([], true) => self.dns.addresses(&url.host, url.port).await?,
@@ -153,7 +154,7 @@ impl Holder {
         Ok(self.dialer.dial_at(url, addresses).await?)
     }
 
-    /// Has the links of all go on from where the node is now, once after each change of the network.
+    /// Moves the dialers' sockets to the current network, once after each change.
     pub(crate) fn rebind(&self) {
         if !self.network.is_first() {
             return;
@@ -165,16 +166,23 @@ impl Holder {
         }
     }
 
-    /// Says of a link that it is up, and remembers the way.
-    pub(crate) fn linked(&self, aim: &Aim, url: &LinkUrl, passed: &[Passed], node: &NodeId, line: &Line) {
-        line.linked(url, node);
-        line.passed_over(aim.better_than(url), passed);
-        if aim.ways.len() > 1 {
-            self.ways.worked_by(&aim.ways, url);
+    /// Shows that a link is up, and remembers its URL.
+    pub(crate) fn linked(
+        &self,
+        target: &DialTarget,
+        url: &LinkUrl,
+        passed: &[SkippedUrl],
+        node: &NodeId,
+        row: &StatusRow,
+    ) {
+        row.linked(url, node);
+        row.passed_over(target.better_than(url), passed);
+        if target.urls.len() > 1 {
+            self.urls.worked_by(&target.urls, url);
         }
     }
 
-    /// The claim on who answered, unless the one that is held covers it.
+    /// Claims the peer of a link, unless the claim that is held covers it.
     pub(crate) fn claim_again(&self, link: &AnyLink, held: &Claim) -> Result<Option<Claim>, Failure> {
         let node = link.peer().node_id;
         if node == held.node() {
@@ -187,65 +195,74 @@ impl Holder {
         claim.map(Some)
     }
 
-    /// Judges who answered.
-    fn enter(&self, link: &AnyLink, wish: &Wish) -> Result<(Claim, Option<OwnedSemaphorePermit>), Failure> {
+    /// Judges the peer of a link.
+    fn enter(
+        &self,
+        link: &AnyLink,
+        request: &LinkRequest,
+    ) -> Result<(Claim, Option<OwnedSemaphorePermit>), Failure> {
         let peer = link.peer();
         let node = peer.node_id;
         if node == self.me {
             return Err(Failure::Itself);
         }
-        if wish.nodes.as_ref().is_some_and(|nodes| !nodes.contains(&node)) {
+        if request.nodes.as_ref().is_some_and(|nodes| !nodes.contains(&node)) {
             return Err(Failure::Other(node));
         }
-        if wish.hearsay && !peer.may_route {
+        if request.hearsay && !peer.may_route {
             return Err(Failure::NoRouter(node));
         }
-        if self.gives_way(wish, &node) && self.claims.has_come(&node) {
+        if self.gives_way(request, &node) && self.claims.has_come(&node) {
             return Err(Failure::Reached(node));
         }
         let claim = self.claims.claim(node).ok_or(Failure::Reached(node))?;
-        let place = match &wish.places {
+        let place = match &request.places {
             None => None,
             Some(places) => Some(places.clone().try_acquire_owned().map_err(|_| Failure::Enough)?),
         };
         Ok((claim, place))
     }
 
-    /// Where two nodes find each other, the link of the one with the lesser id stays.
-    fn gives_way(&self, wish: &Wish, node: &NodeId) -> bool {
-        wish.hearsay && self.me > *node
+    /// Decides which of two crossing links stays: that of the node with the lesser id.
+    fn gives_way(&self, request: &LinkRequest, node: &NodeId) -> bool {
+        request.hearsay && self.me > *node
     }
 }
 
-impl Hold for Holder {
-    async fn hold(&self, mut aim: watch::Receiver<Aim>, wish: &Wish, line: &Line) -> Outcome {
-        // What changes from here on may come too late for this attempt.
+impl KeepLink for LinkKeeper {
+    async fn keep_link(
+        &self,
+        mut target: watch::Receiver<DialTarget>,
+        request: &LinkRequest,
+        row: &StatusRow,
+    ) -> Outcome {
+        // Subscribe before dialling, since a later subscription could miss a change during this attempt.
         let mut redial = self.redial.clone();
         redial.mark_unchanged();
-        let first = aim.borrow_and_update().clone();
-        line.connecting(&first);
-        let Dialled { link, url, passed } = match self.dial(&first).await {
+        let first = target.borrow_and_update().clone();
+        row.connecting(&first);
+        let DialledLink { link, url, passed } = match self.dial(&first).await {
             Ok(dialled) => dialled,
             Err(why) => return Outcome::Failed(why),
         };
         let (node, remote) = (link.peer().node_id, link.remote());
-        let (claim, _place) = match self.enter(&link, wish) {
+        let (claim, _place) = match self.enter(&link, request) {
             Ok(entered) => entered,
             Err(why) => {
                 link.close(CloseReason::Goodbye);
                 return Outcome::Failed(why);
             }
         };
-        self.linked(&first, &url, &passed, &node, line);
+        self.linked(&first, &url, &passed, &node, row);
         let overtaken = async {
-            if self.gives_way(wish, &node) {
+            if self.gives_way(request, &node) {
                 self.claims.arrived(&node).await;
                 link.close(CloseReason::Replaced);
             }
             std::future::pending::<Infallible>().await
         };
         tokio::select! {
-            end = keep_renewed(link.clone(), url, aim, redial, self, claim, line) => Outcome::Ended { remote, end },
+            end = keep_renewed(link.clone(), url, target, redial, self, claim, row) => Outcome::Ended { remote, end },
             never = overtaken => match never {},
         }
     }

@@ -1,7 +1,6 @@
 //! DNS: addresses of hosts, and the SRV records of a domain (RFC 2782).
 //!
-//! What DNS says is nobody's word: it is bounded here, and whoever answers at such an address has to show its
-//! certificate like any other.
+//! Answers of DNS are not authenticated. They are bounded here, and each router still has to prove its certificate.
 
 use std::future::Future;
 use std::net::SocketAddr;
@@ -17,20 +16,20 @@ use tokio::time::timeout;
 use super::srv::{SrvAnswer, SrvTarget, TARGETS_MAX, TTL_MAX, TTL_MIN};
 use crate::config::SrvDomain;
 
-/// Most addresses of one host that are taken.
+/// Most addresses that are taken of one host.
 const ADDRESSES_MAX: usize = 8;
-/// How long a server may take to answer a question, and how often it is asked.
+/// Time for a server to answer, and the number of attempts.
 const QUERY_TIMEOUT: Duration = Duration::from_secs(2);
 const QUERY_ATTEMPTS: usize = 2;
-/// How long a look-up may take, all servers and attempts together.
+/// Time for a whole look-up, including all servers and attempts.
 const LOOKUP_MAX: Duration = Duration::from_secs(10);
 const REASON_CHARS_MAX: usize = 200;
 
-/// What DNS is asked; tests answer in its place.
+/// The questions that DNS answers. Tests implement it without DNS.
 pub(crate) trait Names: Clone + Send + Sync + 'static {
-    /// Which routers a domain names.
+    /// Returns the routers of a domain.
     fn routers(&self, domain: &SrvDomain) -> impl Future<Output = Result<SrvAnswer, DnsError>> + Send;
-    /// Where a host is.
+    /// Returns the addresses of a host.
     fn addresses(
         &self,
         host: &str,
@@ -38,7 +37,7 @@ pub(crate) trait Names: Clone + Send + Sync + 'static {
     ) -> impl Future<Output = Result<Vec<SocketAddr>, DnsError>> + Send;
 }
 
-/// Why DNS does not say where a router is.
+/// Reasons why DNS yields no router.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum DnsError {
     /// The system's configuration cannot be read.
@@ -46,32 +45,32 @@ pub(crate) enum DnsError {
         "the system's DNS servers are not known ({0}): look at /etc/resolv.conf, or name one with `resolver` in [node]"
     )]
     System(String),
-    /// Nobody answered, or with an error.
+    /// No server answered without an error.
     #[error("{name} cannot be looked up: {reason}")]
     NoAnswer {
-        /// What was asked for.
+        /// The name in question.
         name: String,
-        /// What came instead.
+        /// The error instead of an answer.
         reason: String,
     },
-    /// There is no such record.
+    /// The record does not exist.
     #[error(
         "DNS has no record {name}: the keeper of the domain has to add SRV records that name its routers"
     )]
     NoRecord {
-        /// What was asked for.
+        /// The name in question.
         name: String,
     },
-    /// The domain says that it has no routers.
+    /// The domain declares that it has no routers.
     #[error("{name} says that this domain offers no routers (its target is \".\")")]
     NotOffered {
-        /// What was asked for.
+        /// The name in question.
         name: String,
     },
-    /// There are records, and none can be used.
+    /// None of the records is usable.
     #[error("the SRV records of {name} name no host and port that can be dialled")]
     Useless {
-        /// What was asked for.
+        /// The name in question.
         name: String,
     },
     /// The host has no address.
@@ -83,31 +82,31 @@ pub(crate) enum DnsError {
 }
 
 impl DnsError {
-    /// True if that is how things are, not that they could not be found out.
+    /// Returns `true` if DNS answered authoritatively, in contrast to a failed look-up.
     pub(crate) fn is_final(&self) -> bool {
         !matches!(self, Self::System(_) | Self::NoAnswer { .. })
     }
 }
 
-/// Asks DNS: the system's servers, or a chosen one.
+/// Client of the system's DNS servers, or of a configured one.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Dns {
     server: Option<SocketAddr>,
 }
 
 impl Dns {
-    /// With this server, or with those of the system.
+    /// Creates a client of this server, or of the system's servers.
     pub(crate) fn new(server: Option<SocketAddr>) -> Self {
         Self { server }
     }
 
-    /// True if the user chose a server.
+    /// Returns `true` if the user configured a server.
     pub(crate) fn is_chosen(&self) -> bool {
         self.server.is_some()
     }
 
-    /// Made anew for each look-up: the servers change when a robot changes networks, and what may be remembered of
-    /// answers is for the caller.
+    /// Creates a resolver for one look-up. It is not reused, because the servers change when a robot changes networks.
+    /// Callers cache answers.
     fn resolver(&self) -> Result<TokioResolver, DnsError> {
         let system = |error: NetError| DnsError::System(printable(&error));
         let mut builder = match self.server {
@@ -164,7 +163,7 @@ impl Names for Dns {
                 targets.push(target);
             }
         }
-        // The best of too many.
+        // Keep the targets with the best priority.
         targets.sort_by_key(|target| target.priority);
         targets.truncate(TARGETS_MAX);
         match (targets.is_empty(), is_offered) {
@@ -177,7 +176,7 @@ impl Names for Dns {
     async fn addresses(&self, host: &str, port: u16) -> Result<Vec<SocketAddr>, DnsError> {
         let resolver = self.resolver()?;
         let none = || DnsError::NoAddress { host: host.to_owned() };
-        // A dot behind it keeps the search list out, which is for what people type.
+        // A trailing dot disables the search list, which is meant for typed names.
         let absolute =
             if host.parse::<std::net::IpAddr>().is_ok() { host.to_owned() } else { format!("{host}.") };
         let found = Self::bounded(&absolute, resolver.lookup_ip(absolute.as_str()), none).await?;
@@ -191,12 +190,12 @@ impl Names for Dns {
     }
 }
 
-/// A name as people write it.
+/// Formats a name for people.
 fn shown(query: &str) -> String {
     query.strip_suffix('.').unwrap_or(query).to_owned()
 }
 
-/// What a library says, which may quote what came from the network, fit for a log.
+/// Formats an error of the library for a log. The error may quote text from the network.
 fn printable(error: &NetError) -> String {
     error.to_string().chars().filter(|c| !c.is_control()).take(REASON_CHARS_MAX).collect()
 }

@@ -1,5 +1,5 @@
-//! When to try again: after failures with growing patience, always with jitter, so that many nodes which lost one router
-//! do not come back at one moment.
+//! Back-off between attempts: the wait grows with each failure and is always jittered, so that nodes that lost the same
+//! router do not all return at one moment.
 
 use std::time::Duration;
 
@@ -9,13 +9,13 @@ use tokio::time::Instant;
 
 /// The shortest wait, before jitter.
 pub(super) const BACKOFF_MIN: Duration = Duration::from_millis(250);
-/// The longest wait for a router that the user, or his DNS, named.
+/// The longest wait for a router that the user, or the user's DNS, named.
 pub(crate) const BACKOFF_MAX: Duration = Duration::from_secs(10);
 /// The first wait, before jitter, after another process with this node's identity took its links. It is doubled each time.
 const DISPLACED_MIN: Duration = Duration::from_secs(1);
 /// The longest such wait, before jitter.
 pub(crate) const DISPLACED_MAX: Duration = Duration::from_secs(300);
-/// How long nothing is tried where trying again soon is of no use.
+/// The wait where an early attempt cannot succeed.
 pub(crate) const STAND_BACK: Duration = Duration::from_secs(300);
 
 /// The attempts at one target.
@@ -29,63 +29,63 @@ pub(crate) struct Backoff {
 }
 
 impl Backoff {
-    /// Nothing was tried yet, so now is the time. No wait is longer than `max`, standing back excepted.
+    /// Creates a back-off that is due at once. No wait exceeds `max`, except [`STAND_BACK`].
     pub(crate) fn new(max: Duration) -> Self {
         Self { max, failures: 0, displaced: 0, due: None }
     }
 
-    /// It worked, and is over.
+    /// Notes that a link was up and ended.
     pub(crate) fn ended(&mut self, now: Instant, rng: &mut ChaCha20Rng) {
         (self.failures, self.displaced) = (0, 0);
         self.due = Some(now + wait(1, self.max, rng));
     }
 
-    /// It worked, and was ended for another process with this node's identity.
+    /// Notes that a link ended because another process uses this node's identity.
     pub(crate) fn displaced(&mut self, now: Instant, rng: &mut ChaCha20Rng) {
         self.displaced = self.displaced.saturating_add(1);
         self.due = Some(now + doubled(DISPLACED_MIN, self.displaced, DISPLACED_MAX, rng));
     }
 
-    /// It did not work.
+    /// Notes that an attempt failed.
     pub(crate) fn failed(&mut self, now: Instant, rng: &mut ChaCha20Rng) {
         self.failures = self.failures.saturating_add(1);
         self.due = Some(now + wait(self.failures, self.max, rng));
     }
 
-    /// There is no use in trying soon.
+    /// Notes that an early attempt is useless.
     pub(crate) fn stand_back(&mut self, now: Instant, rng: &mut ChaCha20Rng) {
         self.due = Some(now + jittered(STAND_BACK, rng));
     }
 
-    /// Failures in a row.
+    /// Returns the number of failures in a row.
     pub(crate) fn failures(&self) -> u32 {
         self.failures
     }
 
-    /// When it may be tried; `None` is at once.
+    /// Returns the time of the next attempt; `None` means at once.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.due
     }
 
-    /// Whether it may be tried.
+    /// Returns `true` if the next attempt is due.
     pub(crate) fn is_due(&self, now: Instant) -> bool {
         self.due.is_none_or(|due| due <= now)
     }
 }
 
-/// How long to wait after so many failures in a row: `BACKOFF_MIN` doubled for each after the first, at most `max`, times
-/// a random factor in [0.5, 1).
+/// Returns the wait after this many failures in a row: `BACKOFF_MIN` doubled for each after the first, at most `max`,
+/// times a random factor in [0.5, 1).
 pub(crate) fn wait(failures: u32, max: Duration, rng: &mut ChaCha20Rng) -> Duration {
     doubled(BACKOFF_MIN, failures, max, rng)
 }
 
-/// `least` doubled for each time after the first, at most `max`, with jitter.
+/// Returns `least` doubled `times` times, at most `max`, with jitter.
 pub(crate) fn doubled(least: Duration, times: u32, max: Duration, rng: &mut ChaCha20Rng) -> Duration {
     let doubled = least.saturating_mul(2u32.saturating_pow(times.saturating_sub(1).min(16)));
     jittered(doubled.min(max), rng)
 }
 
-/// Between a half of it and all of it.
+/// Returns a random duration between half of `wait` and `wait`.
 pub(super) fn jittered(wait: Duration, rng: &mut ChaCha20Rng) -> Duration {
     wait.mul_f64(0.5 + f64::from(rng.next_u32()) / f64::from(u32::MAX) / 2.0)
 }

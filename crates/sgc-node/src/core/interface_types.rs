@@ -1,8 +1,8 @@
-//! What the types of shared and used interfaces look like: found in files here, or told by the owners of what is used; and
-//! told to those who ask.
+//! [`InterfaceTypes`]: searches for the types of shared and used interfaces, in local files or at the owners of used
+//! interfaces, and answers nodes that ask.
 //!
-//! Files are read, and descriptions judged, one after the other where that may take its time. What is known goes into the
-//! store, which others in this process look into, and to the ends of the interface that convert by it.
+//! Jobs read files and verify descriptions one after the other on a blocking thread. Known types go into the store,
+//! which the whole process shares, and to the ends of the interface that convert messages.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -23,49 +23,49 @@ use super::{Core, CoreEvent, now};
 use crate::conversion::KnownType;
 use crate::type_questions::TypeQuestions;
 
-/// Types for which room is looked for once more when that of another returns.
+/// Types that are tried again when room returns.
 const RETRIES_MAX: usize = 16;
 
 /// The types of the interfaces that this node shares and uses.
-pub(super) struct Types {
+pub(super) struct InterfaceTypes {
     store: Arc<TypeStore>,
     definitions: Arc<Definitions>,
     needs: BTreeMap<Name, Need>,
-    /// At most one for each need.
+    /// Pending jobs, at most one for each need.
     jobs: VecDeque<Job>,
     is_busy: bool,
     questions: TypeQuestions,
-    /// Needs for which there was no room, those first that are looked at next.
+    /// Needs without room, in the order in which they are tried again.
     no_room: VecDeque<Name>,
 }
 
-/// The type of an interface.
+/// Search for the type of one interface.
 struct Need {
     type_name: TypeName,
-    /// As it is announced.
+    /// Announced type hash.
     type_hash: Option<String>,
-    /// Whose it is, if it is another's.
+    /// Owner, if it is another node.
     owner: Option<NodeId>,
     state: NeedState,
 }
 
 enum NeedState {
-    /// It is looked for.
+    /// A job searches local files.
     Looking,
-    /// Its owner is asked.
+    /// The owner is asked.
     Asked,
-    /// Its owner told it; it is judged.
+    /// The owner's description is being verified.
     Told,
-    /// It is known.
+    /// The type is known.
     Known(Arc<ResolvedType>),
-    /// There is no room for it, or none for another of its owner's.
+    /// The store has no room for the type.
     NoRoom {
-        /// Whether the owner has as many as it may have.
+        /// Whether the owner's own limit is reached.
         of_owner: bool,
     },
-    /// What its owner told is not what it was asked for.
+    /// The owner's description does not match its hash.
     Refused,
-    /// It is not known, and nobody is asked for it.
+    /// The type is unknown, and no owner is asked for it.
     Unknown,
 }
 
@@ -78,84 +78,84 @@ impl Need {
     }
 }
 
-/// What takes its time.
+/// A job for the blocking thread.
 struct Job {
     name: Name,
     type_name: TypeName,
     type_hash: Option<String>,
     owner: Option<NodeId>,
-    /// What an owner told; without it, files are looked into.
+    /// Description from an owner; without it, the job searches files.
     told: Option<DescribedType>,
 }
 
-/// A type that became known, and as it is told to others.
-struct Found {
-    described: KnownOrNew,
+/// A known type, with its packed description for other nodes.
+struct TypeEntry {
+    described: StoredOrNewType,
     packed: Option<PackedType>,
 }
 
-/// A type that is in the store already, or one that is not.
-type KnownOrNew = Result<Arc<ResolvedType>, ResolvedType>;
+/// A type from the store (`Ok`), or one that is not stored yet (`Err`).
+type StoredOrNewType = Result<Arc<ResolvedType>, ResolvedType>;
 
-/// What became of looking for a type.
+/// Result of a job.
 pub(crate) struct TypeOutcome {
-    of: LookedFor,
-    found: Result<Found, TypeMiss>,
+    of: TypeQuery,
+    found: Result<TypeEntry, TypeMiss>,
 }
 
-/// What was looked for.
-struct LookedFor {
+/// The subject of a job.
+struct TypeQuery {
     name: Name,
     type_name: TypeName,
     type_hash: Option<String>,
     owner: Option<NodeId>,
-    /// Bytes that an owner told of it, if it told.
+    /// Size of the owner's description, if there was one.
     told_bytes: Option<usize>,
 }
 
-/// Why a type is not known.
+/// Reasons why a type is unknown.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum TypeMiss {
-    /// No file defines it, or one does so wrongly.
+    /// No file defines it, or a definition is invalid.
     #[error(transparent)]
     Definition(#[from] TypeError),
-    /// It is too large to be described.
+    /// The type is too large to be described.
     #[error(transparent)]
     Description(#[from] DescriptionError),
-    /// The definition is another than that of whoever uses it.
+    /// The local definition differs from the announced one.
     #[error("the definition that was found is {found}, what is announced {announced}")]
     Differs {
-        /// Hash of what was found.
+        /// Hash of the local definition.
         found: String,
-        /// Hash that is announced.
+        /// Announced hash.
         announced: String,
     },
-    /// What an owner told cannot be unpacked.
+    /// The owner's description cannot be unpacked.
     #[error("the description cannot be unpacked: {0}")]
     Packed(#[from] CompressionError),
-    /// What an owner told is not what it was asked for.
+    /// The owner's description does not match its hash.
     #[error(transparent)]
     ResolveError(#[from] ResolveError),
-    /// There is no room for it.
+    /// The store is full.
     #[error(transparent)]
     Full(#[from] StoreFull),
-    /// One owner has as many as it may have.
+    /// The owner's limit is reached.
     #[error(
         "{types} types with {bytes} bytes of descriptions are known of its owner already: it may have no more"
     )]
     OwnerFull {
-        /// Types of its.
+        /// Number of the owner's types.
         types: usize,
         /// Bytes of their descriptions.
         bytes: usize,
     },
-    /// Looking for it failed, by a fault in this program.
+    /// The job panicked.
     #[error("looking for it failed, which is a fault in this program")]
     Failed,
 }
 
 impl TypeMiss {
-    /// A short, stable name for counters; none for what is no fault.
+    /// Returns a short, stable name for counters; `None` if it is no fault.
     fn key(&self) -> Option<&'static str> {
         match self {
             Self::Definition(_) => None,
@@ -167,7 +167,7 @@ impl TypeMiss {
         }
     }
 
-    /// What becomes of the need.
+    /// Returns the state of the need after this result.
     fn state(&self, asks: bool) -> NeedState {
         match self {
             Self::Full(_) => NeedState::NoRoom { of_owner: false },
@@ -179,7 +179,7 @@ impl TypeMiss {
     }
 }
 
-impl Types {
+impl InterfaceTypes {
     pub(super) fn new(store: Arc<TypeStore>, definitions: Definitions) -> Self {
         Self {
             store,
@@ -192,7 +192,7 @@ impl Types {
         }
     }
 
-    /// The type of an interface, if it is known; without one, that of this name and hash.
+    /// Returns the type of an interface, or else the stored type with this name and hash.
     pub(super) fn described(
         &self,
         name: Option<&Name>,
@@ -205,12 +205,12 @@ impl Types {
         self.store.described(&type_name.parse().ok()?, type_hash)
     }
 
-    /// When an owner is to be asked for others of its types.
+    /// Returns the time at which an owner is to be asked for further types.
     pub(super) fn deadline(&self) -> Option<Instant> {
         self.questions.deadline()
     }
 
-    /// What the user should know; `called` is what an owner is called.
+    /// Returns the problems to report. `called` returns the name of an owner.
     pub(super) fn problems(&self, called: impl Fn(&NodeId) -> String) -> Vec<String> {
         let count = |of: fn(&NeedState) -> bool| {
             let mut all = self.needs.values().filter(|need| of(&need.state)).peekable();
@@ -243,11 +243,14 @@ impl Types {
     }
 }
 
-/// Keeping what is known.
-impl Types {
-    /// Takes a type into the store, for an interface of another if that has an `owner`; what no interface has any more makes
-    /// room.
-    fn keep(&self, described: KnownOrNew, owner: Option<&NodeId>) -> Result<Arc<ResolvedType>, TypeMiss> {
+/// Storing of types.
+impl InterfaceTypes {
+    /// Stores a type, charged to `owner` if the interface belongs to another node. Unused types make room.
+    fn keep(
+        &self,
+        described: StoredOrNewType,
+        owner: Option<&NodeId>,
+    ) -> Result<Arc<ResolvedType>, TypeMiss> {
         let new = match described {
             Ok(known) => return Ok(known),
             Err(new) => new,
@@ -273,7 +276,7 @@ impl Types {
         Ok(self.store.insert(new)?)
     }
 
-    /// An interface does not have this type any more: those are looked for once more that may have the room of it.
+    /// Retries the needs that lack room, after an interface dropped this type.
     fn room_returns(&mut self, gone: &ResolvedType, owner: Option<NodeId>) {
         let is_it =
             |known: &Arc<ResolvedType>| (known.name(), known.type_hash()) == (gone.name(), gone.type_hash());
@@ -287,7 +290,7 @@ impl Types {
             let may = match state {
                 Some((NeedState::NoRoom { of_owner: true }, whose)) => whose == owner,
                 Some((NeedState::NoRoom { of_owner: false }, _)) => true,
-                // It found its room, or is no more.
+                // This need has found room, or has ended.
                 _ => continue,
             };
             if may && retried < RETRIES_MAX {
@@ -299,7 +302,7 @@ impl Types {
         }
     }
 
-    /// Looks for the type of a need, from the beginning.
+    /// Starts the search for the type of a need.
     fn look_for(&mut self, name: Name) {
         let Some(need) = self.needs.get_mut(&name) else { return };
         need.state = NeedState::Looking;
@@ -311,7 +314,7 @@ impl Types {
         self.jobs.push_back(Job { name, type_name, type_hash, owner, told: None });
     }
 
-    /// The interfaces of an owner of which it lists another type than the one that is known, or looked for.
+    /// Returns the interfaces for which the owner now lists another type.
     fn listed_otherwise<'a>(
         &self,
         owner: &NodeId,
@@ -327,7 +330,7 @@ impl Types {
         self.needs.iter().filter(differs).map(|(name, _)| *name).collect()
     }
 
-    /// Forgets a need; says whose it was.
+    /// Removes a need. Returns its owner.
     fn forget(&mut self, name: &Name) -> Option<NodeId> {
         let need = self.needs.remove(name)?;
         if let Some(owner) = &need.owner {
@@ -351,13 +354,13 @@ impl Types {
         need.owner
     }
 
-    /// Whether types of this node's own interfaces are still to be looked for.
+    /// Returns `true` if types of this node's own interfaces are still being searched.
     fn has_own_jobs(&self) -> bool {
         self.jobs.iter().any(|job| job.owner.is_none())
     }
 
-    /// What was looked for is over; says whether its need still waits for it.
-    fn ends(&mut self, of: &LookedFor) -> bool {
+    /// Ends a job. Returns whether its need still waits for it.
+    fn ends(&mut self, of: &TypeQuery) -> bool {
         if let Some(owner) = &of.owner {
             self.questions.ends(owner, of.told_bytes.unwrap_or_default());
         }
@@ -378,11 +381,11 @@ impl Job {
         Some(self.told.as_ref()?.description.len())
     }
 
-    /// Looks into the store, into files, or at what was told.
+    /// Searches the store or files, or verifies the owner's description.
     fn run(self, store: &TypeStore, definitions: &Definitions) -> TypeOutcome {
         let told_bytes = self.told_bytes();
         let Self { name, type_name, type_hash, owner, told } = self;
-        let of = LookedFor { name, type_name, type_hash, owner, told_bytes };
+        let of = TypeQuery { name, type_name, type_hash, owner, told_bytes };
         let (type_name, type_hash) = (of.type_name.clone(), of.type_hash.clone());
         of.found_by(move || match told {
             Some(told) => read(&type_name, type_hash.as_deref(), &told),
@@ -391,16 +394,16 @@ impl Job {
     }
 }
 
-impl LookedFor {
-    /// What comes of looking; whatever happens there, something does, since others wait for their turn.
-    fn found_by(self, look: impl FnOnce() -> Result<KnownOrNew, TypeMiss>) -> TypeOutcome {
+impl TypeQuery {
+    /// Turns the search into a result. A panic yields a result too, since other jobs wait for their turn.
+    fn found_by(self, look: impl FnOnce() -> Result<StoredOrNewType, TypeMiss>) -> TypeOutcome {
         let look = || {
             let described = look()?;
             let of: &ResolvedType = match &described {
                 Ok(known) => known,
                 Err(new) => new,
             };
-            Ok(Found { packed: PackedType::new(of.type_hash(), of.description()), described })
+            Ok(TypeEntry { packed: PackedType::new(of.type_hash(), of.description()), described })
         };
         let found = catch_unwind(AssertUnwindSafe(look)).unwrap_or(Err(TypeMiss::Failed));
         TypeOutcome { of: self, found }
@@ -412,8 +415,8 @@ fn find(
     type_hash: Option<&str>,
     store: &TypeStore,
     definitions: &Definitions,
-) -> Result<KnownOrNew, TypeMiss> {
-    // What another owner told of a type of this name need not be this one.
+) -> Result<StoredOrNewType, TypeMiss> {
+    // A type of this name from another owner may differ, so the hash must match.
     if let Some(known) = type_hash.and_then(|hash| store.described(type_name, Some(hash))) {
         return Ok(Ok(known));
     }
@@ -427,8 +430,13 @@ fn find(
     }
 }
 
-fn read(type_name: &TypeName, type_hash: Option<&str>, told: &DescribedType) -> Result<KnownOrNew, TypeMiss> {
-    // Where nobody announces a hash, the owner vouches for it, and for that of a service, of which only the messages may be announced.
+fn read(
+    type_name: &TypeName,
+    type_hash: Option<&str>,
+    told: &DescribedType,
+) -> Result<StoredOrNewType, TypeMiss> {
+    // Without an announced hash, the owner vouches for its description. The same holds for services, for which only the
+    // hashes of messages may be announced.
     let expected = type_hash.filter(|_| type_name.kind() == "msg").unwrap_or(&told.type_hash);
     let described = ResolvedType::read(unpack_type(told)?, type_name, expected)?;
     if let Some(expected) = type_hash.filter(|announced| !described.is_announced_as(announced)) {
@@ -439,7 +447,7 @@ fn read(type_name: &TypeName, type_hash: Option<&str>, told: &DescribedType) -> 
 }
 
 impl<N: RosNetwork> Core<N> {
-    /// The type of this interface is to be known: one of this node, or one of another's.
+    /// Starts the search for the type of an interface, of this node or of another.
     pub(super) fn need_type(
         &mut self,
         name: Name,
@@ -458,7 +466,7 @@ impl<N: RosNetwork> Core<N> {
         }
         self.forget_type(&name);
         let Ok(type_name) = type_name else {
-            // Plain DDS programs may call theirs what they like.
+            // Plain DDS programs use type names that are not of ROS.
             return self.set_type(&name, &KnownType::Lacking);
         };
         self.types.needs.insert(name, Need { type_name, type_hash, owner, state: NeedState::Looking });
@@ -467,7 +475,7 @@ impl<N: RosNetwork> Core<N> {
         self.next_type_job();
     }
 
-    /// The type of an interface of another, which granted it, is to be known.
+    /// Starts the search for the type of a granted interface of another node.
     pub(super) fn need_type_of_used(&mut self, name: Name) {
         let Some((owner, entry)) = self.routes.as_ref().and_then(|routes| routes.used_entry(&name)) else {
             return;
@@ -476,7 +484,7 @@ impl<N: RosNetwork> Core<N> {
         self.need_type(name, &metadata, type_hash, Some(owner));
     }
 
-    /// What an owner lists may have other types now.
+    /// Handles a changed catalogue, which may list other types.
     pub(super) fn types_listed(&mut self, owner: NodeId) {
         let Some(routes) = &self.routes else { return };
         let listed = |name: &Name| routes.used_entry(name).map(|(_, entry)| entry);
@@ -485,7 +493,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// The interface is no more.
+    /// Ends the search, because the interface is gone.
     pub(super) fn forget_type(&mut self, name: &Name) {
         if let Some(owner) = self.types.forget(name) {
             self.ask_types(owner);
@@ -493,7 +501,7 @@ impl<N: RosNetwork> Core<N> {
         self.next_type_job();
     }
 
-    /// An owner tells what types look like.
+    /// Handles type descriptions from an owner.
     pub(super) fn types_told(&mut self, owner: NodeId, types: Vec<DescribedType>) {
         self.types.questions.answered(&owner);
         for told in types {
@@ -529,7 +537,7 @@ impl<N: RosNetwork> Core<N> {
         });
     }
 
-    /// A type is known, or is not.
+    /// Handles the result of a job.
     pub(super) fn type_looked_for(&mut self, outcome: TypeOutcome) {
         self.types.is_busy = false;
         let TypeOutcome { of, found } = outcome;
@@ -538,7 +546,7 @@ impl<N: RosNetwork> Core<N> {
         }
         match of.owner {
             Some(owner) => self.ask_types(owner),
-            // What becomes known at about one time is told at one time.
+            // Types that become known together are sent together.
             None if !self.types.has_own_jobs() => self.endpoint.tell_types(now()),
             None => {}
         }
@@ -548,7 +556,7 @@ impl<N: RosNetwork> Core<N> {
         self.next_type_job();
     }
 
-    fn settle_need(&mut self, of: &LookedFor, found: Result<Found, TypeMiss>) {
+    fn settle_need(&mut self, of: &TypeQuery, found: Result<TypeEntry, TypeMiss>) {
         let (name, owner, was_told) = (of.name, of.owner, of.told_bytes.is_some());
         let found =
             found.and_then(|found| Ok((self.types.keep(found.described, owner.as_ref())?, found.packed)));
@@ -584,14 +592,14 @@ impl<N: RosNetwork> Core<N> {
         self.apply_type(&name);
     }
 
-    /// It is the turn of other types to be asked for.
+    /// Asks for further types, because their turn has come.
     pub(super) fn types_due(&mut self, now: Instant) {
         for owner in self.types.questions.due(now) {
             self.ask_types(owner);
         }
     }
 
-    /// Asks an owner for what is not known of its types, if it is not asked for that already.
+    /// Asks an owner for its unknown types, unless it was asked already.
     fn ask_types(&mut self, owner: NodeId) {
         let now = now();
         if let Some(names) = self.types.questions.next(owner, now.instant) {
@@ -599,10 +607,10 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Tells both ends of an interface what is known of its type.
+    /// Passes the state of a type to both ends of its interface.
     pub(super) fn apply_type(&self, name: &Name) {
         let Some(need) = self.types.needs.get(name) else {
-            // Its name is none of ROS: nobody looks for it, and nothing is to wait for it.
+            // The name is not of ROS, so no search starts and no message waits.
             return self.set_type(name, &KnownType::Lacking);
         };
         let known = match &need.state {
@@ -661,7 +669,7 @@ mod tests {
         assert_eq!(differs.key(), Some("type_differs"), "{differs}");
         let unknown = run(job("p/msg/Nobody", None, None)).unwrap_err();
         assert_eq!(unknown.key(), None, "{unknown}");
-        // A service is looked for by its own name, and by its hash or that of what its readers read.
+        // A service is searched by its own name and by its hash, or by the hash of its request type.
         let service = run(job("std_srvs/srv/SetBool", None, None)).unwrap();
         let request = service.layout().part(&service.name().request()).unwrap().type_hash();
         for hash in [service.type_hash(), &request] {
@@ -677,7 +685,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_told_is_believed_by_its_hash_and_refused_otherwise() {
+    fn received_type_description_is_refused_unless_its_hash_matches() {
         let twist = twist();
         let plain = |hash: &str| told(hash, PayloadEncoding::Plain, twist.description());
         let (hash, other) = (twist.type_hash(), "RIHS01_00");
@@ -686,15 +694,15 @@ mod tests {
             assert!(run(job(TWIST, announced, Some(told))).is_ok());
         }
         let lies = [
-            // It is not of the hash that is announced, nor of the one that it is said to have.
+            // The description has neither the announced hash nor its own claimed one.
             (TWIST, Some(other), plain(hash)),
             (TWIST, None, plain(other)),
-            // It is of another type.
+            // The description is of another type.
             ("std_msgs/msg/String", Some(hash), plain(hash)),
             ("std_msgs/msg/String", None, plain(hash)),
-            // It is none.
+            // The bytes are no description.
             (TWIST, None, told(hash, PayloadEncoding::Plain, &Bytes::from_static(b"no description"))),
-            // It is longer than it may be, packed or not.
+            // The description exceeds the limit, packed or not.
             (TWIST, None, told(hash, PayloadEncoding::Plain, &vec![0; 300 << 10].into())),
             (TWIST, None, told(hash, PayloadEncoding::Zstd, &vec![0xff; 100].into())),
         ];
@@ -704,12 +712,12 @@ mod tests {
         }
     }
 
-    fn types(types_max: usize) -> Types {
-        Types::new(Arc::new(TypeStore::with_limits(types_max, usize::MAX)), Definitions::default())
+    fn types(types_max: usize) -> InterfaceTypes {
+        InterfaceTypes::new(Arc::new(TypeStore::with_limits(types_max, usize::MAX)), Definitions::default())
     }
 
-    /// An interface of a type; what it looks like is looked for.
-    fn need(types: &mut Types, name: u8, type_name: &str, owner: Option<NodeId>) -> Name {
+    /// Adds an interface, whose type is then searched.
+    fn need(types: &mut InterfaceTypes, name: u8, type_name: &str, owner: Option<NodeId>) -> Name {
         let (name, type_name) = (Name([name; 32]), type_name.parse().unwrap());
         let state = NeedState::Looking;
         types.needs.insert(name, Need { type_name, type_hash: None, owner, state });
@@ -717,8 +725,8 @@ mod tests {
         name
     }
 
-    /// What becomes of the next job, as the control task has it.
-    fn step(types: &mut Types) -> Result<Arc<ResolvedType>, TypeMiss> {
+    /// Runs the next job and applies its result, as the control task does.
+    fn step(types: &mut InterfaceTypes) -> Result<Arc<ResolvedType>, TypeMiss> {
         let job = types.jobs.pop_front().expect("something to do");
         let TypeOutcome { of, found } = job.run(&TypeStore::default(), &Definitions::default());
         assert!(types.ends(&of));
@@ -735,7 +743,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_in_use_stays_in_a_full_store_and_what_is_not_makes_room() {
+    fn full_store_drops_unused_types_and_keeps_used_ones() {
         let string = || run(job("std_msgs/msg/String", None, None)).unwrap();
         let mut types = types(1);
         let kept = types.keep(Err(twist()), None).unwrap();
@@ -748,7 +756,7 @@ mod tests {
     }
 
     #[test]
-    fn what_had_no_room_is_looked_for_again_when_there_is() {
+    fn type_without_room_is_looked_for_again_once_there_is_room() {
         let mut types = types(1);
         let first = need(&mut types, 1, "std_msgs/msg/String", None);
         let same = need(&mut types, 2, "std_msgs/msg/String", None);
@@ -769,7 +777,7 @@ mod tests {
     }
 
     #[test]
-    fn one_owner_does_not_take_all_the_room() {
+    fn single_owner_does_not_fill_the_type_store() {
         let (mut types, owner, other) = (types(TYPES_MAX), NodeId([1; 32]), NodeId([2; 32]));
         let of = |n: usize| {
             let mut text = |_: &TypeName| Some(format!("int8 a{n}"));
@@ -793,7 +801,7 @@ mod tests {
         assert!(said.len() == 1 && said[0].contains("of one node this one keeps 512 types"), "{said:?}");
         assert!(said[0].contains(&owner.short()), "{said:?}");
         assert!(types.keep(Err(twist()), Some(&other)).is_ok() && types.keep(Err(twist()), None).is_ok());
-        // It has fewer.
+        // The owner has fewer types now.
         types.forget(&name(0));
         assert_eq!(types.jobs.front().map(|job| job.name), Some(late));
     }
@@ -805,7 +813,7 @@ mod tests {
         let owner = types.needs[&name].owner;
         types.jobs.pop_front().unwrap();
         let type_name = TWIST.parse().unwrap();
-        let of = LookedFor { name, type_name, type_hash: None, owner, told_bytes: None };
+        let of = TypeQuery { name, type_name, type_hash: None, owner, told_bytes: None };
         let TypeOutcome { of, found } = of.found_by(|| panic!("as a fault does"));
         assert!(types.ends(&of));
         let failed = found.map(|_| ()).unwrap_err();
@@ -816,11 +824,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_wanted_any_more_is_neither_looked_for_nor_taken() {
+    fn unwanted_type_is_neither_looked_for_nor_accepted() {
         let (mut types, owner) = (types(1), NodeId([1; 32]));
         let name = need(&mut types, 1, TWIST, Some(owner));
         let job = types.jobs.pop_front().unwrap();
-        // Its owner lists another type by now.
+        // Its owner now lists another type.
         assert_eq!(types.forget(&name), Some(owner));
         need(&mut types, 1, "std_msgs/msg/String", Some(owner));
         let outcome = job.run(&TypeStore::default(), &Definitions::default());
@@ -832,7 +840,7 @@ mod tests {
     }
 
     #[test]
-    fn what_an_owner_lists_otherwise_is_looked_for_anew() {
+    fn changed_listing_of_an_owner_starts_a_new_type_search() {
         let (mut types, owner) = (types(1), NodeId([1; 32]));
         let [same, other_hash, other_type, _] =
             [1, 2, 3, 4].map(|name| need(&mut types, name, TWIST, Some(owner)));

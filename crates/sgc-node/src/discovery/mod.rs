@@ -1,0 +1,213 @@
+//! Finding routers and keeping links to them: one link for each named router, one for each domain of DNS, and a few on
+//! the local network.
+//!
+//! Each kind of search is a loop that yields dial targets (`keep_at`, `srv`, `mdns`). [`link_keeper::LinkKeeper`] dials
+//! and keeps the link. The loops are generic over [`KeepLink`], so tests run their timing on a virtual clock.
+
+mod backoff;
+mod board;
+mod candidates;
+mod claims;
+mod dns;
+mod link_keeper;
+mod local;
+mod mdns;
+mod srv;
+mod urls;
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use rand_chacha::ChaCha20Rng;
+use rand_core::SeedableRng as _;
+use sgc_transport::LinkUrl;
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+use tokio::time::{Instant, sleep_until};
+use tracing::{debug, info, warn};
+
+use backoff::BACKOFF_MIN;
+pub(crate) use backoff::{BACKOFF_MAX, Backoff, doubled, wait};
+pub use board::RouterStatus;
+pub(crate) use board::{Board, StatusRow};
+pub(crate) use claims::{Claim, Claims};
+pub(crate) use dns::{Dns, Names};
+pub(crate) use link_keeper::{DialledLink, Failure, KeepLink, LinkKeeper, LinkRequest, Outcome};
+pub(crate) use local::LocalNetwork;
+pub(crate) use mdns::RouterFilter;
+pub(crate) use urls::{Failback, SkippedUrl, WorkingUrls, is_over_udp};
+
+use crate::config::RouterUrl;
+use crate::links::place_in_use;
+use crate::roaming::Network;
+
+/// A router to dial.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct DialTarget {
+    /// The preferred URL.
+    pub(crate) url: LinkUrl,
+    /// Addresses of the host, if known; otherwise the host is looked up.
+    pub(crate) addresses: Vec<SocketAddr>,
+    /// All URLs of the router, the best first, if it has several. `url` is the first.
+    pub(crate) urls: Vec<LinkUrl>,
+}
+
+impl DialTarget {
+    /// Returns the target with these URLs, the best first; `None` without any.
+    pub(crate) fn by(urls: Vec<LinkUrl>) -> Option<Self> {
+        let url = urls.first()?.clone();
+        Some(Self { urls, ..Self::from(url) })
+    }
+
+    /// Returns all URLs, the best first.
+    pub(crate) fn urls(&self) -> &[LinkUrl] {
+        if self.urls.is_empty() { std::slice::from_ref(&self.url) } else { &self.urls }
+    }
+
+    /// Returns the URLs that are better than this one; none if the target lacks it.
+    pub(crate) fn better_than(&self, url: &LinkUrl) -> &[LinkUrl] {
+        let rank = self.urls().iter().position(|other| other == url);
+        &self.urls()[..rank.unwrap_or(0)]
+    }
+}
+
+impl From<LinkUrl> for DialTarget {
+    fn from(url: LinkUrl) -> Self {
+        Self { url, addresses: Vec::new(), urls: Vec::new() }
+    }
+}
+
+/// Starts the searches for the routers of the configuration and of tokens. `local` holds the local network and the
+/// routers wanted there.
+pub(crate) fn start(
+    configured: &[RouterUrl],
+    of_tokens: &[RouterUrl],
+    keeper: &LinkKeeper,
+    board: &Board,
+    local: Option<(Arc<LocalNetwork>, RouterFilter)>,
+    rng: &mut ChaCha20Rng,
+) -> Vec<JoinHandle<()>> {
+    let mut tasks = Vec::new();
+    for (urls, by) in [(configured, "static"), (of_tokens, "token")] {
+        for urls in urls::routers(urls) {
+            let (keeper, rng) = (keeper.clone(), ChaCha20Rng::from_rng(rng));
+            let Some(target) = DialTarget::by(urls) else { continue };
+            let written = RouterUrl::by(target.urls());
+            tasks.push(tokio::spawn(keep_at(target, keeper, board.row(written, by), rng)));
+        }
+    }
+    for url in configured.iter().chain(of_tokens) {
+        // One task below serves all entries of the local network.
+        let RouterUrl::Srv(domain) = url else { continue };
+        let (keeper, rng) = (keeper.clone(), ChaCha20Rng::from_rng(rng));
+        let (row, dns) = (board.row(url, "srv"), keeper.dns.clone());
+        tasks.push(tokio::spawn(srv::keep_one_of(domain.clone(), dns, keeper, row, rng)));
+    }
+    if let Some((local, wanted)) = local {
+        let (keeper, rng) = (keeper.clone(), ChaCha20Rng::from_rng(rng));
+        tasks.push(tokio::spawn(mdns::keep_some(local, wanted, keeper, board.clone(), rng)));
+    }
+    tasks
+}
+
+/// Keeps a link to one router: dials, and dials again with jittered back-off whenever the link ends.
+pub(crate) async fn keep_at<H: KeepLink>(
+    target: impl Into<DialTarget>,
+    keeper: H,
+    row: StatusRow,
+    mut rng: ChaCha20Rng,
+) {
+    let (_fixed, target) = watch::channel(target.into());
+    let mut backoff = Backoff::new(BACKOFF_MAX);
+    let mut network = keeper.network();
+    loop {
+        let outcome = keeper.keep_link(target.clone(), &LinkRequest::default(), &row).await;
+        if keeper.is_over() {
+            return;
+        }
+        take_note(&outcome, &mut backoff, &row, &mut rng);
+        if pause(&keeper, &outcome, backoff.due(), &mut network).await == Pause::Cut {
+            backoff = Backoff::new(BACKOFF_MAX);
+        }
+    }
+}
+
+/// Applies the result of an attempt to the back-off and to the status row.
+fn take_note(outcome: &Outcome, backoff: &mut Backoff, row: &StatusRow, rng: &mut ChaCha20Rng) {
+    let now = Instant::now();
+    match outcome {
+        Outcome::Ended { remote, end } if place_in_use(end).is_some() => {
+            // The control task logs this once, in words for the operator.
+            info!(%remote, "link ended: {end}");
+            row.ended(&end.to_string());
+            backoff.displaced(now, rng);
+        }
+        Outcome::Ended { remote, end } => {
+            info!(%remote, "link ended: {end}");
+            row.ended(&end.to_string());
+            backoff.ended(now, rng);
+        }
+        Outcome::Failed(why) if why.stands_back() => {
+            // Another link exists in its place, or no link can be made.
+            info!("{why}; trying again in some minutes");
+            row.noted(&why.to_string());
+            backoff.stand_back(now, rng);
+        }
+        Outcome::Failed(why) => {
+            // Only the first failure in a row is news.
+            if backoff.failures() == 0 {
+                warn!("cannot connect: {why}; trying again until it works");
+            } else {
+                debug!("cannot connect: {why}");
+            }
+            row.failed(&why.to_string());
+            backoff.failed(now, rng);
+        }
+    }
+    let stands_back = match outcome {
+        Outcome::Failed(why) => why.stands_back(),
+        Outcome::Ended { end, .. } => place_in_use(end).is_some(),
+    };
+    row.waits(backoff.due(), stands_back);
+}
+
+/// How a pause ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Pause {
+    /// The time is over.
+    Over,
+    /// The network changed, so a failed attempt may succeed now.
+    Cut,
+}
+
+/// Waits until `due`, until the link that displaced this attempt ends, or until the network changes.
+async fn pause<H: KeepLink>(
+    keeper: &H,
+    outcome: &Outcome,
+    due: Option<Instant>,
+    network: &mut Network,
+) -> Pause {
+    let due = due.unwrap_or_else(Instant::now);
+    let released = async {
+        match outcome {
+            Outcome::Failed(Failure::Reached(node)) => keeper.released(node).await,
+            _ => std::future::pending().await,
+        }
+    };
+    tokio::select! {
+        () = sleep_until(due) => Pause::Over,
+        () = released => Pause::Over,
+        () = another_network(network) => Pause::Cut,
+    }
+}
+
+/// Waits until the network changes. It takes at least [`BACKOFF_MIN`], so that a flapping network causes no burst of
+/// attempts.
+async fn another_network(network: &mut Network) {
+    let least = Instant::now() + BACKOFF_MIN;
+    network.changed().await;
+    sleep_until(least).await;
+}
+
+#[cfg(test)]
+mod tests;
