@@ -445,7 +445,7 @@ impl Access {
     }
 }
 
-/// The reason of a refusal, for the gateway's log. [`Denial::told`] is the text for the client.
+/// The reason of a refusal, for the gateway's log. [`Denial::client_message`] is the text for the client.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Denial {
     /// The client showed neither a token nor a certificate, and this address needs one.
