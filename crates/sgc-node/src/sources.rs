@@ -631,7 +631,7 @@ impl LocalShare {
                 self.data.count(LinkId::LOCAL, &self.name, DataDrop::TooLarge);
             }
             Err(PublishError::Exhausted | PublishError::Keeps) => {
-                self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted);
+                self.data.count(LinkId::LOCAL, &self.name, DataDrop::SourceExhausted);
             }
         }
     }

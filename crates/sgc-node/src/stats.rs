@@ -66,6 +66,8 @@ pub(crate) enum DataDrop {
     UnknownLabel,
     /// The name has no grant yet.
     NotGranted,
+    /// The source has used all its numbers.
+    SourceExhausted,
     /// A sink refused the packet. The sink's own counter has the reason.
     Sink,
     /// No local writer takes the message.
@@ -88,7 +90,7 @@ pub(crate) enum DataDrop {
 
 impl DataDrop {
     /// All reasons in the order of their numbers.
-    const ALL: [Self; 19] = [
+    const ALL: [Self; 20] = [
         Self::NoTree,
         Self::WrongWay,
         Self::HopLimit,
@@ -99,6 +101,7 @@ impl DataDrop {
         Self::Malformed,
         Self::UnknownLabel,
         Self::NotGranted,
+        Self::SourceExhausted,
         Self::Sink,
         Self::NoWriter,
         Self::TooLarge,
@@ -123,6 +126,7 @@ impl DataDrop {
             Self::Malformed => "malformed",
             Self::UnknownLabel => "unknown_label",
             Self::NotGranted => "not_granted",
+            Self::SourceExhausted => "source_exhausted",
             Self::Sink => "sink",
             Self::NoWriter => "no_writer",
             Self::TooLarge => "too_large",

@@ -411,6 +411,11 @@ const PACKETS: &[Refusal] = &[
     counted("unknown_label", "it could not be read", SAME_VERSION),
     counted("not_granted", "there was no key for it yet", "a few when a topic begins are no fault"),
     counted(
+        "source_exhausted",
+        "a publisher has sent 2^48 messages, which is all that its source has numbers for",
+        "start the publisher again",
+    ),
+    counted(
         "sink",
         "it was refused when it was opened: a replay, a broken seal or signature, or lost for good",
         "`sgc status` counts the kinds under Drops",
