@@ -2,10 +2,10 @@
 //!
 //! - The participant of each endpoint. Fast DDS 3 shows an endpoint without it as one of no ROS node.
 //! - The request of a reader for inline QoS, if [`asking`] created it. With it come the key hashes, which Fast DDS 2
-//! sends only on request. Cyclone's writers refuse to match such a reader.
+//!   sends only on request. Cyclone's writers refuse to match such a reader.
 //! - The type identifiers (XTypes 1.3, 7.6.3.2.2) in received announcements. Cyclone asks for the types, considers
-//! those of Fast DDS 3 invalid, and then ignores all further endpoints with them. A network here needs only names and
-//! hashes of types.
+//!   those of Fast DDS 3 invalid, and then ignores all further endpoints with them. A network here needs only names and
+//!   hashes of types.
 //!
 //! An announcement is a sample of a built-in type, which builds it from a list of parameters. [`complete`] gives the
 //! two types of a domain another table of functions, which calls Cyclone's and adds to the result. It finds the types

@@ -8,13 +8,13 @@
 //!
 //! This module does two things when Cyclone discovers a reliable writer of Fast DDS, see [`install`]:
 //! - A volatile writer counts as one whose heartbeat was seen. Then the first heartbeat skips nothing, and Cyclone
-//! asks for all messages that it announces. Fast DDS answers with a GAP for those written before it matched the
-//! reader (`ReaderProxy::requested_changes_set`), as RTPS 2.5, 8.4.2.2.5 demands. Writers of Cyclone rely on the
-//! skip, and the answer of others is unknown, so both are left alone. So are transient-local writers: their readers
-//! ask for everything anyway, and Cyclone learns the end of history from the first heartbeat.
+//!   asks for all messages that it announces. Fast DDS answers with a GAP for those written before it matched the
+//!   reader (`ReaderProxy::requested_changes_set`), as RTPS 2.5, 8.4.2.2.5 demands. Writers of Cyclone rely on the
+//!   skip, and the answer of others is unknown, so both are left alone. So are transient-local writers: their readers
+//!   ask for everything anyway, and Cyclone learns the end of history from the first heartbeat.
 //! - Each reliable reader that matches the writer asks for a heartbeat at once, with an ACKNACK of base 0, as readers
-//! of Fast DDS do. Fast DDS answers that at once. It answers an ACKNACK of base 1, which is Cyclone's first, with its
-//! next periodic heartbeat, after up to three seconds.
+//!   of Fast DDS do. Fast DDS answers that at once. It answers an ACKNACK of base 1, which is Cyclone's first, with its
+//!   next periodic heartbeat, after up to three seconds.
 //!
 //! This needs structs and functions of the C code of `cyclors` =0.4.0: `CYCLORS` in `sample.rs`. Each struct is
 //! compared with its expected content at that moment, and everything is left alone if it differs.

@@ -4,10 +4,10 @@
 //! bound to such an address. Once the address is gone, neither works, although no program moved; Fast DDS keeps to
 //! the addresses that it received first. This module therefore replaces the function by which Cyclone sends a packet:
 //! - Participants are announced to programs on this host at 127.0.0.1 alone, and to others at the host's other
-//! address alone. Each gets one address, because Fast DDS sends each message to all. A multicast announcement is sent
-//! twice: to other hosts without a copy for this one, and to this host with a hop limit of zero.
+//!   address alone. Each gets one address, because Fast DDS sends each message to all. A multicast announcement is sent
+//!   twice: to other hosts without a copy for this one, and to this host with a hop limit of zero.
 //! - When the source or destination address of a packet is gone, and the receiver is on this host, the packet goes to
-//! 127.0.0.1. A former address of this host may belong to another host by now, so its packets go there as well.
+//!   127.0.0.1. A former address of this host may belong to another host by now, so its packets go there as well.
 //!
 //! All other packets go as Cyclone sends them. This needs `struct ddsi_tran_conn` and `struct
 //! ddsi_tran_write_msgfrags` of the Cyclone that `cyclors` =0.4.0 builds (`CYCLORS` in `sample.rs`). A connection

@@ -3,11 +3,11 @@
 //! Cyclone lets the type of a topic serialise and deserialise, and knows nothing else about a sample. This type
 //! - keeps the payload as it was serialised, and sends long payloads without a copy;
 //! - reads the key hash and the related request from the inline QoS of a received sample, because it gets the whole
-//! packet;
+//!   packet;
 //! - puts the key hash and the related request into the inline QoS of a sent sample;
 //! - keeps the serialised key of a sample that has nothing else, for which Cyclone would look up the instance;
 //! - spreads the samples of a writer over instances that only that writer knows, so that its history is as deep as
-//! memory allows ([`crate::writer`]).
+//!   memory allows ([`crate::writer`]).
 //!
 //! Cyclone DDS 11 writes a key hash only for readers that ask for it in Cyclone's own way, and neither reads nor
 //! writes the parameter that names the related request. [`crate::inline_qos`] adds both. Another version of `cyclors`
