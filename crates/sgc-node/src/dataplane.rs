@@ -157,7 +157,7 @@ impl DataPlane {
         // A packet from the wrong link may have been under way while the path changed, so it is not suspicious.
         let suspicious = matches!(reason, DataDrop::HopLimit | DataDrop::Malformed);
         if self.drops.count_from(reason.key(), ingress) && suspicious {
-            warn!(%ingress, ?reason, "dropped an invalid packet of a peer; counted from here on");
+            warn!(%ingress, reason = reason.key(), "dropped an invalid packet of a peer; counted from here on");
         }
     }
 

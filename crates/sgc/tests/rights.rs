@@ -440,7 +440,7 @@ fn another_user_is_refused_at_a_status_socket_that_somebody_opened() {
     }
     assert!(place.good(&["status", "--socket", "arm.sock"]).starts_with("arm-1: "));
     let log = node.end();
-    assert_eq!(log.matches("another user asks at the status socket").count(), 1, "{log}");
+    assert_eq!(log.matches("refused another user at the status socket").count(), 1, "{log}");
 }
 
 #[test]
