@@ -17,9 +17,10 @@ use cyclors::{
     dds_instance_state_DDS_IST_ALIVE, dds_return_loan, dds_sample_info_t, dds_take,
 };
 use sgc_ros::{DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, Guid};
+use sgc_sync::lock;
 
 use crate::entity::{Entity, check};
-use crate::graph::{Announcer, Listener, SharedHandler, lock};
+use crate::graph::{Announcer, Listener, SharedHandler};
 use crate::network::Participant;
 use crate::reader::CycloneReader;
 use crate::wait::{Stop, WaitSet, join};

@@ -2,11 +2,12 @@
 //!
 //! This module moves messages; [`sgc_ros::graph`] interprets them.
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use sgc_ros::graph::{GidBytes, GraphView, encode_nodes, graph_reader, graph_writer};
 use sgc_ros::{DiscoveryEvent, DiscoveryHandler, GraphNode, Guid, RosError, RosWriter, Sample, SampleKind};
+use sgc_sync::lock;
 
 use crate::network::Participant;
 use crate::reader::CycloneReader;
@@ -105,8 +106,4 @@ impl Listener {
         drop(view);
         self.announcer.set_gid_bytes(gid_bytes);
     }
-}
-
-pub(crate) fn lock<T>(value: &Mutex<T>) -> MutexGuard<'_, T> {
-    value.lock().unwrap_or_else(PoisonError::into_inner)
 }

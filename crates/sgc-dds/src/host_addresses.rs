@@ -4,7 +4,7 @@
 
 use std::net::Ipv4Addr;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Once, PoisonError, RwLock};
+use std::sync::{Once, RwLock};
 use std::time::{Duration, Instant};
 use std::{io, thread};
 
@@ -12,6 +12,7 @@ use rustix::fd::OwnedFd;
 use rustix::io::Errno;
 use rustix::net::netlink::SocketAddrNetlink;
 use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, bind, recv, socket_with};
+use sgc_sync::{read_lock, write_lock};
 
 use crate::config::local_addresses;
 use crate::network::read_file;
@@ -119,7 +120,7 @@ pub(crate) fn changes() -> Changes {
 }
 
 fn read<T>(look: impl FnOnce(&Addresses) -> T) -> T {
-    look(&ADDRESSES.read().unwrap_or_else(PoisonError::into_inner))
+    look(&read_lock(&ADDRESSES))
 }
 
 /// Reads the addresses. A difference counts as a change, except for the first time.
@@ -127,7 +128,7 @@ fn refresh(is_change: bool) {
     // An unreadable table does not mean that all addresses are gone.
     let Some(table) = read_file("/proc/net/fib_trie") else { return };
     let here = local_addresses(&table, HERE_MAX);
-    let mut addresses = ADDRESSES.write().unwrap_or_else(PoisonError::into_inner);
+    let mut addresses = write_lock(&ADDRESSES);
     if addresses.here != here {
         if is_change {
             tracing::info!(now = ?here, before = ?addresses.here, "this host's addresses changed");
@@ -142,7 +143,7 @@ fn refresh(is_change: bool) {
 /// Makes this host lose an address.
 #[cfg(test)]
 pub(crate) fn lose(address: Ipv4Addr) {
-    let mut addresses = ADDRESSES.write().unwrap_or_else(PoisonError::into_inner);
+    let mut addresses = write_lock(&ADDRESSES);
     addresses.known.push(address);
     ANY_GONE.store(true, Ordering::Relaxed);
 }

@@ -27,6 +27,7 @@ use cyclors::{
     dds_lset_liveliness_changed, dds_sample_info_t, dds_takecdr, ddsi_serdata,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, RELIABLE_READER_DEPTH_MIN};
+use sgc_sync::lock;
 
 use crate::announced;
 use crate::entity::{Entity, reason};
@@ -602,10 +603,6 @@ unsafe extern "C" fn liveliness_changed<R: Receiver>(
         _ => WriterState::Gone,
     };
     shared.change_liveliness(LivelinessChange { writer: status.last_publication_handle, now });
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

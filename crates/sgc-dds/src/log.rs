@@ -9,11 +9,12 @@ use std::cell::RefCell;
 use std::ffi::{CStr, c_void};
 use std::net::SocketAddrV4;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, Once, PoisonError};
+use std::sync::{Mutex, Once};
 use std::time::{Duration, Instant};
 
 use cyclors::{DDS_LC_ERROR, DDS_LC_FATAL, DDS_LC_WARNING, dds_log_data_t, dds_set_log_sink};
 use sgc_ros::Guid;
+use sgc_sync::lock;
 
 use crate::strangers;
 
@@ -42,12 +43,12 @@ static CUT_OFF: Mutex<Option<Instant>> = Mutex::new(None);
 
 /// Returns the packets of this process's local networks that could not be sent, if there were any.
 pub fn unsent() -> Option<Unsent> {
-    UNSENT.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    lock(&UNSENT).clone()
 }
 
 /// Returns `true` if a packet for a program on another host could not be sent since `begin`.
 pub(crate) fn is_cut_off_since(begin: Instant) -> bool {
-    CUT_OFF.lock().unwrap_or_else(PoisonError::into_inner).is_some_and(|last| last >= begin)
+    lock(&CUT_OFF).is_some_and(|last| last >= begin)
 }
 
 /// Returns `true` for the address of a program on another host.
@@ -155,15 +156,15 @@ fn is_premature(message: &str) -> bool {
 fn complain(message: &str, now: Instant) {
     let to = unsent_to(message);
     if let Some(to) = to {
-        let mut unsent = UNSENT.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut unsent = lock(&UNSENT);
         let packets = unsent.as_ref().map_or(0, |unsent| unsent.packets) + 1;
         *unsent = Some(Unsent { packets, to: to.to_owned(), last: now });
         if is_elsewhere(to) {
-            *CUT_OFF.lock().unwrap_or_else(PoisonError::into_inner) = Some(now);
+            *lock(&CUT_OFF) = Some(now);
         }
     }
     let refused = refused_program(message);
-    let [sending, security, other] = &mut *REPEATS.lock().unwrap_or_else(PoisonError::into_inner);
+    let [sending, security, other] = &mut *lock(&REPEATS);
     let kind = match (to, refused) {
         (Some(_), _) => sending,
         (None, Some(_)) => security,

@@ -15,11 +15,12 @@
 use std::collections::BTreeMap;
 use std::ffi::c_void;
 use std::sync::atomic::{AtomicI64, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 use std::time::Duration;
 
 use cyclors::{dds_liveliness_kind_DDS_LIVELINESS_MANUAL_BY_TOPIC, dds_qget_liveliness, dds_qos_t};
 use sgc_ros::Guid;
+use sgc_sync::lock;
 
 use crate::entity::INFINITE;
 
@@ -69,7 +70,7 @@ type Key = (usize, [u32; 4]);
 static LEASES: Mutex<BTreeMap<Key, KeptLease>> = Mutex::new(BTreeMap::new());
 
 fn leases() -> MutexGuard<'static, BTreeMap<Key, KeptLease>> {
-    LEASES.lock().unwrap_or_else(PoisonError::into_inner)
+    lock(&LEASES)
 }
 
 /// Keeps the lease of a new reliable writer from running out, if the writer is manual by topic.

@@ -18,6 +18,7 @@ use sgc_ros::{
     DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid, Reach, RequestHandler,
     RosError, RosNetwork, SampleHandler, ServiceSpec, ShownEndpoint,
 };
+use sgc_sync::lock;
 
 use crate::announced;
 use crate::config::{
@@ -28,7 +29,7 @@ use crate::discovery::{self, Running};
 use crate::entity::{Entity, c_string, check, reason};
 use crate::first_messages;
 use crate::fragments;
-use crate::graph::{Announcer, SharedHandler, lock};
+use crate::graph::{Announcer, SharedHandler};
 use crate::host_addresses::{self, Changes};
 use crate::intake::Pace;
 use crate::log;
@@ -251,7 +252,7 @@ impl RosNetwork for CycloneNetwork {
 
     fn discover(&self, handler: DiscoveryHandler) -> Result<(), RosError> {
         let refused = |reason| RosError::Domain { domain: self.participant.domain_id, reason };
-        let mut running = self.discovery.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut running = lock(&self.discovery);
         if running.is_some() {
             return Err(refused("discovery has been started already".into()));
         }

@@ -2,7 +2,7 @@
 //! ([`crate::sample`]). [`crate::service`] knows the other mapping, and which one a client or server expects.
 
 use std::fmt;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use bytes::Bytes;
@@ -11,6 +11,7 @@ use cyclors::{
     ddsi_serdata,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, RosError};
+use sgc_sync::lock;
 
 use crate::entity::{Entity, check, reason};
 use crate::identity::{Mapping, SampleIdentity};
@@ -184,7 +185,7 @@ impl RpcWriter {
         let failed = |reason: String| RosError::Write { reason };
         // The lock is held while writing, so that the numbers agree with Cyclone's: consecutive from 1, without one
         // for a failed write.
-        let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut written = lock(&self.written);
         let number = *written + 1;
         let frame = make(number)?;
         let mut sertype = std::ptr::null();

@@ -18,13 +18,14 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
 use std::os::fd::BorrowedFd;
 use std::ptr;
 use std::sync::atomic::{AtomicPtr, Ordering};
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::{Arc, RwLock};
 
 use cyclors::{
     DDS_BUILTIN_TOPIC_DCPSPARTICIPANT, dds_create_reader, dds_domain_set_deafmute, dds_entity_t,
     dds_get_entity_sertype, dds_return_t, ddsi_domaingv, ddsi_locator, ddsi_tran_conn, ddsi_xlocator,
 };
 use rustix::net::sockopt;
+use sgc_sync::{read_lock, write_lock};
 
 use crate::announcement::{self, HEAD_BYTES};
 use crate::config::local_addresses;
@@ -141,7 +142,7 @@ pub(crate) struct SameHost {
 
 impl Drop for SameHost {
     fn drop(&mut self) {
-        let mut beside = BESIDE.write().unwrap_or_else(PoisonError::into_inner);
+        let mut beside = write_lock(&BESIDE);
         beside.retain(|(connection, _)| !self.connections.contains(connection));
     }
 }
@@ -250,7 +251,7 @@ fn take_over(domain: *const ddsi_domaingv, connection: &Connection) -> Result<Ip
             return Err("connections send in different ways".into());
         }
     }
-    let mut all = BESIDE.write().unwrap_or_else(PoisonError::into_inner);
+    let mut all = write_lock(&BESIDE);
     all.push((ptr::from_ref(connection) as usize, Arc::new(beside)));
     connection.write.store(ours, Ordering::Release);
     Ok(address)
@@ -399,7 +400,7 @@ fn otherwise(connection: usize, to: &ddsi_locator, packet: &Packet<'_>) -> Optio
     let [.., a, b, c, d] = to.address;
     let port = u16::try_from(to.port).ok()?;
     let beside = {
-        let all = BESIDE.read().unwrap_or_else(PoisonError::into_inner);
+        let all = read_lock(&BESIDE);
         all.iter().find(|(of, _)| *of == connection).map(|(_, beside)| Arc::clone(beside))
     };
     beside?.send(Ipv4Addr::new(a, b, c, d), port, packet)

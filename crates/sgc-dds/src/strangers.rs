@@ -3,10 +3,11 @@
 //! This module keeps the reports of [`crate::discovery`] and [`crate::log`], within bounds.
 
 use std::collections::BTreeMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use sgc_ros::Guid;
+use sgc_sync::lock;
 
 use crate::security::is_enclave;
 
@@ -61,7 +62,7 @@ type Programs = BTreeMap<[u8; 12], Program>;
 static PROGRAMS: Mutex<Programs> = Mutex::new(Programs::new());
 
 fn programs() -> MutexGuard<'static, Programs> {
-    PROGRAMS.lock().unwrap_or_else(PoisonError::into_inner)
+    lock(&PROGRAMS)
 }
 
 impl Program {

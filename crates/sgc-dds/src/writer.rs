@@ -5,7 +5,7 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -15,6 +15,7 @@ use cyclors::{
     dds_publication_matched_status, dds_set_status_mask, dds_take_status, dds_wait_for_acks, dds_write_flush,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, KeyHash, RosError, RosWriter, SampleHead, SampleKind};
+use sgc_sync::lock;
 use sgc_wire::{History, Qos};
 
 use crate::entity::{Entity, INFINITE, check, reason};
@@ -251,10 +252,6 @@ impl CycloneWriter {
     }
 }
 
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl RosWriter for CycloneWriter {
     fn guid(&self) -> Guid {
         self.guid
@@ -305,7 +302,7 @@ impl RosWriter for CycloneWriter {
             return Err(RosError::KeyUnknown);
         }
         let instance = match (&self.keys, &key_hash) {
-            (Some(keys), Some(hash)) => keys.lock().unwrap_or_else(PoisonError::into_inner).instance(hash),
+            (Some(keys), Some(hash)) => lock(keys).instance(hash),
             _ => self.written.fetch_add(1, Ordering::Relaxed) % self.instances(payload.len()),
         };
 

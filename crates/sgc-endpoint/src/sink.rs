@@ -8,9 +8,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use bytes::{Bytes, BytesMut};
+use sgc_sync::lock;
 use sgc_trust::{BatchVerifier, Freshness, OpenError, ReplayWindow, SourceKey, Suite, opened_bytes};
 use sgc_wire::{
     Decode, GRANT_SOURCES_MAX, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, Packet, PacketHeader,
@@ -161,7 +162,7 @@ pub struct SinkProgress {
 impl SinkProgress {
     /// Returns the greatest delivered number of the source; 0 before any, or if the sink does not know the source.
     pub fn newest(&self, source: &SourceId) -> u64 {
-        let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        let newest = lock(&self.newest);
         newest.get(source).map_or(0, |n| n.load(Acquire))
     }
 }
@@ -460,7 +461,7 @@ impl Sink {
     /// Lists the sources known by now.
     fn list_progress(&self) {
         let newest = self.sources.iter().map(|(id, s)| (*id, s.newest.clone())).collect();
-        *self.progress.newest.lock().unwrap_or_else(PoisonError::into_inner) = newest;
+        *lock(&self.progress.newest) = newest;
     }
 
     /// Drops a source that is no longer announced, if there are too many.

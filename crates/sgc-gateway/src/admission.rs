@@ -10,6 +10,7 @@ use std::time::Instant;
 
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
+use sgc_sync::lock;
 use sgc_trust::{AddressPrefix, PlaceDecision, PlaceLimits, Places, TrustAnchors, VerifiedPeer};
 use sgc_wire::UnixMillis;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
@@ -18,7 +19,6 @@ use crate::access::{Access, AdmissionRequest, Client, Credential, Denial};
 use crate::access_watch::AccessWatch;
 use crate::clock::WallClock;
 use crate::error::GatewayError;
-use crate::hub::lock;
 use crate::quota::Pool;
 
 /// Most connections of other hosts in their handshake at a time.

@@ -2,9 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use sgc_cdr::{Layout, Library, TypeError, TypeName};
+use sgc_sync::lock;
 
 use crate::error::GatewayError;
 use crate::offload::offload;
@@ -167,7 +168,7 @@ impl Types {
     }
 
     fn lock(&self) -> MutexGuard<'_, LayoutCache> {
-        self.known.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.known)
     }
 }
 

@@ -1,7 +1,7 @@
 //! [`Feed`]: a reader of a topic and its subscribers. Subscribers with the same requirements share one reader.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, MutexGuard, Weak};
 use std::time::Duration;
 
 use sgc_cdr::Layout;
@@ -9,6 +9,7 @@ use sgc_ros::{
     DiscoveredEndpoint, EndpointKind, EndpointSpec, Guid, HandleSamples, Sample, SampleKind, dds_topic,
     dds_type, reader_for, weakest,
 };
+use sgc_sync::lock;
 use sgc_wire::{Durability, History, Qos, Reliability};
 use tokio::time::Instant;
 
@@ -228,7 +229,7 @@ impl Feed {
     }
 
     fn outlets(&self) -> MutexGuard<'_, Outlets> {
-        self.outlets.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.outlets)
     }
 
     fn hand_out(&self, sample: Sample) {
@@ -326,7 +327,7 @@ impl Feed {
     /// Creates the reader, or recreates it if the offers have changed. May block.
     pub(crate) fn adapt(self: &Arc<Self>) -> Result<(), GatewayError> {
         let hub = self.hub.upgrade().ok_or(GatewayError::Stopping)?;
-        let mut reader = self.reader.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut reader = lock(&self.reader);
         let wanted = self.wanted(&hub.graph());
         {
             let mut outlets = self.outlets();
@@ -368,7 +369,7 @@ impl Feed {
         // A subscriber without room would hold up the reader's thread.
         let subscribers = std::mem::take(&mut self.outlets().subscribers);
         subscribers.iter().filter_map(|other| other.queue.upgrade()).for_each(|queue| queue.close());
-        let reader = self.reader.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let reader = lock(&self.reader).take();
         if let Some(((reader, _), hub)) = reader.zip(self.hub.upgrade()) {
             hub.forget(&[reader.guid()]);
         }

@@ -8,11 +8,11 @@ use std::pin::Pin;
 use std::sync::{Arc, Mutex, OnceLock};
 use std::task::{Context, Poll, ready};
 
+use sgc_sync::lock;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 
 use crate::budget::UNIT_BYTES;
 use crate::error::GatewayError;
-use crate::hub::lock;
 use crate::quota::{Permits, Quota};
 
 /// The bytes of unfinished messages of one connection.

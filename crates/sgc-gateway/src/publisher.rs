@@ -9,13 +9,14 @@ use std::time::Duration;
 use bytes::Bytes;
 use sgc_cdr::{Layout, Value};
 use sgc_ros::{EndpointKind, EndpointSpec, RosError, RosWriter, SampleHead, SampleKind, dds_topic, dds_type};
+use sgc_sync::lock;
 use sgc_wire::{History, Qos};
 use tokio::time::Instant;
 
 use crate::content::{Content, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
-use crate::hub::{HubState, lock};
+use crate::hub::HubState;
 use crate::quota::{Charge, PendingBytes, Quota};
 
 /// Time within which readers must acknowledge the last messages before the writer ends.

@@ -9,13 +9,13 @@
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, Weak};
+use std::sync::{Arc, Mutex, RwLock, RwLockReadGuard, Weak};
 
+use sgc_sync::{lock, read_lock, write_lock};
 use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 
 use crate::access::{Client, Credential};
 use crate::error::GatewayError;
-use crate::hub::lock;
 use crate::session::SessionLimits;
 
 /// Bound of one credential, in sessions.
@@ -274,7 +274,7 @@ struct Ledger {
 
 impl Ledger {
     fn pools(&self) -> RwLockReadGuard<'_, Pools> {
-        self.pools.read().unwrap_or_else(PoisonError::into_inner)
+        read_lock(&self.pools)
     }
 
     fn holdings(&self) -> Holdings {
@@ -348,7 +348,7 @@ impl Quota {
 
     /// Moves everything that the session holds to the credential of another client. An error changes nothing.
     pub(crate) fn move_to(&self, client: &Client, limits: &SessionLimits) -> Result<(), GatewayError> {
-        let mut pools = self.0.pools.write().unwrap_or_else(PoisonError::into_inner);
+        let mut pools = write_lock(&self.0.pools);
         let wanted = self.0.quotas.pools(client);
         let holdings = self.0.holdings();
         let is_in = |counts: &Arc<Counts>, of: &Pools| of.iter().any(|other| Arc::ptr_eq(counts, other));

@@ -11,12 +11,13 @@ use sgc_ros::{
     EndpointKind, EndpointSpec, RequestId, RosClient, RosError, RosServer, ServiceSpec, ServiceTopic,
     service_qos,
 };
+use sgc_sync::lock;
 use tokio::sync::{mpsc, oneshot};
 
 use crate::content::{Content, Form, convert, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
-use crate::hub::{HubState, lock};
+use crate::hub::HubState;
 use crate::quota::{Charge, Quota};
 
 /// Most replies that arrive before their request number is known.

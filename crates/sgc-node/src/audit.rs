@@ -17,12 +17,13 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use arc_swap::ArcSwap;
 use serde::{Deserialize, Serialize};
+use sgc_sync::lock;
 use sgc_wire::{Name, NodeId, UnixMillis};
 use tracing::warn;
 
@@ -303,10 +304,6 @@ impl AuditInner {
             }
         }
     }
-}
-
-fn lock(quotas: &Mutex<Quotas>) -> MutexGuard<'_, Quotas> {
-    quotas.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The writing thread.

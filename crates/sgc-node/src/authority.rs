@@ -8,11 +8,12 @@ use std::collections::{BTreeMap, VecDeque};
 use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
 use rand_core::{OsRng, TryRngCore};
+use sgc_sync::lock;
 use sgc_trust::{
     CertId, CrlReport, Fleet, FleetError, Grantees, ROSTER_NODES_MAX, TrustAnchors, VerifiedPeer,
     requested_key_hash, serial_of,
@@ -210,7 +211,7 @@ impl Authority {
         let (desk, own) = (self.desk.clone(), self.own);
         let seen = if batch.operations.is_empty() { BTreeMap::new() } else { self.seen.clone() };
         Some(move |now: Now| {
-            let mut desk = desk.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut desk = lock(&desk);
             let done = |job: OperationJob| job.carry_out(&desk.file, &own, &seen, now.unix);
             let operations = batch.operations.into_iter().map(done).collect();
             DeskAnswers { operations, renewals: desk.answer(batch.renewals, now) }
@@ -220,7 +221,7 @@ impl Authority {
     /// Returns a blocking job that records the revocations of these lists in the file.
     pub(crate) fn catch_up_job(&self, anchors: Arc<TrustAnchors>) -> impl FnOnce(Now) + Send + use<> {
         let desk = self.desk.clone();
-        move |now| desk.lock().unwrap_or_else(PoisonError::into_inner).catch_up(&anchors, now)
+        move |now| lock(&desk).catch_up(&anchors, now)
     }
 }
 

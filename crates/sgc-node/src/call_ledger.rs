@@ -2,11 +2,12 @@
 //! service whose server stays away has none. Callers are known by id; the reader finds their names.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Instant;
 
 use sgc_endpoint::{CallLoss, CallStats};
 use sgc_ros::Guid;
+use sgc_sync::lock;
 use sgc_wire::SourceId;
 use tracing::{debug, warn};
 
@@ -113,7 +114,7 @@ impl CallLedger {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 }
 

@@ -13,6 +13,7 @@ use sgc_endpoint::{
     ANSWER_KEPT_BYTES_MAX, Answerer, Answering, CallLimits, CallLoss, CallStats, Caller, Message, Outcome,
 };
 use sgc_ros::{Guid, HandleCalls, RequestId, RosClient, RosError, RosServer, UnhandledCall};
+use sgc_sync::lock;
 use sgc_wire::{MessageHead, MessageKind, SinkId, SourceId};
 use tokio::sync::Notify;
 use tracing::{debug, warn};
@@ -289,7 +290,7 @@ impl LocalService {
     }
 
     fn lock(&self) -> MutexGuard<'_, LocalServiceState> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 }
 
@@ -510,6 +511,6 @@ impl FarService {
     }
 
     fn lock(&self) -> MutexGuard<'_, FarServiceState> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 }

@@ -3,10 +3,11 @@
 //! Both directions need the type, which may become known after the first message. Until then the ends of the topic hold
 //! the messages (`pending.rs`). `sgc-cdr` defines the JSON (docs/spec/json.md).
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use bytes::Bytes;
 use sgc_cdr::{CdrVersion, DecodeError, Encoding, Layout, ValueError};
+use sgc_sync::lock;
 use sgc_wire::Representations;
 
 /// State of the search for a type.
@@ -59,7 +60,7 @@ impl TypeSlot {
     }
 
     fn lock(&self) -> MutexGuard<'_, KnownType> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 }
 

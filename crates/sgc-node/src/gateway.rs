@@ -8,7 +8,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, MutexGuard, PoisonError};
+use std::sync::{Arc, MutexGuard};
 
 use rustls::sign::CertifiedKey;
 use sgc_cdr::{Layout, TypeName};
@@ -17,6 +17,7 @@ use sgc_gateway::{
     Protocol, Server, ServerError, ServerOptions, Session, SessionLimits, TlsError, Types, certified_key,
 };
 use sgc_ros::RosError;
+use sgc_sync::lock;
 use sgc_trust::{Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
 use tokio::sync::{Mutex, OnceCell};
@@ -94,7 +95,7 @@ impl Gateway {
     }
 
     fn lock_open(&self) -> MutexGuard<'_, Option<OpenLocalRos>> {
-        self.open.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.open)
     }
 
     /// Returns the hub, and opens it first if needed.
@@ -167,7 +168,7 @@ impl Gateway {
     }
 
     fn lock_showing(&self) -> MutexGuard<'_, ()> {
-        self.showing.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.showing)
     }
 
     /// Returns the status, if there are sockets.
@@ -187,7 +188,7 @@ impl Gateway {
     }
 
     fn lock(&self) -> MutexGuard<'_, Option<Arc<Server>>> {
-        self.server.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.server)
     }
 
     /// Closes the sockets and leaves the local network.

@@ -6,11 +6,12 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
+use sgc_sync::lock;
 use sgc_transport::{AnyLink, CloseReason, DialError, Dialer, Link, LinkError, LinkUrl};
 use sgc_wire::{Control, LaneToken, Name, NodeId};
 use tokio::sync::oneshot;
@@ -53,7 +54,7 @@ impl LaneAdmission {
     /// Expects a lane. Returns `false` if too many are expected.
     fn expect(&self, token: LaneToken, name: Name, lanes: &Arc<Lanes>) -> bool {
         let now = Instant::now();
-        let mut expected = self.expected.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut expected = lock(&self.expected);
         expected.retain(|_, lane| lane.until > now);
         if expected.len() >= EXPECTED_MAX || expected.contains_key(&token) {
             return false;
@@ -73,7 +74,7 @@ impl LaneAdmission {
 
     /// Passes an incoming lane to its link. Closes a lane that is not expected, or that comes from another node.
     pub(crate) fn enter(&self, token: LaneToken, lane: AnyLink) {
-        let found = self.expected.lock().unwrap_or_else(PoisonError::into_inner).remove(&token);
+        let found = lock(&self.expected).remove(&token);
         let found = found.filter(|e| e.node == lane.peer().node_id && e.until > Instant::now());
         match found.and_then(|e| Some((e.lanes.upgrade()?, e.name))) {
             Some((lanes, name)) => lanes.attach(name, lane),
@@ -364,7 +365,7 @@ impl Lanes {
     }
 
     fn table(&self) -> MutexGuard<'_, Table> {
-        self.table.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.table)
     }
 }
 

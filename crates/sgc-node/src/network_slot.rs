@@ -1,8 +1,9 @@
 //! [`NetworkSlot`]: the local network of a node, which may be joined after the start and reopened.
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use sgc_ros::RosError;
+use sgc_sync::lock;
 
 /// Opens a network with the settings of the present one. May block.
 pub(crate) type OpenAgain<N> = Arc<dyn Fn() -> Result<Arc<N>, RosError> + Send + Sync>;
@@ -50,6 +51,6 @@ impl<N> NetworkSlot<N> {
     }
 
     fn lock(&self) -> MutexGuard<'_, Place<N>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 }

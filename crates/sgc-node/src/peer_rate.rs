@@ -5,9 +5,10 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use sgc_sync::lock;
 use sgc_wire::NodeId;
 use tracing::warn;
 
@@ -61,7 +62,7 @@ impl PeerRates {
 
     fn for_peer_at(&self, now: u64, peer: NodeId) -> Option<Arc<PeerRate>> {
         let limit = self.limit?;
-        let mut peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut peers = lock(&self.peers);
         peers.retain(|id, rate| {
             let stays = *id == peer || Arc::strong_count(rate) > 1 || !rate.is_paid(now);
             self.gone.fetch_add(if stays { 0 } else { rate.over().dropped }, Relaxed);
@@ -79,13 +80,13 @@ impl PeerRates {
 
     /// Returns the counts of delayed and dropped packets of a peer.
     pub(crate) fn over(&self, peer: &NodeId) -> Over {
-        let peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
+        let peers = lock(&self.peers);
         peers.get(peer).map(|rate| rate.over()).unwrap_or_default()
     }
 
     /// Returns the drops of all peers, and of each peer with a link.
     pub(crate) fn drops(&self) -> BTreeMap<String, u64> {
-        let peers = self.peers.lock().unwrap_or_else(PoisonError::into_inner);
+        let peers = lock(&self.peers);
         let (mut drops, mut all) = (BTreeMap::new(), self.gone.load(Relaxed));
         for (peer, rate) in peers.iter() {
             let dropped = rate.over().dropped;

@@ -5,8 +5,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
@@ -16,6 +16,7 @@ use rustls_pki_types::CertificateDer;
 use serde::Serialize;
 use sgc_gateway::Access;
 use sgc_ros::{Direction, ShareRule, UseRule};
+use sgc_sync::lock;
 use sgc_transport::CredentialStore;
 use sgc_trust::{Identity, Suite, TrustAnchors};
 use sgc_wire::{Kind, UnixMillis};
@@ -173,14 +174,14 @@ impl Reloader {
         }
         let mut rng = ChaCha20Rng::from_seed(seed);
         let tasks = discovery::start(&[], &new, &self.keeper, &self.board, None, &mut rng);
-        self.dialling.lock().unwrap_or_else(PoisonError::into_inner).extend(tasks);
+        lock(&self.dialling).extend(tasks);
         running.dialled.extend(new.iter().cloned());
         new
     }
 
     /// Removes and returns the tasks that dial routers of later tokens.
     pub(crate) fn take_dialling(&self) -> Vec<JoinHandle<()>> {
-        std::mem::take(&mut self.dialling.lock().unwrap_or_else(PoisonError::into_inner))
+        std::mem::take(&mut lock(&self.dialling))
     }
 
     /// Applies `config`.

@@ -1,8 +1,9 @@
 //! Answers to sinks that ask for missing messages: a bounded number at once, the others in turn.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
+use sgc_sync::lock;
 use sgc_wire::{Name, Recover, SinkId, SourceId};
 
 use crate::sources::LocalShare;
@@ -73,7 +74,7 @@ impl Replays {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 }
 

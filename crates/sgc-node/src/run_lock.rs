@@ -8,11 +8,12 @@ use std::fs;
 use std::io;
 use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use rustix::fs::{FlockOperation, OFlags, flock, major, minor};
 use rustix::io::Errno;
+use sgc_sync::lock;
 use sgc_wire::NodeId;
 use tokio::time::{Instant, sleep};
 use tracing::{info, warn};
@@ -67,8 +68,8 @@ impl RunLock {
         let deadline = Instant::now() + WAIT_MAX;
         let mut is_told = false;
         loop {
-            let taken = lock(identity, false).and_then(|identity| {
-                let state = state.as_deref().map_or(Ok(None), |state| lock(state, true))?;
+            let taken = lock_file(identity, false).and_then(|identity| {
+                let state = state.as_deref().map_or(Ok(None), |state| lock_file(state, true))?;
                 Ok(LockHandle { identity, _state: state })
             });
             match taken {
@@ -88,8 +89,8 @@ impl RunLock {
 
     /// Locks the identity file that replaced the previous one.
     pub(crate) fn follow(&self) {
-        match lock(&self.identity, false) {
-            Ok(file) => self.held.lock().unwrap_or_else(PoisonError::into_inner).identity = file,
+        match lock_file(&self.identity, false) {
+            Ok(file) => lock(&self.held).identity = file,
             Err(in_use) => warn!("the renewed identity is in use: {in_use}"),
         }
     }
@@ -97,7 +98,7 @@ impl RunLock {
 
 /// Locks a file and creates it if `makes`. Returns `None` if the file or file system does not allow it; then the other
 /// lock or the routers have to suffice.
-fn lock(path: &Path, makes: bool) -> Result<Option<fs::File>, IdentityInUse> {
+fn lock_file(path: &Path, makes: bool) -> Result<Option<fs::File>, IdentityInUse> {
     let mut options = fs::OpenOptions::new();
     options.read(true);
     if makes {

@@ -7,7 +7,7 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::num::NonZeroU64;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -18,6 +18,7 @@ use sgc_ros::{
     prefix_frames,
 };
 use sgc_router::LinkId;
+use sgc_sync::lock;
 use sgc_wire::{
     History, KEY_HASH_BYTES, Liveliness, MessageHead, MessageKind, Name, Packet, PayloadForm, SinkId,
     SourceId, TopicGrant,
@@ -297,13 +298,13 @@ impl LocalSink {
 
     /// Sets the limits of rate, bandwidth and age.
     pub(crate) fn set_shaping(&self, shaping: Shaping) {
-        *self.shaping.lock().unwrap_or_else(PoisonError::into_inner) = shaping;
+        *lock(&self.shaping) = shaping;
         self.writers.load().values().for_each(|writer| writer.set_shaping(shaping));
     }
 
     /// Returns the limits of rate, bandwidth and age.
     pub(crate) fn shaping(&self) -> Shaping {
-        *self.shaping.lock().unwrap_or_else(PoisonError::into_inner)
+        *lock(&self.shaping)
     }
 
     /// Sets the prefix of frame names in tf messages.
@@ -526,7 +527,7 @@ impl LocalSink {
     }
 
     fn lock(&self) -> std::sync::MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 }
 
@@ -801,7 +802,7 @@ impl WriterQueue {
             // Without it, the pauses of a burst overrun by as much as they are long.
             let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(TIMER_SLACK_NS));
             while runtime.block_on(task.queue.wait()) {
-                let mut take = task.take.lock().unwrap_or_else(PoisonError::into_inner);
+                let mut take = lock(&task.take);
                 let mut behind = None;
                 while let Some(message) = runtime.block_on(task.next(&mut behind, &drops)) {
                     let next = match behind.is_none() && task.queue.is_empty() {
@@ -816,7 +817,7 @@ impl WriterQueue {
             drop(in_thread);
             // Dropping the consumer drops a writer, which may block.
             let end: MessageConsumer = Box::new(|_, _| ());
-            drop(std::mem::replace(&mut *task.take.lock().unwrap_or_else(PoisonError::into_inner), end));
+            drop(std::mem::replace(&mut *lock(&task.take), end));
         })?;
         Ok(this)
     }
@@ -929,11 +930,11 @@ impl WriterQueue {
     /// Returns `None` if the publisher keeps nothing for late joiners.
     fn with_recent<T>(&self, look: impl FnOnce(&mut Recent) -> T) -> Option<T> {
         let recent = self.info.recent.as_ref()?;
-        Some(look(&mut recent.lock().unwrap_or_else(PoisonError::into_inner)))
+        Some(look(&mut lock(recent)))
     }
 
     fn shaper(&self) -> std::sync::MutexGuard<'_, Shaper> {
-        self.shaper.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.shaper)
     }
 
     /// Closes the queue. The thread ends after it is empty.
@@ -999,11 +1000,11 @@ impl Room {
     }
 
     fn spacing(&self) -> MutexGuard<'_, Spacing> {
-        self.spacing.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.spacing)
     }
 
     fn last(&self) -> MutexGuard<'_, Option<(Instant, i64)>> {
-        self.last.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.last)
     }
 }
 

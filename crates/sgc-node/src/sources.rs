@@ -16,6 +16,7 @@ use bytes::Bytes;
 use sgc_endpoint::{Compressor, Marks, PublishError, Source, SourceProgress};
 use sgc_ros::{Guid, HandleSamples, KeyHash, Sample, SampleKind, Shaping};
 use sgc_router::LinkId;
+use sgc_sync::lock;
 use sgc_transport::prompt::{self, WakeBatch};
 use sgc_wire::{
     MessageHead, MessageKind, Name, Packet, PayloadEncoding, PayloadForm, Recover, SinkId, SourceId,
@@ -430,7 +431,7 @@ impl LocalShare {
     /// Publishes a sample without shaping.
     fn publish_now(&self, sample: Sample) {
         let more = sample.more;
-        let mut inbox = self.inbox.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut inbox = lock(&self.inbox);
         self.publish_early(&mut inbox);
         if let Err(sample) = self.try_publish(sample, more, &mut inbox.open) {
             let reason = if self.awaits_type() { DataDrop::NoDefinition } else { DataDrop::Stale };
@@ -462,7 +463,7 @@ impl LocalShare {
         let (share, alive) = (self.clone(), self.alive.clone());
         self.runtime.spawn_blocking(move || {
             let _alive = alive;
-            let mut inbox = share.inbox.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut inbox = lock(&share.inbox);
             share.publish_early(&mut inbox);
             share.flush(&mut inbox);
         });
@@ -806,7 +807,7 @@ impl LocalShare {
             return false;
         }
         let map = self.map();
-        let mut marks = self.marks.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut marks = lock(&self.marks);
         marks.retain(|id, _| map.slot(id).is_some());
         let mut look = || {
             let mut busy = false;
@@ -893,10 +894,6 @@ async fn let_go(share: Weak<LocalShare>) {
 fn unix_ns() -> i64 {
     let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     unix.as_nanos().try_into().unwrap_or(i64::MAX)
-}
-
-fn lock<T>(source: &Mutex<T>) -> MutexGuard<'_, T> {
-    source.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

@@ -5,13 +5,14 @@
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use bytes::{Buf as _, Bytes};
 use sgc_cdr::Layout;
 use sgc_endpoint::{Decompressor, Message};
 use sgc_ros::{Sample, SampleKind};
+use sgc_sync::lock;
 use sgc_types::ResolvedType;
 use sgc_wire::{KEY_HASH_BYTES, MessageKind, PayloadEncoding, PayloadForm, Representations};
 use tokio::sync::Notify;
@@ -271,10 +272,6 @@ pub(crate) enum TapError {
     /// The local network refused.
     #[error("{0}")]
     Network(String),
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

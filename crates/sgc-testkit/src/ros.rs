@@ -6,7 +6,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::atomic::{AtomicI64, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use bytes::{BufMut, Bytes, BytesMut};
@@ -15,6 +15,7 @@ use sgc_ros::{
     RequestHandler, RequestId, RosClient, RosError, RosNetwork, RosServer, RosWriter, Sample, SampleHandler,
     SampleHead, SampleKind, ServiceSpec, ShownEndpoint,
 };
+use sgc_sync::lock;
 use sgc_wire::{History, Qos};
 
 /// Number of times that a request looks for its server before it fails.
@@ -158,13 +159,13 @@ impl FakeDomain {
     }
 
     fn lock(&self) -> MutexGuard<'_, DomainState> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 
     fn add(&self, network: &FakeRos, spec: &EndpointSpec, reader: Option<SampleHandler>) -> Guid {
         let reader = reader.map(|r| Arc::new(Mutex::new(r)));
         // Locked until the reader has the history, so that samples written meanwhile follow it and keep their order.
-        let handler = reader.as_ref().map(|r| r.lock().unwrap_or_else(PoisonError::into_inner));
+        let handler = reader.as_ref().map(|r| lock(r));
         let (guid, watchers, missed) = {
             let mut state = self.lock();
             state.next += 1;
@@ -211,7 +212,7 @@ impl FakeDomain {
             let state = self.lock();
             let Some(endpoint) = state.endpoints.get(&guid).map(|e| e.discovered.clone()) else { break };
             drop(state);
-            (watcher.lock().unwrap_or_else(PoisonError::into_inner))(DiscoveryEvent::Appeared(endpoint));
+            (lock(&watcher))(DiscoveryEvent::Appeared(endpoint));
         }
         guid
     }
@@ -231,7 +232,7 @@ impl FakeDomain {
         for watcher in watchers {
             let (participant, nodes) = (participant(network), nodes.clone());
             let event = DiscoveryEvent::Nodes { participant, nodes };
-            (watcher.lock().unwrap_or_else(PoisonError::into_inner))(event);
+            (lock(&watcher))(event);
         }
     }
 
@@ -242,7 +243,7 @@ impl FakeDomain {
             state.watchers_of(endpoint.network, endpoint.tagged)
         };
         for watcher in watchers {
-            (watcher.lock().unwrap_or_else(PoisonError::into_inner))(DiscoveryEvent::Vanished { guid });
+            (lock(&watcher))(DiscoveryEvent::Vanished { guid });
         }
     }
 }
@@ -477,7 +478,7 @@ impl FakeWriter {
                 .collect()
         };
         for reader in readers {
-            let mut reader = reader.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut reader = lock(&reader);
             if let Err(sample) = reader.handle_at_once(sample.clone()) {
                 reader.handle(sample);
             }

@@ -12,11 +12,12 @@ use std::future::{Future, poll_fn};
 use std::marker::PhantomData;
 use std::pin::{Pin, pin};
 use std::sync::atomic::{AtomicU8, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 use std::task::{Context, Poll, Wake, Waker, ready};
 use std::time::Instant;
 
 use quinn::{AsyncTimer, AsyncUdpSocket, Runtime, TokioRuntime};
+use sgc_sync::lock;
 use tokio::runtime::{EnterGuard, Handle};
 use tokio::time::{Sleep, sleep_until};
 
@@ -58,7 +59,7 @@ pub fn spawn(work: impl Future<Output = ()> + Send + 'static) {
 
 impl Task {
     fn work(&self) -> MutexGuard<'_, Option<Work>> {
-        self.work.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.work)
     }
 
     /// Returns `true` if the caller has to arrange the run.

@@ -5,10 +5,11 @@
 //! with an empty table. Refusals are not remembered. The table affects only the time spent.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 
 use aws_lc_rs::digest;
 use rustls_pki_types::CertificateDer;
+use sgc_sync::lock;
 use sgc_wire::UnixMillis;
 
 use crate::verify::VerifiedPeer;
@@ -74,7 +75,7 @@ impl KnownChains {
     }
 
     fn lock(&self) -> MutexGuard<'_, ChainTable> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 }
 

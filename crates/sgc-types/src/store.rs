@@ -4,9 +4,10 @@
 //! being decoded with.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use sgc_cdr::{Layout, TypeName};
+use sgc_sync::lock;
 
 use crate::ResolvedType;
 
@@ -125,7 +126,7 @@ impl TypeStore {
     }
 
     fn lock(&self) -> MutexGuard<'_, StoreState> {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.kept)
     }
 }
 

@@ -6,10 +6,11 @@
 mod support;
 
 use std::fs;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 
 use rustix::process::Signal;
 use serde_json::Value;
+use sgc_sync::lock;
 use sgc_testkit::netsim::Namespace;
 use support::{Peer, Running, eventually};
 
@@ -30,7 +31,7 @@ struct Lab {
 
 impl Lab {
     fn new(ros: &str) -> Self {
-        let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+        let turn = lock(&TURN);
         let made = Namespace::create(format!("sgcg-{}", std::process::id()));
         let namespace = support::namespaces(made, "using this host's network");
         let dir = tempfile::tempdir().unwrap();

@@ -13,9 +13,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use sgc_sync::lock;
 use sgc_trust::{AddressPrefix, Grantees, TrustAnchors, VerifiedPeer};
 use sgc_wire::{NodeId, UnixMillis};
 
@@ -441,7 +442,7 @@ impl Access {
     }
 
     fn attempts(&self) -> std::sync::MutexGuard<'_, Attempts> {
-        self.attempts.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.attempts)
     }
 }
 

@@ -2,8 +2,9 @@
 //! in one lane per subscription and may be dropped.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
+use sgc_sync::lock;
 use tokio::sync::Notify;
 use tokio_tungstenite::tungstenite::Message as Frame;
 
@@ -76,7 +77,7 @@ impl Outbox {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     /// Appends an answer even without room. The reader checks for room before it reads.

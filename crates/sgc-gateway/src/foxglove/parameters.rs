@@ -4,7 +4,7 @@
 //! A client may access the parameters of a node whose services it may call.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures_util::StreamExt;
@@ -12,6 +12,7 @@ use futures_util::stream;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
+use sgc_sync::lock;
 use tokio::time::Instant;
 
 use crate::access::Right;
@@ -206,7 +207,7 @@ impl Parameters {
             services.services.iter().filter(|(_, info)| info.type_name == LIST.1 && !info.servers.is_empty());
         let nodes = names.filter_map(|(name, _)| name.strip_suffix(LIST.0));
         let has_get = |node: &&str| services.services.contains_key(&full_service(node, GET.0));
-        let mut silent = self.silent.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut silent = lock(&self.silent);
         silent.retain(|_, since| since.elapsed() < SILENT_FOR);
         let may = |node: &&str| {
             self.may_get(node) && self.session.check(Right::Call, &full_service(node, LIST.0)).is_ok()
@@ -253,7 +254,7 @@ impl Parameters {
                         error,
                         Refusal::Gateway(GatewayError::Timeout { .. } | GatewayError::NoServer { .. })
                     ) {
-                        let mut silent = self.silent.lock().unwrap_or_else(PoisonError::into_inner);
+                        let mut silent = lock(&self.silent);
                         // A client can invent any number of nodes, so the table is bounded.
                         if silent.len() < NODES_MAX {
                             silent.insert(node.clone(), Instant::now());

@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 
 use aws_lc_rs::digest::{SHA256, digest};
+use sgc_sync::lock;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tonic::{Request, Status};
@@ -18,7 +19,7 @@ use crate::access_watch::AccessWatch;
 use crate::budget::Budget;
 use crate::error::GatewayError;
 use crate::feed::{Subscription, SubscriptionEnd};
-use crate::hub::{Hub, lock};
+use crate::hub::Hub;
 use crate::session::Session;
 
 /// Most credentials in use on one connection at a time.

@@ -7,13 +7,13 @@ use std::sync::{Arc, Mutex, Weak};
 use std::task::{Context, Poll};
 
 use futures_util::task::AtomicWaker;
+use sgc_sync::lock;
 use sgc_trust::VerifiedPeer;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tonic::transport::server::Connected;
 
 use super::client::GuestEntry;
 use crate::access::Client;
-use crate::hub::lock;
 
 /// A connection as its acceptor knows it. Clones share it.
 #[derive(Clone)]

@@ -8,6 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, ready};
 
 use bytes::Bytes;
+use sgc_sync::lock;
 use tonic::Status;
 
 use super::MESSAGE_BYTES_MAX;
@@ -15,7 +16,6 @@ use super::client::Guest;
 use super::fault::Fault;
 use crate::budget::{Budget, Room};
 use crate::error::GatewayError;
-use crate::hub::lock;
 
 /// Length of the head of each message: the compression flag and the length (gRPC over HTTP/2,
 /// Length-Prefixed-Message).

@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, ready};
 
 use bytes::Bytes;
+use sgc_sync::lock;
 use tokio::sync::mpsc;
 use tokio_stream::StreamExt as _;
 use tokio_stream::wrappers::ReceiverStream;
@@ -20,7 +21,6 @@ use super::incoming::{Incoming, KeptRooms};
 use super::proto::gateway_server::GatewayServer;
 use super::service::{Responses, Service};
 use crate::budget::Room;
-use crate::hub::lock;
 
 /// A slot in which a stream passes the room of its next message to the body.
 #[derive(Clone, Debug, Default)]

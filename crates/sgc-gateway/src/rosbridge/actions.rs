@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use futures_util::FutureExt as _;
 use serde_json::Value as Json;
+use sgc_sync::lock;
 use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinHandle;
 
@@ -19,7 +20,6 @@ use super::topics::fragment_id;
 use crate::action::{ActionEvent, ActionReplier, ActionServing, Feedback, Goal, GoalId, GoalStatus};
 use crate::content::{Content, Form};
 use crate::error::GatewayError;
-use crate::hub::lock;
 use crate::quota::ByteReservation;
 use crate::session::Session;
 

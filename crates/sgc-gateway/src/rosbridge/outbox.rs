@@ -6,10 +6,11 @@
 //! ones exceed the room.
 
 use std::sync::atomic::{AtomicU8, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures_util::{Sink, SinkExt as _};
+use sgc_sync::lock;
 use tokio::sync::{Mutex as Turns, MutexGuard as Turn, mpsc};
 use tokio::time::Instant;
 use tokio_tungstenite::tungstenite::{self, Message};
@@ -194,7 +195,7 @@ impl PingState {
     }
 
     fn lock(&self) -> std::sync::MutexGuard<'_, Option<Instant>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 }
 

@@ -6,13 +6,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use sgc_ros::RequestId;
+use sgc_sync::lock;
 use tokio::task::JoinHandle;
 
 use super::envelope::Envelope;
 use super::op::OpId;
 use super::outbox::{Level, Outbox};
 use crate::content::Form;
-use crate::hub::lock;
 use crate::service::{Replier, Serving};
 
 /// Most unanswered requests. Beyond that the oldest is given up.

@@ -2,9 +2,10 @@
 //! node of its own for the rest.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use sgc_ros::{EndpointKind, GraphNode, Guid, RosNetwork};
+use sgc_sync::lock;
 use sgc_wire::{Name, NodeId, RosNode, SourceId};
 use tracing::debug;
 
@@ -195,10 +196,6 @@ impl<N: RosNetwork> Core<N> {
             }
         });
     }
-}
-
-fn lock<T>(value: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
-    value.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

@@ -1,9 +1,10 @@
 //! State of the search for each router, for `sgc status`. It displays and decides nothing.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use serde::Serialize;
+use sgc_sync::lock;
 use sgc_transport::LinkUrl;
 use sgc_wire::NodeId;
 use tokio::time::Instant;
@@ -90,7 +91,7 @@ impl Board {
     }
 
     fn rows(&self) -> MutexGuard<'_, Rows> {
-        self.shared.rows.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.shared.rows)
     }
 }
 

@@ -3,8 +3,9 @@
 //! It decides nothing. A caller that finds a node claimed stands back.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
+use sgc_sync::lock;
 use sgc_wire::NodeId;
 use tokio::sync::watch;
 
@@ -65,7 +66,7 @@ impl Claims {
     }
 
     fn table(&self) -> MutexGuard<'_, Table> {
-        self.shared.table.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.shared.table)
     }
 }
 

@@ -6,10 +6,11 @@
 use std::collections::BTreeMap;
 use std::future::Future;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
+use sgc_sync::lock;
 use sgc_transport::{LinkUrl, Scheme};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
@@ -237,7 +238,7 @@ impl WorkingUrls {
     }
 
     fn worked(&self) -> MutexGuard<'_, BTreeMap<String, String>> {
-        self.worked.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.worked)
     }
 }
 
@@ -250,7 +251,7 @@ async fn keep_written(
     while asked.changed().await.is_ok() {
         let (path, worked) = (path.clone(), worked.clone());
         let write = move || {
-            let known = worked.lock().unwrap_or_else(PoisonError::into_inner).clone();
+            let known = lock(&worked).clone();
             let text: String = known.iter().map(|(best, url)| format!("{best} {url}\n")).collect();
             match state::replace(&path, text.as_bytes()) {
                 Ok(()) => debug!(path = %path.display(), "saved the URLs of routers that work"),

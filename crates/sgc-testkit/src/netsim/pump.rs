@@ -6,11 +6,12 @@ use std::io;
 use std::num::NonZeroU64;
 use std::os::fd::{AsFd, OwnedFd};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
+use sgc_sync::lock;
 
 use super::channel::{Channel, Counters, Profile};
 
@@ -61,7 +62,7 @@ struct PumpState<P> {
 
 impl<P> PumpState<P> {
     fn channels(&self) -> MutexGuard<'_, [Channel<P>; 2]> {
-        self.channels.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.channels)
     }
 
     fn wake(&self) {

@@ -5,8 +5,9 @@
 //! piece by piece. The gate knows no clock and no socket.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
+use sgc_sync::lock;
 use sgc_wire::Class;
 use tokio::sync::oneshot;
 
@@ -128,7 +129,7 @@ impl Gate {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 }
 

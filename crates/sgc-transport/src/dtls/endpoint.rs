@@ -2,9 +2,10 @@
 
 use std::io;
 use std::net::SocketAddr;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use quinn::{Connection, Endpoint};
+use sgc_sync::lock;
 use sgc_trust::VerifiedPeer;
 use tokio::sync::watch;
 use tokio::time::timeout;
@@ -150,7 +151,7 @@ impl DtlsDialer {
         }
         let link = quic::greet(connection, parts, greeting, &self.shared.options).await?;
         link.end_with(async move { wait_for_end(&mut progress).await });
-        let mut links = self.links.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut links = lock(&self.links);
         links.retain(|link| link.endpoint.open_connections() > 0);
         links.push(attempt.0.clone());
         // Dropping the attempt cleans up at the end of the link.
@@ -159,7 +160,7 @@ impl DtlsDialer {
 
     /// Moves every link to a fresh socket.
     pub(crate) fn rebind(&self) -> io::Result<()> {
-        let mut links = self.links.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut links = lock(&self.links);
         links.retain(|link| link.endpoint.open_connections() > 0);
         for link in links.iter() {
             let (io, _) = socket::bind(socket::any_like(link.remote), &self.shared.options)?;
@@ -169,7 +170,7 @@ impl DtlsDialer {
     }
 
     pub(crate) async fn close(&self, reason: &CloseReason) {
-        let links = std::mem::take(&mut *self.links.lock().unwrap_or_else(PoisonError::into_inner));
+        let links = std::mem::take(&mut *lock(&self.links));
         let (code, text) = reason.to_wire();
         for link in &links {
             link.endpoint.close(quinn::VarInt::from_u32(code), text.as_bytes());

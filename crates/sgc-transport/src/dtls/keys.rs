@@ -4,20 +4,21 @@
 use std::collections::HashMap;
 use std::panic::AssertUnwindSafe;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
-use std::sync::{Arc, LazyLock, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, LazyLock, Mutex, MutexGuard};
 
 use dimpl::DtlsCertificate;
 use dimpl::crypto::{Buf, HashAlgorithm, KeyProvider, SignatureAlgorithm, SigningKey};
 use dimpl::{CryptoError, CryptoOperation};
 use rustls::SignatureScheme;
 use rustls::sign::CertifiedKey;
+use sgc_sync::lock;
 use sgc_wire::CERT_BYTES_MAX;
 
 static NEXT: AtomicU64 = AtomicU64::new(0);
 static LENT: LazyLock<Mutex<HashMap<u64, Arc<CertifiedKey>>>> = LazyLock::new(Mutex::default);
 
 fn lent() -> MutexGuard<'static, HashMap<u64, Arc<CertifiedKey>>> {
-    LENT.lock().unwrap_or_else(PoisonError::into_inner)
+    lock(&LENT)
 }
 
 /// A registered signing key, for as long as this lives.

@@ -13,13 +13,14 @@ use std::net::{IpAddr, SocketAddr};
 use std::ops::Range;
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, Weak};
 use std::task::{Context, Poll, ready};
 use std::time::{Duration, Instant};
 
 use aws_lc_rs::{constant_time, hmac, rand};
 use quinn::udp::{EcnCodepoint, RecvMeta, Transmit};
 use quinn::{AsyncUdpSocket, UdpPoller};
+use sgc_sync::lock;
 use sgc_trust::{AddressPrefix, VerifiedPeer};
 use tokio::sync::{Notify, mpsc, watch};
 
@@ -137,10 +138,6 @@ pub(super) enum Progress {
     Connecting,
     Up(Box<VerifiedPeer>),
     Ended(LinkError),
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn random<const N: usize>() -> [u8; N] {

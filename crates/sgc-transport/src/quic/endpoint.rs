@@ -6,12 +6,13 @@
 
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use quinn::crypto::rustls::HandshakeData;
 use quinn::{AsyncUdpSocket, Connecting, Connection, ConnectionError, Endpoint, Incoming, VarInt};
 use rustls::NamedGroup;
+use sgc_sync::lock;
 use sgc_trust::CertError;
 use sgc_wire::{Decode, DecodeError, Encode};
 use tokio::task::{AbortHandle, JoinSet};
@@ -278,8 +279,7 @@ impl QuicDialer {
     }
 
     pub(crate) async fn close(&self, reason: &CloseReason) {
-        let Endpoints { v4, v6 } =
-            std::mem::take(&mut *self.endpoints.lock().unwrap_or_else(PoisonError::into_inner));
+        let Endpoints { v4, v6 } = std::mem::take(&mut *lock(&self.endpoints));
         for endpoint in [v4, v6].into_iter().flatten() {
             shut(&endpoint, reason).await;
         }
@@ -295,7 +295,7 @@ impl QuicDialer {
     }
 
     fn endpoint(&self, remote: SocketAddr) -> Result<Endpoint, LinkError> {
-        let mut endpoints = self.endpoints.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut endpoints = lock(&self.endpoints);
         let slot = match remote {
             SocketAddr::V4(_) => &mut endpoints.v4,
             SocketAddr::V6(_) => &mut endpoints.v6,
@@ -311,7 +311,7 @@ impl QuicDialer {
 
     /// Moves every link to a fresh socket, so that it leaves by the interface that the system would choose now.
     pub(crate) fn rebind(&self) -> std::io::Result<()> {
-        let endpoints = self.endpoints.lock().unwrap_or_else(PoisonError::into_inner);
+        let endpoints = lock(&self.endpoints);
         for endpoint in [&endpoints.v4, &endpoints.v6].into_iter().flatten() {
             let (socket, _) = socket::bind(socket::any_like(endpoint.local_addr()?), &self.options)?;
             endpoint.rebind_abstract(socket)?;

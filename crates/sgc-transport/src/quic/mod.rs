@@ -17,7 +17,7 @@ use std::fmt;
 use std::future::{Future as _, poll_fn};
 use std::net::SocketAddr;
 use std::pin::pin;
-use std::sync::{Arc, OnceLock, PoisonError};
+use std::sync::{Arc, OnceLock};
 use std::task::Poll;
 use std::time::Duration;
 
@@ -26,6 +26,7 @@ use quinn::{
     Connection, ConnectionError, ReadError, RecvStream, SendDatagramError, SendStream, StoppedError, VarInt,
     WriteError,
 };
+use sgc_sync::lock;
 use sgc_trust::VerifiedPeer;
 use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet, Slab};
 use tokio::sync::Mutex;
@@ -411,7 +412,7 @@ impl Link for QuicLink {
             },
         };
         permit.written(bytes);
-        let datagram = datagram(packet, label, &mut datagrams.lock().unwrap_or_else(PoisonError::into_inner));
+        let datagram = datagram(packet, label, &mut lock(datagrams));
         connection.send_datagram_wait(datagram).await.map_err(|e| match e {
             SendDatagramError::ConnectionLost(e) => fate.explain(&e),
             // The path may have narrowed in between.

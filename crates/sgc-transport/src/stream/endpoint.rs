@@ -5,9 +5,10 @@
 use std::io::{self, Write as _};
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::sync::{Arc, Mutex, Weak};
 use std::time::{Duration, Instant};
 
+use sgc_sync::lock;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::{sleep, timeout};
@@ -266,7 +267,7 @@ impl Links {
         options: &LinkOptions,
     ) -> StreamLink {
         let (link, shared) = start(made, remote, is_dialer, options);
-        let mut all = self.all.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut all = lock(&self.all);
         if all.len() == all.capacity() {
             all.retain(|link| link.strong_count() > 0);
         }
@@ -276,7 +277,7 @@ impl Links {
 
     /// Closes all links, and gives their peers a while to hear of it.
     async fn close(&self, reason: &CloseReason) {
-        let all = std::mem::take(&mut *self.all.lock().unwrap_or_else(PoisonError::into_inner));
+        let all = std::mem::take(&mut *lock(&self.all));
         let all: Vec<_> = all.iter().filter_map(Weak::upgrade).collect();
         for link in &all {
             link.close(reason, LinkError::Closed { by_peer: false, reason: reason.clone() });

@@ -41,11 +41,12 @@ use std::fmt;
 use std::future::poll_fn;
 use std::net::SocketAddr;
 use std::pin::pin;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::task::{Poll, Waker};
 use std::time::Instant;
 
 use bytes::Bytes;
+use sgc_sync::lock;
 use sgc_trust::VerifiedPeer;
 use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet, Slab};
 use tokio::sync::{Notify, futures::Notified};
@@ -151,7 +152,7 @@ impl LinkInner {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     /// Runs an action that may give the task bytes to write.

@@ -7,11 +7,12 @@ use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use clap::Args;
 use sgc_dds::CycloneNetwork;
+use sgc_sync::lock;
 use sgc_trust::Suite;
 
 use super::echo::Echo;
@@ -195,8 +196,7 @@ impl AnswerSide {
             Ask::Echo => self.open_echo(&id),
             Ask::Direct => self.open_direct(),
             Ask::Count { phase } => {
-                let mut counted =
-                    self.tally.lock().unwrap_or_else(PoisonError::into_inner).stream_count(phase);
+                let mut counted = lock(&self.tally).stream_count(phase);
                 counted.node_cpu_us = cpu_us(self.side.process()).unwrap_or(0);
                 Reply::Counted(counted)
             }
@@ -252,7 +252,7 @@ impl AnswerSide {
                 Err(error) => return refused(error.to_string()),
             }
         }
-        *self.tally.lock().unwrap_or_else(PoisonError::into_inner) = Tally::default();
+        *lock(&self.tally) = Tally::default();
         self.run = Some(Run {
             id: id.clone(),
             has_begun: false,

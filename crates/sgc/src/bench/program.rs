@@ -4,11 +4,12 @@
 //! reading thread. Everything else goes to the measurement as an [`Event`].
 
 use std::sync::mpsc::SyncSender;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use sgc_dds::{CycloneNetwork, CycloneReader, CycloneWriter};
 use sgc_ros::{EndpointSpec, RosError, RosNetwork, RosWriter, Sample, SampleKind, dds_topic, dds_type};
+use sgc_sync::lock;
 use sgc_wire::{History, Qos};
 
 use super::Event;
@@ -99,7 +100,7 @@ impl End {
                 let answer = match frame.kind {
                     Kind::Ping => Frame { kind: Kind::Pong, ..frame },
                     Kind::Stream | Kind::Marked => {
-                        tally.lock().unwrap_or_else(PoisonError::into_inner).count(&frame, now);
+                        lock(&tally).count(&frame, now);
                         if frame.kind == Kind::Stream {
                             return;
                         }

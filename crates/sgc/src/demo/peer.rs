@@ -6,7 +6,7 @@
 use std::io::{BufRead, Write};
 use std::process;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -14,6 +14,7 @@ use clap::Args;
 use rustix::time::{ClockId, clock_gettime};
 use sgc_dds::{CycloneNetwork, DdsConfig, DiscoveryRange};
 use sgc_ros::{RosError, RosNetwork, RosWriter, Sample, SampleKind};
+use sgc_sync::lock;
 
 use super::messages::{self, Draft};
 use super::protocol::{PeerCommand, PeerEvent};
@@ -102,7 +103,7 @@ impl Events {
     fn tell(&self, event: &PeerEvent) {
         let Ok(mut line) = serde_json::to_vec(event) else { return };
         line.push(b'\n');
-        let _whole_lines = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let _whole_lines = lock(&self.0);
         let mut out = std::io::stdout().lock();
         if out.write_all(&line).and_then(|()| out.flush()).is_err() {
             // The demo is gone, so there is nothing left to do.
@@ -187,7 +188,7 @@ impl<R> Listener<R> {
                 Box::new(move |sample: Sample| {
                     let now_ns = monotonic_ns();
                     let message = messages::decode(topic, &sample.payload);
-                    let mut tracker = tracker.lock().unwrap_or_else(PoisonError::into_inner);
+                    let mut tracker = lock(&tracker);
                     tracker.handle(message, now_ns);
                     if !arrived && tracker.is_alive() {
                         arrived = true;
@@ -201,7 +202,7 @@ impl<R> Listener<R> {
         thread::spawn(move || {
             let mut told = None;
             while let Err(RecvTimeoutError::Timeout) = ended.recv_timeout(REPORT_PERIOD) {
-                let counts = tracker.lock().unwrap_or_else(PoisonError::into_inner).counts();
+                let counts = lock(&tracker).counts();
                 if told.as_ref() != Some(&counts) {
                     events.tell(&PeerEvent::Receiving { topic, counts: counts.clone() });
                     told = Some(counts);

@@ -8,10 +8,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus};
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 
 use rustix::process::Signal;
 use serde_json::Value;
+use sgc_sync::lock;
 use sgc_testkit::netsim::{Namespace, NetsimError};
 use tempfile::TempDir;
 
@@ -102,7 +103,7 @@ impl Lab {
 
     /// The same before the nodes are started.
     pub(crate) fn silent(plan: Plan, [robot, desk]: [String; 2]) -> Self {
-        let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+        let turn = lock(&TURN);
         let number = LABS.fetch_add(1, Ordering::Relaxed);
         let made = make_namespaces(&format!("{}-{}-{number}", plan.name, std::process::id()));
         let namespaces = support::namespaces(made, "using two ROS domains of this host instead");

@@ -17,13 +17,14 @@ mod real;
 #[path = "../support/mod.rs"]
 mod support;
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use flow::{Flow, TOPICS};
 use lab::{Lab, Lan, Nat, RANGES, schemes};
 use node::Node;
+use sgc_sync::lock;
 use sgc_testkit::FakeDomain;
 use sgc_testkit::netsim::{Loss, Profile, TunOptions, on_host};
 use support::{eventually, say};
@@ -43,7 +44,7 @@ fn is_long() -> bool {
 }
 
 fn turn() -> MutexGuard<'static, ()> {
-    TURN.lock().unwrap_or_else(PoisonError::into_inner)
+    lock(&TURN)
 }
 
 /// A robot and a desk that talk by one transport.
