@@ -10,7 +10,6 @@ use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
 use sgc_router::LinkId;
 use sgc_transport::{
     AnyLink, CloseReason, CredentialStore, FlowEnd, FlowError, FlowRx, Link, LinkError, LinkUrl, Listener,
-    prompt,
 };
 use sgc_wire::{Control, Decode, DecodeError, Encode, Name, Packet};
 use tokio::sync::{mpsc, oneshot, watch};
@@ -585,7 +584,7 @@ impl Inflow {
                     // A single packet on an idle flow is forwarded right here, since the tasks that it wakes have no
                     // other work.
                     PacketAdmission::Granted if flow.is_at_rest() && packet.header.fragments() == 1 => {
-                        prompt::poll_at_hand(data.forward(id, packet)).await;
+                        sgc_executor::poll_at_hand(data.forward(id, packet)).await;
                     }
                     PacketAdmission::Granted => data.forward(id, packet).await,
                     PacketAdmission::OverRate if packet.header.fragments() == 1 => {}

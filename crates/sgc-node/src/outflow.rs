@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use sgc_transport::{AnyLink, FlowEnd, FlowTx, Link, LinkError, prompt};
+use sgc_transport::{AnyLink, FlowEnd, FlowTx, Link, LinkError};
 use sgc_wire::{Label, Name, Packet, SourceId};
 use tokio::sync::watch;
 use tracing::debug;
@@ -78,7 +78,7 @@ impl OutFlow {
             ended: watch::Sender::new(false),
         });
         let task = flow.clone();
-        prompt::spawn(async move {
+        sgc_executor::spawn(async move {
             let mut sender = Sender {
                 by: link.clone(),
                 lane: None,

@@ -14,10 +14,10 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use arc_swap::ArcSwap;
 use bytes::Bytes;
 use sgc_endpoint::{Compressor, Marks, PublishError, Source, SourceProgress};
+use sgc_executor::WakeBatch;
 use sgc_ros::{Guid, HandleSamples, KeyHash, Sample, SampleKind, Shaping};
 use sgc_router::LinkId;
 use sgc_sync::lock;
-use sgc_transport::prompt::{self, WakeBatch};
 use sgc_wire::{
     MessageHead, MessageKind, Name, Packet, PayloadEncoding, PayloadForm, Recover, SinkId, SourceId,
     TopicGrant,
@@ -707,7 +707,7 @@ impl LocalShare {
         move |packet| {
             if wanted && !self.closed.load(Relaxed) {
                 // The future is passed by reference, since tokio boxes large futures.
-                prompt::block_on(&self.runtime, pin!(self.data.forward(LinkId::LOCAL, packet)));
+                sgc_executor::block_on(&self.runtime, pin!(self.data.forward(LinkId::LOCAL, packet)));
             }
         }
     }

@@ -17,8 +17,8 @@ use crate::error::{CloseReason, DialError, LinkError, ProtocolError, Refusal};
 use crate::framing::Greeting;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
-use crate::prompt::PromptRuntime;
 use crate::quic::{self, Flavor, Parts, QuicLink, QuicListener};
+use crate::quinn_runtime::PromptRuntime;
 use crate::url::LinkUrl;
 use crate::{race, socket};
 

@@ -32,7 +32,7 @@ use crate::handshakes::{Entry, Handshakes, Holder};
 use crate::link::KeyExchange;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
-use crate::prompt::PromptRuntime;
+use crate::quinn_runtime::PromptRuntime;
 use crate::race;
 use crate::socket;
 use crate::tls::Findings;

@@ -22,7 +22,6 @@ use crate::framing::Greeting;
 use crate::handshakes::{Entry, Handshakes, Holder};
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
-use crate::prompt;
 use crate::race;
 use crate::url::{LinkUrl, ListenAddr, Scheme};
 
@@ -247,7 +246,7 @@ pub(super) fn start(
     let EstablishedStream { wire, counters, peer, lane, rtt, key_exchange, mtu_bytes } = made;
     let shared = LinkInner::new(options, counters);
     shared.lock().mux.note_handshake(rtt);
-    prompt::spawn(run(wire, Arc::clone(&shared), options.idle_timeout));
+    sgc_executor::spawn(run(wire, Arc::clone(&shared), options.idle_timeout));
     let about = LinkInfo { remote, is_dialer, lane, key_exchange, mtu_bytes };
     (StreamLink::new(Arc::clone(&shared), peer, about), shared)
 }

@@ -4,6 +4,7 @@
 //! machine that takes longer than all the work. Within a [`WakeBatch`] the thread itself runs the tasks that it woke,
 //! at the end. Any other waker has the runtime run the task as usual. A task never runs twice at once; a wake-up while
 //! it runs makes it run again. This module decides nothing about the tasks' work and makes no threads.
+#![forbid(unsafe_code)]
 
 use std::cell::RefCell;
 use std::collections::VecDeque;
@@ -13,13 +14,10 @@ use std::marker::PhantomData;
 use std::pin::{Pin, pin};
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
-use std::task::{Context, Poll, Wake, Waker, ready};
-use std::time::Instant;
+use std::task::{Context, Poll, Wake, Waker};
 
-use quinn::{AsyncTimer, AsyncUdpSocket, Runtime, TokioRuntime};
 use sgc_sync::lock;
 use tokio::runtime::{EnterGuard, Handle};
-use tokio::time::{Sleep, sleep_until};
 
 /// Most runs of tasks in one batch; the runtime runs the rest. A task that wakes itself must not keep the thread for
 /// ever.
@@ -236,66 +234,13 @@ fn hand_over(tasks: Option<VecDeque<Arc<Task>>>) {
     }
 }
 
-/// Tokio for quinn, with tasks that the waking thread may run.
-#[derive(Debug)]
-pub(crate) struct PromptRuntime;
-
-impl Runtime for PromptRuntime {
-    fn new_timer(&self, at: Instant) -> Pin<Box<dyn AsyncTimer>> {
-        Box::pin(Timer { at, sleep: Box::pin(sleep_until(at.into())) })
-    }
-
-    fn spawn(&self, future: Work) {
-        spawn(future);
-    }
-
-    fn wrap_udp_socket(
-        &self,
-        socket: std::net::UdpSocket,
-    ) -> std::io::Result<std::sync::Arc<dyn AsyncUdpSocket>> {
-        TokioRuntime.wrap_udp_socket(socket)
-    }
-
-    fn now(&self) -> Instant {
-        TokioRuntime.now()
-    }
-}
-
-/// A timer that is postponed without telling the runtime: a connection postpones it with each packet, and an earlier
-/// time would wake a thread of the runtime.
-#[derive(Debug)]
-struct Timer {
-    at: Instant,
-    sleep: Pin<Box<Sleep>>,
-}
-
-impl AsyncTimer for Timer {
-    fn reset(mut self: Pin<&mut Self>, at: Instant) {
-        self.at = at;
-        if self.sleep.deadline() > at.into() {
-            self.sleep.as_mut().reset(at.into());
-        }
-    }
-
-    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<()> {
-        loop {
-            ready!(Future::poll(self.sleep.as_mut(), cx));
-            let at = self.at.into();
-            if self.sleep.deadline() >= at {
-                return Poll::Ready(());
-            }
-            self.sleep.as_mut().reset(at);
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use std::future::poll_fn;
     use std::sync::Weak;
     use std::sync::atomic::AtomicUsize;
     use std::thread;
-    use std::time::Duration;
+    use std::time::{Duration, Instant};
 
     use tokio::sync::{Notify, oneshot};
     use tokio::time::timeout;
@@ -429,19 +374,5 @@ mod tests {
         assert!(weak.upgrade().is_some_and(|held| held.0.lock().unwrap().is_some()));
         drop(runtime);
         assert!(weak.upgrade().is_none());
-    }
-
-    #[tokio::test]
-    async fn a_timer_rings_when_it_was_last_set_to() {
-        let begun = Instant::now();
-        let after = |ms| begun + Duration::from_millis(ms);
-        let mut late = PromptRuntime.new_timer(after(10));
-        late.as_mut().reset(after(60));
-        let mut early = PromptRuntime.new_timer(after(600_000));
-        early.as_mut().reset(after(30));
-        for (timer, ms) in [(&mut early, 30), (&mut late, 60)] {
-            timeout(PATIENCE, poll_fn(|cx| timer.as_mut().poll(cx))).await.unwrap();
-            assert!(begun.elapsed() >= Duration::from_millis(ms));
-        }
     }
 }
