@@ -1,12 +1,13 @@
 //! The fleets and identities of all tests, made once per process and the same in every process.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 use std::time::Duration;
 
 use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
+use sgc_sync::lock;
 use sgc_trust::{EnrollRequest, Fleet, Identity, Revocation, TrustAnchors};
 use sgc_wire::UnixMillis;
 
@@ -72,7 +73,7 @@ impl Cast {
 
 fn cast() -> MutexGuard<'static, Cast> {
     static CAST: OnceLock<Mutex<Cast>> = OnceLock::new();
-    CAST.get_or_init(Mutex::default).lock().unwrap_or_else(PoisonError::into_inner)
+    lock(CAST.get_or_init(Mutex::default))
 }
 
 /// Returns the identity of a member, which is the same on every call.

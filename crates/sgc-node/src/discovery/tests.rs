@@ -373,17 +373,22 @@ async fn a_set_whose_router_has_a_link_already_stands_back_until_that_ends() {
     task.abort();
 }
 
-#[tokio::test(start_paused = true)]
-async fn many_announcements_lead_to_two_links_and_at_most_four_dials() {
-    let world = World::new();
+/// Keeps links to the routers that the returned channel announces.
+fn keep_announced_links(world: &World) -> (mpsc::Sender<Sighting>, JoinHandle<()>) {
     let (tell, heard) = mpsc::channel(64);
-    let board = Board::default();
-    let keeper = world.clone();
+    let (board, keeper) = (Board::default(), world.clone());
     let task = tokio::spawn(async move {
         let row = board.row("mdns://", "mdns");
         let wanted = RouterFilter { written: "mdns://".into(), nodes: None };
         mdns::keep_links(heard, wanted, keeper, &board, &row, ChaCha20Rng::seed_from_u64(1)).await;
     });
+    (tell, task)
+}
+
+#[tokio::test(start_paused = true)]
+async fn many_announcements_lead_to_two_links_and_at_most_four_dials() {
+    let world = World::new();
+    let (tell, task) = keep_announced_links(&world);
     let ip = |n: u8| format!("10.0.0.{n}");
     for n in 1..=20u8 {
         // Most announcements are false.
@@ -414,14 +419,7 @@ async fn many_announcements_lead_to_two_links_and_at_most_four_dials() {
 #[tokio::test(start_paused = true)]
 async fn a_router_that_is_reached_otherwise_is_dialled_again_when_it_no_longer_is() {
     let world = World::new();
-    let (tell, heard) = mpsc::channel(64);
-    let board = Board::default();
-    let keeper = world.clone();
-    let task = tokio::spawn(async move {
-        let row = board.row("mdns://", "mdns");
-        let wanted = RouterFilter { written: "mdns://".into(), nodes: None };
-        mdns::keep_links(heard, wanted, keeper, &board, &row, ChaCha20Rng::seed_from_u64(1)).await;
-    });
+    let (tell, task) = keep_announced_links(&world);
     world.set("10.0.0.1", Host::Reached(50 * SECOND));
     let addresses = vec![SocketAddr::from(([10, 0, 0, 1], 7447))];
     tell.send(Sighting::Announced { instance: "a".into(), addresses }).await.unwrap();

@@ -125,11 +125,8 @@ fn a_wrong_target_or_test_is_found() {
         ("crates/one/tests/y/main.rs", ""),
         ("crates/one/tests/y/part.rs", "#[tokio::test]\nasync fn it_runs() {}\n"),
     ]);
-    let faults = |text: &str| {
-        let mut report = Report::default();
-        check(&repository, &Document::new("page.md", text), &mut report);
-        report.faults()
-    };
+    let faults =
+        |text: &str| Report::faults_of(|report| check(&repository, &Document::new("page.md", text), report));
     for right in [
         "`make test`, `make test ARGS=\"a b\"`, `A_B=1 make lint`, `make TARGET`, `make …`",
         "`cargo test -p one`, `cargo test --release -p one --test x it_works -- --nocapture`",

@@ -155,11 +155,7 @@ fn is_flag(text: &str) -> bool {
 
 #[test]
 fn a_wrong_command_line_is_found_in_each_form() {
-    let faults = |text: &str| {
-        let mut report = Report::default();
-        check(&Document::new("page.md", text), &mut report);
-        report.faults()
-    };
+    let faults = |text: &str| Report::faults_of(|report| check(&Document::new("page.md", text), report));
     for right in [
         "`sgc`, `sgc why`, `sgc fleet`, `sgc fleet revoke`, `sgc why --name HEX`, `sgc fleet … --at`, `sgc run --identity`, `sgc use …`",
         "`sgc run --help`, `sgc COMMAND --help`, `/usr/bin/sgc why`, `--at NODE` of `sgc fleet revoke`, `sgc fleet … --allow-core-dumps`, `--force`, `--nocapture`, `sgc join v1`, `sgc audit --since TIME`",

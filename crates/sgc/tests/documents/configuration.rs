@@ -11,7 +11,7 @@ use crate::markdown::{Document, Paragraph};
 use crate::report::Report;
 use crate::repository::REPOSITORY;
 
-/// What a whole file has, for parts that lack it: a name, and routers or a place to listen.
+/// Lines of a complete file, for parts that lack them: a name, and routers or a place to listen.
 const NODES: [&str; 4] = [
     "",
     "[node]\nname = 'part'\nrouters = ['quic://router.example']\n",
@@ -135,11 +135,7 @@ fn is_key(text: &str) -> bool {
 
 #[test]
 fn a_wrong_configuration_is_found_in_each_form() {
-    let faults = |text: &str| {
-        let mut report = Report::default();
-        check(&Document::new("page.md", text), &mut report);
-        report.faults()
-    };
+    let faults = |text: &str| Report::faults_of(|report| check(&Document::new("page.md", text), report));
     for right in [
         "```toml\n[node]\nname = \"a\"\nrouters = [\"quic://b\"]\n\n[[share]]\ntopic = \"/a\"\nto = [\"b\"]\n```",
         "```toml\n[[share]]\ntopic = \"/a\"\nto = [\"b\"]\n```",

@@ -198,11 +198,7 @@ fn page() -> String {
 
 #[test]
 fn a_wrong_counter_is_found_in_each_form() {
-    let faults = |text: &str| {
-        let mut report = Report::default();
-        check(&Document::new("page.md", text), &mut report);
-        report.faults()
-    };
+    let faults = |text: &str| Report::faults_of(|report| check(&Document::new("page.md", text), report));
     for right in [
         "counted (`crl_flood`), counted as `thinned`, `sink_replayed`, `link_state`, `sink_…`, `max_rate`",
         "| where | keys |\n|---|---|\n| `another_name` | **`stale`**, `limit` (`peer_rate`) |\n\n`another_name`",

@@ -107,7 +107,7 @@ impl Document {
         let mut links = Vec::new();
         for paragraph in self.paragraphs() {
             let mut text = paragraph.text.clone();
-            // What stands in code is no link. Bytes keep their places.
+            // Code contains no links. Bytes keep their places.
             for span in paragraph.spans() {
                 text.replace_range(span.place.clone(), &"`".repeat(span.place.len()));
             }

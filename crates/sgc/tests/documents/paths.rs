@@ -196,9 +196,7 @@ fn a_wrong_document_in_the_code_is_found() {
 #[test]
 fn a_wrong_path_is_found_in_each_form() {
     let faults = |text: &str| {
-        let mut report = Report::default();
-        check_paths(&own(), &Document::new("docs/page.md", text), &mut report);
-        report.faults()
+        Report::faults_of(|report| check_paths(&own(), &Document::new("docs/page.md", text), report))
     };
     for right in [
         "`crates/one/src/x.rs`",

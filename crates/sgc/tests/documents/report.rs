@@ -31,4 +31,11 @@ impl Report {
     pub(crate) fn faults(&self) -> String {
         self.faults.join("; ")
     }
+
+    /// Returns the faults that a rule finds.
+    pub(crate) fn faults_of(rule: impl FnOnce(&mut Self)) -> String {
+        let mut report = Self::default();
+        rule(&mut report);
+        report.faults()
+    }
 }
