@@ -25,34 +25,34 @@ use tokio::sync::{Mutex, Notify, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
-use crate::access::{AccessError, access_with, refused_tokens};
 use crate::admin::{self, Desk};
-use crate::alerts::clock_alert;
-use crate::audit::{self, Audit, AuditEvent, AuditRecord, AuditWriter};
-use crate::authority::Authority;
 use crate::config::{Config, DiscoveryRange, RosConfig, RouterUrl};
-use crate::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
-use crate::credentials::{StateWriter, with_kept_crls};
+use crate::control::alerts::clock_alert;
+use crate::control::authority::Authority;
+use crate::control::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
+use crate::control::file_watch::FileWatch;
+use crate::control::peer_rate::PeerRates;
+use crate::control::policy::grantees;
+use crate::control::reload::{ConfigSource, JoinNetwork, Reloader, Running};
+use crate::control::rules::{Rules, RulesError};
+use crate::data::message_keys;
 use crate::discovery::{self, Board, Claims, Dns, LinkKeeper, LocalNetwork, RouterFilter, WorkingUrls};
-use crate::discovery_server;
-use crate::file_watch::FileWatch;
+use crate::gateway::access::{AccessError, access_with, refused_tokens};
 use crate::gateway::{
     Gateway, GatewayStartError, NodeDefinitions, OpenLocalRos, ShownKey, Sockets, key_of_files, listen_at,
 };
-use crate::keep_alive::KeepAlivePolicy;
-use crate::lanes::LaneAdmission;
-use crate::links::{Admission, keep_accepting};
-use crate::message_keys;
-use crate::network_slot::{NetworkSlot, OpenAgain};
-use crate::peer_rate::PeerRates;
-use crate::policy::grantees;
-use crate::reload::{ConfigSource, JoinNetwork, Reloader, Running};
-use crate::reopening;
-use crate::roaming::Network;
-use crate::rules::{Rules, RulesError};
-use crate::run_lock::{IdentityInUse, RunLock};
+use crate::link::keep_alive::KeepAlivePolicy;
+use crate::link::lanes::LaneAdmission;
+use crate::link::links::{Admission, keep_accepting};
+use crate::link::roaming::Network;
+use crate::local::discovery_server;
+use crate::local::network_slot::{NetworkSlot, OpenAgain};
+use crate::local::reopening;
+use crate::local::strangers;
+use crate::state::audit::{self, Audit, AuditEvent, AuditRecord, AuditWriter};
+use crate::state::credentials::{StateWriter, with_kept_crls};
+use crate::state::run_lock::{IdentityInUse, RunLock};
 use crate::state::{self, StateError};
-use crate::strangers;
 
 /// Delay of the transport's own keep-alive behind ours.
 const KEEP_ALIVE_SLACK: Duration = Duration::from_secs(5);
@@ -218,7 +218,7 @@ pub fn load_identity(path: &Path) -> Result<Identity, NodeError> {
 }
 
 /// Checks the identity as [`run`] does, and binds nothing. A certificate that is not valid yet passes, see
-/// [`clock_alert`](crate::alerts::clock_alert).
+/// [`clock_alert`](crate::control::alerts::clock_alert).
 pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
     let identity = load_identity(&config.identity)?;
     let certified = identity.node_name().as_str();

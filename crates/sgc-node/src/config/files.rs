@@ -12,7 +12,8 @@ use sgc_trust::{ShareToken, TOKEN_TEXT_BYTES_MAX};
 
 use super::error::Mistake;
 use super::resolve::{FileChecks, IdentityFile};
-use crate::{partners, state};
+use crate::control::partners;
+use crate::state;
 
 /// Largest file of certificates or of a key for TLS, bytes.
 const PEM_BYTES_MAX: u64 = 256 * 1024;

@@ -26,7 +26,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use crate::audit::AuditRoom;
+use crate::state::audit::AuditRoom;
 use sgc_dds::Security;
 pub use sgc_ros::{Interface, Naming, QosOverride, Rename, Shaping};
 use sgc_router::MappingKind;

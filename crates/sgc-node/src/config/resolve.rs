@@ -28,7 +28,7 @@ use super::{
     RosConfig, RotationConfig, SecurityConfig, ShareConfig, ShareMetadata, TokenConfig, TokenSource,
     TransportConfig, UseConfig, ros_env,
 };
-use crate::audit::AuditRoom;
+use crate::state::audit::AuditRoom;
 
 /// Most shares of one node.
 pub const SHARES_MAX: usize = 1024;

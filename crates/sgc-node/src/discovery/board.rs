@@ -10,7 +10,7 @@ use sgc_wire::NodeId;
 use tokio::time::Instant;
 
 use super::{DialTarget, SkippedUrl};
-use crate::stats::Drops;
+use crate::data::stats::Drops;
 
 /// A router that the node looks for, or a place where it looks for routers.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]

@@ -13,9 +13,9 @@ use tracing::warn;
 
 use super::dns::DnsError;
 use super::{Claim, Claims, DialTarget, Dns, Names as _, SkippedUrl, StatusRow, WorkingUrls, urls};
-use crate::core::CoreEvent;
-use crate::links::keep_renewed;
-use crate::roaming::Network;
+use crate::control::core::CoreEvent;
+use crate::link::links::keep_renewed;
+use crate::link::roaming::Network;
 
 /// Makes and keeps links. Tests replace it.
 pub(crate) trait KeepLink: Clone + Send + Sync + 'static {

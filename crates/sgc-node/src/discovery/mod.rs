@@ -38,8 +38,8 @@ pub(crate) use mdns::RouterFilter;
 pub(crate) use urls::{Failback, SkippedUrl, WorkingUrls, is_over_udp};
 
 use crate::config::RouterUrl;
-use crate::links::place_in_use;
-use crate::roaming::Network;
+use crate::link::links::place_in_use;
+use crate::link::roaming::Network;
 
 /// A router to dial.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -1,0 +1,170 @@
+//! How a node is doing, as its status socket tells it: one JSON document a connection.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::Ordering::Relaxed;
+
+use serde::Serialize;
+use sgc_gateway::GatewayStatus;
+use sgc_ros::RouteStatus;
+use sgc_wire::Name;
+
+use crate::control::alerts::Alert;
+use crate::data::stats::NameStats;
+use crate::discovery::RouterStatus;
+
+/// The status document.
+#[derive(Clone, Debug, Serialize)]
+pub struct Status {
+    /// The node's name.
+    pub node: String,
+    /// The version of the program.
+    pub version: String,
+    /// Seconds since the node started.
+    pub uptime_s: u64,
+    /// The links that are up.
+    pub links: Vec<LinkStatus>,
+    /// The routers that the node looks for, and the state of each search.
+    pub routers: Vec<RouterStatus>,
+    /// Shares and uses, and the state of each.
+    pub routes: Vec<RouteLine>,
+    /// Alerts for an operator.
+    pub alerts: Vec<Alert>,
+    /// Contradictions between local endpoints and the other side, with both values and the fix. An entry lasts as long as its
+    /// contradiction.
+    pub problems: Vec<String>,
+    /// Names whose data passes this node.
+    pub names: Vec<NameStatus>,
+    /// Counts of drops and refusals, by reason, and by reason and culprit.
+    pub drops: BTreeMap<String, u64>,
+    /// Counts of refused links, by reason.
+    pub refused: BTreeMap<String, u64>,
+    /// The number of times that the node opened the local network again because this host's addresses changed.
+    pub local_network_reopened: u64,
+    /// The size of the routing state.
+    pub router: RouterLine,
+    /// The gateway for programs without ROS; null without `[gateway]`.
+    pub gateway: Option<GatewayStatus>,
+}
+
+/// A link that is up.
+#[derive(Clone, Debug, Serialize)]
+pub struct LinkStatus {
+    /// The number of the link, counted since the node started.
+    pub id: u32,
+    /// The node id of the peer.
+    pub peer: String,
+    /// The end of the certificate that the peer showed, RFC 3339.
+    pub peer_until: String,
+    /// The address of the peer.
+    pub remote: String,
+    /// The URL that this node dialled; null if the peer dialled.
+    pub url: Option<String>,
+    /// The key exchange, as TLS names it.
+    pub kex: &'static str,
+    /// The smoothed round-trip time, microseconds.
+    pub rtt_us: u64,
+    /// The cost of the link in routing, microseconds of round trip.
+    pub cost: u32,
+    /// `true` while the peer does not answer.
+    pub silent: bool,
+    /// The time without a sign of life after which the node asks the peer for one, milliseconds.
+    pub keep_alive_ms: u64,
+    /// Bytes sent over the link.
+    pub sent_bytes: u64,
+    /// Bytes received over the link.
+    pub received_bytes: u64,
+    /// The number of connections beside the link that carry one name each.
+    pub lanes: usize,
+    /// The number of names for which this node sends labels.
+    pub labels_sent: u32,
+    /// The number of names for which the peer may send labels.
+    pub labels_received: u32,
+    /// Packets of the peer, over all its links, that waited because it exceeded `peer_rate`.
+    pub peer_slowed: u64,
+    /// Packets of the peer, over all its links, that were dropped because it exceeded `peer_rate`.
+    pub peer_dropped: u64,
+}
+
+/// A share or a use.
+#[derive(Clone, Debug, Serialize)]
+pub struct RouteLine {
+    /// `"share"` or `"use"`.
+    pub direction: &'static str,
+    /// The name on the local ROS 2 network.
+    pub topic: String,
+    /// The ROS type; null until it is known.
+    #[serde(rename = "type")]
+    pub type_name: Option<String>,
+    /// The 256-bit name; null until it is known.
+    pub name: Option<String>,
+    /// The name of the owner's node.
+    pub owner: String,
+    /// The state, in words.
+    pub state: String,
+    /// The number of messages that were published or delivered.
+    pub messages: u64,
+    /// The number of signatures for messages of the present publishers. Under load it is smaller than `messages`, because
+    /// one signature covers a batch. 0 in the `group` suites.
+    pub signatures: u64,
+    /// Bytes of payload before and after compression, of a topic that this node compresses.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub compressed: Option<(u64, u64)>,
+}
+
+impl RouteLine {
+    pub(crate) fn new(
+        route: RouteStatus,
+        messages: Option<u64>,
+        signatures: u64,
+        compressed: Option<(u64, u64)>,
+    ) -> Self {
+        Self {
+            compressed,
+            direction: route.direction,
+            topic: route.topic,
+            type_name: route.type_name,
+            name: route.name.map(|n| n.to_string()),
+            owner: route.owner,
+            state: route.state,
+            messages: messages.unwrap_or(0),
+            signatures,
+        }
+    }
+}
+
+/// The traffic of a name at this node.
+#[derive(Clone, Debug, Serialize)]
+pub struct NameStatus {
+    /// The 256-bit name.
+    pub name: String,
+    /// Packets that the node took in.
+    pub packets: u64,
+    /// Bytes of the payloads of these packets.
+    pub bytes: u64,
+    /// Packets that the node dropped.
+    pub dropped: u64,
+}
+
+impl NameStatus {
+    pub(crate) fn new(name: &Name, stats: &NameStats) -> Self {
+        Self {
+            name: name.to_string(),
+            packets: stats.packets.load(Relaxed),
+            bytes: stats.bytes.load(Relaxed),
+            dropped: stats.dropped.load(Relaxed),
+        }
+    }
+}
+
+/// The size of the routing state.
+#[derive(Clone, Debug, Serialize)]
+pub struct RouterLine {
+    /// Nodes whose link states are known.
+    pub nodes: usize,
+    /// All known names.
+    pub names: usize,
+    /// Names to whose owner a route leads.
+    pub routed_names: usize,
+    /// Branches of trees.
+    pub branches: usize,
+}

@@ -1,0 +1,885 @@
+//! The control task: owns the three machines, feeds them events, and carries out their outputs.
+//!
+//! It blocks on nothing but its inbox and its timer. Work that may block, on the local network or on a slow peer, runs
+//! in other tasks and threads.
+
+mod alerts;
+mod consumers;
+mod graph;
+mod interface_types;
+mod nodes;
+mod operations;
+mod outputs;
+mod publish;
+mod quality;
+mod reopening;
+mod ros;
+mod services;
+mod trust;
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use rand_chacha::ChaCha20Rng;
+use sgc_endpoint::{Endpoint, Output as EndpointOutput};
+use sgc_ros::{
+    DiscoveryEvent, EndpointKind, EndpointSpec, Guid, RosClient, RosNetwork, RosServer, Routes, ServiceSpec,
+    ShareRule, ShownEndpoint, UseRule,
+};
+use sgc_router::{FibEntry, LinkId, Neighbour, Output as RouterOutput, Router};
+use sgc_transport::{AnyLink, CredentialStore, Link, LinkUrl};
+use sgc_trust::{CrlError, Identity, NodeName, TrustAnchors, VerifiedPeer};
+use sgc_types::{Definitions, TypeStore};
+use sgc_wire::{Control, Name, NodeId, Now, Operation, OperationAnswer, SourceId, UnixMillis};
+use tokio::sync::{Notify, mpsc, oneshot, watch};
+use tracing::{debug, warn};
+
+use crate::admin::graph::Graph;
+use crate::admin::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
+use crate::control::alerts::{Alerts, clock_alert};
+use crate::control::authority::{Authority, DeskAnswers};
+use crate::control::control_queue::{FrameRoom, Inbox, InboxShare};
+use crate::control::core::consumers::{ConsumerKey, FarConsumers};
+use crate::control::core::interface_types::{InterfaceTypes, TypeOutcome};
+use crate::control::core::nodes::LocalGraph;
+use crate::control::core::publish::{Offer, Publishing};
+use crate::control::core::reopening::Reopening;
+use crate::control::members::{MemberNames, Members};
+use crate::control::operations::{OperationError, Operations};
+use crate::control::peer_rate::PeerRates;
+use crate::control::problem_log::ProblemLog;
+use crate::data::call_ledger::CallLedger;
+use crate::data::calls::Calls;
+use crate::data::dataplane::DataPlane;
+use crate::data::message_keys::MessageKeys;
+use crate::data::outflow::OutFlow;
+use crate::data::replays::Replays;
+use crate::data::sinks::{LocalSink, SinkRequest, WriterQueue};
+use crate::data::sources::{LocalShare, NewestSamples};
+use crate::data::stats::{Drops, NameStats};
+use crate::data::tap::{Tap, TapError, TapQueue, TapRequest};
+use crate::discovery::Board;
+use crate::gateway::Gateway;
+use crate::link::keep_alive::{KeepAlive, KeepAlivePolicy};
+use crate::link::links::ControlTx;
+use crate::local::network_slot::NetworkSlot;
+use crate::state::audit::{Audit, AuditEvent, AuditRecord};
+use crate::state::credentials::StateWriter;
+
+/// Events that may wait for the control task. Senders wait while it is full.
+pub(crate) const INBOX_MAX: usize = 4096;
+/// Events handled before the timers are checked again.
+const BATCH_MAX: usize = 256;
+/// Interval of checks for sources that may have fallen silent.
+const SILENCE_LOOK: Duration = Duration::from_secs(1);
+/// Time without progress after which a history is asked for again.
+const HISTORY_RETRY: Duration = Duration::from_secs(2);
+/// Bytes of history kept for late joiners of one publisher.
+const HISTORY_BYTES_MAX: usize = 64 << 20;
+/// Messages of history kept for a publisher that keeps all.
+const HISTORY_KEEP_ALL_MAX: usize = 4096;
+/// Instances for which a transient-local source of a keyed topic keeps its history, as the writers of `sgc-dds` do.
+const KEYED_INSTANCES_KEPT: usize = 256;
+/// Time for which packets of past epochs may be under way.
+const EPOCH_GRACE: Duration = Duration::from_secs(5);
+
+/// Event for the control task.
+pub(crate) enum CoreEvent {
+    /// A link was made.
+    LinkUp {
+        /// The link.
+        link: AnyLink,
+        /// URL, if this node dialled.
+        url: Option<String>,
+        /// Queue of its control frames.
+        control: ControlTx,
+        /// Receives the link's place, or `None` if the node is stopping.
+        reply: oneshot::Sender<Option<LinkPlace>>,
+    },
+    /// The configuration was read again.
+    ConfigurationRead {
+        /// The mistakes for which it was refused.
+        mistakes: Option<String>,
+    },
+    /// A link ended.
+    LinkDown {
+        /// The link.
+        id: LinkId,
+        /// Place of another process with this node's identity, if the peer closed the link for it.
+        in_use: Option<String>,
+    },
+    /// A control frame arrived.
+    Frame {
+        /// The link.
+        link: LinkId,
+        /// The frame.
+        frame: Control,
+        /// Its room in the inbox.
+        room: FrameRoom,
+    },
+    /// A link has taken all control frames before a flush.
+    Flushed {
+        /// The link.
+        link: LinkId,
+    },
+    /// A malformed control frame arrived.
+    Malformed {
+        /// The link.
+        link: LinkId,
+    },
+    /// The local graph changed.
+    Discovery(DiscoveryEvent),
+    /// The local network is about to close and to open again. Answered once the control task holds nothing of it.
+    CloseNetwork(oneshot::Sender<()>),
+    /// The local network is open again. Its discovery events follow.
+    NetworkReopened,
+    /// The local network could not be opened again so far, for this reason.
+    NetworkStaysClosed(String),
+    /// A local writer was created, or failed.
+    WriterReady {
+        /// The joined name.
+        name: Name,
+        /// The source whose messages it writes.
+        source: Option<SourceId>,
+        /// The requested endpoint.
+        spec: EndpointSpec,
+        /// Its queue.
+        writer: Option<Arc<WriterQueue>>,
+    },
+    /// A local reader was created.
+    ReaderReady {
+        /// The share.
+        name: Name,
+        /// The requested endpoint.
+        spec: EndpointSpec,
+        /// Its GUID on the local network.
+        guid: Guid,
+        /// Owner of the reader. Dropping it closes the reader.
+        reader: Box<dyn std::any::Any + Send>,
+    },
+    /// The local endpoints that stand for a far consumer were created, or failed.
+    ConsumerShown {
+        /// The consumer.
+        key: ConsumerKey,
+        /// The requested endpoints with the created ones.
+        ends: Vec<(EndpointKind, EndpointSpec, ShownEndpoint)>,
+    },
+    /// A service's local client or server was created.
+    ServiceReady {
+        /// The share or the joined name.
+        name: Name,
+        /// The requested service.
+        spec: ServiceSpec,
+        /// The client or server.
+        end: ServiceEnd,
+    },
+    /// The node joined the local network after its start. The rules follow.
+    NetworkJoined(Box<Routes<ChaCha20Rng>>),
+    /// The configuration changed. Answered when the change is under way.
+    Reload {
+        /// The new shares.
+        shares: Vec<ShareRule>,
+        /// The new uses.
+        uses: Vec<UseRule>,
+        /// The new trust anchors with kept revocation lists, if they change.
+        anchors: Option<TrustAnchors>,
+        /// Keys for suites that were not in use.
+        message_keys: MessageKeys,
+        /// The names of members in these rules.
+        member_names: MemberNames,
+        /// Notified when the change is under way.
+        reply: oneshot::Sender<()>,
+    },
+    /// The authority's desk answered requests for renewal and carried out operations.
+    DeskAnswered(DeskAnswers),
+    /// A user asks an authority for an operation on the fleet.
+    Operate {
+        /// The authority's name.
+        at: NodeName,
+        /// The operation.
+        operation: Operation,
+        /// The channel for the answer.
+        reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
+    },
+    /// A user brings a revocation list. Answered with whether it is new, and with the lists that were in force before.
+    Crl {
+        /// The list, DER.
+        der: bytes::Bytes,
+        /// The channel for the answer.
+        reply: oneshot::Sender<Result<(bool, Vec<bytes::Bytes>), CrlError>>,
+    },
+    /// Signing keys of these suites were created.
+    MessageKeys(MessageKeys),
+    /// A search for a type ended.
+    TypeLookedFor(TypeOutcome),
+    /// Asks for the status.
+    Status(oneshot::Sender<Status>),
+    /// Asks for the graph, also of a name that is not in use here.
+    Graph(Option<Name>, oneshot::Sender<Graph>),
+    /// Asks for a tap.
+    Tap(TapRequest, oneshot::Sender<Result<Tap, TapError>>),
+    /// Stop receiving. Answered with the queues that still have to drain.
+    Quiesce(oneshot::Sender<Vec<Arc<OutFlow>>>),
+    /// Withdraw the shares and say goodbye. Answered with the links, which the peers then close.
+    Stop(oneshot::Sender<Vec<AnyLink>>),
+}
+
+/// The place of a link at this node.
+pub(crate) struct LinkPlace {
+    /// Its number.
+    pub(crate) id: LinkId,
+    /// Data path for its packets.
+    pub(crate) data: Arc<DataPlane>,
+    /// Its share of the inbox.
+    pub(crate) inbox: InboxShare,
+}
+
+/// A local reader for a name.
+struct LocalReader {
+    /// The requested endpoint.
+    spec: EndpointSpec,
+    /// Owner of the reader; `None` while it is being created. Dropping it closes the reader.
+    opened: Option<Box<dyn std::any::Any + Send>>,
+    /// Time stamps of the newest samples that it took.
+    newest: Option<Arc<NewestSamples>>,
+}
+
+/// This node's end of a service on the local network.
+pub(crate) enum ServiceEnd {
+    /// A client that calls local servers.
+    Client(Arc<dyn RosClient>),
+    /// A server that local clients call.
+    Server(Arc<dyn RosServer>),
+}
+
+struct LinkEntry {
+    link: AnyLink,
+    url: Option<String>,
+    control: ControlTx,
+    flows: HashMap<Name, Arc<OutFlow>>,
+    /// Reason, if this node closed it.
+    closed_for: Option<String>,
+    keep_alive: KeepAlive,
+}
+
+/// The control task's state. `N` is the local network; a pure router has none.
+pub(crate) struct Core<N: RosNetwork> {
+    identity: Arc<Identity>,
+    router: Router,
+    endpoint: Endpoint,
+    routes: Option<Routes<ChaCha20Rng>>,
+    network: NetworkSlot<N>,
+    data: Arc<DataPlane>,
+    inbox: Inbox,
+    links: BTreeMap<LinkId, LinkEntry>,
+    /// Time of the next look at the links.
+    look_due: Option<Instant>,
+    /// Keep-alive policy of new links.
+    keep_alive_policy: KeepAlivePolicy,
+    /// Shorter intervals of peers behind NATs that forget soon.
+    impatient: BTreeMap<NodeId, Duration>,
+    next_link: u32,
+    entries: HashMap<Name, (FibEntry, Arc<NameStats>)>,
+    shares: HashMap<Name, Arc<LocalShare>>,
+    readers: HashMap<Name, LocalReader>,
+    sinks: HashMap<Name, Arc<LocalSink>>,
+    /// Shared and joined services.
+    calls: BTreeMap<Name, Calls>,
+    /// Lost calls by service. They outlive the services.
+    call_ledgers: BTreeMap<Name, Arc<CallLedger>>,
+    /// Requested local clients and servers of the services.
+    service_ends: HashMap<Name, ServiceSpec>,
+    writers: HashMap<(Name, Option<SourceId>), EndpointSpec>,
+    /// Far nodes that the local graph shows.
+    graph: LocalGraph,
+    reopening: Reopening,
+    /// Local consumers that owners are told, and far consumers that are shown here.
+    consumers: FarConsumers,
+    history_due: BTreeMap<(Name, SourceId), Instant>,
+    /// Times at which the keys of past epochs are dropped.
+    retire_due: BTreeMap<Name, Instant>,
+    /// Signing keys of this node's messages, by suite.
+    message_keys: MessageKeys,
+    publishing: BTreeMap<Name, Publishing>,
+    /// Offers to publish on, which wait for a signing key.
+    keyless: BTreeMap<Name, Offer>,
+    /// Messages of one source under one key.
+    epoch_messages_max: u64,
+    /// Notified when a source reaches that number.
+    epoch_over: Arc<Notify>,
+    credentials: CredentialStore,
+    gateway: Arc<Gateway>,
+    /// Set if this node is the authority of its fleet.
+    authority: Option<Authority>,
+    /// Operations that users of this node request.
+    operations: Operations,
+    keeper: StateWriter,
+    /// Time of the next request for renewal.
+    renew_due: Option<Instant>,
+    redial: watch::Sender<()>,
+    replays: Arc<Replays>,
+    /// Time of the next check for silent sources; `None` until one publishes.
+    silence_due: Option<Instant>,
+    requests: mpsc::Sender<SinkRequest>,
+    control_drops: Drops,
+    problem_log: ProblemLog,
+    ros_failures: Arc<Drops>,
+    events: mpsc::WeakSender<CoreEvent>,
+    started: Instant,
+    alerts: Alerts,
+    /// Whether the clock is still before the start of this node's certificate.
+    awaits_clock: bool,
+    transport: Arc<sgc_transport::TransportMetrics>,
+    alive: mpsc::Sender<()>,
+    audit: Audit,
+    board: Board,
+    /// Refused nodes of each share, with the reason.
+    refused: BTreeMap<Name, BTreeMap<NodeId, String>>,
+    /// Taps of the local network.
+    local_taps: Vec<Arc<TapQueue>>,
+    types: InterfaceTypes,
+    members: Members,
+}
+
+/// Parts from which a [`Core`] is built.
+pub(crate) struct CoreParts<N> {
+    /// Identity of this node.
+    pub identity: Arc<Identity>,
+    /// Credentials of links.
+    pub credentials: CredentialStore,
+    /// Gateway, whose client certificates follow this node's trust anchors.
+    pub gateway: Arc<Gateway>,
+    /// Rate limits of peers.
+    pub(crate) rates: PeerRates,
+    /// Set if this node is the authority of its fleet.
+    pub authority: Option<Authority>,
+    /// Messages of one source under one key.
+    pub epoch_messages_max: u64,
+    /// Signing keys for the suites of its shares.
+    pub(crate) message_keys: MessageKeys,
+    /// Writes state that outlives the process.
+    pub(crate) keeper: StateWriter,
+    /// Notifies the dialling tasks of a new certificate.
+    pub redial: watch::Sender<()>,
+    /// The routing machine.
+    pub router: Router,
+    /// The endpoint machine.
+    pub endpoint: Endpoint,
+    /// The route machine, if there is a local network.
+    pub routes: Option<Routes<ChaCha20Rng>>,
+    /// The local network.
+    pub(crate) network: NetworkSlot<N>,
+    /// Sender to its own inbox.
+    pub events: mpsc::WeakSender<CoreEvent>,
+    /// Clone held by every thread and blocking task while it uses the runtime.
+    pub(crate) alive: mpsc::Sender<()>,
+    /// Transport counters.
+    pub transport: Arc<sgc_transport::TransportMetrics>,
+    /// Audit log.
+    pub audit: Audit,
+    /// State of the searches for routers.
+    pub(crate) board: Board,
+    /// Keep-alive policy of new links.
+    pub(crate) keep_alive_policy: KeepAlivePolicy,
+    /// Store of known types.
+    pub types: Arc<TypeStore>,
+    /// Search paths of type definitions.
+    pub definitions: Definitions,
+    /// The names of members in rules.
+    pub(crate) member_names: MemberNames,
+}
+
+/// Returns the current time of both clocks.
+pub(crate) fn now() -> Now {
+    let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    Now { instant: Instant::now(), unix: UnixMillis(unix.as_millis().try_into().unwrap_or(u64::MAX)) }
+}
+
+impl<N: RosNetwork> Core<N> {
+    /// Creates the control task and the inbox of its sinks.
+    pub(crate) fn new(parts: CoreParts<N>) -> (Self, mpsc::Receiver<SinkRequest>) {
+        let (requests, requested) = mpsc::channel(INBOX_MAX);
+        let graph = LocalGraph::new(parts.identity.node_name().as_str());
+        let members = Members::new(parts.member_names, &parts.identity);
+        let awaits_clock = clock_alert(&parts.identity, now().unix).is_some();
+        let core = Self {
+            identity: parts.identity,
+            router: parts.router,
+            endpoint: parts.endpoint,
+            routes: parts.routes,
+            network: parts.network,
+            data: Arc::new(DataPlane::new(parts.rates)),
+            inbox: Inbox::default(),
+            links: BTreeMap::new(),
+            look_due: None,
+            keep_alive_policy: parts.keep_alive_policy,
+            impatient: BTreeMap::new(),
+            next_link: 1,
+            entries: HashMap::new(),
+            shares: HashMap::new(),
+            readers: HashMap::new(),
+            sinks: HashMap::new(),
+            calls: BTreeMap::new(),
+            service_ends: HashMap::new(),
+            writers: HashMap::new(),
+            graph,
+            reopening: Reopening::default(),
+            consumers: FarConsumers::default(),
+            history_due: BTreeMap::new(),
+            retire_due: BTreeMap::new(),
+            message_keys: parts.message_keys,
+            publishing: BTreeMap::new(),
+            keyless: BTreeMap::new(),
+            epoch_messages_max: parts.epoch_messages_max,
+            epoch_over: Arc::default(),
+            credentials: parts.credentials,
+            gateway: parts.gateway,
+            authority: parts.authority,
+            operations: Operations::default(),
+            keeper: parts.keeper,
+            renew_due: None,
+            redial: parts.redial,
+            replays: Arc::default(),
+            silence_due: None,
+            requests,
+            control_drops: Drops::default(),
+            call_ledgers: BTreeMap::new(),
+            problem_log: ProblemLog::default(),
+            ros_failures: Arc::default(),
+            events: parts.events,
+            started: Instant::now(),
+            alerts: Alerts::default(),
+            awaits_clock,
+            transport: parts.transport,
+            alive: parts.alive,
+            audit: parts.audit,
+            board: parts.board,
+            refused: BTreeMap::new(),
+            types: InterfaceTypes::new(parts.types, parts.definitions),
+            members,
+            local_taps: Vec::new(),
+        };
+        (core, requested)
+    }
+
+    /// Runs until it is stopped or all senders are gone.
+    pub(crate) async fn run(
+        mut self,
+        mut inbox: mpsc::Receiver<CoreEvent>,
+        mut requested: mpsc::Receiver<SinkRequest>,
+    ) {
+        let mut batch = Vec::with_capacity(BATCH_MAX);
+        let epoch_over = self.epoch_over.clone();
+        self.ask_renewal();
+        let mut deadline = self.drain();
+        loop {
+            let timer = async {
+                match deadline {
+                    Some(at) => tokio::time::sleep_until(at.into()).await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                n = inbox.recv_many(&mut batch, BATCH_MAX) => {
+                    if n == 0 {
+                        return;
+                    }
+                    for event in batch.drain(..) {
+                        if let CoreEvent::Stop(done) = event {
+                            let _ = done.send(self.stop());
+                            return;
+                        }
+                        self.handle(event);
+                        self.drain();
+                    }
+                }
+                Some(request) = requested.recv() => self.handle_sink(request),
+                () = epoch_over.notified() => {}
+                () = timer => {}
+            }
+            self.handle_timeouts();
+            deadline = self.drain();
+            self.show_graph();
+        }
+    }
+
+    fn handle(&mut self, event: CoreEvent) {
+        match event {
+            CoreEvent::LinkUp { link, url, control, reply } => {
+                let id = LinkId(self.next_link);
+                self.next_link += 1;
+                let set =
+                    url.as_deref().and_then(|url| url.parse::<LinkUrl>().ok()).and_then(|url| url.cost_ms);
+                let cost = set.map(|ms| ms.saturating_mul(1000));
+                let neighbour = Neighbour { cost, ..Neighbour::from(link.peer()) };
+                let remote = link.remote();
+                self.hear_of(link.peer());
+                let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
+                self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
+                let (flows, keep_alive) = (HashMap::new(), self.keep_alive_for(&link));
+                self.control_drops.link_up(id);
+                self.data.drops().link_up(id);
+                self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, keep_alive });
+                let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
+                if reply.send(Some(place)).is_err() {
+                    debug!(%remote, "the link's task is gone");
+                }
+                self.router.handle_link_up(now(), id, neighbour);
+                self.begin_to_look(id);
+            }
+            CoreEvent::LinkDown { id, in_use } => {
+                self.router.handle_link_down(now(), id);
+                self.control_drops.link_down(id);
+                self.data.drops().link_down(id);
+                if let Some(entry) = self.links.remove(&id) {
+                    self.remember_policy(entry.link.peer().node_id, entry.keep_alive.policy());
+                    let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
+                    let record = record.remote(entry.link.remote());
+                    self.audit.write(match &entry.closed_for {
+                        Some(reason) => record.reason(reason),
+                        None => record,
+                    });
+                    entry.flows.values().for_each(|f| f.close());
+                }
+                if let Some(place) = in_use {
+                    self.displaced(&place);
+                }
+            }
+            CoreEvent::Frame { link, frame: Control::IdentityInUse { place }, .. } => {
+                self.kept_out(link, place)
+            }
+            CoreEvent::Frame { link, frame, room } => {
+                let tells_time = matches!(frame, Control::Clock { .. });
+                self.router.handle_frame(now(), link, frame);
+                drop(room);
+                if tells_time {
+                    self.compare_clocks(link);
+                }
+            }
+            CoreEvent::Flushed { link } => self.router.handle_flushed(now(), link),
+            CoreEvent::Malformed { link } => {
+                self.control_drops.count_from("malformed_control", link);
+            }
+            CoreEvent::Discovery(event) => self.discovered(event),
+            CoreEvent::CloseNetwork(reply) => {
+                self.close_network();
+                let _ = reply.send(());
+            }
+            CoreEvent::NetworkReopened => self.network_reopened(),
+            CoreEvent::NetworkStaysClosed(reason) => self.reopening.failed = Some(reason),
+            CoreEvent::ReaderReady { name, spec, guid, reader } => match self.readers.get_mut(&name) {
+                Some(wanted) if wanted.spec == spec && !self.reopening.is_closed => {
+                    wanted.opened = Some(reader);
+                    self.graph.reader_there(name, guid);
+                }
+                _ => drop_elsewhere(reader),
+            },
+            CoreEvent::WriterReady { name, source, spec, writer } => {
+                let wanted = !self.reopening.is_closed && self.writers.get(&(name, source)) == Some(&spec);
+                match (self.sinks.get(&name), writer) {
+                    (Some(sink), Some(writer)) if wanted => {
+                        self.graph.writer_there((name, source), writer.guid());
+                        sink.set_writer(source, Some(writer));
+                        match source {
+                            Some(source) => self.ask_history(name, source),
+                            None => self.ask_histories(name),
+                        }
+                    }
+                    (_, Some(writer)) => writer.close(),
+                    (_, None) => {}
+                }
+            }
+            CoreEvent::ConsumerShown { key, ends } => self.consumer_shown(key, ends),
+            CoreEvent::ServiceReady { name, spec, end } => self.service_ready(name, &spec, end),
+            CoreEvent::DeskAnswered(answers) => self.desk_answered(answers),
+            CoreEvent::Operate { at, operation, reply } => self.operate(&at, operation, reply),
+            CoreEvent::NetworkJoined(routes) => self.routes = Some(*routes),
+            CoreEvent::Reload { shares, uses, anchors, message_keys, member_names, reply } => {
+                self.add_message_keys(message_keys);
+                self.members.set_names(member_names, &self.identity);
+                self.reconfigure(shares, uses, anchors);
+                let _ = reply.send(());
+                self.answer_renewals();
+            }
+            CoreEvent::ConfigurationRead { mistakes } => {
+                self.alerts.configuration_read(mistakes.as_deref(), Instant::now());
+            }
+            CoreEvent::Crl { der, reply } => {
+                let taken = self.router.add_crl(now(), &der);
+                let record = AuditRecord::new(AuditEvent::Crl).by_user();
+                match &taken {
+                    // The list is logged where it comes into force.
+                    Ok(true) => {}
+                    Ok(false) => self.audit.write(record.reason("known already")),
+                    Err(why) => self.audit.write(record.reason(format!("refused: {why}"))),
+                }
+                let lists = self.credentials.anchors().crls().cloned().collect();
+                let _ = reply.send(taken.map(|is_news| (is_news, lists)));
+                // A user who brings a list may have changed the fleet file.
+                self.answer_renewals();
+            }
+            CoreEvent::MessageKeys(keys) => self.add_message_keys(keys),
+            CoreEvent::TypeLookedFor(outcome) => self.type_looked_for(outcome),
+            CoreEvent::Status(reply) => {
+                let _ = reply.send(self.status());
+            }
+            CoreEvent::Graph(name, reply) => {
+                let _ = reply.send(self.graph(name));
+            }
+            CoreEvent::Tap(wish, reply) => self.tap(wish, reply),
+            CoreEvent::Quiesce(reply) => {
+                let _ = reply.send(self.quiesce());
+            }
+            CoreEvent::Stop(_) => {}
+        }
+    }
+
+    fn handle_sink(&mut self, request: SinkRequest) {
+        match request {
+            SinkRequest::History(name, source) => {
+                self.ask_history(name, source);
+            }
+            SinkRequest::Synced(name, source) => {
+                self.history_due.remove(&(name, source));
+            }
+        }
+    }
+
+    fn handle_timeouts(&mut self) {
+        let now = now();
+        if self.awaits_clock {
+            self.await_clock(now.unix);
+        }
+        self.look_at_links(now.instant);
+        self.router.handle_timeout(now);
+        self.endpoint.handle_timeout(now);
+        if let Some(routes) = &mut self.routes {
+            routes.handle_timeout(now.instant);
+        }
+        let due: Vec<_> =
+            self.history_due.iter().filter(|(_, at)| **at <= now.instant).map(|(key, _)| *key).collect();
+        for (name, source) in due {
+            self.history_due.remove(&(name, source));
+            self.ask_history_again(name, source);
+        }
+        if self.silence_due.is_none_or(|at| at <= now.instant) {
+            let looks = self.shares.values().map(|share| share.look_for_silence(now.instant));
+            // `fold` looks at all of them, where `any` would stop at the first.
+            let busy = looks.fold(false, |any, busy| any | busy);
+            self.silence_due = busy.then(|| now.instant + SILENCE_LOOK);
+        }
+        if self.renew_due.take_if(|at| *at <= now.instant).is_some() {
+            self.ask_renewal();
+        }
+        let long: Vec<_> = self.shares.iter().filter(|(_, s)| s.is_epoch_over()).map(|(n, _)| *n).collect();
+        for name in long {
+            self.endpoint.rotate(now, &name);
+        }
+        self.operations_due(now.instant);
+        self.calls_due(now.instant);
+        self.types_due(now.instant);
+        self.consumers_due(now);
+        self.rediscovery_due(now.instant);
+        self.rekey_due(now);
+        let over: Vec<_> =
+            self.retire_due.iter().filter(|(_, at)| **at <= now.instant).map(|(name, _)| *name).collect();
+        for name in over {
+            self.retire_due.remove(&name);
+            if let Some(sink) = self.sinks.get(&name) {
+                sink.retire_epochs();
+            }
+        }
+    }
+
+    /// Carries out the outputs of the machines until there are none. Returns the time of the next timer.
+    fn drain(&mut self) -> Option<Instant> {
+        loop {
+            let router = loop {
+                match self.router.poll_output() {
+                    RouterOutput::Timeout(at) => break at,
+                    output => self.router_output(output),
+                }
+            };
+            let mut progressed = false;
+            let endpoint = loop {
+                match self.endpoint.poll_output() {
+                    EndpointOutput::Timeout(at) => break at,
+                    output => {
+                        progressed = true;
+                        self.endpoint_output(output);
+                    }
+                }
+            };
+            while let Some(command) = self.routes.as_mut().and_then(Routes::poll_command) {
+                progressed = true;
+                self.carry_out(command);
+            }
+            if !progressed {
+                self.note_consumers();
+                let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
+                let history = self.history_due.values().min().copied();
+                let retire = self.retire_due.values().min().copied();
+                let rekey = self.rekey_deadline();
+                let own = [self.renew_due, self.silence_due, self.look_due, self.operations.deadline()];
+                let own = own.into_iter().chain([self.reopening.rediscovery.deadline()]);
+                let all = [router, endpoint, routes, history, retire, rekey, self.calls_deadline()];
+                let all =
+                    all.into_iter().chain(own).chain([self.types.deadline(), self.consumers.deadline()]);
+                return all.flatten().min();
+            }
+        }
+    }
+
+    /// Applies new rules, and new trust anchors if they changed.
+    fn reconfigure(&mut self, shares: Vec<ShareRule>, uses: Vec<UseRule>, anchors: Option<TrustAnchors>) {
+        if let Some(routes) = &mut self.routes {
+            routes.reconfigure(Instant::now(), shares, uses);
+        }
+        // Revoked nodes are told before their links close.
+        self.drain();
+        if let Some(anchors) = anchors {
+            self.trust(anchors);
+            self.drain();
+        }
+        self.close_not_admitted();
+        self.want_all_lanes();
+    }
+
+    /// Notes a member that was heard. Reports names in rules that are probably misspellings of it.
+    fn hear_of(&mut self, peer: &VerifiedPeer) {
+        for (written, meant) in self.members.heard(peer, &self.identity) {
+            warn!(
+                "a [[share]] names \"{written}\", which nobody here is called; \"{meant}\" is here and may be meant"
+            );
+        }
+    }
+
+    /// Stops receiving. Queued packets still leave.
+    fn quiesce(&mut self) -> Vec<Arc<OutFlow>> {
+        self.routes = None;
+        self.end_consumers();
+        self.local_taps.drain(..).for_each(|tap| tap.close());
+        for share in self.shares.values() {
+            share.close();
+        }
+        self.close_all_calls();
+        for (_, reader) in self.readers.drain() {
+            if let Some(reader) = reader.opened {
+                drop_elsewhere(reader);
+            }
+        }
+        let flows: Vec<_> = self.links.values().flat_map(|l| l.flows.values().cloned()).collect();
+        flows.iter().for_each(|f| f.close());
+        flows
+    }
+
+    /// Withdraws the shares and says goodbye.
+    fn stop(&mut self) -> Vec<AnyLink> {
+        self.operations.stop();
+        self.endpoint.withdraw_all(now());
+        self.drain();
+        for entry in self.links.values() {
+            entry.control.send(Control::Goodbye);
+        }
+        for sink in self.sinks.values() {
+            sink.close();
+        }
+        self.links.values().map(|l| l.link.clone()).collect()
+    }
+
+    fn status(&self) -> Status {
+        let links = self.links.iter().map(|(id, entry)| {
+            let stats = entry.link.stats();
+            let (cost, silent) = self.router.link_cost(*id).unwrap_or_default();
+            let over = self.data.rates().over(&entry.link.peer().node_id);
+            LinkStatus {
+                id: id.0,
+                peer: entry.link.peer().node_id.to_string(),
+                peer_until: entry.link.peer().not_after.to_string(),
+                remote: entry.link.remote().to_string(),
+                url: entry.url.clone(),
+                kex: stats.key_exchange.label(),
+                rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
+                cost,
+                silent,
+                keep_alive_ms: entry.keep_alive.step().as_millis().try_into().unwrap_or(u64::MAX),
+                sent_bytes: stats.sent_bytes,
+                received_bytes: stats.received_bytes,
+                lanes: entry.control.lanes().count(),
+                labels_sent: entry.control.labels_known(),
+                labels_received: entry.link.labels_defined(),
+                peer_slowed: over.slowed,
+                peer_dropped: over.dropped,
+            }
+        });
+        let names = self.entries.iter().map(|(name, (_, stats))| NameStatus::new(name, stats));
+        let router = self.router.stats();
+        Status {
+            node: self.identity.node_name().to_string(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            uptime_s: self.started.elapsed().as_secs(),
+            links: links.collect(),
+            routers: self.board.snapshot(),
+            routes: self
+                .routes
+                .iter()
+                .flat_map(Routes::status)
+                .map(|mut route| {
+                    self.describe_calls(&mut route);
+                    let messages = route.name.and_then(|n| {
+                        let published = self.shares.get(&n).map(|s| s.published());
+                        published.or_else(|| self.sinks.get(&n).map(|s| s.delivered()))
+                    });
+                    let share = route.name.and_then(|n| self.shares.get(&n));
+                    let compressed = share.and_then(|s| s.compressed());
+                    RouteLine::new(route, messages, share.map_or(0, |s| s.signatures()), compressed)
+                })
+                .collect(),
+            alerts: self.alerts(),
+            problems: self.problems(),
+            names: names.collect(),
+            drops: self.all_drops(),
+            refused: self.all_refused(),
+            local_network_reopened: self.reopening.times,
+            router: RouterLine {
+                nodes: router.nodes,
+                names: router.names,
+                routed_names: router.routed_names,
+                branches: router.branches,
+            },
+            // The caller adds it, since the core knows nothing of the gateway.
+            gateway: None,
+        }
+    }
+
+    /// Returns everything that was dropped or refused, by kind and culprit. Control frames and packets share some kinds.
+    fn all_drops(&self) -> BTreeMap<String, u64> {
+        let audit =
+            [("audit_lost", self.audit.lost_total()), ("audit_summed_up", self.audit.summed_up_total())];
+        let audit = audit.into_iter().filter(|(_, n)| *n > 0).map(|(key, n)| (key.to_owned(), n));
+        let mut all: BTreeMap<String, u64> = audit.collect();
+        for counts in [
+            self.control_drops.snapshot(),
+            self.data.drops().snapshot(),
+            self.data.rates().drops(),
+            self.ros_failures.snapshot(),
+            self.board.drops().snapshot(),
+        ] {
+            counts.into_iter().for_each(|(key, n)| *all.entry(key).or_default() += n);
+        }
+        all
+    }
+
+    /// Returns the peers that were refused a link, by kind.
+    fn all_refused(&self) -> BTreeMap<String, u64> {
+        let all = sgc_transport::RefusalKind::ALL.into_iter();
+        let all = all.map(|kind| (kind.label().to_owned(), self.transport.refused(kind)));
+        all.filter(|(_, n)| *n > 0).collect()
+    }
+}
+
+/// Drops a value on a blocking thread, since the drop may block.
+fn drop_elsewhere(thing: Box<dyn std::any::Any + Send>) {
+    tokio::task::spawn_blocking(move || drop(thing));
+}

@@ -1,0 +1,138 @@
+//! Alerts for the operator, raised by events of the control task.
+
+use std::net::SocketAddr;
+use std::time::Instant;
+
+use sgc_endpoint::JoinStatus;
+use sgc_ros::RosNetwork;
+use sgc_router::{LinkId, clocks_differ};
+use sgc_transport::{CloseReason, Link as _};
+use sgc_wire::{Control, Place, UnixMillis};
+use tracing::{debug, info, warn};
+
+use super::{Core, now};
+use crate::control::alerts::{Alert, clock_alert};
+use crate::local::strangers;
+
+/// Place of a process that is linked to another router.
+const ELSEWHERE: &str = "another router";
+
+/// Seconds for which a failure to send to the local network is shown. It exceeds the interval of participants'
+/// announcements.
+const UNSENT_SHOWN_S: u64 = 60;
+
+impl<N: RosNetwork> Core<N> {
+    /// Closes the link of a run that another run of the same node superseded. A run that returns after it was told so
+    /// is a second process; both it and the operator are told.
+    pub(super) fn close_superseded(&mut self, link: LinkId, by: Option<LinkId>, alive: bool) {
+        let holder = by.and_then(|by| self.links.get(&by));
+        let place = holder.map_or(ELSEWHERE.to_owned(), |entry| entry.link.remote().to_string());
+        let Some(entry) = self.links.get_mut(&link) else { return };
+        let (node, remote) = (entry.link.peer().node_id, entry.link.remote());
+        let reason = CloseReason::InUse(place.clone());
+        entry.closed_for = Some(reason.to_string());
+        entry.link.close(reason);
+        if !alive {
+            info!(%link, peer = %node.short(), %remote, %place, "a newer process of the node takes the place of this link");
+            return;
+        }
+        if let Some(holder) = by.and_then(|by| self.links.get(&by)) {
+            // If the queue is full, the link closes for that reason elsewhere.
+            holder.control.send(Control::IdentityInUse { place: Place::from(remote) });
+        }
+        self.control_drops.count_from("identity_in_use", node);
+        let called = self.called(&node);
+        if self.alerts.peer_in_use(node, &place, remote, Instant::now()) {
+            warn!(
+                "the identity {called} is in use at two places: {place} has its links, {remote} is kept out"
+            );
+        } else {
+            debug!(
+                "the identity {called} is in use at two places: {place} has its links, {remote} is kept out"
+            );
+        }
+    }
+
+    /// Handles a link that a peer closed because another process with this node's identity took its place.
+    pub(super) fn displaced(&mut self, place: &str) {
+        self.router.handle_superseded();
+        // Joins over that link are lost. Their data goes to the other process now, and from there perhaps to the same
+        // programs.
+        self.drain();
+        for (name, sink) in &self.sinks {
+            if self.endpoint.join_status(name) != Some(JoinStatus::Granted) {
+                sink.begin_anew();
+            }
+        }
+        let node = self.identity.node_name();
+        if self.alerts.displaced(place, Instant::now()) {
+            warn!(
+                "the identity {node} is in use at another place: {place}, which has the links of this node; it is tried \
+                 again with growing patience"
+            );
+        }
+    }
+
+    /// Handles a peer's report that it keeps out another process with this node's identity.
+    pub(super) fn kept_out(&mut self, link: LinkId, place: Place) {
+        let Some(entry) = self.links.get(&link) else { return };
+        // Other peers have no links from which a process could be kept out.
+        if !entry.link.peer().may_route && entry.url.is_none() {
+            self.control_drops.count_from("unknown", link);
+            return;
+        }
+        let (node, place) = (self.identity.node_name(), SocketAddr::from(place));
+        if self.alerts.kept_out(place, Instant::now()) {
+            warn!(
+                "the identity {node} is in use at another place: {place}, which is kept out while this node has its links"
+            );
+        }
+    }
+
+    /// Compares the clock with the time that a peer told.
+    pub(super) fn compare_clocks(&self, link: LinkId) {
+        let Some(entry) = self.links.get(&link) else { return };
+        let ahead_ms = self.router.clock_ahead_ms(link).filter(|ms| clocks_differ(*ms));
+        let Some(ahead_ms) = ahead_ms else { return };
+        if self.control_drops.count_from("clocks_differ", link) {
+            let (peer, remote) = (self.called(&entry.link.peer().node_id), entry.link.remote().to_string());
+            let alert = Alert::ClocksDiffer { peer, remote, ahead_ms };
+            warn!("{alert}; {}", alert.fix());
+        }
+    }
+
+    /// Checks whether the clock has reached the beginning of this node's certificate.
+    pub(super) fn await_clock(&mut self, unix: UnixMillis) {
+        if clock_alert(&self.identity, unix).is_none() {
+            self.awaits_clock = false;
+            info!("the clock is set: this node's certificate holds");
+        }
+    }
+
+    /// Returns the current alerts.
+    pub(super) fn alerts(&self) -> Vec<Alert> {
+        let now = now();
+        let mut alerts = Vec::from_iter(clock_alert(&self.identity, now.unix));
+        let node = self.identity.node_name().as_str();
+        alerts.extend(self.alerts.shown(node, |peer| self.called(peer), now.instant));
+        alerts.extend(sgc_dds::unsent().and_then(|unsent| {
+            let ago_s = now.instant.saturating_duration_since(unsent.last).as_secs();
+            let (to, packets) = (unsent.to, unsent.packets);
+            let is_of_before = self.reopening.last.is_some_and(|reopened| unsent.last < reopened);
+            (ago_s < UNSENT_SHOWN_S && !is_of_before).then_some(Alert::LocalNetworkFails {
+                to,
+                packets,
+                ago_s,
+            })
+        }));
+        let closed = self.reopening.failed.clone();
+        alerts.extend(closed.map(|reason| Alert::LocalNetworkClosed { reason }));
+        alerts.extend(strangers::alerts());
+        alerts.extend(self.links.iter().filter_map(|(id, entry)| {
+            let ahead_ms = self.router.clock_ahead_ms(*id).filter(|ms| clocks_differ(*ms))?;
+            let peer = self.called(&entry.link.peer().node_id);
+            Some(Alert::ClocksDiffer { peer, remote: entry.link.remote().to_string(), ahead_ms })
+        }));
+        alerts
+    }
+}

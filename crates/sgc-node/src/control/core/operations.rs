@@ -1,0 +1,143 @@
+//! Operations on the fleet: requests of this node's users to an authority, and requests of operators to this authority.
+
+use std::time::Instant;
+
+use bytes::Bytes;
+use rand_core::{OsRng, TryRngCore as _};
+use sgc_endpoint::{JoinStatus, RefusedBy};
+use sgc_ros::RosNetwork;
+use sgc_trust::{NodeName, VerifiedPeer};
+use sgc_wire::{Name, NodeId, Operation, OperationAnswer, RefuseReason, SinkId};
+use tokio::sync::oneshot;
+use tracing::{info, warn};
+
+use super::{Core, now};
+use crate::control::operations::{OperationError, Step, UserOperation};
+use crate::control::operators::{OperationOutcome, RequestStep};
+use crate::state::audit::{AuditEvent, AuditRecord};
+
+/// Counts repeated operations, which were not carried out again.
+const REPEATED: &str = "operation_repeated";
+/// Counts operations of nodes that are no operators.
+const NOT_PERMITTED: &str = "operation_not_permitted";
+
+/// Requests of this node's users.
+impl<N: RosNetwork> Core<N> {
+    pub(super) fn operate(
+        &mut self,
+        at: &NodeName,
+        operation: Operation,
+        reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
+    ) {
+        let Some(authority) = self.identity.node_id_of(at.as_str()) else {
+            let _ = reply.send(Err(OperationError::NoSecret));
+            return;
+        };
+        if authority == self.identity.node_id() {
+            let _ = reply.send(Err(OperationError::OwnName { at: at.to_string() }));
+            return;
+        }
+        let is_named = self.identity.authority() == Some(authority);
+        let wish = UserOperation { at: at.to_string(), authority, is_named, operation, reply };
+        self.operations.push(Instant::now(), wish);
+        self.next_operation();
+    }
+
+    pub(super) fn operation_answered(&mut self, name: Name, answer: OperationAnswer) {
+        let step = self.operations.answered(name, answer);
+        self.operation_step(step);
+    }
+
+    pub(super) fn operation_denied(&mut self, name: Name, by: RefusedBy) {
+        let step = self.operations.denied(name, by);
+        self.operation_step(step);
+    }
+
+    pub(super) fn operations_due(&mut self, at: Instant) {
+        if self.operations.deadline().is_some_and(|due| due <= at) {
+            let asked = self.operations.name().and_then(|name| self.endpoint.join_status(&name));
+            let is_found = !matches!(asked, None | Some(JoinStatus::Waiting));
+            let step = self.operations.look(at, is_found);
+            self.operation_step(step);
+        }
+    }
+
+    fn operation_step(&mut self, step: Option<Step>) {
+        match step {
+            Some(Step::Ask(authority, request)) => {
+                let name = self.endpoint.operate(now(), authority, &request);
+                self.operations.asked(name);
+            }
+            Some(Step::Leave(name)) => {
+                self.endpoint.leave(now(), &name);
+                self.next_operation();
+            }
+            None => {}
+        }
+    }
+
+    fn next_operation(&mut self) {
+        let step = self.operations.next(Instant::now());
+        self.operation_step(step);
+    }
+}
+
+/// Requests to this authority.
+impl<N: RosNetwork> Core<N> {
+    /// Judges an operator's request and queues its operation.
+    pub(super) fn operation_asked(&mut self, sink: SinkId, peer: &VerifiedPeer, request: &Bytes) {
+        let Some(authority) = &mut self.authority else { return };
+        let now = now();
+        let asked = authority.operators.ask(now.instant, peer, sink, request, &mut OsRng.unwrap_err());
+        let node = peer.node_id;
+        match asked {
+            RequestStep::Answer(answer) => self.answer_operator(&node, sink, answer),
+            RequestStep::Again(answer) => {
+                self.control_drops.count_from(REPEATED, node);
+                self.answer_operator(&node, sink, answer);
+            }
+            RequestStep::UnderWay => {
+                self.control_drops.count_from(REPEATED, node);
+            }
+            RequestStep::Job(job) => {
+                // Nodes that are connected now count as present.
+                let here: Vec<_> = self.endpoint.renewing().map(|(_, peer, _)| peer.node_id).collect();
+                authority.note_seen(here, now.unix);
+                match authority.queue.push_operation(job) {
+                    Ok(()) => self.answer_next_batch(),
+                    Err(job) => self.operation_done(job.busy()),
+                }
+            }
+            RequestStep::NotPermitted => {
+                if self.control_drops.count_from(NOT_PERMITTED, node) {
+                    warn!(peer = %node.short(), "refused an operation of a node that is no operator; counted from here on");
+                }
+                let reason = "an operation: it is no operator";
+                self.audit.write(AuditRecord::new(AuditEvent::Refused).peer(&node).reason(reason));
+                self.endpoint.answer_operation(now, sink, Err(RefuseReason::NotPermitted));
+            }
+        }
+    }
+
+    /// Answers an operation that was carried out or refused, and announces a revocation to everyone.
+    pub(super) fn operation_done(&mut self, done: OperationOutcome) {
+        info!(operator = %done.node.short(), operation = done.said, "was asked for an operation");
+        self.audit.write(AuditRecord::new(AuditEvent::Operation).peer(&done.node).reason(&done.said));
+        let waits = self.authority.as_mut().and_then(|authority| authority.operators.done(&done));
+        if let Some(sink) = waits {
+            self.answer_operator(&done.node, sink, done.answer);
+        }
+        if let Some(list) = done.list.map(Bytes::from)
+            && let Err(why) = self.router.add_crl(now(), &list)
+        {
+            warn!(%why, "this authority cannot use its own new revocation list");
+        }
+    }
+
+    fn answer_operator(&mut self, node: &NodeId, sink: SinkId, answer: OperationAnswer) {
+        if let OperationAnswer::Refused { why, .. } = &answer {
+            self.control_drops.count_from(why.key(), *node);
+        }
+        self.endpoint.answer_operation(now(), sink, Ok(answer));
+    }
+}

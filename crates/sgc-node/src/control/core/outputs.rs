@@ -1,0 +1,274 @@
+//! Carries out the outputs of the router and the endpoint, and reports their events.
+
+use rand_chacha::ChaCha20Rng;
+use sgc_endpoint::{Event, Output as EndpointOutput};
+use sgc_ros::{RosNetwork, Routes, UNREACHABLE_HOLD};
+use sgc_router::{DropReason, LinkClose, LinkId, Output as RouterOutput};
+use sgc_transport::{CloseReason, Link};
+use sgc_wire::{Name, Now, RefuseReason, Role};
+use tracing::{debug, info, warn};
+
+use super::{Core, EPOCH_GRACE, graph, now};
+use crate::state::audit::{AuditEvent, AuditRecord};
+
+impl<N: RosNetwork> Core<N> {
+    pub(super) fn router_output(&mut self, output: RouterOutput) {
+        match output {
+            RouterOutput::Send { link: LinkId::LOCAL, frame } => self.endpoint.handle_frame(now(), frame),
+            RouterOutput::Send { link, frame } => {
+                let Some(entry) = self.links.get_mut(&link) else { return };
+                entry.keep_alive.stir();
+                if !entry.control.send(frame) {
+                    self.close_overloaded(link);
+                }
+            }
+            RouterOutput::Flush { link } => {
+                if self.links.get(&link).is_some_and(|entry| !entry.control.flush()) {
+                    self.close_overloaded(link);
+                }
+            }
+            RouterOutput::Forward { name, entry } => self.set_forward(name, entry),
+            RouterOutput::Close { link, reason } => {
+                let Some(entry) = self.links.get_mut(&link) else { return };
+                entry.closed_for = Some(reason.to_string());
+                if matches!(reason, LinkClose::Revoked) {
+                    let record = AuditRecord::new(AuditEvent::Revoked).peer(&entry.link.peer().node_id);
+                    self.audit.write(record.remote(entry.link.remote()).reason("its link is cut"));
+                }
+                match &reason {
+                    LinkClose::Superseded { by, alive } => self.close_superseded(link, *by, *alive),
+                    LinkClose::Goodbye => entry.link.close(CloseReason::Goodbye),
+                    LinkClose::Revoked => {
+                        let peer = entry.link.peer();
+                        let why = self.credentials.objection(peer, now().unix);
+                        let why = why.unwrap_or(CloseReason::Revoked);
+                        info!(%link, peer = %peer.node_id.short(), "{why}; its link is closed");
+                        entry.closed_for = Some(why.to_string());
+                        entry.link.close(why);
+                    }
+                    LinkClose::Expired => {
+                        info!(%link, peer = %entry.link.peer().node_id.short(), "the peer's certificate has ended; its link is closed");
+                        entry.link.close(CloseReason::Expired);
+                    }
+                    LinkClose::TooMany | LinkClose::Forgeries => {
+                        warn!(%link, remote = %entry.link.remote(), peer = %entry.link.peer().node_id.short(), "{reason}; its link is closed");
+                        entry.link.close(CloseReason::Denied(reason.to_string()));
+                    }
+                    LinkClose::Greeting | LinkClose::Loop => {
+                        warn!(%link, remote = %entry.link.remote(), "{reason}");
+                        entry.link.close(CloseReason::Protocol(reason.to_string()));
+                    }
+                }
+            }
+            RouterOutput::Trust(anchors) => {
+                let lists = anchors.crls().count();
+                let record =
+                    AuditRecord::new(AuditEvent::Crl).reason(format!("in force, {lists} lists in all"));
+                self.audit.write(record);
+                self.set_anchors(anchors);
+            }
+            RouterOutput::Dropped(dropped) => {
+                let first = self.control_drops.count_from(dropped.reason.key(), dropped.link);
+                // Honest neighbours may forward statements of which a partner's CA makes too many.
+                let is_told =
+                    dropped.reason.is_suspicious() || matches!(dropped.reason, DropReason::ListFlood { .. });
+                if first && is_told {
+                    let peer = dropped.peer.map(|p| p.short()).unwrap_or_default();
+                    warn!(link = %dropped.link, peer, reason = %dropped.reason, "control frame refused; counted from here on");
+                } else {
+                    debug!(link = %dropped.link, reason = %dropped.reason, "control frame refused");
+                }
+            }
+            RouterOutput::Timeout(_) => {}
+        }
+    }
+
+    fn close_overloaded(&mut self, link: LinkId) {
+        let Some(entry) = self.links.get(&link) else { return };
+        warn!(%link, remote = %entry.link.remote(), "the peer does not take control frames; the link is closed");
+        self.control_drops.count_from("control_queue_full", link);
+        entry.link.close(CloseReason::Overloaded);
+    }
+
+    pub(super) fn endpoint_output(&mut self, output: EndpointOutput) {
+        let now = now();
+        match output {
+            EndpointOutput::Send(frame) => self.router.handle_frame(now, LinkId::LOCAL, frame),
+            EndpointOutput::Dropped(dropped) => {
+                let is_first = self.control_drops.count(dropped.key());
+                if is_first && dropped.is_suspicious() {
+                    warn!(reason = %dropped, "refused; counted from here on");
+                } else {
+                    debug!(reason = %dropped, "refused");
+                }
+            }
+            EndpointOutput::Event(event) => self.endpoint_event(now, event),
+            EndpointOutput::Timeout(_) => {}
+        }
+    }
+
+    pub(super) fn endpoint_event(&mut self, now: Now, event: Event) {
+        self.audit_event(&event);
+        match event {
+            Event::RenewAsked { sink, peer, csr } => self.answer_renewal(sink, peer, csr),
+            Event::OperationAsked { sink, peer, request } => self.operation_asked(sink, &peer, &request),
+            Event::OperationAnswered { name, answer } => self.operation_answered(name, answer),
+            Event::OperationDenied { name, by } => self.operation_denied(name, by),
+            Event::Renewed { credentials } => self.take_credentials(credentials),
+            Event::RenewRefused { by } => {
+                if self.control_drops.count("renewal_refused") {
+                    warn!(reason = %by, "the fleet's authority gives this node no credentials; asking again later");
+                }
+            }
+            Event::Rekeyed { name, grant } => {
+                debug!(name = %name.short(), epoch = grant.epoch, "a new epoch begins");
+                if let Some(share) = self.shares.get(&name) {
+                    share.rekey(grant);
+                }
+            }
+            Event::OwnGrant { name, grant } => self.own_grant(name, grant),
+            Event::Consumers { peer, consumers } => self.consumers_told(now, peer, consumers),
+            Event::ConsumersLost { peer, reason } => self.consumers_lost(now, peer, reason),
+            Event::Types { owner, types } => self.types_told(owner, types),
+            Event::Recover(recover) => {
+                if let Some(share) = self.shares.get(&recover.name)
+                    && !self.replays.ask(share.clone(), recover)
+                {
+                    self.control_drops.count("replays_full");
+                }
+            }
+            Event::Granted { name, sink, grant } => {
+                debug!(name = %name.short(), epoch = grant.epoch, "granted");
+                let entry = grant.entry.as_deref().cloned();
+                if let Some(anew) = self.publishing_granted(now, name, &grant) {
+                    debug!(name = %name.short(), "publishing under it");
+                    self.call_granted(now, name, sink, grant, anew);
+                } else if let Some(local) = self.sinks.get(&name) {
+                    local.grant(sink, grant, &self.data);
+                    self.retire_due.insert(name, now.instant + EPOCH_GRACE);
+                }
+                if let Some(routes) = &mut self.routes {
+                    routes.handle_granted(&name, entry);
+                }
+                self.need_type_of_used(name);
+                self.ask_histories(name);
+            }
+            Event::Followed { peer } => self.hear_of(&peer),
+            event => self.route_event(now, event),
+        }
+    }
+
+    /// Handles events for the route machine only.
+    pub(super) fn route_event(&mut self, now: Now, event: Event) {
+        self.calls_event(&event);
+        let Some(routes) = &mut self.routes else { return };
+        match event {
+            Event::SinkJoined { name, sink, peer, role } => {
+                info!("granted {} to {}", shown(routes, &name), graph::called(&self.audit, &peer));
+                debug!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
+                graph::forget_refusal(&mut self.refused, &name, &peer);
+                if role == Role::Subscribe || routes.is_service(&name) {
+                    routes.handle_sink_joined(&name, sink);
+                }
+                self.consumers.sink_joined(now.instant, peer, name, sink, role);
+            }
+            Event::SinkLeft { name, sink, peer } => {
+                debug!(name = %name.short(), peer = %peer.short(), "a subscriber is gone");
+                routes.handle_sink_left(now.instant, &name, &sink);
+                self.consumers.sink_left(peer, name, sink, now.instant + UNREACHABLE_HOLD);
+            }
+            Event::SinkCut { name, sink, peer, reason } => {
+                info!(
+                    "{} no longer gets {}: {reason}; the others get a new key",
+                    graph::called(&self.audit, &peer),
+                    shown(routes, &name)
+                );
+                debug!(name = %name.short(), peer = %peer.short(), "took a grant back");
+                routes.handle_sink_left(now.instant, &name, &sink);
+                self.consumers.sink_left(peer, name, sink, now.instant);
+            }
+            Event::SinkRefused { name, peer, reason } => {
+                debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
+                graph::remember_refusal(&mut self.refused, name, peer, &reason);
+                if self.control_drops.count_from("join_refused", peer) {
+                    warn!(peer = %peer.short(), %reason, "refused a subscriber; counted from here on");
+                }
+            }
+            Event::Refused { name, by } => {
+                warn!("{} is refused to this node: {by}; asking again later", shown(routes, &name));
+                debug!(name = %name.short(), reason = %by, "refused");
+                routes.handle_refused(&name, by);
+            }
+            Event::Lost { name, reason } => {
+                debug!(name = %name.short(), ?reason, "interrupted; waiting for the way to come back");
+                routes.handle_lost(now.instant, &name);
+            }
+            Event::Catalogue { owner, catalogue } => {
+                debug!(owner = %owner.short(), entries = catalogue.entries.len(), "catalogue");
+                routes.handle_catalogue(now.instant, owner, catalogue);
+                self.types_listed(owner);
+            }
+            Event::OwnerLost { owner, reason } => {
+                info!(
+                    "{} is out of reach: its topics and services wait for it",
+                    graph::called(&self.audit, &owner)
+                );
+                debug!(owner = %owner.short(), ?reason, "owner out of reach");
+                routes.handle_owner_lost(owner, reason);
+            }
+            Event::OwnerRefused { owner, by } => {
+                warn!(
+                    "{} tells this node nothing of what it shares: {by}",
+                    graph::called(&self.audit, &owner)
+                );
+                routes.handle_owner_refused(owner, by);
+            }
+            Event::RenewAsked { .. }
+            | Event::Renewed { .. }
+            | Event::RenewRefused { .. }
+            | Event::OperationAsked { .. }
+            | Event::OperationAnswered { .. }
+            | Event::OperationDenied { .. }
+            | Event::Rekeyed { .. }
+            | Event::OwnGrant { .. }
+            | Event::Recover(_)
+            | Event::Types { .. }
+            | Event::Consumers { .. }
+            | Event::ConsumersLost { .. }
+            | Event::Followed { .. }
+            | Event::Granted { .. } => {}
+        }
+    }
+
+    /// Writes events about access to this node's shares into the audit log.
+    pub(super) fn audit_event(&self, event: &Event) {
+        let about = |event, name| {
+            let topic = self.routes.as_ref().and_then(|routes| routes.topic_of(name));
+            AuditRecord::new(event).topic(topic).name(name)
+        };
+        match event {
+            Event::SinkJoined { name, peer, .. } => {
+                let epoch = self.endpoint.share_grant(name).map_or(0, |grant| grant.epoch);
+                self.audit.write(about(AuditEvent::Granted, name).peer(peer).epoch(epoch));
+            }
+            Event::SinkLeft { name, peer, .. } => self.audit.write(about(AuditEvent::Left, name).peer(peer)),
+            Event::SinkCut { name, peer, reason, .. } => {
+                let revoked = *reason == RefuseReason::Revoked;
+                let event = if revoked { AuditEvent::Revoked } else { AuditEvent::Cut };
+                self.audit.write(about(event, name).peer(peer).reason(reason));
+            }
+            Event::Rekeyed { name, grant } => {
+                self.audit.write(about(AuditEvent::Epoch, name).epoch(grant.epoch));
+            }
+            Event::SinkRefused { name, peer, reason } => {
+                self.audit.write(about(AuditEvent::Refused, name).peer(peer).reason(reason));
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Returns the topic or service of this node behind a name, for the log.
+fn shown(routes: &Routes<ChaCha20Rng>, name: &Name) -> String {
+    routes.topic_of(name).map_or_else(|| name.short(), str::to_owned)
+}

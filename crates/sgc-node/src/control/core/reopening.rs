@@ -1,0 +1,119 @@
+//! Closing and reopening the local network: endpoints end with the old network and are created again on the new one.
+//!
+//! Routes, sources, sinks and calls stay, so other nodes notice only a pause.
+
+use std::any::Any;
+
+use sgc_ros::{DiscoveryEvent, RosNetwork};
+use tracing::debug;
+
+use super::{Core, drop_elsewhere, now};
+use crate::data::calls::Calls;
+use crate::local::rediscovery::Rediscovery;
+
+/// State of reopening the local network.
+#[derive(Default)]
+pub(super) struct Reopening {
+    /// Whether the network is closed and not open again yet.
+    pub(super) is_closed: bool,
+    /// Reason of the last failure to open it.
+    pub(super) failed: Option<String>,
+    pub(super) rediscovery: Rediscovery,
+    /// Time of the last reopening, and their number.
+    pub(super) last: Option<std::time::Instant>,
+    pub(super) times: u64,
+}
+
+impl<N: RosNetwork> Core<N> {
+    /// Ends all endpoints of the local network, which the caller has taken.
+    pub(super) fn close_network(&mut self) {
+        let (endpoints, participants) = match &self.routes {
+            Some(routes) => {
+                (routes.local_endpoints().cloned().collect(), routes.local_participants().collect())
+            }
+            None => (Vec::new(), Vec::new()),
+        };
+        self.reopening.is_closed = true;
+        self.reopening.rediscovery = Rediscovery::new(endpoints, participants);
+        let mut ending: Vec<Box<dyn Any + Send>> = Vec::new();
+        ending.extend(self.readers.values_mut().filter_map(|reader| reader.opened.take()));
+        for (name, source) in self.writers.keys() {
+            if let Some(sink) = self.sinks.get(name) {
+                sink.set_writer(*source, None);
+            }
+        }
+        for calls in self.calls.values() {
+            ending.extend(match calls {
+                Calls::LocalService(served) => {
+                    // Replies of servers reach nobody from here on.
+                    served.servers_gone();
+                    served.set_client(None)
+                }
+                Calls::FarService(called) => called.set_server(None),
+            });
+        }
+        ending.extend(self.consumers.take_shown());
+        self.local_taps.drain(..).for_each(|tap| tap.close());
+        self.graph.endpoints_gone();
+        drop_elsewhere(Box::new(ending));
+    }
+
+    /// Creates the endpoints of the old network on the new one.
+    pub(super) fn network_reopened(&mut self) {
+        let now = now().instant;
+        self.reopening.is_closed = false;
+        self.reopening.failed = None;
+        self.reopening.last = Some(now);
+        self.reopening.times += 1;
+        self.reopening.rediscovery.opened(now);
+        self.graph.endpoints_gone();
+        let readers: Vec<_> =
+            self.readers.iter().map(|(name, reader)| (*name, reader.spec.clone())).collect();
+        let writers: Vec<_> = self.writers.iter().map(|(key, spec)| (*key, spec.clone())).collect();
+        let services: Vec<_> = self.service_ends.iter().map(|(name, spec)| (*name, spec.clone())).collect();
+        debug!(
+            readers = readers.len(),
+            writers = writers.len(),
+            services = services.len(),
+            "the local network is open again"
+        );
+        for (name, spec) in readers {
+            self.open_reader(name, spec);
+        }
+        for ((name, source), spec) in writers {
+            self.open_writer(name, source, spec);
+        }
+        for (name, spec) in services {
+            match self.calls.get(&name) {
+                Some(Calls::LocalService(_)) => self.open_client(name, spec),
+                Some(Calls::FarService(_)) => self.open_server(name, spec),
+                None => {}
+            }
+        }
+        self.consumers.show_soon(now);
+    }
+
+    /// Handles a discovery event, unless the network is closed.
+    pub(super) fn discovered(&mut self, event: DiscoveryEvent) {
+        if self.reopening.is_closed {
+            return;
+        }
+        if let Some(event) = self.reopening.rediscovery.news(event) {
+            self.handle_discovery(event);
+        }
+    }
+
+    /// Reports endpoints that the new network lacks as gone.
+    pub(super) fn rediscovery_due(&mut self, now: std::time::Instant) {
+        for event in self.reopening.rediscovery.handle_timeout(now) {
+            self.handle_discovery(event);
+        }
+    }
+
+    fn handle_discovery(&mut self, event: DiscoveryEvent) {
+        self.calls_discovery(&event);
+        if let Some(routes) = &mut self.routes {
+            routes.handle_discovery(now().instant, event);
+        }
+    }
+}

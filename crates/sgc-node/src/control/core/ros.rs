@@ -1,0 +1,427 @@
+//! Carries out the outputs of the route machine: shares, joins, readers, writers, and forwarding.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use sgc_endpoint::{AskAgain, JoinKind, RecoveryLimits, Source, SourceConfig};
+use sgc_ros::{Command, EndpointSpec, Guid, RosNetwork, Shaping, TF_MESSAGE, service_qos};
+use sgc_router::{FibEntry, LinkId};
+use sgc_trust::{MessageKey, Suite};
+use sgc_wire::{Class, History, Kind, Name, Qos, SourceId};
+use tracing::{debug, error};
+
+use super::publish::Offer;
+use super::{
+    Core, CoreEvent, HISTORY_BYTES_MAX, HISTORY_KEEP_ALL_MAX, HISTORY_RETRY, KEYED_INSTANCES_KEPT,
+    LocalReader, drop_elsewhere, now,
+};
+use crate::data::assertions::{self, ManualLease};
+use crate::data::dataplane::{Forward, Out};
+use crate::data::outflow::{self, OUTFLOW_AGE_MAX, OutFlow};
+use crate::data::sinks::{LocalSink, WriterQueue};
+use crate::data::sources::{LocalShare, Publisher, SourceMap, SourceSlot};
+
+/// Least bytes of recovery kept for one of a topic's many publishers.
+const RECOVERY_BYTES_MIN: usize = 1 << 20;
+
+impl<N: RosNetwork> Core<N> {
+    pub(super) fn carry_out(&mut self, command: Command) {
+        let now = now();
+        match command {
+            Command::Share(spec) => {
+                let topic = spec.metadata.ros_name.clone();
+                let (metadata, type_hash) = (spec.metadata.clone(), spec.type_hash.clone());
+                let is_service = spec.metadata.kind == Kind::Service;
+                match self.endpoint.share(now, spec) {
+                    Ok(name) => {
+                        debug!(%topic, %name, "shared");
+                        let share = LocalShare::new(
+                            name,
+                            self.data.clone(),
+                            self.alive.clone(),
+                            self.epoch_messages_max,
+                            self.epoch_over.clone(),
+                        );
+                        self.shares.insert(name, Arc::new(share));
+                        self.need_type(name, &metadata, type_hash, None);
+                        if is_service {
+                            self.begin_local(name);
+                        }
+                    }
+                    Err(why) => error!("{topic} is not shared: {why}"),
+                }
+            }
+            Command::Shape { name, shaping } => {
+                if let Some(share) = self.shares.get(&name) {
+                    let ages_as_before = share.shaping().max_age == shaping.max_age;
+                    share.set_shaping(shaping);
+                    if !ages_as_before {
+                        self.begin_flows_anew(name);
+                    }
+                }
+                if let Some(wanted) = self.keyless.get_mut(&name) {
+                    wanted.shaping = shaping;
+                }
+                // Messages of other publishers on our share are shaped by those publishers.
+                if let Some(sink) = self.sinks.get(&name).filter(|_| !self.shares.contains_key(&name)) {
+                    sink.set_shaping(shaping);
+                }
+            }
+            Command::Frames { name, prefix } => {
+                if let Some(sink) = self.sinks.get(&name) {
+                    sink.set_frames(prefix);
+                }
+            }
+            Command::UpdateShare { name, qos, sources } => {
+                self.endpoint.update_share(now, &name, qos, sources)
+            }
+            Command::Unshare { name } => {
+                self.endpoint.unshare(now, &name);
+                self.consumers.show_soon(now.instant);
+                self.forget_type(&name);
+                if let Some(share) = self.shares.remove(&name) {
+                    share.close();
+                }
+                self.end_calls(&name);
+                if let Some(sink) = self.sinks.remove(&name) {
+                    sink.close();
+                }
+            }
+            Command::MapSources { name, class, own } => self.map_sources(name, class, own),
+            Command::OpenReader { name, spec } => self.open_reader(name, spec),
+            Command::CloseReader { name } => {
+                self.graph.reader_gone(&name);
+                if let Some(reader) = self.readers.remove(&name).and_then(|reader| reader.opened) {
+                    drop_elsewhere(reader);
+                }
+            }
+            Command::UpdatePolicy { name, policy } => self.endpoint.update_policy(now, &name, policy),
+            Command::Follow { owner_name } => {
+                self.endpoint.follow(now, &owner_name);
+            }
+            Command::Unfollow { owner } => self.endpoint.unfollow(now, &owner),
+            Command::Join { name, owner, transient_local, describe } => {
+                let sink =
+                    LocalSink::new(name, transient_local, self.requests.clone(), self.data.holds().clone());
+                self.sinks.insert(name, Arc::new(sink));
+                self.endpoint.join(now, name, owner, JoinKind::Subscribe { describe });
+            }
+            Command::JoinAgain { name, owner } => {
+                self.endpoint.leave(now, &name);
+                self.endpoint.join(now, name, owner, JoinKind::Subscribe { describe: false });
+            }
+            Command::Publish { name, owner, suite, class, reliable } => {
+                self.publish_under(
+                    name,
+                    Offer { owner, suite, class, reliable, shaping: Shaping::default(), calls: false },
+                );
+            }
+            Command::Call { name, owner, suite, class } => {
+                let shaping = Shaping::default();
+                self.publish_under(name, Offer { owner, suite, class, reliable: true, shaping, calls: true });
+            }
+            Command::OpenClient { name, spec } => self.open_client(name, spec),
+            Command::CloseClient { name } => self.close_client(&name),
+            Command::ServersGone { name } => self.servers_gone(&name),
+            Command::OpenServer { name, spec } => self.open_server(name, spec),
+            Command::CloseServer { name } => self.close_service_end(&name),
+            Command::Leave { name } => {
+                self.endpoint.leave(now, &name);
+                self.forget_type(&name);
+                self.stop_publishing(&name);
+                self.end_calls(&name);
+                if let Some(sink) = self.sinks.remove(&name) {
+                    sink.close();
+                }
+                self.history_due.retain(|(n, _), _| *n != name);
+                self.retire_due.remove(&name);
+            }
+            Command::OpenWriter { name, source, spec } => self.open_writer(name, source, spec),
+            Command::CloseWriter { name, source } => {
+                self.writers.remove(&(name, source));
+                self.graph.writer_gone(&(name, source));
+                if let Some(source) = source {
+                    self.history_due.remove(&(name, source));
+                }
+                if let Some(sink) = self.sinks.get(&name) {
+                    sink.set_writer(source, None);
+                }
+            }
+            Command::ResizeWriter { name, source, spec } => self.resize_writer(name, source, spec),
+            Command::MoveWriter { name, from, to } => self.move_writer(name, from, to),
+            Command::SetNode { name, source, owner, node } => {
+                self.graph.set_node((name, source), owner, node)
+            }
+            Command::Report(problem) => self.problem_log.note(now.instant, &problem),
+        }
+    }
+
+    pub(super) fn map_sources(&mut self, name: Name, class: Class, own: Vec<(Guid, SourceId, Qos)>) {
+        let (Some(share), Some(grant)) = (self.shares.get(&name).cloned(), self.endpoint.share_grant(&name))
+        else {
+            return;
+        };
+        let Some(message_key) = self.message_key(grant.suite) else { return };
+        let old = share.map();
+        // A reply is for one caller, and the call machine remembers it.
+        let is_service = self.calls.contains_key(&name);
+        let recovery = if is_service { RecoveryLimits::NONE } else { RecoveryLimits::default() };
+        // The memory of a topic must not grow with its publishers.
+        let share_of = |bytes: usize, sources: usize| (bytes / sources).max(RECOVERY_BYTES_MIN);
+        // Keys of instances are inside payloads, which are not parsed here, so all instances share one history as in
+        // the local writers.
+        let instances = if self.endpoint.is_keyed(&name) { KEYED_INSTANCES_KEPT } else { 1 };
+        let depth_of = |qos: &Qos| match qos.history {
+            _ if !qos.is_transient_local() => 0,
+            History::KeepAll => HISTORY_KEEP_ALL_MAX,
+            History::KeepLast(n) => (n as usize).saturating_mul(instances).min(HISTORY_KEEP_ALL_MAX),
+        };
+        let slot = |id, qos: &Qos, sources: usize| {
+            let (keeps_history, depth) = (qos.is_transient_local(), depth_of(qos));
+            let config = SourceConfig {
+                name,
+                id,
+                class,
+                reliable: qos.is_reliable(),
+                history_depth: depth,
+                history_bytes_max: HISTORY_BYTES_MAX,
+                recovery: RecoveryLimits { bytes_max: share_of(recovery.bytes_max, sources), ..recovery },
+            };
+            let source = Source::new(config, &grant, message_key.clone())?;
+            let manual = ManualLease::from_qos(qos, Instant::now());
+            let slot = SourceSlot::new(source, keeps_history, qos.is_reliable());
+            Some(SourceSlot { depth, manual, ..slot })
+        };
+        // Publishers that share a source keep the deepest of their histories.
+        let mut depths = BTreeMap::<SourceId, usize>::new();
+        for (_, id, qos) in &own {
+            let depth = depths.entry(*id).or_default();
+            *depth = depth_of(qos).max(*depth);
+        }
+        // No two sources have the same id, since sequence numbers are nonces.
+        let mut map = SourceMap { per_writer: !own.is_empty(), ..SourceMap::default() };
+        for (guid, id, qos) in own {
+            let kept = map.slot(&id).or_else(|| old.slot(&id));
+            let sources = map.own.len() + 1;
+            if let Some(mut slot) = kept.or_else(|| slot(id, &qos, sources)) {
+                let depth = depths.get(&id).copied().unwrap_or_default();
+                if slot.depth != depth {
+                    share.set_history_depth(&slot, depth);
+                    slot.depth = depth;
+                }
+                // The lifespan, unlike reliability and durability, can change while the source exists.
+                slot.lifespan = qos.lifespan_ns.map(Duration::from_nanos);
+                map.own.insert(guid, slot);
+            }
+        }
+        if is_service {
+            let mut id = || self.endpoint.new_source_id();
+            map.shared = old.shared.clone().or_else(|| slot(id(), &service_qos(), 1));
+        }
+        if map.own.values().any(|slot| slot.manual.is_some()) {
+            map.assertions = old.assertions.clone().or_else(|| {
+                let id = self.endpoint.new_source_id();
+                let recovery = RecoveryLimits::NONE;
+                let (history_depth, history_bytes_max, reliable) = (0, 0, true);
+                let config =
+                    SourceConfig { name, id, class, reliable, history_depth, history_bytes_max, recovery };
+                Some(SourceSlot::new(Source::new(config, &grant, message_key.clone())?, false, reliable))
+            });
+        }
+        let sources: BTreeMap<_, _> = map.slots().map(|s| (s.id, s.progress.clone())).collect();
+        self.endpoint.set_sources(now(), &name, sources.into_values().collect());
+        share.set_map(map);
+        if share.begins_watch() {
+            tokio::spawn(assertions::watch(Arc::downgrade(&share), self.network.clone()));
+        }
+    }
+
+    /// Returns the signing key of a suite, one for the whole node. Keys that take long to create exist before they are
+    /// needed.
+    pub(super) fn message_key(&mut self, suite: u8) -> Option<MessageKey> {
+        let suite = Suite::from_id(suite)?;
+        Some(self.message_keys.entry(suite).or_insert_with(|| MessageKey::generate(suite)).clone())
+    }
+
+    /// Creates a reader. While the network is closed, it is only noted. A reader that replaces another skips samples
+    /// that the other took.
+    pub(super) fn open_reader(&mut self, name: Name, spec: EndpointSpec) {
+        let Some(share) = self.shares.get(&name).cloned() else { return };
+        let newest = self.readers.remove(&name).and_then(|old| old.newest);
+        let newest = newest.or_else(|| spec.qos.is_transient_local().then(Arc::default));
+        let wanted = LocalReader { spec: spec.clone(), opened: None, newest: newest.clone() };
+        self.readers.insert(name, wanted);
+        let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
+        let publisher = Box::new(Publisher::new(share, newest));
+        let alive = self.alive.clone();
+        let failures = self.ros_failures.clone();
+        tokio::task::spawn_blocking(move || match network.create_reader(&spec, publisher) {
+            Ok(reader) => {
+                let _ = events.blocking_send(CoreEvent::ReaderReady {
+                    name,
+                    spec,
+                    guid: network.reader_guid(&reader),
+                    reader: Box::new((reader, alive)),
+                });
+            }
+            Err(why) => {
+                failures.count("create_reader");
+                error!("{why}");
+            }
+        });
+    }
+
+    pub(super) fn open_writer(&mut self, name: Name, source: Option<SourceId>, spec: EndpointSpec) {
+        self.writers.insert((name, source), spec.clone());
+        let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
+        let alive = self.alive.clone();
+        let failures = self.ros_failures.clone();
+        let shaping = self.sinks.get(&name).map(|sink| sink.shaping()).unwrap_or_default();
+        let frames = self.sinks.get(&name).map(|sink| sink.frames()).filter(|_| spec.type_name == TF_MESSAGE);
+        let types = self.sinks.get(&name).map(|sink| sink.types().clone()).unwrap_or_default();
+        tokio::task::spawn_blocking(move || {
+            let writer = network.create_writer(&spec).map_err(|e| e.to_string()).and_then(|writer| {
+                WriterQueue::spawn(writer, &spec, shaping, frames, types, failures.clone(), alive)
+                    .map_err(|e| e.to_string())
+            });
+            let writer = writer
+                .inspect_err(|why| {
+                    failures.count("create_writer");
+                    error!("{why}");
+                })
+                .ok();
+            let _ = events.blocking_send(CoreEvent::WriterReady { name, source, spec, writer });
+        });
+    }
+
+    /// Reduces the number of messages that a writer gives late joiners.
+    fn resize_writer(&mut self, name: Name, source: Option<SourceId>, spec: EndpointSpec) {
+        let History::KeepLast(depth) = spec.qos.history else { return };
+        let Some(writer) = self.sinks.get(&name).and_then(|sink| sink.open_writer(source)) else {
+            // The writer does not exist yet. When it is ready, it is found to be outdated.
+            return self.open_writer(name, source, spec);
+        };
+        self.writers.insert((name, source), spec);
+        let alive = self.alive.clone();
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            writer.resize(depth);
+        });
+    }
+
+    /// Moves a writer to another source of the same publisher.
+    fn move_writer(&mut self, name: Name, from: SourceId, to: SourceId) {
+        let Some(spec) = self.writers.remove(&(name, Some(from))) else { return };
+        self.history_due.remove(&(name, from));
+        if self.sinks.get(&name).is_some_and(|sink| sink.move_writer(from, to)) {
+            self.graph.writer_moved(name, from, to);
+            self.writers.insert((name, Some(to)), spec);
+            return self.ask_history(name, to);
+        }
+        // The writer does not exist yet. When it is ready, it is found to be outdated.
+        self.open_writer(name, Some(to), spec);
+    }
+
+    /// Asks for all messages that a sink's writers lack.
+    pub(super) fn ask_histories(&mut self, name: Name) {
+        let Some(sink) = self.sinks.get(&name) else { return };
+        for source in sink.unsynced() {
+            self.ask_history(name, source);
+        }
+    }
+
+    pub(super) fn ask_history(&mut self, name: Name, source: SourceId) {
+        let from = self.sinks.get(&name).and_then(|sink| sink.ask(source));
+        self.recover(name, source, from.map_or(AskAgain::No, AskAgain::From));
+    }
+
+    /// Asks for a history again after a while.
+    pub(super) fn ask_history_again(&mut self, name: Name, source: SourceId) {
+        let again = self.sinks.get(&name).map_or(AskAgain::No, |sink| sink.ask_again(source));
+        self.recover(name, source, again);
+    }
+
+    fn recover(&mut self, name: Name, source: SourceId, ask: AskAgain) {
+        match ask {
+            AskAgain::No => return,
+            AskAgain::Wait => {}
+            AskAgain::From(from) => self.endpoint.recover(name, source, from, u64::MAX),
+        }
+        self.history_due.insert((name, source), Instant::now() + HISTORY_RETRY);
+    }
+
+    /// Applies new settings to the queues of a name. Queued packets are still sent.
+    fn begin_flows_anew(&mut self, name: Name) {
+        let Some((entry, _)) = self.entries.get(&name) else { return };
+        let entry = entry.clone();
+        for link in self.links.values_mut() {
+            if let Some(flow) = link.flows.remove(&name) {
+                flow.close();
+            }
+        }
+        self.set_forward(name, Some(entry));
+    }
+
+    pub(super) fn set_forward(&mut self, name: Name, entry: Option<FibEntry>) {
+        let Some(entry) = entry else {
+            self.entries.remove(&name);
+            self.want_lanes(name);
+            self.data.set(name, None);
+            for link in self.links.values_mut() {
+                if let Some(flow) = link.flows.remove(&name) {
+                    flow.close();
+                }
+            }
+            return;
+        };
+        let stats = self.entries.get(&name).map(|(_, stats)| stats.clone()).unwrap_or_default();
+        let wanted = entry.links();
+        let max_age = self.shares.get(&name).and_then(|share| share.shaping().max_age);
+        let max_age = max_age.map_or(OUTFLOW_AGE_MAX, |max_age| max_age.min(OUTFLOW_AGE_MAX));
+        let waits = outflow::FlowLimits { max_age, ..outflow::FlowLimits::default() };
+        let mut outs = Vec::new();
+        for id in &wanted {
+            if *id == LinkId::LOCAL {
+                if let Some(sink) = self.sinks.get(&name) {
+                    outs.push((*id, Out::Local(sink.clone())));
+                }
+            } else if let Some(link) = self.links.get_mut(id) {
+                let (to, control) = (&link.link, &mut link.control);
+                let begin = || {
+                    let lanes = control.lanes().clone();
+                    OutFlow::spawn(to.clone(), name, control.label(name), lanes, waits)
+                };
+                let flow = link.flows.entry(name).or_insert_with(begin).clone();
+                outs.push((*id, Out::Link(flow, link.control.activity().clone())));
+            }
+        }
+        for (id, link) in &mut self.links {
+            if !wanted.contains(id)
+                && let Some(flow) = link.flows.remove(&name)
+            {
+                flow.close();
+            }
+        }
+        self.data.set(name, Some(Forward::new(entry.clone(), outs, stats.clone())));
+        self.entries.insert(name, (entry, stats));
+        self.want_lanes(name);
+    }
+
+    /// Adjusts the lanes of a name to its links and to the configuration.
+    fn want_lanes(&self, name: Name) {
+        let dedicated = self.routes.as_ref().is_some_and(|routes| routes.is_dedicated(&name));
+        let entry = self.entries.get(&name).map(|(entry, _)| entry);
+        for (id, link) in &self.links {
+            let carries = |entry: &FibEntry| {
+                entry.links().contains(id) || entry.trees.iter().any(|tree| tree.up == *id)
+            };
+            link.control.lanes().set_wanted(name, dedicated && entry.is_some_and(carries));
+        }
+    }
+
+    /// Adjusts the lanes of all names.
+    pub(super) fn want_all_lanes(&self) {
+        self.entries.keys().for_each(|name| self.want_lanes(*name));
+    }
+}

@@ -1,0 +1,307 @@
+//! Services: calls of local clients to other nodes, and calls of other nodes to local servers.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use sgc_endpoint::{CallLoss, CallStats, Event};
+use sgc_ros::{DiscoveryEvent, RosNetwork, RouteStatus, ServiceSpec, ServiceTopic, Shaping};
+use sgc_wire::{Name, Now, SinkId, TopicGrant};
+use tracing::error;
+
+use super::{Core, CoreEvent, EPOCH_GRACE, ServiceEnd, drop_elsewhere};
+use crate::admin::graph::{LostCalls, ServiceCalls};
+use crate::data::call_ledger::{CallLedger, CallerId, LEDGERS_MAX};
+use crate::data::calls::{Answers, Calls, FarService, LocalService, Requests};
+use crate::data::sinks::{LocalSink, WriterInfo, WriterQueue};
+
+impl<N: RosNetwork> Core<N> {
+    /// Starts a shared service. Incoming messages are calls, not messages of publishers.
+    pub(super) fn begin_local(&mut self, name: Name) {
+        let Some(share) = self.shares.get(&name) else { return };
+        let (share, ledger) = (share.clone(), self.call_ledger(name, true));
+        let served = Arc::new(LocalService::new(share, self.ros_failures.clone(), ledger));
+        let takes = served.clone();
+        self.begin_calls(name, Calls::LocalService(served), move |message| takes.take(message));
+    }
+
+    /// Starts a used service. Incoming messages are replies.
+    pub(super) fn begin_far(&mut self, name: Name) {
+        let Some(share) = self.shares.get(&name) else { return };
+        let (share, ledger) = (share.clone(), self.call_ledger(name, false));
+        let called = FarService::new(share, self.ros_failures.clone(), ledger, self.epoch_over.clone());
+        let called = Arc::new(called);
+        let takes = called.clone();
+        self.begin_calls(name, Calls::FarService(called), move |message| takes.take(message));
+    }
+
+    /// Returns the ledger of a service's lost calls, over all its routes so far.
+    fn call_ledger(&mut self, name: Name, is_served: bool) -> Arc<CallLedger> {
+        if self.call_ledgers.len() >= LEDGERS_MAX && !self.call_ledgers.contains_key(&name) {
+            let ended = self.call_ledgers.keys().find(|name| !self.calls.contains_key(*name)).copied();
+            if let Some(name) = ended {
+                self.call_ledgers.remove(&name);
+            }
+        }
+        let failures = self.ros_failures.clone();
+        let new = || Arc::new(CallLedger::new(is_served, failures));
+        self.call_ledgers.entry(name).or_insert_with(new).clone()
+    }
+
+    fn begin_calls(
+        &mut self,
+        name: Name,
+        calls: Calls,
+        mut take: impl FnMut(sgc_endpoint::Message) + Send + 'static,
+    ) {
+        let (alive, failures) = (self.alive.clone(), self.ros_failures.clone());
+        let queue = match WriterQueue::spawn_with(
+            "sgc-calls",
+            WriterInfo::default(),
+            Shaping::default(),
+            failures,
+            alive,
+            move |message, _| take(message),
+        ) {
+            Ok(queue) => queue,
+            Err(why) => return error!(%why, "a service has no thread and cannot be used"),
+        };
+        let sink = LocalSink::new(name, false, self.requests.clone(), self.data.holds().clone());
+        let sink = Arc::new(sink);
+        sink.set_writer(None, Some(queue));
+        self.sinks.insert(name, sink);
+        self.calls.insert(name, calls);
+    }
+
+    /// Ends a service that is no longer shared or used.
+    pub(super) fn end_calls(&mut self, name: &Name) {
+        if let Some(calls) = self.calls.get(name) {
+            calls.withdraw();
+        }
+        self.close_calls(name);
+    }
+
+    fn close_calls(&mut self, name: &Name) {
+        self.service_ends.remove(name);
+        self.graph.service_gone(name);
+        if let Some(old) = self.calls.remove(name).and_then(|calls| calls.close()) {
+            drop_elsewhere(old);
+        }
+    }
+
+    pub(super) fn close_all_calls(&mut self) {
+        for name in self.calls.keys().copied().collect::<Vec<_>>() {
+            self.close_calls(&name);
+        }
+    }
+
+    /// Handles the owner's grant to call a service.
+    pub(super) fn call_granted(&mut self, now: Now, name: Name, sink: SinkId, grant: TopicGrant, anew: bool) {
+        let (Some(Calls::FarService(called)), Some(local)) = (self.calls.get(&name), self.sinks.get(&name))
+        else {
+            return;
+        };
+        local.grant(sink, grant, &self.data);
+        self.retire_due.insert(name, now.instant + EPOCH_GRACE);
+        called.granted(sink, anew);
+    }
+
+    /// Handles endpoint events about services.
+    pub(super) fn calls_event(&self, event: &Event) {
+        let name = match event {
+            Event::SinkJoined { name, .. } | Event::SinkLeft { name, .. } | Event::SinkCut { name, .. } => {
+                name
+            }
+            Event::Lost { name, .. } => {
+                if let Some(Calls::FarService(called)) = self.calls.get(name) {
+                    called.lost();
+                }
+                return;
+            }
+            _ => return,
+        };
+        if let Some(Calls::LocalService(served)) = self.calls.get(name) {
+            served.set_callers(self.endpoint.publishers(name));
+        }
+    }
+
+    /// Ends the calls of a local client or server that disappeared.
+    pub(super) fn calls_discovery(&self, event: &DiscoveryEvent) {
+        let DiscoveryEvent::Vanished { guid } = event else { return };
+        for calls in self.calls.values() {
+            match calls {
+                Calls::FarService(called) => called.endpoint_gone(guid),
+                Calls::LocalService(served) => served.endpoint_gone(guid),
+            }
+        }
+    }
+
+    /// Asks for the state of calls without news for long.
+    pub(super) fn calls_due(&self, now: Instant) {
+        for calls in self.calls.values() {
+            if let Calls::FarService(called) = calls {
+                called.ask_due(now);
+            }
+        }
+    }
+
+    pub(super) fn calls_deadline(&self) -> Option<Instant> {
+        let deadline = |calls: &Calls| match calls {
+            Calls::FarService(called) => called.deadline(),
+            Calls::LocalService(_) => None,
+        };
+        self.calls.values().filter_map(deadline).min()
+    }
+
+    pub(super) fn servers_gone(&self, name: &Name) {
+        if let Some(Calls::LocalService(served)) = self.calls.get(name) {
+            served.servers_gone();
+        }
+    }
+
+    pub(super) fn open_client(&mut self, name: Name, spec: ServiceSpec) {
+        let Some(Calls::LocalService(served)) = self.calls.get(&name).cloned() else { return };
+        if served.keep_client() {
+            return;
+        }
+        self.make_service_end(name, spec, move |network, spec| {
+            let handler = Box::new(Answers(served));
+            network.create_client(spec, handler).map(|client| ServiceEnd::Client(Arc::new(client)))
+        });
+    }
+
+    pub(super) fn close_client(&mut self, name: &Name) {
+        self.service_ends.remove(name);
+        if let Some(Calls::LocalService(served)) = self.calls.get(name)
+            && let Some(old) = served.end_client()
+        {
+            self.graph.service_gone(name);
+            drop_elsewhere(old);
+        }
+    }
+
+    pub(super) fn open_server(&mut self, name: Name, spec: ServiceSpec) {
+        let Some(Calls::FarService(called)) = self.calls.get(&name).cloned() else { return };
+        self.make_service_end(name, spec, move |network, spec| {
+            let handler = Box::new(Requests(called));
+            network.create_server(spec, handler).map(|server| ServiceEnd::Server(Arc::new(server)))
+        });
+    }
+
+    pub(super) fn close_service_end(&mut self, name: &Name) {
+        self.service_ends.remove(name);
+        self.graph.service_gone(name);
+        if let Some(Calls::FarService(called)) = self.calls.get(name)
+            && let Some(old) = called.set_server(None)
+        {
+            drop_elsewhere(old);
+        }
+    }
+
+    fn make_service_end(
+        &mut self,
+        name: Name,
+        spec: ServiceSpec,
+        make: impl FnOnce(&N, &ServiceSpec) -> Result<ServiceEnd, sgc_ros::RosError> + Send + 'static,
+    ) {
+        self.service_ends.insert(name, spec.clone());
+        if let (Some(calls), Some((_, service, _))) =
+            (self.calls.get(&name), ServiceTopic::parse(&spec.request.topic, &spec.request.type_name))
+        {
+            calls.ledger().set_topic(service);
+        }
+        let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
+        let (alive, failures) = (self.alive.clone(), self.ros_failures.clone());
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            match make(&network, &spec) {
+                Ok(end) => drop(events.blocking_send(CoreEvent::ServiceReady { name, spec, end })),
+                Err(why) => {
+                    failures.count("create_service");
+                    error!("{why}");
+                }
+            }
+        });
+    }
+
+    pub(super) fn service_ready(&mut self, name: Name, spec: &ServiceSpec, end: ServiceEnd) {
+        let wanted = !self.reopening.is_closed && self.service_ends.get(&name) == Some(spec);
+        if wanted {
+            self.graph.service_there(
+                name,
+                match &end {
+                    ServiceEnd::Client(client) => client.guids(),
+                    ServiceEnd::Server(server) => server.guids(),
+                },
+            );
+        }
+        let old = match (self.calls.get(&name).filter(|_| wanted), end) {
+            (Some(Calls::LocalService(served)), ServiceEnd::Client(client)) => {
+                served.set_client(Some(client))
+            }
+            (Some(Calls::FarService(called)), ServiceEnd::Server(server)) => called.set_server(Some(server)),
+            (_, ServiceEnd::Client(client)) => Some(Box::new(client) as _),
+            (_, ServiceEnd::Server(server)) => Some(Box::new(server) as _),
+        };
+        if let Some(old) = old {
+            drop_elsewhere(old);
+        }
+    }
+
+    /// Adds the statistics of calls to a route's status.
+    pub(super) fn describe_calls(&self, route: &mut RouteStatus) {
+        if let Some(calls) = route.name.and_then(|name| self.calls.get(&name)) {
+            let CallStats { calls: now, open, answered: answered_now } = calls.stats();
+            let (_, past, losses) = calls.ledger().read();
+            let (calls, answered) = (past.calls + now, past.answered + answered_now);
+            let refused = losses.get(&CallLoss::Refused).map_or(0, |losses| losses.count);
+            let lost = losses.values().map(|losses| losses.count).sum::<u64>() - refused;
+            let counts = format!(
+                ", {calls} calls, {open} in progress, {answered} answered, {refused} refused, {lost} lost"
+            );
+            route.state.push_str(&counts);
+        }
+    }
+
+    /// Returns the services with lost calls.
+    pub(super) fn lost_calls(&self) -> Vec<ServiceCalls> {
+        let of_service = |(name, ledger): (&Name, &Arc<CallLedger>)| {
+            let (topic, _, losses) = ledger.read();
+            let lost = losses.into_iter().map(|(loss, losses)| LostCalls {
+                reason: loss.key().to_owned(),
+                count: losses.count,
+                since_answer: losses.since_answer,
+                by: self.named_callers(name, losses.by),
+                last_s: losses.last.elapsed().as_secs(),
+            });
+            let lost: Vec<_> = lost.collect();
+            (!lost.is_empty()).then_some(ServiceCalls { topic, is_served: ledger.is_served, lost })
+        };
+        self.call_ledgers.iter().filter_map(of_service).collect()
+    }
+
+    fn named_callers(&self, name: &Name, by: BTreeMap<CallerId, u64>) -> BTreeMap<String, u64> {
+        let mut named = BTreeMap::new();
+        for (of, calls) in by {
+            if let Some(caller) = self.caller_name(name, of) {
+                *named.entry(caller).or_default() += calls;
+            }
+        }
+        named
+    }
+
+    /// Returns the caller's name, if the caller still exists.
+    fn caller_name(&self, name: &Name, of: CallerId) -> Option<String> {
+        match of {
+            CallerId::Client(guid) => {
+                let node = self.routes.as_ref()?.node_of(&guid)?;
+                Some(format!("{}/{}", node.namespace().trim_end_matches('/'), node.name()))
+            }
+            CallerId::Source(source) => {
+                let sink = *self.endpoint.publishers(name).get(&source)?;
+                let granted = self.endpoint.granted(name);
+                granted.into_iter().find(|(id, _)| *id == sink).map(|(_, peer)| self.called(&peer))
+            }
+        }
+    }
+}

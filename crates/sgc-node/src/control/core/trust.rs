@@ -1,0 +1,212 @@
+//! Trust that changes while the node runs: its own credentials, revocations, and as an authority the credentials of
+//! members.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use sgc_ros::RosNetwork;
+use sgc_transport::{CloseReason, Link as _};
+use sgc_trust::{Identity, TrustAnchors, VerifiedPeer};
+use sgc_wire::{Credentials, RefuseReason, SinkId};
+use tracing::{info, warn};
+
+use super::{Core, CoreEvent, now};
+use crate::control::authority::{Asker, DeskAnswers, RenewalAnswer, RenewalRefusal, RenewalRequest};
+use crate::state::audit::{AuditEvent, AuditRecord};
+use crate::state::credentials::{renew_at, renewed};
+
+impl<N: RosNetwork> Core<N> {
+    /// Asks the authority for credentials, if the identity names one or this node is the authority.
+    pub(super) fn ask_renewal(&mut self) {
+        let now = now();
+        let asked = if self.authority.is_some() {
+            self.renew_own();
+            true
+        } else {
+            self.endpoint.renew(now, self.identity.csr().into())
+        };
+        if asked {
+            self.renew_due = Some(renew_at(&self.identity, now));
+        }
+    }
+
+    /// Queues a member's request for the fleet file.
+    pub(super) fn answer_renewal(&mut self, sink: SinkId, peer: VerifiedPeer, csr: Bytes) {
+        self.queue_renewal(RenewalRequest { asker: Asker::Member(sink), peer, csr });
+        self.answer_next_batch();
+    }
+
+    /// Queues this authority's own request, since no route leads from a node to itself.
+    fn renew_own(&mut self) {
+        let (peer, csr) = (self.identity.as_peer().clone(), self.identity.csr().into());
+        self.queue_renewal(RenewalRequest { asker: Asker::Own, peer, csr });
+        self.answer_next_batch();
+    }
+
+    fn queue_renewal(&mut self, request: RenewalRequest) {
+        let (asker, node) = (request.asker, request.peer.node_id);
+        let queued = self.authority.as_mut().map_or(Ok(()), |authority| authority.queue.push(request));
+        if let Err(why) = queued {
+            self.renewal_ready(RenewalAnswer { asker, node, answer: Err(why) });
+        }
+    }
+
+    /// Answers the waiting requests on a blocking thread, unless a batch is under way.
+    pub(super) fn answer_next_batch(&mut self) {
+        let (Some(authority), Some(events)) = (&mut self.authority, self.events.upgrade()) else { return };
+        let Some(job) = authority.next_job() else { return };
+        let alive = self.alive.clone();
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            let _ = events.blocking_send(CoreEvent::DeskAnswered(job(now())));
+        });
+    }
+
+    /// Records the revocations of these lists in the fleet file, if this node is the authority.
+    fn catch_up_file(&self, anchors: Arc<TrustAnchors>) {
+        let Some(job) = self.authority.as_ref().map(|authority| authority.catch_up_job(anchors)) else {
+            return;
+        };
+        let alive = self.alive.clone();
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            job(now());
+        });
+    }
+
+    /// Sends the answers of a batch.
+    pub(super) fn desk_answered(&mut self, answers: DeskAnswers) {
+        let DeskAnswers { renewals, operations } = answers;
+        operations.into_iter().for_each(|done| self.operation_done(done));
+        renewals.into_iter().for_each(|answer| self.renewal_ready(answer));
+        if let Some(authority) = &mut self.authority {
+            authority.queue.end_batch();
+        }
+        self.answer_next_batch();
+    }
+
+    fn renewal_ready(&mut self, RenewalAnswer { asker, node, answer }: RenewalAnswer) {
+        if let Err(why) = &answer
+            && self.control_drops.count_from(why.key(), node)
+        {
+            warn!(peer = %node.short(), %why, "refused credentials; counted from here on");
+        }
+        if answer.is_ok()
+            && let Some(authority) = &mut self.authority
+        {
+            authority.note_seen([node], now().unix);
+        }
+        let answer = answer.map_err(RenewalRefusal::refuse_reason);
+        match asker {
+            Asker::Own => self.own_renewal(answer),
+            Asker::Member(sink) => self.give_credentials(sink, answer),
+        }
+    }
+
+    fn own_renewal(&mut self, answer: Result<Credentials, RefuseReason>) {
+        match answer {
+            Ok(credentials) => self.take_credentials(credentials),
+            Err(reason) => {
+                if self.control_drops.count("renewal_refused") {
+                    warn!(%reason, "the fleet's file has no credentials for this node; asking again later");
+                }
+            }
+        }
+    }
+
+    /// Sends a member its credentials, or a refusal.
+    fn give_credentials(&mut self, sink: SinkId, answer: Result<Credentials, RefuseReason>) {
+        let peer = self.endpoint.renewing().find(|(id, ..)| *id == sink).map(|(_, peer, _)| peer.node_id);
+        if let Some(peer) = peer {
+            let record = |event| AuditRecord::new(event).peer(&peer);
+            match &answer {
+                Ok(credentials) if credentials.chain.is_empty() => {}
+                Ok(_) => self.audit.write(record(AuditEvent::Renewed)),
+                Err(reason) => self.audit.write(record(AuditEvent::Refused).reason(reason)),
+            }
+        }
+        self.endpoint.answer_renewal(now(), sink, answer);
+    }
+
+    /// Closes incoming links of nodes that may no longer attach.
+    pub(super) fn close_not_admitted(&mut self) {
+        for (link, entry) in &mut self.links {
+            let peer = entry.link.peer();
+            if entry.url.is_none() && !self.credentials.admits(peer) {
+                let why = CloseReason::not_admitted();
+                info!(%link, peer = %peer.node_id.short(), "{why}; its link is closed");
+                entry.closed_for = Some(why.to_string());
+                entry.link.close(why);
+            }
+        }
+    }
+
+    /// Answers every member again, since the fleet file may have changed.
+    pub(super) fn answer_renewals(&mut self) {
+        if self.authority.is_none() {
+            return;
+        }
+        let request = |(sink, peer, csr): (SinkId, &VerifiedPeer, &Bytes)| RenewalRequest {
+            asker: Asker::Member(sink),
+            peer: peer.clone(),
+            csr: csr.clone(),
+        };
+        let asked: Vec<_> = self.endpoint.renewing().map(request).collect();
+        asked.into_iter().for_each(|request| self.queue_renewal(request));
+        self.renew_own();
+    }
+
+    pub(super) fn take_credentials(&mut self, credentials: Credentials) {
+        match renewed(&self.identity, credentials) {
+            Ok(None) => {}
+            Ok(Some(identity)) => {
+                let identity = Arc::new(identity);
+                info!(until = %identity.not_after(), "the fleet's authority sent new credentials");
+                let until = format!("this node's own, until {}", identity.not_after());
+                self.audit.write(AuditRecord::new(AuditEvent::Renewed).reason(until));
+                self.keeper.identity(identity.clone());
+                self.set_identity(identity);
+            }
+            Err(why) => {
+                warn!(%why, "credentials from the fleet's authority are not usable");
+                self.control_drops.count("credentials_unusable");
+            }
+        }
+    }
+
+    /// Switches to a renewed identity, with another certificate or with secrets for later names.
+    pub(super) fn set_identity(&mut self, identity: Arc<Identity>) {
+        let now = now();
+        // A link shows the certificate only, so it stays if the certificate is the same.
+        let shows_another = self.identity.chain() != identity.chain();
+        self.identity = identity.clone();
+        self.renew_due = Some(renew_at(&identity, now));
+        if let (Some(routes), Some(newest)) = (&mut self.routes, identity.naming_secrets().first()) {
+            routes.set_secret(newest.secret.clone());
+        }
+        self.credentials.set_identity(identity.clone());
+        // The gateway reads the current identity itself at a reload.
+        self.gateway.set_identity(&identity);
+        self.router.set_identity(now, identity.clone());
+        self.endpoint.set_identity(now, identity);
+        if shows_another {
+            self.redial.send_replace(());
+        }
+    }
+
+    /// Trusts these CAs and no others. Their revocations stay in force.
+    pub(super) fn trust(&mut self, anchors: TrustAnchors) {
+        let anchors = Arc::new(anchors.with_lists_of(&self.credentials.anchors()));
+        self.router.set_anchors(now(), anchors.clone());
+        self.set_anchors(anchors);
+    }
+
+    /// Replaces the trust anchors everywhere.
+    pub(super) fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
+        self.keeper.anchors(anchors.clone());
+        self.catch_up_file(anchors.clone());
+        self.credentials.set_anchors(TrustAnchors::clone(&anchors));
+        self.gateway.set_anchors(&anchors);
+        self.endpoint.set_anchors(now(), anchors);
+    }
+}

@@ -1,0 +1,311 @@
+//! Members in rules: finds names that the fleet file lacks, and names of which no member was heard.
+//!
+//! Certificates prove a node and its groups by keyed hashes. So a node can check whether a name, or a similar one, is
+//! that of a member it has heard, but it cannot list names.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+
+use sgc_trust::{Fleet, Grantees, Identity, VerifiedPeer};
+use sgc_wire::{GroupTag, NodeId};
+
+use crate::config::{Config, Recipient, nearest};
+
+/// Most members that are remembered.
+const HEARD_MAX: usize = 4096;
+/// Most spellings that are tried for one member, which takes some milliseconds.
+const SPELLINGS_MAX: usize = 4096;
+/// Letters of names (`sgc_trust` label rule).
+const LETTERS: &str = "abcdefghijklmnopqrstuvwxyz0123456789-_.";
+
+/// Names of members in the rules `to` and `publish`.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct MemberNames {
+    nodes: BTreeMap<NodeId, String>,
+    groups: BTreeMap<GroupTag, String>,
+}
+
+impl MemberNames {
+    /// Collects the names of a configuration.
+    pub(crate) fn from_config(config: &Config, identity: &Identity) -> Self {
+        let mut names = Self::default();
+        for recipient in config.shares.iter().flat_map(|share| share.to.iter().chain(&share.publish)) {
+            match recipient {
+                Recipient::Node(node) => {
+                    let id = identity.node_id_of(node.as_str());
+                    names.nodes.extend(id.map(|id| (id, node.to_string())));
+                }
+                Recipient::Group(group) => {
+                    let tag = identity.fleet_secret().map(|secret| secret.group_tag(group.as_str()));
+                    names.groups.extend(tag.map(|tag| (tag, group.to_string())));
+                }
+                Recipient::Everyone | Recipient::Partner(_) => {}
+            }
+        }
+        names
+    }
+}
+
+/// A name in a rule of which no member was heard.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct UnheardName {
+    /// Name in the rule.
+    pub(crate) written: String,
+    /// Name of a heard member that differs by one letter.
+    pub(crate) meant: Option<String>,
+}
+
+/// Members that were heard since the start, and the names in rules.
+#[derive(Debug, Default)]
+pub(crate) struct Members {
+    names: MemberNames,
+    nodes: BTreeSet<NodeId>,
+    groups: BTreeSet<GroupTag>,
+    /// Misspelt names with the probable spelling.
+    meant: BTreeMap<String, String>,
+}
+
+impl Members {
+    pub(crate) fn new(names: MemberNames, own: &Identity) -> Self {
+        Self { names, nodes: [own.node_id()].into(), ..Self::default() }
+    }
+
+    /// Replaces the names by those of another configuration.
+    pub(crate) fn set_names(&mut self, names: MemberNames, own: &Identity) {
+        self.names = names;
+        self.meant.clear();
+        self.compare(own);
+    }
+
+    /// Notes a heard member. Returns newly found misspellings of its names, each with the right spelling.
+    pub(crate) fn heard(&mut self, peer: &VerifiedPeer, own: &Identity) -> Vec<(String, String)> {
+        if peer.ca != own.as_peer().ca || self.nodes.len() >= HEARD_MAX || !self.nodes.insert(peer.node_id) {
+            return Vec::new();
+        }
+        let room = HEARD_MAX.saturating_sub(self.groups.len());
+        self.groups.extend(peer.groups.iter().take(room));
+        let before = self.meant.clone();
+        self.compare(own);
+        let news = self.meant.iter().filter(|(written, _)| !before.contains_key(*written));
+        news.map(|(written, meant)| (written.clone(), meant.clone())).collect()
+    }
+
+    /// Iterates over the misspelt names with the right spelling.
+    pub(crate) fn misspelt(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.meant.iter().map(|(written, meant)| (written.as_str(), meant.as_str()))
+    }
+
+    /// Returns the names in a policy of which no member was heard.
+    pub(crate) fn unheard(&self, grantees: &Grantees) -> Vec<UnheardName> {
+        let nodes = grantees.nodes.iter().filter(|id| !self.nodes.contains(*id));
+        let nodes = nodes.filter_map(|id| self.names.nodes.get(id).cloned());
+        let groups = grantees.groups.iter().filter(|(_, tag)| !self.groups.contains(tag));
+        let groups = groups.filter_map(|(_, tag)| Some(group_word(self.names.groups.get(tag)?)));
+        let name = |written: String| UnheardName { meant: self.meant.get(&written).cloned(), written };
+        nodes.chain(groups).map(name).collect()
+    }
+
+    /// Compares spellings of the names in rules with heard members that no rule names.
+    fn compare(&mut self, own: &Identity) {
+        let mut left = SPELLINGS_MAX;
+        let mut spelt = |name: &str, is_heard: &dyn Fn(&str) -> bool| {
+            let mut tried = 0;
+            let found =
+                spellings(name).take(left).inspect(|_| tried += 1).find(|spelling| is_heard(spelling));
+            left -= tried;
+            found
+        };
+        for (_, name) in self.names.nodes.iter().filter(|(id, _)| !self.nodes.contains(*id)) {
+            let is_heard = |spelling: &str| {
+                let id = own.node_id_of(spelling);
+                id.is_some_and(|id| self.nodes.contains(&id) && !self.names.nodes.contains_key(&id))
+            };
+            if let Some(meant) = spelt(name, &is_heard) {
+                self.meant.insert(name.clone(), meant);
+            }
+        }
+        for (_, name) in self.names.groups.iter().filter(|(tag, _)| !self.groups.contains(*tag)) {
+            let is_heard = |spelling: &str| {
+                let tag = own.fleet_secret().map(|secret| secret.group_tag(spelling));
+                tag.is_some_and(|tag| self.groups.contains(&tag) && !self.names.groups.contains_key(&tag))
+            };
+            if let Some(meant) = spelt(name, &is_heard) {
+                self.meant.insert(group_word(name), group_word(&meant));
+            }
+        }
+    }
+}
+
+fn group_word(group: &str) -> String {
+    format!("group:{group}")
+}
+
+/// Iterates over names that differ by one letter: swapped, missing, replaced or added.
+fn spellings(name: &str) -> impl Iterator<Item = String> {
+    let letters: Vec<char> = name.chars().collect();
+    let with = move |change: &dyn Fn(&mut Vec<char>)| {
+        let mut changed = letters.clone();
+        change(&mut changed);
+        changed.into_iter().collect::<String>()
+    };
+    let len = name.chars().count();
+    let mut all: Vec<String> = (1..len).map(|at| with(&|word| word.swap(at - 1, at))).collect();
+    all.extend((0..len).map(|at| {
+        with(&|word| {
+            word.remove(at);
+        })
+    }));
+    for letter in LETTERS.chars() {
+        all.extend((0..len).map(|at| with(&|word| word[at] = letter)));
+        all.extend((0..=len).map(|at| with(&|word| word.insert(at, letter))));
+    }
+    all.into_iter()
+}
+
+/// A name in a rule that the fleet file lacks.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct UnknownMember {
+    /// Key and interface of the rule.
+    pub place: String,
+    /// The name, after `group:` if it is a group's.
+    pub name: String,
+    /// A similar name of the fleet.
+    pub nearest: Option<String>,
+}
+
+impl fmt::Display for UnknownMember {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let what = if self.name.starts_with("group:") {
+            "no node of the fleet is in"
+        } else {
+            "the fleet has no node of"
+        };
+        write!(f, "{} names \"{}\", and {what} that", self.place, self.name)?;
+        f.write_str(if self.name.starts_with("group:") { " group" } else { " name" })?;
+        match &self.nearest {
+            Some(nearest) => write!(f, "; did you mean \"{nearest}\"?"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Returns the names in a configuration that the fleet file lacks. A file without a roster yields none.
+pub fn unknown_members(config: &Config, fleet: &Fleet) -> Vec<UnknownMember> {
+    if !fleet.has_roster() {
+        return Vec::new();
+    }
+    let nodes: BTreeSet<&str> = fleet.nodes().map(|node| node.name.as_str()).collect();
+    let groups: BTreeSet<String> =
+        fleet.nodes().flat_map(|node| &node.groups).map(|group| group_word(group.as_str())).collect();
+    let mut unknown = Vec::new();
+    let mut check = |place: &dyn Fn() -> String, name: String| {
+        let known: Vec<&str> = match name.starts_with("group:") {
+            true => groups.iter().map(String::as_str).collect(),
+            false => nodes.iter().copied().collect(),
+        };
+        if !known.contains(&name.as_str()) {
+            let nearest = nearest(&name, &known).map(str::to_owned);
+            unknown.push(UnknownMember { place: place(), name, nearest });
+        }
+    };
+    let named = |recipient: &Recipient| {
+        matches!(recipient, Recipient::Node(_) | Recipient::Group(_)).then(|| recipient.to_string())
+    };
+    for share in &config.shares {
+        for (key, recipients) in [("to", &share.to), ("publish", &share.publish)] {
+            let place = || format!("`{key}` of {}", share.topic);
+            recipients.iter().filter_map(named).for_each(|name| check(&place, name));
+        }
+    }
+    for used in &config.uses {
+        check(&|| format!("`from` of {}", used.topic), used.from.to_string());
+    }
+    let operators = config.authority.iter().flat_map(|authority| &authority.operators);
+    operators.filter_map(named).for_each(|name| check(&|| "`operators`".to_owned(), name));
+    unknown
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use rand_core::{OsRng, TryRngCore as _};
+    use sgc_trust::EnrollRequest;
+    use sgc_wire::UnixMillis;
+
+    use super::*;
+    use crate::config;
+
+    fn config(text: &str) -> Config {
+        let text = format!("identity = 'arm.identity'\nnode.routers = ['quic://r:1']\n{text}");
+        config::parse(&text, "node.toml", std::path::Path::new(""), &|_| None).unwrap()
+    }
+
+    fn members(fleet: &mut Fleet, names: [(&str, &[&str]); 2]) -> [Identity; 2] {
+        names.map(|(name, groups)| {
+            let mut request = EnrollRequest::new(name.parse().unwrap(), now());
+            request.groups = groups.iter().map(|group| group.parse().unwrap()).collect();
+            fleet.enroll(&request, &mut OsRng.unwrap_err()).unwrap()
+        })
+    }
+
+    fn now() -> UnixMillis {
+        crate::control::core::now().unix
+    }
+
+    fn fleet() -> Fleet {
+        Fleet::create("lab".parse().unwrap(), now(), &mut OsRng.unwrap_err()).unwrap()
+    }
+
+    const RULES: &str = "[[share]]\ntopic = '/a'\nto = ['deks', 'lamp', 'group:op', 'group:vision']\n\
+                         [[use]]\nfrom = 'desk'\ntopic = '/b'\n";
+
+    #[test]
+    fn names_that_a_fleet_does_not_have_are_found_with_what_was_meant() {
+        let mut fleet = fleet();
+        members(&mut fleet, [("arm", &[]), ("desk", &["ops"])]);
+        let found: Vec<_> = unknown_members(&config(RULES), &fleet).iter().map(ToString::to_string).collect();
+        assert_eq!(
+            found,
+            [
+                "`to` of /a names \"deks\", and the fleet has no node of that name; did you mean \"desk\"?",
+                "`to` of /a names \"lamp\", and the fleet has no node of that name",
+                "`to` of /a names \"group:op\", and no node of the fleet is in that group; did you mean \"group:ops\"?",
+                "`to` of /a names \"group:vision\", and no node of the fleet is in that group",
+            ]
+        );
+    }
+
+    #[test]
+    fn names_are_compared_with_members_that_are_heard_of() {
+        let mut fleet = fleet();
+        let [arm, desk] = members(&mut fleet, [("arm", &[]), ("desk", &["ops"])]);
+        let config = config(RULES);
+        let mut members = Members::new(MemberNames::from_config(&config, &arm), &arm);
+        let grantees = crate::control::policy::grantees(&config.shares[0].to, &arm, &Default::default());
+        let unheard = |members: &Members| -> BTreeMap<String, Option<String>> {
+            members.unheard(&grantees).into_iter().map(|name| (name.written, name.meant)).collect()
+        };
+        assert!(unheard(&members).len() == 4 && unheard(&members).values().all(Option::is_none));
+        let news = members.heard(desk.as_peer(), &arm);
+        let pair = |a: &str, b: &str| (a.to_owned(), b.to_owned());
+        assert_eq!(news, [pair("deks", "desk"), pair("group:op", "group:ops")]);
+        assert_eq!(unheard(&members)["deks"].as_deref(), Some("desk"));
+        assert_eq!(unheard(&members)["lamp"], None);
+        assert!(members.heard(desk.as_peer(), &arm).is_empty(), "said once");
+        // A node of another fleet with this name is another node.
+        let mut other = super::tests::fleet();
+        let [_, stranger] = super::tests::members(&mut other, [("x", &[]), ("lamp", &["vision"])]);
+        assert!(members.heard(stranger.as_peer(), &arm).is_empty() && unheard(&members).contains_key("lamp"));
+        // The corrected name belongs to a member that was heard before.
+        let mut right = config.clone();
+        right.shares[0].to = vec![Recipient::Node("desk".parse().unwrap())];
+        members.set_names(MemberNames::from_config(&right, &arm), &arm);
+        assert!(members.misspelt().next().is_none());
+        assert!(
+            members
+                .unheard(&crate::control::policy::grantees(&right.shares[0].to, &arm, &Default::default()))
+                .is_empty()
+        );
+    }
+}

@@ -1,0 +1,444 @@
+//! Reload: applies another configuration to a running node. The whole configuration is read and judged before anything
+//! changes.
+//!
+//! This module computes the differences; the route machine carries them out.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use rand_chacha::ChaCha20Rng;
+use rand_core::{OsRng, SeedableRng, TryRngCore};
+use rustls::sign::CertifiedKey;
+use rustls_pki_types::CertificateDer;
+use serde::Serialize;
+use sgc_gateway::Access;
+use sgc_ros::{Direction, ShareRule, UseRule};
+use sgc_sync::lock;
+use sgc_transport::CredentialStore;
+use sgc_trust::{Identity, Suite, TrustAnchors};
+use sgc_wire::{Kind, UnixMillis};
+use tokio::sync::{Mutex, Notify, mpsc, oneshot};
+use tokio::task::JoinHandle;
+use tracing::{info, warn};
+
+use crate::config::{Config, ConfigErrors, GatewayConfig, RosConfig, RouterUrl};
+use crate::control::core::{CoreEvent, now};
+use crate::control::rules::Rules;
+use crate::data::message_keys::{MessageKeys, make_for};
+use crate::discovery::{self, Board, LinkKeeper};
+use crate::gateway::access::access_with;
+use crate::gateway::{Gateway, ShownKey, key_of_files};
+use crate::node::NodeError;
+use crate::state::audit::{Audit, AuditEvent, AuditRecord};
+use crate::state::credentials::with_kept_crls;
+
+/// Reads the configuration from the same source as at start.
+pub type ConfigSource = Arc<dyn Fn() -> Result<Config, ConfigErrors> + Send + Sync>;
+
+/// Longest wait before expired tokens are searched again, so that setting the wall clock keeps no token in force.
+const EXPIRY_CHECK_MAX: Duration = Duration::from_secs(60);
+
+/// Result of a reload.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct ReloadReport {
+    /// Changes, one line each.
+    pub changed: Vec<String>,
+    /// Changes that take effect only after a restart.
+    pub needs_restart: Vec<String>,
+    /// Warnings about the new configuration.
+    pub warnings: Vec<String>,
+}
+
+/// The running configuration, with everything that a reload needs.
+pub(crate) struct Reloader {
+    pub(crate) source: Option<ConfigSource>,
+    pub(crate) identity: Arc<Identity>,
+    pub(crate) credentials: CredentialStore,
+    pub(crate) state: Option<PathBuf>,
+    pub(crate) audit: Audit,
+    pub(crate) events: mpsc::Sender<CoreEvent>,
+    /// Joins the local network if the node began without one; blocks. `None` if the node cannot join one.
+    pub(crate) join: Option<JoinNetwork>,
+    /// Whether there is a local network.
+    pub(crate) has_ros: AtomicBool,
+    /// Dials the routers of tokens that are added later.
+    pub(crate) keeper: LinkKeeper,
+    pub(crate) board: Board,
+    pub(crate) dialling: std::sync::Mutex<Vec<JoinHandle<()>>>,
+    pub(crate) gateway: Arc<Gateway>,
+    pub(crate) running: Mutex<Running>,
+    /// Notified when the time of the next expiry changes.
+    pub(crate) changed: Notify,
+}
+
+/// Joins the local network of a configuration with an identity; blocks.
+pub(crate) type JoinNetwork = Arc<dyn Fn(&RosConfig, &Identity) -> Result<(), String> + Send + Sync>;
+
+/// The current configuration and its consequences.
+pub(crate) struct Running {
+    /// Restart-only settings as they were at start, the others as they are now.
+    pub(crate) config: Config,
+    pub(crate) rules: Rules,
+    /// Routers of tokens that are dialled. Their tasks end with the node.
+    pub(crate) dialled: Vec<RouterUrl>,
+    /// Suites with a signing key.
+    pub(crate) suites: BTreeSet<Suite>,
+}
+
+/// Everything that has to exist before a configuration is applied.
+struct PreparedReload {
+    rules: Rules,
+    /// New trust anchors; `None` if they are unchanged.
+    anchors: Option<TrustAnchors>,
+    message_keys: MessageKeys,
+    /// The gateway's access rules, and its certificate if that is not the node's own; `None` without a gateway.
+    gateway: Option<(Access, Option<Arc<CertifiedKey>>)>,
+}
+
+impl Reloader {
+    /// Returns the running configuration.
+    pub(crate) async fn config(&self) -> Config {
+        self.running.lock().await.config.clone()
+    }
+
+    /// Reads and applies the configuration. After an error nothing has changed.
+    pub(crate) async fn reload(&self, by: &str) -> Result<ReloadReport, String> {
+        let result = self.try_reload().await;
+        let record = AuditRecord::new(AuditEvent::Reload).by(by);
+        // A stopping node shows no alerts, so a failure to send is ignored.
+        let read = CoreEvent::ConfigurationRead { mistakes: result.as_ref().err().cloned() };
+        let _ = self.events.send(read).await;
+        match &result {
+            Ok(report) => {
+                let changes = [&report.changed[..], &report.needs_restart[..]].concat();
+                self.audit.write(record.reason(match changes.is_empty() {
+                    true => "nothing changed".to_owned(),
+                    false => changes.join("; "),
+                }));
+                report.changed.iter().for_each(|line| info!("reload: {line}"));
+                report.needs_restart.iter().for_each(|line| warn!("reload: {line}"));
+                report.warnings.iter().for_each(|line| warn!("reload: {line}"));
+            }
+            Err(error) => {
+                warn!("reload refused, everything is as it was: {error}");
+                self.audit.write(record.reason(format!("refused: {error}")));
+            }
+        }
+        result
+    }
+
+    async fn try_reload(&self) -> Result<ReloadReport, String> {
+        let source = self.source.clone().ok_or("this node cannot read its configuration again")?;
+        // Reloads run one at a time, so that the configuration that was read last is applied last.
+        let mut running = self.running.lock().await;
+        let read = tokio::task::spawn_blocking(move || source());
+        let config =
+            read.await.map_err(|_| "reading ended in a panic")?.map_err(|errors| errors.to_string())?;
+        let certified = self.identity.node_name();
+        if let Some(own) = config.uses.iter().find(|one| one.from == *certified) {
+            return Err(format!("[[use]] from {:?}: that is this node itself", own.from.as_str()));
+        }
+        let has_rules = !(config.shares.is_empty() && config.uses.is_empty() && config.tokens.is_empty());
+        let wants_ros = has_rules || config.gateway.is_some();
+        if wants_ros && !self.has_ros.load(Ordering::Relaxed) && self.join.is_none() {
+            let why = "this node joined no ROS network when it started, so it can neither share nor use";
+            return Err(format!("{why}: restart it"));
+        }
+        self.apply(&mut running, config).await
+    }
+
+    /// Joins the local network if the node began without one.
+    async fn join(&self, running: &mut Running, wanted: Option<&RosConfig>) -> Result<(), String> {
+        let join = self.join.clone().filter(|_| !self.has_ros.load(Ordering::Relaxed));
+        let Some((join, ros)) = join.zip(wanted.cloned()) else { return Ok(()) };
+        let (wanted, identity) = (ros.clone(), self.credentials.identity());
+        let joined = tokio::task::spawn_blocking(move || join(&wanted, &identity));
+        joined.await.map_err(|_| "joining the local network ended in a panic")??;
+        self.has_ros.store(true, Ordering::Relaxed);
+        info!("joined the local ROS 2 network of domain {}", ros.domain_id);
+        // Definitions are read only at start.
+        running.config.ros = Some(RosConfig { definitions: Vec::new(), ..ros });
+        Ok(())
+    }
+
+    /// Dials the routers of tokens that are not dialled yet, and returns them.
+    fn dial(&self, running: &mut Running, of_tokens: &[RouterUrl]) -> Vec<RouterUrl> {
+        let is_new = |url: &&RouterUrl| !running.dialled.contains(url);
+        let new: Vec<_> = of_tokens.iter().filter(is_new).cloned().collect();
+        let mut seed = [0; 32];
+        if new.is_empty() || OsRng.try_fill_bytes(&mut seed).is_err() {
+            return Vec::new();
+        }
+        let mut rng = ChaCha20Rng::from_seed(seed);
+        let tasks = discovery::start(&[], &new, &self.keeper, &self.board, None, &mut rng);
+        lock(&self.dialling).extend(tasks);
+        running.dialled.extend(new.iter().cloned());
+        new
+    }
+
+    /// Removes and returns the tasks that dial routers of later tokens.
+    pub(crate) fn take_dialling(&self) -> Vec<JoinHandle<()>> {
+        std::mem::take(&mut lock(&self.dialling))
+    }
+
+    /// Applies `config`.
+    async fn apply(&self, running: &mut Running, config: Config) -> Result<ReloadReport, String> {
+        // The identity may have been renewed since the start.
+        let (identity, state) = (self.credentials.identity(), self.state.clone());
+        let (mut wanted, own, suites) =
+            (config.clone(), self.identity.anchors().clone(), running.suites.clone());
+        let running_gateway = running.config.gateway.clone();
+        let trusted = running.rules.partners.certificates.clone();
+        let prepare = tokio::task::spawn_blocking(move || -> Result<PreparedReload, NodeError> {
+            let rules = Rules::load(&wanted, &identity, state.as_deref(), now().unix)?;
+            let certificates = &rules.partners.certificates;
+            let anchors = match same(&trusted, certificates) {
+                true => None,
+                // The state directory may hold lists of a CA that was trusted before.
+                false => Some(with_kept_crls(
+                    state.as_deref(),
+                    own.with_anchors(certificates.iter().cloned())?,
+                    now(),
+                )),
+            };
+            let message_keys = make_for(&rules.shares, |suite| suites.contains(&suite));
+            // A removed gateway runs until a restart, so its access rules are kept up to date: revoked clients lose
+            // access.
+            wanted.gateway = wanted.gateway.or(running_gateway);
+            let access = access_with(&wanted, &identity, &rules.partners, state.as_deref(), now())?;
+            let gateway = match access.zip(wanted.gateway.as_ref()) {
+                Some((access, gateway)) => Some((access, key_of_files(gateway)?)),
+                None => None,
+            };
+            Ok(PreparedReload { rules, anchors, message_keys, gateway })
+        });
+        let prepared = prepare.await.map_err(|_| "reading ended in a panic")?;
+        let PreparedReload { rules, anchors, message_keys, gateway } =
+            prepared.map_err(|error| error.to_string())?;
+        self.join(running, config.ros.as_ref()).await?;
+        running.suites.extend(message_keys.keys().copied());
+        let mut report = ReloadReport {
+            changed: changes(&running.rules, &rules),
+            needs_restart: needs_restart(running, &config, &rules),
+            warnings: rules.warnings.clone(),
+        };
+        let dialled = self.dial(running, &rules.routers);
+        report.changed.extend(dialled.iter().map(|url| format!("{url} is dialled, which a token names")));
+        // This precedes the control task's check of existing links.
+        self.credentials.set_admitted(rules.partners.admitted.clone());
+        let (reply, done) = oneshot::channel();
+        let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
+        let member_names = rules.members.clone();
+        let event = CoreEvent::Reload { shares, uses, anchors, message_keys, member_names, reply };
+        let stopping = || "the node is stopping".to_owned();
+        self.events.send(event).await.map_err(|_| stopping())?;
+        done.await.map_err(|_| stopping())?;
+        // The control task has the newest revocation lists.
+        if let Some((access, files)) = gateway {
+            let access = access.with_anchors(TrustAnchors::clone(&self.credentials.anchors()));
+            let key = || match files {
+                Some(key) => ShownKey::Files(key),
+                None => ShownKey::Own(self.credentials.identity()),
+            };
+            if self.gateway.reconfigure(access, key).map_err(|error| error.to_string())? {
+                report.changed.push("who connects to the gateway is shown another certificate".to_owned());
+            }
+            if running.config.gateway.as_ref().map(access_part) != config.gateway.as_ref().map(access_part) {
+                report.changed.push("who may connect to the gateway changed".to_owned());
+            }
+        }
+        self.audit.set_names(rules.names.clone());
+        // Restart-only settings keep their running values, so that the next reload reports them again.
+        let Config { shares, uses, tokens, partners, trust, accept, gateway, .. } = config;
+        let before = running.config.clone();
+        let gateway = match (&before.gateway, gateway) {
+            (Some(before), Some(after)) => Some(restarted(before, &after)),
+            (before, _) => before.clone(),
+        };
+        running.config = Config { shares, uses, tokens, partners, trust, accept, gateway, ..before };
+        running.rules = rules;
+        report.changed.dedup();
+        self.changed.notify_one();
+        Ok(report)
+    }
+
+    /// Removes expired tokens from the policies. Never returns.
+    pub(crate) async fn watch_expiry(&self) {
+        loop {
+            let next = self.running.lock().await.rules.partners.next_expiry;
+            let wait = next.map(|UnixMillis(at)| Duration::from_millis(at.saturating_sub(now().unix.0)));
+            let timer = async {
+                match wait {
+                    Some(wait) => tokio::time::sleep(wait.min(EXPIRY_CHECK_MAX)).await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                () = timer => {}
+                () = self.changed.notified() => continue,
+            }
+            if next.is_none_or(|at| at > now().unix) {
+                continue;
+            }
+            let mut running = self.running.lock().await;
+            let config = running.config.clone();
+            match self.apply(&mut running, config).await {
+                Ok(report) => {
+                    let record = AuditRecord::new(AuditEvent::Reload).by("a token ended");
+                    self.audit.write(record.reason(report.changed.join("; ")));
+                }
+                Err(error) => {
+                    warn!("a token expired, but its holder keeps access: {error}");
+                    drop(running);
+                    tokio::time::sleep(EXPIRY_CHECK_MAX).await;
+                }
+            }
+        }
+    }
+}
+
+/// Returns the part of a gateway's configuration that may change at run time.
+fn access_part(gateway: &GatewayConfig) -> GatewayConfig {
+    restarted(&GatewayConfig::default(), gateway)
+}
+
+/// Returns the gateway's configuration after a reload: running sockets and bounds, and new access rules.
+fn restarted(before: &GatewayConfig, after: &GatewayConfig) -> GatewayConfig {
+    GatewayConfig {
+        listen: before.listen.clone(),
+        clients_max: before.clients_max,
+        client_bytes_max: before.client_bytes_max,
+        ..after.clone()
+    }
+}
+
+fn needs_other_sockets(before: Option<&GatewayConfig>, after: Option<&GatewayConfig>) -> bool {
+    match (before, after) {
+        (Some(before), Some(after)) => restarted(before, after) != *after,
+        (before, after) => before.is_some() != after.is_some(),
+    }
+}
+
+/// Lists the differences, one line for each topic.
+fn changes(old: &Rules, new: &Rules) -> Vec<String> {
+    let mut lines = Vec::new();
+    let shares = |rules: &Rules| -> BTreeMap<String, ShareRule> {
+        rules.shares.iter().map(|s| (called(s.metadata.kind, &s.metadata.ros_name), s.clone())).collect()
+    };
+    let (before, after) = (shares(old), shares(new));
+    for topic in before.keys().filter(|topic| !after.contains_key(*topic)) {
+        lines.push(format!("{topic} is no longer shared"));
+    }
+    for (topic, rule) in &after {
+        match before.get(topic) {
+            None => lines.push(format!("{topic} is shared")),
+            Some(known) if known == rule => {}
+            Some(known) => lines.push(share_change(topic, known, rule)),
+        }
+    }
+    let place = |rule: &UseRule| {
+        let publishes = rule.direction == Direction::Publish;
+        let token = rule.token.clone().map(|t| t.0);
+        (rule.owner_name.clone(), called(rule.kind, &rule.topic), token, publishes)
+    };
+    let uses = |rules: &Rules| -> BTreeMap<_, _> {
+        rules.uses.iter().map(|rule| (place(rule), rule.clone())).collect()
+    };
+    let (before, after) = (uses(old), uses(new));
+    let by = |rule: &UseRule| if rule.token.is_some() { " (by token)" } else { "" };
+    for (key, rule) in before.iter().filter(|(key, _)| !after.contains_key(*key)) {
+        lines.push(format!("{} of {} is no longer used{}", key.1, key.0, by(rule)));
+    }
+    for (key, rule) in &after {
+        match before.get(key) {
+            None => lines.push(format!("{} of {} is used{}", key.1, key.0, by(rule))),
+            Some(known) if known == rule => {}
+            Some(_) => lines.push(format!("{} of {} is used otherwise", key.1, key.0)),
+        }
+    }
+    let trusted = |rules: &Rules| rules.partners.certificates.clone();
+    let (before, after) = (trusted(old), trusted(new));
+    if after.iter().any(|ca| !before.contains(ca)) {
+        lines.push("nodes of another CA may link to this one".to_owned());
+    }
+    if before.iter().any(|ca| !after.contains(ca)) {
+        lines.push("nodes of a CA may no longer link to this one".to_owned());
+    }
+    if old.partners.admitted != new.partners.admitted {
+        lines.push("whose nodes may attach changed".to_owned());
+    }
+    lines
+}
+
+/// Formats a name with its kind, unless it is a topic.
+fn called(kind: Kind, name: &str) -> String {
+    if kind == Kind::Service { format!("service {name}") } else { name.to_owned() }
+}
+
+/// Returns `true` if both lists hold the same CAs in any order.
+fn same(a: &[CertificateDer<'_>], b: &[CertificateDer<'_>]) -> bool {
+    a.len() == b.len() && a.iter().all(|ca| b.contains(ca))
+}
+
+fn share_change(topic: &str, known: &ShareRule, rule: &ShareRule) -> String {
+    let mut what = Vec::new();
+    if known.policy.subscribe != rule.policy.subscribe {
+        what.push("who may subscribe");
+    }
+    if known.policy.publish != rule.policy.publish {
+        what.push("who may publish");
+    }
+    let changes_share = (known.suite, known.class, &known.metadata, &known.naming.rename)
+        != (rule.suite, rule.class, &rule.metadata, &rule.naming.rename);
+    let end = if changes_share { "; it begins anew" } else { "" };
+    for (is_changed, word) in [
+        (known.suite != rule.suite, "its suite"),
+        (known.shaping != rule.shaping, "how much of it goes out"),
+        (known.class != rule.class, "its priority"),
+        (known.metadata != rule.metadata, "its type or metadata"),
+        (known.naming.rename != rule.naming.rename, "its name for others"),
+        (known.naming.except != rule.naming.except, "what it leaves out"),
+    ] {
+        if is_changed {
+            what.push(word);
+        }
+    }
+    format!("{topic}: {} changed{end}", what.join(", "))
+}
+
+fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<String> {
+    let now = &running.config;
+    let mut lines: Vec<String> = [
+        (now.node_name != config.node_name, "`name`"),
+        (now.identity != config.identity, "`identity`"),
+        (now.routers != config.routers, "`routers`"),
+        (now.resolver != config.resolver, "`resolver`"),
+        (now.keep_alive != config.keep_alive, "`keep_alive`"),
+        (now.listen != config.listen, "`listen` in [router]"),
+        (now.peer_rate != config.peer_rate, "`peer_rate` in [router]"),
+        (now.mapping != config.mapping, "`mapping` in [router]"),
+        (now.announce != config.announce, "`announce` in [router]"),
+        // Shares and uses join the default network if the file has no `[ros]`.
+        (now.ros != config.ros, "[ros]"),
+        (needs_other_sockets(now.gateway.as_ref(), config.gateway.as_ref()), "[gateway]"),
+        (now.state != config.state, "`state`"),
+        (now.watch != config.watch, "`watch`"),
+        (now.authority != config.authority, "[authority]"),
+        (now.rotation != config.rotation, "[rotation]"),
+        (now.audit != config.audit, "[audit]"),
+        (now.transport != config.transport, "[transport]"),
+        (now.admin_socket != config.admin_socket, "`socket` in [admin]"),
+    ]
+    .into_iter()
+    .filter(|(is_changed, _)| *is_changed)
+    .map(|(_, what)| format!("{what} changed, which needs a restart"))
+    .collect();
+    let is_wanted = |url: &&RouterUrl| rules.routers.contains(url) || config.routers.contains(url);
+    if let Some(url) = running.dialled.iter().find(|url| !is_wanted(url)) {
+        lines.push(format!("{url} is of a token that is not used any more, and is dialled until a restart"));
+    }
+    lines
+}

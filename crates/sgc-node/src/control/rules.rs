@@ -1,0 +1,248 @@
+//! [`Rules`]: everything that follows from a configuration and its files at one moment, such as rules for the route
+//! machine, CAs and routers. Start and reload use the same code.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+
+use sgc_ros::{Direction, Interface, Part, Shaping, ShareRule, UseRule, is_topic_name};
+use sgc_trust::{Identity, ShareToken, TOKEN_TEXT_BYTES_MAX, TokenError};
+use sgc_wire::{Kind, NodeId, UnixMillis};
+
+use crate::config::{Config, Recipient, RouterUrl, TokenConfig, TokenSource, UseConfig};
+use crate::control::members::{MemberNames, unknown_members};
+use crate::control::partners::{PartnerError, Partners};
+use crate::control::policy;
+use crate::state;
+use crate::state::audit::PeerNames;
+use crate::state::fleet_file::read_fleet;
+
+/// Most routers that tokens may add.
+const TOKEN_ROUTERS_MAX: usize = 16;
+
+/// Everything that follows from a configuration and may change at run time.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Rules {
+    pub(crate) shares: Vec<ShareRule>,
+    pub(crate) uses: Vec<UseRule>,
+    pub(crate) partners: Partners,
+    /// Routers of tokens that the configuration does not name.
+    pub(crate) routers: Vec<RouterUrl>,
+    pub(crate) names: PeerNames,
+    pub(crate) members: MemberNames,
+    /// Faults that prevent nothing.
+    pub(crate) warnings: Vec<String>,
+}
+
+impl Rules {
+    /// Loads the files that `config` names, and those of the state directory.
+    pub(crate) fn load(
+        config: &Config,
+        identity: &Identity,
+        state: Option<&Path>,
+        now: UnixMillis,
+    ) -> Result<Self, RulesError> {
+        let mut rules = Self { partners: Partners::load(config, state, now)?, ..Self::default() };
+        let mut names = BTreeSet::new();
+        for one in &config.tokens {
+            let token = match &one.source {
+                TokenSource::File(path) => read_token(path)?,
+                TokenSource::Text(token) => ShareToken::clone(token),
+            };
+            if !names.insert(token.name()) {
+                return Err(RulesError::TokenTwice { topic: token.metadata.ros_name.clone() });
+            }
+            rules.add_token(config, identity, token, one, now)?;
+        }
+        let partners = &rules.partners;
+        rules.shares =
+            config.shares.iter().flat_map(|s| policy::share_rules(s, identity, partners)).collect();
+        let of_fleet = config.uses.iter().flat_map(|u| use_rules(u, identity));
+        rules.uses.splice(0..0, of_fleet);
+        rules.names = peer_names(config, identity, &rules);
+        rules.members = MemberNames::from_config(config, identity);
+        if let Some(authority) = &config.authority
+            && let Ok(fleet) = read_fleet(&authority.fleet)
+        {
+            // The authority itself reports an unusable fleet file.
+            rules.warnings.extend(unknown_members(config, &fleet).iter().map(ToString::to_string));
+        }
+        for grant in &rules.partners.tokens {
+            let is_shared = |s: &crate::config::ShareConfig| {
+                (s.interface, &s.topic) == (Interface::Topic, &grant.topic)
+                    && s.type_name.as_ref().is_none_or(|t| *t == grant.type_name)
+            };
+            if !config.shares.iter().any(is_shared) {
+                rules.warnings.push(format!(
+                    "token {} is for {} [{}], which is not shared any more: sgc share-token --withdraw {}",
+                    grant.id, grant.topic, grant.type_name, grant.id
+                ));
+            }
+        }
+        Ok(rules)
+    }
+
+    fn add_token(
+        &mut self,
+        config: &Config,
+        identity: &Identity,
+        token: ShareToken,
+        wanted: &TokenConfig,
+        now: UnixMillis,
+    ) -> Result<(), RulesError> {
+        let topic = token.metadata.ros_name.clone();
+        if token.owner == identity.node_id() {
+            return Err(RulesError::OwnToken { topic });
+        }
+        let here = wanted.naming.renamed(&topic, &topic);
+        if config.shares.iter().any(|share| (share.interface, &share.topic) == (Interface::Topic, &here)) {
+            return Err(RulesError::SharedAndUsed { topic: here });
+        }
+        if !is_topic_name(&here) {
+            return Err(RulesError::TokenName { topic: here });
+        }
+        if token.expires < now {
+            let (owner, expires) = (&token.owner_name, token.expires);
+            self.warnings
+                .push(format!("the token for {topic} ended at {expires}: ask {owner} for a new one"));
+            return Ok(());
+        }
+        for url in &token.routers {
+            match url.parse::<RouterUrl>() {
+                // A search of the owner's local network is useless on this one.
+                Ok(RouterUrl::Mdns(_)) => {}
+                Ok(url) if config.routers.contains(&url) || self.routers.contains(&url) => {}
+                Ok(url) if self.routers.len() < TOKEN_ROUTERS_MAX => self.routers.push(url),
+                Ok(_) => {}
+                Err(_) => {
+                    self.warnings.push(format!("the token for {topic} names a router that cannot be dialled"))
+                }
+            }
+        }
+        self.partners.trust(vec![token.ca.clone()]);
+        self.uses.push(UseRule {
+            direction: Direction::Bring,
+            owner: token.owner,
+            owner_name: token.owner_name.to_string(),
+            kind: Kind::Topic,
+            topic,
+            naming: wanted.naming.clone(),
+            frame_prefix: wanted.frame_prefix.clone(),
+            type_name: Some(token.metadata.type_name.clone()),
+            token: Some((token.name(), token.metadata)),
+            class: None,
+            shaping: Shaping::default(),
+            qos: wanted.qos,
+            dedicated: wanted.dedicated,
+        });
+        Ok(())
+    }
+}
+
+/// Reads a token file, which only its owner may read.
+pub fn read_token(path: &Path) -> Result<ShareToken, RulesError> {
+    let failed = |source| RulesError::TokenFile { path: path.to_owned(), source };
+    let file = fs::File::open(path).map_err(failed)?;
+    if let Some(mode) = state::exposed(&file.metadata().map_err(failed)?) {
+        return Err(failed(io::Error::other(format!("its mode {mode:04o} lets others at it; chmod 600 it"))));
+    }
+    let mut text = zeroize::Zeroizing::new(String::with_capacity(TOKEN_TEXT_BYTES_MAX + 2));
+    file.take(TOKEN_TEXT_BYTES_MAX as u64 + 2).read_to_string(&mut text).map_err(failed)?;
+    ShareToken::parse(&text).map_err(|source| RulesError::Token { path: path.to_owned(), source })
+}
+
+/// Returns the rules for the topics and services of a use.
+fn use_rules(rule: &UseConfig, identity: &Identity) -> Vec<UseRule> {
+    let Some(owner) = identity.node_id_of(rule.from.as_str()) else { return Vec::new() };
+    let part = |part: &Part| UseRule {
+        direction: match part.kind {
+            // A client publishes requests.
+            Kind::Service => Direction::Publish,
+            _ if rule.publish => Direction::Publish,
+            _ => Direction::Bring,
+        },
+        owner,
+        owner_name: rule.from.to_string(),
+        kind: part.kind,
+        topic: part.name(&rule.topic),
+        naming: rule.naming.for_part(part),
+        frame_prefix: rule.frame_prefix.clone(),
+        type_name: part.type_name(rule.type_name.as_deref()),
+        token: None,
+        class: rule.priority,
+        shaping: rule.shaping,
+        qos: rule.qos,
+        dedicated: rule.dedicated,
+    };
+    rule.interface.parts().iter().map(part).collect()
+}
+
+/// Returns the names that the configuration has for peers.
+fn peer_names(config: &Config, identity: &Identity, rules: &Rules) -> PeerNames {
+    let mut names = PeerNames::new();
+    for (partner, resolved) in config.partners.iter().zip(rules.partners.configured.values()) {
+        let name = |node: &NodeId| (*node, format!("partner:{}", partner.name));
+        names.extend(resolved.nodes.iter().map(name));
+    }
+    names.extend(rules.uses.iter().map(|rule| (rule.owner, rule.owner_name.clone())));
+    let named = config.shares.iter().flat_map(|s| s.to.iter().chain(&s.publish));
+    for recipient in named {
+        if let Recipient::Node(node) = recipient {
+            names.extend(identity.node_id_of(node.as_str()).map(|id| (id, node.to_string())));
+        }
+    }
+    names
+}
+
+/// Reasons why a valid configuration cannot be applied.
+#[derive(Debug, thiserror::Error)]
+pub enum RulesError {
+    /// The partners are invalid.
+    #[error(transparent)]
+    Partner(#[from] PartnerError),
+    /// A token cannot be read.
+    #[error("token {}: {source}", path.display())]
+    TokenFile {
+        /// The file.
+        path: PathBuf,
+        /// The error of the operating system.
+        source: io::Error,
+    },
+    /// A token file holds no token.
+    #[error("token {}: {source}", path.display())]
+    Token {
+        /// The file.
+        path: PathBuf,
+        /// The fault.
+        source: TokenError,
+    },
+    /// Two tokens for the same topic.
+    #[error("two tokens for {topic} of the same owner: take one [[use]] out")]
+    TokenTwice {
+        /// The topic.
+        topic: String,
+    },
+    /// A token that this node issued itself.
+    #[error("the token for {topic} is this node's own: it is for a partner")]
+    OwnToken {
+        /// The topic.
+        topic: String,
+    },
+    /// The topic of a token has no valid local name.
+    #[error(
+        "a token brings {topic:?} here, which is no name for a topic of ROS 2, or too long a one: give another with `as`"
+    )]
+    TokenName {
+        /// The name here.
+        topic: String,
+    },
+    /// The topic of a token would return in a loop.
+    #[error(
+        "a token brings {topic} here, which a [[share]] shares: it would be shared again, in a loop; keep one"
+    )]
+    SharedAndUsed {
+        /// The topic.
+        topic: String,
+    },
+}

@@ -1,0 +1,1207 @@
+//! Local publishers: samples of the local network in, packets out.
+//!
+//! The thread of the local reader seals the samples and pushes the packets into the queues of the links. While the
+//! queue of a reliable topic is full, only this thread waits, so other topics flow on. Samples that are ready together
+//! share a signature; none waits for a later one.
+
+use std::collections::{BTreeMap, HashMap};
+use std::pin::pin;
+use std::sync::atomic::Ordering::{Relaxed, SeqCst};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, fence};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, Weak};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use arc_swap::ArcSwap;
+use bytes::Bytes;
+use sgc_endpoint::{Compressor, Marks, PublishError, Source, SourceProgress};
+use sgc_executor::WakeBatch;
+use sgc_ros::{Guid, HandleSamples, KeyHash, Sample, SampleKind, Shaping};
+use sgc_router::LinkId;
+use sgc_sync::lock;
+use sgc_wire::{
+    MessageHead, MessageKind, Name, Packet, PayloadEncoding, PayloadForm, Recover, SinkId, SourceId,
+    TopicGrant,
+};
+use tokio::runtime::Handle;
+use tokio::sync::{Notify, mpsc};
+use tracing::{debug, warn};
+
+use crate::data::assertions::{ASSERTION_LOOK_MAX, ManualLease};
+use crate::data::conversion::{self, KnownType, TypeSlot};
+use crate::data::dataplane::DataPlane;
+use crate::data::pending::PendingQueue;
+use crate::data::shaper::Shaper;
+use crate::data::stats::DataDrop;
+use crate::data::tap::{TapMessage, Taps};
+
+/// Time stamps of the newest samples that readers of a transient-local topic took, by writer.
+#[derive(Debug, Default)]
+pub(crate) struct NewestSamples(Mutex<BTreeMap<Guid, i64>>);
+
+impl NewestSamples {
+    fn note(&self, writer: Guid, timestamp_ns: i64) {
+        let mut newest = lock(&self.0);
+        if newest.len() < NEWEST_WRITERS_MAX || newest.contains_key(&writer) {
+            let known = newest.entry(writer).or_insert(timestamp_ns);
+            *known = timestamp_ns.max(*known);
+        }
+    }
+}
+
+/// The consumer of a local reader, which publishes its samples on a share.
+pub(crate) struct Publisher {
+    share: Arc<LocalShare>,
+    /// Time stamps of the newest samples before this reader, since its writers deliver them again.
+    past: BTreeMap<Guid, i64>,
+    newest: Option<Arc<NewestSamples>>,
+}
+
+impl Publisher {
+    /// Creates the consumer of a reader. `newest` holds the time stamps of earlier readers and is updated from here on.
+    pub(crate) fn new(share: Arc<LocalShare>, newest: Option<Arc<NewestSamples>>) -> Self {
+        let past = newest.as_ref().map(|newest| lock(&newest.0).clone()).unwrap_or_default();
+        Self { share, past, newest }
+    }
+
+    /// Returns `true` for a sample that an earlier reader took. A writer never gives two samples the same time stamp.
+    fn is_past(&self, sample: &Sample) -> bool {
+        let newest = sample.writer.and_then(|writer| self.past.get(&writer));
+        newest.is_some_and(|newest| sample.source_timestamp_ns <= *newest)
+    }
+
+    /// Skips a sample that was taken before. Otherwise it notes the sample and passes it to the share.
+    fn take(
+        &self,
+        sample: Sample,
+        publish: impl FnOnce(&Arc<LocalShare>, Sample) -> Result<(), Sample>,
+    ) -> Result<(), Sample> {
+        if self.is_past(&sample) {
+            self.share.data.count_here(&self.share.name, DataDrop::Repeated, 1);
+            return Ok(());
+        }
+        let (writer, timestamp_ns) = (sample.writer, sample.source_timestamp_ns);
+        publish(&self.share, sample)?;
+        if let (Some(newest), Some(writer)) = (&self.newest, writer) {
+            newest.note(writer, timestamp_ns);
+        }
+        Ok(())
+    }
+}
+
+impl HandleSamples for Publisher {
+    fn handle(&mut self, sample: Sample) {
+        let _ = self.take(sample, |share, sample| {
+            share.publish(sample);
+            Ok(())
+        });
+    }
+
+    fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
+        self.take(sample, |share, sample| share.publish_at_once(sample))
+    }
+
+    fn overrun(&mut self, samples: u64) {
+        self.share.count_overrun(samples);
+    }
+}
+
+/// Whether a message exceeds the largest size that SGC carries.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum IsTooLarge {
+    /// The message is too large and is never sent.
+    Yes,
+    /// The message was sent, or may be sent later.
+    No,
+}
+
+/// Samples that may wait until their writer is discovered or their type is known.
+const EARLY_SAMPLES_MAX: usize = 256;
+
+/// Writers of a topic whose newest time stamps are remembered.
+const NEWEST_WRITERS_MAX: usize = 1024;
+
+/// The longest message that the reader's thread sends by itself if no other follows.
+const AT_HAND_BYTES_MAX: usize = 16 << 10;
+
+/// A source with the properties of its publisher.
+#[derive(Clone)]
+pub(crate) struct SourceSlot {
+    /// Source id.
+    pub id: SourceId,
+    /// The source. The reader's thread locks it for each message.
+    pub source: Arc<Mutex<Source>>,
+    /// Progress of the source, readable without the lock.
+    pub progress: Arc<SourceProgress>,
+    /// Whether late joiners may ask for its history.
+    pub keeps_history: bool,
+    /// Whether its packets are reliable.
+    pub reliable: bool,
+    /// Time after which its messages expire.
+    pub lifespan: Option<Duration>,
+    /// Number of messages kept for late joiners.
+    pub depth: usize,
+    /// Lease of a publisher that asserts its liveliness without messages.
+    pub manual: Option<Arc<ManualLease>>,
+}
+
+impl SourceSlot {
+    /// Creates the slot of a source.
+    pub(crate) fn new(source: Source, keeps_history: bool, reliable: bool) -> Self {
+        let (id, progress) = (source.id(), source.progress());
+        let source = Arc::new(Mutex::new(source));
+        Self { id, source, progress, keeps_history, reliable, lifespan: None, depth: 0, manual: None }
+    }
+}
+
+/// The sources of a share by writer.
+#[derive(Default)]
+pub(crate) struct SourceMap {
+    /// The one source of all writers, if writers are not distinguished.
+    pub shared: Option<SourceSlot>,
+    /// Whether each writer has its own source. Samples of an unlisted writer then wait until it is listed.
+    pub(crate) per_writer: bool,
+    /// Sources by writer.
+    pub own: HashMap<Guid, SourceSlot>,
+    /// The source that asserts the liveliness of writers without messages. It keeps no history.
+    pub assertions: Option<SourceSlot>,
+}
+
+impl SourceMap {
+    /// Returns the slot of a source.
+    pub(crate) fn slot(&self, id: &SourceId) -> Option<SourceSlot> {
+        self.slots().find(|slot| slot.id == *id).cloned()
+    }
+
+    /// Returns the ids of all sources.
+    pub(crate) fn ids(&self) -> Vec<SourceId> {
+        self.slots().map(|slot| slot.id).collect()
+    }
+
+    /// Iterates over all slots.
+    pub(crate) fn slots(&self) -> impl Iterator<Item = &SourceSlot> {
+        self.own.values().chain(&self.shared).chain(&self.assertions)
+    }
+}
+
+/// State of shaping: the sample that waits for its time.
+#[derive(Default)]
+struct DelayedSample {
+    shaper: Shaper,
+    /// The newest waiting sample.
+    sample: Option<Sample>,
+    /// Whether a task will publish it.
+    is_timed: bool,
+}
+
+/// Compression of messages, with its counters.
+#[derive(Default)]
+struct Compression {
+    encoding: Mutex<(PayloadEncoding, Compressor)>,
+    before: AtomicU64,
+    after: AtomicU64,
+}
+
+/// Samples and sources that wait.
+struct Inbox {
+    /// Samples without a source or a type. DDS may deliver a late joiner's history before it discovers the writer, and
+    /// samples to convert to JSON wait for their type.
+    early: PendingQueue<Sample>,
+    /// Sources that expect more messages and keep an unfinished batch.
+    open: Vec<SourceSlot>,
+}
+
+/// Error: the writer has no source yet.
+struct UnknownWriter;
+
+/// This node's end of a topic that it shares or publishes on.
+pub(crate) struct LocalShare {
+    name: Name,
+    data: Arc<DataPlane>,
+    runtime: Handle,
+    alive: mpsc::Sender<()>,
+    pub map: ArcSwap<SourceMap>,
+    inbox: Mutex<Inbox>,
+    /// Whether shaping is configured, readable without the lock.
+    is_shaped: AtomicBool,
+    /// Whether shaping or compression is configured.
+    is_altered: AtomicBool,
+    /// Whether messages leave as JSON.
+    is_json: AtomicBool,
+    types: TypeSlot,
+    held: Mutex<DelayedSample>,
+    compression: Compression,
+    /// Notified when the share closes, to wake a thread that waits for a sample's time.
+    ended: Condvar,
+    /// Whether the log has said that reliable messages do not age.
+    aged: AtomicBool,
+    /// Number of waiting samples. It is readable without the lock, which a blocked publisher holds.
+    waiting: AtomicUsize,
+    closed: AtomicBool,
+    /// Messages of one source under one key before a new epoch begins.
+    epoch_messages_max: u64,
+    /// Whether the message limit of the epoch is reached and the next epoch has not begun.
+    rotating: AtomicBool,
+    /// Whether the control task has yet to see that the epoch is over.
+    is_over: AtomicBool,
+    /// Wakes the control task, which may otherwise sleep while messages flow.
+    over: Arc<Notify>,
+    /// Progress of each source at the last look for silence.
+    marks: Mutex<BTreeMap<SourceId, Marks>>,
+    /// Whether all sources are silent. The next message clears it.
+    quiet: AtomicBool,
+    published: AtomicU64,
+    taps: Taps,
+    /// Whether a task looks for liveliness assertions.
+    is_watched: AtomicBool,
+}
+
+impl LocalShare {
+    /// Returns the sources. [`Self::set_map`] replaces them as a whole.
+    pub(crate) fn map(&self) -> Arc<SourceMap> {
+        self.map.load_full()
+    }
+
+    /// Creates a share without sources.
+    pub(crate) fn new(
+        name: Name,
+        data: Arc<DataPlane>,
+        alive: mpsc::Sender<()>,
+        epoch_messages_max: u64,
+        over: Arc<Notify>,
+    ) -> Self {
+        let early = PendingQueue::new(EARLY_SAMPLES_MAX, data.holds().clone());
+        Self {
+            name,
+            data,
+            runtime: Handle::current(),
+            alive,
+            map: ArcSwap::default(),
+            inbox: Mutex::new(Inbox { early, open: Vec::new() }),
+            is_shaped: AtomicBool::new(false),
+            is_altered: AtomicBool::new(false),
+            is_json: AtomicBool::new(false),
+            types: TypeSlot::default(),
+            held: Mutex::default(),
+            compression: Compression::default(),
+            ended: Condvar::new(),
+            aged: AtomicBool::new(false),
+            waiting: AtomicUsize::new(0),
+            closed: AtomicBool::new(false),
+            epoch_messages_max,
+            rotating: AtomicBool::new(false),
+            is_over: AtomicBool::new(false),
+            over,
+            marks: Mutex::default(),
+            quiet: AtomicBool::new(true),
+            published: AtomicU64::new(0),
+            taps: Taps::default(),
+            is_watched: AtomicBool::new(false),
+        }
+    }
+
+    /// Sets the number of messages that a source keeps for late joiners.
+    pub(crate) fn set_history_depth(&self, slot: &SourceSlot, depth: usize) {
+        let source = slot.source.clone();
+        self.run_blocking(move || lock(&source).set_history_depth(depth));
+    }
+
+    /// Returns the taps of published messages.
+    pub(crate) fn taps(&self) -> &Taps {
+        &self.taps
+    }
+
+    /// Sets the limits of rate, bandwidth and age.
+    pub(crate) fn set_shaping(self: &Arc<Self>, shaping: Shaping) {
+        lock(&self.held).shaper.set(shaping);
+        lock(&self.compression.encoding).0 = shaping.compression;
+        self.is_altered.store(shaping != Shaping::default(), SeqCst);
+        let (compression, form) = (PayloadEncoding::Plain, PayloadForm::Cdr);
+        let limits = Shaping { compression, form, ..shaping };
+        self.is_shaped.store(limits != Shaping::default(), SeqCst);
+        if self.is_json.swap(shaping.form == PayloadForm::Json, SeqCst) {
+            // Samples that waited for conversion need none any more.
+            self.publish_waiting();
+        }
+    }
+
+    /// Sets the state of the type. Samples that waited for it are published or dropped.
+    pub(crate) fn set_type(self: &Arc<Self>, known: KnownType) {
+        self.types.set(known);
+        self.publish_waiting();
+    }
+
+    /// Returns the limits of rate, bandwidth and age.
+    pub(crate) fn shaping(&self) -> Shaping {
+        *lock(&self.held).shaper.shaping()
+    }
+
+    /// Publishes a sample, at once or when its time has come. The reader's thread calls it.
+    pub(crate) fn publish(self: &Arc<Self>, sample: Sample) {
+        // If more samples follow or the sample is long, the runtime sends packets while this thread seals.
+        let is_alone = !sample.more && sample.payload.len() <= AT_HAND_BYTES_MAX;
+        let _at_hand = is_alone.then(|| WakeBatch::begin(&self.runtime));
+        if !self.is_shaped.load(Relaxed) {
+            return self.publish_now(sample);
+        }
+        let ends_batch = !sample.more;
+        match self.shape(sample) {
+            Some(sample) => self.publish_now(sample),
+            // The last sample of the batch is not published, so the earlier ones must leave now.
+            None if ends_batch => self.flush(&mut lock(&self.inbox)),
+            None => {}
+        }
+    }
+
+    /// Publishes a sample if that needs no waiting, or returns it. Receive threads of several readers call it.
+    fn publish_at_once(&self, sample: Sample) -> Result<(), Sample> {
+        let is_short = sample.payload.len() <= AT_HAND_BYTES_MAX;
+        if !is_short || self.is_altered.load(Relaxed) || !self.data.has_headroom(&self.name) {
+            return Err(sample);
+        }
+        // The woken tasks run after the locks are released.
+        let _at_hand = WakeBatch::begin(&self.runtime);
+        // The holder of the lock may be blocked.
+        let Ok(inbox) = self.inbox.try_lock() else { return Err(sample) };
+        let Ok(slot) = self.slot_of(sample.writer) else { return Err(sample) };
+        if !inbox.early.is_empty() || !inbox.open.is_empty() {
+            return Err(sample);
+        }
+        if let Some(slot) = slot {
+            let Ok(source) = slot.source.try_lock() else { return Err(sample) };
+            self.publish_of(&slot, Some(source), sample, false);
+        } else {
+            self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted);
+        }
+        Ok(())
+    }
+
+    /// Returns a sample that may leave now, or holds it until its time comes or a newer one replaces it. Blocks with a
+    /// sample that may be neither dropped nor overtaken.
+    fn shape(self: &Arc<Self>, sample: Sample) -> Option<Sample> {
+        let mut held = lock(&self.held);
+        if sample.kind != SampleKind::Write {
+            // The end of an instance follows its last sample and is never dropped.
+            if let Some(before) = held.sample.take() {
+                drop(held);
+                self.publish_now(Sample { more: true, ..before });
+            }
+            return Some(sample);
+        }
+        let reliable = self.map.load().slots().any(|slot| slot.reliable);
+        if held.shaper.shaping().max_age.is_some() && reliable {
+            if !self.aged.swap(true, Relaxed) {
+                let topic = self.name.short();
+                warn!(%topic, "`max_age` is set for a topic that is reliable: none of its messages may be left out, and it has no effect");
+            }
+        } else if held.shaper.is_too_old(unix_ns(), sample.source_timestamp_ns) {
+            self.data.count(LinkId::LOCAL, &self.name, DataDrop::TooOld);
+            return None;
+        }
+        let mut now = Instant::now();
+        while !held.shaper.is_due(now) && !self.closed.load(Relaxed) {
+            if held.shaper.gives_way(now, reliable) {
+                if held.sample.replace(sample).is_some() {
+                    self.data.count(LinkId::LOCAL, &self.name, DataDrop::Thinned);
+                }
+                if !std::mem::replace(&mut held.is_timed, true) {
+                    self.runtime.spawn(let_go(Arc::downgrade(self)));
+                }
+                return None;
+            }
+            let wait = held.shaper.due().map_or(Duration::ZERO, |due| due.saturating_duration_since(now));
+            held = self.ended.wait_timeout(held, wait).unwrap_or_else(PoisonError::into_inner).0;
+            now = Instant::now();
+        }
+        if held.sample.take().is_some() {
+            self.data.count(LinkId::LOCAL, &self.name, DataDrop::Thinned);
+        }
+        held.shaper.takes(now, sample.payload.len());
+        Some(sample)
+    }
+
+    /// Returns the held sample if its time has come.
+    fn take_held(&self) -> Option<Sample> {
+        let mut held = lock(&self.held);
+        let now = Instant::now();
+        let sample = if held.shaper.is_due(now) { held.sample.take() } else { None }?;
+        held.shaper.takes(now, sample.payload.len());
+        Some(Sample { more: false, ..sample })
+    }
+
+    /// Publishes a sample without shaping.
+    fn publish_now(&self, sample: Sample) {
+        let more = sample.more;
+        let mut inbox = lock(&self.inbox);
+        self.publish_early(&mut inbox);
+        if let Err(sample) = self.try_publish(sample, more, &mut inbox.open) {
+            let reason = if self.awaits_type() { DataDrop::NoDefinition } else { DataDrop::Stale };
+            let given_up = inbox.early.push(Instant::now(), sample.payload.len(), sample);
+            if given_up > 0 {
+                self.data.count_here(&self.name, reason, given_up);
+            }
+            self.waiting.store(inbox.early.len(), SeqCst);
+            // The source may have been added between the two checks. A later `set_map` sees the waiting sample.
+            self.publish_early(&mut inbox);
+        }
+        if !more {
+            self.flush(&mut inbox);
+        }
+    }
+
+    /// Replaces the sources, and publishes samples that waited for them.
+    pub(crate) fn set_map(self: &Arc<Self>, map: SourceMap) {
+        self.map.store(Arc::new(map));
+        self.publish_waiting();
+    }
+
+    /// Publishes samples that need not wait any more, on a blocking thread.
+    fn publish_waiting(self: &Arc<Self>) {
+        fence(SeqCst);
+        if self.waiting.load(SeqCst) == 0 {
+            return;
+        }
+        let (share, alive) = (self.clone(), self.alive.clone());
+        self.runtime.spawn_blocking(move || {
+            let _alive = alive;
+            let mut inbox = lock(&share.inbox);
+            share.publish_early(&mut inbox);
+            share.flush(&mut inbox);
+        });
+    }
+
+    /// Publishes in order the waiting samples whose writers have a source now. The caller flushes, or publishes more.
+    fn publish_early(&self, inbox: &mut Inbox) {
+        if inbox.early.is_empty() {
+            return;
+        }
+        fence(SeqCst);
+        let (now, mut late) = (Instant::now(), 0);
+        if self.awaits_type() {
+            late = inbox.early.give_up_late(now, |sample| self.is_given_up(sample));
+        } else {
+            for mut held in inbox.early.take() {
+                if held.is_late(now) && self.is_given_up(&held.item) {
+                    late += 1;
+                    continue;
+                }
+                if let Err(sample) = self.try_publish(held.item, true, &mut inbox.open) {
+                    held.item = sample;
+                    inbox.early.push_back(held);
+                }
+            }
+        }
+        if late > 0 {
+            self.data.count_here(&self.name, DataDrop::NoDefinition, late);
+        }
+        self.waiting.store(inbox.early.len(), SeqCst);
+    }
+
+    /// Returns `true` if messages leave as JSON and their type may still become known.
+    fn awaits_type(&self) -> bool {
+        self.is_json.load(Relaxed) && self.types.now().is_awaited()
+    }
+
+    /// Returns `true` if a waiting sample is useless when late, because it is not kept for late joiners.
+    fn is_given_up(&self, sample: &Sample) -> bool {
+        self.is_json.load(Relaxed)
+            && sample.kind == SampleKind::Write
+            && matches!(self.slot_of(sample.writer), Ok(Some(slot)) if !slot.keeps_history)
+    }
+
+    /// Publishes a sample, or returns it if its source or its type is unknown. With `more`, the source may keep an
+    /// unfinished batch and is then in `open`.
+    fn try_publish(&self, sample: Sample, more: bool, open: &mut Vec<SourceSlot>) -> Result<(), Sample> {
+        let awaits_type = self.awaits_type();
+        match self.slot_of(sample.writer) {
+            Err(UnknownWriter) => return Err(sample),
+            Ok(Some(_)) if awaits_type => return Err(sample),
+            Ok(None) => self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted),
+            Ok(Some(slot)) => {
+                let is_open = self.publish_of(&slot, None, sample, more);
+                if is_open && open.iter().all(|o| o.id != slot.id) {
+                    open.push(slot);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns the source of a writer, if it has one.
+    fn slot_of(&self, writer: Option<Guid>) -> Result<Option<SourceSlot>, UnknownWriter> {
+        let map = self.map.load();
+        match writer.and_then(|w| map.own.get(&w)) {
+            Some(slot) => Ok(Some(slot.clone())),
+            None if map.per_writer && writer.is_some() => Err(UnknownWriter),
+            // The writer is gone and was never identified, so any source serves.
+            None => Ok(map.shared.as_ref().or_else(|| map.own.values().min_by_key(|s| s.id)).cloned()),
+        }
+    }
+
+    /// Publishes a sample by its source, which may be locked already. Returns `true` if the source keeps an unfinished
+    /// batch, which only `more` allows.
+    fn publish_of(
+        &self,
+        slot: &SourceSlot,
+        source: Option<MutexGuard<'_, Source>>,
+        sample: Sample,
+        more: bool,
+    ) -> bool {
+        if self.closed.load(Relaxed) {
+            return false;
+        }
+        let wanted = self.data.is_wanted(&self.name);
+        if !wanted && !slot.keeps_history && !slot.progress.recovers() {
+            self.data.count(LinkId::LOCAL, &self.name, DataDrop::NoTree);
+            return false;
+        }
+        self.taps.offer(|| TapMessage::from_sample(&sample));
+        // Messages that cannot leave are not converted.
+        let written = match wanted || slot.keeps_history {
+            true => self.write(sample.kind, sample.key_hash, sample.payload),
+            false => Ok((PayloadForm::Cdr, PayloadEncoding::Plain, sample.payload)),
+        };
+        let (form, encoding, payload) = match written {
+            Ok(written) => written,
+            Err(reason) => {
+                self.data.count(LinkId::LOCAL, &self.name, reason);
+                return more;
+            }
+        };
+        let kind = match sample.kind {
+            SampleKind::Write => MessageKind::Write,
+            SampleKind::Dispose => MessageKind::Dispose,
+            SampleKind::Unregister => MessageKind::Unregister,
+        };
+        let head = MessageHead { form, encoding, ..MessageHead::new(kind, sample.source_timestamp_ns) };
+        if let Some(manual) = slot.manual.as_ref().filter(|_| wanted) {
+            manual.note_heard(Instant::now());
+        }
+        let mut source = source.unwrap_or_else(|| lock(&slot.source));
+        let result = if wanted {
+            // Fragments leave while later ones are sealed, so a large message is under way before its end is read.
+            source.publish(&head, payload, more, self.emit())
+        } else {
+            // Nobody listens now, so the message is only kept for late joiners and rejoining sinks.
+            source.record(&head, payload)
+        };
+        drop(source);
+        self.note_published(slot, result);
+        more
+    }
+
+    /// Publishes a request or a reply. It has no effect while nobody would receive it. May block.
+    pub(crate) fn publish_call(&self, head: &MessageHead, payload: Bytes, to: Option<SinkId>) -> IsTooLarge {
+        let Some(slot) = self.map.load().shared.clone() else { return IsTooLarge::No };
+        if self.closed.load(Relaxed) || !self.data.is_wanted(&self.name) {
+            return IsTooLarge::No;
+        }
+        let mut source = lock(&slot.source);
+        let result = match to {
+            Some(sink) => source.publish_to(sink, head, payload, self.emit()),
+            None => source.publish(head, payload, false, self.emit()),
+        };
+        drop(source);
+        let is_too_large = match result {
+            Err(PublishError::TooLarge { .. }) => IsTooLarge::Yes,
+            _ => IsTooLarge::No,
+        };
+        self.note_published(&slot, result);
+        is_too_large
+    }
+
+    /// Counts local samples that were lost because they came too fast.
+    pub(crate) fn count_overrun(&self, messages: u64) {
+        self.data.count_here(&self.name, DataDrop::Overrun, messages);
+    }
+
+    fn note_published(&self, slot: &SourceSlot, result: Result<(), PublishError>) {
+        match result {
+            Ok(()) => {
+                self.published.fetch_add(1, Relaxed);
+                if self.quiet.load(Relaxed) && slot.progress.recovers() && self.quiet.swap(false, SeqCst) {
+                    self.over.notify_one();
+                }
+                if slot.progress.published_in_epoch() >= self.epoch_messages_max
+                    && !self.rotating.swap(true, Relaxed)
+                {
+                    self.is_over.store(true, SeqCst);
+                    self.over.notify_one();
+                }
+            }
+            Err(PublishError::TooLarge { .. }) => {
+                self.data.count(LinkId::LOCAL, &self.name, DataDrop::TooLarge);
+            }
+            Err(PublishError::Exhausted | PublishError::Keeps) => {
+                self.data.count(LinkId::LOCAL, &self.name, DataDrop::SourceExhausted);
+            }
+        }
+    }
+
+    /// Converts and compresses a payload.
+    fn write(
+        &self,
+        kind: SampleKind,
+        key_hash: Option<KeyHash>,
+        payload: Bytes,
+    ) -> Result<(PayloadForm, PayloadEncoding, Bytes), DataDrop> {
+        let taken = payload.len();
+        let is_converted = self.is_json.load(Relaxed) && kind == SampleKind::Write;
+        let (form, payload) = match key_hash.filter(|_| !is_converted) {
+            None => (PayloadForm::Cdr, payload),
+            Some(hash) => (PayloadForm::KeyedCdr, [&hash[..], &payload].concat().into()),
+        };
+        if !self.is_altered.load(Relaxed) || kind != SampleKind::Write {
+            return Ok((form, PayloadEncoding::Plain, payload));
+        }
+        let (form, payload) = if is_converted { self.convert(payload)? } else { (form, payload) };
+        let (encoding, payload) = self.compress(payload);
+        if self.is_shaped.load(Relaxed) {
+            lock(&self.held).shaper.corrects(taken, payload.len());
+        }
+        Ok((form, encoding, payload))
+    }
+
+    fn convert(&self, payload: Bytes) -> Result<(PayloadForm, Bytes), DataDrop> {
+        let known = self.types.now();
+        let layout = known.layout().ok_or(DataDrop::NoDefinition)?;
+        match conversion::to_json(layout, &payload) {
+            Ok(json) => Ok((PayloadForm::Json, json)),
+            Err(error) => {
+                debug!(name = %self.name.short(), %error, "a message is not sent");
+                Err(DataDrop::NotConverted)
+            }
+        }
+    }
+
+    fn compress(&self, payload: Bytes) -> (PayloadEncoding, Bytes) {
+        let mut compression = lock(&self.compression.encoding);
+        let (encoding, compressor) = &mut *compression;
+        if *encoding == PayloadEncoding::Plain {
+            return (PayloadEncoding::Plain, payload);
+        }
+        let packed = compressor.compress(*encoding, &payload);
+        let encoding = if packed.is_some() { *encoding } else { PayloadEncoding::Plain };
+        drop(compression);
+        let left = packed.unwrap_or_else(|| payload.clone());
+        self.compression.before.fetch_add(payload.len() as u64, Relaxed);
+        self.compression.after.fetch_add(left.len() as u64, Relaxed);
+        (encoding, left)
+    }
+
+    /// Returns the bytes before and after compression; `None` before the first message.
+    pub(crate) fn compressed(&self) -> Option<(u64, u64)> {
+        let before = self.compression.before.load(Relaxed);
+        (before > 0).then(|| (before, self.compression.after.load(Relaxed)))
+    }
+
+    /// Finishes open batches, because no more messages follow.
+    fn flush(&self, inbox: &mut Inbox) {
+        for slot in inbox.open.drain(..) {
+            lock(&slot.source).flush(self.emit());
+        }
+    }
+
+    /// Returns a function that forwards packets. Packets of a history without a sink stay here.
+    fn emit(&self) -> impl FnMut(Packet) {
+        let wanted = self.data.is_wanted(&self.name);
+        move |packet| {
+            if wanted && !self.closed.load(Relaxed) {
+                // The future is passed by reference, since tokio boxes large futures.
+                sgc_executor::block_on(&self.runtime, pin!(self.data.forward(LinkId::LOCAL, packet)));
+            }
+        }
+    }
+
+    /// Publishes under the key of a new epoch from here on. A blocked publisher takes it up after its message.
+    pub(crate) fn rekey(self: &Arc<Self>, grant: TopicGrant) {
+        let (share, alive) = (self.clone(), self.alive.clone());
+        self.runtime.spawn_blocking(move || {
+            let _alive = alive;
+            for slot in share.map.load().slots() {
+                // A source that was created meanwhile has this key already, or a later one.
+                let _ = lock(&slot.source).rekey(&grant, share.emit());
+            }
+            share.rotating.store(false, Relaxed);
+        });
+    }
+
+    /// Returns `true` once per epoch, when a source has reached the message limit.
+    pub(crate) fn is_epoch_over(&self) -> bool {
+        self.is_over.swap(false, SeqCst)
+    }
+
+    /// Sends a sink the requested history, in order with new messages. Blocks until it is sent.
+    pub(crate) fn replay(&self, recover: &Recover) {
+        let Some(slot) = self.map.load().slot(&recover.source) else { return };
+        let mut source = lock(&slot.source);
+        if let Some(lifespan) = slot.lifespan {
+            source.expire(unix_ns().saturating_sub(lifespan.as_nanos().try_into().unwrap_or(i64::MAX)));
+        }
+        source.replay(recover.sink, recover.from, recover.to, |packet| {
+            if !self.closed.load(Relaxed) {
+                self.runtime.block_on(self.data.forward(LinkId::LOCAL, packet));
+            }
+        });
+    }
+
+    /// Returns `true` once if a task has to look for liveliness assertions ([`crate::data::assertions::watch`]).
+    pub(crate) fn begins_watch(&self) -> bool {
+        self.map.load().assertions.is_some() && !self.is_watched.swap(true, SeqCst)
+    }
+
+    /// Passes on liveliness assertions of publishers without messages. Returns the wait until the next look; `None` if
+    /// no such publisher is left.
+    pub(crate) fn look_for_assertions(
+        self: &Arc<Self>,
+        now: Instant,
+        renewed_ago: impl Fn(&Guid) -> Option<Duration>,
+    ) -> Option<Duration> {
+        if self.closed.load(Relaxed) {
+            return None;
+        }
+        let mut map = self.map();
+        if map.assertions.is_none() {
+            self.is_watched.store(false, SeqCst);
+            // A publisher may have been added between the two checks.
+            if !self.begins_watch() {
+                return None;
+            }
+            map = self.map();
+        }
+        let manual =
+            || map.own.iter().filter_map(|(writer, slot)| Some((writer, slot, slot.manual.as_ref()?)));
+        let wait = manual().map(|(_, _, lease)| lease.look_every()).min().unwrap_or(ASSERTION_LOOK_MAX);
+        if !self.data.is_wanted(&self.name) {
+            return Some(wait);
+        }
+        let news = manual()
+            .filter(|(writer, _, lease)| renewed_ago(writer).is_some_and(|ago| lease.is_news(now, ago)));
+        let news: Vec<_> = news.map(|(_, slot, lease)| (slot.id.publisher(), lease.clone())).collect();
+        if let Some(slot) = map.assertions.clone().filter(|_| !news.is_empty()) {
+            let share = self.clone();
+            self.run_blocking(move || {
+                // The holder of the source is blocked.
+                let Ok(mut source) = slot.source.try_lock() else { return };
+                for (publisher, lease) in news {
+                    if source.assert_publisher(publisher, share.emit()).is_ok() {
+                        lease.note_heard(now);
+                    }
+                }
+            });
+        }
+        Some(wait)
+    }
+
+    /// Runs work that may block on a blocking thread.
+    pub(crate) fn run_blocking(&self, work: impl FnOnce() + Send + 'static) {
+        let alive = self.alive.clone();
+        self.runtime.spawn_blocking(move || {
+            let _alive = alive;
+            work();
+        });
+    }
+
+    /// Lets silent sources announce their last message. Returns `false` if none has to before the next message.
+    pub(crate) fn look_for_silence(self: &Arc<Self>, now: Instant) -> bool {
+        if self.quiet.load(SeqCst) {
+            return false;
+        }
+        let map = self.map();
+        let mut marks = lock(&self.marks);
+        marks.retain(|id, _| map.slot(id).is_some());
+        let mut look = || {
+            let mut busy = false;
+            for slot in map.slots() {
+                let marks = marks.entry(slot.id).or_default();
+                if marks.is_due(now, &slot.progress) && self.data.is_wanted(&self.name) {
+                    let (share, slot) = (self.clone(), slot.clone());
+                    self.run_blocking(move || {
+                        // The holder of the source is about to publish.
+                        if let Ok(mut source) = slot.source.try_lock() {
+                            source.mark(share.emit());
+                        }
+                    });
+                }
+                busy |= marks.deadline().is_some();
+            }
+            busy
+        };
+        if look() {
+            return true;
+        }
+        self.quiet.store(true, SeqCst);
+        // A message may have come between the two checks.
+        let busy = look();
+        if busy {
+            self.quiet.store(false, SeqCst);
+        }
+        busy
+    }
+
+    /// Closes the share. A publishing reader's thread stops at the next packet.
+    pub(crate) fn close(&self) {
+        self.closed.store(true, Relaxed);
+        self.taps.close();
+        let _held = lock(&self.held);
+        self.ended.notify_all();
+    }
+
+    /// Returns the number of signatures of its present sources, one for each batch.
+    pub(crate) fn signatures(&self) -> u64 {
+        self.map.load().slots().map(|slot| slot.progress.signatures()).sum()
+    }
+
+    /// Returns `true` if messages have to leave as JSON and their type is unknown.
+    pub(crate) fn lacks_definition(&self) -> bool {
+        self.is_json.load(Relaxed) && self.types.now().is_lacking()
+    }
+
+    /// Returns the number of published messages.
+    pub(crate) fn published(&self) -> u64 {
+        self.published.load(Relaxed)
+    }
+}
+
+/// Publishes held samples when their time comes, until none is left.
+async fn let_go(share: Weak<LocalShare>) {
+    loop {
+        let due = {
+            let Some(share) = share.upgrade() else { return };
+            let mut held = lock(&share.held);
+            held.is_timed = held.sample.is_some() && !share.closed.load(Relaxed);
+            if !held.is_timed {
+                return;
+            }
+            held.shaper.due()
+        };
+        if let Some(due) = due {
+            tokio::time::sleep_until(due.into()).await;
+        }
+        let Some(share) = share.upgrade() else { return };
+        let (runtime, alive) = (share.runtime.clone(), share.alive.clone());
+        let publish = move || {
+            let _alive = alive;
+            if let Some(sample) = share.take_held() {
+                share.publish_now(sample);
+            }
+        };
+        // Publishing may block.
+        let _ = runtime.spawn_blocking(publish).await;
+    }
+}
+
+/// Returns the wall-clock time that publishers stamp samples with.
+fn unix_ns() -> i64 {
+    let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    unix.as_nanos().try_into().unwrap_or(i64::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use sgc_endpoint::{RecoveryLimits, SourceConfig};
+    use sgc_router::{FibEntry, Tree};
+    use sgc_trust::{MessageKey, Suite};
+    use sgc_wire::{Class, SecretBytes};
+
+    use super::*;
+    use crate::data::dataplane::{Forward, Out};
+    use crate::data::outflow::OutFlow;
+    use crate::data::pending::PENDING_BYTES_MAX;
+
+    const KNOWN: Guid = Guid([1; 16]);
+    const STRANGER: Guid = Guid([2; 16]);
+
+    fn sample(writer: Guid, more: bool) -> Sample {
+        let payload = Bytes::from_static(b"\0\x01\0\0data");
+        let (kind, writer) = (SampleKind::Write, Some(writer));
+        Sample { kind, writer, source_timestamp_ns: 0, key_hash: None, payload, more }
+    }
+
+    fn grant(epoch: u32) -> TopicGrant {
+        let key = SecretBytes::new([epoch as u8; 32]);
+        TopicGrant { epoch, suite: Suite::Standard.id(), key, sources: Vec::new(), entry: None }
+    }
+
+    /// Creates a share with a source for one writer. Samples of other writers wait until their writer is known.
+    fn share() -> (Arc<LocalShare>, SourceSlot) {
+        let (alive, _) = mpsc::channel(1);
+        let share = Arc::new(LocalShare::new(Name([1; 32]), Arc::default(), alive, 2, Arc::default()));
+        let config = SourceConfig {
+            name: Name([1; 32]),
+            id: SourceId([1; 16]),
+            class: Class::Default,
+            reliable: true,
+            history_depth: 10,
+            history_bytes_max: 1000,
+            recovery: RecoveryLimits::default(),
+        };
+        let source = Source::new(config, &grant(1), MessageKey::generate(Suite::Standard)).unwrap();
+        let slot = SourceSlot::new(source, true, true);
+        let own = HashMap::from([(KNOWN, slot.clone())]);
+        share.set_map(SourceMap { per_writer: true, own, ..SourceMap::default() });
+        (share, slot)
+    }
+
+    fn unflushed(slot: &SourceSlot) -> usize {
+        let mut n = 0;
+        lock(&slot.source).flush(|_| n += 1);
+        n
+    }
+
+    #[test]
+    fn nothing_stays_unsigned_when_the_last_sample_of_a_batch_goes_elsewhere() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        // Without a sink nothing is sealed.
+        share.publish(sample(KNOWN, true));
+        assert_eq!((share.published(), unflushed(&slot)), (1, 0));
+        let nowhere = FibEntry { trees: [].as_slice().into(), sinks: vec![] };
+        share.data.set(share.name, Some(Forward::new(nowhere, vec![], Arc::default())));
+        share.publish(sample(KNOWN, true));
+        share.publish(sample(STRANGER, false));
+        assert_eq!((share.published(), unflushed(&slot)), (2, 0));
+        // The stranger is known now and its waiting samples are published.
+        share.publish(sample(KNOWN, true));
+        assert_eq!(unflushed(&slot), 1, "it does wait while more is to come");
+        share.publish(sample(KNOWN, true));
+        share.closed.store(true, Relaxed);
+        share.publish(sample(KNOWN, false));
+        assert_eq!(unflushed(&slot), 0);
+    }
+
+    #[test]
+    fn reader_in_the_place_of_another_takes_nothing_twice() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, _) = share();
+        let newest = Some(Arc::default());
+        let dated = |timestamp| Sample { source_timestamp_ns: timestamp, ..sample(KNOWN, false) };
+        let mut first = Publisher::new(share.clone(), newest.clone());
+        [1, 2, 3].into_iter().for_each(|timestamp| first.handle(dated(timestamp)));
+        assert_eq!(share.published(), 3);
+        // The writer delivers the same samples again, and new ones.
+        let mut second = Publisher::new(share.clone(), newest);
+        [1, 2, 3, 4, 5].into_iter().for_each(|timestamp| second.handle(dated(timestamp)));
+        assert_eq!(share.published(), 5);
+        assert_eq!(share.data.drops().snapshot()["repeated"], 3);
+        // A reader does not skip samples that it took itself.
+        second.handle(dated(5));
+        assert_eq!(share.published(), 6);
+    }
+
+    #[test]
+    fn newest_samples_are_kept_of_a_bounded_number_of_writers() {
+        let newest = NewestSamples::default();
+        for n in 0..2 * NEWEST_WRITERS_MAX {
+            let mut guid = [0; 16];
+            guid[..8].copy_from_slice(&n.to_be_bytes());
+            newest.note(Guid(guid), 7);
+            newest.note(Guid(guid), 6);
+        }
+        let newest = lock(&newest.0);
+        assert_eq!(newest.len(), NEWEST_WRITERS_MAX);
+        assert!(newest.values().all(|timestamp| *timestamp == 7));
+    }
+
+    /// Waits until `is_so`, with a bound.
+    fn wait_until(is_so: impl Fn() -> bool) {
+        let end = Instant::now() + Duration::from_secs(30);
+        while !is_so() {
+            assert!(Instant::now() < end, "it does not come");
+            std::thread::yield_now();
+        }
+    }
+
+    #[test]
+    fn sample_that_would_block_is_handed_back() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        let flow = OutFlow::idle();
+        let (link, out) = (LinkId(1), Out::Link(flow.clone(), Arc::default()));
+        let tree =
+            Tree { up: LinkId::LOCAL, down: [link].as_slice().into(), publishers: [].as_slice().into() };
+        let entry = FibEntry { trees: [tree].into(), sinks: vec![] };
+        share.data.set(share.name, Some(Forward::new(entry, vec![(link, out)], Arc::default())));
+        let mut publisher = Publisher::new(share.clone(), None);
+        let mut is_taken = |sample: Sample| publisher.handle_at_once(sample).is_ok();
+        assert!(is_taken(sample(KNOWN, false)));
+        assert_eq!((share.published(), flow.has_headroom()), (1, true));
+        // These cases wait: an unknown source, a locked source, or an unfinished batch.
+        assert!(!is_taken(sample(STRANGER, false)));
+        {
+            let _replays = lock(&slot.source);
+            assert!(!is_taken(sample(KNOWN, false)));
+        }
+        share.publish(sample(KNOWN, true));
+        assert!(!is_taken(sample(KNOWN, false)));
+        share.publish(sample(KNOWN, false));
+        // Long or shaped samples wait.
+        let payload = Bytes::from(vec![0; AT_HAND_BYTES_MAX + 1]);
+        assert!(!is_taken(Sample { payload, ..sample(KNOWN, false) }));
+        share.set_shaping(Shaping { compression: PayloadEncoding::Lz4, ..Shaping::default() });
+        assert!(!is_taken(sample(KNOWN, false)));
+        share.set_shaping(Shaping::default());
+        assert!(is_taken(sample(KNOWN, false)));
+        // A busy link makes it wait.
+        while flow.has_headroom() {
+            share.publish(sample(KNOWN, false));
+        }
+        assert!(!is_taken(sample(KNOWN, false)));
+        // Overruns are counted.
+        publisher.overrun(7);
+        assert_eq!(share.data.drops().snapshot()["overrun"], 7);
+    }
+
+    /// Returns a type with one string, and a message of it.
+    fn text_type() -> (Arc<sgc_cdr::Layout>, Bytes) {
+        let mut text = |_: &sgc_cdr::TypeName| Some("string a".to_owned());
+        let layout = sgc_cdr::Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut text).unwrap();
+        let message = layout.encode(&layout.from_json(br#"{"a":"text"}"#).unwrap()).unwrap();
+        (Arc::new(layout), message.into())
+    }
+
+    #[test]
+    fn sample_to_convert_waits_until_the_owner_describes_its_type() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, mut slot) = share();
+        let (layout, payload) = text_type();
+        let sample = || Sample { payload: payload.clone(), ..sample(KNOWN, false) };
+        share.set_shaping(Shaping { form: PayloadForm::Json, ..Shaping::default() });
+        share.set_type(KnownType::Asked);
+        assert!(share.lacks_definition());
+        (0..EARLY_SAMPLES_MAX + 3).for_each(|_| share.publish(sample()));
+        let lost = |share: &LocalShare| share.data.drops().snapshot().get("no_definition").copied();
+        assert_eq!((share.published(), lost(&share)), (0, Some(3)));
+        // Large samples are bounded by their bytes.
+        let large = Sample { payload: vec![0; PENDING_BYTES_MAX].into(), ..sample() };
+        share.publish(large);
+        assert_eq!(lost(&share), Some(3 + EARLY_SAMPLES_MAX as u64));
+        (0..2).for_each(|_| share.publish(sample()));
+        assert_eq!(lost(&share), Some(4 + EARLY_SAMPLES_MAX as u64));
+        share.set_type(KnownType::Known(layout.clone()));
+        wait_until(|| share.published() == 2);
+        // Late samples are dropped unless they are kept for late joiners.
+        for keeps_history in [true, false] {
+            slot.keeps_history = keeps_history;
+            let own = HashMap::from([(KNOWN, slot.clone())]);
+            share.set_map(SourceMap { per_writer: true, own, ..SourceMap::default() });
+            share.set_type(KnownType::Asked);
+            let long_ago = Instant::now().checked_sub(Duration::from_secs(60)).unwrap();
+            lock(&share.inbox).early.push(long_ago, 1, sample());
+            let nowhere = FibEntry { trees: [].as_slice().into(), sinks: vec![] };
+            share.data.set(share.name, Some(Forward::new(nowhere, vec![], Arc::default())));
+            let (before, lost_before) = (share.published(), lost(&share));
+            share.publish(sample());
+            share.set_type(KnownType::Known(layout.clone()));
+            let left = if keeps_history { 2 } else { 1 };
+            wait_until(|| share.published() == before + left);
+            assert_eq!(lost(&share), lost_before.map(|n| n + 2 - left));
+        }
+        // Samples leave unconverted where that is configured.
+        share.set_type(KnownType::Asked);
+        share.publish(sample());
+        let before = share.published();
+        share.set_shaping(Shaping::default());
+        wait_until(|| share.published() == before + 1);
+    }
+
+    #[test]
+    fn rate_limited_topic_sends_the_newest_sample_and_never_drops_the_last() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        share.set_shaping(Shaping { interval: Some(Duration::from_millis(200)), ..Shaping::default() });
+        let begin = Instant::now();
+        for _ in 0..50 {
+            share.publish(sample(KNOWN, false));
+        }
+        wait_until(|| share.published() == 2);
+        assert!(begin.elapsed() >= Duration::from_millis(200));
+        assert_eq!(share.data.drops().snapshot()["thinned"], 48);
+        assert_eq!(unflushed(&slot), 0);
+        // The end of an instance leaves at once, after its held sample.
+        share.publish(sample(KNOWN, false));
+        share.publish(Sample { kind: SampleKind::Dispose, ..sample(KNOWN, false) });
+        assert_eq!(share.published(), 4);
+        // Without shaping, samples pass.
+        share.set_shaping(Shaping::default());
+        (0..10).for_each(|_| share.publish(sample(KNOWN, false)));
+        assert_eq!(share.published(), 14);
+    }
+
+    #[test]
+    fn reliable_messages_wait_for_their_bandwidth_until_it_is_closed() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, _) = share();
+        share.set_shaping(Shaping { bits_per_s: Some(8 * 80), ..Shaping::default() });
+        let begin = Instant::now();
+        // 8 bytes each, at 80 bytes a second.
+        (0..4).for_each(|_| share.publish(sample(KNOWN, false)));
+        assert!(share.published() == 4 && begin.elapsed() >= Duration::from_millis(250));
+        share.set_shaping(Shaping { bits_per_s: Some(1), ..Shaping::default() });
+        share.publish(sample(KNOWN, false));
+        let waits = share.clone();
+        let thread = std::thread::spawn(move || waits.publish(sample(KNOWN, false)));
+        share.close();
+        thread.join().unwrap();
+        assert!(!share.data.drops().snapshot().contains_key("thinned"));
+    }
+
+    #[test]
+    fn stale_sample_is_dropped_unless_it_is_reliable() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let dated = |age_s: i64| Sample {
+            source_timestamp_ns: unix_ns() - age_s * 1_000_000_000,
+            ..sample(KNOWN, false)
+        };
+        for reliable in [true, false] {
+            let (share, mut slot) = share();
+            slot.reliable = reliable;
+            let own = HashMap::from([(KNOWN, slot)]);
+            share.set_map(SourceMap { per_writer: true, own, ..SourceMap::default() });
+            share.set_shaping(Shaping { max_age: Some(Duration::from_secs(5)), ..Shaping::default() });
+            [0, 60, 0].into_iter().for_each(|age| share.publish(dated(age)));
+            assert_eq!(share.published(), if reliable { 3 } else { 2 });
+        }
+    }
+
+    #[test]
+    fn an_epoch_is_over_once_however_often_that_is_asked() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        share.publish(sample(KNOWN, false));
+        assert!(!share.is_epoch_over());
+        share.publish(sample(KNOWN, false));
+        assert_eq!(slot.progress.published_in_epoch(), 2);
+        assert!(share.is_epoch_over());
+        assert!(!share.is_epoch_over());
+        share.rekey(grant(2));
+        while lock(&slot.source).epoch() == 1 {
+            std::thread::yield_now();
+        }
+        assert_eq!(slot.progress.published_in_epoch(), 0);
+    }
+
+    #[test]
+    fn a_share_is_looked_at_until_its_silence_was_told_three_times() {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _inside = runtime.enter();
+        let (share, slot) = share();
+        let begin = Instant::now();
+        let at = |seconds| begin + Duration::from_secs(seconds);
+        assert!(!share.look_for_silence(at(0)), "nothing was published");
+        for _ in 0..2 {
+            share.publish(sample(KNOWN, false));
+            assert!(share.look_for_silence(at(100)) && share.look_for_silence(at(102)));
+            assert!(share.look_for_silence(at(105)) && share.look_for_silence(at(114)));
+            assert!(!share.look_for_silence(at(116)) && !share.look_for_silence(at(900)));
+        }
+        assert_eq!(slot.progress.published(), 2, "without anybody who listens nothing is said");
+    }
+}

@@ -1,0 +1,7 @@
+//! Links: connections to other nodes, from the first dial to the last frame.
+
+pub(crate) mod keep_alive;
+pub(crate) mod lanes;
+pub(crate) mod links;
+pub(crate) mod push_crl;
+pub(crate) mod roaming;

@@ -1,0 +1,8 @@
+//! The local ROS 2 network as a whole: joining it, joining it again, and what keeps others from being seen in it.
+
+pub mod discovery_server;
+pub(crate) mod network_slot;
+pub(crate) mod rediscovery;
+pub(crate) mod reopening;
+pub(crate) mod strangers;
+pub(crate) mod type_questions;

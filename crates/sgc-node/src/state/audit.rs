@@ -1,0 +1,458 @@
+//! The audit log: grants, refusals, revocations, links and changes of configuration, one JSON line each.
+//!
+//! Writing never delays the control task. Records go through a bounded channel to a thread; records that do not fit are
+//! counted, and the log itself reports them. Lines are passed to the system at once, so a killed process loses none
+//! that were written. They are synced to the disk when a file is rotated and when the node stops, so a loss of power
+//! may cost the last seconds. The log holds no key, token or message.
+//!
+//! Each peer has quotas for the records that it causes (`quota`), so nobody displaces older records by joining and
+//! leaving. `file` handles the files.
+
+mod file;
+mod quota;
+
+use std::collections::BTreeMap;
+use std::io;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use arc_swap::ArcSwap;
+use serde::{Deserialize, Serialize};
+use sgc_sync::lock;
+use sgc_wire::{Name, NodeId, UnixMillis};
+use tracing::warn;
+
+use self::file::LogFile;
+pub use self::file::{AuditRoom, Unread, read, rotated_path};
+use self::quota::{Cause, Quotas};
+use crate::control::core::now;
+
+/// Records that may wait to be written.
+const WAITING_MAX: usize = 1024;
+/// Lines written at once.
+const BATCH_MAX: usize = 64;
+/// Longest text of one field, bytes.
+const FIELD_BYTES_MAX: usize = 512;
+/// Longest delay of a summary after its hour.
+const SUMMARY_DELAY: Duration = Duration::from_secs(60);
+const FILE_NAME: &str = "audit.jsonl";
+
+/// Kind of event.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum AuditEvent {
+    /// The node started.
+    Started,
+    /// The node stopped orderly.
+    Stopped,
+    /// A node was granted a share.
+    Granted,
+    /// A node was refused a share.
+    Refused,
+    /// A node left a share.
+    Left,
+    /// A certificate was revoked.
+    Revoked,
+    /// A node lost a share that was granted.
+    Cut,
+    /// A share has a new key.
+    Epoch,
+    /// A link was made.
+    LinkUp,
+    /// A connecting peer was refused.
+    LinkRefused,
+    /// A link ended.
+    LinkClosed,
+    /// A revocation list came into force.
+    Crl,
+    /// This node's certificate was renewed, or it renewed another's.
+    Renewed,
+    /// This authority carried out or refused an operation of an operator.
+    Operation,
+    /// The configuration was read again.
+    Reload,
+    /// An access token was made for the gateway.
+    TokenMade,
+    /// An access token was revoked.
+    TokenRevoked,
+    /// An invalid access token was presented at the gateway.
+    TokenRefused,
+    /// Stands for records beyond a peer's hourly quota: the last of them, and their number.
+    Summary,
+    /// Records were lost.
+    Lost,
+}
+
+impl AuditEvent {
+    /// All events.
+    pub const ALL: [Self; 20] = [
+        Self::Started,
+        Self::Stopped,
+        Self::Granted,
+        Self::Refused,
+        Self::Left,
+        Self::Revoked,
+        Self::Cut,
+        Self::Epoch,
+        Self::LinkUp,
+        Self::LinkRefused,
+        Self::LinkClosed,
+        Self::Crl,
+        Self::Renewed,
+        Self::Operation,
+        Self::Reload,
+        Self::TokenMade,
+        Self::TokenRevoked,
+        Self::TokenRefused,
+        Self::Summary,
+        Self::Lost,
+    ];
+
+    /// Returns the event's name in the log.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::Started => "started",
+            Self::Stopped => "stopped",
+            Self::Granted => "granted",
+            Self::Refused => "refused",
+            Self::Left => "left",
+            Self::Revoked => "revoked",
+            Self::Cut => "cut",
+            Self::Epoch => "epoch",
+            Self::LinkUp => "link_up",
+            Self::LinkRefused => "link_refused",
+            Self::LinkClosed => "link_closed",
+            Self::Crl => "crl",
+            Self::Renewed => "renewed",
+            Self::Operation => "operation",
+            Self::Reload => "reload",
+            Self::TokenMade => "token_made",
+            Self::TokenRevoked => "token_revoked",
+            Self::TokenRefused => "token_refused",
+            Self::Summary => "summary",
+            Self::Lost => "audit_lost",
+        }
+    }
+
+    /// Returns the cause of a record that names no peer.
+    fn cause(self) -> Cause {
+        match self {
+            Self::Crl | Self::Epoch | Self::Renewed => Cause::Fleet,
+            _ => Cause::Local,
+        }
+    }
+}
+
+/// One line of the log. Fields that do not apply are absent.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct AuditRecord {
+    /// Time, RFC 3339, UTC.
+    pub time: String,
+    /// Time, milliseconds since 1970.
+    pub unix_ms: u64,
+    /// Event: [`AuditEvent::label`], or an event of a later version.
+    pub event: String,
+    /// The ROS topic.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub topic: Option<String>,
+    /// Its name, hexadecimal digits.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// The peer's node id, hexadecimal digits.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub peer: Option<String>,
+    /// The peer's name in the configuration.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub peer_name: Option<String>,
+    /// The peer's address.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub remote: Option<String>,
+    /// The reason.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reason: Option<String>,
+    /// The cause: an entry of the policy, a user, a CA.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub by: Option<String>,
+    /// The epoch.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub epoch: Option<u32>,
+    /// Number of lost records.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lost: Option<u64>,
+    /// Event of the summarised records.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub of: Option<String>,
+    /// Number of the summarised records.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub count: Option<u64>,
+    /// Time of the first summarised record. `time` is that of the last.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub from: Option<String>,
+    #[serde(skip)]
+    kind: Option<AuditEvent>,
+    #[serde(skip)]
+    cause: Cause,
+    #[serde(skip)]
+    about: Option<Name>,
+}
+
+impl AuditRecord {
+    /// Creates a record of the current time.
+    pub fn new(event: AuditEvent) -> Self {
+        Self::at(event, now().unix)
+    }
+
+    /// Creates a record of the time `unix`.
+    pub fn at(event: AuditEvent, unix: UnixMillis) -> Self {
+        let (label, cause) = (event.label().to_owned(), event.cause());
+        let (time, kind) = (unix.to_string(), Some(event));
+        Self { time, unix_ms: unix.0, event: label, kind, cause, ..Self::default() }
+    }
+
+    /// Sets the topic.
+    #[must_use]
+    pub fn topic(mut self, topic: Option<&str>) -> Self {
+        self.topic = topic.map(bounded);
+        self
+    }
+
+    /// Sets the name.
+    #[must_use]
+    pub fn name(mut self, name: &Name) -> Self {
+        self.name = Some(name.to_string());
+        self.about = Some(*name);
+        self
+    }
+
+    /// Sets the peer.
+    #[must_use]
+    pub fn peer(mut self, peer: &NodeId) -> Self {
+        self.peer = Some(peer.to_string());
+        self.cause = Cause::Peer(*peer);
+        self
+    }
+
+    /// Sets the address.
+    #[must_use]
+    pub fn remote(mut self, remote: SocketAddr) -> Self {
+        self.remote = Some(remote.to_string());
+        if !matches!(self.cause, Cause::Peer(_)) {
+            self.cause = Cause::Address(remote.ip());
+        }
+        self
+    }
+
+    /// Marks a user of this machine as the cause, so that no quota counts the record.
+    #[must_use]
+    pub fn by_user(mut self) -> Self {
+        self.cause = Cause::Local;
+        self.by("a user")
+    }
+
+    /// Sets the reason.
+    #[must_use]
+    pub fn reason(mut self, reason: impl ToString) -> Self {
+        self.reason = Some(bounded(&reason.to_string()));
+        self
+    }
+
+    /// Sets the cause.
+    #[must_use]
+    pub fn by(mut self, by: impl ToString) -> Self {
+        self.by = Some(bounded(&by.to_string()));
+        self
+    }
+
+    /// Sets the epoch.
+    #[must_use]
+    pub fn epoch(mut self, epoch: u32) -> Self {
+        self.epoch = Some(epoch);
+        self
+    }
+}
+
+/// Names of peers.
+pub type PeerNames = BTreeMap<NodeId, String>;
+
+/// Handle of the log, cheap to clone. A log that is switched off accepts records and drops them.
+#[derive(Clone, Debug, Default)]
+pub struct Audit {
+    shared: Option<Arc<AuditInner>>,
+}
+
+#[derive(Debug)]
+struct AuditInner {
+    records: SyncSender<Option<AuditRecord>>,
+    lost: Arc<AtomicU64>,
+    names: ArcSwap<PeerNames>,
+    quotas: Arc<Mutex<Quotas>>,
+    lost_total: AtomicU64,
+}
+
+impl AuditInner {
+    fn send(&self, record: AuditRecord) {
+        match self.records.try_send(Some(record)) {
+            Ok(()) => {}
+            Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => {
+                self.lost.fetch_add(1, Relaxed);
+                self.lost_total.fetch_add(1, Relaxed);
+            }
+        }
+    }
+}
+
+/// The writing thread.
+#[derive(Debug)]
+pub struct AuditWriter {
+    shared: Arc<AuditInner>,
+    thread: JoinHandle<()>,
+}
+
+impl Audit {
+    /// Opens the log at `path` and completes a line that an earlier run left unfinished.
+    pub fn open(path: &Path, room: AuditRoom, names: PeerNames) -> io::Result<(Self, AuditWriter)> {
+        let file = LogFile::open(path, room)?;
+        let (records, waiting) = sync_channel(WAITING_MAX);
+        // The thread holds no sender, so it ends with the last handle.
+        let (lost, quotas) = (Arc::<AtomicU64>::default(), Arc::<Mutex<Quotas>>::default());
+        let shared = Arc::new(AuditInner {
+            records,
+            lost: lost.clone(),
+            names: ArcSwap::from_pointee(names),
+            quotas: quotas.clone(),
+            lost_total: AtomicU64::new(0),
+        });
+        let thread = std::thread::Builder::new()
+            .name("sgc-audit".to_owned())
+            .spawn(move || write_all(file, &waiting, &lost, &quotas))?;
+        let audit = Self { shared: Some(shared.clone()) };
+        Ok((audit, AuditWriter { shared, thread }))
+    }
+
+    /// Queues a record. Never waits.
+    pub fn write(&self, mut record: AuditRecord) {
+        let Some(shared) = &self.shared else { return };
+        if let Cause::Peer(peer) = &record.cause {
+            record.peer_name = shared.names.load().get(peer).cloned();
+        }
+        let mut records = Vec::with_capacity(1);
+        lock(&shared.quotas).handle(record, &mut records);
+        records.into_iter().for_each(|record| shared.send(record));
+    }
+
+    /// Replaces the names of peers.
+    pub fn set_names(&self, names: PeerNames) {
+        if let Some(shared) = &self.shared {
+            shared.names.store(Arc::new(names));
+        }
+    }
+
+    /// Returns the name of a peer, if it has one.
+    pub fn name_of(&self, peer: &NodeId) -> Option<String> {
+        self.shared.as_ref()?.names.load().get(peer).cloned()
+    }
+
+    /// Returns the number of records lost since the node started.
+    pub fn lost_total(&self) -> u64 {
+        self.shared.as_ref().map_or(0, |shared| shared.lost_total.load(Relaxed))
+    }
+
+    /// Returns the number of records that only summaries hold, since the node started.
+    pub fn summed_up_total(&self) -> u64 {
+        self.shared.as_ref().map_or(0, |shared| lock(&shared.quotas).left_out())
+    }
+
+    /// Returns the number of lost records that the log has not reported yet.
+    pub fn lost(&self) -> u64 {
+        self.shared.as_ref().map_or(0, |shared| shared.lost.load(Relaxed))
+    }
+}
+
+impl AuditWriter {
+    /// Waits until all records are on the disk. Later records are lost.
+    pub fn finish(self) {
+        let _ = self.shared.records.send(None);
+        let _ = self.thread.join();
+    }
+}
+
+/// Appends a record to the log at `path` from another process than the node's, and syncs it to the disk. The node may
+/// be running.
+pub fn append(path: &Path, record: &AuditRecord) -> io::Result<()> {
+    // Only the node rotates its log.
+    let mut file = LogFile::open(path, AuditRoom { max_bytes: u64::MAX, files: 1 })?;
+    let mut line = String::new();
+    push_line(&mut line, record);
+    file.append(&line)?;
+    file.sync()
+}
+
+/// Returns the path of the log of a node with this state directory.
+pub fn audit_path(configured: Option<&Path>, state: Option<&Path>) -> Option<PathBuf> {
+    configured.map(Path::to_owned).or_else(|| Some(state?.join(FILE_NAME)))
+}
+
+fn write_all(
+    mut file: LogFile,
+    waiting: &Receiver<Option<AuditRecord>>,
+    lost: &AtomicU64,
+    quotas: &Mutex<Quotas>,
+) {
+    let mut is_failing = false;
+    let mut ends = false;
+    while !ends {
+        let mut records = Vec::new();
+        match waiting.recv_timeout(SUMMARY_DELAY) {
+            Ok(Some(record)) => records.push(record),
+            Err(RecvTimeoutError::Timeout) => lock(quotas).sweep(now().unix.0, &mut records),
+            Ok(None) | Err(RecvTimeoutError::Disconnected) => ends = true,
+        }
+        while !ends && records.len() < BATCH_MAX {
+            match waiting.try_recv() {
+                Ok(Some(record)) => records.push(record),
+                Ok(None) => ends = true,
+                Err(_) => break,
+            }
+        }
+        if ends {
+            lock(quotas).finish(&mut records);
+        }
+        let missing = lost.swap(0, Relaxed);
+        if records.is_empty() && missing == 0 {
+            continue;
+        }
+        let mut lines = String::new();
+        records.iter().for_each(|record| push_line(&mut lines, record));
+        if missing > 0 {
+            let record = AuditRecord { lost: Some(missing), ..AuditRecord::new(AuditEvent::Lost) };
+            push_line(&mut lines, &record);
+        }
+        match file.append(&lines) {
+            Ok(()) => is_failing = false,
+            Err(error) => {
+                lost.fetch_add(missing + records.len() as u64, Relaxed);
+                if !std::mem::replace(&mut is_failing, true) {
+                    warn!(path = %file.path().display(), %error, "the audit log cannot be written; losses are counted");
+                }
+            }
+        }
+    }
+    let _ = file.sync();
+}
+
+fn push_line(lines: &mut String, record: &AuditRecord) {
+    if let Ok(line) = serde_json::to_string(record) {
+        lines.push_str(&line);
+        lines.push('\n');
+    }
+}
+
+fn bounded(text: &str) -> String {
+    let end = (0..=FIELD_BYTES_MAX).rev().find(|at| text.is_char_boundary(*at)).unwrap_or(0);
+    text.get(..end).unwrap_or(text).to_owned()
+}

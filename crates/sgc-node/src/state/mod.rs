@@ -1,0 +1,149 @@
+//! The state directory: files that a node keeps from one run to the next, for its user alone.
+//!
+//! This module finds the directory and replaces files in it. Their writers know their content.
+
+pub mod audit;
+pub(crate) mod credentials;
+pub(crate) mod fleet_file;
+pub(crate) mod records;
+pub(crate) mod run_lock;
+
+use std::fs;
+use std::io::{self, Read, Write};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{FlockOperation, OFlags, flock};
+
+use crate::config::Config;
+
+const LOCK_FILE: &str = "lock";
+const PERMISSION_BITS: u32 = 0o7777;
+const OTHERS_BITS: u32 = 0o077;
+
+/// Returns the state directory of a node with this name: as configured, or in the user's state directory. `None` if the
+/// user has none.
+pub fn state_dir(config: &Config, node: &str) -> Option<PathBuf> {
+    let named = |variable: &str| std::env::var_os(variable).filter(|v| !v.is_empty()).map(PathBuf::from);
+    let usual = || {
+        let base = named("XDG_STATE_HOME").filter(|dir| dir.is_absolute());
+        base.or_else(|| Some(named("HOME")?.join(".local/state")))
+    };
+    config.state.clone().or_else(|| Some(usual()?.join("sgc").join(node)))
+}
+
+/// Creates the directory if it is missing, 0700, and checks that it is this user's alone.
+pub fn create_state_dir(dir: &Path) -> Result<(), StateError> {
+    let failed = |source| StateError::Directory { path: dir.to_owned(), source };
+    fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
+    check_owner(dir, &fs::metadata(dir).map_err(failed)?)
+}
+
+/// Checks that an existing directory is this user's alone. Creates nothing.
+pub fn check_state_dir(dir: &Path) -> Result<(), StateError> {
+    match fs::metadata(dir) {
+        Ok(metadata) => check_owner(dir, &metadata),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        Err(source) => Err(StateError::Directory { path: dir.to_owned(), source }),
+    }
+}
+
+fn check_owner(dir: &Path, metadata: &fs::Metadata) -> Result<(), StateError> {
+    if let Some(mode) = exposed(metadata) {
+        return Err(StateError::Exposed { path: dir.to_owned(), mode });
+    }
+    if metadata.uid() != rustix::process::geteuid().as_raw() {
+        return Err(StateError::NotOurs { path: dir.to_owned() });
+    }
+    Ok(())
+}
+
+/// Returns the mode of a file or directory that others than its owner may read, change or enter.
+pub(crate) fn exposed(metadata: &fs::Metadata) -> Option<u32> {
+    let mode = metadata.permissions().mode() & PERMISSION_BITS;
+    (mode & OTHERS_BITS != 0).then_some(mode)
+}
+
+/// Replaces a file whole or not at all. The new file has mode 0600 and is on the disk before it gets its name.
+pub(crate) fn replace(path: &Path, content: &[u8]) -> io::Result<()> {
+    let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let temporary = dir.join(format!(".{name}.{}", std::process::id()));
+    let _ = fs::remove_file(&temporary);
+    let mut options = fs::OpenOptions::new();
+    let mut file = options.write(true).create_new(true).mode(0o600).open(&temporary)?;
+    let written = file
+        .write_all(content)
+        .and_then(|()| file.sync_all())
+        .and_then(|()| fs::rename(&temporary, path))
+        .and_then(|()| fs::File::open(dir)?.sync_all());
+    if written.is_err() {
+        let _ = fs::remove_file(&temporary);
+    }
+    written
+}
+
+/// Reads a file of at most `max` bytes that is no symbolic link; `None` if it is missing.
+pub(crate) fn read(path: &Path, max: u64) -> io::Result<Option<Vec<u8>>> {
+    let flags = OFlags::NOFOLLOW.bits() as i32;
+    let file = match fs::OpenOptions::new().read(true).custom_flags(flags).open(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        file => file?,
+    };
+    let mut content = Vec::new();
+    file.take(max + 1).read_to_end(&mut content)?;
+    if content.len() as u64 > max {
+        return Err(io::Error::other(format!("it has more than {max} bytes")));
+    }
+    Ok(Some(content))
+}
+
+/// Lock for reading and replacing files of the directory, so that two programs do not undo each other's work.
+#[derive(Debug)]
+pub(crate) struct StateLock {
+    _file: fs::File,
+}
+
+impl StateLock {
+    /// Waits for the lock.
+    pub(crate) fn take(dir: &Path) -> io::Result<Self> {
+        let mut options = fs::OpenOptions::new();
+        let flags = OFlags::NOFOLLOW.bits() as i32;
+        let options = options.write(true).create(true).truncate(false).mode(0o600).custom_flags(flags);
+        let file = options.open(dir.join(LOCK_FILE))?;
+        flock(&file, FlockOperation::LockExclusive)?;
+        Ok(Self { _file: file })
+    }
+}
+
+/// Reasons why a state directory cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum StateError {
+    /// The user has no state directory.
+    #[error(
+        "there is no place for this node's state: neither XDG_STATE_HOME nor HOME is set; set `state` in [node]"
+    )]
+    Nowhere,
+    /// The directory cannot be created or read.
+    #[error("state directory {}: {source}", path.display())]
+    Directory {
+        /// The directory.
+        path: PathBuf,
+        /// The error of the operating system.
+        source: io::Error,
+    },
+    /// Others may enter the directory.
+    #[error("state directory {}: its mode {mode:04o} lets others in; chmod 700 it", path.display())]
+    Exposed {
+        /// The directory.
+        path: PathBuf,
+        /// Its permission bits.
+        mode: u32,
+    },
+    /// The directory belongs to another user.
+    #[error("state directory {}: it belongs to another user; name another with `state` in [node]", path.display())]
+    NotOurs {
+        /// The directory.
+        path: PathBuf,
+    },
+}
