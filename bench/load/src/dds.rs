@@ -83,11 +83,18 @@ pub(crate) struct Message<'a> {
 pub(crate) struct Network {
     participant: Entity,
     guid: [u8; 16],
+    /// The type of its measured messages.
+    messages: &'static types::Descriptor,
 }
 
 impl Network {
     /// Joins a domain, with the configuration that `CYCLONEDDS_URI` says.
     pub(crate) fn join(domain: u32) -> Result<Self> {
+        Self::join_with(domain, &types::MESSAGE)
+    }
+
+    /// Joins a domain whose measured messages have this type.
+    pub(crate) fn join_with(domain: u32, messages: &'static types::Descriptor) -> Result<Self> {
         let qos = Qos::new()?;
         // As every participant of ROS 2 has it.
         const ENCLAVE: &[u8] = b"enclave=/;";
@@ -98,7 +105,7 @@ impl Network {
         };
         let participant = Entity::new(handle).with_context(|| format!("domain {domain}"))?;
         let guid = participant.guid()?;
-        Ok(Self { participant, guid })
+        Ok(Self { participant, guid, messages })
     }
 
     /// The GUID of the participant.
@@ -163,7 +170,7 @@ pub(crate) struct Writer {
 impl Writer {
     /// Opens an endpoint on the ROS 2 topic `/name`.
     pub(crate) fn new(network: &Network, name: &str, quality: Quality) -> Result<Self> {
-        Self::open(network, &types::MESSAGE, &types::dds_name(name), Qos::from_quality(quality, false)?)
+        Self::open(network, network.messages, &types::dds_name(name), Qos::from_quality(quality, false)?)
     }
 
     /// Opens a writer whose messages may share packets until [`Self::flush`].
@@ -171,7 +178,7 @@ impl Writer {
         let qos = Qos::from_quality(quality, false)?;
         // SAFETY: the object is valid.
         unsafe { dds_qset_writer_batching(qos.0, true) };
-        Self::open(network, &types::MESSAGE, &types::dds_name(name), qos)
+        Self::open(network, network.messages, &types::dds_name(name), qos)
     }
 
     /// Opens the writer of the ROS graph, which every node has.
@@ -275,7 +282,7 @@ impl Reader {
         quality: Quality,
         listener: *const dds_listener_t,
     ) -> Result<Self> {
-        let topic = network.topic(&types::MESSAGE, &types::dds_name(name))?;
+        let topic = network.topic(network.messages, &types::dds_name(name))?;
         let qos = Qos::from_quality(quality, false)?;
         // SAFETY: Cyclone checks the handles; QoS and listener outlive the call, which copies them.
         let handle = unsafe { dds_create_reader(network.participant.0, topic.0, qos.0, listener) };

@@ -13,6 +13,7 @@ use clap::Args;
 use crate::dds::{Inbox, Message, Network, Quality, Reader, Waiter, Writer};
 use crate::node::LONG;
 use crate::report::{Event, Next, Orders, say};
+use crate::types;
 
 /// Bytes before the content: its length, the message's number, its time.
 const HEAD_BYTES: usize = 4 + 8 + 8;
@@ -48,13 +49,17 @@ pub(crate) struct RelayArgs {
     /// Send all waiting messages together, on a separate thread, instead of each on DDS's receiving thread
     #[arg(long)]
     gathers: bool,
+    /// Carry `std_msgs/msg/UInt8MultiArray`
+    #[arg(long)]
+    ros2: bool,
 }
 
 /// Runs a relay. It takes no orders, and carries every message reliably.
 pub(crate) fn relay(args: &RelayArgs) -> Result<()> {
     let stream = connect(args)?;
     stream.set_nodelay(true)?;
-    let network = Network::join(args.domain)?;
+    let messages = if args.ros2 { &types::BYTES } else { &types::MESSAGE };
+    let network = Network::join_with(args.domain, messages)?;
     let mut waiter = Waiter::new(&network)?;
     let quality = Quality { reliable: true, depth: 0 };
     if let Some(topic) = &args.give {

@@ -30,9 +30,12 @@ const OF_STRUCTS: u32 = dds_stream_typecode_subtype_DDS_OP_SUBTYPE_STU;
 
 const GID_BYTES: usize = 16;
 const SEQUENCE_BYTES: u32 = size_of::<dds_sequence_t>() as u32;
+/// Bytes of a measured message in memory: its number, its time and its content.
+const MESSAGE_BYTES: u32 = 16 + SEQUENCE_BYTES;
 const NODE_BYTES: u32 = size_of::<NodeEntities>() as u32;
 
 /// The description of a type for Cyclone.
+#[derive(Debug)]
 pub(crate) struct Descriptor {
     type_name: &'static CStr,
     bytes: u32,
@@ -44,10 +47,20 @@ pub(crate) struct Descriptor {
 /// The type of measured messages.
 pub(crate) static MESSAGE: Descriptor = Descriptor {
     type_name: c"sgc_bench::msg::dds_::Load_",
-    bytes: 16 + SEQUENCE_BYTES,
+    bytes: MESSAGE_BYTES,
     align: 8,
     fields: 4,
     instructions: &[ADR | EIGHT_BYTES, 0, ADR | EIGHT_BYTES, 8, ADR | SEQUENCE | OF_BYTES, 16, RTS],
+};
+
+/// `std_msgs/msg/UInt8MultiArray` without dimensions and offset, whose counts are the zeros of the number: the type of
+/// the load generator on `rcl`.
+pub(crate) static BYTES: Descriptor = Descriptor {
+    type_name: c"std_msgs::msg::dds_::UInt8MultiArray_",
+    bytes: MESSAGE_BYTES,
+    align: 8,
+    fields: 3,
+    instructions: &[ADR | EIGHT_BYTES, 0, ADR | SEQUENCE | OF_BYTES, 16, RTS],
 };
 
 /// The type of `ros_discovery_info`.

@@ -32,8 +32,9 @@ const PAIRS: [(&str, [&str; 2]); 2] =
 pub(crate) const JAZZY_KILTED: &str = "jazzy-kilted";
 /// The publisher is of Kilted, the subscriber of Jazzy.
 pub(crate) const KILTED_JAZZY: &str = "kilted-jazzy";
-/// The systems of the table: those that goals compare.
-const SYSTEMS: [&str; 4] = ["direct", "zenoh-tcp", "sgc-quic-group", "sgc-quic-standard"];
+/// The systems of the table: those that goals compare, and relays, which show the least that two programs between take.
+const SYSTEMS: [&str; 6] =
+    ["direct", "zenoh-tcp", "sgc-quic-group", "sgc-quic-standard", "relay", "relay-gathers"];
 
 const TOPIC: &str = "/load";
 const BACK: &str = "/load_back";

@@ -4,7 +4,7 @@
 use anyhow::{Result, ensure};
 use sgc_dds::config::{FRAGMENT_BYTES, HEARTBEAT_MS, MESSAGE_BYTES_MAX, RECEIVE_BUFFER_BYTES};
 
-use super::{Dds, Running, System, Topic};
+use super::{Dds, Networks, Running, System, Topic};
 use crate::compare::lab::{Lab, Side};
 
 const PORT: u16 = 7447;
@@ -26,8 +26,8 @@ impl System for Relay {
     }
 
     fn start(&self, lab: &Lab, topics: &[Topic]) -> Result<Running> {
-        let mut running = Running { processes: Vec::new(), dds: Side::BOTH.map(|_| Dds::loopback()) };
-        let its_dds = own_dds();
+        let dds = Side::BOTH.map(|side| lab.networks.local(side));
+        let mut running = Running { processes: Vec::new(), dds };
         let address = format!("{}:{PORT}", lab.address(Side::Right));
         for (side, way, begun) in [(Side::Right, "--listen", "listening"), (Side::Left, "--connect", "up")] {
             let mut args = vec!["relay", way, &address];
@@ -39,7 +39,10 @@ impl System for Relay {
             if self.gathers {
                 args.push("--gathers");
             }
-            let mut program = lab.load_in(&its_dds, side, &args)?;
+            if lab.networks == Networks::Stock {
+                args.push("--ros2");
+            }
+            let mut program = lab.load_in(&own_dds(lab.networks, side), side, &args)?;
             program.soon(begun)?;
             running.processes.push((side, program));
         }
@@ -50,13 +53,15 @@ impl System for Relay {
 }
 
 /// Its own Cyclone is set as that of `sgc` is, so that what differs is what they do.
-fn own_dds() -> Dds {
-    let mut dds = Dds::loopback();
+fn own_dds(networks: Networks, side: Side) -> Dds {
+    let mut dds = networks.local(side);
     let general = format!(
         "<MaxMessageSize>{MESSAGE_BYTES_MAX}B</MaxMessageSize><FragmentSize>{FRAGMENT_BYTES}B</FragmentSize></General>\
          <Internal><HeartbeatInterval>{HEARTBEAT_MS} ms</HeartbeatInterval>\
          <SocketReceiveBufferSize min=\"default\" max=\"{RECEIVE_BUFFER_BYTES}B\"/></Internal>"
     );
-    dds.uri = dds.uri.map(|uri| uri.replace("</General>", &general));
+    let plain = "<CycloneDDS><Domain Id=\"any\"><General></General></Domain></CycloneDDS>";
+    let uri = dds.uri.take().unwrap_or_else(|| plain.to_owned());
+    dds.uri = Some(uri.replace("</General>", &general));
     dds
 }
