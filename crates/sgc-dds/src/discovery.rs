@@ -20,8 +20,8 @@ use sgc_ros::{DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind
 use sgc_sync::lock;
 
 use crate::entity::{Entity, check};
-use crate::graph::{Announcer, Listener, SharedHandler};
-use crate::network::Participant;
+use crate::graph::{Announcer, Listener};
+use crate::participant::{Participant, SharedHandler};
 use crate::reader::CycloneReader;
 use crate::wait::{Stop, WaitSet, join};
 use crate::{qos, strangers, user_data};

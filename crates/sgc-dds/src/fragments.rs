@@ -15,8 +15,8 @@ use std::sync::atomic::{AtomicPtr, Ordering};
 
 use cyclors::{ddsi_rdata, ddsi_serdata, ddsi_serdata_kind, ddsi_serdata_ops, ddsi_sertype};
 
+use crate::files::read_file;
 use crate::inline_qos::{DATA, DATA_FRAG, FLAG_LITTLE_ENDIAN};
-use crate::network::read_file;
 use crate::payload::HEADER_BYTES;
 
 /// Most submessages behind a sample that are examined.

@@ -6,15 +6,12 @@ use std::sync::{Arc, Mutex};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use sgc_ros::graph::{GidBytes, GraphView, encode_nodes, graph_reader, graph_writer};
-use sgc_ros::{DiscoveryEvent, DiscoveryHandler, GraphNode, Guid, RosError, RosWriter, Sample, SampleKind};
+use sgc_ros::{DiscoveryEvent, GraphNode, Guid, RosError, RosWriter, Sample, SampleKind};
 use sgc_sync::lock;
 
-use crate::network::Participant;
+use crate::participant::{Participant, SharedHandler};
 use crate::reader::CycloneReader;
 use crate::writer::CycloneWriter;
-
-/// A handler that several threads call, one at a time.
-pub(crate) type SharedHandler = Arc<Mutex<DiscoveryHandler>>;
 
 /// The writer that announces this participant's nodes.
 #[derive(Debug)]

@@ -15,7 +15,7 @@ use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, bind, recv,
 use sgc_sync::{read_lock, write_lock};
 
 use crate::config::local_addresses;
-use crate::network::read_file;
+use crate::files::read_file;
 
 /// Most present addresses, and most remembered ones. The oldest are forgotten.
 const HERE_MAX: usize = 64;

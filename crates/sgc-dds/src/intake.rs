@@ -16,7 +16,6 @@ use std::cell::Cell;
 use std::collections::VecDeque;
 use std::ffi::c_void;
 use std::mem::MaybeUninit;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -32,8 +31,9 @@ use sgc_sync::lock;
 use crate::announced;
 use crate::entity::{Entity, reason};
 use crate::first_messages;
-use crate::network::Participant;
+use crate::participant::Participant;
 use crate::qos::history_of;
+use crate::wait::join;
 
 /// Samples taken from Cyclone at once.
 const BATCH: usize = 16;
@@ -70,10 +70,6 @@ const FULL_PART: usize = 2;
 
 /// Fewest samples that the reader's thread takes before it wakes a receiving thread that waits for room.
 const ROOM_SAMPLES: usize = 16;
-
-/// Shortest rest of the receiving thread after it handled a sample. It rests as long as that took; the reader's
-/// thread handles fast samples better, several at a time.
-const REST_MIN_NS: u64 = 20_000;
 
 thread_local! {
     /// `true` while this thread is in a listener.
@@ -148,42 +144,6 @@ pub(crate) trait Receiver: Send + 'static {
 
     /// Reports samples that were dropped because newer ones arrived faster than they were received.
     fn overrun(&mut self, samples: u64);
-}
-
-/// A limiter of the time for which a network's receiving threads do other work than receive: at most half.
-#[derive(Debug)]
-pub(crate) struct Pace {
-    began: Instant,
-    rests_until_ns: AtomicU64,
-}
-
-impl Pace {
-    pub(crate) fn new() -> Self {
-        Self { began: Instant::now(), rests_until_ns: AtomicU64::new(0) }
-    }
-
-    fn now_ns(&self) -> u64 {
-        self.began.elapsed().as_nanos() as u64
-    }
-
-    /// Returns the current time if other work may begin.
-    fn begin(&self) -> Option<u64> {
-        let now_ns = self.now_ns();
-        self.may_begin(now_ns).then_some(now_ns)
-    }
-
-    fn end(&self, began_ns: u64) {
-        self.end_at(began_ns, self.now_ns());
-    }
-
-    fn may_begin(&self, now_ns: u64) -> bool {
-        now_ns >= self.rests_until_ns.load(Ordering::Relaxed)
-    }
-
-    fn end_at(&self, began_ns: u64, now_ns: u64) {
-        let rest_ns = now_ns.saturating_sub(began_ns).max(REST_MIN_NS);
-        self.rests_until_ns.store(now_ns.saturating_add(rest_ns), Ordering::Relaxed);
-    }
 }
 
 /// The queue of a reader.
@@ -569,7 +529,7 @@ impl<R: Receiver> Drop for Intake<R> {
         if let Some(thread) = self.thread.take()
             && !IS_LISTENING.get()
         {
-            crate::wait::join(thread);
+            join(thread);
         }
     }
 }
@@ -676,18 +636,5 @@ mod tests {
         (0..many).for_each(|writer| queue.push_change(change(writer)));
         assert_eq!(queue.changes.len(), LIVELINESS_CHANGES_MAX);
         assert!(matches!(queue.next().0, Some(Next::Liveliness(c)) if c.writer == 7));
-    }
-
-    #[test]
-    fn receiving_threads_rest_for_as_long_as_they_worked() {
-        let pace = Pace::new();
-        let may = |now_ns| pace.may_begin(now_ns);
-        assert!(may(0), "nothing was handled yet");
-        pace.end_at(1_000_000, 4_000_000);
-        assert!(!may(4_000_000) && !may(6_999_999) && may(7_000_000));
-        pace.end_at(7_000_000, 7_000_001);
-        assert!(!may(7_020_000) && may(7_020_001), "a short time at least");
-        pace.end_at(1, 0);
-        assert!(!may(19_999) && may(20_000), "clocks of two threads may differ");
     }
 }

@@ -1,6 +1,6 @@
 //! The domain number that the plugins of DDS Security see.
 //!
-//! A second network of this process on a ROS domain has a Cyclone domain with another number ([`crate::network`]),
+//! A second network of this process on a ROS domain has a Cyclone domain with another number ([`crate::domain`]),
 //! and announces the ROS domain's number on the wire. Cyclone would pass its own number to the plugins, which no
 //! governance and no permissions contain. This module makes Cyclone pass the ROS domain's number. Cyclone finds
 //! domains by a copy of the number, which stays, and otherwise uses this field only for its log.

@@ -10,7 +10,7 @@ use sgc_wire::History;
 
 use crate::intake::{Arrival, FromSerdata, Intake, LivelinessChange, Receiver, WriterState};
 use crate::known_writers::{KnownWriter, KnownWriters};
-use crate::network::Participant;
+use crate::participant::Participant;
 use crate::payload::HEADER_BYTES;
 use crate::sample::SampleRef;
 

@@ -17,7 +17,7 @@ use crate::entity::{Entity, check, reason};
 use crate::identity::{Mapping, SampleIdentity};
 use crate::intake::{Arrival, FromSerdata, Intake, Receiver};
 use crate::known_writers::KnownWriters;
-use crate::network::Participant;
+use crate::participant::Participant;
 use crate::payload::{Frame, HEADER_BYTES};
 use crate::sample::{Extra, Origin, SampleRef};
 

@@ -30,8 +30,8 @@ use sgc_sync::{read_lock, write_lock};
 use crate::announcement::{self, HEAD_BYTES};
 use crate::config::local_addresses;
 use crate::entity::{Entity, INFINITE, check};
+use crate::files::read_file;
 use crate::host_addresses;
-use crate::network::read_file;
 
 /// `DDSI_LOCATOR_KIND_UDPv4`.
 const UDP_V4: i32 = 1;

@@ -35,7 +35,6 @@ use crate::identity::{
     key_hash,
 };
 use crate::inline_qos::{self, DATA, FLAG_INLINE_QOS, FLAG_LITTLE_ENDIAN, INLINE_QOS_BASE, Parameter};
-use crate::network::Participant;
 use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
 
 /// The requirement of `Cargo.toml` for the only version of `cyclors` whose C code this module was written for. Cargo builds
@@ -291,8 +290,8 @@ impl Drop for SampleRef {
     }
 }
 
-/// Creates the topic of a spec with SGC's sertype.
-pub(crate) fn topic(participant: &Participant, spec: &EndpointSpec) -> Result<Entity, String> {
+/// Creates the topic of a spec below a participant, with SGC's sertype.
+pub(crate) fn topic(participant: &Entity, spec: &EndpointSpec) -> Result<Entity, String> {
     let (name, type_name) = (c_string(&spec.topic)?, c_string(&spec.type_name)?);
     // SAFETY: all zeros is a valid value of this plain C struct, and the call below fills it.
     let mut sertype = Box::into_raw(Box::new(unsafe { std::mem::zeroed::<ddsi_sertype>() }));
@@ -304,7 +303,7 @@ pub(crate) fn topic(participant: &Participant, spec: &EndpointSpec) -> Result<En
     // parameters. If it succeeds it has taken over the reference to the sertype.
     let handle = unsafe {
         dds_create_topic_sertype(
-            participant.entity().handle(),
+            participant.handle(),
             name.as_ptr(),
             &mut sertype,
             std::ptr::null(),

@@ -26,7 +26,7 @@ use sgc_ros::{Guid, RequestHandler, RequestId, RosClient, RosError, RosServer, S
 
 use crate::entity::check;
 use crate::identity::{Mapping, NUMBER_UNKNOWN, SampleIdentity};
-use crate::network::Participant;
+use crate::participant::Participant;
 use crate::payload::{Frame, HEADER_BYTES, PREFIX_BYTES, is_little_endian};
 use crate::rpc::{HandleMessages, Message, RpcReader, RpcWriter};
 use crate::wait::{READERS_MATCHED, WRITERS_MATCHED, wait_for_status};

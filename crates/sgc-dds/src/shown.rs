@@ -15,7 +15,7 @@ use sgc_wire::{History, Qos};
 
 use crate::entity::Entity;
 use crate::log;
-use crate::network::Participant;
+use crate::participant::Participant;
 
 /// The partition of shown endpoints. Endpoints of ROS 2 are in none.
 pub(crate) const PARTITION: &str = "sgc/shown";

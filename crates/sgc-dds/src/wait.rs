@@ -14,7 +14,7 @@ use cyclors::{
 };
 
 use crate::entity::{Entity, INFINITE, check};
-use crate::network::Participant;
+use crate::participant::Participant;
 
 /// Cyclone's status bits for changes of matches.
 pub(crate) const READERS_MATCHED: u32 = 1 << dds_status_id_DDS_PUBLICATION_MATCHED_STATUS_ID;

@@ -20,7 +20,7 @@ use sgc_wire::{History, Qos};
 
 use crate::entity::{Entity, INFINITE, check, reason};
 use crate::late;
-use crate::network::Participant;
+use crate::participant::Participant;
 use crate::payload::Frame;
 use crate::qos::{SendWindow, history_of, keys_kept};
 use crate::sample::{Extra, SampleRef};
