@@ -4,7 +4,8 @@
 //! links ([`paths`]), tests and long names ([`test_names`]), keys of the configuration ([`configuration`]), counters
 //! ([`counters`]), command lines of `sgc` ([`commands`]), `make` and `cargo test` ([`build_commands`]), pages of the book
 //! ([`summary`]). Placeholders, such as `…` and words in capitals, are passed over. Three reference pages are made of the
-//! code and compared with what is committed ([`generated`]).
+//! code and compared with what is committed ([`generated`]). One rule reads the code alone: files of a crate import each
+//! other in one direction ([`import_circles`]).
 
 #![allow(clippy::unwrap_used)]
 
@@ -14,10 +15,12 @@ mod commands;
 mod configuration;
 mod counters;
 mod generated;
+mod import_circles;
 mod markdown;
 mod paths;
 mod report;
 mod repository;
+mod rust_tokens;
 mod shell;
 mod status_page;
 mod summary;
