@@ -7,11 +7,11 @@ use std::time::Duration;
 
 use sgc_wire::LaneToken;
 
+use crate::any_link::AnyLink;
 use crate::credentials::CredentialStore;
 use crate::dtls::{DtlsDialer, DtlsListener};
 use crate::error::{CloseReason, DialError, Refusal};
 use crate::framing::Greeting;
-use crate::link::AnyLink;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
 use crate::quic::{Flavor, QuicDialer, QuicListener};

@@ -13,7 +13,7 @@ use quinn::{ConnectionError, TransportErrorCode};
 use sgc_trust::{AddressPrefix, CertError};
 use sgc_wire::DecodeError;
 
-use crate::framing::CONTROL_FRAME_BYTES_MAX;
+use crate::limits::CONTROL_FRAME_BYTES_MAX;
 use crate::metrics::RefusalKind;
 use crate::stream::StreamViolation;
 use crate::url::LinkUrl;
@@ -366,13 +366,13 @@ impl From<io::Error> for LinkError {
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum FlowError {
     /// A flow of a version that is not spoken here.
-    #[error("a flow of version {found}, {} is spoken here", crate::framing::FLOW_VERSION)]
+    #[error("a flow of version {found}, {} is spoken here", crate::limits::FLOW_VERSION)]
     Version {
         /// Its version.
         found: u8,
     },
     /// A packet claims to be too long.
-    #[error("a packet of {bytes} bytes, at most {} are allowed", crate::framing::FLOW_PACKET_BYTES_MAX)]
+    #[error("a packet of {bytes} bytes, at most {} are allowed", crate::limits::FLOW_PACKET_BYTES_MAX)]
     PacketTooLong {
         /// The claimed length.
         bytes: u64,

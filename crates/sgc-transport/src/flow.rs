@@ -10,7 +10,8 @@ use sgc_wire::{Label, Packet, Slab};
 use crate::error::{FlowEnd, FlowError, LinkError};
 use crate::framing::{PieceJoiner, Pieces, packet_head};
 use crate::labels::Labels;
-use crate::{quic, stream};
+use crate::quic::halves as quic;
+use crate::stream::halves as stream;
 
 /// Payloads up to this length are copied behind their header: the copy costs less than another piece of memory in the
 /// transport (quinn looks through all unacknowledged pieces for each packet that it sends).
@@ -221,6 +222,3 @@ impl FlowRx {
         each!(Inlet, &mut self.inlet, inlet => inlet.stop(end));
     }
 }
-
-/// Pieces of one frame that are to be written in order.
-pub(crate) type Chunks = Vec<Bytes>;

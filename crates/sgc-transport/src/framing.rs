@@ -9,26 +9,21 @@ use std::collections::VecDeque;
 
 use bytes::{Buf as _, BufMut as _, Bytes, BytesMut};
 use sgc_wire::{
-    Decode, DecodeError, Encode, HEADER_BYTES_MAX, Label, LaneToken, PAYLOAD_BYTES_MAX, Packet, PacketHeader,
-    Payload, Reader, Slab, Writer,
+    Decode, DecodeError, Encode, HEADER_BYTES_MAX, Label, LaneToken, Packet, PacketHeader, Payload, Reader,
+    Slab, Writer,
 };
 
 use crate::error::{FlowError, ProtocolError};
 use crate::labels::Labels;
-
-/// Version of the link protocol, in the greeting.
-pub const LINK_VERSION: u16 = 1;
-/// Version of the framing of a flow, its first byte.
-pub const FLOW_VERSION: u8 = 1;
-/// Longest control frame, bytes.
-pub const CONTROL_FRAME_BYTES_MAX: usize = 1 << 20;
-/// Longest packet of a flow, bytes.
-pub const FLOW_PACKET_BYTES_MAX: usize = HEADER_BYTES_MAX + PAYLOAD_BYTES_MAX;
+use crate::limits::{CONTROL_FRAME_BYTES_MAX, FLOW_PACKET_BYTES_MAX, FLOW_VERSION, LINK_VERSION};
 
 const LENGTH_BYTES: usize = 4;
 const EXTENSIONS_MAX: usize = 16;
 const EXTENSION_BYTES_MAX: usize = 1024;
 const EXTENSION_LANE: u16 = 1;
+
+/// Pieces of one frame that are to be written in order.
+pub(crate) type Chunks = Vec<Bytes>;
 
 /// Bytes of a stream that were received and not yet consumed.
 #[derive(Debug, Default)]

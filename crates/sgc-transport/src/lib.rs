@@ -9,6 +9,7 @@
 //! only) or a stream of bytes: TLS, TCP, WebSocket.
 #![forbid(unsafe_code)]
 
+mod any_link;
 mod budget;
 mod congestion;
 mod credentials;
@@ -19,6 +20,7 @@ mod flow;
 mod framing;
 mod handshakes;
 mod labels;
+mod limits;
 mod link;
 mod metrics;
 mod options;
@@ -26,6 +28,7 @@ mod quic;
 mod quinn_runtime;
 mod race;
 mod socket;
+mod stats;
 mod stream;
 mod tls;
 mod url;
@@ -43,6 +46,7 @@ pub mod benchmarks {
     pub use crate::stream::Conversation;
 }
 
+pub use any_link::AnyLink;
 pub use budget::{RECEIVE_BUDGET_BYTES, RECEIVE_WINDOW_BYTES_MIN, ReceiveBudget};
 pub use congestion::{Congestion, UnknownCongestion};
 pub use credentials::CredentialStore;
@@ -56,11 +60,12 @@ pub use error::{
     CloseReason, DialError, FlowEnd, FlowError, LabelError, LinkError, PeerRefusal, ProtocolError, Refusal,
 };
 pub use flow::{Delivery, FlowRx, FlowTx};
-pub use framing::{CONTROL_FRAME_BYTES_MAX, FLOW_PACKET_BYTES_MAX, FLOW_VERSION, LINK_VERSION};
-pub use link::{AnyLink, KeyExchange, Link, LinkStats};
+pub use limits::{CONTROL_FRAME_BYTES_MAX, FLOW_PACKET_BYTES_MAX, FLOW_VERSION, LINK_VERSION};
+pub use link::Link;
 pub use metrics::{RefusalKind, TransportMetrics};
 pub use options::LinkOptions;
 pub use quic::QuicLink;
+pub use stats::{KeyExchange, LinkStats};
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub use stream::DoorExercise;

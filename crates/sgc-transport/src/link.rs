@@ -2,7 +2,6 @@
 
 use std::future::Future;
 use std::net::SocketAddr;
-use std::time::Duration;
 
 use bytes::Bytes;
 use sgc_trust::VerifiedPeer;
@@ -10,8 +9,7 @@ use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet};
 
 use crate::error::{CloseReason, LabelError, LinkError};
 use crate::flow::{FlowRx, FlowTx};
-use crate::quic::QuicLink;
-use crate::stream::StreamLink;
+use crate::stats::LinkStats;
 
 /// An authenticated connection to one node. Clones share it; when the last is dropped it closes.
 ///
@@ -77,136 +75,4 @@ pub trait Link: Clone + Send + Sync + 'static {
 
     /// Waits for the end of the link and returns its cause.
     fn closed(&self) -> impl Future<Output = LinkError> + Send;
-}
-
-/// Key exchange of the two ends of a link.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum KeyExchange {
-    /// Not known.
-    #[default]
-    Unknown,
-    /// X25519 alone.
-    X25519,
-    /// X25519 and ML-KEM-768, which also withstands quantum computers.
-    X25519MlKem768,
-}
-
-impl KeyExchange {
-    /// Returns the name in TLS (IANA, supported groups).
-    pub fn label(self) -> &'static str {
-        match self {
-            Self::Unknown => "unknown",
-            Self::X25519 => "X25519",
-            Self::X25519MlKem768 => "X25519MLKEM768",
-        }
-    }
-}
-
-/// A transport's measurements of a link.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct LinkStats {
-    /// Smoothed round-trip time.
-    pub rtt: Duration,
-    /// Shortest round-trip time seen on this path.
-    pub rtt_min: Duration,
-    /// Bytes sent, everything included.
-    pub sent_bytes: u64,
-    /// Bytes received, everything included.
-    pub received_bytes: u64,
-    /// Packets of the transport sent.
-    pub sent_packets: u64,
-    /// Packets lost of these. Their content is sent again, except for datagrams.
-    pub lost_packets: u64,
-    /// Bytes in those.
-    pub lost_bytes: u64,
-    /// Bytes that the congestion controller allows in flight.
-    pub congestion_window_bytes: u64,
-    /// Longest packet of the transport that the path carries, bytes.
-    pub mtu_bytes: u16,
-    /// Key exchange of the link.
-    pub key_exchange: KeyExchange,
-}
-
-/// A link over any transport.
-#[derive(Clone, Debug)]
-pub enum AnyLink {
-    /// Over QUIC.
-    Quic(QuicLink),
-    /// Over a stream of bytes: TLS, TCP, WebSocket.
-    Stream(StreamLink),
-}
-
-macro_rules! each {
-    ($self:ident, $link:ident => $body:expr) => {
-        match $self {
-            AnyLink::Quic($link) => $body,
-            AnyLink::Stream($link) => $body,
-        }
-    };
-}
-
-impl Link for AnyLink {
-    fn peer(&self) -> &VerifiedPeer {
-        each!(self, l => l.peer())
-    }
-
-    fn remote(&self) -> SocketAddr {
-        each!(self, l => l.remote())
-    }
-
-    fn is_dialer(&self) -> bool {
-        each!(self, l => l.is_dialer())
-    }
-
-    fn lane(&self) -> Option<LaneToken> {
-        each!(self, l => l.lane())
-    }
-
-    async fn send_control(&self, frame: Bytes) -> Result<(), LinkError> {
-        each!(self, l => l.send_control(frame).await)
-    }
-
-    async fn recv_control(&self) -> Result<Bytes, LinkError> {
-        each!(self, l => l.recv_control().await)
-    }
-
-    async fn open_flow(&self, class: Class) -> Result<FlowTx, LinkError> {
-        each!(self, l => l.open_flow(class).await)
-    }
-
-    async fn accept_flow(&self) -> Result<FlowRx, LinkError> {
-        each!(self, l => l.accept_flow().await)
-    }
-
-    fn datagram_max(&self) -> Option<usize> {
-        each!(self, l => l.datagram_max())
-    }
-
-    async fn send_datagram_as(&self, packet: &Packet, label: Option<Label>) -> Result<(), LinkError> {
-        each!(self, l => l.send_datagram_as(packet, label).await)
-    }
-
-    async fn recv_datagram(&self) -> Result<Result<Packet, DecodeError>, LinkError> {
-        each!(self, l => l.recv_datagram().await)
-    }
-
-    fn define_label(&self, label: Label, name: Name) -> Result<(), LabelError> {
-        each!(self, l => l.define_label(label, name))
-    }
-
-    fn labels_defined(&self) -> u32 {
-        each!(self, l => l.labels_defined())
-    }
-
-    fn stats(&self) -> LinkStats {
-        each!(self, l => l.stats())
-    }
-
-    fn close(&self, reason: CloseReason) {
-        each!(self, l => l.close(reason));
-    }
-
-    async fn closed(&self) -> LinkError {
-        each!(self, l => l.closed().await)
-    }
 }

@@ -19,22 +19,21 @@ use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::timeout;
 
 use super::config::{Flavor, Parts};
-use super::{
-    ControlRx, Inlet, LinkEnd, LinkInner, Outlet, Places, QuicLink, Urgency, canonical, close, config,
-    send_frame,
-};
+use super::halves::{Inlet, LinkEnd, Outlet, Urgency};
+use super::places::Places;
+use super::{ControlRx, LinkInner, QuicLink, canonical, close, config, send_frame};
 use crate::budget::WindowLease;
 use crate::credentials::CredentialStore;
 use crate::dtls::{Claim, Mux};
 use crate::error::{CloseReason, DialError, LinkError, PeerRefusal, ProtocolError, Refusal};
 use crate::framing::{Greeting, Pieces};
 use crate::handshakes::{Entry, Handshakes, Holder};
-use crate::link::KeyExchange;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
 use crate::quinn_runtime::PromptRuntime;
 use crate::race;
 use crate::socket;
+use crate::stats::KeyExchange;
 use crate::tls::Findings;
 use crate::url::LinkUrl;
 

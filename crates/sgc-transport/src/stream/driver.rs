@@ -12,9 +12,9 @@ use bytes::{Buf as _, Bytes};
 use tokio::io::{AsyncRead as _, AsyncReadExt as _, AsyncWrite as _, AsyncWriteExt as _, ReadBuf};
 use tokio::time::{Sleep, sleep_until, timeout};
 
+use super::halves::{LinkInner, State};
 use super::record::RecordError;
 use super::wire::Wire;
-use super::{LinkInner, State};
 use crate::error::{CloseReason, LinkError, ProtocolError};
 
 /// Bytes fetched from the machine at once, at least and at most; between, the bytes that the path delivers in little

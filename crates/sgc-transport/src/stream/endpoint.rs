@@ -13,9 +13,10 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::{sleep, timeout};
 
+use super::StreamLink;
 use super::driver::{DRAIN_TIMEOUT, run};
+use super::halves::{LinkInfo, LinkInner};
 use super::handshake::{self, EstablishedStream};
-use super::{LinkInfo, LinkInner, StreamLink};
 use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, DialError, LinkError, Refusal};
 use crate::framing::Greeting;

@@ -29,10 +29,11 @@ use super::wire::{Counters, CountingTcp, TlsIo, Wire};
 use super::ws::{self, UpgradeError};
 use crate::credentials::CredentialStore;
 use crate::error::{LinkError, PeerRefusal, ProtocolError, Refusal};
-use crate::framing::{CONTROL_FRAME_BYTES_MAX, Greeting, control_head};
-use crate::link::KeyExchange;
+use crate::framing::{Greeting, control_head};
+use crate::limits::CONTROL_FRAME_BYTES_MAX;
 use crate::options::LinkOptions;
 use crate::socket::mark;
+use crate::stats::KeyExchange;
 use crate::tls::{self, Findings};
 use crate::url::{LinkUrl, Scheme};
 
