@@ -4,6 +4,7 @@
 //! that works datagram by datagram: quinn writes the whole type-of-service byte of each datagram for ECN, and lets the
 //! kernel join received datagrams.
 
+use std::fmt;
 use std::future::Future;
 use std::io::{self, IoSliceMut};
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -89,7 +90,7 @@ struct PlainSocket {
 
 impl AsyncUdpSocket for PlainSocket {
     fn create_io_poller(self: Arc<Self>) -> Pin<Box<dyn UdpPoller>> {
-        Box::pin(Writable { socket: self, waiting: None })
+        RoomPoller::new(self)
     }
 
     fn try_send(&self, transmit: &Transmit<'_>) -> io::Result<()> {
@@ -162,7 +163,7 @@ fn watch(socket: std::net::UdpSocket, interest: Interest) -> io::Result<AsyncFd<
 
 impl AsyncUdpSocket for BatchSocket {
     fn create_io_poller(self: Arc<Self>) -> Pin<Box<dyn UdpPoller>> {
-        Box::pin(Room { socket: self, waiting: None })
+        RoomPoller::new(self)
     }
 
     fn try_send(&self, transmit: &Transmit<'_>) -> io::Result<()> {
@@ -205,59 +206,65 @@ impl AsyncUdpSocket for BatchSocket {
     }
 }
 
-/// Waits until a socket takes more, if it was full.
-struct Room {
-    socket: Arc<BatchSocket>,
-    waiting: Option<Waiting>,
+/// A socket whose senders may have to wait.
+trait SendSocket: fmt::Debug + Send + Sync + 'static {
+    /// Returns `true` if a sender has to wait for room.
+    fn may_be_full(&self) -> bool;
+
+    /// Waits until the socket takes more.
+    fn room(self: Arc<Self>) -> impl Future<Output = io::Result<()>> + Send + Sync;
 }
 
-impl std::fmt::Debug for Room {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_tuple("Room").field(&self.socket).finish()
+impl SendSocket for BatchSocket {
+    fn may_be_full(&self) -> bool {
+        self.is_full.load(Ordering::Relaxed)
+    }
+
+    /// Registers with the runtime only while somebody waits. Earlier room is reported, too.
+    async fn room(self: Arc<Self>) -> io::Result<()> {
+        let room = watch(self.io.get_ref().try_clone()?, Interest::WRITABLE)?;
+        room.writable().await.map(drop)
     }
 }
 
-impl UdpPoller for Room {
-    fn poll_writable(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        let Self { socket, waiting } = &mut *self;
-        if waiting.is_none() && !socket.is_full.load(Ordering::Relaxed) {
-            return Poll::Ready(Ok(()));
-        }
-        let future = waiting.get_or_insert_with(|| {
-            let socket = Arc::clone(socket);
-            // Registered only while somebody waits. Earlier room is reported, too.
-            Box::pin(async move {
-                let room = watch(socket.io.get_ref().try_clone()?, Interest::WRITABLE)?;
-                room.writable().await.map(drop)
-            })
-        });
-        let done = ready!(future.as_mut().poll(cx));
-        *waiting = None;
-        Poll::Ready(done)
+impl SendSocket for PlainSocket {
+    /// The runtime knows.
+    fn may_be_full(&self) -> bool {
+        true
+    }
+
+    async fn room(self: Arc<Self>) -> io::Result<()> {
+        self.io.writable().await
     }
 }
 
 type Waiting = Pin<Box<dyn Future<Output = io::Result<()>> + Send + Sync>>;
 
-/// Waits until a socket takes more.
-struct Writable {
-    socket: Arc<PlainSocket>,
+/// A sender that waits until a socket takes more.
+struct RoomPoller<S> {
+    socket: Arc<S>,
     waiting: Option<Waiting>,
 }
 
-impl std::fmt::Debug for Writable {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_tuple("Writable").field(&self.socket).finish()
+impl<S: SendSocket> RoomPoller<S> {
+    fn new(socket: Arc<S>) -> Pin<Box<Self>> {
+        Box::pin(Self { socket, waiting: None })
     }
 }
 
-impl UdpPoller for Writable {
+impl<S: SendSocket> fmt::Debug for RoomPoller<S> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("RoomPoller").field(&self.socket).finish()
+    }
+}
+
+impl<S: SendSocket> UdpPoller for RoomPoller<S> {
     fn poll_writable(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         let Self { socket, waiting } = &mut *self;
-        let future = waiting.get_or_insert_with(|| {
-            let socket = Arc::clone(socket);
-            Box::pin(async move { socket.io.writable().await })
-        });
+        if waiting.is_none() && !socket.may_be_full() {
+            return Poll::Ready(Ok(()));
+        }
+        let future = waiting.get_or_insert_with(|| Box::pin(Arc::clone(socket).room()));
         let done = ready!(future.as_mut().poll(cx));
         *waiting = None;
         Poll::Ready(done)
