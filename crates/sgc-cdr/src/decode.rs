@@ -4,12 +4,11 @@ use bytes::Bytes;
 
 use crate::definition::{Primitive, Shape};
 use crate::encoding::{ENCAPSULATION_BYTES, Encoding, PADDING_BYTES_MAX, Padding, WideUnit};
+use crate::fault::VALUES_MAX;
 use crate::layout::{Element, Layout, Member};
 use crate::path;
 use crate::value::{PackedArray, Value, scalar};
 
-/// Most values in one message; an array or a sequence of primitives is one.
-pub const VALUES_MAX: usize = 4 << 20;
 /// Most elements for which memory is reserved before they are read.
 const RESERVE_MAX: usize = 1024;
 

@@ -6,18 +6,9 @@ use bytes::Bytes;
 
 use crate::definition::{Base, FieldType, Primitive, Shape};
 use crate::fault::{Budget, ValueError, ValueProblem, fits, fits_bound};
-use crate::layout::{Element, Layout, Member};
+use crate::layout::{Element, Layout, Member, MemberDefault};
 use crate::number::{Number, little};
 use crate::value::{PackedArray, Value, scalar};
-
-/// A default of a definition.
-#[derive(Clone, Debug)]
-pub(crate) struct MemberDefault {
-    /// The definition's spelling.
-    pub(crate) text: String,
-    /// Its value; `None` if the text is invalid.
-    pub(crate) value: Option<Value>,
-}
 
 impl MemberDefault {
     pub(crate) fn new(field_type: &FieldType, text: String) -> Self {

@@ -1,9 +1,10 @@
 //! Errors of a value that is to become a message, whether it comes as [`Value`](crate::Value), JSON or CBOR.
 
-use crate::VALUES_MAX;
 use crate::definition::Shape;
 use crate::path;
 
+/// Most values in one message; an array or a sequence of primitives is one.
+pub const VALUES_MAX: usize = 4 << 20;
 /// Most bytes that texts and elements of primitives take in one message: as many as a node carries in one.
 pub const CONTENT_BYTES_MAX: usize = 64 << 20;
 /// Most characters of foreign text that are shown.

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use crate::defaults::MemberDefault;
 use crate::definition::{Constant, FieldType, Primitive, Shape, TypeName};
+use crate::value::Value;
 
 /// Greatest depth of types within types.
 pub const LAYOUT_DEPTH_MAX: usize = 32;
@@ -40,6 +40,15 @@ pub(crate) struct Member {
     pub(crate) field_type: FieldType,
     /// The default of the definition, if there is one.
     pub(crate) default: Option<MemberDefault>,
+}
+
+/// A default of a definition.
+#[derive(Clone, Debug)]
+pub(crate) struct MemberDefault {
+    /// The definition's spelling.
+    pub(crate) text: String,
+    /// Its value; `None` if the text is invalid.
+    pub(crate) value: Option<Value>,
 }
 
 /// One element of a member.

@@ -33,13 +33,13 @@ mod testing;
 mod value;
 mod yaml;
 
-pub use decode::{DecodeError, VALUES_MAX};
+pub use decode::DecodeError;
 pub use definition::{
     Base, Constant, DUMMY_MEMBER, Definition, Field, FieldType, Primitive, Shape, TypeName, TypeNameError,
 };
 pub use describe::{DESCRIPTION_BYTES_MAX, DescriptionError};
 pub use encoding::{ByteOrder, CdrVersion, Encoding, Padding, WideUnit};
-pub use fault::{CONTENT_BYTES_MAX, ValueError, ValueProblem};
+pub use fault::{CONTENT_BYTES_MAX, VALUES_MAX, ValueError, ValueProblem};
 pub use idl::parse_idl;
 pub use layout::{HEADER_STAMP_BYTES, LAYOUT_DEPTH_MAX, LAYOUT_STRUCTS_MAX, Layout};
 pub use library::{Library, LookUp, TypeError};

@@ -3,10 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use crate::defaults::MemberDefault;
 use crate::definition::{Base, Definition, Field, FieldType, Shape, TypeName};
 use crate::idl::{is_idl, parse_idl};
-use crate::layout::{Element, LAYOUT_DEPTH_MAX, LAYOUT_STRUCTS_MAX, Layout, Member, Struct};
+use crate::layout::{Element, LAYOUT_DEPTH_MAX, LAYOUT_STRUCTS_MAX, Layout, Member, MemberDefault, Struct};
 use crate::parse::{ParseError, parse};
 
 /// The interfaces that ship inside: `common.txt`, written by `scripts/make-interfaces.py`.
