@@ -12,7 +12,7 @@ use rustls_pki_types::CertificateDer;
 use sgc_sync::lock;
 use sgc_wire::UnixMillis;
 
-use crate::verify::VerifiedPeer;
+use crate::peer::VerifiedPeer;
 use crate::x509::Validity;
 
 /// Most chains known of one set of CAs, some 600 bytes each. The oldest goes first.

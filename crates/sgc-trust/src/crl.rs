@@ -13,10 +13,10 @@ use bytes::Bytes;
 use sgc_wire::{CRL_BYTES_MAX, Pseudonym, UnixMillis};
 use webpki::BorrowedCertRevocationList;
 
-use crate::revocations::{
-    CaLists, FLEET_LISTS_MAX, LIST_NODES_MAX, REVOKED_NODES_MAX, Revocation, RevocationList, RevokedNodes,
-};
-use crate::verify::{Anchor, CHAIN_ALGORITHMS, CaFingerprint, CertId, TrustAnchors, VerifiedPeer, sha256};
+use crate::cert_id::{CaFingerprint, CertId, sha256};
+use crate::peer::VerifiedPeer;
+use crate::revocations::{CaLists, CrlError, LIST_NODES_MAX, Revocation, RevocationList, RevokedNodes};
+use crate::verify::{Anchor, CHAIN_ALGORITHMS, TrustAnchors};
 use crate::x509::{ListFields, RevokedNodeFields, may_sign_lists, split_spki, without_zeros};
 
 impl TrustAnchors {
@@ -116,7 +116,7 @@ impl TrustAnchors {
             return Err(CrlError::TooLong { bytes: der.len() });
         }
         // Webpki checks the form as a whole: versions, critical extensions, and that both algorithms are the same.
-        let list = BorrowedCertRevocationList::from_der(der).map_err(CrlError::from_webpki)?;
+        let list = BorrowedCertRevocationList::from_der(der).map_err(unreadable)?;
         let fields = ListFields::from_list(der)
             .ok_or_else(|| CrlError::Malformed("its fields cannot be read".into()))?;
         if fields.is_scoped {
@@ -139,7 +139,7 @@ impl TrustAnchors {
         }
         let mut serials = BTreeMap::new();
         for entry in &list {
-            let entry = entry.map_err(CrlError::from_webpki)?;
+            let entry = entry.map_err(unreadable)?;
             let at = UnixMillis(entry.revocation_date.as_secs().saturating_mul(1000));
             serials.insert(without_zeros(entry.serial_number).into(), at);
         }
@@ -203,81 +203,14 @@ fn read_revoked_nodes(extension: &[u8]) -> Result<RevokedNodes, CrlError> {
     Ok(nodes)
 }
 
-/// The reason why a revocation list is not believed.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum CrlError {
-    /// The list is too long.
-    #[error("the revocation list has {bytes} bytes, at most {CRL_BYTES_MAX} are read")]
-    TooLong {
-        /// Its length.
-        bytes: usize,
-    },
-    /// The list cannot be read as X.509.
-    #[error("the revocation list cannot be read: {0}")]
-    Malformed(String),
-    /// The list covers only some certificates of its CA, or those of other CAs.
-    #[error(
-        "the revocation list is a partial one (delta, indirect, or with an issuing distribution point): have the CA \
-         write a full one"
-    )]
-    Partial,
-    /// The list has no number, so that nobody can tell which of two is newer.
-    #[error("the revocation list has no CRL number: have the CA write one with it (RFC 5280, 5.2.3)")]
-    NoNumber,
-    /// No CA that is trusted here made the list.
-    #[error("the revocation list is from a CA that is not trusted here")]
-    UnknownIssuer,
-    /// The list names a trusted CA, which did not sign it.
-    #[error("the revocation list's signature is wrong: it was altered or forged")]
-    BadSignature,
-    /// Its CA's certificate has a key usage without cRLSign.
-    #[error("the CA's certificate does not let it sign revocation lists (key usage cRLSign)")]
-    NotAListSigner,
-    /// The CA has expired, and with it everything that it could revoke.
-    #[error("the revocation list's CA expired at {not_after} and the clock here says {now}")]
-    CaExpired {
-        /// Its end.
-        not_after: UnixMillis,
-        /// The time of the check.
-        now: UnixMillis,
-    },
-    /// With this list its CA would have revoked too many nodes.
-    #[error(
-        "with this revocation list its CA would have revoked more than {REVOKED_NODES_MAX} nodes: it is not taken; \
-         make a new fleet"
-    )]
-    TooManyNodes,
-    /// Too many lists of the CA are in force, each with revocations of its own.
-    #[error(
-        "{FLEET_LISTS_MAX} revocation lists of this CA are in force and none says what another does: it is not taken; \
-         `sgc fleet merge` the copies of the fleet's file and hand out the list of the merged one"
-    )]
-    TooManyLists,
-}
-
-impl CrlError {
-    /// Returns `true` if an honest node never passes such a list on.
-    pub fn is_forgery(&self) -> bool {
-        match self {
-            // Another node may trust the CA, have another clock or more room.
-            Self::UnknownIssuer | Self::CaExpired { .. } | Self::TooManyNodes | Self::TooManyLists => false,
-            Self::TooLong { .. }
-            | Self::Malformed(_)
-            | Self::Partial
-            | Self::NoNumber
-            | Self::BadSignature
-            | Self::NotAListSigner => true,
-        }
-    }
-
-    fn from_webpki(error: webpki::Error) -> Self {
-        use webpki::Error as E;
-        match error {
-            E::UnsupportedDeltaCrl
-            | E::UnsupportedIndirectCrl
-            | E::UnsupportedCrlIssuingDistributionPoint
-            | E::UnsupportedRevocationReasonsPartitioning => Self::Partial,
-            other => Self::Malformed(other.to_string()),
-        }
+/// Returns the reason why webpki does not read a list.
+fn unreadable(error: webpki::Error) -> CrlError {
+    use webpki::Error as E;
+    match error {
+        E::UnsupportedDeltaCrl
+        | E::UnsupportedIndirectCrl
+        | E::UnsupportedCrlIssuingDistributionPoint
+        | E::UnsupportedRevocationReasonsPartitioning => CrlError::Partial,
+        other => CrlError::Malformed(other.to_string()),
     }
 }

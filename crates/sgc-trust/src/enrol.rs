@@ -16,10 +16,10 @@ use crate::fleet_error::FleetError;
 use crate::identity::Identity;
 use crate::issue::{Leaf, RequestedKey};
 use crate::key::Key;
-use crate::label::{GroupName, NodeName};
+use crate::label::{GROUPS_MAX, GroupName, NodeName};
 use crate::member::Membership;
+use crate::peer::VerifiedPeer;
 use crate::roster::{IssuedCertificate, ROSTER_NODES_MAX, RosterNode};
-use crate::verify::{GROUPS_MAX, VerifiedPeer};
 use crate::x509::{Validity, serial_of};
 
 impl Fleet {

@@ -18,39 +18,29 @@ use sgc_wire::{
 };
 use zeroize::Zeroizing;
 
+use crate::blocks::{CERTIFICATE_BLOCK, FLEET_BLOCK, KEY_BLOCK, ROSTER_BLOCK};
 use crate::fleet_error::FleetError;
-use crate::issue::{self, Serial, hex};
+use crate::issue::{self, hex};
 use crate::key::Key;
 use crate::label::{FleetName, LABEL_BYTES_MAX, NodeName};
+use crate::peer::{node_id, signature_input};
 use crate::pem::{self, Block, FLEET_FILE_BYTES_MAX};
 use crate::revocations::{REVOKED_NODES_MAX, Revocation, RevokedNodes, add_revocation};
-use crate::roster::{Generation, ROSTER_NODES_MAX, Roster, RosterNode};
+use crate::roster::{Generation, ROSTER_BYTES_MAX, ROSTER_NODES_MAX, Roster, RosterNode};
 use crate::secret::{FleetSecret, NAMING_BLOCK, NamingSecret, SECRET_BLOCK};
-use crate::verify::{TrustAnchors, node_id, signature_input};
-use crate::x509::{CaFields, Validity, may_sign_lists};
+use crate::verify::TrustAnchors;
+use crate::x509::{CaFields, Serial, Validity, may_sign_lists};
 
 /// Validity of a node's certificate unless the request says otherwise.
 pub const LEAF_VALIDITY_DEFAULT: Duration = Duration::from_secs(90 * 86_400);
-/// Validity of the CA's certificate.
-pub const CA_VALIDITY: Duration = Duration::from_secs(10 * 365 * 86_400);
-/// Time until a revocation list announces the next one; nodes keep to a list for longer.
-pub const CRL_VALIDITY: Duration = Duration::from_secs(30 * 86_400);
-/// Time by which a certificate is valid before its making: clocks of machines differ by minutes.
-pub const CLOCK_SKEW: Duration = Duration::from_secs(600);
 /// Least time between two sightings of a node that a roster notes: the roster is written as a whole.
 pub const SEEN_STEP: Duration = Duration::from_secs(86_400);
 /// A node seen within this time may come back.
 pub const SEEN_RECENTLY: Duration = Duration::from_secs(30 * 86_400);
-/// Longest roster that is kept, bytes.
-pub const ROSTER_BYTES_MAX: usize = 8 * 1024 * 1024;
 
 const FILE_VERSION: u8 = 2;
 /// The version before there was a roster.
 const FILE_VERSION_1: u8 = 1;
-pub(crate) const FLEET_BLOCK: &str = "SGC FLEET";
-pub(crate) const CERTIFICATE_BLOCK: &str = "CERTIFICATE";
-pub(crate) const KEY_BLOCK: &str = "PRIVATE KEY";
-pub(crate) const ROSTER_BLOCK: &str = "SGC ROSTER";
 const ROSTER_CONTEXT: &str = "sgc roster v1";
 const SIGNATURE_BYTES_MAX: usize = 1024;
 
@@ -70,7 +60,7 @@ pub struct Fleet {
 }
 
 impl Fleet {
-    /// Creates a fleet. Its CA is valid for [`CA_VALIDITY`]; the CA's certificate does not tell the fleet's name.
+    /// Creates a fleet. Its CA is valid for [`crate::CA_VALIDITY`]; the CA's certificate does not tell the fleet's name.
     pub fn create(name: FleetName, now: UnixMillis, rng: &mut impl CryptoRng) -> Result<Self, FleetError> {
         let key = Key::generate(rng);
         let secret = FleetSecret::generate(rng);

@@ -4,13 +4,13 @@ use std::fmt;
 
 use sgc_wire::{DecodeError, SECRET_GENERATIONS_MAX, UnixMillis};
 
-use crate::fleet::{CERTIFICATE_BLOCK, FLEET_BLOCK, KEY_BLOCK, ROSTER_BLOCK, ROSTER_BYTES_MAX};
-use crate::label::{FleetName, LabelError, NodeName};
+use crate::blocks::{CERTIFICATE_BLOCK, FLEET_BLOCK, KEY_BLOCK, ROSTER_BLOCK};
+use crate::label::{FleetName, GROUPS_MAX, LabelError, NodeName};
 use crate::pem::PemError;
 use crate::revocations::REVOKED_NODES_MAX;
-use crate::roster::ROSTER_NODES_MAX;
+use crate::roster::{ROSTER_BYTES_MAX, ROSTER_NODES_MAX};
 use crate::secret::{NAMING_BLOCK, SECRET_BLOCK, SECRET_BYTES};
-use crate::verify::{AnchorError, GROUPS_MAX};
+use crate::verify::AnchorError;
 
 /// The reason why a fleet cannot be made or read, or cannot enrol a node.
 #[derive(Debug, thiserror::Error)]

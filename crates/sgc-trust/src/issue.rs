@@ -4,7 +4,6 @@
 
 use std::collections::BTreeSet;
 use std::fmt;
-use std::sync::Arc;
 use std::time::Duration;
 
 use aws_lc_rs::digest;
@@ -19,16 +18,24 @@ use rustls_pki_types::CertificateDer;
 use sgc_wire::{CRL_BYTES_MAX, CSR_BYTES_MAX, GroupTag, Pseudonym, UnixMillis};
 use zeroize::Zeroizing;
 
-use crate::fleet::{CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY};
+use crate::blocks::KEY_BLOCK;
+use crate::cert_id::sha256;
 use crate::fleet_error::FleetError;
 use crate::key::Key;
 use crate::label::{GroupName, NodeName};
-use crate::member::KEY_BLOCK;
+use crate::peer::{GROUP_URI, INCARNATION_URI, NODE_URI, ROUTER_URI};
 use crate::pem;
 use crate::revocations::{LIST_NODES_MAX, RevokedNodes};
 use crate::secret::FleetSecret;
-use crate::verify::{CHAIN_ALGORITHMS, GROUP_URI, INCARNATION_URI, NODE_URI, ROUTER_URI, sha256};
-use crate::x509::{CaFields, ListFields, RequestFields, RevokedNodeFields, Validity};
+use crate::verify::CHAIN_ALGORITHMS;
+use crate::x509::{CaFields, ListFields, RequestFields, RevokedNodeFields, Serial, Validity};
+
+/// Validity of the CA's certificate.
+pub const CA_VALIDITY: Duration = Duration::from_secs(10 * 365 * 86_400);
+/// Time until a revocation list announces the next one; nodes keep to a list for longer.
+pub const CRL_VALIDITY: Duration = Duration::from_secs(30 * 86_400);
+/// Time by which a certificate is valid before its making: clocks of machines differ by minutes.
+pub const CLOCK_SKEW: Duration = Duration::from_secs(600);
 
 /// The year 9000: the times of certificates end a little later.
 const TIME_MAX: UnixMillis = UnixMillis(221_845_392_000_000);
@@ -52,9 +59,6 @@ const _: () = assert!(
     OTHER_EXTENSIONS_BYTES_MAX + LIST_NODES_MAX * RevokedNodeFields::BYTES_MAX <= EXTENSIONS_BYTES_MAX
 );
 const _: () = assert!(LIST_HEAD_BYTES_MAX + LIST_NODES_MAX * RevokedNodeFields::BYTES_MAX <= CRL_BYTES_MAX);
-
-/// The serial number by which a certificate is revoked; big-endian, without leading zeros.
-pub(crate) type Serial = Arc<[u8]>;
 
 /// Content of a node's certificate.
 pub(crate) struct Leaf {

@@ -6,6 +6,8 @@
 use std::fmt;
 use std::str::FromStr;
 
+/// Most groups of one node: that many fit into [`sgc_wire::CERT_BYTES_MAX`].
+pub const GROUPS_MAX: usize = 32;
 /// Longest name of a node, group or fleet, bytes.
 pub const LABEL_BYTES_MAX: usize = 64;
 

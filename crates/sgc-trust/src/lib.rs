@@ -7,6 +7,9 @@
 #![forbid(unsafe_code)]
 
 mod batch;
+mod blocks;
+mod cert_error;
+mod cert_id;
 mod chains;
 mod crl;
 mod crowd;
@@ -16,12 +19,14 @@ mod fleet_error;
 mod grant;
 mod hpke;
 mod identity;
+mod identity_error;
 mod issue;
 mod key;
 mod label;
 mod member;
 mod message_key;
 mod names;
+mod peer;
 mod pem;
 mod policy;
 mod replay;
@@ -37,31 +42,34 @@ mod x509;
 mod xwing;
 
 pub use batch::{BATCH_PACKETS_MAX, Batch, BatchVerifier, SignedBatch, trailer_bytes_max};
-pub use crl::{CrlError, CrlNews, CrlNumber};
+pub use cert_error::CertError;
+pub use cert_id::{CaFingerprint, CertId, NodeIncarnation};
+pub use crl::{CrlNews, CrlNumber};
 pub use crowd::{
     AddressPrefix, PLACE_HELD_MIN, PlaceDecision, PlaceLimits, PlaceRefusal, Places, REPEAT_SOURCES_MAX,
     REPEAT_WINDOW, RepeatCount, Repeats,
 };
 pub use enrol::EnrollRequest;
-pub use fleet::{
-    CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, CrlReport, Fleet, LEAF_VALIDITY_DEFAULT, MergeReport,
-    ROSTER_BYTES_MAX, SEEN_RECENTLY, SEEN_STEP,
-};
+pub use fleet::{CrlReport, Fleet, LEAF_VALIDITY_DEFAULT, MergeReport, SEEN_RECENTLY, SEEN_STEP};
 pub use fleet_error::FleetError;
 pub use grant::{GrantError, Kem, ReplyKey, seal_grant};
-pub use identity::{Identity, IdentityError, Import};
-pub use issue::{KeyRequest, certificate_uris, requested_key_hash};
-pub use label::{FleetName, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
+pub use identity::{Identity, Import};
+pub use identity_error::IdentityError;
+pub use issue::{CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, KeyRequest, certificate_uris, requested_key_hash};
+pub use label::{FleetName, GROUPS_MAX, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
 pub use member::Membership;
 pub use message_key::{MessageKey, MessageKeyError};
 pub use names::{
     TopicSecret, consumers_blind, derive_name, name_of, operations_blind, renewal_blind, types_blind,
 };
+pub use peer::{SignatureError, VerifiedPeer, node_id};
 pub use pem::{FLEET_FILE_BYTES_MAX, PemError, pem_contents, pem_text};
 pub use policy::{DenialReason, GrantReason, Grantees, Policy};
 pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};
-pub use revocations::{FLEET_LISTS_MAX, LIST_NODES_MAX, REVOKED_NODES_MAX, Revocation};
-pub use roster::{Generation, IssuedCertificate, NODE_CERTIFICATES_MAX, ROSTER_NODES_MAX, RosterNode};
+pub use revocations::{CrlError, FLEET_LISTS_MAX, LIST_NODES_MAX, REVOKED_NODES_MAX, Revocation};
+pub use roster::{
+    Generation, IssuedCertificate, NODE_CERTIFICATES_MAX, ROSTER_BYTES_MAX, ROSTER_NODES_MAX, RosterNode,
+};
 pub use seal::{OpenError, SourceKey, TAG_BYTES, opened_bytes, sealed_bytes};
 pub use secret::{FleetSecret, NamingSecret};
 pub use signed::{
@@ -70,8 +78,5 @@ pub use signed::{
 };
 pub use suite::{ParseSuiteError, Suite};
 pub use token::{ShareToken, TOKEN_PREFIX, TOKEN_ROUTERS_MAX, TOKEN_TEXT_BYTES_MAX, TokenError};
-pub use verify::{
-    ANCHORS_MAX, AnchorError, CaFingerprint, CertError, CertId, GROUPS_MAX, NodeIncarnation, SignatureError,
-    TrustAnchors, VerifiedPeer, node_id,
-};
+pub use verify::{ANCHORS_MAX, AnchorError, TrustAnchors};
 pub use x509::serial_of;

@@ -7,7 +7,8 @@ use rustls_pki_types::CertificateDer;
 use sgc_wire::{DecodeError, NodeId, Reader, SECRET_GENERATIONS_MAX, Writer};
 use zeroize::Zeroizing;
 
-use crate::identity::IdentityError;
+use crate::blocks::{ABOUT_BLOCK, AUTHORITY_BLOCK, CA_BLOCK, CERTIFICATE_BLOCK, KEY_BLOCK, RESET_BLOCK};
+use crate::identity_error::IdentityError;
 use crate::label::{FleetName, LABEL_BYTES_MAX, NodeName};
 use crate::pem::{self, Block, FILE_BYTES_MAX};
 use crate::secret::{FleetSecret, NAMING_BLOCK, NamingSecret, SECRET_BLOCK};
@@ -17,12 +18,6 @@ use crate::x509::Validity;
 const FILE_VERSION: u8 = 2;
 /// The version before there were generations of secrets.
 const FILE_VERSION_1: u8 = 1;
-pub(crate) const ABOUT_BLOCK: &str = "SGC IDENTITY";
-pub(crate) const CHAIN_BLOCK: &str = "CERTIFICATE";
-pub(crate) const KEY_BLOCK: &str = "PRIVATE KEY";
-pub(crate) const CA_BLOCK: &str = "SGC CA CERTIFICATE";
-pub(crate) const RESET_BLOCK: &str = "SGC RESET KEY";
-pub(crate) const AUTHORITY_BLOCK: &str = "SGC AUTHORITY";
 
 /// A node's certificates, the CAs it trusts and the secrets of its fleet: an identity without its private key.
 #[derive(Clone)]
@@ -140,7 +135,7 @@ pub(crate) fn write(
     let stored: Vec<_> = member.naming.iter().filter(|n| n.generation >= NamingSecret::STORED_FROM).collect();
     let naming: Vec<_> = stored.iter().map(|n| n.to_block()).collect();
     let mut blocks: Vec<(&str, &[u8])> = vec![(ABOUT_BLOCK, &about)];
-    blocks.extend(member.chain.iter().map(|c| (CHAIN_BLOCK, c.as_ref())));
+    blocks.extend(member.chain.iter().map(|c| (CERTIFICATE_BLOCK, c.as_ref())));
     blocks.extend(key.map(|k| (KEY_BLOCK, k)));
     blocks.extend(member.anchors.certificates().map(|c| (CA_BLOCK, c.as_ref())));
     blocks.extend(member.secret.as_ref().map(|s| (SECRET_BLOCK, &s.expose()[..])));
@@ -162,7 +157,7 @@ pub(crate) fn read(text: &str) -> Result<FileParts, IdentityError> {
     let mut naming = Vec::new();
     for block in pem::parse(text, FILE_BYTES_MAX).map_err(IdentityError::File)? {
         let (name, slot) = match block.label.as_str() {
-            CHAIN_BLOCK => {
+            CERTIFICATE_BLOCK => {
                 chain.push(CertificateDer::from(block.content.to_vec()));
                 continue;
             }
@@ -188,7 +183,7 @@ pub(crate) fn read(text: &str) -> Result<FileParts, IdentityError> {
     }
     let about = read_about(&about.ok_or(IdentityError::Missing(ABOUT_BLOCK))?.content)?;
     if chain.is_empty() {
-        return Err(IdentityError::Missing(CHAIN_BLOCK));
+        return Err(IdentityError::Missing(CERTIFICATE_BLOCK));
     }
     if cas.is_empty() {
         return Err(IdentityError::Missing(CA_BLOCK));

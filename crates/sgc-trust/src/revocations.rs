@@ -7,9 +7,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use sgc_wire::{Pseudonym, UnixMillis};
-
-use crate::crl::CrlError;
+use sgc_wire::{CRL_BYTES_MAX, Pseudonym, UnixMillis};
 
 /// Most nodes that one CA has revoked, in all of its lists together. A list that would add more is refused.
 pub const REVOKED_NODES_MAX: usize = 8192;
@@ -182,4 +180,72 @@ fn drop_covered(lists: &mut Vec<Arc<RevocationList>>, all: &RevokedNodes) {
 
 fn is_greater(number: &[u8], than: &[u8]) -> bool {
     (number.len(), number) > (than.len(), than)
+}
+
+/// The reason why a revocation list is not believed.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum CrlError {
+    /// The list is too long.
+    #[error("the revocation list has {bytes} bytes, at most {CRL_BYTES_MAX} are read")]
+    TooLong {
+        /// Its length.
+        bytes: usize,
+    },
+    /// The list cannot be read as X.509.
+    #[error("the revocation list cannot be read: {0}")]
+    Malformed(String),
+    /// The list covers only some certificates of its CA, or those of other CAs.
+    #[error(
+        "the revocation list is a partial one (delta, indirect, or with an issuing distribution point): have the CA \
+         write a full one"
+    )]
+    Partial,
+    /// The list has no number, so that nobody can tell which of two is newer.
+    #[error("the revocation list has no CRL number: have the CA write one with it (RFC 5280, 5.2.3)")]
+    NoNumber,
+    /// No CA that is trusted here made the list.
+    #[error("the revocation list is from a CA that is not trusted here")]
+    UnknownIssuer,
+    /// The list names a trusted CA, which did not sign it.
+    #[error("the revocation list's signature is wrong: it was altered or forged")]
+    BadSignature,
+    /// Its CA's certificate has a key usage without cRLSign.
+    #[error("the CA's certificate does not let it sign revocation lists (key usage cRLSign)")]
+    NotAListSigner,
+    /// The CA has expired, and with it everything that it could revoke.
+    #[error("the revocation list's CA expired at {not_after} and the clock here says {now}")]
+    CaExpired {
+        /// Its end.
+        not_after: UnixMillis,
+        /// The time of the check.
+        now: UnixMillis,
+    },
+    /// With this list its CA would have revoked too many nodes.
+    #[error(
+        "with this revocation list its CA would have revoked more than {REVOKED_NODES_MAX} nodes: it is not taken; \
+         make a new fleet"
+    )]
+    TooManyNodes,
+    /// Too many lists of the CA are in force, each with revocations of its own.
+    #[error(
+        "{FLEET_LISTS_MAX} revocation lists of this CA are in force and none says what another does: it is not taken; \
+         `sgc fleet merge` the copies of the fleet's file and hand out the list of the merged one"
+    )]
+    TooManyLists,
+}
+
+impl CrlError {
+    /// Returns `true` if an honest node never passes such a list on.
+    pub fn is_forgery(&self) -> bool {
+        match self {
+            // Another node may trust the CA, have another clock or more room.
+            Self::UnknownIssuer | Self::CaExpired { .. } | Self::TooManyNodes | Self::TooManyLists => false,
+            Self::TooLong { .. }
+            | Self::Malformed(_)
+            | Self::Partial
+            | Self::NoNumber
+            | Self::BadSignature
+            | Self::NotAListSigner => true,
+        }
+    }
 }

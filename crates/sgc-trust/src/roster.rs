@@ -10,12 +10,13 @@ use std::time::Duration;
 
 use sgc_wire::{DecodeError, Encode as _, Pseudonym, Reader, SECRET_GENERATIONS_MAX, UnixMillis, Writer};
 
-use crate::issue::Serial;
-use crate::label::{GroupName, LABEL_BYTES_MAX, NodeName};
+use crate::label::{GROUPS_MAX, GroupName, LABEL_BYTES_MAX, NodeName};
 use crate::revocations::{REVOKED_NODES_MAX, Revocation, RevokedNodes, add_revocation};
 use crate::secret::FleetSecret;
-use crate::verify::GROUPS_MAX;
+use crate::x509::Serial;
 
+/// Longest roster that is kept, bytes.
+pub const ROSTER_BYTES_MAX: usize = 8 * 1024 * 1024;
 /// Most nodes of one fleet.
 pub const ROSTER_NODES_MAX: usize = 10_000;
 /// Most certificates of one node that are remembered: those that hold longest.

@@ -186,7 +186,7 @@ pub fn verify_link_state(
 /// Returns a fingerprint of a signed body and its signature, so that no body is verified twice.
 pub fn signed_digest(signed: &SignedBody) -> [u8; 32] {
     let length = (signed.body.len() as u64).to_be_bytes();
-    crate::verify::sha256(&[&length, &signed.body, &signed.signature])
+    crate::cert_id::sha256(&[&length, &signed.body, &signed.signature])
 }
 
 /// Verifies an answer by the owner of the name.

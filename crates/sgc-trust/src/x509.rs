@@ -4,6 +4,8 @@
 //! This module verifies nothing. Its input was parsed by `webpki`, or is about to be verified; anything unexpected is
 //! `None`.
 
+use std::sync::Arc;
+
 use sgc_wire::UnixMillis;
 
 const INTEGER: u8 = 0x02;
@@ -34,6 +36,9 @@ const REVOKED_NODES: &[u8] = &[
 const CRL_SIGN: u8 = 0x02;
 /// Bit 5: the key may sign certificates.
 const KEY_CERT_SIGN: u8 = 0x04;
+
+/// The serial number by which a certificate is revoked; big-endian, without leading zeros.
+pub(crate) type Serial = Arc<[u8]>;
 
 /// Beginning and end of a certificate's validity, both inclusive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
