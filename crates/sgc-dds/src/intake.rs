@@ -129,9 +129,9 @@ pub(crate) trait Receiver: Send + 'static {
     /// Receives a sample of this reader. May block.
     fn receive(&mut self, reader: dds_entity_t, arrival: Arrival<Self::Sample>);
 
-    /// Receives a sample if that needs neither waiting nor a call into Cyclone, or returns it.
-    fn receive_at_once(&mut self, arrival: Arrival<Self::Sample>) -> Result<(), Arrival<Self::Sample>> {
-        Err(arrival)
+    /// Receives a sample if that needs neither waiting nor a call into Cyclone. Returns it otherwise.
+    fn receive_at_once(&mut self, arrival: Arrival<Self::Sample>) -> Option<Arrival<Self::Sample>> {
+        Some(arrival)
     }
 
     /// Receives a change of a writer's liveliness, after the samples that came before it.
@@ -159,15 +159,33 @@ struct Queue<S> {
     /// Changes of liveliness, each with the number of samples before it.
     changes: VecDeque<(u64, LivelinessChange)>,
     overrun: u64,
-    /// `true` while the thread sleeps.
-    is_waiting: bool,
-    is_stopped: bool,
-    /// The level for which the receiving thread waits.
-    held: Option<Level>,
-    /// `true` if it waited in vain and nothing was taken since.
-    is_stuck: bool,
-    /// The time before which it does not wait for room again.
+    thread: ThreadState,
+    receiving: ReceivingState,
+    /// The time before which the receiving thread does not wait for room again.
     no_wait_before: Option<Instant>,
+}
+
+/// The state of a reader's thread.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum ThreadState {
+    Working,
+    /// The thread sleeps until an entry is queued.
+    Waiting,
+    /// The thread ends and takes nothing more.
+    Stopped,
+}
+
+/// The state of the receiving thread towards one reader.
+#[derive(Clone, Copy, Debug)]
+enum ReceivingState {
+    Free,
+    /// The receiving thread waits until the queue has sunk to the level.
+    Held {
+        until: Level,
+        is_stuck: bool,
+    },
+    /// The receiving thread waited in vain, and nothing was taken since.
+    Stuck,
 }
 
 /// An amount of samples in a queue.
@@ -187,10 +205,8 @@ impl<S: FromSerdata> Queue<S> {
             popped: 0,
             changes: VecDeque::new(),
             overrun: 0,
-            is_waiting: false,
-            is_stopped: false,
-            held: None,
-            is_stuck: false,
+            thread: ThreadState::Working,
+            receiving: ReceivingState::Free,
             no_wait_before: None,
         }
     }
@@ -231,6 +247,19 @@ impl<S: FromSerdata> Queue<S> {
         self.changes.push_back((self.pushed, change));
     }
 
+    fn is_stopped(&self) -> bool {
+        self.thread == ThreadState::Stopped
+    }
+
+    /// Returns `true` if the thread sleeps. The caller wakes it.
+    fn begin_to_wake(&mut self) -> bool {
+        let is_waiting = self.thread == ThreadState::Waiting;
+        if is_waiting {
+            self.thread = ThreadState::Working;
+        }
+        is_waiting
+    }
+
     fn is_empty(&self) -> bool {
         self.arrivals.is_empty() && self.changes.is_empty()
     }
@@ -249,11 +278,16 @@ impl<S: FromSerdata> Queue<S> {
             return (Some(Next::Liveliness(change)), false);
         }
         let next = self.pop().map(Next::Sample);
-        self.is_stuck = false;
-        let may_go_on = self.held.is_some_and(|level| !self.is_above(level));
-        if may_go_on {
-            self.held = None;
-        }
+        let may_go_on = match self.receiving {
+            ReceivingState::Held { until, .. } => !self.is_above(until),
+            ReceivingState::Free | ReceivingState::Stuck => false,
+        };
+        self.receiving = match self.receiving {
+            ReceivingState::Held { until, .. } if !may_go_on => {
+                ReceivingState::Held { until, is_stuck: false }
+            }
+            _ => ReceivingState::Free,
+        };
         (next, may_go_on)
     }
 }
@@ -313,26 +347,29 @@ impl<R: Receiver> IntakeState<R> {
         let mut queue = lock(&self.queue);
         let mut arrival = Some(arrival);
         if queue.is_empty()
-            && !queue.is_stopped
+            && !queue.is_stopped()
             && let Some(began) = self.participant.pace().begin()
             && let Ok(mut receiver) = self.receiver.try_lock()
             && let Some(receiver) = receiver.as_mut()
         {
             drop(queue);
-            arrival = arrival.and_then(|a| receiver.receive_at_once(a).err());
+            arrival = arrival.and_then(|a| receiver.receive_at_once(a));
             self.participant.pace().end(began);
             // Cyclone calls one listener of a reader at a time, so no sample came in between.
             queue = lock(&self.queue);
         }
-        let Some(arrival) = arrival.filter(|_| !queue.is_stopped) else { return };
+        let Some(arrival) = arrival.filter(|_| !queue.is_stopped()) else { return };
         if self.holds_back {
             queue = self.wait_for_room(queue);
         }
         queue.push(arrival);
-        if std::mem::take(&mut queue.is_waiting) {
+        if queue.begin_to_wake() {
             drop(queue);
             self.filled.notify_one();
-        } else if self.holds_back && queue.is_full_to(CROWDED_PART) && !queue.is_stuck {
+        } else if self.holds_back
+            && queue.is_full_to(CROWDED_PART)
+            && !matches!(queue.receiving, ReceivingState::Stuck)
+        {
             self.hold_back(queue);
         }
     }
@@ -340,11 +377,11 @@ impl<R: Receiver> IntakeState<R> {
     /// Queues a change of liveliness. Called in the listener.
     fn change_liveliness(&self, change: LivelinessChange) {
         let mut queue = lock(&self.queue);
-        if queue.is_stopped {
+        if queue.is_stopped() {
             return;
         }
         queue.push_change(change);
-        if std::mem::take(&mut queue.is_waiting) {
+        if queue.begin_to_wake() {
             drop(queue);
             self.filled.notify_one();
         }
@@ -362,7 +399,7 @@ impl<R: Receiver> IntakeState<R> {
     fn wait_for_room<'a>(&self, queue: MutexGuard<'a, Queue<R::Sample>>) -> MutexGuard<'a, Queue<R::Sample>> {
         let full = Level { bytes: usize::MAX, ..queue.level(FULL_PART) };
         let waits = queue.no_wait_before.is_none_or(|at| Instant::now() >= at);
-        if !queue.is_above(full) || !waits || queue.is_stopped {
+        if !queue.is_above(full) || !waits || queue.is_stopped() {
             return queue;
         }
         let room = Level { samples: full.samples.saturating_sub(ROOM_SAMPLES), ..full };
@@ -378,10 +415,15 @@ impl<R: Receiver> IntakeState<R> {
         level: Level,
         at_most: Duration,
     ) -> MutexGuard<'a, Queue<R::Sample>> {
-        (queue.held, queue.is_stuck) = (Some(level), true);
-        let waited = self.eased.wait_timeout_while(queue, at_most, |q| q.held.is_some() && !q.is_stopped);
+        queue.receiving = ReceivingState::Held { until: level, is_stuck: true };
+        let waited = self.eased.wait_timeout_while(queue, at_most, |q| {
+            matches!(q.receiving, ReceivingState::Held { .. }) && !q.is_stopped()
+        });
         let mut queue = waited.unwrap_or_else(PoisonError::into_inner).0;
-        queue.held = None;
+        queue.receiving = match queue.receiving {
+            ReceivingState::Held { is_stuck: true, .. } | ReceivingState::Stuck => ReceivingState::Stuck,
+            ReceivingState::Held { is_stuck: false, .. } | ReceivingState::Free => ReceivingState::Free,
+        };
         queue
     }
 
@@ -392,7 +434,7 @@ impl<R: Receiver> IntakeState<R> {
                 loop {
                     let ((next, may_go_on), overrun, is_stopped) = {
                         let mut queue = lock(&self.queue);
-                        (queue.next(), std::mem::take(&mut queue.overrun), queue.is_stopped)
+                        (queue.next(), std::mem::take(&mut queue.overrun), queue.is_stopped())
                     };
                     if may_go_on {
                         self.eased.notify_one();
@@ -410,19 +452,19 @@ impl<R: Receiver> IntakeState<R> {
                 receiver.rest();
             }
             let mut queue = lock(&self.queue);
-            while queue.is_empty() && !queue.is_stopped {
-                queue.is_waiting = true;
+            while queue.is_empty() && !queue.is_stopped() {
+                queue.thread = ThreadState::Waiting;
                 queue = self.filled.wait(queue).unwrap_or_else(PoisonError::into_inner);
             }
-            queue.is_waiting = false;
-            if queue.is_stopped {
+            if queue.is_stopped() {
                 return;
             }
+            queue.thread = ThreadState::Working;
         }
     }
 
     fn stop(&self) {
-        lock(&self.queue).is_stopped = true;
+        lock(&self.queue).thread = ThreadState::Stopped;
         self.filled.notify_one();
         self.eased.notify_one();
     }
@@ -608,11 +650,11 @@ mod tests {
             queue.is_full_to(CROWDED_PART)
         };
         assert!((0..16).all(|_| !push(&mut queue, 1)) && push(&mut queue, 1));
-        (queue.held, queue.is_stuck) = (Some(queue.level(2 * CROWDED_PART)), true);
+        queue.receiving = ReceivingState::Held { until: queue.level(2 * CROWDED_PART), is_stuck: true };
         for _ in 0..8 {
             assert!(!queue.next().1);
         }
-        assert!(queue.next().1 && queue.held.is_none() && !queue.is_stuck);
+        assert!(queue.next().1 && matches!(queue.receiving, ReceivingState::Free));
         assert!(!queue.next().1, "it was told");
         assert!(push(&mut queue, WAITING_BYTES_MAX / CROWDED_PART), "bytes count as well");
     }

@@ -174,23 +174,23 @@ impl Receiver for Samples {
         }
     }
 
-    fn receive_at_once(&mut self, arrival: Arrival<Content>) -> Result<(), Arrival<Content>> {
+    fn receive_at_once(&mut self, arrival: Arrival<Content>) -> Option<Arrival<Content>> {
         // Looking up the writer takes the lock under which this is called.
         let writer = self.writers.known(arrival.writer);
         if writer.is_none() || self.lapsed.contains(&arrival.writer) {
-            return Err(arrival);
+            return Some(arrival);
         }
         if self.is_ignored(writer) {
-            return Ok(());
+            return None;
         }
         // Reporting may block.
         if self.new_depth(&arrival).is_some() {
-            return Err(arrival);
+            return Some(arrival);
         }
         let Arrival { sample: content, source_timestamp_ns, .. } = arrival;
         let kept = content.kept;
         let refused = self.handler.handle_at_once(sample_of(content, writer, source_timestamp_ns));
-        refused.map_err(|Sample { kind, key_hash, payload, .. }| Arrival {
+        refused.map(|Sample { kind, key_hash, payload, .. }| Arrival {
             sample: Content { kind, key_hash, payload, kept },
             ..arrival
         })

@@ -670,12 +670,12 @@ impl HandleSamples for Choosy {
         let _ = self.gate.recv();
     }
 
-    fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
+    fn handle_at_once(&mut self, sample: Sample) -> Option<Sample> {
         if !self.may.load(Relaxed) {
-            return Err(sample);
+            return Some(sample);
         }
         let _ = self.handled.send(Outcome::AtOnce(sample.payload));
-        Ok(())
+        None
     }
 
     fn overrun(&mut self, samples: u64) {
@@ -736,10 +736,10 @@ fn a_reader_may_be_dropped_where_its_samples_are_received() {
             let _ = self.1.send(false);
         }
 
-        fn handle_at_once(&mut self, _: Sample) -> Result<(), Sample> {
+        fn handle_at_once(&mut self, _: Sample) -> Option<Sample> {
             drop(self.0.lock().unwrap().take());
             let _ = self.1.send(true);
-            Ok(())
+            None
         }
     }
 

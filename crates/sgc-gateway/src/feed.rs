@@ -206,14 +206,14 @@ impl HandleSamples for FeedHandler {
         self.0.hand_out(sample);
     }
 
-    fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
+    fn handle_at_once(&mut self, sample: Sample) -> Option<Sample> {
         let bytes = sample.payload.len();
         let would_wait = self.0.outlets().queues().any(|queue| queue.would_wait(bytes));
         if would_wait {
-            return Err(sample);
+            return Some(sample);
         }
         self.0.hand_out(sample);
-        Ok(())
+        None
     }
 
     fn overrun(&mut self, samples: u64) {

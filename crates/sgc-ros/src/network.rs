@@ -203,10 +203,10 @@ pub trait HandleSamples: Send {
     /// Handles a sample on the reader's own thread. It may block, which holds up only this reader.
     fn handle(&mut self, sample: Sample);
 
-    /// Handles a sample on the thread that receives for all readers, or returns it if that could block; the sample is
-    /// then handled on the reader's own thread. No other sample is at hand behind it.
-    fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
-        Err(sample)
+    /// Handles a sample on the thread that receives for all readers. Returns the sample if that could block; it is then
+    /// handled on the reader's own thread. No other sample is at hand behind it.
+    fn handle_at_once(&mut self, sample: Sample) -> Option<Sample> {
+        Some(sample)
     }
 
     /// Reports samples that were dropped because newer ones arrived faster than they were handled.

@@ -479,7 +479,7 @@ impl FakeWriter {
         };
         for reader in readers {
             let mut reader = lock(&reader);
-            if let Err(sample) = reader.handle_at_once(sample.clone()) {
+            if let Some(sample) = reader.handle_at_once(sample.clone()) {
                 reader.handle(sample);
             }
         }

@@ -73,18 +73,20 @@ impl Publisher {
     fn take(
         &self,
         sample: Sample,
-        publish: impl FnOnce(&Arc<LocalShare>, Sample) -> Result<(), Sample>,
-    ) -> Result<(), Sample> {
+        publish: impl FnOnce(&Arc<LocalShare>, Sample) -> Option<Sample>,
+    ) -> Option<Sample> {
         if self.is_past(&sample) {
             self.share.data.count_here(&self.share.name, DataDrop::Repeated, 1);
-            return Ok(());
+            return None;
         }
         let (writer, timestamp_ns) = (sample.writer, sample.source_timestamp_ns);
-        publish(&self.share, sample)?;
-        if let (Some(newest), Some(writer)) = (&self.newest, writer) {
+        let refused = publish(&self.share, sample);
+        if refused.is_none()
+            && let (Some(newest), Some(writer)) = (&self.newest, writer)
+        {
             newest.note(writer, timestamp_ns);
         }
-        Ok(())
+        refused
     }
 }
 
@@ -92,11 +94,11 @@ impl HandleSamples for Publisher {
     fn handle(&mut self, sample: Sample) {
         let _ = self.take(sample, |share, sample| {
             share.publish(sample);
-            Ok(())
+            None
         });
     }
 
-    fn handle_at_once(&mut self, sample: Sample) -> Result<(), Sample> {
+    fn handle_at_once(&mut self, sample: Sample) -> Option<Sample> {
         self.take(sample, |share, sample| share.publish_at_once(sample))
     }
 
@@ -353,26 +355,26 @@ impl LocalShare {
     }
 
     /// Publishes a sample if that needs no waiting, or returns it. Receive threads of several readers call it.
-    fn publish_at_once(&self, sample: Sample) -> Result<(), Sample> {
+    fn publish_at_once(&self, sample: Sample) -> Option<Sample> {
         let is_short = sample.payload.len() <= AT_HAND_BYTES_MAX;
         if !is_short || self.is_altered.load(Relaxed) || !self.data.has_headroom(&self.name) {
-            return Err(sample);
+            return Some(sample);
         }
         // The woken tasks run after the locks are released.
         let _at_hand = WakeBatch::begin(&self.runtime);
         // The holder of the lock may be blocked.
-        let Ok(inbox) = self.inbox.try_lock() else { return Err(sample) };
-        let Ok(slot) = self.slot_of(sample.writer) else { return Err(sample) };
+        let Ok(inbox) = self.inbox.try_lock() else { return Some(sample) };
+        let Ok(slot) = self.slot_of(sample.writer) else { return Some(sample) };
         if !inbox.early.is_empty() || !inbox.open.is_empty() {
-            return Err(sample);
+            return Some(sample);
         }
         if let Some(slot) = slot {
-            let Ok(source) = slot.source.try_lock() else { return Err(sample) };
+            let Ok(source) = slot.source.try_lock() else { return Some(sample) };
             self.publish_of(&slot, Some(source), sample, false);
         } else {
             self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted);
         }
-        Ok(())
+        None
     }
 
     /// Returns a sample that may leave now, or holds it until its time comes or a newer one replaces it. Blocks with a
@@ -1025,7 +1027,7 @@ mod tests {
         let entry = FibEntry { trees: [tree].into(), sinks: vec![] };
         share.data.set(share.name, Some(Forward::new(entry, vec![(link, out)], Arc::default())));
         let mut publisher = Publisher::new(share.clone(), None);
-        let mut is_taken = |sample: Sample| publisher.handle_at_once(sample).is_ok();
+        let mut is_taken = |sample: Sample| publisher.handle_at_once(sample).is_none();
         assert!(is_taken(sample(KNOWN, false)));
         assert_eq!((share.published(), flow.has_headroom()), (1, true));
         // These cases wait: an unknown source, a locked source, or an unfinished batch.
