@@ -335,17 +335,8 @@ pub(crate) unsafe fn discovered(
         dds_qget_liveliness(qos, &mut liveliness, &mut lease);
     }
     Some(Qos {
-        reliability: if reliability == dds_reliability_kind_DDS_RELIABILITY_RELIABLE {
-            Reliability::Reliable
-        } else {
-            Reliability::BestEffort
-        },
-        durability: match durability {
-            dds_durability_kind_DDS_DURABILITY_TRANSIENT_LOCAL => Durability::TransientLocal,
-            dds_durability_kind_DDS_DURABILITY_TRANSIENT => Durability::Transient,
-            dds_durability_kind_DDS_DURABILITY_PERSISTENT => Durability::Persistent,
-            _ => Durability::Volatile,
-        },
+        reliability: reliability_from(reliability),
+        durability: durability_from(durability),
         history: if is_unsaid {
             History::UNSAID
         } else if history == dds_history_kind_DDS_HISTORY_KEEP_ALL {
@@ -355,17 +346,38 @@ pub(crate) unsafe fn discovered(
         },
         deadline_ns: finite(deadline),
         lifespan_ns: finite(lifespan),
-        liveliness: match liveliness {
-            dds_liveliness_kind_DDS_LIVELINESS_MANUAL_BY_PARTICIPANT => Liveliness::ManualByParticipant,
-            dds_liveliness_kind_DDS_LIVELINESS_MANUAL_BY_TOPIC => Liveliness::ManualByTopic,
-            _ => Liveliness::Automatic,
-        },
+        liveliness: liveliness_from(liveliness),
         lease_ns: finite(lease),
         // SAFETY: as above.
         partitions: unsafe { partitions(qos) }?,
         // SAFETY: as above.
         representations: unsafe { representations(kind, qos) },
     })
+}
+
+fn reliability_from(kind: dds_reliability_kind_t) -> Reliability {
+    if kind == dds_reliability_kind_DDS_RELIABILITY_RELIABLE {
+        Reliability::Reliable
+    } else {
+        Reliability::BestEffort
+    }
+}
+
+fn durability_from(kind: dds_durability_kind_t) -> Durability {
+    match kind {
+        dds_durability_kind_DDS_DURABILITY_TRANSIENT_LOCAL => Durability::TransientLocal,
+        dds_durability_kind_DDS_DURABILITY_TRANSIENT => Durability::Transient,
+        dds_durability_kind_DDS_DURABILITY_PERSISTENT => Durability::Persistent,
+        _ => Durability::Volatile,
+    }
+}
+
+fn liveliness_from(kind: dds_liveliness_kind_t) -> Liveliness {
+    match kind {
+        dds_liveliness_kind_DDS_LIVELINESS_MANUAL_BY_PARTICIPANT => Liveliness::ManualByParticipant,
+        dds_liveliness_kind_DDS_LIVELINESS_MANUAL_BY_TOPIC => Liveliness::ManualByTopic,
+        _ => Liveliness::Automatic,
+    }
 }
 
 /// Returns the representations that an endpoint accepts or offers. The first entry of a writer's list counts (XTypes
