@@ -36,6 +36,7 @@ mod seal;
 mod secret;
 mod signed;
 mod suite;
+mod tls13;
 mod token;
 mod verify;
 mod x509;

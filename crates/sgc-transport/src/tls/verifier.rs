@@ -7,17 +7,14 @@
 use std::fmt;
 use std::sync::{Arc, OnceLock};
 
-use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use rustls::client::danger::{ServerCertVerified, ServerCertVerifier};
 use rustls::crypto::{CryptoProvider, WebPkiSupportedAlgorithms};
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::server::{ClientHello, ResolvesServerCert};
 use rustls::sign::CertifiedKey;
-use rustls::{
-    CertificateError, DigitallySignedStruct, DistinguishedName, Error, NamedGroup, PeerIncompatible,
-    SignatureScheme,
-};
+use rustls::{CertificateError, DistinguishedName, Error, NamedGroup};
 use rustls_pki_types::{CertificateDer, ServerName, UnixTime};
-use sgc_trust::{CertError, VerifiedPeer};
+use sgc_trust::{CertError, VerifiedPeer, tls13_signatures};
 use sgc_wire::UnixMillis;
 
 use crate::credentials::CredentialStore;
@@ -120,33 +117,6 @@ impl fmt::Debug for PeerVerifier {
     }
 }
 
-/// The three methods that rustls requires of both verifiers. Signatures are those of TLS 1.3, by the provider.
-macro_rules! handshake_signatures {
-    () => {
-        fn verify_tls12_signature(
-            &self,
-            _message: &[u8],
-            _cert: &CertificateDer<'_>,
-            _dss: &DigitallySignedStruct,
-        ) -> Result<HandshakeSignatureValid, Error> {
-            Err(PeerIncompatible::Tls12NotOffered.into())
-        }
-
-        fn verify_tls13_signature(
-            &self,
-            message: &[u8],
-            cert: &CertificateDer<'_>,
-            dss: &DigitallySignedStruct,
-        ) -> Result<HandshakeSignatureValid, Error> {
-            rustls::crypto::verify_tls13_signature(message, cert, dss, &self.algorithms)
-        }
-
-        fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-            self.algorithms.supported_schemes()
-        }
-    };
-}
-
 impl ServerCertVerifier for PeerVerifier {
     fn verify_server_cert(
         &self,
@@ -159,7 +129,7 @@ impl ServerCertVerifier for PeerVerifier {
         self.judge(end_entity, intermediates, now, false).map(|()| ServerCertVerified::assertion())
     }
 
-    handshake_signatures!();
+    tls13_signatures!();
 }
 
 impl ClientCertVerifier for PeerVerifier {
@@ -177,7 +147,7 @@ impl ClientCertVerifier for PeerVerifier {
         self.judge(end_entity, intermediates, now, true).map(|()| ClientCertVerified::assertion())
     }
 
-    handshake_signatures!();
+    tls13_signatures!();
 }
 
 /// Accepts any certificate, for TLS that only hides: the nodes authenticate each other within it.
@@ -204,7 +174,7 @@ impl ServerCertVerifier for AcceptAnyCertificate {
         Ok(ServerCertVerified::assertion())
     }
 
-    handshake_signatures!();
+    tls13_signatures!();
 }
 
 /// Returns the alert for the peer, and no more than that.
