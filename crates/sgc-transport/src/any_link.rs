@@ -4,11 +4,11 @@ use std::net::SocketAddr;
 
 use bytes::Bytes;
 use sgc_trust::VerifiedPeer;
-use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet};
+use sgc_wire::{Class, Label, LaneToken, Name, Packet};
 
 use crate::error::{CloseReason, LabelError, LinkError};
 use crate::flow::{FlowRx, FlowTx};
-use crate::link::Link;
+use crate::link::{Link, ReceivedDatagram};
 use crate::quic::QuicLink;
 use crate::stats::LinkStats;
 use crate::stream::StreamLink;
@@ -72,7 +72,7 @@ impl Link for AnyLink {
         each!(self, l => l.send_datagram_as(packet, label).await)
     }
 
-    async fn recv_datagram(&self) -> Result<Result<Packet, DecodeError>, LinkError> {
+    async fn recv_datagram(&self) -> Result<ReceivedDatagram, LinkError> {
         each!(self, l => l.recv_datagram().await)
     }
 

@@ -61,7 +61,7 @@ pub use error::{
 };
 pub use flow::{Delivery, FlowRx, FlowTx};
 pub use limits::{CONTROL_FRAME_BYTES_MAX, FLOW_PACKET_BYTES_MAX, FLOW_VERSION, LINK_VERSION};
-pub use link::Link;
+pub use link::{Link, ReceivedDatagram};
 pub use metrics::{RefusalKind, TransportMetrics};
 pub use options::LinkOptions;
 pub use quic::QuicLink;

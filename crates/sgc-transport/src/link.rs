@@ -9,6 +9,7 @@ use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet};
 
 use crate::error::{CloseReason, LabelError, LinkError};
 use crate::flow::{FlowRx, FlowTx};
+use crate::labels::Labels;
 use crate::stats::LinkStats;
 
 /// An authenticated connection to one node. Clones share it; when the last is dropped it closes.
@@ -57,9 +58,8 @@ pub trait Link: Clone + Send + Sync + 'static {
         label: Option<Label>,
     ) -> impl Future<Output = Result<(), LinkError>> + Send;
 
-    /// Receives the next packet that came as a datagram. The inner error is one malformed datagram, which is dropped;
-    /// the outer one is the end of the link. Dropping the future loses nothing.
-    fn recv_datagram(&self) -> impl Future<Output = Result<Result<Packet, DecodeError>, LinkError>> + Send;
+    /// Receives the next datagram. A malformed one does not end the link. Dropping the future loses nothing.
+    fn recv_datagram(&self) -> impl Future<Output = Result<ReceivedDatagram, LinkError>> + Send;
 
     /// Defines a label: from here on the peer's packets under it have this name. The error is the peer's mistake.
     fn define_label(&self, label: Label, name: Name) -> Result<(), LabelError>;
@@ -75,4 +75,30 @@ pub trait Link: Clone + Send + Sync + 'static {
 
     /// Waits for the end of the link and returns its cause.
     fn closed(&self) -> impl Future<Output = LinkError> + Send;
+}
+
+/// A datagram that the peer sent.
+#[derive(Debug)]
+pub enum ReceivedDatagram {
+    /// The packet in it.
+    Packet(Packet),
+    /// The datagram holds no packet, and is dropped.
+    Malformed(DecodeError),
+}
+
+impl ReceivedDatagram {
+    /// Returns the packet in it.
+    pub fn packet(self) -> Option<Packet> {
+        match self {
+            Self::Packet(packet) => Some(packet),
+            Self::Malformed(_) => None,
+        }
+    }
+
+    pub(crate) fn read(datagram: Bytes, labels: &Labels) -> Self {
+        match Packet::from_datagram_as(datagram, |label| labels.name_of(label)) {
+            Ok(packet) => Self::Packet(packet),
+            Err(error) => Self::Malformed(error),
+        }
+    }
 }

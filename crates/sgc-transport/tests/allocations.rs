@@ -90,7 +90,7 @@ async fn by_datagram(bytes: usize) -> AllocationCounts {
         let (sent, result) = allocations_of(near.send_datagram_as(&packet, None)).await;
         result.unwrap();
         let (received, result) = allocations_of(soon(far.recv_datagram())).await;
-        assert_eq!(result.unwrap().unwrap().header.seq, seq);
+        assert_eq!(result.unwrap().packet().unwrap().header.seq, seq);
         counts = [counts[0] + sent.count, counts[1] + received.count];
     }
     AllocationCounts::report(&format!("{bytes} bytes in a datagram"), counts, before)

@@ -181,7 +181,7 @@ async fn altered_datagrams_are_dropped(scheme: &str) {
     // The second arrives, so the first was dropped.
     let second = packet(6, payload.clone());
     far.send_datagram(&second).await.unwrap();
-    assert_eq!(soon(near.recv_datagram()).await.unwrap().unwrap().header.seq, 6);
+    assert_eq!(soon(near.recv_datagram()).await.unwrap().packet().unwrap().header.seq, 6);
     let seen = relay.impairment.seen.lock().unwrap();
     let is_visible = seen.iter().any(|d| d.windows(40).any(|w| w == &payload[..40]));
     assert_eq!(is_visible, scheme == "udp");

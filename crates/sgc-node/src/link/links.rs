@@ -10,6 +10,7 @@ use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
 use sgc_router::LinkId;
 use sgc_transport::{
     AnyLink, CloseReason, CredentialStore, FlowEnd, FlowError, FlowRx, Link, LinkError, LinkUrl, Listener,
+    ReceivedDatagram,
 };
 use sgc_wire::{Control, Decode, DecodeError, Encode, Name, Packet};
 use tokio::sync::{mpsc, oneshot, watch};
@@ -615,14 +616,14 @@ impl Inflow {
         while let Ok(received) = self.link.recv_datagram().await {
             match received {
                 // A datagram is never delayed, whatever its header says, since it would delay those behind it.
-                Ok(packet) if !self.belongs(&packet) => {}
-                Ok(packet) => {
+                ReceivedDatagram::Packet(packet) if !self.belongs(&packet) => {}
+                ReceivedDatagram::Packet(packet) => {
                     self.activity.note();
                     if self.rate.as_ref().is_none_or(|rate| rate.take_now(packet.encoded_bytes())) {
                         data.forward(id, packet).await;
                     }
                 }
-                Err(error) => {
+                ReceivedDatagram::Malformed(error) => {
                     debug!(link = id.0, %error, "malformed datagram");
                     if data.drops().count_from(malformed(&error).key(), id) {
                         warn!(link = id.0, %error, "a peer sends malformed datagrams; counted from here on");

@@ -23,7 +23,7 @@ use bytes::Bytes;
 use quinn::{Connection, SendDatagramError, VarInt};
 use sgc_sync::lock;
 use sgc_trust::VerifiedPeer;
-use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet, Slab};
+use sgc_wire::{Class, Label, LaneToken, Name, Packet, Slab};
 use tokio::sync::Mutex;
 
 use self::halves::{Inlet, LinkEnd, Outlet, Urgency};
@@ -36,7 +36,7 @@ use crate::flow::{self, FlowRx, FlowTx};
 use crate::framing::{Pieces, control_head, datagram};
 use crate::labels::Labels;
 use crate::limits::CONTROL_FRAME_BYTES_MAX;
-use crate::link::Link;
+use crate::link::{Link, ReceivedDatagram};
 use crate::stats::{KeyExchange, LinkStats};
 
 /// Time in which QUIC ends a connection by itself after the layer below has ended.
@@ -190,10 +190,10 @@ impl Link for QuicLink {
         })
     }
 
-    async fn recv_datagram(&self) -> Result<Result<Packet, DecodeError>, LinkError> {
+    async fn recv_datagram(&self) -> Result<ReceivedDatagram, LinkError> {
         let LinkInner { connection, fate, labels, .. } = &*self.shared;
         let datagram = connection.read_datagram().await.map_err(|e| fate.explain(&e))?;
-        Ok(Packet::from_datagram_as(datagram, |label| labels.name_of(label)))
+        Ok(ReceivedDatagram::read(datagram, labels))
     }
 
     fn define_label(&self, label: Label, name: Name) -> Result<(), LabelError> {

@@ -43,7 +43,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use sgc_trust::VerifiedPeer;
-use sgc_wire::{Class, DecodeError, Label, LaneToken, Name, Packet, Slab};
+use sgc_wire::{Class, Label, LaneToken, Name, Packet, Slab};
 
 use self::frame::DATAGRAM_BYTES_MAX;
 use self::halves::{Handle, Inlet, LinkInfo, LinkInner, Outlet};
@@ -51,7 +51,7 @@ use crate::error::{CloseReason, LabelError, LinkError, ProtocolError};
 use crate::flow::{self, FlowRx, FlowTx};
 use crate::framing::{Chunks, control_head, datagram};
 use crate::limits::CONTROL_FRAME_BYTES_MAX;
-use crate::link::Link;
+use crate::link::{Link, ReceivedDatagram};
 use crate::stats::LinkStats;
 
 /// A link over one stream of bytes.
@@ -191,11 +191,11 @@ impl Link for StreamLink {
             .await
     }
 
-    async fn recv_datagram(&self) -> Result<Result<Packet, DecodeError>, LinkError> {
+    async fn recv_datagram(&self) -> Result<ReceivedDatagram, LinkError> {
         let Handle { shared, labels, .. } = &*self.handle;
         let datagram =
             shared.until(&shared.datagrams_rx, |state| state.mux.receive_datagram().map(Ok)).await?;
-        Ok(Packet::from_datagram_as(datagram, |label| labels.name_of(label)))
+        Ok(ReceivedDatagram::read(datagram, labels))
     }
 
     fn define_label(&self, label: Label, name: Name) -> Result<(), LabelError> {
