@@ -13,7 +13,6 @@
 //! thus lose at most half of that thread's time to a slow one.
 
 use std::cell::Cell;
-use std::collections::VecDeque;
 use std::ffi::c_void;
 use std::mem::MaybeUninit;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -22,13 +21,14 @@ use std::time::{Duration, Instant};
 
 use cyclors::{
     DDS_ANY_STATE, dds_create_listener, dds_create_reader, dds_delete_listener, dds_entity_t,
-    dds_instance_handle_t, dds_liveliness_changed_status_t, dds_lset_data_available,
-    dds_lset_liveliness_changed, dds_sample_info_t, dds_takecdr, ddsi_serdata,
+    dds_liveliness_changed_status_t, dds_lset_data_available, dds_lset_liveliness_changed, dds_sample_info_t,
+    dds_takecdr, ddsi_serdata,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, RELIABLE_READER_DEPTH_MIN};
 use sgc_sync::lock;
 
 use crate::announced;
+use crate::arrivals::{Arrival, FromSerdata, Level, LivelinessChange, Next, Queue, WriterState};
 use crate::entity::{Entity, reason};
 use crate::first_messages;
 use crate::participant::Participant;
@@ -38,16 +38,10 @@ use crate::wait::join;
 /// Samples taken from Cyclone at once.
 const BATCH: usize = 16;
 
-/// Most queued bytes of one reader; a single sample may be longer.
-pub const WAITING_BYTES_MAX: usize = 64 << 20;
-
 /// Shortest queue of a reliable reader that asks for [`RELIABLE_READER_DEPTH_MIN`] or more. Fast DDS does not
 /// announce whether a publisher is `KEEP_ALL`. Such a publisher loses nothing to a reader on its own network, and may
 /// be faster than this thread by the length of a burst.
 const RELIABLE_WAITING_MIN: usize = 16_384;
-
-/// Most queued liveliness changes of one reader. The oldest give way.
-const LIVELINESS_CHANGES_MAX: usize = 1024;
 
 /// Longest wait of the receiving thread for a reader's thread at once while a queue is crowded.
 const HOLD_MAX: Duration = Duration::from_millis(2);
@@ -76,51 +70,6 @@ thread_local! {
     static IS_LISTENING: Cell<bool> = const { Cell::new(false) };
 }
 
-/// A sample converted from Cyclone's.
-pub(crate) trait FromSerdata: Send + Sized {
-    /// Takes over a reference. Returns `None` for an unusable sample.
-    ///
-    /// # Safety
-    /// The caller owns one reference to `sample`, which is of the type that `Self` is made of.
-    unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self>;
-
-    /// Returns the length of the payload in bytes.
-    fn bytes(&self) -> usize;
-}
-
-/// A sample with the reader's information on it.
-#[derive(Debug)]
-pub(crate) struct Arrival<S> {
-    pub(crate) sample: S,
-    /// The writer, by the reader's handle.
-    pub(crate) writer: dds_instance_handle_t,
-    pub(crate) source_timestamp_ns: i64,
-}
-
-/// A change of a writer's liveliness.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct LivelinessChange {
-    pub(crate) writer: dds_instance_handle_t,
-    pub(crate) now: WriterState,
-}
-
-/// The state of a writer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum WriterState {
-    Alive,
-    /// The lease expired.
-    Lapsed,
-    /// The writer is no longer matched.
-    Gone,
-}
-
-/// An entry of a queue.
-#[derive(Debug)]
-enum Next<S> {
-    Sample(Arrival<S>),
-    Liveliness(LivelinessChange),
-}
-
 /// A receiver of an intake's samples, one after the other.
 pub(crate) trait Receiver: Send + 'static {
     /// The samples of the reader's topic.
@@ -144,152 +93,6 @@ pub(crate) trait Receiver: Send + 'static {
 
     /// Reports samples that were dropped because newer ones arrived faster than they were received.
     fn overrun(&mut self, samples: u64);
-}
-
-/// The queue of a reader.
-#[derive(Debug)]
-struct Queue<S> {
-    arrivals: VecDeque<Arrival<S>>,
-    bytes: usize,
-    /// Most queued samples.
-    depth: usize,
-    /// The numbers of samples that were queued so far, and that left the queue.
-    pushed: u64,
-    popped: u64,
-    /// Changes of liveliness, each with the number of samples before it.
-    changes: VecDeque<(u64, LivelinessChange)>,
-    overrun: u64,
-    thread: ThreadState,
-    receiving: ReceivingState,
-    /// The time before which the receiving thread does not wait for room again.
-    no_wait_before: Option<Instant>,
-}
-
-/// The state of a reader's thread.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum ThreadState {
-    Working,
-    /// The thread sleeps until an entry is queued.
-    Waiting,
-    /// The thread ends and takes nothing more.
-    Stopped,
-}
-
-/// The state of the receiving thread towards one reader.
-#[derive(Clone, Copy, Debug)]
-enum ReceivingState {
-    Free,
-    /// The receiving thread waits until the queue has sunk to the level.
-    Held {
-        until: Level,
-        is_stuck: bool,
-    },
-    /// The receiving thread waited in vain, and nothing was taken since.
-    Stuck,
-}
-
-/// An amount of samples in a queue.
-#[derive(Clone, Copy, Debug)]
-struct Level {
-    samples: usize,
-    bytes: usize,
-}
-
-impl<S: FromSerdata> Queue<S> {
-    fn new(depth: usize) -> Self {
-        Self {
-            arrivals: VecDeque::new(),
-            bytes: 0,
-            depth,
-            pushed: 0,
-            popped: 0,
-            changes: VecDeque::new(),
-            overrun: 0,
-            thread: ThreadState::Working,
-            receiving: ReceivingState::Free,
-            no_wait_before: None,
-        }
-    }
-
-    /// Returns one part in `part` of the allowed amount.
-    fn level(&self, part: usize) -> Level {
-        Level { samples: self.depth / part, bytes: WAITING_BYTES_MAX / part }
-    }
-
-    /// Returns `true` if the queue holds more than `level`.
-    fn is_above(&self, level: Level) -> bool {
-        self.arrivals.len() > level.samples || self.bytes > level.bytes
-    }
-
-    fn is_full_to(&self, part: usize) -> bool {
-        self.is_above(self.level(part))
-    }
-
-    /// Appends a sample. The oldest samples give way if there is no room.
-    fn push(&mut self, arrival: Arrival<S>) {
-        let bytes = arrival.sample.bytes();
-        while (self.arrivals.len() >= self.depth || self.bytes + bytes > WAITING_BYTES_MAX)
-            && self.pop().is_some()
-        {
-            self.overrun += 1;
-        }
-        self.bytes += bytes;
-        self.pushed += 1;
-        self.arrivals.push_back(arrival);
-    }
-
-    /// Appends a change of liveliness behind the queued samples.
-    fn push_change(&mut self, change: LivelinessChange) {
-        if self.changes.len() >= LIVELINESS_CHANGES_MAX {
-            self.changes.pop_front();
-            tracing::debug!("a change of liveliness is dropped: too many wait");
-        }
-        self.changes.push_back((self.pushed, change));
-    }
-
-    fn is_stopped(&self) -> bool {
-        self.thread == ThreadState::Stopped
-    }
-
-    /// Returns `true` if the thread sleeps. The caller wakes it.
-    fn begin_to_wake(&mut self) -> bool {
-        let is_waiting = self.thread == ThreadState::Waiting;
-        if is_waiting {
-            self.thread = ThreadState::Working;
-        }
-        is_waiting
-    }
-
-    fn is_empty(&self) -> bool {
-        self.arrivals.is_empty() && self.changes.is_empty()
-    }
-
-    fn pop(&mut self) -> Option<Arrival<S>> {
-        let arrival = self.arrivals.pop_front()?;
-        self.bytes -= arrival.sample.bytes();
-        self.popped += 1;
-        Some(arrival)
-    }
-
-    /// Takes the oldest entry, and tells whether the receiving thread may continue.
-    fn next(&mut self) -> (Option<Next<S>>, bool) {
-        let is_due = self.changes.front().is_some_and(|(behind, _)| *behind <= self.popped);
-        if let Some((_, change)) = is_due.then(|| self.changes.pop_front()).flatten() {
-            return (Some(Next::Liveliness(change)), false);
-        }
-        let next = self.pop().map(Next::Sample);
-        let may_go_on = match self.receiving {
-            ReceivingState::Held { until, .. } => !self.is_above(until),
-            ReceivingState::Free | ReceivingState::Stuck => false,
-        };
-        self.receiving = match self.receiving {
-            ReceivingState::Held { until, .. } if !may_go_on => {
-                ReceivingState::Held { until, is_stuck: false }
-            }
-            _ => ReceivingState::Free,
-        };
-        (next, may_go_on)
-    }
 }
 
 /// The state that the listener and the reader's thread share.
@@ -366,10 +169,7 @@ impl<R: Receiver> IntakeState<R> {
         if queue.begin_to_wake() {
             drop(queue);
             self.filled.notify_one();
-        } else if self.holds_back
-            && queue.is_full_to(CROWDED_PART)
-            && !matches!(queue.receiving, ReceivingState::Stuck)
-        {
+        } else if self.holds_back && queue.is_full_to(CROWDED_PART) && !queue.is_stuck() {
             self.hold_back(queue);
         }
     }
@@ -398,13 +198,14 @@ impl<R: Receiver> IntakeState<R> {
     /// Waits until there is room for a sample in a queue of many.
     fn wait_for_room<'a>(&self, queue: MutexGuard<'a, Queue<R::Sample>>) -> MutexGuard<'a, Queue<R::Sample>> {
         let full = Level { bytes: usize::MAX, ..queue.level(FULL_PART) };
-        let waits = queue.no_wait_before.is_none_or(|at| Instant::now() >= at);
+        let waits = queue.may_wait_at(Instant::now);
         if !queue.is_above(full) || !waits || queue.is_stopped() {
             return queue;
         }
         let room = Level { samples: full.samples.saturating_sub(ROOM_SAMPLES), ..full };
         let mut queue = self.wait_until(queue, room, ROOM_WAIT_MAX);
-        queue.no_wait_before = queue.is_above(room).then(|| Instant::now() + ROOM_WAIT_PAUSE);
+        let pause = queue.is_above(room).then(|| Instant::now() + ROOM_WAIT_PAUSE);
+        queue.set_no_wait_before(pause);
         queue
     }
 
@@ -415,15 +216,10 @@ impl<R: Receiver> IntakeState<R> {
         level: Level,
         at_most: Duration,
     ) -> MutexGuard<'a, Queue<R::Sample>> {
-        queue.receiving = ReceivingState::Held { until: level, is_stuck: true };
-        let waited = self.eased.wait_timeout_while(queue, at_most, |q| {
-            matches!(q.receiving, ReceivingState::Held { .. }) && !q.is_stopped()
-        });
+        queue.begin_hold(level);
+        let waited = self.eased.wait_timeout_while(queue, at_most, |queue| queue.is_held());
         let mut queue = waited.unwrap_or_else(PoisonError::into_inner).0;
-        queue.receiving = match queue.receiving {
-            ReceivingState::Held { is_stuck: true, .. } | ReceivingState::Stuck => ReceivingState::Stuck,
-            ReceivingState::Held { is_stuck: false, .. } | ReceivingState::Free => ReceivingState::Free,
-        };
+        queue.end_hold();
         queue
     }
 
@@ -434,7 +230,7 @@ impl<R: Receiver> IntakeState<R> {
                 loop {
                     let ((next, may_go_on), overrun, is_stopped) = {
                         let mut queue = lock(&self.queue);
-                        (queue.next(), std::mem::take(&mut queue.overrun), queue.is_stopped())
+                        (queue.next(), queue.take_overrun(), queue.is_stopped())
                     };
                     if may_go_on {
                         self.eased.notify_one();
@@ -453,18 +249,17 @@ impl<R: Receiver> IntakeState<R> {
             }
             let mut queue = lock(&self.queue);
             while queue.is_empty() && !queue.is_stopped() {
-                queue.thread = ThreadState::Waiting;
+                queue.begin_to_wait();
                 queue = self.filled.wait(queue).unwrap_or_else(PoisonError::into_inner);
             }
-            if queue.is_stopped() {
+            if !queue.begin_to_work() {
                 return;
             }
-            queue.thread = ThreadState::Working;
         }
     }
 
     fn stop(&self) {
-        lock(&self.queue).thread = ThreadState::Stopped;
+        lock(&self.queue).stop();
         self.filled.notify_one();
         self.eased.notify_one();
     }
@@ -605,78 +400,4 @@ unsafe extern "C" fn liveliness_changed<R: Receiver>(
         _ => WriterState::Gone,
     };
     shared.change_liveliness(LivelinessChange { writer: status.last_publication_handle, now });
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    impl FromSerdata for usize {
-        unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self> {
-            Some(sample as Self)
-        }
-
-        fn bytes(&self) -> usize {
-            *self
-        }
-    }
-
-    /// Returns the lengths of the queued samples, and the number of dropped ones.
-    fn waits(depth: usize, all: impl IntoIterator<Item = usize>) -> (Vec<usize>, u64) {
-        let mut queue = Queue::new(depth);
-        for bytes in all {
-            queue.push(Arrival { sample: bytes, writer: 1, source_timestamp_ns: 0 });
-            assert!(queue.bytes <= WAITING_BYTES_MAX.max(bytes));
-        }
-        let waits = std::iter::from_fn(|| queue.pop()).map(|a| a.sample).collect();
-        assert_eq!(queue.bytes, 0);
-        (waits, queue.overrun)
-    }
-
-    #[test]
-    fn queue_is_bounded_in_samples_and_bytes() {
-        assert_eq!(waits(3, 10..15), (vec![12, 13, 14], 2));
-        const HALF: usize = WAITING_BYTES_MAX / 2;
-        assert_eq!(waits(9, [5, HALF, HALF]), (vec![HALF, HALF], 1));
-        assert_eq!(waits(9, [5, 7, WAITING_BYTES_MAX + 1]), (vec![WAITING_BYTES_MAX + 1], 2));
-        assert_eq!(waits(9, [WAITING_BYTES_MAX + 1, 6]), (vec![6], 1));
-    }
-
-    #[test]
-    fn held_reader_continues_once_half_of_the_queue_is_gone() {
-        let mut queue = Queue::new(16 * CROWDED_PART);
-        let push = |queue: &mut Queue<usize>, bytes| {
-            queue.push(Arrival { sample: bytes, writer: 1, source_timestamp_ns: 0 });
-            queue.is_full_to(CROWDED_PART)
-        };
-        assert!((0..16).all(|_| !push(&mut queue, 1)) && push(&mut queue, 1));
-        queue.receiving = ReceivingState::Held { until: queue.level(2 * CROWDED_PART), is_stuck: true };
-        for _ in 0..8 {
-            assert!(!queue.next().1);
-        }
-        assert!(queue.next().1 && matches!(queue.receiving, ReceivingState::Free));
-        assert!(!queue.next().1, "it was told");
-        assert!(push(&mut queue, WAITING_BYTES_MAX / CROWDED_PART), "bytes count as well");
-    }
-
-    #[test]
-    fn changes_of_liveliness_keep_their_place_among_samples_and_have_a_bound() {
-        let mut queue = Queue::new(3);
-        let change = |writer| LivelinessChange { writer, now: WriterState::Lapsed };
-        let sample = |bytes| Arrival { sample: bytes, writer: 1, source_timestamp_ns: 0 };
-        queue.push_change(change(1));
-        (0..2).for_each(|bytes| queue.push(sample(bytes)));
-        queue.push_change(change(2));
-        // The first sample gives way.
-        (2..4).for_each(|bytes| queue.push(sample(bytes)));
-        let order = std::iter::from_fn(|| match queue.next().0? {
-            Next::Sample(arrival) => Some(format!("sample {}", arrival.sample)),
-            Next::Liveliness(change) => Some(format!("change {}", change.writer)),
-        });
-        assert_eq!(order.collect::<Vec<_>>(), ["change 1", "sample 1", "change 2", "sample 2", "sample 3"]);
-        let many = LIVELINESS_CHANGES_MAX as u64 + 7;
-        (0..many).for_each(|writer| queue.push_change(change(writer)));
-        assert_eq!(queue.changes.len(), LIVELINESS_CHANGES_MAX);
-        assert!(matches!(queue.next().0, Some(Next::Liveliness(c)) if c.writer == 7));
-    }
 }

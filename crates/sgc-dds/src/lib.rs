@@ -20,6 +20,7 @@
 
 mod announced;
 mod announcement;
+mod arrivals;
 pub mod config;
 mod discovery;
 mod domain;
@@ -54,8 +55,8 @@ pub mod user_data;
 mod wait;
 mod writer;
 
+pub use arrivals::WAITING_BYTES_MAX;
 pub use config::{DdsConfig, DiscoveryRange};
-pub use intake::WAITING_BYTES_MAX;
 pub use log::{Unsent, unsent};
 pub use network::CycloneNetwork;
 pub use reader::CycloneReader;

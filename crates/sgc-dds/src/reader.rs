@@ -8,7 +8,8 @@ use cyclors::{dds_entity_t, dds_instance_handle_t, ddsi_serdata};
 use sgc_ros::{DiscoveryEvent, EndpointSpec, Guid, KeyHash, Sample, SampleHandler, SampleKind};
 use sgc_wire::History;
 
-use crate::intake::{Arrival, FromSerdata, Intake, LivelinessChange, Receiver, WriterState};
+use crate::arrivals::{Arrival, FromSerdata, LivelinessChange, WriterState};
+use crate::intake::{Intake, Receiver};
 use crate::known_writers::{KnownWriter, KnownWriters};
 use crate::participant::Participant;
 use crate::payload::HEADER_BYTES;

@@ -13,9 +13,10 @@ use cyclors::{
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, RosError};
 use sgc_sync::lock;
 
+use crate::arrivals::{Arrival, FromSerdata};
 use crate::entity::{Entity, check, reason};
 use crate::identity::{Mapping, SampleIdentity};
-use crate::intake::{Arrival, FromSerdata, Intake, Receiver};
+use crate::intake::{Intake, Receiver};
 use crate::known_writers::KnownWriters;
 use crate::participant::Participant;
 use crate::payload::{Frame, HEADER_BYTES};

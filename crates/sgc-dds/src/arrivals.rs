@@ -1,0 +1,338 @@
+//! [`Queue`]: the samples of a reader between Cyclone's receiving thread and the reader's own, and the states of both.
+//!
+//! It locks nothing and wakes nobody: [`crate::intake`] does.
+
+use std::collections::VecDeque;
+use std::time::Instant;
+
+use cyclors::{dds_instance_handle_t, ddsi_serdata};
+
+/// Most queued bytes of one reader; a single sample may be longer.
+pub const WAITING_BYTES_MAX: usize = 64 << 20;
+
+/// Most queued liveliness changes of one reader. The oldest give way.
+const LIVELINESS_CHANGES_MAX: usize = 1024;
+
+/// A sample converted from Cyclone's.
+pub(crate) trait FromSerdata: Send + Sized {
+    /// Takes over a reference. Returns `None` for an unusable sample.
+    ///
+    /// # Safety
+    /// The caller owns one reference to `sample`, which is of the type that `Self` is made of.
+    unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self>;
+
+    /// Returns the length of the payload in bytes.
+    fn bytes(&self) -> usize;
+}
+
+/// A sample with the reader's information on it.
+#[derive(Debug)]
+pub(crate) struct Arrival<S> {
+    pub(crate) sample: S,
+    /// The writer, by the reader's handle.
+    pub(crate) writer: dds_instance_handle_t,
+    pub(crate) source_timestamp_ns: i64,
+}
+
+/// A change of a writer's liveliness.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct LivelinessChange {
+    pub(crate) writer: dds_instance_handle_t,
+    pub(crate) now: WriterState,
+}
+
+/// The state of a writer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum WriterState {
+    Alive,
+    /// The lease expired.
+    Lapsed,
+    /// The writer is no longer matched.
+    Gone,
+}
+
+/// An entry of a queue.
+#[derive(Debug)]
+pub(crate) enum Next<S> {
+    Sample(Arrival<S>),
+    Liveliness(LivelinessChange),
+}
+
+/// The queue of a reader.
+#[derive(Debug)]
+pub(crate) struct Queue<S> {
+    arrivals: VecDeque<Arrival<S>>,
+    bytes: usize,
+    /// Most queued samples.
+    depth: usize,
+    /// The numbers of samples that were queued so far, and that left the queue.
+    pushed: u64,
+    popped: u64,
+    /// Changes of liveliness, each with the number of samples before it.
+    changes: VecDeque<(u64, LivelinessChange)>,
+    overrun: u64,
+    thread: ThreadState,
+    receiving: ReceivingState,
+    /// The time before which the receiving thread does not wait for room again.
+    no_wait_before: Option<Instant>,
+}
+
+/// The state of a reader's thread.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum ThreadState {
+    Working,
+    /// The thread sleeps until an entry is queued.
+    Waiting,
+    /// The thread ends and takes nothing more.
+    Stopped,
+}
+
+/// The state of the receiving thread towards one reader.
+#[derive(Clone, Copy, Debug)]
+enum ReceivingState {
+    Free,
+    /// The receiving thread waits until the queue has sunk to the level.
+    Held {
+        until: Level,
+        is_stuck: bool,
+    },
+    /// The receiving thread waited in vain, and nothing was taken since.
+    Stuck,
+}
+
+/// An amount of samples in a queue.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Level {
+    pub(crate) samples: usize,
+    pub(crate) bytes: usize,
+}
+
+impl<S: FromSerdata> Queue<S> {
+    pub(crate) fn new(depth: usize) -> Self {
+        Self {
+            arrivals: VecDeque::new(),
+            bytes: 0,
+            depth,
+            pushed: 0,
+            popped: 0,
+            changes: VecDeque::new(),
+            overrun: 0,
+            thread: ThreadState::Working,
+            receiving: ReceivingState::Free,
+            no_wait_before: None,
+        }
+    }
+
+    /// Returns one part in `part` of the allowed amount.
+    pub(crate) fn level(&self, part: usize) -> Level {
+        Level { samples: self.depth / part, bytes: WAITING_BYTES_MAX / part }
+    }
+
+    /// Returns `true` if the queue holds more than `level`.
+    pub(crate) fn is_above(&self, level: Level) -> bool {
+        self.arrivals.len() > level.samples || self.bytes > level.bytes
+    }
+
+    pub(crate) fn is_full_to(&self, part: usize) -> bool {
+        self.is_above(self.level(part))
+    }
+
+    /// Appends a sample. The oldest samples give way if there is no room.
+    pub(crate) fn push(&mut self, arrival: Arrival<S>) {
+        let bytes = arrival.sample.bytes();
+        while (self.arrivals.len() >= self.depth || self.bytes + bytes > WAITING_BYTES_MAX)
+            && self.pop().is_some()
+        {
+            self.overrun += 1;
+        }
+        self.bytes += bytes;
+        self.pushed += 1;
+        self.arrivals.push_back(arrival);
+    }
+
+    /// Appends a change of liveliness behind the queued samples.
+    pub(crate) fn push_change(&mut self, change: LivelinessChange) {
+        if self.changes.len() >= LIVELINESS_CHANGES_MAX {
+            self.changes.pop_front();
+            tracing::debug!("a change of liveliness is dropped: too many wait");
+        }
+        self.changes.push_back((self.pushed, change));
+    }
+
+    pub(crate) fn is_stopped(&self) -> bool {
+        self.thread == ThreadState::Stopped
+    }
+
+    /// Returns `true` if the thread sleeps. The caller wakes it.
+    pub(crate) fn begin_to_wake(&mut self) -> bool {
+        let is_waiting = self.thread == ThreadState::Waiting;
+        if is_waiting {
+            self.thread = ThreadState::Working;
+        }
+        is_waiting
+    }
+
+    /// Makes the thread sleep until an entry is queued.
+    pub(crate) fn begin_to_wait(&mut self) {
+        self.thread = ThreadState::Waiting;
+    }
+
+    /// Ends the sleep of the thread. Returns `false` if it must end.
+    pub(crate) fn begin_to_work(&mut self) -> bool {
+        if self.is_stopped() {
+            return false;
+        }
+        self.thread = ThreadState::Working;
+        true
+    }
+
+    /// Makes the thread end.
+    pub(crate) fn stop(&mut self) {
+        self.thread = ThreadState::Stopped;
+    }
+
+    /// Begins a wait of the receiving thread until the queue has sunk to the level.
+    pub(crate) fn begin_hold(&mut self, until: Level) {
+        self.receiving = ReceivingState::Held { until, is_stuck: true };
+    }
+
+    /// Returns `true` while the receiving thread has to wait.
+    pub(crate) fn is_held(&self) -> bool {
+        matches!(self.receiving, ReceivingState::Held { .. }) && !self.is_stopped()
+    }
+
+    /// Ends the wait of the receiving thread.
+    pub(crate) fn end_hold(&mut self) {
+        self.receiving = match self.receiving {
+            ReceivingState::Held { is_stuck: true, .. } | ReceivingState::Stuck => ReceivingState::Stuck,
+            ReceivingState::Held { is_stuck: false, .. } | ReceivingState::Free => ReceivingState::Free,
+        };
+    }
+
+    /// Returns `true` if the receiving thread waited in vain and nothing was taken since.
+    pub(crate) fn is_stuck(&self) -> bool {
+        matches!(self.receiving, ReceivingState::Stuck | ReceivingState::Held { is_stuck: true, .. })
+    }
+
+    /// Returns `true` if the receiving thread may wait for room at this time.
+    pub(crate) fn may_wait_at(&self, now: impl FnOnce() -> Instant) -> bool {
+        self.no_wait_before.is_none_or(|at| now() >= at)
+    }
+
+    /// Sets the time before which the receiving thread does not wait for room again.
+    pub(crate) fn set_no_wait_before(&mut self, at: Option<Instant>) {
+        self.no_wait_before = at;
+    }
+
+    /// Returns the number of dropped samples since the last call.
+    pub(crate) fn take_overrun(&mut self) -> u64 {
+        std::mem::take(&mut self.overrun)
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.arrivals.is_empty() && self.changes.is_empty()
+    }
+
+    fn pop(&mut self) -> Option<Arrival<S>> {
+        let arrival = self.arrivals.pop_front()?;
+        self.bytes -= arrival.sample.bytes();
+        self.popped += 1;
+        Some(arrival)
+    }
+
+    /// Takes the oldest entry, and tells whether the receiving thread may continue.
+    pub(crate) fn next(&mut self) -> (Option<Next<S>>, bool) {
+        let is_due = self.changes.front().is_some_and(|(behind, _)| *behind <= self.popped);
+        if let Some((_, change)) = is_due.then(|| self.changes.pop_front()).flatten() {
+            return (Some(Next::Liveliness(change)), false);
+        }
+        let next = self.pop().map(Next::Sample);
+        let may_go_on = match self.receiving {
+            ReceivingState::Held { until, .. } => !self.is_above(until),
+            ReceivingState::Free | ReceivingState::Stuck => false,
+        };
+        self.receiving = match self.receiving {
+            ReceivingState::Held { until, .. } if !may_go_on => {
+                ReceivingState::Held { until, is_stuck: false }
+            }
+            _ => ReceivingState::Free,
+        };
+        (next, may_go_on)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CROWDED_PART: usize = 8;
+
+    impl FromSerdata for usize {
+        unsafe fn from_raw(sample: *mut ddsi_serdata) -> Option<Self> {
+            Some(sample as Self)
+        }
+
+        fn bytes(&self) -> usize {
+            *self
+        }
+    }
+
+    /// Returns the lengths of the queued samples, and the number of dropped ones.
+    fn waits(depth: usize, all: impl IntoIterator<Item = usize>) -> (Vec<usize>, u64) {
+        let mut queue = Queue::new(depth);
+        for bytes in all {
+            queue.push(Arrival { sample: bytes, writer: 1, source_timestamp_ns: 0 });
+            assert!(queue.bytes <= WAITING_BYTES_MAX.max(bytes));
+        }
+        let waits = std::iter::from_fn(|| queue.pop()).map(|a| a.sample).collect();
+        assert_eq!(queue.bytes, 0);
+        (waits, queue.overrun)
+    }
+
+    #[test]
+    fn queue_is_bounded_in_samples_and_bytes() {
+        assert_eq!(waits(3, 10..15), (vec![12, 13, 14], 2));
+        const HALF: usize = WAITING_BYTES_MAX / 2;
+        assert_eq!(waits(9, [5, HALF, HALF]), (vec![HALF, HALF], 1));
+        assert_eq!(waits(9, [5, 7, WAITING_BYTES_MAX + 1]), (vec![WAITING_BYTES_MAX + 1], 2));
+        assert_eq!(waits(9, [WAITING_BYTES_MAX + 1, 6]), (vec![6], 1));
+    }
+
+    #[test]
+    fn held_reader_continues_once_half_of_the_queue_is_gone() {
+        let mut queue = Queue::new(16 * CROWDED_PART);
+        let push = |queue: &mut Queue<usize>, bytes| {
+            queue.push(Arrival { sample: bytes, writer: 1, source_timestamp_ns: 0 });
+            queue.is_full_to(CROWDED_PART)
+        };
+        assert!((0..16).all(|_| !push(&mut queue, 1)) && push(&mut queue, 1));
+        queue.begin_hold(queue.level(2 * CROWDED_PART));
+        for _ in 0..8 {
+            assert!(!queue.next().1);
+        }
+        assert!(queue.next().1 && matches!(queue.receiving, ReceivingState::Free));
+        assert!(!queue.next().1, "it was told");
+        assert!(push(&mut queue, WAITING_BYTES_MAX / CROWDED_PART), "bytes count as well");
+    }
+
+    #[test]
+    fn changes_of_liveliness_keep_their_place_among_samples_and_have_a_bound() {
+        let mut queue = Queue::new(3);
+        let change = |writer| LivelinessChange { writer, now: WriterState::Lapsed };
+        let sample = |bytes| Arrival { sample: bytes, writer: 1, source_timestamp_ns: 0 };
+        queue.push_change(change(1));
+        (0..2).for_each(|bytes| queue.push(sample(bytes)));
+        queue.push_change(change(2));
+        // The first sample gives way.
+        (2..4).for_each(|bytes| queue.push(sample(bytes)));
+        let order = std::iter::from_fn(|| match queue.next().0? {
+            Next::Sample(arrival) => Some(format!("sample {}", arrival.sample)),
+            Next::Liveliness(change) => Some(format!("change {}", change.writer)),
+        });
+        assert_eq!(order.collect::<Vec<_>>(), ["change 1", "sample 1", "change 2", "sample 2", "sample 3"]);
+        let many = LIVELINESS_CHANGES_MAX as u64 + 7;
+        (0..many).for_each(|writer| queue.push_change(change(writer)));
+        assert_eq!(queue.changes.len(), LIVELINESS_CHANGES_MAX);
+        assert!(matches!(queue.next().0, Some(Next::Liveliness(c)) if c.writer == 7));
+    }
+}
