@@ -3,7 +3,7 @@
 use sgc_wire::SinkId;
 use smallvec::SmallVec;
 
-use crate::LinkId;
+use crate::link_id::LinkId;
 
 /// The compiled trees of one name at this node: one, and for a while a second one after a route change.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

@@ -5,30 +5,40 @@
 //! number, never by address; it sees no payload and holds no key but the one that its node signs with. The data path
 //! reads [`FibEntry`]s and never calls the machine. The normative text is `docs/spec/routing.md`.
 //!
+//! [`Router`] is a composition. `Links` has the neighbours and the costs of links, `Topology` the network behind them,
+//! `Names` the owners of names and the nodes to tell, `Trees` the branches. Each part keeps its state to itself and
+//! verifies nothing. The router verifies an event, asks the parts, and passes the effects of one on to the next. No
+//! file imports one that imports it.
+//!
 //! Every node has one, proxies too: a proxy is a router that carries nobody else's names, with its own
 //! endpoint behind [`LinkId::LOCAL`].
 #![forbid(unsafe_code)]
 
+mod config;
+mod context;
+mod drops;
 mod fib;
+mod lease;
 mod limits;
+mod link_id;
 mod links;
-mod lists;
 mod mapping;
 mod memory;
 mod names;
+mod network;
+mod output;
 mod router;
 mod shares;
-mod spf;
-mod tell;
 mod topology;
-mod tree;
-mod trust;
+mod trees;
 
+pub use config::RouterConfig;
+pub use drops::{DropReason, RouterDrop};
 pub use fib::{FibEntry, Tree};
 pub use limits::Limits;
-pub use links::Neighbour;
+pub use link_id::LinkId;
+pub use links::{Neighbour, clocks_differ};
 pub use mapping::MappingKind;
-pub use router::{
-    DropReason, LinkClose, LinkId, Output, Router, RouterConfig, RouterDrop, RouterStats, clocks_differ,
-};
+pub use output::{LinkClose, Output};
+pub use router::{Router, RouterStats};
 pub use topology::RouteStats;

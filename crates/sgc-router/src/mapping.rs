@@ -1,9 +1,9 @@
 //! Two rules by which routers learn the owners of names, behind one trait.
 //!
-//! A mapping decides which routers are told, and which are asked; `names.rs` keeps the records and sends the frames.
+//! A mapping decides which routers are told, and which are asked; `names/` keeps the records and sends the frames.
 //! Routers with different mappings understand each other: a router asks for names that it is not told.
 
-use crate::router::LinkId;
+use crate::link_id::LinkId;
 
 /// The mapping of a router.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

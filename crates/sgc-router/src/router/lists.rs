@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use sgc_trust::{CaFingerprint, CrlNumber};
 
-use crate::limits::Budget;
-use crate::router::LinkId;
+use crate::limits::budget::Budget;
+use crate::link_id::LinkId;
 
 /// Lists of a CA that are taken in a second, once its burst is used.
 const LISTS_PER_SECOND: u32 = 1;
