@@ -51,7 +51,7 @@ pub enum DropReason {
     /// Too many hops.
     #[error("hop limit reached")]
     HopLimit,
-    /// A bound of [`Limits`] is reached.
+    /// A bound of [`Limits`](crate::Limits) is reached.
     #[error("limit reached: {what}")]
     Limit {
         /// The bound.

@@ -18,6 +18,11 @@ pub(super) struct Interests {
 }
 
 impl Interests {
+    /// Returns `true` if no link wants to know of any name.
+    pub(super) fn is_empty(&self) -> bool {
+        self.watchers.is_empty()
+    }
+
     /// Returns `true` if the link wants to know of the name.
     pub(super) fn contains(&self, link: LinkId, name: &Name) -> bool {
         self.of_link.get(&link).is_some_and(|names| names.contains_key(name))

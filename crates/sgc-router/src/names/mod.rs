@@ -25,8 +25,8 @@ use sgc_wire::{Control, Name, NodeId, SignedBody};
 use self::heard::Heard;
 use self::interests::Interests;
 use self::questions::Questions;
-use self::record::{Record, RecordKind};
-pub(crate) use self::record::{RecordEnd, RecordId};
+use self::record::Record;
+pub(crate) use self::record::{RecordEnd, RecordId, RecordKind};
 use self::records::Records;
 use crate::config::RouterConfig;
 use crate::context::Context;
@@ -78,10 +78,9 @@ pub(crate) struct Arrival {
 pub(crate) struct Admitted {
     pub(crate) id: RecordId,
     pub(crate) owner: NodeId,
+    pub(crate) kind: RecordKind,
     /// Names whose routes may have changed.
     pub(crate) changed: Vec<Name>,
-    /// The withdrawal to pass on; `None` for an advertisement.
-    pub(crate) withdrawal: Option<Control>,
 }
 
 /// The consequence of a verified announcement.
@@ -226,7 +225,7 @@ impl Names {
             seq: advert.body.seq,
             kind,
             names: advert.names.into(),
-            signed: signed.clone(),
+            signed,
             issued_at: advert.body.issued_at,
             digest,
             expires,
@@ -235,15 +234,13 @@ impl Names {
             from: link,
             asked: is_answer.then_some(now.instant),
         };
-        let is_withdrawal = record.is_withdrawal();
         let known: Vec<_> = match kind {
             RecordKind::Withdrawal => news.iter().copied().filter(|n| self.records.id(n).is_some()).collect(),
             RecordKind::Advert => Vec::new(),
         };
         let id = self.insert(now.instant, record, &news);
-        let (changed, withdrawal) =
-            if is_withdrawal { (known, Some(Control::Advert { cost: 0, signed })) } else { (news, None) };
-        Admission::Admitted(Admitted { id, owner, changed, withdrawal })
+        let changed = if kind == RecordKind::Withdrawal { known } else { news };
+        Admission::Admitted(Admitted { id, owner, kind, changed })
     }
 
     /// Returns the names of a verified announcement that it has news of. Without any, whatever has to be said is said.

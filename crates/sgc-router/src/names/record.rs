@@ -19,7 +19,7 @@ pub(crate) type RecordId = u64;
 
 /// The statement of a record about its names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum RecordKind {
+pub(crate) enum RecordKind {
     /// The owner has them.
     Advert,
     /// The owner no longer has them.

@@ -135,8 +135,8 @@ impl Records {
 
     /// Returns the names that a record still speaks for.
     pub(super) fn live_names(&self, id: RecordId) -> Vec<Name> {
-        let names = self.records.get(&id).into_iter().flat_map(|record| record.names.iter().copied());
-        names.filter(|name| self.words.get(name) == Some(&id)).collect()
+        let Some(record) = self.records.get(&id) else { return Vec::new() };
+        record.names.iter().copied().filter(|name| self.words.get(name) == Some(&id)).collect()
     }
 
     /// Returns the number of advertised names.

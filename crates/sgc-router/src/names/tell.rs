@@ -25,12 +25,13 @@ impl Names {
         owner: &NodeId,
         id: RecordId,
     ) {
-        let names = self.records.live_names(id);
         let own = *owner == self.own;
-        if names.is_empty() || !(self.transit || own) {
+        // A record in force speaks for at least one name.
+        if self.records.get(id).is_none() || !(self.transit || own) {
             return;
         }
         let everyone = if self.transit { self.mapping.tells_unasked() } else { own };
+        let names = if everyone { Vec::new() } else { self.records.live_names(id) };
         let is_told = |link: &LinkId| {
             let asked = || {
                 self.questions.follows(*link, owner)
@@ -224,16 +225,20 @@ impl Names {
         &mut self,
         cx: &mut Context<'_>,
         ingress: LinkId,
+        id: RecordId,
         names: &[Name],
-        frame: &Control,
     ) {
+        let Some(record) = self.records.get(id) else { return };
         for link in self.interests.take_told(ingress, names) {
-            cx.send(link, frame.clone());
+            cx.send(link, Control::Advert { cost: 0, signed: record.signed.clone() });
         }
     }
 
     /// Tells interested neighbours after the routes to these names may have changed, and asks for lost names.
     pub(crate) fn routes_changed(&mut self, cx: &mut Context<'_>, names: &[Name]) {
+        if self.interests.is_empty() {
+            return;
+        }
         let mut watched = BTreeMap::<LinkId, Vec<Name>>::new();
         for name in names {
             for link in self.interests.watchers(name) {

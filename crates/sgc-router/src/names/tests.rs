@@ -110,14 +110,14 @@ fn reader_is_told_of_a_name_once_and_of_its_withdrawal() {
     bench.with(|names, cx| names.add_interests(cx, READER, &[NAME]));
     assert_eq!(bench.outputs(), [""; 0]);
     let admitted = bench.announce(1, false).unwrap();
-    assert_eq!((admitted.changed.as_slice(), admitted.withdrawal.is_some()), (&[NAME][..], false));
+    assert_eq!((admitted.changed.as_slice(), admitted.kind), (&[NAME][..], RecordKind::Advert));
     for _ in 0..2 {
         bench.with(|names, cx| names.routes_changed(cx, &[NAME]));
     }
     assert_eq!(bench.outputs(), ["link 2: advert"]);
     let admitted = bench.announce(2, true).unwrap();
-    let frame = admitted.withdrawal.unwrap();
-    bench.with(|names, cx| names.tell_withdrawal(cx, OWNER, &admitted.changed, &frame));
+    assert_eq!(admitted.kind, RecordKind::Withdrawal);
+    bench.with(|names, cx| names.tell_withdrawal(cx, OWNER, admitted.id, &admitted.changed));
     bench.with(|names, cx| names.routes_changed(cx, &[NAME]));
     assert_eq!(bench.outputs(), ["link 2: advert"], "no unreach after the withdrawal");
 }

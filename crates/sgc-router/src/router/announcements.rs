@@ -11,7 +11,7 @@ use crate::drops::DropReason;
 use crate::lease::verifies_elsewhere;
 use crate::link_id::LinkId;
 use crate::links::EarlierRun;
-use crate::names::{self, Admitted, Arrival, RecordEnd, RecordId};
+use crate::names::{self, Admitted, Arrival, RecordEnd, RecordId, RecordKind};
 use crate::topology;
 
 /// Interval of looks at announcements beyond the allowance of their signer.
@@ -51,18 +51,18 @@ impl Router {
 
     /// Passes on a record that was just put into force, and lets everything else follow it.
     fn pass_on_record(&mut self, link: LinkId, cost: u32, admitted: Admitted) {
-        let Admitted { id, owner, mut changed, withdrawal } = admitted;
-        match withdrawal {
-            None => {
+        let Admitted { id, owner, kind, mut changed } = admitted;
+        match kind {
+            RecordKind::Advert => {
                 // A node that only listens may learn of known names from another neighbour.
                 self.hear(link, cost, id);
                 self.pass_on_or_wait(link, &owner, id);
             }
             // Neighbours that never heard of the names need no withdrawal.
-            Some(_) if changed.is_empty() => self.charge_stale(link),
-            Some(frame) => {
+            RecordKind::Withdrawal if changed.is_empty() => self.charge_stale(link),
+            RecordKind::Withdrawal => {
                 self.pass_on_or_wait(link, &owner, id);
-                self.names_part(|names, cx| names.tell_withdrawal(cx, link, &changed, &frame));
+                self.names_part(|names, cx| names.tell_withdrawal(cx, link, id, &changed));
             }
         }
         changed.extend(self.names.make_room(self.now.instant, &owner));
@@ -248,6 +248,9 @@ impl Router {
 
     /// Updates trees and interested neighbours after the routes to these names may have changed.
     pub(super) fn routes_changed(&mut self, names: &[Name]) {
+        if names.is_empty() {
+            return;
+        }
         for name in names {
             let network = super::Network { links: &self.links, topology: &self.topology };
             self.names.select(network, name);
