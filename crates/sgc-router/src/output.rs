@@ -38,8 +38,8 @@ pub enum Output {
     /// The trust anchors changed, because a newer revocation list came. The driver stores them, and passes them to
     /// everything else that verifies certificates.
     Trust(Arc<TrustAnchors>),
-    /// Call [`Router::handle_flushed`](crate::Router::handle_flushed) once the link has taken all earlier frames; the router has more for it than a
-    /// queue can hold.
+    /// Call [`Router::handle_flushed`](crate::Router::handle_flushed) once the link has taken all earlier frames; the
+    /// router has more for it than a queue can hold.
     Flush {
         /// The link.
         link: LinkId,
