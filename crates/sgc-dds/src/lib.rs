@@ -61,7 +61,7 @@ pub use log::{Unsent, unsent};
 pub use network::CycloneNetwork;
 pub use reader::CycloneReader;
 pub use sample::unidentified_messages;
-pub use security::{Security, SecurityError, is_enclave};
+pub use security::{Security, SecurityError};
 pub use service::{CycloneClient, CycloneServer};
 pub use strangers::{Barrier, Strangers, strangers};
 pub use writer::CycloneWriter;

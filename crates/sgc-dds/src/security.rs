@@ -13,6 +13,7 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 
 use cyclors::DDS_RETCODE_NOT_ALLOWED_BY_SECURITY;
+use sgc_ros::{ENCLAVE_BYTES_MAX, is_enclave};
 
 use crate::entity::reason;
 use crate::qos::NativeQos;
@@ -22,9 +23,6 @@ const NAMED_MAX: usize = 8;
 
 /// Most directories of a keystore that are searched.
 const DIRECTORIES_MAX: usize = 256;
-
-/// Longest name of an enclave, in bytes (rmw: `RMW_NAMESPACE_MAX_LENGTH`).
-const NAME_BYTES_MAX: usize = 245;
 
 /// The bits of a file's mode for users other than its owner.
 const MODE_OF_OTHERS: u32 = 0o077;
@@ -70,7 +68,7 @@ const PLUGINS: [(&str, &str); 9] = [
 pub struct Security {
     /// The directory that `ROS_SECURITY_KEYSTORE` names.
     pub keystore: PathBuf,
-    /// The enclave's name, such as `/sgc`: see [`is_enclave`].
+    /// The enclave's name, such as `/sgc`: see [`sgc_ros::is_enclave`].
     pub enclave: String,
 }
 
@@ -296,20 +294,8 @@ fn read_bounded(file: &Path) -> Result<Vec<u8>, SecurityError> {
 fn subjects(permissions: &str) -> Vec<String> {
     let named = permissions.split("<subject_name>").skip(1);
     let named = named.filter_map(|rest| Some(rest.split_once("</subject_name>")?.0.trim()));
-    let plain = named.filter(|name| name.len() <= NAME_BYTES_MAX && !name.contains(char::is_control));
+    let plain = named.filter(|name| name.len() <= ENCLAVE_BYTES_MAX && !name.contains(char::is_control));
     plain.map(str::to_owned).take(NAMED_MAX).collect()
-}
-
-/// Returns `true` for names that rcl accepts for an enclave: `/`, or tokens of letters, digits and `_`, each after a
-/// `/`.
-pub fn is_enclave(name: &str) -> bool {
-    let is_token = |token: &str| {
-        !token.is_empty()
-            && !token.as_bytes()[0].is_ascii_digit()
-            && token.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
-    };
-    name.len() <= NAME_BYTES_MAX
-        && name.strip_prefix('/').is_some_and(|tokens| tokens.is_empty() || tokens.split('/').all(is_token))
 }
 
 impl Security {
@@ -448,17 +434,6 @@ fn enclaves(root: &Path) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn enclaves_are_named_as_rcl_names_them() {
-        for name in ["/", "/sgc", "/arm_1/sgc"] {
-            assert!(is_enclave(name), "{name}");
-        }
-        for name in ["", "sgc", "/sgc/", "//sgc", "/../private", "/1", "/a-b", "/a b"] {
-            assert!(!is_enclave(name), "{name}");
-        }
-        assert!(!is_enclave(&format!("/{}", "a".repeat(NAME_BYTES_MAX))));
-    }
 
     #[test]
     fn refusals_of_the_plugins_are_told_with_the_file_and_what_to_do() {

@@ -6,10 +6,8 @@ use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
-use sgc_ros::Guid;
+use sgc_ros::{Guid, is_enclave};
 use sgc_sync::lock;
-
-use crate::security::is_enclave;
 
 /// Most programs that are remembered.
 const PROGRAMS_MAX: usize = 64;

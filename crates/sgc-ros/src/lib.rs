@@ -15,7 +15,10 @@ mod routes;
 
 pub use frames::{FrameError, TF_MESSAGE, prefix_frames};
 pub use interface::{Interface, Part};
-pub use names::{ServiceTopic, TOPIC_BYTES_MAX, dds_topic, dds_type, is_topic_name, ros_topic, ros_type};
+pub use names::{
+    ENCLAVE_BYTES_MAX, ServiceTopic, TOPIC_BYTES_MAX, dds_topic, dds_type, is_enclave, is_topic_name,
+    ros_topic, ros_type,
+};
 pub use network::{
     DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid,
     HandleCalls, HandleSamples, KeyHash, Reach, RequestHandler, RequestId, RosClient, RosError, RosNetwork,

@@ -63,6 +63,21 @@ pub fn is_topic_name(name: &str) -> bool {
     name.len() <= TOPIC_BYTES_MAX && name.strip_prefix('/').is_some_and(|words| words.split('/').all(is_word))
 }
 
+/// Longest name of an enclave, in bytes (rmw: `RMW_NAMESPACE_MAX_LENGTH`).
+pub const ENCLAVE_BYTES_MAX: usize = 245;
+
+/// Returns `true` for names that rcl accepts for an enclave: `/`, or tokens of letters, digits and `_`, each after a
+/// `/`.
+pub fn is_enclave(name: &str) -> bool {
+    let is_token = |token: &str| {
+        !token.is_empty()
+            && !token.as_bytes()[0].is_ascii_digit()
+            && token.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
+    };
+    name.len() <= ENCLAVE_BYTES_MAX
+        && name.strip_prefix('/').is_some_and(|tokens| tokens.is_empty() || tokens.split('/').all(is_token))
+}
+
 /// Returns the DDS topic of an absolute ROS topic: `/chatter` → `rt/chatter`.
 pub fn dds_topic(ros_topic: &str) -> String {
     format!("{TOPIC_PREFIX}{ros_topic}")
@@ -100,6 +115,17 @@ pub fn ros_type(dds_type: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn enclaves_are_named_as_rcl_names_them() {
+        for name in ["/", "/sgc", "/arm_1/sgc"] {
+            assert!(is_enclave(name), "{name}");
+        }
+        for name in ["", "sgc", "/sgc/", "//sgc", "/../private", "/1", "/a-b", "/a b"] {
+            assert!(!is_enclave(name), "{name}");
+        }
+        assert!(!is_enclave(&format!("/{}", "a".repeat(ENCLAVE_BYTES_MAX))));
+    }
 
     #[test]
     fn services_are_two_topics() {

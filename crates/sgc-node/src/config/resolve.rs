@@ -552,7 +552,7 @@ impl Resolver<'_> {
             (None, Some(enclave)) => (ros_env::SECURITY_ENCLAVE_OVERRIDE, enclave, Origin::Environment),
             (None, None) => ("enclave", "/".to_owned(), Origin::Environment),
         };
-        if !sgc_dds::is_enclave(&enclave) {
+        if !sgc_ros::is_enclave(&enclave) {
             self.record(&origin, Mistake::Enclave { key, value: enclave });
             return None;
         }
