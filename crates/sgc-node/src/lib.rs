@@ -1,7 +1,7 @@
 //! The driver of SGC: the one place where machines, sockets, the local ROS 2 network, files and clocks meet.
 //!
-//! It decides nothing that a machine can decide. [`config`] turns the user's input into a [`config::Config`], and
-//! [`run`] runs it. One control task owns the machines (`core`). The data path (`dataplane`) runs beside it, on the
+//! It decides nothing that a machine can decide. [`config`] reads a [`config::Config`] from its file, and [`run`] runs
+//! it. One control task owns the machines (`core`). The data path (`dataplane`) runs beside it, on the
 //! receiving tasks and threads.
 #![forbid(unsafe_code)]
 
@@ -38,8 +38,8 @@ pub use gateway::access::{
 pub use gateway::{GatewayStartError, OpenLocalRos};
 pub use link::push_crl::{PushCrlError, push_crl};
 pub use node::{
-    NodeError, OpenNetwork, RunOptions, admin_socket_path, check_identity, load_identity, run, run_on,
-    run_opening,
+    NodeError, OpenNetwork, RunOptions, admin_socket_path, check_identity, enclave_of, load_identity, run,
+    run_on, run_opening,
 };
 pub use state::fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use state::run_lock::IdentityInUse;

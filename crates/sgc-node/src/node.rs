@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng, TryRngCore};
+use sgc_config::{Config, DiscoveryRange, RosConfig, RouterUrl, SecurityConfig};
 use sgc_dds::{CycloneNetwork, DdsConfig, Security};
 use sgc_endpoint::{Endpoint, EndpointConfig};
 use sgc_gateway::LocalRos;
@@ -26,7 +27,6 @@ use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
 use crate::admin::{self, Desk};
-use crate::config::{Config, DiscoveryRange, RosConfig, RouterUrl};
 use crate::control::alerts::clock_alert;
 use crate::control::authority::Authority;
 use crate::control::core::{Core, CoreEvent, CoreParts, INBOX_MAX, now};
@@ -709,9 +709,15 @@ fn system_rng() -> Result<ChaCha20Rng, NodeError> {
     Ok(ChaCha20Rng::from_seed(seed))
 }
 
+/// Returns the enclave that a configuration names.
+pub fn enclave_of(config: &SecurityConfig) -> Security {
+    Security { keystore: config.keystore.clone(), enclave: config.enclave.clone() }
+}
+
 fn dds_config(ros: &RosConfig, identity: &Identity) -> DdsConfig {
-    let security = ros.security.as_ref().filter(|security| match security.enclave.check() {
-        Err(error) if !security.enforced && error.is_absence() => {
+    let security = ros.security.as_ref().map(|security| (enclave_of(security), security.enforced));
+    let security = security.filter(|(enclave, enforced)| match enclave.check() {
+        Err(error) if !enforced && error.is_absence() => {
             warn!(
                 "ROS_SECURITY_ENABLE is set and ROS_SECURITY_STRATEGY is not Enforce, so this node goes without DDS Security: {error}"
             );
@@ -719,7 +725,7 @@ fn dds_config(ros: &RosConfig, identity: &Identity) -> DdsConfig {
         }
         _ => true,
     });
-    let security = security.map(|security| security.enclave.clone());
+    let security = security.map(|(enclave, _)| enclave);
     if let Some(key) = security.as_ref().and_then(Security::exposed_key) {
         warn!("{}: others can read it, and it is the private key of an enclave: chmod 600 it", key.display());
     }

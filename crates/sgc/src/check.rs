@@ -148,7 +148,7 @@ fn summary(config: &Config, identity: &Identity, file: &Path) -> Result<Vec<Vec<
         rows.push(vec!["warning".to_owned(), format!("{alert}. The node starts and waits: {}", alert.fix())]);
     }
     if let Some(security) = config.ros.as_ref().and_then(|ros| ros.security.as_ref()) {
-        let enclave = &security.enclave;
+        let enclave = sgc_node::enclave_of(security);
         rows.push(vec![
             "enclave".to_owned(),
             format!("{} in {}", enclave.enclave, enclave.keystore.display()),

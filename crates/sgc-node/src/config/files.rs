@@ -8,10 +8,9 @@ use std::path::Path;
 
 use rustls_pki_types::PrivateKeyDer;
 use rustls_pki_types::pem::PemObject as _;
+use sgc_config::{FileChecks, IdentityFile, Mistake};
 use sgc_trust::{ShareToken, TOKEN_TEXT_BYTES_MAX};
 
-use super::error::Mistake;
-use super::resolve::{FileChecks, IdentityFile};
 use crate::control::partners;
 use crate::state;
 

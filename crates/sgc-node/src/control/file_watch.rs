@@ -13,10 +13,10 @@ use std::time::{Duration, Instant};
 
 use rustix::fs::inotify::{self, CreateFlags, WatchFlags};
 use rustix::io::Errno;
+use sgc_config::{Config, TokenSource};
 use tokio::net::unix::pipe::Receiver;
 use tracing::{debug, warn};
 
-use crate::config::{Config, TokenSource};
 use crate::control::reload::Reloader;
 
 /// Quiet time before the files are read, since editors take several steps.
@@ -180,7 +180,7 @@ mod tests {
     fn gateway_certificate_files_are_watched_like_other_files() {
         let text = "identity = 'x'\n[node]\nrouters = ['quic://r']\n[gateway]\nlisten = ['wss://0.0.0.0']\n\
                     certificate = 'a.pem'\nkey = 'a.key'\n";
-        let config = crate::config::parse(text, "node.toml", Path::new("/etc/sgc"), &|_| None).unwrap();
+        let config = sgc_config::parse(text, "node.toml", Path::new("/etc/sgc"), &|_| None).unwrap();
         let files = files_of(Path::new("/etc/sgc/node.toml"), &config);
         let wanted = ["/etc/sgc/node.toml", "/etc/sgc/a.key", "/etc/sgc/a.pem"].map(PathBuf::from);
         assert_eq!(files, wanted);

@@ -6,10 +6,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
+use sgc_config::{Config, Recipient, nearest};
 use sgc_trust::{Fleet, Grantees, Identity, VerifiedPeer};
 use sgc_wire::{GroupTag, NodeId};
-
-use crate::config::{Config, Recipient, nearest};
 
 /// Most members that are remembered.
 const HEARD_MAX: usize = 4096;
@@ -234,11 +233,10 @@ mod tests {
     use sgc_wire::UnixMillis;
 
     use super::*;
-    use crate::config;
 
     fn config(text: &str) -> Config {
         let text = format!("identity = 'arm.identity'\nnode.routers = ['quic://r:1']\n{text}");
-        config::parse(&text, "node.toml", std::path::Path::new(""), &|_| None).unwrap()
+        sgc_config::parse(&text, "node.toml", std::path::Path::new(""), &|_| None).unwrap()
     }
 
     fn members(fleet: &mut Fleet, names: [(&str, &[&str]); 2]) -> [Identity; 2] {

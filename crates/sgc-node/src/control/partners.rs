@@ -10,10 +10,10 @@ use std::path::{Path, PathBuf};
 use rustls_pki_types::CertificateDer;
 use rustls_pki_types::pem::PemObject as _;
 use serde::{Deserialize, Serialize};
+use sgc_config::Config;
 use sgc_trust::{AnchorError, CaFingerprint, FleetName, Identity, TrustAnchors};
 use sgc_wire::{NodeId, UnixMillis};
 
-use crate::config::Config;
 use crate::state::records::{self, Records};
 
 /// Largest file of CA certificates, bytes.

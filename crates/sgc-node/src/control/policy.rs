@@ -5,11 +5,11 @@
 
 use std::fmt::Write as _;
 
+use sgc_config::{Recipient, ShareConfig};
 use sgc_ros::{Interface, Part, ShareRule};
 use sgc_trust::{CaFingerprint, Grantees, Identity, Policy, VerifiedPeer};
 use sgc_wire::{GroupTag, Kind, Metadata, NodeId, Role};
 
-use crate::config::{Recipient, ShareConfig};
 use crate::control::partners::Partners;
 
 /// A node as its certificate proves it.

@@ -14,6 +14,7 @@ use rand_core::{OsRng, SeedableRng, TryRngCore};
 use rustls::sign::CertifiedKey;
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
+use sgc_config::{Config, ConfigErrors, GatewayConfig, RosConfig, RouterUrl};
 use sgc_gateway::Access;
 use sgc_ros::{Direction, ShareRule, UseRule};
 use sgc_sync::lock;
@@ -24,7 +25,6 @@ use tokio::sync::{Mutex, Notify, mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
-use crate::config::{Config, ConfigErrors, GatewayConfig, RosConfig, RouterUrl};
 use crate::control::core::{CoreEvent, now};
 use crate::control::rules::Rules;
 use crate::data::message_keys::{MessageKeys, make_for};

@@ -6,11 +6,11 @@ use std::fs;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
+use sgc_config::{Config, Recipient, RouterUrl, TokenConfig, TokenSource, UseConfig};
 use sgc_ros::{Direction, Interface, Part, Shaping, ShareRule, UseRule, is_topic_name};
 use sgc_trust::{Identity, ShareToken, TOKEN_TEXT_BYTES_MAX, TokenError};
 use sgc_wire::{Kind, NodeId, UnixMillis};
 
-use crate::config::{Config, Recipient, RouterUrl, TokenConfig, TokenSource, UseConfig};
 use crate::control::members::{MemberNames, unknown_members};
 use crate::control::partners::{PartnerError, Partners};
 use crate::control::policy;
@@ -69,7 +69,7 @@ impl Rules {
             rules.warnings.extend(unknown_members(config, &fleet).iter().map(ToString::to_string));
         }
         for grant in &rules.partners.tokens {
-            let is_shared = |s: &crate::config::ShareConfig| {
+            let is_shared = |s: &sgc_config::ShareConfig| {
                 (s.interface, &s.topic) == (Interface::Topic, &grant.topic)
                     && s.type_name.as_ref().is_none_or(|t| *t == grant.type_name)
             };

@@ -11,10 +11,10 @@ use hickory_resolver::config::{NameServerConfig, ResolverConfig};
 use hickory_resolver::net::runtime::TokioRuntimeProvider;
 use hickory_resolver::net::{DnsError as NoAnswer, NetError};
 use hickory_resolver::proto::rr::RData;
+use sgc_config::SrvDomain;
 use tokio::time::timeout;
 
 use super::srv::{SrvAnswer, SrvTarget, TARGETS_MAX, TTL_MAX, TTL_MIN};
-use crate::config::SrvDomain;
 
 /// Most addresses that are taken of one host.
 const ADDRESSES_MAX: usize = 8;

@@ -20,6 +20,7 @@ use std::sync::Arc;
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng as _;
+use sgc_config::RouterUrl;
 use sgc_transport::LinkUrl;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -37,7 +38,6 @@ pub(crate) use local::LocalNetwork;
 pub(crate) use mdns::RouterFilter;
 pub(crate) use urls::{Failback, SkippedUrl, WorkingUrls, is_over_udp};
 
-use crate::config::RouterUrl;
 use crate::link::links::place_in_use;
 use crate::link::roaming::Network;
 

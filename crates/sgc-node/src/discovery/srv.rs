@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::RngCore;
+use sgc_config::{RouterUrl, SrvDomain};
 use sgc_transport::{LinkUrl, Scheme};
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep_until};
@@ -14,7 +15,6 @@ use super::{
     BACKOFF_MAX, Backoff, DialTarget, Failure, KeepLink, LinkRequest, Names, Outcome, StatusRow,
     another_network, pause, take_note,
 };
-use crate::config::{RouterUrl, SrvDomain};
 
 /// Most targets of a domain that are kept, the best of them.
 pub(crate) const TARGETS_MAX: usize = 16;

@@ -163,7 +163,7 @@ impl KeepLink for World {
 }
 
 impl Names for World {
-    async fn routers(&self, _: &crate::config::SrvDomain) -> Result<SrvAnswer, DnsError> {
+    async fn routers(&self, _: &sgc_config::SrvDomain) -> Result<SrvAnswer, DnsError> {
         self.asked.lock().unwrap().push(self.start.elapsed());
         self.answer.lock().unwrap().clone()
     }

@@ -10,6 +10,7 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use rand_chacha::ChaCha20Rng;
+use sgc_config::{RouterUrl, WAYS_MAX};
 use sgc_sync::lock;
 use sgc_transport::{LinkUrl, Scheme};
 use tokio::sync::watch;
@@ -18,7 +19,6 @@ use tokio::time::{Instant, sleep_until};
 use tracing::{debug, warn};
 
 use super::backoff::jittered;
-use crate::config::{RouterUrl, WAYS_MAX};
 use crate::state;
 
 /// Time after which a silent URL gets a parallel attempt at the next. It covers two round trips of a bad link around

@@ -9,13 +9,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
+use sgc_config::{Config, Recipient};
 use sgc_gateway::{
     ACCESS_VALID_MS_MAX, Access, AccessGrant, AccessRules, ClientRule, RefusalListener, Right, Scope, TokenId,
 };
 use sgc_trust::{AnchorError, Identity};
 use sgc_wire::{Now, UnixMillis};
 
-use crate::config::{Config, Recipient};
 use crate::control::partners::{PartnerError, Partners};
 use crate::control::policy;
 use crate::state::audit::{Audit, AuditEvent, AuditRecord};
@@ -56,7 +56,7 @@ pub fn access_with(
 ) -> Result<Option<Access>, AccessError> {
     let Some(gateway) = &config.gateway else { return Ok(None) };
     let records = state.map(AccessRecords::load).transpose()?.unwrap_or_default();
-    let rule = |client: &crate::config::GatewayClientConfig| ClientRule {
+    let rule = |client: &sgc_config::GatewayClientConfig| ClientRule {
         who: policy::grantees(&client.who, identity, partners),
         scope: client.scope.clone(),
     };
@@ -323,7 +323,7 @@ mod tests {
         /// Returns the access rules under a configuration with this `[gateway]`.
         fn access(&self, gateway: &str) -> Result<Option<Access>, AccessError> {
             let text = format!("identity = 'x'\nnode.routers = ['quic://r']\n{gateway}");
-            let config = crate::config::parse(&text, "node.toml", Path::new(""), &|_| None).unwrap();
+            let config = sgc_config::parse(&text, "node.toml", Path::new(""), &|_| None).unwrap();
             let now = Now { instant: std::time::Instant::now(), unix: NOW };
             access_of(&config, &self.gateway, Some(self.dir.path()), now)
         }
@@ -387,7 +387,7 @@ mod tests {
         let cast = Cast::new();
         let log = cast.dir.path().join("audit.jsonl");
         let (audit, writer) =
-            Audit::open(&log, crate::config::AuditConfig::default().room, Default::default()).unwrap();
+            Audit::open(&log, sgc_config::AuditConfig::default().room, Default::default()).unwrap();
         let access = cast.access("[gateway]").unwrap().unwrap().with_refusal_listener(refused_tokens(audit));
         let text = "sgc-access-1:AAAA";
         assert!(access.admit(&AdmissionRequest { token: Some(text), ..elsewhere() }).is_err());

@@ -14,6 +14,7 @@ use std::sync::{Arc, MutexGuard};
 
 use rustls::sign::CertifiedKey;
 use sgc_cdr::{Layout, TypeName};
+use sgc_config::{GatewayConfig, GatewayScheme, GatewayUrl};
 use sgc_gateway::{
     Access, Client, FindDefinitions, GatewayError, GatewayStatus, Hub, HubOptions, ListenAt, LocalRos,
     Protocol, Server, ServerError, ServerOptions, Session, SessionLimits, TlsError, Types, certified_key,
@@ -24,8 +25,6 @@ use sgc_trust::{Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
 use tokio::sync::{Mutex, OnceCell};
 use zeroize::Zeroizing;
-
-use crate::config::{GatewayConfig, GatewayScheme, GatewayUrl};
 
 /// Opens the gateway's part of the local network. May block.
 pub type OpenLocalRos = Arc<dyn Fn() -> Result<Arc<dyn LocalRos>, RosError> + Send + Sync>;

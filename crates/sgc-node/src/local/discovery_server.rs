@@ -10,9 +10,9 @@ use std::io::Read as _;
 use std::path::Path;
 use std::time::Duration;
 
+use sgc_config::Environment;
 use tracing::warn;
 
-use crate::config::Environment;
 use crate::control::alerts::Alert;
 
 const VARIABLE: &str = "ROS_DISCOVERY_SERVER";

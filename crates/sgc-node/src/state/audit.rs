@@ -23,12 +23,13 @@ use std::time::Duration;
 
 use arc_swap::ArcSwap;
 use serde::{Deserialize, Serialize};
+pub use sgc_config::AuditRoom;
 use sgc_sync::lock;
 use sgc_wire::{Name, NodeId, UnixMillis};
 use tracing::warn;
 
 use self::file::LogFile;
-pub use self::file::{AuditRoom, Unread, read, rotated_path};
+pub use self::file::{Unread, read, rotated_path};
 use self::quota::{Cause, Quotas};
 use crate::control::core::now;
 

@@ -14,8 +14,7 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsE
 use std::path::{Path, PathBuf};
 
 use rustix::fs::{FlockOperation, OFlags, flock};
-
-use crate::config::Config;
+use sgc_config::Config;
 
 const LOCK_FILE: &str = "lock";
 const PERMISSION_BITS: u32 = 0o7777;

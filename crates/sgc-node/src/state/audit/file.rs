@@ -10,6 +10,7 @@ use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::OFlags;
+use sgc_config::AuditRoom;
 
 use super::AuditRecord;
 
@@ -19,15 +20,6 @@ const LINE_BYTES_MAX: u64 = 16 * 1024;
 const READ_FILES_MAX: usize = 256;
 /// Suffixes of files that a log rotator compressed.
 const COMPRESSED: [&str; 5] = [".gz", ".xz", ".zst", ".bz2", ".lz4"];
-
-/// Limits of the log's size on the disk.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct AuditRoom {
-    /// Most bytes of one file. It is rotated at this size.
-    pub max_bytes: u64,
-    /// Number of rotated files that are kept.
-    pub files: u32,
-}
 
 /// Returns the path of the log that was put aside as the `n`th, from 1, the newest.
 pub fn rotated_path(path: &Path, n: u32) -> PathBuf {

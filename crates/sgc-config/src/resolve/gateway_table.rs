@@ -2,13 +2,13 @@
 
 use sgc_gateway::{Anonymous, Scope};
 
-use super::super::draft::{GatewayClientDraft, GatewayDraft, PartnerDraft, WithOrigin};
-use super::super::error::Mistake;
-use super::super::gateway::{
-    self, GATEWAY_CLIENTS_MAX, GatewayClientConfig, GatewayConfig, GatewayTls, GatewayUrl, ORIGINS_MAX,
-};
-use super::super::names;
 use super::{LISTEN_MAX, Resolver, unknown_word};
+use crate::draft::{GatewayClientDraft, GatewayDraft, PartnerDraft, WithOrigin};
+use crate::error::Mistake;
+use crate::gateway::{
+    GATEWAY_CLIENTS_MAX, GatewayClientConfig, GatewayConfig, GatewayTls, GatewayUrl, ORIGINS_MAX,
+};
+use crate::names;
 
 impl Resolver<'_> {
     pub(super) fn gateway(&mut self, written: &GatewayDraft, partners: &[PartnerDraft]) -> GatewayConfig {
@@ -23,7 +23,7 @@ impl Resolver<'_> {
         let client_bytes_max = written
             .client_bytes_max
             .as_ref()
-            .and_then(|size| self.keep(size, |key, value| gateway::size(key, value, bounds)));
+            .and_then(|size| self.keep(size, |key, value| names::size(key, value, bounds)));
         if let Some(over) = written.clients.get(GATEWAY_CLIENTS_MAX) {
             let origin = over.origin.clone();
             self.check_count(&origin, "[[gateway.client]]", written.clients.len(), GATEWAY_CLIENTS_MAX);
@@ -37,7 +37,7 @@ impl Resolver<'_> {
                 .as_ref()
                 .and_then(|word| self.keep(word, anonymous))
                 .unwrap_or_default(),
-            origins: self.addresses(&written.origins, gateway::origin, ORIGINS_MAX),
+            origins: self.addresses(&written.origins, names::page_origin, ORIGINS_MAX),
             plain,
             clients_max: clients_max.and_then(|n| n.try_into().ok()).unwrap_or(default.clients_max),
             client_bytes_max: client_bytes_max.unwrap_or(default.client_bytes_max),
@@ -51,7 +51,7 @@ impl Resolver<'_> {
             let example = "listen = [\"ws://127.0.0.1:9090\"], or leave it out to listen at the usual ports of this host";
             self.record(&listen.origin, Mistake::Empty { key: listen.key, example });
         }
-        let valid = self.addresses(&listen.value, gateway::listen, LISTEN_MAX);
+        let valid = self.addresses(&listen.value, names::gateway_listen, LISTEN_MAX);
         for one in listen.value.iter().filter(|_| !plain) {
             let Ok(url) = one.value.parse::<GatewayUrl>() else { continue };
             if url.is_open() {

@@ -31,7 +31,7 @@ pub enum RouterUrl {
 
 impl RouterUrl {
     /// Returns the entry of a router with these URLs, at least one.
-    pub(crate) fn by(urls: &[LinkUrl]) -> Self {
+    pub fn by(urls: &[LinkUrl]) -> Self {
         match urls {
             [only] => Self::At(only.clone()),
             urls => Self::Ways(urls.to_vec()),

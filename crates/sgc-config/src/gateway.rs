@@ -7,10 +7,9 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use sgc_gateway::{Anonymous, PageOrigin, PageOriginError, Scope};
+use sgc_gateway::{Anonymous, PageOrigin, Scope};
 
-use super::Recipient;
-use super::error::Mistake;
+use crate::recipient::Recipient;
 
 /// Most origins of web pages that one gateway admits.
 pub const ORIGINS_MAX: usize = 64;
@@ -21,7 +20,6 @@ const WEBSOCKET_PORT: u16 = 9090;
 const FOXGLOVE_PORT: u16 = 8765;
 const GRPC_PORT: u16 = 50051;
 const MIB: u64 = 1 << 20;
-const SIZE_UNITS: [(u64, &str); 3] = [(1 << 30, "GiB"), (MIB, "MiB"), (1 << 10, "KiB")];
 
 /// A gateway for programs without ROS.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -226,39 +224,6 @@ impl fmt::Display for GatewayUrl {
     }
 }
 
-/// Parses a listen address.
-pub(super) fn listen(key: &'static str, value: &str) -> Result<GatewayUrl, Mistake> {
-    value.parse().map_err(|fault| Mistake::GatewayUrl { key, value: value.to_owned(), fault })
-}
-
-/// Parses an origin of web pages.
-pub(super) fn origin(key: &'static str, value: &str) -> Result<PageOrigin, Mistake> {
-    value.parse().map_err(|fault: PageOriginError| Mistake::PageOrigin {
-        key,
-        value: value.to_owned(),
-        fault,
-    })
-}
-
-/// Parses a size such as `64MiB` and checks its bounds.
-pub(super) fn size(key: &'static str, value: &str, (min, max): (u64, u64)) -> Result<u64, Mistake> {
-    let bytes = parse_size(value).filter(|bytes| (min..=max).contains(bytes));
-    bytes.ok_or_else(|| Mistake::Size { key, value: value.to_owned(), min, max })
-}
-
-/// Parses a size: `512KiB`, `64MiB`, `1GiB`.
-fn parse_size(text: &str) -> Option<u64> {
-    let (number, unit) = text.split_at(text.find(|c: char| !c.is_ascii_digit())?);
-    let unit = SIZE_UNITS.into_iter().find(|(_, name)| *name == unit.trim_start())?.0;
-    number.parse::<u64>().ok()?.checked_mul(unit)
-}
-
-/// Formats a size in the largest unit that divides it.
-pub(super) fn size_text(bytes: u64) -> String {
-    let unit = SIZE_UNITS.into_iter().find(|(unit, _)| bytes.is_multiple_of(*unit) && bytes > 0);
-    unit.map_or_else(|| format!("{bytes} bytes"), |(unit, name)| format!("{}{name}", bytes / unit))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -286,16 +251,5 @@ mod tests {
             assert_eq!(refused(text), GatewayUrlError::Address("ws", 9090), "{text}");
         }
         assert_eq!(refused("ws://127.0.0.1:9090/ros"), GatewayUrlError::Path);
-    }
-
-    #[test]
-    fn sizes_have_a_unit() {
-        for (text, bytes) in [("64MiB", 64 << 20), ("1 GiB", 1 << 30), ("512KiB", 512 << 10)] {
-            assert_eq!(parse_size(text), Some(bytes), "{text}");
-        }
-        for text in ["", "64", "64MB", "-1MiB", "MiB", "99999999999GiB", "1.5MiB"] {
-            assert_eq!(parse_size(text), None, "{text}");
-        }
-        assert_eq!((size_text(64 << 20), size_text(1000)), ("64MiB".to_owned(), "1000 bytes".to_owned()));
     }
 }

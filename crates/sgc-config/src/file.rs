@@ -11,12 +11,12 @@ use sgc_ros::Interface;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use super::draft::{
+use crate::draft::{
     AuditDraft, Draft, GatewayClientDraft, GatewayDraft, NamingDraft, PartnerDraft, QosDraft, RosDraft,
     RotationDraft, ShapingDraft, ShareDraft, TransportDraft, UseDraft, WithOrigin, Words,
 };
-use super::error::{ConfigError, Mistake, Origin};
-use super::schema::{Table, nearest};
+use crate::error::{ConfigError, Mistake, Origin};
+use crate::schema::{Table, nearest};
 
 const WORDS: Words = Words {
     no_identity: "neither `identity` nor `name` in [node]",
@@ -33,7 +33,7 @@ const INTERFACES: [Interface; 4] =
 
 /// Reads the text. Returns a draft even with errors, unless the text is no TOML, so that `resolve` can report its own
 /// errors as well.
-pub(super) fn read(text: &str, file: &str) -> (Option<Draft>, Vec<ConfigError>) {
+pub(crate) fn read(text: &str, file: &str) -> (Option<Draft>, Vec<ConfigError>) {
     let line_starts =
         text.bytes().enumerate().filter(|(_, byte)| *byte == b'\n').map(|(at, _)| at + 1).collect();
     let mut reader =

@@ -11,10 +11,10 @@ use sgc_gateway::{PageOriginError, ScopeError};
 use sgc_transport::UrlError;
 use sgc_trust::TokenError;
 
-use super::gateway::{GatewayUrl, GatewayUrlError, size_text};
-use super::names::{duration_text, rate_text};
-use super::router_url::RouterUrlError;
-use super::{PEER_RATE_MAX, PEER_RATE_MIN};
+use crate::config::{PEER_RATE_MAX, PEER_RATE_MIN};
+use crate::gateway::{GatewayUrl, GatewayUrlError};
+use crate::router_url::RouterUrlError;
+use crate::units::{duration_text, rate_text, size_text};
 
 /// All mistakes, in the order of the file; never empty.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -24,7 +24,7 @@ pub struct ConfigErrors {
 
 impl ConfigErrors {
     /// Sorts by place and keeps the order of discovery within a line.
-    pub(super) fn new(mut errors: Vec<ConfigError>) -> Self {
+    pub(crate) fn new(mut errors: Vec<ConfigError>) -> Self {
         debug_assert!(!errors.is_empty());
         errors.sort_by_key(|error| error.origin.rank());
         Self { errors }
@@ -76,7 +76,8 @@ pub struct ConfigError {
 }
 
 impl ConfigError {
-    pub(super) fn new(origin: Origin, mistake: Mistake) -> Self {
+    /// Creates an error.
+    pub fn new(origin: Origin, mistake: Mistake) -> Self {
         Self { origin, mistake: Box::new(mistake) }
     }
 }

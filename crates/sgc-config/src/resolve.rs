@@ -7,8 +7,7 @@ mod gateway_table;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use sgc_dds::Security;
-use sgc_ros::{Interface, Naming, QosOverride, Rename, Shaping, is_pattern, matches};
+use sgc_ros::{Interface, Naming, QosOverride, Rename, Shaping, is_enclave, is_pattern, matches};
 use sgc_router::MappingKind;
 use sgc_transport::Congestion;
 use sgc_trust::{FleetName, NodeName, ShareToken, Suite, TOKEN_PREFIX};
@@ -16,19 +15,20 @@ use sgc_wire::{
     Class, Durability, History, METADATA_FIELD_BYTES_MAX, PayloadEncoding, PayloadForm, Reliability,
 };
 
-use super::draft::{
+use crate::config::{
+    AuditConfig, AuditRoom, AuthorityConfig, Config, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN, PartnerConfig,
+    RosConfig, RotationConfig, SecurityConfig, ShareConfig, ShareMetadata, TokenConfig, TokenSource,
+    TransportConfig, UseConfig,
+};
+use crate::draft::{
     Draft, NamingDraft, PartnerDraft, QosDraft, RosDraft, ShapingDraft, ShareDraft, UseDraft, WithOrigin,
     Words,
 };
-use super::error::{ConfigError, Mistake, Origin};
-use super::names::{self, Recipient};
-use super::schema::nearest;
-use super::{
-    AuditConfig, AuthorityConfig, Config, Environment, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN, PartnerConfig,
-    RosConfig, RotationConfig, SecurityConfig, ShareConfig, ShareMetadata, TokenConfig, TokenSource,
-    TransportConfig, UseConfig, ros_env,
-};
-use crate::state::audit::AuditRoom;
+use crate::error::{ConfigError, Mistake, Origin};
+use crate::names;
+use crate::recipient::Recipient;
+use crate::ros_env::{self, Environment};
+use crate::schema::nearest;
 
 /// Most shares of one node.
 pub const SHARES_MAX: usize = 1024;
@@ -67,27 +67,41 @@ pub const SUITES: [&str; 8] = [
 ];
 
 /// An identity file, with details for errors.
-pub(super) struct IdentityFile<'i> {
-    pub(super) path: &'i Path,
-    pub(super) key: &'static str,
+#[derive(Debug)]
+pub struct IdentityFile<'i> {
+    /// The file.
+    pub path: &'i Path,
+    /// The key that names it.
+    pub key: &'static str,
     /// Whether the path follows from the name instead of being written down.
-    pub(super) implied: bool,
-    pub(super) node_name: Option<&'i NodeName>,
+    pub implied: bool,
+    /// The node's name in the configuration, if there is one.
+    pub node_name: Option<&'i NodeName>,
 }
 
 /// Checks of named files. They are an argument, since they read the file system.
-pub(super) struct FileChecks {
-    pub(super) identity: fn(&IdentityFile<'_>) -> Result<(), Mistake>,
-    pub(super) ca: fn(&'static str, &Path) -> Result<(), Mistake>,
-    pub(super) token: fn(&'static str, &Path) -> Result<ShareToken, Mistake>,
-    pub(super) fleet: fn(&'static str, &Path) -> Result<(), Mistake>,
-    pub(super) chain: fn(&'static str, &Path) -> Result<(), Mistake>,
-    pub(super) private_key: fn(&'static str, &Path) -> Result<(), Mistake>,
-    pub(super) directory: fn(&'static str, &Path) -> Result<(), Mistake>,
+///
+/// Each takes the key that names the file, and its path.
+#[derive(Debug)]
+pub struct FileChecks {
+    /// Checks an identity.
+    pub identity: fn(&IdentityFile<'_>) -> Result<(), Mistake>,
+    /// Checks a file of CA certificates.
+    pub ca: fn(&'static str, &Path) -> Result<(), Mistake>,
+    /// Reads a share token.
+    pub token: fn(&'static str, &Path) -> Result<ShareToken, Mistake>,
+    /// Checks a fleet file.
+    pub fleet: fn(&'static str, &Path) -> Result<(), Mistake>,
+    /// Checks the certificate chain of the gateway.
+    pub chain: fn(&'static str, &Path) -> Result<(), Mistake>,
+    /// Checks the private key of the gateway.
+    pub private_key: fn(&'static str, &Path) -> Result<(), Mistake>,
+    /// Checks a directory of message definitions.
+    pub directory: fn(&'static str, &Path) -> Result<(), Mistake>,
 }
 
 /// Resolves a draft whose reader found `errors`. Relative paths are resolved against `base_dir`.
-pub(super) fn resolve(
+pub(crate) fn resolve(
     draft: &Draft,
     errors: Vec<ConfigError>,
     base_dir: &Path,
@@ -552,11 +566,11 @@ impl Resolver<'_> {
             (None, Some(enclave)) => (ros_env::SECURITY_ENCLAVE_OVERRIDE, enclave, Origin::Environment),
             (None, None) => ("enclave", "/".to_owned(), Origin::Environment),
         };
-        if !sgc_ros::is_enclave(&enclave) {
+        if !is_enclave(&enclave) {
             self.record(&origin, Mistake::Enclave { key, value: enclave });
             return None;
         }
-        Some(SecurityConfig { enclave: Security { keystore, enclave }, enforced })
+        Some(SecurityConfig { keystore, enclave, enforced })
     }
 
     fn rotation(&mut self, draft: &Draft) -> RotationConfig {

@@ -8,12 +8,12 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use super::draft::{
+use crate::draft::{
     AuditDraft, Draft, GatewayDraft, RosDraft, RotationDraft, ShareDraft, TransportDraft, UseDraft,
     WithOrigin, Words,
 };
-use super::error::{ConfigError, Mistake, Origin};
-use super::schema::nearest;
+use crate::error::{ConfigError, Mistake, Origin};
+use crate::schema::nearest;
 
 const WORDS: Words = Words {
     no_identity: "no `--identity`",
@@ -60,7 +60,7 @@ pub struct ArgsConfig {
 }
 
 /// Parses the arguments.
-pub(super) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
+pub(crate) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
     let mut errors = Vec::new();
     let mut record = |mistake| errors.push(ConfigError::new(Origin::Arguments, mistake));
     let mut to_taken = false;

@@ -6,14 +6,18 @@
 use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
 
+use sgc_gateway::{PageOrigin, PageOriginError};
 use sgc_ros::{Interface, TOPIC_BYTES_MAX};
 use sgc_transport::{ListenAddr, UrlError};
-use sgc_trust::{FleetName, GroupName, LABEL_BYTES_MAX, NodeName};
+use sgc_trust::{FleetName, LABEL_BYTES_MAX, NodeName};
 use sgc_wire::NodeId;
 
-use super::error::{Mistake, TopicRule};
-use super::router_url::{RouterUrl, RouterUrlError};
-use super::{PEER_RATE_MAX, PEER_RATE_MIN};
+use crate::config::{PEER_RATE_MAX, PEER_RATE_MIN};
+use crate::error::{Mistake, TopicRule};
+use crate::gateway::GatewayUrl;
+use crate::recipient::Recipient;
+use crate::router_url::{RouterUrl, RouterUrlError};
+use crate::units::{parse_duration, parse_rate, parse_size};
 
 /// The longest frame prefix.
 pub const FRAME_PREFIX_BYTES_MAX: usize = 64;
@@ -25,32 +29,8 @@ pub const PEER_BYTES_MAX: usize = 255;
 const HOST_BYTES_MAX: usize = 253;
 const DNS_PORT: u16 = 53;
 
-/// A recipient that may subscribe to a share, or publish on it.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Recipient {
-    /// `"*"`: every member of the fleet.
-    Everyone,
-    /// `"group:operators"`: the members of a group, without the prefix.
-    Group(GroupName),
-    /// `"desk"`: one node.
-    Node(NodeName),
-    /// `"partner:acme"`: the nodes of the `[[partner]]` with that name.
-    Partner(FleetName),
-}
-
-impl std::fmt::Display for Recipient {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Everyone => f.write_str("*"),
-            Self::Group(group) => write!(f, "group:{group}"),
-            Self::Node(node) => write!(f, "{node}"),
-            Self::Partner(partner) => write!(f, "partner:{partner}"),
-        }
-    }
-}
-
 /// Checks a topic, or a pattern with `*` and `**` in place of words.
-pub(super) fn pattern(key: &'static str, value: &str) -> Result<String, Mistake> {
+pub(crate) fn pattern(key: &'static str, value: &str) -> Result<String, Mistake> {
     if !value.contains('*') {
         return topic(key, value);
     }
@@ -70,7 +50,7 @@ pub(super) fn pattern(key: &'static str, value: &str) -> Result<String, Mistake>
 }
 
 /// Checks a frame prefix.
-pub(super) fn frame_prefix(key: &'static str, value: &str) -> Result<String, Mistake> {
+pub(crate) fn frame_prefix(key: &'static str, value: &str) -> Result<String, Mistake> {
     let allowed = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'_' | b'-' | b'.' | b'/');
     let fits = (1..=FRAME_PREFIX_BYTES_MAX).contains(&value.len());
     if fits && value.bytes().all(allowed) && !value.starts_with('/') {
@@ -80,7 +60,7 @@ pub(super) fn frame_prefix(key: &'static str, value: &str) -> Result<String, Mis
 }
 
 /// Returns the check of an interface's name. Interfaces of several topics take no wildcard.
-pub(super) fn interface_name(interface: Interface) -> fn(&'static str, &str) -> Result<String, Mistake> {
+pub(crate) fn interface_name(interface: Interface) -> fn(&'static str, &str) -> Result<String, Mistake> {
     match interface {
         Interface::Topic | Interface::Service => pattern,
         Interface::Action | Interface::Parameters => topic,
@@ -88,7 +68,7 @@ pub(super) fn interface_name(interface: Interface) -> fn(&'static str, &str) -> 
 }
 
 /// Checks a fully qualified topic name like rmw, which permits repeated underscores.
-pub(super) fn topic(key: &'static str, value: &str) -> Result<String, Mistake> {
+pub(crate) fn topic(key: &'static str, value: &str) -> Result<String, Mistake> {
     match broken_topic_rule(value) {
         None => Ok(value.to_owned()),
         Some(rule) => {
@@ -135,7 +115,7 @@ fn repaired_topic(value: &str) -> Option<String> {
 }
 
 /// Checks the type of an interface.
-pub(super) fn interface_type(
+pub(crate) fn interface_type(
     key: &'static str,
     value: &str,
     interface: Interface,
@@ -160,7 +140,7 @@ pub(super) fn interface_type(
 }
 
 /// Checks a message type and returns it as `pkg/msg/Name`, also from DDS's `pkg::msg::dds_::Name_`.
-pub(super) fn message_type(key: &'static str, value: &str) -> Result<String, Mistake> {
+pub(crate) fn message_type(key: &'static str, value: &str) -> Result<String, Mistake> {
     let other = || Mistake::InterfaceType {
         key,
         value: value.to_owned(),
@@ -203,7 +183,7 @@ fn is_identifier(word: &str) -> bool {
 }
 
 /// Checks the name of a node.
-pub(super) fn node(key: &'static str, value: &str) -> Result<NodeName, Mistake> {
+pub(crate) fn node(key: &'static str, value: &str) -> Result<NodeName, Mistake> {
     value.parse().map_err(|_| {
         let right = repaired_label(value);
         Mistake::NodeName { key, value: value.to_owned(), max: LABEL_BYTES_MAX, right }
@@ -211,7 +191,7 @@ pub(super) fn node(key: &'static str, value: &str) -> Result<NodeName, Mistake> 
 }
 
 /// Checks the name of a partner.
-pub(super) fn partner(key: &'static str, value: &str) -> Result<FleetName, Mistake> {
+pub(crate) fn partner(key: &'static str, value: &str) -> Result<FleetName, Mistake> {
     value.parse().map_err(|_| {
         let right = repaired_label(value);
         Mistake::PartnerName { key, value: value.to_owned(), max: LABEL_BYTES_MAX, right }
@@ -219,12 +199,12 @@ pub(super) fn partner(key: &'static str, value: &str) -> Result<FleetName, Mista
 }
 
 /// Checks a node id.
-pub(super) fn node_id(key: &'static str, value: &str) -> Result<NodeId, Mistake> {
+pub(crate) fn node_id(key: &'static str, value: &str) -> Result<NodeId, Mistake> {
     value.parse().map_err(|_| Mistake::NodeId { key, value: value.to_owned() })
 }
 
 /// Checks a duration, `NUMBER` and `s`, `min`, `h` or `d`, and its bounds.
-pub(super) fn duration(
+pub(crate) fn duration(
     key: &'static str,
     value: &str,
     (min, max): (Duration, Duration),
@@ -233,42 +213,14 @@ pub(super) fn duration(
     duration.ok_or_else(|| Mistake::Duration { key, value: value.to_owned(), min, max })
 }
 
-/// Parses a duration: `90s`, `15min`, `1h`, `30d`.
-pub fn parse_duration(text: &str) -> Option<Duration> {
-    let (number, unit) = text.split_at(text.find(|c: char| !c.is_ascii_digit())?);
-    let unit = match unit.trim_start() {
-        "s" => 1,
-        "m" | "min" => 60,
-        "h" => 3600,
-        "d" => 86_400,
-        _ => return None,
-    };
-    number.parse::<u64>().ok()?.checked_mul(unit).map(Duration::from_secs)
-}
-
-/// Formats a duration in the largest unit that divides it.
-pub(super) fn duration_text(duration: Duration) -> String {
-    let seconds = duration.as_secs();
-    let units = [(86_400, "d"), (3600, "h"), (60, "min")];
-    let unit = units.into_iter().find(|(unit, _)| seconds.is_multiple_of(*unit) && seconds > 0);
-    unit.map_or_else(|| format!("{seconds}s"), |(unit, text)| format!("{}{text}", seconds / unit))
-}
-
 /// Checks the rate limit of a peer.
-pub(super) fn rate(key: &'static str, value: &str) -> Result<u64, Mistake> {
+pub(crate) fn rate(key: &'static str, value: &str) -> Result<u64, Mistake> {
     let rate = parse_rate(value).filter(|rate| (PEER_RATE_MIN..=PEER_RATE_MAX).contains(rate));
     rate.ok_or_else(|| Mistake::Rate { key, value: value.to_owned() })
 }
 
-/// Parses a rate: `500kbps`, `50Mbps`, `1Gbps`. Returns bits a second.
-pub fn parse_rate(text: &str) -> Option<u64> {
-    let (number, unit) = text.split_at(text.find(|c: char| !c.is_ascii_digit())?);
-    let unit = RATE_UNITS.into_iter().find(|(_, name)| *name == unit.trim_start())?.0;
-    number.parse::<u64>().ok()?.checked_mul(unit)
-}
-
 /// Checks a DSCP mark: a class of differentiated services (RFC 2474, 2597, 3246), or its number.
-pub(super) fn dscp(key: &'static str, value: &str) -> Result<u8, Mistake> {
+pub(crate) fn dscp(key: &'static str, value: &str) -> Result<u8, Mistake> {
     const WHAT: &str = "a class of differentiated services: \"CS0\" to \"CS7\", \"AF11\" to \"AF43\", \"EF\", or \"0\" to \"63\"";
     let digit = |byte: u8, max: u8| Some(byte.checked_sub(b'0')?).filter(|digit| *digit <= max);
     let mark = match value.as_bytes() {
@@ -285,7 +237,7 @@ pub(super) fn dscp(key: &'static str, value: &str) -> Result<u8, Mistake> {
 }
 
 /// Checks a message rate. Returns the time between two messages.
-pub(super) fn interval(key: &'static str, value: &str) -> Result<Duration, Mistake> {
+pub(crate) fn interval(key: &'static str, value: &str) -> Result<Duration, Mistake> {
     const WHAT: &str = "messages a second, 0.001 to 10000: \"10Hz\", \"0.5Hz\"";
     let number = |text: &str| {
         let text = text.trim_end();
@@ -297,14 +249,14 @@ pub(super) fn interval(key: &'static str, value: &str) -> Result<Duration, Mista
 }
 
 /// Checks a bandwidth in bits a second.
-pub(super) fn bandwidth(key: &'static str, value: &str) -> Result<u64, Mistake> {
+pub(crate) fn bandwidth(key: &'static str, value: &str) -> Result<u64, Mistake> {
     const WHAT: &str = "bits a second, \"1kbps\" to \"1000Gbps\": \"500kbps\", \"2Mbps\"";
     let rate = parse_rate(value).filter(|rate| (1000..=PEER_RATE_MAX).contains(rate));
     rate.ok_or_else(|| shaping_mistake(key, value, WHAT))
 }
 
 /// Checks the greatest age of messages.
-pub(super) fn age(key: &'static str, value: &str) -> Result<Duration, Mistake> {
+pub(crate) fn age(key: &'static str, value: &str) -> Result<Duration, Mistake> {
     const WHAT: &str = "a length of time, \"1ms\" to \"1h\": \"500ms\", \"2s\"";
     let millis = |text: &str| {
         let digits = Some(text.trim_end()).filter(|t| t.bytes().all(|b| b.is_ascii_digit()));
@@ -319,16 +271,8 @@ fn shaping_mistake(key: &'static str, value: &str, what: &'static str) -> Mistak
     Mistake::Shaping { key, value: value.to_owned(), what }
 }
 
-/// Formats a rate in the largest unit that divides it.
-pub(super) fn rate_text(rate: u64) -> String {
-    let unit = RATE_UNITS.into_iter().find(|(unit, _)| rate.is_multiple_of(*unit));
-    unit.map_or_else(|| format!("{rate}bps"), |(unit, name)| format!("{}{name}", rate / unit))
-}
-
-const RATE_UNITS: [(u64, &str); 3] = [(1_000_000_000, "Gbps"), (1_000_000, "Mbps"), (1000, "kbps")];
-
 /// Checks one entry of `to` or `publish`.
-pub(super) fn recipient(key: &'static str, value: &str) -> Result<Recipient, Mistake> {
+pub(crate) fn recipient(key: &'static str, value: &str) -> Result<Recipient, Mistake> {
     let recipient = match value.split_once(':') {
         None if value == "*" => Some(Recipient::Everyone),
         None => value.parse().ok().map(Recipient::Node),
@@ -346,7 +290,7 @@ fn repaired_label(value: &str) -> Option<String> {
 }
 
 /// Checks a static peer: a host name or an IP address, without a port.
-pub(super) fn peer(key: &'static str, value: &str) -> Result<String, Mistake> {
+pub(crate) fn peer(key: &'static str, value: &str) -> Result<String, Mistake> {
     if value.len() <= PEER_BYTES_MAX && is_host(value) {
         Ok(value.to_owned())
     } else {
@@ -368,7 +312,7 @@ fn is_host(value: &str) -> bool {
 }
 
 /// Checks an entry of `routers`: `quic://HOST[:PORT]`, `srv://DOMAIN`, `mdns://[NODE]`.
-pub(super) fn router(key: &'static str, value: &str) -> Result<RouterUrl, Mistake> {
+pub(crate) fn router(key: &'static str, value: &str) -> Result<RouterUrl, Mistake> {
     let router: RouterUrl = match value.parse() {
         Ok(router) => router,
         Err(RouterUrlError::Link(fault)) => return Err(url_mistake(key, value, fault)),
@@ -387,7 +331,7 @@ pub(super) fn router(key: &'static str, value: &str) -> Result<RouterUrl, Mistak
 }
 
 /// Checks a DNS server, `ADDRESS[:PORT]`.
-pub(super) fn resolver(key: &'static str, value: &str) -> Result<SocketAddr, Mistake> {
+pub(crate) fn resolver(key: &'static str, value: &str) -> Result<SocketAddr, Mistake> {
     let bare = || value.parse().ok().map(|address| SocketAddr::new(address, DNS_PORT));
     let server = value.parse().ok().or_else(bare);
     server
@@ -396,7 +340,7 @@ pub(super) fn resolver(key: &'static str, value: &str) -> Result<SocketAddr, Mis
 }
 
 /// Checks a listen address, `SCHEME://ADDRESS[:PORT]`.
-pub(super) fn listen(key: &'static str, value: &str) -> Result<ListenAddr, Mistake> {
+pub(crate) fn listen(key: &'static str, value: &str) -> Result<ListenAddr, Mistake> {
     if matches!(value.split_once("://"), Some(("srv" | "mdns", _))) {
         return Err(Mistake::ListenFinds { key, value: value.to_owned() });
     }
@@ -405,4 +349,24 @@ pub(super) fn listen(key: &'static str, value: &str) -> Result<ListenAddr, Mista
 
 fn url_mistake(key: &'static str, value: &str, fault: UrlError) -> Mistake {
     Mistake::Url { key, value: value.to_owned(), fault }
+}
+
+/// Parses a listen address of the gateway.
+pub(crate) fn gateway_listen(key: &'static str, value: &str) -> Result<GatewayUrl, Mistake> {
+    value.parse().map_err(|fault| Mistake::GatewayUrl { key, value: value.to_owned(), fault })
+}
+
+/// Parses an origin of web pages.
+pub(crate) fn page_origin(key: &'static str, value: &str) -> Result<PageOrigin, Mistake> {
+    value.parse().map_err(|fault: PageOriginError| Mistake::PageOrigin {
+        key,
+        value: value.to_owned(),
+        fault,
+    })
+}
+
+/// Parses a size such as `64MiB` and checks its bounds.
+pub(crate) fn size(key: &'static str, value: &str, (min, max): (u64, u64)) -> Result<u64, Mistake> {
+    let bytes = parse_size(value).filter(|bytes| (min..=max).contains(bytes));
+    bytes.ok_or_else(|| Mistake::Size { key, value: value.to_owned(), min, max })
 }

@@ -1,19 +1,18 @@
 //! Configurations: their resolved values, and the messages about mistakes.
 
+#![allow(clippy::disallowed_methods)]
+
 use std::collections::BTreeMap;
 use std::fs;
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use sgc_dds::Security;
-use sgc_gateway::{Anonymous, Right};
-use sgc_node::audit::AuditRoom;
-use sgc_node::config::{
-    ArgsConfig, AuditConfig, Config, ConfigErrors, DiscoveryRange, GatewayConfig, Mistake, Naming, Origin,
+use sgc_config::{
+    ArgsConfig, AuditConfig, AuditRoom, Config, ConfigErrors, DiscoveryRange, GatewayConfig, Naming,
     Recipient, Rename, RotationConfig, SHARES_MAX, SUITES, SecurityConfig, Shaping, Table, TokenConfig,
-    TokenSource, TransportConfig, load, load_args, parse,
+    TokenSource, TransportConfig, parse,
 };
+use sgc_gateway::{Anonymous, Right};
 use sgc_transport::Congestion;
 use sgc_trust::Suite;
 use sgc_wire::Class;
@@ -1100,39 +1099,6 @@ fn a_token_says_owner_and_topic_itself() {
 }
 
 #[test]
-fn files_with_certificates_and_tokens_are_read_before_anything_is_done() {
-    let dir = tempfile::tempdir().unwrap();
-    let path = |name: &str| dir.path().join(name);
-    fs::write(path("x"), "").unwrap();
-    fs::set_permissions(path("x"), fs::Permissions::from_mode(0o600)).unwrap();
-    fs::write(path("bad.pem"), "no certificate").unwrap();
-    fs::write(path("t.token"), "sgc-token-1:AAAAAAAA").unwrap();
-    let text = "identity = 'x'\nnode.routers = ['quic://r']\nnode.trust = ['none.pem', 'bad.pem']\n\
-                [[use]]\ntoken = 't.token'\n[authority]\nfleet = 'lab.fleet'";
-    fs::write(path("node.toml"), text).unwrap();
-    let said = |dir: &Path| {
-        let errors = load(&dir.join("node.toml"), &no_env).unwrap_err().to_string();
-        errors.replace(&format!("{}/", dir.display()), "")
-    };
-    let ca = "it must be a file of CA certificates in PEM, such as `sgc fleet show --ca` prints";
-    assert_eq!(
-        said(dir.path()).lines().collect::<Vec<_>>(),
-        [
-            &format!(
-                "node.toml:3: `trust` is none.pem: it cannot be read: No such file or directory (os error 2); {ca}"
-            ),
-            &format!(
-                "node.toml:3: `trust` is bad.pem: no CA certificate is given: at least one is needed; {ca}"
-            ),
-            "node.toml:5: `token` is t.token: its mode 0644 lets others at the topic's secret; `chmod 600 t.token`",
-            "node.toml:7: `fleet` is lab.fleet: no such file; it must be a file that this user may read",
-        ]
-    );
-    fs::set_permissions(path("t.token"), fs::Permissions::from_mode(0o600)).unwrap();
-    assert!(said(dir.path()).contains("its checksum is wrong"), "{}", said(dir.path()));
-}
-
-#[test]
 fn topic_may_be_configured_once() {
     check_all(&[
         (
@@ -1291,8 +1257,8 @@ fn security_is_what_the_file_says_or_else_the_environment() {
         config.map(|config| config.ros.unwrap().security).map_err(|errors| errors.to_string())
     };
     let security = |keystore: &str, enclave: &str, enforced| {
-        let enclave = Security { keystore: keystore.into(), enclave: enclave.to_owned() };
-        Ok(Some(SecurityConfig { enclave, enforced }))
+        let (keystore, enclave) = (keystore.into(), enclave.to_owned());
+        Ok(Some(SecurityConfig { keystore, enclave, enforced }))
     };
     let file = "enclave = '/sgc'\nsecurity_root = '/here'";
     assert_eq!(parse("", &[ENFORCE, KEYSTORE, OVERRIDE]), Ok(None));
@@ -1532,32 +1498,6 @@ fn mistakes_in_a_gateway_are_told() {
 }
 
 #[test]
-fn files_of_a_gateway_are_looked_at() {
-    let dir = tempfile::tempdir().unwrap();
-    let (file, key) = (dir.path().join("node.toml"), dir.path().join("robot.key"));
-    let identity = dir.path().join("x");
-    for path in [&identity, &key] {
-        fs::write(path, "nothing").unwrap();
-        fs::set_permissions(path, fs::Permissions::from_mode(0o600)).unwrap();
-    }
-    fs::write(dir.path().join("robot.pem"), "nothing").unwrap();
-    let gateway = "[gateway]\nlisten = ['wss://127.0.0.1']\ncertificate = 'robot.pem'\nkey = 'robot.key'\n";
-    fs::write(&file, format!("{NODE}{gateway}")).unwrap();
-    let told = || -> Vec<String> {
-        let place = dir.path().display().to_string();
-        let errors = load(&file, &no_env).unwrap_err();
-        errors.iter().map(|error| error.to_string().replace(&place, "DIR")).collect()
-    };
-    let said = told();
-    let lines: Vec<_> = said.iter().map(|line| &line[..16]).collect();
-    assert_eq!(lines, ["DIR/node.toml:5:", "DIR/node.toml:6:"]);
-    assert!(said[0].contains("no certificate is in it"), "{}", said[0]);
-    assert!(said[1].contains("no private key is in it"), "{}", said[1]);
-    fs::set_permissions(&key, fs::Permissions::from_mode(0o644)).unwrap();
-    assert!(told()[1].contains("its mode 0644 lets others at the gateway's private key"), "{}", told()[1]);
-}
-
-#[test]
 fn an_argument_turns_a_gateway_on() {
     let config = Config::from_args(
         &args(&[("identity", "x"), ("router", "quic://r:7447"), ("gateway", "yes")]),
@@ -1753,75 +1693,6 @@ fn mistakes_in_arguments_name_the_argument() {
 }
 
 #[test]
-fn the_identity_file_is_checked_when_loading() {
-    let dir = tempfile::tempdir().unwrap();
-    let file = dir.path().join("node.toml");
-    let identity = dir.path().join("arm-1.identity");
-    let write = |text: &str| fs::write(&file, text).unwrap();
-    let chmod = |mode| fs::set_permissions(&identity, fs::Permissions::from_mode(mode)).unwrap();
-    let said = |result: Result<Config, ConfigErrors>| {
-        result.unwrap_err().to_string().replace(&dir.path().display().to_string(), "DIR")
-    };
-
-    write("node.routers = ['quic://r:7447']\nnode.name = 'arm-1'");
-    assert_eq!(
-        said(load(&file, &no_env)),
-        "DIR/node.toml:2: `identity` is DIR/arm-1.identity (after the node's name): no such file; `sgc fleet enroll \
-         arm-1 --out DIR/arm-1.identity` makes one"
-    );
-    write("identity = 'arm-1.identity'\nnode.routers = ['quic://r:7447']");
-    assert_eq!(
-        said(load(&file, &no_env)),
-        "DIR/node.toml:1: `identity` is DIR/arm-1.identity: no such file; `sgc fleet enroll NODE --out \
-         DIR/arm-1.identity` makes one"
-    );
-    fs::create_dir(&identity).unwrap();
-    assert_eq!(
-        said(load(&file, &no_env)),
-        "DIR/node.toml:1: `identity` is DIR/arm-1.identity: not a file; it must be a file that this user may read"
-    );
-    fs::remove_dir(&identity).unwrap();
-    fs::write(&identity, "secret").unwrap();
-    for mode in [0o644, 0o640, 0o602, 0o601] {
-        chmod(mode);
-        assert_eq!(
-            said(load(&file, &no_env)),
-            format!(
-                "DIR/node.toml:1: `identity` is DIR/arm-1.identity: its mode {mode:04o} lets others at the private key; \
-                 `chmod 600 DIR/arm-1.identity` and, if others had access, enrol again"
-            )
-        );
-    }
-    for mode in [0o600, 0o400] {
-        chmod(mode);
-        assert_eq!(load(&file, &no_env).unwrap().identity, identity);
-    }
-    let identity_arg = identity.display().to_string();
-    let from_args = args(&[("identity", &identity_arg), ("router", "quic://r:7447")]);
-    assert_eq!(load_args(&from_args, &no_env).unwrap().identity, identity);
-    chmod(0o666);
-    assert!(
-        said(load_args(&from_args, &no_env))
-            .starts_with("command line: `--identity` is DIR/arm-1.identity: its mode 0666")
-    );
-}
-
-#[test]
-fn a_file_that_cannot_be_read_is_told() {
-    let dir = tempfile::tempdir().unwrap();
-    let file = dir.path().join("node.toml");
-    let mistake =
-        || load(&file, &no_env).unwrap_err().iter().map(|error| (*error.mistake).clone()).next().unwrap();
-    assert!(matches!(mistake(), Mistake::Unreadable { reason } if reason.contains("No such file")));
-    fs::write(&file, b"a = 1\n\xff").unwrap();
-    assert_eq!(mistake(), Mistake::Unreadable { reason: "line 2 is not UTF-8 text".to_owned() });
-    fs::write(&file, vec![b'#'; 5 * 1024 * 1024]).unwrap();
-    assert_eq!(mistake(), Mistake::TooLarge { bytes: 5 * 1024 * 1024, max: 4 * 1024 * 1024 });
-    let errors = load(dir.path(), &no_env).unwrap_err();
-    assert!(matches!(errors.iter().next().unwrap().origin, Origin::File { line: None, .. }));
-}
-
-#[test]
 fn a_file_of_nothing_but_mistakes_is_answered_in_time() {
     let text = "a.b=1\n[[share]]\nto=['','']\n".repeat(20_000);
     let begin = std::time::Instant::now();
@@ -1870,7 +1741,7 @@ fn the_examples_of_the_reference_are_valid() {
 
 #[test]
 fn policies_are_named_as_in_ros_2_and_contradict_each_other_nowhere() {
-    use sgc_node::config::QosOverride;
+    use sgc_config::QosOverride;
     use sgc_wire::{Durability, History, Reliability};
 
     const SHARE: &str = "[[share]]\ntopic = '/a'\nto = ['b']\n";

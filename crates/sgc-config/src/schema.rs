@@ -207,7 +207,7 @@ impl Table {
 
     /// Returns the tables that have `key`, with the key. Tables within tables do not count: a `router` in `[node]` is
     /// no misplaced `[router]`.
-    pub(super) fn homes(key: &str) -> Option<(&'static str, Vec<&'static str>)> {
+    pub(crate) fn homes(key: &str) -> Option<(&'static str, Vec<&'static str>)> {
         let has = |table: &&Self| table.keys().contains(&key) && (**table != Self::Top || key == "identity");
         let homes: Vec<Self> = Self::ALL.iter().filter(has).copied().collect();
         let known = homes.first()?.keys().iter().find(|known| **known == key)?;
@@ -217,7 +217,7 @@ impl Table {
 
 /// Returns the candidate that `word` was probably meant to be: at most one edit per three characters away, or
 /// containing the word. Case is ignored.
-pub(crate) fn nearest<'c>(word: &str, candidates: &[&'c str]) -> Option<&'c str> {
+pub fn nearest<'c>(word: &str, candidates: &[&'c str]) -> Option<&'c str> {
     const PART_CHARS_MIN: usize = 4;
     let word = word.to_lowercase();
     let chars = word.chars().count();

@@ -3,10 +3,14 @@
 //! The variables have their meaning in `rcl`, with one difference: a value that `rcl` replaces with a warning is an
 //! error here. A key of the file overrides its variable, which is then not read.
 
-use super::draft::{RosDraft, WithOrigin};
-use super::error::{ConfigError, Mistake, Origin};
-use super::schema::nearest;
-use super::{DiscoveryRange, Environment, RosConfig, names};
+use crate::config::{DiscoveryRange, RosConfig};
+use crate::draft::{RosDraft, WithOrigin};
+use crate::error::{ConfigError, Mistake, Origin};
+use crate::names;
+use crate::schema::nearest;
+
+/// Looks up an environment variable. It is `&|name| std::env::var(name).ok()` outside of tests.
+pub type Environment<'e> = &'e dyn Fn(&str) -> Option<String>;
 
 /// The greatest domain id for which DDS's formula gives valid ports (RTPS 2.5, 9.6.2.3).
 pub const DOMAIN_ID_MAX: u32 = 232;
@@ -17,10 +21,10 @@ const DOMAIN_ID: &str = "ROS_DOMAIN_ID";
 const LOCALHOST_ONLY: &str = "ROS_LOCALHOST_ONLY";
 const DISCOVERY_RANGE: &str = "ROS_AUTOMATIC_DISCOVERY_RANGE";
 const STATIC_PEERS: &str = "ROS_STATIC_PEERS";
-pub(super) const SECURITY_ENABLE: &str = "ROS_SECURITY_ENABLE";
-pub(super) const SECURITY_STRATEGY: &str = "ROS_SECURITY_STRATEGY";
-pub(super) const SECURITY_KEYSTORE: &str = "ROS_SECURITY_KEYSTORE";
-pub(super) const SECURITY_ENCLAVE_OVERRIDE: &str = "ROS_SECURITY_ENCLAVE_OVERRIDE";
+pub(crate) const SECURITY_ENABLE: &str = "ROS_SECURITY_ENABLE";
+pub(crate) const SECURITY_STRATEGY: &str = "ROS_SECURITY_STRATEGY";
+pub(crate) const SECURITY_KEYSTORE: &str = "ROS_SECURITY_KEYSTORE";
+pub(crate) const SECURITY_ENCLAVE_OVERRIDE: &str = "ROS_SECURITY_ENCLAVE_OVERRIDE";
 const CYCLONEDDS_URI: &str = "CYCLONEDDS_URI";
 
 const RANGES: [(&str, &str, DiscoveryRange); 4] = [
@@ -33,7 +37,7 @@ const RANGES_IN_FILE: [&str; 4] = [RANGES[0].0, RANGES[1].0, RANGES[2].0, RANGES
 const RANGES_IN_ENVIRONMENT: [&str; 4] = [RANGES[0].1, RANGES[1].1, RANGES[2].1, RANGES[3].1];
 
 /// Resolves the settings. Mistakes are added to `errors` and leave defaults.
-pub(super) fn resolve(ros: &RosDraft, env: Environment<'_>, errors: &mut Vec<ConfigError>) -> RosConfig {
+pub(crate) fn resolve(ros: &RosDraft, env: Environment<'_>, errors: &mut Vec<ConfigError>) -> RosConfig {
     let domain_id = match &ros.domain_id {
         Some(id) => keep(file_domain_id(id), errors),
         None => keep(env_domain_id(env), errors),
