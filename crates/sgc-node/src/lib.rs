@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 pub mod admin;
+mod clock;
 pub mod config;
 mod control;
 mod data;

@@ -10,7 +10,7 @@ use sgc_wire::Name;
 
 use crate::control::alerts::Alert;
 use crate::data::stats::NameStats;
-use crate::discovery::RouterStatus;
+use crate::discovery::board::RouterStatus;
 
 /// The status document.
 #[derive(Clone, Debug, Serialize)]

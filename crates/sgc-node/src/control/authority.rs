@@ -460,7 +460,7 @@ mod tests {
     const DAY: u64 = 86_400_000;
 
     fn now() -> Now {
-        crate::control::core::now()
+        crate::clock::now()
     }
 
     /// A fleet file with members whose certificates are due.

@@ -6,7 +6,7 @@
 mod alerts;
 mod consumers;
 mod graph;
-mod interface_types;
+pub(crate) mod interface_types;
 mod nodes;
 mod operations;
 mod outputs;
@@ -19,34 +19,32 @@ mod trust;
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Output as EndpointOutput};
-use sgc_ros::{
-    DiscoveryEvent, EndpointKind, EndpointSpec, Guid, RosClient, RosNetwork, RosServer, Routes, ServiceSpec,
-    ShareRule, ShownEndpoint, UseRule,
-};
+use sgc_ros::{EndpointSpec, RosNetwork, Routes, ServiceSpec, ShareRule, UseRule};
 use sgc_router::{FibEntry, LinkId, Neighbour, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CredentialStore, Link, LinkUrl};
-use sgc_trust::{CrlError, Identity, NodeName, TrustAnchors, VerifiedPeer};
+use sgc_trust::{Identity, TrustAnchors, VerifiedPeer};
 use sgc_types::{Definitions, TypeStore};
-use sgc_wire::{Control, Name, NodeId, Now, Operation, OperationAnswer, SourceId, UnixMillis};
-use tokio::sync::{Notify, mpsc, oneshot, watch};
+use sgc_wire::{Control, Name, NodeId, SourceId};
+use tokio::sync::{Notify, mpsc, watch};
 use tracing::{debug, warn};
 
-use crate::admin::graph::Graph;
 use crate::admin::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
+use crate::clock::now;
 use crate::control::alerts::{Alerts, clock_alert};
-use crate::control::authority::{Authority, DeskAnswers};
-use crate::control::control_queue::{FrameRoom, Inbox, InboxShare};
-use crate::control::core::consumers::{ConsumerKey, FarConsumers};
-use crate::control::core::interface_types::{InterfaceTypes, TypeOutcome};
+use crate::control::authority::Authority;
+use crate::control::control_queue::Inbox;
+use crate::control::core::consumers::FarConsumers;
+use crate::control::core::interface_types::InterfaceTypes;
 use crate::control::core::nodes::LocalGraph;
 use crate::control::core::publish::{Offer, Publishing};
 use crate::control::core::reopening::Reopening;
+use crate::control::event::{CoreEvent, INBOX_MAX, LinkPlace};
 use crate::control::members::{MemberNames, Members};
-use crate::control::operations::{OperationError, Operations};
+use crate::control::operations::Operations;
 use crate::control::peer_rate::PeerRates;
 use crate::control::problem_log::ProblemLog;
 use crate::data::call_ledger::CallLedger;
@@ -55,20 +53,18 @@ use crate::data::dataplane::DataPlane;
 use crate::data::message_keys::MessageKeys;
 use crate::data::outflow::OutFlow;
 use crate::data::replays::Replays;
-use crate::data::sinks::{LocalSink, SinkRequest, WriterQueue};
+use crate::data::sinks::{LocalSink, SinkRequest};
 use crate::data::sources::{LocalShare, NewestSamples};
-use crate::data::stats::{Drops, NameStats};
-use crate::data::tap::{Tap, TapError, TapQueue, TapRequest};
+use crate::data::stats::{CountDrops, Drops, NameStats};
+use crate::data::tap::TapQueue;
 use crate::discovery::Board;
 use crate::gateway::Gateway;
+use crate::link::control_tx::ControlTx;
 use crate::link::keep_alive::{KeepAlive, KeepAlivePolicy};
-use crate::link::links::ControlTx;
 use crate::local::network_slot::NetworkSlot;
 use crate::state::audit::{Audit, AuditEvent, AuditRecord};
 use crate::state::credentials::StateWriter;
 
-/// Events that may wait for the control task. Senders wait while it is full.
-pub(crate) const INBOX_MAX: usize = 4096;
 /// Events handled before the timers are checked again.
 const BATCH_MAX: usize = 256;
 /// Interval of checks for sources that may have fallen silent.
@@ -84,157 +80,6 @@ const KEYED_INSTANCES_KEPT: usize = 256;
 /// Time for which packets of past epochs may be under way.
 const EPOCH_GRACE: Duration = Duration::from_secs(5);
 
-/// Event for the control task.
-pub(crate) enum CoreEvent {
-    /// A link was made.
-    LinkUp {
-        /// The link.
-        link: AnyLink,
-        /// URL, if this node dialled.
-        url: Option<String>,
-        /// Queue of its control frames.
-        control: ControlTx,
-        /// Receives the link's place, or `None` if the node is stopping.
-        reply: oneshot::Sender<Option<LinkPlace>>,
-    },
-    /// The configuration was read again.
-    ConfigurationRead {
-        /// The mistakes for which it was refused.
-        mistakes: Option<String>,
-    },
-    /// A link ended.
-    LinkDown {
-        /// The link.
-        id: LinkId,
-        /// Place of another process with this node's identity, if the peer closed the link for it.
-        in_use: Option<String>,
-    },
-    /// A control frame arrived.
-    Frame {
-        /// The link.
-        link: LinkId,
-        /// The frame.
-        frame: Control,
-        /// Its room in the inbox.
-        room: FrameRoom,
-    },
-    /// A link has taken all control frames before a flush.
-    Flushed {
-        /// The link.
-        link: LinkId,
-    },
-    /// A malformed control frame arrived.
-    Malformed {
-        /// The link.
-        link: LinkId,
-    },
-    /// The local graph changed.
-    Discovery(DiscoveryEvent),
-    /// The local network is about to close and to open again. Answered once the control task holds nothing of it.
-    CloseNetwork(oneshot::Sender<()>),
-    /// The local network is open again. Its discovery events follow.
-    NetworkReopened,
-    /// The local network could not be opened again so far, for this reason.
-    NetworkStaysClosed(String),
-    /// A local writer was created, or failed.
-    WriterReady {
-        /// The joined name.
-        name: Name,
-        /// The source whose messages it writes.
-        source: Option<SourceId>,
-        /// The requested endpoint.
-        spec: EndpointSpec,
-        /// Its queue.
-        writer: Option<Arc<WriterQueue>>,
-    },
-    /// A local reader was created.
-    ReaderReady {
-        /// The share.
-        name: Name,
-        /// The requested endpoint.
-        spec: EndpointSpec,
-        /// Its GUID on the local network.
-        guid: Guid,
-        /// Owner of the reader. Dropping it closes the reader.
-        reader: Box<dyn std::any::Any + Send>,
-    },
-    /// The local endpoints that stand for a far consumer were created, or failed.
-    ConsumerShown {
-        /// The consumer.
-        key: ConsumerKey,
-        /// The requested endpoints with the created ones.
-        ends: Vec<(EndpointKind, EndpointSpec, ShownEndpoint)>,
-    },
-    /// A service's local client or server was created.
-    ServiceReady {
-        /// The share or the joined name.
-        name: Name,
-        /// The requested service.
-        spec: ServiceSpec,
-        /// The client or server.
-        end: ServiceEnd,
-    },
-    /// The node joined the local network after its start. The rules follow.
-    NetworkJoined(Box<Routes<ChaCha20Rng>>),
-    /// The configuration changed. Answered when the change is under way.
-    Reload {
-        /// The new shares.
-        shares: Vec<ShareRule>,
-        /// The new uses.
-        uses: Vec<UseRule>,
-        /// The new trust anchors with kept revocation lists, if they change.
-        anchors: Option<TrustAnchors>,
-        /// Keys for suites that were not in use.
-        message_keys: MessageKeys,
-        /// The names of members in these rules.
-        member_names: MemberNames,
-        /// Notified when the change is under way.
-        reply: oneshot::Sender<()>,
-    },
-    /// The authority's desk answered requests for renewal and carried out operations.
-    DeskAnswered(DeskAnswers),
-    /// A user asks an authority for an operation on the fleet.
-    Operate {
-        /// The authority's name.
-        at: NodeName,
-        /// The operation.
-        operation: Operation,
-        /// The channel for the answer.
-        reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
-    },
-    /// A user brings a revocation list. Answered with whether it is new, and with the lists that were in force before.
-    Crl {
-        /// The list, DER.
-        der: bytes::Bytes,
-        /// The channel for the answer.
-        reply: oneshot::Sender<Result<(bool, Vec<bytes::Bytes>), CrlError>>,
-    },
-    /// Signing keys of these suites were created.
-    MessageKeys(MessageKeys),
-    /// A search for a type ended.
-    TypeLookedFor(TypeOutcome),
-    /// Asks for the status.
-    Status(oneshot::Sender<Status>),
-    /// Asks for the graph, also of a name that is not in use here.
-    Graph(Option<Name>, oneshot::Sender<Graph>),
-    /// Asks for a tap.
-    Tap(TapRequest, oneshot::Sender<Result<Tap, TapError>>),
-    /// Stop receiving. Answered with the queues that still have to drain.
-    Quiesce(oneshot::Sender<Vec<Arc<OutFlow>>>),
-    /// Withdraw the shares and say goodbye. Answered with the links, which the peers then close.
-    Stop(oneshot::Sender<Vec<AnyLink>>),
-}
-
-/// The place of a link at this node.
-pub(crate) struct LinkPlace {
-    /// Its number.
-    pub(crate) id: LinkId,
-    /// Data path for its packets.
-    pub(crate) data: Arc<DataPlane>,
-    /// Its share of the inbox.
-    pub(crate) inbox: InboxShare,
-}
-
 /// A local reader for a name.
 struct LocalReader {
     /// The requested endpoint.
@@ -243,14 +88,6 @@ struct LocalReader {
     opened: Option<Box<dyn std::any::Any + Send>>,
     /// Time stamps of the newest samples that it took.
     newest: Option<Arc<NewestSamples>>,
-}
-
-/// This node's end of a service on the local network.
-pub(crate) enum ServiceEnd {
-    /// A client that calls local servers.
-    Client(Arc<dyn RosClient>),
-    /// A server that local clients call.
-    Server(Arc<dyn RosServer>),
 }
 
 struct LinkEntry {
@@ -388,12 +225,6 @@ pub(crate) struct CoreParts<N> {
     pub definitions: Definitions,
     /// The names of members in rules.
     pub(crate) member_names: MemberNames,
-}
-
-/// Returns the current time of both clocks.
-pub(crate) fn now() -> Now {
-    let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    Now { instant: Instant::now(), unix: UnixMillis(unix.as_millis().try_into().unwrap_or(u64::MAX)) }
 }
 
 impl<N: RosNetwork> Core<N> {

@@ -248,7 +248,7 @@ mod tests {
     }
 
     fn now() -> UnixMillis {
-        crate::control::core::now().unix
+        crate::clock::now().unix
     }
 
     fn fleet() -> Fleet {

@@ -4,6 +4,7 @@ pub mod alerts;
 pub(crate) mod authority;
 pub(crate) mod control_queue;
 pub(crate) mod core;
+pub(crate) mod event;
 pub(crate) mod file_watch;
 pub(crate) mod members;
 pub(crate) mod operations;

@@ -407,7 +407,7 @@ mod tests {
             let dir = tempfile::tempdir().unwrap();
             let file = dir.path().join("lab.fleet");
             let mut rng = ChaCha20Rng::seed_from_u64(1);
-            let unix = crate::control::core::now().unix;
+            let unix = crate::clock::now().unix;
             let mut fleet = Fleet::create("lab".parse().unwrap(), unix, &mut rng).unwrap();
             let mut enroll = |node: &str| {
                 let request = EnrollRequest::new(node.parse().unwrap(), unix);
@@ -433,7 +433,7 @@ mod tests {
         }
 
         fn carry_out(&mut self, job: OperationJob) -> OperationOutcome {
-            let now = crate::control::core::now().unix;
+            let now = crate::clock::now().unix;
             job.carry_out(&self.file, &self.keeper, &BTreeMap::new(), now)
         }
 

@@ -25,13 +25,14 @@ use tokio::sync::{Mutex, Notify, mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
-use crate::control::core::{CoreEvent, now};
+use crate::clock::now;
+use crate::control::event::CoreEvent;
 use crate::control::rules::Rules;
 use crate::data::message_keys::{MessageKeys, make_for};
 use crate::discovery::{self, Board, LinkKeeper};
 use crate::gateway::access::access_with;
 use crate::gateway::{Gateway, ShownKey, key_of_files};
-use crate::node::NodeError;
+use crate::node::error::NodeError;
 use crate::state::audit::{Audit, AuditEvent, AuditRecord};
 use crate::state::credentials::with_kept_crls;
 

@@ -16,7 +16,7 @@ use crate::control::peer_rate::PeerRates;
 use crate::data::outflow::OutFlow;
 use crate::data::pending::PendingBytes;
 use crate::data::sinks::LocalSink;
-use crate::data::stats::{DataDrop, Drops, NameStats};
+use crate::data::stats::{CountDrops, DataDrop, Drops, NameStats};
 use crate::link::keep_alive::Activity;
 
 /// Number of tables over which names are spread, so that a change copies only a part.
@@ -148,34 +148,6 @@ impl DataPlane {
         self.count(ingress, &packet.header.name, reason);
     }
 
-    /// Counts a drop under `name` from `ingress`.
-    pub(crate) fn count(&self, ingress: LinkId, name: &Name, reason: DataDrop) {
-        debug!(%ingress, name = %name.short(), ?reason, "dropped");
-        if let Some(forward) = self.shard(name).load().get(name) {
-            forward.stats.count_drops(reason, 1);
-        }
-        // A packet from the wrong link may have been under way while the path changed, so it is not suspicious.
-        let suspicious = matches!(reason, DataDrop::HopLimit | DataDrop::Malformed);
-        if self.drops.count_from(reason.key(), ingress) && suspicious {
-            warn!(%ingress, reason = reason.key(), "dropped an invalid packet of a peer; counted from here on");
-        }
-    }
-
-    /// Counts several drops under `name` at this node itself.
-    pub(crate) fn count_here(&self, name: &Name, reason: DataDrop, several: u64) {
-        if let Some(forward) = self.shard(name).load().get(name) {
-            forward.stats.count_drops(reason, several);
-        }
-        if self.drops.add(reason.key(), several) {
-            debug!(name = %name.short(), ?reason, several, "dropped; counted from here on");
-        }
-    }
-
-    /// Returns drops by reason and link, and by reason for this node's sinks.
-    pub(crate) fn drops(&self) -> &Drops {
-        &self.drops
-    }
-
     async fn send(&self, ingress: LinkId, forward: &Forward, out: &Out, packet: Packet) {
         let name = packet.header.name;
         let dropped = match out {
@@ -194,6 +166,33 @@ impl DataPlane {
     fn shard(&self, name: &Name) -> &ArcSwap<HashMap<Name, Arc<Forward>>> {
         // Names are hashes, so any byte spreads them evenly.
         &self.shards[usize::from(name.0[0]) % SHARDS]
+    }
+}
+
+impl CountDrops for DataPlane {
+    fn count(&self, ingress: LinkId, name: &Name, reason: DataDrop) {
+        debug!(%ingress, name = %name.short(), ?reason, "dropped");
+        if let Some(forward) = self.shard(name).load().get(name) {
+            forward.stats.count_drops(reason, 1);
+        }
+        // A packet from the wrong link may have been under way while the path changed, so it is not suspicious.
+        let suspicious = matches!(reason, DataDrop::HopLimit | DataDrop::Malformed);
+        if self.drops.count_from(reason.key(), ingress) && suspicious {
+            warn!(%ingress, reason = reason.key(), "dropped an invalid packet of a peer; counted from here on");
+        }
+    }
+
+    fn count_here(&self, name: &Name, reason: DataDrop, several: u64) {
+        if let Some(forward) = self.shard(name).load().get(name) {
+            forward.stats.count_drops(reason, several);
+        }
+        if self.drops.add(reason.key(), several) {
+            debug!(name = %name.short(), ?reason, several, "dropped; counted from here on");
+        }
+    }
+
+    fn drops(&self) -> &Drops {
+        &self.drops
     }
 }
 

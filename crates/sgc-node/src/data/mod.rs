@@ -11,6 +11,7 @@ pub(crate) mod calls;
 pub(crate) mod conversion;
 pub(crate) mod dataplane;
 pub(crate) mod labels;
+pub(crate) mod manual_lease;
 pub(crate) mod message_keys;
 pub(crate) mod outflow;
 pub(crate) mod pending;

@@ -28,12 +28,11 @@ use tokio::time::{sleep_until, timeout_at};
 use tracing::{debug, warn};
 
 use crate::data::conversion::{self, KnownType, TypeSlot};
-use crate::data::dataplane::DataPlane;
 use crate::data::pending::{PendingBytes, PendingQueue};
 use crate::data::queue::Queue;
 use crate::data::shaper::Shaper;
 use crate::data::spacing::Spacing;
-use crate::data::stats::{DataDrop, Drops};
+use crate::data::stats::{CountDrops, DataDrop, Drops};
 use crate::data::tap::{TapMessage, Taps};
 
 /// Most messages that wait for one local writer.
@@ -134,7 +133,7 @@ impl LocalSink {
     }
 
     /// Applies a grant. A task writes the packets that waited for it, since that may take a while.
-    pub(crate) fn grant(self: &Arc<Self>, id: SinkId, grant: TopicGrant, data: &Arc<DataPlane>) {
+    pub(crate) fn grant(self: &Arc<Self>, id: SinkId, grant: TopicGrant, data: &Arc<impl CountDrops>) {
         let mut released = Vec::new();
         let turn = {
             let state = &mut *self.lock();
@@ -318,7 +317,7 @@ impl LocalSink {
     }
 
     /// Sets the state of the type. Messages that waited for it are written or dropped.
-    pub(crate) fn set_type(self: &Arc<Self>, known: KnownType, data: &Arc<DataPlane>) {
+    pub(crate) fn set_type(self: &Arc<Self>, known: KnownType, data: &Arc<impl CountDrops>) {
         let (held, turn) = {
             let mut state = self.lock();
             self.types.set(known);
@@ -1047,6 +1046,7 @@ mod tests {
     use sgc_wire::{Class, SecretBytes};
 
     use super::*;
+    use crate::data::dataplane::DataPlane;
     use crate::data::pending::PENDING_BYTES_MAX;
 
     struct Slow {
@@ -1339,8 +1339,8 @@ mod tests {
     async fn sources_that_never_had_a_writer_are_forgotten_with_those_of_the_sink() {
         let (requests, _receiver) = mpsc::channel(1);
         let sink = Arc::new(LocalSink::new(Name([1; 32]), false, requests, Arc::default()));
-        let (id, key, suite, data) =
-            (SinkId([9; 16]), SecretBytes::new([3; 32]), Suite::Group, Arc::default());
+        let (id, key, suite) = (SinkId([9; 16]), SecretBytes::new([3; 32]), Suite::Group);
+        let data = Arc::<DataPlane>::default();
         let grant = TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None };
         sink.grant(id, grant.clone(), &data);
         let sources_max = SinkLimits::default().sources_max;

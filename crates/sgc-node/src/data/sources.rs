@@ -26,12 +26,12 @@ use tokio::runtime::Handle;
 use tokio::sync::{Notify, mpsc};
 use tracing::{debug, warn};
 
-use crate::data::assertions::{ASSERTION_LOOK_MAX, ManualLease};
 use crate::data::conversion::{self, KnownType, TypeSlot};
 use crate::data::dataplane::DataPlane;
+use crate::data::manual_lease::{ASSERTION_LOOK_MAX, ManualLease};
 use crate::data::pending::PendingQueue;
 use crate::data::shaper::Shaper;
-use crate::data::stats::DataDrop;
+use crate::data::stats::{CountDrops, DataDrop};
 use crate::data::tap::{TapMessage, Taps};
 
 /// Time stamps of the newest samples that readers of a transient-local topic took, by writer.

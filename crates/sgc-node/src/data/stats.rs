@@ -7,7 +7,7 @@ use std::sync::{Mutex, MutexGuard};
 
 use sgc_router::LinkId;
 use sgc_sync::lock;
-use sgc_wire::NodeId;
+use sgc_wire::{Name, NodeId};
 
 /// Traffic of one name at this node.
 #[derive(Debug, Default)]
@@ -245,6 +245,18 @@ impl Drops {
     fn lock(&self) -> MutexGuard<'_, Counts> {
         lock(&self.0)
     }
+}
+
+/// Counts of everything that the data path drops.
+pub(crate) trait CountDrops: Send + Sync + 'static {
+    /// Counts a drop under `name` from `ingress`.
+    fn count(&self, ingress: LinkId, name: &Name, reason: DataDrop);
+
+    /// Counts several drops under `name` at this node itself.
+    fn count_here(&self, name: &Name, reason: DataDrop, several: u64);
+
+    /// Returns drops by reason and link, and by reason for this node's sinks.
+    fn drops(&self) -> &Drops;
 }
 
 #[cfg(test)]

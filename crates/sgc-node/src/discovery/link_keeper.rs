@@ -13,7 +13,7 @@ use tracing::warn;
 
 use super::dns::DnsError;
 use super::{Claim, Claims, DialTarget, Dns, Names as _, SkippedUrl, StatusRow, WorkingUrls, urls};
-use crate::control::core::CoreEvent;
+use crate::control::event::CoreEvent;
 use crate::link::links::keep_renewed;
 use crate::link::roaming::Network;
 

@@ -15,7 +15,7 @@ use tracing::{debug, info, warn};
 
 use super::candidates::{CANDIDATES_MAX, Candidates, Verdict};
 use super::local::Sighting;
-use crate::link::links::place_in_use;
+use crate::link::in_use::place_in_use;
 
 use super::{
     BACKOFF_MAX, Board, DialTarget, Failure, KeepLink, LinkRequest, LocalNetwork, Outcome, StatusRow, wait,

@@ -4,8 +4,8 @@
 //! Each kind of search is a loop that yields dial targets (`keep_at`, `srv`, `mdns`). [`link_keeper::LinkKeeper`] dials
 //! and keeps the link. The loops are generic over [`KeepLink`], so tests run their timing on a virtual clock.
 
-mod backoff;
-mod board;
+pub(crate) mod backoff;
+pub(crate) mod board;
 mod candidates;
 mod claims;
 mod dns;
@@ -28,7 +28,7 @@ use tokio::time::{Instant, sleep_until};
 use tracing::{debug, info, warn};
 
 use backoff::BACKOFF_MIN;
-pub(crate) use backoff::{BACKOFF_MAX, Backoff, doubled, wait};
+pub(crate) use backoff::{BACKOFF_MAX, Backoff, wait};
 pub use board::RouterStatus;
 pub(crate) use board::{Board, StatusRow};
 pub(crate) use claims::{Claim, Claims};
@@ -38,7 +38,7 @@ pub(crate) use local::LocalNetwork;
 pub(crate) use mdns::RouterFilter;
 pub(crate) use urls::{Failback, SkippedUrl, WorkingUrls, is_over_udp};
 
-use crate::link::links::place_in_use;
+use crate::link::in_use::place_in_use;
 use crate::link::roaming::Network;
 
 /// A router to dial.

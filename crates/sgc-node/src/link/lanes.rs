@@ -20,8 +20,7 @@ use tokio::time::{sleep, timeout};
 use tracing::{debug, info, warn};
 
 use crate::control::control_queue::ControlQueue;
-use crate::discovery::{BACKOFF_MAX, doubled, wait};
-use crate::link::links::Inflow;
+use crate::discovery::backoff::{BACKOFF_MAX, doubled, wait};
 
 /// Most lanes of one link.
 pub(crate) const LANES_MAX: usize = 8;
@@ -89,6 +88,9 @@ impl LaneAdmission {
 /// Dialer and URL for the lanes of a link.
 pub(crate) type Dial = (Arc<Dialer>, LinkUrl);
 
+/// Starts the tasks that receive the packets of a name over its lane.
+type ReceiveLane = Box<dyn Fn(AnyLink, Name) + Send + Sync>;
+
 /// The lanes of one link.
 pub(crate) struct Lanes {
     link: AnyLink,
@@ -96,8 +98,8 @@ pub(crate) struct Lanes {
     /// Dialer; `None` if the peer dialled the link.
     dial: Option<Dial>,
     admission: LaneAdmission,
-    /// Inflow for the packets of lanes. It is set once the link has its number.
-    inflow: OnceLock<Inflow>,
+    /// Receives the packets of lanes. It is set once the link has its number.
+    receive: OnceLock<ReceiveLane>,
     table: Mutex<Table>,
     /// Whether the table holds any lane, so that links without lanes take no lock for a packet.
     has_any: AtomicBool,
@@ -145,7 +147,7 @@ impl Lanes {
             frames,
             dial,
             admission,
-            inflow: OnceLock::new(),
+            receive: OnceLock::new(),
             table: Mutex::default(),
             has_any: AtomicBool::new(false),
             number: AtomicU64::new(0),
@@ -153,9 +155,9 @@ impl Lanes {
     }
 
     /// Accepts packets of lanes from here on.
-    pub(crate) fn start(&self, inflow: Inflow) {
+    pub(crate) fn start(&self, receive: impl Fn(AnyLink, Name) + Send + Sync + 'static) {
         // The function is called once, so this cannot fail.
-        let _ = self.inflow.set(inflow);
+        let _ = self.receive.set(Box::new(receive));
     }
 
     /// Returns the lane of a name, if one is up, and its number, which is unique within the link.
@@ -328,7 +330,7 @@ impl Lanes {
 
     /// Takes a lane into use.
     fn attach(self: &Arc<Self>, name: Name, lane: AnyLink) {
-        let Some(inflow) = self.inflow.get() else { return lane.close(CloseReason::Goodbye) };
+        let Some(receive) = self.receive.get() else { return lane.close(CloseReason::Goodbye) };
         let number = self.number.fetch_add(1, Ordering::Relaxed) + 1;
         let mut table = self.table();
         let Some(entry) = table.lanes.get_mut(&name) else {
@@ -341,7 +343,7 @@ impl Lanes {
             old.close(CloseReason::Replaced);
         }
         debug!(remote = %lane.remote(), name = %name.short(), "a lane is up");
-        inflow.by_lane(lane.clone(), name).spawn();
+        receive(lane.clone(), name);
         let lanes = Arc::downgrade(self);
         tokio::spawn(async move {
             lane.closed().await;
@@ -387,8 +389,8 @@ mod tests {
     use tokio::sync::mpsc;
 
     use super::*;
+    use crate::clock::now;
     use crate::control::control_queue::Outgoing;
-    use crate::control::core::now;
 
     /// A router, with nodes of its fleet that dial it.
     struct Bench {

@@ -8,25 +8,22 @@ use std::time::Duration;
 use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
 use sgc_router::LinkId;
-use sgc_transport::{
-    AnyLink, CloseReason, CredentialStore, FlowEnd, FlowError, FlowRx, Link, LinkError, LinkUrl, Listener,
-    ReceivedDatagram,
-};
-use sgc_wire::{Control, Decode, DecodeError, Encode, Name, Packet};
+use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link, LinkError, LinkUrl, Listener};
+use sgc_wire::{Control, Decode, DecodeError, Encode};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, warn};
 
 use crate::control::control_queue::{ControlQueue, InboxShare, Outgoing};
-use crate::control::core::{CoreEvent, LinkPlace};
-use crate::control::peer_rate::PeerRate;
+use crate::control::event::{CoreEvent, LinkPlace};
 use crate::control::refusal_log::RefusalLog;
-use crate::data::dataplane::DataPlane;
-use crate::data::labels::{LabelBook, NameLabel, Progress};
-use crate::data::stats::DataDrop;
+use crate::data::labels::{LabelBook, Progress};
 use crate::discovery::{
     BACKOFF_MAX, Claim, Claims, DialTarget, DialledLink, Failback, LinkKeeper, StatusRow, is_over_udp, wait,
 };
+use crate::link::control_tx::ControlTx;
+use crate::link::in_use::place_in_use;
+use crate::link::inflow::Inflow;
 use crate::link::keep_alive::Activity;
 use crate::link::lanes::{Dial, LaneAdmission, Lanes};
 use crate::link::roaming::{self, Move, Origin, source_towards};
@@ -42,48 +39,6 @@ const QUIET_RTTS: u32 = 4;
 const DOUBT_AFTER: Duration = Duration::from_millis(1500);
 /// Time for the peer to answer a goodbye.
 const GOODBYE_MAX: Duration = Duration::from_secs(1);
-
-/// Sends frames of the control task over a link, in order.
-pub(crate) struct ControlTx {
-    frames: ControlQueue,
-    labels: LabelBook,
-    activity: Arc<Activity>,
-    lanes: Arc<Lanes>,
-}
-
-impl ControlTx {
-    /// Returns the label of a name on this link, if it has one. A new label is announced to the peer.
-    pub(crate) fn label(&mut self, name: Name) -> Option<NameLabel> {
-        let frames = &self.frames;
-        self.labels.label(name, |label| frames.push(Control::Label { label, name }))
-    }
-
-    /// Returns the flag of packets that crossed the link.
-    pub(crate) fn activity(&self) -> &Arc<Activity> {
-        &self.activity
-    }
-
-    /// Returns the lanes of the link.
-    pub(crate) fn lanes(&self) -> &Arc<Lanes> {
-        &self.lanes
-    }
-
-    /// Returns the number of labels that the peer knows.
-    pub(crate) fn labels_known(&self) -> u32 {
-        self.labels.known()
-    }
-
-    /// Queues a frame. Returns `false` if the peer is too far behind.
-    pub(crate) fn send(&self, frame: Control) -> bool {
-        self.frames.push(frame)
-    }
-
-    /// Queues a flush: the control task is notified when the link has taken all earlier frames. Returns `false` if the
-    /// peer is too far behind.
-    pub(crate) fn flush(&self) -> bool {
-        self.frames.flush()
-    }
-}
 
 /// Serves a link and its replacements, and returns when the last of them has ended.
 ///
@@ -233,14 +188,6 @@ async fn passed(noted: Option<(Instant, u64)>) -> u64 {
     }
 }
 
-/// Returns the place of another process with this node's identity, if the peer closed the link for it.
-pub(crate) fn place_in_use(end: &LinkError) -> Option<&str> {
-    match end {
-        LinkError::Closed { by_peer: true, reason: CloseReason::InUse(place) } => Some(place),
-        _ => None,
-    }
-}
-
 /// Waits for a change. Waits for ever if the sender is gone.
 async fn changed<T>(watched: &mut watch::Receiver<T>) {
     if watched.changed().await.is_err() {
@@ -333,13 +280,14 @@ impl ReportedLink {
         let lanes = Lanes::new(link.clone(), frames.clone(), dial, admission);
         let labels = LabelBook::new(progress.clone());
         let (activity_tx, lanes_tx) = (activity.clone(), lanes.clone());
-        let control = ControlTx { frames: frames.clone(), labels, activity: activity_tx, lanes: lanes_tx };
+        let control = ControlTx::new(frames.clone(), labels, activity_tx, lanes_tx);
         let up = CoreEvent::LinkUp { link: link.clone(), url, control, reply };
         let id = match (core.send(up).await, id.await) {
             (Ok(()), Ok(Some(LinkPlace { id, data, inbox }))) => {
                 info!(link = id.0, remote = %link.remote(), peer = %link.peer().node_id.short(), "link is up");
                 let inflow = Inflow::new(&link, id, data, activity);
-                lanes.start(inflow.clone());
+                let of_lanes = inflow.clone();
+                lanes.start(move |lane, name| of_lanes.by_lane(lane, name).spawn());
                 let (core, lanes) = (core.clone(), lanes.clone());
                 let reader =
                     ControlRx { link: link.clone(), id, frames, progress, lanes, count, core, inbox };
@@ -401,7 +349,7 @@ impl ReportedLink {
 }
 
 fn spawn_tasks(inflow: Inflow, outgoing: mpsc::Receiver<Outgoing>, reader: ControlRx) {
-    tokio::spawn(send_control(inflow.link.clone(), inflow.id, outgoing, reader.core.clone()));
+    tokio::spawn(send_control(reader.link.clone(), reader.id, outgoing, reader.core.clone()));
     tokio::spawn(reader.run());
     inflow.spawn();
 }
@@ -503,144 +451,6 @@ impl ControlRx {
     }
 }
 
-/// Passes received packets to the data path, within the peer's rate.
-#[derive(Clone)]
-pub(crate) struct Inflow {
-    link: AnyLink,
-    /// The only accepted name, if the packets come over a lane.
-    only: Option<Name>,
-    id: LinkId,
-    data: Arc<DataPlane>,
-    rate: Option<Arc<PeerRate>>,
-    activity: Arc<Activity>,
-}
-
-/// Decision about a packet.
-enum PacketAdmission {
-    /// The packet is forwarded.
-    Granted,
-    /// The packet is dropped, and so is the rest of its message.
-    OverRate,
-    /// The link ended meanwhile.
-    LinkEnded,
-}
-
-impl Inflow {
-    fn new(link: &AnyLink, id: LinkId, data: Arc<DataPlane>, activity: Arc<Activity>) -> Self {
-        let rate = data.rates().for_peer(link.peer().node_id);
-        Self { link: link.clone(), only: None, id, data, rate, activity }
-    }
-
-    /// Returns an inflow for a lane of the link.
-    pub(crate) fn by_lane(&self, lane: AnyLink, name: Name) -> Self {
-        Self { link: lane, only: Some(name), ..self.clone() }
-    }
-
-    /// Starts the receiving tasks.
-    pub(crate) fn spawn(self) {
-        tokio::spawn(self.clone().accept_flows());
-        tokio::spawn(self.read_datagrams());
-    }
-
-    /// Returns `true` if a packet may come here, and counts it as a drop otherwise.
-    fn belongs(&self, packet: &Packet) -> bool {
-        let belongs = self.only.is_none_or(|only| only == packet.header.name);
-        if !belongs {
-            self.data.drop_packet(self.id, packet, DataDrop::WrongWay);
-        }
-        belongs
-    }
-
-    /// Decides about a packet. A message that cannot wait is judged at its beginning; once it is under way it is slowed
-    /// like a reliable one.
-    async fn admit(&self, packet: &Packet) -> PacketAdmission {
-        self.activity.note();
-        let Some(rate) = &self.rate else { return PacketAdmission::Granted };
-        let bytes = packet.encoded_bytes();
-        if !packet.header.reliable && packet.header.index == 0 {
-            return if rate.take_now(bytes) { PacketAdmission::Granted } else { PacketAdmission::OverRate };
-        }
-        let wait = rate.take_later(bytes);
-        if wait.is_zero() {
-            return PacketAdmission::Granted;
-        }
-        tokio::select! {
-            () = tokio::time::sleep(wait) => PacketAdmission::Granted,
-            _ = self.link.closed() => PacketAdmission::LinkEnded,
-        }
-    }
-
-    async fn accept_flows(self) {
-        while let Ok(flow) = self.link.accept_flow().await {
-            tokio::spawn(self.clone().read_flow(flow));
-        }
-    }
-
-    async fn read_flow(self, mut flow: FlowRx) {
-        let (id, data, remote) = (self.id, &self.data, self.link.remote());
-        loop {
-            match flow.recv().await {
-                Ok(Some(packet)) if !self.belongs(&packet) => return flow.stop(FlowEnd::Unwanted),
-                Ok(Some(packet)) => match self.admit(&packet).await {
-                    // A single packet on an idle flow is forwarded right here, since the tasks that it wakes have no
-                    // other work.
-                    PacketAdmission::Granted if flow.is_at_rest() && packet.header.fragments() == 1 => {
-                        sgc_executor::poll_at_hand(data.forward(id, packet)).await;
-                    }
-                    PacketAdmission::Granted => data.forward(id, packet).await,
-                    PacketAdmission::OverRate if packet.header.fragments() == 1 => {}
-                    PacketAdmission::OverRate => return flow.stop(FlowEnd::Stale),
-                    PacketAdmission::LinkEnded => return,
-                },
-                Ok(None) => return,
-                Err(FlowError::Link(_) | FlowError::Ended(_)) => return,
-                Err(error) => {
-                    // A truncated flow is a sign of a lost link; any other error is the peer's mistake.
-                    let reason = match &error {
-                        FlowError::Truncated => None,
-                        FlowError::Packet(error) => Some(malformed(error)),
-                        _ => Some(DataDrop::Malformed),
-                    };
-                    if reason.is_some_and(|reason| data.drops().count_from(reason.key(), id)) {
-                        warn!(link = id.0, %remote, %error, "a peer sends malformed flows; counted from here on");
-                    }
-                    debug!(link = id.0, %remote, %error, "flow ended early");
-                    return;
-                }
-            }
-        }
-    }
-
-    async fn read_datagrams(self) {
-        let (id, data) = (self.id, &self.data);
-        while let Ok(received) = self.link.recv_datagram().await {
-            match received {
-                // A datagram is never delayed, whatever its header says, since it would delay those behind it.
-                ReceivedDatagram::Packet(packet) if !self.belongs(&packet) => {}
-                ReceivedDatagram::Packet(packet) => {
-                    self.activity.note();
-                    if self.rate.as_ref().is_none_or(|rate| rate.take_now(packet.encoded_bytes())) {
-                        data.forward(id, packet).await;
-                    }
-                }
-                ReceivedDatagram::Malformed(error) => {
-                    debug!(link = id.0, %error, "malformed datagram");
-                    if data.drops().count_from(malformed(&error).key(), id) {
-                        warn!(link = id.0, %error, "a peer sends malformed datagrams; counted from here on");
-                    }
-                }
-            }
-        }
-    }
-}
-
-fn malformed(error: &DecodeError) -> DataDrop {
-    match error {
-        DecodeError::UnknownLabel { .. } => DataDrop::UnknownLabel,
-        _ => DataDrop::Malformed,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
@@ -651,11 +461,11 @@ mod tests {
     use rand_core::OsRng;
     use sgc_transport::{CredentialStore, Dialer, LinkOptions, RefusalKind, TransportMetrics};
     use sgc_trust::{CertId, EnrollRequest, Fleet, Identity};
-    use sgc_wire::{Hello, Label, UnixMillis};
+    use sgc_wire::{Hello, Label, Name, UnixMillis};
 
     use super::*;
+    use crate::clock::now;
     use crate::control::control_queue::{Inbox, LINK_INBOX_BYTES_MAX};
-    use crate::control::core::now;
     use crate::discovery::{Board, Dns, WorkingUrls, keep_at};
     use crate::link::roaming::Network;
 

@@ -1,5 +1,8 @@
 //! Links: connections to other nodes, from the first dial to the last frame.
 
+pub(crate) mod control_tx;
+pub(crate) mod in_use;
+pub(crate) mod inflow;
 pub(crate) mod keep_alive;
 pub(crate) mod lanes;
 pub(crate) mod links;

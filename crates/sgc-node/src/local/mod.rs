@@ -1,5 +1,6 @@
 //! The local ROS 2 network as a whole: joining it, joining it again, and what keeps others from being seen in it.
 
+pub(crate) mod dds_discovery;
 pub mod discovery_server;
 pub(crate) mod network_slot;
 pub(crate) mod rediscovery;

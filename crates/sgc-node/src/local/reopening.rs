@@ -9,8 +9,9 @@ use sgc_ros::{Reach, RosNetwork};
 use tokio::sync::{mpsc, oneshot};
 use tracing::{info, warn};
 
-use crate::control::core::CoreEvent;
+use crate::control::event::CoreEvent;
 use crate::link::roaming::Network;
+use crate::local::dds_discovery::discover;
 use crate::local::network_slot::{NetworkSlot, OpenAgain};
 
 /// Interval of looks while the network's reach is in doubt.
@@ -114,7 +115,7 @@ async fn reopen<N: RosNetwork>(
                     return;
                 }
                 let events = events.clone();
-                let discover = move || crate::node::discover(&*opened, events);
+                let discover = move || discover(&*opened, events);
                 if let Ok(Err(error)) = tokio::task::spawn_blocking(discover).await {
                     warn!(%error, "nothing is discovered on the local ROS 2 network: restart the node");
                 }

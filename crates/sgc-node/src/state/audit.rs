@@ -31,7 +31,7 @@ use tracing::warn;
 use self::file::LogFile;
 pub use self::file::{Unread, read, rotated_path};
 use self::quota::{Cause, Quotas};
-use crate::control::core::now;
+use crate::clock::now;
 
 /// Records that may wait to be written.
 const WAITING_MAX: usize = 1024;

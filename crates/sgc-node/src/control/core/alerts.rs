@@ -10,7 +10,8 @@ use sgc_transport::{CloseReason, Link as _};
 use sgc_wire::{Control, Place, UnixMillis};
 use tracing::{debug, info, warn};
 
-use super::{Core, now};
+use super::Core;
+use crate::clock::now;
 use crate::control::alerts::{Alert, clock_alert};
 use crate::local::strangers;
 

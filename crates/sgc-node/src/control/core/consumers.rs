@@ -14,7 +14,8 @@ use sgc_ros::{EndpointKind, EndpointSpec, RosError, RosNetwork, ShownEndpoint, U
 use sgc_wire::{CONSUMERS_PER_INTERFACE_MAX, Consumer, Name, NodeId, Now, Role, RosNode, SinkId};
 use tracing::{debug, info};
 
-use super::{Core, CoreEvent, drop_elsewhere};
+use super::{Core, drop_elsewhere};
+use crate::control::event::{ConsumerKey, CoreEvent};
 
 /// Delay for gathering changes of local consumers before owners are told.
 const TELL_AFTER: Duration = Duration::from_millis(100);
@@ -27,17 +28,6 @@ const SHOW_EACH: Duration = Duration::from_millis(20);
 const ASKED_NODES_MAX: usize = 64;
 /// Most far consumers that are shown, of all nodes and interfaces.
 const SHOWN_MAX: usize = 512;
-
-/// Key of a far consumer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) struct ConsumerKey {
-    /// The share that it uses.
-    pub(super) interface: Name,
-    /// SGC node of the consumer.
-    pub(super) peer: NodeId,
-    /// Id of the consumer at its node.
-    pub(super) id: [u8; 8],
-}
 
 /// The local endpoints that stand for a far consumer.
 struct ShownConsumer {

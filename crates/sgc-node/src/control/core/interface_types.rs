@@ -19,7 +19,9 @@ use sgc_types::{
 use sgc_wire::{CatalogueEntry, DescribedType, Metadata, Name, NodeId};
 use tracing::{debug, warn};
 
-use super::{Core, CoreEvent, now};
+use super::Core;
+use crate::clock::now;
+use crate::control::event::CoreEvent;
 use crate::data::conversion::KnownType;
 use crate::local::type_questions::TypeQuestions;
 

@@ -10,7 +10,7 @@ use sgc_wire::{Name, NodeId, RosNode, SourceId};
 use tracing::debug;
 
 use super::Core;
-use super::consumers::ConsumerKey;
+use crate::control::event::ConsumerKey;
 
 /// Key of a local writer: the joined name and the source.
 type WriterKey = (Name, Option<SourceId>);

@@ -11,7 +11,8 @@ use sgc_wire::{Name, NodeId, Operation, OperationAnswer, RefuseReason, SinkId};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
-use super::{Core, now};
+use super::Core;
+use crate::clock::now;
 use crate::control::operations::{OperationError, Step, UserOperation};
 use crate::control::operators::{OperationOutcome, RequestStep};
 use crate::state::audit::{AuditEvent, AuditRecord};

@@ -8,7 +8,8 @@ use sgc_transport::{CloseReason, Link};
 use sgc_wire::{Name, Now, RefuseReason, Role};
 use tracing::{debug, info, warn};
 
-use super::{Core, EPOCH_GRACE, graph, now};
+use super::{Core, EPOCH_GRACE, graph};
+use crate::clock::now;
 use crate::state::audit::{AuditEvent, AuditRecord};
 
 impl<N: RosNetwork> Core<N> {

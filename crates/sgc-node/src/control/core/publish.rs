@@ -9,7 +9,9 @@ use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, Name, NodeId, Now, SinkId, SourceId, SourceOffer, TopicGrant};
 use tracing::warn;
 
-use super::{Core, CoreEvent, EPOCH_GRACE, now};
+use super::{Core, EPOCH_GRACE};
+use crate::clock::now;
+use crate::control::event::CoreEvent;
 use crate::data::message_keys::MessageKeys;
 use crate::data::sinks::LocalSink;
 use crate::data::sources::{LocalShare, SourceMap, SourceSlot};

@@ -9,7 +9,8 @@ use sgc_transport::{AnyLink, CloseReason, Link};
 use sgc_wire::{Control, NodeId};
 use tracing::info;
 
-use super::{Core, LinkEntry, now};
+use super::{Core, LinkEntry};
+use crate::clock::now;
 use crate::link::keep_alive::{KeepAlive, KeepAlivePolicy, LinkObservation};
 
 /// Interval of looks at the links.

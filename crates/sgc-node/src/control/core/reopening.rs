@@ -7,7 +7,8 @@ use std::any::Any;
 use sgc_ros::{DiscoveryEvent, RosNetwork};
 use tracing::debug;
 
-use super::{Core, drop_elsewhere, now};
+use super::{Core, drop_elsewhere};
+use crate::clock::now;
 use crate::data::calls::Calls;
 use crate::local::rediscovery::Rediscovery;
 

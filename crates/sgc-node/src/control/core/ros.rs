@@ -13,11 +13,14 @@ use tracing::{debug, error};
 
 use super::publish::Offer;
 use super::{
-    Core, CoreEvent, HISTORY_BYTES_MAX, HISTORY_KEEP_ALL_MAX, HISTORY_RETRY, KEYED_INSTANCES_KEPT,
-    LocalReader, drop_elsewhere, now,
+    Core, HISTORY_BYTES_MAX, HISTORY_KEEP_ALL_MAX, HISTORY_RETRY, KEYED_INSTANCES_KEPT, LocalReader,
+    drop_elsewhere,
 };
-use crate::data::assertions::{self, ManualLease};
+use crate::clock::now;
+use crate::control::event::CoreEvent;
+use crate::data::assertions;
 use crate::data::dataplane::{Forward, Out};
+use crate::data::manual_lease::ManualLease;
 use crate::data::outflow::{self, OUTFLOW_AGE_MAX, OutFlow};
 use crate::data::sinks::{LocalSink, WriterQueue};
 use crate::data::sources::{LocalShare, Publisher, SourceMap, SourceSlot};

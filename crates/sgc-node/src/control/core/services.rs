@@ -9,8 +9,9 @@ use sgc_ros::{DiscoveryEvent, RosNetwork, RouteStatus, ServiceSpec, ServiceTopic
 use sgc_wire::{Name, Now, SinkId, TopicGrant};
 use tracing::error;
 
-use super::{Core, CoreEvent, EPOCH_GRACE, ServiceEnd, drop_elsewhere};
+use super::{Core, EPOCH_GRACE, drop_elsewhere};
 use crate::admin::graph::{LostCalls, ServiceCalls};
+use crate::control::event::{CoreEvent, ServiceEnd};
 use crate::data::call_ledger::{CallLedger, CallerId, LEDGERS_MAX};
 use crate::data::calls::{Answers, Calls, FarService, LocalService, Requests};
 use crate::data::sinks::{LocalSink, WriterInfo, WriterQueue};

@@ -10,8 +10,10 @@ use sgc_trust::{Identity, TrustAnchors, VerifiedPeer};
 use sgc_wire::{Credentials, RefuseReason, SinkId};
 use tracing::{info, warn};
 
-use super::{Core, CoreEvent, now};
+use super::Core;
+use crate::clock::now;
 use crate::control::authority::{Asker, DeskAnswers, RenewalAnswer, RenewalRefusal, RenewalRequest};
+use crate::control::event::CoreEvent;
 use crate::state::audit::{AuditEvent, AuditRecord};
 use crate::state::credentials::{renew_at, renewed};
 

@@ -1,0 +1,11 @@
+//! The clocks of the node. Machines take the time as an argument.
+
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
+
+use sgc_wire::{Now, UnixMillis};
+
+/// Returns the current time of both clocks.
+pub(crate) fn now() -> Now {
+    let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    Now { instant: Instant::now(), unix: UnixMillis(unix.as_millis().try_into().unwrap_or(u64::MAX)) }
+}

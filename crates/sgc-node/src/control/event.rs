@@ -1,0 +1,201 @@
+//! Events of the control task: everything that other tasks and threads tell or ask it.
+
+use std::sync::Arc;
+
+use rand_chacha::ChaCha20Rng;
+use sgc_ros::{
+    DiscoveryEvent, EndpointKind, EndpointSpec, Guid, RosClient, RosServer, Routes, ServiceSpec, ShareRule,
+    ShownEndpoint, UseRule,
+};
+use sgc_router::LinkId;
+use sgc_transport::AnyLink;
+use sgc_trust::{CrlError, NodeName, TrustAnchors};
+use sgc_wire::{Control, Name, NodeId, Operation, OperationAnswer, SourceId};
+use tokio::sync::oneshot;
+
+use crate::admin::graph::Graph;
+use crate::admin::status::Status;
+use crate::control::authority::DeskAnswers;
+use crate::control::control_queue::{FrameRoom, InboxShare};
+use crate::control::core::interface_types::TypeOutcome;
+use crate::control::members::MemberNames;
+use crate::control::operations::OperationError;
+use crate::data::dataplane::DataPlane;
+use crate::data::message_keys::MessageKeys;
+use crate::data::outflow::OutFlow;
+use crate::data::sinks::WriterQueue;
+use crate::data::tap::{Tap, TapError, TapRequest};
+use crate::link::control_tx::ControlTx;
+
+/// Events that may wait for the control task. Senders wait while it is full.
+pub(crate) const INBOX_MAX: usize = 4096;
+
+/// Event for the control task.
+pub(crate) enum CoreEvent {
+    /// A link was made.
+    LinkUp {
+        /// The link.
+        link: AnyLink,
+        /// URL, if this node dialled.
+        url: Option<String>,
+        /// Queue of its control frames.
+        control: ControlTx,
+        /// Receives the link's place, or `None` if the node is stopping.
+        reply: oneshot::Sender<Option<LinkPlace>>,
+    },
+    /// The configuration was read again.
+    ConfigurationRead {
+        /// The mistakes for which it was refused.
+        mistakes: Option<String>,
+    },
+    /// A link ended.
+    LinkDown {
+        /// The link.
+        id: LinkId,
+        /// Place of another process with this node's identity, if the peer closed the link for it.
+        in_use: Option<String>,
+    },
+    /// A control frame arrived.
+    Frame {
+        /// The link.
+        link: LinkId,
+        /// The frame.
+        frame: Control,
+        /// Its room in the inbox.
+        room: FrameRoom,
+    },
+    /// A link has taken all control frames before a flush.
+    Flushed {
+        /// The link.
+        link: LinkId,
+    },
+    /// A malformed control frame arrived.
+    Malformed {
+        /// The link.
+        link: LinkId,
+    },
+    /// The local graph changed.
+    Discovery(DiscoveryEvent),
+    /// The local network is about to close and to open again. Answered once the control task holds nothing of it.
+    CloseNetwork(oneshot::Sender<()>),
+    /// The local network is open again. Its discovery events follow.
+    NetworkReopened,
+    /// The local network could not be opened again so far, for this reason.
+    NetworkStaysClosed(String),
+    /// A local writer was created, or failed.
+    WriterReady {
+        /// The joined name.
+        name: Name,
+        /// The source whose messages it writes.
+        source: Option<SourceId>,
+        /// The requested endpoint.
+        spec: EndpointSpec,
+        /// Its queue.
+        writer: Option<Arc<WriterQueue>>,
+    },
+    /// A local reader was created.
+    ReaderReady {
+        /// The share.
+        name: Name,
+        /// The requested endpoint.
+        spec: EndpointSpec,
+        /// Its GUID on the local network.
+        guid: Guid,
+        /// Owner of the reader. Dropping it closes the reader.
+        reader: Box<dyn std::any::Any + Send>,
+    },
+    /// The local endpoints that stand for a far consumer were created, or failed.
+    ConsumerShown {
+        /// The consumer.
+        key: ConsumerKey,
+        /// The requested endpoints with the created ones.
+        ends: Vec<(EndpointKind, EndpointSpec, ShownEndpoint)>,
+    },
+    /// A service's local client or server was created.
+    ServiceReady {
+        /// The share or the joined name.
+        name: Name,
+        /// The requested service.
+        spec: ServiceSpec,
+        /// The client or server.
+        end: ServiceEnd,
+    },
+    /// The node joined the local network after its start. The rules follow.
+    NetworkJoined(Box<Routes<ChaCha20Rng>>),
+    /// The configuration changed. Answered when the change is under way.
+    Reload {
+        /// The new shares.
+        shares: Vec<ShareRule>,
+        /// The new uses.
+        uses: Vec<UseRule>,
+        /// The new trust anchors with kept revocation lists, if they change.
+        anchors: Option<TrustAnchors>,
+        /// Keys for suites that were not in use.
+        message_keys: MessageKeys,
+        /// The names of members in these rules.
+        member_names: MemberNames,
+        /// Notified when the change is under way.
+        reply: oneshot::Sender<()>,
+    },
+    /// The authority's desk answered requests for renewal and carried out operations.
+    DeskAnswered(DeskAnswers),
+    /// A user asks an authority for an operation on the fleet.
+    Operate {
+        /// The authority's name.
+        at: NodeName,
+        /// The operation.
+        operation: Operation,
+        /// The channel for the answer.
+        reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
+    },
+    /// A user brings a revocation list. Answered with whether it is new, and with the lists that were in force before.
+    Crl {
+        /// The list, DER.
+        der: bytes::Bytes,
+        /// The channel for the answer.
+        reply: oneshot::Sender<Result<(bool, Vec<bytes::Bytes>), CrlError>>,
+    },
+    /// Signing keys of these suites were created.
+    MessageKeys(MessageKeys),
+    /// A search for a type ended.
+    TypeLookedFor(TypeOutcome),
+    /// Asks for the status.
+    Status(oneshot::Sender<Status>),
+    /// Asks for the graph, also of a name that is not in use here.
+    Graph(Option<Name>, oneshot::Sender<Graph>),
+    /// Asks for a tap.
+    Tap(TapRequest, oneshot::Sender<Result<Tap, TapError>>),
+    /// Stop receiving. Answered with the queues that still have to drain.
+    Quiesce(oneshot::Sender<Vec<Arc<OutFlow>>>),
+    /// Withdraw the shares and say goodbye. Answered with the links, which the peers then close.
+    Stop(oneshot::Sender<Vec<AnyLink>>),
+}
+
+/// The place of a link at this node.
+pub(crate) struct LinkPlace {
+    /// Its number.
+    pub(crate) id: LinkId,
+    /// Data path for its packets.
+    pub(crate) data: Arc<DataPlane>,
+    /// Its share of the inbox.
+    pub(crate) inbox: InboxShare,
+}
+
+/// This node's end of a service on the local network.
+pub(crate) enum ServiceEnd {
+    /// A client that calls local servers.
+    Client(Arc<dyn RosClient>),
+    /// A server that local clients call.
+    Server(Arc<dyn RosServer>),
+}
+
+/// Key of a far consumer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct ConsumerKey {
+    /// The share that it uses.
+    pub(crate) interface: Name,
+    /// SGC node of the consumer.
+    pub(crate) peer: NodeId,
+    /// Id of the consumer at its node.
+    pub(crate) id: [u8; 8],
+}

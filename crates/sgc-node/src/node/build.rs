@@ -1,0 +1,333 @@
+//! Builds a node: loads its rules, binds its sockets and creates its machines. No task of the node runs yet, except
+//! those of the gateway's sockets.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use rand_chacha::ChaCha20Rng;
+use rand_core::SeedableRng;
+use sgc_config::Config;
+use sgc_endpoint::{Endpoint, EndpointConfig};
+use sgc_ros::{RosNetwork, Routes};
+use sgc_router::{Router, RouterConfig};
+use sgc_transport::{CredentialStore, Dialer, LinkOptions, Listener, TransportMetrics};
+use sgc_trust::{Identity, Suite, TrustAnchors};
+use sgc_types::{Definitions, TypeStore};
+use tokio::sync::{mpsc, watch};
+use tracing::warn;
+
+use crate::clock::now;
+use crate::control::authority::Authority;
+use crate::control::core::{Core, CoreParts};
+use crate::control::event::{CoreEvent, INBOX_MAX};
+use crate::control::peer_rate::PeerRates;
+use crate::control::policy::grantees;
+use crate::control::rules::Rules;
+use crate::data::message_keys;
+use crate::data::sinks::SinkRequest;
+use crate::discovery::Board;
+use crate::gateway::access::{access_with, refused_tokens};
+use crate::gateway::{Gateway, NodeDefinitions, OpenLocalRos, ShownKey, Sockets, key_of_files, listen_at};
+use crate::link::keep_alive::KeepAlivePolicy;
+use crate::local::network_slot::NetworkSlot;
+use crate::node::error::NodeError;
+use crate::node::local::{OpenNetwork, local_routes, open_again};
+use crate::node::random::system_rng;
+use crate::state::audit::{self, Audit, AuditWriter};
+use crate::state::credentials::{StateWriter, with_kept_crls};
+use crate::state::run_lock::RunLock;
+use crate::state::{self, StateError};
+
+/// Delay of the transport's own keep-alive behind ours.
+const KEEP_ALIVE_SLACK: Duration = Duration::from_secs(5);
+/// Lower bound of the transport's idle timeout: two and a half of the longest probe intervals.
+const IDLE_TIMEOUT_MIN: Duration = Duration::from_secs(40);
+
+/// Parts from which a node is built.
+pub(super) struct NodeParts<N> {
+    pub(super) config: Config,
+    pub(super) identity: Arc<Identity>,
+    pub(super) network: Option<Arc<N>>,
+    pub(super) open: Option<OpenNetwork<N>>,
+    pub(super) state: Option<PathBuf>,
+    pub(super) run_lock: RunLock,
+}
+
+/// A node whose tasks are not started.
+pub(super) struct BuiltNode<N: RosNetwork> {
+    pub(super) config: Config,
+    pub(super) identity: Arc<Identity>,
+    pub(super) rules: Rules,
+    pub(super) state: Option<PathBuf>,
+    pub(super) run_lock: RunLock,
+    pub(super) audit: Audit,
+    pub(super) audit_writer: Option<AuditWriter>,
+    pub(super) sockets: LinkSockets,
+    pub(super) network: NetworkSlot<N>,
+    pub(super) open: Option<OpenNetwork<N>>,
+    pub(super) gateway: Arc<Gateway>,
+    pub(super) core: Core<N>,
+    pub(super) channels: CoreChannels,
+    pub(super) board: Board,
+    /// Suites with a signing key.
+    pub(super) suites: BTreeSet<Suite>,
+    pub(super) rng: ChaCha20Rng,
+}
+
+/// Channels between the control task and the other tasks.
+pub(super) struct CoreChannels {
+    pub(super) events: mpsc::Sender<CoreEvent>,
+    pub(super) inbox: mpsc::Receiver<CoreEvent>,
+    /// Requests of the control task's sinks.
+    pub(super) requested: mpsc::Receiver<SinkRequest>,
+    /// Notified when links have to be made again.
+    pub(super) on_redial: watch::Receiver<()>,
+    /// Ends when every thread and blocking task that uses this runtime has ended.
+    pub(super) all_ended: mpsc::Receiver<()>,
+}
+
+/// Builds a node. `open_gateway` opens the gateway's part of the local network.
+pub(super) async fn build<N: RosNetwork>(
+    parts: NodeParts<N>,
+    open_gateway: Option<OpenLocalRos>,
+    types: Option<Arc<TypeStore>>,
+) -> Result<BuiltNode<N>, NodeError> {
+    let NodeParts { config, identity, network, open, state, run_lock } = parts;
+    let rules = Rules::load(&config, &identity, state.as_deref(), now().unix)?;
+    config.warnings().iter().chain(&rules.warnings).for_each(|warning| warn!("{warning}"));
+    let (audit, audit_writer) = open_audit(&config, state.as_deref(), &rules)?;
+    let anchors = with_kept_crls(state.as_deref(), rules.partners.extend(&identity)?, now());
+    let sockets = LinkSockets::bind(&config, &identity, &rules, &anchors)?;
+    let mut rng = system_rng()?;
+    let machines = Machines::new(&config, &identity, &rules, anchors, network.is_some(), &mut rng);
+    let again = open.as_ref().zip(config.ros.as_ref()).map(|(open, ros)| open_again(open, ros));
+    let network = NetworkSlot::new(network, again);
+    let definitions = Definitions::from_env(config.ros.as_ref().map_or(&[], |ros| &ros.definitions));
+    let types = types.unwrap_or_default();
+    let found = NodeDefinitions { files: definitions.clone(), described: types.clone() };
+    let gateway = Gateway::new(open_gateway, identity.node_name().as_str(), found);
+    listen_for_clients(&gateway, &config, &identity, &rules, state.as_deref(), &audit).await?;
+    let (events, inbox) = mpsc::channel(INBOX_MAX);
+    // Every thread and blocking task that uses this runtime holds a clone of `alive`, since the runtime must outlive
+    // them.
+    let (alive, all_ended) = mpsc::channel(1);
+    let (redial, on_redial) = watch::channel(());
+    let wanted = rules.shares.clone();
+    let made = tokio::task::spawn_blocking(move || message_keys::make_for(&wanted, |_| false)).await;
+    let message_keys = made.map_err(|_| NodeError::Panicked)?;
+    let suites = message_keys.keys().copied().collect();
+    let board = Board::default();
+    let (core, requested) = Core::new(CoreParts {
+        types,
+        definitions,
+        member_names: rules.members.clone(),
+        board: board.clone(),
+        keep_alive_policy: keep_alive_policy(&config),
+        message_keys,
+        authority: config.authority.as_ref().map(|wanted| {
+            let operators = grantees(&wanted.operators, &identity, &rules.partners);
+            Authority::new(wanted.fleet.clone(), operators, identity.node_id())
+        }),
+        epoch_messages_max: config.rotation.messages,
+        rates: PeerRates::new(config.peer_rate),
+        keeper: StateWriter::spawn(state.clone(), config.identity.clone(), run_lock.clone(), alive.clone()),
+        redial,
+        alive,
+        identity: identity.clone(),
+        credentials: sockets.credentials.clone(),
+        gateway: gateway.clone(),
+        router: machines.router,
+        endpoint: machines.endpoint,
+        routes: machines.routes,
+        network: network.clone(),
+        events: events.downgrade(),
+        transport: sockets.metrics.clone(),
+        audit: audit.clone(),
+    });
+    let channels = CoreChannels { events, inbox, requested, on_redial, all_ended };
+    Ok(BuiltNode {
+        config,
+        identity,
+        rules,
+        state,
+        run_lock,
+        audit,
+        audit_writer,
+        sockets,
+        network,
+        open,
+        gateway,
+        core,
+        channels,
+        board,
+        suites,
+        rng,
+    })
+}
+
+/// Sockets of links: listeners that are bound, and dialers.
+pub(super) struct LinkSockets {
+    pub(super) credentials: CredentialStore,
+    pub(super) listeners: Vec<Listener>,
+    pub(super) dialer: Arc<Dialer>,
+    /// Dials lanes. DSCP marks belong to sockets, so lanes with another mark need their own.
+    pub(super) lane_dialer: Arc<Dialer>,
+    metrics: Arc<TransportMetrics>,
+}
+
+impl LinkSockets {
+    fn bind(
+        config: &Config,
+        identity: &Arc<Identity>,
+        rules: &Rules,
+        anchors: &TrustAnchors,
+    ) -> Result<Self, NodeError> {
+        let metrics = Arc::new(TransportMetrics::default());
+        let credentials = CredentialStore::new(identity.clone());
+        credentials.set_anchors(anchors.clone());
+        credentials.set_admitted(rules.partners.admitted.clone());
+        let options = link_options(config, identity);
+        let bind = |addr| {
+            Listener::bind(addr, credentials.clone(), options.clone(), metrics.clone())
+                .map_err(|source| NodeError::Listen { addr: addr.clone(), source })
+        };
+        let listeners = config.listen.iter().map(bind).collect::<Result<Vec<_>, _>>()?;
+        let dialer = |options| Arc::new(Dialer::new(credentials.clone(), options, metrics.clone()));
+        let shared = dialer(options.clone());
+        let lane_dialer = match config.transport.lane_dscp {
+            None => shared.clone(),
+            marked => dialer(LinkOptions { dscp: marked, ..options }),
+        };
+        Ok(Self { listeners, dialer: shared, lane_dialer, credentials, metrics })
+    }
+}
+
+fn keep_alive_policy(config: &Config) -> KeepAlivePolicy {
+    config.keep_alive.map_or_else(KeepAlivePolicy::default, KeepAlivePolicy::fixed)
+}
+
+fn link_options(config: &Config, identity: &Identity) -> LinkOptions {
+    let keep_alive_policy = keep_alive_policy(config);
+    LinkOptions {
+        post_quantum: identity.post_quantum(),
+        // The transport's keep-alive matters only for peers that our keep-alive no longer probes.
+        keep_alive: keep_alive_policy.max + KEEP_ALIVE_SLACK,
+        idle_timeout: IDLE_TIMEOUT_MIN.max(keep_alive_policy.max * 5 / 2),
+        congestion: config.transport.congestion,
+        offload: config.transport.offload,
+        mtu_discovery: config.transport.mtu_discovery,
+        dtls12: config.transport.dtls12,
+        dscp: config.transport.dscp,
+        ..LinkOptions::default()
+    }
+}
+
+/// The machines that the control task owns.
+struct Machines {
+    router: Router,
+    endpoint: Endpoint,
+    routes: Option<Routes<ChaCha20Rng>>,
+}
+
+impl Machines {
+    /// Creates the machines. The route machine needs a local network.
+    fn new(
+        config: &Config,
+        identity: &Arc<Identity>,
+        rules: &Rules,
+        anchors: TrustAnchors,
+        has_network: bool,
+        rng: &mut ChaCha20Rng,
+    ) -> Self {
+        let started = now();
+        let router_config = RouterConfig {
+            node: identity.node_id(),
+            identity: identity.clone(),
+            transit: !config.listen.is_empty() && identity.as_peer().may_route,
+            incarnation: rand_core::RngCore::next_u64(rng),
+            started: started.unix,
+            mapping: config.mapping,
+            anchors: Arc::new(anchors.clone()),
+            limits: sgc_router::Limits::default(),
+        };
+        let router = Router::new(router_config, started);
+        let endpoint_config = EndpointConfig {
+            identity: identity.clone(),
+            authority: config.authority.is_some(),
+            operations: config.authority.as_ref().is_some_and(|a| !a.operators.is_empty()),
+            limits: sgc_endpoint::Limits {
+                rotate_every: config.rotation.every,
+                ..sgc_endpoint::Limits::default()
+            },
+        };
+        let mut endpoint = Endpoint::new(endpoint_config, ChaCha20Rng::from_rng(rng), now());
+        endpoint.set_anchors(now(), Arc::new(anchors));
+        let routes = has_network.then(|| {
+            let mut followed = BTreeSet::new();
+            for rule in rules.uses.iter().filter(|rule| rule.token.is_none()) {
+                if followed.insert(rule.owner) {
+                    endpoint.follow(now(), &rule.owner_name);
+                }
+            }
+            local_routes(identity, rules.shares.clone(), rules.uses.clone(), rng)
+        });
+        Self { router, endpoint, routes: routes.flatten() }
+    }
+}
+
+/// Opens the sockets of the gateway, if the configuration has one.
+async fn listen_for_clients(
+    gateway: &Gateway,
+    config: &Config,
+    identity: &Arc<Identity>,
+    rules: &Rules,
+    state: Option<&Path>,
+    audit: &Audit,
+) -> Result<(), NodeError> {
+    let Some(wanted) = &config.gateway else { return Ok(()) };
+    wanted.warnings().iter().for_each(|warning| warn!("{warning}"));
+    let access = access_with(config, identity, &rules.partners, state, now())?;
+    gateway
+        .listen(Sockets {
+            listen: listen_at(wanted),
+            access: access.unwrap_or_default().with_refusal_listener(refused_tokens(audit.clone())),
+            key: match key_of_files(wanted)? {
+                Some(key) => ShownKey::Files(key),
+                None => ShownKey::Own(identity.clone()),
+            },
+            clients_max: wanted.clients_max,
+            client_bytes_max: wanted.client_bytes_max.try_into().unwrap_or(usize::MAX),
+        })
+        .await?;
+    Ok(())
+}
+
+/// Returns the state directory and creates it if needed. A node whose user has no home runs without.
+pub(super) fn state_dir(config: &Config, node: &str) -> Result<Option<PathBuf>, NodeError> {
+    let Some(dir) = state::state_dir(config, node) else {
+        warn!("{}; until then nothing is kept, and there is no audit log", StateError::Nowhere);
+        return Ok(None);
+    };
+    match state::create_state_dir(&dir) {
+        Ok(()) => Ok(Some(dir)),
+        Err(error @ StateError::Directory { .. }) if config.state.is_none() => {
+            warn!("{error}; nothing is kept, and there is no audit log: set `state` in [node]");
+            Ok(None)
+        }
+        Err(error) => Err(error.into()),
+    }
+}
+
+fn open_audit(
+    config: &Config,
+    state: Option<&Path>,
+    rules: &Rules,
+) -> Result<(Audit, Option<AuditWriter>), NodeError> {
+    let path = audit::audit_path(config.audit.file.as_deref(), state);
+    let Some(path) = path.filter(|_| !config.audit.off) else { return Ok((Audit::default(), None)) };
+    let (audit, writer) = Audit::open(&path, config.audit.room, rules.names.clone())
+        .map_err(|source| NodeError::Audit { path, source })?;
+    Ok((audit, Some(writer)))
+}

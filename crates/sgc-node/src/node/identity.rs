@@ -1,0 +1,73 @@
+//! The identity of a node: reads its file and checks it against the configuration.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+use std::sync::Arc;
+
+use sgc_config::{Config, RouterUrl};
+use sgc_trust::{CertError, Identity};
+
+use crate::clock::now;
+use crate::discovery::RouterFilter;
+use crate::node::error::NodeError;
+use crate::state;
+
+/// Reads an identity file, which only its owner may read.
+pub fn load_identity(path: &Path) -> Result<Identity, NodeError> {
+    let file = |source| NodeError::IdentityFile { path: path.to_owned(), source };
+    if let Some(mode) = state::exposed(&fs::metadata(path).map_err(file)?) {
+        return Err(NodeError::IdentityExposed { path: path.to_owned(), mode });
+    }
+    let text = zeroize::Zeroizing::new(fs::read_to_string(path).map_err(file)?);
+    Identity::parse(&text).map_err(|source| NodeError::Identity { path: path.to_owned(), source })
+}
+
+/// Checks the identity as [`run`] does, and binds nothing. A certificate that is not valid yet passes, see
+/// [`clock_alert`](crate::control::alerts::clock_alert).
+pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
+    let identity = load_identity(&config.identity)?;
+    let certified = identity.node_name().as_str();
+    if let Some(configured) = config.node_name.as_ref().filter(|n| n.as_str() != certified) {
+        return Err(NodeError::OtherName {
+            configured: configured.to_string(),
+            certified: certified.to_owned(),
+        });
+    }
+    match identity.anchors().verify(identity.chain(), now().unix) {
+        // The clock may be behind and be set later, as NTP does after the start of a machine without a battery.
+        Ok(_) | Err(CertError::NotYetValid { .. }) => {}
+        Err(source) => return Err(NodeError::Certificate { path: config.identity.clone(), source }),
+    }
+    let touches_topics = !(config.shares.is_empty() && config.uses.is_empty() && config.tokens.is_empty());
+    if identity.fleet_secret().is_none() && touches_topics {
+        return Err(NodeError::RouterIdentity);
+    }
+    if let Some(own) = config.uses.iter().find(|u| u.from.as_str() == certified) {
+        return Err(NodeError::UseOfOwn { node: own.from.to_string() });
+    }
+    wanted_nearby(&config.routers, &identity)?;
+    Ok(identity)
+}
+
+/// Returns the routers wanted on the local network, if any are.
+pub(super) fn wanted_nearby(
+    routers: &[RouterUrl],
+    identity: &Identity,
+) -> Result<Option<RouterFilter>, NodeError> {
+    let mut any = false;
+    let (mut written, mut nodes) = (Vec::new(), BTreeSet::new());
+    for url in routers {
+        let RouterUrl::Mdns(node) = url else { continue };
+        written.push(url.to_string());
+        match node {
+            None => any = true,
+            Some(node) => {
+                let id = identity.node_id_of(node.as_str());
+                nodes.insert(id.ok_or_else(|| NodeError::NamelessIdentity { node: node.to_string() })?);
+            }
+        }
+    }
+    let nodes = (!any).then(|| Arc::new(nodes));
+    Ok((!written.is_empty()).then(|| RouterFilter { written: written.join(", "), nodes }))
+}

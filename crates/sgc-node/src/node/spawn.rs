@@ -1,0 +1,170 @@
+//! Starts the tasks of a node.
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use sgc_ros::RosNetwork;
+use sgc_transport::{Dialer, Listener};
+use tokio::sync::{Mutex, Notify, mpsc, oneshot};
+use tokio::task::JoinHandle;
+use tracing::{info, warn};
+
+use crate::admin::{self, Desk};
+use crate::control::event::CoreEvent;
+use crate::control::file_watch::FileWatch;
+use crate::control::reload::{Reloader, Running};
+use crate::discovery::{self, Claims, Dns, LinkKeeper, LocalNetwork, WorkingUrls};
+use crate::gateway::Gateway;
+use crate::link::lanes::LaneAdmission;
+use crate::link::links::{Admission, keep_accepting};
+use crate::link::roaming::Network;
+use crate::local::dds_discovery::discover;
+use crate::local::network_slot::NetworkSlot;
+use crate::local::reopening;
+use crate::node::build::BuiltNode;
+use crate::node::error::NodeError;
+use crate::node::identity::wanted_nearby;
+use crate::node::local::join_late;
+use crate::node::options::{RunOptions, admin_socket_path};
+use crate::state::audit::{Audit, AuditEvent, AuditRecord, AuditWriter};
+use crate::state::run_lock::RunLock;
+
+/// A running node: the handles by which it is ended.
+pub(super) struct RunningNode<N: RosNetwork> {
+    pub(super) core: JoinHandle<()>,
+    pub(super) events: mpsc::Sender<CoreEvent>,
+    /// Tasks that end with the node.
+    pub(super) tasks: Vec<JoinHandle<()>>,
+    /// Tasks that accept links, each with the sender that stops it.
+    pub(super) accepting: Vec<(JoinHandle<()>, oneshot::Sender<()>)>,
+    /// The task of the status socket.
+    pub(super) socket: JoinHandle<()>,
+    pub(super) reloader: Arc<Reloader>,
+    pub(super) dialer: Arc<Dialer>,
+    pub(super) lane_dialer: Arc<Dialer>,
+    pub(super) gateway: Arc<Gateway>,
+    pub(super) network: NetworkSlot<N>,
+    /// Search for routers on the local network by mDNS.
+    pub(super) local: Option<Arc<LocalNetwork>>,
+    pub(super) audit: Audit,
+    pub(super) audit_writer: Option<AuditWriter>,
+    /// Ends when every thread and blocking task that uses this runtime has ended.
+    pub(super) all_ended: mpsc::Receiver<()>,
+    pub(super) run_lock: RunLock,
+}
+
+/// Starts the tasks of a node, and says so to `options.ready`.
+pub(super) async fn spawn<N: RosNetwork>(
+    node: BuiltNode<N>,
+    options: RunOptions,
+    file_watch: Option<FileWatch>,
+) -> Result<RunningNode<N>, NodeError> {
+    let BuiltNode { config, identity, rules, audit, network, gateway, channels, sockets, board, .. } = node;
+    let (events, mut rng) = (channels.events, node.rng);
+    let core = tokio::spawn(node.core.run(channels.inbox, channels.requested));
+    if let Some(network) = network.get() {
+        let events = events.clone();
+        let discover = move || discover(&*network, events);
+        tokio::task::spawn_blocking(discover).await.map_err(|_| NodeError::Panicked)??;
+    }
+    let listening: Vec<_> = sockets.listeners.iter().map(|l| l.local().clone()).collect();
+    let nearby = wanted_nearby(&config.routers, &identity)?;
+    let announced = if config.announce { &listening[..] } else { &[] };
+    let local = (nearby.is_some() || config.announce)
+        .then(|| LocalNetwork::open(options.mdns_port, announced, &mut rng))
+        .and_then(|opened| {
+            let failed = |why| warn!("mDNS on the local network cannot be used: {why}");
+            opened.map(Arc::new).map_err(failed).ok()
+        });
+    let keeper = LinkKeeper {
+        me: identity.node_id(),
+        dialer: sockets.dialer.clone(),
+        lane_dialer: sockets.lane_dialer.clone(),
+        dns: Dns::new(config.resolver),
+        core: events.clone(),
+        redial: channels.on_redial,
+        claims: Claims::default(),
+        network: Network::watch(),
+        urls: WorkingUrls::open(node.state.as_deref()),
+    };
+    let heard = local.clone().zip(nearby);
+    let mut tasks = discovery::start(&config.routers, &rules.routers, &keeper, &board, heard, &mut rng);
+    let lanes = LaneAdmission::default();
+    let admission = || Admission {
+        core: events.clone(),
+        credentials: sockets.credentials.clone(),
+        claims: keeper.claims.clone(),
+        audit: audit.clone(),
+        lanes: lanes.clone(),
+    };
+    let accepting = sockets.listeners.into_iter().map(|listener| accept(listener, admission())).collect();
+    let socket = admin_socket_path(&config, identity.node_name().as_str());
+    tasks.push(tokio::spawn(reopening::watch(keeper.network.clone(), network.clone(), events.clone())));
+    let reloader = Arc::new(Reloader {
+        source: options.source,
+        join: node.open.map(|open| join_late(open, network.clone(), events.clone(), gateway.clone())),
+        keeper,
+        board,
+        dialling: std::sync::Mutex::default(),
+        identity,
+        credentials: sockets.credentials,
+        state: node.state,
+        audit: audit.clone(),
+        events: events.clone(),
+        has_ros: AtomicBool::new(network.get().is_some()),
+        gateway: gateway.clone(),
+        running: Mutex::new(Running { config, dialled: rules.routers.clone(), rules, suites: node.suites }),
+        changed: Notify::new(),
+    });
+    tasks.extend(reload_tasks(&reloader, options.reload, file_watch));
+    let desk = Desk { events: events.clone(), reloader: reloader.clone(), gateway: gateway.clone() };
+    let socket = admin::begin(socket, desk);
+    audit.write(AuditRecord::new(AuditEvent::Started).by(concat!("sgc ", env!("CARGO_PKG_VERSION"))));
+    if let Some(ready) = options.ready {
+        let _ = ready.send(listening);
+    }
+    Ok(RunningNode {
+        core,
+        events,
+        tasks,
+        accepting,
+        socket,
+        reloader,
+        dialer: sockets.dialer,
+        lane_dialer: sockets.lane_dialer,
+        gateway,
+        network,
+        local,
+        audit,
+        audit_writer: node.audit_writer,
+        all_ended: channels.all_ended,
+        run_lock: node.run_lock,
+    })
+}
+
+fn accept(listener: Listener, admission: Admission) -> (JoinHandle<()>, oneshot::Sender<()>) {
+    info!("listening on {}", listener.local());
+    let (stop, stopped) = oneshot::channel();
+    (tokio::spawn(keep_accepting(listener, admission, stopped)), stop)
+}
+
+/// Starts the tasks that reload the configuration: when a token expires, when `asked` says so, when a file changes.
+fn reload_tasks(
+    reloader: &Arc<Reloader>,
+    asked: Option<mpsc::Receiver<()>>,
+    file_watch: Option<FileWatch>,
+) -> Vec<JoinHandle<()>> {
+    let expiring = reloader.clone();
+    let mut tasks = vec![tokio::spawn(async move { expiring.watch_expiry().await })];
+    if let Some(mut asked) = asked {
+        let reloader = reloader.clone();
+        tasks.push(tokio::spawn(async move {
+            while asked.recv().await.is_some() {
+                // The log has the error; nobody waits for the result.
+                let _ = reloader.reload("SIGHUP").await;
+            }
+        }));
+    }
+    tasks.extend(file_watch.map(|watch| tokio::spawn(watch.run(reloader.clone()))));
+    tasks
+}
