@@ -6,8 +6,6 @@
 mod alerts;
 mod consumers;
 mod graph;
-pub(crate) mod interface_types;
-mod nodes;
 mod operations;
 mod outputs;
 mod publish;
@@ -16,6 +14,7 @@ mod reopening;
 mod ros;
 mod services;
 mod trust;
+mod types;
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -37,16 +36,15 @@ use crate::clock::now;
 use crate::control::alerts::{Alerts, clock_alert};
 use crate::control::authority::Authority;
 use crate::control::control_queue::Inbox;
-use crate::control::core::consumers::FarConsumers;
-use crate::control::core::interface_types::InterfaceTypes;
-use crate::control::core::nodes::LocalGraph;
-use crate::control::core::publish::{Offer, Publishing};
-use crate::control::core::reopening::Reopening;
 use crate::control::event::{CoreEvent, INBOX_MAX, LinkPlace};
+use crate::control::far_consumers::FarConsumers;
+use crate::control::interface_types::InterfaceTypes;
+use crate::control::local_graph::LocalGraph;
 use crate::control::members::{MemberNames, Members};
 use crate::control::operations::Operations;
 use crate::control::peer_rate::PeerRates;
 use crate::control::problem_log::ProblemLog;
+use crate::control::publishing::{Offer, Publishing};
 use crate::data::call_ledger::CallLedger;
 use crate::data::calls::Calls;
 use crate::data::dataplane::DataPlane;
@@ -62,6 +60,7 @@ use crate::gateway::Gateway;
 use crate::link::control_tx::ControlTx;
 use crate::link::keep_alive::{KeepAlive, KeepAlivePolicy};
 use crate::local::network_slot::NetworkSlot;
+use crate::local::network_state::NetworkState;
 use crate::state::audit::{Audit, AuditEvent, AuditRecord};
 use crate::state::credentials::StateWriter;
 
@@ -130,7 +129,7 @@ pub(crate) struct Core<N: RosNetwork> {
     writers: HashMap<(Name, Option<SourceId>), EndpointSpec>,
     /// Far nodes that the local graph shows.
     graph: LocalGraph,
-    reopening: Reopening,
+    reopening: NetworkState,
     /// Local consumers that owners are told, and far consumers that are shown here.
     consumers: FarConsumers,
     history_due: BTreeMap<(Name, SourceId), Instant>,
@@ -255,7 +254,7 @@ impl<N: RosNetwork> Core<N> {
             service_ends: HashMap::new(),
             writers: HashMap::new(),
             graph,
-            reopening: Reopening::default(),
+            reopening: NetworkState::default(),
             consumers: FarConsumers::default(),
             history_due: BTreeMap::new(),
             retire_due: BTreeMap::new(),
@@ -398,16 +397,16 @@ impl<N: RosNetwork> Core<N> {
                 let _ = reply.send(());
             }
             CoreEvent::NetworkReopened => self.network_reopened(),
-            CoreEvent::NetworkStaysClosed(reason) => self.reopening.failed = Some(reason),
+            CoreEvent::NetworkStaysClosed(reason) => self.reopening.stays_closed(reason),
             CoreEvent::ReaderReady { name, spec, guid, reader } => match self.readers.get_mut(&name) {
-                Some(wanted) if wanted.spec == spec && !self.reopening.is_closed => {
+                Some(wanted) if wanted.spec == spec && !self.reopening.is_closed() => {
                     wanted.opened = Some(reader);
                     self.graph.reader_there(name, guid);
                 }
                 _ => drop_elsewhere(reader),
             },
             CoreEvent::WriterReady { name, source, spec, writer } => {
-                let wanted = !self.reopening.is_closed && self.writers.get(&(name, source)) == Some(&spec);
+                let wanted = !self.reopening.is_closed() && self.writers.get(&(name, source)) == Some(&spec);
                 match (self.sinks.get(&name), writer) {
                     (Some(sink), Some(writer)) if wanted => {
                         self.graph.writer_there((name, source), writer.guid());
@@ -553,12 +552,19 @@ impl<N: RosNetwork> Core<N> {
                 let retire = self.retire_due.values().min().copied();
                 let rekey = self.rekey_deadline();
                 let own = [self.renew_due, self.silence_due, self.look_due, self.operations.deadline()];
-                let own = own.into_iter().chain([self.reopening.rediscovery.deadline()]);
+                let own = own.into_iter().chain([self.reopening.deadline()]);
                 let all = [router, endpoint, routes, history, retire, rekey, self.calls_deadline()];
                 let all =
                     all.into_iter().chain(own).chain([self.types.deadline(), self.consumers.deadline()]);
                 return all.flatten().min();
             }
+        }
+    }
+
+    /// Shows changes in the local graph.
+    fn show_graph(&mut self) {
+        if let Some(network) = self.network.get() {
+            self.graph.show(network, &self.alive, &self.ros_failures);
         }
     }
 
@@ -672,7 +678,7 @@ impl<N: RosNetwork> Core<N> {
             names: names.collect(),
             drops: self.all_drops(),
             refused: self.all_refused(),
-            local_network_reopened: self.reopening.times,
+            local_network_reopened: self.reopening.reopenings(),
             router: RouterLine {
                 nodes: router.nodes,
                 names: router.names,

@@ -3,6 +3,7 @@
 pub(crate) mod dds_discovery;
 pub mod discovery_server;
 pub(crate) mod network_slot;
+pub(crate) mod network_state;
 pub(crate) mod rediscovery;
 pub(crate) mod reopening;
 pub(crate) mod strangers;

@@ -119,14 +119,14 @@ impl<N: RosNetwork> Core<N> {
         alerts.extend(sgc_dds::unsent().and_then(|unsent| {
             let ago_s = now.instant.saturating_duration_since(unsent.last).as_secs();
             let (to, packets) = (unsent.to, unsent.packets);
-            let is_of_before = self.reopening.last.is_some_and(|reopened| unsent.last < reopened);
+            let is_of_before = self.reopening.reopened_at().is_some_and(|reopened| unsent.last < reopened);
             (ago_s < UNSENT_SHOWN_S && !is_of_before).then_some(Alert::LocalNetworkFails {
                 to,
                 packets,
                 ago_s,
             })
         }));
-        let closed = self.reopening.failed.clone();
+        let closed = self.reopening.failure().map(str::to_owned);
         alerts.extend(closed.map(|reason| Alert::LocalNetworkClosed { reason }));
         alerts.extend(strangers::alerts());
         alerts.extend(self.links.iter().filter_map(|(id, entry)| {

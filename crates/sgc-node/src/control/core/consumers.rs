@@ -5,207 +5,29 @@
 //! endpoint that nothing matches ([`RosNetwork::show`]). One writer writes the messages of all far publishers. It is
 //! shown as the first of them, and each other one by an endpoint that nothing matches.
 
-use std::any::Any;
-use std::collections::{BTreeMap, BTreeSet};
-use std::time::{Duration, Instant};
+use std::collections::BTreeMap;
+use std::time::Duration;
 
 use sgc_endpoint::LostReason;
 use sgc_ros::{EndpointKind, EndpointSpec, RosError, RosNetwork, ShownEndpoint, UNREACHABLE_HOLD};
-use sgc_wire::{CONSUMERS_PER_INTERFACE_MAX, Consumer, Name, NodeId, Now, Role, RosNode, SinkId};
+use sgc_wire::{Consumer, NodeId, Now};
 use tracing::{debug, info};
 
 use super::{Core, drop_elsewhere};
 use crate::control::event::{ConsumerKey, CoreEvent};
-
-/// Delay for gathering changes of local consumers before owners are told.
-const TELL_AFTER: Duration = Duration::from_millis(100);
-/// Delay for gathering changes of far consumers before they are shown.
-const SHOW_AFTER: Duration = Duration::from_millis(100);
-/// Delay of a node's next announcement for each new consumer, since showing one informs all programs of the local
-/// network.
-const SHOW_EACH: Duration = Duration::from_millis(20);
-/// Most nodes that are asked for their consumers.
-const ASKED_NODES_MAX: usize = 64;
-/// Most far consumers that are shown, of all nodes and interfaces.
-const SHOWN_MAX: usize = 512;
-
-/// The local endpoints that stand for a far consumer.
-struct ShownConsumer {
-    node: RosNode,
-    ends: Vec<(EndpointKind, EndpointSpec)>,
-    /// The endpoints; `None` while they are being created.
-    endpoints: Option<Vec<(EndpointKind, ShownEndpoint)>>,
-}
-
-/// The consumers that a node announced.
-struct PeerConsumers {
-    current: Vec<Consumer>,
-    /// Its last announcement, until that is applied.
-    next: Option<Vec<Consumer>>,
-    /// Time at which it may be applied.
-    ready_at: Instant,
-}
-
-/// The sinks of a node at one share.
-#[derive(Default)]
-struct Sinks {
-    granted: BTreeSet<SinkId>,
-    /// Time until which a node without sinks still counts as granted.
-    until: Option<Instant>,
-}
-
-/// The far consumers, and the schedule of announcing the local ones.
-#[derive(Default)]
-pub(super) struct FarConsumers {
-    /// Time at which owners are told of local consumers.
-    tell_due: Option<Instant>,
-    /// Time at which far consumers are shown.
-    show_due: Option<Instant>,
-    sinks: BTreeMap<NodeId, BTreeMap<(Name, Role), Sinks>>,
-    asked: BTreeSet<NodeId>,
-    told: BTreeMap<NodeId, PeerConsumers>,
-    /// Unreachable nodes, and the time until which their consumers stay.
-    lost: BTreeMap<NodeId, Instant>,
-    shown: BTreeMap<ConsumerKey, ShownConsumer>,
-    /// Numbers of consumers without room at the last attempt: local ones to announce, and far ones to show.
-    left_out: [u64; 2],
-}
-
-impl FarConsumers {
-    pub(super) fn sink_joined(&mut self, now: Instant, peer: NodeId, name: Name, sink: SinkId, role: Role) {
-        let sinks = self.sinks.entry(peer).or_default().entry((name, role)).or_default();
-        sinks.granted.insert(sink);
-        sinks.until = None;
-        self.show_soon(now);
-    }
-
-    /// Removes a sink. Its node still counts as granted until `until`, so that a restart of a router changes nothing.
-    pub(super) fn sink_left(&mut self, peer: NodeId, name: Name, sink: SinkId, until: Instant) {
-        let of_peer = self.sinks.get_mut(&peer).into_iter().flatten();
-        for (_, sinks) in of_peer.filter(|((of, _), _)| *of == name) {
-            if sinks.granted.remove(&sink) && sinks.granted.is_empty() {
-                sinks.until = Some(until);
-            }
-        }
-    }
-
-    pub(super) fn deadline(&self) -> Option<Instant> {
-        let left = self.sinks.values().flat_map(BTreeMap::values).filter_map(|sinks| sinks.until);
-        let told = self.told.values().filter(|told| told.next.is_some()).map(|told| told.ready_at);
-        left.chain(told).chain(self.lost.values().copied()).chain(self.tell_due).chain(self.show_due).min()
-    }
-
-    /// Stores a node's announcement. It is applied soon, or later if the node announced many new consumers.
-    fn tell(&mut self, now: Instant, peer: NodeId, consumers: Vec<Consumer>) {
-        let soon = now + SHOW_AFTER;
-        let new = || PeerConsumers { current: Vec::new(), next: None, ready_at: soon };
-        let told = self.told.entry(peer).or_insert_with(new);
-        if told.next.replace(consumers).is_none() {
-            told.ready_at = told.ready_at.max(soon);
-        }
-    }
-
-    /// Applies the announcements that are due. Returns `true` if there was one.
-    fn take_over(&mut self, now: Instant) -> bool {
-        let mut took = false;
-        for told in self.told.values_mut().filter(|told| told.ready_at <= now) {
-            let Some(next) = told.next.take() else { continue };
-            let added = next.iter().filter(|consumer| !told.current.contains(consumer)).count();
-            told.ready_at = now + SHOW_EACH * u32::try_from(added).unwrap_or(u32::MAX);
-            told.current = next;
-            took = true;
-        }
-        took
-    }
-
-    pub(super) fn show_soon(&mut self, now: Instant) {
-        self.show_due.get_or_insert(now + SHOW_AFTER);
-    }
-
-    /// Removes and returns the endpoints of all shown consumers.
-    pub(super) fn take_shown(&mut self) -> Vec<Box<dyn Any + Send>> {
-        let shown = std::mem::take(&mut self.shown).into_values();
-        shown.filter_map(|shown| Some(Box::new(shown.endpoints?) as _)).collect()
-    }
-
-    /// Returns the type hashes that a share's far subscribers or clients announce, with their SGC nodes.
-    pub(super) fn hashes(&self, interface: Name, role: Role) -> impl Iterator<Item = (NodeId, &str)> {
-        let of = (interface, role);
-        self.told
-            .iter()
-            .filter(move |(peer, _)| self.sinks.get(peer).is_some_and(|granted| granted.contains_key(&of)))
-            .flat_map(move |(peer, told)| {
-                let is_it = move |consumer: &&Consumer| (consumer.interface, consumer.role) == of;
-                let of_it = told.current.iter().filter(is_it);
-                of_it.filter_map(|consumer| consumer.type_hash.as_deref()).map(|hash| (*peer, hash))
-            })
-    }
-
-    /// Forgets expired entries. Returns `true` if there was one.
-    fn forget(&mut self, now: Instant) -> bool {
-        let mut forgot = false;
-        let mut is_over = |until: Option<Instant>| {
-            let is_over = until.is_some_and(|until| until <= now);
-            forgot |= is_over;
-            is_over
-        };
-        self.lost.retain(|peer, until| {
-            let is_over = is_over(Some(*until));
-            if is_over && let Some(told) = self.told.get_mut(peer) {
-                // The pace is kept, since the node may return at once.
-                (told.current, told.next) = (Vec::new(), None);
-            }
-            !is_over
-        });
-        for names in self.sinks.values_mut() {
-            names.retain(|_, sinks| !is_over(sinks.until));
-        }
-        self.sinks.retain(|_, names| !names.is_empty());
-        forgot
-    }
-
-    /// Returns the consumers to show, and the number without room. All nodes have the same share of places.
-    fn wanted(&self) -> (BTreeMap<ConsumerKey, &Consumer>, u64) {
-        let (mut ranked, mut left_out) = (Vec::new(), 0);
-        for (peer, told) in &self.told {
-            let Some(granted) = self.sinks.get(peer) else { continue };
-            let mut of_interface = BTreeMap::<Name, usize>::new();
-            let is_granted =
-                |consumer: &&Consumer| granted.contains_key(&(consumer.interface, consumer.role));
-            let mut rank = 0;
-            for consumer in told.current.iter().filter(is_granted) {
-                let known = of_interface.entry(consumer.interface).or_default();
-                if *known >= CONSUMERS_PER_INTERFACE_MAX {
-                    left_out += 1;
-                    continue;
-                }
-                *known += 1;
-                let key = ConsumerKey { interface: consumer.interface, peer: *peer, id: consumer.id };
-                ranked.push((rank, key, consumer));
-                rank += 1;
-            }
-        }
-        ranked.sort_by_key(|(rank, key, _)| (*rank, *key));
-        left_out += ranked.len().saturating_sub(SHOWN_MAX) as u64;
-        ranked.truncate(SHOWN_MAX);
-        (ranked.into_iter().map(|(_, key, consumer)| (key, consumer)).collect(), left_out)
-    }
-}
+use crate::control::far_consumers::{AskChanges, MadeEndpoints, ShowChanges};
 
 impl<N: RosNetwork> Core<N> {
     /// Schedules an announcement, since local consumers may have changed.
     pub(super) fn note_consumers(&mut self) {
         if self.routes.as_mut().is_some_and(|routes| routes.take_consumers_changed()) {
-            self.consumers.tell_due.get_or_insert_with(|| Instant::now() + TELL_AFTER);
+            self.consumers.tell_soon();
         }
     }
 
     /// Handles a node's announcement of its consumers.
     pub(super) fn consumers_told(&mut self, now: Now, peer: NodeId, consumers: Vec<Consumer>) {
-        if self.consumers.asked.contains(&peer) {
-            self.consumers.lost.remove(&peer);
-            self.consumers.tell(now.instant, peer, consumers);
-        }
+        self.consumers.peer_told(now.instant, peer, consumers);
     }
 
     /// Handles that a node no longer announces its consumers. They go at once if it withdrew them, or after a while if
@@ -215,22 +37,19 @@ impl<N: RosNetwork> Core<N> {
             LostReason::Withdrawn | LostReason::Refused(_) => Duration::ZERO,
             LostReason::Unreachable | LostReason::Cut(_) => UNREACHABLE_HOLD,
         };
-        if self.consumers.asked.contains(&peer) {
-            self.consumers.lost.entry(peer).or_insert(now.instant + hold);
-        }
+        self.consumers.peer_lost(peer, now.instant + hold);
     }
 
     pub(super) fn consumers_due(&mut self, now: Now) {
-        if self.consumers.tell_due.take_if(|at| *at <= now.instant).is_some()
+        if self.consumers.take_tell_due(now.instant)
             && let Some(routes) = &self.routes
         {
             let consumers = routes.consumers();
-            self.count_left_out(0, "consumers_untold", consumers.left_out);
+            let more = self.consumers.more_untold(consumers.left_out);
+            self.count_left_out("consumers_untold", more);
             self.endpoint.set_consumers(now, consumers.by_owner);
         }
-        let is_due = self.consumers.show_due.take_if(|at| *at <= now.instant).is_some();
-        let took_over = self.consumers.take_over(now.instant);
-        if self.consumers.forget(now.instant) || took_over || is_due {
+        if self.consumers.take_changes(now.instant) {
             self.ask_consumers(now);
             self.show_consumers();
         }
@@ -239,20 +58,12 @@ impl<N: RosNetwork> Core<N> {
     /// Asks the granted nodes for their consumers, and no others.
     fn ask_consumers(&mut self, now: Now) {
         let has_graph = self.network.get().is_some_and(|network| network.has_graph());
-        let consumers = &mut self.consumers;
-        let gone: Vec<_> =
-            consumers.asked.iter().filter(|peer| !consumers.sinks.contains_key(peer)).copied().collect();
-        for peer in gone {
-            consumers.asked.remove(&peer);
-            consumers.told.remove(&peer);
-            consumers.lost.remove(&peer);
+        let AskChanges { leave, ask } = self.consumers.ask(has_graph, self.identity.node_id());
+        for peer in leave {
             self.endpoint.leave_consumers(now, &peer);
         }
-        let own = self.identity.node_id();
-        for peer in consumers.sinks.keys().filter(|peer| has_graph && **peer != own) {
-            if consumers.asked.len() < ASKED_NODES_MAX && consumers.asked.insert(*peer) {
-                self.endpoint.ask_consumers(now, *peer);
-            }
+        for peer in ask {
+            self.endpoint.ask_consumers(now, peer);
         }
     }
 
@@ -276,31 +87,17 @@ impl<N: RosNetwork> Core<N> {
             !is_first
         });
         self.graph.set_publishers(publishers);
-        self.count_left_out(1, "consumers_unshown", left_out);
-        let is_gone = |key: &ConsumerKey, shown: &ShownConsumer| {
-            wanted.get(key).is_none_or(|(_, ends)| *ends != shown.ends)
-        };
-        let shown = &mut self.consumers.shown;
-        let gone: Vec<_> =
-            shown.iter().filter(|(key, shown)| is_gone(key, shown)).map(|(key, _)| *key).collect();
-        for key in gone {
+        let more = self.consumers.more_unshown(left_out);
+        self.count_left_out("consumers_unshown", more);
+        let ShowChanges { gone, moved, fresh } = self.consumers.show(wanted);
+        for (key, endpoints) in gone {
             self.graph.consumer_gone(&key);
-            if let Some(endpoints) = shown.remove(&key).and_then(|shown| shown.endpoints) {
+            if let Some(endpoints) = endpoints {
                 drop_elsewhere(Box::new(endpoints));
             }
         }
-        let mut fresh = Vec::new();
-        for (key, (node, ends)) in wanted {
-            if let Some(shown) = shown.get_mut(&key) {
-                if std::mem::replace(&mut shown.node, node.clone()) != node
-                    && let Some(endpoints) = &shown.endpoints
-                {
-                    self.graph.consumer_there(key, node, &guids(endpoints));
-                }
-                continue;
-            }
-            shown.insert(key, ShownConsumer { node, ends: ends.clone(), endpoints: None });
-            fresh.push((key, ends));
+        for (key, node, ids) in moved {
+            self.graph.consumer_there(key, node, &ids);
         }
         let Some(events) = self.events.upgrade().filter(|_| !fresh.is_empty()) else { return };
         let (network, alive, failures) = (network.clone(), self.alive.clone(), self.ros_failures.clone());
@@ -342,136 +139,21 @@ impl<N: RosNetwork> Core<N> {
     ) {
         let (ends, endpoints): (Vec<_>, Vec<_>) =
             made.into_iter().map(|(kind, spec, endpoint)| ((kind, spec), (kind, endpoint))).unzip();
-        match self.consumers.shown.get_mut(&key) {
-            Some(shown) if shown.ends == ends && shown.endpoints.is_none() => {
-                self.graph.consumer_there(key, shown.node.clone(), &guids(&endpoints));
-                shown.endpoints = Some(endpoints);
-            }
-            _ => drop_elsewhere(Box::new(endpoints)),
+        match self.consumers.made(&key, &ends, endpoints) {
+            MadeEndpoints::Shown(node, ids) => self.graph.consumer_there(key, node, &ids),
+            MadeEndpoints::Unwanted(endpoints) => drop_elsewhere(Box::new(endpoints)),
         }
     }
 
-    /// Counts the increase of consumers without room.
-    fn count_left_out(&mut self, which: usize, kind: &'static str, left_out: u64) {
-        let before = std::mem::replace(&mut self.consumers.left_out[which], left_out);
-        if left_out > before {
-            self.control_drops.add(kind, left_out - before);
+    /// Counts more consumers without room.
+    fn count_left_out(&self, kind: &'static str, more: u64) {
+        if more > 0 {
+            self.control_drops.add(kind, more);
         }
     }
 
     /// Removes all shown consumers.
     pub(super) fn end_consumers(&mut self) {
         drop_elsewhere(Box::new(std::mem::take(&mut self.consumers).take_shown()));
-    }
-}
-
-fn guids(endpoints: &[(EndpointKind, ShownEndpoint)]) -> Vec<(EndpointKind, sgc_ros::Guid)> {
-    endpoints.iter().map(|(kind, endpoint)| (*kind, endpoint.guid)).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use sgc_wire::{CONSUMERS_MAX, Qos};
-
-    use super::*;
-
-    /// Returns other consumers at each call, as many as a node may announce.
-    fn all_places(telling: u8) -> Vec<Consumer> {
-        let node = RosNode::new("/", "view", None).unwrap();
-        let consumer = |n: usize| {
-            let interface = Name([(n / CONSUMERS_PER_INTERFACE_MAX) as u8; 32]);
-            let mut id = [telling; 8];
-            id[..2].copy_from_slice(&(n as u16).to_be_bytes());
-            Consumer {
-                interface,
-                id,
-                role: Role::Subscribe,
-                node: node.clone(),
-                type_hash: None,
-                qos: Qos::default(),
-            }
-        };
-        (0..CONSUMERS_MAX).map(consumer).collect()
-    }
-
-    fn granted_all(consumers: &mut FarConsumers, now: Instant, peer: NodeId) {
-        for consumer in all_places(0) {
-            consumers.sink_joined(now, peer, consumer.interface, SinkId([0; 16]), Role::Subscribe);
-        }
-    }
-
-    #[test]
-    fn node_that_tells_others_all_the_time_is_shown_at_a_bounded_pace() {
-        let (mut consumers, start, peer) = (FarConsumers::default(), Instant::now(), NodeId([1; 32]));
-        granted_all(&mut consumers, start, peer);
-        let mut shown = BTreeSet::new();
-        let (mut made, lasts) = (0, Duration::from_secs(60));
-        for n in 0..600_u32 {
-            let now = start + n * lasts / 600;
-            consumers.tell(now, peer, all_places(n as u8));
-            if consumers.take_over(now) {
-                let wanted: BTreeSet<_> = consumers.wanted().0.into_keys().collect();
-                made += wanted.difference(&shown).count();
-                shown = wanted;
-                // A node that withdraws its consumers does not start over.
-                consumers.lost.insert(peer, now);
-                assert!(consumers.forget(now));
-                consumers.lost.clear();
-            }
-        }
-        let bound = (lasts.as_millis() / SHOW_EACH.as_millis()) as usize + CONSUMERS_MAX;
-        assert!((CONSUMERS_MAX..=bound).contains(&made), "{made} made, {bound} may be");
-    }
-
-    #[test]
-    fn change_of_one_consumer_is_shown_without_delay() {
-        let (mut consumers, start, peer) = (FarConsumers::default(), Instant::now(), NodeId([1; 32]));
-        // Nothing is granted yet; a grant alone would cause a change soon.
-        for n in 0..20_u8 {
-            let now = start + u32::from(n) * 2 * SHOW_AFTER;
-            consumers.tell(now, peer, all_places(n).into_iter().take(1).collect());
-            assert!(!consumers.take_over(now), "changes are gathered");
-            assert_eq!(consumers.deadline(), Some(now + SHOW_AFTER));
-            assert!(consumers.take_over(now + SHOW_AFTER));
-        }
-    }
-
-    #[test]
-    fn node_with_many_consumers_leaves_places_to_others() {
-        let (mut consumers, now) = (FarConsumers::default(), Instant::now());
-        let peers = [NodeId([1; 32]), NodeId([2; 32])];
-        for (peer, count) in peers.into_iter().zip([CONSUMERS_MAX, 1]) {
-            granted_all(&mut consumers, now, peer);
-            consumers.tell(now, peer, all_places(0).into_iter().take(count).collect());
-        }
-        assert!(consumers.take_over(now + SHOW_AFTER));
-        let (wanted, left_out) = consumers.wanted();
-        assert_eq!((wanted.len(), left_out), (SHOWN_MAX, 1));
-        assert!(wanted.keys().any(|key| key.peer == peers[1]));
-    }
-
-    #[test]
-    fn consumers_are_shown_in_a_role_that_their_node_was_granted() {
-        let (peer, interface, now) = (NodeId([1; 32]), Name([2; 32]), Instant::now());
-        let consumer = |role| Consumer {
-            interface,
-            id: [role as u8; 8],
-            role,
-            node: RosNode::new("/", "teleop", None).unwrap(),
-            type_hash: None,
-            qos: Qos::default(),
-        };
-        let mut far = FarConsumers::default();
-        far.tell(now, peer, [Role::Subscribe, Role::Publish].map(consumer).into());
-        assert!(far.take_over(now + SHOW_AFTER));
-        let wanted = |far: &FarConsumers| far.wanted().0.values().map(|one| one.role).collect::<Vec<_>>();
-        assert_eq!(wanted(&far), []);
-        far.sink_joined(now, peer, interface, SinkId([3; 16]), Role::Subscribe);
-        assert_eq!(wanted(&far), [Role::Subscribe]);
-        far.sink_joined(now, peer, interface, SinkId([4; 16]), Role::Publish);
-        assert_eq!(wanted(&far), [Role::Subscribe, Role::Publish]);
-        far.sink_left(peer, interface, SinkId([4; 16]), now);
-        assert!(far.forget(now));
-        assert_eq!(wanted(&far), [Role::Subscribe]);
     }
 }

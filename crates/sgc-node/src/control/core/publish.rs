@@ -1,47 +1,21 @@
 //! Publishing on names of other nodes, and messages of other publishers on our shares.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use sgc_endpoint::{JoinKind, RecoveryLimits, Source, SourceConfig};
-use sgc_ros::{RosNetwork, Shaping};
+use sgc_ros::RosNetwork;
 use sgc_trust::{MessageKey, Suite};
-use sgc_wire::{Class, Name, NodeId, Now, SinkId, SourceId, SourceOffer, TopicGrant};
+use sgc_wire::{Name, Now, SinkId, SourceOffer, TopicGrant};
 use tracing::warn;
 
 use super::{Core, EPOCH_GRACE};
 use crate::clock::now;
 use crate::control::event::CoreEvent;
+use crate::control::publishing::{GrantEffect, Offer, Publishing};
 use crate::data::message_keys::MessageKeys;
 use crate::data::sinks::LocalSink;
 use crate::data::sources::{LocalShare, SourceMap, SourceSlot};
-
-/// Time for which a publisher keeps the old key of another node's topic. The owner gives the others as long to get the
-/// new one.
-const REKEY_WAIT: Duration = Duration::from_secs(1);
-
-/// A topic of another node that this node wants to publish on.
-pub(super) struct Offer {
-    pub(super) owner: NodeId,
-    /// Suite id on the wire.
-    pub(super) suite: u8,
-    pub(super) class: Class,
-    pub(super) reliable: bool,
-    pub(super) shaping: Shaping,
-    /// Whether it is a service.
-    pub(super) calls: bool,
-}
-
-/// State of publishing under another node's name.
-pub(super) struct Publishing {
-    id: SourceId,
-    class: Class,
-    reliable: bool,
-    /// Grant of the source's current key; `None` until the owner granted it.
-    grant: Option<TopicGrant>,
-    /// Key of the next epoch, and its beginning.
-    next: Option<(Instant, TopicGrant)>,
-}
 
 impl<N: RosNetwork> Core<N> {
     /// Asks the owner of `name` for permission to publish, at once or when there is a signing key.
@@ -63,7 +37,7 @@ impl<N: RosNetwork> Core<N> {
         let share = Arc::new(LocalShare::new(name, self.data.clone(), self.alive.clone(), max, over));
         share.set_shaping(shaping);
         self.shares.insert(name, share);
-        self.publishing.insert(name, Publishing { id, class, reliable, grant: None, next: None });
+        self.publishing.insert(name, Publishing::new(id, class, reliable));
         let offer = SourceOffer { source: id, key: message_key.public().clone() };
         self.endpoint.join(now(), name, owner, JoinKind::Publish(offer));
         if calls {
@@ -95,51 +69,42 @@ impl<N: RosNetwork> Core<N> {
     /// `true` if the owner knows nothing of earlier messages.
     pub(super) fn publishing_granted(&mut self, now: Now, name: Name, grant: &TopicGrant) -> Option<bool> {
         let publishing = self.publishing.get_mut(&name)?;
-        match &publishing.grant {
-            Some(known) if (known.epoch, &known.key) == (grant.epoch, &grant.key) => Some(false),
-            Some(known) if known.epoch < grant.epoch => {
-                publishing.next = Some((now.instant + REKEY_WAIT, grant.clone()));
-                Some(false)
-            }
-            // The owner restarted: numbers begin again under another key.
-            Some(_) | None => {
-                publishing.grant = Some(grant.clone());
-                publishing.next = None;
-                // Only sources of the owner can be asked for missing messages.
-                let (id, class, reliable) = (publishing.id, publishing.class, publishing.reliable);
-                let config = SourceConfig {
-                    name,
-                    id,
-                    class,
-                    reliable,
-                    history_depth: 0,
-                    history_bytes_max: 0,
-                    recovery: RecoveryLimits::NONE,
-                };
-                let key = self.message_key(grant.suite);
-                let source = key.and_then(|key| Source::new(config, grant, key));
-                if let (Some(source), Some(share)) = (source, self.shares.get(&name)) {
-                    let shared = Some(SourceSlot::new(source, false, reliable));
-                    share.set_map(SourceMap { shared, ..SourceMap::default() });
-                }
-                Some(true)
-            }
+        if publishing.granted(now.instant, grant) == GrantEffect::Kept {
+            return Some(false);
         }
+        // Only sources of the owner can be asked for missing messages.
+        let (id, class, reliable) = publishing.source();
+        let config = SourceConfig {
+            name,
+            id,
+            class,
+            reliable,
+            history_depth: 0,
+            history_bytes_max: 0,
+            recovery: RecoveryLimits::NONE,
+        };
+        let key = self.message_key(grant.suite);
+        let source = key.and_then(|key| Source::new(config, grant, key));
+        if let (Some(source), Some(share)) = (source, self.shares.get(&name)) {
+            let shared = Some(SourceSlot::new(source, false, reliable));
+            share.set_map(SourceMap { shared, ..SourceMap::default() });
+        }
+        Some(true)
     }
 
     /// Switches to the keys whose epoch begins now.
     pub(super) fn rekey_due(&mut self, now: Now) {
         for (name, publishing) in &mut self.publishing {
-            let due = publishing.next.take_if(|(at, _)| *at <= now.instant);
-            if let (Some((_, grant)), Some(share)) = (due, self.shares.get(name)) {
+            let due = publishing.take_due(now.instant);
+            if let (Some(grant), Some(share)) = (due, self.shares.get(name)) {
                 share.rekey(grant.clone());
-                publishing.grant = Some(grant);
+                publishing.rekeyed(grant);
             }
         }
     }
 
     pub(super) fn rekey_deadline(&self) -> Option<Instant> {
-        self.publishing.values().filter_map(|p| p.next.as_ref().map(|(at, _)| *at)).min()
+        self.publishing.values().filter_map(Publishing::deadline).min()
     }
 
     pub(super) fn stop_publishing(&mut self, name: &Name) {

@@ -12,19 +12,6 @@ use crate::clock::now;
 use crate::data::calls::Calls;
 use crate::local::rediscovery::Rediscovery;
 
-/// State of reopening the local network.
-#[derive(Default)]
-pub(super) struct Reopening {
-    /// Whether the network is closed and not open again yet.
-    pub(super) is_closed: bool,
-    /// Reason of the last failure to open it.
-    pub(super) failed: Option<String>,
-    pub(super) rediscovery: Rediscovery,
-    /// Time of the last reopening, and their number.
-    pub(super) last: Option<std::time::Instant>,
-    pub(super) times: u64,
-}
-
 impl<N: RosNetwork> Core<N> {
     /// Ends all endpoints of the local network, which the caller has taken.
     pub(super) fn close_network(&mut self) {
@@ -34,8 +21,7 @@ impl<N: RosNetwork> Core<N> {
             }
             None => (Vec::new(), Vec::new()),
         };
-        self.reopening.is_closed = true;
-        self.reopening.rediscovery = Rediscovery::new(endpoints, participants);
+        self.reopening.closed(Rediscovery::new(endpoints, participants));
         let mut ending: Vec<Box<dyn Any + Send>> = Vec::new();
         ending.extend(self.readers.values_mut().filter_map(|reader| reader.opened.take()));
         for (name, source) in self.writers.keys() {
@@ -62,11 +48,7 @@ impl<N: RosNetwork> Core<N> {
     /// Creates the endpoints of the old network on the new one.
     pub(super) fn network_reopened(&mut self) {
         let now = now().instant;
-        self.reopening.is_closed = false;
-        self.reopening.failed = None;
-        self.reopening.last = Some(now);
-        self.reopening.times += 1;
-        self.reopening.rediscovery.opened(now);
+        self.reopening.opened(now);
         self.graph.endpoints_gone();
         let readers: Vec<_> =
             self.readers.iter().map(|(name, reader)| (*name, reader.spec.clone())).collect();
@@ -96,17 +78,14 @@ impl<N: RosNetwork> Core<N> {
 
     /// Handles a discovery event, unless the network is closed.
     pub(super) fn discovered(&mut self, event: DiscoveryEvent) {
-        if self.reopening.is_closed {
-            return;
-        }
-        if let Some(event) = self.reopening.rediscovery.news(event) {
+        if let Some(event) = self.reopening.news(event) {
             self.handle_discovery(event);
         }
     }
 
     /// Reports endpoints that the new network lacks as gone.
     pub(super) fn rediscovery_due(&mut self, now: std::time::Instant) {
-        for event in self.reopening.rediscovery.handle_timeout(now) {
+        for event in self.reopening.handle_timeout(now) {
             self.handle_discovery(event);
         }
     }

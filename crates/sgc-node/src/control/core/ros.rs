@@ -11,13 +11,13 @@ use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, History, Kind, Name, Qos, SourceId};
 use tracing::{debug, error};
 
-use super::publish::Offer;
 use super::{
     Core, HISTORY_BYTES_MAX, HISTORY_KEEP_ALL_MAX, HISTORY_RETRY, KEYED_INSTANCES_KEPT, LocalReader,
     drop_elsewhere,
 };
 use crate::clock::now;
 use crate::control::event::CoreEvent;
+use crate::control::publishing::Offer;
 use crate::data::assertions;
 use crate::data::dataplane::{Forward, Out};
 use crate::data::manual_lease::ManualLease;

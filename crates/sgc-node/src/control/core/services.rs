@@ -226,7 +226,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn service_ready(&mut self, name: Name, spec: &ServiceSpec, end: ServiceEnd) {
-        let wanted = !self.reopening.is_closed && self.service_ends.get(&name) == Some(spec);
+        let wanted = !self.reopening.is_closed() && self.service_ends.get(&name) == Some(spec);
         if wanted {
             self.graph.service_there(
                 name,

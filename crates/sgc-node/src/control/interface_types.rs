@@ -1,27 +1,22 @@
-//! [`InterfaceTypes`]: searches for the types of shared and used interfaces, in local files or at the owners of used
-//! interfaces, and answers nodes that ask.
+//! [`InterfaceTypes`]: the types of shared and used interfaces, known or being searched, in local files or at the owners
+//! of used interfaces.
 //!
-//! Jobs read files and verify descriptions one after the other on a blocking thread. Known types go into the store,
-//! which the whole process shares, and to the ends of the interface that convert messages.
+//! Jobs (`type_jobs`) read files and verify descriptions one after the other on a blocking thread. Known types go into
+//! the store, which the whole process shares. The control task carries out the rest.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::time::Instant;
 
-use sgc_cdr::{DescriptionError, TypeError, TypeName};
-use sgc_endpoint::{CompressionError, PackedType, unpack_type};
-use sgc_ros::RosNetwork;
+use sgc_cdr::TypeName;
+use sgc_endpoint::PackedType;
 use sgc_types::{
-    Definitions, ResolveError, ResolvedType, StoreFull, TYPES_BYTES_MAX, TYPES_MAX,
-    TYPES_PER_OWNER_BYTES_MAX, TYPES_PER_OWNER_MAX, TypeStore,
+    Definitions, ResolvedType, TYPES_BYTES_MAX, TYPES_MAX, TYPES_PER_OWNER_BYTES_MAX, TYPES_PER_OWNER_MAX,
+    TypeStore,
 };
-use sgc_wire::{CatalogueEntry, DescribedType, Metadata, Name, NodeId};
-use tracing::{debug, warn};
+use sgc_wire::{CatalogueEntry, DescribedType, Name, NodeId};
 
-use super::Core;
-use crate::clock::now;
-use crate::control::event::CoreEvent;
+use crate::control::type_jobs::{Job, StoredOrNewType, TypeEntry, TypeMiss, TypeOutcome, TypeQuery};
 use crate::data::conversion::KnownType;
 use crate::local::type_questions::TypeQuestions;
 
@@ -29,7 +24,7 @@ use crate::local::type_questions::TypeQuestions;
 const RETRIES_MAX: usize = 16;
 
 /// The types of the interfaces that this node shares and uses.
-pub(super) struct InterfaceTypes {
+pub(crate) struct InterfaceTypes {
     store: Arc<TypeStore>,
     definitions: Arc<Definitions>,
     needs: BTreeMap<Name, Need>,
@@ -80,109 +75,19 @@ impl Need {
     }
 }
 
-/// A job for the blocking thread.
-struct Job {
-    name: Name,
-    type_name: TypeName,
-    type_hash: Option<String>,
-    owner: Option<NodeId>,
-    /// Description from an owner; without it, the job searches files.
-    told: Option<DescribedType>,
-}
-
-/// A known type, with its packed description for other nodes.
-struct TypeEntry {
-    described: StoredOrNewType,
-    packed: Option<PackedType>,
-}
-
-/// A type from the store (`Ok`), or one that is not stored yet (`Err`).
-type StoredOrNewType = Result<Arc<ResolvedType>, ResolvedType>;
-
-/// Result of a job.
-pub(crate) struct TypeOutcome {
-    of: TypeQuery,
-    found: Result<TypeEntry, TypeMiss>,
-}
-
-/// The subject of a job.
-struct TypeQuery {
-    name: Name,
-    type_name: TypeName,
-    type_hash: Option<String>,
-    owner: Option<NodeId>,
-    /// Size of the owner's description, if there was one.
-    told_bytes: Option<usize>,
-}
-
-/// Reasons why a type is unknown.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub(crate) enum TypeMiss {
-    /// No file defines it, or a definition is invalid.
-    #[error(transparent)]
-    Definition(#[from] TypeError),
-    /// The type is too large to be described.
-    #[error(transparent)]
-    Description(#[from] DescriptionError),
-    /// The local definition differs from the announced one.
-    #[error("the definition that was found is {found}, what is announced {announced}")]
-    Differs {
-        /// Hash of the local definition.
-        found: String,
-        /// Announced hash.
-        announced: String,
-    },
-    /// The owner's description cannot be unpacked.
-    #[error("the description cannot be unpacked: {0}")]
-    Packed(#[from] CompressionError),
-    /// The owner's description does not match its hash.
-    #[error(transparent)]
-    ResolveError(#[from] ResolveError),
-    /// The store is full.
-    #[error(transparent)]
-    Full(#[from] StoreFull),
-    /// The owner's limit is reached.
-    #[error(
-        "{types} types with {bytes} bytes of descriptions are known of its owner already: it may have no more"
-    )]
-    OwnerFull {
-        /// Number of the owner's types.
-        types: usize,
-        /// Bytes of their descriptions.
-        bytes: usize,
-    },
-    /// The job panicked.
-    #[error("looking for it failed, which is a fault in this program")]
-    Failed,
-}
-
-impl TypeMiss {
-    /// Returns a short, stable name for counters; `None` if it is no fault.
-    fn key(&self) -> Option<&'static str> {
-        match self {
-            Self::Definition(_) => None,
-            Self::Description(_) => Some("type_not_described"),
-            Self::Differs { .. } => Some("type_differs"),
-            Self::Packed(_) | Self::ResolveError(_) => Some("type_refused"),
-            Self::Full(_) | Self::OwnerFull { .. } => Some("types_full"),
-            Self::Failed => Some("type_failed"),
-        }
-    }
-
-    /// Returns the state of the need after this result.
-    fn state(&self, asks: bool) -> NeedState {
-        match self {
-            Self::Full(_) => NeedState::NoRoom { of_owner: false },
-            Self::OwnerFull { .. } => NeedState::NoRoom { of_owner: true },
-            _ if asks => NeedState::Asked,
-            Self::Packed(_) | Self::ResolveError(_) => NeedState::Refused,
-            _ => NeedState::Unknown,
-        }
+/// Returns the state of a need whose type was not found. `asks` is set if its owner can be asked.
+fn need_after(why: &TypeMiss, asks: bool) -> NeedState {
+    match why {
+        TypeMiss::Full(_) => NeedState::NoRoom { of_owner: false },
+        TypeMiss::OwnerFull { .. } => NeedState::NoRoom { of_owner: true },
+        _ if asks => NeedState::Asked,
+        TypeMiss::Packed(_) | TypeMiss::ResolveError(_) => NeedState::Refused,
+        _ => NeedState::Unknown,
     }
 }
 
 impl InterfaceTypes {
-    pub(super) fn new(store: Arc<TypeStore>, definitions: Definitions) -> Self {
+    pub(crate) fn new(store: Arc<TypeStore>, definitions: Definitions) -> Self {
         Self {
             store,
             definitions: Arc::new(definitions),
@@ -195,7 +100,7 @@ impl InterfaceTypes {
     }
 
     /// Returns the type of an interface, or else the stored type with this name and hash.
-    pub(super) fn described(
+    pub(crate) fn described(
         &self,
         name: Option<&Name>,
         type_name: &str,
@@ -208,12 +113,12 @@ impl InterfaceTypes {
     }
 
     /// Returns the time at which an owner is to be asked for further types.
-    pub(super) fn deadline(&self) -> Option<Instant> {
+    pub(crate) fn deadline(&self) -> Option<Instant> {
         self.questions.deadline()
     }
 
     /// Returns the problems to report. `called` returns the name of an owner.
-    pub(super) fn problems(&self, called: impl Fn(&NodeId) -> String) -> Vec<String> {
+    pub(crate) fn problems(&self, called: impl Fn(&NodeId) -> String) -> Vec<String> {
         let count = |of: fn(&NeedState) -> bool| {
             let mut all = self.needs.values().filter(|need| of(&need.state)).peekable();
             let first = all.peek().map(|need| {
@@ -317,7 +222,7 @@ impl InterfaceTypes {
     }
 
     /// Returns the interfaces for which the owner now lists another type.
-    fn listed_otherwise<'a>(
+    pub(crate) fn listed_otherwise<'a>(
         &self,
         owner: &NodeId,
         listed: impl Fn(&Name) -> Option<&'a CatalogueEntry>,
@@ -333,7 +238,7 @@ impl InterfaceTypes {
     }
 
     /// Removes a need. Returns its owner.
-    fn forget(&mut self, name: &Name) -> Option<NodeId> {
+    pub(crate) fn forget(&mut self, name: &Name) -> Option<NodeId> {
         let need = self.needs.remove(name)?;
         if let Some(owner) = &need.owner {
             self.questions.settled(owner, name);
@@ -357,7 +262,7 @@ impl InterfaceTypes {
     }
 
     /// Returns `true` if types of this node's own interfaces are still being searched.
-    fn has_own_jobs(&self) -> bool {
+    pub(crate) fn has_own_jobs(&self) -> bool {
         self.jobs.iter().any(|job| job.owner.is_none())
     }
 
@@ -378,258 +283,142 @@ impl InterfaceTypes {
     }
 }
 
-impl Job {
-    fn told_bytes(&self) -> Option<usize> {
-        Some(self.told.as_ref()?.description.len())
-    }
+/// A type whose search has ended.
+pub(crate) struct SettledType {
+    /// The interface.
+    pub(crate) name: Name,
+    /// Its owner, if it is another node.
+    pub(crate) owner: Option<NodeId>,
+    /// Whether the owner described the type.
+    pub(crate) was_told: bool,
+    /// The type, with its packed description for other nodes.
+    pub(crate) found: Result<(Arc<ResolvedType>, Option<PackedType>), TypeMiss>,
+}
 
-    /// Searches the store or files, or verifies the owner's description.
-    fn run(self, store: &TypeStore, definitions: &Definitions) -> TypeOutcome {
-        let told_bytes = self.told_bytes();
-        let Self { name, type_name, type_hash, owner, told } = self;
-        let of = TypeQuery { name, type_name, type_hash, owner, told_bytes };
-        let (type_name, type_hash) = (of.type_name.clone(), of.type_hash.clone());
-        of.found_by(move || match told {
-            Some(told) => read(&type_name, type_hash.as_deref(), &told),
-            None => find(&type_name, type_hash.as_deref(), store, definitions),
+/// A job, with everything that it reads.
+pub(crate) struct ReadyJob {
+    job: Job,
+    store: Arc<TypeStore>,
+    definitions: Arc<Definitions>,
+}
+
+impl ReadyJob {
+    /// Runs the job. Blocks.
+    pub(crate) fn run(self) -> TypeOutcome {
+        self.job.run(&self.store, &self.definitions)
+    }
+}
+
+/// Searches from their beginning to their end.
+impl InterfaceTypes {
+    /// Returns `true` if this type of an interface is being searched, or its search has ended.
+    pub(crate) fn is_needed(
+        &self,
+        name: &Name,
+        type_name: &TypeName,
+        type_hash: Option<&str>,
+        owner: Option<NodeId>,
+    ) -> bool {
+        self.needs.get(name).is_some_and(|need| {
+            need.type_hash.as_deref() == type_hash && need.owner == owner && need.type_name == *type_name
         })
     }
-}
 
-impl TypeQuery {
-    /// Turns the search into a result. A panic yields a result too, since other jobs wait for their turn.
-    fn found_by(self, look: impl FnOnce() -> Result<StoredOrNewType, TypeMiss>) -> TypeOutcome {
-        let look = || {
-            let described = look()?;
-            let of: &ResolvedType = match &described {
-                Ok(known) => known,
-                Err(new) => new,
-            };
-            Ok(TypeEntry { packed: PackedType::new(of.type_hash(), of.description()), described })
-        };
-        let found = catch_unwind(AssertUnwindSafe(look)).unwrap_or(Err(TypeMiss::Failed));
-        TypeOutcome { of: self, found }
-    }
-}
-
-fn find(
-    type_name: &TypeName,
-    type_hash: Option<&str>,
-    store: &TypeStore,
-    definitions: &Definitions,
-) -> Result<StoredOrNewType, TypeMiss> {
-    // A type of this name from another owner may differ, so the hash must match.
-    if let Some(known) = type_hash.and_then(|hash| store.described(type_name, Some(hash))) {
-        return Ok(Ok(known));
-    }
-    let described = ResolvedType::from_layout(definitions.layout(type_name)?)?;
-    match type_hash {
-        Some(announced) if !described.is_announced_as(announced) => Err(TypeMiss::Differs {
-            found: described.type_hash().to_owned(),
-            announced: announced.to_owned(),
-        }),
-        _ => Ok(Err(described)),
-    }
-}
-
-fn read(
-    type_name: &TypeName,
-    type_hash: Option<&str>,
-    told: &DescribedType,
-) -> Result<StoredOrNewType, TypeMiss> {
-    // Without an announced hash, the owner vouches for its description. The same holds for services, for which only the
-    // hashes of messages may be announced.
-    let expected = type_hash.filter(|_| type_name.kind() == "msg").unwrap_or(&told.type_hash);
-    let described = ResolvedType::read(unpack_type(told)?, type_name, expected)?;
-    if let Some(expected) = type_hash.filter(|announced| !described.is_announced_as(announced)) {
-        let (found, expected) = (described.type_hash().to_owned(), expected.to_owned());
-        return Err(ResolveError::Description(DescriptionError::Hash { found, expected }).into());
-    }
-    Ok(Err(described))
-}
-
-impl<N: RosNetwork> Core<N> {
-    /// Starts the search for the type of an interface, of this node or of another.
-    pub(super) fn need_type(
+    /// Starts the search for the type of an interface.
+    pub(crate) fn need(
         &mut self,
         name: Name,
-        metadata: &Metadata,
+        type_name: TypeName,
         type_hash: Option<String>,
         owner: Option<NodeId>,
     ) {
-        let type_name = metadata.type_name.parse::<TypeName>();
-        let is_same = |need: &Need| {
-            need.type_hash == type_hash
-                && need.owner == owner
-                && type_name.as_ref().is_ok_and(|type_name| need.type_name == *type_name)
-        };
-        if self.types.needs.get(&name).is_some_and(is_same) {
-            return self.apply_type(&name);
-        }
-        self.forget_type(&name);
-        let Ok(type_name) = type_name else {
-            // Plain DDS programs use type names that are not of ROS.
-            return self.set_type(&name, &KnownType::Lacking);
-        };
-        self.types.needs.insert(name, Need { type_name, type_hash, owner, state: NeedState::Looking });
-        self.types.look_for(name);
-        self.apply_type(&name);
-        self.next_type_job();
+        self.needs.insert(name, Need { type_name, type_hash, owner, state: NeedState::Looking });
+        self.look_for(name);
     }
 
-    /// Starts the search for the type of a granted interface of another node.
-    pub(super) fn need_type_of_used(&mut self, name: Name) {
-        let Some((owner, entry)) = self.routes.as_ref().and_then(|routes| routes.used_entry(&name)) else {
-            return;
-        };
-        let (metadata, type_hash) = (entry.metadata.clone(), entry.type_hash.clone());
-        self.need_type(name, &metadata, type_hash, Some(owner));
-    }
-
-    /// Handles a changed catalogue, which may list other types.
-    pub(super) fn types_listed(&mut self, owner: NodeId) {
-        let Some(routes) = &self.routes else { return };
-        let listed = |name: &Name| routes.used_entry(name).map(|(_, entry)| entry);
-        for name in self.types.listed_otherwise(&owner, listed) {
-            self.need_type_of_used(name);
-        }
-    }
-
-    /// Ends the search, because the interface is gone.
-    pub(super) fn forget_type(&mut self, name: &Name) {
-        if let Some(owner) = self.types.forget(name) {
-            self.ask_types(owner);
-        }
-        self.next_type_job();
-    }
-
-    /// Handles type descriptions from an owner.
-    pub(super) fn types_told(&mut self, owner: NodeId, types: Vec<DescribedType>) {
-        self.types.questions.answered(&owner);
+    /// Handles type descriptions from an owner. Returns the number of those without room.
+    pub(crate) fn told(&mut self, owner: NodeId, types: Vec<DescribedType>) -> usize {
+        self.questions.answered(&owner);
+        let mut without_room = 0;
         for told in types {
-            let Some(need) = self.types.needs.get_mut(&told.name) else { continue };
+            let Some(need) = self.needs.get_mut(&told.name) else { continue };
             if need.owner != Some(owner) || !matches!(need.state, NeedState::Asked) {
                 continue;
             }
-            if !self.types.questions.takes_told(&owner, told.description.len()) {
-                self.control_drops.count("types_busy");
+            if !self.questions.takes_told(&owner, told.description.len()) {
+                without_room += 1;
                 continue;
             }
             need.state = NeedState::Told;
             let (type_name, type_hash) = (need.type_name.clone(), need.type_hash.clone());
             let (name, owner) = (told.name, need.owner);
-            self.types.jobs.push_back(Job { name, type_name, type_hash, owner, told: Some(told) });
+            self.jobs.push_back(Job { name, type_name, type_hash, owner, told: Some(told) });
         }
-        self.ask_types(owner);
-        self.next_type_job();
+        without_room
     }
 
-    fn next_type_job(&mut self) {
-        let Some(events) = self.events.upgrade() else { return };
-        if self.types.is_busy {
-            return;
+    /// Returns the next job, unless one is under way.
+    pub(crate) fn next_job(&mut self) -> Option<ReadyJob> {
+        if self.is_busy {
+            return None;
         }
-        let Some(job) = self.types.jobs.pop_front() else { return };
-        self.types.is_busy = true;
-        let (store, definitions) = (self.types.store.clone(), self.types.definitions.clone());
-        let alive = self.alive.clone();
-        tokio::task::spawn_blocking(move || {
-            let _alive = alive;
-            let _ = events.blocking_send(CoreEvent::TypeLookedFor(job.run(&store, &definitions)));
-        });
+        let job = self.jobs.pop_front()?;
+        self.is_busy = true;
+        Some(ReadyJob { job, store: self.store.clone(), definitions: self.definitions.clone() })
     }
 
-    /// Handles the result of a job.
-    pub(super) fn type_looked_for(&mut self, outcome: TypeOutcome) {
-        self.types.is_busy = false;
+    /// Handles the result of a job. Returns it if its interface still waits for it.
+    pub(crate) fn looked_for(&mut self, outcome: TypeOutcome) -> Option<SettledType> {
+        self.is_busy = false;
         let TypeOutcome { of, found } = outcome;
-        if self.types.ends(&of) {
-            self.settle_need(&of, found);
-        }
-        match of.owner {
-            Some(owner) => self.ask_types(owner),
-            // Types that become known together are sent together.
-            None if !self.types.has_own_jobs() => self.endpoint.tell_types(now()),
-            None => {}
-        }
-        for owner in self.types.questions.have_room() {
-            self.ask_types(owner);
-        }
-        self.next_type_job();
+        self.ends(&of).then(|| self.settle(&of, found))
     }
 
-    fn settle_need(&mut self, of: &TypeQuery, found: Result<TypeEntry, TypeMiss>) {
+    fn settle(&mut self, of: &TypeQuery, found: Result<TypeEntry, TypeMiss>) -> SettledType {
         let (name, owner, was_told) = (of.name, of.owner, of.told_bytes.is_some());
-        let found =
-            found.and_then(|found| Ok((self.types.keep(found.described, owner.as_ref())?, found.packed)));
-        let state = match found {
-            Ok((described, packed)) => {
-                debug!(name = %name.short(), type_name = %described.name(), hash = described.type_hash(), "type known");
-                if let (None, Some(packed)) = (owner, packed) {
-                    self.endpoint.describe(now(), &name, packed);
-                }
-                NeedState::Known(described)
-            }
-            Err(why) => {
-                debug!(name = %name.short(), %why, "type not known");
-                if let Some(key) = why.key()
-                    && self.control_drops.count(key)
-                    && (was_told || why == TypeMiss::Failed)
-                {
-                    warn!(%why, "a description of a type is refused; counted from here on");
-                }
-                why.state(owner.is_some() && !was_told)
-            }
+        let found = found.and_then(|found| Ok((self.keep(found.described, owner.as_ref())?, found.packed)));
+        let state = match &found {
+            Ok((described, _)) => NeedState::Known(described.clone()),
+            Err(why) => need_after(why, owner.is_some() && !was_told),
         };
-        let Some(need) = self.types.needs.get_mut(&name) else { return };
-        need.state = state;
-        match (&need.state, owner) {
-            (NeedState::Asked, Some(owner)) => self.types.questions.lacks(owner, name),
-            (_, Some(owner)) => self.types.questions.settled(&owner, &name),
+        match (&state, owner) {
+            (NeedState::Asked, Some(owner)) => self.questions.lacks(owner, name),
+            (_, Some(owner)) => self.questions.settled(&owner, &name),
             (_, None) => {}
         }
-        if matches!(need.state, NeedState::NoRoom { .. }) {
-            self.types.no_room.push_back(name);
+        if matches!(state, NeedState::NoRoom { .. }) {
+            self.no_room.push_back(name);
         }
-        self.apply_type(&name);
+        if let Some(need) = self.needs.get_mut(&name) {
+            need.state = state;
+        }
+        SettledType { name, owner, was_told, found }
     }
 
-    /// Asks for further types, because their turn has come.
-    pub(super) fn types_due(&mut self, now: Instant) {
-        for owner in self.types.questions.due(now) {
-            self.ask_types(owner);
-        }
+    /// Returns the owners that may be asked, because jobs have made room.
+    pub(crate) fn have_room(&mut self) -> Vec<NodeId> {
+        self.questions.have_room().into_iter().collect()
     }
 
-    /// Asks an owner for its unknown types, unless it was asked already.
-    fn ask_types(&mut self, owner: NodeId) {
-        let now = now();
-        if let Some(names) = self.types.questions.next(owner, now.instant) {
-            self.endpoint.ask_types(now, owner, names);
-        }
+    /// Returns the owners that may be asked, because their turn has come.
+    pub(crate) fn due(&mut self, now: Instant) -> Vec<NodeId> {
+        self.questions.due(now)
     }
 
-    /// Passes the state of a type to both ends of its interface.
-    pub(super) fn apply_type(&self, name: &Name) {
-        let Some(need) = self.types.needs.get(name) else {
-            // The name is not of ROS, so no search starts and no message waits.
-            return self.set_type(name, &KnownType::Lacking);
-        };
-        let known = match &need.state {
+    /// Returns the names whose types an owner is to be asked for, unless it was asked already.
+    pub(crate) fn next_question(&mut self, owner: NodeId, now: Instant) -> Option<Vec<Name>> {
+        self.questions.next(owner, now)
+    }
+
+    /// Returns the state of an interface's type, as its ends take it.
+    pub(crate) fn known(&self, name: &Name) -> KnownType {
+        // A name without a need is not of ROS, so no search starts and no message waits.
+        let Some(need) = self.needs.get(name) else { return KnownType::Lacking };
+        match &need.state {
             NeedState::Looking => KnownType::Awaited,
             NeedState::Asked | NeedState::Told => KnownType::Asked,
             NeedState::Known(described) => KnownType::Known(described.layout().clone()),
             NeedState::NoRoom { .. } | NeedState::Refused | NeedState::Unknown => KnownType::Lacking,
-        };
-        self.set_type(name, &known);
-    }
-
-    fn set_type(&self, name: &Name, known: &KnownType) {
-        if let Some(share) = self.shares.get(name) {
-            share.set_type(known.clone());
-        }
-        if let Some(sink) = self.sinks.get(name) {
-            sink.set_type(known.clone(), &self.data);
         }
     }
 }
@@ -637,7 +426,7 @@ impl<N: RosNetwork> Core<N> {
 #[cfg(test)]
 mod tests {
     use bytes::Bytes;
-    use sgc_wire::PayloadEncoding;
+    use sgc_wire::{Metadata, PayloadEncoding};
 
     use super::*;
 
@@ -721,9 +510,7 @@ mod tests {
     /// Adds an interface, whose type is then searched.
     fn need(types: &mut InterfaceTypes, name: u8, type_name: &str, owner: Option<NodeId>) -> Name {
         let (name, type_name) = (Name([name; 32]), type_name.parse().unwrap());
-        let state = NeedState::Looking;
-        types.needs.insert(name, Need { type_name, type_hash: None, owner, state });
-        types.look_for(name);
+        types.need(name, type_name, None, owner);
         name
     }
 
@@ -736,7 +523,7 @@ mod tests {
         let need = types.needs.get_mut(&of.name).unwrap();
         need.state = match &kept {
             Ok(known) => NeedState::Known(known.clone()),
-            Err(why) => why.state(false),
+            Err(why) => need_after(why, false),
         };
         if matches!(need.state, NeedState::NoRoom { .. }) {
             types.no_room.push_back(of.name);
@@ -820,7 +607,7 @@ mod tests {
         assert!(types.ends(&of));
         let failed = found.map(|_| ()).unwrap_err();
         assert_eq!(
-            (failed.key(), matches!(failed.state(true), NeedState::Asked)),
+            (failed.key(), matches!(need_after(&failed, true), NeedState::Asked)),
             (Some("type_failed"), true)
         );
     }

@@ -7,10 +7,11 @@ use std::sync::{Arc, Mutex};
 use sgc_ros::{EndpointKind, GraphNode, Guid, RosNetwork};
 use sgc_sync::lock;
 use sgc_wire::{Name, NodeId, RosNode, SourceId};
+use tokio::sync::mpsc;
 use tracing::debug;
 
-use super::Core;
 use crate::control::event::ConsumerKey;
+use crate::data::stats::Drops;
 
 /// Key of a local writer: the joined name and the source.
 type WriterKey = (Name, Option<SourceId>);
@@ -23,7 +24,7 @@ struct ConsumerEnds {
 }
 
 /// Endpoints of this proxy, by node.
-pub(super) struct LocalGraph {
+pub(crate) struct LocalGraph {
     own: Option<RosNode>,
     writers: BTreeMap<WriterKey, Guid>,
     /// Node of each writer. The SGC node is included, since nodes of two robots may have the same name.
@@ -42,7 +43,7 @@ pub(super) struct LocalGraph {
 
 impl LocalGraph {
     /// Creates the graph of the SGC node with this name, without endpoints.
-    pub(super) fn new(node: &str) -> Self {
+    pub(crate) fn new(node: &str) -> Self {
         Self {
             own: own_node(node),
             writers: BTreeMap::new(),
@@ -56,18 +57,18 @@ impl LocalGraph {
         }
     }
 
-    pub(super) fn writer_there(&mut self, key: WriterKey, guid: Guid) {
+    pub(crate) fn writer_there(&mut self, key: WriterKey, guid: Guid) {
         self.has_changed |= self.writers.insert(key, guid) != Some(guid);
     }
 
     /// Removes a writer.
-    pub(super) fn writer_gone(&mut self, key: &WriterKey) {
+    pub(crate) fn writer_gone(&mut self, key: &WriterKey) {
         self.nodes.remove(key);
         self.has_changed |= self.writers.remove(key).is_some();
     }
 
     /// Moves a writer to another source. Its node is unknown until it is set.
-    pub(super) fn writer_moved(&mut self, name: Name, from: SourceId, to: SourceId) {
+    pub(crate) fn writer_moved(&mut self, name: Name, from: SourceId, to: SourceId) {
         let guid = self.writers.get(&(name, Some(from))).copied();
         self.writer_gone(&(name, Some(from)));
         if let Some(guid) = guid {
@@ -75,27 +76,27 @@ impl LocalGraph {
         }
     }
 
-    pub(super) fn reader_there(&mut self, name: Name, guid: Guid) {
+    pub(crate) fn reader_there(&mut self, name: Name, guid: Guid) {
         self.has_changed |= self.readers.insert(name, guid) != Some(guid);
     }
 
-    pub(super) fn reader_gone(&mut self, name: &Name) {
+    pub(crate) fn reader_gone(&mut self, name: &Name) {
         self.has_changed |= self.readers.remove(name).is_some();
     }
 
     /// Adds the reader and the writer of a service.
-    pub(super) fn service_there(&mut self, name: Name, [reader, writer]: [Guid; 2]) {
+    pub(crate) fn service_there(&mut self, name: Name, [reader, writer]: [Guid; 2]) {
         self.reader_there(name, reader);
         self.writer_there((name, None), writer);
     }
 
-    pub(super) fn service_gone(&mut self, name: &Name) {
+    pub(crate) fn service_gone(&mut self, name: &Name) {
         self.reader_gone(name);
         self.writer_gone(&(*name, None));
     }
 
     /// Removes all endpoints and keeps the nodes that they stand for.
-    pub(super) fn endpoints_gone(&mut self) {
+    pub(crate) fn endpoints_gone(&mut self) {
         self.readers.clear();
         self.writers.clear();
         self.consumers.clear();
@@ -104,7 +105,7 @@ impl LocalGraph {
 
     /// Sets the node of a present or future writer. The name's reader gets the same node if the writer serves all
     /// sources.
-    pub(super) fn set_node(&mut self, key: WriterKey, owner: NodeId, node: Option<RosNode>) {
+    pub(crate) fn set_node(&mut self, key: WriterKey, owner: NodeId, node: Option<RosNode>) {
         self.has_changed |= match node {
             Some(node) => {
                 let node = (owner, node);
@@ -115,12 +116,12 @@ impl LocalGraph {
     }
 
     /// Replaces the nodes of the writers of far messages.
-    pub(super) fn set_publishers(&mut self, publishers: BTreeMap<Name, (NodeId, RosNode)>) {
+    pub(crate) fn set_publishers(&mut self, publishers: BTreeMap<Name, (NodeId, RosNode)>) {
         self.has_changed |= std::mem::replace(&mut self.publishers, publishers.clone()) != publishers;
     }
 
     /// Adds the endpoints of a consumer of this node.
-    pub(super) fn consumer_there(&mut self, key: ConsumerKey, node: RosNode, ends: &[(EndpointKind, Guid)]) {
+    pub(crate) fn consumer_there(&mut self, key: ConsumerKey, node: RosNode, ends: &[(EndpointKind, Guid)]) {
         let of = |kind| ends.iter().filter(move |(of, _)| *of == kind).map(|(_, guid)| *guid).collect();
         let node = (key.peer, node);
         let ends =
@@ -129,7 +130,7 @@ impl LocalGraph {
         self.has_changed = true;
     }
 
-    pub(super) fn consumer_gone(&mut self, key: &ConsumerKey) {
+    pub(crate) fn consumer_gone(&mut self, key: &ConsumerKey) {
         self.has_changed |= self.consumers.remove(key).is_some();
     }
 
@@ -175,17 +176,22 @@ fn own_node(node: &str) -> Option<RosNode> {
     RosNode::new("/", &format!("sgc_{word}"), None)
 }
 
-impl<N: RosNetwork> Core<N> {
+/// Showing on the local network.
+impl LocalGraph {
     /// Shows changes in the local graph on a blocking thread.
-    pub(super) fn show_graph(&mut self) {
-        let Some(network) = self.network.get() else { return };
-        let Some(nodes) = self.graph.changed() else { return };
-        let (wanted, showing) = (self.graph.wanted.clone(), self.graph.showing.clone());
+    pub(crate) fn show<N: RosNetwork>(
+        &mut self,
+        network: Arc<N>,
+        alive: &mpsc::Sender<()>,
+        failures: &Arc<Drops>,
+    ) {
+        let Some(nodes) = self.changed() else { return };
+        let (wanted, showing) = (self.wanted.clone(), self.showing.clone());
         let is_under_way = lock(&wanted).replace(nodes).is_some();
         if is_under_way {
             return;
         }
-        let (alive, failures) = (self.alive.clone(), self.ros_failures.clone());
+        let (alive, failures) = (alive.clone(), failures.clone());
         tokio::task::spawn_blocking(move || {
             let _alive = alive;
             let _turn = lock(&showing);
