@@ -6,6 +6,7 @@
 mod alerts;
 mod consumers;
 mod graph;
+mod links;
 mod operations;
 mod outputs;
 mod publish;
@@ -13,6 +14,7 @@ mod quality;
 mod reopening;
 mod ros;
 mod services;
+mod status;
 mod trust;
 mod types;
 
@@ -23,20 +25,18 @@ use std::time::{Duration, Instant};
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Output as EndpointOutput};
 use sgc_ros::{EndpointSpec, RosNetwork, Routes, ServiceSpec, ShareRule, UseRule};
-use sgc_router::{FibEntry, LinkId, Neighbour, Output as RouterOutput, Router};
-use sgc_transport::{AnyLink, CredentialStore, Link, LinkUrl};
-use sgc_trust::{Identity, TrustAnchors, VerifiedPeer};
+use sgc_router::{FibEntry, LinkId, Output as RouterOutput, Router};
+use sgc_transport::{AnyLink, CredentialStore};
+use sgc_trust::{Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
-use sgc_wire::{Control, Name, NodeId, SourceId};
+use sgc_wire::{Control, Name, NodeId, Now, SourceId};
 use tokio::sync::{Notify, mpsc, watch};
-use tracing::{debug, warn};
 
-use crate::admin::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
 use crate::clock::now;
 use crate::control::alerts::{Alerts, clock_alert};
 use crate::control::authority::Authority;
 use crate::control::control_queue::Inbox;
-use crate::control::event::{CoreEvent, INBOX_MAX, LinkPlace};
+use crate::control::event::{CoreEvent, INBOX_MAX};
 use crate::control::far_consumers::FarConsumers;
 use crate::control::interface_types::InterfaceTypes;
 use crate::control::local_graph::LocalGraph;
@@ -53,7 +53,7 @@ use crate::data::outflow::OutFlow;
 use crate::data::replays::Replays;
 use crate::data::sinks::{LocalSink, SinkRequest};
 use crate::data::sources::{LocalShare, NewestSamples};
-use crate::data::stats::{CountDrops, Drops, NameStats};
+use crate::data::stats::{Drops, NameStats};
 use crate::data::tap::TapQueue;
 use crate::discovery::Board;
 use crate::gateway::Gateway;
@@ -61,7 +61,7 @@ use crate::link::control_tx::ControlTx;
 use crate::link::keep_alive::{KeepAlive, KeepAlivePolicy};
 use crate::local::network_slot::NetworkSlot;
 use crate::local::network_state::NetworkState;
-use crate::state::audit::{Audit, AuditEvent, AuditRecord};
+use crate::state::audit::Audit;
 use crate::state::credentials::StateWriter;
 
 /// Events handled before the timers are checked again.
@@ -336,57 +336,12 @@ impl<N: RosNetwork> Core<N> {
 
     fn handle(&mut self, event: CoreEvent) {
         match event {
-            CoreEvent::LinkUp { link, url, control, reply } => {
-                let id = LinkId(self.next_link);
-                self.next_link += 1;
-                let set =
-                    url.as_deref().and_then(|url| url.parse::<LinkUrl>().ok()).and_then(|url| url.cost_ms);
-                let cost = set.map(|ms| ms.saturating_mul(1000));
-                let neighbour = Neighbour { cost, ..Neighbour::from(link.peer()) };
-                let remote = link.remote();
-                self.hear_of(link.peer());
-                let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
-                self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
-                let (flows, keep_alive) = (HashMap::new(), self.keep_alive_for(&link));
-                self.control_drops.link_up(id);
-                self.data.drops().link_up(id);
-                self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, keep_alive });
-                let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
-                if reply.send(Some(place)).is_err() {
-                    debug!(%remote, "the link's task is gone");
-                }
-                self.router.handle_link_up(now(), id, neighbour);
-                self.begin_to_look(id);
-            }
-            CoreEvent::LinkDown { id, in_use } => {
-                self.router.handle_link_down(now(), id);
-                self.control_drops.link_down(id);
-                self.data.drops().link_down(id);
-                if let Some(entry) = self.links.remove(&id) {
-                    self.remember_policy(entry.link.peer().node_id, entry.keep_alive.policy());
-                    let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
-                    let record = record.remote(entry.link.remote());
-                    self.audit.write(match &entry.closed_for {
-                        Some(reason) => record.reason(reason),
-                        None => record,
-                    });
-                    entry.flows.values().for_each(|f| f.close());
-                }
-                if let Some(place) = in_use {
-                    self.displaced(&place);
-                }
-            }
+            CoreEvent::LinkUp { link, url, control, reply } => self.link_up(link, url, control, reply),
+            CoreEvent::LinkDown { id, in_use } => self.link_down(id, in_use),
             CoreEvent::Frame { link, frame: Control::IdentityInUse { place }, .. } => {
                 self.kept_out(link, place)
             }
-            CoreEvent::Frame { link, frame, room } => {
-                let tells_time = matches!(frame, Control::Clock { .. });
-                self.router.handle_frame(now(), link, frame);
-                drop(room);
-                if tells_time {
-                    self.compare_clocks(link);
-                }
-            }
+            CoreEvent::Frame { link, frame, room } => self.handle_frame(link, frame, room),
             CoreEvent::Flushed { link } => self.router.handle_flushed(now(), link),
             CoreEvent::Malformed { link } => {
                 self.control_drops.count_from("malformed_control", link);
@@ -398,27 +353,11 @@ impl<N: RosNetwork> Core<N> {
             }
             CoreEvent::NetworkReopened => self.network_reopened(),
             CoreEvent::NetworkStaysClosed(reason) => self.reopening.stays_closed(reason),
-            CoreEvent::ReaderReady { name, spec, guid, reader } => match self.readers.get_mut(&name) {
-                Some(wanted) if wanted.spec == spec && !self.reopening.is_closed() => {
-                    wanted.opened = Some(reader);
-                    self.graph.reader_there(name, guid);
-                }
-                _ => drop_elsewhere(reader),
-            },
+            CoreEvent::ReaderReady { name, spec, guid, reader } => {
+                self.reader_ready(name, &spec, guid, reader)
+            }
             CoreEvent::WriterReady { name, source, spec, writer } => {
-                let wanted = !self.reopening.is_closed() && self.writers.get(&(name, source)) == Some(&spec);
-                match (self.sinks.get(&name), writer) {
-                    (Some(sink), Some(writer)) if wanted => {
-                        self.graph.writer_there((name, source), writer.guid());
-                        sink.set_writer(source, Some(writer));
-                        match source {
-                            Some(source) => self.ask_history(name, source),
-                            None => self.ask_histories(name),
-                        }
-                    }
-                    (_, Some(writer)) => writer.close(),
-                    (_, None) => {}
-                }
+                self.writer_ready(name, source, &spec, writer)
             }
             CoreEvent::ConsumerShown { key, ends } => self.consumer_shown(key, ends),
             CoreEvent::ServiceReady { name, spec, end } => self.service_ready(name, &spec, end),
@@ -436,16 +375,7 @@ impl<N: RosNetwork> Core<N> {
                 self.alerts.configuration_read(mistakes.as_deref(), Instant::now());
             }
             CoreEvent::Crl { der, reply } => {
-                let taken = self.router.add_crl(now(), &der);
-                let record = AuditRecord::new(AuditEvent::Crl).by_user();
-                match &taken {
-                    // The list is logged where it comes into force.
-                    Ok(true) => {}
-                    Ok(false) => self.audit.write(record.reason("known already")),
-                    Err(why) => self.audit.write(record.reason(format!("refused: {why}"))),
-                }
-                let lists = self.credentials.anchors().crls().cloned().collect();
-                let _ = reply.send(taken.map(|is_news| (is_news, lists)));
+                let _ = reply.send(self.add_crl(&der));
                 // A user who brings a list may have changed the fleet file.
                 self.answer_renewals();
             }
@@ -487,33 +417,53 @@ impl<N: RosNetwork> Core<N> {
         if let Some(routes) = &mut self.routes {
             routes.handle_timeout(now.instant);
         }
-        let due: Vec<_> =
-            self.history_due.iter().filter(|(_, at)| **at <= now.instant).map(|(key, _)| *key).collect();
-        for (name, source) in due {
-            self.history_due.remove(&(name, source));
-            self.ask_history_again(name, source);
-        }
-        if self.silence_due.is_none_or(|at| at <= now.instant) {
-            let looks = self.shares.values().map(|share| share.look_for_silence(now.instant));
-            // `fold` looks at all of them, where `any` would stop at the first.
-            let busy = looks.fold(false, |any, busy| any | busy);
-            self.silence_due = busy.then(|| now.instant + SILENCE_LOOK);
-        }
+        self.histories_due(now.instant);
+        self.look_for_silence(now.instant);
         if self.renew_due.take_if(|at| *at <= now.instant).is_some() {
             self.ask_renewal();
         }
-        let long: Vec<_> = self.shares.iter().filter(|(_, s)| s.is_epoch_over()).map(|(n, _)| *n).collect();
-        for name in long {
-            self.endpoint.rotate(now, &name);
-        }
+        self.rotation_due(now);
         self.operations_due(now.instant);
         self.calls_due(now.instant);
         self.types_due(now.instant);
         self.consumers_due(now);
         self.rediscovery_due(now.instant);
         self.rekey_due(now);
+        self.epochs_due(now.instant);
+    }
+
+    /// Asks again for histories that make no progress.
+    fn histories_due(&mut self, now: Instant) {
+        let due: Vec<_> =
+            self.history_due.iter().filter(|(_, at)| **at <= now).map(|(key, _)| *key).collect();
+        for (name, source) in due {
+            self.history_due.remove(&(name, source));
+            self.ask_history_again(name, source);
+        }
+    }
+
+    /// Looks for sources that have fallen silent.
+    fn look_for_silence(&mut self, now: Instant) {
+        if self.silence_due.is_none_or(|at| at <= now) {
+            let looks = self.shares.values().map(|share| share.look_for_silence(now));
+            // `fold` looks at all of them, where `any` would stop at the first.
+            let busy = looks.fold(false, |any, busy| any | busy);
+            self.silence_due = busy.then(|| now + SILENCE_LOOK);
+        }
+    }
+
+    /// Starts new epochs of shares that have sent enough under one key.
+    fn rotation_due(&mut self, now: Now) {
+        let long: Vec<_> = self.shares.iter().filter(|(_, s)| s.is_epoch_over()).map(|(n, _)| *n).collect();
+        for name in long {
+            self.endpoint.rotate(now, &name);
+        }
+    }
+
+    /// Drops the keys of past epochs.
+    fn epochs_due(&mut self, now: Instant) {
         let over: Vec<_> =
-            self.retire_due.iter().filter(|(_, at)| **at <= now.instant).map(|(name, _)| *name).collect();
+            self.retire_due.iter().filter(|(_, at)| **at <= now).map(|(name, _)| *name).collect();
         for name in over {
             self.retire_due.remove(&name);
             if let Some(sink) = self.sinks.get(&name) {
@@ -583,15 +533,6 @@ impl<N: RosNetwork> Core<N> {
         self.want_all_lanes();
     }
 
-    /// Notes a member that was heard. Reports names in rules that are probably misspellings of it.
-    fn hear_of(&mut self, peer: &VerifiedPeer) {
-        for (written, meant) in self.members.heard(peer, &self.identity) {
-            warn!(
-                "a [[share]] names \"{written}\", which nobody here is called; \"{meant}\" is here and may be meant"
-            );
-        }
-    }
-
     /// Stops receiving. Queued packets still leave.
     fn quiesce(&mut self) -> Vec<Arc<OutFlow>> {
         self.routes = None;
@@ -623,96 +564,6 @@ impl<N: RosNetwork> Core<N> {
             sink.close();
         }
         self.links.values().map(|l| l.link.clone()).collect()
-    }
-
-    fn status(&self) -> Status {
-        let links = self.links.iter().map(|(id, entry)| {
-            let stats = entry.link.stats();
-            let (cost, silent) = self.router.link_cost(*id).unwrap_or_default();
-            let over = self.data.rates().over(&entry.link.peer().node_id);
-            LinkStatus {
-                id: id.0,
-                peer: entry.link.peer().node_id.to_string(),
-                peer_until: entry.link.peer().not_after.to_string(),
-                remote: entry.link.remote().to_string(),
-                url: entry.url.clone(),
-                kex: stats.key_exchange.label(),
-                rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
-                cost,
-                silent,
-                keep_alive_ms: entry.keep_alive.step().as_millis().try_into().unwrap_or(u64::MAX),
-                sent_bytes: stats.sent_bytes,
-                received_bytes: stats.received_bytes,
-                lanes: entry.control.lanes().count(),
-                labels_sent: entry.control.labels_known(),
-                labels_received: entry.link.labels_defined(),
-                peer_slowed: over.slowed,
-                peer_dropped: over.dropped,
-            }
-        });
-        let names = self.entries.iter().map(|(name, (_, stats))| NameStatus::new(name, stats));
-        let router = self.router.stats();
-        Status {
-            node: self.identity.node_name().to_string(),
-            version: env!("CARGO_PKG_VERSION").to_owned(),
-            uptime_s: self.started.elapsed().as_secs(),
-            links: links.collect(),
-            routers: self.board.snapshot(),
-            routes: self
-                .routes
-                .iter()
-                .flat_map(Routes::status)
-                .map(|mut route| {
-                    self.describe_calls(&mut route);
-                    let messages = route.name.and_then(|n| {
-                        let published = self.shares.get(&n).map(|s| s.published());
-                        published.or_else(|| self.sinks.get(&n).map(|s| s.delivered()))
-                    });
-                    let share = route.name.and_then(|n| self.shares.get(&n));
-                    let compressed = share.and_then(|s| s.compressed());
-                    RouteLine::new(route, messages, share.map_or(0, |s| s.signatures()), compressed)
-                })
-                .collect(),
-            alerts: self.alerts(),
-            problems: self.problems(),
-            names: names.collect(),
-            drops: self.all_drops(),
-            refused: self.all_refused(),
-            local_network_reopened: self.reopening.reopenings(),
-            router: RouterLine {
-                nodes: router.nodes,
-                names: router.names,
-                routed_names: router.routed_names,
-                branches: router.branches,
-            },
-            // The caller adds it, since the core knows nothing of the gateway.
-            gateway: None,
-        }
-    }
-
-    /// Returns everything that was dropped or refused, by kind and culprit. Control frames and packets share some kinds.
-    fn all_drops(&self) -> BTreeMap<String, u64> {
-        let audit =
-            [("audit_lost", self.audit.lost_total()), ("audit_summed_up", self.audit.summed_up_total())];
-        let audit = audit.into_iter().filter(|(_, n)| *n > 0).map(|(key, n)| (key.to_owned(), n));
-        let mut all: BTreeMap<String, u64> = audit.collect();
-        for counts in [
-            self.control_drops.snapshot(),
-            self.data.drops().snapshot(),
-            self.data.rates().drops(),
-            self.ros_failures.snapshot(),
-            self.board.drops().snapshot(),
-        ] {
-            counts.into_iter().for_each(|(key, n)| *all.entry(key).or_default() += n);
-        }
-        all
-    }
-
-    /// Returns the peers that were refused a link, by kind.
-    fn all_refused(&self) -> BTreeMap<String, u64> {
-        let all = sgc_transport::RefusalKind::ALL.into_iter();
-        let all = all.map(|kind| (kind.label().to_owned(), self.transport.refused(kind)));
-        all.filter(|(_, n)| *n > 0).collect()
     }
 }
 

@@ -6,8 +6,8 @@ use std::sync::atomic::Ordering::Relaxed;
 
 use sgc_endpoint::JoinStatus;
 use sgc_ros::{
-    Direction, DiscoveredEndpoint, EndpointKind, EndpointSpec, RosNetwork, Sample, SampleHandler, dds_topic,
-    dds_type, reader_for, ros_topic, ros_type, weakest,
+    Direction, DiscoveredEndpoint, EndpointKind, EndpointSpec, RosNetwork, Sample, SampleHandler, ShareView,
+    UseView, dds_topic, dds_type, reader_for, ros_topic, ros_type, weakest,
 };
 use sgc_transport::Link as _;
 use sgc_trust::{Grantees, Policy};
@@ -105,98 +105,12 @@ impl<N: RosNetwork> Core<N> {
         graph.endpoints = routes.local_endpoints().take(GRAPH_ENDPOINTS_MAX).map(endpoint).collect();
         graph.problems = self.problems();
         for view in routes.share_views() {
-            let is_service = view.metadata.kind == Kind::Service;
-            let mut share = Share {
-                kind: view.metadata.kind.into(),
-                topic: view.metadata.ros_name.clone(),
-                wanted_type: Some(view.metadata.type_name.clone()).filter(|t| !t.is_empty()),
-                // Callers of a service publish under its name. Users do not call that publishing.
-                to: count(if is_service { &view.policy.publish } else { &view.policy.subscribe }),
-                publish: if is_service { [0; 3] } else { count(&view.policy.publish) },
-                unheard: self.unheard(view.policy),
-                routes: Vec::new(),
-            };
-            for route in view.routes {
-                names.insert(route.name);
-                let granted: BTreeSet<_> = self
-                    .endpoint
-                    .granted(&route.name)
-                    .into_iter()
-                    .map(|(_, peer)| self.called(&peer))
-                    .collect();
-                let role = if is_service { Role::Publish } else { Role::Subscribe };
-                let mut consumer_hashes = BTreeMap::<_, BTreeSet<_>>::new();
-                for (peer, hash) in self.consumers.hashes(route.name, role) {
-                    consumer_hashes.entry(self.called(&peer)).or_default().insert(hash.to_owned());
-                }
-                let refused = self.refused.get(&route.name).into_iter().flatten();
-                let sink = self.sinks.get(&route.name);
-                share.routes.push(ShareRoute {
-                    topic: route.local_name,
-                    type_name: route.type_name,
-                    name: route.name.to_string(),
-                    writers: route.writers,
-                    is_read: route.is_read,
-                    is_written: route.is_written,
-                    qos: route.qos.as_ref().map(Into::into),
-                    granted: granted.into_iter().collect(),
-                    consumer_hashes,
-                    refused: refused.map(|(peer, why)| (self.called(peer), why.clone())).collect(),
-                    messages: self.shares.get(&route.name).map_or(0, |share| share.published()),
-                    written: sink.map_or(0, |sink| sink.delivered()),
-                    matched: sink.map_or(0, |sink| sink.matched()),
-                    is_json: route.form == PayloadForm::Json,
-                    lacks_definition: self.lacks_definition(&route.name, route.form),
-                });
-            }
-            graph.shares.push(share);
+            graph.shares.push(self.share_line(view, names));
         }
         let mut owners = BTreeMap::new();
         for view in routes.use_views() {
             owners.insert(view.owner, view.owner_name.to_owned());
-            let publishes = view.direction == Direction::Publish && view.kind == Kind::Topic;
-            let (name, refused) = view.token.map_or((None, None), |(name, refused)| {
-                names.insert(name);
-                (Some(name.to_string()), refused.map(|by| by.to_string()))
-            });
-            let mut used = Use {
-                kind: view.kind.into(),
-                publishes,
-                topic: view.topic.to_owned(),
-                local_topic: view.local_topic,
-                wanted_type: view.wanted_type.map(str::to_owned),
-                owner_id: view.owner.to_string(),
-                owner: view.owner_name.to_owned(),
-                owner_state: view.owner_state.map(str::to_owned),
-                follow: self.endpoint.follow_status(&view.owner).map(|s| label(&s).to_owned()),
-                has_catalogue: view.has_catalogue,
-                is_token: name.is_some(),
-                name,
-                refused,
-                routes: Vec::new(),
-            };
-            for route in view.routes {
-                names.insert(route.name);
-                let published = self.shares.get(&route.name).map(|share| share.published());
-                let sink = self.sinks.get(&route.name);
-                used.routes.push(UseRoute {
-                    topic: route.local_name,
-                    type_name: route.entry.metadata.type_name.clone(),
-                    type_hash: route.entry.type_hash.clone(),
-                    name: route.name.to_string(),
-                    qos: (&route.entry.qos).into(),
-                    is_granted: route.is_granted,
-                    refused: route.refused.map(|by| by.to_string()),
-                    join: self.endpoint.join_status(&route.name).map(|s| label(&s).to_owned()),
-                    writers: route.writers,
-                    matched: sink.map_or(0, |sink| sink.matched()),
-                    publishers: route.publishers,
-                    is_read: route.is_read,
-                    lacks_definition: self.lacks_definition(&route.name, route.form),
-                    messages: published.or(sink.map(|sink| sink.delivered())).unwrap_or(0),
-                });
-            }
-            graph.uses.push(used);
+            graph.uses.push(self.use_line(view, names));
         }
         let offer = |offer: sgc_ros::OfferView<'_>| Offer {
             owner_id: offer.owner.to_string(),
@@ -212,6 +126,98 @@ impl<N: RosNetwork> Core<N> {
             is_used: offer.is_used,
         };
         graph.offers = routes.offers().map(offer).collect();
+    }
+
+    /// Describes a share, and adds the names of its routes to `names`.
+    fn share_line(&self, view: ShareView<'_>, names: &mut BTreeSet<Name>) -> Share {
+        let is_service = view.metadata.kind == Kind::Service;
+        let mut share = Share {
+            kind: view.metadata.kind.into(),
+            topic: view.metadata.ros_name.clone(),
+            wanted_type: Some(view.metadata.type_name.clone()).filter(|t| !t.is_empty()),
+            // Callers of a service publish under its name. Users do not call that publishing.
+            to: count(if is_service { &view.policy.publish } else { &view.policy.subscribe }),
+            publish: if is_service { [0; 3] } else { count(&view.policy.publish) },
+            unheard: self.unheard(view.policy),
+            routes: Vec::new(),
+        };
+        for route in view.routes {
+            names.insert(route.name);
+            let granted: BTreeSet<_> =
+                self.endpoint.granted(&route.name).into_iter().map(|(_, peer)| self.called(&peer)).collect();
+            let role = if is_service { Role::Publish } else { Role::Subscribe };
+            let mut consumer_hashes = BTreeMap::<_, BTreeSet<_>>::new();
+            for (peer, hash) in self.consumers.hashes(route.name, role) {
+                consumer_hashes.entry(self.called(&peer)).or_default().insert(hash.to_owned());
+            }
+            let refused = self.refused.get(&route.name).into_iter().flatten();
+            let sink = self.sinks.get(&route.name);
+            share.routes.push(ShareRoute {
+                topic: route.local_name,
+                type_name: route.type_name,
+                name: route.name.to_string(),
+                writers: route.writers,
+                is_read: route.is_read,
+                is_written: route.is_written,
+                qos: route.qos.as_ref().map(Into::into),
+                granted: granted.into_iter().collect(),
+                consumer_hashes,
+                refused: refused.map(|(peer, why)| (self.called(peer), why.clone())).collect(),
+                messages: self.shares.get(&route.name).map_or(0, |share| share.published()),
+                written: sink.map_or(0, |sink| sink.delivered()),
+                matched: sink.map_or(0, |sink| sink.matched()),
+                is_json: route.form == PayloadForm::Json,
+                lacks_definition: self.lacks_definition(&route.name, route.form),
+            });
+        }
+        share
+    }
+
+    /// Describes a use, and adds the names of its routes to `names`.
+    fn use_line(&self, view: UseView<'_>, names: &mut BTreeSet<Name>) -> Use {
+        let publishes = view.direction == Direction::Publish && view.kind == Kind::Topic;
+        let (name, refused) = view.token.map_or((None, None), |(name, refused)| {
+            names.insert(name);
+            (Some(name.to_string()), refused.map(|by| by.to_string()))
+        });
+        let mut used = Use {
+            kind: view.kind.into(),
+            publishes,
+            topic: view.topic.to_owned(),
+            local_topic: view.local_topic,
+            wanted_type: view.wanted_type.map(str::to_owned),
+            owner_id: view.owner.to_string(),
+            owner: view.owner_name.to_owned(),
+            owner_state: view.owner_state.map(str::to_owned),
+            follow: self.endpoint.follow_status(&view.owner).map(|s| label(&s).to_owned()),
+            has_catalogue: view.has_catalogue,
+            is_token: name.is_some(),
+            name,
+            refused,
+            routes: Vec::new(),
+        };
+        for route in view.routes {
+            names.insert(route.name);
+            let published = self.shares.get(&route.name).map(|share| share.published());
+            let sink = self.sinks.get(&route.name);
+            used.routes.push(UseRoute {
+                topic: route.local_name,
+                type_name: route.entry.metadata.type_name.clone(),
+                type_hash: route.entry.type_hash.clone(),
+                name: route.name.to_string(),
+                qos: (&route.entry.qos).into(),
+                is_granted: route.is_granted,
+                refused: route.refused.map(|by| by.to_string()),
+                join: self.endpoint.join_status(&route.name).map(|s| label(&s).to_owned()),
+                writers: route.writers,
+                matched: sink.map_or(0, |sink| sink.matched()),
+                publishers: route.publishers,
+                is_read: route.is_read,
+                lacks_definition: self.lacks_definition(&route.name, route.form),
+                messages: published.or(sink.map(|sink| sink.delivered())).unwrap_or(0),
+            });
+        }
+        used
     }
 
     /// Returns the members of a policy that were not heard.

@@ -1,14 +1,15 @@
 //! Carries out the outputs of the route machine: shares, joins, readers, writers, and forwarding.
 
+use std::any::Any;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_endpoint::{AskAgain, JoinKind, RecoveryLimits, Source, SourceConfig};
+use sgc_endpoint::{AskAgain, JoinKind, RecoveryLimits, ShareSpec, Source, SourceConfig};
 use sgc_ros::{Command, EndpointSpec, Guid, RosNetwork, Shaping, TF_MESSAGE, service_qos};
 use sgc_router::{FibEntry, LinkId};
 use sgc_trust::{MessageKey, Suite};
-use sgc_wire::{Class, History, Kind, Name, Qos, SourceId};
+use sgc_wire::{Class, History, Kind, Name, Now, Qos, SourceId};
 use tracing::{debug, error};
 
 use super::{
@@ -29,48 +30,12 @@ use crate::data::sources::{LocalShare, Publisher, SourceMap, SourceSlot};
 const RECOVERY_BYTES_MIN: usize = 1 << 20;
 
 impl<N: RosNetwork> Core<N> {
+    /// Carries out a command of the route machine.
     pub(super) fn carry_out(&mut self, command: Command) {
         let now = now();
         match command {
-            Command::Share(spec) => {
-                let topic = spec.metadata.ros_name.clone();
-                let (metadata, type_hash) = (spec.metadata.clone(), spec.type_hash.clone());
-                let is_service = spec.metadata.kind == Kind::Service;
-                match self.endpoint.share(now, spec) {
-                    Ok(name) => {
-                        debug!(%topic, %name, "shared");
-                        let share = LocalShare::new(
-                            name,
-                            self.data.clone(),
-                            self.alive.clone(),
-                            self.epoch_messages_max,
-                            self.epoch_over.clone(),
-                        );
-                        self.shares.insert(name, Arc::new(share));
-                        self.need_type(name, &metadata, type_hash, None);
-                        if is_service {
-                            self.begin_local(name);
-                        }
-                    }
-                    Err(why) => error!("{topic} is not shared: {why}"),
-                }
-            }
-            Command::Shape { name, shaping } => {
-                if let Some(share) = self.shares.get(&name) {
-                    let ages_as_before = share.shaping().max_age == shaping.max_age;
-                    share.set_shaping(shaping);
-                    if !ages_as_before {
-                        self.begin_flows_anew(name);
-                    }
-                }
-                if let Some(wanted) = self.keyless.get_mut(&name) {
-                    wanted.shaping = shaping;
-                }
-                // Messages of other publishers on our share are shaped by those publishers.
-                if let Some(sink) = self.sinks.get(&name).filter(|_| !self.shares.contains_key(&name)) {
-                    sink.set_shaping(shaping);
-                }
-            }
+            Command::Share(spec) => self.share(now, spec),
+            Command::Shape { name, shaping } => self.shape(name, shaping),
             Command::Frames { name, prefix } => {
                 if let Some(sink) = self.sinks.get(&name) {
                     sink.set_frames(prefix);
@@ -79,26 +44,10 @@ impl<N: RosNetwork> Core<N> {
             Command::UpdateShare { name, qos, sources } => {
                 self.endpoint.update_share(now, &name, qos, sources)
             }
-            Command::Unshare { name } => {
-                self.endpoint.unshare(now, &name);
-                self.consumers.show_soon(now.instant);
-                self.forget_type(&name);
-                if let Some(share) = self.shares.remove(&name) {
-                    share.close();
-                }
-                self.end_calls(&name);
-                if let Some(sink) = self.sinks.remove(&name) {
-                    sink.close();
-                }
-            }
+            Command::Unshare { name } => self.unshare(now, name),
             Command::MapSources { name, class, own } => self.map_sources(name, class, own),
             Command::OpenReader { name, spec } => self.open_reader(name, spec),
-            Command::CloseReader { name } => {
-                self.graph.reader_gone(&name);
-                if let Some(reader) = self.readers.remove(&name).and_then(|reader| reader.opened) {
-                    drop_elsewhere(reader);
-                }
-            }
+            Command::CloseReader { name } => self.close_reader(&name),
             Command::UpdatePolicy { name, policy } => self.endpoint.update_policy(now, &name, policy),
             Command::Follow { owner_name } => {
                 self.endpoint.follow(now, &owner_name);
@@ -129,34 +78,139 @@ impl<N: RosNetwork> Core<N> {
             Command::ServersGone { name } => self.servers_gone(&name),
             Command::OpenServer { name, spec } => self.open_server(name, spec),
             Command::CloseServer { name } => self.close_service_end(&name),
-            Command::Leave { name } => {
-                self.endpoint.leave(now, &name);
-                self.forget_type(&name);
-                self.stop_publishing(&name);
-                self.end_calls(&name);
-                if let Some(sink) = self.sinks.remove(&name) {
-                    sink.close();
-                }
-                self.history_due.retain(|(n, _), _| *n != name);
-                self.retire_due.remove(&name);
-            }
+            Command::Leave { name } => self.leave(now, name),
             Command::OpenWriter { name, source, spec } => self.open_writer(name, source, spec),
-            Command::CloseWriter { name, source } => {
-                self.writers.remove(&(name, source));
-                self.graph.writer_gone(&(name, source));
-                if let Some(source) = source {
-                    self.history_due.remove(&(name, source));
-                }
-                if let Some(sink) = self.sinks.get(&name) {
-                    sink.set_writer(source, None);
-                }
-            }
+            Command::CloseWriter { name, source } => self.close_writer(name, source),
             Command::ResizeWriter { name, source, spec } => self.resize_writer(name, source, spec),
             Command::MoveWriter { name, from, to } => self.move_writer(name, from, to),
             Command::SetNode { name, source, owner, node } => {
                 self.graph.set_node((name, source), owner, node)
             }
             Command::Report(problem) => self.problem_log.note(now.instant, &problem),
+        }
+    }
+
+    fn share(&mut self, now: Now, spec: ShareSpec) {
+        let topic = spec.metadata.ros_name.clone();
+        let (metadata, type_hash) = (spec.metadata.clone(), spec.type_hash.clone());
+        let is_service = spec.metadata.kind == Kind::Service;
+        match self.endpoint.share(now, spec) {
+            Ok(name) => {
+                debug!(%topic, %name, "shared");
+                let share = LocalShare::new(
+                    name,
+                    self.data.clone(),
+                    self.alive.clone(),
+                    self.epoch_messages_max,
+                    self.epoch_over.clone(),
+                );
+                self.shares.insert(name, Arc::new(share));
+                self.need_type(name, &metadata, type_hash, None);
+                if is_service {
+                    self.begin_local(name);
+                }
+            }
+            Err(why) => error!("{topic} is not shared: {why}"),
+        }
+    }
+
+    fn shape(&mut self, name: Name, shaping: Shaping) {
+        if let Some(share) = self.shares.get(&name) {
+            let ages_as_before = share.shaping().max_age == shaping.max_age;
+            share.set_shaping(shaping);
+            if !ages_as_before {
+                self.begin_flows_anew(name);
+            }
+        }
+        if let Some(wanted) = self.keyless.get_mut(&name) {
+            wanted.shaping = shaping;
+        }
+        // Messages of other publishers on our share are shaped by those publishers.
+        if let Some(sink) = self.sinks.get(&name).filter(|_| !self.shares.contains_key(&name)) {
+            sink.set_shaping(shaping);
+        }
+    }
+
+    fn unshare(&mut self, now: Now, name: Name) {
+        self.endpoint.unshare(now, &name);
+        self.consumers.show_soon(now.instant);
+        self.forget_type(&name);
+        if let Some(share) = self.shares.remove(&name) {
+            share.close();
+        }
+        self.end_calls(&name);
+        if let Some(sink) = self.sinks.remove(&name) {
+            sink.close();
+        }
+    }
+
+    fn leave(&mut self, now: Now, name: Name) {
+        self.endpoint.leave(now, &name);
+        self.forget_type(&name);
+        self.stop_publishing(&name);
+        self.end_calls(&name);
+        if let Some(sink) = self.sinks.remove(&name) {
+            sink.close();
+        }
+        self.history_due.retain(|(n, _), _| *n != name);
+        self.retire_due.remove(&name);
+    }
+
+    /// Takes a new reader into use, unless the wish has changed meanwhile.
+    pub(super) fn reader_ready(
+        &mut self,
+        name: Name,
+        spec: &EndpointSpec,
+        guid: Guid,
+        reader: Box<dyn Any + Send>,
+    ) {
+        match self.readers.get_mut(&name) {
+            Some(wanted) if wanted.spec == *spec && !self.reopening.is_closed() => {
+                wanted.opened = Some(reader);
+                self.graph.reader_there(name, guid);
+            }
+            _ => drop_elsewhere(reader),
+        }
+    }
+
+    fn close_reader(&mut self, name: &Name) {
+        self.graph.reader_gone(name);
+        if let Some(reader) = self.readers.remove(name).and_then(|reader| reader.opened) {
+            drop_elsewhere(reader);
+        }
+    }
+
+    /// Takes a new writer into use, unless the wish has changed meanwhile.
+    pub(super) fn writer_ready(
+        &mut self,
+        name: Name,
+        source: Option<SourceId>,
+        spec: &EndpointSpec,
+        writer: Option<Arc<WriterQueue>>,
+    ) {
+        let wanted = !self.reopening.is_closed() && self.writers.get(&(name, source)) == Some(spec);
+        match (self.sinks.get(&name), writer) {
+            (Some(sink), Some(writer)) if wanted => {
+                self.graph.writer_there((name, source), writer.guid());
+                sink.set_writer(source, Some(writer));
+                match source {
+                    Some(source) => self.ask_history(name, source),
+                    None => self.ask_histories(name),
+                }
+            }
+            (_, Some(writer)) => writer.close(),
+            (_, None) => {}
+        }
+    }
+
+    fn close_writer(&mut self, name: Name, source: Option<SourceId>) {
+        self.writers.remove(&(name, source));
+        self.graph.writer_gone(&(name, source));
+        if let Some(source) = source {
+            self.history_due.remove(&(name, source));
+        }
+        if let Some(sink) = self.sinks.get(&name) {
+            sink.set_writer(source, None);
         }
     }
 

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use sgc_ros::RosNetwork;
 use sgc_transport::{CloseReason, Link as _};
-use sgc_trust::{Identity, TrustAnchors, VerifiedPeer};
+use sgc_trust::{CrlError, Identity, TrustAnchors, VerifiedPeer};
 use sgc_wire::{Credentials, RefuseReason, SinkId};
 use tracing::{info, warn};
 
@@ -18,6 +18,20 @@ use crate::state::audit::{AuditEvent, AuditRecord};
 use crate::state::credentials::{renew_at, renewed};
 
 impl<N: RosNetwork> Core<N> {
+    /// Adds a revocation list of a user. Returns whether it is new, and the lists that were in force before.
+    pub(super) fn add_crl(&mut self, der: &bytes::Bytes) -> Result<(bool, Vec<bytes::Bytes>), CrlError> {
+        let taken = self.router.add_crl(now(), der);
+        let record = AuditRecord::new(AuditEvent::Crl).by_user();
+        match &taken {
+            // The list is logged where it comes into force.
+            Ok(true) => {}
+            Ok(false) => self.audit.write(record.reason("known already")),
+            Err(why) => self.audit.write(record.reason(format!("refused: {why}"))),
+        }
+        let lists = self.credentials.anchors().crls().cloned().collect();
+        taken.map(|is_news| (is_news, lists))
+    }
+
     /// Asks the authority for credentials, if the identity names one or this node is the authority.
     pub(super) fn ask_renewal(&mut self) {
         let now = now();

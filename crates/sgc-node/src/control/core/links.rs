@@ -1,0 +1,90 @@
+//! Links that come and go, and their frames.
+
+use std::collections::HashMap;
+
+use sgc_ros::RosNetwork;
+use sgc_router::{LinkId, Neighbour};
+use sgc_transport::{AnyLink, Link, LinkUrl};
+use sgc_trust::VerifiedPeer;
+use sgc_wire::Control;
+use tokio::sync::oneshot;
+use tracing::{debug, warn};
+
+use super::{Core, LinkEntry};
+use crate::clock::now;
+use crate::control::control_queue::FrameRoom;
+use crate::control::event::LinkPlace;
+use crate::data::stats::CountDrops;
+use crate::link::control_tx::ControlTx;
+use crate::state::audit::{AuditEvent, AuditRecord};
+
+impl<N: RosNetwork> Core<N> {
+    /// Gives a new link its place.
+    pub(super) fn link_up(
+        &mut self,
+        link: AnyLink,
+        url: Option<String>,
+        control: ControlTx,
+        reply: oneshot::Sender<Option<LinkPlace>>,
+    ) {
+        let id = LinkId(self.next_link);
+        self.next_link += 1;
+        let set = url.as_deref().and_then(|url| url.parse::<LinkUrl>().ok()).and_then(|url| url.cost_ms);
+        let cost = set.map(|ms| ms.saturating_mul(1000));
+        let neighbour = Neighbour { cost, ..Neighbour::from(link.peer()) };
+        let remote = link.remote();
+        self.hear_of(link.peer());
+        let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
+        self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
+        let (flows, keep_alive) = (HashMap::new(), self.keep_alive_for(&link));
+        self.control_drops.link_up(id);
+        self.data.drops().link_up(id);
+        self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, keep_alive });
+        let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
+        if reply.send(Some(place)).is_err() {
+            debug!(%remote, "the link's task is gone");
+        }
+        self.router.handle_link_up(now(), id, neighbour);
+        self.begin_to_look(id);
+    }
+
+    /// Forgets a link. `in_use` is the place of another process with this node's identity, if the peer closed the link
+    /// for it.
+    pub(super) fn link_down(&mut self, id: LinkId, in_use: Option<String>) {
+        self.router.handle_link_down(now(), id);
+        self.control_drops.link_down(id);
+        self.data.drops().link_down(id);
+        if let Some(entry) = self.links.remove(&id) {
+            self.remember_policy(entry.link.peer().node_id, entry.keep_alive.policy());
+            let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
+            let record = record.remote(entry.link.remote());
+            self.audit.write(match &entry.closed_for {
+                Some(reason) => record.reason(reason),
+                None => record,
+            });
+            entry.flows.values().for_each(|f| f.close());
+        }
+        if let Some(place) = in_use {
+            self.displaced(&place);
+        }
+    }
+
+    /// Passes a control frame to the router.
+    pub(super) fn handle_frame(&mut self, link: LinkId, frame: Control, room: FrameRoom) {
+        let tells_time = matches!(frame, Control::Clock { .. });
+        self.router.handle_frame(now(), link, frame);
+        drop(room);
+        if tells_time {
+            self.compare_clocks(link);
+        }
+    }
+
+    /// Notes a member that was heard. Reports names in rules that are probably misspellings of it.
+    pub(super) fn hear_of(&mut self, peer: &VerifiedPeer) {
+        for (written, meant) in self.members.heard(peer, &self.identity) {
+            warn!(
+                "a [[share]] names \"{written}\", which nobody here is called; \"{meant}\" is here and may be meant"
+            );
+        }
+    }
+}

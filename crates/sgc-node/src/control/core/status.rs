@@ -1,0 +1,103 @@
+//! The node's status, as `sgc status` and the metrics show it.
+
+use std::collections::BTreeMap;
+
+use sgc_ros::{RosNetwork, RouteStatus, Routes};
+use sgc_router::LinkId;
+use sgc_transport::Link;
+
+use super::{Core, LinkEntry};
+use crate::admin::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
+use crate::data::stats::CountDrops;
+
+impl<N: RosNetwork> Core<N> {
+    /// Returns the node's status.
+    pub(super) fn status(&self) -> Status {
+        let links = self.links.iter().map(|(id, entry)| self.link_status(*id, entry));
+        let names = self.entries.iter().map(|(name, (_, stats))| NameStatus::new(name, stats));
+        let router = self.router.stats();
+        Status {
+            node: self.identity.node_name().to_string(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            uptime_s: self.started.elapsed().as_secs(),
+            links: links.collect(),
+            routers: self.board.snapshot(),
+            routes: self.routes.iter().flat_map(Routes::status).map(|route| self.route_line(route)).collect(),
+            alerts: self.alerts(),
+            problems: self.problems(),
+            names: names.collect(),
+            drops: self.all_drops(),
+            refused: self.all_refused(),
+            local_network_reopened: self.reopening.reopenings(),
+            router: RouterLine {
+                nodes: router.nodes,
+                names: router.names,
+                routed_names: router.routed_names,
+                branches: router.branches,
+            },
+            // The caller adds it, since the core knows nothing of the gateway.
+            gateway: None,
+        }
+    }
+
+    fn link_status(&self, id: LinkId, entry: &LinkEntry) -> LinkStatus {
+        let stats = entry.link.stats();
+        let (cost, silent) = self.router.link_cost(id).unwrap_or_default();
+        let over = self.data.rates().over(&entry.link.peer().node_id);
+        LinkStatus {
+            id: id.0,
+            peer: entry.link.peer().node_id.to_string(),
+            peer_until: entry.link.peer().not_after.to_string(),
+            remote: entry.link.remote().to_string(),
+            url: entry.url.clone(),
+            kex: stats.key_exchange.label(),
+            rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
+            cost,
+            silent,
+            keep_alive_ms: entry.keep_alive.step().as_millis().try_into().unwrap_or(u64::MAX),
+            sent_bytes: stats.sent_bytes,
+            received_bytes: stats.received_bytes,
+            lanes: entry.control.lanes().count(),
+            labels_sent: entry.control.labels_known(),
+            labels_received: entry.link.labels_defined(),
+            peer_slowed: over.slowed,
+            peer_dropped: over.dropped,
+        }
+    }
+
+    fn route_line(&self, mut route: RouteStatus) -> RouteLine {
+        self.describe_calls(&mut route);
+        let messages = route.name.and_then(|n| {
+            let published = self.shares.get(&n).map(|s| s.published());
+            published.or_else(|| self.sinks.get(&n).map(|s| s.delivered()))
+        });
+        let share = route.name.and_then(|n| self.shares.get(&n));
+        let compressed = share.and_then(|s| s.compressed());
+        RouteLine::new(route, messages, share.map_or(0, |s| s.signatures()), compressed)
+    }
+
+    /// Returns everything that was dropped or refused, by kind and culprit. Control frames and packets share some kinds.
+    pub(super) fn all_drops(&self) -> BTreeMap<String, u64> {
+        let audit =
+            [("audit_lost", self.audit.lost_total()), ("audit_summed_up", self.audit.summed_up_total())];
+        let audit = audit.into_iter().filter(|(_, n)| *n > 0).map(|(key, n)| (key.to_owned(), n));
+        let mut all: BTreeMap<String, u64> = audit.collect();
+        for counts in [
+            self.control_drops.snapshot(),
+            self.data.drops().snapshot(),
+            self.data.rates().drops(),
+            self.ros_failures.snapshot(),
+            self.board.drops().snapshot(),
+        ] {
+            counts.into_iter().for_each(|(key, n)| *all.entry(key).or_default() += n);
+        }
+        all
+    }
+
+    /// Returns the peers that were refused a link, by kind.
+    pub(super) fn all_refused(&self) -> BTreeMap<String, u64> {
+        let all = sgc_transport::RefusalKind::ALL.into_iter();
+        let all = all.map(|kind| (kind.label().to_owned(), self.transport.refused(kind)));
+        all.filter(|(_, n)| *n > 0).collect()
+    }
+}
