@@ -29,7 +29,7 @@ use sgc_router::{FibEntry, LinkId, Output as RouterOutput, Router};
 use sgc_transport::{AnyLink, CredentialStore};
 use sgc_trust::{Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
-use sgc_wire::{Control, Name, NodeId, Now, SourceId};
+use sgc_wire::{Control, Name, Now, SourceId};
 use tokio::sync::{Notify, mpsc, watch};
 
 use crate::clock::now;
@@ -42,9 +42,12 @@ use crate::control::interface_types::InterfaceTypes;
 use crate::control::local_graph::LocalGraph;
 use crate::control::members::{MemberNames, Members};
 use crate::control::operations::Operations;
+use crate::control::peer_policies::PeerPolicies;
 use crate::control::peer_rate::PeerRates;
 use crate::control::problem_log::ProblemLog;
 use crate::control::publishing::{Offer, Publishing};
+use crate::control::refusals::Refusals;
+use crate::control::sink_timers::SinkTimers;
 use crate::data::call_ledger::CallLedger;
 use crate::data::calls::Calls;
 use crate::data::dataplane::DataPlane;
@@ -68,16 +71,12 @@ use crate::state::credentials::StateWriter;
 const BATCH_MAX: usize = 256;
 /// Interval of checks for sources that may have fallen silent.
 const SILENCE_LOOK: Duration = Duration::from_secs(1);
-/// Time without progress after which a history is asked for again.
-const HISTORY_RETRY: Duration = Duration::from_secs(2);
 /// Bytes of history kept for late joiners of one publisher.
 const HISTORY_BYTES_MAX: usize = 64 << 20;
 /// Messages of history kept for a publisher that keeps all.
 const HISTORY_KEEP_ALL_MAX: usize = 4096;
 /// Instances for which a transient-local source of a keyed topic keeps its history, as the writers of `sgc-dds` do.
 const KEYED_INSTANCES_KEPT: usize = 256;
-/// Time for which packets of past epochs may be under way.
-const EPOCH_GRACE: Duration = Duration::from_secs(5);
 
 /// A local reader for a name.
 struct LocalReader {
@@ -111,10 +110,7 @@ pub(crate) struct Core<N: RosNetwork> {
     links: BTreeMap<LinkId, LinkEntry>,
     /// Time of the next look at the links.
     look_due: Option<Instant>,
-    /// Keep-alive policy of new links.
-    keep_alive_policy: KeepAlivePolicy,
-    /// Shorter intervals of peers behind NATs that forget soon.
-    impatient: BTreeMap<NodeId, Duration>,
+    keep_alive_policies: PeerPolicies,
     next_link: u32,
     entries: HashMap<Name, (FibEntry, Arc<NameStats>)>,
     shares: HashMap<Name, Arc<LocalShare>>,
@@ -132,9 +128,7 @@ pub(crate) struct Core<N: RosNetwork> {
     reopening: NetworkState,
     /// Local consumers that owners are told, and far consumers that are shown here.
     consumers: FarConsumers,
-    history_due: BTreeMap<(Name, SourceId), Instant>,
-    /// Times at which the keys of past epochs are dropped.
-    retire_due: BTreeMap<Name, Instant>,
+    sink_timers: SinkTimers,
     /// Signing keys of this node's messages, by suite.
     message_keys: MessageKeys,
     publishing: BTreeMap<Name, Publishing>,
@@ -170,8 +164,7 @@ pub(crate) struct Core<N: RosNetwork> {
     alive: mpsc::Sender<()>,
     audit: Audit,
     board: Board,
-    /// Refused nodes of each share, with the reason.
-    refused: BTreeMap<Name, BTreeMap<NodeId, String>>,
+    refused: Refusals,
     /// Taps of the local network.
     local_taps: Vec<Arc<TapQueue>>,
     types: InterfaceTypes,
@@ -243,8 +236,7 @@ impl<N: RosNetwork> Core<N> {
             inbox: Inbox::default(),
             links: BTreeMap::new(),
             look_due: None,
-            keep_alive_policy: parts.keep_alive_policy,
-            impatient: BTreeMap::new(),
+            keep_alive_policies: PeerPolicies::new(parts.keep_alive_policy),
             next_link: 1,
             entries: HashMap::new(),
             shares: HashMap::new(),
@@ -256,8 +248,7 @@ impl<N: RosNetwork> Core<N> {
             graph,
             reopening: NetworkState::default(),
             consumers: FarConsumers::default(),
-            history_due: BTreeMap::new(),
-            retire_due: BTreeMap::new(),
+            sink_timers: SinkTimers::default(),
             message_keys: parts.message_keys,
             publishing: BTreeMap::new(),
             keyless: BTreeMap::new(),
@@ -285,7 +276,7 @@ impl<N: RosNetwork> Core<N> {
             alive: parts.alive,
             audit: parts.audit,
             board: parts.board,
-            refused: BTreeMap::new(),
+            refused: Refusals::default(),
             types: InterfaceTypes::new(parts.types, parts.definitions),
             members,
             local_taps: Vec::new(),
@@ -401,7 +392,7 @@ impl<N: RosNetwork> Core<N> {
                 self.ask_history(name, source);
             }
             SinkRequest::Synced(name, source) => {
-                self.history_due.remove(&(name, source));
+                self.sink_timers.history_ended(name, source);
             }
         }
     }
@@ -434,10 +425,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// Asks again for histories that make no progress.
     fn histories_due(&mut self, now: Instant) {
-        let due: Vec<_> =
-            self.history_due.iter().filter(|(_, at)| **at <= now).map(|(key, _)| *key).collect();
-        for (name, source) in due {
-            self.history_due.remove(&(name, source));
+        for (name, source) in self.sink_timers.take_histories(now) {
             self.ask_history_again(name, source);
         }
     }
@@ -462,10 +450,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// Drops the keys of past epochs.
     fn epochs_due(&mut self, now: Instant) {
-        let over: Vec<_> =
-            self.retire_due.iter().filter(|(_, at)| **at <= now).map(|(name, _)| *name).collect();
-        for name in over {
-            self.retire_due.remove(&name);
+        for name in self.sink_timers.take_epochs(now) {
             if let Some(sink) = self.sinks.get(&name) {
                 sink.retire_epochs();
             }
@@ -498,12 +483,11 @@ impl<N: RosNetwork> Core<N> {
             if !progressed {
                 self.note_consumers();
                 let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
-                let history = self.history_due.values().min().copied();
-                let retire = self.retire_due.values().min().copied();
                 let rekey = self.rekey_deadline();
                 let own = [self.renew_due, self.silence_due, self.look_due, self.operations.deadline()];
                 let own = own.into_iter().chain([self.reopening.deadline()]);
-                let all = [router, endpoint, routes, history, retire, rekey, self.calls_deadline()];
+                let all =
+                    [router, endpoint, routes, self.sink_timers.deadline(), rekey, self.calls_deadline()];
                 let all =
                     all.into_iter().chain(own).chain([self.types.deadline(), self.consumers.deadline()]);
                 return all.flatten().min();

@@ -204,6 +204,8 @@ pub(crate) struct AskChanges {
 
 /// Endpoints of a consumer, and the kind of each.
 pub(crate) type ConsumerEndpoints = Vec<(EndpointKind, ShownEndpoint)>;
+/// Ids of a consumer's endpoints, and the kind of each.
+pub(crate) type EndpointIds = Vec<(EndpointKind, Guid)>;
 /// The endpoints that are wanted for a consumer.
 pub(crate) type ConsumerSpecs = Vec<(EndpointKind, EndpointSpec)>;
 
@@ -213,7 +215,7 @@ pub(crate) struct ShowChanges {
     /// Consumers that are gone, with their endpoints.
     pub(crate) gone: Vec<(ConsumerKey, Option<ConsumerEndpoints>)>,
     /// Shown consumers of which the node changed, with the ids of their endpoints.
-    pub(crate) moved: Vec<(ConsumerKey, RosNode, Vec<(EndpointKind, Guid)>)>,
+    pub(crate) moved: Vec<(ConsumerKey, RosNode, EndpointIds)>,
     /// Consumers to show.
     pub(crate) fresh: Vec<(ConsumerKey, ConsumerSpecs)>,
 }
@@ -221,7 +223,7 @@ pub(crate) struct ShowChanges {
 /// Decision about created endpoints.
 pub(crate) enum MadeEndpoints {
     /// They stand for a consumer of this node. Their ids follow.
-    Shown(RosNode, Vec<(EndpointKind, Guid)>),
+    Shown(RosNode, EndpointIds),
     /// The consumer has changed meanwhile.
     Unwanted(ConsumerEndpoints),
 }
@@ -332,7 +334,7 @@ impl FarConsumers {
     }
 }
 
-fn guids(endpoints: &[(EndpointKind, ShownEndpoint)]) -> Vec<(EndpointKind, Guid)> {
+fn guids(endpoints: &[(EndpointKind, ShownEndpoint)]) -> EndpointIds {
     endpoints.iter().map(|(kind, endpoint)| (*kind, endpoint.guid)).collect()
 }
 

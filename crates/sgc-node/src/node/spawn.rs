@@ -3,8 +3,9 @@
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use rand_chacha::ChaCha20Rng;
 use sgc_ros::RosNetwork;
-use sgc_transport::{Dialer, Listener};
+use sgc_transport::{Dialer, ListenAddr, Listener};
 use tokio::sync::{Mutex, Notify, mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
@@ -53,7 +54,7 @@ pub(super) struct RunningNode<N: RosNetwork> {
     pub(super) run_lock: RunLock,
 }
 
-/// Starts the tasks of a node, and says so to `options.ready`.
+/// Starts the tasks of a node, and sends its listen addresses to `options.ready`.
 pub(super) async fn spawn<N: RosNetwork>(
     node: BuiltNode<N>,
     options: RunOptions,
@@ -70,12 +71,8 @@ pub(super) async fn spawn<N: RosNetwork>(
     let listening: Vec<_> = sockets.listeners.iter().map(|l| l.local().clone()).collect();
     let nearby = wanted_nearby(&config.routers, &identity)?;
     let announced = if config.announce { &listening[..] } else { &[] };
-    let local = (nearby.is_some() || config.announce)
-        .then(|| LocalNetwork::open(options.mdns_port, announced, &mut rng))
-        .and_then(|opened| {
-            let failed = |why| warn!("mDNS on the local network cannot be used: {why}");
-            opened.map(Arc::new).map_err(failed).ok()
-        });
+    let uses_mdns = nearby.is_some() || config.announce;
+    let local = if uses_mdns { open_mdns(options.mdns_port, announced, &mut rng) } else { None };
     let keeper = LinkKeeper {
         me: identity.node_id(),
         dialer: sockets.dialer.clone(),
@@ -140,6 +137,16 @@ pub(super) async fn spawn<N: RosNetwork>(
         all_ended: channels.all_ended,
         run_lock: node.run_lock,
     })
+}
+
+/// Joins mDNS on the local network. Without it, the node runs all the same.
+fn open_mdns(
+    port: Option<u16>,
+    announced: &[ListenAddr],
+    rng: &mut ChaCha20Rng,
+) -> Option<Arc<LocalNetwork>> {
+    let failed = |why| warn!("mDNS on the local network cannot be used: {why}");
+    LocalNetwork::open(port, announced, rng).map(Arc::new).map_err(failed).ok()
 }
 
 fn accept(listener: Listener, admission: Admission) -> (JoinHandle<()>, oneshot::Sender<()>) {

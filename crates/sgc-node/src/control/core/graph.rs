@@ -22,33 +22,6 @@ use crate::admin::graph::{
 use crate::data::tap::{Tap, TapError, TapMessage, TapQueue, TapRequest, Taps};
 use crate::state::audit::Audit;
 
-/// Names whose refusals are remembered.
-const REFUSED_NAMES_MAX: usize = 256;
-/// Refused nodes remembered for one name.
-const REFUSED_NODES_MAX: usize = 16;
-
-/// Refusals by name and node.
-type Refusals = BTreeMap<Name, BTreeMap<NodeId, String>>;
-
-/// Remembers a refusal, to explain later why nothing flows.
-pub(super) fn remember_refusal(all: &mut Refusals, name: Name, peer: NodeId, reason: &impl ToString) {
-    if all.len() >= REFUSED_NAMES_MAX && !all.contains_key(&name) {
-        all.pop_first();
-    }
-    let of_name = all.entry(name).or_default();
-    if of_name.len() >= REFUSED_NODES_MAX && !of_name.contains_key(&peer) {
-        of_name.pop_first();
-    }
-    of_name.insert(peer, reason.to_string());
-}
-
-/// Forgets a refusal, because it may no longer hold.
-pub(super) fn forget_refusal(all: &mut Refusals, name: &Name, peer: &NodeId) {
-    if let Some(of_name) = all.get_mut(name) {
-        of_name.remove(peer);
-    }
-}
-
 impl<N: RosNetwork> Core<N> {
     pub(super) fn graph(&self, asked: Option<Name>) -> Graph {
         let mut graph = Graph {
@@ -150,7 +123,7 @@ impl<N: RosNetwork> Core<N> {
             for (peer, hash) in self.consumers.hashes(route.name, role) {
                 consumer_hashes.entry(self.called(&peer)).or_default().insert(hash.to_owned());
             }
-            let refused = self.refused.get(&route.name).into_iter().flatten();
+            let refused = self.refused.for_name(&route.name);
             let sink = self.sinks.get(&route.name);
             share.routes.push(ShareRoute {
                 topic: route.local_name,

@@ -55,7 +55,7 @@ impl<N: RosNetwork> Core<N> {
         self.control_drops.link_down(id);
         self.data.drops().link_down(id);
         if let Some(entry) = self.links.remove(&id) {
-            self.remember_policy(entry.link.peer().node_id, entry.keep_alive.policy());
+            self.keep_alive_policies.remember(entry.link.peer().node_id, entry.keep_alive.policy());
             let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
             let record = record.remote(entry.link.remote());
             self.audit.write(match &entry.closed_for {

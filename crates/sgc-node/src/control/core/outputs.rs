@@ -8,7 +8,7 @@ use sgc_transport::{CloseReason, Link};
 use sgc_wire::{Name, Now, RefuseReason, Role};
 use tracing::{debug, info, warn};
 
-use super::{Core, EPOCH_GRACE, graph};
+use super::{Core, graph};
 use crate::clock::now;
 use crate::state::audit::{AuditEvent, AuditRecord};
 
@@ -146,7 +146,7 @@ impl<N: RosNetwork> Core<N> {
                     self.call_granted(now, name, sink, grant, anew);
                 } else if let Some(local) = self.sinks.get(&name) {
                     local.grant(sink, grant, &self.data);
-                    self.retire_due.insert(name, now.instant + EPOCH_GRACE);
+                    self.sink_timers.epoch_ended(name, now.instant);
                 }
                 if let Some(routes) = &mut self.routes {
                     routes.handle_granted(&name, entry);
@@ -167,7 +167,7 @@ impl<N: RosNetwork> Core<N> {
             Event::SinkJoined { name, sink, peer, role } => {
                 info!("granted {} to {}", shown(routes, &name), graph::called(&self.audit, &peer));
                 debug!(name = %name.short(), peer = %peer.short(), "granted a subscriber");
-                graph::forget_refusal(&mut self.refused, &name, &peer);
+                self.refused.forget(&name, &peer);
                 if role == Role::Subscribe || routes.is_service(&name) {
                     routes.handle_sink_joined(&name, sink);
                 }
@@ -190,7 +190,7 @@ impl<N: RosNetwork> Core<N> {
             }
             Event::SinkRefused { name, peer, reason } => {
                 debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
-                graph::remember_refusal(&mut self.refused, name, peer, &reason);
+                self.refused.remember(name, peer, &reason);
                 if self.control_drops.count_from("join_refused", peer) {
                     warn!(peer = %peer.short(), %reason, "refused a subscriber; counted from here on");
                 }

@@ -9,7 +9,7 @@ use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Name, Now, SinkId, SourceOffer, TopicGrant};
 use tracing::warn;
 
-use super::{Core, EPOCH_GRACE};
+use super::Core;
 use crate::clock::now;
 use crate::control::event::CoreEvent;
 use crate::control::publishing::{GrantEffect, Offer, Publishing};
@@ -133,7 +133,7 @@ impl<N: RosNetwork> Core<N> {
         if let Some(progress) = sink.progress() {
             self.endpoint.set_own_sink(&name, progress);
         }
-        self.retire_due.insert(name, now().instant + EPOCH_GRACE);
+        self.sink_timers.epoch_ended(name, now().instant);
         if let Some(routes) = &mut self.routes {
             routes.handle_publishers(&name, others);
             self.consumers.show_soon(now().instant);

@@ -6,37 +6,21 @@ use std::time::{Duration, Instant};
 use sgc_ros::RosNetwork;
 use sgc_router::LinkId;
 use sgc_transport::{AnyLink, CloseReason, Link};
-use sgc_wire::{Control, NodeId};
+use sgc_wire::Control;
 use tracing::info;
 
 use super::{Core, LinkEntry};
 use crate::clock::now;
-use crate::link::keep_alive::{KeepAlive, KeepAlivePolicy, LinkObservation};
+use crate::link::keep_alive::{KeepAlive, LinkObservation};
 
 /// Interval of looks at the links.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
-/// Most peers whose shorter keep-alive interval is remembered.
-const IMPATIENT_MAX: usize = 1024;
 
 impl<N: RosNetwork> Core<N> {
     /// Starts the keep-alive of a link to this peer.
     pub(super) fn keep_alive_for(&self, link: &AnyLink) -> KeepAlive {
-        let known = self.impatient.get(&link.peer().node_id);
-        let keep_alive_policy = KeepAlivePolicy {
-            max: known.copied().unwrap_or(self.keep_alive_policy.max),
-            ..self.keep_alive_policy
-        };
-        KeepAlive::new(Instant::now(), keep_alive_policy, link.stats().received_bytes, link.remote())
-    }
-
-    /// Remembers the keep-alive interval that an ending link had to use.
-    pub(super) fn remember_policy(&mut self, node: NodeId, keep_alive_policy: KeepAlivePolicy) {
-        let is_known = self.impatient.contains_key(&node);
-        if keep_alive_policy.max < self.keep_alive_policy.max
-            && (is_known || self.impatient.len() < IMPATIENT_MAX)
-        {
-            self.impatient.insert(node, keep_alive_policy.max);
-        }
+        let policy = self.keep_alive_policies.for_peer(&link.peer().node_id);
+        KeepAlive::new(Instant::now(), policy, link.stats().received_bytes, link.remote())
     }
 
     /// Looks at all links, if that is due.

@@ -13,8 +13,7 @@ use sgc_wire::{Class, History, Kind, Name, Now, Qos, SourceId};
 use tracing::{debug, error};
 
 use super::{
-    Core, HISTORY_BYTES_MAX, HISTORY_KEEP_ALL_MAX, HISTORY_RETRY, KEYED_INSTANCES_KEPT, LocalReader,
-    drop_elsewhere,
+    Core, HISTORY_BYTES_MAX, HISTORY_KEEP_ALL_MAX, KEYED_INSTANCES_KEPT, LocalReader, drop_elsewhere,
 };
 use crate::clock::now;
 use crate::control::event::CoreEvent;
@@ -152,8 +151,7 @@ impl<N: RosNetwork> Core<N> {
         if let Some(sink) = self.sinks.remove(&name) {
             sink.close();
         }
-        self.history_due.retain(|(n, _), _| *n != name);
-        self.retire_due.remove(&name);
+        self.sink_timers.forget(&name);
     }
 
     /// Takes a new reader into use, unless the wish has changed meanwhile.
@@ -207,7 +205,7 @@ impl<N: RosNetwork> Core<N> {
         self.writers.remove(&(name, source));
         self.graph.writer_gone(&(name, source));
         if let Some(source) = source {
-            self.history_due.remove(&(name, source));
+            self.sink_timers.history_ended(name, source);
         }
         if let Some(sink) = self.sinks.get(&name) {
             sink.set_writer(source, None);
@@ -370,7 +368,7 @@ impl<N: RosNetwork> Core<N> {
     /// Moves a writer to another source of the same publisher.
     fn move_writer(&mut self, name: Name, from: SourceId, to: SourceId) {
         let Some(spec) = self.writers.remove(&(name, Some(from))) else { return };
-        self.history_due.remove(&(name, from));
+        self.sink_timers.history_ended(name, from);
         if self.sinks.get(&name).is_some_and(|sink| sink.move_writer(from, to)) {
             self.graph.writer_moved(name, from, to);
             self.writers.insert((name, Some(to)), spec);
@@ -405,7 +403,7 @@ impl<N: RosNetwork> Core<N> {
             AskAgain::Wait => {}
             AskAgain::From(from) => self.endpoint.recover(name, source, from, u64::MAX),
         }
-        self.history_due.insert((name, source), Instant::now() + HISTORY_RETRY);
+        self.sink_timers.history_asked(name, source);
     }
 
     /// Applies new settings to the queues of a name. Queued packets are still sent.

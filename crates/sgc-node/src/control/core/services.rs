@@ -9,7 +9,7 @@ use sgc_ros::{DiscoveryEvent, RosNetwork, RouteStatus, ServiceSpec, ServiceTopic
 use sgc_wire::{Name, Now, SinkId, TopicGrant};
 use tracing::error;
 
-use super::{Core, EPOCH_GRACE, drop_elsewhere};
+use super::{Core, drop_elsewhere};
 use crate::admin::graph::{LostCalls, ServiceCalls};
 use crate::control::event::{CoreEvent, ServiceEnd};
 use crate::data::call_ledger::{CallLedger, CallerId, LEDGERS_MAX};
@@ -103,7 +103,7 @@ impl<N: RosNetwork> Core<N> {
             return;
         };
         local.grant(sink, grant, &self.data);
-        self.retire_due.insert(name, now.instant + EPOCH_GRACE);
+        self.sink_timers.epoch_ended(name, now.instant);
         called.granted(sink, anew);
     }
 
