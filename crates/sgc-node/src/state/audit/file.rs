@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use rustix::fs::OFlags;
 use sgc_config::AuditRoom;
 
-use super::AuditRecord;
+use super::record::AuditRecord;
 
 /// Longest line that is read, bytes. Written lines are shorter.
 const LINE_BYTES_MAX: u64 = 16 * 1024;

@@ -8,12 +8,11 @@
 //! The clock is an argument: the time of the records.
 
 use std::collections::BTreeMap;
-use std::net::IpAddr;
 
 use sgc_trust::AddressPrefix;
 use sgc_wire::{Name, NodeId};
 
-use super::{AuditEvent, AuditRecord};
+use super::record::{AuditEvent, AuditRecord, Cause};
 
 /// The period of all quotas, milliseconds.
 const HOUR_MS: u64 = 3_600_000;
@@ -33,20 +32,6 @@ const CROWD_RECORDS_MAX: u32 = 4096;
 const QUOTAS_MAX: usize = 16_384;
 /// Shortest time between two searches for quotas whose hour has ended, milliseconds.
 const SWEEP_MS: u64 = 1000;
-
-/// The cause of a record.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) enum Cause {
-    /// This node or its user. Such records are unlimited.
-    #[default]
-    Local,
-    /// The fleet: its CA, its authority, or the passage of time.
-    Fleet,
-    /// A peer with a certificate.
-    Peer(NodeId),
-    /// A peer at this address without a valid certificate.
-    Address(IpAddr),
-}
 
 /// The holder of a quota.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
