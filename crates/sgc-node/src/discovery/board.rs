@@ -9,7 +9,8 @@ use sgc_transport::LinkUrl;
 use sgc_wire::NodeId;
 use tokio::time::Instant;
 
-use super::{DialTarget, SkippedUrl};
+use super::target::DialTarget;
+use super::urls::SkippedUrl;
 use crate::data::stats::Drops;
 
 /// A router that the node looks for, or a place where it looks for routers.

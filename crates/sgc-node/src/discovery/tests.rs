@@ -4,10 +4,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::future::Future;
+use std::net::SocketAddr;
 use std::sync::Mutex;
 use std::time::Duration;
 
-use sgc_transport::{DialError, LinkError};
+use sgc_transport::{DialError, LinkError, LinkUrl};
 use sgc_wire::NodeId;
 use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
