@@ -121,7 +121,7 @@ impl Default for TransportConfig {
 /// The local ROS 2 network.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RosConfig {
-    /// ROS domain id, 0 to [`DOMAIN_ID_MAX`].
+    /// ROS domain id, 0 to [`DOMAIN_ID_MAX`](crate::DOMAIN_ID_MAX).
     pub domain_id: u32,
     /// Range of discovery.
     pub discovery: DiscoveryRange,

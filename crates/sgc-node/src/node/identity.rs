@@ -23,7 +23,7 @@ pub fn load_identity(path: &Path) -> Result<Identity, NodeError> {
     Identity::parse(&text).map_err(|source| NodeError::Identity { path: path.to_owned(), source })
 }
 
-/// Checks the identity as [`run`] does, and binds nothing. A certificate that is not valid yet passes, see
+/// Checks the identity as [`run`](crate::run) does, and binds nothing. A certificate that is not valid yet passes, see
 /// [`clock_alert`](crate::control::alerts::clock_alert).
 pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
     let identity = load_identity(&config.identity)?;
