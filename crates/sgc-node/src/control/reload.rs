@@ -187,6 +187,33 @@ impl Reloader {
 
     /// Applies `config`.
     async fn apply(&self, running: &mut Running, config: Config) -> Result<ReloadReport, String> {
+        let PreparedReload { rules, anchors, message_keys, gateway } = self.prepare(running, &config).await?;
+        self.join(running, config.ros.as_ref()).await?;
+        running.suites.extend(message_keys.keys().copied());
+        let mut report = ReloadReport {
+            changed: changes(&running.rules, &rules),
+            needs_restart: needs_restart(running, &config, &rules),
+            warnings: rules.warnings.clone(),
+        };
+        let dialled = self.dial(running, &rules.routers);
+        report.changed.extend(dialled.iter().map(|url| format!("{url} is dialled, which a token names")));
+        // This precedes the control task's check of existing links.
+        self.credentials.set_admitted(rules.partners.admitted.clone());
+        self.reconfigure(&rules, anchors, message_keys).await?;
+        // The control task has the newest revocation lists.
+        if let Some((access, files)) = gateway {
+            report.changed.extend(self.reconfigure_gateway(running, &config, access, files)?);
+        }
+        self.audit.set_names(rules.names.clone());
+        running.config = merged(running.config.clone(), config);
+        running.rules = rules;
+        report.changed.dedup();
+        self.changed.notify_one();
+        Ok(report)
+    }
+
+    /// Loads everything that `config` names. Nothing changes.
+    async fn prepare(&self, running: &Running, config: &Config) -> Result<PreparedReload, String> {
         // The identity may have been renewed since the start.
         let (identity, state) = (self.credentials.identity(), self.state.clone());
         let (mut wanted, own, suites) =
@@ -217,53 +244,46 @@ impl Reloader {
             Ok(PreparedReload { rules, anchors, message_keys, gateway })
         });
         let prepared = prepare.await.map_err(|_| "reading ended in a panic")?;
-        let PreparedReload { rules, anchors, message_keys, gateway } =
-            prepared.map_err(|error| error.to_string())?;
-        self.join(running, config.ros.as_ref()).await?;
-        running.suites.extend(message_keys.keys().copied());
-        let mut report = ReloadReport {
-            changed: changes(&running.rules, &rules),
-            needs_restart: needs_restart(running, &config, &rules),
-            warnings: rules.warnings.clone(),
-        };
-        let dialled = self.dial(running, &rules.routers);
-        report.changed.extend(dialled.iter().map(|url| format!("{url} is dialled, which a token names")));
-        // This precedes the control task's check of existing links.
-        self.credentials.set_admitted(rules.partners.admitted.clone());
+        prepared.map_err(|error| error.to_string())
+    }
+
+    /// Passes new rules to the control task, and waits until the change is under way.
+    async fn reconfigure(
+        &self,
+        rules: &Rules,
+        anchors: Option<TrustAnchors>,
+        message_keys: MessageKeys,
+    ) -> Result<(), String> {
         let (reply, done) = oneshot::channel();
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
         let member_names = rules.members.clone();
         let event = CoreEvent::Reload { shares, uses, anchors, message_keys, member_names, reply };
         let stopping = || "the node is stopping".to_owned();
         self.events.send(event).await.map_err(|_| stopping())?;
-        done.await.map_err(|_| stopping())?;
-        // The control task has the newest revocation lists.
-        if let Some((access, files)) = gateway {
-            let access = access.with_anchors(TrustAnchors::clone(&self.credentials.anchors()));
-            let key = || match files {
-                Some(key) => ShownKey::Files(key),
-                None => ShownKey::Own(self.credentials.identity()),
-            };
-            if self.gateway.reconfigure(access, key).map_err(|error| error.to_string())? {
-                report.changed.push("who connects to the gateway is shown another certificate".to_owned());
-            }
-            if running.config.gateway.as_ref().map(access_part) != config.gateway.as_ref().map(access_part) {
-                report.changed.push("who may connect to the gateway changed".to_owned());
-            }
-        }
-        self.audit.set_names(rules.names.clone());
-        // Restart-only settings keep their running values, so that the next reload reports them again.
-        let Config { shares, uses, tokens, partners, trust, accept, gateway, .. } = config;
-        let before = running.config.clone();
-        let gateway = match (&before.gateway, gateway) {
-            (Some(before), Some(after)) => Some(restarted(before, &after)),
-            (before, _) => before.clone(),
+        done.await.map_err(|_| stopping())
+    }
+
+    /// Applies new access rules and another certificate to the gateway. Returns the changes.
+    fn reconfigure_gateway(
+        &self,
+        running: &Running,
+        config: &Config,
+        access: Access,
+        files: Option<Arc<CertifiedKey>>,
+    ) -> Result<Vec<String>, String> {
+        let mut changed = Vec::new();
+        let access = access.with_anchors(TrustAnchors::clone(&self.credentials.anchors()));
+        let key = || match files {
+            Some(key) => ShownKey::Files(key),
+            None => ShownKey::Own(self.credentials.identity()),
         };
-        running.config = Config { shares, uses, tokens, partners, trust, accept, gateway, ..before };
-        running.rules = rules;
-        report.changed.dedup();
-        self.changed.notify_one();
-        Ok(report)
+        if self.gateway.reconfigure(access, key).map_err(|error| error.to_string())? {
+            changed.push("who connects to the gateway is shown another certificate".to_owned());
+        }
+        if running.config.gateway.as_ref().map(access_part) != config.gateway.as_ref().map(access_part) {
+            changed.push("who may connect to the gateway changed".to_owned());
+        }
+        Ok(changed)
     }
 
     /// Removes expired tokens from the policies. Never returns.
@@ -299,6 +319,17 @@ impl Reloader {
             }
         }
     }
+}
+
+/// Returns the configuration that runs after a reload. Restart-only settings keep their running values, so that the next
+/// reload reports them again.
+fn merged(before: Config, read: Config) -> Config {
+    let Config { shares, uses, tokens, partners, trust, accept, gateway, .. } = read;
+    let gateway = match (&before.gateway, gateway) {
+        (Some(before), Some(after)) => Some(restarted(before, &after)),
+        (before, _) => before.clone(),
+    };
+    Config { shares, uses, tokens, partners, trust, accept, gateway, ..before }
 }
 
 /// Returns the part of a gateway's configuration that may change at run time.
