@@ -15,7 +15,7 @@ help:
 	@echo 'make demo        install what the build needs, build, run the demo (ARGS="--seconds 10 --json")'
 	@echo 'make test        the whole suite, as CI runs it'
 	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit and interop (ARGS goes to cargo test), docs, deny'
-	@echo 'not in it:       msrv (checks with the oldest Rust that is supported), minimal (checks without optional features)'
+	@echo 'not in it:       msrv (checks with the oldest Rust that is supported), minimal (without optional features, and with each alone)'
 	@echo '                 book (the documents as a book, target/book/index.html; builds mdbook once)'
 	@echo '                 peers-check-long (images of 13 MB), advisories (needs the web), clean-tools,'
 	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS, SGC_RING_DIR keeps the logs)'
@@ -97,9 +97,9 @@ print-msrv:
 msrv:
 	$(CARGO) +$(MSRV) check --workspace $(FEATURES) --locked
 
-# The program without its optional features.
+# The program without its optional features, and with each alone; ARGS goes to cargo.
 minimal:
-	$(CARGO) check -p sgc --no-default-features --locked
+	@CARGO='$(CARGO)' scripts/minimal.sh $(ARGS)
 
 docs:
 	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --no-deps --workspace $(FEATURES) --locked

@@ -205,6 +205,8 @@ pub(crate) struct TransportDraft {
 /// `[gateway]`.
 #[derive(Debug, Default)]
 pub(crate) struct GatewayDraft {
+    /// The place of the table; `None` for `--gateway`.
+    pub(crate) origin: Option<Origin>,
     /// The list has an origin of its own, since an empty one is a mistake.
     pub(crate) listen: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(crate) certificate: Option<WithOrigin<PathBuf>>,

@@ -551,6 +551,12 @@ pub enum Mistake {
         /// The fault.
         fault: GatewayUrlError,
     },
+    /// A gateway in a build without its protocols.
+    #[error(
+        "`gateway` is given, and this sgc is built without its protocols: build it with `cargo build --release -p sgc \
+         --features rosbridge,foxglove,grpc`, or leave it out"
+    )]
+    GatewayNotBuilt,
     /// An unencrypted gateway that other hosts can reach.
     #[error(
         "`{key}` is {value:?}: other hosts may connect, and nothing is encrypted, so that anybody on the way can read and \

@@ -347,10 +347,12 @@ impl FileReader<'_> {
         const FILES: &str = "a string, such as \"robot.pem\"";
         let clients = self.repeated(gateway, "gateway.client", Table::GatewayClient);
         let clients = clients.iter().map(|client| self.gateway_client(client)).collect();
+        let origin = self.origin(gateway.span.clone());
         let gateway = Some(gateway);
         let mut file = |key| self.string(gateway, key, FILES).map(|written| written.map(PathBuf::from));
         let (certificate, key) = (file("certificate"), file("key"));
         GatewayDraft {
+            origin: Some(origin),
             listen: self.strings(gateway, "listen", "an array of strings, such as [\"wss://0.0.0.0:9090\"]"),
             certificate,
             key,

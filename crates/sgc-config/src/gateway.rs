@@ -7,7 +7,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use sgc_gateway::{Anonymous, PageOrigin, Scope};
+use sgc_gateway::{Anonymous, PageOrigin, Protocol, ProtocolNotBuilt, Scope};
 
 use crate::recipient::Recipient;
 
@@ -68,14 +68,16 @@ impl GatewayConfig {
     /// Upper bound of `client_bytes_max`: more than memory has.
     pub const CLIENT_BYTES_MAX: u64 = 16 << 30;
 
-    /// Returns the default listen addresses: this host only, at the ports that clients try first.
+    /// Returns the default listen addresses: this host only, at the ports that clients try first. The list is empty in a
+    /// build without protocols.
     pub fn default_listen() -> Vec<GatewayUrl> {
         let here = |scheme, port| GatewayUrl { scheme, address: (Ipv4Addr::LOCALHOST, port).into() };
-        vec![
+        let usual = [
             here(GatewayScheme::Ws, WEBSOCKET_PORT),
             here(GatewayScheme::Ws, FOXGLOVE_PORT),
             here(GatewayScheme::Grpc, GRPC_PORT),
-        ]
+        ];
+        usual.into_iter().filter(|url| url.scheme.protocol().check_built().is_ok()).collect()
     }
 
     /// Returns warnings for the operator, one sentence each.
@@ -162,6 +164,14 @@ impl GatewayScheme {
         matches!(self, Self::Grpcs | Self::Wss)
     }
 
+    /// Returns the protocol as `sgc-gateway` names it.
+    pub fn protocol(self) -> Protocol {
+        match self {
+            Self::Ws | Self::Wss => Protocol::WebSocket,
+            Self::Grpc | Self::Grpcs => Protocol::Grpc,
+        }
+    }
+
     fn port(self) -> u16 {
         match self {
             Self::Grpc | Self::Grpcs => GRPC_PORT,
@@ -184,6 +194,9 @@ pub enum GatewayUrlError {
         "behind the scheme comes an IP address with a port: \"{0}://127.0.0.1:{1}\" or \"{0}://[::1]:{1}\""
     )]
     Address(&'static str, u16),
+    /// This build lacks the protocol.
+    #[error(transparent)]
+    NotBuilt(#[from] ProtocolNotBuilt),
     /// The URL has a path.
     #[error("there is no path behind the port: clients may ask for any")]
     Path,

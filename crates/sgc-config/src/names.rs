@@ -319,6 +319,7 @@ pub(crate) fn router(key: &'static str, value: &str) -> Result<RouterUrl, Mistak
         Err(fault) => return Err(Mistake::Router { key, value: value.to_owned(), fault }),
     };
     for url in router.urls() {
+        url.scheme.check_built().map_err(|fault| url_mistake(key, value, fault))?;
         let host = url.host.clone();
         if !is_host(&host) {
             return Err(url_mistake(key, value, UrlError::Host(host)));
@@ -344,7 +345,10 @@ pub(crate) fn listen(key: &'static str, value: &str) -> Result<ListenAddr, Mista
     if matches!(value.split_once("://"), Some(("srv" | "mdns", _))) {
         return Err(Mistake::ListenFinds { key, value: value.to_owned() });
     }
-    value.parse().map_err(|fault| url_mistake(key, value, fault))
+    let mistake = |fault| url_mistake(key, value, fault);
+    let listen: ListenAddr = value.parse().map_err(mistake)?;
+    listen.scheme.check_built().map_err(mistake)?;
+    Ok(listen)
 }
 
 fn url_mistake(key: &'static str, value: &str, fault: UrlError) -> Mistake {
@@ -353,7 +357,10 @@ fn url_mistake(key: &'static str, value: &str, fault: UrlError) -> Mistake {
 
 /// Parses a listen address of the gateway.
 pub(crate) fn gateway_listen(key: &'static str, value: &str) -> Result<GatewayUrl, Mistake> {
-    value.parse().map_err(|fault| Mistake::GatewayUrl { key, value: value.to_owned(), fault })
+    let mistake = |fault| Mistake::GatewayUrl { key, value: value.to_owned(), fault };
+    let url: GatewayUrl = value.parse().map_err(mistake)?;
+    url.scheme.protocol().check_built().map_err(|absent| mistake(absent.into()))?;
+    Ok(url)
 }
 
 /// Parses an origin of web pages.

@@ -2,11 +2,16 @@
 //!
 //! A [`Hub`] is an ordinary node of the local ROS 2 network that many clients share. It reads each topic once for all
 //! subscribers, follows the graph and finds definitions. A [`Session`] is one client's use of the hub, bounded by a
-//! [`Scope`] and limits. The protocols [`rosbridge`], [`foxglove`] and [`grpc`] build on sessions only.
+//! [`Scope`] and limits. The protocols `rosbridge`, `foxglove` and `grpc` build on sessions only; each has a cargo feature
+//! of its name.
 //!
 //! The hub knows no other SGC node: the proxy beside it shares its publications by the same rules as those of any
 //! program. Only the module `server` opens sockets, and other crates open the network behind [`LocalRos`].
 #![forbid(unsafe_code)]
+#![cfg_attr(
+    not(all(feature = "foxglove", feature = "grpc", feature = "rosbridge")),
+    allow(dead_code, reason = "sessions offer all that the protocols need together")
+)]
 
 mod access;
 mod access_watch;
@@ -18,8 +23,10 @@ mod content;
 mod definitions;
 mod error;
 mod feed;
+#[cfg(feature = "foxglove")]
 pub mod foxglove;
 mod graph;
+#[cfg(feature = "grpc")]
 pub mod grpc;
 mod hub;
 mod inflow;
@@ -29,11 +36,13 @@ mod publisher;
 mod queue;
 mod quota;
 mod ros;
+#[cfg(feature = "rosbridge")]
 pub mod rosbridge;
 mod server;
 mod service;
 mod session;
 mod tls;
+#[cfg(feature = "_websocket")]
 mod ws;
 
 pub use access::{
@@ -58,7 +67,7 @@ pub use message::Message;
 pub use publisher::Publication;
 pub use quota::Pool;
 pub use ros::{LocalReader, LocalRos};
-pub use server::{ListenAt, Protocol, Server, ServerError, ServerOptions};
+pub use server::{ListenAt, Protocol, ProtocolNotBuilt, Server, ServerError, ServerOptions};
 pub use service::{Replier, Request, Serving};
 pub use session::{Advertise, Session, SessionLimits, Subscribe};
 pub use tls::{TlsError, certified_key};

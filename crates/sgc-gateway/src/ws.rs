@@ -17,6 +17,15 @@ pub(crate) const MESSAGE_BYTES_MAX: usize = 64 << 20;
 /// URL parameters that may hold a token, for programs that cannot send headers.
 const TOKEN_PARAMETERS: [&str; 2] = ["token", "access_token"];
 
+/// The WebSocket subprotocols that clients may ask for.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Subprotocols {
+    /// The subprotocols, the preferred one first.
+    pub(crate) known: &'static [&'static str],
+    /// Refuses clients that ask for none of them.
+    pub(crate) is_needed: bool,
+}
+
 /// An upgraded connection.
 #[derive(Debug)]
 pub(crate) struct Upgrade<S> {
@@ -37,12 +46,12 @@ pub(crate) enum UpgradeError {
     Socket(Box<tungstenite::Error>),
 }
 
-/// Upgrades a connection if its client is admitted. `known` are the subprotocols, the preferred one first.
+/// Upgrades a connection if its client is admitted.
 pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
     stream: S,
     arrival: &Arrival,
     admission: &Arc<Admission>,
-    known: &[&'static str],
+    subprotocols: Subprotocols,
 ) -> Result<Upgrade<S>, UpgradeError> {
     let (mut found, mut is_refused) = (None, false);
     // The library determines the size of the error.
@@ -68,7 +77,11 @@ pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
             .flat_map(|list| list.split(','))
             .map(str::trim)
             .collect();
-        let chosen = known.iter().copied().find(|known| offered.contains(known));
+        let chosen = subprotocols.known.iter().copied().find(|known| offered.contains(known));
+        if subprotocols.is_needed && chosen.is_none() {
+            let why = format!("this gateway takes the subprotocols {}", subprotocols.known.join(", "));
+            return Err(refusal(StatusCode::BAD_REQUEST, &why));
+        }
         if let Some(chosen) = chosen {
             response.headers_mut().insert(SEC_WEBSOCKET_PROTOCOL, http::HeaderValue::from_static(chosen));
         }
@@ -136,10 +149,11 @@ mod tests {
         let admission = Admission::new(Access::default(), 1);
         let peer = "192.0.2.1:1000".parse().unwrap();
         let arrival = Arrival { peer, is_encrypted: false, certificate: None };
+        let subprotocols = Subprotocols { known: &[], is_needed: false };
         let ask = async |text: &str| {
             let (near, mut far) = duplex(4096);
             far.write_all(text.as_bytes()).await.unwrap();
-            let refused = upgrade(near, &arrival, &admission, &[]).await.unwrap_err();
+            let refused = upgrade(near, &arrival, &admission, subprotocols).await.unwrap_err();
             let mut told = String::new();
             far.read_to_string(&mut told).await.unwrap();
             (refused, told)

@@ -16,7 +16,7 @@ use sgc_wire::DecodeError;
 use crate::limits::CONTROL_FRAME_BYTES_MAX;
 use crate::metrics::RefusalKind;
 use crate::stream::StreamViolation;
-use crate::url::LinkUrl;
+use crate::url::{LinkUrl, UrlError};
 
 const TEXT_CHARS_MAX: usize = 200;
 
@@ -508,6 +508,14 @@ pub enum DialError {
     /// The host name has no address.
     #[error("{0}: the host name has no address")]
     NoAddress(LinkUrl),
+    /// This build lacks the transport.
+    #[error("{url}: {source}")]
+    NotBuilt {
+        /// The dialled URL.
+        url: LinkUrl,
+        /// The missing feature.
+        source: UrlError,
+    },
     /// Every address failed.
     #[error("{url}: {}", Attempts(attempts))]
     Failed {

@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::time::Instant;
 
-use sgc_trust::{AddressPrefix, PlaceDecision, PlaceLimits, PlaceRefusal, Places};
+use sgc_trust::{PlaceDecision, PlaceLimits, PlaceRefusal, Places};
 
 use crate::error::Refusal;
 use crate::metrics::TransportMetrics;
@@ -50,7 +50,8 @@ impl<T: Holder> Handshakes<T> {
     }
 
     /// Iterates over the handshakes under way.
-    pub(crate) fn iter(&self) -> impl Iterator<Item = (AddressPrefix, &T)> {
+    #[cfg(feature = "dtls")]
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (sgc_trust::AddressPrefix, &T)> {
         self.places.iter().filter(|(_, holder)| holder.is_pending())
     }
 

@@ -6,13 +6,17 @@
 //!
 //! This crate has no routing, queues, reconnecting or policy. A link tells its peer and the cause of its end; the node
 //! draws the consequences. Below a link is QUIC (by itself, inside of DTLS, or with packets that are authenticated
-//! only) or a stream of bytes: TLS, TCP, WebSocket.
+//! only) or a stream of bytes: TLS, TCP, WebSocket. Builds without the feature `dtls` refuse `dtls://`.
 #![forbid(unsafe_code)]
 
 mod any_link;
 mod budget;
 mod congestion;
 mod credentials;
+#[cfg(feature = "dtls")]
+mod dtls;
+#[cfg(not(feature = "dtls"))]
+#[path = "dtls/absent.rs"]
 mod dtls;
 mod endpoint;
 mod error;
@@ -53,6 +57,7 @@ pub use credentials::CredentialStore;
 #[cfg(feature = "fuzzing")]
 #[doc(hidden)]
 pub use dtls::HandshakeExercise;
+#[cfg(feature = "dtls")]
 #[doc(hidden)]
 pub use dtls::exercise_front;
 pub use endpoint::{Dialer, Listener, RefusedPeer};

@@ -11,8 +11,10 @@ use rustls::sign::SingleCertAndKey;
 
 use crate::credentials::CredentialStore;
 use crate::options::LinkOptions;
+pub(crate) use verifier::Findings;
 use verifier::{AcceptAnyCertificate, ListenerCertResolver, PeerVerifier};
-pub(crate) use verifier::{Findings, alert, judge};
+#[cfg(feature = "dtls")]
+pub(crate) use verifier::{alert, judge};
 
 /// Application protocol that web proxies expect in TLS.
 const HTTP_ALPN: &[u8] = b"http/1.1";

@@ -66,6 +66,19 @@ impl Scheme {
         matches!(self, Self::Udp | Self::Tcp)
     }
 
+    /// Checks that this build has the transport.
+    ///
+    /// # Errors
+    /// [`UrlError::NotBuilt`].
+    pub fn check_built(self) -> Result<(), UrlError> {
+        match self {
+            Self::Dtls if cfg!(not(feature = "dtls")) => {
+                Err(UrlError::NotBuilt { scheme: self, feature: "dtls" })
+            }
+            _ => Ok(()),
+        }
+    }
+
     fn has_path(self) -> bool {
         matches!(self, Self::Ws | Self::Wss)
     }
@@ -195,6 +208,17 @@ pub enum UrlError {
     /// No transport of that name is known.
     #[error("{0}:// is not known: quic, dtls, udp, tls, tcp, ws and wss are")]
     SchemeUnknown(String),
+    /// This build lacks the transport.
+    #[error(
+        "this sgc is built without {scheme}://: build it with `cargo build --release -p sgc --features {feature}`, or \
+         use another transport"
+    )]
+    NotBuilt {
+        /// The transport.
+        scheme: Scheme,
+        /// The cargo feature that has it.
+        feature: &'static str,
+    },
     /// Invalid host.
     #[error("{0:?} is neither a host name nor an IP address (IPv6 is written in brackets)")]
     Host(String),

@@ -4,7 +4,7 @@ use sgc_gateway::{Anonymous, Scope};
 
 use super::{LISTEN_MAX, Resolver, unknown_word};
 use crate::draft::{GatewayClientDraft, GatewayDraft, PartnerDraft, WithOrigin};
-use crate::error::Mistake;
+use crate::error::{Mistake, Origin};
 use crate::gateway::{
     GATEWAY_CLIENTS_MAX, GatewayClientConfig, GatewayConfig, GatewayTls, GatewayUrl, ORIGINS_MAX,
 };
@@ -46,7 +46,14 @@ impl Resolver<'_> {
     }
 
     fn gateway_listen(&mut self, written: &GatewayDraft, plain: bool) -> Vec<GatewayUrl> {
-        let Some(listen) = &written.listen else { return GatewayConfig::default_listen() };
+        let Some(listen) = &written.listen else {
+            let usual = GatewayConfig::default_listen();
+            if usual.is_empty() {
+                let origin = written.origin.clone().unwrap_or(Origin::Arguments);
+                self.record(&origin, Mistake::GatewayNotBuilt);
+            }
+            return usual;
+        };
         if listen.value.is_empty() {
             let example = "listen = [\"ws://127.0.0.1:9090\"], or leave it out to listen at the usual ports of this host";
             self.record(&listen.origin, Mistake::Empty { key: listen.key, example });

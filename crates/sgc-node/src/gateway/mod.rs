@@ -14,10 +14,10 @@ use std::sync::{Arc, MutexGuard};
 
 use rustls::sign::CertifiedKey;
 use sgc_cdr::{Layout, TypeName};
-use sgc_config::{GatewayConfig, GatewayScheme, GatewayUrl};
+use sgc_config::{GatewayConfig, GatewayUrl};
 use sgc_gateway::{
     Access, Client, FindDefinitions, GatewayError, GatewayStatus, Hub, HubOptions, ListenAt, LocalRos,
-    Protocol, Server, ServerError, ServerOptions, Session, SessionLimits, TlsError, Types, certified_key,
+    Server, ServerError, ServerOptions, Session, SessionLimits, TlsError, Types, certified_key,
 };
 use sgc_ros::RosError;
 use sgc_sync::lock;
@@ -260,10 +260,7 @@ pub(crate) fn key_of_files(config: &GatewayConfig) -> Result<Option<Arc<Certifie
 /// Returns the listen addresses in the form of `sgc-gateway`.
 pub(crate) fn listen_at(config: &GatewayConfig) -> Vec<ListenAt> {
     let at = |url: &GatewayUrl| ListenAt {
-        protocol: match url.scheme {
-            GatewayScheme::Ws | GatewayScheme::Wss => Protocol::WebSocket,
-            GatewayScheme::Grpc | GatewayScheme::Grpcs => Protocol::Grpc,
-        },
+        protocol: url.scheme.protocol(),
         is_encrypted: url.scheme.is_encrypted(),
         addr: url.address,
     };
@@ -274,7 +271,7 @@ pub(crate) fn listen_at(config: &GatewayConfig) -> Vec<ListenAt> {
 mod tests {
     use rand_chacha::ChaCha20Rng;
     use rand_chacha::rand_core::SeedableRng as _;
-    use sgc_gateway::ShippedDefinitions;
+    use sgc_gateway::{Protocol, ShippedDefinitions};
     use sgc_testkit::FakeDomain;
     use sgc_trust::{EnrollRequest, Fleet};
     use sgc_wire::UnixMillis;

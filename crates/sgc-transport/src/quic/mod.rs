@@ -9,10 +9,14 @@ mod endpoint;
 pub(crate) mod halves;
 mod places;
 
+pub(crate) use config::Flavor;
 #[cfg(test)]
 pub(crate) use config::transport;
-pub(crate) use config::{Flavor, Parts, client, endpoint as endpoint_config};
-pub(crate) use endpoint::{DRAIN_TIMEOUT, QuicDialer, QuicListener, SERVER_NAME, finish, greet};
+#[cfg(feature = "dtls")]
+pub(crate) use config::{Parts, client, endpoint as endpoint_config};
+#[cfg(feature = "dtls")]
+pub(crate) use endpoint::{DRAIN_TIMEOUT, SERVER_NAME, finish, greet};
+pub(crate) use endpoint::{QuicDialer, QuicListener};
 
 use std::fmt;
 use std::net::SocketAddr;
