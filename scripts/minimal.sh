@@ -5,11 +5,9 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 cargo=${CARGO:-cargo}
 
-# Crates of which a build without the feature has none.
+# Crates that are gone without the feature.
 declare -A crates=(
     [dtls]="dimpl"
-    [foxglove]="tungstenite"
-    [rosbridge]="tungstenite"
     [grpc]="tonic prost hyper h2"
 )
 

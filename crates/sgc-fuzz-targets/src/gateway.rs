@@ -3,18 +3,21 @@
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
+use bytes::BytesMut;
 use futures_util::{SinkExt, StreamExt};
 use sgc_gateway::rosbridge::RosbridgeOptions;
 use sgc_gateway::{
     Client, Hub, HubOptions, Scope, Session, SessionLimits, ShippedDefinitions, Types, foxglove, rosbridge,
 };
 use sgc_testkit::{FakeDomain, FakeRos};
+use sgc_websocket::WebSocket;
 use tokio::runtime::{Builder, Runtime};
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::Role;
 
 const PIPE_BYTES: usize = 1 << 20;
+const MESSAGE_BYTES_MAX: usize = 64 << 20;
 const MESSAGES_MAX: usize = 64;
 const ENDS_WITHIN: Duration = Duration::from_secs(5);
 
@@ -45,7 +48,7 @@ pub fn run(input: &[u8]) {
     let session = Arc::new(Session::new(hub, client, SessionLimits::default()));
     runtime.block_on(async {
         let (here, there) = tokio::io::duplex(PIPE_BYTES);
-        let socket = WebSocketStream::from_raw_socket(there, Role::Server, None).await;
+        let socket = WebSocket::new(there, BytesMut::new(), MESSAGE_BYTES_MAX);
         let served = async {
             match which % 2 {
                 0 => drop(rosbridge::serve(socket, session, RosbridgeOptions::default()).await),

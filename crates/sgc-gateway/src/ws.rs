@@ -2,18 +2,16 @@
 
 use std::sync::Arc;
 
-use http::StatusCode;
-use http::header::{AUTHORIZATION, ORIGIN, SEC_WEBSOCKET_PROTOCOL};
+use sgc_websocket::{Request, WebSocket};
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio_tungstenite::tungstenite::handshake::server::{ErrorResponse, Request, Response};
-use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
-use tokio_tungstenite::{WebSocketStream, tungstenite};
 
 use crate::access::Client;
 use crate::admission::{Admission, Arrival};
 
 /// Longest message of a client, in bytes. An image of 13 MB in base64 fits three times.
 pub(crate) const MESSAGE_BYTES_MAX: usize = 64 << 20;
+/// Longest head of a request, in bytes. A token takes at most half.
+const HEAD_BYTES_MAX: usize = 64 << 10;
 /// URL parameters that may hold a token, for programs that cannot send headers.
 const TOKEN_PARAMETERS: [&str; 2] = ["token", "access_token"];
 
@@ -29,7 +27,7 @@ pub(crate) struct Subprotocols {
 /// An upgraded connection.
 #[derive(Debug)]
 pub(crate) struct Upgrade<S> {
-    pub(crate) socket: WebSocketStream<S>,
+    pub(crate) socket: WebSocket<S>,
     pub(crate) client: Client,
     /// The negotiated subprotocol.
     pub(crate) subprotocol: Option<&'static str>,
@@ -43,62 +41,45 @@ pub(crate) enum UpgradeError {
     NotAdmitted,
     /// The request is not an upgrade, or the connection ended.
     #[error("no WebSocket: {0}")]
-    Socket(Box<tungstenite::Error>),
+    Socket(#[from] sgc_websocket::UpgradeError),
 }
 
 /// Upgrades a connection if its client is admitted.
 pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
-    stream: S,
+    mut stream: S,
     arrival: &Arrival,
     admission: &Arc<Admission>,
     subprotocols: Subprotocols,
 ) -> Result<Upgrade<S>, UpgradeError> {
-    let (mut found, mut is_refused) = (None, false);
-    // The library determines the size of the error.
-    #[allow(clippy::result_large_err)]
-    let decide = |request: &Request, mut response: Response| -> Result<Response, ErrorResponse> {
-        let header = |name| request.headers().get(name).and_then(|value| value.to_str().ok());
-        let bearer = header(AUTHORIZATION).and_then(|value| {
-            let (scheme, token) = value.split_once(' ')?;
-            scheme.eq_ignore_ascii_case("bearer").then(|| token.trim().to_owned())
-        });
-        let token = bearer.or_else(|| request.uri().query().and_then(token_in));
-        // An origin that is not text matches no listed origin.
-        let origin = request.headers().get(ORIGIN).map(|value| value.to_str().unwrap_or("?"));
-        let client = admission.admit(arrival, origin, token.as_deref()).map_err(|denied| {
-            is_refused = true;
-            refusal(StatusCode::UNAUTHORIZED, denied.client_message())
-        })?;
-        let offered: Vec<&str> = request
-            .headers()
-            .get_all(SEC_WEBSOCKET_PROTOCOL)
-            .iter()
-            .filter_map(|value| value.to_str().ok())
-            .flat_map(|list| list.split(','))
-            .map(str::trim)
-            .collect();
-        let chosen = subprotocols.known.iter().copied().find(|known| offered.contains(known));
-        if subprotocols.is_needed && chosen.is_none() {
-            let why = format!("this gateway takes the subprotocols {}", subprotocols.known.join(", "));
-            return Err(refusal(StatusCode::BAD_REQUEST, &why));
+    let request = Request::read(&mut stream, HEAD_BYTES_MAX).await?;
+    request.check_upgrade(&mut stream).await?;
+    let bearer = request.fields("authorization").next().and_then(|value| {
+        let (scheme, token) = value.split_once(' ')?;
+        scheme.eq_ignore_ascii_case("bearer").then(|| token.trim().to_owned())
+    });
+    let query = request.target().and_then(|target| Some(target.split_once('?')?.1));
+    let token = bearer.or_else(|| query.and_then(token_in));
+    // An origin that is not text matches no listed origin.
+    let origin = request.fields("origin").next();
+    let client = match admission.admit(arrival, origin, token.as_deref()) {
+        Ok(client) => client,
+        Err(denied) => {
+            // The refusal stands, whether it reaches the client or not.
+            let text = format!("{}\n", denied.client_message());
+            let _ = Request::refuse(&mut stream, "401 Unauthorized", &text).await;
+            return Err(UpgradeError::NotAdmitted);
         }
-        if let Some(chosen) = chosen {
-            response.headers_mut().insert(SEC_WEBSOCKET_PROTOCOL, http::HeaderValue::from_static(chosen));
-        }
-        found = Some((client, chosen));
-        Ok(response)
     };
-    let mut config = WebSocketConfig::default();
-    config.max_message_size = Some(MESSAGE_BYTES_MAX);
-    config.max_frame_size = Some(MESSAGE_BYTES_MAX);
-    let accepted = tokio_tungstenite::accept_hdr_async_with_config(stream, decide, Some(config)).await;
-    if is_refused {
-        return Err(UpgradeError::NotAdmitted);
+    let offered: Vec<&str> =
+        request.fields("sec-websocket-protocol").flat_map(|list| list.split(',')).map(str::trim).collect();
+    let subprotocol = subprotocols.known.iter().copied().find(|known| offered.contains(known));
+    if subprotocols.is_needed && subprotocol.is_none() {
+        let why = format!("this gateway takes the subprotocols {}", subprotocols.known.join(", "));
+        let _ = Request::refuse(&mut stream, "400 Bad Request", &format!("{why}\n")).await;
+        return Err(sgc_websocket::UpgradeError::Request(why).into());
     }
-    let socket = accepted.map_err(|error| UpgradeError::Socket(Box::new(error)))?;
-    let Some((client, subprotocol)) = found else {
-        return Err(UpgradeError::Socket(Box::new(tungstenite::Error::ConnectionClosed)));
-    };
+    let input = request.accept(&mut stream, subprotocol).await?;
+    let socket = WebSocket::new(stream, input, MESSAGE_BYTES_MAX);
     Ok(Upgrade { socket, client, subprotocol })
 }
 
@@ -109,12 +90,6 @@ pub(crate) fn close_reason(why: &str) -> &str {
         end -= 1;
     }
     &why[..end]
-}
-
-fn refusal(status: StatusCode, why: &str) -> ErrorResponse {
-    let mut response = ErrorResponse::new(Some(format!("{why}\n")));
-    *response.status_mut() = status;
-    response
 }
 
 fn token_in(query: &str) -> Option<String> {

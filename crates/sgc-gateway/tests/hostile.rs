@@ -9,12 +9,14 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
+use bytes::BytesMut;
 use futures_util::{SinkExt as _, StreamExt as _};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore as _, SeedableRng as _};
 use sgc_gateway::rosbridge::RosbridgeOptions;
 use sgc_gateway::{Content, Session, foxglove, rosbridge};
 use sgc_ros::{RosWriter as _, SampleKind};
+use sgc_websocket::WebSocket;
 use sgc_wire::Qos;
 use tokio::io::DuplexStream;
 use tokio_tungstenite::WebSocketStream;
@@ -93,10 +95,7 @@ fn mutated(rng: &mut ChaCha8Rng, valid: &[u8]) -> Vec<u8> {
 }
 
 /// Runs clients with mutated messages and returns the number of panics in the gateway's tasks.
-async fn converse<F>(
-    words: &[&str],
-    serve: impl Fn(WebSocketStream<DuplexStream>, Arc<Session>) -> F,
-) -> usize
+async fn converse<F>(words: &[&str], serve: impl Fn(WebSocket<DuplexStream>, Arc<Session>) -> F) -> usize
 where
     F: Future<Output = ()> + Send + 'static,
 {
@@ -112,7 +111,7 @@ where
     let rng = &mut ChaCha8Rng::seed_from_u64(7);
     for conversation in 0..CONVERSATIONS {
         let (here, there) = tokio::io::duplex(PIPE_BYTES);
-        let socket = WebSocketStream::from_raw_socket(there, Role::Server, None).await;
+        let socket = WebSocket::new(there, BytesMut::new(), 64 << 20);
         let served = tokio::spawn(serve(socket, Arc::new(site.session("stranger"))));
         let socket = WebSocketStream::from_raw_socket(here, Role::Client, None).await;
         let (mut say, mut hear) = socket.split();

@@ -10,6 +10,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use bytes::BytesMut;
 use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value as Json, json};
 use sgc_gateway::rosbridge::{self, RosbridgeOptions};
@@ -20,6 +21,7 @@ use sgc_gateway::{
 use sgc_ros::{RosWriter as _, SampleKind};
 use sgc_wire::{Durability, History, Qos, UnixMillis};
 
+use sgc_websocket::WebSocket;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::Role;
@@ -234,8 +236,7 @@ async fn arguments_of_calls_that_wait_are_bounded_over_connections() {
     let refused: Json = loop {
         let (here, there) = tokio::io::duplex(1 << 20);
         let options = RosbridgeOptions::default();
-        let config = options.websocket();
-        let there = WebSocketStream::from_raw_socket(there, Role::Server, Some(config)).await;
+        let there = WebSocket::new(there, BytesMut::new(), options.message_bytes_max);
         let host = Arc::new(session(&site, "10.0.0.1:1"));
         let served = tokio::spawn(rosbridge::serve(there, host, options));
         let mut page = WebSocketStream::from_raw_socket(here, Role::Client, None).await;
@@ -318,7 +319,7 @@ async fn page_that_changes(site: &Site, peer: &str) -> WebSocketStream<tokio::io
     let session = Session::new(&hub, admit(peer), LIMITS);
     let authenticate: rosbridge::Authenticate = Arc::new(move |token| Ok(admit(token)));
     let options = RosbridgeOptions { authenticate: Some(authenticate), ..RosbridgeOptions::default() };
-    let there = WebSocketStream::from_raw_socket(there, Role::Server, Some(options.websocket())).await;
+    let there = WebSocket::new(there, BytesMut::new(), options.message_bytes_max);
     tokio::spawn(rosbridge::serve(there, Arc::new(session), options));
     let mut page = WebSocketStream::from_raw_socket(here, Role::Client, None).await;
     page.send(Message::text(r#"{"op": "set_level", "level": "info"}"#)).await.unwrap();

@@ -10,9 +10,9 @@ use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use futures_util::stream::{AbortHandle, Abortable, BoxStream, FuturesUnordered, SelectAll};
 use futures_util::{Stream, StreamExt, stream};
+use sgc_websocket::{Message as Frame, WebSocketError as SocketError};
 use sgc_wire::Qos;
 use tokio::time::{Instant, MissedTickBehavior};
-use tokio_tungstenite::tungstenite::{Error as SocketError, Message as Frame};
 
 use crate::content::{Content, Form};
 use crate::error::GatewayError;

@@ -23,12 +23,8 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use futures_util::{Sink, SinkExt, StreamExt};
+use sgc_websocket::{CloseFrame, Message as Frame, WebSocket, WebSocketError as SocketError};
 use tokio::io::{AsyncRead, AsyncWrite};
-use tokio_tungstenite::WebSocketStream;
-use tokio_tungstenite::tungstenite::Error as SocketError;
-use tokio_tungstenite::tungstenite::Message as Frame;
-use tokio_tungstenite::tungstenite::protocol::CloseFrame;
-use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
 use crate::access::Denial;
 use crate::quota::PendingBytes;
@@ -79,6 +75,9 @@ impl Default for Options {
     }
 }
 
+/// The close code for a client whose rights end (RFC 6455, 7.4.1).
+const POLICY: u16 = 1008;
+
 /// The reason why a connection ended without the client's wish.
 #[derive(Debug, thiserror::Error)]
 pub enum FoxgloveError {
@@ -101,7 +100,7 @@ pub enum FoxgloveError {
 /// # Errors
 /// The connection failed, the client fell silent or its rights ended. A client that leaves is no error.
 pub async fn serve<S>(
-    socket: WebSocketStream<S>,
+    socket: WebSocket<S>,
     session: Arc<Session>,
     options: Options,
 ) -> Result<(), FoxgloveError>
@@ -122,7 +121,7 @@ where
     let farewell = async {
         if let Err(FoxgloveError::Denied(denied)) = &ended {
             let reason =
-                CloseFrame { code: CloseCode::Policy, reason: close_reason(denied.client_message()).into() };
+                CloseFrame { code: POLICY, reason: close_reason(denied.client_message()).to_owned() };
             return sink.send(Frame::Close(Some(reason))).await;
         }
         while let Some(answer) = outbox.pop_answer() {
@@ -132,7 +131,7 @@ where
     };
     let _ = tokio::time::timeout(FAREWELL_MAX, farewell).await;
     match ended {
-        Err(FoxgloveError::Socket(SocketError::ConnectionClosed | SocketError::AlreadyClosed)) => Ok(()),
+        Err(FoxgloveError::Socket(SocketError::Closed)) => Ok(()),
         ended => ended,
     }
 }

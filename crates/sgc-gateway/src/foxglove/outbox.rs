@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard};
 
 use sgc_sync::lock;
+use sgc_websocket::Message as Frame;
 use tokio::sync::Notify;
-use tokio_tungstenite::tungstenite::Message as Frame;
 
 use crate::message::Message;
 use crate::queue::MESSAGE_COST_BYTES;
@@ -83,7 +83,7 @@ impl Outbox {
     /// Appends an answer even without room. The reader checks for room before it reads.
     pub(super) fn answer(&self, frame: Frame) {
         let mut state = self.lock();
-        state.answer_bytes += frame.len();
+        state.answer_bytes += frame.payload_bytes();
         state.answers.push_back(frame);
         drop(state);
         self.filled.notify_one();
@@ -147,7 +147,7 @@ impl Outbox {
     pub(super) fn pop(&self) -> Option<Frame> {
         let mut state = self.lock();
         if let Some(answer) = state.answers.pop_front() {
-            state.answer_bytes -= answer.len();
+            state.answer_bytes -= answer.payload_bytes();
             drop(state);
             self.drained.notify_one();
             return Some(answer);
@@ -167,7 +167,7 @@ impl Outbox {
     pub(super) fn pop_answer(&self) -> Option<Frame> {
         let mut state = self.lock();
         let answer = state.answers.pop_front()?;
-        state.answer_bytes -= answer.len();
+        state.answer_bytes -= answer.payload_bytes();
         Some(answer)
     }
 
@@ -210,7 +210,7 @@ mod tests {
 
     fn popped(outbox: &Outbox) -> Option<(u8, usize)> {
         outbox.pop().map(|frame| {
-            let bytes = frame.into_data();
+            let Frame::Binary(bytes) = frame else { panic!() };
             (bytes[1], bytes.len() - 13)
         })
     }

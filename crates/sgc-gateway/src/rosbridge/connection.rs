@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use sgc_websocket::WebSocketError;
 use tokio::sync::{Notify, oneshot, watch};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
@@ -120,8 +121,7 @@ impl From<OpError> for Failure {
 
 impl From<ConnectionClosed> for Failure {
     fn from(_: ConnectionClosed) -> Self {
-        let closed = tokio_tungstenite::tungstenite::Error::ConnectionClosed;
-        Self::End(RosbridgeError::Socket(Box::new(closed)))
+        Self::End(RosbridgeError::Socket(WebSocketError::Closed))
     }
 }
 
@@ -777,8 +777,10 @@ fn fragment_size(op: &Op<'_>) -> Result<Option<usize>, OpError> {
 mod tests {
     use std::net::SocketAddr;
 
+    use bytes::BytesMut;
     use futures_util::{SinkExt as _, StreamExt as _};
     use sgc_testkit::FakeDomain;
+    use sgc_websocket::WebSocket;
     use sgc_wire::UnixMillis;
     use tokio_tungstenite::WebSocketStream;
     use tokio_tungstenite::tungstenite::Message;
@@ -860,7 +862,7 @@ mod tests {
         let (here, there) = tokio::io::duplex(1 << 20);
         let options = RosbridgeOptions::default();
         let there = MeteredStream::new(there, inflow);
-        let there = WebSocketStream::from_raw_socket(there, Role::Server, Some(options.websocket())).await;
+        let there = WebSocket::new(there, BytesMut::new(), options.message_bytes_max);
         let _served = tokio::spawn(super::super::serve(there, session, options));
         let mut page = WebSocketStream::from_raw_socket(here, Role::Client, None).await;
         let piece =

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use serde_json::Value;
-use tokio_tungstenite::tungstenite::{Message, Utf8Bytes};
+use sgc_websocket::{Message, Text};
 
 use super::op::OpId;
 use crate::content::Form;
@@ -47,12 +47,12 @@ impl Compression {
 /// A message for the WebSocket.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Frame {
-    Text(Utf8Bytes),
+    Text(Text),
     Binary(Bytes),
     /// A text in fragments of `size` bytes, made one after the other.
     Fragments {
         id: String,
-        text: Utf8Bytes,
+        text: Text,
         size: usize,
     },
 }
@@ -77,7 +77,7 @@ impl Frame {
 }
 
 /// Splits a text into ops `fragment`, between characters.
-fn pieces(id: String, text: Utf8Bytes, size: usize) -> impl Iterator<Item = Message> {
+fn pieces(id: String, text: Text, size: usize) -> impl Iterator<Item = Message> {
     let total = cuts(&text, size).count();
     let mut at = 0;
     (0..total).map(move |number| {
@@ -303,7 +303,8 @@ mod tests {
             let all: Vec<_> = pieces("1".into(), text.into(), size).collect();
             let mut whole = String::new();
             for (number, piece) in all.iter().enumerate() {
-                let piece: Value = serde_json::from_str(piece.to_text().unwrap()).unwrap();
+                let Message::Text(piece) = piece else { panic!() };
+                let piece: Value = serde_json::from_str(piece).unwrap();
                 assert_eq!((&piece["num"], &piece["total"]), (&number.into(), &all.len().into()));
                 whole.push_str(piece["data"].as_str().unwrap());
             }
@@ -319,7 +320,7 @@ mod tests {
                 .value("v", &serde_json::json!([true, null, 1.5]))
         };
         let Frame::Text(text) = made(Compression::None).content("msg", b"{}").finish() else { panic!() };
-        assert_eq!(text, r#"{"op":"x","id":-300,"v":[true,null,1.5],"msg":{}}"#);
+        assert_eq!(&*text, r#"{"op":"x","id":-300,"v":[true,null,1.5],"msg":{}}"#);
         let Frame::Binary(bytes) = made(Compression::Cbor).content("msg", &[0xa0]).finish() else { panic!() };
         let mut wanted = vec![0xa4, 0x62, b'o', b'p', 0x61, b'x', 0x62, b'i', b'd', 0x39, 0x01, 0x2b];
         wanted.extend([0x61, b'v', 0x83, 0xf5, 0xf6, 0xfb, 0x3f, 0xf8, 0, 0, 0, 0, 0, 0]);

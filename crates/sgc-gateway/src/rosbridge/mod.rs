@@ -23,12 +23,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::{FutureExt as _, SinkExt as _, StreamExt as _};
+use sgc_websocket::{CloseFrame, Message, WebSocket, WebSocketError};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 use tokio::time::Instant;
-use tokio_tungstenite::WebSocketStream;
-use tokio_tungstenite::tungstenite::Message;
-use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 
 use crate::access::Denial;
 use crate::session::Session;
@@ -47,14 +45,12 @@ const TOGETHER_MAX: usize = 64;
 /// Time in which a client may receive the reason for the end of its connection.
 const FAREWELL_MAX: Duration = Duration::from_secs(2);
 
-/// Serves a client until it leaves, and ends everything that it has. Accept the socket with
-/// [`RosbridgeOptions::websocket`], so that the bounds hold from the first byte. Dropping the future is safe at any
-/// time.
+/// Serves a client until it leaves, and ends everything that it has. Dropping the future is safe at any time.
 ///
 /// # Errors
 /// The reason why the connection ended without the client's wish.
 pub async fn serve<S>(
-    socket: WebSocketStream<S>,
+    socket: WebSocket<S>,
     session: Arc<Session>,
     options: RosbridgeOptions,
 ) -> Result<(), RosbridgeError>
@@ -108,11 +104,11 @@ async fn until_denied(mut sessions: watch::Receiver<Arc<Session>>) -> Denial {
 
 async fn farewell<W>(sink: &mut W, outgoing: &mut Outgoing, code: u16, why: String)
 where
-    W: futures_util::Sink<Message, Error = tokio_tungstenite::tungstenite::Error> + Unpin,
+    W: futures_util::Sink<Message, Error = WebSocketError> + Unpin,
 {
     let reason = close_reason(&why).to_owned();
     if write_rest(sink, outgoing).await.is_ok() {
-        let close = CloseFrame { code: code.into(), reason: reason.into() };
+        let close = CloseFrame { code, reason };
         let _ = sink.send(Message::Close(Some(close))).await;
     }
 }
@@ -125,7 +121,7 @@ async fn read_all<R>(
     options: &RosbridgeOptions,
 ) -> Result<(), RosbridgeError>
 where
-    R: futures_util::Stream<Item = Result<Message, tokio_tungstenite::tungstenite::Error>> + Unpin,
+    R: futures_util::Stream<Item = Result<Message, WebSocketError>> + Unpin,
 {
     let begun = Instant::now();
     let mut looks = tokio::time::interval(ping_interval(options.silence_max));
@@ -156,7 +152,7 @@ where
         };
         let Some(message) = message else { return Ok(()) };
         pulse.heard();
-        match message.map_err(|error| RosbridgeError::socket(error, options.message_bytes_max))? {
+        match message.map_err(RosbridgeError::socket)? {
             Message::Text(text) => connection.take(&text).await?,
             // JSON may also come as bytes, as in `rosbridge_suite`.
             Message::Binary(bytes) => match std::str::from_utf8(&bytes) {
@@ -165,7 +161,7 @@ where
                 Err(_) => connection.take("\u{fffd}").await?,
             },
             Message::Close(_) => return Ok(()),
-            Message::Ping(_) | Message::Pong(_) | Message::Frame(_) => {}
+            Message::Ping(_) | Message::Pong(_) => {}
         }
     }
 }

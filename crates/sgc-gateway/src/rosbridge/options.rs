@@ -5,8 +5,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio_tungstenite::tungstenite;
-use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
+use sgc_websocket::WebSocketError;
 
 use crate::access::{Client, Denial};
 use crate::error::GatewayError;
@@ -26,7 +25,7 @@ pub type Authenticate = Arc<dyn Fn(&str) -> Result<Client, String> + Send + Sync
 /// The bounds of a connection and the authentication of its client.
 #[derive(Clone)]
 pub struct RosbridgeOptions {
-    /// Longest message of a client, in bytes.
+    /// Longest message of a client, in bytes. The WebSocket must have the same bound, so that it holds from the first byte.
     pub message_bytes_max: usize,
     /// Time for which a client may leave a ping unanswered or a frame unread. Pings are sent four times as often.
     pub silence_max: Duration,
@@ -53,16 +52,6 @@ impl Default for RosbridgeOptions {
     }
 }
 
-impl RosbridgeOptions {
-    /// Returns the configuration with which to accept the WebSocket. Longer frames are refused by their heads, before
-    /// they arrive.
-    pub fn websocket(&self) -> WebSocketConfig {
-        WebSocketConfig::default()
-            .max_message_size(Some(self.message_bytes_max))
-            .max_frame_size(Some(self.message_bytes_max))
-    }
-}
-
 impl fmt::Debug for RosbridgeOptions {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("RosbridgeOptions")
@@ -78,7 +67,7 @@ impl fmt::Debug for RosbridgeOptions {
 pub enum RosbridgeError {
     /// The socket failed, or the client sent something that is not a WebSocket message.
     #[error("the WebSocket failed")]
-    Socket(#[source] Box<tungstenite::Error>),
+    Socket(#[source] WebSocketError),
     /// A message is too long.
     #[error("the client sent a message of more than {max} bytes")]
     TooLong {
@@ -115,10 +104,10 @@ impl RosbridgeError {
         })
     }
 
-    pub(super) fn socket(error: tungstenite::Error, max: usize) -> Self {
+    pub(super) fn socket(error: WebSocketError) -> Self {
         match error {
-            tungstenite::Error::Capacity(_) => Self::TooLong { max },
-            error => Self::Socket(Box::new(error)),
+            WebSocketError::TooLong { max } => Self::TooLong { max },
+            error => Self::Socket(error),
         }
     }
 }

@@ -11,9 +11,9 @@ use std::time::Duration;
 
 use futures_util::{Sink, SinkExt as _};
 use sgc_sync::lock;
+use sgc_websocket::{Message, WebSocketError};
 use tokio::sync::{Mutex as Turns, MutexGuard as Turn, mpsc};
 use tokio::time::Instant;
-use tokio_tungstenite::tungstenite::{self, Message};
 
 use super::envelope::{Envelope, Frame};
 use super::op::OpId;
@@ -207,7 +207,7 @@ pub(super) async fn write_all<W>(
     silence_max: Duration,
 ) -> RosbridgeError
 where
-    W: Sink<Message, Error = tungstenite::Error> + Unpin,
+    W: Sink<Message, Error = WebSocketError> + Unpin,
 {
     let mut pings = tokio::time::interval(super::ping_interval(silence_max));
     pings.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -218,7 +218,7 @@ where
             _ = pings.tick() => ((Vec::new(), None), true),
             Some(said) = outgoing.control.recv() => (said.frames(), false),
             Some(batch) = outgoing.batches.recv() => ((batch, None), false),
-            else => return RosbridgeError::Socket(Box::new(tungstenite::Error::ConnectionClosed)),
+            else => return RosbridgeError::Socket(WebSocketError::Closed),
         };
         let written = async {
             if is_ping {
@@ -251,9 +251,9 @@ where
 }
 
 /// Writes the remaining frames of the first lane, and no messages of topics.
-pub(super) async fn write_rest<W>(sink: &mut W, outgoing: &mut Outgoing) -> Result<(), tungstenite::Error>
+pub(super) async fn write_rest<W>(sink: &mut W, outgoing: &mut Outgoing) -> Result<(), WebSocketError>
 where
-    W: Sink<Message, Error = tungstenite::Error> + Unpin,
+    W: Sink<Message, Error = WebSocketError> + Unpin,
 {
     outgoing.batches.close();
     outgoing.control.close();
@@ -267,11 +267,11 @@ where
 
 async fn feed<W>(sink: &mut W, frame: Frame, silence_max: Duration) -> Result<usize, RosbridgeError>
 where
-    W: Sink<Message, Error = tungstenite::Error> + Unpin,
+    W: Sink<Message, Error = WebSocketError> + Unpin,
 {
     let bytes = frame.bytes();
     for message in frame.messages() {
-        let length = message.len();
+        let length = message.payload_bytes();
         timed(silence_max, length, sink.feed(message)).await?;
     }
     Ok(bytes)
@@ -281,11 +281,11 @@ where
 async fn timed(
     silence_max: Duration,
     bytes: usize,
-    write: impl Future<Output = Result<(), tungstenite::Error>>,
+    write: impl Future<Output = Result<(), WebSocketError>>,
 ) -> Result<(), RosbridgeError> {
     let max = silence_max + Duration::from_secs(bytes as u64 / PACE_BYTES_MIN);
     match tokio::time::timeout(max, write).await {
-        Ok(result) => result.map_err(|error| RosbridgeError::Socket(Box::new(error))),
+        Ok(result) => result.map_err(RosbridgeError::Socket),
         Err(_) => Err(RosbridgeError::Silent(max)),
     }
 }

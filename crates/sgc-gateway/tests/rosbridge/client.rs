@@ -3,10 +3,12 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use bytes::BytesMut;
 use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::{Value as Json, json};
 use sgc_gateway::rosbridge::{RosbridgeError, RosbridgeOptions, serve};
 use sgc_gateway::{Scope, Session, SessionLimits};
+use sgc_websocket::WebSocket;
 use tokio::io::{AsyncRead, AsyncWrite, DuplexStream};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinHandle;
@@ -48,7 +50,7 @@ pub(crate) async fn connect(session: impl Into<Arc<Session>>, options: Rosbridge
     let served = tokio::spawn(async move {
         let (stream, _) = listener.accept().await.unwrap();
         stream.set_nodelay(true).unwrap();
-        let accepted = tokio_tungstenite::accept_async_with_config(stream, Some(options.websocket()));
+        let accepted = WebSocket::accept(stream, options.message_bytes_max);
         serve(accepted.await.unwrap(), session, options).await
     });
     let stream = TcpStream::connect(address).await.unwrap();
@@ -65,9 +67,8 @@ pub(crate) async fn pipe(
 ) -> Client<DuplexStream> {
     let session = session.into();
     let (here, there) = tokio::io::duplex(pipe_bytes);
-    let config = options.websocket();
     let served = tokio::spawn(async move {
-        let socket = WebSocketStream::from_raw_socket(there, Role::Server, Some(config)).await;
+        let socket = WebSocket::new(there, BytesMut::new(), options.message_bytes_max);
         serve(socket, session, options).await
     });
     let socket = WebSocketStream::from_raw_socket(here, Role::Client, None).await;

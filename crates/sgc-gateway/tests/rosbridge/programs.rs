@@ -10,6 +10,7 @@ use serde_json::{Value as Json, json};
 use sgc_gateway::rosbridge::{RosbridgeOptions, serve};
 use sgc_gateway::{ActionEvent, ActionReplier, Content, Form, GoalId, GoalStatus};
 use sgc_ros::{RosNetwork as _, RosWriter as _, SampleKind};
+use sgc_websocket::WebSocket;
 use sgc_wire::Qos;
 use tokio::net::TcpListener;
 use tokio::process::Command;
@@ -63,8 +64,7 @@ impl Scene {
                 let session = Arc::new(site.session("program"));
                 tokio::spawn(async move {
                     let options = RosbridgeOptions::default();
-                    let config = Some(options.websocket());
-                    let accepted = tokio_tungstenite::accept_async_with_config(stream, config).await;
+                    let accepted = WebSocket::accept(stream, options.message_bytes_max).await;
                     let Ok(socket) = accepted else { return };
                     drop(serve(socket, session, options).await);
                 });

@@ -12,12 +12,11 @@ use futures_util::{SinkExt, StreamExt};
 use serde_json::Value;
 use sgc_gateway::Session;
 use sgc_gateway::foxglove::{self, FoxgloveError, Options, SUBPROTOCOLS};
+use sgc_websocket::{Request, WebSocket};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinHandle;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message as Frame;
-use tokio_tungstenite::tungstenite::handshake::server::{Request, Response};
-use tokio_tungstenite::tungstenite::http::HeaderValue;
 
 const PATIENCE: Duration = Duration::from_secs(10);
 
@@ -28,18 +27,16 @@ pub(crate) async fn serve_one(session: Session, options: Options) -> (SocketAddr
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let ended = tokio::spawn(async move {
-        let (stream, _) = listener.accept().await.unwrap();
-        #[allow(clippy::result_large_err, reason = "the handshake's own type")]
-        let choose = |request: &Request, mut response: Response| {
-            let header = request.headers().get("sec-websocket-protocol");
-            let asked = header.and_then(|header| header.to_str().ok()).unwrap_or_default();
-            let chosen = SUBPROTOCOLS.into_iter().find(|known| asked.split(", ").any(|one| one == *known));
-            if let Some(chosen) = chosen {
-                response.headers_mut().insert("sec-websocket-protocol", HeaderValue::from_static(chosen));
-            }
-            Ok(response)
-        };
-        let socket = tokio_tungstenite::accept_hdr_async(stream, choose).await.unwrap();
+        let (mut stream, _) = listener.accept().await.unwrap();
+        let request = Request::read(&mut stream, 8 << 10).await.unwrap();
+        let asked: Vec<_> = request
+            .fields("sec-websocket-protocol")
+            .flat_map(|list| list.split(','))
+            .map(str::trim)
+            .collect();
+        let chosen = SUBPROTOCOLS.into_iter().find(|known| asked.contains(known));
+        let input = request.accept(&mut stream, chosen).await.unwrap();
+        let socket = WebSocket::new(stream, input, 64 << 20);
         foxglove::serve(socket, Arc::new(session), options).await
     });
     (address, ended)

@@ -17,6 +17,7 @@ use std::time::{Duration, Instant};
 use rustls::pki_types::ServerName;
 use rustls::{AlertDescription, NamedGroup};
 use sgc_trust::{CertError, VerifiedPeer};
+use sgc_websocket::UpgradeError;
 use sgc_wire::{Decode, DecodeError, Encode, LaneToken};
 use socket2::SockRef;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -26,7 +27,6 @@ use tokio_rustls::{TlsAcceptor, TlsConnector, TlsStream};
 use super::driver::part;
 use super::record::{Keys, RecordError, RecordStream};
 use super::wire::{Counters, CountingTcp, TlsIo, Wire};
-use super::ws::{self, UpgradeError};
 use crate::credentials::CredentialStore;
 use crate::error::{LinkError, PeerRefusal, ProtocolError, Refusal};
 use crate::framing::{Greeting, control_head};
@@ -153,7 +153,7 @@ pub(super) async fn accept_on(
         }
     }
     if matches!(scheme, Scheme::Ws | Scheme::Wss) {
-        match ws::accept(wire, path).await {
+        match sgc_websocket::accept(wire, path).await {
             Ok(stream) => wire = Box::new(stream),
             Err((error, wire)) => {
                 part(wire).await;
@@ -210,7 +210,7 @@ pub(super) async fn dial_on(
         wire = Box::new(connector.connect(name, wire).await.map_err(|e| failed(e.into()))?);
     }
     if matches!(url.scheme, Scheme::Ws | Scheme::Wss) {
-        let upgraded = ws::dial(wire, &url.authority(), url.path()).await;
+        let upgraded = sgc_websocket::dial(wire, &url.authority(), url.path()).await;
         wire = Box::new(upgraded.map_err(|e| failed(Failure::Upgrade(e)))?);
     }
     let (config, findings) = tls::client(credentials, options, alpn(url.scheme));

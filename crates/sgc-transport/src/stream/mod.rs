@@ -16,7 +16,6 @@ mod mux;
 mod record;
 mod window;
 mod wire;
-mod ws;
 
 #[cfg(feature = "benchmarks")]
 pub use conversation::Conversation;

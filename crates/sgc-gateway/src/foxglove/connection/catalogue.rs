@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use tokio_tungstenite::tungstenite::Message as Frame;
+use sgc_websocket::Message as Frame;
 
 use crate::access::Right;
 use crate::definitions::Types;
