@@ -305,7 +305,7 @@ struct Layouts {
 
 impl Layouts {
     fn find(shared: &HubState, of: &str) -> Result<Self, GatewayError> {
-        let layout = |part: &str| shared.types.layout(&format!("{of}_{part}"), None);
+        let layout = |part: &str| shared.network.types.layout(&format!("{of}_{part}"), None);
         Ok(Self { goal: layout("Goal")?, result: layout("Result")?, feedback: layout("Feedback")? })
     }
 }
@@ -393,19 +393,23 @@ impl ActionServing {
         let name = of.to_owned();
         let layouts = shared.run(move |shared| Layouts::find(shared, &name)).await?;
         let part = |part: &str| format!("{action}/_action/{part}");
-        let goals = Serving::new(shared, part("send_goal"), format!("{of}_SendGoal"), Some(charge)).await?;
-        let results = Serving::new(shared, part("get_result"), format!("{of}_GetResult"), None).await?;
+        let goals =
+            Serving::new(&shared.network, part("send_goal"), format!("{of}_SendGoal"), Some(charge)).await?;
+        let results =
+            Serving::new(&shared.network, part("get_result"), format!("{of}_GetResult"), None).await?;
         let cancel_type = "action_msgs/srv/CancelGoal".to_owned();
-        let cancels = Serving::new(shared, part("cancel_goal"), cancel_type, None).await?;
+        let cancels = Serving::new(&shared.network, part("cancel_goal"), cancel_type, None).await?;
         let feedback_type = format!("{of}_FeedbackMessage");
         let account = || Account { quota: quota.clone(), charge: None, kept: None };
         let feedback =
-            Publication::new(shared, part("feedback"), feedback_type, Qos::default(), account()).await?;
+            Publication::new(&shared.network, part("feedback"), feedback_type, Qos::default(), account())
+                .await?;
         let kept = Arc::new(PendingBytes::new(results_bytes_max, quota.clone()));
         let latched =
             Qos { durability: Durability::TransientLocal, history: History::KeepLast(1), ..Qos::default() };
         let status_type = "action_msgs/msg/GoalStatusArray".to_owned();
-        let status = Publication::new(shared, part("status"), status_type, latched, account()).await?;
+        let status =
+            Publication::new(&shared.network, part("status"), status_type, latched, account()).await?;
         let server = Arc::new(ActionServer {
             action: action.to_owned(),
             layouts,

@@ -19,7 +19,7 @@ use crate::access::{Access, AdmissionRequest, Client, Credential, Denial};
 use crate::access_watch::AccessWatch;
 use crate::clock::WallClock;
 use crate::error::GatewayError;
-use crate::quota::Pool;
+use crate::pool::Pool;
 
 /// Most connections of other hosts in their handshake at a time.
 const HANDSHAKES_MAX: usize = 128;

@@ -6,10 +6,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::error::GatewayError;
-use crate::quota::{Permits, Quota};
-
-/// The unit of room, in bytes. Messages up to one unit need no room, because their number is bounded.
-pub(crate) const UNIT_BYTES: usize = 64 << 10;
+use crate::quota::{Permits, Quota, UNIT_BYTES};
 
 /// Room for long messages.
 #[derive(Debug)]

@@ -4,7 +4,7 @@ use sgc_cdr::{DecodeError, TypeError, ValueError};
 use sgc_ros::RosError;
 
 use crate::access::Right;
-use crate::quota::Pool;
+use crate::pool::Pool;
 
 /// The reason why a request fails.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

@@ -1,6 +1,7 @@
 //! [`Feed`]: a reader of a topic and its subscribers. Subscribers with the same requirements share one reader.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, Weak};
 use std::time::Duration;
 
@@ -16,12 +17,11 @@ use tokio::time::Instant;
 use crate::content::Form;
 use crate::error::GatewayError;
 use crate::graph::Graph;
-use crate::hub::HubState;
 use crate::message::Message;
+use crate::network::Network;
 use crate::queue::{Overflow, Queue, cost};
 use crate::quota::{ByteReservation, Charge, Payer, PendingBytes};
 use crate::ros::LocalReader;
-use crate::session::WaitPlace;
 
 /// Most messages of one writer that are kept for later subscribers of a transient-local topic.
 pub(crate) const LATCHED_DEPTH_MAX: usize = 100;
@@ -42,7 +42,7 @@ pub(crate) struct FeedKey {
 /// A reader and its subscribers.
 pub(crate) struct Feed {
     pub(crate) key: FeedKey,
-    hub: Weak<HubState>,
+    network: Weak<Network>,
     outlets: Mutex<Outlets>,
     /// The reader and its request. The lock may be held for long while the reader changes.
     reader: Mutex<Option<(LocalReader, EndpointSpec)>>,
@@ -222,10 +222,10 @@ impl HandleSamples for FeedHandler {
 }
 
 impl Feed {
-    pub(crate) fn new(key: FeedKey, hub: &Arc<HubState>, charge: Charge, payer: Payer) -> Arc<Self> {
+    pub(crate) fn new(key: FeedKey, network: &Arc<Network>, charge: Charge, payer: Payer) -> Arc<Self> {
         let outlets = Outlets { subscribers: Vec::new(), charge, payer, latched: LatchedMessages::default() };
         let (outlets, reader) = (Mutex::new(outlets), Mutex::new(None));
-        Arc::new(Self { key, hub: Arc::downgrade(hub), outlets, reader })
+        Arc::new(Self { key, network: Arc::downgrade(network), outlets, reader })
     }
 
     fn outlets(&self) -> MutexGuard<'_, Outlets> {
@@ -253,9 +253,9 @@ impl Feed {
     /// Counts messages that were not kept for later subscribers.
     fn count_dropped(&self, messages: u64) {
         if messages > 0
-            && let Some(hub) = self.hub.upgrade()
+            && let Some(network) = self.network.upgrade()
         {
-            hub.quotas.count_history_dropped(messages);
+            network.quotas.count_history_dropped(messages);
         }
     }
 
@@ -326,13 +326,13 @@ impl Feed {
 
     /// Creates the reader, or recreates it if the offers have changed. May block.
     pub(crate) fn adapt(self: &Arc<Self>) -> Result<(), GatewayError> {
-        let hub = self.hub.upgrade().ok_or(GatewayError::Stopping)?;
+        let network = self.network.upgrade().ok_or(GatewayError::Stopping)?;
         let mut reader = lock(&self.reader);
-        let wanted = self.wanted(&hub.graph());
+        let wanted = self.wanted(&network.graph());
         {
             let mut outlets = self.outlets();
             let latched = &mut outlets.latched;
-            latched.retain(|writer| hub.is_there(writer));
+            latched.retain(|writer| network.is_there(writer));
             latched.is_on = wanted.qos.durability >= Durability::TransientLocal;
             if !latched.is_on {
                 latched.writers.clear();
@@ -349,7 +349,7 @@ impl Feed {
             return Ok(());
         }
         if let Some((old, _)) = reader.take() {
-            hub.forget(&[old.guid()]);
+            network.forget(&[old.guid()]);
             // Dropping the reader waits for its thread, which may wait for a subscriber.
             let queues: Vec<_> = self.outlets().queues().collect();
             queues.iter().for_each(|queue| queue.let_pass(true));
@@ -358,8 +358,8 @@ impl Feed {
         }
         // Writers send what they keep again.
         self.outlets().latched.is_short = false;
-        let made = hub.ros.reader(&wanted, Box::new(FeedHandler(Arc::clone(self))))?;
-        hub.know(own_endpoint(EndpointKind::Reader, made.guid(), &wanted));
+        let made = network.ros.reader(&wanted, Box::new(FeedHandler(Arc::clone(self))))?;
+        network.know(own_endpoint(EndpointKind::Reader, made.guid(), &wanted));
         *reader = Some((made, wanted));
         Ok(())
     }
@@ -370,8 +370,8 @@ impl Feed {
         let subscribers = std::mem::take(&mut self.outlets().subscribers);
         subscribers.iter().filter_map(|other| other.queue.upgrade()).for_each(|queue| queue.close());
         let reader = lock(&self.reader).take();
-        if let Some(((reader, _), hub)) = reader.zip(self.hub.upgrade()) {
-            hub.forget(&[reader.guid()]);
+        if let Some(((reader, _), network)) = reader.zip(self.network.upgrade()) {
+            network.forget(&[reader.guid()]);
         }
     }
 
@@ -400,6 +400,26 @@ pub struct Delivery {
     pub message: Arc<Message>,
     /// Messages that this subscriber has lost so far because it reads too slowly.
     pub dropped: u64,
+}
+
+/// A place among subscriptions that hold up writers, returned on drop.
+#[derive(Debug)]
+pub(crate) struct WaitPlace {
+    waits: Arc<AtomicUsize>,
+    _charge: Charge,
+}
+
+impl WaitPlace {
+    /// Takes over a place that is counted in `waits`.
+    pub(crate) fn new(waits: Arc<AtomicUsize>, charge: Charge) -> Self {
+        Self { waits, _charge: charge }
+    }
+}
+
+impl Drop for WaitPlace {
+    fn drop(&mut self) {
+        self.waits.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 /// The options of a new subscription.
@@ -516,8 +536,8 @@ impl SubscriptionEnd {
             feed.leave(&queue);
             queue.close();
             queue.clear();
-            if let Some(hub) = feed.hub.upgrade() {
-                hub.sweep();
+            if let Some(network) = feed.network.upgrade() {
+                network.sweep();
             }
         }
     }
@@ -538,8 +558,8 @@ impl Drop for Subscription {
     fn drop(&mut self) {
         self.feed.leave(&self.queue);
         self.queue.close();
-        if let Some(hub) = self.feed.hub.upgrade() {
-            hub.sweep();
+        if let Some(network) = self.feed.network.upgrade() {
+            network.sweep();
         }
     }
 }
@@ -553,8 +573,8 @@ mod tests {
     use crate::access::{Access, AccessRules, AdmissionRequest, Anonymous, Client};
     use crate::definitions::{ShippedDefinitions, Types};
     use crate::hub::{Hub, HubOptions};
+    use crate::limits::SessionLimits;
     use crate::quota::{Quota, Resource};
-    use crate::session::SessionLimits;
 
     const MESSAGE_BYTES: usize = 1000;
     const COST: usize = MESSAGE_BYTES + crate::queue::MESSAGE_COST_BYTES;
@@ -583,7 +603,7 @@ mod tests {
             let admission =
                 AdmissionRequest { peer, encrypted: true, origin: None, token: None, certificate: None, now };
             let client: Client = access.admit(&admission).unwrap();
-            let quota = hub.shared.quotas.quota(&client);
+            let quota = hub.shared.network.quotas.quota(&client);
             let history = Arc::new(PendingBytes::new(LIMITS.waiting_bytes_max, quota.clone()));
             let payer = Payer::new(quota.clone(), LIMITS, Arc::clone(&history));
             Self { quota, history, payer }
@@ -598,7 +618,8 @@ mod tests {
         fn feed(&self, hub: &Hub) -> Arc<Feed> {
             let (topic, type_name) = ("/map".to_owned(), "std_msgs/msg/String".to_owned());
             let key = FeedKey { topic, type_name, qos: None, waits: false };
-            let feed = Feed::new(key, &hub.shared, self.payer.take_reader().unwrap(), self.payer.clone());
+            let feed =
+                Feed::new(key, &hub.shared.network, self.payer.take_reader().unwrap(), self.payer.clone());
             {
                 let latched = &mut feed.outlets().latched;
                 (latched.is_on, latched.depth) = (true, LATCHED_DEPTH_MAX);
@@ -658,11 +679,11 @@ mod tests {
         say(&feeds[0], 1, 0..6);
         say(&feeds[1], 1, 0..6);
         assert_eq!((sessions[0].keeps(), heard(&feeds[1])), (ROOM, vec![2, 3, 4, 5]));
-        assert_eq!(hub.shared.quotas.history_dropped(), 2);
+        assert_eq!(hub.shared.network.quotas.history_dropped(), 2);
         // A further topic has no room left and takes none from the others.
         say(&feeds[2], 1, 0..3);
         assert_eq!((heard(&feeds[2]), heard(&feeds[0]).len()), (vec![], 6));
-        assert_eq!(hub.shared.quotas.history_dropped(), 5);
+        assert_eq!(hub.shared.network.quotas.history_dropped(), 5);
         // Within a topic the writer with the most bytes gives way.
         say(&feeds[0], 2, 10..11);
         assert_eq!(heard(&feeds[0]), [1, 2, 3, 4, 5, 10]);
@@ -699,7 +720,7 @@ mod tests {
         feed.join(&queues[0], first.payer.clone());
         assert_eq!([first.keeps(), second.keeps()], [5, 0]);
         assert_eq!([first.readers_left(), second.readers_left()], [all - 1, all]);
-        assert_eq!((heard(&feed).len(), hub.shared.quotas.history_dropped()), (5, 0));
+        assert_eq!((heard(&feed).len(), hub.shared.network.quotas.history_dropped()), (5, 0));
         drop(feed);
         assert_eq!((first.keeps(), first.readers_left()), (0, all));
     }
@@ -721,7 +742,7 @@ mod tests {
         // The newest messages have room, and the victim's own messages stay.
         assert_eq!((leaver.keeps(), victim.keeps()), (0, ROOM));
         assert_eq!((heard(&shared), heard(&own).len()), (vec![6, 7, 8], 7));
-        assert_eq!(hub.shared.quotas.history_dropped(), 6);
+        assert_eq!(hub.shared.network.quotas.history_dropped(), 6);
         // Other clients do not suffer: they have their own readers.
         assert!(shared.has_history_for(&victim.payer) && !shared.has_history_for(&third.payer));
         assert!(own.has_history_for(&third.payer));

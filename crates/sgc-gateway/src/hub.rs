@@ -2,21 +2,19 @@
 
 use std::collections::VecDeque;
 use std::fmt;
-use std::sync::{Arc, Mutex, MutexGuard, Weak};
+use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
-use sgc_ros::{DiscoveredEndpoint, GraphNode, Guid, RosError};
+use sgc_ros::RosError;
 use sgc_sync::lock;
-use sgc_wire::RosNode;
-use tokio::runtime::Handle;
-use tokio::sync::{Notify, Semaphore, watch};
+use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::definitions::Types;
 use crate::error::GatewayError;
 use crate::feed::{Feed, FeedKey, Subscription, SubscriptionOptions};
-use crate::graph::{Graph, GraphState};
-use crate::quota::Quotas;
+use crate::graph::Graph;
+use crate::network::Network;
 use crate::ros::LocalRos;
 use crate::service::Caller;
 
@@ -24,8 +22,6 @@ use crate::service::Caller;
 const SETTLE: Duration = Duration::from_millis(20);
 /// Time for which an unused reader is kept, so that a reloaded page finds it.
 const LINGER: Duration = Duration::from_secs(2);
-/// Most writers that wait for acknowledgements at their end at a time.
-const FAREWELLS_MAX: usize = 32;
 /// Most service clients that are kept for further calls.
 const CALLERS_MAX: usize = 256;
 
@@ -79,25 +75,14 @@ struct Feeds {
 
 /// The state that all clients share.
 pub(crate) struct HubState {
-    pub(crate) ros: Arc<dyn LocalRos>,
-    pub(crate) types: Types,
-    pub(crate) runtime: Handle,
-    node: Option<RosNode>,
-    node_name: String,
-    state: Mutex<GraphState>,
-    changed: watch::Sender<u64>,
+    pub(crate) network: Arc<Network>,
     feeds: Mutex<Feeds>,
-    unused: Notify,
     callers: Mutex<VecDeque<Arc<Caller>>>,
-    /// The counts of all clients, and the threads on which calls and writes may wait.
-    pub(crate) quotas: Arc<Quotas>,
-    /// Permits for writers that wait for acknowledgements before they end.
-    pub(crate) farewells: Arc<Semaphore>,
 }
 
 impl fmt::Debug for Hub {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_tuple("Hub").field(&self.shared.node_name).finish()
+        f.debug_tuple("Hub").field(&self.shared.network.node_name()).finish()
     }
 }
 
@@ -111,58 +96,32 @@ impl Hub {
         types: Types,
         options: HubOptions,
     ) -> Result<Self, GatewayError> {
-        let node = RosNode::new("/", &options.node, None);
-        let node_name = node.as_ref().map_or_else(|| format!("/{}", options.node), ToString::to_string);
-        let shared = Arc::new(HubState {
-            ros,
-            types,
-            runtime: Handle::current(),
-            node,
-            node_name,
-            state: Mutex::default(),
-            changed: watch::Sender::new(0),
-            feeds: Mutex::default(),
-            unused: Notify::new(),
-            callers: Mutex::default(),
-            quotas: Arc::default(),
-            farewells: Arc::new(Semaphore::new(FAREWELLS_MAX)),
-        });
-        let weak = Arc::downgrade(&shared);
-        shared
-            .blocking(move |shared| {
-                shared.ros.discover(Box::new(move |event| {
-                    if let Some(shared) = weak.upgrade() {
-                        shared.state().handle(event);
-                        shared.tell();
-                    }
-                }))?;
-                shared.announce();
-                Ok(())
-            })
-            .await?;
-        let adapting = tokio::spawn(adapt(Arc::downgrade(&shared), shared.changed.subscribe()));
+        let network = Arc::new(Network::new(ros, types, &options.node));
+        let shared = Arc::new(HubState { network, feeds: Mutex::default(), callers: Mutex::default() });
+        shared.network.join().await?;
+        let adapting = tokio::spawn(adapt(Arc::downgrade(&shared), shared.network.changes()));
         let sweeping = tokio::spawn(sweep(Arc::downgrade(&shared)));
         Ok(Self { shared, keeper: Arc::new(Keeper([adapting, sweeping])) })
     }
 
     /// Returns the graph of the local network.
     pub fn graph(&self) -> Arc<Graph> {
-        self.shared.graph()
+        self.shared.network.graph()
     }
 
     /// Returns a receiver that is marked as changed whenever the graph changes.
     pub fn graph_changes(&self) -> watch::Receiver<u64> {
-        self.shared.changed.subscribe()
+        self.shared.network.changes()
     }
 
     /// Returns the message types.
     pub fn types(&self) -> &Types {
-        &self.shared.types
+        &self.shared.network.types
     }
 
     /// Returns the full name of the gateway's node.
     pub fn node_name(&self) -> &str {
-        &self.shared.node_name
+        self.shared.network.node_name()
     }
 
     /// Returns the number of readers, shared by all subscribers.
@@ -180,7 +139,7 @@ impl Hub {
                 feeds.all.iter().for_each(|feed| feed.end());
                 let callers = std::mem::take(&mut *lock(&shared.callers));
                 drop(callers);
-                let _ = shared.ros.announce(&[]);
+                let _ = shared.network.ros.announce(&[]);
                 Ok(())
             })
             .await;
@@ -202,7 +161,7 @@ async fn adapt(shared: Weak<HubState>, mut changed: watch::Receiver<u64>) {
                     tracing::warn!(%error, "a reader could not be made anew");
                 }
             }
-            shared.announce();
+            shared.network.announce();
             Ok(())
         });
         let _ = done.await;
@@ -213,7 +172,7 @@ async fn adapt(shared: Weak<HubState>, mut changed: watch::Receiver<u64>) {
 async fn sweep(shared: Weak<HubState>) {
     loop {
         let Some(shared) = shared.upgrade() else { return };
-        shared.unused.notified().await;
+        shared.network.unused().await;
         tokio::time::sleep(LINGER).await;
         let done = shared.blocking(|shared| {
             let mut gone = Vec::new();
@@ -232,50 +191,8 @@ async fn sweep(shared: Weak<HubState>) {
 }
 
 impl HubState {
-    fn state(&self) -> MutexGuard<'_, GraphState> {
-        lock(&self.state)
-    }
-
-    pub(crate) fn graph(&self) -> Arc<Graph> {
-        self.state().graph(&self.node_name)
-    }
-
-    pub(crate) fn is_there(&self, guid: &Guid) -> bool {
-        self.state().is_there(guid)
-    }
-
-    fn tell(&self) {
-        self.changed.send_modify(|version| *version += 1);
-    }
-
-    /// Adds an endpoint of the gateway to the graph.
-    pub(crate) fn know(&self, endpoint: DiscoveredEndpoint) {
-        self.state().add_own(endpoint);
-        self.tell();
-    }
-
-    /// Removes endpoints of the gateway from the graph.
-    pub(crate) fn forget(&self, guids: &[Guid]) {
-        guids.iter().for_each(|guid| self.state().remove_own(guid));
-        self.tell();
-    }
-
-    /// Announces the gateway's node in the ROS graph. May block.
-    fn announce(&self) {
-        let Some(node) = self.node.clone() else { return };
-        let (readers, writers) = self.state().own();
-        if let Err(error) = self.ros.announce(&[GraphNode { node, readers, writers }]) {
-            tracing::debug!(%error, "the gateway's node could not be announced");
-        }
-    }
-
-    /// Schedules a search for unused readers.
-    pub(crate) fn sweep(&self) {
-        self.unused.notify_one();
-    }
-
     /// Runs blocking work on a thread where it may block.
-    pub(crate) async fn blocking<T: Send + 'static>(
+    async fn blocking<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&Arc<Self>) -> Result<T, RosError> + Send + 'static,
     ) -> Result<T, GatewayError> {
@@ -288,8 +205,7 @@ impl HubState {
         work: impl FnOnce(&Arc<Self>) -> Result<T, GatewayError> + Send + 'static,
     ) -> Result<T, GatewayError> {
         let shared = Arc::clone(self);
-        let done = self.runtime.spawn_blocking(move || work(&shared)).await;
-        done.unwrap_or(Err(GatewayError::Stopping))
+        self.network.run(move |_| work(&shared)).await
     }
 
     /// Subscribes, by an existing reader if one suits. A reader whose history is incomplete for lack of its
@@ -319,7 +235,7 @@ impl HubState {
                         };
                         match charge {
                             Ok(charge) => {
-                                let feed = Feed::new(key, shared, charge, payer.clone());
+                                let feed = Feed::new(key, &shared.network, charge, payer.clone());
                                 feeds.all.push(Arc::clone(&feed));
                                 feed
                             }
@@ -338,9 +254,9 @@ impl HubState {
     }
 
     fn layout_of(&self, key: &FeedKey) -> Result<Arc<sgc_cdr::Layout>, GatewayError> {
-        let graph = self.graph();
+        let graph = self.network.graph();
         let hash = graph.topics.get(&key.topic).and_then(|info| info.type_hash(&key.type_name));
-        self.types.layout(&key.type_name, hash)
+        self.network.types.layout(&key.type_name, hash)
     }
 
     /// Returns the client of a service, created unless a recent call left one. May block.
@@ -359,7 +275,7 @@ impl HubState {
             return Ok(caller);
         }
         // The lock is not held while a client is created. If two are created at once, the second is dropped.
-        let made = Arc::new(Caller::new(self, service, type_name)?);
+        let made = Arc::new(Caller::new(&self.network, service, type_name)?);
         let mut callers = lock(&self.callers);
         if let Some(caller) = known(&mut callers) {
             return Ok(caller);

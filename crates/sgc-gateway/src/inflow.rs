@@ -11,9 +11,8 @@ use std::task::{Context, Poll, ready};
 use sgc_sync::lock;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 
-use crate::budget::UNIT_BYTES;
 use crate::error::GatewayError;
-use crate::quota::{Permits, Quota};
+use crate::quota::{Permits, Quota, UNIT_BYTES};
 
 /// The bytes of unfinished messages of one connection.
 #[derive(Debug, Default)]
@@ -122,7 +121,8 @@ mod tests {
 
     use super::*;
     use crate::access::Client;
-    use crate::quota::{Pool, Quotas};
+    use crate::pool::Pool;
+    use crate::quota::Quotas;
 
     #[tokio::test]
     async fn messages_that_do_not_end_take_no_more_than_the_quota_has() {

@@ -16,7 +16,7 @@ use tokio::time::Instant;
 use crate::content::{Content, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
-use crate::hub::HubState;
+use crate::network::Network;
 use crate::quota::{Charge, PendingBytes, Quota};
 
 /// Time within which readers must acknowledge the last messages before the writer ends.
@@ -93,7 +93,7 @@ impl Drop for WriterHistory {
 
 /// A client's publisher on a topic. Dropping it ends the writer after reliable readers have the last messages.
 pub struct Publication {
-    shared: Arc<HubState>,
+    shared: Arc<Network>,
     line: Arc<WriteQueue>,
     layout: Arc<Layout>,
     topic: String,
@@ -155,7 +155,7 @@ impl WriteQueue {
 
 impl Publication {
     pub(crate) async fn new(
-        shared: &Arc<HubState>,
+        shared: &Arc<Network>,
         topic: String,
         type_name: String,
         qos: Qos,

@@ -7,7 +7,6 @@
 //! The module `admission` decides whether a connection gets a place at all.
 
 use std::collections::BTreeMap;
-use std::fmt;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, RwLock, RwLockReadGuard, Weak};
 
@@ -16,7 +15,8 @@ use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 
 use crate::access::{Client, Credential};
 use crate::error::GatewayError;
-use crate::session::SessionLimits;
+use crate::limits::SessionLimits;
+use crate::pool::Pool;
 
 /// Bound of one credential, in sessions.
 const CREDENTIAL_SHARE: usize = 4;
@@ -24,6 +24,8 @@ const CREDENTIAL_SHARE: usize = 4;
 const REMOTE_SHARE: usize = 12;
 /// Bound of all clients together, in sessions.
 const TOTAL_SHARE: usize = 16;
+/// The unit of room for long messages, in bytes. Messages up to one unit need no room, because their number is bounded.
+pub(crate) const UNIT_BYTES: usize = 64 << 10;
 /// Most threads that wait for local programs: of one credential, of all clients of other hosts, of all clients.
 const THREADS: [usize; 3] = [16, 48, 64];
 /// Most bytes of long messages in transit between gateway and clients: of one credential, of all clients of other
@@ -69,27 +71,6 @@ impl Resource {
             Self::Servings => limits.servings_max,
             Self::Calls => limits.calls_max,
         }
-    }
-}
-
-/// Clients that share a bound.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Pool {
-    /// All clients that show the same token or certificate, or that come from the same address without one.
-    Credential,
-    /// All clients of other hosts.
-    Remote,
-    /// All clients.
-    Total,
-}
-
-impl fmt::Display for Pool {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Credential => "all clients with this token, certificate or address",
-            Self::Remote => "all clients of other hosts",
-            Self::Total => "all clients",
-        })
     }
 }
 
@@ -456,7 +437,7 @@ impl PermitKind {
     fn unit(self) -> usize {
         match self {
             Self::Threads => 1,
-            Self::LongBytes => crate::budget::UNIT_BYTES,
+            Self::LongBytes => UNIT_BYTES,
         }
     }
 

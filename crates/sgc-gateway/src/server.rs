@@ -26,7 +26,7 @@ use tokio_rustls::TlsAcceptor;
 use crate::access::Access;
 use crate::admission::{Admission, Arrival, Engagement, GatewayStatus, Handshakes};
 use crate::hub::Hub;
-use crate::session::SessionLimits;
+use crate::limits::SessionLimits;
 use crate::tls::{TlsError, server_config};
 #[cfg(feature = "grpc")]
 use grpc::GrpcFront;
@@ -281,9 +281,9 @@ impl Server {
     /// Returns the number of refusals by reason.
     fn refused(&self) -> BTreeMap<String, u64> {
         let mut refused = self.shared.admission.refused();
-        let crowded = self.shared.hub.shared.quotas.refused();
+        let crowded = self.shared.hub.shared.network.quotas.refused();
         refused.extend(crowded.into_iter().map(|(pool, count)| (format!("too much for {pool}"), count)));
-        let not_kept = self.shared.hub.shared.quotas.history_dropped();
+        let not_kept = self.shared.hub.shared.network.quotas.history_dropped();
         refused.extend((not_kept > 0).then(|| (HISTORY_DROPPED.to_owned(), not_kept)));
         refused
     }

@@ -17,7 +17,7 @@ use tokio::sync::{mpsc, oneshot};
 use crate::content::{Content, Form, convert, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
-use crate::hub::HubState;
+use crate::network::Network;
 use crate::quota::{Charge, Quota};
 
 /// Most replies that arrive before their request number is known.
@@ -34,7 +34,7 @@ pub(crate) struct Halves {
 
 impl Halves {
     /// Finds the layouts of a service type. May read files.
-    pub(crate) fn find(shared: &HubState, type_name: &str) -> Result<Self, GatewayError> {
+    pub(crate) fn find(shared: &Network, type_name: &str) -> Result<Self, GatewayError> {
         let layout = |half: &str| shared.types.layout(&format!("{type_name}_{half}"), None);
         Ok(Self { request: layout("Request")?, reply: layout("Response")? })
     }
@@ -72,7 +72,7 @@ pub(crate) struct Caller {
     /// The client; `None` only while it is dropped, which may block.
     client: Option<Box<dyn RosClient>>,
     pending: Arc<Mutex<PendingCalls>>,
-    shared: Weak<HubState>,
+    shared: Weak<Network>,
 }
 
 /// A call in progress. Its reply is discarded after this is dropped.
@@ -89,7 +89,7 @@ impl Drop for CallGuard {
 
 impl Caller {
     /// Creates the client of a service. May block.
-    pub(crate) fn new(shared: &Arc<HubState>, service: &str, type_name: &str) -> Result<Self, GatewayError> {
+    pub(crate) fn new(shared: &Arc<Network>, service: &str, type_name: &str) -> Result<Self, GatewayError> {
         let halves = Halves::find(shared, type_name)?;
         let pending: Arc<Mutex<PendingCalls>> = Arc::default();
         let answered = Arc::clone(&pending);
@@ -197,7 +197,7 @@ pub struct Request {
 
 /// A service that a client serves, until dropped.
 pub struct Serving {
-    shared: Arc<HubState>,
+    shared: Arc<Network>,
     server: Arc<dyn RosServer>,
     halves: Halves,
     requests: mpsc::Receiver<Request>,
@@ -208,7 +208,7 @@ pub struct Serving {
 /// A handle that answers requests of a [`Serving`] from any task.
 #[derive(Clone)]
 pub struct Replier {
-    shared: Arc<HubState>,
+    shared: Arc<Network>,
     server: Arc<dyn RosServer>,
     halves: Halves,
 }
@@ -245,7 +245,7 @@ impl fmt::Debug for Replier {
 
 impl Serving {
     pub(crate) async fn new(
-        shared: &Arc<HubState>,
+        shared: &Arc<Network>,
         service: String,
         type_name: String,
         charge: Option<Charge>,

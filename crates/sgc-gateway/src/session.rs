@@ -15,51 +15,18 @@ use crate::access_watch::AccessWatch;
 use crate::content::{Content, Form, convert};
 use crate::definitions::InterfaceType;
 use crate::error::GatewayError;
-use crate::feed::{FeedKey, LATCHED_DEPTH_MAX, Subscription, SubscriptionOptions};
+use crate::feed::{FeedKey, LATCHED_DEPTH_MAX, Subscription, SubscriptionOptions, WaitPlace};
 use crate::graph::Graph;
 use crate::hub::Hub;
 use crate::inflow::Inflow;
+use crate::limits::{SessionLimits, WAITING_PARTS};
 use crate::publisher::{Account, Publication};
 use crate::queue::Overflow;
-use crate::quota::{ByteReservation, Charge, Payer, PendingBytes, Quota, Resource};
+use crate::quota::{ByteReservation, Payer, PendingBytes, Quota, Resource};
 use crate::service::Serving;
 
-/// Divisor: a subscription that holds up writers gets one part in this many of the client's bytes.
-const WAITING_PARTS: usize = 16;
 /// Most messages that may be queued for one subscription, whatever the client asks for.
 const DEPTH_MAX: usize = 10_000;
-
-/// The limits of one session.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct SessionLimits {
-    /// Most bytes queued in all subscriptions together; one message of each topic is always allowed. The same bound
-    /// applies separately to messages kept by transient-local writers, to arguments of calls and goals, and to
-    /// messages that are kept for later subscribers and charged to the session.
-    pub waiting_bytes_max: usize,
-    /// Most subscriptions.
-    pub subscriptions_max: usize,
-    /// Most published topics.
-    pub publications_max: usize,
-    /// Most served services and actions.
-    pub servings_max: usize,
-    /// Most concurrent calls.
-    pub calls_max: usize,
-    /// Most subscriptions that hold up writers. Each has its own reader and its own part of the bytes.
-    pub waits_max: usize,
-}
-
-impl Default for SessionLimits {
-    fn default() -> Self {
-        Self {
-            waiting_bytes_max: 64 << 20,
-            subscriptions_max: 1024,
-            publications_max: 256,
-            servings_max: 256,
-            calls_max: 256,
-            waits_max: WAITING_PARTS,
-        }
-    }
-}
 
 /// A request to subscribe.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -114,19 +81,6 @@ pub struct Session {
     inflow: Arc<Inflow>,
 }
 
-/// A place among subscriptions that hold up writers, returned on drop.
-#[derive(Debug)]
-pub(crate) struct WaitPlace {
-    waits: Arc<AtomicUsize>,
-    _charge: Charge,
-}
-
-impl Drop for WaitPlace {
-    fn drop(&mut self) {
-        self.waits.fetch_sub(1, Ordering::Relaxed);
-    }
-}
-
 /// A call in progress, counted until dropped.
 struct ActiveCall<'s>(&'s AtomicUsize);
 
@@ -139,7 +93,7 @@ impl Drop for ActiveCall<'_> {
 impl Session {
     /// Creates the session of a client.
     pub fn new(hub: &Hub, client: Client, limits: SessionLimits) -> Self {
-        let quota = hub.shared.quotas.quota(&client);
+        let quota = hub.shared.network.quotas.quota(&client);
         let waiting = || Arc::new(PendingBytes::new(limits.waiting_bytes_max, quota.clone()));
         Self {
             hub: hub.clone(),
@@ -394,7 +348,7 @@ impl Session {
     fn take_wait(&self) -> Result<WaitPlace, GatewayError> {
         let charge = self.quota.take(Resource::Waits, &self.limits)?;
         let before = self.waits.fetch_add(1, Ordering::Relaxed);
-        let place = WaitPlace { waits: Arc::clone(&self.waits), _charge: charge };
+        let place = WaitPlace::new(Arc::clone(&self.waits), charge);
         self.check_count("subscriptions that are waited for", before, self.limits.waits_max)?;
         Ok(place)
     }
@@ -412,7 +366,7 @@ impl Session {
         let (quota, kept) = (self.quota.clone(), Some(Arc::clone(&self.kept)));
         let account = Account { quota, charge: Some(charge), kept };
         let qos = kept_within_bounds(wanted.qos);
-        Publication::new(&self.hub.shared, wanted.topic, type_name, qos, account).await
+        Publication::new(&self.hub.shared.network, wanted.topic, type_name, qos, account).await
     }
 
     /// Calls a service and waits for its reply, which comes in the requested form.
@@ -444,7 +398,7 @@ impl Session {
         self.check(Right::Serve, action_of(service))?;
         let type_name = self.service_type(service, type_name)?;
         let charge = self.quota.take(Resource::Servings, &self.limits)?;
-        Serving::new(&self.hub.shared, service.to_owned(), type_name, Some(charge)).await
+        Serving::new(&self.hub.shared.network, service.to_owned(), type_name, Some(charge)).await
     }
 }
 

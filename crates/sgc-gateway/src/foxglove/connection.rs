@@ -22,13 +22,13 @@ use crate::session::{Advertise, Session, Subscribe};
 
 use super::connections::Connections;
 use super::listing::Listing;
+use super::options::{FoxgloveError, Options};
 use super::outbox::{LANE_MESSAGES_MAX, Outbox};
 use super::parameters::{self, ASKED_MAX, Answer, Parameters, WatchList};
 use super::protocol::{
     self, BinaryMessage, ClientChannel, Command, Metadata, Parameter, ServerMessage, SubscribeRequest,
 };
 use super::refusal::{Refusal, Refusals};
-use super::{FoxgloveError, Options};
 
 /// Encodings of messages and calls: that of ROS 2, and that of `docs/spec/json.md`. Topics are always sent as CDR.
 const ENCODINGS: [&str; 2] = [CDR, JSON];

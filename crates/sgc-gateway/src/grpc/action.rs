@@ -6,16 +6,16 @@ use std::time::Duration;
 use futures_util::FutureExt as _;
 use tonic::{Response, Status, Streaming};
 
-use super::client::{Guest, Place, StreamKind};
 use super::conversation::{Conversation, Responder, begin, first};
 use super::fault::Fault;
+use super::guest::{Guest, Place, StreamKind};
 use super::proto::send_goal_request::{Goal as GoalSaid, Kind as Asked};
 use super::proto::send_goal_response as sent;
 use super::proto::serve_action_request::{Finish, Kind as Said, Server};
 use super::proto::serve_action_response as served;
 use super::proto::{self, SendGoalRequest, SendGoalResponse, ServeActionRequest, ServeActionResponse};
 use super::qos;
-use super::service::Responses;
+use super::slot::Responses;
 use crate::action::{
     ActionEvent, ActionReplier, ActionServing, CancelAnswer, Feedback, Goal, GoalId, GoalStatus,
 };

@@ -3,16 +3,16 @@
 use std::fmt;
 use std::net::SocketAddr;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex, Weak};
+use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll};
 
-use futures_util::task::AtomicWaker;
 use sgc_sync::lock;
 use sgc_trust::VerifiedPeer;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tonic::transport::server::Connected;
 
-use super::client::GuestEntry;
+use super::guest::GuestEntry;
+use super::serving_task::ServingTask;
 use crate::access::Client;
 
 /// A connection as its acceptor knows it. Clones share it.
@@ -25,7 +25,7 @@ struct Inner {
     certificate: Option<VerifiedPeer>,
     known: Mutex<Vec<GuestEntry>>,
     /// Woken when the rights of a client on the connection end.
-    serving: AtomicWaker,
+    serving: ServingTask,
 }
 
 impl Connection {
@@ -40,7 +40,7 @@ impl Connection {
     }
 
     fn new(peer: SocketAddr, is_encrypted: bool, certificate: Option<VerifiedPeer>) -> Self {
-        let (known, serving) = (Mutex::default(), AtomicWaker::new());
+        let (known, serving) = (Mutex::default(), ServingTask::default());
         Self(Arc::new(Inner { peer, is_encrypted, certificate, known, serving }))
     }
 
@@ -61,31 +61,19 @@ impl Connection {
 
     /// Returns the first client whose rights have not ended. The task is woken when rights end.
     pub(crate) fn poll_admitted(&self, cx: &mut Context<'_>) -> Option<Client> {
-        self.0.serving.register(cx.waker());
+        self.0.serving.register(cx);
         let known = lock(&self.0.known);
         known.iter().find(|known| known.is_admitted()).map(|known| known.client().clone())
     }
 
-    /// Returns a handle that wakes the task that serves the connection.
-    pub(super) fn waker(&self) -> WeakConnection {
-        WeakConnection(Arc::downgrade(&self.0))
+    /// Returns the task that serves the connection.
+    pub(super) fn serving_task(&self) -> ServingTask {
+        self.0.serving.clone()
     }
 
     /// Returns the guests of the connection.
     pub(super) fn known(&self) -> &Mutex<Vec<GuestEntry>> {
         &self.0.known
-    }
-}
-
-/// A weak handle of a connection.
-pub(super) struct WeakConnection(Weak<Inner>);
-
-impl WeakConnection {
-    /// Wakes the task that serves the connection.
-    pub(super) fn wake(&self) {
-        if let Some(connection) = self.0.upgrade() {
-            connection.serving.wake();
-        }
     }
 }
 

@@ -5,15 +5,14 @@ use std::sync::Arc;
 use tokio::sync::mpsc;
 use tonic::{Response, Status, Streaming};
 
-use super::client::{Guest, Place};
-use super::service::Responses;
-use super::tracking::{self, respond};
+use super::guest::{Guest, Place};
+use super::slot::{self, Responses, respond};
 
 /// Most queued responses. At the bound the source of further responses waits.
 const RESPONSES_MAX: usize = 16;
 
 /// The sender of responses, each with its room.
-pub(super) type Responder<T> = mpsc::Sender<tracking::TrackedResponse<T>>;
+pub(super) type Responder<T> = mpsc::Sender<slot::TrackedResponse<T>>;
 
 /// An exchange between a client and the hub.
 pub(super) trait Conversation: Send + Sized + 'static {

@@ -8,11 +8,11 @@ use futures_util::stream;
 use tokio::sync::watch;
 use tonic::Status;
 
-use super::client::{Guest, Place};
+use super::guest::{Guest, Place};
 use super::proto::watch_graph_response::Gone;
 use super::proto::{self, GetGraphResponse, WatchGraphResponse};
 use super::qos;
-use super::service::Responses;
+use super::slot::Responses;
 use crate::graph::{ActionInfo, EndpointInfo, Graph, NodeInfo, ServiceInfo, TopicInfo, is_hidden};
 
 /// Shortest time between two updates.

@@ -11,9 +11,9 @@ use bytes::Bytes;
 use sgc_sync::lock;
 use tonic::Status;
 
-use super::MESSAGE_BYTES_MAX;
-use super::client::Guest;
 use super::fault::Fault;
+use super::guest::Guest;
+use super::options::MESSAGE_BYTES_MAX;
 use crate::budget::{Budget, Room};
 use crate::error::GatewayError;
 

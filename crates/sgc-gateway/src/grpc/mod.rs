@@ -15,24 +15,18 @@ mod conversation;
 mod fault;
 mod get_type;
 mod graph;
+mod guest;
 mod incoming;
+mod options;
+pub mod proto;
 mod publish;
 mod qos;
 mod serve;
 mod service;
+mod serving_task;
+mod slot;
 mod subscribe;
 mod tracking;
-
-/// Code generated from `proto/sgc/gateway/v1/gateway.proto`, which documents it.
-pub mod proto {
-    #![allow(missing_docs, unreachable_pub, rustdoc::all, reason = "generated")]
-    #![allow(clippy::all, clippy::disallowed_types, reason = "generated")]
-
-    include!("generated/sgc.gateway.v1.rs");
-
-    /// The descriptor that reflection serves.
-    pub const DESCRIPTOR: &[u8] = include_bytes!("generated/descriptor.bin");
-}
 
 use std::fmt;
 use std::sync::Arc;
@@ -47,17 +41,15 @@ use tonic::transport::Server;
 
 pub use connection::{AcceptedStream, Connection};
 pub use fault::Fault;
+pub use options::{GrpcOptions, MESSAGE_BYTES_MAX};
 
 use crate::access_watch::AccessWatch;
 use crate::hub::Hub;
-use crate::session::SessionLimits;
 use client::Clients;
 use proto::gateway_server::GatewayServer;
 use service::Service;
 use tracking::Tracking;
 
-/// Longest gRPC message in either direction, in bytes. Images take 13 MB.
-pub const MESSAGE_BYTES_MAX: usize = 64 << 20;
 /// Most streams of a connection. It exceeds the sum of a session's bounds, so that a client at a bound gets an error
 /// instead of a stream that waits silently.
 pub const STREAMS_MAX: u32 = 2048;
@@ -78,28 +70,6 @@ const PING_INTERVAL: Duration = Duration::from_secs(20);
 const PING_WAIT: Duration = Duration::from_secs(20);
 /// Most streams that a client may open and reset before they are served. More are an attack (CVE-2023-44487).
 const RESETS_MAX: usize = 64;
-
-/// The options of the front end.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct GrpcOptions {
-    /// The limits of one credential on one connection.
-    pub session: SessionLimits,
-    /// Most bytes of long messages that are sent to a client and unread, over all its streams. Further messages wait.
-    pub unread_bytes_max: usize,
-    /// Most bytes of long messages that a client sends at a time, over all its streams, from the head of each until
-    /// it is handled. Streams that exceed it fail.
-    pub incoming_bytes_max: usize,
-}
-
-impl Default for GrpcOptions {
-    fn default() -> Self {
-        Self {
-            session: SessionLimits::default(),
-            unread_bytes_max: 4 * MESSAGE_BYTES_MAX,
-            incoming_bytes_max: 4 * MESSAGE_BYTES_MAX,
-        }
-    }
-}
 
 /// The front end. Clones share it. [`Grpc::stop`] or dropping the last clone ends all streams.
 #[derive(Clone)]
@@ -142,7 +112,7 @@ impl Grpc {
         // The status is set before the first request, which would otherwise be answered with NOT_FOUND.
         reporter.set_serving::<GatewayServer<Service>>().await;
         let mut stopping = self.stopping.subscribe();
-        self.clients.hub().shared.runtime.spawn(async move {
+        self.clients.hub().shared.network.runtime.spawn(async move {
             let _ = stopping.wait_for(|is_stopping| *is_stopping).await;
             reporter.set_not_serving::<GatewayServer<Service>>().await;
         });

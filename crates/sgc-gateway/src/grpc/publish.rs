@@ -7,8 +7,8 @@ use std::time::Duration;
 use futures_util::FutureExt as _;
 use tonic::{Status, Streaming};
 
-use super::client::{Guest, StreamKind};
 use super::fault::Fault;
+use super::guest::{Guest, StreamKind};
 use super::proto::publish_request::{Kind, Publisher};
 use super::proto::{PublishRequest, PublishResponse};
 use super::qos;

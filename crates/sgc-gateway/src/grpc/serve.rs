@@ -6,14 +6,14 @@ use std::sync::Arc;
 use sgc_ros::RequestId;
 use tonic::{Response, Status, Streaming};
 
-use super::client::{Guest, Place, StreamKind};
 use super::conversation::{Conversation, Responder, begin, first};
 use super::fault::Fault;
+use super::guest::{Guest, Place, StreamKind};
 use super::proto::serve_request::{Kind as Said, Reply, Server};
 use super::proto::serve_response::{Kind, Refused, Request, Served};
 use super::proto::{ServeRequest, ServeResponse};
 use super::qos;
-use super::service::Responses;
+use super::slot::Responses;
 use crate::content::{Content, Form};
 use crate::error::GatewayError;
 use crate::service::{Replier, Serving};

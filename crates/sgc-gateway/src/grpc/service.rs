@@ -1,15 +1,13 @@
 //! [`Service`]: the methods of `gateway.proto`, each passed to its module.
 
-use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio_stream::Stream;
 use tonic::metadata::MetadataMap;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::client::{Guest, StreamKind};
 use super::fault::Fault;
+use super::guest::{Guest, StreamKind};
 use super::proto::gateway_server::Gateway;
 use super::proto::{
     CallRequest, CallResponse, GetGraphRequest, GetGraphResponse, GetTypeRequest, GetTypeResponse,
@@ -17,7 +15,7 @@ use super::proto::{
     ServeActionResponse, ServeRequest, ServeResponse, SubscribeRequest, SubscribeResponse, WatchGraphRequest,
     WatchGraphResponse,
 };
-use super::tracking::{Slot, with_slot};
+use super::slot::{Responses, Slot, with_slot};
 use super::{action, get_type, graph, publish, qos, serve, subscribe};
 use crate::content::Content;
 
@@ -26,9 +24,6 @@ const CALL_WAIT_MAX: Duration = Duration::from_secs(3600);
 /// A call ends this long before the client's deadline, but at most a tenth of it, so that the client learns which
 /// server did not answer.
 const CALL_MARGIN_MAX: Duration = Duration::from_millis(100);
-
-/// A stream of responses to a client.
-pub(super) type Responses<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 /// The methods of the gateway. Each request has its guest among its extensions.
 #[derive(Clone, Debug, Default)]
@@ -62,9 +57,9 @@ impl Gateway for Service {
     async fn get_type(&self, request: Request<GetTypeRequest>) -> Result<Response<GetTypeResponse>, Status> {
         let guest = Guest::from_request(&request)?;
         let (asked, name) = (Arc::clone(&guest), request.into_inner().r#type);
-        let described = guest.session.hub().shared.run(move |shared| {
+        let described = guest.session.hub().shared.network.run(move |network| {
             asked.session.check_type(&name)?;
-            Ok(get_type::describe(&shared.types, &name))
+            Ok(get_type::describe(&network.types, &name))
         });
         let described = described.await;
         Ok(Response::new(described.map_err(Fault::from)??))

@@ -10,13 +10,12 @@ use sgc_ros::Guid;
 use tokio::sync::watch;
 use tonic::{Response, Status};
 
-use super::client::{Guest, Place, StreamKind};
 use super::fault::Fault;
+use super::guest::{Guest, Place, StreamKind};
 use super::proto::subscribe_response::{Kind, Message, Subscribed, Unreadable};
 use super::proto::{SubscribeRequest, SubscribeResponse};
 use super::qos;
-use super::service::Responses;
-use super::tracking::{Slot, with_slot};
+use super::slot::{Responses, Slot, with_slot};
 use crate::content::Form;
 use crate::error::GatewayError;
 use crate::feed::{Delivery, Subscription};

@@ -3,57 +3,21 @@
 
 use std::convert::Infallible;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 
 use bytes::Bytes;
-use sgc_sync::lock;
-use tokio::sync::mpsc;
-use tokio_stream::StreamExt as _;
-use tokio_stream::wrappers::ReceiverStream;
+use tonic::Status;
 use tonic::body::Body;
 use tonic::codegen::BoxFuture;
 use tonic::server::NamedService;
-use tonic::{Response, Status};
 
-use super::client::Guest;
+use super::guest::Guest;
 use super::incoming::{Incoming, KeptRooms};
 use super::proto::gateway_server::GatewayServer;
-use super::service::{Responses, Service};
+use super::service::Service;
+use super::slot::Slot;
 use crate::budget::Room;
-
-/// A slot in which a stream passes the room of its next message to the body.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Slot(Arc<Mutex<Option<Room>>>);
-
-impl Slot {
-    pub(super) fn put(&self, room: Option<Room>) {
-        *lock(&self.0) = room;
-    }
-}
-
-/// A response of a stream and its room.
-pub(super) type TrackedResponse<T> = (Result<T, Status>, Option<Room>);
-
-/// Creates a stream of responses, each with its room.
-pub(super) fn respond<T: Send + 'static>(told: mpsc::Receiver<TrackedResponse<T>>) -> Response<Responses<T>> {
-    let slot = Slot::default();
-    let next = slot.clone();
-    let responses: Responses<T> = Box::pin(ReceiverStream::new(told).map(move |(response, room)| {
-        if room.is_some() {
-            next.put(room);
-        }
-        response
-    }));
-    with_slot(responses, slot)
-}
-
-/// Creates a response whose messages take their room from `slot`.
-pub(super) fn with_slot<T>(message: T, slot: Slot) -> Response<T> {
-    let mut response = Response::new(message);
-    response.extensions_mut().insert(slot);
-    response
-}
 
 /// A service whose messages hold their room: incoming ones from their heads until they are handled, outgoing ones
 /// until the connection has written and dropped them.
@@ -127,7 +91,7 @@ impl http_body::Body for TrackedBody {
         cx: &mut Context<'_>,
     ) -> Poll<Option<Result<http_body::Frame<Bytes>, Status>>> {
         let frame = ready!(Pin::new(&mut self.body).poll_frame(cx));
-        let with_room = |bytes| match lock(&self.slot.0).take() {
+        let with_room = |bytes| match self.slot.take() {
             Some(_room) => Bytes::from_owner(BytesWithRoom { bytes, _room }),
             None => bytes,
         };

@@ -788,11 +788,11 @@ mod tests {
 
     use super::*;
     use crate::access::{Access, AccessRules, AdmissionRequest, Anonymous, Client};
-    use crate::budget::UNIT_BYTES;
     use crate::definitions::{ShippedDefinitions, Types};
     use crate::hub::{Hub, HubOptions};
     use crate::inflow::{Inflow, MeteredStream};
-    use crate::session::SessionLimits;
+    use crate::limits::SessionLimits;
+    use crate::quota::UNIT_BYTES;
 
     /// Returns a client of another host.
     fn remote_client() -> Client {
@@ -812,7 +812,7 @@ mod tests {
         let own = Arc::new(FakeDomain::default().join(false));
         let hub = Hub::start(own, Types::new(ShippedDefinitions), HubOptions::default()).await.unwrap();
         let client = remote_client();
-        let quota = hub.shared.quotas.quota(&client);
+        let quota = hub.shared.network.quotas.quota(&client);
         let units = |bytes: usize| u32::try_from(bytes / UNIT_BYTES).unwrap();
         let _other = quota.room_at_once(units(CREDENTIAL_BYTES - LEFT_BYTES)).unwrap();
         let piece = |number: usize| {
@@ -835,7 +835,7 @@ mod tests {
             assert!(begun.len() < 100, "nothing stops it");
         };
         let is_of_credential =
-            matches!(refused, GatewayError::Crowded { pool: crate::quota::Pool::Credential, .. });
+            matches!(refused, GatewayError::Crowded { pool: crate::pool::Pool::Credential, .. });
         assert!(is_of_credential, "{refused}");
         assert_eq!(begun.len(), LEFT_BYTES / PIECE_BYTES);
         // A complete message returns all its room.
@@ -870,7 +870,7 @@ mod tests {
         let began = Instant::now();
         page.send(Message::text(piece)).await.unwrap();
         let free = |hub: &Hub| {
-            let quota = hub.shared.quotas.quota(&client);
+            let quota = hub.shared.network.quotas.quota(&client);
             let mut held = Vec::new();
             while let Ok(room) = quota.room_at_once(1) {
                 held.push(room);

@@ -36,10 +36,8 @@ pub use options::{
     Authenticate, ROSBRIDGE_ADMISSION_MAX, ROSBRIDGE_CALL_MAX, ROSBRIDGE_MESSAGE_BYTES_MAX,
     ROSBRIDGE_SILENCE_MAX, RosbridgeError, RosbridgeOptions,
 };
-use outbox::{Outbox, Outgoing, PingState, write_all, write_rest};
+use outbox::{Outbox, Outgoing, PingState, ping_interval, write_all, write_rest};
 
-/// Shortest interval of pings.
-const PING_INTERVAL_MIN: Duration = Duration::from_millis(10);
 /// Most messages that are read before published messages are flushed and other events are handled.
 const TOGETHER_MAX: usize = 64;
 /// Time in which a client may receive the reason for the end of its connection.
@@ -172,11 +170,6 @@ async fn sleep_until(end: Option<Instant>) {
         Some(end) => tokio::time::sleep_until(end).await,
         None => std::future::pending().await,
     }
-}
-
-/// Returns the interval of pings and checks.
-fn ping_interval(silence_max: Duration) -> Duration {
-    (silence_max / 4).max(PING_INTERVAL_MIN)
 }
 
 /// Fails if a ping is unanswered for too long.

@@ -22,6 +22,8 @@ use crate::budget::{Budget, Room};
 use crate::error::GatewayError;
 use crate::quota::Quota;
 
+/// Shortest interval of pings.
+const PING_INTERVAL_MIN: Duration = Duration::from_millis(10);
 /// Most queued replies, requests and status frames.
 const CONTROL_MAX: usize = 64;
 /// Most queued batches of messages.
@@ -199,6 +201,11 @@ impl PingState {
     }
 }
 
+/// Returns the interval of pings and checks.
+pub(super) fn ping_interval(silence_max: Duration) -> Duration {
+    (silence_max / 4).max(PING_INTERVAL_MIN)
+}
+
 /// Writes frames until the connection ends.
 pub(super) async fn write_all<W>(
     sink: &mut W,
@@ -209,7 +216,7 @@ pub(super) async fn write_all<W>(
 where
     W: Sink<Message, Error = WebSocketError> + Unpin,
 {
-    let mut pings = tokio::time::interval(super::ping_interval(silence_max));
+    let mut pings = tokio::time::interval(ping_interval(silence_max));
     pings.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     pings.reset();
     loop {

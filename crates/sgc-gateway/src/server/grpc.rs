@@ -16,7 +16,7 @@ use super::stream::ByteStream;
 use crate::admission::{Admission, Arrival, Handshake, Place};
 use crate::grpc::{AcceptedStream, Connection, Grpc, GrpcOptions};
 use crate::hub::Hub;
-use crate::session::SessionLimits;
+use crate::limits::SessionLimits;
 
 /// Time to deliver the last answers on a gRPC connection on which no client is admitted any more.
 const GRPC_FAREWELL_MAX: Duration = Duration::from_secs(2);

@@ -12,9 +12,10 @@ use crate::admission::{Admission, Arrival, Handshake};
 use crate::foxglove::{self, FoxgloveError};
 use crate::hub::Hub;
 use crate::inflow::{Inflow, MeteredStream};
+use crate::limits::SessionLimits;
 #[cfg(feature = "rosbridge")]
 use crate::rosbridge::{self, Authenticate, RosbridgeError, RosbridgeOptions};
-use crate::session::{Session, SessionLimits};
+use crate::session::Session;
 use crate::ws::{Subprotocols, Upgrade, UpgradeError, upgrade};
 
 /// The subprotocols of this build. Without one, a client speaks the rosbridge protocol.

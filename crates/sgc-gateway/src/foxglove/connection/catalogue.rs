@@ -91,13 +91,13 @@ impl Connection<'_> {
             return is_all;
         }
         let hub = self.session.hub();
-        let described = hub.shared.run(move |shared| {
+        let described = hub.shared.network.run(move |network| {
             let topics = topics.into_iter().map(|(name, offer)| {
-                let schema = schema(&shared.types, &offer.type_name, offer.hash.as_deref());
+                let schema = schema(&network.types, &offer.type_name, offer.hash.as_deref());
                 (name, offer, schema)
             });
             let services = services.into_iter().map(|(name, offer)| {
-                let half = |half: &str| schema(&shared.types, &format!("{}_{half}", offer.type_name), None);
+                let half = |half: &str| schema(&network.types, &format!("{}_{half}", offer.type_name), None);
                 let schemas =
                     half("Request").and_then(|request| Ok(Halves { request, response: half("Response")? }));
                 (name, offer, schemas)
