@@ -9,35 +9,37 @@
 //! frames only. The normative text is `docs/spec/trust.md` and `docs/spec/routing.md`.
 #![forbid(unsafe_code)]
 
-mod advert_pace;
 mod calls;
 mod compression;
-mod consumers;
+mod config;
+mod context;
 mod endpoint;
 mod history;
 mod joiner;
 mod joins;
 mod marks;
+mod names;
+mod output;
 mod owner;
+mod packed_type;
 mod parking;
 mod partial;
-mod shares;
 mod sink;
 mod source;
-mod type_exchange;
 
-pub use advert_pace::{ADVERT_INTERVAL, ADVERTS_BURST};
 pub use calls::{
     ANSWER_KEPT_BYTES_MAX, ASK_AFTER, ASK_EVERY_MAX, Answerer, Answering, CallLimits, CallLoss, CallRefusal,
     CallStats, Caller, LostCall, Outcome,
 };
 pub use compression::{COMPRESS_BYTES_MIN, CompressionError, Compressor, Decompressor};
-pub use endpoint::{Endpoint, EndpointConfig, EndpointDrop, Event, Limits, Output};
+pub use config::{EndpointConfig, Limits};
+pub use endpoint::Endpoint;
 pub use history::{RECOVERY_BYTES_MAX, RECOVERY_MESSAGES_MAX, RecoveryLimits};
 pub use joins::{JoinKind, JoinStatus, LostReason, RefusedBy};
 pub use marks::{MARK_AFTER, Marks};
+pub use output::{EndpointDrop, Event, Output, SignedKind, UnexpectedFrame};
+pub use owner::{ADVERT_INTERVAL, ADVERTS_BURST, ShareError, ShareSpec};
+pub use packed_type::{PackedType, unpack_type};
 pub use parking::{PARKED_BYTES_MAX, PARKED_LOOKS_MAX, PARKED_PACKETS_MAX};
-pub use shares::{ShareError, ShareSpec};
 pub use sink::{AskAgain, Delivery, EPOCHS_MAX, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
 pub use source::{FRAGMENT_BYTES, PublishError, SOURCE_MESSAGES_MAX, Source, SourceConfig, SourceProgress};
-pub use type_exchange::{PackedType, unpack_type};

@@ -6,7 +6,7 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
     ADVERT_INTERVAL, ADVERTS_BURST, Endpoint, EndpointConfig, EndpointDrop, Event, JoinKind, JoinStatus,
-    Limits, LostReason, Output, ShareError, ShareSpec,
+    Limits, LostReason, Output, ShareError, ShareSpec, SignedKind,
 };
 use sgc_testkit::{Clock, Member, identity};
 use sgc_trust::{Grantees, Identity, Policy, ReplyKey, Suite, seal_grant};
@@ -228,7 +228,7 @@ fn a_joiner_whose_fleet_is_unknown_is_refused_and_told_why() {
     bench.frame(frame);
     assert_eq!(bench.answers(), [(SinkId([1; 16]), Some(RefuseReason::NotVerified))]);
     assert!(
-        matches!(bench.dropped[..], [EndpointDrop::NotVerified { what: "join", .. }]),
+        matches!(bench.dropped[..], [EndpointDrop::NotVerified { what: SignedKind::Join, .. }]),
         "{:?}",
         bench.dropped
     );
@@ -436,7 +436,7 @@ fn an_answer_that_the_owner_did_not_sign_or_seal_changes_nothing() {
     let other = identity(&Member::new("mallory"));
     bench.frame(grant(&other, name, sink, &reply_key, 2, 8));
     assert!(
-        matches!(bench.dropped[..], [EndpointDrop::NotVerified { what: "answer", .. }]),
+        matches!(bench.dropped[..], [EndpointDrop::NotVerified { what: SignedKind::Answer, .. }]),
         "{:?}",
         bench.dropped
     );

@@ -1,0 +1,47 @@
+//! The names at which a node is asked, apart from those of its shares.
+
+use sgc_trust::{
+    Identity, TopicSecret, consumers_blind, name_of, operations_blind, renewal_blind, types_blind,
+};
+use sgc_wire::{Blind, Metadata, Name, NodeId};
+
+/// A name, with the blind that its owner advertises.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct BlindName {
+    pub(crate) name: Name,
+    pub(crate) blind: Blind,
+}
+
+impl BlindName {
+    fn new(owner: &NodeId, blind: Blind) -> Self {
+        Self { name: name_of(owner, &blind), blind }
+    }
+
+    /// Returns the name at which an owner is asked for its types.
+    pub(crate) fn types(owner: &NodeId) -> Self {
+        Self::new(owner, types_blind(owner))
+    }
+
+    /// Returns the name at which `node` is asked for its consumers.
+    pub(crate) fn consumers(node: &NodeId) -> Self {
+        Self::new(node, consumers_blind(node))
+    }
+
+    /// Returns the name at which members of `identity`'s fleet ask `authority` for credentials.
+    pub(crate) fn renewal(authority: &NodeId, identity: &Identity) -> Self {
+        Self::new(authority, renewal_blind(&identity.as_peer().ca))
+    }
+
+    /// Returns the name at which operators of `identity`'s fleet ask `authority` for operations.
+    pub(crate) fn operations(authority: &NodeId, identity: &Identity) -> Self {
+        Self::new(authority, operations_blind(&identity.as_peer().ca))
+    }
+
+    /// Returns the names of an owner's catalogue: one for each secret of `identity`, the newest first.
+    pub(crate) fn catalogues(identity: &Identity, owner: &NodeId, owner_name: &str) -> Vec<Self> {
+        let metadata = Metadata::catalogue(owner_name);
+        let secrets = identity.naming_secrets().iter();
+        let blinds = secrets.map(|s| TopicSecret::derive(&s.secret, &metadata).blind());
+        blinds.map(|blind| Self::new(owner, blind)).collect()
+    }
+}

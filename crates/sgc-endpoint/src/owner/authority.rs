@@ -1,0 +1,144 @@
+//! [`AuthorityRequests`]: requests of this fleet's nodes to their authority, for credentials or for an operation. The
+//! authority answers later; each node has one place.
+
+use std::collections::BTreeMap;
+
+use bytes::Bytes;
+use sgc_trust::VerifiedPeer;
+use sgc_wire::{Blind, GrantContent, Name, RefuseReason, Request, SinkId};
+
+use super::granted::{GrantedSink, is_older};
+use crate::context::Context;
+use crate::names::BlindName;
+use crate::output::UnexpectedFrame;
+
+/// The requests at one name of the authority.
+#[derive(Debug)]
+pub(crate) struct AuthorityRequests {
+    /// `None` if this node does not take such requests, or takes no more.
+    name: Option<BlindName>,
+    asked: BTreeMap<SinkId, GrantedSink>,
+    /// Most nodes that have a place.
+    max: usize,
+}
+
+/// A new request, for the authority.
+pub(crate) struct AuthorityRequest {
+    pub(crate) peer: VerifiedPeer,
+    /// The signing request or the operation, not verified.
+    pub(crate) what: Bytes,
+}
+
+impl AuthorityRequests {
+    pub(crate) fn new(name: Option<BlindName>, max: usize) -> Self {
+        Self { name, asked: BTreeMap::new(), max }
+    }
+
+    /// Returns the blind of the name.
+    pub(crate) fn blind(&self) -> Option<Blind> {
+        self.name.map(|name| name.blind)
+    }
+
+    /// Returns `true` if `name` is that of these requests.
+    pub(crate) fn is_at(&self, name: &Name) -> bool {
+        self.name.is_some_and(|own| own.name == *name)
+    }
+
+    /// Takes no more requests. Returns the blind to withdraw.
+    pub(crate) fn end(&mut self) -> Option<Blind> {
+        self.name.take().map(|name| name.blind)
+    }
+
+    /// Iterates over the nodes that ask: sink, node, and request.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer, &Bytes)> {
+        self.asked.iter().filter_map(|(sink, asked)| match &asked.request {
+            Request::Ask { what } => Some((*sink, &asked.peer, what)),
+            Request::Subscribe { .. } | Request::Publish { .. } => None,
+        })
+    }
+
+    /// Takes a request. Returns it if it has a place.
+    pub(crate) fn handle_request(
+        &mut self,
+        cx: &mut Context,
+        name: Name,
+        sink: SinkId,
+        asked: GrantedSink,
+    ) -> Option<AuthorityRequest> {
+        let Request::Ask { what } = asked.request.clone() else {
+            cx.refuse(name, sink, 1, RefuseReason::RoleNotOffered);
+            return None;
+        };
+        let peer = asked.peer.clone();
+        let is_of_another = self.asked.get(&sink).is_some_and(|known| known.peer.node_id != peer.node_id);
+        if !cx.is_own_fleet(&peer) || is_of_another {
+            cx.refuse(name, sink, 1, RefuseReason::NotPermitted);
+            return None;
+        }
+        let Ok(older) = self.take_older(sink, &asked) else {
+            cx.unexpected(UnexpectedFrame::OlderRequest);
+            return None;
+        };
+        if let Some((older, granted)) = older {
+            granted.refuse(cx, name, older, RefuseReason::Limit);
+        }
+        if self.asked.len() >= self.max {
+            cx.refuse(name, sink, 1, RefuseReason::Limit);
+            return None;
+        }
+        let serial = self.asked.get(&sink).map_or(0, |s| s.serial);
+        self.asked.insert(sink, GrantedSink { serial, ..asked });
+        Some(AuthorityRequest { peer, what })
+    }
+
+    pub(crate) fn handle_leave(&mut self, sink: SinkId) {
+        self.asked.remove(&sink);
+    }
+
+    /// Answers a request, once or again after a change.
+    pub(crate) fn answer(
+        &mut self,
+        cx: &mut Context,
+        sink: SinkId,
+        answer: Result<GrantContent, RefuseReason>,
+    ) {
+        let Some(BlindName { name, .. }) = self.name else { return };
+        let Some(mut asked) = self.asked.remove(&sink) else { return };
+        match answer {
+            Ok(content) => {
+                if asked.grant(cx, name, sink, &content) {
+                    self.asked.insert(sink, asked);
+                }
+            }
+            Err(reason) => asked.refuse(cx, name, sink, reason),
+        }
+    }
+
+    /// Refuses nodes that lost their certificate.
+    pub(crate) fn enforce(&mut self, cx: &mut Context) {
+        let lost = |(sink, asked): (&SinkId, &GrantedSink)| Some((*sink, cx.standing(&asked.peer)?));
+        for (sink, reason) in self.asked.iter().filter_map(lost).collect::<Vec<_>>() {
+            self.answer(cx, sink, Err(reason));
+        }
+    }
+
+    /// Gives the one place of a node to a request: the newer one is of the newer run, or of a newer certificate.
+    /// Removes and returns the request that had the place; an error if that one was signed later, so that this one is
+    /// a replay.
+    fn take_older(
+        &mut self,
+        sink: SinkId,
+        asked: &GrantedSink,
+    ) -> Result<Option<(SinkId, GrantedSink)>, OlderRequest> {
+        let other = self.asked.iter().find(|(id, s)| **id != sink && s.peer.node_id == asked.peer.node_id);
+        let known = other.map(|(_, other)| other).or_else(|| self.asked.get(&sink));
+        if known.is_some_and(|known| is_older(asked, known)) {
+            return Err(OlderRequest);
+        }
+        let other = other.map(|(id, _)| *id);
+        Ok(other.and_then(|id| self.asked.remove_entry(&id)))
+    }
+}
+
+/// A request that was signed before the known one of its node.
+struct OlderRequest;
