@@ -8,9 +8,9 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use sgc_endpoint::{LostReason, RefusedBy};
 use sgc_ros::{
-    Command, Direction, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, GraphNode, Guid, Naming, Problem,
-    QosOverride, REDISCOVERY_HOLD, ROUTES_PER_WILDCARD_MAX, Rename, Routes, SINKLESS_HOLD, Shaping,
-    ShareRule, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
+    Command, Direction, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, GraphNode, Guid, LocalEnd, Naming,
+    OwnerState, Problem, QosOverride, REDISCOVERY_HOLD, ROUTES_PER_WILDCARD_MAX, Rename, RouteState, Routes,
+    SINKLESS_HOLD, Shaping, ShareRule, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
 };
 use sgc_trust::{FleetSecret, Policy, Suite, TopicSecret, derive_name};
 use sgc_wire::{
@@ -364,7 +364,9 @@ fn definitions_that_differ_are_named_by_their_hashes() {
         type_hash: Some("RIHS01_aa".into()),
         ..entry("/a", STRING, Qos::default(), &[])
     }]);
-    for (n, kind, end) in [(1, EndpointKind::Reader, "subscriber"), (2, EndpointKind::Writer, "publisher")] {
+    for (n, kind, end) in
+        [(1, EndpointKind::Reader, LocalEnd::Subscriber), (2, EndpointKind::Writer, LocalEnd::Publisher)]
+    {
         for hash in ["", "RIHS01_aa"] {
             let same = with_hash(hash, endpoint(n, kind, "/a", STRING, Qos::default()));
             assert_eq!(problems(&b.appears(same)), []);
@@ -669,20 +671,21 @@ fn an_owner_that_stops_takes_its_topics_along() {
     b.commands();
     b.routes.handle_owner_lost(OWNER, LostReason::Withdrawn);
     assert_eq!(b.commands(), [Command::CloseWriter { name, source: None }, Command::Leave { name }]);
-    assert!(b.routes.status()[0].state.contains("has gone"), "{:?}", b.routes.status());
+    assert_eq!(b.routes.status()[0].state, RouteState::Owner(OwnerState::Gone));
 }
 
 #[test]
 fn status_says_what_each_rule_waits_for() {
     let mut b = bench(&[("/a", "")], &[("/b", None)]);
     let states = |b: &Bench| b.routes.status().into_iter().map(|s| s.state).collect::<Vec<_>>();
-    assert_eq!(states(&b), ["waits for a local publisher", "owner does not share it with this node (yet)"]);
+    assert_eq!(states(&b), [RouteState::AwaitsLocal, RouteState::NotListed { is_pattern: false }]);
     b.appears(writer(1, "/a", Qos::default()));
     b.catalogue(vec![entry("/b", STRING, Qos::default(), &[])]);
-    assert_eq!(states(&b)[1], "waits for the owner's grant");
-    b.routes.handle_refused(&theirs("/b", STRING), RefusedBy::Owner(RefuseReason::NotPermitted));
-    assert_eq!(states(&b)[1], "refused: the owner does not share it with this node");
-    assert!(states(&b)[0].contains("1 local publishers, 0 remote subscribers"), "{:?}", states(&b));
+    assert_eq!(states(&b)[1], RouteState::AwaitsGrant);
+    let by = RefusedBy::Owner(RefuseReason::NotPermitted);
+    b.routes.handle_refused(&theirs("/b", STRING), by);
+    assert_eq!(states(&b)[1], RouteState::Refused(by));
+    assert_eq!(states(&b)[0], RouteState::Shared { publishers: 1, subscribers: 0, is_read: false });
 }
 
 #[test]
@@ -703,7 +706,7 @@ fn unchanged_rules_change_no_route() {
     uses.reverse();
     assert_eq!(b.reconfigured(shares, uses), []);
     let mut after = b.routes.status();
-    after.sort_by_key(|s| (s.direction, s.topic.clone()));
+    after.sort_by_key(|s| (s.kind.key(), s.topic.clone()));
     assert_eq!(after, before);
     // Each route still belongs to its rule, so removing one rule ends only its routes.
     let gone = b.reconfigured(vec![share("/b", STRING)], vec![token("/d")]);
@@ -823,9 +826,9 @@ fn a_token_is_joined_without_a_catalogue_and_written_once_it_is_described() {
     let name = theirs("/a", STRING);
     let mut b = bench_of(vec![], vec![token("/a")]);
     assert_eq!(b.commands(), [Command::Join { name, owner: OWNER, transient_local: false, describe: true }]);
-    assert_eq!(b.routes.status()[0].state, "waits for the owner's grant");
+    assert_eq!(b.routes.status()[0].state, RouteState::AwaitsGrant);
     b.routes.handle_refused(&name, RefusedBy::Owner(RefuseReason::NotPermitted));
-    assert!(b.routes.status()[0].state.starts_with("refused"), "{:?}", b.routes.status());
+    assert!(matches!(b.routes.status()[0].state, RouteState::Refused(_)), "{:?}", b.routes.status());
     // A catalogue of the same owner does not affect the token.
     assert_eq!(b.catalogue(vec![entry("/a", STRING, Qos::default(), &[])]), []);
     let granted = b.granted(name, Some(entry("/a", STRING, Qos::default(), &[])));

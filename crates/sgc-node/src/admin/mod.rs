@@ -6,6 +6,7 @@
 //! which has the description of the type, if the node knows it. Other modules carry out the requests.
 
 pub mod graph;
+pub(crate) mod route_words;
 pub mod shell;
 mod socket;
 pub(crate) mod status;

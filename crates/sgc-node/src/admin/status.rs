@@ -8,6 +8,7 @@ use sgc_gateway::GatewayStatus;
 use sgc_ros::RouteStatus;
 use sgc_wire::Name;
 
+use super::route_words::route_state;
 use crate::control::alerts::Alert;
 use crate::data::stats::NameStats;
 use crate::discovery::board::RouterStatus;
@@ -114,18 +115,19 @@ pub struct RouteLine {
 impl RouteLine {
     pub(crate) fn new(
         route: RouteStatus,
+        calls: Option<String>,
         messages: Option<u64>,
         signatures: u64,
         compressed: Option<(u64, u64)>,
     ) -> Self {
         Self {
             compressed,
-            direction: route.direction,
+            state: route_state(&route) + &calls.unwrap_or_default(),
+            direction: route.kind.key(),
             topic: route.topic,
             type_name: route.type_name,
             name: route.name.map(|n| n.to_string()),
             owner: route.owner,
-            state: route.state,
             messages: messages.unwrap_or(0),
             signatures,
         }

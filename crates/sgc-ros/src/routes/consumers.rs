@@ -8,8 +8,10 @@ use sgc_wire::{
     CONSUMERS_MAX, CONSUMERS_PER_INTERFACE_MAX, Consumer, History, Kind, Name, NodeId, Qos, Role,
 };
 
+use super::machine::Routes;
+use super::rules::Direction;
 use super::services::service_spec;
-use super::{Direction, Routes, UseRoute};
+use super::use_route::UseRoute;
 use crate::names::{ServiceTopic, dds_topic, dds_type, ros_type};
 use crate::network::{EndpointKind, EndpointSpec};
 
@@ -57,7 +59,7 @@ impl<R: RngCore> Routes<R> {
             return consumers;
         }
         let mut of_interface = BTreeMap::<Name, usize>::new();
-        for endpoint in self.endpoints.values() {
+        for endpoint in self.local.endpoints() {
             let (Some(ends), Some(node)) = (used.get(&endpoint.topic), self.node_of(&endpoint.guid)) else {
                 continue;
             };

@@ -1,17 +1,7 @@
-//! Naming: selects the rule for an interface, and its name on the other side.
-//!
-//! A rule names one interface, or matches several with `*` and `**`. This module also resolves conflicts: an
-//! interface that wildcards would both share and bring is carried one way only, and nothing is brought under a name
-//! that ROS 2 does not allow.
+//! Naming: the interfaces that a rule names or matches with `*` and `**`, and their names on the other side.
 
-use sgc_wire::{CatalogueEntry, Kind, Metadata, NodeId};
-
-use super::{Direction, Problem, Routes, ShareRule, UseRule};
 use crate::interface::Part;
-use crate::names::is_topic_name;
 
-/// Most interfaces that one wildcard rule shares or brings.
-pub const ROUTES_PER_WILDCARD_MAX: usize = 512;
 /// Names that `namespace` does not change, because programs look for exactly these for all robots together (tf2's
 /// listeners; rqt_console). `/clock` is not among them, because two clocks would make time jump.
 pub const GLOBAL_TOPICS: [&str; 3] = ["/tf", "/tf_static", "/rosout"];
@@ -70,7 +60,7 @@ impl Naming {
     }
 
     /// Returns `true` if a rule for `topic` covers `name`.
-    fn covers(&self, topic: &str, name: &str) -> bool {
+    pub(super) fn covers(&self, topic: &str, name: &str) -> bool {
         match is_pattern(topic) {
             true => matches(topic, name) && !self.except.iter().any(|pattern| matches(pattern, name)),
             false => topic == name,
@@ -118,126 +108,6 @@ pub fn matches(pattern: &str, name: &str) -> bool {
 /// hides, such as the parts of actions (`/_action/`).
 pub fn is_for_wildcards(name: &str) -> bool {
     !LITERAL_TOPICS.contains(&name) && !name.split('/').any(|word| word.starts_with('_'))
-}
-
-impl ShareRule {
-    /// Returns `true` if the rule covers the local interface with this name.
-    pub(super) fn covers(&self, kind: Kind, local_name: &str) -> bool {
-        self.metadata.kind == kind && self.naming.shares(&self.metadata.ros_name, local_name)
-    }
-
-    /// Returns the metadata under which an interface is shared.
-    pub fn metadata_of(&self, local_name: &str, type_name: &str) -> Metadata {
-        let ros_name = self.naming.renamed(&self.metadata.ros_name, local_name);
-        Metadata { ros_name, type_name: type_name.to_owned(), ..self.metadata.clone() }
-    }
-
-    /// Returns `true` if the rule may share several interfaces.
-    pub fn is_pattern(&self) -> bool {
-        is_pattern(&self.metadata.ros_name)
-    }
-}
-
-impl UseRule {
-    /// Returns `true` if the rule asks for this entry of the owner's catalogue.
-    pub(super) fn covers(&self, owner: &NodeId, entry: &CatalogueEntry) -> bool {
-        let may = match self.direction {
-            Direction::Bring => entry.subscribe,
-            Direction::Publish => entry.publish,
-        };
-        let Metadata { kind, ros_name, type_name, .. } = &entry.metadata;
-        let is_of_type = || self.type_name.as_ref().is_none_or(|wanted| wanted == type_name);
-        may && self.is_of_catalogue(owner)
-            && self.kind == *kind
-            && self.naming.covers(&self.topic, ros_name)
-            && (!self.is_pattern() || is_of_type())
-    }
-
-    /// Returns the name on the local network.
-    pub fn local_name(&self, metadata: &Metadata) -> String {
-        self.naming.renamed(&self.topic, &metadata.ros_name)
-    }
-
-    /// Returns `true` if the rule may use several interfaces.
-    pub fn is_pattern(&self) -> bool {
-        is_pattern(&self.topic)
-    }
-
-    /// Returns `true` if the rule reserves exactly this local name, whatever the owner lists.
-    fn claims(&self, kind: Kind, local_name: &str) -> bool {
-        self.kind == kind && !self.is_pattern() && self.naming.renamed(&self.topic, &self.topic) == local_name
-    }
-}
-
-impl<R> Routes<R> {
-    /// Returns the rule that shares a local interface: the first that names it, else the first wildcard that covers
-    /// it. Where the type is known, wildcard rules for other types are skipped.
-    pub(super) fn share_rule(&self, kind: Kind, local_name: &str, type_name: Option<&str>) -> Option<usize> {
-        let literal = |rule: &ShareRule| !rule.is_pattern() && rule.covers(kind, local_name);
-        let named = self.share_rules.iter().position(literal);
-        named.or_else(|| {
-            let index = self.wildcard_share(kind, local_name, type_name)?;
-            self.used_as(kind, local_name).is_none().then_some(index)
-        })
-    }
-
-    fn wildcard_share(&self, kind: Kind, local_name: &str, type_name: Option<&str>) -> Option<usize> {
-        let is_of_type = |rule: &ShareRule| {
-            let wanted = rule.metadata.type_name.as_str();
-            wanted.is_empty() || type_name.is_none_or(|found| found == wanted)
-        };
-        let covers =
-            |rule: &ShareRule| rule.is_pattern() && rule.covers(kind, local_name) && is_of_type(rule);
-        self.share_rules.iter().position(covers)
-    }
-
-    /// Returns the rule for an owner's entry: the first that names it, else the first wildcard that covers it.
-    pub(super) fn use_rule(&self, owner: &NodeId, entry: &CatalogueEntry) -> Option<usize> {
-        let find = |pattern| {
-            let asks = |rule: &UseRule| rule.is_pattern() == pattern && rule.covers(owner, entry);
-            self.use_rules.iter().position(asks)
-        };
-        find(false).or_else(|| find(true))
-    }
-
-    /// Returns the owner whose interface has this local name, by a rule that names it or a running route.
-    fn used_as(&self, kind: Kind, local_name: &str) -> Option<&str> {
-        let named = self.use_rules.iter().find(|rule| rule.claims(kind, local_name));
-        let running = || {
-            let has = |metadata: &Metadata, name: &str| metadata.kind == kind && name == local_name;
-            let route = self.uses.values().find(|u| has(&u.entry.metadata, &u.local_name))?;
-            Some(&self.use_rules[route.rule])
-        };
-        named.or_else(running).map(|rule| rule.owner_name.as_str())
-    }
-
-    /// Returns `true` if this local name is shared by a rule that names it or by a running route.
-    fn is_shared_as(&self, kind: Kind, local_name: &str) -> bool {
-        let literal = |rule: &ShareRule| !rule.is_pattern() && rule.covers(kind, local_name);
-        let running = || kind == Kind::Topic && self.shares.values().any(|s| s.local_name == local_name);
-        self.share_rules.iter().any(literal) || running()
-    }
-
-    /// Returns the problem if a local interface that a wildcard covers is not shared because the name is used.
-    pub(super) fn why_not_shared(&self, kind: Kind, local_name: &str, type_name: &str) -> Option<Problem> {
-        self.wildcard_share(kind, local_name, Some(type_name))?;
-        let owner = self.used_as(kind, local_name)?.to_owned();
-        Some(Problem::UsedNotShared { topic: local_name.to_owned(), owner })
-    }
-
-    /// Returns the problem that keeps an owner's entry from having its local name. Rules that name it were checked
-    /// before.
-    pub(super) fn why_not_used(&self, rule: usize, metadata: &Metadata) -> Option<Problem> {
-        let rule = &self.use_rules[rule];
-        if !rule.is_pattern() {
-            return None;
-        }
-        let (topic, owner) = (rule.local_name(metadata), rule.owner_name.clone());
-        if !is_topic_name(&metadata.ros_name) || !is_topic_name(&topic) {
-            return Some(Problem::NoName { topic, owner });
-        }
-        self.is_shared_as(metadata.kind, &topic).then_some(Problem::SharedNotUsed { topic, owner })
-    }
 }
 
 #[cfg(test)]

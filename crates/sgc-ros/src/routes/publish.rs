@@ -6,7 +6,11 @@
 use rand_core::RngCore;
 use sgc_wire::{History, Metadata, Name, Qos};
 
-use super::{Cause, Command, Direction, Routes, Shaping, asks_key_hash, same_reader};
+use super::command::Command;
+use super::machine::Routes;
+use super::problem::Cause;
+use super::readers::{asks_key_hash, same_reader};
+use super::rules::{Direction, Shaping, ShareRuleId, UseRuleId};
 use crate::names::{dds_topic, dds_type, ros_topic, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec};
 use crate::qos::{reader_for, weakest};
@@ -46,7 +50,7 @@ impl<R: RngCore> Routes<R> {
     /// Begins the shares that exist for messages of others. Their rules must give the type, because no local
     /// publisher shows it.
     pub(super) fn begin_inbound(&mut self) {
-        for rule in 0..self.share_rules.len() {
+        for rule in self.share_rules.with_ids().map(|(rule, _)| rule).collect::<Vec<ShareRuleId>>() {
             let share = &self.share_rules[rule];
             let Metadata { type_name, ros_name, .. } = &share.metadata;
             let known = self.shares.values().any(|s| s.rule == rule && ros_type(&s.type_name) == *type_name);
@@ -101,14 +105,14 @@ impl<R: RngCore> Routes<R> {
 
     /// Adds the existing local writers to routes that have just begun.
     pub(super) fn find_publishers(&mut self) {
-        for endpoint in self.endpoints.values().cloned().collect::<Vec<_>>() {
+        for endpoint in self.local.endpoints().cloned().collect::<Vec<_>>() {
             if endpoint.kind == EndpointKind::Writer {
                 self.publisher_there(&endpoint);
             }
         }
     }
 
-    pub(super) fn publishes(&self, rule: usize) -> bool {
+    pub(super) fn publishes(&self, rule: UseRuleId) -> bool {
         self.use_rules[rule].direction == Direction::Publish
     }
 

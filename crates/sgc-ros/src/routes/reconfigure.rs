@@ -8,7 +8,10 @@ use std::time::Instant;
 use rand_core::RngCore;
 use sgc_wire::{Name, NodeId};
 
-use super::{Cause, Command, Direction, Routes, ShareRule, UseRule};
+use super::command::Command;
+use super::machine::Routes;
+use super::problem::Cause;
+use super::rules::{Direction, Rules, ShareRule, ShareRules, UseRule, UseRuleId, UseRules};
 use crate::names::ros_type;
 use crate::network::{DiscoveredEndpoint, EndpointKind, Guid};
 
@@ -18,14 +21,14 @@ impl<R: RngCore> Routes<R> {
     /// A route continues under the rule that now covers its interface, unless that rule demands a different route.
     pub fn reconfigure(&mut self, now: Instant, shares: Vec<ShareRule>, uses: Vec<UseRule>) {
         // Uses are judged by the new shares, and shares then by the new uses.
-        let old = std::mem::replace(&mut self.share_rules, shares);
+        let old = std::mem::replace(&mut self.share_rules, Rules::new(shares));
         self.reconfigure_uses(uses);
         self.reconfigure_shares(now, &old);
         self.check_later();
         self.handle_timeout(now);
     }
 
-    fn reconfigure_shares(&mut self, now: Instant, old: &[ShareRule]) {
+    fn reconfigure_shares(&mut self, now: Instant, old: &ShareRules) {
         let (mut gone, mut kept) = (Vec::new(), Vec::new());
         for (name, route) in &self.shares {
             let before = &old[route.rule];
@@ -63,7 +66,7 @@ impl<R: RngCore> Routes<R> {
         // Existing publishers are offered to new shares. Those of a kept share are in it already.
         let shared: BTreeSet<Guid> = self.shares.values().flat_map(|s| s.writers.keys().copied()).collect();
         let is_new = |e: &&DiscoveredEndpoint| e.kind == EndpointKind::Writer && !shared.contains(&e.guid);
-        for writer in self.endpoints.values().filter(is_new).cloned().collect::<Vec<_>>() {
+        for writer in self.local.endpoints().filter(is_new).cloned().collect::<Vec<_>>() {
             if !self.service_end_there(&writer) {
                 self.writer_there(writer);
             }
@@ -71,80 +74,90 @@ impl<R: RngCore> Routes<R> {
     }
 
     fn reconfigure_uses(&mut self, rules: Vec<UseRule>) {
-        let old = std::mem::replace(&mut self.use_rules, rules);
-        let (mut gone, mut kept) = (Vec::new(), Vec::new());
+        let old = std::mem::replace(&mut self.use_rules, Rules::new(rules));
         let joined = self.uses.iter().map(|(name, route)| (*name, route.rule));
         let tokens = self.tokens.iter().map(|(name, token)| (*name, token.rule));
-        let places: BTreeMap<Name, usize> = joined.chain(tokens).collect();
-        for (name, index) in places {
-            let route = self.uses.get(&name);
-            let place = match route.filter(|_| old[index].token.is_none()) {
-                Some(route) => self
-                    .use_rule(&old[index].owner, &route.entry)
-                    .filter(|place| self.why_not_used(*place, &route.entry.metadata).is_none()),
-                None => self.use_rules.iter().position(|r| r.is_same_place(&old[index])),
-            };
-            let fits = |rule: &UseRule| {
-                let (same_way, wanted) = (rule.direction == old[index].direction, rule.type_name.as_ref());
-                same_way
-                    && route.is_none_or(|route| {
-                        let metadata = &route.entry.metadata;
-                        wanted.is_none_or(|wanted| *wanted == metadata.type_name)
-                            && rule.local_name(metadata) == route.local_name
-                    })
-            };
-            // Publishing in another class begins anew.
-            let same_class =
-                |rule: &UseRule| rule.direction == Direction::Bring || rule.class == old[index].class;
-            let stays = |place: &usize| fits(&self.use_rules[*place]) && same_class(&self.use_rules[*place]);
-            match place.filter(stays) {
-                Some(place) => kept.push((name, place, index)),
-                None => gone.push(name),
-            }
-        }
-        for name in gone {
+        let places: BTreeMap<Name, UseRuleId> = joined.chain(tokens).collect();
+        let places =
+            places.into_iter().map(|(name, before)| (name, before, self.place_of(&name, &old[before])));
+        let (kept, gone): (Vec<_>, Vec<_>) = places.partition(|(_, _, place)| place.is_some());
+        for (name, _, _) in gone {
             self.drop_use(name);
         }
-        for (name, place, before) in kept {
-            let UseRule { shaping, frame_prefix, qos, .. } = &self.use_rules[place];
-            let has_other_qos = *qos != old[before].qos;
-            if *shaping != old[before].shaping {
-                self.commands.push_back(Command::Shape { name, shaping: *shaping });
-            }
-            if *frame_prefix != old[before].frame_prefix {
-                self.commands.push_back(Command::Frames { name, prefix: frame_prefix.clone() });
-            }
-            if let Some(route) = self.uses.get_mut(&name) {
-                route.rule = place;
-            }
-            if has_other_qos && !self.publishes(place) {
-                self.refresh_use(name);
-            }
-            if let Some(token) = self.tokens.get_mut(&name) {
-                token.rule = place;
+        for (name, before, place) in kept {
+            if let Some(place) = place {
+                self.move_use(name, &old[before], place);
             }
         }
-        let owners = |rules: &[UseRule]| -> BTreeMap<NodeId, String> {
+        self.follow_owners(&old);
+        self.join_tokens();
+    }
+
+    /// Returns the rule under which a joined name continues; `None` if its route has to end.
+    fn place_of(&self, name: &Name, before: &UseRule) -> Option<UseRuleId> {
+        let route = self.uses.get(name);
+        let place = match route.filter(|_| before.token.is_none()) {
+            Some(route) => self
+                .use_rule(&before.owner, &route.entry)
+                .filter(|place| self.why_not_used(*place, &route.entry.metadata).is_none()),
+            None => self.use_rules.position(|r| r.is_same_place(before)),
+        };
+        let fits = |rule: &UseRule| {
+            let (same_way, wanted) = (rule.direction == before.direction, rule.type_name.as_ref());
+            same_way
+                && route.is_none_or(|route| {
+                    let metadata = &route.entry.metadata;
+                    wanted.is_none_or(|wanted| *wanted == metadata.type_name)
+                        && rule.local_name(metadata) == route.local_name
+                })
+        };
+        // Publishing in another class begins anew.
+        let same_class = |rule: &UseRule| rule.direction == Direction::Bring || rule.class == before.class;
+        let stays = |place: &UseRuleId| fits(&self.use_rules[*place]) && same_class(&self.use_rules[*place]);
+        place.filter(stays)
+    }
+
+    /// Continues a joined name under another rule.
+    fn move_use(&mut self, name: Name, before: &UseRule, place: UseRuleId) {
+        let UseRule { shaping, frame_prefix, qos, .. } = &self.use_rules[place];
+        let has_other_qos = *qos != before.qos;
+        if *shaping != before.shaping {
+            self.commands.push_back(Command::Shape { name, shaping: *shaping });
+        }
+        if *frame_prefix != before.frame_prefix {
+            self.commands.push_back(Command::Frames { name, prefix: frame_prefix.clone() });
+        }
+        if let Some(route) = self.uses.get_mut(&name) {
+            route.rule = place;
+        }
+        if has_other_qos && !self.publishes(place) {
+            self.refresh_use(name);
+        }
+        if let Some(token) = self.tokens.get_mut(&name) {
+            token.rule = place;
+        }
+    }
+
+    /// Follows the owners of the rules, and no others.
+    fn follow_owners(&mut self, old: &UseRules) {
+        let owners = |rules: &UseRules| -> BTreeMap<NodeId, String> {
             let followed = rules.iter().filter(|r| r.token.is_none());
             followed.map(|r| (r.owner, r.owner_name.clone())).collect()
         };
-        let (before, after) = (owners(&old), owners(&self.use_rules));
+        let (before, after) = (owners(old), owners(&self.use_rules));
         for owner in before.keys().filter(|owner| !after.contains_key(owner)).copied() {
-            self.catalogues.remove(&owner);
             self.settle(Cause::Catalogue(owner), BTreeSet::new());
-            self.owners.remove(&owner);
-            self.settling.remove(&owner);
+            self.owners.forget(&owner);
             self.commands.push_back(Command::Unfollow { owner });
         }
         for (owner, owner_name) in after {
             if !before.contains_key(&owner) {
                 self.commands.push_back(Command::Follow { owner_name });
-            } else if let Some(catalogue) = self.catalogues.get(&owner).cloned() {
+            } else if let Some(catalogue) = self.owners.catalogue(&owner).cloned() {
                 // The catalogue is applied again for new rules. Known entries change nothing.
                 self.list(owner, catalogue);
             }
         }
-        self.join_tokens();
     }
 }
 

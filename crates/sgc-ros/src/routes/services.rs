@@ -9,7 +9,8 @@ use std::time::Instant;
 use rand_core::RngCore;
 use sgc_wire::{Kind, Name};
 
-use super::{Command, Routes};
+use super::command::Command;
+use super::machine::Routes;
 use crate::names::{ServiceTopic, dds_type, ros_topic, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec, ServiceSpec};
 use crate::qos::service_qos;
@@ -60,7 +61,7 @@ impl<R: RngCore> Routes<R> {
         let fits = |e: &&DiscoveredEndpoint| {
             (e.guid.prefix(), e.kind, &e.topic) == (endpoint.guid.prefix(), other.1, &topic)
         };
-        let others: Vec<_> = self.endpoints.values().filter(fits).cloned().collect();
+        let others: Vec<_> = self.local.endpoints().filter(fits).cloned().collect();
         for other in others {
             let request = if half == ServiceTopic::Request { endpoint } else { &other };
             if let Some(server) = server(request) {
@@ -84,14 +85,14 @@ impl<R: RngCore> Routes<R> {
         let (prefix, topic) = (endpoint.guid.prefix(), ServiceTopic::Request.dds_topic(name));
         let of_it = |e: &&DiscoveredEndpoint| e.guid.prefix() == prefix;
         let left = self
-            .endpoints
-            .values()
+            .local
+            .endpoints()
             .filter(of_it)
             .filter(|e| e.kind == EndpointKind::Writer && e.topic == endpoint.topic)
             .count();
         let requests = self
-            .endpoints
-            .values()
+            .local
+            .endpoints()
             .filter(of_it)
             .filter(|e| e.kind == EndpointKind::Reader && e.topic == topic);
         for server in requests.skip(left).filter_map(server).collect::<Vec<_>>() {

@@ -4,14 +4,16 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 
 use rand_core::RngCore;
-use sgc_trust::derive_name;
-use sgc_wire::{CatalogueSource, ENTRY_SOURCES_MAX, History, Kind, Liveliness, Name, Qos, SinkId, SourceId};
+use sgc_trust::{FleetSecret, derive_name};
+use sgc_wire::{CatalogueSource, ENTRY_SOURCES_MAX, Kind, Liveliness, Name, Qos, SinkId, SourceId};
 
+use super::command::Command;
+use super::machine::Routes;
+use super::problem::{Cause, Problem, Way};
+use super::readers::{asks_key_hash, same_reader};
+use super::rules::{ROUTES_PER_WILDCARD_MAX, ShareRuleId};
 use super::services::interface;
-use super::{
-    Cause, Command, OwnSource, Problem, ROUTES_PER_WILDCARD_MAX, Routes, SINKLESS_HOLD, ShareRoute,
-    WRITERLESS_HOLD, asks_key_hash, describe, same_reader, source_of,
-};
+use super::share_route::{OwnSource, SINKLESS_HOLD, ShareRoute, WRITERLESS_HOLD};
 use crate::names::{dds_topic, is_topic_name, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec, Guid};
 use crate::qos::{for_all_instances, reader_for, service_qos, weakest};
@@ -56,7 +58,9 @@ impl<R: RngCore> Routes<R> {
         let found = ros_type(&writer.type_name);
         let Some(rule) = self.share_rule(kind, &topic, Some(&found)) else {
             let problem = self.why_not_shared(kind, &topic, &found);
-            self.waits |= problem.is_some();
+            if problem.is_some() {
+                self.backlog.wait();
+            }
             return problem;
         };
         let share = &self.share_rules[rule];
@@ -82,7 +86,7 @@ impl<R: RngCore> Routes<R> {
     /// forbids it.
     pub(super) fn begin_share(
         &mut self,
-        rule: usize,
+        rule: ShareRuleId,
         topic: &str,
         type_name: String,
         keyless: bool,
@@ -99,10 +103,10 @@ impl<R: RngCore> Routes<R> {
         } else {
             let running = || self.shares.values().filter(|s| s.rule == rule).count();
             (share.is_pattern() && running() >= ROUTES_PER_WILDCARD_MAX)
-                .then(|| Problem::TooManyMatches { topic: share.metadata.ros_name.clone(), verb: "shared" })
+                .then(|| Problem::TooManyMatches { topic: share.metadata.ros_name.clone(), way: Way::Shared })
         };
         if problem.is_some() {
-            self.waits = true;
+            self.backlog.wait();
             return problem;
         }
         let shaping = share.shaping;
@@ -164,13 +168,9 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    /// Updates the depth of a local publisher that did not announce it. Not for publishers with a lifespan, because
-    /// an expired message looks like a dropped one and makes the depth uncertain.
+    /// Updates the depth of a local publisher that did not announce it.
     pub(super) fn handle_depth(&mut self, writer: &Guid, depth: u32) {
-        let is_unsaid = |qos: &Qos| qos.history.is_unsaid() && qos.lifespan_ns.is_none();
-        let Some(endpoint) = self.endpoints.get_mut(writer).filter(|e| is_unsaid(&e.qos)) else { return };
-        endpoint.qos.history = History::KeepLast(depth.max(1));
-        let history = endpoint.qos.history;
+        let Some(history) = self.local.learn_depth(writer, depth) else { return };
         let mut names = Vec::new();
         for (name, share) in &mut self.shares {
             if let Some(endpoint) = share.writers.get_mut(writer) {
@@ -312,10 +312,29 @@ impl<R: RngCore> Routes<R> {
         share.writers.keys().take(ENTRY_SOURCES_MAX).map(server).collect()
     }
 
+    /// Ends shares whose last writer has been gone for a while, and forgets sources and sinks that are gone.
+    pub(super) fn shares_time_out(&mut self, now: Instant) {
+        let due = |at: Option<Instant>| at.is_some_and(|at| at <= now);
+        for name in self.shares.keys().copied().collect::<Vec<_>>() {
+            let Some(share) = self.shares.get_mut(&name) else { continue };
+            if due(share.writerless_until) {
+                self.drop_share(name);
+                continue;
+            }
+            let gone = |own: &OwnSource| due(own.gone.map(|at| at + WRITERLESS_HOLD));
+            let sinkless = share.sinkless_until.take_if(|at| *at <= now).is_some();
+            let sources = share.own.len();
+            share.own.retain(|_, own| !gone(own));
+            if sinkless || share.own.len() < sources {
+                self.refresh_share(name);
+            }
+        }
+    }
+
     pub(super) fn drop_share(&mut self, name: Name) {
         if let Some(share) = self.shares.remove(&name) {
             self.settle(Cause::Share(name), BTreeSet::new());
-            self.freed = true;
+            self.backlog.free();
             if share.reader.is_some() {
                 self.commands.push_back(Command::CloseReader { name });
             }
@@ -372,4 +391,15 @@ fn carried(own: &Qos, offer: &Qos) -> Qos {
 /// Returns `true` if one source can stand for both.
 fn same_kind(a: &Qos, b: &Qos) -> bool {
     (a.reliability, a.is_transient_local()) == (b.reliability, b.is_transient_local())
+}
+
+/// Returns a new source id for a local writer, by which receivers recognise the writer's earlier sources.
+fn source_of(secret: &FleetSecret, writer: &Guid, rng: &mut impl RngCore) -> SourceId {
+    let mut random = [0; 8];
+    rng.fill_bytes(&mut random);
+    SourceId::from_publisher(secret.publisher_tag(&writer.0), random)
+}
+
+fn describe(qos: &Qos) -> String {
+    format!("{:?}, {:?}, {:?}", qos.reliability, qos.durability, qos.representations)
 }

@@ -8,7 +8,11 @@ use rand_core::RngCore;
 use sgc_trust::name_of;
 use sgc_wire::{CatalogueEntry, Name};
 
-use super::{Cause, Command, Problem, Routes, Shaping, TokenJoin, UseRoute};
+use super::command::Command;
+use super::machine::Routes;
+use super::problem::{Cause, Problem};
+use super::rules::Shaping;
+use super::use_route::{TokenJoin, UseRoute};
 
 impl<R: RngCore> Routes<R> {
     /// Handles the owner's description of a token's name, a catalogue of one entry.
@@ -48,7 +52,7 @@ impl<R: RngCore> Routes<R> {
 
     /// Joins the names of tokens that are not joined yet.
     pub(super) fn join_tokens(&mut self) {
-        for (index, rule) in self.use_rules.iter().enumerate() {
+        for (index, rule) in self.use_rules.with_ids() {
             let Some((name, _)) = &rule.token else { continue };
             if self.tokens.contains_key(name) {
                 continue;

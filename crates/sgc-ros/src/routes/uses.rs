@@ -10,10 +10,11 @@ use sgc_wire::{
     Catalogue, CatalogueEntry, ENTRY_SOURCES_MAX, History, Metadata, Name, NodeId, Qos, SourceId,
 };
 
-use super::{
-    Cause, Command, Direction, ENTRIES_PER_RULE_MAX, Problem, ROUTES_PER_WILDCARD_MAX, Routes, Settling,
-    UNREACHABLE_HOLD, UseRoute, UseRule,
-};
+use super::command::Command;
+use super::machine::Routes;
+use super::problem::{Cause, Problem, Way};
+use super::rules::{Direction, ENTRIES_PER_RULE_MAX, ROUTES_PER_WILDCARD_MAX, UseRule, UseRuleId};
+use super::use_route::{UNREACHABLE_HOLD, UseRoute};
 use crate::names::{dds_topic, dds_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec};
 
@@ -23,9 +24,10 @@ impl<R: RngCore> Routes<R> {
         // Two entries with one name would replace each other's route with every catalogue.
         let mut blinds = BTreeSet::new();
         catalogue.entries.retain(|entry| blinds.insert(entry.blind));
-        self.owners.remove(&owner);
-        self.owner_is_back(now, owner, &catalogue);
-        self.catalogues.insert(owner, catalogue.clone());
+        let rules = &self.use_rules;
+        let of_owner = self.uses.values().filter(|u| rules[u.rule].is_of_catalogue(&owner));
+        let known = of_owner.flat_map(|u| u.writers.keys().copied().flatten()).collect();
+        self.owners.list(now, owner, catalogue.clone(), &known);
         self.list(owner, catalogue);
         self.reconsider();
     }
@@ -34,7 +36,7 @@ impl<R: RngCore> Routes<R> {
     pub(super) fn list(&mut self, owner: NodeId, catalogue: Catalogue) {
         let mut listed = BTreeSet::new();
         let said = self.problems.take(Cause::Catalogue(owner));
-        let mut running: BTreeMap<usize, usize> = BTreeMap::new();
+        let mut running: BTreeMap<UseRuleId, usize> = BTreeMap::new();
         for route in self.uses.values() {
             *running.entry(route.rule).or_default() += 1;
         }
@@ -49,7 +51,7 @@ impl<R: RngCore> Routes<R> {
                     continue;
                 }
                 if let Some(problem) = self.why_not_used(rule, &entry.metadata) {
-                    self.waits = true;
+                    self.backlog.wait();
                     self.report(Cause::Catalogue(owner), problem);
                     continue;
                 }
@@ -72,30 +74,31 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    fn too_many(&mut self, owner_id: NodeId, rule: usize) {
+    fn too_many(&mut self, owner_id: NodeId, rule: UseRuleId) {
         let rule = &self.use_rules[rule];
         let (topic, owner) = (rule.topic.clone(), rule.owner_name.clone());
         let problem = match rule.is_pattern() {
-            true => Problem::TooManyMatches { topic, verb: "brought here" },
+            true => Problem::TooManyMatches { topic, way: Way::Brought },
             false => Problem::TooManyEntries { topic, owner },
         };
-        self.waits = true;
+        self.backlog.wait();
         self.report(Cause::Catalogue(owner_id), problem);
     }
 
     /// Reconsiders interfaces that were left out because of a route that has ended since.
     pub(super) fn reconsider(&mut self) {
-        if !std::mem::take(&mut self.freed) || !std::mem::take(&mut self.waits) {
+        if !self.backlog.take_due() {
             return;
         }
         let shared: BTreeSet<_> = self.shares.values().flat_map(|s| s.writers.keys().copied()).collect();
         let is_new = |e: &&DiscoveredEndpoint| e.kind == EndpointKind::Writer && !shared.contains(&e.guid);
-        for writer in self.endpoints.values().filter(is_new).cloned().collect::<Vec<_>>() {
+        for writer in self.local.endpoints().filter(is_new).cloned().collect::<Vec<_>>() {
             if !self.service_end_there(&writer) {
                 self.share_writer(writer);
             }
         }
-        for (owner, catalogue) in self.catalogues.clone() {
+        let catalogues = self.owners.catalogues().map(|(owner, catalogue)| (*owner, catalogue.clone()));
+        for (owner, catalogue) in catalogues.collect::<Vec<_>>() {
             self.list(owner, catalogue);
         }
     }
@@ -104,14 +107,10 @@ impl<R: RngCore> Routes<R> {
     /// own, which may still work; [`Self::handle_lost`] reports their loss.
     pub fn handle_owner_lost(&mut self, owner: NodeId, reason: LostReason) {
         if !matches!(reason, LostReason::Withdrawn | LostReason::Refused(_)) {
-            self.owners.insert(owner, "is out of reach".into());
-            self.settling.insert(owner, Settling::Away);
-            return;
+            return self.owners.lose(owner);
         }
-        self.catalogues.remove(&owner);
         self.settle(Cause::Catalogue(owner), BTreeSet::new());
-        self.settling.remove(&owner);
-        self.owners.insert(owner, "has gone".into());
+        self.owners.end(owner);
         let names: Vec<_> = self
             .uses
             .iter()
@@ -126,7 +125,7 @@ impl<R: RngCore> Routes<R> {
 
     /// Handles an owner's refusal of its catalogue.
     pub fn handle_owner_refused(&mut self, owner: NodeId, by: RefusedBy) {
-        self.owners.insert(owner, format!("refuses its catalogue: {by}"));
+        self.owners.refuse(owner, by);
     }
 
     /// Handles the grant of a join. `entry` describes the interface if the join asked for that.
@@ -164,7 +163,7 @@ impl<R: RngCore> Routes<R> {
     }
 
     /// Returns the rule that asks for a catalogue entry.
-    pub(super) fn rule_for(&mut self, owner: NodeId, entry: &CatalogueEntry) -> Option<usize> {
+    pub(super) fn rule_for(&mut self, owner: NodeId, entry: &CatalogueEntry) -> Option<UseRuleId> {
         let metadata = &entry.metadata;
         let index = self.use_rule(&owner, entry)?;
         let rule = &self.use_rules[index];
@@ -183,7 +182,7 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
-    pub(super) fn entry_there(&mut self, name: Name, rule: usize, entry: CatalogueEntry) {
+    pub(super) fn entry_there(&mut self, name: Name, rule: UseRuleId, entry: CatalogueEntry) {
         let transient_local = entry.qos.is_transient_local();
         let local_name = self.use_rules[rule].local_name(&entry.metadata);
         self.consumers_changed = true;
@@ -244,6 +243,25 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
+    /// Closes the local endpoints of uses whose owner has been out of reach for too long.
+    pub(super) fn uses_time_out(&mut self, now: Instant) {
+        for (name, route) in &mut self.uses {
+            if route.unreachable_until.take_if(|at| *at <= now).is_none() {
+                continue;
+            }
+            route.nodes.clear();
+            for source in std::mem::take(&mut route.writers).into_keys() {
+                self.commands.push_back(Command::CloseWriter { name: *name, source });
+            }
+            if route.reader.take().is_some() {
+                self.commands.push_back(Command::CloseReader { name: *name });
+            }
+            if route.server.take().is_some() {
+                self.commands.push_back(Command::CloseServer { name: *name });
+            }
+        }
+    }
+
     pub(super) fn drop_use(&mut self, name: Name) {
         let is_token = self.tokens.remove(&name).is_some();
         let joined = is_token || self.uses.contains_key(&name);
@@ -256,7 +274,7 @@ impl<R: RngCore> Routes<R> {
     /// Closes the local endpoints of a use. Its name stays joined.
     pub(super) fn close_use(&mut self, name: Name) {
         if let Some(route) = self.uses.remove(&name) {
-            self.freed = true;
+            self.backlog.free();
             self.consumers_changed = true;
             for source in route.writers.into_keys() {
                 self.commands.push_back(Command::CloseWriter { name, source });
@@ -323,7 +341,7 @@ impl<R: RngCore> Routes<R> {
             resized.insert(*source);
         }
         // Writers that a restarted owner may still rediscover stay as they are.
-        if matches!(self.settling.get(&self.use_rules[route.rule].owner), Some(Settling::Until(_))) {
+        if self.owners.is_settling(&self.use_rules[route.rule].owner) {
             for (source, old) in &route.writers {
                 if source.is_some_and(|source| !moved.contains(&source)) {
                     wanted.entry(*source).or_insert_with(|| old.clone());
@@ -348,7 +366,7 @@ impl<R: RngCore> Routes<R> {
     }
 
     /// Reports a problem if interfaces of several owners under one name have different types.
-    fn check_merged(&mut self, rule: usize, metadata: &Metadata) {
+    fn check_merged(&mut self, rule: UseRuleId, metadata: &Metadata) {
         let found = &metadata.type_name;
         let local_name = self.use_rules[rule].local_name(metadata);
         let differs = |u: &&UseRoute| {

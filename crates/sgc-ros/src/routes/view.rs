@@ -4,7 +4,9 @@ use sgc_endpoint::RefusedBy;
 use sgc_trust::{Policy, name_of};
 use sgc_wire::{CatalogueEntry, Kind, Metadata, Name, NodeId, PayloadForm, Qos};
 
-use super::{Direction, Routes};
+use super::machine::Routes;
+use super::owners::OwnerState;
+use super::rules::{Direction, ShareRule, ShareRuleId, UseRule};
 use crate::names::ros_type;
 use crate::network::{DiscoveredEndpoint, Guid};
 use crate::qos::weakest;
@@ -61,7 +63,7 @@ pub struct UseView<'a> {
     /// The owner's name, for people.
     pub owner_name: &'a str,
     /// The problem with the owner, if any.
-    pub owner_state: Option<&'a str>,
+    pub owner_state: Option<OwnerState>,
     /// `true` if the owner's catalogue has arrived.
     pub has_catalogue: bool,
     /// The name from a token, and the reason if it was refused.
@@ -109,16 +111,16 @@ pub struct OfferView<'a> {
 impl<R> Routes<R> {
     /// Returns the endpoints discovered on the local network.
     pub fn local_endpoints(&self) -> impl Iterator<Item = &DiscoveredEndpoint> {
-        self.endpoints.values()
+        self.local.endpoints()
     }
 
     /// Returns the local participants whose nodes are known.
     pub fn local_participants(&self) -> impl Iterator<Item = Guid> {
-        self.nodes.keys().copied()
+        self.local.participants()
     }
 
-    /// Returns the rule that shares a local interface, by its index in [`Self::share_views`].
-    pub fn shared_by(&self, kind: Kind, local_name: &str, type_name: &str) -> Option<usize> {
+    /// Returns the rule that shares a local interface, whose place is its index in [`Self::share_views`].
+    pub fn shared_by(&self, kind: Kind, local_name: &str, type_name: &str) -> Option<ShareRuleId> {
         let by_type = self.share_rule(kind, local_name, Some(type_name));
         by_type.or_else(|| self.share_rule(kind, local_name, None))
     }
@@ -132,7 +134,7 @@ impl<R> Routes<R> {
     /// Returns all share rules.
     pub fn share_views(&self) -> Vec<ShareView<'_>> {
         let view = |(index, rule)| {
-            let rule: &super::ShareRule = rule;
+            let rule: &ShareRule = rule;
             let of_rule = self.shares.values().filter(move |share| share.rule == index);
             let routes = of_rule.map(|share| ShareRouteView {
                 local_name: share.local_name.clone(),
@@ -147,13 +149,13 @@ impl<R> Routes<R> {
             });
             ShareView { metadata: &rule.metadata, policy: &rule.policy, routes: routes.collect() }
         };
-        self.share_rules.iter().enumerate().map(view).collect()
+        self.share_rules.with_ids().map(view).collect()
     }
 
     /// Returns all use rules.
     pub fn use_views(&self) -> Vec<UseView<'_>> {
         let view = |(index, rule)| {
-            let rule: &super::UseRule = rule;
+            let rule: &UseRule = rule;
             let of_rule = self.uses.iter().filter(move |(_, route)| route.rule == index);
             let routes = of_rule.map(|(name, route)| UseRouteView {
                 local_name: route.local_name.clone(),
@@ -178,18 +180,18 @@ impl<R> Routes<R> {
                 wanted_type: rule.type_name.as_deref(),
                 owner: rule.owner,
                 owner_name: &rule.owner_name,
-                owner_state: self.owners.get(&rule.owner).map(String::as_str),
-                has_catalogue: self.catalogues.contains_key(&rule.owner),
+                owner_state: self.owners.state(&rule.owner),
+                has_catalogue: self.owners.catalogue(&rule.owner).is_some(),
                 token,
                 routes: routes.collect(),
             }
         };
-        self.use_rules.iter().enumerate().map(view).collect()
+        self.use_rules.with_ids().map(view).collect()
     }
 
     /// Returns the entries of all followed owners.
     pub fn offers(&self) -> impl Iterator<Item = OfferView<'_>> {
-        self.catalogues.iter().flat_map(|(owner, catalogue)| {
+        self.owners.catalogues().flat_map(|(owner, catalogue)| {
             catalogue.entries.iter().map(|entry| OfferView {
                 owner: *owner,
                 entry,

@@ -19,6 +19,7 @@ use crate::admin::graph::{
     Endpoint, GRAPH_ENDPOINTS_MAX, Graph, Link, NameLine, Offer, Search, Share, ShareRoute, Side,
     UnheardMember, Use, UseRoute,
 };
+use crate::admin::route_words::owner_state;
 use crate::data::tap::{Tap, TapError, TapMessage, TapQueue, TapRequest, Taps};
 use crate::state::audit::Audit;
 
@@ -73,7 +74,8 @@ impl<N: RosNetwork> Core<N> {
                 .map(|node| format!("{}/{}", node.namespace().trim_end_matches('/'), node.name())),
             qos: (&e.qos).into(),
             shared_by: ros_topic(&e.topic)
-                .and_then(|topic| routes.shared_by(Kind::Topic, topic, &ros_type(&e.type_name))),
+                .and_then(|topic| routes.shared_by(Kind::Topic, topic, &ros_type(&e.type_name)))
+                .map(usize::from),
         };
         graph.endpoints = routes.local_endpoints().take(GRAPH_ENDPOINTS_MAX).map(endpoint).collect();
         graph.problems = self.problems();
@@ -161,7 +163,7 @@ impl<N: RosNetwork> Core<N> {
             wanted_type: view.wanted_type.map(str::to_owned),
             owner_id: view.owner.to_string(),
             owner: view.owner_name.to_owned(),
-            owner_state: view.owner_state.map(str::to_owned),
+            owner_state: view.owner_state.map(owner_state),
             follow: self.endpoint.follow_status(&view.owner).map(|s| label(&s).to_owned()),
             has_catalogue: view.has_catalogue,
             is_token: name.is_some(),

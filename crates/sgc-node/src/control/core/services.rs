@@ -249,19 +249,17 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Adds the statistics of calls to a route's status.
-    pub(super) fn describe_calls(&self, route: &mut RouteStatus) {
-        if let Some(calls) = route.name.and_then(|name| self.calls.get(&name)) {
-            let CallStats { calls: now, open, answered: answered_now } = calls.stats();
-            let (_, past, losses) = calls.ledger().read();
-            let (calls, answered) = (past.calls + now, past.answered + answered_now);
-            let refused = losses.get(&CallLoss::Refused).map_or(0, |losses| losses.count);
-            let lost = losses.values().map(|losses| losses.count).sum::<u64>() - refused;
-            let counts = format!(
-                ", {calls} calls, {open} in progress, {answered} answered, {refused} refused, {lost} lost"
-            );
-            route.state.push_str(&counts);
-        }
+    /// Returns the statistics of a route's calls, as an addition to its state.
+    pub(super) fn describe_calls(&self, route: &RouteStatus) -> Option<String> {
+        let calls = route.name.and_then(|name| self.calls.get(&name))?;
+        let CallStats { calls: now, open, answered: answered_now } = calls.stats();
+        let (_, past, losses) = calls.ledger().read();
+        let (calls, answered) = (past.calls + now, past.answered + answered_now);
+        let refused = losses.get(&CallLoss::Refused).map_or(0, |losses| losses.count);
+        let lost = losses.values().map(|losses| losses.count).sum::<u64>() - refused;
+        Some(format!(
+            ", {calls} calls, {open} in progress, {answered} answered, {refused} refused, {lost} lost"
+        ))
     }
 
     /// Returns the services with lost calls.

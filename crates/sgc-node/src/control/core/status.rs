@@ -65,15 +65,15 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    fn route_line(&self, mut route: RouteStatus) -> RouteLine {
-        self.describe_calls(&mut route);
+    fn route_line(&self, route: RouteStatus) -> RouteLine {
+        let calls = self.describe_calls(&route);
         let messages = route.name.and_then(|n| {
             let published = self.shares.get(&n).map(|s| s.published());
             published.or_else(|| self.sinks.get(&n).map(|s| s.delivered()))
         });
         let share = route.name.and_then(|n| self.shares.get(&n));
         let compressed = share.and_then(|s| s.compressed());
-        RouteLine::new(route, messages, share.map_or(0, |s| s.signatures()), compressed)
+        RouteLine::new(route, calls, messages, share.map_or(0, |s| s.signatures()), compressed)
     }
 
     /// Returns everything that was dropped or refused, by kind and culprit. Control frames and packets share some kinds.
