@@ -22,8 +22,6 @@ mod names;
 mod output;
 mod owner;
 mod packed_type;
-mod parking;
-mod partial;
 mod sink;
 mod source;
 
@@ -40,6 +38,8 @@ pub use marks::{MARK_AFTER, Marks};
 pub use output::{EndpointDrop, Event, Output, SignedKind, UnexpectedFrame};
 pub use owner::{ADVERT_INTERVAL, ADVERTS_BURST, ShareError, ShareSpec};
 pub use packed_type::{PackedType, unpack_type};
-pub use parking::{PARKED_BYTES_MAX, PARKED_LOOKS_MAX, PARKED_PACKETS_MAX};
-pub use sink::{AskAgain, Delivery, EPOCHS_MAX, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
+pub use sink::{
+    AskAgain, Delivery, EPOCHS_MAX, Message, PARKED_BYTES_MAX, PARKED_LOOKS_MAX, PARKED_PACKETS_MAX, Sink,
+    SinkDrop, SinkLimits, SinkProgress,
+};
 pub use source::{FRAGMENT_BYTES, PublishError, SOURCE_MESSAGES_MAX, Source, SourceConfig, SourceProgress};

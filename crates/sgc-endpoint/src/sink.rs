@@ -6,20 +6,28 @@
 //! The claims of a header allocate nothing: the packet must open, and be signed, first. A refused packet leaves no
 //! state.
 
+mod delivery;
+mod parking;
+mod partial;
+mod source_state;
+
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
+use std::sync::atomic::{AtomicU64, Ordering::Acquire};
 use std::sync::{Arc, Mutex};
 
-use bytes::{Bytes, BytesMut};
+use bytes::BytesMut;
 use sgc_sync::lock;
-use sgc_trust::{BatchVerifier, Freshness, OpenError, ReplayWindow, SourceKey, Suite, opened_bytes};
+use sgc_trust::{BatchVerifier, OpenError, ReplayWindow, Suite, opened_bytes};
 use sgc_wire::{
     Decode, GRANT_SOURCES_MAX, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, Packet, PacketHeader,
     SinkId, Slab, SourceAnnounce, SourceId, TopicGrant,
 };
 
-use crate::parking::{ParkedPacket, Parking};
-use crate::partial::Partials;
+pub use self::delivery::{AskAgain, Delivery, Message, SinkDrop};
+pub use self::parking::{PARKED_BYTES_MAX, PARKED_LOOKS_MAX, PARKED_PACKETS_MAX};
+
+use self::parking::{ParkedPacket, Parking};
+use self::source_state::{SourceState, derive, oldest_of_mark, verify};
 use crate::source::without_lists;
 
 /// Epochs whose keys are held at once. A past epoch is held until [`Sink::retire_epochs`]; beyond this number the
@@ -47,112 +55,6 @@ impl Default for SinkLimits {
     }
 }
 
-/// A complete message.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Message {
-    /// The publishing source.
-    pub source: SourceId,
-    /// Its number at the source.
-    pub seq: u64,
-    /// Kind and time of publication.
-    pub head: MessageHead,
-    /// Whether its publisher waits for slow receivers; otherwise newer messages replace it.
-    pub reliable: bool,
-    /// The payload, as it was published.
-    pub payload: Bytes,
-}
-
-/// Result of a packet.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Delivery {
-    /// The packet completed a message.
-    Message(Message),
-    /// More fragments are needed.
-    Incomplete,
-    /// No message, but a sign that none is missing.
-    Mark,
-    /// No message: the publisher of this source asserted its liveliness.
-    Asserted(SourceId),
-    /// The sink has to ask the source for missing messages before it delivers later ones; see [`Sink::ask`].
-    NeedsHistory(SourceId),
-    /// The source has sent the requested messages.
-    Synced(SourceId),
-    /// This many numbers of the source will never be delivered: nobody has their messages any more.
-    Lost(SourceId, u64),
-    /// The packet waits for the grant that explains its epoch or source; see [`Sink::regrant`].
-    Parked,
-}
-
-/// The reason why a packet was dropped.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
-pub enum SinkDrop {
-    /// The packet could not be opened.
-    #[error(transparent)]
-    Open(#[from] OpenError),
-    /// The packet is for another sink, or for an earlier id of this one.
-    #[error("addressed to another sink")]
-    NotForUs,
-    /// Several grants came, and none announced its source.
-    #[error("of a source that the owner does not announce")]
-    UnknownSource,
-    /// Several grants came, and none had its epoch.
-    #[error("of an epoch that was never granted")]
-    UnknownEpoch,
-    /// The packet waits for a grant, and an older waiting packet was dropped for it.
-    #[error("too many packets wait for a grant")]
-    ParkingFull,
-    /// The message was published before the source was announced to this sink, and not asked for.
-    #[error("message older than the announcement of its source")]
-    BelowFloor,
-    /// The message was delivered before, or is too old to tell.
-    #[error("message delivered before")]
-    Replayed,
-    /// A newer message of its best-effort source was delivered before.
-    #[error("a newer message was delivered before")]
-    Late,
-    /// The fragment was received before.
-    #[error("fragment received before")]
-    DuplicateFragment,
-    /// The fragment contradicts an earlier one of the same message.
-    #[error("fragment contradicts its message")]
-    Inconsistent,
-    /// The message's head is malformed.
-    #[error("message head malformed")]
-    Head,
-    /// The requested messages have not arrived yet, and will contain this one.
-    #[error("awaiting the answer that contains it")]
-    AwaitingHistory,
-    /// The bound on incomplete messages is reached, and its source would have more than its share of them.
-    #[error("too many incomplete messages")]
-    PartialsFull,
-}
-
-impl SinkDrop {
-    /// Returns a short, stable name for counters.
-    pub fn key(&self) -> &'static str {
-        match self {
-            Self::Open(OpenError::Suite { .. }) => "sink_suite",
-            Self::Open(OpenError::Epoch { .. }) => "sink_epoch",
-            Self::Open(OpenError::Length) => "sink_length",
-            Self::Open(OpenError::Forged) => "sink_forged",
-            Self::Open(OpenError::Trailer) => "sink_trailer",
-            Self::Open(OpenError::Signature) => "sink_signature",
-            Self::NotForUs => "sink_not_for_us",
-            Self::UnknownSource => "sink_unknown_source",
-            Self::UnknownEpoch => "sink_unknown_epoch",
-            Self::ParkingFull => "sink_parking_full",
-            Self::BelowFloor => "sink_below_floor",
-            Self::Replayed => "sink_replayed",
-            Self::Late => "sink_late",
-            Self::DuplicateFragment => "sink_duplicate_fragment",
-            Self::Inconsistent => "sink_inconsistent",
-            Self::Head => "sink_head",
-            Self::AwaitingHistory => "sink_awaiting_history",
-            Self::PartialsFull => "sink_partials_full",
-        }
-    }
-}
-
 /// Progress of a sink with each source, readable without its lock.
 #[derive(Debug, Default)]
 pub struct SinkProgress {
@@ -167,56 +69,14 @@ impl SinkProgress {
     }
 }
 
-/// Action for a source that was asked and then silent for a while.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum AskAgain {
-    /// Nothing is missing any more.
-    No,
-    /// The answer is on its way.
-    Wait,
-    /// Ask for all messages from this number on.
-    From(u64),
-}
-
-/// The fact that a packet lacks and the next grant may bring.
-enum MissingGrant {
-    Epoch,
-    Source,
-}
-
-/// An announced source.
-struct SourceState {
-    /// The announced key of its signatures; parsed when the first packet opens.
-    announced_key: Bytes,
-    verifier: Option<BatchVerifier>,
-    /// Keys for packets to all, by epoch.
-    keys: Vec<SourceKey>,
-    /// The key for packets to this sink, of the epoch seen last.
-    addressed: Option<SourceKey>,
-    window: ReplayWindow,
-    /// The window's newest, for [`SinkProgress`].
-    newest: Arc<AtomicU64>,
-    /// Lower numbers to all are replays from before this sink was told of the source.
-    next: u64,
-    /// This sink did not ask for lower numbers.
-    oldest: u64,
-    /// Whether lost messages can be asked for: then messages are delivered in the order of their numbers.
-    recovers: bool,
-    /// The next number: of a source with recovery all lower ones are done, of another it is one more than the newest.
-    expected: u64,
-    partials: Partials,
-    /// `false` while something is missing: a transient-local source's history, or messages lost on a broken route.
-    synced: bool,
-    /// Set once the source was asked for it.
-    asked: bool,
-    /// Whether the history may begin at any number.
-    anew: bool,
-    /// Whether a part of the answer came since the last look.
-    heard: bool,
-    /// Whether the answer has a hole, so that it must be asked for once more.
-    torn: bool,
-    /// The last epoch of the source, if the newest grant no longer announces it.
-    last_epoch: Option<u32>,
+/// Result of a packet that was not dropped.
+enum Handled {
+    /// A grant explained the packet.
+    Explained(Delivery),
+    /// No grant has the packet's epoch yet.
+    UnknownEpoch,
+    /// No grant has announced the packet's source yet.
+    UnknownSource,
 }
 
 /// A subscriber.
@@ -290,21 +150,17 @@ impl Sink {
         if moved {
             self.id = id;
             for source in self.sources.values_mut() {
-                source.addressed = None;
-                // The id of the request is no longer valid.
-                source.asked = false;
+                source.moved();
             }
         }
         self.announce(grant.sources, Some(newest), moved, &mut deliver);
         let latest = self.newest_epoch();
         for mut parked in self.parking.take() {
             let result = match self.handle(&parked.packet) {
-                Ok(Ok(delivery)) => Ok(delivery),
-                Ok(Err(unexplained)) if parked.looked_in_vain(latest) => Err(match unexplained {
-                    MissingGrant::Epoch => SinkDrop::UnknownEpoch,
-                    MissingGrant::Source => SinkDrop::UnknownSource,
-                }),
-                Ok(Err(_)) => {
+                Ok(Handled::Explained(delivery)) => Ok(delivery),
+                Ok(Handled::UnknownEpoch) if parked.looked_in_vain(latest) => Err(SinkDrop::UnknownEpoch),
+                Ok(Handled::UnknownSource) if parked.looked_in_vain(latest) => Err(SinkDrop::UnknownSource),
+                Ok(Handled::UnknownEpoch | Handled::UnknownSource) => {
                     // The packet was parked before, so there is room.
                     self.parking.push(parked);
                     continue;
@@ -326,27 +182,20 @@ impl Sink {
 
     /// Iterates over the announced sources with missing messages.
     pub fn unsynced(&self) -> impl Iterator<Item = SourceId> + '_ {
-        self.sources.iter().filter(|(_, s)| !s.synced && s.last_epoch.is_none()).map(|(id, _)| *id)
+        self.sources.iter().filter(|(_, s)| !s.is_synced() && s.last_epoch.is_none()).map(|(id, _)| *id)
     }
 
     /// Returns the number from which on a source must be asked for its messages, which the caller then does; `None` if
     /// nothing is missing. 0 stands for the whole history.
     pub fn ask(&mut self, source: SourceId) -> Option<u64> {
-        let state = self.sources.get_mut(&source).filter(|s| !s.synced && s.last_epoch.is_none())?;
-        state.asked = true;
-        state.heard = false;
-        state.torn = false;
-        Some(if state.anew { 0 } else { state.expected })
+        self.sources.get_mut(&source)?.ask()
     }
 
     /// Returns the action for a source a while after it was asked.
     pub fn ask_again(&mut self, source: SourceId) -> AskAgain {
         match self.sources.get_mut(&source) {
-            Some(state) if !state.synced && state.heard && !state.torn => {
-                state.heard = false;
-                AskAgain::Wait
-            }
-            _ => self.ask(source).map_or(AskAgain::No, AskAgain::From),
+            Some(state) => state.ask_again(),
+            None => AskAgain::No,
         }
     }
 
@@ -377,8 +226,7 @@ impl Sink {
             state.next = state.next.max(state.window.newest().saturating_add(1));
             state.window = ReplayWindow::default();
             if self.transient_local {
-                state.anew = true;
-                state.unsync();
+                state.restart();
             }
         }
     }
@@ -387,9 +235,9 @@ impl Sink {
     pub fn handle_packet(&mut self, packet: &Packet) -> Result<Delivery, SinkDrop> {
         debug_assert_eq!(packet.header.name, self.name);
         match self.handle(packet)? {
-            Ok(delivery) => Ok(delivery),
-            Err(_) if self.parking.push(ParkedPacket::new(packet)) > 0 => Err(SinkDrop::ParkingFull),
-            Err(_) => Ok(Delivery::Parked),
+            Handled::Explained(delivery) => Ok(delivery),
+            _ if self.parking.push(ParkedPacket::new(packet)) > 0 => Err(SinkDrop::ParkingFull),
+            _ => Ok(Delivery::Parked),
         }
     }
 
@@ -483,14 +331,14 @@ impl Sink {
 
     /// Returns the result of a packet, if a grant explained it. Checks in this order: the cheap facts (addressee,
     /// epoch, suite, replay); the seal, which only holders of the topic's key pass; the signature.
-    fn handle(&mut self, packet: &Packet) -> Result<Result<Delivery, MissingGrant>, SinkDrop> {
+    fn handle(&mut self, packet: &Packet) -> Result<Handled, SinkDrop> {
         let header = &packet.header;
         if header.to.is_some_and(|to| to != self.id) {
             return Err(SinkDrop::NotForUs);
         }
         let Some(grant) = self.epochs.iter().find(|known| known.epoch == header.epoch) else {
             if header.epoch > self.newest_epoch() {
-                return Ok(Err(MissingGrant::Epoch));
+                return Ok(Handled::UnknownEpoch);
             }
             return Err(OpenError::Epoch { found: header.epoch }.into());
         };
@@ -511,7 +359,7 @@ impl Sink {
             // Nodes without the topic's key take no room.
             let mut text = vec![0; opened_bytes(header)];
             derive(grant, &self.name, header)?.open(header, payload, &mut text)?;
-            return Ok(Err(MissingGrant::Source));
+            return Ok(Handled::UnknownSource);
         };
         source.check_freshness(header)?;
         source.derive_key(grant, &self.name, header)?;
@@ -551,7 +399,7 @@ impl Sink {
         if let OpenBuffer::Aside(scratch) = opened {
             self.scratch = scratch;
         }
-        delivery.map(Ok)
+        delivery.map(Handled::Explained)
     }
 
     /// Makes room for a message that begins. If its source has no more than its share with it, the oldest messages of
@@ -596,19 +444,7 @@ impl Sink {
 
     /// Takes the opened text of a packet: fragment, and behind the first one the head.
     fn accept(&mut self, header: &PacketHeader, opened: &mut OpenBuffer) -> Result<Delivery, SinkDrop> {
-        let head = match opened {
-            OpenBuffer::Whole(_) | OpenBuffer::Aside(_) if header.index == 0 => {
-                let at = opened.text().len() - MESSAGE_HEAD_BYTES;
-                let head = MessageHead::from_slice(&opened.text()[at..]).map_err(|_| SinkDrop::Head)?;
-                opened.truncate(at);
-                // Number 0 is the mark of a history's end, and nothing else.
-                if (head.kind == MessageKind::Synced) != (header.seq == 0) {
-                    return Err(SinkDrop::Head);
-                }
-                Some(head)
-            }
-            _ => None,
-        };
+        let head = opened.take_head(header)?;
         let known = self.sources.get(&header.source);
         let begins = header.fragments() > 1 && known.is_some_and(|s| !s.partials.has_begun(header.seq));
         let Some(source) = self.sources.get_mut(&header.source) else { return Err(SinkDrop::UnknownSource) };
@@ -616,16 +452,11 @@ impl Sink {
             if head.is_none() || header.total > 0 {
                 return Err(SinkDrop::Head);
             }
-            // An answer with a hole is asked for again, after a while.
-            if source.torn {
-                return Err(SinkDrop::AwaitingHistory);
-            }
-            source.synced = true;
-            source.anew = false;
+            source.take_end()?;
             return Ok(Delivery::Synced(header.source));
         }
         if header.to.is_some() {
-            source.heard = true;
+            source.hear();
         }
         if let Some(head) = head.filter(|head| head.kind == MessageKind::Mark) {
             // A resent assertion is no news of a publisher's liveliness.
@@ -635,18 +466,21 @@ impl Sink {
             source.done(header.seq);
             return Ok(self.asserted(&header.source, publisher));
         }
-        if header.to.is_some() && std::mem::take(&mut source.anew) {
-            source.expected = header.seq;
-        } else if source.recovers && header.seq > source.expected {
-            if header.to.is_some() {
-                source.torn = true;
-                return Err(SinkDrop::AwaitingHistory);
-            }
-            source.miss();
-        }
-        if !source.synced && header.to.is_none() {
+        source.take_number(header)?;
+        if !source.is_synced() && header.to.is_none() {
             return source.await_history(header.source);
         }
+        self.assemble(header, head, opened, begins)
+    }
+
+    /// Delivers a message of one packet, or puts a fragment into its message, which may complete it.
+    fn assemble(
+        &mut self,
+        header: &PacketHeader,
+        head: Option<MessageHead>,
+        opened: &mut OpenBuffer,
+        begins: bool,
+    ) -> Result<Delivery, SinkDrop> {
         let complete = match (opened, head) {
             (OpenBuffer::Whole(text), Some(head)) => Some((head, std::mem::take(text).freeze())),
             (opened, head) => {
@@ -693,6 +527,21 @@ impl OpenBuffer {
         }
     }
 
+    /// Takes the head off a message's first packet.
+    fn take_head(&mut self, header: &PacketHeader) -> Result<Option<MessageHead>, SinkDrop> {
+        if header.index != 0 || matches!(self, Self::InPlace) {
+            return Ok(None);
+        }
+        let at = self.text().len() - MESSAGE_HEAD_BYTES;
+        let head = MessageHead::from_slice(&self.text()[at..]).map_err(|_| SinkDrop::Head)?;
+        self.truncate(at);
+        // Number 0 is the mark of a history's end, and nothing else.
+        if (head.kind == MessageKind::Synced) != (header.seq == 0) {
+            return Err(SinkDrop::Head);
+        }
+        Ok(Some(head))
+    }
+
     /// Cuts off the rest.
     fn truncate(&mut self, bytes: usize) {
         match self {
@@ -701,174 +550,4 @@ impl OpenBuffer {
             Self::InPlace => {}
         }
     }
-}
-
-impl SourceState {
-    fn new(announce: &SourceAnnounce, transient_local: bool) -> Self {
-        let first = if transient_local { announce.oldest } else { announce.next };
-        Self {
-            announced_key: announce.key.clone(),
-            verifier: None,
-            keys: Vec::new(),
-            addressed: None,
-            window: ReplayWindow::default(),
-            newest: Arc::default(),
-            next: announce.next,
-            oldest: first,
-            recovers: announce.recover > 0,
-            expected: first.max(1),
-            partials: Partials::default(),
-            synced: !transient_local,
-            asked: false,
-            anew: false,
-            heard: false,
-            torn: false,
-            last_epoch: None,
-        }
-    }
-
-    /// Takes a repeated announcement and returns the number of messages that are lost for good. The floors stay those
-    /// of the first announcement: later messages were not delivered yet, or are in the window.
-    fn announce_again(&mut self, announce: &SourceAnnounce) -> u64 {
-        self.last_epoch = None;
-        if self.announced_key != announce.key {
-            self.announced_key = announce.key.clone();
-            self.verifier = None;
-        }
-        // Nothing older will be sent to this node.
-        let lost = if self.recovers { announce.recover.saturating_sub(self.expected) } else { 0 };
-        self.give_up(lost);
-        lost
-    }
-
-    /// Notes that messages are missing from here on.
-    fn unsync(&mut self) {
-        self.synced = false;
-        self.asked = false;
-        self.partials.clear();
-    }
-
-    /// Notes that a number is missing.
-    fn miss(&mut self) {
-        if self.synced {
-            self.unsync();
-        }
-    }
-
-    /// Handles a message that came too early.
-    fn await_history(&mut self, source: SourceId) -> Result<Delivery, SinkDrop> {
-        if std::mem::replace(&mut self.asked, true) {
-            return Err(SinkDrop::AwaitingHistory);
-        }
-        Ok(Delivery::NeedsHistory(source))
-    }
-
-    /// Notes that a message is complete.
-    fn done(&mut self, seq: u64) {
-        self.window.accept(seq);
-        self.newest.fetch_max(seq, Release);
-        self.expected = self.expected.max(seq.saturating_add(1));
-    }
-
-    /// Gives up the next numbers, which will never come.
-    fn give_up(&mut self, numbers: u64) {
-        if numbers > 0 {
-            self.expected += numbers;
-            self.partials.clear();
-        }
-    }
-
-    /// Takes a mark; each has its number. A mark ahead of an answer reports messages that are lost for good.
-    fn take_mark(&mut self, header: &PacketHeader, text: &[u8]) -> Result<Delivery, SinkDrop> {
-        let oldest = oldest_of_mark(header, text)?;
-        let in_turn = !self.recovers || header.seq == self.expected;
-        if header.to.is_none() {
-            if !in_turn {
-                self.miss();
-            }
-            if !self.synced {
-                return self.await_history(header.source);
-            }
-        }
-        if in_turn {
-            self.done(header.seq);
-            return Ok(Delivery::Mark);
-        }
-        // The mark goes ahead of an answer, and counts in its turn.
-        let lost = if self.anew { 0 } else { oldest.saturating_sub(self.expected) };
-        if lost == 0 {
-            return Ok(Delivery::Incomplete);
-        }
-        self.give_up(lost);
-        Ok(Delivery::Lost(header.source, lost))
-    }
-
-    fn check_freshness(&self, header: &PacketHeader) -> Result<(), SinkDrop> {
-        let floor = match (header.to, header.seq) {
-            (Some(_), 0) => return Ok(()),
-            (Some(_), _) => self.oldest,
-            (None, _) => self.next.max(1),
-        };
-        if header.seq < floor {
-            return Err(SinkDrop::BelowFloor);
-        }
-        if self.recovers && !self.anew && header.seq < self.expected {
-            return Err(SinkDrop::Replayed);
-        }
-        match self.window.check(header.seq) {
-            // As in DDS: best-effort messages come in order or not at all.
-            Freshness::Fresh if !header.reliable && header.to.is_none() && header.seq < self.expected => {
-                Err(SinkDrop::Late)
-            }
-            Freshness::Fresh => Ok(()),
-            Freshness::Duplicate | Freshness::TooOld => Err(SinkDrop::Replayed),
-        }
-    }
-
-    /// Derives the key for a packet if it is not here yet: one for each epoch, and one more for packets to this sink.
-    fn derive_key(
-        &mut self,
-        grant: &TopicGrant,
-        name: &Name,
-        header: &PacketHeader,
-    ) -> Result<(), OpenError> {
-        if header.to.is_some() {
-            if self.addressed.as_ref().is_none_or(|key| key.epoch() != header.epoch) {
-                self.addressed = Some(derive(grant, name, header)?);
-            }
-        } else if self.keys.iter().all(|key| key.epoch() != header.epoch) {
-            self.keys.push(derive(grant, name, header)?);
-        }
-        Ok(())
-    }
-}
-
-/// Returns the oldest number that the source of a mark could send again.
-fn oldest_of_mark(header: &PacketHeader, text: &[u8]) -> Result<u64, SinkDrop> {
-    let oldest = text.try_into().map(u64::from_be_bytes).map_err(|_| SinkDrop::Head)?;
-    if oldest > header.seq { Err(SinkDrop::Head) } else { Ok(oldest) }
-}
-
-/// Derives the key of a packet from its header.
-fn derive(grant: &TopicGrant, name: &Name, header: &PacketHeader) -> Result<SourceKey, OpenError> {
-    let key = match &header.to {
-        Some(sink) => SourceKey::derive_addressed(grant, name, &header.source, sink),
-        None => SourceKey::derive(grant, name, &header.source),
-    };
-    key.ok_or(OpenError::Suite { found: grant.suite })
-}
-
-/// Verifies a packet that opened.
-fn verify(
-    verifier: &mut Option<BatchVerifier>,
-    announced_key: &Bytes,
-    suite: Suite,
-    header: &PacketHeader,
-    payload: &[u8],
-) -> Result<(), OpenError> {
-    if verifier.is_none() {
-        *verifier = BatchVerifier::new(suite, announced_key);
-    }
-    // A source with an unusable key has signed nothing.
-    verifier.as_mut().ok_or(OpenError::Signature)?.verify(header, payload)
 }

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use bytes::Bytes;
 use sgc_wire::{MessageHead, PacketHeader};
 
-use crate::SinkDrop;
+use super::delivery::SinkDrop;
 
 /// A message that lacks fragments.
 pub(crate) struct Partial {
