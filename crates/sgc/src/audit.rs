@@ -9,9 +9,9 @@ use std::time::Duration;
 use clap::Args;
 use sgc_node::audit::{self, AuditEvent, AuditRecord};
 use sgc_node::config::{self, Config};
+use sgc_process::{ProcessError, unix_now};
 
 use crate::error::CliError;
-use crate::fleet::unix_now;
 use crate::{output, run, status};
 
 const FILE_NAME: &str = "audit.jsonl";
@@ -67,7 +67,7 @@ pub(crate) fn audit(args: &AuditArgs) -> Result<(), CliError> {
     })?;
     if args.json {
         for record in &found {
-            let line = serde_json::to_string(record).map_err(|error| CliError::Output(error.into()))?;
+            let line = serde_json::to_string(record).map_err(|error| ProcessError::Output(error.into()))?;
             output::line(harmless(&line))?;
         }
     } else if found.is_empty() {

@@ -14,12 +14,13 @@ use sgc_node::config::{
     TokenSource,
 };
 use sgc_node::discovery_server;
+use sgc_process::unix_now;
 use sgc_trust::Identity;
 use sgc_types::Definitions;
 use sgc_wire::PayloadForm;
 
 use crate::error::CliError;
-use crate::fleet::{FLEET_EXTENSION, unix_now};
+use crate::fleet::FLEET_EXTENSION;
 use crate::{files, name, output, run};
 
 /// List all mistakes of a configuration, or describe the node that would run with it. Binds no socket.

@@ -13,13 +13,12 @@ use sgc_gateway::AccessTokenError;
 use sgc_node::config::ConfigErrors;
 use sgc_node::partners::PartnerError;
 use sgc_node::{AccessError, FleetFileError, NodeError, RulesError, StateError};
+use sgc_process::{ProcessError, output};
 use sgc_trust::{CrlError, FleetError, IdentityError, LabelError, PemError, TokenError};
 
-use crate::output;
 use crate::run::LogFilterError;
+pub(crate) use sgc_process::EXIT_FAILURE;
 
-/// Exit code for a failure while running.
-pub(crate) const EXIT_FAILURE: u8 = 1;
 /// Exit code for wrong arguments, a wrong configuration or a wrong identity.
 pub(crate) const EXIT_USAGE: u8 = 2;
 
@@ -46,40 +45,6 @@ pub(crate) enum CliError {
     /// A revocation list could not be pushed to a router.
     #[error("the revocation is in force here, but a router was not told: {0}")]
     Tell(#[from] sgc_node::PushCrlError),
-    /// A file cannot be read.
-    #[error("cannot read {}: {source}", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// A file cannot be written.
-    #[error("cannot write {}: {source}", path.display())]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// A file that would be overwritten.
-    #[error("{} exists already{hint}", path.display())]
-    Exists {
-        /// The file.
-        path: PathBuf,
-        /// The remedy, with its separator.
-        hint: &'static str,
-    },
-    /// A file of secrets that others may read.
-    #[error("{}: its mode {mode:04o} lets others at {what}: chmod 600 {}", path.display(), path.display())]
-    Exposed {
-        /// The file.
-        path: PathBuf,
-        /// Its permission bits.
-        mode: u32,
-        /// The content of the file.
-        what: &'static str,
-    },
     /// A file without the expected content.
     #[error("{}: it holds no {what}: {hint}", path.display())]
     NotInFile {
@@ -310,17 +275,9 @@ pub(crate) enum CliError {
         /// Further facts, printed below the error.
         facts: Vec<String>,
     },
-    /// The system refused something that the program needs.
-    #[error("{what}: {source}")]
-    System {
-        /// The failed action.
-        what: &'static str,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// Standard output cannot be written.
-    #[error("cannot write to standard output: {0}")]
-    Output(io::Error),
+    /// The process or one of its files.
+    #[error(transparent)]
+    Process(#[from] ProcessError),
 }
 
 impl CliError {
@@ -328,7 +285,9 @@ impl CliError {
     pub(crate) fn report(&self) -> ExitCode {
         match self {
             // The reader closed the pipe, as with `sgc status | head -1`.
-            Self::Output(error) if error.kind() == io::ErrorKind::BrokenPipe => return ExitCode::SUCCESS,
+            Self::Process(ProcessError::Output(error)) if error.kind() == io::ErrorKind::BrokenPipe => {
+                return ExitCode::SUCCESS;
+            }
             Self::Config { errors, .. } => {
                 for error in errors {
                     output::diagnostic(&error.to_string());
@@ -354,8 +313,7 @@ impl CliError {
             Self::Config { .. }
             | Self::Arguments { .. }
             | Self::Label(_)
-            | Self::Exists { .. }
-            | Self::Exposed { .. }
+            | Self::Process(ProcessError::Exists { .. } | ProcessError::Exposed { .. })
             | Self::NotInFile { .. }
             | Self::Pem { .. }
             | Self::Identity { .. }
@@ -387,9 +345,8 @@ impl CliError {
                 | NodeError::Randomness(_),
             ) => EXIT_FAILURE,
             Self::Node(_) => EXIT_USAGE,
-            Self::Read { .. }
+            Self::Process(_)
             | Self::FleetFile(FleetFileError::Read { .. } | FleetFileError::Write { .. })
-            | Self::Write { .. }
             | Self::NoNode { .. }
             | Self::NoNodeHere { .. }
             | Self::NotAStatus { .. }
@@ -401,9 +358,7 @@ impl CliError {
             | Self::NoAudit { .. }
             | Self::Demo { .. }
             | Self::Bench { .. }
-            | Self::Tell(_)
-            | Self::System { .. }
-            | Self::Output(_) => EXIT_FAILURE,
+            | Self::Tell(_) => EXIT_FAILURE,
         }
     }
 }
@@ -502,7 +457,7 @@ mod tests {
     #[test]
     fn error_chain_names_each_source_once() {
         let inner = || io::Error::other("disk on fire");
-        let outer = CliError::Read { path: "/x".into(), source: inner() };
+        let outer = CliError::from(ProcessError::Read { path: "/x".into(), source: inner() });
         assert_eq!(chain(&outer), "cannot read /x: disk on fire");
     }
 }

@@ -10,11 +10,11 @@ use serde::Serialize;
 use sgc_node::config::{self, Config};
 use sgc_node::partners::Partners;
 use sgc_node::policy::{Subject, Verdict, explain};
+use sgc_process::{ProcessError, unix_now};
 use sgc_trust::{GroupName, Identity, NodeName};
 use sgc_wire::Role;
 
 use crate::error::{CliError, EXIT_FAILURE};
-use crate::fleet::unix_now;
 use crate::{files, output, run};
 
 const CERTIFICATE_BYTES_MAX: u64 = 64 * 1024;
@@ -116,7 +116,7 @@ fn test(args: &TestArgs) -> Result<ExitCode, CliError> {
         who,
     };
     if args.json {
-        let text = serde_json::to_string(&answer).map_err(|error| CliError::Output(error.into()))?;
+        let text = serde_json::to_string(&answer).map_err(|error| ProcessError::Output(error.into()))?;
         output::line(text)?;
     } else {
         let (yes, not) = if answer.permitted { ("yes", "") } else { ("no", " not") };

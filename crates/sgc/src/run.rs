@@ -3,21 +3,22 @@
 //! `sgc_node::run` is the node. This file owns its surroundings: the log, the signals, and the standard input that a
 //! parent may hold open.
 
-use std::io::{IsTerminal, Read};
+use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
-use serde::{Deserialize, Serialize};
 use sgc_node::config::{self, ArgsConfig};
 use sgc_node::{ConfigSource, RunOptions};
-use tokio::signal::unix::{Signal, SignalKind, signal};
+use sgc_process::children::ReadyLine;
+use sgc_process::{EndSignals, ProcessError, listen, stdin_closed};
+use tokio::signal::unix::{Signal, SignalKind};
 use tokio::sync::{mpsc, oneshot};
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::LevelFilter;
 
-use crate::error::{CliError, EXIT_FAILURE};
+use crate::error::CliError;
 use crate::{heap, output};
 
 const LOG_VARIABLE: &str = "SGC_LOG";
@@ -37,8 +38,6 @@ const LOG_TARGETS: [&str; 12] = [
     "sgc_types",
     "sgc_wire",
 ];
-/// Time that a process has to end by itself once the parent that holds its standard input is gone.
-const ORPHAN_GRACE: Duration = Duration::from_secs(5);
 /// Time by which working threads may delay the end of the process.
 const RUNTIME_GRACE: Duration = Duration::from_secs(1);
 
@@ -121,13 +120,6 @@ struct ProcessArgs {
     /// Print a line of JSON with the bound addresses once the node is up
     #[arg(long, hide = true)]
     print_ready: bool,
-}
-
-/// The line that `--print-ready` prints.
-#[derive(Debug, Serialize, Deserialize)]
-pub(crate) struct ReadyLine {
-    /// The addresses on which the node listens, as URLs.
-    pub(crate) ready: Vec<String>,
 }
 
 /// Runs `sgc run`.
@@ -253,70 +245,6 @@ pub(crate) enum LogFilterError {
     },
 }
 
-/// Returns a receiver that becomes ready when standard input ends, which also happens when the parent dies. If the process
-/// still runs [`ORPHAN_GRACE`] later, it is ended.
-pub(crate) fn stdin_closed() -> oneshot::Receiver<()> {
-    let (closed, when_closed) = oneshot::channel();
-    // A plain thread, because a runtime would wait for one of its own at shutdown.
-    std::thread::spawn(move || {
-        let mut buffer = [0; 256];
-        while !matches!(std::io::stdin().lock().read(&mut buffer), Ok(0) | Err(_)) {}
-        let _ = closed.send(());
-        exit_after_grace();
-    });
-    when_closed
-}
-
-/// Blocks for [`ORPHAN_GRACE`], then ends the process.
-pub(crate) fn exit_after_grace() {
-    std::thread::sleep(ORPHAN_GRACE);
-    std::process::exit(EXIT_FAILURE.into());
-}
-
-/// The signals that ask a process to end.
-pub(crate) struct EndSignals {
-    interrupt: Signal,
-    terminate: Signal,
-    hang_up: Option<Signal>,
-}
-
-impl EndSignals {
-    /// Starts to listen for the signals. Needs a runtime.
-    pub(crate) fn new() -> Result<Self, CliError> {
-        Ok(Self { hang_up: Some(listen(SignalKind::hangup())?), ..Self::without_hang_up()? })
-    }
-
-    /// Starts to listen for the signals except SIGHUP, which means something else to a node.
-    fn without_hang_up() -> Result<Self, CliError> {
-        let (interrupt, terminate) = (listen(SignalKind::interrupt())?, listen(SignalKind::terminate())?);
-        Ok(Self { interrupt, terminate, hang_up: None })
-    }
-
-    /// Waits for the next signal.
-    pub(crate) async fn next(&mut self) {
-        let Self { interrupt, terminate, hang_up } = self;
-        let hung_up = async {
-            match hang_up {
-                Some(signal) => drop(signal.recv().await),
-                None => std::future::pending().await,
-            }
-        };
-        tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
-            () = hung_up => {}
-        }
-    }
-
-    /// Ends the process at the next signal.
-    pub(crate) fn end_at_once(mut self) {
-        tokio::spawn(async move {
-            self.next().await;
-            std::process::exit(EXIT_FAILURE.into());
-        });
-    }
-}
-
 /// Hang-ups of a running node. A hang-up ends the node if its terminal is gone; otherwise it asks for a reload.
 struct HangUps {
     signal: Signal,
@@ -344,10 +272,6 @@ impl HangUps {
     }
 }
 
-fn listen(kind: SignalKind) -> Result<Signal, CliError> {
-    signal(kind).map_err(|source| CliError::System { what: "cannot listen for signals", source })
-}
-
 fn terminal_is_there() -> bool {
     std::fs::File::open("/dev/tty").is_ok()
 }
@@ -364,7 +288,7 @@ fn run_node(
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
-        .map_err(|source| CliError::System { what: "cannot start threads", source })?;
+        .map_err(|source| ProcessError::System { what: "cannot start threads", source })?;
     let result = runtime.block_on(async {
         let signals = EndSignals::without_hang_up()?;
         let hang_ups = HangUps::new()?;
@@ -441,7 +365,8 @@ mod tests {
 
     #[test]
     fn log_targets_list_every_crate_that_logs() {
-        const SILENT: [&str; 4] = ["sgc_executor", "sgc_fuzz_targets", "sgc_sync", "sgc_testkit"];
+        const SILENT: [&str; 5] =
+            ["sgc_executor", "sgc_fuzz_targets", "sgc_process", "sgc_sync", "sgc_testkit"];
         let crates = std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/..")).unwrap();
         let names = crates.map(|entry| entry.unwrap().file_name().to_string_lossy().replace('-', "_"));
         let mut names: Vec<_> = names.filter(|name| !SILENT.contains(&&**name)).collect();

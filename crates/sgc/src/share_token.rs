@@ -10,12 +10,12 @@ use clap::Args;
 use sgc_node::config::{self, Config, Interface, RouterUrl, ShareConfig};
 use sgc_node::partners::{TokenRecord, TokenRecords, read_ca_file};
 use sgc_node::policy::metadata;
+use sgc_process::unix_now;
 use sgc_transport::LinkUrl;
 use sgc_trust::{FleetSecret, Identity, ShareToken, TOKEN_ROUTERS_MAX, TopicSecret, TrustAnchors, pem_text};
 use sgc_wire::{NodeId, UnixMillis};
 
 use crate::error::CliError;
-use crate::fleet::unix_now;
 use crate::topic::NodeArgs;
 use crate::{files, output, policy, reload};
 

@@ -12,11 +12,11 @@ use sgc_gateway::{ACCESS_VALID_MS_MAX, AccessGrant, Scope, TokenId};
 use sgc_node::audit::{self, AuditEvent, AuditRecord};
 use sgc_node::config::{self, Config};
 use sgc_node::{AccessRecord, AccessRecords};
+use sgc_process::{ProcessError, system_rng, unix_now};
 use sgc_trust::Identity;
 use sgc_wire::UnixMillis;
 
 use crate::error::CliError;
-use crate::fleet::{system_rng, unix_now};
 use crate::{files, output, policy, reload};
 
 /// Number of digits of an id that a list shows.
@@ -109,7 +109,7 @@ fn create(args: &CreateArgs) -> Result<(), CliError> {
     let (config, identity, state) = open(args.config.as_deref())?;
     if let Some(path) = args.out.as_deref().filter(|path| files::exists(path)) {
         let hint = ": a token may be in it; name another file, or remove it";
-        return Err(CliError::Exists { path: path.to_owned(), hint });
+        return Err(ProcessError::Exists { path: path.to_owned(), hint }.into());
     }
     let now = unix_now();
     let mut id = [0; 16];
@@ -149,7 +149,7 @@ fn create(args: &CreateArgs) -> Result<(), CliError> {
     match &args.out {
         Some(path) => {
             let text = zeroize::Zeroizing::new(format!("{}\n", token.to_text().as_str()));
-            files::write_secret(path, &text, files::Existing::Keep(""))
+            Ok(files::write_secret(path, &text, files::Existing::Keep(""))?)
         }
         None => output::line(token.to_text().as_str()),
     }
@@ -161,7 +161,8 @@ fn list(args: &ListArgs) -> Result<(), CliError> {
     let mut records = AccessRecords::load(&state)?;
     records.tokens.retain(|record| record.expires >= now.0);
     if args.json {
-        let text = serde_json::to_string(&records.tokens).map_err(|error| CliError::Output(error.into()))?;
+        let text =
+            serde_json::to_string(&records.tokens).map_err(|error| ProcessError::Output(error.into()))?;
         return output::line(text);
     }
     if records.tokens.is_empty() {

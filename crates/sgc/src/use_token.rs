@@ -8,11 +8,11 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use sgc_node::config::{self, Config, Interface, TokenSource};
+use sgc_process::{ProcessError, unix_now};
 use sgc_trust::{ShareToken, TOKEN_PREFIX, TOKEN_TEXT_BYTES_MAX};
 use zeroize::Zeroizing;
 
 use crate::error::CliError;
-use crate::fleet::unix_now;
 use crate::{files, output, policy, reload, run, share_token};
 
 const TOKENS_DIR: &str = "tokens";
@@ -48,7 +48,7 @@ pub(crate) fn use_token(args: &UseArgs) -> Result<(), CliError> {
     let node = identity.node_name().as_str();
     let state = sgc_node::state_dir(&config, node).ok_or(sgc_node::StateError::Nowhere)?;
     let file = std::path::absolute(state.join(TOKENS_DIR).join(file_name(&token)))
-        .map_err(|source| CliError::Read { path: state.clone(), source })?;
+        .map_err(|source| ProcessError::Read { path: state.clone(), source })?;
     let block = block(&token, &file);
     let before = files::read_limited(&path, config::CONFIG_BYTES_MAX)?;
     let mut after = String::from_utf8_lossy(&before).into_owned();
@@ -97,12 +97,12 @@ fn token_text(given: &str) -> Result<Zeroizing<String>, CliError> {
         if std::io::stdin().is_terminal() {
             output::diagnostic("Paste the token, then end with Ctrl-D:");
         }
-        let failed = |source| CliError::System { what: "cannot read standard input", source };
+        let failed = |source| ProcessError::System { what: "cannot read standard input", source };
         std::io::stdin().take(limit).read_to_string(&mut text).map_err(failed)?;
     } else {
         let path = PathBuf::from(given);
         let read = fs::File::open(&path).and_then(|file| file.take(limit).read_to_string(&mut text));
-        read.map_err(|source| CliError::Read { path, source })?;
+        read.map_err(|source| ProcessError::Read { path, source })?;
     }
     Ok(text)
 }
@@ -163,7 +163,7 @@ fn block(token: &ShareToken, file: &Path) -> String {
 
 /// Replaces the configuration atomically. Its mode stays, and a symbolic link stays a link.
 fn replace(path: &Path, text: &str) -> Result<(), CliError> {
-    let failed = |source| CliError::Write { path: path.to_owned(), source };
+    let failed = |source| ProcessError::Write { path: path.to_owned(), source };
     let target = fs::canonicalize(path).map_err(failed)?;
     let permissions = fs::metadata(&target).map_err(failed)?.permissions();
     let dir = target.parent().unwrap_or(Path::new("/"));
@@ -171,5 +171,6 @@ fn replace(path: &Path, text: &str) -> Result<(), CliError> {
     file.write_all(text.as_bytes()).map_err(failed)?;
     file.as_file().set_permissions(permissions).map_err(failed)?;
     file.as_file().sync_all().map_err(failed)?;
-    file.persist(&target).map(drop).map_err(|error| failed(error.error))
+    file.persist(&target).map_err(|error| failed(error.error))?;
+    Ok(())
 }

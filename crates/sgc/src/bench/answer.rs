@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use sgc_dds::CycloneNetwork;
+use sgc_process::domains::{DomainLock, lock_one};
 use sgc_sync::lock;
 use sgc_trust::Suite;
 
@@ -21,7 +22,6 @@ use super::program::{End, Tally};
 use super::side::{self, Rendezvous, Side, Topics};
 use super::words::{Answer, Ask, Channel, Frame, PROTOCOL, Question, Reply, RunId};
 use super::{EVENTS_MAX, Event, failed, listen_addr, next_event, router_url, wait_ready};
-use crate::demo::domains::{DomainLock, lock_one};
 use crate::error::CliError;
 use crate::output;
 

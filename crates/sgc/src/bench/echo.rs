@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use aws_lc_rs::constant_time::verify_slices_are_equal;
+use sgc_process::ProcessError;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::runtime::Runtime;
 use tokio::sync::Semaphore;
@@ -49,7 +50,7 @@ pub(crate) struct Echo {
 impl Echo {
     /// Opens both ports for this peer and this run. The system chooses the ports if `port` is 0.
     pub(crate) fn open(peer: IpAddr, run: &RunId, port: u16) -> Result<Self, CliError> {
-        let failed = |source| CliError::System { what: "cannot open the plain echo", source };
+        let failed = |source| ProcessError::System { what: "cannot open the plain echo", source };
         let token = run.token().ok_or_else(|| failed(io::ErrorKind::InvalidInput.into()))?;
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)

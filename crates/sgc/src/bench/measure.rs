@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use rand_core::RngCore as _;
 use sgc_dds::CycloneNetwork;
+use sgc_process::ProcessError;
 use sgc_ros::RosError;
 use sgc_trust::{NodeName, Suite};
 
@@ -23,7 +24,7 @@ use super::side::{self, Rendezvous, Side, Topics};
 use super::words::{Answer, Ask, Channel, Frame, Kind, PROTOCOL, Question, Reply, RunId, Size, StreamCount};
 use super::{EVENTS_MAX, Event, failed, next_event, router_url, wait_ready};
 use crate::error::CliError;
-use crate::{fleet, output, status, why};
+use crate::{output, status, why};
 
 /// Longest wait for the first answer.
 const HELLO_MAX: Duration = Duration::from_secs(30);
@@ -111,7 +112,7 @@ pub(crate) fn measure(args: &MeasureArgs) -> Result<(), CliError> {
     let (sender, events) = sync_channel(EVENTS_MAX);
     side::tell_of_signals(sender.clone())?;
     let mut bytes = [0; 16];
-    fleet::system_rng()?.fill_bytes(&mut bytes);
+    sgc_process::system_rng()?.fill_bytes(&mut bytes);
     let mut measure_side = MeasureSide::start(args, events, sender, RunId::new(bytes))?;
     let report = measure_side.run()?;
     // A failure is ignored: the other side may be gone already.
@@ -122,10 +123,10 @@ pub(crate) fn measure(args: &MeasureArgs) -> Result<(), CliError> {
     }
     let text = || {
         serde_json::to_string_pretty(&report)
-            .map_err(|e| CliError::System { what: "cannot write the figures", source: e.into() })
+            .map_err(|e| ProcessError::System { what: "cannot write the figures", source: e.into() })
     };
     let write = |path: &PathBuf, text: String| {
-        std::fs::write(path, text).map_err(|source| CliError::Write { path: path.clone(), source })
+        std::fs::write(path, text).map_err(|source| ProcessError::Write { path: path.clone(), source })
     };
     if let Some(path) = &args.json {
         write(path, text()? + "\n")?;

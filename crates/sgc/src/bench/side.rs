@@ -14,15 +14,15 @@ use std::time::{Duration, Instant};
 
 use sgc_dds::{CycloneNetwork, DdsConfig, DiscoveryRange};
 use sgc_node::config;
+use sgc_process::children::{ROS_VARIABLES, ReadyLine, last_lines};
+use sgc_process::domains::{DomainLock, lock_one};
+use sgc_process::{EndSignals, ProcessError};
 use sgc_trust::Suite;
 use tempfile::TempDir;
 
 use super::Event;
 use super::words::{Channel, TYPE};
-use crate::demo::domains::{DomainLock, lock_one};
-use crate::demo::processes::{ROS_VARIABLES, last_lines};
 use crate::error::CliError;
-use crate::run::{EndSignals, ReadyLine};
 use crate::status;
 
 /// Longest time a node may take to end cleanly.
@@ -69,17 +69,17 @@ impl Side {
         let dir = tempfile::Builder::new()
             .prefix("sgc-bench-")
             .tempdir()
-            .map_err(|source| CliError::Write { path: std::env::temp_dir(), source })?;
+            .map_err(|source| ProcessError::Write { path: std::env::temp_dir(), source })?;
         let domain = lock_one(std::process::id()).ok_or_else(|| {
             super::failed(
                 "no free ROS domain among 20 to 69: other ROS 2 programs or demos run here; end one of them",
             )
         })?;
         let identity = fs::canonicalize(identity)
-            .map_err(|source| CliError::Read { path: identity.to_owned(), source })?;
+            .map_err(|source| ProcessError::Read { path: identity.to_owned(), source })?;
         let text = configuration(&identity, meeting, topics, domain.id())?;
         let path = dir.path().join("bench.toml");
-        fs::write(&path, text).map_err(|source| CliError::Write { path: path.clone(), source })?;
+        fs::write(&path, text).map_err(|source| ProcessError::Write { path: path.clone(), source })?;
         // Mistakes in the user's arguments are reported before any process runs.
         let config = config::load(&path, &|_: &str| None).map_err(|errors| CliError::Arguments { errors })?;
         let what = identity.display().to_string();
@@ -151,7 +151,7 @@ pub(crate) fn tell_of_signals(events: SyncSender<Event>) -> Result<(), CliError>
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
-        .map_err(|source| CliError::System { what: "cannot start a runtime", source })?;
+        .map_err(|source| ProcessError::System { what: "cannot start a runtime", source })?;
     let mut signals = {
         let _guard = runtime.enter();
         EndSignals::new()?
@@ -161,16 +161,16 @@ pub(crate) fn tell_of_signals(events: SyncSender<Event>) -> Result<(), CliError>
             signals.next().await;
             let _ = events.send(Event::Interrupted);
             signals.next().await;
-            std::process::exit(crate::error::EXIT_FAILURE.into());
+            std::process::exit(sgc_process::EXIT_FAILURE.into());
         });
     });
     Ok(())
 }
 
 fn start_node(dir: &Path, config: &Path, events: &SyncSender<Event>) -> Result<Child, CliError> {
-    let failed = |source| CliError::System { what: "cannot start a node", source };
+    let failed = |source| ProcessError::System { what: "cannot start a node", source };
     let log = dir.join("bench.log");
-    let log = File::create(&log).map_err(|source| CliError::Write { path: log, source })?;
+    let log = File::create(&log).map_err(|source| ProcessError::Write { path: log, source })?;
     let mut command = Command::new(std::env::current_exe().map_err(failed)?);
     command
         .args(["run", "--until-stdin-closes", "--print-ready", "-c"])

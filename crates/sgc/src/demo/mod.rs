@@ -4,7 +4,6 @@
 //! The nodes are `sgc run` processes with configurations as a user writes them. The talkers and listeners are DDS
 //! participants that do not know `sgc`. No packet leaves this host.
 
-pub(crate) mod domains;
 mod messages;
 mod peer;
 pub(crate) mod processes;
@@ -21,19 +20,20 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
+use sgc_process::children::{ReadyLine, last_lines};
+use sgc_process::domains::{self, DomainLock};
+use sgc_process::{EndSignals, ProcessError};
 use tokio::time::{Instant, MissedTickBehavior, interval_at, sleep_until, timeout};
 
 pub(crate) use peer::{PeerArgs, peer};
 
-use self::domains::DomainLock;
-use self::processes::{ChildEvent, ProcessName, Processes, last_lines};
+use self::processes::{ChildEvent, ProcessName, Processes};
 use self::protocol::{PeerCommand, PeerEvent};
 use self::report::{Flow, Report};
 use self::screen::Screen;
 use self::stage::{CLOUD, Stage};
 use self::topics::{Role, Topic};
 use crate::error::{CliError, EXIT_FAILURE};
-use crate::run::{EndSignals, ReadyLine};
 use crate::{output, status};
 
 /// Longest demo: one week, so that [`tracker::SEQ_MAX`] is out of reach.
@@ -74,7 +74,7 @@ pub(crate) fn demo(args: DemoArgs) -> Result<ExitCode, CliError> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
-        .map_err(|source| CliError::System { what: "cannot start a runtime", source })?;
+        .map_err(|source| ProcessError::System { what: "cannot start a runtime", source })?;
     let result = runtime.block_on(stage_and_perform(&args));
     let report = match &result {
         Ok(report) => report,
@@ -82,7 +82,7 @@ pub(crate) fn demo(args: DemoArgs) -> Result<ExitCode, CliError> {
     };
     if args.json {
         let text = serde_json::to_string(report)
-            .map_err(|e| CliError::System { what: "cannot print the report", source: e.into() })?;
+            .map_err(|e| ProcessError::System { what: "cannot print the report", source: e.into() })?;
         output::line(text)?;
     }
     result.map(|report| if report.is_ok() { ExitCode::SUCCESS } else { ExitCode::from(EXIT_FAILURE) })
@@ -199,7 +199,7 @@ impl Demo {
 
     fn start_node(&mut self, who: ProcessName, config: &str) -> Result<(), CliError> {
         let args = ["run", "-c", config, "--until-stdin-closes", "--print-ready"];
-        self.processes.start(who, &args, &self.stage.log(who.0))
+        Ok(self.processes.start(who, &args, &self.stage.log(who.0))?)
     }
 
     async fn wait_ready(&mut self, nodes: &[ProcessName]) -> Result<(), CliError> {
@@ -344,7 +344,8 @@ impl Demo {
         let socket = self.stage.socket(node);
         async move {
             tokio::task::spawn_blocking(move || status::query_node(&socket)).await.unwrap_or_else(|error| {
-                Err(CliError::System { what: "cannot ask a node", source: std::io::Error::other(error) })
+                Err(ProcessError::System { what: "cannot ask a node", source: std::io::Error::other(error) }
+                    .into())
             })
         }
     }

@@ -70,7 +70,7 @@ fn run_peer(args: &PeerArgs, events: &Events) -> Result<(), RosError> {
 
     // Standard input has ended. The steps below leave the network in good order. They must not take for ever, because
     // the parent may be dead.
-    thread::spawn(run::exit_after_grace);
+    thread::spawn(sgc_process::exit_after_grace);
     drop(orders);
     for talker in talkers {
         let _ = talker.join();

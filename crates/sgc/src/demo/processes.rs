@@ -4,7 +4,7 @@
 //! and the child ends itself. Children are in process groups of their own, so a Ctrl-C reaches only this process, which
 //! ends them in order.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io;
 use std::path::Path;
 use std::process::{ExitStatus, Stdio};
@@ -15,21 +15,11 @@ use tokio::process::{Child, ChildStdin, Command};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 
-use crate::error::CliError;
+use sgc_process::ProcessError;
+use sgc_process::children::ROS_VARIABLES;
 
-/// Environment variables that would change the network that children join.
-pub(crate) const ROS_VARIABLES: [&str; 5] = [
-    "ROS_DOMAIN_ID",
-    "ROS_LOCALHOST_ONLY",
-    "ROS_AUTOMATIC_DISCOVERY_RANGE",
-    "ROS_STATIC_PEERS",
-    "CYCLONEDDS_URI",
-];
 /// Most events of children in the queue.
 const EVENTS_MAX: usize = 1024;
-/// Number of lines at the end of a log that are shown after a failure.
-const LOG_LINES_SHOWN: usize = 5;
-
 /// The name of a child process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct ProcessName(pub(crate) &'static str);
@@ -77,9 +67,9 @@ impl Processes {
     }
 
     /// Starts `sgc` with these arguments. Its standard error goes to a file.
-    pub(crate) fn start(&mut self, who: ProcessName, args: &[&str], log: &Path) -> Result<(), CliError> {
-        let failed = |source| CliError::System { what: "cannot start a process of the demo", source };
-        let log = File::create(log).map_err(|source| CliError::Write { path: log.to_owned(), source })?;
+    pub(crate) fn start(&mut self, who: ProcessName, args: &[&str], log: &Path) -> Result<(), ProcessError> {
+        let failed = |source| ProcessError::System { what: "cannot start a process of the demo", source };
+        let log = File::create(log).map_err(|source| ProcessError::Write { path: log.to_owned(), source })?;
         let mut command = Command::new(std::env::current_exe().map_err(failed)?);
         command
             .args(args)
@@ -100,8 +90,12 @@ impl Processes {
     }
 
     /// Sends a child a line of JSON.
-    pub(crate) async fn tell(&mut self, who: ProcessName, message: &impl Serialize) -> Result<(), CliError> {
-        let failed = |source| CliError::System { what: "cannot speak to a process of the demo", source };
+    pub(crate) async fn tell(
+        &mut self,
+        who: ProcessName,
+        message: &impl Serialize,
+    ) -> Result<(), ProcessError> {
+        let failed = |source| ProcessError::System { what: "cannot speak to a process of the demo", source };
         let mut line = serde_json::to_vec(message).map_err(|e| failed(e.into()))?;
         line.push(b'\n');
         let stdin = self.children.iter_mut().find(|c| c.who == who).and_then(|c| c.stdin.as_mut());
@@ -176,12 +170,4 @@ async fn watch(
         },
     };
     let _ = events.send(ChildEvent::Ended(who, status)).await;
-}
-
-/// Returns the last lines of a log, if it has any.
-pub(crate) fn last_lines(log: &Path) -> Vec<String> {
-    let Ok(bytes) = fs::read(log) else { return Vec::new() };
-    let text = String::from_utf8_lossy(&bytes);
-    let lines: Vec<&str> = text.lines().filter(|line| !line.trim().is_empty()).collect();
-    lines[lines.len().saturating_sub(LOG_LINES_SHOWN)..].iter().map(|line| (*line).to_owned()).collect()
 }

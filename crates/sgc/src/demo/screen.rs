@@ -5,10 +5,10 @@
 use std::io::IsTerminal;
 use std::time::Duration;
 
+use sgc_process::{ProcessError, output};
+
 use super::report::Flow;
 use super::topics::{Role, Topic};
-use crate::error::CliError;
-use crate::output;
 
 const REDRAW_PERIOD: Duration = Duration::from_secs(1);
 const REPRINT_PERIOD: Duration = Duration::from_secs(2);
@@ -51,7 +51,7 @@ impl Screen {
     }
 
     /// Prints the introduction, which says how to join the demo's networks.
-    pub(crate) fn introduce(&self, robot_domain: u32, operator_domain: u32) -> Result<(), CliError> {
+    pub(crate) fn introduce(&self, robot_domain: u32, operator_domain: u32) -> Result<(), ProcessError> {
         self.say(&format!(
             "Two ROS 2 networks that cannot see each other, and three sgc processes that join them:\n\n  \
              ROS domain {robot_domain} ─ robot ══ cloud ══ operator ─ ROS domain {operator_domain}\n\n\
@@ -72,12 +72,12 @@ impl Screen {
     }
 
     /// Prints a line between introduction and table.
-    pub(crate) fn say(&self, text: &str) -> Result<(), CliError> {
+    pub(crate) fn say(&self, text: &str) -> Result<(), ProcessError> {
         if self.kind == Kind::Nothing { Ok(()) } else { output::line(text) }
     }
 
     /// Shows the table while the demo runs.
-    pub(crate) fn show(&mut self, elapsed: Duration, flows: &[Flow]) -> Result<(), CliError> {
+    pub(crate) fn show(&mut self, elapsed: Duration, flows: &[Flow]) -> Result<(), ProcessError> {
         let rates = self.rates(elapsed, flows);
         let lines = table(flows, &rates);
         match self.kind {
@@ -102,7 +102,7 @@ impl Screen {
     }
 
     /// Prints the last table and the verdict.
-    pub(crate) fn sum_up(&mut self, elapsed: Duration, flows: &[Flow]) -> Result<(), CliError> {
+    pub(crate) fn sum_up(&mut self, elapsed: Duration, flows: &[Flow]) -> Result<(), ProcessError> {
         if self.kind == Kind::Nothing {
             return Ok(());
         }

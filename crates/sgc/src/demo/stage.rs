@@ -8,6 +8,7 @@ use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 
 use sgc_node::config::{QosOverride, SOCKET_PATH_BYTES_MAX, Shaping, ShareConfig, ShareMetadata};
+use sgc_process::ProcessError;
 use sgc_trust::{EnrollRequest, Fleet, Identity, NodeName, Suite};
 use sgc_wire::{Class, Name};
 use tempfile::TempDir;
@@ -15,7 +16,7 @@ use tempfile::TempDir;
 use super::topics::{Role, Topic};
 use crate::error::CliError;
 use crate::files::{self, Existing};
-use crate::{fleet, name};
+use crate::name;
 
 /// The node that only routes.
 pub(crate) const CLOUD: &str = "cloud";
@@ -43,13 +44,14 @@ impl Stage {
                 let temporary = tempfile::Builder::new()
                     .prefix("sgc-demo-")
                     .tempdir()
-                    .map_err(|source| CliError::Write { path: std::env::temp_dir(), source })?;
+                    .map_err(|source| ProcessError::Write { path: std::env::temp_dir(), source })?;
                 (temporary.path().to_owned(), Some(temporary))
             }
         };
         let failed = |source| CliError::Fleet { path: dir.join(FLEET), source };
         let name = FLEET.parse().map_err(CliError::Label)?;
-        let fleet = Fleet::create(name, fleet::unix_now(), &mut fleet::system_rng()?).map_err(failed)?;
+        let fleet =
+            Fleet::create(name, sgc_process::unix_now(), &mut sgc_process::system_rng()?).map_err(failed)?;
         let robot = enroll(&fleet, Role::Robot.name(), false)?;
         let stage = Self { dir, temporary, fleet, robot };
         if stage.is_kept() {
@@ -111,7 +113,7 @@ impl Stage {
         }
         for node in [CLOUD, Role::Robot.name(), Role::Operator.name()] {
             let path = self.dir.join(identity_file(node));
-            fs::remove_file(&path).map_err(|source| CliError::Write { path, source })?;
+            fs::remove_file(&path).map_err(|source| ProcessError::Write { path, source })?;
         }
         Ok(())
     }
@@ -158,11 +160,11 @@ impl Stage {
 
     fn write(&self, node: &str, text: &str) -> Result<PathBuf, CliError> {
         let path = self.dir.join(format!("{node}.toml"));
-        fs::write(&path, text).map_err(|source| CliError::Write { path: path.clone(), source })?;
+        fs::write(&path, text).map_err(|source| ProcessError::Write { path: path.clone(), source })?;
         Ok(path)
     }
 
-    fn write_secret(&self, file: &str, text: &str) -> Result<(), CliError> {
+    fn write_secret(&self, file: &str, text: &str) -> Result<(), ProcessError> {
         files::write_secret(&self.dir.join(file), text, Existing::Keep(""))
     }
 }
@@ -172,18 +174,18 @@ fn identity_file(node: &str) -> String {
 }
 
 fn enroll(fleet: &Fleet, node: &str, router: bool) -> Result<Identity, CliError> {
-    let request = EnrollRequest { router, ..EnrollRequest::new(node.parse()?, fleet::unix_now()) };
+    let request = EnrollRequest { router, ..EnrollRequest::new(node.parse()?, sgc_process::unix_now()) };
     fleet
-        .issue(&request, &mut fleet::system_rng()?)
+        .issue(&request, &mut sgc_process::system_rng()?)
         .map_err(|source| CliError::Fleet { path: FLEET.into(), source })
 }
 
-fn make_empty_dir(dir: &Path) -> Result<(), CliError> {
-    let failed = |source| CliError::Write { path: dir.to_owned(), source };
+fn make_empty_dir(dir: &Path) -> Result<(), ProcessError> {
+    let failed = |source| ProcessError::Write { path: dir.to_owned(), source };
     match fs::read_dir(dir) {
         Ok(mut entries) => match entries.next() {
             None => Ok(()),
-            Some(_) => Err(CliError::Exists {
+            Some(_) => Err(ProcessError::Exists {
                 path: dir.to_owned(),
                 hint: " and is not empty; name another directory for --keep",
             }),
@@ -231,6 +233,6 @@ mod tests {
         let dir = parent.path().join("kept");
         drop(Stage::set(Some(&dir)).unwrap());
         assert!(dir.join("demo.fleet").is_file());
-        assert!(matches!(Stage::set(Some(&dir)), Err(CliError::Exists { .. })));
+        assert!(matches!(Stage::set(Some(&dir)), Err(CliError::Process(ProcessError::Exists { .. }))));
     }
 }

@@ -7,12 +7,13 @@ use std::path::{Path, PathBuf};
 use bytes::Bytes;
 use clap::Args;
 use sgc_node::LockedFleet;
+use sgc_process::{ProcessError, unix_now};
 use sgc_transport::LinkUrl;
 use sgc_trust::{CrlReport, Fleet, MergeReport, NodeName};
 use sgc_wire::{CRL_BYTES_MAX, UnixMillis};
 
 use super::keeping::{LIST_EXTENSION, list_path, push_crl, write_list};
-use super::{WhichFleet, fleet_here, unix_now};
+use super::{WhichFleet, fleet_here};
 use crate::error::CliError;
 use crate::{files, output};
 
@@ -112,7 +113,7 @@ pub(super) fn catch_up(fleet: &mut Fleet, file: &Path) -> Result<bool, CliError>
             Ok(absorbed != CrlReport::default())
         }
         // A file that is no list of this fleet must not prevent a revocation. The next list replaces it.
-        Err(error @ (CliError::List { .. } | CliError::Read { .. })) => {
+        Err(error @ (CliError::List { .. } | CliError::Process(ProcessError::Read { .. }))) => {
             output::diagnostic(&format!("Note: {error}; it is left out"));
             Ok(false)
         }

@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 
 use clap::{ArgAction, Args};
 use rustls_pki_types::CertificateDer;
+use sgc_process::{system_rng, unix_now};
 use sgc_trust::{Fleet, FleetName, NodeName, pem_contents};
 
-use super::{FLEET_EXTENSION, WhichFleet, fleet_option, system_rng, unix_now};
+use super::{FLEET_EXTENSION, WhichFleet, fleet_option};
 use crate::error::CliError;
 use crate::files::{self, Existing};
 use crate::output;

@@ -7,6 +7,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use clap::Args;
 use sgc_node::LockedFleet;
+use sgc_process::{ProcessError, system_rng, unix_now};
 use sgc_trust::{
     EnrollRequest, GroupName, Identity, KeyRequest, LEAF_VALIDITY_DEFAULT, Membership, NodeName, pem_contents,
 };
@@ -14,7 +15,7 @@ use sgc_wire::{Operation, UnixMillis};
 use zeroize::Zeroizing;
 
 use super::remote::{FleetPlace, Remote};
-use super::{DAY, copies, parse_span, system_rng, unix_now};
+use super::{DAY, copies, parse_span};
 use crate::error::CliError;
 use crate::files::{self, Existing};
 use crate::output;
@@ -103,7 +104,7 @@ impl OutputArgs {
     fn check_free(&self, path: &Path) -> Result<(), CliError> {
         match self.existing() {
             Existing::Keep(hint) if files::exists(path) => {
-                Err(CliError::Exists { path: path.to_owned(), hint })
+                Err(ProcessError::Exists { path: path.to_owned(), hint }.into())
             }
             _ => Ok(()),
         }

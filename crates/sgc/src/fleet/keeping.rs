@@ -8,12 +8,13 @@ use clap::Args;
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
 use sgc_node::{LockedFleet, roster_head, roster_row};
+use sgc_process::{ProcessError, system_rng, unix_now};
 use sgc_transport::LinkUrl;
 use sgc_trust::{EnrollRequest, Fleet, NodeName, pem_contents, pem_text};
 use sgc_wire::{RosterPage, RosterRow, UnixMillis};
 
 use super::remote::{FleetPlace, Remote};
-use super::{WhichFleet, copies, system_rng, unix_now};
+use super::{WhichFleet, copies};
 use crate::error::CliError;
 use crate::files;
 use crate::{output, status};
@@ -142,7 +143,8 @@ pub(super) fn list(args: &ListArgs) -> Result<(), CliError> {
     };
     if args.json {
         let json = serde_json::to_string_pretty(&json(&roster));
-        let json = json.map_err(|e| CliError::System { what: "JSON", source: std::io::Error::other(e) })?;
+        let json =
+            json.map_err(|e| ProcessError::System { what: "JSON", source: std::io::Error::other(e) })?;
         return output::line(json);
     }
     output::line(table(&roster, unix_now()))
@@ -269,7 +271,7 @@ pub(super) fn push_crl(
         let identity = Arc::new(identity.map_err(CliError::Making)?);
         let runtime = tokio::runtime::Runtime::new();
         let runtime =
-            runtime.map_err(|source| CliError::System { what: "the runtime does not start", source })?;
+            runtime.map_err(|source| ProcessError::System { what: "the runtime does not start", source })?;
         for url in routers {
             let list = bytes::Bytes::copy_from_slice(list);
             match runtime.block_on(sgc_node::push_crl(url, identity.clone(), list)) {

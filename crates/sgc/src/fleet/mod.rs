@@ -10,15 +10,12 @@ mod own_key;
 mod remote;
 
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use clap::{Args, Subcommand};
-use rand_chacha::ChaCha20Rng;
-use rand_core::{OsRng, SeedableRng, TryRngCore};
 use sgc_node::{LockedFleet, config};
+use sgc_process::ProcessError;
 use sgc_trust::Fleet;
-use sgc_wire::UnixMillis;
-use zeroize::Zeroize;
 
 use crate::error::CliError;
 use crate::files;
@@ -108,29 +105,11 @@ impl WhichFleet {
     }
 }
 
-/// Returns a random generator, seeded by the system.
-pub(crate) fn system_rng() -> Result<ChaCha20Rng, CliError> {
-    let mut seed = [0; 32];
-    OsRng.try_fill_bytes(&mut seed).map_err(|e| CliError::System {
-        what: "the system gives no randomness",
-        source: std::io::Error::other(e.to_string()),
-    })?;
-    let rng = ChaCha20Rng::from_seed(seed);
-    seed.zeroize();
-    Ok(rng)
-}
-
-/// Returns the time, for certificates.
-pub(crate) fn unix_now() -> UnixMillis {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    UnixMillis(u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
-}
-
 /// Returns the only fleet file of this directory, apart from `other`.
 fn fleet_here(other: Option<&Path>) -> Result<PathBuf, CliError> {
     let dir = Path::new(".");
     let mut found = files::with_extension(dir, FLEET_EXTENSION)
-        .map_err(|source| CliError::Read { path: dir.to_owned(), source })?;
+        .map_err(|source| ProcessError::Read { path: dir.to_owned(), source })?;
     found.retain(|path| {
         other.is_none_or(|other| path.file_name() != other.file_name() || is_elsewhere(other))
     });

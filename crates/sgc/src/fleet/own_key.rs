@@ -4,13 +4,13 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use rustls_pki_types::CertificateDer;
+use sgc_process::system_rng;
 use sgc_trust::{
     FleetName, FleetSecret, GroupName, Identity, Import, KeyRequest, Membership, NodeName, certificate_uris,
     pem_contents,
 };
 use zeroize::Zeroizing;
 
-use super::system_rng;
 use crate::error::CliError;
 use crate::files::{self, Existing};
 use crate::output;

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use clap::{Args, ValueEnum};
 use sgc_node::admin::AdminRequest;
 use sgc_node::shell::{PublishReport, PublishRequest};
+use sgc_process::ProcessError;
 
 use super::{ANSWER_MAX, BEGIN_MAX, NodeArgs, answer, type_and_message};
 use crate::error::{CliError, EXIT_FAILURE};
@@ -140,7 +141,8 @@ pub(super) fn publish(args: &PubArgs) -> Result<ExitCode, CliError> {
     }
     let Some(message) = message else {
         for line in std::io::stdin().lock().lines() {
-            let line = line.map_err(|source| CliError::System { what: "cannot read messages", source })?;
+            let line =
+                line.map_err(|source| ProcessError::System { what: "cannot read messages", source })?;
             publisher.publish(&yaml::json_of(&line).map_err(not_a_message)?)?;
         }
         return Ok(ExitCode::SUCCESS);

@@ -14,26 +14,26 @@ const DOMAINS: RangeInclusive<u32> = 20..=69;
 
 /// The reservation of a domain, released when it is dropped.
 #[derive(Debug)]
-pub(crate) struct DomainLock {
+pub struct DomainLock {
     id: u32,
     _lock: UnixListener,
 }
 
 impl DomainLock {
     /// Returns the domain's number.
-    pub(crate) fn id(&self) -> u32 {
+    pub fn id(&self) -> u32 {
         self.id
     }
 }
 
 /// Finds and reserves two free domains. `seed` selects where the search begins, so that processes rarely collide.
-pub(crate) fn lock_two(seed: u32) -> Option<[DomainLock; 2]> {
+pub fn lock_two(seed: u32) -> Option<[DomainLock; 2]> {
     let mut free = free(seed);
     Some([free.next()?, free.next()?])
 }
 
 /// Finds and reserves one free domain.
-pub(crate) fn lock_one(seed: u32) -> Option<DomainLock> {
+pub fn lock_one(seed: u32) -> Option<DomainLock> {
     free(seed).next()
 }
 
