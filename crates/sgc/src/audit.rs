@@ -11,8 +11,9 @@ use sgc_node::audit::{self, AuditEvent, AuditRecord};
 use sgc_node::config::{self, Config};
 use sgc_process::{ProcessError, unix_now};
 
+use crate::environment::environment;
 use crate::error::CliError;
-use crate::{output, run, status};
+use crate::output;
 
 const FILE_NAME: &str = "audit.jsonl";
 const NODE_CHARS: usize = 8;
@@ -119,9 +120,9 @@ fn path(args: &AuditArgs) -> Result<PathBuf, CliError> {
         return Ok(file.clone());
     }
     if let Some(path) = &args.config {
-        let config = config::load(path, &run::environment)
+        let config = config::load(path, &environment)
             .map_err(|errors| CliError::Config { what: path.display().to_string(), errors })?;
-        let state = sgc_node::state_dir(&config, &status::node_name(&config)?);
+        let state = sgc_node::state_dir(&config, &sgc_diagnosis::ask::node_name(&config)?);
         let path = audit::audit_path(config.audit.file.as_deref(), state.as_deref());
         return path.filter(|_| !config.audit.off).ok_or_else(|| CliError::Cannot {
             reason: "this node keeps no audit log: [audit] is off, or there is no state directory".to_owned(),

@@ -1,27 +1,16 @@
 //! `sgc check`: lists all mistakes of a configuration, or describes the node that would run with it.
 //!
-//! It reads the configuration and its identity, and binds no socket. It cannot know whether the named routers exist. It knows
-//! nodes and groups if the fleet file is at hand.
+//! It reads the configuration and its identity, and binds no socket.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args;
-use sgc_gateway::Anonymous;
-use sgc_node::UnknownMember;
-use sgc_node::alerts::clock_alert;
-use sgc_node::config::{
-    self, Config, DiscoveryRange, GatewayConfig, Interface, Naming, Rename, RouterUrl, ShareConfig,
-    TokenSource,
-};
-use sgc_node::discovery_server;
-use sgc_process::unix_now;
-use sgc_trust::Identity;
-use sgc_types::Definitions;
-use sgc_wire::PayloadForm;
+use sgc_diagnosis::check::summary;
+use sgc_node::config;
 
+use crate::environment::environment;
 use crate::error::CliError;
-use crate::fleet::FLEET_EXTENSION;
-use crate::{files, name, output, run};
+use crate::output;
 
 /// List all mistakes of a configuration, or describe the node that would run with it. Binds no socket.
 ///
@@ -37,255 +26,13 @@ pub(crate) struct CheckArgs {
 /// Runs `sgc check`.
 pub(crate) fn check(args: &CheckArgs) -> Result<(), CliError> {
     let what = args.config.display().to_string();
-    let config = config::load(&args.config, &run::environment)
+    let config = config::load(&args.config, &environment)
         .map_err(|errors| CliError::Config { what: what.clone(), errors })?;
     let identity = sgc_node::check_identity(&config)
         .map_err(|source| CliError::CheckIdentity { what: what.clone(), source })?;
     output::line(format!("{what}: no mistakes"))?;
-    for line in output::columns(&summary(&config, &identity, &args.config)?) {
+    for line in output::columns(&summary(&config, &identity, &args.config, &environment)?) {
         output::line(line)?;
     }
     Ok(())
-}
-
-fn summary(config: &Config, identity: &Identity, file: &Path) -> Result<Vec<Vec<String>>, CliError> {
-    let mut rows = Vec::new();
-    let mut row = |kind: &str, text: String| rows.push(vec![kind.to_owned(), text]);
-    row("node", format!("{} of fleet {}", identity.node_name(), identity.fleet_name()));
-    row("identity", format!("{}, holds until {}", config.identity.display(), identity.not_after()));
-    for url in &config.routers {
-        match url {
-            RouterUrl::At(url) => row("dials", url.to_string()),
-            RouterUrl::Ways(ways) => row(
-                "dials",
-                format!(
-                    "{}: the first that works",
-                    ways.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
-                ),
-            ),
-            RouterUrl::Srv(domain) => {
-                let query = domain.query();
-                row(
-                    "finds",
-                    format!("{url}, one of those that {} names in DNS", query.trim_end_matches('.')),
-                );
-            }
-            RouterUrl::Mdns(None) => {
-                row("finds", format!("{url}, routers of the local network that are trusted"))
-            }
-            RouterUrl::Mdns(Some(node)) => row("finds", format!("{url}, router {node} on the local network")),
-        }
-    }
-    if let Some(server) = &config.resolver {
-        row("", format!("looked up at {server}"));
-    }
-    for addr in &config.listen {
-        row("listens", addr.to_string());
-    }
-    if config.announce {
-        row("", "announced on the local network by mDNS".to_owned());
-    }
-    for path in &config.accept {
-        row("accepts", format!("nodes of the CAs in {} only", path.display()));
-    }
-    match &config.ros {
-        Some(ros) => {
-            let range = match ros.discovery {
-                DiscoveryRange::Off => "nobody is discovered",
-                DiscoveryRange::Localhost => "this host",
-                DiscoveryRange::Subnet => "the local subnet",
-                DiscoveryRange::SystemDefault => "as the middleware is configured",
-            };
-            let peers = match &ros.static_peers[..] {
-                [] => String::new(),
-                peers => format!(", and {}", peers.join(", ")),
-            };
-            row("ROS 2", format!("domain {}, {range}{peers}", ros.domain_id));
-        }
-        None => row("ROS 2", "none: a router only".to_owned()),
-    }
-    for share in &config.shares {
-        let to: Vec<_> = share.to.iter().map(ToString::to_string).collect();
-        let to = if to == ["*"] { "everyone in the fleet".to_owned() } else { to.join(", ") };
-        let (what, type_name) = (called(share.interface, &share.topic), type_of(share.type_name.as_deref()));
-        row("shares", format!("{what}{type_name}{} with {to}", renamed(&share.naming, "as")));
-        if !share.publish.is_empty() {
-            let publish: Vec<_> = share.publish.iter().map(ToString::to_string).collect();
-            row("", format!("published on by {} besides", publish.join(", ")));
-        }
-        if share.shaping.form == PayloadForm::Json {
-            row("", json(config, share.type_name.as_deref()));
-        }
-        if let Some(name) = name_of(config, identity, share)? {
-            row("", format!("named {name}"));
-        }
-    }
-    for one in &config.uses {
-        let (what, type_name) = (called(one.interface, &one.topic), type_of(one.type_name.as_deref()));
-        row("uses", format!("{what}{type_name} from {}{}", one.from, renamed(&one.naming, "here as")));
-        if one.shaping.form == PayloadForm::Json {
-            row("", json(config, one.type_name.as_deref()));
-        }
-    }
-    for token in &config.tokens {
-        match &token.source {
-            TokenSource::File(path) => row("uses", format!("by token, {}", path.display())),
-            TokenSource::Text(token) => {
-                row("uses", format!("{} from {}, by token", token.metadata.ros_name, token.owner_name));
-            }
-        }
-    }
-    for partner in &config.partners {
-        let nodes = match partner.nodes.len() {
-            0 => "all of its nodes".to_owned(),
-            n => format!("{n} of its nodes"),
-        };
-        row("partner", format!("{}, {nodes}, CA in {}", partner.name, partner.ca.display()));
-    }
-    if let Some(gateway) = &config.gateway {
-        rows.extend(gateway_rows(gateway));
-    }
-    if let Some(alert) = clock_alert(identity, unix_now()) {
-        rows.push(vec!["warning".to_owned(), format!("{alert}. The node starts and waits: {}", alert.fix())]);
-    }
-    if let Some(security) = config.ros.as_ref().and_then(|ros| ros.security.as_ref()) {
-        let enclave = sgc_node::enclave_of(security);
-        rows.push(vec![
-            "enclave".to_owned(),
-            format!("{} in {}", enclave.enclave, enclave.keystore.display()),
-        ]);
-        let unusable = enclave.check().err().map(|error| {
-            let goes_without = !security.enforced && error.is_absence();
-            let result = if goes_without { "goes without DDS Security" } else { "does not start like that" };
-            format!("{error}; the node {result}")
-        });
-        let exposed = enclave.exposed_key().map(|key| {
-            format!("{}: others can read it, and it is a private key: chmod 600 it", key.display())
-        });
-        rows.extend(unusable.or(exposed).map(|text| vec!["warning".to_owned(), text]));
-    }
-    if config.ros.is_some() {
-        for alert in discovery_server::alerts(&run::environment) {
-            rows.push(vec!["warning".to_owned(), format!("{alert}: {}", alert.fix())]);
-        }
-    }
-    for unknown in unknown_members(config, identity, file) {
-        rows.push(vec!["warning".to_owned(), unknown.to_string()]);
-    }
-    let state = sgc_node::state_dir(config, identity.node_name().as_str());
-    if let Some(Err(error)) = state.as_deref().map(sgc_node::check_state_dir) {
-        rows.push(vec!["warning".to_owned(), format!("{error}; the node does not start like that")]);
-    }
-    Ok(rows)
-}
-
-/// Returns the members that rules name and the fleet file lacks, if that file is at hand: the authority's, or one in this
-/// directory, beside the configuration or beside the identity.
-fn unknown_members(config: &Config, identity: &Identity, file: &Path) -> Vec<UnknownMember> {
-    let own = identity.as_peer().ca;
-    let dirs = [Some(Path::new("")), file.parent(), config.identity.parent()].into_iter().flatten();
-    let dirs = dirs.map(|dir| if dir == Path::new("") { Path::new(".") } else { dir });
-    let found = dirs.flat_map(|dir| files::with_extension(dir, FLEET_EXTENSION).unwrap_or_default());
-    let authority = config.authority.as_ref().map(|authority| authority.fleet.clone());
-    let fleets = authority.into_iter().chain(found).filter_map(|path| sgc_node::read_fleet(&path).ok());
-    let fleet = fleets.into_iter().find(|fleet| fleet.anchors().fingerprints().any(|ca| ca == own));
-    fleet.map_or_else(Vec::new, |fleet| sgc_node::unknown_members(config, &fleet))
-}
-
-/// Returns the rows about the gateway: addresses, permitted clients, and notes for the operator.
-fn gateway_rows(gateway: &GatewayConfig) -> Vec<Vec<String>> {
-    let mut rows = Vec::new();
-    let mut row = |kind: &str, text: String| rows.push(vec![kind.to_owned(), text]);
-    let listen: Vec<_> = gateway.listen.iter().map(ToString::to_string).collect();
-    row("gateway", listen.join(", "));
-    if let Some(tls) = &gateway.tls {
-        row("", format!("shows the certificate in {}", tls.certificate.display()));
-    }
-    row(
-        "",
-        match gateway.anonymous {
-            Anonymous::Local => {
-                "programs of this host may do everything; others show a token or a certificate"
-            }
-            Anonymous::None => "programs show a token or a certificate, those of this host too",
-            Anonymous::All => "whoever reaches it may do everything",
-        }
-        .to_owned(),
-    );
-    if !gateway.origins.is_empty() {
-        let origins: Vec<_> = gateway.origins.iter().map(ToString::to_string).collect();
-        row("", format!("pages of {} may connect without a token", origins.join(", ")));
-    }
-    for client in &gateway.clients {
-        let who: Vec<_> = client.who.iter().map(ToString::to_string).collect();
-        row("", format!("certificates of {}: {}", who.join(", "), client.scope));
-    }
-    for warning in gateway.warnings() {
-        row("warning", warning);
-    }
-    rows
-}
-
-/// Returns the note on sharing as JSON, which needs a definition of the type.
-fn json(config: &Config, type_name: Option<&str>) -> String {
-    let dirs = config.ros.as_ref().map_or(&[][..], |ros| &ros.definitions);
-    let found =
-        type_name.and_then(|name| name.parse().ok()).map(|name| Definitions::from_env(dirs).layout(&name));
-    match found {
-        None => "as JSON, if a definition of its type is known here by then".to_owned(),
-        Some(Ok(_)) => "as JSON".to_owned(),
-        Some(Err(why)) => format!(
-            "as JSON, but nothing can be sent: {why}; name a directory that has it with `definitions` in [ros]"
-        ),
-    }
-}
-
-fn type_of(type_name: Option<&str>) -> String {
-    type_name.map(|name| format!(" [{name}]")).unwrap_or_default()
-}
-
-/// Returns the name, preceded by its kind if it is no topic.
-fn called(interface: Interface, name: &str) -> String {
-    match interface {
-        Interface::Topic => name.to_owned(),
-        other => format!("{} {name}", other.key()),
-    }
-}
-
-/// Returns the topic's name on the other side, if it differs.
-fn renamed(naming: &Naming, word: &str) -> String {
-    let except = match &naming.except[..] {
-        [] => String::new(),
-        except => format!(" except {}", except.join(", ")),
-    };
-    match &naming.rename {
-        Rename::Keep => except,
-        Rename::As(other) => format!("{except}, {word} {other}"),
-        Rename::Namespace(namespace) => format!("{except}, {word} {namespace}/..."),
-    }
-}
-
-/// Returns the share's 256-bit name, or `None` if its type has to come from a publisher.
-fn name_of(config: &Config, identity: &Identity, share: &ShareConfig) -> Result<Option<String>, CliError> {
-    // A share of several interfaces has one name for each.
-    let several = share.interface.parts().len() > 1 || share.topic.contains('*');
-    if share.type_name.is_none() || several {
-        return Ok(None);
-    }
-    let name = name::name_of(identity, &config.identity, identity.node_name(), share)?;
-    Ok(Some(name.to_string()))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn check_reports_type_that_cannot_travel_as_json() {
-        let said = |type_name| json(&Config::default(), type_name);
-        assert_eq!(said(Some("std_msgs/msg/String")), "as JSON");
-        assert!(said(None).contains("if a definition of its type is known"));
-        let unknown = said(Some("mine/msg/Thing"));
-        assert!(unknown.contains("nothing can be sent: no definition of mine/msg/Thing"), "{unknown}");
-    }
 }

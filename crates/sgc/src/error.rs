@@ -9,6 +9,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::error::ErrorKind;
+use sgc_diagnosis::DiagnosisError;
 use sgc_gateway::AccessTokenError;
 use sgc_node::config::ConfigErrors;
 use sgc_node::partners::PartnerError;
@@ -16,7 +17,7 @@ use sgc_node::{AccessError, FleetFileError, NodeError, RulesError, StateError};
 use sgc_process::{ProcessError, output};
 use sgc_trust::{CrlError, FleetError, IdentityError, LabelError, PemError, TokenError};
 
-use crate::run::LogFilterError;
+use crate::log_filter::LogFilterError;
 pub(crate) use sgc_process::EXIT_FAILURE;
 
 /// Exit code for wrong arguments, a wrong configuration or a wrong identity.
@@ -113,16 +114,6 @@ pub(crate) enum CliError {
         /// The cause.
         source: NodeError,
     },
-    /// A router's identity where names are to be derived.
-    #[error(
-        "{} is a router's identity: it holds no fleet secret, so that a router can derive no name; use a member's \
-         identity",
-        path.display()
-    )]
-    RouterCannotName {
-        /// The identity file.
-        path: PathBuf,
-    },
     /// A text that is no log filter.
     #[error("{from} is {value:?}: {reason}")]
     LogFilter {
@@ -132,14 +123,6 @@ pub(crate) enum CliError {
         value: String,
         /// The fault.
         reason: LogFilterError,
-    },
-    /// No node answers at a status socket.
-    #[error("no node runs at {}: {reason}", path.display())]
-    NoNode {
-        /// The socket.
-        path: PathBuf,
-        /// The system's error.
-        reason: String,
     },
     /// No status socket was named and none is in the usual place.
     #[error("no node of this user runs here (no socket in {}); name one with -c or --socket", dir.display())]
@@ -152,14 +135,6 @@ pub(crate) enum CliError {
     SeveralNodes {
         /// Their names, taken from the names of their sockets.
         nodes: Vec<String>,
-    },
-    /// An answer from a status socket that is no status.
-    #[error("what answers at {} is not a node's status: {reason}", path.display())]
-    NotAStatus {
-        /// The socket.
-        path: PathBuf,
-        /// The parser's error.
-        reason: String,
     },
     /// No configuration was named and none is here.
     #[error("no configuration here (no *.toml): name one with -c FILE")]
@@ -223,12 +198,6 @@ pub(crate) enum CliError {
         /// The causes, one per line.
         reason: String,
     },
-    /// A running node cannot answer a request.
-    #[error("{reason}")]
-    NotSeen {
-        /// The cause.
-        reason: String,
-    },
     /// No definition of a type was found.
     #[error(
         "{type_name} cannot be decoded: {why}; source the workspace that defines it, name a directory with --msg-dir, or use --raw"
@@ -275,6 +244,9 @@ pub(crate) enum CliError {
         /// Further facts, printed below the error.
         facts: Vec<String>,
     },
+    /// A node that cannot be asked, or an answer that cannot be used.
+    #[error(transparent)]
+    Diagnosis(#[from] DiagnosisError),
     /// The process or one of its files.
     #[error(transparent)]
     Process(#[from] ProcessError),
@@ -325,7 +297,7 @@ impl CliError {
             | Self::SeveralFleets { .. }
             | Self::SecretLacking { .. }
             | Self::CheckIdentity { .. }
-            | Self::RouterCannotName { .. }
+            | Self::Diagnosis(DiagnosisError::RouterCannotName { .. })
             | Self::LogFilter { .. }
             | Self::SeveralNodes { .. }
             | Self::NoConfigHere
@@ -347,11 +319,9 @@ impl CliError {
             Self::Node(_) => EXIT_USAGE,
             Self::Process(_)
             | Self::FleetFile(FleetFileError::Read { .. } | FleetFileError::Write { .. })
-            | Self::NoNode { .. }
+            | Self::Diagnosis(_)
             | Self::NoNodeHere { .. }
-            | Self::NotAStatus { .. }
             | Self::NodeRefused { .. }
-            | Self::NotSeen { .. }
             | Self::NoDefinition { .. }
             | Self::NoSuchField { .. }
             | Self::NoHeader { .. }

@@ -14,12 +14,16 @@ mod audit;
 mod bench;
 mod check;
 mod demo;
+mod environment;
 mod error;
 mod files;
 mod fleet;
 mod heap;
+mod log;
+mod log_filter;
 mod memory;
 mod name;
+mod node;
 mod output;
 mod policy;
 mod reload;
@@ -38,7 +42,7 @@ use std::process::ExitCode;
 use clap::{CommandFactory as _, Parser, Subcommand};
 
 use crate::error::CliError;
-pub use crate::why::refusals::{COUNTERS, CounterTable, Refusal};
+pub use sgc_diagnosis::{COUNTERS, CounterTable, Refusal};
 
 /// Secure global connectivity for ROS 2: share exactly the topics you name with exactly the nodes you trust,
 /// between ROS 2 networks anywhere.

@@ -5,10 +5,9 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use sgc_node::config::{self, ConfigErrors, Interface, ShareConfig};
-use sgc_node::policy::metadata;
-use sgc_trust::{Identity, NodeName, derive_name};
-use sgc_wire::{Kind, Metadata, Name};
+use sgc_diagnosis::names::name_of;
+use sgc_node::config::{self, ConfigErrors, ShareConfig};
+use sgc_trust::NodeName;
 
 use crate::error::CliError;
 use crate::output;
@@ -61,24 +60,6 @@ pub(crate) fn name(args: &NameArgs) -> Result<(), CliError> {
     }
     let identity = sgc_node::load_identity(&args.identity)?;
     output::line(name_of(&identity, &args.identity, &owner, &share)?)
-}
-
-/// Derives the name of a share of `owner` with a member's secret. The share has to have a type.
-pub(crate) fn name_of(
-    identity: &Identity,
-    identity_path: &Path,
-    owner: &NodeName,
-    share: &ShareConfig,
-) -> Result<Name, CliError> {
-    let newest = identity.naming_secrets().first().map(|n| &n.secret);
-    let (Some(secret), Some(owner_id)) = (newest, identity.node_id_of(owner.as_str())) else {
-        return Err(CliError::RouterCannotName { path: identity_path.to_owned() });
-    };
-    let metadata = Metadata {
-        kind: if share.interface == Interface::Service { Kind::Service } else { Kind::Topic },
-        ..metadata(share, owner.as_str())
-    };
-    Ok(derive_name(secret, &owner_id, &metadata))
 }
 
 impl NameArgs {

@@ -7,6 +7,7 @@ use std::process::ExitCode;
 
 use clap::{Args, Subcommand};
 use serde::Serialize;
+use sgc_diagnosis::DiagnosisError;
 use sgc_node::config::{self, Config};
 use sgc_node::partners::Partners;
 use sgc_node::policy::{Subject, Verdict, explain};
@@ -14,8 +15,9 @@ use sgc_process::{ProcessError, unix_now};
 use sgc_trust::{GroupName, Identity, NodeName};
 use sgc_wire::Role;
 
+use crate::environment::environment;
 use crate::error::{CliError, EXIT_FAILURE};
-use crate::{files, output, run};
+use crate::{files, output};
 
 const CERTIFICATE_BYTES_MAX: u64 = 64 * 1024;
 
@@ -86,8 +88,8 @@ pub(crate) fn policy(args: &PolicyArgs) -> Result<ExitCode, CliError> {
 /// Loads a configuration with the identity and the partners that a node with it would have now.
 pub(crate) fn load(path: &Path) -> Result<(Config, Identity, Partners), CliError> {
     let what = path.display().to_string();
-    let config = config::load(path, &run::environment)
-        .map_err(|errors| CliError::Config { what: what.clone(), errors })?;
+    let config =
+        config::load(path, &environment).map_err(|errors| CliError::Config { what: what.clone(), errors })?;
     let identity =
         sgc_node::check_identity(&config).map_err(|source| CliError::CheckIdentity { what, source })?;
     let state = sgc_node::state_dir(&config, identity.node_name().as_str()).filter(|dir| dir.is_dir());
@@ -159,7 +161,7 @@ fn subject(
         let name: NodeName = name.parse()?;
         let groups = args.groups.iter().map(|g| g.parse()).collect::<Result<Vec<GroupName>, _>>()?;
         let (Some(secret), Some(node)) = (identity.fleet_secret(), identity.node_id_of(name.as_str())) else {
-            return Err(CliError::RouterCannotName { path: config.identity.clone() });
+            return Err(DiagnosisError::RouterCannotName { path: config.identity.clone() }.into());
         };
         let mut groups: Vec<_> = groups.iter().map(|group| secret.group_tag(group.as_str())).collect();
         groups.sort_unstable();

@@ -7,10 +7,12 @@ use std::time::Duration;
 
 use clap::Args;
 use serde::Deserialize;
+use sgc_diagnosis::{DiagnosisError, ask};
 use sgc_node::admin::AdminRequest;
 
 use crate::error::CliError;
-use crate::{output, status};
+use crate::node;
+use crate::output;
 
 /// Longest time a node may take to read files and to change its shares.
 const ANSWER_MAX: Duration = Duration::from_secs(30);
@@ -55,7 +57,7 @@ struct Report {
 /// Runs `sgc reload`.
 pub(crate) fn reload(args: &ReloadArgs) -> Result<(), CliError> {
     let named = args.node.as_deref().map(sgc_node::default_socket_path);
-    let socket = status::socket(args.config.as_deref(), named.as_deref().or(args.socket.as_deref()))?;
+    let socket = node::socket(args.config.as_deref(), named.as_deref().or(args.socket.as_deref()))?;
     let report = ask(&socket)?;
     if args.json {
         return output::line(report);
@@ -67,7 +69,7 @@ pub(crate) fn reload(args: &ReloadArgs) -> Result<(), CliError> {
 pub(crate) fn after_change(socket: &Path) -> Result<Vec<String>, CliError> {
     match ask(socket) {
         Ok(report) => Ok(lines(report, "The node that runs knows it.")),
-        Err(CliError::NoNode { .. }) => {
+        Err(CliError::Diagnosis(DiagnosisError::NoNode { .. })) => {
             Ok(vec!["The node does not run; it counts from its next start.".to_owned()])
         }
         Err(error) => Err(error),
@@ -75,14 +77,15 @@ pub(crate) fn after_change(socket: &Path) -> Result<Vec<String>, CliError> {
 }
 
 fn ask(socket: &Path) -> Result<serde_json::Value, CliError> {
-    let text = status::ask(socket, &AdminRequest::Reload, ANSWER_MAX)?;
+    let text = ask::ask(socket, &AdminRequest::Reload, ANSWER_MAX)?;
     match serde_json::from_str(&text) {
         Ok(Answer::Done(report)) => Ok(report),
         Ok(Answer::Refused(reason)) => Err(CliError::NodeRefused { path: socket.to_owned(), reason }),
-        Err(_) => Err(CliError::NotAStatus {
+        Err(_) => Err(DiagnosisError::NotAStatus {
             path: socket.to_owned(),
             reason: "it does not know `reload`: it is of an earlier version; restart it".to_owned(),
-        }),
+        }
+        .into()),
     }
 }
 

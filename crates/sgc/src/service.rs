@@ -5,12 +5,13 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use serde_json::value::RawValue;
+use sgc_diagnosis::ask::{answer, ask};
 use sgc_node::admin::AdminRequest;
 use sgc_node::shell::CallRequest;
 
 use crate::error::CliError;
-use crate::topic::{NodeArgs, answer};
-use crate::{output, status, yaml};
+use crate::node::NodeArgs;
+use crate::{output, yaml};
 
 /// Time that the node may take to answer beyond the call itself.
 const ANSWER_MAX: Duration = Duration::from_secs(5);
@@ -66,7 +67,7 @@ pub(crate) fn service(args: &ServiceArgs) -> Result<ExitCode, CliError> {
     };
     let socket = args.node.socket()?;
     let patience = Duration::from_secs(args.timeout).saturating_add(ANSWER_MAX);
-    let text = status::ask(&socket, &AdminRequest::Call(wish), patience)?;
+    let text = ask(&socket, &AdminRequest::Call(wish), patience)?;
     let reply: Box<RawValue> = answer(&socket, &text)?;
     output::line(reply)?;
     Ok(ExitCode::SUCCESS)

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
+use sgc_diagnosis::DiagnosisError;
 use sgc_node::config::{self, Config, Interface, RouterUrl, ShareConfig};
 use sgc_node::partners::{TokenRecord, TokenRecords, read_ca_file};
 use sgc_node::policy::metadata;
@@ -16,7 +17,6 @@ use sgc_trust::{FleetSecret, Identity, ShareToken, TOKEN_ROUTERS_MAX, TopicSecre
 use sgc_wire::{NodeId, UnixMillis};
 
 use crate::error::CliError;
-use crate::topic::NodeArgs;
 use crate::{files, output, policy, reload};
 
 const VALID_MAX: Duration = Duration::from_secs(3650 * 86_400);
@@ -83,7 +83,7 @@ fn give(
     let seen = seen_types(config, identity.node_name().as_str(), topic);
     let share = share(args, topic, config, seen.as_ref())?;
     let Some(secret) = naming_secret(identity) else {
-        return Err(CliError::RouterCannotName { path: config.identity.clone() });
+        return Err(DiagnosisError::RouterCannotName { path: config.identity.clone() }.into());
     };
     let (ca, fingerprint, node) = recipient(args.to.as_deref().unwrap_or_default())?;
     if fingerprint == identity.as_peer().ca.to_string() {
@@ -142,7 +142,7 @@ fn give(
 pub(crate) fn seen_types(config: &Config, node: &str, topic: &str) -> Option<BTreeSet<String>> {
     let socket = sgc_node::admin_socket_path(config, node);
     // Without an answer of the node, the user has to give the type.
-    let graph = NodeArgs::at(&socket).graph(None).ok()?;
+    let graph = sgc_diagnosis::ask::graph(&socket, None).ok()?;
     let shared = graph.shares.iter().flat_map(|share| &share.routes).filter(|route| route.topic == topic);
     let seen = graph.endpoints.iter().filter(|end| end.is_ros_topic && end.topic == topic);
     Some(shared.map(|route| &route.type_name).chain(seen.map(|end| &end.type_name)).cloned().collect())

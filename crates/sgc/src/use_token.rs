@@ -12,8 +12,9 @@ use sgc_process::{ProcessError, unix_now};
 use sgc_trust::{ShareToken, TOKEN_PREFIX, TOKEN_TEXT_BYTES_MAX};
 use zeroize::Zeroizing;
 
+use crate::environment::environment;
 use crate::error::CliError;
-use crate::{files, output, policy, reload, run, share_token};
+use crate::{files, output, policy, reload, share_token};
 
 const TOKENS_DIR: &str = "tokens";
 
@@ -57,7 +58,7 @@ pub(crate) fn use_token(args: &UseArgs) -> Result<(), CliError> {
     }
     after.push_str(&block);
     let base = path.parent().unwrap_or(Path::new(""));
-    if config::parse(&after, &path.display().to_string(), base, &run::environment).is_err() {
+    if config::parse(&after, &path.display().to_string(), base, &environment).is_err() {
         let reason =
             format!("{} cannot be added to; add these lines yourself:\n{}", path.display(), block.trim());
         return Err(CliError::Cannot { reason });

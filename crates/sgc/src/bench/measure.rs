@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use rand_core::RngCore as _;
 use sgc_dds::CycloneNetwork;
+use sgc_diagnosis::status;
 use sgc_process::ProcessError;
 use sgc_ros::RosError;
 use sgc_trust::{NodeName, Suite};
@@ -24,7 +25,7 @@ use super::side::{self, Rendezvous, Side, Topics};
 use super::words::{Answer, Ask, Channel, Frame, Kind, PROTOCOL, Question, Reply, RunId, Size, StreamCount};
 use super::{EVENTS_MAX, Event, failed, next_event, router_url, wait_ready};
 use crate::error::CliError;
-use crate::{output, status, why};
+use crate::output;
 
 /// Longest wait for the first answer.
 const HELLO_MAX: Duration = Duration::from_secs(30);
@@ -314,8 +315,8 @@ impl<'a> MeasureSide<'a> {
                 "`sgc bench answer` prints the name of its node there: that belongs behind --with".to_owned();
             return CliError::Bench { reason, facts: vec![fact] };
         }
-        let mut facts = why::first_wrong(&self.side.socket(), &Channel::Control.answer())
-            .or_else(|| why::first_wrong(&self.side.socket(), &Channel::Control.ask()))
+        let mut facts = sgc_diagnosis::first_wrong(&self.side.socket(), &Channel::Control.answer())
+            .or_else(|| sgc_diagnosis::first_wrong(&self.side.socket(), &Channel::Control.ask()))
             .unwrap_or_default();
         facts.push(format!(
             "is --with right? `sgc bench answer` prints the name of its node; here it is {who}"
@@ -343,7 +344,9 @@ impl<'a> MeasureSide<'a> {
         let mut facts = Vec::new();
         match self.side.status() {
             Ok(status) if status.links.iter().any(|link| !link.silent) => {
-                facts.extend(why::first_wrong(&self.side.socket(), &channel.ask()).unwrap_or_default());
+                facts.extend(
+                    sgc_diagnosis::first_wrong(&self.side.socket(), &channel.ask()).unwrap_or_default(),
+                );
                 facts.push(
                     "the link of this side is up: look at what `sgc bench answer` said there".to_owned(),
                 );

@@ -13,6 +13,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use sgc_dds::{CycloneNetwork, DdsConfig, DiscoveryRange};
+use sgc_diagnosis::status;
 use sgc_node::config;
 use sgc_process::children::{ROS_VARIABLES, ReadyLine, last_lines};
 use sgc_process::domains::{DomainLock, lock_one};
@@ -23,7 +24,6 @@ use tempfile::TempDir;
 use super::Event;
 use super::words::{Channel, TYPE};
 use crate::error::CliError;
-use crate::status;
 
 /// Longest time a node may take to end cleanly.
 const END_MAX: Duration = Duration::from_secs(6);
@@ -101,7 +101,7 @@ impl Side {
 
     /// Asks the node for its status.
     pub(crate) fn status(&self) -> Result<status::Status, CliError> {
-        status::query_node(&self.socket())
+        Ok(status::query(&self.socket())?)
     }
 
     /// Returns the node's status socket.
@@ -201,7 +201,7 @@ fn start_node(dir: &Path, config: &Path, events: &SyncSender<Event>) -> Result<C
 fn take_over_revocations(config: &config::Config, dir: &Path) {
     let mut usual = config.clone();
     usual.state = None;
-    let Ok(name) = status::node_name(config) else { return };
+    let Ok(name) = sgc_diagnosis::ask::node_name(config) else { return };
     let Some(kept) = sgc_node::state_dir(&usual, &name) else { return };
     let state = dir.join("state");
     let lists = crate::files::with_extension(&kept.join("crl"), "crl").unwrap_or_default();

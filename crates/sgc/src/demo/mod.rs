@@ -20,6 +20,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
+use sgc_diagnosis::status;
 use sgc_process::children::{ReadyLine, last_lines};
 use sgc_process::domains::{self, DomainLock};
 use sgc_process::{EndSignals, ProcessError};
@@ -34,7 +35,7 @@ use self::screen::Screen;
 use self::stage::{CLOUD, Stage};
 use self::topics::{Role, Topic};
 use crate::error::{CliError, EXIT_FAILURE};
-use crate::{output, status};
+use crate::output;
 
 /// Longest demo: one week, so that [`tracker::SEQ_MAX`] is out of reach.
 const SECONDS_MAX: i64 = 7 * 86_400;
@@ -343,10 +344,13 @@ impl Demo {
     fn status_of(&self, node: &str) -> impl Future<Output = Result<status::Status, CliError>> + use<> {
         let socket = self.stage.socket(node);
         async move {
-            tokio::task::spawn_blocking(move || status::query_node(&socket)).await.unwrap_or_else(|error| {
-                Err(ProcessError::System { what: "cannot ask a node", source: std::io::Error::other(error) }
-                    .into())
-            })
+            match tokio::task::spawn_blocking(move || status::query(&socket)).await {
+                Ok(status) => Ok(status?),
+                Err(error) => {
+                    let source = std::io::Error::other(error);
+                    Err(ProcessError::System { what: "cannot ask a node", source }.into())
+                }
+            }
         }
     }
 

@@ -21,7 +21,6 @@ use super::protocol::{PeerCommand, PeerEvent};
 use super::topics::{Role, Topic};
 use super::tracker::Tracker;
 use crate::error::{CliError, EXIT_FAILURE};
-use crate::run;
 
 /// The period of its reports.
 const REPORT_PERIOD: Duration = Duration::from_millis(200);
@@ -39,7 +38,7 @@ pub(crate) struct PeerArgs {
 
 /// Runs a peer until standard input ends.
 pub(crate) fn peer(args: PeerArgs) -> Result<(), CliError> {
-    run::start_log(None)?;
+    crate::log::start_log(None)?;
     let events = Events::default();
     if let Err(error) = run_peer(&args, &events) {
         events.tell(&PeerEvent::Failed { reason: error.to_string() });

@@ -16,7 +16,6 @@ use tempfile::TempDir;
 use super::topics::{Role, Topic};
 use crate::error::CliError;
 use crate::files::{self, Existing};
-use crate::name;
 
 /// The node that only routes.
 pub(crate) const CLOUD: &str = "cloud";
@@ -135,7 +134,7 @@ impl Stage {
             suite: Suite::Group,
             metadata: ShareMetadata::default(),
         };
-        name::name_of(&self.robot, &self.dir, &owner, &share)
+        Ok(sgc_diagnosis::names::name_of(&self.robot, &self.dir, &owner, &share)?)
     }
 
     /// Returns the path of a node's status socket.

@@ -4,10 +4,11 @@ use std::path::{Path, PathBuf};
 
 use clap::{ArgAction, Args};
 use rustls_pki_types::CertificateDer;
+use sgc_diagnosis::check::FLEET_EXTENSION;
 use sgc_process::{system_rng, unix_now};
 use sgc_trust::{Fleet, FleetName, NodeName, pem_contents};
 
-use super::{FLEET_EXTENSION, WhichFleet, fleet_option};
+use super::{WhichFleet, fleet_option};
 use crate::error::CliError;
 use crate::files::{self, Existing};
 use crate::output;

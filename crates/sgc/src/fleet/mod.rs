@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::{Args, Subcommand};
+use sgc_diagnosis::check::FLEET_EXTENSION;
 use sgc_node::{LockedFleet, config};
 use sgc_process::ProcessError;
 use sgc_trust::Fleet;
@@ -20,7 +21,6 @@ use sgc_trust::Fleet;
 use crate::error::CliError;
 use crate::files;
 
-pub(crate) const FLEET_EXTENSION: &str = "fleet";
 const DAY: Duration = Duration::from_secs(86_400);
 
 /// Make a fleet, and enrol, renew and revoke its nodes.

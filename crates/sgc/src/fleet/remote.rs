@@ -8,6 +8,7 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use clap::Args;
 use serde::Deserialize;
+use sgc_diagnosis::{DiagnosisError, ask};
 use sgc_node::admin::AdminRequest;
 use sgc_trust::{IdentityError, Membership, NodeName};
 use sgc_wire::{
@@ -17,7 +18,7 @@ use zeroize::Zeroizing;
 
 use super::WhichFleet;
 use crate::error::CliError;
-use crate::status;
+use crate::node;
 
 /// Longest wait for the node's answer. The node gives up earlier.
 const ANSWER_MAX: Duration = Duration::from_secs(40);
@@ -41,7 +42,7 @@ impl FleetPlace {
     pub(super) fn remote(&self) -> Result<Option<Remote>, CliError> {
         let Some(at) = &self.at else { return Ok(None) };
         let at = at.parse()?;
-        Ok(Some(Remote { at, socket: status::socket(None, self.socket.as_deref())? }))
+        Ok(Some(Remote { at, socket: node::socket(None, self.socket.as_deref())? }))
     }
 }
 
@@ -110,17 +111,18 @@ impl Remote {
 
     fn ask(&self, operation: Operation) -> Result<OperationAnswer, CliError> {
         let request = AdminRequest::Operate { at: self.at.clone(), operation };
-        let text = Zeroizing::new(status::ask(&self.socket, &request, ANSWER_MAX)?);
+        let text = Zeroizing::new(ask::ask(&self.socket, &request, ANSWER_MAX)?);
         let answer = match serde_json::from_str(&text) {
             Ok(Answer::Done { answer }) => Zeroizing::new(answer),
-            Ok(Answer::Refused(reason)) => return Err(CliError::NotSeen { reason }),
+            Ok(Answer::Refused(reason)) => return Err(DiagnosisError::NotSeen { reason }.into()),
             Err(_) => return Err(self.surprised()),
         };
         let bytes = Zeroizing::new(STANDARD.decode(answer.as_bytes()).map_err(|_| self.surprised())?);
         match OperationAnswer::from_slice(&bytes) {
             Ok(OperationAnswer::Refused { why: OperationRefusal::Stale, .. }) => {
                 let at = self.at.to_string();
-                Err(CliError::NotSeen { reason: sgc_node::OperationError::OutcomeUnknown { at }.to_string() })
+                let reason = sgc_node::OperationError::OutcomeUnknown { at }.to_string();
+                Err(DiagnosisError::NotSeen { reason }.into())
             }
             Ok(OperationAnswer::Refused { why: OperationRefusal::Fleet, detail }) => {
                 Err(self.failed(&detail))
@@ -135,10 +137,11 @@ impl Remote {
     }
 
     fn failed(&self, why: &str) -> CliError {
-        CliError::NotSeen { reason: format!("{} refuses: {why}", self.at) }
+        DiagnosisError::NotSeen { reason: format!("{} refuses: {why}", self.at) }.into()
     }
 
     fn surprised(&self) -> CliError {
-        CliError::NotSeen { reason: format!("the node here or {} is of another version of sgc", self.at) }
+        let reason = format!("the node here or {} is of another version of sgc", self.at);
+        DiagnosisError::NotSeen { reason }.into()
     }
 }

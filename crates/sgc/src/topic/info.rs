@@ -5,8 +5,8 @@ use std::process::ExitCode;
 use clap::Args;
 use sgc_node::graph::{Endpoint, Graph, Qos};
 
-use super::NodeArgs;
 use crate::error::{CliError, EXIT_FAILURE};
+use crate::node::NodeArgs;
 use crate::output;
 
 /// Show a topic's publishers and subscribers, here and on the far side

@@ -8,8 +8,8 @@ use serde::Serialize;
 use sgc_node::graph::{Graph, Interface};
 use sgc_ros::is_pattern;
 
-use super::NodeArgs;
 use crate::error::CliError;
+use crate::node::NodeArgs;
 use crate::output;
 
 /// List topics of the local network and topics that other nodes share with this one

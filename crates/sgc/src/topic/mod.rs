@@ -17,14 +17,14 @@ use std::time::Duration;
 use clap::{Args, Subcommand, ValueEnum};
 use serde::Deserialize;
 use sgc_cdr::DESCRIPTION_BYTES_MAX;
+use sgc_diagnosis::DiagnosisError;
+use sgc_diagnosis::ask::{self, answer};
 use sgc_node::admin::{AdminRequest, TapHead};
-use sgc_node::graph::{Graph, Side};
+use sgc_node::graph::Side;
 
 use crate::error::CliError;
-use crate::status;
+use crate::node::NodeArgs;
 
-/// Longest time a node may take to answer.
-const ANSWER_MAX: Duration = Duration::from_secs(5);
 /// Longest time a node may take to create a local reader.
 const BEGIN_MAX: Duration = Duration::from_secs(30);
 /// Longest first line of a tap. A type description in base64 fits.
@@ -48,20 +48,6 @@ enum TopicCommand {
     Hz(rates::HzArgs),
     Bw(rates::BwArgs),
     Delay(rates::DelayArgs),
-}
-
-/// The node to ask.
-#[derive(Debug, Args)]
-pub(crate) struct NodeArgs {
-    /// Configuration of the node; without it, the only node that this user runs here
-    #[arg(short, long, value_name = "FILE", conflicts_with_all = ["socket", "node"])]
-    config: Option<PathBuf>,
-    /// Name of the node, if its socket is in the usual place
-    #[arg(long, value_name = "NAME", conflicts_with = "socket")]
-    node: Option<String>,
-    /// Status socket of the node
-    #[arg(long, value_name = "PATH")]
-    socket: Option<PathBuf>,
 }
 
 /// The side on which messages of a topic are copied.
@@ -110,46 +96,6 @@ pub(crate) fn topic(args: &TopicArgs) -> Result<ExitCode, CliError> {
     }
 }
 
-impl NodeArgs {
-    /// Names the node at this socket.
-    pub(crate) fn at(socket: &Path) -> Self {
-        Self { config: None, node: None, socket: Some(socket.to_owned()) }
-    }
-
-    /// Returns the node's status socket.
-    pub(crate) fn socket(&self) -> Result<PathBuf, CliError> {
-        let named = self.node.as_deref().map(sgc_node::default_socket_path);
-        status::socket(self.config.as_deref(), named.as_deref().or(self.socket.as_deref()))
-    }
-
-    /// Returns the node's graph.
-    pub(crate) fn graph(&self, name: Option<sgc_wire::Name>) -> Result<Graph, CliError> {
-        let socket = self.socket()?;
-        let text = status::ask(&socket, &AdminRequest::Graph(name), ANSWER_MAX)?;
-        answer(&socket, &text)
-    }
-}
-
-#[derive(Debug, Deserialize)]
-enum Answer<T> {
-    #[serde(rename = "ok")]
-    Done(T),
-    #[serde(rename = "error")]
-    Refused(String),
-}
-
-/// Parses a node's answer.
-pub(crate) fn answer<T: serde::de::DeserializeOwned>(socket: &Path, text: &str) -> Result<T, CliError> {
-    match serde_json::from_str(text) {
-        Ok(Answer::Done(what)) => Ok(what),
-        Ok(Answer::Refused(reason)) => Err(CliError::NotSeen { reason }),
-        Err(_) => Err(CliError::NotAStatus {
-            path: socket.to_owned(),
-            reason: "it does not know what it was asked: it is of an earlier version; restart it".to_owned(),
-        }),
-    }
-}
-
 /// The first line of a tap: the type of the topic.
 #[derive(Debug, Deserialize)]
 struct TapType {
@@ -180,8 +126,8 @@ impl TapArgs {
     fn begin(&self, bytes: u32) -> Result<Tap, CliError> {
         let socket = self.node.socket()?;
         let request = AdminRequest::Tap { topic: self.topic.clone(), side: self.side.map(Into::into), bytes };
-        let no_node = |error: std::io::Error| status::no_node(&socket, &error, BEGIN_MAX);
-        let mut stream = status::connect(&socket, BEGIN_MAX)?;
+        let no_node = |error: std::io::Error| ask::no_node(&socket, &error, BEGIN_MAX);
+        let mut stream = ask::connect(&socket, BEGIN_MAX)?;
         stream.set_read_timeout(Some(BEGIN_MAX)).map_err(no_node)?;
         stream.write_all(request.to_line().as_bytes()).map_err(no_node)?;
         let mut line = Vec::new();
@@ -201,9 +147,8 @@ impl TapArgs {
 impl Tap {
     /// Returns the next message and its copied bytes. Returns `None` at the end of the stream, or after `patience` without a message.
     fn next(&mut self, patience: Option<Duration>) -> Result<Option<(TapHead, Vec<u8>)>, CliError> {
-        let broken = |socket: &Path, error: &std::io::Error| {
-            status::no_node(socket, error, patience.unwrap_or_default())
-        };
+        let broken =
+            |socket: &Path, error: &std::io::Error| ask::no_node(socket, error, patience.unwrap_or_default());
         self.stream.set_read_timeout(patience).map_err(|e| broken(&self.socket, &e))?;
         let mut head = [0; TapHead::BYTES];
         match self.stream.read_exact(&mut head) {
@@ -212,16 +157,17 @@ impl Tap {
                 use std::io::ErrorKind::{TimedOut, UnexpectedEof, WouldBlock};
                 return match error.kind() {
                     UnexpectedEof | WouldBlock | TimedOut => Ok(None),
-                    _ => Err(broken(&self.socket, &error)),
+                    _ => Err(broken(&self.socket, &error).into()),
                 };
             }
         }
         let head = TapHead::from_bytes(&head);
         if head.carried > MESSAGE_BYTES_MAX {
-            return Err(CliError::NotAStatus {
+            return Err(DiagnosisError::NotAStatus {
                 path: self.socket.clone(),
                 reason: format!("a message of {} bytes", head.carried),
-            });
+            }
+            .into());
         }
         let mut payload = vec![0; head.carried as usize];
         self.stream.set_read_timeout(Some(BEGIN_MAX)).map_err(|e| broken(&self.socket, &e))?;

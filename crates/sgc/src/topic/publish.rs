@@ -7,13 +7,16 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use clap::{Args, ValueEnum};
+use sgc_diagnosis::DiagnosisError;
+use sgc_diagnosis::ask::{self, ANSWER_MAX, answer};
 use sgc_node::admin::AdminRequest;
 use sgc_node::shell::{PublishReport, PublishRequest};
 use sgc_process::ProcessError;
 
-use super::{ANSWER_MAX, BEGIN_MAX, NodeArgs, answer, type_and_message};
+use super::{BEGIN_MAX, type_and_message};
 use crate::error::{CliError, EXIT_FAILURE};
-use crate::{output, status, yaml};
+use crate::node::NodeArgs;
+use crate::{output, yaml};
 
 /// Default time to wait for subscribers, in seconds.
 const WAIT_DEFAULT_S: u64 = 10;
@@ -83,8 +86,8 @@ struct Publisher {
 impl Publisher {
     fn begin(socket: PathBuf, wish: PublishRequest) -> Result<(Self, PublishReport), CliError> {
         let patience = BEGIN_MAX + Duration::from_millis(wish.wait_ms);
-        let no_node = |error: std::io::Error| status::no_node(&socket, &error, patience);
-        let mut into = status::connect(&socket, patience)?;
+        let no_node = |error: std::io::Error| ask::no_node(&socket, &error, patience);
+        let mut into = ask::connect(&socket, patience)?;
         into.set_read_timeout(Some(patience)).map_err(no_node)?;
         into.write_all(AdminRequest::Publish(wish).to_line().as_bytes()).map_err(no_node)?;
         let from = BufReader::new(into.try_clone().map_err(no_node)?);
@@ -95,14 +98,14 @@ impl Publisher {
     }
 
     fn broken(&self, error: &std::io::Error) -> CliError {
-        status::no_node(&self.socket, error, ANSWER_MAX)
+        ask::no_node(&self.socket, error, ANSWER_MAX).into()
     }
 
     fn answer<T: serde::de::DeserializeOwned>(&mut self) -> Result<T, CliError> {
         let mut line = String::new();
         match self.from.read_line(&mut line) {
-            Ok(0) => Err(CliError::NotSeen { reason: "the node stopped".to_owned() }),
-            Ok(_) => answer(&self.socket, line.trim_end()),
+            Ok(0) => Err(DiagnosisError::NotSeen { reason: "the node stopped".to_owned() }.into()),
+            Ok(_) => Ok(answer(&self.socket, line.trim_end())?),
             Err(error) => Err(self.broken(&error)),
         }
     }

@@ -6,7 +6,7 @@ const SHOWN_MAX: usize = 3;
 const COMPARED_BYTES_MAX: usize = 256;
 
 /// Returns the `candidates` close to `name`: in another namespace, in other case, or a few letters away.
-pub(super) fn near<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> Vec<&'a str> {
+pub(crate) fn near<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> Vec<&'a str> {
     let mut found: Vec<(usize, &str)> = candidates
         .into_iter()
         .filter(|candidate| *candidate != name)
@@ -18,7 +18,7 @@ pub(super) fn near<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>
 }
 
 /// Formats `"; did you mean /a or /b?"`, or nothing.
-pub(super) fn hint(near: &[&str]) -> String {
+pub(crate) fn hint(near: &[&str]) -> String {
     match near {
         [] => String::new(),
         all => format!("; did you mean {}?", all.join(" or ")),

@@ -12,7 +12,8 @@ use sgc_transport::PeerRefusal;
 use sgc_trust::CertError;
 use sgc_wire::{RefuseReason, RejectReason};
 
-use super::{Verdict, diagnose};
+use crate::diagnose;
+use crate::step::Verdict;
 
 const STRING: &str = "std_msgs/msg/String";
 const NAME: &str = "aa";
@@ -415,7 +416,7 @@ fn refusals_and_their_peers_precede_walk() {
     // A router, which knows only names, reports the same.
     assert!(named(&graph).iter().any(|(_, found)| found.contains("crl_flood 9")));
     // Only the most frequent refusals are reported.
-    let all = crate::why::refusals::tests::every_named_refusal();
+    let all = crate::refusals::tests::every_named_refusal();
     graph.drops.extend(all.into_iter().map(|key| (key.to_owned(), 1)));
     let steps = diagnose::interface(&graph, "/a");
     assert_eq!(steps.iter().filter(|step| step.found.starts_with("refused here: ")).count(), 8 - 3);

@@ -9,7 +9,8 @@ use sgc_transport::PeerRefusal;
 use sgc_trust::CertError;
 use sgc_wire::{RefuseReason, RejectReason};
 
-use super::{Step, diagnose};
+use crate::links::link_of;
+use crate::step::Step;
 
 /// Most refusals that `sgc why` reports before its walk, by descending count.
 const NAMED_MAX: usize = 8;
@@ -689,12 +690,12 @@ impl Answer {
 }
 
 /// Returns the remedy at the owner that refused a topic, unless its policy is the reason.
-pub(super) fn fix_at_owner(why: &str) -> Option<&'static str> {
+pub(crate) fn fix_at_owner(why: &str) -> Option<&'static str> {
     fixes(why).map(|(owner, _)| owner).filter(|fix| !fix.is_empty())
 }
 
 /// Returns the remedy at the node to which a topic is refused, unless the owner's policy is the reason.
-pub(super) fn fix_at_asker(why: &str) -> Option<&'static str> {
+pub(crate) fn fix_at_asker(why: &str) -> Option<&'static str> {
     fixes(why).map(|(_, asker)| asker).filter(|fix| !fix.is_empty())
 }
 
@@ -703,7 +704,7 @@ fn fixes(why: &str) -> Option<(&'static str, &'static str)> {
 }
 
 /// Returns the remedy for a link that either end refused, by the reason at the end of `why`.
-pub(super) fn fix_of_link(why: &str) -> Option<&'static str> {
+pub(crate) fn fix_of_link(why: &str) -> Option<&'static str> {
     let other_fleet = "`sgc check -c FILE` says of which fleet this node's identity is. If it is the wrong one, bring the right file here; if \
          the router is of another fleet on purpose, name this fleet's CA in `accept` there, and its CA in `trust` of [node] here";
     let fixes = [
@@ -724,12 +725,12 @@ pub(super) fn fix_of_link(why: &str) -> Option<&'static str> {
 }
 
 /// Returns the explanation of a drop of packets or messages.
-pub(super) fn packet_drop(key: &str) -> Option<&'static Refusal> {
+pub(crate) fn packet_drop(key: &str) -> Option<&'static Refusal> {
     find(PACKETS, key)
 }
 
 /// Returns the meaning and the remedy of a reason for lost calls.
-pub(super) fn call_loss(key: &str) -> Option<(&'static str, &'static str)> {
+pub(crate) fn call_loss(key: &str) -> Option<(&'static str, &'static str)> {
     if key == "overrun" {
         let means = "requests or replies came faster than they were taken, more than may wait";
         return Some((means, "have the programs on the local network make fewer calls at a time"));
@@ -757,7 +758,7 @@ pub(crate) fn gateway_meaning(row: &str) -> String {
 }
 
 /// Returns a step for each refusal on which an operator has to act, with the current links that cause it.
-pub(super) fn steps(graph: &Graph) -> Vec<Step> {
+pub(crate) fn steps(graph: &Graph) -> Vec<Step> {
     let counts = [
         ("refused here", CONTROL, &graph.drops),
         ("peers refused a link", DOOR, &graph.refused),
@@ -782,7 +783,7 @@ pub(super) fn steps(graph: &Graph) -> Vec<Step> {
 fn culprits(graph: &Graph, key: &str) -> String {
     let of_link = |link: &sgc_node::graph::Link| {
         let count = graph.drops.get(&format!("{key} from link {}", link.id))?;
-        Some(format!("{count} over {}", diagnose::link_of(graph, link.id)))
+        Some(format!("{count} over {}", link_of(graph, link.id)))
     };
     let all: Vec<_> = graph.links.iter().filter_map(of_link).collect();
     if all.is_empty() { String::new() } else { format!(", of these {}", all.join(", ")) }
@@ -793,7 +794,7 @@ fn find(table: &'static [Refusal], key: &str) -> Option<&'static Refusal> {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(crate) mod tests {
     #![allow(clippy::unwrap_used, clippy::panic)]
 
     use std::collections::BTreeSet;
@@ -801,10 +802,10 @@ pub(super) mod tests {
     use sgc_transport::RefusalKind;
 
     use super::*;
-    use crate::why::Verdict;
+    use crate::step::Verdict;
 
     /// Returns the refusals that are reported for any topic.
-    pub(in crate::why) fn every_named_refusal() -> impl IntoIterator<Item = &'static str> {
+    pub(crate) fn every_named_refusal() -> impl IntoIterator<Item = &'static str> {
         CONTROL.iter().filter(|refusal| refusal.is_named).map(|refusal| refusal.key)
     }
 

@@ -10,9 +10,12 @@ use sgc_node::graph::{
 };
 use sgc_ros::{Naming, Rename, is_for_wildcards, is_pattern, matches};
 
-use super::near::{hint, near};
-use super::refusals;
-use super::{Step, Verdict};
+use sgc_process::output;
+
+use crate::links::{link_of, millis};
+use crate::near::{hint, near};
+use crate::refusals;
+use crate::step::{Step, Verdict};
 
 /// The steps of a walk. A fault is the last of them.
 type Walk = Vec<Step>;
@@ -34,7 +37,7 @@ fn begin(graph: &Graph) -> (Walk, bool) {
 }
 
 /// Explains why an interface of the local network does not flow.
-pub(super) fn interface(graph: &Graph, topic: &str) -> Walk {
+pub fn interface(graph: &Graph, topic: &str) -> Walk {
     let (mut steps, is_over) = begin(graph);
     if is_over {
         return steps;
@@ -212,7 +215,7 @@ fn walk_parts(graph: &Graph, topic: &str, steps: &mut Walk) -> bool {
 }
 
 /// Explains why a name does not flow, at a router.
-pub(super) fn name(graph: &Graph, name: &str) -> Walk {
+pub fn name(graph: &Graph, name: &str) -> Walk {
     let (mut steps, is_over) = begin(graph);
     if is_over {
         return steps;
@@ -978,7 +981,7 @@ fn silent(graph: &Graph, link: u32) -> Step {
 /// Reports the traffic of a name and its drops with their reasons.
 fn traffic(line: &NameLine, what: &str, steps: &mut Walk) {
     if line.packets > 0 {
-        let bytes = crate::output::bytes(line.bytes);
+        let bytes = output::bytes(line.bytes);
         steps.push(Step::fine(format!("{} packets ({bytes}) {what}", line.packets)));
     }
     // Packets without a subscriber are no loss to anybody.
@@ -1021,27 +1024,12 @@ fn told(graph: &Graph, topic: &str, otherwise: &str) -> String {
 }
 
 fn whom([nodes, groups, fleets]: [usize; 3]) -> String {
-    let count = |n: usize, noun: &str| (n > 0).then(|| crate::output::several(n as u64, noun));
+    let count = |n: usize, noun: &str| (n > 0).then(|| output::several(n as u64, noun));
     let all: Vec<_> = [count(nodes, "node"), count(groups, "group"), count(fleets, "whole fleet")]
         .into_iter()
         .flatten()
         .collect();
     if all.is_empty() { "nobody".to_owned() } else { all.join(", ") }
-}
-
-pub(super) fn link_of(graph: &Graph, link: u32) -> String {
-    match graph.links.iter().find(|l| l.id == link) {
-        _ if link == 0 => "this node".to_owned(),
-        Some(l) => {
-            let peer = l.name.clone().unwrap_or_else(|| l.peer.chars().take(8).collect());
-            format!("link {link} to {peer} at {} ({})", l.remote, crate::output::millis(l.rtt_us))
-        }
-        None => format!("link {link}"),
-    }
-}
-
-fn millis(us: u32) -> String {
-    crate::output::millis(us.into())
 }
 
 /// Shortens a hash to a length that still identifies it.

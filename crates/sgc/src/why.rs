@@ -1,26 +1,20 @@
 //! `sgc why`: finds the first fault on the path of a topic, service or action.
 //!
 //! The node answers with its whole state ([`sgc_node::graph::Graph`]). [`diagnose`] follows the path in it and asks nothing
-//! else.
+//! else. This file asks and prints.
 
-mod diagnose;
-mod near;
-pub(crate) mod refusals;
-#[cfg(test)]
-mod tests;
-
-use std::path::Path;
 use std::process::ExitCode;
 
 use clap::Args;
-use serde::Serialize;
+use sgc_diagnosis::{DiagnosisError, Step, Verdict, diagnose};
 use sgc_node::discovery_server;
 use sgc_node::graph::Graph;
 use sgc_wire::Name;
 
+use crate::environment::environment;
 use crate::error::{CliError, EXIT_FAILURE};
-use crate::topic::NodeArgs;
-use crate::{output, run};
+use crate::node::NodeArgs;
+use crate::output;
 
 /// Explain why a topic, service or action does not flow: follow its path and name the first fault
 ///
@@ -41,52 +35,11 @@ pub(crate) struct WhyArgs {
     json: bool,
 }
 
-/// The result of a step.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub(crate) enum Verdict {
-    /// The step is in order.
-    Fine,
-    /// The step has a fault.
-    Wrong,
-    /// This node cannot know, or the finding need not be a fault.
-    Unknown,
-}
-
-/// One step of the path.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub(crate) struct Step {
-    verdict: Verdict,
-    /// The finding.
-    found: String,
-    /// The advice how to mend it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    fix: Option<String>,
-}
-
-impl Step {
-    fn fine(found: impl Into<String>) -> Self {
-        Self { verdict: Verdict::Fine, found: found.into(), fix: None }
-    }
-
-    fn wrong(found: impl Into<String>, fix: impl Into<String>) -> Self {
-        Self { verdict: Verdict::Wrong, found: found.into(), fix: Some(fix.into()) }
-    }
-
-    fn unknown(found: impl Into<String>) -> Self {
-        Self { verdict: Verdict::Unknown, found: found.into(), fix: None }
-    }
-
-    fn with_fix(self, fix: impl Into<String>) -> Self {
-        Self { fix: Some(fix.into()), ..self }
-    }
-}
-
 /// Runs `sgc why`.
 pub(crate) fn why(args: &WhyArgs) -> Result<ExitCode, CliError> {
     let steps = match (&args.topic, &args.name) {
         (_, Some(hex)) => {
-            let name = name_of(hex).ok_or_else(|| CliError::NotSeen {
+            let name = name_of(hex).ok_or_else(|| DiagnosisError::NotSeen {
                 reason: format!("{hex:?} is not a name: it has 64 hexadecimal digits"),
             })?;
             graph(args, Some(name), |graph| diagnose::name(graph, &name.to_string()))?
@@ -113,13 +66,6 @@ pub(crate) fn why(args: &WhyArgs) -> Result<ExitCode, CliError> {
     Ok(if is_wrong { ExitCode::from(EXIT_FAILURE) } else { ExitCode::SUCCESS })
 }
 
-/// Returns the first fault on the path of a topic of the node at this socket, and its fix, as one line each.
-pub(crate) fn first_wrong(socket: &Path, topic: &str) -> Option<Vec<String>> {
-    let graph = NodeArgs::at(socket).graph(None).ok()?;
-    let step = diagnose::interface(&graph, topic).into_iter().find(|step| step.verdict == Verdict::Wrong)?;
-    Some([Some(step.found), step.fix].into_iter().flatten().map(|line| output::clean(&line)).collect())
-}
-
 /// Returns the steps that follow from the node's answer. If no node answers, that is the only step.
 fn graph(
     args: &WhyArgs,
@@ -129,14 +75,16 @@ fn graph(
     match args.node.graph(name) {
         Ok(mut graph) => {
             if graph.has_ros {
-                graph.alerts.extend(discovery_server::alerts(&run::environment));
+                graph.alerts.extend(discovery_server::alerts(&environment));
             }
             Ok(walk(&graph))
         }
-        Err(error @ (CliError::NoNode { .. } | CliError::NoNodeHere { .. })) => Ok(vec![Step::wrong(
-            error.to_string(),
-            "start it with `sgc run -c FILE`; if it runs elsewhere, ask there, or as the user that runs it",
-        )]),
+        Err(error @ (CliError::Diagnosis(DiagnosisError::NoNode { .. }) | CliError::NoNodeHere { .. })) => {
+            Ok(vec![Step::wrong(
+                error.to_string(),
+                "start it with `sgc run -c FILE`; if it runs elsewhere, ask there, or as the user that runs it",
+            )])
+        }
         Err(error) => Err(error),
     }
 }

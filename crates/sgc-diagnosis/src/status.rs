@@ -1,0 +1,374 @@
+//! The status of a node, and its tables as `sgc status` prints them.
+//!
+//! `sgc-node` makes the document. This file reads the fields that it needs and ignores unknown ones, so it understands older
+//! and newer nodes.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::Deserialize;
+use sgc_node::admin::AdminRequest;
+use sgc_node::alerts::Alert;
+use sgc_process::output;
+
+use crate::ask::{ANSWER_MAX, ask};
+use crate::error::DiagnosisError;
+use crate::refusals;
+
+/// A node's status.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub struct Status {
+    node: String,
+    version: String,
+    uptime_s: u64,
+    /// Links to other nodes.
+    pub links: Vec<Link>,
+    /// Routers that the node dials or searches.
+    pub routers: Vec<Router>,
+    /// Shares and uses.
+    pub routes: Vec<Route>,
+    /// States that need an operator.
+    pub alerts: Vec<Alert>,
+    problems: Vec<String>,
+    names: Vec<NameTraffic>,
+    /// Counts of dropped frames, packets and messages.
+    pub drops: BTreeMap<String, u64>,
+    /// Counts of refused links.
+    pub refused: BTreeMap<String, u64>,
+    local_network_reopened: u64,
+    router: RouterSize,
+    gateway: Option<Gateway>,
+}
+
+/// A node's answer that reports an error.
+#[derive(Debug, Deserialize)]
+struct ErrorAnswer {
+    error: String,
+}
+
+/// The gateway of a node.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct Gateway {
+    listen: Vec<String>,
+    clients: Vec<GatewayClient>,
+    refused: BTreeMap<String, u64>,
+    readers: usize,
+}
+
+/// A client of a gateway.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct GatewayClient {
+    name: String,
+    protocol: String,
+    address: String,
+    /// Time of the connection, in milliseconds since the Unix epoch.
+    since: u64,
+}
+
+/// A link of a node.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub struct Link {
+    /// Node id of the peer.
+    pub peer: String,
+    /// Address of the peer.
+    pub remote: String,
+    url: Option<String>,
+    /// Round trip, in microseconds.
+    pub rtt_us: u64,
+    cost: u32,
+    /// Nothing comes over the link although something should.
+    pub silent: bool,
+    sent_bytes: u64,
+    received_bytes: u64,
+    peer_slowed: u64,
+    peer_dropped: u64,
+}
+
+/// A router that a node dials or searches.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub struct Router {
+    /// The router as configured.
+    pub router: String,
+    found_by: String,
+    at: Option<String>,
+    state: String,
+    why_not_first: Option<String>,
+    /// Failures since the last success.
+    pub failures: u32,
+    /// The last failure.
+    pub last_failure: Option<String>,
+    again_in_s: Option<u64>,
+}
+
+/// A share or use of a node.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub struct Route {
+    /// `share` or `use`.
+    pub direction: String,
+    /// Name of the topic on the local network.
+    pub topic: String,
+    #[serde(rename = "type")]
+    type_name: Option<String>,
+    /// The 256-bit name.
+    pub name: Option<String>,
+    owner: String,
+    /// The state in words.
+    pub state: String,
+    messages: u64,
+    /// Bytes before and after compression.
+    compressed: Option<(u64, u64)>,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct NameTraffic {
+    name: String,
+    packets: u64,
+    bytes: u64,
+    dropped: u64,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct RouterSize {
+    nodes: usize,
+    names: u64,
+    routed_names: u64,
+    branches: u64,
+}
+
+/// Asks the node at a socket for its status, for programs that show it in another way.
+pub fn query(socket: &Path) -> Result<Status, DiagnosisError> {
+    parse(socket, &ask(socket, &AdminRequest::Status, ANSWER_MAX)?)
+}
+
+/// Parses the document that a node made.
+pub fn parse(socket: &Path, text: &str) -> Result<Status, DiagnosisError> {
+    if let Ok(ErrorAnswer { error }) = serde_json::from_str(text) {
+        return Err(DiagnosisError::NotSeen { reason: error });
+    }
+    serde_json::from_str(text)
+        .map_err(|e| DiagnosisError::NotAStatus { path: socket.to_owned(), reason: e.to_string() })
+}
+
+impl Status {
+    /// Returns the lines of `sgc status`.
+    pub fn lines(&self) -> Vec<String> {
+        let mut lines =
+            vec![format!("{}: sgc {}, up for {}", self.node, self.version, duration(self.uptime_s))];
+        let mut section = |title: &str, head: &[&str], rows: Vec<Vec<String>>| {
+            lines.push(String::new());
+            if rows.is_empty() {
+                lines.push(format!("{title}: none"));
+                return;
+            }
+            lines.push(format!("{title}:"));
+            let head = head.iter().map(|h| (*h).to_owned()).collect();
+            let table: Vec<_> = std::iter::once(head).chain(rows).collect();
+            lines.extend(output::columns(&table).into_iter().map(|line| format!("  {line}")));
+        };
+        if !self.alerts.is_empty() {
+            let rows = self.alerts.iter().map(|alert| vec![alert.to_string(), alert.fix().to_owned()]);
+            section("Needs attention", &["what", "do"], rows.collect());
+        }
+        section(
+            "Links",
+            &["peer", "remote", "round trip", "cost", "sent", "received", "dialled"],
+            self.links.iter().map(Link::row).collect(),
+        );
+        let over: Vec<_> = self.links.iter().filter(|l| l.peer_slowed + l.peer_dropped > 0).collect();
+        if !over.is_empty() {
+            section(
+                "Peers that send more than `peer_rate`",
+                &["peer", "packets slowed", "dropped"],
+                over.iter().map(|l| l.over_row()).collect(),
+            );
+        }
+        section(
+            "Routers",
+            &["router", "found by", "at", "state", "last failure"],
+            self.routers.iter().map(Router::row).collect(),
+        );
+        let second: Vec<_> = self.routers.iter().filter_map(Router::second_row).collect();
+        if !second.is_empty() {
+            section("Not by the first way", &["router", "at", "why"], second);
+        }
+        section(
+            "Topics",
+            &["", "topic", "type", "owner", "messages", "state"],
+            self.routes.iter().map(Route::row).collect(),
+        );
+        if !self.problems.is_empty() {
+            let rows = self.problems.iter().map(|problem| vec![problem.clone()]);
+            section("What is wrong", &["problem"], rows.collect());
+        }
+        section(
+            "Names",
+            &["name", "packets", "bytes", "dropped"],
+            self.names.iter().map(NameTraffic::row).collect(),
+        );
+        let counts = |counts: &BTreeMap<String, u64>, meaning: fn(&str) -> String| {
+            counts.iter().map(|(key, n)| vec![key.clone(), n.to_string(), meaning(key)]).collect()
+        };
+        let head = ["reason", "count", "meaning"];
+        section("Drops", &head, counts(&self.drops, refusals::drop_meaning));
+        section("Refused peers", &head, counts(&self.refused, refusals::door_meaning));
+        if let Some(gateway) = &self.gateway {
+            section(
+                "Programs without ROS",
+                &["client", "protocol", "address", "since"],
+                gateway.clients.iter().map(GatewayClient::row).collect(),
+            );
+            if !gateway.refused.is_empty() {
+                section("Refused there", &head, counts(&gateway.refused, refusals::gateway_meaning));
+            }
+            lines.push(format!("  at {}; {} topics read", gateway.listen.join(", "), gateway.readers));
+        }
+        let RouterSize { nodes, names, routed_names, branches } = self.router;
+        lines.push(String::new());
+        if self.local_network_reopened > 0 {
+            let times = self.local_network_reopened;
+            lines.push(format!(
+                "Local network: opened again after this host's addresses changed, so often: {times}"
+            ));
+        }
+        lines.push(format!(
+            "Router: {} and {} known, {routed_names} with a route; branches: {branches}",
+            output::several(nodes as u64, "node"),
+            output::several(names, "name"),
+        ));
+        lines
+    }
+}
+
+impl GatewayClient {
+    fn row(&self) -> Vec<String> {
+        let since = sgc_wire::UnixMillis(self.since).to_string();
+        vec![self.name.clone(), self.protocol.clone(), self.address.clone(), since]
+    }
+}
+
+impl Link {
+    fn row(&self) -> Vec<String> {
+        vec![
+            self.peer.chars().take(8).collect(),
+            self.remote.clone(),
+            output::millis(self.rtt_us),
+            // The cost that silence adds serves routing and means nothing to a reader.
+            if self.silent { "silent".into() } else { output::millis(self.cost.into()) },
+            output::bytes(self.sent_bytes),
+            output::bytes(self.received_bytes),
+            self.url.clone().unwrap_or_default(),
+        ]
+    }
+
+    fn over_row(&self) -> Vec<String> {
+        let peer = self.peer.chars().take(8).collect();
+        vec![peer, self.peer_slowed.to_string(), self.peer_dropped.to_string()]
+    }
+}
+
+impl Router {
+    fn row(&self) -> Vec<String> {
+        vec![
+            self.router.clone(),
+            self.found_by.clone(),
+            self.at.clone().unwrap_or_default(),
+            match self.again_in_s {
+                Some(s) => format!("{} in {}", self.state, duration(s)),
+                None => self.state.clone(),
+            },
+            self.last_failure.clone().unwrap_or_default(),
+        ]
+    }
+}
+
+impl Router {
+    fn second_row(&self) -> Option<Vec<String>> {
+        let why = self.why_not_first.clone()?;
+        Some(vec![self.router.clone(), self.at.clone().unwrap_or_default(), why])
+    }
+}
+
+impl Route {
+    fn row(&self) -> Vec<String> {
+        vec![
+            self.direction.clone(),
+            self.topic.clone(),
+            self.type_name.clone().unwrap_or_else(|| "?".into()),
+            self.owner.clone(),
+            self.messages.to_string(),
+            match self.compressed {
+                Some((before, after)) if before > 0 => {
+                    format!("{}, compressed to {:.0} %", self.state, 100.0 * after as f64 / before as f64)
+                }
+                _ => self.state.clone(),
+            },
+        ]
+    }
+}
+
+impl NameTraffic {
+    fn row(&self) -> Vec<String> {
+        vec![self.name.clone(), self.packets.to_string(), output::bytes(self.bytes), self.dropped.to_string()]
+    }
+}
+
+fn duration(seconds: u64) -> String {
+    match (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60, seconds % 60) {
+        (0, 0, 0, s) => format!("{s} s"),
+        (0, 0, m, s) => format!("{m} min {s} s"),
+        (0, h, m, _) => format!("{h} h {m} min"),
+        (d, h, _, _) => format!("{d} d {h} h"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn status_is_shown_in_tables() {
+        let text = r#"{"node":"arm-1","version":"0.1.0","uptime_s":75,"new":{},
+            "links":[{"id":1,"peer":"0123456789abcdef","remote":"127.0.0.1:7447","url":"quic://localhost:7447",
+                      "rtt_us":420,"cost":1420,"sent_bytes":1500,"received_bytes":7}],
+            "routers":[{"router":"srv://lab.example","found_by":"srv","at":"quic://r1.lab.example:7447",
+                        "state":"trying again","failures":2,"last_failure":"no answer","again_in_s":3}],
+            "routes":[{"direction":"share","topic":"/chatter","type":null,"name":null,"owner":"arm-1",
+                       "state":"waiting for a publisher"}],
+            "names":[],"drops":{"hop_limit":3},"refused":{},"router":{"nodes":3,"names":1,"routed_names":0,"branches":2}}"#;
+        let lines = parse(Path::new("x"), text).unwrap().lines();
+        let expected = [
+            "arm-1: sgc 0.1.0, up for 1 min 15 s",
+            "",
+            "Links:",
+            "  peer      remote          round trip  cost     sent    received  dialled",
+            "  01234567  127.0.0.1:7447  0.42 ms     1.42 ms  1.5 kB  7 B       quic://localhost:7447",
+            "",
+            "Routers:",
+            "  router             found by  at                          state                last failure",
+            "  srv://lab.example  srv       quic://r1.lab.example:7447  trying again in 3 s  no answer",
+            "",
+            "Topics:",
+            "         topic     type  owner  messages  state",
+            "  share  /chatter  ?     arm-1  0         waiting for a publisher",
+            "",
+            "Names: none",
+            "",
+            "Drops:",
+            "  reason     count  meaning",
+            "  hop_limit  3      it went in a circle, or over too many routers",
+            "",
+            "Refused peers: none",
+            "",
+            "Router: 3 nodes and 1 name known, 0 with a route; branches: 2",
+        ];
+        assert_eq!(lines, expected);
+    }
+}

@@ -1,0 +1,65 @@
+//! The running node of a command: named by its configuration, its name or its socket, or the only one of this user.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use sgc_diagnosis::ask;
+use sgc_node::config;
+use sgc_node::graph::Graph;
+
+use crate::environment::environment;
+use crate::error::CliError;
+
+/// The node to ask.
+#[derive(Debug, Args)]
+pub(crate) struct NodeArgs {
+    /// Configuration of the node; without it, the only node that this user runs here
+    #[arg(short, long, value_name = "FILE", conflicts_with_all = ["socket", "node"])]
+    config: Option<PathBuf>,
+    /// Name of the node, if its socket is in the usual place
+    #[arg(long, value_name = "NAME", conflicts_with = "socket")]
+    node: Option<String>,
+    /// Status socket of the node
+    #[arg(long, value_name = "PATH")]
+    socket: Option<PathBuf>,
+}
+
+impl NodeArgs {
+    /// Returns the node's status socket.
+    pub(crate) fn socket(&self) -> Result<PathBuf, CliError> {
+        let named = self.node.as_deref().map(sgc_node::default_socket_path);
+        socket(self.config.as_deref(), named.as_deref().or(self.socket.as_deref()))
+    }
+
+    /// Returns the node's graph.
+    pub(crate) fn graph(&self, name: Option<sgc_wire::Name>) -> Result<Graph, CliError> {
+        Ok(ask::graph(&self.socket()?, name)?)
+    }
+}
+
+/// Returns the named socket, the socket of the configuration, or the only socket of this user.
+pub(crate) fn socket(config: Option<&Path>, socket: Option<&Path>) -> Result<PathBuf, CliError> {
+    if let Some(socket) = socket {
+        return Ok(socket.to_owned());
+    }
+    let Some(path) = config else { return only_socket() };
+    let config = config::load(path, &environment)
+        .map_err(|errors| CliError::Config { what: path.display().to_string(), errors })?;
+    Ok(sgc_node::admin_socket_path(&config, &ask::node_name(&config)?))
+}
+
+/// Returns the socket of the only node that this user runs with a default socket.
+fn only_socket() -> Result<PathBuf, CliError> {
+    let mut found = ask::usual_sockets();
+    match found.len() {
+        0 => {
+            let usual = sgc_node::default_socket_path("node");
+            Err(CliError::NoNodeHere { dir: usual.parent().unwrap_or(Path::new("/")).to_owned() })
+        }
+        1 => Ok(found.swap_remove(0)),
+        _ => {
+            let name = |socket: &PathBuf| Some(socket.file_stem()?.to_string_lossy().into_owned());
+            Err(CliError::SeveralNodes { nodes: found.iter().filter_map(name).collect() })
+        }
+    }
+}
