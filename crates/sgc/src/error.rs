@@ -9,6 +9,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::error::ErrorKind;
+use sgc_demo::DemoError;
 use sgc_diagnosis::DiagnosisError;
 use sgc_gateway::AccessTokenError;
 use sgc_node::config::ConfigErrors;
@@ -229,13 +230,8 @@ pub(crate) enum CliError {
         reason: String,
     },
     /// The demo cannot go on.
-    #[error("demo: {reason}")]
-    Demo {
-        /// The cause, with the culprit.
-        reason: String,
-        /// Further facts, printed below the error.
-        facts: Vec<String>,
-    },
+    #[error(transparent)]
+    Demo(DemoError),
     /// A measurement between two machines cannot begin or continue.
     #[error("bench: {reason}")]
     Bench {
@@ -272,7 +268,7 @@ impl CliError {
             _ => {}
         }
         output::diagnostic(&format!("sgc: {}", one_line(&chain(self))));
-        if let Self::Demo { facts, .. } | Self::Bench { facts, .. } = self {
+        if let Self::Demo(DemoError::Failed { facts, .. }) | Self::Bench { facts, .. } = self {
             for fact in facts {
                 output::diagnostic(&format!("  {fact}"));
             }
@@ -326,9 +322,21 @@ impl CliError {
             | Self::NoSuchField { .. }
             | Self::NoHeader { .. }
             | Self::NoAudit { .. }
-            | Self::Demo { .. }
+            | Self::Demo(_)
             | Self::Bench { .. }
             | Self::Tell(_) => EXIT_FAILURE,
+        }
+    }
+}
+
+impl From<DemoError> for CliError {
+    fn from(error: DemoError) -> Self {
+        match error {
+            DemoError::Failed { .. } => Self::Demo(error),
+            DemoError::Fleet { path, source } => Self::Fleet { path, source },
+            DemoError::Label(error) => error.into(),
+            DemoError::Diagnosis(error) => error.into(),
+            DemoError::Process(error) => error.into(),
         }
     }
 }

@@ -4,10 +4,11 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::LevelFilter;
 
 /// The log targets: the names of the crates that log.
-const LOG_TARGETS: [&str; 12] = [
+const LOG_TARGETS: [&str; 13] = [
     "sgc",
     "sgc_cdr",
     "sgc_dds",
+    "sgc_demo",
     "sgc_endpoint",
     "sgc_gateway",
     "sgc_node",

@@ -3,9 +3,9 @@
 use serde::Serialize;
 use sgc_wire::Name;
 
-use super::protocol::PeerEvent;
-use super::topics::Topic;
-use super::tracker::Counts;
+use crate::protocol::PeerEvent;
+use crate::topics::Topic;
+use crate::tracker::Counts;
 
 /// The progress of one topic, by the last reports of its peers.
 #[derive(Debug)]

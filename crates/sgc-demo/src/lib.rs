@@ -3,10 +3,13 @@
 //!
 //! The nodes are `sgc run` processes with configurations as a user writes them. The talkers and listeners are DDS
 //! participants that do not know `sgc`. No packet leaves this host.
+//!
+//! `sgc` parses the arguments and runs each peer in a process of its own, by its hidden command `demo-peer`.
 
+mod error;
 mod messages;
 mod peer;
-pub(crate) mod processes;
+mod processes;
 mod protocol;
 mod report;
 mod screen;
@@ -16,29 +19,27 @@ mod tracker;
 
 use std::future::Future;
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::time::Duration;
 
-use clap::Args;
 use sgc_diagnosis::status;
 use sgc_process::children::{ReadyLine, last_lines};
 use sgc_process::domains::{self, DomainLock};
-use sgc_process::{EndSignals, ProcessError};
+use sgc_process::{EndSignals, ProcessError, output};
 use tokio::time::{Instant, MissedTickBehavior, interval_at, sleep_until, timeout};
 
-pub(crate) use peer::{PeerArgs, peer};
+pub use error::DemoError;
+pub use peer::peer;
+pub use topics::Role;
 
 use self::processes::{ChildEvent, ProcessName, Processes};
 use self::protocol::{PeerCommand, PeerEvent};
 use self::report::{Flow, Report};
 use self::screen::Screen;
 use self::stage::{CLOUD, Stage};
-use self::topics::{Role, Topic};
-use crate::error::{CliError, EXIT_FAILURE};
-use crate::output;
+use self::topics::Topic;
 
-/// Longest demo: one week, so that [`tracker::SEQ_MAX`] is out of reach.
-const SECONDS_MAX: i64 = 7 * 86_400;
+/// Longest demo: one week, so that `tracker::SEQ_MAX` is out of reach.
+pub const SECONDS_MAX: i64 = 7 * 86_400;
 /// Longest time a node may take to start.
 const READY_MAX: Duration = Duration::from_secs(30);
 /// Longest time until the first messages arrive.
@@ -51,49 +52,41 @@ const END_MAX: Duration = Duration::from_secs(6);
 const ROUTER: ProcessName = ProcessName(CLOUD);
 const PEERS: [ProcessName; 2] = [ProcessName("robot-peer"), ProcessName("operator-peer")];
 
-/// Demonstrate sgc: join two separate ROS 2 networks on this machine by three sgc processes.
-///
-/// The demo needs no ROS 2 and no configuration, and leaves no files behind. A text, an image of 1 MB and a velocity command
-/// cross over at 10, 10 and 50 Hz. Every message is numbered and checked. Exit code 0 means that each message arrived
-/// once and unaltered.
-#[derive(Debug, Args)]
-pub(crate) struct DemoArgs {
-    /// How long to count messages, in seconds
-    #[arg(long, value_name = "N", default_value_t = 10,
-          value_parser = clap::value_parser!(u32).range(1..=SECONDS_MAX))]
-    seconds: u32,
-    /// Print only one JSON document, at the end
-    #[arg(long)]
-    json: bool,
-    /// Directory in which to keep configurations, identities and logs; must be new or empty
-    #[arg(long, value_name = "DIR")]
-    keep: Option<PathBuf>,
+/// How a demo runs.
+#[derive(Clone, Debug)]
+pub struct DemoOptions {
+    /// How long to count messages, in seconds: 1 to [`SECONDS_MAX`].
+    pub seconds: u32,
+    /// Print one JSON document at the end and nothing else.
+    pub json: bool,
+    /// Directory in which to keep configurations, identities and logs.
+    pub keep: Option<PathBuf>,
 }
 
-/// Runs `sgc demo`.
-pub(crate) fn demo(args: DemoArgs) -> Result<ExitCode, CliError> {
+/// Runs the demo and prints its course. Returns `true` if each message arrived once and unaltered.
+pub fn demo(options: &DemoOptions) -> Result<bool, DemoError> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
         .map_err(|source| ProcessError::System { what: "cannot start a runtime", source })?;
-    let result = runtime.block_on(stage_and_perform(&args));
+    let result = runtime.block_on(stage_and_perform(options));
     let report = match &result {
         Ok(report) => report,
         Err(error) => &Report::failed(error.to_string()),
     };
-    if args.json {
+    if options.json {
         let text = serde_json::to_string(report)
             .map_err(|e| ProcessError::System { what: "cannot print the report", source: e.into() })?;
         output::line(text)?;
     }
-    result.map(|report| if report.is_ok() { ExitCode::SUCCESS } else { ExitCode::from(EXIT_FAILURE) })
+    result.map(|report| report.is_ok())
 }
 
-async fn stage_and_perform(args: &DemoArgs) -> Result<Report, CliError> {
+async fn stage_and_perform(options: &DemoOptions) -> Result<Report, DemoError> {
     let interruption = Interruption { signals: Some(EndSignals::new()?) };
-    let screen = Screen::new(args.json);
-    let mut demo = Demo::new(args, interruption, screen)?;
-    let result = demo.perform(Duration::from_secs(args.seconds.into())).await;
+    let screen = Screen::new(options.json);
+    let mut demo = Demo::new(options, interruption, screen)?;
+    let result = demo.perform(Duration::from_secs(options.seconds.into())).await;
     demo.take_down().await;
     result
 }
@@ -136,21 +129,21 @@ struct Demo {
 }
 
 impl Demo {
-    fn new(args: &DemoArgs, interruption: Interruption, screen: Screen) -> Result<Self, CliError> {
-        let stage = Stage::set(args.keep.as_deref())?;
-        let domains = domains::lock_two(std::process::id()).ok_or_else(|| CliError::Demo {
+    fn new(options: &DemoOptions, interruption: Interruption, screen: Screen) -> Result<Self, DemoError> {
+        let stage = Stage::set(options.keep.as_deref())?;
+        let domains = domains::lock_two(std::process::id()).ok_or_else(|| DemoError::Failed {
             reason: "no two free ROS domains: other ROS 2 programs or demos run here".into(),
             facts: Vec::new(),
         })?;
         let flows = Topic::ALL
             .into_iter()
             .map(|topic| Ok(Flow::new(topic, stage.name_of(topic)?)))
-            .collect::<Result<_, CliError>>()?;
+            .collect::<Result<_, DemoError>>()?;
         let processes = Processes::new();
         Ok(Self { stage, domains, processes, interruption, screen, ready: Vec::new(), flows })
     }
 
-    async fn perform(&mut self, duration: Duration) -> Result<Report, CliError> {
+    async fn perform(&mut self, duration: Duration) -> Result<Report, DemoError> {
         self.screen.introduce(self.domain(Role::Robot), self.domain(Role::Operator))?;
         let begun = Instant::now();
         self.start_all().await?;
@@ -173,12 +166,12 @@ impl Demo {
     }
 
     /// Starts the router, and everything else once the router's address is known.
-    async fn start_all(&mut self) -> Result<(), CliError> {
+    async fn start_all(&mut self) -> Result<(), DemoError> {
         let config = self.stage.write_cloud("quic://127.0.0.1:0")?;
         self.start_node(ROUTER, &config.display().to_string())?;
         self.wait_ready(&[ROUTER]).await?;
         let router = self.ready.first().and_then(|(_, addresses)| addresses.first()).cloned();
-        let router = router.ok_or_else(|| CliError::Demo {
+        let router = router.ok_or_else(|| DemoError::Failed {
             reason: "the router listens nowhere".into(),
             facts: last_lines(&self.stage.log(CLOUD)),
         })?;
@@ -198,12 +191,12 @@ impl Demo {
         self.stage.forget_secrets()
     }
 
-    fn start_node(&mut self, who: ProcessName, config: &str) -> Result<(), CliError> {
+    fn start_node(&mut self, who: ProcessName, config: &str) -> Result<(), DemoError> {
         let args = ["run", "-c", config, "--until-stdin-closes", "--print-ready"];
         Ok(self.processes.start(who, &args, &self.stage.log(who.0))?)
     }
 
-    async fn wait_ready(&mut self, nodes: &[ProcessName]) -> Result<(), CliError> {
+    async fn wait_ready(&mut self, nodes: &[ProcessName]) -> Result<(), DemoError> {
         let is_ready = |demo: &Self, node: &ProcessName| demo.ready.iter().any(|(who, _)| who == node);
         match self.wait_for(READY_MAX, |demo| nodes.iter().all(|node| is_ready(demo, node))).await? {
             WaitOutcome::Happened => Ok(()),
@@ -212,13 +205,13 @@ impl Demo {
                 let late: Vec<_> = nodes.iter().filter(|node| !is_ready(self, node)).map(|w| w.0).collect();
                 let facts = late.iter().flat_map(|node| last_lines(&self.stage.log(node))).collect();
                 let reason = format!("not up after {} s: {}", READY_MAX.as_secs(), late.join(", "));
-                Err(CliError::Demo { reason, facts })
+                Err(DemoError::Failed { reason, facts })
             }
         }
     }
 
     /// Lets the talkers number their messages for a time, or until the user interrupts. Returns the elapsed time.
-    async fn measure(&mut self, duration: Duration) -> Result<Duration, CliError> {
+    async fn measure(&mut self, duration: Duration) -> Result<Duration, DemoError> {
         self.tell_peers(PeerCommand::Go).await?;
         let begun = Instant::now();
         let period = self.screen.period();
@@ -235,7 +228,7 @@ impl Demo {
         Ok(begun.elapsed())
     }
 
-    async fn tell_peers(&mut self, command: PeerCommand) -> Result<(), CliError> {
+    async fn tell_peers(&mut self, command: PeerCommand) -> Result<(), DemoError> {
         for peer in PEERS {
             self.processes.tell(peer, &command).await?;
         }
@@ -247,7 +240,7 @@ impl Demo {
         &mut self,
         limit: Duration,
         done: impl Fn(&Self) -> bool,
-    ) -> Result<WaitOutcome, CliError> {
+    ) -> Result<WaitOutcome, DemoError> {
         let deadline = Instant::now() + limit;
         while !done(self) {
             tokio::select! {
@@ -259,7 +252,7 @@ impl Demo {
         Ok(WaitOutcome::Happened)
     }
 
-    fn handle(&mut self, event: ChildEvent) -> Result<(), CliError> {
+    fn handle(&mut self, event: ChildEvent) -> Result<(), DemoError> {
         match event {
             ChildEvent::Line(who, line) if PEERS.contains(&who) => {
                 let event = serde_json::from_str(&line).map_err(|_| strange(who, &line))?;
@@ -273,12 +266,12 @@ impl Demo {
             ChildEvent::Ended(who, status) => {
                 let how = status.map_or_else(|error| error.to_string(), |status| status.to_string());
                 let facts = last_lines(&self.stage.log(who.0));
-                Err(CliError::Demo { reason: format!("{} ended too early: {how}", who.0), facts })
+                Err(DemoError::Failed { reason: format!("{} ended too early: {how}", who.0), facts })
             }
         }
     }
 
-    fn handle_peer(&mut self, who: ProcessName, event: PeerEvent) -> Result<(), CliError> {
+    fn handle_peer(&mut self, who: ProcessName, event: PeerEvent) -> Result<(), DemoError> {
         let topic = match &event {
             PeerEvent::Matched { topic, .. }
             | PeerEvent::Arrived { topic }
@@ -287,7 +280,7 @@ impl Demo {
             | PeerEvent::Receiving { topic, .. } => *topic,
             PeerEvent::Failed { reason } => {
                 let facts = last_lines(&self.stage.log(who.0));
-                return Err(CliError::Demo { reason: format!("{}: {reason}", who.0), facts });
+                return Err(DemoError::Failed { reason: format!("{}: {reason}", who.0), facts });
             }
         };
         for flow in self.flows.iter_mut().filter(|flow| flow.topic == topic) {
@@ -297,7 +290,7 @@ impl Demo {
     }
 
     /// Checks that the nodes use the names that the demo shows.
-    async fn check_names(&self) -> Result<(), CliError> {
+    async fn check_names(&self) -> Result<(), DemoError> {
         for role in Role::ALL {
             let Ok(status) = self.status_of(role.name()).await else { continue };
             for route in status.routes {
@@ -306,7 +299,7 @@ impl Demo {
                 if used != flow.name.to_string() {
                     let reason =
                         format!("{} is named {} here, but {used} at {}", route.topic, flow.name, role.name());
-                    return Err(CliError::Demo { reason, facts: Vec::new() });
+                    return Err(DemoError::Failed { reason, facts: Vec::new() });
                 }
             }
         }
@@ -314,7 +307,7 @@ impl Demo {
     }
 
     /// Explains why no message arrived, as far as the nodes know.
-    async fn no_path(&self, waited: WaitOutcome) -> CliError {
+    async fn no_path(&self, waited: WaitOutcome) -> DemoError {
         if waited == WaitOutcome::Interrupted {
             return interrupted();
         }
@@ -338,10 +331,10 @@ impl Demo {
         };
         facts.push(kept);
         let reason = format!("nothing came through in {} s: {}", PATH_MAX.as_secs(), missing.join(", "));
-        CliError::Demo { reason, facts }
+        DemoError::Failed { reason, facts }
     }
 
-    fn status_of(&self, node: &str) -> impl Future<Output = Result<status::Status, CliError>> + use<> {
+    fn status_of(&self, node: &str) -> impl Future<Output = Result<status::Status, DemoError>> + use<> {
         let socket = self.stage.socket(node);
         async move {
             match tokio::task::spawn_blocking(move || status::query(&socket)).await {
@@ -403,12 +396,15 @@ fn node_facts(node: &str, status: &status::Status) -> Vec<String> {
     facts
 }
 
-fn interrupted() -> CliError {
-    CliError::Demo { reason: "interrupted before anything was counted".into(), facts: Vec::new() }
+fn interrupted() -> DemoError {
+    DemoError::Failed { reason: "interrupted before anything was counted".into(), facts: Vec::new() }
 }
 
-fn strange(who: ProcessName, line: &str) -> CliError {
+fn strange(who: ProcessName, line: &str) -> DemoError {
     const SHOWN: usize = 200;
     let line: String = line.chars().take(SHOWN).collect();
-    CliError::Demo { reason: format!("{} printed what was not expected: {line}", who.0), facts: Vec::new() }
+    DemoError::Failed {
+        reason: format!("{} printed what was not expected: {line}", who.0),
+        facts: Vec::new(),
+    }
 }

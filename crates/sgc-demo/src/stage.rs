@@ -9,13 +9,13 @@ use std::path::{Path, PathBuf};
 
 use sgc_node::config::{QosOverride, SOCKET_PATH_BYTES_MAX, Shaping, ShareConfig, ShareMetadata};
 use sgc_process::ProcessError;
+use sgc_process::files::{self, Existing};
 use sgc_trust::{EnrollRequest, Fleet, Identity, NodeName, Suite};
 use sgc_wire::{Class, Name};
 use tempfile::TempDir;
 
-use super::topics::{Role, Topic};
-use crate::error::CliError;
-use crate::files::{self, Existing};
+use crate::error::DemoError;
+use crate::topics::{Role, Topic};
 
 /// The node that only routes.
 pub(crate) const CLOUD: &str = "cloud";
@@ -33,7 +33,7 @@ pub(crate) struct Stage {
 
 impl Stage {
     /// Makes the directory and the identities. A directory that the user wants to keep must be new or empty.
-    pub(crate) fn set(keep: Option<&Path>) -> Result<Self, CliError> {
+    pub(crate) fn set(keep: Option<&Path>) -> Result<Self, DemoError> {
         let (dir, temporary) = match keep {
             Some(dir) => {
                 make_empty_dir(dir)?;
@@ -47,8 +47,8 @@ impl Stage {
                 (temporary.path().to_owned(), Some(temporary))
             }
         };
-        let failed = |source| CliError::Fleet { path: dir.join(FLEET), source };
-        let name = FLEET.parse().map_err(CliError::Label)?;
+        let failed = |source| DemoError::Fleet { path: dir.join(FLEET), source };
+        let name = FLEET.parse().map_err(DemoError::Label)?;
         let fleet =
             Fleet::create(name, sgc_process::unix_now(), &mut sgc_process::system_rng()?).map_err(failed)?;
         let robot = enroll(&fleet, Role::Robot.name(), false)?;
@@ -66,13 +66,13 @@ impl Stage {
                 "the path {} is too long: a Unix socket in it has at most {SOCKET_PATH_BYTES_MAX} bytes",
                 stage.dir.display()
             );
-            return Err(CliError::Demo { reason, facts: Vec::new() });
+            return Err(DemoError::Failed { reason, facts: Vec::new() });
         }
         Ok(stage)
     }
 
     /// Writes the router's configuration; to listen at port 0 is to let the system choose.
-    pub(crate) fn write_cloud(&self, listen: &str) -> Result<PathBuf, CliError> {
+    pub(crate) fn write_cloud(&self, listen: &str) -> Result<PathBuf, DemoError> {
         let text = format!(
             "# The router: it passes packets on and can read none of them.\n\
              identity = \"{CLOUD}.identity\"\n\n\
@@ -84,7 +84,7 @@ impl Stage {
     }
 
     /// Writes the configuration of one end.
-    pub(crate) fn write_end(&self, role: Role, domain: u32, router: &str) -> Result<PathBuf, CliError> {
+    pub(crate) fn write_end(&self, role: Role, domain: u32, router: &str) -> Result<PathBuf, DemoError> {
         let (node, far) = (role.name(), role.other().name());
         let mut text = format!(
             "identity = \"{node}.identity\"\n\n\
@@ -106,7 +106,7 @@ impl Stage {
     }
 
     /// Removes the secrets from disk unless they are kept. Running nodes have read them already.
-    pub(crate) fn forget_secrets(&self) -> Result<(), CliError> {
+    pub(crate) fn forget_secrets(&self) -> Result<(), DemoError> {
         if self.is_kept() {
             return Ok(());
         }
@@ -118,7 +118,7 @@ impl Stage {
     }
 
     /// Derives the name of a topic as its owner does.
-    pub(crate) fn name_of(&self, topic: Topic) -> Result<Name, CliError> {
+    pub(crate) fn name_of(&self, topic: Topic) -> Result<Name, DemoError> {
         let owner: NodeName = topic.owner().name().parse()?;
         let share = ShareConfig {
             interface: Default::default(),
@@ -157,7 +157,7 @@ impl Stage {
         self.temporary.is_none()
     }
 
-    fn write(&self, node: &str, text: &str) -> Result<PathBuf, CliError> {
+    fn write(&self, node: &str, text: &str) -> Result<PathBuf, DemoError> {
         let path = self.dir.join(format!("{node}.toml"));
         fs::write(&path, text).map_err(|source| ProcessError::Write { path: path.clone(), source })?;
         Ok(path)
@@ -172,11 +172,11 @@ fn identity_file(node: &str) -> String {
     format!("{node}.identity")
 }
 
-fn enroll(fleet: &Fleet, node: &str, router: bool) -> Result<Identity, CliError> {
+fn enroll(fleet: &Fleet, node: &str, router: bool) -> Result<Identity, DemoError> {
     let request = EnrollRequest { router, ..EnrollRequest::new(node.parse()?, sgc_process::unix_now()) };
     fleet
         .issue(&request, &mut sgc_process::system_rng()?)
-        .map_err(|source| CliError::Fleet { path: FLEET.into(), source })
+        .map_err(|source| DemoError::Fleet { path: FLEET.into(), source })
 }
 
 fn make_empty_dir(dir: &Path) -> Result<(), ProcessError> {
@@ -232,6 +232,6 @@ mod tests {
         let dir = parent.path().join("kept");
         drop(Stage::set(Some(&dir)).unwrap());
         assert!(dir.join("demo.fleet").is_file());
-        assert!(matches!(Stage::set(Some(&dir)), Err(CliError::Process(ProcessError::Exists { .. }))));
+        assert!(matches!(Stage::set(Some(&dir)), Err(DemoError::Process(ProcessError::Exists { .. }))));
     }
 }

@@ -2,6 +2,7 @@
 //!
 //! The module `messages` defines their content.
 
+use std::str::FromStr;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -12,11 +13,9 @@ use sgc_wire::{History, Qos};
 const LISTENER_DEPTH: u32 = 1000;
 
 /// The two ends of the demo: each a ROS 2 network with an `sgc` node and a talker and listener.
-#[derive(
-    Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, clap::ValueEnum,
-)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Role {
+pub enum Role {
     /// Owns the camera and the chatter.
     Robot,
     /// Owns the commands.
@@ -41,6 +40,14 @@ impl Role {
             Self::Robot => Self::Operator,
             Self::Operator => Self::Robot,
         }
+    }
+}
+
+impl FromStr for Role {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        Self::ALL.into_iter().find(|role| role.name() == text).ok_or_else(|| format!("{text:?} is no role"))
     }
 }
 

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::topics::Topic;
-use super::tracker::Counts;
+use crate::topics::Topic;
+use crate::tracker::Counts;
 
 /// A command of the demo to a peer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -7,7 +7,7 @@
 use aws_lc_rs::digest::{Context, SHA256, digest};
 use bytes::Bytes;
 
-use super::topics::Topic;
+use crate::topics::Topic;
 
 /// Encapsulation of plain CDR, little endian, no options (RTPS 2.5, 10.2).
 const ENCAPSULATION: [u8; ENCAPSULATION_BYTES] = [0, 1, 0, 0];

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use sgc_process::{ProcessError, output};
 
-use super::report::Flow;
-use super::topics::{Role, Topic};
+use crate::report::Flow;
+use crate::topics::{Role, Topic};
 
 const REDRAW_PERIOD: Duration = Duration::from_secs(1);
 const REPRINT_PERIOD: Duration = Duration::from_secs(2);
@@ -168,7 +168,7 @@ mod tests {
     use sgc_wire::Name;
 
     use super::*;
-    use crate::demo::tracker::Counts;
+    use crate::tracker::Counts;
 
     #[test]
     fn table_fits_terminal_and_names_every_topic() {

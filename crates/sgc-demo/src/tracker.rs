@@ -5,7 +5,7 @@
 use hdrhistogram::Histogram;
 use serde::{Deserialize, Serialize};
 
-use super::messages::{Damage, Stamp};
+use crate::messages::{Damage, Stamp};
 
 /// Largest sequence number: two weeks at 50 Hz, 8 MB of bits. A larger one counts as damage.
 pub(crate) const SEQ_MAX: u64 = 1 << 26;

@@ -10,55 +10,43 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use clap::Args;
 use rustix::time::{ClockId, clock_gettime};
 use sgc_dds::{CycloneNetwork, DdsConfig, DiscoveryRange};
+use sgc_process::EXIT_FAILURE;
 use sgc_ros::{RosError, RosNetwork, RosWriter, Sample, SampleKind};
 use sgc_sync::lock;
 
-use super::messages::{self, Draft};
-use super::protocol::{PeerCommand, PeerEvent};
-use super::topics::{Role, Topic};
-use super::tracker::Tracker;
-use crate::error::{CliError, EXIT_FAILURE};
+use crate::error::DemoError;
+use crate::messages::{self, Draft};
+use crate::protocol::{PeerCommand, PeerEvent};
+use crate::topics::{Role, Topic};
+use crate::tracker::Tracker;
 
 /// The period of its reports.
 const REPORT_PERIOD: Duration = Duration::from_millis(200);
 
-/// A talker and listener of `sgc demo`.
-#[derive(Debug, Args)]
-pub(crate) struct PeerArgs {
-    /// Role of this end
-    #[arg(long)]
-    role: Role,
-    /// ROS domain
-    #[arg(long)]
-    domain: u32,
-}
-
 /// Runs a peer until standard input ends.
-pub(crate) fn peer(args: PeerArgs) -> Result<(), CliError> {
-    crate::log::start_log(None)?;
+pub fn peer(role: Role, domain: u32) -> Result<(), DemoError> {
     let events = Events::default();
-    if let Err(error) = run_peer(&args, &events) {
+    if let Err(error) = run_peer(role, domain, &events) {
         events.tell(&PeerEvent::Failed { reason: error.to_string() });
-        return Err(CliError::Demo { reason: error.to_string(), facts: Vec::new() });
+        return Err(DemoError::Failed { reason: error.to_string(), facts: Vec::new() });
     }
     Ok(())
 }
 
-fn run_peer(args: &PeerArgs, events: &Events) -> Result<(), RosError> {
+fn run_peer(role: Role, domain: u32, events: &Events) -> Result<(), RosError> {
     let network = CycloneNetwork::open(&DdsConfig {
-        domain: args.domain,
+        domain,
         discovery: DiscoveryRange::LocalHost,
         ..DdsConfig::default()
     })?;
     let mut listeners = Vec::new();
-    for topic in Topic::owned_by(args.role.other()) {
+    for topic in Topic::owned_by(role.other()) {
         listeners.push(Listener::start(&network, topic, events)?);
     }
     let (mut orders, mut talkers) = (Vec::new(), Vec::new());
-    for topic in Topic::owned_by(args.role) {
+    for topic in Topic::owned_by(role) {
         let (order, taken) = channel();
         let talker =
             Talker { topic, writer: network.create_writer(&topic.writer())?, events: events.clone() };
