@@ -12,6 +12,7 @@ use clap::error::ErrorKind;
 use sgc_demo::DemoError;
 use sgc_diagnosis::DiagnosisError;
 use sgc_gateway::AccessTokenError;
+use sgc_measure::MeasureError;
 use sgc_node::config::ConfigErrors;
 use sgc_node::partners::PartnerError;
 use sgc_node::{AccessError, FleetFileError, NodeError, RulesError, StateError};
@@ -233,13 +234,8 @@ pub(crate) enum CliError {
     #[error(transparent)]
     Demo(DemoError),
     /// A measurement between two machines cannot begin or continue.
-    #[error("bench: {reason}")]
-    Bench {
-        /// The cause, with the culprit and the remedy.
-        reason: String,
-        /// Further facts, printed below the error.
-        facts: Vec<String>,
-    },
+    #[error(transparent)]
+    Bench(MeasureError),
     /// A node that cannot be asked, or an answer that cannot be used.
     #[error(transparent)]
     Diagnosis(#[from] DiagnosisError),
@@ -268,7 +264,9 @@ impl CliError {
             _ => {}
         }
         output::diagnostic(&format!("sgc: {}", one_line(&chain(self))));
-        if let Self::Demo(DemoError::Failed { facts, .. }) | Self::Bench { facts, .. } = self {
+        if let Self::Demo(DemoError::Failed { facts, .. }) | Self::Bench(MeasureError::Failed { facts, .. }) =
+            self
+        {
             for fact in facts {
                 output::diagnostic(&format!("  {fact}"));
             }
@@ -323,7 +321,7 @@ impl CliError {
             | Self::NoHeader { .. }
             | Self::NoAudit { .. }
             | Self::Demo(_)
-            | Self::Bench { .. }
+            | Self::Bench(_)
             | Self::Tell(_) => EXIT_FAILURE,
         }
     }
@@ -337,6 +335,20 @@ impl From<DemoError> for CliError {
             DemoError::Label(error) => error.into(),
             DemoError::Diagnosis(error) => error.into(),
             DemoError::Process(error) => error.into(),
+        }
+    }
+}
+
+impl From<MeasureError> for CliError {
+    fn from(error: MeasureError) -> Self {
+        match error {
+            MeasureError::Failed { .. } => Self::Bench(error),
+            MeasureError::Cannot { reason } => Self::Cannot { reason },
+            MeasureError::Arguments { errors } => Self::Arguments { errors },
+            MeasureError::CheckIdentity { what, source } => Self::CheckIdentity { what, source },
+            MeasureError::Node(error) => error.into(),
+            MeasureError::Diagnosis(error) => error.into(),
+            MeasureError::Process(error) => error.into(),
         }
     }
 }

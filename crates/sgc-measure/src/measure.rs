@@ -9,23 +9,23 @@ use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
-use clap::Args;
 use rand_core::RngCore as _;
 use sgc_dds::CycloneNetwork;
 use sgc_diagnosis::status;
-use sgc_process::ProcessError;
+use sgc_process::{ProcessError, output};
 use sgc_ros::RosError;
 use sgc_trust::{NodeName, Suite};
 
-use super::echo::{Tcp, UDP_BYTES_MAX, Udp};
-use super::machine::{Machine, cpu_us};
-use super::program::End;
-use super::report::{Flow, Path, Report, Trips};
-use super::side::{self, Rendezvous, Side, Topics};
-use super::words::{Answer, Ask, Channel, Frame, Kind, PROTOCOL, Question, Reply, RunId, Size, StreamCount};
-use super::{EVENTS_MAX, Event, failed, next_event, router_url, wait_ready};
-use crate::error::CliError;
-use crate::output;
+use crate::echo::{Tcp, UDP_BYTES_MAX, Udp};
+use crate::error::MeasureError;
+use crate::error::failed;
+use crate::event::{EVENTS_MAX, Event};
+use crate::machine::{Machine, cpu_us};
+use crate::program::End;
+use crate::report::{Flow, Path, Report, Trips};
+use crate::side::{self, Rendezvous, Side, Topics};
+use crate::side::{next_event, wait_ready};
+use crate::words::{Answer, Ask, Channel, Frame, Kind, PROTOCOL, Question, Reply, RunId, Size, StreamCount};
 
 /// Longest wait for the first answer.
 const HELLO_MAX: Duration = Duration::from_secs(30);
@@ -63,52 +63,40 @@ const TCP_PIECE_BYTES: usize = 64 << 10;
 /// Most sizes in one run.
 const SIZES_MAX: usize = 16;
 
-/// Measure between this machine and one where `sgc bench answer` runs
-///
-/// The command prints a table and an interpretation. It takes about twice --seconds for each suite and size. Exit code 0 means
-/// that it measured; 1 means that it could not, and it prints the cause.
-#[derive(Debug, Args)]
-pub(crate) struct MeasureArgs {
-    /// Identity file of a node, other than the answering one's, as `sgc fleet enroll` writes it
-    #[arg(long, value_name = "FILE")]
-    identity: PathBuf,
-    /// Name of the answering node
-    #[arg(long, value_name = "NODE")]
-    with: NodeName,
-    /// URL at which it listens, such as quic://desk.example:7448; several separated by commas
-    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, required_unless_present = "router")]
-    to: Vec<String>,
-    /// Router of yours instead; the other side has to name it too; several separated by commas
-    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "to")]
-    router: Vec<String>,
-    /// Suites to measure, separated by commas
-    #[arg(long, value_name = "SUITES", value_delimiter = ',', default_value = "group,standard")]
-    suites: Vec<Suite>,
-    /// Sizes of messages, separated by commas
-    #[arg(long, value_name = "SIZES", value_delimiter = ',', default_value = "16,1000,1MB")]
-    sizes: Vec<Size>,
-    /// Duration of each measurement in seconds
-    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=60))]
-    seconds: u32,
-    /// File for the figures as JSON
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
-    /// File for the tables as Markdown
-    #[arg(long, value_name = "FILE")]
-    markdown: Option<PathBuf>,
+/// What a side measures, and with whom.
+#[derive(Clone, Debug)]
+pub struct MeasureOptions {
+    /// Identity file of a node, other than the answering one's.
+    pub identity: PathBuf,
+    /// Name of the answering node.
+    pub with: NodeName,
+    /// URLs at which it listens; none if `router` names one.
+    pub to: Vec<String>,
+    /// Routers between the two sides.
+    pub router: Vec<String>,
+    /// Suites to measure.
+    pub suites: Vec<Suite>,
+    /// Sizes of messages.
+    pub sizes: Vec<Size>,
+    /// Duration of each measurement in seconds.
+    pub seconds: u32,
+    /// File for the figures as JSON.
+    pub json: Option<PathBuf>,
+    /// File for the tables as Markdown.
+    pub markdown: Option<PathBuf>,
 }
 
-/// Runs `sgc bench run`.
-pub(crate) fn measure(args: &MeasureArgs) -> Result<(), CliError> {
+/// Measures, and prints a table and an interpretation.
+pub fn measure(args: &MeasureOptions) -> Result<(), MeasureError> {
     let name = sgc_node::load_identity(&args.identity)?.node_name().to_string();
     if name == args.with.to_string() {
         let reason = format!(
             "{name} cannot measure with itself: enrol another node (`sgc fleet enroll`), one identity for each machine"
         );
-        return Err(CliError::Cannot { reason });
+        return Err(MeasureError::Cannot { reason });
     }
     if args.sizes.len() > SIZES_MAX {
-        return Err(CliError::Cannot { reason: format!("at most {SIZES_MAX} sizes in one run") });
+        return Err(MeasureError::Cannot { reason: format!("at most {SIZES_MAX} sizes in one run") });
     }
     let (sender, events) = sync_channel(EVENTS_MAX);
     side::tell_of_signals(sender.clone())?;
@@ -147,18 +135,18 @@ struct MeasureSide<'a> {
     events: Receiver<Event>,
     sender: SyncSender<Event>,
     run: RunId,
-    args: &'a MeasureArgs,
+    args: &'a MeasureOptions,
     phase: u32,
     kept: Instant,
 }
 
 impl<'a> MeasureSide<'a> {
     fn start(
-        args: &'a MeasureArgs,
+        args: &'a MeasureOptions,
         events: Receiver<Event>,
         sender: SyncSender<Event>,
         run: RunId,
-    ) -> Result<Self, CliError> {
+    ) -> Result<Self, MeasureError> {
         let urls = if args.router.is_empty() { &args.to } else { &args.router };
         let topics = Topics::Of(args.with.to_string(), args.suites.clone());
         let side = Side::start(&args.identity, &Rendezvous::Connect(urls.clone()), &topics, &sender)?;
@@ -194,7 +182,7 @@ impl<'a> MeasureSide<'a> {
         channels
     }
 
-    fn run(&mut self) -> Result<Report, CliError> {
+    fn run(&mut self) -> Result<Report, MeasureError> {
         let (version, there) = self.hello()?;
         let mut report = Report::new(self.path(), Machine::here(), there, version);
         for channel in self.channels() {
@@ -218,14 +206,14 @@ impl<'a> MeasureSide<'a> {
 
     // Questions and answers.
 
-    fn say(&mut self, ask: &Ask) -> Result<(), CliError> {
+    fn say(&mut self, ask: &Ask) -> Result<(), MeasureError> {
         self.kept = Instant::now();
         let question = Frame::words(&Question { run: self.run.clone(), ask: ask.clone() });
         self.ends[&Channel::Control].send(&question).map_err(from_dds)
     }
 
     /// Returns the next event until then. Gives the other side signs of life meanwhile.
-    fn next(&mut self, until: Instant) -> Result<Option<Event>, CliError> {
+    fn next(&mut self, until: Instant) -> Result<Option<Event>, MeasureError> {
         if self.kept.elapsed() > KEEP_PERIOD {
             self.say(&Ask::Count { phase: 0 })?;
         }
@@ -238,7 +226,7 @@ impl<'a> MeasureSide<'a> {
         ask: &Ask,
         max: Duration,
         fits: impl Fn(Reply) -> Option<T>,
-    ) -> Result<Option<T>, CliError> {
+    ) -> Result<Option<T>, MeasureError> {
         let deadline = Instant::now() + max;
         while Instant::now() < deadline {
             self.say(ask)?;
@@ -261,7 +249,7 @@ impl<'a> MeasureSide<'a> {
         Ok(None)
     }
 
-    fn hello(&mut self) -> Result<(String, Machine), CliError> {
+    fn hello(&mut self) -> Result<(String, Machine), MeasureError> {
         let suites = self.args.suites.iter().map(|suite| suite.name().to_owned()).collect();
         let hello = Ask::Hello { protocol: PROTOCOL, version: env!("CARGO_PKG_VERSION").to_owned(), suites };
         let deadline = Instant::now() + HELLO_MAX;
@@ -288,7 +276,7 @@ impl<'a> MeasureSide<'a> {
     }
 
     /// Explains why the other side never answered.
-    fn unreached(&self) -> CliError {
+    fn unreached(&self) -> MeasureError {
         let who = &self.args.with;
         let status = match self.side.status() {
             Ok(status) => status,
@@ -307,13 +295,13 @@ impl<'a> MeasureSide<'a> {
                  the others), and are both identities of one fleet, neither revoked nor expired?"
                     .to_owned(),
             );
-            return CliError::Bench { reason: format!("no link to {who}"), facts };
+            return MeasureError::Failed { reason: format!("no link to {who}"), facts };
         }
         if let Some(link) = self.another(&status.links) {
             let reason = format!("the node at {} is not {who}", output::clean(&link.remote));
             let fact =
                 "`sgc bench answer` prints the name of its node there: that belongs behind --with".to_owned();
-            return CliError::Bench { reason, facts: vec![fact] };
+            return MeasureError::Failed { reason, facts: vec![fact] };
         }
         let mut facts = sgc_diagnosis::first_wrong(&self.side.socket(), &Channel::Control.answer())
             .or_else(|| sgc_diagnosis::first_wrong(&self.side.socket(), &Channel::Control.ask()))
@@ -325,7 +313,7 @@ impl<'a> MeasureSide<'a> {
             facts.push("does `sgc bench answer` run there, with the same --router?".to_owned());
         }
         let reason = format!("linked, but {who} does not answer after {} s", HELLO_MAX.as_secs());
-        CliError::Bench { reason, facts }
+        MeasureError::Failed { reason, facts }
     }
 
     /// Returns a direct link to a node whose name differs from --with.
@@ -339,7 +327,7 @@ impl<'a> MeasureSide<'a> {
     }
 
     /// Explains why the other side fell silent, or why a channel carries nothing.
-    fn silent(&self, channel: Channel, waited: Duration) -> CliError {
+    fn silent(&self, channel: Channel, waited: Duration) -> MeasureError {
         let who = &self.args.with;
         let mut facts = Vec::new();
         match self.side.status() {
@@ -362,7 +350,7 @@ impl<'a> MeasureSide<'a> {
             Err(error) => facts.push(error.to_string()),
         }
         let reason = format!("{who} is silent on {} for {:.0} s", channel.name(), waited.as_secs_f64());
-        CliError::Bench { reason, facts }
+        MeasureError::Failed { reason, facts }
     }
 
     fn has_link(&self) -> bool {
@@ -387,7 +375,7 @@ impl<'a> MeasureSide<'a> {
     // Measurements.
 
     /// Waits until a channel carries messages: it needs a grant, and DDS discovery on both sides.
-    fn warm_up(&mut self, channel: Channel, max: Duration) -> Result<(), CliError> {
+    fn warm_up(&mut self, channel: Channel, max: Duration) -> Result<(), MeasureError> {
         self.progress(&format!("{}: waiting until it carries", channel.name()));
         let begun = Instant::now();
         self.phase += 1;
@@ -419,7 +407,7 @@ impl<'a> MeasureSide<'a> {
     }
 
     /// Waits for a pong and fails if none comes. Checks the link when the pong is late.
-    fn pong(&mut self, channel: Channel, size: Size) -> Result<(u64, Instant), CliError> {
+    fn pong(&mut self, channel: Channel, size: Size) -> Result<(u64, Instant), MeasureError> {
         let begun = Instant::now();
         let max = SILENCE_MAX + Duration::from_secs(2 * size.0 as u64 / SLOWEST);
         while begun.elapsed() < max {
@@ -436,7 +424,7 @@ impl<'a> MeasureSide<'a> {
         Err(self.silent(channel, begun.elapsed()))
     }
 
-    fn trips(&mut self, channel: Channel, size: Size) -> Result<Trips, CliError> {
+    fn trips(&mut self, channel: Channel, size: Size) -> Result<Trips, MeasureError> {
         self.progress(&format!("{}, {size}: round trips", channel.name()));
         self.phase += 1;
         let data = bytes::Bytes::from(vec![0x5a; size.0]);
@@ -457,7 +445,7 @@ impl<'a> MeasureSide<'a> {
         Ok(Trips::from_times(channel.name(), size, took, 0))
     }
 
-    fn flow(&mut self, channel: Channel, size: Size) -> Result<Flow, CliError> {
+    fn flow(&mut self, channel: Channel, size: Size) -> Result<Flow, MeasureError> {
         self.progress(&format!("{}, {size}: throughput", channel.name()));
         self.phase += 1;
         let phase = self.phase;
@@ -508,7 +496,7 @@ impl<'a> MeasureSide<'a> {
             .with_cpu(cpu_here.filter(|_| !is_direct), Some(cpu_there).filter(|_| !is_direct)))
     }
 
-    fn count(&mut self, channel: Channel, phase: u32) -> Result<StreamCount, CliError> {
+    fn count(&mut self, channel: Channel, phase: u32) -> Result<StreamCount, MeasureError> {
         let counted = self.ask(&Ask::Count { phase }, ANSWER_MAX, |tell| match tell {
             Reply::Counted(counted) if counted.phase == phase => Some(counted),
             _ => None,
@@ -517,7 +505,7 @@ impl<'a> MeasureSide<'a> {
     }
 
     /// Returns the count of a stream once no more messages arrive.
-    fn drained(&mut self, channel: Channel, phase: u32, sent: u64) -> Result<StreamCount, CliError> {
+    fn drained(&mut self, channel: Channel, phase: u32, sent: u64) -> Result<StreamCount, MeasureError> {
         let (mut last, mut since) = (StreamCount::default(), Instant::now());
         loop {
             let counted = self.count(channel, phase)?;
@@ -545,7 +533,7 @@ impl<'a> MeasureSide<'a> {
     }
 
     /// Measures the bare path. The inner error says why there is none.
-    fn bare(&mut self, report: &mut Report) -> Result<Result<(), String>, CliError> {
+    fn bare(&mut self, report: &mut Report) -> Result<Result<(), String>, MeasureError> {
         self.progress("the bare path: TCP and UDP");
         let opened = self.ask(&Ask::Echo, ANSWER_MAX, |tell| match tell {
             Reply::Echo { tcp, udp } => Some(Ok((tcp, udp))),
@@ -576,7 +564,7 @@ impl<'a> MeasureSide<'a> {
         Ok(Ok(()))
     }
 
-    fn tcp(&mut self, at: SocketAddr, report: &mut Report) -> Result<std::io::Result<()>, CliError> {
+    fn tcp(&mut self, at: SocketAddr, report: &mut Report) -> Result<std::io::Result<()>, MeasureError> {
         let mut connection = match Tcp::for_echo(at, &self.run) {
             Ok(connection) => connection,
             Err(error) => return Ok(Err(error)),
@@ -597,10 +585,10 @@ impl<'a> MeasureSide<'a> {
         let streamed = Tcp::for_stream(at, &self.run)
             .and_then(|connection| connection.stream(&[0x5a; TCP_PIECE_BYTES], duration));
         self.breathe()?;
-        Ok(streamed.map(|(bytes, took)| report.tcp_mbit_s = Some(super::report::mbit_s(bytes, took))))
+        Ok(streamed.map(|(bytes, took)| report.tcp_mbit_s = Some(crate::report::mbit_s(bytes, took))))
     }
 
-    fn udp(&mut self, at: SocketAddr, report: &mut Report) -> Result<std::io::Result<()>, CliError> {
+    fn udp(&mut self, at: SocketAddr, report: &mut Report) -> Result<std::io::Result<()>, MeasureError> {
         let mut socket = match Udp::new(at, &self.run) {
             Ok(socket) => socket,
             Err(error) => return Ok(Err(error)),
@@ -624,13 +612,13 @@ impl<'a> MeasureSide<'a> {
     }
 
     /// Empties the event queue, so that no sender blocks on it.
-    fn breathe(&mut self) -> Result<(), CliError> {
+    fn breathe(&mut self) -> Result<(), MeasureError> {
         while self.next(Instant::now())?.is_some() {}
         Ok(())
     }
 
     /// Measures DDS without `sgc`. The inner error says why there is none.
-    fn directly(&mut self, report: &mut Report) -> Result<Result<(), String>, CliError> {
+    fn directly(&mut self, report: &mut Report) -> Result<Result<(), String>, MeasureError> {
         self.progress("DDS without sgc");
         let opened = self.ask(&Ask::Direct, ANSWER_MAX, |tell| match tell {
             Reply::Direct { domain } => Some(Ok(domain)),
@@ -652,7 +640,9 @@ impl<'a> MeasureSide<'a> {
         self.ends.insert(Channel::Direct, end);
         self.direct = Some(network);
         match self.warm_up(Channel::Direct, DIRECT_MAX) {
-            Err(CliError::Bench { reason, .. }) if reason == "interrupted" => return Err(failed(reason)),
+            Err(MeasureError::Failed { reason, .. }) if reason == "interrupted" => {
+                return Err(failed(reason));
+            }
             Err(_) => {
                 return Ok(Err(format!(
                     "it does not reach in {} s, as usual behind a NAT or a firewall: DDS needs UDP ports from {} on in \
@@ -670,7 +660,9 @@ impl<'a> MeasureSide<'a> {
             });
             match measured {
                 Ok(flow) => report.flows.push(flow),
-                Err(CliError::Bench { reason, .. }) if reason.starts_with(&self.args.with.to_string()) => {
+                Err(MeasureError::Failed { reason, .. })
+                    if reason.starts_with(&self.args.with.to_string()) =>
+                {
                     return Ok(Err(format!("{size}: {reason}")));
                 }
                 Err(error) => return Err(error),
@@ -687,6 +679,6 @@ impl<'a> MeasureSide<'a> {
     }
 }
 
-fn from_dds(error: RosError) -> CliError {
+fn from_dds(error: RosError) -> MeasureError {
     failed(error.to_string())
 }

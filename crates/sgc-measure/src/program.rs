@@ -12,8 +12,8 @@ use sgc_ros::{EndpointSpec, RosError, RosNetwork, RosWriter, Sample, SampleKind,
 use sgc_sync::lock;
 use sgc_wire::{History, Qos};
 
-use super::Event;
-use super::words::{Channel, Frame, Kind, StreamCount, TYPE};
+use crate::event::Event;
+use crate::words::{Channel, Frame, Kind, StreamCount, TYPE};
 
 /// Depth of a reader, which exceeds the number of messages in flight.
 const READER_DEPTH: u32 = 4096;

@@ -8,7 +8,7 @@ use std::io::{BufRead, BufReader};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::mpsc::SyncSender;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -21,14 +21,16 @@ use sgc_process::{EndSignals, ProcessError};
 use sgc_trust::Suite;
 use tempfile::TempDir;
 
-use super::Event;
-use super::words::{Channel, TYPE};
-use crate::error::CliError;
+use crate::error::{MeasureError, failed};
+use crate::event::Event;
+use crate::words::{Channel, TYPE};
 
 /// Longest time a node may take to end cleanly.
 const END_MAX: Duration = Duration::from_secs(6);
 /// How often an ending node is polled.
 const END_PERIOD: Duration = Duration::from_millis(20);
+/// Longest time a node may take to start.
+const READY_MAX: Duration = Duration::from_secs(30);
 /// Most revocation lists that are taken over.
 const CRLS_MAX: usize = 128;
 const CRL_BYTES_MAX: u64 = 1 << 20;
@@ -65,13 +67,13 @@ impl Side {
         meeting: &Rendezvous,
         topics: &Topics,
         events: &SyncSender<Event>,
-    ) -> Result<Self, CliError> {
+    ) -> Result<Self, MeasureError> {
         let dir = tempfile::Builder::new()
             .prefix("sgc-bench-")
             .tempdir()
             .map_err(|source| ProcessError::Write { path: std::env::temp_dir(), source })?;
         let domain = lock_one(std::process::id()).ok_or_else(|| {
-            super::failed(
+            failed(
                 "no free ROS domain among 20 to 69: other ROS 2 programs or demos run here; end one of them",
             )
         })?;
@@ -81,26 +83,27 @@ impl Side {
         let path = dir.path().join("bench.toml");
         fs::write(&path, text).map_err(|source| ProcessError::Write { path: path.clone(), source })?;
         // Mistakes in the user's arguments are reported before any process runs.
-        let config = config::load(&path, &|_: &str| None).map_err(|errors| CliError::Arguments { errors })?;
+        let config =
+            config::load(&path, &|_: &str| None).map_err(|errors| MeasureError::Arguments { errors })?;
         let what = identity.display().to_string();
-        sgc_node::check_identity(&config).map_err(|source| CliError::CheckIdentity { what, source })?;
+        sgc_node::check_identity(&config).map_err(|source| MeasureError::CheckIdentity { what, source })?;
         take_over_revocations(&config, dir.path());
         let node = start_node(dir.path(), &path, events)?;
         Ok(Self { dir, domain, node })
     }
 
     /// Joins the side's domain as a separate DDS program.
-    pub(crate) fn join(&self) -> Result<CycloneNetwork, CliError> {
+    pub(crate) fn join(&self) -> Result<CycloneNetwork, MeasureError> {
         let config = DdsConfig {
             domain: self.domain.id(),
             discovery: DiscoveryRange::LocalHost,
             ..DdsConfig::default()
         };
-        CycloneNetwork::open(&config).map_err(|error| super::failed(error.to_string()))
+        CycloneNetwork::open(&config).map_err(|error| failed(error.to_string()))
     }
 
     /// Asks the node for its status.
-    pub(crate) fn status(&self) -> Result<status::Status, CliError> {
+    pub(crate) fn status(&self) -> Result<status::Status, MeasureError> {
         Ok(status::query(&self.socket())?)
     }
 
@@ -136,18 +139,18 @@ impl Drop for Side {
 }
 
 /// Joins a domain in which both machines discover each other by unicast.
-pub(crate) fn join_directly(domain: u32, peer: std::net::IpAddr) -> Result<CycloneNetwork, CliError> {
+pub(crate) fn join_directly(domain: u32, peer: std::net::IpAddr) -> Result<CycloneNetwork, MeasureError> {
     let config = DdsConfig {
         domain,
         discovery: DiscoveryRange::LocalHost,
         static_peers: vec![peer.to_string()],
         ..DdsConfig::default()
     };
-    CycloneNetwork::open(&config).map_err(|error| super::failed(error.to_string()))
+    CycloneNetwork::open(&config).map_err(|error| failed(error.to_string()))
 }
 
 /// Turns the user's first signal into an event. The next signal ends the process at once.
-pub(crate) fn tell_of_signals(events: SyncSender<Event>) -> Result<(), CliError> {
+pub(crate) fn tell_of_signals(events: SyncSender<Event>) -> Result<(), MeasureError> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
@@ -167,7 +170,7 @@ pub(crate) fn tell_of_signals(events: SyncSender<Event>) -> Result<(), CliError>
     Ok(())
 }
 
-fn start_node(dir: &Path, config: &Path, events: &SyncSender<Event>) -> Result<Child, CliError> {
+fn start_node(dir: &Path, config: &Path, events: &SyncSender<Event>) -> Result<Child, MeasureError> {
     let failed = |source| ProcessError::System { what: "cannot start a node", source };
     let log = dir.join("bench.log");
     let log = File::create(&log).map_err(|source| ProcessError::Write { path: log, source })?;
@@ -204,7 +207,7 @@ fn take_over_revocations(config: &config::Config, dir: &Path) {
     let Ok(name) = sgc_diagnosis::ask::node_name(config) else { return };
     let Some(kept) = sgc_node::state_dir(&usual, &name) else { return };
     let state = dir.join("state");
-    let lists = crate::files::with_extension(&kept.join("crl"), "crl").unwrap_or_default();
+    let lists = sgc_process::files::with_extension(&kept.join("crl"), "crl").unwrap_or_default();
     if lists.is_empty() || sgc_node::create_state_dir(&state.join("crl")).is_err() {
         return;
     }
@@ -217,13 +220,47 @@ fn take_over_revocations(config: &config::Config, dir: &Path) {
     }
 }
 
+/// Returns the next event, or `None` if there is none by then. Fails if the user interrupts the program or the node ends.
+pub(crate) fn next_event(
+    events: &Receiver<Event>,
+    side: &Side,
+    until: Instant,
+) -> Result<Option<Event>, MeasureError> {
+    match events.recv_timeout(until.saturating_duration_since(Instant::now())) {
+        Ok(Event::Interrupted) => Err(failed("interrupted")),
+        Ok(Event::NodeEnded) => {
+            let reason = "the node here ended; its last words:".to_owned();
+            Err(MeasureError::Failed { reason, facts: side.last_words() })
+        }
+        Ok(event) => Ok(Some(event)),
+        Err(RecvTimeoutError::Timeout) => Ok(None),
+        Err(RecvTimeoutError::Disconnected) => Err(failed("nobody is left to say anything")),
+    }
+}
+
+/// Waits until the node is up. Returns the URLs at which it listens.
+pub(crate) fn wait_ready(events: &Receiver<Event>, side: &Side) -> Result<Vec<String>, MeasureError> {
+    let deadline = Instant::now() + READY_MAX;
+    loop {
+        match next_event(events, side, deadline)? {
+            Some(Event::NodeReady(urls)) => return Ok(urls),
+            Some(_) => {}
+            None => {
+                let reason =
+                    format!("the node here is not up after {} s; its last words:", READY_MAX.as_secs());
+                return Err(MeasureError::Failed { reason, facts: side.last_words() });
+            }
+        }
+    }
+}
+
 fn configuration(
     identity: &Path,
     meeting: &Rendezvous,
     topics: &Topics,
     domain: u32,
-) -> Result<String, CliError> {
-    let identity = identity.to_str().ok_or_else(|| CliError::Cannot {
+) -> Result<String, MeasureError> {
+    let identity = identity.to_str().ok_or_else(|| MeasureError::Cannot {
         reason: format!("{}: the path of an identity must be UTF-8; copy it elsewhere", identity.display()),
     })?;
     // A JSON string is a valid TOML string.
@@ -292,7 +329,7 @@ mod tests {
         let listen = Rendezvous::Listen(vec!["quic://0.0.0.0:7448".into(), "tls://[::]:7448".into()]);
         let place = tempfile::tempdir().unwrap();
         let identity = place.path().join("a \"b\".identity");
-        crate::files::write_secret(&identity, "", crate::files::Existing::Keep("")).unwrap();
+        sgc_process::files::write_secret(&identity, "", sgc_process::files::Existing::Keep("")).unwrap();
         let own = load(&identity, &listen, &Topics::Own);
         assert_eq!(own.identity, identity);
         assert_eq!((own.shares.len(), own.uses.len()), (2 * (Suite::ALL.len() + 1), 0));

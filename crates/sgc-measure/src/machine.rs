@@ -4,7 +4,7 @@ use std::fs;
 
 use serde::{Deserialize, Serialize};
 
-use crate::output;
+use sgc_process::output;
 
 /// Longest description that is taken from the other side, bytes.
 const TEXT_BYTES_MAX: usize = 200;

@@ -10,20 +10,21 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use clap::Args;
 use sgc_dds::CycloneNetwork;
 use sgc_process::domains::{DomainLock, lock_one};
+use sgc_process::output;
 use sgc_sync::lock;
 use sgc_trust::Suite;
 
-use super::echo::Echo;
-use super::machine::{Machine, cpu_us};
-use super::program::{End, Tally};
-use super::side::{self, Rendezvous, Side, Topics};
-use super::words::{Answer, Ask, Channel, Frame, PROTOCOL, Question, Reply, RunId};
-use super::{EVENTS_MAX, Event, failed, listen_addr, next_event, router_url, wait_ready};
-use crate::error::CliError;
-use crate::output;
+use crate::echo::Echo;
+use crate::error::MeasureError;
+use crate::error::failed;
+use crate::event::{EVENTS_MAX, Event};
+use crate::machine::{Machine, cpu_us};
+use crate::program::{End, Tally};
+use crate::side::{self, Rendezvous, Side, Topics};
+use crate::side::{next_event, wait_ready};
+use crate::words::{Answer, Ask, Channel, Frame, PROTOCOL, Question, Reply, RunId};
 
 /// Longest silence of a run. After it another run may begin.
 const RUN_SILENCE_MAX: Duration = Duration::from_secs(30);
@@ -32,28 +33,21 @@ const LOOK_PERIOD: Duration = Duration::from_secs(1);
 /// Distance between the node's domain and the first candidate for direct DDS, so that both rarely want the same domain.
 const DIRECT_OFFSET: u32 = 17;
 
-/// Answer `sgc bench run` from another machine, until Ctrl-C
-///
-/// Only members of the fleet may measure. While one does, a TCP and a UDP echo port are open to its address, and a DDS
-/// participant looks for its machine.
-#[derive(Debug, Args)]
-pub(crate) struct AnswerArgs {
-    /// Identity file of a node, other than the measuring one's, as `sgc fleet enroll` writes it
-    #[arg(long, value_name = "FILE")]
-    identity: PathBuf,
-    /// Address to listen on, such as quic://0.0.0.0:7448; several separated by commas
-    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = listen_addr, required_unless_present = "router")]
-    listen: Vec<String>,
-    /// Router of yours instead; the other side has to name it too; several separated by commas
-    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "listen")]
-    router: Vec<String>,
-    /// TCP and UDP port of the plain echo, for a firewall that has to open it; 0 lets the system choose
-    #[arg(long, value_name = "PORT", default_value_t = 0)]
-    echo_port: u16,
+/// How a side answers.
+#[derive(Clone, Debug)]
+pub struct AnswerOptions {
+    /// Identity file of a node, other than the measuring one's.
+    pub identity: PathBuf,
+    /// Addresses to listen on; none if `router` names one.
+    pub listen: Vec<String>,
+    /// Routers between the two sides.
+    pub router: Vec<String>,
+    /// TCP and UDP port of the plain echo; 0 lets the system choose.
+    pub echo_port: u16,
 }
 
-/// Runs `sgc bench answer`.
-pub(crate) fn answer(args: &AnswerArgs) -> Result<(), CliError> {
+/// Answers measurements until the user interrupts.
+pub fn answer(args: &AnswerOptions) -> Result<(), MeasureError> {
     let name = sgc_node::load_identity(&args.identity)?.node_name().to_string();
     let (sender, events) = sync_channel(EVENTS_MAX);
     side::tell_of_signals(sender.clone())?;
@@ -84,7 +78,7 @@ pub(crate) fn answer(args: &AnswerArgs) -> Result<(), CliError> {
     answer_side.serve(&events)
 }
 
-fn introduce(name: &str, is_direct: bool, urls: &[String]) -> Result<(), CliError> {
+fn introduce(name: &str, is_direct: bool, urls: &[String]) -> Result<(), MeasureError> {
     let how = if is_direct { "--to" } else { "--router" };
     output::line(format!("{name} waits at {}", urls.join(",")))?;
     output::line("On the other machine, with the identity of another node of the fleet:")?;
@@ -97,7 +91,7 @@ fn introduce(name: &str, is_direct: bool, urls: &[String]) -> Result<(), CliErro
         "  sgc bench run --identity FILE --with {name} {how} {}",
         reached.collect::<Vec<_>>().join(",")
     ))?;
-    output::line("Ctrl-C ends it.")
+    Ok(output::line("Ctrl-C ends it.")?)
 }
 
 /// The run that is being served.
@@ -147,7 +141,7 @@ struct AnswerSide {
 }
 
 impl AnswerSide {
-    fn serve(&mut self, events: &Receiver<Event>) -> Result<(), CliError> {
+    fn serve(&mut self, events: &Receiver<Event>) -> Result<(), MeasureError> {
         loop {
             match next_event(events, &self.side, Instant::now() + LOOK_PERIOD) {
                 Ok(Some(Event::Frame(Channel::Control, frame, _))) => {
@@ -157,7 +151,7 @@ impl AnswerSide {
                 }
                 Ok(None) if self.run.is_none() => self.tell_refused()?,
                 Ok(_) => {}
-                Err(CliError::Bench { reason, .. }) if reason == "interrupted" => return Ok(()),
+                Err(MeasureError::Failed { reason, .. }) if reason == "interrupted" => return Ok(()),
                 Err(error) => return Err(error),
             }
             if let Some(run) = &mut self.run {
@@ -171,7 +165,7 @@ impl AnswerSide {
     }
 
     /// Tells the waiting user about peers that were refused.
-    fn tell_refused(&mut self) -> Result<(), CliError> {
+    fn tell_refused(&mut self) -> Result<(), MeasureError> {
         let Ok(status) = self.side.status() else { return Ok(()) };
         for (kind, count) in
             status.refused.iter().filter(|(kind, count)| self.refused.get(*kind) != Some(count))
@@ -182,7 +176,7 @@ impl AnswerSide {
         Ok(())
     }
 
-    fn handle(&mut self, question: Question) -> Result<(), CliError> {
+    fn handle(&mut self, question: Question) -> Result<(), MeasureError> {
         let Question { run: id, ask } = question;
         let is_hello = matches!(ask, Ask::Hello { .. });
         let is_known = self.run.as_ref().is_some_and(|run| run.id == id);
@@ -202,7 +196,7 @@ impl AnswerSide {
             }
             Ask::Bye => {
                 self.run = None;
-                return output::line("the run is over; ready for another");
+                return Ok(output::line("the run is over; ready for another")?);
             }
         };
         if let Some(run) = self.run.as_mut().filter(|run| run.id == id) {

@@ -16,8 +16,8 @@ use tokio::runtime::Runtime;
 use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
-use super::words::{RunId, SIZE_MAX};
-use crate::error::CliError;
+use crate::error::MeasureError;
+use crate::words::{RunId, SIZE_MAX};
 
 /// Bytes of the token in front of everything.
 const TOKEN_BYTES: usize = 32;
@@ -49,7 +49,7 @@ pub(crate) struct Echo {
 
 impl Echo {
     /// Opens both ports for this peer and this run. The system chooses the ports if `port` is 0.
-    pub(crate) fn open(peer: IpAddr, run: &RunId, port: u16) -> Result<Self, CliError> {
+    pub(crate) fn open(peer: IpAddr, run: &RunId, port: u16) -> Result<Self, MeasureError> {
         let failed = |source| ProcessError::System { what: "cannot open the plain echo", source };
         let token = run.token().ok_or_else(|| failed(io::ErrorKind::InvalidInput.into()))?;
         let runtime = tokio::runtime::Builder::new_multi_thread()

@@ -10,7 +10,7 @@ use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 use sgc_trust::Suite;
 
-use super::machine::Machine;
+use crate::machine::Machine;
 
 /// Version of this protocol, on which both programs must agree.
 pub(crate) const PROTOCOL: u32 = 1;
@@ -257,7 +257,7 @@ pub(crate) struct StreamCount {
 
 /// A size of messages, as `1000`, `64kB` or `1MB`: powers of ten.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-pub(crate) struct Size(pub(crate) usize);
+pub struct Size(pub usize);
 
 impl FromStr for Size {
     type Err = String;

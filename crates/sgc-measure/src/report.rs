@@ -4,10 +4,10 @@ use std::fmt::Write as _;
 use std::time::Duration;
 
 use serde::Serialize;
+use sgc_process::output;
 
-use super::machine::Machine;
-use super::words::{Size, StreamCount};
-use crate::output;
+use crate::machine::Machine;
+use crate::words::{Size, StreamCount};
 
 /// Fraction of lost UDP packets from which the findings mention loss.
 const UDP_LOSS_TOLD: f64 = 0.005;

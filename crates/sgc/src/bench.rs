@@ -1,0 +1,110 @@
+//! `sgc bench`: the arguments of its two sides. `sgc-measure` runs them.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Args, Subcommand};
+use sgc_measure::{AnswerOptions, MeasureOptions, Size};
+use sgc_node::config::RouterUrl;
+use sgc_transport::ListenAddr;
+use sgc_trust::{NodeName, Suite};
+
+use crate::error::CliError;
+
+/// Measure throughput and latency between two of your machines, through sgc and through the bare network
+///
+/// Run `sgc bench answer` on one machine and `sgc bench run` on the other. They measure round trips, throughput, loss and CPU
+/// with DDS on both ends, then plain TCP and UDP, and DDS without sgc if it can reach the other machine.
+#[derive(Debug, Args)]
+pub(crate) struct BenchArgs {
+    #[command(subcommand)]
+    command: BenchCommand,
+}
+
+#[derive(Debug, Subcommand)]
+enum BenchCommand {
+    Answer(AnswerArgs),
+    Run(MeasureArgs),
+}
+
+/// Answer `sgc bench run` from another machine, until Ctrl-C
+///
+/// Only members of the fleet may measure. While one does, a TCP and a UDP echo port are open to its address, and a DDS
+/// participant looks for its machine.
+#[derive(Debug, Args)]
+pub(crate) struct AnswerArgs {
+    /// Identity file of a node, other than the measuring one's, as `sgc fleet enroll` writes it
+    #[arg(long, value_name = "FILE")]
+    identity: PathBuf,
+    /// Address to listen on, such as quic://0.0.0.0:7448; several separated by commas
+    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = listen_addr, required_unless_present = "router")]
+    listen: Vec<String>,
+    /// Router of yours instead; the other side has to name it too; several separated by commas
+    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "listen")]
+    router: Vec<String>,
+    /// TCP and UDP port of the plain echo, for a firewall that has to open it; 0 lets the system choose
+    #[arg(long, value_name = "PORT", default_value_t = 0)]
+    echo_port: u16,
+}
+
+/// Measure between this machine and one where `sgc bench answer` runs
+///
+/// The command prints a table and an interpretation. It takes about twice --seconds for each suite and size. Exit code 0 means
+/// that it measured; 1 means that it could not, and it prints the cause.
+#[derive(Debug, Args)]
+pub(crate) struct MeasureArgs {
+    /// Identity file of a node, other than the answering one's, as `sgc fleet enroll` writes it
+    #[arg(long, value_name = "FILE")]
+    identity: PathBuf,
+    /// Name of the answering node
+    #[arg(long, value_name = "NODE")]
+    with: NodeName,
+    /// URL at which it listens, such as quic://desk.example:7448; several separated by commas
+    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, required_unless_present = "router")]
+    to: Vec<String>,
+    /// Router of yours instead; the other side has to name it too; several separated by commas
+    #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "to")]
+    router: Vec<String>,
+    /// Suites to measure, separated by commas
+    #[arg(long, value_name = "SUITES", value_delimiter = ',', default_value = "group,standard")]
+    suites: Vec<Suite>,
+    /// Sizes of messages, separated by commas
+    #[arg(long, value_name = "SIZES", value_delimiter = ',', default_value = "16,1000,1MB")]
+    sizes: Vec<Size>,
+    /// Duration of each measurement in seconds
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=60))]
+    seconds: u32,
+    /// File for the figures as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// File for the tables as Markdown
+    #[arg(long, value_name = "FILE")]
+    markdown: Option<PathBuf>,
+}
+
+/// Runs `sgc bench`.
+pub(crate) fn bench(args: BenchArgs) -> Result<ExitCode, CliError> {
+    match args.command {
+        BenchCommand::Answer(args) => {
+            let AnswerArgs { identity, listen, router, echo_port } = args;
+            sgc_measure::answer(&AnswerOptions { identity, listen, router, echo_port })?;
+        }
+        BenchCommand::Run(args) => {
+            let MeasureArgs { identity, with, to, router, suites, sizes, seconds, json, markdown } = args;
+            let options =
+                MeasureOptions { identity, with, to, router, suites, sizes, seconds, json, markdown };
+            sgc_measure::measure(&options)?;
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Checks the URL of a router or of the other side by the rules of a configuration.
+fn router_url(text: &str) -> Result<String, String> {
+    text.parse::<RouterUrl>().map(|_| text.to_owned()).map_err(|fault| fault.to_string())
+}
+
+/// Checks an address to listen on by the same rules.
+fn listen_addr(text: &str) -> Result<String, String> {
+    text.parse::<ListenAddr>().map(|_| text.to_owned()).map_err(|fault| fault.to_string())
+}
