@@ -11,5 +11,5 @@ mod signals;
 mod system;
 
 pub use error::ProcessError;
-pub use signals::{EXIT_FAILURE, EndSignals, exit_after_grace, listen, stdin_closed};
+pub use signals::{EXIT_FAILURE, EndSignals, ORPHAN_GRACE, exit_after_grace, listen, stdin_closed};
 pub use system::{system_rng, unix_now};

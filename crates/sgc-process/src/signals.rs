@@ -11,7 +11,7 @@ use crate::error::ProcessError;
 /// Exit code for a failure while running.
 pub const EXIT_FAILURE: u8 = 1;
 /// Time that a process has to end by itself once the parent that holds its standard input is gone.
-const ORPHAN_GRACE: Duration = Duration::from_secs(5);
+pub const ORPHAN_GRACE: Duration = Duration::from_secs(5);
 
 /// Returns a receiver that becomes ready when standard input ends, which also happens when the parent dies. If the process
 /// still runs [`ORPHAN_GRACE`] later, it is ended.
