@@ -54,7 +54,7 @@ pub struct GatewayStatus {
     pub listen: Vec<String>,
     /// The connected clients.
     pub clients: Vec<ClientStatus>,
-    /// The number of refused connections by reason.
+    /// The number of refused connections by reason, and of messages and calls that the gateway gave up.
     pub refused: BTreeMap<String, u64>,
     /// The number of readers on the local network, shared by all clients.
     pub readers: usize,

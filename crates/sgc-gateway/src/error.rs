@@ -128,6 +128,15 @@ pub enum GatewayError {
         /// The time waited.
         waited_ms: u64,
     },
+    /// The local network was closed before the answer came.
+    #[error(
+        "the local ROS 2 network was opened again before {name} answered, because this host's addresses changed: \
+         the call may have been carried out"
+    )]
+    CutOff {
+        /// The service or action.
+        name: String,
+    },
     /// The server rejected the goal.
     #[error("the server of {name} rejected the goal")]
     GoalRejected {
@@ -179,7 +188,9 @@ impl GatewayError {
             Self::Denied { .. } | Self::OtherClient { .. } => ErrorKind::Denied,
             Self::TooLong { .. } | Self::TooMany { .. } | Self::Crowded { .. } => ErrorKind::Exhausted,
             Self::Twice { .. } => ErrorKind::Exists,
-            Self::NoServer { .. } | Self::Stopping => ErrorKind::Unavailable,
+            Self::NoServer { .. } | Self::CutOff { .. } | Self::Stopping | Self::Ros(RosError::Closed) => {
+                ErrorKind::Unavailable
+            }
             Self::GoalRejected { .. } => ErrorKind::Refused,
             Self::Timeout { .. } => ErrorKind::Timeout,
             Self::Decode(_) | Self::Ros(_) => ErrorKind::Internal,

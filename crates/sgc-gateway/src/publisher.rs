@@ -17,7 +17,7 @@ use crate::content::{Content, serialise};
 use crate::error::GatewayError;
 use crate::feed::own_endpoint;
 use crate::network::Network;
-use crate::quota::{Charge, PendingBytes, Quota};
+use crate::quota::{Charge, PendingBytes, Quota, Quotas};
 
 /// Time within which readers must acknowledge the last messages before the writer ends.
 const FAREWELL_MAX: Duration = Duration::from_secs(1);
@@ -114,6 +114,7 @@ struct WriteQueue {
     /// Held while the queue is written, which keeps the order.
     turn: Mutex<()>,
     published: AtomicU64,
+    quotas: Arc<Quotas>,
     /// The lengths of the messages that the writer keeps, until it ends.
     kept: Option<WriterHistory>,
 }
@@ -128,8 +129,14 @@ struct PendingWrites {
 impl WriteQueue {
     /// Writes one message, which is sent with the messages that follow or at the next flush.
     fn write(&self, stamp_ns: i64, payload: Bytes) -> Result<(), RosError> {
-        self.writer.write_ahead(SampleHead::new(SampleKind::Write, stamp_ns), payload)?;
-        self.published.fetch_add(1, Ordering::Relaxed);
+        match self.writer.write_ahead(SampleHead::new(SampleKind::Write, stamp_ns), payload) {
+            // No subscriber is known while the network is closed, as after the start of a publisher.
+            Err(RosError::Closed) => self.quotas.count_unwritten(),
+            written => {
+                written?;
+                self.published.fetch_add(1, Ordering::Relaxed);
+            }
+        }
         Ok(())
     }
 
@@ -182,7 +189,8 @@ impl Publication {
                 let writer: Arc<dyn RosWriter> = Arc::from(shared.ros.writer(&spec)?);
                 shared.know(own_endpoint(EndpointKind::Writer, writer.guid(), &spec));
                 let (ahead, turn, published) = (Mutex::default(), Mutex::default(), AtomicU64::new(0));
-                let line = Arc::new(WriteQueue { writer, ahead, turn, published, kept });
+                let quotas = Arc::clone(&shared.quotas);
+                let line = Arc::new(WriteQueue { writer, ahead, turn, published, quotas, kept });
                 let bytes_at_once_max = bytes_at_once_max(&spec);
                 let may_block = AtomicBool::new(bytes_at_once_max == 0);
                 let shared = Arc::clone(shared);

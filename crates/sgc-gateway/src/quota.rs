@@ -165,6 +165,9 @@ pub(crate) struct Quotas {
     refused: Mutex<BTreeMap<Pool, u64>>,
     /// Messages that were not kept for later subscribers.
     history_dropped: AtomicU64,
+    /// Messages that clients published, and calls that were unanswered, while the local network was closed.
+    unwritten: AtomicU64,
+    calls_cut_off: AtomicU64,
 }
 
 impl Default for Quotas {
@@ -176,6 +179,8 @@ impl Default for Quotas {
             of: Mutex::default(),
             refused: Mutex::default(),
             history_dropped: AtomicU64::new(0),
+            unwritten: AtomicU64::new(0),
+            calls_cut_off: AtomicU64::new(0),
         }
     }
 }
@@ -226,6 +231,24 @@ impl Quotas {
 
     pub(crate) fn count_history_dropped(&self, messages: u64) {
         self.history_dropped.fetch_add(messages, Ordering::Relaxed);
+    }
+
+    /// Returns the number of messages that clients published while the local network was closed.
+    pub(crate) fn unwritten(&self) -> u64 {
+        self.unwritten.load(Ordering::Relaxed)
+    }
+
+    pub(crate) fn count_unwritten(&self) {
+        self.unwritten.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Returns the number of calls that had no answer when the local network closed.
+    pub(crate) fn calls_cut_off(&self) -> u64 {
+        self.calls_cut_off.load(Ordering::Relaxed)
+    }
+
+    pub(crate) fn count_call_cut_off(&self) {
+        self.calls_cut_off.fetch_add(1, Ordering::Relaxed);
     }
 }
 

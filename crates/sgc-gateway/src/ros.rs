@@ -2,9 +2,11 @@
 
 use std::any::Any;
 use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
 
 use sgc_ros::{
-    DiscoveryHandler, EndpointSpec, GraphNode, Guid, RequestHandler, RosClient, RosError, RosNetwork,
+    DiscoveryHandler, EndpointSpec, GraphNode, Guid, Reach, RequestHandler, RosClient, RosError, RosNetwork,
     RosServer, RosWriter, SampleHandler, ServiceSpec,
 };
 
@@ -15,6 +17,11 @@ pub struct LocalReader {
 }
 
 impl LocalReader {
+    /// Wraps what keeps the reader until it is dropped.
+    pub fn new(guid: Guid, reader: impl Any + Send) -> Self {
+        Self { guid, _reader: Box::new(reader) }
+    }
+
     /// Returns the GUID.
     pub fn guid(&self) -> Guid {
         self.guid
@@ -41,6 +48,12 @@ pub trait LocalRos: Send + Sync + 'static {
     fn server(&self, spec: &ServiceSpec, handler: RequestHandler) -> Result<Box<dyn RosServer>, RosError>;
     /// [`RosNetwork::announce`].
     fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError>;
+    /// [`RosNetwork::reach`].
+    fn reach(&self) -> Reach;
+    /// [`RosNetwork::gains_by_reopening`].
+    fn gains_by_reopening(&self) -> Result<bool, RosError>;
+    /// [`RosNetwork::close`].
+    fn close(self: Arc<Self>, max: Duration) -> bool;
 }
 
 impl<N: RosNetwork> LocalRos for N {
@@ -50,7 +63,7 @@ impl<N: RosNetwork> LocalRos for N {
 
     fn reader(&self, spec: &EndpointSpec, handler: SampleHandler) -> Result<LocalReader, RosError> {
         let reader = self.create_reader(spec, handler)?;
-        Ok(LocalReader { guid: self.reader_guid(&reader), _reader: Box::new(reader) })
+        Ok(LocalReader::new(self.reader_guid(&reader), reader))
     }
 
     fn writer(&self, spec: &EndpointSpec) -> Result<Box<dyn RosWriter>, RosError> {
@@ -67,5 +80,17 @@ impl<N: RosNetwork> LocalRos for N {
 
     fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError> {
         RosNetwork::announce(self, nodes)
+    }
+
+    fn reach(&self) -> Reach {
+        RosNetwork::reach(self)
+    }
+
+    fn gains_by_reopening(&self) -> Result<bool, RosError> {
+        RosNetwork::gains_by_reopening(self)
+    }
+
+    fn close(self: Arc<Self>, max: Duration) -> bool {
+        RosNetwork::close(self, max)
     }
 }

@@ -40,6 +40,9 @@ const HANDSHAKE_MAX: Duration = Duration::from_secs(10);
 const ACCEPT_RETRY: Duration = Duration::from_millis(100);
 /// Status key for messages that were not kept for later subscribers.
 const HISTORY_DROPPED: &str = "messages not kept for later subscribers";
+/// Reasons of losses while the local network was closed, in the same counts.
+const UNWRITTEN: &str = "messages published while the local network was closed";
+const CALLS_CUT_OFF: &str = "calls not answered before the local network closed";
 
 /// The protocol of a listening address.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -283,8 +286,14 @@ impl Server {
         let mut refused = self.shared.admission.refused();
         let crowded = self.shared.hub.shared.network.quotas.refused();
         refused.extend(crowded.into_iter().map(|(pool, count)| (format!("too much for {pool}"), count)));
-        let not_kept = self.shared.hub.shared.network.quotas.history_dropped();
-        refused.extend((not_kept > 0).then(|| (HISTORY_DROPPED.to_owned(), not_kept)));
+        let quotas = &self.shared.hub.shared.network.quotas;
+        let losses = [
+            (HISTORY_DROPPED, quotas.history_dropped()),
+            (UNWRITTEN, quotas.unwritten()),
+            (CALLS_CUT_OFF, quotas.calls_cut_off()),
+        ];
+        let losses = losses.into_iter().filter(|(_, count)| *count > 0);
+        refused.extend(losses.map(|(reason, count)| (reason.to_owned(), count)));
         refused
     }
 

@@ -8,8 +8,8 @@ use std::time::Duration;
 use bytes::Bytes;
 use sgc_cdr::{Layout, Value};
 use sgc_ros::{
-    EndpointKind, EndpointSpec, RequestId, RosClient, RosError, RosServer, ServiceSpec, ServiceTopic,
-    service_qos,
+    EndpointKind, EndpointSpec, HandleCalls, RequestId, RosClient, RosError, RosServer, ServiceSpec,
+    ServiceTopic, service_qos,
 };
 use sgc_sync::lock;
 use tokio::sync::{mpsc, oneshot};
@@ -55,13 +55,42 @@ fn spec(service: &str, type_name: &str, halves: &Halves) -> ServiceSpec {
     }
 }
 
+/// The id of a client on the network and the number of its request. A client that is created again has another id.
+type CallId = ([u8; 16], i64);
+
 #[derive(Default)]
 struct PendingCalls {
-    asked: BTreeMap<i64, oneshot::Sender<Bytes>>,
+    asked: BTreeMap<CallId, oneshot::Sender<Bytes>>,
     /// Requests that are being sent, whose numbers are not known yet.
     sending: usize,
     /// Replies that may belong to these requests.
-    early: VecDeque<(i64, Bytes)>,
+    early: VecDeque<(CallId, Bytes)>,
+}
+
+/// The handler of a client's replies.
+struct Replies(Arc<Mutex<PendingCalls>>);
+
+impl HandleCalls for Replies {
+    fn handle(&mut self, id: RequestId, payload: Bytes) {
+        let id = (id.client, id.number);
+        let mut pending = lock(&self.0);
+        match pending.asked.remove(&id) {
+            Some(waiting) => drop(waiting.send(payload)),
+            // No call waits for this reply.
+            None if pending.sending == 0 => {}
+            None => {
+                pending.early.push_back((id, payload));
+                if pending.early.len() > EARLY_MAX {
+                    pending.early.pop_front();
+                }
+            }
+        }
+    }
+
+    fn network_closed(&mut self) {
+        // Calls without their sender end.
+        lock(&self.0).asked.clear();
+    }
 }
 
 /// A client of a service, shared by all callers.
@@ -78,12 +107,12 @@ pub(crate) struct Caller {
 /// A call in progress. Its reply is discarded after this is dropped.
 struct CallGuard {
     caller: Arc<Caller>,
-    number: i64,
+    id: CallId,
 }
 
 impl Drop for CallGuard {
     fn drop(&mut self) {
-        lock(&self.caller.pending).asked.remove(&self.number);
+        lock(&self.caller.pending).asked.remove(&self.id);
     }
 }
 
@@ -94,23 +123,7 @@ impl Caller {
         let pending: Arc<Mutex<PendingCalls>> = Arc::default();
         let answered = Arc::clone(&pending);
         let spec = spec(service, type_name, &halves);
-        let client = shared.ros.client(
-            &spec,
-            Box::new(move |id: RequestId, payload: Bytes| {
-                let mut pending = lock(&answered);
-                match pending.asked.remove(&id.number) {
-                    Some(waiting) => drop(waiting.send(payload)),
-                    // No call waits for this reply.
-                    None if pending.sending == 0 => {}
-                    None => {
-                        pending.early.push_back((id.number, payload));
-                        if pending.early.len() > EARLY_MAX {
-                            pending.early.pop_front();
-                        }
-                    }
-                }
-            }),
-        )?;
+        let client = shared.ros.client(&spec, Box::new(Replies(answered)))?;
         let [reader, writer] = client.guids();
         shared.know(own_endpoint(EndpointKind::Reader, reader, &spec.reply));
         shared.know(own_endpoint(EndpointKind::Writer, writer, &spec.request));
@@ -132,19 +145,20 @@ impl Caller {
         let mut pending = lock(&self.pending);
         pending.sending -= 1;
         let early = sent.as_ref().ok().and_then(|id| {
-            let at = pending.early.iter().position(|(number, _)| *number == id.number)?;
+            let at = pending.early.iter().position(|(of, _)| *of == (id.client, id.number))?;
             pending.early.remove(at)
         });
         if pending.sending == 0 {
             pending.early.clear();
         }
-        let number = sent?.number;
+        let sent = sent?;
+        let id = (sent.client, sent.number);
         match early {
             Some((_, payload)) => drop(send.send(payload)),
-            None => drop(pending.asked.insert(number, send)),
+            None => drop(pending.asked.insert(id, send)),
         }
         drop(pending);
-        Ok((CallGuard { caller: Arc::clone(self), number }, reply))
+        Ok((CallGuard { caller: Arc::clone(self), id }, reply))
     }
 
     /// Calls the service and waits for the reply.
@@ -164,16 +178,25 @@ impl Caller {
             Err(GatewayError::Ros(RosError::NoPeer { .. })) => {
                 return Err(GatewayError::NoServer { name: self.service.clone() });
             }
+            Err(GatewayError::Ros(RosError::Closed)) => return Err(self.cut_off(&shared)),
             asked => asked?,
         };
         match tokio::time::timeout(max, reply).await {
             Ok(Ok(payload)) => Ok(payload),
-            Ok(Err(_)) => Err(GatewayError::Stopping),
+            Ok(Err(_)) => Err(self.cut_off(&shared)),
             Err(_) => Err(GatewayError::Timeout {
                 name: self.service.clone(),
                 waited_ms: u64::try_from(max.as_millis()).unwrap_or(u64::MAX),
             }),
         }
+    }
+}
+
+impl Caller {
+    /// Counts a call that gets no answer because the network closed. Returns its error.
+    fn cut_off(&self, shared: &HubState) -> GatewayError {
+        shared.quotas.count_call_cut_off();
+        GatewayError::CutOff { name: self.service.clone() }
     }
 }
 

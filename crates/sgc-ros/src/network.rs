@@ -267,6 +267,9 @@ pub trait HandleCalls: Send {
     fn unhandled(&mut self, why: UnhandledCall, messages: u64) {
         let _ = (why, messages);
     }
+
+    /// Reports at a client that its network closed. Requests sent before get no answer.
+    fn network_closed(&mut self) {}
 }
 
 impl<F: FnMut(RequestId, Bytes) + Send> HandleCalls for F {
@@ -382,6 +385,9 @@ pub enum RosError {
         "the hash of its key is not known, without which subscribers of Fast DDS 3 end with a segmentation fault"
     )]
     KeyUnknown,
+    /// The network is closed and is to be opened again.
+    #[error("the local ROS 2 network is closed, and is opened again because this host's addresses changed")]
+    Closed,
     /// No endpoint is there to receive a request or a reply.
     #[error("nobody on the local network was there to hear it for {waited_ms} ms")]
     NoPeer {
@@ -397,7 +403,7 @@ pub enum RosError {
 }
 
 /// The reach of a network, compared with the time when it was opened.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Reach {
     /// The reach is unchanged.
     Whole,

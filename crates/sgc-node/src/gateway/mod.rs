@@ -5,12 +5,14 @@
 //! like any program, so shares and uses apply to its topics as well.
 
 pub(crate) mod access;
+mod network;
 
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, MutexGuard};
+use std::time::Duration;
 
 use rustls::sign::CertifiedKey;
 use sgc_cdr::{Layout, TypeName};
@@ -19,12 +21,14 @@ use sgc_gateway::{
     Access, Client, FindDefinitions, GatewayError, GatewayStatus, Hub, HubOptions, ListenAt, LocalRos,
     Server, ServerError, ServerOptions, Session, SessionLimits, TlsError, Types, certified_key,
 };
-use sgc_ros::RosError;
+use sgc_ros::{Reach, RosError};
 use sgc_sync::lock;
 use sgc_trust::{Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
 use tokio::sync::{Mutex, OnceCell};
 use zeroize::Zeroizing;
+
+use self::network::{GatewayNetwork, HubNetwork};
 
 /// Opens the gateway's part of the local network. May block.
 pub type OpenLocalRos = Arc<dyn Fn() -> Result<Arc<dyn LocalRos>, RosError> + Send + Sync>;
@@ -67,6 +71,8 @@ pub(crate) struct Gateway {
     /// Name of the ROS 2 node.
     node: String,
     hub: OnceCell<Hub>,
+    /// The network of the hub.
+    network: std::sync::Mutex<Option<Arc<GatewayNetwork>>>,
     server: std::sync::Mutex<Option<Arc<Server>>>,
     /// Held while the shown certificates change, so that a reload does not undo a renewal.
     showing: std::sync::Mutex<()>,
@@ -87,7 +93,8 @@ impl Gateway {
         let (name, showing, shows_own) =
             (node_name.to_owned(), std::sync::Mutex::default(), AtomicBool::default());
         let open = std::sync::Mutex::new(open);
-        Arc::new(Self { open, types, name, node, hub, server, showing, shows_own })
+        let network = std::sync::Mutex::default();
+        Arc::new(Self { open, types, name, node, hub, network, server, showing, shows_own })
     }
 
     /// Sets how to open a local network that the node joined after its start.
@@ -107,12 +114,52 @@ impl Gateway {
                     let reason = "this node has no local ROS 2 network: it is only a router".to_owned();
                     GatewayError::Ros(RosError::Domain { domain: 0, reason })
                 })?;
-                let opened = tokio::task::spawn_blocking(move || open()).await;
-                let ros = opened.map_err(|_| GatewayError::Stopping)??;
+                let opened = tokio::task::spawn_blocking(move || GatewayNetwork::open(open)).await;
+                let network = opened.map_err(|_| GatewayError::Stopping)??;
                 let types = self.types.lock().await.take().ok_or(GatewayError::Stopping)?;
-                Hub::start(ros, types, HubOptions { node: self.node.clone() }).await
+                let ros = Arc::new(HubNetwork(Arc::clone(&network)));
+                let hub = Hub::start(ros, types, HubOptions { node: self.node.clone() }).await?;
+                *lock(&self.network) = Some(network);
+                Ok(hub)
             })
             .await
+    }
+
+    /// Returns the reach of the hub's network, if it is open.
+    pub(crate) fn reach(&self) -> Reach {
+        self.network().map_or(Reach::Whole, |network| HubNetwork(network).reach())
+    }
+
+    /// Returns `true` if the hub's network would reach more if it were opened again. May block.
+    pub(crate) fn gains_by_reopening(&self) -> Result<bool, RosError> {
+        self.network().map_or(Ok(false), |network| HubNetwork(network).gains_by_reopening())
+    }
+
+    /// Closes the hub's network, if it is open. Clients stay connected.
+    pub(crate) async fn close_network(&self, max: Duration) {
+        if let Some(network) = self.network() {
+            let _ = tokio::task::spawn_blocking(move || network.close_for_now(max)).await;
+        }
+    }
+
+    /// Opens the hub's network again after [`Self::close_network`].
+    pub(crate) async fn open_network(&self) -> Result<(), RosError> {
+        let Some(network) = self.network() else { return Ok(()) };
+        let opening = Arc::clone(&network);
+        if let Ok(Err(error)) = tokio::task::spawn_blocking(move || opening.open_again()).await {
+            return Err(error);
+        }
+        if let Some(deadline) = network.rediscovery_deadline() {
+            tokio::spawn(async move {
+                tokio::time::sleep_until(deadline.into()).await;
+                network.rediscovery_due(deadline);
+            });
+        }
+        Ok(())
+    }
+
+    fn network(&self) -> Option<Arc<GatewayNetwork>> {
+        lock(&self.network).clone()
     }
 
     /// Opens a session with all rights for the user who runs the node.

@@ -3,13 +3,15 @@
 //! [`Pace`], a pure machine, decides when. [`watch`] looks at the network only after a change of addresses. The control
 //! task (`core/reopening.rs`) ends and creates the endpoints.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_ros::{Reach, RosNetwork};
+use sgc_ros::{Reach, RosError, RosNetwork};
 use tokio::sync::{mpsc, oneshot};
 use tracing::{info, warn};
 
 use crate::control::event::CoreEvent;
+use crate::gateway::Gateway;
 use crate::link::roaming::Network;
 use crate::local::dds_discovery::discover;
 use crate::local::network_slot::{NetworkSlot, OpenAgain};
@@ -52,6 +54,7 @@ impl Pace {
 pub(crate) async fn watch<N: RosNetwork>(
     mut changes: Network,
     network: NetworkSlot<N>,
+    gateway: Arc<Gateway>,
     events: mpsc::Sender<CoreEvent>,
 ) {
     let mut pace = Pace::default();
@@ -60,17 +63,28 @@ pub(crate) async fn watch<N: RosNetwork>(
         loop {
             tokio::time::sleep(LOOK_EVERY).await;
             let (Some(present), Some(open)) = (network.get(), network.again()) else { break };
-            match present.reach() {
+            let (node_reach, gateway_reach) = (present.reach(), gateway.reach());
+            match node_reach.max(gateway_reach) {
                 Reach::Whole => break,
                 Reach::Doubtful => continue,
                 Reach::CutOff if !pace.may_open(Instant::now()) => continue,
                 Reach::CutOff => {}
             }
             // A network that cannot be opened is worse than one that does not reach other hosts.
-            let gains = tokio::task::spawn_blocking(move || present.gains_by_reopening()).await;
-            match gains {
-                Ok(Ok(true)) => reopen(&network, &open, &events, &mut pace).await,
-                Ok(Ok(false)) => {}
+            let probed = Arc::clone(&gateway);
+            let gains = tokio::task::spawn_blocking(move || {
+                let node = node_reach == Reach::CutOff && present.gains_by_reopening()?;
+                let gateway = !node && gateway_reach == Reach::CutOff && probed.gains_by_reopening()?;
+                Ok::<_, RosError>((node, gateway))
+            });
+            match gains.await {
+                Ok(Ok((true, _))) => reopen(&network, &open, &gateway, &events, &mut pace).await,
+                Ok(Ok((false, true))) => {
+                    gateway.close_network(CLOSE_MAX).await;
+                    pace.opened(Instant::now());
+                    open_gateway(&gateway, &mut pace).await;
+                }
+                Ok(Ok((false, false))) => {}
                 Ok(Err(error)) => {
                     let pause = pace.failed(Instant::now());
                     warn!(
@@ -89,6 +103,7 @@ pub(crate) async fn watch<N: RosNetwork>(
 async fn reopen<N: RosNetwork>(
     network: &NetworkSlot<N>,
     open: &OpenAgain<N>,
+    gateway: &Gateway,
     events: &mpsc::Sender<CoreEvent>,
     pace: &mut Pace,
 ) {
@@ -98,6 +113,8 @@ async fn reopen<N: RosNetwork>(
     if events.send(CoreEvent::CloseNetwork(reply)).await.is_err() || closed.await.is_err() {
         return;
     }
+    // The gateway's endpoints end unseen, so that their routes wait for those that follow.
+    gateway.close_network(CLOSE_MAX).await;
     let all_ended = tokio::task::spawn_blocking(move || old.close(CLOSE_MAX)).await;
     if !all_ended.unwrap_or(false) {
         warn!(
@@ -119,6 +136,7 @@ async fn reopen<N: RosNetwork>(
                 if let Ok(Err(error)) = tokio::task::spawn_blocking(discover).await {
                     warn!(%error, "nothing is discovered on the local ROS 2 network: restart the node");
                 }
+                open_gateway(gateway, pace).await;
                 info!(
                     took = ?began.elapsed(),
                     "this host's addresses changed: the local ROS 2 network was opened again, for programs of other hosts"
@@ -142,6 +160,19 @@ async fn reopen<N: RosNetwork>(
     }
 }
 
+/// Opens the gateway's part of the network again, repeatedly until it is open.
+async fn open_gateway(gateway: &Gateway, pace: &mut Pace) {
+    while let Err(error) = gateway.open_network().await {
+        let pause = pace.failed(Instant::now());
+        warn!(
+            "the gateway's part of the local ROS 2 network is closed and cannot be opened again: {error}. Trying again in {} s",
+            pause.as_secs()
+        );
+        tokio::time::sleep(pause).await;
+        gateway.close_network(CLOSE_MAX).await;
+    }
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
@@ -150,7 +181,7 @@ mod tests {
     use std::sync::atomic::AtomicU32;
     use std::sync::atomic::Ordering::Relaxed;
 
-    use sgc_ros::RosError;
+    use sgc_gateway::ShippedDefinitions;
     use sgc_testkit::{FakeDomain, FakeRos};
 
     use super::*;
@@ -170,7 +201,8 @@ mod tests {
         let slot = NetworkSlot::new(Some(Arc::new(domain.join(true))), Some(again));
         let (tell, changes) = Network::channel();
         let (events, mut inbox) = mpsc::channel(8);
-        let watching = tokio::spawn(watch(changes, slot.clone(), events));
+        let watching =
+            tokio::spawn(watch(changes, slot.clone(), Gateway::new(None, "arm", ShippedDefinitions), events));
         let change = || tell.send_modify(|change| *change += 1);
         change();
         // The network reaches as far as before.

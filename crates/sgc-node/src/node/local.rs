@@ -58,7 +58,7 @@ pub(super) fn local_routes(
     Some(Routes::new(secret.clone(), identity.node_id(), shares, uses, ChaCha20Rng::from_rng(rng)))
 }
 
-/// Returns a function that opens the network of this configuration again. The gateway's part stays open.
+/// Returns a function that opens the network of this configuration again. The gateway opens its part itself.
 pub(super) fn open_again<N: RosNetwork>(open: &OpenNetwork<N>, ros: &RosConfig) -> OpenAgain<N> {
     let (open, ros) = (open.clone(), ros.clone());
     Arc::new(move || open(&ros).map(|(network, _)| network))

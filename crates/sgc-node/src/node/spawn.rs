@@ -96,7 +96,12 @@ pub(super) async fn spawn<N: RosNetwork>(
     };
     let accepting = sockets.listeners.into_iter().map(|listener| accept(listener, admission())).collect();
     let socket = admin_socket_path(&config, identity.node_name().as_str());
-    tasks.push(tokio::spawn(reopening::watch(keeper.network.clone(), network.clone(), events.clone())));
+    tasks.push(tokio::spawn(reopening::watch(
+        keeper.network.clone(),
+        network.clone(),
+        gateway.clone(),
+        events.clone(),
+    )));
     let reloader = Arc::new(Reloader {
         source: options.source,
         join: node.open.map(|open| join_late(open, network.clone(), events.clone(), gateway.clone())),

@@ -274,3 +274,110 @@ fn nodes_with_defaults_are_found_by_a_proxy_that_keeps_to_its_host() {
         }
     }
 }
+
+/// Program of a robot's gateway, by its protocol, whose subscriptions and publications have to outlast the change.
+fn without_ros(lab: &Lab, protocol: &str, address: &str) -> Peer {
+    let args =
+        [protocol, address, "--topic", "/text_out", "--publish", "/text_in", "--serve", "/add_two_ints"];
+    // A second server of a service is no help.
+    let args = if protocol == "grpc" { &args[..] } else { &args[..6] };
+    lab.python(Site::Robot, "gateway.py", &[args, &["--timeout", PLAN.peer_life]].concat())
+}
+
+/// Asserts that an event of this kind comes within the bound after `since`.
+fn assert_event(peer: &mut Peer, kind: &str, since: Instant, bound: Duration, what: &str) {
+    let deadline = since + bound;
+    let is_one = |(at, event): (Instant, Value)| {
+        assert_ne!(event["event"], "failed", "{what}: {event}");
+        event["event"] == kind && (since..=deadline).contains(&at)
+    };
+    let came = std::iter::from_fn(|| {
+        peer.events.recv_timeout(deadline.saturating_duration_since(Instant::now())).ok()
+    })
+    .any(is_one);
+    assert!(came, "{what}: nothing within {bound:?}");
+}
+
+#[test]
+fn programs_of_the_gateway_keep_their_topics_after_an_address_change() {
+    let mut lab = Lab::silent(PLAN, ["[gateway]\n", ""].map(str::to_owned));
+    lab.reconfigure(Site::Robot, "discovery_range = \"localhost\"", "discovery_range = \"subnet\"");
+    lab.start_all();
+    let (Some(robot), Some(cloud)) = (lab.namespace(Site::Robot), lab.namespace(Site::Cloud)) else {
+        return;
+    };
+    // The cloud's host is a second computer of the robot's network.
+    change(cloud, "route add 239.0.0.0/8 dev robot");
+    let mut clients = [("grpc", "grpc://127.0.0.1:50051"), ("rosbridge", "ws://127.0.0.1:9090")]
+        .map(|(protocol, address)| (protocol, without_ros(&lab, protocol, address)));
+    let text = ["--timeout", PLAN.peer_life];
+    let mut program = lab.rclpy(Site::Cloud, "jazzy", "text.py", &text);
+    let sees_all = |clients: &mut [(&str, Peer)], program: &mut Peer, bound, when: &str| {
+        let since = Instant::now();
+        for (protocol, client) in clients {
+            assert_event(client, "heard", since, bound, &format!("{protocol} {when}"));
+        }
+        assert_event(program, "received", since, bound, &format!("ROS {when}"));
+    };
+    sees_all(&mut clients, &mut program, PATIENCE, "at first");
+    let since = |lab: &Lab| {
+        let status = lab.status(Site::Robot);
+        let all = status["gateway"]["clients"].as_array().cloned().unwrap_or_default();
+        all.iter().map(|client| client["since"].as_u64().unwrap()).collect::<Vec<_>>()
+    };
+    let before = since(&lab);
+    change(robot, "addr del 10.92.1.2/24 dev cloud");
+    change(robot, "addr add 10.92.1.3/24 dev cloud");
+    eventually("the network is opened again", || lab.status(Site::Robot)["local_network_reopened"] == 1);
+    sees_all(&mut clients, &mut program, REOPENED, "with another address");
+    assert_eq!((before.len(), since(&lab)), (2, before), "the clients stay connected");
+}
+
+/// The robot's programs are on a second computer of its network; calls go on across the change, either way.
+#[test]
+fn services_of_other_hosts_go_on_after_an_address_change() {
+    for pair in PAIRS {
+        let [mut robot, mut desk] = robot_to_desk("service", ["/near"]);
+        robot += &uses("service", "/far", "desk");
+        desk += &share("service", "/far", "robot");
+        let mut lab = Lab::silent(PLAN, [robot, desk]);
+        lab.reconfigure(Site::Robot, "discovery_range = \"localhost\"", "discovery_range = \"subnet\"");
+        lab.start_all();
+        let (Some(robot), Some(cloud)) = (lab.namespace(Site::Robot), lab.namespace(Site::Cloud)) else {
+            return;
+        };
+        change(cloud, "route add 239.0.0.0/8 dev robot");
+        let program = |site, distribution, range: Environment, args: &[&str]| {
+            let mut command = lab.ros(site, distribution, "text.py");
+            command.args(args).args(["--patience", "8", "--delay", "0.5", "--timeout", PLAN.peer_life]);
+            Peer::start({
+                command.envs(range.iter().copied());
+                command
+            })
+        };
+        let mut robots = program(Site::Cloud, pair[0], SUBNET, &["--serve", "/near", "--call", "/far"]);
+        let mut desks = program(Site::Desk, pair[1], LOCALHOST, &["--serve", "/far", "--call", "/near"]);
+        let both = |robots: &mut Peer, desks: &mut Peer, bound, when: &str| {
+            let since = Instant::now();
+            assert_event(
+                robots,
+                "answered",
+                since,
+                bound,
+                &format!("{pair:?}, a call of the desk's server {when}"),
+            );
+            assert_event(
+                desks,
+                "answered",
+                since,
+                bound,
+                &format!("{pair:?}, a call of the robot's server {when}"),
+            );
+        };
+        both(&mut robots, &mut desks, PATIENCE, "at first");
+        change(robot, "addr del 10.92.1.2/24 dev cloud");
+        change(robot, "addr add 10.92.1.3/24 dev cloud");
+        eventually("the network is opened again", || lab.status(Site::Robot)["local_network_reopened"] == 1);
+        both(&mut robots, &mut desks, REOPENED, "with another address");
+    }
+}
