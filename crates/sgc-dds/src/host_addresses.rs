@@ -29,6 +29,8 @@ const MESSAGE_BYTES_MAX: usize = 8192;
 static ADDRESSES: RwLock<Addresses> = RwLock::new(Addresses::NONE);
 /// `true` once a former address of this host is gone.
 static ANY_GONE: AtomicBool = AtomicBool::new(false);
+/// `true` once a network is open that reaches other hosts by IPv4.
+static REACHES_OUT: AtomicBool = AtomicBool::new(false);
 
 struct Addresses {
     here: Vec<Ipv4Addr>,
@@ -112,6 +114,24 @@ pub(crate) fn is_here(address: Ipv4Addr) -> bool {
 /// Returns `true` if this host has an address besides loopback.
 pub(crate) fn has_any() -> bool {
     read(|addresses| !addresses.here.is_empty())
+}
+
+/// Notes that a network of this process reaches other hosts by IPv4.
+pub(crate) fn note_reaching_out() {
+    REACHES_OUT.store(true, Ordering::Relaxed);
+}
+
+/// Returns `true` if a network of this process reaches other hosts by IPv4, and this host has no such address besides
+/// loopback.
+pub fn is_alone() -> bool {
+    REACHES_OUT.load(Ordering::Relaxed) && !has_any()
+}
+
+/// Returns `true` if this host has an IPv4 address besides loopback now, by which programs of other hosts could be
+/// reached.
+pub fn has_outward_address() -> bool {
+    // An unreadable table does not mean that there is none.
+    read_file("/proc/net/fib_trie").is_none_or(|table| !local_addresses(&table, HERE_MAX).is_empty())
 }
 
 /// Returns the number of address changes and the time of the last.

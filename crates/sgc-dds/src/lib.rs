@@ -57,6 +57,7 @@ mod writer;
 
 pub use arrivals::WAITING_BYTES_MAX;
 pub use config::{DdsConfig, DiscoveryRange};
+pub use host_addresses::{has_outward_address, is_alone};
 pub use log::{Unsent, unsent};
 pub use network::CycloneNetwork;
 pub use reader::CycloneReader;

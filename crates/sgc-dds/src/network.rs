@@ -66,6 +66,10 @@ impl CycloneNetwork {
     pub fn open(config: &DdsConfig) -> Result<Self, RosError> {
         log::install();
         host_addresses::follow();
+        // Cyclone's own settings may choose IPv6.
+        if reaches_out(config) && config.cyclonedds_uri.as_deref().is_none_or(|uri| uri.trim().is_empty()) {
+            host_addresses::note_reaching_out();
+        }
         let opened_after = host_addresses::changes();
         let (alive, all_dropped) = channel();
         let refused = |reason| RosError::Domain { domain: config.domain, reason };

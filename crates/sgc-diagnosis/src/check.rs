@@ -7,7 +7,7 @@ use std::path::Path;
 
 use sgc_gateway::Anonymous;
 use sgc_node::UnknownMember;
-use sgc_node::alerts::clock_alert;
+use sgc_node::alerts::{Alert, clock_alert};
 use sgc_node::config::{
     Config, DiscoveryRange, GatewayConfig, Interface, Naming, Rename, RouterUrl, ShareConfig, TokenSource,
 };
@@ -146,7 +146,11 @@ pub fn summary(
         });
         rows.extend(unusable.or(exposed).map(|text| vec!["warning".to_owned(), text]));
     }
-    if config.ros.is_some() {
+    if let Some(ros) = &config.ros {
+        let reaches_out = ros.discovery == DiscoveryRange::Subnet && ros.cyclonedds_uri.is_none();
+        let alone = reaches_out && !sgc_dds::has_outward_address();
+        let alone = alone.then_some(Alert::LocalNetworkAlone);
+        rows.extend(alone.map(|alert| vec!["warning".to_owned(), format!("{alert}: {}", alert.fix())]));
         for alert in discovery_server::alerts(environment) {
             rows.push(vec!["warning".to_owned(), format!("{alert}: {}", alert.fix())]);
         }

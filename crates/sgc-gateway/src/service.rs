@@ -194,7 +194,7 @@ impl Caller {
 
 impl Caller {
     /// Counts a call that gets no answer because the network closed. Returns its error.
-    fn cut_off(&self, shared: &HubState) -> GatewayError {
+    fn cut_off(&self, shared: &Network) -> GatewayError {
         shared.quotas.count_call_cut_off();
         GatewayError::CutOff { name: self.service.clone() }
     }

@@ -112,6 +112,8 @@ pub enum Alert {
         /// Their number.
         programs: usize,
     },
+    /// This host has no IPv4 address besides loopback, so programs of other hosts are not found.
+    LocalNetworkAlone,
     /// Local programs announce themselves, but nothing else arrives from them.
     SilentPrograms {
         /// The enclave that they name, `/` if they have none of their own.
@@ -150,7 +152,7 @@ impl Alert {
             }
             Self::LocalNetworkFails { .. } => {
                 "compare `ip addr` and `ip route` with that address; if this host's own address changed, the node opens its network again \
-                 within some 15 s of the change. If this stays, or clients of a gateway miss programs of other hosts, restart the node"
+                 within some 15 s of the change. If this stays, restart the node"
             }
             Self::LocalNetworkClosed { .. } => {
                 "see whether an interface or address that CYCLONEDDS_URI or ROS_STATIC_PEERS names is gone; the node tries again by itself, \
@@ -170,6 +172,10 @@ impl Alert {
             Self::UnprotectedPrograms { .. } => {
                 "start them with ROS_SECURITY_ENABLE=true and an enclave of this node's keystore, or share their topics with a second node \
                  of sgc without `enclave`"
+            }
+            Self::LocalNetworkAlone => {
+                "give an interface an IPv4 address, since ROS 2 uses IPv4 unless told otherwise; the node opens its network again then. \
+                 Links to routers may be IPv6"
             }
             Self::SilentPrograms { .. } => "look for a firewall that stops UDP between them and sgc",
             Self::Other => "use an `sgc` of the node's version",
@@ -235,6 +241,9 @@ impl fmt::Display for Alert {
             Self::UnprotectedPrograms { programs } => write!(
                 f,
                 "{programs} programs have no DDS Security (SROS2) on the local network: this node's governance does not let them in"
+            ),
+            Self::LocalNetworkAlone => f.write_str(
+                "this host has no IPv4 address besides loopback: the local ROS 2 network reaches programs of this host only",
             ),
             Self::SilentPrograms { enclave } => write!(
                 f,

@@ -13,9 +13,11 @@ const LOGGED_MAX: usize = 64;
 /// Interval of looks.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
 
-/// Returns an alert for each group of programs that cannot be joined for the same reason.
+/// Returns an alert for each group of programs that cannot be joined for the same reason, and one if this host has no
+/// address by which programs of other hosts could be joined.
 pub(crate) fn alerts() -> impl Iterator<Item = Alert> {
-    sgc_dds::strangers().into_iter().map(alert)
+    let alone = sgc_dds::is_alone().then_some(Alert::LocalNetworkAlone);
+    sgc_dds::strangers().into_iter().map(alert).chain(alone)
 }
 
 fn alert(strangers: Strangers) -> Alert {

@@ -85,10 +85,12 @@ fn page(repository: &Repository) -> String {
                     if has_serde(&variant.attrs, "other") {
                         continue;
                     }
-                    let Fields::Named(fields) = &variant.fields else {
-                        panic!("{name}::{} has no names", variant.ident)
+                    let fields = match &variant.fields {
+                        Fields::Named(fields) => fields.named.iter().collect(),
+                        Fields::Unit => Vec::new(),
+                        Fields::Unnamed(_) => panic!("{name}::{} has no names", variant.ident),
                     };
-                    let fields = fields.named.iter().map(|field| {
+                    let fields = fields.into_iter().map(|field| {
                         let (field_name, shown, inner) = describe(field, &path);
                         assert!(inner.is_none(), "{name}::{}: a type in a variant", variant.ident);
                         let (kind, meaning) = shown.split_once(" | ").unwrap_or_default();

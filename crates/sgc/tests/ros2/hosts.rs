@@ -381,3 +381,31 @@ fn services_of_other_hosts_go_on_after_an_address_change() {
         both(&mut robots, &mut desks, REOPENED, "with another address");
     }
 }
+
+/// The local ROS 2 network is IPv4, as that of Fast DDS with its defaults.
+#[test]
+fn host_without_ipv4_is_pointed_out_until_it_has_an_address() {
+    let mut lab = Lab::silent(PLAN, robot_to_desk("topic", ["/text_out"]));
+    lab.reconfigure(Site::Robot, "discovery_range = \"localhost\"", "discovery_range = \"subnet\"");
+    let Some(robot) = lab.namespace(Site::Robot) else { return };
+    const SAID: &str = "this host has no IPv4 address besides loopback";
+    let check = |lab: &Lab| {
+        let output = lab.sgc(Some(Site::Robot), &["check", "-c", "robot.toml"]).output().unwrap();
+        String::from_utf8(output.stdout).unwrap()
+    };
+    assert!(!check(&lab).contains(SAID));
+    change(robot, "addr del 10.92.1.2/24 dev cloud");
+    change(robot, "-6 addr add fd00:92::2/64 dev cloud");
+    assert!(check(&lab).contains(SAID), "{}", check(&lab));
+    lab.start(Site::Robot);
+    let _talker = lab.rclpy(Site::Robot, "jazzy", "text.py", &["--timeout", PLAN.peer_life]);
+    eventually("programs of this host are found", || {
+        lab.why(Site::Robot, "/text_out").contains("1 local publishers of /text_out")
+    });
+    eventually("the log says so", || lab.log(Site::Robot).contains(SAID));
+    assert!(lab.why(Site::Robot, "/text_out").contains(SAID));
+    let Some(robot) = lab.namespace(Site::Robot) else { return };
+    change(robot, "addr add 10.92.1.2/24 dev cloud");
+    eventually("the network is opened again", || lab.status(Site::Robot)["local_network_reopened"] == 1);
+    assert!(!lab.why(Site::Robot, "/text_out").contains(SAID));
+}
