@@ -6,7 +6,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use sgc_node::alerts::Alert;
 use sgc_node::graph::{
-    Endpoint, Graph, Interface, LostCalls, NameLine, Offer, ServiceCalls, Share, ShareRoute, Use, UseRoute,
+    Endpoint, Graph, Interface, LostCalls, NameLine, Offer, Qos, ServiceCalls, Share, ShareRoute, Use,
+    UseRoute,
 };
 use sgc_ros::{Naming, Rename, is_for_wildcards, is_pattern, matches};
 
@@ -22,6 +23,10 @@ type Walk = Vec<Step>;
 
 /// Time in seconds for which lost calls count as a fault, unless calls are answered before.
 const LOST_CALLS_FRESH_S: u64 = 600;
+/// `Qos::liveliness` of a publisher that is manual by topic.
+const MANUAL_BY_TOPIC: u8 = 2;
+/// Shortest lease whose assertions without a message travel (`sgc-node`, `ASSERTED_LEASE_MIN`).
+const ASSERTED_LEASE_MIN_NS: u64 = 100_000_000;
 
 /// Begins a walk with the node itself and the alerts that need an operator. Returns `true` if one of them stops all traffic.
 fn begin(graph: &Graph) -> (Walk, bool) {
@@ -416,6 +421,7 @@ fn walk_share(graph: &Graph, share: &Share, topic: &str, steps: &mut Walk) {
         }
     }
     steps.push(Step::fine(format!("a [[share]] covers it, for {}", whom(share.to))));
+    steps.extend(unasserted(&providers, ASSERTED_LEASE_MIN_NS, "with a lease of 100 ms or more"));
     let is_granted = routes.iter().any(|route| !route.granted.is_empty());
     for step in unheard(graph, share) {
         // A misspelt name explains that no node has the topic.
@@ -460,6 +466,24 @@ fn definitions_differ(graph: &Graph, route: &ShareRoute) -> Option<Step> {
         ),
         "build both sides from one version of the interface package",
     ))
+}
+
+/// Returns a step for publishers that are manual by topic and whose `assert_liveliness()` alone is not seen at other
+/// nodes: those with a lease below `lease_min_ns`, or all if that is 0.
+fn unasserted(providers: &[&Endpoint], lease_min_ns: u64, seen: &str) -> Option<Step> {
+    let is_unseen = |qos: &Qos| {
+        let is_short = qos.lease_ns.is_some_and(|lease| lease_min_ns == 0 || lease < lease_min_ns);
+        qos.reliable && qos.liveliness == MANUAL_BY_TOPIC && is_short
+    };
+    let unseen = providers.iter().filter(|end| end.writes && is_unseen(&end.qos)).count();
+    let text = format!(
+        "{unseen} local publishers assert their liveliness by hand (MANUAL_BY_TOPIC): other nodes see their messages, and \
+         `assert_liveliness()` only {seen}"
+    );
+    (unseen > 0).then(|| {
+        Step::unknown(text)
+            .with_fix("publish a message within each lease, or choose a liveliness that is automatic")
+    })
 }
 
 /// Returns a step for each member that a share names and this node has never heard of, misspelt ones first.
@@ -608,6 +632,7 @@ fn walk_use(graph: &Graph, used: &Use, topic: &str, steps: &mut Walk) {
             return;
         }
         steps.push(Step::fine(format!("{} local {}s of {topic}", providers.len(), provider(kind))));
+        steps.extend(unasserted(&providers, 0, "at the node that shares the topic"));
     }
     if !linked(graph, steps) {
         return;
@@ -635,7 +660,10 @@ fn walk_use(graph: &Graph, used: &Use, topic: &str, steps: &mut Walk) {
             }
         };
         let fix = refused.map_or_else(look, str::to_owned);
-        steps.push(Step::wrong(format!("{owner} {state}: {why}"), fix));
+        let meant =
+            used.owner_meant.as_ref().filter(|_| !is_linked && used.follow.as_deref() != Some("refused"));
+        let meant = meant.map_or_else(String::new, |meant| format!(" \"{meant}\" is here"));
+        steps.push(Step::wrong(format!("{owner} {state}: {why}{meant}"), fix));
         return;
     }
     let routes: Vec<_> = used.routes.iter().filter(|route| route.topic == topic).collect();

@@ -214,12 +214,32 @@ fn each_fault_of_owner_is_named() {
     }
 }
 
+/// The assertions of such publishers do not travel without a message.
+#[test]
+fn publishers_whose_assertions_are_not_seen_elsewhere_are_pointed_out() {
+    let said = |graph: &Graph| {
+        let steps = diagnose::interface(graph, "/a");
+        steps.iter().any(|step| step.verdict == Verdict::Unknown && step.found.contains("MANUAL_BY_TOPIC"))
+    };
+    let with = |mut graph: Graph, liveliness, lease_ms: u64| {
+        graph.endpoints[0].qos = Qos { liveliness, lease_ns: Some(lease_ms * 1_000_000), ..qos() };
+        graph
+    };
+    assert!(said(&with(owner(), 2, 99)) && !said(&with(owner(), 2, 100)) && !said(&with(owner(), 0, 99)));
+    assert!(said(&with(publisher(), 2, 2000)) && !said(&with(publisher(), 0, 2000)) && !said(&publisher()));
+    assert_eq!(wrong(&with(publisher(), 2, 2000), "/a"), "", "it is no fault of the topic");
+}
+
 #[test]
 fn each_fault_of_user_is_named() {
     let cases: Vec<Case> = vec![
         ("no link is up", |g| g.links.clear()),
         ("arm has not said yet what it shares: nobody in reach knows it", |g| {
             g.uses[0].has_catalogue = false
+        }),
+        ("Is its name spelt right? \"ram\" is here", |g| {
+            g.uses[0].has_catalogue = false;
+            g.uses[0].owner_meant = Some("ram".into());
         }),
         ("arm refuses its catalogue: x: it is in reach and refuses this node", |g| {
             g.uses[0].has_catalogue = false;

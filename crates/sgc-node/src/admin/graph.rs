@@ -381,6 +381,8 @@ pub struct Use {
     pub owner_id: String,
     /// Owner's name.
     pub owner: String,
+    /// Name of a node in reach that differs from the owner's by one letter, if nobody has the owner's name.
+    pub owner_meant: Option<String>,
     /// Fault of the owner, if there is one.
     pub owner_state: Option<String>,
     /// State of following the owner: `"waiting"`, `"asked"`, `"refused"`, `"granted"`.

@@ -17,11 +17,13 @@ const SPELLINGS_MAX: usize = 4096;
 /// Letters of names (`sgc_trust` label rule).
 const LETTERS: &str = "abcdefghijklmnopqrstuvwxyz0123456789-_.";
 
-/// Names of members in the rules `to` and `publish`.
+/// Names of members in rules.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct MemberNames {
     nodes: BTreeMap<NodeId, String>,
     groups: BTreeMap<GroupTag, String>,
+    /// Names in `from`. Those in `nodes` and `groups` are of `to` and `publish`.
+    owners: BTreeMap<NodeId, String>,
 }
 
 impl MemberNames {
@@ -40,6 +42,10 @@ impl MemberNames {
                 }
                 Recipient::Everyone | Recipient::Partner(_) => {}
             }
+        }
+        for used in &config.uses {
+            let id = identity.node_id_of(used.from.as_str());
+            names.owners.extend(id.map(|id| (id, used.from.to_string())));
         }
         names
     }
@@ -62,6 +68,8 @@ pub(crate) struct Members {
     groups: BTreeSet<GroupTag>,
     /// Misspelt names with the probable spelling.
     meant: BTreeMap<String, String>,
+    /// The same for names in `from`, also if the right spelling is in another rule.
+    owners_meant: BTreeMap<String, String>,
 }
 
 impl Members {
@@ -73,6 +81,7 @@ impl Members {
     pub(crate) fn set_names(&mut self, names: MemberNames, own: &Identity) {
         self.names = names;
         self.meant.clear();
+        self.owners_meant.clear();
         self.compare(own);
     }
 
@@ -92,6 +101,11 @@ impl Members {
     /// Iterates over the misspelt names with the right spelling.
     pub(crate) fn misspelt(&self) -> impl Iterator<Item = (&str, &str)> {
         self.meant.iter().map(|(written, meant)| (written.as_str(), meant.as_str()))
+    }
+
+    /// Returns the name of a heard member that differs by one letter from an owner's that was not heard.
+    pub(crate) fn owner_meant(&self, written: &str) -> Option<&str> {
+        self.owners_meant.get(written).map(String::as_str)
     }
 
     /// Returns the names in a policy of which no member was heard.
@@ -122,6 +136,15 @@ impl Members {
             if let Some(meant) = spelt(name, &is_heard) {
                 self.meant.insert(name.clone(), meant);
             }
+        }
+        for (_, name) in self.names.owners.iter().filter(|(id, _)| !self.nodes.contains(*id)) {
+            let heard = |spelling: &str| own.node_id_of(spelling).filter(|id| self.nodes.contains(id));
+            let Some(meant) = spelt(name, &|spelling| heard(spelling).is_some()) else { continue };
+            // Nodes of a fleet may have similar names, such as arm-1 and arm-2.
+            if heard(&meant).is_some_and(|id| !self.names.owners.contains_key(&id)) {
+                self.meant.insert(name.clone(), meant.clone());
+            }
+            self.owners_meant.insert(name.clone(), meant);
         }
         for (_, name) in self.names.groups.iter().filter(|(tag, _)| !self.groups.contains(*tag)) {
             let is_heard = |spelling: &str| {
@@ -272,6 +295,22 @@ mod tests {
                 "`to` of /a names \"group:vision\", and no node of the fleet is in that group",
             ]
         );
+    }
+
+    #[test]
+    fn owner_in_a_use_is_compared_with_members_that_are_heard_of() {
+        let mut fleet = fleet();
+        let [arm, desk] = members(&mut fleet, [("arm", &[]), ("desk", &["ops"])]);
+        let config = config("[[use]]\nfrom = 'deks'\ntopic = '/b'\n");
+        let mut members = Members::new(MemberNames::from_config(&config, &arm), &arm);
+        assert_eq!(members.owner_meant("deks"), None);
+        assert_eq!(members.heard(desk.as_peer(), &arm), [("deks".to_owned(), "desk".to_owned())]);
+        assert_eq!(members.owner_meant("deks"), Some("desk"));
+        // A name that another rule has may be meant, but is no reason for a warning.
+        let both = "[[use]]\nfrom = 'deks'\ntopic = '/b'\n[[use]]\nfrom = 'desk'\ntopic = '/c'\n";
+        let mut members = Members::new(MemberNames::from_config(&super::tests::config(both), &arm), &arm);
+        assert_eq!(members.heard(desk.as_peer(), &arm), []);
+        assert_eq!(members.owner_meant("deks"), Some("desk"));
     }
 
     #[test]

@@ -163,6 +163,7 @@ impl<N: RosNetwork> Core<N> {
             wanted_type: view.wanted_type.map(str::to_owned),
             owner_id: view.owner.to_string(),
             owner: view.owner_name.to_owned(),
+            owner_meant: self.members.owner_meant(view.owner_name).map(str::to_owned),
             owner_state: view.owner_state.map(owner_state),
             follow: self.endpoint.follow_status(&view.owner).map(|s| label(&s).to_owned()),
             has_catalogue: view.has_catalogue,
@@ -229,7 +230,7 @@ impl<N: RosNetwork> Core<N> {
             }
         }
         problems.extend(self.members.misspelt().map(|(written, meant)| {
-            format!("a [[share]] names \"{written}\", which nobody here is called; \"{meant}\" is here and may be meant")
+            format!("a rule names \"{written}\", which nobody here is called; \"{meant}\" is here and may be meant")
         }));
         problems.extend(self.types.problems(|owner| self.called(owner)));
         problems

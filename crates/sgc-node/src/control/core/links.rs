@@ -83,7 +83,7 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn hear_of(&mut self, peer: &VerifiedPeer) {
         for (written, meant) in self.members.heard(peer, &self.identity) {
             warn!(
-                "a [[share]] names \"{written}\", which nobody here is called; \"{meant}\" is here and may be meant"
+                "a rule names \"{written}\", which nobody here is called; \"{meant}\" is here and may be meant"
             );
         }
     }
