@@ -92,6 +92,19 @@ impl Members {
         }
         let room = HEARD_MAX.saturating_sub(self.groups.len());
         self.groups.extend(peer.groups.iter().take(room));
+        self.compared(own)
+    }
+
+    /// Notes a node whose catalogue has come, as [`Self::heard`] does.
+    pub(crate) fn heard_owner(&mut self, node: NodeId, own: &Identity) -> Vec<(String, String)> {
+        if self.nodes.len() >= HEARD_MAX || !self.nodes.insert(node) {
+            return Vec::new();
+        }
+        self.compared(own)
+    }
+
+    /// Compares names with heard members. Returns newly found misspellings.
+    fn compared(&mut self, own: &Identity) -> Vec<(String, String)> {
         let before = self.meant.clone();
         self.compare(own);
         let news = self.meant.iter().filter(|(written, _)| !before.contains_key(*written));
@@ -309,7 +322,7 @@ mod tests {
         // A name that another rule has may be meant, but is no reason for a warning.
         let both = "[[use]]\nfrom = 'deks'\ntopic = '/b'\n[[use]]\nfrom = 'desk'\ntopic = '/c'\n";
         let mut members = Members::new(MemberNames::from_config(&super::tests::config(both), &arm), &arm);
-        assert_eq!(members.heard(desk.as_peer(), &arm), []);
+        assert_eq!(members.heard_owner(desk.node_id(), &arm), []);
         assert_eq!(members.owner_meant("deks"), Some("desk"));
     }
 

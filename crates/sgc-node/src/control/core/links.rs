@@ -6,7 +6,7 @@ use sgc_ros::RosNetwork;
 use sgc_router::{LinkId, Neighbour};
 use sgc_transport::{AnyLink, Link, LinkUrl};
 use sgc_trust::VerifiedPeer;
-use sgc_wire::Control;
+use sgc_wire::{Control, NodeId};
 use tokio::sync::oneshot;
 use tracing::{debug, warn};
 
@@ -81,7 +81,18 @@ impl<N: RosNetwork> Core<N> {
 
     /// Notes a member that was heard. Reports names in rules that are probably misspellings of it.
     pub(super) fn hear_of(&mut self, peer: &VerifiedPeer) {
-        for (written, meant) in self.members.heard(peer, &self.identity) {
+        let misspelt = self.members.heard(peer, &self.identity);
+        Self::warn_of_misspelt(&misspelt);
+    }
+
+    /// Does the same for a node whose catalogue has come.
+    pub(super) fn hear_of_owner(&mut self, owner: NodeId) {
+        let misspelt = self.members.heard_owner(owner, &self.identity);
+        Self::warn_of_misspelt(&misspelt);
+    }
+
+    fn warn_of_misspelt(misspelt: &[(String, String)]) {
+        for (written, meant) in misspelt {
             warn!(
                 "a rule names \"{written}\", which nobody here is called; \"{meant}\" is here and may be meant"
             );

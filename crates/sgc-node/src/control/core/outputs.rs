@@ -162,6 +162,9 @@ impl<N: RosNetwork> Core<N> {
     /// Handles events for the route machine only.
     pub(super) fn route_event(&mut self, now: Now, event: Event) {
         self.calls_event(&event);
+        if let Event::Catalogue { owner, .. } = &event {
+            self.hear_of_owner(*owner);
+        }
         let Some(routes) = &mut self.routes else { return };
         match event {
             Event::SinkJoined { name, sink, peer, role } => {
