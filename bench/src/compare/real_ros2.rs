@@ -91,7 +91,8 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
     let environments = compare.ros2();
     let environments =
         environments.canonicalize().with_context(|| format!("{}: is it built?", environments.display()))?;
-    let mut ways: Vec<_> = compare.systems().iter().map(|system| Way::System(&**system)).collect();
+    let systems = compare.systems().iter().chain(compare.relays());
+    let mut ways: Vec<_> = systems.map(|system| Way::System(&**system)).collect();
     let all = ways.len();
     ways.retain(|way| SYSTEMS.contains(&&*way.name()));
     if ways.len() < all {

@@ -21,6 +21,7 @@
 mod announced;
 mod announcement;
 mod arrivals;
+mod bursts;
 pub mod config;
 mod discovery;
 mod domain;

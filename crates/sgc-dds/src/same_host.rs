@@ -9,7 +9,7 @@
 //! - When the source or destination address of a packet is gone, and the receiver is on this host, the packet goes to
 //!   127.0.0.1. A former address of this host may belong to another host by now, so its packets go there as well.
 //!
-//! All other packets go as Cyclone sends them. This needs `struct ddsi_tran_conn` and `struct
+//! All other packets go as Cyclone sends them, those of a long message in bursts (`bursts.rs`). This needs `struct ddsi_tran_conn` and `struct
 //! ddsi_tran_write_msgfrags` of the Cyclone that `cyclors` =0.4.0 builds (`CYCLORS` in `sample.rs`). A connection
 //! that does not refer to its domain, or whose socket is not bound to an address of this host, is left alone.
 
@@ -28,6 +28,7 @@ use rustix::net::sockopt;
 use sgc_sync::{read_lock, write_lock};
 
 use crate::announcement::{self, HEAD_BYTES};
+use crate::bursts;
 use crate::config::local_addresses;
 use crate::entity::{Entity, INFINITE, check};
 use crate::files::read_file;
@@ -352,6 +353,10 @@ impl Packet<'_> {
         announcement::is_announcement(&head[..filled])
     }
 
+    fn length(&self) -> usize {
+        self.parts().map(<[u8]>::len).sum()
+    }
+
     fn bytes(&self) -> Vec<u8> {
         self.parts().flatten().copied().collect()
     }
@@ -373,8 +378,10 @@ unsafe extern "C" fn write(
             None
         } else {
             let packet = Packet { pieces: std::slice::from_raw_parts(pieces, count) };
-            otherwise(connection as usize, &*to, &packet)
-                .map(|sent| (sent, packet.parts().map(<[u8]>::len).sum()))
+            if bursts::is_bursting() {
+                bursts::before_packet(packet.length());
+            }
+            otherwise(connection as usize, &*to, &packet).map(|sent| (sent, packet.length()))
         }
     };
     if let Some((Ok(()), bytes)) = sent {

@@ -1,5 +1,6 @@
 //! Messages at full speed, large messages, and stalled subscribers.
 
+use std::fs;
 use std::thread;
 use std::time::Duration;
 
@@ -8,6 +9,9 @@ use serde_json::Value;
 
 use crate::lab::{Lab, Site, robot_to_desk};
 use crate::{PAIRS, PLAN, count};
+
+/// Bytes of a fragment (`sgc_dds::config::FRAGMENT_BYTES`).
+const FRAGMENT_BYTES: u64 = 14_000;
 
 /// Runs a publisher of so many messages, the second half a second after the first, and a subscriber, matched directly or through
 /// `sgc`. Returns the subscriber's summary once it has the last message.
@@ -55,11 +59,28 @@ fn a_reliable_topic_that_keeps_all_arrives_whole_however_fast_it_is_published() 
 fn large_messages_of_real_ros_2_arrive_whole() {
     const MESSAGES: u64 = 10;
     let lab = Lab::real(PLAN, robot_to_desk("topic", ["/load"]));
-    for (pair, size) in PAIRS.into_iter().zip(["1000000", "6000000"]) {
-        let extra = ["--rate", "5", "--size", size];
+    for (pair, size) in PAIRS.into_iter().zip([1_000_000, 6_000_000]) {
+        let (text, before) = (size.to_string(), dropped_at_full_buffers(&lab));
+        let extra = ["--rate", "5", "--size", &text];
         let carried = carry(&lab, pair, [Site::Robot, Site::Desk], MESSAGES, &extra);
         assert_whole(&carried, MESSAGES, &format!("{pair:?}, {size} bytes"));
+        // Without pauses between bursts, as many packets were dropped as fragments were written.
+        let (dropped, fragments) = (dropped_at_full_buffers(&lab) - before, MESSAGES * size / FRAGMENT_BYTES);
+        assert!(dropped < fragments / 4, "{pair:?}, {size} bytes: {dropped} of {fragments} dropped");
     }
+}
+
+/// Returns the number of datagrams that the kernel has dropped at the desk because a receive buffer was full.
+fn dropped_at_full_buffers(lab: &Lab) -> u64 {
+    let counters = fs::read_to_string(format!("/proc/{}/net/snmp", lab.node(Site::Desk).pid())).unwrap();
+    let [names, values] = [0, 1].map(|line| {
+        let line = counters.lines().filter(|line| line.starts_with("Udp: ")).nth(line).unwrap();
+        line.split_whitespace()
+    });
+    names
+        .zip(values)
+        .find_map(|(name, value)| (name == "RcvbufErrors").then(|| value.parse().unwrap()))
+        .unwrap()
 }
 
 /// A subscriber with default QoS keeps ten messages. Hundreds that come at once after a router stalled would overwrite each other

@@ -1,0 +1,103 @@
+//! Pauses between the fragments of a long message.
+//!
+//! Cyclone sends the fragments of a message without a pause. A ROS 2 subscriber has a receive buffer of the kernel's
+//! default size (`net.core.rmem_default`, 208 KiB), which holds some twelve fragments, so of a megabyte it would lose
+//! half and ask for it after the next heartbeat. A pause lets the subscriber's thread empty its buffer. The writer holds
+//! no lock meanwhile: `transmit_sample_lgmsg_unlocks_wr` of the Cyclone that `cyclors` =0.4.0 builds sends fragments
+//! outside of it.
+
+use std::cell::Cell;
+use std::thread;
+use std::time::Duration;
+
+use crate::config::FRAGMENT_BYTES;
+
+/// Bytes that are sent without a pause: eight fragments, so that other packets have room in the buffer, too.
+const BURST_BYTES: usize = 8 * FRAGMENT_BYTES as usize;
+
+/// Pause after a burst. A subscriber's thread takes a burst within it, and a megabyte leaves within two milliseconds,
+/// faster than Ethernet at a gigabit a second carries it.
+const PAUSE: Duration = Duration::from_micros(100);
+
+thread_local! {
+    /// The burst of the long message that this thread writes.
+    static BURST: Cell<Option<Burst>> = const { Cell::new(None) };
+}
+
+/// The bytes that may still be sent before a pause.
+#[derive(Clone, Copy, Debug)]
+struct Burst {
+    left: usize,
+}
+
+impl Burst {
+    const BEGUN: Self = Self { left: BURST_BYTES };
+
+    /// Records a packet of this length. Returns `true` if a pause is due before it.
+    fn send(&mut self, bytes: usize) -> bool {
+        let is_over = bytes > self.left;
+        let left = if is_over { BURST_BYTES } else { self.left };
+        self.left = left.saturating_sub(bytes);
+        is_over
+    }
+}
+
+/// Makes this thread send in bursts, until dropped.
+#[derive(Debug)]
+pub(crate) struct Bursts(());
+
+impl Bursts {
+    /// Begins a message of this length. Returns `None` if it is sent at once.
+    pub(crate) fn begin(message_bytes: usize) -> Option<Self> {
+        (message_bytes > BURST_BYTES).then(|| {
+            BURST.set(Some(Burst::BEGUN));
+            Self(())
+        })
+    }
+}
+
+impl Drop for Bursts {
+    fn drop(&mut self) {
+        BURST.set(None);
+    }
+}
+
+/// Returns `true` if this thread sends in bursts.
+pub(crate) fn is_bursting() -> bool {
+    BURST.get().is_some()
+}
+
+/// Pauses before a packet of this length if the burst of this thread is over.
+pub(crate) fn before_packet(bytes: usize) {
+    let Some(mut burst) = BURST.get() else { return };
+    let is_over = burst.send(bytes);
+    BURST.set(Some(burst));
+    if is_over {
+        thread::sleep(PAUSE);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pause_is_due_whenever_a_burst_is_full() {
+        let fragment = FRAGMENT_BYTES as usize;
+        let mut burst = Burst::BEGUN;
+        let due: Vec<usize> = (0..30).filter(|_| burst.send(fragment)).collect();
+        assert_eq!(due, [8, 16, 24]);
+        // A packet longer than a burst is sent after a pause, and alone.
+        assert_eq!([1, BURST_BYTES + 1, 1].map(|bytes| burst.send(bytes)), [false, true, true]);
+    }
+
+    #[test]
+    fn only_the_thread_of_a_long_message_sends_in_bursts() {
+        assert!(Bursts::begin(BURST_BYTES).is_none() && !is_bursting());
+        let bursts = Bursts::begin(BURST_BYTES + 1);
+        assert!(is_bursting());
+        assert!(!thread::spawn(is_bursting).join().unwrap());
+        drop(bursts);
+        assert!(!is_bursting());
+    }
+}
