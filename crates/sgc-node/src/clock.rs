@@ -9,3 +9,8 @@ pub(crate) fn now() -> Now {
     let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     Now { instant: Instant::now(), unix: UnixMillis(unix.as_millis().try_into().unwrap_or(u64::MAX)) }
 }
+
+/// Returns the time of the runtime, which tests can stop.
+pub(crate) fn time_now() -> Instant {
+    tokio::time::Instant::now().into_std()
+}

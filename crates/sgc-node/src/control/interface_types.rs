@@ -10,6 +10,7 @@ use std::time::Instant;
 
 use sgc_cdr::TypeName;
 use sgc_endpoint::PackedType;
+use sgc_session::TypeQuestions;
 use sgc_types::{
     Definitions, ResolvedType, TYPES_BYTES_MAX, TYPES_MAX, TYPES_PER_OWNER_BYTES_MAX, TYPES_PER_OWNER_MAX,
     TypeStore,
@@ -18,7 +19,6 @@ use sgc_wire::{CatalogueEntry, DescribedType, Name, NodeId};
 
 use crate::control::type_jobs::{Job, StoredOrNewType, TypeEntry, TypeMiss, TypeOutcome, TypeQuery};
 use crate::data::conversion::KnownType;
-use crate::local::type_questions::TypeQuestions;
 
 /// Types that are tried again when room returns.
 const RETRIES_MAX: usize = 16;

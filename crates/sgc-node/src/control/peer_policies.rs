@@ -3,9 +3,8 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use sgc_session::KeepAlivePolicy;
 use sgc_wire::NodeId;
-
-use crate::link::keep_alive::KeepAlivePolicy;
 
 /// Most peers whose shorter keep-alive interval is remembered.
 const IMPATIENT_MAX: usize = 1024;

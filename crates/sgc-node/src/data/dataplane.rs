@@ -9,6 +9,7 @@ use std::sync::atomic::Ordering::Relaxed;
 
 use arc_swap::ArcSwap;
 use sgc_router::{FibEntry, LinkId};
+use sgc_session::Activity;
 use sgc_wire::{Name, Packet};
 use tracing::{debug, warn};
 
@@ -17,7 +18,6 @@ use crate::data::outflow::OutFlow;
 use crate::data::pending::PendingBytes;
 use crate::data::sinks::LocalSink;
 use crate::data::stats::{CountDrops, DataDrop, Drops, NameStats};
-use crate::link::keep_alive::Activity;
 
 /// Number of tables over which names are spread, so that a change copies only a part.
 const SHARDS: usize = 64;

@@ -17,7 +17,6 @@ pub(crate) mod outflow;
 pub(crate) mod pending;
 pub(crate) mod queue;
 pub(crate) mod replays;
-pub(crate) mod shaper;
 pub(crate) mod sinks;
 pub(crate) mod sources;
 pub(crate) mod spacing;

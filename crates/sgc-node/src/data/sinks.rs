@@ -18,6 +18,7 @@ use sgc_ros::{
     prefix_frames,
 };
 use sgc_router::LinkId;
+use sgc_session::Shaper;
 use sgc_sync::lock;
 use sgc_wire::{
     History, KEY_HASH_BYTES, Liveliness, MessageHead, MessageKind, Name, Packet, PayloadForm, SinkId,
@@ -30,7 +31,6 @@ use tracing::{debug, warn};
 use crate::data::conversion::{self, KnownType, TypeSlot};
 use crate::data::pending::{PendingBytes, PendingQueue};
 use crate::data::queue::Queue;
-use crate::data::shaper::Shaper;
 use crate::data::spacing::Spacing;
 use crate::data::stats::{CountDrops, DataDrop, Drops};
 use crate::data::tap::{TapMessage, Taps};

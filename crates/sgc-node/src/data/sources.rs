@@ -17,6 +17,7 @@ use sgc_endpoint::{Compressor, Marks, PublishError, Source, SourceProgress};
 use sgc_executor::WakeBatch;
 use sgc_ros::{Guid, HandleSamples, KeyHash, Sample, SampleKind, Shaping};
 use sgc_router::LinkId;
+use sgc_session::Shaper;
 use sgc_sync::lock;
 use sgc_wire::{
     MessageHead, MessageKind, Name, Packet, PayloadEncoding, PayloadForm, Recover, SinkId, SourceId,
@@ -30,7 +31,6 @@ use crate::data::conversion::{self, KnownType, TypeSlot};
 use crate::data::dataplane::DataPlane;
 use crate::data::manual_lease::{ASSERTION_LOOK_MAX, ManualLease};
 use crate::data::pending::PendingQueue;
-use crate::data::shaper::Shaper;
 use crate::data::stats::{CountDrops, DataDrop};
 use crate::data::tap::{TapMessage, Taps};
 

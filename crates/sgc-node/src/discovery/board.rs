@@ -2,15 +2,16 @@
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard};
+use std::time::Instant;
 
 use serde::Serialize;
 use sgc_sync::lock;
 use sgc_transport::LinkUrl;
 use sgc_wire::NodeId;
-use tokio::time::Instant;
 
 use super::target::DialTarget;
 use super::urls::SkippedUrl;
+use crate::clock::time_now;
 use crate::data::stats::Drops;
 
 /// A router that the node looks for, or a place where it looks for routers.
@@ -78,7 +79,7 @@ impl Board {
 
     /// Returns all rows in the order in which they were added.
     pub(crate) fn snapshot(&self) -> Vec<RouterStatus> {
-        let now = Instant::now();
+        let now = time_now();
         let shown = |(status, due): &(RouterStatus, Option<Instant>)| RouterStatus {
             again_in_s: due.map(|due| due.saturating_duration_since(now).as_secs()),
             ..status.clone()

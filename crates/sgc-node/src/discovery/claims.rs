@@ -1,10 +1,8 @@
-//! Claims: the nodes that this node has links to, so that two searches for one router make one link.
-//!
-//! It decides nothing. A caller that finds a node claimed stands back.
+//! Claims of tasks on nodes, and waiting for their end. [`ClaimTable`] holds them.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard};
 
+use sgc_session::ClaimTable;
 use sgc_sync::lock;
 use sgc_wire::NodeId;
 use tokio::sync::watch;
@@ -17,47 +15,40 @@ pub(crate) struct Claims {
 
 #[derive(Debug, Default)]
 struct ClaimsInner {
-    table: Mutex<Table>,
+    table: Mutex<ClaimTable>,
     changed: watch::Sender<()>,
-}
-
-#[derive(Debug, Default)]
-struct Table {
-    dialled: BTreeSet<NodeId>,
-    /// Number of incoming links of each node.
-    came: BTreeMap<NodeId, usize>,
 }
 
 impl Claims {
     /// Claims a dialled node, unless another task has claimed it.
     pub(crate) fn claim(&self, node: NodeId) -> Option<Claim> {
-        let is_free = self.table().dialled.insert(node);
+        let is_free = self.table().claim(node);
         is_free.then(|| Claim { node, claims: self.clone() })
     }
 
     /// Notes an incoming link of a node until the result is dropped.
     pub(crate) fn note_arrival(&self, node: NodeId) -> Arrival {
-        *self.table().came.entry(node).or_default() += 1;
+        self.table().arrives(node);
         self.shared.changed.send_replace(());
         Arrival { node, claims: self.clone() }
     }
 
     /// Returns `true` if a node has an incoming link here.
     pub(crate) fn has_come(&self, node: &NodeId) -> bool {
-        self.table().came.contains_key(node)
+        self.table().has_come(node)
     }
 
     /// Waits until no link to this node is left.
     pub(crate) async fn released(&self, node: &NodeId) {
-        self.until(|table| !table.dialled.contains(node) && !table.came.contains_key(node)).await;
+        self.until(|table| table.is_free(node)).await;
     }
 
     /// Waits for an incoming link of this node.
     pub(crate) async fn arrived(&self, node: &NodeId) {
-        self.until(|table| table.came.contains_key(node)).await;
+        self.until(|table| table.has_come(node)).await;
     }
 
-    async fn until(&self, is_so: impl Fn(&Table) -> bool) {
+    async fn until(&self, is_so: impl Fn(&ClaimTable) -> bool) {
         let mut changed = self.shared.changed.subscribe();
         while !is_so(&self.table()) {
             // This cannot fail, since `self` holds the sender.
@@ -65,7 +56,7 @@ impl Claims {
         }
     }
 
-    fn table(&self) -> MutexGuard<'_, Table> {
+    fn table(&self) -> MutexGuard<'_, ClaimTable> {
         lock(&self.shared.table)
     }
 }
@@ -86,7 +77,7 @@ impl Claim {
 
 impl Drop for Claim {
     fn drop(&mut self) {
-        self.claims.table().dialled.remove(&self.node);
+        self.claims.table().release(&self.node);
         self.claims.shared.changed.send_replace(());
     }
 }
@@ -100,14 +91,7 @@ pub(crate) struct Arrival {
 
 impl Drop for Arrival {
     fn drop(&mut self) {
-        let mut table = self.claims.table();
-        if let Some(links) = table.came.get_mut(&self.node) {
-            *links -= 1;
-            if *links == 0 {
-                table.came.remove(&self.node);
-            }
-        }
-        drop(table);
+        self.claims.table().leaves(&self.node);
         self.claims.shared.changed.send_replace(());
     }
 }

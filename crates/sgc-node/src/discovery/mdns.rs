@@ -3,23 +3,22 @@
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
+use sgc_session::{AttemptResult, BACKOFF_MAX, CANDIDATES_MAX, Candidates, wait};
 use sgc_transport::{LinkUrl, Scheme};
 use sgc_wire::NodeId;
 use tokio::sync::{Semaphore, mpsc, watch};
 use tokio::task::JoinSet;
-use tokio::time::{Instant, sleep, sleep_until};
+use tokio::time::{sleep, sleep_until};
 use tracing::{debug, info, warn};
 
-use super::candidates::{CANDIDATES_MAX, Candidates, Verdict};
 use super::local::Sighting;
 use crate::link::in_use::place_in_use;
 
-use super::{
-    BACKOFF_MAX, Board, DialTarget, Failure, KeepLink, LinkRequest, LocalNetwork, Outcome, StatusRow, wait,
-};
+use super::{Board, DialTarget, Failure, KeepLink, LinkRequest, LocalNetwork, Outcome, StatusRow};
+use crate::clock::time_now;
 
 /// Most links to announced routers.
 pub(crate) const LINKS_MAX: usize = 2;
@@ -87,7 +86,7 @@ pub(crate) struct RouterFilter {
 }
 
 /// Result of an attempt at an announced router.
-struct AttemptResult {
+struct Attempt {
     addresses: Vec<SocketAddr>,
     outcome: Outcome,
 }
@@ -104,14 +103,14 @@ pub(crate) async fn keep_links<H: KeepLink>(
     let places = Arc::new(Semaphore::new(LINKS_MAX));
     let request = LinkRequest { hearsay: true, nodes: wanted.nodes, places: Some(places.clone()) };
     let mut found = Candidates::default();
-    let mut attempts: JoinSet<AttemptResult> = JoinSet::new();
+    let mut attempts: JoinSet<Attempt> = JoinSet::new();
     // Routers with another link, until that link ends.
     let mut elsewhere: JoinSet<Vec<SocketAddr>> = JoinSet::new();
     // At most one task waits per router, however often it is tried.
     let mut waiting = BTreeSet::new();
     let (mut network, mut forgiven) = (keeper.network(), None::<Instant>);
     loop {
-        let now = Instant::now();
+        let now = time_now();
         let mut is_full = true;
         while places.available_permits() > 0 {
             let linked = LINKS_MAX - places.available_permits();
@@ -128,7 +127,7 @@ pub(crate) async fn keep_links<H: KeepLink>(
         let next = found.next_due(now).filter(|_| !is_full);
         let timer = async {
             match next {
-                Some(at) => sleep_until(at).await,
+                Some(at) => sleep_until(at.into()).await,
                 None => std::future::pending().await,
             }
         };
@@ -147,7 +146,7 @@ pub(crate) async fn keep_links<H: KeepLink>(
                 None => return,
             },
             Some(done) = attempts.join_next() => {
-                let Ok(AttemptResult { addresses, outcome }) = done else { continue };
+                let Ok(Attempt { addresses, outcome }) = done else { continue };
                 if keeper.is_over() {
                     return;
                 }
@@ -165,7 +164,7 @@ pub(crate) async fn keep_links<H: KeepLink>(
                         addresses
                     });
                 }
-                found.done(&addresses, verdict, Instant::now(), &mut rng);
+                found.done(&addresses, verdict, time_now(), &mut rng);
             }
             Some(released) = elsewhere.join_next() => {
                 let released = released.unwrap_or_default();
@@ -174,7 +173,7 @@ pub(crate) async fn keep_links<H: KeepLink>(
             }
             () = timer => {}
             () = network.changed() => {
-                let now = Instant::now();
+                let now = time_now();
                 if forgiven.is_none_or(|at| now - at >= FORGIVE_EVERY) {
                     forgiven = Some(now);
                     found.forgive_all();
@@ -190,7 +189,7 @@ async fn attempt<H: KeepLink>(
     request: LinkRequest,
     keeper: H,
     board: Board,
-) -> AttemptResult {
+) -> Attempt {
     let url = LinkUrl {
         scheme: Scheme::Quic,
         host: addresses.first().map(|first| first.ip().to_string()).unwrap_or_default(),
@@ -206,18 +205,18 @@ async fn attempt<H: KeepLink>(
         Outcome::Ended { remote, end } => info!(%remote, "link ended: {end}"),
         Outcome::Failed(why) => debug!(%url, "a router on the local network: {why}"),
     }
-    AttemptResult { addresses, outcome }
+    Attempt { addresses, outcome }
 }
 
-fn judge(outcome: &Outcome) -> Verdict {
+fn judge(outcome: &Outcome) -> AttemptResult {
     match outcome {
-        Outcome::Ended { end, .. } if place_in_use(end).is_some() => Verdict::StandBack,
-        Outcome::Ended { .. } => Verdict::Ended,
+        Outcome::Ended { end, .. } if place_in_use(end).is_some() => AttemptResult::StandBack,
+        Outcome::Ended { .. } => AttemptResult::Ended,
         // A router of another fleet stays one.
-        Outcome::Failed(Failure::Dial(why)) if why.is_refusal() => Verdict::StandBack,
+        Outcome::Failed(Failure::Dial(why)) if why.is_refusal() => AttemptResult::StandBack,
         // A place becomes free only when a link ends.
-        Outcome::Failed(Failure::Enough) => Verdict::Failed,
-        Outcome::Failed(why) if why.stands_back() => Verdict::StandBack,
-        Outcome::Failed(_) => Verdict::Failed,
+        Outcome::Failed(Failure::Enough) => AttemptResult::Failed,
+        Outcome::Failed(why) if why.stands_back() => AttemptResult::StandBack,
+        Outcome::Failed(_) => AttemptResult::Failed,
     }
 }

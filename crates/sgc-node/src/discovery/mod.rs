@@ -4,9 +4,7 @@
 //! Each kind of search is a loop that yields dial targets (`keep_at`, `srv`, `mdns`). [`link_keeper::LinkKeeper`] dials
 //! and keeps the link. The loops are generic over [`KeepLink`], so tests run their timing on a virtual clock.
 
-pub(crate) mod backoff;
 pub(crate) mod board;
-mod candidates;
 mod claims;
 mod dns;
 mod link_keeper;
@@ -17,17 +15,17 @@ mod target;
 mod urls;
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng as _;
 use sgc_config::RouterUrl;
+use sgc_session::{BACKOFF_MAX, BACKOFF_MIN, Backoff};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
-use tokio::time::{Instant, sleep_until};
+use tokio::time::sleep_until;
 use tracing::{debug, info, warn};
 
-use backoff::BACKOFF_MIN;
-pub(crate) use backoff::{BACKOFF_MAX, Backoff, wait};
 pub use board::RouterStatus;
 pub(crate) use board::{Board, StatusRow};
 pub(crate) use claims::{Claim, Claims};
@@ -36,8 +34,9 @@ pub(crate) use link_keeper::{DialledLink, Failure, KeepLink, LinkKeeper, LinkReq
 pub(crate) use local::LocalNetwork;
 pub(crate) use mdns::RouterFilter;
 pub(crate) use target::DialTarget;
-pub(crate) use urls::{Failback, SkippedUrl, WorkingUrls, is_over_udp};
+pub(crate) use urls::{SkippedUrl, WorkingUrls, is_over_udp};
 
+use crate::clock::time_now;
 use crate::link::in_use::place_in_use;
 use crate::link::roaming::Network;
 
@@ -98,7 +97,7 @@ pub(crate) async fn keep_at<H: KeepLink>(
 
 /// Applies the result of an attempt to the back-off and to the status row.
 fn take_note(outcome: &Outcome, backoff: &mut Backoff, row: &StatusRow, rng: &mut ChaCha20Rng) {
-    let now = Instant::now();
+    let now = time_now();
     match outcome {
         Outcome::Ended { remote, end } if place_in_use(end).is_some() => {
             // The control task logs this once, in words for the operator.
@@ -151,7 +150,7 @@ async fn pause<H: KeepLink>(
     due: Option<Instant>,
     network: &mut Network,
 ) -> Pause {
-    let due = due.unwrap_or_else(Instant::now);
+    let due = due.unwrap_or_else(time_now);
     let released = async {
         match outcome {
             Outcome::Failed(Failure::Reached(node)) => keeper.released(node).await,
@@ -159,7 +158,7 @@ async fn pause<H: KeepLink>(
         }
     };
     tokio::select! {
-        () = sleep_until(due) => Pause::Over,
+        () = sleep_until(due.into()) => Pause::Over,
         () = released => Pause::Over,
         () = another_network(network) => Pause::Cut,
     }
@@ -168,9 +167,9 @@ async fn pause<H: KeepLink>(
 /// Waits until the network changes. It takes at least [`BACKOFF_MIN`], so that a flapping network causes no burst of
 /// attempts.
 async fn another_network(network: &mut Network) {
-    let least = Instant::now() + BACKOFF_MIN;
+    let least = time_now() + BACKOFF_MIN;
     network.changed().await;
-    sleep_until(least).await;
+    sleep_until(least.into()).await;
 }
 
 #[cfg(test)]

@@ -1,20 +1,21 @@
 //! Keeps one link to one router of a domain, in the order of its SRV records (RFC 2782).
 
 use std::collections::BTreeMap;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::RngCore;
 use sgc_config::{RouterUrl, SrvDomain};
+use sgc_session::{BACKOFF_MAX, Backoff};
 use sgc_transport::{LinkUrl, Scheme};
 use tokio::sync::watch;
-use tokio::time::{Instant, sleep_until};
+use tokio::time::sleep_until;
 use tracing::{info, warn};
 
 use super::{
-    BACKOFF_MAX, Backoff, DialTarget, Failure, KeepLink, LinkRequest, Names, Outcome, StatusRow,
-    another_network, pause, take_note,
+    DialTarget, Failure, KeepLink, LinkRequest, Names, Outcome, StatusRow, another_network, pause, take_note,
 };
+use crate::clock::time_now;
 
 /// Most targets of a domain that are kept, the best of them.
 pub(crate) const TARGETS_MAX: usize = 16;
@@ -99,7 +100,7 @@ impl SrvState {
         rng: &mut ChaCha20Rng,
     ) -> bool {
         let asked = names.routers(domain).await;
-        let now = Instant::now();
+        let now = time_now();
         self.asked = Some(now);
         match asked {
             Ok(answer) => {
@@ -133,11 +134,11 @@ pub(crate) async fn keep_one_of<N: Names, H: KeepLink>(
     mut rng: ChaCha20Rng,
 ) {
     let mut known =
-        SrvState { answer: None, expires: Instant::now(), asked: None, asking: Backoff::new(BACKOFF_MAX) };
+        SrvState { answer: None, expires: time_now(), asked: None, asking: Backoff::new(BACKOFF_MAX) };
     let mut tried: BTreeMap<LinkUrl, Backoff> = BTreeMap::new();
     let mut network = keeper.network();
     loop {
-        if known.expires <= Instant::now() {
+        if known.expires <= time_now() {
             row.looking_up();
             known.ask(&domain, &names, &row, &mut rng).await;
         }
@@ -147,7 +148,7 @@ pub(crate) async fn keep_one_of<N: Names, H: KeepLink>(
         let mut has_failed = false;
         for target in targets {
             let backoff = tried.entry(target.url()).or_insert_with(|| Backoff::new(BACKOFF_MAX));
-            if !backoff.is_due(Instant::now()) {
+            if !backoff.is_due(time_now()) {
                 continue;
             }
             let outcome = match dial_target(&target, &names).await {
@@ -176,16 +177,16 @@ pub(crate) async fn keep_one_of<N: Names, H: KeepLink>(
         if has_failed && let Some(asked) = known.asked {
             known.expires = known.expires.min(asked + TTL_MIN);
         }
-        let next = tried.values().map(|backoff| backoff.due().unwrap_or_else(Instant::now)).min();
+        let next = tried.values().map(|backoff| backoff.due().unwrap_or_else(time_now)).min();
         let next = next.map_or(known.expires, |next| next.min(known.expires));
         row.waits(Some(next), false);
         tokio::select! {
-            () = sleep_until(next) => {}
+            () = sleep_until(next.into()) => {}
             () = another_network(&mut network) => {
                 tried.clear();
                 // A good answer stays valid. A missing one says nothing about the new network.
                 if known.answer.is_none() {
-                    known.expires = Instant::now();
+                    known.expires = time_now();
                 }
             }
         }
@@ -212,7 +213,7 @@ async fn keep_link<N: Names, H: KeepLink>(
     let (move_to, at) = watch::channel(first);
     let refresh = async {
         loop {
-            sleep_until(known.expires).await;
+            sleep_until(known.expires.into()).await;
             if !known.ask(domain, names, row, rng).await {
                 continue;
             }

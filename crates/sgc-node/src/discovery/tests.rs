@@ -11,7 +11,7 @@ use std::time::Duration;
 use sgc_transport::{DialError, LinkError, LinkUrl};
 use sgc_wire::NodeId;
 use tokio::sync::mpsc;
-use tokio::time::{sleep, timeout};
+use tokio::time::{Instant, sleep, timeout};
 
 use super::dns::DnsError;
 use super::local::Sighting;

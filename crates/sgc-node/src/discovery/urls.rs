@@ -1,5 +1,4 @@
-//! The URLs of one router: order of attempts, parallel attempts, memory of the URL that worked, and [`Failback`] to a
-//! better one.
+//! The URLs of one router: order of attempts, parallel attempts, and memory of the URL that worked.
 //!
 //! It dials nothing. The caller passes the targets and a function that dials.
 
@@ -9,7 +8,6 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
-use rand_chacha::ChaCha20Rng;
 use sgc_config::{RouterUrl, WAYS_MAX};
 use sgc_sync::lock;
 use sgc_transport::{LinkUrl, Scheme};
@@ -18,7 +16,6 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until};
 use tracing::{debug, warn};
 
-use super::backoff::jittered;
 use crate::state;
 
 /// Time after which a silent URL gets a parallel attempt at the next. It covers two round trips of a bad link around
@@ -27,10 +24,6 @@ pub(crate) const SILENT_AFTER: Duration = Duration::from_millis(700);
 /// Longest wait for silent URLs once all were tried and one has failed. A failed URL may work again soon, for example
 /// after a restart of the router, so it has to be tried again.
 const SILENT_MAX: Duration = Duration::from_millis(2500);
-/// First wait before failback, and the longest.
-const CLIMB_MIN: Duration = Duration::from_secs(30);
-const CLIMB_MAX: Duration = Duration::from_secs(600);
-
 /// File below the state directory that remembers working URLs.
 const FILE: &str = "ways";
 /// Most routers that are remembered, and the most bytes of the file.
@@ -144,43 +137,6 @@ pub(crate) fn is_over_udp(scheme: Scheme) -> bool {
     matches!(scheme, Scheme::Quic | Scheme::Dtls | Scheme::Udp)
 }
 
-/// Schedule of attempts at a better URL than the one in use.
-#[derive(Debug)]
-pub(crate) struct Failback {
-    failures: u32,
-    due: Option<Instant>,
-}
-
-impl Failback {
-    /// Starts for a link by the URL of this rank. Rank 0 is the best, so it schedules nothing.
-    pub(crate) fn new(rank: usize, now: Instant, rng: &mut ChaCha20Rng) -> Self {
-        let due = (rank > 0).then(|| now + jittered(CLIMB_MIN, rng));
-        Self { failures: 0, due }
-    }
-
-    /// Notes that no better URL works yet.
-    pub(crate) fn failed(&mut self, now: Instant, rng: &mut ChaCha20Rng) {
-        self.failures = self.failures.saturating_add(1);
-        let doubled = CLIMB_MIN.saturating_mul(2u32.saturating_pow(self.failures.min(16)));
-        self.due = Some(now + jittered(doubled.min(CLIMB_MAX), rng));
-    }
-
-    /// Makes an attempt due, because another network may not block the better URL.
-    pub(crate) fn network_changed(&mut self, now: Instant) {
-        if self.due.is_some() {
-            *self = Self { failures: 0, due: Some(now) };
-        }
-    }
-
-    /// Waits until an attempt is due; for ever if none is scheduled.
-    pub(crate) async fn is_due(&self) {
-        match self.due {
-            Some(due) => sleep_until(due).await,
-            None => std::future::pending().await,
-        }
-    }
-}
-
 /// The URL that worked last for each router, kept over restarts. Clones share the state.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct WorkingUrls {
@@ -268,7 +224,6 @@ async fn keep_written(
 mod tests {
     #![allow(clippy::unwrap_used)]
 
-    use rand_core::SeedableRng as _;
     use tokio::time::sleep;
 
     use super::*;
@@ -343,25 +298,6 @@ mod tests {
         );
         let written = RouterUrl::Ways(vec![url(Quic, "a"), url(Tls, "b")]);
         assert_eq!(of(&[written, at(Tls, "a")]), [vec![url(Quic, "a"), url(Tls, "b")], vec![url(Tls, "a")]]);
-    }
-
-    #[tokio::test(start_paused = true)]
-    async fn a_better_way_is_tried_again_with_growing_patience() {
-        let mut rng = ChaCha20Rng::seed_from_u64(1);
-        let mut failback = Failback::new(1, Instant::now(), &mut rng);
-        let mut waits = Vec::new();
-        for _ in 0..10 {
-            let before = Instant::now();
-            failback.is_due().await;
-            waits.push(before.elapsed().as_secs_f64());
-            failback.failed(Instant::now(), &mut rng);
-        }
-        for (n, wait) in waits.iter().enumerate() {
-            let most = f64::from(30 << n.min(5)).min(600.0);
-            assert!((most / 2.0 - 0.01..=most + 0.01).contains(wait), "{n}: {waits:?}");
-        }
-        let at_best = Failback::new(0, Instant::now(), &mut rng);
-        assert!(tokio::time::timeout(Duration::from_secs(86_400), at_best.is_due()).await.is_err());
     }
 
     #[tokio::test]

@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
+use sgc_session::Activity;
 use sgc_wire::{Control, Name};
 
 use crate::control::control_queue::ControlQueue;
 use crate::data::labels::{LabelBook, NameLabel};
-use crate::link::keep_alive::Activity;
 use crate::link::lanes::Lanes;
 
 /// Sends frames of the control task over a link, in order.

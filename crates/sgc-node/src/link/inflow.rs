@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use sgc_router::LinkId;
+use sgc_session::Activity;
 use sgc_transport::{AnyLink, FlowEnd, FlowError, FlowRx, Link, ReceivedDatagram};
 use sgc_wire::{DecodeError, Name, Packet};
 use tracing::{debug, warn};
@@ -10,7 +11,6 @@ use tracing::{debug, warn};
 use crate::control::peer_rate::PeerRate;
 use crate::data::dataplane::DataPlane;
 use crate::data::stats::{CountDrops, DataDrop};
-use crate::link::keep_alive::Activity;
 
 /// Passes received packets to the data path, within the peer's rate.
 #[derive(Clone)]

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
+use sgc_session::{BACKOFF_MAX, doubled, wait};
 use sgc_sync::lock;
 use sgc_transport::{AnyLink, CloseReason, DialError, Dialer, Link, LinkError, LinkUrl};
 use sgc_wire::{Control, LaneToken, Name, NodeId};
@@ -20,7 +21,6 @@ use tokio::time::{sleep, timeout};
 use tracing::{debug, info, warn};
 
 use crate::control::control_queue::ControlQueue;
-use crate::discovery::backoff::{BACKOFF_MAX, doubled, wait};
 
 /// Most lanes of one link.
 pub(crate) const LANES_MAX: usize = 8;

@@ -8,23 +8,22 @@ use std::time::Duration;
 use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
 use sgc_router::LinkId;
+use sgc_session::{Activity, BACKOFF_MAX, Failback, wait};
 use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link, LinkError, LinkUrl, Listener};
 use sgc_wire::{Control, Decode, DecodeError, Encode};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, warn};
 
+use crate::clock::time_now;
 use crate::control::control_queue::{ControlQueue, InboxShare, Outgoing};
 use crate::control::event::{CoreEvent, LinkPlace};
 use crate::control::refusal_log::RefusalLog;
 use crate::data::labels::{LabelBook, Progress};
-use crate::discovery::{
-    BACKOFF_MAX, Claim, Claims, DialTarget, DialledLink, Failback, LinkKeeper, StatusRow, is_over_udp, wait,
-};
+use crate::discovery::{Claim, Claims, DialTarget, DialledLink, LinkKeeper, StatusRow, is_over_udp};
 use crate::link::control_tx::ControlTx;
 use crate::link::in_use::place_in_use;
 use crate::link::inflow::Inflow;
-use crate::link::keep_alive::Activity;
 use crate::link::lanes::{Dial, LaneAdmission, Lanes};
 use crate::link::roaming::{self, Move, Origin, source_towards};
 use crate::state::audit::{Audit, AuditEvent, AuditRecord};
@@ -66,7 +65,7 @@ pub(crate) async fn keep_renewed(
     let mut rng = ChaCha20Rng::seed_from_u64(OsRng.try_next_u64().unwrap_or(0));
     let mut failures = None;
     let failback_from = |target: &DialTarget, url: &LinkUrl, rng: &mut ChaCha20Rng| {
-        Failback::new(target.better_than(url).len(), Instant::now(), rng)
+        Failback::new(target.better_than(url).len(), time_now(), rng)
     };
     let mut failback = failback_from(&target.borrow(), &url, &mut rng);
     let mut network = keeper.network.onward();
@@ -82,7 +81,7 @@ pub(crate) async fn keep_renewed(
                 None => tokio::select! {
                     () = changed(&mut redial) => false,
                     () = changed(&mut target) => false,
-                    () = failback.is_due() => true,
+                    () = is_due(failback.due()) => true,
                 },
                 Some(failures) => {
                     tokio::time::sleep(wait(failures, BACKOFF_MAX, &mut rng)).await;
@@ -121,7 +120,7 @@ pub(crate) async fn keep_renewed(
                     Move::Redial => is_wanted = true,
                 }
                 failures = failures.map(|_| 0);
-                failback.network_changed(Instant::now());
+                failback.network_changed(time_now());
             }
             before = passed(doubted) => {
                 doubted = None;
@@ -162,7 +161,7 @@ pub(crate) async fn keep_renewed(
                 }
                 Err((why, true)) => {
                     debug!("no better URL works yet: {why}");
-                    failback.failed(Instant::now(), &mut rng);
+                    failback.failed(time_now(), &mut rng);
                 }
                 Err((why, false)) => {
                     is_wanted = false;
@@ -174,6 +173,14 @@ pub(crate) async fn keep_renewed(
                 }
             }
         }
+    }
+}
+
+/// Waits until a time. Waits for ever if there is none.
+async fn is_due(at: Option<std::time::Instant>) {
+    match at {
+        Some(at) => tokio::time::sleep_until(at.into()).await,
+        None => std::future::pending().await,
     }
 }
 

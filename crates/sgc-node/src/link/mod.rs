@@ -3,7 +3,6 @@
 pub(crate) mod control_tx;
 pub(crate) mod in_use;
 pub(crate) mod inflow;
-pub(crate) mod keep_alive;
 pub(crate) mod lanes;
 pub(crate) mod links;
 pub(crate) mod push_crl;

@@ -7,4 +7,3 @@ pub(crate) mod network_state;
 pub(crate) mod rediscovery;
 pub(crate) mod reopening;
 pub(crate) mod strangers;
-pub(crate) mod type_questions;

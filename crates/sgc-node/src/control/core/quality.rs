@@ -1,17 +1,17 @@
 //! Measures links, so that the router machine can weigh them and leave silent ones before they time out.
-//! [`crate::link::keep_alive`] decides when to probe a peer.
+//! [`sgc_session::KeepAlive`] decides when to probe a peer.
 
 use std::time::{Duration, Instant};
 
 use sgc_ros::RosNetwork;
 use sgc_router::LinkId;
+use sgc_session::{KeepAlive, LinkObservation};
 use sgc_transport::{AnyLink, CloseReason, Link};
 use sgc_wire::Control;
 use tracing::info;
 
 use super::{Core, LinkEntry};
 use crate::clock::now;
-use crate::link::keep_alive::{KeepAlive, LinkObservation};
 
 /// Interval of looks at the links.
 const LOOK_EVERY: Duration = Duration::from_millis(500);

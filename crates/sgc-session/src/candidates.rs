@@ -5,17 +5,16 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, SocketAddr};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
-use tokio::time::Instant;
 
-use super::Backoff;
+use crate::Backoff;
 
 /// Most announcements that are remembered at once.
-pub(crate) const CANDIDATES_MAX: usize = 32;
+pub const CANDIDATES_MAX: usize = 32;
 /// Most addresses of one announcement.
-pub(crate) const ADDRESSES_MAX: usize = 8;
+pub const ADDRESSES_MAX: usize = 8;
 /// Most addresses whose failures are remembered.
 const TRIED_MAX: usize = 256;
 /// The longest wait for an announced address.
@@ -23,7 +22,7 @@ const BACKOFF_MAX: Duration = Duration::from_secs(60);
 
 /// The routers that are announced now.
 #[derive(Debug, Default)]
-pub(crate) struct Candidates {
+pub struct Candidates {
     known: BTreeMap<String, Vec<SocketAddr>>,
     /// Back-off of each address. It outlives the announcement, since each new announcement would otherwise reset it.
     tried: BTreeMap<SocketAddr, Backoff>,
@@ -33,7 +32,7 @@ pub(crate) struct Candidates {
 
 /// Result of an attempt at a candidate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Verdict {
+pub enum AttemptResult {
     /// A link was up, and ended.
     Ended,
     /// The attempt failed.
@@ -44,11 +43,7 @@ pub(crate) enum Verdict {
 
 impl Candidates {
     /// Adds an announced router or its new addresses. Returns `false` if there is no room.
-    pub(crate) fn announced(
-        &mut self,
-        instance: &str,
-        addresses: impl IntoIterator<Item = SocketAddr>,
-    ) -> bool {
+    pub fn announced(&mut self, instance: &str, addresses: impl IntoIterator<Item = SocketAddr>) -> bool {
         let usable = |address: &SocketAddr| {
             let ip = address.ip();
             let broadcast = matches!(ip, IpAddr::V4(v4) if v4.is_broadcast());
@@ -68,7 +63,7 @@ impl Candidates {
     }
 
     /// Removes an announcement. A link to the router stays as long as it works.
-    pub(crate) fn vanished(&mut self, instance: &str) {
+    pub fn vanished(&mut self, instance: &str) {
         self.known.remove(instance);
     }
 
@@ -86,7 +81,7 @@ impl Candidates {
     }
 
     /// Returns the due candidate with the fewest failures. It is busy until [`Candidates::done`].
-    pub(crate) fn next(&mut self, now: Instant) -> Option<Vec<SocketAddr>> {
+    pub fn next(&mut self, now: Instant) -> Option<Vec<SocketAddr>> {
         let due = |addresses: &&Vec<SocketAddr>| !self.is_busy(addresses) && self.due(addresses) <= Some(now);
         let best = self.known.values().filter(due).min_by_key(|addresses| self.failures(addresses))?;
         let is_due = |address: &&SocketAddr| self.tried.get(*address).is_none_or(|tried| tried.is_due(now));
@@ -96,16 +91,16 @@ impl Candidates {
     }
 
     /// Returns the time at which the next candidate becomes due.
-    pub(crate) fn next_due(&self, now: Instant) -> Option<Instant> {
+    pub fn next_due(&self, now: Instant) -> Option<Instant> {
         let idle = self.known.values().filter(|addresses| !self.is_busy(addresses));
         idle.map(|addresses| self.due(addresses).unwrap_or(now)).min()
     }
 
     /// Records the result of an attempt and schedules the next.
-    pub(crate) fn done(
+    pub fn done(
         &mut self,
         addresses: &[SocketAddr],
-        verdict: Verdict,
+        verdict: AttemptResult,
         now: Instant,
         rng: &mut ChaCha20Rng,
     ) {
@@ -118,28 +113,28 @@ impl Candidates {
             }
             let tried = self.tried.entry(*address).or_insert_with(|| Backoff::new(BACKOFF_MAX));
             match verdict {
-                Verdict::Ended => tried.ended(now, rng),
-                Verdict::Failed => tried.failed(now, rng),
-                Verdict::StandBack => tried.stand_back(now, rng),
+                AttemptResult::Ended => tried.ended(now, rng),
+                AttemptResult::Failed => tried.failed(now, rng),
+                AttemptResult::StandBack => tried.stand_back(now, rng),
             }
         }
     }
 
     /// Makes addresses due again, because the reason to stand back is gone.
-    pub(crate) fn forgive(&mut self, addresses: &[SocketAddr]) {
+    pub fn forgive(&mut self, addresses: &[SocketAddr]) {
         for address in addresses {
             self.tried.remove(address);
         }
     }
 
     /// Makes all addresses due again, because the network changed.
-    pub(crate) fn forgive_all(&mut self) {
+    pub fn forgive_all(&mut self) {
         self.tried.clear();
     }
 
     /// Returns the number of announcements.
     #[cfg(test)]
-    pub(crate) fn len(&self) -> usize {
+    pub fn len(&self) -> usize {
         self.known.len()
     }
 
@@ -160,7 +155,7 @@ impl Candidates {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
+    #![allow(clippy::unwrap_used, clippy::disallowed_methods)]
 
     use rand_core::SeedableRng as _;
 
@@ -174,8 +169,8 @@ mod tests {
         (Candidates::default(), ChaCha20Rng::seed_from_u64(1), Instant::now())
     }
 
-    #[tokio::test(start_paused = true)]
-    async fn announced_router_is_dialled_once_and_forgotten_when_it_vanishes() {
+    #[test]
+    fn announced_router_is_dialled_once_and_forgotten_when_it_vanishes() {
         let (mut found, mut rng, now) = start();
         assert!(found.announced("a", [at(1)]));
         assert_eq!(found.next(now), Some(vec![at(1)]));
@@ -184,18 +179,18 @@ mod tests {
         assert!(found.announced("a", [at(1)]) && found.announced("b", [at(1)]));
         assert_eq!((found.next(now), found.next_due(now)), (None, None));
         found.vanished("b");
-        found.done(&[at(1)], Verdict::Ended, now, &mut rng);
+        found.done(&[at(1)], AttemptResult::Ended, now, &mut rng);
         assert_eq!(found.next(now), None);
         let soon = now + Duration::from_millis(250);
         assert!(found.next_due(now).unwrap() <= soon);
         assert_eq!(found.next(soon), Some(vec![at(1)]));
-        found.done(&[at(1)], Verdict::Ended, soon, &mut rng);
+        found.done(&[at(1)], AttemptResult::Ended, soon, &mut rng);
         found.vanished("a");
         assert_eq!((found.next(now + BACKOFF_MAX), found.len()), (None, 0));
     }
 
-    #[tokio::test(start_paused = true)]
-    async fn patience_with_an_address_outlives_its_announcements() {
+    #[test]
+    fn patience_with_an_address_outlives_its_announcements() {
         let (mut found, mut rng, mut now) = start();
         let mut attempts = 0;
         let end = now + Duration::from_secs(600);
@@ -205,7 +200,7 @@ mod tests {
             found.announced(&name, [at(1)]);
             if let Some(addresses) = found.next(now) {
                 attempts += 1;
-                found.done(&addresses, Verdict::Failed, now, &mut rng);
+                found.done(&addresses, AttemptResult::Failed, now, &mut rng);
             }
             found.vanished(&name);
             now += Duration::from_millis(100);
@@ -214,8 +209,8 @@ mod tests {
         assert!((15..35).contains(&attempts), "{attempts}");
     }
 
-    #[tokio::test(start_paused = true)]
-    async fn a_flood_leaves_room_for_those_that_did_not_fail() {
+    #[test]
+    fn a_flood_leaves_room_for_those_that_did_not_fail() {
         let (mut found, mut rng, now) = start();
         for n in 0..=255 {
             assert_eq!(found.announced(&format!("liar {n}"), [at(n)]), usize::from(n) < CANDIDATES_MAX);
@@ -223,23 +218,23 @@ mod tests {
         assert_eq!(found.len(), CANDIDATES_MAX);
         assert!(!found.announced("router", [SocketAddr::from(([10, 0, 1, 1], 7447))]));
         let failed = found.next(now).unwrap();
-        found.done(&failed, Verdict::Failed, now, &mut rng);
+        found.done(&failed, AttemptResult::Failed, now, &mut rng);
         assert!(found.announced("router", [SocketAddr::from(([10, 0, 1, 1], 7447))]));
         assert_eq!(found.len(), CANDIDATES_MAX);
     }
 
-    #[tokio::test(start_paused = true)]
-    async fn memory_of_failures_is_bounded() {
+    #[test]
+    fn memory_of_failures_is_bounded() {
         let (mut found, mut rng, now) = start();
         for n in 0..1000u16 {
             let address = SocketAddr::from(([10, 0, 0, 1], n + 1));
-            found.done(&[address], Verdict::Failed, now, &mut rng);
+            found.done(&[address], AttemptResult::Failed, now, &mut rng);
         }
         assert_eq!(found.tried.len(), TRIED_MAX);
     }
 
-    #[tokio::test(start_paused = true)]
-    async fn only_what_can_be_dialled_counts() {
+    #[test]
+    fn only_what_can_be_dialled_counts() {
         let (mut found, _, now) = start();
         let addresses =
             ["0.0.0.0:1", "224.0.0.251:1", "255.255.255.255:1", "10.0.0.1:0", "[::]:1", "[ff02::fb]:1"];
@@ -249,12 +244,12 @@ mod tests {
         assert_eq!(found.next(now).unwrap().len(), ADDRESSES_MAX);
     }
 
-    #[tokio::test(start_paused = true)]
-    async fn candidate_that_stood_back_returns_after_forgiveness() {
+    #[test]
+    fn candidate_that_stood_back_returns_after_forgiveness() {
         let (mut found, mut rng, now) = start();
         found.announced("a", [at(1), at(2)]);
         let addresses = found.next(now).unwrap();
-        found.done(&addresses, Verdict::StandBack, now, &mut rng);
+        found.done(&addresses, AttemptResult::StandBack, now, &mut rng);
         assert_eq!(found.next(now + Duration::from_secs(60)), None);
         found.forgive(&addresses);
         assert_eq!(found.next(now), Some(addresses));

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 /// Longest silence on an active or suspect link before the peer is probed.
 const ASK_MIN: Duration = Duration::from_secs(1);
 /// Longest silence on a link that has been idle for long. Mobile carriers forget UDP mappings after 20 to 30 s.
-pub(crate) const ASK_MAX: Duration = Duration::from_secs(15);
+pub const ASK_MAX: Duration = Duration::from_secs(15);
 /// Lower bound of the interval when a NAT forgets sooner than that.
 const ASK_FLOOR: Duration = Duration::from_secs(5);
 /// Time after the last packet during which a link counts as active.
@@ -26,11 +26,11 @@ const ASLEEP_AFTER: Duration = Duration::from_secs(3);
 
 /// Longest interval between probes on an idle link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct KeepAlivePolicy {
+pub struct KeepAlivePolicy {
     /// Upper bound of the silence before a probe.
-    pub(crate) max: Duration,
+    pub max: Duration,
     /// Whether the bound shrinks when a NAT turns out to forget sooner.
-    pub(crate) adapts: bool,
+    pub adapts: bool,
 }
 
 impl Default for KeepAlivePolicy {
@@ -41,18 +41,18 @@ impl Default for KeepAlivePolicy {
 
 impl KeepAlivePolicy {
     /// Returns the policy for an interval that the user configured.
-    pub(crate) fn fixed(every: Duration) -> Self {
+    pub fn fixed(every: Duration) -> Self {
         Self { max: every.max(ASK_MIN), adapts: false }
     }
 }
 
 /// Flag that packets crossed a link since the last look. Every task that moves packets sets it.
 #[derive(Debug, Default)]
-pub(crate) struct Activity(AtomicBool);
+pub struct Activity(AtomicBool);
 
 impl Activity {
     /// Notes that a packet crosses the link.
-    pub(crate) fn note(&self) {
+    pub fn note(&self) {
         // The flag is usually set already. Reading first avoids invalidating the cache line of other cores.
         if !self.0.load(Relaxed) {
             self.0.store(true, Relaxed);
@@ -66,31 +66,31 @@ impl Activity {
 
 /// State of a link at one moment.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct LinkObservation<'a> {
+pub struct LinkObservation<'a> {
     /// Bytes received so far, of any kind.
-    pub(crate) received_bytes: u64,
+    pub received_bytes: u64,
     /// Flag of packets that crossed the link.
-    pub(crate) activity: &'a Activity,
+    pub activity: &'a Activity,
     /// Current address of the peer.
-    pub(crate) remote: SocketAddr,
+    pub remote: SocketAddr,
     /// Smoothed round-trip time.
-    pub(crate) rtt: Duration,
+    pub rtt: Duration,
 }
 
 /// Decision after one look at a link.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Verdict {
+pub struct Verdict {
     /// The peer is to be probed now.
-    pub(crate) asks: bool,
+    pub asks: bool,
     /// An answer is overdue.
-    pub(crate) is_silent: bool,
+    pub is_silent: bool,
     /// The answer is overdue for so long that the link ends.
-    pub(crate) is_dead: bool,
+    pub is_dead: bool,
 }
 
 /// Keep-alive state of one link.
 #[derive(Debug)]
-pub(crate) struct KeepAlive {
+pub struct KeepAlive {
     policy: KeepAlivePolicy,
     /// Silence before the next probe, at most `policy.max`.
     step: Duration,
@@ -107,12 +107,7 @@ pub(crate) struct KeepAlive {
 
 impl KeepAlive {
     /// Starts the keep-alive of a link that is up.
-    pub(crate) fn new(
-        now: Instant,
-        policy: KeepAlivePolicy,
-        received_bytes: u64,
-        remote: SocketAddr,
-    ) -> Self {
+    pub fn new(now: Instant, policy: KeepAlivePolicy, received_bytes: u64, remote: SocketAddr) -> Self {
         Self {
             policy,
             step: ASK_MIN,
@@ -127,22 +122,22 @@ impl KeepAlive {
     }
 
     /// Returns the silence after which the peer is probed.
-    pub(crate) fn step(&self) -> Duration {
+    pub fn step(&self) -> Duration {
         self.step
     }
 
     /// Returns the policy, with the bound that the path has shown to bear.
-    pub(crate) fn policy(&self) -> KeepAlivePolicy {
+    pub fn policy(&self) -> KeepAlivePolicy {
         self.policy
     }
 
     /// Shortens the interval, because a frame is sent that expects an answer or a live peer.
-    pub(crate) fn stir(&mut self) {
+    pub fn stir(&mut self) {
         self.step = ASK_MIN;
     }
 
     /// Observes the link. The caller calls this a few times a second.
-    pub(crate) fn look(&mut self, now: Instant, seen: LinkObservation<'_>) -> Verdict {
+    pub fn look(&mut self, now: Instant, seen: LinkObservation<'_>) -> Verdict {
         if now.saturating_duration_since(self.looked) >= ASLEEP_AFTER {
             // This node was suspended, so its own silence counts for nothing.
             (self.asked, self.heard) = (None, now);
@@ -198,6 +193,8 @@ impl KeepAlive {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used, clippy::disallowed_methods)]
+
     use super::*;
 
     const LOOK: Duration = Duration::from_millis(500);

@@ -1,7 +1,7 @@
 //! [`TypeQuestions`]: decides which owner is asked for which types, and when. Each owner has one question at a time,
 //! with as many names as one question holds.
 //!
-//! A pure machine. `core/interface_types.rs` sends questions and verifies answers. This machine counts the running
+//! A pure machine. `sgc-node` sends questions and verifies answers. This machine counts the running
 //! searches of an owner, so that their results are gathered into one question, and gives each missing type its turn.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -20,7 +20,7 @@ const TOLD_BYTES_PER_OWNER_MAX: usize = SEALED_BYTES_MAX;
 
 /// The questions to all owners.
 #[derive(Debug, Default)]
-pub(crate) struct TypeQuestions {
+pub struct TypeQuestions {
     owners: BTreeMap<NodeId, Owner>,
     told_bytes: usize,
     /// Owners whose descriptions had no room.
@@ -49,12 +49,12 @@ struct Owner {
 
 impl TypeQuestions {
     /// Notes that a search or verification for this owner begins.
-    pub(crate) fn begins(&mut self, owner: NodeId) {
+    pub fn begins(&mut self, owner: NodeId) {
         self.owners.entry(owner).or_default().under_way += 1;
     }
 
     /// Notes that it ends. `told_bytes` is the size of a received description.
-    pub(crate) fn ends(&mut self, owner: &NodeId, told_bytes: usize) {
+    pub fn ends(&mut self, owner: &NodeId, told_bytes: usize) {
         self.told_bytes = self.told_bytes.saturating_sub(told_bytes);
         if let Some(of) = self.owners.get_mut(owner) {
             of.under_way = of.under_way.saturating_sub(1);
@@ -63,26 +63,26 @@ impl TypeQuestions {
     }
 
     /// Adds a type to ask the owner for.
-    pub(crate) fn lacks(&mut self, owner: NodeId, name: Name) {
+    pub fn lacks(&mut self, owner: NodeId, name: Name) {
         self.owners.entry(owner).or_default().lacking.entry(name).or_default();
     }
 
     /// Removes a type, because it is known or no longer wanted.
-    pub(crate) fn settled(&mut self, owner: &NodeId, name: &Name) {
+    pub fn settled(&mut self, owner: &NodeId, name: &Name) {
         if let Some(of) = self.owners.get_mut(owner) {
             of.lacking.remove(name);
         }
     }
 
     /// Notes that the owner answered the open question.
-    pub(crate) fn answered(&mut self, owner: &NodeId) {
+    pub fn answered(&mut self, owner: &NodeId) {
         if let Some(of) = self.owners.get_mut(owner) {
             of.is_answered = true;
         }
     }
 
     /// Reserves room to verify a description. Returns `false` if there is none; the type is then asked for again.
-    pub(crate) fn takes_told(&mut self, owner: &NodeId, bytes: usize) -> bool {
+    pub fn takes_told(&mut self, owner: &NodeId, bytes: usize) -> bool {
         let Some(of) = self.owners.get_mut(owner) else { return false };
         if of.told_bytes + bytes > TOLD_BYTES_PER_OWNER_MAX || self.told_bytes + bytes > TOLD_BYTES_MAX {
             self.held_up.insert(*owner);
@@ -96,7 +96,7 @@ impl TypeQuestions {
     }
 
     /// Removes and returns the owners to ask again, because there is room now.
-    pub(crate) fn have_room(&mut self) -> BTreeSet<NodeId> {
+    pub fn have_room(&mut self) -> BTreeSet<NodeId> {
         if self.held_up.is_empty() || self.told_bytes > TOLD_BYTES_MAX / 2 {
             return BTreeSet::new();
         }
@@ -110,19 +110,19 @@ impl TypeQuestions {
     }
 
     /// Returns the owners to be asked for other types now.
-    pub(crate) fn due(&self, now: Instant) -> Vec<NodeId> {
+    pub fn due(&self, now: Instant) -> Vec<NodeId> {
         let is_due = |of: &Owner| of.turn().is_some_and(|at| at <= now);
         self.owners.iter().filter(|(_, of)| is_due(of)).map(|(owner, _)| *owner).collect()
     }
 
     /// Returns the time of the next such question.
-    pub(crate) fn deadline(&self) -> Option<Instant> {
+    pub fn deadline(&self) -> Option<Instant> {
         self.owners.values().filter_map(Owner::turn).min()
     }
 
     /// Returns the names of a new question, which replaces the open one. `None` keeps the open question; no names means
     /// that nothing is missing.
-    pub(crate) fn next(&mut self, owner: NodeId, now: Instant) -> Option<Vec<Name>> {
+    pub fn next(&mut self, owner: NodeId, now: Instant) -> Option<Vec<Name>> {
         let of = self.owners.get_mut(&owner)?;
         if of.under_way > 0 {
             return None;
@@ -181,6 +181,8 @@ impl Owner {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used, clippy::disallowed_methods)]
+
     use super::*;
 
     const OWNER: NodeId = NodeId([7; 32]);

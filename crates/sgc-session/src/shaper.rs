@@ -11,7 +11,7 @@ const SLACK: Duration = Duration::from_millis(50);
 
 /// Decides when the next message of a topic may leave.
 #[derive(Debug, Default)]
-pub(crate) struct Shaper {
+pub struct Shaper {
     shaping: Shaping,
     /// Time allowed by the rate.
     rate_due: Option<Instant>,
@@ -22,34 +22,34 @@ pub(crate) struct Shaper {
 
 impl Shaper {
     /// Replaces the settings.
-    pub(crate) fn set(&mut self, shaping: Shaping) {
+    pub fn set(&mut self, shaping: Shaping) {
         *self = Self { shaping, ..Self::default() };
     }
 
     /// Returns the settings.
-    pub(crate) fn shaping(&self) -> &Shaping {
+    pub fn shaping(&self) -> &Shaping {
         &self.shaping
     }
 
     /// Returns the time at which a message may leave. A message that waits for the rate is replaced by the next. One
     /// that waits for bandwidth is replaced only if it is best effort.
-    pub(crate) fn due(&self) -> Option<Instant> {
+    pub fn due(&self) -> Option<Instant> {
         self.rate_due.max(self.bandwidth_due)
     }
 
     /// Returns `true` if a message may leave now.
-    pub(crate) fn is_due(&self, now: Instant) -> bool {
+    pub fn is_due(&self, now: Instant) -> bool {
         self.due().is_none_or(|due| due <= now)
     }
 
     /// Returns `true` if a waiting message is replaced by the next one.
-    pub(crate) fn gives_way(&self, now: Instant, reliable: bool) -> bool {
+    pub fn gives_way(&self, now: Instant, reliable: bool) -> bool {
         !reliable || self.rate_due.is_some_and(|due| due > now)
     }
 
     /// Charges a message that leaves. The next one is due relative to this one's due time, so that the configured rate
     /// is met.
-    pub(crate) fn takes(&mut self, now: Instant, bytes: usize) {
+    pub fn takes(&mut self, now: Instant, bytes: usize) {
         if let Some(interval) = self.shaping.interval {
             let next = self.rate_due.map(|due| due + interval).filter(|next| *next > now);
             self.rate_due = Some(next.unwrap_or(now + interval));
@@ -63,7 +63,7 @@ impl Shaper {
     }
 
     /// Corrects the charge, because the message's final length differs.
-    pub(crate) fn corrects(&mut self, taken: usize, left: usize) {
+    pub fn corrects(&mut self, taken: usize, left: usize) {
         if let (Some(due), Some(bits_per_s)) = (&mut self.bandwidth_due, self.shaping.bits_per_s) {
             let took = Duration::from_secs_f64(taken.abs_diff(left) as f64 * 8.0 / bits_per_s.max(1) as f64);
             *due = if left > taken { *due + took } else { due.checked_sub(took).unwrap_or(*due) };
@@ -72,7 +72,7 @@ impl Shaper {
 
     /// Returns `true` if a message is too old by its publisher's time stamp and this node's clock, both in ns since
     /// 1970.
-    pub(crate) fn is_too_old(&mut self, now_ns: i64, dated_ns: i64) -> bool {
+    pub fn is_too_old(&mut self, now_ns: i64, dated_ns: i64) -> bool {
         let Some(max) = self.shaping.max_age else { return false };
         self.age.measure(now_ns, dated_ns) > max
     }
@@ -99,6 +99,8 @@ impl Age {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used, clippy::disallowed_methods)]
+
     use super::*;
 
     fn shaper(shaping: Shaping) -> (Shaper, Instant) {

@@ -1,0 +1,22 @@
+//! Decisions about the links of a node, and about the traffic that it starts by itself: keep-alive, back-off, claims,
+//! candidates, questions for types, shaping.
+//!
+//! Pure machines: time and randomness are arguments, and nothing here opens a socket, spawns a task or waits. `sgc-node`
+//! observes, passes events in, and carries the results out.
+#![forbid(unsafe_code)]
+
+mod backoff;
+mod candidates;
+mod claims;
+mod failback;
+mod keep_alive;
+mod shaper;
+mod type_questions;
+
+pub use backoff::{BACKOFF_MAX, BACKOFF_MIN, Backoff, DISPLACED_MAX, STAND_BACK, doubled, jittered, wait};
+pub use candidates::{ADDRESSES_MAX, AttemptResult, CANDIDATES_MAX, Candidates};
+pub use claims::ClaimTable;
+pub use failback::Failback;
+pub use keep_alive::{ASK_MAX, Activity, KeepAlive, KeepAlivePolicy, LinkObservation, Verdict};
+pub use shaper::Shaper;
+pub use type_questions::TypeQuestions;
