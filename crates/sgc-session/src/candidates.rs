@@ -134,7 +134,7 @@ impl Candidates {
 
     /// Returns the number of announcements.
     #[cfg(test)]
-    pub fn len(&self) -> usize {
+    fn len(&self) -> usize {
         self.known.len()
     }
 

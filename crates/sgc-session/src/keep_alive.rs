@@ -82,10 +82,47 @@ pub struct LinkObservation<'a> {
 pub struct Verdict {
     /// The peer is to be probed now.
     pub asks: bool,
+    /// What its silence means.
+    pub peer: PeerState,
+}
+
+impl Verdict {
+    /// Returns `true` if an answer is overdue.
+    pub fn is_silent(&self) -> bool {
+        self.peer >= PeerState::Silent
+    }
+
+    /// Returns `true` if the link ends.
+    pub fn is_dead(&self) -> bool {
+        self.peer == PeerState::Dead
+    }
+}
+
+/// State of the peer by its silence.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub enum PeerState {
+    /// No answer is overdue.
+    #[default]
+    Alive,
     /// An answer is overdue.
-    pub is_silent: bool,
+    Silent,
     /// The answer is overdue for so long that the link ends.
-    pub is_dead: bool,
+    Dead,
+}
+
+/// What the link waits for.
+#[derive(Clone, Copy, Debug)]
+enum Waiting {
+    /// For the time of the next probe.
+    ToAsk,
+    /// For an answer.
+    ForAnswer {
+        /// Times of the first and the last probe since something was last received.
+        first: Instant,
+        last: Instant,
+        /// Silence before the first.
+        gap: Duration,
+    },
 }
 
 /// Keep-alive state of one link.
@@ -99,10 +136,7 @@ pub struct KeepAlive {
     heard: Instant,
     active: Instant,
     looked: Instant,
-    /// Times of the first and the last probe since something was last received.
-    asked: Option<(Instant, Instant)>,
-    /// Silence before the current or the last probe.
-    gap: Duration,
+    waiting: Waiting,
 }
 
 impl KeepAlive {
@@ -116,8 +150,7 @@ impl KeepAlive {
             heard: now,
             active: now,
             looked: now,
-            asked: None,
-            gap: Duration::ZERO,
+            waiting: Waiting::ToAsk,
         }
     }
 
@@ -140,7 +173,7 @@ impl KeepAlive {
     pub fn look(&mut self, now: Instant, seen: LinkObservation<'_>) -> Verdict {
         if now.saturating_duration_since(self.looked) >= ASLEEP_AFTER {
             // This node was suspended, so its own silence counts for nothing.
-            (self.asked, self.heard) = (None, now);
+            (self.waiting, self.heard) = (Waiting::ToAsk, now);
         }
         self.looked = now;
         if seen.activity.take() {
@@ -156,34 +189,43 @@ impl KeepAlive {
             self.hear(now, quiet, seen.remote, is_active);
             return Verdict::default();
         }
-        let Some((first, last)) = self.asked else {
-            if quiet < self.step {
-                return Verdict::default();
+        match &mut self.waiting {
+            Waiting::ToAsk => {
+                let asks = quiet >= self.step;
+                if asks {
+                    self.waiting = Waiting::ForAnswer { first: now, last: now, gap: quiet };
+                }
+                Verdict { asks, peer: PeerState::Alive }
             }
-            (self.asked, self.gap) = (Some((now, now)), quiet);
-            return Verdict { asks: true, ..Verdict::default() };
-        };
-        let waited = now.saturating_duration_since(first);
-        let asks = now.saturating_duration_since(last) >= ASK_MIN;
-        if asks {
-            self.asked = Some((first, now));
+            Waiting::ForAnswer { first, last, .. } => {
+                let asks = now.saturating_duration_since(*last) >= ASK_MIN;
+                if asks {
+                    *last = now;
+                }
+                let answer_max = (ANSWER_RTTS * seen.rtt).clamp(ANSWER_MIN, ANSWER_MAX);
+                let peer = match now.saturating_duration_since(*first) {
+                    waited if waited >= DEAD_AFTER => PeerState::Dead,
+                    waited if waited >= answer_max => PeerState::Silent,
+                    _ => PeerState::Alive,
+                };
+                Verdict { asks, peer }
+            }
         }
-        let is_silent = waited >= (ANSWER_RTTS * seen.rtt).clamp(ANSWER_MIN, ANSWER_MAX);
-        Verdict { asks, is_silent, is_dead: waited >= DEAD_AFTER }
     }
 
     /// Handles a receipt after `quiet` of silence.
     fn hear(&mut self, now: Instant, quiet: Duration, remote: SocketAddr, is_active: bool) {
         let has_moved = std::mem::replace(&mut self.remote, remote) != remote;
-        let asked = self.asked.take();
-        // A path that needed several probes lost the first one, because a NAT on it had forgotten the mapping.
-        let was_lost = asked.is_some_and(|(first, last)| last > first);
-        let gap = if asked.is_some() { self.gap } else { quiet };
+        let (was_asked, was_lost, gap) = match std::mem::replace(&mut self.waiting, Waiting::ToAsk) {
+            Waiting::ToAsk => (false, false, quiet),
+            // A path that needed several probes lost the first one, because a NAT on it had forgotten the mapping.
+            Waiting::ForAnswer { first, last, gap } => (true, last > first, gap),
+        };
         if self.policy.adapts && gap >= ASK_FLOOR && (has_moved || was_lost) {
             self.policy.max = self.policy.max.min(gap / 2).max(ASK_FLOOR);
         }
         // The peer answers, so the next probe may come later.
-        if asked.is_some() && !was_lost && !is_active {
+        if was_asked && !was_lost && !is_active {
             self.step = (self.step * 2).min(self.policy.max);
         }
         self.step = self.step.min(self.policy.max);
@@ -301,25 +343,25 @@ mod tests {
         let mut bench = Bench::new(KeepAlivePolicy::default());
         bench.run(10);
         bench.answers = false;
-        assert!((2.0..=3.5).contains(&bench.until(|v| v.is_silent)));
-        assert!((6.0..=8.0).contains(&bench.until(|v| v.is_dead)));
+        assert!((2.0..=3.5).contains(&bench.until(|v| v.is_silent())));
+        assert!((6.0..=8.0).contains(&bench.until(|v| v.is_dead())));
         // A link that was idle for long notices it as soon as a packet is to cross it.
         let mut bench = Bench::new(KeepAlivePolicy::default());
         bench.run(200);
         bench.answers = false;
         bench.activity.note();
-        assert!(bench.until(|v| v.is_silent) <= 3.5);
+        assert!(bench.until(|v| v.is_silent()) <= 3.5);
         let mut bench = Bench::new(KeepAlivePolicy::default());
         bench.run(200);
         bench.answers = false;
         bench.keep_alive.stir();
         // An answer under way may extend the interval once more.
-        assert!(bench.until(|v| v.is_silent) <= 4.5);
+        assert!(bench.until(|v| v.is_silent()) <= 4.5);
         // An idle link notices it at its next probe.
         let mut bench = Bench::new(KeepAlivePolicy::default());
         bench.run(200);
         bench.answers = false;
-        assert!(bench.until(|v| v.is_silent) <= 18.0);
+        assert!(bench.until(|v| v.is_silent()) <= 18.0);
         bench.answers = true;
         bench.run(2);
         assert_eq!(bench.verdict, Verdict::default());
@@ -357,11 +399,11 @@ mod tests {
     fn suspended_node_takes_no_peer_for_dead() {
         let mut bench = Bench::new(KeepAlivePolicy::default());
         bench.answers = false;
-        bench.until(|v| v.is_silent);
+        bench.until(|v| v.is_silent());
         bench.now += Duration::from_secs(60);
         bench.look();
         assert_eq!(bench.verdict, Verdict::default());
-        bench.until(|v| v.is_dead);
+        bench.until(|v| v.is_dead());
     }
 
     #[test]
@@ -375,7 +417,7 @@ mod tests {
         };
         let silent = |rtt| {
             let mut keep_alive = KeepAlive::new(bench.now, KeepAlivePolicy::default(), 0, bench.remote);
-            (1..).find(|n| keep_alive.look(bench.now + LOOK * *n, seen(rtt)).is_silent)
+            (1..).find(|n| keep_alive.look(bench.now + LOOK * *n, seen(rtt)).is_silent())
         };
         assert_eq!((silent(1), silent(700), silent(60_000)), (Some(5), Some(8), Some(12)));
         bench.run(1);

@@ -1,5 +1,5 @@
 //! Decisions about the links of a node, and about the traffic that it starts by itself: keep-alive, back-off, claims,
-//! candidates, questions for types, shaping.
+//! candidates, questions for types, shaping. [`LinkSupervisor`] decides when a link is replaced.
 //!
 //! Pure machines: time and randomness are arguments, and nothing here opens a socket, spawns a task or waits. `sgc-node`
 //! observes, passes events in, and carries the results out.
@@ -10,13 +10,17 @@ mod candidates;
 mod claims;
 mod failback;
 mod keep_alive;
+mod origin;
 mod shaper;
+mod supervisor;
 mod type_questions;
 
 pub use backoff::{BACKOFF_MAX, BACKOFF_MIN, Backoff, DISPLACED_MAX, STAND_BACK, doubled, jittered, wait};
 pub use candidates::{ADDRESSES_MAX, AttemptResult, CANDIDATES_MAX, Candidates};
 pub use claims::ClaimTable;
 pub use failback::Failback;
-pub use keep_alive::{ASK_MAX, Activity, KeepAlive, KeepAlivePolicy, LinkObservation, Verdict};
+pub use keep_alive::{ASK_MAX, Activity, KeepAlive, KeepAlivePolicy, LinkObservation, PeerState, Verdict};
+pub use origin::{Move, Origin};
 pub use shaper::Shaper;
+pub use supervisor::{DOUBT_AFTER, DialCause, Event, LinkFacts, LinkKey, LinkSupervisor, Output};
 pub use type_questions::TypeQuestions;

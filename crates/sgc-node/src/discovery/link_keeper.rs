@@ -1,7 +1,6 @@
 //! One attempt at a router: dial, judge the peer, and keep the link until it ends.
 
 use std::collections::BTreeSet;
-use std::convert::Infallible;
 use std::future::Future;
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -14,7 +13,7 @@ use tracing::warn;
 use super::dns::DnsError;
 use super::{Claim, Claims, DialTarget, Dns, Names as _, SkippedUrl, StatusRow, WorkingUrls, urls};
 use crate::control::event::CoreEvent;
-use crate::link::links::keep_renewed;
+use crate::link::renewal::{Signals, keep_renewed};
 use crate::link::roaming::Network;
 
 /// Makes and keeps links. Tests replace it.
@@ -254,17 +253,9 @@ impl KeepLink for LinkKeeper {
             }
         };
         self.linked(&first, &url, &passed, &node, row);
-        let overtaken = async {
-            if self.gives_way(request, &node) {
-                self.claims.arrived(&node).await;
-                link.close(CloseReason::Replaced);
-            }
-            std::future::pending::<Infallible>().await
-        };
-        tokio::select! {
-            end = keep_renewed(link.clone(), url, target, redial, self, claim, row) => Outcome::Ended { remote, end },
-            never = overtaken => match never {},
-        }
+        let gives_way_to = self.gives_way(request, &node).then_some(node);
+        let end = keep_renewed(link, url, Signals { target, redial, gives_way_to }, self, claim, row).await;
+        Outcome::Ended { remote, end }
     }
 
     async fn released(&self, node: &NodeId) {

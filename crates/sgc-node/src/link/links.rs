@@ -1,31 +1,27 @@
-//! Tasks of a link: they dial, accept, and pass on received frames and packets.
+//! Tasks of a link: they accept, and pass on received frames and packets. `renewal.rs` replaces links that were dialled.
 //!
 //! Control frames go to the control task. The task that reads a packet passes it straight to the data path.
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use rand_chacha::ChaCha20Rng;
-use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
 use sgc_router::LinkId;
-use sgc_session::{Activity, BACKOFF_MAX, Failback, wait};
-use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link, LinkError, LinkUrl, Listener};
+use sgc_session::Activity;
+use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link, LinkError, Listener};
 use sgc_wire::{Control, Decode, DecodeError, Encode};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, warn};
 
-use crate::clock::time_now;
 use crate::control::control_queue::{ControlQueue, InboxShare, Outgoing};
 use crate::control::event::{CoreEvent, LinkPlace};
 use crate::control::refusal_log::RefusalLog;
 use crate::data::labels::{LabelBook, Progress};
-use crate::discovery::{Claim, Claims, DialTarget, DialledLink, LinkKeeper, StatusRow, is_over_udp};
+use crate::discovery::Claims;
 use crate::link::control_tx::ControlTx;
 use crate::link::in_use::place_in_use;
 use crate::link::inflow::Inflow;
 use crate::link::lanes::{Dial, LaneAdmission, Lanes};
-use crate::link::roaming::{self, Move, Origin, source_towards};
 use crate::state::audit::{Audit, AuditEvent, AuditRecord};
 
 /// Time for a replacement link to settle before the old one goes.
@@ -34,173 +30,8 @@ const SETTLE_MAX: Duration = Duration::from_secs(5);
 /// round trips.
 const QUIET_MIN: Duration = Duration::from_millis(100);
 const QUIET_RTTS: u32 = 4;
-/// Silence on a new socket after which another link is tried beside it, since the new network may block the transport.
-const DOUBT_AFTER: Duration = Duration::from_millis(1500);
 /// Time for the peer to answer a goodbye.
 const GOODBYE_MAX: Duration = Duration::from_secs(1);
-
-/// Serves a link and its replacements, and returns when the last of them has ended.
-///
-/// A link is replaced when the credentials change (`redial`), when the target changes (`target`), when a better URL
-/// than the current one (`url`) works, or when the network changes and the transport cannot follow.
-///
-/// The new link is made while the old one is up. The old one is closed once both sides have sent each other their state
-/// on the new one. If that fails, the old one stays.
-pub(crate) async fn keep_renewed(
-    link: AnyLink,
-    mut url: LinkUrl,
-    mut target: watch::Receiver<DialTarget>,
-    mut redial: watch::Receiver<()>,
-    keeper: &LinkKeeper,
-    mut claim: Claim,
-    row: &StatusRow,
-) -> LinkError {
-    let core = &keeper.core;
-    let serve = |link, url: &LinkUrl| {
-        let dial = (keeper.lane_dialer.clone(), url.clone());
-        async move { ReportedLink::start(link, Some(dial), LaneAdmission::default(), core).await }
-    };
-    let mut current = serve(link, &url).await;
-    // The generator serves jitter only.
-    let mut rng = ChaCha20Rng::seed_from_u64(OsRng.try_next_u64().unwrap_or(0));
-    let mut failures = None;
-    let failback_from = |target: &DialTarget, url: &LinkUrl, rng: &mut ChaCha20Rng| {
-        Failback::new(target.better_than(url).len(), time_now(), rng)
-    };
-    let mut failback = failback_from(&target.borrow(), &url, &mut rng);
-    let mut network = keeper.network.onward();
-    let mut origin = Origin::from_remote(current.link.remote());
-    // Whether a replacement is wanted without a further event.
-    let mut is_wanted = false;
-    // Time at which to check for receipts after a network change, and the bytes received before.
-    let mut doubted = None;
-    loop {
-        let next = async {
-            let fails_back = match failures {
-                _ if is_wanted => false,
-                None => tokio::select! {
-                    () = changed(&mut redial) => false,
-                    () = changed(&mut target) => false,
-                    () = is_due(failback.due()) => true,
-                },
-                Some(failures) => {
-                    tokio::time::sleep(wait(failures, BACKOFF_MAX, &mut rng)).await;
-                    false
-                }
-            };
-            let dialled = if fails_back {
-                let target = target.borrow().clone();
-                keeper.dial_first(target.better_than(&url)).await.map(|dialled| (dialled, target))
-            } else {
-                // Stays set until a replacement exists, whatever interrupts this attempt.
-                is_wanted = true;
-                redial.mark_unchanged();
-                let target = target.borrow_and_update().clone();
-                keeper.dial(&target).await.map(|dialled| (dialled, target))
-            };
-            let claimed = |(dialled, target): (DialledLink, DialTarget)| {
-                let claim = keeper.claim_again(&dialled.link, &claim)?;
-                Ok((dialled, target, claim))
-            };
-            dialled.and_then(claimed).map_err(|why| (why, fails_back))
-        };
-        tokio::select! {
-            end = current.end(core) => return end,
-            () = network.changed() => {
-                let remote = current.link.remote();
-                let source = source_towards(remote);
-                let moves = origin.moves(source, is_over_udp(url.scheme));
-                roaming::report(remote, source, moves);
-                match moves {
-                    Move::Stay => {}
-                    Move::Rebind => {
-                        keeper.rebind();
-                        doubted = Some((Instant::now() + DOUBT_AFTER, current.link.stats().received_bytes));
-                    }
-                    Move::Redial => is_wanted = true,
-                }
-                failures = failures.map(|_| 0);
-                failback.network_changed(time_now());
-            }
-            before = passed(doubted) => {
-                doubted = None;
-                if current.link.stats().received_bytes == before {
-                    info!(%url, "nothing arrives since the network changed; connecting again in parallel");
-                    is_wanted = true;
-                }
-            }
-            dialled = next => match dialled {
-                Ok((dialled, target, other)) => {
-                    (is_wanted, doubted) = (false, None);
-                    let DialledLink { link, url: new_url, passed } = dialled;
-                    let node = link.peer().node_id;
-                    let next = serve(link, &new_url).await;
-                    tokio::select! {
-                        () = next.settled() => {
-                            failures = None;
-                            let old = std::mem::replace(&mut current, next);
-                            tokio::spawn(old.retire(core.clone()));
-                        }
-                        end = next.end(core) => {
-                            warn!("the replacement link ended: {end}; the old link stays until the next attempt");
-                            failures = Some(failures.unwrap_or(0).saturating_add(1));
-                            continue;
-                        }
-                        end = current.end(core) => {
-                            info!(%url, "link ended: {end}");
-                            (current, failures) = (next, None);
-                        }
-                    }
-                    keeper.linked(&target, &new_url, &passed, &node, row);
-                    failback = failback_from(&target, &new_url, &mut rng);
-                    origin = Origin::from_remote(current.link.remote());
-                    url = new_url;
-                    if let Some(other) = other {
-                        claim = other;
-                    }
-                }
-                Err((why, true)) => {
-                    debug!("no better URL works yet: {why}");
-                    failback.failed(time_now(), &mut rng);
-                }
-                Err((why, false)) => {
-                    is_wanted = false;
-                    if failures.is_none() {
-                        warn!("cannot reconnect: {why}; the old link stays until the next attempt");
-                    }
-                    row.noted(&why.to_string());
-                    failures = Some(failures.unwrap_or(0).saturating_add(1));
-                }
-            }
-        }
-    }
-}
-
-/// Waits until a time. Waits for ever if there is none.
-async fn is_due(at: Option<std::time::Instant>) {
-    match at {
-        Some(at) => tokio::time::sleep_until(at.into()).await,
-        None => std::future::pending().await,
-    }
-}
-
-/// Waits until the noted time, and returns the noted count. Waits for ever if there is none.
-async fn passed(noted: Option<(Instant, u64)>) -> u64 {
-    match noted {
-        Some((at, what)) => {
-            tokio::time::sleep_until(at).await;
-            what
-        }
-        None => std::future::pending().await,
-    }
-}
-
-/// Waits for a change. Waits for ever if the sender is gone.
-async fn changed<T>(watched: &mut watch::Receiver<T>) {
-    if watched.changed().await.is_err() {
-        std::future::pending().await
-    }
-}
 
 /// Checks and registers incoming links.
 pub(crate) struct Admission {
@@ -261,8 +92,8 @@ pub(crate) async fn keep_accepting(
 }
 
 /// A link that was reported to the control task.
-struct ReportedLink {
-    link: AnyLink,
+pub(super) struct ReportedLink {
+    pub(super) link: AnyLink,
     /// Number of the link; `None` if the node is stopping.
     id: Option<LinkId>,
     /// Number of control frames received.
@@ -272,7 +103,7 @@ struct ReportedLink {
 
 impl ReportedLink {
     /// Reports the link to the control task and starts to receive.
-    async fn start(
+    pub(super) async fn start(
         link: AnyLink,
         dial: Option<Dial>,
         admission: LaneAdmission,
@@ -310,7 +141,7 @@ impl ReportedLink {
     }
 
     /// Waits for the end of the link and reports it. Dropping the future is safe: the caller calls it again.
-    async fn end(&self, core: &mpsc::Sender<CoreEvent>) -> LinkError {
+    pub(super) async fn end(&self, core: &mpsc::Sender<CoreEvent>) -> LinkError {
         let end = self.link.closed().await;
         self.lanes.close();
         if let Some(id) = self.id {
@@ -325,7 +156,7 @@ impl ReportedLink {
     /// it.
     ///
     /// Never returns on a link that has ended. Ends a link on which no frame arrives.
-    async fn settled(&self) {
+    pub(super) async fn settled(&self) {
         let mut heard = self.heard.clone();
         let deadline = Instant::now() + SETTLE_MAX;
         if timeout_at(deadline, heard.wait_for(|frames| *frames > 0)).await.is_err() {
@@ -343,14 +174,14 @@ impl ReportedLink {
 
     /// Retires the link. The peer closes it in answer to the goodbye, which shows that it has received everything
     /// before.
-    async fn retire(self, core: mpsc::Sender<CoreEvent>) {
+    pub(super) async fn retire(&self, core: &mpsc::Sender<CoreEvent>) {
         let goodbye = async {
             let _ = self.link.send_control(Control::Goodbye.to_bytes()).await;
             self.link.closed().await
         };
         let _ = timeout(GOODBYE_MAX, goodbye).await;
         self.link.close(CloseReason::Replaced);
-        self.end(&core).await;
+        self.end(core).await;
         info!(remote = %self.link.remote(), "a newer link replaced this one");
     }
 }
@@ -465,15 +296,16 @@ mod tests {
     use std::future::Future;
     use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
-    use rand_core::OsRng;
-    use sgc_transport::{CredentialStore, Dialer, LinkOptions, RefusalKind, TransportMetrics};
+    use rand_chacha::ChaCha20Rng;
+    use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
+    use sgc_transport::{CredentialStore, Dialer, LinkOptions, LinkUrl, RefusalKind, TransportMetrics};
     use sgc_trust::{CertId, EnrollRequest, Fleet, Identity};
     use sgc_wire::{Hello, Label, Name, UnixMillis};
 
     use super::*;
     use crate::clock::now;
     use crate::control::control_queue::{Inbox, LINK_INBOX_BYTES_MAX};
-    use crate::discovery::{Board, Dns, WorkingUrls, keep_at};
+    use crate::discovery::{Board, DialTarget, Dns, LinkKeeper, WorkingUrls, keep_at};
     use crate::link::roaming::Network;
 
     /// Event that the test's control task reports about links.

@@ -6,4 +6,5 @@ pub(crate) mod inflow;
 pub(crate) mod lanes;
 pub(crate) mod links;
 pub(crate) mod push_crl;
+pub(crate) mod renewal;
 pub(crate) mod roaming;

@@ -1,7 +1,7 @@
 //! Changes of the network: a node learns of them from the kernel instead of waiting for a time-out.
 //!
-//! This module reports changes and decides what they mean for a link; other modules make and move links. It does not
-//! parse the kernel's messages. Their arrival is enough, because only the source address of the route to a peer
+//! This module reports changes; [`sgc_session::LinkSupervisor`] decides what they mean for a link. It does not parse the
+//! kernel's messages. Their arrival is enough, because only the source address of the route to a peer
 //! matters, and that is queried.
 
 use std::io;
@@ -17,7 +17,7 @@ use rustix::net::{AddressFamily, SocketFlags, SocketType, bind, socket_with};
 use tokio::net::UnixDatagram;
 use tokio::sync::watch;
 use tokio::time::{Instant, timeout_at};
-use tracing::{info, warn};
+use tracing::warn;
 
 /// Quiet time after which a burst of changes counts as over, and the longest wait for that.
 const QUIET: Duration = Duration::from_millis(50);
@@ -80,47 +80,6 @@ impl Network {
     }
 }
 
-/// Consequence of a change for a link that this node dialled.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Move {
-    /// The link stays, or no route exists at present.
-    Stay,
-    /// The link continues on a new socket.
-    Rebind,
-    /// The link is bound to an address that no longer reaches the peer, so another link has to replace it.
-    Redial,
-}
-
-/// Local address of a link.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Origin {
-    /// Last source address towards the peer.
-    source: Option<IpAddr>,
-    /// Whether a route to the peer exists now.
-    is_there: bool,
-}
-
-impl Origin {
-    /// Returns the origin of a link to this peer, which is up.
-    pub(crate) fn from_remote(remote: SocketAddr) -> Self {
-        let source = source_towards(remote);
-        Self { source, is_there: source.is_some() }
-    }
-
-    /// Handles a change with the present source address. Returns its consequence.
-    pub(crate) fn moves(&mut self, source: Option<IpAddr>, over_udp: bool) -> Move {
-        let came_back = !std::mem::replace(&mut self.is_there, source.is_some());
-        let before = self.source;
-        self.source = source.or(before);
-        match source {
-            None => Move::Stay,
-            Some(_) if source == before && !came_back => Move::Stay,
-            Some(_) if over_udp => Move::Rebind,
-            Some(_) => Move::Redial,
-        }
-    }
-}
-
 /// Returns the source address of packets to this peer without sending any; `None` if no route exists.
 pub(crate) fn source_towards(remote: SocketAddr) -> Option<IpAddr> {
     let any: IpAddr =
@@ -178,41 +137,11 @@ async fn take(socket: &UnixDatagram) -> io::Result<()> {
     Ok(())
 }
 
-/// Logs the consequence of a change.
-pub(crate) fn report(remote: SocketAddr, source: Option<IpAddr>, moves: Move) {
-    let source = source.map(|source| source.to_string()).unwrap_or_default();
-    match moves {
-        Move::Stay => {}
-        Move::Rebind => info!(%remote, %source, "the network changed; the link goes on from here"),
-        Move::Redial => info!(%remote, %source, "the network changed; reconnecting from here"),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     #![allow(clippy::unwrap_used)]
 
     use super::*;
-
-    #[test]
-    fn a_link_moves_when_its_source_is_another_or_came_back() {
-        let (wifi, lte) = (IpAddr::from([192, 168, 0, 7]), IpAddr::from([10, 64, 1, 1]));
-        for (over_udp, moved) in [(true, Move::Rebind), (false, Move::Redial)] {
-            let mut origin = Origin { source: Some(wifi), is_there: true };
-            let mut sees = |source| origin.moves(source, over_udp);
-            // Another interface came up.
-            assert_eq!(sees(Some(wifi)), Move::Stay);
-            assert_eq!(sees(Some(lte)), moved);
-            assert_eq!(sees(Some(lte)), Move::Stay);
-            // The route disappears, and another appears.
-            assert_eq!(sees(None), Move::Stay);
-            assert_eq!(sees(None), Move::Stay);
-            assert_eq!(sees(Some(lte)), moved);
-            assert_eq!(sees(Some(lte)), Move::Stay);
-            assert_eq!(sees(None), Move::Stay);
-            assert_eq!(sees(Some(wifi)), moved);
-        }
-    }
 
     #[test]
     fn the_source_towards_a_peer_is_known_without_a_packet() {

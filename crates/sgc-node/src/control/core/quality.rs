@@ -55,11 +55,11 @@ impl LinkEntry {
             // A full queue means that the peer takes nothing, which is detected elsewhere.
             self.control.send(Control::Probe { answers: false });
         }
-        if verdict.is_dead && self.closed_for.is_none() {
+        if verdict.is_dead() && self.closed_for.is_none() {
             info!(%remote, peer = %self.link.peer().node_id.short(), "the peer does not answer; its link is closed");
             self.closed_for = Some(CloseReason::Silent.to_string());
             self.link.close(CloseReason::Silent);
         }
-        verdict.is_silent
+        verdict.is_silent()
     }
 }
