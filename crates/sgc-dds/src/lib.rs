@@ -55,6 +55,7 @@ mod strangers;
 pub mod user_data;
 mod wait;
 mod writer;
+mod writer_inside;
 
 pub use arrivals::WAITING_BYTES_MAX;
 pub use config::{DdsConfig, DiscoveryRange};

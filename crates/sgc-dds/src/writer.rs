@@ -26,6 +26,7 @@ use crate::payload::Frame;
 use crate::qos::{SendWindow, history_of, keys_kept};
 use crate::sample::{Extra, SampleRef};
 use crate::wait::{READERS_MATCHED, wait_for_status};
+use crate::writer_inside::WriterInside;
 
 /// Latest source timestamp that RTPS can express, in nanoseconds since the Unix epoch: seconds have 32 bits (RTPS
 /// 2.5, 9.3.2.1).
@@ -330,6 +331,11 @@ impl RosWriter for CycloneWriter {
                 Ok(())
             }
         }
+    }
+
+    fn unacknowledged(&self) -> Option<u32> {
+        let inside = WriterInside::find(self.writer.handle(), self.topic.handle())?;
+        Some(u32::try_from(inside.unacknowledged()).unwrap_or(u32::MAX))
     }
 
     fn wait_acknowledged(&self, max: Duration) -> bool {

@@ -520,6 +520,12 @@ pub trait RosWriter: Send + Sync + 'static {
         None
     }
 
+    /// Returns the number of written samples that a reliable reader has not acknowledged. Returns `None` if only waiting
+    /// shows that.
+    fn unacknowledged(&self) -> Option<u32> {
+        None
+    }
+
     /// Waits until all reliable readers have acknowledged everything. Returns `false` after `max`.
     fn wait_acknowledged(&self, max: Duration) -> bool {
         let _ = max;

@@ -973,11 +973,10 @@ impl Room {
         if self.unacknowledged.load(Relaxed) < kept || self.is_in_its_time(timestamp_ns) {
             return true;
         }
-        if !writer.wait_acknowledged(Duration::ZERO) {
-            return false;
-        }
-        self.unacknowledged.store(0, Relaxed);
-        true
+        let acknowledged = || writer.wait_acknowledged(Duration::ZERO).then_some(0);
+        let Some(unacknowledged) = writer.unacknowledged().or_else(acknowledged) else { return false };
+        self.unacknowledged.store(unacknowledged, Relaxed);
+        unacknowledged < kept
     }
 
     /// Returns `true` if the time since the last write is about the publisher's interval. Readers then have the time
@@ -1013,6 +1012,9 @@ impl Burst {
     fn before_next(&mut self, writer: &impl RosWriter, is_alone: bool, bytes: usize, timestamp_ns: i64) {
         let Some(kept) = writer.kept(bytes) else { return };
         let mut unacknowledged = self.room.unacknowledged.load(Relaxed);
+        if unacknowledged >= kept {
+            unacknowledged = writer.unacknowledged().unwrap_or(unacknowledged);
+        }
         // A single sample is acknowledged, or waited for, before the next burst.
         let waits = !is_alone && self.not_before.is_none_or(|at| Instant::now() >= at);
         if waits && unacknowledged >= kept {
@@ -1051,13 +1053,20 @@ mod tests {
 
     struct Slow {
         kept: Option<u32>,
+        /// The count that it knows, if it knows one.
+        unacknowledged: Option<u32>,
         waited: AtomicUsize,
         stands_still: AtomicBool,
     }
 
     impl Slow {
         fn new(kept: Option<u32>) -> Self {
-            Self { kept, waited: AtomicUsize::new(0), stands_still: AtomicBool::new(false) }
+            Self {
+                kept,
+                unacknowledged: None,
+                waited: AtomicUsize::new(0),
+                stands_still: AtomicBool::new(false),
+            }
         }
     }
 
@@ -1069,6 +1078,10 @@ mod tests {
         fn kept(&self, bytes: usize) -> Option<u32> {
             // Half as many long messages are kept.
             self.kept.map(|kept| if bytes > 1000 { kept / 2 } else { kept })
+        }
+
+        fn unacknowledged(&self) -> Option<u32> {
+            self.unacknowledged
         }
 
         fn wait_acknowledged(&self, _: Duration) -> bool {
@@ -1102,6 +1115,15 @@ mod tests {
         writer.stands_still.store(true, Relaxed);
         (0..1000).for_each(|_| burst.before_next(&writer, false, 8, 0));
         assert!(writer.waited.load(Relaxed) <= 32, "once in a while");
+        // What was acknowledged meanwhile is not waited for.
+        let acknowledging = Slow { unacknowledged: Some(3), ..Slow::new(Some(10)) };
+        let mut burst = Burst::default();
+        (0..100).for_each(|_| burst.before_next(&acknowledging, false, 8, 0));
+        assert_eq!(acknowledging.waited.load(Relaxed), 0);
+        let lagging = Slow { unacknowledged: Some(10), ..Slow::new(Some(10)) };
+        let mut burst = Burst::default();
+        (0..11).for_each(|_| burst.before_next(&lagging, false, 8, 0));
+        assert_eq!(lagging.waited.load(Relaxed), 1);
         let (writer, mut other) = (Slow::new(None), Burst::default());
         (0..100).for_each(|_| other.before_next(&writer, false, 8, 0));
         assert_eq!(writer.waited.load(Relaxed), 0, "one that blocks by itself");
