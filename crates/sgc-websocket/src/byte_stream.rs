@@ -91,6 +91,8 @@ pub struct ByteStream<S> {
     input: BytesMut,
     expect: Expect,
     output: BytesMut,
+    /// The content of the last ping that is not answered.
+    ping: Option<BytesMut>,
     has_closed: bool,
 }
 
@@ -103,17 +105,30 @@ enum Expect {
 
 impl<S: AsyncRead + AsyncWrite + Unpin> ByteStream<S> {
     fn new(wire: S, input: BytesMut, is_dialer: bool) -> Self {
-        Self { wire, is_dialer, input, expect: Expect::Head, output: BytesMut::new(), has_closed: false }
+        Self {
+            wire,
+            is_dialer,
+            input,
+            expect: Expect::Head,
+            output: BytesMut::new(),
+            ping: None,
+            has_closed: false,
+        }
     }
 
     fn poll_output(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        while !self.output.is_empty() {
-            match ready!(Pin::new(&mut self.wire).poll_write(cx, &self.output))? {
-                0 => return Poll::Ready(Err(io::ErrorKind::WriteZero.into())),
-                n => self.output.advance(n),
+        loop {
+            while !self.output.is_empty() {
+                match ready!(Pin::new(&mut self.wire).poll_write(cx, &self.output))? {
+                    0 => return Poll::Ready(Err(io::ErrorKind::WriteZero.into())),
+                    n => self.output.advance(n),
+                }
             }
+            let Some(ping) = self.ping.take().filter(|_| !self.has_closed) else {
+                return Poll::Ready(Ok(()));
+            };
+            put_frame(&mut self.output, self.is_dialer, PONG, &ping);
         }
-        Poll::Ready(Ok(()))
     }
 
     /// Consumes input. Returns `true` if `buf` got bytes or the stream is over, `false` if more input is needed.
@@ -153,9 +168,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> ByteStream<S> {
                     let mut payload = self.input.split_to(length);
                     frame.unmask(&mut payload);
                     self.expect = if opcode == CLOSE { Expect::Ended } else { Expect::Head };
-                    // One answer is enough for all pings that came while it could not be written.
-                    if opcode == PING && self.output.is_empty() {
-                        put_frame(&mut self.output, self.is_dialer, PONG, &payload);
+                    // The last of several pings is answered, behind what is written (RFC 6455, 5.5.3).
+                    if opcode == PING {
+                        self.ping = Some(payload);
                     }
                 }
             }
@@ -262,16 +277,44 @@ mod tests {
         }
     }
 
+    /// Returns a masked frame of a few bytes.
+    fn frame(first: u8, payload: &[u8]) -> Vec<u8> {
+        let mask = [1, 2, 3, 4];
+        let mut masked = payload.to_vec();
+        apply(mask, &mut masked);
+        [&[first, 0x80 | payload.len() as u8], &mask[..], &masked].concat()
+    }
+
+    #[tokio::test]
+    async fn pings_are_answered_while_data_waits_to_be_written() {
+        let (mut raw, far) = tokio::io::duplex(1 << 10);
+        let (mut reads, mut writes) = tokio::io::split(ByteStream::new(far, BytesMut::new(), false));
+        let sent = [7; 4000];
+        let writing = async {
+            writes.write_all(&sent).await.unwrap();
+            writes.flush().await.unwrap();
+        };
+        let reading = async {
+            let mut byte = [0];
+            reads.read_exact(&mut byte).await.unwrap();
+        };
+        let peer = async {
+            // Nothing more fits into the pipe when the ping comes.
+            tokio::task::yield_now().await;
+            raw.write_all(&[frame(0x89, b"first"), frame(0x89, b"ping"), frame(0x82, b"x")].concat())
+                .await
+                .unwrap();
+            let mut got = vec![0; 4 + sent.len() + 6];
+            raw.read_exact(&mut got).await.unwrap();
+            assert_eq!(&got[4 + sent.len()..], b"\x8a\x04ping");
+        };
+        tokio::join!(writing, reading, peer);
+    }
+
     #[tokio::test]
     async fn pings_are_answered_between_fragments_of_a_message() {
         let (mut raw, far) = tokio::io::duplex(1 << 16);
         let mut far = ByteStream::new(far, BytesMut::new(), false);
-        let mask = [1, 2, 3, 4];
-        let frame = |first: u8, payload: &[u8]| {
-            let mut masked = payload.to_vec();
-            apply(mask, &mut masked);
-            [&[first, 0x80 | payload.len() as u8], &mask[..], &masked].concat()
-        };
         let stream =
             [frame(0x02, b"hel"), frame(0x89, b"ping"), frame(0x00, b""), frame(0x80, b"lo")].concat();
         for byte in stream {

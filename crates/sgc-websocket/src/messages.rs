@@ -270,6 +270,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
                     n => self.output.advance(n),
                 }
             }
+            // Room for a long message is not kept.
+            if self.output.capacity() > 2 * WRITE_BYTES {
+                self.output = BytesMut::new();
+            }
             // Answers wait until the output is empty, so that a peer that does not read takes no more memory by pings.
             let Some((opcode, payload)) = self.answer.take() else { return Poll::Ready(Ok(())) };
             put_frame(&mut self.output, false, opcode, &payload);

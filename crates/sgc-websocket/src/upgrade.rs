@@ -105,7 +105,14 @@ impl Request {
         let is_upgrade =
             fields.has_token("upgrade", "websocket") && fields.has_token("connection", "upgrade");
         match key {
-            Some(key) if is_upgrade && fields.get("sec-websocket-version") == Some("13") => Ok(key),
+            // RFC 6455, 4.2.1.
+            Some(key)
+                if is_upgrade
+                    && self.target().is_some()
+                    && fields.get("sec-websocket-version") == Some("13") =>
+            {
+                Ok(key)
+            }
             _ => {
                 let status = "426 Upgrade Required\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13";
                 refuse(stream, status, "it does not ask for WebSocket".into()).await
