@@ -38,6 +38,8 @@ pub(crate) struct GatewayNetwork {
 
 struct State {
     network: Option<Arc<dyn LocalRos>>,
+    /// `true` while the endpoints are opened again.
+    is_opening: bool,
     /// The number of openings. An endpoint of an earlier network is not kept.
     generation: u64,
     endpoints: BTreeMap<u64, Weak<dyn Endpoint>>,
@@ -117,6 +119,7 @@ impl GatewayNetwork {
     pub(crate) fn open(open: OpenLocalRos) -> Result<Arc<Self>, RosError> {
         let state = State {
             network: Some(open()?),
+            is_opening: false,
             generation: 0,
             endpoints: BTreeMap::new(),
             next: 0,
@@ -136,7 +139,7 @@ impl GatewayNetwork {
 
     /// Returns the open network and its generation. Waits for it.
     fn present(&self) -> Result<(Arc<dyn LocalRos>, u64), RosError> {
-        let is_closed = |state: &mut State| state.network.is_none();
+        let is_closed = |state: &mut State| state.network.is_none() || state.is_opening;
         let (state, _) = self
             .opened
             .wait_timeout_while(self.lock(), OPEN_WAIT_MAX, is_closed)
@@ -168,6 +171,7 @@ impl GatewayNetwork {
     pub(crate) fn close_for_now(&self, max: Duration) {
         let mut state = self.lock();
         let Some(network) = state.network.take() else { return };
+        state.is_opening = false;
         let endpoints: Vec<_> = state.endpoints.values().filter_map(Weak::upgrade).collect();
         drop(state);
         {
@@ -191,6 +195,7 @@ impl GatewayNetwork {
         let (endpoints, generation) = {
             let mut state = self.lock();
             state.generation += 1;
+            state.is_opening = true;
             state.network = Some(Arc::clone(&network));
             let endpoints: Vec<_> = state.endpoints.values().filter_map(Weak::upgrade).collect();
             (endpoints, state.generation)
@@ -201,11 +206,15 @@ impl GatewayNetwork {
             discovery.is_closed = false;
             discovery.rediscovery.opened(Instant::now());
         }
-        for endpoint in endpoints {
-            if let Err(error) = endpoint.open(&*network) {
+        let fails = |endpoint: &Arc<dyn Endpoint>| endpoint.open(&*network).err();
+        let failed: Vec<_> = endpoints.into_iter().filter(|endpoint| fails(endpoint).is_some()).collect();
+        for endpoint in failed {
+            // Once more, now that the others are open.
+            if let Some(error) = fails(&endpoint) {
                 tracing::warn!(%error, "an endpoint of the gateway could not be opened again");
             }
         }
+        self.lock().is_opening = false;
         self.opened.notify_all();
         if lock(&self.discovery).handler.is_some() {
             self.discover_on(&*network, generation)?;
@@ -438,6 +447,16 @@ impl Writer {
         }
         self.present()
     }
+
+    /// Forgets a message that was not written, since its publisher is told so.
+    fn forget(&self, payload: &Bytes) {
+        let mut kept = lock(&self.kept);
+        let is_it = |(_, kept): &(SampleHead, Bytes)| kept.as_ptr() == payload.as_ptr();
+        if let Some(at) = kept.messages.iter().rposition(is_it) {
+            kept.messages.remove(at);
+            kept.bytes -= payload.len();
+        }
+    }
 }
 
 impl Endpoint for Writer {
@@ -448,12 +467,14 @@ impl Endpoint for Writer {
     fn open(&self, network: &dyn LocalRos) -> Result<(), RosError> {
         let writer: Arc<dyn RosWriter> = Arc::from(network.writer(&self.spec)?);
         let guid = writer.guid();
+        // New messages wait for the lock, so they are written after the kept ones.
         let kept = lock(&self.kept);
-        for (head, payload) in &kept.messages {
-            writer.write_ahead(*head, payload.clone())?;
+        lock(&self.present).set(Arc::clone(&writer), [guid]);
+        let written = kept.messages.iter().map(|(head, payload)| writer.write_ahead(*head, payload.clone()));
+        if let Some(error) = written.filter_map(Result::err).last() {
+            tracing::warn!(%error, topic = self.spec.topic, "messages for late subscribers were not written again");
         }
         writer.flush();
-        lock(&self.present).set(writer, [guid]);
         Ok(())
     }
 
@@ -468,7 +489,12 @@ impl RosWriter for WriterHandle {
     fn write_ahead(&self, head: SampleHead, payload: Bytes) -> Result<(), RosError> {
         let writer = &self.0.endpoint;
         if writer.kept_max > 0 {
-            return writer.keep(head, &payload).map_or(Ok(()), |present| present.write_ahead(head, payload));
+            let Some(present) = writer.keep(head, &payload) else { return Ok(()) };
+            let written = present.write_ahead(head, payload.clone());
+            if written.is_err() {
+                writer.forget(&payload);
+            }
+            return written;
         }
         writer.present().ok_or(RosError::Closed)?.write_ahead(head, payload)
     }
