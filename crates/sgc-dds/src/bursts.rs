@@ -2,9 +2,10 @@
 //!
 //! Cyclone sends the fragments of a message without a pause. A ROS 2 subscriber has a receive buffer of the kernel's
 //! default size (`net.core.rmem_default`, 208 KiB), which holds some twelve fragments, so of a megabyte it would lose
-//! half and ask for it after the next heartbeat. A pause lets the subscriber's thread empty its buffer. The writer holds
-//! no lock meanwhile: `transmit_sample_lgmsg_unlocks_wr` of the Cyclone that `cyclors` =0.4.0 builds sends fragments
-//! outside of it.
+//! half and ask for it after the next heartbeat. A pause lets the subscriber's thread empty its buffer. Meanwhile the
+//! lock under which acknowledgements are handled is free: `transmit_sample_lgmsg_unlocks_wr` of the Cyclone that
+//! `cyclors` =0.4.0 builds sends fragments outside of it. Others of the same writer wait, as they do for each long
+//! message.
 
 use std::cell::Cell;
 use std::thread;
@@ -24,17 +25,25 @@ thread_local! {
     static BURST: Cell<Option<Burst>> = const { Cell::new(None) };
 }
 
-/// The bytes that may still be sent before a pause.
+/// The address and port of a receiver.
+pub(crate) type Receiver = ([u8; 16], u32);
+
+/// The bytes that may still be sent before a pause. Each fragment goes to all receivers in turn, so the packets to the
+/// first one count for all.
 #[derive(Clone, Copy, Debug)]
 struct Burst {
     left: usize,
+    first: Option<Receiver>,
 }
 
 impl Burst {
-    const BEGUN: Self = Self { left: BURST_BYTES };
+    const BEGUN: Self = Self { left: BURST_BYTES, first: None };
 
     /// Records a packet of this length. Returns `true` if a pause is due before it.
-    fn send(&mut self, bytes: usize) -> bool {
+    fn send(&mut self, to: Receiver, bytes: usize) -> bool {
+        if *self.first.get_or_insert(to) != to {
+            return false;
+        }
         let is_over = bytes > self.left;
         let left = if is_over { BURST_BYTES } else { self.left };
         self.left = left.saturating_sub(bytes);
@@ -68,9 +77,9 @@ pub(crate) fn is_bursting() -> bool {
 }
 
 /// Pauses before a packet of this length if the burst of this thread is over.
-pub(crate) fn before_packet(bytes: usize) {
+pub(crate) fn before_packet(to: Receiver, bytes: usize) {
     let Some(mut burst) = BURST.get() else { return };
-    let is_over = burst.send(bytes);
+    let is_over = burst.send(to, bytes);
     BURST.set(Some(burst));
     if is_over {
         thread::sleep(PAUSE);
@@ -85,10 +94,17 @@ mod tests {
     fn a_pause_is_due_whenever_a_burst_is_full() {
         let fragment = FRAGMENT_BYTES as usize;
         let mut burst = Burst::BEGUN;
-        let due: Vec<usize> = (0..30).filter(|_| burst.send(fragment)).collect();
+        let [first, second] = [1, 2].map(|last| ([last; 16], 7410));
+        let due: Vec<usize> = (0..30)
+            .filter(|_| {
+                let is_due = burst.send(first, fragment);
+                assert!(!burst.send(second, fragment), "packets to others come with those to the first");
+                is_due
+            })
+            .collect();
         assert_eq!(due, [8, 16, 24]);
         // A packet longer than a burst is sent after a pause, and alone.
-        assert_eq!([1, BURST_BYTES + 1, 1].map(|bytes| burst.send(bytes)), [false, true, true]);
+        assert_eq!([1, BURST_BYTES + 1, 1].map(|bytes| burst.send(first, bytes)), [false, true, true]);
     }
 
     #[test]

@@ -379,7 +379,7 @@ unsafe extern "C" fn write(
         } else {
             let packet = Packet { pieces: std::slice::from_raw_parts(pieces, count) };
             if bursts::is_bursting() {
-                bursts::before_packet(packet.length());
+                bursts::before_packet(((*to).address, (*to).port), packet.length());
             }
             otherwise(connection as usize, &*to, &packet).map(|sent| (sent, packet.length()))
         }

@@ -1019,8 +1019,11 @@ impl Burst {
         let waits = !is_alone && self.not_before.is_none_or(|at| Instant::now() >= at);
         if waits && unacknowledged >= kept {
             let acknowledged = writer.wait_acknowledged(ACKNOWLEDGED_WAIT_MAX);
-            self.not_before = (!acknowledged).then(|| Instant::now() + STALLED_READER_PAUSE);
-            unacknowledged = 0;
+            // A slow reader that acknowledged some is not stalled.
+            let left = writer.unacknowledged().filter(|_| !acknowledged);
+            let is_stalled = !acknowledged && left.is_none_or(|left| left >= kept);
+            self.not_before = is_stalled.then(|| Instant::now() + STALLED_READER_PAUSE);
+            unacknowledged = left.unwrap_or(0);
         }
         self.room.unacknowledged.store(unacknowledged.saturating_add(1), Relaxed);
         *self.room.last() = Some((Instant::now(), timestamp_ns));
@@ -1053,8 +1056,8 @@ mod tests {
 
     struct Slow {
         kept: Option<u32>,
-        /// The count that it knows, if it knows one.
-        unacknowledged: Option<u32>,
+        /// The count that it knows, if it knows one, before and after a wait.
+        unacknowledged: [Option<u32>; 2],
         waited: AtomicUsize,
         stands_still: AtomicBool,
     }
@@ -1063,7 +1066,7 @@ mod tests {
         fn new(kept: Option<u32>) -> Self {
             Self {
                 kept,
-                unacknowledged: None,
+                unacknowledged: [None; 2],
                 waited: AtomicUsize::new(0),
                 stands_still: AtomicBool::new(false),
             }
@@ -1081,7 +1084,8 @@ mod tests {
         }
 
         fn unacknowledged(&self) -> Option<u32> {
-            self.unacknowledged
+            let [before, after] = self.unacknowledged;
+            if self.waited.load(Relaxed) == 0 { before } else { after }
         }
 
         fn wait_acknowledged(&self, _: Duration) -> bool {
@@ -1116,14 +1120,19 @@ mod tests {
         (0..1000).for_each(|_| burst.before_next(&writer, false, 8, 0));
         assert!(writer.waited.load(Relaxed) <= 32, "once in a while");
         // What was acknowledged meanwhile is not waited for.
-        let acknowledging = Slow { unacknowledged: Some(3), ..Slow::new(Some(10)) };
+        let acknowledging = Slow { unacknowledged: [Some(3); 2], ..Slow::new(Some(10)) };
         let mut burst = Burst::default();
         (0..100).for_each(|_| burst.before_next(&acknowledging, false, 8, 0));
         assert_eq!(acknowledging.waited.load(Relaxed), 0);
-        let lagging = Slow { unacknowledged: Some(10), ..Slow::new(Some(10)) };
-        let mut burst = Burst::default();
-        (0..11).for_each(|_| burst.before_next(&lagging, false, 8, 0));
-        assert_eq!(lagging.waited.load(Relaxed), 1);
+        // A reader that acknowledged some in the longest wait is slow, and not stalled.
+        for (after, is_stalled) in [(4, false), (10, true)] {
+            let lagging = Slow { unacknowledged: [Some(10), Some(after)], ..Slow::new(Some(10)) };
+            lagging.stands_still.store(true, Relaxed);
+            let mut burst = Burst::default();
+            (0..11).for_each(|_| burst.before_next(&lagging, false, 8, 0));
+            assert_eq!((lagging.waited.load(Relaxed), burst.not_before.is_some()), (1, is_stalled));
+            assert_eq!(burst.room.unacknowledged.load(Relaxed), after + 1);
+        }
         let (writer, mut other) = (Slow::new(None), Burst::default());
         (0..100).for_each(|_| other.before_next(&writer, false, 8, 0));
         assert_eq!(writer.waited.load(Relaxed), 0, "one that blocks by itself");
