@@ -462,7 +462,7 @@ fn samples_that_readers_have_acknowledged_are_not_counted() {
         let head = SampleHead::new(SampleKind::Write, 1_000_000_000);
         writer.write_ahead(head, string_cdr(text)).unwrap();
     };
-    // What has not left cannot be acknowledged.
+    // Unsent samples cannot be acknowledged.
     (0..5).for_each(|i| ahead(&i.to_string()));
     assert_eq!(writer.unacknowledged(), Some(5));
     assert!(writer.wait_acknowledged(PATIENCE));

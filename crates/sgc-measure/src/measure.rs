@@ -63,7 +63,7 @@ const TCP_PIECE_BYTES: usize = 64 << 10;
 /// Most sizes in one run.
 const SIZES_MAX: usize = 16;
 
-/// What a side measures, and with whom.
+/// The measurement of one side, and its peer.
 #[derive(Clone, Debug)]
 pub struct MeasureOptions {
     /// Identity file of a node, other than the answering one's.

@@ -82,7 +82,7 @@ pub struct LinkObservation<'a> {
 pub struct Verdict {
     /// The peer is to be probed now.
     pub asks: bool,
-    /// What its silence means.
+    /// The meaning of its silence.
     pub peer: PeerState,
 }
 
@@ -110,7 +110,7 @@ pub enum PeerState {
     Dead,
 }
 
-/// What the link waits for.
+/// The event for which the link waits.
 #[derive(Clone, Copy, Debug)]
 enum Waiting {
     /// For the time of the next probe.

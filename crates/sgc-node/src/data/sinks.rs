@@ -1119,7 +1119,7 @@ mod tests {
         writer.stands_still.store(true, Relaxed);
         (0..1000).for_each(|_| burst.before_next(&writer, false, 8, 0));
         assert!(writer.waited.load(Relaxed) <= 32, "once in a while");
-        // What was acknowledged meanwhile is not waited for.
+        // A burst does not wait for samples that were acknowledged meanwhile.
         let acknowledging = Slow { unacknowledged: [Some(3); 2], ..Slow::new(Some(10)) };
         let mut burst = Burst::default();
         (0..100).for_each(|_| burst.before_next(&acknowledging, false, 8, 0));

@@ -796,7 +796,7 @@ mod tests {
         let kept = [maps.recv_timeout(PATIENCE).unwrap(), maps.recv_timeout(PATIENCE).unwrap()];
         assert_eq!(kept, [string("before"), string("meanwhile")]);
 
-        // What was found again was never gone; what was not found is gone after a while.
+        // Endpoints that were found again were never gone; the others are gone after a while.
         assert_eq!((site.publishers("/chatter"), site.publishers("/gone")), (1, 1));
         site.network.rediscovery_due(Instant::now() + REDISCOVERY_HOLD);
         assert_eq!((site.publishers("/chatter"), site.publishers("/gone")), (1, 0));
