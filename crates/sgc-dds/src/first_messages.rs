@@ -16,6 +16,8 @@
 //!   of Fast DDS do. Fast DDS answers that at once. It answers an ACKNACK of base 1, which is Cyclone's first, with its
 //!   next periodic heartbeat, after up to three seconds.
 //!
+//! Discovered writers are also reported to [`manual_leases`], and discovered readers to [`late_readers`].
+//!
 //! This needs structs and functions of the C code of `cyclors` =0.4.0: `CYCLORS` in `sample.rs`. Each struct is
 //! compared with its expected content at that moment, and everything is left alone if it differs.
 
@@ -34,6 +36,7 @@ use cyclors::{
 
 use crate::entity::{Entity, check};
 use crate::identity::FAST_DDS;
+use crate::late_readers::{self, ProxyReaderState};
 use crate::manual_leases::{self, Lease};
 
 /// Delays after a match with which a reader asks for a heartbeat, in nanoseconds. Cyclone reports the match a few
@@ -45,8 +48,9 @@ const ASK_DELAYS_NS: [i64; 2] = [1_000_000, 50_000_000];
 /// Bytes of `struct dds_domain` before the structs that are examined here; there are some 600.
 const DOMAIN_HEAD_BYTES_MAX: usize = 4096;
 
-/// `DDSI_EK_PROXY_WRITER` (`ddsi_entity.h`).
+/// `DDSI_EK_PROXY_WRITER` and `DDSI_EK_PROXY_READER` (`ddsi_entity.h`).
 const PROXY_WRITER: c_int = 4;
+const PROXY_READER: c_int = 6;
 
 /// The bits of an entity id that mark endpoints of discovery and of vendors (RTPS 2.5, 9.3.1.2).
 const NOT_OF_USERS: u32 = 0xc0;
@@ -113,9 +117,10 @@ struct Locator {
     connection: *const c_void,
 }
 
-/// The part of `struct ddsi_proxy_writer` (`ddsi_proxy_endpoint.h`) that is the same with and without security.
+/// The part of `struct ddsi_generic_proxy_endpoint` (`ddsi_proxy_endpoint.h`) that is the same with and without
+/// security.
 #[repr(C)]
-struct ProxyWriter {
+struct ProxyEndpoint {
     common: EntityCommon,
     participant: *const c_void,
     next: *const c_void,
@@ -129,7 +134,7 @@ struct ProxyWriter {
     type_pair: *const c_void,
 }
 
-/// The used part of the rest of that struct.
+/// The used part of the rest of `struct ddsi_proxy_writer`.
 #[repr(C)]
 struct ProxyWriterState {
     readers: *const c_void,
@@ -289,8 +294,11 @@ unsafe extern "C" fn endpoint_changed(
         DISCOVERED.set(unsafe { discover(entity, domain) });
     } else {
         // SAFETY: every entity begins with these.
-        let (gv, guid) = unsafe { ((*entity).gv, (*entity).guid) };
-        manual_leases::forget(gv, guid);
+        let (kind, gv, guid) = unsafe { ((*entity).kind, (*entity).gv, (*entity).guid) };
+        match kind {
+            PROXY_READER => late_readers::forget(entity.cast()),
+            _ => manual_leases::forget(gv, guid),
+        }
     }
     let original = WRITE_ENDPOINT.load(Ordering::Acquire);
     if !original.is_null() {
@@ -299,8 +307,8 @@ unsafe extern "C" fn endpoint_changed(
     }
 }
 
-/// Keeps the lease of a new reliable writer if necessary. Returns the writer if it is one of Fast DDS, whose first
-/// heartbeat then skips nothing.
+/// Keeps the lease of a new reliable writer if necessary, and spares a new reader old samples. Returns the writer if it
+/// is one of Fast DDS, whose first heartbeat then skips nothing.
 ///
 /// # Safety
 /// `entity` must be a `struct ddsi_entity_common` that may be written to, `domain` the `struct dds_domain` that it belongs to.
@@ -308,22 +316,29 @@ unsafe fn discover(entity: *const EntityCommon, domain: *mut c_void) -> Option<N
     // SAFETY: valid by contract, and every entity begins with these.
     let (kind, guid, gv) = unsafe { ((*entity).kind, (*entity).guid, (*entity).gv) };
     let is_of_domain = (gv as usize).wrapping_sub(domain as usize) <= DOMAIN_HEAD_BYTES_MAX;
-    if kind != PROXY_WRITER || guid[3] & NOT_OF_USERS != 0 || !is_of_domain || cfg!(target_endian = "big") {
+    if guid[3] & NOT_OF_USERS != 0 || !is_of_domain || cfg!(target_endian = "big") {
         return None;
     }
-    let writer = entity.cast::<ProxyWriter>();
-    // SAFETY: this kind of entity is one, and the fields in front were where they should be.
+    if !matches!(kind, PROXY_WRITER | PROXY_READER) {
+        return None;
+    }
+    let endpoint = entity.cast::<ProxyEndpoint>();
+    // SAFETY: these kinds of entities are endpoints, and the fields in front were where they should be.
     let (vendor, qos, unicast, instance) =
-        unsafe { ((*writer).vendor, (*writer).qos, (*writer).unicast, (*writer).common.instance) };
+        unsafe { ((*endpoint).vendor, (*endpoint).qos, (*endpoint).unicast, (*endpoint).common.instance) };
     if qos.is_null() {
         return None;
     }
-    let state = SECURITY_BYTES.into_iter().find_map(|security| {
-        // SAFETY: either place is inside of the struct, which is longer by another two pointers at least.
-        let state = unsafe { writer.add(1).byte_add(security) }.cast::<ProxyWriterState>().cast_mut();
-        // SAFETY: as above.
-        unsafe { is_new_and_reliable(&*state) }.then_some(state)
-    })?;
+    if kind == PROXY_READER {
+        // SAFETY: the reader is new, and the places are inside of its struct.
+        unsafe {
+            let state = state_of(endpoint, |state: &ProxyReaderState| state.is_new());
+            late_readers::spare(gv, entity.cast(), vendor, qos, state);
+        }
+        return None;
+    }
+    // SAFETY: the places are inside of the struct.
+    let state = unsafe { state_of(endpoint, is_new_and_reliable) }?;
     // SAFETY: the writer is new, as was just seen, and its lease and QoS live as long as it does.
     unsafe { manual_leases::keep(gv, guid, entity.cast(), qos, (*state).lease) };
     if vendor != FAST_DDS {
@@ -339,6 +354,19 @@ unsafe fn discover(entity: *const EntityCommon, domain: *mut c_void) -> Option<N
     // SAFETY: as above.
     let events = unsafe { (*state).events };
     Some(NewWriter { instance, guid, unicast, events })
+}
+
+/// Returns the place of the rest of an endpoint's struct: the first of the possible ones whose content is as expected.
+///
+/// # Safety
+/// The struct of the endpoint must be at least as long as the rest at its last possible place.
+unsafe fn state_of<T>(endpoint: *const ProxyEndpoint, is_expected: impl Fn(&T) -> bool) -> Option<*mut T> {
+    SECURITY_BYTES.into_iter().find_map(|security| {
+        // SAFETY: inside of the struct by contract.
+        let state = unsafe { endpoint.add(1).byte_add(security) }.cast::<T>().cast_mut();
+        // SAFETY: as above; any content is a valid value.
+        unsafe { is_expected(&*state) }.then_some(state)
+    })
 }
 
 /// Returns `true` for exactly the state that `ddsi_new_proxy_writer` writes for a reliable writer.

@@ -36,6 +36,7 @@ mod inline_qos;
 mod intake;
 mod known_writers;
 mod late;
+mod late_readers;
 mod log;
 mod manual_leases;
 mod network;

@@ -20,6 +20,7 @@ use crate::config::DdsConfig;
 use crate::domain::Domain;
 use crate::entity::{Entity, check};
 use crate::first_messages;
+use crate::late_readers::LateReaders;
 use crate::log;
 use crate::manual_leases::Leases;
 use crate::pace::Pace;
@@ -42,6 +43,8 @@ pub(crate) struct Participant {
     domain: Entity,
     /// The watch of writers' leases, if there is one. Ends after the domain.
     leases: Option<Leases>,
+    /// After the domain too.
+    _late_readers: Option<LateReaders>,
     guid: Guid,
     tag: Option<String>,
     security: Option<Security>,
@@ -89,6 +92,7 @@ impl Participant {
             entity,
             same_host: same_host.ok(),
             domain: domain.entity,
+            _late_readers: inside.as_ref().ok().copied().map(LateReaders),
             leases: inside.ok().map(Leases),
             guid,
             tag: config.tag.clone(),

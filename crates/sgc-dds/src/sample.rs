@@ -42,8 +42,8 @@ use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
 /// below. To be done then, in `cyclonedds/src/core/ddsi/src`: compare `struct ddsi_xmsg` and `struct ddsi_xmsg_marker`
 /// (`ddsi_xmsg.c`, `ddsi__xmsg.h`), `struct ddsi_rdata` and `struct ddsi_rmsg` (`ddsi_radmin.h`), `struct ddsi_sertype_plist`
 /// (`ddsi__serdata_plist.h`) and the users of `ddsi_serdata_ops_plist`, the callers of `ddsi_serdata_to_ser_ref`, and the functions
-/// declared below, with the text here and in `inline_qos.rs`, `announced.rs` and `fragments.rs`; all that `first_messages.rs` and
-/// `same_host.rs` name; `domainId` and its readers (`plugin_domain.rs`); and in `cyclonedds/src/core/ddsc/src` the structures that `late.rs` names.
+/// declared below, with the text here and in `inline_qos.rs`, `announced.rs` and `fragments.rs`; all that `first_messages.rs`,
+/// `late_readers.rs` and `same_host.rs` name; `domainId` and its readers (`plugin_domain.rs`); and in `cyclonedds/src/core/ddsc/src` the structures that `late.rs` names.
 const CYCLORS: &str = "\ncyclors = \"=0.4.0\"\n";
 
 const _: () = assert!(
@@ -131,6 +131,8 @@ struct Content {
     extra: Extra,
     /// The properties of the received message.
     origin: Option<Origin>,
+    /// The number of discoveries that [`count_discovery`] had counted when the sample was made.
+    discoveries: u64,
 }
 
 /// A reference to a sample of SGC's sertype.
@@ -326,6 +328,26 @@ pub fn unidentified_messages() -> u64 {
 
 static UNIDENTIFIED: AtomicU64 = AtomicU64::new(0);
 
+/// Discoveries of late readers in this process.
+static DISCOVERIES: AtomicU64 = AtomicU64::new(0);
+
+/// Counts a discovery. Samples that are made from here on know of it. Returns its number, from 1.
+pub(crate) fn count_discovery() -> u64 {
+    DISCOVERIES.fetch_add(1, Ordering::AcqRel) + 1
+}
+
+/// Returns how many discoveries were counted before a sample was made; `None` for a sample of another sertype.
+///
+/// # Safety
+/// `sample` must be valid.
+pub(crate) unsafe fn discoveries_before(sample: *const ddsi_serdata) -> Option<u64> {
+    // SAFETY: by contract; a sample with this table is of the sertype made here.
+    unsafe {
+        let is_ours = std::ptr::eq((*sample).ops, &SERDATA.0);
+        is_ours.then(|| (*sample.cast::<Content>()).discoveries)
+    }
+}
+
 // A function of Cyclone that `cyclors` has no binding for. `ddsi_serdata.h`.
 #[allow(improper_ctypes)]
 unsafe extern "C" {
@@ -360,6 +382,7 @@ impl Content {
                 shared: None,
                 extra: Extra::default(),
                 origin: None,
+                discoveries: DISCOVERIES.load(Ordering::Acquire),
             });
             ddsi_serdata_init(&raw mut (*sample).common, sertype, ddsi_serdata_kind_SDK_DATA);
             (*sample).common.hash = 0;

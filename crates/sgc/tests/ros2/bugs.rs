@@ -50,6 +50,46 @@ fn subscriber_hears_each_message_once_however_often_publisher_and_nodes_restart(
     }
 }
 
+/// A subscriber that is killed acknowledges nothing more, and Fast DDS asks a writer for all that it still keeps.
+#[test]
+fn late_subscriber_hears_nothing_from_before_it_joined_after_another_was_killed() {
+    const EARLY: u64 = 30;
+    const LATER: u64 = 10;
+    let lab = Lab::real(PLAN, robot_to_desk("topic", PAIRS.map(|[talks, _]| format!("/late_{talks}"))));
+    for [talks, listens] in PAIRS {
+        let topic = format!("/late_{talks}");
+        let of = ["--topic", &topic];
+        let hear =
+            || start(&lab, Site::Desk, listens, "events.py", &[&["sub", "--depth", "100"], &of[..]].concat());
+        let subscribers = |number: u32| {
+            let text = format!("Subscribers on the local network: {number}");
+            eventually(&text, || lab.asked(Site::Desk, &["topic", "info", &topic]).contains(&text));
+        };
+        let early = hear();
+        subscribers(1);
+        early.signal(Signal::KILL);
+        // The first one finds the subscriber that `sgc` stands for.
+        let args = ["pub", "--rate", "50", "--count", "1"];
+        let mut talker = start(&lab, Site::Robot, talks, "events.py", &[&args, &of[..]].concat());
+        talker.wait("a subscriber", |e| e["event"] == "matched");
+        talker.tell(&(EARLY - 1).to_string());
+        eventually("the early messages are written", || {
+            let routes = lab.status(Site::Desk)["routes"].take();
+            routes
+                .as_array()
+                .unwrap()
+                .iter()
+                .any(|r| r["topic"] == *topic && count(r, "messages") >= EARLY - 1)
+        });
+        let mut late = hear();
+        // The killed one counts until its lease ends.
+        subscribers(2);
+        talker.tell(&LATER.to_string());
+        let first = late.wait("a message", |e| e["event"] == "received");
+        assert_eq!(count(&first, "seq"), EARLY, "{talks} to {listens}");
+    }
+}
+
 /// eclipse-zenoh/zenoh-plugin-ros2dds #712: a program that makes and destroys subscriptions costs the bridge gigabytes.
 #[test]
 fn subscriptions_that_come_and_go_leave_no_memory_behind() {
