@@ -22,7 +22,9 @@ use cyclors::{
     dds_get_matched_publication_data, dds_get_matched_publications, dds_get_matched_subscription_data,
     dds_get_matched_subscriptions, dds_instance_handle_t, dds_set_status_mask, dds_take_status,
 };
-use sgc_ros::{Guid, RequestHandler, RequestId, RosClient, RosError, RosServer, ServiceSpec, UnhandledCall};
+use sgc_ros::{
+    Guid, RequestHandler, RequestId, RosClient, RosError, RosServer, SentRequest, ServiceSpec, UnhandledCall,
+};
 
 use crate::entity::check;
 use crate::identity::{Mapping, NUMBER_UNKNOWN, SampleIdentity};
@@ -131,11 +133,10 @@ impl CycloneClient {
         Ok(Self { ends, id, mixed, last_in_body })
     }
 
-    /// Returns the mapping that servers expect. Every reader of requests counts, even if it cannot answer yet,
-    /// because only one mapping can be used and a reader of the other one would read an id as part of the request. In
-    /// a mix it is that of the others, which Cyclone's servers skip.
-    fn mapping(&self) -> Mapping {
-        let readers = self.ends.readers();
+    /// Returns the mapping that servers with these readers expect. Every reader of requests counts, even if it cannot
+    /// answer yet, because only one mapping can be used and a reader of the other one would read an id as part of the
+    /// request. In a mix it is that of the others, which Cyclone's servers skip.
+    fn mapping_for(&self, readers: &BTreeSet<Guid>) -> Mapping {
         let inline = readers.iter().filter(|r| Mapping::for_vendor(r.vendor()) == Mapping::InlineQos).count();
         let is_mixed = inline > 0 && inline < readers.len();
         if self.mixed.swap(is_mixed, Relaxed) != is_mixed && is_mixed {
@@ -148,9 +149,11 @@ impl CycloneClient {
 }
 
 impl RosClient for CycloneClient {
-    fn request(&self, payload: Bytes) -> Result<RequestId, RosError> {
+    fn send(&self, payload: Bytes) -> Result<SentRequest, RosError> {
         self.ends.wait(|| self.matched_servers() > 0)?;
-        let number = match self.mapping() {
+        // A reader that is matched after the request was written does not get it.
+        let readers = self.ends.readers();
+        let number = match self.mapping_for(&readers) {
             Mapping::Body => self.ends.writer.write(None, |number| {
                 self.last_in_body.store(number, Relaxed);
                 Frame::with_prefix(&payload, |little| prefix(self.id, number, little))
@@ -161,7 +164,8 @@ impl RosClient for CycloneClient {
                 self.ends.writer.write(Some(related), |_| Frame::new(&payload))?
             }
         };
-        Ok(RequestId { client: id_bytes(self.id), number, asker: None })
+        let id = RequestId { client: id_bytes(self.id), number, asker: None };
+        Ok(SentRequest { id, servers: &self.servers() & &readers })
     }
 
     fn servers(&self) -> BTreeSet<Guid> {

@@ -235,6 +235,28 @@ fn call_asked_of_a_server_that_was_replaced_is_counted_at_both_ends() {
 }
 
 #[test]
+fn server_that_starts_while_another_takes_a_call_was_not_asked() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let (_cloud, robot, desk) = (lab.cloud(), robot(&lab, &["desk"]), caller(&lab, "desk"));
+    let (net, domain) = (lab.net("robot").join(false), lab.net("robot"));
+    let (tx, started) = channel();
+    // The second server appears before the owner's client knows that its request was sent.
+    let handler = Box::new(move |_, _| drop(tx.send(Server::new(&domain, "/add"))));
+    let first = net.create_server(&service("/add"), handler).unwrap();
+    let client = Client::new(&lab.net("desk"), "/add");
+    client.calls("lost");
+    let second = started.recv_timeout(PATIENCE).expect("a second server");
+    drop(first);
+    for node in [&robot, &desk] {
+        wait("it is counted", || node.status()["drops"]["call_server_gone"] == 1);
+    }
+    let call = client.calls("new");
+    second.answers(&second.takes(), 1);
+    client.is_answered(call, "new", 1);
+    client.hears_nothing();
+}
+
+#[test]
 fn call_that_waits_when_its_service_ends_is_counted_and_stays_so() {
     let lab = Lab::new(&["robot", "desk"]);
     let (_cloud, _robot, desk) = (lab.cloud(), robot(&lab, &["desk"]), caller(&lab, "desk"));

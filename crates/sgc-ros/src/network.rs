@@ -238,6 +238,16 @@ pub struct RequestId {
     pub asker: Option<Guid>,
 }
 
+/// A request that a client sent.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SentRequest {
+    /// The id under which the reply comes.
+    pub id: RequestId,
+    /// The request readers of the servers that got the request. A server that appears after the request was written is
+    /// not among them, even if it appears before the sender returns.
+    pub servers: BTreeSet<Guid>,
+}
+
 /// Both topics of a service, at its client or at its server.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ServiceSpec {
@@ -285,10 +295,14 @@ pub type RequestHandler = Box<dyn HandleCalls>;
 pub trait RosClient: Send + Sync + 'static {
     /// Sends a request. The handler gets the reply under the returned id, possibly before this function returns.
     /// Waits briefly for a server, and fails with [`RosError::NoPeer`] if there is none.
-    fn request(&self, payload: Bytes) -> Result<RequestId, RosError>;
+    fn send(&self, payload: Bytes) -> Result<SentRequest, RosError>;
 
-    /// Returns the request readers of the current servers. A request reaches only servers that exist before it is
-    /// sent.
+    /// Sends a request as [`Self::send`] does, and returns its id.
+    fn request(&self, payload: Bytes) -> Result<RequestId, RosError> {
+        self.send(payload).map(|sent| sent.id)
+    }
+
+    /// Returns the request readers of the current servers.
     fn servers(&self) -> BTreeSet<Guid>;
 
     /// Returns the current number of servers.

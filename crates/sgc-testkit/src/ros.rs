@@ -13,7 +13,7 @@ use bytes::{BufMut, Bytes, BytesMut};
 use sgc_ros::{
     DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, GraphNode, Guid, Reach,
     RequestHandler, RequestId, RosClient, RosError, RosNetwork, RosServer, RosWriter, Sample, SampleHandler,
-    SampleHead, SampleKind, ServiceSpec, ShownEndpoint,
+    SampleHead, SampleKind, SentRequest, ServiceSpec, ShownEndpoint,
 };
 use sgc_sync::lock;
 use sgc_wire::{History, Qos};
@@ -355,10 +355,10 @@ impl RosNetwork for FakeRos {
 }
 
 impl RosClient for FakeClient {
-    fn request(&self, payload: Bytes) -> Result<RequestId, RosError> {
+    fn send(&self, payload: Bytes) -> Result<SentRequest, RosError> {
         let id = RequestId { client: self.client, number: self.next.fetch_add(1, Relaxed), asker: None };
-        self.requests.write_with(&id, &payload)?;
-        Ok(id)
+        let servers = self.requests.write_with(&id, &payload)?;
+        Ok(SentRequest { id, servers })
     }
 
     fn servers(&self) -> BTreeSet<Guid> {
@@ -372,7 +372,7 @@ impl RosClient for FakeClient {
 
 impl RosServer for FakeServer {
     fn reply(&self, request: &RequestId, payload: Bytes) -> Result<(), RosError> {
-        self.replies.write_with(request, &payload)
+        self.replies.write_with(request, &payload).map(drop)
     }
 
     fn guids(&self) -> [Guid; 2] {
@@ -436,8 +436,8 @@ impl FakeWriter {
         matched.map(|r| r.discovered.guid).collect()
     }
 
-    /// Writes a request or a reply once a reader is there.
-    fn write_with(&self, id: &RequestId, payload: &Bytes) -> Result<(), RosError> {
+    /// Writes a request or a reply once a reader is there. Returns the readers that got it.
+    fn write_with(&self, id: &RequestId, payload: &Bytes) -> Result<BTreeSet<Guid>, RosError> {
         let Some((header, body)) = payload.split_first_chunk::<HEADER_BYTES>() else {
             return Err(RosError::Payload { bytes: payload.len() });
         };
@@ -447,20 +447,20 @@ impl FakeWriter {
         sample.put_slice(body);
         for _ in 0..PEER_LOOKS {
             if self.matched_readers() > 0 {
-                self.give(SampleHead::new(SampleKind::Write, 1), sample.freeze(), false);
-                return Ok(());
+                return Ok(self.give(SampleHead::new(SampleKind::Write, 1), sample.freeze(), false));
             }
             std::thread::sleep(Duration::from_millis(PEER_LOOK_MS));
         }
         Err(RosError::NoPeer { waited_ms: PEER_LOOKS * PEER_LOOK_MS })
     }
 
-    fn give(&self, head: SampleHead, payload: Bytes, more: bool) {
+    /// Gives a sample to the readers that match now, and returns them.
+    fn give(&self, head: SampleHead, payload: Bytes, more: bool) -> BTreeSet<Guid> {
         let SampleHead { kind, source_timestamp_ns, key_hash } = head;
         let sample = Sample { kind, writer: Some(self.guid), source_timestamp_ns, key_hash, payload, more };
         let readers: Vec<_> = {
             let mut state = self.domain.lock();
-            let Some(writer) = state.endpoints.get_mut(&self.guid) else { return };
+            let Some(writer) = state.endpoints.get_mut(&self.guid) else { return BTreeSet::new() };
             if writer.discovered.qos.is_transient_local() {
                 writer.history.push_back(sample.clone());
                 if let History::KeepLast(depth) = writer.discovered.qos.history
@@ -474,15 +474,16 @@ impl FakeWriter {
                 .endpoints
                 .values()
                 .filter(|r| writer.reaches(r.tagged) && matches(&writer.discovered, &r.discovered))
-                .filter_map(|r| r.reader.clone())
+                .filter_map(|r| Some((r.discovered.guid, r.reader.clone()?)))
                 .collect()
         };
-        for reader in readers {
-            let mut reader = lock(&reader);
+        for (_, reader) in &readers {
+            let mut reader = lock(reader);
             if let Some(sample) = reader.handle_at_once(sample.clone()) {
                 reader.handle(sample);
             }
         }
+        readers.into_iter().map(|(guid, _)| guid).collect()
     }
 }
 

@@ -215,15 +215,15 @@ impl LocalService {
     fn ask(self: &Arc<Self>, source: SourceId, number: u64, payload: Bytes) {
         let Some(client) = self.client() else { return self.lock().answerer.not_asked(source, number) };
         self.lock().asking = true;
-        let asked = client.request(payload).map(|id| (id, client.servers()));
+        let asked = client.send(payload);
         let early = {
             let mut state = self.lock();
             state.asking = false;
             let gone = std::mem::take(&mut state.gone);
             match &asked {
-                Ok((id, servers)) => {
-                    let servers = servers.difference(&gone).copied().collect();
-                    state.answerer.asked(source, number, *id, servers);
+                Ok(sent) => {
+                    let servers = sent.servers.difference(&gone).copied().collect();
+                    state.answerer.asked(source, number, sent.id, servers);
                 }
                 Err(_) => state.answerer.not_asked(source, number),
             }

@@ -13,7 +13,7 @@ use sgc_gateway::{LocalReader, LocalRos};
 use sgc_ros::{
     DiscoveredEndpoint, DiscoveryEvent, DiscoveryHandler, EndpointSpec, GraphNode, Guid, HandleCalls,
     HandleSamples, Reach, RequestHandler, RequestId, RosClient, RosError, RosServer, RosWriter, Sample,
-    SampleHandler, SampleHead, ServiceSpec, UnhandledCall,
+    SampleHandler, SampleHead, SentRequest, ServiceSpec, UnhandledCall,
 };
 use sgc_sync::lock;
 use sgc_wire::History;
@@ -587,7 +587,7 @@ impl Endpoint for Client {
 struct ClientHandle(Registered<Client>);
 
 impl RosClient for ClientHandle {
-    fn request(&self, payload: Bytes) -> Result<RequestId, RosError> {
+    fn send(&self, payload: Bytes) -> Result<SentRequest, RosError> {
         let present = || lock(&self.0.endpoint.present).entity.clone();
         if present().is_none()
             && let Some(network) = self.0.network.upgrade()
@@ -595,10 +595,10 @@ impl RosClient for ClientHandle {
             network.present()?;
         }
         let client = present().ok_or(RosError::Closed)?;
-        let id = client.request(payload)?;
+        let sent = client.send(payload)?;
         // The reply to a client that ended meanwhile reaches nobody.
         match present() {
-            Some(now) if Arc::ptr_eq(&now, &client) => Ok(id),
+            Some(now) if Arc::ptr_eq(&now, &client) => Ok(sent),
             _ => Err(RosError::Closed),
         }
     }
