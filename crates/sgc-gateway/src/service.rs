@@ -65,6 +65,54 @@ struct PendingCalls {
     sending: usize,
     /// Replies that may belong to these requests.
     early: VecDeque<(CallId, Bytes)>,
+    /// The number of times that the network closed.
+    closings: u64,
+}
+
+/// A request that is being sent, from [`PendingCalls::begin`] to [`PendingCalls::finish`].
+struct Sending {
+    /// The number of closings before it.
+    closings: u64,
+}
+
+impl PendingCalls {
+    /// Notes that a request is being sent.
+    fn begin(&mut self) -> Sending {
+        self.sending += 1;
+        Sending { closings: self.closings }
+    }
+
+    /// Notes that the request was sent, and returns the receiver of its reply. A call whose network closed meanwhile
+    /// gets none, so it fails as closed unless its reply is here.
+    fn finish(
+        &mut self,
+        sending: &Sending,
+        sent: Result<RequestId, RosError>,
+    ) -> Result<(CallId, oneshot::Receiver<Bytes>), RosError> {
+        self.sending -= 1;
+        let early = sent.as_ref().ok().and_then(|id| {
+            let at = self.early.iter().position(|(of, _)| *of == (id.client, id.number))?;
+            self.early.remove(at)
+        });
+        if self.sending == 0 {
+            self.early.clear();
+        }
+        let sent = sent?;
+        let id = (sent.client, sent.number);
+        let (send, reply) = oneshot::channel();
+        match early {
+            Some((_, payload)) => drop(send.send(payload)),
+            None if self.closings != sending.closings => return Err(RosError::Closed),
+            None => drop(self.asked.insert(id, send)),
+        }
+        Ok((id, reply))
+    }
+
+    /// Ends all calls: without their sender they fail.
+    fn network_closed(&mut self) {
+        self.closings += 1;
+        self.asked.clear();
+    }
 }
 
 /// The handler of a client's replies.
@@ -88,8 +136,7 @@ impl HandleCalls for Replies {
     }
 
     fn network_closed(&mut self) {
-        // Calls without their sender end.
-        lock(&self.0).asked.clear();
+        lock(&self.0).network_closed();
     }
 }
 
@@ -139,25 +186,9 @@ impl Caller {
     /// Sends a request and returns a guard and a receiver for the reply. May block.
     fn ask(self: &Arc<Self>, payload: Bytes) -> Result<(CallGuard, oneshot::Receiver<Bytes>), RosError> {
         let client = self.client.as_ref().ok_or(RosError::NoPeer { waited_ms: 0 })?;
-        lock(&self.pending).sending += 1;
+        let sending = lock(&self.pending).begin();
         let sent = client.request(payload);
-        let (send, reply) = oneshot::channel();
-        let mut pending = lock(&self.pending);
-        pending.sending -= 1;
-        let early = sent.as_ref().ok().and_then(|id| {
-            let at = pending.early.iter().position(|(of, _)| *of == (id.client, id.number))?;
-            pending.early.remove(at)
-        });
-        if pending.sending == 0 {
-            pending.early.clear();
-        }
-        let sent = sent?;
-        let id = (sent.client, sent.number);
-        match early {
-            Some((_, payload)) => drop(send.send(payload)),
-            None => drop(pending.asked.insert(id, send)),
-        }
-        drop(pending);
+        let (id, reply) = lock(&self.pending).finish(&sending, sent)?;
         Ok((CallGuard { caller: Arc::clone(self), id }, reply))
     }
 
@@ -334,5 +365,38 @@ impl Drop for Serving {
             shared.forget(&server.guids());
             drop(server);
         });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use super::*;
+
+    fn sent(number: i64) -> RequestId {
+        RequestId { client: [7; 16], number, asker: None }
+    }
+
+    #[test]
+    fn call_whose_network_closes_while_it_is_sent_is_cut_off() {
+        let pending: Arc<Mutex<PendingCalls>> = Arc::default();
+        let mut replies = Replies(Arc::clone(&pending));
+        let sending = lock(&pending).begin();
+        replies.network_closed();
+        let finished = lock(&pending).finish(&sending, Ok(sent(1)));
+        assert_eq!(finished.unwrap_err(), RosError::Closed);
+        // The reply came before the network closed.
+        let sending = lock(&pending).begin();
+        replies.handle(sent(2), Bytes::from_static(b"reply"));
+        replies.network_closed();
+        let (_, mut reply) = lock(&pending).finish(&sending, Ok(sent(2))).unwrap();
+        assert_eq!(reply.try_recv().unwrap(), Bytes::from_static(b"reply"));
+        // A later call is on the next network.
+        let sending = lock(&pending).begin();
+        let (_, mut reply) = lock(&pending).finish(&sending, Ok(sent(3))).unwrap();
+        assert_eq!(reply.try_recv(), Err(oneshot::error::TryRecvError::Empty));
+        replies.network_closed();
+        assert_eq!(reply.try_recv(), Err(oneshot::error::TryRecvError::Closed));
     }
 }
