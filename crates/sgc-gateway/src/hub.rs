@@ -5,7 +5,6 @@ use std::fmt;
 use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
-use sgc_ros::RosError;
 use sgc_sync::lock;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -134,7 +133,7 @@ impl Hub {
         self.keeper.end();
         let _ = self
             .shared
-            .blocking(|shared| {
+            .run(|shared| {
                 let feeds = std::mem::replace(&mut *lock(&shared.feeds), Feeds::stopped());
                 feeds.all.iter().for_each(|feed| feed.end());
                 let callers = std::mem::take(&mut *lock(&shared.callers));
@@ -154,7 +153,7 @@ async fn adapt(shared: Weak<HubState>, mut changed: watch::Receiver<u64>) {
         // Later changes trigger another round. That round covers the readers created here and finds nothing to do for
         // them.
         changed.mark_unchanged();
-        let done = shared.blocking(|shared| {
+        let done = shared.run(|shared| {
             let feeds = lock(&shared.feeds).all.clone();
             for feed in feeds {
                 if let Err(error) = feed.adapt() {
@@ -174,7 +173,7 @@ async fn sweep(shared: Weak<HubState>) {
         let Some(shared) = shared.upgrade() else { return };
         shared.network.unused().await;
         tokio::time::sleep(LINGER).await;
-        let done = shared.blocking(|shared| {
+        let done = shared.run(|shared| {
             let mut gone = Vec::new();
             lock(&shared.feeds).all.retain(|feed| {
                 let is_used = !feed.is_unused();
@@ -191,15 +190,7 @@ async fn sweep(shared: Weak<HubState>) {
 }
 
 impl HubState {
-    /// Runs blocking work on a thread where it may block.
-    async fn blocking<T: Send + 'static>(
-        self: &Arc<Self>,
-        work: impl FnOnce(&Arc<Self>) -> Result<T, RosError> + Send + 'static,
-    ) -> Result<T, GatewayError> {
-        self.run(move |shared| work(shared).map_err(GatewayError::Ros)).await
-    }
-
-    /// Runs blocking work that may fail in other ways than ROS errors.
+    /// Runs work on a thread where it may block.
     pub(crate) async fn run<T: Send + 'static>(
         self: &Arc<Self>,
         work: impl FnOnce(&Arc<Self>) -> Result<T, GatewayError> + Send + 'static,
