@@ -22,6 +22,16 @@ pub trait FindDefinitions: Send + Sync + 'static {
     fn described(&self, name: &TypeName, hash: Option<&str>) -> Option<Arc<Layout>>;
 }
 
+impl<F: FindDefinitions + ?Sized> FindDefinitions for Arc<F> {
+    fn text(&self, file: &TypeName) -> Option<String> {
+        (**self).text(file)
+    }
+
+    fn described(&self, name: &TypeName, hash: Option<&str>) -> Option<Arc<Layout>> {
+        (**self).described(name, hash)
+    }
+}
+
 /// A source without further definitions.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ShippedDefinitions;

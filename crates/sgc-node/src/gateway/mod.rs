@@ -11,7 +11,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, MutexGuard};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use rustls::sign::CertifiedKey;
@@ -25,7 +25,7 @@ use sgc_ros::{Reach, RosError};
 use sgc_sync::lock;
 use sgc_trust::{Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
-use tokio::sync::{Mutex, OnceCell};
+use tokio::sync::OnceCell;
 use zeroize::Zeroizing;
 
 use self::network::{GatewayNetwork, HubNetwork};
@@ -64,18 +64,18 @@ pub(crate) struct Sockets {
 /// The gateway of this node.
 pub(crate) struct Gateway {
     /// Opens the local network; `None` if there is none.
-    open: std::sync::Mutex<Option<OpenLocalRos>>,
-    types: Mutex<Option<Types>>,
+    open: Mutex<Option<OpenLocalRos>>,
+    definitions: Arc<dyn FindDefinitions>,
     /// Name of the SGC node.
     name: String,
     /// Name of the ROS 2 node.
     node: String,
     hub: OnceCell<Hub>,
     /// The network of the hub.
-    network: std::sync::Mutex<Option<Arc<GatewayNetwork>>>,
-    server: std::sync::Mutex<Option<Arc<Server>>>,
+    network: Mutex<Option<Arc<GatewayNetwork>>>,
+    server: Mutex<Option<Arc<Server>>>,
     /// Held while the shown certificates change, so that a reload does not undo a renewal.
-    showing: std::sync::Mutex<()>,
+    showing: Mutex<()>,
     /// Whether the shown certificate is the node's own, not one of the configuration.
     shows_own: AtomicBool,
 }
@@ -88,13 +88,12 @@ impl Gateway {
     ) -> Arc<Self> {
         let fits = |c: char| if c.is_ascii_alphanumeric() { c } else { '_' };
         let node = NODE_PREFIX.chars().chain(node_name.chars().map(fits)).collect();
-        let (types, hub, server) =
-            (Mutex::new(Some(Types::new(definitions))), OnceCell::new(), std::sync::Mutex::default());
-        let (name, showing, shows_own) =
-            (node_name.to_owned(), std::sync::Mutex::default(), AtomicBool::default());
-        let open = std::sync::Mutex::new(open);
-        let network = std::sync::Mutex::default();
-        Arc::new(Self { open, types, name, node, hub, network, server, showing, shows_own })
+        let definitions = Arc::new(definitions);
+        let (hub, server) = (OnceCell::new(), Mutex::default());
+        let (name, showing, shows_own) = (node_name.to_owned(), Mutex::default(), AtomicBool::default());
+        let open = Mutex::new(open);
+        let network = Mutex::default();
+        Arc::new(Self { open, definitions, name, node, hub, network, server, showing, shows_own })
     }
 
     /// Sets how to open a local network that the node joined after its start.
@@ -106,7 +105,7 @@ impl Gateway {
         lock(&self.open)
     }
 
-    /// Returns the hub, and opens it first if needed.
+    /// Returns the hub, and opens it first if needed. A later call tries again after an error.
     pub(crate) async fn hub(&self) -> Result<&Hub, GatewayError> {
         self.hub
             .get_or_try_init(|| async {
@@ -116,7 +115,7 @@ impl Gateway {
                 })?;
                 let opened = tokio::task::spawn_blocking(move || GatewayNetwork::open(open)).await;
                 let network = opened.map_err(|_| GatewayError::Stopping)??;
-                let types = self.types.lock().await.take().ok_or(GatewayError::Stopping)?;
+                let types = Types::new(Arc::clone(&self.definitions));
                 let ros = Arc::new(HubNetwork(Arc::clone(&network)));
                 let hub = Hub::start(ros, types, HubOptions { node: self.node.clone() }).await?;
                 *lock(&self.network) = Some(network);
@@ -318,12 +317,80 @@ pub(crate) fn listen_at(config: &GatewayConfig) -> Vec<ListenAt> {
 mod tests {
     use rand_chacha::ChaCha20Rng;
     use rand_chacha::rand_core::SeedableRng as _;
-    use sgc_gateway::{Protocol, ShippedDefinitions};
+    use sgc_gateway::{LocalReader, Protocol, ShippedDefinitions};
+    use sgc_ros::{
+        DiscoveryHandler, EndpointSpec, GraphNode, RequestHandler, RosClient, RosServer, RosWriter,
+        SampleHandler, ServiceSpec,
+    };
     use sgc_testkit::FakeDomain;
     use sgc_trust::{EnrollRequest, Fleet};
     use sgc_wire::UnixMillis;
 
     use super::*;
+
+    /// A network whose discovery fails.
+    struct Undiscovered(HubNetwork);
+
+    impl LocalRos for Undiscovered {
+        fn discover(&self, _: DiscoveryHandler) -> Result<(), RosError> {
+            Err(RosError::Closed)
+        }
+
+        fn reader(&self, spec: &EndpointSpec, handler: SampleHandler) -> Result<LocalReader, RosError> {
+            self.0.reader(spec, handler)
+        }
+
+        fn writer(&self, spec: &EndpointSpec) -> Result<Box<dyn RosWriter>, RosError> {
+            self.0.writer(spec)
+        }
+
+        fn client(
+            &self,
+            spec: &ServiceSpec,
+            handler: RequestHandler,
+        ) -> Result<Box<dyn RosClient>, RosError> {
+            self.0.client(spec, handler)
+        }
+
+        fn server(
+            &self,
+            spec: &ServiceSpec,
+            handler: RequestHandler,
+        ) -> Result<Box<dyn RosServer>, RosError> {
+            self.0.server(spec, handler)
+        }
+
+        fn announce(&self, nodes: &[GraphNode]) -> Result<(), RosError> {
+            self.0.announce(nodes)
+        }
+
+        fn reach(&self) -> Reach {
+            self.0.reach()
+        }
+
+        fn gains_by_reopening(&self) -> Result<bool, RosError> {
+            self.0.gains_by_reopening()
+        }
+
+        fn close(self: Arc<Self>, _: Duration) -> bool {
+            true
+        }
+    }
+
+    #[tokio::test]
+    async fn hub_starts_at_a_later_attempt_after_discovery_failed() {
+        let domain = FakeDomain::default();
+        let open: OpenLocalRos = Arc::new(move || Ok(Arc::new(domain.join(false)) as Arc<dyn LocalRos>));
+        let network = GatewayNetwork::open(Arc::clone(&open)).unwrap();
+        let undiscovered: OpenLocalRos = Arc::new(move || {
+            Ok(Arc::new(Undiscovered(HubNetwork(Arc::clone(&network)))) as Arc<dyn LocalRos>)
+        });
+        let gateway = Gateway::new(Some(undiscovered), "arm-1", ShippedDefinitions);
+        assert_eq!(gateway.hub().await.unwrap_err(), GatewayError::Ros(RosError::Closed));
+        gateway.set_local_network(Some(open));
+        gateway.hub().await.unwrap();
+        gateway.stop().await;
+    }
 
     #[tokio::test]
     async fn a_renewed_certificate_is_shown_and_a_reload_does_not_undo_it() {
