@@ -268,6 +268,8 @@ fn call_that_waits_when_its_service_ends_is_counted_and_stays_so() {
     // The service is still offered.
     client.end.request(body("lost")).unwrap();
     wait("it is counted", || desk.status()["drops"]["call_withdrawn"] == 1);
+    // Until the desk's server ends, it takes calls and counts them as withdrawn.
+    wait("the service is gone", || client.end.matched_servers() == 0);
     let server = Server::new(&lab.net("robot"), "/add");
     let call = client.calls("new");
     server.answers(&server.takes(), 1);
