@@ -22,5 +22,8 @@ pub use failback::Failback;
 pub use keep_alive::{ASK_MAX, Activity, KeepAlive, KeepAlivePolicy, LinkObservation, PeerState, Verdict};
 pub use origin::{Move, Origin};
 pub use shaper::Shaper;
-pub use supervisor::{DOUBT_AFTER, DialCause, Event, LinkFacts, LinkKey, LinkSupervisor, Output};
+pub use supervisor::{
+    DOUBT_AFTER, DialCause, Event, LinkFacts, LinkKey, LinkSupervisor, NETWORK_NEWS_MAX, Output,
+    UNDISTURBED_MAX,
+};
 pub use type_questions::TypeQuestions;

@@ -30,6 +30,11 @@ impl Origin {
         Self { source, is_there: source.is_some() }
     }
 
+    /// Treats the link as one whose route was gone, because its local address is not known for certain.
+    pub fn distrust(&mut self) {
+        self.is_there = false;
+    }
+
     /// Handles a change with the present source address. Returns its consequence.
     pub fn moves(&mut self, source: Option<IpAddr>, over_udp: bool) -> Move {
         let came_back = !std::mem::replace(&mut self.is_there, source.is_some());

@@ -15,10 +15,17 @@ use std::time::{Duration, Instant};
 use rand_chacha::ChaCha20Rng;
 
 use crate::origin::{Move, Origin};
-use crate::{BACKOFF_MAX, Failback, wait};
+use crate::{BACKOFF_MAX, BACKOFF_MIN, Failback, wait};
 
 /// Silence on a new socket after which another link is tried beside it, since the new network may block the transport.
 pub const DOUBT_AFTER: Duration = Duration::from_millis(1500);
+
+/// Number of [`DOUBT_AFTER`] by which further changes postpone that at most.
+const DOUBTS_MAX: u32 = 4;
+/// Longest time between a change of the network and [`Event::NetworkChanged`].
+pub const NETWORK_NEWS_MAX: Duration = Duration::from_millis(300);
+/// Longest time for which a dial goes on although the network changed.
+pub const UNDISTURBED_MAX: Duration = Duration::from_secs(32);
 
 /// Number of a link, given by the driver. No number is used twice by one supervisor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -33,7 +40,7 @@ pub struct LinkFacts {
     pub rank: usize,
     /// Whether the transport uses UDP, and so can continue on another socket.
     pub over_udp: bool,
-    /// Source address of packets to the peer when the link was made; `None` if no route existed.
+    /// Source address of packets to the peer when the dial began; `None` if no route existed.
     pub source: Option<IpAddr>,
 }
 
@@ -119,7 +126,7 @@ enum State {
     /// The last attempt failed.
     BackingOff { failures: u32, due: Instant },
     /// A dial is under way.
-    Dialling { cause: DialCause, failures: Option<u32> },
+    Dialling { cause: DialCause, failures: Option<u32>, restarts: Restarts },
     /// The successor is up and does not carry both sides' state yet.
     Settling { successor: LinkFacts, failures: Option<u32> },
     /// No successor will be made: the node stops, or the peer's own link has precedence.
@@ -128,10 +135,35 @@ enum State {
     Ended,
 }
 
+/// Restarts of a dial, each because the network changed. The first change restarts it at once, so that roaming is fast.
+/// Later ones wait, twice as long each time, so that a stream of changes lets a dial succeed or fail.
+#[derive(Clone, Copy, Debug)]
+struct Restarts {
+    count: u32,
+    /// When the next restart is permitted.
+    permitted: Instant,
+    /// Whether the network changed and the dial was not restarted.
+    is_wanted: bool,
+}
+
+impl Restarts {
+    fn new(now: Instant) -> Self {
+        Self { count: 0, permitted: now, is_wanted: false }
+    }
+
+    fn next(self, now: Instant) -> Self {
+        let undisturbed = BACKOFF_MIN.saturating_mul(2u32.saturating_pow(self.count.min(16)));
+        let permitted = now + undisturbed.min(UNDISTURBED_MAX);
+        Self { count: self.count.saturating_add(1), permitted, is_wanted: false }
+    }
+}
+
 /// Suspicion that a link fell silent with its old socket.
 #[derive(Clone, Copy, Debug)]
 struct Doubt {
     due: Instant,
+    /// Latest time to which further changes postpone it.
+    latest: Instant,
     received_bytes: u64,
 }
 
@@ -146,8 +178,10 @@ pub struct LinkSupervisor {
     doubt: Option<Doubt>,
     /// Whether credentials or target changed since the last dial to the whole target began.
     is_outdated: bool,
-    /// Whether the network changed while a successor settled.
+    /// Whether the network changed while a successor was dialled or settled.
     has_network_changed: bool,
+    /// Until when a reported change may have happened while the first link was dialled.
+    uncertain_until: Instant,
     outputs: VecDeque<Output>,
     /// Serves jitter only.
     rng: ChaCha20Rng,
@@ -165,6 +199,7 @@ impl LinkSupervisor {
             doubt: None,
             is_outdated: false,
             has_network_changed: false,
+            uncertain_until: now + NETWORK_NEWS_MAX,
             outputs: VecDeque::new(),
             rng,
         }
@@ -188,8 +223,9 @@ impl LinkSupervisor {
     pub fn handle(&mut self, now: Instant, event: Event) {
         match event {
             Event::Dialled(successor) => {
-                if let State::Dialling { failures, .. } = self.state {
+                if let State::Dialling { failures, restarts, .. } = self.state {
                     self.doubt = None;
+                    self.has_network_changed = restarts.is_wanted;
                     self.state = State::Settling { successor, failures };
                 }
             }
@@ -201,11 +237,11 @@ impl LinkSupervisor {
                 }
             }
             Event::Closed(key) => self.closed(now, key),
-            Event::NetworkChanged => self.network_changed(),
+            Event::NetworkChanged => self.network_changed(now),
             Event::Source { source, received_bytes } => self.follow_network(now, source, received_bytes),
             Event::CredentialsRenewed | Event::TargetChanged => {
                 self.is_outdated = true;
-                self.dial_if_outdated();
+                self.dial_if_outdated(now);
             }
             Event::PeerLinked => self.give_way(),
             Event::Shutdown => self.stop(),
@@ -222,7 +258,8 @@ impl LinkSupervisor {
         let attempt = match &self.state {
             State::Content => self.failback.due(),
             State::BackingOff { due, .. } => Some(*due),
-            State::Dialling { .. } | State::Settling { .. } | State::Stopping | State::Ended => None,
+            State::Dialling { restarts, .. } => restarts.is_wanted.then_some(restarts.permitted),
+            State::Settling { .. } | State::Stopping | State::Ended => None,
         };
         let doubt = self.doubt.map(|doubt| doubt.due);
         attempt.into_iter().chain(doubt).min()
@@ -237,11 +274,16 @@ impl LinkSupervisor {
 
     fn dial_failed(&mut self, now: Instant) {
         match self.state {
-            State::Dialling { cause: DialCause::Failback, .. } => {
+            State::Dialling { cause: DialCause::Failback, restarts, .. } => {
                 self.failback.failed(now, &mut self.rng);
+                if restarts.is_wanted {
+                    self.failback.network_changed(now);
+                }
                 self.state = State::Content;
-                self.dial_if_outdated();
+                self.dial_if_outdated(now);
             }
+            // The attempt says nothing about the present network.
+            State::Dialling { restarts, .. } if restarts.is_wanted => self.back_off(now, 1),
             State::Dialling { failures, .. } => self.back_off(now, failures.unwrap_or(0).saturating_add(1)),
             _ => {}
         }
@@ -272,17 +314,20 @@ impl LinkSupervisor {
         self.state = State::Content;
         self.outputs.push_back(Output::Adopt(successor.key));
         self.look_again();
-        self.dial_if_outdated();
+        self.dial_if_outdated(now);
     }
 
-    /// Handles a change of the network that came while a successor settled.
+    /// Handles a change of the network that came while a successor was dialled or settled.
     fn look_again(&mut self) {
         if std::mem::take(&mut self.has_network_changed) {
             self.outputs.push_back(Output::LookUpSource);
         }
     }
 
-    fn network_changed(&mut self) {
+    fn network_changed(&mut self, now: Instant) {
+        if now <= self.uncertain_until {
+            self.origin.distrust();
+        }
         match self.state {
             State::Settling { .. } => self.has_network_changed = true,
             State::Stopping | State::Ended => {}
@@ -293,26 +338,55 @@ impl LinkSupervisor {
     }
 
     fn follow_network(&mut self, now: Instant, source: Option<IpAddr>, received_bytes: u64) {
-        if let State::Settling { .. } | State::Stopping | State::Ended = self.state {
-            return;
+        match self.state {
+            // The dial ended between the question and its answer, which is about the old link.
+            State::Settling { .. } => return self.has_network_changed = true,
+            State::Stopping | State::Ended => return,
+            State::Content | State::BackingOff { .. } | State::Dialling { .. } => {}
         }
         let moves = self.origin.moves(source, self.over_udp);
         if moves == Move::Rebind {
             self.outputs.push_back(Output::Rebind);
-            self.doubt = Some(Doubt { due: now + DOUBT_AFTER, received_bytes });
+            let latest = self.doubt.map_or(now + DOUBTS_MAX * DOUBT_AFTER, |doubt| doubt.latest);
+            self.doubt = Some(Doubt { due: latest.min(now + DOUBT_AFTER), latest, received_bytes });
         }
         // Another network may not block the better URL.
         self.failback.network_changed(now);
         match self.state {
-            _ if moves == Move::Redial => self.dial(DialCause::Network),
             // The dial began on the old network.
-            State::Dialling { cause: DialCause::Failback, .. } => self.dial(DialCause::Failback),
-            State::Dialling { .. } => self.dial(DialCause::Network),
+            State::Dialling { .. } => self.want_restart(now, moves),
+            _ if moves == Move::Redial => self.dial(now, DialCause::Network),
+            // An earlier change made the wait short already.
+            State::BackingOff { failures: 0, .. } => {}
             State::BackingOff { .. } => self.back_off(now, 0),
             State::Content | State::Settling { .. } | State::Stopping | State::Ended => {}
         }
         if let State::Dialling { failures, .. } = &mut self.state {
             *failures = failures.map(|_| 0);
+        }
+    }
+
+    /// Begins the dial under way anew, now or once that is permitted. A failback goes on as one unless the link has to
+    /// be replaced.
+    fn want_restart(&mut self, now: Instant, moves: Move) {
+        if let State::Dialling { cause, restarts, .. } = &mut self.state {
+            restarts.is_wanted = true;
+            if *cause != DialCause::Failback || moves == Move::Redial {
+                *cause = DialCause::Network;
+            }
+        }
+        self.restart_if_permitted(now);
+    }
+
+    fn restart_if_permitted(&mut self, now: Instant) {
+        if let State::Dialling { cause, restarts, .. } = self.state
+            && restarts.is_wanted
+            && restarts.permitted <= now
+        {
+            self.dial(now, cause);
+            if let State::Dialling { restarts: next, .. } = &mut self.state {
+                *next = restarts.next(now);
+            }
         }
     }
 
@@ -322,40 +396,41 @@ impl LinkSupervisor {
             let is_tried =
                 matches!(&self.state, State::Dialling { cause, .. } if *cause != DialCause::Failback);
             if received_bytes == doubt.received_bytes && !is_tried {
-                self.dial(DialCause::Silence);
+                self.dial(now, DialCause::Silence);
             }
         }
+        self.restart_if_permitted(now);
         match self.state {
-            State::BackingOff { due, .. } if due <= now => self.dial(DialCause::Retry),
+            State::BackingOff { due, .. } if due <= now => self.dial(now, DialCause::Retry),
             State::Content if self.failback.due().is_some_and(|due| due <= now) => {
-                self.dial(DialCause::Failback)
+                self.dial(now, DialCause::Failback)
             }
             _ => {}
         }
     }
 
     /// Dials if the link in use has outdated credentials or target. A failed attempt is not hastened by it.
-    fn dial_if_outdated(&mut self) {
+    fn dial_if_outdated(&mut self, now: Instant) {
         if self.is_outdated && matches!(self.state, State::Content) {
-            self.dial(DialCause::Renewal);
+            self.dial(now, DialCause::Renewal);
         }
     }
 
     /// Begins to dial, in place of a dial under way.
-    fn dial(&mut self, cause: DialCause) {
-        let failures = match self.state {
-            State::Content => None,
-            State::BackingOff { failures, .. } => Some(failures),
-            State::Dialling { failures, .. } => {
+    fn dial(&mut self, now: Instant, cause: DialCause) {
+        let (failures, restarts) = match self.state {
+            State::Content => (None, Restarts::new(now)),
+            State::BackingOff { failures, .. } => (Some(failures), Restarts::new(now)),
+            State::Dialling { failures, restarts, .. } => {
                 self.outputs.push_back(Output::AbortDial);
-                failures
+                (failures, Restarts { is_wanted: false, ..restarts })
             }
             State::Settling { .. } | State::Stopping | State::Ended => return,
         };
         if cause != DialCause::Failback {
             self.is_outdated = false;
         }
-        self.state = State::Dialling { cause, failures };
+        self.state = State::Dialling { cause, failures, restarts };
         self.outputs.push_back(Output::Dial(cause));
     }
 
@@ -417,6 +492,12 @@ mod tests {
 
     impl Bench {
         fn new(rank: usize, over_udp: bool) -> Self {
+            let mut bench = Self::just_dialled(rank, over_udp);
+            bench.now += 2 * NETWORK_NEWS_MAX;
+            bench
+        }
+
+        fn just_dialled(rank: usize, over_udp: bool) -> Self {
             let (now, rng) = (Instant::now(), ChaCha20Rng::seed_from_u64(1));
             Self {
                 now,
@@ -581,6 +662,67 @@ mod tests {
         let outputs = bench.on(Event::Settled(SECOND));
         assert_eq!(outputs, [Output::Retire(FIRST), Output::Adopt(SECOND), Output::LookUpSource]);
         assert_eq!(bench.on(Event::Source { source: ip(2), received_bytes: 0 }), [Output::Rebind]);
+    }
+
+    #[test]
+    fn source_that_arrives_after_the_dial_ended_is_looked_up_again() {
+        let mut bench = Bench::new(0, true);
+        bench.on(Event::CredentialsRenewed);
+        assert_eq!(bench.on(Event::NetworkChanged), [Output::LookUpSource]);
+        bench.on(Event::Dialled(facts(SECOND, 0, true)));
+        assert_eq!(bench.on(Event::Source { source: ip(2), received_bytes: 0 }), []);
+        let outputs = bench.on(Event::Settled(SECOND));
+        assert_eq!(outputs, [Output::Retire(FIRST), Output::Adopt(SECOND), Output::LookUpSource]);
+    }
+
+    #[test]
+    fn change_reported_right_after_the_first_dial_moves_the_link() {
+        for (over_udp, output) in [(true, Output::Rebind), (false, Output::Dial(DialCause::Network))] {
+            let mut bench = Bench::just_dialled(0, over_udp);
+            bench.now += NETWORK_NEWS_MAX;
+            // The lookup after the dial already yielded the new address.
+            assert_eq!(bench.network(ip(1)), [output]);
+        }
+    }
+
+    #[test]
+    fn stream_of_network_changes_lets_a_dial_end() {
+        let mut bench = Bench::new(0, false);
+        assert_eq!(bench.network(ip(2)), [Output::Dial(DialCause::Network)]);
+        // A dial takes three seconds, and the network changes five times a second.
+        let (mut began, mut dials) = (bench.now, 1);
+        while bench.now - began < ms(3000) {
+            let outputs = [bench.after(ms(200)), bench.network(ip(1 + dials % 2))].concat();
+            if outputs.contains(&Output::Dial(DialCause::Network)) {
+                (began, dials) = (bench.now, dials + 1);
+            }
+            assert!(dials <= 6, "no dial goes on for three seconds");
+        }
+        // The changes since then make the next dial due soon.
+        assert_eq!(bench.on(Event::DialFailed), []);
+        assert!(bench.deadline().unwrap() <= BACKOFF_MIN);
+    }
+
+    #[test]
+    fn stream_of_network_changes_does_not_postpone_a_retry() {
+        let mut bench = Bench::new(0, true);
+        bench.on(Event::CredentialsRenewed);
+        bench.on(Event::DialFailed);
+        bench.network(ip(1));
+        let due = bench.now + bench.deadline().unwrap();
+        bench.now += ms(100);
+        assert_eq!(bench.network(ip(1)), []);
+        assert_eq!(bench.now + bench.deadline().unwrap(), due);
+    }
+
+    #[test]
+    fn stream_of_network_changes_does_not_postpone_a_doubt_for_ever() {
+        let mut bench = Bench::new(0, true);
+        let moves = (0..100).find(|n| {
+            let outputs = [bench.after(ms(200)), bench.network(ip(1 + n % 2))].concat();
+            outputs.contains(&Output::Dial(DialCause::Silence))
+        });
+        assert!(moves.is_some());
     }
 
     #[test]

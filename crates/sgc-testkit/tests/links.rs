@@ -26,6 +26,11 @@ const RESTLESS: Duration = Duration::from_secs(300);
 const RECOVERY_MAX: Duration = Duration::from_secs(30);
 /// Longest time until the best URL serves again: the longest wait of a failback.
 const FAILBACK_MAX: Duration = Duration::from_secs(610);
+/// Changes that a flapping interface causes.
+const FLAPS: u32 = 100;
+const FLAP_EVERY: Duration = ms(200);
+/// Most dials in a row that are abandoned, since each lasts longer than the one before.
+const ABORTS_MAX: u32 = 8;
 /// URLs of the router, the best first. The last one is over TCP.
 const RANKS: usize = 3;
 
@@ -52,6 +57,8 @@ enum Transition {
     PeerLinked,
     /// The next successor ends before it settles.
     FrailSuccessor,
+    /// An interface flaps: the kernel reports a stream of changes.
+    Flap,
 }
 
 struct SimLink {
@@ -76,6 +83,8 @@ struct SimDial {
     rank: Option<usize>,
     cause: Option<DialCause>,
     version: u64,
+    /// Address of the host when the dial began.
+    address: Option<u8>,
 }
 
 struct Run {
@@ -101,10 +110,14 @@ struct Run {
     look_due: Instant,
     /// When the kernel's news of a change reaches the node.
     network_due: Option<Instant>,
+    /// Changes that a flapping interface will still cause.
+    flaps: u32,
     // The reference.
     failures: u32,
     failed_at: Option<Instant>,
     changed_at: Option<Instant>,
+    /// Dials that were abandoned since one ended.
+    aborts: u32,
     last_failback: Instant,
     /// Whether a dial because of the network, and one because of silence, may come.
     may_move: bool,
@@ -137,9 +150,11 @@ impl Run {
             deadline: None,
             look_due: now,
             network_due: None,
+            flaps: 0,
             failures: 0,
             failed_at: None,
             changed_at: None,
+            aborts: 0,
             last_failback: now,
             may_move: false,
             may_doubt: false,
@@ -186,6 +201,7 @@ impl Run {
             14..=15 => Transition::CredentialsRenewed,
             16 => Transition::TargetChanged,
             17 => Transition::PeerLinked,
+            18 => Transition::Flap,
             _ => Transition::FrailSuccessor,
         }
     }
@@ -217,6 +233,10 @@ impl Run {
             }
             Transition::PeerLinked => self.tell(Event::PeerLinked),
             Transition::FrailSuccessor => self.is_frail = true,
+            Transition::Flap => {
+                self.flaps = FLAPS;
+                self.network_due = Some(self.now() + ms(50));
+            }
         }
     }
 
@@ -237,7 +257,11 @@ impl Run {
             }
             match output {
                 Output::Dial(cause) => self.begin_dial(Some(cause)),
-                Output::AbortDial => assert!(self.dial.take().is_some(), "no dial to abort"),
+                Output::AbortDial => {
+                    assert!(self.dial.take().is_some(), "no dial to abort");
+                    self.aborts += 1;
+                    assert!(self.aborts <= ABORTS_MAX, "no dial ends");
+                }
                 Output::Rebind => {
                     let address = self.address;
                     self.may_doubt = true;
@@ -304,7 +328,13 @@ impl Run {
             Some(rank) => (ms(700 * (rank - ranks.start) as u64 + 50), Some(rank)),
             None => (ms(3200), None),
         };
-        self.dial = Some(SimDial { ends: self.now() + took, rank, cause, version: self.version });
+        self.dial = Some(SimDial {
+            ends: self.now() + took,
+            rank,
+            cause,
+            version: self.version,
+            address: self.address,
+        });
     }
 
     /// No dial comes faster than its back-off permits.
@@ -316,7 +346,8 @@ impl Run {
             None | Some(DialCause::Retry) => {
                 let doubled = BACKOFF_MIN * 2u32.pow(self.failures.saturating_sub(1).min(16));
                 let least = if is_forgiven { BACKOFF_MIN / 2 } else { doubled.min(BACKOFF_MAX) / 2 };
-                let begun = if is_forgiven { self.changed_at } else { self.failed_at };
+                // A stream of changes does not postpone the dial, so the wait counts from the failure.
+                let begun = self.failed_at;
                 assert!(since(begun) >= least, "dialled {:?} after failure {}", since(begun), self.failures);
             }
             Some(DialCause::Failback) => {
@@ -346,6 +377,7 @@ impl Run {
 
     fn end_dial(&mut self, dial: SimDial) {
         let now = self.now();
+        self.aborts = 0;
         // The world may have changed since the dial began.
         let rank =
             dial.rank.filter(|rank| !self.is_partitioned && !self.blocked[*rank] && self.address.is_some());
@@ -368,13 +400,14 @@ impl Run {
         };
         let key = LinkKey(self.next_key);
         self.next_key += 1;
-        let facts = LinkFacts { key, rank, over_udp: rank + 1 < RANKS, source: self.source() };
+        let source = dial.address.map(|n| IpAddr::from([10, 0, 0, n]));
+        let facts = LinkFacts { key, rank, over_udp: rank + 1 < RANKS, source };
         let remote = ([10, 9, 9, 9], 7447).into();
         let settles = dial.cause.map(|_| (now + ms(self.dice.within(100..=400) as u64), !self.is_frail));
         self.is_frail &= dial.cause.is_none();
         let link = SimLink {
             facts,
-            address: self.address,
+            address: dial.address,
             version: dial.version,
             keep_alive: KeepAlive::new(now, KeepAlivePolicy::default(), 0, remote),
             activity: Activity::default(),
@@ -415,7 +448,8 @@ impl Run {
         let now = self.now() + STEP;
         self.clock.advance_to(now);
         if self.network_due.is_some_and(|due| due <= now) {
-            self.network_due = None;
+            self.network_due = (self.flaps > 0).then_some(now + FLAP_EVERY);
+            self.flaps = self.flaps.saturating_sub(1);
             self.changed_at = Some(now);
             self.may_move = true;
             if self.supervisor.is_none() && self.dial.is_none() {

@@ -181,25 +181,43 @@ impl LinkKeeper {
         }
     }
 
-    /// Claims the peer of a link, unless the claim that is held covers it.
-    pub(crate) fn claim_again(&self, link: &AnyLink, held: &Claim) -> Result<Option<Claim>, Failure> {
+    /// Judges the peer of a successor link like that of a first one, and claims it unless the claim that is held covers
+    /// it. The successor keeps the place of the link that it replaces.
+    pub(crate) fn enter_again(
+        &self,
+        link: &AnyLink,
+        request: &LinkRequest,
+        held: &Claim,
+    ) -> Result<Option<Claim>, Failure> {
         let node = link.peer().node_id;
-        if node == held.node() {
-            return Ok(None);
-        }
-        let claim = self.claims.claim(node).ok_or(Failure::Reached(node));
-        if claim.is_err() {
+        let entered = self.judge(link, request).and_then(|()| {
+            let claim = || self.claims.claim(node).ok_or(Failure::Reached(node));
+            (node != held.node()).then(claim).transpose()
+        });
+        if entered.is_err() {
             link.close(CloseReason::Goodbye);
         }
-        claim.map(Some)
+        entered
     }
 
-    /// Judges the peer of a link.
+    /// Judges the peer of a first link, and takes its claim and its place.
     fn enter(
         &self,
         link: &AnyLink,
         request: &LinkRequest,
     ) -> Result<(Claim, Option<OwnedSemaphorePermit>), Failure> {
+        self.judge(link, request)?;
+        let node = link.peer().node_id;
+        let claim = self.claims.claim(node).ok_or(Failure::Reached(node))?;
+        let place = match &request.places {
+            None => None,
+            Some(places) => Some(places.clone().try_acquire_owned().map_err(|_| Failure::Enough)?),
+        };
+        Ok((claim, place))
+    }
+
+    /// Judges the peer of a link.
+    fn judge(&self, link: &AnyLink, request: &LinkRequest) -> Result<(), Failure> {
         let peer = link.peer();
         let node = peer.node_id;
         if node == self.me {
@@ -214,16 +232,11 @@ impl LinkKeeper {
         if self.gives_way(request, &node) && self.claims.has_come(&node) {
             return Err(Failure::Reached(node));
         }
-        let claim = self.claims.claim(node).ok_or(Failure::Reached(node))?;
-        let place = match &request.places {
-            None => None,
-            Some(places) => Some(places.clone().try_acquire_owned().map_err(|_| Failure::Enough)?),
-        };
-        Ok((claim, place))
+        Ok(())
     }
 
     /// Decides which of two crossing links stays: that of the node with the lesser id.
-    fn gives_way(&self, request: &LinkRequest, node: &NodeId) -> bool {
+    pub(crate) fn gives_way(&self, request: &LinkRequest, node: &NodeId) -> bool {
         request.hearsay && self.me > *node
     }
 }
@@ -238,6 +251,7 @@ impl KeepLink for LinkKeeper {
         // Subscribe before dialling, since a later subscription could miss a change during this attempt.
         let mut redial = self.redial.clone();
         redial.mark_unchanged();
+        let network = self.network.onward();
         let first = target.borrow_and_update().clone();
         row.connecting(&first);
         let DialledLink { link, url, passed } = match self.dial(&first).await {
@@ -253,8 +267,8 @@ impl KeepLink for LinkKeeper {
             }
         };
         self.linked(&first, &url, &passed, &node, row);
-        let gives_way_to = self.gives_way(request, &node).then_some(node);
-        let end = keep_renewed(link, url, Signals { target, redial, gives_way_to }, self, claim, row).await;
+        let signals = Signals { target, redial, network };
+        let end = keep_renewed(link, url, signals, request, self, claim, row).await;
         Outcome::Ended { remote, end }
     }
 

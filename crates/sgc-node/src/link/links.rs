@@ -305,7 +305,9 @@ mod tests {
     use super::*;
     use crate::clock::now;
     use crate::control::control_queue::{Inbox, LINK_INBOX_BYTES_MAX};
-    use crate::discovery::{Board, DialTarget, Dns, LinkKeeper, WorkingUrls, keep_at};
+    use crate::discovery::{
+        Board, DialTarget, Dns, KeepLink as _, LinkKeeper, LinkRequest, WorkingUrls, keep_at,
+    };
     use crate::link::roaming::Network;
 
     /// Event that the test's control task reports about links.
@@ -397,6 +399,16 @@ mod tests {
         Arc::new(fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap())
     }
 
+    /// Enrolls a router whose id is less than that of the arm. A number after the name makes it so.
+    fn enroll_router(fleet: &Fleet, name: &str) -> Arc<Identity> {
+        let mut routers = (0..1000).map(|n| {
+            let request = EnrollRequest::new(format!("{name}{n}").parse().unwrap(), now().unix);
+            let request = EnrollRequest { router: true, ..request };
+            Arc::new(fleet.issue(&request, &mut OsRng.unwrap_err()).unwrap())
+        });
+        routers.find(|router| router.node_id().0[0] < 0x80).unwrap()
+    }
+
     fn admission(core: &mpsc::Sender<CoreEvent>, credentials: &CredentialStore) -> Admission {
         let (core, credentials) = (core.clone(), credentials.clone());
         Admission {
@@ -415,9 +427,26 @@ mod tests {
 
         /// Creates a bench with better URLs than the one that works.
         fn by(mut urls: Vec<LinkUrl>) -> Self {
-            let fleet = Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
-            let arm = CredentialStore::new(enroll(&fleet, "arm"));
-            let router = CredentialStore::new(enroll(&fleet, "router"));
+            let (bench, keeper, url) = Self::without_a_link();
+            let row = bench.board.row(&url, "static");
+            let rng = ChaCha20Rng::from_rng(&mut OsRng.unwrap_err());
+            urls.push(url);
+            tokio::spawn(keep_at(DialTarget::by(urls).unwrap(), keeper, row, rng));
+            bench
+        }
+
+        /// Creates a bench whose node dials nothing, with the node's keeper and the URL of the router.
+        fn without_a_link() -> (Self, LinkKeeper, LinkUrl) {
+            // The links of the arm give way to those of routers that are announced.
+            let (fleet, arm) = loop {
+                let fleet =
+                    Fleet::create("lab".parse().unwrap(), now().unix, &mut OsRng.unwrap_err()).unwrap();
+                let arm = enroll(&fleet, "arm");
+                if arm.node_id().0[0] >= 0x80 {
+                    break (fleet, CredentialStore::new(arm));
+                }
+            };
+            let router = CredentialStore::new(enroll_router(&fleet, "router"));
             let addr = "quic://127.0.0.1:0".parse().unwrap();
             let options = LinkOptions::default();
             let doors = Arc::<TransportMetrics>::default();
@@ -446,13 +475,8 @@ mod tests {
                 network,
                 urls: book,
             };
-            let board = Board::default();
-            let row = board.row(&url, "static");
-            let rng = ChaCha20Rng::from_rng(&mut OsRng.unwrap_err());
-            urls.push(url);
-            tokio::spawn(keep_at(DialTarget::by(urls).unwrap(), keeper, row, rng));
-            Self {
-                board,
+            let bench = Self {
+                board: Board::default(),
                 change_network,
                 fleet,
                 arm,
@@ -466,7 +490,34 @@ mod tests {
                 close_far,
                 far_core,
                 stops: vec![stop],
-            }
+            };
+            (bench, keeper, url)
+        }
+
+        /// Starts another router of the fleet.
+        fn start_router(&mut self) -> (CredentialStore, LinkUrl) {
+            let router = CredentialStore::new(enroll_router(&self.fleet, "other"));
+            let addr = "quic://127.0.0.1:0".parse().unwrap();
+            let listener =
+                Listener::bind(&addr, router.clone(), LinkOptions::default(), Arc::default()).unwrap();
+            let url = listener.local().to_string().parse().unwrap();
+            let (stop, stopped) = oneshot::channel();
+            self.stops.push(stop);
+            tokio::spawn(keep_accepting(listener, admission(&self.far_core, &router), stopped));
+            (router, url)
+        }
+
+        /// Keeps a link to this URL that meets the request. The target can be changed.
+        fn keep_link(
+            &self,
+            keeper: LinkKeeper,
+            url: LinkUrl,
+            request: LinkRequest,
+        ) -> watch::Sender<DialTarget> {
+            let row = self.board.row(&url, "mdns");
+            let (change_target, target) = watch::channel(DialTarget::from(url));
+            tokio::spawn(async move { keeper.keep_link(target, &request, &row).await });
+            change_target
         }
 
         fn cert(store: &CredentialStore) -> CertId {
@@ -669,6 +720,38 @@ mod tests {
             (row.why_not_first.as_deref(), row.at.as_deref()),
             (None, Some(addr.to_string().as_str()))
         );
+    }
+
+    #[tokio::test]
+    async fn successor_to_a_node_that_is_not_wanted_is_refused() {
+        let (mut bench, keeper, url) = Bench::without_a_link();
+        let nodes = Some(Arc::new([bench.router.identity().node_id()].into()));
+        let request = LinkRequest { hearsay: true, nodes, places: None };
+        let change_target = bench.keep_link(keeper, url, request);
+        bench.expect_up(1).await;
+        let (_other, url) = bench.start_router();
+        change_target.send_replace(url.into());
+        assert!(matches!(soon(bench.far.recv()).await.unwrap(), LinkEvent::Up(LinkId(2), _)));
+        assert_eq!(soon(bench.far.recv()).await.unwrap(), LinkEvent::Down(LinkId(2)));
+        assert!(bench.near.is_empty(), "the link in use stays and has no successor");
+    }
+
+    #[tokio::test]
+    async fn link_gives_way_to_the_router_that_it_leads_to_now() {
+        let (mut bench, keeper, url) = Bench::without_a_link();
+        let claims = keeper.claims.clone();
+        let request = LinkRequest { hearsay: true, ..LinkRequest::default() };
+        let change_target = bench.keep_link(keeper, url, request);
+        bench.expect_up(1).await;
+        let (other, url) = bench.start_router();
+        change_target.send_replace(url.into());
+        let (near, far) = (Bench::cert(&other), Bench::cert(&bench.arm));
+        bench.expect(LinkEvent::Up(LinkId(2), near), LinkEvent::Up(LinkId(2), far)).await;
+        bench.expect(LinkEvent::Down(LinkId(1)), LinkEvent::Down(LinkId(1))).await;
+        let _former = claims.note_arrival(bench.router.identity().node_id());
+        assert!(timeout(Duration::from_millis(200), bench.near.recv()).await.is_err());
+        let _present = claims.note_arrival(other.identity().node_id());
+        bench.expect(LinkEvent::Down(LinkId(2)), LinkEvent::Down(LinkId(2))).await;
     }
 
     #[tokio::test]

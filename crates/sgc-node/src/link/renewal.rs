@@ -19,7 +19,7 @@ use tracing::{debug, info, warn};
 use crate::clock::time_now;
 use crate::control::event::CoreEvent;
 use crate::discovery::{
-    Claim, DialTarget, DialledLink, Failure, LinkKeeper, SkippedUrl, StatusRow, is_over_udp,
+    Claim, DialTarget, DialledLink, Failure, LinkKeeper, LinkRequest, SkippedUrl, StatusRow, is_over_udp,
 };
 use crate::link::lanes::LaneAdmission;
 use crate::link::links::ReportedLink;
@@ -27,6 +27,8 @@ use crate::link::roaming::{Network, source_towards};
 
 /// A dial under way. It yields the link with the target that was dialled.
 type Dialling = Pin<Box<dyn Future<Output = Result<(DialledLink, DialTarget), Failure>> + Send>>;
+/// Waiting for the peer's own link, which has precedence.
+type PeerLinked = Pin<Box<dyn Future<Output = ()> + Send>>;
 /// Waiting for a successor to settle or to end.
 type Settling = Pin<Box<dyn Future<Output = SettleResult> + Send>>;
 
@@ -42,8 +44,8 @@ pub(crate) struct Signals {
     pub(crate) target: watch::Receiver<DialTarget>,
     /// Changes with the credentials.
     pub(crate) redial: watch::Receiver<()>,
-    /// Node whose incoming link has precedence, and ends this link and its successors.
-    pub(crate) gives_way_to: Option<NodeId>,
+    /// Changes of the network since the first dial began.
+    pub(crate) network: Network,
 }
 
 /// A link of the supervisor.
@@ -68,14 +70,19 @@ struct Renewal<'a> {
     supervisor: LinkSupervisor,
     keeper: &'a LinkKeeper,
     row: &'a StatusRow,
+    /// Conditions that each link has to meet.
+    request: &'a LinkRequest,
     signals: Signals,
-    network: Network,
     claim: Claim,
     current: Held,
     dialling: Option<Dialling>,
     /// Reason of the last dial.
     cause: DialCause,
+    /// Source address of packets to the peer of the link in use when the last dial began.
+    source_before: Option<IpAddr>,
     successor: Option<Successor>,
+    /// `None` after the peer of the link in use made a link of its own that has precedence.
+    peer_linked: Option<PeerLinked>,
     last_key: LinkKey,
     /// Reason given to peers whose links the supervisor closes.
     close_reason: CloseReason,
@@ -87,6 +94,7 @@ pub(crate) async fn keep_renewed(
     link: AnyLink,
     url: LinkUrl,
     signals: Signals,
+    request: &LinkRequest,
     keeper: &LinkKeeper,
     claim: Claim,
     row: &StatusRow,
@@ -100,17 +108,30 @@ pub(crate) async fn keep_renewed(
         supervisor: LinkSupervisor::new(time_now(), current.facts(key, rank), rng),
         keeper,
         row,
+        request,
         signals,
-        network: keeper.network.onward(),
+        peer_linked: Some(peer_linked(keeper, request, claim.node())),
         claim,
         current,
         dialling: None,
         cause: DialCause::Renewal,
+        source_before: None,
         successor: None,
         last_key: key,
         close_reason: CloseReason::Goodbye,
     };
     renewal.run().await
+}
+
+/// Waits until this node has a link of its own that has precedence.
+fn peer_linked(keeper: &LinkKeeper, request: &LinkRequest, node: NodeId) -> PeerLinked {
+    let (claims, gives_way) = (keeper.claims.clone(), keeper.gives_way(request, &node));
+    Box::pin(async move {
+        match gives_way {
+            true => claims.arrived(&node).await,
+            false => std::future::pending().await,
+        }
+    })
 }
 
 /// Reports a link and starts to receive.
@@ -138,15 +159,7 @@ impl Held {
 impl Renewal<'_> {
     async fn run(mut self) -> LinkError {
         let keeper = self.keeper;
-        let gives_way_to = self.signals.gives_way_to;
-        let peer_linked = async {
-            match gives_way_to {
-                Some(node) => keeper.claims.arrived(&node).await,
-                None => std::future::pending().await,
-            }
-        };
-        tokio::pin!(peer_linked);
-        let (mut has_given_way, mut is_over) = (false, false);
+        let mut is_over = false;
         loop {
             let deadline = loop {
                 match self.supervisor.poll_output() {
@@ -168,12 +181,13 @@ impl Renewal<'_> {
                     self.dialled(dialled).await
                 }
                 result = done(settling) => self.settled(result),
-                () = self.network.changed() => Event::NetworkChanged,
+                () = self.signals.network.changed() => Event::NetworkChanged,
                 () = changed(&mut self.signals.redial) => Event::CredentialsRenewed,
                 () = changed(&mut self.signals.target) => Event::TargetChanged,
                 () = is_due(deadline) => Event::Timeout { received_bytes: self.current.received_bytes() },
-                () = &mut peer_linked, if !has_given_way => {
-                    (has_given_way, self.close_reason) = (true, CloseReason::Replaced);
+                () = done(self.peer_linked.as_mut()) => {
+                    self.peer_linked = None;
+                    self.close_reason = CloseReason::Replaced;
                     Event::PeerLinked
                 }
                 () = keeper.core.closed(), if !is_over => {
@@ -230,6 +244,7 @@ impl Renewal<'_> {
             }
             DialCause::Failback | DialCause::Renewal | DialCause::Retry => {}
         }
+        self.source_before = self.current.source();
         self.dialling = Some(if cause == DialCause::Failback {
             let target = self.signals.target.borrow().clone();
             Box::pin(async move {
@@ -246,10 +261,17 @@ impl Renewal<'_> {
         });
     }
 
+    /// Returns the source address of packets to a successor's peer when the dial began. The network may have changed
+    /// during the dial; then it is that towards the peer of the link in use.
+    fn source_of(&self, successor: &Held) -> Option<IpAddr> {
+        let before = self.source_before;
+        if before == self.current.source() { successor.source() } else { before }
+    }
+
     /// Serves a dialled link as successor, or shows why there is none.
     async fn dialled(&mut self, result: Result<(DialledLink, DialTarget), Failure>) -> Event {
         let claimed = result.and_then(|(dialled, target)| {
-            let claim = self.keeper.claim_again(&dialled.link, &self.claim)?;
+            let claim = self.keeper.enter_again(&dialled.link, self.request, &self.claim)?;
             Ok((dialled, target, claim))
         });
         match claimed {
@@ -258,7 +280,7 @@ impl Renewal<'_> {
                 self.last_key = key;
                 let rank = target.better_than(&url).len();
                 let held = serve(self.keeper, link, url).await;
-                let facts = held.facts(key, rank);
+                let facts = LinkFacts { source: self.source_of(&held), ..held.facts(key, rank) };
                 let settling = Box::pin(settle(key, held.reported.clone(), self.keeper.core.clone()));
                 self.successor = Some(Successor { key, held, target, passed, claim, settling });
                 Event::Dialled(facts)
@@ -296,6 +318,9 @@ impl Renewal<'_> {
     fn adopt(&mut self, successor: Successor) {
         let Successor { held, target, passed, claim, .. } = successor;
         let node = held.reported.link.peer().node_id;
+        if node != self.claim.node() {
+            self.peer_linked = Some(peer_linked(self.keeper, self.request, node));
+        }
         self.keeper.linked(&target, &held.url, &passed, &node, self.row);
         self.current = held;
         if let Some(claim) = claim {
