@@ -14,7 +14,7 @@ use hickory_resolver::proto::rr::RData;
 use sgc_config::SrvDomain;
 use tokio::time::timeout;
 
-use super::srv::{SrvAnswer, SrvTarget, TARGETS_MAX, TTL_MAX, TTL_MIN};
+use super::srv_answer::{SrvAnswer, SrvTarget, TARGETS_MAX, TTL_MAX, TTL_MIN};
 
 /// Most addresses that are taken of one host.
 const ADDRESSES_MAX: usize = 8;

@@ -1,4 +1,4 @@
-//! One attempt at a router: dial, judge the peer, and keep the link until it ends.
+//! One attempt at a router: dial, and judge the peer. `kept_link.rs` keeps the link until it ends.
 
 use std::collections::BTreeSet;
 use std::future::Future;
@@ -13,7 +13,6 @@ use tracing::warn;
 use super::dns::DnsError;
 use super::{Claim, Claims, DialTarget, Dns, Names as _, SkippedUrl, StatusRow, WorkingUrls, urls};
 use crate::control::event::CoreEvent;
-use crate::link::renewal::{Signals, keep_renewed};
 use crate::link::roaming::Network;
 
 /// Makes and keeps links. Tests replace it.
@@ -201,7 +200,7 @@ impl LinkKeeper {
     }
 
     /// Judges the peer of a first link, and takes its claim and its place.
-    fn enter(
+    pub(crate) fn enter(
         &self,
         link: &AnyLink,
         request: &LinkRequest,
@@ -238,49 +237,5 @@ impl LinkKeeper {
     /// Decides which of two crossing links stays: that of the node with the lesser id.
     pub(crate) fn gives_way(&self, request: &LinkRequest, node: &NodeId) -> bool {
         request.hearsay && self.me > *node
-    }
-}
-
-impl KeepLink for LinkKeeper {
-    async fn keep_link(
-        &self,
-        mut target: watch::Receiver<DialTarget>,
-        request: &LinkRequest,
-        row: &StatusRow,
-    ) -> Outcome {
-        // Subscribe before dialling, since a later subscription could miss a change during this attempt.
-        let mut redial = self.redial.clone();
-        redial.mark_unchanged();
-        let network = self.network.onward();
-        let first = target.borrow_and_update().clone();
-        row.connecting(&first);
-        let DialledLink { link, url, passed } = match self.dial(&first).await {
-            Ok(dialled) => dialled,
-            Err(why) => return Outcome::Failed(why),
-        };
-        let (node, remote) = (link.peer().node_id, link.remote());
-        let (claim, _place) = match self.enter(&link, request) {
-            Ok(entered) => entered,
-            Err(why) => {
-                link.close(CloseReason::Goodbye);
-                return Outcome::Failed(why);
-            }
-        };
-        self.linked(&first, &url, &passed, &node, row);
-        let signals = Signals { target, redial, network };
-        let end = keep_renewed(link, url, signals, request, self, claim, row).await;
-        Outcome::Ended { remote, end }
-    }
-
-    async fn released(&self, node: &NodeId) {
-        self.claims.released(node).await;
-    }
-
-    fn network(&self) -> Network {
-        self.network.onward()
-    }
-
-    fn is_over(&self) -> bool {
-        self.core.is_closed()
     }
 }

@@ -15,7 +15,7 @@ use tokio::time::{Instant, sleep, timeout};
 
 use super::dns::DnsError;
 use super::local::Sighting;
-use super::srv::{SrvAnswer, SrvTarget};
+use super::srv_answer::{SrvAnswer, SrvTarget, TTL_MIN};
 use super::*;
 
 const SECOND: Duration = Duration::from_secs(1);
@@ -314,7 +314,7 @@ async fn dns_is_asked_again_when_all_targets_failed_but_not_more_often_than_it_m
     sleep(20 * SECOND).await;
     assert_eq!(world.up(), ["b"]);
     let asked = world.asked();
-    assert!(asked.windows(2).all(|two| two[1] - two[0] >= srv::TTL_MIN), "{asked:?}");
+    assert!(asked.windows(2).all(|two| two[1] - two[0] >= TTL_MIN), "{asked:?}");
     task.abort();
 }
 
