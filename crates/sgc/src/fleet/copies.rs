@@ -4,7 +4,6 @@
 
 use std::path::{Path, PathBuf};
 
-use bytes::Bytes;
 use clap::Args;
 use sgc_node::LockedFleet;
 use sgc_process::{ProcessError, unix_now};
@@ -12,6 +11,7 @@ use sgc_transport::LinkUrl;
 use sgc_trust::{CrlReport, Fleet, MergeReport, NodeName};
 use sgc_wire::{CRL_BYTES_MAX, UnixMillis};
 
+use super::heard_lists::say_behind;
 use super::keeping::{LIST_EXTENSION, list_path, push_crl, write_list};
 use super::{WhichFleet, fleet_here};
 use crate::error::CliError;
@@ -128,34 +128,6 @@ fn take_list(fleet: &mut Fleet, path: &Path, now: UnixMillis) -> Result<CrlRepor
     let anchors = anchors.map_err(|source| CliError::List { path: path.to_owned(), source })?;
     let absorbed = anchors.map_or(Ok(CrlReport::default()), |anchors| fleet.absorb(&anchors, now));
     absorbed.map_err(|source| CliError::Fleet { path: path.to_owned(), source })
-}
-
-/// Takes over the revocations of the lists that nodes have in force and reports them. Returns `true` if the fleet changed.
-pub(super) fn take_heard(file: &mut LockedFleet, heard: &[Bytes], now: UnixMillis) -> Result<bool, CliError> {
-    let mut anchors = file.fleet.anchors().clone();
-    for list in heard {
-        // Lists of partners' CAs are among them.
-        if let Ok(Some(more)) = anchors.with_crl(list, now) {
-            anchors = more;
-        }
-    }
-    let absorbed = file.fleet.absorb(&anchors, now).map_err(|source| file.error(source))?;
-    say_behind(file.path(), "a revocation list that nodes have", &absorbed);
-    Ok(absorbed != CrlReport::default())
-}
-
-fn say_behind(fleet: &Path, list: &str, absorbed: &CrlReport) {
-    let fleet = fleet.display();
-    let revoked = match &absorbed.revoked[..] {
-        [] if !absorbed.is_behind => return,
-        [] => String::new(),
-        nodes => format!(" It revokes {}, which {fleet} did not know and knows now.", nodes.join(", ")),
-    };
-    output::diagnostic(&format!(
-        "Note: another copy of {fleet} made {list}, so this copy is not the newest.{revoked} Nodes that the other copy \
-         enrolled or renewed may be missing here, and one that it enrolled again cannot be revoked here. Bring the \
-         other copy here and run: sgc fleet merge OTHER.fleet"
-    ));
 }
 
 /// Tells the user that another copy of the fleet file made a certificate.

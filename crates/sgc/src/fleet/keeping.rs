@@ -14,7 +14,7 @@ use sgc_trust::{EnrollRequest, Fleet, NodeName, pem_contents, pem_text};
 use sgc_wire::{RosterPage, RosterRow, UnixMillis};
 
 use super::remote::{FleetPlace, Remote};
-use super::{WhichFleet, copies};
+use super::{WhichFleet, heard_lists};
 use crate::error::CliError;
 use crate::files;
 use crate::{output, status};
@@ -284,7 +284,7 @@ pub(super) fn push_crl(
         }
     }
     let now = unix_now();
-    if copies::take_heard(file, &heard, now)? {
+    if heard_lists::take_heard(file, &heard, now)? {
         file.save()?;
         write_list(file, now)?;
     }

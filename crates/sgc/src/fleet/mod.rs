@@ -5,6 +5,7 @@
 mod copies;
 mod create;
 mod enroll;
+mod heard_lists;
 mod keeping;
 mod own_key;
 mod remote;
