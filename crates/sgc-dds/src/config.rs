@@ -68,7 +68,8 @@ pub const FRAGMENT_BYTES: u32 = 14_000;
 /// beyond stock socket buffers.
 pub const MESSAGE_BYTES_MAX: u32 = 14_720;
 
-/// Milliseconds from a write to the heartbeat that asks for acknowledgement, short for the same reason.
+/// Milliseconds from a write to the heartbeat that asks for acknowledgement, short for the same reason. Also the least
+/// time between two such heartbeats; Cyclone's default of 20 ms would delay the first.
 pub const HEARTBEAT_MS: u32 = 5;
 
 /// Milliseconds after which a reader asks again for a missing message without a heartbeat. A Fast DDS writer ignores
@@ -231,7 +232,7 @@ pub fn cyclone_config(config: &DdsConfig, instance: &Instance) -> Result<String,
          <General>{general}<MaxMessageSize>{MESSAGE_BYTES_MAX}B</MaxMessageSize>\
          <FragmentSize>{FRAGMENT_BYTES}B</FragmentSize></General>\
          <Discovery>{discovery}</Discovery>\
-         <Internal><HeartbeatInterval>{HEARTBEAT_MS} ms</HeartbeatInterval>\
+         <Internal><HeartbeatInterval minsched=\"{HEARTBEAT_MS} ms\">{HEARTBEAT_MS} ms</HeartbeatInterval>\
          <AutoReschedNackDelay>{ASK_AGAIN_MS} ms</AutoReschedNackDelay>\
          <SocketReceiveBufferSize min=\"default\" max=\"{RECEIVE_BUFFER_BYTES}B\"/>\
          <MaxSampleSize>{PAYLOAD_BYTES_MAX}B</MaxSampleSize>\
@@ -455,7 +456,7 @@ mod tests {
             let xml = xml(range, &[]);
             assert!(xml.contains("<FragmentSize>14000B</FragmentSize>"));
             assert!(xml.contains("<MaxMessageSize>14720B</MaxMessageSize>"));
-            assert!(xml.contains("<HeartbeatInterval>5 ms</HeartbeatInterval>"));
+            assert!(xml.contains("<HeartbeatInterval minsched=\"5 ms\">5 ms</HeartbeatInterval>"));
             assert!(xml.contains("<GenerateKeyhash>true</GenerateKeyhash>"));
             assert!(xml.contains("<AutoReschedNackDelay>500 ms</AutoReschedNackDelay>"));
             assert!(xml.contains("min=\"default\" max=\"8388608B\""));

@@ -11,6 +11,21 @@ use cyclors::{
 };
 use sgc_ros::Guid;
 
+/// `ddsrt_mtime_t` (`ddsrt/time.h`), nanoseconds.
+#[repr(C)]
+struct MonotonicTime(i64);
+
+// A function of Cyclone that `cyclors` has no binding for. `ddsrt/time.h`.
+unsafe extern "C" {
+    fn ddsrt_time_monotonic() -> MonotonicTime;
+}
+
+/// Returns the time of Cyclone's monotonic clock, in nanoseconds.
+pub(crate) fn monotonic_ns() -> i64 {
+    // SAFETY: takes nothing.
+    unsafe { ddsrt_time_monotonic() }.0
+}
+
 /// Cyclone's infinite duration.
 pub(crate) const INFINITE: i64 = i64::MAX;
 

@@ -34,7 +34,7 @@ use cyclors::{
     pthread_mutex_t,
 };
 
-use crate::entity::{Entity, check};
+use crate::entity::{Entity, check, monotonic_ns};
 use crate::identity::FAST_DDS;
 use crate::late_readers::{self, ProxyReaderState};
 use crate::manual_leases::{self, Lease};
@@ -173,7 +173,7 @@ struct ProtocolVersion {
 type EventCallback =
     unsafe extern "C" fn(gv: *mut c_void, event: *mut c_void, pack: *mut c_void, arg: *mut c_void, now: Time);
 
-// Functions of Cyclone that `cyclors` has no binding for. `ddsi__xmsg.h`, `ddsi__xevent.h`, `time.h`.
+// Functions of Cyclone that `cyclors` has no binding for. `ddsi__xmsg.h`, `ddsi__xevent.h`.
 #[allow(improper_ctypes)]
 unsafe extern "C" {
     fn ddsi_xmsgpool_new(version: ProtocolVersion) -> *mut c_void;
@@ -201,7 +201,6 @@ unsafe extern "C" {
         sync_on_delete: bool,
     ) -> *mut c_void;
     fn ddsi_delete_xevent(event: *mut c_void);
-    fn ddsrt_time_monotonic() -> Time;
 }
 
 /// The function `dds__builtin_write_endpoint` of Cyclone, which all its domains share.
@@ -413,7 +412,7 @@ unsafe extern "C" fn matched(
         let asking = AskArguments { reader, writer: writer.guid, to: writer.unicast, count };
         // SAFETY: the queue of events lives as long as the domain; the argument is copied.
         unsafe {
-            let at = Time(ddsrt_time_monotonic().0.saturating_add(delay_ns));
+            let at = Time(monotonic_ns().saturating_add(delay_ns));
             let arg = (&raw const asking).cast();
             ddsi_qxev_callback(writer.events, at, ask, arg, size_of::<AskArguments>(), false);
         }

@@ -28,6 +28,10 @@ use crate::sample::{Extra, SampleRef};
 use crate::wait::{READERS_MATCHED, wait_for_status};
 use crate::writer_inside::WriterInside;
 
+/// Requests for acknowledgement while a writer writes as many samples as it keeps, so that they come before it has to
+/// wait for them.
+const ASKED_PER_KEPT: u32 = 4;
+
 /// Latest source timestamp that RTPS can express, in nanoseconds since the Unix epoch: seconds have 32 bits (RTPS
 /// 2.5, 9.3.2.1).
 const TIMESTAMP_MAX_NS: i64 = 4_294_967_295_999_999_999;
@@ -303,10 +307,16 @@ impl RosWriter for CycloneWriter {
         if key_hash.is_none() && !self.keyless {
             return Err(RosError::KeyUnknown);
         }
+        let number = self.written.fetch_add(1, Ordering::Relaxed);
         let instance = match (&self.keys, &key_hash) {
             (Some(keys), Some(hash)) => lock(keys).instance(hash),
-            _ => self.written.fetch_add(1, Ordering::Relaxed) % self.instances(payload.len()),
+            _ => number % self.instances(payload.len()),
         };
+        let asks = self.kept(payload.len()).is_some_and(|kept| number.is_multiple_of((kept / ASKED_PER_KEPT).max(1)));
+        let asked = if asks { WriterInside::find(self.writer.handle(), self.topic.handle()) } else { None };
+        if let Some(inside) = &asked {
+            inside.ask_for_acknowledgement();
+        }
 
         let mut sertype = std::ptr::null();
         // SAFETY: the handle is checked by Cyclone, and `sertype` is a valid place for the result.
@@ -321,6 +331,9 @@ impl RosWriter for CycloneWriter {
         let started = Instant::now();
         // SAFETY: the sample is valid and of the writer's type; the call consumes the reference.
         let ret = unsafe { dds_forwardcdr(self.writer.handle(), sample.into_raw()) };
+        if let Some(inside) = asked {
+            inside.await_acknowledgement();
+        }
         match ret {
             DDS_RETCODE_TIMEOUT => {
                 Err(RosError::WriteTimeout { waited_ms: started.elapsed().as_millis() as u64 })

@@ -8,6 +8,8 @@ use std::ops::Range;
 
 use cyclors::{dds_entity_t, dds_get_entity_sertype, dds_get_guid, dds_guid_t};
 
+use crate::entity::monotonic_ns;
+
 // Functions of Cyclone that `cyclors` has no binding for. `dds__entity.h`, `ddsrt/sync.h`, `ddsi__endpoint.h`.
 unsafe extern "C" {
     fn dds_entity_pin(handle: dds_entity_t, entity: *mut *mut c_void) -> c_int;
@@ -28,6 +30,43 @@ const TOPIC_TO_CACHE: usize = 3;
 /// Bytes from the beginning of `struct ddsi_writer` to its GUID and to its lock (`struct ddsi_entity_common`).
 const ENTITY_GUID: usize = 4;
 const ENTITY_LOCK: usize = 48;
+
+/// The words of `struct ddsi_writer` among which [`Progress`] is. The exact place depends on the platform's mutexes.
+const PROGRESS_WORDS: Range<usize> = 24..56;
+/// Most samples that are written and not sent yet, of those that are written together.
+const UNSENT_MAX: u64 = 1 << 16;
+
+/// Time in which Fast DDS answers a heartbeat (`heartbeatResponseDelay`, 5 ms), with a reserve, nanoseconds.
+const ANSWER_NS: i64 = 7_000_000;
+
+/// `seq` and the fields behind it in `struct ddsi_writer` (`ddsi_endpoint.h`), with `struct ddsi_hbcontrol`. Times are
+/// monotonic, in nanoseconds.
+#[repr(C)]
+struct Progress {
+    written: u64,
+    sent: u64,
+    reject: u64,
+    heartbeats: [u32; 2],
+    throttling: c_int,
+    last_write: i64,
+    last_heartbeat: i64,
+    last_request: i64,
+    next_heartbeat: i64,
+}
+
+impl Progress {
+    /// Returns `true` for the state of a writer that has written so many samples.
+    fn is_of(&self, written: u64, now: i64) -> bool {
+        self.written == written
+            && self.sent <= written
+            && written - self.sent <= UNSENT_MAX
+            && matches!(self.throttling, 0 | 1)
+            && (1..=now).contains(&self.last_write)
+            && (0..=now + ANSWER_NS).contains(&self.last_heartbeat)
+            && (0..=now).contains(&self.last_request)
+            && self.next_heartbeat > 0
+    }
+}
 
 /// `struct ddsi_whc_ops` (`ddsi_whc.h`) up to its fourth function.
 #[repr(C)]
@@ -154,6 +193,37 @@ impl WriterInside {
         // SAFETY: Cyclone's own function on the cache of a writer that lives, whose lock is held.
         unsafe { ((*(*self.cache).ops).state)(self.cache, &mut state) };
         state.max.saturating_sub(self.acknowledged(&lock))
+    }
+
+    /// Makes the next sample carry a heartbeat that readers answer with an acknowledgement. Cyclone asks for one after a
+    /// pause of 4 ms only, so a writer that never pauses hears none.
+    pub(crate) fn ask_for_acknowledgement(&self) {
+        // The time of the last write is used for nothing else.
+        self.change_progress(|progress, _| progress.last_write = 1);
+    }
+
+    /// Sends no heartbeat for a moment after one that asks for an acknowledgement. Fast DDS answers 5 ms later, and not at
+    /// all if a heartbeat that asks for nothing comes in between (`WriterProxy::process_heartbeat`).
+    pub(crate) fn await_acknowledgement(&self) {
+        self.change_progress(|progress, now| progress.last_heartbeat = now + ANSWER_NS);
+    }
+
+    /// Changes the progress, unless nothing is unacknowledged or this Cyclone is not the one that this was written for.
+    fn change_progress(&self, change: impl FnOnce(&mut Progress, i64)) {
+        let _lock = self.lock();
+        let mut state = CacheState::default();
+        // SAFETY: as above. The structure is longer than what is looked at, any content is a valid value, and the lock is
+        // held by all who change it.
+        unsafe {
+            ((*(*self.cache).ops).state)(self.cache, &mut state);
+            let now = monotonic_ns();
+            let at = |word: usize| self.ddsi_writer.cast::<u64>().add(word).cast::<Progress>();
+            let mut places = PROGRESS_WORDS.map(at);
+            let found = places.find(|progress| state.max > 0 && (**progress).is_of(state.max, now));
+            if let Some(progress) = found {
+                change(&mut *progress, now);
+            }
+        }
     }
 
     /// Returns the history cache.

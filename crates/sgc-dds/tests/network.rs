@@ -472,6 +472,25 @@ fn samples_that_readers_have_acknowledged_are_not_counted() {
 }
 
 #[test]
+fn readers_acknowledge_while_a_writer_never_pauses() {
+    const SAMPLES: u32 = 1000;
+    let (ros, sgc) = (open(164, None), open(164, Some("arm-1")));
+    let spec = with(spec("steady"), |qos| qos.history = History::KeepLast(10));
+    let writer = sgc.create_writer(&spec).unwrap();
+    let _reader = read(&ros, &spec);
+    matched(&writer, 1);
+    assert_eq!(writer.kept(10), Some(1024));
+    let mut most = 0;
+    for i in 0..SAMPLES {
+        write(&writer, &string_cdr(&i.to_string()));
+        std::thread::sleep(Duration::from_micros(200));
+        most = most.max(writer.unacknowledged().unwrap());
+    }
+    // It asks four times while it writes as many samples as it keeps.
+    assert!(most < SAMPLES / 2, "{most} of {SAMPLES}");
+}
+
+#[test]
 fn late_joiners_get_history_of_the_depth_asked_for() {
     let (ros, sgc) = (open(80, None), open(80, Some("arm-1")));
     let latched = |depth| {
