@@ -312,7 +312,9 @@ impl RosWriter for CycloneWriter {
             (Some(keys), Some(hash)) => lock(keys).instance(hash),
             _ => number % self.instances(payload.len()),
         };
-        let asks = self.kept(payload.len()).is_some_and(|kept| number.is_multiple_of((kept / ASKED_PER_KEPT).max(1)));
+        let asks = self
+            .kept(payload.len())
+            .is_some_and(|kept| number.is_multiple_of((kept / ASKED_PER_KEPT).max(1)));
         let asked = if asks { WriterInside::find(self.writer.handle(), self.topic.handle()) } else { None };
         if let Some(inside) = &asked {
             inside.ask_for_acknowledgement();
