@@ -23,8 +23,8 @@ use crate::control::type_jobs::TypeOutcome;
 use crate::data::dataplane::DataPlane;
 use crate::data::message_keys::MessageKeys;
 use crate::data::outflow::OutFlow;
-use crate::data::sinks::WriterQueue;
 use crate::data::tap::{Tap, TapError, TapRequest};
+use crate::data::writer_queue::WriterQueue;
 use crate::link::control_tx::ControlTx;
 
 /// Events that may wait for the control task. Senders wait while it is full.

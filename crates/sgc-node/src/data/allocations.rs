@@ -22,9 +22,10 @@ use tokio::sync::mpsc;
 
 use crate::data::dataplane::{DataPlane, Forward, Out};
 use crate::data::outflow::OutFlow;
-use crate::data::sinks::{LocalSink, WriterInfo, WriterQueue};
+use crate::data::sinks::LocalSink;
 use crate::data::sources::{LocalShare, SourceMap, SourceSlot};
 use crate::data::stats::Drops;
+use crate::data::writer_queue::{WriterInfo, WriterQueue};
 
 #[global_allocator]
 static COUNTING: CountingAllocator = CountingAllocator;

@@ -19,9 +19,9 @@ use tokio::sync::Notify;
 use tracing::{debug, warn};
 
 use crate::data::call_ledger::{CallLedger, CallerId};
-use crate::data::sinks::failure_key;
 use crate::data::sources::{IsTooLarge, LocalShare};
 use crate::data::stats::Drops;
+use crate::data::writer_queue::failure_key;
 
 /// Longest wait of a message about a call for its local endpoint.
 const ENDPOINT_WAIT: Duration = Duration::from_secs(10);

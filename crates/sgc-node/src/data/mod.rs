@@ -6,6 +6,7 @@ pub(crate) mod assertions;
 #[cfg(feature = "benchmarks")]
 #[doc(hidden)]
 pub mod benchmarks;
+mod burst;
 pub(crate) mod call_ledger;
 pub(crate) mod calls;
 pub(crate) mod conversion;
@@ -22,3 +23,4 @@ pub(crate) mod sources;
 pub(crate) mod spacing;
 pub(crate) mod stats;
 pub(crate) mod tap;
+pub(crate) mod writer_queue;

@@ -22,8 +22,9 @@ use crate::data::assertions;
 use crate::data::dataplane::{Forward, Out};
 use crate::data::manual_lease::ManualLease;
 use crate::data::outflow::{self, OUTFLOW_AGE_MAX, OutFlow};
-use crate::data::sinks::{LocalSink, WriterQueue};
+use crate::data::sinks::LocalSink;
 use crate::data::sources::{LocalShare, Publisher, SourceMap, SourceSlot};
+use crate::data::writer_queue::WriterQueue;
 
 /// Least bytes of recovery kept for one of a topic's many publishers.
 const RECOVERY_BYTES_MIN: usize = 1 << 20;

@@ -14,7 +14,8 @@ use crate::admin::graph::{LostCalls, ServiceCalls};
 use crate::control::event::{CoreEvent, ServiceEnd};
 use crate::data::call_ledger::{CallLedger, CallerId, LEDGERS_MAX};
 use crate::data::calls::{Answers, Calls, FarService, LocalService, Requests};
-use crate::data::sinks::{LocalSink, WriterInfo, WriterQueue};
+use crate::data::sinks::LocalSink;
+use crate::data::writer_queue::{WriterInfo, WriterQueue};
 
 impl<N: RosNetwork> Core<N> {
     /// Starts a shared service. Incoming messages are calls, not messages of publishers.

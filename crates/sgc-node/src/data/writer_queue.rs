@@ -1,0 +1,581 @@
+//! The queue in front of a local writer, and the thread that writes.
+//!
+//! Writing may block, so each local writer has a thread behind a bounded queue. If the writer cannot block and its queue
+//! is empty, the receiving task writes a short message itself. [`crate::data::sinks`] opens packets and chooses the
+//! queue; [`crate::data::burst`] paces the writes.
+
+use std::collections::VecDeque;
+use std::num::NonZeroU64;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, MutexGuard};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use arc_swap::ArcSwapOption;
+use sgc_endpoint::{Decompressor, Message};
+use sgc_ros::{
+    EndpointSpec, Guid, RosError, RosWriter, SampleHead, SampleKind, Shaping, for_all_instances,
+    prefix_frames,
+};
+use sgc_session::Shaper;
+use sgc_sync::lock;
+use sgc_wire::{History, KEY_HASH_BYTES, Liveliness, MessageHead, MessageKind, PayloadForm};
+use tokio::sync::mpsc;
+use tokio::time::{sleep_until, timeout_at};
+use tracing::warn;
+
+use crate::data::burst::Burst;
+use crate::data::conversion::{self, TypeSlot};
+use crate::data::queue::{PushError, Queue};
+use crate::data::stats::{DataDrop, Drops};
+
+/// Most messages that wait for one local writer.
+pub(crate) const WRITER_MESSAGES_MAX: usize = 1024;
+/// Most bytes that wait for one local writer.
+const WRITER_BYTES_MAX: usize = 64 << 20;
+/// Most delay of a wake-up of a writer's thread; Linux's default is 50 µs.
+const TIMER_SLACK_NS: u64 = 1_000;
+/// Messages of a transient-local writer that are remembered, to recognise repetitions.
+const RECENT_MAX: usize = 4096;
+/// The longest message that the receiving task writes itself.
+pub(crate) const AT_ONCE_BYTES_MAX: usize = 16 << 10;
+/// Least time between two liveliness assertions of a writer. It is shorter than any lease that is asserted.
+const ASSERTION_SPACING: Duration = Duration::from_millis(20);
+/// Longest time that a local writer may block the network.
+const WRITER_PATIENCE: Duration = Duration::from_secs(5);
+
+/// The queue in front of a local writer's thread.
+pub(crate) struct WriterQueue {
+    queue: Queue<Message>,
+    shaper: Mutex<Shaper>,
+    /// Whether no shaping is configured, readable without the lock.
+    is_unshaped: AtomicBool,
+    /// Held by the thread from before it takes a message until it has consumed it, so that no other message overtakes.
+    take: Mutex<MessageConsumer>,
+    info: WriterInfo,
+    /// Whether liveliness was asserted just now, or is being asserted.
+    is_asserted: Arc<AtomicBool>,
+    /// Closed once the thread has consumed everything.
+    thread: mpsc::Sender<()>,
+}
+
+/// Prefix of frame names, if there is one. Writers share it.
+pub(crate) type FramePrefix = Arc<ArcSwapOption<String>>;
+
+/// State of the queue behind a message that is taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum NextMessage {
+    /// The queue is empty.
+    Nothing,
+    /// The next message waits for its time.
+    Later,
+    /// The next message follows at once.
+    AtOnce,
+    /// The next message follows at once, and the queue is closed: messages of another writer wait for it.
+    Last,
+}
+
+impl NextMessage {
+    /// Returns `true` if the next message is taken without a pause.
+    fn is_at_once(self) -> bool {
+        matches!(self, Self::AtOnce | Self::Last)
+    }
+}
+
+/// Consumes the messages of a queue one by one.
+type MessageConsumer = Box<dyn FnMut(Message, NextMessage) + Send>;
+
+/// Properties of the writer behind a queue.
+pub(crate) struct WriterInfo {
+    guid: Guid,
+    recent: Option<Mutex<Recent>>,
+    /// Returns the number of matched local readers.
+    matched: Box<dyn Fn() -> u32 + Send + Sync>,
+    /// Returns `true` if a short message can be written now without blocking and without overwriting one that a reader
+    /// may lack.
+    is_free: Box<dyn Fn(&Message) -> bool + Send + Sync>,
+    /// Sets the number of messages that late joiners get. May block.
+    resize: Box<dyn Fn(u32) + Send + Sync>,
+    /// Asserts liveliness without a message, if it is manual by topic. May block.
+    assert: Option<Box<dyn Fn() + Send + Sync>>,
+}
+
+impl Default for WriterInfo {
+    fn default() -> Self {
+        Self {
+            guid: Guid([0; 16]),
+            recent: None,
+            matched: Box::new(|| 0),
+            is_free: Box::new(|_| false),
+            resize: Box::new(|_| ()),
+            assert: None,
+        }
+    }
+}
+
+/// Heads of the messages that a transient-local writer wrote last, as many as late joiners get.
+struct Recent {
+    depth: usize,
+    heads: VecDeque<MessageHead>,
+    /// Whether messages may repeat: they come from the history of a source that replaced another.
+    again: bool,
+}
+
+impl Recent {
+    fn new(spec: &EndpointSpec) -> Option<Mutex<Self>> {
+        let history = spec.qos.history;
+        let depth = match if spec.keyless { history } else { for_all_instances(history) } {
+            _ if !spec.qos.is_transient_local() => return None,
+            History::KeepAll => RECENT_MAX,
+            History::KeepLast(n) => (n as usize).min(RECENT_MAX),
+        };
+        Some(Mutex::new(Self { depth, heads: VecDeque::new(), again: false }))
+    }
+
+    fn keep(&mut self, depth: usize) {
+        self.depth = depth.clamp(1, RECENT_MAX);
+        self.heads.drain(..self.heads.len().saturating_sub(self.depth));
+    }
+}
+
+impl WriterQueue {
+    /// Starts the thread. It ends, and the writer with it, once the queue is closed and empty. `frames` applies to tf
+    /// messages, `types` to messages that arrive as JSON.
+    pub(crate) fn spawn<W: RosWriter>(
+        writer: W,
+        spec: &EndpointSpec,
+        shaping: Shaping,
+        frames: Option<FramePrefix>,
+        types: Arc<TypeSlot>,
+        failures: Arc<Drops>,
+        alive: mpsc::Sender<()>,
+    ) -> std::io::Result<Arc<Self>> {
+        let (counted, topic) = (failures.clone(), spec.topic.clone());
+        let in_topic = topic.clone();
+        let writer = Arc::new(writer);
+        // Only the thread owns the writer, so the writer is dropped where it may block.
+        let weak = Arc::downgrade(&writer);
+        let mut burst = Burst::default();
+        // Cyclone's writers block only if they have to keep all samples until they are acknowledged.
+        let never_blocks = !spec.qos.is_reliable() || matches!(spec.qos.history, History::KeepLast(_));
+        let (room, of_room) = (burst.room.clone(), weak.clone());
+        let is_free = Box::new(move |message: &Message| {
+            let (bytes, published_ns) = (message.payload.len(), message.head.source_timestamp_ns);
+            never_blocks
+                && room.spacing().wait(Instant::now(), message.source, published_ns).is_none()
+                && of_room.upgrade().is_some_and(|writer| room.is_there(&*writer, bytes, published_ns))
+        });
+        let to_resize = weak.clone();
+        let resize = Box::new(move |depth| {
+            if let Some(writer) = to_resize.upgrade() {
+                writer.set_late_depth(depth);
+            }
+        });
+        let to_assert = weak.clone();
+        let assert = Box::new(move || {
+            if let Some(writer) = to_assert.upgrade() {
+                writer.assert_liveliness();
+            }
+        });
+        let is_manual = spec.qos.liveliness == Liveliness::ManualByTopic && spec.qos.lease_ns.is_some();
+        let assert = is_manual.then_some(assert as Box<dyn Fn() + Send + Sync>);
+        let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
+        let info =
+            WriterInfo { guid: writer.guid(), recent: Recent::new(spec), matched, is_free, resize, assert };
+        let (mut decompressor, offered) = (Decompressor::default(), spec.qos.representations);
+        let mut prepare = move |message: Message| {
+            let mut key_hash = None;
+            let kind = match message.head.kind {
+                MessageKind::Write => SampleKind::Write,
+                MessageKind::Dispose => SampleKind::Dispose,
+                MessageKind::Unregister => SampleKind::Unregister,
+                // Topics carry no calls.
+                _ => return None,
+            };
+            let payload = match decompressor.decompress(message.head.encoding, message.payload) {
+                Ok(payload) => payload,
+                Err(error) => {
+                    if counted.count("decompress") {
+                        warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
+                    }
+                    return None;
+                }
+            };
+            let payload = match message.head.form {
+                PayloadForm::Cdr => payload,
+                PayloadForm::KeyedCdr => {
+                    let Some(hash) = payload.first_chunk::<KEY_HASH_BYTES>().copied() else {
+                        counted.count("key_hash");
+                        return None;
+                    };
+                    key_hash = Some(hash);
+                    payload.slice(KEY_HASH_BYTES..)
+                }
+                PayloadForm::Json => {
+                    let known = types.now();
+                    let Some(layout) = known.layout() else {
+                        // The type was known when the message was queued.
+                        counted.count("json_unknown_type");
+                        return None;
+                    };
+                    match conversion::from_json(layout, &payload, offered) {
+                        Ok(payload) => payload,
+                        Err(error) => {
+                            if counted.count("json_refused") {
+                                warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
+                            }
+                            return None;
+                        }
+                    }
+                }
+            };
+            let prefix = frames.as_ref().and_then(|frames| frames.load_full());
+            let payload = match prefix.filter(|_| kind == SampleKind::Write) {
+                None => payload,
+                Some(prefix) => match prefix_frames(&payload, &prefix) {
+                    Ok(rewritten) => rewritten.into(),
+                    Err(error) => {
+                        if counted.count("frames") {
+                            warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
+                        }
+                        return None;
+                    }
+                },
+            };
+            let source_timestamp_ns = message.head.source_timestamp_ns;
+            Some((SampleHead { kind, source_timestamp_ns, key_hash }, payload))
+        };
+        let refused = failures.clone();
+        Self::spawn_with("sgc-write", info, shaping, failures, alive, move |message, next| {
+            let source = message.source;
+            let Some((head, payload)) = prepare(message) else {
+                return if !next.is_at_once() {
+                    writer.flush()
+                };
+            };
+            if next != NextMessage::Last {
+                burst.room.space(&*writer, source, head.source_timestamp_ns);
+            }
+            burst.before_next(
+                &*writer,
+                next == NextMessage::Nothing,
+                payload.len(),
+                head.source_timestamp_ns,
+            );
+            let written = writer.write_ahead(head, payload);
+            if !next.is_at_once() {
+                writer.flush();
+            }
+            if let Err(error) = written
+                && refused.count(failure_key(&error))
+            {
+                warn!(%topic, %error, "a message could not be given to the local network; counted from here on");
+            }
+        })
+    }
+
+    /// Starts a queue with another consumer, which also learns the state of the queue behind each message. The consumer
+    /// may block, except for a short message that `info` declares free.
+    pub(crate) fn spawn_with(
+        thread_name: &str,
+        info: WriterInfo,
+        shaping: Shaping,
+        drops: Arc<Drops>,
+        alive: mpsc::Sender<()>,
+        take: impl FnMut(Message, NextMessage) + Send + 'static,
+    ) -> std::io::Result<Arc<Self>> {
+        let mut shaper = Shaper::default();
+        shaper.set(shaping);
+        let (running, in_thread) = mpsc::channel(1);
+        let this = Arc::new(Self {
+            queue: Queue::new(WRITER_MESSAGES_MAX),
+            shaper: shaper.into(),
+            is_unshaped: AtomicBool::new(shaping == Shaping::default()),
+            take: Mutex::new(Box::new(take)),
+            info,
+            is_asserted: Arc::default(),
+            thread: running,
+        });
+        let (task, runtime) = (this.clone(), tokio::runtime::Handle::current());
+        thread::Builder::new().name(thread_name.into()).spawn(move || {
+            let _alive = alive;
+            // Without it, the pauses of a burst overrun by as much as they are long.
+            let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(TIMER_SLACK_NS));
+            while runtime.block_on(task.queue.wait()) {
+                let mut take = lock(&task.take);
+                let mut behind = None;
+                while let Some(message) = runtime.block_on(task.next(&mut behind, &drops)) {
+                    let next = match behind.is_none() && task.queue.is_empty() {
+                        true => NextMessage::Nothing,
+                        false if task.queue.is_closed() => NextMessage::Last,
+                        false if task.is_unshaped.load(Relaxed) => NextMessage::AtOnce,
+                        false => NextMessage::Later,
+                    };
+                    take(message, next);
+                }
+            }
+            drop(in_thread);
+            // Dropping the consumer drops a writer, which may block.
+            let end: MessageConsumer = Box::new(|_, _| ());
+            drop(std::mem::replace(&mut *lock(&task.take), end));
+        })?;
+        Ok(this)
+    }
+
+    /// Returns the consumer if it takes a message now without blocking and the queue is empty. Only one caller queues
+    /// at a time.
+    fn at_once(&self, message: &Message) -> Option<MutexGuard<'_, MessageConsumer>> {
+        let may = message.payload.len() <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
+        let take = if may { self.take.try_lock().ok() } else { None };
+        take.filter(|_| self.queue.is_empty() && !self.queue.is_closed() && (self.info.is_free)(message))
+    }
+
+    /// Writes a message on the caller's thread if `may_write` and nothing is ahead of it, or queues it. Returns the
+    /// number of evicted messages, or the message if it has to wait for room.
+    pub(crate) fn try_push(&self, message: Message, may_write: bool) -> Result<u64, Message> {
+        let (bytes, head) = (message.payload.len(), message.head);
+        let mut evicted = 0;
+        let at_once = may_write.then(|| self.at_once(&message)).flatten();
+        if let Some(mut take) = at_once {
+            take(message, NextMessage::Nothing);
+        } else if message.reliable {
+            self.queue.try_push(message, bytes, WRITER_BYTES_MAX)?;
+        } else {
+            self.queue.push_evicting(message, bytes, WRITER_BYTES_MAX, |_| evicted += 1);
+        }
+        self.remember(&head);
+        Ok(evicted)
+    }
+
+    /// Queues a message once there is room. Fails if there is none for too long.
+    pub(crate) async fn push(&self, message: Message) -> Result<(), PushError> {
+        let (bytes, head) = (message.payload.len(), message.head);
+        self.queue.push(message, bytes, WRITER_BYTES_MAX, WRITER_PATIENCE).await?;
+        self.remember(&head);
+        Ok(())
+    }
+
+    /// Returns the number of matched local readers.
+    pub(crate) fn matched(&self) -> u32 {
+        (self.info.matched)()
+    }
+
+    /// Returns the writer's GUID.
+    pub(crate) fn guid(&self) -> Guid {
+        self.info.guid
+    }
+
+    /// Sets the limits of rate, bandwidth and age.
+    pub(crate) fn set_shaping(&self, shaping: Shaping) {
+        self.is_unshaped.store(shaping == Shaping::default(), Relaxed);
+        self.shaper().set(shaping);
+    }
+
+    /// Waits for the time of the next message and returns it, or the newest one if later messages replace it. `behind`
+    /// is a message that was taken after it and must not overtake it.
+    async fn next(&self, behind: &mut Option<Message>, drops: &Drops) -> Option<Message> {
+        let mut message = match behind.take() {
+            Some(message) => message,
+            None => self.queue.try_pop()?,
+        };
+        loop {
+            let now = Instant::now();
+            let (due, gives_way) = {
+                let mut shaper = self.shaper();
+                let is_shaped = message.head.kind == MessageKind::Write;
+                if !is_shaped || shaper.is_due(now) || self.queue.is_closed() {
+                    if is_shaped {
+                        shaper.takes(now, message.payload.len());
+                    }
+                    return Some(message);
+                }
+                (shaper.due().unwrap_or(now), shaper.gives_way(now, message.reliable))
+            };
+            if !gives_way {
+                sleep_until(due.into()).await;
+                continue;
+            }
+            match timeout_at(due.into(), self.queue.pop()).await {
+                Ok(Some(newer)) if newer.head.kind == MessageKind::Write => {
+                    drops.count(DataDrop::Thinned.key());
+                    message = newer;
+                }
+                // The end of an instance is never skipped, nor is the message before it.
+                Ok(Some(end)) => {
+                    *behind = Some(end);
+                    return Some(message);
+                }
+                Ok(None) => return Some(message),
+                Err(_) => {}
+            }
+        }
+    }
+
+    /// Sets the number of messages that late joiners get. May block.
+    pub(crate) fn resize(&self, depth: u32) {
+        self.with_recent(|recent| recent.keep(depth as usize));
+        (self.info.resize)(depth);
+    }
+
+    /// Asserts the writer's liveliness, at most once in [`ASSERTION_SPACING`].
+    pub(crate) fn assert_liveliness(self: &Arc<Self>) {
+        if self.info.assert.is_none() || self.is_asserted.swap(true, Relaxed) {
+            return;
+        }
+        let (this, is_asserted) = (self.clone(), self.is_asserted.clone());
+        tokio::spawn(async move {
+            let assert = move || this.info.assert.as_ref().map(|assert| assert());
+            let _ = tokio::task::spawn_blocking(assert).await;
+            tokio::time::sleep(ASSERTION_SPACING).await;
+            is_asserted.store(false, Relaxed);
+        });
+    }
+
+    /// Expects repetitions of written messages from here on.
+    pub(crate) fn begin_again(&self) {
+        self.with_recent(|recent| recent.again = true);
+    }
+
+    /// Returns `true` if a message was written before. Its time stamp tells, since a publisher never uses one twice.
+    /// After the first new message, all are new.
+    pub(crate) fn has_written(&self, head: &MessageHead) -> bool {
+        let is_known = |recent: &mut Recent| {
+            let is_it =
+                |h: &MessageHead| h.kind == head.kind && h.source_timestamp_ns == head.source_timestamp_ns;
+            recent.again = recent.again && recent.heads.iter().any(is_it);
+            recent.again
+        };
+        self.with_recent(is_known).unwrap_or(false)
+    }
+
+    fn remember(&self, head: &MessageHead) {
+        self.with_recent(|recent| {
+            if recent.heads.len() >= recent.depth {
+                recent.heads.pop_front();
+            }
+            recent.heads.push_back(*head);
+        });
+    }
+
+    /// Returns `None` if the publisher keeps nothing for late joiners.
+    fn with_recent<T>(&self, look: impl FnOnce(&mut Recent) -> T) -> Option<T> {
+        let recent = self.info.recent.as_ref()?;
+        Some(look(&mut lock(recent)))
+    }
+
+    fn shaper(&self) -> std::sync::MutexGuard<'_, Shaper> {
+        lock(&self.shaper)
+    }
+
+    /// Closes the queue. The thread ends after it is empty.
+    pub(crate) fn close(&self) {
+        self.queue.close();
+    }
+
+    /// Waits until the thread has consumed everything.
+    pub(crate) async fn ended(&self) {
+        self.thread.closed().await;
+    }
+}
+
+/// Returns a short, stable name of a failure for counters.
+pub(crate) fn failure_key(error: &RosError) -> &'static str {
+    match error {
+        RosError::Payload { .. } => "write_payload",
+        RosError::WriteTimeout { .. } => "write_timeout",
+        RosError::NoPeer { .. } => "no_local_peer",
+        RosError::KeyUnknown => "key_unknown",
+        _ => "write_failed",
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+
+    use sgc_wire::SourceId;
+
+    use super::*;
+
+    /// Number and thread of each written message.
+    pub(crate) type WriteLog = Arc<Mutex<Vec<(u64, thread::ThreadId)>>>;
+
+    /// Creates a queue that records the thread of each message. Each write lasts until the gate opens.
+    pub(crate) fn noting(gate: &Arc<Mutex<()>>) -> (Arc<WriterQueue>, WriteLog) {
+        let taken = WriteLog::default();
+        let (note, gate) = (taken.clone(), gate.clone());
+        let queue = taking(move |message, _| {
+            drop(gate.lock().unwrap());
+            note.lock().unwrap().push((message.seq, thread::current().id()));
+        });
+        (queue, taken)
+    }
+
+    pub(crate) fn taking(take: impl FnMut(Message, NextMessage) + Send + 'static) -> Arc<WriterQueue> {
+        let info = WriterInfo { is_free: Box::new(|_| true), ..WriterInfo::default() };
+        let (alive, _) = mpsc::channel(1);
+        WriterQueue::spawn_with("test", info, Shaping::default(), Arc::default(), alive, take).unwrap()
+    }
+
+    pub(crate) fn message(seq: u64, bytes: usize) -> Message {
+        let head = MessageHead::new(MessageKind::Write, 1);
+        Message { source: SourceId([1; 16]), seq, head, reliable: true, payload: vec![0; bytes].into() }
+    }
+
+    /// Queues a message as a sink does.
+    fn give(queue: &WriterQueue, message: Message) {
+        assert_eq!(queue.try_push(message, true), Ok(0));
+    }
+
+    /// Waits until `is_so`, with a bound.
+    pub(crate) async fn wait_until(is_so: impl Fn() -> bool) {
+        let begun = Instant::now();
+        while !is_so() {
+            assert!(begun.elapsed() < Duration::from_secs(20), "it does not come");
+            tokio::task::yield_now().await;
+        }
+    }
+
+    #[tokio::test]
+    async fn liveliness_of_a_writer_is_asserted_once_in_a_while() {
+        let count = Arc::new(AtomicUsize::new(0));
+        let counted = count.clone();
+        let assert = Box::new(move || {
+            counted.fetch_add(1, Relaxed);
+        });
+        let info = WriterInfo { assert: Some(assert), ..WriterInfo::default() };
+        let (alive, _) = mpsc::channel(1);
+        let (shaping, drops) = (Shaping::default(), Arc::default());
+        let queue = WriterQueue::spawn_with("test", info, shaping, drops, alive, |_, _| ()).unwrap();
+        let begun = Instant::now();
+        wait_until(|| {
+            queue.assert_liveliness();
+            count.load(Relaxed) == 3
+        })
+        .await;
+        assert!(begun.elapsed() >= 2 * ASSERTION_SPACING);
+        queue.close();
+    }
+
+    #[tokio::test]
+    async fn receiving_task_writes_a_message_unless_others_are_ahead() {
+        let gate = Arc::default();
+        let (queue, taken) = noting(&gate);
+        give(&queue, message(0, 16));
+        assert_eq!(*taken.lock().unwrap(), [(0, thread::current().id())]);
+        let is_stuck = gate.lock().unwrap();
+        // The thread writes the long message, and later ones do not overtake it.
+        give(&queue, message(1, AT_ONCE_BYTES_MAX + 1));
+        (2..100).for_each(|seq| give(&queue, message(seq, 16)));
+        drop(is_stuck);
+        let begun = Instant::now();
+        while taken.lock().unwrap().len() < 100 {
+            assert!(begun.elapsed() < Duration::from_secs(20));
+            thread::yield_now();
+        }
+        let taken = taken.lock().unwrap();
+        assert!(taken.iter().map(|(seq, _)| *seq).eq(0..100));
+        assert!(taken[1..].iter().all(|(_, by)| *by != thread::current().id()));
+        queue.close();
+    }
+}
