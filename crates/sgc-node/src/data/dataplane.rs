@@ -17,7 +17,7 @@ use crate::control::peer_rate::PeerRates;
 use crate::data::outflow::OutFlow;
 use crate::data::pending::PendingBytes;
 use crate::data::sinks::LocalSink;
-use crate::data::stats::{CountDrops, DataDrop, Drops, NameStats};
+use crate::data::stats::{CountDrops, DataDrop, Dropped, Drops, NameStats};
 
 /// Number of tables over which names are spread, so that a change copies only a part.
 const SHARDS: usize = 64;
@@ -150,15 +150,15 @@ impl DataPlane {
 
     async fn send(&self, ingress: LinkId, forward: &Forward, out: &Out, packet: Packet) {
         let name = packet.header.name;
-        let dropped = match out {
+        let written = match out {
             Out::Link(flow, activity) => {
                 activity.note();
                 flow.push(packet).await
             }
             Out::Local(sink) => sink.deliver(packet, &self.drops).await,
         };
-        if let Some((reason, n)) = dropped {
-            forward.stats.dropped.fetch_add(n, Relaxed);
+        if let Err(Dropped { reason, messages }) = written {
+            forward.stats.dropped.fetch_add(messages, Relaxed);
             self.count(ingress, &name, reason);
         }
     }

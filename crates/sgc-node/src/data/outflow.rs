@@ -15,7 +15,7 @@ use tracing::debug;
 
 use crate::data::labels::NameLabel;
 use crate::data::queue::{PushError, Queue};
-use crate::data::stats::DataDrop;
+use crate::data::stats::{DataDrop, Dropped};
 use crate::link::lanes::Lanes;
 
 /// Most packets that wait for one link under one name.
@@ -115,8 +115,8 @@ impl OutFlow {
         self.queue.pop().await.expect("it is open").0
     }
 
-    /// Queues a packet. Returns the kind and number of packets that were dropped for it.
-    pub(crate) async fn push(&self, packet: Packet) -> Option<(DataDrop, u64)> {
+    /// Queues a packet. Fails if it, or others for it, were dropped.
+    pub(crate) async fn push(&self, packet: Packet) -> Result<(), Dropped> {
         let bytes = packet.encoded_bytes();
         if packet.header.reliable {
             return match self
@@ -124,13 +124,13 @@ impl OutFlow {
                 .push((packet, Instant::now()), bytes, OUTFLOW_RELIABLE_BYTES_MAX, OUTFLOW_PATIENCE)
                 .await
             {
-                Ok(()) => None,
-                Err(PushError::Stalled) => Some((DataDrop::Stalled, 1)),
-                Err(PushError::Closed) => Some((DataDrop::LinkClosed, 1)),
+                Ok(()) => Ok(()),
+                Err(PushError::Stalled) => Err(Dropped::one(DataDrop::Stalled)),
+                Err(PushError::Closed) => Err(Dropped::one(DataDrop::LinkClosed)),
             };
         }
         if self.queue.is_closed() {
-            return Some((DataDrop::LinkClosed, 1));
+            return Err(Dropped::one(DataDrop::LinkClosed));
         }
         if ends_large_message(&packet) {
             self.complete.fetch_add(1, Ordering::AcqRel);
@@ -142,7 +142,7 @@ impl OutFlow {
                 self.complete.fetch_sub(1, Ordering::AcqRel);
             }
         });
-        (evicted > 0).then_some((DataDrop::Stale, evicted))
+        Dropped::check(DataDrop::Stale, evicted)
     }
 
     /// Returns `true` if the queue is far from blocking.
@@ -452,7 +452,7 @@ mod tests {
     async fn newer_messages_do_not_push_out_the_end_of_one_that_is_being_sent() {
         let flow = OutFlow::idle();
         for index in 0..3 {
-            assert!(flow.push(packet(1, index)).await.is_none());
+            assert!(flow.push(packet(1, index)).await.is_ok());
         }
         let mut taken = VecDeque::new();
         let (first, _) = flow.at_hand(&mut taken).unwrap();
@@ -460,7 +460,7 @@ mod tests {
         flow.take_rest(&first, &mut taken);
         for seq in 2..1000 {
             for index in 0..3 {
-                flow.push(packet(seq, index)).await;
+                let _ = flow.push(packet(seq, index)).await;
             }
         }
         for index in 1..3 {
@@ -488,11 +488,11 @@ mod tests {
         };
         let flow = OutFlow::idle();
         for seq in 1..10 {
-            flow.push(one(2, seq)).await;
-            flow.push(one(3, seq)).await;
+            let _ = flow.push(one(2, seq)).await;
+            let _ = flow.push(one(3, seq)).await;
         }
         for index in 0..3 {
-            flow.push(packet(10, index)).await;
+            let _ = flow.push(packet(10, index)).await;
         }
         let (mut taken, mut sent) = (VecDeque::new(), vec![]);
         while let Some((next, _)) = taken.pop_front().or_else(|| flow.queue.try_pop()) {

@@ -20,7 +20,7 @@ use tracing::{debug, warn};
 
 use crate::data::conversion::{KnownType, TypeSlot};
 use crate::data::pending::{PendingBytes, PendingQueue};
-use crate::data::stats::{CountDrops, DataDrop, Drops};
+use crate::data::stats::{CountDrops, DataDrop, Dropped, Drops};
 use crate::data::tap::{TapMessage, Taps};
 use crate::data::writer_queue::{FramePrefix, WRITER_MESSAGES_MAX, WriterQueue};
 
@@ -130,8 +130,8 @@ impl LocalSink {
         let (this, data) = (self.clone(), data.clone());
         self.release(turn, async move {
             for result in released {
-                if let Some((reason, _)) = this.finish(result, data.drops()).await {
-                    data.count(LinkId::LOCAL, &this.name, reason);
+                if let Err(dropped) = this.finish(result, data.drops()).await {
+                    data.count(LinkId::LOCAL, &this.name, dropped.reason);
                 }
             }
         });
@@ -299,12 +299,12 @@ impl LocalSink {
             let now = Instant::now();
             for held in held {
                 let is_late = held.is_late(now) && this.is_given_up(&held.item);
-                let dropped = match is_late {
-                    true => Some((DataDrop::NoDefinition, 1)),
+                let written = match is_late {
+                    true => Err(Dropped::one(DataDrop::NoDefinition)),
                     false => this.write(held.item).await,
                 };
-                if let Some((reason, several)) = dropped {
-                    data.count_here(&this.name, reason, several);
+                if let Err(Dropped { reason, messages }) = written {
+                    data.count_here(&this.name, reason, messages);
                 }
             }
         });
@@ -338,24 +338,25 @@ impl LocalSink {
         self.delivered.load(Relaxed)
     }
 
-    /// Delivers a packet. Returns the drop, if there is one. Waits while the local writer of a reliable topic is full.
-    pub(crate) async fn deliver(&self, packet: Packet, drops: &Drops) -> Option<(DataDrop, u64)> {
+    /// Delivers a packet, or fails with the drop. Waits while the local writer of a reliable topic is full.
+    pub(crate) async fn deliver(&self, packet: Packet, drops: &Drops) -> Result<(), Dropped> {
         let (result, behind, turn) = {
             let mut state = self.lock();
             let State { sink, releases, missed, held } = &mut *state;
-            let Some(sink) = sink else { return Some((DataDrop::NotGranted, 1)) };
+            let Some(sink) = sink else { return Err(Dropped::one(DataDrop::NotGranted)) };
             let source = packet.header.source;
             if !self.has_writer(&source) && sink.recovers(&source) {
                 // The sink bounds its sources, so this set is small.
                 missed.insert(source);
-                return Some((DataDrop::NoWriter, 1));
+                return Err(Dropped::one(DataDrop::NoWriter));
             }
             let behind = *releases > 0;
             match sink.handle_packet(&packet) {
                 // Writing happens under the lock, so that messages from two links keep the order of their numbers.
                 Ok(Delivery::Message(message)) if !behind => match self.write_now(message, held) {
-                    Ok(dropped) => return dropped,
-                    Err(message) => {
+                    Handover::Queued => return Ok(()),
+                    Handover::Dropped(dropped) => return Err(dropped),
+                    Handover::Full(message) => {
                         *releases += 1;
                         let turn = (Releasing(self), self.releasing.clone().try_lock_owned().ok());
                         (Ok(Delivery::Message(message)), false, Some(turn))
@@ -374,62 +375,55 @@ impl LocalSink {
     }
 
     /// Completes a delivery after the lock is released.
-    async fn finish(&self, result: Result<Delivery, SinkDrop>, drops: &Drops) -> Option<(DataDrop, u64)> {
+    async fn finish(&self, result: Result<Delivery, SinkDrop>, drops: &Drops) -> Result<(), Dropped> {
         match result {
-            Ok(Delivery::Incomplete | Delivery::Mark | Delivery::Parked) => None,
+            Ok(Delivery::Incomplete | Delivery::Mark | Delivery::Parked) => Ok(()),
             Ok(Delivery::Message(message)) => self.write(message).await,
             Ok(Delivery::Asserted(source)) => {
                 if let Some(writer) = self.open_writer(Some(source)) {
                     writer.assert_liveliness();
                 }
-                None
+                Ok(())
             }
             Ok(Delivery::NeedsHistory(source)) => {
                 let _ = self.requests.send(SinkRequest::History(self.name, source)).await;
-                None
+                Ok(())
             }
             Ok(Delivery::Synced(source)) => {
                 let _ = self.requests.send(SinkRequest::Synced(self.name, source)).await;
-                None
+                Ok(())
             }
             Ok(Delivery::Lost(_, messages)) => {
                 debug!(name = %self.name.short(), messages, "lost for good");
                 if drops.add("sink_lost", messages) {
                     warn!(messages, "a source no longer keeps messages that were lost; counted from here on");
                 }
-                Some((DataDrop::Sink, messages))
+                Dropped::check(DataDrop::Sink, messages)
             }
             Err(error) => {
                 debug!(name = %self.name.short(), %error, "packet refused");
                 drops.count(error.key());
-                Some((DataDrop::Sink, 1))
+                Err(Dropped::one(DataDrop::Sink))
             }
         }
     }
 
-    async fn write(&self, message: Message) -> Option<(DataDrop, u64)> {
+    async fn write(&self, message: Message) -> Result<(), Dropped> {
         let written = self.write_now(message, &mut self.lock().held);
         let message = match written {
-            Ok(dropped) => return dropped,
-            Err(message) => message,
+            Handover::Queued => return Ok(()),
+            Handover::Dropped(dropped) => return Err(dropped),
+            Handover::Full(message) => message,
         };
-        let Some(writer) = self.writer(&message.source) else { return Some((DataDrop::NoWriter, 1)) };
+        let Some(writer) = self.writer(&message.source) else { return Err(Dropped::one(DataDrop::NoWriter)) };
         self.delivered.fetch_add(1, Relaxed);
         self.taps.offer(|| self.tapped(&message));
-        match writer.push(message).await {
-            Ok(()) => None,
-            Err(_) => Some((DataDrop::Stalled, 1)),
-        }
+        writer.push(message).await.map_err(|_| Dropped::one(DataDrop::Stalled))
     }
 
-    /// Queues a message for its writer, or holds it until its type is known. Returns the drop, or the message if it has
-    /// to wait for room.
-    fn write_now(
-        &self,
-        message: Message,
-        held: &mut PendingQueue<Message>,
-    ) -> Result<Option<(DataDrop, u64)>, Message> {
-        let Some(writer) = self.writer(&message.source) else { return Ok(Some((DataDrop::NoWriter, 1))) };
+    /// Queues a message for its writer without waiting, or holds it until its type is known.
+    fn write_now(&self, message: Message, held: &mut PendingQueue<Message>) -> Handover {
+        let Some(writer) = self.writer(&message.source) else { return Handover::dropped(DataDrop::NoWriter) };
         let head = message.head;
         let mut waits = !held.is_empty();
         if head.form == PayloadForm::Json {
@@ -437,31 +431,34 @@ impl LocalSink {
             match self.types.now() {
                 KnownType::Known(_) => {}
                 KnownType::Awaited | KnownType::Asked => waits = true,
-                KnownType::Lacking => return Ok(Some((DataDrop::NoDefinition, 1))),
+                KnownType::Lacking => return Handover::dropped(DataDrop::NoDefinition),
             }
         }
         if waits {
-            return Ok(self.hold(message, held));
+            return self.hold(message, held).into();
         }
         if writer.has_written(&head) {
-            return Ok(Some((DataDrop::Repeated, 1)));
+            return Handover::dropped(DataDrop::Repeated);
         }
         let tapped = self.taps.is_any().then(|| self.tapped(&message));
         // Converting takes time, and may have to wait for the type.
-        let evicted = writer.try_push(message, head.form != PayloadForm::Json)?;
+        let evicted = match writer.try_push(message, head.form != PayloadForm::Json) {
+            Ok(evicted) => evicted,
+            Err(message) => return Handover::Full(message),
+        };
         self.delivered.fetch_add(1, Relaxed);
         if let Some(tapped) = tapped {
             self.taps.offer(|| tapped);
         }
-        Ok((evicted > 0).then_some((DataDrop::Stale, evicted)))
+        Dropped::check(DataDrop::Stale, evicted).into()
     }
 
     /// Holds a message until its type is known or given up. The oldest messages make room.
-    fn hold(&self, message: Message, held: &mut PendingQueue<Message>) -> Option<(DataDrop, u64)> {
+    fn hold(&self, message: Message, held: &mut PendingQueue<Message>) -> Result<(), Dropped> {
         let now = Instant::now();
         let late = held.give_up_late(now, |message| self.is_given_up(message));
         let given_up = late + held.push(now, message.payload.len(), message);
-        (given_up > 0).then_some((DataDrop::NoDefinition, given_up))
+        Dropped::check(DataDrop::NoDefinition, given_up)
     }
 
     fn tapped(&self, message: &Message) -> TapMessage {
@@ -488,6 +485,28 @@ impl Drop for LocalSink {
     /// Closes the writers when a node stops without leaving its topics.
     fn drop(&mut self) {
         self.close();
+    }
+}
+
+/// Outcome of handing a message to its writer without waiting.
+enum Handover {
+    /// The message is written, queued or held.
+    Queued,
+    /// The message, or older ones for it, were dropped.
+    Dropped(Dropped),
+    /// The message has to wait for room in the queue.
+    Full(Message),
+}
+
+impl Handover {
+    fn dropped(reason: DataDrop) -> Self {
+        Self::Dropped(Dropped::one(reason))
+    }
+}
+
+impl From<Result<(), Dropped>> for Handover {
+    fn from(result: Result<(), Dropped>) -> Self {
+        result.map_or_else(Self::Dropped, |()| Self::Queued)
     }
 }
 
@@ -526,6 +545,10 @@ mod tests {
         Message { head: MessageHead { form: PayloadForm::Json, ..plain.head }, ..plain }
     }
 
+    fn undefined(messages: u64) -> Result<(), Dropped> {
+        Dropped::check(DataDrop::NoDefinition, messages)
+    }
+
     fn any_type() -> KnownType {
         let mut text = |_: &sgc_cdr::TypeName| Some("string a".to_owned());
         let layout = sgc_cdr::Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut text);
@@ -539,22 +562,22 @@ mod tests {
         sink.set_type(KnownType::Asked, &data);
         for seq in 0..WRITER_MESSAGES_MAX as u64 + 3 {
             let lost = sink.write(json(seq, 8)).await;
-            assert_eq!(lost, (seq >= WRITER_MESSAGES_MAX as u64).then_some((DataDrop::NoDefinition, 1)));
+            assert_eq!(lost, undefined(u64::from(seq >= WRITER_MESSAGES_MAX as u64)));
         }
         assert!(sink.lacks_definition());
         // Large messages are bounded by their bytes, and later ones do not overtake them.
         let lost = sink.write(json(5000, PENDING_BYTES_MAX)).await;
-        assert_eq!(lost, Some((DataDrop::NoDefinition, WRITER_MESSAGES_MAX as u64)));
-        assert_eq!(sink.write(json(5001, 8)).await, Some((DataDrop::NoDefinition, 1)));
-        assert_eq!(sink.write(message(5002, 8)).await, None);
+        assert_eq!(lost, undefined(WRITER_MESSAGES_MAX as u64));
+        assert_eq!(sink.write(json(5001, 8)).await, undefined(1));
+        assert_eq!(sink.write(message(5002, 8)).await, Ok(()));
         assert!(seqs().is_empty());
         sink.set_type(any_type(), &data);
         wait_until(|| seqs().len() == 2).await;
         assert_eq!((seqs(), sink.delivered(), sink.lacks_definition()), (vec![5001, 5002], 2, false));
         // If the type stays unknown, messages that need no conversion are written.
         sink.set_type(KnownType::Asked, &data);
-        assert_eq!(sink.write(json(5003, 8)).await, None);
-        assert_eq!(sink.write(message(5004, 8)).await, None);
+        assert_eq!(sink.write(json(5003, 8)).await, Ok(()));
+        assert_eq!(sink.write(message(5004, 8)).await, Ok(()));
         sink.set_type(KnownType::Lacking, &data);
         wait_until(|| seqs().len() == 3).await;
         assert_eq!((seqs()[2], data.drops().snapshot()["no_definition"]), (5004, 1));
@@ -569,7 +592,7 @@ mod tests {
             let long_ago = Instant::now().checked_sub(Duration::from_secs(60)).unwrap();
             sink.lock().held.push(long_ago, 8, json(1, 8));
             let lost = sink.write(json(2, 8)).await;
-            assert_eq!(lost, (!transient_local).then_some((DataDrop::NoDefinition, 1)));
+            assert_eq!(lost, undefined(u64::from(!transient_local)));
             sink.set_type(any_type(), &data);
             let left = if transient_local { 2 } else { 1 };
             wait_until(|| taken.lock().unwrap().len() == left).await;
@@ -590,7 +613,7 @@ mod tests {
         };
         let write = |sink: &Arc<LocalSink>, message| {
             let written = sink.write_now(message, &mut sink.lock().held);
-            assert_eq!(written.ok(), Some(None));
+            assert!(matches!(written, Handover::Queued));
         };
         let (sink, _, _) = sink(false);
         let [killed, restarted] = [[1; 16], [2; 16]].map(SourceId);
@@ -654,7 +677,7 @@ mod tests {
                 .publish(&head, Bytes::from_static(b"first"), false, |packet| packets.push(packet))
                 .unwrap();
             for packet in packets {
-                assert_eq!(sink.deliver(packet, data.drops()).await, None, "it is parked");
+                assert_eq!(sink.deliver(packet, data.drops()).await, Ok(()), "it is parked");
             }
             sink.grant(id, TopicGrant { sources: vec![source.announce()], ..grant.clone() }, &data);
         }

@@ -89,6 +89,27 @@ pub(crate) enum DataDrop {
     NotConverted,
 }
 
+/// A drop on the data path: the packet or message itself, or older ones that made room for it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{messages} dropped: {}", reason.key())]
+pub(crate) struct Dropped {
+    pub(crate) reason: DataDrop,
+    /// The number of dropped messages or packets.
+    pub(crate) messages: u64,
+}
+
+impl Dropped {
+    /// Returns the drop of a single message or packet.
+    pub(crate) fn one(reason: DataDrop) -> Self {
+        Self { reason, messages: 1 }
+    }
+
+    /// Fails if any messages were dropped.
+    pub(crate) fn check(reason: DataDrop, messages: u64) -> Result<(), Self> {
+        if messages > 0 { Err(Self { reason, messages }) } else { Ok(()) }
+    }
+}
+
 impl DataDrop {
     /// All reasons in the order of their numbers.
     const ALL: [Self; 20] = [
