@@ -80,6 +80,14 @@ pub struct Decompressor {
 }
 
 impl Decompressor {
+    /// Returns the length of the original payload as the payload claims it. A malformed payload has its own length.
+    pub fn original_bytes(encoding: PayloadEncoding, payload: &[u8]) -> usize {
+        match payload.first_chunk::<LENGTH_BYTES>() {
+            Some(length) if encoding != PayloadEncoding::Plain => u32::from_be_bytes(*length) as usize,
+            _ => payload.len(),
+        }
+    }
+
     /// Returns the original payload. It takes the claimed memory and no more, which is at most that of a message.
     pub fn decompress(
         &mut self,

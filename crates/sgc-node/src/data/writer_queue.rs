@@ -160,7 +160,7 @@ impl WriterQueue {
         let never_blocks = !spec.qos.is_reliable() || matches!(spec.qos.history, History::KeepLast(_));
         let (room, of_room) = (burst.room.clone(), weak.clone());
         let is_free = Box::new(move |message: &Message| {
-            let (bytes, published_ns) = (message.payload.len(), message.head.source_timestamp_ns);
+            let (bytes, published_ns) = (written_bytes(message), message.head.source_timestamp_ns);
             never_blocks
                 && room.spacing().wait(Instant::now(), message.source, published_ns).is_none()
                 && of_room.upgrade().is_some_and(|writer| room.is_there(&*writer, bytes, published_ns))
@@ -325,7 +325,7 @@ impl WriterQueue {
     /// Returns the consumer if it takes a message now without blocking and the queue is empty. Only one caller queues
     /// at a time.
     fn at_once(&self, message: &Message) -> Option<MutexGuard<'_, MessageConsumer>> {
-        let may = message.payload.len() <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
+        let may = written_bytes(message) <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
         let take = if may { self.take.try_lock().ok() } else { None };
         take.filter(|_| self.queue.is_empty() && !self.queue.is_closed() && (self.info.is_free)(message))
     }
@@ -478,6 +478,13 @@ impl WriterQueue {
     }
 }
 
+/// Returns the length of the payload that the writer writes. A compressed message is decompressed first.
+fn written_bytes(message: &Message) -> usize {
+    let bytes = Decompressor::original_bytes(message.head.encoding, &message.payload);
+    let is_keyed = message.head.form == PayloadForm::KeyedCdr;
+    if is_keyed { bytes.saturating_sub(KEY_HASH_BYTES) } else { bytes }
+}
+
 /// Returns a short, stable name of a failure for counters.
 pub(crate) fn failure_key(error: &RosError) -> &'static str {
     match error {
@@ -493,7 +500,7 @@ pub(crate) fn failure_key(error: &RosError) -> &'static str {
 pub(crate) mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-    use sgc_wire::SourceId;
+    use sgc_wire::{PayloadEncoding, SourceId};
 
     use super::*;
 
@@ -576,6 +583,27 @@ pub(crate) mod tests {
         let taken = taken.lock().unwrap();
         assert!(taken.iter().map(|(seq, _)| *seq).eq(0..100));
         assert!(taken[1..].iter().all(|(_, by)| *by != thread::current().id()));
+        queue.close();
+    }
+
+    #[tokio::test]
+    async fn receiving_task_judges_compressed_messages_by_the_length_that_is_written() {
+        let (queue, _) = noting(&Arc::default());
+        let compressed = |original: usize, form| {
+            let mut message = message(0, 100);
+            let length = u32::try_from(original).unwrap().to_be_bytes();
+            (message.head.encoding, message.head.form) = (PayloadEncoding::Zstd, form);
+            message.payload = [&length[..], &[0; 96]].concat().into();
+            message
+        };
+        for (original, form, is_short) in [
+            (AT_ONCE_BYTES_MAX, PayloadForm::Cdr, true),
+            (AT_ONCE_BYTES_MAX + 1, PayloadForm::Cdr, false),
+            (AT_ONCE_BYTES_MAX + KEY_HASH_BYTES, PayloadForm::KeyedCdr, true),
+            (AT_ONCE_BYTES_MAX + KEY_HASH_BYTES + 1, PayloadForm::KeyedCdr, false),
+        ] {
+            assert_eq!(queue.at_once(&compressed(original, form)).is_some(), is_short, "{original} {form:?}");
+        }
         queue.close();
     }
 }
