@@ -32,6 +32,8 @@ pub(crate) struct Burst {
 #[derive(Default)]
 pub(crate) struct Room {
     unacknowledged: AtomicU32,
+    /// The smallest number of samples that the writer kept at a write since none was unacknowledged.
+    kept_min: AtomicU32,
     /// When the last message was written, and its time stamp.
     last: Mutex<Option<(Instant, i64)>>,
     spacing: Mutex<Spacing>,
@@ -42,6 +44,7 @@ impl Room {
     /// Never waits.
     pub(crate) fn is_there(&self, writer: &impl RosWriter, bytes: usize, timestamp_ns: i64) -> bool {
         let Some(kept) = writer.kept(bytes) else { return true };
+        let kept = self.kept(kept);
         if self.unacknowledged.load(Relaxed) < kept || self.is_in_its_time(timestamp_ns) {
             return true;
         }
@@ -49,6 +52,15 @@ impl Room {
         let Some(unacknowledged) = writer.unacknowledged().or_else(acknowledged) else { return false };
         self.unacknowledged.store(unacknowledged, Relaxed);
         unacknowledged < kept
+    }
+
+    /// Returns the number of samples that can be unacknowledged, given the number that the writer keeps of the next
+    /// one's size. Unacknowledged long samples leave less room for short ones.
+    fn kept(&self, of_next: u32) -> u32 {
+        match self.unacknowledged.load(Relaxed) {
+            0 => of_next,
+            _ => of_next.min(self.kept_min.load(Relaxed)),
+        }
     }
 
     /// Returns `true` if the time since the last write is about the publisher's interval. Readers then have the time
@@ -88,7 +100,8 @@ impl Burst {
         bytes: usize,
         timestamp_ns: i64,
     ) {
-        let Some(kept) = writer.kept(bytes) else { return };
+        let Some(of_next) = writer.kept(bytes) else { return };
+        let kept = self.room.kept(of_next);
         let mut unacknowledged = self.room.unacknowledged.load(Relaxed);
         if unacknowledged >= kept {
             unacknowledged = writer.unacknowledged().unwrap_or(unacknowledged);
@@ -103,6 +116,8 @@ impl Burst {
             self.not_before = is_stalled.then(|| Instant::now() + STALLED_READER_PAUSE);
             unacknowledged = left.unwrap_or(0);
         }
+        let kept_min = if unacknowledged == 0 { of_next } else { kept };
+        self.room.kept_min.store(kept_min, Relaxed);
         self.room.unacknowledged.store(unacknowledged.saturating_add(1), Relaxed);
         *self.room.last() = Some((Instant::now(), timestamp_ns));
     }
@@ -199,6 +214,24 @@ mod tests {
         let (writer, mut other) = (Slow::new(None), Burst::default());
         (0..100).for_each(|_| other.before_next(&writer, false, 8, 0));
         assert_eq!(writer.waited.load(Relaxed), 0, "one that blocks by itself");
+    }
+
+    #[test]
+    fn short_samples_overwrite_no_long_ones_that_are_unacknowledged() {
+        let writer = Slow::new(Some(10));
+        let mut burst = Burst::default();
+        (0..5).for_each(|_| burst.before_next(&writer, false, 2000, 0));
+        assert_eq!(writer.waited.load(Relaxed), 0);
+        burst.before_next(&writer, false, 8, 0);
+        assert_eq!(writer.waited.load(Relaxed), 1, "five long ones are kept");
+        // The long ones are acknowledged, so ten short ones are kept again.
+        (0..9).for_each(|_| burst.before_next(&writer, false, 8, 0));
+        assert_eq!(writer.waited.load(Relaxed), 1);
+        let stuck = Slow::new(Some(10));
+        stuck.stands_still.store(true, Relaxed);
+        let mut burst = Burst::default();
+        (0..5).for_each(|_| burst.before_next(&stuck, true, 2000, 0));
+        assert!(!burst.room.is_there(&stuck, 8, 0));
     }
 
     #[test]
