@@ -52,6 +52,8 @@ pub struct CycloneWriter {
     unacknowledged: Option<SendWindow>,
     /// The number of samples written so far, which wraps.
     written: AtomicU32,
+    /// The instance of the next sample, if keys are not kept apart.
+    next_instance: AtomicU32,
     /// The instances of keys, if keys are kept apart.
     keys: Option<Mutex<Keys>>,
     /// The history for late joiners, if it may have to shrink.
@@ -182,6 +184,14 @@ impl Keys {
     }
 }
 
+/// Returns the instance of a sample that is spread over so many, and moves on to the next one. The first instance
+/// follows the last one also if the number changes, so no instance gets more than its share of the smallest number.
+fn take_instance(next: &AtomicU32, instances: u32) -> u32 {
+    let wrapped = |at: u32| if at < instances { at } else { 0 };
+    let before = next.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |at| Some(wrapped(at) + 1));
+    before.map_or(0, wrapped)
+}
+
 impl CycloneWriter {
     pub(crate) fn new(participant: &Arc<Participant>, spec: &EndpointSpec) -> Result<Self, String> {
         let qos = participant.endpoint_qos(EndpointKind::Writer, spec, "")?;
@@ -224,6 +234,7 @@ impl CycloneWriter {
             keyless: spec.keyless,
             unacknowledged,
             written: AtomicU32::new(0),
+            next_instance: AtomicU32::new(0),
             keys: keys_kept(&spec.qos, spec.keyless).map(|max| Mutex::new(Keys::new(max))),
             late: late
                 .map(|late| (Mutex::new(late), WriterCount::new(participant, Participant::late_writers))),
@@ -310,7 +321,7 @@ impl RosWriter for CycloneWriter {
         let number = self.written.fetch_add(1, Ordering::Relaxed);
         let instance = match (&self.keys, &key_hash) {
             (Some(keys), Some(hash)) => lock(keys).instance(hash),
-            _ => number % self.instances(payload.len()),
+            _ => take_instance(&self.next_instance, self.instances(payload.len())),
         };
         let asks = self
             .kept(payload.len())
@@ -398,6 +409,21 @@ impl RosWriter for CycloneWriter {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn samples_of_varying_size_share_instances_evenly() {
+        const DEPTH: usize = 16;
+        let few = 2;
+        for many in [3, 4, 63, 64] {
+            let (next, mut of_each) = (AtomicU32::new(0), vec![0; many as usize]);
+            // Every second sample is long, and as many are written as the long ones leave room for.
+            for n in 0..DEPTH * few as usize {
+                let instances = if n % 2 == 0 { few } else { many };
+                of_each[take_instance(&next, instances) as usize] += 1;
+            }
+            assert!(of_each.iter().all(|samples| *samples <= DEPTH), "{many}: {of_each:?}");
+        }
+    }
 
     #[test]
     fn keys_share_instances_only_beyond_their_bound() {
