@@ -16,5 +16,5 @@ mod upgrade;
 pub use byte_stream::{ByteStream, accept, dial};
 pub use frame::WS_FRAME_BYTES_MAX;
 #[cfg(feature = "messages")]
-pub use messages::{CloseFrame, Message, Text, WebSocket, WebSocketError};
+pub use messages::{CloseFrame, Message, Text, WS_DISCARD_BYTES_MAX, WebSocket, WebSocketError};
 pub use upgrade::{HTTP_HEAD_BYTES_MAX, Request, UpgradeError};

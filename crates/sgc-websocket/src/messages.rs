@@ -1,6 +1,7 @@
 //! [`WebSocket`]: messages of text and bytes, with pings and the closing handshake (RFC 6455, 5.4, 5.5 and 7).
 
 use std::fmt;
+use std::future::poll_fn;
 use std::io;
 use std::ops::Deref;
 use std::pin::Pin;
@@ -9,7 +10,7 @@ use std::task::{Context, Poll, ready};
 
 use bytes::{Buf as _, Bytes, BytesMut};
 use futures_util::{Sink, Stream};
-use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite};
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 
 use crate::frame::{
     BINARY, CLOSE, CONTINUATION, Frame, FrameError, PING, PONG, TEXT, WS_CONTROL_BYTES_MAX, put_frame,
@@ -20,6 +21,9 @@ use crate::upgrade::{Request, UpgradeError};
 const WRITE_BYTES: usize = 128 << 10;
 /// Bytes that are read at a time.
 const READ_BYTES: usize = 64 << 10;
+
+/// Most bytes of a peer that are discarded after a close, as many as the gateway's longest message has.
+pub const WS_DISCARD_BYTES_MAX: usize = 64 << 20;
 
 /// A text, cheap to clone.
 #[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -117,6 +121,23 @@ pub enum WebSocketError {
     Io(#[from] io::Error),
 }
 
+impl WebSocketError {
+    /// Returns the close code that tells the peer of its breach (RFC 6455, 7.4.1), or `None` if there was no breach.
+    pub fn close_code(&self) -> Option<u16> {
+        match self {
+            Self::Protocol(_) => Some(PROTOCOL),
+            Self::NotText => Some(NOT_TEXT),
+            Self::TooLong { .. } => Some(TOO_LONG),
+            Self::Closed | Self::Cut | Self::Io(_) => None,
+        }
+    }
+}
+
+/// Close codes of breaches (RFC 6455, 7.4.1).
+const PROTOCOL: u16 = 1002;
+const NOT_TEXT: u16 = 1007;
+const TOO_LONG: u16 = 1009;
+
 /// The state of the closing handshake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum State {
@@ -173,6 +194,37 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         let request = Request::read(&mut stream, crate::HTTP_HEAD_BYTES_MAX).await?;
         let input = request.accept(&mut stream, None).await?;
         Ok(Self::new(stream, input, message_bytes_max))
+    }
+
+    /// Ends the WebSocket so that the peer gets the reason (RFC 6455, 7.1.1). Writes the waiting output and the close,
+    /// or the answer to the peer's close, ends the writing side, and discards what the peer still sends: a stream that
+    /// is dropped with unread bytes may be reset, and a reset discards the reason. At most [`WS_DISCARD_BYTES_MAX`]
+    /// bytes are discarded. The caller bounds the time.
+    ///
+    /// # Errors
+    /// The connection failed.
+    pub async fn finish(mut self, close: Option<CloseFrame>) -> Result<(), WebSocketError> {
+        if self.state == State::Open {
+            Pin::new(&mut self).start_send(Message::Close(close))?;
+        }
+        poll_fn(|cx| self.poll_output(cx)).await?;
+        self.stream.shutdown().await?;
+        // A close is the last that a peer sends.
+        if self.state == State::Closed { Ok(()) } else { self.discard().await }
+    }
+
+    /// Discards bytes until the peer ends its side.
+    async fn discard(&mut self) -> Result<(), WebSocketError> {
+        (self.message, self.control) = (None, Vec::new());
+        let mut left = WS_DISCARD_BYTES_MAX;
+        loop {
+            self.input.clear();
+            match poll_fn(|cx| self.poll_input(cx)).await? {
+                0 => return Ok(()),
+                bytes if bytes >= left => return Ok(()),
+                bytes => left -= bytes,
+            }
+        }
     }
 
     /// Returns the next message whose bytes are here, if any.
@@ -393,7 +445,6 @@ fn close_frame(payload: &[u8]) -> Result<Option<CloseFrame>, WebSocketError> {
 
 /// Returns the code that answers a close (RFC 6455, 7.4.2).
 fn answered_code(code: u16) -> u16 {
-    const PROTOCOL: u16 = 1002;
     match code {
         1000..=1003 | 1007..=1014 | 3000..=4999 => code,
         _ => PROTOCOL,
@@ -428,18 +479,71 @@ mod tests {
         (near, WebSocket::new(far, BytesMut::new(), MAX))
     }
 
+    /// Returns the error of wrong bytes. The peer is told its code.
     async fn error_of(bytes: &[u8]) -> WebSocketError {
         let (mut raw, mut socket) = pair(1 << 16);
         raw.write_all(bytes).await.unwrap();
         let error = socket.next().await.unwrap().unwrap_err();
         assert!(socket.next().await.is_none());
-        // The peer is told.
-        let why = CloseFrame { code: 1002, reason: "no".into() };
-        socket.send(Message::Close(Some(why))).await.unwrap();
-        let mut told = [0; 6];
-        raw.read_exact(&mut told).await.unwrap();
-        assert_eq!(&told, b"\x88\x04\x03\xeano");
+        let code = error.close_code().unwrap();
+        let finished = tokio::spawn(socket.finish(Some(CloseFrame { code, reason: "no".into() })));
+        let mut told = Vec::new();
+        raw.read_to_end(&mut told).await.unwrap();
+        assert_eq!(told, [&b"\x88\x04"[..], &code.to_be_bytes(), b"no"].concat());
+        drop(raw);
+        finished.await.unwrap().unwrap();
         error
+    }
+
+    #[tokio::test]
+    async fn breaches_have_the_codes_of_the_standard() {
+        for (error, code) in [
+            (WebSocketError::Protocol("x"), Some(1002)),
+            (WebSocketError::NotText, Some(1007)),
+            (WebSocketError::TooLong { max: 1 }, Some(1009)),
+            (WebSocketError::Cut, None),
+            (WebSocketError::Closed, None),
+        ] {
+            assert_eq!(error.close_code(), code, "{error}");
+        }
+    }
+
+    #[tokio::test]
+    async fn peer_that_sends_on_after_a_close_is_read_within_a_bound() {
+        const SENT: usize = 1 << 20;
+        let (mut raw, socket) = pair(1 << 10);
+        let why = CloseFrame { code: 1008, reason: "no".into() };
+        let finished = tokio::spawn(socket.finish(Some(why)));
+        raw.write_all(&vec![7; SENT]).await.unwrap();
+        let mut told = Vec::new();
+        raw.read_to_end(&mut told).await.unwrap();
+        assert_eq!(told, b"\x88\x04\x03\xf0no");
+        assert!(!finished.is_finished(), "the peer has not ended its side");
+        drop(raw);
+        finished.await.unwrap().unwrap();
+        let (mut raw, socket) = pair(1 << 20);
+        let finished = tokio::spawn(socket.finish(None));
+        let endless = async { while raw.write_all(&[7; 1 << 16]).await.is_ok() {} };
+        endless.await;
+        finished.await.unwrap().unwrap();
+    }
+
+    #[tokio::test]
+    async fn close_is_answered_behind_waiting_output() {
+        let (mut raw, mut socket) = pair(16);
+        socket.feed(Message::text("x".repeat(100))).await.unwrap();
+        assert!(socket.flush().now_or_never().is_none());
+        raw.write_all(&frame(0x88, b"\x03\xe8")).await.unwrap();
+        assert_eq!(
+            socket.next().await.unwrap().unwrap(),
+            Message::Close(Some(CloseFrame { code: 1000, reason: String::new() }))
+        );
+        let finished = tokio::spawn(socket.finish(None));
+        let mut told = Vec::new();
+        raw.read_to_end(&mut told).await.unwrap();
+        assert_eq!(told.split_at(2 + 100).1, b"\x88\x02\x03\xe8");
+        // The peer's own end is not waited for.
+        finished.await.unwrap().unwrap();
     }
 
     #[tokio::test]
