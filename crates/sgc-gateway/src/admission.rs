@@ -100,12 +100,7 @@ impl Place {
         let mut clients = lock(&self.admission.clients);
         if let Err(pool) = self.admission.check_places(&clients, client, Some(self.number)) {
             drop(clients);
-            self.admission.count(no_place(pool));
-            return Err(GatewayError::Crowded {
-                what: "clients",
-                max: self.admission.places_max(pool),
-                pool,
-            });
+            return Err(self.admission.crowded(pool));
         }
         if let Some(entered) = clients.get_mut(&self.number) {
             entered.status.name = client.name.to_string();
@@ -174,19 +169,21 @@ impl Admission {
         *lock(&self.refused).entry(why).or_default() += 1;
     }
 
-    /// Takes a place for a client, if one is free.
+    /// Takes a place for a client.
+    ///
+    /// # Errors
+    /// The bound whose places are taken. The refusal has been counted.
     pub(crate) fn enter(
         self: &Arc<Self>,
         client: &Client,
         protocol: &str,
         peer: SocketAddr,
-    ) -> Option<Place> {
+    ) -> Result<Place, GatewayError> {
         let number = self.next.fetch_add(1, Ordering::Relaxed);
         let mut clients = lock(&self.clients);
         if let Err(pool) = self.check_places(&clients, client, None) {
             drop(clients);
-            self.count(no_place(pool));
-            return None;
+            return Err(self.crowded(pool));
         }
         let status = ClientStatus {
             name: client.name.to_string(),
@@ -199,7 +196,13 @@ impl Admission {
             ClientEntry { status, credential: client.credential(), is_local: client.is_local() },
         );
         drop(clients);
-        Some(Place { admission: Arc::clone(self), number })
+        Ok(Place { admission: Arc::clone(self), number })
+    }
+
+    /// Counts a refusal for lack of a place, and returns it.
+    fn crowded(&self, pool: Pool) -> GatewayError {
+        self.count(no_place(pool));
+        GatewayError::Crowded { what: "clients", max: self.places_max(pool), pool }
     }
 
     /// Returns the number of places for the clients of a pool.
@@ -426,7 +429,7 @@ mod tests {
         let (access, admission) = (all(), Admission::new(all(), 64));
         let enter = |peer: &str| {
             let peer = peer.parse().unwrap();
-            admission.enter(&client(&access, peer), "rosbridge", peer)
+            admission.enter(&client(&access, peer), "rosbridge", peer).ok()
         };
         // Of 64 places 8 are reserved for this host, and one credential may hold a quarter of the rest.
         let mut held: Vec<_> = std::iter::from_fn(|| enter("[2001:db8::1]:1")).collect();

@@ -5,6 +5,7 @@
 
 use std::io;
 use std::pin::Pin;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::task::{Context, Poll, ready};
 
@@ -20,6 +21,8 @@ pub(crate) struct Inflow {
     /// The quota of the client after its admission. Before that the upgrade bounds the bytes.
     quota: OnceLock<Quota>,
     held: Mutex<UnfinishedBytes>,
+    /// `true` once received bytes are discarded, which take no memory.
+    is_discarded: AtomicBool,
 }
 
 #[derive(Debug, Default)]
@@ -37,7 +40,9 @@ impl Inflow {
 
     /// Charges received bytes.
     pub(crate) fn add(&self, bytes: usize) -> Result<(), GatewayError> {
-        let Some(quota) = self.quota.get() else { return Ok(()) };
+        let Some(quota) = self.quota.get().filter(|_| !self.is_discarded.load(Ordering::Relaxed)) else {
+            return Ok(());
+        };
         let mut held = lock(&self.held);
         held.bytes += bytes;
         while held.room.len() < (held.bytes.saturating_sub(1)) / UNIT_BYTES {
@@ -53,6 +58,12 @@ impl Inflow {
         held.bytes = held.bytes.saturating_sub(bytes);
         let places = held.bytes.saturating_sub(1) / UNIT_BYTES;
         held.room.truncate(places);
+    }
+
+    /// Releases all bytes, and charges none from now on, because they are discarded.
+    pub(crate) fn discard(&self) {
+        self.is_discarded.store(true, Ordering::Relaxed);
+        self.finish_keeping(0);
     }
 
     /// Releases the bytes of a finished message, except for `kept` bytes.
@@ -152,5 +163,8 @@ mod tests {
         let mut stream = MeteredStream::new(&[7; 200_000][..], Arc::new(short));
         assert_eq!(stream.read_to_end(&mut Vec::new()).await.unwrap(), 200_000);
         assert_eq!(lock(&stream.inflow.held).room.len(), (200_000 - 1) / UNIT_BYTES);
+        stream.inflow.discard();
+        stream.inflow.add(usize::MAX / 2).unwrap();
+        assert!(lock(&stream.inflow.held).room.is_empty());
     }
 }

@@ -126,6 +126,11 @@ impl Session {
         self
     }
 
+    /// Returns the count of incoming bytes.
+    pub(crate) fn inflow(&self) -> Arc<Inflow> {
+        Arc::clone(&self.inflow)
+    }
+
     /// Releases the room of a message that was handled.
     pub(crate) fn finish_message(&self) {
         self.finish_message_keeping(0);

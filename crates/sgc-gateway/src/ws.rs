@@ -1,12 +1,15 @@
-//! The upgrade to WebSocket (RFC 6455), which reads origin, credentials and subprotocol.
+//! The upgrade to WebSocket (RFC 6455), which reads origin, credentials and subprotocol, and its end, which tells the
+//! client the reason.
 
 use std::sync::Arc;
+use std::time::Duration;
 
-use sgc_websocket::{Request, WebSocket};
+use sgc_websocket::{CloseFrame, Request, WebSocket};
 use tokio::io::{AsyncRead, AsyncWrite};
 
 use crate::access::Client;
 use crate::admission::{Admission, Arrival};
+use crate::inflow::Inflow;
 
 /// Longest message of a client, in bytes. An image of 13 MB in base64 fits three times.
 pub(crate) const MESSAGE_BYTES_MAX: usize = 64 << 20;
@@ -14,6 +17,9 @@ pub(crate) const MESSAGE_BYTES_MAX: usize = 64 << 20;
 const HEAD_BYTES_MAX: usize = 64 << 10;
 /// URL parameters that may hold a token, for programs that cannot send headers.
 const TOKEN_PARAMETERS: [&str; 2] = ["token", "access_token"];
+
+/// Time in which a close is written and a client that sends on is heard.
+const FINISH_MAX: Duration = Duration::from_secs(2);
 
 /// The WebSocket subprotocols that clients may ask for.
 #[derive(Clone, Copy, Debug)]
@@ -83,8 +89,20 @@ pub(crate) async fn upgrade<S: AsyncRead + AsyncWrite + Unpin>(
     Ok(Upgrade { socket, client, subprotocol })
 }
 
+/// Ends a WebSocket so that the client gets the reason, or the answer to its own close, in [`FINISH_MAX`]. `inflow`
+/// counts the bytes of the stream.
+pub(crate) async fn finish<S>(socket: WebSocket<S>, inflow: &Inflow, close: Option<(u16, &str)>)
+where
+    S: AsyncRead + AsyncWrite + Unpin,
+{
+    inflow.discard();
+    let close = close.map(|(code, why)| CloseFrame { code, reason: close_reason(why).to_owned() });
+    // The session has ended, whether the client hears of it or not.
+    let _ = tokio::time::timeout(FINISH_MAX, socket.finish(close)).await;
+}
+
 /// Cuts a reason to the 123 bytes that a close frame has room for (RFC 6455, 5.5).
-pub(crate) fn close_reason(why: &str) -> &str {
+fn close_reason(why: &str) -> &str {
     let mut end = why.len().min(123);
     while !why.is_char_boundary(end) {
         end -= 1;

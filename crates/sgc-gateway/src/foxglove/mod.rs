@@ -24,12 +24,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::{Sink, SinkExt, StreamExt};
-use sgc_websocket::{CloseFrame, Message as Frame, WebSocket, WebSocketError as SocketError};
+use sgc_websocket::{Message as Frame, WebSocket, WebSocketError as SocketError};
 use tokio::io::{AsyncRead, AsyncWrite};
 
 use crate::quota::PendingBytes;
 use crate::session::Session;
-use crate::ws::close_reason;
+use crate::ws::finish;
 
 use connection::Connection;
 pub use options::{FoxgloveError, Options};
@@ -40,9 +40,6 @@ pub const SUBPROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"]
 
 /// Time in which queued answers may be written when the connection ends.
 const FAREWELL_MAX: Duration = Duration::from_secs(1);
-
-/// The close code for a client whose rights end (RFC 6455, 7.4.1).
-const POLICY: u16 = 1008;
 
 /// Serves a client until it leaves. Dropping the future ends the connection and everything that the client has.
 ///
@@ -58,7 +55,7 @@ where
 {
     let (mut sink, mut frames) = socket.split();
     let waiting = PendingBytes::new(session.limits().waiting_bytes_max, session.quota().clone());
-    let outbox = Outbox::new(waiting);
+    let (outbox, inflow) = (Outbox::new(waiting), session.inflow());
     let mut connection = Connection::new(Arc::clone(&session), options, &outbox);
     let ended = tokio::select! {
         biased;
@@ -67,22 +64,28 @@ where
         failed = write(&mut sink, &outbox) => Err(FoxgloveError::Socket(failed)),
     };
     drop(connection);
-    let farewell = async {
-        if let Err(FoxgloveError::Denied(denied)) = &ended {
-            let reason =
-                CloseFrame { code: POLICY, reason: close_reason(denied.client_message()).to_owned() };
-            return sink.send(Frame::Close(Some(reason))).await;
-        }
-        while let Some(answer) = outbox.pop_answer() {
-            sink.feed(answer).await?;
-        }
-        sink.send(Frame::Close(None)).await
-    };
-    let _ = tokio::time::timeout(FAREWELL_MAX, farewell).await;
+    let close = ended.as_ref().err().and_then(FoxgloveError::close);
+    if !matches!(ended, Err(FoxgloveError::Denied(_))) {
+        let _ = tokio::time::timeout(FAREWELL_MAX, write_answers(&mut sink, &outbox)).await;
+    }
+    if let Ok(socket) = frames.reunite(sink) {
+        finish(socket, &inflow, close.as_ref().map(|(code, why)| (*code, why.as_str()))).await;
+    }
     match ended {
         Err(FoxgloveError::Socket(SocketError::Closed)) => Ok(()),
         ended => ended,
     }
+}
+
+/// Writes the queued answers, and no messages of topics.
+async fn write_answers<K>(sink: &mut K, outbox: &Outbox) -> Result<(), SocketError>
+where
+    K: Sink<Frame, Error = SocketError> + Unpin,
+{
+    while let Some(answer) = outbox.pop_answer() {
+        sink.feed(answer).await?;
+    }
+    sink.flush().await
 }
 
 /// Writes queued frames until the socket fails.

@@ -57,3 +57,14 @@ pub enum FoxgloveError {
     #[error("the client's right has ended: {0}")]
     Denied(#[source] Denial),
 }
+
+impl FoxgloveError {
+    /// Returns the close code (RFC 6455, 7.4.1) and the text for the client, or `None` if there is nothing to say.
+    pub(super) fn close(&self) -> Option<(u16, String)> {
+        match self {
+            Self::Socket(error) => Some((error.close_code()?, error.to_string())),
+            Self::Silent { .. } => None,
+            Self::Denied(denied) => Some((1008, denied.client_message().to_owned())),
+        }
+    }
+}

@@ -22,25 +22,25 @@ mod typedefs;
 use std::sync::Arc;
 use std::time::Duration;
 
-use futures_util::{FutureExt as _, SinkExt as _, StreamExt as _};
-use sgc_websocket::{CloseFrame, Message, WebSocket, WebSocketError};
+use futures_util::{FutureExt as _, StreamExt as _};
+use sgc_websocket::{Message, WebSocket, WebSocketError};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 use tokio::time::Instant;
 
 use crate::access::Denial;
 use crate::session::Session;
-use crate::ws::close_reason;
+use crate::ws::finish;
 use connection::Connection;
 pub use options::{
     Authenticate, ROSBRIDGE_ADMISSION_MAX, ROSBRIDGE_CALL_MAX, ROSBRIDGE_MESSAGE_BYTES_MAX,
     ROSBRIDGE_SILENCE_MAX, RosbridgeError, RosbridgeOptions,
 };
-use outbox::{Outbox, Outgoing, PingState, ping_interval, write_all, write_rest};
+use outbox::{Outbox, PingState, ping_interval, write_all, write_rest};
 
 /// Most messages that are read before published messages are flushed and other events are handled.
 const TOGETHER_MAX: usize = 64;
-/// Time in which a client may receive the reason for the end of its connection.
+/// Time in which replies that wait are written when the connection ends.
 const FAREWELL_MAX: Duration = Duration::from_secs(2);
 
 /// Serves a client until it leaves, and ends everything that it has. Dropping the future is safe at any time.
@@ -57,7 +57,7 @@ where
 {
     let options = Arc::new(options);
     let (outbox, mut outgoing) = Outbox::new(session.limits().waiting_bytes_max, session.quota().clone());
-    let pulse = PingState::default();
+    let (pulse, inflow) = (PingState::default(), session.inflow());
     let (mut sink, mut stream) = socket.split();
     let mut connection = Connection::new(session, Arc::clone(&options), outbox);
     let denied = until_denied(connection.sessions());
@@ -72,15 +72,19 @@ where
         }
     };
     drop(connection);
-    if let Some((code, why)) = ended.as_ref().err().and_then(RosbridgeError::close) {
+    let close = ended.as_ref().err().and_then(RosbridgeError::close);
+    if close.is_some() {
         if matches!(ended, Err(RosbridgeError::Denied(_))) {
             outgoing.clear();
         }
-        let farewell = farewell(&mut sink, &mut outgoing, code, why);
-        let _ = tokio::time::timeout(FAREWELL_MAX, farewell).await;
-        // Pending input is read from the socket, since closing it with unread data could discard the last message.
-        let until_closed = async { while let Some(Ok(_)) = stream.next().await {} };
-        let _ = tokio::time::timeout(FAREWELL_MAX, until_closed).await;
+        let _ = tokio::time::timeout(FAREWELL_MAX, write_rest(&mut sink, &mut outgoing)).await;
+    }
+    // A client that failed hears nothing. One that has left gets the answer to its close.
+    if (close.is_some() || ended.is_ok())
+        && let Ok(socket) = stream.reunite(sink)
+    {
+        let close = close.as_ref().map(|(code, why)| (*code, why.as_str()));
+        finish(socket, &inflow, close).await;
     }
     ended
 }
@@ -97,17 +101,6 @@ async fn until_denied(mut sessions: watch::Receiver<Arc<Session>>) -> Denial {
                 }
             }
         }
-    }
-}
-
-async fn farewell<W>(sink: &mut W, outgoing: &mut Outgoing, code: u16, why: String)
-where
-    W: futures_util::Sink<Message, Error = WebSocketError> + Unpin,
-{
-    let reason = close_reason(&why).to_owned();
-    if write_rest(sink, outgoing).await.is_ok() {
-        let close = CloseFrame { code, reason };
-        let _ = sink.send(Message::Close(Some(close))).await;
     }
 }
 

@@ -92,10 +92,11 @@ pub enum RosbridgeError {
 }
 
 impl RosbridgeError {
-    /// Returns the close code (RFC 6455, 7.4.1) and the text for the client.
+    /// Returns the close code (RFC 6455, 7.4.1) and the text for the client, or `None` if it would not hear them.
     pub(super) fn close(&self) -> Option<(u16, String)> {
         Some(match self {
-            Self::Socket(_) | Self::Silent(_) => return None,
+            Self::Socket(error) => (error.close_code()?, error.to_string()),
+            Self::Silent(_) => return None,
             Self::TooLong { max } => (1009, format!("messages of {max} bytes at most")),
             Self::TooManyErrors => (1008, "too many errors".to_owned()),
             Self::NotAdmitted(why) => (1008, why.clone()),

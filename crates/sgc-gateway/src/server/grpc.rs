@@ -113,8 +113,8 @@ impl GrpcStream {
                 return self.check(cx);
             }
             (_, Some(client)) => match self.admission.enter(&client, "grpc", self.connection.peer()) {
-                Some(place) => (Standing::Proven(place), Ok(())),
-                None => (Standing::Refused, Err(io::Error::other("too many clients"))),
+                Ok(place) => (Standing::Proven(place), Ok(())),
+                Err(why) => (Standing::Refused, Err(io::Error::other(why))),
             },
             (Standing::Unproven { deadline, handshake }, None) => {
                 if handshake.poll_evicted(cx).is_ready() {

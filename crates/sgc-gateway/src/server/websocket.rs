@@ -7,7 +7,7 @@ use tokio::time::Instant;
 
 use super::stream::ByteStream;
 use crate::access::Denial;
-use crate::admission::{Admission, Arrival, Handshake};
+use crate::admission::{Admission, Arrival, Handshake, Place};
 #[cfg(feature = "foxglove")]
 use crate::foxglove::{self, FoxgloveError};
 use crate::hub::Hub;
@@ -16,7 +16,7 @@ use crate::limits::SessionLimits;
 #[cfg(feature = "rosbridge")]
 use crate::rosbridge::{self, Authenticate, RosbridgeError, RosbridgeOptions};
 use crate::session::Session;
-use crate::ws::{Subprotocols, Upgrade, UpgradeError, upgrade};
+use crate::ws::{Subprotocols, Upgrade, UpgradeError, finish, upgrade};
 
 /// The subprotocols of this build. Without one, a client speaks the rosbridge protocol.
 const SUBPROTOCOLS: Subprotocols = Subprotocols {
@@ -26,6 +26,10 @@ const SUBPROTOCOLS: Subprotocols = Subprotocols {
     known: &[],
     is_needed: cfg!(not(feature = "rosbridge")),
 };
+
+/// Close code for a client that finds no place (1013, "try again later", of IANA's registry for RFC 6455, 11.7). Pages
+/// in browsers see close codes, and no HTTP status of a refused upgrade.
+const TRY_AGAIN_LATER: u16 = 1013;
 
 /// A protocol over WebSocket.
 #[derive(Clone, Copy)]
@@ -97,9 +101,26 @@ impl WebSocketFront {
             upgraded = tokio::time::timeout_at(deadline, upgrade(stream, &arrival, admission, SUBPROTOCOLS)) => upgraded,
             () = handshake.evicted() => return admission.count("handshake gave way"),
         };
-        drop(handshake);
         match upgraded {
-            Ok(Ok(upgraded)) => self.speak(upgraded, arrival, inflow).await,
+            Ok(Ok(upgraded)) => {
+                // `upgrade` refuses clients without a protocol of this build.
+                let Some(dialect) = Dialect::from_subprotocol(upgraded.subprotocol) else { return };
+                match admission.enter(&upgraded.client, dialect.as_str(), peer) {
+                    Ok(place) => {
+                        drop(handshake);
+                        self.speak(dialect, upgraded, place, arrival, inflow).await;
+                    }
+                    Err(why) => {
+                        tracing::debug!(%peer, client = %upgraded.client.name, %why, "a client finds no place");
+                        let why = why.to_string();
+                        // The refusal keeps the place of its handshake, so that refusals are bounded.
+                        tokio::select! {
+                            () = finish(upgraded.socket, &inflow, Some((TRY_AGAIN_LATER, &why))) => {}
+                            () = handshake.evicted() => {}
+                        }
+                    }
+                }
+            }
             Ok(Err(UpgradeError::NotAdmitted)) => {}
             Ok(Err(UpgradeError::Socket(error))) => {
                 tracing::debug!(%peer, %error, "no WebSocket");
@@ -112,14 +133,13 @@ impl WebSocketFront {
     /// Serves a client until it leaves or its rights end.
     async fn speak(
         &self,
+        dialect: Dialect,
         upgraded: Upgrade<MeteredStream<Box<dyn ByteStream>>>,
+        place: Place,
         arrival: Arrival,
         inflow: Arc<Inflow>,
     ) {
         let (admission, peer, client) = (&self.admission, arrival.peer, upgraded.client);
-        // `upgrade` refuses clients without a protocol of this build.
-        let Some(dialect) = Dialect::from_subprotocol(upgraded.subprotocol) else { return };
-        let Some(place) = admission.enter(&client, dialect.as_str(), peer) else { return };
         let place = Arc::new(place);
         let name = Arc::clone(&client.name);
         let session = Session::new(&self.hub, client, self.limits).admitted_by(admission.rules().clone());

@@ -1,0 +1,153 @@
+//! The ends of connections: clients get the reason, whatever they send or have not read.
+#![allow(clippy::unwrap_used)]
+
+mod support;
+
+use std::future::Future;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::BytesMut;
+use futures_util::{SinkExt as _, StreamExt as _};
+use serde_json::json;
+use sgc_gateway::rosbridge::RosbridgeOptions;
+use sgc_gateway::{
+    Access, ListenAt, Protocol, Server, ServerOptions, Session, SessionLimits, foxglove, rosbridge,
+};
+use sgc_websocket::WebSocket;
+use tokio::io::{AsyncWriteExt as _, DuplexStream};
+use tokio::net::TcpStream;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
+use tokio_tungstenite::tungstenite::protocol::Role;
+
+use support::Site;
+
+const PATIENCE: Duration = Duration::from_secs(20);
+const FOXGLOVE: &str = "foxglove.sdk.v1";
+/// Bytes that a client sends before it reads, more than the buffers of the kernel take.
+const SENT_ON_BYTES: usize = 16 << 20;
+
+async fn within<T>(work: impl Future<Output = T>) -> T {
+    tokio::time::timeout(PATIENCE, work).await.expect("it should have been done by now")
+}
+
+async fn server(site: &Site, clients_max: usize) -> Server {
+    let listen = ListenAt {
+        protocol: Protocol::WebSocket,
+        is_encrypted: false,
+        addr: ([127, 0, 0, 1], 0).into(),
+    };
+    let options = ServerOptions {
+        name: "robot".into(),
+        listen: vec![listen],
+        access: Access::default(),
+        key: None,
+        clients_max,
+        limits: SessionLimits::default(),
+    };
+    Server::start(site.hub.clone(), options).await.unwrap()
+}
+
+async fn connect(addr: SocketAddr, subprotocol: Option<&str>) -> WebSocketStream<TcpStream> {
+    let stream = TcpStream::connect(addr).await.unwrap();
+    let mut request = format!("ws://{addr}/").into_client_request().unwrap();
+    if let Some(name) = subprotocol {
+        request.headers_mut().insert("sec-websocket-protocol", name.parse().unwrap());
+    }
+    within(tokio_tungstenite::client_async(request, stream)).await.unwrap().0
+}
+
+/// Reads up to the close frame, and returns its code and reason.
+async fn close<S>(socket: &mut WebSocketStream<S>) -> Option<(u16, String)>
+where
+    S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
+{
+    loop {
+        match within(socket.next()).await.expect("a close frame comes first").unwrap() {
+            Message::Close(why) => return why.map(|why| (why.code.into(), why.reason.to_string())),
+            _ => {}
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn client_that_breaks_a_rule_and_sends_on_gets_the_code() {
+    let site = Site::new().await;
+    let server = server(&site, 64).await;
+    let addr = server.local()[0].addr;
+    let gigabyte = [&[0x82, 0xff][..], &(1_u64 << 30).to_be_bytes(), &[0; 4]].concat();
+    for subprotocol in [None, Some(FOXGLOVE)] {
+        for (wrong, code) in [
+            // A frame without a mask.
+            (vec![0x81, 0x01, b'x'], 1002),
+            // A text that is not UTF-8.
+            (vec![0x81, 0x81, 0, 0, 0, 0, 0xff], 1007),
+            (gigabyte.clone(), 1009),
+        ] {
+            let mut socket = connect(addr, subprotocol).await;
+            let stream = socket.get_mut();
+            stream.write_all(&wrong).await.unwrap();
+            within(stream.write_all(&vec![0; SENT_ON_BYTES])).await.unwrap();
+            assert_eq!(close(&mut socket).await.unwrap().0, code, "{subprotocol:?}");
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn client_without_a_free_place_is_told() {
+    let site = Site::new().await;
+    let server = server(&site, 1).await;
+    let addr = server.local()[0].addr;
+    let mut first = connect(addr, None).await;
+    for subprotocol in [None, Some(FOXGLOVE)] {
+        let mut second = connect(addr, subprotocol).await;
+        let (code, why) = close(&mut second).await.unwrap();
+        assert_eq!(code, 1013);
+        assert!(why.starts_with("1 clients at most for "), "{why}");
+    }
+    assert_eq!(server.status().refused["too many clients"], 2);
+    first.send(Message::text(r#"{"op":"dance"}"#)).await.unwrap();
+    assert!(within(first.next()).await.unwrap().unwrap().is_text());
+}
+
+/// Lets a client ask much through a narrow pipe, close before it reads, and expects the answer to its close.
+async fn leave<F>(site: &Site, question: String, serve: impl FnOnce(WebSocket<DuplexStream>, Arc<Session>) -> F)
+where
+    F: Future<Output = ()> + Send + 'static,
+{
+    const PIPE_BYTES: usize = 1 << 15;
+    const QUESTIONS: usize = 60;
+    let (here, there) = tokio::io::duplex(PIPE_BYTES);
+    let socket = WebSocket::new(there, BytesMut::new(), 64 << 20);
+    let served = tokio::spawn(serve(socket, Arc::new(site.session("page"))));
+    let mut page = WebSocketStream::from_raw_socket(here, Role::Client, None).await;
+    for _ in 0..QUESTIONS {
+        within(page.send(Message::text(question.clone()))).await.unwrap();
+    }
+    // Time is virtual, and goes on once the answers fill the pipe.
+    tokio::time::sleep(Duration::from_millis(1)).await;
+    within(page.send(Message::Close(None))).await.unwrap();
+    tokio::time::sleep(Duration::from_millis(1)).await;
+    assert_eq!(close(&mut page).await, None);
+    within(served).await.unwrap();
+}
+
+#[tokio::test]
+async fn close_of_a_client_is_answered_while_output_waits() {
+    const LONG: usize = 3000;
+    let site = Site::new().await;
+    tokio::time::pause();
+    let asset = json!({"op": "fetchAsset", "uri": "x".repeat(LONG), "requestId": 1}).to_string();
+    leave(&site, asset, |socket, session| async move {
+        foxglove::serve(socket, session, foxglove::Options::default()).await.unwrap();
+    })
+    .await;
+    let unknown = json!({"op": "subscribe", "topic": "/a", "id": "x".repeat(1000), "type": 3}).to_string();
+    leave(&site, unknown, |socket, session| async move {
+        rosbridge::serve(socket, session, RosbridgeOptions::default()).await.unwrap();
+    })
+    .await;
+}
