@@ -35,11 +35,8 @@ async fn within<T>(work: impl Future<Output = T>) -> T {
 }
 
 async fn server(site: &Site, clients_max: usize) -> Server {
-    let listen = ListenAt {
-        protocol: Protocol::WebSocket,
-        is_encrypted: false,
-        addr: ([127, 0, 0, 1], 0).into(),
-    };
+    let listen =
+        ListenAt { protocol: Protocol::WebSocket, is_encrypted: false, addr: ([127, 0, 0, 1], 0).into() };
     let options = ServerOptions {
         name: "robot".into(),
         listen: vec![listen],
@@ -66,9 +63,9 @@ where
     S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
 {
     loop {
-        match within(socket.next()).await.expect("a close frame comes first").unwrap() {
-            Message::Close(why) => return why.map(|why| (why.code.into(), why.reason.to_string())),
-            _ => {}
+        let message = within(socket.next()).await.expect("a close frame comes first").unwrap();
+        if let Message::Close(why) = message {
+            return why.map(|why| (why.code.into(), why.reason.to_string()));
         }
     }
 }
@@ -114,8 +111,11 @@ async fn client_without_a_free_place_is_told() {
 }
 
 /// Lets a client ask much through a narrow pipe, close before it reads, and expects the answer to its close.
-async fn leave<F>(site: &Site, question: String, serve: impl FnOnce(WebSocket<DuplexStream>, Arc<Session>) -> F)
-where
+async fn leave<F>(
+    site: &Site,
+    question: String,
+    serve: impl FnOnce(WebSocket<DuplexStream>, Arc<Session>) -> F,
+) where
     F: Future<Output = ()> + Send + 'static,
 {
     const PIPE_BYTES: usize = 1 << 15;
