@@ -30,6 +30,8 @@ mod graph;
 pub mod grpc;
 mod hub;
 mod inflow;
+#[cfg(feature = "_websocket")]
+mod keep_alive;
 mod limits;
 mod message;
 mod network;

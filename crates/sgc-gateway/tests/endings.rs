@@ -11,12 +11,13 @@ use std::time::Duration;
 use bytes::BytesMut;
 use futures_util::{SinkExt as _, StreamExt as _};
 use serde_json::json;
+use sgc_gateway::foxglove::FoxgloveError;
 use sgc_gateway::rosbridge::RosbridgeOptions;
 use sgc_gateway::{
     Access, ListenAt, Protocol, Server, ServerOptions, Session, SessionLimits, foxglove, rosbridge,
 };
 use sgc_websocket::WebSocket;
-use tokio::io::{AsyncWriteExt as _, DuplexStream};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, DuplexStream};
 use tokio::net::TcpStream;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
@@ -63,8 +64,8 @@ where
     S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
 {
     loop {
-        let message = within(socket.next()).await.expect("a close frame comes first").unwrap();
-        if let Message::Close(why) = message {
+        if let Message::Close(why) = within(socket.next()).await.expect("a close frame comes first").unwrap()
+        {
             return why.map(|why| (why.code.into(), why.reason.to_string()));
         }
     }
@@ -150,4 +151,67 @@ async fn close_of_a_client_is_answered_while_output_waits() {
         rosbridge::serve(socket, session, RosbridgeOptions::default()).await.unwrap();
     })
     .await;
+}
+
+/// Passes bytes on, to the client `bytes` each second.
+async fn pass_slowly(gateway: DuplexStream, client: DuplexStream, bytes: usize) {
+    let (mut from_gateway, mut to_gateway) = tokio::io::split(gateway);
+    let (mut from_client, mut to_client) = tokio::io::split(client);
+    let back = tokio::io::copy(&mut from_client, &mut to_gateway);
+    let forth = async {
+        let mut some = vec![0; bytes];
+        while let Ok(read @ 1..) = from_gateway.read(&mut some).await {
+            to_client.write_all(&some[..read]).await.unwrap();
+            tokio::time::sleep(Duration::from_secs(1)).await;
+        }
+    };
+    tokio::select! {
+        _ = back => {}
+        () = forth => {}
+    }
+}
+
+#[tokio::test]
+async fn slow_viewer_is_not_silent_and_one_that_reads_nothing_is() {
+    const PIPE_BYTES: usize = 1 << 16;
+    const SLOW_BYTES: usize = 20 << 10;
+    const ASSETS: usize = 60;
+    const ASSET_BYTES: usize = 60_000;
+    let site = Site::new().await;
+    tokio::time::pause();
+    let serve = |here| {
+        let socket = WebSocket::new(here, BytesMut::new(), 64 << 20);
+        let served = foxglove::serve(socket, Arc::new(site.session("page")), foxglove::Options::default());
+        tokio::spawn(served)
+    };
+    let ask = async |page: &mut WebSocketStream<DuplexStream>, asset: usize| {
+        let question = json!({"op": "fetchAsset", "uri": "x".repeat(ASSET_BYTES), "requestId": asset});
+        page.send(Message::text(question.to_string())).await
+    };
+    // A pipe that never fills stands for the buffers of both systems, which hold a ping back.
+    for narrow_bytes in [PIPE_BYTES, 8 << 20] {
+        let ((here, there), (near, far)) = (tokio::io::duplex(narrow_bytes), tokio::io::duplex(PIPE_BYTES));
+        let served = serve(here);
+        let _passing = tokio::spawn(pass_slowly(there, near, SLOW_BYTES));
+        let mut page = WebSocketStream::from_raw_socket(far, Role::Client, None).await;
+        for asset in 0..ASSETS {
+            ask(&mut page, asset).await.unwrap();
+        }
+        let begun = tokio::time::Instant::now();
+        let mut answers = 0;
+        while answers < ASSETS {
+            let next = within(page.next()).await.expect("it only reads slowly").unwrap();
+            answers += usize::from(next.is_binary());
+        }
+        assert!(begun.elapsed() > 2 * foxglove::Options::default().silence_max);
+        assert!(!served.is_finished());
+    }
+    let (here, far) = tokio::io::duplex(PIPE_BYTES);
+    let served = serve(here);
+    let mut page = WebSocketStream::from_raw_socket(far, Role::Client, None).await;
+    for asset in 0..ASSETS {
+        ask(&mut page, asset).await.unwrap();
+    }
+    let ended = served.await.unwrap();
+    assert!(matches!(ended, Err(FoxgloveError::Silent { .. })), "{ended:?}");
 }

@@ -17,6 +17,7 @@ use tokio::time::{Instant, MissedTickBehavior};
 use crate::content::{Content, Form};
 use crate::error::GatewayError;
 use crate::feed::{Delivery, Subscription};
+use crate::keep_alive::PingState;
 use crate::publisher::Publication;
 use crate::session::{Advertise, Session, Subscribe};
 
@@ -163,7 +164,7 @@ impl<'o> Connection<'o> {
     }
 
     /// Serves the client until it leaves or must leave.
-    pub(super) async fn run<R>(&mut self, frames: &mut R) -> Result<(), FoxgloveError>
+    pub(super) async fn run<R>(&mut self, frames: &mut R, pings: &PingState) -> Result<(), FoxgloveError>
     where
         R: Stream<Item = Result<Frame, SocketError>> + Unpin + Send,
     {
@@ -172,12 +173,16 @@ impl<'o> Connection<'o> {
         let mut tell_at = Some(Instant::now());
         let mut ticks = tokio::time::interval(REPORT.min(self.options.ping_interval));
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let (mut came_at, mut pinged_at) = (Instant::now(), Instant::now());
+        let mut pinged_at = Instant::now();
+        // The time since which frames are read, while they are.
+        let mut read_since = None;
         loop {
             let has_room = self.outbox.has_room();
+            let is_read = has_room && self.jobs.len() < JOBS_MAX;
+            read_since = is_read.then(|| read_since.unwrap_or_else(Instant::now));
             let at = tell_at.unwrap_or_else(Instant::now);
             let event = tokio::select! {
-                frame = frames.next(), if has_room && self.jobs.len() < JOBS_MAX => Event::Frame(frame),
+                frame = frames.next(), if is_read => Event::Frame(frame),
                 Some(done) = self.jobs.next(), if has_room => Event::JobDone(done),
                 Some((id, delivery)) = self.deliveries.next() => Event::Message(id, delivery),
                 event = next_event(&mut self.events), if has_room => Event::ParametersChanged(event),
@@ -188,7 +193,7 @@ impl<'o> Connection<'o> {
             };
             match event {
                 Event::Frame(frame) => {
-                    came_at = Instant::now();
+                    pings.heard();
                     match frame {
                         None | Some(Ok(Frame::Close(_))) => return Ok(()),
                         Some(Ok(frame)) => {
@@ -211,10 +216,10 @@ impl<'o> Connection<'o> {
                     tell_at = (!self.tell_graph().await).then(Instant::now);
                 }
                 Event::Tick => {
-                    let silence = came_at.elapsed();
-                    if silence >= self.options.silence_max {
-                        let silence_ms = u64::try_from(silence.as_millis()).unwrap_or(u64::MAX);
-                        return Err(FoxgloveError::Silent { silence_ms });
+                    // An answer that is not read is no silence. Writes have a bound of their own.
+                    let silence = read_since.and_then(|since| pings.silence(self.options.silence_max, since));
+                    if let Some(silence) = silence {
+                        return Err(FoxgloveError::silent(silence));
                     }
                     if pinged_at.elapsed() >= self.options.ping_interval && has_room {
                         pinged_at = Instant::now();

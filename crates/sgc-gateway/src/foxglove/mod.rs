@@ -27,6 +27,7 @@ use futures_util::{Sink, SinkExt, StreamExt};
 use sgc_websocket::{Message as Frame, WebSocket, WebSocketError as SocketError};
 use tokio::io::{AsyncRead, AsyncWrite};
 
+use crate::keep_alive::{PingState, TooSlow, write_paced};
 use crate::quota::PendingBytes;
 use crate::session::Session;
 use crate::ws::finish;
@@ -37,6 +38,9 @@ use outbox::Outbox;
 
 /// WebSocket subprotocols of this protocol, the preferred one first.
 pub const SUBPROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
+
+/// Most bytes that are written before a flush.
+const FLUSH_BYTES: usize = 256 << 10;
 
 /// Time in which queued answers may be written when the connection ends.
 const FAREWELL_MAX: Duration = Duration::from_secs(1);
@@ -56,12 +60,13 @@ where
     let (mut sink, mut frames) = socket.split();
     let waiting = PendingBytes::new(session.limits().waiting_bytes_max, session.quota().clone());
     let (outbox, inflow) = (Outbox::new(waiting), session.inflow());
+    let (pings, silence_max) = (PingState::default(), options.silence_max);
     let mut connection = Connection::new(Arc::clone(&session), options, &outbox);
     let ended = tokio::select! {
         biased;
         denied = session.until_denied() => Err(FoxgloveError::Denied(denied)),
-        ended = connection.run(&mut frames) => ended,
-        failed = write(&mut sink, &outbox) => Err(FoxgloveError::Socket(failed)),
+        ended = connection.run(&mut frames, &pings) => ended,
+        failed = write(&mut sink, &outbox, &pings, silence_max) => Err(failed),
     };
     drop(connection);
     let close = ended.as_ref().err().and_then(FoxgloveError::close);
@@ -88,22 +93,39 @@ where
     sink.flush().await
 }
 
-/// Writes queued frames until the socket fails.
-async fn write<K>(sink: &mut K, outbox: &Outbox) -> SocketError
+/// Writes queued frames until the socket fails, or the client does not take them.
+async fn write<K>(sink: &mut K, outbox: &Outbox, pings: &PingState, silence_max: Duration) -> FoxgloveError
 where
     K: Sink<Frame, Error = SocketError> + Unpin,
 {
+    // Bytes that have not been flushed.
+    let mut waiting_bytes = 0;
     loop {
-        let written = match outbox.pop() {
-            Some(frame) => sink.feed(frame).await,
-            None => {
-                let flushed = sink.flush().await;
-                outbox.filled().await;
-                flushed
+        let frame = outbox.pop();
+        let (is_empty, is_ping) = (frame.is_none(), matches!(frame, Some(Frame::Ping(_))));
+        let bytes = frame.as_ref().map_or(0, Frame::payload_bytes);
+        waiting_bytes += bytes;
+        pings.wrote(bytes);
+        let is_flushed = is_empty || is_ping || waiting_bytes >= FLUSH_BYTES;
+        let written = write_paced(silence_max, waiting_bytes, async {
+            if let Some(frame) = frame {
+                sink.feed(frame).await?;
             }
-        };
-        if let Err(error) = written {
-            return error;
+            if is_flushed { sink.flush().await } else { Ok(()) }
+        });
+        match written.await {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => return error.into(),
+            Err(TooSlow(max)) => return FoxgloveError::silent(max),
+        }
+        if is_flushed {
+            waiting_bytes = 0;
+        }
+        if is_ping {
+            pings.asked();
+        }
+        if is_empty {
+            outbox.filled().await;
         }
     }
 }

@@ -22,7 +22,7 @@ pub struct Options {
     pub call_max: Duration,
     /// Interval of pings to the client.
     pub ping_interval: Duration,
-    /// Longest silence of a client.
+    /// Time for which a client may leave a ping unanswered or a frame unread.
     pub silence_max: Duration,
 }
 
@@ -47,8 +47,8 @@ pub enum FoxgloveError {
     /// The WebSocket failed, or the data was not a WebSocket message.
     #[error("the connection failed: {0}")]
     Socket(#[from] SocketError),
-    /// The client neither sends nor receives anything.
-    #[error("nothing came from the client for {silence_ms} ms")]
+    /// A ping was not answered, or a frame was not read, in time.
+    #[error("the client was silent for {silence_ms} ms")]
     Silent {
         /// The duration of the silence.
         silence_ms: u64,
@@ -59,6 +59,10 @@ pub enum FoxgloveError {
 }
 
 impl FoxgloveError {
+    pub(super) fn silent(silence: Duration) -> Self {
+        Self::Silent { silence_ms: u64::try_from(silence.as_millis()).unwrap_or(u64::MAX) }
+    }
+
     /// Returns the close code (RFC 6455, 7.4.1) and the text for the client, or `None` if there is nothing to say.
     pub(super) fn close(&self) -> Option<(u16, String)> {
         match self {

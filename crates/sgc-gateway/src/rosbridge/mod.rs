@@ -29,6 +29,7 @@ use tokio::sync::watch;
 use tokio::time::Instant;
 
 use crate::access::Denial;
+use crate::keep_alive::PingState;
 use crate::session::Session;
 use crate::ws::finish;
 use connection::Connection;
@@ -36,7 +37,7 @@ pub use options::{
     Authenticate, ROSBRIDGE_ADMISSION_MAX, ROSBRIDGE_CALL_MAX, ROSBRIDGE_MESSAGE_BYTES_MAX,
     ROSBRIDGE_SILENCE_MAX, RosbridgeError, RosbridgeOptions,
 };
-use outbox::{Outbox, PingState, ping_interval, write_all, write_rest};
+use outbox::{Outbox, ping_interval, write_all, write_rest};
 
 /// Most messages that are read before published messages are flushed and other events are handled.
 const TOGETHER_MAX: usize = 64;

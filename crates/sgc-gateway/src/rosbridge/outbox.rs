@@ -5,21 +5,20 @@
 //! replies and requests also wait for room in bytes. Nothing holds back replies, so they are refused once waiting
 //! ones exceed the room.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
-use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures_util::{Sink, SinkExt as _};
-use sgc_sync::lock;
 use sgc_websocket::{Message, WebSocketError};
 use tokio::sync::{Mutex as Turns, MutexGuard as Turn, mpsc};
-use tokio::time::Instant;
 
 use super::envelope::{Envelope, Frame};
 use super::op::OpId;
 use super::options::RosbridgeError;
 use crate::budget::{Budget, Room};
 use crate::error::GatewayError;
+use crate::keep_alive::{PingState, TooSlow, write_paced};
 use crate::quota::Quota;
 
 /// Shortest interval of pings.
@@ -30,8 +29,6 @@ const CONTROL_MAX: usize = 64;
 const BATCHES_MAX: usize = 4;
 /// Most bytes that are written before a flush.
 const FLUSH_BYTES: usize = 256 << 10;
-/// Lowest rate at which a client must read in the long run, in bytes per second.
-const PACE_BYTES_MIN: u64 = 16 << 10;
 
 /// The severity of statuses that a client receives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -178,29 +175,6 @@ impl Outbox {
     }
 }
 
-/// The time since which a ping has not been answered.
-#[derive(Debug, Default)]
-pub(super) struct PingState(Mutex<Option<Instant>>);
-
-impl PingState {
-    fn asked(&self) {
-        self.lock().get_or_insert_with(Instant::now);
-    }
-
-    /// Records that a message arrived.
-    pub(super) fn heard(&self) {
-        *self.lock() = None;
-    }
-
-    pub(super) fn unanswered(&self) -> Option<Instant> {
-        *self.lock()
-    }
-
-    fn lock(&self) -> std::sync::MutexGuard<'_, Option<Instant>> {
-        lock(&self.0)
-    }
-}
-
 /// Returns the interval of pings and checks.
 pub(super) fn ping_interval(silence_max: Duration) -> Duration {
     (silence_max / 4).max(PING_INTERVAL_MIN)
@@ -290,9 +264,8 @@ async fn timed(
     bytes: usize,
     write: impl Future<Output = Result<(), WebSocketError>>,
 ) -> Result<(), RosbridgeError> {
-    let max = silence_max + Duration::from_secs(bytes as u64 / PACE_BYTES_MIN);
-    match tokio::time::timeout(max, write).await {
+    match write_paced(silence_max, bytes, write).await {
         Ok(result) => result.map_err(RosbridgeError::Socket),
-        Err(_) => Err(RosbridgeError::Silent(max)),
+        Err(TooSlow(max)) => Err(RosbridgeError::Silent(max)),
     }
 }
