@@ -43,7 +43,7 @@ pub(crate) struct Participant {
     domain: Entity,
     /// The watch of writers' leases, if there is one. Ends after the domain.
     leases: Option<Leases>,
-    /// After the domain too.
+    /// The filters of late readers. They end after the domain.
     _late_readers: Option<LateReaders>,
     guid: Guid,
     tag: Option<String>,
