@@ -1,35 +1,10 @@
 //! Actions of nodes that break the protocol: they capture, inject and alter frames and packets.
 
-use std::time::Duration;
-
 use sgc_wire::{Control, Packet};
 
-use crate::NodeKey;
+use crate::ids::NodeKey;
+use crate::record::{CapturedFrame, CapturedPacket};
 use crate::world::World;
-
-/// A frame that crossed a link while [`World::capture`] was on.
-#[derive(Clone, Debug)]
-pub struct CapturedFrame {
-    /// The sender.
-    pub from: NodeKey,
-    /// The receiver.
-    pub to: NodeKey,
-    /// The frame.
-    pub frame: Control,
-}
-
-/// A packet that crossed a link while [`World::capture`] was on.
-#[derive(Clone, Debug)]
-pub struct CapturedPacket {
-    /// The sender.
-    pub from: NodeKey,
-    /// The receiver.
-    pub to: NodeKey,
-    /// Time since the world began.
-    pub at: Duration,
-    /// The packet.
-    pub packet: Packet,
-}
 
 impl World {
     /// Sends a frame from one node to a neighbour, as if its router sent it.

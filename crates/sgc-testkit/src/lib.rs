@@ -30,11 +30,11 @@ mod allocator;
 mod cast;
 mod clock;
 mod evil;
+mod ids;
 pub mod mesh;
 mod model;
 pub mod netsim;
 mod node;
-mod publishers;
 mod record;
 mod rng;
 mod ros;
@@ -48,10 +48,12 @@ pub use allocator::{
 };
 pub use cast::{Member, identity, revocation_list, serial_list};
 pub use clock::Clock;
-pub use evil::{CapturedFrame, CapturedPacket};
+pub use ids::{MessageId, NodeKey};
 pub use model::Model;
-pub use node::{NodeKey, Sharing};
-pub use record::{DataDrop, LogEntry, MessageId, PublishedMessage, ReceivedMessage, What};
+pub use node::Sharing;
+pub use record::{
+    CapturedFrame, CapturedPacket, DataDrop, LogEntry, PublishedMessage, ReceivedMessage, What,
+};
 pub use rng::Dice;
 pub use ros::{FakeClient, FakeDomain, FakeReader, FakeRos, FakeServer, FakeWriter};
 pub use seeds::run_seeds;

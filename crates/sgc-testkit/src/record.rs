@@ -4,13 +4,9 @@ use std::time::Duration;
 
 use sgc_endpoint::{Event, SinkDrop};
 use sgc_router::{LinkClose, LinkId};
-use sgc_wire::{Name, SourceId};
+use sgc_wire::{Control, Name, Packet, SourceId};
 
-use crate::NodeKey;
-
-/// Number of a published message, unique in its world.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct MessageId(pub u64);
+use crate::ids::{MessageId, NodeKey};
 
 /// A message that was published.
 #[derive(Clone, Debug)]
@@ -48,6 +44,30 @@ pub struct ReceivedMessage {
     pub owner: NodeKey,
     /// The topic.
     pub topic: String,
+}
+
+/// A frame that crossed a link while [`World::capture`](crate::World::capture) was on.
+#[derive(Clone, Debug)]
+pub struct CapturedFrame {
+    /// The sender.
+    pub from: NodeKey,
+    /// The receiver.
+    pub to: NodeKey,
+    /// The frame.
+    pub frame: Control,
+}
+
+/// A packet that crossed a link while [`World::capture`](crate::World::capture) was on.
+#[derive(Clone, Debug)]
+pub struct CapturedPacket {
+    /// The sender.
+    pub from: NodeKey,
+    /// The receiver.
+    pub to: NodeKey,
+    /// Time since the world began.
+    pub at: Duration,
+    /// The packet.
+    pub packet: Packet,
 }
 
 /// An event at a node, with its time.

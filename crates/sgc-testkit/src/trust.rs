@@ -8,7 +8,8 @@ use sgc_trust::TrustAnchors;
 use sgc_wire::{Now, UnixMillis};
 
 use crate::cast::{identity, with_fleet};
-use crate::node::{Node, NodeKey, Sharing, policy};
+use crate::ids::NodeKey;
+use crate::node::{Node, Sharing, policy};
 use crate::world::World;
 
 impl World {

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use sgc_router::LinkId;
 use sgc_wire::{Control, Name};
 
-use crate::NodeKey;
+use crate::ids::NodeKey;
 
 /// A function that replaces a frame by others, or by none.
 pub(crate) type Tamper = Box<dyn FnMut(&Control) -> Vec<Control>>;

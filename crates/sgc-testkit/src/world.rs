@@ -16,12 +16,13 @@ use sgc_wire::{
 
 use crate::cast::{Member, identity};
 use crate::clock::{Clock, GENESIS};
-use crate::evil::{CapturedFrame, CapturedPacket};
+use crate::ids::{MessageId, NodeKey};
 use crate::node::{Arrival, Directory, Effect, Node, Sharing, metadata};
-use crate::record::{LogEntry, MessageId, PublishedMessage, ReceivedMessage, What};
+use crate::record::{
+    CapturedFrame, CapturedPacket, DataDrop, LogEntry, PublishedMessage, ReceivedMessage, What,
+};
 use crate::rng::Dice;
 use crate::wires::{Cable, Wire, WireEnd};
-use crate::{DataDrop, NodeKey};
 
 /// Number of deliveries in one call of [`World::run`] above which the network counts as looping.
 const STEPS_MAX: usize = 300_000;

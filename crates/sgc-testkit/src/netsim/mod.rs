@@ -16,8 +16,8 @@ mod tun;
 mod units;
 
 pub use channel::{Channel, Counters, FLYING_BYTES_MAX, Loss, Profile, QueueLimit, Reorder};
-pub use namespace::{Namespace, NetsimError, ip, on_host};
+pub use namespace::{Namespace, NetsimError, ip};
 pub use pump::Direction;
 pub use relay::{TcpRelay, UdpRelay};
-pub use tun::{TunEnd, TunLink, TunOptions};
+pub use tun::{TunEnd, TunLink, TunOptions, on_host};
 pub use units::{UnitError, parse_bytes, parse_duration, parse_percent, parse_queue, parse_rate};

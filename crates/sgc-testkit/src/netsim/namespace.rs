@@ -141,14 +141,6 @@ pub fn ip(args: &[&str]) -> Result<String, NetsimError> {
     finish(Command::new("ip").args(args))
 }
 
-/// Checks that namespaces and TUN devices can be made here. The error gives the reason.
-pub fn on_host() -> Result<(), NetsimError> {
-    let name = format!("netsim-{}-{:?}", std::process::id(), std::thread::current().id());
-    let name: String = name.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').collect();
-    let namespace = Namespace::create(name)?;
-    namespace.within(|| super::tun::open("netsim0").map(drop))?
-}
-
 fn finish(command: &mut Command) -> Result<String, NetsimError> {
     let line = || {
         let words = std::iter::once(command.get_program()).chain(command.get_args());

@@ -9,7 +9,7 @@ use rustix::event::{PollFd, PollFlags};
 use tun_rs::{DeviceBuilder, SyncDevice};
 
 use super::channel::{Channel, Counters, Profile};
-use super::namespace::{NetsimError, configure, ip, within};
+use super::namespace::{Namespace, NetsimError, configure, ip, within};
 use super::pump::{BATCH_MAX, Direction, Ports, Pump, controls};
 
 /// Packets that the kernel holds for us, so that none is lost before it is in the channel, where it is counted.
@@ -65,6 +65,14 @@ impl TunLink {
     }
 }
 
+/// Checks that namespaces and TUN devices can be made here. The error gives the reason.
+pub fn on_host() -> Result<(), NetsimError> {
+    let name = format!("netsim-{}-{:?}", std::process::id(), std::thread::current().id());
+    let name: String = name.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').collect();
+    let namespace = Namespace::create(name)?;
+    namespace.within(|| open("netsim0").map(drop))?
+}
+
 fn device(end: &TunEnd, mtu: u16) -> Result<SyncDevice, NetsimError> {
     let namespace = end.namespace.as_deref();
     let device = within(namespace, || {
@@ -78,7 +86,7 @@ fn device(end: &TunEnd, mtu: u16) -> Result<SyncDevice, NetsimError> {
 }
 
 /// Opens a device in the namespace of the calling thread.
-pub(super) fn open(interface: &str) -> Result<SyncDevice, NetsimError> {
+fn open(interface: &str) -> Result<SyncDevice, NetsimError> {
     let make = || {
         let device = DeviceBuilder::new().name(interface).enable(false).build_sync()?;
         device.set_nonblocking(true)?;

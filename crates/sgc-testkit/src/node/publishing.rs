@@ -2,23 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use sgc_endpoint::{JoinKind, RecoveryLimits, Sink, SinkLimits, Source, SourceConfig};
+use sgc_endpoint::{JoinKind, RecoveryLimits, Sink, SinkLimits, SourceConfig};
 use sgc_trust::{MessageKey, Suite, name_of};
-use sgc_wire::{Name, NodeId, Now, Packet, Reliability, SinkId, SourceId, SourceOffer, TopicGrant};
+use sgc_wire::{Name, NodeId, Now, Reliability, SinkId, SourceId, SourceOffer, TopicGrant};
 
-use crate::NodeKey;
-use crate::node::{Directory, EPOCH_GRACE, LocalSink, Running, sealed};
-use crate::record::MessageId;
-
-/// A source of this node on another's topic.
-pub(crate) struct Publisher {
-    owner: NodeKey,
-    config: SourceConfig,
-    message_key: MessageKey,
-    /// The grant with the key of `source`.
-    grant: Option<TopicGrant>,
-    pub(crate) source: Option<Source>,
-}
+use super::publisher::Publisher;
+use super::{Directory, EPOCH_GRACE, LocalSink, Running, sealed};
+use crate::ids::{MessageId, NodeKey};
 
 impl Running {
     /// Publishes on another's topic whenever its catalogue permits it.
@@ -50,7 +40,7 @@ impl Running {
             }
         }
         let gone = |(name, p): (&Name, &Publisher)| {
-            (p.owner == owner && !wanted.contains_key(name)).then_some(*name)
+            (p.owner() == owner && !wanted.contains_key(name)).then_some(*name)
         };
         for name in self.publishers.iter().filter_map(gone).collect::<Vec<_>>() {
             self.publishers.remove(&name);
@@ -72,7 +62,7 @@ impl Running {
             };
             let message_key = MessageKey::generate(suite);
             let offer = SourceOffer { source: config.id, key: message_key.public().clone() };
-            self.publishers.insert(name, Publisher { owner, config, message_key, grant: None, source: None });
+            self.publishers.insert(name, Publisher::new(owner, config, message_key));
             self.endpoint.join(now, name, owner_id, JoinKind::Publish(offer));
         }
     }
@@ -106,19 +96,5 @@ impl Running {
         for delivery in released {
             self.delivered(now, name, delivery);
         }
-    }
-}
-
-impl Publisher {
-    pub(crate) fn take_grant(&mut self, grant: TopicGrant, emit: impl FnMut(Packet)) {
-        let of_same_run = |known: &TopicGrant| known.epoch < grant.epoch || known.key == grant.key;
-        match &mut self.source {
-            Some(source) if self.grant.as_ref().is_some_and(of_same_run) => {
-                let _ = source.rekey(&grant, emit);
-            }
-            // The first grant, or one of a restarted owner, under whose keys no message was sealed yet.
-            source => *source = Source::new(self.config.clone(), &grant, self.message_key.clone()),
-        }
-        self.grant = Some(grant);
     }
 }

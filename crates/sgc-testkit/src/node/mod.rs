@@ -2,8 +2,10 @@
 //!
 //! The node owns no time and no network: the world passes in arrivals and carries out its [`Effect`]s.
 
+mod publisher;
+mod publishing;
+
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -21,9 +23,11 @@ use sgc_wire::{
     Name, NodeId, Now, Packet, Qos, Reliability, SourceId,
 };
 
+use publisher::Publisher;
+
 use crate::cast::{Member, identity};
-use crate::publishers::Publisher;
-use crate::record::{DataDrop, MessageId, What};
+use crate::ids::{MessageId, NodeKey};
+use crate::record::{DataDrop, What};
 
 /// Type of every topic.
 const TYPE_NAME: &str = "sgc_testkit/msg/Numbered";
@@ -32,16 +36,6 @@ const HISTORY_RETRY: Duration = Duration::from_secs(2);
 const HISTORY_BYTES_MAX: usize = 1 << 20;
 /// Time for which packets of past epochs are still accepted.
 pub(crate) const EPOCH_GRACE: Duration = Duration::from_secs(5);
-
-/// A node of a world.
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct NodeKey(pub usize);
-
-impl fmt::Debug for NodeKey {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "n{}", self.0)
-    }
-}
 
 /// The recipients and the settings of a shared topic.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
