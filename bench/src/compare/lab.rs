@@ -12,8 +12,10 @@ use anyhow::{Context, Result};
 use sgc_testkit::netsim::{Loss, Namespace, Profile, TunLink};
 use tempfile::TempDir;
 
+pub(crate) use super::networks::Side;
+
+use super::networks::{Dds, Networks, Running};
 use super::program::Program;
-use super::system::{Dds, Networks, Running};
 use crate::uplink::{FAR, NEAR, Uplink};
 
 /// The interface at each end of the path.
@@ -21,33 +23,6 @@ pub(crate) const INTERFACE: &str = "path0";
 const BITS_PREFIX: u8 = 24;
 
 static LABS: AtomicU32 = AtomicU32::new(0);
-
-/// One of the two places.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Side {
-    /// The robot's.
-    Left,
-    /// The desk's, or the cloud's.
-    Right,
-}
-
-impl Side {
-    /// Both.
-    pub(crate) const BOTH: [Self; 2] = [Self::Left, Self::Right];
-
-    /// `left`, `right`.
-    pub(crate) fn name(self) -> &'static str {
-        ["left", "right"][self as usize]
-    }
-
-    /// The other one.
-    pub(crate) fn other(self) -> Self {
-        match self {
-            Self::Left => Self::Right,
-            Self::Right => Self::Left,
-        }
-    }
-}
 
 /// The path between the two places.
 #[derive(Clone, Copy, Debug)]

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use anyhow::Result;
 
 use super::lab::PathKind;
+use super::sample::Sample;
 use super::system::Sgc;
 use super::tally::{Round, Tally};
 use super::{Compare, Figures, round_trip, throughput};
@@ -41,7 +42,7 @@ fn measure(
     let system = Sgc::new(compare.sgc(), "quic", suite, routers)?;
     let mut samples = BTreeMap::new();
     round_trip::measure(compare, &kind, &system, &[BYTES], &mut samples)?;
-    for round_trip::Sample { round_trips_us, .. } in samples.into_values() {
+    for Sample { round_trips_us, .. } in samples.into_values() {
         let spread = crate::report::Spread::from_samples(round_trips_us);
         tally.add(name, kind.name(), routers as u64, "p50_us", spread.p50);
         tally.add(name, kind.name(), routers as u64, "p99_us", spread.p99);

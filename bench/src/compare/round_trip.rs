@@ -13,6 +13,7 @@ use super::flow::CONNECT_MAX;
 use super::lab::{Lab, PathKind, Side};
 use super::plan::Breadth;
 use super::program::Program;
+use super::sample::{LARGE_BYTES, Plan, Sample};
 use super::system::{Running, System, Topic};
 use super::turns::by_stages;
 use super::{Compare, Figures, plan, tcp};
@@ -24,10 +25,6 @@ const PONG: &str = "/bench/pong";
 pub(crate) const GAVE_UP: &str = "gave_up_us";
 /// Bytes of a message.
 const SIZES: [usize; 7] = [16, 100, 1000, 8 << 10, 64 << 10, 1 << 20, 13 << 20];
-/// From where on a message is large: few are measured, and one is enough where the path is thin.
-const LARGE_BYTES: usize = 1 << 20;
-/// And from where on it is huge: there one says it all where the path is thin.
-const HUGE_BYTES: usize = 8 << 20;
 /// How much longer than it may take is waited for an answer.
 const SPARE: Duration = Duration::from_secs(5);
 
@@ -98,17 +95,6 @@ fn sizes(kind: &PathKind, quick: bool) -> &'static [usize] {
 
 /// Samples by system and size.
 pub(crate) type Samples = BTreeMap<(String, usize), Sample>;
-
-/// The round trips of one size.
-#[derive(Debug, Default)]
-pub(crate) struct Sample {
-    /// Each round trip, µs.
-    pub(crate) round_trips_us: Vec<f64>,
-    /// Messages that did not come back in time.
-    pub(crate) lost: u64,
-    /// That time.
-    pub(crate) patience: Duration,
-}
 
 /// Adds what was measured of these sizes, as far as it came.
 fn add(samples: &mut Samples, name: &str, sizes: &[usize], measured: Vec<Sample>) {
@@ -204,35 +190,4 @@ pub(crate) fn measure(
         turn = after;
     }
     Ok(())
-}
-
-/// How one size is measured.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Plan {
-    /// At most so many that count.
-    pub(crate) count: usize,
-    /// None begins after so long.
-    pub(crate) seconds: f64,
-    /// How many come first and do not count.
-    pub(crate) warm_up: usize,
-    /// How long each is waited for.
-    pub(crate) patience: Duration,
-}
-
-impl Plan {
-    fn for_path(kind: &PathKind, size: usize, quick: bool) -> Self {
-        let is_large = size >= LARGE_BYTES;
-        let is_huge = size >= HUGE_BYTES;
-        let (count, seconds, warm_up, patience): (usize, f64, usize, u64) = match kind {
-            PathKind::Bare if is_huge => (12, 2.5, 1, 15),
-            PathKind::Bare if is_large => (60, 1.5, 2, 10),
-            PathKind::Bare => (3000, 1.0, 50, 5),
-            // 13 MB take 44 s there and back at 5 Mbit/s.
-            _ if is_huge => (1, 1.0, 0, 100),
-            _ if is_large => (3, 1.0, 0, 40),
-            _ => (200, 4.0, 2, 10),
-        };
-        let (count, seconds) = if quick { (count.min(100), seconds.min(0.5)) } else { (count, seconds) };
-        Self { count, seconds, warm_up, patience: Duration::from_secs(patience) }
-    }
 }

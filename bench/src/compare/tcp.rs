@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, ensure};
 
 use super::lab::{Lab, Side};
-use super::round_trip::{Plan, Sample};
+use super::sample::{Plan, Sample};
 
 /// As figures call it.
 pub(crate) const NAME: &str = "tcp";

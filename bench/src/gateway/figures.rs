@@ -3,7 +3,6 @@
 use serde::Serialize;
 
 use super::client::Way;
-use super::goals;
 use super::measure::Flow;
 use crate::report::{Spread, Table, digits, median};
 
@@ -88,7 +87,7 @@ impl Figure {
     }
 }
 
-/// Goals first.
+/// Returns the tables of round trips and rates.
 pub(super) fn tables(figures: &[Figure]) -> Vec<Table> {
     let trips = figures.iter().map(|figure| {
         let Spread { p50, p99, max, .. } = figure.round_trip_us;
@@ -97,7 +96,6 @@ pub(super) fn tables(figures: &[Figure]) -> Vec<Table> {
         row
     });
     vec![
-        goals::table(figures),
         Table {
             title: "Round trips: the client publishes, a Cyclone program sends it back on another topic, the client has it. µs"
                 .into(),

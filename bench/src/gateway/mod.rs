@@ -11,6 +11,7 @@ mod measure;
 mod scene;
 
 use std::fs;
+use std::iter;
 use std::path::PathBuf;
 
 use anyhow::{Context, Result};
@@ -81,7 +82,7 @@ pub(crate) fn run(args: &GatewayArgs) -> Result<()> {
             }
         }
     }
-    let tables = tables(&figures);
+    let tables = iter::once(goals::table(&figures)).chain(tables(&figures)).collect();
     let report = Report::new(&figures, tables)?;
     report.print();
     if args.quick {

@@ -9,9 +9,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::repository::{REPOSITORY, Repository};
 use crate::rust_tokens::{Module, Path, modules};
 
-/// Crates whose circles are still to be removed.
-const STILL_CIRCULAR: [&str; 1] = ["bench"];
-
 /// Most re-exports between a path and its file.
 const RE_EXPORTS_MAX: usize = 16;
 
@@ -117,12 +114,9 @@ fn circles(repository: &Repository) -> BTreeMap<&str, Vec<String>> {
 #[test]
 fn files_of_a_crate_import_each_other_in_one_direction() {
     assert!(crates(&REPOSITORY).len() > 10, "few crates are found");
-    let mut found = circles(&REPOSITORY);
-    let cured: Vec<&str> = STILL_CIRCULAR.into_iter().filter(|krate| found.remove(krate).is_none()).collect();
     let list = |(krate, circles): (&str, Vec<String>)| format!("{krate}: {}", circles.join("\n"));
-    let found: Vec<String> = found.into_iter().map(list).collect();
+    let found: Vec<String> = circles(&REPOSITORY).into_iter().map(list).collect();
     assert!(found.is_empty(), "move what the files share into a file below them\n{}", found.join("\n"));
-    assert!(cured.is_empty(), "these crates have no circles, and leave STILL_CIRCULAR: {cured:?}");
 }
 
 #[cfg(test)]
