@@ -62,18 +62,6 @@ pub enum GraphError {
     TooMany,
 }
 
-impl GraphError {
-    /// Returns a short, stable name for counters.
-    pub fn key(&self) -> &'static str {
-        match self {
-            Self::Malformed => "graph_malformed",
-            Self::Ambiguous => "graph_ambiguous",
-            Self::Foreign => "graph_foreign",
-            Self::TooMany => "graph_participants",
-        }
-    }
-}
-
 /// A participant's announcement of its nodes, without the enclave.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ParticipantNodes {
