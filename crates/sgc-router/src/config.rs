@@ -28,3 +28,23 @@ pub struct RouterConfig {
     /// Bounds.
     pub limits: Limits,
 }
+
+#[cfg(test)]
+impl RouterConfig {
+    /// Returns the parameters of a router `cloud` that starts now, for tests of its parts.
+    pub(crate) fn for_tests(now: sgc_wire::Now) -> Self {
+        use sgc_testkit::{Member, identity};
+
+        let own = identity(&Member { router: true, ..Member::new("cloud") });
+        Self {
+            node: own.node_id(),
+            transit: true,
+            incarnation: 1,
+            started: now.unix,
+            mapping: MappingKind::Flood,
+            anchors: Arc::new(own.anchors().clone()),
+            limits: Limits::default(),
+            identity: own,
+        }
+    }
+}

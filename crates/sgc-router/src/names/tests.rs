@@ -7,7 +7,6 @@ use sgc_wire::{AdvertBody, Hello, Now, UnixMillis};
 use super::*;
 use crate::limits::allowances::Allowances;
 use crate::links::{Links, Neighbour};
-use crate::mapping::MappingKind;
 use crate::output::{Output, Outputs};
 use crate::topology::Topology;
 
@@ -29,18 +28,8 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        let own = identity(&Member { router: true, ..Member::new("cloud") });
         let now = Clock::default().now();
-        let config = RouterConfig {
-            node: own.node_id(),
-            transit: true,
-            incarnation: 1,
-            started: now.unix,
-            mapping: MappingKind::Flood,
-            anchors: Arc::new(own.anchors().clone()),
-            limits: Limits::default(),
-            identity: own,
-        };
+        let config = RouterConfig::for_tests(now);
         let hello = Hello { minor: 0, incarnation: 1, transit: false, yields: false, started: UnixMillis(1) };
         let mut bench = Self {
             now,

@@ -4,8 +4,6 @@ use bytes::Bytes;
 use sgc_testkit::{Clock, Member, identity};
 
 use super::*;
-use crate::limits::Limits;
-use crate::mapping::MappingKind;
 
 const FLOOR: u64 = 3;
 
@@ -14,18 +12,7 @@ fn router(name: &str) -> Arc<Identity> {
 }
 
 fn topology(now: Now) -> Topology {
-    let own = router("cloud");
-    let config = RouterConfig {
-        node: own.node_id(),
-        transit: true,
-        incarnation: 1,
-        started: now.unix,
-        mapping: MappingKind::Flood,
-        anchors: Arc::new(own.anchors().clone()),
-        limits: Limits::default(),
-        identity: own,
-    };
-    Topology::new(now.instant, &config)
+    Topology::new(now.instant, &RouterConfig::for_tests(now))
 }
 
 /// Lets `edge` say that it is linked to these routers; the digest is its number.
