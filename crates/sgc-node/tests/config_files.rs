@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use sgc_node::config::{ArgsConfig, Config, ConfigErrors, Mistake, Origin, load, load_args};
 
@@ -11,24 +11,6 @@ const NODE: &str = "identity = 'x'\nnode.routers = ['quic://r:7447']\n";
 
 fn no_env(_: &str) -> Option<String> {
     None
-}
-
-fn args(args: &[(&str, &str)]) -> ArgsConfig {
-    let all = |name| {
-        args.iter().filter(|(n, _)| *n == name).map(|(_, value)| (*value).to_owned()).collect::<Vec<_>>()
-    };
-    ArgsConfig {
-        identity: all("identity").first().map(PathBuf::from),
-        routers: all("router"),
-        shares: all("share"),
-        to: all("to"),
-        uses: all("use"),
-        listen: all("listen"),
-        peers: all("peer"),
-        announce: !all("announce").is_empty(),
-        accept: all("accept").iter().map(PathBuf::from).collect(),
-        gateway: !all("gateway").is_empty(),
-    }
 }
 
 #[test]
@@ -134,8 +116,11 @@ fn the_identity_file_is_checked_when_loading() {
         chmod(mode);
         assert_eq!(load(&file, &no_env).unwrap().identity, identity);
     }
-    let identity_arg = identity.display().to_string();
-    let from_args = args(&[("identity", &identity_arg), ("router", "quic://r:7447")]);
+    let from_args = ArgsConfig {
+        identity: Some(identity.clone()),
+        routers: vec!["quic://r:7447".into()],
+        ..ArgsConfig::default()
+    };
     assert_eq!(load_args(&from_args, &no_env).unwrap().identity, identity);
     chmod(0o666);
     assert!(
