@@ -21,7 +21,7 @@ const PLACES: [(&str, usize); 3] = [("data path", 1), ("sink", 2), ("links refus
 const COUNTED: [&str; 8] =
     ["counted", "counted as", "counts as", "counter", "counter is", "drop reason", "counts", "counted under"];
 /// The heads of columns that list counters.
-const HEADS: [&str; 3] = ["keys", "counter", "refusals that `sgc why` names"];
+const HEADS: [&str; 2] = ["keys", "counter"];
 /// So many counters that begin with one word are a family: whatever begins so is one of them.
 const FAMILY_MIN: usize = 3;
 /// The crate that counts.
