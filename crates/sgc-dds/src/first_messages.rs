@@ -36,8 +36,8 @@ use cyclors::{
 
 use crate::entity::{Entity, check, monotonic_ns};
 use crate::identity::FAST_DDS;
-use crate::late_readers::{self, ProxyReaderState};
-use crate::manual_leases::{self, Lease};
+use crate::late_readers::{self, LateReaders, ProxyReaderState};
+use crate::manual_leases::{self, Lease, Leases};
 
 /// Delays after a match with which a reader asks for a heartbeat, in nanoseconds. Cyclone reports the match a few
 /// instructions before it would handle a heartbeat for the reader, so on a busy machine the first answer may come too
@@ -219,11 +219,25 @@ struct NewWriter {
     events: *mut c_void,
 }
 
+/// The watch of the endpoints that a domain discovers. Dropped after the domain, which may end without reporting their
+/// end.
+#[derive(Debug)]
+pub(crate) struct EndpointWatch {
+    pub(crate) leases: Leases,
+    _late_readers: LateReaders,
+}
+
+impl EndpointWatch {
+    /// `domain` is the address of its variables.
+    fn of_domain(domain: usize) -> Self {
+        Self { leases: Leases(domain), _late_readers: LateReaders(domain) }
+    }
+}
+
 /// Makes Cyclone report the endpoints that it discovers in a domain to this module, by replacing the function with
 /// which it publishes them to the built-in topics. Cyclone calls that function once a writer is known, under the
-/// writer's lock, before it matches readers and before it handles a heartbeat. Returns the id of the domain for
-/// [`manual_leases`].
-pub(crate) fn install(domain: &Entity, participant: &Entity) -> Result<usize, String> {
+/// writer's lock, before it matches readers and before it handles a heartbeat.
+pub(crate) fn install(domain: &Entity, participant: &Entity) -> Result<EndpointWatch, String> {
     // SAFETY: the topic is a constant of Cyclone's; null means its own QoS and no listener.
     let reader = Entity::new(unsafe {
         dds_create_reader(
@@ -255,7 +269,7 @@ pub(crate) fn install(domain: &Entity, participant: &Entity) -> Result<usize, St
     }
     let ours = endpoint_changed as WriteEndpoint as *mut c_void;
     if write_endpoint == ours {
-        return Ok(gv);
+        return Ok(EndpointWatch::of_domain(gv));
     }
     let known = WRITE_ENDPOINT.compare_exchange(
         std::ptr::null_mut(),
@@ -268,7 +282,7 @@ pub(crate) fn install(domain: &Entity, participant: &Entity) -> Result<usize, St
     }
     // SAFETY: the field is aligned, lives as long as the domain, and Cyclone's other threads read it whole; either function does for them.
     unsafe { AtomicPtr::from_ptr(&raw mut (*topics).write_endpoint) }.store(ours, Ordering::Release);
-    Ok(gv)
+    Ok(EndpointWatch::of_domain(gv))
 }
 
 /// Makes the listener of a reliable reader ask writers for a heartbeat.
@@ -315,10 +329,8 @@ unsafe fn discover(entity: *const EntityCommon, domain: *mut c_void) -> Option<N
     // SAFETY: valid by contract, and every entity begins with these.
     let (kind, guid, gv) = unsafe { ((*entity).kind, (*entity).guid, (*entity).gv) };
     let is_of_domain = (gv as usize).wrapping_sub(domain as usize) <= DOMAIN_HEAD_BYTES_MAX;
-    if guid[3] & NOT_OF_USERS != 0 || !is_of_domain || cfg!(target_endian = "big") {
-        return None;
-    }
-    if !matches!(kind, PROXY_WRITER | PROXY_READER) {
+    let is_endpoint = matches!(kind, PROXY_WRITER | PROXY_READER) && guid[3] & NOT_OF_USERS == 0;
+    if !is_endpoint || !is_of_domain || cfg!(target_endian = "big") {
         return None;
     }
     let endpoint = entity.cast::<ProxyEndpoint>();

@@ -109,7 +109,7 @@ pub(crate) fn forget(reader: *const c_void) {
     readers().remove(&(reader as usize));
 }
 
-/// The readers of a domain. Dropped after the domain, which may end without reporting its readers.
+/// The readers of a domain. Dropping forgets them.
 #[derive(Debug)]
 pub(crate) struct LateReaders(pub(crate) usize);
 

@@ -118,7 +118,7 @@ pub(crate) fn forget(domain: *const c_void, guid: [u32; 4]) {
     leases().remove(&(domain as usize, guid));
 }
 
-/// The leases of a domain's writers. Dropped after the domain, which may end without reporting its writers.
+/// The leases of a domain's writers. Dropping forgets them.
 #[derive(Debug)]
 pub(crate) struct Leases(pub(crate) usize);
 

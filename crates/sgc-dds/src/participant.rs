@@ -19,10 +19,8 @@ use crate::announced;
 use crate::config::DdsConfig;
 use crate::domain::Domain;
 use crate::entity::{Entity, check};
-use crate::first_messages;
-use crate::late_readers::LateReaders;
+use crate::first_messages::{self, EndpointWatch};
 use crate::log;
-use crate::manual_leases::Leases;
 use crate::pace::Pace;
 use crate::plugin_domain;
 use crate::qos::NativeQos;
@@ -41,10 +39,8 @@ pub(crate) struct Participant {
     /// Ends before the domain. `None` if the participant loses programs on this host when its addresses change.
     same_host: Option<SameHost>,
     domain: Entity,
-    /// The watch of writers' leases, if there is one. Ends after the domain.
-    leases: Option<Leases>,
-    /// The filters of late readers. They end after the domain.
-    _late_readers: Option<LateReaders>,
+    /// The watch of discovered endpoints, unless this Cyclone is another one. Ends after the domain.
+    endpoint_watch: Option<EndpointWatch>,
     guid: Guid,
     tag: Option<String>,
     security: Option<Security>,
@@ -82,7 +78,7 @@ impl Participant {
             tracing::warn!(reason, "programs of this host may be lost when its addresses change");
         }
         let guid = entity.guid().map_err(refused)?;
-        let inside = first_messages::install(&domain.entity, &entity).inspect_err(|reason| {
+        let endpoint_watch = first_messages::install(&domain.entity, &entity).inspect_err(|reason| {
             tracing::warn!(
                 reason,
                 "this Cyclone DDS is another one: first messages of Fast DDS writers may be lost"
@@ -92,8 +88,7 @@ impl Participant {
             entity,
             same_host: same_host.ok(),
             domain: domain.entity,
-            _late_readers: inside.as_ref().ok().copied().map(LateReaders),
-            leases: inside.ok().map(Leases),
+            endpoint_watch: endpoint_watch.ok(),
             guid,
             tag: config.tag.clone(),
             security: config.security.clone(),
@@ -160,7 +155,7 @@ impl Participant {
 
     /// Returns the time since a writer renewed its lease, if leases are watched.
     pub(crate) fn renewed_ago(&self, writer: &Guid) -> Option<Duration> {
-        self.leases.as_ref()?.renewed_ago(writer)
+        self.endpoint_watch.as_ref()?.leases.renewed_ago(writer)
     }
 
     /// Returns `true` if the endpoint belongs to this participant.

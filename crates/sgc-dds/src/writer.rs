@@ -248,6 +248,13 @@ impl CycloneWriter {
         self.unacknowledged.map_or(1, |kept| kept.instances(bytes, writers))
     }
 
+    /// Returns the number of samples of this length that the writer keeps unacknowledged over so many instances.
+    fn kept_over(&self, instances: u32, bytes: usize) -> Option<u32> {
+        let kept = self.unacknowledged?.depth.saturating_mul(instances);
+        let late = self.late.as_ref().map(|(late, _)| lock(late).kept(bytes));
+        Some(late.map_or(kept, |late| late.min(kept)))
+    }
+
     /// Changes the history for late joiners and updates Cyclone's. The change gets the number of writers like this
     /// one and returns the number of samples that may stay, if others may not.
     fn change_late(&self, change: impl FnOnce(&mut LateHistory, usize) -> Option<u32>) {
@@ -293,9 +300,7 @@ impl RosWriter for CycloneWriter {
     }
 
     fn kept(&self, bytes: usize) -> Option<u32> {
-        let kept = self.unacknowledged?.depth.saturating_mul(self.instances(bytes));
-        let late = self.late.as_ref().map(|(late, _)| lock(late).kept(bytes));
-        Some(late.map_or(kept, |late| late.min(kept)))
+        self.kept_over(self.instances(bytes), bytes)
     }
 
     fn write_ahead(&self, head: SampleHead, payload: Bytes) -> Result<(), RosError> {
@@ -319,12 +324,13 @@ impl RosWriter for CycloneWriter {
             return Err(RosError::KeyUnknown);
         }
         let number = self.written.fetch_add(1, Ordering::Relaxed);
+        let instances = self.instances(payload.len());
         let instance = match (&self.keys, &key_hash) {
             (Some(keys), Some(hash)) => lock(keys).instance(hash),
-            _ => take_instance(&self.next_instance, self.instances(payload.len())),
+            _ => take_instance(&self.next_instance, instances),
         };
         let asks = self
-            .kept(payload.len())
+            .kept_over(instances, payload.len())
             .is_some_and(|kept| number.is_multiple_of((kept / ASKED_PER_KEPT).max(1)));
         let asked = if asks { WriterInside::find(self.writer.handle(), self.topic.handle()) } else { None };
         if let Some(inside) = &asked {
