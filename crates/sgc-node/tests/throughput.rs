@@ -17,6 +17,7 @@ use sgc_dds::{CycloneNetwork, CycloneReader, CycloneWriter, DdsConfig, Discovery
 use sgc_node::config::{Config, QosOverride, Recipient, Shaping, ShareConfig, ShareMetadata, UseConfig};
 use sgc_node::{RunOptions, run_on};
 use sgc_ros::{EndpointSpec, RosNetwork, RosWriter, SampleKind, dds_topic, dds_type};
+use sgc_testkit::unused_port;
 use sgc_transport::{ListenAddr, Scheme};
 use sgc_trust::{EnrollRequest, Fleet, FleetName, Identity, NodeName, Suite};
 use sgc_wire::{Class, History, Qos, UnixMillis};
@@ -126,9 +127,7 @@ struct Way {
 
 impl Way {
     fn new(suite: Suite, dir: &Path) -> Self {
-        let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
-        let port = socket.local_addr().unwrap().port();
-        drop(socket);
+        let port = unused_port();
         let config = |name: &str| Config {
             node_name: None,
             identity: "unused".into(),

@@ -7,7 +7,7 @@
 //!
 //! There is no socket, no thread and no sleep here, and no ROS: nodes publish numbered messages.
 //! Sealing is as in production; the provider's own randomness in signatures decides nothing. Only [`netsim`] is
-//! different: it is a bad network for real processes, in real time. [`CountingAllocator`] is for tests of allocations.
+//! different: it is a bad network for real processes, in real time, and [`unused_port`] is for their listeners. [`CountingAllocator`] is for tests of allocations.
 //!
 //! ```
 //! use std::time::Duration;
@@ -35,6 +35,7 @@ pub mod mesh;
 mod model;
 pub mod netsim;
 mod node;
+mod ports;
 mod record;
 mod rng;
 mod ros;
@@ -51,6 +52,7 @@ pub use clock::Clock;
 pub use ids::{MessageId, NodeKey};
 pub use model::Model;
 pub use node::Sharing;
+pub use ports::unused_port;
 pub use record::{
     CapturedFrame, CapturedPacket, DataDrop, LogEntry, PublishedMessage, ReceivedMessage, What,
 };

@@ -11,6 +11,7 @@ use sgc_testkit::netsim::{
     Direction, Loss, Namespace, NetsimError, Profile, QueueLimit, Reorder, TcpRelay, TunEnd, TunLink,
     TunOptions, UdpRelay, on_host,
 };
+use sgc_testkit::unused_port;
 
 const PATIENCE: Duration = Duration::from_secs(30);
 /// Time without a datagram after which it counts as lost, once the relay has counted all.
@@ -153,7 +154,7 @@ fn streams_pass_whole_at_the_rate_and_end() {
 
 #[test]
 fn a_stream_to_nowhere_is_closed() {
-    let nowhere = TcpListener::bind(any_port()).unwrap().local_addr().unwrap();
+    let nowhere = (Ipv4Addr::LOCALHOST, unused_port()).into();
     let relay = TcpRelay::start(any_port(), nowhere, [Profile::default(); 2], 1).unwrap();
     let mut stream = TcpStream::connect(relay.local()).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
+use sgc_testkit::unused_port;
 use sgc_transport::*;
 use sgc_trust::{CertError, Identity};
 use sgc_wire::{Class, DecodeError, Label, Name, UnixMillis};
@@ -141,8 +142,7 @@ async fn a_listener_with_an_expired_certificate_gets_no_link(scheme: &str) {
 }
 
 async fn nobody_at_the_address_is_said(scheme: &str) {
-    let unused = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
-    let url = format!("{scheme}://{}", unused.local_addr().unwrap()).parse().unwrap();
+    let url = format!("{scheme}://127.0.0.1:{}", unused_port()).parse().unwrap();
     let options = LinkOptions { handshake_timeout: Duration::from_millis(200), ..LinkOptions::default() };
     let dialer = Dialer::new(enroll(&fleet(1), "arm-1"), options, Arc::default());
     let error = soon(dialer.dial(&url)).await.unwrap_err();

@@ -15,6 +15,7 @@ use std::time::Duration;
 
 use openssl::{openssl, pem};
 use relay::Relay;
+use sgc_testkit::unused_port;
 use sgc_transport::*;
 use sgc_trust::{CertError, Identity};
 use support::*;
@@ -124,7 +125,7 @@ async fn a_dialer_connects_to_openssl_with_certificates_of_both_sides() {
     let fleet = fleet(1);
     let files = Files::write(&enroll(&fleet, "router"), "server");
     let (ca, leaf, key) = (files.path("ca.pem"), files.path("leaf.der"), files.path("key.pem"));
-    let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let port = unused_port();
     let accept = format!("127.0.0.1:{port}");
     let mut child = openssl(
         "s_server",

@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use dimpl::{DtlsCertificate, ProtocolVersion};
 use openssl::{openssl, pem};
+use sgc_testkit::unused_port;
 use sgc_transport::*;
 use sgc_trust::{CertError, EnrollRequest, GROUPS_MAX, Identity};
 use sgc_wire::CERT_BYTES_MAX;
@@ -221,7 +222,7 @@ async fn listener_without_dtls13_is_named() {
     let (leaf, key) = (dir.join("leaf.pem"), dir.join("key.pem"));
     std::fs::write(&leaf, stranger.certificate.pem()).unwrap();
     std::fs::write(&key, stranger.key.serialize_pem()).unwrap();
-    let port = std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let port = unused_port();
     let accept = format!("127.0.0.1:{port}");
     let (leaf, key) = (leaf.to_str().unwrap(), key.to_str().unwrap());
     let _server = openssl("s_server", &["-dtls1_2", "-accept", &accept, "-cert", leaf, "-key", key]);

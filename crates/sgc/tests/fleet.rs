@@ -9,6 +9,7 @@ use std::process::{Command, Output, Stdio};
 
 use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair};
 use rustls_pki_types::CertificateDer;
+use sgc_testkit::unused_port;
 use sgc_trust::{CertError, Fleet, Identity, TrustAnchors, requested_key_hash};
 use sgc_wire::UnixMillis;
 use tempfile::TempDir;
@@ -696,7 +697,7 @@ fn an_operator_keeps_the_fleet_from_a_machine_without_its_file() {
     for node in ["keeper", "arm-1", "arm-2"] {
         place.good(&["fleet", "enroll", node]);
     }
-    let port = std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let port = unused_port();
     let _cloud = place.start("cloud", port, &format!("[router]\nlisten = [\"quic://127.0.0.1:{port}\"]\n"));
     let keeper = place.keeper(port);
     let (_desk, _arm) = (place.start("desk", port, ""), place.start("arm-1", port, ""));

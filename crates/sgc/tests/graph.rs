@@ -12,6 +12,7 @@ use rustix::process::Signal;
 use serde_json::Value;
 use sgc_sync::lock;
 use sgc_testkit::netsim::Namespace;
+use sgc_testkit::unused_port;
 use support::{Peer, Running, eventually};
 
 /// ROS domains: the robot's and the desk's.
@@ -37,9 +38,7 @@ impl Lab {
         let dir = tempfile::tempdir().unwrap();
         let mut lab = Self { dir, namespace, nodes: Vec::new(), _turn: turn };
         support::enroll(lab.dir.path(), ["robot --may-route", "desk"]);
-        let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
-        let port = socket.local_addr().unwrap().port();
-        drop(socket);
+        let port = unused_port();
         let common = |name: &str, domain: &str| {
             format!(
                 "identity = \"{name}.identity\"\n[admin]\nsocket = \"{name}.sock\"\n[ros]\n\

@@ -227,8 +227,7 @@ impl Drop for Node {
 pub fn begin() -> u16 {
     let filter = tracing_subscriber::EnvFilter::from_env("SGC_LOG");
     let _ = tracing_subscriber::fmt().with_env_filter(filter).with_test_writer().try_init();
-    let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
-    socket.local_addr().unwrap().port()
+    sgc_testkit::unused_port()
 }
 
 /// The three nodes of the demo: a robot, a cloud router and an operator's desk, each with its own network.
