@@ -4,6 +4,7 @@
 //! thread of Cyclone or of an async runtime.
 
 use std::collections::{HashMap, VecDeque};
+use std::ffi::c_void;
 use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -11,8 +12,9 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use cyclors::{
     DDS_RETCODE_TIMEOUT, DDSI_STATUSINFO_DISPOSE, DDSI_STATUSINFO_UNREGISTER, dds_assert_liveliness,
-    dds_create_writer, dds_forwardcdr, dds_get_entity_sertype, dds_get_publication_matched_status,
-    dds_publication_matched_status, dds_set_status_mask, dds_take_status, dds_wait_for_acks, dds_write_flush,
+    dds_create_listener, dds_create_writer, dds_delete_listener, dds_entity_t, dds_forwardcdr,
+    dds_get_entity_sertype, dds_lset_publication_matched_arg, dds_publication_matched_status_t,
+    dds_set_status_mask, dds_take_status, dds_wait_for_acks, dds_write_flush,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, KeyHash, RosError, RosWriter, SampleHead, SampleKind};
 use sgc_sync::lock;
@@ -43,6 +45,8 @@ const TIMESTAMP_MAX_NS: i64 = 4_294_967_295_999_999_999;
 #[derive(Debug)]
 pub struct CycloneWriter {
     writer: Entity,
+    /// The number of matched readers, which the listener writes. The listener has a pointer to it, so it outlives the writer.
+    readers: Arc<AtomicU32>,
     _group: Option<Entity>,
     topic: Entity,
     participant: Arc<Participant>,
@@ -207,10 +211,18 @@ impl CycloneWriter {
         let topic = participant.topic(spec)?;
         let group = participant.group(EndpointKind::Writer, spec)?;
         let parent = group.as_ref().unwrap_or(participant.entity()).handle();
-        // SAFETY: the QoS object outlives the call, which copies it; null means no listener.
-        let writer = Entity::new(unsafe {
-            dds_create_writer(parent, topic.handle(), qos.as_ptr(), std::ptr::null())
-        })?;
+        let readers = Arc::new(AtomicU32::new(0));
+        let arg = Arc::as_ptr(&readers).cast_mut().cast::<c_void>();
+        // SAFETY: the QoS object and the listener outlive the call, which copies them, and the listener is deleted once.
+        // `arg` outlives the writer, whose deletion waits for its listener: see the fields' order.
+        let writer = unsafe {
+            let listener = dds_create_listener(arg);
+            // The status stays set, because a wait for readers waits for it.
+            dds_lset_publication_matched_arg(listener, Some(readers_changed), arg, false);
+            let writer = dds_create_writer(parent, topic.handle(), qos.as_ptr(), listener);
+            dds_delete_listener(listener);
+            Entity::new(writer)?
+        };
         // SAFETY: takes numbers, checked by Cyclone.
         check(unsafe { dds_set_status_mask(writer.handle(), READERS_MATCHED) })?;
         let late = LateHistory::new(spec);
@@ -227,6 +239,7 @@ impl CycloneWriter {
         let guid = writer.guid()?;
         Ok(Self {
             writer,
+            readers,
             _group: group,
             topic,
             participant: Arc::clone(participant),
@@ -379,16 +392,8 @@ impl RosWriter for CycloneWriter {
     }
 
     fn matched_readers(&self) -> u32 {
-        let mut status = dds_publication_matched_status {
-            total_count: 0,
-            total_count_change: 0,
-            current_count: 0,
-            current_count_change: 0,
-            last_subscription_handle: 0,
-        };
-        // SAFETY: the handle is checked by Cyclone, and `status` is a valid place for the result.
-        let ret = unsafe { dds_get_publication_matched_status(self.writer.handle(), &mut status) };
-        if ret < 0 { 0 } else { status.current_count }
+        // Cyclone's own status has the writer's lock, which a write that waits for acknowledgements holds.
+        self.readers.load(Ordering::Relaxed)
     }
 
     fn wait_matched(&self, readers: u32, max: Duration) -> u32 {
@@ -410,6 +415,17 @@ impl RosWriter for CycloneWriter {
             }
         }
     }
+}
+
+/// The listener of matched readers. Cyclone calls it for each change.
+unsafe extern "C" fn readers_changed(
+    _: dds_entity_t,
+    status: dds_publication_matched_status_t,
+    arg: *mut c_void,
+) {
+    // SAFETY: the argument of the listener, which lives until the writer is deleted.
+    let readers = unsafe { &*arg.cast::<AtomicU32>() };
+    readers.store(status.current_count, Ordering::Relaxed);
 }
 
 #[cfg(test)]
