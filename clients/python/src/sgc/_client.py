@@ -300,7 +300,7 @@ class Client:
         """Hears a topic; it is heard once this returns.
 
         ``type`` may be left out if somebody has the topic. At most ``rate`` messages a second come, 0 is all. Of what
-        comes too fast the newest ``depth`` are kept; with ``waits`` up to 64 MiB or 4096 messages wait at the gateway
+        comes too fast the newest ``depth`` are kept; with ``waits`` up to 64 MiB or 16384 messages wait at the gateway
         before any is left out. Without ``qos`` each publisher is heard as it offers.
         """
         return Subscription(self, _subscribe_request(topic, type, _CBOR, qos, depth, rate, waits), _decode)

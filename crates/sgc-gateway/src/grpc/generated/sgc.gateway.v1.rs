@@ -395,7 +395,7 @@ pub struct SubscribeRequest {
     /// of 1 the newest message comes.
     #[prost(double, tag = "6")]
     pub max_rate_hz: f64,
-    /// True to queue rather than drop: the gateway stops reading for this client, and up to 64 MiB or 4096 messages of
+    /// True to queue rather than drop: the gateway stops reading for this client, and up to 64 MiB or 16384 messages of
     /// reliable publishers are queued. Further ones are dropped and counted in `dropped`, so the network is not held up.
     #[prost(bool, tag = "7")]
     pub waits: bool,
