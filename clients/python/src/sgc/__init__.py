@@ -1,4 +1,4 @@
-"""ROS 2 topics, services and actions without ROS, through a gateway of SGC.
+"""Uses ROS 2 topics, services and actions without ROS, through a gateway of SGC.
 
     import sgc
 
@@ -6,8 +6,8 @@
         for odom in robot.subscribe("/odom", rate=5):
             print(odom.pose.pose.position.x)
 
-Messages are :class:`Message`: dictionaries whose members are attributes, too. Arrays of bytes are ``bytes``, arrays of other
-numbers ``array.array``, which numpy takes as they are. What goes wrong is a :class:`GatewayError`.
+Messages are :class:`Message`: dictionaries whose members are attributes, too. Arrays of bytes are ``bytes``. Arrays of
+other numbers are ``array.array``, which numpy uses without a copy. A failure raises :class:`GatewayError`.
 """
 
 from ._client import (

@@ -1,4 +1,4 @@
-"""CBOR (RFC 8949), as messages are written in it: maps, arrays, numbers, texts, bytes and typed arrays (RFC 8746)."""
+"""Reads and writes messages in CBOR (RFC 8949): maps, arrays, numbers, texts, bytes and typed arrays (RFC 8746)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Callable, List, Mapping, Tuple
 
 from ._message import Message
 
-# Tags of typed arrays, little endian, and what arrays of Python call them.
+# Tags of little-endian typed arrays, and the type codes of Python's arrays.
 _TYPED = {69: "H", 70: "I", 71: "Q", 72: "b", 77: "h", 78: "i", 79: "q", 85: "f", 86: "d"}
 _TAGS = {code: tag for tag, code in _TYPED.items()}
 _DEPTH_MAX = 64
@@ -17,11 +17,11 @@ _IS_LITTLE = sys.byteorder == "little"
 
 
 class CborError(ValueError):
-    """Not such a message."""
+    """Data that is not the CBOR of a message, or a value that has none."""
 
 
 def loads(data: bytes) -> Any:
-    """What is written in ``data``."""
+    """Returns the value that ``data`` encodes."""
     value, end = _read(data, 0, 0)
     if end != len(data):
         raise CborError(f"{len(data) - end} bytes too many")
@@ -29,14 +29,14 @@ def loads(data: bytes) -> Any:
 
 
 def dumps(value: Any) -> bytes:
-    """``value``, written."""
+    """Returns ``value`` in CBOR."""
     out: List[bytes] = []
     _write(value, out.append, 0)
     return b"".join(out)
 
 
 def _head(data: bytes, at: int) -> Tuple[int, int, int, int]:
-    """Kind, what the five bits say, the number, and where it goes on."""
+    """Returns the major type, the five low bits, the argument, and the position behind the head."""
     if at >= len(data):
         raise CborError("it ends too early")
     first = data[at]
@@ -142,7 +142,7 @@ def _write(value: Any, put: Callable[[bytes], None], depth: int) -> None:
 
 
 def _write_other(value: Any, put: Callable[[bytes], None], depth: int) -> None:
-    """Arrays of numbers, of the standard library and of numpy, and single numbers of numpy."""
+    """Writes arrays of numbers, of the standard library and of numpy, and single numbers of numpy."""
     try:
         view = memoryview(value)
     except TypeError:
@@ -152,7 +152,7 @@ def _write_other(value: Any, put: Callable[[bytes], None], depth: int) -> None:
         if not callable(item):
             raise CborError(f"{type(value).__name__} is no part of a message")
         return _write(item(), put, depth)
-    # Images are arrays of rows; messages have all of it in one.
+    # Images are arrays of rows; a message has all rows in one array.
     code, size = view.format.lstrip("<=@"), view.itemsize
     if size == 1 and code in ("B", "c"):
         data = view.tobytes()

@@ -1,4 +1,7 @@
-"""A client of the gateway: topics, services, actions and the graph. Threads are those of grpc, and one for each service."""
+"""A client of the gateway: topics, services, actions and the graph.
+
+Threads are those of grpc, and for each served service one that reads and a pool that runs the handler.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from ._message import Info, Message
 _log = logging.getLogger("sgc")
 
 MESSAGE_BYTES_MAX = 64 << 20
-"""Longest message, either way."""
+"""The longest message in both directions, in bytes."""
 _PORT = 50051
 _CDR, _CBOR = 1, 3
 _OPTIONS = [
@@ -28,25 +31,25 @@ _OPTIONS = [
     ("grpc.max_send_message_length", MESSAGE_BYTES_MAX),
     ("grpc.keepalive_time_ms", 20_000),
     ("grpc.keepalive_timeout_ms", 20_000),
-    # Each client has a connection of its own: what one leaves unread is no business of another.
+    # Each client has a connection of its own, so unread messages of one never hold up another.
     ("grpc.use_local_subchannel_pool", 1),
 ]
 
 Pem = Union[str, "os.PathLike[str]", bytes]
-"""A file of certificates or a key in PEM: its name, or what is in it."""
+"""Certificates or a key in PEM: the name of a file, or its content."""
 Content = Mapping[str, Any]
-"""A message: members that are left out have their defaults."""
+"""A message. Missing members have their defaults."""
 T = TypeVar("T")
 Handler = TypeVar("Handler", bound=Callable[..., Any])
 
 
 class GatewayError(Exception):
-    """What went wrong, as the gateway says it."""
+    """A failure, with the message of the gateway."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
         self.code = code
-        """Name of the status of gRPC: ``PERMISSION_DENIED``, ``NOT_FOUND``, ``UNAVAILABLE`` …"""
+        """The name of the gRPC status: ``PERMISSION_DENIED``, ``NOT_FOUND``, ``UNAVAILABLE`` …"""
 
     @classmethod
     def _of(cls, error: Any) -> "GatewayError":
@@ -55,11 +58,11 @@ class GatewayError(Exception):
 
 @dataclass(frozen=True)
 class Qos:
-    """Quality of service; the defaults are those of ROS 2."""
+    """Quality of service. The defaults are those of ROS 2."""
 
     reliable: bool = True
     latched: bool = False
-    """Whether those who come later hear what was published before (``transient_local``)."""
+    """Whether late subscribers get earlier messages (``transient_local``)."""
     depth: int = 10
     keep_all: bool = False
 
@@ -107,7 +110,7 @@ class Service:
 
 @dataclass(frozen=True)
 class Node:
-    """A node, and the names of what it has."""
+    """A node, with the names of its topics and services."""
 
     name: str
     publishes: Tuple[str, ...]
@@ -118,7 +121,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Graph:
-    """What is on the network, by name."""
+    """The topics, services, actions and nodes of the network, by name."""
 
     topics: Dict[str, Topic] = field(default_factory=dict)
     services: Dict[str, Service] = field(default_factory=dict)
@@ -157,12 +160,12 @@ def _node(said: Any) -> Node:
 
 @dataclass(frozen=True)
 class TypeDefinition:
-    """What a type is."""
+    """The definition of a type."""
 
     hash: str
-    """``RIHS01_…``, of a message."""
+    """The hash of a message type, ``RIHS01_…``."""
     texts: Dict[str, str]
-    """The text of its file, and those of all types that it needs."""
+    """The texts of its file and of the files of all types that it needs, by type."""
 
 
 def _pem(said: Optional[Pem]) -> Optional[bytes]:
@@ -185,11 +188,12 @@ def connect(
 ) -> "Client":
     """Connects to a gateway.
 
-    ``address`` is ``grpc://HOST[:PORT]``, or ``grpcs://HOST[:PORT]`` over TLS. A gateway admits by ``token``
-    (``sgc token create --out FILE`` makes one; ``token_file=FILE`` reads it, which keeps it out of programs and command
-    lines), by a client certificate (``certificate`` and its ``key``), or programs of its own
-    host. ``ca`` verifies the gateway, by default whom the system trusts; ``server_name`` is what its certificate calls it,
-    if that is not HOST. Files are in PEM.
+    ``address`` is ``grpc://HOST[:PORT]``, or ``grpcs://HOST[:PORT]`` over TLS. A gateway admits a program by ``token``
+    (``sgc token create --out FILE`` makes one), by a client certificate (``certificate`` and its ``key``), or because
+    it runs on the gateway's host. ``token_file=FILE`` reads the token from a file, which keeps it out of programs and
+    command lines. ``ca`` has the certificates that verify the gateway, by default those that the system trusts.
+    ``server_name`` is the name in the gateway's certificate, if it is not HOST. Files are in PEM. The call waits for
+    the connection up to ``timeout`` seconds.
     """
     if token_file is not None:
         if token is not None:
@@ -220,7 +224,10 @@ def connect(
 
 
 class Client:
-    """A program's connection to a gateway. Threads may share it; it ends with :meth:`close`, or as a context."""
+    """A program's connection to a gateway.
+
+    Threads may share it. It ends with :meth:`close`, or with the ``with`` block of which it is the context.
+    """
 
     def __init__(self, channel: Any, token: Optional[str] = None) -> None:
         self._channel = channel
@@ -237,11 +244,14 @@ class Client:
         except GatewayError as error:
             if kind is None:
                 raise
-            # What ended the block says more.
+            # The exception that ended the block matters more.
             _log.error("%s", error)
 
     def close(self) -> None:
-        """Ends everything that it began; raises what was wrong with a message that was published last."""
+        """Ends the publishers and services that it opened, and the connection.
+
+        Raises the first failure of a publisher.
+        """
         wrong: Optional[GatewayError] = None
         for one in list(self._open):
             try:
@@ -264,13 +274,13 @@ class Client:
         return self._calls[name](request, metadata=self._metadata)
 
     def graph(self, *, hidden: bool = False, timeout: Optional[float] = 10.0) -> Graph:
-        """What is on the network. With ``hidden`` also that of which actions are made."""
+        """Returns the graph of the network. ``hidden`` includes the topics and services that make up actions."""
         request = _proto.message("GetGraphRequest")(include_hidden=hidden)
         said = self._unary("GetGraph", request, timeout)
         return Graph()._with(said.graph, _proto.message("WatchGraphResponse.Gone")())
 
     def watch_graph(self, *, hidden: bool = False) -> Iterator[Graph]:
-        """What is on the network, and again whenever it has changed."""
+        """Yields the graph of the network, and the new graph after each change."""
         call = self._stream("WatchGraph", _proto.message("WatchGraphRequest")(include_hidden=hidden))
         graph = Graph()
         try:
@@ -283,7 +293,7 @@ class Client:
             call.cancel()
 
     def type(self, name: str, *, timeout: Optional[float] = 10.0) -> TypeDefinition:
-        """What a type is: ``geometry_msgs/msg/Twist``."""
+        """Returns the definition of a type, such as ``geometry_msgs/msg/Twist``."""
         said = self._unary("GetType", _proto.message("GetTypeRequest")(type=name), timeout)
         return TypeDefinition(said.type_hash, {one.type: one.text for one in said.definitions})
 
@@ -297,11 +307,12 @@ class Client:
         rate: float = 0.0,
         waits: bool = False,
     ) -> "Subscription[Message]":
-        """Hears a topic; it is heard once this returns.
+        """Subscribes to a topic. The subscription is active once this returns.
 
-        ``type`` may be left out if somebody has the topic. At most ``rate`` messages a second come, 0 is all. Of what
-        comes too fast the newest ``depth`` are kept; with ``waits`` up to 64 MiB or 16384 messages wait at the gateway
-        before any is left out. Without ``qos`` each publisher is heard as it offers.
+        ``type`` may be left out if the topic exists on the network. At most ``rate`` messages a second arrive; 0 is no
+        limit. Of messages that come faster than the program reads, the newest ``depth`` are kept. With ``waits``, up to
+        64 MiB or 16384 messages of reliable publishers wait at the gateway before any is dropped. Without ``qos``, the
+        subscription adapts to each publisher, and includes latched messages.
         """
         return Subscription(self, _subscribe_request(topic, type, _CBOR, qos, depth, rate, waits), _decode)
 
@@ -315,12 +326,15 @@ class Client:
         rate: float = 0.0,
         waits: bool = False,
     ) -> "Subscription[Tuple[bytes, Info]]":
-        """The same with messages as ROS 2 serialises them, for who reads CDR."""
+        """Subscribes like :meth:`subscribe`, and yields messages as serialised by ROS 2 (CDR)."""
         return Subscription(self, _subscribe_request(topic, type, _CDR, qos, depth, rate, waits), _raw)
 
     def publisher(self, topic: str, type: str = "", *, qos: Optional[Qos] = None, raw: bool = False) -> "Publisher":
-        """Publishes on a topic. ``type`` may be left out if somebody has the topic; with ``raw`` messages are ``bytes``,
-        as ROS 2 serialises them."""
+        """Opens a publisher of a topic.
+
+        ``type`` may be left out if the topic exists on the network. With ``raw``, messages are ``bytes`` as serialised
+        by ROS 2 (CDR).
+        """
         publisher = Publisher(self, topic, type, qos, raw)
         self._open.add(publisher)
         return publisher
@@ -328,7 +342,7 @@ class Client:
     def call(
         self, service: str, request: Optional[Content] = None, type: str = "", *, timeout: Optional[float] = 10.0
     ) -> Message:
-        """Calls a service, and waits for its reply, so many seconds at most."""
+        """Calls a service and returns its reply, for which it waits up to ``timeout`` seconds."""
         payload = _cbor.dumps(request or {})
         said = _proto.message("CallRequest")(service=service, type=type, encoding=_CBOR, payload=payload)
         return _message(self._unary("Call", said, timeout).payload)
@@ -336,14 +350,17 @@ class Client:
     def serve(
         self, service: str, handler: Callable[[Message], Content], type: str = "", *, workers: int = 4
     ) -> "Serving":
-        """Serves a service until it is closed; it is served once this returns. ``handler`` is given each request and gives
-        the reply, in up to ``workers`` threads; if it fails, that is logged and who called is not answered."""
+        """Serves a service until it is closed. The service is available once this returns.
+
+        ``handler`` takes a request and returns the reply. It runs in up to ``workers`` threads. An exception in it is
+        logged, and the caller gets no reply.
+        """
         serving = Serving(self, service, type, handler, workers)
         self._open.add(serving)
         return serving
 
     def service(self, name: str, type: str = "", *, workers: int = 4) -> Callable[[Handler], Handler]:
-        """The same as a decorator::
+        """Serves a service by the decorated function, like :meth:`serve`::
 
             @robot.service("/switch", "std_srvs/srv/SetBool")
             def switch(request):
@@ -357,20 +374,23 @@ class Client:
         return decorate
 
     def send_goal(self, action: str, goal: Optional[Content] = None, type: str = "") -> "Goal":
-        """Sends a goal; a server has taken it once this returns."""
+        """Sends a goal. A server has accepted it once this returns."""
         return Goal(self, action, goal or {}, type)
 
     def serve_action(
         self, action: str, handler: Callable[["ActionGoal"], Optional[Content]], type: str = "", *, workers: int = 4
     ) -> "Serving":
-        """Serves an action until it is closed. ``handler`` works on a goal, in a thread of up to ``workers``, and gives the
-        result; if it fails the goal is aborted."""
+        """Serves an action until it is closed.
+
+        ``handler`` works on a goal and returns the result. It runs in up to ``workers`` threads. An exception in it
+        aborts the goal.
+        """
         serving = _ServingAction(self, action, type, handler, workers)
         self._open.add(serving)
         return serving
 
     def action(self, name: str, type: str = "", *, workers: int = 4) -> Callable[[Handler], Handler]:
-        """The same as a decorator."""
+        """Serves an action by the decorated function, like :meth:`serve_action`."""
 
         def decorate(handler: Handler) -> Handler:
             self.serve_action(name, handler, type, workers=workers)
@@ -412,7 +432,7 @@ def _raw(said: Any) -> Tuple[bytes, Info]:
 
 
 class Subscription(Generic[T]):
-    """What is heard on a topic: an iterator, which ends when it is closed."""
+    """An iterator over the messages of a topic, which ends when it is closed."""
 
     def __init__(self, client: Client, request: Any, read: Callable[[Any], T]) -> None:
         self.topic: str = request.topic
@@ -448,13 +468,13 @@ class Subscription(Generic[T]):
         self.close()
 
     def close(self) -> None:
-        """Ends it; who waits for a message goes on."""
+        """Ends the subscription. A thread that waits for a message stops waiting."""
         self._is_closed = True
         self._call.cancel()
 
 
 class _Requests:
-    """What is sent on a stream, at the pace at which the gateway takes it."""
+    """A queue of requests on a stream, which the gateway takes at its own pace."""
 
     def __init__(self, waiting_max: int) -> None:
         self._waiting: "queue.Queue[Any]" = queue.Queue(waiting_max)
@@ -463,7 +483,7 @@ class _Requests:
         return iter(self._waiting.get, None)
 
     def put(self, request: Any, call: Any) -> None:
-        """Waits for room, unless the call has ended."""
+        """Queues a request. Waits for room, and raises if the call has ended."""
         while not call.done():
             try:
                 return self._waiting.put(request, timeout=0.1)
@@ -472,7 +492,7 @@ class _Requests:
         raise GatewayError._of(call)
 
     def end(self) -> None:
-        """Nothing is sent any more: the thread that sends ends."""
+        """Ends the stream and the thread that sends on it. Drops requests that wait."""
         while True:
             try:
                 return self._waiting.put_nowait(None)
@@ -484,7 +504,7 @@ class _Requests:
 
 
 class Publisher:
-    """Publishes on a topic, until it is closed."""
+    """A publisher of a topic, until it is closed."""
 
     def __init__(self, client: Client, topic: str, type: str, qos: Optional[Qos], raw: bool) -> None:
         self.topic = topic
@@ -500,8 +520,10 @@ class Publisher:
         self._published: Optional[int] = None
 
     def publish(self, message: Optional[Union[Content, bytes]] = None, **members: Any) -> None:
-        """Publishes a message: ``publish({"data": "left"})`` or ``publish(data="left")``. Waits while the gateway does not
-        take more; what was wrong with an earlier message is raised here."""
+        """Publishes a message: ``publish({"data": "left"})`` or ``publish(data="left")``.
+
+        Waits while the gateway does not accept more. Raises the failure of an earlier message, if there was one.
+        """
         if self._is_raw:
             payload = message if isinstance(message, bytes) else b""
         else:
@@ -509,7 +531,7 @@ class Publisher:
         self._requests.put(self._request(payload=payload), self._call)
 
     def close(self, timeout: float = 10.0) -> int:
-        """Ends it; says how many messages were published, and raises what was wrong with one."""
+        """Ends the publisher and returns the number of published messages. Raises the failure of a message."""
         self._client._open.discard(self)
         if self._published is None:
             try:
@@ -537,7 +559,7 @@ class Publisher:
 
 
 class Serving:
-    """A service or an action that is served, until it is closed."""
+    """A service or an action that this program serves, until it is closed."""
 
     _call_name, _request_name = "Serve", "ServeRequest"
 
@@ -597,13 +619,13 @@ class Serving:
         self._requests.put(self._request(**kind), self._call)
 
     def wait(self) -> None:
-        """Waits until it is closed; raises why, if it was not by this program."""
+        """Waits until it is closed. Raises the reason if the gateway ended it."""
         self._thread.join()
         if self._error is not None:
             raise self._error
 
     def close(self) -> None:
-        """Ends it: what is asked meanwhile is not answered."""
+        """Ends it. Requests that are still open get no reply."""
         self._is_closed = True
         self._call.cancel()
 
@@ -620,21 +642,21 @@ class ActionGoal:
     def __init__(self, serving: "_ServingAction", goal_id: bytes, request: Message) -> None:
         self.id = goal_id
         self.request = request
-        """What is wanted."""
+        """The content of the goal."""
         self._serving = serving
         self._is_to_end = threading.Event()
 
     @property
     def is_canceled(self) -> bool:
-        """Whether it is to be given up: then :meth:`Client.serve_action`'s handler gives what it has."""
+        """Whether the goal is to be canceled. The handler then returns the result that it has."""
         return self._is_to_end.is_set()
 
     def wait(self, seconds: float) -> bool:
-        """Waits so long, or until it is to be given up; says whether it is."""
+        """Waits for the time, or until the goal is to be canceled. Returns whether it is."""
         return self._is_to_end.wait(seconds)
 
     def feedback(self, message: Content) -> None:
-        """Tells of it."""
+        """Sends feedback to the client."""
         said = _proto.message("ServeActionRequest.Feedback")(goal_id=self.id, payload=_cbor.dumps(message))
         self._serving._say(feedback=said)
 
@@ -680,7 +702,7 @@ class _ServingAction(Serving):
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a goal ended."""
+    """The end of a goal."""
 
     status: str
     """``succeeded``, ``canceled`` or ``aborted``."""
@@ -688,7 +710,7 @@ class Outcome:
 
 
 class Goal:
-    """A goal that a server has taken: iterate over its feedback, then ask for its outcome."""
+    """A goal that a server has accepted: iterate over its feedback, then ask for its outcome."""
 
     _STATUS = {4: "succeeded", 5: "canceled", 6: "aborted"}
 
@@ -715,7 +737,7 @@ class Goal:
             raise GatewayError._of(error) from None
 
     def __iter__(self) -> Iterator[Message]:
-        """Its feedback, until it has ended."""
+        """Yields the feedback until the goal has ended."""
         while self._outcome is None:
             said = self._next()
             if said is None:
@@ -729,12 +751,12 @@ class Goal:
                 self._requests.end()
 
     def outcome(self) -> Outcome:
-        """Waits for its end; feedback that was not looked at is left out."""
+        """Waits for the end of the goal and returns it. Discards feedback that was not read."""
         for _ in self:
             pass
         assert self._outcome is not None
         return self._outcome
 
     def cancel(self) -> None:
-        """Asks its server to give it up."""
+        """Asks the server to cancel the goal."""
         self._requests.put(self._request(cancel=_proto.message("SendGoalRequest.Cancel")()), self._call)

@@ -1,4 +1,4 @@
-"""Messages: dictionaries whose members are attributes, too."""
+"""Messages, which are dictionaries whose members are attributes, too."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import Any, Optional
 
 @dataclass(frozen=True)
 class Info:
-    """How a message came."""
+    """The origin and the times of a message."""
 
     source_time_ns: int
-    """When it was published, by the publisher's clock, nanoseconds since 1970."""
+    """Time of publication by the publisher's clock, in nanoseconds since 1970."""
     received_time_ns: int
-    """When it came to the gateway, by its clock, nanoseconds since 1970."""
+    """Time of arrival at the gateway by its clock, in nanoseconds since 1970."""
     node: str
-    """Full name of the node that published it; empty if the network does not tell."""
+    """Full name of the publishing node; empty if the network does not announce it."""
     dropped: int
-    """How many messages were left out until now, since this program took them too slowly."""
+    """Number of messages dropped so far because this program reads too slowly."""
 
 
 class Message(dict):  # type: ignore[type-arg]
     """A message: ``message.pose.position.x`` is ``message["pose"]["position"]["x"]``.
 
-    Members come before what dictionaries have themselves: ``message.values`` is the member of that name, if there is one.
+    Members take precedence over methods of dictionaries: ``message.values`` is the member ``values``, if there is one.
     """
 
     __slots__ = ("_sgc_info",)
@@ -47,5 +47,5 @@ class Message(dict):  # type: ignore[type-arg]
 
 
 def info(message: Message) -> Optional[Info]:
-    """How a message came that was heard on a topic; ``None`` of any other, and of parts of it."""
+    """Returns the origin of a message of a topic; ``None`` for any other message, and for parts of one."""
     return getattr(message, "_sgc_info", None)

@@ -1,7 +1,7 @@
 """The protocol, from its own description: messages of ``gateway.proto``, and its calls on a channel.
 
-Nothing is generated, so no version of protoc has to fit that of protobuf; ``gateway.binpb`` is what the gateway tells by
-reflection.
+The code is not generated, so the version of protoc never has to fit that of protobuf. ``gateway.binpb`` is the
+description that the gateway returns by reflection.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _messages: Dict[str, Any] = {}
 
 
 def message(name: str) -> Any:
-    """The class of a message: ``SubscribeRequest``, ``PublishRequest.Publisher``."""
+    """Returns the class of a message, such as ``SubscribeRequest`` or ``PublishRequest.Publisher``."""
     known = _messages.get(name)
     if known is None:
         known = message_factory.GetMessageClass(_pool.FindMessageTypeByName(f"{_PACKAGE}.{name}"))
@@ -29,7 +29,7 @@ def message(name: str) -> Any:
 
 
 def stub(channel: Any) -> Dict[str, Any]:
-    """The calls of the gateway on a channel of grpc or grpc.aio, by name."""
+    """Returns the calls of the gateway on a channel of grpc or grpc.aio, by name."""
     calls: Dict[str, Any] = {}
     for method in _files.file[-1].service[0].method:
         kinds = ("stream" if method.client_streaming else "unary", "stream" if method.server_streaming else "unary")
