@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Builds the test peers that are not ours to test against: .peers/cyclone (Python), .peers/fastdds (C++) and .peers/rustdds (Rust),
-# installs ROS 2 (build-ros2.sh) and the libraries that clients of the gateway use, of Python and JavaScript.
-# Does nothing for what is there and newer than its sources.
+# Builds the independent test peers .peers/cyclone (Python), .peers/fastdds (C++) and .peers/rustdds (Rust).
+# Installs ROS 2 (build-ros2.sh), and the Python and JavaScript libraries that clients of the gateway use.
+# Skips each part that is newer than its sources.
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
 . "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
@@ -11,7 +11,7 @@ mkdir -p .peers
 requirements=tests/peers/py/requirements.txt
 installed=.venv/installed.txt
 if ! cmp -s "$requirements" "$installed"; then
-    # `--clear` would empty what a link leads to, which is another checkout's.
+    # `--clear` would empty the target of a link, which belongs to another checkout.
     if [ -L .venv ]; then
         rm .venv
     fi
@@ -21,7 +21,7 @@ if ! cmp -s "$requirements" "$installed"; then
     cp "$requirements" "$installed"
 fi
 
-# roslibpy's own tests, of the version that is installed.
+# The tests of roslibpy itself, in the installed version.
 source_of=tests/peers/py/roslibpy-source.txt
 if ! cmp -s "$source_of" .peers/roslibpy/installed.txt; then
     say "roslibpy's own tests in .peers/roslibpy"
@@ -34,7 +34,7 @@ if ! cmp -s "$source_of" .peers/roslibpy/installed.txt; then
     mv .peers/roslibpy.new .peers/roslibpy
 fi
 
-# What they depend on is pinned with its hashes, and runs nothing while it is installed.
+# The lock file pins dependencies by hash, and no scripts run during the installation.
 lock=tests/js/package-lock.json
 if ! cmp -s "$lock" tests/js/node_modules/installed.json; then
     say "JavaScript clients in tests/js"
@@ -58,7 +58,7 @@ fi
 
 scripts/build-ros2.sh
 
-# A workspace of its own, built where its dependencies are kept apart from ours. Cargo knows what is there and newer.
+# A separate workspace with its own target directory, so its dependencies stay apart. Cargo skips an unchanged build.
 say "RustDDS peer"
 CARGO_TARGET_DIR=.peers/rustdds-target "${CARGO:-cargo}" build --quiet --release --locked --manifest-path tests/peers/rustdds/Cargo.toml
 if ! cmp -s .peers/rustdds-target/release/rustdds-peer .peers/rustdds; then

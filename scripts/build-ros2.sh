@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Installs two distributions of ROS 2 (.peers/jazzy, .peers/kilted) and builds a load generator on the client library of each.
-# Does nothing for what is there and newer than its sources.
+# Skips each part that is newer than its sources.
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
 . "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
@@ -8,7 +8,7 @@ cd "$root"
 
 mkdir -p .peers
 
-# Real ROS 2, each distribution in an environment of its own. Two of its needs come as source only.
+# Each distribution has its own environment. Two of its dependencies are available only as source.
 for distribution in jazzy kilted; do
     environment=.peers/$distribution
     requirements=tests/peers/ros2/$distribution.txt
@@ -28,7 +28,7 @@ for distribution in jazzy kilted; do
         for folder in "$environment"/include/*/; do
             includes+=(-isystem "$folder")
         done
-        # The environment's Python finds what these libraries need in turn.
+        # The environment's Python finds the dependencies of these libraries.
         "${CC:-gcc}" -std=gnu17 -O2 -Wall -Wextra -Werror -shared -fPIC -o "$environment/load.so.new" "$source" "${includes[@]}" \
             -L"$environment/lib" -lrcl -lrmw -lrcutils -lrosidl_runtime_c -lstd_msgs__rosidl_typesupport_c \
             -lstd_msgs__rosidl_generator_c -Wl,--allow-shlib-undefined

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Runs cargo-deny over Cargo.lock with deny.toml.
-#   deny.sh            licences, bans and sources: what can be judged from crates.io alone
-#   deny.sh advisories known vulnerabilities: its database is fetched from the web
+#   deny.sh            licences, bans and sources, which need only crates.io
+#   deny.sh advisories known vulnerabilities, whose database is fetched from the web
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
 . "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
@@ -13,7 +13,7 @@ if [ "$("$tool" --version 2>/dev/null)" != "cargo-deny $version" ]; then
     if [ "$(cargo-deny --version 2>/dev/null)" = "cargo-deny $version" ]; then
         tool=cargo-deny
     else
-        # Unoptimised: it runs for a second or two, so building it is what costs.
+        # Unoptimised, because cargo-deny runs for a second or two and only its build takes long.
         say "building cargo-deny $version into .tools (about a minute, once)"
         CARGO_PROFILE_RELEASE_OPT_LEVEL=0 CARGO_PROFILE_RELEASE_LTO=off CARGO_PROFILE_RELEASE_DEBUG=0 \
             CARGO_TARGET_DIR=.tools/target cargo install --quiet --locked --root .tools --no-default-features \
@@ -25,9 +25,9 @@ fi
 case ${1:-} in
 advisories) "$tool" --locked check advisories ;;
 "")
-    # Duplicates are warnings, and long ones: their trees are for `cargo tree -d`.
+    # Duplicates are warnings. `cargo tree -d` shows their trees, which are long.
     "$tool" --locked check --hide-inclusion-graph bans licenses sources
-    say "advisories: NOT checked here, their database is not on crates.io; \`make advisories\` checks them where it can be fetched"
+    say "advisories: NOT checked, because their database is not on crates.io; \`make advisories\` fetches it and checks them"
     ;;
 *) die "usage: deny.sh [advisories]" ;;
 esac

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Runs fuzz targets one after the other, each for SGC_FUZZ_SECONDS (600), and adds what was found to fuzz/corpus.
+# Runs fuzz targets one after the other, each for SGC_FUZZ_SECONDS (600), and adds new inputs to fuzz/corpus.
 #   fuzz.sh            every target
-#   fuzz.sh TARGET…    these
-# Needs a nightly compiler (SGC_FUZZ_TOOLCHAIN, "nightly") and cargo-fuzz. Inputs are found in target/fuzz-corpus, which is kept
-# from run to run; of these the corpus gets the ones that reach code no committed input reaches, up to CORPUS_BYTES_MAX each.
+#   fuzz.sh TARGET…    these targets
+# Needs a nightly compiler (SGC_FUZZ_TOOLCHAIN, "nightly") and cargo-fuzz. The folder target/fuzz-corpus keeps found inputs
+# from run to run. The corpus gets those that reach code that no committed input reaches, up to CORPUS_BYTES_MAX each.
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
 . "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
@@ -24,7 +24,7 @@ for target in "${targets[@]}"; do
     mkdir -p "$found" "fuzz/corpus/$target"
     cargo "+$toolchain" fuzz run -O "$target" "$found" "fuzz/corpus/$target" -- \
         -max_total_time="$seconds" -timeout=10 -rss_limit_mb=2048 -print_final_stats=1
-    # Without -reduce_inputs nothing that is committed is replaced.
+    # Without -reduce_inputs, committed inputs are never replaced.
     cargo "+$toolchain" fuzz run -O "$target" "fuzz/corpus/$target" "$found" -- \
         -merge=1 -max_len="$CORPUS_BYTES_MAX" -timeout=10
 done

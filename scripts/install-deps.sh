@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # Installs the Debian or Ubuntu packages that are missing, and nothing else.
-#   install-deps.sh build   what compiling the workspace needs
-#   install-deps.sh test    that, and what the test suite needs
-#   install-deps.sh bench   what `build` does, what SGC is measured beside (make bench), and what counts instructions
-# A need is met when its probe succeeds, however it came here; only then unmet ones are installed, and it says which and why.
+#   install-deps.sh build   requirements of the build
+#   install-deps.sh test    the same, and those of the test suite
+#   install-deps.sh bench   those of the build, of the systems beside SGC in `make bench`, and of counting instructions
+# A requirement is met if its probe succeeds, whatever installed it. The script names each missing one with its reason, and
+# installs the missing ones together.
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
 . "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
@@ -11,7 +12,7 @@ set -euo pipefail
 what=${1:-build}
 packages=()
 
-# need PROBE PACKAGES… -- WHY…
+# need PROBE PACKAGES… -- REASON…: adds the packages if the probe fails.
 need() {
     local probe=$1 wanted=()
     shift
@@ -26,12 +27,12 @@ need() {
     fi
 }
 
-# bindgen loads libclang.so and needs the compiler headers that come with the -dev package.
+# bindgen loads libclang.so, and needs the compiler headers of the -dev package.
 has_libclang() {
     [ -n "${LIBCLANG_PATH:-}" ] || dpkg -s libclang-dev || compgen -G '/usr/lib/llvm-*/lib/libclang.so'
 }
 
-# compiles LANGUAGE HEADER: whether a program that includes it compiles.
+# compiles LANGUAGE HEADER: succeeds if a program that includes the header compiles.
 compiles() {
     local compiler=cc
     [ "$1" = c++ ] && compiler=c++
@@ -48,10 +49,10 @@ have_rust() {
 case $what in build | test | bench) ;; *) die "usage: install-deps.sh build|test|bench" ;; esac
 have_rust
 need 'compiles c stdlib.h' gcc libc6-dev -- "C compiler: Cyclone DDS and AWS-LC are built from source"
-need 'compiles c++ vector' g++ -- "C++ compiler: Cyclone DDS's build asks for one"
+need 'compiles c++ vector' g++ -- "C++ compiler: the build of Cyclone DDS requires one"
 need 'command -v make' make -- "CMake drives it"
 need 'command -v cmake' cmake -- "builds Cyclone DDS (crate cyclors)"
-need has_libclang libclang-dev -- "makes the Rust bindings of Cyclone DDS (bindgen)"
+need has_libclang libclang-dev -- "bindgen makes the Rust bindings of Cyclone DDS"
 need 'compiles c openssl/ssl.h' libssl-dev -- "DDS Security in Cyclone DDS, which is linked with the static library"
 need 'command -v pkg-config' pkg-config -- "finds OpenSSL"
 if [ "$what" = test ]; then
@@ -60,14 +61,14 @@ if [ "$what" = test ]; then
     need 'python3 -c "import venv, ensurepip"' python3 python3-venv -- "the Cyclone DDS test peer runs in a virtual environment"
     need 'command -v node && command -v npm' nodejs npm -- "clients of the gateway in JavaScript"
     # shellcheck disable=SC2016 # the probe is evaluated later
-    need 'test -x "${SGC_CHROMIUM:-/usr/bin/chromium}"' chromium -- "a page that uses the gateway; SGC_CHROMIUM names another browser of its kind"
+    need 'test -x "${SGC_CHROMIUM:-/usr/bin/chromium}"' chromium -- "a page that uses the gateway; SGC_CHROMIUM names another Chromium"
     need 'command -v ip' iproute2 -- "isolated networks for the tests (ip netns)"
     need 'command -v nft' nftables -- "NATs and firewalls between them"
-    need 'command -v openssl' openssl -- "a DTLS program that is not ours, a keystore for DDS Security"
+    need 'command -v openssl' openssl -- "an independent DTLS program, a keystore for DDS Security"
 fi
 if [ "$what" = bench ]; then
     need 'python3 -c "import venv, ensurepip"' python3 python3-venv -- "ROS 2 is installed into virtual environments"
-    need 'command -v ip' iproute2 -- "networks of their own for what is measured (ip netns)"
+    need 'command -v ip' iproute2 -- "separate networks for the compared systems (ip netns)"
     need 'command -v wireguard-go' wireguard-go -- "DDS over WireGuard"
     need 'command -v wg' wireguard-tools -- "DDS over WireGuard: its keys"
     need 'command -v openssl' openssl -- "certificates for Zenoh over TLS, a keystore for DDS Security"
@@ -77,7 +78,7 @@ if [ "$what" = bench ]; then
 fi
 [ ${#packages[@]} -gt 0 ] || exit 0
 
-command -v apt-get >/dev/null || die "no apt-get here: install the like of these yourself: ${packages[*]}"
+command -v apt-get >/dev/null || die "apt-get is missing: install the equivalents of these packages yourself: ${packages[*]}"
 sudo=()
 if [ "$(id -u)" != 0 ]; then
     command -v sudo >/dev/null || die "not root and no sudo: ask an administrator for: apt-get install ${packages[*]}"
@@ -87,7 +88,7 @@ fi
 say "installing from Debian's packages: ${packages[*]}"
 "${sudo[@]}" apt-get update -qq
 for package in "${packages[@]}"; do
-    apt-cache show "$package" >/dev/null 2>&1 || die "this release has no package $package (tested on Debian 12)"
+    apt-cache show "$package" >/dev/null 2>&1 || die "this release of the system has no package $package (tested on Debian 12)"
 done
 "${sudo[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${packages[@]}" >/dev/null
 say "installed: ${packages[*]}"

@@ -1,7 +1,7 @@
 # shellcheck shell=bash
-# What the scripts share. Sourced, never run.
+# Functions and variables of the other scripts. Sourced, never run.
 
-# shellcheck disable=SC2034  # for those who source this
+# shellcheck disable=SC2034  # used by the scripts that source this file
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 
 say() { printf '==> %s\n' "$*"; }

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Checks the program without its optional features and with each alone: no warnings, no dependencies of features that are
-# off, and typed refusals of configurations that need them. Arguments go to cargo.
+# Checks the program without its optional features, and with each alone: no warnings, no dependencies of disabled features,
+# and typed refusals of configurations that need them. Arguments go to cargo.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 cargo=${CARGO:-cargo}
 
-# Crates that are gone without the feature.
+# The crates that only this feature needs.
 declare -A crates=(
     [dtls]="dimpl"
     [grpc]="tonic prost hyper h2"
