@@ -103,7 +103,7 @@ pub(super) fn tables(figures: &[Figure]) -> Vec<Table> {
             rows: trips.collect(),
         },
         rates(
-            "To the client: a Cyclone program publishes as fast as DDS lets it. By gRPC up to 4096 messages or 64 MiB wait for the client \
+            "To the client: a Cyclone program publishes as fast as DDS lets it. By gRPC up to 16384 messages or 64 MiB wait for the client \
              (`waits`), by the rosbridge protocol 1000; what is beyond is lost",
             figures,
             |figure| &figure.down,
