@@ -12,12 +12,10 @@ mod input;
 mod op;
 mod options;
 mod outbox;
-mod params;
 mod qos;
 mod rosapi;
 mod services;
 mod topics;
-mod typedefs;
 
 use std::sync::Arc;
 use std::time::Duration;

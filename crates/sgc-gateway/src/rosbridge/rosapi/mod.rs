@@ -1,6 +1,9 @@
 //! [`RosApi`]: the services of the `rosapi` node, answered by the gateway within the client's view. A `rosapi` node
 //! on the network is not asked.
 
+mod params;
+mod typedefs;
+
 use std::collections::BTreeSet;
 
 use serde::Deserialize;
@@ -9,12 +12,11 @@ use sgc_cdr::Library;
 
 use super::input;
 use super::options::RosbridgeOptions;
-use super::params::ParamError;
-use super::{params, typedefs};
 use crate::definitions::InterfaceType;
 use crate::graph::{Graph, NodeInfo, is_hidden};
 use crate::offload::offload;
 use crate::session::Session;
+use params::ParamError;
 
 /// Longest arguments, in bytes, because errors echo them.
 const ARGS_BYTES_MAX: usize = 64 << 10;
