@@ -1,6 +1,7 @@
 //! Actions of a client: [`pursue`] sends a goal, [`ServedAction`] is an action that the client serves.
 
 use std::collections::BTreeMap;
+use std::num::NonZeroUsize;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -11,7 +12,7 @@ use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinHandle;
 
 use super::calls::ended;
-use super::envelope::{Compression, Envelope};
+use super::envelope::{Compression, Envelope, Frame};
 use super::input;
 use super::op::{OpId, told};
 use super::outbox::{Level, Outbox};
@@ -40,7 +41,7 @@ pub(super) struct GoalRequest {
     pub(super) action: String,
     pub(super) type_name: Option<String>,
     pub(super) has_feedback: bool,
-    pub(super) fragment_size: Option<usize>,
+    pub(super) fragment_size: Option<NonZeroUsize>,
     pub(super) compression: Compression,
 }
 
@@ -50,11 +51,21 @@ impl GoalRequest {
     }
 
     /// Sends the result of a goal that has no outcome.
-    pub(super) async fn fail(&self, why: &str, outbox: &Outbox) {
-        let failed = self.envelope("action_result", why.len()).text("values", why);
-        let failed = failed.value("status", &Json::from(GoalStatus::Unknown as i8));
-        let _ = outbox.say(failed.value("result", &Json::Bool(false)).finish()).await;
+    async fn fail(&self, why: &str, outbox: &Outbox) {
+        let _ = outbox.say(failed(self.envelope("action_result", why.len()), why)).await;
     }
+}
+
+/// Answers a goal that is refused before it is sent.
+pub(super) async fn refuse_goal(id: &OpId, action: &str, why: &str, outbox: &Outbox) {
+    let refused = Envelope::json("action_result").id(Some(id)).text("action", action);
+    let _ = outbox.say(failed(refused, why)).await;
+}
+
+/// Finishes the result of a goal that has no outcome.
+fn failed(result: Envelope, why: &str) -> Frame {
+    let failed = result.text("values", why).value("status", &Json::from(GoalStatus::Unknown as i8));
+    failed.value("result", &Json::Bool(false)).finish()
 }
 
 /// Sends a goal and reports on it until it ends. `cancel` asks to cancel it; `end` means that the client may not have

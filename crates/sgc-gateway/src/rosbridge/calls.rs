@@ -1,5 +1,6 @@
 //! [`Call`]: a client's call of a service, on the network or of the gateway's own `rosapi`.
 
+use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -26,12 +27,12 @@ pub(super) struct Call {
     pub(super) type_name: Option<String>,
     pub(super) args: Option<String>,
     pub(super) max: Duration,
-    pub(super) fragment_size: Option<usize>,
+    pub(super) fragment_size: Option<NonZeroUsize>,
     pub(super) compression: Compression,
 }
 
 /// Answers a call that is refused before it begins.
-pub(super) async fn refuse(id: &OpId, service: &str, why: &str, outbox: &Outbox) {
+pub(super) async fn refuse_call(id: &OpId, service: &str, why: &str, outbox: &Outbox) {
     let refused = Envelope::json("service_response").id(Some(id)).text("service", service);
     let refused = refused.text("values", why).value("result", &Json::Bool(false));
     let _ = outbox.say(refused.finish()).await;

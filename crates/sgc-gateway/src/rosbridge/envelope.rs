@@ -1,6 +1,7 @@
 //! [`Envelope`]: a message to a client in JSON or CBOR; [`Frame`]: its form in the WebSocket.
 
 use std::fmt::Write as _;
+use std::num::NonZeroUsize;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -231,8 +232,8 @@ impl Envelope {
     }
 
     /// Finishes the message, in fragments if it exceeds `size`. CBOR is never split.
-    pub(super) fn finish_in_pieces(self, size: Option<usize>, id: impl FnOnce() -> String) -> Frame {
-        match (self.finish(), size) {
+    pub(super) fn finish_in_pieces(self, size: Option<NonZeroUsize>, id: impl FnOnce() -> String) -> Frame {
+        match (self.finish(), size.map(NonZeroUsize::get)) {
             (Frame::Text(text), Some(size)) if text.len() > size => Frame::Fragments { id: id(), text, size },
             (frame, _) => frame,
         }

@@ -12,7 +12,6 @@ mod input;
 mod op;
 mod options;
 mod outbox;
-mod qos;
 mod rosapi;
 mod services;
 mod topics;

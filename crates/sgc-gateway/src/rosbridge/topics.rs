@@ -2,6 +2,7 @@
 //! message once.
 
 use std::collections::BTreeMap;
+use std::num::NonZeroUsize;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
@@ -31,7 +32,7 @@ const WARN_INTERVAL: Duration = Duration::from_secs(1);
 pub(super) struct SubscriptionRequest {
     pub(super) throttle: Duration,
     pub(super) queue_length: usize,
-    pub(super) fragment_size: Option<usize>,
+    pub(super) fragment_size: Option<NonZeroUsize>,
     pub(super) compression: Compression,
 }
 
@@ -40,7 +41,7 @@ pub(super) struct SubscriptionRequest {
 struct Pace {
     interval_min: Option<Duration>,
     depth: usize,
-    fragment_size: Option<usize>,
+    fragment_size: Option<NonZeroUsize>,
     compression: Compression,
     /// The number of replays of kept messages so far.
     replays: u64,
@@ -62,11 +63,6 @@ impl Drop for Topic {
 }
 
 impl Topic {
-    /// Returns the queue length for a request.
-    pub(super) fn depth(wish: &SubscriptionRequest) -> usize {
-        wish.depth()
-    }
-
     pub(super) fn new(
         subscription: Subscription,
         id: Option<OpId>,
@@ -117,7 +113,7 @@ impl Topic {
 
 impl SubscriptionRequest {
     /// Returns the queue length.
-    fn depth(&self) -> usize {
+    pub(super) fn depth(&self) -> usize {
         match self.queue_length {
             0 if self.throttle.is_zero() => QUEUE_DEFAULT,
             // Only the latest message matters when its time has come.
@@ -262,27 +258,27 @@ mod tests {
 
     #[test]
     fn pace_suits_all_requests() {
-        let wish = |throttle, queue_length, fragment_size, compression| SubscriptionRequest {
+        let wish = |throttle, queue_length, fragment_size: usize, compression| SubscriptionRequest {
             throttle: Duration::from_millis(throttle),
             queue_length,
-            fragment_size,
+            fragment_size: NonZeroUsize::new(fragment_size),
             compression,
         };
-        let slow = wish(500, 0, Some(1000), Compression::None);
+        let slow = wish(500, 0, 1000, Compression::None);
         assert_eq!(
-            (pace([&slow].into_iter(), 0).depth, Topic::depth(&SubscriptionRequest::default())),
+            (pace([&slow].into_iter(), 0).depth, SubscriptionRequest::default().depth()),
             (1, QUEUE_DEFAULT)
         );
-        let queued = wish(100, 5, Some(300), Compression::Cbor);
+        let queued = wish(100, 5, 300, Compression::Cbor);
         let both = pace([&slow, &queued].into_iter(), 0);
         assert_eq!((both.interval_min, both.depth), (Some(Duration::from_millis(100)), 5));
-        assert_eq!((both.fragment_size, both.compression), (Some(300), Compression::Cbor));
-        let fast = wish(0, 0, None, Compression::CborRaw);
+        assert_eq!((both.fragment_size, both.compression), (NonZeroUsize::new(300), Compression::Cbor));
+        let fast = wish(0, 0, 0, Compression::CborRaw);
         let all = pace([&slow, &queued, &fast].into_iter(), 0);
         assert_eq!(
             (all.interval_min, all.depth, all.compression),
             (None, QUEUE_DEFAULT, Compression::CborRaw)
         );
-        assert_eq!(Topic::depth(&wish(0, usize::MAX, None, Compression::None)), QUEUE_MAX);
+        assert_eq!(wish(0, usize::MAX, 0, Compression::None).depth(), QUEUE_MAX);
     }
 }

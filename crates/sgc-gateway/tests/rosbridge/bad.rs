@@ -101,6 +101,57 @@ async fn members_of_the_wrong_kind_are_named() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn invalid_calls_and_goals_are_answered_with_their_id() {
+    let site = Site::new().await;
+    let mut browser = client(&site).await;
+    for (op, told, answer) in [
+        (
+            json!({"op": "call_service", "id": "c", "service": "/a", "timeout": "soon"}),
+            r#"call_service: "timeout" is no number of seconds: "soon""#,
+            json!({"op": "service_response", "id": "c", "service": "/a", "result": false}),
+        ),
+        (
+            json!({"op": "call_service", "id": 7, "service": 3}),
+            r#"call_service: "service" is no text: 3"#,
+            json!({"op": "service_response", "id": 7, "service": "", "result": false}),
+        ),
+        (
+            json!({"op": "send_action_goal", "id": "g", "action": "/a", "feedback": "much"}),
+            r#"send_action_goal: "feedback" is no bool: "much""#,
+            json!({"op": "action_result", "id": "g", "action": "/a", "status": 0, "result": false}),
+        ),
+    ] {
+        let mut wanted = answer;
+        wanted["values"] = json!(told);
+        browser.send(op.clone()).await;
+        assert_eq!(browser.next().await, wanted, "{op}");
+        assert_eq!(browser.status().await, (told.to_owned(), op["id"].clone()));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn error_in_an_assembled_message_has_its_id_or_that_of_its_fragments() {
+    let site = Site::new().await;
+    let mut browser = client(&site).await;
+    for (inner, told, id) in [
+        (json!({"op": "subscribe"}), r#"subscribe: "topic" is missing"#, json!("f")),
+        (json!({"op": "subscribe", "id": 3}), r#"subscribe: "topic" is missing"#, json!(3)),
+        (
+            json!({"op": "unsubscribe", "topic": "/a"}),
+            "unsubscribe: /a is not subscribed to by this client",
+            json!("f"),
+        ),
+        (json!({"op": "dance", "id": 3}), r#"there is no op "dance""#, json!(3)),
+        (json!({"op": "status", "id": 1.5}), r#"status: "id" is no text or integer: 1.5"#, json!("f")),
+        (json!([]), "not an object with a member \"op\"", json!("f")),
+    ] {
+        let data = inner.to_string();
+        browser.send(json!({"op": "fragment", "id": "f", "num": 0, "total": 1, "data": data})).await;
+        assert_eq!(browser.status().await, (told.to_owned(), id), "{inner}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn messages_that_are_not_of_their_type_are_refused_with_the_path() {
     let site = Site::new().await;
     let (texts, _reader) = site.reader("/a");

@@ -155,6 +155,19 @@ async fn a_goal_is_passed_on_told_of_and_done() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn goal_with_the_id_of_another_is_refused_without_a_result() {
+    let site = Site::new().await;
+    let mut server = serve_fibonacci(&site).await;
+    let mut client = client(&site).await;
+    client.send(goal("g", 3)).await;
+    server.next().await;
+    assert_eq!(client.told(goal("g", 4)).await, "send_action_goal: a goal of that id is under way");
+    let invalid = json!({"op": "send_action_goal", "id": "g", "action": "/fib", "feedback": "much"});
+    assert!(client.told(invalid).await.starts_with("send_action_goal: "));
+    client.settle().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn goals_are_canceled_aborted_and_given_up_with_their_server() {
     let site = Site::new().await;
     let mut server = serve_fibonacci(&site).await;

@@ -1,10 +1,12 @@
-//! QoS as rosbridge clients write it.
+//! [`QosMember`]: QoS as rosbridge clients write it.
 
 use std::collections::BTreeMap;
 
 use serde::Deserialize;
 use serde_json::Value as Json;
 use sgc_wire::{Durability, History, Qos, Reliability};
+
+use super::error::Refusal;
 
 /// The default depth of a publisher, and the largest one.
 const DEPTH_DEFAULT: u32 = 100;
@@ -30,11 +32,11 @@ enum Span {
 }
 
 impl QosMember {
-    /// Parses the member; an error explains what is wrong. A policy with the value `best_available` counts as
+    /// Parses the member. A policy with the value `best_available` counts as
     /// missing.
-    pub(super) fn read(raw: &str) -> Result<Self, String> {
+    pub(super) fn read(raw: &str) -> Result<Self, Refusal> {
         let members: BTreeMap<String, Json> =
-            serde_json::from_str(raw).map_err(|_| "\"qos\" is no object".to_owned())?;
+            serde_json::from_str(raw).map_err(|_| Refusal::rule("\"qos\" is no object"))?;
         let mut said = Self::default();
         for (name, value) in members {
             let word = value.as_str().map(str::to_ascii_lowercase);
@@ -49,14 +51,17 @@ impl QosMember {
                 "history" if is("keep_all") => said.keeps_all = true,
                 "depth" => match value.as_u64().and_then(|depth| u32::try_from(depth).ok()) {
                     Some(depth) => said.depth = Some(depth),
-                    None => return Err(format!("\"qos\": \"depth\" is no number of 0 or more: {value}")),
+                    None => {
+                        let wrong = format!("\"qos\": \"depth\" is no number of 0 or more: {value}");
+                        return Err(Refusal::rule(wrong));
+                    }
                 },
                 "deadline" => said.deadline_ns = span(&name, value)?,
                 "lifespan" => said.lifespan_ns = span(&name, value)?,
                 "reliability" | "durability" | "history" => {
-                    return Err(format!("\"qos\": {name:?} cannot be {value}"));
+                    return Err(Refusal::rule(format!("\"qos\": {name:?} cannot be {value}")));
                 }
-                _ => return Err(format!("\"qos\" has no member {name:?}")),
+                _ => return Err(Refusal::rule(format!("\"qos\" has no member {name:?}"))),
             }
         }
         Ok(said)
@@ -101,8 +106,8 @@ impl QosMember {
     }
 }
 
-fn span(name: &str, value: Json) -> Result<Option<u64>, String> {
-    let wrong = format!("\"qos\": {name:?} is no time: {value}");
+fn span(name: &str, value: Json) -> Result<Option<u64>, Refusal> {
+    let wrong = Refusal::rule(format!("\"qos\": {name:?} is no time: {value}"));
     match serde_json::from_value(value) {
         Ok(Span::Seconds(seconds)) if (0.0..1e9).contains(&seconds) => Ok(Some((seconds * 1e9) as u64)),
         Ok(Span::Parts { secs, nsecs }) => {
@@ -147,7 +152,7 @@ mod tests {
             (r#"{"deadline":"soon"}"#, r#""qos": "deadline" is no time: "soon""#),
             (r#"{"colour":"red"}"#, r#""qos" has no member "colour""#),
         ] {
-            assert_eq!(QosMember::read(raw).unwrap_err(), told);
+            assert_eq!(QosMember::read(raw).unwrap_err().to_string(), told);
         }
     }
 }
