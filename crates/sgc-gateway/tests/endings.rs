@@ -63,12 +63,21 @@ async fn close<S>(socket: &mut WebSocketStream<S>) -> Option<(u16, String)>
 where
     S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
 {
-    loop {
-        if let Message::Close(why) = within(socket.next()).await.expect("a close frame comes first").unwrap()
-        {
-            return why.map(|why| (why.code.into(), why.reason.to_string()));
+    // Pings of a connection that stays do not extend the wait.
+    within(async {
+        loop {
+            if let Message::Close(why) = socket.next().await.expect("a close frame comes first").unwrap() {
+                return why.map(|why| (why.code.into(), why.reason.to_string()));
+            }
         }
-    }
+    })
+    .await
+}
+
+/// Lets a client of rosbridge make an error, and expects that it is told.
+async fn make_error(socket: &mut WebSocketStream<TcpStream>) {
+    socket.send(Message::text(r#"{"op":"dance"}"#)).await.unwrap();
+    assert!(within(socket.next()).await.unwrap().unwrap().is_text());
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -100,6 +109,8 @@ async fn client_without_a_free_place_is_told() {
     let server = server(&site, 1).await;
     let addr = server.local()[0].addr;
     let mut first = connect(addr, None).await;
+    // The client has its place only after the upgrade is answered.
+    make_error(&mut first).await;
     for subprotocol in [None, Some(FOXGLOVE)] {
         let mut second = connect(addr, subprotocol).await;
         let (code, why) = close(&mut second).await.unwrap();
@@ -107,8 +118,7 @@ async fn client_without_a_free_place_is_told() {
         assert!(why.starts_with("1 clients at most for "), "{why}");
     }
     assert_eq!(server.status().refused["too many clients"], 2);
-    first.send(Message::text(r#"{"op":"dance"}"#)).await.unwrap();
-    assert!(within(first.next()).await.unwrap().unwrap().is_text());
+    make_error(&mut first).await;
 }
 
 /// Lets a client ask much through a narrow pipe, close before it reads, and expects the answer to its close.
