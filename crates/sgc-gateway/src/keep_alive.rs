@@ -11,7 +11,6 @@ use tokio::time::Instant;
 const PACE_BYTES_MIN: u64 = 16 << 10;
 /// Most bytes before a ping that the buffers of both systems are assumed to hold: the greatest that Linux gives a
 /// connection by itself, 4 MiB at the sender and 6 MiB at the receiver.
-#[cfg(feature = "foxglove")]
 const BUFFERED_BYTES_MAX: usize = 10 << 20;
 
 /// The ping that has not been answered.
@@ -23,10 +22,8 @@ struct Ping {
     /// The time since which the ping has not been answered.
     since: Option<Instant>,
     /// Bytes written since the last ping.
-    #[cfg(feature = "foxglove")]
     written_bytes: usize,
     /// Bytes that the client must read before the ping, at most.
-    #[cfg(feature = "foxglove")]
     ahead_bytes: usize,
 }
 
@@ -34,14 +31,11 @@ impl PingState {
     /// Records that a ping was written.
     pub(crate) fn asked(&self) {
         let mut ping = lock(&self.0);
-        #[cfg(feature = "foxglove")]
-        {
-            let written = std::mem::take(&mut ping.written_bytes);
-            if ping.since.is_none() {
-                ping.ahead_bytes = written.min(BUFFERED_BYTES_MAX);
-            }
+        let written_bytes = std::mem::take(&mut ping.written_bytes);
+        if ping.since.is_none() {
+            ping.ahead_bytes = written_bytes.min(BUFFERED_BYTES_MAX);
+            ping.since = Some(Instant::now());
         }
-        ping.since.get_or_insert_with(Instant::now);
     }
 
     /// Records that a message arrived.
@@ -49,14 +43,7 @@ impl PingState {
         lock(&self.0).since = None;
     }
 
-    /// Returns the time since which a ping has not been answered.
-    #[cfg(feature = "rosbridge")]
-    pub(crate) fn unanswered(&self) -> Option<Instant> {
-        lock(&self.0).since
-    }
-
-    /// Records written bytes.
-    #[cfg(feature = "foxglove")]
+    /// Records written bytes, which give a ping behind them more time. The protocol rosbridge records none.
     pub(crate) fn wrote(&self, bytes: usize) {
         let mut ping = lock(&self.0);
         ping.written_bytes = ping.written_bytes.saturating_add(bytes);
@@ -64,7 +51,6 @@ impl PingState {
 
     /// Returns the silence of a client that has left a ping unanswered for too long. A ping that waits behind other
     /// bytes has their time as well. `read_since` is the time since which messages of the client are read.
-    #[cfg(feature = "foxglove")]
     pub(crate) fn silence(&self, silence_max: Duration, read_since: Instant) -> Option<Duration> {
         let ping = *lock(&self.0);
         let silence = ping.since?.max(read_since).elapsed();

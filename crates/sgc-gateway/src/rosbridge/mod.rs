@@ -126,7 +126,9 @@ where
                 tokio::select! {
                     message = stream.next() => message,
                     _ = looks.tick() => {
-                        look(pulse, options)?;
+                        if pulse.silence(options.silence_max, begun).is_some() {
+                            return Err(RosbridgeError::Silent(options.silence_max));
+                        }
                         continue;
                     }
                     () = sleep_until(connection.fragments_end()) => {
@@ -160,15 +162,5 @@ async fn sleep_until(end: Option<Instant>) {
     match end {
         Some(end) => tokio::time::sleep_until(end).await,
         None => std::future::pending().await,
-    }
-}
-
-/// Fails if a ping is unanswered for too long.
-fn look(pulse: &PingState, options: &RosbridgeOptions) -> Result<(), RosbridgeError> {
-    match pulse.unanswered() {
-        Some(since) if since.elapsed() >= options.silence_max => {
-            Err(RosbridgeError::Silent(options.silence_max))
-        }
-        _ => Ok(()),
     }
 }
