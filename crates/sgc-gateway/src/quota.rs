@@ -84,6 +84,15 @@ struct Counts {
     permits: [Arc<Semaphore>; PERMITS],
 }
 
+/// The bound of a pool that has no room.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct PoolFull {
+    pool: Pool,
+    /// The bounded resource.
+    what: &'static str,
+    max: usize,
+}
+
 impl Counts {
     fn new(pool: Pool) -> Arc<Self> {
         let permits = PermitKind::ALL.map(|kind| Arc::new(Semaphore::new(kind.max(pool))));
@@ -98,8 +107,8 @@ impl Counts {
         }
     }
 
-    /// Takes everything that a session holds, or nothing. An error names the exceeded bound.
-    fn take_all(&self, holdings: &Holdings, limits: &SessionLimits) -> Result<(), (&'static str, usize)> {
+    /// Takes everything that a session holds, or nothing.
+    fn take_all(&self, holdings: &Holdings, limits: &SessionLimits) -> Result<(), PoolFull> {
         let mut taken = Holdings::default();
         let refused = self.take_each(holdings, limits, &mut taken);
         if refused.is_err() {
@@ -114,24 +123,25 @@ impl Counts {
         holdings: &Holdings,
         limits: &SessionLimits,
         taken: &mut Holdings,
-    ) -> Result<(), (&'static str, usize)> {
+    ) -> Result<(), PoolFull> {
+        let full = |what, max| PoolFull { pool: self.pool, what, max };
         for resource in Resource::ALL {
             let (at, max) = (resource as usize, resource.session_max(limits).saturating_mul(self.share()));
             if !add_within(&self.resources[at], holdings.resources[at], max) {
-                return Err((resource.what(), max));
+                return Err(full(resource.what(), max));
             }
             taken.resources[at] = holdings.resources[at];
         }
         let max = limits.waiting_bytes_max.saturating_mul(self.share());
         if !add_within(&self.bytes, holdings.bytes, max) {
-            return Err(("bytes of messages that wait or are kept", max));
+            return Err(full("bytes of messages that wait or are kept", max));
         }
         taken.bytes = holdings.bytes;
         for kind in PermitKind::ALL {
             let units = holdings.permits[kind as usize];
             let permits =
                 self.permits[kind as usize].try_acquire_many(u32::try_from(units).unwrap_or(u32::MAX));
-            let permits = permits.map_err(|_| (kind.what(), kind.max(self.pool) * kind.unit()))?;
+            let permits = permits.map_err(|_| full(kind.what(), kind.max(self.pool) * kind.unit()))?;
             permits.forget();
             taken.permits[kind as usize] = units;
         }
@@ -324,17 +334,17 @@ impl Quota {
 
     /// Takes one unit of a resource. `limits` holds the bound of one session.
     pub(crate) fn take(&self, resource: Resource, limits: &SessionLimits) -> Result<Charge, GatewayError> {
-        self.try_take(resource, limits).map_err(|(pool, max)| self.refuse(resource.what(), pool, max))
+        self.try_take(resource, limits).map_err(|full| self.refuse(full))
     }
 
-    /// Takes one unit without counting a refusal. An error names the bound.
-    fn try_take(&self, resource: Resource, limits: &SessionLimits) -> Result<Charge, (Pool, usize)> {
+    /// Takes one unit without counting a refusal.
+    fn try_take(&self, resource: Resource, limits: &SessionLimits) -> Result<Charge, PoolFull> {
         let pools = self.0.pools();
         for (at, counts) in pools.iter().enumerate() {
             let max = resource.session_max(limits).saturating_mul(counts.share());
             if !add_within(&counts.resources[resource as usize], 1, max) {
                 give_back(resource, &pools[..at]);
-                return Err((counts.pool, max));
+                return Err(PoolFull { pool: counts.pool, what: resource.what(), max });
             }
         }
         self.0.resources[resource as usize].fetch_add(1, Ordering::Relaxed);
@@ -358,9 +368,9 @@ impl Quota {
         let is_in = |counts: &Arc<Counts>, of: &Pools| of.iter().any(|other| Arc::ptr_eq(counts, other));
         let joined: Vec<_> = wanted.iter().filter(|counts| !is_in(counts, &pools)).collect();
         for (at, counts) in joined.iter().enumerate() {
-            if let Err((what, max)) = counts.take_all(&holdings, limits) {
+            if let Err(full) = counts.take_all(&holdings, limits) {
                 joined[..at].iter().for_each(|taken| taken.give_back_all(&holdings));
-                return Err(self.refuse(what, counts.pool, max));
+                return Err(self.refuse(full));
             }
         }
         pools.iter().filter(|counts| !is_in(counts, &wanted)).for_each(|left| left.give_back_all(&holdings));
@@ -370,7 +380,8 @@ impl Quota {
         Ok(())
     }
 
-    fn refuse(&self, what: &'static str, pool: Pool, max: usize) -> GatewayError {
+    /// Counts a refusal.
+    fn refuse(&self, PoolFull { pool, what, max }: PoolFull) -> GatewayError {
         self.0.quotas.count(pool);
         GatewayError::Crowded { what, max, pool }
     }
@@ -395,7 +406,7 @@ impl Quota {
                 Ok(permits) => held.push(permits),
                 Err(_) => {
                     let max = kind.max(counts.pool) * kind.unit();
-                    return Err(self.refuse(kind.what(), counts.pool, max));
+                    return Err(self.refuse(PoolFull { pool: counts.pool, what: kind.what(), max }));
                 }
             }
         }
@@ -577,6 +588,15 @@ impl Payer {
     }
 }
 
+/// The bound of bytes that has no room.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum BytesFull {
+    /// The client's own bound in bytes.
+    Client { max: usize },
+    /// The bound of a pool in bytes.
+    Pool { pool: Pool, max: usize },
+}
+
 /// The bytes of messages that are queued for one client, within its own bound and those of its pools.
 #[derive(Debug)]
 pub(crate) struct PendingBytes {
@@ -610,17 +630,16 @@ impl PendingBytes {
 
     /// Takes room for bytes, unless the client or one of its pools has less.
     pub(crate) fn take(&self, what: &'static str, bytes: usize) -> Result<(), GatewayError> {
-        self.try_take(bytes).map_err(|(pool, max)| match pool {
-            None => GatewayError::TooMany { what, max },
-            Some(pool) => self.quota.refuse(what, pool, max),
+        self.try_take(bytes).map_err(|full| match full {
+            BytesFull::Client { max } => GatewayError::TooMany { what, max },
+            BytesFull::Pool { pool, max } => self.quota.refuse(PoolFull { pool, what, max }),
         })
     }
 
-    /// Takes room without counting a refusal. An error has the bound and its pool, or no pool for the client's own
-    /// bound.
-    fn try_take(&self, bytes: usize) -> Result<(), (Option<Pool>, usize)> {
+    /// Takes room without counting a refusal.
+    fn try_take(&self, bytes: usize) -> Result<(), BytesFull> {
         if !add_within(&self.bytes, bytes, self.bytes_max) {
-            return Err((None, self.bytes_max));
+            return Err(BytesFull::Client { max: self.bytes_max });
         }
         let ledger = &self.quota.0;
         let pools = ledger.pools();
@@ -631,7 +650,7 @@ impl PendingBytes {
                 taken.for_each(|count| {
                     count.fetch_sub(bytes, Ordering::Relaxed);
                 });
-                return Err((Some(counts.pool), max));
+                return Err(BytesFull::Pool { pool: counts.pool, max });
             }
         }
         ledger.bytes.fetch_add(bytes, Ordering::Relaxed);
