@@ -86,10 +86,10 @@ impl Outlets {
 /// Messages that are kept for later subscribers.
 #[derive(Default)]
 struct LatchedMessages {
-    is_on: bool,
+    /// Most messages of a writer, or `None` if none are kept.
+    depth: Option<usize>,
     /// The messages of each writer, the newest last.
     writers: BTreeMap<Option<Guid>, VecDeque<KeptMessage>>,
-    depth: usize,
     /// `true` if a message was left out because no subscriber had room for it.
     is_short: bool,
 }
@@ -122,12 +122,10 @@ impl LatchedMessages {
         message: &Arc<Message>,
         payers: impl Fn() -> P,
     ) -> u64 {
-        if !self.is_on {
-            return 0;
-        }
+        let Some(depth) = self.depth else { return 0 };
         let bytes = cost(message);
         let own = self.writers.entry(message.writer).or_default();
-        let beyond = (own.len() + 1).saturating_sub(self.depth);
+        let beyond = (own.len() + 1).saturating_sub(depth);
         own.drain(..beyond);
         let mut dropped = 0;
         loop {
@@ -180,7 +178,7 @@ impl LatchedMessages {
             kept.message.source_timestamp_ns == sample.source_timestamp_ns
                 && kept.message.payload == sample.payload
         };
-        self.is_on && self.writers.get(&sample.writer).is_some_and(|kept| kept.iter().any(is_it))
+        self.depth.is_some() && self.writers.get(&sample.writer).is_some_and(|kept| kept.iter().any(is_it))
     }
 
     fn retain(&mut self, is_there: impl Fn(&Guid) -> bool) {
@@ -333,14 +331,14 @@ impl Feed {
             let mut outlets = self.outlets();
             let latched = &mut outlets.latched;
             latched.retain(|writer| network.is_there(writer));
-            latched.is_on = wanted.qos.durability >= Durability::TransientLocal;
-            if !latched.is_on {
-                latched.writers.clear();
-            }
-            latched.depth = match wanted.qos.history {
+            let is_kept = wanted.qos.durability >= Durability::TransientLocal;
+            latched.depth = is_kept.then(|| match wanted.qos.history {
                 History::KeepLast(depth) => (depth as usize).clamp(1, LATCHED_DEPTH_MAX),
                 History::KeepAll => LATCHED_DEPTH_MAX,
-            };
+            });
+            if latched.depth.is_none() {
+                latched.writers.clear();
+            }
         }
         let is_as_wanted = |spec: &EndpointSpec| {
             spec.qos == wanted.qos && spec.keyless == wanted.keyless && spec.type_name == wanted.type_name
@@ -620,10 +618,7 @@ mod tests {
             let key = FeedKey { topic, type_name, qos: None, waits: false };
             let feed =
                 Feed::new(key, &hub.shared.network, self.payer.take_reader().unwrap(), self.payer.clone());
-            {
-                let latched = &mut feed.outlets().latched;
-                (latched.is_on, latched.depth) = (true, LATCHED_DEPTH_MAX);
-            }
+            feed.outlets().latched.depth = Some(LATCHED_DEPTH_MAX);
             feed
         }
 
