@@ -3,11 +3,13 @@
 //!
 //! The form of `docs/spec/json.md` is tried first. Only a message that does not match it is converted.
 
+use std::fmt;
 use std::future::Future;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::Deserialize;
+use serde::de::{DeserializeSeed, Deserializer, IgnoredAny, SeqAccess, Visitor};
 use serde_json::value::RawValue;
 use serde_json::{Map, Value as Json};
 use sgc_cdr::{Layout, Value};
@@ -62,8 +64,8 @@ pub(super) fn arguments(
     layout: impl FnOnce() -> Result<Arc<Layout>, GatewayError>,
 ) -> Result<String, GatewayError> {
     let Some(raw) = raw else { return Ok("{}".to_owned()) };
-    let Ok(list) = serde_json::from_str::<Vec<&RawValue>>(raw) else { return Ok(raw.to_owned()) };
-    if list.is_empty() {
+    let Some(list) = raw.strip_prefix('[') else { return Ok(raw.to_owned()) };
+    if list.trim_start().starts_with(']') {
         return Ok("{}".to_owned());
     }
     let empty = layout()?.from_json(b"{}").map_err(GatewayError::Value)?;
@@ -71,10 +73,41 @@ pub(super) fn arguments(
         Value::Record(members) => members.iter().map(|(name, _)| name.to_string()).collect(),
         _ => Vec::new(),
     };
-    // A surplus argument gets a name that the type does not have, so that reading refuses it.
-    let name = |index: usize| names.get(index).cloned().unwrap_or_else(|| format!("[{index}]"));
-    let members = list.iter().enumerate().map(|(index, raw)| format!("{}:{raw}", Json::from(name(index))));
-    Ok(format!("{{{}}}", members.collect::<Vec<_>>().join(",")))
+    let object = ArgumentList { names }.deserialize(&mut serde_json::Deserializer::from_str(raw));
+    Ok(object.unwrap_or_else(|_| raw.to_owned()))
+}
+
+/// A list of arguments, which is read as an object with these names. A surplus argument gets a name that the type does
+/// not have, so that reading refuses it. Further ones are left out, because a list takes far more memory than its text.
+struct ArgumentList {
+    names: Vec<String>,
+}
+
+impl<'de> DeserializeSeed<'de> for ArgumentList {
+    type Value = String;
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<String, D::Error> {
+        deserializer.deserialize_seq(self)
+    }
+}
+
+impl<'de> Visitor<'de> for ArgumentList {
+    type Value = String;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a list")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<String, A::Error> {
+        let surplus = format!("[{}]", self.names.len());
+        let mut members = Vec::with_capacity(self.names.len() + 1);
+        for name in self.names.into_iter().chain([surplus]) {
+            let Some(raw) = list.next_element::<&RawValue>()? else { break };
+            members.push(format!("{}:{raw}", Json::from(name)));
+        }
+        while list.next_element::<IgnoredAny>()?.is_some() {}
+        Ok(format!("{{{}}}", members.join(",")))
+    }
 }
 
 /// Returns the JSON with ROS 2's names for `secs` and `nsecs` and without null stamps, or `None` if there are none or
@@ -203,5 +236,9 @@ mod tests {
         assert_eq!(read(Some(r#"{"data":true}"#)), r#"{"data":true}"#);
         assert_eq!(read(Some("[true]")), r#"{"data":true}"#);
         assert_eq!(read(Some("[true, 3]")), r#"{"data":true,"[1]":3}"#);
+        assert_eq!(read(Some("[ ]")), "{}");
+        // Many surplus arguments take no memory.
+        let many = format!("[true{}]", ",3".repeat(100_000));
+        assert_eq!(read(Some(many.as_str())), r#"{"data":true,"[1]":3}"#);
     }
 }

@@ -11,6 +11,8 @@ use super::error::Refusal;
 /// The default depth of a publisher, and the largest one.
 const DEPTH_DEFAULT: u32 = 100;
 const DEPTH_MAX: u32 = 10_000;
+/// Longest member, in bytes, because its values take far more memory than their text.
+const BYTES_MAX: usize = 4096;
 
 /// The member `qos`.
 #[derive(Debug, Default, PartialEq)]
@@ -35,6 +37,9 @@ impl QosMember {
     /// Parses the member. A policy with the value `best_available` counts as
     /// missing.
     pub(super) fn read(raw: &str) -> Result<Self, Refusal> {
+        if raw.len() > BYTES_MAX {
+            return Err(Refusal::rule(format!("\"qos\" is longer than {BYTES_MAX} bytes")));
+        }
         let members: BTreeMap<String, Json> =
             serde_json::from_str(raw).map_err(|_| Refusal::rule("\"qos\" is no object"))?;
         let mut said = Self::default();
@@ -154,5 +159,9 @@ mod tests {
         ] {
             assert_eq!(QosMember::read(raw).unwrap_err().to_string(), told);
         }
+        let long = |spaces| format!(r#"{{"depth":{}1}}"#, " ".repeat(spaces));
+        assert!(QosMember::read(&long(4000)).is_ok());
+        let told = "\"qos\" is longer than 4096 bytes";
+        assert_eq!(QosMember::read(&long(4100)).unwrap_err().to_string(), told);
     }
 }
