@@ -8,8 +8,9 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use sgc_endpoint::LostReason;
 use sgc_ros::{
-    Command, Direction, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, Guid, Naming, QosOverride, Routes,
-    SINKLESS_HOLD, ServiceTopic, Shaping, ShareRule, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, service_qos,
+    Command, Direction, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, Guid, Naming, QosOverride,
+    REDISCOVERY_HOLD, Routes, SINKLESS_HOLD, ServiceTopic, Shaping, ShareRule, UNREACHABLE_HOLD, UseRule,
+    WRITERLESS_HOLD, service_qos,
 };
 use sgc_trust::{FleetSecret, Policy, Suite, TopicSecret, derive_name};
 use sgc_wire::{Catalogue, CatalogueEntry, Class, Kind, Metadata, Name, NodeId, SinkId};
@@ -186,9 +187,14 @@ fn a_remote_service_is_here_while_it_is_granted_and_a_topic_of_its_name_is_not()
     assert_eq!(words(&mut routes), ["CloseServer"]);
     routes.handle_granted(&name, None);
     assert_eq!(words(&mut routes), ["OpenServer"]);
-    routes.handle_catalogue(now, OWNER, Catalogue { version: 4, entries: vec![] });
+    // A service of a restarted owner gets no writer once the owner's time to rediscover its network has ended.
+    routes.handle_owner_lost(OWNER, LostReason::Unreachable);
+    routes.handle_catalogue(now, OWNER, Catalogue { version: 4, entries: both.clone() });
+    routes.handle_timeout(now + REDISCOVERY_HOLD);
+    assert_eq!(words(&mut routes), [""; 0]);
+    routes.handle_catalogue(now, OWNER, Catalogue { version: 5, entries: vec![] });
     assert_eq!(words(&mut routes), ["CloseServer", "Leave"]);
-    routes.handle_catalogue(now, OWNER, Catalogue { version: 5, entries: both });
+    routes.handle_catalogue(now, OWNER, Catalogue { version: 6, entries: both });
     routes.handle_owner_lost(OWNER, LostReason::Withdrawn);
     assert_eq!(words(&mut routes), ["Call", "Leave"]);
 }

@@ -293,6 +293,10 @@ impl<R: RngCore> Routes<R> {
     /// its QoS, history and node, and one for all others if there are any.
     pub(super) fn refresh_use(&mut self, name: Name) {
         let Some(route) = self.uses.get_mut(&name).filter(|u| u.granted) else { return };
+        // A route that publishes or calls has no writers.
+        if self.use_rules[route.rule].direction == Direction::Publish {
+            return;
+        }
         let entry = &route.entry;
         let set = self.use_rules[route.rule].qos;
         let spec = |qos: &Qos| EndpointSpec {
