@@ -111,7 +111,7 @@ impl<R: RngCore> Routes<R> {
     fn problems_with_publishers(&self, topic: &str, reader: &DiscoveredEndpoint) -> BTreeSet<Problem> {
         let offers = |qos: &Qos| mismatches(qos, &reader.qos);
         let shares = self.shares.values().filter(|s| s.fits(topic, &reader.type_name));
-        let found = shares.filter_map(|s| s.writer.as_ref()).flat_map(|spec| offers(&spec.qos));
+        let found = shares.filter_map(|s| s.inbound_writer()).flat_map(|spec| offers(&spec.qos));
         let problem =
             |mismatch| Problem::LocalQos { topic: topic.to_owned(), offerer: Offerer::Publisher, mismatch };
         found.map(problem).collect()

@@ -4,15 +4,12 @@
 use std::collections::BTreeMap;
 
 use rand_core::RngCore;
-use sgc_wire::{
-    CONSUMERS_MAX, CONSUMERS_PER_INTERFACE_MAX, Consumer, History, Kind, Name, NodeId, Qos, Role,
-};
+use sgc_wire::{CONSUMERS_MAX, CONSUMERS_PER_INTERFACE_MAX, Consumer, Kind, Name, NodeId, Qos, Role};
 
 use super::machine::Routes;
 use super::rules::Direction;
-use super::services::service_spec;
 use super::use_route::UseRoute;
-use crate::names::{ServiceTopic, dds_topic, dds_type, ros_type};
+use crate::names::{ServiceTopic, dds_topic, dds_type};
 use crate::network::{EndpointKind, EndpointSpec};
 
 /// Local consumers of interfaces that others own.
@@ -116,29 +113,7 @@ impl<R: RngCore> Routes<R> {
     /// both ends of a service client. The list is empty without such a share, or without the writer for messages of
     /// others.
     pub fn consumer_ends(&self, consumer: &Consumer) -> Vec<(EndpointKind, EndpointSpec)> {
-        let Some(share) = self.shares.get(&consumer.interface) else { return Vec::new() };
-        // The hash goes into a text of `key=value;` elements.
-        let is_plain = |hash: &&String| hash.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_');
-        let type_hash = consumer.type_hash.as_ref().filter(is_plain);
-        if self.share_rules[share.rule].is_service() {
-            let type_name = ros_type(&share.type_name);
-            let spec = service_spec(&share.local_name, &type_name, type_hash.map(String::as_str));
-            return vec![(EndpointKind::Writer, spec.request), (EndpointKind::Reader, spec.reply)];
-        }
-        if consumer.role == Role::Publish {
-            // The consumer's messages come from that writer with its QoS.
-            let spec =
-                |writer: &EndpointSpec| EndpointSpec { type_hash: type_hash.cloned(), ..writer.clone() };
-            return share.writer.iter().map(|writer| (EndpointKind::Writer, spec(writer))).collect();
-        }
-        let spec = EndpointSpec {
-            topic: dds_topic(&share.local_name),
-            type_name: share.type_name.clone(),
-            keyless: share.keyless,
-            asks_key_hash: false,
-            type_hash: type_hash.cloned(),
-            qos: Qos { history: History::KeepLast(1), partitions: Vec::new(), ..consumer.qos.clone() },
-        };
-        vec![(EndpointKind::Reader, spec)]
+        let share = self.shares.get(&consumer.interface);
+        share.map_or_else(Vec::new, |share| share.consumer_ends(&self.share_rules[share.rule()], consumer))
     }
 }

@@ -5,18 +5,15 @@ use sgc_wire::{Name, NodeId, RosNode, SourceId};
 
 use super::command::Command;
 use super::machine::Routes;
+use super::share_route::ShareRoute;
 use crate::network::{GraphNode, Guid};
 
 impl<R: RngCore> Routes<R> {
     /// Replaces the nodes of a local participant.
     pub(super) fn handle_nodes(&mut self, participant: Guid, nodes: Vec<GraphNode>) {
         let changed = self.local.set_nodes(participant, nodes);
-        let has_changed = |guid: &Guid| changed.contains(guid);
-        let concerned = self
-            .shares
-            .iter()
-            .filter(|(_, share)| share.own.keys().chain(share.writers.keys()).any(has_changed));
-        for name in concerned.map(|(name, _)| *name).collect::<Vec<Name>>() {
+        let concerned = self.shares.values().filter(|share| share.concerns(&changed));
+        for name in concerned.map(ShareRoute::name).collect::<Vec<Name>>() {
             self.refresh_share(name);
         }
     }

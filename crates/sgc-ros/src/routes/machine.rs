@@ -15,7 +15,7 @@ use super::local_graph::LocalGraph;
 use super::owners::Owners;
 use super::problem::{Cause, Problem, Problems};
 use super::rules::{Rules, ShareRule, ShareRules, UseRule, UseRules};
-use super::share_route::{ShareRoute, WRITERLESS_HOLD};
+use super::share_route::ShareRoute;
 use super::use_route::{TokenJoin, UseRoute};
 use crate::network::{DiscoveryEvent, EndpointKind};
 
@@ -126,16 +126,14 @@ impl<R: RngCore> Routes<R> {
 
     /// Returns the time of the next timeout.
     pub fn poll_timeout(&self) -> Option<Instant> {
-        let shares = self.shares.values().flat_map(|s| [s.writerless_until, s.sinkless_until]);
-        let gone = self.shares.values().flat_map(|s| s.own.values()).filter_map(|own| own.gone);
+        let shares = self.shares.values().map(ShareRoute::deadline);
         let uses = self.uses.values().map(|u| u.unreachable_until);
-        let gone = gone.map(|at| Some(at + WRITERLESS_HOLD));
-        shares.chain(uses).chain([self.owners.deadline()]).chain(gone).flatten().min()
+        shares.chain(uses).chain([self.owners.deadline()]).flatten().min()
     }
 
     /// Returns the ROS topic of a name that is shared or used here.
     pub fn topic_of(&self, name: &Name) -> Option<&str> {
-        let share = self.shares.get(name).map(|s| s.local_name.as_str());
+        let share = self.shares.get(name).map(ShareRoute::local_name);
         share.or_else(|| {
             let token = || Some(self.use_rules[self.tokens.get(name)?.rule].topic.as_str());
             self.uses.get(name).map(|u| u.local_name.as_str()).or_else(token)
@@ -144,7 +142,7 @@ impl<R: RngCore> Routes<R> {
 
     /// Returns `true` if the traffic of a name that is shared or used here has a lane of its own.
     pub fn is_dedicated(&self, name: &Name) -> bool {
-        let share = self.shares.get(name).map(|share| self.share_rules[share.rule].dedicated);
+        let share = self.shares.get(name).map(|share| self.share_rules[share.rule()].dedicated);
         let used = self.uses.get(name).map(|route| self.use_rules[route.rule].dedicated);
         share.or(used).unwrap_or(false)
     }

@@ -4,7 +4,7 @@
 //! which others may publish has a local writer while at least one of them is present.
 
 use rand_core::RngCore;
-use sgc_wire::{History, Metadata, Name, Qos};
+use sgc_wire::{Metadata, Name};
 
 use super::command::Command;
 use super::machine::Routes;
@@ -15,36 +15,14 @@ use crate::names::{dds_topic, dds_type, ros_topic, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec};
 use crate::qos::{reader_for, weakest};
 
-/// Depth of the owner's local writer for messages of others. Writers wait for acknowledgements, some 15 ms with
-/// Cyclone, once this many arrive at once. As many are kept for a reader that stands still.
-const PUBLISHERS_DEPTH: u32 = 100;
-
 impl<R: RngCore> Routes<R> {
     /// Handles the arrival of the first other publisher on a share, or the end of the last.
     pub fn handle_publishers(&mut self, name: &Name, any: bool) {
         let Some(share) = self.shares.get_mut(name) else { return };
-        if self.share_rules[share.rule].is_service() {
-            return;
+        if let Some(command) = share.set_publishers(any, &self.share_rules[share.rule()]) {
+            self.commands.push_back(command);
+            self.check_later();
         }
-        let spec = any.then(|| EndpointSpec {
-            topic: dds_topic(&share.local_name),
-            type_name: share.type_name.clone(),
-            keyless: share.keyless,
-            asks_key_hash: false,
-            type_hash: share.writers.values().find_map(|w| w.type_hash.clone()),
-            qos: self.share_rules[share.rule]
-                .qos
-                .apply(&Qos { history: History::KeepLast(PUBLISHERS_DEPTH), ..Qos::default() }),
-        });
-        if share.writer.is_some() == spec.is_some() {
-            return;
-        }
-        self.commands.push_back(match &spec {
-            Some(spec) => Command::OpenWriter { name: *name, source: None, spec: spec.clone() },
-            None => Command::CloseWriter { name: *name, source: None },
-        });
-        share.writer = spec;
-        self.check_later();
     }
 
     /// Begins the shares that exist for messages of others. Their rules must give the type, because no local
@@ -53,7 +31,7 @@ impl<R: RngCore> Routes<R> {
         for rule in self.share_rules.with_ids().map(|(rule, _)| rule).collect::<Vec<ShareRuleId>>() {
             let share = &self.share_rules[rule];
             let Metadata { type_name, ros_name, .. } = &share.metadata;
-            let known = self.shares.values().any(|s| s.rule == rule && ros_type(&s.type_name) == *type_name);
+            let known = self.shares.values().any(|s| s.rule() == rule && s.type_name() == *type_name);
             if known || type_name.is_empty() || !share.is_inbound() || share.is_pattern() {
                 continue;
             }

@@ -12,7 +12,6 @@ use super::command::Command;
 use super::machine::Routes;
 use super::problem::Cause;
 use super::rules::{Direction, Rules, ShareRule, ShareRules, UseRule, UseRuleId, UseRules};
-use crate::names::ros_type;
 use crate::network::{DiscoveredEndpoint, EndpointKind, Guid};
 
 impl<R: RngCore> Routes<R> {
@@ -31,8 +30,8 @@ impl<R: RngCore> Routes<R> {
     fn reconfigure_shares(&mut self, now: Instant, old: &ShareRules) {
         let (mut gone, mut kept) = (Vec::new(), Vec::new());
         for (name, route) in &self.shares {
-            let before = &old[route.rule];
-            let (local_name, type_name) = (&route.local_name, ros_type(&route.type_name));
+            let before = &old[route.rule()];
+            let (local_name, type_name) = (route.local_name(), route.type_name());
             let kind = before.metadata.kind;
             match self.share_rule(kind, local_name, Some(&type_name)) {
                 Some(index) if continues(before, &self.share_rules[index], local_name, &type_name) => {
@@ -46,10 +45,7 @@ impl<R: RngCore> Routes<R> {
         }
         for (name, index, before) in kept {
             let Some(route) = self.shares.get_mut(&name) else { continue };
-            route.rule = index;
-            if route.writers.is_empty() && !self.share_rules[index].is_inbound() {
-                route.writerless_until.get_or_insert(now);
-            }
+            route.move_to(now, index, &self.share_rules[index]);
             let ShareRule { policy, shaping, qos, .. } = &self.share_rules[index];
             let has_other_qos = *qos != before.qos;
             if *policy != before.policy {
@@ -64,7 +60,7 @@ impl<R: RngCore> Routes<R> {
         }
         self.begin_inbound();
         // Existing publishers are offered to new shares. Those of a kept share are in it already.
-        let shared: BTreeSet<Guid> = self.shares.values().flat_map(|s| s.writers.keys().copied()).collect();
+        let shared: BTreeSet<Guid> = self.shares.values().flat_map(|s| s.writers().copied()).collect();
         let is_new = |e: &&DiscoveredEndpoint| e.kind == EndpointKind::Writer && !shared.contains(&e.guid);
         for writer in self.local.endpoints().filter(is_new).cloned().collect::<Vec<_>>() {
             if !self.service_end_there(&writer) {

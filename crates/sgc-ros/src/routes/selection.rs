@@ -60,7 +60,7 @@ impl<R> Routes<R> {
     /// Returns `true` if this local name is shared by a rule that names it or by a running route.
     fn is_shared_as(&self, kind: Kind, local_name: &str) -> bool {
         let literal = |rule: &ShareRule| !rule.is_pattern() && rule.covers(kind, local_name);
-        let running = || kind == Kind::Topic && self.shares.values().any(|s| s.local_name == local_name);
+        let running = || kind == Kind::Topic && self.shares.values().any(|s| s.local_name() == local_name);
         self.share_rules.iter().any(literal) || running()
     }
 

@@ -11,36 +11,14 @@ use sgc_wire::{Kind, Name};
 
 use super::command::Command;
 use super::machine::Routes;
-use crate::names::{ServiceTopic, dds_type, ros_topic, ros_type};
-use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec, ServiceSpec};
-use crate::qos::service_qos;
-
-/// The prefix that ROS 2 reserves for services as a whole ("Topic and Service name mapping to DDS").
-const SERVICE_PREFIX: &str = "rs";
-
-/// Returns the kind and name of the interface that an endpoint provides.
-pub(super) fn interface(topic: &str) -> Option<(Kind, &str)> {
-    let service = topic.strip_prefix(SERVICE_PREFIX).filter(|service| service.starts_with('/'));
-    service.map(|service| (Kind::Service, service)).or_else(|| Some((Kind::Topic, ros_topic(topic)?)))
-}
-
-/// Returns the spec of both topics of a service.
-pub(super) fn service_spec(local_name: &str, type_name: &str, type_hash: Option<&str>) -> ServiceSpec {
-    let half = |half: ServiceTopic, type_hash: Option<&str>| EndpointSpec {
-        topic: half.dds_topic(local_name),
-        type_name: half.dds_type(type_name),
-        keyless: true,
-        asks_key_hash: false,
-        type_hash: type_hash.map(str::to_owned),
-        qos: service_qos(),
-    };
-    ServiceSpec { request: half(ServiceTopic::Request, type_hash), reply: half(ServiceTopic::Reply, None) }
-}
+use super::service_ends::{interface, server_of, service_spec};
+use crate::names::ServiceTopic;
+use crate::network::{DiscoveredEndpoint, EndpointKind};
 
 impl<R: RngCore> Routes<R> {
     /// Returns `true` if a name that is shared or used here belongs to a service.
     pub fn is_service(&self, name: &Name) -> bool {
-        let shared = self.shares.get(name).map(|share| self.share_rules[share.rule].is_service());
+        let shared = self.shares.get(name).map(|share| self.share_rules[share.rule()].is_service());
         let used = || self.uses.get(name).map(|route| self.use_rules[route.rule].is_service());
         shared.or_else(used).unwrap_or(false)
     }
@@ -64,7 +42,7 @@ impl<R: RngCore> Routes<R> {
         let others: Vec<_> = self.local.endpoints().filter(fits).cloned().collect();
         for other in others {
             let request = if half == ServiceTopic::Request { endpoint } else { &other };
-            if let Some(server) = server(request) {
+            if let Some(server) = server_of(request) {
                 self.writer_there(server);
             }
         }
@@ -95,28 +73,9 @@ impl<R: RngCore> Routes<R> {
             .endpoints()
             .filter(of_it)
             .filter(|e| e.kind == EndpointKind::Reader && e.topic == topic);
-        for server in requests.skip(left).filter_map(server).collect::<Vec<_>>() {
+        for server in requests.skip(left).filter_map(server_of).collect::<Vec<_>>() {
             self.writer_gone(now, &server);
         }
-    }
-
-    /// Updates the local client of a shared service to match its callers.
-    pub(super) fn refresh_client(&mut self, name: Name) {
-        let Some(share) = self.shares.get_mut(&name) else { return };
-        let wanted = !share.sinks.is_empty() || share.sinkless_until.is_some();
-        if !share.sinks.is_empty() {
-            share.sinkless_until = None;
-        }
-        let hash = share.writers.values().find_map(|w| w.type_hash.as_deref());
-        let spec = wanted.then(|| service_spec(&share.local_name, &ros_type(&share.type_name), hash));
-        if share.client.is_some() == spec.is_some() {
-            return;
-        }
-        self.commands.push_back(match &spec {
-            Some(spec) => Command::OpenClient { name, spec: spec.clone() },
-            None => Command::CloseClient { name },
-        });
-        share.client = spec;
     }
 
     /// Updates the local server of a called service to match its catalogue entry.
@@ -140,16 +99,4 @@ impl<R: RngCore> Routes<R> {
         route.nodes.clear();
         self.name_writers(name);
     }
-}
-
-/// Returns the endpoint that represents a server in a share route, from its request reader.
-fn server(request: &DiscoveredEndpoint) -> Option<DiscoveredEndpoint> {
-    let (_, name, type_name) = ServiceTopic::parse(&request.topic, &request.type_name)?;
-    Some(DiscoveredEndpoint {
-        kind: EndpointKind::Writer,
-        topic: format!("{SERVICE_PREFIX}{name}"),
-        type_name: dds_type(&type_name),
-        qos: service_qos(),
-        ..request.clone()
-    })
 }

@@ -8,7 +8,6 @@ use super::owners::OwnerState;
 use super::rules::{Direction, ShareRule, UseRule};
 use super::share_route::ShareRoute;
 use super::use_route::UseRoute;
-use crate::names::ros_type;
 
 /// The way of a rule's interfaces.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -102,7 +101,9 @@ impl<R> Routes<R> {
         let mut all = Vec::new();
         for (id, rule) in self.share_rules.with_ids() {
             let before = all.len();
-            all.extend(self.shares.values().filter(|s| s.rule == id).map(|route| share_status(rule, route)));
+            all.extend(
+                self.shares.values().filter(|s| s.rule() == id).map(|route| share_status(rule, route)),
+            );
             if all.len() == before {
                 all.push(idle_share(rule));
             }
@@ -164,21 +165,21 @@ fn idle_share(rule: &ShareRule) -> RouteStatus {
 }
 
 fn share_status(rule: &ShareRule, route: &ShareRoute) -> RouteStatus {
-    let (local, remote) = (route.writers.len(), route.sinks.len());
+    let (local, remote) = (route.writers().len(), route.sink_count());
     let (topic_there, state) = if rule.is_service() {
         (None, RouteState::Served { servers: local, callers: remote })
     } else {
-        let is_read = route.reader.is_some();
-        let there = rule.naming.renamed(&rule.metadata.ros_name, &route.local_name);
+        let is_read = route.is_read();
+        let there = rule.naming.renamed(&rule.metadata.ros_name, route.local_name());
         let state = RouteState::Shared { publishers: local, subscribers: remote, is_read };
-        (Some(there).filter(|there| *there != route.local_name), state)
+        (Some(there).filter(|there| there != route.local_name()), state)
     };
     RouteStatus {
         kind: share_kind(rule),
-        topic: route.local_name.clone(),
+        topic: route.local_name().to_owned(),
         topic_there,
-        type_name: Some(ros_type(&route.type_name)),
-        name: Some(route.name),
+        type_name: Some(route.type_name()),
+        name: Some(route.name()),
         owner: rule.metadata.owner.clone(),
         state,
     }

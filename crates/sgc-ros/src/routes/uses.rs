@@ -90,7 +90,7 @@ impl<R: RngCore> Routes<R> {
         if !self.backlog.take_due() {
             return;
         }
-        let shared: BTreeSet<_> = self.shares.values().flat_map(|s| s.writers.keys().copied()).collect();
+        let shared: BTreeSet<_> = self.shares.values().flat_map(|s| s.writers().copied()).collect();
         let is_new = |e: &&DiscoveredEndpoint| e.kind == EndpointKind::Writer && !shared.contains(&e.guid);
         for writer in self.local.endpoints().filter(is_new).cloned().collect::<Vec<_>>() {
             if !self.service_end_there(&writer) {

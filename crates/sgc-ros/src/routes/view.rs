@@ -7,9 +7,7 @@ use sgc_wire::{CatalogueEntry, Kind, Metadata, Name, NodeId, PayloadForm, Qos};
 use super::machine::Routes;
 use super::owners::OwnerState;
 use super::rules::{Direction, ShareRule, ShareRuleId, UseRule};
-use crate::names::ros_type;
 use crate::network::{DiscoveredEndpoint, Guid};
-use crate::qos::weakest;
 
 /// A share rule and its routes.
 #[derive(Clone, Debug)]
@@ -135,16 +133,16 @@ impl<R> Routes<R> {
     pub fn share_views(&self) -> Vec<ShareView<'_>> {
         let view = |(index, rule)| {
             let rule: &ShareRule = rule;
-            let of_rule = self.shares.values().filter(move |share| share.rule == index);
+            let of_rule = self.shares.values().filter(move |share| share.rule() == index);
             let routes = of_rule.map(|share| ShareRouteView {
-                local_name: share.local_name.clone(),
-                type_name: ros_type(&share.type_name),
-                name: share.name,
-                writers: share.writers.len(),
-                sinks: share.sinks.len(),
-                is_read: share.reader.is_some(),
-                is_written: share.writer.is_some() || share.client.is_some(),
-                qos: weakest(share.writers.values().map(|w| &w.qos)),
+                local_name: share.local_name().to_owned(),
+                type_name: share.type_name(),
+                name: share.name(),
+                writers: share.writers().len(),
+                sinks: share.sink_count(),
+                is_read: share.is_read(),
+                is_written: share.is_written(),
+                qos: share.offer(),
                 form: rule.shaping.form,
             });
             ShareView { metadata: &rule.metadata, policy: &rule.policy, routes: routes.collect() }
