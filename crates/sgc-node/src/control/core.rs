@@ -10,7 +10,6 @@ mod links;
 mod operations;
 mod outputs;
 mod publish;
-mod quality;
 mod reopening;
 mod ros;
 mod services;
@@ -25,8 +24,8 @@ use std::time::{Duration, Instant};
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Output as EndpointOutput};
 use sgc_ros::{EndpointSpec, RosNetwork, Routes, ServiceSpec, ShareRule, UseRule};
-use sgc_router::{FibEntry, LinkId, Output as RouterOutput, Router};
-use sgc_session::{KeepAlive, KeepAlivePolicy};
+use sgc_router::{Output as RouterOutput, Router};
+use sgc_session::KeepAlivePolicy;
 use sgc_transport::{AnyLink, CredentialStore};
 use sgc_trust::{Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
@@ -43,7 +42,8 @@ use crate::control::interface_types::InterfaceTypes;
 use crate::control::local_graph::LocalGraph;
 use crate::control::members::{MemberNames, Members};
 use crate::control::operations::Operations;
-use crate::control::peer_policies::PeerPolicies;
+use crate::control::parts::forward_table::ForwardTable;
+use crate::control::parts::link_table::LinkTable;
 use crate::control::peer_rate::PeerRates;
 use crate::control::problem_log::ProblemLog;
 use crate::control::publishing::{Offer, Publishing};
@@ -57,11 +57,10 @@ use crate::data::outflow::OutFlow;
 use crate::data::replays::Replays;
 use crate::data::sinks::{LocalSink, SinkRequest};
 use crate::data::sources::{LocalShare, NewestSamples};
-use crate::data::stats::{Drops, NameStats};
+use crate::data::stats::Drops;
 use crate::data::tap::TapQueue;
 use crate::discovery::Board;
 use crate::gateway::Gateway;
-use crate::link::control_tx::ControlTx;
 use crate::local::network_slot::NetworkSlot;
 use crate::local::network_state::NetworkState;
 use crate::state::audit::Audit;
@@ -88,16 +87,6 @@ struct LocalReader {
     newest: Option<Arc<NewestSamples>>,
 }
 
-struct LinkEntry {
-    link: AnyLink,
-    url: Option<String>,
-    control: ControlTx,
-    flows: HashMap<Name, Arc<OutFlow>>,
-    /// Reason, if this node closed it.
-    closed_for: Option<String>,
-    keep_alive: KeepAlive,
-}
-
 /// The control task's state. `N` is the local network; a pure router has none.
 pub(crate) struct Core<N: RosNetwork> {
     identity: Arc<Identity>,
@@ -107,12 +96,8 @@ pub(crate) struct Core<N: RosNetwork> {
     network: NetworkSlot<N>,
     data: Arc<DataPlane>,
     inbox: Inbox,
-    links: BTreeMap<LinkId, LinkEntry>,
-    /// Time of the next look at the links.
-    look_due: Option<Instant>,
-    keep_alive_policies: PeerPolicies,
-    next_link: u32,
-    entries: HashMap<Name, (FibEntry, Arc<NameStats>)>,
+    links: LinkTable,
+    forwards: ForwardTable,
     shares: HashMap<Name, Arc<LocalShare>>,
     readers: HashMap<Name, LocalReader>,
     sinks: HashMap<Name, Arc<LocalSink>>,
@@ -234,11 +219,8 @@ impl<N: RosNetwork> Core<N> {
             network: parts.network,
             data: Arc::new(DataPlane::new(parts.rates)),
             inbox: Inbox::default(),
-            links: BTreeMap::new(),
-            look_due: None,
-            keep_alive_policies: PeerPolicies::new(parts.keep_alive_policy),
-            next_link: 1,
-            entries: HashMap::new(),
+            links: LinkTable::new(parts.keep_alive_policy),
+            forwards: ForwardTable::default(),
             shares: HashMap::new(),
             readers: HashMap::new(),
             sinks: HashMap::new(),
@@ -484,7 +466,8 @@ impl<N: RosNetwork> Core<N> {
                 self.note_consumers();
                 let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
                 let rekey = self.rekey_deadline();
-                let own = [self.renew_due, self.silence_due, self.look_due, self.operations.deadline()];
+                let own =
+                    [self.renew_due, self.silence_due, self.links.deadline(), self.operations.deadline()];
                 let own = own.into_iter().chain([self.reopening.deadline()]);
                 let all =
                     [router, endpoint, routes, self.sink_timers.deadline(), rekey, self.calls_deadline()];
@@ -531,9 +514,7 @@ impl<N: RosNetwork> Core<N> {
                 drop_elsewhere(reader);
             }
         }
-        let flows: Vec<_> = self.links.values().flat_map(|l| l.flows.values().cloned()).collect();
-        flows.iter().for_each(|f| f.close());
-        flows
+        self.links.close_flows()
     }
 
     /// Withdraws the shares and says goodbye.
@@ -541,13 +522,11 @@ impl<N: RosNetwork> Core<N> {
         self.operations.stop();
         self.endpoint.withdraw_all(now());
         self.drain();
-        for entry in self.links.values() {
-            entry.control.send(Control::Goodbye);
-        }
+        let links = self.links.say_goodbye();
         for sink in self.sinks.values() {
             sink.close();
         }
-        self.links.values().map(|l| l.link.clone()).collect()
+        links
     }
 }
 

@@ -13,6 +13,7 @@ pub(crate) mod members;
 pub(crate) mod operations;
 pub(crate) mod operators;
 pub mod partners;
+pub(crate) mod parts;
 pub(crate) mod peer_policies;
 pub(crate) mod peer_rate;
 pub mod policy;

@@ -6,7 +6,7 @@ use std::time::Instant;
 use sgc_endpoint::JoinStatus;
 use sgc_ros::RosNetwork;
 use sgc_router::{LinkId, clocks_differ};
-use sgc_transport::{CloseReason, Link as _};
+use sgc_transport::CloseReason;
 use sgc_wire::{Control, Place, UnixMillis};
 use tracing::{debug, info, warn};
 
@@ -26,20 +26,18 @@ impl<N: RosNetwork> Core<N> {
     /// Closes the link of a run that another run of the same node superseded. A run that returns after it was told so
     /// is a second process; both it and the operator are told.
     pub(super) fn close_superseded(&mut self, link: LinkId, by: Option<LinkId>, alive: bool) {
-        let holder = by.and_then(|by| self.links.get(&by));
-        let place = holder.map_or(ELSEWHERE.to_owned(), |entry| entry.link.remote().to_string());
-        let Some(entry) = self.links.get_mut(&link) else { return };
-        let (node, remote) = (entry.link.peer().node_id, entry.link.remote());
+        let holder = by.and_then(|by| self.links.get(by));
+        let place = holder.map_or(ELSEWHERE.to_owned(), |entry| entry.remote().to_string());
+        let Some(entry) = self.links.get(link) else { return };
+        let (node, remote) = (entry.peer().node_id, entry.remote());
         let reason = CloseReason::InUse(place.clone());
-        entry.closed_for = Some(reason.to_string());
-        entry.link.close(reason);
+        self.links.close(link, reason.to_string(), reason);
         if !alive {
             info!(%link, peer = %node.short(), %remote, %place, "a newer process of the node takes the place of this link");
             return;
         }
-        if let Some(holder) = by.and_then(|by| self.links.get(&by)) {
-            // If the queue is full, the link closes for that reason elsewhere.
-            holder.control.send(Control::IdentityInUse { place: Place::from(remote) });
+        if let Some(holder) = by.and_then(|by| self.links.get(by)) {
+            holder.notify(Control::IdentityInUse { place: Place::from(remote) });
         }
         self.control_drops.count_from("identity_in_use", node);
         let called = self.called(&node);
@@ -76,9 +74,9 @@ impl<N: RosNetwork> Core<N> {
 
     /// Handles a peer's report that it keeps out another process with this node's identity.
     pub(super) fn kept_out(&mut self, link: LinkId, place: Place) {
-        let Some(entry) = self.links.get(&link) else { return };
+        let Some(entry) = self.links.get(link) else { return };
         // Other peers have no links from which a process could be kept out.
-        if !entry.link.peer().may_route && entry.url.is_none() {
+        if !entry.peer().may_route && entry.url().is_none() {
             self.control_drops.count_from("unknown", link);
             return;
         }
@@ -92,11 +90,11 @@ impl<N: RosNetwork> Core<N> {
 
     /// Compares the clock with the time that a peer told.
     pub(super) fn compare_clocks(&self, link: LinkId) {
-        let Some(entry) = self.links.get(&link) else { return };
+        let Some(entry) = self.links.get(link) else { return };
         let ahead_ms = self.router.clock_ahead_ms(link).filter(|ms| clocks_differ(*ms));
         let Some(ahead_ms) = ahead_ms else { return };
         if self.control_drops.count_from("clocks_differ", link) {
-            let (peer, remote) = (self.called(&entry.link.peer().node_id), entry.link.remote().to_string());
+            let (peer, remote) = (self.called(&entry.peer().node_id), entry.remote().to_string());
             let alert = Alert::ClocksDiffer { peer, remote, ahead_ms };
             warn!("{alert}; {}", alert.fix());
         }
@@ -130,9 +128,9 @@ impl<N: RosNetwork> Core<N> {
         alerts.extend(closed.map(|reason| Alert::LocalNetworkClosed { reason }));
         alerts.extend(strangers::alerts());
         alerts.extend(self.links.iter().filter_map(|(id, entry)| {
-            let ahead_ms = self.router.clock_ahead_ms(*id).filter(|ms| clocks_differ(*ms))?;
-            let peer = self.called(&entry.link.peer().node_id);
-            Some(Alert::ClocksDiffer { peer, remote: entry.link.remote().to_string(), ahead_ms })
+            let ahead_ms = self.router.clock_ahead_ms(id).filter(|ms| clocks_differ(*ms))?;
+            let peer = self.called(&entry.peer().node_id);
+            Some(Alert::ClocksDiffer { peer, remote: entry.remote().to_string(), ahead_ms })
         }));
         alerts
     }

@@ -9,7 +9,6 @@ use sgc_ros::{
     Direction, DiscoveredEndpoint, EndpointKind, EndpointSpec, RosNetwork, Sample, SampleHandler, ShareView,
     UseView, dds_topic, dds_type, reader_for, ros_topic, ros_type, weakest,
 };
-use sgc_transport::Link as _;
 use sgc_trust::{Grantees, Policy};
 use sgc_wire::{CatalogueEntry, Kind, Name, NodeId, PayloadForm, Role};
 use tokio::sync::oneshot;
@@ -36,14 +35,14 @@ impl<N: RosNetwork> Core<N> {
             ..Graph::default()
         };
         let links = self.links.iter().map(|(id, entry)| {
-            let peer = entry.link.peer().node_id;
-            let (_, silent) = self.router.link_cost(*id).unwrap_or_default();
+            let peer = entry.peer().node_id;
+            let (_, silent) = self.router.link_cost(id).unwrap_or_default();
             Link {
                 id: id.0,
                 peer: peer.to_string(),
                 name: self.audit.name_of(&peer),
-                remote: entry.link.remote().to_string(),
-                rtt_us: entry.link.stats().rtt.as_micros().try_into().unwrap_or(u64::MAX),
+                remote: entry.remote().to_string(),
+                rtt_us: entry.stats().rtt.as_micros().try_into().unwrap_or(u64::MAX),
                 silent,
             }
         });
@@ -52,7 +51,7 @@ impl<N: RosNetwork> Core<N> {
         graph.routers = searches
             .map(|s| Search { router: s.router, state: s.state.to_string(), last_failure: s.last_failure })
             .collect();
-        let mut names: BTreeSet<Name> = self.entries.keys().chain(&asked).copied().collect();
+        let mut names: BTreeSet<Name> = self.forwards.names().chain(&asked).copied().collect();
         self.add_routes(&mut graph, &mut names);
         graph.names = names.into_iter().map(|name| (name.to_string(), self.name_line(&name))).collect();
         graph
@@ -241,7 +240,7 @@ impl<N: RosNetwork> Core<N> {
             way: self.router.route(name).map(|(link, cost)| (link.0, cost)),
             ..NameLine::default()
         };
-        if let Some((entry, stats)) = self.entries.get(name) {
+        if let Some((entry, stats)) = self.forwards.get(name) {
             line.has_branch = true;
             line.out = entry.links().iter().map(|link| link.0).collect();
             line.up = entry.trees.iter().map(|tree| tree.up.0).collect();

@@ -1,6 +1,6 @@
 //! Links that come and go, and their frames.
 
-use std::collections::HashMap;
+use std::time::Instant;
 
 use sgc_ros::RosNetwork;
 use sgc_router::{LinkId, Neighbour};
@@ -10,10 +10,11 @@ use sgc_wire::{Control, NodeId};
 use tokio::sync::oneshot;
 use tracing::{debug, warn};
 
-use super::{Core, LinkEntry};
+use super::Core;
 use crate::clock::now;
 use crate::control::control_queue::FrameRoom;
 use crate::control::event::LinkPlace;
+use crate::control::parts::link_table::{EndedLink, LinkLook};
 use crate::data::stats::CountDrops;
 use crate::link::control_tx::ControlTx;
 use crate::state::audit::{AuditEvent, AuditRecord};
@@ -27,8 +28,6 @@ impl<N: RosNetwork> Core<N> {
         control: ControlTx,
         reply: oneshot::Sender<Option<LinkPlace>>,
     ) {
-        let id = LinkId(self.next_link);
-        self.next_link += 1;
         let set = url.as_deref().and_then(|url| url.parse::<LinkUrl>().ok()).and_then(|url| url.cost_ms);
         let cost = set.map(|ms| ms.saturating_mul(1000));
         let neighbour = Neighbour { cost, ..Neighbour::from(link.peer()) };
@@ -36,16 +35,16 @@ impl<N: RosNetwork> Core<N> {
         self.hear_of(link.peer());
         let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
         self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
-        let (flows, keep_alive) = (HashMap::new(), self.keep_alive_for(&link));
+        let rtt = link.stats().rtt;
+        let id = self.links.add(Instant::now(), link, url, control);
         self.control_drops.link_up(id);
         self.data.drops().link_up(id);
-        self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, keep_alive });
         let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
         if reply.send(Some(place)).is_err() {
             debug!(%remote, "the link's task is gone");
         }
         self.router.handle_link_up(now(), id, neighbour);
-        self.begin_to_look(id);
+        self.router.handle_link_quality(now(), id, rtt, false);
     }
 
     /// Forgets a link. `in_use` is the place of another process with this node's identity, if the peer closed the link
@@ -54,18 +53,23 @@ impl<N: RosNetwork> Core<N> {
         self.router.handle_link_down(now(), id);
         self.control_drops.link_down(id);
         self.data.drops().link_down(id);
-        if let Some(entry) = self.links.remove(&id) {
-            self.keep_alive_policies.remember(entry.link.peer().node_id, entry.keep_alive.policy());
-            let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&entry.link.peer().node_id);
-            let record = record.remote(entry.link.remote());
-            self.audit.write(match &entry.closed_for {
+        if let Some(EndedLink { node, remote, closed_for }) = self.links.remove(id) {
+            let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&node).remote(remote);
+            self.audit.write(match closed_for {
                 Some(reason) => record.reason(reason),
                 None => record,
             });
-            entry.flows.values().for_each(|f| f.close());
         }
         if let Some(place) = in_use {
             self.displaced(&place);
+        }
+    }
+
+    /// Looks at the links, and passes the measurements to the router.
+    pub(super) fn look_at_links(&mut self, at: Instant) {
+        let now = now();
+        for LinkLook { link, rtt, is_silent } in self.links.look(at) {
+            self.router.handle_link_quality(now, link, rtt, is_silent);
         }
     }
 

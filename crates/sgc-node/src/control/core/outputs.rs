@@ -4,7 +4,7 @@ use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Event, Output as EndpointOutput};
 use sgc_ros::{RosNetwork, Routes, UNREACHABLE_HOLD};
 use sgc_router::{DropReason, LinkClose, LinkId, Output as RouterOutput};
-use sgc_transport::{CloseReason, Link};
+use sgc_transport::CloseReason;
 use sgc_wire::{Name, Now, RefuseReason, Role};
 use tracing::{debug, info, warn};
 
@@ -17,50 +17,17 @@ impl<N: RosNetwork> Core<N> {
         match output {
             RouterOutput::Send { link: LinkId::LOCAL, frame } => self.endpoint.handle_frame(now(), frame),
             RouterOutput::Send { link, frame } => {
-                let Some(entry) = self.links.get_mut(&link) else { return };
-                entry.keep_alive.stir();
-                if !entry.control.send(frame) {
+                if !self.links.send(link, frame) {
                     self.close_overloaded(link);
                 }
             }
             RouterOutput::Flush { link } => {
-                if self.links.get(&link).is_some_and(|entry| !entry.control.flush()) {
+                if !self.links.flush(link) {
                     self.close_overloaded(link);
                 }
             }
             RouterOutput::Forward { name, entry } => self.set_forward(name, entry),
-            RouterOutput::Close { link, reason } => {
-                let Some(entry) = self.links.get_mut(&link) else { return };
-                entry.closed_for = Some(reason.to_string());
-                if matches!(reason, LinkClose::Revoked) {
-                    let record = AuditRecord::new(AuditEvent::Revoked).peer(&entry.link.peer().node_id);
-                    self.audit.write(record.remote(entry.link.remote()).reason("its link is cut"));
-                }
-                match &reason {
-                    LinkClose::Superseded { by, alive } => self.close_superseded(link, *by, *alive),
-                    LinkClose::Goodbye => entry.link.close(CloseReason::Goodbye),
-                    LinkClose::Revoked => {
-                        let peer = entry.link.peer();
-                        let why = self.credentials.objection(peer, now().unix);
-                        let why = why.unwrap_or(CloseReason::Revoked);
-                        info!(%link, peer = %peer.node_id.short(), "{why}; its link is closed");
-                        entry.closed_for = Some(why.to_string());
-                        entry.link.close(why);
-                    }
-                    LinkClose::Expired => {
-                        info!(%link, peer = %entry.link.peer().node_id.short(), "the peer's certificate has ended; its link is closed");
-                        entry.link.close(CloseReason::Expired);
-                    }
-                    LinkClose::TooMany | LinkClose::Forgeries => {
-                        warn!(%link, remote = %entry.link.remote(), peer = %entry.link.peer().node_id.short(), "{reason}; its link is closed");
-                        entry.link.close(CloseReason::Denied(reason.to_string()));
-                    }
-                    LinkClose::Greeting | LinkClose::Loop => {
-                        warn!(%link, remote = %entry.link.remote(), "{reason}");
-                        entry.link.close(CloseReason::Protocol(reason.to_string()));
-                    }
-                }
-            }
+            RouterOutput::Close { link, reason } => self.close_link(link, &reason),
             RouterOutput::Trust(anchors) => {
                 let lists = anchors.crls().count();
                 let record =
@@ -84,11 +51,44 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
+    /// Closes a link that the router no longer wants.
+    fn close_link(&mut self, link: LinkId, reason: &LinkClose) {
+        let Some(entry) = self.links.get(link) else { return };
+        let (peer, remote) = (entry.peer(), entry.remote());
+        let node = peer.node_id;
+        let mut because = reason.to_string();
+        let close = match reason {
+            LinkClose::Superseded { by, alive } => return self.close_superseded(link, *by, *alive),
+            LinkClose::Goodbye => CloseReason::Goodbye,
+            LinkClose::Revoked => {
+                let record = AuditRecord::new(AuditEvent::Revoked).peer(&node);
+                self.audit.write(record.remote(remote).reason("its link is cut"));
+                let why = self.credentials.objection(peer, now().unix).unwrap_or(CloseReason::Revoked);
+                info!(%link, peer = %node.short(), "{why}; its link is closed");
+                because = why.to_string();
+                why
+            }
+            LinkClose::Expired => {
+                info!(%link, peer = %node.short(), "the peer's certificate has ended; its link is closed");
+                CloseReason::Expired
+            }
+            LinkClose::TooMany | LinkClose::Forgeries => {
+                warn!(%link, %remote, peer = %node.short(), "{reason}; its link is closed");
+                CloseReason::Denied(because.clone())
+            }
+            LinkClose::Greeting | LinkClose::Loop => {
+                warn!(%link, %remote, "{reason}");
+                CloseReason::Protocol(because.clone())
+            }
+        };
+        self.links.close(link, because, close);
+    }
+
     fn close_overloaded(&mut self, link: LinkId) {
-        let Some(entry) = self.links.get(&link) else { return };
-        warn!(%link, remote = %entry.link.remote(), "the peer does not take control frames; the link is closed");
+        let Some(entry) = self.links.get(link) else { return };
+        warn!(%link, remote = %entry.remote(), "the peer does not take control frames; the link is closed");
         self.control_drops.count_from("control_queue_full", link);
-        entry.link.close(CloseReason::Overloaded);
+        entry.close_overloaded();
     }
 
     pub(super) fn endpoint_output(&mut self, output: EndpointOutput) {

@@ -21,7 +21,7 @@ use crate::control::publishing::Offer;
 use crate::data::assertions;
 use crate::data::dataplane::{Forward, Out};
 use crate::data::manual_lease::ManualLease;
-use crate::data::outflow::{self, OUTFLOW_AGE_MAX, OutFlow};
+use crate::data::outflow::{FlowLimits, OUTFLOW_AGE_MAX};
 use crate::data::sinks::LocalSink;
 use crate::data::sources::{LocalShare, Publisher, SourceMap, SourceSlot};
 use crate::data::writer_queue::WriterQueue;
@@ -409,75 +409,47 @@ impl<N: RosNetwork> Core<N> {
 
     /// Applies new settings to the queues of a name. Queued packets are still sent.
     fn begin_flows_anew(&mut self, name: Name) {
-        let Some((entry, _)) = self.entries.get(&name) else { return };
+        let Some((entry, _)) = self.forwards.get(&name) else { return };
         let entry = entry.clone();
-        for link in self.links.values_mut() {
-            if let Some(flow) = link.flows.remove(&name) {
-                flow.close();
-            }
-        }
+        self.links.end_flows(&name, &[]);
         self.set_forward(name, Some(entry));
     }
 
     pub(super) fn set_forward(&mut self, name: Name, entry: Option<FibEntry>) {
         let Some(entry) = entry else {
-            self.entries.remove(&name);
+            self.forwards.remove(&name);
             self.want_lanes(name);
             self.data.set(name, None);
-            for link in self.links.values_mut() {
-                if let Some(flow) = link.flows.remove(&name) {
-                    flow.close();
-                }
-            }
+            self.links.end_flows(&name, &[]);
             return;
         };
-        let stats = self.entries.get(&name).map(|(_, stats)| stats.clone()).unwrap_or_default();
         let wanted = entry.links();
         let max_age = self.shares.get(&name).and_then(|share| share.shaping().max_age);
         let max_age = max_age.map_or(OUTFLOW_AGE_MAX, |max_age| max_age.min(OUTFLOW_AGE_MAX));
-        let waits = outflow::FlowLimits { max_age, ..outflow::FlowLimits::default() };
+        let limits = FlowLimits { max_age, ..FlowLimits::default() };
         let mut outs = Vec::new();
         for id in &wanted {
-            if *id == LinkId::LOCAL {
-                if let Some(sink) = self.sinks.get(&name) {
-                    outs.push((*id, Out::Local(sink.clone())));
-                }
-            } else if let Some(link) = self.links.get_mut(id) {
-                let (to, control) = (&link.link, &mut link.control);
-                let begin = || {
-                    let lanes = control.lanes().clone();
-                    OutFlow::spawn(to.clone(), name, control.label(name), lanes, waits)
-                };
-                let flow = link.flows.entry(name).or_insert_with(begin).clone();
-                outs.push((*id, Out::Link(flow, link.control.activity().clone())));
-            }
+            let out = if *id == LinkId::LOCAL {
+                self.sinks.get(&name).cloned().map(Out::Local)
+            } else {
+                self.links.out(*id, name, limits)
+            };
+            outs.extend(out.map(|out| (*id, out)));
         }
-        for (id, link) in &mut self.links {
-            if !wanted.contains(id)
-                && let Some(flow) = link.flows.remove(&name)
-            {
-                flow.close();
-            }
-        }
-        self.data.set(name, Some(Forward::new(entry.clone(), outs, stats.clone())));
-        self.entries.insert(name, (entry, stats));
+        self.links.end_flows(&name, &wanted);
+        let stats = self.forwards.set(name, entry.clone());
+        self.data.set(name, Some(Forward::new(entry, outs, stats)));
         self.want_lanes(name);
     }
 
     /// Adjusts the lanes of a name to its links and to the configuration.
     fn want_lanes(&self, name: Name) {
         let dedicated = self.routes.as_ref().is_some_and(|routes| routes.is_dedicated(&name));
-        let entry = self.entries.get(&name).map(|(entry, _)| entry);
-        for (id, link) in &self.links {
-            let carries = |entry: &FibEntry| {
-                entry.links().contains(id) || entry.trees.iter().any(|tree| tree.up == *id)
-            };
-            link.control.lanes().set_wanted(name, dedicated && entry.is_some_and(carries));
-        }
+        self.links.set_lanes(name, |id| dedicated && self.forwards.uses_link(&name, id));
     }
 
     /// Adjusts the lanes of all names.
     pub(super) fn want_all_lanes(&self) {
-        self.entries.keys().for_each(|name| self.want_lanes(*name));
+        self.forwards.names().for_each(|name| self.want_lanes(*name));
     }
 }

@@ -4,17 +4,17 @@ use std::collections::BTreeMap;
 
 use sgc_ros::{RosNetwork, RouteStatus, Routes};
 use sgc_router::LinkId;
-use sgc_transport::Link;
 
-use super::{Core, LinkEntry};
+use super::Core;
 use crate::admin::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
+use crate::control::parts::link_table::LinkEntry;
 use crate::data::stats::CountDrops;
 
 impl<N: RosNetwork> Core<N> {
     /// Returns the node's status.
     pub(super) fn status(&self) -> Status {
-        let links = self.links.iter().map(|(id, entry)| self.link_status(*id, entry));
-        let names = self.entries.iter().map(|(name, (_, stats))| NameStatus::new(name, stats));
+        let links = self.links.iter().map(|(id, entry)| self.link_status(id, entry));
+        let names = self.forwards.stats().map(|(name, stats)| NameStatus::new(name, stats));
         let router = self.router.stats();
         Status {
             node: self.identity.node_name().to_string(),
@@ -41,25 +41,25 @@ impl<N: RosNetwork> Core<N> {
     }
 
     fn link_status(&self, id: LinkId, entry: &LinkEntry) -> LinkStatus {
-        let stats = entry.link.stats();
+        let stats = entry.stats();
         let (cost, silent) = self.router.link_cost(id).unwrap_or_default();
-        let over = self.data.rates().over(&entry.link.peer().node_id);
+        let over = self.data.rates().over(&entry.peer().node_id);
         LinkStatus {
             id: id.0,
-            peer: entry.link.peer().node_id.to_string(),
-            peer_until: entry.link.peer().not_after.to_string(),
-            remote: entry.link.remote().to_string(),
-            url: entry.url.clone(),
+            peer: entry.peer().node_id.to_string(),
+            peer_until: entry.peer().not_after.to_string(),
+            remote: entry.remote().to_string(),
+            url: entry.url().map(str::to_owned),
             kex: stats.key_exchange.label(),
             rtt_us: stats.rtt.as_micros().try_into().unwrap_or(u64::MAX),
             cost,
             silent,
-            keep_alive_ms: entry.keep_alive.step().as_millis().try_into().unwrap_or(u64::MAX),
+            keep_alive_ms: entry.keep_alive_interval().as_millis().try_into().unwrap_or(u64::MAX),
             sent_bytes: stats.sent_bytes,
             received_bytes: stats.received_bytes,
-            lanes: entry.control.lanes().count(),
-            labels_sent: entry.control.labels_known(),
-            labels_received: entry.link.labels_defined(),
+            lanes: entry.lanes(),
+            labels_sent: entry.labels_sent(),
+            labels_received: entry.labels_received(),
             peer_slowed: over.slowed,
             peer_dropped: over.dropped,
         }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use sgc_ros::RosNetwork;
-use sgc_transport::{CloseReason, Link as _};
+use sgc_transport::CloseReason;
 use sgc_trust::{CrlError, Identity, TrustAnchors, VerifiedPeer};
 use sgc_wire::{Credentials, RefuseReason, SinkId};
 use tracing::{info, warn};
@@ -14,6 +14,7 @@ use super::Core;
 use crate::clock::now;
 use crate::control::authority::{Asker, DeskAnswers, RenewalAnswer, RenewalRefusal, RenewalRequest};
 use crate::control::event::CoreEvent;
+use crate::control::parts::link_table::LinkEntry;
 use crate::state::audit::{AuditEvent, AuditRecord};
 use crate::state::credentials::{renew_at, renewed};
 
@@ -146,14 +147,13 @@ impl<N: RosNetwork> Core<N> {
 
     /// Closes incoming links of nodes that may no longer attach.
     pub(super) fn close_not_admitted(&mut self) {
-        for (link, entry) in &mut self.links {
-            let peer = entry.link.peer();
-            if entry.url.is_none() && !self.credentials.admits(peer) {
-                let why = CloseReason::not_admitted();
-                info!(%link, peer = %peer.node_id.short(), "{why}; its link is closed");
-                entry.closed_for = Some(why.to_string());
-                entry.link.close(why);
-            }
+        let is_refused = |entry: &LinkEntry| entry.url().is_none() && !self.credentials.admits(entry.peer());
+        let refused = self.links.iter().filter(|(_, entry)| is_refused(entry));
+        let refused: Vec<_> = refused.map(|(link, entry)| (link, entry.peer().node_id)).collect();
+        for (link, node) in refused {
+            let why = CloseReason::not_admitted();
+            info!(%link, peer = %node.short(), "{why}; its link is closed");
+            self.links.close(link, why.to_string(), why);
         }
     }
 

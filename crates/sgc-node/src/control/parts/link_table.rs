@@ -1,0 +1,253 @@
+//! [`LinkTable`]: the links of this node with their keep-alive, their queues of packets, and the reasons for which this
+//! node closes them.
+//!
+//! The router machine decides which links a name uses and which links end. [`sgc_session::KeepAlive`] decides when to
+//! probe a peer. The looks measure links, so that the router machine can weigh them and leave silent ones before they
+//! time out.
+
+use std::collections::{BTreeMap, HashMap};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use sgc_router::LinkId;
+use sgc_session::{KeepAlive, KeepAlivePolicy, LinkObservation};
+use sgc_transport::{AnyLink, CloseReason, Link, LinkStats};
+use sgc_trust::VerifiedPeer;
+use sgc_wire::{Control, Name, NodeId};
+use tracing::info;
+
+use crate::control::peer_policies::PeerPolicies;
+use crate::data::dataplane::Out;
+use crate::data::outflow::{FlowLimits, OutFlow};
+use crate::link::control_tx::ControlTx;
+
+/// Interval of looks at the links.
+const LOOK_EVERY: Duration = Duration::from_millis(500);
+
+/// A link that is up.
+pub(crate) struct LinkEntry {
+    link: AnyLink,
+    url: Option<String>,
+    control: ControlTx,
+    flows: HashMap<Name, Arc<OutFlow>>,
+    /// Reason, if this node closed it.
+    closed_for: Option<String>,
+    keep_alive: KeepAlive,
+}
+
+/// All links that are up.
+pub(crate) struct LinkTable {
+    links: BTreeMap<LinkId, LinkEntry>,
+    /// Number of the next link.
+    next: u32,
+    /// Time of the next look at the links; `None` while there are none.
+    look_due: Option<Instant>,
+    policies: PeerPolicies,
+}
+
+/// Measurement of a link.
+pub(crate) struct LinkLook {
+    pub(crate) link: LinkId,
+    pub(crate) rtt: Duration,
+    pub(crate) is_silent: bool,
+}
+
+/// A link that was removed.
+pub(crate) struct EndedLink {
+    pub(crate) node: NodeId,
+    pub(crate) remote: SocketAddr,
+    /// Reason, if this node closed it.
+    pub(crate) closed_for: Option<String>,
+}
+
+impl LinkTable {
+    /// Creates the table without links. New links use the keep-alive policy.
+    pub(crate) fn new(policy: KeepAlivePolicy) -> Self {
+        Self { links: BTreeMap::new(), next: 1, look_due: None, policies: PeerPolicies::new(policy) }
+    }
+
+    /// Adds a link, and looks at it from here on.
+    pub(crate) fn add(
+        &mut self,
+        now: Instant,
+        link: AnyLink,
+        url: Option<String>,
+        control: ControlTx,
+    ) -> LinkId {
+        let id = LinkId(self.next);
+        self.next += 1;
+        let policy = self.policies.for_peer(&link.peer().node_id);
+        let keep_alive = KeepAlive::new(now, policy, link.stats().received_bytes, link.remote());
+        let flows = HashMap::new();
+        self.links.insert(id, LinkEntry { link, url, control, flows, closed_for: None, keep_alive });
+        self.look_due.get_or_insert(now + LOOK_EVERY);
+        id
+    }
+
+    /// Removes a link and closes its queues.
+    pub(crate) fn remove(&mut self, id: LinkId) -> Option<EndedLink> {
+        let entry = self.links.remove(&id)?;
+        let (node, remote) = (entry.peer().node_id, entry.remote());
+        self.policies.remember(node, entry.keep_alive.policy());
+        entry.flows.values().for_each(|flow| flow.close());
+        Some(EndedLink { node, remote, closed_for: entry.closed_for })
+    }
+
+    pub(crate) fn get(&self, id: LinkId) -> Option<&LinkEntry> {
+        self.links.get(&id)
+    }
+
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (LinkId, &LinkEntry)> {
+        self.links.iter().map(|(id, entry)| (*id, entry))
+    }
+
+    /// Queues a frame of the router machine. Returns `false` if the peer is too far behind.
+    pub(crate) fn send(&mut self, id: LinkId, frame: Control) -> bool {
+        let Some(entry) = self.links.get_mut(&id) else { return true };
+        entry.keep_alive.stir();
+        entry.control.send(frame)
+    }
+
+    /// Queues a flush. Returns `false` if the peer is too far behind.
+    pub(crate) fn flush(&self, id: LinkId) -> bool {
+        self.links.get(&id).is_none_or(|entry| entry.control.flush())
+    }
+
+    /// Closes a link. The record of its end shows the reason as `because`.
+    pub(crate) fn close(&mut self, id: LinkId, because: String, reason: CloseReason) {
+        if let Some(entry) = self.links.get_mut(&id) {
+            entry.closed_for = Some(because);
+            entry.link.close(reason);
+        }
+    }
+
+    /// Looks at all links, if that is due: probes peers, and closes links whose peer does not answer.
+    pub(crate) fn look(&mut self, now: Instant) -> Vec<LinkLook> {
+        if self.look_due.is_none_or(|due| due > now) {
+            return Vec::new();
+        }
+        self.look_due = (!self.links.is_empty()).then_some(now + LOOK_EVERY);
+        let looks = self.links.iter_mut().map(|(id, entry)| {
+            let stats = entry.link.stats();
+            let is_silent = entry.look(now, stats.received_bytes, stats.rtt);
+            LinkLook { link: *id, rtt: stats.rtt, is_silent }
+        });
+        looks.collect()
+    }
+
+    /// Returns the time of the next look.
+    pub(crate) fn deadline(&self) -> Option<Instant> {
+        self.look_due
+    }
+
+    /// Returns the destination of packets of a name on a link. Its queue is created if there is none.
+    pub(crate) fn out(&mut self, id: LinkId, name: Name, limits: FlowLimits) -> Option<Out> {
+        let LinkEntry { link, control, flows, .. } = self.links.get_mut(&id)?;
+        let begin = || {
+            let lanes = control.lanes().clone();
+            OutFlow::spawn(link.clone(), name, control.label(name), lanes, limits)
+        };
+        let flow = flows.entry(name).or_insert_with(begin).clone();
+        Some(Out::Link(flow, control.activity().clone()))
+    }
+
+    /// Closes the queues of a name, except on the links to keep. Queued packets are still sent.
+    pub(crate) fn end_flows(&mut self, name: &Name, keep: &[LinkId]) {
+        for (id, entry) in &mut self.links {
+            if !keep.contains(id)
+                && let Some(flow) = entry.flows.remove(name)
+            {
+                flow.close();
+            }
+        }
+    }
+
+    /// Closes all queues, and returns them. Queued packets are still sent.
+    pub(crate) fn close_flows(&self) -> Vec<Arc<OutFlow>> {
+        let flows: Vec<_> = self.links.values().flat_map(|entry| entry.flows.values().cloned()).collect();
+        flows.iter().for_each(|flow| flow.close());
+        flows
+    }
+
+    /// Sets on which links a name has a lane of its own.
+    pub(crate) fn set_lanes(&self, name: Name, is_wanted: impl Fn(LinkId) -> bool) {
+        for (id, entry) in &self.links {
+            entry.control.lanes().set_wanted(name, is_wanted(*id));
+        }
+    }
+
+    /// Says goodbye on all links, and returns them.
+    pub(crate) fn say_goodbye(&self) -> Vec<AnyLink> {
+        let leave = |entry: &LinkEntry| {
+            entry.control.send(Control::Goodbye);
+            entry.link.clone()
+        };
+        self.links.values().map(leave).collect()
+    }
+}
+
+impl LinkEntry {
+    pub(crate) fn peer(&self) -> &VerifiedPeer {
+        self.link.peer()
+    }
+
+    pub(crate) fn remote(&self) -> SocketAddr {
+        self.link.remote()
+    }
+
+    /// Returns the URL that this node dialled; `None` if the peer dialled.
+    pub(crate) fn url(&self) -> Option<&str> {
+        self.url.as_deref()
+    }
+
+    pub(crate) fn stats(&self) -> LinkStats {
+        self.link.stats()
+    }
+
+    /// Returns the present interval of the keep-alive.
+    pub(crate) fn keep_alive_interval(&self) -> Duration {
+        self.keep_alive.step()
+    }
+
+    /// Returns the number of lanes.
+    pub(crate) fn lanes(&self) -> usize {
+        self.control.lanes().count()
+    }
+
+    /// Returns the number of labels that the peer knows.
+    pub(crate) fn labels_sent(&self) -> u32 {
+        self.control.labels_known()
+    }
+
+    /// Returns the number of labels that the peer defined.
+    pub(crate) fn labels_received(&self) -> u32 {
+        self.link.labels_defined()
+    }
+
+    /// Queues a frame that calls for no answer. If the queue is full, the link closes for that reason elsewhere.
+    pub(crate) fn notify(&self, frame: Control) {
+        self.control.send(frame);
+    }
+
+    /// Closes the link because the peer does not take its frames.
+    pub(crate) fn close_overloaded(&self) {
+        self.link.close(CloseReason::Overloaded);
+    }
+
+    /// Looks at a link, and probes the peer or marks it silent if needed. Returns `true` if the link seems dead.
+    fn look(&mut self, now: Instant, received_bytes: u64, rtt: Duration) -> bool {
+        let (activity, remote) = (self.control.activity(), self.link.remote());
+        let verdict = self.keep_alive.look(now, LinkObservation { received_bytes, activity, remote, rtt });
+        if verdict.asks {
+            // A full queue means that the peer takes nothing, which is detected elsewhere.
+            self.control.send(Control::Probe { answers: false });
+        }
+        if verdict.is_dead() && self.closed_for.is_none() {
+            info!(%remote, peer = %self.link.peer().node_id.short(), "the peer does not answer; its link is closed");
+            self.closed_for = Some(CloseReason::Silent.to_string());
+            self.link.close(CloseReason::Silent);
+        }
+        verdict.is_silent()
+    }
+}
