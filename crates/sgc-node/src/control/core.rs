@@ -19,7 +19,7 @@ mod types;
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Output as EndpointOutput};
@@ -30,7 +30,7 @@ use sgc_transport::{AnyLink, CredentialStore};
 use sgc_trust::{Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
 use sgc_wire::{Control, Name, Now, SourceId};
-use tokio::sync::{Notify, mpsc, watch};
+use tokio::sync::{mpsc, watch};
 
 use crate::clock::now;
 use crate::control::alerts::{Alerts, clock_alert};
@@ -44,19 +44,20 @@ use crate::control::members::{MemberNames, Members};
 use crate::control::operations::Operations;
 use crate::control::parts::forward_table::ForwardTable;
 use crate::control::parts::link_table::LinkTable;
+use crate::control::parts::shares::Shares;
+use crate::control::parts::sinks::Sinks;
 use crate::control::peer_rate::PeerRates;
 use crate::control::problem_log::ProblemLog;
 use crate::control::publishing::{Offer, Publishing};
 use crate::control::refusals::Refusals;
-use crate::control::sink_timers::SinkTimers;
 use crate::data::call_ledger::CallLedger;
 use crate::data::calls::Calls;
 use crate::data::dataplane::DataPlane;
 use crate::data::message_keys::MessageKeys;
 use crate::data::outflow::OutFlow;
 use crate::data::replays::Replays;
-use crate::data::sinks::{LocalSink, SinkRequest};
-use crate::data::sources::{LocalShare, NewestSamples};
+use crate::data::sinks::SinkRequest;
+use crate::data::sources::NewestSamples;
 use crate::data::stats::Drops;
 use crate::data::tap::TapQueue;
 use crate::discovery::Board;
@@ -68,8 +69,6 @@ use crate::state::credentials::StateWriter;
 
 /// Events handled before the timers are checked again.
 const BATCH_MAX: usize = 256;
-/// Interval of checks for sources that may have fallen silent.
-const SILENCE_LOOK: Duration = Duration::from_secs(1);
 /// Bytes of history kept for late joiners of one publisher.
 const HISTORY_BYTES_MAX: usize = 64 << 20;
 /// Messages of history kept for a publisher that keeps all.
@@ -98,9 +97,9 @@ pub(crate) struct Core<N: RosNetwork> {
     inbox: Inbox,
     links: LinkTable,
     forwards: ForwardTable,
-    shares: HashMap<Name, Arc<LocalShare>>,
+    shares: Shares,
     readers: HashMap<Name, LocalReader>,
-    sinks: HashMap<Name, Arc<LocalSink>>,
+    sinks: Sinks,
     /// Shared and joined services.
     calls: BTreeMap<Name, Calls>,
     /// Lost calls by service. They outlive the services.
@@ -113,16 +112,11 @@ pub(crate) struct Core<N: RosNetwork> {
     reopening: NetworkState,
     /// Local consumers that owners are told, and far consumers that are shown here.
     consumers: FarConsumers,
-    sink_timers: SinkTimers,
     /// Signing keys of this node's messages, by suite.
     message_keys: MessageKeys,
     publishing: BTreeMap<Name, Publishing>,
     /// Offers to publish on, which wait for a signing key.
     keyless: BTreeMap<Name, Offer>,
-    /// Messages of one source under one key.
-    epoch_messages_max: u64,
-    /// Notified when a source reaches that number.
-    epoch_over: Arc<Notify>,
     credentials: CredentialStore,
     gateway: Arc<Gateway>,
     /// Set if this node is the authority of its fleet.
@@ -134,9 +128,6 @@ pub(crate) struct Core<N: RosNetwork> {
     renew_due: Option<Instant>,
     redial: watch::Sender<()>,
     replays: Arc<Replays>,
-    /// Time of the next check for silent sources; `None` until one publishes.
-    silence_due: Option<Instant>,
-    requests: mpsc::Sender<SinkRequest>,
     control_drops: Drops,
     problem_log: ProblemLog,
     ros_failures: Arc<Drops>,
@@ -210,6 +201,7 @@ impl<N: RosNetwork> Core<N> {
         let (requests, requested) = mpsc::channel(INBOX_MAX);
         let graph = LocalGraph::new(parts.identity.node_name().as_str());
         let members = Members::new(parts.member_names, &parts.identity);
+        let data = Arc::new(DataPlane::new(parts.rates));
         let awaits_clock = clock_alert(&parts.identity, now().unix).is_some();
         let core = Self {
             identity: parts.identity,
@@ -217,25 +209,22 @@ impl<N: RosNetwork> Core<N> {
             endpoint: parts.endpoint,
             routes: parts.routes,
             network: parts.network,
-            data: Arc::new(DataPlane::new(parts.rates)),
+            data: data.clone(),
             inbox: Inbox::default(),
             links: LinkTable::new(parts.keep_alive_policy),
             forwards: ForwardTable::default(),
-            shares: HashMap::new(),
+            shares: Shares::new(data.clone(), parts.alive.clone(), parts.epoch_messages_max),
             readers: HashMap::new(),
-            sinks: HashMap::new(),
+            sinks: Sinks::new(requests, data),
             calls: BTreeMap::new(),
             service_ends: HashMap::new(),
             writers: HashMap::new(),
             graph,
             reopening: NetworkState::default(),
             consumers: FarConsumers::default(),
-            sink_timers: SinkTimers::default(),
             message_keys: parts.message_keys,
             publishing: BTreeMap::new(),
             keyless: BTreeMap::new(),
-            epoch_messages_max: parts.epoch_messages_max,
-            epoch_over: Arc::default(),
             credentials: parts.credentials,
             gateway: parts.gateway,
             authority: parts.authority,
@@ -244,8 +233,6 @@ impl<N: RosNetwork> Core<N> {
             renew_due: None,
             redial: parts.redial,
             replays: Arc::default(),
-            silence_due: None,
-            requests,
             control_drops: Drops::default(),
             call_ledgers: BTreeMap::new(),
             problem_log: ProblemLog::default(),
@@ -273,7 +260,7 @@ impl<N: RosNetwork> Core<N> {
         mut requested: mpsc::Receiver<SinkRequest>,
     ) {
         let mut batch = Vec::with_capacity(BATCH_MAX);
-        let epoch_over = self.epoch_over.clone();
+        let epoch_over = self.shares.epoch_over().clone();
         self.ask_renewal();
         let mut deadline = self.drain();
         loop {
@@ -374,7 +361,7 @@ impl<N: RosNetwork> Core<N> {
                 self.ask_history(name, source);
             }
             SinkRequest::Synced(name, source) => {
-                self.sink_timers.history_ended(name, source);
+                self.sinks.history_arrived(name, source);
             }
         }
     }
@@ -390,8 +377,8 @@ impl<N: RosNetwork> Core<N> {
         if let Some(routes) = &mut self.routes {
             routes.handle_timeout(now.instant);
         }
-        self.histories_due(now.instant);
-        self.look_for_silence(now.instant);
+        self.sinks_due(now.instant);
+        self.shares.look_for_silence(now.instant);
         if self.renew_due.take_if(|at| *at <= now.instant).is_some() {
             self.ask_renewal();
         }
@@ -402,40 +389,18 @@ impl<N: RosNetwork> Core<N> {
         self.consumers_due(now);
         self.rediscovery_due(now.instant);
         self.rekey_due(now);
-        self.epochs_due(now.instant);
     }
 
-    /// Asks again for histories that make no progress.
-    fn histories_due(&mut self, now: Instant) {
-        for (name, source) in self.sink_timers.take_histories(now) {
-            self.ask_history_again(name, source);
-        }
-    }
-
-    /// Looks for sources that have fallen silent.
-    fn look_for_silence(&mut self, now: Instant) {
-        if self.silence_due.is_none_or(|at| at <= now) {
-            let looks = self.shares.values().map(|share| share.look_for_silence(now));
-            // `fold` looks at all of them, where `any` would stop at the first.
-            let busy = looks.fold(false, |any, busy| any | busy);
-            self.silence_due = busy.then(|| now + SILENCE_LOOK);
-        }
+    /// Asks again for histories that make no progress, and drops the keys of past epochs.
+    fn sinks_due(&mut self, now: Instant) {
+        let requests = self.sinks.handle_timeout(now);
+        self.recover(requests);
     }
 
     /// Starts new epochs of shares that have sent enough under one key.
     fn rotation_due(&mut self, now: Now) {
-        let long: Vec<_> = self.shares.iter().filter(|(_, s)| s.is_epoch_over()).map(|(n, _)| *n).collect();
-        for name in long {
+        for name in self.shares.take_epochs_over() {
             self.endpoint.rotate(now, &name);
-        }
-    }
-
-    /// Drops the keys of past epochs.
-    fn epochs_due(&mut self, now: Instant) {
-        for name in self.sink_timers.take_epochs(now) {
-            if let Some(sink) = self.sinks.get(&name) {
-                sink.retire_epochs();
-            }
         }
     }
 
@@ -466,11 +431,14 @@ impl<N: RosNetwork> Core<N> {
                 self.note_consumers();
                 let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
                 let rekey = self.rekey_deadline();
-                let own =
-                    [self.renew_due, self.silence_due, self.links.deadline(), self.operations.deadline()];
+                let own = [
+                    self.renew_due,
+                    self.shares.deadline(),
+                    self.links.deadline(),
+                    self.operations.deadline(),
+                ];
                 let own = own.into_iter().chain([self.reopening.deadline()]);
-                let all =
-                    [router, endpoint, routes, self.sink_timers.deadline(), rekey, self.calls_deadline()];
+                let all = [router, endpoint, routes, self.sinks.deadline(), rekey, self.calls_deadline()];
                 let all =
                     all.into_iter().chain(own).chain([self.types.deadline(), self.consumers.deadline()]);
                 return all.flatten().min();
@@ -505,9 +473,7 @@ impl<N: RosNetwork> Core<N> {
         self.routes = None;
         self.end_consumers();
         self.local_taps.drain(..).for_each(|tap| tap.close());
-        for share in self.shares.values() {
-            share.close();
-        }
+        self.shares.close();
         self.close_all_calls();
         for (_, reader) in self.readers.drain() {
             if let Some(reader) = reader.opened {
@@ -523,9 +489,7 @@ impl<N: RosNetwork> Core<N> {
         self.endpoint.withdraw_all(now());
         self.drain();
         let links = self.links.say_goodbye();
-        for sink in self.sinks.values() {
-            sink.close();
-        }
+        self.sinks.close();
         links
     }
 }

@@ -23,5 +23,4 @@ pub(crate) mod refusal_log;
 pub(crate) mod refusals;
 pub(crate) mod reload;
 pub(crate) mod rules;
-pub(crate) mod sink_timers;
 pub(crate) mod type_jobs;

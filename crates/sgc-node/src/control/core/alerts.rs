@@ -58,7 +58,7 @@ impl<N: RosNetwork> Core<N> {
         // Joins over that link are lost. Their data goes to the other process now, and from there perhaps to the same
         // programs.
         self.drain();
-        for (name, sink) in &self.sinks {
+        for (name, sink) in self.sinks.iter() {
             if self.endpoint.join_status(name) != Some(JoinStatus::Granted) {
                 sink.begin_anew();
             }

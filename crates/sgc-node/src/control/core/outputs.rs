@@ -144,9 +144,8 @@ impl<N: RosNetwork> Core<N> {
                 if let Some(anew) = self.publishing_granted(now, name, &grant) {
                     debug!(name = %name.short(), "publishing under it");
                     self.call_granted(now, name, sink, grant, anew);
-                } else if let Some(local) = self.sinks.get(&name) {
-                    local.grant(sink, grant, &self.data);
-                    self.sink_timers.epoch_ended(name, now.instant);
+                } else {
+                    self.sinks.grant(now.instant, name, sink, grant);
                 }
                 if let Some(routes) = &mut self.routes {
                     routes.handle_granted(&name, entry);

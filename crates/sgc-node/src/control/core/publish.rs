@@ -1,6 +1,5 @@
 //! Publishing on names of other nodes, and messages of other publishers on our shares.
 
-use std::sync::Arc;
 use std::time::Instant;
 
 use sgc_endpoint::{JoinKind, RecoveryLimits, Source, SourceConfig};
@@ -14,8 +13,7 @@ use crate::clock::now;
 use crate::control::event::CoreEvent;
 use crate::control::publishing::{GrantEffect, Offer, Publishing};
 use crate::data::message_keys::MessageKeys;
-use crate::data::sinks::LocalSink;
-use crate::data::sources::{LocalShare, SourceMap, SourceSlot};
+use crate::data::sources::{SourceMap, SourceSlot};
 
 impl<N: RosNetwork> Core<N> {
     /// Asks the owner of `name` for permission to publish, at once or when there is a signing key.
@@ -33,10 +31,7 @@ impl<N: RosNetwork> Core<N> {
             return;
         };
         let id = self.endpoint.new_source_id();
-        let (max, over) = (self.epoch_messages_max, self.epoch_over.clone());
-        let share = Arc::new(LocalShare::new(name, self.data.clone(), self.alive.clone(), max, over));
-        share.set_shaping(shaping);
-        self.shares.insert(name, share);
+        self.shares.add(name).set_shaping(shaping);
         self.publishing.insert(name, Publishing::new(id, class, reliable));
         let offer = SourceOffer { source: id, key: message_key.public().clone() };
         self.endpoint.join(now(), name, owner, JoinKind::Publish(offer));
@@ -109,10 +104,8 @@ impl<N: RosNetwork> Core<N> {
 
     pub(super) fn stop_publishing(&mut self, name: &Name) {
         self.keyless.remove(name);
-        if self.publishing.remove(name).is_some()
-            && let Some(share) = self.shares.remove(name)
-        {
-            share.close();
+        if self.publishing.remove(name).is_some() {
+            self.shares.remove(name);
         }
     }
 
@@ -120,20 +113,13 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn own_grant(&mut self, name: Name, grant: TopicGrant) {
         let own: Vec<_> = self.shares.get(&name).iter().flat_map(|s| s.map().ids()).collect();
         let others = grant.sources.iter().any(|s| !own.contains(&s.source));
-        let sink = self
-            .sinks
-            .entry(name)
-            .or_insert_with(|| {
-                Arc::new(LocalSink::new(name, false, self.requests.clone(), self.data.holds().clone()))
-            })
-            .clone();
+        let sink = self.sinks.of_own_share(name);
         self.apply_type(&name);
         // This node's own messages do not come back to it, since its sink receives only others'.
-        sink.grant(SinkId([0; 16]), grant, &self.data);
+        self.sinks.grant(now().instant, name, SinkId([0; 16]), grant);
         if let Some(progress) = sink.progress() {
             self.endpoint.set_own_sink(&name, progress);
         }
-        self.sink_timers.epoch_ended(name, now().instant);
         if let Some(routes) = &mut self.routes {
             routes.handle_publishers(&name, others);
             self.consumers.show_soon(now().instant);

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_endpoint::{AskAgain, JoinKind, RecoveryLimits, ShareSpec, Source, SourceConfig};
+use sgc_endpoint::{JoinKind, RecoveryLimits, ShareSpec, Source, SourceConfig};
 use sgc_ros::{Command, EndpointSpec, Guid, RosNetwork, Shaping, TF_MESSAGE, service_qos};
 use sgc_router::{FibEntry, LinkId};
 use sgc_trust::{MessageKey, Suite};
@@ -17,13 +17,13 @@ use super::{
 };
 use crate::clock::now;
 use crate::control::event::CoreEvent;
+use crate::control::parts::sinks::HistoryRequest;
 use crate::control::publishing::Offer;
 use crate::data::assertions;
 use crate::data::dataplane::{Forward, Out};
 use crate::data::manual_lease::ManualLease;
 use crate::data::outflow::{FlowLimits, OUTFLOW_AGE_MAX};
-use crate::data::sinks::LocalSink;
-use crate::data::sources::{LocalShare, Publisher, SourceMap, SourceSlot};
+use crate::data::sources::{Publisher, SourceMap, SourceSlot};
 use crate::data::writer_queue::WriterQueue;
 
 /// Least bytes of recovery kept for one of a topic's many publishers.
@@ -54,9 +54,7 @@ impl<N: RosNetwork> Core<N> {
             }
             Command::Unfollow { owner } => self.endpoint.unfollow(now, &owner),
             Command::Join { name, owner, transient_local, describe } => {
-                let sink =
-                    LocalSink::new(name, transient_local, self.requests.clone(), self.data.holds().clone());
-                self.sinks.insert(name, Arc::new(sink));
+                self.sinks.add(name, transient_local);
                 self.endpoint.join(now, name, owner, JoinKind::Subscribe { describe });
             }
             Command::JoinAgain { name, owner } => {
@@ -97,14 +95,7 @@ impl<N: RosNetwork> Core<N> {
         match self.endpoint.share(now, spec) {
             Ok(name) => {
                 debug!(%topic, %name, "shared");
-                let share = LocalShare::new(
-                    name,
-                    self.data.clone(),
-                    self.alive.clone(),
-                    self.epoch_messages_max,
-                    self.epoch_over.clone(),
-                );
-                self.shares.insert(name, Arc::new(share));
+                self.shares.add(name);
                 self.need_type(name, &metadata, type_hash, None);
                 if is_service {
                     self.begin_local(name);
@@ -126,7 +117,7 @@ impl<N: RosNetwork> Core<N> {
             wanted.shaping = shaping;
         }
         // Messages of other publishers on our share are shaped by those publishers.
-        if let Some(sink) = self.sinks.get(&name).filter(|_| !self.shares.contains_key(&name)) {
+        if let Some(sink) = self.sinks.get(&name).filter(|_| self.shares.get(&name).is_none()) {
             sink.set_shaping(shaping);
         }
     }
@@ -135,13 +126,9 @@ impl<N: RosNetwork> Core<N> {
         self.endpoint.unshare(now, &name);
         self.consumers.show_soon(now.instant);
         self.forget_type(&name);
-        if let Some(share) = self.shares.remove(&name) {
-            share.close();
-        }
+        self.shares.remove(&name);
         self.end_calls(&name);
-        if let Some(sink) = self.sinks.remove(&name) {
-            sink.close();
-        }
+        self.sinks.remove(&name);
     }
 
     fn leave(&mut self, now: Now, name: Name) {
@@ -149,10 +136,7 @@ impl<N: RosNetwork> Core<N> {
         self.forget_type(&name);
         self.stop_publishing(&name);
         self.end_calls(&name);
-        if let Some(sink) = self.sinks.remove(&name) {
-            sink.close();
-        }
-        self.sink_timers.forget(&name);
+        self.sinks.remove(&name);
     }
 
     /// Takes a new reader into use, unless the wish has changed meanwhile.
@@ -205,12 +189,7 @@ impl<N: RosNetwork> Core<N> {
     fn close_writer(&mut self, name: Name, source: Option<SourceId>) {
         self.writers.remove(&(name, source));
         self.graph.writer_gone(&(name, source));
-        if let Some(source) = source {
-            self.sink_timers.history_ended(name, source);
-        }
-        if let Some(sink) = self.sinks.get(&name) {
-            sink.set_writer(source, None);
-        }
+        self.sinks.writer_closed(name, source);
     }
 
     pub(super) fn map_sources(&mut self, name: Name, class: Class, own: Vec<(Guid, SourceId, Qos)>) {
@@ -369,8 +348,7 @@ impl<N: RosNetwork> Core<N> {
     /// Moves a writer to another source of the same publisher.
     fn move_writer(&mut self, name: Name, from: SourceId, to: SourceId) {
         let Some(spec) = self.writers.remove(&(name, Some(from))) else { return };
-        self.sink_timers.history_ended(name, from);
-        if self.sinks.get(&name).is_some_and(|sink| sink.move_writer(from, to)) {
+        if self.sinks.move_writer(name, from, to) {
             self.graph.writer_moved(name, from, to);
             self.writers.insert((name, Some(to)), spec);
             return self.ask_history(name, to);
@@ -381,30 +359,20 @@ impl<N: RosNetwork> Core<N> {
 
     /// Asks for all messages that a sink's writers lack.
     pub(super) fn ask_histories(&mut self, name: Name) {
-        let Some(sink) = self.sinks.get(&name) else { return };
-        for source in sink.unsynced() {
-            self.ask_history(name, source);
-        }
+        let requests = self.sinks.ask_all(now().instant, name);
+        self.recover(requests);
     }
 
     pub(super) fn ask_history(&mut self, name: Name, source: SourceId) {
-        let from = self.sinks.get(&name).and_then(|sink| sink.ask(source));
-        self.recover(name, source, from.map_or(AskAgain::No, AskAgain::From));
+        let request = self.sinks.ask(now().instant, name, source);
+        self.recover(request);
     }
 
-    /// Asks for a history again after a while.
-    pub(super) fn ask_history_again(&mut self, name: Name, source: SourceId) {
-        let again = self.sinks.get(&name).map_or(AskAgain::No, |sink| sink.ask_again(source));
-        self.recover(name, source, again);
-    }
-
-    fn recover(&mut self, name: Name, source: SourceId, ask: AskAgain) {
-        match ask {
-            AskAgain::No => return,
-            AskAgain::Wait => {}
-            AskAgain::From(from) => self.endpoint.recover(name, source, from, u64::MAX),
+    /// Asks sources for histories.
+    pub(super) fn recover(&mut self, requests: impl IntoIterator<Item = HistoryRequest>) {
+        for HistoryRequest { name, source, from } in requests {
+            self.endpoint.recover(name, source, from, u64::MAX);
         }
-        self.sink_timers.history_asked(name, source);
     }
 
     /// Applies new settings to the queues of a name. Queued packets are still sent.

@@ -14,7 +14,6 @@ use crate::admin::graph::{LostCalls, ServiceCalls};
 use crate::control::event::{CoreEvent, ServiceEnd};
 use crate::data::call_ledger::{CallLedger, CallerId, LEDGERS_MAX};
 use crate::data::calls::{Answers, Calls, FarService, LocalService, Requests};
-use crate::data::sinks::LocalSink;
 use crate::data::writer_queue::{WriterInfo, WriterQueue};
 
 impl<N: RosNetwork> Core<N> {
@@ -31,7 +30,8 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn begin_far(&mut self, name: Name) {
         let Some(share) = self.shares.get(&name) else { return };
         let (share, ledger) = (share.clone(), self.call_ledger(name, false));
-        let called = FarService::new(share, self.ros_failures.clone(), ledger, self.epoch_over.clone());
+        let called =
+            FarService::new(share, self.ros_failures.clone(), ledger, self.shares.epoch_over().clone());
         let called = Arc::new(called);
         let takes = called.clone();
         self.begin_calls(name, Calls::FarService(called), move |message| takes.take(message));
@@ -68,10 +68,7 @@ impl<N: RosNetwork> Core<N> {
             Ok(queue) => queue,
             Err(why) => return error!(%why, "a service has no thread and cannot be used"),
         };
-        let sink = LocalSink::new(name, false, self.requests.clone(), self.data.holds().clone());
-        let sink = Arc::new(sink);
-        sink.set_writer(None, Some(queue));
-        self.sinks.insert(name, sink);
+        self.sinks.add(name, false).set_writer(None, Some(queue));
         self.calls.insert(name, calls);
     }
 
@@ -99,12 +96,8 @@ impl<N: RosNetwork> Core<N> {
 
     /// Handles the owner's grant to call a service.
     pub(super) fn call_granted(&mut self, now: Now, name: Name, sink: SinkId, grant: TopicGrant, anew: bool) {
-        let (Some(Calls::FarService(called)), Some(local)) = (self.calls.get(&name), self.sinks.get(&name))
-        else {
-            return;
-        };
-        local.grant(sink, grant, &self.data);
-        self.sink_timers.epoch_ended(name, now.instant);
+        let Some(Calls::FarService(called)) = self.calls.get(&name) else { return };
+        self.sinks.grant(now.instant, name, sink, grant);
         called.granted(sink, anew);
     }
 

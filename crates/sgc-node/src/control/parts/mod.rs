@@ -3,3 +3,6 @@
 
 pub(crate) mod forward_table;
 pub(crate) mod link_table;
+pub(crate) mod shares;
+mod sink_timers;
+pub(crate) mod sinks;

@@ -21,8 +21,8 @@ pub(crate) struct SinkTimers {
 
 impl SinkTimers {
     /// Starts the timer of a history that was asked for.
-    pub(crate) fn history_asked(&mut self, name: Name, source: SourceId) {
-        self.histories.insert((name, source), Instant::now() + HISTORY_RETRY);
+    pub(crate) fn history_asked(&mut self, name: Name, source: SourceId, now: Instant) {
+        self.histories.insert((name, source), now + HISTORY_RETRY);
     }
 
     /// Ends the timer of a history.
