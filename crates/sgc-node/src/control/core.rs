@@ -44,11 +44,11 @@ use crate::control::members::{MemberNames, Members};
 use crate::control::operations::Operations;
 use crate::control::parts::forward_table::ForwardTable;
 use crate::control::parts::link_table::LinkTable;
+use crate::control::parts::publishers::Publishers;
 use crate::control::parts::shares::Shares;
 use crate::control::parts::sinks::Sinks;
 use crate::control::peer_rate::PeerRates;
 use crate::control::problem_log::ProblemLog;
-use crate::control::publishing::{Offer, Publishing};
 use crate::control::refusals::Refusals;
 use crate::data::call_ledger::CallLedger;
 use crate::data::calls::Calls;
@@ -112,11 +112,7 @@ pub(crate) struct Core<N: RosNetwork> {
     reopening: NetworkState,
     /// Local consumers that owners are told, and far consumers that are shown here.
     consumers: FarConsumers,
-    /// Signing keys of this node's messages, by suite.
-    message_keys: MessageKeys,
-    publishing: BTreeMap<Name, Publishing>,
-    /// Offers to publish on, which wait for a signing key.
-    keyless: BTreeMap<Name, Offer>,
+    publishers: Publishers,
     credentials: CredentialStore,
     gateway: Arc<Gateway>,
     /// Set if this node is the authority of its fleet.
@@ -222,9 +218,7 @@ impl<N: RosNetwork> Core<N> {
             graph,
             reopening: NetworkState::default(),
             consumers: FarConsumers::default(),
-            message_keys: parts.message_keys,
-            publishing: BTreeMap::new(),
-            keyless: BTreeMap::new(),
+            publishers: Publishers::new(parts.message_keys),
             credentials: parts.credentials,
             gateway: parts.gateway,
             authority: parts.authority,
@@ -430,7 +424,7 @@ impl<N: RosNetwork> Core<N> {
             if !progressed {
                 self.note_consumers();
                 let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
-                let rekey = self.rekey_deadline();
+                let rekey = self.publishers.deadline();
                 let own = [
                     self.renew_due,
                     self.shares.deadline(),

@@ -18,7 +18,6 @@ pub(crate) mod peer_policies;
 pub(crate) mod peer_rate;
 pub mod policy;
 pub(crate) mod problem_log;
-pub(crate) mod publishing;
 pub(crate) mod refusal_log;
 pub(crate) mod refusals;
 pub(crate) mod reload;

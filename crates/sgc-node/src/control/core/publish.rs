@@ -1,39 +1,32 @@
 //! Publishing on names of other nodes, and messages of other publishers on our shares.
 
-use std::time::Instant;
-
-use sgc_endpoint::{JoinKind, RecoveryLimits, Source, SourceConfig};
+use sgc_endpoint::JoinKind;
 use sgc_ros::RosNetwork;
 use sgc_trust::{MessageKey, Suite};
-use sgc_wire::{Name, Now, SinkId, SourceOffer, TopicGrant};
+use sgc_wire::{Name, Now, SinkId, TopicGrant};
 use tracing::warn;
 
 use super::Core;
 use crate::clock::now;
 use crate::control::event::CoreEvent;
-use crate::control::publishing::{GrantEffect, Offer, Publishing};
+use crate::control::parts::publishers::{GrantStep, Offer, OfferStep};
 use crate::data::message_keys::MessageKeys;
-use crate::data::sources::{SourceMap, SourceSlot};
+use crate::data::sources::SourceMap;
 
 impl<N: RosNetwork> Core<N> {
     /// Asks the owner of `name` for permission to publish, at once or when there is a signing key.
     pub(super) fn publish_under(&mut self, name: Name, wanted: Offer) {
-        let Offer { owner, suite, class, reliable, shaping, calls } = wanted;
-        let Some(suite) = Suite::from_id(suite) else {
-            warn!(suite, "a topic's suite is not in this build; this node cannot publish on it");
-            return;
-        };
-        let Some(message_key) = self.message_keys.get(&suite).cloned() else {
-            if self.keyless.values().all(|other| other.suite != wanted.suite) {
-                self.make_message_key(suite);
+        let Offer { owner, suite, shaping, calls, .. } = wanted;
+        let offer = match self.publishers.offer(name, wanted, || self.endpoint.new_source_id()) {
+            OfferStep::Ask(offer) => offer,
+            OfferStep::MakeKey(suite) => return self.make_message_key(suite),
+            OfferStep::Wait => return,
+            OfferStep::UnknownSuite => {
+                warn!(suite, "a topic's suite is not in this build; this node cannot publish on it");
+                return;
             }
-            self.keyless.insert(name, wanted);
-            return;
         };
-        let id = self.endpoint.new_source_id();
         self.shares.add(name).set_shaping(shaping);
-        self.publishing.insert(name, Publishing::new(id, class, reliable));
-        let offer = SourceOffer { source: id, key: message_key.public().clone() };
         self.endpoint.join(now(), name, owner, JoinKind::Publish(offer));
         if calls {
             self.begin_far(name);
@@ -52,10 +45,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// Adds signing keys. Existing keys stay.
     pub(super) fn add_message_keys(&mut self, keys: MessageKeys) {
-        for (suite, key) in keys {
-            self.message_keys.entry(suite).or_insert(key);
-        }
-        for (name, wanted) in std::mem::take(&mut self.keyless) {
+        for (name, wanted) in self.publishers.add_keys(keys) {
             self.publish_under(name, wanted);
         }
     }
@@ -63,48 +53,26 @@ impl<N: RosNetwork> Core<N> {
     /// Handles a grant to publish, or a new epoch. Returns `None` if this node does not publish under `name`, and
     /// `true` if the owner knows nothing of earlier messages.
     pub(super) fn publishing_granted(&mut self, now: Now, name: Name, grant: &TopicGrant) -> Option<bool> {
-        let publishing = self.publishing.get_mut(&name)?;
-        if publishing.granted(now.instant, grant) == GrantEffect::Kept {
+        let GrantStep::Anew(slot) = self.publishers.granted(now.instant, name, grant)? else {
             return Some(false);
-        }
-        // Only sources of the owner can be asked for missing messages.
-        let (id, class, reliable) = publishing.source();
-        let config = SourceConfig {
-            name,
-            id,
-            class,
-            reliable,
-            history_depth: 0,
-            history_bytes_max: 0,
-            recovery: RecoveryLimits::NONE,
         };
-        let key = self.message_key(grant.suite);
-        let source = key.and_then(|key| Source::new(config, grant, key));
-        if let (Some(source), Some(share)) = (source, self.shares.get(&name)) {
-            let shared = Some(SourceSlot::new(source, false, reliable));
-            share.set_map(SourceMap { shared, ..SourceMap::default() });
+        if let (Some(slot), Some(share)) = (slot, self.shares.get(&name)) {
+            share.set_map(SourceMap { shared: Some(slot), ..SourceMap::default() });
         }
         Some(true)
     }
 
     /// Switches to the keys whose epoch begins now.
     pub(super) fn rekey_due(&mut self, now: Now) {
-        for (name, publishing) in &mut self.publishing {
-            let due = publishing.take_due(now.instant);
-            if let (Some(grant), Some(share)) = (due, self.shares.get(name)) {
-                share.rekey(grant.clone());
-                publishing.rekeyed(grant);
+        for (name, grant) in self.publishers.take_rekeys(now.instant) {
+            if let Some(share) = self.shares.get(&name) {
+                share.rekey(grant);
             }
         }
     }
 
-    pub(super) fn rekey_deadline(&self) -> Option<Instant> {
-        self.publishing.values().filter_map(Publishing::deadline).min()
-    }
-
     pub(super) fn stop_publishing(&mut self, name: &Name) {
-        self.keyless.remove(name);
-        if self.publishing.remove(name).is_some() {
+        if self.publishers.stop(name) {
             self.shares.remove(name);
         }
     }

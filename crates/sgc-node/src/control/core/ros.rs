@@ -8,7 +8,6 @@ use std::time::{Duration, Instant};
 use sgc_endpoint::{JoinKind, RecoveryLimits, ShareSpec, Source, SourceConfig};
 use sgc_ros::{Command, EndpointSpec, Guid, RosNetwork, Shaping, TF_MESSAGE, service_qos};
 use sgc_router::{FibEntry, LinkId};
-use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, History, Kind, Name, Now, Qos, SourceId};
 use tracing::{debug, error};
 
@@ -17,8 +16,8 @@ use super::{
 };
 use crate::clock::now;
 use crate::control::event::CoreEvent;
+use crate::control::parts::publishers::Offer;
 use crate::control::parts::sinks::HistoryRequest;
-use crate::control::publishing::Offer;
 use crate::data::assertions;
 use crate::data::dataplane::{Forward, Out};
 use crate::data::manual_lease::ManualLease;
@@ -113,9 +112,7 @@ impl<N: RosNetwork> Core<N> {
                 self.begin_flows_anew(name);
             }
         }
-        if let Some(wanted) = self.keyless.get_mut(&name) {
-            wanted.shaping = shaping;
-        }
+        self.publishers.set_shaping(&name, shaping);
         // Messages of other publishers on our share are shaped by those publishers.
         if let Some(sink) = self.sinks.get(&name).filter(|_| self.shares.get(&name).is_none()) {
             sink.set_shaping(shaping);
@@ -197,7 +194,7 @@ impl<N: RosNetwork> Core<N> {
         else {
             return;
         };
-        let Some(message_key) = self.message_key(grant.suite) else { return };
+        let Some(message_key) = self.publishers.key(grant.suite) else { return };
         let old = share.map();
         // A reply is for one caller, and the call machine remembers it.
         let is_service = self.calls.contains_key(&name);
@@ -270,13 +267,6 @@ impl<N: RosNetwork> Core<N> {
         if share.begins_watch() {
             tokio::spawn(assertions::watch(Arc::downgrade(&share), self.network.clone()));
         }
-    }
-
-    /// Returns the signing key of a suite, one for the whole node. Keys that take long to create exist before they are
-    /// needed.
-    pub(super) fn message_key(&mut self, suite: u8) -> Option<MessageKey> {
-        let suite = Suite::from_id(suite)?;
-        Some(self.message_keys.entry(suite).or_insert_with(|| MessageKey::generate(suite)).clone())
     }
 
     /// Creates a reader. While the network is closed, it is only noted. A reader that replaces another skips samples

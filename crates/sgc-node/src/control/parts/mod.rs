@@ -3,6 +3,7 @@
 
 pub(crate) mod forward_table;
 pub(crate) mod link_table;
+pub(crate) mod publishers;
 pub(crate) mod shares;
 mod sink_timers;
 pub(crate) mod sinks;
