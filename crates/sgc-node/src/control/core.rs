@@ -17,19 +17,18 @@ mod status;
 mod trust;
 mod types;
 
-use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::Instant;
 
 use rand_chacha::ChaCha20Rng;
 use sgc_endpoint::{Endpoint, Output as EndpointOutput};
-use sgc_ros::{EndpointSpec, RosNetwork, Routes, ServiceSpec, ShareRule, UseRule};
+use sgc_ros::{RosNetwork, Routes, ShareRule, UseRule};
 use sgc_router::{Output as RouterOutput, Router};
 use sgc_session::KeepAlivePolicy;
 use sgc_transport::{AnyLink, CredentialStore};
 use sgc_trust::{Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
-use sgc_wire::{Control, Name, Now, SourceId};
+use sgc_wire::{Control, Now};
 use tokio::sync::{mpsc, watch};
 
 use crate::clock::now;
@@ -44,20 +43,19 @@ use crate::control::members::{MemberNames, Members};
 use crate::control::operations::Operations;
 use crate::control::parts::forward_table::ForwardTable;
 use crate::control::parts::link_table::LinkTable;
+use crate::control::parts::network_ends::{NetworkEnds, OpenEnd};
 use crate::control::parts::publishers::Publishers;
+use crate::control::parts::services::Services;
 use crate::control::parts::shares::Shares;
 use crate::control::parts::sinks::Sinks;
 use crate::control::peer_rate::PeerRates;
 use crate::control::problem_log::ProblemLog;
 use crate::control::refusals::Refusals;
-use crate::data::call_ledger::CallLedger;
-use crate::data::calls::Calls;
 use crate::data::dataplane::DataPlane;
 use crate::data::message_keys::MessageKeys;
 use crate::data::outflow::OutFlow;
 use crate::data::replays::Replays;
 use crate::data::sinks::SinkRequest;
-use crate::data::sources::NewestSamples;
 use crate::data::stats::Drops;
 use crate::data::tap::TapQueue;
 use crate::discovery::Board;
@@ -76,16 +74,6 @@ const HISTORY_KEEP_ALL_MAX: usize = 4096;
 /// Instances for which a transient-local source of a keyed topic keeps its history, as the writers of `sgc-dds` do.
 const KEYED_INSTANCES_KEPT: usize = 256;
 
-/// A local reader for a name.
-struct LocalReader {
-    /// The requested endpoint.
-    spec: EndpointSpec,
-    /// Owner of the reader; `None` while it is being created. Dropping it closes the reader.
-    opened: Option<Box<dyn std::any::Any + Send>>,
-    /// Time stamps of the newest samples that it took.
-    newest: Option<Arc<NewestSamples>>,
-}
-
 /// The control task's state. `N` is the local network; a pure router has none.
 pub(crate) struct Core<N: RosNetwork> {
     identity: Arc<Identity>,
@@ -98,15 +86,10 @@ pub(crate) struct Core<N: RosNetwork> {
     links: LinkTable,
     forwards: ForwardTable,
     shares: Shares,
-    readers: HashMap<Name, LocalReader>,
+    /// Wanted readers and writers of the local network.
+    ends: NetworkEnds,
     sinks: Sinks,
-    /// Shared and joined services.
-    calls: BTreeMap<Name, Calls>,
-    /// Lost calls by service. They outlive the services.
-    call_ledgers: BTreeMap<Name, Arc<CallLedger>>,
-    /// Requested local clients and servers of the services.
-    service_ends: HashMap<Name, ServiceSpec>,
-    writers: HashMap<(Name, Option<SourceId>), EndpointSpec>,
+    services: Services,
     /// Far nodes that the local graph shows.
     graph: LocalGraph,
     reopening: NetworkState,
@@ -198,6 +181,9 @@ impl<N: RosNetwork> Core<N> {
         let graph = LocalGraph::new(parts.identity.node_name().as_str());
         let members = Members::new(parts.member_names, &parts.identity);
         let data = Arc::new(DataPlane::new(parts.rates));
+        let shares = Shares::new(data.clone(), parts.alive.clone(), parts.epoch_messages_max);
+        let ros_failures = Arc::<Drops>::default();
+        let services = Services::new(ros_failures.clone(), shares.epoch_over().clone());
         let awaits_clock = clock_alert(&parts.identity, now().unix).is_some();
         let core = Self {
             identity: parts.identity,
@@ -209,12 +195,10 @@ impl<N: RosNetwork> Core<N> {
             inbox: Inbox::default(),
             links: LinkTable::new(parts.keep_alive_policy),
             forwards: ForwardTable::default(),
-            shares: Shares::new(data.clone(), parts.alive.clone(), parts.epoch_messages_max),
-            readers: HashMap::new(),
+            shares,
+            ends: NetworkEnds::default(),
             sinks: Sinks::new(requests, data),
-            calls: BTreeMap::new(),
-            service_ends: HashMap::new(),
-            writers: HashMap::new(),
+            services,
             graph,
             reopening: NetworkState::default(),
             consumers: FarConsumers::default(),
@@ -228,9 +212,8 @@ impl<N: RosNetwork> Core<N> {
             redial: parts.redial,
             replays: Arc::default(),
             control_drops: Drops::default(),
-            call_ledgers: BTreeMap::new(),
             problem_log: ProblemLog::default(),
-            ros_failures: Arc::default(),
+            ros_failures,
             events: parts.events,
             started: Instant::now(),
             alerts: Alerts::default(),
@@ -378,7 +361,7 @@ impl<N: RosNetwork> Core<N> {
         }
         self.rotation_due(now);
         self.operations_due(now.instant);
-        self.calls_due(now.instant);
+        self.services.handle_timeout(now.instant);
         self.types_due(now.instant);
         self.consumers_due(now);
         self.rediscovery_due(now.instant);
@@ -432,7 +415,7 @@ impl<N: RosNetwork> Core<N> {
                     self.operations.deadline(),
                 ];
                 let own = own.into_iter().chain([self.reopening.deadline()]);
-                let all = [router, endpoint, routes, self.sinks.deadline(), rekey, self.calls_deadline()];
+                let all = [router, endpoint, routes, self.sinks.deadline(), rekey, self.services.deadline()];
                 let all =
                     all.into_iter().chain(own).chain([self.types.deadline(), self.consumers.deadline()]);
                 return all.flatten().min();
@@ -469,11 +452,7 @@ impl<N: RosNetwork> Core<N> {
         self.local_taps.drain(..).for_each(|tap| tap.close());
         self.shares.close();
         self.close_all_calls();
-        for (_, reader) in self.readers.drain() {
-            if let Some(reader) = reader.opened {
-                drop_elsewhere(reader);
-            }
-        }
+        self.ends.forget_readers().into_iter().for_each(drop_elsewhere);
         self.links.close_flows()
     }
 
@@ -489,6 +468,6 @@ impl<N: RosNetwork> Core<N> {
 }
 
 /// Drops a value on a blocking thread, since the drop may block.
-fn drop_elsewhere(thing: Box<dyn std::any::Any + Send>) {
+fn drop_elsewhere(thing: OpenEnd) {
     tokio::task::spawn_blocking(move || drop(thing));
 }

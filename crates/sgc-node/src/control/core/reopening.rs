@@ -2,8 +2,6 @@
 //!
 //! Routes, sources, sinks and calls stay, so other nodes notice only a pause.
 
-use std::any::Any;
-
 use sgc_ros::{DiscoveryEvent, RosNetwork};
 use tracing::debug;
 
@@ -22,23 +20,13 @@ impl<N: RosNetwork> Core<N> {
             None => (Vec::new(), Vec::new()),
         };
         self.reopening.closed(Rediscovery::new(endpoints, participants));
-        let mut ending: Vec<Box<dyn Any + Send>> = Vec::new();
-        ending.extend(self.readers.values_mut().filter_map(|reader| reader.opened.take()));
-        for (name, source) in self.writers.keys() {
-            if let Some(sink) = self.sinks.get(name) {
-                sink.set_writer(*source, None);
+        let mut ending = self.ends.take_readers();
+        for ((name, source), _) in self.ends.writers() {
+            if let Some(sink) = self.sinks.get(&name) {
+                sink.set_writer(source, None);
             }
         }
-        for calls in self.calls.values() {
-            ending.extend(match calls {
-                Calls::LocalService(served) => {
-                    // Replies of servers reach nobody from here on.
-                    served.servers_gone();
-                    served.set_client(None)
-                }
-                Calls::FarService(called) => called.set_server(None),
-            });
-        }
+        ending.extend(self.services.take_ends());
         ending.extend(self.consumers.take_shown());
         self.local_taps.drain(..).for_each(|tap| tap.close());
         self.graph.endpoints_gone();
@@ -50,10 +38,8 @@ impl<N: RosNetwork> Core<N> {
         let now = now().instant;
         self.reopening.opened(now);
         self.graph.endpoints_gone();
-        let readers: Vec<_> =
-            self.readers.iter().map(|(name, reader)| (*name, reader.spec.clone())).collect();
-        let writers: Vec<_> = self.writers.iter().map(|(key, spec)| (*key, spec.clone())).collect();
-        let services: Vec<_> = self.service_ends.iter().map(|(name, spec)| (*name, spec.clone())).collect();
+        let (readers, writers) = (self.ends.readers(), self.ends.writers());
+        let services = self.services.ends();
         debug!(
             readers = readers.len(),
             writers = writers.len(),
@@ -67,7 +53,7 @@ impl<N: RosNetwork> Core<N> {
             self.open_writer(name, source, spec);
         }
         for (name, spec) in services {
-            match self.calls.get(&name) {
+            match self.services.get(&name) {
                 Some(Calls::LocalService(_)) => self.open_client(name, spec),
                 Some(Calls::FarService(_)) => self.open_server(name, spec),
                 None => {}
@@ -91,7 +77,9 @@ impl<N: RosNetwork> Core<N> {
     }
 
     fn handle_discovery(&mut self, event: DiscoveryEvent) {
-        self.calls_discovery(&event);
+        if let DiscoveryEvent::Vanished { guid } = &event {
+            self.services.endpoint_gone(guid);
+        }
         if let Some(routes) = &mut self.routes {
             routes.handle_discovery(now().instant, event);
         }

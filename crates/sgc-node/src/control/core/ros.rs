@@ -1,6 +1,5 @@
 //! Carries out the outputs of the route machine: shares, joins, readers, writers, and forwarding.
 
-use std::any::Any;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -11,11 +10,10 @@ use sgc_router::{FibEntry, LinkId};
 use sgc_wire::{Class, History, Kind, Name, Now, Qos, SourceId};
 use tracing::{debug, error};
 
-use super::{
-    Core, HISTORY_BYTES_MAX, HISTORY_KEEP_ALL_MAX, KEYED_INSTANCES_KEPT, LocalReader, drop_elsewhere,
-};
+use super::{Core, HISTORY_BYTES_MAX, HISTORY_KEEP_ALL_MAX, KEYED_INSTANCES_KEPT, drop_elsewhere};
 use crate::clock::now;
 use crate::control::event::CoreEvent;
+use crate::control::parts::network_ends::OpenEnd;
 use crate::control::parts::publishers::Offer;
 use crate::control::parts::sinks::HistoryRequest;
 use crate::data::assertions;
@@ -72,7 +70,11 @@ impl<N: RosNetwork> Core<N> {
             }
             Command::OpenClient { name, spec } => self.open_client(name, spec),
             Command::CloseClient { name } => self.close_client(&name),
-            Command::ServersGone { name } => self.servers_gone(&name),
+            Command::ServersGone { name } => {
+                if let Some(served) = self.services.local(&name) {
+                    served.servers_gone();
+                }
+            }
             Command::OpenServer { name, spec } => self.open_server(name, spec),
             Command::CloseServer { name } => self.close_service_end(&name),
             Command::Leave { name } => self.leave(now, name),
@@ -137,25 +139,18 @@ impl<N: RosNetwork> Core<N> {
     }
 
     /// Takes a new reader into use, unless the wish has changed meanwhile.
-    pub(super) fn reader_ready(
-        &mut self,
-        name: Name,
-        spec: &EndpointSpec,
-        guid: Guid,
-        reader: Box<dyn Any + Send>,
-    ) {
-        match self.readers.get_mut(&name) {
-            Some(wanted) if wanted.spec == *spec && !self.reopening.is_closed() => {
-                wanted.opened = Some(reader);
-                self.graph.reader_there(name, guid);
-            }
-            _ => drop_elsewhere(reader),
+    pub(super) fn reader_ready(&mut self, name: Name, spec: &EndpointSpec, guid: Guid, reader: OpenEnd) {
+        let is_wanted = !self.reopening.is_closed() && self.ends.wants_reader(&name, spec);
+        let unwanted = if is_wanted { self.ends.put_reader(&name, reader) } else { Some(reader) };
+        match unwanted {
+            Some(reader) => drop_elsewhere(reader),
+            None => self.graph.reader_there(name, guid),
         }
     }
 
     fn close_reader(&mut self, name: &Name) {
         self.graph.reader_gone(name);
-        if let Some(reader) = self.readers.remove(name).and_then(|reader| reader.opened) {
+        if let Some(reader) = self.ends.forget_reader(name) {
             drop_elsewhere(reader);
         }
     }
@@ -168,7 +163,7 @@ impl<N: RosNetwork> Core<N> {
         spec: &EndpointSpec,
         writer: Option<Arc<WriterQueue>>,
     ) {
-        let wanted = !self.reopening.is_closed() && self.writers.get(&(name, source)) == Some(spec);
+        let wanted = !self.reopening.is_closed() && self.ends.wants_writer(&(name, source), spec);
         match (self.sinks.get(&name), writer) {
             (Some(sink), Some(writer)) if wanted => {
                 self.graph.writer_there((name, source), writer.guid());
@@ -184,7 +179,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     fn close_writer(&mut self, name: Name, source: Option<SourceId>) {
-        self.writers.remove(&(name, source));
+        self.ends.forget_writer(&(name, source));
         self.graph.writer_gone(&(name, source));
         self.sinks.writer_closed(name, source);
     }
@@ -197,7 +192,7 @@ impl<N: RosNetwork> Core<N> {
         let Some(message_key) = self.publishers.key(grant.suite) else { return };
         let old = share.map();
         // A reply is for one caller, and the call machine remembers it.
-        let is_service = self.calls.contains_key(&name);
+        let is_service = self.services.get(&name).is_some();
         let recovery = if is_service { RecoveryLimits::NONE } else { RecoveryLimits::default() };
         // The memory of a topic must not grow with its publishers.
         let share_of = |bytes: usize, sources: usize| (bytes / sources).max(RECOVERY_BYTES_MIN);
@@ -273,10 +268,7 @@ impl<N: RosNetwork> Core<N> {
     /// that the other took.
     pub(super) fn open_reader(&mut self, name: Name, spec: EndpointSpec) {
         let Some(share) = self.shares.get(&name).cloned() else { return };
-        let newest = self.readers.remove(&name).and_then(|old| old.newest);
-        let newest = newest.or_else(|| spec.qos.is_transient_local().then(Arc::default));
-        let wanted = LocalReader { spec: spec.clone(), opened: None, newest: newest.clone() };
-        self.readers.insert(name, wanted);
+        let newest = self.ends.want_reader(name, spec.clone());
         let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
         let publisher = Box::new(Publisher::new(share, newest));
         let alive = self.alive.clone();
@@ -298,7 +290,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn open_writer(&mut self, name: Name, source: Option<SourceId>, spec: EndpointSpec) {
-        self.writers.insert((name, source), spec.clone());
+        self.ends.want_writer((name, source), spec.clone());
         let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
         let alive = self.alive.clone();
         let failures = self.ros_failures.clone();
@@ -327,7 +319,7 @@ impl<N: RosNetwork> Core<N> {
             // The writer does not exist yet. When it is ready, it is found to be outdated.
             return self.open_writer(name, source, spec);
         };
-        self.writers.insert((name, source), spec);
+        self.ends.want_writer((name, source), spec);
         let alive = self.alive.clone();
         tokio::task::spawn_blocking(move || {
             let _alive = alive;
@@ -337,10 +329,10 @@ impl<N: RosNetwork> Core<N> {
 
     /// Moves a writer to another source of the same publisher.
     fn move_writer(&mut self, name: Name, from: SourceId, to: SourceId) {
-        let Some(spec) = self.writers.remove(&(name, Some(from))) else { return };
+        let Some(spec) = self.ends.forget_writer(&(name, Some(from))) else { return };
         if self.sinks.move_writer(name, from, to) {
             self.graph.writer_moved(name, from, to);
-            self.writers.insert((name, Some(to)), spec);
+            self.ends.want_writer((name, Some(to)), spec);
             return self.ask_history(name, to);
         }
         // The writer does not exist yet. When it is ready, it is found to be outdated.

@@ -2,52 +2,34 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Instant;
 
 use sgc_endpoint::{CallLoss, CallStats, Event};
-use sgc_ros::{DiscoveryEvent, RosNetwork, RouteStatus, ServiceSpec, ServiceTopic, Shaping};
+use sgc_ros::{RosNetwork, RouteStatus, ServiceSpec, Shaping};
 use sgc_wire::{Name, Now, SinkId, TopicGrant};
 use tracing::error;
 
 use super::{Core, drop_elsewhere};
 use crate::admin::graph::{LostCalls, ServiceCalls};
 use crate::control::event::{CoreEvent, ServiceEnd};
-use crate::data::call_ledger::{CallLedger, CallerId, LEDGERS_MAX};
-use crate::data::calls::{Answers, Calls, FarService, LocalService, Requests};
+use crate::data::call_ledger::{CallLedger, CallerId};
+use crate::data::calls::{Answers, Calls, Requests};
 use crate::data::writer_queue::{WriterInfo, WriterQueue};
 
 impl<N: RosNetwork> Core<N> {
     /// Starts a shared service. Incoming messages are calls, not messages of publishers.
     pub(super) fn begin_local(&mut self, name: Name) {
-        let Some(share) = self.shares.get(&name) else { return };
-        let (share, ledger) = (share.clone(), self.call_ledger(name, true));
-        let served = Arc::new(LocalService::new(share, self.ros_failures.clone(), ledger));
+        let Some(share) = self.shares.get(&name).cloned() else { return };
+        let served = self.services.create_local(name, share);
         let takes = served.clone();
         self.begin_calls(name, Calls::LocalService(served), move |message| takes.take(message));
     }
 
     /// Starts a used service. Incoming messages are replies.
     pub(super) fn begin_far(&mut self, name: Name) {
-        let Some(share) = self.shares.get(&name) else { return };
-        let (share, ledger) = (share.clone(), self.call_ledger(name, false));
-        let called =
-            FarService::new(share, self.ros_failures.clone(), ledger, self.shares.epoch_over().clone());
-        let called = Arc::new(called);
+        let Some(share) = self.shares.get(&name).cloned() else { return };
+        let called = self.services.create_far(name, share);
         let takes = called.clone();
         self.begin_calls(name, Calls::FarService(called), move |message| takes.take(message));
-    }
-
-    /// Returns the ledger of a service's lost calls, over all its routes so far.
-    fn call_ledger(&mut self, name: Name, is_served: bool) -> Arc<CallLedger> {
-        if self.call_ledgers.len() >= LEDGERS_MAX && !self.call_ledgers.contains_key(&name) {
-            let ended = self.call_ledgers.keys().find(|name| !self.calls.contains_key(*name)).copied();
-            if let Some(name) = ended {
-                self.call_ledgers.remove(&name);
-            }
-        }
-        let failures = self.ros_failures.clone();
-        let new = || Arc::new(CallLedger::new(is_served, failures));
-        self.call_ledgers.entry(name).or_insert_with(new).clone()
     }
 
     fn begin_calls(
@@ -69,34 +51,33 @@ impl<N: RosNetwork> Core<N> {
             Err(why) => return error!(%why, "a service has no thread and cannot be used"),
         };
         self.sinks.add(name, false).set_writer(None, Some(queue));
-        self.calls.insert(name, calls);
+        self.services.add(name, calls);
     }
 
     /// Ends a service that is no longer shared or used.
     pub(super) fn end_calls(&mut self, name: &Name) {
-        if let Some(calls) = self.calls.get(name) {
+        if let Some(calls) = self.services.get(name) {
             calls.withdraw();
         }
         self.close_calls(name);
     }
 
     fn close_calls(&mut self, name: &Name) {
-        self.service_ends.remove(name);
         self.graph.service_gone(name);
-        if let Some(old) = self.calls.remove(name).and_then(|calls| calls.close()) {
+        if let Some(old) = self.services.remove(name) {
             drop_elsewhere(old);
         }
     }
 
     pub(super) fn close_all_calls(&mut self) {
-        for name in self.calls.keys().copied().collect::<Vec<_>>() {
+        for name in self.services.names() {
             self.close_calls(&name);
         }
     }
 
     /// Handles the owner's grant to call a service.
     pub(super) fn call_granted(&mut self, now: Now, name: Name, sink: SinkId, grant: TopicGrant, anew: bool) {
-        let Some(Calls::FarService(called)) = self.calls.get(&name) else { return };
+        let Some(called) = self.services.far(&name) else { return };
         self.sinks.grant(now.instant, name, sink, grant);
         called.granted(sink, anew);
     }
@@ -108,54 +89,20 @@ impl<N: RosNetwork> Core<N> {
                 name
             }
             Event::Lost { name, .. } => {
-                if let Some(Calls::FarService(called)) = self.calls.get(name) {
+                if let Some(called) = self.services.far(name) {
                     called.lost();
                 }
                 return;
             }
             _ => return,
         };
-        if let Some(Calls::LocalService(served)) = self.calls.get(name) {
+        if let Some(served) = self.services.local(name) {
             served.set_callers(self.endpoint.publishers(name));
         }
     }
 
-    /// Ends the calls of a local client or server that disappeared.
-    pub(super) fn calls_discovery(&self, event: &DiscoveryEvent) {
-        let DiscoveryEvent::Vanished { guid } = event else { return };
-        for calls in self.calls.values() {
-            match calls {
-                Calls::FarService(called) => called.endpoint_gone(guid),
-                Calls::LocalService(served) => served.endpoint_gone(guid),
-            }
-        }
-    }
-
-    /// Asks for the state of calls without news for long.
-    pub(super) fn calls_due(&self, now: Instant) {
-        for calls in self.calls.values() {
-            if let Calls::FarService(called) = calls {
-                called.ask_due(now);
-            }
-        }
-    }
-
-    pub(super) fn calls_deadline(&self) -> Option<Instant> {
-        let deadline = |calls: &Calls| match calls {
-            Calls::FarService(called) => called.deadline(),
-            Calls::LocalService(_) => None,
-        };
-        self.calls.values().filter_map(deadline).min()
-    }
-
-    pub(super) fn servers_gone(&self, name: &Name) {
-        if let Some(Calls::LocalService(served)) = self.calls.get(name) {
-            served.servers_gone();
-        }
-    }
-
     pub(super) fn open_client(&mut self, name: Name, spec: ServiceSpec) {
-        let Some(Calls::LocalService(served)) = self.calls.get(&name).cloned() else { return };
+        let Some(served) = self.services.local(&name).cloned() else { return };
         if served.keep_client() {
             return;
         }
@@ -166,8 +113,8 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn close_client(&mut self, name: &Name) {
-        self.service_ends.remove(name);
-        if let Some(Calls::LocalService(served)) = self.calls.get(name)
+        self.services.forget_end(name);
+        if let Some(served) = self.services.local(name)
             && let Some(old) = served.end_client()
         {
             self.graph.service_gone(name);
@@ -176,7 +123,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn open_server(&mut self, name: Name, spec: ServiceSpec) {
-        let Some(Calls::FarService(called)) = self.calls.get(&name).cloned() else { return };
+        let Some(called) = self.services.far(&name).cloned() else { return };
         self.make_service_end(name, spec, move |network, spec| {
             let handler = Box::new(Requests(called));
             network.create_server(spec, handler).map(|server| ServiceEnd::Server(Arc::new(server)))
@@ -184,9 +131,9 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn close_service_end(&mut self, name: &Name) {
-        self.service_ends.remove(name);
+        self.services.forget_end(name);
         self.graph.service_gone(name);
-        if let Some(Calls::FarService(called)) = self.calls.get(name)
+        if let Some(called) = self.services.far(name)
             && let Some(old) = called.set_server(None)
         {
             drop_elsewhere(old);
@@ -199,12 +146,7 @@ impl<N: RosNetwork> Core<N> {
         spec: ServiceSpec,
         make: impl FnOnce(&N, &ServiceSpec) -> Result<ServiceEnd, sgc_ros::RosError> + Send + 'static,
     ) {
-        self.service_ends.insert(name, spec.clone());
-        if let (Some(calls), Some((_, service, _))) =
-            (self.calls.get(&name), ServiceTopic::parse(&spec.request.topic, &spec.request.type_name))
-        {
-            calls.ledger().set_topic(service);
-        }
+        self.services.want_end(name, spec.clone());
         let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
         let (alive, failures) = (self.alive.clone(), self.ros_failures.clone());
         tokio::task::spawn_blocking(move || {
@@ -220,7 +162,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn service_ready(&mut self, name: Name, spec: &ServiceSpec, end: ServiceEnd) {
-        let wanted = !self.reopening.is_closed() && self.service_ends.get(&name) == Some(spec);
+        let wanted = !self.reopening.is_closed() && self.services.wants_end(&name, spec);
         if wanted {
             self.graph.service_there(
                 name,
@@ -230,14 +172,7 @@ impl<N: RosNetwork> Core<N> {
                 },
             );
         }
-        let old = match (self.calls.get(&name).filter(|_| wanted), end) {
-            (Some(Calls::LocalService(served)), ServiceEnd::Client(client)) => {
-                served.set_client(Some(client))
-            }
-            (Some(Calls::FarService(called)), ServiceEnd::Server(server)) => called.set_server(Some(server)),
-            (_, ServiceEnd::Client(client)) => Some(Box::new(client) as _),
-            (_, ServiceEnd::Server(server)) => Some(Box::new(server) as _),
-        };
+        let old = if wanted { self.services.put_end(&name, end) } else { Some(Box::new(end) as _) };
         if let Some(old) = old {
             drop_elsewhere(old);
         }
@@ -245,7 +180,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// Returns the statistics of a route's calls, as an addition to its state.
     pub(super) fn describe_calls(&self, route: &RouteStatus) -> Option<String> {
-        let calls = route.name.and_then(|name| self.calls.get(&name))?;
+        let calls = route.name.and_then(|name| self.services.get(&name))?;
         let CallStats { calls: now, open, answered: answered_now } = calls.stats();
         let (_, past, losses) = calls.ledger().read();
         let (calls, answered) = (past.calls + now, past.answered + answered_now);
@@ -258,7 +193,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// Returns the services with lost calls.
     pub(super) fn lost_calls(&self) -> Vec<ServiceCalls> {
-        let of_service = |(name, ledger): (&Name, &Arc<CallLedger>)| {
+        let of_service = |(name, ledger): (&Name, &CallLedger)| {
             let (topic, _, losses) = ledger.read();
             let lost = losses.into_iter().map(|(loss, losses)| LostCalls {
                 reason: loss.key().to_owned(),
@@ -270,7 +205,7 @@ impl<N: RosNetwork> Core<N> {
             let lost: Vec<_> = lost.collect();
             (!lost.is_empty()).then_some(ServiceCalls { topic, is_served: ledger.is_served, lost })
         };
-        self.call_ledgers.iter().filter_map(of_service).collect()
+        self.services.ledgers().filter_map(of_service).collect()
     }
 
     fn named_callers(&self, name: &Name, by: BTreeMap<CallerId, u64>) -> BTreeMap<String, u64> {
