@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
-use rand_core::{OsRng, TryRngCore};
+use rand_core::{OsRng, RngCore, TryRngCore};
 use sgc_sync::lock;
 use sgc_trust::{
     CertId, CrlReport, Fleet, FleetError, Grantees, ROSTER_NODES_MAX, TrustAnchors, VerifiedPeer,
@@ -21,7 +21,9 @@ use sgc_trust::{
 use sgc_wire::{Credentials, NodeId, Now, RefuseReason, SinkId, UnixMillis};
 use tracing::{error, info, warn};
 
-use crate::control::operators::{OPERATIONS_WAITING_MAX, OperationJob, OperationOutcome, Operators};
+use crate::control::operators::{
+    OPERATIONS_WAITING_MAX, OperationJob, OperationOutcome, Operators, RequestStep,
+};
 use crate::state::credentials::{is_due, lasts, renewal_interval};
 use crate::state::fleet_file::{FleetFileError, LockedFleet};
 
@@ -116,7 +118,7 @@ impl RenewalRefusal {
 /// Requests that wait for the fleet file: one for each node, in order of arrival, in batches; and operations, each by
 /// itself.
 #[derive(Debug, Default)]
-pub(crate) struct DeskQueue {
+struct DeskQueue {
     waiting: BTreeMap<NodeId, RenewalRequest>,
     order: VecDeque<NodeId>,
     operations: VecDeque<OperationJob>,
@@ -125,7 +127,7 @@ pub(crate) struct DeskQueue {
 
 impl DeskQueue {
     /// Queues a request. It replaces an older one of the same node.
-    pub(crate) fn push(&mut self, request: RenewalRequest) -> Result<(), RenewalRefusal> {
+    fn push(&mut self, request: RenewalRequest) -> Result<(), RenewalRefusal> {
         let node = request.peer.node_id;
         if let Some(older) = self.waiting.get_mut(&node) {
             *older = request;
@@ -180,8 +182,8 @@ pub(crate) struct DeskAnswers {
 
 /// Role of this node as its fleet's authority.
 pub(crate) struct Authority {
-    pub(crate) queue: DeskQueue,
-    pub(crate) operators: Operators,
+    queue: DeskQueue,
+    operators: Operators,
     /// Times at which members last got an answer in this run; at most as many as a roster has.
     seen: BTreeMap<NodeId, UnixMillis>,
     own: NodeId,
@@ -194,6 +196,38 @@ impl Authority {
         let (queue, operators) = (DeskQueue::default(), Operators::new(operators));
         let desk = Arc::new(Mutex::new(FleetDesk::new(file)));
         Self { queue, operators, seen: BTreeMap::new(), own, desk }
+    }
+
+    /// Queues a request for credentials. It replaces an older one of the same node.
+    pub(crate) fn push_renewal(&mut self, request: RenewalRequest) -> Result<(), RenewalRefusal> {
+        self.queue.push(request)
+    }
+
+    /// Judges an operator's request.
+    pub(crate) fn ask_operation(
+        &mut self,
+        now: Instant,
+        peer: &VerifiedPeer,
+        sink: SinkId,
+        request: &Bytes,
+        rng: &mut impl RngCore,
+    ) -> RequestStep {
+        self.operators.ask(now, peer, sink, request, rng)
+    }
+
+    /// Queues an operation, or returns it if too many wait.
+    pub(crate) fn push_operation(&mut self, job: OperationJob) -> Result<(), Box<OperationJob>> {
+        self.queue.push_operation(job)
+    }
+
+    /// Notes the outcome of an operation. Returns the sink that waits for its answer.
+    pub(crate) fn operation_done(&mut self, done: &OperationOutcome) -> Option<SinkId> {
+        self.operators.done(done)
+    }
+
+    /// Ends the batch under way.
+    pub(crate) fn end_batch(&mut self) {
+        self.queue.end_batch();
     }
 
     /// Notes that members are present.

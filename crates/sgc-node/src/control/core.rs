@@ -30,9 +30,10 @@ use sgc_trust::{Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
 use sgc_wire::{Control, Now};
 use tokio::sync::{mpsc, watch};
+use tracing::info;
 
 use crate::clock::now;
-use crate::control::alerts::{Alerts, clock_alert};
+use crate::control::alerts::Alerts;
 use crate::control::authority::Authority;
 use crate::control::control_queue::Inbox;
 use crate::control::event::{CoreEvent, INBOX_MAX};
@@ -41,6 +42,7 @@ use crate::control::interface_types::InterfaceTypes;
 use crate::control::local_graph::LocalGraph;
 use crate::control::members::{MemberNames, Members};
 use crate::control::operations::Operations;
+use crate::control::parts::certificates::Certificates;
 use crate::control::parts::forward_table::ForwardTable;
 use crate::control::parts::link_table::LinkTable;
 use crate::control::parts::network_ends::{NetworkEnds, OpenEnd};
@@ -76,7 +78,7 @@ const KEYED_INSTANCES_KEPT: usize = 256;
 
 /// The control task's state. `N` is the local network; a pure router has none.
 pub(crate) struct Core<N: RosNetwork> {
-    identity: Arc<Identity>,
+    certificates: Certificates,
     router: Router,
     endpoint: Endpoint,
     routes: Option<Routes<ChaCha20Rng>>,
@@ -96,16 +98,10 @@ pub(crate) struct Core<N: RosNetwork> {
     /// Local consumers that owners are told, and far consumers that are shown here.
     consumers: FarConsumers,
     publishers: Publishers,
-    credentials: CredentialStore,
-    gateway: Arc<Gateway>,
     /// Set if this node is the authority of its fleet.
     authority: Option<Authority>,
     /// Operations that users of this node request.
     operations: Operations,
-    keeper: StateWriter,
-    /// Time of the next request for renewal.
-    renew_due: Option<Instant>,
-    redial: watch::Sender<()>,
     replays: Arc<Replays>,
     control_drops: Drops,
     problem_log: ProblemLog,
@@ -113,8 +109,6 @@ pub(crate) struct Core<N: RosNetwork> {
     events: mpsc::WeakSender<CoreEvent>,
     started: Instant,
     alerts: Alerts,
-    /// Whether the clock is still before the start of this node's certificate.
-    awaits_clock: bool,
     transport: Arc<sgc_transport::TransportMetrics>,
     alive: mpsc::Sender<()>,
     audit: Audit,
@@ -184,9 +178,16 @@ impl<N: RosNetwork> Core<N> {
         let shares = Shares::new(data.clone(), parts.alive.clone(), parts.epoch_messages_max);
         let ros_failures = Arc::<Drops>::default();
         let services = Services::new(ros_failures.clone(), shares.epoch_over().clone());
-        let awaits_clock = clock_alert(&parts.identity, now().unix).is_some();
+        let certificates = Certificates::new(
+            parts.identity,
+            parts.credentials,
+            parts.gateway,
+            parts.keeper,
+            parts.redial,
+            now().unix,
+        );
         let core = Self {
-            identity: parts.identity,
+            certificates,
             router: parts.router,
             endpoint: parts.endpoint,
             routes: parts.routes,
@@ -203,13 +204,8 @@ impl<N: RosNetwork> Core<N> {
             reopening: NetworkState::default(),
             consumers: FarConsumers::default(),
             publishers: Publishers::new(parts.message_keys),
-            credentials: parts.credentials,
-            gateway: parts.gateway,
             authority: parts.authority,
             operations: Operations::default(),
-            keeper: parts.keeper,
-            renew_due: None,
-            redial: parts.redial,
             replays: Arc::default(),
             control_drops: Drops::default(),
             problem_log: ProblemLog::default(),
@@ -217,7 +213,6 @@ impl<N: RosNetwork> Core<N> {
             events: parts.events,
             started: Instant::now(),
             alerts: Alerts::default(),
-            awaits_clock,
             transport: parts.transport,
             alive: parts.alive,
             audit: parts.audit,
@@ -303,7 +298,7 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::NetworkJoined(routes) => self.routes = Some(*routes),
             CoreEvent::Reload { shares, uses, anchors, message_keys, member_names, reply } => {
                 self.add_message_keys(message_keys);
-                self.members.set_names(member_names, &self.identity);
+                self.members.set_names(member_names, self.certificates.identity());
                 self.reconfigure(shares, uses, anchors);
                 let _ = reply.send(());
                 self.answer_renewals();
@@ -345,8 +340,8 @@ impl<N: RosNetwork> Core<N> {
 
     fn handle_timeouts(&mut self) {
         let now = now();
-        if self.awaits_clock {
-            self.await_clock(now.unix);
+        if self.certificates.clock_has_come(now.unix) {
+            info!("the clock is set: this node's certificate holds");
         }
         self.look_at_links(now.instant);
         self.router.handle_timeout(now);
@@ -356,7 +351,7 @@ impl<N: RosNetwork> Core<N> {
         }
         self.sinks_due(now.instant);
         self.shares.look_for_silence(now.instant);
-        if self.renew_due.take_if(|at| *at <= now.instant).is_some() {
+        if self.certificates.take_renewal_due(now.instant) {
             self.ask_renewal();
         }
         self.rotation_due(now);
@@ -409,7 +404,7 @@ impl<N: RosNetwork> Core<N> {
                 let routes = self.routes.as_ref().and_then(Routes::poll_timeout);
                 let rekey = self.publishers.deadline();
                 let own = [
-                    self.renew_due,
+                    self.certificates.deadline(),
                     self.shares.deadline(),
                     self.links.deadline(),
                     self.operations.deadline(),

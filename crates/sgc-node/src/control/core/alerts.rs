@@ -7,7 +7,7 @@ use sgc_endpoint::JoinStatus;
 use sgc_ros::RosNetwork;
 use sgc_router::{LinkId, clocks_differ};
 use sgc_transport::CloseReason;
-use sgc_wire::{Control, Place, UnixMillis};
+use sgc_wire::{Control, Place};
 use tracing::{debug, info, warn};
 
 use super::Core;
@@ -63,7 +63,7 @@ impl<N: RosNetwork> Core<N> {
                 sink.begin_anew();
             }
         }
-        let node = self.identity.node_name();
+        let node = self.certificates.identity().node_name();
         if self.alerts.displaced(place, Instant::now()) {
             warn!(
                 "the identity {node} is in use at another place: {place}, which has the links of this node; it is tried \
@@ -80,7 +80,7 @@ impl<N: RosNetwork> Core<N> {
             self.control_drops.count_from("unknown", link);
             return;
         }
-        let (node, place) = (self.identity.node_name(), SocketAddr::from(place));
+        let (node, place) = (self.certificates.identity().node_name(), SocketAddr::from(place));
         if self.alerts.kept_out(place, Instant::now()) {
             warn!(
                 "the identity {node} is in use at another place: {place}, which is kept out while this node has its links"
@@ -100,19 +100,11 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Checks whether the clock has reached the beginning of this node's certificate.
-    pub(super) fn await_clock(&mut self, unix: UnixMillis) {
-        if clock_alert(&self.identity, unix).is_none() {
-            self.awaits_clock = false;
-            info!("the clock is set: this node's certificate holds");
-        }
-    }
-
     /// Returns the current alerts.
     pub(super) fn alerts(&self) -> Vec<Alert> {
         let now = now();
-        let mut alerts = Vec::from_iter(clock_alert(&self.identity, now.unix));
-        let node = self.identity.node_name().as_str();
+        let mut alerts = Vec::from_iter(clock_alert(self.certificates.identity(), now.unix));
+        let node = self.certificates.identity().node_name().as_str();
         alerts.extend(self.alerts.shown(node, |peer| self.called(peer), now.instant));
         alerts.extend(sgc_dds::unsent().and_then(|unsent| {
             let ago_s = now.instant.saturating_duration_since(unsent.last).as_secs();

@@ -58,7 +58,7 @@ impl<N: RosNetwork> Core<N> {
     /// Asks the granted nodes for their consumers, and no others.
     fn ask_consumers(&mut self, now: Now) {
         let has_graph = self.network.get().is_some_and(|network| network.has_graph());
-        let AskChanges { leave, ask } = self.consumers.ask(has_graph, self.identity.node_id());
+        let AskChanges { leave, ask } = self.consumers.ask(has_graph, self.certificates.identity().node_id());
         for peer in leave {
             self.endpoint.leave_consumers(now, &peer);
         }

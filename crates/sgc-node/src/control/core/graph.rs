@@ -25,7 +25,7 @@ use crate::state::audit::Audit;
 impl<N: RosNetwork> Core<N> {
     pub(super) fn graph(&self, asked: Option<Name>) -> Graph {
         let mut graph = Graph {
-            node: self.identity.node_name().to_string(),
+            node: self.certificates.identity().node_name().to_string(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             has_ros: self.routes.is_some(),
             drops: self.all_drops(),

@@ -85,13 +85,13 @@ impl<N: RosNetwork> Core<N> {
 
     /// Notes a member that was heard. Reports names in rules that are probably misspellings of it.
     pub(super) fn hear_of(&mut self, peer: &VerifiedPeer) {
-        let misspelt = self.members.heard(peer, &self.identity);
+        let misspelt = self.members.heard(peer, self.certificates.identity());
         Self::warn_of_misspelt(&misspelt);
     }
 
     /// Does the same for a node whose catalogue has come.
     pub(super) fn hear_of_owner(&mut self, owner: NodeId) {
-        let misspelt = self.members.heard_owner(owner, &self.identity);
+        let misspelt = self.members.heard_owner(owner, self.certificates.identity());
         Self::warn_of_misspelt(&misspelt);
     }
 

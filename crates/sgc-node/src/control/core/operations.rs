@@ -30,15 +30,15 @@ impl<N: RosNetwork> Core<N> {
         operation: Operation,
         reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
     ) {
-        let Some(authority) = self.identity.node_id_of(at.as_str()) else {
+        let Some(authority) = self.certificates.identity().node_id_of(at.as_str()) else {
             let _ = reply.send(Err(OperationError::NoSecret));
             return;
         };
-        if authority == self.identity.node_id() {
+        if authority == self.certificates.identity().node_id() {
             let _ = reply.send(Err(OperationError::OwnName { at: at.to_string() }));
             return;
         }
-        let is_named = self.identity.authority() == Some(authority);
+        let is_named = self.certificates.identity().authority() == Some(authority);
         let wish = UserOperation { at: at.to_string(), authority, is_named, operation, reply };
         self.operations.push(Instant::now(), wish);
         self.next_operation();
@@ -89,7 +89,7 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn operation_asked(&mut self, sink: SinkId, peer: &VerifiedPeer, request: &Bytes) {
         let Some(authority) = &mut self.authority else { return };
         let now = now();
-        let asked = authority.operators.ask(now.instant, peer, sink, request, &mut OsRng.unwrap_err());
+        let asked = authority.ask_operation(now.instant, peer, sink, request, &mut OsRng.unwrap_err());
         let node = peer.node_id;
         match asked {
             RequestStep::Answer(answer) => self.answer_operator(&node, sink, answer),
@@ -104,7 +104,7 @@ impl<N: RosNetwork> Core<N> {
                 // Nodes that are connected now count as present.
                 let here: Vec<_> = self.endpoint.renewing().map(|(_, peer, _)| peer.node_id).collect();
                 authority.note_seen(here, now.unix);
-                match authority.queue.push_operation(job) {
+                match authority.push_operation(job) {
                     Ok(()) => self.answer_next_batch(),
                     Err(job) => self.operation_done(job.busy()),
                 }
@@ -124,7 +124,7 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn operation_done(&mut self, done: OperationOutcome) {
         info!(operator = %done.node.short(), operation = done.said, "was asked for an operation");
         self.audit.write(AuditRecord::new(AuditEvent::Operation).peer(&done.node).reason(&done.said));
-        let waits = self.authority.as_mut().and_then(|authority| authority.operators.done(&done));
+        let waits = self.authority.as_mut().and_then(|authority| authority.operation_done(&done));
         if let Some(sink) = waits {
             self.answer_operator(&done.node, sink, done.answer);
         }

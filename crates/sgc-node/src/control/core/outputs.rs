@@ -63,7 +63,7 @@ impl<N: RosNetwork> Core<N> {
             LinkClose::Revoked => {
                 let record = AuditRecord::new(AuditEvent::Revoked).peer(&node);
                 self.audit.write(record.remote(remote).reason("its link is cut"));
-                let why = self.credentials.objection(peer, now().unix).unwrap_or(CloseReason::Revoked);
+                let why = self.certificates.objection(peer, now().unix).unwrap_or(CloseReason::Revoked);
                 info!(%link, peer = %node.short(), "{why}; its link is closed");
                 because = why.to_string();
                 why

@@ -17,7 +17,7 @@ impl<N: RosNetwork> Core<N> {
         let names = self.forwards.stats().map(|(name, stats)| NameStatus::new(name, stats));
         let router = self.router.stats();
         Status {
-            node: self.identity.node_name().to_string(),
+            node: self.certificates.identity().node_name().to_string(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             uptime_s: self.started.elapsed().as_secs(),
             links: links.collect(),

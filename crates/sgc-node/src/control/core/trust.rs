@@ -7,7 +7,7 @@ use bytes::Bytes;
 use sgc_ros::RosNetwork;
 use sgc_transport::CloseReason;
 use sgc_trust::{CrlError, Identity, TrustAnchors, VerifiedPeer};
-use sgc_wire::{Credentials, RefuseReason, SinkId};
+use sgc_wire::{Credentials, Now, RefuseReason, SinkId};
 use tracing::{info, warn};
 
 use super::Core;
@@ -16,7 +16,6 @@ use crate::control::authority::{Asker, DeskAnswers, RenewalAnswer, RenewalRefusa
 use crate::control::event::CoreEvent;
 use crate::control::parts::link_table::LinkEntry;
 use crate::state::audit::{AuditEvent, AuditRecord};
-use crate::state::credentials::{renew_at, renewed};
 
 impl<N: RosNetwork> Core<N> {
     /// Adds a revocation list of a user. Returns whether it is new, and the lists that were in force before.
@@ -29,7 +28,7 @@ impl<N: RosNetwork> Core<N> {
             Ok(false) => self.audit.write(record.reason("known already")),
             Err(why) => self.audit.write(record.reason(format!("refused: {why}"))),
         }
-        let lists = self.credentials.anchors().crls().cloned().collect();
+        let lists = self.certificates.anchors().crls().cloned().collect();
         taken.map(|is_news| (is_news, lists))
     }
 
@@ -40,10 +39,10 @@ impl<N: RosNetwork> Core<N> {
             self.renew_own();
             true
         } else {
-            self.endpoint.renew(now, self.identity.csr().into())
+            self.endpoint.renew(now, self.certificates.identity().csr().into())
         };
         if asked {
-            self.renew_due = Some(renew_at(&self.identity, now));
+            self.certificates.renewal_asked(now);
         }
     }
 
@@ -55,14 +54,15 @@ impl<N: RosNetwork> Core<N> {
 
     /// Queues this authority's own request, since no route leads from a node to itself.
     fn renew_own(&mut self) {
-        let (peer, csr) = (self.identity.as_peer().clone(), self.identity.csr().into());
+        let (peer, csr) =
+            (self.certificates.identity().as_peer().clone(), self.certificates.identity().csr().into());
         self.queue_renewal(RenewalRequest { asker: Asker::Own, peer, csr });
         self.answer_next_batch();
     }
 
     fn queue_renewal(&mut self, request: RenewalRequest) {
         let (asker, node) = (request.asker, request.peer.node_id);
-        let queued = self.authority.as_mut().map_or(Ok(()), |authority| authority.queue.push(request));
+        let queued = self.authority.as_mut().map_or(Ok(()), |authority| authority.push_renewal(request));
         if let Err(why) = queued {
             self.renewal_ready(RenewalAnswer { asker, node, answer: Err(why) });
         }
@@ -97,7 +97,7 @@ impl<N: RosNetwork> Core<N> {
         operations.into_iter().for_each(|done| self.operation_done(done));
         renewals.into_iter().for_each(|answer| self.renewal_ready(answer));
         if let Some(authority) = &mut self.authority {
-            authority.queue.end_batch();
+            authority.end_batch();
         }
         self.answer_next_batch();
     }
@@ -147,7 +147,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// Closes incoming links of nodes that may no longer attach.
     pub(super) fn close_not_admitted(&mut self) {
-        let is_refused = |entry: &LinkEntry| entry.url().is_none() && !self.credentials.admits(entry.peer());
+        let is_refused = |entry: &LinkEntry| entry.url().is_none() && !self.certificates.admits(entry.peer());
         let refused = self.links.iter().filter(|(_, entry)| is_refused(entry));
         let refused: Vec<_> = refused.map(|(link, entry)| (link, entry.peer().node_id)).collect();
         for (link, node) in refused {
@@ -173,15 +173,14 @@ impl<N: RosNetwork> Core<N> {
     }
 
     pub(super) fn take_credentials(&mut self, credentials: Credentials) {
-        match renewed(&self.identity, credentials) {
+        let now = now();
+        match self.certificates.renew(now, credentials) {
             Ok(None) => {}
             Ok(Some(identity)) => {
-                let identity = Arc::new(identity);
                 info!(until = %identity.not_after(), "the fleet's authority sent new credentials");
                 let until = format!("this node's own, until {}", identity.not_after());
                 self.audit.write(AuditRecord::new(AuditEvent::Renewed).reason(until));
-                self.keeper.identity(identity.clone());
-                self.set_identity(identity);
+                self.identity_renewed(now, identity);
             }
             Err(why) => {
                 warn!(%why, "credentials from the fleet's authority are not usable");
@@ -190,39 +189,26 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Switches to a renewed identity, with another certificate or with secrets for later names.
-    pub(super) fn set_identity(&mut self, identity: Arc<Identity>) {
-        let now = now();
-        // A link shows the certificate only, so it stays if the certificate is the same.
-        let shows_another = self.identity.chain() != identity.chain();
-        self.identity = identity.clone();
-        self.renew_due = Some(renew_at(&identity, now));
+    /// Passes a renewed identity to the machines.
+    fn identity_renewed(&mut self, now: Now, identity: Arc<Identity>) {
         if let (Some(routes), Some(newest)) = (&mut self.routes, identity.naming_secrets().first()) {
             routes.set_secret(newest.secret.clone());
         }
-        self.credentials.set_identity(identity.clone());
-        // The gateway reads the current identity itself at a reload.
-        self.gateway.set_identity(&identity);
         self.router.set_identity(now, identity.clone());
         self.endpoint.set_identity(now, identity);
-        if shows_another {
-            self.redial.send_replace(());
-        }
     }
 
     /// Trusts these CAs and no others. Their revocations stay in force.
     pub(super) fn trust(&mut self, anchors: TrustAnchors) {
-        let anchors = Arc::new(anchors.with_lists_of(&self.credentials.anchors()));
+        let anchors = Arc::new(anchors.with_lists_of(&self.certificates.anchors()));
         self.router.set_anchors(now(), anchors.clone());
         self.set_anchors(anchors);
     }
 
     /// Replaces the trust anchors everywhere.
     pub(super) fn set_anchors(&mut self, anchors: Arc<TrustAnchors>) {
-        self.keeper.anchors(anchors.clone());
+        self.certificates.set_anchors(&anchors);
         self.catch_up_file(anchors.clone());
-        self.credentials.set_anchors(TrustAnchors::clone(&anchors));
-        self.gateway.set_anchors(&anchors);
         self.endpoint.set_anchors(now(), anchors);
     }
 }
