@@ -19,7 +19,7 @@ use tokio::sync::Notify;
 use tracing::{debug, warn};
 
 use crate::data::call_ledger::{CallLedger, CallerId};
-use crate::data::sources::{IsTooLarge, LocalShare};
+use crate::data::sending::share::{IsTooLarge, LocalShare};
 use crate::data::stats::Drops;
 use crate::data::writer_queue::failure_key;
 

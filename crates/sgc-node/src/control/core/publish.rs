@@ -13,9 +13,9 @@ use super::Core;
 use crate::clock::now;
 use crate::control::event::CoreEvent;
 use crate::control::publishing::{GrantEffect, Offer, Publishing};
-use crate::data::message_keys::MessageKeys;
+use crate::data::sending::message_keys::MessageKeys;
+use crate::data::sending::share::{LocalShare, SourceMap, SourceSlot};
 use crate::data::sinks::LocalSink;
-use crate::data::sources::{LocalShare, SourceMap, SourceSlot};
 
 impl<N: RosNetwork> Core<N> {
     /// Asks the owner of `name` for permission to publish, at once or when there is a signing key.

@@ -18,12 +18,12 @@ use super::{
 use crate::clock::now;
 use crate::control::event::CoreEvent;
 use crate::control::publishing::Offer;
-use crate::data::assertions;
 use crate::data::dataplane::{Forward, Out};
-use crate::data::manual_lease::ManualLease;
 use crate::data::outflow::{self, OUTFLOW_AGE_MAX, OutFlow};
+use crate::data::sending::assertions;
+use crate::data::sending::manual_lease::ManualLease;
+use crate::data::sending::share::{LocalShare, Publisher, SourceMap, SourceSlot};
 use crate::data::sinks::LocalSink;
-use crate::data::sources::{LocalShare, Publisher, SourceMap, SourceSlot};
 use crate::data::writer_queue::WriterQueue;
 
 /// Least bytes of recovery kept for one of a topic's many publishers.

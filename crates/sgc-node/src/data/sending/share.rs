@@ -29,8 +29,8 @@ use tracing::{debug, warn};
 
 use crate::data::conversion::{self, KnownType, TypeSlot};
 use crate::data::dataplane::DataPlane;
-use crate::data::manual_lease::{ASSERTION_LOOK_MAX, ManualLease};
 use crate::data::pending::PendingQueue;
+use crate::data::sending::manual_lease::{ASSERTION_LOOK_MAX, ManualLease};
 use crate::data::stats::{CountDrops, DataDrop};
 use crate::data::tap::{TapMessage, Taps};
 
@@ -746,7 +746,7 @@ impl LocalShare {
         });
     }
 
-    /// Returns `true` once if a task has to look for liveliness assertions ([`crate::data::assertions::watch`]).
+    /// Returns `true` once if a task has to look for liveliness assertions ([`super::assertions::watch`]).
     pub(crate) fn begins_watch(&self) -> bool {
         self.map.load().assertions.is_some() && !self.is_watched.swap(true, SeqCst)
     }

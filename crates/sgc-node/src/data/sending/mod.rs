@@ -1,0 +1,7 @@
+//! The sending side of a topic: the path of a message from the local network to the links.
+
+pub(crate) mod assertions;
+pub(crate) mod manual_lease;
+pub(crate) mod message_keys;
+pub(crate) mod replays;
+pub(crate) mod share;
