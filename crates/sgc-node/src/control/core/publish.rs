@@ -14,7 +14,8 @@ use crate::clock::now;
 use crate::control::event::CoreEvent;
 use crate::control::publishing::{GrantEffect, Offer, Publishing};
 use crate::data::sending::message_keys::MessageKeys;
-use crate::data::sending::share::{LocalShare, SourceMap, SourceSlot};
+use crate::data::sending::share::LocalShare;
+use crate::data::sending::source_map::{SourceMap, SourceSlot};
 use crate::data::sinks::LocalSink;
 
 impl<N: RosNetwork> Core<N> {

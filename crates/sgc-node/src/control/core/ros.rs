@@ -21,8 +21,10 @@ use crate::control::publishing::Offer;
 use crate::data::dataplane::{Forward, Out};
 use crate::data::outflow::{self, OUTFLOW_AGE_MAX, OutFlow};
 use crate::data::sending::assertions;
+use crate::data::sending::intake::Publisher;
 use crate::data::sending::manual_lease::ManualLease;
-use crate::data::sending::share::{LocalShare, Publisher, SourceMap, SourceSlot};
+use crate::data::sending::share::LocalShare;
+use crate::data::sending::source_map::{SourceMap, SourceSlot};
 use crate::data::sinks::LocalSink;
 use crate::data::writer_queue::WriterQueue;
 

@@ -1,7 +1,13 @@
 //! The sending side of a topic: the path of a message from the local network to the links.
 
 pub(crate) mod assertions;
+#[cfg(test)]
+mod fixtures;
+pub(crate) mod intake;
 pub(crate) mod manual_lease;
 pub(crate) mod message_keys;
 pub(crate) mod replays;
 pub(crate) mod share;
+pub(crate) mod source_map;
+#[cfg(test)]
+mod tests;

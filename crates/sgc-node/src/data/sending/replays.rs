@@ -88,7 +88,7 @@ mod tests {
     use tokio::sync::mpsc;
 
     use super::*;
-    use crate::data::sending::share::{SourceMap, SourceSlot};
+    use crate::data::sending::source_map::{SourceMap, SourceSlot};
 
     const NAME: Name = Name([1; 32]);
 

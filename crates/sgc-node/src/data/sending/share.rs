@@ -4,18 +4,18 @@
 //! queue of a reliable topic is full, only this thread waits, so other topics flow on. Samples that are ready together
 //! share a signature; none waits for a later one.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::pin::pin;
 use std::sync::atomic::Ordering::{Relaxed, SeqCst};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, fence};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, Weak};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use bytes::Bytes;
-use sgc_endpoint::{Compressor, Marks, PublishError, Source, SourceProgress};
+use sgc_endpoint::{Compressor, Marks, PublishError, Source};
 use sgc_executor::WakeBatch;
-use sgc_ros::{Guid, HandleSamples, KeyHash, Sample, SampleKind, Shaping};
+use sgc_ros::{Guid, KeyHash, Sample, SampleKind, Shaping};
 use sgc_router::LinkId;
 use sgc_session::Shaper;
 use sgc_sync::lock;
@@ -27,85 +27,14 @@ use tokio::runtime::Handle;
 use tokio::sync::{Notify, mpsc};
 use tracing::{debug, warn};
 
+use crate::clock::unix_ns;
 use crate::data::conversion::{self, KnownType, TypeSlot};
 use crate::data::dataplane::DataPlane;
 use crate::data::pending::PendingQueue;
-use crate::data::sending::manual_lease::{ASSERTION_LOOK_MAX, ManualLease};
-use crate::data::stats::{CountDrops, DataDrop};
+use crate::data::sending::manual_lease::ASSERTION_LOOK_MAX;
+use crate::data::sending::source_map::{SourceChoice, SourceMap, SourceSlot};
+use crate::data::stats::{CountDrops, DataDrop, Dropped};
 use crate::data::tap::{TapMessage, Taps};
-
-/// Time stamps of the newest samples that readers of a transient-local topic took, by writer.
-#[derive(Debug, Default)]
-pub(crate) struct NewestSamples(Mutex<BTreeMap<Guid, i64>>);
-
-impl NewestSamples {
-    fn note(&self, writer: Guid, timestamp_ns: i64) {
-        let mut newest = lock(&self.0);
-        if newest.len() < NEWEST_WRITERS_MAX || newest.contains_key(&writer) {
-            let known = newest.entry(writer).or_insert(timestamp_ns);
-            *known = timestamp_ns.max(*known);
-        }
-    }
-}
-
-/// The consumer of a local reader, which publishes its samples on a share.
-pub(crate) struct Publisher {
-    share: Arc<LocalShare>,
-    /// Time stamps of the newest samples before this reader, since its writers deliver them again.
-    past: BTreeMap<Guid, i64>,
-    newest: Option<Arc<NewestSamples>>,
-}
-
-impl Publisher {
-    /// Creates the consumer of a reader. `newest` holds the time stamps of earlier readers and is updated from here on.
-    pub(crate) fn new(share: Arc<LocalShare>, newest: Option<Arc<NewestSamples>>) -> Self {
-        let past = newest.as_ref().map(|newest| lock(&newest.0).clone()).unwrap_or_default();
-        Self { share, past, newest }
-    }
-
-    /// Returns `true` for a sample that an earlier reader took. A writer never gives two samples the same time stamp.
-    fn is_past(&self, sample: &Sample) -> bool {
-        let newest = sample.writer.and_then(|writer| self.past.get(&writer));
-        newest.is_some_and(|newest| sample.source_timestamp_ns <= *newest)
-    }
-
-    /// Skips a sample that was taken before. Otherwise it notes the sample and passes it to the share.
-    fn take(
-        &self,
-        sample: Sample,
-        publish: impl FnOnce(&Arc<LocalShare>, Sample) -> Option<Sample>,
-    ) -> Option<Sample> {
-        if self.is_past(&sample) {
-            self.share.data.count_here(&self.share.name, DataDrop::Repeated, 1);
-            return None;
-        }
-        let (writer, timestamp_ns) = (sample.writer, sample.source_timestamp_ns);
-        let refused = publish(&self.share, sample);
-        if refused.is_none()
-            && let (Some(newest), Some(writer)) = (&self.newest, writer)
-        {
-            newest.note(writer, timestamp_ns);
-        }
-        refused
-    }
-}
-
-impl HandleSamples for Publisher {
-    fn handle(&mut self, sample: Sample) {
-        let _ = self.take(sample, |share, sample| {
-            share.publish(sample);
-            None
-        });
-    }
-
-    fn handle_at_once(&mut self, sample: Sample) -> Option<Sample> {
-        self.take(sample, |share, sample| share.publish_at_once(sample))
-    }
-
-    fn overrun(&mut self, samples: u64) {
-        self.share.count_overrun(samples);
-    }
-}
 
 /// Whether a message exceeds the largest size that SGC carries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -117,73 +46,10 @@ pub(crate) enum IsTooLarge {
 }
 
 /// Samples that may wait until their writer is discovered or their type is known.
-const EARLY_SAMPLES_MAX: usize = 256;
-
-/// Writers of a topic whose newest time stamps are remembered.
-const NEWEST_WRITERS_MAX: usize = 1024;
+pub(crate) const EARLY_SAMPLES_MAX: usize = 256;
 
 /// The longest message that the reader's thread sends by itself if no other follows.
-const AT_HAND_BYTES_MAX: usize = 16 << 10;
-
-/// A source with the properties of its publisher.
-#[derive(Clone)]
-pub(crate) struct SourceSlot {
-    /// Source id.
-    pub id: SourceId,
-    /// The source. The reader's thread locks it for each message.
-    pub source: Arc<Mutex<Source>>,
-    /// Progress of the source, readable without the lock.
-    pub progress: Arc<SourceProgress>,
-    /// Whether late joiners may ask for its history.
-    pub keeps_history: bool,
-    /// Whether its packets are reliable.
-    pub reliable: bool,
-    /// Time after which its messages expire.
-    pub lifespan: Option<Duration>,
-    /// Number of messages kept for late joiners.
-    pub depth: usize,
-    /// Lease of a publisher that asserts its liveliness without messages.
-    pub manual: Option<Arc<ManualLease>>,
-}
-
-impl SourceSlot {
-    /// Creates the slot of a source.
-    pub(crate) fn new(source: Source, keeps_history: bool, reliable: bool) -> Self {
-        let (id, progress) = (source.id(), source.progress());
-        let source = Arc::new(Mutex::new(source));
-        Self { id, source, progress, keeps_history, reliable, lifespan: None, depth: 0, manual: None }
-    }
-}
-
-/// The sources of a share by writer.
-#[derive(Default)]
-pub(crate) struct SourceMap {
-    /// The one source of all writers, if writers are not distinguished.
-    pub shared: Option<SourceSlot>,
-    /// Whether each writer has its own source. Samples of an unlisted writer then wait until it is listed.
-    pub(crate) per_writer: bool,
-    /// Sources by writer.
-    pub own: HashMap<Guid, SourceSlot>,
-    /// The source that asserts the liveliness of writers without messages. It keeps no history.
-    pub assertions: Option<SourceSlot>,
-}
-
-impl SourceMap {
-    /// Returns the slot of a source.
-    pub(crate) fn slot(&self, id: &SourceId) -> Option<SourceSlot> {
-        self.slots().find(|slot| slot.id == *id).cloned()
-    }
-
-    /// Returns the ids of all sources.
-    pub(crate) fn ids(&self) -> Vec<SourceId> {
-        self.slots().map(|slot| slot.id).collect()
-    }
-
-    /// Iterates over all slots.
-    pub(crate) fn slots(&self) -> impl Iterator<Item = &SourceSlot> {
-        self.own.values().chain(&self.shared).chain(&self.assertions)
-    }
-}
+pub(crate) const AT_HAND_BYTES_MAX: usize = 16 << 10;
 
 /// State of shaping: the sample that waits for its time.
 #[derive(Default)]
@@ -212,16 +78,13 @@ struct Inbox {
     open: Vec<SourceSlot>,
 }
 
-/// Error: the writer has no source yet.
-struct UnknownWriter;
-
 /// This node's end of a topic that it shares or publishes on.
 pub(crate) struct LocalShare {
     name: Name,
     data: Arc<DataPlane>,
     runtime: Handle,
     alive: mpsc::Sender<()>,
-    pub map: ArcSwap<SourceMap>,
+    map: ArcSwap<SourceMap>,
     inbox: Mutex<Inbox>,
     /// Whether shaping is configured, readable without the lock.
     is_shaped: AtomicBool,
@@ -355,7 +218,7 @@ impl LocalShare {
     }
 
     /// Publishes a sample if that needs no waiting, or returns it. Receive threads of several readers call it.
-    fn publish_at_once(&self, sample: Sample) -> Option<Sample> {
+    pub(crate) fn publish_at_once(&self, sample: Sample) -> Option<Sample> {
         let is_short = sample.payload.len() <= AT_HAND_BYTES_MAX;
         if !is_short || self.is_altered.load(Relaxed) || !self.data.has_headroom(&self.name) {
             return Some(sample);
@@ -364,15 +227,16 @@ impl LocalShare {
         let _at_hand = WakeBatch::begin(&self.runtime);
         // The holder of the lock may be blocked.
         let Ok(inbox) = self.inbox.try_lock() else { return Some(sample) };
-        let Ok(slot) = self.slot_of(sample.writer) else { return Some(sample) };
         if !inbox.early.is_empty() || !inbox.open.is_empty() {
             return Some(sample);
         }
-        if let Some(slot) = slot {
-            let Ok(source) = slot.source.try_lock() else { return Some(sample) };
-            self.publish_of(&slot, Some(source), sample, false);
-        } else {
-            self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted);
+        match self.choose(sample.writer) {
+            SourceChoice::UnknownWriter => return Some(sample),
+            SourceChoice::NoSource => self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted),
+            SourceChoice::Source(slot) => {
+                let Ok(source) = slot.source.try_lock() else { return Some(sample) };
+                self.publish_of(&slot, Some(source), sample, false);
+            }
         }
         None
     }
@@ -507,18 +371,18 @@ impl LocalShare {
     fn is_given_up(&self, sample: &Sample) -> bool {
         self.is_json.load(Relaxed)
             && sample.kind == SampleKind::Write
-            && matches!(self.slot_of(sample.writer), Ok(Some(slot)) if !slot.keeps_history)
+            && matches!(self.choose(sample.writer), SourceChoice::Source(slot) if !slot.keeps_history)
     }
 
     /// Publishes a sample, or returns it if its source or its type is unknown. With `more`, the source may keep an
     /// unfinished batch and is then in `open`.
     fn try_publish(&self, sample: Sample, more: bool, open: &mut Vec<SourceSlot>) -> Result<(), Sample> {
         let awaits_type = self.awaits_type();
-        match self.slot_of(sample.writer) {
-            Err(UnknownWriter) => return Err(sample),
-            Ok(Some(_)) if awaits_type => return Err(sample),
-            Ok(None) => self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted),
-            Ok(Some(slot)) => {
+        match self.choose(sample.writer) {
+            SourceChoice::UnknownWriter => return Err(sample),
+            SourceChoice::Source(_) if awaits_type => return Err(sample),
+            SourceChoice::NoSource => self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted),
+            SourceChoice::Source(slot) => {
                 let is_open = self.publish_of(&slot, None, sample, more);
                 if is_open && open.iter().all(|o| o.id != slot.id) {
                     open.push(slot);
@@ -528,15 +392,9 @@ impl LocalShare {
         Ok(())
     }
 
-    /// Returns the source of a writer, if it has one.
-    fn slot_of(&self, writer: Option<Guid>) -> Result<Option<SourceSlot>, UnknownWriter> {
-        let map = self.map.load();
-        match writer.and_then(|w| map.own.get(&w)) {
-            Some(slot) => Ok(Some(slot.clone())),
-            None if map.per_writer && writer.is_some() => Err(UnknownWriter),
-            // The writer is gone and was never identified, so any source serves.
-            None => Ok(map.shared.as_ref().or_else(|| map.own.values().min_by_key(|s| s.id)).cloned()),
-        }
+    /// Chooses the source for a sample of a writer.
+    fn choose(&self, writer: Option<Guid>) -> SourceChoice {
+        self.map.load().choose(writer)
     }
 
     /// Publishes a sample by its source, which may be locked already. Returns `true` if the source keeps an unfinished
@@ -611,9 +469,9 @@ impl LocalShare {
         is_too_large
     }
 
-    /// Counts local samples that were lost because they came too fast.
-    pub(crate) fn count_overrun(&self, messages: u64) {
-        self.data.count_here(&self.name, DataDrop::Overrun, messages);
+    /// Counts samples that were dropped before they came to the share.
+    pub(crate) fn count_here(&self, dropped: Dropped) {
+        self.data.count_here(&self.name, dropped.reason, dropped.messages);
     }
 
     fn note_published(&self, slot: &SourceSlot, result: Result<(), PublishError>) {
@@ -892,318 +750,33 @@ async fn let_go(share: Weak<LocalShare>) {
     }
 }
 
-/// Returns the wall-clock time that publishers stamp samples with.
-fn unix_ns() -> i64 {
-    let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    unix.as_nanos().try_into().unwrap_or(i64::MAX)
-}
-
 #[cfg(test)]
 mod tests {
-    use sgc_endpoint::{RecoveryLimits, SourceConfig};
-    use sgc_router::{FibEntry, Tree};
-    use sgc_trust::{MessageKey, Suite};
-    use sgc_wire::{Class, SecretBytes};
-
     use super::*;
-    use crate::data::dataplane::{Forward, Out};
-    use crate::data::outflow::OutFlow;
-    use crate::data::pending::PENDING_BYTES_MAX;
-
-    const KNOWN: Guid = Guid([1; 16]);
-    const STRANGER: Guid = Guid([2; 16]);
-
-    fn sample(writer: Guid, more: bool) -> Sample {
-        let payload = Bytes::from_static(b"\0\x01\0\0data");
-        let (kind, writer) = (SampleKind::Write, Some(writer));
-        Sample { kind, writer, source_timestamp_ns: 0, key_hash: None, payload, more }
-    }
-
-    fn grant(epoch: u32) -> TopicGrant {
-        let key = SecretBytes::new([epoch as u8; 32]);
-        TopicGrant { epoch, suite: Suite::Standard.id(), key, sources: Vec::new(), entry: None }
-    }
-
-    /// Creates a share with a source for one writer. Samples of other writers wait until their writer is known.
-    fn share() -> (Arc<LocalShare>, SourceSlot) {
-        let (alive, _) = mpsc::channel(1);
-        let share = Arc::new(LocalShare::new(Name([1; 32]), Arc::default(), alive, 2, Arc::default()));
-        let config = SourceConfig {
-            name: Name([1; 32]),
-            id: SourceId([1; 16]),
-            class: Class::Default,
-            reliable: true,
-            history_depth: 10,
-            history_bytes_max: 1000,
-            recovery: RecoveryLimits::default(),
-        };
-        let source = Source::new(config, &grant(1), MessageKey::generate(Suite::Standard)).unwrap();
-        let slot = SourceSlot::new(source, true, true);
-        let own = HashMap::from([(KNOWN, slot.clone())]);
-        share.set_map(SourceMap { per_writer: true, own, ..SourceMap::default() });
-        (share, slot)
-    }
-
-    fn unflushed(slot: &SourceSlot) -> usize {
-        let mut n = 0;
-        lock(&slot.source).flush(|_| n += 1);
-        n
-    }
+    use crate::data::sending::fixtures::{KNOWN, add_tree, map_of, sample, share, text_type, wait_until};
 
     #[test]
-    fn nothing_stays_unsigned_when_the_last_sample_of_a_batch_goes_elsewhere() {
+    fn late_sample_is_dropped_unless_it_is_kept_for_late_joiners() {
         let runtime = tokio::runtime::Runtime::new().unwrap();
         let _inside = runtime.enter();
-        let (share, slot) = share();
-        // Without a sink nothing is sealed.
-        share.publish(sample(KNOWN, true));
-        assert_eq!((share.published(), unflushed(&slot)), (1, 0));
-        let nowhere = FibEntry { trees: [].as_slice().into(), sinks: vec![] };
-        share.data.set(share.name, Some(Forward::new(nowhere, vec![], Arc::default())));
-        share.publish(sample(KNOWN, true));
-        share.publish(sample(STRANGER, false));
-        assert_eq!((share.published(), unflushed(&slot)), (2, 0));
-        // The stranger is known now and its waiting samples are published.
-        share.publish(sample(KNOWN, true));
-        assert_eq!(unflushed(&slot), 1, "it does wait while more is to come");
-        share.publish(sample(KNOWN, true));
-        share.closed.store(true, Relaxed);
-        share.publish(sample(KNOWN, false));
-        assert_eq!(unflushed(&slot), 0);
-    }
-
-    #[test]
-    fn reader_in_the_place_of_another_takes_nothing_twice() {
-        let runtime = tokio::runtime::Runtime::new().unwrap();
-        let _inside = runtime.enter();
-        let (share, _) = share();
-        let newest = Some(Arc::default());
-        let dated = |timestamp| Sample { source_timestamp_ns: timestamp, ..sample(KNOWN, false) };
-        let mut first = Publisher::new(share.clone(), newest.clone());
-        [1, 2, 3].into_iter().for_each(|timestamp| first.handle(dated(timestamp)));
-        assert_eq!(share.published(), 3);
-        // The writer delivers the same samples again, and new ones.
-        let mut second = Publisher::new(share.clone(), newest);
-        [1, 2, 3, 4, 5].into_iter().for_each(|timestamp| second.handle(dated(timestamp)));
-        assert_eq!(share.published(), 5);
-        assert_eq!(share.data.drops().snapshot()["repeated"], 3);
-        // A reader does not skip samples that it took itself.
-        second.handle(dated(5));
-        assert_eq!(share.published(), 6);
-    }
-
-    #[test]
-    fn newest_samples_are_kept_of_a_bounded_number_of_writers() {
-        let newest = NewestSamples::default();
-        for n in 0..2 * NEWEST_WRITERS_MAX {
-            let mut guid = [0; 16];
-            guid[..8].copy_from_slice(&n.to_be_bytes());
-            newest.note(Guid(guid), 7);
-            newest.note(Guid(guid), 6);
-        }
-        let newest = lock(&newest.0);
-        assert_eq!(newest.len(), NEWEST_WRITERS_MAX);
-        assert!(newest.values().all(|timestamp| *timestamp == 7));
-    }
-
-    /// Waits until `is_so`, with a bound.
-    fn wait_until(is_so: impl Fn() -> bool) {
-        let end = Instant::now() + Duration::from_secs(30);
-        while !is_so() {
-            assert!(Instant::now() < end, "it does not come");
-            std::thread::yield_now();
-        }
-    }
-
-    #[test]
-    fn sample_that_would_block_is_handed_back() {
-        let runtime = tokio::runtime::Runtime::new().unwrap();
-        let _inside = runtime.enter();
-        let (share, slot) = share();
-        let flow = OutFlow::idle();
-        let (link, out) = (LinkId(1), Out::Link(flow.clone(), Arc::default()));
-        let tree =
-            Tree { up: LinkId::LOCAL, down: [link].as_slice().into(), publishers: [].as_slice().into() };
-        let entry = FibEntry { trees: [tree].into(), sinks: vec![] };
-        share.data.set(share.name, Some(Forward::new(entry, vec![(link, out)], Arc::default())));
-        let mut publisher = Publisher::new(share.clone(), None);
-        let mut is_taken = |sample: Sample| publisher.handle_at_once(sample).is_none();
-        assert!(is_taken(sample(KNOWN, false)));
-        assert_eq!((share.published(), flow.has_headroom()), (1, true));
-        // These cases wait: an unknown source, a locked source, or an unfinished batch.
-        assert!(!is_taken(sample(STRANGER, false)));
-        {
-            let _replays = lock(&slot.source);
-            assert!(!is_taken(sample(KNOWN, false)));
-        }
-        share.publish(sample(KNOWN, true));
-        assert!(!is_taken(sample(KNOWN, false)));
-        share.publish(sample(KNOWN, false));
-        // Long or shaped samples wait.
-        let payload = Bytes::from(vec![0; AT_HAND_BYTES_MAX + 1]);
-        assert!(!is_taken(Sample { payload, ..sample(KNOWN, false) }));
-        share.set_shaping(Shaping { compression: PayloadEncoding::Lz4, ..Shaping::default() });
-        assert!(!is_taken(sample(KNOWN, false)));
-        share.set_shaping(Shaping::default());
-        assert!(is_taken(sample(KNOWN, false)));
-        // A busy link makes it wait.
-        while flow.has_headroom() {
-            share.publish(sample(KNOWN, false));
-        }
-        assert!(!is_taken(sample(KNOWN, false)));
-        // Overruns are counted.
-        publisher.overrun(7);
-        assert_eq!(share.data.drops().snapshot()["overrun"], 7);
-    }
-
-    /// Returns a type with one string, and a message of it.
-    fn text_type() -> (Arc<sgc_cdr::Layout>, Bytes) {
-        let mut text = |_: &sgc_cdr::TypeName| Some("string a".to_owned());
-        let layout = sgc_cdr::Library::empty().layout(&"p/msg/M".parse().unwrap(), &mut text).unwrap();
-        let message = layout.encode(&layout.from_json(br#"{"a":"text"}"#).unwrap()).unwrap();
-        (Arc::new(layout), message.into())
-    }
-
-    #[test]
-    fn sample_to_convert_waits_until_the_owner_describes_its_type() {
-        let runtime = tokio::runtime::Runtime::new().unwrap();
-        let _inside = runtime.enter();
-        let (share, mut slot) = share();
+        let (data, share, mut slot) = share();
+        add_tree(&data);
         let (layout, payload) = text_type();
         let sample = || Sample { payload: payload.clone(), ..sample(KNOWN, false) };
         share.set_shaping(Shaping { form: PayloadForm::Json, ..Shaping::default() });
-        share.set_type(KnownType::Asked);
-        assert!(share.lacks_definition());
-        (0..EARLY_SAMPLES_MAX + 3).for_each(|_| share.publish(sample()));
-        let lost = |share: &LocalShare| share.data.drops().snapshot().get("no_definition").copied();
-        assert_eq!((share.published(), lost(&share)), (0, Some(3)));
-        // Large samples are bounded by their bytes.
-        let large = Sample { payload: vec![0; PENDING_BYTES_MAX].into(), ..sample() };
-        share.publish(large);
-        assert_eq!(lost(&share), Some(3 + EARLY_SAMPLES_MAX as u64));
-        (0..2).for_each(|_| share.publish(sample()));
-        assert_eq!(lost(&share), Some(4 + EARLY_SAMPLES_MAX as u64));
-        share.set_type(KnownType::Known(layout.clone()));
-        wait_until(|| share.published() == 2);
-        // Late samples are dropped unless they are kept for late joiners.
+        let lost = || data.drops().snapshot().get("no_definition").copied().unwrap_or_default();
         for keeps_history in [true, false] {
             slot.keeps_history = keeps_history;
-            let own = HashMap::from([(KNOWN, slot.clone())]);
-            share.set_map(SourceMap { per_writer: true, own, ..SourceMap::default() });
+            share.set_map(map_of(slot.clone()));
             share.set_type(KnownType::Asked);
             let long_ago = Instant::now().checked_sub(Duration::from_secs(60)).unwrap();
             lock(&share.inbox).early.push(long_ago, 1, sample());
-            let nowhere = FibEntry { trees: [].as_slice().into(), sinks: vec![] };
-            share.data.set(share.name, Some(Forward::new(nowhere, vec![], Arc::default())));
-            let (before, lost_before) = (share.published(), lost(&share));
+            let (before, lost_before) = (share.published(), lost());
             share.publish(sample());
             share.set_type(KnownType::Known(layout.clone()));
             let left = if keeps_history { 2 } else { 1 };
             wait_until(|| share.published() == before + left);
-            assert_eq!(lost(&share), lost_before.map(|n| n + 2 - left));
+            assert_eq!(lost(), lost_before + 2 - left);
         }
-        // Samples leave unconverted where that is configured.
-        share.set_type(KnownType::Asked);
-        share.publish(sample());
-        let before = share.published();
-        share.set_shaping(Shaping::default());
-        wait_until(|| share.published() == before + 1);
-    }
-
-    #[test]
-    fn rate_limited_topic_sends_the_newest_sample_and_never_drops_the_last() {
-        let runtime = tokio::runtime::Runtime::new().unwrap();
-        let _inside = runtime.enter();
-        let (share, slot) = share();
-        share.set_shaping(Shaping { interval: Some(Duration::from_millis(200)), ..Shaping::default() });
-        let begin = Instant::now();
-        for _ in 0..50 {
-            share.publish(sample(KNOWN, false));
-        }
-        wait_until(|| share.published() == 2);
-        assert!(begin.elapsed() >= Duration::from_millis(200));
-        assert_eq!(share.data.drops().snapshot()["thinned"], 48);
-        assert_eq!(unflushed(&slot), 0);
-        // The end of an instance leaves at once, after its held sample.
-        share.publish(sample(KNOWN, false));
-        share.publish(Sample { kind: SampleKind::Dispose, ..sample(KNOWN, false) });
-        assert_eq!(share.published(), 4);
-        // Without shaping, samples pass.
-        share.set_shaping(Shaping::default());
-        (0..10).for_each(|_| share.publish(sample(KNOWN, false)));
-        assert_eq!(share.published(), 14);
-    }
-
-    #[test]
-    fn reliable_messages_wait_for_their_bandwidth_until_it_is_closed() {
-        let runtime = tokio::runtime::Runtime::new().unwrap();
-        let _inside = runtime.enter();
-        let (share, _) = share();
-        share.set_shaping(Shaping { bits_per_s: Some(8 * 80), ..Shaping::default() });
-        let begin = Instant::now();
-        // 8 bytes each, at 80 bytes a second.
-        (0..4).for_each(|_| share.publish(sample(KNOWN, false)));
-        assert!(share.published() == 4 && begin.elapsed() >= Duration::from_millis(250));
-        share.set_shaping(Shaping { bits_per_s: Some(1), ..Shaping::default() });
-        share.publish(sample(KNOWN, false));
-        let waits = share.clone();
-        let thread = std::thread::spawn(move || waits.publish(sample(KNOWN, false)));
-        share.close();
-        thread.join().unwrap();
-        assert!(!share.data.drops().snapshot().contains_key("thinned"));
-    }
-
-    #[test]
-    fn stale_sample_is_dropped_unless_it_is_reliable() {
-        let runtime = tokio::runtime::Runtime::new().unwrap();
-        let _inside = runtime.enter();
-        let dated = |age_s: i64| Sample {
-            source_timestamp_ns: unix_ns() - age_s * 1_000_000_000,
-            ..sample(KNOWN, false)
-        };
-        for reliable in [true, false] {
-            let (share, mut slot) = share();
-            slot.reliable = reliable;
-            let own = HashMap::from([(KNOWN, slot)]);
-            share.set_map(SourceMap { per_writer: true, own, ..SourceMap::default() });
-            share.set_shaping(Shaping { max_age: Some(Duration::from_secs(5)), ..Shaping::default() });
-            [0, 60, 0].into_iter().for_each(|age| share.publish(dated(age)));
-            assert_eq!(share.published(), if reliable { 3 } else { 2 });
-        }
-    }
-
-    #[test]
-    fn an_epoch_is_over_once_however_often_that_is_asked() {
-        let runtime = tokio::runtime::Runtime::new().unwrap();
-        let _inside = runtime.enter();
-        let (share, slot) = share();
-        share.publish(sample(KNOWN, false));
-        assert!(!share.is_epoch_over());
-        share.publish(sample(KNOWN, false));
-        assert_eq!(slot.progress.published_in_epoch(), 2);
-        assert!(share.is_epoch_over());
-        assert!(!share.is_epoch_over());
-        share.rekey(grant(2));
-        while lock(&slot.source).epoch() == 1 {
-            std::thread::yield_now();
-        }
-        assert_eq!(slot.progress.published_in_epoch(), 0);
-    }
-
-    #[test]
-    fn a_share_is_looked_at_until_its_silence_was_told_three_times() {
-        let runtime = tokio::runtime::Runtime::new().unwrap();
-        let _inside = runtime.enter();
-        let (share, slot) = share();
-        let begin = Instant::now();
-        let at = |seconds| begin + Duration::from_secs(seconds);
-        assert!(!share.look_for_silence(at(0)), "nothing was published");
-        for _ in 0..2 {
-            share.publish(sample(KNOWN, false));
-            assert!(share.look_for_silence(at(100)) && share.look_for_silence(at(102)));
-            assert!(share.look_for_silence(at(105)) && share.look_for_silence(at(114)));
-            assert!(!share.look_for_silence(at(116)) && !share.look_for_silence(at(900)));
-        }
-        assert_eq!(slot.progress.published(), 2, "without anybody who listens nothing is said");
     }
 }
