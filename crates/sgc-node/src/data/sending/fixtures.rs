@@ -1,20 +1,23 @@
 //! Samples, sources and shares that the tests of several stages use.
 
 use std::collections::HashMap;
+use std::pin::pin;
 use std::sync::Arc;
+use std::task::{Context, Poll, Waker};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_cdr::{Layout, Library, TypeName};
 use sgc_endpoint::{RecoveryLimits, Source, SourceConfig};
 use sgc_ros::{Guid, Sample, SampleKind};
-use sgc_router::FibEntry;
+use sgc_router::{FibEntry, LinkId, Tree};
 use sgc_sync::lock;
 use sgc_trust::{MessageKey, Suite};
-use sgc_wire::{Class, Name, SecretBytes, SourceId, TopicGrant};
+use sgc_wire::{Class, HOP_LIMIT, Name, Packet, PacketHeader, SecretBytes, SourceId, TopicGrant};
 use tokio::sync::mpsc;
 
-use crate::data::dataplane::{DataPlane, Forward};
+use crate::data::dataplane::{DataPlane, Forward, Out};
+use crate::data::outflow::OutFlow;
 use crate::data::sending::share::LocalShare;
 use crate::data::sending::source_map::{SourceMap, SourceSlot};
 
@@ -72,6 +75,44 @@ pub(crate) fn share() -> (Arc<DataPlane>, Arc<LocalShare>, SourceSlot) {
 pub(crate) fn add_tree(data: &DataPlane) {
     let nowhere = FibEntry { trees: [].as_slice().into(), sinks: vec![] };
     data.set(NAME, Some(Forward::new(nowhere, vec![], Arc::default())));
+}
+
+/// Adds a link that wants the packets of the name. Only [`queued`] empties its queue.
+pub(crate) fn add_link(data: &DataPlane) -> Arc<OutFlow> {
+    let (link, flow) = (LinkId(1), OutFlow::idle());
+    let down = [link].as_slice().into();
+    let tree = Tree { up: LinkId::LOCAL, down, publishers: [].as_slice().into() };
+    let entry = FibEntry { trees: [tree].into(), sinks: vec![] };
+    let outs = vec![(link, Out::Link(flow.clone(), Arc::default()))];
+    data.set(NAME, Some(Forward::new(entry, outs, Arc::default())));
+    flow
+}
+
+/// Removes the oldest packet of a link's queue, if there is one.
+pub(crate) fn queued(flow: &OutFlow) -> Option<Packet> {
+    match pin!(flow.queued()).poll(&mut Context::from_waker(Waker::noop())) {
+        Poll::Ready(packet) => Some(packet),
+        Poll::Pending => None,
+    }
+}
+
+/// Creates a packet of one message.
+pub(crate) fn packet(seq: u64) -> Packet {
+    let header = PacketHeader {
+        reliable: true,
+        class: Class::Default,
+        hops: HOP_LIMIT,
+        suite: Suite::Standard.id(),
+        epoch: 1,
+        name: NAME,
+        source: SourceId([1; 16]),
+        seq,
+        total: 4,
+        index: 0,
+        grid: 16_384,
+        to: None,
+    };
+    Packet { header, payload: Bytes::from_static(b"data").into() }
 }
 
 /// Returns the number of packets that waited for a signature.

@@ -1,6 +1,8 @@
 //! The sending side of a topic: the path of a message from the local network to the links.
 
 pub(crate) mod assertions;
+mod emit;
+mod encode;
 #[cfg(test)]
 mod fixtures;
 pub(crate) mod intake;

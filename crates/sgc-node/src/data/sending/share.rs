@@ -5,7 +5,6 @@
 //! share a signature; none waits for a later one.
 
 use std::collections::BTreeMap;
-use std::pin::pin;
 use std::sync::atomic::Ordering::{Relaxed, SeqCst};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, fence};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, Weak};
@@ -13,27 +12,26 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use bytes::Bytes;
-use sgc_endpoint::{Compressor, Marks, PublishError, Source};
-use sgc_executor::WakeBatch;
-use sgc_ros::{Guid, KeyHash, Sample, SampleKind, Shaping};
-use sgc_router::LinkId;
+use sgc_endpoint::{Marks, PublishError, Source};
+use sgc_ros::{Guid, Sample, SampleKind, Shaping};
 use sgc_session::Shaper;
 use sgc_sync::lock;
 use sgc_wire::{
-    MessageHead, MessageKind, Name, Packet, PayloadEncoding, PayloadForm, Recover, SinkId, SourceId,
-    TopicGrant,
+    MessageHead, MessageKind, Name, PayloadEncoding, PayloadForm, Recover, SinkId, SourceId, TopicGrant,
 };
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, mpsc};
-use tracing::{debug, warn};
+use tracing::warn;
 
 use crate::clock::unix_ns;
-use crate::data::conversion::{self, KnownType, TypeSlot};
+use crate::data::conversion::KnownType;
 use crate::data::dataplane::DataPlane;
 use crate::data::pending::PendingQueue;
+use crate::data::sending::emit::EmitStage;
+use crate::data::sending::encode::{EncodeStage, EncodedPayload};
 use crate::data::sending::manual_lease::ASSERTION_LOOK_MAX;
 use crate::data::sending::source_map::{SourceChoice, SourceMap, SourceSlot};
-use crate::data::stats::{CountDrops, DataDrop, Dropped};
+use crate::data::stats::{DataDrop, Dropped};
 use crate::data::tap::{TapMessage, Taps};
 
 /// Whether a message exceeds the largest size that SGC carries.
@@ -61,14 +59,6 @@ struct DelayedSample {
     is_timed: bool,
 }
 
-/// Compression of messages, with its counters.
-#[derive(Default)]
-struct Compression {
-    encoding: Mutex<(PayloadEncoding, Compressor)>,
-    before: AtomicU64,
-    after: AtomicU64,
-}
-
 /// Samples and sources that wait.
 struct Inbox {
     /// Samples without a source or a type. DDS may deliver a late joiner's history before it discovers the writer, and
@@ -81,27 +71,21 @@ struct Inbox {
 /// This node's end of a topic that it shares or publishes on.
 pub(crate) struct LocalShare {
     name: Name,
-    data: Arc<DataPlane>,
     runtime: Handle,
     alive: mpsc::Sender<()>,
     map: ArcSwap<SourceMap>,
     inbox: Mutex<Inbox>,
+    encode: EncodeStage,
+    emit: EmitStage,
     /// Whether shaping is configured, readable without the lock.
     is_shaped: AtomicBool,
-    /// Whether shaping or compression is configured.
-    is_altered: AtomicBool,
-    /// Whether messages leave as JSON.
-    is_json: AtomicBool,
-    types: TypeSlot,
     held: Mutex<DelayedSample>,
-    compression: Compression,
     /// Notified when the share closes, to wake a thread that waits for a sample's time.
     ended: Condvar,
     /// Whether the log has said that reliable messages do not age.
     aged: AtomicBool,
     /// Number of waiting samples. It is readable without the lock, which a blocked publisher holds.
     waiting: AtomicUsize,
-    closed: AtomicBool,
     /// Messages of one source under one key before a new epoch begins.
     epoch_messages_max: u64,
     /// Whether the message limit of the epoch is reached and the next epoch has not begun.
@@ -134,24 +118,21 @@ impl LocalShare {
         epoch_messages_max: u64,
         over: Arc<Notify>,
     ) -> Self {
+        let runtime = Handle::current();
         let early = PendingQueue::new(EARLY_SAMPLES_MAX, data.holds().clone());
         Self {
             name,
-            data,
-            runtime: Handle::current(),
+            encode: EncodeStage::new(name),
+            emit: EmitStage::new(name, data, runtime.clone()),
+            runtime,
             alive,
             map: ArcSwap::default(),
             inbox: Mutex::new(Inbox { early, open: Vec::new() }),
             is_shaped: AtomicBool::new(false),
-            is_altered: AtomicBool::new(false),
-            is_json: AtomicBool::new(false),
-            types: TypeSlot::default(),
             held: Mutex::default(),
-            compression: Compression::default(),
             ended: Condvar::new(),
             aged: AtomicBool::new(false),
             waiting: AtomicUsize::new(0),
-            closed: AtomicBool::new(false),
             epoch_messages_max,
             rotating: AtomicBool::new(false),
             is_over: AtomicBool::new(false),
@@ -178,12 +159,10 @@ impl LocalShare {
     /// Sets the limits of rate, bandwidth and age.
     pub(crate) fn set_shaping(self: &Arc<Self>, shaping: Shaping) {
         lock(&self.held).shaper.set(shaping);
-        lock(&self.compression.encoding).0 = shaping.compression;
-        self.is_altered.store(shaping != Shaping::default(), SeqCst);
         let (compression, form) = (PayloadEncoding::Plain, PayloadForm::Cdr);
         let limits = Shaping { compression, form, ..shaping };
         self.is_shaped.store(limits != Shaping::default(), SeqCst);
-        if self.is_json.swap(shaping.form == PayloadForm::Json, SeqCst) {
+        if self.encode.configure(shaping.compression, shaping.form) {
             // Samples that waited for conversion need none any more.
             self.publish_waiting();
         }
@@ -191,7 +170,7 @@ impl LocalShare {
 
     /// Sets the state of the type. Samples that waited for it are published or dropped.
     pub(crate) fn set_type(self: &Arc<Self>, known: KnownType) {
-        self.types.set(known);
+        self.encode.set_type(known);
         self.publish_waiting();
     }
 
@@ -204,7 +183,7 @@ impl LocalShare {
     pub(crate) fn publish(self: &Arc<Self>, sample: Sample) {
         // If more samples follow or the sample is long, the runtime sends packets while this thread seals.
         let is_alone = !sample.more && sample.payload.len() <= AT_HAND_BYTES_MAX;
-        let _at_hand = is_alone.then(|| WakeBatch::begin(&self.runtime));
+        let _at_hand = is_alone.then(|| self.emit.begin_batch());
         if !self.is_shaped.load(Relaxed) {
             return self.publish_now(sample);
         }
@@ -220,11 +199,12 @@ impl LocalShare {
     /// Publishes a sample if that needs no waiting, or returns it. Receive threads of several readers call it.
     pub(crate) fn publish_at_once(&self, sample: Sample) -> Option<Sample> {
         let is_short = sample.payload.len() <= AT_HAND_BYTES_MAX;
-        if !is_short || self.is_altered.load(Relaxed) || !self.data.has_headroom(&self.name) {
+        let is_changed = self.is_shaped.load(Relaxed) || self.encode.is_active();
+        if !is_short || is_changed || !self.emit.has_headroom() {
             return Some(sample);
         }
         // The woken tasks run after the locks are released.
-        let _at_hand = WakeBatch::begin(&self.runtime);
+        let _at_hand = self.emit.begin_batch();
         // The holder of the lock may be blocked.
         let Ok(inbox) = self.inbox.try_lock() else { return Some(sample) };
         if !inbox.early.is_empty() || !inbox.open.is_empty() {
@@ -232,10 +212,14 @@ impl LocalShare {
         }
         match self.choose(sample.writer) {
             SourceChoice::UnknownWriter => return Some(sample),
-            SourceChoice::NoSource => self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted),
+            SourceChoice::NoSource => self.emit.count(Dropped::one(DataDrop::NotGranted)),
             SourceChoice::Source(slot) => {
                 let Ok(source) = slot.source.try_lock() else { return Some(sample) };
-                self.publish_of(&slot, Some(source), sample, false);
+                if !self.emit.is_closed()
+                    && let Err(dropped) = self.send(&slot, Some(source), sample, false)
+                {
+                    self.emit.count(dropped);
+                }
             }
         }
         None
@@ -260,14 +244,14 @@ impl LocalShare {
                 warn!(%topic, "`max_age` is set for a topic that is reliable: none of its messages may be left out, and it has no effect");
             }
         } else if held.shaper.is_too_old(unix_ns(), sample.source_timestamp_ns) {
-            self.data.count(LinkId::LOCAL, &self.name, DataDrop::TooOld);
+            self.emit.count(Dropped::one(DataDrop::TooOld));
             return None;
         }
         let mut now = Instant::now();
-        while !held.shaper.is_due(now) && !self.closed.load(Relaxed) {
+        while !held.shaper.is_due(now) && !self.emit.is_closed() {
             if held.shaper.gives_way(now, reliable) {
                 if held.sample.replace(sample).is_some() {
-                    self.data.count(LinkId::LOCAL, &self.name, DataDrop::Thinned);
+                    self.emit.count(Dropped::one(DataDrop::Thinned));
                 }
                 if !std::mem::replace(&mut held.is_timed, true) {
                     self.runtime.spawn(let_go(Arc::downgrade(self)));
@@ -279,7 +263,7 @@ impl LocalShare {
             now = Instant::now();
         }
         if held.sample.take().is_some() {
-            self.data.count(LinkId::LOCAL, &self.name, DataDrop::Thinned);
+            self.emit.count(Dropped::one(DataDrop::Thinned));
         }
         held.shaper.takes(now, sample.payload.len());
         Some(sample)
@@ -300,10 +284,10 @@ impl LocalShare {
         let mut inbox = lock(&self.inbox);
         self.publish_early(&mut inbox);
         if let Err(sample) = self.try_publish(sample, more, &mut inbox.open) {
-            let reason = if self.awaits_type() { DataDrop::NoDefinition } else { DataDrop::Stale };
+            let reason = if self.encode.awaits_type() { DataDrop::NoDefinition } else { DataDrop::Stale };
             let given_up = inbox.early.push(Instant::now(), sample.payload.len(), sample);
             if given_up > 0 {
-                self.data.count_here(&self.name, reason, given_up);
+                self.emit.count_here(Dropped { reason, messages: given_up });
             }
             self.waiting.store(inbox.early.len(), SeqCst);
             // The source may have been added between the two checks. A later `set_map` sees the waiting sample.
@@ -342,7 +326,7 @@ impl LocalShare {
         }
         fence(SeqCst);
         let (now, mut late) = (Instant::now(), 0);
-        if self.awaits_type() {
+        if self.encode.awaits_type() {
             late = inbox.early.give_up_late(now, |sample| self.is_given_up(sample));
         } else {
             for mut held in inbox.early.take() {
@@ -357,19 +341,14 @@ impl LocalShare {
             }
         }
         if late > 0 {
-            self.data.count_here(&self.name, DataDrop::NoDefinition, late);
+            self.emit.count_here(Dropped { reason: DataDrop::NoDefinition, messages: late });
         }
         self.waiting.store(inbox.early.len(), SeqCst);
     }
 
-    /// Returns `true` if messages leave as JSON and their type may still become known.
-    fn awaits_type(&self) -> bool {
-        self.is_json.load(Relaxed) && self.types.now().is_awaited()
-    }
-
     /// Returns `true` if a waiting sample is useless when late, because it is not kept for late joiners.
     fn is_given_up(&self, sample: &Sample) -> bool {
-        self.is_json.load(Relaxed)
+        self.encode.is_json()
             && sample.kind == SampleKind::Write
             && matches!(self.choose(sample.writer), SourceChoice::Source(slot) if !slot.keeps_history)
     }
@@ -377,15 +356,19 @@ impl LocalShare {
     /// Publishes a sample, or returns it if its source or its type is unknown. With `more`, the source may keep an
     /// unfinished batch and is then in `open`.
     fn try_publish(&self, sample: Sample, more: bool, open: &mut Vec<SourceSlot>) -> Result<(), Sample> {
-        let awaits_type = self.awaits_type();
+        let awaits_type = self.encode.awaits_type();
         match self.choose(sample.writer) {
             SourceChoice::UnknownWriter => return Err(sample),
             SourceChoice::Source(_) if awaits_type => return Err(sample),
-            SourceChoice::NoSource => self.data.count(LinkId::LOCAL, &self.name, DataDrop::NotGranted),
+            SourceChoice::NoSource => self.emit.count(Dropped::one(DataDrop::NotGranted)),
             SourceChoice::Source(slot) => {
-                let is_open = self.publish_of(&slot, None, sample, more);
-                if is_open && open.iter().all(|o| o.id != slot.id) {
-                    open.push(slot);
+                if self.emit.is_closed() {
+                    return Ok(());
+                }
+                match self.send(&slot, None, sample, more) {
+                    Ok(()) if more && open.iter().all(|o| o.id != slot.id) => open.push(slot),
+                    Ok(()) => {}
+                    Err(dropped) => self.emit.count(dropped),
                 }
             }
         }
@@ -397,84 +380,80 @@ impl LocalShare {
         self.map.load().choose(writer)
     }
 
-    /// Publishes a sample by its source, which may be locked already. Returns `true` if the source keeps an unfinished
-    /// batch, which only `more` allows.
-    fn publish_of(
+    /// Encodes, seals and emits a sample. Its source may be locked already. With `more`, the source may keep an
+    /// unfinished batch.
+    fn send(
         &self,
         slot: &SourceSlot,
         source: Option<MutexGuard<'_, Source>>,
         sample: Sample,
         more: bool,
-    ) -> bool {
-        if self.closed.load(Relaxed) {
-            return false;
-        }
-        let wanted = self.data.is_wanted(&self.name);
+    ) -> Result<(), Dropped> {
+        let wanted = self.emit.is_wanted();
         if !wanted && !slot.keeps_history && !slot.progress.recovers() {
-            self.data.count(LinkId::LOCAL, &self.name, DataDrop::NoTree);
-            return false;
+            return Err(Dropped::one(DataDrop::NoTree));
         }
         self.taps.offer(|| TapMessage::from_sample(&sample));
-        // Messages that cannot leave are not converted.
-        let written = match wanted || slot.keeps_history {
-            true => self.write(sample.kind, sample.key_hash, sample.payload),
-            false => Ok((PayloadForm::Cdr, PayloadEncoding::Plain, sample.payload)),
-        };
-        let (form, encoding, payload) = match written {
-            Ok(written) => written,
-            Err(reason) => {
-                self.data.count(LinkId::LOCAL, &self.name, reason);
-                return more;
+        let Sample { kind, source_timestamp_ns, key_hash, payload, .. } = sample;
+        let EncodedPayload { form, encoding, payload } = if wanted || slot.keeps_history {
+            let taken = payload.len();
+            let encoded = self.encode.encode(kind, key_hash, payload)?;
+            if kind == SampleKind::Write && self.is_shaped.load(Relaxed) {
+                lock(&self.held).shaper.corrects(taken, encoded.payload.len());
             }
+            encoded
+        } else {
+            EncodedPayload::unchanged(payload)
         };
-        let kind = match sample.kind {
+        let kind = match kind {
             SampleKind::Write => MessageKind::Write,
             SampleKind::Dispose => MessageKind::Dispose,
             SampleKind::Unregister => MessageKind::Unregister,
         };
-        let head = MessageHead { form, encoding, ..MessageHead::new(kind, sample.source_timestamp_ns) };
+        let head = MessageHead { form, encoding, ..MessageHead::new(kind, source_timestamp_ns) };
         if let Some(manual) = slot.manual.as_ref().filter(|_| wanted) {
             manual.note_heard(Instant::now());
         }
         let mut source = source.unwrap_or_else(|| lock(&slot.source));
         let result = if wanted {
             // Fragments leave while later ones are sealed, so a large message is under way before its end is read.
-            source.publish(&head, payload, more, self.emit())
+            source.publish(&head, payload, more, self.emit.packets())
         } else {
             // Nobody listens now, so the message is only kept for late joiners and rejoining sinks.
             source.record(&head, payload)
         };
         drop(source);
-        self.note_published(slot, result);
-        more
+        self.note_published(slot, result)
     }
 
     /// Publishes a request or a reply. It has no effect while nobody would receive it. May block.
     pub(crate) fn publish_call(&self, head: &MessageHead, payload: Bytes, to: Option<SinkId>) -> IsTooLarge {
         let Some(slot) = self.map.load().shared.clone() else { return IsTooLarge::No };
-        if self.closed.load(Relaxed) || !self.data.is_wanted(&self.name) {
+        if self.emit.is_closed() || !self.emit.is_wanted() {
             return IsTooLarge::No;
         }
         let mut source = lock(&slot.source);
         let result = match to {
-            Some(sink) => source.publish_to(sink, head, payload, self.emit()),
-            None => source.publish(head, payload, false, self.emit()),
+            Some(sink) => source.publish_to(sink, head, payload, self.emit.packets()),
+            None => source.publish(head, payload, false, self.emit.packets()),
         };
         drop(source);
-        let is_too_large = match result {
-            Err(PublishError::TooLarge { .. }) => IsTooLarge::Yes,
-            _ => IsTooLarge::No,
-        };
-        self.note_published(&slot, result);
-        is_too_large
+        match self.note_published(&slot, result) {
+            Ok(()) => IsTooLarge::No,
+            Err(dropped) => {
+                self.emit.count(dropped);
+                if dropped.reason == DataDrop::TooLarge { IsTooLarge::Yes } else { IsTooLarge::No }
+            }
+        }
     }
 
     /// Counts samples that were dropped before they came to the share.
     pub(crate) fn count_here(&self, dropped: Dropped) {
-        self.data.count_here(&self.name, dropped.reason, dropped.messages);
+        self.emit.count_here(dropped);
     }
 
-    fn note_published(&self, slot: &SourceSlot, result: Result<(), PublishError>) {
+    /// Notes a message that the source has sealed or kept.
+    fn note_published(&self, slot: &SourceSlot, result: Result<(), PublishError>) -> Result<(), Dropped> {
         match result {
             Ok(()) => {
                 self.published.fetch_add(1, Relaxed);
@@ -488,87 +467,23 @@ impl LocalShare {
                     self.over.notify_one();
                 }
             }
-            Err(PublishError::TooLarge { .. }) => {
-                self.data.count(LinkId::LOCAL, &self.name, DataDrop::TooLarge);
-            }
+            Err(PublishError::TooLarge { .. }) => return Err(Dropped::one(DataDrop::TooLarge)),
             Err(PublishError::Exhausted | PublishError::Keeps) => {
-                self.data.count(LinkId::LOCAL, &self.name, DataDrop::SourceExhausted);
+                return Err(Dropped::one(DataDrop::SourceExhausted));
             }
         }
-    }
-
-    /// Converts and compresses a payload.
-    fn write(
-        &self,
-        kind: SampleKind,
-        key_hash: Option<KeyHash>,
-        payload: Bytes,
-    ) -> Result<(PayloadForm, PayloadEncoding, Bytes), DataDrop> {
-        let taken = payload.len();
-        let is_converted = self.is_json.load(Relaxed) && kind == SampleKind::Write;
-        let (form, payload) = match key_hash.filter(|_| !is_converted) {
-            None => (PayloadForm::Cdr, payload),
-            Some(hash) => (PayloadForm::KeyedCdr, [&hash[..], &payload].concat().into()),
-        };
-        if !self.is_altered.load(Relaxed) || kind != SampleKind::Write {
-            return Ok((form, PayloadEncoding::Plain, payload));
-        }
-        let (form, payload) = if is_converted { self.convert(payload)? } else { (form, payload) };
-        let (encoding, payload) = self.compress(payload);
-        if self.is_shaped.load(Relaxed) {
-            lock(&self.held).shaper.corrects(taken, payload.len());
-        }
-        Ok((form, encoding, payload))
-    }
-
-    fn convert(&self, payload: Bytes) -> Result<(PayloadForm, Bytes), DataDrop> {
-        let known = self.types.now();
-        let layout = known.layout().ok_or(DataDrop::NoDefinition)?;
-        match conversion::to_json(layout, &payload) {
-            Ok(json) => Ok((PayloadForm::Json, json)),
-            Err(error) => {
-                debug!(name = %self.name.short(), %error, "a message is not sent");
-                Err(DataDrop::NotConverted)
-            }
-        }
-    }
-
-    fn compress(&self, payload: Bytes) -> (PayloadEncoding, Bytes) {
-        let mut compression = lock(&self.compression.encoding);
-        let (encoding, compressor) = &mut *compression;
-        if *encoding == PayloadEncoding::Plain {
-            return (PayloadEncoding::Plain, payload);
-        }
-        let packed = compressor.compress(*encoding, &payload);
-        let encoding = if packed.is_some() { *encoding } else { PayloadEncoding::Plain };
-        drop(compression);
-        let left = packed.unwrap_or_else(|| payload.clone());
-        self.compression.before.fetch_add(payload.len() as u64, Relaxed);
-        self.compression.after.fetch_add(left.len() as u64, Relaxed);
-        (encoding, left)
+        Ok(())
     }
 
     /// Returns the bytes before and after compression; `None` before the first message.
     pub(crate) fn compressed(&self) -> Option<(u64, u64)> {
-        let before = self.compression.before.load(Relaxed);
-        (before > 0).then(|| (before, self.compression.after.load(Relaxed)))
+        self.encode.compressed()
     }
 
     /// Finishes open batches, because no more messages follow.
     fn flush(&self, inbox: &mut Inbox) {
         for slot in inbox.open.drain(..) {
-            lock(&slot.source).flush(self.emit());
-        }
-    }
-
-    /// Returns a function that forwards packets. Packets of a history without a sink stay here.
-    fn emit(&self) -> impl FnMut(Packet) {
-        let wanted = self.data.is_wanted(&self.name);
-        move |packet| {
-            if wanted && !self.closed.load(Relaxed) {
-                // The future is passed by reference, since tokio boxes large futures.
-                sgc_executor::block_on(&self.runtime, pin!(self.data.forward(LinkId::LOCAL, packet)));
-            }
+            lock(&slot.source).flush(self.emit.packets());
         }
     }
 
@@ -579,7 +494,7 @@ impl LocalShare {
             let _alive = alive;
             for slot in share.map.load().slots() {
                 // A source that was created meanwhile has this key already, or a later one.
-                let _ = lock(&slot.source).rekey(&grant, share.emit());
+                let _ = lock(&slot.source).rekey(&grant, share.emit.packets());
             }
             share.rotating.store(false, Relaxed);
         });
@@ -597,11 +512,7 @@ impl LocalShare {
         if let Some(lifespan) = slot.lifespan {
             source.expire(unix_ns().saturating_sub(lifespan.as_nanos().try_into().unwrap_or(i64::MAX)));
         }
-        source.replay(recover.sink, recover.from, recover.to, |packet| {
-            if !self.closed.load(Relaxed) {
-                self.runtime.block_on(self.data.forward(LinkId::LOCAL, packet));
-            }
-        });
+        source.replay(recover.sink, recover.from, recover.to, self.emit.requested_packets());
     }
 
     /// Returns `true` once if a task has to look for liveliness assertions ([`super::assertions::watch`]).
@@ -616,7 +527,7 @@ impl LocalShare {
         now: Instant,
         renewed_ago: impl Fn(&Guid) -> Option<Duration>,
     ) -> Option<Duration> {
-        if self.closed.load(Relaxed) {
+        if self.emit.is_closed() {
             return None;
         }
         let mut map = self.map();
@@ -631,7 +542,7 @@ impl LocalShare {
         let manual =
             || map.own.iter().filter_map(|(writer, slot)| Some((writer, slot, slot.manual.as_ref()?)));
         let wait = manual().map(|(_, _, lease)| lease.look_every()).min().unwrap_or(ASSERTION_LOOK_MAX);
-        if !self.data.is_wanted(&self.name) {
+        if !self.emit.is_wanted() {
             return Some(wait);
         }
         let news = manual()
@@ -643,7 +554,7 @@ impl LocalShare {
                 // The holder of the source is blocked.
                 let Ok(mut source) = slot.source.try_lock() else { return };
                 for (publisher, lease) in news {
-                    if source.assert_publisher(publisher, share.emit()).is_ok() {
+                    if source.assert_publisher(publisher, share.emit.packets()).is_ok() {
                         lease.note_heard(now);
                     }
                 }
@@ -673,12 +584,12 @@ impl LocalShare {
             let mut busy = false;
             for slot in map.slots() {
                 let marks = marks.entry(slot.id).or_default();
-                if marks.is_due(now, &slot.progress) && self.data.is_wanted(&self.name) {
+                if marks.is_due(now, &slot.progress) && self.emit.is_wanted() {
                     let (share, slot) = (self.clone(), slot.clone());
                     self.run_blocking(move || {
                         // The holder of the source is about to publish.
                         if let Ok(mut source) = slot.source.try_lock() {
-                            source.mark(share.emit());
+                            source.mark(share.emit.packets());
                         }
                     });
                 }
@@ -700,7 +611,7 @@ impl LocalShare {
 
     /// Closes the share. A publishing reader's thread stops at the next packet.
     pub(crate) fn close(&self) {
-        self.closed.store(true, Relaxed);
+        self.emit.close();
         self.taps.close();
         let _held = lock(&self.held);
         self.ended.notify_all();
@@ -713,7 +624,7 @@ impl LocalShare {
 
     /// Returns `true` if messages have to leave as JSON and their type is unknown.
     pub(crate) fn lacks_definition(&self) -> bool {
-        self.is_json.load(Relaxed) && self.types.now().is_lacking()
+        self.encode.lacks_definition()
     }
 
     /// Returns the number of published messages.
@@ -728,7 +639,7 @@ async fn let_go(share: Weak<LocalShare>) {
         let due = {
             let Some(share) = share.upgrade() else { return };
             let mut held = lock(&share.held);
-            held.is_timed = held.sample.is_some() && !share.closed.load(Relaxed);
+            held.is_timed = held.sample.is_some() && !share.emit.is_closed();
             if !held.is_timed {
                 return;
             }
@@ -754,6 +665,7 @@ async fn let_go(share: Weak<LocalShare>) {
 mod tests {
     use super::*;
     use crate::data::sending::fixtures::{KNOWN, add_tree, map_of, sample, share, text_type, wait_until};
+    use crate::data::stats::CountDrops;
 
     #[test]
     fn late_sample_is_dropped_unless_it_is_kept_for_late_joiners() {

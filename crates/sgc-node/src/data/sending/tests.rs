@@ -1,21 +1,18 @@
 //! Samples through all stages of a share.
 
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use sgc_ros::{HandleSamples, Sample, SampleKind, Shaping};
-use sgc_router::{FibEntry, LinkId, Tree};
 use sgc_sync::lock;
 use sgc_wire::{PayloadEncoding, PayloadForm};
 
 use crate::clock::unix_ns;
 use crate::data::conversion::KnownType;
-use crate::data::dataplane::{DataPlane, Forward, Out};
-use crate::data::outflow::OutFlow;
+use crate::data::dataplane::DataPlane;
 use crate::data::pending::PENDING_BYTES_MAX;
 use crate::data::sending::fixtures::{
-    KNOWN, NAME, STRANGER, add_tree, grant, map_of, sample, share, text_type, unflushed, wait_until,
+    KNOWN, STRANGER, add_link, add_tree, grant, map_of, sample, share, text_type, unflushed, wait_until,
 };
 use crate::data::sending::intake::Publisher;
 use crate::data::sending::share::{AT_HAND_BYTES_MAX, EARLY_SAMPLES_MAX};
@@ -47,11 +44,7 @@ fn sample_that_would_block_is_handed_back() {
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let _inside = runtime.enter();
     let (data, share, slot) = share();
-    let flow = OutFlow::idle();
-    let (link, out) = (LinkId(1), Out::Link(flow.clone(), Arc::default()));
-    let tree = Tree { up: LinkId::LOCAL, down: [link].as_slice().into(), publishers: [].as_slice().into() };
-    let entry = FibEntry { trees: [tree].into(), sinks: vec![] };
-    data.set(NAME, Some(Forward::new(entry, vec![(link, out)], Arc::default())));
+    let flow = add_link(&data);
     let mut publisher = Publisher::new(share.clone(), None);
     let mut is_taken = |sample: Sample| publisher.handle_at_once(sample).is_none();
     assert!(is_taken(sample(KNOWN, false)));
