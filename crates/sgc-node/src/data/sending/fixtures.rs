@@ -13,7 +13,7 @@ use sgc_ros::{Guid, Sample, SampleKind};
 use sgc_router::{FibEntry, LinkId, Tree};
 use sgc_sync::lock;
 use sgc_trust::{MessageKey, Suite};
-use sgc_wire::{Class, HOP_LIMIT, Name, Packet, PacketHeader, SecretBytes, SourceId, TopicGrant};
+use sgc_wire::{Class, HOP_LIMIT, Name, Packet, PacketHeader, SecretBytes, SinkId, SourceId, TopicGrant};
 use tokio::sync::mpsc;
 
 use crate::data::dataplane::{DataPlane, Forward, Out};
@@ -28,6 +28,9 @@ pub(crate) const KNOWN: Guid = Guid([1; 16]);
 /// A writer without a source.
 pub(crate) const STRANGER: Guid = Guid([2; 16]);
 
+/// A sink behind the link of [`add_link`].
+pub(crate) const SINK: SinkId = SinkId([5; 16]);
+
 /// Creates a sample of eight bytes.
 pub(crate) fn sample(writer: Guid, more: bool) -> Sample {
     let payload = Bytes::from_static(b"\0\x01\0\0data");
@@ -41,19 +44,27 @@ pub(crate) fn grant(epoch: u32) -> TopicGrant {
     TopicGrant { epoch, suite: Suite::Standard.id(), key, sources: Vec::new(), entry: None }
 }
 
-/// Creates a reliable source that keeps a history.
-pub(crate) fn slot_with_id(id: u8) -> SourceSlot {
+fn new_source(id: u8, history_depth: usize, recovery: RecoveryLimits) -> Source {
     let config = SourceConfig {
         name: NAME,
         id: SourceId([id; 16]),
         class: Class::Default,
         reliable: true,
-        history_depth: 10,
+        history_depth,
         history_bytes_max: 1000,
-        recovery: RecoveryLimits::default(),
+        recovery,
     };
-    let source = Source::new(config, &grant(1), MessageKey::generate(Suite::Standard)).unwrap();
-    SourceSlot::new(source, true, true)
+    Source::new(config, &grant(1), MessageKey::generate(Suite::Standard)).unwrap()
+}
+
+/// Creates a reliable source that keeps a history.
+pub(crate) fn slot_with_id(id: u8) -> SourceSlot {
+    SourceSlot::new(new_source(id, 10, RecoveryLimits::default()), true, true)
+}
+
+/// Creates a reliable source that keeps nothing, and therefore may address single sinks.
+pub(crate) fn addressed_slot() -> SourceSlot {
+    SourceSlot::new(new_source(9, 0, RecoveryLimits::NONE), false, true)
 }
 
 /// Creates a map with a source for [`KNOWN`]. Samples of other writers wait until their writer is listed.
@@ -82,7 +93,7 @@ pub(crate) fn add_link(data: &DataPlane) -> Arc<OutFlow> {
     let (link, flow) = (LinkId(1), OutFlow::idle());
     let down = [link].as_slice().into();
     let tree = Tree { up: LinkId::LOCAL, down, publishers: [].as_slice().into() };
-    let entry = FibEntry { trees: [tree].into(), sinks: vec![] };
+    let entry = FibEntry { trees: [tree].into(), sinks: vec![(SINK, link)] };
     let outs = vec![(link, Out::Link(flow.clone(), Arc::default()))];
     data.set(NAME, Some(Forward::new(entry, outs, Arc::default())));
     flow

@@ -9,7 +9,9 @@ pub(crate) mod intake;
 pub(crate) mod manual_lease;
 pub(crate) mod message_keys;
 pub(crate) mod replays;
+mod seal;
 pub(crate) mod share;
+mod silence;
 pub(crate) mod source_map;
 #[cfg(test)]
 mod tests;

@@ -4,21 +4,18 @@
 //! queue of a reliable topic is full, only this thread waits, so other topics flow on. Samples that are ready together
 //! share a signature; none waits for a later one.
 
-use std::collections::BTreeMap;
 use std::sync::atomic::Ordering::{Relaxed, SeqCst};
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, fence};
+use std::sync::atomic::{AtomicBool, AtomicUsize, fence};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use bytes::Bytes;
-use sgc_endpoint::{Marks, PublishError, Source};
+use sgc_endpoint::Source;
 use sgc_ros::{Guid, Sample, SampleKind, Shaping};
 use sgc_session::Shaper;
 use sgc_sync::lock;
-use sgc_wire::{
-    MessageHead, MessageKind, Name, PayloadEncoding, PayloadForm, Recover, SinkId, SourceId, TopicGrant,
-};
+use sgc_wire::{MessageHead, MessageKind, Name, PayloadEncoding, PayloadForm, Recover, SinkId, TopicGrant};
 use tokio::runtime::Handle;
 use tokio::sync::{Notify, mpsc};
 use tracing::warn;
@@ -30,6 +27,7 @@ use crate::data::pending::PendingQueue;
 use crate::data::sending::emit::EmitStage;
 use crate::data::sending::encode::{EncodeStage, EncodedPayload};
 use crate::data::sending::manual_lease::ASSERTION_LOOK_MAX;
+use crate::data::sending::seal::{self, Destination, SealStage};
 use crate::data::sending::source_map::{SourceChoice, SourceMap, SourceSlot};
 use crate::data::stats::{DataDrop, Dropped};
 use crate::data::tap::{TapMessage, Taps};
@@ -76,6 +74,7 @@ pub(crate) struct LocalShare {
     map: ArcSwap<SourceMap>,
     inbox: Mutex<Inbox>,
     encode: EncodeStage,
+    seal: SealStage,
     emit: EmitStage,
     /// Whether shaping is configured, readable without the lock.
     is_shaped: AtomicBool,
@@ -86,19 +85,6 @@ pub(crate) struct LocalShare {
     aged: AtomicBool,
     /// Number of waiting samples. It is readable without the lock, which a blocked publisher holds.
     waiting: AtomicUsize,
-    /// Messages of one source under one key before a new epoch begins.
-    epoch_messages_max: u64,
-    /// Whether the message limit of the epoch is reached and the next epoch has not begun.
-    rotating: AtomicBool,
-    /// Whether the control task has yet to see that the epoch is over.
-    is_over: AtomicBool,
-    /// Wakes the control task, which may otherwise sleep while messages flow.
-    over: Arc<Notify>,
-    /// Progress of each source at the last look for silence.
-    marks: Mutex<BTreeMap<SourceId, Marks>>,
-    /// Whether all sources are silent. The next message clears it.
-    quiet: AtomicBool,
-    published: AtomicU64,
     taps: Taps,
     /// Whether a task looks for liveliness assertions.
     is_watched: AtomicBool,
@@ -123,6 +109,7 @@ impl LocalShare {
         Self {
             name,
             encode: EncodeStage::new(name),
+            seal: SealStage::new(epoch_messages_max, over),
             emit: EmitStage::new(name, data, runtime.clone()),
             runtime,
             alive,
@@ -133,13 +120,6 @@ impl LocalShare {
             ended: Condvar::new(),
             aged: AtomicBool::new(false),
             waiting: AtomicUsize::new(0),
-            epoch_messages_max,
-            rotating: AtomicBool::new(false),
-            is_over: AtomicBool::new(false),
-            over,
-            marks: Mutex::default(),
-            quiet: AtomicBool::new(true),
-            published: AtomicU64::new(0),
             taps: Taps::default(),
             is_watched: AtomicBool::new(false),
         }
@@ -414,16 +394,9 @@ impl LocalShare {
         if let Some(manual) = slot.manual.as_ref().filter(|_| wanted) {
             manual.note_heard(Instant::now());
         }
-        let mut source = source.unwrap_or_else(|| lock(&slot.source));
-        let result = if wanted {
-            // Fragments leave while later ones are sealed, so a large message is under way before its end is read.
-            source.publish(&head, payload, more, self.emit.packets())
-        } else {
-            // Nobody listens now, so the message is only kept for late joiners and rejoining sinks.
-            source.record(&head, payload)
-        };
-        drop(source);
-        self.note_published(slot, result)
+        let to = if wanted { Destination::Everyone { more } } else { Destination::History };
+        let source = source.unwrap_or_else(|| lock(&slot.source));
+        self.seal.seal(slot, source, &head, payload, to, &self.emit)
     }
 
     /// Publishes a request or a reply. It has no effect while nobody would receive it. May block.
@@ -432,13 +405,8 @@ impl LocalShare {
         if self.emit.is_closed() || !self.emit.is_wanted() {
             return IsTooLarge::No;
         }
-        let mut source = lock(&slot.source);
-        let result = match to {
-            Some(sink) => source.publish_to(sink, head, payload, self.emit.packets()),
-            None => source.publish(head, payload, false, self.emit.packets()),
-        };
-        drop(source);
-        match self.note_published(&slot, result) {
+        let to = to.map_or(Destination::Everyone { more: false }, Destination::Sink);
+        match self.seal.seal(&slot, lock(&slot.source), head, payload, to, &self.emit) {
             Ok(()) => IsTooLarge::No,
             Err(dropped) => {
                 self.emit.count(dropped);
@@ -452,29 +420,6 @@ impl LocalShare {
         self.emit.count_here(dropped);
     }
 
-    /// Notes a message that the source has sealed or kept.
-    fn note_published(&self, slot: &SourceSlot, result: Result<(), PublishError>) -> Result<(), Dropped> {
-        match result {
-            Ok(()) => {
-                self.published.fetch_add(1, Relaxed);
-                if self.quiet.load(Relaxed) && slot.progress.recovers() && self.quiet.swap(false, SeqCst) {
-                    self.over.notify_one();
-                }
-                if slot.progress.published_in_epoch() >= self.epoch_messages_max
-                    && !self.rotating.swap(true, Relaxed)
-                {
-                    self.is_over.store(true, SeqCst);
-                    self.over.notify_one();
-                }
-            }
-            Err(PublishError::TooLarge { .. }) => return Err(Dropped::one(DataDrop::TooLarge)),
-            Err(PublishError::Exhausted | PublishError::Keeps) => {
-                return Err(Dropped::one(DataDrop::SourceExhausted));
-            }
-        }
-        Ok(())
-    }
-
     /// Returns the bytes before and after compression; `None` before the first message.
     pub(crate) fn compressed(&self) -> Option<(u64, u64)> {
         self.encode.compressed()
@@ -483,26 +428,19 @@ impl LocalShare {
     /// Finishes open batches, because no more messages follow.
     fn flush(&self, inbox: &mut Inbox) {
         for slot in inbox.open.drain(..) {
-            lock(&slot.source).flush(self.emit.packets());
+            seal::finish_batch(&slot, &self.emit);
         }
     }
 
     /// Publishes under the key of a new epoch from here on. A blocked publisher takes it up after its message.
     pub(crate) fn rekey(self: &Arc<Self>, grant: TopicGrant) {
-        let (share, alive) = (self.clone(), self.alive.clone());
-        self.runtime.spawn_blocking(move || {
-            let _alive = alive;
-            for slot in share.map.load().slots() {
-                // A source that was created meanwhile has this key already, or a later one.
-                let _ = lock(&slot.source).rekey(&grant, share.emit.packets());
-            }
-            share.rotating.store(false, Relaxed);
-        });
+        let share = self.clone();
+        self.run_blocking(move || share.seal.rekey(&share.map.load(), &grant, &share.emit));
     }
 
     /// Returns `true` once per epoch, when a source has reached the message limit.
     pub(crate) fn is_epoch_over(&self) -> bool {
-        self.is_over.swap(false, SeqCst)
+        self.seal.is_epoch_over()
     }
 
     /// Sends a sink the requested history, in order with new messages. Blocks until it is sent.
@@ -574,39 +512,17 @@ impl LocalShare {
 
     /// Lets silent sources announce their last message. Returns `false` if none has to before the next message.
     pub(crate) fn look_for_silence(self: &Arc<Self>, now: Instant) -> bool {
-        if self.quiet.load(SeqCst) {
-            return false;
-        }
-        let map = self.map();
-        let mut marks = lock(&self.marks);
-        marks.retain(|id, _| map.slot(id).is_some());
-        let mut look = || {
-            let mut busy = false;
-            for slot in map.slots() {
-                let marks = marks.entry(slot.id).or_default();
-                if marks.is_due(now, &slot.progress) && self.emit.is_wanted() {
-                    let (share, slot) = (self.clone(), slot.clone());
-                    self.run_blocking(move || {
-                        // The holder of the source is about to publish.
-                        if let Ok(mut source) = slot.source.try_lock() {
-                            source.mark(share.emit.packets());
-                        }
-                    });
-                }
-                busy |= marks.deadline().is_some();
+        self.seal.look_for_silence(now, &self.map.load(), |slot| {
+            if self.emit.is_wanted() {
+                let (share, slot) = (self.clone(), slot.clone());
+                self.run_blocking(move || {
+                    // The holder of the source is about to publish.
+                    if let Ok(mut source) = slot.source.try_lock() {
+                        source.mark(share.emit.packets());
+                    }
+                });
             }
-            busy
-        };
-        if look() {
-            return true;
-        }
-        self.quiet.store(true, SeqCst);
-        // A message may have come between the two checks.
-        let busy = look();
-        if busy {
-            self.quiet.store(false, SeqCst);
-        }
-        busy
+        })
     }
 
     /// Closes the share. A publishing reader's thread stops at the next packet.
@@ -629,7 +545,7 @@ impl LocalShare {
 
     /// Returns the number of published messages.
     pub(crate) fn published(&self) -> u64 {
-        self.published.load(Relaxed)
+        self.seal.published()
     }
 }
 
