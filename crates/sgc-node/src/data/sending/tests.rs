@@ -14,8 +14,9 @@ use crate::data::pending::PENDING_BYTES_MAX;
 use crate::data::sending::fixtures::{
     KNOWN, STRANGER, add_link, add_tree, grant, map_of, sample, share, text_type, unflushed, wait_until,
 };
+use crate::data::sending::hold::{Downstream as _, EARLY_SAMPLES_MAX};
 use crate::data::sending::intake::Publisher;
-use crate::data::sending::share::{AT_HAND_BYTES_MAX, EARLY_SAMPLES_MAX};
+use crate::data::sending::share::AT_HAND_BYTES_MAX;
 use crate::data::stats::CountDrops;
 
 #[test]
@@ -105,6 +106,22 @@ fn sample_to_convert_waits_until_the_owner_describes_its_type() {
     assert_eq!(share.published(), 2);
     share.set_shaping(Shaping::default());
     wait_until(|| share.published() == 3);
+}
+
+#[test]
+fn only_data_that_no_late_joiner_gets_is_useless_late() {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let _inside = runtime.enter();
+    let (_, share, mut slot) = share();
+    share.set_shaping(Shaping { form: PayloadForm::Json, ..Shaping::default() });
+    assert!(!share.is_useless_late(&sample(KNOWN, false)), "it is kept");
+    slot.keeps_history = false;
+    share.set_map(map_of(slot));
+    assert!(share.is_useless_late(&sample(KNOWN, false)));
+    assert!(!share.is_useless_late(&sample(STRANGER, false)));
+    assert!(!share.is_useless_late(&Sample { kind: SampleKind::Dispose, ..sample(KNOWN, false) }));
+    share.set_shaping(Shaping::default());
+    assert!(!share.is_useless_late(&sample(KNOWN, false)), "it waits for no type");
 }
 
 #[test]
