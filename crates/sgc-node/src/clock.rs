@@ -14,3 +14,9 @@ pub(crate) fn now() -> Now {
 pub(crate) fn time_now() -> Instant {
     tokio::time::Instant::now().into_std()
 }
+
+/// Returns the wall-clock time that publishers stamp samples with, nanoseconds since the Unix epoch.
+pub(crate) fn unix_ns() -> i64 {
+    let unix = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    unix.as_nanos().try_into().unwrap_or(i64::MAX)
+}

@@ -28,7 +28,7 @@ use tracing::{info, warn};
 use crate::clock::now;
 use crate::control::event::CoreEvent;
 use crate::control::rules::Rules;
-use crate::data::message_keys::{MessageKeys, make_for};
+use crate::data::sending::message_keys::{MessageKeys, make_for};
 use crate::discovery::{self, Board, LinkKeeper};
 use crate::gateway::access::access_with;
 use crate::gateway::{Gateway, ShownKey, key_of_files};

@@ -22,8 +22,9 @@ use tokio::sync::mpsc;
 
 use crate::data::dataplane::{DataPlane, Forward, Out};
 use crate::data::outflow::OutFlow;
+use crate::data::sending::share::LocalShare;
+use crate::data::sending::source_map::{SourceMap, SourceSlot};
 use crate::data::sinks::LocalSink;
-use crate::data::sources::{LocalShare, SourceMap, SourceSlot};
 use crate::data::stats::Drops;
 use crate::data::writer_queue::{WriterInfo, WriterQueue};
 

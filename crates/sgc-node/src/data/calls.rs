@@ -19,8 +19,8 @@ use tokio::sync::Notify;
 use tracing::{debug, warn};
 
 use crate::data::call_ledger::{CallLedger, CallerId};
-use crate::data::sources::{IsTooLarge, LocalShare};
-use crate::data::stats::Drops;
+use crate::data::sending::share::{IsTooLarge, LocalShare};
+use crate::data::stats::{DataDrop, Dropped, Drops};
 use crate::data::writer_queue::failure_key;
 
 /// Longest wait of a message about a call for its local endpoint.
@@ -331,7 +331,7 @@ impl HandleCalls for Requests {
 fn count_unhandled(share: &LocalShare, ledger: &CallLedger, why: UnhandledCall, messages: u64) {
     match why {
         UnhandledCall::Overrun => {
-            share.count_overrun(messages);
+            share.count_here(Dropped { reason: DataDrop::Overrun, messages });
             ledger.count(CallLoss::Overrun, None, messages);
         }
         UnhandledCall::Unreadable => ledger.count(CallLoss::Unreadable, None, messages),

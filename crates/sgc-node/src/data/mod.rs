@@ -2,7 +2,6 @@
 
 #[cfg(test)]
 mod allocations;
-pub(crate) mod assertions;
 #[cfg(feature = "benchmarks")]
 #[doc(hidden)]
 pub mod benchmarks;
@@ -12,14 +11,11 @@ pub(crate) mod calls;
 pub(crate) mod conversion;
 pub(crate) mod dataplane;
 pub(crate) mod labels;
-pub(crate) mod manual_lease;
-pub(crate) mod message_keys;
 pub(crate) mod outflow;
 pub(crate) mod pending;
 pub(crate) mod queue;
-pub(crate) mod replays;
+pub(crate) mod sending;
 pub(crate) mod sinks;
-pub(crate) mod sources;
 pub(crate) mod spacing;
 pub(crate) mod stats;
 pub(crate) mod tap;

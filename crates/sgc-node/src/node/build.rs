@@ -26,7 +26,7 @@ use crate::control::event::{CoreEvent, INBOX_MAX};
 use crate::control::peer_rate::PeerRates;
 use crate::control::policy::grantees;
 use crate::control::rules::Rules;
-use crate::data::message_keys;
+use crate::data::sending::message_keys;
 use crate::data::sinks::SinkRequest;
 use crate::discovery::Board;
 use crate::gateway::access::{access_with, refused_tokens};

@@ -10,8 +10,8 @@ use super::Core;
 use crate::clock::now;
 use crate::control::event::CoreEvent;
 use crate::control::parts::publishers::{GrantStep, Offer, OfferStep};
-use crate::data::message_keys::MessageKeys;
-use crate::data::sources::SourceMap;
+use crate::data::sending::message_keys::MessageKeys;
+use crate::data::sending::source_map::SourceMap;
 
 impl<N: RosNetwork> Core<N> {
     /// Asks the owner of `name` for permission to publish, at once or when there is a signing key.

@@ -16,11 +16,12 @@ use crate::control::event::CoreEvent;
 use crate::control::parts::network_ends::OpenEnd;
 use crate::control::parts::publishers::Offer;
 use crate::control::parts::sinks::HistoryRequest;
-use crate::data::assertions;
 use crate::data::dataplane::{Forward, Out};
-use crate::data::manual_lease::ManualLease;
 use crate::data::outflow::{FlowLimits, OUTFLOW_AGE_MAX};
-use crate::data::sources::{Publisher, SourceMap, SourceSlot};
+use crate::data::sending::assertions;
+use crate::data::sending::intake::Publisher;
+use crate::data::sending::manual_lease::ManualLease;
+use crate::data::sending::source_map::{SourceMap, SourceSlot};
 use crate::data::writer_queue::WriterQueue;
 
 /// Least bytes of recovery kept for one of a topic's many publishers.

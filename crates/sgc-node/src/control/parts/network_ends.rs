@@ -10,7 +10,7 @@ use std::sync::Arc;
 use sgc_ros::EndpointSpec;
 use sgc_wire::{Name, SourceId};
 
-use crate::data::sources::NewestSamples;
+use crate::data::sending::intake::NewestSamples;
 
 /// Owner of an endpoint of the local network. Dropping it closes the endpoint, which may block.
 pub(crate) type OpenEnd = Box<dyn Any + Send>;

@@ -9,8 +9,8 @@ use sgc_ros::Shaping;
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, Name, NodeId, SourceId, SourceOffer, TopicGrant};
 
-use crate::data::message_keys::MessageKeys;
-use crate::data::sources::SourceSlot;
+use crate::data::sending::message_keys::MessageKeys;
+use crate::data::sending::source_map::SourceSlot;
 
 /// Time for which a publisher keeps the old key of another node's topic. The owner gives the others as long to get the
 /// new one.

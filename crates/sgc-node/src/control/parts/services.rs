@@ -13,7 +13,7 @@ use crate::control::event::ServiceEnd;
 use crate::control::parts::network_ends::OpenEnd;
 use crate::data::call_ledger::{CallLedger, LEDGERS_MAX};
 use crate::data::calls::{Calls, FarService, LocalService};
-use crate::data::sources::LocalShare;
+use crate::data::sending::share::LocalShare;
 use crate::data::stats::Drops;
 
 /// Shared and used services.

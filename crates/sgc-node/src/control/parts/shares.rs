@@ -8,7 +8,7 @@ use sgc_wire::Name;
 use tokio::sync::{Notify, mpsc};
 
 use crate::data::dataplane::DataPlane;
-use crate::data::sources::LocalShare;
+use crate::data::sending::share::LocalShare;
 
 /// Interval of checks for sources that may have fallen silent.
 const SILENCE_LOOK: Duration = Duration::from_secs(1);

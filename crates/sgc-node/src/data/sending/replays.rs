@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use sgc_sync::lock;
 use sgc_wire::{Name, Recover, SinkId, SourceId};
 
-use crate::data::sources::LocalShare;
+use crate::data::sending::share::LocalShare;
 
 /// Answers that may be sent at once.
 pub(crate) const REPLAYS_MAX: usize = 16;
@@ -88,7 +88,7 @@ mod tests {
     use tokio::sync::mpsc;
 
     use super::*;
-    use crate::data::sources::{SourceMap, SourceSlot};
+    use crate::data::sending::source_map::{SourceMap, SourceSlot};
 
     const NAME: Name = Name([1; 32]);
 

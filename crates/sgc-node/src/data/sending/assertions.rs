@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use sgc_ros::{Guid, RosNetwork};
 
-use crate::data::sources::LocalShare;
+use crate::data::sending::share::LocalShare;
 use crate::local::network_slot::NetworkSlot;
 
 /// Publishes assertions of a share's publishers, while there are any that may assert manually.
