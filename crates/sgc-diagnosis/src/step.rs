@@ -1,6 +1,7 @@
 //! Steps of a walk along the path of a topic: the findings of `sgc why`.
 
 use serde::Serialize;
+use sgc_process::output;
 
 /// The result of a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -46,5 +47,20 @@ impl Step {
     #[must_use]
     pub fn with_fix(self, fix: impl Into<String>) -> Self {
         Self { fix: Some(fix.into()), ..self }
+    }
+
+    /// Returns the lines of `sgc why`: the finding behind a mark, and the advice.
+    pub fn lines(&self) -> Vec<String> {
+        let mark = match self.verdict {
+            Verdict::Fine => '✓',
+            Verdict::Wrong => '✗',
+            Verdict::Unknown => '?',
+        };
+        let fix = self.fix.as_ref().map(|fix| format!("    {fix}"));
+        [Some(format!("{mark} {}", self.found)), fix]
+            .into_iter()
+            .flatten()
+            .map(|line| output::clean(&line))
+            .collect()
     }
 }

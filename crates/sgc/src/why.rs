@@ -51,16 +51,8 @@ pub(crate) fn why(args: &WhyArgs) -> Result<ExitCode, CliError> {
     if args.json {
         output::line(serde_json::to_string(&steps).unwrap_or_default())?;
     } else {
-        for step in &steps {
-            let mark = match step.verdict {
-                Verdict::Fine => '✓',
-                Verdict::Wrong => '✗',
-                Verdict::Unknown => '?',
-            };
-            output::line(output::clean(&format!("{mark} {}", step.found)))?;
-            if let Some(fix) = &step.fix {
-                output::line(output::clean(&format!("    {fix}")))?;
-            }
+        for line in steps.iter().flat_map(Step::lines) {
+            output::line(line)?;
         }
     }
     Ok(if is_wrong { ExitCode::from(EXIT_FAILURE) } else { ExitCode::SUCCESS })
