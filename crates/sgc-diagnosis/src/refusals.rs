@@ -2,21 +2,14 @@
 //!
 //! The specification of routing lists the counters, and the node keeps them. `tests/documents` compares both with this table.
 
-use std::collections::BTreeMap;
-
-use sgc_node::graph::Graph;
 use sgc_transport::PeerRefusal;
 use sgc_trust::CertError;
 use sgc_wire::{RefuseReason, RejectReason};
 
-use crate::links::link_of;
-use crate::step::Step;
-
-/// Most refusals that `sgc why` reports before its walk, by descending count.
-const NAMED_MAX: usize = 8;
-
+/// The counter of packets that nobody asked for.
+pub(crate) const NO_SUBSCRIBER: &str = "no_subscriber";
 /// A counter's explanation.
-#[derive(Debug)]
+#[derive(Debug, PartialEq, Eq)]
 pub struct Refusal {
     /// The counter, as the node spells it.
     pub key: &'static str,
@@ -97,7 +90,7 @@ const SLOW_CLIENTS: &str = "if it is somebody who connects again and again, keep
                             host have places of their own";
 
 /// Refusals of control frames, of the machines, of the authority and of the local network.
-const CONTROL: &[Refusal] = &[
+pub(crate) const CONTROL: &[Refusal] = &[
     named(
         "not_verified",
         "a neighbour brought what is not signed as it says, or under a certificate that does not hold here: over, revoked with \
@@ -511,7 +504,7 @@ const SINK: &[Refusal] = &[
 ];
 
 /// Refusals of peers that requested a link.
-const DOOR: &[Refusal] = &[
+pub(crate) const DOOR: &[Refusal] = &[
     named(
         "no_certificate",
         "it showed no certificate",
@@ -568,7 +561,7 @@ const DOOR: &[Refusal] = &[
 ];
 
 /// Refusals of programs at the gateway.
-const GATEWAY: &[Refusal] = &[
+pub(crate) const GATEWAY: &[Refusal] = &[
     named("too many clients", "all places for clients are taken", RAISE_CLIENTS),
     named(
         "too many clients of other hosts",
@@ -757,44 +750,12 @@ pub(crate) fn gateway_meaning(row: &str) -> String {
     find(GATEWAY, row).map_or_else(String::new, |refusal| refusal.means.to_owned())
 }
 
-/// Returns a step for each refusal on which an operator has to act, with the current links that cause it.
-pub(crate) fn steps(graph: &Graph) -> Vec<Step> {
-    let counts = [
-        ("refused here", CONTROL, &graph.drops),
-        ("peers refused a link", DOOR, &graph.refused),
-        ("programs refused at the gateway", GATEWAY, &graph.gateway_refused),
-    ];
-    let of = |(what, table, counts): (&'static str, &'static [Refusal], &'_ BTreeMap<String, u64>)| {
-        let counted = |refusal: &'static Refusal| {
-            let count = counts.get(refusal.key).copied().filter(|count| *count > 0)?;
-            let by = culprits(graph, refusal.key);
-            let found = format!("{what}: {} {count}{by} ({})", refusal.key, refusal.means);
-            let step = Step::unknown(found);
-            Some((count, if refusal.fix.is_empty() { step } else { step.with_fix(refusal.fix) }))
-        };
-        table.iter().filter(|refusal| refusal.is_named).filter_map(counted).collect::<Vec<_>>()
-    };
-    let mut all: Vec<_> = counts.into_iter().flat_map(of).collect();
-    all.sort_by_key(|(count, _)| std::cmp::Reverse(*count));
-    all.into_iter().take(NAMED_MAX).map(|(_, step)| step).collect()
-}
-
-/// Returns the peers of current links that cause a refusal.
-fn culprits(graph: &Graph, key: &str) -> String {
-    let of_link = |link: &sgc_node::graph::Link| {
-        let count = graph.drops.get(&format!("{key} from link {}", link.id))?;
-        Some(format!("{count} over {}", link_of(graph, link.id)))
-    };
-    let all: Vec<_> = graph.links.iter().filter_map(of_link).collect();
-    if all.is_empty() { String::new() } else { format!(", of these {}", all.join(", ")) }
-}
-
 fn find(table: &'static [Refusal], key: &str) -> Option<&'static Refusal> {
     table.iter().find(|refusal| refusal.key == key)
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     #![allow(clippy::unwrap_used, clippy::panic)]
 
     use std::collections::BTreeSet;
@@ -802,12 +763,6 @@ pub(crate) mod tests {
     use sgc_transport::RefusalKind;
 
     use super::*;
-    use crate::step::Verdict;
-
-    /// Returns the refusals that are reported for any topic.
-    pub(crate) fn every_named_refusal() -> impl IntoIterator<Item = &'static str> {
-        CONTROL.iter().filter(|refusal| refusal.is_named).map(|refusal| refusal.key)
-    }
 
     fn keys(table: &[Refusal]) -> BTreeSet<String> {
         table.iter().map(|refusal| refusal.key.to_owned()).collect()
@@ -848,27 +803,5 @@ pub(crate) mod tests {
         }
         // The walk names the entry to add to the policy.
         assert_eq!(fix_at_owner(&Refuse::NotPermitted.to_string()), None);
-    }
-
-    #[test]
-    fn refusals_are_reported_with_remedy_unless_sound_network_causes_them() {
-        for (place, table) in [CONTROL, DOOR, GATEWAY].into_iter().enumerate() {
-            for refusal in table {
-                let mut graph = Graph::default();
-                let counts = match place {
-                    0 => &mut graph.drops,
-                    1 => &mut graph.refused,
-                    _ => &mut graph.gateway_refused,
-                };
-                counts.insert(refusal.key.to_owned(), 3);
-                let steps = steps(&graph);
-                assert_eq!(steps.len(), usize::from(refusal.is_named), "{refusal:?}");
-                for step in steps {
-                    assert_eq!(step.verdict, Verdict::Unknown);
-                    assert!(step.found.contains(&format!("{} 3 ({})", refusal.key, refusal.means)));
-                    assert_eq!(step.fix.as_deref().unwrap_or_default(), refusal.fix);
-                }
-            }
-        }
     }
 }

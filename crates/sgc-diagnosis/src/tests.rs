@@ -16,6 +16,7 @@ use self::scenarios::{
     NAME, end, owner, owner_faults, pattern, publisher, publisher_faults, qos, sound, user, user_faults,
 };
 use crate::diagnose;
+use crate::refusals::{CONTROL, DOOR, GATEWAY};
 use crate::step::Verdict;
 
 /// Returns the step with the fault, and its remedy.
@@ -26,15 +27,15 @@ fn wrong(graph: &Graph, topic: &str) -> String {
         [] => String::new(),
         [step] => {
             assert_eq!(Some(step), steps.last(), "what is wrong comes last: {steps:?}");
-            assert!(step.fix.as_ref().is_some_and(|fix| !fix.is_empty()));
-            step.found.clone()
+            assert!(step.fix().as_ref().is_some_and(|fix| !fix.is_empty()));
+            step.found()
         }
         _ => panic!("one thing is wrong at a time: {steps:?}"),
     }
 }
 
 fn named(graph: &Graph) -> Vec<(Verdict, String)> {
-    diagnose::name(graph, NAME).into_iter().map(|step| (step.verdict, step.found)).collect()
+    diagnose::name(graph, NAME).into_iter().map(|step| (step.verdict, step.found())).collect()
 }
 
 #[test]
@@ -62,7 +63,7 @@ fn each_fault_of_owner_is_named() {
 fn publishers_whose_assertions_are_not_seen_elsewhere_are_pointed_out() {
     let said = |graph: &Graph| {
         let steps = diagnose::interface(graph, "/a");
-        steps.iter().any(|step| step.verdict == Verdict::Unknown && step.found.contains("MANUAL_BY_TOPIC"))
+        steps.iter().any(|step| step.verdict == Verdict::Unknown && step.found().contains("MANUAL_BY_TOPIC"))
     };
     let with = |mut graph: Graph, liveliness, lease_ms: u64| {
         graph.endpoints[0].qos = Qos { liveliness, lease_ns: Some(lease_ms * 1_000_000), ..qos() };
@@ -87,7 +88,7 @@ fn each_fault_of_user_is_named() {
 fn fix(graph: &Graph) -> String {
     let steps = diagnose::interface(graph, "/a");
     let step = steps.into_iter().find(|step| step.verdict == Verdict::Wrong);
-    step.and_then(|step| step.fix).unwrap_or_default()
+    step.and_then(|step| step.fix()).unwrap_or_default()
 }
 
 #[test]
@@ -147,6 +148,7 @@ fn refused_topic_has_remedy_of_its_reason_at_both_ends() {
     let mut graph = user();
     graph.uses[0].has_catalogue = false;
     graph.uses[0].owner_state = Some(format!("refuses its catalogue: {}", RejectReason::Limit));
+    graph.uses[0].owner_refusal = Some(RejectReason::Limit.to_string());
     assert!(fix(&graph).contains("no place for more branches or requests"), "{}", fix(&graph));
 }
 
@@ -163,8 +165,8 @@ fn refusals_and_their_peers_precede_walk() {
     graph.refused = [("too_many_from_address".to_owned(), 400), ("revoked".to_owned(), 3)].into();
     graph.gateway_refused = [("too many clients of one credential".to_owned(), 5)].into();
     let steps = diagnose::interface(&graph, "/a");
-    let said = steps.iter().filter(|step| step.verdict == Verdict::Unknown && step.fix.is_some());
-    let said: Vec<_> = said.map(|step| step.found.as_str()).take(4).collect();
+    let said = steps.iter().filter(|step| step.verdict == Verdict::Unknown && step.fix().is_some());
+    let said: Vec<_> = said.map(|step| step.found()).take(4).collect();
     assert!(
         said[0].starts_with("peers refused a link: too_many_from_address 400 (too many were"),
         "{said:?}"
@@ -176,14 +178,35 @@ fn refusals_and_their_peers_precede_walk() {
     );
     assert!(said[3].starts_with("peers refused a link: revoked 3"), "{said:?}");
     // Refusals that a sound network causes are not reported.
-    assert!(!steps.iter().any(|step| step.found.contains("unknown 30")));
+    assert!(!steps.iter().any(|step| step.found().contains("unknown 30")));
     // A router, which knows only names, reports the same.
     assert!(named(&graph).iter().any(|(_, found)| found.contains("crl_flood 9")));
     // Only the most frequent refusals are reported.
-    let all = crate::refusals::tests::every_named_refusal();
-    graph.drops.extend(all.into_iter().map(|key| (key.to_owned(), 1)));
+    let all = CONTROL.iter().filter(|refusal| refusal.is_named);
+    graph.drops.extend(all.map(|refusal| (refusal.key.to_owned(), 1)));
     let steps = diagnose::interface(&graph, "/a");
-    assert_eq!(steps.iter().filter(|step| step.found.starts_with("refused here: ")).count(), 8 - 3);
+    assert_eq!(steps.iter().filter(|step| step.found().starts_with("refused here: ")).count(), 8 - 3);
+}
+
+#[test]
+fn refusals_are_reported_with_remedy_unless_sound_network_causes_them() {
+    for (place, table) in [CONTROL, DOOR, GATEWAY].into_iter().enumerate() {
+        for refusal in table {
+            let mut graph = sound();
+            let counts = match place {
+                0 => &mut graph.drops,
+                1 => &mut graph.refused,
+                _ => &mut graph.gateway_refused,
+            };
+            counts.insert(refusal.key.to_owned(), 3);
+            let said = format!("{} 3 ({})", refusal.key, refusal.means);
+            let steps = diagnose::name(&graph, NAME);
+            let step = steps.iter().find(|step| step.found().contains(&said));
+            assert_eq!(step.is_some(), refusal.is_named, "{refusal:?}");
+            assert!(step.is_none_or(|step| step.verdict == Verdict::Unknown));
+            assert!(step.is_none_or(|step| step.fix().unwrap_or_default() == refusal.fix), "{refusal:?}");
+        }
+    }
 }
 
 #[test]
@@ -332,10 +355,10 @@ fn covering_patterns_are_chosen_by_kind() {
     assert!(wrong(&graph, "/a").contains("1 local publishers have it, but no rule names it"));
     graph.endpoints = vec![end("/rosout", false)];
     let steps = diagnose::interface(&graph, "/rosout");
-    assert!(steps.last().unwrap().found.contains("does not share /robot/rosout"), "{steps:?}");
+    assert!(steps.last().unwrap().found().contains("does not share /robot/rosout"), "{steps:?}");
     graph.uses[1].topic = "/**".into();
     let steps = diagnose::interface(&graph, "/rosout");
-    let fix = steps.last().unwrap().fix.as_deref().unwrap_or_default();
+    let fix = steps.last().unwrap().fix().unwrap_or_default();
     assert!(fix.contains("no wildcard shares it; name it, [[share]] topic = \"/rosout\""), "{steps:?}");
 }
 
@@ -349,7 +372,7 @@ fn incompatible_subscribers_beside_matched_ones_are_no_fault() {
     assert!(
         steps
             .iter()
-            .any(|s| s.verdict == Verdict::Unknown && s.found.starts_with("1 of 2 local subscribers"))
+            .any(|s| s.verdict == Verdict::Unknown && s.found().starts_with("1 of 2 local subscribers"))
     );
 }
 
@@ -369,7 +392,7 @@ fn routers_know_names() {
 /// Returns the first finding of a walk with this verdict.
 fn found(graph: &Graph, verdict: Verdict) -> Option<String> {
     let steps = diagnose::interface(graph, "/a");
-    steps.into_iter().find(|step| step.verdict == verdict).map(|step| step.found)
+    steps.into_iter().find(|step| step.verdict == verdict).map(|step| step.found())
 }
 
 #[test]
@@ -403,7 +426,7 @@ fn operator_mistakes_come_first() {
     );
     let at_router = diagnose::name(&Graph { alerts: vec![clock.clone()], ..sound() }, NAME);
     assert_eq!(
-        at_router.last().map(|step| (step.verdict, step.found.clone())),
+        at_router.last().map(|step| (step.verdict, step.found())),
         Some((Verdict::Wrong, clock.to_string()))
     );
 }
@@ -418,7 +441,7 @@ fn unknown_member_names_are_reported() {
     let hints: Vec<_> = diagnose::interface(&graph, "/a")
         .into_iter()
         .filter(|step| step.verdict == Verdict::Unknown)
-        .map(|step| step.found)
+        .map(|step| step.found())
         .collect();
     assert_eq!(hints[0], "the [[share]] names \"deks\", which nobody here is called; \"desk\" is here");
     assert!(
@@ -447,18 +470,18 @@ fn lost_calls_are_fault_until_calls_are_answered() {
     };
     let fault = wrong(&lost("call_server_gone", 3, 5));
     let said = "/a: 3 calls of clients here got no answer, among them 2 of /caller, the last 5 s ago: call_server_gone";
-    assert!(fault.len() == 1 && fault[0].found.starts_with(said), "{fault:?}");
-    assert!(fault[0].fix.as_ref().unwrap().contains("start the server again"));
+    assert!(fault.len() == 1 && fault[0].found().starts_with(said), "{fault:?}");
+    assert!(fault[0].fix().as_ref().unwrap().contains("start the server again"));
     for graph in
         [lost("call_server_gone", 0, 5), lost("call_server_gone", 3, 601), lost("call_client_gone", 3, 5)]
     {
         assert_eq!(wrong(&graph), []);
         let steps = diagnose::interface(&graph, "/a");
-        assert!(steps.iter().any(|step| step.found.contains("3 calls of clients here got no answer")));
+        assert!(steps.iter().any(|step| step.found().contains("3 calls of clients here got no answer")));
     }
     // Another fault comes last, as the only one.
     let mut graph = lost("call_withdrawn", 3, 5);
     graph.links.clear();
     let fault = wrong(&graph);
-    assert!(fault.len() == 1 && fault[0].found.contains("no link is up"), "{fault:?}");
+    assert!(fault.len() == 1 && fault[0].found().contains("no link is up"), "{fault:?}");
 }

@@ -72,10 +72,7 @@ fn graph(
             Ok(walk(&graph))
         }
         Err(error @ (CliError::Diagnosis(DiagnosisError::NoNode { .. }) | CliError::NoNodeHere { .. })) => {
-            Ok(vec![Step::wrong(
-                error.to_string(),
-                "start it with `sgc run -c FILE`; if it runs elsewhere, ask there, or as the user that runs it",
-            )])
+            Ok(vec![Step::no_node(error.to_string())])
         }
         Err(error) => Err(error),
     }

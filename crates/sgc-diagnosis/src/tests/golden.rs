@@ -5,7 +5,7 @@ use std::path::Path;
 
 use sgc_node::alerts::Alert;
 use sgc_node::graph::{
-    Endpoint, Graph, Interface, Link, LostCalls, NameLine, Qos, ServiceCalls, Share, ShareRoute,
+    Endpoint, Graph, Interface, JoinState, Link, LostCalls, NameLine, Qos, ServiceCalls, Share, ShareRoute,
     UnheardMember, Use,
 };
 use sgc_transport::PeerRefusal;
@@ -164,7 +164,7 @@ fn more_faults(side: &str) -> Vec<Case> {
             }),
             ("asked an owner that is linked", |g| {
                 g.uses[0].has_catalogue = false;
-                g.uses[0].follow = Some("asked".into());
+                g.uses[0].follow = Some(JoinState::Asked);
                 g.links[0].name = Some("arm".into());
             }),
             ("an owner without name shares it", |g| {
@@ -373,8 +373,9 @@ fn reasons() -> Vec<Scenario> {
         all.push(last(&format!("user is refused: {why}"), &graph));
         let mut graph = user();
         graph.uses[0].has_catalogue = false;
-        graph.uses[0].follow = Some("refused".into());
+        graph.uses[0].follow = Some(JoinState::Refused);
         graph.uses[0].owner_state = Some(format!("refuses its catalogue: {why}"));
+        graph.uses[0].owner_refusal = Some(why.clone());
         all.push(last(&format!("the catalogue is refused: {why}"), &graph));
     }
     let peers = [

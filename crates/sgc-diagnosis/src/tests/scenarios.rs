@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 
 use sgc_node::graph::{
-    Endpoint, Graph, Interface, Link, NameLine, Offer, Qos, Search, Share, ShareRoute, Use, UseRoute,
+    Endpoint, Graph, Interface, JoinState, Link, NameLine, Offer, Qos, Search, Share, ShareRoute, Use,
+    UseRoute,
 };
 
 pub(super) const STRING: &str = "std_msgs/msg/String";
@@ -197,8 +198,9 @@ pub(super) fn user_faults() -> Vec<Case> {
         }),
         ("arm refuses its catalogue: x: it is in reach and refuses this node", |g| {
             g.uses[0].has_catalogue = false;
-            g.uses[0].follow = Some("refused".into());
+            g.uses[0].follow = Some(JoinState::Refused);
             g.uses[0].owner_state = Some("refuses its catalogue: x".into());
+            g.uses[0].owner_refusal = Some("x".into());
         }),
         ("arm is in reach and does not share /a with here; did you mean /robot/a?", |g| {
             g.uses[0].routes.clear();
@@ -225,7 +227,7 @@ pub(super) fn user_faults() -> Vec<Case> {
         }),
         ("no way leads to it now", |g| {
             g.uses[0].routes[0].is_granted = false;
-            g.uses[0].routes[0].join = Some("waiting".into());
+            g.uses[0].routes[0].join = Some(JoinState::Waiting);
         }),
         ("the answer is not here yet", |g| g.uses[0].routes[0].is_granted = false),
         ("is silent", |g| g.links[0].silent = true),

@@ -4,10 +4,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
-use sgc_endpoint::JoinStatus;
 use sgc_ros::{
-    Direction, DiscoveredEndpoint, EndpointKind, EndpointSpec, RosNetwork, Sample, SampleHandler, ShareView,
-    UseView, dds_topic, dds_type, reader_for, ros_topic, ros_type, weakest,
+    Direction, DiscoveredEndpoint, EndpointKind, EndpointSpec, OwnerState, RosNetwork, Sample, SampleHandler,
+    ShareView, UseView, dds_topic, dds_type, reader_for, ros_topic, ros_type, weakest,
 };
 use sgc_transport::Link as _;
 use sgc_trust::{Grantees, Policy};
@@ -155,6 +154,10 @@ impl<N: RosNetwork> Core<N> {
             names.insert(name);
             (Some(name.to_string()), refused.map(|by| by.to_string()))
         });
+        let owner_refusal = match &view.owner_state {
+            Some(OwnerState::Refuses(by)) => Some(by),
+            _ => None,
+        };
         let mut used = Use {
             kind: view.kind.into(),
             publishes,
@@ -164,8 +167,9 @@ impl<N: RosNetwork> Core<N> {
             owner_id: view.owner.to_string(),
             owner: view.owner_name.to_owned(),
             owner_meant: self.members.owner_meant(view.owner_name).map(str::to_owned),
+            owner_refusal: owner_refusal.map(|by| by.to_string()),
             owner_state: view.owner_state.map(owner_state),
-            follow: self.endpoint.follow_status(&view.owner).map(|s| label(&s).to_owned()),
+            follow: self.endpoint.follow_status(&view.owner).map(|status| (&status).into()),
             has_catalogue: view.has_catalogue,
             is_token: name.is_some(),
             name,
@@ -184,7 +188,7 @@ impl<N: RosNetwork> Core<N> {
                 qos: (&route.entry.qos).into(),
                 is_granted: route.is_granted,
                 refused: route.refused.map(|by| by.to_string()),
-                join: self.endpoint.join_status(&route.name).map(|s| label(&s).to_owned()),
+                join: self.endpoint.join_status(&route.name).map(|status| (&status).into()),
                 writers: route.writers,
                 matched: sink.map_or(0, |sink| sink.matched()),
                 publishers: route.publishers,
@@ -363,13 +367,4 @@ fn is_called(entry: &CatalogueEntry) -> bool {
 
 fn count(grantees: &Grantees) -> [usize; 3] {
     [grantees.nodes.len(), grantees.groups.len(), grantees.fleets.len()]
-}
-
-fn label(status: &JoinStatus) -> &'static str {
-    match status {
-        JoinStatus::Waiting => "waiting",
-        JoinStatus::Asked => "asked",
-        JoinStatus::Refused(_) => "refused",
-        JoinStatus::Granted => "granted",
-    }
 }
