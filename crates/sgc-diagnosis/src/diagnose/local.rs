@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use sgc_node::DataDrop;
 use sgc_node::graph::{Endpoint, Graph, Interface, NameLine, Qos, Use, UseRoute};
 use sgc_ros::{Naming, Rename, is_pattern};
 
@@ -9,7 +10,6 @@ use crate::finding::{
     AssertionsSeen, Direction, Finding, Hop, LinkFinding, LocalFinding, QosMismatch, TrafficFinding,
 };
 use crate::near::near;
-use crate::refusals::NO_SUBSCRIBER;
 use crate::step::{Step, Walk};
 
 /// `Qos::liveliness` of a publisher that is manual by topic.
@@ -195,7 +195,7 @@ pub(super) fn traffic(line: &NameLine, direction: Direction, steps: &mut Walk) {
         steps.push(Step::fine(Finding::Traffic(passed)));
     }
     // Packets without a subscriber are no loss to anybody.
-    let lost = line.dropped.iter().filter(|(counter, _)| *counter != NO_SUBSCRIBER);
+    let lost = line.dropped.iter().filter(|(counter, _)| *counter != DataDrop::NoTree.key());
     let counts: BTreeMap<_, _> = lost.map(|(counter, count)| (counter.clone(), *count)).collect();
     let Some((worst, _)) = counts.iter().max_by_key(|(_, count)| **count) else { return };
     let (worst, total) = (worst.clone(), counts.values().sum::<u64>());
