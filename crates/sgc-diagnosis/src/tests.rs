@@ -456,6 +456,23 @@ fn unknown_member_names_are_reported() {
 }
 
 #[test]
+fn advice_for_other_side_has_the_name_of_that_side() {
+    let advice = |graph: &Graph| diagnose::interface(graph, "/a").last().and_then(|step| step.fix()).unwrap();
+    let mut graph = owner();
+    graph.shares[0].routes[0].shared_as = Some("/arm/a".into());
+    assert_eq!(advice(&graph), "run `sgc why /arm/a` there");
+    graph.shares[0].routes[0].granted.clear();
+    assert!(advice(&graph).contains("topic = \"/arm/a\"; if it is there, run `sgc why /arm/a`"));
+    // A pattern has no path of its own at its owner.
+    let mut graph = publisher();
+    (graph.uses[0].topic, graph.uses[0].local_topic) = ("/**".into(), "/**".into());
+    assert_eq!(advice(&graph), "run `sgc why /a` there");
+    graph.uses[0].routes[0].is_granted = false;
+    graph.uses[0].routes[0].refused = Some("not listed".into());
+    assert!(advice(&graph).contains("`sgc why /a` names the entry"));
+}
+
+#[test]
 fn lost_calls_are_fault_until_calls_are_answered() {
     let lost = |reason: &str, since_answer, last_s| {
         let mut graph = owner();

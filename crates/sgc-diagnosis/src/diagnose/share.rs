@@ -97,11 +97,12 @@ fn unheard(graph: &Graph, share: &Share) -> Vec<ShareFinding> {
 
 fn walk_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: bool, steps: &mut Walk) {
     let (topic, kind) = (&route.topic, share.kind);
+    let far_topic = route.shared_as.as_ref().unwrap_or(topic);
     let refused = route.refused.iter().next().map(|(node, reason)| (node.clone(), reason.clone()));
     if route.granted.is_empty() {
         steps.push(wrong(match refused {
             Some((node, reason)) => ShareFinding::Refused { node, reason },
-            None => ShareFinding::Unasked { kind, topic: topic.clone(), node: graph.node.clone() },
+            None => ShareFinding::Unasked { kind, topic: far_topic.clone(), node: graph.node.clone() },
         }));
         return;
     }
@@ -125,7 +126,7 @@ fn walk_route(graph: &Graph, share: &Share, route: &ShareRoute, provides: bool, 
         let over = out.into_iter().map(|link| Hop::over(graph, link)).collect();
         steps.push(fine(ShareFinding::Leaves { over }));
     }
-    let far = || far_half(route.granted.join(", "), topic);
+    let far = || far_half(route.granted.join(", "), far_topic);
     if kind != Interface::Topic {
         if !route.is_written {
             steps.push(wrong(ShareFinding::NoCaller));

@@ -124,10 +124,11 @@ fn unlisted(graph: &Graph, used: &Use, topic: String) -> UseFinding {
 fn walk_route(graph: &Graph, used: &Use, route: &UseRoute, steps: &mut Walk) {
     let (topic, kind) = (&route.topic, used.kind);
     let owner = || used.owner.clone();
+    let far_topic = || name_at_owner(used, topic);
     if !route.is_granted {
         steps.push(wrong(match (&route.refused, route.join) {
             (Some(reason), _) => {
-                UseFinding::Refused { owner: owner(), reason: reason.clone(), topic: used.topic.clone() }
+                UseFinding::Refused { owner: owner(), reason: reason.clone(), topic: far_topic() }
             }
             (None, Some(JoinState::Waiting)) => UseFinding::NoRoute { owner: owner() },
             (None, _) => UseFinding::Unanswered { owner: owner() },
@@ -160,7 +161,7 @@ fn walk_route(graph: &Graph, used: &Use, route: &UseRoute, steps: &mut Walk) {
             steps.push(wrong(UseFinding::NoServer));
             return;
         }
-        steps.extend([fine(UseFinding::Answered { owner: owner() }), far_half(owner(), &used.topic)]);
+        steps.extend([fine(UseFinding::Answered { owner: owner() }), far_half(owner(), &far_topic())]);
         return;
     }
     let written =
@@ -169,8 +170,7 @@ fn walk_route(graph: &Graph, used: &Use, route: &UseRoute, steps: &mut Walk) {
         return;
     }
     steps.push(if route.messages == 0 {
-        let topic = used.topic.clone();
-        Step::unknown(Finding::Use(UseFinding::NoMessage { owner: owner(), topic }))
+        Step::unknown(Finding::Use(UseFinding::NoMessage { owner: owner(), topic: far_topic() }))
     } else {
         fine(UseFinding::Received { messages: route.messages })
     });
@@ -195,5 +195,5 @@ fn walk_publishing(graph: &Graph, used: &Use, route: &UseRoute, line: &NameLine,
         fine(UseFinding::Published { messages: route.messages, owner: owner.clone() })
     });
     traffic(line, Direction::Out, steps);
-    steps.push(far_half(owner, &used.topic));
+    steps.push(far_half(owner, &name_at_owner(used, &route.topic)));
 }

@@ -333,6 +333,8 @@ pub struct UnheardMember {
 pub struct ShareRoute {
     /// Name on the local network.
     pub topic: String,
+    /// Name under which other nodes find it. Nodes of earlier versions do not say it.
+    pub shared_as: Option<String>,
     /// ROS type.
     #[serde(rename = "type")]
     pub type_name: String,

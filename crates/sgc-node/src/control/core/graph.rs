@@ -128,6 +128,7 @@ impl<N: RosNetwork> Core<N> {
             let sink = self.sinks.get(&route.name);
             share.routes.push(ShareRoute {
                 topic: route.local_name,
+                shared_as: Some(route.shared_as),
                 type_name: route.type_name,
                 name: route.name.to_string(),
                 writers: route.writers,
