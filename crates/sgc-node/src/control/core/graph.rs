@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering::Relaxed;
 
 use sgc_ros::{
     Direction, DiscoveredEndpoint, EndpointKind, EndpointSpec, OwnerState, RosNetwork, Sample, SampleHandler,
-    ShareView, UseView, dds_topic, dds_type, reader_for, ros_topic, ros_type, weakest,
+    ShareView, UseView, dds_topic, dds_type, matches, reader_for, ros_topic, ros_type, weakest,
 };
 use sgc_transport::Link as _;
 use sgc_trust::{Grantees, Policy};
@@ -323,7 +323,12 @@ impl<N: RosNetwork> Core<N> {
             .collect();
         // If publishers have several types, the first one counts.
         let Some(first) = writers.first() else {
-            let _ = reply.send(Err(TapError::NoTopic { topic }));
+            let is_used = routes
+                .use_views()
+                .iter()
+                .any(|view| view.direction == Direction::Bring && matches(&view.local_topic, &topic));
+            let error = if is_used { TapError::NotBrought { topic } } else { TapError::NoTopic { topic } };
+            let _ = reply.send(Err(error));
             return;
         };
         let same: Vec<_> = writers.iter().filter(|w| w.type_name == first.type_name).collect();
