@@ -84,7 +84,7 @@ pub fn summary(
             };
             row("ROS 2", format!("domain {}, {range}{peers}", ros.domain_id));
         }
-        None => row("ROS 2", "none: a router only".to_owned()),
+        None => row("ROS 2", format!("none: {} only", role_without_ros(config))),
     }
     for share in &config.shares {
         let to: Vec<_> = share.to.iter().map(ToString::to_string).collect();
@@ -212,6 +212,15 @@ fn gateway_rows(gateway: &GatewayConfig) -> Vec<Vec<String>> {
     rows
 }
 
+/// Returns the role of a node that touches no ROS 2 network.
+fn role_without_ros(config: &Config) -> &'static str {
+    match (&config.authority, config.listen.is_empty()) {
+        (Some(_), true) => "the fleet's authority",
+        (Some(_), false) => "a router and the fleet's authority",
+        (None, _) => "a router",
+    }
+}
+
 /// Returns the note on sharing as JSON, which needs a definition of the type.
 fn json(config: &Config, type_name: Option<&str>) -> String {
     let dirs = config.ros.as_ref().map_or(&[][..], |ros| &ros.definitions);
@@ -268,7 +277,19 @@ fn name_of(
 
 #[cfg(test)]
 mod tests {
+    use sgc_node::config::AuthorityConfig;
+
     use super::*;
+
+    #[test]
+    fn authority_that_does_not_listen_is_no_router() {
+        let mut config = Config::default();
+        assert_eq!(role_without_ros(&config), "a router");
+        config.authority = Some(AuthorityConfig::new("lab.fleet".into()));
+        assert_eq!(role_without_ros(&config), "the fleet's authority");
+        config.listen = vec!["quic://127.0.0.1:0".parse().unwrap()];
+        assert_eq!(role_without_ros(&config), "a router and the fleet's authority");
+    }
 
     #[test]
     fn check_reports_type_that_cannot_travel_as_json() {

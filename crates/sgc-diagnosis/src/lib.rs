@@ -1,6 +1,7 @@
 //! Diagnosis: asks nodes for their documents, finds what is wrong and names the remedy.
 //!
-//! [`diagnose`] follows the path of a topic in a node's graph up to the first fault. [`refusals`] explains counters, [`status`] a
+//! [`diagnose`] follows the path of a topic in a node's graph up to the first fault, and finds facts without words, which
+//! `words` renders. [`refusals`] explains counters, [`status`] a
 //! node's status, and [`check`] a configuration. Of these, only [`ask`] talks to nodes. The crate parses no arguments, prints
 //! nothing and knows no exit codes; `sgc` does.
 
@@ -8,7 +9,7 @@ pub mod ask;
 pub mod check;
 pub mod diagnose;
 mod error;
-mod links;
+mod finding;
 pub mod names;
 mod near;
 pub mod refusals;
@@ -16,6 +17,7 @@ pub mod status;
 mod step;
 #[cfg(test)]
 mod tests;
+mod words;
 
 use std::path::Path;
 
@@ -28,5 +30,5 @@ pub use step::{Step, Verdict};
 pub fn first_wrong(socket: &Path, topic: &str) -> Option<Vec<String>> {
     let graph = ask::graph(socket, None).ok()?;
     let step = diagnose::interface(&graph, topic).into_iter().find(|step| step.verdict == Verdict::Wrong)?;
-    Some([Some(step.found), step.fix].into_iter().flatten().map(|line| output::clean(&line)).collect())
+    Some([Some(step.found()), step.fix()].into_iter().flatten().map(|line| output::clean(&line)).collect())
 }

@@ -18,7 +18,7 @@ pub(crate) fn near<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>
 }
 
 /// Formats `"; did you mean /a or /b?"`, or nothing.
-pub(crate) fn hint(near: &[&str]) -> String {
+pub(crate) fn hint(near: &[String]) -> String {
     match near {
         [] => String::new(),
         all => format!("; did you mean {}?", all.join(" or ")),
@@ -67,6 +67,6 @@ mod tests {
         assert_eq!(near("/chater", all), ["/Chater", "/chatter"]);
         assert_eq!(near("/scans", all), ["/scan"]);
         assert!(near("/odom", all).is_empty());
-        assert_eq!(hint(&["/a", "/b"]), "; did you mean /a or /b?");
+        assert_eq!(hint(&["/a".to_owned(), "/b".to_owned()]), "; did you mean /a or /b?");
     }
 }

@@ -1,22 +1,16 @@
 //! The meaning and the remedy of each refusal: the table from which `sgc why` and `sgc status` explain counters.
 //!
 //! The specification of routing lists the counters, and the node keeps them. `tests/documents` compares both with this table.
+//! Where an enum without data has the counters, a row names the variant.
 
-use std::collections::BTreeMap;
-
-use sgc_node::graph::Graph;
-use sgc_transport::PeerRefusal;
+use sgc_endpoint::CallLoss;
+use sgc_node::DataDrop;
+use sgc_transport::{PeerRefusal, RefusalKind};
 use sgc_trust::CertError;
 use sgc_wire::{RefuseReason, RejectReason};
 
-use crate::links::link_of;
-use crate::step::Step;
-
-/// Most refusals that `sgc why` reports before its walk, by descending count.
-const NAMED_MAX: usize = 8;
-
 /// A counter's explanation.
-#[derive(Debug)]
+#[derive(Debug, PartialEq, Eq)]
 pub struct Refusal {
     /// The counter, as the node spells it.
     pub key: &'static str,
@@ -97,7 +91,7 @@ const SLOW_CLIENTS: &str = "if it is somebody who connects again and again, keep
                             host have places of their own";
 
 /// Refusals of control frames, of the machines, of the authority and of the local network.
-const CONTROL: &[Refusal] = &[
+pub(crate) const CONTROL: &[Refusal] = &[
     named(
         "not_verified",
         "a neighbour brought what is not signed as it says, or under a certificate that does not hold here: over, revoked with \
@@ -290,53 +284,53 @@ const CONTROL: &[Refusal] = &[
     ),
     counted("frames", "a transform could not be given the prefix of its owner", SAME_VERSION),
     counted(
-        "call_refused",
+        CallLoss::Refused.key(),
         "calls were not taken: 1024 of one client, or 8192 or 128 MiB of all, were without an answer",
         "have the client wait for answers; if none come, look at the server",
     ),
     counted(
-        "call_owner_full",
+        CallLoss::OwnerFull.key(),
         "calls were not taken: 4096 calls of one node were under way at the owner",
         "look at the server: it answers too slowly, or not at all",
     ),
     counted(
-        "call_server_gone",
+        CallLoss::ServerGone.key(),
         "the server that was asked is gone: its process ended or was killed, or its network broke",
         "start the server again and call again; what it was asked may have been carried out in part",
     ),
     counted(
-        "call_owner_restarted",
+        CallLoss::OwnerRestarted.key(),
         "the owner's sgc started anew and no longer knows whether the calls were carried out",
         "call again if that does no harm",
     ),
     counted(
-        "call_withdrawn",
+        CallLoss::Withdrawn.key(),
         "the service ended while calls waited: its server stayed away for more than 2 s, its node stopped, or a rule changed",
         "start the server again and call again; `sgc why` on the owner says what it has",
     ),
-    counted("call_client_gone", "clients ended, or were dropped, before their answer came", ""),
+    counted(CallLoss::ClientGone.key(), "clients ended, or were dropped, before their answer came", ""),
     counted(
-        "call_forgotten",
+        CallLoss::Forgotten.key(),
         "the answer came while the way was broken, and the owner kept it no longer when the way was back",
         "call again if that does no harm",
     ),
     counted(
-        "call_too_large",
+        CallLoss::TooLarge.key(),
         "a request or an answer is larger than 64 MiB",
         "send it in parts, or as a topic",
     ),
     counted(
-        "call_unheard",
+        CallLoss::Unheard.key(),
         "the answer came, and DDS did not find the client that had asked",
         "is the client still there, and does DDS match it with this node?",
     ),
     counted(
-        "call_unreadable",
+        CallLoss::Unreadable.key(),
         "a request or reply on the local network does not say to which call it belongs",
         "look for a program of another DDS vendor on that service",
     ),
     counted(
-        "call_unsaid",
+        CallLoss::Unsaid.key(),
         "the owner gave calls up; its sgc is older and does not say why",
         "`sgc why` on the owner",
     ),
@@ -381,67 +375,75 @@ const CONTROL: &[Refusal] = &[
 
 /// Refusals of packets and messages of a name.
 const PACKETS: &[Refusal] = &[
-    counted("no_subscriber", "nobody asked for it yet, or any more", ""),
+    counted(DataDrop::NoTree.key(), "nobody asked for it yet, or any more", ""),
     counted(
-        "wrong_way",
+        DataDrop::WrongWay.key(),
         "it came over a link that the tree does not use",
         "a few when a way changes are no fault",
     ),
     counted(
-        "hop_limit",
+        DataDrop::HopLimit.key(),
         "it went in a circle, or over too many routers",
         "look at the links between the routers",
     ),
-    counted("no_such_sink", "it was for a subscriber that is gone", ""),
+    counted(DataDrop::NoSuchSink.key(), "it was for a subscriber that is gone", ""),
     counted(
-        "stalled",
+        DataDrop::Stalled.key(),
         "a reliable consumer took nothing for seconds",
         "is a subscriber stopped? A best-effort one would hold nothing up",
     ),
     counted(
-        "stale",
+        DataDrop::Stale.key(),
         "newer messages took the place of what could not be sent in time",
         "the link is thinner than the topic: set max_rate, max_bandwidth or a `priority` in the [[share]]",
     ),
     counted(
-        "link_closed",
+        DataDrop::LinkClosed.key(),
         "a link ended with something under way",
         "reliable topics ask for it again by themselves",
     ),
-    counted("malformed", "it could not be read", SAME_VERSION),
-    counted("unknown_label", "it could not be read", SAME_VERSION),
-    counted("not_granted", "there was no key for it yet", "a few when a topic begins are no fault"),
+    counted(DataDrop::Malformed.key(), "it could not be read", SAME_VERSION),
+    counted(DataDrop::UnknownLabel.key(), "it could not be read", SAME_VERSION),
     counted(
-        "source_exhausted",
+        DataDrop::NotGranted.key(),
+        "there was no key for it yet",
+        "a few when a topic begins are no fault",
+    ),
+    counted(
+        DataDrop::SourceExhausted.key(),
         "a publisher has sent 2^48 messages, which is all that its source has numbers for",
         "start the publisher again",
     ),
     counted(
-        "sink",
+        DataDrop::Sink.key(),
         "it was refused when it was opened: a replay, a broken seal or signature, or lost for good",
         "`sgc status` counts the kinds under Drops",
     ),
-    counted("no_writer", "no local writer was there for it", DDS_LOG),
-    counted("too_large", "larger than 64 MiB", "publish smaller messages"),
+    counted(DataDrop::NoWriter.key(), "no local writer was there for it", DDS_LOG),
+    counted(DataDrop::TooLarge.key(), "larger than 64 MiB", "publish smaller messages"),
     counted(
-        "thinned",
+        DataDrop::Thinned.key(),
         "more came than max_rate or max_bandwidth let on",
         "raise the limit if that is not meant",
     ),
-    counted("too_old", "older than max_age", "raise max_age, or compare the clocks of the hosts"),
-    counted("repeated", "a publisher's history came once more after its node started anew", ""),
     counted(
-        "overrun",
+        DataDrop::TooOld.key(),
+        "older than max_age",
+        "raise max_age, or compare the clocks of the hosts",
+    ),
+    counted(DataDrop::Repeated.key(), "a publisher's history came once more after its node started anew", ""),
+    counted(
+        DataDrop::Overrun.key(),
         "a local publisher writes faster than the link takes it, longer than 4096 messages and 64 MiB make up for",
         "set max_rate or max_bandwidth in the [[share]], or have the program publish less",
     ),
     counted(
-        "no_definition",
+        DataDrop::NoDefinition.key(),
         "its messages travel as JSON, and what its type looks like was not known",
         DEFINITIONS,
     ),
     counted(
-        "not_converted",
+        DataDrop::NotConverted.key(),
         "a publisher wrote something else than its type says, so that it could not become JSON",
         "build the publisher and the definitions that this node finds from one version of the package",
     ),
@@ -511,64 +513,76 @@ const SINK: &[Refusal] = &[
 ];
 
 /// Refusals of peers that requested a link.
-const DOOR: &[Refusal] = &[
+pub(crate) const DOOR: &[Refusal] = &[
     named(
-        "no_certificate",
+        RefusalKind::NoCertificate.label(),
         "it showed no certificate",
         "does that node have an identity, and is it an sgc at all?",
     ),
     named(
-        "other_ca",
+        RefusalKind::OtherCa.label(),
         "its certificate is of a CA that is not trusted here",
         "if its fleet may link here, name the CA in a [[partner]], or in `accept` of [router]",
     ),
     named(
-        "not_admitted",
+        RefusalKind::NotAdmitted.label(),
         "its certificate is of a CA that is trusted here, but whose nodes may not link",
         "if they may, add the CA to `accept` in [router]",
     ),
-    named("expired", "its certificate is over", "`sgc fleet renew` it there, and compare the clocks"),
-    named("not_yet_valid", "its certificate has not begun by the clock here", SET_CLOCK),
-    named("revoked", "its certificate, or its node's incarnation, is revoked", ENROLL_AGAIN),
     named(
-        "bad_certificate",
+        RefusalKind::Expired.label(),
+        "its certificate is over",
+        "`sgc fleet renew` it there, and compare the clocks",
+    ),
+    named(RefusalKind::NotYetValid.label(), "its certificate has not begun by the clock here", SET_CLOCK),
+    named(
+        RefusalKind::Revoked.label(),
+        "its certificate, or its node's incarnation, is revoked",
+        ENROLL_AGAIN,
+    ),
+    named(
+        RefusalKind::BadCertificate.label(),
         "its certificate is altered, malformed or not for a node",
         "enroll that node again",
     ),
-    named("version", "it speaks another version, or another protocol", SAME_VERSION),
+    named(RefusalKind::Version.label(), "it speaks another version, or another protocol", SAME_VERSION),
     named(
-        "key_exchange",
+        RefusalKind::KeyExchange.label(),
         "it offers no key exchange that is accepted here",
         "one of the two requires post-quantum X25519MLKEM768: upgrade the other, or turn `post_quantum` off in both fleets",
     ),
     named(
-        "handshake_too_long",
+        RefusalKind::HandshakeTooLong.label(),
         "its handshake is longer than any that is read",
         "is it an sgc? Certificates have room for many groups, but not for any number",
     ),
-    named("bad_greeting", "it connected and said something that is no greeting", SAME_VERSION),
     named(
-        "timed_out",
+        RefusalKind::BadGreeting.label(),
+        "it connected and said something that is no greeting",
+        SAME_VERSION,
+    ),
+    named(
+        RefusalKind::TimedOut.label(),
         "it did not finish in time",
         "a few are scanners, or nodes on bad networks; many from one address are somebody who holds places",
     ),
     named(
-        "too_many",
+        RefusalKind::TooMany.label(),
         "too many were connecting at once: the heaviest address gave way",
         "they try again by themselves; if it goes on, keep the addresses that the log names out by a firewall",
     ),
     named(
-        "too_many_from_address",
+        RefusalKind::TooManyFromAddress.label(),
         "too many were connecting at once from its address (IPv6: its /64)",
         "if many nodes share that address, let them start one after the other or link through a router of their own; else keep \
          it out by a firewall",
     ),
-    counted("by_peer", "it refused this node, or gave up", "see the log on the other side"),
-    counted("transport", "the connection broke while it was made", ""),
+    counted(RefusalKind::ByPeer.label(), "it refused this node, or gave up", "see the log on the other side"),
+    counted(RefusalKind::Transport.label(), "the connection broke while it was made", ""),
 ];
 
 /// Refusals of programs at the gateway.
-const GATEWAY: &[Refusal] = &[
+pub(crate) const GATEWAY: &[Refusal] = &[
     named("too many clients", "all places for clients are taken", RAISE_CLIENTS),
     named(
         "too many clients of other hosts",
@@ -731,7 +745,7 @@ pub(crate) fn packet_drop(key: &str) -> Option<&'static Refusal> {
 
 /// Returns the meaning and the remedy of a reason for lost calls.
 pub(crate) fn call_loss(key: &str) -> Option<(&'static str, &'static str)> {
-    if key == "overrun" {
+    if key == CallLoss::Overrun.key() {
         let means = "requests or replies came faster than they were taken, more than may wait";
         return Some((means, "have the programs on the local network make fewer calls at a time"));
     }
@@ -757,57 +771,17 @@ pub(crate) fn gateway_meaning(row: &str) -> String {
     find(GATEWAY, row).map_or_else(String::new, |refusal| refusal.means.to_owned())
 }
 
-/// Returns a step for each refusal on which an operator has to act, with the current links that cause it.
-pub(crate) fn steps(graph: &Graph) -> Vec<Step> {
-    let counts = [
-        ("refused here", CONTROL, &graph.drops),
-        ("peers refused a link", DOOR, &graph.refused),
-        ("programs refused at the gateway", GATEWAY, &graph.gateway_refused),
-    ];
-    let of = |(what, table, counts): (&'static str, &'static [Refusal], &'_ BTreeMap<String, u64>)| {
-        let counted = |refusal: &'static Refusal| {
-            let count = counts.get(refusal.key).copied().filter(|count| *count > 0)?;
-            let by = culprits(graph, refusal.key);
-            let found = format!("{what}: {} {count}{by} ({})", refusal.key, refusal.means);
-            let step = Step::unknown(found);
-            Some((count, if refusal.fix.is_empty() { step } else { step.with_fix(refusal.fix) }))
-        };
-        table.iter().filter(|refusal| refusal.is_named).filter_map(counted).collect::<Vec<_>>()
-    };
-    let mut all: Vec<_> = counts.into_iter().flat_map(of).collect();
-    all.sort_by_key(|(count, _)| std::cmp::Reverse(*count));
-    all.into_iter().take(NAMED_MAX).map(|(_, step)| step).collect()
-}
-
-/// Returns the peers of current links that cause a refusal.
-fn culprits(graph: &Graph, key: &str) -> String {
-    let of_link = |link: &sgc_node::graph::Link| {
-        let count = graph.drops.get(&format!("{key} from link {}", link.id))?;
-        Some(format!("{count} over {}", link_of(graph, link.id)))
-    };
-    let all: Vec<_> = graph.links.iter().filter_map(of_link).collect();
-    if all.is_empty() { String::new() } else { format!(", of these {}", all.join(", ")) }
-}
-
 fn find(table: &'static [Refusal], key: &str) -> Option<&'static Refusal> {
     table.iter().find(|refusal| refusal.key == key)
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     #![allow(clippy::unwrap_used, clippy::panic)]
 
     use std::collections::BTreeSet;
 
-    use sgc_transport::RefusalKind;
-
     use super::*;
-    use crate::step::Verdict;
-
-    /// Returns the refusals that are reported for any topic.
-    pub(crate) fn every_named_refusal() -> impl IntoIterator<Item = &'static str> {
-        CONTROL.iter().filter(|refusal| refusal.is_named).map(|refusal| refusal.key)
-    }
 
     fn keys(table: &[Refusal]) -> BTreeSet<String> {
         table.iter().map(|refusal| refusal.key.to_owned()).collect()
@@ -817,6 +791,19 @@ pub(crate) mod tests {
     fn every_refusal_of_a_link_is_explained_and_no_other() {
         let kinds = RefusalKind::ALL.into_iter().map(|kind| kind.label().to_owned());
         assert_eq!(kinds.collect::<BTreeSet<_>>(), keys(DOOR));
+    }
+
+    #[test]
+    fn every_drop_of_data_path_is_explained_and_no_other() {
+        let keys_of_code = DataDrop::ALL.into_iter().map(|reason| reason.key().to_owned());
+        assert_eq!(keys_of_code.collect::<BTreeSet<_>>(), keys(PACKETS));
+    }
+
+    #[test]
+    fn every_reason_for_lost_calls_is_explained() {
+        for loss in CallLoss::ALL {
+            assert!(call_loss(loss.key()).is_some(), "{loss:?}");
+        }
     }
 
     #[test]
@@ -848,27 +835,5 @@ pub(crate) mod tests {
         }
         // The walk names the entry to add to the policy.
         assert_eq!(fix_at_owner(&Refuse::NotPermitted.to_string()), None);
-    }
-
-    #[test]
-    fn refusals_are_reported_with_remedy_unless_sound_network_causes_them() {
-        for (place, table) in [CONTROL, DOOR, GATEWAY].into_iter().enumerate() {
-            for refusal in table {
-                let mut graph = Graph::default();
-                let counts = match place {
-                    0 => &mut graph.drops,
-                    1 => &mut graph.refused,
-                    _ => &mut graph.gateway_refused,
-                };
-                counts.insert(refusal.key.to_owned(), 3);
-                let steps = steps(&graph);
-                assert_eq!(steps.len(), usize::from(refusal.is_named), "{refusal:?}");
-                for step in steps {
-                    assert_eq!(step.verdict, Verdict::Unknown);
-                    assert!(step.found.contains(&format!("{} 3 ({})", refusal.key, refusal.means)));
-                    assert_eq!(step.fix.as_deref().unwrap_or_default(), refusal.fix);
-                }
-            }
-        }
     }
 }

@@ -1,6 +1,8 @@
-//! Steps of a walk along the path of a topic: the findings of `sgc why`.
+//! Steps of a walk along the path of a topic.
 
 use serde::Serialize;
+
+use crate::finding::{Finding, NodeFinding};
 
 /// The result of a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -14,37 +16,35 @@ pub enum Verdict {
     Unknown,
 }
 
-/// One step of the path.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+/// One step of the path. `words` has its methods that render it.
+#[derive(Clone, Debug, PartialEq)]
 pub struct Step {
     /// The result.
     pub verdict: Verdict,
-    /// The finding.
-    pub found: String,
-    /// The advice how to mend it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub fix: Option<String>,
+    pub(crate) finding: Finding,
 }
 
+/// The steps of a walk. A fault is the last of them.
+pub(crate) type Walk = Vec<Step>;
+
 impl Step {
-    /// Returns a step that is in order.
-    pub fn fine(found: impl Into<String>) -> Self {
-        Self { verdict: Verdict::Fine, found: found.into(), fix: None }
+    /// Returns the fault that no node answers.
+    pub fn no_node(error: String) -> Self {
+        Self::wrong(Finding::Node(NodeFinding::Absent { error }))
     }
 
-    /// Returns a fault and its remedy.
-    pub fn wrong(found: impl Into<String>, fix: impl Into<String>) -> Self {
-        Self { verdict: Verdict::Wrong, found: found.into(), fix: Some(fix.into()) }
+    /// Returns a step that is in order.
+    pub(crate) fn fine(finding: Finding) -> Self {
+        Self { verdict: Verdict::Fine, finding }
+    }
+
+    /// Returns a fault.
+    pub(crate) fn wrong(finding: Finding) -> Self {
+        Self { verdict: Verdict::Wrong, finding }
     }
 
     /// Returns a finding that need not be a fault.
-    pub fn unknown(found: impl Into<String>) -> Self {
-        Self { verdict: Verdict::Unknown, found: found.into(), fix: None }
-    }
-
-    /// Adds a remedy.
-    #[must_use]
-    pub fn with_fix(self, fix: impl Into<String>) -> Self {
-        Self { fix: Some(fix.into()), ..self }
+    pub(crate) fn unknown(finding: Finding) -> Self {
+        Self { verdict: Verdict::Unknown, finding }
     }
 }

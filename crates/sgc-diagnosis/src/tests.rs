@@ -1,119 +1,23 @@
 //! Tests of every fault that a node can see, each in an otherwise sound document.
 
-use std::collections::BTreeMap;
+mod golden;
+mod scenarios;
 
 use sgc_node::alerts::Alert;
 use sgc_node::graph::{
-    Endpoint, Graph, Interface, Link, LostCalls, NameLine, Offer, Qos, Search, ServiceCalls, Share,
-    ShareRoute, UnheardMember, Use, UseRoute,
+    Endpoint, Graph, Interface, Link, LostCalls, NameLine, Qos, ServiceCalls, Share, ShareRoute,
+    UnheardMember, Use,
 };
-
 use sgc_transport::PeerRefusal;
 use sgc_trust::CertError;
 use sgc_wire::{RefuseReason, RejectReason};
 
+use self::scenarios::{
+    NAME, end, owner, owner_faults, pattern, publisher, publisher_faults, qos, sound, user, user_faults,
+};
 use crate::diagnose;
+use crate::refusals::{CONTROL, DOOR, GATEWAY};
 use crate::step::Verdict;
-
-const STRING: &str = "std_msgs/msg/String";
-const NAME: &str = "aa";
-
-/// The expected finding, and the fault to inject.
-type Case = (&'static str, fn(&mut Graph));
-
-fn end(topic: &str, writes: bool) -> Endpoint {
-    Endpoint {
-        topic: topic.into(),
-        is_ros_topic: true,
-        type_name: STRING.into(),
-        writes,
-        shared_by: (topic == "/a").then_some(0),
-        qos: qos(),
-        ..Endpoint::default()
-    }
-}
-
-fn qos() -> Qos {
-    Qos { reliable: true, depth: Some(10), ..Qos::default() }
-}
-
-fn sound() -> Graph {
-    let name =
-        NameLine { way: Some((1, 900)), out: vec![1], has_branch: true, packets: 5, ..NameLine::default() };
-    Graph {
-        node: "here".into(),
-        has_ros: true,
-        links: vec![Link { id: 1, peer: "cloudcloud".into(), rtt_us: 500, ..Link::default() }],
-        routers: vec![Search { router: "quic://r".into(), state: "linked".into(), ..Search::default() }],
-        names: [(NAME.to_owned(), name)].into(),
-        ..Graph::default()
-    }
-}
-
-/// Returns the graph of a sound node that shares `/a`.
-fn owner() -> Graph {
-    let route = ShareRoute {
-        topic: "/a".into(),
-        type_name: STRING.into(),
-        name: NAME.into(),
-        writers: 1,
-        is_read: true,
-        granted: vec!["desk".into()],
-        messages: 3,
-        ..ShareRoute::default()
-    };
-    Graph {
-        endpoints: vec![end("/a", true)],
-        shares: vec![Share { topic: "/a".into(), to: [1, 0, 0], routes: vec![route], ..Share::default() }],
-        ..sound()
-    }
-}
-
-/// Returns the graph of a sound node that uses `/a`.
-fn user() -> Graph {
-    let route = UseRoute {
-        topic: "/a".into(),
-        type_name: STRING.into(),
-        name: NAME.into(),
-        qos: qos(),
-        is_granted: true,
-        writers: 1,
-        matched: 1,
-        messages: 3,
-        ..UseRoute::default()
-    };
-    let used = Use {
-        topic: "/a".into(),
-        local_topic: "/a".into(),
-        owner: "arm".into(),
-        owner_id: "1d".into(),
-        has_catalogue: true,
-        routes: vec![route],
-        ..Use::default()
-    };
-    let offer = Offer {
-        owner: Some("arm".into()),
-        owner_id: "1d".into(),
-        topic: "/a".into(),
-        type_name: STRING.into(),
-        name: NAME.into(),
-        subscribe: true,
-        is_used: true,
-        ..Offer::default()
-    };
-    Graph { endpoints: vec![end("/a", false)], uses: vec![used], offers: vec![offer], ..sound() }
-}
-
-/// Returns the graph of a sound node that publishes on `/a`.
-fn publisher() -> Graph {
-    let mut graph = user();
-    graph.endpoints = vec![end("/a", true)];
-    graph.uses[0].publishes = true;
-    graph.uses[0].routes[0].publishers = 1;
-    graph.uses[0].routes[0].is_read = true;
-    graph.offers[0].publish = true;
-    graph
-}
 
 /// Returns the step with the fault, and its remedy.
 fn wrong(graph: &Graph, topic: &str) -> String {
@@ -123,15 +27,15 @@ fn wrong(graph: &Graph, topic: &str) -> String {
         [] => String::new(),
         [step] => {
             assert_eq!(Some(step), steps.last(), "what is wrong comes last: {steps:?}");
-            assert!(step.fix.as_ref().is_some_and(|fix| !fix.is_empty()));
-            step.found.clone()
+            assert!(step.fix().as_ref().is_some_and(|fix| !fix.is_empty()));
+            step.found()
         }
         _ => panic!("one thing is wrong at a time: {steps:?}"),
     }
 }
 
 fn named(graph: &Graph) -> Vec<(Verdict, String)> {
-    diagnose::name(graph, NAME).into_iter().map(|step| (step.verdict, step.found)).collect()
+    diagnose::name(graph, NAME).into_iter().map(|step| (step.verdict, step.found())).collect()
 }
 
 #[test]
@@ -146,67 +50,7 @@ fn sound_node_has_no_fault() {
 
 #[test]
 fn each_fault_of_owner_is_named() {
-    let cases: Vec<Case> = vec![
-        ("touches no ROS 2 network", |g| g.has_ros = false),
-        ("no publisher of /a is on the local network (1 subscribers are there)", |g| {
-            g.endpoints[0].writes = false
-        }),
-        ("no publisher of /a is on the local network; did you mean /robot/a?", |g| {
-            g.endpoints[0].topic = "/robot/a".into();
-        }),
-        ("says type x/msg/Y, and the publishers have std_msgs/msg/String", |g| {
-            g.shares[0].wanted_type = Some("x/msg/Y".into());
-        }),
-        ("travel as JSON, and no definition of std_msgs/msg/String is known here", |g| {
-            g.shares[0].routes[0].lacks_definition = true;
-        }),
-        ("have different definitions of std_msgs/msg/String: RIHS01_a and RIHS01_b", |g| {
-            g.endpoints.push(g.endpoints[0].clone());
-            g.endpoints[0].type_hash = Some("RIHS01_a".into());
-            g.endpoints[1].type_hash = Some("RIHS01_b".into());
-        }),
-        ("covered by a rule, but not shared: too many", |g| {
-            g.shares[0].routes.clear();
-            g.problems = vec!["/a: too many".into()];
-        }),
-        ("no link is up; quic://r is trying again: no answer", |g| {
-            g.links.clear();
-            g.routers[0].state = "trying again".into();
-            g.routers[0].last_failure = Some("no answer".into());
-        }),
-        ("no link is up, and no router is configured", |g| {
-            g.links.clear();
-            g.routers.clear();
-        }),
-        ("link 1 to cloudclo at  (0.50 ms) is silent", |g| g.links[0].silent = true),
-        ("nobody asked for it", |g| g.shares[0].routes[0].granted.clear()),
-        ("desk asked for it and was refused: not listed", |g| {
-            g.shares[0].routes[0].granted.clear();
-            g.shares[0].routes[0].refused = [("desk".to_owned(), "not listed".to_owned())].into();
-        }),
-        ("no branch leads away", |g| g.names = BTreeMap::new()),
-        ("the definitions of std_msgs/msg/String differ: RIHS01_a here, RIHS01_b at desk", |g| {
-            g.endpoints[0].type_hash = Some("RIHS01_a".into());
-            let hashes = ["RIHS01_a".to_owned(), "RIHS01_b".to_owned()].into();
-            g.shares[0].routes[0].consumer_hashes = [("desk".to_owned(), hashes)].into();
-        }),
-        ("the local publishers are not read", |g| g.shares[0].routes[0].is_read = false),
-        ("dropped here: stale 9, too_old 1", |g| {
-            let dropped =
-                [("stale".to_owned(), 9), ("too_old".to_owned(), 1), ("no_subscriber".to_owned(), 99)];
-            g.names.get_mut(NAME).unwrap().dropped = dropped.into();
-        }),
-        ("1 local publishers have it, but no rule names it", |g| {
-            g.shares.clear();
-            g.endpoints[0].shared_by = None;
-        }),
-        ("1 local publishers have it, but no rule names it; did you mean /A?", |g| {
-            g.shares[0].topic = "/A".into();
-            g.shares[0].routes.clear();
-            g.endpoints[0].shared_by = None;
-        }),
-    ];
-    for (found, fault) in cases {
+    for (found, fault) in owner_faults() {
         let mut graph = owner();
         fault(&mut graph);
         let wrong = wrong(&graph, "/a");
@@ -219,7 +63,7 @@ fn each_fault_of_owner_is_named() {
 fn publishers_whose_assertions_are_not_seen_elsewhere_are_pointed_out() {
     let said = |graph: &Graph| {
         let steps = diagnose::interface(graph, "/a");
-        steps.iter().any(|step| step.verdict == Verdict::Unknown && step.found.contains("MANUAL_BY_TOPIC"))
+        steps.iter().any(|step| step.verdict == Verdict::Unknown && step.found().contains("MANUAL_BY_TOPIC"))
     };
     let with = |mut graph: Graph, liveliness, lease_ms: u64| {
         graph.endpoints[0].qos = Qos { liveliness, lease_ns: Some(lease_ms * 1_000_000), ..qos() };
@@ -232,106 +76,7 @@ fn publishers_whose_assertions_are_not_seen_elsewhere_are_pointed_out() {
 
 #[test]
 fn each_fault_of_user_is_named() {
-    let cases: Vec<Case> = vec![
-        ("no link is up", |g| g.links.clear()),
-        ("arm has not said yet what it shares: nobody in reach knows it", |g| {
-            g.uses[0].has_catalogue = false
-        }),
-        ("Is its name spelt right? \"ram\" is here", |g| {
-            g.uses[0].has_catalogue = false;
-            g.uses[0].owner_meant = Some("ram".into());
-        }),
-        ("arm refuses its catalogue: x: it is in reach and refuses this node", |g| {
-            g.uses[0].has_catalogue = false;
-            g.uses[0].follow = Some("refused".into());
-            g.uses[0].owner_state = Some("refuses its catalogue: x".into());
-        }),
-        ("arm is in reach and does not share /a with here; did you mean /robot/a?", |g| {
-            g.uses[0].routes.clear();
-            g.offers[0].topic = "/robot/a".into();
-        }),
-        ("arm shares /a as std_msgs/msg/String, and the [[use]] asks for x/msg/Y", |g| {
-            g.uses[0].routes.clear();
-            g.uses[0].wanted_type = Some("x/msg/Y".into());
-        }),
-        ("arm shares /a as a service, and the [[use]] asks for a topic", |g| {
-            g.uses[0].routes.clear();
-            g.offers[0].kind = Interface::Service;
-        }),
-        ("arm lets here publish on /a, but not subscribe", |g| {
-            g.uses[0].routes.clear();
-            g.offers[0].subscribe = false;
-        }),
-        ("arm refuses it: revoked", |g| {
-            g.uses[0].routes[0].is_granted = false;
-            g.uses[0].routes[0].refused = Some("revoked".into());
-        }),
-        ("travel as JSON, and no definition of std_msgs/msg/String is known here", |g| {
-            g.uses[0].routes[0].lacks_definition = true;
-        }),
-        ("no way leads to it now", |g| {
-            g.uses[0].routes[0].is_granted = false;
-            g.uses[0].routes[0].join = Some("waiting".into());
-        }),
-        ("the answer is not here yet", |g| g.uses[0].routes[0].is_granted = false),
-        ("is silent", |g| g.links[0].silent = true),
-        ("no branch leads here", |g| g.names.get_mut(NAME).unwrap().has_branch = false),
-        ("nobody on this local network subscribes to /a", |g| g.endpoints.clear()),
-        ("the far side has std_msgs/msg/String, and the local subscribers have x/msg/Y", |g| {
-            g.endpoints[0].type_name = "x/msg/Y".into();
-        }),
-        ("the definitions of std_msgs/msg/String differ: RIHS01_a on the far side, RIHS01_b here", |g| {
-            g.endpoints[0].type_hash = Some("RIHS01_b".into());
-            g.uses[0].routes[0].type_hash = Some("RIHS01_a".into());
-        }),
-        ("by reliability: BEST_EFFORT is offered by the far side, RELIABLE is asked for", |g| {
-            g.uses[0].routes[0].qos.reliable = false;
-        }),
-        ("by durability: VOLATILE is offered by the far side, TRANSIENT_LOCAL is asked for", |g| {
-            g.endpoints[0].qos.durability = 1;
-        }),
-        ("by deadline: infinite is offered by the far side, 0.5 s is asked for", |g| {
-            g.endpoints[0].qos.deadline_ns = Some(500_000_000);
-        }),
-        ("by liveliness: AUTOMATIC is offered by the far side, MANUAL_BY_TOPIC is asked for", |g| {
-            g.endpoints[0].qos.liveliness = 2;
-        }),
-        ("by liveliness lease: 3 s is offered by the far side, 2 s is asked for", |g| {
-            g.endpoints[0].qos.lease_ns = Some(2_000_000_000);
-            g.uses[0].routes[0].qos.lease_ns = Some(3_000_000_000);
-        }),
-        ("by partition: [\"\"] is offered by the far side, [\"p\"] is asked for", |g| {
-            g.endpoints[0].qos.partitions = vec!["p".into()];
-        }),
-        ("by data representation: XCDR1 is offered by the far side, XCDR2 is asked for", |g| {
-            g.endpoints[0].qos.representations = vec!["XCDR2".into()];
-            g.uses[0].routes[0].qos.representations = vec!["XCDR2".into(), "XCDR1".into()];
-        }),
-        ("no writer for it is on the local network", |g| g.uses[0].routes[0].writers = 0),
-        ("DDS matches none of them with this node", |g| g.uses[0].routes[0].matched = 0),
-        ("dropped here: sink 6", |g| {
-            g.names.get_mut(NAME).unwrap().dropped = [("sink".to_owned(), 6)].into();
-        }),
-        ("arm shares /a with this node, but no [[use]] asks for it", |g| {
-            g.uses.clear();
-            g.offers[0].is_used = false;
-        }),
-        ("1 local subscribers want it, but no rule brings it here; did you mean /arm/a?", |g| {
-            g.uses.clear();
-            g.offers[0].topic = "/arm/a".into();
-        }),
-        ("arm refuses the token: expired", |g| {
-            g.uses[0].is_token = true;
-            g.uses[0].routes.clear();
-            g.uses[0].refused = Some("expired".into());
-        }),
-        ("nobody on the local network has /a, no rule names it", |g| {
-            g.uses.clear();
-            g.endpoints.clear();
-            g.offers.clear();
-        }),
-    ];
-    for (found, fault) in cases {
+    for (found, fault) in user_faults() {
         let mut graph = user();
         fault(&mut graph);
         let wrong = wrong(&graph, "/a");
@@ -343,7 +88,7 @@ fn each_fault_of_user_is_named() {
 fn fix(graph: &Graph) -> String {
     let steps = diagnose::interface(graph, "/a");
     let step = steps.into_iter().find(|step| step.verdict == Verdict::Wrong);
-    step.and_then(|step| step.fix).unwrap_or_default()
+    step.and_then(|step| step.fix()).unwrap_or_default()
 }
 
 #[test]
@@ -403,6 +148,7 @@ fn refused_topic_has_remedy_of_its_reason_at_both_ends() {
     let mut graph = user();
     graph.uses[0].has_catalogue = false;
     graph.uses[0].owner_state = Some(format!("refuses its catalogue: {}", RejectReason::Limit));
+    graph.uses[0].owner_refusal = Some(RejectReason::Limit.to_string());
     assert!(fix(&graph).contains("no place for more branches or requests"), "{}", fix(&graph));
 }
 
@@ -419,8 +165,8 @@ fn refusals_and_their_peers_precede_walk() {
     graph.refused = [("too_many_from_address".to_owned(), 400), ("revoked".to_owned(), 3)].into();
     graph.gateway_refused = [("too many clients of one credential".to_owned(), 5)].into();
     let steps = diagnose::interface(&graph, "/a");
-    let said = steps.iter().filter(|step| step.verdict == Verdict::Unknown && step.fix.is_some());
-    let said: Vec<_> = said.map(|step| step.found.as_str()).take(4).collect();
+    let said = steps.iter().filter(|step| step.verdict == Verdict::Unknown && step.fix().is_some());
+    let said: Vec<_> = said.map(|step| step.found()).take(4).collect();
     assert!(
         said[0].starts_with("peers refused a link: too_many_from_address 400 (too many were"),
         "{said:?}"
@@ -432,31 +178,40 @@ fn refusals_and_their_peers_precede_walk() {
     );
     assert!(said[3].starts_with("peers refused a link: revoked 3"), "{said:?}");
     // Refusals that a sound network causes are not reported.
-    assert!(!steps.iter().any(|step| step.found.contains("unknown 30")));
+    assert!(!steps.iter().any(|step| step.found().contains("unknown 30")));
     // A router, which knows only names, reports the same.
     assert!(named(&graph).iter().any(|(_, found)| found.contains("crl_flood 9")));
     // Only the most frequent refusals are reported.
-    let all = crate::refusals::tests::every_named_refusal();
-    graph.drops.extend(all.into_iter().map(|key| (key.to_owned(), 1)));
+    let all = CONTROL.iter().filter(|refusal| refusal.is_named);
+    graph.drops.extend(all.map(|refusal| (refusal.key.to_owned(), 1)));
     let steps = diagnose::interface(&graph, "/a");
-    assert_eq!(steps.iter().filter(|step| step.found.starts_with("refused here: ")).count(), 8 - 3);
+    assert_eq!(steps.iter().filter(|step| step.found().starts_with("refused here: ")).count(), 8 - 3);
+}
+
+#[test]
+fn refusals_are_reported_with_remedy_unless_sound_network_causes_them() {
+    for (place, table) in [CONTROL, DOOR, GATEWAY].into_iter().enumerate() {
+        for refusal in table {
+            let mut graph = sound();
+            let counts = match place {
+                0 => &mut graph.drops,
+                1 => &mut graph.refused,
+                _ => &mut graph.gateway_refused,
+            };
+            counts.insert(refusal.key.to_owned(), 3);
+            let said = format!("{} 3 ({})", refusal.key, refusal.means);
+            let steps = diagnose::name(&graph, NAME);
+            let step = steps.iter().find(|step| step.found().contains(&said));
+            assert_eq!(step.is_some(), refusal.is_named, "{refusal:?}");
+            assert!(step.is_none_or(|step| step.verdict == Verdict::Unknown));
+            assert!(step.is_none_or(|step| step.fix().unwrap_or_default() == refusal.fix), "{refusal:?}");
+        }
+    }
 }
 
 #[test]
 fn each_fault_of_remote_publisher_is_named() {
-    let cases: Vec<Case> = vec![
-        ("no publisher of /a is on the local network", |g| g.endpoints.clear()),
-        ("arm shares /a with here, but does not let it publish", |g| {
-            g.uses[0].routes.clear();
-            g.offers[0].publish = false;
-        }),
-        ("arm takes it as std_msgs/msg/String, and the local publishers have x/msg/Y", |g| {
-            g.uses[0].routes[0].publishers = 0;
-            g.endpoints[0].type_name = "x/msg/Y".into();
-        }),
-        ("are not read", |g| g.uses[0].routes[0].is_read = false),
-    ];
-    for (found, fault) in cases {
+    for (found, fault) in publisher_faults() {
         let mut graph = publisher();
         fault(&mut graph);
         let wrong = wrong(&graph, "/a");
@@ -532,19 +287,6 @@ fn wildcards_and_renames_are_followed() {
     );
 }
 
-/// Returns a use of all interfaces of a kind that an owner shares.
-fn pattern(kind: Interface, owner: &str) -> Use {
-    Use {
-        kind,
-        topic: "/**".into(),
-        local_topic: "/**".into(),
-        owner: owner.into(),
-        owner_id: if owner == "arm" { "1d".into() } else { "2d".into() },
-        has_catalogue: true,
-        ..Use::default()
-    }
-}
-
 #[test]
 fn other_patterns_are_no_fault_of_healthy_topic() {
     let mut graph = user();
@@ -613,10 +355,10 @@ fn covering_patterns_are_chosen_by_kind() {
     assert!(wrong(&graph, "/a").contains("1 local publishers have it, but no rule names it"));
     graph.endpoints = vec![end("/rosout", false)];
     let steps = diagnose::interface(&graph, "/rosout");
-    assert!(steps.last().unwrap().found.contains("does not share /robot/rosout"), "{steps:?}");
+    assert!(steps.last().unwrap().found().contains("does not share /robot/rosout"), "{steps:?}");
     graph.uses[1].topic = "/**".into();
     let steps = diagnose::interface(&graph, "/rosout");
-    let fix = steps.last().unwrap().fix.as_deref().unwrap_or_default();
+    let fix = steps.last().unwrap().fix().unwrap_or_default();
     assert!(fix.contains("no wildcard shares it; name it, [[share]] topic = \"/rosout\""), "{steps:?}");
 }
 
@@ -630,7 +372,7 @@ fn incompatible_subscribers_beside_matched_ones_are_no_fault() {
     assert!(
         steps
             .iter()
-            .any(|s| s.verdict == Verdict::Unknown && s.found.starts_with("1 of 2 local subscribers"))
+            .any(|s| s.verdict == Verdict::Unknown && s.found().starts_with("1 of 2 local subscribers"))
     );
 }
 
@@ -650,7 +392,7 @@ fn routers_know_names() {
 /// Returns the first finding of a walk with this verdict.
 fn found(graph: &Graph, verdict: Verdict) -> Option<String> {
     let steps = diagnose::interface(graph, "/a");
-    steps.into_iter().find(|step| step.verdict == verdict).map(|step| step.found)
+    steps.into_iter().find(|step| step.verdict == verdict).map(|step| step.found())
 }
 
 #[test]
@@ -684,7 +426,7 @@ fn operator_mistakes_come_first() {
     );
     let at_router = diagnose::name(&Graph { alerts: vec![clock.clone()], ..sound() }, NAME);
     assert_eq!(
-        at_router.last().map(|step| (step.verdict, step.found.clone())),
+        at_router.last().map(|step| (step.verdict, step.found())),
         Some((Verdict::Wrong, clock.to_string()))
     );
 }
@@ -699,7 +441,7 @@ fn unknown_member_names_are_reported() {
     let hints: Vec<_> = diagnose::interface(&graph, "/a")
         .into_iter()
         .filter(|step| step.verdict == Verdict::Unknown)
-        .map(|step| step.found)
+        .map(|step| step.found())
         .collect();
     assert_eq!(hints[0], "the [[share]] names \"deks\", which nobody here is called; \"desk\" is here");
     assert!(
@@ -711,6 +453,23 @@ fn unknown_member_names_are_reported() {
     assert!(fix(&graph).contains("if \"desk\" is meant, correct it in the file of here"));
     graph.shares[0].unheard.pop();
     assert_eq!(wrong(&graph, "/a"), "nobody asked for it");
+}
+
+#[test]
+fn advice_for_other_side_has_the_name_of_that_side() {
+    let advice = |graph: &Graph| diagnose::interface(graph, "/a").last().and_then(|step| step.fix()).unwrap();
+    let mut graph = owner();
+    graph.shares[0].routes[0].shared_as = Some("/arm/a".into());
+    assert_eq!(advice(&graph), "run `sgc why /arm/a` there");
+    graph.shares[0].routes[0].granted.clear();
+    assert!(advice(&graph).contains("topic = \"/arm/a\"; if it is there, run `sgc why /arm/a`"));
+    // A pattern has no path of its own at its owner.
+    let mut graph = publisher();
+    (graph.uses[0].topic, graph.uses[0].local_topic) = ("/**".into(), "/**".into());
+    assert_eq!(advice(&graph), "run `sgc why /a` there");
+    graph.uses[0].routes[0].is_granted = false;
+    graph.uses[0].routes[0].refused = Some("not listed".into());
+    assert!(advice(&graph).contains("`sgc why /a` names the entry"));
 }
 
 #[test]
@@ -728,18 +487,18 @@ fn lost_calls_are_fault_until_calls_are_answered() {
     };
     let fault = wrong(&lost("call_server_gone", 3, 5));
     let said = "/a: 3 calls of clients here got no answer, among them 2 of /caller, the last 5 s ago: call_server_gone";
-    assert!(fault.len() == 1 && fault[0].found.starts_with(said), "{fault:?}");
-    assert!(fault[0].fix.as_ref().unwrap().contains("start the server again"));
+    assert!(fault.len() == 1 && fault[0].found().starts_with(said), "{fault:?}");
+    assert!(fault[0].fix().as_ref().unwrap().contains("start the server again"));
     for graph in
         [lost("call_server_gone", 0, 5), lost("call_server_gone", 3, 601), lost("call_client_gone", 3, 5)]
     {
         assert_eq!(wrong(&graph), []);
         let steps = diagnose::interface(&graph, "/a");
-        assert!(steps.iter().any(|step| step.found.contains("3 calls of clients here got no answer")));
+        assert!(steps.iter().any(|step| step.found().contains("3 calls of clients here got no answer")));
     }
     // Another fault comes last, as the only one.
     let mut graph = lost("call_withdrawn", 3, 5);
     graph.links.clear();
     let fault = wrong(&graph);
-    assert!(fault.len() == 1 && fault[0].found.contains("no link is up"), "{fault:?}");
+    assert!(fault.len() == 1 && fault[0].found().contains("no link is up"), "{fault:?}");
 }

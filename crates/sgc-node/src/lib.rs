@@ -32,6 +32,7 @@ pub use control::operations::OperationError;
 pub use control::operators::{roster_head, roster_row};
 pub use control::reload::{ConfigSource, ReloadReport};
 pub use control::rules::{RulesError, read_token};
+pub use data::stats::DataDrop;
 pub use discovery::RouterStatus;
 pub use gateway::access::{
     ACCESS_TOKENS_MAX, AccessError, AccessRecord, AccessRecords, access_of, access_with,

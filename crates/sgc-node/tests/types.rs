@@ -119,6 +119,18 @@ fn a_user_without_definitions_is_told_what_a_type_looks_like() {
 }
 
 #[test]
+fn tap_of_used_topic_that_nobody_publishes_does_not_call_it_unused() {
+    let trio = Trio::new();
+    let desk = desk(&trio, None, |_| {});
+    let refused = |topic: &str| {
+        let tap = AdminRequest::Tap { topic: topic.into(), side: None, bytes: 64 };
+        desk.begin(&tap)["error"].as_str().unwrap_or_default().to_owned()
+    };
+    wait("the rule", || refused("/thing").contains("the [[use]] of it has brought nothing yet"));
+    assert!(refused("/other").contains("this node does not use it"));
+}
+
+#[test]
 fn a_definition_that_is_another_than_the_announced_one_is_not_told() {
     let package = Package::new();
     let trio = Trio::new();

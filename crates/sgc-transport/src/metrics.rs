@@ -61,7 +61,7 @@ impl RefusalKind {
     ];
 
     /// Returns the label of the metric.
-    pub fn label(self) -> &'static str {
+    pub const fn label(self) -> &'static str {
         match self {
             Self::NoCertificate => "no_certificate",
             Self::OtherCa => "other_ca",

@@ -51,16 +51,8 @@ pub(crate) fn why(args: &WhyArgs) -> Result<ExitCode, CliError> {
     if args.json {
         output::line(serde_json::to_string(&steps).unwrap_or_default())?;
     } else {
-        for step in &steps {
-            let mark = match step.verdict {
-                Verdict::Fine => '✓',
-                Verdict::Wrong => '✗',
-                Verdict::Unknown => '?',
-            };
-            output::line(output::clean(&format!("{mark} {}", step.found)))?;
-            if let Some(fix) = &step.fix {
-                output::line(output::clean(&format!("    {fix}")))?;
-            }
+        for line in steps.iter().flat_map(Step::lines) {
+            output::line(line)?;
         }
     }
     Ok(if is_wrong { ExitCode::from(EXIT_FAILURE) } else { ExitCode::SUCCESS })
@@ -80,10 +72,7 @@ fn graph(
             Ok(walk(&graph))
         }
         Err(error @ (CliError::Diagnosis(DiagnosisError::NoNode { .. }) | CliError::NoNodeHere { .. })) => {
-            Ok(vec![Step::wrong(
-                error.to_string(),
-                "start it with `sgc run -c FILE`; if it runs elsewhere, ask there, or as the user that runs it",
-            )])
+            Ok(vec![Step::no_node(error.to_string())])
         }
         Err(error) => Err(error),
     }

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
+use sgc_endpoint::JoinStatus;
 use sgc_wire::{Durability, History, Kind, Liveliness, Reliability, Representations};
 
 use crate::control::alerts::Alert;
@@ -332,6 +333,8 @@ pub struct UnheardMember {
 pub struct ShareRoute {
     /// Name on the local network.
     pub topic: String,
+    /// Name under which other nodes find it. Nodes of earlier versions do not say it.
+    pub shared_as: Option<String>,
     /// ROS type.
     #[serde(rename = "type")]
     pub type_name: String,
@@ -385,8 +388,10 @@ pub struct Use {
     pub owner_meant: Option<String>,
     /// Fault of the owner, if there is one.
     pub owner_state: Option<String>,
-    /// State of following the owner: `"waiting"`, `"asked"`, `"refused"`, `"granted"`.
-    pub follow: Option<String>,
+    /// Reason of the owner or of a router, if it refuses its catalogue.
+    pub owner_refusal: Option<String>,
+    /// State of following the owner.
+    pub follow: Option<JoinState>,
     /// Whether the owner's catalogue has arrived.
     pub has_catalogue: bool,
     /// Whether the rule is a token.
@@ -397,6 +402,34 @@ pub struct Use {
     pub refused: Option<String>,
     /// Interfaces that the rule uses now.
     pub routes: Vec<UseRoute>,
+}
+
+/// State of a request to an owner.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum JoinState {
+    /// No route leads to the owner.
+    Waiting,
+    /// It is not answered yet.
+    Asked,
+    /// The owner or a router refused it.
+    Refused,
+    /// The owner granted it.
+    Granted,
+    /// A state that this version does not know.
+    #[serde(other)]
+    Other,
+}
+
+impl From<&JoinStatus> for JoinState {
+    fn from(status: &JoinStatus) -> Self {
+        match status {
+            JoinStatus::Waiting => Self::Waiting,
+            JoinStatus::Asked => Self::Asked,
+            JoinStatus::Refused(_) => Self::Refused,
+            JoinStatus::Granted => Self::Granted,
+        }
+    }
 }
 
 /// An interface of another node that is used here.
@@ -418,8 +451,8 @@ pub struct UseRoute {
     pub is_granted: bool,
     /// Refusing node and reason, if it was refused.
     pub refused: Option<String>,
-    /// State of the join, as in [`Use::follow`].
-    pub join: Option<String>,
+    /// State of the join.
+    pub join: Option<JoinState>,
     /// Writers on the local network, or a server for a service.
     pub writers: usize,
     /// Local readers that match those writers.

@@ -46,7 +46,7 @@ impl NameStats {
 
 /// Reasons why the data path drops a packet or a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum DataDrop {
+pub enum DataDrop {
     /// The name has no tree, because nobody joined.
     NoTree,
     /// The packet came over a link that is not on the tree towards its source.
@@ -112,7 +112,7 @@ impl Dropped {
 
 impl DataDrop {
     /// All reasons in the order of their numbers.
-    const ALL: [Self; 20] = [
+    pub const ALL: [Self; 20] = [
         Self::NoTree,
         Self::WrongWay,
         Self::HopLimit,
@@ -136,7 +136,7 @@ impl DataDrop {
     ];
 
     /// Returns a short, stable name for counters.
-    pub(crate) fn key(self) -> &'static str {
+    pub const fn key(self) -> &'static str {
         match self {
             Self::NoTree => "no_subscriber",
             Self::WrongWay => "wrong_way",

@@ -255,6 +255,14 @@ pub(crate) enum TapError {
         /// The topic.
         topic: String,
     },
+    /// The topic is used, and no owner has it.
+    #[error(
+        "nobody publishes {topic} on the local network, and the [[use]] of it has brought nothing yet; see `sgc why {topic}`"
+    )]
+    NotBrought {
+        /// The topic.
+        topic: String,
+    },
     /// The topic has no messages on that side.
     #[error("{topic} is not to be seen there: {why}")]
     NotThere {

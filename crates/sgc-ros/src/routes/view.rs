@@ -25,6 +25,8 @@ pub struct ShareView<'a> {
 pub struct ShareRouteView {
     /// The name on the local network.
     pub local_name: String,
+    /// The name under which other nodes find it.
+    pub shared_as: String,
     /// The ROS type.
     pub type_name: String,
     /// The name on the wire.
@@ -136,6 +138,7 @@ impl<R> Routes<R> {
             let of_rule = self.shares.values().filter(move |share| share.rule() == index);
             let routes = of_rule.map(|share| ShareRouteView {
                 local_name: share.local_name().to_owned(),
+                shared_as: rule.naming.renamed(&rule.metadata.ros_name, share.local_name()),
                 type_name: share.type_name(),
                 name: share.name(),
                 writers: share.writers().len(),

@@ -20,6 +20,8 @@ use crate::{output, yaml};
 
 /// Default time to wait for subscribers, in seconds.
 const WAIT_DEFAULT_S: u64 = 10;
+/// Default rate of a message, in messages per second.
+const RATE_DEFAULT_HZ: f64 = 1.0;
 
 #[derive(Clone, Copy, Debug, ValueEnum, PartialEq, Eq)]
 enum ReliabilityArg {
@@ -50,9 +52,9 @@ pub(crate) struct PubArgs {
     /// Message in JSON or YAML
     #[arg(value_name = "MESSAGE")]
     second: Option<String>,
-    /// Messages per second
-    #[arg(short, long, value_name = "HZ", default_value_t = 1.0)]
-    rate: f64,
+    /// Messages per second [default: 1; lines of standard input are published as they come]
+    #[arg(short, long, value_name = "HZ")]
+    rate: Option<f64>,
     /// Wait for a subscriber, publish once and end
     #[arg(short = '1', long, conflicts_with = "count")]
     once: bool,
@@ -74,6 +76,26 @@ pub(crate) struct PubArgs {
     depth: Option<u32>,
     #[command(flatten)]
     node: NodeArgs,
+}
+
+/// The times of messages.
+struct Pace {
+    /// Time between messages; none publishes each at once.
+    period: Option<Duration>,
+    /// Time of the next message.
+    next: Instant,
+}
+
+impl Pace {
+    /// Returns the time to wait before a message that is at hand.
+    fn wait(&mut self, now: Instant) -> Duration {
+        let Some(period) = self.period else { return Duration::ZERO };
+        let wait = self.next.saturating_duration_since(now);
+        // A pause is not made up for.
+        let at = if now > self.next + period { now } else { self.next };
+        self.next = at + period;
+        wait
+    }
 }
 
 /// A running node that publishes for this command.
@@ -122,7 +144,10 @@ pub(super) fn publish(args: &PubArgs) -> Result<ExitCode, CliError> {
     let (type_name, message) = type_and_message(args.first.as_deref(), args.second.as_deref());
     let not_a_message = |reason: String| CliError::Cannot { reason: format!("the message: {reason}") };
     let message = message.map(yaml::json_of).transpose().map_err(not_a_message)?;
-    let period = Duration::try_from_secs_f64(1.0 / args.rate)
+    let rate = args.rate.or(message.is_some().then_some(RATE_DEFAULT_HZ));
+    let period = rate
+        .map(|rate| Duration::try_from_secs_f64(1.0 / rate))
+        .transpose()
         .map_err(|_| CliError::Cannot { reason: "--rate: more than 0 messages a second".to_owned() })?;
     let wait_for = args.wait.unwrap_or(u32::from(args.once));
     let wish = PublishRequest {
@@ -142,25 +167,40 @@ pub(super) fn publish(args: &PubArgs) -> Result<ExitCode, CliError> {
         ));
         return Ok(ExitCode::from(EXIT_FAILURE));
     }
+    let mut pace = Pace { period, next: Instant::now() };
     let Some(message) = message else {
         for line in std::io::stdin().lock().lines() {
             let line =
                 line.map_err(|source| ProcessError::System { what: "cannot read messages", source })?;
-            publisher.publish(&yaml::json_of(&line).map_err(not_a_message)?)?;
+            let message = yaml::json_of(&line).map_err(not_a_message)?;
+            std::thread::sleep(pace.wait(Instant::now()));
+            publisher.publish(&message)?;
         }
         return Ok(ExitCode::SUCCESS);
     };
     let most = if args.once { Some(1) } else { args.count };
-    let mut next = Instant::now();
     let mut sent = 0;
     while most.is_none_or(|most| sent < most) {
+        std::thread::sleep(pace.wait(Instant::now()));
         publisher.publish(&message)?;
         sent += 1;
         output::line(format!("published {sent}: {message}"))?;
-        next += period;
-        if most != Some(sent) {
-            std::thread::sleep(next.saturating_duration_since(Instant::now()));
-        }
     }
     Ok(ExitCode::SUCCESS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn messages_keep_their_rate_and_do_not_make_up_for_a_pause() {
+        let begin = Instant::now();
+        let at = |ms| begin + Duration::from_millis(ms);
+        let mut pace = Pace { period: Some(Duration::from_millis(100)), next: begin };
+        let waits = [0, 0, 130, 1000, 1001].map(|ms| pace.wait(at(ms)).as_millis());
+        assert_eq!(waits, [0, 100, 70, 0, 99]);
+        let mut unpaced = Pace { period: None, next: begin };
+        assert_eq!([0, 0].map(|ms| unpaced.wait(at(ms))), [Duration::ZERO; 2]);
+    }
 }

@@ -4,10 +4,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 
-use sgc_endpoint::JoinStatus;
 use sgc_ros::{
-    Direction, DiscoveredEndpoint, EndpointKind, EndpointSpec, RosNetwork, Sample, SampleHandler, ShareView,
-    UseView, dds_topic, dds_type, reader_for, ros_topic, ros_type, weakest,
+    Direction, DiscoveredEndpoint, EndpointKind, EndpointSpec, OwnerState, RosNetwork, Sample, SampleHandler,
+    ShareView, UseView, dds_topic, dds_type, matches, reader_for, ros_topic, ros_type, weakest,
 };
 use sgc_trust::{Grantees, Policy};
 use sgc_wire::{CatalogueEntry, Kind, Name, NodeId, PayloadForm, Role};
@@ -128,6 +127,7 @@ impl<N: RosNetwork> Core<N> {
             let sink = self.sinks.get(&route.name);
             share.routes.push(ShareRoute {
                 topic: route.local_name,
+                shared_as: Some(route.shared_as),
                 type_name: route.type_name,
                 name: route.name.to_string(),
                 writers: route.writers,
@@ -154,6 +154,10 @@ impl<N: RosNetwork> Core<N> {
             names.insert(name);
             (Some(name.to_string()), refused.map(|by| by.to_string()))
         });
+        let owner_refusal = match &view.owner_state {
+            Some(OwnerState::Refuses(by)) => Some(by),
+            _ => None,
+        };
         let mut used = Use {
             kind: view.kind.into(),
             publishes,
@@ -163,8 +167,9 @@ impl<N: RosNetwork> Core<N> {
             owner_id: view.owner.to_string(),
             owner: view.owner_name.to_owned(),
             owner_meant: self.members.owner_meant(view.owner_name).map(str::to_owned),
+            owner_refusal: owner_refusal.map(|by| by.to_string()),
             owner_state: view.owner_state.map(owner_state),
-            follow: self.endpoint.follow_status(&view.owner).map(|s| label(&s).to_owned()),
+            follow: self.endpoint.follow_status(&view.owner).map(|status| (&status).into()),
             has_catalogue: view.has_catalogue,
             is_token: name.is_some(),
             name,
@@ -183,7 +188,7 @@ impl<N: RosNetwork> Core<N> {
                 qos: (&route.entry.qos).into(),
                 is_granted: route.is_granted,
                 refused: route.refused.map(|by| by.to_string()),
-                join: self.endpoint.join_status(&route.name).map(|s| label(&s).to_owned()),
+                join: self.endpoint.join_status(&route.name).map(|status| (&status).into()),
                 writers: route.writers,
                 matched: sink.map_or(0, |sink| sink.matched()),
                 publishers: route.publishers,
@@ -317,7 +322,12 @@ impl<N: RosNetwork> Core<N> {
             .collect();
         // If publishers have several types, the first one counts.
         let Some(first) = writers.first() else {
-            let _ = reply.send(Err(TapError::NoTopic { topic }));
+            let is_used = routes
+                .use_views()
+                .iter()
+                .any(|view| view.direction == Direction::Bring && matches(&view.local_topic, &topic));
+            let error = if is_used { TapError::NotBrought { topic } } else { TapError::NoTopic { topic } };
+            let _ = reply.send(Err(error));
             return;
         };
         let same: Vec<_> = writers.iter().filter(|w| w.type_name == first.type_name).collect();
@@ -362,13 +372,4 @@ fn is_called(entry: &CatalogueEntry) -> bool {
 
 fn count(grantees: &Grantees) -> [usize; 3] {
     [grantees.nodes.len(), grantees.groups.len(), grantees.fleets.len()]
-}
-
-fn label(status: &JoinStatus) -> &'static str {
-    match status {
-        JoinStatus::Waiting => "waiting",
-        JoinStatus::Asked => "asked",
-        JoinStatus::Refused(_) => "refused",
-        JoinStatus::Granted => "granted",
-    }
 }
