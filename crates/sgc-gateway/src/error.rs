@@ -26,7 +26,7 @@ pub enum GatewayError {
         example: &'static str,
     },
     /// The type is not given and not known.
-    #[error("the type of {name} is not known, since nobody has it yet: say it")]
+    #[error("the type of {name} is not known, since nobody has it yet; give its type")]
     TypeUnknown {
         /// The topic, service or action.
         name: String,

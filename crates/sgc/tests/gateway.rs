@@ -63,6 +63,19 @@ fn clients(lab: &Lab) -> Vec<(String, String)> {
 }
 
 #[test]
+fn first_call_after_a_start_finds_the_type_of_the_service() {
+    let lab = lab("");
+    let _server = server(&lab);
+    eventually("the service is here", || shell(&lab, &["why", "/add_two_ints"]).status.success());
+    // Nothing opened the gateway's network before.
+    let reply = said(&shell(&lab, &["service", "call", "/add_two_ints", "{a: 2, b: 3}"]));
+    assert_eq!(reply, r#"{"sum":5}"#);
+    let nobody = shell(&lab, &["service", "call", "/add_three_ints", "{a: 2, b: 3}"]);
+    let text = String::from_utf8_lossy(&nobody.stderr).into_owned();
+    assert!(text.contains("the type of /add_three_ints is not known"), "{text}");
+}
+
+#[test]
 fn programs_without_ros_talk_with_ros_2_nodes_at_the_other_end_of_the_mesh() {
     let mut lab = lab("[gateway]\n");
     let _talker = talker(&lab);

@@ -554,7 +554,11 @@ async fn invalid_requests_are_refused_with_an_explanation() {
             Code::InvalidArgument,
             "/chatter is of type std_msgs/msg/String, not std_msgs/msg/Bool",
         ),
-        (hear("/none"), Code::NotFound, "the type of /none is not known, since nobody has it yet: say it"),
+        (
+            hear("/none"),
+            Code::NotFound,
+            "the type of /none is not known, since nobody has it yet; give its type",
+        ),
         (hear("none"), Code::InvalidArgument, "\"none\" is no name of a topic"),
         (SubscribeRequest { depth: 10_001, ..hear("/chatter") }, Code::InvalidArgument, "a depth of 10001"),
         (SubscribeRequest { encoding: 9, ..hear("/chatter") }, Code::InvalidArgument, "9 is no encoding"),

@@ -67,7 +67,10 @@ async fn calls_that_fail_say_why() {
     let told = "not a message of that type: there is no member \"date\"";
     assert_eq!(wrong, (json!(told), false));
     let nobody = browser.call("/nobody", json!({})).await;
-    assert_eq!(nobody, (json!("the type of /nobody is not known, since nobody has it yet: say it"), false));
+    assert_eq!(
+        nobody,
+        (json!("the type of /nobody is not known, since nobody has it yet; give its type"), false)
+    );
     // The next service does not answer.
     let _silent = site.session("silent").serve("/silent", Some(SET_BOOL)).await.unwrap();
     browser.send(json!({"op": "call_service", "id": "c", "service": "/silent", "timeout": 0.05})).await;

@@ -38,7 +38,7 @@ async fn topics_without_a_type_take_that_of_the_network() {
     write(&talker, "hello");
     assert_eq!(browser.next().await["msg"]["data"], "hello");
     let told = browser.told(json!({"op": "subscribe", "topic": "/nothing", "id": 3})).await;
-    assert_eq!(told, "subscribe: the type of /nothing is not known, since nobody has it yet: say it");
+    assert_eq!(told, "subscribe: the type of /nothing is not known, since nobody has it yet; give its type");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -7,10 +7,11 @@ use std::io;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use sgc_gateway::{Advertise, Content, Form, GatewayError};
+use sgc_gateway::{Advertise, Content, Form, GatewayError, Graph, Session};
 use sgc_wire::{Durability, History, Qos, Reliability};
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::UnixStream;
+use tokio::time::timeout;
 
 use crate::gateway::Gateway;
 
@@ -18,7 +19,7 @@ use crate::gateway::Gateway;
 const MESSAGE_BYTES_MAX: u64 = 256 << 20;
 /// Longest wait for subscribers or a reply.
 const WAIT_MAX: Duration = Duration::from_secs(3600);
-/// Time to discover the subscribers that the graph shows.
+/// Time to discover the subscribers that the graph shows, and the endpoints that have a type.
 const SETTLE_MAX: Duration = Duration::from_secs(2);
 
 /// Request to publish.
@@ -69,13 +70,26 @@ fn wait(ms: u64) -> Duration {
     Duration::from_millis(ms).min(WAIT_MAX)
 }
 
+/// Waits until an interface with a type is discovered, at most for a moment. The first request opens the gateway's network,
+/// on which nothing is discovered yet.
+async fn wait_for_type(session: &Session, longest: Duration, has_type: impl Fn(&Graph) -> bool) {
+    let mut graph = session.hub().graph_changes();
+    let discovered = async { while !has_type(&session.hub().graph()) && graph.changed().await.is_ok() {} };
+    // Without a type the request is refused with the reason.
+    let _ = timeout(SETTLE_MAX.min(longest), discovered).await;
+}
+
 /// Calls a service and returns its reply as JSON.
 pub(crate) async fn call(gateway: &Gateway, wish: &CallRequest) -> Result<String, String> {
     let reply = async {
         let session = gateway.own_session().await?;
         let request = Content::json(wish.request.clone());
-        let type_name = wish.type_name.as_deref();
-        session.call(&wish.service, type_name, &request, Form::Json, wait(wish.timeout_ms)).await
+        let (type_name, longest) = (wish.type_name.as_deref(), wait(wish.timeout_ms));
+        if type_name.is_none() {
+            let has_type = |graph: &Graph| graph.services.contains_key(&wish.service);
+            wait_for_type(&session, longest, has_type).await;
+        }
+        session.call(&wish.service, type_name, &request, Form::Json, longest).await
     };
     let reply = reply.await.map_err(|error| error.to_string())?;
     Ok(String::from_utf8_lossy(&reply).into_owned())
@@ -93,6 +107,10 @@ pub(crate) async fn publish(
     let begun = async {
         let session = gateway.own_session().await?;
         let (wait_for, longest) = (wish.wait_for, wait(wish.wait_ms));
+        if wish.type_name.is_none() {
+            let info = |graph: &Graph| graph.topics.get(&wish.topic)?.type_name().map(drop);
+            wait_for_type(&session, longest, |graph| info(graph).is_some()).await;
+        }
         let publication = session.advertise(advertise(wish)).await?;
         publication.settle(SETTLE_MAX.min(longest)).await;
         let subscribers = publication.wait_for_readers(wait_for, longest).await;
