@@ -42,7 +42,11 @@ pub fn answer<T: serde::de::DeserializeOwned>(socket: &Path, text: &str) -> Resu
         Ok(Answer::Refused(reason)) => Err(DiagnosisError::NotSeen { reason }),
         Err(_) => Err(DiagnosisError::NotAStatus {
             path: socket.to_owned(),
-            reason: "it does not know what it was asked: it is of an earlier version; restart it".to_owned(),
+            reason: match text.trim() {
+                "" => "it gave no answer: the node is starting or ending; ask again",
+                _ => "it does not know what it was asked: it is of an earlier version; restart it",
+            }
+            .to_owned(),
         }),
     }
 }
