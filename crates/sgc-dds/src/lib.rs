@@ -39,6 +39,7 @@ mod late;
 mod late_readers;
 mod log;
 mod manual_leases;
+mod neighbours;
 mod network;
 mod pace;
 mod participant;

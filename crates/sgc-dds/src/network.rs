@@ -3,6 +3,7 @@
 //! It opens the [`Participant`] and hands it to readers, writers and discovery, which keep it alive. It moves no sample
 //! itself.
 
+use std::collections::BTreeSet;
 use std::net::Ipv4Addr;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
@@ -180,6 +181,10 @@ impl RosNetwork for CycloneNetwork {
 
     fn has_graph(&self) -> bool {
         self.announcer.is_some()
+    }
+
+    fn neighbours(&self) -> BTreeSet<String> {
+        self.participant.neighbours().tags()
     }
 
     fn show(&self, kind: EndpointKind, spec: &EndpointSpec) -> Result<ShownEndpoint, RosError> {

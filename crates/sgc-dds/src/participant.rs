@@ -21,6 +21,7 @@ use crate::domain::Domain;
 use crate::entity::{Entity, check};
 use crate::first_messages::{self, EndpointWatch};
 use crate::log;
+use crate::neighbours::Neighbours;
 use crate::pace::Pace;
 use crate::plugin_domain;
 use crate::qos::NativeQos;
@@ -48,6 +49,7 @@ pub(crate) struct Participant {
     holds: Pace,
     writers: AtomicUsize,
     late_writers: AtomicUsize,
+    neighbours: Neighbours,
     /// The handler of discovery events while discovery runs.
     watcher: Mutex<Weak<Mutex<DiscoveryHandler>>>,
     /// Dropped last.
@@ -96,6 +98,7 @@ impl Participant {
             holds: Pace::new(),
             writers: AtomicUsize::new(0),
             late_writers: AtomicUsize::new(0),
+            neighbours: Neighbours::default(),
             watcher: Mutex::default(),
             _alive: alive,
         };
@@ -135,6 +138,11 @@ impl Participant {
 
     pub(crate) fn guid(&self) -> Guid {
         self.guid
+    }
+
+    /// Returns the other SGC nodes on the network.
+    pub(crate) fn neighbours(&self) -> &Neighbours {
+        &self.neighbours
     }
 
     /// Returns the participant's domain.

@@ -57,6 +57,14 @@ pub fn is_tagged(user_data: &[u8]) -> bool {
     elements(user_data).any(|(key, _)| key == TAG_KEY.as_bytes())
 }
 
+/// Returns the name of the SGC node that created the endpoint or participant.
+pub fn tag(user_data: &[u8]) -> Option<&str> {
+    elements(user_data)
+        .find(|(key, _)| *key == TAG_KEY.as_bytes())
+        .and_then(|(_, value)| std::str::from_utf8(value).ok())
+        .filter(|value| is_value(value))
+}
+
 /// Returns the type hash (`RIHS01_…`) of an endpoint, if it carries a plausible one.
 pub fn type_hash(user_data: &[u8]) -> Option<String> {
     elements(user_data)

@@ -1000,6 +1000,18 @@ fn a_write_that_nobody_acknowledges_ends_with_a_timeout() {
 }
 
 #[test]
+fn nodes_on_one_network_know_each_other_by_name() {
+    let (arm, desk) = (open(166, Some("arm-1")), open(166, Some("desk")));
+    let _plain = open(166, None);
+    let (_arms, _desks) = (discover(&arm), discover(&desk));
+    let names = |network: &CycloneNetwork| Vec::from_iter(network.neighbours());
+    eventually("the arm knows the desk", || names(&arm) == ["desk"]);
+    eventually("the desk knows the arm", || names(&desk) == ["arm-1"]);
+    drop(desk);
+    eventually("the desk is gone", || names(&arm).is_empty());
+}
+
+#[test]
 fn readers_are_counted_while_a_write_waits() {
     let (ros, sgc) = (open(165, None), open(165, Some("arm-1")));
     let all = with(spec("counted"), |qos| qos.history = History::KeepAll);

@@ -472,6 +472,11 @@ pub trait RosNetwork: Send + Sync + 'static {
     /// Returns `true` if nodes are reported and announced.
     fn has_graph(&self) -> bool;
 
+    /// Returns the names of other SGC nodes that are on this network as well, as far as they are known.
+    fn neighbours(&self) -> BTreeSet<String> {
+        BTreeSet::new()
+    }
+
     /// Shows an endpoint that represents a remote one in the local graph, with its type, type hash and QoS except for
     /// history and partitions. It matches no endpoint, so it exchanges no data. May block.
     fn show(&self, kind: EndpointKind, spec: &EndpointSpec) -> Result<ShownEndpoint, RosError>;

@@ -25,8 +25,8 @@ struct Lab {
 }
 
 impl Lab {
-    fn new() -> Self {
-        let namespace = support::own_network(format!("sgcl-{}", std::process::id()));
+    fn new(name: &str) -> Self {
+        let namespace = support::own_network(format!("sgcl-{name}-{}", std::process::id()));
         let dir = tempfile::tempdir().unwrap();
         support::enroll(dir.path(), ["robot", "cloud --router", "desk"]);
         Self { dir, namespace, nodes: Vec::new() }
@@ -119,8 +119,25 @@ impl Drop for Lab {
 }
 
 #[test]
+fn owner_on_the_same_local_network_is_pointed_out() {
+    let mut lab = Lab::new("same");
+    let router = lab.start("cloud", "[router]\nlisten = [\"quic://127.0.0.1:0\"]\n").remove(0);
+    let here = lab.ros("robot", &router);
+    lab.start("robot", &format!("{here}[[share]]\ntopic = \"/chatter\"\nto = [\"desk\"]\n"));
+    lab.start("desk", &format!("{here}[[use]]\nfrom = \"robot\"\ntopic = \"/chatter\"\n"));
+    let _talker = lab.peer("robot", "pub", &["--type", "string", "--rate", "20", "--wait-matched", "0"]);
+    let alert = "robot and this node are on the same local ROS 2 network";
+    eventually("why points it out", || {
+        let output = lab.sgc(&["why", "--socket", "desk.sock", "/chatter"]);
+        String::from_utf8_lossy(&output.stdout).contains(alert)
+    });
+    eventually("the log warns", || lab.log("desk").contains(alert));
+    assert!(!lab.log("robot").contains("same local ROS 2 network"), "it uses nothing of the desk");
+}
+
+#[test]
 fn messages_are_shown_at_both_ends_and_missing_parts_are_named() {
-    let mut lab = Lab::new();
+    let mut lab = Lab::new("two");
     assert_eq!(lab.why("robot", &["/chatter"]).0, 1, "no node runs");
     let router = lab.start("cloud", "[router]\nlisten = [\"quic://127.0.0.1:0\"]\n").remove(0);
     let config = lab.ros("robot", &router)

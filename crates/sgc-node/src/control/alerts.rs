@@ -3,7 +3,7 @@
 //! Every affected node knows of a mistake. `Alerts` remembers those that no machine's state shows. `sgc status` and
 //! `sgc why` display them; no decision depends on them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -114,6 +114,11 @@ pub enum Alert {
     },
     /// This host has no IPv4 address besides loopback, so programs of other hosts are not found.
     LocalNetworkAlone,
+    /// A node whose topics this node uses is on the same local ROS 2 network.
+    SameLocalNetwork {
+        /// The other node's name.
+        node: String,
+    },
     /// Local programs announce themselves, but nothing else arrives from them.
     SilentPrograms {
         /// The enclave that they name, `/` if they have none of their own.
@@ -176,6 +181,10 @@ impl Alert {
             Self::LocalNetworkAlone => {
                 "give an interface an IPv4 address, since ROS 2 uses IPv4 unless told otherwise; the node opens its network again then. \
                  Links to routers may be IPv6"
+            }
+            Self::SameLocalNetwork { .. } => {
+                "give the two nodes and their programs different domains: `domain_id` in [ros], ROS_DOMAIN_ID for programs. Programs on \
+                 one network need no `[[use]]`"
             }
             Self::SilentPrograms { .. } => "look for a firewall that stops UDP between them and sgc",
             Self::Other => "use an `sgc` of the node's version",
@@ -245,6 +254,10 @@ impl fmt::Display for Alert {
             Self::LocalNetworkAlone => f.write_str(
                 "this host has no IPv4 address besides loopback: the local ROS 2 network reaches programs of this host only",
             ),
+            Self::SameLocalNetwork { node } => write!(
+                f,
+                "{node} and this node are on the same local ROS 2 network: what this node uses of {node} arrives there twice"
+            ),
             Self::SilentPrograms { enclave } => write!(
                 f,
                 "a program of enclave {enclave} announces itself to sgc, and nothing else of it arrives; it has no DDS Security"
@@ -304,9 +317,16 @@ pub(crate) struct Alerts {
     /// The process that is kept out in favour of this node.
     kept_out: Option<Sighting>,
     peers: BTreeMap<NodeId, Sighting>,
+    /// The owners on the local network that the log names.
+    owners_here: BTreeSet<String>,
 }
 
 impl Alerts {
+    /// Notes that an owner is on the local network. Returns `true` if that is news.
+    pub(crate) fn owner_here(&mut self, node: &str) -> bool {
+        self.owners_here.len() < PEERS_MAX && self.owners_here.insert(node.to_owned())
+    }
+
     /// Notes the mistakes of the last read configuration; `None` if it has none.
     pub(crate) fn configuration_read(&mut self, mistakes: Option<&str>, now: Instant) {
         self.refused = mistakes.map(|text| (text.chars().take(MISTAKES_CHARS_MAX).collect(), now));

@@ -1,5 +1,6 @@
 //! Alerts for the operator, raised by events of the control task.
 
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::time::Instant;
 
@@ -100,6 +101,29 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
+    /// Returns the nodes that this node uses topics of, and that are on its local network.
+    fn owners_here(&self) -> BTreeSet<String> {
+        let (Some(routes), Some(network)) = (&self.routes, self.network.get()) else {
+            return BTreeSet::new();
+        };
+        let neighbours = network.neighbours();
+        if neighbours.is_empty() {
+            return neighbours;
+        }
+        let owners = routes.use_views().into_iter().map(|view| view.owner_name.to_owned());
+        owners.filter(|owner| neighbours.contains(owner)).collect()
+    }
+
+    /// Warns of owners on this node's local network, of each once.
+    pub(super) fn warn_of_owners_here(&mut self) {
+        for node in self.owners_here() {
+            if self.alerts.owner_here(&node) {
+                let alert = Alert::SameLocalNetwork { node };
+                warn!("{alert}; {}", alert.fix());
+            }
+        }
+    }
+
     /// Returns the current alerts.
     pub(super) fn alerts(&self) -> Vec<Alert> {
         let now = now();
@@ -119,6 +143,7 @@ impl<N: RosNetwork> Core<N> {
         let closed = self.reopening.failure().map(str::to_owned);
         alerts.extend(closed.map(|reason| Alert::LocalNetworkClosed { reason }));
         alerts.extend(strangers::alerts());
+        alerts.extend(self.owners_here().into_iter().map(|node| Alert::SameLocalNetwork { node }));
         alerts.extend(self.links.iter().filter_map(|(id, entry)| {
             let ahead_ms = self.router.clock_ahead_ms(id).filter(|ms| clocks_differ(*ms))?;
             let peer = self.called(&entry.peer().node_id);

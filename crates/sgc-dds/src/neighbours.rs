@@ -1,0 +1,60 @@
+//! [`Neighbours`]: the other SGC nodes on a local network, by the tags of their participants.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Mutex;
+
+use sgc_ros::Guid;
+use sgc_sync::lock;
+
+/// Most participants that are remembered.
+const NEIGHBOURS_MAX: usize = 64;
+
+/// The tagged participants of other processes.
+#[derive(Debug, Default)]
+pub(crate) struct Neighbours {
+    tags: Mutex<BTreeMap<[u8; 12], String>>,
+}
+
+impl Neighbours {
+    /// Records a participant and its tag, or forgets one that is gone or has none.
+    pub(crate) fn note(&self, guid: &Guid, tag: Option<&str>) {
+        let mut tags = lock(&self.tags);
+        match tag {
+            Some(tag) if tags.len() < NEIGHBOURS_MAX || tags.contains_key(&guid.prefix()) => {
+                tags.insert(guid.prefix(), tag.to_owned());
+            }
+            _ => {
+                tags.remove(&guid.prefix());
+            }
+        }
+    }
+
+    /// Returns the tags.
+    pub(crate) fn tags(&self) -> BTreeSet<String> {
+        lock(&self.tags).values().cloned().collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn participants_are_remembered_within_a_bound() {
+        let neighbours = Neighbours::default();
+        let guid = |n: usize| {
+            let mut guid = [0; 16];
+            guid[..8].copy_from_slice(&n.to_be_bytes());
+            Guid(guid)
+        };
+        for n in 0..2 * NEIGHBOURS_MAX {
+            neighbours.note(&guid(n), Some(&format!("arm-{n}")));
+        }
+        assert_eq!(neighbours.tags().len(), NEIGHBOURS_MAX);
+        neighbours.note(&guid(0), None);
+        neighbours.note(&guid(1), Some("desk"));
+        let tags = neighbours.tags();
+        assert_eq!(tags.len(), NEIGHBOURS_MAX - 1);
+        assert!(tags.contains("desk") && !tags.contains("arm-0") && !tags.contains("arm-1"), "{tags:?}");
+    }
+}
