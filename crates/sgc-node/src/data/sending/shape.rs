@@ -19,7 +19,7 @@ use crate::data::stats::{DataDrop, Dropped};
 /// Limits the samples of one share.
 pub(crate) struct ShapeStage {
     name: Name,
-    /// Whether there are limits, readable without the lock.
+    /// Whether there are limits or a held sample, readable without the lock.
     is_active: AtomicBool,
     state: Mutex<State>,
     /// Notified when the share closes, to wake a thread that waits for a sample's time.
@@ -36,6 +36,7 @@ struct State {
     /// Whether the log has said that reliable messages do not age.
     has_warned: bool,
     is_closed: bool,
+    has_limits: bool,
 }
 
 /// The decision about a sample, and the drop of this one or of the held one.
@@ -66,10 +67,18 @@ impl ShapeStage {
 
     /// Sets the limits.
     pub(crate) fn configure(&self, shaping: Shaping) {
-        lock(&self.state).shaper.set(shaping);
         let (compression, form) = (PayloadEncoding::Plain, PayloadForm::Cdr);
         let limits = Shaping { compression, form, ..shaping };
-        self.is_active.store(limits != Shaping::default(), SeqCst);
+        let mut state = lock(&self.state);
+        state.shaper.set(shaping);
+        state.has_limits = limits != Shaping::default();
+        self.note_active(&state);
+    }
+
+    /// Makes later samples pass this stage, or not. They pass it after the limits as well while it holds a sample, which
+    /// would otherwise leave behind them.
+    fn note_active(&self, state: &State) {
+        self.is_active.store(state.has_limits || state.held.is_some(), SeqCst);
     }
 
     /// Returns the settings.
@@ -77,7 +86,7 @@ impl ShapeStage {
         *lock(&self.state).shaper.shaping()
     }
 
-    /// Returns `true` if there are limits. Without limits, samples need not pass this stage.
+    /// Returns `true` if samples have to pass this stage.
     pub(crate) fn is_active(&self) -> bool {
         self.is_active.load(Relaxed)
     }
@@ -92,6 +101,7 @@ impl ShapeStage {
                 Some(held) => Turn::AfterHeld { held: Sample { more: true, ..held }, sample },
                 None => Turn::Now(sample),
             };
+            self.note_active(&state);
             return Shaped { turn, dropped: Ok(()) };
         }
         if state.shaper.shaping().max_age.is_some() && reliable {
@@ -115,6 +125,7 @@ impl ShapeStage {
         }
         let overtaken = state.held.take();
         state.shaper.takes(now, sample.payload.len());
+        self.note_active(&state);
         Shaped { turn: Turn::Now(sample), dropped: thinned(overtaken) }
     }
 
@@ -130,6 +141,7 @@ impl ShapeStage {
         let mut state = lock(&self.state);
         let sample = if state.shaper.is_due(now) { state.held.take() } else { None }?;
         state.shaper.takes(now, sample.payload.len());
+        self.note_active(&state);
         Some(Sample { more: false, ..sample })
     }
 
@@ -140,7 +152,7 @@ impl ShapeStage {
         }
     }
 
-    /// Ends all waiting. Samples leave at once from here on, and the timer releases none.
+    /// Ends all waiting. Samples leave at once from here on.
     pub(crate) fn close(&self) {
         lock(&self.state).is_closed = true;
         self.closing.notify_all();
@@ -190,6 +202,7 @@ mod tests {
         assert!(matches!(stage.shape(dated(5), true).turn, Turn::Later { starts_timer: true }));
         // Without limits, the next sample leaves, and the older one does not follow it.
         stage.configure(Shaping::default());
+        assert!(stage.is_active(), "the next sample finds the older one here");
         let Shaped { turn, dropped } = stage.shape(dated(6), true);
         assert!(!stage.is_active() && matches!(turn, Turn::Now(_)));
         assert_eq!(dropped, Err(Dropped::one(DataDrop::Thinned)));
@@ -217,7 +230,14 @@ mod tests {
     }
 
     #[test]
-    fn reliable_sample_blocks_until_the_stage_is_closed() {
+    fn reliable_sample_blocks_until_its_time_or_until_the_stage_is_closed() {
+        // A sample takes 50 ms.
+        let bits = 8 * sample(KNOWN, true).payload.len() as u64;
+        let timed = stage(Shaping { bits_per_s: Some(20 * bits), ..Shaping::default() });
+        let begun = Instant::now();
+        let _ = timed.shape(dated(1), true);
+        assert!(matches!(timed.shape(dated(2), true).turn, Turn::Now(_)));
+        assert!(begun.elapsed() >= Duration::from_millis(40), "{:?}", begun.elapsed());
         let stage = stage(Shaping { bits_per_s: Some(1), ..Shaping::default() });
         let _ = stage.shape(dated(1), true);
         std::thread::scope(|scope| {
