@@ -13,8 +13,9 @@ use bytes::Bytes;
 use cyclors::{
     DDS_RETCODE_TIMEOUT, DDSI_STATUSINFO_DISPOSE, DDSI_STATUSINFO_UNREGISTER, dds_assert_liveliness,
     dds_create_listener, dds_create_writer, dds_delete_listener, dds_entity_t, dds_forwardcdr,
-    dds_get_entity_sertype, dds_lset_publication_matched_arg, dds_publication_matched_status_t,
-    dds_set_status_mask, dds_take_status, dds_wait_for_acks, dds_write_flush,
+    dds_get_entity_sertype, dds_get_publication_matched_status, dds_lset_publication_matched_arg,
+    dds_publication_matched_status, dds_publication_matched_status_t, dds_set_status_mask, dds_take_status,
+    dds_wait_for_acks, dds_write_flush,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, KeyHash, RosError, RosWriter, SampleHead, SampleKind};
 use sgc_sync::lock;
@@ -45,7 +46,8 @@ const TIMESTAMP_MAX_NS: i64 = 4_294_967_295_999_999_999;
 #[derive(Debug)]
 pub struct CycloneWriter {
     writer: Entity,
-    /// The number of matched readers, which the listener writes. The listener has a pointer to it, so it outlives the writer.
+    /// The number of matched readers, which the listener writes. It outlives the writer, because the listener has a
+    /// pointer to it.
     readers: Arc<AtomicU32>,
     _group: Option<Entity>,
     topic: Entity,
@@ -283,6 +285,21 @@ impl CycloneWriter {
         }
     }
 
+    /// Returns the number of matched readers by Cyclone's status. It has the writer's lock, so this waits for a write.
+    /// A listener is called between the change of the status and the wake-up of who waits for it.
+    fn matched_now(&self) -> u32 {
+        let mut status = dds_publication_matched_status {
+            total_count: 0,
+            total_count_change: 0,
+            current_count: 0,
+            current_count_change: 0,
+            last_subscription_handle: 0,
+        };
+        // SAFETY: the handle is checked by Cyclone, and `status` is a valid place for the result.
+        let ret = unsafe { dds_get_publication_matched_status(self.writer.handle(), &mut status) };
+        if ret < 0 { 0 } else { status.current_count }
+    }
+
     /// Returns the GUID of the writer, as others discover it.
     pub fn guid(&self) -> Guid {
         self.guid
@@ -404,7 +421,7 @@ impl RosWriter for CycloneWriter {
             // Later changes wake the wait below.
             // SAFETY: the handle is checked by Cyclone, and `status` is a valid place for the result.
             unsafe { dds_take_status(handle, &mut status, READERS_MATCHED) };
-            let matched = self.matched_readers();
+            let matched = self.matched_now();
             let left = until.saturating_duration_since(Instant::now());
             if matched >= readers || left.is_zero() {
                 return matched;
