@@ -284,7 +284,7 @@ impl Discovery {
             return;
         }
         self.note_stranger(guid, user_data);
-        self.participant.neighbours().note(&guid, user_data.and_then(user_data::tag));
+        self.participant.local_nodes().note(&guid, user_data.and_then(user_data::tag));
         let Some(graph) = &self.graph else { return };
         match user_data {
             // Announcements of SGC nodes for remote nodes are for ROS 2, not for other SGC nodes.

@@ -183,8 +183,8 @@ impl RosNetwork for CycloneNetwork {
         self.announcer.is_some()
     }
 
-    fn neighbours(&self) -> BTreeSet<String> {
-        self.participant.neighbours().tags()
+    fn nodes_here(&self) -> BTreeSet<String> {
+        self.participant.local_nodes().tags()
     }
 
     fn show(&self, kind: EndpointKind, spec: &EndpointSpec) -> Result<ShownEndpoint, RosError> {

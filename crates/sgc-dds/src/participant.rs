@@ -20,8 +20,8 @@ use crate::config::DdsConfig;
 use crate::domain::Domain;
 use crate::entity::{Entity, check};
 use crate::first_messages::{self, EndpointWatch};
+use crate::local_nodes::LocalNodes;
 use crate::log;
-use crate::neighbours::Neighbours;
 use crate::pace::Pace;
 use crate::plugin_domain;
 use crate::qos::NativeQos;
@@ -49,7 +49,7 @@ pub(crate) struct Participant {
     holds: Pace,
     writers: AtomicUsize,
     late_writers: AtomicUsize,
-    neighbours: Neighbours,
+    local_nodes: LocalNodes,
     /// The handler of discovery events while discovery runs.
     watcher: Mutex<Weak<Mutex<DiscoveryHandler>>>,
     /// Dropped last.
@@ -98,7 +98,7 @@ impl Participant {
             holds: Pace::new(),
             writers: AtomicUsize::new(0),
             late_writers: AtomicUsize::new(0),
-            neighbours: Neighbours::default(),
+            local_nodes: LocalNodes::default(),
             watcher: Mutex::default(),
             _alive: alive,
         };
@@ -141,8 +141,8 @@ impl Participant {
     }
 
     /// Returns the other SGC nodes on the network.
-    pub(crate) fn neighbours(&self) -> &Neighbours {
-        &self.neighbours
+    pub(crate) fn local_nodes(&self) -> &LocalNodes {
+        &self.local_nodes
     }
 
     /// Returns the participant's domain.

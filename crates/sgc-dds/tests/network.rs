@@ -1004,7 +1004,7 @@ fn nodes_on_one_network_know_each_other_by_name() {
     let (arm, desk) = (open(166, Some("arm-1")), open(166, Some("desk")));
     let _plain = open(166, None);
     let (_arms, _desks) = (discover(&arm), discover(&desk));
-    let names = |network: &CycloneNetwork| Vec::from_iter(network.neighbours());
+    let names = |network: &CycloneNetwork| Vec::from_iter(network.nodes_here());
     eventually("the arm knows the desk", || names(&arm) == ["desk"]);
     eventually("the desk knows the arm", || names(&desk) == ["arm-1"]);
     drop(desk);

@@ -473,7 +473,7 @@ pub trait RosNetwork: Send + Sync + 'static {
     fn has_graph(&self) -> bool;
 
     /// Returns the names of other SGC nodes that are on this network as well, as far as they are known.
-    fn neighbours(&self) -> BTreeSet<String> {
+    fn nodes_here(&self) -> BTreeSet<String> {
         BTreeSet::new()
     }
 

@@ -114,7 +114,7 @@ pub enum Alert {
     },
     /// This host has no IPv4 address besides loopback, so programs of other hosts are not found.
     LocalNetworkAlone,
-    /// A node whose topics this node uses is on the same local ROS 2 network.
+    /// A node whose topics this node uses is on the same local ROS 2 network, or a node of another fleet with its name.
     SameLocalNetwork {
         /// The other node's name.
         node: String,

@@ -131,6 +131,11 @@ impl<R> Routes<R> {
         Some((self.use_rules[route.rule].owner, &route.entry))
     }
 
+    /// Returns the names of the owners in use rules.
+    pub fn used_owners(&self) -> impl Iterator<Item = &str> {
+        self.use_rules.iter().map(|rule| rule.owner_name.as_str())
+    }
+
     /// Returns all share rules.
     pub fn share_views(&self) -> Vec<ShareView<'_>> {
         let view = |(index, rule)| {

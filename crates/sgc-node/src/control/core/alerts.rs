@@ -101,17 +101,17 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Returns the nodes that this node uses topics of, and that are on its local network.
+    /// Returns the owners in use rules that are on this node's local network.
     fn owners_here(&self) -> BTreeSet<String> {
         let (Some(routes), Some(network)) = (&self.routes, self.network.get()) else {
             return BTreeSet::new();
         };
-        let neighbours = network.neighbours();
-        if neighbours.is_empty() {
-            return neighbours;
+        let mut nodes = network.nodes_here();
+        if !nodes.is_empty() {
+            let owners: BTreeSet<&str> = routes.used_owners().collect();
+            nodes.retain(|node| owners.contains(node.as_str()));
         }
-        let owners = routes.use_views().into_iter().map(|view| view.owner_name.to_owned());
-        owners.filter(|owner| neighbours.contains(owner)).collect()
+        nodes
     }
 
     /// Warns of owners on this node's local network, of each once.

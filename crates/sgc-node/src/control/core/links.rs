@@ -71,6 +71,7 @@ impl<N: RosNetwork> Core<N> {
         for LinkLook { link, rtt, is_silent } in self.links.look(at) {
             self.router.handle_link_quality(now, link, rtt, is_silent);
         }
+        self.warn_of_owners_here();
     }
 
     /// Passes a control frame to the router.

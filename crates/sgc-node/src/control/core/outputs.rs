@@ -152,7 +152,6 @@ impl<N: RosNetwork> Core<N> {
                 }
                 self.need_type_of_used(name);
                 self.ask_histories(name);
-                self.warn_of_owners_here();
             }
             Event::Followed { peer } => self.hear_of(&peer),
             event => self.route_event(now, event),
