@@ -11,7 +11,7 @@ use sgc_gateway::{Advertise, Content, Form, GatewayError, Graph, Session};
 use sgc_wire::{Durability, History, Qos, Reliability};
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::UnixStream;
-use tokio::time::timeout;
+use tokio::time::{Instant, timeout};
 
 use crate::gateway::Gateway;
 
@@ -85,11 +85,14 @@ pub(crate) async fn call(gateway: &Gateway, wish: &CallRequest) -> Result<String
         let session = gateway.own_session().await?;
         let request = Content::json(wish.request.clone());
         let (type_name, longest) = (wish.type_name.as_deref(), wait(wish.timeout_ms));
+        let begun = Instant::now();
         if type_name.is_none() {
             let has_type = |graph: &Graph| graph.services.contains_key(&wish.service);
             wait_for_type(&session, longest, has_type).await;
         }
-        session.call(&wish.service, type_name, &request, Form::Json, longest).await
+        session
+            .call(&wish.service, type_name, &request, Form::Json, longest.saturating_sub(begun.elapsed()))
+            .await
     };
     let reply = reply.await.map_err(|error| error.to_string())?;
     Ok(String::from_utf8_lossy(&reply).into_owned())
