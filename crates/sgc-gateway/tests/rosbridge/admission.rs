@@ -35,6 +35,7 @@ async fn nothing_is_taken_before_a_token_is_shown() {
         let mut browser = connect(site.session("nobody"), options()).await;
         let told = browser.told(json!({"op": "subscribe", "id": 1, "topic": "/odom"})).await;
         assert_eq!(told, r#"subscribe: say who you are first: {"op":"auth","token":"…"}"#);
+        assert_eq!(browser.told(json!({"op": "auth"})).await, r#"auth: "token" is missing"#);
         browser.send(json!({"op": "set_level", "level": "info"})).await;
         browser.status().await;
         browser.send(auth).await;
@@ -190,6 +191,9 @@ async fn interfaces_outside_the_scope_are_refused_and_invisible() {
 async fn tokens_are_refused_where_none_are_taken() {
     let site = Site::new().await;
     let mut browser = connect(site.session("desk"), RosbridgeOptions::default()).await;
-    let told = browser.told(json!({"op": "auth", "token": "x"})).await;
-    assert_eq!(told, "auth: this gateway takes no tokens here");
+    for auth in
+        [json!({"op": "auth", "token": "x"}), json!({"op": "auth"}), json!({"op": "auth", "token": 1})]
+    {
+        assert_eq!(browser.told(auth).await, "auth: this gateway takes no tokens here");
+    }
 }

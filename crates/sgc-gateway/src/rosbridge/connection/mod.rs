@@ -9,6 +9,7 @@ mod publications;
 mod servings;
 mod subscriptions;
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use sgc_websocket::WebSocketError;
@@ -198,7 +199,7 @@ impl Connection {
     async fn execute<'a>(&mut self, op: Op<'a>, id: Option<OpId>) -> Result<(), Failure<'a>> {
         let (context, id_ref) = (&self.context, id.as_ref());
         match op {
-            Op::Auth { token } => return self.auth(&token, id).await,
+            Op::Auth { token } => return self.auth(token, id).await,
             Op::SetLevel(level) => context.outbox.set_level(level),
             Op::Status => {}
             Op::Fragment(_) => return Err(Refusal::nested_fragment().into()),
@@ -228,13 +229,18 @@ impl Connection {
         Ok(())
     }
 
-    async fn auth<'a>(&mut self, token: &str, id: Option<OpId>) -> Result<(), Failure<'a>> {
+    async fn auth<'a>(
+        &mut self,
+        token: Result<Cow<'_, str>, Refusal>,
+        id: Option<OpId>,
+    ) -> Result<(), Failure<'a>> {
         let Context { session, options, outbox } = &mut self.context;
         let Some(authenticate) = &options.authenticate else {
             return Err(Refusal::rule("this gateway takes no tokens here").into());
         };
+        let token = token?;
         let refused = |why| told(&OpError::Refused { op: OpName::Auth, why });
-        let client = match authenticate(token) {
+        let client = match authenticate(&token) {
             Ok(client) => client,
             Err(why) => {
                 // A client that guesses must open a connection for each guess.

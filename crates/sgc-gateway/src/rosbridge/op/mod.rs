@@ -84,7 +84,7 @@ pub(super) enum Op<'a> {
     Advertise(AdvertiseTopic<'a>),
     AdvertiseAction(Serve<'a>),
     AdvertiseService(Serve<'a>),
-    Auth { token: Cow<'a, str> },
+    Auth { token: Result<Cow<'a, str>, Refusal> },
     CallService(CallService<'a>),
     CancelActionGoal,
     Fragment(Fragment),
@@ -245,7 +245,8 @@ impl<'a> Op<'a> {
             OpName::Advertise => AdvertiseTopic::read(members).map(Self::Advertise),
             OpName::AdvertiseAction => Serve::read(members, "action").map(Self::AdvertiseAction),
             OpName::AdvertiseService => Serve::read(members, "service").map(Self::AdvertiseService),
-            OpName::Auth => token(members).map(|token| Self::Auth { token }),
+            // Errors of the token count only where tokens are taken.
+            OpName::Auth => Ok(Self::Auth { token: token(members) }),
             OpName::CallService => CallService::read(members).map(Self::CallService),
             OpName::CancelActionGoal => Ok(Self::CancelActionGoal),
             OpName::Fragment => Fragment::read(id, members).map(Self::Fragment),
