@@ -55,13 +55,13 @@ where
 {
     let options = Arc::new(options);
     let (outbox, mut outgoing) = Outbox::new(session.limits().waiting_bytes_max, session.quota().clone());
-    let (pulse, inflow) = (PingState::default(), session.inflow());
+    let (pings, inflow) = (PingState::default(), session.inflow());
     let (mut sink, mut stream) = socket.split();
     let mut connection = Connection::new(session, Arc::clone(&options), outbox);
     let denied = until_denied(connection.sessions());
     let ended = {
-        let reading = read_all(&mut stream, &mut connection, &pulse, &options);
-        let writing = write_all(&mut sink, &mut outgoing, &pulse, options.silence_max);
+        let reading = read_all(&mut stream, &mut connection, &pings, &options);
+        let writing = write_all(&mut sink, &mut outgoing, &pings, options.silence_max);
         tokio::select! {
             biased;
             denied = denied => Err(RosbridgeError::Denied(denied)),
@@ -106,7 +106,7 @@ async fn until_denied(mut sessions: watch::Receiver<Arc<Session>>) -> Denial {
 async fn read_all<R>(
     stream: &mut R,
     connection: &mut Connection,
-    pulse: &PingState,
+    pings: &PingState,
     options: &RosbridgeOptions,
 ) -> Result<(), RosbridgeError>
 where
@@ -126,7 +126,7 @@ where
                 tokio::select! {
                     message = stream.next() => message,
                     _ = looks.tick() => {
-                        if pulse.silence(options.silence_max, begun).is_some() {
+                        if pings.silence(options.silence_max, begun).is_some() {
                             return Err(RosbridgeError::Silent(options.silence_max));
                         }
                         continue;
@@ -142,7 +142,7 @@ where
             }
         };
         let Some(message) = message else { return Ok(()) };
-        pulse.heard();
+        pings.heard();
         match message.map_err(RosbridgeError::socket)? {
             Message::Text(text) => connection.take(&text).await?,
             // JSON may also come as bytes, as in `rosbridge_suite`.

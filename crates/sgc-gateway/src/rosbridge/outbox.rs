@@ -184,19 +184,19 @@ pub(super) fn ping_interval(silence_max: Duration) -> Duration {
 pub(super) async fn write_all<W>(
     sink: &mut W,
     outgoing: &mut Outgoing,
-    pulse: &PingState,
+    pings: &PingState,
     silence_max: Duration,
 ) -> RosbridgeError
 where
     W: Sink<Message, Error = WebSocketError> + Unpin,
 {
-    let mut pings = tokio::time::interval(ping_interval(silence_max));
-    pings.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-    pings.reset();
+    let mut interval = tokio::time::interval(ping_interval(silence_max));
+    interval.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    interval.reset();
     loop {
         let (said, is_ping) = tokio::select! {
             biased;
-            _ = pings.tick() => ((Vec::new(), None), true),
+            _ = interval.tick() => ((Vec::new(), None), true),
             Some(said) = outgoing.control.recv() => (said.frames(), false),
             Some(batch) = outgoing.batches.recv() => ((batch, None), false),
             else => return RosbridgeError::Socket(WebSocketError::Closed),
@@ -204,7 +204,7 @@ where
         let written = async {
             if is_ping {
                 timed(silence_max, 0, sink.send(Message::Ping(Default::default()))).await?;
-                pulse.asked();
+                pings.asked();
             }
             let mut bytes = 0;
             let (mut frames, mut room) = said;

@@ -1,6 +1,7 @@
 //! [`Connection`]: the state of one client, which hands each op to the part that executes it.
 //!
-//! The parts own what a client has: [`Subscriptions`], [`Publications`], [`Servings`] and [`Jobs`]. JSON is read by `op`.
+//! The parts own what a client has: [`Subscriptions`], [`Publications`], [`Servings`] and [`Jobs`]. JSON is read by
+//! `op`.
 
 mod context;
 mod error_budget;
@@ -202,6 +203,7 @@ impl Connection {
             Op::Auth { token } => return self.auth(token, id).await,
             Op::SetLevel(level) => context.outbox.set_level(level),
             Op::Status => {}
+            // Unreachable: `take_message` takes fragments, and `MessagePlace` refuses those within fragments.
             Op::Fragment(_) => return Err(Refusal::nested_fragment().into()),
             Op::Advertise(op) => self.publications.advertise(&context.session, id, op).await?,
             Op::Unadvertise { topic } => self.publications.unadvertise(id, &topic)?,

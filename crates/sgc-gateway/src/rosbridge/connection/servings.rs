@@ -11,7 +11,7 @@ use crate::error::GatewayError;
 use crate::rosbridge::actions::ServedAction;
 use crate::rosbridge::input;
 use crate::rosbridge::op::{
-    ActionFeedback, ActionResult, OpId, Refusal, Serve, ServiceOutcome, ServiceResponse, short,
+    ActionFeedback, ActionResult, OpId, Refusal, ServiceOutcome, ServiceResponse, ServingAdvertisement, short,
 };
 use crate::rosbridge::services::ServedService;
 use crate::session::{Session, action_of};
@@ -33,9 +33,9 @@ impl Servings {
     pub(super) async fn advertise_service(
         &mut self,
         context: &Context,
-        op: Serve<'_>,
+        op: ServingAdvertisement<'_>,
     ) -> Result<(), Refusal> {
-        let Serve { name: service, type_name } = op;
+        let ServingAdvertisement { name: service, type_name } = op;
         self.check_count(&context.session)?;
         self.services.remove(&*service);
         let serving = context.session.serve(&service, Some(&type_name)).await?;
@@ -74,8 +74,12 @@ impl Servings {
     }
 
     /// Serves an action. A second advertisement replaces the first.
-    pub(super) async fn advertise_action(&mut self, context: &Context, op: Serve<'_>) -> Result<(), Refusal> {
-        let Serve { name: action, type_name } = op;
+    pub(super) async fn advertise_action(
+        &mut self,
+        context: &Context,
+        op: ServingAdvertisement<'_>,
+    ) -> Result<(), Refusal> {
+        let ServingAdvertisement { name: action, type_name } = op;
         let session = &context.session;
         self.check_count(session)?;
         session.check(Right::Serve, &action)?;

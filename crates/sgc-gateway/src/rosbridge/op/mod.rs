@@ -82,8 +82,8 @@ pub(super) enum Op<'a> {
     ActionResult(ActionResult<'a>),
     ActionStatus { action: Cow<'a, str> },
     Advertise(AdvertiseTopic<'a>),
-    AdvertiseAction(Serve<'a>),
-    AdvertiseService(Serve<'a>),
+    AdvertiseAction(ServingAdvertisement<'a>),
+    AdvertiseService(ServingAdvertisement<'a>),
     Auth { token: Result<Cow<'a, str>, Refusal> },
     CallService(CallService<'a>),
     CancelActionGoal,
@@ -127,7 +127,7 @@ pub(super) struct AdvertiseTopic<'a> {
 
 /// An advertisement of a service or action.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) struct Serve<'a> {
+pub(super) struct ServingAdvertisement<'a> {
     /// The service or action.
     pub(super) name: Cow<'a, str>,
     pub(super) type_name: Cow<'a, str>,
@@ -206,7 +206,8 @@ pub(super) struct SubscribeTopic<'a> {
 }
 
 impl<'a> ClientMessage<'a> {
-    /// Parses a message. The values of `msg`, `args` and `values` are only checked to be JSON.
+    /// Parses a message. The values of `msg`, `args` and `values` are valid JSON, and are read no further than whether
+    /// they are objects or lists.
     ///
     /// # Errors
     /// The message has no op or no valid id, so that only a status can answer it.
@@ -243,8 +244,12 @@ impl<'a> Op<'a> {
             OpName::ActionResult => ActionResult::read(members).map(Self::ActionResult),
             OpName::ActionStatus => members.needed_name("action").map(|action| Self::ActionStatus { action }),
             OpName::Advertise => AdvertiseTopic::read(members).map(Self::Advertise),
-            OpName::AdvertiseAction => Serve::read(members, "action").map(Self::AdvertiseAction),
-            OpName::AdvertiseService => Serve::read(members, "service").map(Self::AdvertiseService),
+            OpName::AdvertiseAction => {
+                ServingAdvertisement::read(members, "action").map(Self::AdvertiseAction)
+            }
+            OpName::AdvertiseService => {
+                ServingAdvertisement::read(members, "service").map(Self::AdvertiseService)
+            }
             // Errors of the token count only where tokens are taken.
             OpName::Auth => Ok(Self::Auth { token: token(members) }),
             OpName::CallService => CallService::read(members).map(Self::CallService),
@@ -307,7 +312,7 @@ impl<'a> AdvertiseTopic<'a> {
     }
 }
 
-impl<'a> Serve<'a> {
+impl<'a> ServingAdvertisement<'a> {
     fn read(members: &Members<'a>, kind: &'static str) -> Result<Self, Refusal> {
         Ok(Self { name: members.needed_name(kind)?, type_name: members.needed_name("type")? })
     }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::text::{clip, short};
 
 /// Longest echoed name of an op, in bytes.
-const NAME_BYTES_MAX: usize = 64;
+const OP_BYTES_MAX: usize = 64;
 
 /// The name of an op.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -94,7 +94,7 @@ impl OpName {
 
 impl fmt::Display for OpName {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&clip(self.text(), NAME_BYTES_MAX))
+        f.write_str(&clip(self.text(), OP_BYTES_MAX))
     }
 }
 

@@ -22,7 +22,7 @@ fn each_op_is_read_with_its_members() {
     let second = Duration::from_secs(1);
     let offered = |is_latched, size| QosMember::default().offer(is_latched, size);
     let best_effort = QosMember::read(r#"{"reliability":"best_effort","depth":3}"#).unwrap();
-    let serve = || Serve { name: name("/s"), type_name: name("t/T") };
+    let serve = || ServingAdvertisement { name: name("/s"), type_name: name("t/T") };
     let call = CallService {
         service: name("/s"),
         type_name: None,
