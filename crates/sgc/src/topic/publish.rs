@@ -20,8 +20,10 @@ use crate::{output, yaml};
 
 /// Default time to wait for subscribers, in seconds.
 const WAIT_DEFAULT_S: u64 = 10;
-/// Default rate of a message, in messages per second.
-const RATE_DEFAULT_HZ: f64 = 1.0;
+/// Default time between messages that are given as an argument.
+const PERIOD_DEFAULT: Duration = Duration::from_secs(1);
+/// Longest time between messages.
+const PERIOD_MAX: Duration = Duration::from_secs(365 * 24 * 60 * 60);
 
 #[derive(Clone, Copy, Debug, ValueEnum, PartialEq, Eq)]
 enum ReliabilityArg {
@@ -53,8 +55,8 @@ pub(crate) struct PubArgs {
     #[arg(value_name = "MESSAGE")]
     second: Option<String>,
     /// Messages per second [default: 1; lines of standard input are published as they come]
-    #[arg(short, long, value_name = "HZ")]
-    rate: Option<f64>,
+    #[arg(short = 'r', long = "rate", value_name = "HZ", value_parser = period)]
+    period: Option<Duration>,
     /// Wait for a subscriber, publish once and end
     #[arg(short = '1', long, conflicts_with = "count")]
     once: bool,
@@ -144,11 +146,7 @@ pub(super) fn publish(args: &PubArgs) -> Result<ExitCode, CliError> {
     let (type_name, message) = type_and_message(args.first.as_deref(), args.second.as_deref());
     let not_a_message = |reason: String| CliError::Cannot { reason: format!("the message: {reason}") };
     let message = message.map(yaml::json_of).transpose().map_err(not_a_message)?;
-    let rate = args.rate.or(message.is_some().then_some(RATE_DEFAULT_HZ));
-    let period = rate
-        .map(|rate| Duration::try_from_secs_f64(1.0 / rate))
-        .transpose()
-        .map_err(|_| CliError::Cannot { reason: "--rate: more than 0 messages a second".to_owned() })?;
+    let period = args.period.or(message.is_some().then_some(PERIOD_DEFAULT));
     let wait_for = args.wait.unwrap_or(u32::from(args.once));
     let wish = PublishRequest {
         topic: args.topic.clone(),
@@ -189,9 +187,26 @@ pub(super) fn publish(args: &PubArgs) -> Result<ExitCode, CliError> {
     Ok(ExitCode::SUCCESS)
 }
 
+/// Parses a rate in messages per second, and returns the time between messages.
+fn period(rate: &str) -> Result<Duration, String> {
+    let period = rate.parse().ok().and_then(|rate: f64| Duration::try_from_secs_f64(1.0 / rate).ok());
+    let period = period.filter(|period| *period <= PERIOD_MAX);
+    period.ok_or_else(|| "10 or 0.5, for example, and at least one message a year".to_owned())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn rate_of_less_than_one_message_a_year_is_refused() {
+        let periods = ["10", "0.5", "inf"].map(|rate| period(rate).unwrap());
+        assert_eq!(periods, [Duration::from_millis(100), Duration::from_secs(2), Duration::ZERO]);
+        assert!(period("1e-7").is_ok_and(|period| period < PERIOD_MAX));
+        for rate in ["", "fast", "nan", "0", "-1", "1e-8", "1e-19", "1e-300"] {
+            assert!(period(rate).is_err(), "{rate}");
+        }
+    }
 
     #[test]
     fn messages_keep_their_rate_and_do_not_make_up_for_a_pause() {
