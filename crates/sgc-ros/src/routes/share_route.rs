@@ -54,9 +54,9 @@ pub(super) struct ShareUpdate {
     pub(super) problems: BTreeSet<Problem>,
 }
 
-/// The effect of a writer's end on its share.
+/// The effect of a writer's removal on its share.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum WriterEnd {
+pub(super) enum WriterRemoval {
     /// The share has other writers or needs none. It has to be refreshed.
     Changed,
     /// The writer was the last one. The offer stands until the hold ends.
@@ -185,16 +185,16 @@ impl ShareRoute {
         now: Instant,
         writer: &Guid,
         rule: &ShareRule,
-    ) -> Option<WriterEnd> {
+    ) -> Option<WriterRemoval> {
         self.writers.remove(writer)?;
         self.own.writer_gone(now, writer, self.writers.is_empty());
         // The offer stands until the hold ends, so that a restarted program finds the share unchanged. A share for
         // messages of others needs no writer.
         if !self.writers.is_empty() || rule.is_inbound() {
-            return Some(WriterEnd::Changed);
+            return Some(WriterRemoval::Changed);
         }
         self.writerless_until = Some(now + WRITERLESS_HOLD);
-        Some(WriterEnd::Held)
+        Some(WriterRemoval::Held)
     }
 
     /// Handles the expiry of a writer's lease, or its renewal. Returns `true` if the share has to be refreshed.

@@ -12,7 +12,7 @@ use super::machine::Routes;
 use super::problem::{Cause, Problem, Way};
 use super::rules::{ROUTES_PER_WILDCARD_MAX, ShareRuleId};
 use super::service_ends::interface;
-use super::share_route::{ShareRoute, ShareTimeout, ShareUpdate, WriterEnd};
+use super::share_route::{ShareRoute, ShareTimeout, ShareUpdate, WriterRemoval};
 use crate::names::{is_topic_name, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, Guid};
 
@@ -122,11 +122,11 @@ impl<R: RngCore> Routes<R> {
             let Some(share) = self.shares.get_mut(&name) else { continue };
             let rule = &self.share_rules[share.rule()];
             match share.remove_writer(now, &endpoint.guid, rule) {
-                Some(WriterEnd::Changed) => self.refresh_share(name),
-                Some(WriterEnd::Held) if rule.is_service() => {
+                Some(WriterRemoval::Changed) => self.refresh_share(name),
+                Some(WriterRemoval::Held) if rule.is_service() => {
                     self.commands.push_back(Command::ServersGone { name });
                 }
-                Some(WriterEnd::Held) | None => {}
+                Some(WriterRemoval::Held) | None => {}
             }
         }
     }
