@@ -14,7 +14,7 @@ use super::Core;
 use crate::clock::now;
 use crate::control::control_queue::FrameRoom;
 use crate::control::event::LinkPlace;
-use crate::control::parts::link_table::{EndedLink, LinkLook};
+use crate::control::parts::link_table::{EndedLink, LinkMeasurement};
 use crate::data::stats::CountDrops;
 use crate::link::control_tx::ControlTx;
 use crate::state::audit::{AuditEvent, AuditRecord};
@@ -68,7 +68,7 @@ impl<N: RosNetwork> Core<N> {
     /// Looks at the links, and passes the measurements to the router.
     pub(super) fn look_at_links(&mut self, at: Instant) {
         let now = now();
-        for LinkLook { link, rtt, is_silent } in self.links.look(at) {
+        for LinkMeasurement { link, rtt, is_silent } in self.links.look(at) {
             self.router.handle_link_quality(now, link, rtt, is_silent);
         }
         self.warn_of_owners_here();

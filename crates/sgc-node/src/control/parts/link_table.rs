@@ -47,7 +47,7 @@ pub(crate) struct LinkTable {
 }
 
 /// Measurement of a link.
-pub(crate) struct LinkLook {
+pub(crate) struct LinkMeasurement {
     pub(crate) link: LinkId,
     pub(crate) rtt: Duration,
     pub(crate) is_silent: bool,
@@ -123,7 +123,7 @@ impl LinkTable {
     }
 
     /// Looks at all links, if that is due: probes peers, and closes links whose peer does not answer.
-    pub(crate) fn look(&mut self, now: Instant) -> Vec<LinkLook> {
+    pub(crate) fn look(&mut self, now: Instant) -> Vec<LinkMeasurement> {
         if self.look_due.is_none_or(|due| due > now) {
             return Vec::new();
         }
@@ -131,7 +131,7 @@ impl LinkTable {
         let looks = self.links.iter_mut().map(|(id, entry)| {
             let stats = entry.link.stats();
             let is_silent = entry.look(now, stats.received_bytes, stats.rtt);
-            LinkLook { link: *id, rtt: stats.rtt, is_silent }
+            LinkMeasurement { link: *id, rtt: stats.rtt, is_silent }
         });
         looks.collect()
     }

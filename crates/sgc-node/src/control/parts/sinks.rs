@@ -44,7 +44,7 @@ impl Sinks {
     }
 
     /// Returns the sink of our own share, which takes the messages of other publishers. Adds it if there is none.
-    pub(crate) fn of_own_share(&mut self, name: Name) -> Arc<LocalSink> {
+    pub(crate) fn get_or_add_own(&mut self, name: Name) -> Arc<LocalSink> {
         match self.sinks.get(&name) {
             Some(sink) => sink.clone(),
             None => self.add(name, false),

@@ -36,7 +36,7 @@ struct Inbox {
 /// The stages behind the hold.
 pub(crate) trait Downstream {
     /// Sends a sample, unless its source or its type is unknown. With `more`, the source may keep an unfinished batch.
-    fn pass(&self, sample: Sample, more: bool) -> Passed;
+    fn pass(&self, sample: Sample, more: bool) -> PassOutcome;
 
     /// Finishes the open batch of a source, because no more messages follow.
     fn finish_batch(&self, source: &SourceSlot);
@@ -52,7 +52,7 @@ pub(crate) trait Downstream {
 }
 
 /// The fate of a sample behind the hold.
-pub(crate) enum Passed {
+pub(crate) enum PassOutcome {
     /// The sample was sent or dropped.
     Done,
     /// The sample was sent, and its source may keep an unfinished batch.
@@ -152,13 +152,13 @@ impl Inbox {
     /// Passes a sample on, and notes a batch that stays open. Returns the sample if it has to wait.
     fn pass(&mut self, sample: Sample, more: bool, next: &impl Downstream) -> Option<Sample> {
         match next.pass(sample, more) {
-            Passed::Done => {}
-            Passed::Open(slot) => {
+            PassOutcome::Done => {}
+            PassOutcome::Open(slot) => {
                 if self.open.iter().all(|open| open.id != slot.id) {
                     self.open.push(slot);
                 }
             }
-            Passed::Waits(sample) => return Some(sample),
+            PassOutcome::Waits(sample) => return Some(sample),
         }
         None
     }
@@ -205,13 +205,13 @@ mod tests {
     }
 
     impl Downstream for Recorder {
-        fn pass(&self, sample: Sample, more: bool) -> Passed {
+        fn pass(&self, sample: Sample, more: bool) -> PassOutcome {
             let is_known = sample.writer.is_some_and(|writer| self.known.borrow().contains(&writer));
             if !is_known || self.awaits_type.get() {
-                return Passed::Waits(sample);
+                return PassOutcome::Waits(sample);
             }
             self.sent.borrow_mut().push(sample.source_timestamp_ns);
-            if more { Passed::Open(self.slot.clone()) } else { Passed::Done }
+            if more { PassOutcome::Open(self.slot.clone()) } else { PassOutcome::Done }
         }
 
         fn finish_batch(&self, _: &SourceSlot) {

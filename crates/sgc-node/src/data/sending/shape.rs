@@ -41,7 +41,7 @@ struct State {
 
 /// The decision about a sample, and the drop of this one or of the held one.
 #[must_use]
-pub(crate) struct Shaped {
+pub(crate) struct ShapeDecision {
     pub turn: Turn,
     pub dropped: Result<(), Dropped>,
 }
@@ -93,7 +93,7 @@ impl ShapeStage {
 
     /// Decides when a sample leaves. Blocks with one that may be neither dropped nor overtaken. `reliable` is the
     /// reliability of the topic.
-    pub(crate) fn shape(&self, sample: Sample, reliable: bool) -> Shaped {
+    pub(crate) fn shape(&self, sample: Sample, reliable: bool) -> ShapeDecision {
         let mut state = lock(&self.state);
         if sample.kind != SampleKind::Write {
             // The end of an instance follows its last sample and is never dropped.
@@ -102,7 +102,7 @@ impl ShapeStage {
                 None => Turn::Now(sample),
             };
             self.note_active(&state);
-            return Shaped { turn, dropped: Ok(()) };
+            return ShapeDecision { turn, dropped: Ok(()) };
         }
         if state.shaper.shaping().max_age.is_some() && reliable {
             if !std::mem::replace(&mut state.has_warned, true) {
@@ -110,14 +110,14 @@ impl ShapeStage {
                 warn!(%topic, "`max_age` is set for a topic that is reliable: none of its messages may be left out, and it has no effect");
             }
         } else if state.shaper.is_too_old(unix_ns(), sample.source_timestamp_ns) {
-            return Shaped { turn: Turn::Never, dropped: Err(Dropped::one(DataDrop::TooOld)) };
+            return ShapeDecision { turn: Turn::Never, dropped: Err(Dropped::one(DataDrop::TooOld)) };
         }
         let mut now = Instant::now();
         while !state.shaper.is_due(now) && !state.is_closed {
             if state.shaper.gives_way(now, reliable) {
                 let replaced = state.held.replace(sample);
                 let starts_timer = !std::mem::replace(&mut state.is_timed, true);
-                return Shaped { turn: Turn::Later { starts_timer }, dropped: thinned(replaced) };
+                return ShapeDecision { turn: Turn::Later { starts_timer }, dropped: thinned(replaced) };
             }
             let wait = state.shaper.due().map_or(Duration::ZERO, |due| due.saturating_duration_since(now));
             state = self.closing.wait_timeout(state, wait).unwrap_or_else(PoisonError::into_inner).0;
@@ -126,7 +126,7 @@ impl ShapeStage {
         let overtaken = state.held.take();
         state.shaper.takes(now, sample.payload.len());
         self.note_active(&state);
-        Shaped { turn: Turn::Now(sample), dropped: thinned(overtaken) }
+        ShapeDecision { turn: Turn::Now(sample), dropped: thinned(overtaken) }
     }
 
     /// Returns the time at which the timer has to release the held sample; `None` if there is none, and the timer ends.
@@ -188,7 +188,7 @@ mod tests {
         let first = stage.shape(dated(1), true);
         assert!(matches!(first.turn, Turn::Now(_)) && first.dropped.is_ok());
         for n in 2..5 {
-            let Shaped { turn, dropped } = stage.shape(dated(n), true);
+            let ShapeDecision { turn, dropped } = stage.shape(dated(n), true);
             assert!(matches!(turn, Turn::Later { starts_timer } if starts_timer == (n == 2)), "{turn:?}");
             assert_eq!(dropped.is_err(), n > 2);
         }
@@ -203,7 +203,7 @@ mod tests {
         // Without limits, the next sample leaves, and the older one does not follow it.
         stage.configure(Shaping::default());
         assert!(stage.is_active(), "the next sample finds the older one here");
-        let Shaped { turn, dropped } = stage.shape(dated(6), true);
+        let ShapeDecision { turn, dropped } = stage.shape(dated(6), true);
         assert!(!stage.is_active() && matches!(turn, Turn::Now(_)));
         assert_eq!(dropped, Err(Dropped::one(DataDrop::Thinned)));
     }
@@ -223,7 +223,7 @@ mod tests {
         let stage = stage(Shaping { max_age: Some(HOUR), ..Shaping::default() });
         let (new, old) = (unix_ns(), unix_ns() - 2 * HOUR.as_nanos() as i64);
         assert!(matches!(stage.shape(dated(new), false).turn, Turn::Now(_)));
-        let Shaped { turn, dropped } = stage.shape(dated(old), false);
+        let ShapeDecision { turn, dropped } = stage.shape(dated(old), false);
         assert!(matches!(turn, Turn::Never));
         assert_eq!(dropped, Err(Dropped::one(DataDrop::TooOld)));
         assert!(matches!(stage.shape(dated(old), true).turn, Turn::Now(_)));

@@ -22,10 +22,10 @@ use crate::data::conversion::KnownType;
 use crate::data::dataplane::DataPlane;
 use crate::data::sending::emit::EmitStage;
 use crate::data::sending::encode::{EncodeStage, EncodedPayload};
-use crate::data::sending::hold::{Downstream, HoldStage, Passed};
+use crate::data::sending::hold::{Downstream, HoldStage, PassOutcome};
 use crate::data::sending::manual_lease::ASSERTION_LOOK_MAX;
 use crate::data::sending::seal::{self, Destination, SealStage};
-use crate::data::sending::shape::{ShapeStage, Shaped, Turn};
+use crate::data::sending::shape::{ShapeDecision, ShapeStage, Turn};
 use crate::data::sending::source_map::{SourceChoice, SourceMap, SourceSlot};
 use crate::data::stats::{DataDrop, Dropped};
 use crate::data::tap::{TapMessage, Taps};
@@ -154,7 +154,7 @@ impl LocalShare {
     fn publish_shaped(self: &Arc<Self>, sample: Sample) {
         let ends_batch = !sample.more;
         let reliable = self.map.load().slots().any(|slot| slot.reliable);
-        let Shaped { turn, dropped } = self.shape.shape(sample, reliable);
+        let ShapeDecision { turn, dropped } = self.shape.shape(sample, reliable);
         if let Err(dropped) = dropped {
             self.emit.count(dropped);
         }
@@ -376,20 +376,20 @@ impl LocalShare {
 }
 
 impl Downstream for LocalShare {
-    fn pass(&self, sample: Sample, more: bool) -> Passed {
+    fn pass(&self, sample: Sample, more: bool) -> PassOutcome {
         let awaits_type = self.encode.awaits_type();
         match self.choose(sample.writer) {
-            SourceChoice::UnknownWriter => return Passed::Waits(sample),
-            SourceChoice::Source(_) if awaits_type => return Passed::Waits(sample),
+            SourceChoice::UnknownWriter => return PassOutcome::Waits(sample),
+            SourceChoice::Source(_) if awaits_type => return PassOutcome::Waits(sample),
             SourceChoice::Source(_) if self.emit.is_closed() => {}
             SourceChoice::Source(slot) => match self.send(&slot, None, sample, more) {
-                Ok(()) if more => return Passed::Open(slot),
+                Ok(()) if more => return PassOutcome::Open(slot),
                 Ok(()) => {}
                 Err(dropped) => self.emit.count(dropped),
             },
             SourceChoice::NoSource => self.emit.count(Dropped::one(DataDrop::NotGranted)),
         }
-        Passed::Done
+        PassOutcome::Done
     }
 
     fn finish_batch(&self, source: &SourceSlot) {
