@@ -1,5 +1,5 @@
-//! [`Certificates`]: the identity of this node and its trust anchors, where links and gateway take them from, and the time
-//! at which the identity is renewed.
+//! [`Certificates`]: the identity of this node and its trust anchors, where links and gateway take them from, and the
+//! time at which the identity is renewed.
 //!
 //! The machines have copies, which the control task replaces. [`crate::control::authority`] issues certificates.
 

@@ -1,5 +1,17 @@
-//! The parts of the control task's state. Each owns its fields and returns values or effects, which [`super::core`] carries
-//! out: no part reaches into the machines, another part, or the local network.
+//! The parts of the control task's state.
+//!
+//! Each part owns its fields. It returns values, and effects on the machines, on other parts and on the local network,
+//! which [`super::core`] carries out. The rest a part does itself, without blocking:
+//!
+//! - [`link_table`] queues frames, probes peers, starts the senders of packets, and closes links.
+//! - [`certificates`] has the identity and the revocation lists saved, and passes credentials to links, to the gateway
+//!   and to dialling tasks.
+//! - [`publishers`] creates signing keys.
+//! - [`shares`] and [`services`] send on other threads: announcements of silent sources, and questions and notices
+//!   about calls.
+//! - [`sinks`] closes the queues of writers, whose threads end the writers, and drops keys of past epochs.
+//!
+//! [`forward_table`] and [`network_ends`] only keep entries.
 
 pub(crate) mod certificates;
 pub(crate) mod forward_table;

@@ -1,5 +1,5 @@
-//! [`NetworkEnds`]: the readers and writers that the route machine wants on the local network. They stay wanted while the
-//! network is closed.
+//! [`NetworkEnds`]: the readers and writers that the route machine wants on the local network. They stay wanted while
+//! the network is closed.
 //!
 //! The sinks own the writers that exist. Readers and writers are created by blocking tasks of the control task.
 

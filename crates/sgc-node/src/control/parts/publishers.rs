@@ -1,5 +1,5 @@
-//! [`Publishers`]: publishing on names of other nodes, from the offer over the owner's grants to the change of keys, with
-//! the signing keys of this node's messages.
+//! [`Publishers`]: publishing on names of other nodes, from the offer over the owner's grants to the change of keys,
+//! with the signing keys of this node's messages.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};

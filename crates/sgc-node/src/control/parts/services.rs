@@ -1,5 +1,5 @@
-//! [`Services`]: the services that this node shares and uses, their wanted clients and servers on the local network, and
-//! the ledgers of lost calls.
+//! [`Services`]: the services that this node shares and uses, their wanted clients and servers on the local network,
+//! and the ledgers of lost calls.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -146,7 +146,8 @@ impl Services {
         self.ends.remove(name);
     }
 
-    /// Takes a new client or server into use. Returns the previous one, or this one if the service is of the other kind.
+    /// Takes a new client or server into use. Returns the previous one, or this one if the service is of the other
+    /// kind.
     pub(crate) fn put_end(&self, name: &Name, end: ServiceEnd) -> Option<OpenEnd> {
         match (self.calls.get(name), end) {
             (Some(Calls::LocalService(served)), ServiceEnd::Client(client)) => {
