@@ -59,24 +59,24 @@ pub fn is_tagged(user_data: &[u8]) -> bool {
 
 /// Returns the name of the SGC node that created the endpoint or participant.
 pub fn tag(user_data: &[u8]) -> Option<&str> {
-    elements(user_data)
-        .find(|(key, _)| *key == TAG_KEY.as_bytes())
-        .and_then(|(_, value)| std::str::from_utf8(value).ok())
-        .filter(|value| is_value(value))
+    value_of(user_data, TAG_KEY).filter(|value| is_value(value))
 }
 
 /// Returns the type hash (`RIHS01_…`) of an endpoint, if it carries a plausible one.
 pub fn type_hash(user_data: &[u8]) -> Option<String> {
-    elements(user_data)
-        .find(|(key, _)| *key == TYPE_HASH_KEY.as_bytes())
-        .and_then(|(_, value)| std::str::from_utf8(value).ok())
+    value_of(user_data, TYPE_HASH_KEY)
         .filter(|value| value.starts_with("RIHS") && is_value(value))
         .map(str::to_owned)
 }
 
 /// Returns the enclave of a participant. Only ROS 2 participants have one.
 pub fn enclave(user_data: &[u8]) -> Option<&str> {
-    let (_, value) = elements(user_data).find(|(key, _)| *key == ENCLAVE_KEY.as_bytes())?;
+    value_of(user_data, ENCLAVE_KEY)
+}
+
+/// Returns the value of the first element with this key, if it is UTF-8.
+fn value_of<'a>(user_data: &'a [u8], key: &str) -> Option<&'a str> {
+    let (_, value) = elements(user_data).find(|(other, _)| *other == key.as_bytes())?;
     std::str::from_utf8(value).ok()
 }
 
