@@ -82,32 +82,13 @@ impl Replays {
 mod tests {
     use std::time::Duration;
 
-    use sgc_endpoint::{RecoveryLimits, Source, SourceConfig};
-    use sgc_trust::{MessageKey, Suite};
-    use sgc_wire::{Class, SecretBytes, TopicGrant};
-    use tokio::sync::mpsc;
-
     use super::*;
+    use crate::data::sending::fixtures::{self, NAME};
     use crate::data::sending::source_map::{SourceMap, SourceSlot};
 
-    const NAME: Name = Name([1; 32]);
-
+    /// Returns a share with one source for all writers.
     fn share() -> (Arc<LocalShare>, SourceSlot) {
-        let (alive, _) = mpsc::channel(1);
-        let share = Arc::new(LocalShare::new(NAME, Arc::default(), alive, 100, Arc::default()));
-        let config = SourceConfig {
-            name: NAME,
-            id: SourceId([1; 16]),
-            class: Class::Default,
-            reliable: true,
-            history_depth: 0,
-            history_bytes_max: 0,
-            recovery: RecoveryLimits::default(),
-        };
-        let key = SecretBytes::new([1; 32]);
-        let grant = TopicGrant { epoch: 1, suite: Suite::Group.id(), key, sources: Vec::new(), entry: None };
-        let source = Source::new(config, &grant, MessageKey::generate(Suite::Group)).unwrap();
-        let slot = SourceSlot::new(source, false, true);
+        let (_, share, slot) = fixtures::share();
         share.set_map(SourceMap { shared: Some(slot.clone()), ..SourceMap::default() });
         (share, slot)
     }
