@@ -782,6 +782,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     use super::*;
+    use crate::tests::scenarios::{REFUSED_WITH_REMEDY, REJECTED};
 
     fn keys(table: &[Refusal]) -> BTreeSet<String> {
         table.iter().map(|refusal| refusal.key.to_owned()).collect()
@@ -808,32 +809,14 @@ mod tests {
 
     #[test]
     fn every_refused_join_has_remedy() {
-        use RefuseReason as Refuse;
-        use RejectReason as Reject;
-        for reason in [
-            Refuse::NotVerified,
-            Refuse::RoleNotOffered,
-            Refuse::Limit,
-            Refuse::Clock,
-            Refuse::Expired,
-            Refuse::Revoked,
-        ] {
+        for reason in REFUSED_WITH_REMEDY {
             let why = reason.to_string();
             assert!(fix_at_owner(&why).is_some() && fix_at_asker(&why).is_some(), "{why}");
         }
-        for reason in [
-            Reject::NoRoute,
-            Reject::NotVerified,
-            Reject::Limit,
-            Reject::TimedOut,
-            Reject::RouteLost,
-            Reject::Clock,
-            Reject::Expired,
-            Reject::Revoked,
-        ] {
+        for reason in REJECTED {
             assert!(fix_at_asker(&reason.to_string()).is_some(), "{reason}");
         }
         // The walk names the entry to add to the policy.
-        assert_eq!(fix_at_owner(&Refuse::NotPermitted.to_string()), None);
+        assert_eq!(fix_at_owner(&RefuseReason::NotPermitted.to_string()), None);
     }
 }

@@ -1,7 +1,7 @@
 //! Tests of every fault that a node can see, each in an otherwise sound document.
 
 mod golden;
-mod scenarios;
+pub(crate) mod scenarios;
 
 use sgc_node::alerts::Alert;
 use sgc_node::graph::{
@@ -13,7 +13,8 @@ use sgc_trust::CertError;
 use sgc_wire::{RefuseReason, RejectReason};
 
 use self::scenarios::{
-    NAME, end, owner, owner_faults, pattern, publisher, publisher_faults, qos, sound, user, user_faults,
+    NAME, action_part, end, owner, owner_faults, pattern, publisher, publisher_faults, qos, sound, user,
+    user_faults,
 };
 use crate::diagnose;
 use crate::refusals::{CONTROL, DOOR, GATEWAY};
@@ -248,17 +249,8 @@ fn services_and_actions_have_clients_and_servers() {
 
 #[test]
 fn action_is_walked_by_its_parts() {
-    let part = |suffix: &str| {
-        let mut graph = user();
-        let name = format!("/fib/_action/{suffix}");
-        graph.uses[0].topic.clone_from(&name);
-        graph.uses[0].local_topic.clone_from(&name);
-        graph.uses[0].routes[0].topic = name;
-        graph.uses[0].kind = Interface::Service;
-        graph
-    };
-    let mut graph = part("send_goal");
-    graph.uses.extend(part("get_result").uses);
+    let mut graph = action_part("send_goal");
+    graph.uses.extend(action_part("get_result").uses);
     assert_eq!(wrong(&graph, "/fib"), "");
     assert_eq!(wrong(&graph, "/fib/_action/get_result"), "");
     graph.uses[1].routes[0].writers = 0;

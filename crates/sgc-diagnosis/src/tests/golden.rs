@@ -10,10 +10,11 @@ use sgc_node::graph::{
 };
 use sgc_transport::PeerRefusal;
 use sgc_trust::CertError;
-use sgc_wire::{RefuseReason, RejectReason};
+use sgc_wire::RefuseReason;
 
 use super::scenarios::{
-    Case, NAME, end, owner, owner_faults, pattern, publisher, publisher_faults, qos, sound, user, user_faults,
+    Case, NAME, REFUSED_WITH_REMEDY, REJECTED, action_part, end, owner, owner_faults, pattern, publisher,
+    publisher_faults, qos, sound, user, user_faults,
 };
 use crate::diagnose;
 
@@ -319,17 +320,8 @@ fn services_and_actions() -> Vec<Scenario> {
         graph.uses[0] = pattern(kind, "arm");
         all.push(asked(&format!("{kind} that wildcards leave out"), &graph, "/n/get_parameters"));
     }
-    let part = |suffix: &str| {
-        let mut graph = user();
-        let name = format!("/fib/_action/{suffix}");
-        graph.uses[0].topic.clone_from(&name);
-        graph.uses[0].local_topic.clone_from(&name);
-        graph.uses[0].routes[0].topic = name;
-        graph.uses[0].kind = Interface::Service;
-        graph
-    };
-    let mut graph = part("send_goal");
-    graph.uses.extend(part("get_result").uses);
+    let mut graph = action_part("send_goal");
+    graph.uses.extend(action_part("get_result").uses);
     all.push(asked("parts of an action", &graph, "/fib"));
     graph.uses[1].routes[0].writers = 0;
     all.push(asked("parts of an action of which one fails", &graph, "/fib"));
@@ -340,32 +332,11 @@ fn services_and_actions() -> Vec<Scenario> {
 
 /// Refusals of joins and links.
 fn reasons() -> Vec<Scenario> {
-    use RefuseReason as Refuse;
-    use RejectReason as Reject;
-    let refused: Vec<_> = [
-        Refuse::NotPermitted,
-        Refuse::NotShared,
-        Refuse::NotVerified,
-        Refuse::RoleNotOffered,
-        Refuse::Limit,
-        Refuse::Clock,
-        Refuse::Expired,
-        Refuse::Revoked,
-    ]
-    .map(|reason| reason.to_string())
-    .into();
-    let rejected = [
-        Reject::NoRoute,
-        Reject::NotVerified,
-        Reject::Limit,
-        Reject::TimedOut,
-        Reject::RouteLost,
-        Reject::Clock,
-        Reject::Expired,
-        Reject::Revoked,
-    ];
+    let walked = [RefuseReason::NotPermitted, RefuseReason::NotShared];
+    let refused = walked.iter().chain(&REFUSED_WITH_REMEDY).map(|reason| reason.to_string());
+    let rejected = REJECTED.iter().map(|reason| reason.to_string());
     let mut all = Vec::new();
-    for why in refused.into_iter().chain(rejected.map(|reason| reason.to_string())) {
+    for why in refused.chain(rejected) {
         let mut graph = owner();
         graph.shares[0].routes[0].granted.clear();
         graph.shares[0].routes[0].refused = [("desk".to_owned(), why.clone())].into();

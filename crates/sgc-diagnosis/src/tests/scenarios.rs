@@ -6,6 +6,29 @@ use sgc_node::graph::{
     Endpoint, Graph, Interface, JoinState, Link, NameLine, Offer, Qos, Search, Share, ShareRoute, Use,
     UseRoute,
 };
+use sgc_wire::{RefuseReason, RejectReason};
+
+/// Reasons to refuse a join whose remedy does not depend on the document.
+pub(crate) const REFUSED_WITH_REMEDY: [RefuseReason; 6] = [
+    RefuseReason::NotVerified,
+    RefuseReason::RoleNotOffered,
+    RefuseReason::Limit,
+    RefuseReason::Clock,
+    RefuseReason::Expired,
+    RefuseReason::Revoked,
+];
+
+/// All reasons to reject a join on its way.
+pub(crate) const REJECTED: [RejectReason; 8] = [
+    RejectReason::NoRoute,
+    RejectReason::NotVerified,
+    RejectReason::Limit,
+    RejectReason::TimedOut,
+    RejectReason::RouteLost,
+    RejectReason::Clock,
+    RejectReason::Expired,
+    RejectReason::Revoked,
+];
 
 pub(super) const STRING: &str = "std_msgs/msg/String";
 pub(super) const NAME: &str = "aa";
@@ -60,6 +83,17 @@ pub(super) fn owner() -> Graph {
         shares: vec![Share { topic: "/a".into(), to: [1, 0, 0], routes: vec![route], ..Share::default() }],
         ..sound()
     }
+}
+
+/// A sound document of a user of a part of the action `/fib`.
+pub(super) fn action_part(suffix: &str) -> Graph {
+    let mut graph = user();
+    let name = format!("/fib/_action/{suffix}");
+    graph.uses[0].topic.clone_from(&name);
+    graph.uses[0].local_topic.clone_from(&name);
+    graph.uses[0].routes[0].topic = name;
+    graph.uses[0].kind = Interface::Service;
+    graph
 }
 
 /// Returns the graph of a sound node that uses `/a`.
