@@ -9,44 +9,34 @@
 //! for. It exists while the catalogue lists the entry. A *token route* is a use route whose entry comes with the
 //! grant, from an owner of another fleet whose catalogue this node cannot read.
 //!
-//! `machine.rs` has the machine's state; this file only lists its parts.
+//! `machine.rs` has the machine's state, and the files below it the handlers. The other files have its parts, each with
+//! private state.
 
 mod backlog;
-mod checks;
 mod command;
-mod consumers;
-mod graph;
 mod local_graph;
 mod machine;
 mod naming;
 mod own_sources;
 mod owners;
 mod problem;
-mod publish;
 mod readers;
-mod reconfigure;
 mod rules;
-mod selection;
 mod service_ends;
-mod services;
-mod settling;
 mod share_route;
-mod shares;
-mod status;
-mod tokens;
+mod token_join;
 mod use_route;
-mod uses;
-mod view;
+mod use_writers;
 
 pub use command::Command;
-pub use consumers::Consumers;
-pub use machine::Routes;
+pub use machine::{
+    Consumers, OfferView, RouteKind, RouteState, RouteStatus, Routes, ShareRouteView, ShareView,
+    UseRouteView, UseView,
+};
 pub use naming::{GLOBAL_TOPICS, LITERAL_TOPICS, Naming, Rename, is_for_wildcards, is_pattern, matches};
 pub use own_sources::WRITERLESS_HOLD;
 pub use owners::{OwnerState, REDISCOVERY_HOLD};
 pub use problem::{LocalEnd, Offerer, Problem, Way};
 pub use rules::{Direction, ROUTES_PER_WILDCARD_MAX, Shaping, ShareRule, ShareRuleId, UseRule, UseRuleId};
 pub use share_route::SINKLESS_HOLD;
-pub use status::{RouteKind, RouteState, RouteStatus};
 pub use use_route::UNREACHABLE_HOLD;
-pub use view::{OfferView, ShareRouteView, ShareView, UseRouteView, UseView};

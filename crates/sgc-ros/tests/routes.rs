@@ -903,6 +903,23 @@ fn a_topic_that_its_owner_lets_us_publish_on_is_read_while_someone_here_writes_i
 }
 
 #[test]
+fn reader_of_local_publishers_follows_the_owner_s_type() {
+    let mut b = bench_of(Vec::new(), vec![publish_rule("/cmd")]);
+    let listed =
+        CatalogueEntry { subscribe: false, publish: true, ..entry("/cmd", STRING, Qos::default(), &[]) };
+    b.catalogue(vec![listed.clone()]);
+    b.granted(theirs("/cmd", STRING), None);
+    b.appears(writer(1, "/cmd", Qos::default()));
+    // The owner's first publisher shows that the type has a key.
+    let commands = b.catalogue(vec![CatalogueEntry { keyless: false, ..listed.clone() }]);
+    assert!(
+        matches!(&commands[..], [Command::CloseReader { .. }, Command::OpenReader { spec, .. }] if !spec.keyless),
+        "{commands:?}"
+    );
+    assert_eq!(b.catalogue(vec![CatalogueEntry { keyless: false, ..listed }]), []);
+}
+
+#[test]
 fn a_topic_that_may_only_be_published_on_is_not_brought_here() {
     let mut b = bench(&[], &[("/cmd", None)]);
     let listed =

@@ -1,6 +1,20 @@
 //! [`Routes`]: the state of the route machine, its inputs and its outputs.
 //!
-//! The other files of this folder have the handlers, each for one part of the machine.
+//! The files below have the handlers, each for one subject. Only they reach the fields.
+
+mod checks;
+mod consumers;
+mod graph;
+mod publish;
+mod reconfigure;
+mod selection;
+mod services;
+mod settling;
+mod shares;
+mod status;
+mod tokens;
+mod uses;
+mod view;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
@@ -16,27 +30,31 @@ use super::owners::Owners;
 use super::problem::{Cause, Problem, Problems};
 use super::rules::{Rules, ShareRule, ShareRules, UseRule, UseRules};
 use super::share_route::ShareRoute;
-use super::use_route::{TokenJoin, UseRoute};
+use super::token_join::TokenJoin;
+use super::use_route::UseRoute;
 use crate::network::{DiscoveryEvent, EndpointKind};
+
+pub use consumers::Consumers;
+pub use status::{RouteKind, RouteState, RouteStatus};
+pub use view::{OfferView, ShareRouteView, ShareView, UseRouteView, UseView};
 
 /// The route machine.
 pub struct Routes<R> {
-    pub(super) secret: FleetSecret,
-    pub(super) node: NodeId,
-    pub(super) rng: R,
-    pub(super) share_rules: ShareRules,
-    pub(super) use_rules: UseRules,
-    pub(super) local: LocalGraph,
-    pub(super) shares: BTreeMap<Name, ShareRoute>,
-    pub(super) uses: BTreeMap<Name, UseRoute>,
-    /// The joined names of tokens. From the first grant on a use route exists, too.
-    pub(super) tokens: BTreeMap<Name, TokenJoin>,
-    pub(super) owners: Owners,
-    pub(super) problems: Problems,
-    pub(super) backlog: Backlog,
+    secret: FleetSecret,
+    node: NodeId,
+    rng: R,
+    share_rules: ShareRules,
+    use_rules: UseRules,
+    local: LocalGraph,
+    shares: BTreeMap<Name, ShareRoute>,
+    uses: BTreeMap<Name, UseRoute>,
+    tokens: BTreeMap<Name, TokenJoin>,
+    owners: Owners,
+    problems: Problems,
+    backlog: Backlog,
     /// `true` if local consumers or the interfaces that they use may have changed.
-    pub(super) consumers_changed: bool,
-    pub(super) commands: VecDeque<Command>,
+    consumers_changed: bool,
+    commands: VecDeque<Command>,
 }
 
 impl<R: RngCore> Routes<R> {
@@ -127,7 +145,7 @@ impl<R: RngCore> Routes<R> {
     /// Returns the time of the next timeout.
     pub fn poll_timeout(&self) -> Option<Instant> {
         let shares = self.shares.values().map(ShareRoute::deadline);
-        let uses = self.uses.values().map(|u| u.unreachable_until);
+        let uses = self.uses.values().map(UseRoute::deadline);
         shares.chain(uses).chain([self.owners.deadline()]).flatten().min()
     }
 
@@ -135,15 +153,15 @@ impl<R: RngCore> Routes<R> {
     pub fn topic_of(&self, name: &Name) -> Option<&str> {
         let share = self.shares.get(name).map(ShareRoute::local_name);
         share.or_else(|| {
-            let token = || Some(self.use_rules[self.tokens.get(name)?.rule].topic.as_str());
-            self.uses.get(name).map(|u| u.local_name.as_str()).or_else(token)
+            let token = || Some(self.use_rules[self.tokens.get(name)?.rule()].topic.as_str());
+            self.uses.get(name).map(UseRoute::local_name).or_else(token)
         })
     }
 
     /// Returns `true` if the traffic of a name that is shared or used here has a lane of its own.
     pub fn is_dedicated(&self, name: &Name) -> bool {
         let share = self.shares.get(name).map(|share| self.share_rules[share.rule()].dedicated);
-        let used = self.uses.get(name).map(|route| self.use_rules[route.rule].dedicated);
+        let used = self.uses.get(name).map(|route| self.use_rules[route.rule()].dedicated);
         share.or(used).unwrap_or(false)
     }
 }

@@ -7,14 +7,14 @@ use rand_core::RngCore;
 use sgc_trust::derive_name;
 use sgc_wire::{Kind, Name, SinkId};
 
-use super::command::Command;
-use super::machine::Routes;
-use super::problem::{Cause, Problem, Way};
-use super::rules::{ROUTES_PER_WILDCARD_MAX, ShareRuleId};
-use super::service_ends::interface;
-use super::share_route::{ShareRoute, ShareTimeout, ShareUpdate, WriterRemoval};
+use super::Routes;
 use crate::names::{is_topic_name, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind, Guid};
+use crate::routes::command::Command;
+use crate::routes::problem::{Cause, Problem, Way};
+use crate::routes::rules::{ROUTES_PER_WILDCARD_MAX, ShareRuleId};
+use crate::routes::service_ends::interface;
+use crate::routes::share_route::{ShareRoute, ShareTimeout, ShareUpdate, WriterRemoval};
 
 impl<R: RngCore> Routes<R> {
     /// Handles the grant of a share to a sink.

@@ -8,11 +8,11 @@ use std::time::Instant;
 use rand_core::RngCore;
 use sgc_wire::{Name, NodeId};
 
-use super::command::Command;
-use super::machine::Routes;
-use super::problem::Cause;
-use super::rules::{Direction, Rules, ShareRule, ShareRules, UseRule, UseRuleId, UseRules};
+use super::Routes;
 use crate::network::{DiscoveredEndpoint, EndpointKind, Guid};
+use crate::routes::command::Command;
+use crate::routes::problem::Cause;
+use crate::routes::rules::{Direction, Rules, ShareRule, ShareRules, UseRule, UseRuleId, UseRules};
 
 impl<R: RngCore> Routes<R> {
     /// Replaces the rules.
@@ -71,8 +71,8 @@ impl<R: RngCore> Routes<R> {
 
     fn reconfigure_uses(&mut self, rules: Vec<UseRule>) {
         let old = std::mem::replace(&mut self.use_rules, Rules::new(rules));
-        let joined = self.uses.iter().map(|(name, route)| (*name, route.rule));
-        let tokens = self.tokens.iter().map(|(name, token)| (*name, token.rule));
+        let joined = self.uses.iter().map(|(name, route)| (*name, route.rule()));
+        let tokens = self.tokens.iter().map(|(name, token)| (*name, token.rule()));
         let places: BTreeMap<Name, UseRuleId> = joined.chain(tokens).collect();
         let places =
             places.into_iter().map(|(name, before)| (name, before, self.place_of(&name, &old[before])));
@@ -94,17 +94,17 @@ impl<R: RngCore> Routes<R> {
         let route = self.uses.get(name);
         let place = match route.filter(|_| before.token.is_none()) {
             Some(route) => self
-                .use_rule(&before.owner, &route.entry)
-                .filter(|place| self.why_not_used(*place, &route.entry.metadata).is_none()),
+                .use_rule(&before.owner, route.entry())
+                .filter(|place| self.why_not_used(*place, &route.entry().metadata).is_none()),
             None => self.use_rules.position(|r| r.is_same_place(before)),
         };
         let fits = |rule: &UseRule| {
             let (same_way, wanted) = (rule.direction == before.direction, rule.type_name.as_ref());
             same_way
                 && route.is_none_or(|route| {
-                    let metadata = &route.entry.metadata;
+                    let metadata = &route.entry().metadata;
                     wanted.is_none_or(|wanted| *wanted == metadata.type_name)
-                        && rule.local_name(metadata) == route.local_name
+                        && rule.local_name(metadata) == route.local_name()
                 })
         };
         // Publishing in another class begins anew.
@@ -124,13 +124,13 @@ impl<R: RngCore> Routes<R> {
             self.commands.push_back(Command::Frames { name, prefix: frame_prefix.clone() });
         }
         if let Some(route) = self.uses.get_mut(&name) {
-            route.rule = place;
+            route.move_to(place);
         }
-        if has_other_qos && !self.publishes(place) {
+        if has_other_qos {
             self.refresh_use(name);
         }
         if let Some(token) = self.tokens.get_mut(&name) {
-            token.rule = place;
+            token.move_to(place);
         }
     }
 

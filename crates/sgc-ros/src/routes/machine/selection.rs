@@ -5,10 +5,10 @@
 
 use sgc_wire::{CatalogueEntry, Kind, Metadata, NodeId};
 
-use super::machine::Routes;
-use super::problem::Problem;
-use super::rules::{ShareRule, ShareRuleId, UseRule, UseRuleId};
+use super::Routes;
 use crate::names::is_topic_name;
+use crate::routes::problem::Problem;
+use crate::routes::rules::{ShareRule, ShareRuleId, UseRule, UseRuleId};
 
 impl<R> Routes<R> {
     /// Returns the rule that shares a local interface: the first that names it, else the first wildcard that covers
@@ -51,8 +51,8 @@ impl<R> Routes<R> {
         let named = self.use_rules.iter().find(|rule| rule.claims(kind, local_name));
         let running = || {
             let has = |metadata: &Metadata, name: &str| metadata.kind == kind && name == local_name;
-            let route = self.uses.values().find(|u| has(&u.entry.metadata, &u.local_name))?;
-            Some(&self.use_rules[route.rule])
+            let route = self.uses.values().find(|u| has(&u.entry().metadata, u.local_name()))?;
+            Some(&self.use_rules[route.rule()])
         };
         named.or_else(running).map(|rule| rule.owner_name.as_str())
     }

@@ -6,14 +6,13 @@
 use rand_core::RngCore;
 use sgc_wire::{Metadata, Name};
 
-use super::command::Command;
-use super::machine::Routes;
-use super::problem::Cause;
-use super::readers::{asks_key_hash, same_reader};
-use super::rules::{Direction, Shaping, ShareRuleId, UseRuleId};
-use crate::names::{dds_topic, dds_type, ros_topic, ros_type};
-use crate::network::{DiscoveredEndpoint, EndpointKind, EndpointSpec};
-use crate::qos::{reader_for, weakest};
+use super::Routes;
+use crate::names::dds_type;
+use crate::network::{DiscoveredEndpoint, EndpointKind};
+use crate::routes::command::Command;
+use crate::routes::problem::Cause;
+use crate::routes::rules::{Direction, Shaping, ShareRuleId, UseRule, UseRuleId};
+use crate::routes::use_route::UseRoute;
 
 impl<R: RngCore> Routes<R> {
     /// Handles the arrival of the first other publisher on a share, or the end of the last.
@@ -58,26 +57,24 @@ impl<R: RngCore> Routes<R> {
 
     /// Adds a local writer to the routes that publish its topic elsewhere.
     pub(super) fn publisher_there(&mut self, writer: &DiscoveredEndpoint) {
-        let names: Vec<_> =
-            self.uses.iter().filter(|(_, u)| self.publishes(u.rule)).map(|(n, _)| *n).collect();
-        for name in names {
-            let Some(route) = self.uses.get_mut(&name) else { continue };
-            if ros_topic(&writer.topic) == Some(route.local_name.as_str())
-                && ros_type(&writer.type_name) == route.entry.metadata.type_name
-            {
-                route.local.insert(writer.guid, writer.clone());
-                self.refresh_publisher(name);
-            }
-        }
+        self.refresh_uses_where(|route, rule| {
+            rule.direction == Direction::Publish && route.add_publisher(writer)
+        });
     }
 
     pub(super) fn publisher_gone(&mut self, writer: &DiscoveredEndpoint) {
-        let with = self.uses.iter().filter(|(_, u)| u.local.contains_key(&writer.guid));
-        for name in with.map(|(n, _)| *n).collect::<Vec<_>>() {
-            if let Some(route) = self.uses.get_mut(&name) {
-                route.local.remove(&writer.guid);
-                self.refresh_publisher(name);
-            }
+        self.refresh_uses_where(|route, _| route.remove_publisher(&writer.guid));
+    }
+
+    /// Changes uses and refreshes those for which `change` returns `true`.
+    fn refresh_uses_where(&mut self, mut change: impl FnMut(&mut UseRoute, &UseRule) -> bool) {
+        let rules = &self.use_rules;
+        let changed = self.uses.iter_mut().filter_map(|(name, route)| {
+            let rule = &rules[route.rule()];
+            change(route, rule).then_some(*name)
+        });
+        for name in changed.collect::<Vec<_>>() {
+            self.refresh_use(name);
         }
     }
 
@@ -92,33 +89,5 @@ impl<R: RngCore> Routes<R> {
 
     pub(super) fn publishes(&self, rule: UseRuleId) -> bool {
         self.use_rules[rule].direction == Direction::Publish
-    }
-
-    /// Updates the local reader of a publishing route to match its local writers.
-    pub(super) fn refresh_publisher(&mut self, name: Name) {
-        let Some(route) = self.uses.get_mut(&name).filter(|u| u.granted) else { return };
-        if self.use_rules[route.rule].is_service() {
-            return self.refresh_server(name);
-        }
-        let offer = weakest(route.local.values().map(|w| &w.qos));
-        let metadata = &route.entry.metadata;
-        let spec = offer.map(|offer| EndpointSpec {
-            topic: dds_topic(&route.local_name),
-            type_name: dds_type(&metadata.type_name),
-            keyless: route.entry.keyless,
-            asks_key_hash: asks_key_hash(route.entry.keyless, route.local.keys()),
-            type_hash: route.entry.type_hash.clone(),
-            qos: reader_for(&offer, route.local.len()),
-        });
-        if same_reader(route.reader.as_ref(), spec.as_ref()) {
-            return;
-        }
-        if route.reader.is_some() {
-            self.commands.push_back(Command::CloseReader { name });
-        }
-        if let Some(spec) = &spec {
-            self.commands.push_back(Command::OpenReader { name, spec: spec.clone() });
-        }
-        route.reader = spec;
     }
 }

@@ -4,10 +4,11 @@ use sgc_endpoint::RefusedBy;
 use sgc_trust::{Policy, name_of};
 use sgc_wire::{CatalogueEntry, Kind, Metadata, Name, NodeId, PayloadForm, Qos};
 
-use super::machine::Routes;
-use super::owners::OwnerState;
-use super::rules::{Direction, ShareRule, ShareRuleId, UseRule};
+use super::Routes;
 use crate::network::{DiscoveredEndpoint, Guid};
+use crate::routes::owners::OwnerState;
+use crate::routes::rules::{Direction, ShareRule, ShareRuleId, UseRule};
+use crate::routes::token_join::TokenJoin;
 
 /// A share rule and its routes.
 #[derive(Clone, Debug)]
@@ -128,7 +129,7 @@ impl<R> Routes<R> {
     /// Returns the entry of a used interface, and its owner.
     pub fn used_entry(&self, name: &Name) -> Option<(NodeId, &CatalogueEntry)> {
         let route = self.uses.get(name)?;
-        Some((self.use_rules[route.rule].owner, &route.entry))
+        Some((self.use_rules[route.rule()].owner, route.entry()))
     }
 
     /// Returns the names of the owners in use rules.
@@ -162,22 +163,22 @@ impl<R> Routes<R> {
     pub fn use_views(&self) -> Vec<UseView<'_>> {
         let view = |(index, rule)| {
             let rule: &UseRule = rule;
-            let of_rule = self.uses.iter().filter(move |(_, route)| route.rule == index);
+            let of_rule = self.uses.iter().filter(move |(_, route)| route.rule() == index);
             let routes = of_rule.map(|(name, route)| UseRouteView {
-                local_name: route.local_name.clone(),
-                entry: &route.entry,
+                local_name: route.local_name().to_owned(),
+                entry: route.entry(),
                 name: *name,
                 form: rule.shaping.form,
-                is_granted: route.granted,
-                refused: route.refused,
-                writers: route.writers.len() + usize::from(route.server.is_some()),
-                publishers: route.local.len(),
-                is_read: route.reader.is_some(),
+                is_granted: route.is_granted(),
+                refused: route.refused(),
+                writers: route.writer_count() + usize::from(route.is_served()),
+                publishers: route.publisher_count(),
+                is_read: route.is_read(),
             });
             let token = rule
                 .token
                 .as_ref()
-                .map(|(name, _)| (*name, self.tokens.get(name).and_then(|token| token.refused)));
+                .map(|(name, _)| (*name, self.tokens.get(name).and_then(TokenJoin::refused)));
             UseView {
                 direction: rule.direction,
                 kind: rule.kind,

@@ -6,11 +6,11 @@ use std::collections::BTreeMap;
 use rand_core::RngCore;
 use sgc_wire::{CONSUMERS_MAX, CONSUMERS_PER_INTERFACE_MAX, Consumer, Kind, Name, NodeId, Qos, Role};
 
-use super::machine::Routes;
-use super::rules::Direction;
-use super::use_route::UseRoute;
+use super::Routes;
 use crate::names::{ServiceTopic, dds_topic, dds_type};
 use crate::network::{EndpointKind, EndpointSpec};
+use crate::routes::rules::Direction;
+use crate::routes::use_route::UseRoute;
 
 /// Local consumers of interfaces that others own.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -42,7 +42,7 @@ impl<R: RngCore> Routes<R> {
         let mut used = BTreeMap::<String, Vec<ConsumingEnd>>::new();
         for (name, route) in &self.uses {
             if let Some((kind, topic, type_name)) = self.consuming_end(route) {
-                let owner = self.use_rules[route.rule].owner;
+                let owner = self.use_rules[route.rule()].owner;
                 used.entry(topic).or_default().push(ConsumingEnd {
                     kind,
                     type_name,
@@ -88,15 +88,15 @@ impl<R: RngCore> Routes<R> {
 
     /// Returns kind, topic and type of the endpoints by which programs consume a used interface.
     fn consuming_end(&self, route: &UseRoute) -> Option<(EndpointKind, String, String)> {
-        if !route.granted && route.unreachable_until.is_none() {
+        if !route.is_up() {
             return None;
         }
-        let (rule, type_name) = (&self.use_rules[route.rule], &route.entry.metadata.type_name);
+        let (rule, type_name) = (&self.use_rules[route.rule()], &route.entry().metadata.type_name);
         let request = ServiceTopic::Request;
         match (rule.kind, rule.direction) {
             (Kind::Service, _) => Some((
                 EndpointKind::Writer,
-                request.dds_topic(&route.local_name),
+                request.dds_topic(route.local_name()),
                 request.dds_type(type_name),
             )),
             (_, direction) => {
@@ -104,7 +104,7 @@ impl<R: RngCore> Routes<R> {
                     Direction::Bring => EndpointKind::Reader,
                     Direction::Publish => EndpointKind::Writer,
                 };
-                Some((kind, dds_topic(&route.local_name), dds_type(type_name)))
+                Some((kind, dds_topic(route.local_name()), dds_type(type_name)))
             }
         }
     }

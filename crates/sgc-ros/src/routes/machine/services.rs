@@ -9,17 +9,16 @@ use std::time::Instant;
 use rand_core::RngCore;
 use sgc_wire::{Kind, Name};
 
-use super::command::Command;
-use super::machine::Routes;
-use super::service_ends::{interface, server_of, service_spec};
+use super::Routes;
 use crate::names::ServiceTopic;
 use crate::network::{DiscoveredEndpoint, EndpointKind};
+use crate::routes::service_ends::{interface, server_of};
 
 impl<R: RngCore> Routes<R> {
     /// Returns `true` if a name that is shared or used here belongs to a service.
     pub fn is_service(&self, name: &Name) -> bool {
         let shared = self.shares.get(name).map(|share| self.share_rules[share.rule()].is_service());
-        let used = || self.uses.get(name).map(|route| self.use_rules[route.rule].is_service());
+        let used = || self.uses.get(name).map(|route| self.use_rules[route.rule()].is_service());
         shared.or_else(used).unwrap_or(false)
     }
 
@@ -76,27 +75,5 @@ impl<R: RngCore> Routes<R> {
         for server in requests.skip(left).filter_map(server_of).collect::<Vec<_>>() {
             self.writer_gone(now, &server);
         }
-    }
-
-    /// Updates the local server of a called service to match its catalogue entry.
-    pub(super) fn refresh_server(&mut self, name: Name) {
-        let Some(route) = self.uses.get_mut(&name).filter(|u| u.granted) else { return };
-        let rule = &self.use_rules[route.rule];
-        if !rule.is_service() {
-            return;
-        }
-        let metadata = &route.entry.metadata;
-        let hash = route.entry.type_hash.as_deref();
-        let spec = service_spec(&rule.local_name(metadata), &metadata.type_name, hash);
-        if route.server.as_ref() == Some(&spec) {
-            return self.name_writers(name);
-        }
-        if route.server.is_some() {
-            self.commands.push_back(Command::CloseServer { name });
-        }
-        self.commands.push_back(Command::OpenServer { name, spec: spec.clone() });
-        route.server = Some(spec);
-        route.nodes.clear();
-        self.name_writers(name);
     }
 }

@@ -5,12 +5,12 @@ use std::collections::BTreeSet;
 use rand_core::RngCore;
 use sgc_wire::{Kind, Qos};
 
-use super::command::Command;
-use super::machine::Routes;
-use super::problem::{Cause, LocalEnd, Offerer, Problem};
+use super::Routes;
 use crate::names::{ros_topic, ros_type};
 use crate::network::{DiscoveredEndpoint, EndpointKind};
 use crate::qos::mismatches;
+use crate::routes::command::Command;
+use crate::routes::problem::{Cause, LocalEnd, Offerer, Problem};
 
 impl<R: RngCore> Routes<R> {
     /// Returns the current problems, each once, in a fixed order.
@@ -65,11 +65,11 @@ impl<R: RngCore> Routes<R> {
             }
         }
         for route in self.uses.values() {
-            let rule = &self.use_rules[route.rule];
-            let entry = &route.entry;
-            let publishes = self.publishes(route.rule);
+            let rule = &self.use_rules[route.rule()];
+            let entry = route.entry();
+            let publishes = self.publishes(route.rule());
             // An interface on which this node publishes elsewhere concerns local publishers only.
-            if route.local_name != topic || rule.is_service() || (publishes && is_reader) {
+            if route.local_name() != topic || rule.is_service() || (publishes && is_reader) {
                 continue;
             }
             let (topic, owner) = (topic.to_owned(), rule.owner_name.clone());
@@ -96,8 +96,7 @@ impl<R: RngCore> Routes<R> {
             // The offers of all present writers, or the expected one if there are none.
             let offers = entry.sources.iter().map(|source| &source.qos);
             let offers = offers.chain(entry.sources.is_empty().then_some(&entry.qos));
-            let set = self.use_rules[route.rule].qos;
-            for mismatch in offers.flat_map(|offer| mismatches(&set.apply(offer), &endpoint.qos)) {
+            for mismatch in offers.flat_map(|offer| mismatches(&rule.qos.apply(offer), &endpoint.qos)) {
                 let (topic, offerer) = (topic.clone(), Offerer::Owner(owner.clone()));
                 problems.insert(Problem::LocalQos { topic, offerer, mismatch });
             }

@@ -3,11 +3,12 @@
 use sgc_endpoint::RefusedBy;
 use sgc_wire::{Metadata, Name};
 
-use super::machine::Routes;
-use super::owners::OwnerState;
-use super::rules::{Direction, ShareRule, UseRule};
-use super::share_route::ShareRoute;
-use super::use_route::UseRoute;
+use super::Routes;
+use crate::routes::owners::OwnerState;
+use crate::routes::rules::{Direction, ShareRule, UseRule};
+use crate::routes::share_route::ShareRoute;
+use crate::routes::token_join::TokenJoin;
+use crate::routes::use_route::UseRoute;
 
 /// The way of a rule's interfaces.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -110,7 +111,7 @@ impl<R> Routes<R> {
         }
         for (id, rule) in self.use_rules.with_ids() {
             let before = all.len();
-            let routes = self.uses.iter().filter(|(_, u)| u.rule == id);
+            let routes = self.uses.iter().filter(|(_, u)| u.rule() == id);
             all.extend(routes.map(|(name, route)| use_status(rule, *name, route)));
             if all.len() == before {
                 all.push(self.idle_use(rule));
@@ -123,7 +124,7 @@ impl<R> Routes<R> {
     fn idle_use(&self, rule: &UseRule) -> RouteStatus {
         let (type_name, name, state) = match &rule.token {
             Some((name, metadata)) => {
-                let refused = self.tokens.get(name).and_then(|token| token.refused);
+                let refused = self.tokens.get(name).and_then(TokenJoin::refused);
                 let state = refused.map_or(RouteState::AwaitsGrant, RouteState::Refused);
                 (Some(metadata.type_name.clone()), Some(*name), state)
             }
@@ -187,19 +188,19 @@ fn share_status(rule: &ShareRule, route: &ShareRoute) -> RouteStatus {
 
 fn use_status(rule: &UseRule, name: Name, route: &UseRoute) -> RouteStatus {
     let local = match rule.direction {
-        Direction::Publish => route.local.len(),
-        Direction::Bring => route.writers.len(),
+        Direction::Publish => route.publisher_count(),
+        Direction::Bring => route.writer_count(),
     };
-    let state = match (route.granted, route.refused) {
+    let state = match (route.is_granted(), route.refused()) {
         (true, _) => RouteState::Granted { local },
         (false, Some(by)) => RouteState::Refused(by),
         (false, None) => RouteState::AwaitsGrant,
     };
-    let Metadata { ros_name, type_name, .. } = &route.entry.metadata;
+    let Metadata { ros_name, type_name, .. } = &route.entry().metadata;
     RouteStatus {
         kind: use_kind(rule),
-        topic: route.local_name.clone(),
-        topic_there: Some(ros_name.clone()).filter(|there| *there != route.local_name),
+        topic: route.local_name().to_owned(),
+        topic_there: Some(ros_name.clone()).filter(|there| there != route.local_name()),
         type_name: Some(type_name.clone()),
         name: Some(name),
         owner: rule.owner_name.clone(),

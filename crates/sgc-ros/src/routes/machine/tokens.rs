@@ -8,18 +8,19 @@ use rand_core::RngCore;
 use sgc_trust::name_of;
 use sgc_wire::{CatalogueEntry, Name};
 
-use super::command::Command;
-use super::machine::Routes;
-use super::problem::{Cause, Problem};
-use super::rules::Shaping;
-use super::use_route::{TokenJoin, UseRoute};
+use super::Routes;
+use crate::routes::command::Command;
+use crate::routes::problem::{Cause, Problem};
+use crate::routes::rules::Shaping;
+use crate::routes::token_join::TokenJoin;
+use crate::routes::use_route::UseRoute;
 
 impl<R: RngCore> Routes<R> {
     /// Handles the owner's description of a token's name, a catalogue of one entry.
     pub(super) fn handle_described(&mut self, name: Name, entry: CatalogueEntry) {
         let Some(token) = self.tokens.get_mut(&name) else { return };
-        token.refused = None;
-        let index = token.rule;
+        token.grant();
+        let index = token.rule();
         let rule = &self.use_rules[index];
         let expected = rule.token.as_ref().map(|(_, metadata)| metadata);
         if name_of(&rule.owner, &entry.blind) != name || expected != Some(&entry.metadata) {
@@ -31,9 +32,8 @@ impl<R: RngCore> Routes<R> {
         self.settle(Cause::Token(name), BTreeSet::new());
         let Some(token) = self.tokens.get_mut(&name) else { return };
         let transient_local = entry.qos.is_transient_local();
-        if token.transient_local != transient_local {
-            // Another durability needs another kind of sink, so the join starts over with it.
-            token.transient_local = transient_local;
+        if token.set_durability(transient_local) {
+            // The join starts over with the other kind of sink.
             self.close_use(name);
             self.commands.push_back(Command::Leave { name });
             self.commands.push_back(Command::Join { name, owner, transient_local, describe: true });
@@ -42,10 +42,10 @@ impl<R: RngCore> Routes<R> {
             return;
         }
         if let Some(route) = self.uses.get_mut(&name) {
-            route.entry = entry;
+            route.set_entry(entry);
         } else {
             let local_name = self.use_rules[index].local_name(&entry.metadata);
-            self.uses.insert(name, UseRoute::new(index, local_name, entry));
+            self.uses.insert(name, UseRoute::new(name, index, local_name, entry));
         }
         self.check_later();
     }
@@ -57,7 +57,7 @@ impl<R: RngCore> Routes<R> {
             if self.tokens.contains_key(name) {
                 continue;
             }
-            self.tokens.insert(*name, TokenJoin { rule: index, transient_local: false, refused: None });
+            self.tokens.insert(*name, TokenJoin::new(index));
             let (name, owner, shaping) = (*name, rule.owner, rule.shaping);
             self.commands.push_back(Command::Join { name, owner, transient_local: false, describe: true });
             if shaping != Shaping::default() {
