@@ -26,7 +26,7 @@ use tracing::warn;
 
 use crate::data::burst::Burst;
 use crate::data::conversion::{self, TypeSlot};
-use crate::data::queue::{PushError, Queue};
+use crate::data::queue::{PushError, PushOutcome, Queue};
 use crate::data::stats::{DataDrop, Drops};
 
 /// Most messages that wait for one local writer.
@@ -80,6 +80,16 @@ impl NextMessage {
     fn is_at_once(self) -> bool {
         matches!(self, Self::AtOnce | Self::Last)
     }
+}
+
+/// Outcome of handing a message to a queue without waiting.
+#[derive(Debug, PartialEq, Eq)]
+#[must_use]
+pub(crate) enum WriteOutcome {
+    /// The message is written or queued; so many best-effort messages were evicted for it.
+    Taken { evicted: u64 },
+    /// The message is returned: it has to wait for room.
+    Full(Message),
 }
 
 /// Consumes the messages of a queue one by one.
@@ -330,21 +340,23 @@ impl WriterQueue {
         take.filter(|_| self.queue.is_empty() && !self.queue.is_closed() && (self.info.is_free)(message))
     }
 
-    /// Writes a message on the caller's thread if `may_write` and nothing is ahead of it, or queues it. Returns the
-    /// number of evicted messages, or the message if it has to wait for room.
-    pub(crate) fn try_push(&self, message: Message, may_write: bool) -> Result<u64, Message> {
+    /// Writes a message on the caller's thread if `may_write` and nothing is ahead of it, or queues it if there is room.
+    pub(crate) fn try_push(&self, message: Message, may_write: bool) -> WriteOutcome {
         let (bytes, head) = (message.payload.len(), message.head);
         let mut evicted = 0;
         let at_once = may_write.then(|| self.at_once(&message)).flatten();
         if let Some(mut take) = at_once {
             take(message, NextMessage::Nothing);
         } else if message.reliable {
-            self.queue.try_push(message, bytes, WRITER_BYTES_MAX)?;
+            match self.queue.try_push(message, bytes, WRITER_BYTES_MAX) {
+                PushOutcome::Queued => {}
+                PushOutcome::NotQueued(message) => return WriteOutcome::Full(message),
+            }
         } else {
             self.queue.push_evicting(message, bytes, WRITER_BYTES_MAX, |_| evicted += 1);
         }
         self.remember(&head);
-        Ok(evicted)
+        WriteOutcome::Taken { evicted }
     }
 
     /// Queues a message once there is room. Fails if there is none for too long.
@@ -531,7 +543,7 @@ pub(crate) mod tests {
 
     /// Queues a message as a sink does.
     fn give(queue: &WriterQueue, message: Message) {
-        assert_eq!(queue.try_push(message, true), Ok(0));
+        assert_eq!(queue.try_push(message, true), WriteOutcome::Taken { evicted: 0 });
     }
 
     /// Waits until `is_so`, with a bound.
