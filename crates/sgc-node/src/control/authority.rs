@@ -141,13 +141,13 @@ impl DeskQueue {
         Ok(())
     }
 
-    /// Queues an operation, or returns it if too many wait.
-    pub(crate) fn push_operation(&mut self, job: OperationJob) -> Result<(), Box<OperationJob>> {
+    /// Queues an operation unless too many wait: then it is returned.
+    fn push_or_return(&mut self, job: OperationJob) -> Option<OperationJob> {
         if self.operations.len() >= OPERATIONS_WAITING_MAX {
-            return Err(Box::new(job));
+            return Some(job);
         }
         self.operations.push_back(job);
-        Ok(())
+        None
     }
 
     /// Returns the next work, unless a batch is under way.
@@ -215,9 +215,9 @@ impl Authority {
         self.operators.ask(now, peer, sink, request, rng)
     }
 
-    /// Queues an operation, or returns it if too many wait.
-    pub(crate) fn push_operation(&mut self, job: OperationJob) -> Result<(), Box<OperationJob>> {
-        self.queue.push_operation(job)
+    /// Queues an operation unless too many wait: then it is returned.
+    pub(crate) fn push_or_return(&mut self, job: OperationJob) -> Option<OperationJob> {
+        self.queue.push_or_return(job)
     }
 
     /// Notes the outcome of an operation. Returns the sink that waits for its answer.

@@ -17,7 +17,7 @@ use sgc_types::{
 };
 use sgc_wire::{CatalogueEntry, DescribedType, Name, NodeId};
 
-use crate::control::type_jobs::{Job, StoredOrNewType, TypeEntry, TypeMiss, TypeOutcome, TypeQuery};
+use crate::control::type_jobs::{FoundType, Job, TypeEntry, TypeMiss, TypeOutcome, TypeQuery};
 use crate::data::conversion::KnownType;
 
 /// Types that are tried again when room returns.
@@ -153,14 +153,10 @@ impl InterfaceTypes {
 /// Storing of types.
 impl InterfaceTypes {
     /// Stores a type, charged to `owner` if the interface belongs to another node. Unused types make room.
-    fn keep(
-        &self,
-        described: StoredOrNewType,
-        owner: Option<&NodeId>,
-    ) -> Result<Arc<ResolvedType>, TypeMiss> {
+    fn keep(&self, described: FoundType, owner: Option<&NodeId>) -> Result<Arc<ResolvedType>, TypeMiss> {
         let new = match described {
-            Ok(known) => return Ok(known),
-            Err(new) => new,
+            FoundType::Stored(known) => return Ok(known),
+            FoundType::New(new) => new,
         };
         if let Some(known) = self.store.described(new.name(), Some(new.type_hash())) {
             return Ok(known);
@@ -440,7 +436,10 @@ mod tests {
 
     fn run(job: Job) -> Result<ResolvedType, TypeMiss> {
         let outcome = job.run(&TypeStore::default(), &Definitions::default());
-        outcome.found.map(|found| found.described.expect_err("the store is empty"))
+        outcome.found.map(|found| match found.described {
+            FoundType::New(new) => new,
+            FoundType::Stored(_) => panic!("the store is empty"),
+        })
     }
 
     fn twist() -> ResolvedType {
@@ -535,12 +534,12 @@ mod tests {
     fn full_store_drops_unused_types_and_keeps_used_ones() {
         let string = || run(job("std_msgs/msg/String", None, None)).unwrap();
         let mut types = types(1);
-        let kept = types.keep(Err(twist()), None).unwrap();
-        assert!(types.keep(Err(string()), None).is_ok(), "nobody uses the first");
+        let kept = types.keep(FoundType::New(twist()), None).unwrap();
+        assert!(types.keep(FoundType::New(string()), None).is_ok(), "nobody uses the first");
         assert!(types.store.described(kept.name(), None).is_none());
         need(&mut types, 1, "std_msgs/msg/String", None);
         step(&mut types).unwrap();
-        let refused = types.keep(Err(twist()), None).unwrap_err();
+        let refused = types.keep(FoundType::New(twist()), None).unwrap_err();
         assert_eq!(refused.key(), Some("types_full"), "{refused}");
     }
 
@@ -576,20 +575,23 @@ mod tests {
         };
         let name = |n: usize| Name(std::array::from_fn(|i| n.to_be_bytes()[i % 8]));
         for n in 0..TYPES_PER_OWNER_MAX {
-            let known = types.keep(Err(of(n)), Some(&owner)).unwrap();
+            let known = types.keep(FoundType::New(of(n)), Some(&owner)).unwrap();
             let (type_name, state) = (known.name().clone(), NeedState::Known(known));
             let need = Need { type_name, type_hash: None, owner: Some(owner), state };
             types.needs.insert(name(n), need);
         }
-        let refused = types.keep(Err(twist()), Some(&owner)).unwrap_err();
+        let refused = types.keep(FoundType::New(twist()), Some(&owner)).unwrap_err();
         assert_eq!(refused.key(), Some("types_full"), "{refused}");
-        assert!(types.keep(Err(of(0)), Some(&owner)).is_ok(), "it has that already");
+        assert!(types.keep(FoundType::New(of(0)), Some(&owner)).is_ok(), "it has that already");
         let late = need(&mut types, 0xfe, TWIST, Some(owner));
         assert!(step(&mut types).is_err());
         let said = types.problems(|owner| owner.short());
         assert!(said.len() == 1 && said[0].contains("of one node this one keeps 512 types"), "{said:?}");
         assert!(said[0].contains(&owner.short()), "{said:?}");
-        assert!(types.keep(Err(twist()), Some(&other)).is_ok() && types.keep(Err(twist()), None).is_ok());
+        assert!(
+            types.keep(FoundType::New(twist()), Some(&other)).is_ok()
+                && types.keep(FoundType::New(twist()), None).is_ok()
+        );
         // The owner has fewer types now.
         types.forget(&name(0));
         assert_eq!(types.jobs.front().map(|job| job.name), Some(late));

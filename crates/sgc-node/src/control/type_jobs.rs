@@ -20,12 +20,27 @@ pub(crate) struct Job {
 
 /// A known type, with its packed description for other nodes.
 pub(crate) struct TypeEntry {
-    pub(crate) described: StoredOrNewType,
+    pub(crate) described: FoundType,
     pub(crate) packed: Option<PackedType>,
 }
 
-/// A type from the store (`Ok`), or one that is not stored yet (`Err`).
-pub(crate) type StoredOrNewType = Result<Arc<ResolvedType>, ResolvedType>;
+/// A type that was found.
+pub(crate) enum FoundType {
+    /// It is from the store.
+    Stored(Arc<ResolvedType>),
+    /// It is not stored yet.
+    New(ResolvedType),
+}
+
+impl FoundType {
+    /// Returns the type.
+    fn resolved(&self) -> &ResolvedType {
+        match self {
+            Self::Stored(known) => known,
+            Self::New(new) => new,
+        }
+    }
+}
 
 /// Result of a job.
 pub(crate) struct TypeOutcome {
@@ -119,13 +134,10 @@ impl Job {
 
 impl TypeQuery {
     /// Turns the search into a result. A panic yields a result too, since other jobs wait for their turn.
-    pub(crate) fn found_by(self, look: impl FnOnce() -> Result<StoredOrNewType, TypeMiss>) -> TypeOutcome {
+    pub(crate) fn found_by(self, look: impl FnOnce() -> Result<FoundType, TypeMiss>) -> TypeOutcome {
         let look = || {
             let described = look()?;
-            let of: &ResolvedType = match &described {
-                Ok(known) => known,
-                Err(new) => new,
-            };
+            let of = described.resolved();
             Ok(TypeEntry { packed: PackedType::new(of.type_hash(), of.description()), described })
         };
         let found = catch_unwind(AssertUnwindSafe(look)).unwrap_or(Err(TypeMiss::Failed));
@@ -138,10 +150,10 @@ fn find(
     type_hash: Option<&str>,
     store: &TypeStore,
     definitions: &Definitions,
-) -> Result<StoredOrNewType, TypeMiss> {
+) -> Result<FoundType, TypeMiss> {
     // A type of this name from another owner may differ, so the hash must match.
     if let Some(known) = type_hash.and_then(|hash| store.described(type_name, Some(hash))) {
-        return Ok(Ok(known));
+        return Ok(FoundType::Stored(known));
     }
     let described = ResolvedType::from_layout(definitions.layout(type_name)?)?;
     match type_hash {
@@ -149,15 +161,11 @@ fn find(
             found: described.type_hash().to_owned(),
             announced: announced.to_owned(),
         }),
-        _ => Ok(Err(described)),
+        _ => Ok(FoundType::New(described)),
     }
 }
 
-fn read(
-    type_name: &TypeName,
-    type_hash: Option<&str>,
-    told: &DescribedType,
-) -> Result<StoredOrNewType, TypeMiss> {
+fn read(type_name: &TypeName, type_hash: Option<&str>, told: &DescribedType) -> Result<FoundType, TypeMiss> {
     // Without an announced hash, the owner vouches for its description. The same holds for services, for which only the
     // hashes of messages may be announced.
     let expected = type_hash.filter(|_| type_name.kind() == "msg").unwrap_or(&told.type_hash);
@@ -166,5 +174,5 @@ fn read(
         let (found, expected) = (described.type_hash().to_owned(), expected.to_owned());
         return Err(ResolveError::Description(DescriptionError::Hash { found, expected }).into());
     }
-    Ok(Err(described))
+    Ok(FoundType::New(described))
 }

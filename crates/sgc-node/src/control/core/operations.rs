@@ -104,9 +104,9 @@ impl<N: RosNetwork> Core<N> {
                 // Nodes that are connected now count as present.
                 let here: Vec<_> = self.endpoint.renewing().map(|(_, peer, _)| peer.node_id).collect();
                 authority.note_seen(here, now.unix);
-                match authority.push_operation(job) {
-                    Ok(()) => self.answer_next_batch(),
-                    Err(job) => self.operation_done(job.busy()),
+                match authority.push_or_return(job) {
+                    None => self.answer_next_batch(),
+                    Some(job) => self.operation_done(job.busy()),
                 }
             }
             RequestStep::NotPermitted => {
