@@ -98,7 +98,7 @@ impl Place {
     /// Gives the place to another client, unless all places of that client's credential are taken.
     pub(crate) fn rename(&self, client: &Client) -> Result<(), GatewayError> {
         let mut clients = lock(&self.admission.clients);
-        if let Err(pool) = self.admission.check_places(&clients, client, Some(self.number)) {
+        if let Some(pool) = self.admission.full_pool(&clients, client, Some(self.number)) {
             drop(clients);
             return Err(self.admission.crowded(pool));
         }
@@ -181,7 +181,7 @@ impl Admission {
     ) -> Result<Place, GatewayError> {
         let number = self.next.fetch_add(1, Ordering::Relaxed);
         let mut clients = lock(&self.clients);
-        if let Err(pool) = self.check_places(&clients, client, None) {
+        if let Some(pool) = self.full_pool(&clients, client, None) {
             drop(clients);
             return Err(self.crowded(pool));
         }
@@ -215,29 +215,29 @@ impl Admission {
         }
     }
 
-    /// Fails if the places of the client's credential, of other hosts or of all clients are taken. `except` is the
+    /// Returns the pool that has no place for the client: its credential, other hosts or all clients. `except` is the
     /// place that the client already has.
-    fn check_places(
+    fn full_pool(
         &self,
         clients: &BTreeMap<u64, ClientEntry>,
         client: &Client,
         except: Option<u64>,
-    ) -> Result<(), Pool> {
+    ) -> Option<Pool> {
         let count = |is_counted: &dyn Fn(&ClientEntry) -> bool| {
             let others = clients.iter().filter(|(number, _)| Some(**number) != except);
             others.filter(|(_, entered)| is_counted(entered)).count()
         };
         if count(&|_| true) >= self.clients_max {
-            return Err(Pool::Total);
+            return Some(Pool::Total);
         }
         if !client.is_local() && count(&|entered| !entered.is_local) >= self.places_max(Pool::Remote) {
-            return Err(Pool::Remote);
+            return Some(Pool::Remote);
         }
         let own = client.credential().filter(|credential| *credential != Credential::Local);
         if own.is_some() && count(&|entered| entered.credential == own) >= self.places_max(Pool::Credential) {
-            return Err(Pool::Credential);
+            return Some(Pool::Credential);
         }
-        Ok(())
+        None
     }
 
     pub(crate) fn clients(&self) -> Vec<ClientStatus> {
