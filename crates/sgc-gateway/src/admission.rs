@@ -20,6 +20,7 @@ use crate::access_watch::AccessWatch;
 use crate::clock::WallClock;
 use crate::error::GatewayError;
 use crate::pool::Pool;
+use crate::refusal::ClientRefusal;
 
 /// Most connections of other hosts in their handshake at a time.
 const HANDSHAKES_MAX: usize = 128;
@@ -74,7 +75,7 @@ pub(crate) struct Arrival {
 pub(crate) struct Admission {
     access: AccessWatch,
     clients: Mutex<BTreeMap<u64, ClientEntry>>,
-    refused: Mutex<BTreeMap<&'static str, u64>>,
+    refused: Mutex<BTreeMap<ClientRefusal, u64>>,
     next: AtomicU64,
     clients_max: usize,
 }
@@ -165,7 +166,7 @@ impl Admission {
         })
     }
 
-    pub(crate) fn count(&self, why: &'static str) {
+    pub(crate) fn count(&self, why: ClientRefusal) {
         *lock(&self.refused).entry(why).or_default() += 1;
     }
 
@@ -201,7 +202,7 @@ impl Admission {
 
     /// Counts a refusal for lack of a place, and returns it.
     fn crowded(&self, pool: Pool) -> GatewayError {
-        self.count(no_place(pool));
+        self.count(ClientRefusal::TooManyClients(pool));
         GatewayError::Crowded { what: "clients", max: self.places_max(pool), pool }
     }
 
@@ -247,18 +248,10 @@ impl Admission {
     pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
         let counted = lock(&self.refused);
         // The count covers all protocols, because gRPC admits each call.
-        let denied = Some(("not admitted", self.access.current().denied())).filter(|(_, count)| *count > 0);
+        let denied = Some((ClientRefusal::NotAdmitted, self.access.current().denied()));
+        let denied = denied.filter(|(_, count)| *count > 0);
         let all = counted.iter().map(|(why, count)| (*why, *count)).chain(denied);
-        all.map(|(why, count)| (why.to_owned(), count)).collect()
-    }
-}
-
-/// Returns the status key of a refusal for lack of a place.
-fn no_place(pool: Pool) -> &'static str {
-    match pool {
-        Pool::Credential => "too many clients of one credential",
-        Pool::Remote => "too many clients of other hosts",
-        Pool::Total => "too many clients",
+        all.map(|(why, count)| (why.key().to_owned(), count)).collect()
     }
 }
 

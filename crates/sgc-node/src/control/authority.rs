@@ -24,6 +24,7 @@ use tracing::{error, info, warn};
 use crate::control::operators::{
     OPERATIONS_WAITING_MAX, OperationJob, OperationOutcome, Operators, RequestStep,
 };
+use crate::drops::NodeDrop;
 use crate::state::credentials::{is_due, lasts, renewal_interval};
 use crate::state::fleet_file::{FleetFileError, LockedFleet};
 
@@ -84,15 +85,15 @@ pub(crate) enum RenewalRefusal {
 }
 
 impl RenewalRefusal {
-    /// Returns a short, stable name for counters.
-    pub(crate) fn key(self) -> &'static str {
+    /// Returns the counter.
+    pub(crate) fn counter(self) -> NodeDrop {
         match self {
-            Self::TooSoon => "renewal_too_soon",
-            Self::QueueFull => "renewal_queue_full",
-            Self::File => "renewal_fleet_file",
-            Self::UnknownNode => "renewal_unknown_node",
-            Self::Revoked => "renewal_revoked",
-            Self::Unusable => "renewal_unusable",
+            Self::TooSoon => NodeDrop::RenewalTooSoon,
+            Self::QueueFull => NodeDrop::RenewalQueueFull,
+            Self::File => NodeDrop::RenewalFleetFile,
+            Self::UnknownNode => NodeDrop::RenewalUnknownNode,
+            Self::Revoked => NodeDrop::RenewalRevoked,
+            Self::Unusable => NodeDrop::RenewalUnusable,
         }
     }
 

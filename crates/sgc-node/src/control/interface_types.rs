@@ -425,6 +425,7 @@ mod tests {
     use sgc_wire::{Metadata, PayloadEncoding};
 
     use super::*;
+    use crate::drops::NodeDrop;
 
     const TWIST: &str = "geometry_msgs/msg/Twist";
 
@@ -456,9 +457,9 @@ mod tests {
         let hash = twist().type_hash().to_owned();
         assert!(run(job(TWIST, Some(&hash), None)).is_ok());
         let differs = run(job(TWIST, Some("RIHS01_00"), None)).unwrap_err();
-        assert_eq!(differs.key(), Some("type_differs"), "{differs}");
+        assert_eq!(differs.counter(), Some(NodeDrop::TypeDiffers), "{differs}");
         let unknown = run(job("p/msg/Nobody", None, None)).unwrap_err();
-        assert_eq!(unknown.key(), None, "{unknown}");
+        assert_eq!(unknown.counter(), None, "{unknown}");
         // A service is searched by its own name and by its hash, or by the hash of its request type.
         let service = run(job("std_srvs/srv/SetBool", None, None)).unwrap();
         let request = service.layout().part(&service.name().request()).unwrap().type_hash();
@@ -468,10 +469,10 @@ mod tests {
             assert!(run(job("std_srvs/srv/SetBool", Some(hash), Some(told))).is_ok());
         }
         let differs = run(job("std_srvs/srv/SetBool", Some(twist().type_hash()), None)).unwrap_err();
-        assert_eq!(differs.key(), Some("type_differs"), "{differs}");
+        assert_eq!(differs.counter(), Some(NodeDrop::TypeDiffers), "{differs}");
         let other = told(service.type_hash(), PayloadEncoding::Plain, service.description());
         let refused = run(job("std_srvs/srv/SetBool", Some(twist().type_hash()), Some(other))).unwrap_err();
-        assert_eq!(refused.key(), Some("type_refused"), "{refused}");
+        assert_eq!(refused.counter(), Some(NodeDrop::TypeRefused), "{refused}");
     }
 
     #[test]
@@ -498,7 +499,7 @@ mod tests {
         ];
         for (type_name, announced, told) in lies {
             let refused = run(job(type_name, announced, Some(told))).unwrap_err();
-            assert_eq!(refused.key(), Some("type_refused"), "{refused}");
+            assert_eq!(refused.counter(), Some(NodeDrop::TypeRefused), "{refused}");
         }
     }
 
@@ -540,7 +541,7 @@ mod tests {
         need(&mut types, 1, "std_msgs/msg/String", None);
         step(&mut types).unwrap();
         let refused = types.keep(FoundType::New(twist()), None).unwrap_err();
-        assert_eq!(refused.key(), Some("types_full"), "{refused}");
+        assert_eq!(refused.counter(), Some(NodeDrop::TypesFull), "{refused}");
     }
 
     #[test]
@@ -551,7 +552,7 @@ mod tests {
         need(&mut types, 3, TWIST, None);
         step(&mut types).unwrap();
         step(&mut types).unwrap();
-        assert_eq!(step(&mut types).unwrap_err().key(), Some("types_full"));
+        assert_eq!(step(&mut types).unwrap_err().counter(), Some(NodeDrop::TypesFull));
         let said = types.problems(|_| unreachable!("it is of this node"));
         assert!(said.len() == 1 && said[0].contains(TWIST) && said[0].contains("1024 types"), "{said:?}");
         types.forget(&first);
@@ -581,7 +582,7 @@ mod tests {
             types.needs.insert(name(n), need);
         }
         let refused = types.keep(FoundType::New(twist()), Some(&owner)).unwrap_err();
-        assert_eq!(refused.key(), Some("types_full"), "{refused}");
+        assert_eq!(refused.counter(), Some(NodeDrop::TypesFull), "{refused}");
         assert!(types.keep(FoundType::New(of(0)), Some(&owner)).is_ok(), "it has that already");
         let late = need(&mut types, 0xfe, TWIST, Some(owner));
         assert!(step(&mut types).is_err());
@@ -609,8 +610,8 @@ mod tests {
         assert!(types.ends(&of));
         let failed = found.map(|_| ()).unwrap_err();
         assert_eq!(
-            (failed.key(), matches!(need_after(&failed, true), NeedState::Asked)),
-            (Some("type_failed"), true)
+            (failed.counter(), matches!(need_after(&failed, true), NeedState::Asked)),
+            (Some(NodeDrop::TypeFailed), true)
         );
     }
 

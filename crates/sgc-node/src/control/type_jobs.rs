@@ -8,6 +8,8 @@ use sgc_endpoint::{CompressionError, PackedType, unpack_type};
 use sgc_types::{Definitions, ResolveError, ResolvedType, StoreFull, TypeStore};
 use sgc_wire::{DescribedType, Name, NodeId};
 
+use crate::drops::NodeDrop;
+
 /// A job for the blocking thread.
 pub(crate) struct Job {
     pub(crate) name: Name,
@@ -100,15 +102,15 @@ pub(crate) enum TypeMiss {
 }
 
 impl TypeMiss {
-    /// Returns a short, stable name for counters; `None` if it is no fault.
-    pub(crate) fn key(&self) -> Option<&'static str> {
+    /// Returns the counter; `None` if it is no fault.
+    pub(crate) fn counter(&self) -> Option<NodeDrop> {
         match self {
             Self::Definition(_) => None,
-            Self::Description(_) => Some("type_not_described"),
-            Self::Differs { .. } => Some("type_differs"),
-            Self::Packed(_) | Self::ResolveError(_) => Some("type_refused"),
-            Self::Full(_) | Self::OwnerFull { .. } => Some("types_full"),
-            Self::Failed => Some("type_failed"),
+            Self::Description(_) => Some(NodeDrop::TypeNotDescribed),
+            Self::Differs { .. } => Some(NodeDrop::TypeDiffers),
+            Self::Packed(_) | Self::ResolveError(_) => Some(NodeDrop::TypeRefused),
+            Self::Full(_) | Self::OwnerFull { .. } => Some(NodeDrop::TypesFull),
+            Self::Failed => Some(NodeDrop::TypeFailed),
         }
     }
 }

@@ -28,6 +28,7 @@ use crate::data::burst::Burst;
 use crate::data::conversion::{self, TypeSlot};
 use crate::data::queue::{PushError, PushOutcome, Queue};
 use crate::data::stats::{DataDrop, Drops};
+use crate::drops::NodeDrop;
 
 /// Most messages that wait for one local writer.
 pub(crate) const WRITER_MESSAGES_MAX: usize = 1024;
@@ -205,7 +206,7 @@ impl WriterQueue {
             let payload = match decompressor.decompress(message.head.encoding, message.payload) {
                 Ok(payload) => payload,
                 Err(error) => {
-                    if counted.count("decompress") {
+                    if counted.count(NodeDrop::Decompress) {
                         warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
                     }
                     return None;
@@ -215,7 +216,7 @@ impl WriterQueue {
                 PayloadForm::Cdr => payload,
                 PayloadForm::KeyedCdr => {
                     let Some(hash) = payload.first_chunk::<KEY_HASH_BYTES>().copied() else {
-                        counted.count("key_hash");
+                        counted.count(NodeDrop::KeyHash);
                         return None;
                     };
                     key_hash = Some(hash);
@@ -225,13 +226,13 @@ impl WriterQueue {
                     let known = types.now();
                     let Some(layout) = known.layout() else {
                         // The type was known when the message was queued.
-                        counted.count("json_unknown_type");
+                        counted.count(NodeDrop::JsonUnknownType);
                         return None;
                     };
                     match conversion::from_json(layout, &payload, offered) {
                         Ok(payload) => payload,
                         Err(error) => {
-                            if counted.count("json_refused") {
+                            if counted.count(NodeDrop::JsonRefused) {
                                 warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
                             }
                             return None;
@@ -245,7 +246,7 @@ impl WriterQueue {
                 Some(prefix) => match prefix_frames(&payload, &prefix) {
                     Ok(rewritten) => rewritten.into(),
                     Err(error) => {
-                        if counted.count("frames") {
+                        if counted.count(NodeDrop::Frames) {
                             warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
                         }
                         return None;
@@ -277,7 +278,7 @@ impl WriterQueue {
                 writer.flush();
             }
             if let Err(error) = written
-                && refused.count(failure_key(&error))
+                && refused.count(write_drop(&error))
             {
                 warn!(%topic, %error, "a message could not be given to the local network; counted from here on");
             }
@@ -409,7 +410,7 @@ impl WriterQueue {
             }
             match timeout_at(due.into(), self.queue.pop()).await {
                 Ok(Some(newer)) if newer.head.kind == MessageKind::Write => {
-                    drops.count(DataDrop::Thinned.key());
+                    drops.count(DataDrop::Thinned);
                     message = newer;
                 }
                 // The end of an instance is never skipped, nor is the message before it.
@@ -497,14 +498,14 @@ fn written_bytes(message: &Message) -> usize {
     if is_keyed { bytes.saturating_sub(KEY_HASH_BYTES) } else { bytes }
 }
 
-/// Returns a short, stable name of a failure for counters.
-pub(crate) fn failure_key(error: &RosError) -> &'static str {
+/// Returns the counter of a failure.
+pub(crate) fn write_drop(error: &RosError) -> NodeDrop {
     match error {
-        RosError::Payload { .. } => "write_payload",
-        RosError::WriteTimeout { .. } => "write_timeout",
-        RosError::NoPeer { .. } => "no_local_peer",
-        RosError::KeyUnknown => "key_unknown",
-        _ => "write_failed",
+        RosError::Payload { .. } => NodeDrop::WritePayload,
+        RosError::WriteTimeout { .. } => NodeDrop::WriteTimeout,
+        RosError::NoPeer { .. } => NodeDrop::NoLocalPeer,
+        RosError::KeyUnknown => NodeDrop::KeyUnknown,
+        _ => NodeDrop::WriteFailed,
     }
 }
 
