@@ -4,10 +4,11 @@
 //! Where an enum without data has the counters, a row names the variant.
 
 use sgc_endpoint::CallLoss;
-use sgc_node::DataDrop;
+use sgc_gateway::{ClientRefusal, Pool};
+use sgc_node::{DataDrop, NodeDrop};
 use sgc_transport::{PeerRefusal, RefusalKind};
 use sgc_trust::CertError;
-use sgc_wire::{RefuseReason, RejectReason};
+use sgc_wire::{OperationRefusal, RefuseReason, RejectReason};
 
 /// A counter's explanation.
 #[derive(Debug, PartialEq, Eq)]
@@ -156,18 +157,22 @@ pub(crate) const CONTROL: &[Refusal] = &[
         "an answer that does not verify with the key that is known of its owner",
         "a few when an owner gets another certificate are no fault",
     ),
-    named("malformed_control", "a neighbour sends control frames that cannot be read", SAME_VERSION),
     named(
-        "control_queue_full",
+        NodeDrop::MalformedControl.key(),
+        "a neighbour sends control frames that cannot be read",
+        SAME_VERSION,
+    ),
+    named(
+        NodeDrop::ControlQueueFull.key(),
         "a peer does not take control frames, so its link was closed",
         "is it stopped, or the link far too thin? It is dialled again by itself",
     ),
     counted(
-        "identity_in_use",
+        NodeDrop::IdentityInUse.key(),
         "two processes use one identity",
         "`sgc status` says where, under what needs attention",
     ),
-    counted("clocks_differ", "the clock of a peer differs from the one here", SET_CLOCK),
+    counted(NodeDrop::ClocksDiffer.key(), "the clock of a peer differs from the one here", SET_CLOCK),
     named(
         "endpoint_not_verified",
         "an answer or request is not signed by whom it says, or under a certificate that does not hold",
@@ -180,109 +185,137 @@ pub(crate) const CONTROL: &[Refusal] = &[
         "this node shares more than fits into what it lists for others: some topics are left out",
         "share fewer topics, or give some to another node",
     ),
-    counted("join_refused", "a node that may not have a topic asked for it", "`sgc why TOPIC` names it"),
-    named("replays_full", "too many ask for a history at once; they ask again by themselves", ""),
+    counted(
+        NodeDrop::JoinRefused.key(),
+        "a node that may not have a topic asked for it",
+        "`sgc why TOPIC` names it",
+    ),
     named(
-        "renewal_refused",
+        NodeDrop::ReplaysFull.key(),
+        "too many ask for a history at once; they ask again by themselves",
+        "",
+    ),
+    named(
+        NodeDrop::RenewalRefused.key(),
         "the fleet's authority gives this node no new certificate",
         "see `sgc fleet list` there: is the node revoked or unknown? Then enroll it again",
     ),
     named(
-        "credentials_unusable",
+        NodeDrop::CredentialsUnusable.key(),
         "what the fleet's authority sent is not usable with this node's key",
         "is the identity file in use on two machines? Enroll one of them under a name of its own",
     ),
     named(
-        "renewal_too_soon",
+        NodeDrop::RenewalTooSoon.key(),
         "a node asks this authority for another certificate too soon; it is answered later",
         "is it started again and again, or is its identity in use at two places?",
     ),
     named(
-        "renewal_queue_full",
+        NodeDrop::RenewalQueueFull.key(),
         "too many nodes ask this authority at once; they ask again by themselves",
         "",
     ),
-    named("renewal_fleet_file", "this authority cannot read or write the fleet's file", FLEET_FILE),
     named(
-        "renewal_unknown_node",
+        NodeDrop::RenewalFleetFile.key(),
+        "this authority cannot read or write the fleet's file",
+        FLEET_FILE,
+    ),
+    named(
+        NodeDrop::RenewalUnknownNode.key(),
         "a node asks this authority that the fleet's file does not know",
         "another copy of the file enrolled it: bring that here and `sgc fleet merge` it",
     ),
-    named("renewal_revoked", "a node asks this authority whose incarnation is revoked", ENROLL_AGAIN),
-    named("renewal_unusable", "a node's request for a certificate is not usable", SAME_VERSION),
     named(
-        "operation_not_permitted",
+        NodeDrop::RenewalRevoked.key(),
+        "a node asks this authority whose incarnation is revoked",
+        ENROLL_AGAIN,
+    ),
+    named(NodeDrop::RenewalUnusable.key(), "a node's request for a certificate is not usable", SAME_VERSION),
+    named(
+        NodeDrop::OperationNotPermitted.key(),
         "a node that is no operator wants to change the fleet",
         "if it may, name it in `operators` of [authority]",
     ),
-    counted("operation_stale", "an operator's request was of an earlier run; it is made again by itself", ""),
-    counted("operation_repeated", "an operator's request came twice and was carried out once", ""),
-    named("operation_busy", "too many operations wait at this authority", "try again in a minute"),
-    named("operation_fleet_file", "this authority cannot read or write the fleet's file", FLEET_FILE),
-    counted("operation_refused", "an operation was not possible; the operator was told why", ""),
-    named("operation_malformed", "an operator's request cannot be read", SAME_VERSION),
     counted(
-        "type_differs",
+        OperationRefusal::Stale.key(),
+        "an operator's request was of an earlier run; it is made again by itself",
+        "",
+    ),
+    counted(
+        NodeDrop::OperationRepeated.key(),
+        "an operator's request came twice and was carried out once",
+        "",
+    ),
+    named(
+        OperationRefusal::Busy.key(),
+        "too many operations wait at this authority",
+        "try again in a minute",
+    ),
+    named(OperationRefusal::File.key(), "this authority cannot read or write the fleet's file", FLEET_FILE),
+    counted(OperationRefusal::Fleet.key(), "an operation was not possible; the operator was told why", ""),
+    named(OperationRefusal::Malformed.key(), "an operator's request cannot be read", SAME_VERSION),
+    counted(
+        NodeDrop::TypeDiffers.key(),
         "an owner describes a type otherwise than its publishers announce it",
         "build both from one version of the interface package",
     ),
     named(
-        "type_refused",
+        NodeDrop::TypeRefused.key(),
         "a description of a type is not what its hash says, or larger than any",
         SAME_VERSION,
     ),
-    counted("type_not_described", "an owner does not know what a type looks like", DEFINITIONS),
+    counted(NodeDrop::TypeNotDescribed.key(), "an owner does not know what a type looks like", DEFINITIONS),
     named(
-        "types_full",
+        NodeDrop::TypesFull.key(),
         "there is no room for more descriptions of types",
         "use fewer types from other nodes at this one",
     ),
     counted(
-        "types_busy",
+        NodeDrop::TypesBusy.key(),
         "descriptions of types come faster than they are judged; they are asked for again",
         "",
     ),
     named(
-        "type_failed",
+        NodeDrop::TypeFailed.key(),
         "a description of a type could not be judged: a fault in this program",
         "please report it",
     ),
     counted(
-        "json_unknown_type",
+        NodeDrop::JsonUnknownType.key(),
         "messages travel as JSON, and what their type looks like is not known here",
         DEFINITIONS,
     ),
     named(
-        "json_refused",
+        NodeDrop::JsonRefused.key(),
         "JSON that is not what its type says",
         "build both sides from one version of the package",
     ),
-    named("decompress", "a compressed message is not what it claims", SAME_VERSION),
-    named("create_reader", "the local network refused a reader", DDS_LOG),
-    named("create_writer", "the local network refused a writer", DDS_LOG),
-    counted("create_service", "the local network refused an end of a service", DDS_LOG),
-    counted("announce_nodes", "the local network could not be told of other nodes", DDS_LOG),
+    named(NodeDrop::Decompress.key(), "a compressed message is not what it claims", SAME_VERSION),
+    named(NodeDrop::CreateReader.key(), "the local network refused a reader", DDS_LOG),
+    named(NodeDrop::CreateWriter.key(), "the local network refused a writer", DDS_LOG),
+    counted(NodeDrop::CreateService.key(), "the local network refused an end of a service", DDS_LOG),
+    counted(NodeDrop::AnnounceNodes.key(), "the local network could not be told of other nodes", DDS_LOG),
     counted(
-        "show_consumer",
+        NodeDrop::ShowConsumer.key(),
         "the local network could not be shown a subscriber or client of another node",
         DDS_LOG,
     ),
     counted(
-        "consumers_forbidden",
+        NodeDrop::ConsumersForbidden.key(),
         "the enclave of this node may not show subscribers and clients of other nodes in the local graph; messages flow all the same",
         "grant it the partition `sgc/shown` in permissions.p7s (docs/how-to/sros2.md)",
     ),
     counted(
-        "consumers_untold",
+        NodeDrop::ConsumersUntold.key(),
         "more subscribers or clients use one interface of another node than its owner is told of",
         "",
     ),
     counted(
-        "consumers_unshown",
+        NodeDrop::ConsumersUnshown.key(),
         "more subscribers or clients of other nodes use what is shared here than the local graph shows",
         "",
     ),
-    counted("frames", "a transform could not be given the prefix of its owner", SAME_VERSION),
+    counted(NodeDrop::Frames.key(), "a transform could not be given the prefix of its owner", SAME_VERSION),
     counted(
         CallLoss::Refused.key(),
         "calls were not taken: 1024 of one client, or 8192 or 128 MiB of all, were without an answer",
@@ -335,39 +368,55 @@ pub(crate) const CONTROL: &[Refusal] = &[
         "`sgc why` on the owner",
     ),
     counted(
-        "no_local_peer",
+        NodeDrop::NoLocalPeer.key(),
         "no server, or no client, was there on the local network when something was to be handed to it",
         "calls are handed over again after 5 s while the service is shared",
     ),
-    counted("reply_to_nothing", "a reply came to a call that nobody waits for any more, or a second one", ""),
-    counted("write_payload", "a message could not be given to the local network", DDS_LOG),
     counted(
-        "write_timeout",
+        NodeDrop::ReplyToNothing.key(),
+        "a reply came to a call that nobody waits for any more, or a second one",
+        "",
+    ),
+    counted(NodeDrop::WritePayload.key(), "a message could not be given to the local network", DDS_LOG),
+    counted(
+        NodeDrop::WriteTimeout.key(),
         "a local subscriber that is to get everything took nothing for too long",
         "is it stopped?",
     ),
-    counted("write_failed", "the local network did not take a message", DDS_LOG),
-    named("key_hash", "a message of a topic with keys is not what it claims", SAME_VERSION),
+    counted(NodeDrop::WriteFailed.key(), "the local network did not take a message", DDS_LOG),
+    named(NodeDrop::KeyHash.key(), "a message of a topic with keys is not what it claims", SAME_VERSION),
     named(
-        "key_unknown",
+        NodeDrop::KeyUnknown.key(),
         "messages of a topic with keys came without the hashes of their keys, at which subscribers of ROS 2 Kilted crash",
         "update `sgc` on the far side; its publishers of that topic should all use Cyclone DDS, or none of them",
     ),
     named(
-        "over_rate",
+        NodeDrop::OverRate.key(),
         "a peer sends more than `peer_rate` lets it: best-effort messages are dropped, reliable ones slowed",
         "raise `peer_rate` in [router], or set max_rate or max_bandwidth in the [[share]] on the peer",
     ),
-    counted("mdns_crowded", "more nodes announce themselves on the local network than are listened to", ""),
-    counted("mdns_unknown", "an announcement on the local network is of another version", SAME_VERSION),
-    counted("mdns_overrun", "announcements on the local network come faster than they are read", ""),
+    counted(
+        NodeDrop::MdnsCrowded.key(),
+        "more nodes announce themselves on the local network than are listened to",
+        "",
+    ),
+    counted(
+        NodeDrop::MdnsUnknown.key(),
+        "an announcement on the local network is of another version",
+        SAME_VERSION,
+    ),
+    counted(
+        NodeDrop::MdnsOverrun.key(),
+        "announcements on the local network come faster than they are read",
+        "",
+    ),
     named(
-        "audit_lost",
+        NodeDrop::AuditLost.key(),
         "records could not be written into the audit log",
         "is the disk full, or does the directory belong to another user?",
     ),
     counted(
-        "audit_summed_up",
+        NodeDrop::AuditSummedUp.key(),
         "records of one peer came too fast for the audit log and stand there as a number",
         "",
     ),
@@ -506,7 +555,7 @@ const SINK: &[Refusal] = &[
         "many large messages lose packets: limit the topic with max_rate or max_bandwidth in the [[share]]",
     ),
     counted(
-        "sink_lost",
+        NodeDrop::SinkLost.key(),
         "a publisher's node no longer keeps messages that were lost on the way",
         "the interruption was longer than what the node keeps; is a link too thin for the topic?",
     ),
@@ -583,41 +632,45 @@ pub(crate) const DOOR: &[Refusal] = &[
 
 /// Refusals of programs at the gateway.
 pub(crate) const GATEWAY: &[Refusal] = &[
-    named("too many clients", "all places for clients are taken", RAISE_CLIENTS),
     named(
-        "too many clients of other hosts",
+        ClientRefusal::TooManyClients(Pool::Total).key(),
+        "all places for clients are taken",
+        RAISE_CLIENTS,
+    ),
+    named(
+        ClientRefusal::TooManyClients(Pool::Remote).key(),
         "all places for clients of other hosts are taken",
         RAISE_CLIENTS,
     ),
     named(
-        "too many clients of one credential",
+        ClientRefusal::TooManyClients(Pool::Credential).key(),
         "one token, certificate or address has all the places that one may have",
         RAISE_CLIENTS,
     ),
     named(
-        "too much for all clients with this token, certificate or address",
+        ClientRefusal::TooMuch(Pool::Credential).key(),
         "clients with one token, certificate or address have all the subscriptions, calls or memory that these may have",
         FEWER,
     ),
     named(
-        "too much for all clients of other hosts",
+        ClientRefusal::TooMuch(Pool::Remote).key(),
         "clients of other hosts have all the subscriptions, calls or memory that these may have",
         FEWER,
     ),
     named(
-        "too much for all clients",
+        ClientRefusal::TooMuch(Pool::Total).key(),
         "the clients have all the subscriptions, calls or memory that there is",
         FEWER,
     ),
-    named("too many handshakes", "too many were connecting at once", SLOW_CLIENTS),
+    named(ClientRefusal::TooManyHandshakes.key(), "too many were connecting at once", SLOW_CLIENTS),
     named(
-        "handshake gave way",
+        ClientRefusal::HandshakeGaveWay.key(),
         "too many were connecting at once, and it was the oldest of the heaviest",
         SLOW_CLIENTS,
     ),
-    named("handshake too slow", "it did not finish in time", SLOW_CLIENTS),
+    named(ClientRefusal::HandshakeTooSlow.key(), "it did not finish in time", SLOW_CLIENTS),
     named(
-        "not admitted",
+        ClientRefusal::NotAdmitted.key(),
         "it shows no token, certificate or origin that holds here, or tries too often",
         "make a token (`sgc token`), or name it in [gateway]; the log says at DEBUG why",
     ),
@@ -798,6 +851,12 @@ mod tests {
     fn every_drop_of_data_path_is_explained_and_no_other() {
         let keys_of_code = DataDrop::ALL.into_iter().map(|reason| reason.key().to_owned());
         assert_eq!(keys_of_code.collect::<BTreeSet<_>>(), keys(PACKETS));
+    }
+
+    #[test]
+    fn every_refusal_of_a_client_is_explained_and_no_other() {
+        let keys_of_code = ClientRefusal::ALL.into_iter().map(|why| why.key().to_owned());
+        assert_eq!(keys_of_code.collect::<BTreeSet<_>>(), keys(GATEWAY));
     }
 
     #[test]

@@ -7,6 +7,7 @@
 //! state.
 
 mod delivery;
+mod open_buffer;
 mod parking;
 mod partial;
 mod source_state;
@@ -15,19 +16,19 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicU64, Ordering::Acquire};
 use std::sync::{Arc, Mutex};
 
-use bytes::BytesMut;
 use sgc_sync::lock;
-use sgc_trust::{BatchVerifier, OpenError, ReplayWindow, Suite, opened_bytes};
+use sgc_trust::{OpenError, Suite, opened_bytes};
 use sgc_wire::{
-    Decode, GRANT_SOURCES_MAX, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, Packet, PacketHeader,
-    SinkId, Slab, SourceAnnounce, SourceId, TopicGrant,
+    GRANT_SOURCES_MAX, MessageHead, MessageKind, Name, Packet, PacketHeader, SinkId, Slab, SourceAnnounce,
+    SourceId, TopicGrant,
 };
 
 pub use self::delivery::{AskAgain, Delivery, Message, SinkDrop};
 pub use self::parking::{PARKED_BYTES_MAX, PARKED_LOOKS_MAX, PARKED_PACKETS_MAX};
 
+use self::open_buffer::OpenBuffer;
 use self::parking::{ParkedPacket, Parking};
-use self::source_state::{SourceState, derive, oldest_of_mark, verify};
+use self::source_state::{SourceState, derive, oldest_of_mark};
 use crate::source::without_lists;
 
 /// Epochs whose keys are held at once. A past epoch is held until [`Sink::retire_epochs`]; beyond this number the
@@ -176,13 +177,13 @@ impl Sink {
         let newest = self.newest_epoch();
         self.epochs.retain(|known| known.epoch == newest);
         self.drop_old_keys();
-        self.sources.retain(|_, source| source.last_epoch.is_none_or(|last| last >= newest));
+        self.sources.retain(|_, source| source.counts_in(newest));
         self.list_progress();
     }
 
     /// Iterates over the announced sources with missing messages.
     pub fn unsynced(&self) -> impl Iterator<Item = SourceId> + '_ {
-        self.sources.iter().filter(|(_, s)| !s.is_synced() && s.last_epoch.is_none()).map(|(id, _)| *id)
+        self.sources.iter().filter(|(_, s)| !s.is_synced() && s.is_announced()).map(|(id, _)| *id)
     }
 
     /// Returns the number from which on a source must be asked for its messages, which the caller then does; `None` if
@@ -202,7 +203,7 @@ impl Sink {
     /// Returns `true` if the messages of a source can be asked for again, so that messages without a destination may be
     /// dropped.
     pub fn recovers(&self, source: &SourceId) -> bool {
-        self.sources.get(source).is_some_and(|s| s.recovers)
+        self.sources.get(source).is_some_and(SourceState::recovers)
     }
 
     /// Drops the parked packets of sources whose messages have no destination yet. Returns these sources; each must be
@@ -213,9 +214,8 @@ impl Sink {
 
     /// Marks a source of which a message was not handed over: it must be asked for it, if it can be.
     pub fn suspect(&mut self, source: &SourceId) {
-        let known = self.sources.get_mut(source);
-        if let Some(source) = known.filter(|s| s.recovers && s.last_epoch.is_none()) {
-            source.unsync();
+        if let Some(source) = self.sources.get_mut(source) {
+            source.suspect();
         }
     }
 
@@ -223,11 +223,7 @@ impl Sink {
     /// delivered again. Other earlier messages stay past.
     pub fn forget(&mut self, source: &SourceId) {
         if let Some(state) = self.sources.get_mut(source) {
-            state.next = state.next.max(state.window.newest().saturating_add(1));
-            state.window = ReplayWindow::default();
-            if self.transient_local {
-                state.restart();
-            }
+            state.forget(self.transient_local);
         }
     }
 
@@ -263,8 +259,7 @@ impl Sink {
 
     /// Returns the number of checked signatures.
     pub fn signatures_checked(&self) -> u64 {
-        let verifiers = self.sources.values().filter_map(|s| s.verifier.as_ref());
-        verifiers.map(BatchVerifier::signatures_checked).sum()
+        self.sources.values().map(SourceState::signatures_checked).sum()
     }
 
     fn newest_epoch(&self) -> u32 {
@@ -280,8 +275,8 @@ impl Sink {
         moved: bool,
         deliver: &mut impl FnMut(Result<Delivery, SinkDrop>),
     ) {
-        for source in self.sources.values_mut() {
-            source.last_epoch = source.last_epoch.or(before);
+        if let Some(before) = before {
+            self.sources.values_mut().for_each(|source| source.end_after(before));
         }
         for announce in announced {
             match self.sources.get_mut(&announce.source) {
@@ -290,8 +285,8 @@ impl Sink {
                     if lost > 0 {
                         deliver(Ok(Delivery::Lost(announce.source, lost)));
                     }
-                    if moved && known.expected < announce.next && (known.recovers || self.transient_local) {
-                        known.unsync();
+                    if moved {
+                        known.miss_below(announce.next, self.transient_local);
                     }
                 }
                 None => {
@@ -308,14 +303,14 @@ impl Sink {
 
     /// Lists the sources known by now.
     fn list_progress(&self) {
-        let newest = self.sources.iter().map(|(id, s)| (*id, s.newest.clone())).collect();
+        let newest = self.sources.iter().map(|(id, s)| (*id, s.progress())).collect();
         *lock(&self.progress.newest) = newest;
     }
 
     /// Drops a source that is no longer announced, if there are too many.
     fn make_room(&mut self) {
         if self.sources.len() >= self.limits.sources_max
-            && let Some(gone) = self.sources.iter().find(|(_, s)| s.last_epoch.is_some()).map(|(id, _)| *id)
+            && let Some(gone) = self.sources.iter().find(|(_, s)| !s.is_announced()).map(|(id, _)| *id)
         {
             self.sources.remove(&gone);
         }
@@ -324,8 +319,7 @@ impl Sink {
     fn drop_old_keys(&mut self) {
         let oldest = self.epochs.first().map_or(0, |known| known.epoch);
         for source in self.sources.values_mut() {
-            source.keys.retain(|key| key.epoch() >= oldest);
-            source.addressed = source.addressed.take().filter(|key| key.epoch() >= oldest);
+            source.drop_keys_before(oldest);
         }
     }
 
@@ -355,7 +349,7 @@ impl Sink {
             }
         };
         let known = self.sources.get_mut(&header.source);
-        let Some(source) = known.filter(|s| s.last_epoch.is_none_or(|last| header.epoch <= last)) else {
+        let Some(source) = known.filter(|s| s.counts_in(header.epoch)) else {
             // Nodes without the topic's key take no room.
             let mut text = vec![0; opened_bytes(header)];
             derive(grant, &self.name, header)?.open(header, payload, &mut text)?;
@@ -363,19 +357,12 @@ impl Sink {
         };
         source.check_freshness(header)?;
         source.derive_key(grant, &self.name, header)?;
-        let SourceState { keys, addressed, partials, verifier, announced_key, .. } = source;
-        let key = if header.to.is_some() {
-            addressed.as_ref()
-        } else {
-            keys.iter().find(|key| key.epoch() == header.epoch)
-        };
-        let key = key.ok_or(OpenError::Epoch { found: header.epoch })?;
         let text_bytes = opened_bytes(header);
         let mut opened = if header.fragments() == 1 {
             let mut text = self.slab.room(text_bytes);
             text.resize(text_bytes, 0);
             OpenBuffer::Whole(text)
-        } else if partials.place(header).is_some() {
+        } else if source.place(header).is_some() {
             OpenBuffer::InPlace
         } else {
             let mut scratch = std::mem::take(&mut self.scratch);
@@ -383,16 +370,7 @@ impl Sink {
             scratch.resize(text_bytes, 0);
             OpenBuffer::Aside(scratch)
         };
-        let out = match &mut opened {
-            OpenBuffer::Whole(text) => &mut text[..],
-            OpenBuffer::Aside(text) => &mut text[..],
-            OpenBuffer::InPlace => partials.place(header).unwrap_or_default(),
-        };
-        let mut result = key.open(header, payload, out);
-        if result.is_ok() && suite.is_signed() {
-            result = verify(verifier, announced_key, suite, header, payload);
-        }
-        let delivery = match result {
+        let delivery = match source.open(suite, header, payload, &mut opened) {
             Ok(()) => self.accept(header, &mut opened),
             Err(error) => Err(error.into()),
         };
@@ -407,7 +385,7 @@ impl Sink {
     fn make_partial_room(&mut self, header: &PacketHeader) -> Result<(), SinkDrop> {
         let max = self.limits.partial_bytes_max;
         let held: BTreeMap<SourceId, usize> =
-            self.sources.iter().map(|(id, source)| (*id, source.partials.bytes())).collect();
+            self.sources.iter().map(|(id, source)| (*id, source.partial_bytes())).collect();
         let mut used: usize = held.values().sum();
         if used.saturating_add(header.total as usize) <= max {
             return Ok(());
@@ -419,8 +397,8 @@ impl Sink {
         }
         while used.saturating_add(header.total as usize) > max {
             let others = self.sources.iter_mut().filter(|(id, _)| **id != header.source);
-            let heaviest = others.max_by_key(|(_, source)| source.partials.bytes());
-            let freed = heaviest.map_or(0, |(_, source)| source.partials.give_up_oldest());
+            let heaviest = others.max_by_key(|(_, source)| source.partial_bytes());
+            let freed = heaviest.map_or(0, |(_, source)| source.give_up_oldest_partial());
             if freed == 0 {
                 return Err(SinkDrop::PartialsFull);
             }
@@ -433,10 +411,10 @@ impl Sink {
     /// Returns the result of an assertion in `by` about a publisher. It counts for publishers of the same node, which
     /// sign with the same key, and for no others.
     fn asserted(&self, by: &SourceId, publisher: [u8; 8]) -> Delivery {
-        let Some(SourceState { announced_key, .. }) = self.sources.get(by) else { return Delivery::Mark };
+        let Some(asserting) = self.sources.get(by) else { return Delivery::Mark };
         let [first, last] = [0, 0xff].map(|byte| SourceId::from_publisher(publisher, [byte; 8]));
         let is_it = |(id, state): &(&SourceId, &SourceState)| {
-            *id != by && state.last_epoch.is_none() && state.announced_key == *announced_key
+            *id != by && state.is_announced() && state.has_key_of(asserting)
         };
         let found = self.sources.range(first..=last).find(is_it);
         found.map_or(Delivery::Mark, |(id, _)| Delivery::Asserted(*id))
@@ -446,7 +424,7 @@ impl Sink {
     fn accept(&mut self, header: &PacketHeader, opened: &mut OpenBuffer) -> Result<Delivery, SinkDrop> {
         let head = opened.take_head(header)?;
         let known = self.sources.get(&header.source);
-        let begins = header.fragments() > 1 && known.is_some_and(|s| !s.partials.has_begun(header.seq));
+        let begins = header.fragments() > 1 && known.is_some_and(|s| !s.has_begun(header.seq));
         let Some(source) = self.sources.get_mut(&header.source) else { return Err(SinkDrop::UnknownSource) };
         if header.seq == 0 {
             if head.is_none() || header.total > 0 {
@@ -460,7 +438,7 @@ impl Sink {
         }
         if let Some(head) = head.filter(|head| head.kind == MessageKind::Mark) {
             // A resent assertion is no news of a publisher's liveliness.
-            let asserted = head.asserted().filter(|_| header.to.is_none() && !source.recovers);
+            let asserted = head.asserted().filter(|_| header.to.is_none() && !source.recovers());
             let Some(publisher) = asserted else { return source.take_mark(header, opened.text()) };
             oldest_of_mark(header, opened.text())?;
             source.done(header.seq);
@@ -490,64 +468,15 @@ impl Sink {
                 let source = self.sources.get_mut(&header.source).ok_or(SinkDrop::UnknownSource)?;
                 let fragment = (!matches!(opened, OpenBuffer::InPlace)).then(|| opened.text());
                 let max = self.limits.partials_per_source_max;
-                let (complete, given_up) = source.partials.put(header, head, fragment, max)?;
+                let (complete, given_up) = source.put_fragment(header, head, fragment, max)?;
                 self.incomplete += given_up;
                 complete
             }
         };
         let Some((head, payload)) = complete else { return Ok(Delivery::Incomplete) };
         let source = self.sources.get_mut(&header.source).ok_or(SinkDrop::UnknownSource)?;
-        source.done(header.seq);
-        if header.reliable {
-            // A reliable flow is in order: older incomplete messages will never be complete.
-            self.incomplete += source.partials.give_up(header.seq);
-        }
+        self.incomplete += source.complete(header);
         let PacketHeader { source, seq, reliable, .. } = *header;
         Ok(Delivery::Message(Message { source, seq, head, reliable, payload }))
-    }
-}
-
-/// Place of a packet's opened text.
-enum OpenBuffer {
-    /// Memory of its own, which becomes the message.
-    Whole(BytesMut),
-    /// Its place in the message.
-    InPlace,
-    /// Memory that is used again; the fragment is copied to its place.
-    Aside(Vec<u8>),
-}
-
-impl OpenBuffer {
-    /// Returns the opened text, if it is here.
-    fn text(&self) -> &[u8] {
-        match self {
-            Self::Whole(text) => text,
-            Self::Aside(text) => text,
-            Self::InPlace => &[],
-        }
-    }
-
-    /// Takes the head off a message's first packet.
-    fn take_head(&mut self, header: &PacketHeader) -> Result<Option<MessageHead>, SinkDrop> {
-        if header.index != 0 || matches!(self, Self::InPlace) {
-            return Ok(None);
-        }
-        let at = self.text().len() - MESSAGE_HEAD_BYTES;
-        let head = MessageHead::from_slice(&self.text()[at..]).map_err(|_| SinkDrop::Head)?;
-        self.truncate(at);
-        // Number 0 is the mark of a history's end, and nothing else.
-        if (head.kind == MessageKind::Synced) != (header.seq == 0) {
-            return Err(SinkDrop::Head);
-        }
-        Ok(Some(head))
-    }
-
-    /// Cuts off the rest.
-    fn truncate(&mut self, bytes: usize) {
-        match self {
-            Self::Whole(text) => text.truncate(bytes),
-            Self::Aside(text) => text.truncate(bytes),
-            Self::InPlace => {}
-        }
     }
 }

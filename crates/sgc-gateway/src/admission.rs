@@ -20,6 +20,7 @@ use crate::access_watch::AccessWatch;
 use crate::clock::WallClock;
 use crate::error::GatewayError;
 use crate::pool::Pool;
+use crate::refusal::ClientRefusal;
 
 /// Most connections of other hosts in their handshake at a time.
 const HANDSHAKES_MAX: usize = 128;
@@ -74,7 +75,7 @@ pub(crate) struct Arrival {
 pub(crate) struct Admission {
     access: AccessWatch,
     clients: Mutex<BTreeMap<u64, ClientEntry>>,
-    refused: Mutex<BTreeMap<&'static str, u64>>,
+    refused: Mutex<BTreeMap<ClientRefusal, u64>>,
     next: AtomicU64,
     clients_max: usize,
 }
@@ -98,7 +99,7 @@ impl Place {
     /// Gives the place to another client, unless all places of that client's credential are taken.
     pub(crate) fn rename(&self, client: &Client) -> Result<(), GatewayError> {
         let mut clients = lock(&self.admission.clients);
-        if let Err(pool) = self.admission.check_places(&clients, client, Some(self.number)) {
+        if let Some(pool) = self.admission.full_pool(&clients, client, Some(self.number)) {
             drop(clients);
             return Err(self.admission.crowded(pool));
         }
@@ -165,7 +166,7 @@ impl Admission {
         })
     }
 
-    pub(crate) fn count(&self, why: &'static str) {
+    pub(crate) fn count(&self, why: ClientRefusal) {
         *lock(&self.refused).entry(why).or_default() += 1;
     }
 
@@ -181,7 +182,7 @@ impl Admission {
     ) -> Result<Place, GatewayError> {
         let number = self.next.fetch_add(1, Ordering::Relaxed);
         let mut clients = lock(&self.clients);
-        if let Err(pool) = self.check_places(&clients, client, None) {
+        if let Some(pool) = self.full_pool(&clients, client, None) {
             drop(clients);
             return Err(self.crowded(pool));
         }
@@ -201,7 +202,7 @@ impl Admission {
 
     /// Counts a refusal for lack of a place, and returns it.
     fn crowded(&self, pool: Pool) -> GatewayError {
-        self.count(no_place(pool));
+        self.count(ClientRefusal::TooManyClients(pool));
         GatewayError::Crowded { what: "clients", max: self.places_max(pool), pool }
     }
 
@@ -215,29 +216,29 @@ impl Admission {
         }
     }
 
-    /// Fails if the places of the client's credential, of other hosts or of all clients are taken. `except` is the
+    /// Returns the pool that has no place for the client: its credential, other hosts or all clients. `except` is the
     /// place that the client already has.
-    fn check_places(
+    fn full_pool(
         &self,
         clients: &BTreeMap<u64, ClientEntry>,
         client: &Client,
         except: Option<u64>,
-    ) -> Result<(), Pool> {
+    ) -> Option<Pool> {
         let count = |is_counted: &dyn Fn(&ClientEntry) -> bool| {
             let others = clients.iter().filter(|(number, _)| Some(**number) != except);
             others.filter(|(_, entered)| is_counted(entered)).count()
         };
         if count(&|_| true) >= self.clients_max {
-            return Err(Pool::Total);
+            return Some(Pool::Total);
         }
         if !client.is_local() && count(&|entered| !entered.is_local) >= self.places_max(Pool::Remote) {
-            return Err(Pool::Remote);
+            return Some(Pool::Remote);
         }
         let own = client.credential().filter(|credential| *credential != Credential::Local);
         if own.is_some() && count(&|entered| entered.credential == own) >= self.places_max(Pool::Credential) {
-            return Err(Pool::Credential);
+            return Some(Pool::Credential);
         }
-        Ok(())
+        None
     }
 
     pub(crate) fn clients(&self) -> Vec<ClientStatus> {
@@ -247,18 +248,10 @@ impl Admission {
     pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
         let counted = lock(&self.refused);
         // The count covers all protocols, because gRPC admits each call.
-        let denied = Some(("not admitted", self.access.current().denied())).filter(|(_, count)| *count > 0);
+        let denied = Some((ClientRefusal::NotAdmitted, self.access.current().denied()));
+        let denied = denied.filter(|(_, count)| *count > 0);
         let all = counted.iter().map(|(why, count)| (*why, *count)).chain(denied);
-        all.map(|(why, count)| (why.to_owned(), count)).collect()
-    }
-}
-
-/// Returns the status key of a refusal for lack of a place.
-fn no_place(pool: Pool) -> &'static str {
-    match pool {
-        Pool::Credential => "too many clients of one credential",
-        Pool::Remote => "too many clients of other hosts",
-        Pool::Total => "too many clients",
+        all.map(|(why, count)| (why.key().to_owned(), count)).collect()
     }
 }
 

@@ -40,6 +40,7 @@ mod pool;
 mod publisher;
 mod queue;
 mod quota;
+mod refusal;
 mod ros;
 #[cfg(feature = "rosbridge")]
 pub mod rosbridge;
@@ -72,6 +73,7 @@ pub use limits::SessionLimits;
 pub use message::Message;
 pub use pool::Pool;
 pub use publisher::Publication;
+pub use refusal::ClientRefusal;
 pub use ros::{LocalReader, LocalRos};
 pub use server::{ListenAt, Protocol, ProtocolNotBuilt, Server, ServerError, ServerOptions};
 pub use service::{Replier, Request, Serving};

@@ -27,6 +27,7 @@ use crate::access::Access;
 use crate::admission::{Admission, Arrival, Engagement, GatewayStatus, Handshakes};
 use crate::hub::Hub;
 use crate::limits::SessionLimits;
+use crate::refusal::ClientRefusal;
 use crate::tls::{TlsError, server_config};
 #[cfg(feature = "grpc")]
 use grpc::GrpcFront;
@@ -285,7 +286,8 @@ impl Server {
     fn refused(&self) -> BTreeMap<String, u64> {
         let mut refused = self.shared.admission.refused();
         let crowded = self.shared.hub.shared.network.quotas.refused();
-        refused.extend(crowded.into_iter().map(|(pool, count)| (format!("too much for {pool}"), count)));
+        let crowded = crowded.into_iter().map(|(pool, count)| (ClientRefusal::TooMuch(pool), count));
+        refused.extend(crowded.map(|(why, count)| (why.key().to_owned(), count)));
         let quotas = &self.shared.hub.shared.network.quotas;
         let losses = [
             (HISTORY_DROPPED, quotas.history_dropped()),
@@ -332,19 +334,19 @@ async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<ServerS
 async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<ServerState>) {
     let admission = &shared.admission;
     let Some(mut handshake) = Handshakes::begin(&shared.handshakes, peer.ip()) else {
-        return admission.count("too many handshakes");
+        return admission.count(ClientRefusal::TooManyHandshakes);
     };
     let deadline = Instant::now() + HANDSHAKE_MAX;
     let engagement = handshake.engagement();
     let arriving = arrive(stream, peer, at, &shared, &engagement);
     let arrived = tokio::select! {
         arrived = tokio::time::timeout_at(deadline, arriving) => arrived,
-        () = handshake.evicted() => return admission.count("handshake gave way"),
+        () = handshake.evicted() => return admission.count(ClientRefusal::HandshakeGaveWay),
     };
     let (stream, arrival) = match arrived {
         Ok(Some(arrived)) => arrived,
         Ok(None) => return,
-        Err(_) => return admission.count("handshake too slow"),
+        Err(_) => return admission.count(ClientRefusal::HandshakeTooSlow),
     };
     match at.protocol {
         #[cfg(feature = "grpc")]
@@ -379,7 +381,7 @@ async fn arrive(
     let stream = match TlsAcceptor::from(config).accept(stream).await {
         Ok(stream) => stream,
         Err(error) => {
-            shared.admission.count("TLS failed");
+            shared.admission.count(ClientRefusal::TlsFailed);
             tracing::debug!(%peer, %error, "a client's TLS failed");
             return None;
         }
@@ -389,7 +391,7 @@ async fn arrive(
     let certificate = match Admission::judge_certificate(access.rules().anchors.as_ref(), chain) {
         Ok(certificate) => certificate,
         Err(error) => {
-            shared.admission.count("certificate does not hold");
+            shared.admission.count(ClientRefusal::CertificateDoesNotHold);
             tracing::debug!(%peer, %error, "a client's certificate does not hold");
             None
         }

@@ -11,6 +11,7 @@ pub mod config;
 mod control;
 mod data;
 mod discovery;
+mod drops;
 mod gateway;
 mod link;
 mod local;
@@ -34,6 +35,7 @@ pub use control::reload::{ConfigSource, ReloadReport};
 pub use control::rules::{RulesError, read_token};
 pub use data::stats::DataDrop;
 pub use discovery::RouterStatus;
+pub use drops::NodeDrop;
 pub use gateway::access::{
     ACCESS_TOKENS_MAX, AccessError, AccessRecord, AccessRecords, access_of, access_with,
 };

@@ -221,7 +221,7 @@ impl OperationRefusal {
     const ALL: [Self; 5] = [Self::Stale, Self::Busy, Self::File, Self::Fleet, Self::Malformed];
 
     /// Returns a short, stable name for counters and JSON.
-    pub fn key(self) -> &'static str {
+    pub const fn key(self) -> &'static str {
         match self {
             Self::Stale => "operation_stale",
             Self::Busy => "operation_busy",

@@ -5,36 +5,37 @@ use std::sync::atomic::{AtomicU64, Ordering::Release};
 
 use bytes::Bytes;
 use sgc_trust::{BatchVerifier, Freshness, OpenError, ReplayWindow, SourceKey, Suite};
-use sgc_wire::{Name, PacketHeader, SourceAnnounce, SourceId, TopicGrant};
+use sgc_wire::{MessageHead, Name, PacketHeader, SourceAnnounce, SourceId, TopicGrant};
 
 use super::delivery::{AskAgain, Delivery, SinkDrop};
+use super::open_buffer::OpenBuffer;
 use super::partial::Partials;
 
 /// An announced source.
 pub(super) struct SourceState {
     /// The announced key of its signatures; parsed when the first packet opens.
-    pub(super) announced_key: Bytes,
-    pub(super) verifier: Option<BatchVerifier>,
+    announced_key: Bytes,
+    verifier: Option<BatchVerifier>,
     /// Keys for packets to all, by epoch.
-    pub(super) keys: Vec<SourceKey>,
+    keys: Vec<SourceKey>,
     /// The key for packets to this sink, of the epoch seen last.
-    pub(super) addressed: Option<SourceKey>,
-    pub(super) window: ReplayWindow,
+    addressed: Option<SourceKey>,
+    window: ReplayWindow,
     /// The window's newest, for [`SinkProgress`].
-    pub(super) newest: Arc<AtomicU64>,
+    newest: Arc<AtomicU64>,
     /// Lower numbers to all are replays from before this sink was told of the source.
-    pub(super) next: u64,
+    next: u64,
     /// This sink did not ask for lower numbers.
-    pub(super) oldest: u64,
+    oldest: u64,
     /// Whether lost messages can be asked for: then messages are delivered in the order of their numbers.
-    pub(super) recovers: bool,
+    recovers: bool,
     /// The next number: of a source with recovery all lower ones are done, of another it is one more than the newest.
-    pub(super) expected: u64,
-    pub(super) partials: Partials,
+    expected: u64,
+    partials: Partials,
     sync: SyncState,
     answer: AnswerState,
     /// The last epoch of the source, if the newest grant no longer announces it.
-    pub(super) last_epoch: Option<u32>,
+    last_epoch: Option<u32>,
 }
 
 /// Whether messages of a source are missing: a transient-local source's history, or messages lost on a broken route.
@@ -107,8 +108,74 @@ impl SourceState {
         lost
     }
 
+    /// Notes that a grant no longer announces the source: packets of later epochs than `epoch` do not count.
+    pub(super) fn end_after(&mut self, epoch: u32) {
+        self.last_epoch = self.last_epoch.or(Some(epoch));
+    }
+
+    /// Returns `true` if the newest grant announces the source.
+    pub(super) fn is_announced(&self) -> bool {
+        self.last_epoch.is_none()
+    }
+
+    /// Returns `true` if packets of this epoch count.
+    pub(super) fn counts_in(&self, epoch: u32) -> bool {
+        self.last_epoch.is_none_or(|last| epoch <= last)
+    }
+
+    /// Returns `true` if lost messages can be asked for.
+    pub(super) fn recovers(&self) -> bool {
+        self.recovers
+    }
+
+    /// Returns the greatest delivered number, which changes as messages are delivered.
+    pub(super) fn progress(&self) -> Arc<AtomicU64> {
+        self.newest.clone()
+    }
+
+    /// Returns `true` if both sources sign with the same key.
+    pub(super) fn has_key_of(&self, other: &Self) -> bool {
+        self.announced_key == other.announced_key
+    }
+
+    /// Returns the number of checked signatures.
+    pub(super) fn signatures_checked(&self) -> u64 {
+        self.verifier.as_ref().map_or(0, BatchVerifier::signatures_checked)
+    }
+
+    /// Drops the keys of earlier epochs than `oldest`.
+    pub(super) fn drop_keys_before(&mut self, oldest: u32) {
+        self.keys.retain(|key| key.epoch() >= oldest);
+        self.addressed = self.addressed.take().filter(|key| key.epoch() >= oldest);
+    }
+
+    /// Notes that a message was not handed over: it must be asked for, if it can be.
+    pub(super) fn suspect(&mut self) {
+        if self.recovers && self.is_announced() {
+            self.unsync();
+        }
+    }
+
+    /// Notes that messages below `next` came on another route: those that did not arrive must be asked for, if they can
+    /// be.
+    pub(super) fn miss_below(&mut self, next: u64, transient_local: bool) {
+        if self.expected < next && (self.recovers || transient_local) {
+            self.unsync();
+        }
+    }
+
+    /// Forgets the delivered numbers. A transient-local sink asks for the history once more; other earlier messages
+    /// stay past.
+    pub(super) fn forget(&mut self, transient_local: bool) {
+        self.next = self.next.max(self.window.newest().saturating_add(1));
+        self.window = ReplayWindow::default();
+        if transient_local {
+            self.restart();
+        }
+    }
+
     /// Notes that messages are missing from here on.
-    pub(super) fn unsync(&mut self) {
+    fn unsync(&mut self) {
         self.sync = SyncState::NotAsked(self.start().unwrap_or(HistoryStart::Expected));
         self.partials.clear();
     }
@@ -131,7 +198,7 @@ impl SourceState {
     }
 
     /// Begins anew: the history is asked for, and delivered again.
-    pub(super) fn restart(&mut self) {
+    fn restart(&mut self) {
         self.sync = SyncState::NotAsked(HistoryStart::Any);
         self.partials.clear();
     }
@@ -224,6 +291,44 @@ impl SourceState {
         self.expected = self.expected.max(seq.saturating_add(1));
     }
 
+    /// Notes that a message is delivered. Returns the number of incomplete messages that are given up for it.
+    pub(super) fn complete(&mut self, header: &PacketHeader) -> u64 {
+        self.done(header.seq);
+        // A reliable flow is in order: older incomplete messages will never be complete.
+        if header.reliable { self.partials.give_up(header.seq) } else { 0 }
+    }
+
+    /// Returns the place of a fragment in its message, to be opened into directly.
+    pub(super) fn place(&mut self, header: &PacketHeader) -> Option<&mut [u8]> {
+        self.partials.place(header)
+    }
+
+    /// Returns `true` if a fragment of the message is here.
+    pub(super) fn has_begun(&self, seq: u64) -> bool {
+        self.partials.has_begun(seq)
+    }
+
+    /// Takes a fragment as [`Partials::put`] does.
+    pub(super) fn put_fragment(
+        &mut self,
+        header: &PacketHeader,
+        head: Option<MessageHead>,
+        fragment: Option<&[u8]>,
+        max: usize,
+    ) -> Result<(Option<(MessageHead, Bytes)>, u64), SinkDrop> {
+        self.partials.put(header, head, fragment, max)
+    }
+
+    /// Returns the memory of incomplete messages.
+    pub(super) fn partial_bytes(&self) -> usize {
+        self.partials.bytes()
+    }
+
+    /// Gives up the oldest incomplete message, and returns its memory, 0 if there is none.
+    pub(super) fn give_up_oldest_partial(&mut self) -> usize {
+        self.partials.give_up_oldest()
+    }
+
     /// Gives up the next numbers, which will never come.
     fn give_up(&mut self, numbers: u64) {
         if numbers > 0 {
@@ -295,6 +400,38 @@ impl SourceState {
         }
         Ok(())
     }
+
+    /// Opens a packet, whose key is [derived](Self::derive_key), into the buffer, and verifies it if the suite signs.
+    pub(super) fn open(
+        &mut self,
+        suite: Suite,
+        header: &PacketHeader,
+        payload: &[u8],
+        opened: &mut OpenBuffer,
+    ) -> Result<(), OpenError> {
+        let key = if header.to.is_some() {
+            self.addressed.as_ref()
+        } else {
+            self.keys.iter().find(|key| key.epoch() == header.epoch)
+        };
+        let key = key.ok_or(OpenError::Epoch { found: header.epoch })?;
+        let out = match opened {
+            OpenBuffer::Whole(text) => &mut text[..],
+            OpenBuffer::Aside(text) => &mut text[..],
+            OpenBuffer::InPlace => self.partials.place(header).unwrap_or_default(),
+        };
+        key.open(header, payload, out)?;
+        if suite.is_signed() { self.verify(suite, header, payload) } else { Ok(()) }
+    }
+
+    /// Verifies a packet that opened.
+    fn verify(&mut self, suite: Suite, header: &PacketHeader, payload: &[u8]) -> Result<(), OpenError> {
+        if self.verifier.is_none() {
+            self.verifier = BatchVerifier::new(suite, &self.announced_key);
+        }
+        // A source with an unusable key has signed nothing.
+        self.verifier.as_mut().ok_or(OpenError::Signature)?.verify(header, payload)
+    }
 }
 
 /// Returns the oldest number that the source of a mark could send again.
@@ -310,19 +447,4 @@ pub(super) fn derive(grant: &TopicGrant, name: &Name, header: &PacketHeader) -> 
         None => SourceKey::derive(grant, name, &header.source),
     };
     key.ok_or(OpenError::Suite { found: grant.suite })
-}
-
-/// Verifies a packet that opened.
-pub(super) fn verify(
-    verifier: &mut Option<BatchVerifier>,
-    announced_key: &Bytes,
-    suite: Suite,
-    header: &PacketHeader,
-    payload: &[u8],
-) -> Result<(), OpenError> {
-    if verifier.is_none() {
-        *verifier = BatchVerifier::new(suite, announced_key);
-    }
-    // A source with an unusable key has signed nothing.
-    verifier.as_mut().ok_or(OpenError::Signature)?.verify(header, payload)
 }

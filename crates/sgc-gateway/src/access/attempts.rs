@@ -30,19 +30,19 @@ struct Failures {
 }
 
 impl Attempts {
-    /// Returns `Ok` if a token of this address may be checked, else the time until then.
-    pub(super) fn check(&mut self, address: IpAddr, now: UnixMillis) -> Result<(), Duration> {
+    /// Returns the time until a token of this address may be checked; `None` if it may be now.
+    pub(super) fn wait(&mut self, address: IpAddr, now: UnixMillis) -> Option<Duration> {
         let key = AddressPrefix::from(address);
-        let Some(Failures { count, since }) = self.of.get(&key) else { return Ok(()) };
+        let Failures { count, since } = self.of.get(&key)?;
         // A clock that was set back must not lock an address out.
         let left = match now.0.checked_sub(since.0) {
             Some(age) if age < WINDOW_MS => WINDOW_MS - age,
             _ => {
                 self.of.remove(&key);
-                return Ok(());
+                return None;
             }
         };
-        if *count < FAILURES_MAX { Ok(()) } else { Err(Duration::from_millis(left)) }
+        (*count >= FAILURES_MAX).then(|| Duration::from_millis(left))
     }
 
     /// Counts a failed token of this address.
@@ -72,23 +72,23 @@ mod tests {
         let mut attempts = Attempts::default();
         let (bad, other) = (address("10.0.0.66"), address("10.0.0.7"));
         for _ in 0..FAILURES_MAX {
-            assert_eq!(attempts.check(bad, NOW), Ok(()));
+            assert_eq!(attempts.wait(bad, NOW), None);
             attempts.fail(bad, NOW);
         }
         let later = UnixMillis(NOW.0 + 20_000);
-        assert_eq!(attempts.check(bad, later), Err(Duration::from_secs(40)));
-        assert_eq!(attempts.check(address("::ffff:10.0.0.66"), later), Err(Duration::from_secs(40)));
-        assert_eq!(attempts.check(other, later), Ok(()));
-        assert_eq!(attempts.check(bad, UnixMillis(NOW.0 + WINDOW_MS)), Ok(()));
-        assert_eq!(attempts.check(bad, NOW), Ok(()), "what is over is forgotten");
+        assert_eq!(attempts.wait(bad, later), Some(Duration::from_secs(40)));
+        assert_eq!(attempts.wait(address("::ffff:10.0.0.66"), later), Some(Duration::from_secs(40)));
+        assert_eq!(attempts.wait(other, later), None);
+        assert_eq!(attempts.wait(bad, UnixMillis(NOW.0 + WINDOW_MS)), None);
+        assert_eq!(attempts.wait(bad, NOW), None, "what is over is forgotten");
     }
 
     #[test]
     fn a_host_with_many_addresses_is_one() {
         let mut attempts = Attempts::default();
         (0..FAILURES_MAX).for_each(|n| attempts.fail(address(&format!("2001:db8::{n}")), NOW));
-        assert!(attempts.check(address("2001:db8::ffff"), NOW).is_err());
-        assert_eq!(attempts.check(address("2001:db8:0:1::1"), NOW), Ok(()));
+        assert!(attempts.wait(address("2001:db8::ffff"), NOW).is_some());
+        assert_eq!(attempts.wait(address("2001:db8:0:1::1"), NOW), None);
     }
 
     #[test]

@@ -286,7 +286,7 @@ impl Access {
     fn judge(&self, admission: &AdmissionRequest<'_>) -> Result<Client, Denial> {
         if let Some(token) = admission.token {
             // The listener is not called again for an address that keeps trying: the log is for others, too.
-            let is_heard = self.attempts().check(admission.peer.ip(), admission.now).is_ok();
+            let is_heard = self.attempts().wait(admission.peer.ip(), admission.now).is_none();
             return self.admit_token(token, admission).inspect_err(|denied| {
                 if let Some(listener) = self.listener.as_ref().filter(|_| is_heard) {
                     listener(admission.peer, denied);
@@ -344,9 +344,10 @@ impl Access {
         let ip = admission.peer.ip().to_canonical();
         let is_exposed = !admission.encrypted && !ip.is_loopback();
         // This host is never locked out, because a proxy on it may serve many clients.
-        if !ip.is_loopback() {
-            let checked = self.attempts().check(ip, admission.now);
-            checked.map_err(|wait| Denial::TooManyAttempts { ip, wait })?;
+        if !ip.is_loopback()
+            && let Some(wait) = self.attempts().wait(ip, admission.now)
+        {
+            return Err(Denial::TooManyAttempts { ip, wait });
         }
         if is_exposed && !self.rules.plain {
             self.attempts().fail(ip, admission.now);

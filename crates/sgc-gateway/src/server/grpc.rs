@@ -17,6 +17,7 @@ use crate::admission::{Admission, Arrival, Handshake, Place};
 use crate::grpc::{AcceptedStream, Connection, Grpc, GrpcOptions};
 use crate::hub::Hub;
 use crate::limits::SessionLimits;
+use crate::refusal::ClientRefusal;
 
 /// Time to deliver the last answers on a gRPC connection on which no client is admitted any more.
 const GRPC_FAREWELL_MAX: Duration = Duration::from_secs(2);
@@ -107,7 +108,7 @@ impl GrpcStream {
             (Standing::Refused, _) => return Err(io::ErrorKind::ConnectionAborted.into()),
             (Standing::Proven(_), Some(_)) => return Ok(()),
             (Standing::Proven(_), None) => {
-                self.admission.count("no longer admitted");
+                self.admission.count(ClientRefusal::NoLongerAdmitted);
                 let deadline = Box::pin(tokio::time::sleep(GRPC_FAREWELL_MAX));
                 self.standing = Standing::Denied { deadline };
                 return self.check(cx);
@@ -118,10 +119,10 @@ impl GrpcStream {
             },
             (Standing::Unproven { deadline, handshake }, None) => {
                 if handshake.poll_evicted(cx).is_ready() {
-                    self.admission.count("handshake gave way");
+                    self.admission.count(ClientRefusal::HandshakeGaveWay);
                     (Standing::Refused, Err(io::ErrorKind::ConnectionAborted.into()))
                 } else if deadline.as_mut().poll(cx).is_ready() {
-                    self.admission.count("handshake too slow");
+                    self.admission.count(ClientRefusal::HandshakeTooSlow);
                     (Standing::Refused, Err(io::ErrorKind::TimedOut.into()))
                 } else {
                     return Ok(());

@@ -13,6 +13,7 @@ use crate::foxglove::{self, FoxgloveError};
 use crate::hub::Hub;
 use crate::inflow::{Inflow, MeteredStream};
 use crate::limits::SessionLimits;
+use crate::refusal::ClientRefusal;
 #[cfg(feature = "rosbridge")]
 use crate::rosbridge::{self, Authenticate, RosbridgeError, RosbridgeOptions};
 use crate::session::Session;
@@ -99,7 +100,7 @@ impl WebSocketFront {
         let stream = MeteredStream::new(stream, Arc::clone(&inflow));
         let upgraded = tokio::select! {
             upgraded = tokio::time::timeout_at(deadline, upgrade(stream, &arrival, admission, SUBPROTOCOLS)) => upgraded,
-            () = handshake.evicted() => return admission.count("handshake gave way"),
+            () = handshake.evicted() => return admission.count(ClientRefusal::HandshakeGaveWay),
         };
         match upgraded {
             Ok(Ok(upgraded)) => {
@@ -124,9 +125,9 @@ impl WebSocketFront {
             Ok(Err(UpgradeError::NotAdmitted)) => {}
             Ok(Err(UpgradeError::Socket(error))) => {
                 tracing::debug!(%peer, %error, "no WebSocket");
-                admission.count("no WebSocket");
+                admission.count(ClientRefusal::NoWebSocket);
             }
-            Err(_) => admission.count("handshake too slow"),
+            Err(_) => admission.count(ClientRefusal::HandshakeTooSlow),
         }
     }
 
@@ -170,7 +171,7 @@ impl WebSocketFront {
         match ended {
             Ok(()) => {}
             Err(EndReason::Denied(denied)) => {
-                admission.count("no longer admitted");
+                admission.count(ClientRefusal::NoLongerAdmitted);
                 tracing::info!(client = %name, %denied, "a client is disconnected");
             }
             Err(EndReason::Failed(error)) => tracing::debug!(%peer, %error, "a client's connection failed"),

@@ -24,6 +24,7 @@ use tracing::{error, info, warn};
 use crate::control::operators::{
     OPERATIONS_WAITING_MAX, OperationJob, OperationOutcome, Operators, RequestStep,
 };
+use crate::drops::NodeDrop;
 use crate::state::credentials::{is_due, lasts, renewal_interval};
 use crate::state::fleet_file::{FleetFileError, LockedFleet};
 
@@ -84,15 +85,15 @@ pub(crate) enum RenewalRefusal {
 }
 
 impl RenewalRefusal {
-    /// Returns a short, stable name for counters.
-    pub(crate) fn key(self) -> &'static str {
+    /// Returns the counter.
+    pub(crate) fn counter(self) -> NodeDrop {
         match self {
-            Self::TooSoon => "renewal_too_soon",
-            Self::QueueFull => "renewal_queue_full",
-            Self::File => "renewal_fleet_file",
-            Self::UnknownNode => "renewal_unknown_node",
-            Self::Revoked => "renewal_revoked",
-            Self::Unusable => "renewal_unusable",
+            Self::TooSoon => NodeDrop::RenewalTooSoon,
+            Self::QueueFull => NodeDrop::RenewalQueueFull,
+            Self::File => NodeDrop::RenewalFleetFile,
+            Self::UnknownNode => NodeDrop::RenewalUnknownNode,
+            Self::Revoked => NodeDrop::RenewalRevoked,
+            Self::Unusable => NodeDrop::RenewalUnusable,
         }
     }
 
@@ -141,13 +142,13 @@ impl DeskQueue {
         Ok(())
     }
 
-    /// Queues an operation, or returns it if too many wait.
-    pub(crate) fn push_operation(&mut self, job: OperationJob) -> Result<(), Box<OperationJob>> {
+    /// Queues an operation unless too many wait: then it is returned.
+    fn push_or_return(&mut self, job: OperationJob) -> Option<OperationJob> {
         if self.operations.len() >= OPERATIONS_WAITING_MAX {
-            return Err(Box::new(job));
+            return Some(job);
         }
         self.operations.push_back(job);
-        Ok(())
+        None
     }
 
     /// Returns the next work, unless a batch is under way.
@@ -215,9 +216,9 @@ impl Authority {
         self.operators.ask(now, peer, sink, request, rng)
     }
 
-    /// Queues an operation, or returns it if too many wait.
-    pub(crate) fn push_operation(&mut self, job: OperationJob) -> Result<(), Box<OperationJob>> {
-        self.queue.push_operation(job)
+    /// Queues an operation unless too many wait: then it is returned.
+    pub(crate) fn push_or_return(&mut self, job: OperationJob) -> Option<OperationJob> {
+        self.queue.push_or_return(job)
     }
 
     /// Notes the outcome of an operation. Returns the sink that waits for its answer.

@@ -61,6 +61,7 @@ use crate::data::sinks::SinkRequest;
 use crate::data::stats::Drops;
 use crate::data::tap::TapQueue;
 use crate::discovery::Board;
+use crate::drops::NodeDrop;
 use crate::gateway::Gateway;
 use crate::local::network_slot::NetworkSlot;
 use crate::local::network_state::NetworkState;
@@ -276,7 +277,7 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::Frame { link, frame, room } => self.handle_frame(link, frame, room),
             CoreEvent::Flushed { link } => self.router.handle_flushed(now(), link),
             CoreEvent::Malformed { link } => {
-                self.control_drops.count_from("malformed_control", link);
+                self.control_drops.count_from(NodeDrop::MalformedControl, link);
             }
             CoreEvent::Discovery(event) => self.discovered(event),
             CoreEvent::CloseNetwork(reply) => {

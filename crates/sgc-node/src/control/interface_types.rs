@@ -17,7 +17,7 @@ use sgc_types::{
 };
 use sgc_wire::{CatalogueEntry, DescribedType, Name, NodeId};
 
-use crate::control::type_jobs::{Job, StoredOrNewType, TypeEntry, TypeMiss, TypeOutcome, TypeQuery};
+use crate::control::type_jobs::{FoundType, Job, TypeEntry, TypeMiss, TypeOutcome, TypeQuery};
 use crate::data::conversion::KnownType;
 
 /// Types that are tried again when room returns.
@@ -153,14 +153,10 @@ impl InterfaceTypes {
 /// Storing of types.
 impl InterfaceTypes {
     /// Stores a type, charged to `owner` if the interface belongs to another node. Unused types make room.
-    fn keep(
-        &self,
-        described: StoredOrNewType,
-        owner: Option<&NodeId>,
-    ) -> Result<Arc<ResolvedType>, TypeMiss> {
+    fn keep(&self, described: FoundType, owner: Option<&NodeId>) -> Result<Arc<ResolvedType>, TypeMiss> {
         let new = match described {
-            Ok(known) => return Ok(known),
-            Err(new) => new,
+            FoundType::Stored(known) => return Ok(known),
+            FoundType::New(new) => new,
         };
         if let Some(known) = self.store.described(new.name(), Some(new.type_hash())) {
             return Ok(known);
@@ -429,6 +425,7 @@ mod tests {
     use sgc_wire::{Metadata, PayloadEncoding};
 
     use super::*;
+    use crate::drops::NodeDrop;
 
     const TWIST: &str = "geometry_msgs/msg/Twist";
 
@@ -440,7 +437,10 @@ mod tests {
 
     fn run(job: Job) -> Result<ResolvedType, TypeMiss> {
         let outcome = job.run(&TypeStore::default(), &Definitions::default());
-        outcome.found.map(|found| found.described.expect_err("the store is empty"))
+        outcome.found.map(|found| match found.described {
+            FoundType::New(new) => new,
+            FoundType::Stored(_) => panic!("the store is empty"),
+        })
     }
 
     fn twist() -> ResolvedType {
@@ -457,9 +457,9 @@ mod tests {
         let hash = twist().type_hash().to_owned();
         assert!(run(job(TWIST, Some(&hash), None)).is_ok());
         let differs = run(job(TWIST, Some("RIHS01_00"), None)).unwrap_err();
-        assert_eq!(differs.key(), Some("type_differs"), "{differs}");
+        assert_eq!(differs.counter(), Some(NodeDrop::TypeDiffers), "{differs}");
         let unknown = run(job("p/msg/Nobody", None, None)).unwrap_err();
-        assert_eq!(unknown.key(), None, "{unknown}");
+        assert_eq!(unknown.counter(), None, "{unknown}");
         // A service is searched by its own name and by its hash, or by the hash of its request type.
         let service = run(job("std_srvs/srv/SetBool", None, None)).unwrap();
         let request = service.layout().part(&service.name().request()).unwrap().type_hash();
@@ -469,10 +469,10 @@ mod tests {
             assert!(run(job("std_srvs/srv/SetBool", Some(hash), Some(told))).is_ok());
         }
         let differs = run(job("std_srvs/srv/SetBool", Some(twist().type_hash()), None)).unwrap_err();
-        assert_eq!(differs.key(), Some("type_differs"), "{differs}");
+        assert_eq!(differs.counter(), Some(NodeDrop::TypeDiffers), "{differs}");
         let other = told(service.type_hash(), PayloadEncoding::Plain, service.description());
         let refused = run(job("std_srvs/srv/SetBool", Some(twist().type_hash()), Some(other))).unwrap_err();
-        assert_eq!(refused.key(), Some("type_refused"), "{refused}");
+        assert_eq!(refused.counter(), Some(NodeDrop::TypeRefused), "{refused}");
     }
 
     #[test]
@@ -499,7 +499,7 @@ mod tests {
         ];
         for (type_name, announced, told) in lies {
             let refused = run(job(type_name, announced, Some(told))).unwrap_err();
-            assert_eq!(refused.key(), Some("type_refused"), "{refused}");
+            assert_eq!(refused.counter(), Some(NodeDrop::TypeRefused), "{refused}");
         }
     }
 
@@ -535,13 +535,13 @@ mod tests {
     fn full_store_drops_unused_types_and_keeps_used_ones() {
         let string = || run(job("std_msgs/msg/String", None, None)).unwrap();
         let mut types = types(1);
-        let kept = types.keep(Err(twist()), None).unwrap();
-        assert!(types.keep(Err(string()), None).is_ok(), "nobody uses the first");
+        let kept = types.keep(FoundType::New(twist()), None).unwrap();
+        assert!(types.keep(FoundType::New(string()), None).is_ok(), "nobody uses the first");
         assert!(types.store.described(kept.name(), None).is_none());
         need(&mut types, 1, "std_msgs/msg/String", None);
         step(&mut types).unwrap();
-        let refused = types.keep(Err(twist()), None).unwrap_err();
-        assert_eq!(refused.key(), Some("types_full"), "{refused}");
+        let refused = types.keep(FoundType::New(twist()), None).unwrap_err();
+        assert_eq!(refused.counter(), Some(NodeDrop::TypesFull), "{refused}");
     }
 
     #[test]
@@ -552,7 +552,7 @@ mod tests {
         need(&mut types, 3, TWIST, None);
         step(&mut types).unwrap();
         step(&mut types).unwrap();
-        assert_eq!(step(&mut types).unwrap_err().key(), Some("types_full"));
+        assert_eq!(step(&mut types).unwrap_err().counter(), Some(NodeDrop::TypesFull));
         let said = types.problems(|_| unreachable!("it is of this node"));
         assert!(said.len() == 1 && said[0].contains(TWIST) && said[0].contains("1024 types"), "{said:?}");
         types.forget(&first);
@@ -576,20 +576,23 @@ mod tests {
         };
         let name = |n: usize| Name(std::array::from_fn(|i| n.to_be_bytes()[i % 8]));
         for n in 0..TYPES_PER_OWNER_MAX {
-            let known = types.keep(Err(of(n)), Some(&owner)).unwrap();
+            let known = types.keep(FoundType::New(of(n)), Some(&owner)).unwrap();
             let (type_name, state) = (known.name().clone(), NeedState::Known(known));
             let need = Need { type_name, type_hash: None, owner: Some(owner), state };
             types.needs.insert(name(n), need);
         }
-        let refused = types.keep(Err(twist()), Some(&owner)).unwrap_err();
-        assert_eq!(refused.key(), Some("types_full"), "{refused}");
-        assert!(types.keep(Err(of(0)), Some(&owner)).is_ok(), "it has that already");
+        let refused = types.keep(FoundType::New(twist()), Some(&owner)).unwrap_err();
+        assert_eq!(refused.counter(), Some(NodeDrop::TypesFull), "{refused}");
+        assert!(types.keep(FoundType::New(of(0)), Some(&owner)).is_ok(), "it has that already");
         let late = need(&mut types, 0xfe, TWIST, Some(owner));
         assert!(step(&mut types).is_err());
         let said = types.problems(|owner| owner.short());
         assert!(said.len() == 1 && said[0].contains("of one node this one keeps 512 types"), "{said:?}");
         assert!(said[0].contains(&owner.short()), "{said:?}");
-        assert!(types.keep(Err(twist()), Some(&other)).is_ok() && types.keep(Err(twist()), None).is_ok());
+        assert!(
+            types.keep(FoundType::New(twist()), Some(&other)).is_ok()
+                && types.keep(FoundType::New(twist()), None).is_ok()
+        );
         // The owner has fewer types now.
         types.forget(&name(0));
         assert_eq!(types.jobs.front().map(|job| job.name), Some(late));
@@ -607,8 +610,8 @@ mod tests {
         assert!(types.ends(&of));
         let failed = found.map(|_| ()).unwrap_err();
         assert_eq!(
-            (failed.key(), matches!(need_after(&failed, true), NeedState::Asked)),
-            (Some("type_failed"), true)
+            (failed.counter(), matches!(need_after(&failed, true), NeedState::Asked)),
+            (Some(NodeDrop::TypeFailed), true)
         );
     }
 

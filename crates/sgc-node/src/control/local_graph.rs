@@ -12,6 +12,7 @@ use tracing::debug;
 
 use crate::control::event::ConsumerKey;
 use crate::data::stats::Drops;
+use crate::drops::NodeDrop;
 
 /// Key of a local writer: the joined name and the source.
 type WriterKey = (Name, Option<SourceId>);
@@ -197,7 +198,7 @@ impl LocalGraph {
             let _turn = lock(&showing);
             let Some(nodes) = lock(&wanted).take() else { return };
             if let Err(error) = network.announce(&nodes) {
-                failures.count("announce_nodes");
+                failures.count(NodeDrop::AnnounceNodes);
                 debug!(%error, "the local graph does not show the far nodes");
             }
         });

@@ -12,6 +12,8 @@ use sgc_sync::lock;
 use sgc_wire::NodeId;
 use tracing::warn;
 
+use crate::drops::NodeDrop;
+
 /// Time's worth of rate that a peer may save up, at least [`BURST_BYTES_MIN`].
 const BURST: Duration = Duration::from_millis(250);
 /// Room for several of the longest packets.
@@ -87,15 +89,16 @@ impl PeerRates {
     /// Returns the drops of all peers, and of each peer with a link.
     pub(crate) fn drops(&self) -> BTreeMap<String, u64> {
         let peers = lock(&self.peers);
+        let key = NodeDrop::OverRate.key();
         let (mut drops, mut all) = (BTreeMap::new(), self.gone.load(Relaxed));
         for (peer, rate) in peers.iter() {
             let dropped = rate.over().dropped;
             all += dropped;
             if dropped > 0 && Arc::strong_count(rate) > 1 {
-                drops.insert(format!("over_rate from {}", peer.short()), dropped);
+                drops.insert(format!("{key} from {}", peer.short()), dropped);
             }
         }
-        drops.extend((all > 0).then(|| ("over_rate".to_owned(), all)));
+        drops.extend((all > 0).then(|| (key.to_owned(), all)));
         drops
     }
 }

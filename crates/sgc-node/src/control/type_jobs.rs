@@ -8,6 +8,8 @@ use sgc_endpoint::{CompressionError, PackedType, unpack_type};
 use sgc_types::{Definitions, ResolveError, ResolvedType, StoreFull, TypeStore};
 use sgc_wire::{DescribedType, Name, NodeId};
 
+use crate::drops::NodeDrop;
+
 /// A job for the blocking thread.
 pub(crate) struct Job {
     pub(crate) name: Name,
@@ -20,12 +22,27 @@ pub(crate) struct Job {
 
 /// A known type, with its packed description for other nodes.
 pub(crate) struct TypeEntry {
-    pub(crate) described: StoredOrNewType,
+    pub(crate) described: FoundType,
     pub(crate) packed: Option<PackedType>,
 }
 
-/// A type from the store (`Ok`), or one that is not stored yet (`Err`).
-pub(crate) type StoredOrNewType = Result<Arc<ResolvedType>, ResolvedType>;
+/// A type that was found.
+pub(crate) enum FoundType {
+    /// It is from the store.
+    Stored(Arc<ResolvedType>),
+    /// It is not stored yet.
+    New(ResolvedType),
+}
+
+impl FoundType {
+    /// Returns the type.
+    fn resolved(&self) -> &ResolvedType {
+        match self {
+            Self::Stored(known) => known,
+            Self::New(new) => new,
+        }
+    }
+}
 
 /// Result of a job.
 pub(crate) struct TypeOutcome {
@@ -85,15 +102,15 @@ pub(crate) enum TypeMiss {
 }
 
 impl TypeMiss {
-    /// Returns a short, stable name for counters; `None` if it is no fault.
-    pub(crate) fn key(&self) -> Option<&'static str> {
+    /// Returns the counter; `None` if it is no fault.
+    pub(crate) fn counter(&self) -> Option<NodeDrop> {
         match self {
             Self::Definition(_) => None,
-            Self::Description(_) => Some("type_not_described"),
-            Self::Differs { .. } => Some("type_differs"),
-            Self::Packed(_) | Self::ResolveError(_) => Some("type_refused"),
-            Self::Full(_) | Self::OwnerFull { .. } => Some("types_full"),
-            Self::Failed => Some("type_failed"),
+            Self::Description(_) => Some(NodeDrop::TypeNotDescribed),
+            Self::Differs { .. } => Some(NodeDrop::TypeDiffers),
+            Self::Packed(_) | Self::ResolveError(_) => Some(NodeDrop::TypeRefused),
+            Self::Full(_) | Self::OwnerFull { .. } => Some(NodeDrop::TypesFull),
+            Self::Failed => Some(NodeDrop::TypeFailed),
         }
     }
 }
@@ -119,13 +136,10 @@ impl Job {
 
 impl TypeQuery {
     /// Turns the search into a result. A panic yields a result too, since other jobs wait for their turn.
-    pub(crate) fn found_by(self, look: impl FnOnce() -> Result<StoredOrNewType, TypeMiss>) -> TypeOutcome {
+    pub(crate) fn found_by(self, look: impl FnOnce() -> Result<FoundType, TypeMiss>) -> TypeOutcome {
         let look = || {
             let described = look()?;
-            let of: &ResolvedType = match &described {
-                Ok(known) => known,
-                Err(new) => new,
-            };
+            let of = described.resolved();
             Ok(TypeEntry { packed: PackedType::new(of.type_hash(), of.description()), described })
         };
         let found = catch_unwind(AssertUnwindSafe(look)).unwrap_or(Err(TypeMiss::Failed));
@@ -138,10 +152,10 @@ fn find(
     type_hash: Option<&str>,
     store: &TypeStore,
     definitions: &Definitions,
-) -> Result<StoredOrNewType, TypeMiss> {
+) -> Result<FoundType, TypeMiss> {
     // A type of this name from another owner may differ, so the hash must match.
     if let Some(known) = type_hash.and_then(|hash| store.described(type_name, Some(hash))) {
-        return Ok(Ok(known));
+        return Ok(FoundType::Stored(known));
     }
     let described = ResolvedType::from_layout(definitions.layout(type_name)?)?;
     match type_hash {
@@ -149,15 +163,11 @@ fn find(
             found: described.type_hash().to_owned(),
             announced: announced.to_owned(),
         }),
-        _ => Ok(Err(described)),
+        _ => Ok(FoundType::New(described)),
     }
 }
 
-fn read(
-    type_name: &TypeName,
-    type_hash: Option<&str>,
-    told: &DescribedType,
-) -> Result<StoredOrNewType, TypeMiss> {
+fn read(type_name: &TypeName, type_hash: Option<&str>, told: &DescribedType) -> Result<FoundType, TypeMiss> {
     // Without an announced hash, the owner vouches for its description. The same holds for services, for which only the
     // hashes of messages may be announced.
     let expected = type_hash.filter(|_| type_name.kind() == "msg").unwrap_or(&told.type_hash);
@@ -166,5 +176,5 @@ fn read(
         let (found, expected) = (described.type_hash().to_owned(), expected.to_owned());
         return Err(ResolveError::Description(DescriptionError::Hash { found, expected }).into());
     }
-    Ok(Err(described))
+    Ok(FoundType::New(described))
 }

@@ -68,7 +68,7 @@ impl CallLedger {
     /// Counts lost calls.
     pub(crate) fn count(&self, loss: CallLoss, of: Option<CallerId>, calls: u64) {
         // The data path counts overruns itself.
-        let is_first = loss != CallLoss::Overrun && self.failures.add(loss.key(), calls);
+        let is_first = loss != CallLoss::Overrun && self.failures.add(loss, calls);
         let mut state = self.lock();
         state.is_lossy = true;
         let none = Losses { count: 0, since_answer: 0, by: BTreeMap::new(), last: Instant::now() };

@@ -21,7 +21,8 @@ use tracing::{debug, warn};
 use crate::data::call_ledger::{CallLedger, CallerId};
 use crate::data::sending::share::{IsTooLarge, LocalShare};
 use crate::data::stats::{DataDrop, Dropped, Drops};
-use crate::data::writer_queue::failure_key;
+use crate::data::writer_queue::write_drop;
+use crate::drops::NodeDrop;
 
 /// Longest wait of a message about a call for its local endpoint.
 const ENDPOINT_WAIT: Duration = Duration::from_secs(10);
@@ -269,7 +270,7 @@ impl LocalService {
                 self.tell(source, MessageKind::Gone, number, why);
             }
         } else {
-            self.failures.count("reply_to_nothing");
+            self.failures.count(NodeDrop::ReplyToNothing);
         }
         // The client cannot be dropped on its own thread.
         if let Some(ended) = ended {
@@ -284,7 +285,7 @@ impl LocalService {
     }
 
     fn failed(&self, why: &RosError) {
-        if self.failures.count(failure_key(why)) {
+        if self.failures.count(write_drop(why)) {
             warn!(%why, "a call could not be given to a local server; counted from here on");
         }
     }
@@ -457,7 +458,7 @@ impl FarService {
                     Ok(()) => self.ledger.answered(),
                     Err(why) => {
                         debug!(%why, "an answer could not be given to a local client");
-                        self.failures.count(failure_key(&why));
+                        self.failures.count(write_drop(&why));
                         self.lock().caller.unheard(id);
                         self.count_lost();
                     }

@@ -177,7 +177,7 @@ impl CountDrops for DataPlane {
         }
         // A packet from the wrong link may have been under way while the path changed, so it is not suspicious.
         let suspicious = matches!(reason, DataDrop::HopLimit | DataDrop::Malformed);
-        if self.drops.count_from(reason.key(), ingress) && suspicious {
+        if self.drops.count_from(reason, ingress) && suspicious {
             warn!(%ingress, reason = reason.key(), "dropped an invalid packet of a peer; counted from here on");
         }
     }
@@ -186,7 +186,7 @@ impl CountDrops for DataPlane {
         if let Some(forward) = self.shard(name).load().get(name) {
             forward.stats.count_drops(reason, several);
         }
-        if self.drops.add(reason.key(), several) {
+        if self.drops.add(reason, several) {
             debug!(name = %name.short(), ?reason, several, "dropped; counted from here on");
         }
     }

@@ -18,6 +18,16 @@ pub(crate) enum PushError {
     Stalled,
 }
 
+/// Outcome of a push that does not wait.
+#[derive(Debug, PartialEq, Eq)]
+#[must_use]
+pub(crate) enum PushOutcome<T> {
+    /// The item is queued.
+    Queued,
+    /// The item is returned, because there is no room or the queue is closed.
+    NotQueued(T),
+}
+
 /// A bounded queue with one consumer.
 pub(crate) struct Queue<T> {
     items: ArrayQueue<(T, usize)>,
@@ -50,7 +60,10 @@ impl<T> Queue<T> {
         bytes_max: usize,
         patience: Duration,
     ) -> Result<(), PushError> {
-        let Err(mut item) = self.try_push(item, bytes, bytes_max) else { return Ok(()) };
+        let mut item = match self.try_push(item, bytes, bytes_max) {
+            PushOutcome::Queued => return Ok(()),
+            PushOutcome::NotQueued(item) => item,
+        };
         let deadline = tokio::time::Instant::now() + patience;
         loop {
             if self.is_closed() {
@@ -60,10 +73,10 @@ impl<T> Queue<T> {
             tokio::pin!(drained);
             drained.as_mut().enable();
             // The consumer may have moved between the last attempt and `enable`.
-            match self.try_push(item, bytes, bytes_max) {
-                Ok(()) => return Ok(()),
-                Err(back) => item = back,
-            }
+            item = match self.try_push(item, bytes, bytes_max) {
+                PushOutcome::Queued => return Ok(()),
+                PushOutcome::NotQueued(item) => item,
+            };
             if self.stalled.load(Ordering::Relaxed) {
                 return Err(PushError::Stalled);
             }
@@ -148,20 +161,20 @@ impl<T> Queue<T> {
         self.closed.load(Ordering::Acquire)
     }
 
-    /// Queues an item if there is room, or returns it.
-    pub(crate) fn try_push(&self, item: T, bytes: usize, bytes_max: usize) -> Result<(), T> {
+    /// Queues an item if there is room.
+    pub(crate) fn try_push(&self, item: T, bytes: usize, bytes_max: usize) -> PushOutcome<T> {
         if self.is_closed() || !self.has_room(bytes, bytes_max) {
-            return Err(item);
+            return PushOutcome::NotQueued(item);
         }
         self.bytes.fetch_add(bytes, Ordering::AcqRel);
         match self.items.push((item, bytes)) {
             Ok(()) => {
                 self.filled.notify_one();
-                Ok(())
+                PushOutcome::Queued
             }
             Err((item, _)) => {
                 self.bytes.fetch_sub(bytes, Ordering::AcqRel);
-                Err(item)
+                PushOutcome::NotQueued(item)
             }
         }
     }

@@ -22,7 +22,8 @@ use crate::data::conversion::{KnownType, TypeSlot};
 use crate::data::pending::{PendingBytes, PendingQueue};
 use crate::data::stats::{CountDrops, DataDrop, Dropped, Drops};
 use crate::data::tap::{TapMessage, Taps};
-use crate::data::writer_queue::{FramePrefix, WRITER_MESSAGES_MAX, WriterQueue};
+use crate::data::writer_queue::{FramePrefix, WRITER_MESSAGES_MAX, WriteOutcome, WriterQueue};
+use crate::drops::NodeDrop;
 
 /// Longest wait of new messages for a closed writer that still writes its queue.
 const LAST_WRITES_MAX: Duration = Duration::from_secs(1);
@@ -395,14 +396,14 @@ impl LocalSink {
             }
             Ok(Delivery::Lost(_, messages)) => {
                 debug!(name = %self.name.short(), messages, "lost for good");
-                if drops.add("sink_lost", messages) {
+                if drops.add(NodeDrop::SinkLost, messages) {
                     warn!(messages, "a source no longer keeps messages that were lost; counted from here on");
                 }
                 Dropped::check(DataDrop::Sink, messages)
             }
             Err(error) => {
                 debug!(name = %self.name.short(), %error, "packet refused");
-                drops.count(error.key());
+                drops.count(error);
                 Err(Dropped::one(DataDrop::Sink))
             }
         }
@@ -443,8 +444,8 @@ impl LocalSink {
         let tapped = self.taps.is_any().then(|| self.tapped(&message));
         // Converting takes time, and may have to wait for the type.
         let evicted = match writer.try_push(message, head.form != PayloadForm::Json) {
-            Ok(evicted) => evicted,
-            Err(message) => return Handover::Full(message),
+            WriteOutcome::Taken { evicted } => evicted,
+            WriteOutcome::Full(message) => return Handover::Full(message),
         };
         self.delivered.fetch_add(1, Relaxed);
         if let Some(tapped) = tapped {

@@ -9,6 +9,8 @@ use sgc_router::LinkId;
 use sgc_sync::lock;
 use sgc_wire::{Name, NodeId};
 
+use crate::drops::DropKind;
+
 /// Traffic of one name at this node.
 #[derive(Debug, Default)]
 pub(crate) struct NameStats {
@@ -162,6 +164,12 @@ impl DataDrop {
     }
 }
 
+impl DropKind for DataDrop {
+    fn key(&self) -> &'static str {
+        DataDrop::key(*self)
+    }
+}
+
 /// Most rows of drops by culprit. Beyond it, the smallest one is dropped.
 const ROWS_MAX: usize = 512;
 
@@ -209,22 +217,22 @@ struct Counts {
 
 impl Drops {
     /// Counts one drop. Returns `true` if it is the first of its kind.
-    pub(crate) fn count(&self, kind: &'static str) -> bool {
+    pub(crate) fn count(&self, kind: impl DropKind) -> bool {
         self.add(kind, 1)
     }
 
     /// Counts several drops. Returns `true` if they are the first of their kind.
-    pub(crate) fn add(&self, kind: &'static str, several: u64) -> bool {
+    pub(crate) fn add(&self, kind: impl DropKind, several: u64) -> bool {
         let mut counts = self.lock();
-        let n = counts.kinds.entry(kind).or_default();
+        let n = counts.kinds.entry(kind.key()).or_default();
         *n += several;
         *n == several
     }
 
     /// Counts a drop of a culprit. Returns `true` if it is the culprit's first of its kind. For a link that is not up,
     /// only the kind is counted.
-    pub(crate) fn count_from(&self, kind: &'static str, culprit: impl Into<Culprit>) -> bool {
-        let culprit = culprit.into();
+    pub(crate) fn count_from(&self, kind: impl DropKind, culprit: impl Into<Culprit>) -> bool {
+        let (kind, culprit) = (kind.key(), culprit.into());
         let mut counts = self.lock();
         let counts = &mut *counts;
         *counts.kinds.entry(kind).or_default() += 1;
@@ -301,10 +309,10 @@ mod tests {
         let drops = Drops::default();
         let links = (0..10_000).map(LinkId);
         links.clone().for_each(|link| drops.link_up(link));
-        assert!(drops.count_from("stale", LinkId(1)));
-        assert!(!drops.count_from("stale", LinkId(1)));
+        assert!(drops.count_from(DataDrop::Stale, LinkId(1)));
+        assert!(!drops.count_from(DataDrop::Stale, LinkId(1)));
         for link in links {
-            drops.count_from("stale", link);
+            drops.count_from(DataDrop::Stale, link);
         }
         let snapshot = drops.snapshot();
         assert_eq!(snapshot.len(), ROWS_MAX + 1);
@@ -316,12 +324,12 @@ mod tests {
         let drops = Drops::default();
         for link in [1, 2].map(LinkId) {
             drops.link_up(link);
-            drops.count_from("stale", link);
+            drops.count_from(DataDrop::Stale, link);
         }
-        drops.count_from("stale", Culprit::Peer(NodeId([7; 32])));
+        drops.count_from(DataDrop::Stale, Culprit::Peer(NodeId([7; 32])));
         drops.link_down(LinkId(1));
         // The packet was under way when its link ended.
-        assert!(!drops.count_from("stale", LinkId(1)));
+        assert!(!drops.count_from(DataDrop::Stale, LinkId(1)));
         let rows: Vec<_> = drops.snapshot().into_iter().collect();
         let row = |key: &str, n| (key.to_owned(), n);
         let peer = format!("stale from {}", NodeId([7; 32]).short());

@@ -26,8 +26,9 @@ use tracing::warn;
 
 use crate::data::burst::Burst;
 use crate::data::conversion::{self, TypeSlot};
-use crate::data::queue::{PushError, Queue};
+use crate::data::queue::{PushError, PushOutcome, Queue};
 use crate::data::stats::{DataDrop, Drops};
+use crate::drops::NodeDrop;
 
 /// Most messages that wait for one local writer.
 pub(crate) const WRITER_MESSAGES_MAX: usize = 1024;
@@ -80,6 +81,16 @@ impl NextMessage {
     fn is_at_once(self) -> bool {
         matches!(self, Self::AtOnce | Self::Last)
     }
+}
+
+/// Outcome of handing a message to a queue without waiting.
+#[derive(Debug, PartialEq, Eq)]
+#[must_use]
+pub(crate) enum WriteOutcome {
+    /// The message is written or queued; so many best-effort messages were evicted for it.
+    Taken { evicted: u64 },
+    /// The message is returned: it has to wait for room.
+    Full(Message),
 }
 
 /// Consumes the messages of a queue one by one.
@@ -195,7 +206,7 @@ impl WriterQueue {
             let payload = match decompressor.decompress(message.head.encoding, message.payload) {
                 Ok(payload) => payload,
                 Err(error) => {
-                    if counted.count("decompress") {
+                    if counted.count(NodeDrop::Decompress) {
                         warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
                     }
                     return None;
@@ -205,7 +216,7 @@ impl WriterQueue {
                 PayloadForm::Cdr => payload,
                 PayloadForm::KeyedCdr => {
                     let Some(hash) = payload.first_chunk::<KEY_HASH_BYTES>().copied() else {
-                        counted.count("key_hash");
+                        counted.count(NodeDrop::KeyHash);
                         return None;
                     };
                     key_hash = Some(hash);
@@ -215,13 +226,13 @@ impl WriterQueue {
                     let known = types.now();
                     let Some(layout) = known.layout() else {
                         // The type was known when the message was queued.
-                        counted.count("json_unknown_type");
+                        counted.count(NodeDrop::JsonUnknownType);
                         return None;
                     };
                     match conversion::from_json(layout, &payload, offered) {
                         Ok(payload) => payload,
                         Err(error) => {
-                            if counted.count("json_refused") {
+                            if counted.count(NodeDrop::JsonRefused) {
                                 warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
                             }
                             return None;
@@ -235,7 +246,7 @@ impl WriterQueue {
                 Some(prefix) => match prefix_frames(&payload, &prefix) {
                     Ok(rewritten) => rewritten.into(),
                     Err(error) => {
-                        if counted.count("frames") {
+                        if counted.count(NodeDrop::Frames) {
                             warn!(%in_topic, %error, "a message is not written to the local network; counted from here on");
                         }
                         return None;
@@ -267,7 +278,7 @@ impl WriterQueue {
                 writer.flush();
             }
             if let Err(error) = written
-                && refused.count(failure_key(&error))
+                && refused.count(write_drop(&error))
             {
                 warn!(%topic, %error, "a message could not be given to the local network; counted from here on");
             }
@@ -330,21 +341,23 @@ impl WriterQueue {
         take.filter(|_| self.queue.is_empty() && !self.queue.is_closed() && (self.info.is_free)(message))
     }
 
-    /// Writes a message on the caller's thread if `may_write` and nothing is ahead of it, or queues it. Returns the
-    /// number of evicted messages, or the message if it has to wait for room.
-    pub(crate) fn try_push(&self, message: Message, may_write: bool) -> Result<u64, Message> {
+    /// Writes a message on the caller's thread if `may_write` and nothing is ahead of it, or queues it if there is room.
+    pub(crate) fn try_push(&self, message: Message, may_write: bool) -> WriteOutcome {
         let (bytes, head) = (message.payload.len(), message.head);
         let mut evicted = 0;
         let at_once = may_write.then(|| self.at_once(&message)).flatten();
         if let Some(mut take) = at_once {
             take(message, NextMessage::Nothing);
         } else if message.reliable {
-            self.queue.try_push(message, bytes, WRITER_BYTES_MAX)?;
+            match self.queue.try_push(message, bytes, WRITER_BYTES_MAX) {
+                PushOutcome::Queued => {}
+                PushOutcome::NotQueued(message) => return WriteOutcome::Full(message),
+            }
         } else {
             self.queue.push_evicting(message, bytes, WRITER_BYTES_MAX, |_| evicted += 1);
         }
         self.remember(&head);
-        Ok(evicted)
+        WriteOutcome::Taken { evicted }
     }
 
     /// Queues a message once there is room. Fails if there is none for too long.
@@ -397,7 +410,7 @@ impl WriterQueue {
             }
             match timeout_at(due.into(), self.queue.pop()).await {
                 Ok(Some(newer)) if newer.head.kind == MessageKind::Write => {
-                    drops.count(DataDrop::Thinned.key());
+                    drops.count(DataDrop::Thinned);
                     message = newer;
                 }
                 // The end of an instance is never skipped, nor is the message before it.
@@ -485,14 +498,14 @@ fn written_bytes(message: &Message) -> usize {
     if is_keyed { bytes.saturating_sub(KEY_HASH_BYTES) } else { bytes }
 }
 
-/// Returns a short, stable name of a failure for counters.
-pub(crate) fn failure_key(error: &RosError) -> &'static str {
+/// Returns the counter of a failure.
+pub(crate) fn write_drop(error: &RosError) -> NodeDrop {
     match error {
-        RosError::Payload { .. } => "write_payload",
-        RosError::WriteTimeout { .. } => "write_timeout",
-        RosError::NoPeer { .. } => "no_local_peer",
-        RosError::KeyUnknown => "key_unknown",
-        _ => "write_failed",
+        RosError::Payload { .. } => NodeDrop::WritePayload,
+        RosError::WriteTimeout { .. } => NodeDrop::WriteTimeout,
+        RosError::NoPeer { .. } => NodeDrop::NoLocalPeer,
+        RosError::KeyUnknown => NodeDrop::KeyUnknown,
+        _ => NodeDrop::WriteFailed,
     }
 }
 
@@ -531,7 +544,7 @@ pub(crate) mod tests {
 
     /// Queues a message as a sink does.
     fn give(queue: &WriterQueue, message: Message) {
-        assert_eq!(queue.try_push(message, true), Ok(0));
+        assert_eq!(queue.try_push(message, true), WriteOutcome::Taken { evicted: 0 });
     }
 
     /// Waits until `is_so`, with a bound.

@@ -15,6 +15,7 @@ use tokio::time::{sleep, sleep_until};
 use tracing::{debug, info, warn};
 
 use super::local::Sighting;
+use crate::drops::NodeDrop;
 use crate::link::in_use::place_in_use;
 
 use super::{Board, DialTarget, Failure, KeepLink, LinkRequest, LocalNetwork, Outcome, StatusRow};
@@ -57,7 +58,7 @@ pub(crate) async fn keep_some<H: KeepLink>(
                         }
                     }
                     // The queue overflowed. Routers repeat their announcements, so none is lost for good.
-                    board.drops().count("mdns_overrun");
+                    board.drops().count(NodeDrop::MdnsOverrun);
                 }
                 Err(why) => {
                     if failures == 0 {
@@ -136,12 +137,12 @@ pub(crate) async fn keep_links<H: KeepLink>(
                 Some(Sighting::Announced { instance, addresses }) => {
                     debug!(%instance, ?addresses, "a router is announced on the local network");
                     if !found.announced(&instance, addresses) {
-                        board.drops().count("mdns_crowded");
+                        board.drops().count(NodeDrop::MdnsCrowded);
                     }
                 }
                 Some(Sighting::Vanished { instance }) => found.vanished(&instance),
                 Some(Sighting::Unknown) => {
-                    board.drops().count("mdns_unknown");
+                    board.drops().count(NodeDrop::MdnsUnknown);
                 }
                 None => return,
             },

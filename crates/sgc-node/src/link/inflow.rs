@@ -111,7 +111,7 @@ impl Inflow {
                         FlowError::Packet(error) => Some(malformed(error)),
                         _ => Some(DataDrop::Malformed),
                     };
-                    if reason.is_some_and(|reason| data.drops().count_from(reason.key(), id)) {
+                    if reason.is_some_and(|reason| data.drops().count_from(reason, id)) {
                         warn!(link = id.0, %remote, %error, "a peer sends malformed flows; counted from here on");
                     }
                     debug!(link = id.0, %remote, %error, "flow ended early");
@@ -135,7 +135,7 @@ impl Inflow {
                 }
                 ReceivedDatagram::Malformed(error) => {
                     debug!(link = id.0, %error, "malformed datagram");
-                    if data.drops().count_from(malformed(&error).key(), id) {
+                    if data.drops().count_from(malformed(&error), id) {
                         warn!(link = id.0, %error, "a peer sends malformed datagrams; counted from here on");
                     }
                 }

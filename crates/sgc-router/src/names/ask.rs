@@ -45,8 +45,8 @@ impl Names {
             if next_hop.is_some()
                 && let Some(record) = self.records.of_name(name)
             {
-                let (owner, from) = (record.owner.node_id, record.from);
-                let again = record.asked.filter(|at| *at + QUERY_AGAIN <= now).is_some();
+                let (owner, from) = (record.owner_id(), record.link());
+                let again = record.asked().filter(|at| *at + QUERY_AGAIN <= now).is_some();
                 self.answer(cx, link, &owner, &[*name]);
                 self.tell_record(cx, link, name);
                 if again && from != link {
@@ -137,9 +137,9 @@ impl Names {
         match record {
             None => NameLocation::Unknown,
             // A router that answered, or told the record unasked, may withhold a later one.
-            Some(record) if record.renewal_due <= cx.now.instant => NameLocation::Unknown,
-            Some(record) => match record.asked {
-                Some(_) if cx.network.links.contains(record.from) => NameLocation::Answered(record.from),
+            Some(record) if record.renewal_due() <= cx.now.instant => NameLocation::Unknown,
+            Some(record) => match record.asked() {
+                Some(_) if cx.network.links.contains(record.link()) => NameLocation::Answered(record.link()),
                 Some(_) => NameLocation::Unknown,
                 None => NameLocation::Flooded,
             },

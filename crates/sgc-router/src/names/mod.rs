@@ -25,7 +25,7 @@ use sgc_wire::{Control, Name, NodeId, SignedBody};
 use self::heard::Heard;
 use self::interests::Interests;
 use self::questions::Questions;
-use self::record::Record;
+use self::record::{NewRecord, Record};
 pub(crate) use self::record::{RecordEnd, RecordId, RecordKind};
 use self::records::Records;
 use crate::config::RouterConfig;
@@ -112,7 +112,7 @@ impl Names {
 
     /// Returns the owner of a name as its advertisement proved it.
     pub(crate) fn owner(&self, name: &Name) -> Option<&Arc<VerifiedPeer>> {
-        self.records.of_name(name).map(|record| &record.owner)
+        self.records.of_name(name).map(Record::owner)
     }
 
     /// Iterates over the owners of records.
@@ -147,23 +147,23 @@ impl Names {
 
     /// Returns the link towards the owner of `name`, and the cost of the route.
     pub(crate) fn next_hop(&self, network: Network<'_>, name: &Name) -> Option<(LinkId, u32)> {
-        let owner = &self.records.of_name(name)?.owner.node_id;
-        if *owner == self.own {
+        let owner = self.records.of_name(name)?.owner_id();
+        if owner == self.own {
             return Some((LinkId::LOCAL, 0));
         }
-        if self.transit { network.next_hop_to(owner) } else { self.heard.next_hop(network.links, name) }
+        if self.transit { network.next_hop_to(&owner) } else { self.heard.next_hop(network.links, name) }
     }
 
     /// Returns the number of names whose owners are in reach.
     pub(crate) fn routed(&self, network: Network<'_>) -> usize {
         let names = |record: &Record| {
-            let owner = &record.owner.node_id;
-            if *owner == self.own {
-                record.live
+            let owner = record.owner_id();
+            if owner == self.own {
+                record.live()
             } else if self.transit {
-                network.next_hop_to(owner).map_or(0, |_| record.live)
+                network.next_hop_to(&owner).map_or(0, |_| record.live())
             } else {
-                record.names.iter().filter(|name| self.next_hop(network, name).is_some()).count()
+                record.names().iter().filter(|name| self.next_hop(network, name).is_some()).count()
             }
         };
         self.records.adverts().map(names).sum()
@@ -191,7 +191,7 @@ impl Names {
     /// Returns the record with this digest.
     pub(crate) fn recognise(&self, digest: &[u8; 32]) -> Recognised {
         if let Some((id, record)) = self.records.with_digest(digest) {
-            return Recognised::Known { id, owner: record.owner.node_id };
+            return Recognised::Known { id, owner: record.owner_id() };
         }
         match self.records.ended(digest) {
             Some((owner, seq)) => Recognised::Ended { owner, seq },
@@ -220,7 +220,7 @@ impl Names {
         // Owners announce changes unasked.
         let is_answer =
             kind == RecordKind::Advert && from.is_router && news.iter().any(|n| self.questions.is_open(n));
-        let record = Record {
+        let record = NewRecord {
             owner: Arc::new(advert.owner),
             seq: advert.body.seq,
             kind,
@@ -230,7 +230,6 @@ impl Names {
             digest,
             expires,
             renewal_due: now.instant + expires.saturating_duration_since(now.instant) / 2,
-            live: 0,
             from: link,
             asked: is_answer.then_some(now.instant),
         };
@@ -285,7 +284,7 @@ impl Names {
         Some(news)
     }
 
-    fn insert(&mut self, now: Instant, record: Record, names: &[Name]) -> RecordId {
+    fn insert(&mut self, now: Instant, record: NewRecord, names: &[Name]) -> RecordId {
         for name in names {
             match record.kind {
                 RecordKind::Withdrawal => self.heard.remove(name),
@@ -329,7 +328,7 @@ impl Names {
         let Some(record) = self.records.get(id).filter(|record| !record.is_withdrawal()) else {
             return Vec::new();
         };
-        let names: Vec<_> = record.names.iter().copied().filter(|n| self.interests.is_watched(n)).collect();
+        let names: Vec<_> = record.names().iter().copied().filter(|n| self.interests.is_watched(n)).collect();
         for name in &names {
             // It may have been without interest when the record came.
             self.records.speak_for(now, id, name);

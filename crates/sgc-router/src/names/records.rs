@@ -6,8 +6,7 @@ use std::time::Instant;
 use sgc_trust::{CLOCK_SKEW_MAX, CertId};
 use sgc_wire::{Control, Name, NodeId, Now, SignedBody};
 
-use super::record::{OwnerRecords, Record, RecordEnd, RecordId, RecordKind};
-use crate::lease::verifies_elsewhere;
+use super::record::{NewRecord, OwnerRecords, Record, RecordEnd, RecordId, RecordKind};
 use crate::limits::Limits;
 use crate::link_id::LinkId;
 use crate::memory::Memory;
@@ -106,13 +105,13 @@ impl Records {
 
     /// Returns the newest known sequence number of a name, withdrawn or not.
     pub(super) fn known_seq(&self, name: &Name) -> Option<u64> {
-        self.records.get(self.words.get(name)?).map(|record| record.seq)
+        self.records.get(self.words.get(name)?).map(Record::seq)
     }
 
     /// Returns the last message of an owner, in force or not, and its number.
     pub(super) fn newest(&self, owner: &NodeId) -> Option<(u64, &SignedBody)> {
         let in_force = self.owners.get(owner).and_then(OwnerRecords::newest);
-        let in_force = in_force.and_then(|(seq, id)| Some((seq, &self.records.get(&id)?.signed)));
+        let in_force = in_force.and_then(|(seq, id)| Some((seq, self.records.get(&id)?.signed())));
         in_force.into_iter().chain(self.memory.newest(owner)).max_by_key(|(seq, _)| *seq)
     }
 
@@ -128,15 +127,15 @@ impl Records {
 
     /// Iterates over the names that the advertisements of an owner speak for.
     pub(super) fn names_of(&self, owner: &NodeId) -> impl Iterator<Item = &Name> {
-        let records = self.owners.get(owner).into_iter().flat_map(|of_owner| &of_owner.records);
-        let named = records.filter_map(|(_, id)| Some((id, self.records.get(id)?)));
-        named.flat_map(move |(id, r)| r.names.iter().filter(move |n| self.words.get(*n) == Some(id)))
+        let adverts = self.owners.get(owner).into_iter().flat_map(OwnerRecords::adverts);
+        let named = adverts.filter_map(|id| Some((id, self.records.get(&id)?)));
+        named.flat_map(move |(id, r)| r.names().iter().filter(move |n| self.words.get(*n) == Some(&id)))
     }
 
     /// Returns the names that a record still speaks for.
     pub(super) fn live_names(&self, id: RecordId) -> Vec<Name> {
         let Some(record) = self.records.get(&id) else { return Vec::new() };
-        record.names.iter().copied().filter(|name| self.words.get(name) == Some(&id)).collect()
+        record.names().iter().copied().filter(|name| self.words.get(name) == Some(&id)).collect()
     }
 
     /// Returns the number of advertised names.
@@ -166,18 +165,18 @@ impl Records {
     /// Returns an advertisement, and the withdrawals of those of its names that are void; nothing if the receiver would
     /// not believe it.
     pub(super) fn frames(&self, now: Now, id: RecordId, cost: u32) -> Vec<Control> {
-        let record = self.records.get(&id).filter(|record| verifies_elsewhere(now, record.issued_at));
+        let record = self.records.get(&id).filter(|record| record.verifies_elsewhere(now));
         let Some(record) = record else { return Vec::new() };
-        let mut frames = vec![Control::Advert { cost, signed: record.signed.clone() }];
-        if record.live < record.names.len() {
+        let mut frames = vec![Control::Advert { cost, signed: record.signed().clone() }];
+        if record.is_partly_void() {
             let mut withdrawals = BTreeMap::new();
-            for name in &record.names {
+            for name in record.names() {
                 let word = self.words.get(name).and_then(|id| self.records.get(id));
                 let is_newer = |word: &&Record| {
-                    word.is_withdrawal() && word.seq > record.seq && verifies_elsewhere(now, word.issued_at)
+                    word.is_withdrawal() && word.seq() > record.seq() && word.verifies_elsewhere(now)
                 };
                 if let Some(newer) = word.filter(is_newer) {
-                    withdrawals.insert(newer.seq, newer.signed.clone());
+                    withdrawals.insert(newer.seq(), newer.signed().clone());
                 }
             }
             frames.extend(withdrawals.into_values().map(|signed| Control::Advert { cost: 0, signed }));
@@ -196,9 +195,9 @@ impl Records {
     ) -> Option<RecordId> {
         // Advertisements that an older withdrawal ended have no lease left.
         let oldest = now + 2 * CLOCK_SKEW_MAX - self.limits.lease_max;
-        let is_told = |record: &Record| match record.kind {
-            RecordKind::Withdrawal => all && record.expires > oldest,
-            RecordKind::Advert => all || record.owner.node_id == self.own,
+        let is_told = |record: &Record| match record.kind() {
+            RecordKind::Withdrawal => all && record.expires() > oldest,
+            RecordKind::Advert => all || record.owner_id() == self.own,
         };
         self.records.range(from..end).find(|(_, record)| is_told(record)).map(|(id, _)| *id)
     }
@@ -221,7 +220,7 @@ impl Records {
             return Some("owners");
         }
         let more = news.iter().filter(|n| self.id(n).is_none()).count();
-        let of_owner = self.owners.get(owner).map_or(0, |o| o.names);
+        let of_owner = self.owners.get(owner).map_or(0, OwnerRecords::names);
         let over_link = self.over_link.get(&link).copied().unwrap_or_default();
         if kind == RecordKind::Withdrawal || more == 0 {
             None
@@ -237,17 +236,16 @@ impl Records {
     }
 
     /// Puts a record into force; it speaks for these names.
-    pub(super) fn insert(&mut self, now: Instant, record: Record, names: &[Name]) -> RecordId {
+    pub(super) fn insert(&mut self, now: Instant, record: NewRecord, names: &[Name]) -> RecordId {
+        let record = Record::new(record);
         let id = self.next_id;
         self.next_id += 1;
-        self.seen.insert(record.digest, id);
-        self.expiries.insert((record.expires, id));
-        if self.transit && !record.is_withdrawal() && record.owner.node_id != self.own {
-            self.renewals.insert((record.renewal_due, id));
+        self.seen.insert(*record.digest(), id);
+        self.expiries.insert((record.expires(), id));
+        if self.transit && !record.is_withdrawal() && record.owner_id() != self.own {
+            self.renewals.insert((record.renewal_due(), id));
         }
-        let of_owner = self.owners.entry(record.owner.node_id).or_default();
-        of_owner.of_kind(record.kind).0.insert((record.seq, id));
-        of_owner.bytes += record.bytes();
+        self.owners.entry(record.owner_id()).or_default().insert(id, &record);
         self.records.insert(id, record);
         for name in names {
             if let Some(old) = self.words.insert(*name, id) {
@@ -260,7 +258,7 @@ impl Records {
 
     /// Lets a record speak for one more of its names, unless a record that is as new does.
     pub(super) fn speak_for(&mut self, now: Instant, id: RecordId, name: &Name) {
-        let Some(seq) = self.records.get(&id).map(|record| record.seq) else { return };
+        let Some(seq) = self.records.get(&id).map(Record::seq) else { return };
         if self.known_seq(name).is_none_or(|known| known < seq) {
             if let Some(old) = self.words.insert(*name, id) {
                 self.release(now, old, 1, RecordEnd::Superseded);
@@ -273,14 +271,14 @@ impl Records {
     pub(super) fn mark_asked(&mut self, now: Instant, name: &Name) {
         let record = self.id(name).and_then(|id| self.records.get_mut(&id));
         if let Some(record) = record {
-            record.asked = Some(now);
+            record.mark_asked(now);
         }
     }
 
     fn hold(&mut self, now: Instant, id: RecordId, names: usize) {
         let Some(record) = self.records.get_mut(&id) else { return };
-        record.live += names;
-        let (owner, kind, from) = (record.owner.node_id, record.kind, record.from);
+        record.gain(names);
+        let (owner, kind, from) = (record.owner_id(), record.kind(), record.link());
         self.count(&owner, kind, from, names, usize::saturating_add);
         self.release(now, id, 0, RecordEnd::Unwanted);
     }
@@ -295,9 +293,7 @@ impl Records {
         change: fn(usize, usize) -> usize,
     ) {
         let Some(of_owner) = self.owners.get_mut(owner) else { return };
-        let (_, count) = of_owner.of_kind(kind);
-        let old = std::mem::replace(count, change(*count, names));
-        let new = *count;
+        let (old, new) = of_owner.count(kind, |count| change(count, names));
         if kind == RecordKind::Withdrawal {
             self.withdrawn = self.withdrawn + new - old;
             self.most_withdrawn.remove(&(old, *owner));
@@ -314,30 +310,28 @@ impl Records {
     /// Takes names from a record; without any it is removed.
     fn release(&mut self, now: Instant, id: RecordId, names: usize, end: RecordEnd) {
         let Some(record) = self.records.get_mut(&id) else { return };
-        record.live = record.live.saturating_sub(names);
-        let is_gone = record.live == 0;
-        let (owner, kind, from) = (record.owner.node_id, record.kind, record.from);
+        let is_gone = record.lose(names);
+        let (owner, kind, from) = (record.owner_id(), record.kind(), record.link());
         self.count(&owner, kind, from, names, usize::saturating_sub);
         if !is_gone {
             return;
         }
         let Some(record) = self.records.remove(&id) else { return };
-        self.seen.remove(&record.digest);
-        self.expiries.remove(&(record.expires, id));
-        self.renewals.remove(&(record.renewal_due, id));
+        self.seen.remove(record.digest());
+        self.expiries.remove(&(record.expires(), id));
+        self.renewals.remove(&(record.renewal_due(), id));
         self.waits_no_more(&owner, id);
         if let Some(of_owner) = self.owners.get_mut(&owner) {
-            of_owner.of_kind(kind).0.remove(&(record.seq, id));
-            of_owner.bytes = of_owner.bytes.saturating_sub(record.bytes());
+            of_owner.remove(id, &record);
             if of_owner.is_empty() {
                 self.owners.remove(&owner);
             }
         }
         let max = self.limits.nodes_max;
-        let Record { seq, digest, signed, .. } = record;
+        let (seq, digest) = (record.seq(), *record.digest());
         match end {
             RecordEnd::Superseded => self.memory.superseded(now, &owner, seq, digest, max),
-            RecordEnd::Ended => self.memory.ended(now, &owner, seq, digest, &signed, max),
+            RecordEnd::Ended => self.memory.ended(now, &owner, seq, digest, record.signed(), max),
             RecordEnd::Unwanted => {}
         }
     }
@@ -365,9 +359,8 @@ impl Records {
     pub(super) fn surplus_of_owner(&self, owner: &NodeId) -> Option<RecordId> {
         let limits = &self.limits;
         let of_owner = self.owners.get(owner).filter(|_| *owner != self.own)?;
-        let records = of_owner.records.len() + of_owner.withdrawals.len();
-        let is_over =
-            records > limits.adverts_per_owner_max || of_owner.bytes > limits.advert_bytes_per_owner_max;
+        let is_over = of_owner.len() > limits.adverts_per_owner_max
+            || of_owner.bytes() > limits.advert_bytes_per_owner_max;
         if is_over { of_owner.oldest() } else { None }
     }
 
@@ -377,18 +370,17 @@ impl Records {
             return None;
         }
         let (_, owner) = self.most_withdrawn.last()?;
-        self.owners.get(owner)?.withdrawals.first().map(|(_, id)| *id)
+        self.owners.get(owner)?.oldest_withdrawal()
     }
 
     /// Returns the advertisements of an owner with numbers below `floor`.
     pub(super) fn before(&self, owner: &NodeId, floor: u64) -> Vec<RecordId> {
-        let old = self.owners.get(owner).into_iter().flat_map(|o| o.records.range(..(floor, 0)));
-        old.map(|(_, id)| *id).collect()
+        self.owners.get(owner).into_iter().flat_map(|of_owner| of_owner.adverts_below(floor)).collect()
     }
 
     /// Returns the records under certificates that are no longer believed.
     pub(super) fn untrusted(&self, is_untrusted: impl Fn(&[CertId]) -> bool) -> Vec<RecordId> {
-        let gone = self.records.iter().filter(|(_, record)| is_untrusted(&record.owner.path));
+        let gone = self.records.iter().filter(|(_, record)| is_untrusted(&record.owner().path));
         gone.map(|(id, _)| *id).collect()
     }
 
@@ -448,6 +440,6 @@ impl Records {
     /// Returns the owner's record that has waited for longest, and the link that brought it.
     pub(super) fn first_waiting(&self, owner: &NodeId) -> Option<(RecordId, LinkId)> {
         let id = self.waiting.get(owner)?.first()?;
-        self.records.get(id).map(|record| (*id, record.from))
+        self.records.get(id).map(|record| (*id, record.link()))
     }
 }

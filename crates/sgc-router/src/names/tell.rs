@@ -187,8 +187,8 @@ impl Names {
         let now = cx.now.instant;
         let is_late = |name: &Name| {
             self.records.of_name(name).is_some_and(|record| {
-                let is_late = record.asked.is_some() || record.renewal_due <= now;
-                is_late && record.owner.node_id != self.own
+                let is_late = record.asked().is_some() || record.renewal_due() <= now;
+                is_late && record.owner_id() != self.own
             })
         };
         let needs = self.next_hop(cx.network, &name).is_none() || is_late(&name);
@@ -230,7 +230,7 @@ impl Names {
     ) {
         let Some(record) = self.records.get(id) else { return };
         for link in self.interests.take_told(ingress, names) {
-            cx.send(link, Control::Advert { cost: 0, signed: record.signed.clone() });
+            cx.send(link, Control::Advert { cost: 0, signed: record.signed().clone() });
         }
     }
 

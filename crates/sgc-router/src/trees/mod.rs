@@ -12,11 +12,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{CertId, VerifiedPeer};
-use sgc_wire::{Control, Name, NodeId, RejectReason, Role, SinkId};
+use sgc_wire::{Control, Name, NodeId, RejectReason, SinkId};
 use smallvec::SmallVec;
 
-pub(crate) use self::tree::Branch;
-use self::tree::{Stage, Tree};
+pub(crate) use self::tree::{Branch, NewBranch};
+use self::tree::{RouteChange, Tree};
 use crate::drops::DropReason;
 use crate::fib::FibEntry;
 use crate::limits::Limits;
@@ -34,24 +34,6 @@ pub(crate) enum Effect {
 /// Effects in their order; cutting a branch has three.
 pub(crate) type Effects = SmallVec<[Effect; 3]>;
 
-/// A verified request to join, and the links that it takes.
-#[derive(Debug)]
-pub(crate) struct NewBranch {
-    /// The link towards the sink.
-    pub(crate) link: LinkId,
-    /// The node at its other end.
-    pub(crate) neighbour: NodeId,
-    /// The link towards the owner.
-    pub(crate) up: LinkId,
-    /// The owner of the name.
-    pub(crate) owner: Arc<VerifiedPeer>,
-    /// The node of the sink.
-    pub(crate) peer: NodeId,
-    /// Its certificates.
-    pub(crate) certs: Arc<[CertId]>,
-    pub(crate) role: Role,
-}
-
 /// The place of a sink that asks to join.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Place {
@@ -61,12 +43,6 @@ pub(crate) enum Place {
     Kept { up: LinkId },
     /// Another node has it, or the same request came over another link.
     Taken,
-}
-
-/// The consequence of another route for a branch.
-enum Moved {
-    Cut,
-    Drain,
 }
 
 /// The trees of all names.
@@ -128,7 +104,7 @@ impl Trees {
         what: &'static str,
     ) -> Result<&Branch, DropReason> {
         let branch = self.branch(name, sink).ok_or(DropReason::Unknown { what })?;
-        if branch.up == link { Ok(branch) } else { Err(DropReason::WrongWay { what }) }
+        if branch.up() == link { Ok(branch) } else { Err(DropReason::WrongWay { what }) }
     }
 
     /// Returns the granted branch that a frame from the sink's side takes.
@@ -139,7 +115,7 @@ impl Trees {
         sink: &SinkId,
         what: &'static str,
     ) -> Result<&Branch, DropReason> {
-        let branch = self.branch(name, sink).filter(|b| b.link == link && b.carries());
+        let branch = self.branch(name, sink).filter(|b| b.link() == link && b.carries());
         branch.ok_or(DropReason::Unknown { what })
     }
 
@@ -160,14 +136,11 @@ impl Trees {
         owner: Option<&Arc<VerifiedPeer>>,
     ) -> Place {
         let Some(known) = self.trees.get_mut(name).and_then(|t| t.get_mut(sink)) else { return Place::New };
-        if known.peer != peer.node_id || known.link != link {
+        if !known.is_of(link, &peer.node_id) {
             return Place::Taken;
         }
-        known.certs = peer.path.clone();
-        if let Some(owner) = owner {
-            known.owner = owner.clone();
-        }
-        Place::Kept { up: known.up }
+        known.renew(peer, owner);
+        Place::Kept { up: known.up() }
     }
 
     /// Returns `true` if the name, or the neighbour, has as many branches as it may have.
@@ -178,16 +151,13 @@ impl Trees {
 
     /// Adds a branch, which expects the owner's answer.
     pub(crate) fn add(&mut self, now: Instant, name: Name, sink: SinkId, new: NewBranch) {
-        let NewBranch { link, neighbour, up, owner, peer, certs, role } = new;
         let until = now + self.answer_wait;
         self.deadlines.insert((until, name, sink));
-        for link in [link, up] {
+        for link in [new.link, new.up] {
             self.of_link.entry(link).or_default().insert((name, sink));
         }
-        *self.of_node.entry(neighbour).or_default() += 1;
-        let stage = Stage::ExpectAnswer { until };
-        let branch = Branch { link, neighbour, up, owner, peer, certs, role, stage };
-        self.trees.entry(name).or_default().insert(sink, branch);
+        *self.of_node.entry(new.neighbour).or_default() += 1;
+        self.trees.entry(name).or_default().insert(sink, Branch::new(new, until));
     }
 
     /// Takes the owner's grant.
@@ -211,7 +181,7 @@ impl Trees {
 
     /// Ends a branch because its sink left over this link.
     pub(crate) fn leave(&mut self, link: LinkId, name: Name, sink: SinkId) -> Result<Effects, DropReason> {
-        if self.branch(&name, &sink).is_none_or(|b| b.link != link) {
+        if self.branch(&name, &sink).is_none_or(|b| b.link() != link) {
             return Err(DropReason::Unknown { what: "leave" });
         }
         let mut effects = Effects::new();
@@ -231,7 +201,7 @@ impl Trees {
     pub(crate) fn distrust_answer(&mut self, now: Instant, name: Name, sink: SinkId) -> Effects {
         let mut effects = Effects::new();
         let Some(branch) = self.branch(&name, &sink) else { return effects };
-        if branch.stage == Stage::Granted {
+        if branch.is_granted() {
             self.drain(now, name, sink, &mut effects);
         } else {
             self.cut(name, sink, RejectReason::RouteLost, &mut effects);
@@ -250,23 +220,14 @@ impl Trees {
     ) -> Effects {
         let mut effects = Effects::new();
         let Some(tree) = self.trees.get(name) else { return effects };
-        let mut moved = Vec::new();
-        for (sink, branch) in tree.iter() {
-            match (next_hop, branch.stage) {
-                // Withdrawn: the owner itself tells its sinks, unless it died.
-                (None, _) if !is_known => moved.push((*sink, Moved::Cut)),
-                // The owner is out of reach from here; its neighbours will report it.
-                (None, _) => {}
-                (Some(next_hop), _) if next_hop == branch.up => {}
-                (Some(_), Stage::ExpectAnswer { .. }) => moved.push((*sink, Moved::Cut)),
-                (Some(_), Stage::Granted) => moved.push((*sink, Moved::Drain)),
-                (Some(_), Stage::Draining { .. }) => {}
-            }
-        }
-        for (sink, moved) in moved {
-            match moved {
-                Moved::Cut => self.cut(*name, sink, RejectReason::RouteLost, &mut effects),
-                Moved::Drain => self.drain(now, *name, sink, &mut effects),
+        let change = |(sink, branch): (&SinkId, &Branch)| {
+            Some((*sink, branch.after_route_change(is_known, next_hop)?))
+        };
+        let changes: Vec<_> = tree.iter().filter_map(change).collect();
+        for (sink, change) in changes {
+            match change {
+                RouteChange::Cut => self.cut(*name, sink, RejectReason::RouteLost, &mut effects),
+                RouteChange::Drain => self.drain(now, *name, sink, &mut effects),
             }
         }
         effects
@@ -288,7 +249,7 @@ impl Trees {
     pub(crate) fn link_down(&mut self, link: LinkId) -> Effects {
         let mut effects = Effects::new();
         for (name, sink) in self.of_link.remove(&link).unwrap_or_default() {
-            match self.branch(&name, &sink).map(|b| b.up == link) {
+            match self.branch(&name, &sink).map(|b| b.up() == link) {
                 Some(true) => self.cut_down(name, sink, RejectReason::RouteLost, &mut effects),
                 Some(false) => self.cut_up(name, sink, &mut effects),
                 None => {}
@@ -301,7 +262,7 @@ impl Trees {
     pub(crate) fn distrust(&mut self, is_untrusted: impl Fn(&[CertId]) -> bool) -> Effects {
         let mut gone = Vec::new();
         for (name, tree) in &self.trees {
-            let untrusted = tree.iter().filter(|(_, b)| is_untrusted(&b.certs));
+            let untrusted = tree.iter().filter(|(_, b)| is_untrusted(b.certs()));
             gone.extend(untrusted.map(|(sink, _)| (*name, *sink)));
         }
         let mut effects = Effects::new();
@@ -315,30 +276,30 @@ impl Trees {
     fn drain(&mut self, now: Instant, name: Name, sink: SinkId, effects: &mut Effects) {
         let until = now + self.answer_wait;
         let Some(branch) = self.trees.get_mut(&name).and_then(|t| t.get_mut(&sink)) else { return };
-        branch.stage = Stage::Draining { until };
+        branch.drain(until);
         self.deadlines.insert((until, name, sink));
-        effects.push(Effect::Send { link: branch.link, frame: Control::Reroute { name, sink } });
+        effects.push(Effect::Send { link: branch.link(), frame: Control::Reroute { name, sink } });
     }
 
     /// Cuts a branch in both directions.
     fn cut(&mut self, name: Name, sink: SinkId, reason: RejectReason, effects: &mut Effects) {
         if let Some(branch) = self.remove(name, sink, effects) {
-            effects.push(Effect::Send { link: branch.link, frame: Control::Reject { name, sink, reason } });
-            effects.push(Effect::Send { link: branch.up, frame: Control::Leave { name, sink } });
+            effects.push(Effect::Send { link: branch.link(), frame: Control::Reject { name, sink, reason } });
+            effects.push(Effect::Send { link: branch.up(), frame: Control::Leave { name, sink } });
         }
     }
 
     /// Cuts the rest of a branch whose upper part is gone.
     fn cut_down(&mut self, name: Name, sink: SinkId, reason: RejectReason, effects: &mut Effects) {
         if let Some(branch) = self.remove(name, sink, effects) {
-            effects.push(Effect::Send { link: branch.link, frame: Control::Reject { name, sink, reason } });
+            effects.push(Effect::Send { link: branch.link(), frame: Control::Reject { name, sink, reason } });
         }
     }
 
     /// Cuts the rest of a branch whose lower part is gone.
     fn cut_up(&mut self, name: Name, sink: SinkId, effects: &mut Effects) {
         if let Some(branch) = self.remove(name, sink, effects) {
-            effects.push(Effect::Send { link: branch.up, frame: Control::Leave { name, sink } });
+            effects.push(Effect::Send { link: branch.up(), frame: Control::Leave { name, sink } });
         }
     }
 
@@ -356,7 +317,7 @@ impl Trees {
         if let Some(deadline) = branch.deadline() {
             self.deadlines.remove(&(deadline, name, sink));
         }
-        for link in [branch.link, branch.up] {
+        for link in [branch.link(), branch.up()] {
             if let Some(of_link) = self.of_link.get_mut(&link) {
                 of_link.remove(&(name, sink));
                 if of_link.is_empty() {
@@ -364,10 +325,10 @@ impl Trees {
                 }
             }
         }
-        if let Some(count) = self.of_node.get_mut(&branch.neighbour) {
+        if let Some(count) = self.of_node.get_mut(branch.neighbour()) {
             *count -= 1;
             if *count == 0 {
-                self.of_node.remove(&branch.neighbour);
+                self.of_node.remove(branch.neighbour());
             }
         }
         Some(branch)

@@ -1,6 +1,7 @@
 //! Tests of [`Trees`] alone: without router, links and signatures.
 
 use sgc_testkit::{Member, identity};
+use sgc_wire::Role;
 
 use super::*;
 

@@ -13,7 +13,7 @@ use crate::link_id::LinkId;
 
 /// Stage of a branch, by the event that it waits for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Stage {
+enum Stage {
     /// The owner's answer.
     ExpectAnswer { until: Instant },
     /// Nothing.
@@ -22,25 +22,49 @@ pub(super) enum Stage {
     Draining { until: Instant },
 }
 
+/// A verified request to join, and the links that it takes.
+#[derive(Debug)]
+pub(crate) struct NewBranch {
+    /// The link towards the sink.
+    pub(crate) link: LinkId,
+    /// The node at its other end.
+    pub(crate) neighbour: NodeId,
+    /// The link towards the owner.
+    pub(crate) up: LinkId,
+    /// The owner of the name.
+    pub(crate) owner: Arc<VerifiedPeer>,
+    /// The node of the sink.
+    pub(crate) peer: NodeId,
+    /// Its certificates.
+    pub(crate) certs: Arc<[CertId]>,
+    pub(crate) role: Role,
+}
+
 /// A sink's place in the tree.
 #[derive(Clone, Debug)]
 pub(crate) struct Branch {
     /// The link towards the sink.
-    pub(super) link: LinkId,
+    link: LinkId,
     /// The node at its other end.
-    pub(super) neighbour: NodeId,
+    neighbour: NodeId,
     /// The link towards the owner.
-    pub(super) up: LinkId,
+    up: LinkId,
     /// The owner as its advertisement proved it when the request was passed on.
-    pub(super) owner: Arc<VerifiedPeer>,
-    pub(super) peer: NodeId,
+    owner: Arc<VerifiedPeer>,
+    peer: NodeId,
     /// The certificates of its request.
-    pub(super) certs: Arc<[CertId]>,
-    pub(super) role: Role,
-    pub(super) stage: Stage,
+    certs: Arc<[CertId]>,
+    role: Role,
+    stage: Stage,
 }
 
 impl Branch {
+    /// Returns a branch that expects the owner's answer until then.
+    pub(super) fn new(new: NewBranch, until: Instant) -> Self {
+        let NewBranch { link, neighbour, up, owner, peer, certs, role } = new;
+        Self { link, neighbour, up, owner, peer, certs, role, stage: Stage::ExpectAnswer { until } }
+    }
+
     /// Returns the link towards the sink.
     pub(crate) fn link(&self) -> LinkId {
         self.link
@@ -56,6 +80,60 @@ impl Branch {
         &self.owner
     }
 
+    /// Returns the node at the other end of the link towards the sink.
+    pub(super) fn neighbour(&self) -> &NodeId {
+        &self.neighbour
+    }
+
+    /// Returns the certificates of its request.
+    pub(super) fn certs(&self) -> &[CertId] {
+        &self.certs
+    }
+
+    /// Returns `true` if the sink is of this node, and over this link.
+    pub(super) fn is_of(&self, link: LinkId, peer: &NodeId) -> bool {
+        self.link == link && self.peer == *peer
+    }
+
+    /// Takes the certificates of a further request, and the owner as it is proved by now.
+    pub(super) fn renew(&mut self, peer: &VerifiedPeer, owner: Option<&Arc<VerifiedPeer>>) {
+        self.certs = peer.path.clone();
+        if let Some(owner) = owner {
+            self.owner = owner.clone();
+        }
+    }
+
+    /// Returns the consequence of a route change; `is_known` tells whether the name is still advertised.
+    pub(super) fn after_route_change(&self, is_known: bool, next_hop: Option<LinkId>) -> Option<RouteChange> {
+        match (next_hop, self.stage) {
+            // Withdrawn: the owner itself tells its sinks, unless it died.
+            (None, _) if !is_known => Some(RouteChange::Cut),
+            // The owner is out of reach from here; its neighbours will report it.
+            (None, _) => None,
+            (Some(next_hop), _) if next_hop == self.up => None,
+            (Some(_), Stage::ExpectAnswer { .. }) => Some(RouteChange::Cut),
+            (Some(_), Stage::Granted) => Some(RouteChange::Drain),
+            (Some(_), Stage::Draining { .. }) => None,
+        }
+    }
+
+    /// Waits for the sink's new request until then.
+    pub(super) fn drain(&mut self, until: Instant) {
+        self.stage = Stage::Draining { until };
+    }
+
+    /// Takes the owner's grant. Returns the deadline that no longer holds, or `None` if the branch expects no answer.
+    fn grant(&mut self) -> Option<Instant> {
+        let Stage::ExpectAnswer { until } = self.stage else { return None };
+        self.stage = Stage::Granted;
+        Some(until)
+    }
+
+    /// Returns `true` if it is granted and waits for nothing.
+    pub(super) fn is_granted(&self) -> bool {
+        self.stage == Stage::Granted
+    }
+
     /// Returns the time at which it is given up.
     pub(super) fn deadline(&self) -> Option<Instant> {
         match self.stage {
@@ -68,6 +146,14 @@ impl Branch {
     pub(super) fn carries(&self) -> bool {
         !matches!(self.stage, Stage::ExpectAnswer { .. })
     }
+}
+
+/// The consequence of another route for a branch.
+pub(super) enum RouteChange {
+    /// It ends.
+    Cut,
+    /// It serves while its sink asks again.
+    Drain,
 }
 
 /// The branches of one name.
@@ -113,8 +199,7 @@ impl Tree {
     /// Takes the owner's grant. Returns the deadline that no longer holds, or `None` if the branch expects no answer.
     pub(super) fn grant(&mut self, sink: &SinkId) -> Option<Instant> {
         let branch = self.branches.get_mut(sink)?;
-        let Stage::ExpectAnswer { until } = branch.stage else { return None };
-        branch.stage = Stage::Granted;
+        let until = branch.grant()?;
         self.feeds.insert((branch.link, branch.role), branch.up);
         Some(until)
     }

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use sgc_endpoint::JoinStatus;
 use sgc_ros::RosNetwork;
-use sgc_router::{LinkId, clocks_differ};
+use sgc_router::{DropReason, LinkId, clocks_differ};
 use sgc_transport::CloseReason;
 use sgc_wire::{Control, Place};
 use tracing::{debug, info, warn};
@@ -14,6 +14,7 @@ use tracing::{debug, info, warn};
 use super::Core;
 use crate::clock::now;
 use crate::control::alerts::{Alert, clock_alert};
+use crate::drops::NodeDrop;
 use crate::local::strangers;
 
 /// Place of a process that is linked to another router.
@@ -40,7 +41,7 @@ impl<N: RosNetwork> Core<N> {
         if let Some(holder) = by.and_then(|by| self.links.get(by)) {
             holder.notify(Control::IdentityInUse { place: Place::from(remote) });
         }
-        self.control_drops.count_from("identity_in_use", node);
+        self.control_drops.count_from(NodeDrop::IdentityInUse, node);
         let called = self.called(&node);
         if self.alerts.peer_in_use(node, &place, remote, Instant::now()) {
             warn!(
@@ -78,7 +79,7 @@ impl<N: RosNetwork> Core<N> {
         let Some(entry) = self.links.get(link) else { return };
         // Other peers have no links from which a process could be kept out.
         if !entry.peer().may_route && entry.url().is_none() {
-            self.control_drops.count_from("unknown", link);
+            self.control_drops.count_from(&DropReason::Unknown { what: "identity" }, link);
             return;
         }
         let (node, place) = (self.certificates.identity().node_name(), SocketAddr::from(place));
@@ -94,7 +95,7 @@ impl<N: RosNetwork> Core<N> {
         let Some(entry) = self.links.get(link) else { return };
         let ahead_ms = self.router.clock_ahead_ms(link).filter(|ms| clocks_differ(*ms));
         let Some(ahead_ms) = ahead_ms else { return };
-        if self.control_drops.count_from("clocks_differ", link) {
+        if self.control_drops.count_from(NodeDrop::ClocksDiffer, link) {
             let (peer, remote) = (self.called(&entry.peer().node_id), entry.remote().to_string());
             let alert = Alert::ClocksDiffer { peer, remote, ahead_ms };
             warn!("{alert}; {}", alert.fix());

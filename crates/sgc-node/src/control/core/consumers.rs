@@ -16,6 +16,7 @@ use tracing::{debug, info};
 use super::{Core, drop_elsewhere};
 use crate::control::event::{ConsumerKey, CoreEvent};
 use crate::control::far_consumers::{AskChanges, MadeEndpoints, ShowChanges};
+use crate::drops::NodeDrop;
 
 impl<N: RosNetwork> Core<N> {
     /// Schedules an announcement, since local consumers may have changed.
@@ -46,7 +47,7 @@ impl<N: RosNetwork> Core<N> {
         {
             let consumers = routes.consumers();
             let more = self.consumers.more_untold(consumers.left_out);
-            self.count_left_out("consumers_untold", more);
+            self.count_left_out(NodeDrop::ConsumersUntold, more);
             self.endpoint.set_consumers(now, consumers.by_owner);
         }
         if self.consumers.take_changes(now.instant) {
@@ -88,7 +89,7 @@ impl<N: RosNetwork> Core<N> {
         });
         self.graph.set_publishers(publishers);
         let more = self.consumers.more_unshown(left_out);
-        self.count_left_out("consumers_unshown", more);
+        self.count_left_out(NodeDrop::ConsumersUnshown, more);
         let ShowChanges { gone, moved, fresh } = self.consumers.show(wanted);
         for (key, endpoints) in gone {
             self.graph.consumer_gone(&key);
@@ -113,13 +114,13 @@ impl<N: RosNetwork> Core<N> {
                 let ends = match made.collect::<Result<_, RosError>>() {
                     Ok(ends) => ends,
                     Err(error @ RosError::ForbiddenPartition { .. }) => {
-                        if failures.count("consumers_forbidden") {
+                        if failures.count(NodeDrop::ConsumersForbidden) {
                             info!("far programs are not shown in the local graph: {error}");
                         }
                         continue;
                     }
                     Err(error) => {
-                        failures.count("show_consumer");
+                        failures.count(NodeDrop::ShowConsumer);
                         debug!(%error, "the local graph does not show a far subscriber or client");
                         continue;
                     }
@@ -146,7 +147,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     /// Counts more consumers without room.
-    fn count_left_out(&self, kind: &'static str, more: u64) {
+    fn count_left_out(&self, kind: NodeDrop, more: u64) {
         if more > 0 {
             self.control_drops.add(kind, more);
         }

@@ -15,12 +15,8 @@ use super::Core;
 use crate::clock::now;
 use crate::control::operations::{OperationError, Step, UserOperation};
 use crate::control::operators::{OperationOutcome, RequestStep};
+use crate::drops::NodeDrop;
 use crate::state::audit::{AuditEvent, AuditRecord};
-
-/// Counts repeated operations, which were not carried out again.
-const REPEATED: &str = "operation_repeated";
-/// Counts operations of nodes that are no operators.
-const NOT_PERMITTED: &str = "operation_not_permitted";
 
 /// Requests of this node's users.
 impl<N: RosNetwork> Core<N> {
@@ -94,23 +90,23 @@ impl<N: RosNetwork> Core<N> {
         match asked {
             RequestStep::Answer(answer) => self.answer_operator(&node, sink, answer),
             RequestStep::Again(answer) => {
-                self.control_drops.count_from(REPEATED, node);
+                self.control_drops.count_from(NodeDrop::OperationRepeated, node);
                 self.answer_operator(&node, sink, answer);
             }
             RequestStep::UnderWay => {
-                self.control_drops.count_from(REPEATED, node);
+                self.control_drops.count_from(NodeDrop::OperationRepeated, node);
             }
             RequestStep::Job(job) => {
                 // Nodes that are connected now count as present.
                 let here: Vec<_> = self.endpoint.renewing().map(|(_, peer, _)| peer.node_id).collect();
                 authority.note_seen(here, now.unix);
-                match authority.push_operation(job) {
-                    Ok(()) => self.answer_next_batch(),
-                    Err(job) => self.operation_done(job.busy()),
+                match authority.push_or_return(job) {
+                    None => self.answer_next_batch(),
+                    Some(job) => self.operation_done(job.busy()),
                 }
             }
             RequestStep::NotPermitted => {
-                if self.control_drops.count_from(NOT_PERMITTED, node) {
+                if self.control_drops.count_from(NodeDrop::OperationNotPermitted, node) {
                     warn!(peer = %node.short(), "refused an operation of a node that is no operator; counted from here on");
                 }
                 let reason = "an operation: it is no operator";
@@ -137,7 +133,7 @@ impl<N: RosNetwork> Core<N> {
 
     fn answer_operator(&mut self, node: &NodeId, sink: SinkId, answer: OperationAnswer) {
         if let OperationAnswer::Refused { why, .. } = &answer {
-            self.control_drops.count_from(why.key(), *node);
+            self.control_drops.count_from(*why, *node);
         }
         self.endpoint.answer_operation(now(), sink, Ok(answer));
     }

@@ -10,6 +10,7 @@ use tracing::{debug, info, warn};
 
 use super::{Core, graph};
 use crate::clock::now;
+use crate::drops::NodeDrop;
 use crate::state::audit::{AuditEvent, AuditRecord};
 
 impl<N: RosNetwork> Core<N> {
@@ -36,7 +37,7 @@ impl<N: RosNetwork> Core<N> {
                 self.set_anchors(anchors);
             }
             RouterOutput::Dropped(dropped) => {
-                let first = self.control_drops.count_from(dropped.reason.key(), dropped.link);
+                let first = self.control_drops.count_from(&dropped.reason, dropped.link);
                 // Honest neighbours may forward statements of which a partner's CA makes too many.
                 let is_told =
                     dropped.reason.is_suspicious() || matches!(dropped.reason, DropReason::ListFlood { .. });
@@ -87,7 +88,7 @@ impl<N: RosNetwork> Core<N> {
     fn close_overloaded(&mut self, link: LinkId) {
         let Some(entry) = self.links.get(link) else { return };
         warn!(%link, remote = %entry.remote(), "the peer does not take control frames; the link is closed");
-        self.control_drops.count_from("control_queue_full", link);
+        self.control_drops.count_from(NodeDrop::ControlQueueFull, link);
         entry.close_overloaded();
     }
 
@@ -96,7 +97,7 @@ impl<N: RosNetwork> Core<N> {
         match output {
             EndpointOutput::Send(frame) => self.router.handle_frame(now, LinkId::LOCAL, frame),
             EndpointOutput::Dropped(dropped) => {
-                let is_first = self.control_drops.count(dropped.key());
+                let is_first = self.control_drops.count(&dropped);
                 if is_first && dropped.is_suspicious() {
                     warn!(reason = %dropped, "refused; counted from here on");
                 } else {
@@ -117,7 +118,7 @@ impl<N: RosNetwork> Core<N> {
             Event::OperationDenied { name, by } => self.operation_denied(name, by),
             Event::Renewed { credentials } => self.take_credentials(credentials),
             Event::RenewRefused { by } => {
-                if self.control_drops.count("renewal_refused") {
+                if self.control_drops.count(NodeDrop::RenewalRefused) {
                     warn!(reason = %by, "the fleet's authority gives this node no credentials; asking again later");
                 }
             }
@@ -135,7 +136,7 @@ impl<N: RosNetwork> Core<N> {
                 if let Some(share) = self.shares.get(&recover.name)
                     && !self.replays.ask(share.clone(), recover)
                 {
-                    self.control_drops.count("replays_full");
+                    self.control_drops.count(NodeDrop::ReplaysFull);
                 }
             }
             Event::Granted { name, sink, grant } => {
@@ -193,7 +194,7 @@ impl<N: RosNetwork> Core<N> {
             Event::SinkRefused { name, peer, reason } => {
                 debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
                 self.refused.remember(name, peer, &reason);
-                if self.control_drops.count_from("join_refused", peer) {
+                if self.control_drops.count_from(NodeDrop::JoinRefused, peer) {
                     warn!(peer = %peer.short(), %reason, "refused a subscriber; counted from here on");
                 }
             }

@@ -23,6 +23,7 @@ use crate::data::sending::intake::Publisher;
 use crate::data::sending::manual_lease::ManualLease;
 use crate::data::sending::source_map::{SourceMap, SourceSlot};
 use crate::data::writer_queue::WriterQueue;
+use crate::drops::NodeDrop;
 
 /// Least bytes of recovery kept for one of a topic's many publishers.
 const RECOVERY_BYTES_MIN: usize = 1 << 20;
@@ -284,7 +285,7 @@ impl<N: RosNetwork> Core<N> {
                 });
             }
             Err(why) => {
-                failures.count("create_reader");
+                failures.count(NodeDrop::CreateReader);
                 error!("{why}");
             }
         });
@@ -305,7 +306,7 @@ impl<N: RosNetwork> Core<N> {
             });
             let writer = writer
                 .inspect_err(|why| {
-                    failures.count("create_writer");
+                    failures.count(NodeDrop::CreateWriter);
                     error!("{why}");
                 })
                 .ok();

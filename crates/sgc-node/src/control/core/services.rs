@@ -14,6 +14,7 @@ use crate::control::event::{CoreEvent, ServiceEnd};
 use crate::data::call_ledger::{CallLedger, CallerId};
 use crate::data::calls::{Answers, Calls, Requests};
 use crate::data::writer_queue::{WriterInfo, WriterQueue};
+use crate::drops::NodeDrop;
 
 impl<N: RosNetwork> Core<N> {
     /// Starts a shared service. Incoming messages are calls, not messages of publishers.
@@ -154,7 +155,7 @@ impl<N: RosNetwork> Core<N> {
             match make(&network, &spec) {
                 Ok(end) => drop(events.blocking_send(CoreEvent::ServiceReady { name, spec, end })),
                 Err(why) => {
-                    failures.count("create_service");
+                    failures.count(NodeDrop::CreateService);
                     error!("{why}");
                 }
             }

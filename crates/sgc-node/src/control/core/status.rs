@@ -9,6 +9,7 @@ use super::Core;
 use crate::admin::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
 use crate::control::parts::link_table::LinkEntry;
 use crate::data::stats::CountDrops;
+use crate::drops::NodeDrop;
 
 impl<N: RosNetwork> Core<N> {
     /// Returns the node's status.
@@ -78,9 +79,11 @@ impl<N: RosNetwork> Core<N> {
 
     /// Returns everything that was dropped or refused, by kind and culprit. Control frames and packets share some kinds.
     pub(super) fn all_drops(&self) -> BTreeMap<String, u64> {
-        let audit =
-            [("audit_lost", self.audit.lost_total()), ("audit_summed_up", self.audit.summed_up_total())];
-        let audit = audit.into_iter().filter(|(_, n)| *n > 0).map(|(key, n)| (key.to_owned(), n));
+        let audit = [
+            (NodeDrop::AuditLost, self.audit.lost_total()),
+            (NodeDrop::AuditSummedUp, self.audit.summed_up_total()),
+        ];
+        let audit = audit.into_iter().filter(|(_, n)| *n > 0).map(|(kind, n)| (kind.key().to_owned(), n));
         let mut all: BTreeMap<String, u64> = audit.collect();
         for counts in [
             self.control_drops.snapshot(),

@@ -15,6 +15,7 @@ use crate::clock::now;
 use crate::control::authority::{Asker, DeskAnswers, RenewalAnswer, RenewalRefusal, RenewalRequest};
 use crate::control::event::CoreEvent;
 use crate::control::parts::link_table::LinkEntry;
+use crate::drops::NodeDrop;
 use crate::state::audit::{AuditEvent, AuditRecord};
 
 impl<N: RosNetwork> Core<N> {
@@ -104,7 +105,7 @@ impl<N: RosNetwork> Core<N> {
 
     fn renewal_ready(&mut self, RenewalAnswer { asker, node, answer }: RenewalAnswer) {
         if let Err(why) = &answer
-            && self.control_drops.count_from(why.key(), node)
+            && self.control_drops.count_from(why.counter(), node)
         {
             warn!(peer = %node.short(), %why, "refused credentials; counted from here on");
         }
@@ -124,7 +125,7 @@ impl<N: RosNetwork> Core<N> {
         match answer {
             Ok(credentials) => self.take_credentials(credentials),
             Err(reason) => {
-                if self.control_drops.count("renewal_refused") {
+                if self.control_drops.count(NodeDrop::RenewalRefused) {
                     warn!(%reason, "the fleet's file has no credentials for this node; asking again later");
                 }
             }
@@ -184,7 +185,7 @@ impl<N: RosNetwork> Core<N> {
             }
             Err(why) => {
                 warn!(%why, "credentials from the fleet's authority are not usable");
-                self.control_drops.count("credentials_unusable");
+                self.control_drops.count(NodeDrop::CredentialsUnusable);
             }
         }
     }

@@ -14,6 +14,7 @@ use crate::control::event::CoreEvent;
 use crate::control::interface_types::SettledType;
 use crate::control::type_jobs::{TypeMiss, TypeOutcome};
 use crate::data::conversion::KnownType;
+use crate::drops::NodeDrop;
 
 impl<N: RosNetwork> Core<N> {
     /// Starts the search for the type of an interface, of this node or of another.
@@ -68,7 +69,7 @@ impl<N: RosNetwork> Core<N> {
     /// Handles type descriptions from an owner.
     pub(super) fn types_told(&mut self, owner: NodeId, types: Vec<DescribedType>) {
         for _ in 0..self.types.told(owner, types) {
-            self.control_drops.count("types_busy");
+            self.control_drops.count(NodeDrop::TypesBusy);
         }
         self.ask_types(owner);
         self.next_type_job();
@@ -113,8 +114,8 @@ impl<N: RosNetwork> Core<N> {
             }
             Err(why) => {
                 debug!(name = %name.short(), %why, "type not known");
-                if let Some(key) = why.key()
-                    && self.control_drops.count(key)
+                if let Some(counter) = why.counter()
+                    && self.control_drops.count(counter)
                     && (was_told || why == TypeMiss::Failed)
                 {
                     warn!(%why, "a description of a type is refused; counted from here on");
