@@ -145,6 +145,11 @@ impl<T> Queue<T> {
         self.items.is_empty()
     }
 
+    /// Returns the number of queued items.
+    pub(crate) fn len(&self) -> usize {
+        self.items.len()
+    }
+
     /// Returns `true` if the queue is less than half full.
     pub(crate) fn has_headroom(&self, bytes_max: usize) -> bool {
         self.items.len() < self.items.capacity() / 2 && self.bytes.load(Ordering::Acquire) < bytes_max / 2

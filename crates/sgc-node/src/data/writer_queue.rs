@@ -42,6 +42,13 @@ const RECENT_MAX: usize = 4096;
 pub(crate) const AT_ONCE_BYTES_MAX: usize = 16 << 10;
 /// Least time between two liveliness assertions of a writer. It is shorter than any lease that is asserted.
 const ASSERTION_SPACING: Duration = Duration::from_millis(20);
+/// Longest time for which messages of a new reliable writer wait for its first local reader. DDS programs that start
+/// together find each other within about a second.
+const FIRST_READER_WAIT_MAX: Duration = Duration::from_secs(2);
+/// Messages do not wait for the first reader once they fill half of this, or half of the places in the queue.
+const FIRST_READER_BYTES_MAX: usize = 2 << 20;
+/// Time between two looks for the first reader.
+const FIRST_READER_LOOK: Duration = Duration::from_millis(5);
 /// Longest time that a local writer may block the network.
 const WRITER_PATIENCE: Duration = Duration::from_secs(5);
 
@@ -54,6 +61,9 @@ pub(crate) struct WriterQueue {
     /// Held by the thread from before it takes a message until it has consumed it, so that no other message overtakes.
     take: Mutex<MessageConsumer>,
     info: WriterInfo,
+    opened: Instant,
+    /// Whether messages wait until the writer has its first reader.
+    awaits_reader: AtomicBool,
     /// Whether liveliness was asserted just now, or is being asserted.
     is_asserted: Arc<AtomicBool>,
     /// Closed once the thread has consumed everything.
@@ -74,12 +84,19 @@ pub(crate) enum NextMessage {
     AtOnce,
     /// The next message follows at once, and the queue is closed: messages of another writer wait for it.
     Last,
+    /// The next message follows at once. Neither has a reader, so they need no pause between them.
+    Unheard,
 }
 
 impl NextMessage {
     /// Returns `true` if the next message is taken without a pause.
     fn is_at_once(self) -> bool {
-        matches!(self, Self::AtOnce | Self::Last)
+        matches!(self, Self::AtOnce | Self::Last | Self::Unheard)
+    }
+
+    /// Returns `true` if the publisher's pace is kept for the readers.
+    fn keeps_pace(self) -> bool {
+        !matches!(self, Self::Last | Self::Unheard)
     }
 }
 
@@ -100,6 +117,8 @@ type MessageConsumer = Box<dyn FnMut(Message, NextMessage) + Send>;
 pub(crate) struct WriterInfo {
     guid: Guid,
     recent: Option<Mutex<Recent>>,
+    /// `true` if the first messages wait for a reader: it could not get them later.
+    awaits_reader: bool,
     /// Returns the number of matched local readers.
     matched: Box<dyn Fn() -> u32 + Send + Sync>,
     /// Returns `true` if a short message can be written now without blocking and without overwriting one that a reader
@@ -116,6 +135,7 @@ impl Default for WriterInfo {
         Self {
             guid: Guid([0; 16]),
             recent: None,
+            awaits_reader: false,
             matched: Box::new(|| 0),
             is_free: Box::new(|_| false),
             resize: Box::new(|_| ()),
@@ -191,8 +211,9 @@ impl WriterQueue {
         let is_manual = spec.qos.liveliness == Liveliness::ManualByTopic && spec.qos.lease_ns.is_some();
         let assert = is_manual.then_some(assert as Box<dyn Fn() + Send + Sync>);
         let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
-        let info =
-            WriterInfo { guid: writer.guid(), recent: Recent::new(spec), matched, is_free, resize, assert };
+        let awaits_reader = spec.qos.is_reliable() && !spec.qos.is_transient_local();
+        let (guid, recent) = (writer.guid(), Recent::new(spec));
+        let info = WriterInfo { guid, recent, awaits_reader, matched, is_free, resize, assert };
         let (mut decompressor, offered) = (Decompressor::default(), spec.qos.representations);
         let mut prepare = move |message: Message| {
             let mut key_hash = None;
@@ -264,7 +285,7 @@ impl WriterQueue {
                     writer.flush()
                 };
             };
-            if next != NextMessage::Last {
+            if next.keeps_pace() {
                 burst.room.space(&*writer, source, head.source_timestamp_ns);
             }
             burst.before_next(
@@ -303,6 +324,8 @@ impl WriterQueue {
             shaper: shaper.into(),
             is_unshaped: AtomicBool::new(shaping == Shaping::default()),
             take: Mutex::new(Box::new(take)),
+            opened: Instant::now(),
+            awaits_reader: AtomicBool::new(info.awaits_reader),
             info,
             is_asserted: Arc::default(),
             thread: running,
@@ -313,15 +336,18 @@ impl WriterQueue {
             // Without it, the pauses of a burst overrun by as much as they are long.
             let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(TIMER_SLACK_NS));
             while runtime.block_on(task.queue.wait()) {
+                let mut unheard = task.await_first_reader();
                 let mut take = lock(&task.take);
                 let mut behind = None;
                 while let Some(message) = runtime.block_on(task.next(&mut behind, &drops)) {
                     let next = match behind.is_none() && task.queue.is_empty() {
                         true => NextMessage::Nothing,
+                        false if unheard > 1 => NextMessage::Unheard,
                         false if task.queue.is_closed() => NextMessage::Last,
                         false if task.is_unshaped.load(Relaxed) => NextMessage::AtOnce,
                         false => NextMessage::Later,
                     };
+                    unheard = unheard.saturating_sub(1);
                     take(message, next);
                 }
             }
@@ -333,12 +359,36 @@ impl WriterQueue {
         Ok(this)
     }
 
+    /// Waits until the writer has its first reader, for a bounded time. Returns the number of messages that waited in
+    /// vain.
+    fn await_first_reader(&self) -> usize {
+        if !self.awaits_reader.load(Relaxed) {
+            return 0;
+        }
+        let may_wait = || {
+            self.opened.elapsed() < FIRST_READER_WAIT_MAX
+                && self.queue.has_headroom(FIRST_READER_BYTES_MAX)
+                && !self.queue.is_closed()
+        };
+        while self.matched() == 0 && may_wait() {
+            thread::sleep(FIRST_READER_LOOK);
+        }
+        self.awaits_reader.store(false, Relaxed);
+        if self.matched() == 0 { self.queue.len() } else { 0 }
+    }
+
     /// Returns the consumer if it takes a message now without blocking and the queue is empty. Only one caller queues
     /// at a time.
     fn at_once(&self, message: &Message) -> Option<MutexGuard<'_, MessageConsumer>> {
         let may = written_bytes(message) <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
         let take = if may { self.take.try_lock().ok() } else { None };
-        take.filter(|_| self.queue.is_empty() && !self.queue.is_closed() && (self.info.is_free)(message))
+        let is_free = || {
+            !self.awaits_reader.load(Relaxed)
+                && self.queue.is_empty()
+                && !self.queue.is_closed()
+                && (self.info.is_free)(message)
+        };
+        take.filter(|_| is_free())
     }
 
     /// Writes a message on the caller's thread if `may_write` and nothing is ahead of it, or queues it if there is room.
@@ -511,7 +561,7 @@ pub(crate) fn write_drop(error: &RosError) -> NodeDrop {
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+    use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering::Relaxed};
 
     use sgc_wire::{PayloadEncoding, SourceId};
 
@@ -597,6 +647,72 @@ pub(crate) mod tests {
         assert!(taken.iter().map(|(seq, _)| *seq).eq(0..100));
         assert!(taken[1..].iter().all(|(_, by)| *by != thread::current().id()));
         queue.close();
+    }
+
+    /// The numbers of the written messages, with the state of the queue behind each.
+    type OrderLog = Arc<Mutex<Vec<(u64, NextMessage)>>>;
+
+    /// Creates a queue whose messages wait for a reader, with the number of readers, and a log of what is written.
+    fn awaiting() -> (Arc<WriterQueue>, Arc<AtomicU32>, OrderLog) {
+        let (readers, written) = (Arc::new(AtomicU32::new(0)), OrderLog::default());
+        let (matched, log) = (readers.clone(), written.clone());
+        let info = WriterInfo {
+            awaits_reader: true,
+            matched: Box::new(move || matched.load(Relaxed)),
+            is_free: Box::new(|_| true),
+            ..WriterInfo::default()
+        };
+        let take = move |message: Message, next| log.lock().unwrap().push((message.seq, next));
+        let (alive, _) = mpsc::channel(1);
+        let queue =
+            WriterQueue::spawn_with("test", info, Shaping::default(), Arc::default(), alive, take).unwrap();
+        (queue, readers, written)
+    }
+
+    #[tokio::test]
+    async fn first_messages_wait_for_the_first_reader() {
+        let (queue, readers, written) = awaiting();
+        (0..3).for_each(|seq| give(&queue, message(seq, 16)));
+        tokio::time::sleep(4 * FIRST_READER_LOOK).await;
+        assert_eq!(*written.lock().unwrap(), []);
+        readers.store(1, Relaxed);
+        wait_until(|| written.lock().unwrap().len() == 3).await;
+        assert!(queue.opened.elapsed() < FIRST_READER_WAIT_MAX);
+        let order = [(0, NextMessage::AtOnce), (1, NextMessage::AtOnce), (2, NextMessage::Nothing)];
+        assert_eq!(*written.lock().unwrap(), order, "in order and at the publisher's pace");
+        // Later messages wait no more, even without readers.
+        readers.store(0, Relaxed);
+        wait_until(|| {
+            queue.try_push(message(3, 16), true) == WriteOutcome::Taken { evicted: 0 }
+                && written.lock().unwrap().iter().any(|(seq, _)| *seq == 3)
+        })
+        .await;
+        queue.close();
+    }
+
+    #[tokio::test]
+    async fn messages_that_nobody_hears_are_written_without_a_pause() {
+        let (queue, _, written) = awaiting();
+        (0..3).for_each(|seq| give(&queue, message(seq, 16)));
+        wait_until(|| written.lock().unwrap().len() == 3).await;
+        assert!(queue.opened.elapsed() >= FIRST_READER_WAIT_MAX);
+        let order = [(0, NextMessage::Unheard), (1, NextMessage::Unheard), (2, NextMessage::Nothing)];
+        assert_eq!(*written.lock().unwrap(), order);
+        queue.close();
+    }
+
+    #[tokio::test]
+    async fn no_message_waits_for_a_reader_in_a_crowded_or_closed_queue() {
+        let (queue, _, written) = awaiting();
+        give(&queue, message(0, FIRST_READER_BYTES_MAX / 2));
+        wait_until(|| written.lock().unwrap().len() == 1).await;
+        assert!(queue.opened.elapsed() < FIRST_READER_WAIT_MAX);
+        queue.close();
+        let (queue, _, written) = awaiting();
+        give(&queue, message(0, 16));
+        queue.close();
+        wait_until(|| written.lock().unwrap().len() == 1).await;
+        assert!(queue.opened.elapsed() < FIRST_READER_WAIT_MAX);
     }
 
     #[tokio::test]
