@@ -1,7 +1,7 @@
 //! [`Certificates`]: the identity of this node and its trust anchors, where links and gateway take them from, and the
 //! time at which the identity is renewed.
 //!
-//! The machines have copies, which the control task replaces. [`crate::control::authority`] issues certificates.
+//! The machines have copies, which the control task replaces. [`crate::control::fleet::authority`] issues certificates.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -11,7 +11,7 @@ use sgc_trust::{Identity, IdentityError, TrustAnchors, VerifiedPeer};
 use sgc_wire::{Credentials, Now, UnixMillis};
 use tokio::sync::watch;
 
-use crate::control::alerts::clock_alert;
+use crate::control::faults::alerts::clock_alert;
 use crate::gateway::Gateway;
 use crate::state::credentials::{StateWriter, renew_at, renewed};
 

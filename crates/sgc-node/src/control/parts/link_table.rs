@@ -17,7 +17,7 @@ use sgc_trust::VerifiedPeer;
 use sgc_wire::{Control, Name, NodeId};
 use tracing::info;
 
-use crate::control::peer_policies::PeerPolicies;
+use crate::control::peers::peer_policies::PeerPolicies;
 use crate::data::dataplane::Out;
 use crate::data::outflow::{FlowLimits, OutFlow};
 use crate::link::control_tx::ControlTx;
@@ -261,7 +261,7 @@ mod tests {
 
     use super::*;
     use crate::clock;
-    use crate::control::control_queue::{CONTROL_FRAMES_MAX, ControlQueue, Outgoing};
+    use crate::control::peers::control_queue::{CONTROL_FRAMES_MAX, ControlQueue, Outgoing};
     use crate::data::labels::LabelBook;
     use crate::link::lanes::{LaneAdmission, Lanes};
 
