@@ -19,7 +19,9 @@ mod node;
 mod state;
 
 pub use admin::{graph, shell};
-pub use control::{alerts, partners, policy};
+pub use control::faults::alerts;
+pub use control::fleet::partners;
+pub use control::settings::policy;
 #[cfg(feature = "benchmarks")]
 #[doc(hidden)]
 pub use data::benchmarks;
@@ -28,11 +30,11 @@ pub use state::audit;
 
 pub use admin::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
 pub use admin::{SocketError, default_socket_path};
-pub use control::members::{UnknownMember, unknown_members};
-pub use control::operations::OperationError;
-pub use control::operators::{roster_head, roster_row};
-pub use control::reload::{ConfigSource, ReloadReport};
-pub use control::rules::{RulesError, read_token};
+pub use control::fleet::members::{UnknownMember, unknown_members};
+pub use control::fleet::operations::OperationError;
+pub use control::fleet::operators::{roster_head, roster_row};
+pub use control::settings::reload::{ConfigSource, ReloadReport};
+pub use control::settings::rules::{RulesError, read_token};
 pub use data::stats::DataDrop;
 pub use discovery::RouterStatus;
 pub use drops::NodeDrop;

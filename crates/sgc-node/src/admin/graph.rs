@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use sgc_endpoint::JoinStatus;
 use sgc_wire::{Durability, History, Kind, Liveliness, Reliability, Representations};
 
-use crate::control::alerts::Alert;
+use crate::control::faults::alerts::Alert;
 
 /// Local endpoints in one document.
 pub const GRAPH_ENDPOINTS_MAX: usize = 16_384;

@@ -35,7 +35,7 @@ use self::socket::{StatusSocket, may_ask};
 use crate::admin::graph::Side;
 use crate::admin::shell::{CallRequest, PublishRequest};
 use crate::control::event::CoreEvent;
-use crate::control::reload::Reloader;
+use crate::control::settings::reload::Reloader;
 use crate::data::tap::{Tap, TapMessage, TapRequest};
 use crate::gateway::Gateway;
 

@@ -9,7 +9,7 @@ use sgc_ros::RouteStatus;
 use sgc_wire::Name;
 
 use super::route_words::route_state;
-use crate::control::alerts::Alert;
+use crate::control::faults::alerts::Alert;
 use crate::data::stats::NameStats;
 use crate::discovery::board::RouterStatus;
 

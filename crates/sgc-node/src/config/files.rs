@@ -11,7 +11,7 @@ use rustls_pki_types::pem::PemObject as _;
 use sgc_config::{FileChecks, IdentityFile, Mistake};
 use sgc_trust::{ShareToken, TOKEN_TEXT_BYTES_MAX};
 
-use crate::control::partners;
+use crate::control::fleet::partners;
 use crate::state;
 
 /// Largest file of certificates or of a key for TLS, bytes.

@@ -15,11 +15,11 @@ use tokio::sync::oneshot;
 
 use crate::admin::graph::Graph;
 use crate::admin::status::Status;
-use crate::control::authority::DeskAnswers;
-use crate::control::control_queue::{FrameRoom, InboxShare};
-use crate::control::members::MemberNames;
-use crate::control::operations::OperationError;
-use crate::control::type_jobs::TypeOutcome;
+use crate::control::fleet::authority::DeskAnswers;
+use crate::control::fleet::members::MemberNames;
+use crate::control::fleet::operations::OperationError;
+use crate::control::peers::control_queue::{FrameRoom, InboxShare};
+use crate::control::types::type_jobs::TypeOutcome;
 use crate::data::dataplane::DataPlane;
 use crate::data::outflow::OutFlow;
 use crate::data::sending::message_keys::MessageKeys;

@@ -13,7 +13,7 @@ use sgc_session::Activity;
 use sgc_wire::{Name, Packet};
 use tracing::{debug, warn};
 
-use crate::control::peer_rate::PeerRates;
+use crate::control::peers::peer_rate::PeerRates;
 use crate::data::outflow::OutFlow;
 use crate::data::pending::PendingBytes;
 use crate::data::sinks::LocalSink;

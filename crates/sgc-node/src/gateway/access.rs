@@ -16,8 +16,8 @@ use sgc_gateway::{
 use sgc_trust::{AnchorError, Identity};
 use sgc_wire::{Now, UnixMillis};
 
-use crate::control::partners::{PartnerError, Partners};
-use crate::control::policy;
+use crate::control::fleet::partners::{PartnerError, Partners};
+use crate::control::settings::policy;
 use crate::state::audit::{Audit, AuditEvent, AuditRecord};
 use crate::state::credentials::with_kept_crls;
 use crate::state::records::{self, Records};

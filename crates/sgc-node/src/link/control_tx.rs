@@ -5,7 +5,7 @@ use std::sync::Arc;
 use sgc_session::Activity;
 use sgc_wire::{Control, Name};
 
-use crate::control::control_queue::ControlQueue;
+use crate::control::peers::control_queue::ControlQueue;
 use crate::data::labels::{LabelBook, NameLabel};
 use crate::link::lanes::Lanes;
 

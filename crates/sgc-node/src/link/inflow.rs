@@ -8,7 +8,7 @@ use sgc_transport::{AnyLink, FlowEnd, FlowError, FlowRx, Link, ReceivedDatagram}
 use sgc_wire::{DecodeError, Name, Packet};
 use tracing::{debug, warn};
 
-use crate::control::peer_rate::PeerRate;
+use crate::control::peers::peer_rate::PeerRate;
 use crate::data::dataplane::DataPlane;
 use crate::data::stats::{CountDrops, DataDrop};
 

@@ -20,7 +20,7 @@ use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 use tracing::{debug, info, warn};
 
-use crate::control::control_queue::ControlQueue;
+use crate::control::peers::control_queue::ControlQueue;
 
 /// Most lanes of one link.
 pub(crate) const LANES_MAX: usize = 8;
@@ -390,7 +390,7 @@ mod tests {
 
     use super::*;
     use crate::clock::now;
-    use crate::control::control_queue::Outgoing;
+    use crate::control::peers::control_queue::Outgoing;
 
     /// A router, with nodes of its fleet that dial it.
     struct Bench {

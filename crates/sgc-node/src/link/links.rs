@@ -13,9 +13,9 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, warn};
 
-use crate::control::control_queue::{ControlQueue, InboxShare, Outgoing};
 use crate::control::event::{CoreEvent, LinkPlace};
-use crate::control::refusal_log::RefusalLog;
+use crate::control::peers::control_queue::{ControlQueue, InboxShare, Outgoing};
+use crate::control::peers::refusal_log::RefusalLog;
 use crate::data::labels::{LabelBook, Progress};
 use crate::discovery::Claims;
 use crate::link::control_tx::ControlTx;
@@ -304,7 +304,7 @@ mod tests {
 
     use super::*;
     use crate::clock::now;
-    use crate::control::control_queue::{Inbox, LINK_INBOX_BYTES_MAX};
+    use crate::control::peers::control_queue::{Inbox, LINK_INBOX_BYTES_MAX};
     use crate::discovery::{
         Board, DialTarget, Dns, KeepLink as _, LinkKeeper, LinkRequest, WorkingUrls, keep_at,
     };

@@ -13,7 +13,7 @@ use std::time::Duration;
 use sgc_config::Environment;
 use tracing::warn;
 
-use crate::control::alerts::Alert;
+use crate::control::faults::alerts::Alert;
 
 const VARIABLE: &str = "ROS_DISCOVERY_SERVER";
 /// Most processes that are examined.

@@ -6,7 +6,7 @@ use std::time::Duration;
 use sgc_dds::{Barrier, Strangers};
 use tracing::warn;
 
-use crate::control::alerts::Alert;
+use crate::control::faults::alerts::Alert;
 
 /// Most alerts that are logged.
 const LOGGED_MAX: usize = 64;

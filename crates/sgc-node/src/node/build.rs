@@ -20,12 +20,12 @@ use tokio::sync::{mpsc, watch};
 use tracing::warn;
 
 use crate::clock::now;
-use crate::control::authority::Authority;
 use crate::control::core::{Core, CoreParts};
 use crate::control::event::{CoreEvent, INBOX_MAX};
-use crate::control::peer_rate::PeerRates;
-use crate::control::policy::grantees;
-use crate::control::rules::Rules;
+use crate::control::fleet::authority::Authority;
+use crate::control::peers::peer_rate::PeerRates;
+use crate::control::settings::policy::grantees;
+use crate::control::settings::rules::Rules;
 use crate::data::sending::message_keys;
 use crate::data::sinks::SinkRequest;
 use crate::discovery::Board;

@@ -7,7 +7,7 @@ use sgc_ros::RosError;
 use sgc_transport::ListenAddr;
 use sgc_trust::{AnchorError, IdentityError};
 
-use crate::control::rules::RulesError;
+use crate::control::settings::rules::RulesError;
 use crate::gateway::GatewayStartError;
 use crate::gateway::access::AccessError;
 use crate::state::StateError;

@@ -24,7 +24,7 @@ pub fn load_identity(path: &Path) -> Result<Identity, NodeError> {
 }
 
 /// Checks the identity as [`run`](crate::run) does, and binds nothing. A certificate that is not valid yet passes, see
-/// [`clock_alert`](crate::control::alerts::clock_alert).
+/// [`clock_alert`](crate::control::faults::alerts::clock_alert).
 pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
     let identity = load_identity(&config.identity)?;
     let certified = identity.node_name().as_str();

@@ -14,7 +14,7 @@ use tokio::sync::mpsc;
 use tracing::warn;
 
 use crate::control::event::CoreEvent;
-use crate::control::reload::JoinNetwork;
+use crate::control::settings::reload::JoinNetwork;
 use crate::gateway::{Gateway, OpenLocalRos};
 use crate::local::dds_discovery::discover;
 use crate::local::network_slot::{NetworkSlot, OpenAgain};

@@ -23,8 +23,8 @@ pub use self::identity::{check_identity, load_identity};
 pub use self::local::{OpenNetwork, enclave_of};
 pub use self::options::{RunOptions, admin_socket_path};
 use crate::clock::now;
-use crate::control::alerts::clock_alert;
-use crate::control::file_watch::FileWatch;
+use crate::control::faults::alerts::clock_alert;
+use crate::control::settings::file_watch::FileWatch;
 use crate::state::run_lock::RunLock;
 
 /// Time before its certificate's end at which a node starts to warn.

@@ -9,7 +9,7 @@ use sgc_types::TypeStore;
 use tokio::sync::{mpsc, oneshot};
 
 use crate::admin;
-use crate::control::reload::ConfigSource;
+use crate::control::settings::reload::ConfigSource;
 use crate::gateway::OpenLocalRos;
 
 /// Options of a running node.

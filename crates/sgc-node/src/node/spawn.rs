@@ -12,8 +12,8 @@ use tracing::{info, warn};
 
 use crate::admin::{self, Desk};
 use crate::control::event::CoreEvent;
-use crate::control::file_watch::FileWatch;
-use crate::control::reload::{Reloader, Running};
+use crate::control::settings::file_watch::FileWatch;
+use crate::control::settings::reload::{Reloader, Running};
 use crate::discovery::{self, Claims, Dns, LinkKeeper, LocalNetwork, WorkingUrls};
 use crate::gateway::Gateway;
 use crate::link::lanes::LaneAdmission;

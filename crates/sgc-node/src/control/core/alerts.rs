@@ -13,7 +13,7 @@ use tracing::{debug, info, warn};
 
 use super::Core;
 use crate::clock::now;
-use crate::control::alerts::{Alert, clock_alert};
+use crate::control::faults::alerts::{Alert, clock_alert};
 use crate::drops::NodeDrop;
 use crate::local::strangers;
 

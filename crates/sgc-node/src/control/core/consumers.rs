@@ -15,7 +15,7 @@ use tracing::{debug, info};
 
 use super::{Core, drop_elsewhere};
 use crate::control::event::{ConsumerKey, CoreEvent};
-use crate::control::far_consumers::{AskChanges, MadeEndpoints, ShowChanges};
+use crate::control::graph::far_consumers::{AskChanges, MadeEndpoints, ShowChanges};
 use crate::drops::NodeDrop;
 
 impl<N: RosNetwork> Core<N> {

@@ -12,9 +12,9 @@ use tracing::{debug, warn};
 
 use super::Core;
 use crate::clock::now;
-use crate::control::control_queue::FrameRoom;
 use crate::control::event::LinkPlace;
 use crate::control::parts::link_table::{EndedLink, LinkMeasurement};
+use crate::control::peers::control_queue::FrameRoom;
 use crate::data::stats::CountDrops;
 use crate::link::control_tx::ControlTx;
 use crate::state::audit::{AuditEvent, AuditRecord};

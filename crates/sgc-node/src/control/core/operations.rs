@@ -13,8 +13,8 @@ use tracing::{info, warn};
 
 use super::Core;
 use crate::clock::now;
-use crate::control::operations::{OperationError, Step, UserOperation};
-use crate::control::operators::{OperationOutcome, RequestStep};
+use crate::control::fleet::operations::{OperationError, Step, UserOperation};
+use crate::control::fleet::operators::{OperationOutcome, RequestStep};
 use crate::drops::NodeDrop;
 use crate::state::audit::{AuditEvent, AuditRecord};
 

@@ -12,8 +12,8 @@ use tracing::{info, warn};
 
 use super::Core;
 use crate::clock::now;
-use crate::control::authority::{Asker, DeskAnswers, RenewalAnswer, RenewalRefusal, RenewalRequest};
 use crate::control::event::CoreEvent;
+use crate::control::fleet::authority::{Asker, DeskAnswers, RenewalAnswer, RenewalRefusal, RenewalRequest};
 use crate::control::parts::link_table::LinkEntry;
 use crate::drops::NodeDrop;
 use crate::state::audit::{AuditEvent, AuditRecord};

@@ -11,8 +11,8 @@ use tracing::{debug, warn};
 use super::Core;
 use crate::clock::now;
 use crate::control::event::CoreEvent;
-use crate::control::interface_types::SettledType;
-use crate::control::type_jobs::{TypeMiss, TypeOutcome};
+use crate::control::types::interface_types::SettledType;
+use crate::control::types::type_jobs::{TypeMiss, TypeOutcome};
 use crate::data::conversion::KnownType;
 use crate::drops::NodeDrop;
 

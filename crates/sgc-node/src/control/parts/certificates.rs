@@ -1,7 +1,7 @@
 //! [`Certificates`]: the identity of this node and its trust anchors, where links and gateway take them from, and the
 //! time at which the identity is renewed.
 //!
-//! The machines have copies, which the control task replaces. [`crate::control::authority`] issues certificates.
+//! The machines have copies, which the control task replaces. [`crate::control::fleet::authority`] issues certificates.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -11,7 +11,7 @@ use sgc_trust::{Identity, IdentityError, TrustAnchors, VerifiedPeer};
 use sgc_wire::{Credentials, Now, UnixMillis};
 use tokio::sync::watch;
 
-use crate::control::alerts::clock_alert;
+use crate::control::faults::alerts::clock_alert;
 use crate::gateway::Gateway;
 use crate::state::credentials::{StateWriter, renew_at, renewed};
 
@@ -112,5 +112,147 @@ impl Certificates {
         self.keeper.anchors(anchors.clone());
         self.store.set_anchors(TrustAnchors::clone(anchors));
         self.gateway.set_anchors(anchors);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use rand_chacha::ChaCha20Rng;
+    use rand_chacha::rand_core::SeedableRng as _;
+    use sgc_gateway::ShippedDefinitions;
+    use sgc_trust::{EnrollRequest, Fleet};
+    use tokio::sync::mpsc;
+
+    use super::*;
+    use crate::state::run_lock::RunLock;
+
+    const BEGIN: UnixMillis = UnixMillis(1_795_000_000_000);
+    const DAY: Duration = Duration::from_secs(86_400);
+
+    /// The certificates of a node of this fleet, beside what takes them over.
+    struct Bench {
+        fleet: Fleet,
+        rng: ChaCha20Rng,
+        first: Arc<Identity>,
+        certificates: Certificates,
+        store: CredentialStore,
+        redialled: watch::Receiver<()>,
+        start: Instant,
+        _dir: tempfile::TempDir,
+    }
+
+    impl Bench {
+        /// Creates a node whose certificate begins at [`BEGIN`] and that starts as much later or earlier.
+        async fn new(now: UnixMillis) -> Self {
+            let mut rng = ChaCha20Rng::seed_from_u64(8);
+            let mut fleet = Fleet::create("lab".parse().unwrap(), BEGIN, &mut rng).unwrap();
+            let first = fleet.enroll(&EnrollRequest::new("arm".parse().unwrap(), BEGIN), &mut rng).unwrap();
+            let (first, dir) = (Arc::new(first), tempfile::tempdir().unwrap());
+            let file = dir.path().join("arm.identity");
+            std::fs::write(&file, first.to_text().as_bytes()).unwrap();
+            let run_lock = RunLock::take(&file, None, first.node_id()).await.unwrap();
+            let keeper = StateWriter::spawn(None, file, run_lock, mpsc::channel(1).0);
+            let store = CredentialStore::new(first.clone());
+            let gateway = Gateway::new(None, "arm", ShippedDefinitions);
+            let (redial, redialled) = watch::channel(());
+            let certificates = Certificates::new(first.clone(), store.clone(), gateway, keeper, redial, now);
+            Self { fleet, rng, first, certificates, store, redialled, start: Instant::now(), _dir: dir }
+        }
+
+        fn at(&self, since: Duration) -> Now {
+            let unix = UnixMillis(BEGIN.0 + since.as_millis() as u64);
+            Now { unix, instant: self.start + since }
+        }
+
+        /// Returns credentials with another certificate for the node's key.
+        fn another(&mut self, since: Duration) -> Credentials {
+            let now = self.at(since).unix;
+            let (csr, pseudonym) = (self.first.csr(), self.first.pseudonym());
+            self.fleet.renew_csr(&csr, &pseudonym, 30 * DAY, now, &mut self.rng).unwrap()
+        }
+    }
+
+    #[tokio::test]
+    async fn clock_before_the_certificate_is_reported_once_it_is_right() {
+        let begin = Bench::new(BEGIN).await.first.as_peer().not_before;
+        let early = UnixMillis(begin.0 - 1);
+        let mut certificates = Bench::new(early).await.certificates;
+        assert!(!certificates.clock_has_come(early));
+        assert!(certificates.clock_has_come(begin) && !certificates.clock_has_come(begin));
+        assert!(!certificates.clock_has_come(early), "a clock that is set back is none that came");
+        assert!(!Bench::new(begin).await.certificates.clock_has_come(begin), "it was right at the start");
+    }
+
+    #[tokio::test]
+    async fn renewal_is_due_once_and_only_after_credentials_were_asked_for() {
+        let mut bench = Bench::new(BEGIN).await;
+        let certificates = &mut bench.certificates;
+        assert_eq!(certificates.deadline(), None);
+        assert!(!certificates.take_renewal_due(bench.start + 10_000 * DAY));
+        let now = Now { unix: BEGIN, instant: bench.start };
+        certificates.renewal_asked(now);
+        let due = certificates.deadline().unwrap();
+        assert_eq!(due, renew_at(&bench.first, now));
+        assert!(!certificates.take_renewal_due(due - Duration::from_millis(1)));
+        assert!(certificates.take_renewal_due(due) && !certificates.take_renewal_due(due));
+        assert_eq!(certificates.deadline(), None);
+    }
+
+    #[tokio::test]
+    async fn another_certificate_is_shown_by_new_links_and_the_same_one_changes_nothing() {
+        let mut bench = Bench::new(BEGIN).await;
+        let credentials = bench.another(DAY);
+        let now = bench.at(DAY);
+        let renewed = bench.certificates.renew(now, credentials.clone()).unwrap().unwrap();
+        assert_ne!(renewed.chain(), bench.first.chain());
+        for shown in [bench.certificates.identity(), &bench.store.identity()] {
+            assert_eq!(shown.chain(), renewed.chain());
+        }
+        assert!(bench.redialled.has_changed().unwrap());
+        assert_eq!(bench.certificates.deadline(), Some(renew_at(&renewed, now)));
+        bench.redialled.mark_unchanged();
+        assert!(bench.certificates.renew(bench.at(2 * DAY), credentials).unwrap().is_none());
+        assert!(!bench.redialled.has_changed().unwrap());
+        assert_eq!(bench.certificates.deadline(), Some(renew_at(&renewed, now)), "nothing was renewed");
+    }
+
+    #[tokio::test]
+    async fn secret_for_later_names_is_taken_over_without_another_link() {
+        let mut bench = Bench::new(BEGIN).await;
+        let now = bench.at(DAY);
+        bench.fleet.rotate_secret(now.unix, &mut bench.rng).unwrap();
+        let node = bench.first.node_name().clone();
+        let credentials = bench.fleet.credentials_for(&node, Vec::new()).unwrap();
+        let renewed = bench.certificates.renew(now, credentials).unwrap().unwrap();
+        assert_eq!(renewed.chain(), bench.first.chain());
+        assert_eq!(renewed.naming_secrets().len(), bench.first.naming_secrets().len() + 1);
+        assert!(!bench.redialled.has_changed().unwrap(), "links show the certificate only");
+    }
+
+    #[tokio::test]
+    async fn credentials_of_another_node_are_refused() {
+        let mut bench = Bench::new(BEGIN).await;
+        let request = EnrollRequest::new("desk".parse().unwrap(), BEGIN);
+        let desk = bench.fleet.enroll(&request, &mut bench.rng).unwrap();
+        let (chain, secrets) = (desk.chain_bytes(), bench.another(DAY).secrets);
+        assert!(bench.certificates.renew(bench.at(DAY), Credentials { chain, secrets }).is_err());
+        assert!(Arc::ptr_eq(bench.certificates.identity(), &bench.first));
+        assert!(!bench.redialled.has_changed().unwrap());
+    }
+
+    #[tokio::test]
+    async fn peer_of_a_ca_that_is_no_longer_trusted_is_objected_to() {
+        let mut bench = Bench::new(BEGIN).await;
+        let partner = Fleet::create("partner".parse().unwrap(), BEGIN, &mut bench.rng).unwrap();
+        let peer = bench.first.as_peer().clone();
+        let objection = |bench: &Bench, at| bench.certificates.objection(&peer, at);
+        assert_eq!(objection(&bench, BEGIN), None);
+        let over = UnixMillis(peer.not_after.0 + 1000);
+        assert_eq!(objection(&bench, over), Some(CloseReason::Expired));
+        bench.certificates.set_anchors(&Arc::new(partner.anchors().clone()));
+        assert!(matches!(objection(&bench, BEGIN), Some(CloseReason::Denied(_))));
+        assert_eq!(bench.certificates.anchors().crls().count(), 0);
     }
 }

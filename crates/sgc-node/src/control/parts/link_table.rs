@@ -17,7 +17,7 @@ use sgc_trust::VerifiedPeer;
 use sgc_wire::{Control, Name, NodeId};
 use tracing::info;
 
-use crate::control::peer_policies::PeerPolicies;
+use crate::control::peers::peer_policies::PeerPolicies;
 use crate::data::dataplane::Out;
 use crate::data::outflow::{FlowLimits, OutFlow};
 use crate::link::control_tx::ControlTx;
@@ -249,5 +249,173 @@ impl LinkEntry {
             self.link.close(CloseReason::Silent);
         }
         verdict.is_silent()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand_core::{OsRng, TryRngCore as _};
+    use sgc_transport::{CredentialStore, Dialer, LinkOptions, LinkUrl, Listener};
+    use sgc_trust::{EnrollRequest, Fleet};
+    use tokio::sync::mpsc;
+
+    use super::*;
+    use crate::clock;
+    use crate::control::peers::control_queue::{CONTROL_FRAMES_MAX, ControlQueue, Outgoing};
+    use crate::data::labels::LabelBook;
+    use crate::link::lanes::{LaneAdmission, Lanes};
+
+    const NAME: Name = Name([1; 32]);
+    const OTHER: Name = Name([2; 32]);
+
+    /// Two nodes with links between them.
+    struct Bench {
+        dialer: Dialer,
+        listener: Listener,
+        url: LinkUrl,
+        /// The node at the other end.
+        dialled: NodeId,
+        /// The far ends of the links.
+        far: Vec<AnyLink>,
+        table: LinkTable,
+    }
+
+    impl Bench {
+        fn new() -> Self {
+            let rng = &mut OsRng.unwrap_err();
+            let now = clock::now().unix;
+            let fleet = Fleet::create("lab".parse().unwrap(), now, rng).unwrap();
+            let mut enroll = |node: &str| {
+                let request = EnrollRequest::new(node.parse().unwrap(), now);
+                CredentialStore::new(Arc::new(fleet.issue(&request, rng).unwrap()))
+            };
+            let (arm, cloud) = (enroll("arm"), enroll("cloud"));
+            let dialled = cloud.identity().node_id();
+            let addr = "quic://127.0.0.1:0".parse().unwrap();
+            let listener = Listener::bind(&addr, cloud, LinkOptions::default(), Arc::default()).unwrap();
+            let url = listener.local().to_string().parse().unwrap();
+            let dialer = Dialer::new(arm, LinkOptions::default(), Arc::default());
+            let table = LinkTable::new(KeepAlivePolicy::default());
+            Self { dialer, listener, url, dialled, far: Vec::new(), table }
+        }
+
+        /// Adds a link. Returns its number and its control frames.
+        async fn add(&mut self, now: Instant) -> (LinkId, mpsc::Receiver<Outgoing>) {
+            let (near, far) = tokio::join!(self.dialer.dial(&self.url), self.listener.accept());
+            let near = near.unwrap();
+            self.far.push(far.unwrap().unwrap());
+            let (frames, outgoing) = ControlQueue::new();
+            let lanes = Lanes::new(near.clone(), frames.clone(), None, LaneAdmission::default());
+            let control = ControlTx::new(frames, LabelBook::new(Arc::default()), Arc::default(), lanes);
+            (self.table.add(now, near, Some(self.url.to_string()), control), outgoing)
+        }
+    }
+
+    #[tokio::test]
+    async fn number_of_a_link_is_never_used_again() {
+        let (mut bench, now) = (Bench::new(), Instant::now());
+        let (first, _frames) = bench.add(now).await;
+        let remote = bench.table.get(first).unwrap().remote();
+        let ended = bench.table.remove(first).unwrap();
+        assert_eq!((ended.node, ended.remote), (bench.dialled, remote));
+        assert!(bench.table.remove(first).is_none() && bench.table.get(first).is_none());
+        let (second, _frames) = bench.add(now).await;
+        assert_eq!((first, second), (LinkId(1), LinkId(2)));
+        assert_eq!(bench.table.iter().map(|(id, _)| id).collect::<Vec<_>>(), [second]);
+    }
+
+    #[tokio::test]
+    async fn reason_of_an_end_is_that_for_which_this_node_closed_the_link() {
+        let (mut bench, now) = (Bench::new(), Instant::now());
+        let (closed, _frames) = bench.add(now).await;
+        let (lost, _frames) = bench.add(now).await;
+        bench.table.close(closed, "revoked here".into(), CloseReason::Revoked);
+        bench.table.close(LinkId(9), "there is none".into(), CloseReason::Revoked);
+        assert_eq!(bench.table.remove(closed).unwrap().closed_for.as_deref(), Some("revoked here"));
+        assert_eq!(bench.table.remove(lost).unwrap().closed_for, None);
+        assert!(bench.far[0].recv_control().await.is_err(), "the far end hears of it");
+    }
+
+    #[tokio::test]
+    async fn links_are_measured_every_half_second_while_there_are_any() {
+        let (mut bench, begin) = (Bench::new(), Instant::now());
+        let at = |ms| begin + Duration::from_millis(ms);
+        assert_eq!(bench.table.deadline(), None);
+        assert!(bench.table.look(at(0)).is_empty());
+        let (first, _frames) = bench.add(at(0)).await;
+        let (second, _frames) = bench.add(at(300)).await;
+        assert_eq!(bench.table.deadline(), Some(at(500)), "the second link does not move the look");
+        assert!(bench.table.look(at(499)).is_empty());
+        let measured: Vec<_> = bench.table.look(at(500)).iter().map(|seen| seen.link).collect();
+        assert_eq!((measured, bench.table.deadline()), (vec![first, second], Some(at(1000))));
+        bench.table.remove(first);
+        bench.table.remove(second);
+        assert!(bench.table.look(at(1000)).is_empty());
+        assert_eq!(bench.table.deadline(), None);
+    }
+
+    #[tokio::test]
+    async fn link_of_a_peer_that_does_not_answer_is_closed_after_probes() {
+        let (mut bench, begin) = (Bench::new(), Instant::now());
+        let (link, mut frames) = bench.add(begin).await;
+        // The transport may still count late packets of the handshake, which are signs of life.
+        let mut looks = (1..).map(|n| begin + n * LOOK_EVERY);
+        let closed = looks.by_ref().take(100).find(|now| {
+            let seen = bench.table.look(*now);
+            assert!(seen.len() == 1 && seen[0].link == link);
+            bench.table.links[&link].closed_for.is_some() && seen[0].is_silent
+        });
+        assert!(closed.is_some(), "a silent peer is given up");
+        assert!(matches!(frames.recv().await, Some(Outgoing::Frame(Control::Probe { answers: false }))));
+        let ended = bench.table.remove(link).unwrap();
+        assert_eq!(ended.closed_for, Some(CloseReason::Silent.to_string()));
+    }
+
+    #[tokio::test]
+    async fn only_a_peer_with_a_full_queue_is_too_far_behind() {
+        let (mut bench, now) = (Bench::new(), Instant::now());
+        let (link, mut frames) = bench.add(now).await;
+        for _ in 0..CONTROL_FRAMES_MAX {
+            assert!(bench.table.send(link, Control::Goodbye));
+        }
+        assert!(!bench.table.send(link, Control::Goodbye) && !bench.table.flush(link));
+        assert!(matches!(frames.recv().await, Some(Outgoing::Frame(Control::Goodbye))));
+        assert!(bench.table.flush(link) && !bench.table.flush(link));
+        let gone = LinkId(9);
+        assert!(bench.table.send(gone, Control::Goodbye) && bench.table.flush(gone), "it has ended");
+    }
+
+    #[tokio::test]
+    async fn name_has_one_queue_on_each_link_until_its_flows_end() {
+        let (mut bench, now) = (Bench::new(), Instant::now());
+        let (first, _frames) = bench.add(now).await;
+        let (second, _frames) = bench.add(now).await;
+        let mut flow = |id, name| match bench.table.out(id, name, FlowLimits::default()) {
+            Some(Out::Link(flow, _)) => flow,
+            _ => panic!("the link is up"),
+        };
+        let (kept, ended, other) = (flow(first, NAME), flow(second, NAME), flow(second, OTHER));
+        assert!(Arc::ptr_eq(&kept, &flow(first, NAME)) && !Arc::ptr_eq(&ended, &other));
+        bench.table.end_flows(&NAME, &[first]);
+        tokio::time::timeout(Duration::from_secs(20), ended.ended()).await.expect("its queue is closed");
+        let mut left = bench.table.close_flows();
+        assert_eq!(left.len(), 2);
+        left.retain(|flow| !Arc::ptr_eq(flow, &kept) && !Arc::ptr_eq(flow, &other));
+        assert!(left.is_empty());
+        for flow in [kept, other] {
+            tokio::time::timeout(Duration::from_secs(20), flow.ended()).await.expect("its queue is closed");
+        }
+        assert!(bench.table.out(LinkId(9), NAME, FlowLimits::default()).is_none(), "it has ended");
+    }
+
+    #[tokio::test]
+    async fn goodbye_goes_out_on_every_link() {
+        let (mut bench, now) = (Bench::new(), Instant::now());
+        let (_, mut first) = bench.add(now).await;
+        let (_, mut second) = bench.add(now).await;
+        assert_eq!(bench.table.say_goodbye().len(), 2);
+        for frames in [&mut first, &mut second] {
+            assert!(matches!(frames.recv().await, Some(Outgoing::Frame(Control::Goodbye))));
+        }
     }
 }

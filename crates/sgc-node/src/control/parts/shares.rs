@@ -84,3 +84,76 @@ impl Shares {
         self.silence_due
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::sending::fixtures::{KNOWN, NAME, add_tree, map_of, sample, slot_with_id};
+
+    const OTHER: Name = Name([2; 32]);
+
+    /// Returns shares of two names with a source each, whose epochs have two messages.
+    fn shares() -> (Shares, Arc<DataPlane>) {
+        let data = Arc::<DataPlane>::default();
+        let mut shares = Shares::new(data.clone(), mpsc::channel(1).0, 2);
+        for (id, name) in [NAME, OTHER].into_iter().enumerate() {
+            shares.add(name).set_map(map_of(slot_with_id(id as u8)));
+        }
+        (shares, data)
+    }
+
+    fn publish(shares: &Shares, name: &Name) {
+        shares.get(name).unwrap().publish(sample(KNOWN, false));
+    }
+
+    #[tokio::test]
+    async fn full_epoch_is_reported_once_and_for_its_name_only() {
+        let (shares, _) = shares();
+        publish(&shares, &NAME);
+        publish(&shares, &OTHER);
+        assert_eq!(shares.take_epochs_over(), []);
+        publish(&shares, &NAME);
+        shares.epoch_over().notified().await;
+        assert_eq!(shares.take_epochs_over(), [NAME]);
+        assert_eq!(shares.take_epochs_over(), []);
+    }
+
+    #[tokio::test]
+    async fn all_sources_are_looked_at_once_a_second_until_all_are_silent() {
+        let (mut shares, _) = shares();
+        let begin = Instant::now();
+        let at = |ms| begin + Duration::from_millis(ms);
+        shares.look_for_silence(at(0));
+        assert_eq!(shares.deadline(), None, "nothing was published");
+        publish(&shares, &NAME);
+        publish(&shares, &OTHER);
+        shares.look_for_silence(at(0));
+        assert_eq!(shares.deadline(), Some(at(1000)));
+        shares.look_for_silence(at(999));
+        assert_eq!(shares.deadline(), Some(at(1000)), "the look is not due");
+        shares.look_for_silence(at(1000));
+        assert_eq!(shares.deadline(), Some(at(2000)));
+        // Each look of a share that has begun goes on, so one share does not hide the other.
+        let looks = (2..).map(|s| at(1000 * s)).take_while(|now| {
+            shares.look_for_silence(*now);
+            shares.deadline().is_some()
+        });
+        assert!(looks.take(60).count() < 60, "the silence of both is announced");
+    }
+
+    #[tokio::test]
+    async fn removed_share_is_gone_and_closed_ones_stay() {
+        let (mut shares, data) = shares();
+        add_tree(&data);
+        let removed = shares.get(&NAME).unwrap().clone();
+        shares.remove(&NAME);
+        shares.remove(&NAME);
+        assert!(shares.get(&NAME).is_none() && shares.get(&OTHER).is_some());
+        removed.publish(sample(KNOWN, false));
+        assert_eq!(removed.published(), 0, "it is closed");
+        publish(&shares, &OTHER);
+        shares.close();
+        publish(&shares, &OTHER);
+        assert_eq!(shares.get(&OTHER).unwrap().published(), 1);
+    }
+}

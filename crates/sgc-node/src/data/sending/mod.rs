@@ -14,7 +14,7 @@ pub(crate) mod assertions;
 mod emit;
 mod encode;
 #[cfg(test)]
-mod fixtures;
+pub(crate) mod fixtures;
 mod hold;
 pub(crate) mod intake;
 pub(crate) mod manual_lease;

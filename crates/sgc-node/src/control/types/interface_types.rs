@@ -17,7 +17,7 @@ use sgc_types::{
 };
 use sgc_wire::{CatalogueEntry, DescribedType, Name, NodeId};
 
-use crate::control::type_jobs::{FoundType, Job, TypeEntry, TypeMiss, TypeOutcome, TypeQuery};
+use crate::control::types::type_jobs::{FoundType, Job, TypeEntry, TypeMiss, TypeOutcome, TypeQuery};
 use crate::data::conversion::KnownType;
 
 /// Types that are tried again when room returns.

@@ -17,7 +17,7 @@ use sgc_config::{Config, TokenSource};
 use tokio::net::unix::pipe::Receiver;
 use tracing::{debug, warn};
 
-use crate::control::reload::Reloader;
+use crate::control::settings::reload::Reloader;
 
 /// Quiet time before the files are read, since editors take several steps.
 const QUIET: Duration = Duration::from_millis(200);

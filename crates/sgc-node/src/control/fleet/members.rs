@@ -332,7 +332,8 @@ mod tests {
         let [arm, desk] = members(&mut fleet, [("arm", &[]), ("desk", &["ops"])]);
         let config = config(RULES);
         let mut members = Members::new(MemberNames::from_config(&config, &arm), &arm);
-        let grantees = crate::control::policy::grantees(&config.shares[0].to, &arm, &Default::default());
+        let grantees =
+            crate::control::settings::policy::grantees(&config.shares[0].to, &arm, &Default::default());
         let unheard = |members: &Members| -> BTreeMap<String, Option<String>> {
             members.unheard(&grantees).into_iter().map(|name| (name.written, name.meant)).collect()
         };
@@ -354,7 +355,11 @@ mod tests {
         assert!(members.misspelt().next().is_none());
         assert!(
             members
-                .unheard(&crate::control::policy::grantees(&right.shares[0].to, &arm, &Default::default()))
+                .unheard(&crate::control::settings::policy::grantees(
+                    &right.shares[0].to,
+                    &arm,
+                    &Default::default()
+                ))
                 .is_empty()
         );
     }

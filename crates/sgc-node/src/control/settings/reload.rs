@@ -27,7 +27,7 @@ use tracing::{info, warn};
 
 use crate::clock::now;
 use crate::control::event::CoreEvent;
-use crate::control::rules::Rules;
+use crate::control::settings::rules::Rules;
 use crate::data::sending::message_keys::{MessageKeys, make_for};
 use crate::discovery::{self, Board, LinkKeeper};
 use crate::gateway::access::access_with;

@@ -11,9 +11,9 @@ use sgc_ros::{Direction, Interface, Part, Shaping, ShareRule, UseRule, is_topic_
 use sgc_trust::{Identity, ShareToken, TOKEN_TEXT_BYTES_MAX, TokenError};
 use sgc_wire::{Kind, NodeId, UnixMillis};
 
-use crate::control::members::{MemberNames, unknown_members};
-use crate::control::partners::{PartnerError, Partners};
-use crate::control::policy;
+use crate::control::fleet::members::{MemberNames, unknown_members};
+use crate::control::fleet::partners::{PartnerError, Partners};
+use crate::control::settings::policy;
 use crate::state;
 use crate::state::audit::PeerNames;
 use crate::state::fleet_file::read_fleet;

@@ -21,7 +21,7 @@ use sgc_trust::{
 use sgc_wire::{Credentials, NodeId, Now, RefuseReason, SinkId, UnixMillis};
 use tracing::{error, info, warn};
 
-use crate::control::operators::{
+use crate::control::fleet::operators::{
     OPERATIONS_WAITING_MAX, OperationJob, OperationOutcome, Operators, RequestStep,
 };
 use crate::drops::NodeDrop;

@@ -10,7 +10,7 @@ use sgc_ros::{Interface, Part, ShareRule};
 use sgc_trust::{CaFingerprint, Grantees, Identity, Policy, VerifiedPeer};
 use sgc_wire::{GroupTag, Kind, Metadata, NodeId, Role};
 
-use crate::control::partners::Partners;
+use crate::control::fleet::partners::Partners;
 
 /// A node as its certificate proves it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -140,7 +140,7 @@ pub fn explain(
 fn tokens_of<'p>(
     share: &'p ShareConfig,
     partners: &'p Partners,
-) -> impl Iterator<Item = &'p crate::control::partners::TokenGrant> {
+) -> impl Iterator<Item = &'p crate::control::fleet::partners::TokenGrant> {
     partners.tokens.iter().filter(|grant| {
         grant.topic == share.topic && share.type_name.as_ref().is_none_or(|t| *t == grant.type_name)
     })
