@@ -20,7 +20,7 @@ use self::local::{ends, line_of, name_at_owner, silent, traffic};
 use self::share::walk_share;
 use self::uncovered::uncovered;
 use self::uses::walk_use;
-use crate::finding::{Direction, Finding, Hop, NameFinding, NodeFinding, UnansweredCalls};
+use crate::finding::{Direction, Finding, Hop, LocalFinding, NameFinding, NodeFinding, UnansweredCalls};
 use crate::step::{Step, Verdict, Walk};
 
 /// Time in seconds for which lost calls count as a fault, unless calls are answered before.
@@ -197,7 +197,14 @@ fn walk_parts(graph: &Graph, topic: &str, steps: &mut Walk) -> bool {
     let kinds = [sgc_ros::Interface::Action, sgc_ros::Interface::Parameters];
     let mut is_any = false;
     for part in kinds.into_iter().flat_map(|kind| kind.parts()) {
-        let for_part = merged(walks(graph, &part.name(topic)));
+        let mut for_part = merged(walks(graph, &part.name(topic)));
+        // A client subscribes to the topics of an action only while it runs.
+        for step in &mut for_part {
+            if matches!(&step.finding, Finding::Local(LocalFinding::NoSubscriber { .. })) {
+                let action = topic.to_owned();
+                *step = Step::unknown(Finding::Local(LocalFinding::NoActionClient { action }));
+            }
+        }
         is_any |= !for_part.is_empty();
         // The parts share most of their steps.
         let is_known = |step: &Step| steps.iter().any(|known| known.finding.is_same_of_part(&step.finding));

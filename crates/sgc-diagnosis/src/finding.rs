@@ -351,6 +351,10 @@ pub(crate) enum LocalFinding {
         topic: String,
         meant: Vec<String>,
     },
+    /// No program here uses the action, so nobody subscribes to its topics.
+    NoActionClient {
+        action: String,
+    },
     SubscribedTypeDiffers {
         far: String,
         here: String,

@@ -253,6 +253,11 @@ fn action_is_walked_by_its_parts() {
     graph.uses.extend(action_part("get_result").uses);
     assert_eq!(wrong(&graph, "/fib"), "");
     assert_eq!(wrong(&graph, "/fib/_action/get_result"), "");
+    let mut feedback = action_part("feedback").uses;
+    feedback[0].kind = Interface::Topic;
+    graph.uses.extend(feedback);
+    assert_eq!(wrong(&graph, "/fib"), "", "nobody here has to use the action");
+    assert!(wrong(&graph, "/fib/_action/feedback").contains("nobody on this local network subscribes"));
     graph.uses[1].routes[0].writers = 0;
     assert!(wrong(&graph, "/fib").contains("nothing on the local network answers for it"));
     assert_eq!(wrong(&graph, "/fib/_action/send_goal"), "");

@@ -542,6 +542,9 @@ impl fmt::Display for LocalFinding {
             Self::NoSubscriber { topic, meant } => {
                 write!(f, "nobody on this local network subscribes to {topic}{}", hint(meant))
             }
+            Self::NoActionClient { action } => {
+                write!(f, "no client of {action} runs on this local network")
+            }
             Self::SubscribedTypeDiffers { far, here } => {
                 write!(f, "the far side has {far}, and the local subscribers have {here}")
             }
@@ -586,6 +589,9 @@ impl LocalFinding {
                 "start a subscriber; if one runs, compare `domain_id` and `discovery_range` in [ros] with its ROS_DOMAIN_ID and \
                  ROS_AUTOMATIC_DISCOVERY_RANGE"
                     .into()
+            }
+            Self::NoActionClient { .. } => {
+                "that is no fault: start a client, or send a goal with `ros2 action send_goal`".into()
             }
             Self::SubscribedTypeDiffers { .. } => "the two never talk: use one type on both sides".into(),
             Self::SubscribedDefinitionDiffers { .. } => ONE_VERSION.into(),

@@ -323,6 +323,13 @@ fn services_and_actions() -> Vec<Scenario> {
     let mut graph = action_part("send_goal");
     graph.uses.extend(action_part("get_result").uses);
     all.push(asked("parts of an action", &graph, "/fib"));
+    let mut idle = graph.clone();
+    for topic in ["feedback", "status"] {
+        let mut part = action_part(topic).uses;
+        part[0].kind = Interface::Topic;
+        idle.uses.extend(part);
+    }
+    all.push(asked("action without a client here", &idle, "/fib"));
     graph.uses[1].routes[0].writers = 0;
     all.push(asked("parts of an action of which one fails", &graph, "/fib"));
     all.push(asked("no action", &graph, "/other"));
