@@ -287,6 +287,8 @@ pub(crate) enum UseFinding {
     },
     Received {
         messages: u64,
+        /// Time since the last one, seconds.
+        last_s: Option<u64>,
     },
     /// The local publishers have other types than the owner takes.
     TakesOther {

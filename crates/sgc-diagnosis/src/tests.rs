@@ -248,6 +248,22 @@ fn services_and_actions_have_clients_and_servers() {
 }
 
 #[test]
+fn age_of_the_last_message_is_shown() {
+    let shown = |last_s| {
+        let mut graph = user();
+        graph.uses[0].routes[0].last_s = last_s;
+        let steps = crate::diagnose::interface(&graph, "/a");
+        steps.iter().map(|step| step.finding.to_string()).find(|text| text.contains("were given")).unwrap()
+    };
+    assert_eq!(
+        shown(Some(0)),
+        "3 messages were given to the local network, the last one less than a second ago"
+    );
+    assert_eq!(shown(Some(7)), "3 messages were given to the local network, the last one 7 s ago");
+    assert_eq!(shown(None), "3 messages were given to the local network", "an older node does not say");
+}
+
+#[test]
 fn action_is_walked_by_its_parts() {
     let mut graph = action_part("send_goal");
     graph.uses.extend(action_part("get_result").uses);

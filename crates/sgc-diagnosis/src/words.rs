@@ -417,8 +417,13 @@ impl fmt::Display for UseFinding {
             ),
             Self::Answered { owner } => write!(f, "local clients are answered for {owner}"),
             Self::NoMessage { owner, .. } => write!(f, "nothing has come from {owner} yet"),
-            Self::Received { messages } => {
-                write!(f, "{messages} messages were given to the local network")
+            Self::Received { messages, last_s } => {
+                write!(f, "{messages} messages were given to the local network")?;
+                match last_s {
+                    Some(0) => f.write_str(", the last one less than a second ago"),
+                    Some(s) => write!(f, ", the last one {s} s ago"),
+                    None => Ok(()),
+                }
             }
             Self::TakesOther { owner, taken, types } => {
                 write!(f, "{owner} takes it as {taken}, and the local publishers have {}", types.join(", "))

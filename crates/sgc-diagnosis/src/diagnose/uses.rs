@@ -172,7 +172,7 @@ fn walk_route(graph: &Graph, used: &Use, route: &UseRoute, steps: &mut Walk) {
     steps.push(if route.messages == 0 {
         Step::unknown(Finding::Use(UseFinding::NoMessage { owner: owner(), topic: far_topic() }))
     } else {
-        fine(UseFinding::Received { messages: route.messages })
+        fine(UseFinding::Received { messages: route.messages, last_s: route.last_s })
     });
     traffic(&line, Direction::In, steps);
 }

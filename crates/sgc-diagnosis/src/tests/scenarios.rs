@@ -107,6 +107,7 @@ pub(super) fn user() -> Graph {
         writers: 1,
         matched: 1,
         messages: 3,
+        last_s: Some(7),
         ..UseRoute::default()
     };
     let used = Use {

@@ -463,6 +463,8 @@ pub struct UseRoute {
     pub is_read: bool,
     /// Number of messages that were written to the local network, or published.
     pub messages: u64,
+    /// Time in seconds since the last message was written to the local network.
+    pub last_s: Option<u64>,
     /// Whether messages travel as JSON although their type is unknown here.
     pub lacks_definition: bool,
 }

@@ -101,6 +101,12 @@ impl LocalSink {
         self.writers.load().values().map(|writer| writer.matched()).max().unwrap_or(0)
     }
 
+    /// Returns the time since the last message was written to the local network.
+    pub(crate) fn since_last(&self) -> Option<Duration> {
+        let last = self.writers.load().values().filter_map(|writer| writer.last_written()).max();
+        last.map(|last| last.elapsed())
+    }
+
     /// Applies a grant. A task writes the packets that waited for it, since that may take a while.
     pub(crate) fn grant(self: &Arc<Self>, id: SinkId, grant: TopicGrant, data: &Arc<impl CountDrops>) {
         let mut released = Vec::new();

@@ -59,6 +59,11 @@ impl Spacing {
         self.last = Some(Last { source, published_ns, scheduled });
     }
 
+    /// Returns the time for which the last message was scheduled.
+    pub(crate) fn last_written(&self) -> Option<Instant> {
+        self.last.as_ref().map(|last| last.scheduled)
+    }
+
     /// Returns the scheduled time of a message, and its interval after the one before.
     fn schedule(&self, now: Instant, source: SourceId, published_ns: i64) -> (Instant, Duration) {
         // Clocks of two publishers are not comparable.

@@ -121,6 +121,8 @@ pub(crate) struct WriterInfo {
     awaits_reader: bool,
     /// Returns the number of matched local readers.
     matched: Box<dyn Fn() -> u32 + Send + Sync>,
+    /// Returns the time of the last write.
+    last_written: Box<dyn Fn() -> Option<Instant> + Send + Sync>,
     /// Returns `true` if a short message can be written now without blocking and without overwriting one that a reader
     /// may lack.
     is_free: Box<dyn Fn(&Message) -> bool + Send + Sync>,
@@ -137,6 +139,7 @@ impl Default for WriterInfo {
             recent: None,
             awaits_reader: false,
             matched: Box::new(|| 0),
+            last_written: Box::new(|| None),
             is_free: Box::new(|_| false),
             resize: Box::new(|_| ()),
             assert: None,
@@ -190,6 +193,8 @@ impl WriterQueue {
         // Cyclone's writers block only if they have to keep all samples until they are acknowledged.
         let never_blocks = !spec.qos.is_reliable() || matches!(spec.qos.history, History::KeepLast(_));
         let (room, of_room) = (burst.room.clone(), weak.clone());
+        let noted = room.clone();
+        let last_written = Box::new(move || noted.spacing().last_written());
         let is_free = Box::new(move |message: &Message| {
             let (bytes, published_ns) = (written_bytes(message), message.head.source_timestamp_ns);
             never_blocks
@@ -213,7 +218,7 @@ impl WriterQueue {
         let matched = Box::new(move || weak.upgrade().map_or(0, |writer| writer.matched_readers()));
         let awaits_reader = spec.qos.is_reliable() && !spec.qos.is_transient_local();
         let (guid, recent) = (writer.guid(), Recent::new(spec));
-        let info = WriterInfo { guid, recent, awaits_reader, matched, is_free, resize, assert };
+        let info = WriterInfo { guid, recent, awaits_reader, matched, last_written, is_free, resize, assert };
         let (mut decompressor, offered) = (Decompressor::default(), spec.qos.representations);
         let mut prepare = move |message: Message| {
             let mut key_hash = None;
@@ -421,6 +426,11 @@ impl WriterQueue {
     /// Returns the number of matched local readers.
     pub(crate) fn matched(&self) -> u32 {
         (self.info.matched)()
+    }
+
+    /// Returns the time of the last write.
+    pub(crate) fn last_written(&self) -> Option<Instant> {
+        (self.info.last_written)()
     }
 
     /// Returns the writer's GUID.

@@ -195,6 +195,7 @@ impl<N: RosNetwork> Core<N> {
                 is_read: route.is_read,
                 lacks_definition: self.lacks_definition(&route.name, route.form),
                 messages: published.or(sink.map(|sink| sink.delivered())).unwrap_or(0),
+                last_s: sink.and_then(|sink| sink.since_last()).map(|since| since.as_secs()),
             });
         }
         used
