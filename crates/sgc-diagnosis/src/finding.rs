@@ -202,6 +202,9 @@ pub(crate) enum UseFinding {
         reach: Reach,
         meant: Option<String>,
     },
+    OwnerRevoked {
+        owner: String,
+    },
     TokenRefused {
         owner: String,
         reason: String,

@@ -398,6 +398,7 @@ impl fmt::Display for UseFinding {
             Self::NotForWildcards { owner, topic, node, .. } => {
                 write!(f, "{owner} is in reach and does not share {topic} with {node}")
             }
+            Self::OwnerRevoked { owner } => write!(f, "the fleet of {owner} has revoked it"),
             Self::NotShared { owner, topic, node, meant } => {
                 write!(f, "{owner} is in reach and does not share {topic} with {node}{}", hint(meant))
             }
@@ -473,6 +474,10 @@ impl UseFinding {
             Self::NotForWildcards { owner, kind, rule, .. } => {
                 format!("on {owner}: no wildcard shares it; name it, [[share]] {kind} = \"{rule}\"")
             }
+            Self::OwnerRevoked { owner } => format!(
+                "nothing comes from {owner} any more; to have it back, the keeper of its fleet has to enroll it again (`sgc \
+                 fleet enroll {owner}`)"
+            ),
             Self::NotShared { owner, topic, node, .. } => format!(
                 "on {owner}: is it in a [[share]] whose `to` has \"{node}\" or a group of it, and is it published there? `sgc why \
                  {topic}` there says more"

@@ -10,11 +10,11 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use sgc_wire::{CRL_BYTES_MAX, Pseudonym, UnixMillis};
+use sgc_wire::{CRL_BYTES_MAX, NodeId, Pseudonym, UnixMillis};
 use webpki::BorrowedCertRevocationList;
 
 use crate::cert_id::{CaFingerprint, CertId, sha256};
-use crate::peer::VerifiedPeer;
+use crate::peer::{VerifiedPeer, node_id};
 use crate::revocations::{CaLists, CrlError, LIST_NODES_MAX, Revocation, RevocationList, RevokedNodes};
 use crate::verify::{Anchor, CHAIN_ALGORITHMS, TrustAnchors};
 use crate::x509::{ListFields, RevokedNodeFields, may_sign_lists, split_spki, without_zeros};
@@ -65,6 +65,13 @@ impl TrustAnchors {
     /// Returns the nodes that a CA has revoked by name, in all of its lists.
     pub fn revoked_nodes(&self, ca: &CaFingerprint) -> impl Iterator<Item = (Pseudonym, Revocation)> {
         self.lists.get(ca).into_iter().flat_map(|lists| lists.nodes()).map(|(node, r)| (*node, *r))
+    }
+
+    /// Returns `true` if a trusted CA has revoked a node by name. A later incarnation of the node may be valid.
+    pub fn is_node_revoked(&self, node: &NodeId) -> bool {
+        let spki_of = |ca| self.ca_spki(ca).map(|spki| (ca, spki));
+        let mut by_ca = self.lists.keys().filter_map(spki_of);
+        by_ca.any(|(ca, spki)| self.revoked_nodes(ca).any(|(revoked, _)| node_id(spki, &revoked) == *node))
     }
 
     /// Returns the greatest number of a CA's lists that revoke nodes by name.

@@ -74,11 +74,14 @@ fn a_certificate_that_an_old_copy_does_not_know_is_revoked_with_its_node() {
     old.revoke(&[name("va")], at(2)).unwrap();
     let anchors = with(old.anchors(), &old.revocation_list(at(2)).unwrap(), 2);
     assert!(is_revoked(&anchors, &renewed, 2));
+    assert!(
+        anchors.is_node_revoked(&renewed.node_id()) && !old.anchors().is_node_revoked(&renewed.node_id())
+    );
     // Nor is one that the other copy makes from now on.
     let later = new.renew(&name("va"), VALID, at(3), &mut rng(3)).unwrap();
     assert!(is_revoked(&anchors, &later, 3));
     let other = new.renew(&name("vb"), VALID, at(3), &mut rng(4)).unwrap();
-    assert!(!is_revoked(&anchors, &other, 3));
+    assert!(!is_revoked(&anchors, &other, 3) && !anchors.is_node_revoked(&other.node_id()));
 }
 
 #[test]

@@ -44,6 +44,10 @@ pub(super) fn walk_use(graph: &Graph, used: &Use, topic: &str, steps: &mut Walk)
     if !linked(graph, steps) {
         return;
     }
+    if used.is_owner_revoked {
+        steps.push(wrong(UseFinding::OwnerRevoked { owner: owner.clone() }));
+        return;
+    }
     if !used.is_token && !used.has_catalogue {
         steps.push(wrong(no_catalogue(graph, used)));
         return;

@@ -166,6 +166,10 @@ fn more_faults(side: &str) -> Vec<Case> {
                 g.uses[0].has_catalogue = false;
                 g.links[0].name = Some("arm".into());
             }),
+            ("the owner was revoked", |g| {
+                g.uses[0].routes[0].is_granted = false;
+                g.uses[0].is_owner_revoked = true;
+            }),
             ("asked an owner that is linked", |g| {
                 g.uses[0].has_catalogue = false;
                 g.uses[0].follow = Some(JoinState::Asked);

@@ -390,6 +390,8 @@ pub struct Use {
     pub owner_state: Option<String>,
     /// Reason of the owner or of a router, if it refuses its catalogue.
     pub owner_refusal: Option<String>,
+    /// Whether the owner's CA has revoked the owner, and nothing is granted.
+    pub is_owner_revoked: bool,
     /// State of following the owner.
     pub follow: Option<JoinState>,
     /// Whether the owner's catalogue has arrived.

@@ -158,6 +158,9 @@ impl<N: RosNetwork> Core<N> {
             Some(OwnerState::Refuses(by)) => Some(by),
             _ => None,
         };
+        // A later incarnation of the owner would grant something.
+        let is_granted = view.routes.iter().any(|route| route.is_granted);
+        let is_owner_revoked = !is_granted && self.certificates.anchors().is_node_revoked(&view.owner);
         let mut used = Use {
             kind: view.kind.into(),
             publishes,
@@ -169,6 +172,7 @@ impl<N: RosNetwork> Core<N> {
             owner_meant: self.members.owner_meant(view.owner_name).map(str::to_owned),
             owner_refusal: owner_refusal.map(|by| by.to_string()),
             owner_state: view.owner_state.map(owner_state),
+            is_owner_revoked,
             follow: self.endpoint.follow_status(&view.owner).map(|status| (&status).into()),
             has_catalogue: view.has_catalogue,
             is_token: name.is_some(),
