@@ -59,13 +59,16 @@ impl<'a> Frame<'a> {
         prefix_bytes: usize,
         prefix: impl FnOnce(bool) -> [u8; PREFIX_BYTES],
     ) -> Result<Self, RosError> {
-        let refused = RosError::Payload { bytes: payload.len() };
-        let Some((&header, body)) = payload.split_first_chunk::<HEADER_BYTES>() else { return Err(refused) };
+        // Made only when returned: a value made here would be dropped on the way of every good payload.
+        let refused = || RosError::Payload { bytes: payload.len() };
+        let Some((&header, body)) = payload.split_first_chunk::<HEADER_BYTES>() else {
+            return Err(refused());
+        };
         let pad = payload.len().wrapping_neg() & 3;
         if payload.len() + prefix_bytes + pad > PAYLOAD_BYTES_MAX
             || !is_encapsulation(u16::from_be_bytes([header[0], header[1]]))
         {
-            return Err(refused);
+            return Err(refused());
         }
         let mut frame = Self { header, prefix: prefix(is_little_endian(header)), prefix_bytes, body, pad };
         if pad > 0 {

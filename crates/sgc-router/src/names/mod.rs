@@ -147,11 +147,20 @@ impl Names {
 
     /// Returns the link towards the owner of `name`, and the cost of the route.
     pub(crate) fn next_hop(&self, network: Network<'_>, name: &Name) -> Option<(LinkId, u32)> {
-        let owner = self.records.of_name(name)?.owner_id();
-        if owner == self.own {
+        self.next_hop_to(network, name, &self.records.of_name(name)?.owner_id())
+    }
+
+    /// Returns the same for a name whose owner is at hand.
+    pub(crate) fn next_hop_to(
+        &self,
+        network: Network<'_>,
+        name: &Name,
+        owner: &NodeId,
+    ) -> Option<(LinkId, u32)> {
+        if *owner == self.own {
             return Some((LinkId::LOCAL, 0));
         }
-        if self.transit { network.next_hop_to(&owner) } else { self.heard.next_hop(network.links, name) }
+        if self.transit { network.next_hop_to(owner) } else { self.heard.next_hop(network.links, name) }
     }
 
     /// Returns the number of names whose owners are in reach.

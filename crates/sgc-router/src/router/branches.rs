@@ -37,8 +37,9 @@ impl Router {
             Place::Taken => return reject(self, RejectReason::NoRoute),
             Place::Kept { up } => return self.send(up, Control::Join { signed }),
         }
-        let next_hop = self.names.next_hop(self.network(), &name).filter(|(up, _)| *up != link);
-        let Some(((up, _), owner)) = next_hop.zip(owner.cloned()) else {
+        let Some(owner) = owner.cloned() else { return reject(self, RejectReason::NoRoute) };
+        let next_hop = self.names.next_hop_to(self.network(), &name, &owner.node_id);
+        let Some((up, _)) = next_hop.filter(|(up, _)| *up != link) else {
             return reject(self, RejectReason::NoRoute);
         };
         if !(up == LinkId::LOCAL || link == LinkId::LOCAL || self.config.transit) {
