@@ -193,7 +193,7 @@ impl Status {
         section(
             "Routers",
             &["router", "found by", "at", "state", "last failure"],
-            self.routers.iter().map(Router::row).collect(),
+            self.routers.iter().map(|router| router.row(&self.links)).collect(),
         );
         let second: Vec<_> = self.routers.iter().filter_map(Router::second_row).collect();
         if !second.is_empty() {
@@ -275,13 +275,15 @@ impl Link {
 }
 
 impl Router {
-    fn row(&self) -> Vec<String> {
+    fn row(&self, links: &[Link]) -> Vec<String> {
+        let is_silent = links.iter().any(|link| link.silent && link.url.is_some() && link.url == self.at);
         vec![
             self.router.clone(),
             self.found_by.clone(),
             self.at.clone().unwrap_or_default(),
             match self.again_in_s {
                 Some(s) => format!("{} in {}", self.state, duration(s)),
+                None if is_silent => format!("{}, silent", self.state),
                 None => self.state.clone(),
             },
             self.last_failure.clone().unwrap_or_default(),
@@ -370,5 +372,21 @@ mod tests {
             "Router: 3 nodes and 1 name known, 0 with a route; branches: 2",
         ];
         assert_eq!(lines, expected);
+    }
+
+    #[test]
+    fn router_over_a_silent_link_is_shown_as_silent() {
+        let text = r#"{"node":"arm-1","version":"0.1.0","uptime_s":75,
+            "links":[{"id":1,"peer":"0123456789abcdef","remote":"127.0.0.1:7447","url":"quic://localhost:7447",
+                      "rtt_us":420,"cost":1420,"silent":true},
+                     {"id":2,"peer":"1123456789abcdef","remote":"127.0.0.1:7448","url":"quic://localhost:7448",
+                      "rtt_us":420,"cost":1420}],
+            "routers":[{"router":"quic://localhost:7447","found_by":"static","at":"quic://localhost:7447","state":"linked"},
+                       {"router":"quic://localhost:7448","found_by":"static","at":"quic://localhost:7448","state":"linked"}],
+            "routes":[],"names":[],"drops":{},"refused":{},"router":{"nodes":3,"names":1,"routed_names":0,"branches":2}}"#;
+        let lines = parse(Path::new("x"), text).unwrap().lines();
+        let state = |router: &str| lines.iter().find(|line| line.starts_with(router)).unwrap().trim_end();
+        assert!(state("  quic://localhost:7447").ends_with("linked, silent"));
+        assert!(state("  quic://localhost:7448").ends_with("linked"));
     }
 }

@@ -672,7 +672,8 @@ impl fmt::Display for TrafficFinding {
                     Direction::Shared => "went through here",
                     Direction::Through => "passed through this node",
                 };
-                write!(f, "{packets} packets ({}) {passed}", output::bytes(*bytes))
+                // Messages are counted for longer, and one may need several packets or share one.
+                write!(f, "{packets} packets ({}) {passed} since the branch began", output::bytes(*bytes))
             }
             Self::Dropped { counts, worst } => {
                 let means = refusals::packet_drop(worst).map_or(FOR_ANOTHER_REASON, |drop| drop.means);
