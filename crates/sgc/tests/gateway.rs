@@ -7,6 +7,7 @@
 mod lab;
 mod support;
 
+use std::fs;
 use std::process::{Command, Output};
 
 use lab::{Lab, Plan, Site, share, uses};
@@ -73,6 +74,24 @@ fn first_call_after_a_start_finds_the_type_of_the_service() {
     let nobody = shell(&lab, &["service", "call", "/add_three_ints", "{a: 2, b: 3}"]);
     let text = String::from_utf8_lossy(&nobody.stderr).into_owned();
     assert!(text.contains("the type of /add_three_ints is not known"), "{text}");
+}
+
+#[test]
+fn number_of_messages_counts_for_standard_input_too() {
+    let lab = lab("");
+    fs::write(lab.dir().join("lines"), "data: a\ndata: b\nno message\n").unwrap();
+    let publish = |number: &[&str]| {
+        let args = ["topic", "pub", "/lines", "std_msgs/String", "--wait", "0", "--socket", "desk.sock"];
+        let mut command = lab.sgc(Some(Site::Desk), &[&args, number].concat());
+        command.stdin(fs::File::open(lab.dir().join("lines")).unwrap()).output().unwrap()
+    };
+    for number in [&["--once"][..], &["-n", "2"]] {
+        said(&publish(number));
+    }
+    for number in [&["-n", "3"][..], &[]] {
+        let output = publish(number);
+        assert_eq!(output.status.code(), Some(1), "the third line is no message: {output:?}");
+    }
 }
 
 #[test]

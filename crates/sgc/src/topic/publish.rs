@@ -166,8 +166,11 @@ pub(super) fn publish(args: &PubArgs) -> Result<ExitCode, CliError> {
         return Ok(ExitCode::from(EXIT_FAILURE));
     }
     let mut pace = Pace { period, next: Instant::now() };
+    let most = if args.once { 1 } else { args.count.unwrap_or(u64::MAX) };
     let Some(message) = message else {
-        for line in std::io::stdin().lock().lines() {
+        let mut lines = std::io::stdin().lock().lines();
+        for _ in 0..most {
+            let Some(line) = lines.next() else { break };
             let line =
                 line.map_err(|source| ProcessError::System { what: "cannot read messages", source })?;
             let message = yaml::json_of(&line).map_err(not_a_message)?;
@@ -176,12 +179,9 @@ pub(super) fn publish(args: &PubArgs) -> Result<ExitCode, CliError> {
         }
         return Ok(ExitCode::SUCCESS);
     };
-    let most = if args.once { Some(1) } else { args.count };
-    let mut sent = 0;
-    while most.is_none_or(|most| sent < most) {
+    for sent in 1..=most {
         std::thread::sleep(pace.wait(Instant::now()));
         publisher.publish(&message)?;
-        sent += 1;
         output::line(format!("published {sent}: {message}"))?;
     }
     Ok(ExitCode::SUCCESS)
