@@ -107,7 +107,8 @@ impl<N: RosNetwork> Core<N> {
             }
             RequestStep::NotPermitted => {
                 if self.control_drops.count_from(NodeDrop::OperationNotPermitted, node) {
-                    warn!(peer = %node.short(), "refused an operation of a node that is no operator; counted from here on");
+                    let node = self.called(&node);
+                    warn!("refused an operation of {node}, which is no operator; counted from here on");
                 }
                 let reason = "an operation: it is no operator";
                 self.audit.write(AuditRecord::new(AuditEvent::Refused).peer(&node).reason(reason));
@@ -118,7 +119,7 @@ impl<N: RosNetwork> Core<N> {
 
     /// Answers an operation that was carried out or refused, and announces a revocation to everyone.
     pub(super) fn operation_done(&mut self, done: OperationOutcome) {
-        info!(operator = %done.node.short(), operation = done.said, "was asked for an operation");
+        info!("{} asked for an operation: {}", self.called(&done.node), done.said);
         self.audit.write(AuditRecord::new(AuditEvent::Operation).peer(&done.node).reason(&done.said));
         let waits = self.authority.as_mut().and_then(|authority| authority.operation_done(&done));
         if let Some(sink) = waits {

@@ -195,7 +195,11 @@ impl<N: RosNetwork> Core<N> {
                 debug!(name = %name.short(), peer = %peer.short(), %reason, "refused a subscriber");
                 self.refused.remember(name, peer, &reason);
                 if self.control_drops.count_from(NodeDrop::JoinRefused, peer) {
-                    warn!(peer = %peer.short(), %reason, "refused a subscriber; counted from here on");
+                    warn!(
+                        "refused {} to {}: {reason}; counted from here on",
+                        shown(routes, &name),
+                        graph::called(&self.audit, &peer)
+                    );
                 }
             }
             Event::Refused { name, by } => {

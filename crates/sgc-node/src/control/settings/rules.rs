@@ -66,6 +66,9 @@ impl Rules {
             && let Ok(fleet) = read_fleet(&authority.fleet)
         {
             // The authority itself reports an unusable fleet file.
+            let known = fleet.nodes().map(|node| node.name.as_str());
+            let named = known.filter_map(|name| Some((identity.node_id_of(name)?, name.to_owned())));
+            rules.names.extend(named);
             rules.warnings.extend(unknown_members(config, &fleet).iter().map(ToString::to_string));
         }
         for grant in &rules.partners.tokens {
@@ -187,7 +190,8 @@ fn peer_names(config: &Config, identity: &Identity, rules: &Rules) -> PeerNames 
     }
     names.extend(rules.uses.iter().map(|rule| (rule.owner, rule.owner_name.clone())));
     let named = config.shares.iter().flat_map(|s| s.to.iter().chain(&s.publish));
-    for recipient in named {
+    let operators = config.authority.iter().flat_map(|authority| &authority.operators);
+    for recipient in named.chain(operators) {
         if let Recipient::Node(node) = recipient {
             names.extend(identity.node_id_of(node.as_str()).map(|id| (id, node.to_string())));
         }
@@ -245,4 +249,35 @@ pub enum RulesError {
         /// The topic.
         topic: String,
     },
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use rand_core::{OsRng, TryRngCore as _};
+    use sgc_config::AuthorityConfig;
+    use sgc_trust::{EnrollRequest, Fleet};
+
+    use super::*;
+
+    #[test]
+    fn authority_knows_its_operators_and_the_nodes_of_its_file_by_name() {
+        let now = UnixMillis(1_795_000_000_000);
+        let rng = &mut OsRng.unwrap_err();
+        let mut fleet = Fleet::create("lab".parse().unwrap(), now, rng).unwrap();
+        let keeper = fleet.enroll(&EnrollRequest::new("keeper".parse().unwrap(), now), rng).unwrap();
+        let arm = fleet.enroll(&EnrollRequest::new("arm".parse().unwrap(), now), rng).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("lab.fleet");
+        let operators = vec![Recipient::Node("laptop".parse().unwrap())];
+        let authority = Some(AuthorityConfig { fleet: file.clone(), operators });
+        let config = Config { authority, ..Config::default() };
+        let name = |node: &sgc_wire::NodeId| {
+            Rules::load(&config, &keeper, None, now).unwrap().names.get(node).cloned()
+        };
+        let laptop = keeper.node_id_of("laptop").unwrap();
+        assert_eq!((name(&laptop).as_deref(), name(&arm.node_id())), (Some("laptop"), None));
+        state::replace(&file, fleet.to_text().as_bytes()).unwrap();
+        assert_eq!(name(&arm.node_id()).as_deref(), Some("arm"));
+    }
 }
