@@ -327,7 +327,8 @@ impl ShareFinding {
                 || {
                     format!(
                         "if {node} may have it, add it to `to` of this [[share]] (`publish`, if it is to publish), then \
-                         `sgc reload`; `sgc policy test` says who may"
+                         `sgc reload`; `sgc policy test` says who may. A node of another fleet needs a token (`sgc \
+                         share-token`)"
                     )
                 },
                 str::to_owned,

@@ -131,6 +131,10 @@ fn walk_route(graph: &Graph, used: &Use, route: &UseRoute, steps: &mut Walk) {
     let far_topic = || name_at_owner(used, topic);
     if !route.is_granted {
         steps.push(wrong(match (&route.refused, route.join) {
+            // The owner's side knows no entry of it any more.
+            (Some(reason), _) if used.is_token => {
+                UseFinding::TokenRefused { owner: owner(), reason: reason.clone() }
+            }
             (Some(reason), _) => {
                 UseFinding::Refused { owner: owner(), reason: reason.clone(), topic: far_topic() }
             }

@@ -166,6 +166,11 @@ fn more_faults(side: &str) -> Vec<Case> {
                 g.uses[0].has_catalogue = false;
                 g.links[0].name = Some("arm".into());
             }),
+            ("the token of a running use was withdrawn", |g| {
+                g.uses[0].is_token = true;
+                g.uses[0].routes[0].is_granted = false;
+                g.uses[0].routes[0].refused = Some("the owner does not share it with this node".into());
+            }),
             ("the owner was revoked", |g| {
                 g.uses[0].routes[0].is_granted = false;
                 g.uses[0].is_owner_revoked = true;

@@ -188,6 +188,7 @@ impl<N: RosNetwork> Core<N> {
                     shown(routes, &name)
                 );
                 debug!(name = %name.short(), peer = %peer.short(), "took a grant back");
+                self.refused.remember(name, peer, &reason);
                 routes.handle_sink_left(now.instant, &name, &sink);
                 self.consumers.sink_left(peer, name, sink, now.instant);
             }
