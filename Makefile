@@ -5,8 +5,11 @@ CARGO ?= cargo
 ARGS ?=
 # The features of release builds. Tests use them too, so that Cyclone DDS is built once.
 FEATURES := --features sgc/sros2
-# Suites of tests with programs of others (`test = false` in their Cargo.toml), and suites with some such tests, which are ignored.
-INTEROP := $(addprefix --test ,browser fidelity gateway gateway_soak graph looking peers ring ros2 transports vendors)
+# Suites of tests with programs of others (`test = false` in their Cargo.toml): those with labs, and the rest. A suite may have
+# other tests, too; then those with programs of others are ignored. A name stands for the suites of all crates, so no suite of
+# `unit` may have one of these names: it would run twice.
+LABS := $(addprefix --test ,fidelity gateway peers ros2)
+INTEROP := $(addprefix --test ,browser gateway_soak looking ring ros_graph transports vendors)
 CLIENTS := $(addprefix --test ,foxglove grpc rosbridge)
 
 .PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
@@ -80,15 +83,17 @@ fmt:
 
 clippy:
 	$(CARGO) clippy --workspace --all-targets $(FEATURES) --locked -- -D warnings
-	$(CARGO) clippy --workspace $(INTEROP) $(FEATURES) --locked -- -D warnings
+	$(CARGO) clippy --workspace $(LABS) $(INTEROP) $(FEATURES) --locked -- -D warnings
 
 # Has only the requirements of the build. `cargo test` runs the same without SROS2.
 unit:
 	$(CARGO) test --workspace $(FEATURES) --locked $(ARGS)
 
-# The tests with programs of others: ROS 2, other DDS vendors, clients of the gateway, Chromium.
+# The tests with programs of others: ROS 2, other DDS vendors, clients of the gateway, Chromium. Tests with labs take turns
+# (`tests/support/turn.rs`), so most of their threads wait.
 interop: peers
 	$(CARGO) test --workspace $(CLIENTS) $(FEATURES) --locked -- --ignored
+	RUST_TEST_THREADS=6 $(CARGO) test --workspace $(LABS) $(FEATURES) --locked $(ARGS)
 	$(CARGO) test --workspace $(INTEROP) $(FEATURES) --locked $(ARGS)
 
 # The oldest Rust that Cargo.toml supports. rustup must have it.
@@ -104,8 +109,10 @@ msrv:
 minimal:
 	@CARGO='$(CARGO)' scripts/minimal.sh $(ARGS)
 
+# Examples take the dependencies of tests, so that `clippy` has checked all dependencies with the same features before. Without
+# them, other features would have Cyclone DDS built once more.
 docs:
-	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --no-deps --workspace $(FEATURES) --locked
+	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --no-deps --workspace --lib --bin netsim --examples $(FEATURES) --locked
 
 # Builds the pages below docs/ as a book and checks its links.
 book:

@@ -13,9 +13,10 @@ use std::process::{Command, Output};
 use lab::{Lab, Plan, Site, share, uses};
 use rustix::process::Signal;
 use serde_json::Value;
+use support::turn::TurnKind;
 use support::{Peer, eventually};
 
-const PLAN: Plan = Plan { name: "sgcgw", domains: ["97", "98"], peer_life: "180" };
+const PLAN: Plan = Plan { name: "sgcgw", domains: ["97", "98"], peer_life: "180", turn: TurnKind::Exclusive };
 
 /// The robot talks and adds; it hears what the desk commands. At the desk nobody has ROS.
 fn lab(gateway: &str) -> Lab {

@@ -15,9 +15,12 @@ use std::time::{Duration, Instant};
 use lab::{Lab, Plan, Site, robot_to_desk};
 use rustix::process::Signal;
 use serde_json::Value;
+use support::turn::TurnKind;
 use support::{Peer, eventually, say};
 
-const PLAN: Plan = Plan { name: "sgct", domains: ["91", "92"], peer_life: "120" };
+const PLAN: Plan = Plan { name: "sgct", domains: ["91", "92"], peer_life: "120", turn: TurnKind::Shared };
+/// The settings of labs in which a test measures.
+const EXCLUSIVE: Plan = Plan { turn: TurnKind::Exclusive, ..PLAN };
 
 /// Longest wait of a client for its calls, of which there are some tens.
 const CALLS_WAIT: Duration = Duration::from_secs(20);
@@ -241,7 +244,7 @@ fn the_flow_resumes_after_every_kill_and_restart_without_a_duplicate() {
 
 #[test]
 fn a_restarted_program_is_heard_at_its_own_rate_and_a_stopped_node_is_gone_at_once() {
-    let mut lab = Lab::with_topics(PLAN, ["/string"]);
+    let mut lab = Lab::with_topics(EXCLUSIVE, ["/string"]);
     let common = ["--type", "string", "--topic", "/string"];
     // Cyclone, because Fast DDS notices the end of a Cyclone writer only when its lease is over, also without us.
     let mut listener = lab.peer(Site::Desk, "cyclone", "sub", &[&common[..], &["--verbose"]].concat());

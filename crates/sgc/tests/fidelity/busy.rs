@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use crate::lab::{Lab, Site};
 use crate::support::{eventually, say};
-use crate::{PLAN, environment, python};
+use crate::{EXCLUSIVE, environment, python};
 
 const NODES: u64 = 20;
 const SHARED: u64 = 10;
@@ -39,7 +39,7 @@ fn carried(lab: &Lab) -> u64 {
 fn a_busy_network_costs_little_and_its_silence_next_to_nothing() {
     let (nodes, shared) = (environment("SGC_GRAPH_NODES", NODES), environment("SGC_GRAPH_SHARED", SHARED));
     let seconds = environment("SGC_GRAPH_SECONDS", SECONDS);
-    let lab = Lab::with_topics(PLAN, (0..shared).map(|n| format!("/shared/n{n}")));
+    let lab = Lab::with_topics(EXCLUSIVE, (0..shared).map(|n| format!("/shared/n{n}")));
     let node = lab.node(Site::Robot);
     let pid = node.pid();
     let (before, begun, idle) = (node.held(), Instant::now(), busy(pid));

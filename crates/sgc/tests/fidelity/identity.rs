@@ -5,9 +5,9 @@ use std::fs;
 
 use serde_json::Value;
 
-use crate::PLAN;
 use crate::lab::{Lab, Site};
 use crate::support::{self, Peer, Running, eventually};
+use crate::{EXCLUSIVE, PLAN};
 
 const COMMON: [&str; 4] = ["--type", "string", "--topic", "/chatter"];
 /// The ROS domain of the second process, which is in the robot's network.
@@ -70,7 +70,7 @@ fn end(mut listener: Peer, heard: &mut Vec<u64>) {
 
 #[test]
 fn identity_in_two_networks_delivers_nothing_twice_and_is_named_on_all_sides() {
-    let lab = Lab::with_topics(PLAN, ["/chatter"]);
+    let lab = Lab::with_topics(EXCLUSIVE, ["/chatter"]);
     let mut at_desk = listener(&lab, Site::Desk, lab.domain(Site::Desk));
     let mut at_twin = listener(&lab, Site::Robot, DOMAIN);
     let sends = ["--count", "1000000", "--rate", "50"];

@@ -18,9 +18,12 @@ mod support;
 
 use lab::{Lab, Plan, Site};
 use support::Peer;
+use support::turn::TurnKind;
 
 /// Peers live for as long as the longest of these tests.
-const PLAN: Plan = Plan { name: "sgcfi", domains: ["93", "94"], peer_life: "3000" };
+const PLAN: Plan = Plan { name: "sgcfi", domains: ["93", "94"], peer_life: "3000", turn: TurnKind::Shared };
+/// The settings of labs in which a test measures.
+const EXCLUSIVE: Plan = Plan { turn: TurnKind::Exclusive, ..PLAN };
 
 /// Starts a Python program of `tests/peers/py`, whose first argument is its domain.
 fn python(lab: &Lab, site: Site, program: &str, args: &[&str]) -> Peer {

@@ -2,11 +2,11 @@
 //! partition.
 
 use crate::lab::{Lab, Site};
-use crate::{PLAN, python};
+use crate::{EXCLUSIVE, python};
 
 #[test]
 fn a_publisher_that_falls_silent_is_missed_on_the_far_side() {
-    let lab = Lab::with_topics(PLAN, ["/pulse"]);
+    let lab = Lab::with_topics(EXCLUSIVE, ["/pulse"]);
     let policies = ["/pulse", "1500", "2500", "left"];
     let mut sub = python(&lab, Site::Desk, "policies.py", &[&["sub"][..], &policies].concat());
     // Another partition, another deadline: it must not be heard, and it is said why.

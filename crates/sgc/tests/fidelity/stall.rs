@@ -11,7 +11,7 @@ use rustix::process::Signal;
 
 use crate::lab::{Lab, SITES, Site};
 use crate::support::{PATIENCE, Peer, say};
-use crate::{PLAN, environment};
+use crate::{EXCLUSIVE, environment};
 
 const SECONDS: u64 = 6;
 const NODE_SECONDS_MAX: u64 = 8;
@@ -36,7 +36,7 @@ struct Stall {
 
 impl Stall {
     fn new() -> Self {
-        let lab = Lab::with_topics(PLAN, ["/image", "/string"]);
+        let lab = Lab::with_topics(EXCLUSIVE, ["/image", "/string"]);
         let of = |kind: &'static str, topic: &'static str| {
             ["--type", kind, "--topic", topic, "--verbose", "--large"]
         };

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use crate::lab::{Lab, Site, robot_to_desk, share, uses};
 use crate::support::{Peer, eventually};
-use crate::{PAIRS, PLAN, count};
+use crate::{EXCLUSIVE, PAIRS, PLAN, count};
 
 /// Starts `features.py`.
 fn start(lab: &Lab, site: Site, distribution: &str, args: &[&str]) -> Peer {
@@ -98,7 +98,7 @@ fn step(ticks: &[f64]) -> f64 {
 
 #[test]
 fn clocks_with_use_sim_time_follow_a_far_simulator_back_to_its_beginning_too() {
-    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/clock"]));
+    let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/clock"]));
     for [talks, listens] in PAIRS {
         let mut both = [Site::Robot, Site::Desk].map(|site| start(&lab, site, listens, &["simulated"]));
         let mut simulator = start(&lab, Site::Robot, talks, &["simulator"]);
@@ -240,7 +240,7 @@ fn images_of_one_six_and_thirteen_megabytes_arrive_whole() {
 #[test]
 fn topic_of_a_thousand_messages_a_second_arrives_whole_and_in_time() {
     const LATER_P50_US: f64 = 5_000.0;
-    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/imu"]));
+    let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/imu"]));
     for [talks, listens] in PAIRS {
         // A subscriber that keeps ten loses some when it has no processor for 10 ms, natively as well.
         let common = ["--topic", "/imu", "--size", "300", "--depth", "0", "--timeout", PLAN.peer_life];

@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use super::lab::{Lab, Site, robot_to_desk};
 use super::support::{Peer, eventually};
-use super::{PAIRS, PLAN, count};
+use super::{EXCLUSIVE, PAIRS, PLAN, count};
 
 const CLIENTS: u64 = 50;
 
@@ -53,7 +53,7 @@ fn assert_answered_at_once(summary: &Value, calls: u64, of: &str) {
 #[test]
 fn calls_made_when_a_service_is_first_seen_are_answered() {
     const PARTICIPANTS: u64 = 5;
-    let lab = Lab::real(PLAN, robot_to_desk("service", ["/jazzy", "/kilted"]));
+    let lab = Lab::real(EXCLUSIVE, robot_to_desk("service", ["/jazzy", "/kilted"]));
     let both = ["--service", "/jazzy", "--service", "/kilted"];
     let serve_at =
         |site, [d, name]: [&str; 2]| serve(&lab, site, d, &["--node", "server", "--service", name]);

@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use crate::lab::{Lab, Site, robot_to_desk};
 use crate::support::Peer;
-use crate::{PAIRS, PLAN};
+use crate::{EXCLUSIVE, PAIRS, PLAN};
 
 /// Longest additional delay of news through `sgc`, compared with a publisher nearby.
 const LATER_MAX: Duration = Duration::from_secs(1);
@@ -98,7 +98,7 @@ fn carried(topics: &[&str]) -> [String; 2] {
 
 #[test]
 fn far_subscriber_hears_of_a_publisher_that_hangs_or_is_killed_as_soon_as_a_near_one() {
-    let lab = Lab::real(PLAN, carried(&["/carried"]));
+    let lab = Lab::real(EXCLUSIVE, carried(&["/carried"]));
     let qos: [&[&str]; 2] = [&["--lease", "2"]; 2];
     let all = Pair::start_all(&lab, ["/native", "/carried"], qos);
     let each = |act: &dyn Fn(&Pair) -> Instant| [0, 1].map(|n| [0, 1].map(|i| act(&all[n][i])));
@@ -129,7 +129,7 @@ fn far_subscriber_hears_of_a_publisher_that_hangs_or_is_killed_as_soon_as_a_near
 
 #[test]
 fn far_subscriber_hears_of_a_manual_publisher_and_of_a_missed_deadline_as_soon_as_a_near_one() {
-    let lab = Lab::real(PLAN, carried(&["/carried"]));
+    let lab = Lab::real(EXCLUSIVE, carried(&["/carried"]));
     let qos: [&[&str]; 2] = [&["--lease", "2", "--kind", "manual", "--deadline", "1"]; 2];
     let mut all = Pair::start_all(&lab, ["/native", "/carried"], qos);
     // Silence ends liveliness and misses the deadline. The next message brings the publisher back.
@@ -161,7 +161,7 @@ fn far_subscriber_hears_of_a_manual_publisher_and_of_a_missed_deadline_as_soon_a
 #[test]
 fn far_subscriber_hears_of_a_publisher_that_only_asserts_its_liveliness_as_a_near_one_does() {
     const LEASE: Duration = Duration::from_secs(2);
-    let lab = Lab::real(PLAN, carried(&["/carried"]));
+    let lab = Lab::real(EXCLUSIVE, carried(&["/carried"]));
     let manual = ["--lease", "2", "--kind", "manual"];
     let asserts = [&manual[..], &["--asserts", "--rate", "2"]].concat();
     let mut all = Pair::start_all(&lab, ["/native", "/carried"], [&asserts, &manual]);

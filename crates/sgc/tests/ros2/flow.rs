@@ -8,7 +8,7 @@ use rustix::process::Signal;
 use serde_json::Value;
 
 use crate::lab::{Lab, Site, robot_to_desk};
-use crate::{PAIRS, PLAN, count};
+use crate::{EXCLUSIVE, PAIRS, PLAN, count};
 
 /// Bytes of a fragment (`sgc_dds::config::FRAGMENT_BYTES`).
 const FRAGMENT_BYTES: u64 = 14_000;
@@ -42,7 +42,7 @@ fn assert_whole(summary: &Value, messages: u64, what: &str) {
 #[test]
 fn a_reliable_topic_that_keeps_all_arrives_whole_however_fast_it_is_published() {
     const MESSAGES: u64 = 10_000;
-    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/load"]));
+    let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/load"]));
     // Fast DDS refuses a message if 5000 wait for a subscriber that gets no CPU for 100 ms.
     let extra = ["--depth", "0", "--rate", "0", "--size", "1000", "--insist"];
     for pair in PAIRS {
@@ -58,7 +58,7 @@ fn a_reliable_topic_that_keeps_all_arrives_whole_however_fast_it_is_published() 
 #[test]
 fn large_messages_of_real_ros_2_arrive_whole() {
     const MESSAGES: u64 = 10;
-    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/load"]));
+    let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/load"]));
     for (pair, size) in PAIRS.into_iter().zip([1_000_000, 6_000_000]) {
         let (text, before) = (size.to_string(), dropped_at_full_buffers(&lab));
         let extra = ["--rate", "5", "--size", &text];
@@ -89,7 +89,7 @@ fn dropped_at_full_buffers(lab: &Lab) -> u64 {
 fn subscriber_with_default_qos_receives_a_burst() {
     const MESSAGES: u64 = 2_000;
     const PAUSE: Duration = Duration::from_millis(400);
-    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/load"]));
+    let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/load"]));
     let common = ["--topic", "/load", "--timeout", PLAN.peer_life];
     let (last, mut lost) = (MESSAGES.to_string(), 0);
     for [talks, listens] in PAIRS {
@@ -120,7 +120,7 @@ fn subscriber_with_default_qos_receives_a_burst() {
 #[test]
 fn a_subscriber_that_stands_still_holds_up_nobody_else() {
     const MESSAGES: u64 = 500;
-    let lab = Lab::real(PLAN, robot_to_desk("topic", ["/load"]));
+    let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/load"]));
     let sub = |distribution| {
         lab.load(
             Site::Desk,

@@ -8,7 +8,7 @@ use sgc_testkit::netsim::Namespace;
 
 use crate::lab::{Lab, Site, robot_to_desk, share, uses};
 use crate::support::{PATIENCE, Peer, eventually};
-use crate::{PAIRS, PLAN, count};
+use crate::{EXCLUSIVE, PAIRS, PLAN, count};
 
 const SERVER: &str = "ROS_DISCOVERY_SERVER=127.0.0.1:11811";
 
@@ -138,7 +138,7 @@ fn change(robot: &Namespace, args: &str) {
 #[test]
 fn topics_of_programs_of_a_host_survive_its_addresses() {
     for pair in PAIRS {
-        let lab = Lab::real(PLAN, both_ways(RANGES.map(|(label, _)| label)));
+        let lab = Lab::real(EXCLUSIVE, both_ways(RANGES.map(|(label, _)| label)));
         let mut flows =
             RANGES.map(|(label, range)| Flow::start(&lab, Site::Robot, pair, label, [range, SUBNET]));
         assert_all(&mut flows, PATIENCE, "at first");
@@ -198,7 +198,7 @@ fn programs_of_other_hosts_come_back_after_an_address_change() {
             robot += &share("topic", topic, "desk");
             desk += &uses("topic", topic, "robot");
         }
-        let mut lab = Lab::silent(PLAN, [robot, desk]);
+        let mut lab = Lab::silent(EXCLUSIVE, [robot, desk]);
         lab.reconfigure(Site::Robot, "discovery_range = \"localhost\"", "discovery_range = \"subnet\"");
         lab.start_all();
         let (Some(robot), Some(cloud)) = (lab.namespace(Site::Robot), lab.namespace(Site::Cloud)) else {

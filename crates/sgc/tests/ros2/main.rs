@@ -24,8 +24,11 @@ mod why;
 
 use lab::Plan;
 use serde_json::Value;
+use support::turn::TurnKind;
 
-const PLAN: Plan = Plan { name: "sgcr", domains: ["87", "88"], peer_life: "120" };
+const PLAN: Plan = Plan { name: "sgcr", domains: ["87", "88"], peer_life: "120", turn: TurnKind::Shared };
+/// The settings of labs in which a test measures.
+const EXCLUSIVE: Plan = Plan { turn: TurnKind::Exclusive, ..PLAN };
 
 /// The distribution at the robot and that at the desk.
 const PAIRS: [[&str; 2]; 2] = [["jazzy", "kilted"], ["kilted", "jazzy"]];

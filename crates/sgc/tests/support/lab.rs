@@ -8,18 +8,15 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus};
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Mutex, MutexGuard};
 
 use rustix::process::Signal;
 use serde_json::Value;
-use sgc_sync::lock;
 use sgc_testkit::netsim::{Namespace, NetsimError};
 use tempfile::TempDir;
 
+use crate::support::turn::{Turn, TurnKind};
 use crate::support::{self, Peer, Running, say, say_log};
 
-/// One lab at a time: each fills both processors.
-static TURN: Mutex<()> = Mutex::new(());
 static LABS: AtomicU32 = AtomicU32::new(0);
 
 /// The settings of a test program's labs.
@@ -31,6 +28,8 @@ pub(crate) struct Plan {
     pub(crate) domains: [&'static str; 2],
     /// Longest life of a peer in seconds, should no test end it.
     pub(crate) peer_life: &'static str,
+    /// Whether labs of other tests may run at the same time.
+    pub(crate) turn: TurnKind,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
@@ -75,7 +74,7 @@ pub(crate) struct Lab {
     nodes: [Option<Running>; 3],
     /// `None` where the kernel or the user cannot make namespaces.
     namespaces: Option<[Namespace; 3]>,
-    _turn: MutexGuard<'static, ()>,
+    _turn: Turn,
 }
 
 impl Lab {
@@ -103,10 +102,11 @@ impl Lab {
 
     /// The same before the nodes are started.
     pub(crate) fn silent(plan: Plan, [robot, desk]: [String; 2]) -> Self {
-        let turn = lock(&TURN);
         let number = LABS.fetch_add(1, Ordering::Relaxed);
         let made = make_namespaces(&format!("{}-{}-{number}", plan.name, std::process::id()));
         let namespaces = support::namespaces(made, "using two ROS domains of this host instead");
+        // Labs on one host would meet.
+        let turn = Turn::take(if namespaces.is_some() { plan.turn } else { TurnKind::Exclusive });
         let dir = tempfile::tempdir().unwrap();
         support::enroll(dir.path(), ["robot", "cloud --router", "desk"]);
         let lab = Self { plan, number, dir, nodes: [const { None }; 3], namespaces, _turn: turn };

@@ -17,9 +17,10 @@ use std::fmt;
 
 use lab::{Lab, Plan, Site, robot_to_desk};
 use sgc_testkit::netsim::Namespace;
+use support::turn::TurnKind;
 use support::{Peer, eventually, say};
 
-const PLAN: Plan = Plan { name: "sgcv", domains: ["93", "94"], peer_life: "60" };
+const PLAN: Plan = Plan { name: "sgcv", domains: ["93", "94"], peer_life: "60", turn: TurnKind::Exclusive };
 
 const VENDORS: [&str; 3] = ["cyclone", "fastdds", "rustdds"];
 /// The types, small ones first. The cases of a pair of vendors run at the same time.
