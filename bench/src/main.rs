@@ -1,7 +1,7 @@
 //! Benchmarks on real sockets; `README.md` says what each part measures and how to read it.
 //!
-//! This file knows the command line. The parts are [`compare`], [`forward`], [`gateway`], [`rib`], [`first_message`], [`teleop`]
-//! and [`transports`]; [`fleet`], [`node`], [`process`], [`report`] and [`uplink`] are shared.
+//! This file knows the command line. The parts are [`compare`], [`forward`], [`gateway`], [`rib`], [`first_message`],
+//! [`teleop`] and [`transports`]; [`fleet`], [`node`], [`process`], [`report`] and [`uplink`] are shared.
 #![forbid(unsafe_code)]
 
 mod compare;

@@ -1,4 +1,5 @@
-//! Whole nodes in this process, with local networks in memory instead of DDS, so that only SGC and its links are measured.
+//! Whole nodes in this process, with local networks in memory instead of DDS, so that only SGC and its links are
+//! measured.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -123,8 +123,8 @@ impl SgcRouter {
         Ok(status(&self.socket)?["links"].as_array().context("a status without `links`")?.len())
     }
 
-    /// Waits until the router has a route for so many names, while their number grows. Counting them takes the router's time, so
-    /// slow answers make it ask less often.
+    /// Waits until the router has a route for so many names, while their number grows. Counting them takes the router's
+    /// time, so slow answers make it ask less often.
     pub(crate) fn until_routed(&self, names: u64) -> Result<()> {
         let (mut most, mut deadline) = (0, Instant::now() + PATIENCE);
         loop {

@@ -1,7 +1,8 @@
 //! Measures driving a robot over a thin uplink while its camera sends three times the uplink's rate.
 //!
-//! Robot, router and desk are nodes of this process, so that one clock times all; the robot is in one network namespace, the
-//! others in another, and the emulated uplink is between them. Each run has nodes and an uplink of its own.
+//! Robot, router and desk are nodes of this process, so that one clock times all; the robot is in one network
+//! namespace, the others in another, and the emulated uplink is between them. Each run has nodes and an uplink of its
+//! own.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::SeqCst};

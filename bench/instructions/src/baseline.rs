@@ -1,7 +1,7 @@
 //! The committed instruction counts of the hot functions, and the comparison with new ones.
 //!
-//! Rust code is always compared. Cryptography and the C library choose their code by the processor, so these are compared
-//! only where valgrind shows the same processor as in the committed counts, and has the same version.
+//! Rust code is always compared. Cryptography and the C library choose their code by the processor, so these are
+//! compared only where valgrind shows the same processor as in the committed counts, and has the same version.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

@@ -1,7 +1,7 @@
 //! The hot functions, each repeated often enough that one repetition more or less does not show.
 //!
-//! A case prepares, does its work once as a warm-up, and counts. Its input is the same each time but for keys, whose content
-//! does not change the path of any Rust code.
+//! A case prepares, does its work once as a warm-up, and counts. Its input is the same each time but for keys, whose
+//! content does not change the path of any Rust code.
 
 use std::future::Future;
 use std::hint::black_box;

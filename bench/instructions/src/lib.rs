@@ -155,8 +155,8 @@ fn valgrind_version() -> Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }
 
-/// Returns the architecture and the features by which libraries choose their code, as this process sees them: valgrind's
-/// processor differs from the machine's.
+/// Returns the architecture and the features by which libraries choose their code, as this process sees them:
+/// valgrind's processor differs from the machine's.
 fn features() -> String {
     let mut seen = vec![std::env::consts::ARCH];
     #[cfg(target_arch = "x86_64")]

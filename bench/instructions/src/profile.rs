@@ -1,5 +1,5 @@
-//! Parses callgrind's output to instructions by kind of code. Pure. It reads only the self costs of functions from the format
-//! (`cl-format` in valgrind's manual) and ignores calls.
+//! Parses callgrind's output to instructions by kind of code. Pure. It reads only the self costs of functions from the
+//! format (`cl-format` in valgrind's manual) and ignores calls.
 
 use std::collections::HashMap;
 

@@ -1,7 +1,7 @@
 //! Requests and answers of different sizes: `ask` sends requests at its rate, and `answer` answers them.
 //!
-//! A request names the length of its answer in its data. One without a length is hello, and answered at once. An `answer` of
-//! several topics answers all once it has a request on each, like a fleet that goes step by step.
+//! A request names the length of its answer in its data. One without a length is hello, and answered at once. An
+//! `answer` of several topics answers all once it has a request on each, like a fleet that goes step by step.
 
 use std::time::{Duration, Instant};
 

@@ -1,5 +1,5 @@
-//! The common part of [`crate::ping`] and [`crate::ask`]: sends one message at a time and waits for the answer. They decide on
-//! content and rate.
+//! The common part of [`crate::ping`] and [`crate::ask`]: sends one message at a time and waits for the answer. They
+//! decide on content and rate.
 
 use std::time::{Duration, Instant};
 

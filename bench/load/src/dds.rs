@@ -296,8 +296,8 @@ impl Reader {
         Ok(Self { condition: Entity::new(condition)?, entity, _topic: topic })
     }
 
-    /// Opens a reader that calls `arrived` on Cyclone's receiving thread, one call at a time. `arrived` lives until the process
-    /// ends.
+    /// Opens a reader that calls `arrived` on Cyclone's receiving thread, one call at a time. `arrived` lives until the
+    /// process ends.
     pub(crate) fn with_listener<F: FnMut(Inbox) + Send + 'static>(
         network: &Network,
         name: &str,
@@ -310,8 +310,8 @@ impl Reader {
             arrived(Inbox(reader));
         }
         let arrived: *mut F = Box::leak(Box::new(arrived));
-        // SAFETY: `arrived` lives as long as the process and is used by calls of this listener only; the listener is copied
-        // by the call that makes the reader, and deleted once.
+        // SAFETY: `arrived` lives as long as the process and is used by calls of this listener only; the listener is
+        // copied by the call that makes the reader, and deleted once.
         unsafe {
             let listener = dds_create_listener(arrived.cast());
             dds_lset_data_available(listener, Some(call::<F>));

@@ -1,7 +1,7 @@
 //! One-way flows: `source` sends messages, `sink` counts them and their ages.
 //!
-//! A message's number consists of the number of its run, above [`RUN_SHIFT`], and its own. Run 0 is hello, which is sent until
-//! the first run begins and is not counted.
+//! A message's number consists of the number of its run, above [`RUN_SHIFT`], and its own. Run 0 is hello, which is
+//! sent until the first run begins and is not counted.
 
 use std::time::{Duration, Instant};
 

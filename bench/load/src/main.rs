@@ -1,8 +1,8 @@
-//! `load`: talkers and listeners for benchmarks. They are plain Cyclone DDS programs with a ROS 2 node's names, and do not know
-//! what carries their topics.
+//! `load`: talkers and listeners for benchmarks. They are plain Cyclone DDS programs with a ROS 2 node's names, and do
+//! not know what carries their topics.
 //!
-//! This file knows the command line. Each role prints events on standard output in lines of JSON ([`report::Event`]), takes
-//! orders from standard input ([`report::Order`]), and ends when that does. It measures and judges nothing.
+//! This file knows the command line. Each role prints events on standard output in lines of JSON ([`report::Event`]),
+//! takes orders from standard input ([`report::Order`]), and ends when that does. It measures and judges nothing.
 #![deny(unsafe_code)]
 
 mod ask;

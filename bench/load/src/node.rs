@@ -71,8 +71,8 @@ impl Node {
         }
     }
 
-    /// Sends hello on the first topic. Returns whether an answer came on the first topic of the other way, also to an earlier
-    /// hello, because the path may take longer than the time between two.
+    /// Sends hello on the first topic. Returns whether an answer came on the first topic of the other way, also to an
+    /// earlier hello, because the path may take longer than the time between two.
     pub(crate) fn is_heard(&self, seq: u64) -> Result<bool> {
         self.writers[0].write(&Message { seq, stamp_ns: now_ns(), data: &[] })?;
         let deadline = Instant::now() + HELLO_EVERY;

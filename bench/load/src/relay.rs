@@ -1,7 +1,8 @@
-//! A minimal relay between two DDS networks: it writes each message that it reads to a TCP connection, and publishes each that
-//! comes over it.
+//! A minimal relay between two DDS networks: it writes each message that it reads to a TCP connection, and publishes
+//! each that comes over it.
 //!
-//! It has no encryption, authentication, names or bounds, and is not for use. It is a reference for systems that do more.
+//! It has no encryption, authentication, names or bounds, and is not for use. It is a reference for systems that do
+//! more.
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};

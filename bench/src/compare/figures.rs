@@ -5,14 +5,14 @@ use serde::{Deserialize, Serialize};
 /// One number.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Figure {
-    /// The table that it belongs to: `round-trip`, `throughput`, `real-ros2` and those that begin so, `start-up`, `applications`, `fleet-step`, `fan-out`, `multi-hop`,
-    /// `teleop`, `roaming`, `footprint`.
+    /// The table that it belongs to: `round-trip`, `throughput`, `real-ros2` and those that begin so, `start-up`,
+    /// `applications`, `fleet-step`, `fan-out`, `multi-hop`, `teleop`, `roaming`, `footprint`.
     pub(crate) table: String,
     /// The measured system: `direct`, `wireguard`, `dds-security`, `zenoh-tcp`, `zenoh-tls`, `sgc-quic-group`,
     /// `sgc-dtls-standard`, …; `sgc-quic-group-router` with a router process between the proxies; `ssh`; `tcp`.
     pub(crate) system: String,
-    /// Over which path: `bare`, `paper` (76 ms round trip, 5 Mbit/s), `lossy` (40 ms, 50 Mbit/s, 2 %), `jazzy-kilted` and `kilted-jazzy` over
-    /// `bare` between programs of these distributions, or what a table says.
+    /// Over which path: `bare`, `paper` (76 ms round trip, 5 Mbit/s), `lossy` (40 ms, 50 Mbit/s, 2 %), `jazzy-kilted`
+    /// and `kilted-jazzy` over `bare` between programs of these distributions, or what a table says.
     pub(crate) path: String,
     /// At what: bytes of a message, messages a second, sinks, routers, records, runs, by the table.
     pub(crate) at: f64,

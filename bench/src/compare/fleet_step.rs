@@ -1,7 +1,8 @@
 //! Table `fleet-step`: four robots send an image each, and a server answers all once it has all four.
 //!
-//! Beside topics, as the paper's previous system did it: files over SSH and SFTP, with a real `sshd`. There every robot keeps one
-//! SFTP session for all steps, so that no step has a handshake in it, and the server sees files without asking.
+//! Beside topics, as the paper's previous system did it: files over SSH and SFTP, with a real `sshd`. There every robot
+//! keeps one SFTP session for all steps, so that no step has a handshake in it, and the server sees files without
+//! asking.
 
 use std::fs;
 use std::io::ErrorKind;

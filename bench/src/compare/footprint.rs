@@ -1,8 +1,8 @@
 //! Table `footprint`: what a node costs while nothing happens, by topics, links and names, beside the bridges that were
 //! asked for.
 //!
-//! A figure is of one process that has come to rest. Applications, owners of names and the far ends of links are in this
-//! process, which is not measured.
+//! A figure is of one process that has come to rest. Applications, owners of names and the far ends of links are in
+//! this process, which is not measured.
 
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -1,7 +1,7 @@
 //! The project's goals, each judged by the figures of one run: met, missed, or not measured.
 //!
-//! A goal against another system is a ratio to that system's figure in the same run, because times differ from machine to
-//! machine. This module judges and measures nothing.
+//! A goal against another system is a ratio to that system's figure in the same run, because times differ from machine
+//! to machine. This module judges and measures nothing.
 
 use super::figures::{Figure, Figures};
 use super::plot::Unit;

@@ -137,8 +137,8 @@ impl Lab {
         Ok(dir)
     }
 
-    /// A program of `load` at a place, in the local network that a system brings there: `args` are its role and what that
-    /// is given, domain left out.
+    /// A program of `load` at a place, in the local network that a system brings there: `args` are its role and what
+    /// that is given, domain left out.
     pub(crate) fn load(&self, running: &Running, side: Side, args: &[&str]) -> Result<Program> {
         self.load_in(&running.dds[side as usize], side, args)
     }

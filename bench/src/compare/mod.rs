@@ -1,8 +1,8 @@
 //! `compare`: SGC and its alternatives, side by side in one run over one emulated network.
 //!
-//! A [`System`](system::System) joins two places of a [`Lab`](lab::Lab) and carries topics of programs that do not know it. A
-//! table is a module here and a row of [`TABLES`]. It measures [`figures::Figure`]s, which `report` turns into pages, plots and
-//! goals.
+//! A [`System`](system::System) joins two places of a [`Lab`](lab::Lab) and carries topics of programs that do not know
+//! it. A table is a module here and a row of [`TABLES`]. It measures [`figures::Figure`]s, which `report` turns into
+//! pages, plots and goals.
 
 mod applications;
 mod fan_out;
@@ -150,7 +150,8 @@ impl Compare {
         &self.relays
     }
 
-    /// Returns the requested systems that a table has, and reports missing ones. Systems requested by name are always included.
+    /// Returns the requested systems that a table has, and reports missing ones. Systems requested by name are always
+    /// included.
     pub(crate) fn systems_of(
         &self,
         breadth: Breadth,
@@ -232,8 +233,8 @@ fn fits(pattern: &str, name: &str) -> bool {
     pattern.strip_suffix('*').map_or(pattern == name, |start| name.starts_with(start))
 }
 
-/// Runs what is asked for and writes figures, report and plots, anew after each table: what was measured is not lost with what
-/// was not.
+/// Runs what is asked for and writes figures, report and plots, anew after each table: what was measured is not lost
+/// with what was not.
 pub(crate) fn run(args: CompareArgs) -> Result<()> {
     let compare = Compare::new(args)?;
     let mut figures = Figures::default();

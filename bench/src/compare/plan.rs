@@ -1,5 +1,5 @@
-//! The extent of a whole run: the variants of `sgc` in each table, the number of turns of each system, and the number of systems
-//! measured at the same time. The budget is in `bench/README.md`.
+//! The extent of a whole run: the variants of `sgc` in each table, the number of turns of each system, and the number
+//! of systems measured at the same time. The budget is in `bench/README.md`.
 
 use super::lab::PathKind;
 use super::tcp;
@@ -64,8 +64,8 @@ pub(crate) fn rounds(kind: &PathKind, system: &str) -> usize {
     }
 }
 
-/// How many go at the same time over paths of their own. 5 Mbit/s are little for a machine, and so is what TCP makes of a path that
-/// loses packets; what copes with losses fills 50 Mbit/s.
+/// How many go at the same time over paths of their own. 5 Mbit/s are little for a machine, and so is what TCP makes of
+/// a path that loses packets; what copes with losses fills 50 Mbit/s.
 const ABREAST_PAPER: usize = 6;
 const ABREAST_LOSSY: usize = 2;
 const ABREAST_LOSSY_TCP: usize = 6;

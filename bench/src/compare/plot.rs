@@ -1,7 +1,7 @@
 //! Plots as SVG text: curves and bars with axes, units and a legend, legible on light and on dark pages.
 //!
-//! It draws what it is given and knows neither figures nor systems; which plots there are is [`super::report`]'s. A crate
-//! for plots would bring fonts and bitmaps, and writes colours where a page's scheme cannot change them.
+//! It draws what it is given and knows neither figures nor systems; which plots there are is [`super::report`]'s. A
+//! crate for plots would bring fonts and bitmaps, and writes colours where a page's scheme cannot change them.
 
 use std::fmt::Write as _;
 
@@ -126,8 +126,8 @@ impl Stroke {
     }
 }
 
-/// Curves over a common x axis. Numbers that are not finite, and on logarithmic axes those that are not above nothing, are
-/// left out. `None` if no curve has anything to show.
+/// Curves over a common x axis. Numbers that are not finite, and on logarithmic axes those that are not above nothing,
+/// are left out. `None` if no curve has anything to show.
 pub(crate) fn curves(title: &str, x: &Axis<'_>, y: &Axis<'_>, series: &[Series]) -> Option<String> {
     let finite = |(x, y): &&(f64, f64)| x.is_finite() && y.is_finite();
     let points: Vec<_> = series.iter().flat_map(|s| &s.points).filter(finite).copied().collect();

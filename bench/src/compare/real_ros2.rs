@@ -1,7 +1,9 @@
-//! Table `real-ros2`: programs of real ROS 2 with stock Fast DDS, one distribution at the left and another at the right.
+//! Table `real-ros2`: programs of real ROS 2 with stock Fast DDS, one distribution at the left and another at the
+//! right.
 //!
-//! The programs are the C load generator on `rcl` of `tests/peers/ros2`. Each measurement starts the places, the system and the programs
-//! anew, since a system may keep something of programs that have gone: that has a row of its own, the restart.
+//! The programs are the C load generator on `rcl` of `tests/peers/ros2`. Each measurement starts the places, the system
+//! and the programs anew, since a system may keep something of programs that have gone: that has a row of its own, the
+//! restart.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;

@@ -1,7 +1,7 @@
 //! Pages of a run: goals, a table for every path, plots, the machine, and what was left out.
 //!
-//! It shows whatever figures there are; tables that it knows nothing of it lays out by the same rule as those it has words
-//! for. It measures nothing, and judging goals is [`super::goals`]'s.
+//! It shows whatever figures there are; tables that it knows nothing of it lays out by the same rule as those it has
+//! words for. It measures nothing, and judging goals is [`super::goals`]'s.
 
 use std::fmt::Write as _;
 use std::fs;

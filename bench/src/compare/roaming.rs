@@ -1,7 +1,7 @@
 //! Table `roaming`: the left place changes its address under a reliable flow, and changes it back.
 //!
-//! The path is a bare one, so that what is seen is how long a system takes to notice and to act. `at` 0 is the way to the new
-//! address, `at` 1 the way back.
+//! The path is a bare one, so that what is seen is how long a system takes to notice and to act. `at` 0 is the way to
+//! the new address, `at` 1 the way back.
 
 use std::thread::sleep;
 use std::time::Duration;
@@ -34,7 +34,8 @@ const CONNECT_MAX: Duration = Duration::from_secs(30);
 /// How much longer something may take than it says.
 const SPARE: Duration = Duration::from_secs(60);
 
-/// Returns settings for users of the Zenoh bridge: it notices silence earlier than after ten seconds, and reconnects earlier.
+/// Returns settings for users of the Zenoh bridge: it notices silence earlier than after ten seconds, and reconnects
+/// earlier.
 fn zenoh_tuning() -> Value {
     json!({
         "transport": { "link": { "tx": { "lease": 2000 } } },

@@ -1,7 +1,7 @@
 //! Table `round-trip`: a message to the other place and back, by its size.
 //!
-//! Systems take turns in rounds. A turn starts the system anew, and measures all sizes one after the other; on thin paths several
-//! have theirs at the same time.
+//! Systems take turns in rounds. A turn starts the system anew, and measures all sizes one after the other; on thin
+//! paths several have theirs at the same time.
 
 use std::collections::BTreeMap;
 use std::time::Duration;

@@ -1,5 +1,5 @@
-//! Table `start-up`: how long it takes until something is known, and until a first message comes, at a router that knows
-//! much, and for an application by every system.
+//! Table `start-up`: how long it takes until something is known, and until a first message comes, at a router that
+//! knows much, and for an application by every system.
 //!
 //! `sgc-router` by the names that it knows; the other systems with nothing but the one topic.
 

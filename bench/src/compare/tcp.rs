@@ -1,5 +1,5 @@
-//! Plain kernel TCP over the path: what any system is to be measured by where the path is what limits. No DDS, no encryption;
-//! a length in front of each message, and the message sent back once it is there as a whole.
+//! Plain kernel TCP over the path: what any system is to be measured by where the path is what limits. No DDS, no
+//! encryption; a length in front of each message, and the message sent back once it is there as a whole.
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};

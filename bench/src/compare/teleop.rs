@@ -1,7 +1,8 @@
 //! Table `teleop`: driving a robot over a thin uplink while its camera sends three times the uplink's rate.
 //!
-//! The programs are those of every table, with the QoS that ROS 2 gives them by default: commands and state reliable, the
-//! camera best effort as sensor data. Each system is configured as its users would for this, see [`PRIORITIES`] and [`zenoh_tuning`].
+//! The programs are those of every table, with the QoS that ROS 2 gives them by default: commands and state reliable,
+//! the camera best effort as sensor data. Each system is configured as its users would for this, see [`PRIORITIES`] and
+//! [`zenoh_tuning`].
 
 use std::time::Duration;
 
@@ -68,8 +69,9 @@ const FLOWS: [Flow; 3] = [
 /// Priorities that users of SGC configure.
 const PRIORITIES: &[(&str, &str)] = &[("/cmd_vel", "realtime"), ("/camera", "bulk")];
 
-/// Returns settings for users of the Zenoh bridge: priorities of topics, small messages without batching, only as many frames as
-/// the uplink carries (nine take 4.3 of its 5 Mbit/s; the user has to know the rate), and a short kernel queue.
+/// Returns settings for users of the Zenoh bridge: priorities of topics, small messages without batching, only as many
+/// frames as the uplink carries (nine take 4.3 of its 5 Mbit/s; the user has to know the rate), and a short kernel
+/// queue.
 fn zenoh_tuning() -> Value {
     json!({
         "plugins": { "ros2dds": {

@@ -1,7 +1,7 @@
 //! Table `throughput`: messages one way, as fast as they are taken, by their size; over the bare path.
 //!
-//! The topic is reliable and keeps all that is not acknowledged, so who writes waits for who is slow, as far as the system
-//! hands that on; what is lost all the same is counted.
+//! The topic is reliable and keeps all that is not acknowledged, so who writes waits for who is slow, as far as the
+//! system hands that on; what is lost all the same is counted.
 
 use anyhow::Result;
 

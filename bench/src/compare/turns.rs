@@ -1,5 +1,5 @@
-//! Turns of several participants at the same time, each in a lab of its own, where the path and not the machine decides how long
-//! things take. This module does not know what is measured.
+//! Turns of several participants at the same time, each in a lab of its own, where the path and not the machine decides
+//! how long things take. This module does not know what is measured.
 
 use anyhow::Result;
 
@@ -27,8 +27,9 @@ pub(crate) fn abreast<W: Send, R: Send>(
     })
 }
 
-/// Starts all participants and lets them go through stages. Each stage begins when all have finished the one before, so that no
-/// start or end disturbs a measurement. A participant is out if it fails, or if a stage leaves it unable to go on (`None`).
+/// Starts all participants and lets them go through stages. Each stage begins when all have finished the one before, so
+/// that no start or end disturbs a measurement. A participant is out if it fails, or if a stage leaves it unable to go
+/// on (`None`).
 pub(crate) fn by_stages<W: Copy + Send, T: Send, R: Send, S: Copy + Sync>(
     who: &[W],
     stages: &[S],

@@ -25,7 +25,8 @@ use crate::report::{Report, Spread, Table, digits, median, thousands};
 
 /// Payload of a message.
 const MESSAGE_BYTES: usize = 1024;
-/// Messages that the sender hands over together when it goes as fast as it can: what an application under load has at hand.
+/// Messages that the sender hands over together when it goes as fast as it can: what an application under load has at
+/// hand.
 const BURST: usize = 32;
 /// Messages a second when it is delays that are measured.
 const PACE: Duration = Duration::from_millis(1);

@@ -1,5 +1,5 @@
-//! A program without ROS that sends and receives messages, by protocol and encoding. It reads only the number of a message, so
-//! that the gateway is measured and not this program.
+//! A program without ROS that sends and receives messages, by protocol and encoding. It reads only the number of a
+//! message, so that the gateway is measured and not this program.
 
 use anyhow::{Context, Result, bail, ensure};
 use base64::Engine as _;

@@ -4,8 +4,8 @@ use super::REFERENCE_BYTES;
 use super::figures::Figure;
 use crate::report::{Table, digits};
 
-/// Rate of the paper's reference, `rosbridge_suite`, in messages of [`REFERENCE_BYTES`] per second. It was measured once, on a
-/// machine such as that of the first published figures, not in this run.
+/// Rate of the paper's reference, `rosbridge_suite`, in messages of [`REFERENCE_BYTES`] per second. It was measured
+/// once, on a machine such as that of the first published figures, not in this run.
 const PEER_PER_SECOND: f64 = 640.0;
 /// Its round trip, µs; and with its polling patched away.
 const PEER_TRIP_US: f64 = 12_000.0;

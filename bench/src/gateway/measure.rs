@@ -107,8 +107,8 @@ struct ClientArrivals {
     last_ns: AtomicU64,
 }
 
-/// Measures messages from a DDS program at full speed to the client. By gRPC the gateway buffers messages up to a bound. It drops
-/// messages beyond that, and by rosbridge those beyond a queue.
+/// Measures messages from a DDS program at full speed to the client. By gRPC the gateway buffers messages up to a
+/// bound. It drops messages beyond that, and by rosbridge those beyond a queue.
 pub(super) async fn down(scene: &Scene, way: Way, size: usize, plan: &Plan) -> Result<Flow> {
     let hearer = Hearer::new(scene, way, DOWN, size, true).await?;
     let heard = Arc::new(ClientArrivals::default());
@@ -183,8 +183,8 @@ struct SinkReport {
     ended_ns: u64,
 }
 
-/// Measures messages from the client at full speed to a DDS program. None is lost: DDS keeps unacknowledged messages, and the
-/// gateway lets the client wait.
+/// Measures messages from the client at full speed to a DDS program. None is lost: DDS keeps unacknowledged messages,
+/// and the gateway lets the client wait.
 pub(super) async fn up(scene: &Scene, way: Way, size: usize, plan: &Plan) -> Result<Flow> {
     let mut sayer = Sayer::new(scene, way, UP, size, true).await?;
     let (.., before) = say(scene, &mut sayer, plan.seconds / 4.0).await?;

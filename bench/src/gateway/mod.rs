@@ -1,5 +1,5 @@
-//! `gateway`: programs without ROS beside a DDS program, through one `sgc run` with `[gateway]`: round trips and messages as fast as
-//! they go, by each protocol and encoding.
+//! `gateway`: programs without ROS beside a DDS program, through one `sgc run` with `[gateway]`: round trips and
+//! messages as fast as they go, by each protocol and encoding.
 //!
 //! [`scene`] starts the measured node, [`client`] is the program without ROS, [`measure`] times it, [`goals`] and
 //! [`figures`] hold the results.

@@ -1,4 +1,5 @@
-//! Measures the cost of names over real links to a router's process: owners publish, a subscriber joins and is answered.
+//! Measures the cost of names over real links to a router's process: owners publish, a subscriber joins and is
+//! answered.
 
 use std::collections::HashMap;
 use std::path::Path;

@@ -1,8 +1,8 @@
-//! Links by every transport, beside plain TCP and TLS 1.3 as rustls does it: throughput, round trips, CPU time, memory, and a
-//! message of 13 MB over a path that loses packets.
+//! Links by every transport, beside plain TCP and TLS 1.3 as rustls does it: throughput, round trips, CPU time, memory,
+//! and a message of 13 MB over a path that loses packets.
 //!
-//! The near end is in this process and the far end in one of its own, so that their CPU time and memory can be told apart. All
-//! ways stay up and take turns. No node and no routing is in it: [`crate::forward`] has those.
+//! The near end is in this process and the far end in one of its own, so that their CPU time and memory can be told
+//! apart. All ways stay up and take turns. No node and no routing is in it: [`crate::forward`] has those.
 
 mod links;
 mod raw;

@@ -1,5 +1,5 @@
-//! The floor: messages with their length in front over TCP, and over TLS 1.3 as rustls does it. One thread at each end, and
-//! nothing else.
+//! The floor: messages with their length in front over TCP, and over TLS 1.3 as rustls does it. One thread at each end,
+//! and nothing else.
 
 use std::io::{BufReader, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};

@@ -1,5 +1,5 @@
-//! Hosts the ROS 2 plugin of Zenoh in a Zenoh runtime, as `zenoh-bridge-ros2dds` does, so that the benchmarks can run it
-//! from crates.io without a release of that program.
+//! Hosts the ROS 2 plugin of Zenoh in a Zenoh runtime, as `zenoh-bridge-ros2dds` does, so that the benchmarks can run
+//! it from crates.io without a release of that program.
 //!
 //! It adds nothing: no watchdog, no REST, no ROS arguments. Other settings come with `--config`, in the form
 //! that the bridge's own users write: <https://github.com/eclipse-zenoh/zenoh-plugin-ros2dds>.

@@ -68,8 +68,8 @@ impl GatewayConfig {
     /// Upper bound of `client_bytes_max`: more than memory has.
     pub const CLIENT_BYTES_MAX: u64 = 16 << 30;
 
-    /// Returns the default listen addresses: this host only, at the ports that clients try first. The list is empty in a
-    /// build without protocols.
+    /// Returns the default listen addresses: this host only, at the ports that clients try first. The list is empty in
+    /// a build without protocols.
     pub fn default_listen() -> Vec<GatewayUrl> {
         let here = |scheme, port| GatewayUrl { scheme, address: (Ipv4Addr::LOCALHOST, port).into() };
         let usual = [

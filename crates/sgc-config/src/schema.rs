@@ -1,6 +1,7 @@
 //! Tables and keys of a configuration, planned keys, and suggestions for misspelt ones.
 //!
-//! A key is defined here only; `docs/reference/configuration.md` is tested against this table. `resolve` checks the values.
+//! A key is defined here only; `docs/reference/configuration.md` is tested against this table. `resolve` checks the
+//! values.
 
 /// A table of the file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

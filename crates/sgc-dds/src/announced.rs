@@ -87,8 +87,9 @@ pub(crate) unsafe fn complete(sertype: *const ddsi_sertype) -> bool {
 /// # Safety
 /// `domain` must be valid, and no other thread may register types there meanwhile.
 unsafe fn complete_type(domain: *mut ddsi_domaingv, name: &CStr) -> bool {
-    // SAFETY: all zeros is a valid value of this plain C struct, which the call fills; the name is copied, and both tables live for
-    // ever. The type that is found is compared with functions of the first table, which read no more than the struct has.
+    // SAFETY: all zeros is a valid value of this plain C struct, which the call fills; the name is copied, and both
+    // tables live for ever. The type that is found is compared with functions of the first table, which read no more
+    // than the struct has.
     let found = unsafe {
         let mut like = ParameterListType {
             common: std::mem::zeroed(),
@@ -105,8 +106,8 @@ unsafe fn complete_type(domain: *mut ddsi_domaingv, name: &CStr) -> bool {
     if found.is_null() {
         return false;
     }
-    // SAFETY: a type of the domain, of which the look-up gave a reference; threads of Cyclone's read the pointer meanwhile, and do
-    // alike with either table.
+    // SAFETY: a type of the domain, of which the look-up gave a reference; threads of Cyclone's read the pointer
+    // meanwhile, and do alike with either table.
     unsafe {
         let table = std::ptr::from_ref(table()).cast_mut();
         AtomicPtr::from_ptr((&raw mut (*found).serdata_ops).cast::<*mut ddsi_serdata_ops>())

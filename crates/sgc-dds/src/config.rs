@@ -154,20 +154,20 @@ fn participant_index_max(domain: u32) -> u32 {
     ((u32::from(u16::MAX) - first) / 2).min(PARTICIPANT_INDEX_MAX)
 }
 
-/// Cyclone's configuration for a network, the user's `CYCLONEDDS_URI` appended. Key hashes are on because Fast DDS (2.14, 3.2) learns from
-/// nothing else which endpoint is gone: without them it keeps every writer and reader that was ever deleted.
+/// Cyclone's configuration for a network, the user's `CYCLONEDDS_URI` appended. Key hashes are on because Fast DDS
+/// (2.14, 3.2) learns from nothing else which endpoint is gone: without them it keeps every writer and reader that was
+/// ever deleted.
 ///
-/// The discovery ranges mean what they mean to rmw_cyclonedds from Iron on: `Off` is a domain tag that
-/// nobody else has, `LocalHost` unicast to the participants of this host, `Subnet` multicast plus peers.
-/// Three things differ, each to be found by more peers, none to be found from farther away:
-/// `LocalHost` binds to the loopback interface (as rmw_cyclonedds did for `ROS_LOCALHOST_ONLY` up to
-/// Humble) unless a static peer is on another host, and also uses multicast *on that interface* for
-/// participant discovery where it is possible; a hundred participants of a host are asked, not 33; and
-/// peers are asked for ever, while Cyclone 11 gives up after 30 s. The host's other addresses are asked as
-/// well, from the loopback interface, which no packet leaves: a Cyclone 11 that is bound to such an
-/// address ignores participants that speak to it on another. And with static peers on other hosts, `LocalHost` takes
-/// the interfaces that lead to them, where Cyclone would take the first that can do multicast. `Subnet` takes the loopback interface
-/// as well: nodes that keep to their host are found there.
+/// The discovery ranges mean what they mean to rmw_cyclonedds from Iron on: `Off` is a domain tag that nobody else has,
+/// `LocalHost` unicast to the participants of this host, `Subnet` multicast plus peers. Three things differ, each to be
+/// found by more peers, none to be found from farther away: `LocalHost` binds to the loopback interface (as
+/// rmw_cyclonedds did for `ROS_LOCALHOST_ONLY` up to Humble) unless a static peer is on another host, and also uses
+/// multicast *on that interface* for participant discovery where it is possible; a hundred participants of a host are
+/// asked, not 33; and peers are asked for ever, while Cyclone 11 gives up after 30 s. The host's other addresses are
+/// asked as well, from the loopback interface, which no packet leaves: a Cyclone 11 that is bound to such an address
+/// ignores participants that speak to it on another. And with static peers on other hosts, `LocalHost` takes the
+/// interfaces that lead to them, where Cyclone would take the first that can do multicast. `Subnet` takes the loopback
+/// interface as well: nodes that keep to their host are found there.
 ///
 /// # Errors
 /// [`RosError::Domain`] if the configuration is invalid.

@@ -280,7 +280,8 @@ pub(crate) fn install(domain: &Entity, participant: &Entity) -> Result<EndpointW
     if known.is_err_and(|known| known != write_endpoint) {
         return Err("domains publish endpoints in different ways".into());
     }
-    // SAFETY: the field is aligned, lives as long as the domain, and Cyclone's other threads read it whole; either function does for them.
+    // SAFETY: the field is aligned, lives as long as the domain, and Cyclone's other threads read it whole; either
+    // function does for them.
     unsafe { AtomicPtr::from_ptr(&raw mut (*topics).write_endpoint) }.store(ours, Ordering::Release);
     Ok(EndpointWatch::of_domain(gv))
 }
@@ -324,7 +325,8 @@ unsafe extern "C" fn endpoint_changed(
 /// is one of Fast DDS, whose first heartbeat then skips nothing.
 ///
 /// # Safety
-/// `entity` must be a `struct ddsi_entity_common` that may be written to, `domain` the `struct dds_domain` that it belongs to.
+/// `entity` must be a `struct ddsi_entity_common` that may be written to, `domain` the `struct dds_domain` that it
+/// belongs to.
 unsafe fn discover(entity: *const EntityCommon, domain: *mut c_void) -> Option<NewWriter> {
     // SAFETY: valid by contract, and every entity begins with these.
     let (kind, guid, gv) = unsafe { ((*entity).kind, (*entity).guid, (*entity).gv) };
@@ -356,7 +358,8 @@ unsafe fn discover(entity: *const EntityCommon, domain: *mut c_void) -> Option<N
         return None;
     }
     let mut durability = dds_durability_kind_DDS_DURABILITY_VOLATILE;
-    // SAFETY: the QoS of a writer that its lock is held of; a place for the result. Without a durability it is volatile.
+    // SAFETY: the QoS of a writer that its lock is held of; a place for the result. Without a durability it is
+    // volatile.
     unsafe { dds_qget_durability(qos, &mut durability) };
     if durability == dds_durability_kind_DDS_DURABILITY_VOLATILE {
         // SAFETY: the flags are where they should be, and the writer's lock is held.
@@ -413,8 +416,8 @@ unsafe extern "C" fn matched(
         return;
     };
     let mut guid = dds_guid_t { v: [0; 16] };
-    // SAFETY: the handle is checked by Cyclone, and `guid` is a valid place for the result. A reader that is being made has no handle
-    // yet; the writer's periodic heartbeat does for it.
+    // SAFETY: the handle is checked by Cyclone, and `guid` is a valid place for the result. A reader that is being made
+    // has no handle yet; the writer's periodic heartbeat does for it.
     if check(unsafe { dds_get_guid(reader, &mut guid) }).is_err() {
         return;
     }
@@ -476,8 +479,8 @@ unsafe extern "C" fn ask(gv: *mut c_void, event: *mut c_void, pack: *mut c_void,
     let pool =
         POOL.get_or_init(|| Pool(unsafe { ddsi_xmsgpool_new(ProtocolVersion { major: 2, minor: 1 }) }));
     let (bytes, prefix) = (size_of::<AckNack>(), [writer[0], writer[1], writer[2]]);
-    // SAFETY: arguments are copied; a message that there is memory for has room for what is appended, and is the pack's then. The
-    // event is deleted once, by its own callback, as Cyclone's are.
+    // SAFETY: arguments are copied; a message that there is memory for has room for what is appended, and is the pack's
+    // then. The event is deleted once, by its own callback, as Cyclone's are.
     unsafe {
         let message = ddsi_xmsg_new(pool.0, &reader, std::ptr::null(), bytes, CONTROL);
         if !message.is_null() {

@@ -75,8 +75,9 @@ pub(crate) unsafe fn cover_exactly(fragments: *const ddsi_rdata, bytes: usize) -
     covered == bytes
 }
 
-// Of `ddsi__serdata_plist.h`, `ddsi__serdata_pserop.h` and `ddsi__serdata_cdr.h`: the tables of functions of Cyclone's own types, which are those
-// of participants and endpoints, of liveliness and DDS Security, and of questions for types. mprotect(2), sysconf(3).
+// Of `ddsi__serdata_plist.h`, `ddsi__serdata_pserop.h` and `ddsi__serdata_cdr.h`: the tables of functions of Cyclone's
+// own types, which are those of participants and endpoints, of liveliness and DDS Security, and of questions for types.
+// mprotect(2), sysconf(3).
 #[allow(improper_ctypes)]
 unsafe extern "C" {
     static ddsi_serdata_ops_plist: ddsi_serdata_ops;

@@ -73,10 +73,10 @@ struct Submessage {
 ///
 /// # Safety
 /// `view` must be the `refd_payload_iov` of a `struct ddsi_xmsg` of Cyclone DDS 11 as `cyclors` =0.4.0 builds it:
-/// `ddsi_xmsg_serdata` is the only function there that asks for the payload of a sample of this crate's sertype. (Others ask for
-/// keys, or copy samples for readers of the same participant with another sertype. Those of a proxy are ignored, and in any other
-/// network all endpoints of a topic are of one sertype: those that [`crate::sample::topic`] makes are equal, so that Cyclone keeps one
-/// of them.)
+/// `ddsi_xmsg_serdata` is the only function there that asks for the payload of a sample of this crate's sertype.
+/// (Others ask for keys, or copy samples for readers of the same participant with another sertype. Those of a proxy are
+/// ignored, and in any other network all endpoints of a topic are of one sertype: those that [`crate::sample::topic`]
+/// makes are equal, so that Cyclone keeps one of them.)
 pub(crate) unsafe fn add(view: *mut ddsrt_iovec_t, parameters: &[Parameter<'_>]) -> bool {
     // SAFETY: by contract the view is that field of that struct.
     let message = unsafe { view.cast::<u8>().sub(offset_of!(Xmsg, payload_view)).cast::<Xmsg>() };

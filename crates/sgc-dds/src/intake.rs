@@ -316,8 +316,8 @@ impl<R: Receiver> Intake<R> {
             participant: Arc::clone(participant),
         });
         let arg = Arc::as_ptr(&shared).cast_mut().cast::<c_void>();
-        // SAFETY: the listener is copied by the call that makes the reader, as is the QoS, and deleted once. `arg` outlives
-        // the reader, whose deletion waits for its listener: see `Entities`.
+        // SAFETY: the listener is copied by the call that makes the reader, as is the QoS, and deleted once. `arg`
+        // outlives the reader, whose deletion waits for its listener: see `Entities`.
         let reader = unsafe {
             let listener = dds_create_listener(arg);
             dds_lset_data_available(listener, Some(arrived::<R>));

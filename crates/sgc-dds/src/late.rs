@@ -3,8 +3,8 @@
 //! A writer for a publisher that did not announce its depth keeps as much as it can until the depth is known. Cyclone
 //! DDS 11 fixes both depths of a history at creation, and another writer could not repeat the samples without sending
 //! them again to every reader. So this module reaches into `struct whc_impl` (`dds_whc.c`), the history cache, and
-//! makes Cyclone's own code drop old samples. Each number on the way is compared with its expected value, and nothing is
-//! touched if one differs.
+//! makes Cyclone's own code drop old samples. Each number on the way is compared with its expected value, and nothing
+//! is touched if one differs.
 
 use std::ffi::c_void;
 use std::ops::Range;
@@ -33,7 +33,8 @@ const IS_TRANSIENT_LOCAL: u32 = 1;
 
 /// Has a transient-local writer that keeps the last `history` samples, the first of `late` for late joiners, give late
 /// joiners the second of `late` from here on, and drop all but the last `stay` samples, whether readers have
-/// acknowledged them or not. Returns `false`, and does nothing, if this Cyclone is not the one that this was written for.
+/// acknowledged them or not. Returns `false`, and does nothing, if this Cyclone is not the one that this was written
+/// for.
 pub(crate) fn set_depth(
     writer: dds_entity_t,
     topic: dds_entity_t,

@@ -76,8 +76,8 @@ fn leases() -> MutexGuard<'static, BTreeMap<Key, KeptLease>> {
 /// Keeps the lease of a new reliable writer from running out, if the writer is manual by topic.
 ///
 /// # Safety
-/// `entity` is the writer, which no reader is matched with yet, `qos` its QoS and `lease` what it has for a lease; all live at least until
-/// [`forget`] is told of it.
+/// `entity` is the writer, which no reader is matched with yet, `qos` its QoS and `lease` what it has for a lease; all
+/// live at least until [`forget`] is told of it.
 pub(crate) unsafe fn keep(
     domain: *const c_void,
     guid: [u32; 4],

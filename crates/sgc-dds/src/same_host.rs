@@ -9,9 +9,10 @@
 //! - When the source or destination address of a packet is gone, and the receiver is on this host, the packet goes to
 //!   127.0.0.1. A former address of this host may belong to another host by now, so its packets go there as well.
 //!
-//! All other packets go as Cyclone sends them, those of a long message in bursts (`bursts.rs`). This needs `struct ddsi_tran_conn` and `struct
-//! ddsi_tran_write_msgfrags` of the Cyclone that `cyclors` =0.4.0 builds (`CYCLORS` in `sample.rs`). A connection
-//! that does not refer to its domain, or whose socket is not bound to an address of this host, is left alone.
+//! All other packets go as Cyclone sends them, those of a long message in bursts (`bursts.rs`). This needs `struct
+//! ddsi_tran_conn` and `struct ddsi_tran_write_msgfrags` of the Cyclone that `cyclors` =0.4.0 builds (`CYCLORS` in
+//! `sample.rs`). A connection that does not refer to its domain, or whose socket is not bound to an address of this
+//! host, is left alone.
 
 use std::ffi::{c_int, c_void};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};

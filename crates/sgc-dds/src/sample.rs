@@ -37,13 +37,15 @@ use crate::identity::{
 use crate::inline_qos::{self, DATA, FLAG_INLINE_QOS, FLAG_LITTLE_ENDIAN, INLINE_QOS_BASE, Parameter};
 use crate::payload::{Frame, PAYLOAD_BYTES_MAX};
 
-/// The requirement of `Cargo.toml` for the only version of `cyclors` whose C code this module was written for. Cargo builds
-/// no other version than the one that is written there with `=`, and whoever writes another one there meets the assertion
-/// below. To be done then, in `cyclonedds/src/core/ddsi/src`: compare `struct ddsi_xmsg` and `struct ddsi_xmsg_marker`
-/// (`ddsi_xmsg.c`, `ddsi__xmsg.h`), `struct ddsi_rdata` and `struct ddsi_rmsg` (`ddsi_radmin.h`), `struct ddsi_sertype_plist`
-/// (`ddsi__serdata_plist.h`) and the users of `ddsi_serdata_ops_plist`, the callers of `ddsi_serdata_to_ser_ref`, and the functions
-/// declared below, with the text here and in `inline_qos.rs`, `announced.rs` and `fragments.rs`; all that `first_messages.rs`,
-/// `late_readers.rs` and `same_host.rs` name; `domainId` and its readers (`plugin_domain.rs`); and in `cyclonedds/src/core/ddsc/src` the structures that `late.rs` names.
+/// The requirement of `Cargo.toml` for the only version of `cyclors` whose C code this module was written for. Cargo
+/// builds no other version than the one that is written there with `=`, and whoever writes another one there meets the
+/// assertion below. To be done then, in `cyclonedds/src/core/ddsi/src`: compare `struct ddsi_xmsg` and `struct
+/// ddsi_xmsg_marker` (`ddsi_xmsg.c`, `ddsi__xmsg.h`), `struct ddsi_rdata` and `struct ddsi_rmsg` (`ddsi_radmin.h`),
+/// `struct ddsi_sertype_plist` (`ddsi__serdata_plist.h`) and the users of `ddsi_serdata_ops_plist`, the callers of
+/// `ddsi_serdata_to_ser_ref`, and the functions declared below, with the text here and in `inline_qos.rs`,
+/// `announced.rs` and `fragments.rs`; all that `first_messages.rs`, `late_readers.rs` and `same_host.rs` name;
+/// `domainId` and its readers (`plugin_domain.rs`); and in `cyclonedds/src/core/ddsc/src` the structures that `late.rs`
+/// names.
 const CYCLORS: &str = "\ncyclors = \"=0.4.0\"\n";
 
 const _: () = assert!(
@@ -139,8 +141,8 @@ struct Content {
 #[derive(Debug)]
 pub(crate) struct SampleRef(*mut ddsi_serdata);
 
-// SAFETY: the reference count is atomic, the content is never changed once it is shared, and freeing it is possible on any thread,
-// also when the domain that it came from is gone.
+// SAFETY: the reference count is atomic, the content is never changed once it is shared, and freeing it is possible on
+// any thread, also when the domain that it came from is gone.
 unsafe impl Send for SampleRef {}
 
 impl SampleRef {
@@ -372,8 +374,8 @@ impl Content {
         if sample.is_null() {
             return None;
         }
-        // SAFETY: the block has room for the struct, at an alignment for any type, and the payload follows it. All zeros is a valid
-        // value of Cyclone's plain struct, which the call fills; the sertype is valid by contract.
+        // SAFETY: the block has room for the struct, at an alignment for any type, and the payload follows it. All
+        // zeros is a valid value of Cyclone's plain struct, which the call fills; the sertype is valid by contract.
         unsafe {
             sample.write(Self {
                 common: std::mem::zeroed(),
@@ -524,8 +526,8 @@ unsafe extern "C" fn from_ser(
     if bytes > PAYLOAD_BYTES_MAX || !unsafe { fragments::cover_exactly(fragments, bytes) } {
         return std::ptr::null_mut();
     }
-    // SAFETY: the sertype is this one; the fragments are a chain that ends with null and covers exactly so many bytes, and each one's
-    // message holds its bytes at the offset of its payload.
+    // SAFETY: the sertype is this one; the fragments are a chain that ends with null and covers exactly so many bytes,
+    // and each one's message holds its bytes at the offset of its payload.
     unsafe {
         let Some(sample) = Content::allocate(sertype, bytes) else { return std::ptr::null_mut() };
         let mut at = fragments.cast::<ReceivedFragment>();

@@ -215,8 +215,8 @@ impl CycloneWriter {
         let parent = group.as_ref().unwrap_or(participant.entity()).handle();
         let readers = Arc::new(AtomicU32::new(0));
         let arg = Arc::as_ptr(&readers).cast_mut().cast::<c_void>();
-        // SAFETY: the QoS object and the listener outlive the call, which copies them, and the listener is deleted once.
-        // `arg` outlives the writer, whose deletion waits for its listener: see the fields' order.
+        // SAFETY: the QoS object and the listener outlive the call, which copies them, and the listener is deleted
+        // once. `arg` outlives the writer, whose deletion waits for its listener: see the fields' order.
         let writer = unsafe {
             let listener = dds_create_listener(arg);
             // The status stays set, because a wait for readers waits for it.

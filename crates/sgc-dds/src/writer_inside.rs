@@ -195,15 +195,15 @@ impl WriterInside {
         state.max.saturating_sub(self.acknowledged(&lock))
     }
 
-    /// Makes the next sample carry a heartbeat that readers answer with an acknowledgement. Cyclone asks for one after a
-    /// pause of 4 ms only, so a writer that never pauses hears none.
+    /// Makes the next sample carry a heartbeat that readers answer with an acknowledgement. Cyclone asks for one after
+    /// a pause of 4 ms only, so a writer that never pauses hears none.
     pub(crate) fn ask_for_acknowledgement(&self) {
         // The time of the last write is used for nothing else.
         self.change_progress(|progress, _| progress.last_write = 1);
     }
 
-    /// Sends no heartbeat for a moment after one that asks for an acknowledgement. Fast DDS answers 5 ms later, and not at
-    /// all if a heartbeat that asks for nothing comes in between (`WriterProxy::process_heartbeat`).
+    /// Sends no heartbeat for a moment after one that asks for an acknowledgement. Fast DDS answers 5 ms later, and not
+    /// at all if a heartbeat that asks for nothing comes in between (`WriterProxy::process_heartbeat`).
     pub(crate) fn await_acknowledgement(&self) {
         self.change_progress(|progress, now| progress.last_heartbeat = now + ANSWER_NS);
     }
@@ -212,8 +212,8 @@ impl WriterInside {
     fn change_progress(&self, change: impl FnOnce(&mut Progress, i64)) {
         let _lock = self.lock();
         let mut state = CacheState::default();
-        // SAFETY: as above. The structure is longer than what is looked at, any content is a valid value, and the lock is
-        // held by all who change it.
+        // SAFETY: as above. The structure is longer than what is looked at, any content is a valid value, and the lock
+        // is held by all who change it.
         unsafe {
             ((*(*self.cache).ops).state)(self.cache, &mut state);
             let now = monotonic_ns();

@@ -1,8 +1,8 @@
-//! The demo's messages: real ROS 2 messages in CDR. The content of each holds a sequence number, the time of sending and a
-//! checksum, so that a listener detects any alteration.
+//! The demo's messages: real ROS 2 messages in CDR. The content of each holds a sequence number, the time of sending
+//! and a checksum, so that a listener detects any alteration.
 //!
-//! Pure: times are arguments. This is no general CDR library: it knows three types (`std_msgs/String`, `sensor_msgs/Image`,
-//! `geometry_msgs/Twist`) in plain CDR, little endian (RTPS 2.5, 10; XTypes 1.3, 7.4.1).
+//! Pure: times are arguments. This is no general CDR library: it knows three types (`std_msgs/String`,
+//! `sensor_msgs/Image`, `geometry_msgs/Twist`) in plain CDR, little endian (RTPS 2.5, 10; XTypes 1.3, 7.4.1).
 
 use aws_lc_rs::digest::{Context, SHA256, digest};
 use bytes::Bytes;

@@ -1,7 +1,8 @@
-//! Talker and listener of the demo: a plain DDS participant in one domain that does not know `sgc`, like a ROS 2 program.
+//! Talker and listener of the demo: a plain DDS participant in one domain that does not know `sgc`, like a ROS 2
+//! program.
 //!
-//! It runs in a process of its own, takes commands over standard input, and ends when that ends. Messages flow as soon as
-//! a listener is there. They are numbered and counted only between [`PeerCommand::Go`] and [`PeerCommand::Stop`].
+//! It runs in a process of its own, takes commands over standard input, and ends when that ends. Messages flow as soon
+//! as a listener is there. They are numbered and counted only between [`PeerCommand::Go`] and [`PeerCommand::Stop`].
 
 use std::io::{BufRead, Write};
 use std::process;

@@ -1,8 +1,8 @@
 //! The demo's child processes: runs of this same program, watched and always ended.
 //!
-//! Each child reads a pipe whose other end only this process holds. When this process ends, however it does, the pipe closes
-//! and the child ends itself. Children are in process groups of their own, so a Ctrl-C reaches only this process, which
-//! ends them in order.
+//! Each child reads a pipe whose other end only this process holds. When this process ends, however it does, the pipe
+//! closes and the child ends itself. Children are in process groups of their own, so a Ctrl-C reaches only this
+//! process, which ends them in order.
 
 use std::fs::File;
 use std::io;
@@ -114,8 +114,8 @@ impl Processes {
         }
     }
 
-    /// Asks these children to end by closing their standard input, and waits until they have. The caller bounds the wait.
-    /// Appends children that ended badly to `failures`.
+    /// Asks these children to end by closing their standard input, and waits until they have. The caller bounds the
+    /// wait. Appends children that ended badly to `failures`.
     pub(crate) async fn end(&mut self, those: &[ProcessName], failures: &mut Vec<(ProcessName, String)>) {
         for child in self.children.iter_mut().filter(|c| those.contains(&c.who)) {
             child.stdin = None;

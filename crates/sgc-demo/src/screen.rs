@@ -1,6 +1,7 @@
 //! The demo's display: an introduction, a table that is redrawn while the demo runs, and a summary.
 //!
-//! On a terminal the table stays in its place. Elsewhere it is printed again every two seconds. With `--json` there is none.
+//! On a terminal the table stays in its place. Elsewhere it is printed again every two seconds. With `--json` there is
+//! none.
 
 use std::io::IsTerminal;
 use std::time::Duration;

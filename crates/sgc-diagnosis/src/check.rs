@@ -165,8 +165,8 @@ pub fn summary(
     Ok(rows)
 }
 
-/// Returns the members that rules name and the fleet file lacks, if that file is at hand: the authority's, or one in this
-/// directory, beside the configuration or beside the identity.
+/// Returns the members that rules name and the fleet file lacks, if that file is at hand: the authority's, or one in
+/// this directory, beside the configuration or beside the identity.
 fn unknown_members(config: &Config, identity: &Identity, file: &Path) -> Vec<UnknownMember> {
     let own = identity.as_peer().ca;
     let dirs = [Some(Path::new("")), file.parent(), config.identity.parent()].into_iter().flatten();

@@ -26,7 +26,8 @@ use crate::step::{Step, Verdict, Walk};
 /// Time in seconds for which lost calls count as a fault, unless calls are answered before.
 const LOST_CALLS_FRESH_S: u64 = 600;
 
-/// Begins a walk with the node itself and the alerts that need an operator. Returns `true` if one of them stops all traffic.
+/// Begins a walk with the node itself and the alerts that need an operator. Returns `true` if one of them stops all
+/// traffic.
 fn begin(graph: &Graph) -> (Walk, bool) {
     let node = |finding| Finding::Node(finding);
     let (name, version) = (graph.node.clone(), graph.version.clone());
@@ -110,8 +111,8 @@ pub fn name(graph: &Graph, name: &str) -> Vec<Step> {
 /// The walk of one rule.
 struct RuleWalk {
     steps: Walk,
-    /// The rule may be wrong for this interface while the interface flows by another rule: its wildcard covers more than its
-    /// owner offers, or no program here takes part in this direction.
+    /// The rule may be wrong for this interface while the interface flows by another rule: its wildcard covers more
+    /// than its owner offers, or no program here takes part in this direction.
     is_optional: bool,
 }
 
@@ -139,8 +140,8 @@ fn walks(graph: &Graph, topic: &str) -> Vec<RuleWalk> {
     shares.chain(uses).collect()
 }
 
-/// Merges the walks of several rules. If the interface flows by one of them, faults of optional rules do not count. If it
-/// flows by none, the first fault is enough.
+/// Merges the walks of several rules. If the interface flows by one of them, faults of optional rules do not count. If
+/// it flows by none, the first fault is enough.
 fn merged(walks: Vec<RuleWalk>) -> Walk {
     let (wrong, mut sound): (Vec<_>, Vec<_>) = walks.into_iter().partition(RuleWalk::is_wrong);
     let (optional, required): (Vec<_>, Vec<_>) =
@@ -163,8 +164,8 @@ fn merged(walks: Vec<RuleWalk>) -> Walk {
     steps
 }
 
-/// Returns the walk of a rule whose wildcard covers an idle interface. Prefers the rule whose owner offers it to a rule that
-/// programs here wait for.
+/// Returns the walk of a rule whose wildcard covers an idle interface. Prefers the rule whose owner offers it to a rule
+/// that programs here wait for.
 fn pattern_walk(graph: &Graph, topic: &str) -> Option<RuleWalk> {
     let covering =
         graph.uses.iter().filter(|used| is_pattern(&used.topic) && matches(&used.local_topic, topic));
@@ -192,7 +193,8 @@ fn pattern_walk(graph: &Graph, topic: &str) -> Option<RuleWalk> {
     Some(RuleWalk { steps, is_optional: true })
 }
 
-/// Walks the parts of an action or of a node's parameters, up to the first fault. Returns `false` if no rule covers any part.
+/// Walks the parts of an action or of a node's parameters, up to the first fault. Returns `false` if no rule covers any
+/// part.
 fn walk_parts(graph: &Graph, topic: &str, steps: &mut Walk) -> bool {
     let kinds = [sgc_ros::Interface::Action, sgc_ros::Interface::Parameters];
     let mut is_any = false;
@@ -223,15 +225,15 @@ fn covers(graph: &Graph, at: usize, share: &Share, topic: &str) -> bool {
     is_named || graph.endpoints.iter().any(|e| e.topic == topic && e.shared_by == Some(at))
 }
 
-/// Returns `true` if a use names this topic, or one of its routes carries it. A wildcard alone does not count, because its
-/// owner may not offer the interface.
+/// Returns `true` if a use names this topic, or one of its routes carries it. A wildcard alone does not count, because
+/// its owner may not offer the interface.
 fn concerns(used: &Use, topic: &str) -> bool {
     let runs = used.routes.iter().any(|route| route.topic == topic);
     runs || used.routes.is_empty() && used.local_topic == topic
 }
 
-/// Reports unanswered calls of a service, or of the parts of an action or of parameters. They are a fault if there is no other,
-/// until calls are answered again. Ahead of another fault they are its consequence.
+/// Reports unanswered calls of a service, or of the parts of an action or of parameters. They are a fault if there is
+/// no other, until calls are answered again. Ahead of another fault they are its consequence.
 fn lost_calls(graph: &Graph, topic: &str, steps: &mut Walk) {
     let kinds = [sgc_ros::Interface::Action, sgc_ros::Interface::Parameters];
     let parts = kinds.into_iter().flat_map(|kind| kind.parts()).map(|part| part.name(topic));

@@ -1,7 +1,7 @@
 //! The meaning and the remedy of each refusal: the table from which `sgc why` and `sgc status` explain counters.
 //!
-//! The specification of routing lists the counters, and the node keeps them. `tests/documents` compares both with this table.
-//! Where an enum without data has the counters, a row names the variant.
+//! The specification of routing lists the counters, and the node keeps them. `tests/documents` compares both with this
+//! table. Where an enum without data has the counters, a row names the variant.
 
 use sgc_endpoint::CallLoss;
 use sgc_gateway::{ClientRefusal, Pool};
@@ -696,8 +696,8 @@ pub(crate) const GATEWAY: &[Refusal] = &[
     ),
 ];
 
-/// Refusals of a join by an owner, or by a router on the path, with the remedy at the owner and the one at the node that
-/// asked.
+/// Refusals of a join by an owner, or by a router on the path, with the remedy at the owner and the one at the node
+/// that asked.
 const JOINS: &[(Answer, &str, &str)] = &[
     // The walk itself names the entry to add to `to`.
     (Answer::Owner(RefuseReason::NotPermitted), "", ""),

@@ -1,7 +1,7 @@
 //! The status of a node, and its tables as `sgc status` prints them.
 //!
-//! `sgc-node` makes the document. This file reads the fields that it needs and ignores unknown ones, so it understands older
-//! and newer nodes.
+//! `sgc-node` makes the document. This file reads the fields that it needs and ignores unknown ones, so it understands
+//! older and newer nodes.
 
 use std::collections::BTreeMap;
 use std::path::Path;

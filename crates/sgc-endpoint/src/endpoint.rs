@@ -1,7 +1,7 @@
 //! The endpoint's state machine: the user's requests, the router's frames, and the time, in; frames and events out.
 //!
-//! [`Endpoint`] only routes: `owner.rs` has its part as the owner of names, `joiner.rs` its part as the joiner of others'
-//! names. Both put their effects into one `Context`.
+//! [`Endpoint`] only routes: `owner.rs` has its part as the owner of names, `joiner.rs` its part as the joiner of
+//! others' names. Both put their effects into one `Context`.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

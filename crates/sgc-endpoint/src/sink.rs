@@ -119,11 +119,11 @@ impl Sink {
 
     /// Takes a further grant, and returns the results of the packets that waited for it.
     ///
-    /// - A later epoch is added to the known ones. Delivered numbers are remembered; packets of the earlier epochs open until
-    ///   [`Self::retire_epochs`].
+    /// - A later epoch is added to the known ones. Delivered numbers are remembered; packets of the earlier epochs open
+    ///   until [`Self::retire_epochs`].
     /// - Another key for a known epoch, or an earlier epoch, is that of a restarted owner: nothing of before counts.
-    /// - Under another id (the route to the owner changed, and this sink asked again), newer messages of a source must be asked
-    ///   for.
+    /// - Under another id (the route to the owner changed, and this sink asked again), newer messages of a source must
+    ///   be asked for.
     /// - A source that is no longer announced counts in the epochs until then, and in no later one.
     pub fn regrant(
         &mut self,

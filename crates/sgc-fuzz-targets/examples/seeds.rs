@@ -196,8 +196,8 @@ fn consumer(node: &str, role: Role, type_hash: Option<&str>) -> Consumer {
     }
 }
 
-/// Returns a grant with another key than that of the target `sink`. In suites without signatures, packets sealed under the
-/// same key would count as genuine there, though its source did not make them.
+/// Returns a grant with another key than that of the target `sink`. In suites without signatures, packets sealed under
+/// the same key would count as genuine there, though its source did not make them.
 fn grant(suite: Suite) -> TopicGrant {
     let key = SecretBytes::new([4; 32]);
     TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None }
@@ -333,7 +333,8 @@ fn definitions(bytes: &[u8]) -> Vec<Vec<u8>> {
     texts.into_iter().enumerate().map(seed).collect()
 }
 
-/// Returns beginnings of DTLS records: a handshake, application data, an alert, a record with a connection id (RFC 9146).
+/// Returns beginnings of DTLS records: a handshake, application data, an alert, a record with a connection id (RFC
+/// 9146).
 fn dtls() -> Vec<Vec<u8>> {
     [[22, 254, 253], [23, 254, 253], [21, 254, 255], [25, 254, 253]]
         .map(|head| [&head[..], &[0, 0, 0, 0, 0, 0, 0, 1, 0, 4, 1, 2, 3, 4]].concat())

@@ -1,5 +1,5 @@
-//! Access tokens, origins of pages and names: no input panics, parsed values are written back unchanged, and no altered token
-//! is valid.
+//! Access tokens, origins of pages and names: no input panics, parsed values are written back unchanged, and no altered
+//! token is valid.
 use std::sync::OnceLock;
 
 use rand_chacha::ChaCha20Rng;

@@ -1,5 +1,5 @@
-//! Whole DTLS handshakes with a hostile peer, in both roles and versions. An input is a script of alterations to the peer's
-//! datagrams. Finds panics of `dimpl`, accepted strangers, and dialers that show a stranger their certificate.
+//! Whole DTLS handshakes with a hostile peer, in both roles and versions. An input is a script of alterations to the
+//! peer's datagrams. Finds panics of `dimpl`, accepted strangers, and dialers that show a stranger their certificate.
 
 use std::sync::LazyLock;
 

@@ -1,6 +1,6 @@
-//! Whole conversations with the front door of stream links (TLS, TCP, WebSocket). The first byte of an input selects scheme and
-//! role: bytes of a stranger, bytes of a member inside its TLS, or alterations between two honest ends. Finds panics of
-//! `rustls` and of the upgrade, strangers that get a link, and altered frames that are accepted.
+//! Whole conversations with the front door of stream links (TLS, TCP, WebSocket). The first byte of an input selects
+//! scheme and role: bytes of a stranger, bytes of a member inside its TLS, or alterations between two honest ends.
+//! Finds panics of `rustls` and of the upgrade, strangers that get a link, and altered frames that are accepted.
 
 use std::sync::LazyLock;
 

@@ -1,5 +1,5 @@
-//! Conversations with a gateway, by the rosbridge protocol or Foxglove's. An input holds a client's messages, one a line. No
-//! input panics, and the conversation ends when its client is gone.
+//! Conversations with a gateway, by the rosbridge protocol or Foxglove's. An input holds a client's messages, one a
+//! line. No input panics, and the conversation ends when its client is gone.
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 

@@ -1,5 +1,5 @@
-//! Grants, signed bodies, share tokens and requests for certificates, arbitrary and altered: no input panics, and no altered
-//! value opens or verifies.
+//! Grants, signed bodies, share tokens and requests for certificates, arbitrary and altered: no input panics, and no
+//! altered value opens or verifies.
 use std::sync::OnceLock;
 
 use bytes::Bytes;

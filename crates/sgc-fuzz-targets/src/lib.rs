@@ -1,8 +1,8 @@
 //! Bodies of the fuzz targets, one module each.
 //!
-//! `fuzz/` links them to libFuzzer, which needs a nightly compiler. `cargo test` runs the same bodies over the committed
-//! inputs in `fuzz/corpus/` and over alterations of these from a fixed seed (`tests/corpus.rs`). A body panics if its
-//! input shows a defect. `make fuzz` runs long searches and adds their results to the corpus.
+//! `fuzz/` links them to libFuzzer, which needs a nightly compiler. `cargo test` runs the same bodies over the
+//! committed inputs in `fuzz/corpus/` and over alterations of these from a fixed seed (`tests/corpus.rs`). A body
+//! panics if its input shows a defect. `make fuzz` runs long searches and adds their results to the corpus.
 #![forbid(unsafe_code)]
 // A target reports a defect by a panic.
 #![allow(clippy::unwrap_used)]
@@ -63,8 +63,8 @@ fn members(names: [&str; 2]) -> [Arc<Identity>; 2] {
     })
 }
 
-/// Splits an input into a selecting byte, a text with its length in front (16 bits, big-endian), and the remaining bytes.
-/// The text ends early where it is not UTF-8. Returns `None` if the input is shorter than three bytes.
+/// Splits an input into a selecting byte, a text with its length in front (16 bits, big-endian), and the remaining
+/// bytes. The text ends early where it is not UTF-8. Returns `None` if the input is shorter than three bytes.
 fn choice_text_bytes(input: &[u8]) -> Option<(u8, &str, &[u8])> {
     let [choice, high, low, rest @ ..] = input else { return None };
     let text_bytes = usize::from(u16::from_be_bytes([*high, *low])).min(rest.len());

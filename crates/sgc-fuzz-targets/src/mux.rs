@@ -1,5 +1,5 @@
-//! The multiplexer of stream links: two ends agree whatever their users do, and one end survives any bytes. The first byte
-//! selects the case.
+//! The multiplexer of stream links: two ends agree whatever their users do, and one end survives any bytes. The first
+//! byte selects the case.
 
 /// Runs one input of the target.
 pub fn run(input: &[u8]) {

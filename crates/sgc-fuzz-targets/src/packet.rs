@@ -1,5 +1,5 @@
-//! Data packets, with names and under labels: no input panics, fragments stay within their message, and decoded packets encode
-//! to the same bytes, and in the other form to the same header.
+//! Data packets, with names and under labels: no input panics, fragments stay within their message, and decoded packets
+//! encode to the same bytes, and in the other form to the same header.
 use bytes::Bytes;
 use sgc_wire::{Label, MESSAGE_BYTES_MAX, Name, Packet};
 

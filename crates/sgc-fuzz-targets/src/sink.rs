@@ -1,5 +1,5 @@
-//! Arbitrary packets into a sink that holds a grant, in every suite: none panics, none is delivered that the source did not
-//! make, and packets of the source are still delivered afterwards.
+//! Arbitrary packets into a sink that holds a grant, in every suite: none panics, none is delivered that the source did
+//! not make, and packets of the source are still delivered afterwards.
 use std::sync::OnceLock;
 
 use bytes::Bytes;

@@ -1,5 +1,5 @@
-//! [`PingState`] and [`write_paced`]: whether a WebSocket client is still there. A client is taken for gone if it leaves
-//! a ping unanswered, or does not take what is written. A slow client is neither.
+//! [`PingState`] and [`write_paced`]: whether a WebSocket client is still there. A client is taken for gone if it
+//! leaves a ping unanswered, or does not take what is written. A slow client is neither.
 
 use std::sync::Mutex;
 use std::time::Duration;

@@ -2,8 +2,8 @@
 //!
 //! A [`Hub`] is an ordinary node of the local ROS 2 network that many clients share. It reads each topic once for all
 //! subscribers, follows the graph and finds definitions. A [`Session`] is one client's use of the hub, bounded by a
-//! [`Scope`] and limits. The protocols `rosbridge`, `foxglove` and `grpc` build on sessions only; each has a cargo feature
-//! of its name.
+//! [`Scope`] and limits. The protocols `rosbridge`, `foxglove` and `grpc` build on sessions only; each has a cargo
+//! feature of its name.
 //!
 //! The hub knows no other SGC node: the proxy beside it shares its publications by the same rules as those of any
 //! program. Only the module `server` opens sockets, and other crates open the network behind [`LocalRos`].

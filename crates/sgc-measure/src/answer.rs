@@ -1,7 +1,7 @@
 //! `sgc bench answer`: the side that waits, echoes, counts, and opens the plain echo for the time of a run.
 //!
-//! It serves one run at a time and drops a silent one. The plain echo is open only to the address of the linked peer, and is
-//! closed with the run.
+//! It serves one run at a time and drops a silent one. The plain echo is open only to the address of the linked peer,
+//! and is closed with the run.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};

@@ -1,7 +1,7 @@
 //! The bare path beside `sgc`: a plain echo over TCP and UDP that shows the cost of the network itself.
 //!
-//! It is open for the time of one run, to one address, and only for a peer that knows the id of the run, which the other side
-//! gets through `sgc`. It echoes or counts bytes up to a bound, and never interprets them.
+//! It is open for the time of one run, to one address, and only for a peer that knows the id of the run, which the
+//! other side gets through `sgc`. It echoes or counts bytes up to a bound, and never interprets them.
 
 use std::io::{self, Read, Write};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, Shutdown, SocketAddr, TcpStream, UdpSocket};
@@ -230,8 +230,8 @@ impl Tcp {
         if back == length { Ok(begun.elapsed()) } else { Err(io::ErrorKind::InvalidData.into()) }
     }
 
-    /// Sends `piece` again and again for `duration`. Returns the bytes that arrived, and the time from the first byte until the
-    /// other end has the last.
+    /// Sends `piece` again and again for `duration`. Returns the bytes that arrived, and the time from the first byte
+    /// until the other end has the last.
     pub(crate) fn stream(mut self, piece: &[u8], duration: Duration) -> io::Result<(u64, Duration)> {
         let (begun, mut sent) = (Instant::now(), 0_u64);
         while begun.elapsed() < duration && sent + (piece.len() as u64) < BYTES_MAX {

@@ -44,7 +44,8 @@ impl Machine {
 /// Returns the processor time that a process has used so far, in microseconds, or `None` if it is gone.
 pub(crate) fn cpu_us(process: u32) -> Option<u64> {
     let stat = fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
-    // The program's name is in parentheses and may hold anything (proc_pid_stat(5): utime and stime are fields 14 and 15).
+    // The program's name is in parentheses and may hold anything (proc_pid_stat(5): utime and stime are fields 14 and
+    // 15).
     let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
     let ticks = |field: usize| fields.get(field - 3)?.parse::<u64>().ok();
     Some((ticks(14)? + ticks(15)?) * 1_000_000 / rustix::param::clock_ticks_per_second().max(1))

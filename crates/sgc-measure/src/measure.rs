@@ -1,7 +1,7 @@
 //! `sgc bench run`: the side that measures.
 //!
-//! It measures one thing after the other, so that none disturbs another: each suite, then the bare path, then DDS without
-//! `sgc`. Every wait is bounded, and its error names the cause as far as this side knows it.
+//! It measures one thing after the other, so that none disturbs another: each suite, then the bare path, then DDS
+//! without `sgc`. Every wait is bounded, and its error names the cause as far as this side knows it.
 
 use std::collections::HashMap;
 use std::net::{IpAddr, SocketAddr};

@@ -1,7 +1,7 @@
 //! The DDS programs of `sgc bench`: plain participants that do not know `sgc`, like ROS 2 programs.
 //!
-//! One end of a channel writes on one topic and reads on the other. The answering end echoes pings and counts streams on the
-//! reading thread. Everything else goes to the measurement as an [`Event`].
+//! One end of a channel writes on one topic and reads on the other. The answering end echoes pings and counts streams
+//! on the reading thread. Everything else goes to the measurement as an [`Event`].
 
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex};

@@ -1,7 +1,7 @@
 //! One side of `sgc bench`: a separate node in a process of its own, on a ROS domain that no other program uses.
 //!
-//! The node is `sgc run` with a configuration as a user writes it and the identity that the user named. Its other files are in
-//! a directory that is removed with the side. It takes only revocation lists from the user's own node.
+//! The node is `sgc run` with a configuration as a user writes it and the identity that the user named. Its other files
+//! are in a directory that is removed with the side. It takes only revocation lists from the user's own node.
 
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader};
@@ -220,7 +220,8 @@ fn take_over_revocations(config: &config::Config, dir: &Path) {
     }
 }
 
-/// Returns the next event, or `None` if there is none by then. Fails if the user interrupts the program or the node ends.
+/// Returns the next event, or `None` if there is none by then. Fails if the user interrupts the program or the node
+/// ends.
 pub(crate) fn next_event(
     events: &Receiver<Event>,
     side: &Side,

@@ -1,7 +1,7 @@
 //! The protocol between both sides of `sgc bench`, and the measured messages. Pure.
 //!
-//! All messages have one private ROS 2 type, in plain CDR, and travel over topics that `sgc` carries, so only members of the
-//! fleet take part. Questions and answers are JSON inside such a message.
+//! All messages have one private ROS 2 type, in plain CDR, and travel over topics that `sgc` carries, so only members
+//! of the fleet take part. Questions and answers are JSON inside such a message.
 
 use std::fmt;
 use std::str::FromStr;
@@ -18,7 +18,8 @@ pub(crate) const PROTOCOL: u32 = 1;
 pub(crate) const TYPE: &str = "sgc_bench/msg/Frame";
 /// Longest question or answer, bytes.
 const WORDS_BYTES_MAX: usize = 16 << 10;
-/// Encapsulation of plain CDR, little endian (RTPS 2.5, 10.2), and the three fields and the length in front of the data.
+/// Encapsulation of plain CDR, little endian (RTPS 2.5, 10.2), and the three fields and the length in front of the
+/// data.
 const ENCAPSULATION: [u8; 4] = [0, 1, 0, 0];
 const FIELDS_BYTES: usize = 20;
 /// Largest measured message, in bytes of data.

@@ -1,7 +1,7 @@
 //! Reserves ROS domains that no other program uses, so that two demos on one host, or a demo and a robot, do not meet.
 //!
-//! A reservation is an abstract Unix socket. It vanishes with the process, however that ends, and has the same scope as the
-//! domain's loopback interface: the network namespace.
+//! A reservation is an abstract Unix socket. It vanishes with the process, however that ends, and has the same scope as
+//! the domain's loopback interface: the network namespace.
 
 use std::io;
 use std::net::{Ipv4Addr, UdpSocket};
@@ -9,7 +9,8 @@ use std::ops::RangeInclusive;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
 
-/// Domains to choose from. Users take small numbers, and the ports of domains above 101 are ephemeral ports of the system.
+/// Domains to choose from. Users take small numbers, and the ports of domains above 101 are ephemeral ports of the
+/// system.
 const DOMAINS: RangeInclusive<u32> = 20..=69;
 
 /// The reservation of a domain, released when it is dropped.

@@ -1,6 +1,7 @@
 //! Surroundings of a process of SGC: standard streams, files of secrets, signals, randomness, ROS domains.
 //!
-//! The command line and the libraries behind it share them. This crate parses no arguments and starts no node; `sgc` does.
+//! The command line and the libraries behind it share them. This crate parses no arguments and starts no node; `sgc`
+//! does.
 
 pub mod children;
 pub mod domains;

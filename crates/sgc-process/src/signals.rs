@@ -13,8 +13,8 @@ pub const EXIT_FAILURE: u8 = 1;
 /// Time that a process has to end by itself once the parent that holds its standard input is gone.
 pub const ORPHAN_GRACE: Duration = Duration::from_secs(5);
 
-/// Returns a receiver that becomes ready when standard input ends, which also happens when the parent dies. If the process
-/// still runs [`ORPHAN_GRACE`] later, it is ended.
+/// Returns a receiver that becomes ready when standard input ends, which also happens when the parent dies. If the
+/// process still runs [`ORPHAN_GRACE`] later, it is ended.
 pub fn stdin_closed() -> oneshot::Receiver<()> {
     let (closed, when_closed) = oneshot::channel();
     // A plain thread, because a runtime would wait for one of its own at shutdown.

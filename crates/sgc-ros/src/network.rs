@@ -539,8 +539,8 @@ pub trait RosWriter: Send + Sync + 'static {
         None
     }
 
-    /// Returns the number of written samples that a reliable reader has not acknowledged. Returns `None` if only waiting
-    /// shows that.
+    /// Returns the number of written samples that a reliable reader has not acknowledged. Returns `None` if only
+    /// waiting shows that.
     fn unacknowledged(&self) -> Option<u32> {
         None
     }

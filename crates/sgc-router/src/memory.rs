@@ -9,8 +9,8 @@ use std::time::Instant;
 use sgc_trust::CLOCK_SKEW_MAX;
 use sgc_wire::{NodeId, SignedBody};
 
-/// Digests remembered of one signer. Neighbours repeat the last few announcements of a node when paths differ in speed or a
-/// partition ends; they are recognised without verifying them again.
+/// Digests remembered of one signer. Neighbours repeat the last few announcements of a node when paths differ in speed
+/// or a partition ends; they are recognised without verifying them again.
 const DIGESTS_MAX: usize = 8;
 
 /// The memory of one signer.
@@ -75,7 +75,8 @@ impl Memory {
         }
     }
 
-    /// Remembers an announcement that ended without a newer one: neither it nor an older one of its signer counts again.
+    /// Remembers an announcement that ended without a newer one: neither it nor an older one of its signer counts
+    /// again.
     pub(crate) fn ended(
         &mut self,
         now: Instant,

@@ -10,8 +10,8 @@ use sgc_wire::NodeId;
 
 /// Entries that are each charged to a node.
 ///
-/// A newcomer that finds the table full displaces the oldest entry of the node that holds the most. Once its own node would hold
-/// as much as that one, it displaces the oldest entry of its own node, and only one that may give way.
+/// A newcomer that finds the table full displaces the oldest entry of the node that holds the most. Once its own node
+/// would hold as much as that one, it displaces the oldest entry of its own node, and only one that may give way.
 #[derive(Debug)]
 pub(crate) struct Shares<K, V> {
     entries: BTreeMap<K, Entry<V>>,
@@ -62,8 +62,8 @@ impl<K: Ord + Copy, V> Shares<K, V> {
         self.of_node.get(node).map_or(0, BTreeSet::len)
     }
 
-    /// Puts an entry in place of the one with the same key, and charges it to a node; returns `false` if there is no room among
-    /// `max` entries.
+    /// Puts an entry in place of the one with the same key, and charges it to a node; returns `false` if there is no
+    /// room among `max` entries.
     pub(crate) fn insert(
         &mut self,
         node: NodeId,

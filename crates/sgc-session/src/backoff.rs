@@ -10,7 +10,8 @@ use rand_core::RngCore;
 pub const BACKOFF_MIN: Duration = Duration::from_millis(250);
 /// The longest wait for a router that the user, or the user's DNS, named.
 pub const BACKOFF_MAX: Duration = Duration::from_secs(10);
-/// The first wait, before jitter, after another process with this node's identity took its links. It is doubled each time.
+/// The first wait, before jitter, after another process with this node's identity took its links. It is doubled each
+/// time.
 const DISPLACED_MIN: Duration = Duration::from_secs(1);
 /// The longest such wait, before jitter.
 pub const DISPLACED_MAX: Duration = Duration::from_secs(300);

@@ -1,8 +1,8 @@
 //! Decisions about the links of a node, and about the traffic that it starts by itself: keep-alive, back-off, claims,
 //! candidates, questions for types, shaping. [`LinkSupervisor`] decides when a link is replaced.
 //!
-//! Pure machines: time and randomness are arguments, and nothing here opens a socket, spawns a task or waits. `sgc-node`
-//! observes, passes events in, and carries the results out.
+//! Pure machines: time and randomness are arguments, and nothing here opens a socket, spawns a task or waits.
+//! `sgc-node` observes, passes events in, and carries the results out.
 #![forbid(unsafe_code)]
 
 mod backoff;

@@ -4,8 +4,8 @@
 //! old link still serves, and retires the old link only after the successor carries both sides' state.
 //!
 //! A pure machine. The driver passes events to [`LinkSupervisor::handle`] and then drains
-//! [`LinkSupervisor::poll_output`] until it returns [`Output::Timeout`]. It dials, measures and closes; the machine knows
-//! links by number and routers by rank only. The first dial, and the next one after the link ended, belong to the
+//! [`LinkSupervisor::poll_output`] until it returns [`Output::Timeout`]. It dials, measures and closes; the machine
+//! knows links by number and routers by rank only. The first dial, and the next one after the link ended, belong to the
 //! searches for routers, which wait by [`crate::Backoff`].
 
 use std::collections::VecDeque;
@@ -117,8 +117,8 @@ pub enum Output {
     Timeout(Option<Instant>),
 }
 
-/// The work on a successor. Each attempt carries the number of failures since the link in use was adopted; `None` without
-/// one.
+/// The work on a successor. Each attempt carries the number of failures since the link in use was adopted; `None`
+/// without one.
 #[derive(Debug)]
 enum State {
     /// No successor is wanted.

@@ -1,7 +1,7 @@
 //! Locks that stay usable after a panic of their holder.
 //!
-//! Release builds abort on panic, so poison is seen in tests only. There the panic itself fails the test, and a second panic in another
-//! thread would hide it.
+//! Release builds abort on panic, so poison is seen in tests only. There the panic itself fails the test, and a second
+//! panic in another thread would hide it.
 
 use std::sync::{Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 

@@ -1,9 +1,9 @@
 //! Measures how the control protocol scales with routers and names: `make scale`.
 //!
-//! It simulates growing networks of bare routers ([`sgc_testkit::mesh`]) and prints a table for each kind of event. Times in
-//! the tables are of the virtual clock; processor times are of this machine. `--full` goes to 1000 routers, 100 000
-//! flooded names and a million queried ones. `--sizes 10,30` and `--only flood` or `query` select parts; `--csv DIR`
-//! also writes the tables there.
+//! It simulates growing networks of bare routers ([`sgc_testkit::mesh`]) and prints a table for each kind of event.
+//! Times in the tables are of the virtual clock; processor times are of this machine. `--full` goes to 1000 routers,
+//! 100 000 flooded names and a million queried ones. `--sizes 10,30` and `--only flood` or `query` select parts; `--csv
+//! DIR` also writes the tables there.
 #![allow(clippy::print_stdout, reason = "the tables are what it is for")]
 
 use std::path::PathBuf;
@@ -521,7 +521,8 @@ mod tests {
         let edges = cell(&tables.cold, 0, "links");
         assert!(cell(&tables.cold, 0, "ways final after ms") < 1000.0);
         for row in 0..tables.events.rows.len() - 1 {
-            // Two or three nodes change their state in at most two steps, and each change crosses each link at most twice.
+            // Two or three nodes change their state in at most two steps, and each change crosses each link at most
+            // twice.
             assert!(cell(&tables.events, row, "frames") <= 8.0 * 2.0 * edges);
         }
         assert!(cell(&tables.query, 2, "answered after ms") < 100.0);

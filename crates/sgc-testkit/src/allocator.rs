@@ -1,4 +1,5 @@
-//! An allocator that counts allocations and passes every call on to the system's, for tests of allocations. It has no limits.
+//! An allocator that counts allocations and passes every call on to the system's, for tests of allocations. It has no
+//! limits.
 //!
 //! A test binary installs it with `#[global_allocator]`. Without that, all counts are 0.
 #![allow(unsafe_code, reason = "an allocator is unsafe by its nature; this one counts and hands on")]

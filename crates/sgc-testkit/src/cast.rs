@@ -128,8 +128,8 @@ pub(crate) fn with_fleet(anchors: &TrustAnchors, fleet: &str) -> TrustAnchors {
     anchors.with_anchors([ca]).expect("a CA that was made well")
 }
 
-/// Returns a list of a fleet that revokes only these members in their incarnations, like a list of a copy of the fleet file
-/// that does not know the revocations of another copy.
+/// Returns a list of a fleet that revokes only these members in their incarnations, like a list of a copy of the fleet
+/// file that does not know the revocations of another copy.
 pub fn revocation_list(fleet: &str, members: &[Member], number: u64) -> Bytes {
     let mut cast = cast();
     let fleet = cast.fleet(fleet);

@@ -1,8 +1,9 @@
 //! Thousands of bare routers on a virtual clock, to measure how the control protocol scales.
 //!
-//! It has no endpoints, payloads or recovery ([`crate::World`] has those): a proxy here is a router machine that carries no
-//! names of others, with a few lines in place of its endpoint. Frames go from machine to machine as values, so that signed
-//! bytes exist once. Everything is signed and verified as in production. The caller passes in a clock of processor time.
+//! It has no endpoints, payloads or recovery ([`crate::World`] has those): a proxy here is a router machine that
+//! carries no names of others, with a few lines in place of its endpoint. Frames go from machine to machine as values,
+//! so that signed bytes exist once. Everything is signed and verified as in production. The caller passes in a clock of
+//! processor time.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -23,8 +24,8 @@ use crate::{Clock, Dice};
 pub const BATCH_NAMES: usize = 250;
 /// Lease of advertisements.
 const LEASE: Duration = Duration::from_secs(600);
-/// Time without an event after which a mesh has settled. It is longer than a router's pause between link states or searches,
-/// and shorter than its pause before it repeats a question or an advertisement.
+/// Time without an event after which a mesh has settled. It is longer than a router's pause between link states or
+/// searches, and shorter than its pause before it repeats a question or an advertisement.
 const SETTLED_AFTER: Duration = Duration::from_secs(1);
 /// Longest time to settle after an event. More is a defect.
 const SETTLE_MAX: Duration = Duration::from_secs(60);
@@ -153,7 +154,8 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// Returns an empty mesh. `cpu` returns the processor time of this thread; a constant serves callers that do not measure it.
+    /// Returns an empty mesh. `cpu` returns the processor time of this thread; a constant serves callers that do not
+    /// measure it.
     pub fn new(seed: u64, mapping: MappingKind, cpu: fn() -> Duration) -> Self {
         let clock = Clock::default();
         Self {
@@ -173,9 +175,9 @@ impl Mesh {
         }
     }
 
-    /// Adds routers, scattered over a continent. Each new one gets cables to two existing ones with a probability proportional to
-    /// their degree (Barabási and Albert), so the mean degree is 4. A link's latency is 1 ms and up to 40 ms more by distance.
-    /// The cables are not plugged in.
+    /// Adds routers, scattered over a continent. Each new one gets cables to two existing ones with a probability
+    /// proportional to their degree (Barabási and Albert), so the mean degree is 4. A link's latency is 1 ms and up to
+    /// 40 ms more by distance. The cables are not plugged in.
     pub fn add_routers(&mut self, routers: usize) {
         for n in 0..routers {
             let router = self.add_station(format!("router-{n}"), true);
@@ -587,8 +589,8 @@ impl Mesh {
 
     // ---- The reference model.
 
-    /// Computes the costs of the cheapest paths from a router to all others, without this cable or that router, by another
-    /// algorithm than the routers' (Bellman and Ford).
+    /// Computes the costs of the cheapest paths from a router to all others, without this cable or that router, by
+    /// another algorithm than the routers' (Bellman and Ford).
     fn reference(&self, from: usize, cable: Option<usize>, router: Option<usize>) -> BTreeMap<usize, u32> {
         let usable = |(n, c): &(usize, &Cable)| {
             c.links.is_some()
@@ -613,8 +615,8 @@ impl Mesh {
         costs
     }
 
-    /// Panics unless an even sample of routers know the cheapest paths to exactly the running routers, and all routers know the
-    /// same number of routers.
+    /// Panics unless an even sample of routers know the cheapest paths to exactly the running routers, and all routers
+    /// know the same number of routers.
     pub fn check(&self, sample: usize) {
         let routers = self.routers();
         for at in &routers {

@@ -1,5 +1,5 @@
-//! The reference model: the expected outcome, computed from cables, runs, shares, uses, and the revocations that nodes know.
-//! It reads no other state of a machine.
+//! The reference model: the expected outcome, computed from cables, runs, shares, uses, and the revocations that nodes
+//! know. It reads no other state of a machine.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -107,8 +107,8 @@ impl Model {
             }
         }
         let stats = world.stats(node);
-        // A router with mapping `query` knows the names that it needs. One with `flood` knows all names, unless it learns them from a
-        // router with `query`.
+        // A router with mapping `query` knows the names that it needs. One with `flood` knows all names, unless it
+        // learns them from a router with `query`.
         let floods = world.nodes.iter().all(|n| !n.transit || n.mapping == MappingKind::Flood);
         if world.nodes[node.0].transit
             && (stats.routed_names > routed || floods && stats.routed_names != routed)

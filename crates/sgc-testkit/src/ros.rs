@@ -1,8 +1,8 @@
 //! A local ROS 2 network in memory: [`FakeRos`] implements [`sgc_ros::RosNetwork`].
 //!
-//! A domain is a value on which networks are opened. Networks of one domain see each other. Samples are delivered on the
-//! writer's thread. Matching honours topic, type, keylessness, reliability and durability. It has no depth of volatile
-//! history, no loss, no partitions and no delays.
+//! A domain is a value on which networks are opened. Networks of one domain see each other. Samples are delivered on
+//! the writer's thread. Matching honours topic, type, keylessness, reliability and durability. It has no depth of
+//! volatile history, no loss, no partitions and no delays.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::atomic::{AtomicI64, Ordering::Relaxed};

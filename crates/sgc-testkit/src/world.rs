@@ -751,8 +751,8 @@ impl World {
         }
     }
 
-    /// Returns the neighbour on a node's route to a name, or the node itself for its own. Returns `None` without a route, or if
-    /// the link is gone.
+    /// Returns the neighbour on a node's route to a name, or the node itself for its own. Returns `None` without a
+    /// route, or if the link is gone.
     pub fn next_hop(&self, node: NodeKey, name: &Name) -> Option<NodeKey> {
         let running = self.nodes[node.0].running.as_ref()?;
         let (link, _) = running.router.route(name)?;
@@ -765,8 +765,8 @@ impl World {
         (self.wires[wire].carries && far.up && there.run == far.run).then_some(far.node)
     }
 
-    /// Follows the data of a name from every node and link. Returns the nodes of the first circle. Routes may loop for a moment,
-    /// while routers learn a change one after the other; data may not.
+    /// Follows the data of a name from every node and link. Returns the nodes of the first circle. Routes may loop for
+    /// a moment, while routers learn a change one after the other; data may not.
     pub fn circle(&self, name: &Name) -> Option<Vec<NodeKey>> {
         let mut done = BTreeSet::new();
         for start in self.nodes() {

@@ -1,9 +1,10 @@
-//! Random honest networks beside an adversary: a router of another fleet and a member of the same one, which have recorded all
-//! signed frames of the network, work together, and draw hostile actions from a grammar.
+//! Random honest networks beside an adversary: a router of another fleet and a member of the same one, which have
+//! recorded all signed frames of the network, work together, and draw hostile actions from a grammar.
 //!
-//! The adversary's links are slower than any honest path, so no path between two honest nodes leads over it while an honest one
-//! exists; `docs/explanation/security.md` says how a router can harm nodes behind it. With an honest path, no honest pair loses its route,
-//! its allowance or a reliable message. `SGC_SEEDS=100..2000` runs those seeds instead of the committed ones and lists failures.
+//! The adversary's links are slower than any honest path, so no path between two honest nodes leads over it while an
+//! honest one exists; `docs/explanation/security.md` says how a router can harm nodes behind it. With an honest path,
+//! no honest pair loses its route, its allowance or a reliable message. `SGC_SEEDS=100..2000` runs those seeds instead
+//! of the committed ones and lists failures.
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};

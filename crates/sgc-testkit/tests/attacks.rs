@@ -168,7 +168,8 @@ fn a_withdrawn_advertisement_cannot_be_replayed() {
     assert_eq!(world.distance(east, &world.name(arm, "/chatter")), None);
 }
 
-/// Replaces the answers that `west` passes on to the operator by the results of `forge`, and checks that none is granted.
+/// Replaces the answers that `west` passes on to the operator by the results of `forge`, and checks that none is
+/// granted.
 fn check_forged_answers(seed: u64, forge: impl Fn(AnswerBody) -> SignedBody + 'static) {
     let mut scene = scene(seed);
     let Scene { world, arm, west, desk, .. } = &mut scene;

@@ -1,7 +1,7 @@
 //! Random networks and random histories against the reference model.
 //!
-//! A seed decides topology and transitions. After each burst of them the network is left alone until it matches [`Model`],
-//! within a bound. Then messages are published and must reach exactly the granted nodes.
+//! A seed decides topology and transitions. After each burst of them the network is left alone until it matches
+//! [`Model`], within a bound. Then messages are published and must reach exactly the granted nodes.
 //! `SGC_SEEDS=100..2000` runs those seeds instead of the committed ones and lists failures.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -79,8 +79,8 @@ struct Run {
     shared: BTreeMap<(NodeKey, &'static str), Sharing>,
     /// The nodes that may get each message: permitted when it was published, shortly before, or while it was history.
     permitted: BTreeMap<MessageId, BTreeSet<NodeKey>>,
-    /// The nodes that just lost a right, and the time until which routers may not know it: messages to other nodes may overtake
-    /// the news.
+    /// The nodes that just lost a right, and the time until which routers may not know it: messages to other nodes may
+    /// overtake the news.
     lapsing: Vec<(NodeKey, &'static str, BTreeSet<NodeKey>, Duration)>,
     revoked: Vec<NodeKey>,
     routers: Vec<NodeKey>,

@@ -1,5 +1,5 @@
-//! Tests that paths between real sockets have their configured properties. No test asserts an upper bound of time, because the
-//! machine may be busy.
+//! Tests that paths between real sockets have their configured properties. No test asserts an upper bound of time,
+//! because the machine may be busy.
 
 #![allow(clippy::unwrap_used)]
 

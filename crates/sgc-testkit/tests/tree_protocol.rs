@@ -1,9 +1,9 @@
 //! Checks the tree protocol in every interleaving of joins, answers, leaves, rejects and reroutes with changes of
 //! next hops and links, within bounds.
 //!
-//! This is a model of the protocol of `docs/spec/routing.md`, not the router machine: it proves properties of the protocol and
-//! not of the code. `docs/spec/tree-model.md` describes the model, its properties and its omissions.
-//! `make model-check` runs the larger bounds.
+//! This is a model of the protocol of `docs/spec/routing.md`, not the router machine: it proves properties of the
+//! protocol and not of the code. `docs/spec/tree-model.md` describes the model, its properties and its omissions. `make
+//! model-check` runs the larger bounds.
 
 #![allow(clippy::print_stdout, reason = "how much was looked at is for who runs it with --nocapture")]
 
@@ -18,8 +18,8 @@ type Id = u8;
 
 /// The node of the owner, to which all trees lead.
 const OWNER: Node = 0;
-/// Additional requests of each sink after the state settles. They are more than it needs, so a sink that uses them up makes no
-/// progress.
+/// Additional requests of each sink after the state settles. They are more than it needs, so a sink that uses them up
+/// makes no progress.
 const SETTLED_REQUESTS: u8 = 4;
 
 const NO_GRANTED_CIRCLE: &str = "granted branches, whatever is fed to whom, are no circle";
@@ -159,7 +159,8 @@ enum FeedRule {
     NeverUp,
     /// Each port gets data from the upstream of its branch that was granted last.
     LastGranted,
-    /// Each port gets data from the upstream of its branch granted last. When that branch ends, it falls back to a remaining one.
+    /// Each port gets data from the upstream of its branch granted last. When that branch ends, it falls back to a
+    /// remaining one.
     FallBack,
 }
 

@@ -56,8 +56,8 @@ fn main() {
     });
 }
 
-/// Megabytes a second of so many packets, over a flow of their own, until the last has arrived. Up to `together` bytes of them
-/// are sent at once.
+/// Megabytes a second of so many packets, over a flow of their own, until the last has arrived. Up to `together` bytes
+/// of them are sent at once.
 async fn measure(near: &AnyLink, far: &AnyLink, bytes: usize, packets: usize, together: usize) -> f64 {
     let packet = support::packet(1, bytes, 0);
     let begun = Instant::now();

@@ -17,8 +17,8 @@ static COUNTING: CountingAllocator = CountingAllocator;
 const WARM_UP: u64 = 500;
 const PACKETS: u64 = 1000;
 
-/// An allocation in so many packets may be that of a container that grows: acknowledgements come when they come, so more
-/// may be under way than ever before.
+/// An allocation in so many packets may be that of a container that grows: acknowledgements come when they come, so
+/// more may be under way than ever before.
 const SOME: f64 = 0.1;
 
 /// Both ends in one thread, so that one counter sees all.

@@ -20,8 +20,8 @@ use sgc_wire::CERT_BYTES_MAX;
 use stranger::{FakeListener, HandshakeLog, LongCertificate, VERSIONS, visit};
 use support::*;
 
-/// Lengths of strangers' certificates, bytes, and of the datagrams that carry them. In DTLS 1.3 dimpl itself cannot send
-/// longer ones.
+/// Lengths of strangers' certificates, bytes, and of the datagrams that carry them. In DTLS 1.3 dimpl itself cannot
+/// send longer ones.
 fn long(version: ProtocolVersion) -> &'static [(usize, usize)] {
     match version {
         ProtocolVersion::DTLS1_2 => &[(2100, 1150), (5000, 1150), (20_000, 2000), (50_000, 2000)],

@@ -80,8 +80,8 @@ impl TrustAnchors {
         (number.len() <= 8).then(|| number.iter().fold(0, |n, byte| (n << 8) | u64::from(*byte)))
     }
 
-    /// Returns `true` if a path from the certificate below a CA down to a node's is broken: one of its certificates is revoked,
-    /// or that incarnation of the node.
+    /// Returns `true` if a path from the certificate below a CA down to a node's is broken: one of its certificates is
+    /// revoked, or that incarnation of the node.
     pub fn is_path_revoked(&self, path: &[CertId]) -> bool {
         self.path_revoked_at(path).is_some()
     }

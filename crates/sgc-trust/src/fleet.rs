@@ -60,7 +60,8 @@ pub struct Fleet {
 }
 
 impl Fleet {
-    /// Creates a fleet. Its CA is valid for [`crate::CA_VALIDITY`]; the CA's certificate does not tell the fleet's name.
+    /// Creates a fleet. Its CA is valid for [`crate::CA_VALIDITY`]; the CA's certificate does not tell the fleet's
+    /// name.
     pub fn create(name: FleetName, now: UnixMillis, rng: &mut impl CryptoRng) -> Result<Self, FleetError> {
         let key = Key::generate(rng);
         let secret = FleetSecret::generate(rng);
@@ -198,8 +199,8 @@ impl Fleet {
         self.sign_roster()
     }
 
-    /// Gives the next list its number. It follows the clock, so that another copy of the fleet's file makes no list that
-    /// passes for a newer one.
+    /// Gives the next list its number. It follows the clock, so that another copy of the fleet's file makes no list
+    /// that passes for a newer one.
     fn begin_list(&mut self, now: UnixMillis) {
         self.roster.crl_number = now.secs().max(self.roster.crl_number.saturating_add(1));
     }

@@ -1,5 +1,5 @@
-//! Copies of one fleet's file that go their own ways: nothing that one of them revoked is undone by another, in whatever
-//! order lists come and copies are merged.
+//! Copies of one fleet's file that go their own ways: nothing that one of them revoked is undone by another, in
+//! whatever order lists come and copies are merged.
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
 use std::collections::BTreeMap;

@@ -1,5 +1,5 @@
-//! Golden vectors of sealing and signing in every suite, of grants, and of a fleet's revocation list. `scripts/trust-vectors.py` made them with another
-//! implementation, and checks the same file.
+//! Golden vectors of sealing and signing in every suite, of grants, and of a fleet's revocation list.
+//! `scripts/trust-vectors.py` made them with another implementation, and checks the same file.
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng as _;

@@ -1,7 +1,8 @@
 //! WebSocket (RFC 6455), for links and for the gateway.
 //!
-//! [`ByteStream`] carries one stream of bytes in binary messages whose borders mean nothing. `WebSocket`, with the feature
-//! `messages`, carries text and binary messages. Both upgrade from HTTP/1.1 by [`Request`] and share the frames.
+//! [`ByteStream`] carries one stream of bytes in binary messages whose borders mean nothing. `WebSocket`, with the
+//! feature `messages`, carries text and binary messages. Both upgrade from HTTP/1.1 by [`Request`] and share the
+//! frames.
 //!
 //! There are no extensions, and so no compression, no cookies, and no more of HTTP than the upgrade takes. WebSocket
 //! authenticates nobody, and this crate decides about nobody: its callers do.

@@ -83,8 +83,8 @@ id!(
     GroupTag, 32, "group tag"
 );
 id!(
-    /// One incarnation of one publisher on one name: the tag of the publisher, if its node gives it one, and else random;
-    /// then 8 random bytes, so that no nonce repeats after a restart.
+    /// One incarnation of one publisher on one name: the tag of the publisher, if its node gives it one, and else
+    /// random; then 8 random bytes, so that no nonce repeats after a restart.
     SourceId, 16, "source id"
 );
 id!(
@@ -114,7 +114,8 @@ impl SourceId {
         self
     }
 
-    /// Returns `true` if the publisher's lease ran out, so that it has no writer on other networks until it lives again.
+    /// Returns `true` if the publisher's lease ran out, so that it has no writer on other networks until it lives
+    /// again.
     pub fn is_lapsed(&self) -> bool {
         self.0[8..] == LAPSED
     }

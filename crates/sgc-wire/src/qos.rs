@@ -37,8 +37,8 @@ pub enum History {
 }
 
 impl History {
-    /// The history of a transient-local publisher that did not announce its depth: as deep as memory allows, until the depth is known.
-    /// DDS has no deeper one (DDS 1.4, 2.2.3.18: a signed number).
+    /// The history of a transient-local publisher that did not announce its depth: as deep as memory allows, until the
+    /// depth is known. DDS has no deeper one (DDS 1.4, 2.2.3.18: a signed number).
     pub const UNSAID: Self = Self::KeepLast(i32::MAX as u32);
 
     /// Returns `true` if the depth was not announced and is not known.

@@ -13,8 +13,8 @@ use crate::error::CliError;
 
 /// Measure throughput and latency between two of your machines, through sgc and through the bare network
 ///
-/// Run `sgc bench answer` on one machine and `sgc bench run` on the other. They measure round trips, throughput, loss and CPU
-/// with DDS on both ends, then plain TCP and UDP, and DDS without sgc if it can reach the other machine.
+/// Run `sgc bench answer` on one machine and `sgc bench run` on the other. They measure round trips, throughput, loss
+/// and CPU with DDS on both ends, then plain TCP and UDP, and DDS without sgc if it can reach the other machine.
 #[derive(Debug, Args)]
 pub(crate) struct BenchArgs {
     #[command(subcommand)]
@@ -49,8 +49,8 @@ pub(crate) struct AnswerArgs {
 
 /// Measure between this machine and one where `sgc bench answer` runs
 ///
-/// The command prints a table and an interpretation. It takes about twice --seconds for each suite and size. Exit code 0 means
-/// that it measured; 1 means that it could not, and it prints the cause.
+/// The command prints a table and an interpretation. It takes about twice --seconds for each suite and size. Exit code
+/// 0 means that it measured; 1 means that it could not, and it prints the cause.
 #[derive(Debug, Args)]
 pub(crate) struct MeasureArgs {
     /// Identity file of a node, other than the answering one's, as `sgc fleet enroll` writes it

@@ -14,8 +14,8 @@ use crate::output;
 
 /// List all mistakes of a configuration, or describe the node that would run with it. Binds no socket.
 ///
-/// Mistakes go to standard error as FILE:LINE: MISTAKE, with exit code 2. The command also checks that the identity is readable
-/// by its owner alone, belongs to this node, and is valid today.
+/// Mistakes go to standard error as FILE:LINE: MISTAKE, with exit code 2. The command also checks that the identity is
+/// readable by its owner alone, belongs to this node, and is valid today.
 #[derive(Debug, Args)]
 pub(crate) struct CheckArgs {
     /// Configuration file

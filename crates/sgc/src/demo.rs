@@ -11,9 +11,9 @@ use crate::log::start_log;
 
 /// Demonstrate sgc: join two separate ROS 2 networks on this machine by three sgc processes.
 ///
-/// The demo needs no ROS 2 and no configuration, and leaves no files behind. A text, an image of 1 MB and a velocity command
-/// cross over at 10, 10 and 50 Hz. Every message is numbered and checked. Exit code 0 means that each message arrived
-/// once and unaltered.
+/// The demo needs no ROS 2 and no configuration, and leaves no files behind. A text, an image of 1 MB and a velocity
+/// command cross over at 10, 10 and 50 Hz. Every message is numbered and checked. Exit code 0 means that each message
+/// arrived once and unaltered.
 #[derive(Debug, Args)]
 pub(crate) struct DemoArgs {
     /// How long to count messages, in seconds

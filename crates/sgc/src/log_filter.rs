@@ -21,8 +21,8 @@ const LOG_TARGETS: [&str; 14] = [
     "sgc_wire",
 ];
 
-/// Reads `LEVEL` and `TARGET=LEVEL`, separated by commas. Refuses a bare word that is no level: the parser would take it for a
-/// target and log nothing of all others, so a typing error would silence the log.
+/// Reads `LEVEL` and `TARGET=LEVEL`, separated by commas. Refuses a bare word that is no level: the parser would take
+/// it for a target and log nothing of all others, so a typing error would silence the log.
 pub(crate) fn log_filter(text: &str) -> Result<EnvFilter, LogFilterError> {
     let directives: Vec<_> = text.split(',').map(str::trim).collect();
     for directive in &directives {

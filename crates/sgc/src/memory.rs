@@ -5,8 +5,8 @@ use crate::output;
 /// The variable that allows core dumps and debuggers, if it is set and not empty.
 const ALLOW_VARIABLE: &str = "SGC_ALLOW_CORE_DUMPS";
 
-/// Forbids core dumps and tracing from now on, unless the user allows them by argument or variable. Child processes decide for
-/// themselves. A refusal of the system is only reported.
+/// Forbids core dumps and tracing from now on, unless the user allows them by argument or variable. Child processes
+/// decide for themselves. A refusal of the system is only reported.
 pub(crate) fn close(allow: bool) {
     if allow || std::env::var_os(ALLOW_VARIABLE).is_some_and(|value| !value.is_empty()) {
         return;

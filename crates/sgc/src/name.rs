@@ -14,8 +14,8 @@ use crate::output;
 
 /// Print the 256-bit name of a topic.
 ///
-/// The name follows from the fleet's secret, the owner, and the topic with its type and other metadata. It depends neither
-/// on the owner's address nor on its key.
+/// The name follows from the fleet's secret, the owner, and the topic with its type and other metadata. It depends
+/// neither on the owner's address nor on its key.
 #[derive(Debug, Args)]
 pub(crate) struct NameArgs {
     /// Node that shares the topic

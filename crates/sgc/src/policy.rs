@@ -149,7 +149,8 @@ fn verdict(
 
 type SubjectResult = Result<Subject, String>;
 
-/// Returns the node's name for the output, and the subject that its certificate proves or the reason why it proves none.
+/// Returns the node's name for the output, and the subject that its certificate proves or the reason why it proves
+/// none.
 fn subject(
     args: &TestArgs,
     config: &Config,

@@ -65,7 +65,8 @@ pub(crate) fn reload(args: &ReloadArgs) -> Result<(), CliError> {
     lines(report, "nothing changed").into_iter().try_for_each(output::line)
 }
 
-/// Asks the node at this socket to read its configuration again, if one runs there. Returns the lines that report the result.
+/// Asks the node at this socket to read its configuration again, if one runs there. Returns the lines that report the
+/// result.
 pub(crate) fn after_change(socket: &Path) -> Result<Vec<String>, CliError> {
     match ask(socket) {
         Ok(report) => Ok(lines(report, "The node that runs knows it.")),

@@ -25,9 +25,9 @@ const RUNTIME_GRACE: Duration = Duration::from_secs(1);
 
 /// Run a node from a configuration file or from arguments alone.
 ///
-/// A node with shares or uses joins the local ROS 2 network that ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE select. A
-/// node that listens is a router; a node can be both. SIGINT and SIGTERM end the node cleanly, and a second signal ends it
-/// at once. On SIGHUP it reads its configuration again.
+/// A node with shares or uses joins the local ROS 2 network that ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE
+/// select. A node that listens is a router; a node can be both. SIGINT and SIGTERM end the node cleanly, and a second
+/// signal ends it at once. On SIGHUP it reads its configuration again.
 #[derive(Debug, Args)]
 pub(crate) struct RunArgs {
     /// Configuration file
@@ -41,12 +41,12 @@ pub(crate) struct RunArgs {
     /// (srv://lab.example), or any router on the local network (mdns://); may be repeated
     #[arg(long, value_name = "URL")]
     router: Vec<String>,
-    /// Topic to share, as /TOPIC or /TOPIC=NODE,group:GROUP; the prefix service:, action: or parameters: shares that kind
-    /// instead; may be repeated
+    /// Topic to share, as /TOPIC or /TOPIC=NODE,group:GROUP; the prefix service:, action: or parameters: shares that
+    /// kind instead; may be repeated
     #[arg(long, value_name = "[KIND:]/NAME")]
     share: Vec<String>,
-    /// Node or group that may subscribe to shared topics and call shared services: NODE, group:GROUP, or '*' for every member
-    /// of the fleet, which is the default; may be repeated
+    /// Node or group that may subscribe to shared topics and call shared services: NODE, group:GROUP, or '*' for every
+    /// member of the fleet, which is the default; may be repeated
     #[arg(long, value_name = "WHO")]
     to: Vec<String>,
     /// Topic of another node to use here; the prefix service:, action: or parameters: uses that kind instead, as in
@@ -77,7 +77,8 @@ pub(crate) struct RouterArgs {
     /// Address to listen on, such as quic://0.0.0.0:7447; may be repeated
     #[arg(long, value_name = "URL", required = true)]
     listen: Vec<String>,
-    /// Other router to connect to, so that both form one mesh: quic://HOST:PORT, srv://DOMAIN or mdns://; may be repeated
+    /// Other router to connect to, so that both form one mesh: quic://HOST:PORT, srv://DOMAIN or mdns://; may be
+    /// repeated
     #[arg(long, value_name = "URL")]
     peer: Vec<String>,
     /// Announce this router on the local network by mDNS

@@ -32,7 +32,8 @@ enum ServiceCommand {
 
 /// Call a service with a request in JSON or YAML and print its reply as JSON
 ///
-/// The node that runs here calls the service on its local network. Services that the node uses from the far side are there too.
+/// The node that runs here calls the service on its local network. Services that the node uses from the far side are
+/// there too.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   sgc service call /add_two_ints example_interfaces/srv/AddTwoInts '{a: 2, b: 3}'

@@ -137,8 +137,8 @@ fn give(
     told
 }
 
-/// Returns the types that programs on the local network use for a topic, as the running node sees them. Returns `None` if no
-/// node runs.
+/// Returns the types that programs on the local network use for a topic, as the running node sees them. Returns `None`
+/// if no node runs.
 pub(crate) fn seen_types(config: &Config, node: &str, topic: &str) -> Option<BTreeSet<String>> {
     let socket = sgc_node::admin_socket_path(config, node);
     // Without an answer of the node, the user has to give the type.

@@ -35,8 +35,8 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), CliError> {
     Ok(())
 }
 
-/// Pushes a revocation list to every node that this user runs here. Returns the names of those that took it, and their lists.
-/// Nodes of other fleets do not take it.
+/// Pushes a revocation list to every node that this user runs here. Returns the names of those that took it, and their
+/// lists. Nodes of other fleets do not take it.
 pub(crate) fn push_crl_local(list: &[u8]) -> (Vec<String>, Vec<bytes::Bytes>) {
     let request = AdminRequest::Crl(list.to_vec());
     let mut heard = Vec::new();

@@ -1,7 +1,7 @@
 //! `sgc token`: makes, lists and revokes access tokens for programs that connect to this node's gateway.
 //!
-//! It signs a token with the node's identity, writes the records of tokens to the state directory, and asks a running node to
-//! read them again.
+//! It signs a token with the node's identity, writes the records of tokens to the state directory, and asks a running
+//! node to read them again.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -44,9 +44,9 @@ enum TokenCommand {
 
 /// Make a token that permits only the named topics and services.
 ///
-/// The command prints the token once and does not keep it. Bring it to the program over a private channel. Anybody who has
-/// the token may use it at this node's gateway until it expires or is revoked. Names may be patterns in quotes: '/arm/*',
-/// '/**'.
+/// The command prints the token once and does not keep it. Bring it to the program over a private channel. Anybody who
+/// has the token may use it at this node's gateway until it expires or is revoked. Names may be patterns in quotes:
+/// '/arm/*', '/**'.
 #[derive(Debug, Args)]
 struct CreateArgs {
     /// Configuration of the node; without it, the only *.toml of this directory
@@ -192,7 +192,8 @@ fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
     reload::after_change(&socket)?.into_iter().try_for_each(output::line)
 }
 
-/// Writes a record into the audit log of the node. A failure is only reported, because the change itself is already made.
+/// Writes a record into the audit log of the node. A failure is only reported, because the change itself is already
+/// made.
 fn note(config: &Config, state: &Path, event: AuditEvent, what: &str) {
     let path = audit::audit_path(config.audit.file.as_deref(), Some(state));
     let Some(path) = path.filter(|_| !config.audit.off) else { return };

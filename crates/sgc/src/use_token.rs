@@ -20,8 +20,8 @@ const TOKENS_DIR: &str = "tokens";
 
 /// Use a topic of another fleet, by the token that its owner gave.
 ///
-/// The command writes the token into the node's state directory and adds a `[[use]]` that names it to the configuration.
-/// The other lines of the configuration stay as they are.
+/// The command writes the token into the node's state directory and adds a `[[use]]` that names it to the
+/// configuration. The other lines of the configuration stay as they are.
 #[derive(Debug, Args)]
 pub(crate) struct UseArgs {
     /// File that holds the token, or - for standard input

@@ -1,7 +1,7 @@
 //! `sgc why`: finds the first fault on the path of a topic, service or action.
 //!
-//! The node answers with its whole state ([`sgc_node::graph::Graph`]). [`diagnose`] follows the path in it and asks nothing
-//! else. This file asks and prints.
+//! The node answers with its whole state ([`sgc_node::graph::Graph`]). [`diagnose`] follows the path in it and asks
+//! nothing else. This file asks and prints.
 
 use std::process::ExitCode;
 
@@ -18,8 +18,8 @@ use crate::output;
 
 /// Explain why a topic, service or action does not flow: follow its path and name the first fault
 ///
-/// Each node knows its own half of the path. If this side is fine, run the command on the other side as well. Exit code 0
-/// means that nothing is wrong here; 1 means that something is, or that no node runs.
+/// Each node knows its own half of the path. If this side is fine, run the command on the other side as well. Exit code
+/// 0 means that nothing is wrong here; 1 means that something is, or that no node runs.
 #[derive(Debug, Args)]
 pub(crate) struct WhyArgs {
     /// Topic, service or action, by its name on this node's local network

@@ -1,5 +1,5 @@
-//! Tests of `sgc bench` between two sides on the loopback interface: measurements, refusals, and the end with its cause when
-//! the other side ends. They check that all figures are there and nothing was lost, and compare no figures.
+//! Tests of `sgc bench` between two sides on the loopback interface: measurements, refusals, and the end with its cause
+//! when the other side ends. They check that all figures are there and nothing was lost, and compare no figures.
 
 #![allow(clippy::unwrap_used)]
 

@@ -1,5 +1,5 @@
-//! Routers and nodes as processes that find each other: in a mesh from the command line, and by mDNS between two network
-//! namespaces.
+//! Routers and nodes as processes that find each other: in a mesh from the command line, and by mDNS between two
+//! network namespaces.
 
 #![allow(clippy::unwrap_used)]
 

@@ -1,5 +1,5 @@
-//! Programs without ROS at one node, ROS 2 programs that are not ours at another, a router between them: by gRPC, by the
-//! rosbridge protocol and from the shell, with processes that are killed, and with a token that is taken back.
+//! Programs without ROS at one node, ROS 2 programs that are not ours at another, a router between them: by gRPC, by
+//! the rosbridge protocol and from the shell, with processes that are killed, and with a token that is taken back.
 
 #![allow(clippy::unwrap_used)]
 

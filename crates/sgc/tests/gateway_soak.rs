@@ -1,8 +1,8 @@
-//! Tests the gateway's memory while a client does not read, with many clients, and after very many have come and gone: a real
-//! `sgc run`, Cyclone's programs on its ROS network, and clients of both protocols over sockets.
+//! Tests the gateway's memory while a client does not read, with many clients, and after very many have come and gone:
+//! a real `sgc run`, Cyclone's programs on its ROS network, and clients of both protocols over sockets.
 //!
-//! The suite has a short run. `make gateway-soak` has many more clients, and as many visits as one every two minutes makes in
-//! 26 days. It prints figures.
+//! The suite has a short run. `make gateway-soak` has many more clients, and as many visits as one every two minutes
+//! makes in 26 days. It prints figures.
 
 #![allow(clippy::unwrap_used)]
 

@@ -1,5 +1,5 @@
-//! Tests of `sgc topic` and `sgc why` between two ROS 2 networks and a router: messages of an independent program, and the
-//! fault that is named when a part is missing.
+//! Tests of `sgc topic` and `sgc why` between two ROS 2 networks and a router: messages of an independent program, and
+//! the fault that is named when a part is missing.
 
 #![allow(clippy::unwrap_used)]
 

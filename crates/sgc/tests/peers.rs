@@ -36,14 +36,16 @@ impl Lab {
         self.python(site, "services.py", &[&common, args].concat())
     }
 
-    /// A server at the robot and a client at the desk: so many calls, each answered rightly. A client that calls as soon as
-    /// it is matched may be so alone, and what it sends then is lost (`tests/peers/README.md`): so another may try.
+    /// A server at the robot and a client at the desk: so many calls, each answered rightly. A client that calls as
+    /// soon as it is matched may be so alone, and what it sends then is lost (`tests/peers/README.md`): so another may
+    /// try.
     fn calls(&self, server: &str, client: &str, kind: &str, extra: &[&str], calls: u64) {
         let what = format!("{kind} at {server} from {client}");
         let name = service(kind, server, client);
         let mut served = match server {
             "cyclone" => self.service_peer(Site::Robot, "server", &["--name", &name]),
-            // Cyclone's client calls all at once: a history of ten, as ROS 2 has it, would be overwritten at the server.
+            // Cyclone's client calls all at once: a history of ten, as ROS 2 has it, would be overwritten at the
+            // server.
             _ => self.peer(
                 Site::Robot,
                 server,
@@ -142,8 +144,8 @@ fn every_vendor_reaches_every_vendor_through_a_router() {
     );
 }
 
-/// Fast DDS does not announce how deep its history is. With the specification's single sample the writer on the far side
-/// would overwrite each image that its reader has not whole yet.
+/// Fast DDS does not announce how deep its history is. With the specification's single sample the writer on the far
+/// side would overwrite each image that its reader has not whole yet.
 #[test]
 fn a_subscriber_that_stands_still_for_a_moment_gets_what_its_publisher_keeps() {
     const SENT: u64 = 9;
@@ -168,7 +170,8 @@ fn a_subscriber_that_stands_still_for_a_moment_gets_what_its_publisher_keeps() {
     talker.summary();
 }
 
-/// A client and a server of different vendors do not understand each other where Cyclone is one of them, on one network.
+/// A client and a server of different vendors do not understand each other where Cyclone is one of them, on one
+/// network.
 #[test]
 fn every_vendor_calls_services_of_every_vendor_through_a_router() {
     const VENDORS: [&str; 3] = ["cyclone", "fastdds", "rustdds"];
@@ -461,8 +464,8 @@ fn the_router_never_holds_what_it_carries() {
     for _ in 0..50 {
         listener.wait("messages", |e| e["event"] == "received");
     }
-    // The listener holds the talker's words in plain text. Finding them there shows that the search works, so that finding
-    // nothing in the router means something.
+    // The listener holds the talker's words in plain text. Finding them there shows that the search works, so that
+    // finding nothing in the router means something.
     let words: [&[u8]; 4] = [b" fill=", b"std_msgs", b"rt/string", b"dds_::String_"];
     for word in words {
         assert!(

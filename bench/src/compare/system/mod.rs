@@ -24,7 +24,8 @@ pub(crate) trait System: Sync {
     /// As figures call it.
     fn name(&self) -> String;
 
-    /// Starts its processes in a lab. Topics may take their time to be joined: who uses them waits for the first message.
+    /// Starts its processes in a lab. Topics may take their time to be joined: who uses them waits for the first
+    /// message.
     fn start(&self, lab: &Lab, topics: &[Topic]) -> Result<Running>;
 }
 
@@ -73,8 +74,8 @@ pub(crate) fn relays() -> Vec<Box<dyn System>> {
 /// Systems that [`configured`] has beside those of [`all`].
 pub(crate) const CONFIGURED: [&str; 1] = ["zenoh-tcp-tuned"];
 
-/// Those that tables compare for which users configure more than names of topics: priorities for the topics of SGC, and a
-/// Zenoh bridge with `zenoh` beside the one with its defaults.
+/// Those that tables compare for which users configure more than names of topics: priorities for the topics of SGC, and
+/// a Zenoh bridge with `zenoh` beside the one with its defaults.
 pub(crate) fn configured(
     sgc: &Path,
     peers: &Peers,
@@ -94,8 +95,8 @@ pub(crate) fn configured(
     Ok(systems)
 }
 
-/// The reason why rosbridge is not compared: it carries only types that are installed as ROS 2 packages beside it, and the
-/// programs here have a type of their own.
+/// The reason why rosbridge is not compared: it carries only types that are installed as ROS 2 packages beside it, and
+/// the programs here have a type of their own.
 pub(crate) fn why_no_rosbridge() -> String {
     let installed = std::fs::read_dir("/opt/ros").into_iter().flatten().flatten();
     let installed: Vec<_> =

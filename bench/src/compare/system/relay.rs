@@ -1,5 +1,5 @@
-//! Two programs that do no more than carry messages from one DDS network to the other over TCP: about the least that short
-//! messages can take where a program at each place joins the networks. No user would want one.
+//! Two programs that do no more than carry messages from one DDS network to the other over TCP: about the least that
+//! short messages can take where a program at each place joins the networks. No user would want one.
 
 use anyhow::{Result, ensure};
 use sgc_dds::config::{FRAGMENT_BYTES, HEARTBEAT_MS, MESSAGE_BYTES_MAX, RECEIVE_BUFFER_BYTES};
@@ -11,7 +11,8 @@ const PORT: u16 = 7447;
 
 /// A relay at each place; the right one listens. For one topic each way.
 pub(crate) struct Relay {
-    /// Many messages at a time, by a thread of its own, which suits rates; otherwise each at once, which suits round trips.
+    /// Many messages at a time, by a thread of its own, which suits rates; otherwise each at once, which suits round
+    /// trips.
     gathers: bool,
 }
 

@@ -1,7 +1,8 @@
-//! One DDS network over the path, secured by DDS itself, as SROS2 sets it up: authentication, access control, encryption.
+//! One DDS network over the path, secured by DDS itself, as SROS2 sets it up: authentication, access control,
+//! encryption.
 //!
-//! The keystore is made for the run: one CA for identities and permissions, an enclave for each place, and documents with
-//! what SROS2 writes into them by default. Programs are a build of `load` whose Cyclone has the plug-ins.
+//! The keystore is made for the run: one CA for identities and permissions, an enclave for each place, and documents
+//! with what SROS2 writes into them by default. Programs are a build of `load` whose Cyclone has the plug-ins.
 
 use std::fs;
 use std::path::{Path, PathBuf};

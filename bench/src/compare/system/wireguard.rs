@@ -1,7 +1,7 @@
 //! DDS over WireGuard: a tunnel between the two places, and Cyclone with unicast peers in it.
 //!
-//! The tunnel is `wireguard-go`, which needs no kernel module; its keys are made for the run. The right place has the known
-//! address, as a server does; the left one dials, and may move.
+//! The tunnel is `wireguard-go`, which needs no kernel module; its keys are made for the run. The right place has the
+//! known address, as a server does; the left one dials, and may move.
 
 use std::fs;
 use std::io::Write as _;

@@ -1,7 +1,7 @@
 //! Zenoh bridges at both places, joined over TCP or TLS, as users of ROS 2 join networks today.
 //!
-//! The right bridge listens, the left one connects, as a robot's does. Configurations are the bridge's defaults, but for
-//! scouting, which both places do without as they know each other, and for what [`Zenoh::tuned`] says.
+//! The right bridge listens, the left one connects, as a robot's does. Configurations are the bridge's defaults, but
+//! for scouting, which both places do without as they know each other, and for what [`Zenoh::tuned`] says.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -32,7 +32,8 @@ enum Over {
     Tls,
 }
 
-/// In the clear and over TLS. `program` is the bridge of `bench/zenoh-bridge`; whether it is there shows when it starts.
+/// In the clear and over TLS. `program` is the bridge of `bench/zenoh-bridge`; whether it is there shows when it
+/// starts.
 pub(crate) fn all(program: &Path) -> [Zenoh; 2] {
     [Over::Tcp, Over::Tls].map(|over| Zenoh { program: program.to_owned(), over, tuning: None })
 }

@@ -1,8 +1,8 @@
 //! The contents of an enclave's files: whether they belong together and hold now.
 //!
-//! Asks what Cyclone's plugins ask, with the same library and the same flags, and one thing that they do not: whether the key is that of
-//! the certificate. With another key nobody lets the participant in, and only the others know why. Leaves revoked certificates and the
-//! rules of governance and permissions to the plugins.
+//! Asks what Cyclone's plugins ask, with the same library and the same flags, and one thing that they do not: whether
+//! the key is that of the certificate. With another key nobody lets the participant in, and only the others know why.
+//! Leaves revoked certificates and the rules of governance and permissions to the plugins.
 
 use std::path::{Path, PathBuf};
 
@@ -31,7 +31,8 @@ pub(super) fn check(directory: &Path) -> Result<(), SecurityError> {
     let [ca_file, certificate_file] = [IDENTITY_CA, CERTIFICATE].map(|name| directory.join(name));
     let (ca, certificate) = (certificate_in(&ca_file)?, certificate_in(&certificate_file)?);
     let key_file = directory.join(KEY);
-    // An empty password, as the plugins have where no property names one: otherwise OpenSSL asks for it at the terminal.
+    // An empty password, as the plugins have where no property names one: otherwise OpenSSL asks for it at the
+    // terminal.
     let key = PKey::private_key_from_pem_passphrase(&read_bounded(&key_file)?, b"").map_err(|_| {
         SecurityError::Unreadable { file: key_file.clone(), kind: "a private key in PEM without a password" }
     })?;
@@ -89,7 +90,8 @@ fn check_certificate(
     })
 }
 
-/// Returns `true` if this certificate's key signed the document; as `PKCS7_document_verify` in the plugins' `access_control_utils.c`.
+/// Returns `true` if this certificate's key signed the document; as `PKCS7_document_verify` in the plugins'
+/// `access_control_utils.c`.
 fn is_signed(document: &[u8], signer: &X509) -> bool {
     let verify = || {
         let (signed, content) = Pkcs7::from_smime(document)?;

@@ -1,5 +1,5 @@
-//! The walk of an interface of another node, from the owner to the local subscribers or from the local publishers to the
-//! owner.
+//! The walk of an interface of another node, from the owner to the local subscribers or from the local publishers to
+//! the owner.
 
 use sgc_node::graph::{Graph, Interface, JoinState, NameLine, Use, UseRoute};
 use sgc_ros::is_for_wildcards;

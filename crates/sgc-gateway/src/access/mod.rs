@@ -1,8 +1,8 @@
 //! Access control of a gateway: decides which clients may connect and which rights they get.
 //!
-//! A front end describes a connection in an [`AdmissionRequest`]. It gets a [`Client`] with a [`Scope`], or a [`Denial`]
-//! with the reason. This module reads no file, clock or socket: the node builds an [`Access`] from its configuration
-//! at each reload. Certificates are verified before they come here; tokens are verified here.
+//! A front end describes a connection in an [`AdmissionRequest`]. It gets a [`Client`] with a [`Scope`], or a
+//! [`Denial`] with the reason. This module reads no file, clock or socket: the node builds an [`Access`] from its
+//! configuration at each reload. Certificates are verified before they come here; tokens are verified here.
 
 mod attempts;
 mod origin;

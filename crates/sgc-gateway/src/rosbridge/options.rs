@@ -25,7 +25,8 @@ pub type Authenticate = Arc<dyn Fn(&str) -> Result<Client, String> + Send + Sync
 /// The bounds of a connection and the authentication of its client.
 #[derive(Clone)]
 pub struct RosbridgeOptions {
-    /// Longest message of a client, in bytes. The WebSocket must have the same bound, so that it holds from the first byte.
+    /// Longest message of a client, in bytes. The WebSocket must have the same bound, so that it holds from the first
+    /// byte.
     pub message_bytes_max: usize,
     /// Time for which a client may leave a ping unanswered or a frame unread. Pings are sent four times as often.
     pub silence_max: Duration,

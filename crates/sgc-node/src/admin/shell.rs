@@ -70,8 +70,8 @@ fn wait(ms: u64) -> Duration {
     Duration::from_millis(ms).min(WAIT_MAX)
 }
 
-/// Waits until an interface with a type is discovered, at most for a moment. The first request opens the gateway's network,
-/// on which nothing is discovered yet.
+/// Waits until an interface with a type is discovered, at most for a moment. The first request opens the gateway's
+/// network, on which nothing is discovered yet.
 async fn wait_for_type(session: &Session, longest: Duration, has_type: impl Fn(&Graph) -> bool) {
     let mut graph = session.hub().graph_changes();
     let discovered = async { while !has_type(&session.hub().graph()) && graph.changed().await.is_ok() {} };

@@ -30,8 +30,8 @@ pub struct Status {
     pub routes: Vec<RouteLine>,
     /// Alerts for an operator.
     pub alerts: Vec<Alert>,
-    /// Contradictions between local endpoints and the other side, with both values and the fix. An entry lasts as long as its
-    /// contradiction.
+    /// Contradictions between local endpoints and the other side, with both values and the fix. An entry lasts as long
+    /// as its contradiction.
     pub problems: Vec<String>,
     /// Names whose data passes this node.
     pub names: Vec<NameStatus>,
@@ -104,8 +104,8 @@ pub struct RouteLine {
     pub state: String,
     /// The number of messages that were published or delivered.
     pub messages: u64,
-    /// The number of signatures for messages of the present publishers. Under load it is smaller than `messages`, because
-    /// one signature covers a batch. 0 in the `group` suites.
+    /// The number of signatures for messages of the present publishers. Under load it is smaller than `messages`,
+    /// because one signature covers a batch. 0 in the `group` suites.
     pub signatures: u64,
     /// Bytes of payload before and after compression, of a topic that this node compresses.
     #[serde(skip_serializing_if = "Option::is_none")]

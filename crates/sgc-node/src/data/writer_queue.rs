@@ -1,8 +1,8 @@
 //! The queue in front of a local writer, and the thread that writes.
 //!
-//! Writing may block, so each local writer has a thread behind a bounded queue. If the writer cannot block and its queue
-//! is empty, the receiving task writes a short message itself. [`crate::data::sinks`] opens packets and chooses the
-//! queue; [`crate::data::burst`] paces the writes.
+//! Writing may block, so each local writer has a thread behind a bounded queue. If the writer cannot block and its
+//! queue is empty, the receiving task writes a short message itself. [`crate::data::sinks`] opens packets and chooses
+//! the queue; [`crate::data::burst`] paces the writes.
 
 use std::collections::VecDeque;
 use std::num::NonZeroU64;
@@ -396,7 +396,8 @@ impl WriterQueue {
         take.filter(|_| is_free())
     }
 
-    /// Writes a message on the caller's thread if `may_write` and nothing is ahead of it, or queues it if there is room.
+    /// Writes a message on the caller's thread if `may_write` and nothing is ahead of it, or queues it if there is
+    /// room.
     pub(crate) fn try_push(&self, message: Message, may_write: bool) -> WriteOutcome {
         let (bytes, head) = (message.payload.len(), message.head);
         let mut evicted = 0;

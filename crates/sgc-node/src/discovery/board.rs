@@ -23,7 +23,8 @@ pub struct RouterStatus {
     pub found_by: &'static str,
     /// The URL that the node dials, or dialled last.
     pub at: Option<String>,
-    /// The state of the search: `"connecting"`, `"linked"`, `"trying again"`, `"standing back"`, `"looking up"`, `"looking"`.
+    /// The state of the search: `"connecting"`, `"linked"`, `"trying again"`, `"standing back"`, `"looking up"`,
+    /// `"looking"`.
     pub state: &'static str,
     /// The node id of the linked router.
     pub peer: Option<String>,

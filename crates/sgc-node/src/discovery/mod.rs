@@ -1,8 +1,9 @@
 //! Finding routers and keeping links to them: one link for each named router, one for each domain of DNS, and a few on
 //! the local network.
 //!
-//! Each kind of search is a loop that yields dial targets (`keep_at`, `srv`, `mdns`). [`link_keeper::LinkKeeper`] dials,
-//! and `kept_link` keeps the link. The loops are generic over [`KeepLink`], so tests run their timing on a virtual clock.
+//! Each kind of search is a loop that yields dial targets (`keep_at`, `srv`, `mdns`). [`link_keeper::LinkKeeper`]
+//! dials, and `kept_link` keeps the link. The loops are generic over [`KeepLink`], so tests run their timing on a
+//! virtual clock.
 
 pub(crate) mod board;
 mod claims;

@@ -1,7 +1,7 @@
 //! [`GatewayNetwork`]: the gateway's part of the local network, which may be closed and opened again.
 //!
-//! The hub's readers, writers, clients and servers stay. Only the entities behind them end and are created again, and the
-//! hub knows each by the GUID that it had first. `local/reopening.rs` decides when.
+//! The hub's readers, writers, clients and servers stay. Only the entities behind them end and are created again, and
+//! the hub knows each by the GUID that it had first. `local/reopening.rs` decides when.
 
 use std::any::Any;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};

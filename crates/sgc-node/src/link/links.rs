@@ -1,4 +1,5 @@
-//! Tasks of a link: they accept, and pass on received frames and packets. `renewal.rs` replaces links that were dialled.
+//! Tasks of a link: they accept, and pass on received frames and packets. `renewal.rs` replaces links that were
+//! dialled.
 //!
 //! Control frames go to the control task. The task that reads a packet passes it straight to the data path.
 

@@ -1,8 +1,8 @@
 //! Changes of the network: a node learns of them from the kernel instead of waiting for a time-out.
 //!
-//! This module reports changes; [`sgc_session::LinkSupervisor`] decides what they mean for a link. It does not parse the
-//! kernel's messages. Their arrival is enough, because only the source address of the route to a peer
-//! matters, and that is queried.
+//! This module reports changes; [`sgc_session::LinkSupervisor`] decides what they mean for a link. It does not parse
+//! the kernel's messages. Their arrival is enough, because only the source address of the route to a peer matters, and
+//! that is queried.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};

@@ -1,5 +1,5 @@
-//! A node from configuration to clean shutdown, in three steps: `build` makes machines and binds sockets, `spawn` starts
-//! the tasks, `drain` empties and ends them.
+//! A node from configuration to clean shutdown, in three steps: `build` makes machines and binds sockets, `spawn`
+//! starts the tasks, `drain` empties and ends them.
 
 mod build;
 mod drain;

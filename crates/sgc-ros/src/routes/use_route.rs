@@ -193,8 +193,8 @@ impl UseRoute {
         }
     }
 
-    /// Returns the writers for the catalogue entry: one for each listed publisher, with its QoS and history, and one for
-    /// all others if there are any.
+    /// Returns the writers for the catalogue entry: one for each listed publisher, with its QoS and history, and one
+    /// for all others if there are any.
     fn wanted_writers(&self, rule: &UseRule) -> BTreeMap<Option<SourceId>, EndpointSpec> {
         let entry = &self.entry;
         let spec = |qos: &Qos| EndpointSpec {

@@ -55,8 +55,8 @@ pub struct Limits {
     /// Requests to join that a proxy may bring at once; refilled by an eighth of it a second. A router, which brings
     /// those of many, may bring sixteen times as many.
     pub joins_burst: u32,
-    /// Names that a neighbour may ask for at once; refilled by an eighth of it a second. A router may ask for sixteen times as
-    /// many.
+    /// Names that a neighbour may ask for at once; refilled by an eighth of it a second. A router may ask for sixteen
+    /// times as many.
     pub queries_burst: u32,
     /// Advertisements and link states of a node that are passed on at once, each to all routers; refilled by an eighth
     /// of it a second. Further ones wait, and only the newest of them is passed on.

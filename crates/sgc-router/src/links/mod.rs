@@ -248,7 +248,8 @@ impl Links {
         state.measure(now, round_trip, suspect).then_some(*state.node())
     }
 
-    /// Takes the time of a neighbour's wall clock. Returns `true` if the clocks of the two nodes no longer differ as they did.
+    /// Takes the time of a neighbour's wall clock. Returns `true` if the clocks of the two nodes no longer differ as
+    /// they did.
     pub(crate) fn note_clock(&mut self, now: Now, link: LinkId, time: UnixMillis) -> bool {
         let Some(state) = self.links.get_mut(&link).filter(|_| link != LinkId::LOCAL) else { return false };
         let clock = PeerClock::new(time, now);

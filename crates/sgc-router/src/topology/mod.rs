@@ -448,7 +448,8 @@ impl Topology {
 
     // ---- Link states that end.
 
-    /// Ends the link states whose leases are over. Returns their nodes: advertisements from before their runs stay void.
+    /// Ends the link states whose leases are over. Returns their nodes: advertisements from before their runs stay
+    /// void.
     pub(crate) fn expire(&mut self, now: Instant) -> Vec<EndedRun> {
         let mut ended = Vec::new();
         while let Some((at, node)) = self.expiries.first().copied().filter(|(at, _)| *at <= now) {

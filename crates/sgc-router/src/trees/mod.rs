@@ -125,8 +125,9 @@ impl Trees {
 
     // ---- Branches that come.
 
-    /// Returns the place of a sink that asks to join. A sink has one and asks once: the same request over another link is
-    /// a replay, or went in a circle. Over the same link it may ask again under a new certificate, and keeps its branch.
+    /// Returns the place of a sink that asks to join. A sink has one and asks once: the same request over another link
+    /// is a replay, or went in a circle. Over the same link it may ask again under a new certificate, and keeps its
+    /// branch.
     pub(crate) fn place(
         &mut self,
         link: LinkId,

@@ -22,8 +22,8 @@ const COMMANDS_MAX: usize = 16;
 
 /// A bad network between real processes: rate, queue, delay, jitter, loss, reordering.
 ///
-/// While it runs it reads commands from standard input: `cut`, `restore`, `rebind` (udp), `stats`, and `forth`, `back` or
-/// `both` with options such as `both --rate 1mbit --loss 5%`, which replace all earlier options.
+/// While it runs it reads commands from standard input: `cut`, `restore`, `rebind` (udp), `stats`, and `forth`, `back`
+/// or `both` with options such as `both --rate 1mbit --loss 5%`, which replace all earlier options.
 #[derive(Parser)]
 #[command(name = "netsim")]
 struct Cli {

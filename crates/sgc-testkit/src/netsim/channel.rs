@@ -57,8 +57,8 @@ pub enum Loss {
     None,
     /// Each packet is lost with this probability, independently of others.
     Random(f64),
-    /// Packets are lost in bursts (Gilbert and Elliott): in one state all arrive, in the other the fraction `in_burst` is lost.
-    /// `begin` and `end` are the probabilities, per packet, of a change to the second state and back.
+    /// Packets are lost in bursts (Gilbert and Elliott): in one state all arrive, in the other the fraction `in_burst`
+    /// is lost. `begin` and `end` are the probabilities, per packet, of a change to the second state and back.
     Bursts {
         /// Probability that a burst begins with a packet.
         begin: f64,

@@ -12,8 +12,8 @@ use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 /// The directory in which `ip netns` keeps namespaces.
 const NAMESPACES: &str = "/run/netns";
 
-/// The directory of shared memory. Each namespace has its own, because DDS implementations take programs that share one for
-/// programs of the same host.
+/// The directory of shared memory. Each namespace has its own, because DDS implementations take programs that share one
+/// for programs of the same host.
 const SHARED_MEMORY: &str = "/dev/shm";
 
 /// The reason why a network could not be made.
@@ -79,8 +79,8 @@ impl Namespace {
         finish(self.command(program).args(args))
     }
 
-    /// Returns a command for a program in the namespace. The process is the program's own, because `ip` and the shell replace
-    /// themselves by it.
+    /// Returns a command for a program in the namespace. The process is the program's own, because `ip` and the shell
+    /// replace themselves by it.
     pub fn command(&self, program: impl AsRef<OsStr>) -> Command {
         let mut command = Command::new("ip");
         // `ip` gives the process a mount namespace of its own.
@@ -95,8 +95,8 @@ impl Namespace {
         Path::new(SHARED_MEMORY).join(format!("netns-{}", self.name))
     }
 
-    /// Makes a pair of interfaces that are up: one here with this name and these addresses, one there. Addresses have their
-    /// prefix, as in `10.1.0.1/24`.
+    /// Makes a pair of interfaces that are up: one here with this name and these addresses, one there. Addresses have
+    /// their prefix, as in `10.1.0.1/24`.
     pub fn veth(
         &self,
         ours: (&str, &[&str]),
@@ -118,7 +118,8 @@ impl Namespace {
         configure(Some(&self.name), interface, addresses, &[""; 0])
     }
 
-    /// Moves the calling thread into the namespace for the rest of its life. Sockets that it opens belong to the namespace.
+    /// Moves the calling thread into the namespace for the rest of its life. Sockets that it opens belong to the
+    /// namespace.
     pub fn enter(&self) -> Result<(), NetsimError> {
         enter(&self.name)
     }

@@ -1,4 +1,5 @@
-//! Topics on which other nodes than the owner publish: a node's sources on topics of others, and the sink of its own topic.
+//! Topics on which other nodes than the owner publish: a node's sources on topics of others, and the sink of its own
+//! topic.
 
 use std::collections::BTreeMap;
 

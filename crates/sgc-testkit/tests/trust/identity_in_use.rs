@@ -1,4 +1,5 @@
-//! One identity in two processes: the process that started last keeps the links, the other waits, and no message reaches both.
+//! One identity in two processes: the process that started last keeps the links, the other waits, and no message
+//! reaches both.
 
 use std::collections::BTreeMap;
 use std::time::Duration;

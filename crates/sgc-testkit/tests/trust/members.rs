@@ -35,7 +35,8 @@ fn forged(world: &World, owner: NodeKey, grant: &TopicGrant, source: SourceId, f
     packets.split_off(from as usize)
 }
 
-/// Delivers packets that a member forged with the topic's key, with a router's help. Returns the refusals at each other member.
+/// Delivers packets that a member forged with the topic's key, with a router's help. Returns the refusals at each other
+/// member.
 fn play_forged(scene: &mut Scene, source: SourceId) -> Vec<Vec<(&'static str, usize)>> {
     let Scene { world, arm, west, desk, lap, tab, .. } = scene;
     publish_steadily(world, *arm, ms(10), ms(50), |_, _| ());

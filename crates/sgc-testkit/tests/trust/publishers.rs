@@ -197,8 +197,8 @@ fn publisher_that_loses_its_right_is_cut_and_its_key_distrusted() {
     }
 }
 
-/// A subscriber that begins anew takes recorded packets of a publisher at another node than the owner's for past ones, even
-/// in the epoch in which they were sealed.
+/// A subscriber that begins anew takes recorded packets of a publisher at another node than the owner's for past ones,
+/// even in the epoch in which they were sealed.
 #[test]
 fn fresh_subscriber_ignores_recorded_packets_of_other_publishers() {
     for suite in [None, Some(Suite::Group)] {

@@ -278,7 +278,8 @@ fn a_router_that_was_off_too_learns_of_it_before_it_serves() {
         let mut scene = flowing(41);
         let Scene { world, arm, east, west, tab, .. } = &mut scene;
         if disk {
-            // It knew the revocation, lost it with its state, and starts without a node in reach that could tell it again.
+            // It knew the revocation, lost it with its state, and starts without a node in reach that could tell it
+            // again.
             let list = revoke(world, &[*tab], 1);
             world.hand_crl(*arm, &list);
             world.run(ms(500));

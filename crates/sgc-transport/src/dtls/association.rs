@@ -561,8 +561,8 @@ impl Association {
         has_heard
     }
 
-    /// Keeps the peer's certificate. A dialer judges it here: dimpl has checked the listener's signature in DTLS 1.2, and
-    /// shows nothing of ours before it has done so in 1.3.
+    /// Keeps the peer's certificate. A dialer judges it here: dimpl has checked the listener's signature in DTLS 1.2,
+    /// and shows nothing of ours before it has done so in 1.3.
     fn take_certificate(&mut self, leaf: &[u8]) -> Result<(), CertError> {
         if leaf.len() > CERT_BYTES_MAX {
             return Err(CertError::CertificateTooLong { bytes: leaf.len() });

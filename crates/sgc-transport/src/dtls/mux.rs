@@ -362,8 +362,8 @@ impl Mux {
             let tables = lock(&self.tables);
             (tables.pending.get(&remote).cloned(), tables.routes.get(&remote).cloned())
         };
-        // Anybody can send a hello in a peer's name, so it does not disturb an established association. Nor do records of
-        // that association disturb a handshake from the same address.
+        // Anybody can send a hello in a peer's name, so it does not disturb an established association. Nor do records
+        // of that association disturb a handshake from the same address.
         let peer = match (pending, route) {
             (Some(pending), Some(route)) if !front::has_plaintext(records) => {
                 if self.feed(&route, records, meta, now, sink, data) {

@@ -48,10 +48,10 @@ pub enum PlaceDecision<T> {
 
 /// The handshakes under way at one listener, the oldest first. Each holds a `T`, by which the caller can end it.
 ///
-/// An *engaged* handshake has cost its peer something: its address is proven, or bytes came. A newcomer of an address at
-/// its bound displaces a handshake of the same address, and a newcomer that finds all places taken one of the address that
-/// holds the most: the oldest that is not engaged, else the oldest. Engaged handshakes of an address that holds no
-/// more than the newcomer's are displaced only after [`PLACE_HELD_MIN`].
+/// An *engaged* handshake has cost its peer something: its address is proven, or bytes came. A newcomer of an address
+/// at its bound displaces a handshake of the same address, and a newcomer that finds all places taken one of the
+/// address that holds the most: the oldest that is not engaged, else the oldest. Engaged handshakes of an address that
+/// holds no more than the newcomer's are displaced only after [`PLACE_HELD_MIN`].
 #[derive(Debug)]
 pub struct Places<T> {
     limits: PlaceLimits,

@@ -24,7 +24,8 @@ use crate::{files, output};
 pub(super) struct MergeArgs {
     /// Other copy of the fleet file, or a revocation list that was made with it (.crl)
     other: PathBuf,
-    /// Push the revocation list to this router as well; may be repeated. Nodes of this user on this machine always get it
+    /// Push the revocation list to this router as well; may be repeated. Nodes of this user on this machine always get
+    /// it
     #[arg(long = "router", value_name = "URL")]
     routers: Vec<LinkUrl>,
     #[command(flatten)]
@@ -100,8 +101,8 @@ fn gained_text(gained: &MergeReport) -> String {
     text
 }
 
-/// Takes over the revocations of the list beside a fleet file. Another copy of the file may have made that list; if so, the
-/// user is told. Returns `true` if the fleet changed.
+/// Takes over the revocations of the list beside a fleet file. Another copy of the file may have made that list; if so,
+/// the user is told. Returns `true` if the fleet changed.
 pub(super) fn catch_up(fleet: &mut Fleet, file: &Path) -> Result<bool, CliError> {
     let path = list_path(file);
     if !files::exists(&path) {

@@ -17,8 +17,8 @@ const KEPT: &str = "; a fleet is never overwritten: its nodes would no longer be
 
 /// Make a fleet: a certificate authority and a secret, in the file NAME.fleet.
 ///
-/// Anybody who holds the file can make nodes of the fleet. The file is needed to enrol, renew and revoke nodes, not to run
-/// them: keep it off the nodes, and keep a copy.
+/// Anybody who holds the file can make nodes of the fleet. The file is needed to enrol, renew and revoke nodes, not to
+/// run them: keep it off the nodes, and keep a copy.
 #[derive(Debug, Args)]
 pub(super) struct CreateArgs {
     /// Name of the fleet: a-z, 0-9, '-', '_' and '.'
@@ -32,8 +32,8 @@ pub(super) struct CreateArgs {
 
 /// Make a fleet around an existing CA.
 ///
-/// The CA does not change. The file NAME.fleet holds its key beside the fleet's secret and roster. If the key must stay where
-/// it is, let the CA sign the requests of `sgc fleet request` instead.
+/// The CA does not change. The file NAME.fleet holds its key beside the fleet's secret and roster. If the key must stay
+/// where it is, let the CA sign the requests of `sgc fleet request` instead.
 #[derive(Debug, Args)]
 pub(super) struct ImportArgs {
     /// Name of the fleet: a-z, 0-9, '-', '_' and '.'

@@ -22,8 +22,8 @@ use crate::output;
 
 /// Make the identity of a node, in one file.
 ///
-/// The file holds the node's private key. Bring it to the node's machine and keep it there with mode 0600. If the node made
-/// its key itself (`sgc fleet request`), answer its request with --csr: the answer holds no key.
+/// The file holds the node's private key. Bring it to the node's machine and keep it there with mode 0600. If the node
+/// made its key itself (`sgc fleet request`), answer its request with --csr: the answer holds no key.
 #[derive(Debug, Args)]
 pub(super) struct EnrollArgs {
     /// Name of the node: a-z, 0-9, '-', '_' and '.'
@@ -100,7 +100,8 @@ impl OutputArgs {
         }
     }
 
-    /// Fails if the file exists and may not be replaced. Runs before the roster records a certificate that would then be lost.
+    /// Fails if the file exists and may not be replaced. Runs before the roster records a certificate that would then
+    /// be lost.
     fn check_free(&self, path: &Path) -> Result<(), CliError> {
         match self.existing() {
             Existing::Keep(hint) if files::exists(path) => {

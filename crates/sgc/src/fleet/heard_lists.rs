@@ -10,7 +10,8 @@ use sgc_wire::UnixMillis;
 use crate::error::CliError;
 use crate::output;
 
-/// Takes over the revocations of the lists that nodes have in force and reports them. Returns `true` if the fleet changed.
+/// Takes over the revocations of the lists that nodes have in force and reports them. Returns `true` if the fleet
+/// changed.
 pub(super) fn take_heard(file: &mut LockedFleet, heard: &[Bytes], now: UnixMillis) -> Result<bool, CliError> {
     let mut anchors = file.fleet.anchors().clone();
     for list in heard {

@@ -44,8 +44,8 @@ pub(super) struct CaArgs {
 
 /// Revoke all certificates of nodes, for good.
 ///
-/// The command writes the fleet's revocation list next to its file. Nodes that have the list refuse the revoked nodes at once
-/// and pass the list on to their neighbours. Without a node, the command writes the list again.
+/// The command writes the fleet's revocation list next to its file. Nodes that have the list refuse the revoked nodes
+/// at once and pass the list on to their neighbours. Without a node, the command writes the list again.
 #[derive(Debug, Args)]
 pub(super) struct RevokeArgs {
     /// Names of the nodes
@@ -253,8 +253,8 @@ pub(super) struct PushReport {
     pub(super) failed: Option<CliError>,
 }
 
-/// Pushes a list to the nodes that this user runs here and to these routers, and takes over revocations that only they know.
-/// In that case the list is written once more; the receivers need no second push, because they know its content.
+/// Pushes a list to the nodes that this user runs here and to these routers, and takes over revocations that only they
+/// know. In that case the list is written once more; the receivers need no second push, because they know its content.
 pub(super) fn push_crl(
     file: &mut LockedFleet,
     list: &[u8],

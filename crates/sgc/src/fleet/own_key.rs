@@ -19,8 +19,8 @@ const KEY_KEPT: &str = "; a key is never overwritten: an identity may need it";
 
 /// On a node's machine: make its private key and a request for a certificate.
 ///
-/// The command writes the key to NODE.key, where it stays, and the request to NODE.csr. The keeper of the fleet answers the
-/// request with `sgc fleet enroll NODE --csr NODE.csr`.
+/// The command writes the key to NODE.key, where it stays, and the request to NODE.csr. The keeper of the fleet answers
+/// the request with `sgc fleet enroll NODE --csr NODE.csr`.
 #[derive(Debug, Args)]
 pub(super) struct RequestArgs {
     /// Name of the node: a-z, 0-9, '-', '_' and '.'
@@ -70,8 +70,8 @@ pub(super) struct AcceptArgs {
 
 /// For a CA that does not know SGC: write the extensions of a node's certificate.
 ///
-/// The file has OpenSSL's format (`openssl x509 -req -extfile`) and holds no secret. The CA takes the extensions from this
-/// file and none from the request, so its keeper decides on name, groups and role.
+/// The file has OpenSSL's format (`openssl x509 -req -extfile`) and holds no secret. The CA takes the extensions from
+/// this file and none from the request, so its keeper decides on name, groups and role.
 #[derive(Debug, Args)]
 pub(super) struct ExtensionsArgs {
     /// Name of the node: a-z, 0-9, '-', '_' and '.'

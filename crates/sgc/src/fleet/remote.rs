@@ -1,5 +1,5 @@
-//! `--at AUTHORITY`: fleet operations that the authority carries out. A node of this user requests them over the mesh as
-//! an operator.
+//! `--at AUTHORITY`: fleet operations that the authority carries out. A node of this user requests them over the mesh
+//! as an operator.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -28,8 +28,8 @@ const ANSWER_MAX: Duration = Duration::from_secs(40);
 pub(super) struct FleetPlace {
     #[command(flatten)]
     pub(super) which: WhichFleet,
-    /// Let the fleet's authority do it, over the mesh: the name of its node. Your node that runs here sends the request; the
-    /// authority's configuration has to list it in `operators`
+    /// Let the fleet's authority do it, over the mesh: the name of its node. Your node that runs here sends the
+    /// request; the authority's configuration has to list it in `operators`
     #[arg(long, value_name = "AUTHORITY", conflicts_with = "fleet")]
     at: Option<String>,
     /// With --at: status socket of the node that sends the request, if it is not the only one here

@@ -20,9 +20,9 @@ const RAW_LINE_BYTES: usize = 32;
 
 /// Show messages of a topic, decoded
 ///
-/// The command looks for definitions in `--msg-dir`, then in AMENT_PREFIX_PATH. It has the common interfaces of ROS 2 built
-/// in. If a definition is missing or differs, the node has it from the publishing side. Showing messages never slows
-/// the topic down: messages that are not shown in time are skipped and counted.
+/// The command looks for definitions in `--msg-dir`, then in AMENT_PREFIX_PATH. It has the common interfaces of ROS 2
+/// built in. If a definition is missing or differs, the node has it from the publishing side. Showing messages never
+/// slows the topic down: messages that are not shown in time are skipped and counted.
 #[derive(Debug, Args)]
 pub(crate) struct EchoArgs {
     #[command(flatten)]

@@ -145,7 +145,8 @@ impl TapArgs {
 }
 
 impl Tap {
-    /// Returns the next message and its copied bytes. Returns `None` at the end of the stream, or after `patience` without a message.
+    /// Returns the next message and its copied bytes. Returns `None` at the end of the stream, or after `patience`
+    /// without a message.
     fn next(&mut self, patience: Option<Duration>) -> Result<Option<(TapHead, Vec<u8>)>, CliError> {
         let broken =
             |socket: &Path, error: &std::io::Error| ask::no_node(socket, error, patience.unwrap_or_default());
@@ -176,7 +177,8 @@ impl Tap {
     }
 }
 
-/// Splits the arguments into a type and a message; either may be left out. A single argument is a type if it looks like one.
+/// Splits the arguments into a type and a message; either may be left out. A single argument is a type if it looks like
+/// one.
 pub(crate) fn type_and_message<'a>(
     first: Option<&'a str>,
     second: Option<&'a str>,

@@ -39,8 +39,8 @@ enum DurabilityArg {
 
 /// Publish messages on a topic, in JSON or YAML
 ///
-/// The node that runs here publishes the messages on its local network like any program there, and shared topics go to the
-/// far side. Omitted members have their defaults. Without MESSAGE, each line of standard input is a message.
+/// The node that runs here publishes the messages on its local network like any program there, and shared topics go to
+/// the far side. Omitted members have their defaults. Without MESSAGE, each line of standard input is a message.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   sgc topic pub /cmd_vel geometry_msgs/msg/Twist '{linear: {x: 0.5}}' --rate 10
@@ -63,7 +63,8 @@ pub(crate) struct PubArgs {
     /// End after N messages
     #[arg(short = 'n', long, value_name = "N")]
     count: Option<u64>,
-    /// Wait first for N subscribers on the local network, including the node's own for the far side [default: 1 with --once, else 0]
+    /// Wait first for N subscribers on the local network, including the node's own for the far side [default: 1 with
+    /// --once, else 0]
     #[arg(short, long, value_name = "N")]
     wait: Option<u32>,
     /// Longest time to wait for subscribers

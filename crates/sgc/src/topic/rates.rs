@@ -30,7 +30,8 @@ pub(crate) struct BwArgs {
     rates: RateArgs,
 }
 
-/// Measure the age of a topic's messages by the stamp of their header, which comes from the clock of the publisher's host
+/// Measure the age of a topic's messages by the stamp of their header, which comes from the clock of the publisher's
+/// host
 #[derive(Debug, Args)]
 pub(crate) struct DelayArgs {
     #[command(flatten)]

@@ -1,4 +1,5 @@
-//! `docs/reference/command-line.md`: every command with its arguments, from the definition that the program parses with.
+//! `docs/reference/command-line.md`: every command with its arguments, from the definition that the program parses
+//! with.
 
 use std::fmt::Write as _;
 

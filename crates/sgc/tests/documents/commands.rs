@@ -1,7 +1,7 @@
 //! Command lines of `sgc` parse with the definition that the program parses with.
 //!
-//! A line of a code block must be a whole command. A code span may leave arguments out: it may name no more than a command,
-//! and an `…` in it stands for anything.
+//! A line of a code block must be a whole command. A code span may leave arguments out: it may name no more than a
+//! command, and an `…` in it stands for anything.
 
 use std::collections::BTreeSet;
 use std::sync::LazyLock;

@@ -1,7 +1,7 @@
 //! Configurations that documents show are valid, and keys that they name exist.
 //!
-//! A block of TOML may be a part of a file: it is then read with a node's name and routers in front, and under the header
-//! of a table if it has none.
+//! A block of TOML may be a part of a file: it is then read with a node's name and routers in front, and under the
+//! header of a table if it has none.
 
 use std::path::Path;
 

@@ -135,8 +135,8 @@ fn is_key(text: &str) -> bool {
     !text.is_empty() && text.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_')
 }
 
-/// Returns the names that the code counts under: what methods return as the names of reasons for drops. Nothing is counted
-/// under a bare text.
+/// Returns the names that the code counts under: what methods return as the names of reasons for drops. Nothing is
+/// counted under a bare text.
 fn counted_in(repository: &Repository) -> BTreeSet<String> {
     let mut counted = BTreeSet::new();
     for path in

@@ -1,8 +1,8 @@
 //! The files of a crate import each other in one direction only.
 //!
 //! An edge leads from a file to the file that defines what a path with `crate::` or `super::` names; re-exports are
-//! followed. The declaration of a module and its re-export by the parent are no edges. Code under `#[cfg(test)]` does not
-//! count.
+//! followed. The declaration of a module and its re-export by the parent are no edges. Code under `#[cfg(test)]` does
+//! not count.
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -1,4 +1,5 @@
-//! Links lead to files and headings, and paths in code spans to files and folders. Documents that the code cites exist, too.
+//! Links lead to files and headings, and paths in code spans to files and folders. Documents that the code cites exist,
+//! too.
 //!
 //! A path may be cited without its first folders, as `router.rs` or `sgc-router/src/router.rs`. Files of users, such as
 //! `node.toml`, are not looked for.

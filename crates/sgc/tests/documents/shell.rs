@@ -61,8 +61,8 @@ fn without_prompt(line: &str) -> &str {
     if is_prompt { rest.trim_start() } else { line }
 }
 
-/// Returns the words of each command of a line: of a pipeline, or of a list. Redirections and comments are left out, and
-/// so are variables and `sudo` in front.
+/// Returns the words of each command of a line: of a pipeline, or of a list. Redirections and comments are left out,
+/// and so are variables and `sudo` in front.
 pub(crate) fn commands(line: &str) -> Vec<Vec<String>> {
     let (mut commands, mut words) = (Vec::new(), Vec::new());
     let (mut word, mut is_word, mut quote) = (String::new(), false, None);

@@ -195,8 +195,8 @@ impl<'r> Citations<'r> {
     }
 }
 
-/// Returns the names of all tests in a source: functions with a test's attribute, and functions whose names stand alone in
-/// a line, as a macro that makes tests of them takes them.
+/// Returns the names of all tests in a source: functions with a test's attribute, and functions whose names stand alone
+/// in a line, as a macro that makes tests of them takes them.
 pub(crate) fn tests_in(source: &str) -> BTreeSet<String> {
     let (mut tests, mut functions, mut alone) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
     let mut is_test = false;

@@ -1,5 +1,5 @@
-//! Programs and nodes come and go at random under traffic. Afterwards no route or endpoint is left over, and no message comes
-//! twice.
+//! Programs and nodes come and go at random under traffic. Afterwards no route or endpoint is left over, and no message
+//! comes twice.
 //!
 //! `SGC_CHURN_SEED` and `SGC_CHURN_STEPS` make it another run, or a longer one (`make churn`); each step ends one
 //! program or node, with SIGKILL or SIGTERM, and starts it again.

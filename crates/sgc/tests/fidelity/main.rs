@@ -1,5 +1,5 @@
-//! Tests in the large that an unmodified program cannot tell sgc from a plain network: latched topics many to many, programs
-//! and nodes that come and go, a subscriber that stalls, and isolation of topics that are not shared.
+//! Tests in the large that an unmodified program cannot tell sgc from a plain network: latched topics many to many,
+//! programs and nodes that come and go, a subscriber that stalls, and isolation of topics that are not shared.
 
 #![allow(clippy::unwrap_used)]
 

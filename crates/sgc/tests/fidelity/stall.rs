@@ -1,9 +1,9 @@
-//! Images go to a subscriber that stalls, and to a node that stalls. Memory stays bounded everywhere, other topics flow on, and
-//! a subscriber that resumes gets new images.
+//! Images go to a subscriber that stalls, and to a node that stalls. Memory stays bounded everywhere, other topics flow
+//! on, and a subscriber that resumes gets new images.
 //!
-//! `SGC_STALL_SECONDS` is how long the subscriber stands still (`make stall`: ten minutes). A node stands still for less than
-//! the leases of DDS: after ten minutes all was with its writers at once, but the Fast DDS program beside it had not found
-//! them again a minute later.
+//! `SGC_STALL_SECONDS` is how long the subscriber stands still (`make stall`: ten minutes). A node stands still for
+//! less than the leases of DDS: after ten minutes all was with its writers at once, but the Fast DDS program beside it
+//! had not found them again a minute later.
 
 use std::time::{Duration, Instant};
 
@@ -43,8 +43,8 @@ impl Stall {
         let rate = |rate: &'static str| ["--wait-matched", "0", "--rate", rate];
         let image = [&of("image", "/image")[..], &rate(IMAGES_PER_S), &["--size", IMAGE_BYTES]].concat();
         let mut images = lab.peer(Site::Desk, "cyclone", "sub", &of("image", "/image"));
-        // Deeper than what is said while a node stands still: else a reader that is slow to acknowledge, on a busy machine,
-        // may see some of it overwritten, as it may without us.
+        // Deeper than what is said while a node stands still: else a reader that is slow to acknowledge, on a busy
+        // machine, may see some of it overwritten, as it may without us.
         let deep = ["--depth", "400"];
         let states = [&of("string", "/string")[..], &deep].concat();
         let mut states = lab.peer(Site::Desk, "fastdds", "sub", &states);

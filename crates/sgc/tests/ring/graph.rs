@@ -1,5 +1,5 @@
-//! The ring as a graph, and the faults that follow from a seed. Pure, without processes and clocks: a plan says what breaks or
-//! mends and when, and [`Graph`] says what is still connected.
+//! The ring as a graph, and the faults that follow from a seed. Pure, without processes and clocks: a plan says what
+//! breaks or mends and when, and [`Graph`] says what is still connected.
 
 use std::fmt;
 use std::time::Duration;

@@ -1,5 +1,5 @@
-//! The ring as processes: a namespace for each node, a cable for each link, and functions that break them. The lab ends its
-//! processes by their process ids and removes its namespaces, also when a test panics.
+//! The ring as processes: a namespace for each node, a cable for each link, and functions that break them. The lab ends
+//! its processes by their process ids and removes its namespaces, also when a test panics.
 
 use std::fs;
 use std::io::{Read, Write};

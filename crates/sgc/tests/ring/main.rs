@@ -1,6 +1,6 @@
-//! Tests that a ring of routers heals, with real processes: five routers with chords, three proxies and independent programs,
-//! each network in a namespace of its own. A seed cuts links and kills, restarts and stops routers. Three topics flow from
-//! the robot to the desk and the lab. No reliable message may be lost, repeated or reordered.
+//! Tests that a ring of routers heals, with real processes: five routers with chords, three proxies and independent
+//! programs, each network in a namespace of its own. A seed cuts links and kills, restarts and stops routers. Three
+//! topics flow from the robot to the desk and the lab. No reliable message may be lost, repeated or reordered.
 //!
 //! `SGC_RING_SEED` and `SGC_RING_SECONDS` choose the faults and how long there are any, `SGC_RING_DIR` a directory that
 //! keeps the logs and the trace. A plan follows from the seed alone, its moments do not: no router is taken before
@@ -56,8 +56,8 @@ const EXPLAINS: Duration = Duration::from_secs(15);
 const TOGETHER: Duration = Duration::from_millis(100);
 /// How much more memory a router may have in the end.
 const GROWTH_KB_MAX: u64 = 64 * 1024;
-/// Counters of what an honest peer never causes (`docs/spec/routing.md`). `wrong_way` is also a control frame that crossed
-/// another; the log tells the two apart.
+/// Counters of what an honest peer never causes (`docs/spec/routing.md`). `wrong_way` is also a control frame that
+/// crossed another; the log tells the two apart.
 const SUSPICIOUS: [&str; 7] =
     ["not_verified", "not_owner", "hop_limit", "limit", "crl", "not_router", "malformed_control"];
 /// Texts that no log may contain.

@@ -18,7 +18,8 @@ fn start(lab: &Lab, site: Site, distribution: &str, program: &str, args: &[&str]
     Peer::start(command)
 }
 
-/// eclipse-zenoh/zenoh-plugin-ros2dds #700 and #570: after each restart of a publisher or a bridge, every message is repeated once more.
+/// eclipse-zenoh/zenoh-plugin-ros2dds #700 and #570: after each restart of a publisher or a bridge, every message is
+/// repeated once more.
 #[test]
 fn subscriber_hears_each_message_once_however_often_publisher_and_nodes_restart() {
     /// Each publisher's numbers begin at its run times this.
@@ -94,8 +95,8 @@ fn late_subscriber_hears_nothing_from_before_it_joined_after_another_was_killed(
 #[test]
 fn subscriptions_that_come_and_go_leave_no_memory_behind() {
     const SUBSCRIPTIONS: &str = "300";
-    /// Far below 16 bytes for each subscription of each message about the graph, which was the leak: 1.4 MB for 300, and four times
-    /// that for 600.
+    /// Far below 16 bytes for each subscription of each message about the graph, which was the leak: 1.4 MB for 300,
+    /// and four times that for 600.
     const MORE_KB_MAX: u64 = 2_000;
     let lab = Lab::real(PLAN, robot_to_desk("topic", ["/churn"]));
     let _talker = start(&lab, Site::Robot, "jazzy", "events.py", &["pub", "--topic", "/churn"]);
@@ -135,8 +136,8 @@ fn topic_survives_thirteen_participants_that_join_at_once() {
     }
 }
 
-/// ros2/rmw_zenoh #425: where two distributions have different definitions of a type, topics are silent without a message. Here they
-/// flow, as they do natively, and the difference is reported.
+/// ros2/rmw_zenoh #425: where two distributions have different definitions of a type, topics are silent without a
+/// message. Here they flow, as they do natively, and the difference is reported.
 #[test]
 fn different_definitions_of_a_type_are_named_where_they_meet() {
     let lab = Lab::real(PLAN, robot_to_desk("topic", PAIRS.map(|[talks, _]| format!("/differs_{talks}"))));
@@ -177,8 +178,8 @@ fn bad_way(robot: &Namespace, cloud: &Namespace) -> TunLink {
     TunLink::start(ends, &TunOptions { profiles: [profile; 2], ..TunOptions::default() }).unwrap()
 }
 
-/// eProsima/DDS-Router #397: over a bad network reliable messages are lost. The path loses, delays, repeats and reorders packets, and
-/// is cut for some seconds.
+/// eProsima/DDS-Router #397: over a bad network reliable messages are lost. The path loses, delays, repeats and
+/// reorders packets, and is cut for some seconds.
 #[test]
 fn reliable_messages_arrive_once_and_in_order_over_a_bad_network() {
     const CUT: Duration = Duration::from_secs(3);

@@ -1,5 +1,5 @@
-//! Services, actions and parameters of real ROS 2: calls right after discovery of a server, slow servers, restarted servers. Also
-//! the first messages of publishers, which the same fault of the transport affects.
+//! Services, actions and parameters of real ROS 2: calls right after discovery of a server, slow servers, restarted
+//! servers. Also the first messages of publishers, which the same fault of the transport affects.
 
 use rustix::process::Signal;
 use serde_json::Value;
@@ -15,8 +15,8 @@ const DISTRIBUTIONS: [&str; 2] = ["jazzy", "kilted"];
 /// Seconds after which a program reports missing answers.
 const TRIES_S: &str = "20";
 
-/// Longest duration of a first call, in seconds. A Fast DDS writer sends heartbeats every three seconds, so a call that waits for
-/// one takes longer.
+/// Longest duration of a first call, in seconds. A Fast DDS writer sends heartbeats every three seconds, so a call that
+/// waits for one takes longer.
 const FIRST_CALL_MAX_S: f64 = 2.0;
 
 fn program(lab: &Lab, site: Site, distribution: &str, args: &[&str]) -> Peer {
@@ -156,7 +156,8 @@ fn calls_of_a_server_that_was_started_again_are_answered() {
     call_all(CLIENTS);
 }
 
-/// A server that is killed is missed when its lease ends, after 20 s; until then its service is offered, natively as well.
+/// A server that is killed is missed when its lease ends, after 20 s; until then its service is offered, natively as
+/// well.
 #[test]
 fn calls_of_a_server_that_was_killed_are_counted_and_explained_until_calls_are_answered() {
     let lab = Lab::real(PLAN, robot_to_desk("service", ["/jazzy", "/kilted"]));

@@ -9,7 +9,8 @@ use crate::{PAIRS, PLAN, count};
 
 const MESSAGES: u64 = 20;
 
-/// Names of topics, the depths of their publishers (`load.c`: 0 keeps all), and the number of messages that late joiners get.
+/// Names of topics, the depths of their publishers (`load.c`: 0 keeps all), and the number of messages that late
+/// joiners get.
 const LATCHED: [(&str, &str, u64); 4] =
     [("last", "1", 1), ("five", "5", 5), ("ten", "10", 10), ("all", "0", MESSAGES)];
 
@@ -118,7 +119,8 @@ fn late_joiners_get_as_much_as_their_publishers_keep() {
     }
 }
 
-/// As natively of a latched publisher that starts again: the far node's writer is another one to a subscriber that has it all.
+/// As natively of a latched publisher that starts again: the far node's writer is another one to a subscriber that has
+/// it all.
 #[test]
 fn restart_beside_a_latched_subscriber_repeats_what_is_kept_once_and_loses_nothing() {
     let pairs = PAIRS.iter().flat_map(|pair| [(pair, 1), (pair, 5)]);
@@ -175,7 +177,8 @@ fn late_joiners_hear_each_latched_publisher_of_a_topic() {
     let topics = PAIRS.map(|[talks, _]| topic(talks, "tf_static"));
     let lab = Lab::real(PLAN, robot_to_desk("topic", &topics));
     for ([talks, listens], topic) in PAIRS.into_iter().zip(&topics) {
-        // Their last messages are those with the numbers 2, 4 and 6, and the first of them may be lost on their own network.
+        // Their last messages are those with the numbers 2, 4 and 6, and the first of them may be lost on their own
+        // network.
         let _publishers = [3, 5, 7].map(|count| {
             let publisher = latch(&lab, Site::Robot, talks, topic, "1", count, "1");
             wait_for_last(&lab, listens, topic, count);

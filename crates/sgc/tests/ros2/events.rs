@@ -1,4 +1,5 @@
-//! QoS events: the far side hears of liveliness, deadlines, lifespans and incompatible offers as a subscriber beside the publisher does.
+//! QoS events: the far side hears of liveliness, deadlines, lifespans and incompatible offers as a subscriber beside
+//! the publisher does.
 
 use std::time::{Duration, Instant};
 
@@ -43,7 +44,8 @@ impl Pair {
         Self { name: format!("{talks} to {listens} on {topic}"), talker, listener }
     }
 
-    /// Starts four: of each two distributions a pair beside each other at the desk, and one through `sgc`, in this order.
+    /// Starts four: of each two distributions a pair beside each other at the desk, and one through `sgc`, in this
+    /// order.
     fn start_all(lab: &Lab, [native, carried]: [&str; 2], qos: [&[&str]; 2]) -> [[Self; 2]; 2] {
         PAIRS.map(|pair| {
             let near = Self::start(lab, &format!("{native}_{}", pair[0]), [Site::Desk; 2], pair, qos);

@@ -13,8 +13,8 @@ use crate::{EXCLUSIVE, PAIRS, PLAN, count};
 /// Bytes of a fragment (`sgc_dds::config::FRAGMENT_BYTES`).
 const FRAGMENT_BYTES: u64 = 14_000;
 
-/// Runs a publisher of so many messages, the second half a second after the first, and a subscriber, matched directly or through
-/// `sgc`. Returns the subscriber's summary once it has the last message.
+/// Runs a publisher of so many messages, the second half a second after the first, and a subscriber, matched directly
+/// or through `sgc`. Returns the subscriber's summary once it has the last message.
 fn carry(lab: &Lab, [talks, listens]: [&str; 2], sites: [Site; 2], messages: u64, extra: &[&str]) -> Value {
     let messages = messages.to_string();
     let common = [&["--topic", "/load", "--timeout", PLAN.peer_life][..], extra].concat();
@@ -31,8 +31,8 @@ fn carry(lab: &Lab, [talks, listens]: [&str; 2], sites: [Site; 2], messages: u64
     summary
 }
 
-/// Asserts that all messages came once each, unaltered and in order. The first may be lost, because a reader is matched a moment
-/// before it knows (`tests/peers/README.md`).
+/// Asserts that all messages came once each, unaltered and in order. The first may be lost, because a reader is matched
+/// a moment before it knows (`tests/peers/README.md`).
 fn assert_whole(summary: &Value, messages: u64, what: &str) {
     let counts = ["last", "lost", "duplicated", "altered", "reordered"].map(|key| count(summary, key));
     assert_eq!(counts, [messages - 1, 0, 0, 0, 0], "{what}: {summary}");
@@ -83,8 +83,8 @@ fn dropped_at_full_buffers(lab: &Lab) -> u64 {
         .unwrap()
 }
 
-/// A subscriber with default QoS keeps ten messages. Hundreds that come at once after a router stalled would overwrite each other
-/// there.
+/// A subscriber with default QoS keeps ten messages. Hundreds that come at once after a router stalled would overwrite
+/// each other there.
 #[test]
 fn subscriber_with_default_qos_receives_a_burst() {
     const MESSAGES: u64 = 2_000;

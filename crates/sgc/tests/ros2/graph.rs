@@ -1,4 +1,5 @@
-//! Far programs in the local ROS graph, those that publish and those that consume, as a program of each distribution reads it.
+//! Far programs in the local ROS graph, those that publish and those that consume, as a program of each distribution
+//! reads it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::process::Stdio;

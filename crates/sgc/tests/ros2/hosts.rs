@@ -54,7 +54,8 @@ fn packets_that_cannot_be_sent_are_reported() {
 /// Bound on the time from the end of a change to the next message.
 const RESUMED: Duration = Duration::from_secs(2);
 
-/// Environment variables that set the discovery range of a program: the default of ROS 2, and two ways to limit it to the host.
+/// Environment variables that set the discovery range of a program: the default of ROS 2, and two ways to limit it to
+/// the host.
 type Environment = &'static [(&'static str, &'static str)];
 const SUBNET: Environment = &[];
 const LOCALHOST: Environment = &[("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")];
@@ -186,8 +187,8 @@ fn topics_survive_an_outage_longer_than_leases_and_reach_programs_that_start_lat
     assert_all(&mut flows, PATIENCE, "for programs that started after the change");
 }
 
-/// Bound on the time from a change of addresses to messages of programs of other hosts: until a packet to them fails, addresses count as
-/// settled, and the network is open again.
+/// Bound on the time from a change of addresses to messages of programs of other hosts: until a packet to them fails,
+/// addresses count as settled, and the network is open again.
 const REOPENED: Duration = Duration::from_secs(30);
 
 #[test]

@@ -1,5 +1,5 @@
-//! Topics with keys, which Kilted has and Jazzy does not. A Kilted subscriber ends with a segmentation fault at a message without
-//! the hash of its key (`docs/reference/compatibility.md`).
+//! Topics with keys, which Kilted has and Jazzy does not. A Kilted subscriber ends with a segmentation fault at a
+//! message without the hash of its key (`docs/reference/compatibility.md`).
 
 use serde_json::{Value, json};
 

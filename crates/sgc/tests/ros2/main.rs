@@ -1,7 +1,9 @@
-//! Real ROS 2 through `sgc`: programs on the client library of Jazzy (Fast DDS 2.14) and of Kilted (Fast DDS 3.2), installed from PyPI
-//! (`tests/peers/README.md`), as their packages set them up: default QoS, default discovery, shared memory.
+//! Real ROS 2 through `sgc`: programs on the client library of Jazzy (Fast DDS 2.14) and of Kilted (Fast DDS 3.2),
+//! installed from PyPI (`tests/peers/README.md`), as their packages set them up: default QoS, default discovery, shared
+//! memory.
 //!
-//! They run in a robot's network, the cloud and a desk's network (`support/lab.rs`). The same programs without sgc are the reference.
+//! They run in a robot's network, the cloud and a desk's network (`support/lab.rs`). The same programs without sgc are
+//! the reference.
 
 #![allow(clippy::unwrap_used)]
 

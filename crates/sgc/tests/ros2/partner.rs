@@ -16,8 +16,9 @@ const CHATTER: &str = "/robot/chatter";
 /// The topic that the cart's company gives.
 const STATE: &str = "/cart/state";
 
-/// Returns a lab with a robot of the fleet `lab`, and a cart of the fleet `acme` in the place of the desk, whose node knows no router
-/// yet. Each company has the CA of the other (`acme.pem`, `lab.pem`). Returns `None` if networks are not separate.
+/// Returns a lab with a robot of the fleet `lab`, and a cart of the fleet `acme` in the place of the desk, whose node
+/// knows no router yet. Each company has the CA of the other (`acme.pem`, `lab.pem`). Returns `None` if networks are
+/// not separate.
 fn companies([robot, cart]: [&str; 2]) -> Option<Lab> {
     let lab = Lab::silent(PLAN, [robot.to_owned(), String::new()]);
     if lab.namespace(Site::Desk).is_none() {
@@ -92,8 +93,8 @@ fn token_takes_its_type_from_the_robot_and_the_partner_needs_no_restart() {
     desk.wait("a message", |event| event["event"] == "received");
 }
 
-/// Returns the names with this beginning that a site knows: nodes, and topics and services of some node. Waits until the topic has only
-/// the publishers of this node.
+/// Returns the names with this beginning that a site knows: nodes, and topics and services of some node. Waits until
+/// the topic has only the publishers of this node.
 fn seen(lab: &Lab, site: Site, distribution: &str, [topic, node, begin]: [&str; 3]) -> [Vec<Value>; 3] {
     let args = ["--topic", topic, "--publishers", "1", "--node", node, "--timeout", "30"];
     let found = lab.rclpy(site, distribution, "graph.py", &args).summary();

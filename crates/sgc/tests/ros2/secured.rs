@@ -1,7 +1,8 @@
-//! A local network that DDS Security (SROS2) protects, with a keystore as SROS2 lays it out: everything is encrypted, and permissions
-//! name each topic.
+//! A local network that DDS Security (SROS2) protects, with a keystore as SROS2 lays it out: everything is encrypted,
+//! and permissions name each topic.
 //!
-//! The programs are Fast DDS of Debian, with the properties that rmw_fastrtps sets. The wheels of ROS 2 are built without security.
+//! The programs are Fast DDS of Debian, with the properties that rmw_fastrtps sets. The wheels of ROS 2 are built
+//! without security.
 
 #![cfg_attr(
     not(feature = "sros2"),
@@ -17,8 +18,9 @@ use crate::PLAN;
 use crate::lab::{Lab, Site, share, uses};
 use crate::support::{self, Peer, eventually};
 
-/// The enclave of `sgc`. Of two participants the one with the lower id proposes how keys are agreed on, and Cyclone DDS does not read the
-/// proposal of this Fast DDS. The ids are hashes of the names, and this one is below that of `/talker`, `/listener` and most others.
+/// The enclave of `sgc`. Of two participants the one with the lower id proposes how keys are agreed on, and Cyclone DDS
+/// does not read the proposal of this Fast DDS. The ids are hashes of the names, and this one is below that of
+/// `/talker`, `/listener` and most others.
 const ENCLAVE: &str = "/bridge";
 
 /// The topic in each direction, and that of the ROS graph.

@@ -6,8 +6,8 @@ use crate::lab::{Lab, Site};
 use crate::support::{Peer, eventually, say};
 use crate::{PAIRS, PLAN};
 
-/// The robot shares all that it has, and the desk takes all of it: by a pattern for topics, one for services, and the name of an
-/// action, of which patterns cover no part.
+/// The robot shares all that it has, and the desk takes all of it: by a pattern for topics, one for services, and the
+/// name of an action, of which patterns cover no part.
 pub(crate) fn everything() -> [String; 2] {
     let rules = |table: &str, whom: &str| {
         [("topic", "/**"), ("service", "/**"), ("action", "/robot/fibonacci")]

@@ -1,6 +1,6 @@
-//! A robot's network, the cloud and a desk's network, each a network namespace with a node in it; both networks reach the
-//! cloud and nothing routes between them. DDS stays on the loopback interface of each. Where namespaces cannot be made the
-//! lab says so and uses two ROS domains of this host instead. All of it goes with the lab.
+//! A robot's network, the cloud and a desk's network, each a network namespace with a node in it; both networks reach
+//! the cloud and nothing routes between them. DDS stays on the loopback interface of each. Where namespaces cannot be
+//! made the lab says so and uses two ROS domains of this host instead. All of it goes with the lab.
 
 #![allow(dead_code, reason = "each test program uses a part")]
 

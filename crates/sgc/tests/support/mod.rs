@@ -61,7 +61,8 @@ pub(crate) fn command(namespace: Option<&Namespace>, dir: &Path, program: &Path)
     command
 }
 
-/// Returns such a command for the tested program, with core dumps allowed, because tests read its memory and open files.
+/// Returns such a command for the tested program, with core dumps allowed, because tests read its memory and open
+/// files.
 pub(crate) fn sgc(namespace: Option<&Namespace>, dir: &Path) -> Command {
     let mut command = command(namespace, dir, Path::new(env!("CARGO_BIN_EXE_sgc")));
     command.env("SGC_ALLOW_CORE_DUMPS", "1");
@@ -75,8 +76,8 @@ pub(crate) fn python(namespace: Option<&Namespace>, dir: &Path, program: &str) -
     command
 }
 
-/// Writes the files of the fleet `lab` and of its members to a directory. Each member is a name and further arguments of
-/// `sgc fleet enroll`.
+/// Writes the files of the fleet `lab` and of its members to a directory. Each member is a name and further arguments
+/// of `sgc fleet enroll`.
 pub(crate) fn enroll<'a>(dir: &Path, members: impl IntoIterator<Item = &'a str>) {
     let good = |command: &str| {
         let output = sgc(None, dir).args(command.split_whitespace()).output().unwrap();
@@ -217,8 +218,8 @@ impl Peer {
         }
     }
 
-    /// Waits until the peer is matched, in whatever order its reports come. It may be matched before it is ready: a writer on the
-    /// far side outlives its publisher for a while, and serves the next one with equal settings.
+    /// Waits until the peer is matched, in whatever order its reports come. It may be matched before it is ready: a
+    /// writer on the far side outlives its publisher for a while, and serves the next one with equal settings.
     pub(crate) fn wait_matched(&mut self, what: &str) {
         self.wait(what, |event| event["event"] == "matched" && event["count"].as_u64() >= Some(1));
     }

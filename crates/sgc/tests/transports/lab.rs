@@ -1,5 +1,5 @@
-//! A robot and a desk behind a NAT each, and a router with a public address between them; every one a network namespace.
-//! All of it goes with the lab.
+//! A robot and a desk behind a NAT each, and a router with a public address between them; every one a network
+//! namespace. All of it goes with the lab.
 //!
 //! ```text
 //! robot ─ eth0 ──── lan ─ near ─ wan ──── cloud ──── wan ─ far ─ lan ──── eth0 ─ desk
@@ -106,8 +106,8 @@ impl Lab {
         }
         lab.robot
             .within(|| {
-                // ARP requests use the address of their interface. Otherwise a packet with the old address asks in its name, gets no
-                // answer, and all packets wait a second.
+                // ARP requests use the address of their interface. Otherwise a packet with the old address asks in its
+                // name, gets no answer, and all packets wait a second.
                 fs::write("/proc/sys/net/ipv4/conf/all/arp_announce", "2").unwrap();
             })
             .unwrap();

@@ -1,12 +1,12 @@
-//! Tests of every transport between real namespaces: NATs on both sides, a NAT that loses its state, an address that changes, a
-//! route that moves, a small MTU, a bad path.
+//! Tests of every transport between real namespaces: NATs on both sides, a NAT that loses its state, an address that
+//! changes, a route that moves, a small MTU, a bad path.
 //!
-//! A robot publishes a reliable and a best-effort topic, a desk receives them, and an event happens on the path. No reliable
-//! message may be lost, repeated or reordered, and both topics must go on. The tests print outages and never judge them,
-//! because they depend on the load of the machine.
+//! A robot publishes a reliable and a best-effort topic, a desk receives them, and an event happens on the path. No
+//! reliable message may be lost, repeated or reordered, and both topics must go on. The tests print outages and never
+//! judge them, because they depend on the load of the machine.
 //!
-//! All transports run each scenario at the same time. `SGC_TRANSPORTS_LONG=1` (`make transports`) runs one at a time, repeats
-//! the event, and has independent programs at both ends.
+//! All transports run each scenario at the same time. `SGC_TRANSPORTS_LONG=1` (`make transports`) runs one at a time,
+//! repeats the event, and has independent programs at both ends.
 
 #![allow(clippy::unwrap_used)]
 
@@ -309,7 +309,8 @@ fn a_robot_that_comes_to_a_network_without_udp_goes_on_by_tls() {
     }
 }
 
-/// The lab is what it says: a NAT that forgets shows another port, and an address that is not of a network is not let out.
+/// The lab is what it says: a NAT that forgets shows another port, and an address that is not of a network is not let
+/// out.
 #[test]
 fn the_lab_is_as_bad_as_it_says() {
     if !can_run() {

@@ -1,9 +1,9 @@
 //! The matrix of vendors: Cyclone DDS, Fast DDS and RustDDS, each to each through a router, every type with every
-//! quality of service. Each message must arrive whole and once. The suite runs a part in which each pair of vendors has each
-//! type, and each quality has each pair and type; `make vendors` runs all. It prints a table at the end.
+//! quality of service. Each message must arrive whole and once. The suite runs a part in which each pair of vendors has
+//! each type, and each quality has each pair and type; `make vendors` runs all. It prints a table at the end.
 //!
-//! `SGC_VENDORS=full` runs all cases. `SGC_VENDORS=direct` runs all without `sgc`, as the reference. `SGC_VENDORS_ONLY` selects
-//! cases whose name contains it.
+//! `SGC_VENDORS=full` runs all cases. `SGC_VENDORS=direct` runs all without `sgc`, as the reference. `SGC_VENDORS_ONLY`
+//! selects cases whose name contains it.
 
 #![allow(clippy::unwrap_used)]
 
@@ -97,14 +97,14 @@ impl Case {
         format!("/v/{self}")
     }
 
-    /// Returns `true` where the vendors lose messages without sgc, over stock socket buffers (`tests/peers/README.md`, `WEAK` in
-    /// `check.py`). Some messages must come, each intact and once.
+    /// Returns `true` where the vendors lose messages without sgc, over stock socket buffers (`tests/peers/README.md`,
+    /// `WEAK` in `check.py`). Some messages must come, each intact and once.
     fn is_weak(&self) -> bool {
         self.from != "cyclone" && KINDS[self.kind] == "pointcloud"
     }
 
-    /// Returns `true` where a lost fragment is a lost message, so that a burst of several hundred fragments may lose everything,
-    /// as it may without sgc.
+    /// Returns `true` where a lost fragment is a lost message, so that a burst of several hundred fragments may lose
+    /// everything, as it may without sgc.
     fn is_chance(&self) -> bool {
         !self.reliable && self.kind >= SMALL
     }
@@ -134,8 +134,8 @@ impl Case {
         }
     }
 
-    /// Runs a case in which both ends exist before the first message. A reader may be matched a moment before it knows, so all
-    /// messages from the first received one on must come.
+    /// Runs a case in which both ends exist before the first message. A reader may be matched a moment before it knows,
+    /// so all messages from the first received one on must come.
     fn live(&self, lab: &Lab, far: Site) -> Result<Outcome, String> {
         let (sent, wanted, rate) = if self.kind < SMALL { ("40", 20, "50") } else { ("15", 8, "10") };
         let wanted = if self.is_weak() { 1 } else { wanted };
@@ -174,7 +174,8 @@ impl Case {
 
     /// Runs a case in which a late subscriber gets the publisher's history once.
     ///
-    /// Only Cyclone announces how many it keeps; of others the last one is kept on the way (`docs/reference/compatibility.md`).
+    /// Only Cyclone announces how many it keeps; of others the last one is kept on the way
+    /// (`docs/reference/compatibility.md`).
     fn late(&self, lab: &Lab, far: Site) -> Result<Outcome, String> {
         let (kept, depth) = match (KINDS[self.kind], self.from) {
             // One of each of the five instances.
@@ -249,7 +250,8 @@ fn every_vendor_reaches_every_vendor_with_every_type_and_quality() {
     assert!(failures.is_empty(), "{} of {} failed:\n{}", failures.len(), outcomes.len(), failures.join("\n"));
 }
 
-/// Formats a line for each pair of vendors with four signs for each type: best effort and reliable, each volatile and latched.
+/// Formats a line for each pair of vendors with four signs for each type: best effort and reliable, each volatile and
+/// latched.
 fn table(outcomes: &BTreeMap<Case, Outcome>) -> String {
     let mut text = format!("{:20}", "");
     KINDS.iter().for_each(|kind| text += &format!("{kind:>11}"));
@@ -312,7 +314,8 @@ fn hall_beside(robot: &Namespace) -> Namespace {
     hall
 }
 
-/// Starts a peer in the hall with the defaults of its DDS except shared memory, and with the configuration of a Cyclone there.
+/// Starts a peer in the hall with the defaults of its DDS except shared memory, and with the configuration of a Cyclone
+/// there.
 fn peer_in_the_hall(lab: &Lab, hall: &Namespace, vendor: &str, args: &[&str]) -> Peer {
     let mut command = support::command(Some(hall), lab.dir(), &Peer::program(vendor));
     // As rmw_cyclonedds makes of ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, ROS_STATIC_PEERS=10.92.3.1.

@@ -1,7 +1,7 @@
 //! A ROS 2 talker and listener on `ros2-client` and RustDDS that does not know SGC.
 //!
-//! `../../README.md` specifies the command line and the printed lines. All events come through one channel: discovery and data
-//! from streams, signals and standard input from threads. Nothing polls.
+//! `../../README.md` specifies the command line and the printed lines. All events come through one channel: discovery
+//! and data from streams, signals and standard input from threads. Nothing polls.
 
 mod messages;
 mod options;

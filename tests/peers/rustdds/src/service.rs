@@ -1,5 +1,5 @@
-//! A client and a server, as `ros2-client` makes them by default (`ServiceMapping::Enhanced`): a request is known by its
-//! writer and sequence number, and a reply names both in its related sample identity.
+//! A client and a server, as `ros2-client` makes them by default (`ServiceMapping::Enhanced`): a request is known by
+//! its writer and sequence number, and a reply names both in its related sample identity.
 
 use std::pin::pin;
 use std::time::{Duration, Instant};
@@ -37,8 +37,8 @@ fn answer(request: &Request) -> Response {
     Response { sum: request.a + request.b }
 }
 
-/// How long a client waits once it is matched, since the server may be so later, and how long a server stays for a client
-/// that has not yet taken the last answer.
+/// How long a client waits once it is matched, since the server may be so later, and how long a server stays for a
+/// client that has not yet taken the last answer.
 const SETTLE: Duration = Duration::from_secs(1);
 
 pub fn run(options: &Options) -> Result<u8, String> {

@@ -77,7 +77,8 @@ impl<N: RosNetwork> Core<N> {
         RouteLine::new(route, calls, messages, share.map_or(0, |s| s.signatures()), compressed)
     }
 
-    /// Returns everything that was dropped or refused, by kind and culprit. Control frames and packets share some kinds.
+    /// Returns everything that was dropped or refused, by kind and culprit. Control frames and packets share some
+    /// kinds.
     pub(super) fn all_drops(&self) -> BTreeMap<String, u64> {
         let audit = [
             (NodeDrop::AuditLost, self.audit.lost_total()),

@@ -321,8 +321,8 @@ impl Reloader {
     }
 }
 
-/// Returns the configuration that runs after a reload. Restart-only settings keep their running values, so that the next
-/// reload reports them again.
+/// Returns the configuration that runs after a reload. Restart-only settings keep their running values, so that the
+/// next reload reports them again.
 fn merged(before: Config, read: Config) -> Config {
     let Config { shares, uses, tokens, partners, trust, accept, gateway, .. } = read;
     let gateway = match (&before.gateway, gateway) {

@@ -75,8 +75,8 @@ impl ShapeStage {
         self.note_active(&state);
     }
 
-    /// Makes later samples pass this stage, or not. They pass it after the limits as well while it holds a sample, which
-    /// would otherwise leave behind them.
+    /// Makes later samples pass this stage, or not. They pass it after the limits as well while it holds a sample,
+    /// which would otherwise leave behind them.
     fn note_active(&self, state: &State) {
         self.is_active.store(state.has_limits || state.held.is_some(), SeqCst);
     }
