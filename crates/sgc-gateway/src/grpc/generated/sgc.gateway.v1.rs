@@ -391,13 +391,12 @@ pub struct SubscribeRequest {
     /// Most queued messages before the oldest is dropped, 1 to 10000; 0 is 10.
     #[prost(uint32, tag = "5")]
     pub depth: u32,
-    /// Highest rate in messages per second; 0 is unlimited. The newest `depth` messages wait in between, so with a
-    /// depth of 1 the newest message comes.
+    /// Highest rate in messages per second; 0 is unlimited. The newest `depth` messages wait in between, so with a depth
+    /// of 1 the newest message comes.
     #[prost(double, tag = "6")]
     pub max_rate_hz: f64,
     /// True to queue rather than drop: the gateway stops reading for this client, and up to 64 MiB or 16384 messages of
-    /// reliable publishers are queued. Further ones are dropped and counted in `dropped`, so the network is not held
-    /// up.
+    /// reliable publishers are queued. Further ones are dropped and counted in `dropped`, so the network is not held up.
     #[prost(bool, tag = "7")]
     pub waits: bool,
 }
@@ -816,14 +815,14 @@ pub mod serve_action_response {
 pub enum Encoding {
     /// CDR.
     Unspecified = 0,
-    /// The serialisation of ROS 2: encapsulation header and body. Nothing is converted, so it is the fastest. Reading
-    /// it takes the definition of the type (GetType).
+    /// The serialisation of ROS 2: encapsulation header and body. Nothing is converted, so it is the fastest. Reading it
+    /// takes the definition of the type (GetType).
     Cdr = 1,
     /// JSON in UTF-8: an object with the members of the message. Arrays of bytes are base64, floats that are not finite
     /// are "NaN", "Infinity" or "-Infinity", and missing members have their defaults.
     Json = 2,
-    /// The same structure in CBOR (RFC 8949): arrays of bytes are byte strings, other arrays of numbers are typed
-    /// arrays (RFC 8746).
+    /// The same structure in CBOR (RFC 8949): arrays of bytes are byte strings, other arrays of numbers are typed arrays
+    /// (RFC 8746).
     Cbor = 3,
 }
 impl Encoding {
@@ -898,8 +897,8 @@ pub mod gateway_client {
     )]
     use tonic::codegen::*;
     use tonic::codegen::http::Uri;
-    /// The methods of a gateway. Streams are independent of each other. The client opens one connection, which serves
-    /// all streams in both directions.
+    /// The methods of a gateway. Streams are independent of each other. The client opens one connection, which serves all
+    /// streams in both directions.
     #[derive(Debug, Clone)]
     pub struct GatewayClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -1055,8 +1054,8 @@ pub mod gateway_client {
                 .insert(GrpcMethod::new("sgc.gateway.v1.Gateway", "GetType"));
             self.inner.unary(req, path, codec).await
         }
-        /// Publishes on a topic until the stream ends. The first request names the topic, and each later one is a
-        /// message. The client ends the stream. A message of the wrong type ends it with INVALID_ARGUMENT.
+        /// Publishes on a topic until the stream ends. The first request names the topic, and each later one is a message.
+        /// The client ends the stream. A message of the wrong type ends it with INVALID_ARGUMENT.
         pub async fn publish(
             &mut self,
             request: impl tonic::IntoStreamingRequest<Message = super::PublishRequest>,
@@ -1106,8 +1105,8 @@ pub mod gateway_client {
                 .insert(GrpcMethod::new("sgc.gateway.v1.Gateway", "Subscribe"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// Calls a service and waits for its reply until the deadline of the call (`grpc-timeout`), or for an hour
-        /// without one.
+        /// Calls a service and waits for its reply until the deadline of the call (`grpc-timeout`), or for an hour without
+        /// one.
         pub async fn call(
             &mut self,
             request: impl tonic::IntoRequest<super::CallRequest>,
@@ -1129,8 +1128,8 @@ pub mod gateway_client {
                 .insert(GrpcMethod::new("sgc.gateway.v1.Gateway", "Call"));
             self.inner.unary(req, path, codec).await
         }
-        /// Serves a service until the stream ends. The first request names the service, and the first response confirms
-        /// it. Then calls come as responses, and are answered by requests in any order.
+        /// Serves a service until the stream ends. The first request names the service, and the first response confirms it.
+        /// Then calls come as responses, and are answered by requests in any order.
         pub async fn serve(
             &mut self,
             request: impl tonic::IntoStreamingRequest<Message = super::ServeRequest>,
@@ -1155,10 +1154,10 @@ pub mod gateway_client {
                 .insert(GrpcMethod::new("sgc.gateway.v1.Gateway", "Serve"));
             self.inner.streaming(req, path, codec).await
         }
-        /// Sends a goal to an action. The first request is the goal. If the server accepts it, the first response
-        /// confirms that; else the stream ends with FAILED_PRECONDITION. Feedback follows, and then the result as the
-        /// last response. Further requests ask to cancel the goal. Like any ROS 2 goal, it continues if its client does
-        /// not wait for the end.
+        /// Sends a goal to an action. The first request is the goal. If the server accepts it, the first response confirms
+        /// that; else the stream ends with FAILED_PRECONDITION. Feedback follows, and then the result as the last response.
+        /// Further requests ask to cancel the goal. Like any ROS 2 goal, it continues if its client does not wait for the
+        /// end.
         pub async fn send_goal(
             &mut self,
             request: impl tonic::IntoStreamingRequest<Message = super::SendGoalRequest>,
@@ -1183,9 +1182,9 @@ pub mod gateway_client {
                 .insert(GrpcMethod::new("sgc.gateway.v1.Gateway", "SendGoal"));
             self.inner.streaming(req, path, codec).await
         }
-        /// Serves an action until the stream ends. The first request names the action, and the first response confirms
-        /// it. Then goals come, each of which must be answered, reported on and finished. Unfinished goals are aborted
-        /// when the stream ends.
+        /// Serves an action until the stream ends. The first request names the action, and the first response confirms it.
+        /// Then goals come, each of which must be answered, reported on and finished. Unfinished goals are aborted when the
+        /// stream ends.
         pub async fn serve_action(
             &mut self,
             request: impl tonic::IntoStreamingRequest<
@@ -1251,8 +1250,8 @@ pub mod gateway_server {
             &self,
             request: tonic::Request<super::GetTypeRequest>,
         ) -> std::result::Result<tonic::Response<super::GetTypeResponse>, tonic::Status>;
-        /// Publishes on a topic until the stream ends. The first request names the topic, and each later one is a
-        /// message. The client ends the stream. A message of the wrong type ends it with INVALID_ARGUMENT.
+        /// Publishes on a topic until the stream ends. The first request names the topic, and each later one is a message.
+        /// The client ends the stream. A message of the wrong type ends it with INVALID_ARGUMENT.
         async fn publish(
             &self,
             request: tonic::Request<tonic::Streaming<super::PublishRequest>>,
@@ -1268,8 +1267,8 @@ pub mod gateway_server {
             &self,
             request: tonic::Request<super::SubscribeRequest>,
         ) -> std::result::Result<tonic::Response<Self::SubscribeStream>, tonic::Status>;
-        /// Calls a service and waits for its reply until the deadline of the call (`grpc-timeout`), or for an hour
-        /// without one.
+        /// Calls a service and waits for its reply until the deadline of the call (`grpc-timeout`), or for an hour without
+        /// one.
         async fn call(
             &self,
             request: tonic::Request<super::CallRequest>,
@@ -1280,8 +1279,8 @@ pub mod gateway_server {
             >
             + std::marker::Send
             + 'static;
-        /// Serves a service until the stream ends. The first request names the service, and the first response confirms
-        /// it. Then calls come as responses, and are answered by requests in any order.
+        /// Serves a service until the stream ends. The first request names the service, and the first response confirms it.
+        /// Then calls come as responses, and are answered by requests in any order.
         async fn serve(
             &self,
             request: tonic::Request<tonic::Streaming<super::ServeRequest>>,
@@ -1292,10 +1291,10 @@ pub mod gateway_server {
             >
             + std::marker::Send
             + 'static;
-        /// Sends a goal to an action. The first request is the goal. If the server accepts it, the first response
-        /// confirms that; else the stream ends with FAILED_PRECONDITION. Feedback follows, and then the result as the
-        /// last response. Further requests ask to cancel the goal. Like any ROS 2 goal, it continues if its client does
-        /// not wait for the end.
+        /// Sends a goal to an action. The first request is the goal. If the server accepts it, the first response confirms
+        /// that; else the stream ends with FAILED_PRECONDITION. Feedback follows, and then the result as the last response.
+        /// Further requests ask to cancel the goal. Like any ROS 2 goal, it continues if its client does not wait for the
+        /// end.
         async fn send_goal(
             &self,
             request: tonic::Request<tonic::Streaming<super::SendGoalRequest>>,
@@ -1306,9 +1305,9 @@ pub mod gateway_server {
             >
             + std::marker::Send
             + 'static;
-        /// Serves an action until the stream ends. The first request names the action, and the first response confirms
-        /// it. Then goals come, each of which must be answered, reported on and finished. Unfinished goals are aborted
-        /// when the stream ends.
+        /// Serves an action until the stream ends. The first request names the action, and the first response confirms it.
+        /// Then goals come, each of which must be answered, reported on and finished. Unfinished goals are aborted when the
+        /// stream ends.
         async fn serve_action(
             &self,
             request: tonic::Request<tonic::Streaming<super::ServeActionRequest>>,
@@ -1317,8 +1316,8 @@ pub mod gateway_server {
             tonic::Status,
         >;
     }
-    /// The methods of a gateway. Streams are independent of each other. The client opens one connection, which serves
-    /// all streams in both directions.
+    /// The methods of a gateway. Streams are independent of each other. The client opens one connection, which serves all
+    /// streams in both directions.
     #[derive(Debug)]
     pub struct GatewayServer<T> {
         inner: Arc<T>,
