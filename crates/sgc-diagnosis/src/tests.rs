@@ -5,16 +5,15 @@ pub(crate) mod scenarios;
 
 use sgc_node::alerts::Alert;
 use sgc_node::graph::{
-    Endpoint, Graph, Interface, Link, LostCalls, NameLine, Qos, ServiceCalls, Share, ShareRoute,
-    UnheardMember, Use,
+    Endpoint, Graph, Interface, LostCalls, NameLine, Qos, ServiceCalls, Share, ShareRoute, UnheardMember, Use,
 };
 use sgc_transport::PeerRefusal;
 use sgc_trust::CertError;
 use sgc_wire::{RefuseReason, RejectReason};
 
 use self::scenarios::{
-    NAME, action_part, end, owner, owner_faults, pattern, publisher, publisher_faults, qos, sound, user,
-    user_faults,
+    NAME, action_part, end, link, owner, owner_faults, pattern, publisher, publisher_faults, qos, sound,
+    user, user_faults,
 };
 use crate::diagnose;
 use crate::refusals::{CONTROL, DOOR, GATEWAY};
@@ -432,7 +431,7 @@ fn operator_mistakes_come_first() {
     let graph = Graph { alerts: vec![clock.clone()], ..user() };
     assert_eq!(found(&graph, Verdict::Wrong), Some(clock.to_string()));
     let mut graph = Graph { alerts: vec![clock.clone()], ..user() };
-    graph.links.push(Link { id: 2, ..Link::default() });
+    graph.links.push(link(2, "routerrouter"));
     assert_eq!(
         (found(&graph, Verdict::Unknown), found(&graph, Verdict::Wrong)),
         (Some(clock.to_string()), None)

@@ -13,8 +13,8 @@ use sgc_trust::CertError;
 use sgc_wire::RefuseReason;
 
 use super::scenarios::{
-    Case, NAME, REFUSED_WITH_REMEDY, REJECTED, action_part, end, owner, owner_faults, pattern, publisher,
-    publisher_faults, qos, sound, user, user_faults,
+    Case, NAME, REFUSED_WITH_REMEDY, REJECTED, action_part, end, link, owner, owner_faults, pattern,
+    publisher, publisher_faults, qos, sound, user, user_faults,
 };
 use crate::diagnose;
 
@@ -96,7 +96,7 @@ fn more_faults(side: &str) -> Vec<Case> {
             }),
             ("has not sent a message", |g| g.shares[0].routes[0].messages = 0),
             ("a link on the way is silent", |g| {
-                g.links.push(Link { id: 2, name: Some("r2".into()), silent: true, ..Link::default() });
+                g.links.push(Link { name: Some("r2".into()), silent: true, ..link(2, "routerrouter") });
                 g.names.get_mut(NAME).unwrap().out = vec![1, 2, 7];
             }),
             ("leaves over unlisted links", |g| g.names.get_mut(NAME).unwrap().out = vec![0, 1, 7]),
@@ -219,11 +219,6 @@ fn more_faults(side: &str) -> Vec<Case> {
                 g.endpoints[1].qos.durability = 1;
             }),
             ("subscribers of another name", |g| g.endpoints[0].topic = "/A".into()),
-            ("a wildcard does not carry what is only shared by name", |g| {
-                g.uses[0] = pattern(Interface::Topic, "arm");
-                g.offers.clear();
-                g.endpoints = vec![end("/rosout", false)];
-            }),
             ("an alias", |g| {
                 g.uses[0].topic = "/far/a".into();
                 g.uses[0].routes[0].messages = 0;
@@ -252,7 +247,7 @@ fn alerts() -> Vec<Scenario> {
     let kept_out = Alert::IdentityInUse { node: "here".into(), place: place(), ago_s: 3 };
     let clock = Alert::ClocksDiffer { peer: "cloud".into(), remote: place(), ahead_ms: 7_200_000 };
     let mut two = owner();
-    two.links.push(Link { id: 2, ..Link::default() });
+    two.links.push(link(2, "routerrouter"));
     let with = |alerts: &[&Alert], graph: Graph| Graph {
         alerts: alerts.iter().map(|alert| (*alert).clone()).collect(),
         ..graph
@@ -326,9 +321,18 @@ fn services_and_actions() -> Vec<Scenario> {
         graph.endpoints.clear();
         graph.uses[0].topic = "/a/_action/send_goal".into();
         all.push(topic(&format!("{kind} that is a part"), &graph));
-        graph.uses[0] = pattern(kind, "arm");
-        all.push(asked(&format!("{kind} that wildcards leave out"), &graph, "/n/get_parameters"));
     }
+    let mut graph = user();
+    graph.uses[0] = pattern(Interface::Service, "arm");
+    graph.offers.clear();
+    graph.endpoints =
+        vec![Endpoint { topic: "rq/n/_hiddenRequest".into(), writes: true, ..Endpoint::default() }];
+    all.push(asked("service that wildcards leave out", &graph, "/n/_hidden"));
+    let mut graph = user();
+    graph.uses[0] = pattern(Interface::Topic, "arm");
+    graph.offers.clear();
+    graph.endpoints = vec![end("/rosout", false)];
+    all.push(asked("topic that wildcards leave out", &graph, "/rosout"));
     let mut graph = action_part("send_goal");
     graph.uses.extend(action_part("get_result").uses);
     all.push(asked("parts of an action", &graph, "/fib"));
@@ -424,7 +428,7 @@ fn patterns() -> Vec<Scenario> {
 /// Counters on which an operator has to act.
 fn counters() -> Vec<Scenario> {
     let mut graph = user();
-    graph.links.push(Link { id: 3, name: Some("cloud".into()), rtt_us: 12_345, ..Link::default() });
+    graph.links.push(Link { name: Some("cloud".into()), rtt_us: 12_345, ..link(3, "cloudcloud") });
     graph.drops = [
         ("crl_flood".to_owned(), 9),
         ("crl_flood from link 1".to_owned(), 7),

@@ -59,11 +59,17 @@ pub(super) fn sound() -> Graph {
         node: "here".into(),
         version: "0.1.0".into(),
         has_ros: true,
-        links: vec![Link { id: 1, peer: "cloudcloud".into(), rtt_us: 500, ..Link::default() }],
+        links: vec![link(1, "cloudcloud")],
         routers: vec![Search { router: "quic://r".into(), state: "linked".into(), ..Search::default() }],
         names: [(NAME.to_owned(), name)].into(),
         ..Graph::default()
     }
+}
+
+/// Returns a link to a peer.
+pub(super) fn link(id: u32, peer: &str) -> Link {
+    let remote = format!("192.0.2.{id}:7447");
+    Link { id, peer: peer.into(), remote, rtt_us: 500, ..Link::default() }
 }
 
 /// Returns the graph of a sound node that shares `/a`.
@@ -190,7 +196,7 @@ pub(super) fn owner_faults() -> Vec<Case> {
             g.links.clear();
             g.routers.clear();
         }),
-        ("link 1 to cloudclo at  (0.50 ms) is silent", |g| g.links[0].silent = true),
+        ("link 1 to cloudclo at 192.0.2.1:7447 (0.50 ms) is silent", |g| g.links[0].silent = true),
         ("nobody asked for it", |g| g.shares[0].routes[0].granted.clear()),
         ("desk asked for it and was refused: not listed", |g| {
             g.shares[0].routes[0].granted.clear();
