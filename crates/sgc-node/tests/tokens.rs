@@ -14,13 +14,14 @@ use rand_core::{OsRng, TryRngCore as _};
 use sgc_node::config::{
     Config, QosOverride, Recipient, Shaping, ShareConfig, ShareMetadata, TokenConfig, TokenSource,
 };
+use sgc_node::graph::Graph;
 use sgc_node::partners::{TokenRecord, TokenRecords};
 use sgc_node::{RunOptions, create_state_dir, run_on};
 use sgc_ros::{EndpointSpec, RosNetwork, RosWriter, Sample, SampleKind, dds_topic, dds_type};
 use sgc_testkit::{FakeDomain, FakeRos};
 use sgc_transport::{ListenAddr, Scheme};
 use sgc_trust::{EnrollRequest, Fleet, Identity, ShareToken, Suite, TopicSecret};
-use sgc_wire::{Class, Metadata, Qos, UnixMillis};
+use sgc_wire::{Class, Metadata, Qos, RefuseReason, UnixMillis};
 use tokio::sync::oneshot;
 
 const PATIENCE: Duration = Duration::from_secs(40);
@@ -94,10 +95,10 @@ fn spec() -> EndpointSpec {
     }
 }
 
-fn reload(socket: &Path) -> String {
+fn ask(socket: &Path, request: &str) -> String {
     use std::io::{Read, Write};
     let mut stream = UnixStream::connect(socket).unwrap();
-    stream.write_all(b"sgc/1 reload\n").unwrap();
+    stream.write_all(format!("sgc/1 {request}\n").as_bytes()).unwrap();
     let mut text = String::new();
     stream.read_to_string(&mut text).unwrap();
     text
@@ -182,7 +183,7 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
         expires: token.expires.0,
     };
     let id = TokenRecords::change(&state, |records| records.add(record, unix_now())).unwrap();
-    let said = reload(&at("robot.sock"));
+    let said = ask(&at("robot.sock"), "reload");
     assert!(said.contains("who may subscribe changed") && said.contains("another CA may link"), "{said}");
     let cart_net = FakeDomain::default();
     let nowhere = "quic://127.0.0.1:9".parse().unwrap();
@@ -207,11 +208,16 @@ fn a_partner_gets_the_topic_of_its_token_until_it_is_withdrawn() {
     });
 
     TokenRecords::change(&state, |records| records.withdraw(id)).unwrap();
-    assert!(reload(&at("robot.sock")).contains("who may subscribe changed"));
+    assert!(ask(&at("robot.sock"), "reload").contains("who may subscribe changed"));
     wait("the end of it", || audit_of(&state).contains("\"cut\""));
     let log = audit_of(&state);
     assert!(log.contains("\"granted\"") && log.contains(&cart.node_id().to_string()), "{log}");
     assert!(!log.contains("sgc-token") && !log.contains(&STANDARD.encode(token.secret.expose())), "{log}");
+    // Whoever asks the owner why learns of the cut.
+    let mut answer: serde_json::Value = serde_json::from_str(&ask(&at("robot.sock"), "graph")).unwrap();
+    let graph: Graph = serde_json::from_value(answer["ok"].take()).unwrap();
+    let refused = graph.shares[0].routes[0].refused.get(&cart.node_id().short());
+    assert_eq!(refused, Some(&RefuseReason::NotPermitted.to_string()));
     // The partner's writer ends once its node learns that the owner no longer shares, and no message arrives.
     while samples.try_recv().is_ok() {}
     wait("a new epoch", || audit_of(&state).contains("\"epoch\""));
