@@ -31,8 +31,13 @@ const TOPIC_TO_CACHE: usize = 3;
 const ENTITY_GUID: usize = 4;
 const ENTITY_LOCK: usize = 48;
 
-/// The words of `struct ddsi_writer` among which [`Progress`] is. The exact place depends on the platform's mutexes.
-const PROGRESS_WORDS: Range<usize> = 24..56;
+/// The words of `struct ddsi_writer` among which `status_cb_entity`, the pointer to the `struct dds_writer`, is. The
+/// exact place depends on the platform's mutexes.
+const OWNER_WORDS: Range<usize> = 16..48;
+/// Words from that pointer over the condition `throttle_cond` (48 bytes on Linux) to [`Progress`], and to `whc`. Small
+/// numbers are everywhere in a writer, so [`Progress`] is not looked for by its content.
+const OWNER_TO_PROGRESS: usize = 7;
+const OWNER_TO_CACHE: usize = 25;
 /// Most samples that are written and not sent yet, of those that are written together.
 const UNSENT_MAX: u64 = 1 << 16;
 
@@ -55,7 +60,7 @@ struct Progress {
 }
 
 impl Progress {
-    /// Returns `true` for the state of a writer that has written so many samples.
+    /// Returns `true` for a possible state of a writer that has written so many samples.
     fn is_of(&self, written: u64, now: i64) -> bool {
         self.written == written
             && self.sent <= written
@@ -217,11 +222,15 @@ impl WriterInside {
         unsafe {
             ((*(*self.cache).ops).state)(self.cache, &mut state);
             let now = monotonic_ns();
-            let at = |word: usize| self.ddsi_writer.cast::<u64>().add(word).cast::<Progress>();
-            let mut places = PROGRESS_WORDS.map(at);
-            let found = places.find(|progress| state.max > 0 && (**progress).is_of(state.max, now));
-            if let Some(progress) = found {
-                change(&mut *progress, now);
+            let in_writer = self.ddsi_writer.cast::<usize>();
+            let is_owner = |at: &usize| {
+                in_writer.add(*at).read_volatile() == self.dds_writer.0 as usize
+                    && in_writer.add(at + OWNER_TO_CACHE).read_volatile() == self.cache as usize
+            };
+            let Some(at) = OWNER_WORDS.into_iter().find(is_owner) else { return };
+            let progress = &mut *in_writer.add(at + OWNER_TO_PROGRESS).cast::<Progress>();
+            if state.max > 0 && progress.is_of(state.max, now) {
+                change(progress, now);
             }
         }
     }

@@ -1347,6 +1347,32 @@ fn late_joiners_get_the_last_samples_of_each_key() {
     assert_eq!(sgc_dds::unidentified_messages(), 0);
 }
 
+/// Asking for acknowledgements changes times inside of Cyclone's writer. Small numbers beside them, such as those of a
+/// condition that was waited for twice, must not pass for them.
+#[test]
+fn writer_that_waits_for_acknowledgements_goes_on_counting() {
+    for run in 0..8 {
+        let (ros, sgc) = (open(153, None), open(153, None));
+        let spec = with(spec(&format!("counted{run}")), |qos| {
+            qos.history = History::KeepLast(1);
+            qos.durability = Durability::TransientLocal;
+        });
+        let deep = with(spec.clone(), |qos| qos.history = History::KeepAll);
+        // Cyclone notes in the writer which samples its own readers take.
+        let (_far, samples) = read(&ros, &deep);
+        let (_own, own) = read(&sgc, &deep);
+        let writer = writer(&sgc, &spec, 2);
+        for n in 0..20 {
+            let payload = string_cdr(&n.to_string());
+            write(&writer, &payload);
+            assert!(writer.wait_acknowledged(Duration::from_secs(10)));
+            assert_eq!(next(&samples).payload, padded(&payload));
+            assert_eq!(next(&own).payload, padded(&payload));
+        }
+        quiet(&samples);
+    }
+}
+
 #[test]
 fn a_reliable_writer_keeps_what_is_not_acknowledged_as_far_as_memory_goes() {
     let (ros, sgc) = (open(152, None), open(152, Some("arm-1")));
