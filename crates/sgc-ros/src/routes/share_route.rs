@@ -12,7 +12,7 @@ use super::command::Command;
 use super::local_graph::LocalGraph;
 use super::own_sources::{OwnSources, WRITERLESS_HOLD};
 use super::problem::Problem;
-use super::readers::{asks_key_hash, same_reader};
+use super::readers::{asks_key_hash, replace_reader};
 use super::rules::{ShareRule, ShareRuleId};
 use super::service_ends::service_spec;
 use crate::names::{dds_topic, ros_type};
@@ -338,14 +338,7 @@ impl ShareRoute {
             type_hash: self.type_hash().map(str::to_owned),
             qos: reader_for(&read, self.writers.len()),
         });
-        if same_reader(self.reader.as_ref(), spec.as_ref()) {
-            return Vec::new();
-        }
-        let name = self.name;
-        let closes = self.reader.is_some().then_some(Command::CloseReader { name });
-        let opens = spec.clone().map(|spec| Command::OpenReader { name, spec });
-        self.reader = spec;
-        closes.into_iter().chain(opens).collect()
+        replace_reader(self.name, &mut self.reader, spec)
     }
 
     /// Opens the local client of a shared service for its callers, or closes it.

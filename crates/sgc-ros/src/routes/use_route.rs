@@ -7,7 +7,7 @@ use sgc_endpoint::RefusedBy;
 use sgc_wire::{CatalogueEntry, ENTRY_SOURCES_MAX, Name, Qos, RosNode, SourceId};
 
 use super::command::Command;
-use super::readers::{asks_key_hash, same_reader};
+use super::readers::{asks_key_hash, replace_reader};
 use super::rules::{Direction, UseRule, UseRuleId};
 use super::service_ends::service_spec;
 use super::use_writers::UseWriters;
@@ -227,14 +227,7 @@ impl UseRoute {
             type_hash: type_hash.clone(),
             qos: reader_for(&offer, self.publishers.len()),
         });
-        if same_reader(self.reader.as_ref(), spec.as_ref()) {
-            return Vec::new();
-        }
-        let name = self.name;
-        let closes = self.reader.is_some().then_some(Command::CloseReader { name });
-        let opens = spec.clone().map(|spec| Command::OpenReader { name, spec });
-        self.reader = spec;
-        closes.into_iter().chain(opens).collect()
+        replace_reader(self.name, &mut self.reader, spec)
     }
 
     /// Updates the local server of a called service.
