@@ -477,7 +477,7 @@ impl UseFinding {
             }
             Self::OwnerRevoked { owner } => format!(
                 "nothing comes from {owner} any more; to have it back, the keeper of its fleet has to enroll it again (`sgc \
-                 fleet enroll {owner}`)"
+                 fleet enroll {owner} --again`)"
             ),
             Self::NotShared { owner, topic, node, .. } => format!(
                 "on {owner}: is it in a [[share]] whose `to` has \"{node}\" or a group of it, and is it published there? `sgc why \
