@@ -20,6 +20,7 @@ def main() -> int:
     parser.add_argument("--action", help="shows its clients")
     parser.add_argument("--client", help="waits until this node, with its namespace, is among them")
     parser.add_argument("--node", help="waits until all publishers are of this node")
+    parser.add_argument("--subscriber-nodes", help="waits for one subscriber of each of these nodes (A,B), and no other")
     parser.add_argument("--timeout", type=float, default=60)
     options = parser.parse_args()
     deadline = time.monotonic() + options.timeout
@@ -68,6 +69,8 @@ def main() -> int:
         subscribers = endpoints(node.get_subscriptions_info_by_topic)
         is_known = all(e["node"] and not e["node"].startswith("_") for e in publishers + subscribers)
         is_known = is_known and all(e["node"] == options.node or not options.node for e in publishers)
+        subscriber_nodes = sorted(options.subscriber_nodes.split(",")) if options.subscriber_nodes else None
+        is_known = is_known and subscriber_nodes in (None, sorted(e["node"] for e in subscribers))
         have, wanted = (len(publishers), len(subscribers)), (options.publishers, options.subscribers)
         enough = have == wanted if options.exactly else have[0] >= wanted[0] and have[1] >= wanted[1]
         enough = enough and (not options.service or is_there(service_clients)) and (not options.action or is_there(in_action))
