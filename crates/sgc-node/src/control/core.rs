@@ -195,7 +195,7 @@ impl<N: RosNetwork> Core<N> {
             network: parts.network,
             data: data.clone(),
             inbox: Inbox::default(),
-            links: LinkTable::new(parts.keep_alive_policy),
+            links: LinkTable::new(parts.keep_alive_policy, data.clone()),
             forwards: ForwardTable::default(),
             shares,
             ends: NetworkEnds::default(),

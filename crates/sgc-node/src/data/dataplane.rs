@@ -157,9 +157,23 @@ impl DataPlane {
             }
             Out::Local(sink) => sink.deliver(packet, &self.drops).await,
         };
-        if let Err(Dropped { reason, messages }) = written {
-            forward.stats.dropped.fetch_add(messages, Relaxed);
-            self.count(ingress, &name, reason);
+        if let Err(dropped) = written {
+            forward.stats.dropped.fetch_add(dropped.messages, Relaxed);
+            self.count_from(ingress, &name, dropped);
+        }
+    }
+
+    /// Counts drops under `name` from `ingress`.
+    fn count_from(&self, ingress: LinkId, name: &Name, dropped: Dropped) {
+        let Dropped { reason, messages } = dropped;
+        debug!(%ingress, name = %name.short(), ?reason, messages, "dropped");
+        if let Some(forward) = self.shard(name).load().get(name) {
+            forward.stats.count_drops(reason, messages);
+        }
+        // A packet from the wrong link may have been under way while the path changed, so it is not suspicious.
+        let suspicious = matches!(reason, DataDrop::HopLimit | DataDrop::Malformed);
+        if self.drops.add_from(reason, ingress, messages) && suspicious {
+            warn!(%ingress, reason = reason.key(), "dropped an invalid packet of a peer; counted from here on");
         }
     }
 
@@ -171,15 +185,7 @@ impl DataPlane {
 
 impl CountDrops for DataPlane {
     fn count(&self, ingress: LinkId, name: &Name, reason: DataDrop) {
-        debug!(%ingress, name = %name.short(), ?reason, "dropped");
-        if let Some(forward) = self.shard(name).load().get(name) {
-            forward.stats.count_drops(reason, 1);
-        }
-        // A packet from the wrong link may have been under way while the path changed, so it is not suspicious.
-        let suspicious = matches!(reason, DataDrop::HopLimit | DataDrop::Malformed);
-        if self.drops.count_from(reason, ingress) && suspicious {
-            warn!(%ingress, reason = reason.key(), "dropped an invalid packet of a peer; counted from here on");
-        }
+        self.count_from(ingress, name, Dropped::one(reason));
     }
 
     fn count_here(&self, name: &Name, reason: DataDrop, several: u64) {
@@ -189,6 +195,13 @@ impl CountDrops for DataPlane {
         if self.drops.add(reason, several) {
             debug!(name = %name.short(), ?reason, several, "dropped; counted from here on");
         }
+    }
+
+    fn count_left_out(&self, name: &Name, dropped: Dropped) {
+        if let Some(forward) = self.shard(name).load().get(name) {
+            forward.stats.dropped.fetch_add(dropped.messages, Relaxed);
+        }
+        self.count_here(name, dropped.reason, dropped.messages);
     }
 
     fn drops(&self) -> &Drops {

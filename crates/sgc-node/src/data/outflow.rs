@@ -15,7 +15,7 @@ use tracing::debug;
 
 use crate::data::labels::NameLabel;
 use crate::data::queue::{PushError, Queue};
-use crate::data::stats::{DataDrop, Dropped};
+use crate::data::stats::{CountDrops, DataDrop, Dropped};
 use crate::link::lanes::Lanes;
 
 /// Most packets that wait for one link under one name.
@@ -28,21 +28,6 @@ pub(crate) const OUTFLOW_PATIENCE: Duration = Duration::from_secs(5);
 pub(crate) const OUTFLOW_BYTES_MAX: usize = 16 << 20;
 /// Longest wait of a best-effort packet by default. Later it is useless.
 pub(crate) const OUTFLOW_AGE_MAX: Duration = Duration::from_secs(1);
-
-/// Limits of waiting best-effort packets.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct FlowLimits {
-    /// Longest wait, judged at the beginning of a message.
-    pub max_age: Duration,
-    /// Whether only the newest message of each source waits, also among messages of one packet.
-    pub newest_only: bool,
-}
-
-impl Default for FlowLimits {
-    fn default() -> Self {
-        Self { max_age: OUTFLOW_AGE_MAX, newest_only: false }
-    }
-}
 
 /// Bytes of waiting reliable packets that are written together. A fast path has more under way; a thin link takes them
 /// in parts.
@@ -64,13 +49,15 @@ pub(crate) struct OutFlow {
 }
 
 impl OutFlow {
-    /// Starts the sending task. It ends when the queue is closed and empty, or the link ends.
+    /// Starts the sending task. It ends when the queue is closed and empty, or the link ends. A best-effort message whose
+    /// beginning has waited for longer than `max_age` is left out.
     pub(crate) fn spawn(
         link: AnyLink,
         name: Name,
         label: Option<NameLabel>,
         lanes: Arc<Lanes>,
-        limits: FlowLimits,
+        max_age: Duration,
+        drops: Arc<dyn CountDrops>,
     ) -> Arc<Self> {
         let flow = Arc::new(Self {
             queue: Queue::new(OUTFLOW_PACKETS_MAX),
@@ -88,8 +75,10 @@ impl OutFlow {
                 label,
                 reliable: None,
                 messages: VecDeque::new(),
+                left_out: None,
+                drops,
             };
-            if let Err(error) = task.empty(&mut sender, limits).await {
+            if let Err(error) = task.empty(&mut sender, max_age).await {
                 debug!(name = %name.short(), %error, "stopped sending over this link");
             }
             task.close();
@@ -162,7 +151,9 @@ impl OutFlow {
     }
 
     /// Sends packets until the queue is closed and empty, or the link ends.
-    async fn empty(&self, sender: &mut Sender, limits: FlowLimits) -> Result<(), LinkError> {
+    async fn empty(&self, sender: &mut Sender, max_age: Duration) -> Result<(), LinkError> {
+        // Where no age is configured, an old message is one that the link had no room for.
+        let too_old = if max_age < OUTFLOW_AGE_MAX { DataDrop::TooOld } else { DataDrop::Stale };
         // The rest of the current message, and packets that came between.
         let mut taken = VecDeque::new();
         loop {
@@ -177,10 +168,13 @@ impl OutFlow {
             let Some((packet, since)) = next else { return Ok(()) };
             // Limits apply at the beginning: a large message that is under way continues.
             let begins = !packet.header.reliable && packet.header.index == 0;
-            let stale = begins && since.elapsed() > limits.max_age;
-            let newer = limits.newest_only && self.has_newer(&packet, &mut taken);
-            if self.is_superseded(&packet) || newer || stale {
-                sender.abandon(&packet);
+            let is_old = begins && since.elapsed() > max_age;
+            if self.is_superseded(&packet) {
+                sender.leave_out(&packet, DataDrop::Stale);
+                continue;
+            }
+            if is_old {
+                sender.leave_out(&packet, too_old);
                 continue;
             }
             if begins && !packet.header.is_last() {
@@ -206,21 +200,6 @@ impl OutFlow {
             is_whole = ends(&next.0);
             taken.push_back(next);
         }
-    }
-
-    /// Returns `true` if a newer message of the same source waits behind this best-effort message of one packet. It
-    /// takes waiting packets for that.
-    fn has_newer(&self, packet: &Packet, taken: &mut VecDeque<Waiting>) -> bool {
-        let is_one = |packet: &Packet| !packet.header.reliable && packet.header.fragments() == 1;
-        if !is_one(packet) {
-            return false;
-        }
-        while taken.len() < OUTFLOW_PACKETS_MAX
-            && let Some(next) = self.queue.try_pop()
-        {
-            taken.push_back(next);
-        }
-        taken.iter().any(|(next, _)| is_one(next) && next.header.source == packet.header.source)
     }
 
     /// Returns `true` if the packet belongs to a best-effort message that a complete newer one supersedes.
@@ -263,6 +242,9 @@ struct Sender {
     reliable: Option<FlowTx>,
     /// Best-effort messages of several packets that are being sent, the oldest first.
     messages: VecDeque<Message>,
+    /// The last message that was left out, and the reason for its later packets.
+    left_out: Option<((SourceId, u64), DataDrop)>,
+    drops: Arc<dyn CountDrops>,
 }
 
 impl Sender {
@@ -364,7 +346,12 @@ impl Sender {
         }
         let at = self.messages.iter().position(|m| (m.id, m.next) == (id, header.index));
         // Without a flow, the beginning was dropped, and the rest is useless.
-        let Some(message) = at.and_then(|at| self.messages.get_mut(at)) else { return Ok(()) };
+        let Some(message) = at.and_then(|at| self.messages.get_mut(at)) else {
+            let reason =
+                self.left_out.filter(|(left, _)| *left == id).map_or(DataDrop::Stale, |(_, reason)| reason);
+            self.drops.count_left_out(&self.name, Dropped::one(reason));
+            return Ok(());
+        };
         match message.flow.send_as(&packet, label).await {
             Ok(()) if !header.is_last() => message.next += 1,
             sent => {
@@ -403,14 +390,10 @@ impl Sender {
         }
     }
 
-    /// Drops a message. Its later packets find no flow and are dropped as well.
-    fn abandon(&mut self, packet: &Packet) {
-        let id = (packet.header.source, packet.header.seq);
-        if let Some(at) = self.messages.iter().position(|m| m.id == id)
-            && let Some(message) = self.messages.remove(at)
-        {
-            message.flow.reset(FlowEnd::Stale);
-        }
+    /// Drops and counts the first packet of a message. Its later packets find no flow and are dropped as well.
+    fn leave_out(&mut self, packet: &Packet, reason: DataDrop) {
+        self.left_out = Some(((packet.header.source, packet.header.seq), reason));
+        self.drops.count_left_out(&self.name, Dropped::one(reason));
     }
 
     async fn finish(self) {
@@ -477,29 +460,5 @@ mod tests {
             }
         }
         assert_eq!(begun, [999]);
-    }
-
-    #[tokio::test]
-    async fn newest_single_packet_message_of_each_source_waits_if_configured() {
-        let one = |source: u8, seq| {
-            let mut packet = packet(seq, 0);
-            (packet.header.source, packet.header.total) = (SourceId([source; 16]), 1000);
-            packet
-        };
-        let flow = OutFlow::idle();
-        for seq in 1..10 {
-            let _ = flow.push(one(2, seq)).await;
-            let _ = flow.push(one(3, seq)).await;
-        }
-        for index in 0..3 {
-            let _ = flow.push(packet(10, index)).await;
-        }
-        let (mut taken, mut sent) = (VecDeque::new(), vec![]);
-        while let Some((next, _)) = taken.pop_front().or_else(|| flow.queue.try_pop()) {
-            if !flow.has_newer(&next, &mut taken) {
-                sent.push((next.header.source.0[0], next.header.seq));
-            }
-        }
-        assert_eq!(sent, [(2, 9), (3, 9), (2, 10), (2, 10), (2, 10)]);
     }
 }

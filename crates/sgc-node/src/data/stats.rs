@@ -232,10 +232,15 @@ impl Drops {
     /// Counts a drop of a culprit. Returns `true` if it is the culprit's first of its kind. For a link that is not up,
     /// only the kind is counted.
     pub(crate) fn count_from(&self, kind: impl DropKind, culprit: impl Into<Culprit>) -> bool {
+        self.add_from(kind, culprit, 1)
+    }
+
+    /// Counts several drops of a culprit, as [`Self::count_from`] does.
+    pub(crate) fn add_from(&self, kind: impl DropKind, culprit: impl Into<Culprit>, several: u64) -> bool {
         let (kind, culprit) = (kind.key(), culprit.into());
         let mut counts = self.lock();
         let counts = &mut *counts;
-        *counts.kinds.entry(kind).or_default() += 1;
+        *counts.kinds.entry(kind).or_default() += several;
         if matches!(culprit, Culprit::Link(link) if link != LinkId::LOCAL && !counts.links.contains(&link)) {
             return false;
         }
@@ -247,8 +252,8 @@ impl Drops {
             counts.rows.remove(&smallest);
         }
         let n = counts.rows.entry(key).or_default();
-        *n += 1;
-        *n == 1
+        *n += several;
+        *n == several
     }
 
     /// Gives the drops of a link rows of their own from here on.
@@ -283,6 +288,9 @@ pub(crate) trait CountDrops: Send + Sync + 'static {
 
     /// Counts several drops under `name` at this node itself.
     fn count_here(&self, name: &Name, reason: DataDrop, several: u64);
+
+    /// Counts packets under `name` that this node had accepted and queued, and then left out.
+    fn count_left_out(&self, name: &Name, dropped: Dropped);
 
     /// Returns drops by reason and link, and by reason for this node's sinks.
     fn drops(&self) -> &Drops;

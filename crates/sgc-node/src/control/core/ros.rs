@@ -17,7 +17,7 @@ use crate::control::parts::network_ends::OpenEnd;
 use crate::control::parts::publishers::Offer;
 use crate::control::parts::sinks::HistoryRequest;
 use crate::data::dataplane::{Forward, Out};
-use crate::data::outflow::{FlowLimits, OUTFLOW_AGE_MAX};
+use crate::data::outflow::OUTFLOW_AGE_MAX;
 use crate::data::sending::assertions;
 use crate::data::sending::intake::Publisher;
 use crate::data::sending::manual_lease::ManualLease;
@@ -378,13 +378,12 @@ impl<N: RosNetwork> Core<N> {
         let wanted = entry.links();
         let max_age = self.shares.get(&name).and_then(|share| share.shaping().max_age);
         let max_age = max_age.map_or(OUTFLOW_AGE_MAX, |max_age| max_age.min(OUTFLOW_AGE_MAX));
-        let limits = FlowLimits { max_age, ..FlowLimits::default() };
         let mut outs = Vec::new();
         for id in &wanted {
             let out = if *id == LinkId::LOCAL {
                 self.sinks.get(&name).cloned().map(Out::Local)
             } else {
-                self.links.out(*id, name, limits)
+                self.links.out(*id, name, max_age)
             };
             outs.extend(out.map(|out| (*id, out)));
         }

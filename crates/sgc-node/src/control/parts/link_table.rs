@@ -19,7 +19,8 @@ use tracing::info;
 
 use crate::control::peers::peer_policies::PeerPolicies;
 use crate::data::dataplane::Out;
-use crate::data::outflow::{FlowLimits, OutFlow};
+use crate::data::outflow::OutFlow;
+use crate::data::stats::CountDrops;
 use crate::link::control_tx::ControlTx;
 
 /// Interval of looks at the links.
@@ -44,6 +45,8 @@ pub(crate) struct LinkTable {
     /// Time of the next look at the links; `None` while there are none.
     look_due: Option<Instant>,
     policies: PeerPolicies,
+    /// Counts the packets that queues leave out.
+    drops: Arc<dyn CountDrops>,
 }
 
 /// Measurement of a link.
@@ -63,8 +66,8 @@ pub(crate) struct EndedLink {
 
 impl LinkTable {
     /// Creates the table without links. New links use the keep-alive policy.
-    pub(crate) fn new(policy: KeepAlivePolicy) -> Self {
-        Self { links: BTreeMap::new(), next: 1, look_due: None, policies: PeerPolicies::new(policy) }
+    pub(crate) fn new(policy: KeepAlivePolicy, drops: Arc<dyn CountDrops>) -> Self {
+        Self { links: BTreeMap::new(), next: 1, look_due: None, policies: PeerPolicies::new(policy), drops }
     }
 
     /// Adds a link, and looks at it from here on.
@@ -141,12 +144,14 @@ impl LinkTable {
         self.look_due
     }
 
-    /// Returns the destination of packets of a name on a link. Its queue is created if there is none.
-    pub(crate) fn out(&mut self, id: LinkId, name: Name, limits: FlowLimits) -> Option<Out> {
+    /// Returns the destination of packets of a name on a link. Its queue is created if there is none, and leaves out
+    /// best-effort messages older than `max_age`.
+    pub(crate) fn out(&mut self, id: LinkId, name: Name, max_age: Duration) -> Option<Out> {
         let LinkEntry { link, control, flows, .. } = self.links.get_mut(&id)?;
+        let drops = &self.drops;
         let begin = || {
             let lanes = control.lanes().clone();
-            OutFlow::spawn(link.clone(), name, control.label(name), lanes, limits)
+            OutFlow::spawn(link.clone(), name, control.label(name), lanes, max_age, drops.clone())
         };
         let flow = flows.entry(name).or_insert_with(begin).clone();
         Some(Out::Link(flow, control.activity().clone()))
@@ -254,15 +259,19 @@ impl LinkEntry {
 
 #[cfg(test)]
 mod tests {
+    use bytes::Bytes;
     use rand_core::{OsRng, TryRngCore as _};
     use sgc_transport::{CredentialStore, Dialer, LinkOptions, LinkUrl, Listener};
     use sgc_trust::{EnrollRequest, Fleet};
+    use sgc_wire::{Class, HOP_LIMIT, Packet, PacketHeader, SourceId};
     use tokio::sync::mpsc;
 
     use super::*;
     use crate::clock;
     use crate::control::peers::control_queue::{CONTROL_FRAMES_MAX, ControlQueue, Outgoing};
+    use crate::data::dataplane::DataPlane;
     use crate::data::labels::LabelBook;
+    use crate::data::outflow::OUTFLOW_AGE_MAX;
     use crate::link::lanes::{LaneAdmission, Lanes};
 
     const NAME: Name = Name([1; 32]);
@@ -278,6 +287,7 @@ mod tests {
         /// The far ends of the links.
         far: Vec<AnyLink>,
         table: LinkTable,
+        data: Arc<DataPlane>,
     }
 
     impl Bench {
@@ -295,8 +305,9 @@ mod tests {
             let listener = Listener::bind(&addr, cloud, LinkOptions::default(), Arc::default()).unwrap();
             let url = listener.local().to_string().parse().unwrap();
             let dialer = Dialer::new(arm, LinkOptions::default(), Arc::default());
-            let table = LinkTable::new(KeepAlivePolicy::default());
-            Self { dialer, listener, url, dialled, far: Vec::new(), table }
+            let data = Arc::<DataPlane>::default();
+            let table = LinkTable::new(KeepAlivePolicy::default(), data.clone());
+            Self { dialer, listener, url, dialled, far: Vec::new(), table, data }
         }
 
         /// Adds a link. Returns its number and its control frames.
@@ -390,7 +401,7 @@ mod tests {
         let (mut bench, now) = (Bench::new(), Instant::now());
         let (first, _frames) = bench.add(now).await;
         let (second, _frames) = bench.add(now).await;
-        let mut flow = |id, name| match bench.table.out(id, name, FlowLimits::default()) {
+        let mut flow = |id, name| match bench.table.out(id, name, OUTFLOW_AGE_MAX) {
             Some(Out::Link(flow, _)) => flow,
             _ => panic!("the link is up"),
         };
@@ -405,7 +416,44 @@ mod tests {
         for flow in [kept, other] {
             tokio::time::timeout(Duration::from_secs(20), flow.ended()).await.expect("its queue is closed");
         }
-        assert!(bench.table.out(LinkId(9), NAME, FlowLimits::default()).is_none(), "it has ended");
+        assert!(bench.table.out(LinkId(9), NAME, OUTFLOW_AGE_MAX).is_none(), "it has ended");
+    }
+
+    #[tokio::test]
+    async fn packets_that_a_queue_leaves_out_are_counted_by_their_reason() {
+        let (mut bench, now) = (Bench::new(), Instant::now());
+        let (link, _frames) = bench.add(now).await;
+        let packet = |name, seq, index| {
+            let header = PacketHeader {
+                reliable: false,
+                class: Class::Bulk,
+                hops: HOP_LIMIT,
+                suite: 1,
+                epoch: 1,
+                name,
+                source: SourceId([2; 16]),
+                seq,
+                total: 2000,
+                index,
+                grid: 1000,
+                to: None,
+            };
+            Packet::new(header, Bytes::from(vec![0; 1000]).into()).unwrap()
+        };
+        // Both queues are full before their tasks begin. One allows no age, the other has a newer message.
+        for (name, max_age) in [(NAME, Duration::ZERO), (OTHER, OUTFLOW_AGE_MAX)] {
+            let Some(Out::Link(flow, _)) = bench.table.out(link, name, max_age) else {
+                panic!("the link is up")
+            };
+            for (seq, index) in [(1, 0), (1, 1), (2, 0), (2, 1)] {
+                flow.push(packet(name, seq, index)).await.expect("there is room");
+            }
+            flow.close();
+            tokio::time::timeout(Duration::from_secs(20), flow.ended()).await.expect("its queue is closed");
+        }
+        // Of the first queue, the first message gives way to the second, which is too old.
+        let counted = bench.data.drops().snapshot();
+        assert_eq!(counted, BTreeMap::from([("stale".to_owned(), 4), ("too_old".to_owned(), 2)]));
     }
 
     #[tokio::test]
