@@ -6,6 +6,8 @@ With --write it makes that file anew; the packets that Rust signs with RSA are t
     cargo test -p sgc-trust --test vectors -- --ignored --nocapture | scripts/trust-vectors.py --take
 It also checks grants.json beside it, which --write-grants makes: grants sealed with HPKE (RFC 9180, base mode), put
 together here from HKDF, X25519 and AES-GCM. Of X-Wing the shared secret is the draft's own, from xwing.txt.
+And macs.json, which --write-macs makes: packets of the pairwise suites with a MAC for each receiver, and the grant that
+brings the key.
 And revocation.json, which --write-revocation makes: a CA, a node's certificate and a fleet's revocation list, byte for
 byte as Rust makes it.
 Rules: docs/spec/trust.md, docs/spec/wire.md.
@@ -25,6 +27,7 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM, ChaCha20Poly1305
 
 GRANTS = pathlib.Path(__file__).parent.parent / "crates/sgc-trust/tests/vectors/grants.json"
 REVOCATION = GRANTS.with_name("revocation.json")
+MACS = GRANTS.with_name("macs.json")
 XWING = GRANTS.with_name("xwing.txt")
 FILE = pathlib.Path(__file__).parent.parent / "crates/sgc-trust/tests/vectors/sealing.json"
 SUITES = {
@@ -36,7 +39,10 @@ SUITES = {
     6: ("paper-3072", AESGCM, "rsa-3072"),
     7: ("paper-chacha", ChaCha20Poly1305, "rsa-2048"),
     8: ("paper-3072-chacha", ChaCha20Poly1305, "rsa-3072"),
+    9: ("pairwise", AESGCM, "ed25519"),
+    10: ("pairwise-chacha", ChaCha20Poly1305, "ed25519"),
 }
+PAIRWISE = (9, 10)
 TOPIC_KEY, EPOCH = bytes(range(32)), 7
 NAME, SOURCE, SINK = b"\xaa" * 32, b"\xbb" * 16, b"\xcc" * 16
 GRID, TIMESTAMP = 16, 1_795_391_999_000_000_000
@@ -45,10 +51,10 @@ PACKETS = [(1, 5, 0, False), (2, 40, 0, False), (2, 40, 1, False), (2, 40, 2, Fa
 SIGNATURE_BYTES = {"ed25519": 64, "rsa-2048": 256, "rsa-3072": 384}
 
 
-def hkdf(suite, sink=b""):
+def hkdf(suite, sink=b"", salt=b"sgc source v1", key=TOPIC_KEY):
     """RFC 5869, one block."""
     info = struct.pack(">BI", suite, EPOCH) + NAME + SOURCE + sink
-    prk = hmac.digest(b"sgc source v1", TOPIC_KEY, "sha256")
+    prk = hmac.digest(salt, key, "sha256")
     return hmac.digest(prk, info + b"\x01", "sha256")
 
 
@@ -80,9 +86,18 @@ def tree(leaves):
     return root, [p + [right] for p in left_paths] + [p + [left] for p in right_paths]
 
 
+def leaf_hash(suite, packet, text):
+    return hashlib.sha256(b"\x00" + header(suite, *packet) + text).digest()
+
+
+def form(suite):
+    """The byte in front of a signature's trailer, where a trailer may also have MACs."""
+    return b"\x00" if suite in PAIRWISE else b""
+
+
 def batch(suite):
     texts = [sealed(suite, *p) for p in PACKETS]
-    leaves = [hashlib.sha256(b"\x00" + header(suite, *p) + t).digest() for p, t in zip(PACKETS, texts)]
+    leaves = [leaf_hash(suite, p, t) for p, t in zip(PACKETS, texts)]
     root, paths = tree(leaves)
     return texts, paths, b"sgc batch v1\x00" + struct.pack(">H", len(leaves)) + root
 
@@ -118,7 +133,7 @@ def payloads(suite, key):
         return texts
     signature = sign(key, message)
     place = [struct.pack(">HH", i, len(texts)) for i in range(len(texts))]
-    return [t + b"".join(p) + n + signature for t, p, n in zip(texts, paths, place)]
+    return [t + form(suite) + b"".join(p) + n + signature for t, p, n in zip(texts, paths, place)]
 
 
 def write():
@@ -161,7 +176,7 @@ def check_signed(suite, key, given):
     texts, paths, message = batch(suite)
     assert len(given) == len(texts)
     for i, (text, path, payload) in enumerate(zip(texts, paths, given)):
-        rest = text + b"".join(path) + struct.pack(">HH", i, len(texts))
+        rest = text + form(suite) + b"".join(path) + struct.pack(">HH", i, len(texts))
         assert payload.startswith(rest), f"suite {suite}, packet {i}"
         verify(key, payload[len(rest):], message)
 
@@ -195,6 +210,53 @@ class Hpke:
         key = self.expand(self.id, secret, b"key", context, 32)
         nonce = self.expand(self.id, secret, b"base_nonce", context, 12)
         return AESGCM(key).encrypt(nonce, text, aad)
+
+
+def receiver_key(secret, node):
+    """RFC 5869: the id of the key in packets, 4 bytes, and the key, 32 bytes."""
+    prk, info = hmac.digest(b"sgc receiver v1", secret, "sha256"), NAME + node
+    first = hmac.digest(prk, info + b"\x01", "sha256")
+    okm = first + hmac.digest(prk, first + info + b"\x02", "sha256")
+    return okm[:4], okm[4:36]
+
+
+def macs():
+    secret, nodes = bytes(range(64, 96)), [b"\x51" * 32, b"\x52" * 32]
+    keys = [receiver_key(secret, node) for node in nodes]
+
+    def packet(suite, packet):
+        text = sealed(suite, *packet)
+        seq, _, index, addressed = packet
+        nonce = struct.pack(">QI", seq, index)
+
+        def mac(key):
+            aead = SUITES[suite][1](hkdf(suite, SINK if addressed else b"", b"sgc mac v1", key + TOPIC_KEY))
+            return aead.encrypt(nonce, header(suite, *packet), text)[-16:]
+
+        entries = [key_id + mac(key) for key_id, key in keys]
+        return text + b"\x01" + struct.pack(">B", len(keys)) + b"".join(entries)
+
+    key_id, key = keys[0]
+    content = b"\x00" + struct.pack(">IB", EPOCH, 9) + TOPIC_KEY + b"\x01" + key_id + key + struct.pack(">I", 0) + b"\x00"
+    return {
+        "note": "Keys of tests, which protect nothing.",
+        "secret": secret.hex(),
+        "nodes": [node.hex() for node in nodes],
+        "keys": [(key_id + key).hex() for key_id, key in keys],
+        "suites": [
+            {
+                "suite": SUITES[suite][0],
+                "headers": [header(suite, *p).hex() for p in PACKETS],
+                "payloads": [packet(suite, p).hex() for p in PACKETS],
+            }
+            for suite in PAIRWISE
+        ],
+        "content": content.hex(),
+    }
+
+
+def write_macs():
+    MACS.write_text(json.dumps(macs(), indent=1) + "\n")
 
 
 def raw_public(private):
@@ -313,6 +375,8 @@ def write_revocation():
 def check():
     assert json.loads(REVOCATION.read_text()) == revocation(), "revocation list"
     print(f"a revocation list agrees with {REVOCATION.name}")
+    assert json.loads(MACS.read_text()) == macs(), "MACs"
+    print(f"{len(PAIRWISE)} suites with MACs agree with {MACS.name}")
     assert json.loads(GRANTS.read_text()) == grants(), "grants"
     print(f"2 kinds of grants agree with {GRANTS.name}")
     content = json.loads(FILE.read_text())
@@ -340,5 +404,6 @@ if __name__ == "__main__":
         ("--write",): write,
         ("--take",): take,
         ("--write-grants",): write_grants,
+        ("--write-macs",): write_macs,
         ("--write-revocation",): write_revocation,
     }[tuple(sys.argv[1:])]()

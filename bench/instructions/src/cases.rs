@@ -177,9 +177,11 @@ impl Ends {
             history_depth: 0,
             history_bytes_max: 0,
             recovery: RecoveryLimits::default(),
+            receivers: None,
         };
         let key = SecretBytes::new([3; 32]);
-        let mut grant = TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None };
+        let mut grant =
+            TopicGrant { epoch: 1, suite: suite.id(), key, receiver: None, sources: Vec::new(), entry: None };
         let source = Source::new(config, &grant, MessageKey::generate(suite)).context("no such suite")?;
         grant.sources = vec![source.announce()];
         let sink = Sink::new(NAME, SinkId([9; 16]), grant, false, SinkLimits::default());

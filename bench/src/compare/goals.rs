@@ -50,6 +50,8 @@ impl Verdict {
 /// The suite that costs least, over the default transport.
 const GROUP: &str = "sgc-quic-group";
 /// The system with default settings.
+const PAIRWISE: &str = "sgc-quic-pairwise";
+/// The suite in which each message is signed.
 const STANDARD: &str = "sgc-quic-standard";
 /// The same suites over the transport that the peers of most goals use.
 const GROUP_TCP: &str = "sgc-tcp-group";
@@ -157,6 +159,13 @@ pub(crate) fn judge(figures: &Figures) -> Vec<Goal> {
             goal(over("`group` to the Zenoh bridge over TCP"), Bound::AtMost(0.8), None, small(GROUP, ZENOH))
                 .beside(&small(GROUP_TCP, ZENOH), &by_relay),
             goal(
+                over("`pairwise` to the Zenoh bridge over TCP"),
+                Bound::AtMost(0.85),
+                None,
+                small(PAIRWISE, ZENOH),
+            )
+            .beside(&[], &by_relay),
+            goal(
                 over("`standard` to the Zenoh bridge over TCP"),
                 Bound::AtMost(1.0),
                 None,
@@ -194,6 +203,13 @@ pub(crate) fn judge(figures: &Figures) -> Vec<Goal> {
         )
         .beside(&throughput("per_second", GROUP_TCP, "direct"), &by_relay("per_second", "direct", f64::max)),
         goal(
+            "Messages of 1000 B a second: `pairwise` to the Zenoh bridge over TCP",
+            Bound::AtLeast(1.1),
+            None,
+            throughput("per_second", PAIRWISE, ZENOH),
+        )
+        .beside(&[], &by_relay("per_second", ZENOH, f64::max)),
+        goal(
             "Messages of 1000 B a second: `standard` to direct DDS",
             Bound::AtLeast(0.8),
             None,
@@ -216,7 +232,9 @@ pub(crate) fn judge(figures: &Figures) -> Vec<Goal> {
     ]);
 
     goals.extend(
-        [("group", GROUP), ("standard", STANDARD)].into_iter().flat_map(|suite| run.real_ros2(suite)),
+        [("group", GROUP), ("pairwise", PAIRWISE), ("standard", STANDARD)]
+            .into_iter()
+            .flat_map(|suite| run.real_ros2(suite)),
     );
 
     let thin = ["paper", "lossy"];

@@ -7,24 +7,24 @@ use super::tcp;
 /// The variants of `sgc` in a table. The other systems are in all tables.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Breadth {
-    /// Every transport with every suite, and with a router.
+    /// Every variant.
     Whole,
-    /// Every transport with the default suite, every suite with the default transport, no router.
+    /// Every transport with `standard`, every suite with the default transport, no router.
     Cross,
-    /// Every transport with the default suite.
+    /// Every transport with `standard`, and the default transport with the default suite.
     Transports,
 }
 
 impl Breadth {
     /// Whether a system is in it.
     pub(crate) fn has(self, system: &str) -> bool {
-        let is_default_suite = system.ends_with("-standard");
+        let is_in_all = system.ends_with("-standard") || system == "sgc-quic-pairwise";
         let is_default_transport = system.starts_with("sgc-quic-") && !system.contains("-router");
         match self {
             _ if !system.starts_with("sgc-") => true,
             Self::Whole => true,
-            Self::Cross => is_default_suite || is_default_transport,
-            Self::Transports => is_default_suite,
+            Self::Cross => is_in_all || is_default_transport,
+            Self::Transports => is_in_all,
         }
     }
 
@@ -35,7 +35,7 @@ impl Breadth {
             Self::Cross => {
                 "sgc over other transports than QUIC with other suites than `standard`, and with a router"
             }
-            Self::Transports => "sgc with other suites than `standard`, and with a router",
+            Self::Transports => "sgc with other suites than `standard` and `pairwise`, and with a router",
         }
     }
 }
@@ -44,12 +44,13 @@ impl Breadth {
 pub(crate) const RELAY: &str = "relay";
 
 /// Those that goals compare where the machine is the limit: they have a turn in each round, the others in the first.
-const OFTEN: [&str; 7] = [
+const OFTEN: [&str; 8] = [
     "direct",
     RELAY,
     "relay-gathers",
     "zenoh-tcp",
     "sgc-quic-group",
+    "sgc-quic-pairwise",
     "sgc-quic-standard",
     "sgc-quic-group-router",
 ];
@@ -108,7 +109,7 @@ mod tests {
     fn goals_are_asked_of_systems_that_every_breadth_has() {
         for breadth in [Breadth::Whole, Breadth::Cross, Breadth::Transports] {
             assert!(
-                ["direct", "wireguard", "zenoh-tcp", "tcp", "sgc-quic-standard"]
+                ["direct", "wireguard", "zenoh-tcp", "tcp", "sgc-quic-standard", "sgc-quic-pairwise"]
                     .iter()
                     .all(|s| breadth.has(s))
             );

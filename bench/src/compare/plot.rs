@@ -25,6 +25,7 @@ pub(crate) enum Stroke {
     Solid,
     Dashed,
     Dotted,
+    DashDotted,
 }
 
 /// The unit of an axis.
@@ -114,6 +115,7 @@ impl Stroke {
             Self::Solid => "none",
             Self::Dashed => "7 4",
             Self::Dotted => "2 4",
+            Self::DashDotted => "7 4 2 4",
         }
     }
 
@@ -122,6 +124,7 @@ impl Stroke {
             Self::Solid => 1.0,
             Self::Dashed => 0.72,
             Self::Dotted => 0.48,
+            Self::DashDotted => 0.85,
         }
     }
 }

@@ -35,8 +35,15 @@ pub(crate) const JAZZY_KILTED: &str = "jazzy-kilted";
 /// The publisher is of Kilted, the subscriber of Jazzy.
 pub(crate) const KILTED_JAZZY: &str = "kilted-jazzy";
 /// The systems of the table: those that goals compare, and relays, which show the least that two programs between take.
-const SYSTEMS: [&str; 6] =
-    ["direct", "zenoh-tcp", "sgc-quic-group", "sgc-quic-standard", "relay", "relay-gathers"];
+const SYSTEMS: [&str; 7] = [
+    "direct",
+    "zenoh-tcp",
+    "sgc-quic-group",
+    "sgc-quic-pairwise",
+    "sgc-quic-standard",
+    "relay",
+    "relay-gathers",
+];
 
 const TOPIC: &str = "/load";
 const BACK: &str = "/load_back";

@@ -106,8 +106,8 @@ const PLOT_PREFIX: &str = "compare-";
 
 const HOW_TO_READ: &str = "Compare ratios and not times: machines differ, and all systems take turns on this one. Times are \
 from publishing to the subscribing program and, where it says round trip, back. Cells with several numbers are p50 / p99 / \
-longest. `group`, `standard` and `paper` are SGC's cipher suites: sealed with a key that members share; also signed by each \
-source (the default); the paper's choices. *with a router*: through an `sgc` router process, otherwise one node dials the \
+longest. `group`, `pairwise`, `standard` and `paper` are SGC's cipher suites: sealed with a key that members share; with a MAC for \
+each receiver (the default); signed by each source; the paper's choices. *with a router*: through an `sgc` router process, otherwise one node dials the \
 other. A dash is what was not measured.\n\n";
 
 /// The description of a table.
@@ -551,7 +551,7 @@ fn systems<'a>(names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
 }
 
 const SCHEMES: [&str; 4] = ["quic", "dtls", "tls", "tcp"];
-const SUITES: [&str; 3] = ["group", "standard", "paper"];
+const SUITES: [&str; 4] = ["group", "pairwise", "standard", "paper"];
 
 /// The parts of `sgc-quic-group-router`.
 struct Sgc<'a> {
@@ -611,6 +611,7 @@ fn look(system: &str) -> (Hue, Stroke) {
         };
         let stroke = match suite {
             "group" => Stroke::Solid,
+            "pairwise" => Stroke::DashDotted,
             "standard" => Stroke::Dashed,
             _ => Stroke::Dotted,
         };

@@ -55,7 +55,7 @@ pub const SOCKET_PATH_BYTES_MAX: usize = 107;
 
 const PRIORITIES: [&str; 3] = ["realtime", "default", "bulk"];
 /// Names of suites, in the order of their ids from 1.
-pub const SUITES: [&str; 8] = [
+pub const SUITES: [&str; 10] = [
     "group",
     "group-chacha",
     "standard",
@@ -64,6 +64,8 @@ pub const SUITES: [&str; 8] = [
     "paper-3072",
     "paper-chacha",
     "paper-3072-chacha",
+    "pairwise",
+    "pairwise-chacha",
 ];
 
 /// An identity file, with details for errors.

@@ -849,7 +849,7 @@ fn words_are_checked() {
                 "node.toml:6: `priority` is \"realtme\"; did you mean \"realtime\"? It takes \"realtime\", \"default\", \
                \"bulk\"",
                 "node.toml:7: `suite` is \"none\"; it takes \"group\", \"group-chacha\", \"standard\", \"standard-chacha\", \
-               \"paper\", \"paper-3072\", \"paper-chacha\", \"paper-3072-chacha\"",
+               \"paper\", \"paper-3072\", \"paper-chacha\", \"paper-3072-chacha\", \"pairwise\", \"pairwise-chacha\"",
             ],
         ),
         (
@@ -864,7 +864,7 @@ fn words_are_checked() {
 
 #[test]
 fn suites_are_called_by_name() {
-    assert_eq!(Suite::DEFAULT, Suite::Standard);
+    assert_eq!(Suite::DEFAULT, Suite::Pairwise);
     for (name, id) in SUITES.iter().zip(1..) {
         let text = format!("[[share]]\ntopic = '/a'\nto = ['b']\nsuite = '{name}'");
         match Suite::from_id(id) {

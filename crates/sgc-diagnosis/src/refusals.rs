@@ -512,10 +512,21 @@ const SINK: &[Refusal] = &[
         "a seal does not verify: the packet was altered, or its sender lacks the key",
         TAMPERED,
     ),
-    counted("sink_trailer", "a signature names an impossible place in its batch", TAMPERED),
+    counted("sink_trailer", "the bytes behind the seal of a packet contradict each other", TAMPERED),
     counted(
         "sink_signature",
         "the publisher did not sign the packet: it was altered, or another member made it",
+        "if the count grows, find out which member of the topic or which router does this",
+    ),
+    counted(
+        "sink_no_mac",
+        "a packet has no MAC for this node: its message began before its source knew of this subscriber",
+        "a few when a subscriber starts are no fault, of a large message many; if the count grows, find out which router alters \
+         packets",
+    ),
+    counted(
+        "sink_mac",
+        "the MAC for this node does not verify: the packet was altered, or another member made it",
         "if the count grows, find out which member of the topic or which router does this",
     ),
     counted(

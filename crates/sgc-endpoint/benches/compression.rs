@@ -92,9 +92,11 @@ impl Variant {
             history_depth: 0,
             history_bytes_max: 0,
             recovery: RecoveryLimits::default(),
+            receivers: None,
         };
         let (suite, key) = (Suite::Group, SecretBytes::new([3; 32]));
-        let mut grant = TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None };
+        let mut grant =
+            TopicGrant { epoch: 1, suite: suite.id(), key, receiver: None, sources: Vec::new(), entry: None };
         let source =
             Source::new(config, &grant, MessageKey::generate(suite)).expect("the key is of the suite");
         grant.sources = vec![source.announce()];

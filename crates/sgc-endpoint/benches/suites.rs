@@ -4,12 +4,16 @@
 //! round counts. `cargo bench -p sgc-endpoint` prints the tables of `benchmarks/suites.md`.
 #![allow(clippy::print_stdout)]
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_endpoint::{Delivery, RecoveryLimits, Sink, SinkLimits, Source, SourceConfig};
-use sgc_trust::{MessageKey, Suite};
-use sgc_wire::{Class, MessageHead, MessageKind, Name, Packet, SecretBytes, SinkId, SourceId, TopicGrant};
+use sgc_endpoint::{Delivery, Receivers, RecoveryLimits, Sink, SinkLimits, Source, SourceConfig};
+use sgc_trust::{MessageKey, RECEIVERS_MAX, Suite};
+use sgc_wire::{
+    Class, MessageHead, MessageKind, Name, NodeId, Packet, ReceiverKey, SecretBytes, SinkId, SourceId,
+    TopicGrant,
+};
 
 const NAME: Name = Name([1; 32]);
 const HEAD: MessageHead = MessageHead::new(MessageKind::Write, 7);
@@ -18,7 +22,7 @@ const MEASURE: Duration = Duration::from_millis(1500);
 const ROUNDS_MIN: usize = 5;
 
 struct Ends {
-    suite: Suite,
+    name: String,
     source: Source,
     sink: Sink,
     /// Times of each round, per message: sealing and opening.
@@ -26,7 +30,14 @@ struct Ends {
 }
 
 impl Ends {
-    fn new(suite: Suite, key: &MessageKey) -> Self {
+    /// Makes the ends of a topic; of a pairwise suite with this number of known receivers, none for signatures.
+    fn new(suite: Suite, key: &MessageKey, receivers: u8) -> Self {
+        let name = if receivers > 0 { format!("{suite}, {receivers} MACs") } else { suite.to_string() };
+        let known = Arc::<Receivers>::default();
+        let receiver = |n: u8| ReceiverKey { id: [n; 4], key: SecretBytes::new([n; 32]) };
+        for n in 1..=receivers {
+            known.add(SinkId([n; 16]), NodeId([n; 32]), || receiver(n));
+        }
         let config = SourceConfig {
             name: NAME,
             id: SourceId([5; 16]),
@@ -35,14 +46,21 @@ impl Ends {
             history_depth: 0,
             history_bytes_max: 0,
             recovery: RecoveryLimits::default(),
+            receivers: (receivers > 0).then_some(known),
         };
         let key_bytes = SecretBytes::new([3; 32]);
-        let mut grant =
-            TopicGrant { epoch: 1, suite: suite.id(), key: key_bytes, sources: Vec::new(), entry: None };
+        let mut grant = TopicGrant {
+            epoch: 1,
+            suite: suite.id(),
+            key: key_bytes,
+            receiver: (receivers > 0).then(|| receiver(1)),
+            sources: Vec::new(),
+            entry: None,
+        };
         let source = Source::new(config, &grant, key.clone()).expect("the key is of the suite");
         grant.sources = vec![source.announce()];
         let sink = Sink::new(NAME, SinkId([9; 16]), grant, false, SinkLimits::default());
-        Self { suite, source, sink, rounds: Vec::new() }
+        Self { name, source, sink, rounds: Vec::new() }
     }
 
     /// Messages of one size, `batch` at a time; about as much as fits into a few milliseconds.
@@ -65,7 +83,7 @@ impl Ends {
             sealing += sealed - start;
             packets.clear();
         }
-        assert_eq!(delivered, batches * batch, "{}", self.suite);
+        assert_eq!(delivered, batches * batch, "{}", self.name);
         let messages = (batches * batch) as u32;
         self.rounds.push((sealing / messages, opening / messages));
     }
@@ -83,17 +101,20 @@ impl Ends {
 #[expect(clippy::disallowed_methods, reason = "the one thing that a bench is for")]
 fn measure(keys: &[(Suite, MessageKey)], bytes: usize, batch: usize) {
     let payload = Bytes::from(vec![0x5a; bytes]);
-    let mut all: Vec<_> = keys.iter().map(|(suite, key)| Ends::new(*suite, key)).collect();
+    let mut all: Vec<_> = keys.iter().map(|(suite, key)| Ends::new(*suite, key, 0)).collect();
+    for (suite, key) in keys.iter().filter(|(suite, _)| suite.is_pairwise()) {
+        all.extend([1, RECEIVERS_MAX as u8].map(|receivers| Ends::new(*suite, key, receivers)));
+    }
     let start = Instant::now();
     while start.elapsed() < MEASURE || all[0].rounds.len() < ROUNDS_MIN {
         all.iter_mut().for_each(|ends| ends.round(&payload, batch));
     }
     println!("\n{bytes} bytes, {batch} at a time");
-    println!("{:20} {:>12} {:>12} {:>12} {:>9}", "suite", "seal µs", "open µs", "both µs", "× group");
+    println!("{:24} {:>12} {:>12} {:>12} {:>9}", "suite", "seal µs", "open µs", "both µs", "× group");
     let base = all[0].medians().2;
     for ends in &mut all {
         let (seal, open, both) = ends.medians();
-        println!("{:20} {seal:12.2} {open:12.2} {both:12.2} {:9.2}", ends.suite.name(), both / base);
+        println!("{:24} {seal:12.2} {open:12.2} {both:12.2} {:9.2}", ends.name, both / base);
     }
 }
 

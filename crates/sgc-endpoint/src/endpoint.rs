@@ -22,6 +22,7 @@ use crate::joins::{JoinKind, JoinStatus, LostReason};
 use crate::output::{EndpointDrop, Output, SignedKind, UnexpectedFrame};
 use crate::owner::{AuthorityServices, Owner, ShareError, ShareSpec};
 use crate::packed_type::PackedType;
+use crate::receivers::Receivers;
 use crate::sink::SinkProgress;
 use crate::source::SourceProgress;
 
@@ -245,6 +246,11 @@ impl Endpoint {
     /// Returns the key of a share, for its sources.
     pub fn share_grant(&self, name: &Name) -> Option<TopicGrant> {
         self.owner.share_grant(name)
+    }
+
+    /// Returns the receivers of a share, for its sources. The set changes with the grants.
+    pub fn receivers(&self, name: &Name) -> Option<Arc<Receivers>> {
+        self.owner.receivers(name)
     }
 
     /// Returns `true` if the type of a share has a key, so that each of its instances has a history.

@@ -22,6 +22,7 @@ mod names;
 mod output;
 mod owner;
 mod packed_type;
+mod receivers;
 mod sink;
 mod source;
 
@@ -38,6 +39,7 @@ pub use marks::{MARK_AFTER, Marks};
 pub use output::{EndpointDrop, Event, Output, SignedKind, UnexpectedFrame};
 pub use owner::{ADVERT_INTERVAL, ADVERTS_BURST, ShareError, ShareSpec};
 pub use packed_type::{PackedType, unpack_type};
+pub use receivers::Receivers;
 pub use sink::{
     AskAgain, Delivery, EPOCHS_MAX, Message, PARKED_BYTES_MAX, PARKED_LOOKS_MAX, PARKED_PACKETS_MAX, Sink,
     SinkDrop, SinkLimits, SinkProgress,

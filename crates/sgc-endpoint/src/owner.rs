@@ -37,6 +37,7 @@ use crate::context::Context;
 use crate::names::BlindName;
 use crate::output::{EndpointDrop, Event, SignedKind, UnexpectedFrame};
 use crate::packed_type::PackedType;
+use crate::receivers::Receivers;
 use crate::sink::SinkProgress;
 use crate::source::SourceProgress;
 
@@ -243,6 +244,11 @@ impl Owner {
     /// Returns the key of a share, for its sources.
     pub(crate) fn share_grant(&self, name: &Name) -> Option<TopicGrant> {
         self.shares.get(name).map(Share::own_grant)
+    }
+
+    /// Returns the receivers of a share, for its sources.
+    pub(crate) fn receivers(&self, name: &Name) -> Option<Arc<Receivers>> {
+        self.shares.get(name).map(Share::receivers)
     }
 
     /// Returns `true` if the type of a share has a key, so that each of its instances has a history.

@@ -3,7 +3,7 @@
 //! If a source can send lost messages again, the sink delivers every number in turn: it asks for missing ones, and
 //! drops later ones that come before the answer, because the answer contains them. So order needs no memory.
 //!
-//! The claims of a header allocate nothing: the packet must open, and be signed, first. A refused packet leaves no
+//! The claims of a header allocate nothing: the packet must open, and be proved, first. A refused packet leaves no
 //! state.
 
 mod delivery;
@@ -324,7 +324,7 @@ impl Sink {
     }
 
     /// Returns the result of a packet, if a grant explained it. Checks in this order: the cheap facts (addressee,
-    /// epoch, suite, replay); the seal, which only holders of the topic's key pass; the signature.
+    /// epoch, suite, replay); the seal, which only holders of the topic's key pass; the MAC for this node, or the signature.
     fn handle(&mut self, packet: &Packet) -> Result<Handled, SinkDrop> {
         let header = &packet.header;
         if header.to.is_some_and(|to| to != self.id) {
@@ -370,7 +370,7 @@ impl Sink {
             scratch.resize(text_bytes, 0);
             OpenBuffer::Aside(scratch)
         };
-        let delivery = match source.open(suite, header, payload, &mut opened) {
+        let delivery = match source.open(suite, grant, header, payload, &mut opened) {
             Ok(()) => self.accept(header, &mut opened),
             Err(error) => Err(error.into()),
         };

@@ -1,5 +1,5 @@
-//! One publisher under one name: numbers messages, cuts, seals and signs them, and keeps those that late joiners and
-//! sinks with losses may ask for.
+//! One publisher under one name: numbers messages, cuts and seals them, proves that they are its own, and keeps those
+//! that late joiners and sinks with losses may ask for.
 //!
 //! A payload is read once, from its place into the leaving packets; fragments of a large message leave before its end
 //! is read. The endpoint decides who may receive it, and when its epoch ends.
@@ -8,13 +8,16 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Acquire, Ordering::Release};
 
 use bytes::{Bytes, BytesMut};
-use sgc_trust::{Batch, MessageKey, SourceKey, Suite, sealed_bytes, trailer_bytes_max};
+use sgc_trust::{
+    Batch, MacKey, MessageKey, SourceKey, Suite, mac_trailer_bytes, put_macs, sealed_bytes, trailer_bytes_max,
+};
 use sgc_wire::{
-    Class, HOP_LIMIT, MESSAGE_BYTES_MAX, MessageHead, MessageKind, Name, Packet, PacketHeader, SinkId, Slab,
-    SourceAnnounce, SourceId, TopicGrant,
+    Class, HOP_LIMIT, MESSAGE_BYTES_MAX, MessageHead, MessageKind, Name, Packet, PacketHeader, ReceiverKey,
+    SinkId, Slab, SourceAnnounce, SourceId, TopicGrant,
 };
 
 use crate::history::{History, HistoryEntry, RecoveryLimits};
+use crate::receivers::{ReceiverList, Receivers};
 
 /// Bytes of message in one packet.
 pub const FRAGMENT_BYTES: u16 = 16 * 1024;
@@ -38,6 +41,8 @@ pub struct SourceConfig {
     pub history_bytes_max: usize,
     /// Bounds of messages kept beyond that for recovery; of reliable sources only.
     pub recovery: RecoveryLimits,
+    /// The receivers, where this node owns the name: a `pairwise` suite then needs no signature while they are few.
+    pub receivers: Option<Arc<Receivers>>,
 }
 
 /// The reason why a message was not published.
@@ -132,9 +137,24 @@ pub struct Source {
     batch: Batch,
     /// The packets of `batch`, sealed and not signed.
     unsigned: Vec<(PacketHeader, BytesMut)>,
+    /// The keys of MACs in packets to all, and the receivers that they are for.
+    macs: Vec<MacKey>,
+    listed: Vec<Arc<ReceiverKey>>,
     slab: Slab,
     history: History,
     progress: Arc<SourceProgress>,
+}
+
+/// The proof that the packets of a message carry.
+enum Proof {
+    /// None: members trust each other.
+    None,
+    /// A MAC for each receiver, under [`Source::macs`].
+    Macs,
+    /// A MAC for the one receiver.
+    Mac([MacKey; 1]),
+    /// The signature of their batch.
+    Signature,
 }
 
 impl Source {
@@ -169,6 +189,8 @@ impl Source {
             seq: 0,
             batch: Batch::default(),
             unsigned: Vec::new(),
+            macs: Vec::new(),
+            listed: Vec::new(),
             slab: Slab::default(),
             history,
             progress: Arc::new(progress),
@@ -184,6 +206,8 @@ impl Source {
         }
         let Some(key) = SourceKey::derive(grant, &self.config.name, &self.config.id) else { return false };
         self.flush(emit);
+        self.listed.clear();
+        self.macs.clear();
         self.key = key;
         self.grant = without_lists(grant);
         self.progress.epoch_start.store(self.seq, Release);
@@ -225,7 +249,8 @@ impl Source {
         // The suite was in this build when the source was made.
         let Some(key) = key else { return Ok(()) };
         let seq = self.next_number(&payload)?;
-        self.seal_fragments(Some(&key), seq, head, &payload, &mut emit);
+        let proof = self.choose_proof(Some(sink));
+        self.seal_fragments(Some(&key), &proof, seq, head, &payload, &mut emit);
         self.keep(HistoryEntry { seq, head: *head, payload });
         self.flush(emit);
         Ok(())
@@ -239,7 +264,7 @@ impl Source {
         let signed = self.batch.sign(&self.message_key);
         self.progress.signatures.fetch_add(1, Release);
         for (index, (header, mut payload)) in self.unsigned.drain(..).enumerate() {
-            signed.put_trailer(index, &mut payload);
+            signed.put_trailer(self.suite, index, &mut payload);
             emit(Packet { header, payload: payload.freeze().into() });
         }
         self.batch.reuse(signed);
@@ -279,7 +304,8 @@ impl Source {
         let seq = self.next_number(&Bytes::new())?;
         let (head, payload) =
             (MessageHead::for_assertion(publisher), Bytes::copy_from_slice(&seq.to_be_bytes()));
-        self.seal_fragments(None, seq, &head, &payload, &mut emit);
+        let proof = self.choose_proof(None);
+        self.seal_fragments(None, &proof, seq, &head, &payload, &mut emit);
         self.keep(HistoryEntry { seq, head, payload });
         self.flush(emit);
         Ok(())
@@ -303,11 +329,12 @@ impl Source {
         // Clones of references, so that the history can be read while packets are put aside for signing.
         let ahead = mark.into_iter().flat_map(|seq| self.history.range(seq, seq));
         let asked: Vec<_> = ahead.chain(self.history.range(from, to)).collect();
+        let proof = self.choose_proof(Some(sink));
         for (seq, head, payload) in asked {
-            self.seal_fragments(Some(&key), seq, &head, &payload, &mut emit);
+            self.seal_fragments(Some(&key), &proof, seq, &head, &payload, &mut emit);
         }
         let head = MessageHead::new(MessageKind::Synced, 0);
-        self.seal_fragments(Some(&key), 0, &head, &[], &mut emit);
+        self.seal_fragments(Some(&key), &proof, 0, &head, &[], &mut emit);
         self.flush(emit);
     }
 
@@ -361,7 +388,8 @@ impl Source {
         emit: &mut impl FnMut(Packet),
     ) -> Result<(), PublishError> {
         let seq = self.next_number(&payload)?;
-        self.seal_fragments(None, seq, head, &payload, emit);
+        let proof = self.choose_proof(None);
+        self.seal_fragments(None, &proof, seq, head, &payload, emit);
         self.keep(HistoryEntry { seq, head: *head, payload });
         Ok(())
     }
@@ -376,7 +404,8 @@ impl Source {
         if let Some(mark) = self.history.newest_mut() {
             mark.payload = payload.clone();
         }
-        self.seal_fragments(None, self.seq, &head, &payload, emit);
+        let proof = self.choose_proof(None);
+        self.seal_fragments(None, &proof, self.seq, &head, &payload, emit);
     }
 
     fn next_number(&mut self, payload: &Bytes) -> Result<u64, PublishError> {
@@ -401,16 +430,27 @@ impl Source {
         }
     }
 
-    /// Seals a message under the key for all, or the one for a sink.
+    /// Seals a message under the key for all, or the one for a sink, with the proof [chosen](Self::choose_proof) for it.
     fn seal_fragments(
         &mut self,
         addressed: Option<&SourceKey>,
+        proof: &Proof,
         seq: u64,
         head: &MessageHead,
         payload: &[u8],
         emit: &mut impl FnMut(Packet),
     ) {
         let fragments = payload.len().div_ceil(FRAGMENT_BYTES.into()).max(1);
+        let trailer_bytes = match proof {
+            Proof::None => 0,
+            Proof::Macs => mac_trailer_bytes(self.macs.len()),
+            Proof::Mac(one) => mac_trailer_bytes(one.len()),
+            Proof::Signature => trailer_bytes_max(self.suite),
+        };
+        if matches!(proof, Proof::Macs | Proof::Mac(_)) {
+            // Packets leave in the order of their numbers, also if the last ones have a signature.
+            self.flush(&mut *emit);
+        }
         for index in 0..fragments {
             let key = addressed.unwrap_or(&self.key);
             let header = PacketHeader {
@@ -430,24 +470,58 @@ impl Source {
             let start = index * usize::from(FRAGMENT_BYTES);
             let fragment = &payload[start..start + header.fragment_bytes()];
             let bytes = sealed_bytes(&header);
-            let mut sealed = self.slab.room(bytes + trailer_bytes_max(self.suite));
+            let mut sealed = self.slab.room(bytes + trailer_bytes);
             sealed.resize(bytes, 0);
             key.seal(&header, head, fragment, &mut sealed);
-            if !self.suite.is_signed() {
-                emit(Packet { header, payload: sealed.freeze().into() });
-                continue;
+            match proof {
+                Proof::None => {}
+                Proof::Macs => put_macs(&header, &mut sealed, &self.macs),
+                Proof::Mac(one) => put_macs(&header, &mut sealed, one),
+                Proof::Signature => {
+                    self.batch.push(&header, &sealed);
+                    self.unsigned.push((header, sealed));
+                    if self.batch.is_full() {
+                        self.flush(&mut *emit);
+                    }
+                    continue;
+                }
             }
-            self.batch.push(&header, &sealed);
-            self.unsigned.push((header, sealed));
-            if self.batch.is_full() {
-                self.flush(&mut *emit);
-            }
+            emit(Packet { header, payload: sealed.freeze().into() });
         }
+    }
+
+    /// Chooses the proof of a message to all or to one sink.
+    fn choose_proof(&mut self, to: Option<SinkId>) -> Proof {
+        if !self.suite.is_signed() {
+            return Proof::None;
+        }
+        let Some(receivers) = self.config.receivers.as_ref().filter(|_| self.suite.is_pairwise()) else {
+            return Proof::Signature;
+        };
+        let SourceConfig { name, id, .. } = &self.config;
+        let derive = |key: &ReceiverKey| MacKey::derive(key, &self.grant, name, id, to.as_ref());
+        if let Some(sink) = &to {
+            let key = receivers.key_of(sink).and_then(|key| derive(&key));
+            return key.map_or(Proof::Signature, |key| Proof::Mac([key]));
+        }
+        match receivers.update(&mut self.listed) {
+            ReceiverList::TooMany => return Proof::Signature,
+            ReceiverList::Unchanged => {}
+            ReceiverList::Changed => self.macs = self.listed.iter().filter_map(|key| derive(key)).collect(),
+        }
+        Proof::Macs
     }
 }
 
 /// Returns the part of a grant from which keys are derived.
 pub(crate) fn without_lists(grant: &TopicGrant) -> TopicGrant {
-    let TopicGrant { epoch, suite, key, .. } = grant;
-    TopicGrant { epoch: *epoch, suite: *suite, key: key.clone(), sources: Vec::new(), entry: None }
+    let TopicGrant { epoch, suite, key, receiver, .. } = grant;
+    TopicGrant {
+        epoch: *epoch,
+        suite: *suite,
+        key: key.clone(),
+        receiver: receiver.clone(),
+        sources: Vec::new(),
+        entry: None,
+    }
 }

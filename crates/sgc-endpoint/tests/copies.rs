@@ -44,9 +44,11 @@ fn ends(suite: Suite, history_depth: usize) -> (Source, Sink) {
         history_depth,
         history_bytes_max: 100 << 20,
         recovery: RecoveryLimits::default(),
+        receivers: None,
     };
     let key = SecretBytes::new([3; 32]);
-    let mut grant = TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None };
+    let mut grant =
+        TopicGrant { epoch: 1, suite: suite.id(), key, receiver: None, sources: Vec::new(), entry: None };
     let source = Source::new(config, &grant, MessageKey::generate(suite)).expect("the key is of the suite");
     grant.sources = vec![source.announce()];
     (source, Sink::new(NAME, SinkId([9; 16]), grant, false, SinkLimits::default()))

@@ -404,6 +404,7 @@ fn grant(owner: &Identity, name: Name, sink: SinkId, reply_key: &[u8], serial: u
         epoch: serial as u32,
         suite: 1,
         key: SecretBytes::new([key; 32]),
+        receiver: None,
         sources: Vec::new(),
         entry: None,
     });

@@ -200,7 +200,7 @@ fn consumer(node: &str, role: Role, type_hash: Option<&str>) -> Consumer {
 /// the same key would count as genuine there, though its source did not make them.
 fn grant(suite: Suite) -> TopicGrant {
     let key = SecretBytes::new([4; 32]);
-    TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None }
+    TopicGrant { epoch: 1, suite: suite.id(), key, receiver: None, sources: Vec::new(), entry: None }
 }
 
 /// Returns packets of each suite: to all and addressed, in several fragments and in one.
@@ -215,6 +215,7 @@ fn packets(suites: &[Suite]) -> Vec<Vec<u8>> {
             history_depth: 2,
             history_bytes_max: 1 << 20,
             recovery: RecoveryLimits::default(),
+            receivers: None,
         };
         let mut source =
             Source::new(config, &grant(*suite), MessageKey::generate(*suite)).expect("of the suite");

@@ -32,7 +32,14 @@ struct Cast {
 
 fn content() -> GrantContent {
     let key = SecretBytes::new([9; 32]);
-    GrantContent::Topic(TopicGrant { epoch: 1, suite: 1, key, sources: Vec::new(), entry: None })
+    GrantContent::Topic(TopicGrant {
+        epoch: 1,
+        suite: 1,
+        key,
+        receiver: None,
+        sources: Vec::new(),
+        entry: None,
+    })
 }
 
 fn cast() -> &'static Cast {

@@ -1,12 +1,13 @@
 //! Arbitrary packets into a sink that holds a grant, in every suite: none panics, none is delivered that the source did
 //! not make, and packets of the source are still delivered afterwards.
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 use bytes::Bytes;
-use sgc_endpoint::{Delivery, RecoveryLimits, Sink, SinkLimits, Source, SourceConfig};
+use sgc_endpoint::{Delivery, Receivers, RecoveryLimits, Sink, SinkLimits, Source, SourceConfig};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{
-    Class, MessageHead, MessageKind, Name, Packet, Payload, SecretBytes, SinkId, SourceId, TopicGrant,
+    Class, MessageHead, MessageKind, Name, NodeId, Packet, Payload, ReceiverKey, SecretBytes, SinkId,
+    SourceId, TopicGrant,
 };
 
 const NAME: Name = Name([1; 32]);
@@ -35,8 +36,14 @@ fn alter(packet: &Packet, edits: &[u8]) -> Option<Packet> {
 
 /// Runs one input of the target.
 pub fn run(input: &[u8]) {
-    let [suite, size, cut, edits @ ..] = input else { return };
-    let suite = Suite::ALL[usize::from(*suite) % Suite::ALL.len()];
+    let [first, size, cut, edits @ ..] = input else { return };
+    let suite = Suite::ALL[usize::from(*first) % Suite::ALL.len()];
+    // In a pairwise suite, the source knows its receivers or signs.
+    let receivers = (suite.is_pairwise() && *first >= 0x80).then(Arc::<Receivers>::default);
+    let receiver = ReceiverKey { id: [9; 4], key: SecretBytes::new([9; 32]) };
+    if let Some(receivers) = &receivers {
+        receivers.add(SINK, NodeId([9; 32]), || receiver.clone());
+    }
     let config = SourceConfig {
         name: NAME,
         id: SourceId([5; 16]),
@@ -45,10 +52,17 @@ pub fn run(input: &[u8]) {
         history_depth: 2,
         history_bytes_max: 1 << 20,
         recovery: RecoveryLimits::default(),
+        receivers,
     };
     let topic_key = SecretBytes::new([3; 32]);
-    let mut grant =
-        TopicGrant { epoch: 1, suite: suite.id(), key: topic_key, sources: Vec::new(), entry: None };
+    let mut grant = TopicGrant {
+        epoch: 1,
+        suite: suite.id(),
+        key: topic_key,
+        receiver: suite.is_pairwise().then_some(receiver),
+        sources: Vec::new(),
+        entry: None,
+    };
     let mut source = Source::new(config, &grant, key(suite).clone()).expect("the key is of the suite");
     grant.sources = vec![source.announce()];
     let mut sink = Sink::new(NAME, SINK, grant.clone(), false, SinkLimits::default());

@@ -172,7 +172,7 @@ fn every_suite_carries_messages() {
     let topic = |suite: Suite| format!("/{}", suite.name().replace('-', "_"));
     let topics = Suite::ALL.map(|suite| (suite, topic(suite)));
     let _cloud = lab.cloud();
-    let _robot = lab.start("robot", |c| {
+    let robot = lab.start("robot", |c| {
         let in_suite = |(suite, topic): &(Suite, String)| {
             let mut share = share(topic, &["desk"]);
             share.suite = *suite;
@@ -191,6 +191,12 @@ fn every_suite_carries_messages() {
         while listener.samples.recv_timeout(PATIENCE).is_ok_and(|b| b != large) {
             assert!(Instant::now() < deadline, "{suite}: it never comes whole");
         }
+    }
+    let status = robot.status();
+    for (suite, topic) in &topics {
+        let route = status["routes"].as_array().unwrap().iter().find(|route| route["topic"] == **topic);
+        let signs = route.unwrap()["signatures"].as_u64().unwrap() > 0;
+        assert_eq!(signs, suite.is_signed() && !suite.is_pairwise(), "{suite}: {status}");
     }
 }
 

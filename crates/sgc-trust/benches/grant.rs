@@ -22,6 +22,7 @@ fn main() {
         epoch: 1,
         suite: 1,
         key: SecretBytes::new([9; 32]),
+        receiver: None,
         sources: Vec::new(),
         entry: None,
     });

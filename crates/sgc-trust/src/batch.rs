@@ -11,6 +11,7 @@ use bytes::BufMut;
 use sgc_wire::PacketHeader;
 
 use crate::message_key::VerifyKey;
+use crate::receiver::{FORM_SIGNATURE, form_bytes};
 use crate::{MessageKey, OpenError, Suite, TAG_BYTES, opened_bytes};
 
 /// Most packets under one signature.
@@ -99,7 +100,10 @@ impl Batch {
 
 impl SignedBatch {
     /// Appends the trailer of the packet that was added as number `index`.
-    pub fn put_trailer(&self, index: usize, out: &mut impl BufMut) {
+    pub fn put_trailer(&self, suite: Suite, index: usize, out: &mut impl BufMut) {
+        if suite.is_pairwise() {
+            out.put_u8(FORM_SIGNATURE);
+        }
         for (level, sibling) in siblings(index, self.count) {
             out.put_slice(&self.nodes[position(self.count, level, sibling)]);
         }
@@ -109,17 +113,19 @@ impl SignedBatch {
     }
 }
 
-/// Returns the longest trailer of a suite's packets, bytes.
+/// Returns the longest trailer with a signature of a suite's packets, bytes.
 pub fn trailer_bytes_max(suite: Suite) -> usize {
     match suite.scheme().signature_bytes() {
         0 => 0,
-        signature => 6 * HASH_BYTES + PLACE_BYTES + signature,
+        signature => form_bytes(suite) + 6 * HASH_BYTES + PLACE_BYTES + signature,
     }
 }
 
 /// Verifies one source's packets.
 pub struct BatchVerifier {
     key: VerifyKey,
+    /// Bytes between tag and trailer.
+    form_bytes: usize,
     known: VecDeque<KnownBatch>,
     checked: u64,
 }
@@ -144,12 +150,13 @@ struct MerkleWalk {
 impl BatchVerifier {
     /// Returns a verifier for sources with this announced key; `None` if it is not a key of that suite.
     pub fn new(suite: Suite, key: &[u8]) -> Option<Self> {
-        Some(Self { key: VerifyKey::new(suite, key)?, known: VecDeque::new(), checked: 0 })
+        let form_bytes = form_bytes(suite);
+        Some(Self { key: VerifyKey::new(suite, key)?, form_bytes, known: VecDeque::new(), checked: 0 })
     }
 
     /// Verifies that the source signed this packet. At most one signature is checked, and only success is remembered.
     pub fn verify(&mut self, header: &PacketHeader, payload: &[u8]) -> Result<(), OpenError> {
-        let (sealed, trailer) = split(header, payload, self.key.signature_bytes())?;
+        let (sealed, trailer) = split(header, payload, self.form_bytes, self.key.signature_bytes())?;
         let Trailer { path, index, count, signature } = trailer;
         let leaf = leaf(header, sealed);
         let known = self.known.iter_mut().find(|b| b.count == count && b.signature == signature);
@@ -250,10 +257,15 @@ struct Trailer<'a> {
 fn split<'a>(
     header: &PacketHeader,
     payload: &'a [u8],
+    form_bytes: usize,
     signature_bytes: usize,
 ) -> Result<(&'a [u8], Trailer<'a>), OpenError> {
     let (sealed, trailer) =
         payload.split_at_checked(opened_bytes(header) + TAG_BYTES).ok_or(OpenError::Length)?;
+    let (form, trailer) = trailer.split_at_checked(form_bytes).ok_or(OpenError::Length)?;
+    if form.iter().any(|byte| *byte != FORM_SIGNATURE) {
+        return Err(OpenError::Trailer);
+    }
     let path_bytes = trailer.len().checked_sub(PLACE_BYTES + signature_bytes).ok_or(OpenError::Length)?;
     let (path, rest) = trailer.split_at(path_bytes);
     let (place, signature) = rest.split_at(PLACE_BYTES);

@@ -177,6 +177,7 @@ mod tests {
             epoch: 1,
             suite: 1,
             key: SecretBytes::new([9; 32]),
+            receiver: None,
             sources: Vec::new(),
             entry: None,
         })

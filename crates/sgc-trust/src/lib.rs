@@ -29,6 +29,7 @@ mod names;
 mod peer;
 mod pem;
 mod policy;
+mod receiver;
 mod replay;
 mod revocations;
 mod roster;
@@ -66,6 +67,7 @@ pub use names::{
 pub use peer::{SignatureError, VerifiedPeer, node_id};
 pub use pem::{FLEET_FILE_BYTES_MAX, PemError, pem_contents, pem_text};
 pub use policy::{DenialReason, GrantReason, Grantees, Policy};
+pub use receiver::{MacKey, RECEIVERS_MAX, ReceiverSecret, has_macs, mac_trailer_bytes, put_macs};
 pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};
 pub use revocations::{CrlError, FLEET_LISTS_MAX, LIST_NODES_MAX, REVOKED_NODES_MAX, Revocation};
 pub use roster::{

@@ -34,12 +34,19 @@ pub enum OpenError {
     /// The seal does not verify: the packet was altered, or sealed without the key.
     #[error("the seal does not verify")]
     Forged,
-    /// Index, count and path behind the tag contradict each other.
-    #[error("the place in its batch is impossible")]
+    /// The bytes behind the tag contradict each other.
+    #[error("the bytes behind the seal are malformed")]
     Trailer,
     /// The source did not sign the packet: it was altered, or made by another member with the topic's key.
     #[error("the source did not sign it")]
     Signature,
+    /// The packet has MACs for other receivers only: it was sealed before its source knew of this one.
+    #[error("it has no MAC for this node")]
+    NoMac,
+    /// The MAC for this receiver does not verify: the packet was altered, or made by another member with the topic's
+    /// key.
+    #[error("its MAC for this node does not verify")]
+    Mac,
 }
 
 /// The key of one source in one epoch: for packets to all, or for those to one sink.
@@ -163,7 +170,7 @@ pub fn sealed_bytes(header: &PacketHeader) -> usize {
     opened_bytes(header) + TAG_BYTES
 }
 
-fn nonce(header: &PacketHeader) -> Nonce {
+pub(crate) fn nonce(header: &PacketHeader) -> Nonce {
     let mut bytes = [0; NONCE_LEN];
     bytes[..8].copy_from_slice(&header.seq.to_be_bytes());
     bytes[8..].copy_from_slice(&u32::from(header.index).to_be_bytes());
@@ -183,6 +190,7 @@ mod tests {
             epoch: 1,
             suite: suite.id(),
             key: SecretBytes::new([7; 32]),
+            receiver: None,
             sources: Vec::new(),
             entry: None,
         }
@@ -264,8 +272,8 @@ mod tests {
             }
             let epoch = PacketHeader { epoch: 2, ..h.clone() };
             assert_eq!(opened(&epoch, &key, &good), Err(OpenError::Epoch { found: 2 }));
-            let other = PacketHeader { suite: 9, ..h.clone() };
-            assert_eq!(opened(&other, &key, &good), Err(OpenError::Suite { found: 9 }));
+            let other = PacketHeader { suite: 99, ..h.clone() };
+            assert_eq!(opened(&other, &key, &good), Err(OpenError::Suite { found: 99 }));
             assert_eq!(opened(&h, &key, &good[1..]), Err(OpenError::Length));
             assert_eq!(opened(&h, &key, &[&good[..], &[0]].concat()), Err(OpenError::Length));
         }

@@ -8,7 +8,8 @@ use aws_lc_rs::aead::{AES_256_GCM, Algorithm, CHACHA20_POLY1305};
 /// Protection of a topic's payloads.
 ///
 /// The `group` suites keep out every node without a grant of the topic; granted nodes trust each other not to forge
-/// messages. In all others each source signs, so that only it can make its messages.
+/// messages. In all others only a source can make its messages: it signs them, or, in the `pairwise` suites and as long
+/// as receivers are few, proves them to each receiver with a MAC.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Suite {
     /// AES-256-GCM.
@@ -16,7 +17,6 @@ pub enum Suite {
     /// ChaCha20-Poly1305, for CPUs without AES instructions.
     GroupChacha,
     /// AES-256-GCM and Ed25519.
-    #[default]
     Standard,
     /// ChaCha20-Poly1305 and Ed25519.
     StandardChacha,
@@ -28,6 +28,11 @@ pub enum Suite {
     PaperChacha,
     /// ChaCha20-Poly1305 and RSASSA-PSS of 3072 bits with SHA-256.
     Paper3072Chacha,
+    /// AES-256-GCM, and a MAC for each receiver or Ed25519.
+    #[default]
+    Pairwise,
+    /// ChaCha20-Poly1305, and a MAC for each receiver or Ed25519.
+    PairwiseChacha,
 }
 
 /// Signature scheme of messages.
@@ -55,10 +60,10 @@ impl Scheme {
 
 impl Suite {
     /// The suite of topics without a setting.
-    pub const DEFAULT: Self = Self::Standard;
+    pub const DEFAULT: Self = Self::Pairwise;
 
     /// All suites, in the order of their ids.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 10] = [
         Self::Group,
         Self::GroupChacha,
         Self::Standard,
@@ -67,6 +72,8 @@ impl Suite {
         Self::Paper3072,
         Self::PaperChacha,
         Self::Paper3072Chacha,
+        Self::Pairwise,
+        Self::PairwiseChacha,
     ];
 
     /// Returns the id on the wire, from 1.
@@ -90,18 +97,26 @@ impl Suite {
             Self::Paper3072 => "paper-3072",
             Self::PaperChacha => "paper-chacha",
             Self::Paper3072Chacha => "paper-3072-chacha",
+            Self::Pairwise => "pairwise",
+            Self::PairwiseChacha => "pairwise-chacha",
         }
     }
 
-    /// Returns `true` if each source signs its messages, and members cannot forge one another.
+    /// Returns `true` if sources sign their messages, at least where they have no MAC for each receiver. Members cannot
+    /// forge one another.
     pub fn is_signed(self) -> bool {
         self.scheme() != Scheme::Unsigned
+    }
+
+    /// Returns `true` if a source proves its packets by a MAC for each receiver, as long as these are few.
+    pub fn is_pairwise(self) -> bool {
+        matches!(self, Self::Pairwise | Self::PairwiseChacha)
     }
 
     pub(crate) fn scheme(self) -> Scheme {
         match self {
             Self::Group | Self::GroupChacha => Scheme::Unsigned,
-            Self::Standard | Self::StandardChacha => Scheme::Ed25519,
+            Self::Standard | Self::StandardChacha | Self::Pairwise | Self::PairwiseChacha => Scheme::Ed25519,
             Self::Paper | Self::PaperChacha => Scheme::RsaPss(256),
             Self::Paper3072 | Self::Paper3072Chacha => Scheme::RsaPss(384),
         }
@@ -109,10 +124,12 @@ impl Suite {
 
     pub(crate) fn cipher(self) -> &'static Algorithm {
         match self {
-            Self::Group | Self::Standard | Self::Paper | Self::Paper3072 => &AES_256_GCM,
-            Self::GroupChacha | Self::StandardChacha | Self::PaperChacha | Self::Paper3072Chacha => {
-                &CHACHA20_POLY1305
-            }
+            Self::Group | Self::Standard | Self::Paper | Self::Paper3072 | Self::Pairwise => &AES_256_GCM,
+            Self::GroupChacha
+            | Self::StandardChacha
+            | Self::PaperChacha
+            | Self::Paper3072Chacha
+            | Self::PairwiseChacha => &CHACHA20_POLY1305,
         }
     }
 }
@@ -149,8 +166,10 @@ mod tests {
             assert_eq!((suite.id(), Suite::from_id(id)), (id, Some(suite)));
             assert_eq!(suite.to_string().parse(), Ok(suite));
         }
-        assert_eq!((Suite::from_id(0), Suite::from_id(9)), (None, None));
-        assert_eq!((Suite::DEFAULT, Suite::default()), (Suite::Standard, Suite::Standard));
+        assert_eq!((Suite::from_id(0), Suite::from_id(11)), (None, None));
+        assert_eq!((Suite::DEFAULT, Suite::default()), (Suite::Pairwise, Suite::Pairwise));
+        let with_key = |suite: &Suite| sgc_wire::RECEIVER_KEY_SUITES.contains(&suite.id());
+        assert!(Suite::ALL.iter().all(|suite| suite.is_pairwise() == with_key(suite)));
         let error = "Standard".parse::<Suite>().unwrap_err().to_string();
         assert!(error.contains("standard-chacha"), "{error}");
     }

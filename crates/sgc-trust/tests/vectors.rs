@@ -5,11 +5,12 @@ use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng as _;
 use rustls_pki_types::CertificateDer;
 use sgc_trust::{
-    Batch, BatchVerifier, CertError, Fleet, GrantError, Kem, MessageKey, OpenError, ReplyKey, Revocation,
-    SourceKey, Suite, TAG_BYTES, opened_bytes, seal_grant, sealed_bytes,
+    Batch, BatchVerifier, CertError, Fleet, GrantError, Kem, MacKey, MessageKey, OpenError, ReceiverSecret,
+    ReplyKey, Revocation, SourceKey, Suite, TAG_BYTES, has_macs, opened_bytes, put_macs, seal_grant,
+    sealed_bytes,
 };
 use sgc_wire::{
-    Decode, Encode, GrantContent, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, PacketHeader,
+    Decode, Encode, GrantContent, MESSAGE_HEAD_BYTES, MessageHead, MessageKind, Name, NodeId, PacketHeader,
     Pseudonym, SecretBytes, SinkId, SourceAnnounce, SourceId, TopicGrant, UnixMillis,
 };
 
@@ -51,7 +52,8 @@ fn hex(text: &serde_json::Value) -> Vec<u8> {
 
 fn key(suite: Suite, header: &PacketHeader) -> SourceKey {
     let key = SecretBytes::new(std::array::from_fn(|i| i as u8));
-    let grant = TopicGrant { epoch: 7, suite: suite.id(), key, sources: Vec::new(), entry: None };
+    let grant =
+        TopicGrant { epoch: 7, suite: suite.id(), key, receiver: None, sources: Vec::new(), entry: None };
     let key = match header.to {
         Some(sink) => SourceKey::derive_addressed(&grant, &NAME, &SOURCE, &sink),
         None => SourceKey::derive(&grant, &NAME, &SOURCE),
@@ -85,7 +87,7 @@ fn payloads(vector: &Vector) -> Vec<Vec<u8>> {
         let key = MessageKey::from_pkcs8(vector.suite, pkcs8).expect("a key of the suite");
         assert_eq!(key.public(), public);
         let signed = batch.sign(&key);
-        out.iter_mut().enumerate().for_each(|(n, payload)| signed.put_trailer(n, payload));
+        out.iter_mut().enumerate().for_each(|(n, payload)| signed.put_trailer(vector.suite, n, payload));
     }
     out
 }
@@ -150,6 +152,60 @@ fn packets_signed_with_rsa() {
 }
 
 #[test]
+fn macs_of_the_vectors_are_made_and_checked() {
+    let all: serde_json::Value =
+        serde_json::from_str(include_str!("vectors/macs.json")).expect("the file is JSON");
+    let list = |v: &serde_json::Value| v.as_array().expect("a list").iter().map(hex).collect::<Vec<_>>();
+    let secret = hex(&all["secret"]).try_into().expect("32 bytes");
+    let secret = ReceiverSecret::new(SecretBytes::new(secret));
+    let nodes = list(&all["nodes"]).into_iter().map(|node| NodeId(node.try_into().expect("32 bytes")));
+    let keys: Vec<_> = nodes.map(|node| secret.derive_key(&NAME, &node)).collect();
+    assert_eq!(keys.iter().map(Encode::to_vec).collect::<Vec<_>>(), list(&all["keys"]));
+    let stranger = secret.derive_key(&NAME, &NodeId([9; 32]));
+    for vector in all["suites"].as_array().expect("a list") {
+        let suite: Suite = vector["suite"].as_str().expect("a name").parse().expect("a suite");
+        for (header, theirs) in list(&vector["headers"]).iter().zip(list(&vector["payloads"])) {
+            let header = PacketHeader::from_slice(header).expect("a header");
+            let (fragment, head) = plain(&header);
+            let mut ours = vec![0; sealed_bytes(&header)];
+            key(suite, &header).seal(&header, &head, &fragment, &mut ours);
+            let topic_key = SecretBytes::new(std::array::from_fn(|i| i as u8));
+            let (epoch, suite_id) = (header.epoch, suite.id());
+            let grant = TopicGrant {
+                epoch,
+                suite: suite_id,
+                key: topic_key,
+                receiver: None,
+                sources: Vec::new(),
+                entry: None,
+            };
+            let mac_key = |receiver| {
+                MacKey::derive(receiver, &grant, &NAME, &SOURCE, header.to.as_ref())
+                    .expect("a suite of this build")
+            };
+            let mac_keys: Vec<_> = keys.iter().map(mac_key).collect();
+            put_macs(&header, &mut ours, &mac_keys);
+            assert_eq!(ours, theirs, "{suite}, packet {}", header.seq);
+            assert_eq!(has_macs(&header, &theirs), Ok(true));
+            assert!(mac_keys.iter().all(|key| key.check(&header, &theirs) == Ok(())));
+            assert_eq!(mac_key(&stranger).check(&header, &theirs), Err(OpenError::NoMac));
+        }
+    }
+    let topic_key = SecretBytes::new(std::array::from_fn(|i| i as u8));
+    let receiver = Some(keys[0].clone());
+    let content = GrantContent::Topic(TopicGrant {
+        epoch: 7,
+        suite: Suite::Pairwise.id(),
+        key: topic_key,
+        receiver,
+        sources: Vec::new(),
+        entry: None,
+    });
+    assert_eq!(content.to_vec(), hex(&all["content"]));
+    assert_eq!(GrantContent::from_slice(&content.to_vec()), Ok(content));
+}
+
+#[test]
 fn the_grants_of_the_vectors_open() {
     let all: serde_json::Value =
         serde_json::from_str(include_str!("vectors/grants.json")).expect("the file is JSON");
@@ -158,6 +214,7 @@ fn the_grants_of_the_vectors_open() {
         epoch: 7,
         suite: 3,
         key: SecretBytes::new(std::array::from_fn(|i| i as u8)),
+        receiver: None,
         sources: vec![SourceAnnounce {
             source: SOURCE,
             key: vec![0xdd; 32].into(),

@@ -1,5 +1,7 @@
 //! The content of a grant: a topic's key, an owner's catalogue, or the answer to a question.
 
+use std::ops::RangeInclusive;
+
 use bytes::Bytes;
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
@@ -22,6 +24,9 @@ pub const ENTRY_SOURCES_MAX: usize = 128;
 pub const GRANT_SOURCES_MAX: usize = 1024;
 /// Most generations of a fleet's secret that are in use at one time.
 pub const SECRET_GENERATIONS_MAX: usize = 8;
+
+/// Ids of the cipher suites whose grants have a field for a receiver key.
+pub const RECEIVER_KEY_SUITES: RangeInclusive<u8> = 9..=10;
 
 /// The content of a grant.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -49,10 +54,22 @@ pub struct TopicGrant {
     pub suite: u8,
     /// The topic key of the epoch.
     pub key: SecretBytes,
+    /// The key that proves packets to the granted node; only in a suite of [`RECEIVER_KEY_SUITES`], and not for a node
+    /// that receives no packets.
+    pub receiver: Option<ReceiverKey>,
     /// The publishing sources: no other source counts.
     pub sources: Vec<SourceAnnounce>,
     /// The catalogue entry of the name, if it was requested.
     pub entry: Option<Box<CatalogueEntry>>,
+}
+
+/// The key that the owner of a topic shares with one receiving node, and with nobody else.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ReceiverKey {
+    /// Names the key in packets.
+    pub id: [u8; 4],
+    /// The key.
+    pub key: SecretBytes,
 }
 
 /// A source, as its owner announces it.
@@ -161,6 +178,9 @@ impl Encode for GrantContent {
                 w.u32(grant.epoch);
                 w.u8(grant.suite);
                 grant.key.encode(w);
+                if RECEIVER_KEY_SUITES.contains(&grant.suite) {
+                    w.option(grant.receiver.as_ref(), |w, r| r.encode(w));
+                }
                 w.list(&grant.sources, |w, s| s.encode(w));
                 w.option(grant.entry.as_ref(), |w, e| e.encode(w));
             }
@@ -196,12 +216,15 @@ impl Encode for GrantContent {
 impl Decode for GrantContent {
     fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
         match r.u8()? {
-            0 => Ok(Self::Topic(TopicGrant {
-                epoch: r.u32()?,
-                suite: r.u8()?,
-                key: SecretBytes::decode(r)?,
-                sources: r.list("sources", GRANT_SOURCES_MAX, SourceAnnounce::decode)?,
-                entry: r.option("entry", |r| CatalogueEntry::decode(r).map(Box::new))?,
+            0 => Ok(Self::Topic({
+                let (epoch, suite, key) = (r.u32()?, r.u8()?, SecretBytes::decode(r)?);
+                let receiver = match RECEIVER_KEY_SUITES.contains(&suite) {
+                    true => r.option("receiver key", ReceiverKey::decode)?,
+                    false => None,
+                };
+                let sources = r.list("sources", GRANT_SOURCES_MAX, SourceAnnounce::decode)?;
+                let entry = r.option("entry", |r| CatalogueEntry::decode(r).map(Box::new))?;
+                TopicGrant { epoch, suite, key, receiver, sources, entry }
             })),
             1 => Ok(Self::Catalogue(Catalogue {
                 version: r.u64()?,
@@ -220,6 +243,19 @@ impl Decode for GrantContent {
             5 => Ok(Self::Consumers(r.list("consumers", CONSUMERS_MAX, Consumer::decode)?)),
             v => Err(DecodeError::value("grant content", v.into())),
         }
+    }
+}
+
+impl Encode for ReceiverKey {
+    fn encode(&self, w: &mut Writer) {
+        w.raw(&self.id);
+        self.key.encode(w);
+    }
+}
+
+impl Decode for ReceiverKey {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        Ok(Self { id: r.array("receiver key id")?, key: SecretBytes::decode(r)? })
     }
 }
 
@@ -325,6 +361,7 @@ mod tests {
             epoch: 3,
             suite: 1,
             key: SecretBytes::new([0xab; 32]),
+            receiver: None,
             sources: vec![announce],
             entry: Some(Box::new(entry.clone())),
         };

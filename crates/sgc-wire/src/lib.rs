@@ -22,7 +22,8 @@ mod type_descriptions;
 
 pub use catalogue::{
     CATALOGUE_ENTRIES_MAX, Catalogue, CatalogueEntry, CatalogueSource, Credentials, ENTRY_SOURCES_MAX,
-    GRANT_SOURCES_MAX, GrantContent, SECRET_GENERATIONS_MAX, SecretGeneration, SourceAnnounce, TopicGrant,
+    GRANT_SOURCES_MAX, GrantContent, RECEIVER_KEY_SUITES, ReceiverKey, SECRET_GENERATIONS_MAX,
+    SecretGeneration, SourceAnnounce, TopicGrant,
 };
 pub use clock::{ClockWatch, PeerClock};
 pub use codec::{Decode, DecodeError, Encode, Reader, Writer};

@@ -121,6 +121,7 @@ fn signed_bodies_and_grants_survive_mutation() {
             epoch: 1,
             suite: 1,
             key: SecretBytes::new([9; 32]),
+            receiver: None,
             sources: vec![SourceAnnounce {
                 source: SourceId([8; 16]),
                 key: Bytes::new(),

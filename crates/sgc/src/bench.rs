@@ -66,7 +66,7 @@ pub(crate) struct MeasureArgs {
     #[arg(long, value_name = "URL", value_delimiter = ',', value_parser = router_url, conflicts_with = "to")]
     router: Vec<String>,
     /// Suites to measure, separated by commas
-    #[arg(long, value_name = "SUITES", value_delimiter = ',', default_value = "group,standard")]
+    #[arg(long, value_name = "SUITES", value_delimiter = ',', default_value = "group,pairwise")]
     suites: Vec<Suite>,
     /// Sizes of messages, separated by commas
     #[arg(long, value_name = "SIZES", value_delimiter = ',', default_value = "16,1000,1MB")]

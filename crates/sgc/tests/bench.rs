@@ -176,10 +176,10 @@ fn a_run_measures_every_way_and_loses_nothing() {
     let output = lab.run("robot.identity", &[&args[..], &files].concat());
     assert!(output.status.success(), "{}", stderr(&output));
     assert_eq!(stderr(&output), "");
-    answer.said("a run goes on: sgc group, sgc standard");
+    answer.said("a run goes on: sgc group, sgc pairwise");
     answer.said("the run is over");
     let report: Value = serde_json::from_slice(&fs::read(lab.dir.path().join("run.json")).unwrap()).unwrap();
-    check(&report, &["sgc group", "sgc standard"], &["TCP", "direct DDS"], &[16, 1000, 100_000]);
+    check(&report, &["sgc group", "sgc pairwise"], &["TCP", "direct DDS"], &[16, 1000, 100_000]);
     check(&report, &[], &["UDP"], &[16, 1000]);
     assert!(report["tcp_mbit_s"].as_f64().unwrap() > 0.0);
     assert_eq!((&report["bare_not"], &report["direct_not"]), (&Value::Null, &Value::Null));

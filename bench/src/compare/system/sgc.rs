@@ -26,12 +26,13 @@ pub(crate) struct Sgc {
     priorities: &'static [(&'static str, &'static str)],
 }
 
-/// Every transport with every suite, and the default transport with a router between.
+/// Every transport with each of three suites, and the default transport with the default suite, and with a router between.
 pub(crate) fn all(program: &Path) -> Result<Vec<Sgc>> {
     let one = |scheme, suite, routers| Sgc::new(program, scheme, suite, routers);
     let pairs = SCHEMES.iter().flat_map(|scheme| SUITES.iter().map(move |suite| (scheme, suite)));
     let without = pairs.map(|(scheme, suite)| one(scheme, suite, 0));
-    without.chain(["group", "standard"].map(|suite| one("quic", suite, 1))).collect()
+    let more = [("pairwise", 0), ("group", 1), ("standard", 1)];
+    without.chain(more.map(|(suite, routers)| one("quic", suite, routers))).collect()
 }
 
 impl Sgc {

@@ -5,17 +5,18 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use rand_core::RngCore;
-use sgc_trust::{DenialReason, Policy, Suite, VerifiedPeer};
+use sgc_trust::{DenialReason, Policy, ReceiverSecret, Suite, VerifiedPeer};
 use sgc_wire::{
     Blind, CatalogueEntry, CatalogueSource, Class, ENTRY_SOURCES_MAX, GRANT_SOURCES_MAX, GrantContent, Kind,
-    Metadata, Name, NodeId, Qos, Recover, RefuseReason, Request, Role, SecretBytes, SinkId, SourceAnnounce,
-    SourceId, TopicGrant,
+    Metadata, Name, NodeId, Qos, ReceiverKey, Recover, RefuseReason, Request, Role, SecretBytes, SinkId,
+    SourceAnnounce, SourceId, TopicGrant,
 };
 
 use super::granted::{GrantedSink, is_older, place};
 use crate::context::Context;
 use crate::output::{Event, UnexpectedFrame};
 use crate::packed_type::PackedType;
+use crate::receivers::Receivers;
 use crate::sink::SinkProgress;
 use crate::source::SourceProgress;
 
@@ -78,6 +79,9 @@ pub(crate) struct Share {
     rotate_at: Instant,
     /// This node's own sources.
     own: Vec<Arc<SourceProgress>>,
+    /// The secret of receiver keys, and the receivers of this node's sources.
+    receiver_secret: ReceiverSecret,
+    receivers: Arc<Receivers>,
     /// Progress of this node's sink with others' sources.
     heard: Option<Arc<SinkProgress>>,
     sinks: BTreeMap<SinkId, GrantedSink>,
@@ -146,6 +150,8 @@ impl Share {
             rotation: None,
             rotate_at: cx.instant() + cx.limits().rotate_every,
             own: Vec::new(),
+            receiver_secret: ReceiverSecret::generate(cx.rng()),
+            receivers: Arc::default(),
             heard: None,
             sinks: BTreeMap::new(),
             told_own: false,
@@ -194,6 +200,11 @@ impl Share {
             Request::Subscribe { .. } | Request::Ask { .. } => None,
         });
         publishers.collect()
+    }
+
+    /// Returns the receivers of this node's sources.
+    pub(crate) fn receivers(&self) -> Arc<Receivers> {
+        self.receivers.clone()
     }
 
     /// Returns the key in use, for this node's sources.
@@ -258,7 +269,7 @@ impl Share {
         let left = self.left.values().any(|(peer, role)| denied(peer, *role).is_some());
         let any = left || !cut.is_empty();
         for (sink, reason) in cut {
-            let Some(granted) = self.sinks.remove(&sink) else { continue };
+            let Some(granted) = self.remove_sink(&sink) else { continue };
             let (name, peer) = (self.name, granted.peer.node_id);
             granted.refuse(cx, name, sink, reason);
             cx.event(Event::SinkCut { name, sink, peer, reason });
@@ -362,8 +373,29 @@ impl Share {
         if granted.grant(cx, self.name, sink, content) {
             return Some(granted.serial);
         }
-        self.sinks.remove(&sink);
+        self.remove_sink(&sink);
         None
+    }
+
+    /// Adds a sink, or renews it. Returns `true` if it was known. The packets of every message that begins after its
+    /// grant has left have a MAC for it.
+    fn insert_sink(&mut self, sink: SinkId, granted: GrantedSink) -> bool {
+        if let Some(key) = self.receiver_key(&granted) {
+            self.receivers.add(sink, granted.peer.node_id, || key);
+        }
+        self.sinks.insert(sink, granted).is_some()
+    }
+
+    fn remove_sink(&mut self, sink: &SinkId) -> Option<GrantedSink> {
+        self.receivers.remove(sink);
+        self.sinks.remove(sink)
+    }
+
+    /// Returns the key that proves packets to a sink, if it receives any: publishers do only of a service.
+    fn receiver_key(&self, granted: &GrantedSink) -> Option<ReceiverKey> {
+        let receives = granted.request.role() == Role::Subscribe || self.is_service();
+        let key = || self.receiver_secret.derive_key(&self.name, &granted.peer.node_id);
+        (self.spec.suite.is_pairwise() && receives).then(key)
     }
 
     /// Updates this node's own sink of a share on which others may publish.
@@ -404,7 +436,7 @@ impl Share {
         // A request may come twice, on another route or under a new certificate: the serials of its answers keep
         // growing.
         let serial = self.sinks.get(&sink).map_or(0, |s| s.serial);
-        let is_known = self.sinks.insert(sink, GrantedSink { serial, ..asked }).is_some();
+        let is_known = self.insert_sink(sink, GrantedSink { serial, ..asked });
         self.left.remove(&peer);
         let content = GrantContent::Topic(self.grant(&self.epoch, self.sinks.get(&sink)));
         let Some(serial) = self.answer(cx, sink, &content) else { return };
@@ -469,7 +501,7 @@ impl Share {
     }
 
     pub(crate) fn handle_leave(&mut self, cx: &mut Context, sink: SinkId) {
-        let Some(granted) = self.sinks.remove(&sink) else { return };
+        let Some(granted) = self.remove_sink(&sink) else { return };
         if let Some(rotation) = &mut self.rotation {
             rotation.waiting.remove(&sink);
         }
@@ -529,6 +561,7 @@ impl Share {
             epoch: epoch.number,
             suite: self.spec.suite.id(),
             key: epoch.key.clone(),
+            receiver: peer.and_then(|granted| self.receiver_key(granted)),
             sources: own.chain(others).take(GRANT_SOURCES_MAX).collect(),
             entry: describe.map(|p| Box::new(self.entry(&p.peer))),
         }

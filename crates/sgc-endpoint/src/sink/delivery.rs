@@ -94,6 +94,8 @@ impl SinkDrop {
             Self::Open(OpenError::Forged) => "sink_forged",
             Self::Open(OpenError::Trailer) => "sink_trailer",
             Self::Open(OpenError::Signature) => "sink_signature",
+            Self::Open(OpenError::NoMac) => "sink_no_mac",
+            Self::Open(OpenError::Mac) => "sink_mac",
             Self::NotForUs => "sink_not_for_us",
             Self::UnknownSource => "sink_unknown_source",
             Self::UnknownEpoch => "sink_unknown_epoch",

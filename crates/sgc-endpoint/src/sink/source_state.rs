@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Release};
 
 use bytes::Bytes;
-use sgc_trust::{BatchVerifier, Freshness, OpenError, ReplayWindow, SourceKey, Suite};
+use sgc_trust::{BatchVerifier, Freshness, MacKey, OpenError, ReplayWindow, SourceKey, Suite, has_macs};
 use sgc_wire::{MessageHead, Name, PacketHeader, SourceAnnounce, SourceId, TopicGrant};
 
 use super::delivery::{AskAgain, Delivery, SinkDrop};
@@ -17,9 +17,9 @@ pub(super) struct SourceState {
     announced_key: Bytes,
     verifier: Option<BatchVerifier>,
     /// Keys for packets to all, by epoch.
-    keys: Vec<SourceKey>,
-    /// The key for packets to this sink, of the epoch seen last.
-    addressed: Option<SourceKey>,
+    keys: Vec<KeyPair>,
+    /// The keys for packets to this sink, of the epoch seen last.
+    addressed: Option<KeyPair>,
     window: ReplayWindow,
     /// The window's newest, for [`SinkProgress`].
     newest: Arc<AtomicU64>,
@@ -36,6 +36,13 @@ pub(super) struct SourceState {
     answer: AnswerState,
     /// The last epoch of the source, if the newest grant no longer announces it.
     last_epoch: Option<u32>,
+}
+
+/// The keys of packets in one epoch.
+struct KeyPair {
+    seal: SourceKey,
+    /// The key of MACs for this node; derived when a packet with MACs has opened, because anybody can send others.
+    mac: Option<MacKey>,
 }
 
 /// Whether messages of a source are missing: a transient-local source's history, or messages lost on a broken route.
@@ -145,8 +152,8 @@ impl SourceState {
 
     /// Drops the keys of earlier epochs than `oldest`.
     pub(super) fn drop_keys_before(&mut self, oldest: u32) {
-        self.keys.retain(|key| key.epoch() >= oldest);
-        self.addressed = self.addressed.take().filter(|key| key.epoch() >= oldest);
+        self.keys.retain(|key| key.seal.epoch() >= oldest);
+        self.addressed = self.addressed.take().filter(|key| key.seal.epoch() >= oldest);
     }
 
     /// Notes that a message was not handed over: it must be asked for, if it can be.
@@ -392,45 +399,69 @@ impl SourceState {
         header: &PacketHeader,
     ) -> Result<(), OpenError> {
         if header.to.is_some() {
-            if self.addressed.as_ref().is_none_or(|key| key.epoch() != header.epoch) {
-                self.addressed = Some(derive(grant, name, header)?);
+            if self.addressed.as_ref().is_none_or(|key| key.seal.epoch() != header.epoch) {
+                self.addressed = Some(KeyPair { seal: derive(grant, name, header)?, mac: None });
             }
-        } else if self.keys.iter().all(|key| key.epoch() != header.epoch) {
-            self.keys.push(derive(grant, name, header)?);
+        } else if self.keys.iter().all(|key| key.seal.epoch() != header.epoch) {
+            self.keys.push(KeyPair { seal: derive(grant, name, header)?, mac: None });
         }
         Ok(())
     }
 
-    /// Opens a packet, whose key is [derived](Self::derive_key), into the buffer, and verifies it if the suite signs.
+    /// Opens a packet, whose key is [derived](Self::derive_key), into the buffer, and verifies its proof if the suite
+    /// has any.
     pub(super) fn open(
         &mut self,
         suite: Suite,
+        grant: &TopicGrant,
         header: &PacketHeader,
         payload: &[u8],
         opened: &mut OpenBuffer,
     ) -> Result<(), OpenError> {
-        let key = if header.to.is_some() {
-            self.addressed.as_ref()
+        let pair = if header.to.is_some() {
+            self.addressed.as_mut()
         } else {
-            self.keys.iter().find(|key| key.epoch() == header.epoch)
+            self.keys.iter_mut().find(|key| key.seal.epoch() == header.epoch)
         };
-        let key = key.ok_or(OpenError::Epoch { found: header.epoch })?;
+        let pair = pair.ok_or(OpenError::Epoch { found: header.epoch })?;
         let out = match opened {
             OpenBuffer::Whole(text) => &mut text[..],
             OpenBuffer::Aside(text) => &mut text[..],
             OpenBuffer::InPlace => self.partials.place(header).unwrap_or_default(),
         };
-        key.open(header, payload, out)?;
-        if suite.is_signed() { self.verify(suite, header, payload) } else { Ok(()) }
+        pair.seal.open(header, payload, out)?;
+        if !suite.is_signed() {
+            return Ok(());
+        }
+        if suite.is_pairwise() && has_macs(header, payload)? {
+            return pair.check_mac(grant, header, payload);
+        }
+        self.verify(suite, header, payload)
     }
 
-    /// Verifies a packet that opened.
+    /// Verifies the signature of a packet that opened.
     fn verify(&mut self, suite: Suite, header: &PacketHeader, payload: &[u8]) -> Result<(), OpenError> {
         if self.verifier.is_none() {
             self.verifier = BatchVerifier::new(suite, &self.announced_key);
         }
         // A source with an unusable key has signed nothing.
         self.verifier.as_mut().ok_or(OpenError::Signature)?.verify(header, payload)
+    }
+}
+
+impl KeyPair {
+    /// Checks the MAC for this node in a packet that opened.
+    fn check_mac(
+        &mut self,
+        grant: &TopicGrant,
+        header: &PacketHeader,
+        payload: &[u8],
+    ) -> Result<(), OpenError> {
+        if self.mac.is_none() {
+            let receiver = grant.receiver.as_ref().ok_or(OpenError::NoMac)?;
+            self.mac = MacKey::derive(receiver, grant, &header.name, &header.source, header.to.as_ref());
+        }
+        self.mac.as_ref().ok_or(OpenError::Suite { found: grant.suite })?.check(header, payload)
     }
 }
 

@@ -6,6 +6,7 @@ mod epochs;
 mod forgery;
 mod messages;
 mod nonces;
+mod pairwise;
 mod recovery;
 
 use std::sync::OnceLock;
@@ -34,7 +35,7 @@ fn message_key(suite: Suite) -> MessageKey {
 /// The grant of an epoch, whose topic key follows from its number.
 fn grant(suite: Suite, epoch: u32, sources: &[SourceAnnounce]) -> TopicGrant {
     let key = SecretBytes::new([epoch as u8; 32]);
-    TopicGrant { epoch, suite: suite.id(), key, sources: sources.to_vec(), entry: None }
+    TopicGrant { epoch, suite: suite.id(), key, receiver: None, sources: sources.to_vec(), entry: None }
 }
 
 fn config(id: u8, history_depth: usize) -> SourceConfig {
@@ -46,6 +47,7 @@ fn config(id: u8, history_depth: usize) -> SourceConfig {
         history_depth,
         history_bytes_max: 1 << 20,
         recovery: RecoveryLimits::default(),
+        receivers: None,
     }
 }
 

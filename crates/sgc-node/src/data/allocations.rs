@@ -8,14 +8,14 @@ use std::sync::mpsc::channel;
 use std::task::{Context, Poll, Waker};
 
 use bytes::Bytes;
-use sgc_endpoint::{RecoveryLimits, Source, SourceConfig};
+use sgc_endpoint::{Receivers, RecoveryLimits, Source, SourceConfig};
 use sgc_ros::{Guid, Sample, SampleKind, Shaping};
 use sgc_router::{FibEntry, LinkId, Tree};
 use sgc_testkit::{CountingAllocator, allocated_here, allocations};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{
-    Class, HOP_LIMIT, MessageHead, MessageKind, Name, Packet, PacketHeader, Payload, SecretBytes, SinkId,
-    SourceId, TopicGrant,
+    Class, HOP_LIMIT, MessageHead, MessageKind, Name, NodeId, Packet, PacketHeader, Payload, ReceiverKey,
+    SecretBytes, SinkId, SourceId, TopicGrant,
 };
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::mpsc;
@@ -58,9 +58,16 @@ fn forwards(data: &DataPlane, up: LinkId, outs: Vec<(LinkId, Out)>) {
     data.set(NAME, Some(Forward::new(entry, outs, Arc::default())));
 }
 
+/// Returns a source and its announcement; in a pairwise suite with the grant of its one receiver.
 fn source(suite: Suite) -> (Source, TopicGrant) {
     let key = SecretBytes::new([7; 32]);
-    let mut grant = TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None };
+    let receiver = suite.is_pairwise().then(|| ReceiverKey { id: [1; 4], key: SecretBytes::new([1; 32]) });
+    let receivers = Arc::<Receivers>::default();
+    if let Some(receiver) = receiver.clone() {
+        receivers.add(SinkId([1; 16]), NodeId([1; 32]), || receiver);
+    }
+    let mut grant =
+        TopicGrant { epoch: 1, suite: suite.id(), key, receiver, sources: Vec::new(), entry: None };
     let config = SourceConfig {
         name: NAME,
         id: SourceId([1; 16]),
@@ -70,6 +77,7 @@ fn source(suite: Suite) -> (Source, TopicGrant) {
         history_bytes_max: 0,
         // The limit is reached before counting begins, so that the history has grown to its size.
         recovery: RecoveryLimits { messages_max: MESSAGES, ..RecoveryLimits::default() },
+        receivers: Some(receivers),
     };
     let source = Source::new(config, &grant, MessageKey::generate(suite)).expect("a key of the suite");
     grant.sources.push(source.announce());
@@ -124,9 +132,12 @@ fn a_proxy_allocates_less_than_once_for_a_sample_that_it_shares() {
     let _inside = runtime.enter();
     // Number of messages that are ready together. A single one needs a signature of its own, for which the provider
     // allocates.
-    for (suite, at_once, most) in
-        [(Suite::Group, 1, 0.5), (Suite::Standard, 1, 1.0), (Suite::Standard, 20, 0.5)]
-    {
+    for (suite, at_once, most) in [
+        (Suite::Group, 1, 0.5),
+        (Suite::Pairwise, 1, 0.5),
+        (Suite::Standard, 1, 1.0),
+        (Suite::Standard, 20, 0.5),
+    ] {
         let (data, flow) = (Arc::<DataPlane>::default(), OutFlow::idle());
         forwards(&data, LinkId::LOCAL, vec![(LinkId(1), Out::Link(flow.clone(), Arc::default()))]);
         let (alive, _) = mpsc::channel(1);
@@ -161,9 +172,12 @@ fn a_proxy_allocates_less_than_once_for_a_sample_that_it_shares() {
 fn a_proxy_allocates_less_than_once_for_a_message_that_it_brings() {
     let runtime = runtime();
     let _inside = runtime.enter();
-    for (suite, at_once, most) in
-        [(Suite::Group, 1, 0.5), (Suite::Standard, 1, 0.5), (Suite::Standard, 20, 0.5)]
-    {
+    for (suite, at_once, most) in [
+        (Suite::Group, 1, 0.5),
+        (Suite::Pairwise, 1, 0.5),
+        (Suite::Standard, 1, 0.5),
+        (Suite::Standard, 20, 0.5),
+    ] {
         let (mut source, grant) = source(suite);
         let (requests, _requested) = mpsc::channel(1);
         let sink = Arc::new(LocalSink::new(NAME, false, requests, Arc::default()));

@@ -664,7 +664,8 @@ mod tests {
         let sink = Arc::new(LocalSink::new(Name([1; 32]), false, requests, Arc::default()));
         let (id, key, suite) = (SinkId([9; 16]), SecretBytes::new([3; 32]), Suite::Group);
         let data = Arc::<DataPlane>::default();
-        let grant = TopicGrant { epoch: 1, suite: suite.id(), key, sources: Vec::new(), entry: None };
+        let grant =
+            TopicGrant { epoch: 1, suite: suite.id(), key, receiver: None, sources: Vec::new(), entry: None };
         sink.grant(id, grant.clone(), &data);
         let sources_max = SinkLimits::default().sources_max;
         for n in 0..2 * sources_max as u128 {
@@ -676,6 +677,7 @@ mod tests {
                 history_depth: 1,
                 history_bytes_max: 1 << 10,
                 recovery: RecoveryLimits::default(),
+                receivers: None,
             };
             let mut source = Source::new(config, &grant, MessageKey::generate(suite)).unwrap();
             let mut packets = Vec::new();

@@ -374,6 +374,7 @@ impl Running {
             history_depth: sharing.depth,
             history_bytes_max: HISTORY_BYTES_MAX,
             recovery: sharing.recovery,
+            receivers: self.endpoint.receivers(&name),
         };
         let grant = self.endpoint.share_grant(&name).expect("shared above");
         let message_key = MessageKey::generate(suite);

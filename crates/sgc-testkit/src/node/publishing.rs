@@ -60,6 +60,7 @@ impl Running {
                 history_depth: 0,
                 history_bytes_max: 0,
                 recovery: RecoveryLimits::NONE,
+                receivers: None,
             };
             let message_key = MessageKey::generate(suite);
             let offer = SourceOffer { source: config.id, key: message_key.public().clone() };

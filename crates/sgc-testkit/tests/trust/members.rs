@@ -1,11 +1,14 @@
 //! Members, and routers that help them, act as other nodes.
 
+use std::sync::Arc;
+
 use bytes::Bytes;
-use sgc_endpoint::{JoinStatus, PARKED_PACKETS_MAX, RecoveryLimits, Source, SourceConfig};
+use sgc_endpoint::{JoinStatus, PARKED_PACKETS_MAX, Receivers, RecoveryLimits, Source, SourceConfig};
 use sgc_testkit::{DataDrop, Member, NodeKey, World, WorldConfig, identity};
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{
-    AdvertBody, Class, Control, Decode, Hello, MessageHead, MessageKind, Packet, SourceId, TopicGrant,
+    AdvertBody, Class, Control, Decode, Hello, MessageHead, MessageKind, NodeId, Packet, SinkId, SourceId,
+    TopicGrant,
 };
 
 use crate::{
@@ -13,8 +16,14 @@ use crate::{
     scene_with, sink_drops,
 };
 
-/// Returns packets that a member seals under its grant with a key of its own, as `source`, from message `from` on.
+/// Returns packets that a member seals under its grant, as `source`, from message `from` on. It signs with a key of its
+/// own, or makes MACs under its receiver key, if it has one.
 fn forged(world: &World, owner: NodeKey, grant: &TopicGrant, source: SourceId, from: u64) -> Vec<Packet> {
+    let receivers = grant.receiver.clone().map(|own| {
+        let all = Arc::<Receivers>::default();
+        all.add(SinkId([1; 16]), NodeId([1; 32]), || own);
+        all
+    });
     let config = SourceConfig {
         name: world.name(owner, "/chatter"),
         id: source,
@@ -23,6 +32,7 @@ fn forged(world: &World, owner: NodeKey, grant: &TopicGrant, source: SourceId, f
         history_depth: 0,
         history_bytes_max: 0,
         recovery: RecoveryLimits::default(),
+        receivers,
     };
     let suite = Suite::from_id(grant.suite).expect("a suite of this build");
     let mut source = Source::new(config, grant, MessageKey::generate(suite)).expect("a key that fits");
@@ -77,12 +87,18 @@ fn assert_goes_on(scene: &mut Scene) {
 
 #[test]
 fn a_member_that_forges_anothers_message_is_detected_by_every_other_member() {
-    for suite in [Suite::Standard, Suite::StandardChacha, Suite::Paper] {
+    for (suite, reason) in [
+        (Suite::Standard, "sink_signature"),
+        (Suite::StandardChacha, "sink_signature"),
+        (Suite::Paper, "sink_signature"),
+        (Suite::Pairwise, "sink_no_mac"),
+        (Suite::PairwiseChacha, "sink_no_mac"),
+    ] {
         let mut scene =
             flowing_with(WorldConfig::new(60), |s| sgc_testkit::Sharing { suite: Some(suite), ..s });
         let source = source_of(&mut scene);
         let found = play_forged(&mut scene, source);
-        assert_eq!(found, vec![vec![("sink_signature", 10)]; 2], "{suite}");
+        assert_eq!(found, vec![vec![(reason, 10)]; 2], "{suite}");
         assert_goes_on(&mut scene);
     }
 }

@@ -206,6 +206,7 @@ impl<N: RosNetwork> Core<N> {
             History::KeepAll => HISTORY_KEEP_ALL_MAX,
             History::KeepLast(n) => (n as usize).saturating_mul(instances).min(HISTORY_KEEP_ALL_MAX),
         };
+        let receivers = self.endpoint.receivers(&name);
         let slot = |id, qos: &Qos, sources: usize| {
             let (keeps_history, depth) = (qos.is_transient_local(), depth_of(qos));
             let config = SourceConfig {
@@ -216,6 +217,7 @@ impl<N: RosNetwork> Core<N> {
                 history_depth: depth,
                 history_bytes_max: HISTORY_BYTES_MAX,
                 recovery: RecoveryLimits { bytes_max: share_of(recovery.bytes_max, sources), ..recovery },
+                receivers: receivers.clone(),
             };
             let source = Source::new(config, &grant, message_key.clone())?;
             let manual = ManualLease::from_qos(qos, Instant::now());
@@ -253,8 +255,17 @@ impl<N: RosNetwork> Core<N> {
                 let id = self.endpoint.new_source_id();
                 let recovery = RecoveryLimits::NONE;
                 let (history_depth, history_bytes_max, reliable) = (0, 0, true);
-                let config =
-                    SourceConfig { name, id, class, reliable, history_depth, history_bytes_max, recovery };
+                let receivers = receivers.clone();
+                let config = SourceConfig {
+                    name,
+                    id,
+                    class,
+                    reliable,
+                    history_depth,
+                    history_bytes_max,
+                    recovery,
+                    receivers,
+                };
                 Some(SourceSlot::new(Source::new(config, &grant, message_key.clone())?, false, reliable))
             });
         }

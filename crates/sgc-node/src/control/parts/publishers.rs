@@ -116,8 +116,10 @@ impl Publishers {
         let OfferedSource { id, class, reliable, .. } = *publisher;
         // Only sources of the owner can be asked for missing messages.
         let recovery = RecoveryLimits::NONE;
-        let (history_depth, history_bytes_max) = (0, 0);
-        let config = SourceConfig { name, id, class, reliable, history_depth, history_bytes_max, recovery };
+        // The owner has the keys of the receivers, and only the owner.
+        let (history_depth, history_bytes_max, receivers) = (0, 0, None);
+        let config =
+            SourceConfig { name, id, class, reliable, history_depth, history_bytes_max, recovery, receivers };
         let source = self.key(grant.suite).and_then(|key| Source::new(config, grant, key));
         Some(GrantStep::Anew(source.map(|source| SourceSlot::new(source, false, reliable))))
     }
@@ -237,7 +239,7 @@ mod tests {
         let begin = Instant::now();
         let grant = |epoch, key: u8| {
             let (suite, key) = (Suite::Group.id(), SecretBytes::new([key; 32]));
-            TopicGrant { epoch, suite, key, sources: Vec::new(), entry: None }
+            TopicGrant { epoch, suite, key, receiver: None, sources: Vec::new(), entry: None }
         };
         assert!(
             publishers.granted(begin, Name([9; 32]), &grant(1, 1)).is_none(),

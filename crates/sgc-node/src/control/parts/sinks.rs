@@ -176,7 +176,7 @@ mod tests {
         sink.set_writer(Some(SOURCE), Some(writer.unwrap()));
         let announce = SourceAnnounce { source: SOURCE, key: Bytes::new(), oldest: 3, next: 9, recover: 0 };
         let (suite, key) = (Suite::Group.id(), SecretBytes::new([3; 32]));
-        let grant = TopicGrant { epoch: 1, suite, key, sources: vec![announce], entry: None };
+        let grant = TopicGrant { epoch: 1, suite, key, receiver: None, sources: vec![announce], entry: None };
         sinks.grant(Instant::now(), NAME, SinkId([4; 16]), grant);
         (sinks, requested)
     }

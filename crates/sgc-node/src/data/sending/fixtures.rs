@@ -41,7 +41,7 @@ pub(crate) fn sample(writer: Guid, more: bool) -> Sample {
 /// Creates the grant of an epoch.
 pub(crate) fn grant(epoch: u32) -> TopicGrant {
     let key = SecretBytes::new([epoch as u8; 32]);
-    TopicGrant { epoch, suite: Suite::Standard.id(), key, sources: Vec::new(), entry: None }
+    TopicGrant { epoch, suite: Suite::Standard.id(), key, receiver: None, sources: Vec::new(), entry: None }
 }
 
 fn new_source(id: u8, history_depth: usize, recovery: RecoveryLimits) -> Source {
@@ -53,6 +53,7 @@ fn new_source(id: u8, history_depth: usize, recovery: RecoveryLimits) -> Source 
         history_depth,
         history_bytes_max: 1000,
         recovery,
+        receivers: None,
     };
     Source::new(config, &grant(1), MessageKey::generate(Suite::Standard)).unwrap()
 }
