@@ -1,27 +1,37 @@
-//! [`Receivers`]: the granted sinks of a share with a `pairwise` suite, for which its sources make MACs.
+//! [`Receivers`]: the nodes that share a key with the owner of a name, for the MACs of a `pairwise` suite.
 //!
 //! The owner changes the set before it sends a grant or after it took one back. The sources of its node read the set for
-//! each message, on their own threads.
+//! each message, on their own threads. The owner's sink of a service finds the keys of callers in it. At a caller, the
+//! set has the one key that it shares with the owner.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
 use sgc_sync::lock;
 use sgc_trust::RECEIVERS_MAX;
-use sgc_wire::{NodeId, ReceiverKey, SinkId};
+use sgc_wire::{NodeId, ReceiverKey, SinkId, SourceId};
 
-/// The receivers of one share.
+/// The nodes with receiver keys of one name.
 #[derive(Debug, Default)]
 pub struct Receivers(Mutex<Granted>);
 
 #[derive(Debug, Default)]
 struct Granted {
     sinks: BTreeMap<SinkId, NodeId>,
+    /// The sinks of callers, by the sources of their requests.
+    callers: BTreeMap<SourceId, SinkId>,
     /// Each node with its key and its number of sinks.
     nodes: BTreeMap<NodeId, (Arc<ReceiverKey>, usize)>,
 }
 
 impl Receivers {
+    /// Returns the set of a caller: the owner is the one receiver of its requests.
+    pub fn of_caller(shared_with_owner: ReceiverKey) -> Self {
+        // Nobody asks for the id of the owner.
+        let owner = (NodeId([0; 32]), (Arc::new(shared_with_owner), 1));
+        Self(Mutex::new(Granted { nodes: [owner].into(), ..Granted::default() }))
+    }
+
     /// Adds a sink of a node, with the key of a new node. A known sink stays as it is.
     pub fn add(&self, sink: SinkId, node: NodeId, key: impl FnOnce() -> ReceiverKey) {
         let granted = &mut *lock(&self.0);
@@ -33,9 +43,15 @@ impl Receivers {
         granted.sinks.insert(sink, node);
     }
 
+    /// Notes the source under which the node of a granted sink calls.
+    pub fn set_caller(&self, source: SourceId, sink: SinkId) {
+        lock(&self.0).callers.insert(source, sink);
+    }
+
     /// Removes a sink.
     pub fn remove(&self, sink: &SinkId) {
         let granted = &mut *lock(&self.0);
+        granted.callers.retain(|_, caller| caller != sink);
         let Some(node) = granted.sinks.remove(sink) else { return };
         if let Some((_, count)) = granted.nodes.get_mut(&node) {
             *count -= 1;
@@ -50,6 +66,12 @@ impl Receivers {
         let granted = lock(&self.0);
         let (key, _) = granted.nodes.get(granted.sinks.get(sink)?)?;
         Some(key.clone())
+    }
+
+    /// Returns the key of the node that calls under a source.
+    pub(crate) fn key_of_caller(&self, source: &SourceId) -> Option<Arc<ReceiverKey>> {
+        let sink = *lock(&self.0).callers.get(source)?;
+        self.key_of(&sink)
     }
 
     /// Sets `listed` to the keys of all receivers, unless they are too many for MACs.
@@ -114,6 +136,19 @@ mod tests {
         assert_eq!(update(&receivers, &mut listed), (Unchanged, vec![1, 2]));
         receivers.remove(&SinkId([3; 16]));
         assert_eq!(update(&receivers, &mut listed), (Changed, vec![2]));
+    }
+
+    #[test]
+    fn callers_are_known_by_their_sources_while_their_sinks_are_granted() {
+        let receivers = Receivers::default();
+        let key_of = |n| receivers.key_of_caller(&SourceId([n; 16])).map(|key| key.id[0]);
+        for n in [1, 2] {
+            add(&receivers, n, n);
+            receivers.set_caller(SourceId([n; 16]), SinkId([n; 16]));
+        }
+        assert_eq!([1, 2, 3].map(key_of), [Some(1), Some(2), None]);
+        receivers.remove(&SinkId([1; 16]));
+        assert_eq!([1, 2].map(key_of), [None, Some(2)]);
     }
 
     #[test]

@@ -29,6 +29,7 @@ pub use self::parking::{PARKED_BYTES_MAX, PARKED_LOOKS_MAX, PARKED_PACKETS_MAX};
 use self::open_buffer::OpenBuffer;
 use self::parking::{ParkedPacket, Parking};
 use self::source_state::{SourceState, derive, oldest_of_mark};
+use crate::receivers::Receivers;
 use crate::source::without_lists;
 
 /// Epochs whose keys are held at once. A past epoch is held until [`Sink::retire_epochs`]; beyond this number the
@@ -89,6 +90,8 @@ pub struct Sink {
     /// Ascending; never empty.
     epochs: Vec<TopicGrant>,
     sources: BTreeMap<SourceId, SourceState>,
+    /// The keys of callers, at the owner of a service.
+    callers: Option<Arc<Receivers>>,
     parking: Parking,
     incomplete: u64,
     scratch: Vec<u8>,
@@ -107,6 +110,7 @@ impl Sink {
             limits,
             epochs: vec![without_lists(&grant)],
             sources: BTreeMap::new(),
+            callers: None,
             parking: Parking::default(),
             incomplete: 0,
             scratch: Vec::new(),
@@ -115,6 +119,11 @@ impl Sink {
         };
         sink.announce(grant.sources, None, false, &mut |_| ());
         sink
+    }
+
+    /// Believes the MACs of callers whose keys are in this set. The owner of a service calls it for its own sink.
+    pub fn set_callers(&mut self, callers: Arc<Receivers>) {
+        self.callers = Some(callers);
     }
 
     /// Takes a further grant, and returns the results of the packets that waited for it.
@@ -370,7 +379,8 @@ impl Sink {
             scratch.resize(text_bytes, 0);
             OpenBuffer::Aside(scratch)
         };
-        let delivery = match source.open(suite, grant, header, payload, &mut opened) {
+        let callers = self.callers.as_deref();
+        let delivery = match source.open(suite, grant, callers, header, payload, &mut opened) {
             Ok(()) => self.accept(header, &mut opened),
             Err(error) => Err(error.into()),
         };

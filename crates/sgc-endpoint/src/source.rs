@@ -41,7 +41,7 @@ pub struct SourceConfig {
     pub history_bytes_max: usize,
     /// Bounds of messages kept beyond that for recovery; of reliable sources only.
     pub recovery: RecoveryLimits,
-    /// The receivers, where this node owns the name: a `pairwise` suite then needs no signature while they are few.
+    /// The receivers, if this node has their keys: a `pairwise` suite then needs no signature while they are few.
     pub receivers: Option<Arc<Receivers>>,
 }
 

@@ -127,8 +127,8 @@ fn caller(lab: &Lab, name: &str) -> Node {
 fn every_client_anywhere_gets_its_own_answers_and_no_other() {
     const CALLS: usize = 25;
     let lab = Lab::new(&["robot", "desk", "tablet"]);
-    let (_cloud, _robot) = (lab.cloud(), robot(&lab, &["desk", "tablet"]));
-    let (_desk, _tablet) = (caller(&lab, "desk"), caller(&lab, "tablet"));
+    let (_cloud, robot) = (lab.cloud(), robot(&lab, &["desk", "tablet"]));
+    let (desk, tablet) = (caller(&lab, "desk"), caller(&lab, "tablet"));
     let server = Server::new(&lab.net("robot"), "/add");
     let clients = ["desk", "desk", "tablet"].map(|node| Client::new(&lab.net(node), "/add"));
     let mut open: [BTreeMap<RequestId, String>; 3] = Default::default();
@@ -151,6 +151,13 @@ fn every_client_anywhere_gets_its_own_answers_and_no_other() {
     }
     clients.iter().for_each(Client::hears_nothing);
     server.takes_nothing();
+    // In the default suite, both ends of a call prove their messages without a signature.
+    for node in [&robot, &desk, &tablet] {
+        let status = node.status();
+        let route =
+            status["routes"].as_array().unwrap().iter().find(|route| route["topic"] == "/add").unwrap();
+        assert!(route["messages"].as_u64() > Some(0) && route["signatures"] == 0, "{route}");
+    }
 }
 
 #[test]

@@ -382,6 +382,9 @@ impl Share {
     fn insert_sink(&mut self, sink: SinkId, granted: GrantedSink) -> bool {
         if let Some(key) = self.receiver_key(&granted) {
             self.receivers.add(sink, granted.peer.node_id, || key);
+            if let Request::Publish { offer } = &granted.request {
+                self.receivers.set_caller(offer.source, sink);
+            }
         }
         self.sinks.insert(sink, granted).is_some()
     }
@@ -391,7 +394,8 @@ impl Share {
         self.sinks.remove(sink)
     }
 
-    /// Returns the key that proves packets to a sink, if it receives any: publishers do only of a service.
+    /// Returns the key that proves packets to a sink, if it receives any. Of publishers only the callers of a service do,
+    /// and it also proves their requests.
     fn receiver_key(&self, granted: &GrantedSink) -> Option<ReceiverKey> {
         let receives = granted.request.role() == Role::Subscribe || self.is_service();
         let key = || self.receiver_secret.derive_key(&self.name, &granted.peer.node_id);

@@ -10,6 +10,7 @@ use sgc_wire::{MessageHead, Name, PacketHeader, SourceAnnounce, SourceId, TopicG
 use super::delivery::{AskAgain, Delivery, SinkDrop};
 use super::open_buffer::OpenBuffer;
 use super::partial::Partials;
+use crate::receivers::Receivers;
 
 /// An announced source.
 pub(super) struct SourceState {
@@ -414,6 +415,7 @@ impl SourceState {
         &mut self,
         suite: Suite,
         grant: &TopicGrant,
+        callers: Option<&Receivers>,
         header: &PacketHeader,
         payload: &[u8],
         opened: &mut OpenBuffer,
@@ -434,7 +436,7 @@ impl SourceState {
             return Ok(());
         }
         if suite.is_pairwise() && has_macs(header, payload)? {
-            return pair.check_mac(grant, header, payload);
+            return pair.check_mac(grant, callers, header, payload);
         }
         self.verify(suite, header, payload)
     }
@@ -450,15 +452,18 @@ impl SourceState {
 }
 
 impl KeyPair {
-    /// Checks the MAC for this node in a packet that opened.
+    /// Checks the MAC for this node in a packet that opened. The key is that of the grant, or at the owner of a service
+    /// that of the calling node.
     fn check_mac(
         &mut self,
         grant: &TopicGrant,
+        callers: Option<&Receivers>,
         header: &PacketHeader,
         payload: &[u8],
     ) -> Result<(), OpenError> {
         if self.mac.is_none() {
-            let receiver = grant.receiver.as_ref().ok_or(OpenError::NoMac)?;
+            let caller = callers.and_then(|callers| callers.key_of_caller(&header.source));
+            let receiver = grant.receiver.as_ref().or(caller.as_deref()).ok_or(OpenError::NoMac)?;
             self.mac = MacKey::derive(receiver, grant, &header.name, &header.source, header.to.as_ref());
         }
         self.mac.as_ref().ok_or(OpenError::Suite { found: grant.suite })?.check(header, payload)

@@ -159,6 +159,45 @@ fn a_receiver_cannot_forge_the_source_to_another() {
     }
 }
 
+/// A request of a service: its caller shares a key with the owner, who is the only receiver.
+#[test]
+fn callers_prove_their_requests_to_the_owner_and_not_for_each_other() {
+    let (suite, owner) = (Suite::Pairwise, Owner::new());
+    let caller = |node: u8, id: u8| {
+        let receivers = Some(Arc::new(Receivers::of_caller(owner.key(node))));
+        source_with(suite, SourceConfig { receivers, recovery: RecoveryLimits::NONE, ..config(id, 0) })
+    };
+    let (mut one, mut other) = (caller(1, 5), caller(2, 6));
+    for (node, source) in [(1, &one), (2, &other)] {
+        let sink = SinkId([node; 16]);
+        owner.receivers.add(sink, NodeId([node; 32]), || owner.key(node));
+        owner.receivers.set_caller(source.id(), sink);
+    }
+    let mut sink = sink(suite, &[&one, &other]);
+    sink.set_callers(owner.receivers.clone());
+    for (n, source) in [&mut one, &mut other].into_iter().enumerate() {
+        assert_eq!(delivered(&mut sink, &published(source, bytes(20 + n), false)), [bytes(20 + n)]);
+        assert_eq!(source.progress().signatures(), 0);
+    }
+    assert_eq!(sink.signatures_checked(), 0);
+    // The second caller calls as the first, whose key it does not have.
+    let mut forger = caller(2, 5);
+    for _ in 0..3 {
+        let forged = published(&mut forger, bytes(40), false);
+        assert!(delivered(&mut sink, &forged).is_empty());
+    }
+    let forged = published(&mut forger, bytes(40), false);
+    assert_eq!(sink.handle_packet(&forged[0]), Err(OpenError::NoMac.into()));
+    assert_eq!(delivered(&mut sink, &published(&mut one, bytes(50), false)), [bytes(50)]);
+    // A caller that is not granted any more is not believed in the epochs that it has not used.
+    owner.receivers.remove(&SinkId([2; 16]));
+    let next = grant(suite, 2, &announced(&[&one, &other]));
+    assert!(regranted(&mut sink, SINK, next.clone()).is_empty());
+    assert!(other.rekey(&next, |_| ()) && one.rekey(&next, |_| ()));
+    assert_eq!(sink.handle_packet(&published(&mut other, bytes(60), false)[0]), Err(OpenError::NoMac.into()));
+    assert_eq!(delivered(&mut sink, &published(&mut one, bytes(60), false)), [bytes(60)]);
+}
+
 #[test]
 fn sink_without_a_receiver_key_takes_signatures_only() {
     let (suite, owner) = (Suite::Pairwise, Owner::new());

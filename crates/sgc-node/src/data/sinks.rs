@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
-use sgc_endpoint::{AskAgain, Delivery, Message, Sink, SinkDrop, SinkLimits, SinkProgress};
+use sgc_endpoint::{AskAgain, Delivery, Message, Receivers, Sink, SinkDrop, SinkLimits, SinkProgress};
 use sgc_ros::Shaping;
 use sgc_router::LinkId;
 use sgc_sync::lock;
@@ -39,6 +39,8 @@ pub(crate) enum SinkRequest {
 
 struct State {
     sink: Option<Sink>,
+    /// The keys of callers, if it is the sink of our own share.
+    callers: Option<Arc<Receivers>>,
     /// Number of releases under way: messages that waited for a grant and are not written yet.
     releases: u32,
     /// Sources whose recoverable messages were skipped, because they had no writer.
@@ -74,7 +76,7 @@ impl LocalSink {
         holds: Arc<PendingBytes>,
     ) -> Self {
         let held = PendingQueue::new(WRITER_MESSAGES_MAX, holds);
-        let state = State { sink: None, releases: 0, missed: BTreeSet::new(), held };
+        let state = State { sink: None, callers: None, releases: 0, missed: BTreeSet::new(), held };
         Self {
             name,
             transient_local,
@@ -107,6 +109,15 @@ impl LocalSink {
         last.map(|last| last.elapsed())
     }
 
+    /// Sets where the keys of callers are, for the sink of our own service.
+    pub(crate) fn set_callers(&self, callers: Arc<Receivers>) {
+        let state = &mut *self.lock();
+        if let Some(sink) = &mut state.sink {
+            sink.set_callers(callers.clone());
+        }
+        state.callers = Some(callers);
+    }
+
     /// Applies a grant. A task writes the packets that waited for it, since that may take a while.
     pub(crate) fn grant(self: &Arc<Self>, id: SinkId, grant: TopicGrant, data: &Arc<impl CountDrops>) {
         let mut released = Vec::new();
@@ -126,7 +137,11 @@ impl LocalSink {
                 }
                 sink => {
                     let limits = SinkLimits::default();
-                    *sink = Some(Sink::new(self.name, id, grant, self.transient_local, limits));
+                    let mut new = Sink::new(self.name, id, grant, self.transient_local, limits);
+                    if let Some(callers) = state.callers.clone() {
+                        new.set_callers(callers);
+                    }
+                    *sink = Some(new);
                 }
             }
             if released.is_empty() {
@@ -349,7 +364,7 @@ impl LocalSink {
     pub(crate) async fn deliver(&self, packet: Packet, drops: &Drops) -> Result<(), Dropped> {
         let (result, behind, turn) = {
             let mut state = self.lock();
-            let State { sink, releases, missed, held } = &mut *state;
+            let State { sink, releases, missed, held, .. } = &mut *state;
             let Some(sink) = sink else { return Err(Dropped::one(DataDrop::NotGranted)) };
             let source = packet.header.source;
             if !self.has_writer(&source) && sink.recovers(&source) {

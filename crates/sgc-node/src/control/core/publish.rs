@@ -82,6 +82,9 @@ impl<N: RosNetwork> Core<N> {
         let own: Vec<_> = self.shares.get(&name).iter().flat_map(|s| s.map().ids()).collect();
         let others = grant.sources.iter().any(|s| !own.contains(&s.source));
         let sink = self.sinks.get_or_add_own(name);
+        if let Some(callers) = self.endpoint.receivers(&name) {
+            sink.set_callers(callers);
+        }
         self.apply_type(&name);
         // This node's own messages do not come back to it, since its sink receives only others'.
         self.sinks.grant(now().instant, name, SinkId([0; 16]), grant);

@@ -2,9 +2,10 @@
 //! with the signing keys of this node's messages.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use sgc_endpoint::{RecoveryLimits, Source, SourceConfig};
+use sgc_endpoint::{Receivers, RecoveryLimits, Source, SourceConfig};
 use sgc_ros::Shaping;
 use sgc_trust::{MessageKey, Suite};
 use sgc_wire::{Class, Name, NodeId, SourceId, SourceOffer, TopicGrant};
@@ -116,8 +117,9 @@ impl Publishers {
         let OfferedSource { id, class, reliable, .. } = *publisher;
         // Only sources of the owner can be asked for missing messages.
         let recovery = RecoveryLimits::NONE;
-        // The owner has the keys of the receivers, and only the owner.
-        let (history_depth, history_bytes_max, receivers) = (0, 0, None);
+        let (history_depth, history_bytes_max) = (0, 0);
+        // Of a service the owner is the only receiver. Of a topic, nobody but the owner has the keys of receivers.
+        let receivers = grant.receiver.clone().map(|key| Arc::new(Receivers::of_caller(key)));
         let config =
             SourceConfig { name, id, class, reliable, history_depth, history_bytes_max, recovery, receivers };
         let source = self.key(grant.suite).and_then(|key| Source::new(config, grant, key));
