@@ -42,13 +42,17 @@ const RECENT_MAX: usize = 4096;
 pub(crate) const AT_ONCE_BYTES_MAX: usize = 16 << 10;
 /// Least time between two liveliness assertions of a writer. It is shorter than any lease that is asserted.
 const ASSERTION_SPACING: Duration = Duration::from_millis(20);
-/// Longest time for which messages of a new reliable writer wait for its first local reader. DDS programs that start
-/// together find each other within about a second.
+/// Longest time for which messages of a reliable writer wait for a local reader, if the writer is new or [was
+/// silent](SILENCE_MIN). DDS programs that start together find each other within about a second.
 const FIRST_READER_WAIT_MAX: Duration = Duration::from_secs(2);
 /// Messages do not wait for the first reader once they fill half of this, or half of the places in the queue.
 const FIRST_READER_BYTES_MAX: usize = 2 << 20;
-/// Time between two looks for the first reader.
+/// Time between two looks for the first reader, at first and at most.
 const FIRST_READER_LOOK: Duration = Duration::from_millis(5);
+const FIRST_READER_LOOK_MAX: Duration = Duration::from_millis(50);
+/// Silence after which a writer that lost its readers counts as new. A publisher that is restarted publishes through
+/// the writer of the one before, and its subscriber may be restarted with it.
+const SILENCE_MIN: Duration = Duration::from_millis(200);
 /// Longest time that a local writer may block the network.
 const WRITER_PATIENCE: Duration = Duration::from_secs(5);
 
@@ -61,9 +65,11 @@ pub(crate) struct WriterQueue {
     /// Held by the thread from before it takes a message until it has consumed it, so that no other message overtakes.
     take: Mutex<MessageConsumer>,
     info: WriterInfo,
-    opened: Instant,
-    /// Whether messages wait until the writer has its first reader.
+    /// Whether messages wait until the writer has a reader, and since when.
     awaits_reader: AtomicBool,
+    awaits_since: Mutex<Instant>,
+    /// Whether the writer ever had a reader, as far as that was seen.
+    had_reader: AtomicBool,
     /// Whether liveliness was asserted just now, or is being asserted.
     is_asserted: Arc<AtomicBool>,
     /// Closed once the thread has consumed everything.
@@ -329,8 +335,9 @@ impl WriterQueue {
             shaper: shaper.into(),
             is_unshaped: AtomicBool::new(shaping == Shaping::default()),
             take: Mutex::new(Box::new(take)),
-            opened: Instant::now(),
             awaits_reader: AtomicBool::new(info.awaits_reader),
+            awaits_since: Mutex::new(Instant::now()),
+            had_reader: AtomicBool::new(false),
             info,
             is_asserted: Arc::default(),
             thread: running,
@@ -364,22 +371,47 @@ impl WriterQueue {
         Ok(this)
     }
 
-    /// Waits until the writer has its first reader, for a bounded time. Returns the number of messages that waited in
-    /// vain.
+    /// Waits until the writer has a reader, for a bounded time, if it is new or was silent. Returns the number of
+    /// messages that waited in vain.
     fn await_first_reader(&self) -> usize {
         if !self.awaits_reader.load(Relaxed) {
             return 0;
         }
+        let since = *lock(&self.awaits_since);
         let may_wait = || {
-            self.opened.elapsed() < FIRST_READER_WAIT_MAX
+            since.elapsed() < FIRST_READER_WAIT_MAX
                 && self.queue.has_headroom(FIRST_READER_BYTES_MAX)
                 && !self.queue.is_closed()
         };
+        let mut look = FIRST_READER_LOOK;
         while self.matched() == 0 && may_wait() {
-            thread::sleep(FIRST_READER_LOOK);
+            thread::sleep(look);
+            look = (look * 2).min(FIRST_READER_LOOK_MAX);
         }
         self.awaits_reader.store(false, Relaxed);
-        if self.matched() == 0 { self.queue.len() } else { 0 }
+        if self.matched() > 0 {
+            self.had_reader.store(true, Relaxed);
+            return 0;
+        }
+        self.queue.len()
+    }
+
+    /// Lets messages wait for a reader again, if the writer has lost its readers and was silent.
+    fn note_silence(&self) {
+        if !self.info.awaits_reader {
+            return;
+        }
+        if self.matched() > 0 {
+            if !self.had_reader.load(Relaxed) {
+                self.had_reader.store(true, Relaxed);
+            }
+            return;
+        }
+        let was_silent = || self.last_written().is_some_and(|at| at.elapsed() >= SILENCE_MIN);
+        if self.had_reader.load(Relaxed) && !self.awaits_reader.load(Relaxed) && was_silent() {
+            *lock(&self.awaits_since) = Instant::now();
+            self.awaits_reader.store(true, Relaxed);
+        }
     }
 
     /// Returns the consumer if it takes a message now without blocking and the queue is empty. Only one caller queues
@@ -400,6 +432,7 @@ impl WriterQueue {
     /// room.
     pub(crate) fn try_push(&self, message: Message, may_write: bool) -> WriteOutcome {
         let (bytes, head) = (message.payload.len(), message.head);
+        self.note_silence();
         let mut evicted = 0;
         let at_once = may_write.then(|| self.at_once(&message)).flatten();
         if let Some(mut take) = at_once {
@@ -419,6 +452,7 @@ impl WriterQueue {
     /// Queues a message once there is room. Fails if there is none for too long.
     pub(crate) async fn push(&self, message: Message) -> Result<(), PushError> {
         let (bytes, head) = (message.payload.len(), message.head);
+        self.note_silence();
         self.queue.push(message, bytes, WRITER_BYTES_MAX, WRITER_PATIENCE).await?;
         self.remember(&head);
         Ok(())
@@ -667,13 +701,19 @@ pub(crate) mod tests {
     fn awaiting() -> (Arc<WriterQueue>, Arc<AtomicU32>, OrderLog) {
         let (readers, written) = (Arc::new(AtomicU32::new(0)), OrderLog::default());
         let (matched, log) = (readers.clone(), written.clone());
+        let last = Arc::new(Mutex::new(None));
+        let noted = last.clone();
         let info = WriterInfo {
             awaits_reader: true,
             matched: Box::new(move || matched.load(Relaxed)),
             is_free: Box::new(|_| true),
+            last_written: Box::new(move || *last.lock().unwrap()),
             ..WriterInfo::default()
         };
-        let take = move |message: Message, next| log.lock().unwrap().push((message.seq, next));
+        let take = move |message: Message, next| {
+            *noted.lock().unwrap() = Some(Instant::now());
+            log.lock().unwrap().push((message.seq, next));
+        };
         let (alive, _) = mpsc::channel(1);
         let queue =
             WriterQueue::spawn_with("test", info, Shaping::default(), Arc::default(), alive, take).unwrap();
@@ -688,7 +728,7 @@ pub(crate) mod tests {
         assert_eq!(*written.lock().unwrap(), []);
         readers.store(1, Relaxed);
         wait_until(|| written.lock().unwrap().len() == 3).await;
-        assert!(queue.opened.elapsed() < FIRST_READER_WAIT_MAX);
+        assert!(queue.awaits_since.lock().unwrap().elapsed() < FIRST_READER_WAIT_MAX);
         let order = [(0, NextMessage::AtOnce), (1, NextMessage::AtOnce), (2, NextMessage::Nothing)];
         assert_eq!(*written.lock().unwrap(), order, "in order and at the publisher's pace");
         // Later messages wait no more, even without readers.
@@ -702,11 +742,47 @@ pub(crate) mod tests {
     }
 
     #[tokio::test]
+    async fn first_messages_after_a_silence_wait_for_a_reader_that_comes_again() {
+        let (queue, readers, written) = awaiting();
+        readers.store(1, Relaxed);
+        give(&queue, message(0, 16));
+        wait_until(|| written.lock().unwrap().len() == 1).await;
+        // The publisher and its subscriber are restarted.
+        readers.store(0, Relaxed);
+        tokio::time::sleep(SILENCE_MIN).await;
+        (1..3).for_each(|seq| give(&queue, message(seq, 16)));
+        tokio::time::sleep(4 * FIRST_READER_LOOK).await;
+        assert_eq!(written.lock().unwrap().len(), 1);
+        readers.store(1, Relaxed);
+        wait_until(|| written.lock().unwrap().len() == 3).await;
+        assert!(queue.awaits_since.lock().unwrap().elapsed() < FIRST_READER_WAIT_MAX);
+        // A publisher that goes on does not wait for subscribers.
+        readers.store(0, Relaxed);
+        wait_until(|| {
+            give(&queue, message(3, 16));
+            written.lock().unwrap().iter().any(|(seq, _)| *seq == 3)
+        })
+        .await;
+        queue.close();
+    }
+
+    #[tokio::test]
+    async fn writer_that_never_had_a_reader_waits_once() {
+        let (queue, _, written) = awaiting();
+        give(&queue, message(0, 16));
+        wait_until(|| written.lock().unwrap().len() == 1).await;
+        tokio::time::sleep(SILENCE_MIN).await;
+        give(&queue, message(1, 16));
+        assert_eq!(written.lock().unwrap().len(), 2, "the receiving task writes it");
+        queue.close();
+    }
+
+    #[tokio::test]
     async fn messages_that_nobody_hears_are_written_without_a_pause() {
         let (queue, _, written) = awaiting();
         (0..3).for_each(|seq| give(&queue, message(seq, 16)));
         wait_until(|| written.lock().unwrap().len() == 3).await;
-        assert!(queue.opened.elapsed() >= FIRST_READER_WAIT_MAX);
+        assert!(queue.awaits_since.lock().unwrap().elapsed() >= FIRST_READER_WAIT_MAX);
         let order = [(0, NextMessage::Unheard), (1, NextMessage::Unheard), (2, NextMessage::Nothing)];
         assert_eq!(*written.lock().unwrap(), order);
         queue.close();
@@ -717,13 +793,13 @@ pub(crate) mod tests {
         let (queue, _, written) = awaiting();
         give(&queue, message(0, FIRST_READER_BYTES_MAX / 2));
         wait_until(|| written.lock().unwrap().len() == 1).await;
-        assert!(queue.opened.elapsed() < FIRST_READER_WAIT_MAX);
+        assert!(queue.awaits_since.lock().unwrap().elapsed() < FIRST_READER_WAIT_MAX);
         queue.close();
         let (queue, _, written) = awaiting();
         give(&queue, message(0, 16));
         queue.close();
         wait_until(|| written.lock().unwrap().len() == 1).await;
-        assert!(queue.opened.elapsed() < FIRST_READER_WAIT_MAX);
+        assert!(queue.awaits_since.lock().unwrap().elapsed() < FIRST_READER_WAIT_MAX);
     }
 
     #[tokio::test]
