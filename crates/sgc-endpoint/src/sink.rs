@@ -121,7 +121,7 @@ impl Sink {
         sink
     }
 
-    /// Believes the MACs of callers whose keys are in this set. The owner of a service calls it for its own sink.
+    /// Believes the MACs of callers whose keys are in this set; for the owner's own sink of a service.
     pub fn set_callers(&mut self, callers: Arc<Receivers>) {
         self.callers = Some(callers);
     }

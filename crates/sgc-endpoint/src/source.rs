@@ -152,7 +152,7 @@ enum Proof {
     /// A MAC for each receiver, under [`Source::macs`].
     Macs,
     /// A MAC for the one receiver.
-    Mac([MacKey; 1]),
+    Mac(Box<MacKey>),
     /// The signature of their batch.
     Signature,
 }
@@ -444,7 +444,7 @@ impl Source {
         let trailer_bytes = match proof {
             Proof::None => 0,
             Proof::Macs => mac_trailer_bytes(self.macs.len()),
-            Proof::Mac(one) => mac_trailer_bytes(one.len()),
+            Proof::Mac(_) => mac_trailer_bytes(1),
             Proof::Signature => trailer_bytes_max(self.suite),
         };
         if matches!(proof, Proof::Macs | Proof::Mac(_)) {
@@ -476,7 +476,7 @@ impl Source {
             match proof {
                 Proof::None => {}
                 Proof::Macs => put_macs(&header, &mut sealed, &self.macs),
-                Proof::Mac(one) => put_macs(&header, &mut sealed, one),
+                Proof::Mac(key) => put_macs(&header, &mut sealed, std::slice::from_ref(&**key)),
                 Proof::Signature => {
                     self.batch.push(&header, &sealed);
                     self.unsigned.push((header, sealed));
@@ -502,7 +502,7 @@ impl Source {
         let derive = |key: &ReceiverKey| MacKey::derive(key, &self.grant, name, id, to.as_ref());
         if let Some(sink) = &to {
             let key = receivers.key_of(sink).and_then(|key| derive(&key));
-            return key.map_or(Proof::Signature, |key| Proof::Mac([key]));
+            return key.map_or(Proof::Signature, |key| Proof::Mac(Box::new(key)));
         }
         match receivers.update(&mut self.listed) {
             ReceiverList::TooMany => return Proof::Signature,
