@@ -6,6 +6,7 @@
 use std::future::Future;
 use std::hint::black_box;
 use std::pin::pin;
+use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 
 use anyhow::{Context as _, Result, bail, ensure};
@@ -13,13 +14,13 @@ use bytes::{Bytes, BytesMut};
 use rand_chacha::ChaCha8Rng;
 use rand_core::SeedableRng as _;
 use sgc_dds::payload::Frame;
-use sgc_endpoint::{Delivery, RecoveryLimits, Sink, SinkLimits, Source, SourceConfig};
+use sgc_endpoint::{Delivery, Receivers, RecoveryLimits, Sink, SinkLimits, Source, SourceConfig};
 use sgc_node::benchmarks::Forwarding;
 use sgc_transport::benchmarks::Conversation;
 use sgc_trust::{Freshness, MessageKey, ReplayWindow, Suite};
 use sgc_wire::{
-    Class, HOP_LIMIT, Label, MessageHead, MessageKind, Name, Packet, PacketHeader, SecretBytes, SinkId,
-    SourceId, TopicGrant,
+    Class, HOP_LIMIT, Label, MessageHead, MessageKind, Name, NodeId, Packet, PacketHeader, ReceiverKey,
+    SecretBytes, SinkId, SourceId, TopicGrant,
 };
 
 use crate::Counter;
@@ -41,12 +42,18 @@ pub(crate) const CASES: &[Case] = &[
     Case { name: "endpoint: open group 100 B", run: |c| open(c, Suite::Group, 100) },
     Case { name: "endpoint: open group 1000 B", run: |c| open(c, Suite::Group, 1000) },
     Case { name: "endpoint: open group 64 KB", run: |c| open(c, Suite::Group, 64 << 10) },
+    Case { name: "endpoint: open pairwise 100 B", run: |c| open(c, Suite::Pairwise, 100) },
+    Case { name: "endpoint: open pairwise 1000 B", run: |c| open(c, Suite::Pairwise, 1000) },
+    Case { name: "endpoint: open pairwise 64 KB", run: |c| open(c, Suite::Pairwise, 64 << 10) },
     Case { name: "endpoint: open standard 100 B", run: |c| open(c, Suite::Standard, 100) },
     Case { name: "endpoint: open standard 1000 B", run: |c| open(c, Suite::Standard, 1000) },
     Case { name: "endpoint: open standard 64 KB", run: |c| open(c, Suite::Standard, 64 << 10) },
     Case { name: "endpoint: seal group 100 B", run: |c| seal(c, Suite::Group, 100) },
     Case { name: "endpoint: seal group 1000 B", run: |c| seal(c, Suite::Group, 1000) },
     Case { name: "endpoint: seal group 64 KB", run: |c| seal(c, Suite::Group, 64 << 10) },
+    Case { name: "endpoint: seal pairwise 100 B", run: |c| seal(c, Suite::Pairwise, 100) },
+    Case { name: "endpoint: seal pairwise 1000 B", run: |c| seal(c, Suite::Pairwise, 1000) },
+    Case { name: "endpoint: seal pairwise 64 KB", run: |c| seal(c, Suite::Pairwise, 64 << 10) },
     Case { name: "endpoint: seal standard 100 B", run: |c| seal(c, Suite::Standard, 100) },
     Case { name: "endpoint: seal standard 1000 B", run: |c| seal(c, Suite::Standard, 1000) },
     Case { name: "endpoint: seal standard 64 KB", run: |c| seal(c, Suite::Standard, 64 << 10) },
@@ -168,7 +175,14 @@ struct Ends {
 }
 
 impl Ends {
+    /// Makes the ends; in a pairwise suite with one receiver.
     fn new(suite: Suite) -> Result<Self> {
+        let receiver =
+            suite.is_pairwise().then(|| ReceiverKey { id: [1; 4], key: SecretBytes::new([1; 32]) });
+        let receivers = Arc::<Receivers>::default();
+        if let Some(receiver) = receiver.clone() {
+            receivers.add(SinkId([9; 16]), NodeId([1; 32]), || receiver);
+        }
         let config = SourceConfig {
             name: NAME,
             id: SourceId([5; 16]),
@@ -177,11 +191,11 @@ impl Ends {
             history_depth: 0,
             history_bytes_max: 0,
             recovery: RecoveryLimits::default(),
-            receivers: None,
+            receivers: Some(receivers),
         };
         let key = SecretBytes::new([3; 32]);
         let mut grant =
-            TopicGrant { epoch: 1, suite: suite.id(), key, receiver: None, sources: Vec::new(), entry: None };
+            TopicGrant { epoch: 1, suite: suite.id(), key, receiver, sources: Vec::new(), entry: None };
         let source = Source::new(config, &grant, MessageKey::generate(suite)).context("no such suite")?;
         grant.sources = vec![source.announce()];
         let sink = Sink::new(NAME, SinkId([9; 16]), grant, false, SinkLimits::default());
@@ -196,7 +210,8 @@ impl Ends {
 
 /// Returns the number of repetitions, which is low for signatures and many bytes, because callgrind is slow.
 fn times(suite: Suite, bytes: usize) -> u64 {
-    if suite.is_signed() || bytes > 10_000 { 32 } else { 500 }
+    let signs = suite.is_signed() && !suite.is_pairwise();
+    if signs || bytes > 10_000 { 32 } else { 500 }
 }
 
 fn seal(counter: &mut Counter, suite: Suite, bytes: usize) -> Result<()> {
