@@ -6,7 +6,7 @@
 
 use std::fmt;
 
-use aws_lc_rs::aead::{Aad, LessSafeKey, UnboundKey};
+use aws_lc_rs::aead::{Aad, LessSafeKey};
 use aws_lc_rs::constant_time::verify_slices_are_equal;
 use aws_lc_rs::hkdf;
 use bytes::BufMut;
@@ -16,7 +16,7 @@ use sgc_wire::{
 };
 use zeroize::Zeroizing;
 
-use crate::seal::nonce;
+use crate::seal::{derive, nonce};
 use crate::{OpenError, Suite, TAG_BYTES, opened_bytes};
 
 /// Most receivers for which a packet has a MAC. For more, its source signs.
@@ -90,22 +90,11 @@ impl MacKey {
         source: &SourceId,
         to: Option<&SinkId>,
     ) -> Option<Self> {
-        let suite = Suite::from_id(grant.suite)?;
         let mut secret = Zeroizing::new([0; 64]);
         secret[..32].copy_from_slice(receiver.key.expose());
         secret[32..].copy_from_slice(grant.key.expose());
-        let mut bytes = Zeroizing::new([0; 32]);
-        let sink = to.map_or(&[][..], |sink| sink.as_bytes());
-        hkdf::Salt::new(hkdf::HKDF_SHA256, b"sgc mac v1")
-            .extract(&secret[..])
-            .expand(
-                &[&[grant.suite], &grant.epoch.to_be_bytes(), name.as_bytes(), source.as_bytes(), sink],
-                hkdf::HKDF_SHA256,
-            )
-            .and_then(|okm| okm.fill(&mut bytes[..]))
-            .expect("HKDF-SHA-256 always yields 32 bytes");
-        let key = UnboundKey::new(suite.cipher(), &bytes[..]).expect("both ciphers take keys of 32 bytes");
-        Some(Self { id: receiver.id, key: LessSafeKey::new(key) })
+        let key = derive(b"sgc mac v1", &secret[..], grant, name, source, to)?;
+        Some(Self { id: receiver.id, key })
     }
 
     /// Checks the MAC for this receiver in a packet that has opened.

@@ -76,19 +76,8 @@ impl SourceKey {
     }
 
     fn expand(grant: &TopicGrant, name: &Name, source: &SourceId, to: Option<SinkId>) -> Option<Self> {
-        let suite = Suite::from_id(grant.suite)?;
-        let mut bytes = Zeroizing::new([0; 32]);
-        let sink = to.as_ref().map_or(&[][..], |sink| sink.as_bytes());
-        hkdf::Salt::new(hkdf::HKDF_SHA256, b"sgc source v1")
-            .extract(grant.key.expose())
-            .expand(
-                &[&[grant.suite], &grant.epoch.to_be_bytes(), name.as_bytes(), source.as_bytes(), sink],
-                hkdf::HKDF_SHA256,
-            )
-            .and_then(|okm| okm.fill(&mut bytes[..]))
-            .expect("HKDF-SHA-256 always yields 32 bytes");
-        let key = UnboundKey::new(suite.cipher(), &bytes[..]).expect("both ciphers take keys of 32 bytes");
-        Some(Self { key: LessSafeKey::new(key), suite, epoch: grant.epoch, to })
+        let key = derive(b"sgc source v1", grant.key.expose(), grant, name, source, to.as_ref())?;
+        Some(Self { key, suite: Suite::from_id(grant.suite)?, epoch: grant.epoch, to })
     }
 
     /// Suite.
@@ -168,6 +157,31 @@ pub fn opened_bytes(header: &PacketHeader) -> usize {
 /// Returns the sealed length of a fragment: the opened length and the tag.
 pub fn sealed_bytes(header: &PacketHeader) -> usize {
     opened_bytes(header) + TAG_BYTES
+}
+
+/// Derives a key for the packets of one source in one epoch: `HKDF-SHA-256(salt, secret, suite ‖ epoch ‖ name ‖ source
+/// id)`, with the sink's id behind it for packets to one sink; `None` for a suite that this build does not have.
+pub(crate) fn derive(
+    salt: &[u8],
+    secret: &[u8],
+    grant: &TopicGrant,
+    name: &Name,
+    source: &SourceId,
+    to: Option<&SinkId>,
+) -> Option<LessSafeKey> {
+    let suite = Suite::from_id(grant.suite)?;
+    let mut bytes = Zeroizing::new([0; 32]);
+    let sink = to.map_or(&[][..], |sink| sink.as_bytes());
+    hkdf::Salt::new(hkdf::HKDF_SHA256, salt)
+        .extract(secret)
+        .expand(
+            &[&[grant.suite], &grant.epoch.to_be_bytes(), name.as_bytes(), source.as_bytes(), sink],
+            hkdf::HKDF_SHA256,
+        )
+        .and_then(|okm| okm.fill(&mut bytes[..]))
+        .expect("HKDF-SHA-256 always yields 32 bytes");
+    let key = UnboundKey::new(suite.cipher(), &bytes[..]).expect("both ciphers take keys of 32 bytes");
+    Some(LessSafeKey::new(key))
 }
 
 pub(crate) fn nonce(header: &PacketHeader) -> Nonce {
