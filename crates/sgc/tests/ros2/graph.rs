@@ -62,10 +62,12 @@ fn readers_of_sgc_are_shown_as_those_of_its_node() {
     }
 }
 
-/// Returns the subscribers of a topic by the name of their node, once each of these nodes (sorted) has one and no other has any. A
-/// number alone would be met by a subscriber of the pair before, whose end is not known yet.
+/// Returns the subscribers of a topic by the name of their node, once each of these nodes (sorted) has one and no other
+/// has any. A number alone would be met by a subscriber of the pair before, whose end is not known yet.
 fn subscribers(lab: &Lab, site: Site, distribution: &str, nodes: &str) -> BTreeMap<String, Value> {
-    let args = ["--topic", "/load", "--publishers", "1", "--subscriber-nodes", nodes, "--timeout", "30"];
+    let count = nodes.split(',').count().to_string();
+    let counts = ["--exactly", "--publishers", "1", "--subscribers", &count, "--subscriber-nodes", nodes];
+    let args = [&["--topic", "/load", "--timeout", "30"][..], &counts].concat();
     let found = lab.rclpy(site, distribution, "graph.py", &args).summary();
     let all = found["subscribers"].as_array().unwrap();
     let mut names: Vec<_> = all.iter().map(|end| end["node"].as_str().unwrap()).collect();
