@@ -1,8 +1,8 @@
 //! [`Receivers`]: the nodes that share a key with the owner of a name, for the MACs of a `pairwise` suite.
 //!
-//! The owner changes the set before it sends a grant or after it took one back. The sources of its node read the set for
-//! each message, on their own threads. The owner's sink of a service finds the keys of callers in it. At a caller, the
-//! set has the one key that it shares with the owner.
+//! The owner changes the set before it sends a grant or after it took one back. The sources of its node read the set
+//! for each message, on their own threads. The owner's sink of a service finds the keys of callers in it. At a caller,
+//! the set has the one key that it shares with the owner.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};

@@ -333,7 +333,8 @@ impl Sink {
     }
 
     /// Returns the result of a packet, if a grant explained it. Checks in this order: the cheap facts (addressee,
-    /// epoch, suite, replay); the seal, which only holders of the topic's key pass; the MAC for this node, or the signature.
+    /// epoch, suite, replay); the seal, which only holders of the topic's key pass; the MAC for this node, or the
+    /// signature.
     fn handle(&mut self, packet: &Packet) -> Result<Handled, SinkDrop> {
         let header = &packet.header;
         if header.to.is_some_and(|to| to != self.id) {

@@ -430,7 +430,8 @@ impl Source {
         }
     }
 
-    /// Seals a message under the key for all, or the one for a sink, with the proof [chosen](Self::choose_proof) for it.
+    /// Seals a message under the key for all, or the one for a sink, with the proof [chosen](Self::choose_proof) for
+    /// it.
     fn seal_fragments(
         &mut self,
         addressed: Option<&SourceKey>,

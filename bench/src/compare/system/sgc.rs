@@ -26,7 +26,8 @@ pub(crate) struct Sgc {
     priorities: &'static [(&'static str, &'static str)],
 }
 
-/// Every transport with each of three suites, and the default transport with the default suite, and with a router between.
+/// Every transport with each of three suites, and the default transport with the default suite, and with a router
+/// between.
 pub(crate) fn all(program: &Path) -> Result<Vec<Sgc>> {
     let one = |scheme, suite, routers| Sgc::new(program, scheme, suite, routers);
     let pairs = SCHEMES.iter().flat_map(|scheme| SUITES.iter().map(move |suite| (scheme, suite)));

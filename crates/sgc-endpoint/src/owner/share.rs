@@ -394,8 +394,8 @@ impl Share {
         self.sinks.remove(sink)
     }
 
-    /// Returns the key that proves packets to a sink, if it receives any. Of publishers only the callers of a service do,
-    /// and it also proves their requests.
+    /// Returns the key that proves packets to a sink, if it receives any. Of publishers only the callers of a service
+    /// do, and it also proves their requests.
     fn receiver_key(&self, granted: &GrantedSink) -> Option<ReceiverKey> {
         let receives = granted.request.role() == Role::Subscribe || self.is_service();
         let key = || self.receiver_secret.derive_key(&self.name, &granted.peer.node_id);

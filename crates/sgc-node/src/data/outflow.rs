@@ -49,8 +49,8 @@ pub(crate) struct OutFlow {
 }
 
 impl OutFlow {
-    /// Starts the sending task. It ends when the queue is closed and empty, or the link ends. A best-effort message whose
-    /// beginning has waited for longer than `max_age` is left out.
+    /// Starts the sending task. It ends when the queue is closed and empty, or the link ends. A best-effort message
+    /// whose beginning has waited for longer than `max_age` is left out.
     pub(crate) fn spawn(
         link: AnyLink,
         name: Name,
