@@ -3,12 +3,26 @@
 //! It locks nothing and wakes nobody: [`crate::intake`] does.
 
 use std::collections::VecDeque;
-use std::time::Instant;
+use std::sync::Arc;
 
 use cyclors::{dds_instance_handle_t, ddsi_serdata};
 
+use crate::backpressure::{Progress, Tally};
+
 /// Most queued bytes of one reader; a single sample may be longer.
 pub const WAITING_BYTES_MAX: usize = 64 << 20;
+
+/// Bytes in a queue beyond which the samples of reliable writers are refused. Samples on their way still come.
+const REFUSED_BYTES: usize = WAITING_BYTES_MAX / 4;
+
+/// Divisor: the same for one part in this many of the samples that may be queued.
+const REFUSED_PART: usize = 2;
+
+/// Divisor: samples are accepted again once the queue has sunk to one part in this many of what began the refusal.
+const ROOM_PART: usize = 2;
+
+/// Most writers of one reader whose samples are refused. Samples of others are queued, and the oldest give way.
+const REFUSED_WRITERS_MAX: usize = 1024;
 
 /// Most queued liveliness changes of one reader. The oldest give way.
 const LIVELINESS_CHANGES_MAX: usize = 1024;
@@ -73,8 +87,16 @@ pub(crate) struct Queue<S> {
     overrun: u64,
     thread: ThreadState,
     receiving: ReceivingState,
-    /// The time before which the receiving thread does not wait for room again.
-    no_wait_before: Option<Instant>,
+    /// The writers whose samples are refused, or were before.
+    refused: Vec<RefusedWriter>,
+}
+
+/// A writer whose samples are refused until there is room, or were before.
+#[derive(Debug)]
+struct RefusedWriter {
+    writer: dds_instance_handle_t,
+    tally: Arc<Tally>,
+    is_refused: bool,
 }
 
 /// The state of a reader's thread.
@@ -119,7 +141,7 @@ impl<S: FromSerdata> Queue<S> {
             overrun: 0,
             thread: ThreadState::Working,
             receiving: ReceivingState::Free,
-            no_wait_before: None,
+            refused: Vec::new(),
         }
     }
 
@@ -214,19 +236,56 @@ impl<S: FromSerdata> Queue<S> {
         matches!(self.receiving, ReceivingState::Stuck | ReceivingState::Held { is_stuck: true, .. })
     }
 
-    /// Returns `true` if the receiving thread may wait for room at this time.
-    pub(crate) fn may_wait_at(&self, now: impl FnOnce() -> Instant) -> bool {
-        self.no_wait_before.is_none_or(|at| now() >= at)
+    /// Counts a sample of a writer whose samples were refused before.
+    pub(crate) fn count_arrival(&self, writer: dds_instance_handle_t) {
+        if let Some(refused) = self.refused.iter().find(|refused| refused.writer == writer) {
+            refused.tally.count_arrival();
+        }
     }
 
-    /// Sets the time before which the receiving thread does not wait for room again.
-    pub(crate) fn set_no_wait_before(&mut self, at: Option<Instant>) {
-        self.no_wait_before = at;
+    /// Returns the tally of a writer if the queue has grown so long that its samples are to be refused from here on.
+    pub(crate) fn begin_to_refuse(
+        &mut self,
+        writer: dds_instance_handle_t,
+        reader: &Arc<Progress>,
+    ) -> Option<Arc<Tally>> {
+        if !self.is_above(self.refused_level(1)) {
+            return None;
+        }
+        if let Some(known) = self.refused.iter_mut().find(|refused| refused.writer == writer) {
+            let begins = !std::mem::replace(&mut known.is_refused, true);
+            return begins.then(|| Arc::clone(&known.tally));
+        }
+        // Nobody else has the tally of a writer that is gone.
+        self.refused.retain(|refused| Arc::strong_count(&refused.tally) > 1);
+        let has_room = self.refused.len() < REFUSED_WRITERS_MAX;
+        has_room.then(|| {
+            let tally = Arc::new(Tally::new(Arc::clone(reader)));
+            self.refused.push(RefusedWriter { writer, tally: Arc::clone(&tally), is_refused: true });
+            tally
+        })
     }
 
-    /// Returns the number of dropped samples since the last call.
+    /// Calls `accept` with each writer whose samples are accepted again, if there is room or the queue is stopped.
+    pub(crate) fn accept(&mut self, accept: impl Fn(dds_instance_handle_t, &Arc<Tally>)) {
+        if self.is_above(self.refused_level(ROOM_PART)) && !self.is_stopped() {
+            return;
+        }
+        for refused in self.refused.iter_mut().filter(|refused| refused.is_refused) {
+            refused.is_refused = false;
+            accept(refused.writer, &refused.tally);
+        }
+    }
+
+    fn refused_level(&self, part: usize) -> Level {
+        Level { samples: self.depth / (REFUSED_PART * part), bytes: REFUSED_BYTES / part }
+    }
+
+    /// Returns the number of lost samples since the last call: those that gave way, and those that writers dropped
+    /// while they were refused.
     pub(crate) fn take_overrun(&mut self) -> u64 {
-        std::mem::take(&mut self.overrun)
+        let lost: u64 = self.refused.iter().map(|refused| refused.tally.take_lost()).sum();
+        std::mem::take(&mut self.overrun) + lost
     }
 
     pub(crate) fn is_empty(&self) -> bool {

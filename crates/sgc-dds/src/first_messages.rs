@@ -22,22 +22,26 @@
 //! compared with its expected content at that moment, and everything is left alone if it differs.
 
 use std::cell::Cell;
-use std::ffi::{c_int, c_void};
-use std::mem::offset_of;
-use std::sync::OnceLock;
+use std::ffi::c_void;
 use std::sync::atomic::{AtomicPtr, Ordering};
 
 use cyclors::{
     DDS_BUILTIN_TOPIC_DCPSPUBLICATION, dds_create_reader, dds_durability_kind_DDS_DURABILITY_VOLATILE,
     dds_entity_t, dds_get_entity_sertype, dds_get_guid, dds_guid_t, dds_instance_handle_t, dds_listener_t,
-    dds_lset_subscription_matched_arg, dds_qget_durability, dds_qos_t, dds_subscription_matched_status_t,
-    pthread_mutex_t,
+    dds_lset_subscription_matched_arg, dds_qget_durability, dds_subscription_matched_status_t,
 };
 
+use crate::acknack::HeartbeatRequest;
+use crate::backpressure::{self, RemoteWriters};
 use crate::entity::{Entity, check, monotonic_ns};
+use crate::events::{ddsi_delete_xevent, ddsi_qxev_callback};
 use crate::identity::FAST_DDS;
 use crate::late_readers::{self, LateReaders, ProxyReaderState};
-use crate::manual_leases::{self, Lease, Leases};
+use crate::manual_leases::{self, Leases};
+use crate::proxies::{
+    EntityCommon, HAVE_SEEN_HEARTBEAT, Locator, PROXY_READER, PROXY_WRITER, ProxyEndpoint, ProxyWriterState,
+    Time, state_of,
+};
 
 /// Delays after a match with which a reader asks for a heartbeat, in nanoseconds. Cyclone reports the match a few
 /// instructions before it would handle a heartbeat for the reader, so on a busy machine the first answer may come too
@@ -48,22 +52,8 @@ const ASK_DELAYS_NS: [i64; 2] = [1_000_000, 50_000_000];
 /// Bytes of `struct dds_domain` before the structs that are examined here; there are some 600.
 const DOMAIN_HEAD_BYTES_MAX: usize = 4096;
 
-/// `DDSI_EK_PROXY_WRITER` and `DDSI_EK_PROXY_READER` (`ddsi_entity.h`).
-const PROXY_WRITER: c_int = 4;
-const PROXY_READER: c_int = 6;
-
 /// The bits of an entity id that mark endpoints of discovery and of vendors (RTPS 2.5, 9.3.1.2).
 const NOT_OF_USERS: u32 = 0xc0;
-
-/// Lengths of `struct ddsi_security_info` (`ddsi_plist.h`), without and with security in Cyclone, bytes.
-const SECURITY_BYTES: [usize; 2] = [0, 8];
-
-/// Flags of a proxy writer, in the order of its bit fields. Compilers begin with the lowest bit on little-endian
-/// machines.
-const HAVE_SEEN_HEARTBEAT: u32 = 1 << 1;
-const LOCAL_MATCHING_IN_PROGRESS: u32 = 1 << 2;
-const ALIVE: u32 = 1 << 3;
-const FILTERED: u32 = 1 << 4;
 
 /// `struct ddsi_builtin_topic_interface` (`ddsi_builtin_topic_if.h`), by which `ddsi` reports endpoints to `ddsc`.
 #[repr(C)]
@@ -76,132 +66,7 @@ struct BuiltinTopics {
     write_topic: *const c_void,
 }
 
-/// `ddsrt_wctime_t` and `ddsrt_mtime_t`, nanoseconds.
-#[repr(C)]
-#[derive(Clone, Copy)]
-struct Time(i64);
-
 type WriteEndpoint = unsafe extern "C" fn(*const EntityCommon, Time, bool, *mut c_void);
-
-/// `struct ddsi_entity_common` (`ddsi_entity.h`).
-#[repr(C)]
-struct EntityCommon {
-    kind: c_int,
-    /// The GUID, in the byte order of this machine.
-    guid: [u32; 4],
-    updated: i64,
-    instance: u64,
-    tkmap_instance: *const c_void,
-    lock: pthread_mutex_t,
-    only_local: bool,
-    gv: *mut c_void,
-    all_entities: AvlNode,
-    qos_lock: pthread_mutex_t,
-}
-
-/// `ddsrt_avl_node_t`.
-#[repr(C)]
-struct AvlNode {
-    children: [*const c_void; 2],
-    parent: *const c_void,
-    height: c_int,
-}
-
-/// `ddsi_xlocator_t`: an address, and the socket to send from.
-#[repr(C)]
-#[derive(Clone, Copy)]
-struct Locator {
-    kind: i32,
-    port: u32,
-    address: [u8; 16],
-    connection: *const c_void,
-}
-
-/// The part of `struct ddsi_generic_proxy_endpoint` (`ddsi_proxy_endpoint.h`) that is the same with and without
-/// security.
-#[repr(C)]
-struct ProxyEndpoint {
-    common: EntityCommon,
-    participant: *const c_void,
-    next: *const c_void,
-    previous: *const c_void,
-    qos: *const dds_qos_t,
-    addresses: *const c_void,
-    unicast: Locator,
-    group_guid: [u32; 4],
-    vendor: [u8; 2],
-    announcement_number: u64,
-    type_pair: *const c_void,
-}
-
-/// The used part of the rest of `struct ddsi_proxy_writer`.
-#[repr(C)]
-struct ProxyWriterState {
-    readers: *const c_void,
-    reliable_readers: i32,
-    readers_out_of_sync: i32,
-    last_number: u64,
-    last_fragment: u32,
-    nackfrag_count: u32,
-    next_number_to_deliver: u32,
-    flags: u32,
-    alive_changes: u32,
-    defragmenter: *const c_void,
-    reorder: *const c_void,
-    delivery_queue: *const c_void,
-    events: *mut c_void,
-    local_readers: LocalReaders,
-    lease: *const Lease,
-}
-
-/// `struct ddsi_local_reader_ary` (`ddsi_entity.h`).
-#[repr(C)]
-struct LocalReaders {
-    lock: pthread_mutex_t,
-    flags: u32,
-    count: u32,
-    readers: *const c_void,
-}
-
-/// `ddsi_protocol_version_t`.
-#[repr(C)]
-struct ProtocolVersion {
-    major: u8,
-    minor: u8,
-}
-
-type EventCallback =
-    unsafe extern "C" fn(gv: *mut c_void, event: *mut c_void, pack: *mut c_void, arg: *mut c_void, now: Time);
-
-// Functions of Cyclone that `cyclors` has no binding for. `ddsi__xmsg.h`, `ddsi__xevent.h`.
-#[allow(improper_ctypes)]
-unsafe extern "C" {
-    fn ddsi_xmsgpool_new(version: ProtocolVersion) -> *mut c_void;
-    fn ddsi_xmsg_new(
-        pool: *mut c_void,
-        source: *const [u32; 4],
-        participant: *const c_void,
-        bytes: usize,
-        kind: c_int,
-    ) -> *mut c_void;
-    fn ddsi_xmsg_setdst1_generic(
-        gv: *mut c_void,
-        message: *mut c_void,
-        prefix: *const [u32; 3],
-        to: *const Locator,
-    );
-    fn ddsi_xmsg_append(message: *mut c_void, marker: *mut c_void, bytes: usize) -> *mut c_void;
-    fn ddsi_xpack_addmsg(pack: *mut c_void, message: *mut c_void, flags: u32) -> c_int;
-    fn ddsi_qxev_callback(
-        events: *mut c_void,
-        at: Time,
-        callback: EventCallback,
-        arg: *const c_void,
-        arg_bytes: usize,
-        sync_on_delete: bool,
-    ) -> *mut c_void;
-    fn ddsi_delete_xevent(event: *mut c_void);
-}
 
 /// The function `dds__builtin_write_endpoint` of Cyclone, which all its domains share.
 static WRITE_ENDPOINT: AtomicPtr<c_void> = AtomicPtr::new(std::ptr::null_mut());
@@ -224,13 +89,14 @@ struct NewWriter {
 #[derive(Debug)]
 pub(crate) struct EndpointWatch {
     pub(crate) leases: Leases,
+    pub(crate) writers: RemoteWriters,
     _late_readers: LateReaders,
 }
 
 impl EndpointWatch {
     /// `domain` is the address of its variables.
     fn of_domain(domain: usize) -> Self {
-        Self { leases: Leases(domain), _late_readers: LateReaders(domain) }
+        Self { leases: Leases(domain), writers: RemoteWriters(domain), _late_readers: LateReaders(domain) }
     }
 }
 
@@ -308,10 +174,14 @@ unsafe extern "C" fn endpoint_changed(
         DISCOVERED.set(unsafe { discover(entity, domain) });
     } else {
         // SAFETY: every entity begins with these.
-        let (kind, gv, guid) = unsafe { ((*entity).kind, (*entity).gv, (*entity).guid) };
+        let (kind, gv, guid, instance) =
+            unsafe { ((*entity).kind, (*entity).gv, (*entity).guid, (*entity).instance) };
         match kind {
             PROXY_READER => late_readers::forget(entity.cast()),
-            _ => manual_leases::forget(gv, guid),
+            _ => {
+                manual_leases::forget(gv, guid);
+                backpressure::forget(gv, instance);
+            }
         }
     }
     let original = WRITE_ENDPOINT.load(Ordering::Acquire);
@@ -351,9 +221,11 @@ unsafe fn discover(entity: *const EntityCommon, domain: *mut c_void) -> Option<N
         return None;
     }
     // SAFETY: the places are inside of the struct.
-    let state = unsafe { state_of(endpoint, is_new_and_reliable) }?;
+    let state = unsafe { state_of(endpoint, ProxyWriterState::is_new_and_reliable) }?;
     // SAFETY: the writer is new, as was just seen, and its lease and QoS live as long as it does.
     unsafe { manual_leases::keep(gv, guid, entity.cast(), qos, (*state).lease) };
+    // SAFETY: as above.
+    unsafe { backpressure::watch(gv, endpoint, state) };
     if vendor != FAST_DDS {
         return None;
     }
@@ -368,41 +240,6 @@ unsafe fn discover(entity: *const EntityCommon, domain: *mut c_void) -> Option<N
     // SAFETY: as above.
     let events = unsafe { (*state).events };
     Some(NewWriter { instance, guid, unicast, events })
-}
-
-/// Returns the place of the rest of an endpoint's struct: the first of the possible ones whose content is as expected.
-///
-/// # Safety
-/// The struct of the endpoint must be at least as long as the rest at its last possible place.
-unsafe fn state_of<T>(endpoint: *const ProxyEndpoint, is_expected: impl Fn(&T) -> bool) -> Option<*mut T> {
-    SECURITY_BYTES.into_iter().find_map(|security| {
-        // SAFETY: inside of the struct by contract.
-        let state = unsafe { endpoint.add(1).byte_add(security) }.cast::<T>().cast_mut();
-        // SAFETY: as above; any content is a valid value.
-        unsafe { is_expected(&*state) }.then_some(state)
-    })
-}
-
-/// Returns `true` for exactly the state that `ddsi_new_proxy_writer` writes for a reliable writer.
-fn is_new_and_reliable(state: &ProxyWriterState) -> bool {
-    let flags = state.flags & (HAVE_SEEN_HEARTBEAT | LOCAL_MATCHING_IN_PROGRESS | ALIVE | FILTERED);
-    let queues = [state.defragmenter, state.reorder, state.delivery_queue, state.events.cast_const()];
-    state.readers.is_null()
-        && (state.reliable_readers, state.readers_out_of_sync, state.last_number) == (0, 0, 0)
-        && (state.last_fragment, state.nackfrag_count) == (u32::MAX, 1)
-        && (state.next_number_to_deliver, state.alive_changes) == (1, 0)
-        && flags == LOCAL_MATCHING_IN_PROGRESS | ALIVE
-        && queues.iter().all(|queue| !queue.is_null())
-}
-
-/// The arguments of an event that asks for a heartbeat.
-#[derive(Clone, Copy)]
-#[repr(C)]
-struct AskArguments {
-    reader: [u32; 4],
-    writer: [u32; 4],
-    to: Locator,
-    count: u32,
 }
 
 /// The listener for matches. Cyclone calls it on the thread that discovered the writer, while the writer cannot be
@@ -424,72 +261,22 @@ unsafe extern "C" fn matched(
     let word = |at: usize| u32::from_be_bytes([guid.v[at], guid.v[at + 1], guid.v[at + 2], guid.v[at + 3]]);
     let reader = [word(0), word(4), word(8), word(12)];
     for (count, delay_ns) in (0..).zip(ASK_DELAYS_NS) {
-        let asking = AskArguments { reader, writer: writer.guid, to: writer.unicast, count };
+        let request = HeartbeatRequest { reader, writer: writer.guid, to: writer.unicast, base: 0, count };
         // SAFETY: the queue of events lives as long as the domain; the argument is copied.
         unsafe {
             let at = Time(monotonic_ns().saturating_add(delay_ns));
-            let arg = (&raw const asking).cast();
-            ddsi_qxev_callback(writer.events, at, ask, arg, size_of::<AskArguments>(), false);
+            let arg = (&raw const request).cast();
+            ddsi_qxev_callback(writer.events, at, ask, arg, size_of::<HeartbeatRequest>(), false);
         }
     }
 }
 
-/// An ACKNACK (RTPS 2.5, 9.4.5.3) that acknowledges nothing and asks for nothing but an answer.
-#[repr(C)]
-struct AckNack {
-    kind: u8,
-    flags: u8,
-    bytes: u16,
-    reader: [u8; 4],
-    writer: [u8; 4],
-    base: [u32; 2],
-    bits: u32,
-    count: u32,
-}
-
-/// `DDSI_XMSG_KIND_CONTROL`.
-const CONTROL: c_int = 0;
-const ACKNACK: u8 = 0x06;
-const LITTLE_ENDIAN: u8 = 0x01;
-const SUBMESSAGE_HEAD_BYTES: usize = offset_of!(AckNack, reader);
-
-/// Sends the ACKNACK once.
+/// Sends the request once.
 unsafe extern "C" fn ask(gv: *mut c_void, event: *mut c_void, pack: *mut c_void, arg: *mut c_void, _: Time) {
-    /// The pool of messages. It is never freed, because messages may be in transit at any time.
-    struct Pool(*mut c_void);
-    // SAFETY: Cyclone locks it for every use.
-    unsafe impl Send for Pool {}
-    // SAFETY: as above.
-    unsafe impl Sync for Pool {}
-    static POOL: OnceLock<Pool> = OnceLock::new();
-
-    // SAFETY: the copy of what the event was made with, which has no alignment of its own.
-    let AskArguments { reader, writer, to, count } = unsafe { arg.cast::<AskArguments>().read_unaligned() };
-    let acknack = AckNack {
-        kind: ACKNACK,
-        flags: LITTLE_ENDIAN,
-        bytes: (size_of::<AckNack>() - SUBMESSAGE_HEAD_BYTES) as u16,
-        reader: reader[3].to_be_bytes(),
-        writer: writer[3].to_be_bytes(),
-        base: [0, 0],
-        bits: 0,
-        count,
-    };
-    // SAFETY: takes a version of RTPS: 2.1, as Cyclone's own.
-    let pool =
-        POOL.get_or_init(|| Pool(unsafe { ddsi_xmsgpool_new(ProtocolVersion { major: 2, minor: 1 }) }));
-    let (bytes, prefix) = (size_of::<AckNack>(), [writer[0], writer[1], writer[2]]);
-    // SAFETY: arguments are copied; a message that there is memory for has room for what is appended, and is the pack's
-    // then. The event is deleted once, by its own callback, as Cyclone's are.
+    // SAFETY: the argument is the copy of what the event was made with, which has no alignment of its own. The event is
+    // deleted once, by its own callback, as Cyclone's are.
     unsafe {
-        let message = ddsi_xmsg_new(pool.0, &reader, std::ptr::null(), bytes, CONTROL);
-        if !message.is_null() {
-            ddsi_xmsg_setdst1_generic(gv, message, &prefix, &to);
-            let mut marker = 0_usize;
-            let place = ddsi_xmsg_append(message, (&raw mut marker).cast(), bytes);
-            place.cast::<AckNack>().write_unaligned(acknack);
-            ddsi_xpack_addmsg(pack, message, 0);
-        }
+        arg.cast::<HeartbeatRequest>().read_unaligned().send(gv, pack);
         ddsi_delete_xevent(event);
     }
 }

@@ -7,17 +7,17 @@
 //! the reader's thread. That thread may block for any time: no other reader waits for it, and the order of samples
 //! stays.
 //!
-//! A `KEEP_ALL` writer waits for acknowledgements, and those for the receiving thread. So where many samples of a
-//! reliable topic are queued, the receiving thread waits for the reader's thread: briefly and at most half of the
-//! time while a queue is crowded; until there is room while the queue is half full of short samples. Other readers
-//! thus lose at most half of that thread's time to a slow one.
+//! While a queue of a reliable topic is crowded, the receiving thread waits for the reader's thread: briefly and at most
+//! half of the time. So acknowledgements come later, and a `KEEP_ALL` writer becomes slower. Other readers lose at most
+//! half of that thread's time to a slow one. If the queue grows all the same, the samples of its writers are
+//! [refused](crate::backpressure) until there is room.
 
 use std::cell::Cell;
 use std::ffi::c_void;
 use std::mem::MaybeUninit;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use cyclors::{
     DDS_ANY_STATE, dds_create_listener, dds_create_reader, dds_delete_listener, dds_entity_t,
@@ -29,6 +29,7 @@ use sgc_sync::lock;
 
 use crate::announced;
 use crate::arrivals::{Arrival, FromSerdata, Level, LivelinessChange, Next, Queue, WriterState};
+use crate::backpressure::Progress;
 use crate::entity::{Entity, reason};
 use crate::first_messages;
 use crate::participant::Participant;
@@ -46,24 +47,9 @@ const RELIABLE_WAITING_MIN: usize = 16_384;
 /// Longest wait of the receiving thread for a reader's thread at once while a queue is crowded.
 const HOLD_MAX: Duration = Duration::from_millis(2);
 
-/// Longest wait of the receiving thread for room in a queue that is half full of samples. Fast DDS acknowledges late,
-/// and a path may stand still for that long.
-const ROOM_WAIT_MAX: Duration = Duration::from_millis(200);
-
-/// Pause after a wait for room in vain, because the path is too slow for the publisher.
-const ROOM_WAIT_PAUSE: Duration = Duration::from_millis(200);
-
 /// Divisor: the receiving thread waits from time to time once a queue is full to one part in this many, until it has
 /// sunk to half of that.
 const CROWDED_PART: usize = 8;
-
-/// Divisor: the receiving thread takes no more than the reader's thread while more than one part in this many of the
-/// allowed samples is queued. Only short samples come by the thousand; other readers should not wait for long samples
-/// of a camera.
-const FULL_PART: usize = 2;
-
-/// Fewest samples that the reader's thread takes before it wakes a receiving thread that waits for room.
-const ROOM_SAMPLES: usize = 16;
 
 thread_local! {
     /// `true` while this thread is in a listener.
@@ -103,6 +89,7 @@ struct IntakeState<R: Receiver> {
     eased: Condvar,
     /// `true` if writers should wait rather than lose samples.
     holds_back: bool,
+    progress: Arc<Progress>,
     /// The receiver, `None` until the start. Locked while samples are handled, to keep their order. It is locked
     /// before the queue or by `try_lock` only.
     receiver: Mutex<Option<R>>,
@@ -148,6 +135,7 @@ impl<R: Receiver> IntakeState<R> {
     /// Lets the receiver handle a sample at once, or queues it.
     fn arrive(&self, arrival: Arrival<R::Sample>) {
         let mut queue = lock(&self.queue);
+        queue.count_arrival(arrival.writer);
         let mut arrival = Some(arrival);
         if queue.is_empty()
             && !queue.is_stopped()
@@ -162,10 +150,15 @@ impl<R: Receiver> IntakeState<R> {
             queue = lock(&self.queue);
         }
         let Some(arrival) = arrival.filter(|_| !queue.is_stopped()) else { return };
-        if self.holds_back {
-            queue = self.wait_for_room(queue);
-        }
+        let writer = arrival.writer;
         queue.push(arrival);
+        if self.holds_back
+            && !self.progress.is_stuck()
+            && let Some(writers) = self.participant.remote_writers()
+            && let Some(tally) = queue.begin_to_refuse(writer, &self.progress)
+        {
+            writers.refuse(writer, &tally);
+        }
         if queue.begin_to_wake() {
             drop(queue);
             self.filled.notify_one();
@@ -195,20 +188,6 @@ impl<R: Receiver> IntakeState<R> {
         self.participant.holds().end(began);
     }
 
-    /// Waits until there is room for a sample in a queue of many.
-    fn wait_for_room<'a>(&self, queue: MutexGuard<'a, Queue<R::Sample>>) -> MutexGuard<'a, Queue<R::Sample>> {
-        let full = Level { bytes: usize::MAX, ..queue.level(FULL_PART) };
-        let waits = queue.may_wait_at(Instant::now);
-        if !queue.is_above(full) || !waits || queue.is_stopped() {
-            return queue;
-        }
-        let room = Level { samples: full.samples.saturating_sub(ROOM_SAMPLES), ..full };
-        let mut queue = self.wait_until(queue, room, ROOM_WAIT_MAX);
-        let pause = queue.is_above(room).then(|| Instant::now() + ROOM_WAIT_PAUSE);
-        queue.set_no_wait_before(pause);
-        queue
-    }
-
     /// Waits until the queue has sunk to `level`, at most for the given time.
     fn wait_until<'a>(
         &self,
@@ -230,7 +209,10 @@ impl<R: Receiver> IntakeState<R> {
                 loop {
                     let ((next, may_go_on), overrun, is_stopped) = {
                         let mut queue = lock(&self.queue);
-                        (queue.next(), queue.take_overrun(), queue.is_stopped())
+                        let next = queue.next();
+                        self.progress.advance();
+                        self.accept(&mut queue);
+                        (next, queue.take_overrun(), queue.is_stopped())
                     };
                     if may_go_on {
                         self.eased.notify_one();
@@ -258,8 +240,18 @@ impl<R: Receiver> IntakeState<R> {
         }
     }
 
+    /// Accepts the samples of writers again if there is room.
+    fn accept(&self, queue: &mut Queue<R::Sample>) {
+        if let Some(writers) = self.participant.remote_writers() {
+            queue.accept(|writer, tally| writers.accept(writer, tally));
+        }
+    }
+
     fn stop(&self) {
-        lock(&self.queue).stop();
+        let mut queue = lock(&self.queue);
+        queue.stop();
+        self.accept(&mut queue);
+        drop(queue);
         self.filled.notify_one();
         self.eased.notify_one();
     }
@@ -312,6 +304,7 @@ impl<R: Receiver> Intake<R> {
             filled: Condvar::new(),
             eased: Condvar::new(),
             holds_back: is_deep,
+            progress: Arc::default(),
             receiver: Mutex::new(None),
             participant: Arc::clone(participant),
         });

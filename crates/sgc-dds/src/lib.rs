@@ -18,14 +18,17 @@
 #![allow(unsafe_code)]
 #![warn(clippy::undocumented_unsafe_blocks)]
 
+mod acknack;
 mod announced;
 mod announcement;
 mod arrivals;
+mod backpressure;
 mod bursts;
 pub mod config;
 mod discovery;
 mod domain;
 mod entity;
+mod events;
 mod files;
 mod first_messages;
 mod fragments;
@@ -45,6 +48,7 @@ mod pace;
 mod participant;
 pub mod payload;
 mod plugin_domain;
+mod proxies;
 pub mod qos;
 mod reader;
 mod rpc;

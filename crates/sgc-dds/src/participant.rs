@@ -16,6 +16,7 @@ use sgc_ros::{DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, Guid
 use sgc_sync::lock;
 
 use crate::announced;
+use crate::backpressure::RemoteWriters;
 use crate::config::DdsConfig;
 use crate::domain::Domain;
 use crate::entity::{Entity, check};
@@ -164,6 +165,11 @@ impl Participant {
     /// Returns the time since a writer renewed its lease, if leases are watched.
     pub(crate) fn renewed_ago(&self, writer: &Guid) -> Option<Duration> {
         self.endpoint_watch.as_ref()?.leases.renewed_ago(writer)
+    }
+
+    /// Returns the writers whose samples a reader can refuse, unless this Cyclone is another one.
+    pub(crate) fn remote_writers(&self) -> Option<&RemoteWriters> {
+        Some(&self.endpoint_watch.as_ref()?.writers)
     }
 
     /// Returns `true` if the endpoint belongs to this participant.

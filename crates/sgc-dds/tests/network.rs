@@ -618,6 +618,186 @@ fn blocked_keep_all_reader_delays_no_other_reader() {
     }
 }
 
+/// A `std_msgs/String` that begins with a number and is long, as CDR.
+fn numbered(number: usize, bytes: usize) -> Bytes {
+    string_cdr(&format!("{number:08}{}", "x".repeat(bytes)))
+}
+
+/// Returns the number of such a string.
+fn number_of(payload: &[u8]) -> usize {
+    std::str::from_utf8(&payload[8..16]).unwrap().parse().unwrap()
+}
+
+/// Returns a writer whose samples reach a handler that then waits. They begin with number 1.
+fn numbering(network: &CycloneNetwork, spec: &EndpointSpec, handled: &Receiver<Outcome>) -> CycloneWriter {
+    let writer = writer(network, spec, 1);
+    eventually("the reader knows the writer", || {
+        write(&writer, &numbered(0, 0));
+        handled.recv_timeout(QUIET).is_ok()
+    });
+    writer
+}
+
+/// A thread that writes numbered samples to a `KEEP_ALL` writer, each until it is taken, and the number of the last one
+/// so far.
+fn flood(
+    writer: CycloneWriter,
+    samples: usize,
+    bytes: usize,
+) -> (std::thread::JoinHandle<CycloneWriter>, Arc<AtomicUsize>) {
+    let taken = Arc::new(AtomicUsize::new(0));
+    let count = taken.clone();
+    let thread = std::thread::spawn(move || {
+        for number in 1..=samples {
+            let payload = numbered(number, bytes);
+            let head = || SampleHead::new(SampleKind::Write, 1_000_000_000);
+            while writer.write_ahead(head(), payload.clone()).is_err() {}
+            writer.flush();
+            count.store(number, SeqCst);
+        }
+        writer
+    });
+    (thread, taken)
+}
+
+/// Returns the number of the next sample that a handler gets, or the number of those that are lost.
+fn next_number(handled: &Receiver<Outcome>) -> Result<usize, usize> {
+    loop {
+        match next(handled) {
+            Outcome::Overrun(samples) => return Err(samples as usize),
+            Outcome::OnItsThread(payload) | Outcome::AtOnce(payload) => match number_of(&payload) {
+                0 => {}
+                number => return Ok(number),
+            },
+        }
+    }
+}
+
+/// Waits until a writer has to wait.
+fn stalled(taken: &AtomicUsize) -> usize {
+    let mut seen = (usize::MAX, Instant::now());
+    eventually("the writer waits", || {
+        let now = taken.load(SeqCst);
+        if now != seen.0 {
+            seen = (now, Instant::now());
+        }
+        seen.1.elapsed() > Duration::from_millis(700)
+    });
+    seen.0
+}
+
+#[test]
+fn keep_all_writer_waits_for_a_reader_without_room_and_loses_nothing() {
+    // Samples of one packet and of several. All together are more than a queue may hold.
+    for (domain, samples, bytes) in [(167, 40_000, 100), (168, 1000, 200_000)] {
+        let (ros, sgc) = (open(domain, None), open(domain, Some("arm-1")));
+        let ((release, gate), (tell, handled)) = (channel::<()>(), channel());
+        let all = with(spec("all"), |qos| qos.history = History::KeepAll);
+        let gated = Choosy { may: Arc::default(), gate, handled: tell };
+        let _reader = sgc.create_reader(&all, Box::new(gated)).unwrap();
+        let (_free, free) = read(&sgc, &spec("free"));
+        let (w_all, w_free) = (numbering(&ros, &all, &handled), writer(&ros, &spec("free"), 1));
+        let (thread, taken) = flood(w_all, samples, bytes);
+        let waits_at = stalled(&taken);
+        assert!((1..samples).contains(&waits_at), "{waits_at} of {samples} were taken");
+        // Meanwhile other topics flow.
+        for i in 0..50 {
+            let payload = string_cdr(&format!("free {i}"));
+            write(&w_free, &payload);
+            assert_eq!(next(&free).payload, padded(&payload));
+        }
+        assert_eq!(taken.load(SeqCst), waits_at);
+        drop(release);
+        (1..=samples).for_each(|number| assert_eq!(next_number(&handled), Ok(number)));
+        thread.join().unwrap();
+        quiet(&handled);
+    }
+}
+
+#[test]
+fn samples_that_a_keep_last_writer_drops_while_it_is_refused_are_counted() {
+    const UNHEARD: usize = 20_000;
+    let (ros, sgc) = (open(171, None), open(171, Some("arm-1")));
+    let ((release, gate), (tell, handled)) = (channel::<()>(), channel());
+    let all = with(spec("last"), |qos| qos.history = History::KeepAll);
+    let _reader =
+        sgc.create_reader(&all, Box::new(Choosy { may: Arc::default(), gate, handled: tell })).unwrap();
+    let writer = numbering(&ros, &spec("last"), &handled);
+    let mut written = 0;
+    let mut flood = |samples| {
+        (written + 1..=written + samples).for_each(|number| write(&writer, &numbered(number, 0)));
+        written += samples;
+        written
+    };
+    // It drops nothing before it is refused.
+    eventually("the writer is refused", || {
+        flood(200);
+        !writer.wait_acknowledged(Duration::from_secs(1))
+    });
+    flood(UNHEARD);
+    drop(release);
+    let (mut numbers, mut overrun) = (Vec::new(), 0);
+    // Losses are counted a little later, and reported with the next sample.
+    eventually("all is received or counted", || {
+        let written = flood(1);
+        while numbers.last() != Some(&written) {
+            match next_number(&handled) {
+                Ok(number) => numbers.push(number),
+                Err(lost) => overrun += lost,
+            }
+        }
+        std::thread::sleep(Duration::from_millis(50));
+        numbers.len() + overrun == written
+    });
+    assert!(numbers.is_sorted() && overrun > 0, "{overrun} were counted");
+}
+
+#[test]
+fn writer_is_accepted_again_when_the_reader_that_refused_it_is_gone() {
+    const SAMPLES: usize = 1000;
+    let (ros, sgc) = (open(169, None), open(169, Some("arm-1")));
+    let ((release, gate), (tell, handled)) = (channel::<()>(), channel());
+    let all = with(spec("all"), |qos| qos.history = History::KeepAll);
+    let reader =
+        sgc.create_reader(&all, Box::new(Choosy { may: Arc::default(), gate, handled: tell })).unwrap();
+    let (thread, taken) = flood(numbering(&ros, &all, &handled), SAMPLES, 200_000);
+    let waits_at = stalled(&taken);
+    assert!(waits_at < SAMPLES);
+    // A second reader of the writer gets nothing while the first one refuses.
+    let (_second, second) = read(&sgc, &all);
+    let ends = std::thread::spawn(move || drop(reader));
+    drop(release);
+    ends.join().unwrap();
+    drop(handled);
+    thread.join().unwrap();
+    while number_of(&next(&second).payload) != SAMPLES {}
+}
+
+#[test]
+fn writer_goes_on_if_a_reader_takes_nothing_for_ten_seconds() {
+    const SAMPLES: usize = 1000;
+    let (ros, sgc) = (open(170, None), open(170, Some("arm-1")));
+    let ((release, gate), (tell, handled)) = (channel::<()>(), channel());
+    let all = with(spec("all"), |qos| qos.history = History::KeepAll);
+    let _reader =
+        sgc.create_reader(&all, Box::new(Choosy { may: Arc::default(), gate, handled: tell })).unwrap();
+    let (thread, taken) = flood(numbering(&ros, &all, &handled), SAMPLES, 200_000);
+    assert!(stalled(&taken) < SAMPLES);
+    let began = Instant::now();
+    thread.join().unwrap();
+    assert!(began.elapsed() > Duration::from_secs(5), "it waited before");
+    drop(release);
+    let (mut numbers, mut overrun) = (Vec::new(), 0);
+    while numbers.last() != Some(&SAMPLES) {
+        match next_number(&handled) {
+            Ok(number) => numbers.push(number),
+            Err(lost) => overrun += lost,
+        }
+    }
+    assert!(numbers.is_sorted() && overrun > 0);
+    assert_eq!(numbers.len() + overrun, SAMPLES, "each is received or counted");
+}
+
 #[test]
 fn a_handler_that_blocks_delays_no_other_reader() {
     let (ros, sgc) = (open(82, None), open(82, Some("arm-1")));

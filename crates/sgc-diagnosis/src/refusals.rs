@@ -483,7 +483,7 @@ const PACKETS: &[Refusal] = &[
     counted(DataDrop::Repeated.key(), "a publisher's history came once more after its node started anew", ""),
     counted(
         DataDrop::Overrun.key(),
-        "a local publisher writes faster than the link takes it, longer than 4096 messages and 64 MiB make up for",
+        "a local publisher writes faster than the link takes it, and does not keep all its messages (`KEEP_ALL`)",
         "set max_rate or max_bandwidth in the [[share]], or have the program publish less",
     ),
     counted(

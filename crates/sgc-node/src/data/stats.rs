@@ -83,7 +83,7 @@ pub enum DataDrop {
     TooOld,
     /// The publisher's history was repeated after a restart of its node.
     Repeated,
-    /// A newer message replaced it because a local publisher writes faster than this node can send.
+    /// A newer message replaced it, here or at a local publisher that writes faster than this node can send.
     Overrun,
     /// The message is or becomes JSON, and its type is unknown here.
     NoDefinition,

@@ -55,6 +55,29 @@ fn a_reliable_topic_that_keeps_all_arrives_whole_however_fast_it_is_published() 
     }
 }
 
+/// More than a node has room for comes while the router stands still.
+#[test]
+fn a_publisher_that_keeps_all_waits_while_the_path_stands_still() {
+    const MESSAGES: u64 = 2_000;
+    const PAUSE: Duration = Duration::from_secs(1);
+    let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/load"]));
+    let extra = ["--depth", "0", "--rate", "0", "--size", "65536", "--insist"];
+    for pair in PAIRS {
+        let carried = thread::scope(|scope| {
+            let carried = scope.spawn(|| carry(&lab, pair, [Site::Robot, Site::Desk], MESSAGES, &extra));
+            let router = lab.node(Site::Cloud);
+            while !carried.is_finished() {
+                router.signal(Signal::STOP);
+                thread::sleep(PAUSE);
+                router.signal(Signal::CONT);
+                thread::sleep(PAUSE / 4);
+            }
+            carried.join().unwrap()
+        });
+        assert_whole(&carried, MESSAGES, &format!("{pair:?}"));
+    }
+}
+
 #[test]
 fn large_messages_of_real_ros_2_arrive_whole() {
     const MESSAGES: u64 = 10;
