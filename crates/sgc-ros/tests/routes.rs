@@ -232,6 +232,35 @@ fn a_restarted_publisher_keeps_its_share_and_a_gone_one_loses_it() {
 }
 
 #[test]
+fn share_outlives_its_last_publisher_while_messages_of_that_wait() {
+    let mut b = bench(&[("/a", "")], &[]);
+    b.appears(writer(1, "/a", Qos::default()));
+    b.vanishes(1);
+    let began = b.now;
+    // The caller knows whether messages wait. It is asked each time when the hold ends.
+    let ends = loop {
+        let at = b.routes.poll_timeout().expect("a hold");
+        assert_eq!(b.routes.shares_without_writers(at - Duration::from_millis(1)), []);
+        assert_eq!(b.routes.shares_without_writers(at), [mine("/a")]);
+        b.routes.hold_share(at, &mine("/a"));
+        let commands = b.passes(at - b.now);
+        if !commands.is_empty() {
+            break commands;
+        }
+        assert!(b.now - began < Duration::from_secs(700), "it has a bound");
+    };
+    assert_eq!(ends, [Command::Unshare { name: mine("/a") }]);
+    assert!(b.now - began >= Duration::from_secs(600));
+    // With another publisher, the source of one that is gone stays while messages wait, and no longer.
+    b.appears(writer(2, "/a", Qos::default()));
+    b.appears(writer(3, "/a", Qos::default()));
+    b.vanishes(3);
+    b.routes.hold_share(b.now + WRITERLESS_HOLD, &mine("/a"));
+    assert_eq!(b.passes(WRITERLESS_HOLD), []);
+    assert_eq!(published(&b.passes(WRITERLESS_HOLD)).0.len(), 1);
+}
+
+#[test]
 fn publisher_that_is_discovered_again_keeps_its_source_unless_another_has_it() {
     let mut b = bench(&[("/a", "")], &[]);
     b.appears(writer(1, "/a", Qos::default()));

@@ -348,6 +348,11 @@ impl<N: RosNetwork> Core<N> {
         self.router.handle_timeout(now);
         self.endpoint.handle_timeout(now);
         if let Some(routes) = &mut self.routes {
+            for name in routes.shares_without_writers(now.instant) {
+                if self.shares.get(&name).is_some_and(|share| share.has_waiting()) {
+                    routes.hold_share(now.instant, &name);
+                }
+            }
             routes.handle_timeout(now.instant);
         }
         self.sinks_due(now.instant);

@@ -108,6 +108,14 @@ impl DataPlane {
         })
     }
 
+    /// Returns `true` if packets under `name` wait for a link.
+    pub(crate) fn has_waiting(&self, name: &Name) -> bool {
+        let tables = self.shard(name).load();
+        tables.get(name).is_some_and(|forward| {
+            forward.outs.iter().any(|(_, out)| matches!(out, Out::Link(flow, _) if !flow.is_empty()))
+        })
+    }
+
     /// Sends a packet to its destinations. Waits while a reliable one is full; the others of the same name wait with
     /// it.
     pub(crate) async fn forward(&self, ingress: LinkId, mut packet: Packet) {

@@ -139,6 +139,11 @@ impl OutFlow {
         self.queue.has_headroom(OUTFLOW_RELIABLE_BYTES_MAX)
     }
 
+    /// Returns `true` if no packet waits.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.queue.is_empty()
+    }
+
     /// Closes the queue. Queued packets are still sent.
     pub(crate) fn close(&self) {
         self.queue.close();

@@ -118,6 +118,13 @@ impl OwnSources {
         self.0.len() < before
     }
 
+    /// Starts the hold of sources whose time has come once more, because messages of theirs may still wait.
+    pub(super) fn hold_on(&mut self, now: Instant) {
+        for own in self.0.values_mut() {
+            own.gone = own.gone.map(|at| if at + WRITERLESS_HOLD <= now { now } else { at });
+        }
+    }
+
     /// Returns the time of the next [`Self::time_out`].
     pub(super) fn deadline(&self) -> Option<Instant> {
         self.0.values().filter_map(|own| own.gone).min().map(|at| at + WRITERLESS_HOLD)

@@ -22,6 +22,12 @@ use crate::qos::{for_all_instances, reader_for, service_qos, weakest};
 /// Time for which a local reader outlives its last remote sink, so that a router restart costs no sample.
 pub const SINKLESS_HOLD: Duration = Duration::from_secs(10);
 
+/// Longest time for which a share outlives its last writer while messages of that wait: 64 MiB pass a megabit a second.
+const WRITERLESS_BUSY_MAX: Duration = Duration::from_secs(600);
+
+/// Longest time for which a source outlives its writer while messages wait, if there are others, which may never pause.
+const GONE_BUSY_MAX: Duration = Duration::from_secs(60);
+
 /// Depth of the owner's local writer for messages of others. Writers wait for acknowledgements, some 15 ms with
 /// Cyclone, once this many arrive at once. As many are kept for a reader that stands still.
 const PUBLISHERS_DEPTH: u32 = 100;
@@ -44,6 +50,8 @@ pub(super) struct ShareRoute {
     /// The client that calls local servers, if it is a service. The servers are the route's writers.
     client: Option<ServiceSpec>,
     writerless_until: Option<Instant>,
+    /// Since when holds go on because messages of writers that are gone wait.
+    busy_since: Option<Instant>,
     sinkless_until: Option<Instant>,
 }
 
@@ -108,6 +116,7 @@ impl ShareRoute {
             writer: None,
             client: None,
             writerless_until: None,
+            busy_since: None,
             sinkless_until: None,
         };
         (spec, route)
@@ -176,7 +185,7 @@ impl ShareRoute {
     /// Adds a local writer. A share that waits for one goes on.
     pub(super) fn add_writer(&mut self, writer: DiscoveredEndpoint) {
         self.writers.insert(writer.guid, writer);
-        self.writerless_until = None;
+        (self.writerless_until, self.busy_since) = (None, None);
     }
 
     /// Removes a local writer. Returns `None` if it is not one of this share.
@@ -319,6 +328,10 @@ impl ShareRoute {
 
     /// Opens, replaces or closes the reader of the local writers.
     fn refresh_reader(&mut self, offer: Qos) -> Vec<Command> {
+        // Messages of writers that are gone may wait at the reader, which ends with their sources.
+        if self.writers.is_empty() && self.own.writers().next().is_some() {
+            return Vec::new();
+        }
         // The reader requests no more than the writers offer. The rule's policies are offered elsewhere.
         let found = self.offer();
         // A transient-local topic is read from the start, because late joiners are promised its history.
@@ -388,6 +401,22 @@ impl ShareRoute {
         self.writers.keys().take(ENTRY_SOURCES_MAX).map(server).collect()
     }
 
+    /// Returns `true` if writers have been gone for a while: unless messages of theirs still wait, they are forgotten.
+    pub(super) fn outlives_writers(&self, now: Instant) -> bool {
+        [self.writerless_until, self.own.deadline()].into_iter().flatten().any(|at| at <= now)
+    }
+
+    /// Starts the holds of writers that are gone once more, because messages of theirs wait to be sent. Has no effect
+    /// once it has done so for too long.
+    pub(super) fn hold_on(&mut self, now: Instant) {
+        let max = if self.writers.is_empty() { WRITERLESS_BUSY_MAX } else { GONE_BUSY_MAX };
+        if now >= *self.busy_since.get_or_insert(now) + max {
+            return;
+        }
+        self.writerless_until = self.writerless_until.map(|at| at.max(now + WRITERLESS_HOLD));
+        self.own.hold_on(now);
+    }
+
     /// Handles the passing of time: ends a share whose last writer has been gone for a while, and forgets sources and
     /// sinks that are gone.
     pub(super) fn time_out(&mut self, now: Instant) -> ShareTimeout {
@@ -395,7 +424,11 @@ impl ShareRoute {
             return ShareTimeout::Ends;
         }
         let sinkless = self.sinkless_until.take_if(|at| *at <= now).is_some();
-        match self.own.time_out(now) || sinkless {
+        let is_forgetful = self.own.time_out(now);
+        if is_forgetful {
+            self.busy_since = None;
+        }
+        match is_forgetful || sinkless {
             true => ShareTimeout::Changed,
             false => ShareTimeout::Unchanged,
         }

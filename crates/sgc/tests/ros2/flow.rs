@@ -78,6 +78,33 @@ fn a_publisher_that_keeps_all_waits_while_the_path_stands_still() {
     }
 }
 
+/// Most of the messages wait at the robot's node when their publisher ends, for longer than its share would.
+#[test]
+fn last_messages_of_a_publisher_that_ended_arrive_over_a_path_that_stood_still() {
+    const MESSAGES: u64 = 200;
+    const PAUSE: Duration = Duration::from_secs(5);
+    let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/load"]));
+    let common = ["--topic", "/load", "--timeout", PLAN.peer_life, "--depth", "0"];
+    let last = MESSAGES.to_string();
+    for [talks, listens] in PAIRS {
+        let listen = [&["sub", "--last", &last, "--linger", "0.5"][..], &common].concat();
+        let mut listener = lab.load(Site::Desk, listens, &listen);
+        let talk = [&["pub", "--count", &last, "--rate", "0", "--size", "65536", "--wait-go"][..], &common];
+        let mut talker =
+            lab.load(Site::Robot, talks, &[&talk.concat()[..], &["--begin", "0.5", "--hold", "0"]].concat());
+        talker.wait_matched("a match at the publisher");
+        listener.wait_matched("a match at the subscriber");
+        talker.go();
+        thread::sleep(Duration::from_millis(300));
+        let router = lab.node(Site::Cloud);
+        router.signal(Signal::STOP);
+        talker.summary();
+        thread::sleep(PAUSE);
+        router.signal(Signal::CONT);
+        assert_whole(&listener.summary(), MESSAGES, &format!("[{talks:?}, {listens:?}]"));
+    }
+}
+
 #[test]
 fn large_messages_of_real_ros_2_arrive_whole() {
     const MESSAGES: u64 = 10;

@@ -39,6 +39,11 @@ impl EmitStage {
         self.data.has_headroom(&self.name)
     }
 
+    /// Returns `true` if packets wait for a link.
+    pub(crate) fn has_waiting(&self) -> bool {
+        self.data.has_waiting(&self.name)
+    }
+
     /// Returns a function that forwards packets of new messages, and waits where a link is full. Packets of a history
     /// without a sink stay here.
     pub(crate) fn packets(&self) -> impl FnMut(Packet) {

@@ -4,7 +4,7 @@
 //! queue of a reliable topic is full, only this thread waits, so other topics flow on. Samples that are ready together
 //! share a signature; none waits for a later one.
 
-use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed, Ordering::SeqCst};
 use std::sync::{Arc, MutexGuard, Weak};
 use std::time::{Duration, Instant};
 
@@ -55,6 +55,8 @@ pub(crate) struct LocalShare {
     taps: Taps,
     /// Whether a task looks for liveliness assertions.
     is_watched: AtomicBool,
+    /// Whether the reader's thread publishes a sample, or has another at hand.
+    is_publishing: AtomicBool,
 }
 
 impl LocalShare {
@@ -83,6 +85,7 @@ impl LocalShare {
             map: ArcSwap::default(),
             taps: Taps::default(),
             is_watched: AtomicBool::new(false),
+            is_publishing: AtomicBool::new(false),
         }
     }
 
@@ -119,6 +122,18 @@ impl LocalShare {
 
     /// Publishes a sample, at once or when its time has come. The reader's thread calls it.
     pub(crate) fn publish(self: &Arc<Self>, sample: Sample) {
+        let more = sample.more;
+        self.is_publishing.store(true, Relaxed);
+        self.publish_now(sample);
+        self.is_publishing.store(more, Relaxed);
+    }
+
+    /// Returns `true` if messages of local publishers wait here or for links.
+    pub(crate) fn has_waiting(&self) -> bool {
+        self.is_publishing.load(Relaxed) || self.emit.has_waiting()
+    }
+
+    fn publish_now(self: &Arc<Self>, sample: Sample) {
         // If more samples follow or the sample is long, the runtime sends packets while this thread seals.
         let is_alone = !sample.more && sample.payload.len() <= AT_HAND_BYTES_MAX;
         let _at_hand = is_alone.then(|| self.emit.begin_batch());

@@ -12,7 +12,8 @@ use crate::data::conversion::KnownType;
 use crate::data::dataplane::DataPlane;
 use crate::data::pending::PENDING_BYTES_MAX;
 use crate::data::sending::fixtures::{
-    KNOWN, STRANGER, add_link, add_tree, grant, map_of, sample, share, text_type, unflushed, wait_until,
+    KNOWN, STRANGER, add_link, add_tree, grant, map_of, queued, sample, share, text_type, unflushed,
+    wait_until,
 };
 use crate::data::sending::hold::{Downstream as _, EARLY_SAMPLES_MAX};
 use crate::data::sending::intake::Publisher;
@@ -77,6 +78,24 @@ fn sample_that_would_block_is_handed_back() {
         share.publish(sample(KNOWN, false));
     }
     assert!(!is_taken(sample(KNOWN, false)));
+}
+
+#[test]
+fn share_knows_whether_messages_wait_here() {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let _inside = runtime.enter();
+    let (data, share, _) = share();
+    let flow = add_link(&data);
+    assert!(!share.has_waiting());
+    share.publish(sample(KNOWN, false));
+    assert!(share.has_waiting(), "its packet waits for the link");
+    assert!(queued(&flow).is_some() && !share.has_waiting());
+    share.publish(sample(KNOWN, true));
+    while queued(&flow).is_some() {}
+    assert!(share.has_waiting(), "the reader has another one");
+    share.publish(sample(KNOWN, false));
+    while queued(&flow).is_some() {}
+    assert!(!share.has_waiting());
 }
 
 #[test]

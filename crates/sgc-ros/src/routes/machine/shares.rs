@@ -162,6 +162,19 @@ impl<R: RngCore> Routes<R> {
         }
     }
 
+    /// Returns the shares that [`Self::handle_timeout`] ends, or that lose a source, because their writers are gone.
+    pub fn shares_without_writers(&self, now: Instant) -> Vec<Name> {
+        let due = self.shares.values().filter(|share| share.outlives_writers(now));
+        due.map(ShareRoute::name).collect()
+    }
+
+    /// Keeps a share and its sources for a while longer, within bounds, because messages of its writers wait to be sent.
+    pub fn hold_share(&mut self, now: Instant, name: &Name) {
+        if let Some(share) = self.shares.get_mut(name) {
+            share.hold_on(now);
+        }
+    }
+
     /// Ends shares whose last writer has been gone for a while, and forgets sources and sinks that are gone.
     pub(super) fn shares_time_out(&mut self, now: Instant) {
         let due: Vec<_> = self.shares.values_mut().map(|share| (share.name(), share.time_out(now))).collect();
