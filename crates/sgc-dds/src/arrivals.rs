@@ -257,7 +257,14 @@ impl<S: FromSerdata> Queue<S> {
             return begins.then(|| Arc::clone(&known.tally));
         }
         // Nobody else has the tally of a writer that is gone.
-        self.refused.retain(|refused| Arc::strong_count(&refused.tally) > 1);
+        let overrun = &mut self.overrun;
+        self.refused.retain(|refused| {
+            let is_there = Arc::strong_count(&refused.tally) > 1;
+            if !is_there {
+                *overrun += refused.tally.take_lost();
+            }
+            is_there
+        });
         let has_room = self.refused.len() < REFUSED_WRITERS_MAX;
         has_room.then(|| {
             let tally = Arc::new(Tally::new(Arc::clone(reader)));
@@ -266,9 +273,10 @@ impl<S: FromSerdata> Queue<S> {
         })
     }
 
-    /// Calls `accept` with each writer whose samples are accepted again, if there is room or the queue is stopped.
-    pub(crate) fn accept(&mut self, accept: impl Fn(dds_instance_handle_t, &Arc<Tally>)) {
-        if self.is_above(self.refused_level(ROOM_PART)) && !self.is_stopped() {
+    /// Calls `accept` with each writer whose samples are accepted again: if there is room, if the queue is stopped, or
+    /// if nothing is taken from it (`is_stuck`).
+    pub(crate) fn accept(&mut self, is_stuck: bool, accept: impl Fn(dds_instance_handle_t, &Arc<Tally>)) {
+        if self.is_above(self.refused_level(ROOM_PART)) && !self.is_stopped() && !is_stuck {
             return;
         }
         for refused in self.refused.iter_mut().filter(|refused| refused.is_refused) {
@@ -372,6 +380,43 @@ mod tests {
         assert!(queue.next().1 && matches!(queue.receiving, ReceivingState::Free));
         assert!(!queue.next().1, "it was told");
         assert!(push(&mut queue, WAITING_BYTES_MAX / CROWDED_PART), "bytes count as well");
+    }
+
+    #[test]
+    fn writers_are_refused_beyond_a_level_until_there_is_room_or_nothing_is_taken() {
+        let mut queue = Queue::new(8);
+        let reader = Arc::default();
+        let push = |queue: &mut Queue<usize>, writer| {
+            queue.count_arrival(writer);
+            queue.push(Arrival { sample: 1, writer, source_timestamp_ns: 0 });
+            queue.begin_to_refuse(writer, &reader)
+        };
+        let accepted = |queue: &mut Queue<usize>, is_stuck| {
+            let all = std::cell::RefCell::new(Vec::new());
+            queue.accept(is_stuck, |writer, _| all.borrow_mut().push(writer));
+            all.into_inner()
+        };
+        assert!((0..4).all(|_| push(&mut queue, 1).is_none()));
+        let first = push(&mut queue, 1).expect("half of the queue is full");
+        assert!(push(&mut queue, 1).is_none(), "once");
+        let second = push(&mut queue, 2).expect("another writer");
+        assert_eq!(accepted(&mut queue, false), []);
+        while queue.arrivals.len() > 2 {
+            assert_eq!(accepted(&mut queue, false), []);
+            queue.next();
+        }
+        assert_eq!(accepted(&mut queue, false), [1, 2]);
+        assert_eq!(accepted(&mut queue, false), [], "once");
+        // A reader that takes nothing accepts all, and refuses again later.
+        (0..4).for_each(|_| drop(push(&mut queue, 3)));
+        assert!(push(&mut queue, 1).is_some_and(|again| Arc::ptr_eq(&again, &first)));
+        assert_eq!(accepted(&mut queue, true), [1, 3]);
+        assert!(push(&mut queue, 1).is_some());
+        // The tally of a writer that is gone leaves with what it counted.
+        assert_eq!(queue.refused.len(), 3);
+        drop((first, second));
+        assert!(push(&mut queue, 4).is_some());
+        assert_eq!(queue.refused.len(), 1);
     }
 
     #[test]

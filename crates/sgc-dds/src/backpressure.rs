@@ -11,6 +11,9 @@
 //! but no sample is asked for: it would be refused. When the last reader has room again, the flag is cleared. Each
 //! reader asks for what it lacks, and for a heartbeat, because a writer that waits may send its next one seconds later.
 //!
+//! The flag concerns all readers of a participant, so a writer with several of them here is not refused. A network that
+//! DDS Security protects may ignore the request for a heartbeat; then the next one comes when the writer sends it.
+//!
 //! All changes happen in an event of the writer. Cyclone runs the events of a domain one after the other, and frees no
 //! entity meanwhile.
 //!
@@ -19,7 +22,7 @@
 
 use std::collections::BTreeMap;
 use std::ffi::c_void;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard};
 
 use cyclors::dds_instance_handle_t;
@@ -30,7 +33,8 @@ use crate::entity::monotonic_ns;
 use crate::events::{ddsi_delete_xevent, ddsi_qxev_callback, ddsi_resched_xevent_if_earlier};
 use crate::identity::FAST_DDS;
 use crate::proxies::{
-    LOCAL_MATCHING_IN_PROGRESS, Nacked, ProxyEndpoint, ProxyWriterState, ReaderMatch, Time,
+    LOCAL_MATCHING_IN_PROGRESS, NACK_SENT_ON_DELAY, Nacked, ProxyEndpoint, ProxyWriterState, ReaderMatch,
+    Time,
 };
 
 /// Most writers in a process that can be refused.
@@ -40,8 +44,15 @@ const WRITERS_MAX: usize = 16_384;
 const LOOK_NS: i64 = 500_000_000;
 
 /// Longest time for which a reader may refuse samples without taking any from its queue, in nanoseconds. It is longer
-/// than a link without progress may block a publisher.
+/// than a link without progress may block a publisher. A long sample has more time: see [`STUCK_NS_PER_BYTE`].
 const STUCK_NS: i64 = 10_000_000_000;
+
+/// The time by which this is longer for each byte of the sample that the reader took last: as on a path of a megabit a
+/// second.
+const STUCK_NS_PER_BYTE: i64 = 8_000;
+
+/// Time for which the numbers of a writer are looked at after its samples are accepted again, in nanoseconds.
+const COUNTED_NS: i64 = 10_000_000_000;
 
 /// `DDS_NEVER`: an event at this time never happens.
 const NEVER: Time = Time(i64::MAX);
@@ -58,21 +69,30 @@ unsafe extern "C" {
 #[derive(Debug, Default)]
 pub(crate) struct Progress {
     taken: AtomicU64,
+    /// Length of the sample that was taken last.
+    bytes: AtomicUsize,
     is_stuck: AtomicBool,
 }
 
 impl Progress {
-    /// Records that the reader took a sample from its queue.
-    pub(crate) fn advance(&self) {
+    /// Records that the reader took a sample of this length from its queue.
+    pub(crate) fn advance(&self, bytes: usize) {
+        self.bytes.store(bytes, Relaxed);
         self.taken.fetch_add(1, Relaxed);
         if self.is_stuck.load(Relaxed) {
             self.is_stuck.store(false, Relaxed);
         }
     }
 
-    /// Returns `true` if the reader refused samples for [`STUCK_NS`] and took none from its queue since.
+    /// Returns `true` if the reader refused samples for too long without taking any, and took none since.
     pub(crate) fn is_stuck(&self) -> bool {
         self.is_stuck.load(Relaxed)
+    }
+
+    /// Returns the longest time until the reader takes the next sample, in nanoseconds.
+    fn patience_ns(&self) -> i64 {
+        let bytes = i64::try_from(self.bytes.load(Relaxed)).unwrap_or(i64::MAX);
+        bytes.saturating_mul(STUCK_NS_PER_BYTE).saturating_add(STUCK_NS)
     }
 }
 
@@ -120,7 +140,7 @@ impl Refusal {
         if taken != self.taken {
             (self.taken, self.since_ns) = (taken, now_ns);
         }
-        if self.refuses && now_ns.saturating_sub(self.since_ns) >= STUCK_NS {
+        if self.refuses && now_ns.saturating_sub(self.since_ns) >= self.tally.reader.patience_ns() {
             self.tally.reader.is_stuck.store(true, Relaxed);
             self.refuses = false;
         }
@@ -151,6 +171,8 @@ struct RemoteWriter {
     refusals: Vec<Refusal>,
     /// `true` if the flag is set.
     is_refused: bool,
+    /// The time until which its numbers are looked at.
+    counted_until_ns: i64,
 }
 
 // SAFETY: the pointers are used under the writer's lock only, while Cyclone frees no entity.
@@ -190,6 +212,7 @@ pub(crate) unsafe fn watch(
         event: std::ptr::null_mut(),
         refusals: Vec::new(),
         is_refused: false,
+        counted_until_ns: 0,
     };
     all.insert((domain as usize, instance), writer);
 }
@@ -258,19 +281,27 @@ impl RemoteWriter {
     }
 
     /// Looks at all readers that refuse, or refused before. The writer's lock must be held, so that no sample arrives.
-    fn step(&mut self, delivered: u32, now_ns: i64) -> Step {
+    /// `readers` is the number of matched readers, and `delivered` as in [`Refusal::look_at_numbers`]. Returns the next
+    /// step, and whether to look again.
+    fn step(&mut self, readers: usize, delivered: u32, now_ns: i64) -> (Step, bool) {
         // A reader that is gone has left its tally.
         self.refusals.retain(|refusal| refusal.refuses || Arc::strong_count(&refusal.tally) > 1);
         for refusal in &mut self.refusals {
             refusal.look_at_progress(now_ns);
             refusal.look_at_numbers(delivered);
         }
-        let is_refused = self.has_to_be_refused();
-        match (std::mem::replace(&mut self.is_refused, is_refused), is_refused) {
+        let refuses = self.has_to_be_refused();
+        // Other readers would get nothing either.
+        let is_refused = refuses && readers <= 1;
+        let step = match (std::mem::replace(&mut self.is_refused, is_refused), is_refused) {
             (_, true) => Step::Refuse,
             (true, false) => Step::Accept,
             (false, false) => Step::Rest,
+        };
+        if matches!(step, Step::Accept) {
+            self.counted_until_ns = now_ns.saturating_add(COUNTED_NS);
         }
+        (step, refuses || now_ns < self.counted_until_ns)
     }
 
     /// Makes the event happen at once if the flag has to change.
@@ -304,14 +335,16 @@ unsafe extern "C" fn apply(
     let Some((endpoint, state)) = writers().get(&key).map(|writer| (writer.endpoint, writer.state)) else {
         return;
     };
-    // SAFETY: the writer was listed when this event ran, and no entity is freed meanwhile. The callback is lent the
-    // event and the packets.
+    let mut requests = Vec::new();
+    // SAFETY: the writer was listed when this event ran, and no entity is freed meanwhile. Its lock is held, and the
+    // callback is lent the event and the packets.
     unsafe {
         let mutex = (&raw const (*endpoint).common.lock).cast_mut().cast();
         ddsrt_mutex_lock(mutex);
-        let step = match writers().get_mut(&key) {
-            Some(writer) => writer.step((*state).next_number_to_deliver(), now.0),
-            None => Step::Rest,
+        let (readers, delivered) = ((*state).count_readers(), (*state).next_number_to_deliver());
+        let (step, looks_again) = match writers().get_mut(&key) {
+            Some(writer) => writer.step(readers, delivered, now.0),
+            None => (Step::Rest, false),
         };
         match step {
             Step::Refuse => {
@@ -322,17 +355,16 @@ unsafe extern "C" fn apply(
                 (*state).flags &= !LOCAL_MATCHING_IN_PROGRESS;
                 let next = ddsi_reorder_next_seq((*state).reorder);
                 (*state).for_each_reader(|found| {
-                    let request = ask_again(found, &*endpoint, next);
+                    requests.extend(ask_again(found, &*endpoint, next));
                     ddsi_resched_xevent_if_earlier(found.acknack, now);
-                    if let Some(request) = request {
-                        request.send(gv, pack);
-                    }
                 });
             }
             Step::Rest => {}
         }
         ddsrt_mutex_unlock(mutex);
-        if !matches!(step, Step::Rest) {
+        // To send may block.
+        requests.iter().for_each(|request: &HeartbeatRequest| request.send(gv, pack));
+        if looks_again {
             ddsi_resched_xevent_if_earlier(event, Time(now.0.saturating_add(LOOK_NS)));
         }
     }
@@ -351,6 +383,7 @@ enum Step {
 /// Makes a reader answer heartbeats without asking for samples.
 fn ask_for_nothing(found: &mut ReaderMatch, now: Time) {
     found.nacked = Nacked::ALL;
+    found.flags |= NACK_SENT_ON_DELAY;
     // Cyclone asks again for what it asked for before, after a delay from this time on.
     found.last_nack = now.0.saturating_add(2 * LOOK_NS);
 }
@@ -358,6 +391,7 @@ fn ask_for_nothing(found: &mut ReaderMatch, now: Time) {
 /// Makes a reader ask for all samples that it lacks, and returns a request for a heartbeat.
 fn ask_again(found: &mut ReaderMatch, writer: &ProxyEndpoint, next: u64) -> Option<HeartbeatRequest> {
     found.nacked = Nacked::default();
+    found.flags &= !NACK_SENT_ON_DELAY;
     found.last_nack = 0;
     // Fast DDS answers an ACKNACK of base 0 at once, and others with a heartbeat after up to three seconds.
     let base = match writer.vendor {

@@ -153,11 +153,13 @@ impl<R: Receiver> IntakeState<R> {
         let writer = arrival.writer;
         queue.push(arrival);
         if self.holds_back
-            && !self.progress.is_stuck()
             && let Some(writers) = self.participant.remote_writers()
-            && let Some(tally) = queue.begin_to_refuse(writer, &self.progress)
         {
-            writers.refuse(writer, &tally);
+            if self.progress.is_stuck() {
+                self.accept(&mut queue);
+            } else if let Some(tally) = queue.begin_to_refuse(writer, &self.progress) {
+                writers.refuse(writer, &tally);
+            }
         }
         if queue.begin_to_wake() {
             drop(queue);
@@ -210,7 +212,9 @@ impl<R: Receiver> IntakeState<R> {
                     let ((next, may_go_on), overrun, is_stopped) = {
                         let mut queue = lock(&self.queue);
                         let next = queue.next();
-                        self.progress.advance();
+                        if let Some(Next::Sample(arrival)) = &next.0 {
+                            self.progress.advance(arrival.sample.bytes());
+                        }
                         self.accept(&mut queue);
                         (next, queue.take_overrun(), queue.is_stopped())
                     };
@@ -243,7 +247,7 @@ impl<R: Receiver> IntakeState<R> {
     /// Accepts the samples of writers again if there is room.
     fn accept(&self, queue: &mut Queue<R::Sample>) {
         if let Some(writers) = self.participant.remote_writers() {
-            queue.accept(|writer, tally| writers.accept(writer, tally));
+            queue.accept(self.progress.is_stuck(), |writer, tally| writers.accept(writer, tally));
         }
     }
 

@@ -24,6 +24,10 @@ pub(crate) const LOCAL_MATCHING_IN_PROGRESS: u32 = 1 << 2;
 const ALIVE: u32 = 1 << 3;
 const FILTERED: u32 = 1 << 4;
 
+/// Flag of a match: samples were asked for again after a delay. Then a heartbeat for this reader alone, as Cyclone sends
+/// one behind each repetition, makes it ask after a further delay only.
+pub(crate) const NACK_SENT_ON_DELAY: u32 = 1 << 4;
+
 /// Kinds of readers in entity ids, with and without a key (RTPS 2.5, 9.3.1.2).
 const READER_KINDS: [u32; 2] = [0x07, 0x04];
 
@@ -134,23 +138,44 @@ impl ProxyWriterState {
         self.next_number_to_deliver.load(Relaxed)
     }
 
+    /// Returns the number of matched readers, as far as [`MATCHES_MAX`].
+    ///
+    /// # Safety
+    /// The writer's lock must be held.
+    pub(crate) unsafe fn count_readers(&mut self) -> usize {
+        let mut readers = 0;
+        // SAFETY: the lock is held by contract.
+        unsafe { self.for_each_match(|_| readers += 1) };
+        readers
+    }
+
     /// Calls `visit` with each matched reliable reader.
     ///
     /// # Safety
     /// The writer's lock must be held.
     pub(crate) unsafe fn for_each_reader(&mut self, mut visit: impl FnMut(&mut ReaderMatch)) {
+        // SAFETY: the lock is held by contract.
+        unsafe {
+            self.for_each_match(|found| {
+                if found.is_reliable() {
+                    visit(found);
+                }
+            });
+        }
+    }
+
+    /// Calls `visit` with each matched reader.
+    ///
+    /// # Safety
+    /// The writer's lock must be held.
+    unsafe fn for_each_match(&mut self, mut visit: impl FnMut(&mut ReaderMatch)) {
         let mut next = vec![self.readers];
         for _ in 0..MATCHES_MAX {
             let Some(node) = next.pop() else { return };
-            if node.is_null() {
-                continue;
-            }
             // SAFETY: the nodes of the tree are matches, which live while the lock is held.
-            let found = unsafe { &mut *node.cast::<ReaderMatch>() };
-            next.extend(found.node.children);
-            if found.is_reliable() {
-                visit(found);
-            }
+            let Some(found) = (unsafe { node.cast::<ReaderMatch>().as_mut() }) else { continue };
+            next.extend(found.node.children.iter().filter(|child| !child.is_null()));
+            visit(found);
         }
     }
 }
@@ -173,6 +198,8 @@ pub(crate) struct ReaderMatch {
     /// The event that sends the next ACKNACK, `null` for a best-effort reader.
     pub(crate) acknack: *mut c_void,
     sync: c_int,
+    /// Flags in the order of the bit fields.
+    pub(crate) flags: u32,
 }
 
 /// `struct ddsi_last_nack_summary`: the samples that were asked for again last.

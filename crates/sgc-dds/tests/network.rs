@@ -774,6 +774,28 @@ fn writer_is_accepted_again_when_the_reader_that_refused_it_is_gone() {
 }
 
 #[test]
+fn writer_with_another_reader_here_is_not_refused() {
+    const SAMPLES: usize = 1000;
+    let (ros, sgc) = (open(172, None), open(172, Some("arm-1")));
+    let ((release, gate), (tell, handled)) = (channel::<()>(), channel());
+    let all = with(spec("all"), |qos| qos.history = History::KeepAll);
+    let _stuck =
+        sgc.create_reader(&all, Box::new(Choosy { may: Arc::default(), gate, handled: tell })).unwrap();
+    let (_free, free) = read(&sgc, &all);
+    let writer = writer(&ros, &all, 2);
+    eventually("the readers know the writer", || {
+        write(&writer, &numbered(0, 0));
+        handled.recv_timeout(QUIET).is_ok() && free.recv_timeout(QUIET).is_ok()
+    });
+    let (thread, _) = flood(writer, SAMPLES, 200_000);
+    let mut numbers =
+        std::iter::repeat_with(|| number_of(&next(&free).payload)).skip_while(|number| *number == 0);
+    (1..=SAMPLES).for_each(|number| assert_eq!(numbers.next(), Some(number)));
+    drop(release);
+    thread.join().unwrap();
+}
+
+#[test]
 fn writer_goes_on_if_a_reader_takes_nothing_for_ten_seconds() {
     const SAMPLES: usize = 1000;
     let (ros, sgc) = (open(170, None), open(170, Some("arm-1")));

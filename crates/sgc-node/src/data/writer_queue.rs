@@ -33,7 +33,7 @@ use crate::drops::NodeDrop;
 /// Most messages that wait for one local writer.
 pub(crate) const WRITER_MESSAGES_MAX: usize = 1024;
 /// Most bytes that wait for one local writer.
-const WRITER_BYTES_MAX: usize = 64 << 20;
+const WRITER_BYTES_MAX: usize = 16 << 20;
 /// Most delay of a wake-up of a writer's thread; Linux's default is 50 µs.
 const TIMER_SLACK_NS: u64 = 1_000;
 /// Messages of a transient-local writer that are remembered, to recognise repetitions.

@@ -12,15 +12,20 @@ use crate::qos::weakest;
 /// Time for which a share outlives its last local writer, so that a restarted program finds its subscribers.
 pub const WRITERLESS_HOLD: Duration = Duration::from_secs(2);
 
+/// Most writers of a share, those that are gone among them, for whose messages sources are held.
+const HELD_SOURCES_MAX: usize = 2 * ENTRY_SOURCES_MAX;
+
 /// The source that publishes for a local writer.
 #[derive(Clone, Debug)]
 struct OwnSource {
     source: SourceId,
     /// The writer's offer, as far as it is carried.
     qos: Qos,
-    /// The time at which the writer vanished. The source of a volatile writer is kept for a while: for its last
-    /// messages, and so that subscribers of a restarted program notice nothing.
+    /// The time at which the writer vanished, or at which its hold was started once more. The source of a volatile
+    /// writer is kept for a while: for its last messages, and so that subscribers of a restarted program notice nothing.
     gone: Option<Instant>,
+    /// The time at which the writer vanished.
+    vanished: Option<Instant>,
     /// `true` if the writer's liveliness lease has expired.
     is_lapsed: bool,
 }
@@ -46,7 +51,7 @@ impl OwnSources {
             && same_kind(&own.qos, &qos)
         {
             own.qos = qos;
-            own.gone = None;
+            (own.gone, own.vanished) = (None, None);
             return true;
         }
         // A source of another kind must be a new one.
@@ -54,7 +59,7 @@ impl OwnSources {
         let found = self.find(&qos, &mut new);
         let source = found.or_else(|| self.0.values().map(|own| own.source).max());
         let source = source.unwrap_or_else(new);
-        self.0.insert(*writer, OwnSource { source, qos, gone: None, is_lapsed });
+        self.0.insert(*writer, OwnSource { source, qos, gone: None, vanished: None, is_lapsed });
         found.is_some()
     }
 
@@ -86,7 +91,7 @@ impl OwnSources {
     /// Handles the end of a writer; `is_last` if the share has no other.
     pub(super) fn writer_gone(&mut self, now: Instant, writer: &Guid, is_last: bool) {
         match self.0.get_mut(writer) {
-            Some(own) if !own.qos.is_transient_local() => own.gone = Some(now),
+            Some(own) if !own.qos.is_transient_local() => (own.gone, own.vanished) = (Some(now), Some(now)),
             // Late joiners get no history of a publisher that is gone. The last one counts as gone only after the
             // hold.
             _ if !is_last => drop(self.0.remove(writer)),
@@ -118,10 +123,17 @@ impl OwnSources {
         self.0.len() < before
     }
 
-    /// Starts the hold of sources whose time has come once more, because messages of theirs may still wait.
-    pub(super) fn hold_on(&mut self, now: Instant) {
+    /// Starts the hold of sources whose time has come once more, because messages of theirs may still wait: until `max`
+    /// after their writers vanished, and while there are few.
+    pub(super) fn hold_on(&mut self, now: Instant, max: Duration) {
+        if self.0.len() > HELD_SOURCES_MAX {
+            return;
+        }
         for own in self.0.values_mut() {
-            own.gone = own.gone.map(|at| if at + WRITERLESS_HOLD <= now { now } else { at });
+            let is_due = own.gone.is_some_and(|at| at + WRITERLESS_HOLD <= now);
+            if is_due && own.vanished.is_some_and(|at| at + max > now) {
+                own.gone = Some(now);
+            }
         }
     }
 

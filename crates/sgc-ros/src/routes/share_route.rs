@@ -50,8 +50,8 @@ pub(super) struct ShareRoute {
     /// The client that calls local servers, if it is a service. The servers are the route's writers.
     client: Option<ServiceSpec>,
     writerless_until: Option<Instant>,
-    /// Since when holds go on because messages of writers that are gone wait.
-    busy_since: Option<Instant>,
+    /// Since when it has no writer.
+    writerless_since: Option<Instant>,
     sinkless_until: Option<Instant>,
 }
 
@@ -116,7 +116,7 @@ impl ShareRoute {
             writer: None,
             client: None,
             writerless_until: None,
-            busy_since: None,
+            writerless_since: None,
             sinkless_until: None,
         };
         (spec, route)
@@ -185,7 +185,7 @@ impl ShareRoute {
     /// Adds a local writer. A share that waits for one goes on.
     pub(super) fn add_writer(&mut self, writer: DiscoveredEndpoint) {
         self.writers.insert(writer.guid, writer);
-        (self.writerless_until, self.busy_since) = (None, None);
+        (self.writerless_until, self.writerless_since) = (None, None);
     }
 
     /// Removes a local writer. Returns `None` if it is not one of this share.
@@ -202,7 +202,7 @@ impl ShareRoute {
         if !self.writers.is_empty() || rule.is_inbound() {
             return Some(WriterRemoval::Changed);
         }
-        self.writerless_until = Some(now + WRITERLESS_HOLD);
+        (self.writerless_until, self.writerless_since) = (Some(now + WRITERLESS_HOLD), Some(now));
         Some(WriterRemoval::Held)
     }
 
@@ -234,6 +234,7 @@ impl ShareRoute {
         self.rule = place;
         if self.writers.is_empty() && !rule.is_inbound() {
             self.writerless_until.get_or_insert(now);
+            self.writerless_since.get_or_insert(now);
         }
     }
 
@@ -406,15 +407,14 @@ impl ShareRoute {
         [self.writerless_until, self.own.deadline()].into_iter().flatten().any(|at| at <= now)
     }
 
-    /// Starts the holds of writers that are gone once more, because messages of theirs wait to be sent. Has no effect
-    /// once it has done so for too long.
+    /// Starts the holds of writers that are gone once more, because messages of the share wait to be sent. Has no effect
+    /// once they have been gone for too long.
     pub(super) fn hold_on(&mut self, now: Instant) {
-        let max = if self.writers.is_empty() { WRITERLESS_BUSY_MAX } else { GONE_BUSY_MAX };
-        if now >= *self.busy_since.get_or_insert(now) + max {
-            return;
+        let Some(since) = self.writerless_since else { return self.own.hold_on(now, GONE_BUSY_MAX) };
+        if since + WRITERLESS_BUSY_MAX > now {
+            self.writerless_until = self.writerless_until.map(|at| at.max(now + WRITERLESS_HOLD));
+            self.own.hold_on(now, WRITERLESS_BUSY_MAX);
         }
-        self.writerless_until = self.writerless_until.map(|at| at.max(now + WRITERLESS_HOLD));
-        self.own.hold_on(now);
     }
 
     /// Handles the passing of time: ends a share whose last writer has been gone for a while, and forgets sources and
@@ -424,11 +424,7 @@ impl ShareRoute {
             return ShareTimeout::Ends;
         }
         let sinkless = self.sinkless_until.take_if(|at| *at <= now).is_some();
-        let is_forgetful = self.own.time_out(now);
-        if is_forgetful {
-            self.busy_since = None;
-        }
-        match is_forgetful || sinkless {
+        match self.own.time_out(now) || sinkless {
             true => ShareTimeout::Changed,
             false => ShareTimeout::Unchanged,
         }

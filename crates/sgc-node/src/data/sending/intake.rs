@@ -43,6 +43,7 @@ impl Publisher {
     ) -> Option<Sample> {
         if self.is_past(&sample) {
             self.share.count_here(Dropped::one(DataDrop::Repeated));
+            self.share.left_out(sample.more);
             return None;
         }
         let (writer, timestamp_ns) = (sample.writer, sample.source_timestamp_ns);

@@ -136,6 +136,11 @@ impl ShapeStage {
         state.is_timed.then(|| state.shaper.due().unwrap_or(now))
     }
 
+    /// Returns `true` if a sample waits for its time.
+    pub(crate) fn has_held(&self) -> bool {
+        self.is_active() && lock(&self.state).held.is_some()
+    }
+
     /// Returns the held sample if its time has come.
     pub(crate) fn release(&self, now: Instant) -> Option<Sample> {
         let mut state = lock(&self.state);

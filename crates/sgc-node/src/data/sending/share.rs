@@ -128,9 +128,15 @@ impl LocalShare {
         self.is_publishing.store(more, Relaxed);
     }
 
+    /// Records that the reader's thread left a sample out, and whether it has another at hand.
+    pub(crate) fn left_out(&self, more: bool) {
+        self.is_publishing.store(more, Relaxed);
+    }
+
     /// Returns `true` if messages of local publishers wait here or for links.
     pub(crate) fn has_waiting(&self) -> bool {
-        self.is_publishing.load(Relaxed) || self.emit.has_waiting()
+        let waits_here = self.is_publishing.load(Relaxed) || self.hold.has_waiting() || self.shape.has_held();
+        waits_here || self.emit.has_waiting()
     }
 
     fn publish_now(self: &Arc<Self>, sample: Sample) {
