@@ -7,9 +7,9 @@
 //! the reader's thread. That thread may block for any time: no other reader waits for it, and the order of samples
 //! stays.
 //!
-//! While a queue of a reliable topic is crowded, the receiving thread waits for the reader's thread: briefly and at most
-//! half of the time. So acknowledgements come later, and a `KEEP_ALL` writer becomes slower. Other readers lose at most
-//! half of that thread's time to a slow one. If the queue grows all the same, the samples of its writers are
+//! While a queue of a reliable topic is crowded, the receiving thread waits for the reader's thread: briefly and at
+//! most half of the time. So acknowledgements come later, and a `KEEP_ALL` writer becomes slower. Other readers lose at
+//! most half of that thread's time to a slow one. If the queue grows all the same, the samples of its writers are
 //! [refused](crate::backpressure) until there is room.
 
 use std::cell::Cell;

@@ -24,8 +24,8 @@ pub(crate) const LOCAL_MATCHING_IN_PROGRESS: u32 = 1 << 2;
 const ALIVE: u32 = 1 << 3;
 const FILTERED: u32 = 1 << 4;
 
-/// Flag of a match: samples were asked for again after a delay. Then a heartbeat for this reader alone, as Cyclone sends
-/// one behind each repetition, makes it ask after a further delay only.
+/// Flag of a match: samples were asked for again after a delay. Then a heartbeat for this reader alone, as Cyclone
+/// sends one behind each repetition, makes it ask after a further delay only.
 pub(crate) const NACK_SENT_ON_DELAY: u32 = 1 << 4;
 
 /// Kinds of readers in entity ids, with and without a key (RTPS 2.5, 9.3.1.2).

@@ -22,7 +22,8 @@ struct OwnSource {
     /// The writer's offer, as far as it is carried.
     qos: Qos,
     /// The time at which the writer vanished, or at which its hold was started once more. The source of a volatile
-    /// writer is kept for a while: for its last messages, and so that subscribers of a restarted program notice nothing.
+    /// writer is kept for a while: for its last messages, and so that subscribers of a restarted program notice
+    /// nothing.
     gone: Option<Instant>,
     /// The time at which the writer vanished.
     vanished: Option<Instant>,

@@ -407,8 +407,8 @@ impl ShareRoute {
         [self.writerless_until, self.own.deadline()].into_iter().flatten().any(|at| at <= now)
     }
 
-    /// Starts the holds of writers that are gone once more, because messages of the share wait to be sent. Has no effect
-    /// once they have been gone for too long.
+    /// Starts the holds of writers that are gone once more, because messages of the share wait to be sent. Has no
+    /// effect once they have been gone for too long.
     pub(super) fn hold_on(&mut self, now: Instant) {
         let Some(since) = self.writerless_since else { return self.own.hold_on(now, GONE_BUSY_MAX) };
         if since + WRITERLESS_BUSY_MAX > now {

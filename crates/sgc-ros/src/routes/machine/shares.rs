@@ -168,7 +168,8 @@ impl<R: RngCore> Routes<R> {
         due.map(ShareRoute::name).collect()
     }
 
-    /// Keeps a share and its sources for a while longer, within bounds, because messages of its writers wait to be sent.
+    /// Keeps a share and its sources for a while longer, within bounds, because messages of its writers wait to be
+    /// sent.
     pub fn hold_share(&mut self, now: Instant, name: &Name) {
         if let Some(share) = self.shares.get_mut(name) {
             share.hold_on(now);
