@@ -121,7 +121,8 @@ async fn a_topic_is_heard_in_each_encoding() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_client_that_stops_reading_loses_the_oldest_and_holds_up_nobody() {
-    const MESSAGES: i64 = 2000;
+    // Some 1000 fit into the buffers of the connection.
+    const MESSAGES: i64 = 4000;
     let gateway = Gateway::new().await;
     let talker = gateway.site.writer("/fast", RosQos::default());
     gateway.site.knows("/fast").await;
