@@ -29,13 +29,13 @@ use cyclors::dds_instance_handle_t;
 use sgc_sync::lock;
 
 use crate::acknack::HeartbeatRequest;
-use crate::entity::monotonic_ns;
+use crate::entity::{Time, monotonic_ns};
 use crate::events::{ddsi_delete_xevent, ddsi_qxev_callback, ddsi_resched_xevent_if_earlier};
 use crate::identity::FAST_DDS;
 use crate::proxies::{
     LOCAL_MATCHING_IN_PROGRESS, NACK_SENT_ON_DELAY, Nacked, ProxyEndpoint, ProxyWriterState, ReaderMatch,
-    Time,
 };
+use crate::writer_inside::{ddsrt_mutex_lock, ddsrt_mutex_unlock};
 
 /// Most writers in a process that can be refused.
 const WRITERS_MAX: usize = 16_384;
@@ -57,10 +57,8 @@ const COUNTED_NS: i64 = 10_000_000_000;
 /// `DDS_NEVER`: an event at this time never happens.
 const NEVER: Time = Time(i64::MAX);
 
-// Functions of Cyclone that `cyclors` has no binding for. `ddsrt/sync.h`, `ddsi__radmin.h`.
+// A function of Cyclone that `cyclors` has no binding for. `ddsi__radmin.h`.
 unsafe extern "C" {
-    fn ddsrt_mutex_lock(mutex: *mut c_void);
-    fn ddsrt_mutex_unlock(mutex: *mut c_void);
     /// Returns the number of the first sample that was not received.
     fn ddsi_reorder_next_seq(reorder: *const c_void) -> u64;
 }
@@ -127,7 +125,7 @@ struct Refusal {
     /// The progress that was seen last, and when it was seen first.
     taken: u64,
     since_ns: i64,
-    /// What was seen last of the numbers that Cyclone delivered, and of those that arrived.
+    /// The number behind the last delivered sample, and the count of arrivals, at the last look.
     seen: Option<(u32, u64)>,
     /// Numbers that Cyclone delivered or skipped, less those that arrived and those that were counted as lost.
     missing: i64,
@@ -370,7 +368,7 @@ unsafe extern "C" fn apply(
     }
 }
 
-/// What an event does with a writer.
+/// The step of an event for a writer.
 enum Step {
     /// Its samples are refused, from here on or still.
     Refuse,

@@ -11,13 +11,14 @@ use cyclors::{
 };
 use sgc_ros::Guid;
 
-/// `ddsrt_mtime_t` (`ddsrt/time.h`), nanoseconds.
+/// `ddsrt_wctime_t` and `ddsrt_mtime_t` (`ddsrt/time.h`), nanoseconds.
 #[repr(C)]
-struct MonotonicTime(i64);
+#[derive(Clone, Copy)]
+pub(crate) struct Time(pub(crate) i64);
 
 // A function of Cyclone that `cyclors` has no binding for. `ddsrt/time.h`.
 unsafe extern "C" {
-    fn ddsrt_time_monotonic() -> MonotonicTime;
+    fn ddsrt_time_monotonic() -> Time;
 }
 
 /// Returns the time of Cyclone's monotonic clock, in nanoseconds.

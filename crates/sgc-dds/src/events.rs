@@ -2,7 +2,7 @@
 
 use std::ffi::{c_int, c_void};
 
-use crate::proxies::Time;
+use crate::entity::Time;
 
 /// The callback of an event. It gets the domain's variables, the event, the packets to send, a copy of its argument
 /// without alignment of its own, and the time. It runs without the queue's lock, and entities that exist meanwhile are

@@ -33,14 +33,14 @@ use cyclors::{
 
 use crate::acknack::HeartbeatRequest;
 use crate::backpressure::{self, RemoteWriters};
-use crate::entity::{Entity, check, monotonic_ns};
+use crate::entity::{Entity, Time, check, monotonic_ns};
 use crate::events::{ddsi_delete_xevent, ddsi_qxev_callback};
 use crate::identity::FAST_DDS;
 use crate::late_readers::{self, LateReaders, ProxyReaderState};
 use crate::manual_leases::{self, Leases};
 use crate::proxies::{
     EntityCommon, HAVE_SEEN_HEARTBEAT, Locator, PROXY_READER, PROXY_WRITER, ProxyEndpoint, ProxyWriterState,
-    Time, state_of,
+    state_of,
 };
 
 /// Delays after a match with which a reader asks for a heartbeat, in nanoseconds. Cyclone reports the match a few

@@ -1,4 +1,4 @@
-//! What Cyclone knows of remote endpoints: its proxy readers and proxy writers, which its interface does not reach.
+//! Remote endpoints as Cyclone keeps them: its proxy readers and proxy writers, which its interface does not reach.
 //!
 //! The structs are those of the C code of `cyclors` =0.4.0: `CYCLORS` in `sample.rs`. A new endpoint is compared with
 //! its expected content ([`state_of`]), and left alone if it differs.
@@ -33,11 +33,6 @@ const READER_KINDS: [u32; 2] = [0x07, 0x04];
 
 /// Most readers that are looked at for one writer. A proxy has one for a topic, and taps beside it.
 const MATCHES_MAX: usize = 64;
-
-/// `ddsrt_wctime_t` and `ddsrt_mtime_t`, nanoseconds.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub(crate) struct Time(pub(crate) i64);
 
 /// `struct ddsi_entity_common` (`ddsi_entity.h`).
 #[repr(C)]

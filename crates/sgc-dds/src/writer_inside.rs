@@ -14,8 +14,8 @@ use crate::entity::monotonic_ns;
 unsafe extern "C" {
     fn dds_entity_pin(handle: dds_entity_t, entity: *mut *mut c_void) -> c_int;
     fn dds_entity_unpin(entity: *mut c_void);
-    fn ddsrt_mutex_lock(mutex: *mut c_void);
-    fn ddsrt_mutex_unlock(mutex: *mut c_void);
+    pub(crate) fn ddsrt_mutex_lock(mutex: *mut c_void);
+    pub(crate) fn ddsrt_mutex_unlock(mutex: *mut c_void);
     fn ddsi_writer_max_drop_seq(writer: *const c_void) -> u64;
 }
 

@@ -628,6 +628,13 @@ fn number_of(payload: &[u8]) -> usize {
     std::str::from_utf8(&payload[8..16]).unwrap().parse().unwrap()
 }
 
+/// Returns a reader whose handler waits at a gate after each sample, until the sender is dropped.
+fn gated(network: &CycloneNetwork, spec: &EndpointSpec) -> (CycloneReader, Sender<()>, Receiver<Outcome>) {
+    let ((release, gate), (tell, handled)) = (channel(), channel());
+    let choosy = Choosy { may: Arc::default(), gate, handled: tell };
+    (network.create_reader(spec, Box::new(choosy)).unwrap(), release, handled)
+}
+
 /// Returns a writer whose samples reach a handler that then waits. They begin with number 1.
 fn numbering(network: &CycloneNetwork, spec: &EndpointSpec, handled: &Receiver<Outcome>) -> CycloneWriter {
     let writer = writer(network, spec, 1);
@@ -673,6 +680,16 @@ fn next_number(handled: &Receiver<Outcome>) -> Result<usize, usize> {
     }
 }
 
+/// Adds what a handler gets to the numbers of received samples and to the count of lost ones, up to this number.
+fn receive_until(last: usize, handled: &Receiver<Outcome>, numbers: &mut Vec<usize>, overrun: &mut usize) {
+    while numbers.last() != Some(&last) {
+        match next_number(handled) {
+            Ok(number) => numbers.push(number),
+            Err(lost) => *overrun += lost,
+        }
+    }
+}
+
 /// Waits until a writer has to wait.
 fn stalled(taken: &AtomicUsize) -> usize {
     let mut seen = (usize::MAX, Instant::now());
@@ -691,10 +708,8 @@ fn keep_all_writer_waits_for_a_reader_without_room_and_loses_nothing() {
     // Samples of one packet and of several. All together are more than a queue may hold.
     for (domain, samples, bytes) in [(167, 40_000, 100), (168, 1000, 200_000)] {
         let (ros, sgc) = (open(domain, None), open(domain, Some("arm-1")));
-        let ((release, gate), (tell, handled)) = (channel::<()>(), channel());
         let all = with(spec("all"), |qos| qos.history = History::KeepAll);
-        let gated = Choosy { may: Arc::default(), gate, handled: tell };
-        let _reader = sgc.create_reader(&all, Box::new(gated)).unwrap();
+        let (_reader, release, handled) = gated(&sgc, &all);
         let (_free, free) = read(&sgc, &spec("free"));
         let (w_all, w_free) = (numbering(&ros, &all, &handled), writer(&ros, &spec("free"), 1));
         let (thread, taken) = flood(w_all, samples, bytes);
@@ -718,10 +733,8 @@ fn keep_all_writer_waits_for_a_reader_without_room_and_loses_nothing() {
 fn samples_that_a_keep_last_writer_drops_while_it_is_refused_are_counted() {
     const UNHEARD: usize = 20_000;
     let (ros, sgc) = (open(171, None), open(171, Some("arm-1")));
-    let ((release, gate), (tell, handled)) = (channel::<()>(), channel());
     let all = with(spec("last"), |qos| qos.history = History::KeepAll);
-    let _reader =
-        sgc.create_reader(&all, Box::new(Choosy { may: Arc::default(), gate, handled: tell })).unwrap();
+    let (_reader, release, handled) = gated(&sgc, &all);
     let writer = numbering(&ros, &spec("last"), &handled);
     let mut written = 0;
     let mut flood = |samples| {
@@ -740,12 +753,7 @@ fn samples_that_a_keep_last_writer_drops_while_it_is_refused_are_counted() {
     // Losses are counted a little later, and reported with the next sample.
     eventually("all is received or counted", || {
         let written = flood(1);
-        while numbers.last() != Some(&written) {
-            match next_number(&handled) {
-                Ok(number) => numbers.push(number),
-                Err(lost) => overrun += lost,
-            }
-        }
+        receive_until(written, &handled, &mut numbers, &mut overrun);
         std::thread::sleep(Duration::from_millis(50));
         numbers.len() + overrun == written
     });
@@ -756,10 +764,8 @@ fn samples_that_a_keep_last_writer_drops_while_it_is_refused_are_counted() {
 fn writer_is_accepted_again_when_the_reader_that_refused_it_is_gone() {
     const SAMPLES: usize = 1000;
     let (ros, sgc) = (open(169, None), open(169, Some("arm-1")));
-    let ((release, gate), (tell, handled)) = (channel::<()>(), channel());
     let all = with(spec("all"), |qos| qos.history = History::KeepAll);
-    let reader =
-        sgc.create_reader(&all, Box::new(Choosy { may: Arc::default(), gate, handled: tell })).unwrap();
+    let (reader, release, handled) = gated(&sgc, &all);
     let (thread, taken) = flood(numbering(&ros, &all, &handled), SAMPLES, 200_000);
     let waits_at = stalled(&taken);
     assert!(waits_at < SAMPLES);
@@ -777,10 +783,8 @@ fn writer_is_accepted_again_when_the_reader_that_refused_it_is_gone() {
 fn writer_with_another_reader_here_is_not_refused() {
     const SAMPLES: usize = 1000;
     let (ros, sgc) = (open(172, None), open(172, Some("arm-1")));
-    let ((release, gate), (tell, handled)) = (channel::<()>(), channel());
     let all = with(spec("all"), |qos| qos.history = History::KeepAll);
-    let _stuck =
-        sgc.create_reader(&all, Box::new(Choosy { may: Arc::default(), gate, handled: tell })).unwrap();
+    let (_stuck, release, handled) = gated(&sgc, &all);
     let (_free, free) = read(&sgc, &all);
     let writer = writer(&ros, &all, 2);
     eventually("the readers know the writer", || {
@@ -799,10 +803,8 @@ fn writer_with_another_reader_here_is_not_refused() {
 fn writer_goes_on_if_a_reader_takes_nothing_for_ten_seconds() {
     const SAMPLES: usize = 1000;
     let (ros, sgc) = (open(170, None), open(170, Some("arm-1")));
-    let ((release, gate), (tell, handled)) = (channel::<()>(), channel());
     let all = with(spec("all"), |qos| qos.history = History::KeepAll);
-    let _reader =
-        sgc.create_reader(&all, Box::new(Choosy { may: Arc::default(), gate, handled: tell })).unwrap();
+    let (_reader, release, handled) = gated(&sgc, &all);
     let (thread, taken) = flood(numbering(&ros, &all, &handled), SAMPLES, 200_000);
     assert!(stalled(&taken) < SAMPLES);
     let began = Instant::now();
@@ -810,12 +812,7 @@ fn writer_goes_on_if_a_reader_takes_nothing_for_ten_seconds() {
     assert!(began.elapsed() > Duration::from_secs(5), "it waited before");
     drop(release);
     let (mut numbers, mut overrun) = (Vec::new(), 0);
-    while numbers.last() != Some(&SAMPLES) {
-        match next_number(&handled) {
-            Ok(number) => numbers.push(number),
-            Err(lost) => overrun += lost,
-        }
-    }
+    receive_until(SAMPLES, &handled, &mut numbers, &mut overrun);
     assert!(numbers.is_sorted() && overrun > 0);
     assert_eq!(numbers.len() + overrun, SAMPLES, "each is received or counted");
 }
