@@ -15,18 +15,47 @@ pub const WRITERLESS_HOLD: Duration = Duration::from_secs(2);
 /// Most writers of a share, those that are gone among them, for whose messages sources are held.
 const HELD_SOURCES_MAX: usize = 2 * ENTRY_SOURCES_MAX;
 
+/// The time for which something outlives its writers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Hold {
+    until: Instant,
+    /// The time at which the writers vanished.
+    since: Instant,
+}
+
+impl Hold {
+    /// Begins a hold.
+    pub(super) fn begin(now: Instant) -> Self {
+        Self { until: now + WRITERLESS_HOLD, since: now }
+    }
+
+    /// Returns a hold that ends at once.
+    pub(super) fn over(now: Instant) -> Self {
+        Self { until: now, since: now }
+    }
+
+    pub(super) fn until(&self) -> Instant {
+        self.until
+    }
+
+    /// Starts the hold once more if it is over, because messages of the writers may still wait: until `max` after they
+    /// vanished.
+    pub(super) fn go_on(&mut self, now: Instant, max: Duration) {
+        if self.until <= now && self.since + max > now {
+            self.until = now + WRITERLESS_HOLD;
+        }
+    }
+}
+
 /// The source that publishes for a local writer.
 #[derive(Clone, Debug)]
 struct OwnSource {
     source: SourceId,
     /// The writer's offer, as far as it is carried.
     qos: Qos,
-    /// The time at which the writer vanished, or at which its hold was started once more. The source of a volatile
-    /// writer is kept for a while: for its last messages, and so that subscribers of a restarted program notice
-    /// nothing.
-    gone: Option<Instant>,
-    /// The time at which the writer vanished.
-    vanished: Option<Instant>,
+    /// The hold of a writer that vanished. The source of a volatile writer is kept for a while: for its last messages,
+    /// and so that subscribers of a restarted program notice nothing.
+    gone: Option<Hold>,
     /// `true` if the writer's liveliness lease has expired.
     is_lapsed: bool,
 }
@@ -52,7 +81,7 @@ impl OwnSources {
             && same_kind(&own.qos, &qos)
         {
             own.qos = qos;
-            (own.gone, own.vanished) = (None, None);
+            own.gone = None;
             return true;
         }
         // A source of another kind must be a new one.
@@ -60,7 +89,7 @@ impl OwnSources {
         let found = self.find(&qos, &mut new);
         let source = found.or_else(|| self.0.values().map(|own| own.source).max());
         let source = source.unwrap_or_else(new);
-        self.0.insert(*writer, OwnSource { source, qos, gone: None, vanished: None, is_lapsed });
+        self.0.insert(*writer, OwnSource { source, qos, gone: None, is_lapsed });
         found.is_some()
     }
 
@@ -92,7 +121,7 @@ impl OwnSources {
     /// Handles the end of a writer; `is_last` if the share has no other.
     pub(super) fn writer_gone(&mut self, now: Instant, writer: &Guid, is_last: bool) {
         match self.0.get_mut(writer) {
-            Some(own) if !own.qos.is_transient_local() => (own.gone, own.vanished) = (Some(now), Some(now)),
+            Some(own) if !own.qos.is_transient_local() => own.gone = Some(Hold::begin(now)),
             // Late joiners get no history of a publisher that is gone. The last one counts as gone only after the
             // hold.
             _ if !is_last => drop(self.0.remove(writer)),
@@ -120,27 +149,20 @@ impl OwnSources {
     /// Forgets the sources of writers that have been gone for a while. Returns `true` if there were some.
     pub(super) fn time_out(&mut self, now: Instant) -> bool {
         let before = self.0.len();
-        self.0.retain(|_, own| own.gone.is_none_or(|at| at + WRITERLESS_HOLD > now));
+        self.0.retain(|_, own| own.gone.is_none_or(|hold| hold.until > now));
         self.0.len() < before
     }
 
-    /// Starts the hold of sources whose time has come once more, because messages of theirs may still wait: until `max`
-    /// after their writers vanished, and while there are few.
+    /// Starts the holds that are over once more ([`Hold::go_on`]), while there are few sources.
     pub(super) fn hold_on(&mut self, now: Instant, max: Duration) {
-        if self.0.len() > HELD_SOURCES_MAX {
-            return;
-        }
-        for own in self.0.values_mut() {
-            let is_due = own.gone.is_some_and(|at| at + WRITERLESS_HOLD <= now);
-            if is_due && own.vanished.is_some_and(|at| at + max > now) {
-                own.gone = Some(now);
-            }
+        if self.0.len() <= HELD_SOURCES_MAX {
+            self.0.values_mut().filter_map(|own| own.gone.as_mut()).for_each(|hold| hold.go_on(now, max));
         }
     }
 
     /// Returns the time of the next [`Self::time_out`].
     pub(super) fn deadline(&self) -> Option<Instant> {
-        self.0.values().filter_map(|own| own.gone).min().map(|at| at + WRITERLESS_HOLD)
+        self.0.values().filter_map(|own| own.gone).map(|hold| hold.until).min()
     }
 
     /// Iterates over the writers, also those that are gone.

@@ -10,7 +10,7 @@ use sgc_wire::{CatalogueSource, Consumer, ENTRY_SOURCES_MAX, History, Name, Qos,
 
 use super::command::Command;
 use super::local_graph::LocalGraph;
-use super::own_sources::{OwnSources, WRITERLESS_HOLD};
+use super::own_sources::{Hold, OwnSources};
 use super::problem::Problem;
 use super::readers::{asks_key_hash, replace_reader};
 use super::rules::{ShareRule, ShareRuleId};
@@ -49,9 +49,8 @@ pub(super) struct ShareRoute {
     writer: Option<EndpointSpec>,
     /// The client that calls local servers, if it is a service. The servers are the route's writers.
     client: Option<ServiceSpec>,
-    writerless_until: Option<Instant>,
-    /// Since when it has no writer.
-    writerless_since: Option<Instant>,
+    /// The hold of a share without a writer.
+    writerless: Option<Hold>,
     sinkless_until: Option<Instant>,
 }
 
@@ -115,8 +114,7 @@ impl ShareRoute {
             reader: None,
             writer: None,
             client: None,
-            writerless_until: None,
-            writerless_since: None,
+            writerless: None,
             sinkless_until: None,
         };
         (spec, route)
@@ -185,7 +183,7 @@ impl ShareRoute {
     /// Adds a local writer. A share that waits for one goes on.
     pub(super) fn add_writer(&mut self, writer: DiscoveredEndpoint) {
         self.writers.insert(writer.guid, writer);
-        (self.writerless_until, self.writerless_since) = (None, None);
+        self.writerless = None;
     }
 
     /// Removes a local writer. Returns `None` if it is not one of this share.
@@ -202,7 +200,7 @@ impl ShareRoute {
         if !self.writers.is_empty() || rule.is_inbound() {
             return Some(WriterRemoval::Changed);
         }
-        (self.writerless_until, self.writerless_since) = (Some(now + WRITERLESS_HOLD), Some(now));
+        self.writerless = Some(Hold::begin(now));
         Some(WriterRemoval::Held)
     }
 
@@ -233,8 +231,7 @@ impl ShareRoute {
     pub(super) fn move_to(&mut self, now: Instant, place: ShareRuleId, rule: &ShareRule) {
         self.rule = place;
         if self.writers.is_empty() && !rule.is_inbound() {
-            self.writerless_until.get_or_insert(now);
-            self.writerless_since.get_or_insert(now);
+            self.writerless.get_or_insert(Hold::over(now));
         }
     }
 
@@ -404,23 +401,25 @@ impl ShareRoute {
 
     /// Returns `true` if writers have been gone for a while: unless messages of theirs still wait, they are forgotten.
     pub(super) fn outlives_writers(&self, now: Instant) -> bool {
-        [self.writerless_until, self.own.deadline()].into_iter().flatten().any(|at| at <= now)
+        [self.writerless_until(), self.own.deadline()].into_iter().flatten().any(|at| at <= now)
     }
 
     /// Starts the holds of writers that are gone once more, because messages of the share wait to be sent. Has no
     /// effect once they have been gone for too long.
     pub(super) fn hold_on(&mut self, now: Instant) {
-        let Some(since) = self.writerless_since else { return self.own.hold_on(now, GONE_BUSY_MAX) };
-        if since + WRITERLESS_BUSY_MAX > now {
-            self.writerless_until = self.writerless_until.map(|at| at.max(now + WRITERLESS_HOLD));
-            self.own.hold_on(now, WRITERLESS_BUSY_MAX);
-        }
+        let max = if self.writerless.is_some() { WRITERLESS_BUSY_MAX } else { GONE_BUSY_MAX };
+        self.writerless.iter_mut().for_each(|hold| hold.go_on(now, max));
+        self.own.hold_on(now, max);
+    }
+
+    fn writerless_until(&self) -> Option<Instant> {
+        self.writerless.as_ref().map(Hold::until)
     }
 
     /// Handles the passing of time: ends a share whose last writer has been gone for a while, and forgets sources and
     /// sinks that are gone.
     pub(super) fn time_out(&mut self, now: Instant) -> ShareTimeout {
-        if self.writerless_until.is_some_and(|at| at <= now) {
+        if self.writerless_until().is_some_and(|at| at <= now) {
             return ShareTimeout::Ends;
         }
         let sinkless = self.sinkless_until.take_if(|at| *at <= now).is_some();
@@ -432,7 +431,7 @@ impl ShareRoute {
 
     /// Returns the time of the next [`Self::time_out`].
     pub(super) fn deadline(&self) -> Option<Instant> {
-        [self.writerless_until, self.sinkless_until, self.own.deadline()].into_iter().flatten().min()
+        [self.writerless_until(), self.sinkless_until, self.own.deadline()].into_iter().flatten().min()
     }
 
     /// Ends the share.
