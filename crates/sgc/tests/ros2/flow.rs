@@ -8,24 +8,38 @@ use rustix::process::Signal;
 use serde_json::Value;
 
 use crate::lab::{Lab, Site, robot_to_desk};
+use crate::support::Peer;
 use crate::{EXCLUSIVE, PAIRS, PLAN, count};
 
 /// Bytes of a fragment (`sgc_dds::config::FRAGMENT_BYTES`).
 const FRAGMENT_BYTES: u64 = 14_000;
 
-/// Runs a publisher of so many messages, the second half a second after the first, and a subscriber, matched directly
-/// or through `sgc`. Returns the subscriber's summary once it has the last message.
-fn carry(lab: &Lab, [talks, listens]: [&str; 2], sites: [Site; 2], messages: u64, extra: &[&str]) -> Value {
+/// Starts a publisher of so many messages, the second half a second after the first, and a subscriber that ends with
+/// the last one, matched directly or through `sgc`. The publisher stays for `hold` seconds after its last message.
+fn start(
+    lab: &Lab,
+    [talks, listens]: [&str; 2],
+    sites: [Site; 2],
+    messages: u64,
+    hold: &str,
+    extra: &[&str],
+) -> (Peer, Peer) {
     let messages = messages.to_string();
     let common = [&["--topic", "/load", "--timeout", PLAN.peer_life][..], extra].concat();
     let listen = [&["sub", "--last", &messages, "--linger", "0.5"], &common[..]].concat();
     let mut listener = lab.load(sites[1], listens, &listen);
     let talk =
-        [&["pub", "--count", &messages, "--wait-go", "--begin", "0.5", "--hold", "1"], &common[..]].concat();
+        [&["pub", "--count", &messages, "--wait-go", "--begin", "0.5", "--hold", hold], &common[..]].concat();
     let mut talker = lab.load(sites[0], talks, &talk);
     talker.wait_matched("a match at the publisher");
     listener.wait_matched("a match at the subscriber");
     talker.go();
+    (talker, listener)
+}
+
+/// Runs a publisher and a subscriber ([`start`]). Returns the subscriber's summary once it has the last message.
+fn carry(lab: &Lab, pair: [&str; 2], sites: [Site; 2], messages: u64, extra: &[&str]) -> Value {
+    let (mut talker, mut listener) = start(lab, pair, sites, messages, "1", extra);
     let summary = listener.summary();
     talker.summary();
     summary
@@ -84,24 +98,16 @@ fn last_messages_of_a_publisher_that_ended_arrive_over_a_path_that_stood_still()
     const MESSAGES: u64 = 200;
     const PAUSE: Duration = Duration::from_secs(5);
     let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/load"]));
-    let common = ["--topic", "/load", "--timeout", PLAN.peer_life, "--depth", "0"];
-    let last = MESSAGES.to_string();
-    for [talks, listens] in PAIRS {
-        let listen = [&["sub", "--last", &last, "--linger", "0.5"][..], &common].concat();
-        let mut listener = lab.load(Site::Desk, listens, &listen);
-        let talk = [&["pub", "--count", &last, "--rate", "0", "--size", "65536", "--wait-go"][..], &common];
-        let mut talker =
-            lab.load(Site::Robot, talks, &[&talk.concat()[..], &["--begin", "0.5", "--hold", "0"]].concat());
-        talker.wait_matched("a match at the publisher");
-        listener.wait_matched("a match at the subscriber");
-        talker.go();
+    let extra = ["--depth", "0", "--rate", "0", "--size", "65536"];
+    for pair in PAIRS {
+        let (mut talker, mut listener) = start(&lab, pair, [Site::Robot, Site::Desk], MESSAGES, "0", &extra);
         thread::sleep(Duration::from_millis(300));
         let router = lab.node(Site::Cloud);
         router.signal(Signal::STOP);
         talker.summary();
         thread::sleep(PAUSE);
         router.signal(Signal::CONT);
-        assert_whole(&listener.summary(), MESSAGES, &format!("[{talks:?}, {listens:?}]"));
+        assert_whole(&listener.summary(), MESSAGES, &format!("{pair:?}"));
     }
 }
 
@@ -140,17 +146,9 @@ fn subscriber_with_default_qos_receives_a_burst() {
     const MESSAGES: u64 = 2_000;
     const PAUSE: Duration = Duration::from_millis(400);
     let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/load"]));
-    let common = ["--topic", "/load", "--timeout", PLAN.peer_life];
-    let (last, mut lost) = (MESSAGES.to_string(), 0);
-    for [talks, listens] in PAIRS {
-        let listen = [&["sub", "--last", &last, "--linger", "0.5"][..], &common].concat();
-        let mut listener = lab.load(Site::Desk, listens, &listen);
-        let talk = [&["pub", "--count", &last, "--rate", "1000", "--wait-go", "--begin", "0.5"][..], &common]
-            .concat();
-        let mut talker = lab.load(Site::Robot, talks, &[&talk[..], &["--hold", "1"]].concat());
-        talker.wait_matched("a match at the publisher");
-        listener.wait_matched("a match at the subscriber");
-        talker.go();
+    let (extra, mut lost) = (["--rate", "1000"], 0);
+    for pair in PAIRS {
+        let (mut talker, mut listener) = start(&lab, pair, [Site::Robot, Site::Desk], MESSAGES, "1", &extra);
         thread::sleep(Duration::from_secs(1));
         let router = lab.node(Site::Cloud);
         router.signal(Signal::STOP);
