@@ -1,7 +1,11 @@
-//! Locks that stay usable after a panic of their holder.
+//! Locks that stay usable after a panic of their holder, and [threads that queues share](Workers).
 //!
 //! Release builds abort on panic, so poison is seen in tests only. There the panic itself fails the test, and a second
 //! panic in another thread would hide it.
+
+mod workers;
+
+pub use workers::{Work, Workers};
 
 use std::sync::{Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
