@@ -1,4 +1,4 @@
-//! [`Queue`]: the samples of a reader between Cyclone's receiving thread and the reader's own, and the states of both.
+//! [`Queue`]: the samples of a reader between Cyclone's receiving thread and a worker, and the states of both.
 //!
 //! It locks nothing and wakes nobody: [`crate::intake`] does.
 
@@ -85,7 +85,9 @@ pub(crate) struct Queue<S> {
     /// Changes of liveliness, each with the number of samples before it.
     changes: VecDeque<(u64, LivelinessChange)>,
     overrun: u64,
-    thread: ThreadState,
+    /// A worker is at work or about to begin.
+    is_at_work: bool,
+    is_stopped: bool,
     receiving: ReceivingState,
     /// The writers whose samples are refused, or were before.
     refused: Vec<RefusedWriter>,
@@ -97,16 +99,6 @@ struct RefusedWriter {
     writer: dds_instance_handle_t,
     tally: Arc<Tally>,
     is_refused: bool,
-}
-
-/// The state of a reader's thread.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum ThreadState {
-    Working,
-    /// The thread sleeps until an entry is queued.
-    Waiting,
-    /// The thread ends and takes nothing more.
-    Stopped,
 }
 
 /// The state of the receiving thread towards one reader.
@@ -130,6 +122,7 @@ pub(crate) struct Level {
 }
 
 impl<S: FromSerdata> Queue<S> {
+    /// Creates the queue of a worker that begins once the receiver is known.
     pub(crate) fn new(depth: usize) -> Self {
         Self {
             arrivals: VecDeque::new(),
@@ -139,7 +132,8 @@ impl<S: FromSerdata> Queue<S> {
             popped: 0,
             changes: VecDeque::new(),
             overrun: 0,
-            thread: ThreadState::Working,
+            is_at_work: true,
+            is_stopped: false,
             receiving: ReceivingState::Free,
             refused: Vec::new(),
         }
@@ -182,35 +176,24 @@ impl<S: FromSerdata> Queue<S> {
     }
 
     pub(crate) fn is_stopped(&self) -> bool {
-        self.thread == ThreadState::Stopped
+        self.is_stopped
     }
 
-    /// Returns `true` if the thread sleeps. The caller wakes it.
-    pub(crate) fn begin_to_wake(&mut self) -> bool {
-        let is_waiting = self.thread == ThreadState::Waiting;
-        if is_waiting {
-            self.thread = ThreadState::Working;
-        }
-        is_waiting
-    }
-
-    /// Makes the thread sleep until an entry is queued.
-    pub(crate) fn begin_to_wait(&mut self) {
-        self.thread = ThreadState::Waiting;
-    }
-
-    /// Ends the sleep of the thread. Returns `false` if it must end.
+    /// Returns `true` if no worker is at work. The caller lets one begin.
     pub(crate) fn begin_to_work(&mut self) -> bool {
-        if self.is_stopped() {
-            return false;
-        }
-        self.thread = ThreadState::Working;
-        true
+        !std::mem::replace(&mut self.is_at_work, true)
     }
 
-    /// Makes the thread end.
-    pub(crate) fn stop(&mut self) {
-        self.thread = ThreadState::Stopped;
+    /// Lets the worker go if nothing is queued. Returns `true` if it may.
+    pub(crate) fn begin_to_rest(&mut self) -> bool {
+        self.is_at_work = !self.is_empty();
+        !self.is_at_work
+    }
+
+    /// Hands out nothing more from here on. Returns `true` if a worker is at work.
+    pub(crate) fn stop(&mut self) -> bool {
+        self.is_stopped = true;
+        self.is_at_work
     }
 
     /// Begins a wait of the receiving thread until the queue has sunk to the level.

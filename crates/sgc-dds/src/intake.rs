@@ -1,22 +1,21 @@
-//! [`Intake`]: a DDS reader, the queue between it and the receiver of its samples, and the thread that hands them
-//! over.
+//! [`Intake`]: a DDS reader, and the queue between it and the receiver of its samples.
 //!
 //! Cyclone calls a listener on the thread that received a sample, which all readers of a domain share, with the
 //! writer's lock held. The listener takes the sample. Work of a [`Receiver`] that needs no waiting is done right
 //! there, because waking another thread takes longer than all the rest. Other samples are queued, within bounds, for
-//! the reader's thread. That thread may block for any time: no other reader waits for it, and the order of samples
-//! stays.
+//! a [worker](sgc_sync::Workers) that hands them over. The worker may block for any time: no other reader waits for it,
+//! and the order of samples stays.
 //!
-//! While a queue of a reliable topic is crowded, the receiving thread waits for the reader's thread: briefly and at
-//! most half of the time. So acknowledgements come later, and a `KEEP_ALL` writer becomes slower. Other readers lose at
+//! While a queue of a reliable topic is crowded, the receiving thread waits for the worker: briefly and at most half of
+//! the time. So acknowledgements come later, and a `KEEP_ALL` writer becomes slower. Other readers lose at
 //! most half of that thread's time to a slow one. If the queue grows all the same, the samples of its writers are
 //! [refused](crate::backpressure) until there is room.
 
 use std::cell::Cell;
 use std::ffi::c_void;
 use std::mem::MaybeUninit;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread;
+use std::sync::mpsc::{self, Sender};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 
 use cyclors::{
@@ -25,7 +24,7 @@ use cyclors::{
     dds_takecdr, ddsi_serdata,
 };
 use sgc_ros::{EndpointKind, EndpointSpec, Guid, RELIABLE_READER_DEPTH_MIN};
-use sgc_sync::lock;
+use sgc_sync::{Work, lock};
 
 use crate::announced;
 use crate::arrivals::{Arrival, FromSerdata, Level, LivelinessChange, Next, Queue, WriterState};
@@ -34,17 +33,16 @@ use crate::entity::{Entity, reason};
 use crate::first_messages;
 use crate::participant::Participant;
 use crate::qos::history_of;
-use crate::wait::join;
 
 /// Samples taken from Cyclone at once.
 const BATCH: usize = 16;
 
 /// Shortest queue of a reliable reader that asks for [`RELIABLE_READER_DEPTH_MIN`] or more. Fast DDS does not
 /// announce whether a publisher is `KEEP_ALL`. Such a publisher loses nothing to a reader on its own network, and may
-/// be faster than this thread by the length of a burst.
+/// be faster than the worker by the length of a burst.
 const RELIABLE_WAITING_MIN: usize = 16_384;
 
-/// Longest wait of the receiving thread for a reader's thread at once while a queue is crowded.
+/// Longest wait of the receiving thread for a worker at once while a queue is crowded.
 const HOLD_MAX: Duration = Duration::from_millis(2);
 
 /// Divisor: the receiving thread waits from time to time once a queue is full to one part in this many, until it has
@@ -54,6 +52,8 @@ const CROWDED_PART: usize = 8;
 thread_local! {
     /// `true` while this thread is in a listener.
     static IS_LISTENING: Cell<bool> = const { Cell::new(false) };
+    /// The state of the intake whose samples this thread hands over.
+    static SERVED: Cell<*const c_void> = const { Cell::new(std::ptr::null()) };
 }
 
 /// A receiver of an intake's samples, one after the other.
@@ -81,10 +81,13 @@ pub(crate) trait Receiver: Send + 'static {
     fn overrun(&mut self, samples: u64);
 }
 
-/// The state that the listener and the reader's thread share.
+/// The state that the listener and the worker share.
 struct IntakeState<R: Receiver> {
+    /// Dropped before what the listener uses, because that waits for the listener.
+    entities: Mutex<Option<Entities>>,
+    /// Itself, for the worker.
+    this: Weak<Self>,
     queue: Mutex<Queue<R::Sample>>,
-    filled: Condvar,
     /// Signals that the receiving thread may continue.
     eased: Condvar,
     /// `true` if writers should wait rather than lose samples.
@@ -94,6 +97,15 @@ struct IntakeState<R: Receiver> {
     /// before the queue or by `try_lock` only.
     receiver: Mutex<Option<R>>,
     participant: Arc<Participant>,
+    /// Dropped last.
+    _alive: Sender<()>,
+}
+
+/// Cyclone's entities, whose listener has the state for its argument. They drop in this order, children first.
+struct Entities {
+    reader: Entity,
+    _group: Option<Entity>,
+    _topic: Entity,
 }
 
 impl<R: Receiver> IntakeState<R> {
@@ -161,9 +173,8 @@ impl<R: Receiver> IntakeState<R> {
                 writers.refuse(writer, &tally);
             }
         }
-        if queue.begin_to_wake() {
-            drop(queue);
-            self.filled.notify_one();
+        if queue.begin_to_work() {
+            self.work(queue);
         } else if self.holds_back && queue.is_full_to(CROWDED_PART) && !queue.is_stuck() {
             self.hold_back(queue);
         }
@@ -176,13 +187,20 @@ impl<R: Receiver> IntakeState<R> {
             return;
         }
         queue.push_change(change);
-        if queue.begin_to_wake() {
-            drop(queue);
-            self.filled.notify_one();
+        if queue.begin_to_work() {
+            self.work(queue);
         }
     }
 
-    /// Makes the receiving thread, and so the writer, wait briefly for the reader's thread.
+    /// Has a worker hand over the samples. The worker holds the state from before the queue is unlocked, so a listener
+    /// may go on to use it.
+    fn work(&self, queue: MutexGuard<'_, Queue<R::Sample>>) {
+        let this = self.this.upgrade();
+        drop(queue);
+        this.into_iter().for_each(run);
+    }
+
+    /// Makes the receiving thread, and so the writer, wait briefly for the worker.
     fn hold_back(&self, queue: MutexGuard<'_, Queue<R::Sample>>) {
         let Some(began) = self.participant.holds().begin() else { return };
         let until = queue.level(2 * CROWDED_PART);
@@ -204,10 +222,10 @@ impl<R: Receiver> IntakeState<R> {
         queue
     }
 
-    /// Hands queued samples over and waits for more, until it is stopped. Runs on the reader's thread.
-    fn serve(&self, reader: dds_entity_t) {
+    /// Hands queued samples over. Returns `true` if the intake is stopped.
+    fn serve(&self) -> bool {
         loop {
-            if let Some(receiver) = lock(&self.receiver).as_mut() {
+            if let (Some(receiver), Some(reader)) = (lock(&self.receiver).as_mut(), self.reader()) {
                 loop {
                     let ((next, may_go_on), overrun, is_stopped) = {
                         let mut queue = lock(&self.queue);
@@ -234,14 +252,27 @@ impl<R: Receiver> IntakeState<R> {
                 receiver.rest();
             }
             let mut queue = lock(&self.queue);
-            while queue.is_empty() && !queue.is_stopped() {
-                queue.begin_to_wait();
-                queue = self.filled.wait(queue).unwrap_or_else(PoisonError::into_inner);
+            if queue.is_stopped() {
+                return true;
             }
-            if !queue.begin_to_work() {
-                return;
+            if queue.begin_to_rest() {
+                return false;
             }
         }
+    }
+
+    /// Returns the reader's handle, unless the intake has ended.
+    fn reader(&self) -> Option<dds_entity_t> {
+        lock(&self.entities).as_ref().map(|entities| entities.reader.handle())
+    }
+
+    /// Deletes the entities of a stopped intake, and then what receives their samples.
+    fn let_go(&self) {
+        // Deleting the reader waits for its listener, which may be at work with the receiver.
+        let entities = lock(&self.entities).take();
+        drop(entities);
+        let receiver = lock(&self.receiver).take();
+        drop(receiver);
     }
 
     /// Accepts the samples of writers again if there is room.
@@ -251,40 +282,43 @@ impl<R: Receiver> IntakeState<R> {
         }
     }
 
-    fn stop(&self) {
+    /// Stops the intake. Returns `true` if a worker is to end it.
+    fn stop(&self) -> bool {
         let mut queue = lock(&self.queue);
-        queue.stop();
+        let is_at_work = queue.stop();
         self.accept(&mut queue);
         drop(queue);
-        self.filled.notify_one();
         self.eased.notify_one();
+        is_at_work
     }
 }
 
-/// Cyclone's entities and the argument of their listener. They drop in this order: children first, then the
-/// listener's argument when nothing calls it any more.
-struct Entities<R: Receiver> {
-    reader: Entity,
-    _group: Option<Entity>,
-    _topic: Entity,
-    shared: Arc<IntakeState<R>>,
+/// Has a worker hand over the samples of an intake, or end it.
+fn run<R: Receiver>(state: Arc<IntakeState<R>>) {
+    let participant = Arc::clone(&state.participant);
+    participant.workers().run(state);
 }
 
-impl<R: Receiver> Entities<R> {
-    /// Hands samples over until it is stopped. It takes `self` whole, because a closure would capture single fields.
-    fn serve(self) {
-        self.shared.serve(self.reader.handle());
+impl<R: Receiver> Work for IntakeState<R> {
+    fn run(self: Arc<Self>) {
+        SERVED.set(Arc::as_ptr(&self).cast());
+        let is_stopped = self.serve();
+        SERVED.set(std::ptr::null());
+        if is_stopped {
+            self.let_go();
+        }
     }
 }
 
-/// A reader and its thread. Dropping it ends the thread, waits for a receiver at work, and deletes the entities.
+/// A reader with its queue. Dropping it waits for a receiver at work, and deletes the entities.
 pub(crate) struct Intake<R: Receiver> {
     guid: Guid,
     handle: dds_entity_t,
-    shared: Arc<IntakeState<R>>,
-    /// The entities, which the thread takes over.
-    entities: Option<Entities<R>>,
-    thread: Option<thread::JoinHandle<()>>,
+    /// The state, until the intake is dropped.
+    state: Option<Arc<IntakeState<R>>>,
+    is_started: bool,
+    /// Disconnected once nothing holds the state.
+    all_gone: Mutex<mpsc::Receiver<()>>,
 }
 
 impl<R: Receiver> Intake<R> {
@@ -303,18 +337,21 @@ impl<R: Receiver> Intake<R> {
         let (depth, deep) = (usize::try_from(depth).unwrap_or(1), RELIABLE_READER_DEPTH_MIN as usize);
         // A reader that asks for less wants the newest samples only.
         let is_deep = spec.qos.is_reliable() && depth >= deep;
-        let shared = Arc::new(IntakeState {
+        let (alive, all_gone) = mpsc::channel();
+        let state = Arc::new_cyclic(|this| IntakeState {
+            entities: Mutex::default(),
+            this: Weak::clone(this),
             queue: Mutex::new(Queue::new(if is_deep { depth.max(RELIABLE_WAITING_MIN) } else { depth })),
-            filled: Condvar::new(),
             eased: Condvar::new(),
             holds_back: is_deep,
             progress: Arc::default(),
-            receiver: Mutex::new(None),
+            receiver: Mutex::default(),
             participant: Arc::clone(participant),
+            _alive: alive,
         });
-        let arg = Arc::as_ptr(&shared).cast_mut().cast::<c_void>();
+        let arg = Arc::as_ptr(&state).cast_mut().cast::<c_void>();
         // SAFETY: the listener is copied by the call that makes the reader, as is the QoS, and deleted once. `arg`
-        // outlives the reader, whose deletion waits for its listener: see `Entities`.
+        // outlives the reader, whose deletion waits for its listener: holders of `state` drop the entities.
         let reader = unsafe {
             let listener = dds_create_listener(arg);
             dds_lset_data_available(listener, Some(arrived::<R>));
@@ -329,19 +366,19 @@ impl<R: Receiver> Intake<R> {
             Entity::new(reader)?
         };
         let (guid, handle) = (reader.guid()?, reader.handle());
-        let entities = Entities { reader, _group: group, _topic: topic, shared: Arc::clone(&shared) };
-        Ok(Self { guid, handle, shared, entities: Some(entities), thread: None })
+        *lock(&state.entities) = Some(Entities { reader, _group: group, _topic: topic });
+        Ok(Self { guid, handle, state: Some(state), is_started: false, all_gone: all_gone.into() })
     }
 
-    /// Starts to receive samples, by a thread with this name unless it happens at once.
-    pub(crate) fn start(&mut self, name: &str, receiver: R) -> Result<(), String> {
-        let Some(entities) = self.entities.take() else { return Err("it is started".into()) };
-        *lock(&self.shared.receiver) = Some(receiver);
-        let thread = thread::Builder::new()
-            .name(name.into())
-            .spawn(move || entities.serve())
-            .map_err(|e| e.to_string())?;
-        self.thread = Some(thread);
+    /// Starts to receive samples.
+    pub(crate) fn start(&mut self, receiver: R) -> Result<(), String> {
+        if std::mem::replace(&mut self.is_started, true) {
+            return Err("it is started".into());
+        }
+        if let Some(state) = &self.state {
+            *lock(&state.receiver) = Some(receiver);
+            run(Arc::clone(state));
+        }
         Ok(())
     }
 
@@ -358,12 +395,20 @@ impl<R: Receiver> Intake<R> {
 
 impl<R: Receiver> Drop for Intake<R> {
     fn drop(&mut self) {
-        self.shared.stop();
-        // The thread waits for the listener, so a listener that drops its own reader must not wait for the thread.
-        if let Some(thread) = self.thread.take()
-            && !IS_LISTENING.get()
-        {
-            join(thread);
+        let Some(state) = self.state.take() else { return };
+        let is_served_here = std::ptr::eq(SERVED.get(), Arc::as_ptr(&state).cast());
+        // Deleting the reader waits for its listener, so a listener that drops a reader leaves it to a worker.
+        let may_wait = !IS_LISTENING.get() && !is_served_here;
+        let is_at_work = state.stop() && self.is_started;
+        match is_at_work {
+            false if may_wait => state.let_go(),
+            false => run(Arc::clone(&state)),
+            true => {}
+        }
+        drop(state);
+        if may_wait {
+            // It never sends: it waits until a worker has let go of the state as well.
+            let _ = lock(&self.all_gone).recv();
         }
     }
 }

@@ -3,7 +3,7 @@
 //! It joins one DDS domain, reports its endpoints, and moves serialised samples in and out for types that are unknown
 //! at compile time. It decides nothing about sharing, knows no ROS name mangling, never looks inside a payload beyond
 //! its encapsulation header, and uses no tokio. Its threads are plain threads, which block until Cyclone or its
-//! listener has something for them.
+//! listeners have something for them.
 //!
 //! This is the only crate with `unsafe`. Everything that Cyclone hands out is owned by a type of `entity` or
 //! `sample`, whose `Drop` returns it, and no raw pointer leaves the crate.

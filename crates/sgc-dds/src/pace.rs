@@ -3,8 +3,8 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
-/// Shortest rest of the receiving thread after it handled a sample. It rests as long as that took; the reader's
-/// thread handles fast samples better, several at a time.
+/// Shortest rest of the receiving thread after it handled a sample. It rests as long as that took; a worker
+/// handles fast samples better, several at a time.
 const REST_MIN_NS: u64 = 20_000;
 
 /// A limiter of the time for which a network's receiving threads do other work than receive: at most half.

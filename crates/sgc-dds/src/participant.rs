@@ -13,7 +13,7 @@ use cyclors::{
 };
 use sgc_ros::graph::graph_writer;
 use sgc_ros::{DiscoveryEvent, DiscoveryHandler, EndpointKind, EndpointSpec, Guid, RosError};
-use sgc_sync::lock;
+use sgc_sync::{Workers, lock};
 
 use crate::announced;
 use crate::backpressure::RemoteWriters;
@@ -46,6 +46,8 @@ pub(crate) struct Participant {
     guid: Guid,
     tag: Option<String>,
     security: Option<Security>,
+    /// Threads that hand over readers' samples.
+    workers: Workers,
     pace: Pace,
     holds: Pace,
     writers: AtomicUsize,
@@ -64,6 +66,7 @@ impl Participant {
     /// As of [`crate::CycloneNetwork::open`].
     pub(crate) fn open(config: &DdsConfig, alive: Sender<()>) -> Result<Self, RosError> {
         let refused = |reason| RosError::Domain { domain: config.domain, reason };
+        let workers = Workers::start("sgc-dds-read", || ()).map_err(|error| refused(error.to_string()))?;
         let domain = Domain::create(config)?;
         let qos = NativeQos::new().map_err(refused)?;
         let security = config.security.as_ref();
@@ -95,6 +98,7 @@ impl Participant {
             guid,
             tag: config.tag.clone(),
             security: config.security.clone(),
+            workers,
             pace: Pace::new(),
             holds: Pace::new(),
             writers: AtomicUsize::new(0),
@@ -177,6 +181,11 @@ impl Participant {
         self.guid.0[..12] == endpoint.0[..12]
     }
 
+    /// Returns the threads that hand over readers' samples.
+    pub(crate) fn workers(&self) -> &Workers {
+        &self.workers
+    }
+
     /// Returns the limiter of the work that receiving threads do themselves.
     pub(crate) fn pace(&self) -> &Pace {
         &self.pace
@@ -205,7 +214,7 @@ impl Participant {
         }
     }
 
-    /// Returns the limiter of waits for readers' threads.
+    /// Returns the limiter of waits for workers.
     pub(crate) fn holds(&self) -> &Pace {
         &self.holds
     }

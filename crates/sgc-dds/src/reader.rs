@@ -21,7 +21,7 @@ const LAPSED_MAX: usize = 1024;
 /// Most writers of one reader whose depths are reported.
 const DEPTHS_MAX: usize = 1024;
 
-/// A raw reader. Dropping it ends its thread, waits for a handler at work, and deletes the entities.
+/// A raw reader. Dropping it waits for a handler at work, and deletes the entities.
 #[derive(Debug)]
 pub struct CycloneReader(Intake<Samples>);
 
@@ -42,7 +42,7 @@ impl CycloneReader {
             held: None,
             handler,
         };
-        intake.start("sgc-dds-read", samples)?;
+        intake.start(samples)?;
         Ok(Self(intake))
     }
 

@@ -43,7 +43,7 @@ impl Message {
     }
 }
 
-/// A handler of messages, on a thread of its reader alone.
+/// A handler of messages, which may block.
 pub(crate) trait HandleMessages: Send + 'static {
     /// Handles a message. May block.
     fn handle(&mut self, message: Message);
@@ -52,8 +52,8 @@ pub(crate) trait HandleMessages: Send + 'static {
     fn overrun(&mut self, messages: u64);
 }
 
-/// A reader of requests or replies. Dropping it ends its thread, waits for a handler at work, and deletes the
-/// entities. Messages written by SGC, in this process or another, do not reach the handler.
+/// A reader of requests or replies. Dropping it waits for a handler at work, and deletes the entities. Messages written
+/// by SGC, in this process or another, do not reach the handler.
 pub(crate) struct RpcReader<H: HandleMessages> {
     intake: Intake<Messages<H>>,
     ignores_tagged: bool,
@@ -73,7 +73,7 @@ impl<H: HandleMessages> RpcReader<H> {
     /// Starts to hand messages over.
     pub(crate) fn start(&mut self, handler: H) -> Result<(), String> {
         let (ignores_tagged, writers) = (self.ignores_tagged, KnownWriters::default());
-        self.intake.start("sgc-dds-rpc", Messages { ignores_tagged, writers, handler })
+        self.intake.start(Messages { ignores_tagged, writers, handler })
     }
 
     /// Returns the GUID of the reader, as others discover it.

@@ -43,7 +43,7 @@ const MATCHES_MAX: usize = 1024;
 /// Bytes of a client's id in the header; the rest of [`RequestId::client`] is zero.
 const ID_BYTES: usize = 8;
 
-/// A client. Dropping it ends the thread that reads its replies.
+/// A client. Dropping it waits for a handler of a reply at work.
 #[derive(Debug)]
 pub struct CycloneClient {
     ends: Ends<Replies>,
@@ -53,7 +53,7 @@ pub struct CycloneClient {
     last_in_body: Arc<AtomicI64>,
 }
 
-/// A server. Dropping it ends the thread that reads requests.
+/// A server. Dropping it waits for a handler of a request at work.
 #[derive(Debug)]
 pub struct CycloneServer {
     ends: Ends<Requests>,

@@ -672,7 +672,7 @@ fn next_number(handled: &Receiver<Outcome>) -> Result<usize, usize> {
     loop {
         match next(handled) {
             Outcome::Overrun(samples) => return Err(samples as usize),
-            Outcome::OnItsThread(payload) | Outcome::AtOnce(payload) => match number_of(&payload) {
+            Outcome::OnAWorker(payload) | Outcome::AtOnce(payload) => match number_of(&payload) {
                 0 => {}
                 number => return Ok(number),
             },
@@ -891,7 +891,7 @@ fn a_reader_says_whether_more_is_at_hand_and_never_at_the_end() {
 #[derive(Debug, PartialEq, Eq)]
 enum Outcome {
     AtOnce(Bytes),
-    OnItsThread(Bytes),
+    OnAWorker(Bytes),
     Overrun(u64),
 }
 
@@ -904,7 +904,7 @@ struct Choosy {
 
 impl HandleSamples for Choosy {
     fn handle(&mut self, sample: Sample) {
-        let _ = self.handled.send(Outcome::OnItsThread(sample.payload));
+        let _ = self.handled.send(Outcome::OnAWorker(sample.payload));
         let _ = self.gate.recv();
     }
 
@@ -940,7 +940,7 @@ fn samples_are_handled_on_the_receiving_thread_in_order() {
                 true
             }
             other => {
-                assert_eq!(other, Outcome::OnItsThread(padded(&text).into()));
+                assert_eq!(other, Outcome::OnAWorker(padded(&text).into()));
                 release.send(()).unwrap();
                 false
             }
@@ -948,10 +948,10 @@ fn samples_are_handled_on_the_receiving_thread_in_order() {
     });
     assert!(is_at_once, "a thousand were woken for");
 
-    // Samples of the reader's thread are not overtaken, and samples without room are counted.
+    // Samples of the worker are not overtaken, and samples without room are counted.
     may.store(false, Relaxed);
     write(&writer, &string_cdr("blocks"));
-    assert_eq!(next(&handled), Outcome::OnItsThread(padded(&string_cdr("blocks")).into()));
+    assert_eq!(next(&handled), Outcome::OnAWorker(padded(&string_cdr("blocks")).into()));
     may.store(true, Relaxed);
     (0..20).for_each(|i| write(&writer, &string_cdr(&format!("behind {i}"))));
     assert!(writer.wait_acknowledged(PATIENCE));
@@ -960,7 +960,7 @@ fn samples_are_handled_on_the_receiving_thread_in_order() {
     assert_eq!(next(&handled), Outcome::Overrun(15));
     for i in 15..20 {
         let text = string_cdr(&format!("behind {i}"));
-        assert_eq!(next(&handled), Outcome::OnItsThread(padded(&text).into()));
+        assert_eq!(next(&handled), Outcome::OnAWorker(padded(&text).into()));
     }
 }
 
@@ -993,7 +993,7 @@ fn a_reader_may_be_dropped_where_its_samples_are_received() {
     });
     assert!(is_dropped);
     matched(&writer, 0);
-    assert_eq!(handled.recv_timeout(PATIENCE), Err(RecvTimeoutError::Disconnected), "the thread has ended");
+    assert_eq!(handled.recv_timeout(PATIENCE), Err(RecvTimeoutError::Disconnected), "the handler is gone");
 }
 
 #[test]
@@ -1016,7 +1016,7 @@ fn a_reader_may_be_dropped_by_its_own_handler() {
     write(&writer, &string_cdr("x"));
     next(&done);
     matched(&writer, 0);
-    assert_eq!(done.recv_timeout(PATIENCE), Err(RecvTimeoutError::Disconnected), "the thread has ended");
+    assert_eq!(done.recv_timeout(PATIENCE), Err(RecvTimeoutError::Disconnected), "the handler is gone");
 }
 
 #[test]

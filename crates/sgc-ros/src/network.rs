@@ -200,11 +200,11 @@ pub struct Sample {
 
 /// A handler that receives the samples of one reader in order. Closures that take samples implement it.
 pub trait HandleSamples: Send {
-    /// Handles a sample on the reader's own thread. It may block, which holds up only this reader.
+    /// Handles a sample. It may block, which holds up only this reader.
     fn handle(&mut self, sample: Sample);
 
     /// Handles a sample on the thread that receives for all readers. Returns the sample if that could block; it is then
-    /// handled on the reader's own thread. No other sample is at hand behind it.
+    /// handled by [`Self::handle`]. No other sample is at hand behind it.
     fn handle_at_once(&mut self, sample: Sample) -> Option<Sample> {
         Some(sample)
     }
@@ -270,7 +270,7 @@ pub enum UnhandledCall {
 /// implement it.
 pub trait HandleCalls: Send {
     /// Handles a message: encapsulation header and body, without the request id, which vendors encode in different
-    /// places. It runs on a thread of its own and may block.
+    /// places. It may block, which holds up no others.
     fn handle(&mut self, id: RequestId, payload: Bytes);
 
     /// Reports messages that are not handed over.
@@ -431,7 +431,7 @@ pub enum Reach {
 /// A local ROS 2 network.
 ///
 /// Dropping the network ends discovery and waits for its threads. Dropping a reader or writer deletes the entity and
-/// its topic, and waits for the thread that served it.
+/// its topic, and waits for a handler at work.
 pub trait RosNetwork: Send + Sync + 'static {
     /// A reader, until dropped.
     type Reader: Send + 'static;
@@ -506,7 +506,7 @@ pub trait RosNetwork: Send + Sync + 'static {
     }
 }
 
-/// A raw writer. Calls may block (DDS reliability), so they belong on a thread of the writer's own.
+/// A raw writer. Calls may block (DDS reliability), so they belong on a thread that others do not wait for.
 pub trait RosWriter: Send + Sync + 'static {
     /// Writes, disposes or unregisters. The sample may stay queued until the next call or [`Self::flush`], so that
     /// short samples share packets.

@@ -34,6 +34,7 @@ impl Allocations {
 
 thread_local! {
     static HERE: Cell<Allocations> = const { Cell::new(Allocations { count: 0, bytes: 0 }) };
+    static REPORTED: Cell<Option<Allocations>> = const { Cell::new(None) };
 }
 
 static LIVE: AtomicI64 = AtomicI64::new(0);
@@ -41,6 +42,12 @@ static LIVE: AtomicI64 = AtomicI64::new(0);
 /// Returns the allocations of the calling thread so far.
 pub fn allocated_here() -> Allocations {
     HERE.get()
+}
+
+/// Returns the allocations of the calling thread since it last called this; none at its first call.
+pub fn allocated_since_last() -> Allocations {
+    let now = allocated_here();
+    now.since(REPORTED.replace(Some(now)).unwrap_or(now))
 }
 
 /// Returns the bytes that the process has allocated and not freed.

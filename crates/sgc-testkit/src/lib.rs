@@ -46,7 +46,8 @@ mod wires;
 mod world;
 
 pub use allocator::{
-    Allocations, CountingAllocator, allocated_here, allocations, allocations_of, live_bytes,
+    Allocations, CountingAllocator, allocated_here, allocated_since_last, allocations, allocations_of,
+    live_bytes,
 };
 pub use cast::{Member, identity, revocation_list, serial_list};
 pub use clock::Clock;
