@@ -364,7 +364,7 @@ impl Feed {
 
     /// Drops the reader, which holds the feed. May block.
     pub(crate) fn end(&self) {
-        // A subscriber without room would hold up the reader's thread.
+        // A subscriber without room would hold up the reader's worker.
         let subscribers = std::mem::take(&mut self.outlets().subscribers);
         subscribers.iter().filter_map(|other| other.queue.upgrade()).for_each(|queue| queue.close());
         let reader = lock(&self.reader).take();

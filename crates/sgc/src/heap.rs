@@ -1,8 +1,8 @@
 //! Limits the number of arenas in the C library's allocator.
 //!
 //! glibc gives a thread that finds all arenas busy a new one, up to eight per core, and memory freed in one arena stays
-//! there. A node has many threads, one per topic and more for blocking work, but hardly more of them run at a time than
-//! there are cores. With one arena per core, threads reuse the memory that others freed.
+//! there. A node has threads for all work that blocks, but hardly more of them run at a time than there are cores. With
+//! one arena per core, threads reuse the memory that others freed.
 #![allow(unsafe_code)]
 
 /// Limits the arenas to the number of cores. Must be called before other threads exist.

@@ -503,7 +503,7 @@ async fn show(mut stream: UnixStream, mut tap: Tap, most: u32) {
     }
     tap.queue.close();
     if let Some(reader) = tap.reader.take() {
-        // Dropping the reader waits for its thread.
+        // Dropping the reader waits for its handler.
         tokio::task::spawn_blocking(move || drop(reader));
     }
 }

@@ -25,6 +25,7 @@ use sgc_endpoint::{Endpoint, Output as EndpointOutput};
 use sgc_ros::{RosNetwork, Routes, ShareRule, UseRule};
 use sgc_router::{Output as RouterOutput, Router};
 use sgc_session::KeepAlivePolicy;
+use sgc_sync::Workers;
 use sgc_transport::{AnyLink, CredentialStore};
 use sgc_trust::{Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
@@ -60,6 +61,7 @@ use crate::data::sending::replays::Replays;
 use crate::data::sinks::SinkRequest;
 use crate::data::stats::Drops;
 use crate::data::tap::TapQueue;
+use crate::data::writer_queue::WriterContext;
 use crate::discovery::Board;
 use crate::drops::NodeDrop;
 use crate::gateway::Gateway;
@@ -107,6 +109,7 @@ pub(crate) struct Core<N: RosNetwork> {
     control_drops: Drops,
     problem_log: ProblemLog,
     ros_failures: Arc<Drops>,
+    writers: WriterContext,
     events: mpsc::WeakSender<CoreEvent>,
     started: Instant,
     alerts: Alerts,
@@ -153,6 +156,8 @@ pub(crate) struct CoreParts<N> {
     pub events: mpsc::WeakSender<CoreEvent>,
     /// Clone held by every thread and blocking task while it uses the runtime.
     pub(crate) alive: mpsc::Sender<()>,
+    /// The threads that write to the local network.
+    pub(crate) workers: Workers,
     /// Transport counters.
     pub transport: Arc<sgc_transport::TransportMetrics>,
     /// Audit log.
@@ -210,6 +215,7 @@ impl<N: RosNetwork> Core<N> {
             replays: Arc::default(),
             control_drops: Drops::default(),
             problem_log: ProblemLog::default(),
+            writers: WriterContext::new(parts.workers, ros_failures.clone(), parts.alive.clone()),
             ros_failures,
             events: parts.events,
             started: Instant::now(),

@@ -1,8 +1,8 @@
 //! Services at this node: calls of local clients to other nodes, and calls of other nodes to local servers.
 //!
-//! The machines of `sgc-endpoint` remember the state of calls. This module has the threads between them and the local
-//! network. Each service has a thread for everything that may block. No lock is held while the local network is called,
-//! since it may answer on the same thread.
+//! The machines of `sgc-endpoint` remember the state of calls. This module is between them and the local network.
+//! Workers do everything that may block, one at a time for each service. No lock is held while the local network is
+//! called, since it may answer on the same thread.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -198,7 +198,7 @@ impl LocalService {
         lost.into_iter().for_each(|lost| self.ledger.count(lost.loss, Some(CallerId::Source(lost.of)), 1));
     }
 
-    /// Handles a message about a call from another node. Runs on the thread of the service.
+    /// Handles a message about a call from another node. Runs on a worker.
     pub(crate) fn take(self: &Arc<Self>, message: Message) {
         let (source, number) = (message.source, message.head.call());
         let what = self.lock().answerer.handle(source, message.head.kind, number);
@@ -251,7 +251,7 @@ impl LocalService {
         }
     }
 
-    /// Handles a reply of the local server. Runs on the thread of the client.
+    /// Handles a reply of the local server. Runs on a worker of the client.
     pub(crate) fn answer(&self, id: RequestId, payload: Bytes) {
         let (answered, ended) = {
             let mut state = self.lock();
@@ -272,7 +272,7 @@ impl LocalService {
         } else {
             self.failures.count(NodeDrop::ReplyToNothing);
         }
-        // The client cannot be dropped on its own thread.
+        // The client cannot be dropped by its own worker.
         if let Some(ended) = ended {
             self.share.run_blocking(move || drop(ended));
         }
@@ -378,7 +378,7 @@ impl FarService {
         old.map(|old| Box::new(old) as _)
     }
 
-    /// Handles a request of a local client. Runs on the thread of the server.
+    /// Handles a request of a local client. Runs on a worker of the server.
     pub(crate) fn call(&self, id: RequestId, payload: Bytes) {
         let (number, wakes) = {
             let mut state = self.lock();
@@ -438,7 +438,7 @@ impl FarService {
         self.lock().caller.deadline()
     }
 
-    /// Handles the owner's message about a call. Runs on the thread of the service.
+    /// Handles the owner's message about a call. Runs on a worker.
     pub(crate) fn take(&self, message: Message) {
         let (kind, number) = (message.head.kind, message.head.call());
         // Without a server to deliver it, a reply waits where it is.

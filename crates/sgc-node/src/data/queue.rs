@@ -114,20 +114,6 @@ impl<T> Queue<T> {
         }
     }
 
-    /// Waits for an item. Returns `false` once the queue is closed and empty.
-    pub(crate) async fn wait(&self) -> bool {
-        loop {
-            let is_closed = self.is_closed();
-            if !self.is_empty() {
-                return true;
-            }
-            if is_closed {
-                return false;
-            }
-            self.filled.notified().await;
-        }
-    }
-
     /// Removes the oldest item, if there is one.
     pub(crate) fn try_pop(&self) -> Option<T> {
         self.take()

@@ -645,7 +645,7 @@ mod tests {
             let _ = gate.recv();
         };
         sink.set_writer(Some(killed), Some(noted(Box::new(wait))));
-        // The long message keeps the thread busy, so the others queue up.
+        // The long message keeps the worker busy, so the others queue up.
         write(&sink, message(0, AT_ONCE_BYTES_MAX + 1));
         (1..50).for_each(|seq| write(&sink, message(seq, 16)));
         sink.set_writer(Some(killed), None);
@@ -670,7 +670,7 @@ mod tests {
         let writer = sink.writer(&SourceId([1; 16])).unwrap();
         drop(sink);
         let ended = tokio::time::timeout(Duration::from_secs(20), writer.ended()).await;
-        assert!(ended.is_ok(), "its thread goes on");
+        assert!(ended.is_ok(), "its worker goes on");
     }
 
     #[tokio::test]

@@ -1,14 +1,13 @@
-//! The queue in front of a local writer, and the thread that writes.
+//! The queue in front of a local writer.
 //!
-//! Writing may block, so each local writer has a thread behind a bounded queue. If the writer cannot block and its
-//! queue is empty, the receiving task writes a short message itself. [`crate::data::sinks`] opens packets and chooses
-//! the queue; [`crate::data::burst`] paces the writes.
+//! Writing may block, so a [worker](sgc_sync::Workers) writes the messages of a bounded queue. If the writer cannot
+//! block and its queue is empty, the receiving task writes a short message itself. [`crate::data::sinks`] opens packets
+//! and chooses the queue; [`crate::data::burst`] paces the writes.
 
 use std::collections::VecDeque;
 use std::num::NonZeroU64;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, MutexGuard};
-use std::thread;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed, Ordering::SeqCst};
+use std::sync::{Arc, Mutex, MutexGuard, Weak};
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwapOption;
@@ -18,10 +17,11 @@ use sgc_ros::{
     prefix_frames,
 };
 use sgc_session::Shaper;
-use sgc_sync::lock;
+use sgc_sync::{Work, Workers, lock};
 use sgc_wire::{History, KEY_HASH_BYTES, Liveliness, MessageHead, MessageKind, PayloadForm};
+use tokio::runtime::Handle;
 use tokio::sync::mpsc;
-use tokio::time::{sleep_until, timeout_at};
+use tokio::time::sleep_until;
 use tracing::warn;
 
 use crate::data::burst::Burst;
@@ -34,7 +34,7 @@ use crate::drops::NodeDrop;
 pub(crate) const WRITER_MESSAGES_MAX: usize = 1024;
 /// Most bytes that wait for one local writer.
 const WRITER_BYTES_MAX: usize = 16 << 20;
-/// Most delay of a wake-up of a writer's thread; Linux's default is 50 µs.
+/// Most delay of a wake-up of a worker; Linux's default is 50 µs.
 const TIMER_SLACK_NS: u64 = 1_000;
 /// Messages of a transient-local writer that are remembered, to recognise repetitions.
 const RECENT_MAX: usize = 4096;
@@ -56,14 +56,54 @@ const SILENCE_MIN: Duration = Duration::from_millis(200);
 /// Longest time that a local writer may block the network.
 const WRITER_PATIENCE: Duration = Duration::from_secs(5);
 
-/// The queue in front of a local writer's thread.
+/// What the writers of a node share.
+#[derive(Clone, Debug)]
+pub(crate) struct WriterContext {
+    workers: Workers,
+    /// Counts messages that are not written.
+    drops: Arc<Drops>,
+    /// Dropped with the last writer.
+    alive: mpsc::Sender<()>,
+}
+
+impl WriterContext {
+    pub(crate) fn new(workers: Workers, drops: Arc<Drops>, alive: mpsc::Sender<()>) -> Self {
+        Self { workers, drops, alive }
+    }
+}
+
+/// Starts the threads that write to the local network.
+///
+/// # Errors
+/// The system has no room for a thread.
+pub(crate) fn start_workers() -> std::io::Result<Workers> {
+    Workers::start("sgc-write", || {
+        // Without it, the pauses of a burst overrun by as much as they are long.
+        let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(TIMER_SLACK_NS));
+    })
+}
+
+/// The queue in front of a local writer.
 pub(crate) struct WriterQueue {
+    /// Itself, for the worker.
+    this: Weak<Self>,
     queue: Queue<Message>,
     shaper: Mutex<Shaper>,
     /// Whether no shaping is configured, readable without the lock.
     is_unshaped: AtomicBool,
-    /// Held by the thread from before it takes a message until it has consumed it, so that no other message overtakes.
-    take: Mutex<MessageConsumer>,
+    /// Held by the worker from before it takes a message until it has consumed it, so that no other message overtakes.
+    consumer: Mutex<Consumer>,
+    workers: Workers,
+    drops: Arc<Drops>,
+    /// Whether a worker is at work or about to begin.
+    is_at_work: AtomicBool,
+    /// Whether a timer will let a worker begin.
+    is_timed: AtomicBool,
+    /// Whether a timer has run out since the last worker began.
+    is_rung: AtomicBool,
+    /// Whether messages wait for the next look for the first reader.
+    awaits_look: AtomicBool,
+    runtime: Handle,
     info: WriterInfo,
     /// Whether messages wait until the writer has a reader, and since when.
     awaits_reader: AtomicBool,
@@ -72,8 +112,53 @@ pub(crate) struct WriterQueue {
     had_reader: AtomicBool,
     /// Whether liveliness was asserted just now, or is being asserted.
     is_asserted: Arc<AtomicBool>,
-    /// Closed once the thread has consumed everything.
-    thread: mpsc::Sender<()>,
+    /// Closed once everything is consumed.
+    ended: mpsc::Sender<()>,
+}
+
+/// The consumer of a queue, with what it has taken and not consumed.
+struct Consumer {
+    take: MessageConsumer,
+    held: Option<Held>,
+    /// The time until the next look for the first reader.
+    look: Duration,
+    /// When the timer runs out.
+    rings_at: Option<Instant>,
+    /// Dropped once everything is consumed.
+    keeps_open: Option<mpsc::Receiver<()>>,
+    /// Dropped behind what consumes.
+    alive: Option<mpsc::Sender<()>>,
+}
+
+/// The next message, which has left the queue.
+struct Held {
+    message: Message,
+    /// Whether newer messages replace it.
+    gives_way: bool,
+}
+
+/// The wait of a message for its time.
+#[derive(Clone, Copy)]
+struct Later {
+    due: Instant,
+    /// Whether newer messages replace it.
+    gives_way: bool,
+}
+
+/// The state of a writer's wait for its first reader.
+enum FirstReader {
+    /// Messages wait until this time, when it is looked for again.
+    LookAt(Instant),
+    /// Messages wait no longer, or none did. So many waited in vain.
+    WaitIsOver { unheard: usize },
+}
+
+/// The next step of a consumer.
+enum Step {
+    Take(Message),
+    /// The next message waits for this time.
+    Later(Instant),
+    Rest,
 }
 
 /// Prefix of frame names, if there is one. Writers share it.
@@ -179,21 +264,20 @@ impl Recent {
 }
 
 impl WriterQueue {
-    /// Starts the thread. It ends, and the writer with it, once the queue is closed and empty. `frames` applies to tf
+    /// Creates the queue of a writer, which is dropped once the queue is closed and empty. `frames` applies to tf
     /// messages, `types` to messages that arrive as JSON.
-    pub(crate) fn spawn<W: RosWriter>(
+    pub(crate) fn of_writer<W: RosWriter>(
+        context: WriterContext,
         writer: W,
         spec: &EndpointSpec,
         shaping: Shaping,
         frames: Option<FramePrefix>,
         types: Arc<TypeSlot>,
-        failures: Arc<Drops>,
-        alive: mpsc::Sender<()>,
-    ) -> std::io::Result<Arc<Self>> {
-        let (counted, topic) = (failures.clone(), spec.topic.clone());
+    ) -> Arc<Self> {
+        let (counted, topic) = (context.drops.clone(), spec.topic.clone());
         let in_topic = topic.clone();
         let writer = Arc::new(writer);
-        // Only the thread owns the writer, so the writer is dropped where it may block.
+        // Only the consumer owns the writer, so the writer is dropped where it may block.
         let weak = Arc::downgrade(&writer);
         let mut burst = Burst::default();
         // Cyclone's writers block only if they have to keep all samples until they are acknowledged.
@@ -288,8 +372,8 @@ impl WriterQueue {
             let source_timestamp_ns = message.head.source_timestamp_ns;
             Some((SampleHead { kind, source_timestamp_ns, key_hash }, payload))
         };
-        let refused = failures.clone();
-        Self::spawn_with("sgc-write", info, shaping, failures, alive, move |message, next| {
+        let refused = context.drops.clone();
+        Self::new(context, info, shaping, move |message, next| {
             let source = message.source;
             let Some((head, payload)) = prepare(message) else {
                 return if !next.is_at_once() {
@@ -317,83 +401,134 @@ impl WriterQueue {
         })
     }
 
-    /// Starts a queue with another consumer, which also learns the state of the queue behind each message. The consumer
-    /// may block, except for a short message that `info` declares free.
-    pub(crate) fn spawn_with(
-        thread_name: &str,
+    /// Creates a queue with another consumer, which also learns the state of the queue behind each message. The
+    /// consumer may block, except for a short message that `info` declares free.
+    pub(crate) fn new(
+        context: WriterContext,
         info: WriterInfo,
         shaping: Shaping,
-        drops: Arc<Drops>,
-        alive: mpsc::Sender<()>,
         take: impl FnMut(Message, NextMessage) + Send + 'static,
-    ) -> std::io::Result<Arc<Self>> {
+    ) -> Arc<Self> {
         let mut shaper = Shaper::default();
         shaper.set(shaping);
-        let (running, in_thread) = mpsc::channel(1);
-        let this = Arc::new(Self {
+        let WriterContext { workers, drops, alive } = context;
+        let (ended, keeps_open) = mpsc::channel(1);
+        let consumer = Consumer {
+            take: Box::new(take),
+            held: None,
+            look: FIRST_READER_LOOK,
+            rings_at: None,
+            keeps_open: Some(keeps_open),
+            alive: Some(alive),
+        };
+        Arc::new_cyclic(|this| Self {
+            this: this.clone(),
             queue: Queue::new(WRITER_MESSAGES_MAX),
             shaper: shaper.into(),
             is_unshaped: AtomicBool::new(shaping == Shaping::default()),
-            take: Mutex::new(Box::new(take)),
+            consumer: consumer.into(),
+            workers,
+            drops,
+            is_at_work: AtomicBool::new(false),
+            is_timed: AtomicBool::new(false),
+            is_rung: AtomicBool::new(false),
+            awaits_look: AtomicBool::new(false),
+            runtime: Handle::current(),
             awaits_reader: AtomicBool::new(info.awaits_reader),
             awaits_since: Mutex::new(Instant::now()),
             had_reader: AtomicBool::new(false),
             info,
             is_asserted: Arc::default(),
-            thread: running,
-        });
-        let (task, runtime) = (this.clone(), tokio::runtime::Handle::current());
-        thread::Builder::new().name(thread_name.into()).spawn(move || {
-            let _alive = alive;
-            // Without it, the pauses of a burst overrun by as much as they are long.
-            let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(TIMER_SLACK_NS));
-            while runtime.block_on(task.queue.wait()) {
-                let mut unheard = task.await_first_reader();
-                let mut take = lock(&task.take);
-                let mut behind = None;
-                while let Some(message) = runtime.block_on(task.next(&mut behind, &drops)) {
-                    let next = match behind.is_none() && task.queue.is_empty() {
-                        true => NextMessage::Nothing,
-                        false if unheard > 1 => NextMessage::Unheard,
-                        false if task.queue.is_closed() => NextMessage::Last,
-                        false if task.is_unshaped.load(Relaxed) => NextMessage::AtOnce,
-                        false => NextMessage::Later,
-                    };
-                    unheard = unheard.saturating_sub(1);
-                    take(message, next);
-                }
-            }
-            drop(in_thread);
-            // Dropping the consumer drops a writer, which may block.
-            let end: MessageConsumer = Box::new(|_, _| ());
-            drop(std::mem::replace(&mut *lock(&task.take), end));
-        })?;
-        Ok(this)
+            ended,
+        })
     }
 
-    /// Waits until the writer has a reader, for a bounded time, if it is new or was silent. Returns the number of
-    /// messages that waited in vain.
-    fn await_first_reader(&self) -> usize {
-        if !self.awaits_reader.load(Relaxed) {
-            return 0;
+    /// Has a worker consume what is queued, unless that waits for the next look for the first reader.
+    fn wake(&self) {
+        if !(self.awaits_look.load(SeqCst) && self.queue.has_headroom(FIRST_READER_BYTES_MAX)) {
+            self.work();
         }
-        let since = *lock(&self.awaits_since);
-        let may_wait = || {
-            since.elapsed() < FIRST_READER_WAIT_MAX
-                && self.queue.has_headroom(FIRST_READER_BYTES_MAX)
-                && !self.queue.is_closed()
+    }
+
+    fn work(&self) {
+        if !self.is_at_work.swap(true, SeqCst)
+            && let Some(this) = self.this.upgrade()
+        {
+            self.workers.run(this);
+        }
+    }
+
+    /// Consumes what is queued and due. Returns when a timer has to run out, if one has to be set.
+    fn consume(&self) -> Option<Instant> {
+        let mut consumer = lock(&self.consumer);
+        let consumer = &mut *consumer;
+        if self.is_rung.swap(false, SeqCst) {
+            consumer.rings_at = None;
+        }
+        self.is_timed.store(false, SeqCst);
+        self.awaits_look.store(false, SeqCst);
+        let later = match self.await_first_reader(consumer) {
+            FirstReader::LookAt(at) => {
+                self.awaits_look.store(true, SeqCst);
+                Some(at)
+            }
+            FirstReader::WaitIsOver { unheard } => self.take_all(consumer, unheard),
         };
-        let mut look = FIRST_READER_LOOK;
-        while self.matched() == 0 && may_wait() {
-            thread::sleep(look);
-            look = (look * 2).min(FIRST_READER_LOOK_MAX);
+        if later.is_none() && self.queue.is_closed() && self.queue.is_empty() {
+            consumer.keeps_open = None;
+            // This drops a writer, which may block.
+            consumer.take = Box::new(|_, _| ());
+            consumer.alive = None;
         }
+        self.is_timed.store(later.is_some(), SeqCst);
+        let is_set = |later: &Instant| consumer.rings_at.is_some_and(|at| at <= *later);
+        let rings_at = later.filter(|later| !is_set(later));
+        consumer.rings_at = rings_at.or(consumer.rings_at);
+        rings_at
+    }
+
+    /// Consumes all messages, up to one that waits for the time that is returned.
+    fn take_all(&self, consumer: &mut Consumer, mut unheard: usize) -> Option<Instant> {
+        loop {
+            let message = match self.next(&mut consumer.held) {
+                Step::Take(message) => message,
+                Step::Later(at) => return Some(at),
+                Step::Rest => return None,
+            };
+            let next = match consumer.held.is_none() && self.queue.is_empty() {
+                true => NextMessage::Nothing,
+                false if unheard > 1 => NextMessage::Unheard,
+                false if self.queue.is_closed() => NextMessage::Last,
+                false if self.is_unshaped.load(Relaxed) => NextMessage::AtOnce,
+                false => NextMessage::Later,
+            };
+            unheard = unheard.saturating_sub(1);
+            (consumer.take)(message, next);
+        }
+    }
+
+    /// Looks for the first reader, for a bounded time, if the writer is new or was silent and messages wait.
+    fn await_first_reader(&self, consumer: &mut Consumer) -> FirstReader {
+        let nothing_waits = FirstReader::WaitIsOver { unheard: 0 };
+        if !self.awaits_reader.load(Relaxed) || self.queue.is_empty() {
+            return nothing_waits;
+        }
+        let has_reader = self.matched() > 0;
+        let may_wait = lock(&self.awaits_since).elapsed() < FIRST_READER_WAIT_MAX
+            && self.queue.has_headroom(FIRST_READER_BYTES_MAX)
+            && !self.queue.is_closed();
+        if !has_reader && may_wait {
+            let look = consumer.look;
+            consumer.look = (look * 2).min(FIRST_READER_LOOK_MAX);
+            return FirstReader::LookAt(Instant::now() + look);
+        }
+        consumer.look = FIRST_READER_LOOK;
         self.awaits_reader.store(false, Relaxed);
-        if self.matched() > 0 {
+        if has_reader {
             self.had_reader.store(true, Relaxed);
-            return 0;
+            return nothing_waits;
         }
-        self.queue.len()
+        FirstReader::WaitIsOver { unheard: self.queue.len() }
     }
 
     /// Lets messages wait for a reader again, if the writer has lost its readers and was silent.
@@ -416,16 +551,17 @@ impl WriterQueue {
 
     /// Returns the consumer if it takes a message now without blocking and the queue is empty. Only one caller queues
     /// at a time.
-    fn at_once(&self, message: &Message) -> Option<MutexGuard<'_, MessageConsumer>> {
+    fn at_once(&self, message: &Message) -> Option<MutexGuard<'_, Consumer>> {
         let may = written_bytes(message) <= AT_ONCE_BYTES_MAX && self.is_unshaped.load(Relaxed);
-        let take = if may { self.take.try_lock().ok() } else { None };
-        let is_free = || {
-            !self.awaits_reader.load(Relaxed)
+        let consumer = if may { self.consumer.try_lock().ok() } else { None };
+        let is_free = |consumer: &MutexGuard<'_, Consumer>| {
+            consumer.held.is_none()
+                && !self.awaits_reader.load(Relaxed)
                 && self.queue.is_empty()
                 && !self.queue.is_closed()
                 && (self.info.is_free)(message)
         };
-        take.filter(|_| is_free())
+        consumer.filter(is_free)
     }
 
     /// Writes a message on the caller's thread if `may_write` and nothing is ahead of it, or queues it if there is
@@ -435,15 +571,16 @@ impl WriterQueue {
         self.note_silence();
         let mut evicted = 0;
         let at_once = may_write.then(|| self.at_once(&message)).flatten();
-        if let Some(mut take) = at_once {
-            take(message, NextMessage::Nothing);
+        if let Some(mut consumer) = at_once {
+            (consumer.take)(message, NextMessage::Nothing);
         } else if message.reliable {
             match self.queue.try_push(message, bytes, WRITER_BYTES_MAX) {
-                PushOutcome::Queued => {}
+                PushOutcome::Queued => self.wake(),
                 PushOutcome::NotQueued(message) => return WriteOutcome::Full(message),
             }
         } else {
             self.queue.push_evicting(message, bytes, WRITER_BYTES_MAX, |_| evicted += 1);
+            self.wake();
         }
         self.remember(&head);
         WriteOutcome::Taken { evicted }
@@ -454,6 +591,7 @@ impl WriterQueue {
         let (bytes, head) = (message.payload.len(), message.head);
         self.note_silence();
         self.queue.push(message, bytes, WRITER_BYTES_MAX, WRITER_PATIENCE).await?;
+        self.wake();
         self.remember(&head);
         Ok(())
     }
@@ -479,44 +617,45 @@ impl WriterQueue {
         self.shaper().set(shaping);
     }
 
-    /// Waits for the time of the next message and returns it, or the newest one if later messages replace it. `behind`
-    /// is a message that was taken after it and must not overtake it.
-    async fn next(&self, behind: &mut Option<Message>, drops: &Drops) -> Option<Message> {
-        let mut message = match behind.take() {
-            Some(message) => message,
-            None => self.queue.try_pop()?,
+    /// Takes the next message if it is due, or the newest one if later messages replace it.
+    fn next(&self, held: &mut Option<Held>) -> Step {
+        let of_queue = || Some(Held { message: self.queue.try_pop()?, gives_way: false });
+        let Some(Held { mut message, mut gives_way }) = held.take().or_else(of_queue) else {
+            return Step::Rest;
         };
         loop {
-            let now = Instant::now();
-            let (due, gives_way) = {
-                let mut shaper = self.shaper();
-                let is_shaped = message.head.kind == MessageKind::Write;
-                if !is_shaped || shaper.is_due(now) || self.queue.is_closed() {
-                    if is_shaped {
-                        shaper.takes(now, message.payload.len());
-                    }
-                    return Some(message);
-                }
-                (shaper.due().unwrap_or(now), shaper.gives_way(now, message.reliable))
-            };
-            if !gives_way {
-                sleep_until(due.into()).await;
-                continue;
-            }
-            match timeout_at(due.into(), self.queue.pop()).await {
-                Ok(Some(newer)) if newer.head.kind == MessageKind::Write => {
-                    drops.count(DataDrop::Thinned);
+            let later = self.later(&message);
+            gives_way |= later.is_some_and(|later| later.gives_way);
+            match if gives_way { self.queue.try_pop() } else { None } {
+                Some(newer) if newer.head.kind == MessageKind::Write => {
+                    self.drops.count(DataDrop::Thinned);
                     message = newer;
+                    continue;
                 }
                 // The end of an instance is never skipped, nor is the message before it.
-                Ok(Some(end)) => {
-                    *behind = Some(end);
-                    return Some(message);
+                Some(end) => *held = Some(Held { message: end, gives_way: false }),
+                None => {
+                    if let Some(Later { due, .. }) = later {
+                        *held = Some(Held { message, gives_way });
+                        return Step::Later(due);
+                    }
                 }
-                Ok(None) => return Some(message),
-                Err(_) => {}
             }
+            if message.head.kind == MessageKind::Write {
+                self.shaper().takes(Instant::now(), message.payload.len());
+            }
+            return Step::Take(message);
         }
+    }
+
+    /// Returns until when a message waits, unless it is due.
+    fn later(&self, message: &Message) -> Option<Later> {
+        if message.head.kind != MessageKind::Write || self.queue.is_closed() {
+            return None;
+        }
+        let (now, shaper) = (Instant::now(), self.shaper());
+        let due = shaper.due().filter(|_| !shaper.is_due(now))?;
+        Some(Later { due, gives_way: shaper.gives_way(now, message.reliable) })
     }
 
     /// Sets the number of messages that late joiners get. May block.
@@ -575,14 +714,49 @@ impl WriterQueue {
         lock(&self.shaper)
     }
 
-    /// Closes the queue. The thread ends after it is empty.
+    /// Closes the queue. What consumes it is dropped after it is empty.
     pub(crate) fn close(&self) {
         self.queue.close();
+        self.work();
     }
 
-    /// Waits until the thread has consumed everything.
+    /// Waits until everything is consumed.
     pub(crate) async fn ended(&self) {
-        self.thread.closed().await;
+        self.ended.closed().await;
+    }
+
+    /// Returns `true` if a worker has something to do: messages, a timer that ran out, or the end.
+    fn has_work(&self) -> bool {
+        let has_messages = !self.is_timed.load(SeqCst) && !self.queue.is_empty();
+        let has_to_end = self.queue.is_closed() && !self.ended.is_closed();
+        has_messages || has_to_end || self.is_rung.load(SeqCst)
+    }
+
+    /// Lets a worker begin at this time.
+    fn set_timer(&self, at: Instant) {
+        let this = self.this.clone();
+        self.runtime.spawn(async move {
+            sleep_until(at.into()).await;
+            if let Some(this) = this.upgrade() {
+                this.is_rung.store(true, SeqCst);
+                this.work();
+            }
+        });
+    }
+}
+
+impl Work for WriterQueue {
+    fn run(self: Arc<Self>) {
+        loop {
+            if let Some(at) = self.consume() {
+                self.set_timer(at);
+            }
+            self.is_at_work.swap(false, SeqCst);
+            // A message may have come, or the queue may have been closed, while nobody was told.
+            if !self.has_work() || self.is_at_work.swap(true, SeqCst) {
+                return;
+            }
+        }
     }
 }
 
@@ -607,6 +781,7 @@ pub(crate) fn write_drop(error: &RosError) -> NodeDrop {
 #[cfg(test)]
 pub(crate) mod tests {
     use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering::Relaxed};
+    use std::thread;
 
     use sgc_wire::{PayloadEncoding, SourceId};
 
@@ -628,8 +803,13 @@ pub(crate) mod tests {
 
     pub(crate) fn taking(take: impl FnMut(Message, NextMessage) + Send + 'static) -> Arc<WriterQueue> {
         let info = WriterInfo { is_free: Box::new(|_| true), ..WriterInfo::default() };
+        WriterQueue::new(context(), info, Shaping::default(), take)
+    }
+
+    /// Returns a context for queues of one test.
+    pub(crate) fn context() -> WriterContext {
         let (alive, _) = mpsc::channel(1);
-        WriterQueue::spawn_with("test", info, Shaping::default(), Arc::default(), alive, take).unwrap()
+        WriterContext::new(start_workers().unwrap(), Arc::default(), alive)
     }
 
     pub(crate) fn message(seq: u64, bytes: usize) -> Message {
@@ -659,9 +839,7 @@ pub(crate) mod tests {
             counted.fetch_add(1, Relaxed);
         });
         let info = WriterInfo { assert: Some(assert), ..WriterInfo::default() };
-        let (alive, _) = mpsc::channel(1);
-        let (shaping, drops) = (Shaping::default(), Arc::default());
-        let queue = WriterQueue::spawn_with("test", info, shaping, drops, alive, |_, _| ()).unwrap();
+        let queue = WriterQueue::new(context(), info, Shaping::default(), |_, _| ());
         let begun = Instant::now();
         wait_until(|| {
             queue.assert_liveliness();
@@ -679,7 +857,7 @@ pub(crate) mod tests {
         give(&queue, message(0, 16));
         assert_eq!(*taken.lock().unwrap(), [(0, thread::current().id())]);
         let is_stuck = gate.lock().unwrap();
-        // The thread writes the long message, and later ones do not overtake it.
+        // A worker writes the long message, and later ones do not overtake it.
         give(&queue, message(1, AT_ONCE_BYTES_MAX + 1));
         (2..100).for_each(|seq| give(&queue, message(seq, 16)));
         drop(is_stuck);
@@ -714,9 +892,7 @@ pub(crate) mod tests {
             *noted.lock().unwrap() = Some(Instant::now());
             log.lock().unwrap().push((message.seq, next));
         };
-        let (alive, _) = mpsc::channel(1);
-        let queue =
-            WriterQueue::spawn_with("test", info, Shaping::default(), Arc::default(), alive, take).unwrap();
+        let queue = WriterQueue::new(context(), info, Shaping::default(), take);
         (queue, readers, written)
     }
 
@@ -800,6 +976,95 @@ pub(crate) mod tests {
         queue.close();
         wait_until(|| written.lock().unwrap().len() == 1).await;
         assert!(queue.awaits_since.lock().unwrap().elapsed() < FIRST_READER_WAIT_MAX);
+    }
+
+    /// Creates a queue that takes a message in each period, and a log of what is written.
+    fn shaped(shaping: Shaping) -> (Arc<WriterQueue>, OrderLog) {
+        let written = OrderLog::default();
+        let log = written.clone();
+        let take = move |message: Message, next| log.lock().unwrap().push((message.seq, next));
+        (WriterQueue::new(context(), WriterInfo::default(), shaping, take), written)
+    }
+
+    #[tokio::test]
+    async fn messages_of_a_shaped_queue_wait_for_their_time() {
+        let (queue, written) = shaped(Shaping { bits_per_s: Some(16 * 8), ..Shaping::default() });
+        let begun = Instant::now();
+        (0..3).for_each(|seq| give(&queue, message(seq, 16)));
+        wait_until(|| !written.lock().unwrap().is_empty()).await;
+        // The queue has no worker while a message waits, and messages that come meanwhile are not written either.
+        (3..5).for_each(|seq| give(&queue, message(seq, 16)));
+        wait_until(|| !queue.is_at_work.load(SeqCst)).await;
+        wait_until(|| written.lock().unwrap().len() == 2).await;
+        assert!(begun.elapsed() >= Duration::from_millis(900), "{:?}", begun.elapsed());
+        queue.close();
+        queue.ended().await;
+        assert!(begun.elapsed() < Duration::from_millis(1900), "a closed queue waits for nothing");
+        let numbers: Vec<_> = written.lock().unwrap().iter().map(|(seq, _)| *seq).collect();
+        assert_eq!(numbers, [0, 1, 2, 3, 4], "reliable messages are not thinned");
+    }
+
+    #[tokio::test]
+    async fn newest_message_of_a_thinned_queue_replaces_those_before() {
+        let interval = Some(Duration::from_millis(500));
+        let (queue, written) = shaped(Shaping { interval, ..Shaping::default() });
+        give(&queue, message(0, 16));
+        wait_until(|| !written.lock().unwrap().is_empty()).await;
+        (1..5).for_each(|seq| give(&queue, message(seq, 16)));
+        wait_until(|| written.lock().unwrap().len() == 2).await;
+        let numbers: Vec<_> = written.lock().unwrap().iter().map(|(seq, _)| *seq).collect();
+        assert_eq!(numbers, [0, 4]);
+        assert_eq!(queue.drops.snapshot().into_values().collect::<Vec<_>>(), [3]);
+        queue.close();
+    }
+
+    #[tokio::test]
+    async fn messages_go_on_after_a_timer_that_ran_out_while_a_worker_was_busy() {
+        const INTERVAL: Duration = Duration::from_millis(200);
+        let (written, is_blocked) = (OrderLog::default(), Arc::new(AtomicBool::new(false)));
+        let (log, blocks) = (written.clone(), is_blocked.clone());
+        let shaping = Shaping { interval: Some(INTERVAL), ..Shaping::default() };
+        let queue = WriterQueue::new(context(), WriterInfo::default(), shaping, move |message, next| {
+            log.lock().unwrap().push((message.seq, next));
+            while blocks.load(Relaxed) {
+                thread::sleep(Duration::from_millis(1));
+            }
+        });
+        let count = |messages| written.lock().unwrap().len() == messages;
+        give(&queue, message(0, 16));
+        wait_until(|| count(1)).await;
+        give(&queue, message(1, 16));
+        wait_until(|| queue.is_timed.load(SeqCst)).await;
+        // The end of an instance lets the message before it go, which takes until after its time.
+        is_blocked.store(true, Relaxed);
+        let mut end = message(2, 16);
+        end.head.kind = MessageKind::Dispose;
+        give(&queue, end);
+        wait_until(|| count(2)).await;
+        give(&queue, message(3, 16));
+        tokio::time::sleep(2 * INTERVAL).await;
+        give(&queue, message(4, 16));
+        is_blocked.store(false, Relaxed);
+        wait_until(|| written.lock().unwrap().last().is_some_and(|(seq, _)| *seq == 4)).await;
+        queue.close();
+    }
+
+    #[tokio::test]
+    async fn closed_queue_writes_everything_and_then_drops_its_writer() {
+        let gate = Arc::new(Mutex::new(()));
+        let held = gate.lock().unwrap();
+        let (queue, taken) = noting(&gate);
+        (0..3).for_each(|seq| give(&queue, message(seq, AT_ONCE_BYTES_MAX + 1)));
+        queue.close();
+        assert!(!queue.ended.is_closed());
+        drop(held);
+        queue.ended().await;
+        assert_eq!(taken.lock().unwrap().len(), 3);
+        wait_until(|| Arc::strong_count(&taken) == 1).await;
+        let (idle, taken) = noting(&Arc::default());
+        idle.close();
+        idle.ended().await;
+        wait_until(|| Arc::strong_count(&taken) == 1).await;
     }
 
     #[tokio::test]

@@ -182,7 +182,7 @@ impl GatewayNetwork {
         }
         let ending: Vec<_> = endpoints.iter().map(|endpoint| endpoint.close()).collect();
         drop(endpoints);
-        // A reader ends after its thread, which may wait for a client. The network is opened again beside it.
+        // A reader ends after its handler, which may wait for a client. The network is opened again beside it.
         std::thread::spawn(move || drop(ending));
         if !network.close(max) {
             tracing::debug!("readers or writers of the gateway take long to end");

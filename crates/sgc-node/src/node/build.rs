@@ -28,6 +28,7 @@ use crate::control::settings::policy::grantees;
 use crate::control::settings::rules::Rules;
 use crate::data::sending::message_keys;
 use crate::data::sinks::SinkRequest;
+use crate::data::writer_queue::start_workers;
 use crate::discovery::Board;
 use crate::gateway::access::{access_with, refused_tokens};
 use crate::gateway::{Gateway, NodeDefinitions, OpenLocalRos, ShownKey, Sockets, key_of_files, listen_at};
@@ -135,6 +136,7 @@ pub(super) async fn build<N: RosNetwork>(
         keeper: StateWriter::spawn(state.clone(), config.identity.clone(), run_lock.clone(), alive.clone()),
         redial,
         alive,
+        workers: start_workers().map_err(NodeError::Thread)?,
         identity: identity.clone(),
         credentials: sockets.credentials.clone(),
         gateway: gateway.clone(),

@@ -125,6 +125,9 @@ pub enum NodeError {
     /// A thread of the local network did not start, or no key could be made.
     #[error("starting ended in a panic; this is a bug")]
     Panicked,
+    /// The system has no room for a thread.
+    #[error("a thread cannot start: {0}; check the limits of processes and memory (`ulimit -u`, `TasksMax`)")]
+    Thread(io::Error),
     /// The system provides no random numbers.
     #[error("the system gives no randomness: {0}")]
     Randomness(String),

@@ -263,3 +263,33 @@ fn topic_of_a_thousand_messages_a_second_arrives_whole_and_in_time() {
         assert!(far <= near + LATER_P50_US, "{talks} to {listens}: {far} µs, {near} natively");
     }
 }
+
+#[test]
+fn nodes_with_two_hundred_topics_have_few_threads() {
+    const TOPICS_EACH_WAY: &str = "100";
+    const THREADS_MAX: usize = 32;
+    let [robot, desk] = robot_to_desk("topic", ["/sensed/**"]);
+    let robot = robot + &uses("topic", "/commanded/**", "desk");
+    let desk = desk + &share("topic", "/commanded/**", "robot");
+    let lab = Lab::real(PLAN, [robot, desk]);
+    let run = |site, distribution, publish, hear| {
+        let args = ["--publish", publish, "--hear", hear, "--count", TOPICS_EACH_WAY];
+        lab.rclpy(site, distribution, "many.py", &args)
+    };
+    let mut peers = [
+        run(Site::Robot, "jazzy", "/sensed", "/commanded"),
+        run(Site::Desk, "kilted", "/commanded", "/sensed"),
+    ];
+    let heard_all = |e: &Value| e["event"] == "heard_all";
+    for peer in &mut peers {
+        peer.wait("a message of each topic", heard_all);
+    }
+    for site in [Site::Robot, Site::Desk] {
+        // While the topics begin, more threads are at work.
+        eventually("threads end", || lab.node(site).held().threads <= THREADS_MAX);
+    }
+    for peer in &mut peers {
+        peer.go();
+        peer.wait("a later message of each topic", heard_all);
+    }
+}

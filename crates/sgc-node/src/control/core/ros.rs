@@ -305,22 +305,19 @@ impl<N: RosNetwork> Core<N> {
     pub(super) fn open_writer(&mut self, name: Name, source: Option<SourceId>, spec: EndpointSpec) {
         self.ends.want_writer((name, source), spec.clone());
         let (Some(network), Some(events)) = (self.network.get(), self.events.upgrade()) else { return };
-        let alive = self.alive.clone();
-        let failures = self.ros_failures.clone();
+        let (context, failures) = (self.writers.clone(), self.ros_failures.clone());
         let shaping = self.sinks.get(&name).map(|sink| sink.shaping()).unwrap_or_default();
         let frames = self.sinks.get(&name).map(|sink| sink.frames()).filter(|_| spec.type_name == TF_MESSAGE);
         let types = self.sinks.get(&name).map(|sink| sink.types().clone()).unwrap_or_default();
         tokio::task::spawn_blocking(move || {
-            let writer = network.create_writer(&spec).map_err(|e| e.to_string()).and_then(|writer| {
-                WriterQueue::spawn(writer, &spec, shaping, frames, types, failures.clone(), alive)
-                    .map_err(|e| e.to_string())
-            });
-            let writer = writer
+            let writer = network
+                .create_writer(&spec)
                 .inspect_err(|why| {
                     failures.count(NodeDrop::CreateWriter);
                     error!("{why}");
                 })
-                .ok();
+                .ok()
+                .map(|writer| WriterQueue::of_writer(context, writer, &spec, shaping, frames, types));
             let _ = events.blocking_send(CoreEvent::WriterReady { name, source, spec, writer });
         });
     }

@@ -39,18 +39,8 @@ impl<N: RosNetwork> Core<N> {
         calls: Calls,
         mut take: impl FnMut(sgc_endpoint::Message) + Send + 'static,
     ) {
-        let (alive, failures) = (self.alive.clone(), self.ros_failures.clone());
-        let queue = match WriterQueue::spawn_with(
-            "sgc-calls",
-            WriterInfo::default(),
-            Shaping::default(),
-            failures,
-            alive,
-            move |message, _| take(message),
-        ) {
-            Ok(queue) => queue,
-            Err(why) => return error!(%why, "a service has no thread and cannot be used"),
-        };
+        let take = move |message, _| take(message);
+        let queue = WriterQueue::new(self.writers.clone(), WriterInfo::default(), Shaping::default(), take);
         self.sinks.add(name, false).set_writer(None, Some(queue));
         self.services.add(name, calls);
     }

@@ -9,7 +9,7 @@
 //! - [`publishers`] creates signing keys.
 //! - [`shares`] and [`services`] send on other threads: announcements of silent sources, and questions and notices
 //!   about calls.
-//! - [`sinks`] closes the queues of writers, whose threads end the writers, and drops keys of past epochs.
+//! - [`sinks`] closes the queues of writers, which ends the writers, and drops keys of past epochs.
 //!
 //! [`forward_table`] and [`network_ends`] only keep entries.
 

@@ -155,12 +155,11 @@ mod tests {
     use std::time::Duration;
 
     use bytes::Bytes;
-    use sgc_ros::Shaping;
     use sgc_trust::Suite;
     use sgc_wire::{SecretBytes, SourceAnnounce};
 
     use super::*;
-    use crate::data::writer_queue::{WriterInfo, WriterQueue};
+    use crate::data::writer_queue::tests::taking;
 
     const NAME: Name = Name([1; 32]);
     const SOURCE: SourceId = SourceId([2; 16]);
@@ -170,10 +169,7 @@ mod tests {
         let (requests, requested) = mpsc::channel(1);
         let mut sinks = Sinks::new(requests, Arc::default());
         let sink = sinks.add(NAME, true);
-        let (alive, failures) = (mpsc::channel(1).0, Arc::default());
-        let (info, shaping) = (WriterInfo::default(), Shaping::default());
-        let writer = WriterQueue::spawn_with("test", info, shaping, failures, alive, |_, _| ());
-        sink.set_writer(Some(SOURCE), Some(writer.unwrap()));
+        sink.set_writer(Some(SOURCE), Some(taking(|_, _| ())));
         let announce = SourceAnnounce { source: SOURCE, key: Bytes::new(), oldest: 3, next: 9, recover: 0 };
         let (suite, key) = (Suite::Group.id(), SecretBytes::new([3; 32]));
         let grant = TopicGrant { epoch: 1, suite, key, receiver: None, sources: vec![announce], entry: None };

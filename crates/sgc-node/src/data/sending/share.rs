@@ -1,7 +1,7 @@
 //! [`LocalShare`]: wires the stages that a sample passes from the local network to the links ([`super`]).
 //!
-//! The thread of the local reader seals the samples and pushes the packets into the queues of the links. While the
-//! queue of a reliable topic is full, only this thread waits, so other topics flow on. Samples that are ready together
+//! A worker of the local reader seals the samples and pushes the packets into the queues of the links. While the
+//! queue of a reliable topic is full, only this worker waits, so other topics flow on. Samples that are ready together
 //! share a signature; none waits for a later one.
 
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed, Ordering::SeqCst};
@@ -39,7 +39,7 @@ pub(crate) enum IsTooLarge {
     No,
 }
 
-/// The longest message that the reader's thread sends by itself if no other follows.
+/// The longest message that the reader's worker sends by itself if no other follows.
 pub(crate) const AT_HAND_BYTES_MAX: usize = 16 << 10;
 
 /// This node's end of a topic that it shares or publishes on.
@@ -55,7 +55,7 @@ pub(crate) struct LocalShare {
     taps: Taps,
     /// Whether a task looks for liveliness assertions.
     is_watched: AtomicBool,
-    /// Whether the reader's thread publishes a sample, or has another at hand.
+    /// Whether the reader's worker publishes a sample, or has another at hand.
     is_publishing: AtomicBool,
 }
 
@@ -120,7 +120,7 @@ impl LocalShare {
         self.shape.shaping()
     }
 
-    /// Publishes a sample, at once or when its time has come. The reader's thread calls it.
+    /// Publishes a sample, at once or when its time has come. The reader's worker calls it.
     pub(crate) fn publish(self: &Arc<Self>, sample: Sample) {
         let more = sample.more;
         self.is_publishing.store(true, Relaxed);
@@ -128,7 +128,7 @@ impl LocalShare {
         self.is_publishing.store(more, Relaxed);
     }
 
-    /// Records that the reader's thread left a sample out, and whether it has another at hand.
+    /// Records that the reader's worker left a sample out, and whether it has another at hand.
     pub(crate) fn left_out(&self, more: bool) {
         self.is_publishing.store(more, Relaxed);
     }
@@ -373,7 +373,7 @@ impl LocalShare {
         })
     }
 
-    /// Closes the share. A publishing reader's thread stops at the next packet.
+    /// Closes the share. A publishing worker of the reader stops at the next packet.
     pub(crate) fn close(&self) {
         self.emit.close();
         self.taps.close();

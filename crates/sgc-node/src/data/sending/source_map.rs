@@ -71,7 +71,7 @@ pub(crate) enum SourceChoice {
 pub(crate) struct SourceSlot {
     /// Source id.
     pub id: SourceId,
-    /// The source. The reader's thread locks it for each message.
+    /// The source. The reader's worker locks it for each message.
     pub source: Arc<Mutex<Source>>,
     /// Progress of the source, readable without the lock.
     pub progress: Arc<SourceProgress>,
