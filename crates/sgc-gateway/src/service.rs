@@ -309,7 +309,7 @@ impl Serving {
                 let halves = Halves::find(shared, &type_name)?;
                 let spec = spec(&service, &type_name, &halves);
                 let (send, requests) = mpsc::channel(REQUESTS_MAX);
-                // The handler waits for room on the server's own thread.
+                // The handler may wait for room.
                 let handler = Box::new(move |id: RequestId, payload: Bytes| {
                     drop(send.blocking_send(Request { id, payload }));
                 });

@@ -47,6 +47,11 @@ impl Shaper {
         !reliable || self.rate_due.is_some_and(|due| due > now)
     }
 
+    /// Returns `true` if the settings let later messages replace one that waits.
+    pub fn thins(&self, reliable: bool) -> bool {
+        self.shaping.interval.is_some() || (!reliable && self.shaping.bits_per_s.is_some())
+    }
+
     /// Charges a message that leaves. The next one is due relative to this one's due time, so that the configured rate
     /// is met.
     pub fn takes(&mut self, now: Instant, bytes: usize) {

@@ -2,7 +2,7 @@
 //!
 //! A piece of work keeps its thread for as long as it runs. A few pieces get a thread at once. Others wait for the first
 //! thread that is done, and for a new one if all are blocked: if none was done for [`STALL`], or if the oldest has
-//! waited for [`WAIT_MAX`]. So work that blocks holds up others for moments only, and a burst of short work in many
+//! waited for [`WAIT_MAX`]. One new thread starts in each [`STALL`]. So work that blocks holds up others for moments only, and a burst of short work in many
 //! queues does not start a thread for each. Threads that have nothing to do wait for the next piece, the latest first,
 //! and end after a while.
 
@@ -24,7 +24,7 @@ const AT_ONCE: usize = 4;
 const STALL: Duration = Duration::from_millis(2);
 /// Longest wait of work for a thread, whether there is progress or not.
 const WAIT_MAX: Duration = Duration::from_millis(50);
-/// Time between two attempts to start a thread when the system has no room for one.
+/// Time between two attempts of the watch to start a thread when the system has no room for one.
 const RETRY: Duration = Duration::from_millis(100);
 
 /// Work for a thread of [`Workers`].
@@ -107,6 +107,8 @@ struct State {
     waiting: VecDeque<(Instant, Arc<dyn Work>)>,
     /// The last time at which waiting work got a thread.
     progress: Option<Instant>,
+    /// The last time at which waiting work got a new thread.
+    growth: Option<Instant>,
     /// Whether a thread watches over work that waits.
     is_watched: bool,
     is_closed: bool,
@@ -149,7 +151,8 @@ impl State {
     fn grows_at(&self) -> Option<Instant> {
         let (came, _) = self.waiting.front()?;
         let stalled = self.progress.map_or(*came, |progress| progress.max(*came)) + STALL;
-        Some(stalled.min(*came + WAIT_MAX))
+        let spaced = self.growth.map_or(*came, |growth| growth + STALL);
+        Some(stalled.min(*came + WAIT_MAX).max(spaced))
     }
 }
 
@@ -243,6 +246,7 @@ impl Pool {
                 Some(at) if at > now => at - now,
                 Some(_) => {
                     let work = state.take();
+                    state.growth = Some(now);
                     state.threads += 1;
                     drop(state);
                     if !work.is_none_or(|work| self.grow(work)) {

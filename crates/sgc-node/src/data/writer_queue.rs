@@ -97,10 +97,8 @@ pub(crate) struct WriterQueue {
     drops: Arc<Drops>,
     /// Whether a worker is at work or about to begin.
     is_at_work: AtomicBool,
-    /// Whether a timer will let a worker begin.
-    is_timed: AtomicBool,
-    /// Whether a timer has run out since the last worker began.
-    is_rung: AtomicBool,
+    /// Whether there may be something to do that the worker has not looked at.
+    is_told: AtomicBool,
     /// Whether messages wait for the next look for the first reader.
     awaits_look: AtomicBool,
     runtime: Handle,
@@ -133,8 +131,8 @@ struct Consumer {
 /// The next message, which has left the queue.
 struct Held {
     message: Message,
-    /// Whether newer messages replace it.
-    gives_way: bool,
+    /// Whether newer messages replaced it while it waited.
+    gave_way: bool,
 }
 
 /// The wait of a message for its time.
@@ -430,8 +428,7 @@ impl WriterQueue {
             workers,
             drops,
             is_at_work: AtomicBool::new(false),
-            is_timed: AtomicBool::new(false),
-            is_rung: AtomicBool::new(false),
+            is_told: AtomicBool::new(false),
             awaits_look: AtomicBool::new(false),
             runtime: Handle::current(),
             awaits_reader: AtomicBool::new(info.awaits_reader),
@@ -451,6 +448,7 @@ impl WriterQueue {
     }
 
     fn work(&self) {
+        self.is_told.store(true, SeqCst);
         if !self.is_at_work.swap(true, SeqCst)
             && let Some(this) = self.this.upgrade()
         {
@@ -462,10 +460,9 @@ impl WriterQueue {
     fn consume(&self) -> Option<Instant> {
         let mut consumer = lock(&self.consumer);
         let consumer = &mut *consumer;
-        if self.is_rung.swap(false, SeqCst) {
-            consumer.rings_at = None;
-        }
-        self.is_timed.store(false, SeqCst);
+        self.is_told.swap(false, SeqCst);
+        // A timer that runs out tells later than its time, and never earlier.
+        consumer.rings_at = consumer.rings_at.filter(|at| *at > Instant::now());
         self.awaits_look.store(false, SeqCst);
         let later = match self.await_first_reader(consumer) {
             FirstReader::LookAt(at) => {
@@ -480,7 +477,6 @@ impl WriterQueue {
             consumer.take = Box::new(|_, _| ());
             consumer.alive = None;
         }
-        self.is_timed.store(later.is_some(), SeqCst);
         let is_set = |later: &Instant| consumer.rings_at.is_some_and(|at| at <= *later);
         let rings_at = later.filter(|later| !is_set(later));
         consumer.rings_at = rings_at.or(consumer.rings_at);
@@ -619,13 +615,15 @@ impl WriterQueue {
 
     /// Takes the next message if it is due, or the newest one if later messages replace it.
     fn next(&self, held: &mut Option<Held>) -> Step {
-        let of_queue = || Some(Held { message: self.queue.try_pop()?, gives_way: false });
-        let Some(Held { mut message, mut gives_way }) = held.take().or_else(of_queue) else {
-            return Step::Rest;
-        };
+        let of_queue = || Some(Held { message: self.queue.try_pop()?, gave_way: false });
+        let Some(Held { mut message, gave_way }) = held.take().or_else(of_queue) else { return Step::Rest };
         loop {
             let later = self.later(&message);
-            gives_way |= later.is_some_and(|later| later.gives_way);
+            let gives_way = match later {
+                Some(later) => later.gives_way,
+                // Those that came while it waited replace it, unless it waits no more for another reason.
+                None => gave_way && !self.queue.is_closed() && self.shaper().thins(message.reliable),
+            };
             match if gives_way { self.queue.try_pop() } else { None } {
                 Some(newer) if newer.head.kind == MessageKind::Write => {
                     self.drops.count(DataDrop::Thinned);
@@ -633,10 +631,10 @@ impl WriterQueue {
                     continue;
                 }
                 // The end of an instance is never skipped, nor is the message before it.
-                Some(end) => *held = Some(Held { message: end, gives_way: false }),
+                Some(end) => *held = Some(Held { message: end, gave_way: false }),
                 None => {
                     if let Some(Later { due, .. }) = later {
-                        *held = Some(Held { message, gives_way });
+                        *held = Some(Held { message, gave_way: gives_way });
                         return Step::Later(due);
                     }
                 }
@@ -725,11 +723,9 @@ impl WriterQueue {
         self.ended.closed().await;
     }
 
-    /// Returns `true` if a worker has something to do: messages, a timer that ran out, or the end.
+    /// Returns `true` if a worker may have something to do.
     fn has_work(&self) -> bool {
-        let has_messages = !self.is_timed.load(SeqCst) && !self.queue.is_empty();
-        let has_to_end = self.queue.is_closed() && !self.ended.is_closed();
-        has_messages || has_to_end || self.is_rung.load(SeqCst)
+        self.is_told.load(SeqCst) || (self.queue.is_closed() && !self.ended.is_closed())
     }
 
     /// Lets a worker begin at this time.
@@ -738,7 +734,6 @@ impl WriterQueue {
         self.runtime.spawn(async move {
             sleep_until(at.into()).await;
             if let Some(this) = this.upgrade() {
-                this.is_rung.store(true, SeqCst);
                 this.work();
             }
         });
@@ -1034,7 +1029,7 @@ pub(crate) mod tests {
         give(&queue, message(0, 16));
         wait_until(|| count(1)).await;
         give(&queue, message(1, 16));
-        wait_until(|| queue.is_timed.load(SeqCst)).await;
+        wait_until(|| queue.consumer.lock().unwrap().held.is_some()).await;
         // The end of an instance lets the message before it go, which takes until after its time.
         is_blocked.store(true, Relaxed);
         let mut end = message(2, 16);
