@@ -7,8 +7,8 @@
 //! and the order of samples stays.
 //!
 //! While a queue of a reliable topic is crowded, the receiving thread waits for the worker: briefly and at most half of
-//! the time. So acknowledgements come later, and a `KEEP_ALL` writer becomes slower. Other readers lose at
-//! most half of that thread's time to a slow one. If the queue grows all the same, the samples of its writers are
+//! the time. So acknowledgements come later, and a `KEEP_ALL` writer becomes slower. Other readers lose at most half of
+//! that thread's time to a slow one. If the queue grows all the same, the samples of its writers are
 //! [refused](crate::backpressure) until there is room.
 
 use std::cell::Cell;

@@ -1,10 +1,10 @@
 //! [`Workers`]: threads that queues share, so that an idle queue needs none.
 //!
-//! A piece of work keeps its thread for as long as it runs. A few pieces get a thread at once. Others wait for the first
-//! thread that is done, and for a new one if all are blocked: if none was done for [`STALL`], or if the oldest has
-//! waited for [`WAIT_MAX`]. One new thread starts in each [`STALL`]. So work that blocks holds up others for moments only, and a burst of short work in many
-//! queues does not start a thread for each. Threads that have nothing to do wait for the next piece, the latest first,
-//! and end after a while.
+//! A piece of work keeps its thread for as long as it runs. A few pieces get a thread at once. Others wait for the
+//! first thread that is done. They get new ones if all may be blocked: if none was done for [`STALL`], or if the
+//! oldest piece has waited for [`WAIT_MAX`]; one new thread starts in each [`STALL`]. So work that blocks holds up
+//! others for moments only, and a burst of short work in many queues does not start a thread for each. Threads that
+//! have nothing to do wait for the next piece, the latest first, and end after a while.
 
 use std::collections::VecDeque;
 use std::io;
@@ -319,8 +319,7 @@ mod tests {
     fn work_that_blocks_holds_up_no_other() {
         let workers = workers();
         let blocked: Vec<_> = (0..50).map(|_| begin(&workers)).collect();
-        let mut threads: Vec<_> = blocked.iter().map(|(thread, _)| *thread).collect();
-        threads.dedup();
+        let threads: HashSet<_> = blocked.iter().map(|(thread, _)| *thread).collect();
         assert_eq!(threads.len(), 50);
         drop(blocked);
         await_idle(&workers, 50);

@@ -56,7 +56,7 @@ const SILENCE_MIN: Duration = Duration::from_millis(200);
 /// Longest time that a local writer may block the network.
 const WRITER_PATIENCE: Duration = Duration::from_secs(5);
 
-/// What the writers of a node share.
+/// The threads, counters and sign of life that all writers of a node share.
 #[derive(Clone, Debug)]
 pub(crate) struct WriterContext {
     workers: Workers,
@@ -1011,6 +1011,25 @@ pub(crate) mod tests {
         assert_eq!(numbers, [0, 4]);
         assert_eq!(queue.drops.snapshot().into_values().collect::<Vec<_>>(), [3]);
         queue.close();
+    }
+
+    #[tokio::test]
+    async fn messages_that_wait_in_a_thinned_queue_are_written_when_it_is_closed() {
+        let interval = Some(Duration::from_secs(60));
+        let (queue, written) = shaped(Shaping { interval, ..Shaping::default() });
+        give(&queue, message(0, 16));
+        wait_until(|| !written.lock().unwrap().is_empty()).await;
+        give(&queue, message(1, 16));
+        wait_until(|| queue.consumer.lock().unwrap().held.is_some()).await;
+        {
+            // The worker looks at all of these at once.
+            let _held_up = queue.consumer.lock().unwrap();
+            (2..4).for_each(|seq| give(&queue, message(seq, 16)));
+            queue.close();
+        }
+        queue.ended().await;
+        let numbers: Vec<_> = written.lock().unwrap().iter().map(|(seq, _)| *seq).collect();
+        assert_eq!(numbers, [0, 1, 2, 3]);
     }
 
     #[tokio::test]
