@@ -53,6 +53,8 @@ const QUIET_GROW: f64 = 0.25;
 const CUT_MAX: f64 = 0.5;
 /// After so many cuts in a row, a half together, the queue must have become shorter.
 const CUTS_IN_VAIN: u32 = 4;
+/// A queue that grew this many times during cuts is another one, and counting begins anew.
+const NEW_QUEUE_TIMES: u32 = 4;
 /// Loss that shows congestion: this part of the packets of two rounds, beyond the usual loss.
 const LOSS_HEAVY: f64 = 0.03;
 /// Fewest lost packets of which a part is computed.
@@ -313,8 +315,10 @@ impl Delay {
         let over = queue.as_secs_f64() - aim;
         if over > 0.0 {
             self.quiet = 0;
-            if self.cuts == 0 {
+            // The path has become narrower or longer meanwhile: the cuts until now say nothing about its queue.
+            if self.cuts == 0 || queue > self.uncut.0 * NEW_QUEUE_TIMES {
                 self.uncut = (queue, self.window);
+                self.cuts = 0;
             }
             self.cuts += 1;
             let part = (over / rtt * CUT_GAIN).min(CUT_MAX);

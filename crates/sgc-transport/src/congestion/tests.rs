@@ -462,6 +462,21 @@ fn a_path_that_changes_is_used_again_soon() {
     }
 }
 
+/// Wherever a cut of the window is when it happens.
+#[test]
+fn queue_of_a_path_that_becomes_narrower_is_short_again_soon() {
+    for one_way in [10, 16, 22, 28, 34] {
+        let before = Path { one_way: ms(one_way), ..THIN };
+        let mut world = World::new(before, &[(Congestion::Delay, 0.0)]);
+        world.run_until(10.0);
+        world.path.bits_per_second = 1_000_000;
+        world.run_until(25.0);
+        let (p50, _) = world.queue(16.0, 25.0);
+        assert!(p50 < 40.0, "{one_way} ms: {p50:.0} ms");
+        assert!(world.used(0, 16.0, 25.0) > 0.85, "{one_way} ms: {:.2}", world.used(0, 16.0, 25.0));
+    }
+}
+
 #[test]
 fn two_share_a_path_and_none_starves() {
     for (first, second, least) in [
