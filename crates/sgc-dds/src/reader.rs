@@ -21,6 +21,9 @@ const LAPSED_MAX: usize = 1024;
 /// Most writers of one reader whose depths are reported.
 const DEPTHS_MAX: usize = 1024;
 
+/// Most writers of one reader whose first samples are reported.
+const HEARD_MAX: usize = 1024;
+
 /// A raw reader. Dropping it waits for a handler at work, and deletes the entities.
 #[derive(Debug)]
 pub struct CycloneReader(Intake<Samples>);
@@ -37,6 +40,7 @@ impl CycloneReader {
             newest_only: spec.qos.history == History::KeepLast(1),
             writers: KnownWriters::default(),
             lapsed: HashSet::new(),
+            heard: HashSet::new(),
             depths: spec.qos.is_transient_local().then(HashSet::new),
             participant: Arc::clone(participant),
             held: None,
@@ -90,6 +94,8 @@ struct Samples {
     writers: KnownWriters,
     /// Writers whose lease expired.
     lapsed: HashSet<dds_instance_handle_t>,
+    /// Writers that were heard.
+    heard: HashSet<dds_instance_handle_t>,
     /// Writers whose depth was reported; `None` if late joiners get nothing.
     depths: Option<HashSet<dds_instance_handle_t>>,
     participant: Arc<Participant>,
@@ -131,6 +137,7 @@ impl Samples {
             // Discovery reports this by itself.
             WriterState::Gone => {
                 self.lapsed.remove(&writer);
+                self.heard.remove(&writer);
                 if let Some(depths) = &mut self.depths {
                     depths.remove(&writer);
                 }
@@ -157,6 +164,14 @@ impl Receiver for Samples {
         let writer = self.writers.find(reader, arrival.writer);
         if self.is_ignored(writer) {
             return;
+        }
+        if let Some(KnownWriter { guid, .. }) = writer
+            && !self.heard.contains(&arrival.writer)
+            && self.heard.len() < HEARD_MAX
+        {
+            // An earlier reader of the topic may have reported that the lease had expired.
+            self.heard.insert(arrival.writer);
+            self.participant.tell(DiscoveryEvent::Liveliness { guid, is_alive: true });
         }
         if self.lapsed.contains(&arrival.writer) {
             // Cyclone may report two changes in the wrong order.

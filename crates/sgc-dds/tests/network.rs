@@ -1255,8 +1255,10 @@ fn discovery_tells_of_a_lapsed_writer_and_of_its_return() {
     assert!(guids.contains(&writer.guid()) && guids.contains(&endless.guid()));
     write(&writer, &string_cdr("alive"));
     next(&samples);
-    ros.set_deaf_mute(Duration::from_millis(1000));
     let liveliness = |is_alive| DiscoveryEvent::Liveliness { guid: writer.guid(), is_alive };
+    // The reader cannot know what another one reported before.
+    assert_eq!(next(&events), liveliness(true));
+    ros.set_deaf_mute(Duration::from_millis(1000));
     assert_eq!(next(&events), liveliness(false));
     // A lapsed writer is alive again once it writes.
     eventually("a message after the silence", || {
@@ -1296,7 +1298,11 @@ fn assertions_of_a_writer_that_is_manual_by_topic_are_seen_without_messages() {
     }
     write(&writers[1], &string_cdr("alive"));
     assert_eq!(of_automatic(), None);
-    // The lease expires where the messages go.
+    // The lease expires where the messages go, and each writer is reported with its first message only.
+    for writer in &writers {
+        let is_alive = true;
+        assert_eq!(next(&events), DiscoveryEvent::Liveliness { guid: writer.guid(), is_alive });
+    }
     quiet(&events);
     drop(writers);
     eventually("it is forgotten", || ago().is_none());

@@ -350,7 +350,6 @@ pub(crate) enum LocalFinding {
     /// Publishers assert their liveliness by hand, which other nodes see only with messages.
     Unasserted {
         count: usize,
-        seen: AssertionsSeen,
     },
     NoSubscriber {
         topic: String,
@@ -387,15 +386,6 @@ pub(crate) enum LocalFinding {
     NoDefinition {
         type_name: String,
     },
-}
-
-/// Places that see `assert_liveliness()` without a message.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum AssertionsSeen {
-    /// Other nodes, for long leases.
-    ForLongLeases,
-    /// The node that shares the topic.
-    AtOwner,
 }
 
 /// A QoS policy by which a subscriber does not match.

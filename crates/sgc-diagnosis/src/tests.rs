@@ -70,8 +70,8 @@ fn publishers_whose_assertions_are_not_seen_elsewhere_are_pointed_out() {
         graph
     };
     assert!(said(&with(owner(), 2, 99)) && !said(&with(owner(), 2, 100)) && !said(&with(owner(), 0, 99)));
-    assert!(said(&with(publisher(), 2, 2000)) && !said(&with(publisher(), 0, 2000)) && !said(&publisher()));
-    assert_eq!(wrong(&with(publisher(), 2, 2000), "/a"), "", "it is no fault of the topic");
+    assert!(said(&with(publisher(), 2, 99)) && !said(&with(publisher(), 2, 100)) && !said(&publisher()));
+    assert_eq!(wrong(&with(publisher(), 2, 99), "/a"), "", "it is no fault of the topic");
 }
 
 #[test]

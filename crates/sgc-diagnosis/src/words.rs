@@ -8,9 +8,8 @@ use sgc_node::graph::Interface;
 use sgc_process::output;
 
 use crate::finding::{
-    AssertionsSeen, Direction, Finding, Hop, LinkFinding, LocalFinding, NameFinding, NodeFinding,
-    QosMismatch, Reach, Refused, RefusedSide, RuleFinding, ShareFinding, TrafficFinding, UnansweredCalls,
-    UseFinding,
+    Direction, Finding, Hop, LinkFinding, LocalFinding, NameFinding, NodeFinding, QosMismatch, Reach,
+    Refused, RefusedSide, RuleFinding, ShareFinding, TrafficFinding, UnansweredCalls, UseFinding,
 };
 use crate::near::hint;
 use crate::refusals;
@@ -539,17 +538,11 @@ impl fmt::Display for LocalFinding {
                     hashes.join(" and ")
                 )
             }
-            Self::Unasserted { count, seen } => {
-                let seen = match seen {
-                    AssertionsSeen::ForLongLeases => "with a lease of 100 ms or more",
-                    AssertionsSeen::AtOwner => "at the node that shares the topic",
-                };
-                write!(
-                    f,
-                    "{count} local publishers assert their liveliness by hand (MANUAL_BY_TOPIC): other nodes see their messages, \
-                     and `assert_liveliness()` only {seen}"
-                )
-            }
+            Self::Unasserted { count } => write!(
+                f,
+                "{count} local publishers assert their liveliness by hand (MANUAL_BY_TOPIC): other nodes see their messages, \
+                 and `assert_liveliness()` only with a lease of 100 ms or more"
+            ),
             Self::NoSubscriber { topic, meant } => {
                 write!(f, "nobody on this local network subscribes to {topic}{}", hint(meant))
             }

@@ -420,13 +420,13 @@ impl Sink {
     }
 
     /// Returns the result of an assertion in `by` about a publisher. It counts for publishers of the same node, which
-    /// sign with the same key, and for no others.
+    /// sign with the same key, and for no others. The source of a node that publishes on another's topic asserts its
+    /// own publishers.
     fn asserted(&self, by: &SourceId, publisher: [u8; 8]) -> Delivery {
         let Some(asserting) = self.sources.get(by) else { return Delivery::Mark };
         let [first, last] = [0, 0xff].map(|byte| SourceId::from_publisher(publisher, [byte; 8]));
-        let is_it = |(id, state): &(&SourceId, &SourceState)| {
-            *id != by && state.is_announced() && state.has_key_of(asserting)
-        };
+        let is_it =
+            |(_, state): &(&SourceId, &SourceState)| state.is_announced() && state.has_key_of(asserting);
         let found = self.sources.range(first..=last).find(is_it);
         found.map_or(Delivery::Mark, |(id, _)| Delivery::Asserted(*id))
     }

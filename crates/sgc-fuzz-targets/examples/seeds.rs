@@ -190,6 +190,7 @@ fn consumer(node: &str, role: Role, type_hash: Option<&str>) -> Consumer {
         interface: NAME,
         id: *b"consumer",
         role,
+        is_alive: true,
         node: RosNode::new("/desk", node, None).expect("a node"),
         type_hash: type_hash.map(str::to_owned),
         qos: Qos::default(),

@@ -106,7 +106,7 @@ pub enum DiscoveryEvent {
         guid: Guid,
     },
     /// A writer's liveliness lease expired, or the writer is alive again. Reported for writers that match a reader
-    /// created here.
+    /// created here, and once for each writer that such a reader hears.
     Liveliness {
         /// The writer.
         guid: Guid,

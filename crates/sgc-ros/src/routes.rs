@@ -38,5 +38,5 @@ pub use own_sources::WRITERLESS_HOLD;
 pub use owners::{OwnerState, REDISCOVERY_HOLD};
 pub use problem::{LocalEnd, Offerer, Problem, Way};
 pub use rules::{Direction, ROUTES_PER_WILDCARD_MAX, Shaping, ShareRule, ShareRuleId, UseRule, UseRuleId};
-pub use share_route::SINKLESS_HOLD;
+pub use share_route::{ANNOUNCED_EVERY, AnnouncedPublishers, HEARD_MIN, SINKLESS_HOLD};
 pub use use_route::UNREACHABLE_HOLD;

@@ -8,9 +8,10 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use sgc_endpoint::{LostReason, RefusedBy};
 use sgc_ros::{
-    Command, Direction, DiscoveredEndpoint, DiscoveryEvent, EndpointKind, GraphNode, Guid, LocalEnd, Naming,
-    OwnerState, Problem, QosOverride, REDISCOVERY_HOLD, ROUTES_PER_WILDCARD_MAX, Rename, RouteState, Routes,
-    SINKLESS_HOLD, Shaping, ShareRule, UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
+    ANNOUNCED_EVERY, AnnouncedPublishers, Command, Direction, DiscoveredEndpoint, DiscoveryEvent,
+    EndpointKind, GraphNode, Guid, HEARD_MIN, LocalEnd, Naming, OwnerState, Problem, QosOverride,
+    REDISCOVERY_HOLD, ROUTES_PER_WILDCARD_MAX, Rename, RouteState, Routes, SINKLESS_HOLD, Shaping, ShareRule,
+    UNREACHABLE_HOLD, UseRule, WRITERLESS_HOLD, dds_topic, dds_type,
 };
 use sgc_trust::{FleetSecret, Policy, Suite, TopicSecret, derive_name};
 use sgc_wire::{
@@ -982,6 +983,146 @@ fn a_share_that_others_publish_on_is_there_without_a_local_publisher() {
     // No node may publish any more, and no local program does.
     let commands = b.reconfigured(vec![share("/cmd", STRING)], Vec::new());
     assert!(has(&commands, |c| matches!(c, Command::Unshare { .. })), "{commands:?}");
+}
+
+fn writer_commands(commands: Vec<Command>) -> Vec<Command> {
+    let is_it = |c: &Command| matches!(c, Command::OpenWriter { .. } | Command::CloseWriter { .. });
+    commands.into_iter().filter(is_it).collect()
+}
+
+#[test]
+fn writer_for_messages_of_others_offers_what_they_announced() {
+    let mut publish = Policy::default();
+    publish.publish.nodes.insert(OWNER);
+    let mut b = bench_of(vec![ShareRule { policy: publish, ..share("/cmd", STRING) }], Vec::new());
+    let name = mine("/cmd");
+    b.commands();
+    let second = Some(1_000_000_000);
+    let teleop = Qos {
+        reliability: Reliability::BestEffort,
+        durability: Durability::TransientLocal,
+        lease_ns: second,
+        liveliness: Liveliness::ManualByTopic,
+        ..Qos::default()
+    };
+    let announce = |b: &mut Bench, offer: Option<&Qos>, may_live| {
+        let publishers = AnnouncedPublishers { offer: offer.cloned(), may_live };
+        b.routes.handle_announced(b.now, [(name, publishers)].into());
+        let at_once = b.commands();
+        writer_commands([at_once, b.passes(ANNOUNCED_EVERY)].concat())
+    };
+    let closes = [Command::CloseWriter { name, source: None }];
+    assert_eq!(announce(&mut b, Some(&teleop), true), [], "nobody may publish yet");
+    b.routes.handle_publishers(&name, true);
+    let [Command::OpenWriter { source: None, spec, .. }] = &b.commands()[..] else { panic!("no writer") };
+    assert_eq!((spec.qos.liveliness, spec.qos.lease_ns), (Liveliness::ManualByTopic, second));
+    assert!(spec.qos.is_reliable() && !spec.qos.is_transient_local(), "subscribers of both kinds match");
+    let opens = [Command::OpenWriter { name, source: None, spec: spec.clone() }];
+    assert_eq!(announce(&mut b, Some(&teleop), true), []);
+    // All are known to be gone, and subscribers may watch for that.
+    assert_eq!(announce(&mut b, Some(&teleop), false), closes);
+    assert_eq!(announce(&mut b, None, false), []);
+    // A publisher that nobody announces is heard, and then no more.
+    b.routes.handle_unwritten(b.now, &name);
+    assert_eq!(b.commands(), opens);
+    assert_eq!(announce(&mut b, None, false), [], "that is no news");
+    b.now += HEARD_MIN;
+    let doubted: Vec<_> = b.routes.writers_in_doubt(b.now).into_iter().map(|(name, _)| name).collect();
+    assert_eq!(doubted, [name]);
+    b.routes.handle_unwritten(b.now, &name);
+    assert_eq!((b.routes.writers_in_doubt(b.now), b.commands()), (vec![], vec![]));
+    assert_eq!(writer_commands(b.passes(HEARD_MIN)), closes);
+    assert_eq!(announce(&mut b, Some(&teleop), true), opens);
+    // Another offer takes the place of the writer, which stays though all are gone: nobody can tell.
+    let lasting = Qos { lifespan_ns: second, ..Qos::default() };
+    let other = announce(&mut b, Some(&lasting), true);
+    assert!(
+        matches!(&other[..], [Command::OpenWriter { spec, .. }] if spec.qos.lifespan_ns == second),
+        "{other:?}"
+    );
+    assert_eq!(announce(&mut b, None, false), []);
+    // All leave and join again: nothing was said of these yet.
+    assert_eq!(announce(&mut b, Some(&teleop), false), closes);
+    b.routes.handle_publishers(&name, false);
+    b.routes.handle_publishers(&name, true);
+    assert_eq!(writer_commands(b.commands()), opens);
+}
+
+#[test]
+fn announcements_that_change_all_the_time_replace_writers_at_a_bounded_pace() {
+    let mut publish = Policy::default();
+    publish.publish.nodes.insert(OWNER);
+    let mut b = bench_of(vec![ShareRule { policy: publish, ..share("/cmd", STRING) }], Vec::new());
+    let name = mine("/cmd");
+    b.routes.handle_publishers(&name, true);
+    b.commands();
+    let (mut opened, step, steps) = (Vec::new(), ANNOUNCED_EVERY / 10, 100);
+    for n in 0..steps {
+        let offer = Some(Qos { deadline_ns: Some(n + 1), ..Qos::default() });
+        let publishers = AnnouncedPublishers { offer, may_live: true };
+        b.routes.handle_announced(b.now, [(name, publishers)].into());
+        opened.extend(b.commands());
+        opened.extend(b.passes(step));
+    }
+    opened.extend(b.passes(ANNOUNCED_EVERY));
+    let opened = writer_commands(opened);
+    assert_eq!(opened.len(), 1 + usize::try_from(steps).unwrap() / 10, "{opened:?}");
+    // The last one counts.
+    let last = Some(steps);
+    assert!(matches!(opened.last(), Some(Command::OpenWriter { spec, .. }) if spec.qos.deadline_ns == last));
+}
+
+#[test]
+fn reloaded_qos_of_a_share_is_that_of_the_writer_for_messages_of_others() {
+    let mut publish = Policy::default();
+    publish.publish.nodes.insert(OWNER);
+    let rule = ShareRule { policy: publish, ..share("/cmd", STRING) };
+    let mut b = bench_of(vec![rule.clone()], Vec::new());
+    b.routes.handle_publishers(&mine("/cmd"), true);
+    b.commands();
+    let qos = QosOverride { deadline_ns: Some(5), ..QosOverride::default() };
+    let commands = b.reconfigured(vec![ShareRule { qos, ..rule }], Vec::new());
+    let opens =
+        |c: &Command| matches!(c, Command::OpenWriter { spec, .. } if spec.qos.deadline_ns == Some(5));
+    assert!(has(&commands, opens), "{commands:?}");
+}
+
+#[test]
+fn publishers_on_the_topic_of_another_node_are_announced_with_their_liveliness() {
+    let mut b =
+        bench_of(Vec::new(), vec![UseRule { direction: Direction::Publish, ..use_of(OWNER, "/cmd", None) }]);
+    let listed = CatalogueEntry { publish: true, ..entry("/cmd", STRING, Qos::default(), &[]) };
+    b.catalogue(vec![listed]);
+    let name = theirs("/cmd", STRING);
+    b.granted(name, None);
+    let lease_ns = Some(1_000_000_000);
+    let manual = Qos { liveliness: Liveliness::ManualByTopic, lease_ns, ..Qos::default() };
+    let commands = b.appears(writer(1, "/cmd", manual.clone()));
+    let watched = |commands: &[Command]| {
+        commands.iter().find_map(|c| match c {
+            Command::WatchPublishers { publishers, .. } => Some(publishers.clone()),
+            _ => None,
+        })
+    };
+    assert_eq!(watched(&commands), Some(vec![(Guid([1; 16]), manual)]));
+    let automatic = Qos { lease_ns, ..Qos::default() };
+    assert_eq!(watched(&b.appears(writer(2, "/cmd", automatic))), None, "it asserts nothing by itself");
+    for participant in [1, 2].map(|n| Guid([n; 16])) {
+        let node = RosNode::new("/", "teleop", None).unwrap();
+        let nodes = vec![GraphNode { node, readers: Vec::new(), writers: vec![participant] }];
+        b.routes.handle_discovery(b.now, DiscoveryEvent::Nodes { participant, nodes });
+    }
+    let alive = |b: &mut Bench, is_alive| {
+        for n in [1, 2] {
+            b.routes.handle_discovery(b.now, DiscoveryEvent::Liveliness { guid: Guid([n; 16]), is_alive });
+        }
+        let told = b.routes.consumers().by_owner.remove(&OWNER).unwrap();
+        told.iter().map(|one| (one.qos.liveliness, one.is_alive)).collect::<Vec<_>>()
+    };
+    let of = |is_alive| [Liveliness::ManualByTopic, Liveliness::Automatic].map(|kind| (kind, is_alive));
+    assert_eq!(alive(&mut b, false), of(false));
+    assert_eq!(alive(&mut b, true), of(true));
+    assert_eq!(watched(&b.vanishes(1)), Some(vec![]));
 }
 
 #[test]

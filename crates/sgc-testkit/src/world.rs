@@ -487,6 +487,7 @@ impl World {
                 interface: self.name(*owner, topic),
                 id: n.to_be_bytes(),
                 role: Role::Subscribe,
+                is_alive: true,
                 node: RosNode::new("/", ros_node, None).expect("a name that ROS 2 accepts"),
                 type_hash: None,
                 qos: Qos::default(),

@@ -23,6 +23,8 @@ pub struct Consumer {
     /// The role in which its node joined the interface: [`Role::Subscribe`] for a subscriber, [`Role::Publish`] for a
     /// publisher and for a service client.
     pub role: Role,
+    /// `false` for a publisher whose liveliness lease has run out.
+    pub is_alive: bool,
     /// The ROS 2 node that it belongs to.
     pub node: RosNode,
     /// `RIHS01_…` type hash, if its network says it.
@@ -31,11 +33,21 @@ pub struct Consumer {
     pub qos: Qos,
 }
 
+impl Consumer {
+    /// Returns `true` if the owner's network shows both in the same way: at most the liveliness differs.
+    pub fn is_shown_as(&self, other: &Self) -> bool {
+        let Self { interface, id, role, is_alive: _, node, type_hash, qos } = self;
+        (interface, id, role, node) == (&other.interface, &other.id, &other.role, &other.node)
+            && (type_hash, qos) == (&other.type_hash, &other.qos)
+    }
+}
+
 impl Encode for Consumer {
     fn encode(&self, w: &mut Writer) {
         self.interface.encode(w);
         w.raw(&self.id);
         w.bool(self.role == Role::Publish);
+        w.bool(self.is_alive);
         self.node.encode(w);
         w.option(self.type_hash.as_ref(), |w, hash| w.str(hash));
         self.qos.encode(w);
@@ -48,6 +60,7 @@ impl Decode for Consumer {
             interface: Name::decode(r)?,
             id: r.array("consumer")?,
             role: if r.bool("role")? { Role::Publish } else { Role::Subscribe },
+            is_alive: r.bool("alive")?,
             node: RosNode::decode(r)?,
             type_hash: r.option("type hash", |r| r.str("type hash", TYPE_HASH_BYTES_MAX))?,
             qos: Qos::decode(r)?,
@@ -65,7 +78,7 @@ mod tests {
         let node = RosNode::new("/desk", name, None).unwrap();
         let (interface, type_hash) = (Name([7; 32]), Some("RIHS01_ab".to_owned()));
         let (id, role) = (*b"consumer", Role::Subscribe);
-        Consumer { interface, id, role, node, type_hash, qos: Qos::default() }
+        Consumer { interface, id, role, is_alive: true, node, type_hash, qos: Qos::default() }
     }
 
     /// The bytes are normative.
@@ -74,7 +87,7 @@ mod tests {
         let bytes = [
             &[7; 32][..],
             b"consumer",
-            &[0],
+            &[0, 1],
             &[0, 0, 0, 5],
             b"/desk",
             &[0, 0, 0, 4],
@@ -88,7 +101,10 @@ mod tests {
         assert_eq!(Consumer::from_slice(&bytes), Ok(consumer("rviz")));
         let publisher = Consumer { role: Role::Publish, ..consumer("rviz") };
         assert_eq!(publisher.to_vec(), [&bytes[..40], &[1], &bytes[41..]].concat());
-        assert_eq!(Consumer::from_slice(&publisher.to_vec()), Ok(publisher));
+        assert_eq!(Consumer::from_slice(&publisher.to_vec()), Ok(publisher.clone()));
+        let lapsed = Consumer { is_alive: false, ..publisher };
+        assert_eq!(lapsed.to_vec(), [&bytes[..40], &[1, 0], &bytes[42..]].concat());
+        assert_eq!(Consumer::from_slice(&lapsed.to_vec()), Ok(lapsed));
         let content = GrantContent::Consumers(vec![consumer("rviz")]);
         assert_eq!(content.to_vec(), [&[5, 0, 0, 0, 1][..], &bytes].concat());
         assert_eq!(GrantContent::from_slice(&content.to_vec()), Ok(content));

@@ -182,6 +182,7 @@ fn consumers(count: u32) -> Vec<u8> {
         interface: Name([1; 32]),
         id: [2; 8],
         role: if n == 1 { Role::Publish } else { Role::Subscribe },
+        is_alive: n != 1,
         node: node(n),
         type_hash: n.is_multiple_of(2).then(|| "RIHS01_ab".to_owned()),
         qos: Qos { partitions: vec!["p".into()], ..Qos::default() },

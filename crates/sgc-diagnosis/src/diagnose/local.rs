@@ -6,9 +6,7 @@ use sgc_node::DataDrop;
 use sgc_node::graph::{Endpoint, Graph, Interface, NameLine, Qos, Use, UseRoute};
 use sgc_ros::{Naming, Rename, is_pattern};
 
-use crate::finding::{
-    AssertionsSeen, Direction, Finding, Hop, LinkFinding, LocalFinding, QosMismatch, TrafficFinding,
-};
+use crate::finding::{Direction, Finding, Hop, LinkFinding, LocalFinding, QosMismatch, TrafficFinding};
 use crate::near::near;
 use crate::step::{Step, Walk};
 
@@ -114,16 +112,13 @@ pub(super) fn no_provider(graph: &Graph, kind: Interface, topic: &str) -> Step {
 
 /// Returns a step for publishers that are manual by topic and whose `assert_liveliness()` alone is not seen at other
 /// nodes.
-pub(super) fn unasserted(providers: &[&Endpoint], seen: AssertionsSeen) -> Option<Step> {
+pub(super) fn unasserted(providers: &[&Endpoint]) -> Option<Step> {
     let is_unseen = |qos: &Qos| {
-        let is_short = qos.lease_ns.is_some_and(|lease| match seen {
-            AssertionsSeen::ForLongLeases => lease < ASSERTED_LEASE_MIN_NS,
-            AssertionsSeen::AtOwner => true,
-        });
+        let is_short = qos.lease_ns.is_some_and(|lease| lease < ASSERTED_LEASE_MIN_NS);
         qos.reliable && qos.liveliness == MANUAL_BY_TOPIC && is_short
     };
     let count = providers.iter().filter(|end| end.writes && is_unseen(&end.qos)).count();
-    (count > 0).then(|| Step::unknown(Finding::Local(LocalFinding::Unasserted { count, seen })))
+    (count > 0).then(|| Step::unknown(Finding::Local(LocalFinding::Unasserted { count })))
 }
 
 /// The messages that are written for local readers.

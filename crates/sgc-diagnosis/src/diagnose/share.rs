@@ -8,7 +8,7 @@ use super::local::{
     Written, ends, far_half, line_of, linked, no_provider, problem_of, readers, silent, traffic, types_of,
     unasserted,
 };
-use crate::finding::{AssertionsSeen, Direction, Finding, Hop, LocalFinding, ShareFinding};
+use crate::finding::{Direction, Finding, Hop, LocalFinding, ShareFinding};
 use crate::step::{Step, Verdict, Walk};
 
 fn fine(finding: ShareFinding) -> Step {
@@ -56,7 +56,7 @@ pub(super) fn walk_share(graph: &Graph, share: &Share, topic: &str, steps: &mut 
         }
     }
     steps.push(fine(ShareFinding::Covered { to: share.to }));
-    steps.extend(unasserted(&providers, AssertionsSeen::ForLongLeases));
+    steps.extend(unasserted(&providers));
     let is_granted = routes.iter().any(|route| !route.granted.is_empty());
     for finding in unheard(graph, share) {
         // A misspelt name explains that no node has the topic.

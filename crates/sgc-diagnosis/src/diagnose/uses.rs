@@ -8,7 +8,7 @@ use super::local::{
     Written, ends, far_half, line_of, linked, meant, name_at_owner, no_provider, problem_of, readers, silent,
     traffic, types_of, unasserted,
 };
-use crate::finding::{AssertionsSeen, Direction, Finding, Hop, LocalFinding, Reach, UseFinding};
+use crate::finding::{Direction, Finding, Hop, LocalFinding, Reach, UseFinding};
 use crate::step::{Step, Walk};
 
 fn fine(finding: UseFinding) -> Step {
@@ -39,7 +39,7 @@ pub(super) fn walk_use(graph: &Graph, used: &Use, topic: &str, steps: &mut Walk)
             topic: topic.to_owned(),
             types: None,
         })));
-        steps.extend(unasserted(&providers, AssertionsSeen::AtOwner));
+        steps.extend(unasserted(&providers));
     }
     if !linked(graph, steps) {
         return;

@@ -235,7 +235,7 @@ fn more_faults(side: &str) -> Vec<Case> {
         _ => vec![
             ("has not published", |g| g.uses[0].routes[0].messages = 0),
             ("asserts liveliness by hand", |g| {
-                g.endpoints[0].qos = Qos { liveliness: 2, lease_ns: Some(2_000_000_000), ..qos() };
+                g.endpoints[0].qos = Qos { liveliness: 2, lease_ns: Some(1), ..qos() };
             }),
         ],
     }

@@ -34,6 +34,15 @@ fn assertion_is_of_a_publisher_at_the_same_node_each_time_and_once() {
     }
 }
 
+/// A node that publishes on another's topic has one source for messages and assertions.
+#[test]
+fn source_without_history_asserts_its_own_publishers() {
+    let mut node = unrecovered(Suite::Standard, 6);
+    let (id, mut sink) = (node.id(), sink(Suite::Standard, &[&node]));
+    assert_eq!(sink.handle_packet(&asserted(&mut node, id.publisher())), Ok(Delivery::Asserted(id)));
+    assert_eq!(sink.handle_packet(&asserted(&mut node, PUBLISHER)), Ok(Delivery::Mark));
+}
+
 #[test]
 fn assertion_of_another_nodes_publisher_is_none() {
     let suite = Suite::Standard;

@@ -342,6 +342,15 @@ impl<N: RosNetwork> Core<N> {
             SinkRequest::Synced(name, source) => {
                 self.sinks.history_arrived(name, source);
             }
+            SinkRequest::Writer(name) => {
+                if self.reopening.is_closed()
+                    && let Some(sink) = self.sinks.get(&name)
+                {
+                    sink.give_up_held(&*self.data);
+                } else if let Some(routes) = &mut self.routes {
+                    routes.handle_unwritten(now().instant, &name);
+                }
+            }
         }
     }
 
@@ -357,6 +366,12 @@ impl<N: RosNetwork> Core<N> {
             for name in routes.shares_without_writers(now.instant) {
                 if self.shares.get(&name).is_some_and(|share| share.has_waiting()) {
                     routes.hold_share(now.instant, &name);
+                }
+            }
+            for (name, span) in routes.writers_in_doubt(now.instant) {
+                let last = self.sinks.get(&name).and_then(|sink| sink.last_message());
+                if let Some(last) = last.filter(|last| *last + span > now.instant) {
+                    routes.handle_unwritten(last, &name);
                 }
             }
             routes.handle_timeout(now.instant);

@@ -191,7 +191,7 @@ fn a_proxy_allocates_less_than_once_for_a_message_that_it_brings() {
         };
         let context = WriterContext::new(start_workers().expect("a thread"), Arc::default(), alive);
         let queue = WriterQueue::new(context, WriterInfo::default(), Shaping::default(), take);
-        sink.set_writer(None, Some(queue));
+        sink.set_writer(None, Some(queue), &data);
         forwards(&data, LinkId(1), vec![(LinkId::LOCAL, Out::Local(sink.clone()))]);
         let head = MessageHead::new(MessageKind::Write, 0);
         let payload = Bytes::from(vec![7; MESSAGE_BYTES]);

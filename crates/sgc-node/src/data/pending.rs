@@ -1,4 +1,4 @@
-//! [`PendingQueue`]: messages that wait until their type is known. It is bounded in items and in bytes, and the oldest
+//! [`PendingQueue`]: messages that wait until their type is known, or their writer open. It is bounded in items and in bytes, and the oldest
 //! make room.
 //!
 //! It neither converts nor counts. The owner of the queue decides how a dropped message is counted.

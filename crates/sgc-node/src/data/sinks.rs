@@ -28,6 +28,9 @@ use crate::drops::NodeDrop;
 /// Longest wait of new messages for a closed writer that still writes its queue.
 const LAST_WRITES_MAX: Duration = Duration::from_secs(1);
 
+/// Shortest time between two requests of a sink for a writer.
+const ASK_WRITER_EVERY: Duration = Duration::from_secs(1);
+
 /// Request of a sink to the control task.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum SinkRequest {
@@ -35,6 +38,15 @@ pub(crate) enum SinkRequest {
     History(Name, SourceId),
     /// The missing messages have arrived.
     Synced(Name, SourceId),
+    /// A message of another publisher on our share waits for a writer.
+    Writer(Name),
+}
+
+/// Messages that wait for their type or a writer, and the messages behind them.
+struct Held {
+    queue: PendingQueue<Message>,
+    /// The time at which a writer was asked for.
+    asked: Option<Instant>,
 }
 
 struct State {
@@ -45,8 +57,7 @@ struct State {
     releases: u32,
     /// Sources whose recoverable messages were skipped, because they had no writer.
     missed: BTreeSet<SourceId>,
-    /// Messages that wait for their type, and the messages behind them.
-    held: PendingQueue<Message>,
+    held: Held,
 }
 
 /// This node's end of a joined name.
@@ -65,6 +76,10 @@ pub(crate) struct LocalSink {
     types: Arc<TypeSlot>,
     /// Whether messages arrive as JSON.
     takes_json: AtomicBool,
+    /// Whether a message without a writer asks for one.
+    asks_for_writer: AtomicBool,
+    /// The time of the last message of such a sink.
+    last_message: Mutex<Option<Instant>>,
 }
 
 impl LocalSink {
@@ -75,7 +90,7 @@ impl LocalSink {
         requests: mpsc::Sender<SinkRequest>,
         holds: Arc<PendingBytes>,
     ) -> Self {
-        let held = PendingQueue::new(WRITER_MESSAGES_MAX, holds);
+        let held = Held { queue: PendingQueue::new(WRITER_MESSAGES_MAX, holds), asked: None };
         let state = State { sink: None, callers: None, releases: 0, missed: BTreeSet::new(), held };
         Self {
             name,
@@ -90,6 +105,26 @@ impl LocalSink {
             frames: FramePrefix::default(),
             types: Arc::default(),
             takes_json: AtomicBool::new(false),
+            asks_for_writer: AtomicBool::new(false),
+            last_message: Mutex::default(),
+        }
+    }
+
+    /// Has messages without a writer ask for one, and wait for it.
+    pub(crate) fn ask_for_writers(&self) {
+        self.asks_for_writer.store(true, Relaxed);
+    }
+
+    /// Returns the time of the last message, if messages without a writer ask for one.
+    pub(crate) fn last_message(&self) -> Option<Instant> {
+        *lock(&self.last_message)
+    }
+
+    /// Drops the messages that wait for a writer, which is not to come soon.
+    pub(crate) fn give_up_held(&self, data: &impl CountDrops) {
+        let held = self.lock().held.queue.take().len();
+        if held > 0 {
+            data.count_here(&self.name, DataDrop::NoWriter, held as u64);
         }
     }
 
@@ -228,8 +263,14 @@ impl LocalSink {
 
     /// Adds, replaces or removes a writer. The old one ends after its queue. Later messages are written after that,
     /// since their source may have replaced the old one's.
-    pub(crate) fn set_writer(self: &Arc<Self>, source: Option<SourceId>, writer: Option<Arc<WriterQueue>>) {
+    pub(crate) fn set_writer(
+        self: &Arc<Self>,
+        source: Option<SourceId>,
+        writer: Option<Arc<WriterQueue>>,
+        data: &Arc<impl CountDrops>,
+    ) {
         let mut state = self.lock();
+        state.held.asked = None;
         let mut writers = BTreeMap::clone(&self.writers.load());
         let old = match writer {
             Some(writer) => writers.insert(source, writer),
@@ -245,7 +286,10 @@ impl LocalSink {
         if opened {
             self.ask_for_missed(&mut state);
         }
-        let Some(old) = old else { return };
+        let Some(old) = old else {
+            drop(state);
+            return self.release_held(data);
+        };
         old.close();
         let (turn, deadline) = (self.begin_release(&mut state), Instant::now() + LAST_WRITES_MAX);
         self.release(turn, async move {
@@ -308,22 +352,36 @@ impl LocalSink {
 
     /// Sets the state of the type. Messages that waited for it are written or dropped.
     pub(crate) fn set_type(self: &Arc<Self>, known: KnownType, data: &Arc<impl CountDrops>) {
-        let (held, turn) = {
-            let mut state = self.lock();
+        let is_awaited = {
+            let _state = self.lock();
             self.types.set(known);
-            if state.held.is_empty() || self.types.now().is_awaited() {
+            self.types.now().is_awaited()
+        };
+        if !is_awaited {
+            self.release_held(data);
+        }
+    }
+
+    /// Writes or drops the messages that waited for their type or a writer, if there is a writer. Those whose type is
+    /// still awaited wait again.
+    fn release_held(self: &Arc<Self>, data: &Arc<impl CountDrops>) {
+        let turn = {
+            let mut state = self.lock();
+            if state.held.queue.is_empty() || self.writers.load().is_empty() {
                 return;
             }
-            (state.held.take(), self.begin_release(&mut state))
+            self.begin_release(&mut state)
         };
         let (this, data) = (self.clone(), data.clone());
         self.release(turn, async move {
-            let now = Instant::now();
+            // Until here, messages that come line up behind those that wait.
+            let (now, held) = (Instant::now(), this.lock().held.queue.take());
             for held in held {
                 let is_late = held.is_late(now) && this.is_given_up(&held.item);
-                let written = match is_late {
-                    true => Err(Dropped::one(DataDrop::NoDefinition)),
-                    false => this.write(held.item).await,
+                let written = match (is_late, held.item.head.form) {
+                    (true, PayloadForm::Json) => Err(Dropped::one(DataDrop::NoDefinition)),
+                    (true, _) => Err(Dropped::one(DataDrop::NoWriter)),
+                    (false, _) => this.write(held.item).await,
                 };
                 if let Err(Dropped { reason, messages }) = written {
                     data.count_here(&this.name, reason, messages);
@@ -349,8 +407,8 @@ impl LocalSink {
 
     /// Closes all writers. They end after their queues.
     pub(crate) fn close(&self) {
-        // The type can no longer become known.
-        drop(self.lock().held.take());
+        // Neither a type nor a writer will come.
+        drop(self.lock().held.queue.take());
         self.writers.load().values().for_each(|w| w.close());
         self.taps.close();
     }
@@ -402,7 +460,7 @@ impl LocalSink {
             Ok(Delivery::Incomplete | Delivery::Mark | Delivery::Parked) => Ok(()),
             Ok(Delivery::Message(message)) => self.write(message).await,
             Ok(Delivery::Asserted(source)) => {
-                if let Some(writer) = self.open_writer(Some(source)) {
+                if let Some(writer) = self.writer(&source) {
                     writer.assert_liveliness();
                 }
                 Ok(())
@@ -443,11 +501,25 @@ impl LocalSink {
         writer.push(message).await.map_err(|_| Dropped::one(DataDrop::Stalled))
     }
 
-    /// Queues a message for its writer without waiting, or holds it until its type is known.
-    fn write_now(&self, message: Message, held: &mut PendingQueue<Message>) -> Handover {
-        let Some(writer) = self.writer(&message.source) else { return Handover::dropped(DataDrop::NoWriter) };
+    /// Queues a message for its writer without waiting, or holds it until its type or a writer is known.
+    fn write_now(&self, message: Message, held: &mut Held) -> Handover {
+        if self.asks_for_writer.load(Relaxed) {
+            *lock(&self.last_message) = Some(Instant::now());
+        }
+        let Some(writer) = self.writer(&message.source) else {
+            if !self.asks_for_writer.load(Relaxed) {
+                return Handover::dropped(DataDrop::NoWriter);
+            }
+            let now = Instant::now();
+            if held.asked.is_none_or(|at| now >= at + ASK_WRITER_EVERY)
+                && self.requests.try_send(SinkRequest::Writer(self.name)).is_ok()
+            {
+                held.asked = Some(now);
+            }
+            return self.hold(message, held, DataDrop::NoWriter).into();
+        };
         let head = message.head;
-        let mut waits = !held.is_empty();
+        let mut waits = !held.queue.is_empty();
         if head.form == PayloadForm::Json {
             self.takes_json.store(true, Relaxed);
             match self.types.now() {
@@ -457,7 +529,7 @@ impl LocalSink {
             }
         }
         if waits {
-            return self.hold(message, held).into();
+            return self.hold(message, held, DataDrop::NoDefinition).into();
         }
         if writer.has_written(&head) {
             return Handover::dropped(DataDrop::Repeated);
@@ -475,12 +547,13 @@ impl LocalSink {
         Dropped::check(DataDrop::Stale, evicted).into()
     }
 
-    /// Holds a message until its type is known or given up. The oldest messages make room.
-    fn hold(&self, message: Message, held: &mut PendingQueue<Message>) -> Result<(), Dropped> {
+    /// Holds a message until its type or a writer is known, or it is given up. The oldest messages make room, and are
+    /// counted as `lost`.
+    fn hold(&self, message: Message, held: &mut Held, lost: DataDrop) -> Result<(), Dropped> {
         let now = Instant::now();
-        let late = held.give_up_late(now, |message| self.is_given_up(message));
-        let given_up = late + held.push(now, message.payload.len(), message);
-        Dropped::check(DataDrop::NoDefinition, given_up)
+        let late = held.queue.give_up_late(now, |message| self.is_given_up(message));
+        let given_up = late + held.queue.push(now, message.payload.len(), message);
+        Dropped::check(lost, given_up)
     }
 
     fn tapped(&self, message: &Message) -> TapMessage {
@@ -558,8 +631,9 @@ mod tests {
         let (requests, _) = mpsc::channel(1);
         let sink = Arc::new(LocalSink::new(Name([1; 32]), transient_local, requests, Arc::default()));
         let (queue, taken) = noting(&Arc::default());
-        sink.set_writer(None, Some(queue));
-        (sink, Arc::default(), taken)
+        let data = Arc::default();
+        sink.set_writer(None, Some(queue), &data);
+        (sink, data, taken)
     }
 
     fn json(seq: u64, bytes: usize) -> Message {
@@ -607,12 +681,48 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn message_of_another_publisher_waits_for_the_writer_that_it_asks_for() {
+        let (requests, mut requested) = mpsc::channel(1);
+        let sink = Arc::new(LocalSink::new(Name([1; 32]), false, requests, Arc::default()));
+        let data = Arc::<DataPlane>::default();
+        let no_writer = |messages| Dropped::check(DataDrop::NoWriter, messages);
+        assert_eq!(sink.write(message(1, 8)).await, no_writer(1), "only shares of this node ask");
+        sink.ask_for_writers();
+        for seq in 0..WRITER_MESSAGES_MAX as u64 + 2 {
+            let lost = sink.write(message(seq, 8)).await;
+            assert_eq!(lost, no_writer(u64::from(seq >= WRITER_MESSAGES_MAX as u64)));
+        }
+        assert!(matches!(requested.try_recv(), Ok(SinkRequest::Writer(Name(name))) if name == [1; 32]));
+        assert!(requested.try_recv().is_err(), "it asks once");
+        let (queue, taken) = noting(&Arc::default());
+        sink.set_writer(None, Some(queue), &data);
+        wait_until(|| taken.lock().unwrap().len() == WRITER_MESSAGES_MAX).await;
+        assert_eq!(taken.lock().unwrap()[0].0, 2, "the newest are kept, in order");
+        // The writer closes, and the next message asks again.
+        sink.set_writer(None, None, &data);
+        wait_until(|| sink.lock().releases == 0).await;
+        assert_eq!(sink.write(message(9999, 8)).await, Ok(()));
+        assert!(requested.try_recv().is_ok());
+        // No writer comes: it asks again after a while, and may give up.
+        assert_eq!(sink.write(message(10_000, 8)).await, Ok(()));
+        assert!(requested.try_recv().is_err());
+        sink.lock().held.asked = Instant::now().checked_sub(ASK_WRITER_EVERY);
+        assert_eq!(sink.write(message(10_001, 8)).await, Ok(()));
+        assert!(requested.try_recv().is_ok());
+        let dropped = || data.drops().snapshot().get("no_writer").copied().unwrap_or(0);
+        let before = dropped();
+        sink.give_up_held(&*data);
+        assert_eq!(dropped() - before, 3);
+        sink.close();
+    }
+
+    #[tokio::test]
     async fn long_pending_message_is_written_only_if_kept_for_late_joiners() {
         for transient_local in [true, false] {
             let (sink, data, taken) = sink(transient_local);
             sink.set_type(KnownType::Asked, &data);
             let long_ago = Instant::now().checked_sub(Duration::from_secs(60)).unwrap();
-            sink.lock().held.push(long_ago, 8, json(1, 8));
+            sink.lock().held.queue.push(long_ago, 8, json(1, 8));
             let lost = sink.write(json(2, 8)).await;
             assert_eq!(lost, undefined(u64::from(!transient_local)));
             sink.set_type(any_type(), &data);
@@ -637,19 +747,19 @@ mod tests {
             let written = sink.write_now(message, &mut sink.lock().held);
             assert!(matches!(written, Handover::Queued));
         };
-        let (sink, _, _) = sink(false);
+        let (sink, data, _) = sink(false);
         let [killed, restarted] = [[1; 16], [2; 16]].map(SourceId);
         // The consumer blocks until the sender is dropped.
         let (stuck, gate) = std::sync::mpsc::channel::<()>();
         let wait = move || {
             let _ = gate.recv();
         };
-        sink.set_writer(Some(killed), Some(noted(Box::new(wait))));
+        sink.set_writer(Some(killed), Some(noted(Box::new(wait))), &data);
         // The long message keeps the worker busy, so the others queue up.
         write(&sink, message(0, AT_ONCE_BYTES_MAX + 1));
         (1..50).for_each(|seq| write(&sink, message(seq, 16)));
-        sink.set_writer(Some(killed), None);
-        sink.set_writer(Some(restarted), Some(noted(Box::new(|| ()))));
+        sink.set_writer(Some(killed), None, &data);
+        sink.set_writer(Some(restarted), Some(noted(Box::new(|| ()))), &data);
         for _ in 0..10 {
             tokio::task::yield_now().await;
             assert_eq!(sink.lock().releases, 1, "messages that come now wait");

@@ -111,6 +111,14 @@ pub enum Command {
         /// `true` if a full path slows the reader down.
         reliable: bool,
     },
+    /// Pass on the liveliness assertions of these local publishers, whose messages are published under another node's
+    /// name, and of no others.
+    WatchPublishers {
+        /// The joined name.
+        name: Name,
+        /// The publishers with their offers.
+        publishers: Vec<(Guid, Qos)>,
+    },
     /// Join a service to call it for local clients.
     Call {
         /// The name.

@@ -13,6 +13,8 @@ pub(super) const LOCAL_ENDPOINTS_MAX: usize = 65_536;
 #[derive(Debug, Default)]
 pub(super) struct LocalGraph {
     endpoints: BTreeMap<Guid, DiscoveredEndpoint>,
+    /// The writers whose liveliness lease has run out.
+    lapsed: BTreeSet<Guid>,
     /// The endpoints of each local participant that belong to a ROS 2 node, with that node.
     nodes: BTreeMap<Guid, BTreeMap<Guid, RosNode>>,
 }
@@ -30,12 +32,27 @@ impl LocalGraph {
 
     /// Removes an endpoint.
     pub(super) fn remove(&mut self, guid: &Guid) -> Option<DiscoveredEndpoint> {
+        self.lapsed.remove(guid);
         self.endpoints.remove(guid)
     }
 
     /// Iterates over the endpoints.
     pub(super) fn endpoints(&self) -> impl Iterator<Item = &DiscoveredEndpoint> {
         self.endpoints.values()
+    }
+
+    /// Handles the expiry of a writer's lease, or its renewal.
+    pub(super) fn set_alive(&mut self, writer: &Guid, is_alive: bool) {
+        if is_alive || !self.endpoints.contains_key(writer) {
+            self.lapsed.remove(writer);
+        } else {
+            self.lapsed.insert(*writer);
+        }
+    }
+
+    /// Returns `false` if the endpoint is a writer whose lease has run out.
+    pub(super) fn is_alive(&self, endpoint: &Guid) -> bool {
+        !self.lapsed.contains(endpoint)
     }
 
     /// Iterates over the participants whose nodes are known.

@@ -28,9 +28,91 @@ const WRITERLESS_BUSY_MAX: Duration = Duration::from_secs(600);
 /// Longest time for which a source outlives its writer while messages wait, if there are others, which may never pause.
 const GONE_BUSY_MAX: Duration = Duration::from_secs(60);
 
+/// Shortest time between two changes of what other nodes announce of their publishers. Each may replace a writer.
+pub const ANNOUNCED_EVERY: Duration = Duration::from_millis(500);
+
+/// Bounds of the time for which a message shows that its publisher lives, though none was announced. Between them it is
+/// the longest lease or deadline.
+pub const HEARD_MIN: Duration = Duration::from_secs(1);
+const HEARD_MAX: Duration = Duration::from_secs(10);
+
 /// Depth of the owner's local writer for messages of others. Writers wait for acknowledgements, some 15 ms with
 /// Cyclone, once this many arrive at once. As many are kept for a reader that stands still.
 const PUBLISHERS_DEPTH: u32 = 100;
+
+/// The remote publishers on a share, as their nodes announce them.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct AnnouncedPublishers {
+    /// Their combined offer; `None` if none is announced.
+    pub offer: Option<Qos>,
+    /// `true` if one of them may be alive: an announced one whose lease has not run out, or one of a node that has
+    /// announced nothing yet.
+    pub may_live: bool,
+}
+
+/// The remote publishers on a share, as their nodes announced them and as they are heard.
+#[derive(Debug, Default)]
+struct Announced {
+    /// The combined offer of the last ones that were announced.
+    offer: Option<Qos>,
+    /// `true` if all that were announced are gone.
+    are_silent: bool,
+    /// The time until which a publisher that was heard meanwhile counts as living.
+    heard_until: Option<Instant>,
+    /// An announcement that is not taken over yet.
+    next: Option<AnnouncedPublishers>,
+    /// The time of the last change.
+    changed: Option<Instant>,
+}
+
+impl Announced {
+    /// Takes over the last announcement, if the one before stood for a while. Returns `true` if it says something new.
+    fn take_over(&mut self, now: Instant) -> bool {
+        if self.changed.is_some_and(|at| now < at + ANNOUNCED_EVERY) {
+            return false;
+        }
+        let Some(AnnouncedPublishers { offer, may_live }) = self.next.take() else { return false };
+        let offer = offer.or_else(|| self.offer.clone());
+        if (&offer, !may_live) == (&self.offer, self.are_silent) {
+            return false;
+        }
+        (self.offer, self.are_silent) = (offer, !may_live);
+        self.heard_until = None;
+        self.changed = Some(now);
+        true
+    }
+
+    /// Forgets what was said of publishers that have all left. Their offer stands for the next ones.
+    fn begin_again(&mut self) {
+        *self = Self { offer: self.offer.take(), changed: self.changed, ..Self::default() };
+    }
+
+    /// Returns `true` if no publisher lives, and subscribers may watch for that.
+    fn are_gone(&self) -> bool {
+        let is_watched = |offer: &Qos| offer.lease_ns.is_some() || offer.deadline_ns.is_some();
+        self.are_silent && self.heard_until.is_none() && self.offer.as_ref().is_some_and(is_watched)
+    }
+
+    /// Returns the time for which one message shows a living publisher.
+    fn span(&self) -> Duration {
+        let offered =
+            |ns: fn(&Qos) -> Option<u64>| self.offer.as_ref().and_then(ns).map(Duration::from_nanos);
+        let longest = offered(|offer| offer.lease_ns).max(offered(|offer| offer.deadline_ns));
+        longest.unwrap_or(HEARD_MIN).clamp(HEARD_MIN, HEARD_MAX)
+    }
+
+    /// Handles the passing of time. Returns `true` if something changed.
+    fn time_out(&mut self, now: Instant) -> bool {
+        let is_silent = self.heard_until.take_if(|at| *at <= now).is_some();
+        self.take_over(now) || is_silent
+    }
+
+    /// Returns the times of the next [`Self::time_out`].
+    fn deadlines(&self) -> [Option<Instant>; 2] {
+        let next = self.next.as_ref().and(self.changed).map(|at| at + ANNOUNCED_EVERY);
+        [self.heard_until, next]
+    }
+}
 
 /// A share route.
 #[derive(Debug)]
@@ -45,7 +127,11 @@ pub(super) struct ShareRoute {
     own: OwnSources,
     sinks: BTreeSet<SinkId>,
     reader: Option<EndpointSpec>,
-    /// The writer for messages that others publish on the share.
+    /// Whether others publish on the share.
+    has_publishers: bool,
+    /// Those publishers, as their nodes announced them.
+    announced: Announced,
+    /// The writer for their messages.
     writer: Option<EndpointSpec>,
     /// The client that calls local servers, if it is a service. The servers are the route's writers.
     client: Option<ServiceSpec>,
@@ -112,6 +198,8 @@ impl ShareRoute {
             writers: writer.into_iter().map(|w| (w.guid, w)).collect(),
             sinks: BTreeSet::new(),
             reader: None,
+            has_publishers: false,
+            announced: Announced::default(),
             writer: None,
             client: None,
             writerless: None,
@@ -235,23 +323,79 @@ impl ShareRoute {
         }
     }
 
-    /// Opens the local writer for messages of others, or closes it. Returns `None` if nothing changes.
+    /// Handles the arrival of the first other publisher, or the end of the last. Returns `None` if nothing changes.
     pub(super) fn set_publishers(&mut self, any: bool, rule: &ShareRule) -> Option<Command> {
-        if rule.is_service() || self.writer.is_some() == any {
+        if std::mem::replace(&mut self.has_publishers, any) != any {
+            self.announced.begin_again();
+        }
+        self.refresh_writer(rule)
+    }
+
+    /// Handles what the nodes of the others say of their publishers.
+    pub(super) fn set_announced(
+        &mut self,
+        now: Instant,
+        publishers: AnnouncedPublishers,
+        rule: &ShareRule,
+    ) -> Option<Command> {
+        self.announced.next = Some(publishers);
+        self.announced.take_over(now);
+        self.refresh_writer(rule)
+    }
+
+    /// Handles that one of the others published at this time, whatever their nodes say.
+    pub(super) fn hear_publisher(&mut self, at: Instant, rule: &ShareRule) -> Option<Command> {
+        self.announced.heard_until = Some(at + self.announced.span());
+        self.refresh_writer(rule)
+    }
+
+    /// Returns the time within which a message must have come for the writer to stay open, if that is due.
+    pub(super) fn doubts_writer(&self, now: Instant) -> Option<Duration> {
+        self.announced.heard_until.filter(|at| *at <= now).map(|_| self.announced.span())
+    }
+
+    /// Opens, replaces or closes the local writer for messages of others. A new writer takes the place of the old one,
+    /// so no message is without a writer meanwhile.
+    fn refresh_writer(&mut self, rule: &ShareRule) -> Option<Command> {
+        let wanted = self.wanted_writer(rule);
+        if self.writer == wanted {
             return None;
         }
-        self.writer = any.then(|| EndpointSpec {
-            topic: dds_topic(&self.local_name),
-            type_name: self.type_name.clone(),
-            keyless: self.keyless,
-            asks_key_hash: false,
-            type_hash: self.type_hash().map(str::to_owned),
-            qos: rule.qos.apply(&Qos { history: History::KeepLast(PUBLISHERS_DEPTH), ..Qos::default() }),
-        });
+        self.writer = wanted;
         let (name, source) = (self.name, None);
         Some(match &self.writer {
             Some(spec) => Command::OpenWriter { name, source, spec: spec.clone() },
             None => Command::CloseWriter { name, source },
+        })
+    }
+
+    /// Returns the writer for messages of others: with ROS 2's default QoS, and the deadline, lifespan and liveliness
+    /// that they announced. There is none while all of them are known to be gone, if subscribers may watch for that.
+    fn wanted_writer(&self, rule: &ShareRule) -> Option<EndpointSpec> {
+        if rule.is_service() || !self.has_publishers {
+            return None;
+        }
+        let mut qos = Qos { history: History::KeepLast(PUBLISHERS_DEPTH), ..Qos::default() };
+        if self.announced.are_gone() {
+            return None;
+        }
+        if let Some(offer) = &self.announced.offer {
+            qos.deadline_ns = offer.deadline_ns;
+            qos.lifespan_ns = offer.lifespan_ns;
+            qos.liveliness = offer.liveliness;
+            qos.lease_ns = offer.lease_ns;
+        }
+        let type_hash = match &self.writer {
+            Some(open) => open.type_hash.clone(),
+            None => self.type_hash().map(str::to_owned),
+        };
+        Some(EndpointSpec {
+            topic: dds_topic(&self.local_name),
+            type_name: self.type_name.clone(),
+            keyless: self.keyless,
+            asks_key_hash: false,
+            type_hash,
+            qos: rule.qos.apply(&qos),
         })
     }
 
@@ -268,7 +412,7 @@ impl ShareRoute {
         let offer = match weakest(&offers) {
             Some(offer) => offer,
             None if !rule.is_inbound() => return None,
-            // The offers of remote publishers are unknown here. ROS 2's default serves commands well.
+            // ROS 2's default serves commands well.
             None => Qos::default(),
         };
         let mut problems = self.assign_sources(rule, &offer, secret, rng);
@@ -297,7 +441,10 @@ impl ShareRoute {
         }
         match rule.is_service() {
             true => commands.extend(self.refresh_client()),
-            false => commands.extend(self.refresh_reader(offer)),
+            false => {
+                commands.extend(self.refresh_reader(offer));
+                commands.extend(self.refresh_writer(rule));
+            }
         }
         Some(ShareUpdate { commands, problems })
     }
@@ -423,7 +570,7 @@ impl ShareRoute {
             return ShareTimeout::Ends;
         }
         let sinkless = self.sinkless_until.take_if(|at| *at <= now).is_some();
-        match self.own.time_out(now) || sinkless {
+        match self.own.time_out(now) | self.announced.time_out(now) || sinkless {
             true => ShareTimeout::Changed,
             false => ShareTimeout::Unchanged,
         }
@@ -431,7 +578,8 @@ impl ShareRoute {
 
     /// Returns the time of the next [`Self::time_out`].
     pub(super) fn deadline(&self) -> Option<Instant> {
-        [self.writerless_until(), self.sinkless_until, self.own.deadline()].into_iter().flatten().min()
+        let own = [self.writerless_until(), self.sinkless_until, self.own.deadline()];
+        own.into_iter().chain(self.announced.deadlines()).flatten().min()
     }
 
     /// Ends the share.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use sgc_endpoint::RefusedBy;
-use sgc_wire::{CatalogueEntry, ENTRY_SOURCES_MAX, Name, Qos, RosNode, SourceId};
+use sgc_wire::{CatalogueEntry, ENTRY_SOURCES_MAX, Liveliness, Name, Qos, RosNode, SourceId};
 
 use super::command::Command;
 use super::readers::{asks_key_hash, replace_reader};
@@ -44,6 +44,8 @@ pub(super) struct UseRoute {
     publishers: BTreeMap<Guid, DiscoveredEndpoint>,
     /// The reader of their messages.
     reader: Option<EndpointSpec>,
+    /// Those that may assert their liveliness without a message.
+    watched: Vec<(Guid, Qos)>,
     server: Option<LocalServer>,
     unreachable_until: Option<Instant>,
 }
@@ -61,6 +63,7 @@ impl UseRoute {
             writers: UseWriters::default(),
             publishers: BTreeMap::new(),
             reader: None,
+            watched: Vec::new(),
             server: None,
             unreachable_until: None,
         }
@@ -184,7 +187,11 @@ impl UseRoute {
         match rule.direction {
             _ if !self.is_granted => Vec::new(),
             _ if rule.is_service() => self.refresh_server(rule),
-            Direction::Publish => self.refresh_reader(),
+            Direction::Publish => {
+                let mut commands = self.refresh_reader();
+                commands.extend(self.refresh_watched());
+                commands
+            }
             Direction::Bring => {
                 let mut commands = self.writers.update(self.name, self.wanted_writers(rule), owner_settles);
                 commands.extend(self.announce_nodes(rule));
@@ -228,6 +235,18 @@ impl UseRoute {
             qos: reader_for(&offer, self.publishers.len()),
         });
         replace_reader(self.name, &mut self.reader, spec)
+    }
+
+    /// Updates the local publishers whose assertions of liveliness are passed on.
+    fn refresh_watched(&mut self) -> Option<Command> {
+        let of_all = self.publishers.values();
+        let manual = of_all.filter(|writer| writer.qos.liveliness == Liveliness::ManualByTopic);
+        let publishers: Vec<_> = manual.map(|writer| (writer.guid, writer.qos.clone())).collect();
+        if publishers == self.watched {
+            return None;
+        }
+        self.watched.clone_from(&publishers);
+        Some(Command::WatchPublishers { name: self.name, publishers })
     }
 
     /// Updates the local server of a called service.
@@ -285,6 +304,9 @@ impl UseRoute {
         let mut commands: Vec<_> = self.writers.close(name).collect();
         commands.extend(self.reader.take().map(|_| Command::CloseReader { name }));
         commands.extend(self.server.take().map(|_| Command::CloseServer { name }));
+        if !std::mem::take(&mut self.watched).is_empty() {
+            commands.push(Command::WatchPublishers { name, publishers: Vec::new() });
+        }
         commands
     }
 }

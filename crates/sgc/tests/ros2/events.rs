@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use rustix::process::Signal;
 use serde_json::Value;
 
-use crate::lab::{Lab, Site, robot_to_desk};
+use crate::lab::{Lab, Plan, Site, robot_to_desk, share, uses};
 use crate::support::Peer;
 use crate::{EXCLUSIVE, PAIRS, PLAN};
 
@@ -46,11 +46,10 @@ impl Pair {
 
     /// Starts four: of each two distributions a pair beside each other at the desk, and one through `sgc`, in this
     /// order.
-    fn start_all(lab: &Lab, [native, carried]: [&str; 2], qos: [&[&str]; 2]) -> [[Self; 2]; 2] {
+    fn start_all(lab: &Lab, way: Way, qos: [&[&str]; 2]) -> [[Self; 2]; 2] {
         PAIRS.map(|pair| {
-            let near = Self::start(lab, &format!("{native}_{}", pair[0]), [Site::Desk; 2], pair, qos);
-            let topic = format!("{carried}_{}", pair[0]);
-            [near, Self::start(lab, &topic, [Site::Robot, Site::Desk], pair, qos)]
+            let near = Self::start(lab, &format!("/native_{}", pair[0]), [Site::Desk; 2], pair, qos);
+            [near, Self::start(lab, &format!("/carried_{}", pair[0]), way.sites(), pair, qos)]
         })
     }
 
@@ -92,17 +91,54 @@ fn assert_as_soon(what: &str, pairs: &[Pair; 2], since: [Instant; 2], at: [Insta
     );
 }
 
-/// The topics on which [`Pair::start_all`] has messages carried.
-fn carried(topics: &[&str]) -> [String; 2] {
-    let of = |topic: &&str| PAIRS.map(|[talks, _]| format!("{topic}_{talks}"));
-    robot_to_desk("topic", topics.iter().flat_map(of))
+/// Way of a carried topic.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Way {
+    /// From the robot, which shares it.
+    FromOwner,
+    /// To the robot, which shares it with `publish`.
+    ToOwner,
+}
+
+impl Way {
+    /// The sites of publisher and subscriber.
+    fn sites(self) -> [Site; 2] {
+        match self {
+            Self::FromOwner => [Site::Robot, Site::Desk],
+            Self::ToOwner => [Site::Desk, Site::Robot],
+        }
+    }
+
+    /// A robot and a desk with the topics of [`Pair::start_all`].
+    fn lab(self, plan: Plan) -> Lab {
+        let topics = PAIRS.map(|[talks, _]| format!("/carried_{talks}"));
+        let tables = match self {
+            Self::FromOwner => robot_to_desk("topic", topics),
+            Self::ToOwner => {
+                let rights = "type = \"std_msgs/msg/String\"\npublish = [\"desk\"]\n";
+                let shares = topics.each_ref().map(|topic| share("topic", topic, "desk") + rights);
+                let uses = topics.each_ref().map(|topic| uses("topic", topic, "robot") + "publish = true\n");
+                [shares.concat(), uses.concat()]
+            }
+        };
+        Lab::real(plan, tables)
+    }
 }
 
 #[test]
 fn far_subscriber_hears_of_a_publisher_that_hangs_or_is_killed_as_soon_as_a_near_one() {
-    let lab = Lab::real(EXCLUSIVE, carried(&["/carried"]));
+    publisher_hangs_or_is_killed(Way::FromOwner);
+}
+
+#[test]
+fn owner_s_subscriber_hears_of_a_far_publisher_that_hangs_or_is_killed_as_soon_as_a_near_one() {
+    publisher_hangs_or_is_killed(Way::ToOwner);
+}
+
+fn publisher_hangs_or_is_killed(way: Way) {
+    let lab = way.lab(EXCLUSIVE);
     let qos: [&[&str]; 2] = [&["--lease", "2"]; 2];
-    let all = Pair::start_all(&lab, ["/native", "/carried"], qos);
+    let all = Pair::start_all(&lab, way, qos);
     let each = |act: &dyn Fn(&Pair) -> Instant| [0, 1].map(|n| [0, 1].map(|i| act(&all[n][i])));
     each(&|pair| pair.hears_alive(1));
     each(&Pair::hears_message);
@@ -127,13 +163,30 @@ fn far_subscriber_hears_of_a_publisher_that_hangs_or_is_killed_as_soon_as_a_near
             each(&Pair::hears_message);
         }
     }
+    // The next publisher is heard, though the one before is not forgotten yet.
+    for ([_, pair], [talks, _]) in all.iter().zip(PAIRS) {
+        let topic = pair.name.rsplit(' ').next().unwrap();
+        let args = ["pub", "--topic", topic, "--lease", "2", "--start", "1000"];
+        let next = start(&lab, way.sites()[0], talks, &args);
+        pair.hears("the next publisher", |e| e["event"] == "received" && e["seq"].as_u64() >= Some(1000));
+        drop(next);
+    }
 }
 
 #[test]
 fn far_subscriber_hears_of_a_manual_publisher_and_of_a_missed_deadline_as_soon_as_a_near_one() {
-    let lab = Lab::real(EXCLUSIVE, carried(&["/carried"]));
+    publisher_pauses(Way::FromOwner);
+}
+
+#[test]
+fn owner_s_subscriber_hears_of_a_manual_far_publisher_and_of_a_missed_deadline_as_soon_as_a_near_one() {
+    publisher_pauses(Way::ToOwner);
+}
+
+fn publisher_pauses(way: Way) {
+    let lab = way.lab(EXCLUSIVE);
     let qos: [&[&str]; 2] = [&["--lease", "2", "--kind", "manual", "--deadline", "1"]; 2];
-    let mut all = Pair::start_all(&lab, ["/native", "/carried"], qos);
+    let mut all = Pair::start_all(&lab, way, qos);
     // Silence ends liveliness and misses the deadline. The next message brings the publisher back.
     for _ in 0..2 {
         for pair in all.iter().flatten() {
@@ -162,11 +215,20 @@ fn far_subscriber_hears_of_a_manual_publisher_and_of_a_missed_deadline_as_soon_a
 
 #[test]
 fn far_subscriber_hears_of_a_publisher_that_only_asserts_its_liveliness_as_a_near_one_does() {
+    publisher_only_asserts(Way::FromOwner);
+}
+
+#[test]
+fn owner_s_subscriber_hears_of_a_far_publisher_that_only_asserts_its_liveliness_as_a_near_one_does() {
+    publisher_only_asserts(Way::ToOwner);
+}
+
+fn publisher_only_asserts(way: Way) {
     const LEASE: Duration = Duration::from_secs(2);
-    let lab = Lab::real(EXCLUSIVE, carried(&["/carried"]));
+    let lab = way.lab(EXCLUSIVE);
     let manual = ["--lease", "2", "--kind", "manual"];
     let asserts = [&manual[..], &["--asserts", "--rate", "2"]].concat();
-    let mut all = Pair::start_all(&lab, ["/native", "/carried"], [&asserts, &manual]);
+    let mut all = Pair::start_all(&lab, way, [&asserts, &manual]);
     for pair in all.iter().flatten() {
         pair.hears_alive(1);
     }
@@ -192,10 +254,10 @@ fn far_subscriber_hears_of_a_publisher_that_only_asserts_its_liveliness_as_a_nea
 
 #[test]
 fn far_subscriber_that_asks_for_too_much_and_its_publisher_are_told_as_near_ones_are() {
-    let lab = Lab::real(PLAN, carried(&["/carried"]));
+    let lab = Way::FromOwner.lab(PLAN);
     let qos: [&[&str]; 2] =
         [&["--lease", "2", "--best-effort"], &["--lease", "1", "--kind", "manual", "--deadline", "1"]];
-    let mut all = Pair::start_all(&lab, ["/native", "/carried"], qos);
+    let mut all = Pair::start_all(&lab, Way::FromOwner, qos);
     for pairs in &mut all {
         let is_told = |event: &Value| event["event"] == "incompatible";
         let offered = pairs
@@ -213,10 +275,10 @@ fn far_subscriber_that_asks_for_too_much_and_its_publisher_are_told_as_near_ones
 #[test]
 fn far_late_joiner_hears_nothing_that_is_older_than_its_lifespan() {
     const LIFESPAN: Duration = Duration::from_secs(1);
-    let lab = Lab::real(PLAN, carried(&["/carried"]));
+    let lab = Way::FromOwner.lab(PLAN);
     let qos: [&[&str]; 2] =
         [&["--transient-local", "--lifespan", "1", "--depth", "100"], &["--transient-local"]];
-    let mut all = Pair::start_all(&lab, ["/native", "/carried"], qos);
+    let mut all = Pair::start_all(&lab, Way::FromOwner, qos);
     for pairs in &mut all {
         for pair in pairs {
             let mut last = 0;

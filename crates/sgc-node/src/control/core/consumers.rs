@@ -52,6 +52,9 @@ impl<N: RosNetwork> Core<N> {
         }
         if self.consumers.take_changes(now.instant) {
             self.ask_consumers(now);
+            if let Some(routes) = &mut self.routes {
+                routes.handle_announced(now.instant, self.consumers.publishers());
+            }
             self.show_consumers();
         }
     }

@@ -1,9 +1,9 @@
 //! Publishing on names of other nodes, and messages of other publishers on our shares.
 
 use sgc_endpoint::JoinKind;
-use sgc_ros::RosNetwork;
+use sgc_ros::{Guid, RosNetwork};
 use sgc_trust::{MessageKey, Suite};
-use sgc_wire::{Name, Now, SinkId, TopicGrant};
+use sgc_wire::{Name, Now, Qos, SinkId, TopicGrant};
 use tracing::warn;
 
 use super::Core;
@@ -56,10 +56,21 @@ impl<N: RosNetwork> Core<N> {
         let GrantStep::Anew(slot) = self.publishers.granted(now.instant, name, grant)? else {
             return Some(false);
         };
-        if let (Some(slot), Some(share)) = (slot, self.shares.get(&name)) {
-            share.set_map(SourceMap { shared: Some(slot), ..SourceMap::default() });
+        if let (Some(slot), Some(share)) = (slot, self.shares.get(&name).cloned()) {
+            let map = SourceMap::of_one(slot, self.publishers.watched(&name), &share.map(), now.instant);
+            self.set_map(&share, map);
         }
         Some(true)
+    }
+
+    /// Passes on the assertions of these local publishers under a name of another node, and of no others.
+    pub(super) fn watch_publishers(&mut self, name: Name, publishers: Vec<(Guid, Qos)>) {
+        let Some(share) = self.shares.get(&name).cloned() else { return };
+        let before = share.map();
+        if let Some(slot) = before.shared.clone() {
+            self.set_map(&share, SourceMap::of_one(slot, &publishers, &before, now().instant));
+        }
+        self.publishers.watch(&name, publishers);
     }
 
     /// Switches to the keys whose epoch begins now.
@@ -84,6 +95,9 @@ impl<N: RosNetwork> Core<N> {
         let sink = self.sinks.get_or_add_own(name);
         if let Some(callers) = self.endpoint.receivers(&name) {
             sink.set_callers(callers);
+        }
+        if self.services.get(&name).is_none() {
+            sink.ask_for_writers();
         }
         self.apply_type(&name);
         // This node's own messages do not come back to it, since its sink receives only others'.

@@ -23,7 +23,7 @@ impl<N: RosNetwork> Core<N> {
         let mut ending = self.ends.take_readers();
         for ((name, source), _) in self.ends.writers() {
             if let Some(sink) = self.sinks.get(&name) {
-                sink.set_writer(source, None);
+                sink.set_writer(source, None, &self.data);
             }
         }
         ending.extend(self.services.take_ends());

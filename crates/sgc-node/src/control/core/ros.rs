@@ -21,6 +21,7 @@ use crate::data::outflow::OUTFLOW_AGE_MAX;
 use crate::data::sending::assertions;
 use crate::data::sending::intake::Publisher;
 use crate::data::sending::manual_lease::ManualLease;
+use crate::data::sending::share::LocalShare;
 use crate::data::sending::source_map::{SourceMap, SourceSlot};
 use crate::data::writer_queue::WriterQueue;
 use crate::drops::NodeDrop;
@@ -66,6 +67,7 @@ impl<N: RosNetwork> Core<N> {
                     Offer { owner, suite, class, reliable, shaping: Shaping::default(), calls: false },
                 );
             }
+            Command::WatchPublishers { name, publishers } => self.watch_publishers(name, publishers),
             Command::Call { name, owner, suite, class } => {
                 let shaping = Shaping::default();
                 self.publish_under(name, Offer { owner, suite, class, reliable: true, shaping, calls: true });
@@ -80,8 +82,14 @@ impl<N: RosNetwork> Core<N> {
             Command::OpenServer { name, spec } => self.open_server(name, spec),
             Command::CloseServer { name } => self.close_service_end(&name),
             Command::Leave { name } => self.leave(now, name),
-            Command::OpenWriter { name, source, spec } => self.open_writer(name, source, spec),
-            Command::CloseWriter { name, source } => self.close_writer(name, source),
+            Command::OpenWriter { name, source, spec } => {
+                self.note_inbound_writer(now, &name, source);
+                self.open_writer(name, source, spec);
+            }
+            Command::CloseWriter { name, source } => {
+                self.note_inbound_writer(now, &name, source);
+                self.close_writer(name, source);
+            }
             Command::ResizeWriter { name, source, spec } => self.resize_writer(name, source, spec),
             Command::MoveWriter { name, from, to } => self.move_writer(name, from, to),
             Command::SetNode { name, source, owner, node } => {
@@ -169,7 +177,7 @@ impl<N: RosNetwork> Core<N> {
         match (self.sinks.get(&name), writer) {
             (Some(sink), Some(writer)) if wanted => {
                 self.graph.writer_there((name, source), writer.guid());
-                sink.set_writer(source, Some(writer));
+                sink.set_writer(source, Some(writer), &self.data);
                 match source {
                     Some(source) => self.ask_history(name, source),
                     None => self.ask_histories(name),
@@ -177,6 +185,13 @@ impl<N: RosNetwork> Core<N> {
             }
             (_, Some(writer)) => writer.close(),
             (_, None) => {}
+        }
+    }
+
+    /// Notes a change of the writer for messages of others on our share: its QoS is shown as theirs.
+    fn note_inbound_writer(&mut self, now: Now, name: &Name, source: Option<SourceId>) {
+        if source.is_none() && self.shares.get(name).is_some() {
+            self.consumers.show_soon(now.instant);
         }
     }
 
@@ -271,9 +286,14 @@ impl<N: RosNetwork> Core<N> {
         }
         let sources: BTreeMap<_, _> = map.slots().map(|s| (s.id, s.progress.clone())).collect();
         self.endpoint.set_sources(now(), &name, sources.into_values().collect());
+        self.set_map(&share, map);
+    }
+
+    /// Replaces the sources of a share, and begins to look for assertions if one of their publishers may make some.
+    pub(super) fn set_map(&self, share: &Arc<LocalShare>, map: SourceMap) {
         share.set_map(map);
         if share.begins_watch() {
-            tokio::spawn(assertions::watch(Arc::downgrade(&share), self.network.clone()));
+            tokio::spawn(assertions::watch(Arc::downgrade(share), self.network.clone()));
         }
     }
 

@@ -41,7 +41,7 @@ impl<N: RosNetwork> Core<N> {
     ) {
         let take = move |message, _| take(message);
         let queue = WriterQueue::new(self.writers.clone(), WriterInfo::default(), Shaping::default(), take);
-        self.sinks.add(name, false).set_writer(None, Some(queue));
+        self.sinks.add(name, false).set_writer(None, Some(queue), &self.data);
         self.services.add(name, calls);
     }
 

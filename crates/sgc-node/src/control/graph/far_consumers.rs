@@ -5,8 +5,8 @@ use std::any::Any;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
-use sgc_ros::{EndpointKind, EndpointSpec, Guid, ShownEndpoint};
-use sgc_wire::{CONSUMERS_PER_INTERFACE_MAX, Consumer, Name, NodeId, Role, RosNode, SinkId};
+use sgc_ros::{AnnouncedPublishers, EndpointKind, EndpointSpec, Guid, ShownEndpoint, weakest};
+use sgc_wire::{CONSUMERS_PER_INTERFACE_MAX, Consumer, Liveliness, Name, NodeId, Qos, Role, RosNode, SinkId};
 
 use crate::control::event::ConsumerKey;
 
@@ -32,11 +32,18 @@ struct ShownConsumer {
 
 /// The consumers that a node announced.
 struct PeerConsumers {
-    current: Vec<Consumer>,
+    /// `None` until the first announcement is applied, and after the node was lost.
+    current: Option<Vec<Consumer>>,
     /// Its last announcement, until that is applied.
     next: Option<Vec<Consumer>>,
     /// Time at which it may be applied.
     ready_at: Instant,
+}
+
+impl PeerConsumers {
+    fn consumers(&self) -> impl Iterator<Item = &Consumer> {
+        self.current.iter().flatten()
+    }
 }
 
 /// The sinks of a node at one share.
@@ -99,7 +106,7 @@ impl FarConsumers {
     /// Stores a node's announcement. It is applied soon, or later if the node announced many new consumers.
     fn tell(&mut self, now: Instant, peer: NodeId, consumers: Vec<Consumer>) {
         let soon = now + SHOW_AFTER;
-        let new = || PeerConsumers { current: Vec::new(), next: None, ready_at: soon };
+        let new = || PeerConsumers { current: None, next: None, ready_at: soon };
         let told = self.told.entry(peer).or_insert_with(new);
         if told.next.replace(consumers).is_none() {
             told.ready_at = told.ready_at.max(soon);
@@ -111,9 +118,10 @@ impl FarConsumers {
         let mut took = false;
         for told in self.told.values_mut().filter(|told| told.ready_at <= now) {
             let Some(next) = told.next.take() else { continue };
-            let added = next.iter().filter(|consumer| !told.current.contains(consumer)).count();
+            let is_new = |consumer: &&Consumer| !told.consumers().any(|known| known.is_shown_as(consumer));
+            let added = next.iter().filter(is_new).count();
             told.ready_at = now + SHOW_EACH * u32::try_from(added).unwrap_or(u32::MAX);
-            told.current = next;
+            told.current = Some(next);
             took = true;
         }
         took
@@ -137,9 +145,31 @@ impl FarConsumers {
             .filter(move |(peer, _)| self.sinks.get(peer).is_some_and(|granted| granted.contains_key(&of)))
             .flat_map(move |(peer, told)| {
                 let is_it = move |consumer: &&Consumer| (consumer.interface, consumer.role) == of;
-                let of_it = told.current.iter().filter(is_it);
+                let of_it = told.consumers().filter(is_it);
                 of_it.filter_map(|consumer| consumer.type_hash.as_deref()).map(|hash| (*peer, hash))
             })
+    }
+
+    /// Returns the publishers of other nodes on each share, as their nodes announced them.
+    pub(crate) fn publishers(&self) -> BTreeMap<Name, AnnouncedPublishers> {
+        let mut by_name = BTreeMap::<Name, (Vec<&Consumer>, bool)>::new();
+        for (peer, names) in &self.sinks {
+            let is_joined = |((_, role), sinks): &(&(Name, Role), &Sinks)| {
+                *role == Role::Publish && !sinks.granted.is_empty()
+            };
+            for ((name, _), _) in names.iter().filter(is_joined) {
+                let (publishers, is_unsaid) = by_name.entry(*name).or_default();
+                let told = self.told.get(peer).filter(|told| told.current.is_some());
+                *is_unsaid |= told.is_none();
+                let is_it = |one: &&Consumer| (one.interface, one.role) == (*name, Role::Publish);
+                publishers.extend(told.into_iter().flat_map(PeerConsumers::consumers).filter(is_it));
+            }
+        }
+        let announced = by_name.into_iter().map(|(name, (publishers, is_unsaid))| {
+            let (offer, is_one_alive) = combined(&publishers);
+            (name, AnnouncedPublishers { offer, may_live: is_unsaid || is_one_alive })
+        });
+        announced.collect()
     }
 
     /// Forgets expired entries. Returns `true` if there was one.
@@ -154,7 +184,7 @@ impl FarConsumers {
             let is_over = is_over(Some(*until));
             if is_over && let Some(told) = self.told.get_mut(peer) {
                 // The pace is kept, since the node may return at once.
-                (told.current, told.next) = (Vec::new(), None);
+                (told.current, told.next) = (None, None);
             }
             !is_over
         });
@@ -174,7 +204,7 @@ impl FarConsumers {
             let is_granted =
                 |consumer: &&Consumer| granted.contains_key(&(consumer.interface, consumer.role));
             let mut rank = 0;
-            for consumer in told.current.iter().filter(is_granted) {
+            for consumer in told.consumers().filter(is_granted) {
                 let known = of_interface.entry(consumer.interface).or_default();
                 if *known >= CONSUMERS_PER_INTERFACE_MAX {
                     left_out += 1;
@@ -334,13 +364,26 @@ impl FarConsumers {
     }
 }
 
+/// Returns the weakest offer of the publishers that may be alive, and `true`; or that of all, and `false`. A publisher
+/// that is manual by topic may be, since it can assert that without being heard, if its far writer expires by itself.
+fn combined(publishers: &[&Consumer]) -> (Option<Qos>, bool) {
+    let is_manual = |qos: &Qos| qos.liveliness == Liveliness::ManualByTopic;
+    let weakest_of = |is_it: &dyn Fn(&Consumer) -> bool| {
+        weakest(publishers.iter().filter(|one| is_it(one)).map(|one| &one.qos))
+    };
+    let expiring = weakest_of(&|one| one.is_alive || is_manual(&one.qos)).filter(is_manual);
+    let living = expiring.or_else(|| weakest_of(&|one| one.is_alive));
+    let is_one_alive = living.is_some();
+    (living.or_else(|| weakest_of(&|_| true)), is_one_alive)
+}
+
 fn guids(endpoints: &[(EndpointKind, ShownEndpoint)]) -> EndpointIds {
     endpoints.iter().map(|(kind, endpoint)| (*kind, endpoint.guid)).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use sgc_wire::{CONSUMERS_MAX, Qos};
+    use sgc_wire::CONSUMERS_MAX;
 
     use super::*;
 
@@ -355,6 +398,7 @@ mod tests {
                 interface,
                 id,
                 role: Role::Subscribe,
+                is_alive: true,
                 node: node.clone(),
                 type_hash: None,
                 qos: Qos::default(),
@@ -419,6 +463,76 @@ mod tests {
         assert!(wanted.keys().any(|key| key.peer == peers[1]));
     }
 
+    /// A share with publishers at other nodes, and what these nodes say of them.
+    struct Publishers {
+        far: FarConsumers,
+        now: Instant,
+    }
+
+    const SHARE: Name = Name([2; 32]);
+
+    fn publisher(lease_ns: u64, liveliness: Liveliness, is_alive: bool) -> Consumer {
+        let (id, node) = (lease_ns.to_be_bytes(), RosNode::new("/", "teleop", None).unwrap());
+        let qos = Qos { lease_ns: Some(lease_ns), liveliness, ..Qos::default() };
+        Consumer { interface: SHARE, id, role: Role::Publish, is_alive, node, type_hash: None, qos }
+    }
+
+    impl Publishers {
+        fn join(&mut self, peer: u8, role: Role) {
+            self.far.sink_joined(self.now, NodeId([peer; 32]), SHARE, SinkId([peer; 16]), role);
+            self.far.ask(true, NodeId([0; 32]));
+        }
+
+        fn passes(&mut self, time: Duration) -> (Option<u64>, bool) {
+            self.now += time;
+            self.far.take_changes(self.now);
+            let AnnouncedPublishers { offer, may_live } = self.far.publishers().remove(&SHARE).unwrap();
+            (offer.and_then(|offer| offer.lease_ns), may_live)
+        }
+
+        fn tell(&mut self, peer: u8, publishers: Vec<Consumer>) -> (Option<u64>, bool) {
+            self.far.peer_told(self.now, NodeId([peer; 32]), publishers);
+            self.passes(SHOW_AFTER + SHOW_EACH)
+        }
+    }
+
+    #[test]
+    fn publishers_of_a_share_may_live_until_all_nodes_have_said_that_theirs_do_not() {
+        let automatic = |lease_ns, is_alive| publisher(lease_ns, Liveliness::Automatic, is_alive);
+        let mut p = Publishers { far: FarConsumers::default(), now: Instant::now() };
+        p.join(1, Role::Publish);
+        assert_eq!(p.passes(SHOW_AFTER), (None, true), "it said nothing yet");
+        p.far.peer_told(p.now, NodeId([1; 32]), vec![automatic(5, true)]);
+        assert_eq!(p.passes(SHOW_AFTER / 2), (None, true), "that is not taken over yet");
+        assert_eq!(p.passes(SHOW_AFTER), (Some(5), true));
+        p.join(2, Role::Publish);
+        assert_eq!(p.tell(1, vec![automatic(5, false)]), (Some(5), true), "the other one said nothing");
+        assert_eq!(p.tell(2, vec![]), (Some(5), false));
+        assert_eq!(p.tell(2, vec![automatic(3, true)]), (Some(3), true), "those that are gone offer nothing");
+        assert_eq!(p.tell(2, vec![automatic(3, false)]), (Some(5), false));
+        assert_eq!(p.tell(1, vec![]), (Some(3), false));
+        // A subscriber's word is none about publishers.
+        p.join(3, Role::Subscribe);
+        assert_eq!(p.passes(SHOW_AFTER), (Some(3), false));
+        // A node that is lost says nothing any more. One that left does not count, though it is shown for a while.
+        assert_eq!(p.tell(1, vec![automatic(7, true)]), (Some(7), true));
+        p.far.sink_left(NodeId([1; 32]), SHARE, SinkId([1; 16]), p.now + Duration::from_secs(10));
+        assert_eq!(p.passes(SHOW_AFTER), (Some(3), false));
+        p.far.peer_lost(NodeId([2; 32]), p.now);
+        assert_eq!(p.passes(SHOW_AFTER), (None, true));
+    }
+
+    #[test]
+    fn publisher_that_is_manual_by_topic_may_live_while_its_far_writer_expires_by_itself() {
+        let mut p = Publishers { far: FarConsumers::default(), now: Instant::now() };
+        p.join(1, Role::Publish);
+        let manual = publisher(5, Liveliness::ManualByTopic, false);
+        let automatic = |is_alive| publisher(9, Liveliness::Automatic, is_alive);
+        assert_eq!(p.tell(1, vec![manual.clone()]), (Some(5), true));
+        assert_eq!(p.tell(1, vec![manual.clone(), automatic(true)]), (Some(9), true));
+        assert_eq!(p.tell(1, vec![manual, automatic(false)]), (Some(5), true));
+    }
+
     #[test]
     fn consumers_are_shown_in_a_role_that_their_node_was_granted() {
         let (peer, interface, now) = (NodeId([1; 32]), Name([2; 32]), Instant::now());
@@ -426,6 +540,7 @@ mod tests {
             interface,
             id: [role as u8; 8],
             role,
+            is_alive: true,
             node: RosNode::new("/", "teleop", None).unwrap(),
             type_hash: None,
             qos: Qos::default(),

@@ -6,9 +6,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use sgc_endpoint::{Receivers, RecoveryLimits, Source, SourceConfig};
-use sgc_ros::Shaping;
+use sgc_ros::{Guid, Shaping};
 use sgc_trust::{MessageKey, Suite};
-use sgc_wire::{Class, Name, NodeId, SourceId, SourceOffer, TopicGrant};
+use sgc_wire::{Class, Name, NodeId, Qos, SourceId, SourceOffer, TopicGrant};
 
 use crate::data::sending::message_keys::MessageKeys;
 use crate::data::sending::source_map::SourceSlot;
@@ -126,6 +126,18 @@ impl Publishers {
         Some(GrantStep::Anew(source.map(|source| SourceSlot::new(source, false, reliable))))
     }
 
+    /// Sets the local publishers whose assertions of liveliness are passed on under a name.
+    pub(crate) fn watch(&mut self, name: &Name, publishers: Vec<(Guid, Qos)>) {
+        if let Some(publisher) = self.offered.get_mut(name) {
+            publisher.watched = publishers;
+        }
+    }
+
+    /// Returns the local publishers whose assertions of liveliness are passed on under a name.
+    pub(crate) fn watched(&self, name: &Name) -> &[(Guid, Qos)] {
+        self.offered.get(name).map_or(&[], |publisher| &publisher.watched)
+    }
+
     /// Returns the names whose next epoch begins now, with their grants.
     pub(crate) fn take_rekeys(&mut self, now: Instant) -> Vec<(Name, TopicGrant)> {
         let due = self.offered.iter_mut().filter_map(|(name, one)| Some((*name, one.take_due(now)?)));
@@ -153,6 +165,8 @@ struct OfferedSource {
     grant: Option<TopicGrant>,
     /// Key of the next epoch, and its beginning.
     next: Option<(Instant, TopicGrant)>,
+    /// Local publishers that may assert their liveliness without a message.
+    watched: Vec<(Guid, Qos)>,
 }
 
 /// Effect of a grant on the key of a source.
@@ -167,7 +181,7 @@ enum GrantEffect {
 impl OfferedSource {
     /// Creates the state before the first grant.
     fn new(id: SourceId, class: Class, reliable: bool) -> Self {
-        Self { id, class, reliable, grant: None, next: None }
+        Self { id, class, reliable, grant: None, next: None, watched: Vec::new() }
     }
 
     /// Handles a grant to publish, or a new epoch.

@@ -86,7 +86,7 @@ impl Sinks {
             self.timers.history_ended(name, source);
         }
         if let Some(sink) = self.sinks.get(&name) {
-            sink.set_writer(source, None);
+            sink.set_writer(source, None, &self.data);
         }
     }
 
@@ -169,7 +169,7 @@ mod tests {
         let (requests, requested) = mpsc::channel(1);
         let mut sinks = Sinks::new(requests, Arc::default());
         let sink = sinks.add(NAME, true);
-        sink.set_writer(Some(SOURCE), Some(taking(|_, _| ())));
+        sink.set_writer(Some(SOURCE), Some(taking(|_, _| ())), &sinks.data);
         let announce = SourceAnnounce { source: SOURCE, key: Bytes::new(), oldest: 3, next: 9, recover: 0 };
         let (suite, key) = (Suite::Group.id(), SecretBytes::new([3; 32]));
         let grant = TopicGrant { epoch: 1, suite, key, receiver: None, sources: vec![announce], entry: None };

@@ -33,6 +33,11 @@ impl ManualLease {
             .then(|| Arc::new(Self { lease, began: now, heard_ns: AtomicI64::new(i64::MIN) }))
     }
 
+    /// Returns `true` if it is the lease of this offer.
+    pub(crate) fn is_of(&self, qos: &Qos) -> bool {
+        Self::from_qos(qos, self.began).is_some_and(|lease| lease.lease == self.lease)
+    }
+
     /// Returns the interval of looks.
     pub(crate) fn look_every(&self) -> Duration {
         (self.lease / LOOKS_PER_LEASE).min(ASSERTION_LOOK_MAX)

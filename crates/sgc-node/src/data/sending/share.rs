@@ -4,6 +4,7 @@
 //! queue of a reliable topic is full, only this worker waits, so other topics flow on. Samples that are ready together
 //! share a signature; none waits for a later one.
 
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed, Ordering::SeqCst};
 use std::sync::{Arc, MutexGuard, Weak};
 use std::time::{Duration, Instant};
@@ -333,15 +334,20 @@ impl LocalShare {
         }
         let news = manual()
             .filter(|(writer, _, lease)| renewed_ago(writer).is_some_and(|ago| lease.is_news(now, ago)));
-        let news: Vec<_> = news.map(|(_, slot, lease)| (slot.id.publisher(), lease.clone())).collect();
+        // Publishers that share a source are asserted together.
+        let mut by_publisher = BTreeMap::<_, Vec<_>>::new();
+        for (_, slot, lease) in news {
+            by_publisher.entry(slot.id.publisher()).or_default().push(lease.clone());
+        }
+        let news = by_publisher;
         if let Some(slot) = map.assertions.clone().filter(|_| !news.is_empty()) {
             let share = self.clone();
             self.run_blocking(move || {
                 // The holder of the source is blocked.
                 let Ok(mut source) = slot.source.try_lock() else { return };
-                for (publisher, lease) in news {
+                for (publisher, leases) in news {
                     if source.assert_publisher(publisher, share.emit.packets()).is_ok() {
-                        lease.note_heard(now);
+                        leases.iter().for_each(|lease| lease.note_heard(now));
                     }
                 }
             });
@@ -382,7 +388,9 @@ impl LocalShare {
 
     /// Returns the number of signatures of its present sources, one for each batch.
     pub(crate) fn signatures(&self) -> u64 {
-        self.map.load().slots().map(|slot| slot.progress.signatures()).sum()
+        let map = self.map.load();
+        let by_id: BTreeMap<_, _> = map.slots().map(|slot| (slot.id, slot.progress.signatures())).collect();
+        by_id.into_values().sum()
     }
 
     /// Returns `true` if messages have to leave as JSON and their type is unknown.

@@ -5,11 +5,11 @@
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use sgc_endpoint::{Source, SourceProgress};
 use sgc_ros::Guid;
-use sgc_wire::SourceId;
+use sgc_wire::{Qos, SourceId};
 
 use crate::data::sending::manual_lease::ManualLease;
 
@@ -20,13 +20,27 @@ pub(crate) struct SourceMap {
     pub shared: Option<SourceSlot>,
     /// Whether each writer has its own source. Samples of an unlisted writer then wait until it is listed.
     pub(crate) per_writer: bool,
-    /// Sources by writer.
+    /// Sources by writer. Several writers may have one source.
     pub own: HashMap<Guid, SourceSlot>,
     /// The source that asserts the liveliness of writers without messages. It keeps no history.
     pub assertions: Option<SourceSlot>,
 }
 
 impl SourceMap {
+    /// Creates the map of one source for all writers, which also makes the assertions of the writers in `manual`. It
+    /// keeps no history. `before` is the former map of these writers.
+    pub(crate) fn of_one(slot: SourceSlot, manual: &[(Guid, Qos)], before: &Self, now: Instant) -> Self {
+        let leased = |(writer, qos): &(Guid, Qos)| {
+            let known = before.own.get(writer).and_then(|slot| slot.manual.clone());
+            let known = known.filter(|lease| lease.is_of(qos));
+            let manual = Some(known.or_else(|| ManualLease::from_qos(qos, now))?);
+            Some((*writer, SourceSlot { manual, ..slot.clone() }))
+        };
+        let own: HashMap<_, _> = manual.iter().filter_map(leased).collect();
+        let assertions = (!own.is_empty()).then(|| slot.clone());
+        Self { shared: Some(slot), per_writer: false, own, assertions }
+    }
+
     /// Returns the slot of a source.
     pub(crate) fn slot(&self, id: &SourceId) -> Option<SourceSlot> {
         self.slots().find(|slot| slot.id == *id).cloned()
@@ -100,6 +114,27 @@ impl SourceSlot {
 mod tests {
     use super::*;
     use crate::data::sending::fixtures::{KNOWN, STRANGER, slot_with_id};
+
+    #[test]
+    fn writers_with_a_manual_lease_share_the_one_source_that_asserts_them() {
+        let (slot, none, now) = (slot_with_id(7), SourceMap::default(), Instant::now());
+        let liveliness = sgc_wire::Liveliness::ManualByTopic;
+        let manual = Qos { liveliness, lease_ns: Some(2_000_000_000), ..Qos::default() };
+        let map = SourceMap::of_one(
+            slot.clone(),
+            &[(KNOWN, manual.clone()), (STRANGER, Qos::default())],
+            &none,
+            now,
+        );
+        assert_eq!(map.own.keys().collect::<Vec<_>>(), [&KNOWN]);
+        assert!(map.own[&KNOWN].manual.is_some() && map.assertions.is_some());
+        assert!(map.slots().all(|one| Arc::ptr_eq(&one.source, &slot.source)), "numbers are nonces");
+        let again = SourceMap::of_one(slot_with_id(8), &[(KNOWN, manual)], &map, now);
+        let lease = |map: &SourceMap| map.own[&KNOWN].manual.clone().unwrap();
+        assert!(Arc::ptr_eq(&lease(&again), &lease(&map)), "what was heard is not forgotten");
+        let map = SourceMap::of_one(slot, &[(STRANGER, Qos::default())], &map, now);
+        assert!(map.own.is_empty() && map.assertions.is_none());
+    }
 
     #[test]
     fn writer_has_its_own_source_and_waits_until_it_is_listed() {

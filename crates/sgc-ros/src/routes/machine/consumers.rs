@@ -77,6 +77,7 @@ impl<R: RngCore> Routes<R> {
                         EndpointKind::Reader => Role::Subscribe,
                         EndpointKind::Writer => Role::Publish,
                     },
+                    is_alive: self.local.is_alive(&endpoint.guid),
                     node: node.clone(),
                     type_hash: endpoint.type_hash.clone(),
                     qos: Qos { partitions: Vec::new(), ..endpoint.qos.clone() },

@@ -1,7 +1,11 @@
 //! Publishing: local publishers on names of other nodes, and remote publishers on shares of this node.
 //!
 //! A use route whose rule publishes carries local messages to the owner, while the owner permits it. A share route on
-//! which others may publish has a local writer while at least one of them is present.
+//! which others may publish has a local writer while at least one of them is present, unless all their publishers are
+//! known to be gone.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
 
 use rand_core::RngCore;
 use sgc_wire::{Metadata, Name};
@@ -12,6 +16,7 @@ use crate::network::{DiscoveredEndpoint, EndpointKind};
 use crate::routes::command::Command;
 use crate::routes::problem::Cause;
 use crate::routes::rules::{Direction, Shaping, ShareRuleId, UseRule, UseRuleId};
+use crate::routes::share_route::AnnouncedPublishers;
 use crate::routes::use_route::UseRoute;
 
 impl<R: RngCore> Routes<R> {
@@ -22,6 +27,34 @@ impl<R: RngCore> Routes<R> {
             self.commands.push_back(command);
             self.check_later();
         }
+    }
+
+    /// Handles what other nodes say of their publishers on shares of this node.
+    pub fn handle_announced(&mut self, now: Instant, announced: BTreeMap<Name, AnnouncedPublishers>) {
+        for (name, publishers) in announced {
+            let Some(share) = self.shares.get_mut(&name) else { continue };
+            if let Some(command) = share.set_announced(now, publishers, &self.share_rules[share.rule()]) {
+                self.commands.push_back(command);
+                self.check_later();
+            }
+        }
+    }
+
+    /// Handles a message of a remote publisher, which came at this time and waits for a writer, or has one in doubt: that
+    /// publisher lives, whatever was announced.
+    pub fn handle_unwritten(&mut self, at: Instant, name: &Name) {
+        let Some(share) = self.shares.get_mut(name) else { return };
+        if let Some(command) = share.hear_publisher(at, &self.share_rules[share.rule()]) {
+            self.commands.push_back(command);
+            self.check_later();
+        }
+    }
+
+    /// Returns the shares of which [`Self::handle_timeout`] closes the writer for messages of others unless one came
+    /// within the given time. Nobody announced their publishers as living.
+    pub fn writers_in_doubt(&self, now: Instant) -> Vec<(Name, Duration)> {
+        let due = self.shares.values().filter_map(|share| Some((share.name(), share.doubts_writer(now)?)));
+        due.collect()
     }
 
     /// Begins the shares that exist for messages of others. Their rules must give the type, because no local

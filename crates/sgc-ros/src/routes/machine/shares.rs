@@ -133,6 +133,7 @@ impl<R: RngCore> Routes<R> {
 
     /// Handles the expiry of a local writer's lease, or its renewal.
     pub(super) fn handle_liveliness(&mut self, guid: Guid, is_alive: bool) {
+        self.local.set_alive(&guid, is_alive);
         self.refresh_where(|share| share.set_alive(&guid, is_alive));
     }
 
@@ -157,8 +158,14 @@ impl<R: RngCore> Routes<R> {
         let rule = &self.share_rules[share.rule()];
         let update = share.refresh(rule, &self.local, &self.secret, &mut self.rng);
         if let Some(ShareUpdate { commands, problems }) = update {
+            let is_of_writer =
+                |c: &Command| matches!(c, Command::OpenWriter { .. } | Command::CloseWriter { .. });
+            let has_other_writer = commands.iter().any(is_of_writer);
             self.commands.extend(commands);
             self.settle(Cause::Share(name), problems);
+            if has_other_writer {
+                self.check_later();
+            }
         }
     }
 
