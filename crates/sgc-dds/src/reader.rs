@@ -166,11 +166,10 @@ impl Receiver for Samples {
             return;
         }
         if let Some(KnownWriter { guid, .. }) = writer
-            && !self.heard.contains(&arrival.writer)
             && self.heard.len() < HEARD_MAX
+            && self.heard.insert(arrival.writer)
         {
             // An earlier reader of the topic may have reported that the lease had expired.
-            self.heard.insert(arrival.writer);
             self.participant.tell(DiscoveryEvent::Liveliness { guid, is_alive: true });
         }
         if self.lapsed.contains(&arrival.writer) {

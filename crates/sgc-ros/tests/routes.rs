@@ -56,6 +56,13 @@ fn share(topic: &str, type_name: &str) -> ShareRule {
     }
 }
 
+/// Returns a share on which `OWNER` may publish.
+fn inbound(topic: &str) -> ShareRule {
+    let mut policy = Policy::default();
+    policy.publish.nodes.insert(OWNER);
+    ShareRule { policy, ..share(topic, STRING) }
+}
+
 fn use_of(owner: NodeId, topic: &str, type_name: Option<&str>) -> UseRule {
     UseRule {
         direction: Direction::Bring,
@@ -959,9 +966,7 @@ fn a_topic_that_may_only_be_published_on_is_not_brought_here() {
 
 #[test]
 fn a_share_that_others_publish_on_is_there_without_a_local_publisher() {
-    let mut publish = Policy::default();
-    publish.publish.nodes.insert(OWNER);
-    let mut b = bench_of(vec![ShareRule { policy: publish, ..share("/cmd", STRING) }], Vec::new());
+    let mut b = bench_of(vec![inbound("/cmd")], Vec::new());
     let name = mine("/cmd");
     let commands = b.commands();
     assert!(
@@ -992,9 +997,7 @@ fn writer_commands(commands: Vec<Command>) -> Vec<Command> {
 
 #[test]
 fn writer_for_messages_of_others_offers_what_they_announced() {
-    let mut publish = Policy::default();
-    publish.publish.nodes.insert(OWNER);
-    let mut b = bench_of(vec![ShareRule { policy: publish, ..share("/cmd", STRING) }], Vec::new());
+    let mut b = bench_of(vec![inbound("/cmd")], Vec::new());
     let name = mine("/cmd");
     b.commands();
     let second = Some(1_000_000_000);
@@ -1050,9 +1053,7 @@ fn writer_for_messages_of_others_offers_what_they_announced() {
 
 #[test]
 fn announcements_that_change_all_the_time_replace_writers_at_a_bounded_pace() {
-    let mut publish = Policy::default();
-    publish.publish.nodes.insert(OWNER);
-    let mut b = bench_of(vec![ShareRule { policy: publish, ..share("/cmd", STRING) }], Vec::new());
+    let mut b = bench_of(vec![inbound("/cmd")], Vec::new());
     let name = mine("/cmd");
     b.routes.handle_publishers(&name, true);
     b.commands();
@@ -1074,9 +1075,7 @@ fn announcements_that_change_all_the_time_replace_writers_at_a_bounded_pace() {
 
 #[test]
 fn reloaded_qos_of_a_share_is_that_of_the_writer_for_messages_of_others() {
-    let mut publish = Policy::default();
-    publish.publish.nodes.insert(OWNER);
-    let rule = ShareRule { policy: publish, ..share("/cmd", STRING) };
+    let rule = inbound("/cmd");
     let mut b = bench_of(vec![rule.clone()], Vec::new());
     b.routes.handle_publishers(&mine("/cmd"), true);
     b.commands();

@@ -372,13 +372,10 @@ impl ShareRoute {
     /// Returns the writer for messages of others: with ROS 2's default QoS, and the deadline, lifespan and liveliness
     /// that they announced. There is none while all of them are known to be gone, if subscribers may watch for that.
     fn wanted_writer(&self, rule: &ShareRule) -> Option<EndpointSpec> {
-        if rule.is_service() || !self.has_publishers {
+        if rule.is_service() || !self.has_publishers || self.announced.are_gone() {
             return None;
         }
         let mut qos = Qos { history: History::KeepLast(PUBLISHERS_DEPTH), ..Qos::default() };
-        if self.announced.are_gone() {
-            return None;
-        }
         if let Some(offer) = &self.announced.offer {
             qos.deadline_ns = offer.deadline_ns;
             qos.lifespan_ns = offer.lifespan_ns;

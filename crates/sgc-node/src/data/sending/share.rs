@@ -339,13 +339,12 @@ impl LocalShare {
         for (_, slot, lease) in news {
             by_publisher.entry(slot.id.publisher()).or_default().push(lease.clone());
         }
-        let news = by_publisher;
-        if let Some(slot) = map.assertions.clone().filter(|_| !news.is_empty()) {
+        if let Some(slot) = map.assertions.clone().filter(|_| !by_publisher.is_empty()) {
             let share = self.clone();
             self.run_blocking(move || {
                 // The holder of the source is blocked.
                 let Ok(mut source) = slot.source.try_lock() else { return };
-                for (publisher, leases) in news {
+                for (publisher, leases) in by_publisher {
                     if source.assert_publisher(publisher, share.emit.packets()).is_ok() {
                         leases.iter().for_each(|lease| lease.note_heard(now));
                     }

@@ -15,36 +15,37 @@ use crate::names::dds_type;
 use crate::network::{DiscoveredEndpoint, EndpointKind};
 use crate::routes::command::Command;
 use crate::routes::problem::Cause;
-use crate::routes::rules::{Direction, Shaping, ShareRuleId, UseRule, UseRuleId};
-use crate::routes::share_route::AnnouncedPublishers;
+use crate::routes::rules::{Direction, Shaping, ShareRule, ShareRuleId, UseRule, UseRuleId};
+use crate::routes::share_route::{AnnouncedPublishers, ShareRoute};
 use crate::routes::use_route::UseRoute;
 
 impl<R: RngCore> Routes<R> {
     /// Handles the arrival of the first other publisher on a share, or the end of the last.
     pub fn handle_publishers(&mut self, name: &Name, any: bool) {
-        let Some(share) = self.shares.get_mut(name) else { return };
-        if let Some(command) = share.set_publishers(any, &self.share_rules[share.rule()]) {
-            self.commands.push_back(command);
-            self.check_later();
-        }
+        self.change_writer(name, |share, rule| share.set_publishers(any, rule));
     }
 
     /// Handles what other nodes say of their publishers on shares of this node.
     pub fn handle_announced(&mut self, now: Instant, announced: BTreeMap<Name, AnnouncedPublishers>) {
         for (name, publishers) in announced {
-            let Some(share) = self.shares.get_mut(&name) else { continue };
-            if let Some(command) = share.set_announced(now, publishers, &self.share_rules[share.rule()]) {
-                self.commands.push_back(command);
-                self.check_later();
-            }
+            self.change_writer(&name, |share, rule| share.set_announced(now, publishers, rule));
         }
     }
 
     /// Handles a message of a remote publisher, which came at this time and waits for a writer, or has one in doubt: that
     /// publisher lives, whatever was announced.
     pub fn handle_unwritten(&mut self, at: Instant, name: &Name) {
+        self.change_writer(name, |share, rule| share.hear_publisher(at, rule));
+    }
+
+    /// Changes a share, and carries out the effect on its writer for messages of others.
+    fn change_writer(
+        &mut self,
+        name: &Name,
+        change: impl FnOnce(&mut ShareRoute, &ShareRule) -> Option<Command>,
+    ) {
         let Some(share) = self.shares.get_mut(name) else { return };
-        if let Some(command) = share.hear_publisher(at, &self.share_rules[share.rule()]) {
+        if let Some(command) = change(share, &self.share_rules[share.rule()]) {
             self.commands.push_back(command);
             self.check_later();
         }
