@@ -5,7 +5,7 @@
 //! half and ask for it after the next heartbeat. A pause lets the subscriber's thread empty its buffer. Meanwhile the
 //! lock under which acknowledgements are handled is free: `transmit_sample_lgmsg_unlocks_wr` of the Cyclone that
 //! `cyclors` =0.4.0 builds sends fragments outside of it. Others of the same writer wait, as they do for each long
-//! message.
+//! message. Readers of Cyclone ask for a larger buffer, so a writer that has no other readers does not pause.
 
 use std::cell::Cell;
 use std::thread;
@@ -56,12 +56,10 @@ impl Burst {
 pub(crate) struct Bursts(());
 
 impl Bursts {
-    /// Begins a message of this length. Returns `None` if it is sent at once.
-    pub(crate) fn begin(message_bytes: usize) -> Option<Self> {
-        (message_bytes > BURST_BYTES).then(|| {
-            BURST.set(Some(Burst::BEGUN));
-            Self(())
-        })
+    /// Begins a message.
+    pub(crate) fn begin() -> Self {
+        BURST.set(Some(Burst::BEGUN));
+        Self(())
     }
 }
 
@@ -69,6 +67,11 @@ impl Drop for Bursts {
     fn drop(&mut self) {
         BURST.set(None);
     }
+}
+
+/// Returns `true` if a message of this length is more than a burst.
+pub(crate) fn is_long(message_bytes: usize) -> bool {
+    message_bytes > BURST_BYTES
 }
 
 /// Returns `true` if this thread sends in bursts.
@@ -109,8 +112,8 @@ mod tests {
 
     #[test]
     fn only_the_thread_of_a_long_message_sends_in_bursts() {
-        assert!(Bursts::begin(BURST_BYTES).is_none() && !is_bursting());
-        let bursts = Bursts::begin(BURST_BYTES + 1);
+        assert!(!is_long(BURST_BYTES) && is_long(BURST_BYTES + 1) && !is_bursting());
+        let bursts = Bursts::begin();
         assert!(is_bursting());
         assert!(!thread::spawn(is_bursting).join().unwrap());
         drop(bursts);

@@ -43,6 +43,7 @@ mod late_readers;
 mod local_nodes;
 mod log;
 mod manual_leases;
+mod matched;
 mod network;
 mod pace;
 mod participant;

@@ -10,7 +10,8 @@ use sgc_wire::History;
 
 use crate::arrivals::{Arrival, FromSerdata, LivelinessChange, WriterState};
 use crate::intake::{Intake, Receiver};
-use crate::known_writers::{KnownWriter, KnownWriters};
+use crate::known_writers::KnownWriters;
+use crate::matched::MatchedEndpoint;
 use crate::participant::Participant;
 use crate::payload::HEADER_BYTES;
 use crate::sample::SampleRef;
@@ -108,7 +109,7 @@ struct Samples {
 impl Samples {
     /// Returns `true` for a sample of another proxy on this network, which came through SGC already. Sharing it again
     /// would make it circulate.
-    fn is_ignored(&self, writer: Option<KnownWriter>) -> bool {
+    fn is_ignored(&self, writer: Option<MatchedEndpoint>) -> bool {
         self.ignores_tagged && writer.is_some_and(|w| w.tagged)
     }
 
@@ -121,8 +122,8 @@ impl Samples {
     }
 
     /// Reports the depth of a writer's history to discovery if it is new.
-    fn tell_depth(&mut self, arrival: &Arrival<Content>, writer: Option<KnownWriter>) {
-        if let (Some(depth), Some(KnownWriter { guid, .. })) = (self.new_depth(arrival), writer) {
+    fn tell_depth(&mut self, arrival: &Arrival<Content>, writer: Option<MatchedEndpoint>) {
+        if let (Some(depth), Some(MatchedEndpoint { guid, .. })) = (self.new_depth(arrival), writer) {
             self.depths.get_or_insert_default().insert(arrival.writer);
             tracing::debug!(writer = ?guid, depth, "the depth of a publisher's history is known");
             self.participant.tell(DiscoveryEvent::HistoryDepth { guid, depth });
@@ -145,14 +146,14 @@ impl Samples {
             }
         };
         let known = if is_news { self.writers.find(reader, writer) } else { None };
-        if let Some(KnownWriter { guid, .. }) = known.filter(|w| !self.is_ignored(Some(*w))) {
+        if let Some(MatchedEndpoint { guid, .. }) = known.filter(|w| !self.is_ignored(Some(*w))) {
             tracing::debug!(writer = ?guid, is_alive, "the liveliness of a writer changed");
             self.participant.tell(DiscoveryEvent::Liveliness { guid, is_alive });
         }
     }
 }
 
-fn sample_of(content: Content, writer: Option<KnownWriter>, source_timestamp_ns: i64) -> Sample {
+fn sample_of(content: Content, writer: Option<MatchedEndpoint>, source_timestamp_ns: i64) -> Sample {
     let Content { kind, key_hash, payload, .. } = content;
     Sample { kind, writer: writer.map(|w| w.guid), source_timestamp_ns, key_hash, payload, more: false }
 }
@@ -165,7 +166,7 @@ impl Receiver for Samples {
         if self.is_ignored(writer) {
             return;
         }
-        if let Some(KnownWriter { guid, .. }) = writer
+        if let Some(MatchedEndpoint { guid, .. }) = writer
             && self.heard.len() < HEARD_MAX
             && self.heard.insert(arrival.writer)
         {

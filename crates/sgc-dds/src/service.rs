@@ -17,28 +17,21 @@ use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU32, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use bytes::{BufMut, Bytes, BytesMut};
-use cyclors::{
-    dds_builtintopic_endpoint_t, dds_builtintopic_free_endpoint, dds_entity_t, dds_get_instance_handle,
-    dds_get_matched_publication_data, dds_get_matched_publications, dds_get_matched_subscription_data,
-    dds_get_matched_subscriptions, dds_instance_handle_t, dds_set_status_mask, dds_take_status,
-};
+use cyclors::{dds_get_instance_handle, dds_instance_handle_t, dds_set_status_mask, dds_take_status};
 use sgc_ros::{
     Guid, RequestHandler, RequestId, RosClient, RosError, RosServer, SentRequest, ServiceSpec, UnhandledCall,
 };
 
 use crate::entity::check;
 use crate::identity::{Mapping, NUMBER_UNKNOWN, SampleIdentity};
+use crate::matched::{self, MatchedEndpoint};
 use crate::participant::Participant;
 use crate::payload::{Frame, HEADER_BYTES, PREFIX_BYTES, is_little_endian};
 use crate::rpc::{HandleMessages, Message, RpcReader, RpcWriter};
 use crate::wait::{READERS_MATCHED, WRITERS_MATCHED, wait_for_status};
-use crate::{qos, user_data};
 
 /// Longest wait of a request for a server, and of a reply for its client, in milliseconds.
 const MATCH_WAIT_MAX_MS: u64 = 1000;
-
-/// Most matched endpoints that are examined.
-const MATCHES_MAX: usize = 1024;
 
 /// Bytes of a client's id in the header; the rest of [`RequestId::client`] is zero.
 const ID_BYTES: usize = 8;
@@ -266,35 +259,18 @@ impl<H: HandleMessages> Ends<H> {
 
     /// Returns the matched readers.
     fn readers(&self) -> BTreeSet<Guid> {
-        let writer = self.writer.entity().handle();
-        self.matched(writer, dds_get_matched_subscriptions, dds_get_matched_subscription_data)
+        self.of_programs(matched::readers_of(self.writer.entity().handle()))
     }
 
     /// Returns the matched writers.
     fn writers(&self) -> BTreeSet<Guid> {
-        self.matched(self.reader.handle(), dds_get_matched_publications, dds_get_matched_publication_data)
+        self.of_programs(matched::writers_of(self.reader.handle()))
     }
 
-    fn matched(&self, handle: dds_entity_t, list: ListMatches, describe: DescribeMatch) -> BTreeSet<Guid> {
-        let mut matches: [dds_instance_handle_t; MATCHES_MAX] = [0; MATCHES_MAX];
-        // SAFETY: the handle is checked by Cyclone, and there is room for as many as is said.
-        let found = unsafe { list(handle, matches.as_mut_ptr(), MATCHES_MAX) };
-        let found = usize::try_from(found).unwrap_or(0).min(MATCHES_MAX);
-        let endpoints = matches[..found].iter().filter_map(|matched| {
-            // SAFETY: takes numbers, checked by Cyclone; returns null or an object that is ours to free.
-            let data = unsafe { describe(handle, *matched) };
-            // SAFETY: null or valid, see above.
-            let endpoint = unsafe { data.as_ref() }?;
-            let guid = Guid(endpoint.key.v);
-            let tagged = !endpoint.qos.is_null() && {
-                // SAFETY: not null, and valid as long as the endpoint is.
-                user_data::is_tagged(&unsafe { qos::user_data(endpoint.qos) })
-            };
-            // SAFETY: not null, not used any more, freed once.
-            unsafe { dds_builtintopic_free_endpoint(data) };
-            (!(tagged && self.participant.ignores_tagged())).then_some(guid)
-        });
-        endpoints.collect()
+    /// Returns the endpoints that are not ignored.
+    fn of_programs(&self, endpoints: Vec<MatchedEndpoint>) -> BTreeSet<Guid> {
+        let is_ignored = |endpoint: &MatchedEndpoint| endpoint.tagged && self.participant.ignores_tagged();
+        endpoints.into_iter().filter(|endpoint| !is_ignored(endpoint)).map(|endpoint| endpoint.guid).collect()
     }
 }
 
@@ -312,10 +288,6 @@ fn pair_mark(key: &str, participant: &Participant) -> String {
 fn prefixes(endpoints: BTreeSet<Guid>) -> BTreeSet<[u8; 12]> {
     endpoints.iter().map(Guid::prefix).collect()
 }
-
-type ListMatches = unsafe extern "C" fn(dds_entity_t, *mut dds_instance_handle_t, usize) -> i32;
-type DescribeMatch =
-    unsafe extern "C" fn(dds_entity_t, dds_instance_handle_t) -> *mut dds_builtintopic_endpoint_t;
 
 /// Returns client, number and payload of a request, or `None` if it is too short for its mapping.
 fn request_of(message: Message) -> Option<([u8; 16], i64, Bytes)> {

@@ -5,7 +5,7 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::ffi::c_void;
-use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU32, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -21,9 +21,10 @@ use sgc_ros::{EndpointKind, EndpointSpec, Guid, KeyHash, RosError, RosWriter, Sa
 use sgc_sync::lock;
 use sgc_wire::{History, Qos};
 
-use crate::bursts::Bursts;
+use crate::bursts::{self, Bursts};
 use crate::entity::{Entity, INFINITE, check, reason};
 use crate::late;
+use crate::matched::{self, MATCHES_MAX};
 use crate::participant::Participant;
 use crate::payload::Frame;
 use crate::qos::{SendWindow, history_of, keys_kept};
@@ -46,9 +47,10 @@ const TIMESTAMP_MAX_NS: i64 = 4_294_967_295_999_999_999;
 #[derive(Debug)]
 pub struct CycloneWriter {
     writer: Entity,
-    /// The number of matched readers, which the listener writes. It outlives the writer, because the listener has a
-    /// pointer to it.
-    readers: Arc<AtomicU32>,
+    /// The matched readers, which the listener writes. It outlives the writer, because the listener has a pointer to it.
+    matched: Arc<Matched>,
+    /// Whether a matched reader may have a small receive buffer.
+    has_small_buffers: AtOneMatch,
     _group: Option<Entity>,
     topic: Entity,
     participant: Arc<Participant>,
@@ -213,8 +215,8 @@ impl CycloneWriter {
         let topic = participant.topic(spec)?;
         let group = participant.group(EndpointKind::Writer, spec)?;
         let parent = group.as_ref().unwrap_or(participant.entity()).handle();
-        let readers = Arc::new(AtomicU32::new(0));
-        let arg = Arc::as_ptr(&readers).cast_mut().cast::<c_void>();
+        let matched = Arc::<Matched>::default();
+        let arg = Arc::as_ptr(&matched).cast_mut().cast::<c_void>();
         // SAFETY: the QoS object and the listener outlive the call, which copies them, and the listener is deleted
         // once. `arg` outlives the writer, whose deletion waits for its listener: see the fields' order.
         let writer = unsafe {
@@ -241,7 +243,8 @@ impl CycloneWriter {
         let guid = writer.guid()?;
         Ok(Self {
             writer,
-            readers,
+            matched,
+            has_small_buffers: AtOneMatch::default(),
             _group: group,
             topic,
             participant: Arc::clone(participant),
@@ -298,6 +301,16 @@ impl CycloneWriter {
         // SAFETY: the handle is checked by Cyclone, and `status` is a valid place for the result.
         let ret = unsafe { dds_get_publication_matched_status(self.writer.handle(), &mut status) };
         if ret < 0 { 0 } else { status.current_count }
+    }
+
+    /// Returns `true` if a matched reader may have a receive buffer of the kernel's default size. Those of Cyclone ask
+    /// for a larger one.
+    fn has_small_buffers(&self) -> bool {
+        let changes = self.matched.changes.load(Ordering::Acquire);
+        self.has_small_buffers.get(changes, || {
+            let readers = matched::readers_of(self.writer.handle());
+            readers.len() == MATCHES_MAX || !readers.iter().all(|reader| reader.guid.is_of_cyclone())
+        })
     }
 
     /// Returns the GUID of the writer, as others discover it.
@@ -376,7 +389,8 @@ impl RosWriter for CycloneWriter {
         let mut sample = sample.ok_or_else(|| failed("out of memory".into()))?;
         sample.set_status(statusinfo);
 
-        let _bursts = Bursts::begin(payload.len());
+        let is_paced = bursts::is_long(payload.len()) && self.has_small_buffers();
+        let _bursts = is_paced.then(Bursts::begin);
         let started = Instant::now();
         // SAFETY: the sample is valid and of the writer's type; the call consumes the reference.
         let ret = unsafe { dds_forwardcdr(self.writer.handle(), sample.into_raw()) };
@@ -410,7 +424,7 @@ impl RosWriter for CycloneWriter {
 
     fn matched_readers(&self) -> u32 {
         // Cyclone's own status has the writer's lock, which a write that waits for acknowledgements holds.
-        self.readers.load(Ordering::Relaxed)
+        self.matched.readers.load(Ordering::Relaxed)
     }
 
     fn wait_matched(&self, readers: u32, max: Duration) -> u32 {
@@ -441,13 +455,58 @@ unsafe extern "C" fn readers_changed(
     arg: *mut c_void,
 ) {
     // SAFETY: the argument of the listener, which lives until the writer is deleted.
-    let readers = unsafe { &*arg.cast::<AtomicU32>() };
-    readers.store(status.current_count, Ordering::Relaxed);
+    let matched = unsafe { &*arg.cast::<Matched>() };
+    matched.readers.store(status.current_count, Ordering::Relaxed);
+    matched.changes.fetch_add(1, Ordering::Release);
+}
+
+/// The matched readers of a writer.
+#[derive(Debug, Default)]
+struct Matched {
+    /// Their number.
+    readers: AtomicU32,
+    /// The number of changes, which wraps.
+    changes: AtomicU32,
+}
+
+/// A property of the matched readers, which is found anew after they have changed.
+#[derive(Debug, Default)]
+struct AtOneMatch(AtomicU64);
+
+impl AtOneMatch {
+    /// Returns the property after so many changes.
+    fn get(&self, changes: u32, find: impl FnOnce() -> bool) -> bool {
+        // 0 is that of no change; the lowest bit is the property.
+        let at = (u64::from(changes) + 1) << 1;
+        let known = self.0.load(Ordering::Relaxed);
+        if known & !1 == at {
+            return known & 1 == 1;
+        }
+        let found = find();
+        self.0.store(at | u64::from(found), Ordering::Relaxed);
+        found
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn property_of_matched_readers_is_found_once_for_each_change() {
+        let property = AtOneMatch::default();
+        let mut found = 0;
+        for (changes, expected) in
+            [(0, true), (0, true), (1, false), (1, false), (u32::MAX, true), (0, false)]
+        {
+            let is = property.get(changes, || {
+                found += 1;
+                expected
+            });
+            assert_eq!(is, expected, "{changes}");
+        }
+        assert_eq!(found, 4);
+    }
 
     #[test]
     fn samples_of_varying_size_share_instances_evenly() {
