@@ -10,6 +10,7 @@ mod caller;
 #[allow(unsafe_code)]
 mod dds;
 mod flow;
+mod forwarder;
 mod node;
 mod ping;
 mod relay;
@@ -44,6 +45,8 @@ enum Role {
     Sink(flow::SinkArgs),
     /// Carries topics to another relay over TCP, as they are
     Relay(relay::RelayArgs),
+    /// Forwards the bytes of a TCP connection
+    Forwarder(forwarder::ForwarderArgs),
 }
 
 /// The arguments of every role.
@@ -81,6 +84,7 @@ fn main() -> Result<()> {
         Role::Source(args) => flow::source(&args),
         Role::Sink(args) => flow::sink(&args),
         Role::Relay(args) => relay::relay(&args),
+        Role::Forwarder(args) => forwarder::forward(&args),
     }
 }
 

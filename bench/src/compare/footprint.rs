@@ -27,7 +27,7 @@ use crate::process::{PATIENCE, SgcRouter, resident_bytes_of, status, status_fiel
 use crate::rib::LinkedOwners;
 
 const TABLE: &str = "footprint";
-const TOPICS: [usize; 5] = [0, 1, 10, 100, 1000];
+const TOPICS: [usize; 6] = [0, 1, 10, 100, 200, 1000];
 const NAMES: [usize; 4] = [0, 10_000, 100_000, 1_000_000];
 const LINKS: [usize; 4] = [1, 10, 100, 1000];
 /// Most topics, links or names in a quick run, which only shows that all works.

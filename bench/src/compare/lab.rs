@@ -148,6 +148,17 @@ impl Lab {
         let mut command = self.command(side, dds.load.as_deref().unwrap_or(&self.load));
         command.args(args).args(["--domain", &dds.domain.to_string()]);
         dds.configure(&mut command);
+        self.start_load(side, command, args)
+    }
+
+    /// Starts a load program that is in no local network.
+    pub(crate) fn load_alone(&self, side: Side, args: &[&str]) -> Result<Program> {
+        let mut command = self.command(side, &self.load);
+        command.args(args);
+        self.start_load(side, command, args)
+    }
+
+    fn start_load(&self, side: Side, command: Command, args: &[&str]) -> Result<Program> {
         let name = format!("load-{}-{}", side.name(), args.first().copied().unwrap_or_default());
         Program::start(&name, command, &self.new_dir(&name)?)
     }

@@ -44,10 +44,11 @@ impl Breadth {
 pub(crate) const RELAY: &str = "relay";
 
 /// Those that goals compare where the machine is the limit: they have a turn in each round, the others in the first.
-const OFTEN: [&str; 8] = [
+const OFTEN: [&str; 9] = [
     "direct",
     RELAY,
     "relay-gathers",
+    "relay-forwarder",
     "zenoh-tcp",
     "sgc-quic-group",
     "sgc-quic-pairwise",

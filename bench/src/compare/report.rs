@@ -524,12 +524,13 @@ fn measure(metric: &str) -> (Unit, f64, String) {
 
 /// A system's place among the others, by the parts of its name.
 fn systems<'a>(names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
-    const PEERS: [&str; 12] = [
+    const PEERS: [&str; 13] = [
         real_ros2::ONE_HOST,
         "tcp",
         "direct",
         "relay",
         "relay-gathers",
+        "relay-forwarder",
         "wireguard",
         "dds-security",
         "zenoh-tcp",

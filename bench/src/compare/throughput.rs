@@ -20,6 +20,8 @@ const RUN_SECONDS: f64 = 2.0;
 const WARM_UP_SECONDS: f64 = 0.3;
 /// The size that goals ask about: it alone is measured in every round, and of every variant.
 const SIZE_ASKED: usize = 1000;
+/// The system and size that show a router's processor time.
+const ROUTED: (&str, usize) = ("sgc-quic-group-router", 64 << 10);
 /// Most bytes that a run sends, so that its end soon follows its last write.
 const RUN_BYTES_MAX: usize = 2 << 30;
 
@@ -35,7 +37,9 @@ pub(crate) fn run(compare: &Compare, figures: &mut Figures) -> Result<()> {
         let has_turn = |name: &str| number < plan::rounds(&PathKind::Bare, name);
         for system in compare.systems().iter().chain(relays).filter(|system| has_turn(&system.name())) {
             let name = system.name();
-            let is_measured = |size| size == SIZE_ASKED || (number == 0 && others.contains(&name));
+            let is_measured = |size| {
+                size == SIZE_ASKED || (number == 0 && (others.contains(&name) || ROUTED == (&name, size)))
+            };
             for size in SIZES.into_iter().filter(|size| is_measured(*size)) {
                 let what = format!("{name} at {size} B");
                 round.measure(&what, |tally| measure(compare, &**system, size, tally));

@@ -68,7 +68,7 @@ pub(crate) fn all(sgc: &Path, peers: &Peers) -> Result<Vec<Box<dyn System>>> {
 
 /// Returns minimal relays between two networks, which are no systems for users, for tables of round trips and rates.
 pub(crate) fn relays() -> Vec<Box<dyn System>> {
-    relay::all().map(|relay| Box::new(relay) as Box<dyn System>).into()
+    relay::ALL.map(|relay| Box::new(relay) as Box<dyn System>).into()
 }
 
 /// Systems that [`configured`] has beside those of [`all`].

@@ -8,36 +8,58 @@ use super::{Dds, Networks, Running, System, Topic};
 use crate::compare::lab::{Lab, Side};
 
 const PORT: u16 = 7447;
+const FORWARDER_PORT: u16 = 7448;
 
 /// A relay at each place; the right one listens. For one topic each way.
-pub(crate) struct Relay {
-    /// Many messages at a time, by a thread of its own, which suits rates; otherwise each at once, which suits round
-    /// trips.
-    gathers: bool,
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Relay {
+    /// Sends each message at once, which suits round trips.
+    Plain,
+    /// Sends many messages at a time, from a thread of its own, which suits rates.
+    Gathers,
+    /// [`Plain`](Self::Plain), with a program between that forwards the bytes of the connection. The difference is the
+    /// least that a router costs.
+    Forwarder,
 }
 
-/// Both kinds.
-pub(crate) fn all() -> [Relay; 2] {
-    [false, true].map(|gathers| Relay { gathers })
-}
+/// Every kind.
+pub(crate) const ALL: [Relay; 3] = [Relay::Plain, Relay::Gathers, Relay::Forwarder];
 
 impl System for Relay {
     fn name(&self) -> String {
-        if self.gathers { "relay-gathers" } else { "relay" }.into()
+        match self {
+            Self::Plain => "relay",
+            Self::Gathers => "relay-gathers",
+            Self::Forwarder => "relay-forwarder",
+        }
+        .into()
     }
 
     fn start(&self, lab: &Lab, topics: &[Topic]) -> Result<Running> {
         let dds = Side::BOTH.map(|side| lab.networks.local(side));
         let mut running = Running { processes: Vec::new(), dds };
         let address = format!("{}:{PORT}", lab.address(Side::Right));
-        for (side, way, begun) in [(Side::Right, "--listen", "listening"), (Side::Left, "--connect", "up")] {
-            let mut args = vec!["relay", way, &address];
+        let dials = match self {
+            Self::Forwarder => format!("{}:{FORWARDER_PORT}", lab.address(Side::Right)),
+            Self::Plain | Self::Gathers => address.clone(),
+        };
+        for (side, way, at, begun) in
+            [(Side::Right, "--listen", &address, "listening"), (Side::Left, "--connect", &dials, "up")]
+        {
+            if *self == Self::Forwarder && side == Side::Left {
+                // At the right place, where the router of `sgc` is.
+                let args = ["forwarder", "--listen", &dials, "--connect", &address];
+                let mut program = lab.load_alone(Side::Right, &args)?;
+                program.soon("listening")?;
+                running.processes.push((Side::Right, program));
+            }
+            let mut args = vec!["relay", way, at];
             for (what, towards) in [("--take", side.other()), ("--give", side)] {
                 let mut its = topics.iter().filter(|topic| topic.towards == towards);
                 args.extend(its.next().iter().flat_map(|topic| [what, topic.name]));
                 ensure!(its.next().is_none(), "a relay carries one topic each way");
             }
-            if self.gathers {
+            if *self == Self::Gathers {
                 args.push("--gathers");
             }
             if lab.networks == Networks::Stock {
