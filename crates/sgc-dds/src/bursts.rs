@@ -5,7 +5,7 @@
 //! half and ask for it after the next heartbeat. A pause lets the subscriber's thread empty its buffer. Meanwhile the
 //! lock under which acknowledgements are handled is free: `transmit_sample_lgmsg_unlocks_wr` of the Cyclone that
 //! `cyclors` =0.4.0 builds sends fragments outside of it. Others of the same writer wait, as they do for each long
-//! message. Readers of Cyclone ask for a larger buffer, so a writer that has no other readers does not pause.
+//! message. Readers of Cyclone ask for a larger buffer, so a writer that has no other readers pauses less often.
 
 use std::cell::Cell;
 use std::thread;
@@ -15,6 +15,10 @@ use crate::config::FRAGMENT_BYTES;
 
 /// Bytes that are sent without a pause: eight fragments, so that other packets have room in the buffer, too.
 const BURST_BYTES: usize = 8 * FRAGMENT_BYTES as usize;
+
+/// The same if all readers ask for a larger buffer than the default, as Cyclone's do, of which the kernel grants twice
+/// the default (`net.core.rmem_max`).
+const LONG_BURST_BYTES: usize = 4 * BURST_BYTES;
 
 /// Pause after a burst. A subscriber's thread takes a burst within it, and a megabyte leaves within two milliseconds,
 /// faster than Ethernet at a gigabit a second carries it.
@@ -32,12 +36,16 @@ pub(crate) type Receiver = ([u8; 16], u32);
 /// first one count for all.
 #[derive(Clone, Copy, Debug)]
 struct Burst {
+    /// Bytes of a whole burst.
+    bytes: usize,
     left: usize,
     first: Option<Receiver>,
 }
 
 impl Burst {
-    const BEGUN: Self = Self { left: BURST_BYTES, first: None };
+    fn begin(bytes: usize) -> Self {
+        Self { bytes, left: bytes, first: None }
+    }
 
     /// Records a packet of this length. Returns `true` if a pause is due before it.
     fn send(&mut self, to: Receiver, bytes: usize) -> bool {
@@ -45,7 +53,7 @@ impl Burst {
             return false;
         }
         let is_over = bytes > self.left;
-        let left = if is_over { BURST_BYTES } else { self.left };
+        let left = if is_over { self.bytes } else { self.left };
         self.left = left.saturating_sub(bytes);
         is_over
     }
@@ -56,10 +64,17 @@ impl Burst {
 pub(crate) struct Bursts(());
 
 impl Bursts {
-    /// Begins a message.
-    pub(crate) fn begin() -> Self {
-        BURST.set(Some(Burst::BEGUN));
-        Self(())
+    /// Begins a message of this length. Returns `None` if it is sent at once. `has_small_buffers` tells whether a reader
+    /// may have a receive buffer of the default size, and is called for messages longer than the shorter burst.
+    pub(crate) fn begin(message_bytes: usize, has_small_buffers: impl FnOnce() -> bool) -> Option<Self> {
+        if message_bytes <= BURST_BYTES {
+            return None;
+        }
+        let bytes = if has_small_buffers() { BURST_BYTES } else { LONG_BURST_BYTES };
+        (message_bytes > bytes).then(|| {
+            BURST.set(Some(Burst::begin(bytes)));
+            Self(())
+        })
     }
 }
 
@@ -67,11 +82,6 @@ impl Drop for Bursts {
     fn drop(&mut self) {
         BURST.set(None);
     }
-}
-
-/// Returns `true` if a message of this length is more than a burst.
-pub(crate) fn is_long(message_bytes: usize) -> bool {
-    message_bytes > BURST_BYTES
 }
 
 /// Returns `true` if this thread sends in bursts.
@@ -96,7 +106,7 @@ mod tests {
     #[test]
     fn a_pause_is_due_whenever_a_burst_is_full() {
         let fragment = FRAGMENT_BYTES as usize;
-        let mut burst = Burst::BEGUN;
+        let mut burst = Burst::begin(BURST_BYTES);
         let [first, second] = [1, 2].map(|last| ([last; 16], 7410));
         let due: Vec<usize> = (0..30)
             .filter(|_| {
@@ -112,8 +122,11 @@ mod tests {
 
     #[test]
     fn only_the_thread_of_a_long_message_sends_in_bursts() {
-        assert!(!is_long(BURST_BYTES) && is_long(BURST_BYTES + 1) && !is_bursting());
-        let bursts = Bursts::begin();
+        let begin = |bytes, is_small| Bursts::begin(bytes, || is_small);
+        assert!(begin(BURST_BYTES, true).is_none() && begin(LONG_BURST_BYTES, false).is_none());
+        assert!(!is_bursting());
+        drop(begin(LONG_BURST_BYTES + 1, false).unwrap());
+        let bursts = begin(BURST_BYTES + 1, true);
         assert!(is_bursting());
         assert!(!thread::spawn(is_bursting).join().unwrap());
         drop(bursts);

@@ -21,7 +21,7 @@ use sgc_ros::{EndpointKind, EndpointSpec, Guid, KeyHash, RosError, RosWriter, Sa
 use sgc_sync::lock;
 use sgc_wire::{History, Qos};
 
-use crate::bursts::{self, Bursts};
+use crate::bursts::Bursts;
 use crate::entity::{Entity, INFINITE, check, reason};
 use crate::late;
 use crate::matched::{self, MATCHES_MAX};
@@ -389,8 +389,7 @@ impl RosWriter for CycloneWriter {
         let mut sample = sample.ok_or_else(|| failed("out of memory".into()))?;
         sample.set_status(statusinfo);
 
-        let is_paced = bursts::is_long(payload.len()) && self.has_small_buffers();
-        let _bursts = is_paced.then(Bursts::begin);
+        let _bursts = Bursts::begin(payload.len(), || self.has_small_buffers());
         let started = Instant::now();
         // SAFETY: the sample is valid and of the writer's type; the call consumes the reference.
         let ret = unsafe { dds_forwardcdr(self.writer.handle(), sample.into_raw()) };
