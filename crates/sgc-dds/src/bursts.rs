@@ -64,7 +64,7 @@ impl Burst {
 pub(crate) struct Bursts(());
 
 impl Bursts {
-    /// Begins a message of this length. Returns `None` if it is sent at once. `has_small_buffers` tells whether a reader
+    /// Begins a message of this length. Returns `None` if it is sent at once. `has_small_buffers` tells if a reader
     /// may have a receive buffer of the default size, and is called for messages longer than the shorter burst.
     pub(crate) fn begin(message_bytes: usize, has_small_buffers: impl FnOnce() -> bool) -> Option<Self> {
         if message_bytes <= BURST_BYTES {

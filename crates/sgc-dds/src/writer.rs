@@ -47,7 +47,7 @@ const TIMESTAMP_MAX_NS: i64 = 4_294_967_295_999_999_999;
 #[derive(Debug)]
 pub struct CycloneWriter {
     writer: Entity,
-    /// The matched readers, which the listener writes. It outlives the writer, because the listener has a pointer to it.
+    /// The matched readers, which the listener writes. It outlives the writer, because the listener points to it.
     matched: Arc<Matched>,
     /// Whether a matched reader may have a small receive buffer.
     has_small_buffers: AtOneMatch,

@@ -2,15 +2,14 @@
 
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
-use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::path::Path;
+use std::time::{Duration, Instant};
 
 use serde::Deserialize;
 use sgc_node::admin::AdminRequest;
 use sgc_node::config::Config;
 use sgc_node::graph::Graph;
 use sgc_node::{NodeError, SocketError};
-use sgc_process::files;
 use sgc_wire::Name;
 
 use crate::error::DiagnosisError;
@@ -18,8 +17,9 @@ use crate::error::DiagnosisError;
 /// Longest time a node may take to answer.
 pub const ANSWER_MAX: Duration = Duration::from_secs(5);
 /// Largest answer that is read.
-const STATUS_BYTES_MAX: u64 = 64 * 1024 * 1024;
-const SOCKET_EXTENSION: &str = "sock";
+const STATUS_BYTES_MAX: usize = 64 * 1024 * 1024;
+/// Bytes that are read at a time.
+const READ_BYTES: usize = 64 * 1024;
 
 /// Asks the node at a socket for its graph. `name` adds what a router knows of this name.
 pub fn graph(socket: &Path, name: Option<Name>) -> Result<Graph, DiagnosisError> {
@@ -59,13 +59,6 @@ pub fn node_name(config: &Config) -> Result<String, NodeError> {
     }
 }
 
-/// Returns the sockets of this user's nodes in their usual place, whether a node answers there or not.
-pub fn usual_sockets() -> Vec<PathBuf> {
-    let usual = sgc_node::default_socket_path("node");
-    let dir = usual.parent().unwrap_or(Path::new("/"));
-    files::with_extension(dir, SOCKET_EXTENSION).unwrap_or_default()
-}
-
 /// Explains why no node answers at this socket.
 pub fn no_node(socket: &Path, error: &std::io::Error, patience: Duration) -> DiagnosisError {
     DiagnosisError::NoNode {
@@ -87,15 +80,28 @@ pub fn connect(socket: &Path, patience: Duration) -> Result<UnixStream, Diagnosi
     })
 }
 
-/// Asks a node and returns its raw answer.
+/// Asks a node and returns its raw answer, which has to be whole within `patience`.
 pub fn ask(socket: &Path, request: &AdminRequest, patience: Duration) -> Result<String, DiagnosisError> {
     let no_node = |error: std::io::Error| no_node(socket, &error, patience);
     let mut stream = connect(socket, patience)?;
-    stream.set_read_timeout(Some(patience)).map_err(no_node)?;
+    let until = Instant::now() + patience;
     stream.set_write_timeout(Some(patience)).map_err(no_node)?;
     // A node of an earlier version answers without reading.
     let _ = stream.write_all(request.to_line().as_bytes());
-    let mut text = String::new();
-    stream.take(STATUS_BYTES_MAX).read_to_string(&mut text).map_err(no_node)?;
-    Ok(text)
+    let mut answer = Vec::new();
+    let mut buffer = vec![0; READ_BYTES];
+    while answer.len() < STATUS_BYTES_MAX {
+        let left = until.saturating_duration_since(Instant::now());
+        if left.is_zero() {
+            return Err(no_node(std::io::ErrorKind::WouldBlock.into()));
+        }
+        stream.set_read_timeout(Some(left)).map_err(no_node)?;
+        match stream.read(&mut buffer) {
+            Ok(0) => break,
+            Ok(read) => answer.extend(buffer.iter().take(read)),
+            Err(error) if error.kind() == std::io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(no_node(error)),
+        }
+    }
+    String::from_utf8(answer).map_err(|_| no_node(std::io::ErrorKind::InvalidData.into()))
 }

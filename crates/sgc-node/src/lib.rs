@@ -29,7 +29,7 @@ pub use local::discovery_server;
 pub use state::audit;
 
 pub use admin::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status};
-pub use admin::{SocketError, default_socket_path};
+pub use admin::{SocketError, default_socket_path, find_socket, has_hidden_services, usual_sockets};
 pub use control::fleet::members::{UnknownMember, unknown_members};
 pub use control::fleet::operations::OperationError;
 pub use control::fleet::operators::{roster_head, roster_row};
@@ -44,9 +44,9 @@ pub use gateway::access::{
 pub use gateway::{GatewayStartError, OpenLocalRos};
 pub use link::push_crl::{PushCrlError, push_crl};
 pub use node::{
-    NodeError, OpenNetwork, RunOptions, admin_socket_path, check_identity, enclave_of, load_identity, run,
-    run_on, run_opening,
+    NodeError, OpenNetwork, RunOptions, Watchdog, admin_socket_path, check_identity, enclave_of,
+    load_identity, run, run_on, run_opening,
 };
 pub use state::fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use state::run_lock::IdentityInUse;
-pub use state::{StateError, check_state_dir, create_state_dir, state_dir};
+pub use state::{StateError, check_state_dir, create_state_dir, state_bases, state_dir};

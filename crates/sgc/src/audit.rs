@@ -3,7 +3,7 @@
 //! It reads the log that the node writes and its rotated files; the node need not run. Parts of a log come from other
 //! machines, so control characters never reach the terminal.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
@@ -132,17 +132,19 @@ fn path(args: &AuditArgs) -> Result<PathBuf, CliError> {
         let dir = usual(node).ok_or(sgc_node::StateError::Nowhere)?;
         return Ok(dir.join(FILE_NAME));
     }
-    let dir = usual("node").ok_or(sgc_node::StateError::Nowhere)?;
-    only_log(dir.parent().unwrap_or(Path::new("/")))
+    only_log(&sgc_node::state_bases())
 }
 
-fn only_log(dir: &Path) -> Result<PathBuf, CliError> {
-    let entries = std::fs::read_dir(dir).into_iter().flatten().flatten();
+fn only_log(dirs: &[PathBuf]) -> Result<PathBuf, CliError> {
+    let entries = dirs.iter().filter_map(|dir| std::fs::read_dir(dir).ok()).flatten().flatten();
     let mut found: Vec<_> = entries.map(|e| e.path().join(FILE_NAME)).filter(|path| path.is_file()).collect();
     found.sort();
     let reason = match found.len() {
         1 => return Ok(found.swap_remove(0)),
-        0 => format!("no node has a log in {}; name one with -c or --file", dir.display()),
+        0 => {
+            let dirs: Vec<_> = dirs.iter().map(|dir| dir.display().to_string()).collect();
+            format!("no node has a log in {}; name one with -c or --file", dirs.join(" or "))
+        }
         _ => {
             let nodes: Vec<_> = found
                 .iter()

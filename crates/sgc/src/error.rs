@@ -132,6 +132,12 @@ pub(crate) enum CliError {
         /// The usual place.
         dir: PathBuf,
     },
+    /// No status socket was named, and services run whose sockets this user may not use.
+    #[error(
+        "a node runs as a service here, and you may not ask it: write `sudo` in front, or join its group by \
+         `sudo usermod -aG sgc $USER` and log in again"
+    )]
+    ServicesOfOthers,
     /// No status socket was named and several are in the usual place.
     #[error("which node? Name one with --node: {}", nodes.join(", "))]
     SeveralNodes {
@@ -304,17 +310,24 @@ impl CliError {
             | Self::Token(_)
             | Self::TokenShown
             | Self::Cannot { .. } => EXIT_USAGE,
+            // Something that may go away by itself, for which a supervisor starts the node again.
             Self::Node(
                 NodeError::Listen { .. }
                 | NodeError::IdentityInUse { .. }
                 | NodeError::Ros(_)
+                | NodeError::Thread(_)
+                | NodeError::Audit { .. }
+                | NodeError::State(StateError::Directory { .. })
                 | NodeError::Randomness(_),
             ) => EXIT_FAILURE,
+            Self::Node(NodeError::Gateway(error)) if error.may_pass() => EXIT_FAILURE,
+            Self::Node(NodeError::IdentityFile { source, .. }) if !is_lacking(source) => EXIT_FAILURE,
             Self::Node(_) => EXIT_USAGE,
             Self::Process(_)
             | Self::FleetFile(FleetFileError::Read { .. } | FleetFileError::Write { .. })
             | Self::Diagnosis(_)
             | Self::NoNodeHere { .. }
+            | Self::ServicesOfOthers
             | Self::NodeRefused { .. }
             | Self::NoDefinition { .. }
             | Self::NoSuchField { .. }
@@ -419,6 +432,11 @@ fn count(errors: &ConfigErrors) -> String {
         1 => "1 mistake".to_owned(),
         n => format!("{n} mistakes"),
     }
+}
+
+/// Returns `true` if a file is missing or belongs to somebody else, which another start does not change.
+fn is_lacking(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::PermissionDenied)
 }
 
 #[cfg(test)]

@@ -25,15 +25,18 @@ mod memory;
 mod name;
 mod node;
 mod output;
+mod pages;
 mod policy;
 mod reload;
 mod run;
 mod service;
 mod share_token;
 mod status;
+mod supervisor;
 mod token;
 mod topic;
 mod use_token;
+mod version;
 mod why;
 mod yaml;
 
@@ -42,12 +45,13 @@ use std::process::ExitCode;
 use clap::{CommandFactory as _, Parser, Subcommand};
 
 use crate::error::CliError;
+pub use crate::version::Build;
 pub use sgc_diagnosis::{COUNTERS, CounterTable, Refusal};
 
 /// Secure global connectivity for ROS 2: share exactly the topics you name with exactly the nodes you trust,
 /// between ROS 2 networks anywhere.
 #[derive(Debug, Parser)]
-#[command(name = "sgc", version, max_term_width = 100)]
+#[command(name = "sgc", version = version::version(), max_term_width = 100)]
 #[command(after_help = "A first use:
   sgc demo                                  see it work on this machine
   sgc fleet create lab                      make a fleet: lab.fleet
@@ -81,12 +85,16 @@ enum Command {
     ShareToken(share_token::ShareTokenArgs),
     Use(use_token::UseArgs),
     Name(name::NameArgs),
+    Completions(pages::CompletionsArgs),
+    #[command(hide = true)]
+    Man(pages::ManArgs),
     #[command(hide = true)]
     DemoPeer(demo::PeerArgs),
 }
 
 /// Runs the command that the arguments of the process name.
-pub fn main() -> ExitCode {
+pub fn main(build: Build) -> ExitCode {
+    version::set(build);
     let result = match Cli::try_parse() {
         Ok(cli) => {
             memory::close(cli.allow_core_dumps);
@@ -136,6 +144,8 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::ShareToken(args) => share_token::share_token(&args),
         Command::Use(args) => use_token::use_token(&args),
         Command::Name(args) => name::name(&args),
+        Command::Completions(args) => pages::completions(&args),
+        Command::Man(args) => pages::man(&args),
         Command::DemoPeer(args) => demo::peer(args),
     }
     .map(|()| ExitCode::SUCCESS)

@@ -3,5 +3,6 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    sgc::main()
+    // The Makefile sets the variables.
+    sgc::main(sgc::Build { commit: option_env!("SGC_COMMIT"), date: option_env!("SGC_COMMIT_DATE") })
 }

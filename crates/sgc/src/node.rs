@@ -1,4 +1,5 @@
-//! The running node of a command: named by its configuration, its name or its socket, or the only one of this user.
+//! The running node of a command: named by its configuration, its name or its socket, or the only one of this user and
+//! of the services that this user may ask.
 
 use std::path::{Path, PathBuf};
 
@@ -13,7 +14,7 @@ use crate::error::CliError;
 /// The node to ask.
 #[derive(Debug, Args)]
 pub(crate) struct NodeArgs {
-    /// Configuration of the node; without it, the only node that this user runs here
+    /// Configuration of the node; without it, the only node of this user or of a service here
     #[arg(short, long, value_name = "FILE", conflicts_with_all = ["socket", "node"])]
     config: Option<PathBuf>,
     /// Name of the node, if its socket is in the usual place
@@ -27,8 +28,7 @@ pub(crate) struct NodeArgs {
 impl NodeArgs {
     /// Returns the node's status socket.
     pub(crate) fn socket(&self) -> Result<PathBuf, CliError> {
-        let named = self.node.as_deref().map(sgc_node::default_socket_path);
-        socket(self.config.as_deref(), named.as_deref().or(self.socket.as_deref()))
+        socket(self.config.as_deref(), self.node.as_deref(), self.socket.as_deref())
     }
 
     /// Returns the node's graph.
@@ -37,21 +37,41 @@ impl NodeArgs {
     }
 }
 
-/// Returns the named socket, the socket of the configuration, or the only socket of this user.
-pub(crate) fn socket(config: Option<&Path>, socket: Option<&Path>) -> Result<PathBuf, CliError> {
+/// Returns the named socket, the socket of the configuration, or the only socket of this user and of services.
+pub(crate) fn socket(
+    config: Option<&Path>,
+    node: Option<&str>,
+    socket: Option<&Path>,
+) -> Result<PathBuf, CliError> {
     if let Some(socket) = socket {
         return Ok(socket.to_owned());
+    }
+    if let Some(node) = node {
+        return socket_of(node);
     }
     let Some(path) = config else { return only_socket() };
     let config = config::load(path, &environment)
         .map_err(|errors| CliError::Config { what: path.display().to_string(), errors })?;
-    Ok(sgc_node::admin_socket_path(&config, &ask::node_name(&config)?))
+    match config.admin_socket {
+        Some(socket) => Ok(socket),
+        None => socket_of(&ask::node_name(&config)?),
+    }
 }
 
-/// Returns the socket of the only node that this user runs with a default socket.
+/// Returns the usual socket of a node.
+fn socket_of(node: &str) -> Result<PathBuf, CliError> {
+    let socket = sgc_node::find_socket(node);
+    if !socket.exists() && sgc_node::has_hidden_services() {
+        return Err(CliError::ServicesOfOthers);
+    }
+    Ok(socket)
+}
+
+/// Returns the socket of the only node that this user runs with a default socket, or that is a service of this host.
 fn only_socket() -> Result<PathBuf, CliError> {
-    let mut found = ask::usual_sockets();
+    let mut found = sgc_node::usual_sockets();
     match found.len() {
+        0 if sgc_node::has_hidden_services() => Err(CliError::ServicesOfOthers),
         0 => {
             let usual = sgc_node::default_socket_path("node");
             Err(CliError::NoNodeHere { dir: usual.parent().unwrap_or(Path::new("/")).to_owned() })

@@ -23,7 +23,7 @@ const ANSWER_MAX: Duration = Duration::from_secs(30);
 /// differences. SIGHUP does the same and logs the result.
 #[derive(Debug, Args)]
 pub(crate) struct ReloadArgs {
-    /// Configuration of the node; without it, the only node that this user runs here
+    /// Configuration of the node; without it, the only node of this user or of a service here
     #[arg(short, long, value_name = "FILE", conflicts_with_all = ["socket", "node"])]
     config: Option<PathBuf>,
     /// Name of the node, if its socket is in the usual place
@@ -56,8 +56,7 @@ struct Report {
 
 /// Runs `sgc reload`.
 pub(crate) fn reload(args: &ReloadArgs) -> Result<(), CliError> {
-    let named = args.node.as_deref().map(sgc_node::default_socket_path);
-    let socket = node::socket(args.config.as_deref(), named.as_deref().or(args.socket.as_deref()))?;
+    let socket = node::socket(args.config.as_deref(), args.node.as_deref(), args.socket.as_deref())?;
     let report = ask(&socket)?;
     if args.json {
         return output::line(report);

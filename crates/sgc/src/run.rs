@@ -18,7 +18,7 @@ use tokio::sync::{mpsc, oneshot};
 use crate::environment::environment;
 use crate::error::CliError;
 use crate::log::start_log;
-use crate::{heap, output};
+use crate::{heap, output, supervisor, version};
 
 /// Time by which working threads may delay the end of the process.
 const RUNTIME_GRACE: Duration = Duration::from_secs(1);
@@ -195,19 +195,26 @@ fn run_node(
         let signals = EndSignals::without_hang_up()?;
         let hang_ups = HangUps::new()?;
         let (wishes, reload) = mpsc::channel(1);
-        let mut options =
-            RunOptions { source: Some(source), reload: Some(reload), file, ..RunOptions::default() };
-        if process.print_ready {
-            let (ready, when_ready) = oneshot::channel::<Vec<_>>();
-            options.ready = Some(ready);
-            tokio::spawn(async move {
-                if let Ok(addresses) = when_ready.await {
-                    let ready = addresses.iter().map(ToString::to_string).collect();
-                    // A failure to print is ignored: if the parent is gone, standard input ends too.
-                    let _ = serde_json::to_string(&ReadyLine { ready }).map(output::line);
-                }
-            });
-        }
+        let (ready, when_ready) = oneshot::channel::<Vec<_>>();
+        let options = RunOptions {
+            ready: Some(ready),
+            source: Some(source),
+            reload: Some(reload),
+            file,
+            watchdog: supervisor::watchdog(),
+            program: Some(format!("sgc {}", version::version())),
+            ..RunOptions::default()
+        };
+        let prints_ready = process.print_ready;
+        tokio::spawn(async move {
+            let Ok(addresses) = when_ready.await else { return };
+            supervisor::ready();
+            if prints_ready {
+                let ready = addresses.iter().map(ToString::to_string).collect();
+                // A failure to print is ignored: if the parent is gone, standard input ends too.
+                let _ = serde_json::to_string(&ReadyLine { ready }).map(output::line);
+            }
+        });
         sgc_node::run(config, options, shutdown(signals, hang_ups.serve(wishes), stdin_closed))
             .await
             .map_err(CliError::Node)
@@ -233,5 +240,6 @@ async fn shutdown(
         () = orphaned => {}
         () = terminal_gone => {}
     }
+    supervisor::stopping();
     signals.end_at_once();
 }

@@ -3,9 +3,10 @@
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use clap::Args;
-use sgc_diagnosis::ask::{ANSWER_MAX, ask, usual_sockets};
+use sgc_diagnosis::ask::{ANSWER_MAX, ask};
 use sgc_diagnosis::status::parse;
 use sgc_node::admin::AdminRequest;
+use sgc_node::usual_sockets;
 
 use crate::error::CliError;
 use crate::node::NodeArgs;

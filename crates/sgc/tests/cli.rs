@@ -527,8 +527,26 @@ fn usage_errors_are_one_line_and_code_2() {
     // Without a command, sgc prints its help.
     assert!(place.bad(2, &[]).contains("Usage: sgc [OPTIONS] <COMMAND>"));
     assert!(place.good(&["--help"]).contains("Usage: sgc [OPTIONS] <COMMAND>"));
-    assert_eq!(place.good(&["--version"]), format!("sgc {}\n", env!("CARGO_PKG_VERSION")));
+    let version = place.good(&["--version"]);
+    assert!(version.starts_with(concat!("sgc ", env!("CARGO_PKG_VERSION"))), "{version}");
     assert!(!place.good(&["--help"]).contains("demo-peer"));
+}
+
+#[test]
+fn completions_and_man_pages_know_every_command() {
+    let place = Place::new();
+    for shell in ["bash", "zsh", "fish"] {
+        let text = place.good(&["completions", shell]);
+        assert!(text.contains("rotate-secret") && !text.contains("demo-peer"), "{shell}");
+    }
+    assert!(place.bad(2, &["completions", "tcsh"]).contains("tcsh"));
+    fs::create_dir(place.path().join("man")).unwrap();
+    place.good(&["man", "man"]);
+    let page = |name: &str| fs::read_to_string(place.path().join("man").join(name));
+    assert!(page("sgc.1").unwrap().contains(r"sgc\-run"));
+    assert!(page("sgc-fleet-rotate-secret.1").unwrap().contains("new generation"));
+    assert!(page("sgc-demo-peer.1").is_err() && page("sgc-man.1").is_err());
+    assert!(place.bad(1, &["man", "nowhere"]).contains("nowhere"));
 }
 
 #[test]

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 use std::io::{BufRead, BufReader, Read};
+use std::os::unix::net::UnixDatagram;
 use std::path::Path;
 use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
@@ -24,6 +25,11 @@ struct Router {
 
 impl Router {
     fn start() -> Self {
+        Self::start_with(|_, _| {})
+    }
+
+    /// Starts it with further variables, for which it gets its directory.
+    fn start_with(variables: impl FnOnce(&mut Command, &Path)) -> Self {
         let place = tempfile::tempdir().unwrap();
         for args in [&["fleet", "create", "lab"][..], &["fleet", "enroll", "cloud", "--router"]] {
             assert!(sgc(place.path(), args).output().unwrap().status.success());
@@ -31,6 +37,7 @@ impl Router {
         let args = ["router", "--identity", "cloud.identity", "--listen", "quic://127.0.0.1:0"];
         let mut command =
             sgc(place.path(), &[&args[..], &["--print-ready", "--until-stdin-closes"]].concat());
+        variables(&mut command, place.path());
         let mut child = command.stdin(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         let mut stdout = BufReader::new(child.stdout.take().unwrap());
         let mut line = String::new();
@@ -109,6 +116,38 @@ fn either_signal_ends_a_node_cleanly() {
         assert!(status.success(), "{signal:?}: {status}\n{log}");
         assert!(!socket.exists());
     }
+}
+
+#[test]
+fn service_manager_hears_of_start_life_and_end() {
+    let notified = std::cell::OnceCell::new();
+    let router = Router::start_with(|command, dir| {
+        let path = dir.join("notify");
+        let socket = UnixDatagram::bind(&path).unwrap();
+        socket.set_read_timeout(Some(PATIENCE)).unwrap();
+        command.env("NOTIFY_SOCKET", &path).env("WATCHDOG_USEC", "400000");
+        notified.set(socket).unwrap();
+    });
+    let socket = notified.into_inner().unwrap();
+    let hear = || {
+        let mut bytes = [0; 256];
+        let length = socket.recv(&mut bytes).unwrap();
+        String::from_utf8(bytes[..length].to_vec()).unwrap()
+    };
+    let mut heard = vec![hear(), hear(), hear()];
+    heard.sort();
+    assert_eq!(heard, ["READY=1\n", "WATCHDOG=1\n", "WATCHDOG=1\n"]);
+    router.signal(Signal::TERM);
+    // The watchdog may be fed until it has stopped.
+    while hear() != "STOPPING=1\n" {}
+    let (status, log) = router.end();
+    assert!(status.success(), "{log}");
+    let first = log.lines().find(|line| line.contains("node cloud of fleet lab")).unwrap();
+    assert!(first.contains(concat!("sgc ", env!("CARGO_PKG_VERSION"))), "{first}");
+    assert!(
+        first.contains("router at quic://127.0.0.1:") && first.contains("configured by arguments"),
+        "{first}"
+    );
 }
 
 #[test]

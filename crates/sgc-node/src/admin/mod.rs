@@ -29,8 +29,10 @@ use tokio::task::JoinHandle;
 use tracing::{debug, info, warn};
 use zeroize::Zeroizing;
 
-pub use self::socket::{SocketError, connect, default_socket_path};
-use self::socket::{StatusSocket, may_ask};
+use self::socket::{ROOT, StatusSocket};
+pub use self::socket::{
+    SocketError, connect, default_socket_path, find_socket, has_hidden_services, usual_sockets,
+};
 
 use crate::admin::graph::Side;
 use crate::admin::shell::{CallRequest, PublishRequest};
@@ -349,13 +351,16 @@ async fn serve(socket: &StatusSocket, desk: &Desk) {
             }
         };
         let (desk, taps, refused) = (desk.clone(), taps.clone(), refused.clone());
+        let asks = stream.peer_cred().map(|peer| (peer.uid(), socket.may_ask(peer.uid())));
+        let own = rustix::process::geteuid().as_raw();
         tokio::spawn(async move {
-            match stream.peer_cred().map(|peer| peer.uid()) {
-                Ok(uid) if may_ask(uid) => {
-                    answer(stream, &desk.events, &desk.reloader, &taps, &desk.gateway).await;
+            match asks {
+                Ok((uid, true)) => {
+                    let is_own = uid == own || uid == ROOT;
+                    answer(stream, is_own, &desk, &taps).await;
                 }
                 // The socket's mode keeps others out already, unless somebody changed it.
-                Ok(uid) => refuse(&mut stream, uid, &refused).await,
+                Ok((uid, false)) => refuse(&mut stream, uid, &refused).await,
                 Err(error) => debug!(%error, "the user of a client of the status socket is unknown"),
             }
             drop(place);
@@ -374,13 +379,9 @@ async fn refuse(stream: &mut UnixStream, uid: u32, was_said: &AtomicBool) {
     let _ = tokio::time::timeout(TRANSFER_MAX, stream.write_all(text.as_bytes())).await;
 }
 
-async fn answer(
-    mut stream: UnixStream,
-    events: &mpsc::Sender<CoreEvent>,
-    reloader: &Reloader,
-    taps: &Semaphore,
-    gateway: &Gateway,
-) {
+/// Answers a request. Only the node's own user and root may change the fleet.
+async fn answer(mut stream: UnixStream, is_own: bool, desk: &Desk, taps: &Semaphore) {
+    let Desk { events, reloader, gateway } = desk;
     let request = read_line(&mut stream).await.and_then(|line| AdminRequest::parse(&line));
     let text = match request {
         Ok(AdminRequest::Status) => match status(events, gateway).await {
@@ -408,6 +409,9 @@ async fn answer(
                 debug!(%error, "a publishing client of the status socket disconnected");
             }
             return;
+        }
+        Ok(AdminRequest::Operate { .. }) if !is_own => {
+            envelope(Err("only the user of this node and root may change the fleet through it".to_owned()))
         }
         Ok(request) => envelope(carry_out(request, events, reloader, gateway).await),
         Err(error) => envelope(Err(error.to_string())),

@@ -11,15 +11,31 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 
 use rustix::fs::{FlockOperation, OFlags, flock};
+use sgc_trust::NodeName;
 use tokio::net::UnixListener;
 
 /// Permission bits of others than the owner.
 const OTHERS_BITS: u32 = 0o077;
+/// Permission bits of everyone but the owner and the group.
+const WORLD_BITS: u32 = 0o007;
+/// Permission bits with which the group may enter and list a directory.
+const GROUP_ENTERS_BITS: u32 = 0o050;
+/// Permission bits of a socket that the group of its directory may use.
+const SHARED_SOCKET_MODE: u32 = 0o660;
+const OWN_SOCKET_MODE: u32 = 0o600;
 /// Permission bit that lets everyone create and remove files.
 const WORLD_WRITE_BIT: u32 = 0o002;
+/// Permission bit that lets the group create and remove files.
+const GROUP_WRITE_BIT: u32 = 0o020;
 /// Permission bit that restricts removal to owners.
 const STICKY_BIT: u32 = 0o1000;
-const ROOT: u32 = 0;
+/// The user id of root.
+pub(super) const ROOT: u32 = 0;
+/// Directory in which systemd creates the runtime directory of each node of `sgc@.service`.
+const SERVICES_DIR: &str = "/run/sgc";
+const SOCKET_EXTENSION: &str = "sock";
+/// Most sockets of one directory that are considered.
+const SOCKETS_MAX: usize = 64;
 
 /// Reasons why a status socket cannot be opened or used.
 #[derive(Debug, thiserror::Error)]
@@ -80,6 +96,93 @@ pub fn default_socket_path(node: &str) -> PathBuf {
     usual_dir(&|name| std::env::var_os(name).map(PathBuf::from)).join(format!("{node}.sock"))
 }
 
+/// Returns the path of the status socket of the node with this name that runs here: that of this user's node or, if
+/// none answers, that of a service. Without either, it is [`default_socket_path`].
+pub fn find_socket(node: &str) -> PathBuf {
+    let own = default_socket_path(node);
+    if answers(&own) {
+        return own;
+    }
+    let is_it = |path: &PathBuf| path.file_stem().is_some_and(|name| name == node);
+    service_sockets(Path::new(SERVICES_DIR)).into_iter().find(is_it).unwrap_or(own)
+}
+
+/// Returns the status sockets of the nodes of this user and of those services whose directories the user may read. A
+/// socket at which no node answers is among them only if there is no other.
+pub fn usual_sockets() -> Vec<PathBuf> {
+    let own = usual_dir(&|name| std::env::var_os(name).map(PathBuf::from));
+    // Anybody may have made a directory below `/tmp`.
+    let is_safe = own != temporary_dir() || check_dir(&own, true).is_ok();
+    let mut sockets = if is_safe { sockets_in(&own) } else { Vec::new() };
+    sockets
+        .extend(service_sockets(Path::new(SERVICES_DIR)).into_iter().filter(|path| !path.starts_with(&own)));
+    if sockets.len() > 1 && sockets.iter().any(|path| answers(path)) {
+        sockets.retain(|path| answers(path));
+    }
+    sockets
+}
+
+/// Returns `true` if a process has this socket. It is asked nothing.
+fn answers(path: &Path) -> bool {
+    UnixStream::connect(path).is_ok()
+}
+
+/// Returns `true` if a service has a directory for its socket that this user may not read.
+pub fn has_hidden_services() -> bool {
+    directories_in(Path::new(SERVICES_DIR))
+        .iter()
+        .any(|dir| fs::read_dir(dir).is_err_and(|error| error.kind() == io::ErrorKind::PermissionDenied))
+}
+
+/// Returns the sockets of services, whose directories are in `services`.
+fn service_sockets(services: &Path) -> Vec<PathBuf> {
+    directories_in(services).iter().flat_map(|dir| sockets_in(dir)).collect()
+}
+
+fn directories_in(dir: &Path) -> Vec<PathBuf> {
+    entries_of(dir, |path| path.is_dir())
+}
+
+/// Returns the sockets with names of nodes, at most [`SOCKETS_MAX`]: the user of a service chooses them.
+fn sockets_in(dir: &Path) -> Vec<PathBuf> {
+    let is_socket = |path: &Path| {
+        path.extension().is_some_and(|extension| extension == SOCKET_EXTENSION)
+            && path
+                .file_stem()
+                .and_then(|name| name.to_str())
+                .is_some_and(|name| name.parse::<NodeName>().is_ok())
+    };
+    let mut sockets = entries_of(dir, is_socket);
+    sockets.truncate(SOCKETS_MAX);
+    sockets
+}
+
+/// Returns the entries that are wanted, in the order of their names; none if the directory cannot be read.
+fn entries_of(dir: &Path, is_wanted: impl Fn(&Path) -> bool) -> Vec<PathBuf> {
+    let entries = fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut wanted: Vec<_> = entries.filter(|path| is_wanted(path)).collect();
+    wanted.sort();
+    wanted
+}
+
+/// Returns `true` if root made this directory in `services` for a service, and lets the service's group enter, but
+/// nobody else.
+fn is_of_service(dir: &Path, services: &Path) -> bool {
+    let is_in_services = dir.parent() == Some(services);
+    let is_root_s = |metadata: &fs::Metadata| {
+        metadata.is_dir()
+            && metadata.uid() == ROOT
+            && metadata.permissions().mode() & (WORLD_WRITE_BIT | GROUP_WRITE_BIT) == 0
+    };
+    let is_for_group = |metadata: &fs::Metadata| {
+        let mode = metadata.permissions().mode();
+        metadata.is_dir() && mode & WORLD_BITS == 0 && mode & GROUP_ENTERS_BITS == GROUP_ENTERS_BITS
+    };
+    is_in_services
+        && fs::symlink_metadata(services).is_ok_and(|metadata| is_root_s(&metadata))
+        && fs::symlink_metadata(dir).is_ok_and(|metadata| is_for_group(&metadata))
+}
+
 /// Returns the directory of status sockets: the user's runtime directory, that of a systemd service, or one below
 /// `/tmp`.
 fn usual_dir(variable: &dyn Fn(&str) -> Option<PathBuf>) -> PathBuf {
@@ -123,8 +226,8 @@ fn check_dir(dir: &Path, anybody_makes: bool) -> Result<(), SocketError> {
     if is_exposed { Err(SocketError::Exposed { dir: dir.to_owned(), mode }) } else { Ok(()) }
 }
 
-/// Connects to a status socket, if its process belongs to this user or to root. Root may also connect to the process of
-/// the user who owns the socket's directory.
+/// Connects to a status socket, if its process belongs to this user or to root. Root and, for a service, members of its
+/// group may also connect to the process of the user who owns the socket's directory.
 pub fn connect(path: &Path) -> Result<UnixStream, SocketError> {
     let dir = directory(path);
     if dir == temporary_dir() && fs::symlink_metadata(dir).is_ok() {
@@ -132,21 +235,17 @@ pub fn connect(path: &Path) -> Result<UnixStream, SocketError> {
     }
     let stream = UnixStream::connect(path)?;
     let uid = rustix::net::sockopt::socket_peercred(&stream).map_err(io::Error::from)?.uid.as_raw();
-    let expected = expected_uid(dir);
+    let expected = expected_uid(dir, Path::new(SERVICES_DIR));
     if uid == expected || uid == ROOT { Ok(stream) } else { Err(SocketError::Stranger { uid, expected }) }
 }
 
 /// Returns the user whose node should have a socket in this directory.
-fn expected_uid(dir: &Path) -> u32 {
-    match (own_uid(), fs::metadata(dir)) {
-        (ROOT, Ok(metadata)) => metadata.uid(),
-        (own, _) => own,
+fn expected_uid(dir: &Path, services: &Path) -> u32 {
+    match fs::metadata(dir) {
+        // Root made the directory of a service for its user, so nobody else can have the socket.
+        Ok(metadata) if own_uid() == ROOT || is_of_service(dir, services) => metadata.uid(),
+        _ => own_uid(),
     }
-}
-
-/// Returns `true` if a process of this user may send requests.
-pub(super) fn may_ask(uid: u32) -> bool {
-    uid == own_uid() || uid == ROOT
 }
 
 /// A status socket of this node. Dropping it removes the socket, if the path still leads to it, and releases the lock.
@@ -156,13 +255,20 @@ pub(super) struct StatusSocket {
     listener: UnixListener,
     /// Device and inode of the socket.
     identity: (u64, u64),
+    /// Members of the group of the socket's directory may send requests.
+    is_shared: bool,
     /// Lock, held while this lives. The kernel releases it when the process ends for any reason.
     _lock: fs::File,
 }
 
 impl StatusSocket {
-    /// Binds the socket for this user alone. It replaces the socket of a dead node, but not of a live one.
+    /// Binds the socket for this user alone or, in the directory of a service, for the members of its group, too. It
+    /// replaces the socket of a dead node, but not of a live one.
     pub(super) fn bind(path: &Path) -> Result<Self, SocketError> {
+        Self::bind_in(path, Path::new(SERVICES_DIR))
+    }
+
+    fn bind_in(path: &Path, services: &Path) -> Result<Self, SocketError> {
         let dir = directory(path);
         let failed = |source| SocketError::Directory { dir: dir.to_owned(), source };
         fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
@@ -177,9 +283,17 @@ impl StatusSocket {
             _ => {}
         }
         let listener = UnixListener::bind(path)?;
-        fs::set_permissions(path, fs::Permissions::from_mode(0o600))?;
+        let is_shared = is_of_service(dir, services);
+        let mode = if is_shared { SHARED_SOCKET_MODE } else { OWN_SOCKET_MODE };
+        fs::set_permissions(path, fs::Permissions::from_mode(mode))?;
         let identity = identity(path)?;
-        Ok(Self { path: path.to_owned(), listener, identity, _lock: lock })
+        Ok(Self { path: path.to_owned(), listener, identity, is_shared, _lock: lock })
+    }
+
+    /// Returns `true` if a process of this user may send requests. Only members of the group can connect to a shared
+    /// socket, because of its mode.
+    pub(super) fn may_ask(&self, uid: u32) -> bool {
+        self.is_shared || uid == own_uid() || uid == ROOT
     }
 
     /// Returns the listener.
@@ -296,6 +410,43 @@ mod tests {
                 assert!(matches!(checked, Err(SocketError::NotOurs { uid: NOBODY, .. })), "{checked:?}");
             }
         }
+    }
+
+    #[tokio::test]
+    async fn group_of_a_service_may_use_its_socket() {
+        let services = tempfile::tempdir().unwrap();
+        let (dir, group) = (services.path().join("robot"), 0o750);
+        let mode_of = |path: &Path| fs::metadata(path).unwrap().permissions().mode() & 0o777;
+        let set = |path: &Path, mode| fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
+        fs::create_dir(&dir).unwrap();
+        let path = dir.join("arm-1.sock");
+        let is_root = own_uid() == ROOT;
+        for (services_mode, mode, is_shared) in [
+            (0o755, group, is_root),
+            // Not for the group.
+            (0o755, 0o700, false),
+            // For everybody.
+            (0o755, 0o755, false),
+            // Others than root could have made the directory.
+            (0o775, group, false),
+            (0o777, group, false),
+        ] {
+            set(services.path(), services_mode);
+            set(&dir, mode);
+            let socket = StatusSocket::bind_in(&path, services.path()).unwrap();
+            let expected = if is_shared { SHARED_SOCKET_MODE } else { OWN_SOCKET_MODE };
+            assert_eq!(mode_of(&path), expected, "{services_mode:o} {mode:o}");
+            assert_eq!(socket.may_ask(NOBODY), is_shared, "{services_mode:o} {mode:o}");
+            assert!(socket.may_ask(own_uid()) && socket.may_ask(ROOT));
+            // The same directory elsewhere is nobody's service.
+            drop(socket);
+            let socket = StatusSocket::bind_in(&path, dir.as_path()).unwrap();
+            assert_eq!(mode_of(&path), OWN_SOCKET_MODE);
+            assert_eq!(service_sockets(services.path()), std::slice::from_ref(&path));
+            drop(socket);
+        }
+        assert!(service_sockets(services.path()).is_empty());
+        assert!(service_sockets(Path::new("/nowhere")).is_empty());
     }
 
     const NOBODY: u32 = 65534;

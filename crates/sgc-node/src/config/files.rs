@@ -133,5 +133,7 @@ fn check_identity(file: &IdentityFile<'_>) -> Result<(), Mistake> {
     if let Some(mode) = state::exposed(&metadata) {
         return Err(Mistake::IdentityExposed { key, path: path.to_owned(), mode });
     }
-    fs::File::open(path).map(drop).map_err(|error| unreadable(error.to_string()))
+    fs::File::open(path)
+        .map(drop)
+        .map_err(|error| unreadable(format!("{error}{}", state::owner_hint(path, &error))))
 }

@@ -320,6 +320,9 @@ impl<N: RosNetwork> Core<N> {
             }
             CoreEvent::MessageKeys(keys) => self.add_message_keys(keys),
             CoreEvent::TypeLookedFor(outcome) => self.type_looked_for(outcome),
+            CoreEvent::Ping(reply) => {
+                let _ = reply.send(());
+            }
             CoreEvent::Status(reply) => {
                 let _ = reply.send(self.status());
             }

@@ -159,6 +159,8 @@ pub(crate) enum CoreEvent {
     MessageKeys(MessageKeys),
     /// A search for a type ended.
     TypeLookedFor(TypeOutcome),
+    /// Asks whether the control task still works. The answer comes behind everything that came before.
+    Ping(oneshot::Sender<()>),
     /// Asks for the status.
     Status(oneshot::Sender<Status>),
     /// Asks for the graph, also of a name that is not in use here.

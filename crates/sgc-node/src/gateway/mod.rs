@@ -274,6 +274,13 @@ pub enum GatewayStartError {
     },
 }
 
+impl GatewayStartError {
+    /// Returns `true` if it may go away by itself, as a port that another process has.
+    pub fn may_pass(&self) -> bool {
+        matches!(self, Self::Server(ServerError::Listen { .. }))
+    }
+}
+
 /// The certificate that the gateway shows within TLS.
 pub(crate) enum ShownKey {
     /// The certificate that the configuration names.

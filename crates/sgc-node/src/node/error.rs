@@ -10,14 +10,14 @@ use sgc_trust::{AnchorError, IdentityError};
 use crate::control::settings::rules::RulesError;
 use crate::gateway::GatewayStartError;
 use crate::gateway::access::AccessError;
-use crate::state::StateError;
 use crate::state::run_lock::IdentityInUse;
+use crate::state::{StateError, owner_hint};
 
 /// Reasons why a node does not start.
 #[derive(Debug, thiserror::Error)]
 pub enum NodeError {
     /// The identity file could not be read.
-    #[error("identity {}: {source}", path.display())]
+    #[error("identity {}: {source}{}", path.display(), owner_hint(path, source))]
     IdentityFile {
         /// The file.
         path: PathBuf,

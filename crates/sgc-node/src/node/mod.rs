@@ -21,7 +21,7 @@ use tracing::{info, warn};
 pub use self::error::NodeError;
 pub use self::identity::{check_identity, load_identity};
 pub use self::local::{OpenNetwork, enclave_of};
-pub use self::options::{RunOptions, admin_socket_path};
+pub use self::options::{RunOptions, Watchdog, admin_socket_path};
 use crate::clock::now;
 use crate::control::faults::alerts::clock_alert;
 use crate::control::settings::file_watch::FileWatch;
@@ -85,7 +85,7 @@ async fn run_with<N: RosNetwork>(
     mut options: RunOptions,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), NodeError> {
-    let watched = options.file.take().filter(|_| config.watch);
+    let watched = options.file.clone().filter(|_| config.watch);
     let file_watch = watched.map(|file| FileWatch::begin(file, &config));
     let state = build::state_dir(&config, identity.node_name().as_str())?;
     let mut shutdown = std::pin::pin!(shutdown);

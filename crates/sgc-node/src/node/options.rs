@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 use sgc_config::Config;
 use sgc_transport::ListenAddr;
@@ -27,8 +28,21 @@ pub struct RunOptions {
     pub types: Option<Arc<TypeStore>>,
     /// Port of mDNS, if not the standard one, so that each test has its own local network.
     pub mdns_port: Option<u16>,
+    /// Watchdog that the control task feeds.
+    pub watchdog: Option<Watchdog>,
+    /// The program and its version, as the log and the audit log name it; without it, `sgc` and the version of this
+    /// crate.
+    pub program: Option<String>,
     /// Opens the gateway's part of the local network. [`run`](crate::run) sets it by itself.
     pub gateway: Option<OpenLocalRos>,
+}
+
+/// A watchdog: it has to be fed from time to time, or it ends the process.
+pub struct Watchdog {
+    /// Interval of feeding.
+    pub every: Duration,
+    /// Feeds it. Called only after the control task has answered, so a node that hangs does not feed it.
+    pub feed: Box<dyn Fn() + Send + Sync>,
 }
 
 /// Returns the path of the status socket: as configured, or in the user's runtime directory.

@@ -1,13 +1,17 @@
 //! Starts the tasks of a node.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use rand_chacha::ChaCha20Rng;
+use sgc_config::Config;
 use sgc_ros::RosNetwork;
 use sgc_transport::{Dialer, ListenAddr, Listener};
+use sgc_trust::Identity;
 use tokio::sync::{Mutex, Notify, mpsc, oneshot};
 use tokio::task::JoinHandle;
+use tokio::time::MissedTickBehavior;
 use tracing::{info, warn};
 
 use crate::admin::{self, Desk};
@@ -26,7 +30,7 @@ use crate::node::build::BuiltNode;
 use crate::node::error::NodeError;
 use crate::node::identity::wanted_nearby;
 use crate::node::local::join_late;
-use crate::node::options::{RunOptions, admin_socket_path};
+use crate::node::options::{RunOptions, Watchdog, admin_socket_path};
 use crate::state::audit::{Audit, AuditEvent, AuditRecord, AuditWriter};
 use crate::state::run_lock::RunLock;
 
@@ -69,6 +73,7 @@ pub(super) async fn spawn<N: RosNetwork>(
         tokio::task::spawn_blocking(discover).await.map_err(|_| NodeError::Panicked)??;
     }
     let listening: Vec<_> = sockets.listeners.iter().map(|l| l.local().clone()).collect();
+    let description = description(&config, &identity, &listening, options.file.as_deref());
     let nearby = wanted_nearby(&config.routers, &identity)?;
     let announced = if config.announce { &listening[..] } else { &[] };
     let uses_mdns = nearby.is_some() || config.announce;
@@ -119,9 +124,12 @@ pub(super) async fn spawn<N: RosNetwork>(
         changed: Notify::new(),
     });
     tasks.extend(reload_tasks(&reloader, options.reload, file_watch));
+    tasks.extend(options.watchdog.map(|watchdog| tokio::spawn(keep_fed(watchdog, events.clone()))));
     let desk = Desk { events: events.clone(), reloader: reloader.clone(), gateway: gateway.clone() };
     let socket = admin::begin(socket, desk);
-    audit.write(AuditRecord::new(AuditEvent::Started).by(concat!("sgc ", env!("CARGO_PKG_VERSION"))));
+    let program = options.program.unwrap_or_else(|| concat!("sgc ", env!("CARGO_PKG_VERSION")).to_owned());
+    info!("{program}: {description}");
+    audit.write(AuditRecord::new(AuditEvent::Started).by(program));
     if let Some(ready) = options.ready {
         let _ = ready.send(listening);
     }
@@ -142,6 +150,42 @@ pub(super) async fn spawn<N: RosNetwork>(
         all_ended: channels.all_ended,
         run_lock: node.run_lock,
     })
+}
+
+/// Describes a node in a line, for the log.
+fn description(
+    config: &Config,
+    identity: &Identity,
+    listening: &[ListenAddr],
+    file: Option<&Path>,
+) -> String {
+    let mut parts = vec![format!("node {} of fleet {}", identity.node_name(), identity.fleet_name())];
+    if let Some(ros) = &config.ros {
+        parts.push(format!("proxy of ROS domain {}", ros.domain_id));
+    }
+    if !listening.is_empty() {
+        let addresses: Vec<_> = listening.iter().map(ToString::to_string).collect();
+        parts.push(format!("router at {}", addresses.join(" and ")));
+    }
+    parts.push(match file {
+        Some(file) => format!("configured by {}", file.display()),
+        None => "configured by arguments".to_owned(),
+    });
+    parts.join(", ")
+}
+
+/// Feeds a watchdog as long as the control task answers.
+async fn keep_fed(watchdog: Watchdog, events: mpsc::Sender<CoreEvent>) {
+    let mut ticks = tokio::time::interval(watchdog.every);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        ticks.tick().await;
+        let (reply, answered) = oneshot::channel();
+        if events.send(CoreEvent::Ping(reply)).await.is_err() || answered.await.is_err() {
+            return;
+        }
+        (watchdog.feed)();
+    }
 }
 
 /// Joins mDNS on the local network. Without it, the node runs all the same.
@@ -179,4 +223,47 @@ fn reload_tasks(
     }
     tasks.extend(file_watch.map(|watch| tokio::spawn(watch.run(reloader.clone()))));
     tasks
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use std::sync::atomic::AtomicU32;
+    use std::sync::atomic::Ordering::Relaxed;
+    use std::time::Duration;
+
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn watchdog_is_fed_only_while_the_control_task_answers() {
+        let fed = Arc::<AtomicU32>::default();
+        let count = fed.clone();
+        let every = Duration::from_secs(15);
+        let feed = Box::new(move || {
+            count.fetch_add(1, Relaxed);
+        });
+        let (events, mut inbox) = mpsc::channel(1);
+        let task = tokio::spawn(keep_fed(Watchdog { every, feed }, events));
+        let mut asked = async || match inbox.recv().await.unwrap() {
+            CoreEvent::Ping(reply) => reply,
+            _ => panic!("no ping"),
+        };
+        for before in 0..3 {
+            let reply = asked().await;
+            assert_eq!(fed.load(Relaxed), before);
+            reply.send(()).unwrap();
+        }
+        // It hangs.
+        let reply = asked().await;
+        tokio::time::sleep(10 * every).await;
+        assert_eq!(fed.load(Relaxed), 3);
+        // It goes on.
+        reply.send(()).unwrap();
+        let reply = asked().await;
+        assert_eq!(fed.load(Relaxed), 4);
+        // It ends.
+        drop(reply);
+        task.await.unwrap();
+    }
 }

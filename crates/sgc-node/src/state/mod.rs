@@ -8,6 +8,7 @@ pub(crate) mod fleet_file;
 pub(crate) mod records;
 pub(crate) mod run_lock;
 
+use std::ffi::OsString;
 use std::fs;
 use std::io::{self, Read, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
@@ -20,15 +21,52 @@ const LOCK_FILE: &str = "lock";
 const PERMISSION_BITS: u32 = 0o7777;
 const OTHERS_BITS: u32 = 0o077;
 
-/// Returns the state directory of a node with this name: as configured, or in the user's state directory. `None` if the
-/// user has none.
+/// Directory in which systemd keeps the state of `sgc@.service`.
+const SERVICE_DIR: &str = "/var/lib/sgc";
+const ROOT: u32 = 0;
+
+/// Returns the state directory of a node with this name: as configured, or in the state directory of the service or of
+/// the user. A service's node is found from outside of it, too, by root and by its own user. `None` if the user has
+/// none.
 pub fn state_dir(config: &Config, node: &str) -> Option<PathBuf> {
-    let named = |variable: &str| std::env::var_os(variable).filter(|v| !v.is_empty()).map(PathBuf::from);
-    let usual = || {
-        let base = named("XDG_STATE_HOME").filter(|dir| dir.is_absolute());
-        base.or_else(|| Some(named("HOME")?.join(".local/state")))
+    config
+        .state
+        .clone()
+        .or_else(|| usual_state_dir(&|name| std::env::var_os(name), SERVICE_DIR.as_ref(), node))
+}
+
+/// Returns the directories with the state directories of this user's nodes and of services.
+pub fn state_bases() -> Vec<PathBuf> {
+    let own = own_base(&|name| std::env::var_os(name)).map(|base| base.join("sgc"));
+    own.into_iter().chain([PathBuf::from(SERVICE_DIR)]).collect()
+}
+
+/// Returns the directory of the user's state.
+fn own_base(variable: &dyn Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
+    let named = |name| variable(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    let base = named("XDG_STATE_HOME").filter(|dir| dir.is_absolute());
+    base.or_else(|| Some(named("HOME")?.join(".local/state")))
+}
+
+fn usual_state_dir(
+    variable: &dyn Fn(&str) -> Option<OsString>,
+    service: &Path,
+    node: &str,
+) -> Option<PathBuf> {
+    // Several directories of a service are separated by colons.
+    let first = |dirs: OsString| Some(PathBuf::from(dirs.to_str()?.split(':').next()?));
+    if let Some(dir) = variable("STATE_DIRECTORY").and_then(first).filter(|dir| dir.is_absolute()) {
+        return Some(dir.join(node));
+    }
+    let own = own_base(variable).map(|base| base.join("sgc").join(node));
+    if own.as_ref().is_some_and(|own| own.is_dir()) {
+        return own;
+    }
+    let uid = rustix::process::geteuid().as_raw();
+    let is_ours = |dir: &PathBuf| {
+        fs::symlink_metadata(dir).is_ok_and(|m| m.is_dir() && (uid == ROOT || m.uid() == uid))
     };
-    config.state.clone().or_else(|| Some(usual()?.join("sgc").join(node)))
+    Some(service.join(node)).filter(is_ours).or(own)
 }
 
 /// Creates the directory if it is missing, 0700, and checks that it is this user's alone.
@@ -61,6 +99,23 @@ fn check_owner(dir: &Path, metadata: &fs::Metadata) -> Result<(), StateError> {
 pub(crate) fn exposed(metadata: &fs::Metadata) -> Option<u32> {
     let mode = metadata.permissions().mode() & PERMISSION_BITS;
     (mode & OTHERS_BITS != 0).then_some(mode)
+}
+
+/// Returns the remedy for an identity file that this user may not read, as the end of a message; empty for other errors.
+pub(crate) fn owner_hint(path: &Path, error: &io::Error) -> String {
+    if error.kind() != io::ErrorKind::PermissionDenied {
+        return String::new();
+    }
+    match fs::metadata(path).map(|metadata| metadata.uid()) {
+        Ok(ROOT) => format!(
+            "; it belongs to root: give it to the user that the node runs as, for a service by `sudo chown sgc {}`",
+            path.display()
+        ),
+        Ok(uid) if uid != rustix::process::geteuid().as_raw() => {
+            format!("; it belongs to uid {uid}: run this as that user")
+        }
+        _ => String::new(),
+    }
 }
 
 /// Replaces a file whole or not at all. The new file has mode 0600 and is on the disk before it gets its name.
@@ -140,9 +195,48 @@ pub enum StateError {
         mode: u32,
     },
     /// The directory belongs to another user.
-    #[error("state directory {}: it belongs to another user; name another with `state` in [node]", path.display())]
+    #[error(
+        "state directory {}: it belongs to another user: become that user, as `sudo -u sgc` does for a service, or name \
+         another with `state` in [node]",
+        path.display()
+    )]
     NotOurs {
         /// The directory.
         path: PathBuf,
     },
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn state_is_with_the_service_then_with_the_user_then_with_a_service_of_this_user() {
+        let place = tempfile::tempdir().unwrap();
+        let (home, service) = (place.path().join("home"), place.path().join("service"));
+        let dir = |variables: &[(&str, &str)]| {
+            let value = |name: &str| {
+                variables.iter().find(|(known, _)| *known == name).map(|(_, value)| OsString::from(value))
+            };
+            usual_state_dir(&value, &service, "arm-1")
+        };
+        let home_variable = ("HOME", home.to_str().unwrap());
+        let own = home.join(".local/state/sgc/arm-1");
+        assert_eq!(dir(&[]), None);
+        assert_eq!(dir(&[home_variable]), Some(own.clone()));
+        assert_eq!(dir(&[("XDG_STATE_HOME", "relative"), home_variable]), Some(own.clone()));
+        assert_eq!(
+            dir(&[("XDG_STATE_HOME", "/state"), home_variable]).unwrap(),
+            Path::new("/state/sgc/arm-1")
+        );
+        let in_service = dir(&[("STATE_DIRECTORY", "/var/lib/some:/var/lib/more"), home_variable]);
+        assert_eq!(in_service.unwrap(), Path::new("/var/lib/some/arm-1"));
+        assert_eq!(dir(&[("STATE_DIRECTORY", "relative"), home_variable]), Some(own.clone()));
+        // A service of this user.
+        fs::create_dir_all(service.join("arm-1")).unwrap();
+        assert_eq!(dir(&[]), Some(service.join("arm-1")));
+        assert_eq!(dir(&[home_variable]), Some(service.join("arm-1")));
+        fs::create_dir_all(&own).unwrap();
+        assert_eq!(dir(&[home_variable]), Some(own));
+    }
 }

@@ -42,7 +42,7 @@ impl FleetPlace {
     pub(super) fn remote(&self) -> Result<Option<Remote>, CliError> {
         let Some(at) = &self.at else { return Ok(None) };
         let at = at.parse()?;
-        Ok(Some(Remote { at, socket: node::socket(None, self.socket.as_deref())? }))
+        Ok(Some(Remote { at, socket: node::socket(None, None, self.socket.as_deref())? }))
     }
 }
 
