@@ -12,13 +12,19 @@ LABS := $(addprefix --test ,fidelity gateway peers ros2)
 INTEROP := $(addprefix --test ,browser gateway_soak looking ring ros_graph transports vendors)
 CLIENTS := $(addprefix --test ,foxglove grpc rosbridge)
 
-.PHONY: help demo test build deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
+# Release builds name their commit (`sgc --version`), as far as the environment or the repository knows it.
+COMMIT = SGC_COMMIT=$${SGC_COMMIT-$$(git describe --always --dirty --abbrev=8 --exclude '*' 2>/dev/null)} \
+	SGC_COMMIT_DATE=$${SGC_COMMIT_DATE-$$(git log -1 --format=%cs 2>/dev/null)}
+
+.PHONY: help demo test build dist dist-test deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install the requirements of the build, build, and run the demo (ARGS="--seconds 10 --json")'
 	@echo 'make test        run the whole suite, as CI does'
+	@echo 'make dist        build the Debian package and the archive of the program in target/dist'
 	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit and interop (ARGS goes to cargo test), docs, deny'
 	@echo 'not in it:       msrv (check with the oldest supported Rust), minimal (check without optional features, and with each alone)'
+	@echo '                 dist-test (the package on a small Debian with systemd; root)'
 	@echo '                 book (the documents as a book, target/book/index.html; builds mdbook once)'
 	@echo '                 peers-check-long (images of 13 MB), advisories (needs the web), clean-tools'
 	@echo '                 ring (two minutes of faults; SGC_RING_SEED, SGC_RING_SECONDS; SGC_RING_DIR keeps the logs)'
@@ -43,7 +49,16 @@ demo: build
 	"$${CARGO_TARGET_DIR:-target}/release/sgc" demo $(ARGS)
 
 build: deps-build
-	$(CARGO) build --release --locked -p sgc $(FEATURES)
+	$(COMMIT) $(CARGO) build --release --locked -p sgc $(FEATURES)
+
+# Packages, with their licences and checksums, in target/dist.
+dist: deps-dist
+	$(COMMIT) $(CARGO) build --release --locked -p sgc $(FEATURES)
+	scripts/dist.sh "$${CARGO_TARGET_DIR:-target}/release/sgc"
+
+# Installs, runs, upgrades, removes and purges the package on a small Debian whose systemd is started in a container. Root.
+dist-test: dist
+	scripts/dist-test.sh
 
 # In sequence even with -j, the quick ones first.
 test: deps-test
@@ -65,6 +80,9 @@ deps-test:
 
 deps-bench:
 	@scripts/install-deps.sh bench
+
+deps-dist:
+	@scripts/install-deps.sh dist
 
 peers:
 	@scripts/build-peers.sh

@@ -5,20 +5,8 @@ set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
 cd "$root"
 
-version=0.5.4
-tool=.tools/bin/mdbook
-if [ "$("$tool" --version 2>/dev/null)" != "mdbook v$version" ]; then
-    if [ "$(mdbook --version 2>/dev/null)" = "mdbook v$version" ]; then
-        tool=mdbook
-    else
-        # Unoptimised and without its server, because mdbook runs for a second or two and only its build takes long.
-        say "building mdbook $version into .tools (a minute or two, once)"
-        CARGO_PROFILE_RELEASE_OPT_LEVEL=0 CARGO_PROFILE_RELEASE_LTO=off CARGO_PROFILE_RELEASE_DEBUG=0 \
-            CARGO_TARGET_DIR=.tools/target cargo install --quiet --locked --root .tools --no-default-features --features search \
-            --version "$version" mdbook
-        rm -rf .tools/target
-    fi
-fi
+# Without its server.
+cargo_tool mdbook 0.5.4 --no-default-features --features search
 
 rm -rf target/book
 "$tool" build

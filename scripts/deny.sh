@@ -1,32 +1,24 @@
 #!/usr/bin/env bash
 # Runs cargo-deny over Cargo.lock with deny.toml.
-#   deny.sh            licences, bans and sources, which need only crates.io
+#   deny.sh            licences, bans and sources, which need only crates.io; and the lock files of the other workspaces
 #   deny.sh advisories known vulnerabilities, whose database is fetched from the web
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
 . "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
 cd "$root"
 
-version=0.20.2
-tool=.tools/bin/cargo-deny
-if [ "$("$tool" --version 2>/dev/null)" != "cargo-deny $version" ]; then
-    if [ "$(cargo-deny --version 2>/dev/null)" = "cargo-deny $version" ]; then
-        tool=cargo-deny
-    else
-        # Unoptimised, because cargo-deny runs for a second or two and only its build takes long.
-        say "building cargo-deny $version into .tools (about a minute, once)"
-        CARGO_PROFILE_RELEASE_OPT_LEVEL=0 CARGO_PROFILE_RELEASE_LTO=off CARGO_PROFILE_RELEASE_DEBUG=0 \
-            CARGO_TARGET_DIR=.tools/target cargo install --quiet --locked --root .tools --no-default-features \
-            --version "$version" cargo-deny
-        rm -rf .tools/target
-    fi
-fi
+cargo_tool cargo-deny 0.20.2 --no-default-features
 
 case ${1:-} in
 advisories) "$tool" --locked check advisories ;;
 "")
     # Duplicates are warnings. `cargo tree -d` shows their trees, which are long.
     "$tool" --locked check --hide-inclusion-graph bans licenses sources
+    # Nothing that CI builds reads these.
+    for workspace in bench bench/zenoh-bridge fuzz; do
+        cargo update --quiet --workspace --locked --manifest-path "$workspace/Cargo.toml" ||
+            die "$workspace/Cargo.lock is out of date: cargo update --workspace --manifest-path $workspace/Cargo.toml"
+    done
     say "advisories: NOT checked, because their database is not on crates.io; \`make advisories\` fetches it and checks them"
     ;;
 *) die "usage: deny.sh [advisories]" ;;

@@ -2,6 +2,7 @@
 # Installs the Debian or Ubuntu packages that are missing, and nothing else.
 #   install-deps.sh build   requirements of the build
 #   install-deps.sh test    the same, and those of the test suite
+#   install-deps.sh dist    those of the build, of packages and of their test
 #   install-deps.sh bench   those of the build, of the systems beside SGC in `make bench`, and of counting instructions
 # A requirement is met if its probe succeeds, whatever installed it. The script names each missing one with its reason, and
 # installs the missing ones together.
@@ -46,7 +47,7 @@ have_rust() {
     done
 }
 
-case $what in build | test | bench) ;; *) die "usage: install-deps.sh build|test|bench" ;; esac
+case $what in build | test | dist | bench) ;; *) die "usage: install-deps.sh build|test|dist|bench" ;; esac
 have_rust
 need 'compiles c stdlib.h' gcc libc6-dev -- "C compiler: Cyclone DDS and AWS-LC are built from source"
 need 'compiles c++ vector' g++ -- "C++ compiler: the build of Cyclone DDS requires one"
@@ -65,6 +66,11 @@ if [ "$what" = test ]; then
     need 'command -v ip' iproute2 -- "isolated networks for the tests (ip netns)"
     need 'command -v nft' nftables -- "NATs and firewalls between them"
     need 'command -v openssl' openssl -- "an independent DTLS program, a keystore for DDS Security"
+fi
+if [ "$what" = dist ]; then
+    need 'command -v dpkg-shlibdeps' dpkg-dev -- "the package's dependencies on libraries"
+    need 'command -v debootstrap' debootstrap -- "a small Debian to try the package on"
+    need 'command -v systemd-nspawn' systemd-container -- "starts its systemd"
 fi
 if [ "$what" = bench ]; then
     need 'python3 -c "import venv, ensurepip"' python3 python3-venv -- "ROS 2 is installed into virtual environments"

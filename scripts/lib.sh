@@ -9,3 +9,21 @@ die() {
     printf 'error: %s\n' "$*" >&2
     exit 1
 }
+
+# cargo_tool NAME VERSION [ARGS of cargo install…]: sets `tool` to that program, and builds it into .tools if it is missing,
+# with the optimisation TOOL_OPT_LEVEL (0).
+cargo_tool() {
+    local name=$1 version=$2
+    shift 2
+    tool=$root/.tools/bin/$name
+    [ -x "$tool" ] && grep -qs "^\"$name $version " "$root/.tools/.crates.toml" && return
+    if cargo install --list | grep -qx "$name v$version:"; then
+        tool=$name
+        return
+    fi
+    # Most of these programs run for seconds, and only their build takes long.
+    say "building $name $version into .tools (a minute or two, once)"
+    CARGO_PROFILE_RELEASE_OPT_LEVEL=${TOOL_OPT_LEVEL:-0} CARGO_PROFILE_RELEASE_LTO=off CARGO_PROFILE_RELEASE_DEBUG=0 \
+        CARGO_TARGET_DIR=$root/.tools/target cargo install --quiet --locked --root "$root/.tools" --version "$version" "$@" "$name"
+    rm -rf "$root/.tools/target"
+}

@@ -1,0 +1,66 @@
+#!/usr/bin/env bash
+# Tries the package of target/dist on a small Debian whose systemd runs in a container: installs it, runs two nodes as
+# services, reboots, upgrades, breaks things, removes and purges it. Needs root, and the web once for the Debian.
+#   SGC_DIST_SUITE    the release of Debian (that of this machine)
+set -euo pipefail
+# shellcheck source=scripts/lib.sh
+. "$(dirname "${BASH_SOURCE[0]}")/lib.sh"
+cd "$root"
+
+PATIENCE_SECONDS=420
+# The exit code of a container that reboots (EXIT_FORCE_RESTART).
+REBOOTS=133
+# shellcheck source=/dev/null
+suite=${SGC_DIST_SUITE:-$(. /etc/os-release && echo "$VERSION_CODENAME")}
+place=target/dist-test
+base=$place/$suite
+[ "$(id -u)" = 0 ] || die "needs root, for the container"
+package=$(ls target/dist/*.deb) || die "no package in target/dist: make dist"
+
+if [ ! -e "$base/.complete" ]; then
+    say "making a Debian $suite in $base (a minute, once)"
+    rm -rf "$base"
+    mkdir -p "$place"
+    debootstrap --variant=minbase --include=systemd,systemd-sysv,iproute2,bash-completion "$suite" "$base" >"$place/debootstrap.log"
+    touch "$base/.complete"
+fi
+machine=$place/machine
+rm -rf "$machine" "$place/console.log"
+cp -a "$base" "$machine"
+
+mkdir "$machine/test"
+cp tests/dist/in-container.sh "$machine/test"
+cp "$package" "$machine/test/first.deb"
+# The same program under a later version, for the upgrade.
+dpkg-deb -R "$package" "$place/later"
+sed -i 's/^Version: .*/&+later/' "$place/later/DEBIAN/control"
+dpkg-deb --root-owner-group -b "$place/later" "$machine/test/later.deb" >/dev/null
+rm -rf "$place/later"
+cat >"$machine/etc/systemd/system/sgc-test.service" <<'UNIT'
+[Unit]
+After=multi-user.target
+[Service]
+ExecStart=/test/in-container.sh
+StandardOutput=append:/test/log
+StandardError=append:/test/log
+[Install]
+WantedBy=graphical.target
+UNIT
+ln -sf /lib/systemd/system/graphical.target "$machine/etc/systemd/system/default.target"
+mkdir -p "$machine/etc/systemd/system/graphical.target.wants"
+ln -s ../sgc-test.service "$machine/etc/systemd/system/graphical.target.wants/"
+
+say "booting it"
+outcome=$REBOOTS
+until=$((SECONDS + PATIENCE_SECONDS))
+while [ "$outcome" = "$REBOOTS" ] && [ "$SECONDS" -lt "$until" ]; do
+    outcome=0
+    timeout $((until - SECONDS)) systemd-nspawn --quiet --boot --private-network --register=no --keep-unit \
+        --directory "$machine" >>"$place/console.log" 2>&1 </dev/null || outcome=$?
+done
+cat "$machine/test/log" 2>/dev/null || true
+if [ "$(cat "$machine/test/result" 2>/dev/null)" != passed ]; then
+    die "the package did not pass (console: $place/console.log; exit code of the container: $outcome)"
+fi
+rm -rf "$machine"
+say "the package passed"

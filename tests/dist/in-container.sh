@@ -1,0 +1,123 @@
+#!/bin/bash
+# Runs in the container of scripts/dist-test.sh at each boot, as root. The first boot installs, the second goes on after it.
+set -uo pipefail
+cd /test
+
+fail() {
+    echo "FAILED: $*"
+    journalctl --no-pager -n 60 -u 'sgc@*'
+    echo failed >result
+    systemctl poweroff
+    exit 1
+}
+# expect WHAT COMMAND…: the command succeeds.
+expect() {
+    local what=$1
+    shift
+    "$@" >out 2>&1 || { cat out; fail "$what"; }
+    echo "ok: $what"
+}
+# refuse WHAT TEXT COMMAND…: the command fails and says TEXT.
+refuse() {
+    local what=$1 text=$2
+    shift 2
+    "$@" >out 2>&1 && fail "$what: it succeeded"
+    grep -qF -- "$text" out || { cat out; fail "$what: it does not say \"$text\""; }
+    echo "ok: $what"
+}
+# soon WHAT SECONDS COMMAND…: the command succeeds within that time.
+soon() {
+    local what=$1 seconds=$2
+    shift 2
+    for _ in $(seq $((seconds * 5))); do
+        "$@" >out 2>&1 && { echo "ok: $what"; return; }
+        sleep 0.2
+    done
+    cat out
+    fail "$what: not within $seconds s"
+}
+is_linked() { sgc status --node robot | grep -qx 'Links:'; }
+journal() { journalctl --sync; journalctl --no-pager -u "sgc@$1"; }
+pid() { systemctl show --value -p MainPID "sgc@$1"; }
+is_new() { [ "$(pid robot)" != "$1" ] && [ "$(pid robot)" != 0 ]; }
+as() { runuser -u "$1" -- "${@:2}"; }
+
+if [ ! -e rebooted ]; then
+    expect "it installs" dpkg -i first.deb
+    expect "the user exists" id sgc
+    expect "the version names a commit" grep -qE '^sgc [0-9.]+ \([0-9a-f]+' <(sgc --version)
+    expect "completions are installed" bash -c '. /usr/share/bash-completion/completions/sgc && complete -p sgc'
+    expect "man pages are installed" test -e /usr/share/man/man1/sgc-run.1.gz
+    expect "a fleet is made" sgc fleet create lab
+    expect "a router is enrolled" sgc fleet enroll router --router
+    expect "a robot is enrolled" sgc fleet enroll robot
+    sed 's,tls://0.0.0.0:443,tls://127.0.0.1:443,; s,0.0.0.0,127.0.0.1,' /usr/share/doc/sgc/examples/router.toml >/etc/sgc/router.toml
+    sed 's,router.example,127.0.0.1,' /usr/share/doc/sgc/examples/robot.toml >/etc/sgc/robot.toml
+
+    # Mistakes first.
+    refuse "a node without its identity does not start" "failed" systemctl enable --now sgc@robot
+    expect "it is not tried again" test "$(systemctl is-active sgc@robot)" = failed
+    expect "the journal names the file" grep -qF /var/lib/sgc/robot.identity <(journal robot)
+    cp robot.identity /var/lib/sgc/
+    refuse "an identity of root cannot be read" "failed" systemctl start sgc@robot
+    expect "the journal says how to give it to the service" grep -qF 'chown sgc' <(journal robot)
+    install -o sgc -g sgc -m 600 ./*.identity /var/lib/sgc/
+
+    expect "the router starts" systemctl enable --now sgc@router
+    expect "the robot starts" systemctl start sgc@robot
+    soon "both are linked" 10 is_linked
+    refuse "two nodes have to be named" "--node: " sgc status
+    expect "root finds a node by its name" sgc status --node router
+    expect "and by its configuration" sgc status -c /etc/sgc/robot.toml
+    expect "the router listens on port 443" grep -q ':443 ' <(ss -Hltn)
+    useradd -m member -G sgc
+    useradd -m stranger
+    expect "a member of the group asks" as member sgc status --node robot
+    refuse "a stranger is told how to" "sudo" as stranger sgc status
+    refuse "also by name" "sudo" as stranger sgc status --node robot
+    expect "the audit log is found" sgc audit -c /etc/sgc/robot.toml
+    expect "also by name" sgc audit --node robot
+    expect "the service's user makes a token" as sgc sgc token create -c /etc/sgc/robot.toml --for test --subscribe /chatter
+    expect "the log begins with version, node and role" grep -qE 'sgc [0-9.]+ \(.*\): node robot of fleet lab, proxy of ROS domain 0, configured by /etc/sgc/robot.toml' <(journal robot)
+
+    before=$(pid robot)
+    printf '\n[[share]]\ntopic = "/odom"\nto = ["desk"]\n' >>/etc/sgc/robot.toml
+    expect "it reloads" systemctl reload sgc@robot
+    expect "the share is there" grep -q /odom <(sgc topic list --node robot; sgc status --node robot --json)
+    expect "it is the same process" test "$(pid robot)" = "$before"
+    echo 'wrong = 1' >>/etc/sgc/robot.toml
+    refuse "a wrong configuration is refused" "" systemctl reload sgc@robot
+    expect "the node goes on" test "$(pid robot)" = "$before"
+    sed -i '/^wrong/d' /etc/sgc/robot.toml
+
+    kill -9 "$before"
+    soon "a killed node is started again" 15 is_new "$before"
+    soon "and links" 15 is_linked
+    before=$(pid robot)
+    kill -STOP "$before"
+    soon "a node that hangs is ended by the watchdog and started again" 60 is_new "$before"
+    soon "and links" 15 is_linked
+    expect "systemd-analyze security" systemd-analyze security --no-pager sgc@robot
+    tail -n 1 out
+    touch rebooted
+    sync
+    systemctl reboot
+    exit
+fi
+
+soon "the nodes are up after a reboot" 20 is_linked
+before=$(pid robot)
+expect "it upgrades" dpkg -i later.deb
+soon "the nodes run the new program" 20 is_new "$before"
+soon "and link" 15 is_linked
+expect "it can be removed" dpkg -r sgc
+expect "the nodes are stopped" test "$(systemctl is-active sgc@robot)" != active
+expect "identities stay" test -e /var/lib/sgc/robot.identity
+expect "it installs again" dpkg -i first.deb
+expect "the robot starts" systemctl start sgc@robot sgc@router
+expect "it can be purged" dpkg -P sgc
+expect "identities are gone" test ! -e /var/lib/sgc
+expect "configurations stay" test -e /etc/sgc/robot.toml
+expect "no enabled unit is left" test -z "$(find /etc/systemd -name 'sgc@*')"
+echo passed >result
+systemctl poweroff
