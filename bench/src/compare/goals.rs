@@ -272,9 +272,7 @@ impl Run<'_> {
                 );
                 let ours = self.bare(&SMALL, metric, ours, ZENOH);
                 let by_tcp = by_tcp.map(|tcp| self.bare(&SMALL, metric, tcp, ZENOH)).unwrap_or_default();
-                goals.push(
-                    goal(what, Bound::AtMost(bounds[number]), None, ours).beside(&by_tcp, &by_relay),
-                );
+                goals.push(goal(what, Bound::AtMost(bounds[number]), None, ours).beside(&by_tcp, &by_relay));
             }
         }
         for (sizes, all, bound) in TO_RELAY {
@@ -352,9 +350,8 @@ impl Run<'_> {
     /// What a router between two proxies adds, beside what a program adds that only forwards a TCP connection.
     fn router(&self) -> Vec<Goal> {
         let router = format!("{GROUP}-router");
-        let more = |place, with: &str, without: &str| {
-            Some(self.number(place, with)? - self.number(place, without)?)
-        };
+        let more =
+            |place, with: &str, without: &str| Some(self.number(place, with)? - self.number(place, without)?);
         let round_trip = |&at: &f64| {
             let place = ("round-trip", "bare", at, "p50_us");
             let ours = more(place, &router, GROUP);
@@ -364,7 +361,8 @@ impl Run<'_> {
         let cpu = ("throughput", "bare", 64e3, "cpu_us_per_message");
         // Both proxies together.
         let proxies = self.number(cpu, GROUP).filter(|cpu| *cpu > 0.0);
-        let part_of_proxy = more(cpu, &router, GROUP).zip(proxies).map(|(router, both)| router / (both / 2.0));
+        let part_of_proxy =
+            more(cpu, &router, GROUP).zip(proxies).map(|(router, both)| router / (both / 2.0));
         vec![
             goal(
                 "Round trip p50, added by a router, `group`: to what a TCP forwarder adds between bare relays",
@@ -383,7 +381,8 @@ impl Run<'_> {
 
     /// Messages of publishers that keep all, by every suite and transport. Those without a loss are not named.
     fn losses(&self) -> Goal {
-        let is_it = |f: &&Figure| f.table == "throughput" && f.metric == "lost" && f.system.starts_with("sgc-");
+        let is_it =
+            |f: &&Figure| f.table == "throughput" && f.metric == "lost" && f.system.starts_with("sgc-");
         let lost = self.figures.figures.iter().filter(is_it);
         let one = |f: &Figure| part(&format!("{}, {}", f.system, Unit::Bytes.text(f.at)), Some(f.value));
         let (none, some): (Vec<_>, Vec<_>) = lost.map(one).partition(|part| part.value == Some(0.0));
@@ -677,7 +676,8 @@ mod tests {
         for (system, us) in [(GROUP, 100.0), ("sgc-quic-group-router", 125.0)] {
             figures.push("throughput", system, "bare", 65_536.0, "cpu_us_per_message", us);
         }
-        let what = "Round trip p50, added by a router, `group`: to what a TCP forwarder adds between bare relays";
+        let what =
+            "Round trip p50, added by a router, `group`: to what a TCP forwarder adds between bare relays";
         assert_eq!(
             verdict(&figures, what),
             (Verdict::Met, "16 B: 1.2 ×, 100 B: 1.2 ×, 1 KB: 1.2 ×, 8 KB: 1.2 ×".into())
