@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Tries the package of target/dist on a small Debian whose systemd runs in a container: installs it, runs two nodes as
-# services, reboots, upgrades, breaks things, removes and purges it. Needs root, and the web once for the Debian.
+# Tries the package of target/dist on a small Debian whose systemd runs in a container: installs it, runs three nodes as
+# services between programs of ROS 2, reboots, upgrades, breaks things, removes and purges it. Needs root, and the web once for
+# the Debian and for ROS 2.
 #   SGC_DIST_SUITE    the release of Debian (that of this machine)
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
@@ -16,12 +17,13 @@ place=target/dist-test
 base=$place/$suite
 [ "$(id -u)" = 0 ] || die "needs root, for the container"
 package=$(ls target/dist/*.deb) || die "no package in target/dist: make dist"
+scripts/build-ros2.sh
 
 if [ ! -e "$base/.complete" ]; then
     say "making a Debian $suite in $base (a minute, once)"
     rm -rf "$base"
     mkdir -p "$place"
-    debootstrap --variant=minbase --include=systemd,systemd-sysv,iproute2,bash-completion "$suite" "$base" >"$place/debootstrap.log"
+    debootstrap --variant=minbase --include=systemd,systemd-sysv,iproute2,bash-completion,python3 "$suite" "$base" >"$place/debootstrap.log"
     touch "$base/.complete"
 fi
 machine=$place/machine
@@ -29,7 +31,7 @@ rm -rf "$machine" "$place/console.log"
 cp -a "$base" "$machine"
 
 mkdir "$machine/test"
-cp tests/dist/in-container.sh "$machine/test"
+cp tests/dist/in-container.sh tests/dist/chatter.py "$machine/test"
 cp "$package" "$machine/test/first.deb"
 # The same program under a later version, for the upgrade.
 dpkg-deb -R "$package" "$place/later"
@@ -56,7 +58,7 @@ until=$((SECONDS + PATIENCE_SECONDS))
 while [ "$outcome" = "$REBOOTS" ] && [ "$SECONDS" -lt "$until" ]; do
     outcome=0
     timeout $((until - SECONDS)) systemd-nspawn --quiet --boot --private-network --register=no --keep-unit \
-        --directory "$machine" >>"$place/console.log" 2>&1 </dev/null || outcome=$?
+        --bind-ro="$root/.peers:/peers" --directory "$machine" >>"$place/console.log" 2>&1 </dev/null || outcome=$?
 done
 cat "$machine/test/log" 2>/dev/null || true
 if [ "$(cat "$machine/test/result" 2>/dev/null)" != passed ]; then

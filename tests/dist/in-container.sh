@@ -40,6 +40,7 @@ is_linked() { sgc status --node robot | grep -qx 'Links:'; }
 journal() { journalctl --sync; journalctl --no-pager -u "sgc@$1"; }
 pid() { systemctl show --value -p MainPID "sgc@$1"; }
 is_new() { [ "$(pid robot)" != "$1" ] && [ "$(pid robot)" != 0 ]; }
+ros() { as member env ROS_DOMAIN_ID="$1" HOME=/home/member "/ros/$2/bin/python" -B /test/chatter.py "${@:3}"; }
 as() { runuser -u "$1" -- "${@:2}"; }
 
 if [ ! -e rebooted ]; then
@@ -51,8 +52,20 @@ if [ ! -e rebooted ]; then
     expect "a fleet is made" sgc fleet create lab
     expect "a router is enrolled" sgc fleet enroll router --router
     expect "a robot is enrolled" sgc fleet enroll robot
+    expect "a desk is enrolled" sgc fleet enroll desk
     sed 's,tls://0.0.0.0:443,tls://127.0.0.1:443,; s,0.0.0.0,127.0.0.1,' /usr/share/doc/sgc/examples/router.toml >/etc/sgc/router.toml
     sed 's,router.example,127.0.0.1,' /usr/share/doc/sgc/examples/robot.toml >/etc/sgc/robot.toml
+    printf '\n[ros]\ndomain_id = 31\n' >>/etc/sgc/robot.toml
+    cat >/etc/sgc/desk.toml <<'END'
+identity = "/var/lib/sgc/desk.identity"
+[node]
+routers = ["quic://127.0.0.1:7447"]
+[ros]
+domain_id = 32
+[[use]]
+from = "robot"
+topic = "/chatter"
+END
 
     # Mistakes first.
     refuse "a node without its identity does not start" "failed" systemctl enable --now sgc@robot
@@ -75,10 +88,21 @@ if [ ! -e rebooted ]; then
     expect "a member of the group asks" as member sgc status --node robot
     refuse "a stranger is told how to" "sudo" as stranger sgc status
     refuse "also by name" "sudo" as stranger sgc status --node robot
+    # The environments of ROS 2 with the Python of this system.
+    for distribution in jazzy kilted; do
+        mkdir -p "/ros/$distribution/bin"
+        ln -s /usr/bin/python3 "/ros/$distribution/bin/python"
+        printf 'home = /usr/bin\ninclude-system-site-packages = false\n' >"/ros/$distribution/pyvenv.cfg"
+        ln -s "/peers/$distribution/lib" "/peers/$distribution/share" "/ros/$distribution"
+    done
+    expect "a desk starts" systemctl start sgc@desk
+    ros 31 jazzy talk 60 >talk.log 2>&1 &
+    expect "a message crosses from ROS 2 Jazzy to Kilted" ros 32 kilted hear 40
+    expect "sgc shows it" timeout 20 sgc topic echo --node desk --once /chatter
     expect "the audit log is found" sgc audit -c /etc/sgc/robot.toml
     expect "also by name" sgc audit --node robot
     expect "the service's user makes a token" as sgc sgc token create -c /etc/sgc/robot.toml --for test --subscribe /chatter
-    expect "the log begins with version, node and role" grep -qE 'sgc [0-9.]+ \(.*\): node robot of fleet lab, proxy of ROS domain 0, configured by /etc/sgc/robot.toml' <(journal robot)
+    expect "the log begins with version, node and role" grep -qE 'sgc [0-9.]+ \(.*\): node robot of fleet lab, proxy of ROS domain 31, configured by /etc/sgc/robot.toml' <(journal robot)
 
     before=$(pid robot)
     printf '\n[[share]]\ntopic = "/odom"\nto = ["desk"]\n' >>/etc/sgc/robot.toml
@@ -114,7 +138,7 @@ expect "it can be removed" dpkg -r sgc
 expect "the nodes are stopped" test "$(systemctl is-active sgc@robot)" != active
 expect "identities stay" test -e /var/lib/sgc/robot.identity
 expect "it installs again" dpkg -i first.deb
-expect "the robot starts" systemctl start sgc@robot sgc@router
+expect "the nodes start" systemctl start sgc@router sgc@robot
 expect "it can be purged" dpkg -P sgc
 expect "identities are gone" test ! -e /var/lib/sgc
 expect "configurations stay" test -e /etc/sgc/robot.toml
