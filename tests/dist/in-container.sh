@@ -41,7 +41,7 @@ journal() { journalctl --sync; journalctl --no-pager -u "sgc@$1"; }
 pid() { systemctl show --value -p MainPID "sgc@$1"; }
 is_new() { [ "$(pid robot)" != "$1" ] && [ "$(pid robot)" != 0 ]; }
 ros() { as member env ROS_DOMAIN_ID="$1" HOME=/home/member "/ros/$2/bin/python" -B /test/chatter.py "${@:3}"; }
-as() { runuser -u "$1" -- "${@:2}"; }
+as() { runuser -u "$1" -- env HOME="$(getent passwd "$1" | cut -d: -f6)" "${@:2}"; }
 
 if [ ! -e rebooted ]; then
     expect "it installs" dpkg -i first.deb
@@ -101,8 +101,14 @@ END
     expect "sgc shows it" timeout 20 sgc topic echo --node desk --once /chatter
     expect "the audit log is found" sgc audit -c /etc/sgc/robot.toml
     expect "also by name" sgc audit --node robot
+    expect "sgc check warns of nothing" test -z "$(sgc check -c /etc/sgc/robot.toml | grep '^warning')"
     expect "the service's user makes a token" as sgc sgc token create -c /etc/sgc/robot.toml --for test --subscribe /chatter
-    expect "the log begins with version, node and role" grep -qE 'sgc [0-9.]+ \(.*\): node robot of fleet lab, proxy of ROS domain 31, configured by /etc/sgc/robot.toml' <(journal robot)
+    token=$(as sgc sgc token list -c /etc/sgc/robot.toml | awk 'NR == 2 { print $1 }')
+    expect "and revokes it" as sgc sgc token revoke -c /etc/sgc/robot.toml "$token"
+    expect "the running node hears of it" grep -qE "runs knows it|changed" out
+    expect "the log has version, node and role in a line" grep -qE 'sgc [0-9.]+ \(.*\): node robot of fleet lab, proxy of ROS domain 31, configured by /etc/sgc/robot.toml' <(journal robot)
+
+    expect "a line of the journal has one time" grep -qE '\]: +INFO sgc_node' <(journal robot)
 
     before=$(pid robot)
     printf '\n[[share]]\ntopic = "/odom"\nto = ["desk"]\n' >>/etc/sgc/robot.toml

@@ -10,7 +10,10 @@ use sgc_ros::Guid;
 use crate::{qos, user_data};
 
 /// Most matched endpoints that are examined.
-pub(crate) const MATCHES_MAX: usize = 1024;
+const MATCHES_MAX: usize = 1024;
+
+/// Most matched readers that are examined while a message waits to be written.
+const EXAMINED_MAX: usize = 64;
 
 /// A matched endpoint.
 #[derive(Clone, Copy, Debug)]
@@ -22,6 +25,19 @@ pub(crate) struct MatchedEndpoint {
 
 type List = unsafe extern "C" fn(dds_entity_t, *mut dds_instance_handle_t, usize) -> i32;
 type Describe = unsafe extern "C" fn(dds_entity_t, dds_instance_handle_t) -> *mut dds_builtintopic_endpoint_t;
+
+/// Returns `true` if all matched readers of a writer are so, `false` if one cannot be examined, or if there are more
+/// than [`EXAMINED_MAX`]: Cyclone searches all of them for each.
+pub(crate) fn all_readers_are(writer: dds_entity_t, is_so: impl Fn(&MatchedEndpoint) -> bool) -> bool {
+    let mut matches: [dds_instance_handle_t; EXAMINED_MAX] = [0; EXAMINED_MAX];
+    // SAFETY: the handle is checked by Cyclone, and there is room for as many as is said.
+    let found = unsafe { dds_get_matched_subscriptions(writer, matches.as_mut_ptr(), EXAMINED_MAX) };
+    let found = usize::try_from(found).ok().and_then(|found| matches.get(..found));
+    let describe = |handle: &_| one_of(writer, *handle, dds_get_matched_subscription_data);
+    found.is_some_and(|handles| {
+        handles.iter().all(|handle| describe(handle).is_some_and(|reader| is_so(&reader)))
+    })
+}
 
 /// Returns the matched readers of a writer, at most [`MATCHES_MAX`].
 pub(crate) fn readers_of(writer: dds_entity_t) -> Vec<MatchedEndpoint> {

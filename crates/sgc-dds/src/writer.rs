@@ -24,7 +24,7 @@ use sgc_wire::{History, Qos};
 use crate::bursts::Bursts;
 use crate::entity::{Entity, INFINITE, check, reason};
 use crate::late;
-use crate::matched::{self, MATCHES_MAX};
+use crate::matched;
 use crate::participant::Participant;
 use crate::payload::Frame;
 use crate::qos::{SendWindow, history_of, keys_kept};
@@ -308,8 +308,7 @@ impl CycloneWriter {
     fn has_small_buffers(&self) -> bool {
         let changes = self.matched.changes.load(Ordering::Acquire);
         self.has_small_buffers.get(changes, || {
-            let readers = matched::readers_of(self.writer.handle());
-            readers.len() == MATCHES_MAX || !readers.iter().all(|reader| reader.guid.is_of_cyclone())
+            !matched::all_readers_are(self.writer.handle(), |reader| reader.guid.is_of_cyclone())
         })
     }
 

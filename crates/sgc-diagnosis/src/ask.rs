@@ -84,18 +84,19 @@ pub fn connect(socket: &Path, patience: Duration) -> Result<UnixStream, Diagnosi
 pub fn ask(socket: &Path, request: &AdminRequest, patience: Duration) -> Result<String, DiagnosisError> {
     let no_node = |error: std::io::Error| no_node(socket, &error, patience);
     let mut stream = connect(socket, patience)?;
-    let until = Instant::now() + patience;
+    // `None` waits for ever.
+    let until = Instant::now().checked_add(patience);
     stream.set_write_timeout(Some(patience)).map_err(no_node)?;
     // A node of an earlier version answers without reading.
     let _ = stream.write_all(request.to_line().as_bytes());
     let mut answer = Vec::new();
     let mut buffer = vec![0; READ_BYTES];
     while answer.len() < STATUS_BYTES_MAX {
-        let left = until.saturating_duration_since(Instant::now());
-        if left.is_zero() {
+        let left = until.map(|until| until.saturating_duration_since(Instant::now()));
+        if left.is_some_and(|left| left.is_zero()) {
             return Err(no_node(std::io::ErrorKind::WouldBlock.into()));
         }
-        stream.set_read_timeout(Some(left)).map_err(no_node)?;
+        stream.set_read_timeout(left).map_err(no_node)?;
         match stream.read(&mut buffer) {
             Ok(0) => break,
             Ok(read) => answer.extend(buffer.iter().take(read)),

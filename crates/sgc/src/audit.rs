@@ -139,11 +139,16 @@ fn only_log(dirs: &[PathBuf]) -> Result<PathBuf, CliError> {
     let entries = dirs.iter().filter_map(|dir| std::fs::read_dir(dir).ok()).flatten().flatten();
     let mut found: Vec<_> = entries.map(|e| e.path().join(FILE_NAME)).filter(|path| path.is_file()).collect();
     found.sort();
+    found.dedup();
     let reason = match found.len() {
         1 => return Ok(found.swap_remove(0)),
         0 => {
             let dirs: Vec<_> = dirs.iter().map(|dir| dir.display().to_string()).collect();
-            format!("no node has a log in {}; name one with -c or --file", dirs.join(" or "))
+            format!(
+                "no node has a log in {} that you may read; name one with -c or --file, or write `sudo` in front for that \
+                 of a service",
+                dirs.join(" or ")
+            )
         }
         _ => {
             let nodes: Vec<_> = found

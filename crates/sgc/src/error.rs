@@ -132,12 +132,16 @@ pub(crate) enum CliError {
         /// The usual place.
         dir: PathBuf,
     },
-    /// No status socket was named, and services run whose sockets this user may not use.
+    /// No node of this user runs here, and services run whose sockets this user may not use.
     #[error(
-        "a node runs as a service here, and you may not ask it: write `sudo` in front, or join its group by \
-         `sudo usermod -aG sgc $USER` and log in again"
+        "no node{} of yours runs here. There are services that you may not ask: write `sudo` in front, or join their \
+         group by `sudo usermod -aG sgc $USER` and log in again",
+        node.as_ref().map(|node| format!(" {node:?}")).unwrap_or_default()
     )]
-    ServicesOfOthers,
+    ServicesOfOthers {
+        /// The name of the node, if one was named.
+        node: Option<String>,
+    },
     /// No status socket was named and several are in the usual place.
     #[error("which node? Name one with --node: {}", nodes.join(", "))]
     SeveralNodes {
@@ -327,7 +331,7 @@ impl CliError {
             | Self::FleetFile(FleetFileError::Read { .. } | FleetFileError::Write { .. })
             | Self::Diagnosis(_)
             | Self::NoNodeHere { .. }
-            | Self::ServicesOfOthers
+            | Self::ServicesOfOthers { .. }
             | Self::NodeRefused { .. }
             | Self::NoDefinition { .. }
             | Self::NoSuchField { .. }

@@ -137,7 +137,7 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::Topic(args) => return topic::topic(&args),
         Command::Service(args) => return service::service(&args),
         Command::Status(args) => status::status(&args),
-        Command::Reload(args) => reload::reload(&args),
+        Command::Reload(args) => return reload::reload(&args),
         Command::Audit(args) => audit::audit(&args),
         Command::Policy(args) => return policy::policy(&args),
         Command::Token(args) => token::token(&args),

@@ -7,6 +7,7 @@ use crate::log_filter::log_filter;
 
 const LOG_VARIABLE: &str = "SGC_LOG";
 const LOG_DEFAULT: &str = "info";
+const JOURNAL_VARIABLE: &str = "JOURNAL_STREAM";
 
 /// Starts logging to standard error.
 pub(crate) fn start_log(argument: Option<&str>) -> Result<(), CliError> {
@@ -17,10 +18,22 @@ pub(crate) fn start_log(argument: Option<&str>) -> Result<(), CliError> {
         (None, None) => ("--log", LOG_DEFAULT.to_owned()),
     };
     let filter = log_filter(&value).map_err(|reason| CliError::LogFilter { from, value, reason })?;
-    tracing_subscriber::fmt()
+    let log = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal())
-        .init();
+        .with_ansi(std::io::stderr().is_terminal());
+    if is_journal() {
+        log.without_time().init()
+    } else {
+        log.init()
+    }
     Ok(())
+}
+
+/// Returns `true` if standard error is the journal of systemd (`JOURNAL_STREAM`, systemd.exec(5)), which has the time of
+/// each line.
+fn is_journal() -> bool {
+    let Ok(journal) = std::env::var(JOURNAL_VARIABLE) else { return false };
+    rustix::fs::fstat(std::io::stderr())
+        .is_ok_and(|file| journal == format!("{}:{}", file.st_dev, file.st_ino))
 }

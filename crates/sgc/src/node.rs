@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use sgc_diagnosis::ask;
-use sgc_node::config;
+use sgc_node::config::{self, Config};
 use sgc_node::graph::Graph;
 
 use crate::environment::environment;
@@ -47,22 +47,27 @@ pub(crate) fn socket(
         return Ok(socket.to_owned());
     }
     if let Some(node) = node {
-        return socket_of(node);
+        return found(node);
     }
     let Some(path) = config else { return only_socket() };
     let config = config::load(path, &environment)
         .map_err(|errors| CliError::Config { what: path.display().to_string(), errors })?;
     match config.admin_socket {
         Some(socket) => Ok(socket),
-        None => socket_of(&ask::node_name(&config)?),
+        None => found(&ask::node_name(&config)?),
     }
 }
 
+/// Returns the socket of the node with a configuration and this name, whether it runs or not.
+pub(crate) fn socket_of(config: &Config, node: &str) -> PathBuf {
+    config.admin_socket.clone().unwrap_or_else(|| sgc_node::find_socket(node))
+}
+
 /// Returns the usual socket of a node.
-fn socket_of(node: &str) -> Result<PathBuf, CliError> {
+fn found(node: &str) -> Result<PathBuf, CliError> {
     let socket = sgc_node::find_socket(node);
     if !socket.exists() && sgc_node::has_hidden_services() {
-        return Err(CliError::ServicesOfOthers);
+        return Err(CliError::ServicesOfOthers { node: Some(node.to_owned()) });
     }
     Ok(socket)
 }
@@ -71,7 +76,7 @@ fn socket_of(node: &str) -> Result<PathBuf, CliError> {
 fn only_socket() -> Result<PathBuf, CliError> {
     let mut found = sgc_node::usual_sockets();
     match found.len() {
-        0 if sgc_node::has_hidden_services() => Err(CliError::ServicesOfOthers),
+        0 if sgc_node::has_hidden_services() => Err(CliError::ServicesOfOthers { node: None }),
         0 => {
             let usual = sgc_node::default_socket_path("node");
             Err(CliError::NoNodeHere { dir: usual.parent().unwrap_or(Path::new("/")).to_owned() })

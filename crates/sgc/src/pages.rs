@@ -43,6 +43,9 @@ fn shown(command: Command) -> Command {
     // Subcommands cannot be removed, so a command of the same arguments gets the shown ones.
     let mut only = Command::new(command.get_name().to_owned()).args(command.get_arguments().cloned());
     only = only.groups(command.get_groups().cloned()).subcommands(below);
+    if let Some(version) = command.get_version() {
+        only = only.version(version.to_owned());
+    }
     match command.get_about() {
         Some(about) => only.about(about.clone()),
         None => only,

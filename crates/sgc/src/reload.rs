@@ -3,6 +3,7 @@
 //! The node checks and applies the configuration; this module asks for it and prints the answer.
 
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
@@ -10,7 +11,7 @@ use serde::Deserialize;
 use sgc_diagnosis::{DiagnosisError, ask};
 use sgc_node::admin::AdminRequest;
 
-use crate::error::CliError;
+use crate::error::{CliError, EXIT_FAILURE};
 use crate::node;
 use crate::output;
 
@@ -20,7 +21,8 @@ const ANSWER_MAX: Duration = Duration::from_secs(30);
 /// Let a running node read its configuration again, without a restart.
 ///
 /// The node checks the whole file first. If the file has a mistake, nothing changes; otherwise the node applies the
-/// differences. SIGHUP does the same and logs the result.
+/// differences. Exit code 1 means that it refused the file, or that a change needs a restart. SIGHUP does the same and
+/// logs the result.
 #[derive(Debug, Args)]
 pub(crate) struct ReloadArgs {
     /// Configuration of the node; without it, the only node of this user or of a service here
@@ -55,13 +57,17 @@ struct Report {
 }
 
 /// Runs `sgc reload`.
-pub(crate) fn reload(args: &ReloadArgs) -> Result<(), CliError> {
+pub(crate) fn reload(args: &ReloadArgs) -> Result<ExitCode, CliError> {
     let socket = node::socket(args.config.as_deref(), args.node.as_deref(), args.socket.as_deref())?;
     let report = ask(&socket)?;
+    let is_pending =
+        report.get("needs_restart").and_then(|lines| lines.as_array()).is_some_and(|lines| !lines.is_empty());
     if args.json {
-        return output::line(report);
+        output::line(report)?;
+    } else {
+        lines(report, "nothing changed").into_iter().try_for_each(output::line)?;
     }
-    lines(report, "nothing changed").into_iter().try_for_each(output::line)
+    Ok(if is_pending { EXIT_FAILURE.into() } else { ExitCode::SUCCESS })
 }
 
 /// Asks the node at this socket to read its configuration again, if one runs there. Returns the lines that report the

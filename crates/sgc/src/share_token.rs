@@ -140,7 +140,7 @@ fn give(
 /// Returns the types that programs on the local network use for a topic, as the running node sees them. Returns `None`
 /// if no node runs.
 pub(crate) fn seen_types(config: &Config, node: &str, topic: &str) -> Option<BTreeSet<String>> {
-    let socket = sgc_node::admin_socket_path(config, node);
+    let socket = crate::node::socket_of(config, node);
     // Without an answer of the node, the user has to give the type.
     let graph = sgc_diagnosis::ask::graph(&socket, None).ok()?;
     let shared = graph.shares.iter().flat_map(|share| &share.routes).filter(|route| route.topic == topic);
@@ -275,7 +275,7 @@ fn reload_node(
     node: &str,
     mut say: impl FnMut(String) -> Result<(), CliError>,
 ) -> Result<(), CliError> {
-    let socket = sgc_node::admin_socket_path(config, node);
+    let socket = crate::node::socket_of(config, node);
     reload::after_change(&socket)?.into_iter().try_for_each(&mut say)
 }
 

@@ -188,7 +188,7 @@ fn revoke(args: &RevokeArgs) -> Result<(), CliError> {
     let whose = if record.label.is_empty() { "which is not listed here" } else { &record.label };
     note(&config, &state, AuditEvent::TokenRevoked, &format!("{} for {whose}", short(&record.id)));
     output::line(format!("token {} for {whose} is revoked", short(&record.id)))?;
-    let socket = sgc_node::admin_socket_path(&config, identity.node_name().as_str());
+    let socket = crate::node::socket_of(&config, identity.node_name().as_str());
     reload::after_change(&socket)?.into_iter().try_for_each(output::line)
 }
 

@@ -84,7 +84,7 @@ pub(crate) fn use_token(args: &UseArgs) -> Result<(), CliError> {
     files::write_secret(&file, &token.to_text(), files::Existing::Replace)?;
     replace(&path, &after)?;
     output::line(format!("added to {}; the token is in {}", path.display(), file.display()))?;
-    let socket = sgc_node::admin_socket_path(&config, node);
+    let socket = crate::node::socket_of(&config, node);
     reload::after_change(&socket)?.into_iter().try_for_each(output::line)
 }
 

@@ -533,11 +533,29 @@ fn usage_errors_are_one_line_and_code_2() {
 }
 
 #[test]
+fn example_configurations_of_the_package_have_no_mistakes() {
+    let place = Place::new();
+    place.good(&["fleet", "create", "lab"]);
+    place.good(&["fleet", "enroll", "robot"]);
+    place.good(&["fleet", "enroll", "router", "--router"]);
+    let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../dist/examples");
+    for node in ["robot", "router"] {
+        let text = fs::read_to_string(examples.join(format!("{node}.toml"))).unwrap();
+        let here = text.replace("/var/lib/sgc/", "");
+        assert_ne!(here, text);
+        let file = format!("{node}.toml");
+        fs::write(place.path().join(&file), here).unwrap();
+        assert!(place.good(&["check", "-c", &file]).contains("no mistakes"), "{node}");
+    }
+}
+
+#[test]
 fn completions_and_man_pages_know_every_command() {
     let place = Place::new();
     for shell in ["bash", "zsh", "fish"] {
         let text = place.good(&["completions", shell]);
         assert!(text.contains("rotate-secret") && !text.contains("demo-peer"), "{shell}");
+        assert!(text.contains("version"), "{shell}");
     }
     assert!(place.bad(2, &["completions", "tcsh"]).contains("tcsh"));
     fs::create_dir(place.path().join("man")).unwrap();

@@ -293,14 +293,18 @@ fn a_running_node_takes_what_it_can_and_names_what_needs_a_restart() {
     assert_eq!(status["routes"][0]["topic"], "/cmd");
 
     place.write("arm-1.toml", &good.replace("127.0.0.1:9", "127.0.0.1:10").replace("lamp", "sofa"));
-    let said = place.good(&["reload", "--socket", "arm.sock"]);
+    let reload = || place.run(&["reload", "--socket", "arm.sock"]);
+    let said = reload();
     let expected = ["/handoff/pose: who may subscribe changed", "`routers` changed, which needs a restart"];
-    assert_eq!(said.lines().collect::<Vec<_>>(), expected);
+    assert_eq!((said.code, said.stdout.lines().collect::<Vec<_>>()), (Some(1), expected.to_vec()));
+    let said = reload();
     assert_eq!(
-        place.good(&["reload", "--socket", "arm.sock"]),
-        format!("{}\n", expected[1]),
+        (said.code, &*said.stdout),
+        (Some(1), &*format!("{}\n", expected[1])),
         "said until it is done"
     );
+    let pending = format!("restart pending: {}", expected[1]);
+    assert!(place.good(&["status", "--socket", "arm.sock"]).contains(&pending));
 
     // SIGHUP does the same and logs the result.
     place.write("arm-1.toml", &good);
@@ -679,7 +683,13 @@ fn a_token_is_used_by_adding_three_lines() {
     // The rule is removed again while the node runs.
     let node = place.start("cart.toml");
     place.write("cart.toml", &before);
-    let said = place.good(&["reload", "--socket", "cart.sock"]);
+    // The router that only the token named is dialled until a restart.
+    let reload = || {
+        let said = place.run(&["reload", "--socket", "cart.sock"]);
+        assert_eq!(said.code, Some(1), "{}{}", said.stdout, said.stderr);
+        said.stdout
+    };
+    let said = reload();
     assert!(said.starts_with("/handoff/pose of arm-1 is no longer used (by token)"), "{said}");
     node.end();
     // A node that started without a rule also takes one, and dials the router that the token names.
@@ -695,7 +705,7 @@ fn a_token_is_used_by_adding_three_lines() {
     assert_eq!(status["routes"][0]["topic"], "/handoff/pose");
     assert!(status["routers"].to_string().contains("quic://127.0.0.1:10"), "{status}");
     place.write("cart.toml", &before);
-    let said = place.good(&["reload", "--socket", "cart.sock"]);
+    let said = reload();
     assert!(said.contains("is dialled until a restart"), "{said}");
     node.end();
 }

@@ -11,6 +11,7 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 
 use rustix::fs::{FlockOperation, OFlags, flock};
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, socket_with};
 use sgc_trust::NodeName;
 use tokio::net::UnixListener;
 
@@ -100,7 +101,7 @@ pub fn default_socket_path(node: &str) -> PathBuf {
 /// none answers, that of a service. Without either, it is [`default_socket_path`].
 pub fn find_socket(node: &str) -> PathBuf {
     let own = default_socket_path(node);
-    if answers(&own) {
+    if is_safe(directory(&own)) && answers(&own) {
         return own;
     }
     let is_it = |path: &PathBuf| path.file_stem().is_some_and(|name| name == node);
@@ -111,20 +112,37 @@ pub fn find_socket(node: &str) -> PathBuf {
 /// socket at which no node answers is among them only if there is no other.
 pub fn usual_sockets() -> Vec<PathBuf> {
     let own = usual_dir(&|name| std::env::var_os(name).map(PathBuf::from));
-    // Anybody may have made a directory below `/tmp`.
-    let is_safe = own != temporary_dir() || check_dir(&own, true).is_ok();
-    let mut sockets = if is_safe { sockets_in(&own) } else { Vec::new() };
+    let mut sockets = if is_safe(&own) { sockets_in(&own) } else { Vec::new() };
     sockets
         .extend(service_sockets(Path::new(SERVICES_DIR)).into_iter().filter(|path| !path.starts_with(&own)));
-    if sockets.len() > 1 && sockets.iter().any(|path| answers(path)) {
-        sockets.retain(|path| answers(path));
+    if sockets.len() < 2 {
+        return sockets;
     }
-    sockets
+    let live: Vec<_> = sockets.iter().filter(|path| answers(path)).cloned().collect();
+    if live.is_empty() { sockets } else { live }
 }
 
-/// Returns `true` if a process has this socket. It is asked nothing.
+/// Returns `true` unless the directory is below `/tmp`, where anybody may have made it, and is not this user's alone.
+fn is_safe(dir: &Path) -> bool {
+    dir != temporary_dir() || check_dir(dir, true).is_ok()
+}
+
+/// Returns `true` if a process has this socket, without a request to it.
 fn answers(path: &Path) -> bool {
-    UnixStream::connect(path).is_ok()
+    match open(path) {
+        Ok(_) => true,
+        Err(error) => error.kind() == io::ErrorKind::WouldBlock,
+    }
+}
+
+/// Connects to a socket without waiting for room in its queue.
+fn open(path: &Path) -> io::Result<UnixStream> {
+    let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
+    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
+    rustix::net::connect(&socket, &SocketAddrUnix::new(path)?)?;
+    let stream = UnixStream::from(socket);
+    stream.set_nonblocking(false)?;
+    Ok(stream)
 }
 
 /// Returns `true` if a service has a directory for its socket that this user may not read.
@@ -233,7 +251,7 @@ pub fn connect(path: &Path) -> Result<UnixStream, SocketError> {
     if dir == temporary_dir() && fs::symlink_metadata(dir).is_ok() {
         check_dir(dir, true)?;
     }
-    let stream = UnixStream::connect(path)?;
+    let stream = open(path)?;
     let uid = rustix::net::sockopt::socket_peercred(&stream).map_err(io::Error::from)?.uid.as_raw();
     let expected = expected_uid(dir, Path::new(SERVICES_DIR));
     if uid == expected || uid == ROOT { Ok(stream) } else { Err(SocketError::Stranger { uid, expected }) }

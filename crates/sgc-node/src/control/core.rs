@@ -310,8 +310,8 @@ impl<N: RosNetwork> Core<N> {
                 let _ = reply.send(());
                 self.answer_renewals();
             }
-            CoreEvent::ConfigurationRead { mistakes } => {
-                self.alerts.configuration_read(mistakes.as_deref(), Instant::now());
+            CoreEvent::ConfigurationRead { outcome } => {
+                self.alerts.configuration_read(outcome, Instant::now());
             }
             CoreEvent::Crl { der, reply } => {
                 let _ = reply.send(self.add_crl(&der));

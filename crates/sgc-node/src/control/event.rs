@@ -45,8 +45,8 @@ pub(crate) enum CoreEvent {
     },
     /// The configuration was read again.
     ConfigurationRead {
-        /// The mistakes for which it was refused.
-        mistakes: Option<String>,
+        /// The changes that need a restart, or the mistakes for which it was refused.
+        outcome: Result<Vec<String>, String>,
     },
     /// A link ended.
     LinkDown {

@@ -32,7 +32,7 @@ pub fn state_dir(config: &Config, node: &str) -> Option<PathBuf> {
     config
         .state
         .clone()
-        .or_else(|| usual_state_dir(&|name| std::env::var_os(name), SERVICE_DIR.as_ref(), node))
+        .or_else(|| usual_state_dir(&|name| std::env::var_os(name), SERVICE_DIR.as_ref(), node, own_uid()))
 }
 
 /// Returns the directories with the state directories of this user's nodes and of services.
@@ -48,24 +48,33 @@ fn own_base(variable: &dyn Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
     base.or_else(|| Some(named("HOME")?.join(".local/state")))
 }
 
+fn own_uid() -> u32 {
+    rustix::process::geteuid().as_raw()
+}
+
 fn usual_state_dir(
     variable: &dyn Fn(&str) -> Option<OsString>,
     service: &Path,
     node: &str,
+    uid: u32,
 ) -> Option<PathBuf> {
     // Several directories of a service are separated by colons.
     let first = |dirs: OsString| Some(PathBuf::from(dirs.to_str()?.split(':').next()?));
     if let Some(dir) = variable("STATE_DIRECTORY").and_then(first).filter(|dir| dir.is_absolute()) {
         return Some(dir.join(node));
     }
+    let is_a_directory = |dir: &Path, is_whose: &dyn Fn(u32) -> bool| {
+        fs::symlink_metadata(dir).is_ok_and(|m| m.is_dir() && is_whose(m.uid()))
+    };
+    // This user is that of services, perhaps before the first start of the node.
+    if uid != ROOT && is_a_directory(service, &|owner| owner == uid) {
+        return Some(service.join(node));
+    }
     let own = own_base(variable).map(|base| base.join("sgc").join(node));
     if own.as_ref().is_some_and(|own| own.is_dir()) {
         return own;
     }
-    let uid = rustix::process::geteuid().as_raw();
-    let is_ours = |dir: &PathBuf| {
-        fs::symlink_metadata(dir).is_ok_and(|m| m.is_dir() && (uid == ROOT || m.uid() == uid))
-    };
+    let is_ours = |dir: &PathBuf| is_a_directory(dir, &|owner| uid == ROOT || owner == uid);
     Some(service.join(node)).filter(is_ours).or(own)
 }
 
@@ -76,9 +85,13 @@ pub fn create_state_dir(dir: &Path) -> Result<(), StateError> {
     check_owner(dir, &fs::metadata(dir).map_err(failed)?)
 }
 
-/// Checks that an existing directory is this user's alone. Creates nothing.
+/// Checks that an existing directory is this user's alone. Root may look at that of a service. Creates nothing.
 pub fn check_state_dir(dir: &Path) -> Result<(), StateError> {
     match fs::metadata(dir) {
+        Ok(metadata) if own_uid() == ROOT && dir.starts_with(SERVICE_DIR) => match exposed(&metadata) {
+            Some(mode) => Err(StateError::Exposed { path: dir.to_owned(), mode }),
+            None => Ok(()),
+        },
         Ok(metadata) => check_owner(dir, &metadata),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
         Err(source) => Err(StateError::Directory { path: dir.to_owned(), source }),
@@ -218,7 +231,7 @@ mod tests {
             let value = |name: &str| {
                 variables.iter().find(|(known, _)| *known == name).map(|(_, value)| OsString::from(value))
             };
-            usual_state_dir(&value, &service, "arm-1")
+            usual_state_dir(&value, &service, "arm-1", ROOT)
         };
         let home_variable = ("HOME", home.to_str().unwrap());
         let own = home.join(".local/state/sgc/arm-1");
@@ -237,6 +250,18 @@ mod tests {
         assert_eq!(dir(&[]), Some(service.join("arm-1")));
         assert_eq!(dir(&[home_variable]), Some(service.join("arm-1")));
         fs::create_dir_all(&own).unwrap();
-        assert_eq!(dir(&[home_variable]), Some(own));
+        assert_eq!(dir(&[home_variable]), Some(own.clone()));
+        // The user of services has the state of all of them there, also before a node was started.
+        let owner = fs::metadata(&service).unwrap().uid();
+        let of_uid = |uid, node| {
+            usual_state_dir(&|name| (name == "HOME").then(|| home.clone().into()), &service, node, uid)
+        };
+        assert_eq!(of_uid(owner + 1, "arm-1"), Some(own));
+        if owner != ROOT {
+            assert_eq!(of_uid(owner, "new"), Some(service.join("new")));
+        } else {
+            std::os::unix::fs::chown(&service, Some(7), None).unwrap();
+            assert_eq!(of_uid(7, "new"), Some(service.join("new")));
+        }
     }
 }

@@ -102,6 +102,11 @@ pub enum Alert {
         /// Seconds since the node read it.
         ago_s: u64,
     },
+    /// The configuration changed in parts that hold only after a restart.
+    RestartPending {
+        /// These parts, a sentence each.
+        changes: Vec<String>,
+    },
     /// DDS Security protects both this node and local programs, and one does not admit the other.
     RefusedPrograms {
         /// The enclave that they name, `/` if they have none of their own.
@@ -169,6 +174,9 @@ impl Alert {
             Self::ConfigurationRefused { .. } => {
                 "mend the file; `sgc check -c FILE` says everything that is wrong with it. Then `sgc reload`, if the node does not \
                  watch it"
+            }
+            Self::RestartPending { .. } => {
+                "restart the node when it suits you; until then it keeps the old values"
             }
             Self::RefusedPrograms { .. } => {
                 "the log says who refuses whom where Cyclone DDS does; compare CA, governance and permissions of the two enclaves, and when \
@@ -266,6 +274,7 @@ impl fmt::Display for Alert {
                 f,
                 "the changed configuration was refused {ago_s} s ago, and the one before holds: {mistakes}"
             ),
+            Self::RestartPending { changes } => write!(f, "restart pending: {}", changes.join("; ")),
             Self::Other => f.write_str("the node says something that this version of sgc does not know"),
         }
     }
@@ -312,6 +321,8 @@ impl Sighting {
 pub(crate) struct Alerts {
     /// The mistakes of the last read configuration, and the time of reading.
     refused: Option<(String, Instant)>,
+    /// The changes that need a restart.
+    pending: Vec<String>,
     /// The process that has the links of this node.
     displaced: Option<Sighting>,
     /// The process that is kept out in favour of this node.
@@ -327,9 +338,13 @@ impl Alerts {
         self.owners_here.len() < PEERS_MAX && self.owners_here.insert(node.to_owned())
     }
 
-    /// Notes the mistakes of the last read configuration; `None` if it has none.
-    pub(crate) fn configuration_read(&mut self, mistakes: Option<&str>, now: Instant) {
-        self.refused = mistakes.map(|text| (text.chars().take(MISTAKES_CHARS_MAX).collect(), now));
+    /// Notes the outcome of the last read configuration: the changes that need a restart, or its mistakes. A
+    /// configuration with mistakes says nothing about the changes of the one before.
+    pub(crate) fn configuration_read(&mut self, outcome: Result<Vec<String>, String>, now: Instant) {
+        match outcome {
+            Ok(pending) => (self.refused, self.pending) = (None, pending),
+            Err(text) => self.refused = Some((text.chars().take(MISTAKES_CHARS_MAX).collect(), now)),
+        }
     }
 
     /// Notes that another process has the links of this node. Returns `true` if that is news.
@@ -368,6 +383,9 @@ impl Alerts {
             mistakes: mistakes.clone(),
             ago_s: now.saturating_duration_since(*at).as_secs(),
         }));
+        if !self.pending.is_empty() {
+            alerts.push(Alert::RestartPending { changes: self.pending.clone() });
+        }
         if let Some(seen) = own(&self.displaced) {
             let ago_s = seen.ago_s(now);
             alerts.push(Alert::Displaced { node, place: seen.place, ago_s });
@@ -435,11 +453,26 @@ mod tests {
     #[test]
     fn refused_configuration_is_shown_until_one_is_read_that_holds() {
         let (mut alerts, now) = (Alerts::default(), Instant::now());
-        alerts.configuration_read(Some(&"x".repeat(2 * MISTAKES_CHARS_MAX)), now);
+        alerts.configuration_read(Err("x".repeat(2 * MISTAKES_CHARS_MAX)), now);
         let shown = alerts.shown("robot", NodeId::short, now + 2 * SHOWN_FOR);
         let [Alert::ConfigurationRefused { mistakes, ago_s }] = &shown[..] else { panic!("{shown:?}") };
         assert_eq!((mistakes.len(), *ago_s), (MISTAKES_CHARS_MAX, 2 * SHOWN_FOR.as_secs()));
-        alerts.configuration_read(None, now);
+        alerts.configuration_read(Ok(Vec::new()), now);
+        assert_eq!(alerts.shown("robot", NodeId::short, now), []);
+    }
+
+    #[test]
+    fn pending_restart_is_shown_until_a_configuration_is_read_that_needs_none() {
+        let (mut alerts, now) = (Alerts::default(), Instant::now());
+        let pending = Alert::RestartPending { changes: vec!["`listen` changed".to_owned()] };
+        alerts.configuration_read(Ok(vec!["`listen` changed".to_owned()]), now);
+        assert_eq!(alerts.shown("robot", NodeId::short, now + 2 * SHOWN_FOR), std::slice::from_ref(&pending));
+        assert_eq!(pending.to_string(), "restart pending: `listen` changed");
+        // Mistakes come in addition.
+        alerts.configuration_read(Err("x".to_owned()), now);
+        let refused = Alert::ConfigurationRefused { mistakes: "x".to_owned(), ago_s: 0 };
+        assert_eq!(alerts.shown("robot", NodeId::short, now), [refused, pending]);
+        alerts.configuration_read(Ok(Vec::new()), now);
         assert_eq!(alerts.shown("robot", NodeId::short, now), []);
     }
 

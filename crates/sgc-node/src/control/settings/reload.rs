@@ -110,7 +110,8 @@ impl Reloader {
         let result = self.try_reload().await;
         let record = AuditRecord::new(AuditEvent::Reload).by(by);
         // A stopping node shows no alerts, so a failure to send is ignored.
-        let read = CoreEvent::ConfigurationRead { mistakes: result.as_ref().err().cloned() };
+        let outcome = result.as_ref().map(|report| report.needs_restart.clone()).map_err(Clone::clone);
+        let read = CoreEvent::ConfigurationRead { outcome };
         let _ = self.events.send(read).await;
         match &result {
             Ok(report) => {
