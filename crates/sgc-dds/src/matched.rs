@@ -26,8 +26,8 @@ pub(crate) struct MatchedEndpoint {
 type List = unsafe extern "C" fn(dds_entity_t, *mut dds_instance_handle_t, usize) -> i32;
 type Describe = unsafe extern "C" fn(dds_entity_t, dds_instance_handle_t) -> *mut dds_builtintopic_endpoint_t;
 
-/// Returns `true` if all matched readers of a writer are so, `false` if one cannot be examined, or if there are more
-/// than [`EXAMINED_MAX`]: Cyclone searches all of them for each.
+/// Returns `true` if `is_so` holds for all matched readers of a writer. Returns `false` if one cannot be examined, or if
+/// there are more than [`EXAMINED_MAX`], because Cyclone searches all of them for each.
 pub(crate) fn all_readers_are(writer: dds_entity_t, is_so: impl Fn(&MatchedEndpoint) -> bool) -> bool {
     let mut matches: [dds_instance_handle_t; EXAMINED_MAX] = [0; EXAMINED_MAX];
     // SAFETY: the handle is checked by Cyclone, and there is room for as many as is said.
