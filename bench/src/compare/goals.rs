@@ -347,7 +347,7 @@ impl Run<'_> {
         goals
     }
 
-    /// What a router between two proxies adds, beside what a program adds that only forwards a TCP connection.
+    /// Judges the cost of a router between two proxies by that of a program that only forwards a TCP connection.
     fn router(&self) -> Vec<Goal> {
         let router = format!("{GROUP}-router");
         let more =

@@ -2,7 +2,7 @@
 //!
 //! The node checks and applies the configuration; this module asks for it and prints the answer.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ use sgc_diagnosis::{DiagnosisError, ask};
 use sgc_node::admin::AdminRequest;
 
 use crate::error::{CliError, EXIT_FAILURE};
-use crate::node;
+use crate::node::NodeArgs;
 use crate::output;
 
 /// Longest time a node may take to read files and to change its shares.
@@ -25,15 +25,8 @@ const ANSWER_MAX: Duration = Duration::from_secs(30);
 /// logs the result.
 #[derive(Debug, Args)]
 pub(crate) struct ReloadArgs {
-    /// Configuration of the node; without it, the only node of this user or of a service here
-    #[arg(short, long, value_name = "FILE", conflicts_with_all = ["socket", "node"])]
-    config: Option<PathBuf>,
-    /// Name of the node, if its socket is in the usual place
-    #[arg(long, value_name = "NAME", conflicts_with = "socket")]
-    node: Option<String>,
-    /// Status socket of the node
-    #[arg(long, value_name = "PATH")]
-    socket: Option<PathBuf>,
+    #[command(flatten)]
+    node: NodeArgs,
     /// Print the answer as JSON
     #[arg(long)]
     json: bool,
@@ -58,7 +51,7 @@ struct Report {
 
 /// Runs `sgc reload`.
 pub(crate) fn reload(args: &ReloadArgs) -> Result<ExitCode, CliError> {
-    let socket = node::socket(args.config.as_deref(), args.node.as_deref(), args.socket.as_deref())?;
+    let socket = args.node.socket()?;
     let report = ask(&socket)?;
     let is_pending =
         report.get("needs_restart").and_then(|lines| lines.as_array()).is_some_and(|lines| !lines.is_empty());

@@ -29,7 +29,7 @@ use tokio::task::JoinHandle;
 use tracing::{debug, info, warn};
 use zeroize::Zeroizing;
 
-use self::socket::{ROOT, StatusSocket};
+use self::socket::StatusSocket;
 pub use self::socket::{
     SocketError, connect, default_socket_path, find_socket, has_hidden_services, usual_sockets,
 };
@@ -40,6 +40,7 @@ use crate::control::event::CoreEvent;
 use crate::control::settings::reload::Reloader;
 use crate::data::tap::{Tap, TapMessage, TapRequest};
 use crate::gateway::Gateway;
+use crate::state::{ROOT, own_uid};
 
 /// Prefix of a request line. The number is the version of the protocol.
 pub const ADMIN_PREFIX: &str = "sgc/1 ";
@@ -352,11 +353,10 @@ async fn serve(socket: &StatusSocket, desk: &Desk) {
         };
         let (desk, taps, refused) = (desk.clone(), taps.clone(), refused.clone());
         let asks = stream.peer_cred().map(|peer| (peer.uid(), socket.may_ask(peer.uid())));
-        let own = rustix::process::geteuid().as_raw();
         tokio::spawn(async move {
             match asks {
                 Ok((uid, true)) => {
-                    let is_own = uid == own || uid == ROOT;
+                    let is_own = uid == own_uid() || uid == ROOT;
                     answer(stream, is_own, &desk, &taps).await;
                 }
                 // The socket's mode keeps others out already, unless somebody changed it.
@@ -373,7 +373,7 @@ async fn refuse(stream: &mut UnixStream, uid: u32, was_said: &AtomicBool) {
     if !was_said.swap(true, Relaxed) {
         warn!(uid, "refused another user at the status socket; logged once");
     }
-    let own = rustix::process::geteuid().as_raw();
+    let own = own_uid();
     let text =
         envelope(Err(format!("this node answers uid {own}, whose it is, and root alone: you are uid {uid}")));
     let _ = tokio::time::timeout(TRANSFER_MAX, stream.write_all(text.as_bytes())).await;

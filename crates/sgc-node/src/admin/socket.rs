@@ -15,6 +15,8 @@ use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, socket
 use sgc_trust::NodeName;
 use tokio::net::UnixListener;
 
+use crate::state::{ROOT, own_uid};
+
 /// Permission bits of others than the owner.
 const OTHERS_BITS: u32 = 0o077;
 /// Permission bits of everyone but the owner and the group.
@@ -30,8 +32,6 @@ const WORLD_WRITE_BIT: u32 = 0o002;
 const GROUP_WRITE_BIT: u32 = 0o020;
 /// Permission bit that restricts removal to owners.
 const STICKY_BIT: u32 = 0o1000;
-/// The user id of root.
-pub(super) const ROOT: u32 = 0;
 /// Directory in which systemd creates the runtime directory of each node of `sgc@.service`.
 const SERVICES_DIR: &str = "/run/sgc";
 const SOCKET_EXTENSION: &str = "sock";
@@ -217,10 +217,6 @@ fn usual_dir(variable: &dyn Fn(&str) -> Option<PathBuf>) -> PathBuf {
 /// Returns the directory below `/tmp`, which anybody may have created before.
 fn temporary_dir() -> PathBuf {
     std::env::temp_dir().join(format!("sgc-{}", own_uid()))
-}
-
-fn own_uid() -> u32 {
-    rustix::process::geteuid().as_raw()
 }
 
 /// Checks the directory of a status socket and creates nothing. A directory that anybody may have created, such as the

@@ -23,7 +23,8 @@ const OTHERS_BITS: u32 = 0o077;
 
 /// Directory in which systemd keeps the state of `sgc@.service`.
 const SERVICE_DIR: &str = "/var/lib/sgc";
-const ROOT: u32 = 0;
+/// The user id of root.
+pub(crate) const ROOT: u32 = 0;
 
 /// Returns the state directory of a node with this name: as configured, or in the state directory of the service or of
 /// the user. A service's node is found from outside of it, too, by root and by its own user. `None` if the user has
@@ -48,7 +49,8 @@ fn own_base(variable: &dyn Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
     base.or_else(|| Some(named("HOME")?.join(".local/state")))
 }
 
-fn own_uid() -> u32 {
+/// Returns the effective user id of this process.
+pub(crate) fn own_uid() -> u32 {
     rustix::process::geteuid().as_raw()
 }
 
@@ -124,7 +126,7 @@ pub(crate) fn owner_hint(path: &Path, error: &io::Error) -> String {
             "; it belongs to root: give it to the user that the node runs as, for a service by `sudo chown sgc {}`",
             path.display()
         ),
-        Ok(uid) if uid != rustix::process::geteuid().as_raw() => {
+        Ok(uid) if uid != own_uid() => {
             format!("; it belongs to uid {uid}: run this as that user")
         }
         _ => String::new(),
