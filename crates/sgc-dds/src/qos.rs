@@ -12,7 +12,7 @@ use cyclors::*;
 use sgc_ros::EndpointKind;
 // Cyclone does not know the keys, and treats all samples of a keyed topic as one instance.
 pub use sgc_ros::KEYED_INSTANCES_KEPT;
-use sgc_ros::KEYED_SAMPLES_MAX;
+use sgc_ros::{KEYED_SAMPLES_MAX, UNACKNOWLEDGED_MIN};
 use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representations};
 
 use crate::entity::{INFINITE, c_string};
@@ -27,10 +27,6 @@ pub const HISTORY_DEPTH_MAX: u32 = 4096;
 /// Longest wait of a write for a reader that does not acknowledge, in milliseconds. Only `KEEP_ALL` writers wait;
 /// others overwrite old samples.
 pub const WRITE_BLOCK_MAX_MS: u64 = 2000;
-
-/// Fewest unacknowledged samples that a reliable `KEEP_LAST` writer keeps. Fast DDS acknowledges some 7 ms after the
-/// heartbeat, and a publisher's own depth, ten by default, is meant for a reader on its own network.
-pub const UNACKNOWLEDGED_MIN: u32 = 16;
 
 /// Most unacknowledged samples of a writer, if they are short.
 pub const UNACKNOWLEDGED_MAX: u32 = 1024;

@@ -12,12 +12,12 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_dds::qos::{UNACKNOWLEDGED_MAX, UNACKNOWLEDGED_MIN};
+use sgc_dds::qos::UNACKNOWLEDGED_MAX;
 use sgc_dds::{CycloneNetwork, CycloneReader, CycloneWriter, DdsConfig, DiscoveryRange};
 use sgc_ros::graph::{GidBytes, decode_nodes, encode_nodes, graph_reader, graph_writer};
 use sgc_ros::{
     DiscoveredEndpoint, DiscoveryEvent, EndpointKind, EndpointSpec, GraphNode, Guid, HandleSamples, RosError,
-    RosNetwork, RosWriter, Sample, SampleHead, SampleKind,
+    RosNetwork, RosWriter, Sample, SampleHead, SampleKind, UNACKNOWLEDGED_MIN,
 };
 use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representations, RosNode};
 

@@ -27,7 +27,7 @@ pub use network::{
 };
 pub use qos::{
     KEYED_INSTANCES_KEPT, KEYED_SAMPLES_MAX, QosMismatch, QosOverride, QosPolicy, RELIABLE_READER_DEPTH_MIN,
-    SERVICE_DEPTH, for_all_instances, mismatches, reader_for, service_qos, weakest,
+    SERVICE_DEPTH, UNACKNOWLEDGED_MIN, for_all_instances, mismatches, reader_for, service_qos, weakest,
 };
 pub use routes::{
     ANNOUNCED_EVERY, AnnouncedPublishers, Command, Consumers, Direction, GLOBAL_TOPICS, HEARD_MIN,

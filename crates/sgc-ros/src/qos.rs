@@ -9,6 +9,11 @@ use sgc_wire::{Durability, History, Liveliness, Qos, Reliability, Representation
 /// Fewest samples that a reliable reader of SGC keeps, so that a moment without the processor loses nothing.
 pub const RELIABLE_READER_DEPTH_MIN: u32 = 32;
 
+/// Fewest unacknowledged samples that a reliable `KEEP_LAST` writer of SGC keeps, unless late joiners would get them all.
+/// Fast DDS acknowledges some 7 ms after the heartbeat, and a publisher's own depth, ten by default, is meant for a
+/// reader on its own network.
+pub const UNACKNOWLEDGED_MIN: u32 = 16;
+
 /// Number of instances whose history is kept of a keyed topic. SGC does not know the keys: a writer keeps its last
 /// samples of each instance, SGC as many of all instances together.
 pub const KEYED_INSTANCES_KEPT: u32 = 256;

@@ -8,24 +8,22 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use sgc_ros::RosWriter;
+use sgc_ros::{RosWriter, UNACKNOWLEDGED_MIN};
 use sgc_sync::lock;
 use sgc_wire::SourceId;
 
 use crate::data::spacing::Spacing;
 
-/// Longest wait of a burst for acknowledgements of local readers.
+/// Longest wait for acknowledgements of local readers.
 const ACKNOWLEDGED_WAIT_MAX: Duration = Duration::from_secs(1);
-/// Time during which no burst waits again after a local reader acknowledged nothing.
-const STALLED_READER_PAUSE: Duration = Duration::from_secs(10);
 
-/// Paces messages that arrive in a burst after an interruption. A reliable writer that keeps the last samples never
-/// blocks, so a burst would overwrite itself before readers take it. Its publisher spread the messages over time.
+/// Holds back messages that would overwrite others. A reliable writer that keeps the last samples never blocks, so
+/// messages that come in a burst, or while a reader pauses, would overwrite themselves before readers take them.
 #[derive(Default)]
 pub(crate) struct Burst {
     pub(crate) room: Arc<Room>,
-    /// No wait before this time, because a reader is stalled.
-    not_before: Option<Instant>,
+    /// Whether a reader acknowledged nothing for so long that no message waits for it.
+    is_stalled: bool,
 }
 
 /// Upper bound of a writer's unacknowledged samples. Only the holder of the consumer's lock changes it.
@@ -34,9 +32,17 @@ pub(crate) struct Room {
     unacknowledged: AtomicU32,
     /// The smallest number of samples that the writer kept at a write since none was unacknowledged.
     kept_min: AtomicU32,
-    /// When the last message was written, and its time stamp.
-    last: Mutex<Option<(Instant, i64)>>,
+    written: Mutex<Written>,
     spacing: Mutex<Spacing>,
+}
+
+/// Times of writes.
+#[derive(Clone, Copy, Default)]
+struct Written {
+    /// When the last message was written, and its time stamp.
+    last: Option<(Instant, i64)>,
+    /// When the first one was written since readers were last seen to acknowledge.
+    first: Option<Instant>,
 }
 
 impl Room {
@@ -45,13 +51,20 @@ impl Room {
     pub(crate) fn is_there(&self, writer: &impl RosWriter, bytes: usize, timestamp_ns: i64) -> bool {
         let Some(kept) = writer.kept(bytes) else { return true };
         let kept = self.kept(kept);
-        if self.unacknowledged.load(Relaxed) < kept || self.is_in_its_time(timestamp_ns) {
-            return true;
-        }
+        self.unacknowledged.load(Relaxed) < kept
+            || (!is_deep(kept) && self.is_in_its_time(timestamp_ns))
+            || self.look(writer, kept) < kept
+    }
+
+    /// Looks how many samples are unacknowledged, without waiting.
+    fn look(&self, writer: &impl RosWriter, kept: u32) -> u32 {
         let acknowledged = || writer.wait_acknowledged(Duration::ZERO).then_some(0);
-        let Some(unacknowledged) = writer.unacknowledged().or_else(acknowledged) else { return false };
+        let Some(unacknowledged) = writer.unacknowledged().or_else(acknowledged) else { return u32::MAX };
         self.unacknowledged.store(unacknowledged, Relaxed);
-        unacknowledged < kept
+        if unacknowledged < kept {
+            self.written().first = None;
+        }
+        unacknowledged
     }
 
     /// Returns the number of samples that can be unacknowledged, given the number that the writer keeps of the next
@@ -66,7 +79,7 @@ impl Room {
     /// Returns `true` if the time since the last write is about the publisher's interval. Readers then have the time
     /// that the publisher would have given them, and acknowledge no more often.
     fn is_in_its_time(&self, timestamp_ns: i64) -> bool {
-        let Some((written, published_ns)) = *self.last() else { return false };
+        let Some((written, published_ns)) = self.written().last else { return false };
         let apart = timestamp_ns.checked_sub(published_ns).and_then(|ns| u64::try_from(ns).ok());
         apart.is_some_and(|ns| ns > 0 && written.elapsed() >= Duration::from_nanos(ns / 2))
     }
@@ -85,14 +98,20 @@ impl Room {
         lock(&self.spacing)
     }
 
-    fn last(&self) -> MutexGuard<'_, Option<(Instant, i64)>> {
-        lock(&self.last)
+    fn written(&self) -> MutexGuard<'_, Written> {
+        lock(&self.written)
     }
 }
 
+/// Returns `true` if a writer that keeps so many samples may have a publisher that keeps all: Fast DDS does not announce
+/// that. Other writers keep as few as their publishers, which overwrite, too.
+fn is_deep(kept: u32) -> bool {
+    kept >= UNACKNOWLEDGED_MIN
+}
+
 impl Burst {
-    /// Waits while a sample of this size would overwrite one that a reader may lack. A single sample is written at
-    /// once, as its publisher did.
+    /// Waits while a sample of this size would overwrite one that a reader may lack. A single sample of a writer that
+    /// keeps few is written at once, as its publisher did.
     pub(crate) fn before_next(
         &mut self,
         writer: &impl RosWriter,
@@ -101,25 +120,37 @@ impl Burst {
         timestamp_ns: i64,
     ) {
         let Some(of_next) = writer.kept(bytes) else { return };
-        let kept = self.room.kept(of_next);
-        let mut unacknowledged = self.room.unacknowledged.load(Relaxed);
+        let room = &self.room;
+        let kept = room.kept(of_next);
+        let mut unacknowledged = room.unacknowledged.load(Relaxed);
         if unacknowledged >= kept {
-            unacknowledged = writer.unacknowledged().unwrap_or(unacknowledged);
+            unacknowledged = room.look(writer, kept);
         }
-        // A single sample is acknowledged, or waited for, before the next burst.
-        let waits = !is_alone && self.not_before.is_none_or(|at| Instant::now() >= at);
-        if waits && unacknowledged >= kept {
-            let acknowledged = writer.wait_acknowledged(ACKNOWLEDGED_WAIT_MAX);
+        let wait = if unacknowledged < kept { Duration::ZERO } else { self.wait_max(is_alone, kept) };
+        if !wait.is_zero() {
             // A slow reader that acknowledged some is not stalled.
-            let left = writer.unacknowledged().filter(|_| !acknowledged);
-            let is_stalled = !acknowledged && left.is_none_or(|left| left >= kept);
-            self.not_before = is_stalled.then(|| Instant::now() + STALLED_READER_PAUSE);
-            unacknowledged = left.unwrap_or(0);
+            let is_all = writer.wait_acknowledged(wait);
+            unacknowledged = if is_all { 0 } else { room.look(writer, kept) };
         }
+        self.is_stalled = unacknowledged >= kept && (self.is_stalled || !wait.is_zero());
+
         let kept_min = if unacknowledged == 0 { of_next } else { kept };
-        self.room.kept_min.store(kept_min, Relaxed);
-        self.room.unacknowledged.store(unacknowledged.saturating_add(1), Relaxed);
-        *self.room.last() = Some((Instant::now(), timestamp_ns));
+        room.kept_min.store(kept_min, Relaxed);
+        room.unacknowledged.store(unacknowledged.saturating_add(1), Relaxed);
+        let (now, mut written) = (Instant::now(), room.written());
+        written.last = Some((now, timestamp_ns));
+        written.first = written.first.filter(|_| unacknowledged > 0).or(Some(now));
+    }
+
+    /// Returns the longest wait for room among so many samples. A message that came alone waits no longer than until
+    /// readers have acknowledged nothing for [`ACKNOWLEDGED_WAIT_MAX`], so that a slow topic is not held up by a reader
+    /// that stood still before.
+    fn wait_max(&self, is_alone: bool, kept: u32) -> Duration {
+        if self.is_stalled || (is_alone && !is_deep(kept)) {
+            return Duration::ZERO;
+        }
+        let first = self.room.written().first.filter(|_| is_alone);
+        ACKNOWLEDGED_WAIT_MAX.saturating_sub(first.map_or(Duration::ZERO, |first| first.elapsed()))
     }
 }
 
@@ -137,6 +168,8 @@ mod tests {
         /// The count that it knows, if it knows one, before and after a wait.
         unacknowledged: [Option<u32>; 2],
         waited: AtomicUsize,
+        /// Looks without a wait.
+        asked: AtomicUsize,
         stands_still: AtomicBool,
     }
 
@@ -146,6 +179,7 @@ mod tests {
                 kept,
                 unacknowledged: [None; 2],
                 waited: AtomicUsize::new(0),
+                asked: AtomicUsize::new(0),
                 stands_still: AtomicBool::new(false),
             }
         }
@@ -166,8 +200,9 @@ mod tests {
             if self.waited.load(Relaxed) == 0 { before } else { after }
         }
 
-        fn wait_acknowledged(&self, _: Duration) -> bool {
-            self.waited.fetch_add(1, Relaxed);
+        fn wait_acknowledged(&self, max: Duration) -> bool {
+            let counter = if max.is_zero() { &self.asked } else { &self.waited };
+            counter.fetch_add(1, Relaxed);
             !self.stands_still.load(Relaxed)
         }
 
@@ -189,26 +224,34 @@ mod tests {
         let writer = Slow::new(Some(10));
         let mut burst = Burst::default();
         (0..100).for_each(|_| burst.before_next(&writer, true, 8, 0));
-        assert_eq!(writer.waited.load(Relaxed), 0, "each alone");
         (0..100).for_each(|_| burst.before_next(&writer, false, 8, 0));
-        assert_eq!(writer.waited.load(Relaxed), 10);
+        assert_eq!(writer.asked.swap(0, Relaxed), 19);
         (0..100).for_each(|_| burst.before_next(&writer, false, 2000, 0));
-        assert_eq!(writer.waited.load(Relaxed), 30, "fewer of long ones are kept");
+        assert_eq!(writer.asked.load(Relaxed), 20, "fewer of long ones are kept");
+        assert_eq!(writer.waited.load(Relaxed), 0, "all are acknowledged");
+        writer.stands_still.store(true, Relaxed);
+        (0..1000).for_each(|_| burst.before_next(&writer, true, 8, 0));
+        assert_eq!(writer.waited.load(Relaxed), 0, "each alone");
+        (0..1000).for_each(|_| burst.before_next(&writer, false, 8, 0));
+        assert_eq!(writer.waited.load(Relaxed), 1, "once");
+        // After it has acknowledged, the next burst waits again.
+        writer.stands_still.store(false, Relaxed);
+        burst.before_next(&writer, false, 8, 0);
         writer.stands_still.store(true, Relaxed);
         (0..1000).for_each(|_| burst.before_next(&writer, false, 8, 0));
-        assert!(writer.waited.load(Relaxed) <= 32, "once in a while");
+        assert_eq!(writer.waited.load(Relaxed), 2);
         // A burst does not wait for samples that were acknowledged meanwhile.
         let acknowledging = Slow { unacknowledged: [Some(3); 2], ..Slow::new(Some(10)) };
         let mut burst = Burst::default();
         (0..100).for_each(|_| burst.before_next(&acknowledging, false, 8, 0));
-        assert_eq!(acknowledging.waited.load(Relaxed), 0);
+        assert_eq!((acknowledging.waited.load(Relaxed), acknowledging.asked.load(Relaxed)), (0, 0));
         // A reader that acknowledged some in the longest wait is slow, and not stalled.
         for (after, is_stalled) in [(4, false), (10, true)] {
             let lagging = Slow { unacknowledged: [Some(10), Some(after)], ..Slow::new(Some(10)) };
             lagging.stands_still.store(true, Relaxed);
             let mut burst = Burst::default();
             (0..11).for_each(|_| burst.before_next(&lagging, false, 8, 0));
-            assert_eq!((lagging.waited.load(Relaxed), burst.not_before.is_some()), (1, is_stalled));
+            assert_eq!((lagging.waited.load(Relaxed), burst.is_stalled), (1, is_stalled));
             assert_eq!(burst.room.unacknowledged.load(Relaxed), after + 1);
         }
         let (writer, mut other) = (Slow::new(None), Burst::default());
@@ -216,17 +259,37 @@ mod tests {
         assert_eq!(writer.waited.load(Relaxed), 0, "one that blocks by itself");
     }
 
+    /// Its publisher may keep all.
+    #[test]
+    fn a_message_that_came_alone_waits_at_a_writer_that_keeps_many() {
+        let writer = Slow::new(Some(1000));
+        writer.stands_still.store(true, Relaxed);
+        let mut burst = Burst::default();
+        (0..1000).for_each(|_| burst.before_next(&writer, true, 8, 0));
+        assert_eq!(writer.waited.load(Relaxed), 0);
+        thread::sleep(Duration::from_millis(1));
+        assert!(!burst.room.is_there(&writer, 8, 1), "although its time has come");
+        (0..100).for_each(|_| burst.before_next(&writer, true, 8, 0));
+        assert_eq!(writer.waited.load(Relaxed), 1, "once");
+        // A reader that has stood still for longer than a message waits holds up nobody.
+        let mut burst = Burst::default();
+        (0..1000).for_each(|_| burst.before_next(&writer, true, 8, 0));
+        burst.room.written().first = Instant::now().checked_sub(ACKNOWLEDGED_WAIT_MAX);
+        (0..100).for_each(|_| burst.before_next(&writer, true, 8, 0));
+        assert_eq!(writer.waited.load(Relaxed), 1);
+    }
+
     #[test]
     fn short_samples_overwrite_no_long_ones_that_are_unacknowledged() {
         let writer = Slow::new(Some(10));
         let mut burst = Burst::default();
         (0..5).for_each(|_| burst.before_next(&writer, false, 2000, 0));
-        assert_eq!(writer.waited.load(Relaxed), 0);
+        assert_eq!(writer.asked.load(Relaxed), 0);
         burst.before_next(&writer, false, 8, 0);
-        assert_eq!(writer.waited.load(Relaxed), 1, "five long ones are kept");
+        assert_eq!(writer.asked.load(Relaxed), 1, "five long ones are kept");
         // The long ones are acknowledged, so ten short ones are kept again.
         (0..9).for_each(|_| burst.before_next(&writer, false, 8, 0));
-        assert_eq!(writer.waited.load(Relaxed), 1);
+        assert_eq!(writer.asked.load(Relaxed), 1);
         let stuck = Slow::new(Some(10));
         stuck.stands_still.store(true, Relaxed);
         let mut burst = Burst::default();
@@ -242,7 +305,7 @@ mod tests {
             assert!(burst.room.is_there(&writer, 8, 0));
             burst.before_next(&writer, true, 8, 0);
         }
-        assert_eq!(writer.waited.load(Relaxed), 3, "asked when as many were written as are kept");
+        assert_eq!(writer.asked.load(Relaxed), 3, "asked when as many were written as are kept");
         writer.stands_still.store(true, Relaxed);
         for _ in 0..5 {
             assert!(burst.room.is_there(&writer, 8, 0));

@@ -69,6 +69,24 @@ fn a_reliable_topic_that_keeps_all_arrives_whole_however_fast_it_is_published() 
     }
 }
 
+/// The subscriber's node has room for fewer messages than come meanwhile, and each comes alone.
+#[test]
+fn a_reliable_topic_that_keeps_all_arrives_whole_if_its_subscriber_pauses() {
+    const MESSAGES: u64 = 4_000;
+    const PAUSE: Duration = Duration::from_millis(900);
+    let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/load"]));
+    let extra = ["--depth", "0", "--rate", "2000", "--size", "100", "--insist"];
+    for pair in PAIRS {
+        let (mut talker, mut listener) = start(&lab, pair, [Site::Robot, Site::Desk], MESSAGES, "1", &extra);
+        thread::sleep(PAUSE);
+        listener.signal(Signal::STOP);
+        thread::sleep(PAUSE);
+        listener.signal(Signal::CONT);
+        assert_whole(&listener.summary(), MESSAGES, &format!("{pair:?}"));
+        talker.summary();
+    }
+}
+
 /// More than a node has room for comes while the router stands still.
 #[test]
 fn a_publisher_that_keeps_all_waits_while_the_path_stands_still() {
