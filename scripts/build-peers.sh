@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Builds the independent test peers .peers/cyclone (Python), .peers/fastdds (C++) and .peers/rustdds (Rust).
-# Installs ROS 2 (build-ros2.sh), and the Python and JavaScript libraries that clients of the gateway use.
+# Installs ROS 2 (build-ros2.sh), Prometheus (get-prometheus.sh), and the Python and JavaScript libraries that clients of the
+# gateway use.
 # Skips each part that is newer than its sources.
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
@@ -57,6 +58,7 @@ if [ ! -x .peers/fastdds ] || [ -n "$(find tests/peers/fastdds -newer .peers/fas
 fi
 
 scripts/build-ros2.sh
+scripts/get-prometheus.sh
 
 # A separate workspace with its own target directory, so its dependencies stay apart. Cargo skips an unchanged build.
 say "RustDDS peer"

@@ -38,6 +38,8 @@ cargo fetch --locked
     --config dist/about.toml --output-file "$stage/share/doc/licences.txt" dist/about.hbs
 cp NOTICE LICENSE README.md CHANGELOG.md "$stage/share/doc"
 cp -r dist/examples "$stage/share/doc"
+cp -r dist/grafana "$stage/share/doc/examples"
+install -D -m 644 -t "$stage/share/doc/examples/prometheus" dist/prometheus/alerts.yml
 mkdir -p "$stage/lib/systemd/system" "$stage/lib/sysusers.d" "$stage/lib/tmpfiles.d"
 cp dist/systemd/sgc@.service "$stage/lib/systemd/system"
 cp dist/systemd/sysusers.conf "$stage/lib/sysusers.d/sgc.conf"

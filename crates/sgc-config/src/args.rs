@@ -131,6 +131,7 @@ pub(crate) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         transport: TransportDraft::default(),
         partners: Vec::new(),
         gateway: args.gateway.then(GatewayDraft::default),
+        metrics: None,
     };
     (draft, errors)
 }

@@ -11,6 +11,7 @@ use sgc_trust::{FleetName, NodeName, ShareToken, Suite};
 use sgc_wire::{Class, NodeId};
 
 use crate::gateway::GatewayConfig;
+use crate::metrics::MetricsConfig;
 use crate::recipient::Recipient;
 use crate::router_url::RouterUrl;
 
@@ -74,6 +75,8 @@ pub struct Config {
     pub transport: TransportConfig,
     /// Gateway for programs without ROS; `None` without `[gateway]`. With it, `ros` is set as well.
     pub gateway: Option<GatewayConfig>,
+    /// Server of metrics; `None` without `[metrics]`.
+    pub metrics: Option<MetricsConfig>,
     /// Path of the status socket, if not the usual one.
     pub admin_socket: Option<PathBuf>,
 }

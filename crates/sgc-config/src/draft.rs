@@ -71,6 +71,7 @@ pub(crate) struct Draft {
     pub(crate) transport: TransportDraft,
     pub(crate) partners: Vec<PartnerDraft>,
     pub(crate) gateway: Option<GatewayDraft>,
+    pub(crate) metrics: Option<MetricsDraft>,
 }
 
 /// Names of settings in one source of configuration, for errors that ask for them.
@@ -200,6 +201,12 @@ pub(crate) struct TransportDraft {
     pub(crate) dtls_1_2: Option<WithOrigin<bool>>,
     pub(crate) dscp: Option<WithOrigin<String>>,
     pub(crate) lane_dscp: Option<WithOrigin<String>>,
+}
+
+/// `[metrics]`.
+#[derive(Debug, Default)]
+pub(crate) struct MetricsDraft {
+    pub(crate) listen: Option<WithOrigin<String>>,
 }
 
 /// `[gateway]`.

@@ -499,6 +499,17 @@ pub enum Mistake {
         /// The value.
         value: String,
     },
+    /// The listening address of metrics is not an IP address and a port.
+    #[error(
+        "`{key}` in [metrics] is {value:?}: it takes an IP address and a port, such as \"127.0.0.1:9464\" or \"[::1]:9464\", \
+         without http://"
+    )]
+    MetricsListen {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+    },
     /// A listen address that is a search for routers.
     #[error(
         "`{key}` is {value:?}, which finds routers: listen at an address (\"quic://0.0.0.0:7447\"), and be found on \

@@ -12,8 +12,8 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use crate::draft::{
-    AuditDraft, Draft, GatewayClientDraft, GatewayDraft, NamingDraft, PartnerDraft, QosDraft, RosDraft,
-    RotationDraft, ShapingDraft, ShareDraft, TransportDraft, UseDraft, WithOrigin, Words,
+    AuditDraft, Draft, GatewayClientDraft, GatewayDraft, MetricsDraft, NamingDraft, PartnerDraft, QosDraft,
+    RosDraft, RotationDraft, ShapingDraft, ShareDraft, TransportDraft, UseDraft, WithOrigin, Words,
 };
 use crate::error::{ConfigError, Mistake, Origin};
 use crate::schema::{Table, nearest};
@@ -92,6 +92,7 @@ impl FileReader<'_> {
         let audit = self.single(&top, "audit", Table::Audit);
         let transport = self.single(&top, "transport", Table::Transport);
         let gateway = self.single(&top, "gateway", Table::Gateway);
+        let metrics = self.single(&top, "metrics", Table::Metrics);
         let mut draft = Draft {
             origin: Origin::File { file: self.file.clone(), line: None },
             words: WORDS,
@@ -158,6 +159,9 @@ impl FileReader<'_> {
                 .map(|partner| self.partner(partner))
                 .collect(),
             gateway: gateway.map(|gateway| self.gateway(&gateway)),
+            metrics: metrics.map(|metrics| MetricsDraft {
+                listen: self.string(Some(&metrics), "listen", "a string, such as \"127.0.0.1:9464\""),
+            }),
         };
         draft.attempted = std::mem::take(&mut self.attempted);
         draft

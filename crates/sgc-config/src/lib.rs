@@ -14,6 +14,7 @@ mod draft;
 mod error;
 mod file;
 mod gateway;
+mod metrics;
 mod names;
 mod recipient;
 mod resolve;
@@ -35,6 +36,7 @@ pub use gateway::{
     GATEWAY_CLIENTS_MAX, GatewayClientConfig, GatewayConfig, GatewayScheme, GatewayTls, GatewayUrl,
     GatewayUrlError, ORIGINS_MAX,
 };
+pub use metrics::MetricsConfig;
 pub use names::{FRAME_PREFIX_BYTES_MAX, PEER_BYTES_MAX, TYPE_BYTES_MAX};
 pub use recipient::Recipient;
 pub use resolve::{

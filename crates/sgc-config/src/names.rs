@@ -340,6 +340,11 @@ pub(crate) fn resolver(key: &'static str, value: &str) -> Result<SocketAddr, Mis
         .ok_or_else(|| Mistake::Resolver { key, value: value.to_owned() })
 }
 
+/// Checks the listening address of metrics, `ADDRESS:PORT`.
+pub(crate) fn metrics_listen(key: &'static str, value: &str) -> Result<SocketAddr, Mistake> {
+    value.parse().map_err(|_| Mistake::MetricsListen { key, value: value.to_owned() })
+}
+
 /// Checks a listen address, `SCHEME://ADDRESS[:PORT]`.
 pub(crate) fn listen(key: &'static str, value: &str) -> Result<ListenAddr, Mistake> {
     if matches!(value.split_once("://"), Some(("srv" | "mdns", _))) {

@@ -21,10 +21,11 @@ use crate::config::{
     TransportConfig, UseConfig,
 };
 use crate::draft::{
-    Draft, NamingDraft, PartnerDraft, QosDraft, RosDraft, ShapingDraft, ShareDraft, UseDraft, WithOrigin,
-    Words,
+    Draft, MetricsDraft, NamingDraft, PartnerDraft, QosDraft, RosDraft, ShapingDraft, ShareDraft, UseDraft,
+    WithOrigin, Words,
 };
 use crate::error::{ConfigError, Mistake, Origin};
+use crate::metrics::MetricsConfig;
 use crate::names;
 use crate::recipient::Recipient;
 use crate::ros_env::{self, Environment};
@@ -153,6 +154,7 @@ pub(crate) fn resolve(
     let audit = resolver.audit(draft);
     let transport = resolver.transport(draft);
     let gateway = draft.gateway.as_ref().map(|written| resolver.gateway(written, &draft.partners));
+    let metrics = draft.metrics.as_ref().map(|written| resolver.metrics(written));
     let admin_socket = draft.admin_socket.as_ref().and_then(|socket| resolver.socket(socket));
     match identity {
         Some(identity) if resolver.errors.is_empty() => Ok(Config {
@@ -179,6 +181,7 @@ pub(crate) fn resolve(
             audit,
             transport,
             gateway,
+            metrics,
             admin_socket,
         }),
         _ => Err(resolver.errors),
@@ -602,6 +605,11 @@ impl Resolver<'_> {
             dscp: written.dscp.as_ref().and_then(|mark| self.keep(mark, names::dscp)),
             lane_dscp: written.lane_dscp.as_ref().and_then(|mark| self.keep(mark, names::dscp)),
         }
+    }
+
+    fn metrics(&mut self, written: &MetricsDraft) -> MetricsConfig {
+        let listen = written.listen.as_ref().and_then(|listen| self.keep(listen, names::metrics_listen));
+        listen.map(|listen| MetricsConfig { listen }).unwrap_or_default()
     }
 
     fn audit(&mut self, draft: &Draft) -> AuditConfig {

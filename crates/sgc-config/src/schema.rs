@@ -30,6 +30,8 @@ pub enum Table {
     Audit,
     /// `[[partner]]`
     Partner,
+    /// `[metrics]`
+    Metrics,
     /// `[gateway]`
     Gateway,
     /// `[[gateway.client]]`
@@ -38,7 +40,7 @@ pub enum Table {
 
 impl Table {
     /// All tables, in the order of the reference.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::Top,
         Self::Node,
         Self::Ros,
@@ -52,6 +54,7 @@ impl Table {
         Self::Authority,
         Self::Rotation,
         Self::Audit,
+        Self::Metrics,
         Self::Admin,
     ];
 
@@ -70,6 +73,7 @@ impl Table {
             Self::Rotation => "[rotation]",
             Self::Audit => "[audit]",
             Self::Partner => "[[partner]]",
+            Self::Metrics => "[metrics]",
             Self::Gateway => "[gateway]",
             Self::GatewayClient => "[[gateway.client]]",
         }
@@ -91,6 +95,7 @@ impl Table {
                 "authority",
                 "rotation",
                 "audit",
+                "metrics",
                 "admin",
             ],
             Self::Node => {
@@ -171,6 +176,7 @@ impl Table {
             Self::Authority => &["fleet", "operators"],
             Self::Rotation => &["every", "messages"],
             Self::Audit => &["file", "max_bytes", "files", "off"],
+            Self::Metrics => &["listen"],
             Self::Partner => &["name", "ca", "node"],
             Self::Gateway => &[
                 "listen",
@@ -199,6 +205,7 @@ impl Table {
             | Self::Authority
             | Self::Rotation
             | Self::Audit
+            | Self::Metrics
             | Self::Partner
             | Self::Gateway
             | Self::GatewayClient => &[],

@@ -220,7 +220,7 @@ fn unknown_keys_are_answered_with_the_nearest() {
         ),
         (
             "[[share]]\ntopic = '/a'\nto = ['b']\nlisten = []",
-            &["node.toml:6: [[share]] has no key `listen`; it belongs in [gateway] or [router]"],
+            &["node.toml:6: [[share]] has no key `listen`; it belongs in [gateway] or [router] or [metrics]"],
         ),
         (
             "[[use]]\nfrom = 'b'\ntopic = '/a'\nto = ['c']",
@@ -1377,6 +1377,28 @@ fn every_key_of_a_gateway_is_taken_over() {
         "{warnings:?}"
     );
     assert!(warnings[1].contains("ws://10.0.0.1:9090 is not encrypted"), "{warnings:?}");
+}
+
+#[test]
+fn metrics_are_served_on_loopback_unless_told_otherwise() {
+    let of = |text: &str| good(&format!("{NODE}{text}")).metrics;
+    assert_eq!(of(""), None);
+    let usual = of("[metrics]").unwrap();
+    assert_eq!((usual.listen.to_string(), usual.warnings()), ("127.0.0.1:9464".to_owned(), Vec::new()));
+    assert_eq!(of("[metrics]\nlisten = '[::1]:0'").unwrap().warnings(), Vec::<String>::new());
+    let open = of("metrics.listen = '0.0.0.0:9464'").unwrap().warnings();
+    assert!(
+        open[0].starts_with("metrics: http://0.0.0.0:9464 is neither encrypted nor protected"),
+        "{open:?}"
+    );
+    for wrong in ["localhost:9464", "9464", "http://127.0.0.1:9464", "127.0.0.1"] {
+        let said = said_about(&format!("[metrics]\nlisten = '{wrong}'"));
+        assert_eq!(said.len(), 1, "{said:?}");
+        assert!(
+            said[0].contains(&format!("`listen` in [metrics] is {wrong:?}: it takes an IP address")),
+            "{said:?}"
+        );
+    }
 }
 
 #[test]

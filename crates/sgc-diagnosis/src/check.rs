@@ -127,6 +127,13 @@ pub fn summary(
     if let Some(gateway) = &config.gateway {
         rows.extend(gateway_rows(gateway));
     }
+    if let Some(metrics) = &config.metrics {
+        rows.push(vec!["metrics".to_owned(), format!("http://{}/metrics", metrics.listen)]);
+        rows.extend(metrics.warnings().into_iter().map(|warning| vec!["warning".to_owned(), warning]));
+    }
+    rows.extend(
+        sgc_node::expiry_warning(identity, unix_now()).map(|warning| vec!["warning".to_owned(), warning]),
+    );
     if let Some(alert) = clock_alert(identity, unix_now()) {
         rows.push(vec!["warning".to_owned(), format!("{alert}. The node starts and waits: {}", alert.fix())]);
     }

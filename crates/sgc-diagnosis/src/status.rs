@@ -39,6 +39,7 @@ pub struct Status {
     local_network_reopened: u64,
     router: RouterSize,
     gateway: Option<Gateway>,
+    metrics: Option<String>,
 }
 
 /// A node's answer that reports an error.
@@ -238,6 +239,7 @@ impl Status {
                 "Local network: opened again after this host's addresses changed, so often: {times}"
             ));
         }
+        lines.extend(self.metrics.iter().map(|url| format!("Metrics: {url}")));
         lines.push(format!(
             "Router: {} and {} known, {routed_names} with a route; branches: {branches}",
             output::several(nodes as u64, "node"),

@@ -75,7 +75,7 @@ pub use pool::Pool;
 pub use publisher::Publication;
 pub use refusal::ClientRefusal;
 pub use ros::{LocalReader, LocalRos};
-pub use server::{ListenAt, Protocol, ProtocolNotBuilt, Server, ServerError, ServerOptions};
+pub use server::{ListenAt, NotListening, Protocol, ProtocolNotBuilt, Server, ServerError, ServerOptions};
 pub use service::{Replier, Request, Serving};
 pub use session::{Advertise, Session, Subscribe};
 pub use tls::{TlsError, certified_key};

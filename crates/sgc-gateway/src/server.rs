@@ -2,23 +2,24 @@
 
 #[cfg(feature = "grpc")]
 mod grpc;
+mod listening;
 mod stream;
 #[cfg(feature = "_websocket")]
 mod websocket;
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::io;
 use std::net::SocketAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use rustls::ServerConfig;
 use rustls::sign::CertifiedKey;
 use rustls_pki_types::CertificateDer;
+use sgc_sync::lock;
 use sgc_trust::{TrustAnchors, VerifiedPeer};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::watch;
+use tokio::sync::{Mutex as AsyncMutex, watch};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tokio_rustls::TlsAcceptor;
@@ -31,6 +32,8 @@ use crate::refusal::ClientRefusal;
 use crate::tls::{TlsError, server_config};
 #[cfg(feature = "grpc")]
 use grpc::GrpcFront;
+use listening::Listening;
+pub use listening::NotListening;
 use stream::ByteStream;
 #[cfg(feature = "_websocket")]
 use websocket::WebSocketFront;
@@ -138,14 +141,6 @@ pub struct ServerOptions {
 /// The reason why a server does not start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
-    /// An address could not be bound.
-    #[error("the gateway cannot listen on {at}: {source}")]
-    Listen {
-        /// The address.
-        at: ListenAt,
-        /// The error of the system.
-        source: io::Error,
-    },
     /// This build lacks the protocol of an address.
     #[error("the gateway cannot listen on {at}: {source}")]
     NotBuilt {
@@ -185,7 +180,9 @@ struct ServerState {
 /// The gateway's sockets and connections. All of them end when it is dropped.
 pub struct Server {
     shared: Arc<ServerState>,
-    local: Vec<ListenAt>,
+    listening: Mutex<Vec<Listening>>,
+    /// Held while the addresses change.
+    changing: AsyncMutex<()>,
     _tasks: JoinSet<()>,
 }
 
@@ -199,15 +196,9 @@ fn tls_config(key: Option<&Arc<CertifiedKey>>, access: &Access) -> Result<Option
 }
 
 impl Server {
-    /// Binds all addresses and serves clients.
+    /// Serves clients at all addresses. One that cannot be bound is tried again ([`Self::not_listening`]).
     pub async fn start(hub: Hub, options: ServerOptions) -> Result<Self, ServerError> {
         let tls = tls_config(options.key.as_ref(), &options.access)?;
-        if tls.is_none() && options.listen.iter().any(|at| at.is_encrypted) {
-            return Err(ServerError::NoKey);
-        }
-        for at in &options.listen {
-            at.protocol.check_built().map_err(|source| ServerError::NotBuilt { at: *at, source })?;
-        }
         let admission = Admission::new(options.access, options.clients_max);
         let mut tasks = JoinSet::new();
         let shared = Arc::new(ServerState {
@@ -220,29 +211,60 @@ impl Server {
             hub,
             admission,
         });
-        let mut local = Vec::new();
-        for at in options.listen {
-            let bound = TcpListener::bind(at.addr).await.and_then(|listener| {
-                let addr = listener.local_addr()?;
-                Ok((listener, ListenAt { addr, ..at }))
-            });
-            let (listener, at) = bound.map_err(|source| ServerError::Listen { at, source })?;
-            tracing::info!("programs without ROS may connect at {at}");
-            local.push(at);
-            tasks.spawn(keep_accepting(listener, at, Arc::clone(&shared)));
-        }
-        Ok(Self { shared, local, _tasks: tasks })
+        let (listening, changing) = (Mutex::default(), AsyncMutex::default());
+        let server = Self { shared, listening, changing, _tasks: tasks };
+        server.listen(options.listen).await?;
+        Ok(server)
     }
 
-    /// Returns the listening addresses.
-    pub fn local(&self) -> &[ListenAt] {
-        &self.local
+    /// Listens at these addresses from here on, and at no others. Clients of addresses that stay notice nothing; those
+    /// of others are disconnected.
+    ///
+    /// # Errors
+    /// This build lacks a protocol, or there is no certificate for TLS. Nothing has changed then.
+    pub async fn listen(&self, wanted: Vec<ListenAt>) -> Result<(), ServerError> {
+        let _changing = self.changing.lock().await;
+        for at in &wanted {
+            at.protocol.check_built().map_err(|source| ServerError::NotBuilt { at: *at, source })?;
+        }
+        if self.shared.tls.borrow().is_none() && wanted.iter().any(|at| at.is_encrypted) {
+            return Err(ServerError::NoKey);
+        }
+        let known = std::mem::take(&mut *self.lock());
+        let (kept, ended): (Vec<_>, Vec<_>) =
+            known.into_iter().partition(|one| wanted.contains(&one.wanted()));
+        let new: Vec<_> =
+            wanted.into_iter().filter(|at| kept.iter().all(|one| one.wanted() != *at)).collect();
+        *self.lock() = kept;
+        // A new address may have the port of an old one.
+        for one in ended {
+            one.end().await;
+        }
+        for at in new {
+            let begun = Listening::begin(at, Arc::clone(&self.shared)).await;
+            self.lock().push(begun);
+        }
+        Ok(())
+    }
+
+    /// Returns the addresses at which it listens.
+    pub fn local(&self) -> Vec<ListenAt> {
+        self.lock().iter().filter_map(Listening::local).collect()
+    }
+
+    /// Returns the addresses at which it should listen and does not.
+    pub fn not_listening(&self) -> Vec<NotListening> {
+        self.lock().iter().filter_map(Listening::fault).collect()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Vec<Listening>> {
+        lock(&self.listening)
     }
 
     /// Applies other rules and another certificate. Clients that the rules no longer admit are disconnected.
     pub fn reconfigure(&self, access: Access, key: Option<&Arc<CertifiedKey>>) -> Result<(), ServerError> {
         let tls = tls_config(key, &access)?;
-        if tls.is_none() && self.local.iter().any(|at| at.is_encrypted) {
+        if tls.is_none() && self.lock().iter().any(|one| one.wanted().is_encrypted) {
             return Err(ServerError::NoKey);
         }
         self.shared.tls.send_replace(tls);
@@ -275,7 +297,7 @@ impl Server {
     /// Returns the status of the gateway.
     pub fn status(&self) -> GatewayStatus {
         GatewayStatus {
-            listen: self.local.iter().map(ToString::to_string).collect(),
+            listen: self.local().iter().map(ToString::to_string).collect(),
             clients: self.shared.admission.clients(),
             refused: self.refused(),
             readers: self.shared.hub.readers(),
@@ -307,11 +329,17 @@ impl Server {
 
 impl fmt::Debug for Server {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Server").field("local", &self.local).finish_non_exhaustive()
+        f.debug_struct("Server").field("local", &self.local()).finish_non_exhaustive()
     }
 }
 
-async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<ServerState>) {
+/// Accepts connections at an address. `open` tells those that outlive this task of its end.
+async fn keep_accepting(
+    listener: TcpListener,
+    at: ListenAt,
+    shared: Arc<ServerState>,
+    open: watch::Receiver<()>,
+) {
     // The set ends all connections when the listener ends.
     let mut connections = JoinSet::new();
     loop {
@@ -319,7 +347,7 @@ async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<ServerS
             accepted = listener.accept() => match accepted {
                 Ok((stream, peer)) => {
                     let _ = stream.set_nodelay(true);
-                    connections.spawn(serve(stream, peer, at, Arc::clone(&shared)));
+                    connections.spawn(serve(stream, peer, at, Arc::clone(&shared), open.clone()));
                 }
                 Err(error) => {
                     tracing::warn!(%error, "the gateway could not accept a connection");
@@ -331,7 +359,13 @@ async fn keep_accepting(listener: TcpListener, at: ListenAt, shared: Arc<ServerS
     }
 }
 
-async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<ServerState>) {
+async fn serve(
+    stream: TcpStream,
+    peer: SocketAddr,
+    at: ListenAt,
+    shared: Arc<ServerState>,
+    open: watch::Receiver<()>,
+) {
     let admission = &shared.admission;
     let Some(mut handshake) = Handshakes::begin(&shared.handshakes, peer.ip()) else {
         return admission.count(ClientRefusal::TooManyHandshakes);
@@ -348,13 +382,15 @@ async fn serve(stream: TcpStream, peer: SocketAddr, at: ListenAt, shared: Arc<Se
         Ok(None) => return,
         Err(_) => return admission.count(ClientRefusal::HandshakeTooSlow),
     };
+    #[cfg(not(feature = "grpc"))]
+    drop(open);
     match at.protocol {
         #[cfg(feature = "grpc")]
-        Protocol::Grpc => shared.grpc.serve(stream, arrival, deadline, handshake).await,
+        Protocol::Grpc => shared.grpc.serve(stream, arrival, deadline, handshake, open).await,
         #[cfg(feature = "_websocket")]
         Protocol::WebSocket => shared.websocket.serve(stream, arrival, deadline, handshake).await,
         #[cfg(not(all(feature = "grpc", feature = "_websocket")))]
-        // `Server::start` refuses addresses of other protocols.
+        // `Server::listen` refuses addresses of other protocols.
         _ => drop((stream, arrival)),
     }
 }

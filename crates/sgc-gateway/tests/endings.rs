@@ -14,7 +14,8 @@ use serde_json::json;
 use sgc_gateway::foxglove::FoxgloveError;
 use sgc_gateway::rosbridge::RosbridgeOptions;
 use sgc_gateway::{
-    Access, ListenAt, Protocol, Server, ServerOptions, Session, SessionLimits, foxglove, rosbridge,
+    Access, ListenAt, Protocol, Server, ServerError, ServerOptions, Session, SessionLimits, foxglove,
+    rosbridge,
 };
 use sgc_websocket::WebSocket;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, DuplexStream};
@@ -101,6 +102,44 @@ async fn client_that_breaks_a_rule_and_sends_on_gets_the_code() {
             assert_eq!(close(&mut socket).await.unwrap().0, code, "{subprotocol:?}");
         }
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn addresses_change_and_clients_of_those_that_stay_notice_nothing() {
+    let at = |port: u16| ListenAt {
+        protocol: Protocol::WebSocket,
+        is_encrypted: false,
+        addr: ([127, 0, 0, 1], port).into(),
+    };
+    let site = Site::new().await;
+    let server = server(&site, 64).await;
+    let mut stays = connect(server.local()[0].addr, None).await;
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = taken.local_addr().unwrap().port();
+    server.listen(vec![at(port), at(0)]).await.unwrap();
+    let [fault] = &server.not_listening()[..] else { panic!("{:?}", server.not_listening()) };
+    assert_eq!(fault.at, at(port));
+    assert_eq!(server.status().listen.len(), 1);
+    drop(taken);
+    within(async {
+        while !server.not_listening().is_empty() {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    })
+    .await;
+    let mut goes = connect(at(port).addr, None).await;
+    make_error(&mut goes).await;
+    // The port is free at once, also for another protocol.
+    server.listen(vec![at(0), ListenAt { protocol: Protocol::Grpc, ..at(port) }]).await.unwrap();
+    assert_eq!((server.not_listening(), server.local().len()), (Vec::new(), 2));
+    assert!(!matches!(within(goes.next()).await, Some(Ok(_))), "its address is closed");
+    make_error(&mut stays).await;
+    // Without a certificate nothing changes.
+    let encrypted = ListenAt { is_encrypted: true, ..at(0) };
+    assert!(matches!(server.listen(vec![encrypted]).await, Err(ServerError::NoKey)));
+    make_error(&mut stays).await;
+    server.listen(Vec::new()).await.unwrap();
+    assert!(!matches!(within(stays.next()).await, Some(Ok(_))));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -15,6 +15,7 @@ mod drops;
 mod gateway;
 mod link;
 mod local;
+mod metrics;
 mod node;
 mod state;
 
@@ -43,9 +44,10 @@ pub use gateway::access::{
 };
 pub use gateway::{GatewayStartError, OpenLocalRos};
 pub use link::push_crl::{PushCrlError, push_crl};
+pub use metrics::series::{METRICS, Metric, MetricKind};
 pub use node::{
     NodeError, OpenNetwork, RunOptions, Watchdog, admin_socket_path, check_identity, enclave_of,
-    load_identity, run, run_on, run_opening,
+    expiry_warning, load_identity, run, run_on, run_opening,
 };
 pub use state::fleet_file::{FleetFileError, LockedFleet, read_fleet};
 pub use state::run_lock::IdentityInUse;

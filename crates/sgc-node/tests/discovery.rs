@@ -311,6 +311,51 @@ fn a_shared_router_serves_the_fleets_that_it_accepts_and_keeps_them_apart() {
 }
 
 #[test]
+fn routers_change_at_a_reload_and_no_message_is_lost() {
+    let lab = Lab::new(&["robot", "desk"]);
+    lab.enroll("cloud2", |request| request.router = true);
+    let (first, _cloud) = (lab.url(), lab.cloud());
+    let cloud2 = router(&lab, "cloud2", 0, None, |config| config.routers = urls(&[&first]));
+    let second = format!("quic://{}", cloud2.addr.unwrap());
+    let robot = lab.start("robot", |config| config.shares = vec![share("/chatter", &["desk"])]);
+    let desk = lab.start("desk", |config| config.uses = vec![uses("/chatter")]);
+    let (talker, listener) = (lab.talker("robot", "/chatter"), lab.listener("desk", "/chatter"));
+    talker.wait_for_readers(1);
+    warm_up(&talker, &[&listener]);
+    let stream = Stream::start(talker);
+    stream.more(200);
+
+    let report = robot.reload(|config| config.routers = urls(&[&second]));
+    let changed = serde_json::json!([
+        format!("{second} is searched for"),
+        format!("{first} is no longer searched for")
+    ]);
+    assert_eq!((&report["changed"], &report["needs_restart"]), (&changed, &serde_json::json!([])));
+    wait("it is linked with the second", || robot.peers().contains(&lab.id("cloud2").to_string()));
+    wait("and with no other", || is_linked_to(&robot, &lab, "cloud2"));
+    let rows = found_by(&robot, "static");
+    assert_eq!((rows.len(), &rows[0]["router"]), (1, &Value::from(second.clone())));
+    stream.more(300);
+    // One that is added, and then the other removed.
+    robot.reload(|config| config.routers = urls(&[&second, &first]));
+    wait("it is linked with both", || robot.peers().len() == 2);
+    robot.reload(|config| config.routers = urls(&[&first]));
+    wait("it is linked with the first", || is_linked_to(&robot, &lab, "cloud"));
+    stream.more(300);
+    // The same router by another URL: one node has one link to it.
+    let by_name = format!("quic://localhost:{}", first.rsplit_once(':').unwrap().1);
+    desk.reload(|config| config.routers = urls(&[&by_name]));
+    wait("it is linked by that URL", || {
+        let rows = found_by(&desk, "static");
+        rows.len() == 1 && rows[0]["router"] == by_name && rows[0]["state"] == "linked"
+    });
+    stream.more(300);
+    let (_talker, last) = stream.end();
+    hears_each(&listener, 1, last);
+    listener.hears_nothing();
+}
+
+#[test]
 fn a_node_of_one_fleet_behind_a_shared_router_cannot_join_a_name_of_the_other() {
     let (ops, b) = shared_router();
     let a = ops.beside("a");

@@ -126,6 +126,12 @@ pub(crate) enum CliError {
         /// The fault.
         reason: LogFilterError,
     },
+    /// A text that is no form of the log.
+    #[error("SGC_LOG_FORMAT is {value:?}: write text or json")]
+    LogFormat {
+        /// The value.
+        value: String,
+    },
     /// No status socket was named and none is in the usual place.
     #[error("no node of this user runs here (no socket in {}); name one with -c or --socket", dir.display())]
     NoNodeHere {
@@ -303,6 +309,7 @@ impl CliError {
             | Self::CheckIdentity { .. }
             | Self::Diagnosis(DiagnosisError::RouterCannotName { .. })
             | Self::LogFilter { .. }
+            | Self::LogFormat { .. }
             | Self::SeveralNodes { .. }
             | Self::NoConfigHere
             | Self::SeveralConfigs { .. }
@@ -324,7 +331,6 @@ impl CliError {
                 | NodeError::State(StateError::Directory { .. })
                 | NodeError::Randomness(_),
             ) => EXIT_FAILURE,
-            Self::Node(NodeError::Gateway(error)) if error.may_pass() => EXIT_FAILURE,
             Self::Node(NodeError::IdentityFile { source, .. }) if !is_lacking(source) => EXIT_FAILURE,
             Self::Node(_) => EXIT_USAGE,
             Self::Process(_)

@@ -4,6 +4,7 @@
 
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{TcpListener, TcpStream};
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::UnixStream;
 use std::path::Path;
@@ -292,18 +293,24 @@ fn a_running_node_takes_what_it_can_and_names_what_needs_a_restart() {
         serde_json::from_str(&place.good(&["status", "--socket", "arm.sock", "--json"])).unwrap();
     assert_eq!(status["routes"][0]["topic"], "/cmd");
 
-    place.write("arm-1.toml", &good.replace("127.0.0.1:9", "127.0.0.1:10").replace("lamp", "sofa"));
+    let other = good.replace("127.0.0.1:9", "127.0.0.1:10").replace("lamp", "sofa");
+    place.write("arm-1.toml", &other.replace("watch = false", "watch = false\nkeep_alive = \"5s\""));
     let reload = || place.run(&["reload", "--socket", "arm.sock"]);
     let said = reload();
-    let expected = ["/handoff/pose: who may subscribe changed", "`routers` changed, which needs a restart"];
+    let expected = [
+        "/handoff/pose: who may subscribe changed",
+        "quic://127.0.0.1:10 is searched for",
+        "quic://127.0.0.1:9 is no longer searched for",
+        "`keep_alive` changed, which needs a restart",
+    ];
     assert_eq!((said.code, said.stdout.lines().collect::<Vec<_>>()), (Some(1), expected.to_vec()));
     let said = reload();
     assert_eq!(
         (said.code, &*said.stdout),
-        (Some(1), &*format!("{}\n", expected[1])),
+        (Some(1), &*format!("{}\n", expected[3])),
         "said until it is done"
     );
-    let pending = format!("restart pending: {}", expected[1]);
+    let pending = format!("restart pending: {}", expected[3]);
     assert!(place.good(&["status", "--socket", "arm.sock"]).contains(&pending));
 
     // SIGHUP does the same and logs the result.
@@ -322,6 +329,56 @@ fn a_running_node_takes_what_it_can_and_names_what_needs_a_restart() {
     assert_eq!(events.len(), 6);
     assert!(events[2]["reason"].as_str().unwrap().starts_with("refused: "), "{json}");
     assert_eq!((&events[1]["by"], &events[5]["by"]), (&"sgc reload".into(), &"SIGHUP".into()));
+}
+
+#[test]
+fn gateway_comes_moves_and_goes_at_a_reload_and_a_taken_port_stops_nothing() {
+    let place = Place::new();
+    let base = place.read("arm-1.toml");
+    let with = |listen: &str| place.write("arm-1.toml", &format!("{base}\n[gateway]\nlisten = [{listen}]\n"));
+    let status = || -> Value {
+        serde_json::from_str(&place.good(&["status", "--socket", "arm.sock", "--json"])).unwrap()
+    };
+    let eventually = |what: &str, is_so: &dyn Fn() -> bool| {
+        let deadline = Instant::now() + PATIENCE;
+        while !is_so() {
+            assert!(Instant::now() < deadline, "never: {what}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    };
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("ws://{}", taken.local_addr().unwrap());
+    with(&format!("'{url}', 'ws://127.0.0.1:0'"));
+    let node = place.start("arm-1.toml");
+    let alert = status()["alerts"][0].clone();
+    assert_eq!((&alert["kind"], &alert["at"]), (&"gateway_not_listening".into(), &url.clone().into()));
+    let listens_at = || status()["gateway"]["listen"].as_array().cloned().unwrap_or_default();
+    assert_eq!(listens_at().len(), 1, "at the other one it does");
+    drop(taken);
+    eventually("it listens there, too", &|| listens_at().contains(&url.clone().into()));
+    assert_eq!(status()["alerts"], Value::Array(Vec::new()));
+
+    let reload = || place.good(&["reload", "--socket", "arm.sock"]);
+    with("'ws://127.0.0.1:0'");
+    assert_eq!(reload(), "programs without ROS may connect at ws://127.0.0.1:0\n");
+    assert!(TcpStream::connect(url.strip_prefix("ws://").unwrap()).is_err(), "that address is closed");
+    assert_eq!(listens_at().len(), 1);
+    place.write("arm-1.toml", &base);
+    assert_eq!(reload(), "programs without ROS may not connect any more\n");
+    assert!(status()["gateway"].is_null());
+    with(&format!("'{url}'"));
+    assert!(reload().contains(&format!("programs without ROS may connect at {url}")));
+    TcpStream::connect(url.strip_prefix("ws://").unwrap()).unwrap();
+    // Bounds are those of the start.
+    place.write("arm-1.toml", &(place.read("arm-1.toml") + "clients_max = 3\n"));
+    let said = place.run(&["reload", "--socket", "arm.sock"]);
+    assert_eq!(said.code, Some(1), "{}", said.stdout);
+    assert!(
+        said.stdout.contains("`clients_max` or `client_bytes_max` in [gateway] changed"),
+        "{}",
+        said.stdout
+    );
+    node.end();
 }
 
 #[test]
@@ -683,12 +740,7 @@ fn a_token_is_used_by_adding_three_lines() {
     // The rule is removed again while the node runs.
     let node = place.start("cart.toml");
     place.write("cart.toml", &before);
-    // The router that only the token named is dialled until a restart.
-    let reload = || {
-        let said = place.run(&["reload", "--socket", "cart.sock"]);
-        assert_eq!(said.code, Some(1), "{}{}", said.stdout, said.stderr);
-        said.stdout
-    };
+    let reload = || place.good(&["reload", "--socket", "cart.sock"]);
     let said = reload();
     assert!(said.starts_with("/handoff/pose of arm-1 is no longer used (by token)"), "{said}");
     node.end();
@@ -698,7 +750,7 @@ fn a_token_is_used_by_adding_three_lines() {
     let node = place.start("cart.toml");
     let said = place.good(&["use", "pose.token", "-c", "cart.toml"]);
     assert!(said.contains("/handoff/pose of arm-1 is used (by token)"), "{said}");
-    assert!(said.contains("quic://127.0.0.1:10 is dialled, which a token names"), "{said}");
+    assert!(said.contains("quic://127.0.0.1:10 is searched for"), "{said}");
     assert!(!said.contains("restart"), "{said}");
     let status: Value =
         serde_json::from_str(&place.good(&["status", "--socket", "cart.sock", "--json"])).unwrap();
@@ -706,7 +758,13 @@ fn a_token_is_used_by_adding_three_lines() {
     assert!(status["routers"].to_string().contains("quic://127.0.0.1:10"), "{status}");
     place.write("cart.toml", &before);
     let said = reload();
-    assert!(said.contains("is dialled until a restart"), "{said}");
+    assert!(said.contains("quic://127.0.0.1:10 is no longer searched for"), "{said}");
+    let routers = || place.good(&["status", "--socket", "cart.sock", "--json"]);
+    let deadline = Instant::now() + PATIENCE;
+    while routers().contains("quic://127.0.0.1:10") {
+        assert!(Instant::now() < deadline, "the router of the token stays");
+        std::thread::sleep(Duration::from_millis(20));
+    }
     node.end();
 }
 

@@ -7,7 +7,7 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, Sleep};
 use tokio_stream::wrappers::ReceiverStream;
@@ -57,12 +57,13 @@ impl GrpcFront {
         arrival: Arrival,
         deadline: Instant,
         handshake: Handshake,
+        open: watch::Receiver<()>,
     ) {
         let Arrival { peer, is_encrypted, certificate } = arrival;
         let connection =
             if is_encrypted { Connection::encrypted(peer, certificate) } else { Connection::plain(peer) };
         let admission = Arc::clone(&self.admission);
-        let placed = GrpcStream::new(stream, admission, connection.clone(), deadline, handshake);
+        let placed = GrpcStream::new(stream, admission, connection.clone(), deadline, handshake, open);
         let _ = self.accepted.send(AcceptedStream::new(placed, connection)).await;
     }
 }
@@ -74,6 +75,8 @@ struct GrpcStream {
     admission: Arc<Admission>,
     connection: Connection,
     standing: Standing,
+    /// Ends when the address over which the connection came is closed.
+    closing: Pin<Box<dyn Future<Output = ()> + Send>>,
 }
 
 /// The admission state of a gRPC connection.
@@ -95,14 +98,21 @@ impl GrpcStream {
         connection: Connection,
         deadline: Instant,
         handshake: Handshake,
+        mut open: watch::Receiver<()>,
     ) -> Self {
         let deadline = Box::pin(tokio::time::sleep_until(deadline));
-        Self { stream, admission, connection, standing: Standing::Unproven { deadline, handshake } }
+        let standing = Standing::Unproven { deadline, handshake };
+        let closing = Box::pin(async move { while open.changed().await.is_ok() {} });
+        Self { stream, admission, connection, standing, closing }
     }
 
     /// Fails once the client may not stay. Called before reads and writes, because a client that does not read its
     /// answers must not send either.
     fn check(&mut self, cx: &mut Context<'_>) -> io::Result<()> {
+        if matches!(self.standing, Standing::Refused) || self.closing.as_mut().poll(cx).is_ready() {
+            self.standing = Standing::Refused;
+            return Err(io::ErrorKind::ConnectionAborted.into());
+        }
         let admitted = self.connection.poll_admitted(cx);
         let (standing, result) = match (&mut self.standing, admitted) {
             (Standing::Refused, _) => return Err(io::ErrorKind::ConnectionAborted.into()),
@@ -197,19 +207,22 @@ mod tests {
     fn placed(
         admission: &Arc<Admission>,
         handshakes: &Arc<Handshakes>,
+        open: &watch::Sender<()>,
     ) -> (GrpcStream, tokio::io::DuplexStream) {
         let peer: SocketAddr = "192.0.2.1:1000".parse().unwrap();
         let (near, far) = duplex(16);
         let handshake = Handshakes::begin(handshakes, peer.ip()).unwrap();
         let (admission, deadline) = (Arc::clone(admission), Instant::now() + TIME);
-        (GrpcStream::new(Box::new(near), admission, Connection::plain(peer), deadline, handshake), far)
+        let (plain, open) = (Connection::plain(peer), open.subscribe());
+        (GrpcStream::new(Box::new(near), admission, plain, deadline, handshake, open), far)
     }
 
     #[tokio::test(start_paused = true)]
     async fn unproven_client_is_disconnected_without_a_place() {
         let (admission, handshakes) = (Admission::new(Access::default(), 1), Arc::default());
-        let (mut silent, _far) = placed(&admission, &handshakes);
-        let (mut deaf, _other) = placed(&admission, &handshakes);
+        let open = watch::Sender::new(());
+        let (mut silent, _far) = placed(&admission, &handshakes, &open);
+        let (mut deaf, _other) = placed(&admission, &handshakes, &open);
         let began = Instant::now();
         let mut buf = [0; 16];
         let read = silent.read(&mut buf);
@@ -224,5 +237,21 @@ mod tests {
         assert!(silent.read(&mut buf).await.is_err() && silent.shutdown().await.is_err());
         assert_eq!(admission.refused(), [("handshake too slow".to_owned(), 2)].into());
         assert!(admission.clients().is_empty());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn connection_ends_with_its_address() {
+        let (admission, handshakes) = (Admission::new(Access::default(), 1), Arc::default());
+        let open = watch::Sender::new(());
+        let (mut stream, _far) = placed(&admission, &handshakes, &open);
+        let (began, mut buf) = (Instant::now(), [0; 16]);
+        let close = async {
+            tokio::time::sleep(TIME / 4).await;
+            drop(open);
+        };
+        let (read, ()) = tokio::join!(stream.read(&mut buf), close);
+        assert_eq!(read.unwrap_err().kind(), io::ErrorKind::ConnectionAborted);
+        assert!(began.elapsed() < TIME / 2);
+        assert!(stream.write(&[0]).await.is_err() && stream.read(&mut buf).await.is_err());
     }
 }

@@ -40,6 +40,7 @@ use crate::control::event::CoreEvent;
 use crate::control::settings::reload::Reloader;
 use crate::data::tap::{Tap, TapMessage, TapRequest};
 use crate::gateway::Gateway;
+use crate::metrics::Metrics;
 use crate::state::{ROOT, own_uid};
 
 /// Prefix of a request line. The number is the version of the protocol.
@@ -289,6 +290,7 @@ pub(crate) struct Desk {
     pub(crate) events: mpsc::Sender<CoreEvent>,
     pub(crate) reloader: Arc<Reloader>,
     pub(crate) gateway: Arc<Gateway>,
+    pub(crate) metrics: Arc<Metrics>,
 }
 
 /// Binds the socket at `path` and answers there until the returned task is aborted. It retries while another process
@@ -381,10 +383,10 @@ async fn refuse(stream: &mut UnixStream, uid: u32, was_said: &AtomicBool) {
 
 /// Answers a request. Only the node's own user and root may change the fleet.
 async fn answer(mut stream: UnixStream, is_own: bool, desk: &Desk, taps: &Semaphore) {
-    let Desk { events, reloader, gateway } = desk;
+    let Desk { events, gateway, .. } = desk;
     let request = read_line(&mut stream).await.and_then(|line| AdminRequest::parse(&line));
     let text = match request {
-        Ok(AdminRequest::Status) => match status(events, gateway).await {
+        Ok(AdminRequest::Status) => match status(desk).await {
             Some(text) => text,
             None => return,
         },
@@ -413,7 +415,7 @@ async fn answer(mut stream: UnixStream, is_own: bool, desk: &Desk, taps: &Semaph
         Ok(AdminRequest::Operate { .. }) if !is_own => {
             envelope(Err("only the user of this node and root may change the fleet through it".to_owned()))
         }
-        Ok(request) => envelope(carry_out(request, events, reloader, gateway).await),
+        Ok(request) => envelope(carry_out(request, desk).await),
         Err(error) => envelope(Err(error.to_string())),
     };
     let write = async {
@@ -451,11 +453,14 @@ async fn read_line(stream: &mut UnixStream) -> Result<Vec<u8>, AdminError> {
     }
 }
 
-async fn status(events: &mpsc::Sender<CoreEvent>, gateway: &Gateway) -> Option<String> {
+async fn status(desk: &Desk) -> Option<String> {
     let (reply, status) = oneshot::channel();
-    events.send(CoreEvent::Status(reply)).await.ok()?;
+    desk.events.send(CoreEvent::Status(reply)).await.ok()?;
     let mut status = status.await.ok()?;
-    status.gateway = gateway.status();
+    status.gateway = desk.gateway.status();
+    status.metrics = desk.metrics.url();
+    status.alerts.extend(desk.gateway.alerts());
+    status.alerts.extend(desk.metrics.alert());
     serde_json::to_string(&status).ok()
 }
 
@@ -513,15 +518,11 @@ async fn show(mut stream: UnixStream, mut tap: Tap, most: u32) {
 }
 
 /// Carries out a request. Returns JSON or an error message.
-async fn carry_out(
-    request: AdminRequest,
-    events: &mpsc::Sender<CoreEvent>,
-    reloader: &Reloader,
-    gateway: &Gateway,
-) -> Result<String, String> {
+async fn carry_out(request: AdminRequest, desk: &Desk) -> Result<String, String> {
+    let Desk { events, reloader, gateway, .. } = desk;
     let stopping = || "the node is stopping".to_owned();
     match request {
-        AdminRequest::Status => status(events, gateway).await.ok_or_else(stopping),
+        AdminRequest::Status => status(desk).await.ok_or_else(stopping),
         AdminRequest::Graph(name) => {
             let (reply, graph) = oneshot::channel();
             events.send(CoreEvent::Graph(name, reply)).await.map_err(|_| stopping())?;

@@ -45,6 +45,8 @@ pub struct Status {
     pub router: RouterLine,
     /// The gateway for programs without ROS; null without `[gateway]`.
     pub gateway: Option<GatewayStatus>,
+    /// The URL at which metrics are served; null if they are not.
+    pub metrics: Option<String>,
 }
 
 /// A link that is up.

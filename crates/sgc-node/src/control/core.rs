@@ -326,6 +326,9 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::Status(reply) => {
                 let _ = reply.send(self.status());
             }
+            CoreEvent::Readings(reply) => {
+                let _ = reply.send(Box::new(self.readings()));
+            }
             CoreEvent::Graph(name, reply) => {
                 let _ = reply.send(self.graph(name));
             }

@@ -26,6 +26,7 @@ use crate::data::sending::message_keys::MessageKeys;
 use crate::data::tap::{Tap, TapError, TapRequest};
 use crate::data::writer_queue::WriterQueue;
 use crate::link::control_tx::ControlTx;
+use crate::metrics::readings::Readings;
 
 /// Events that may wait for the control task. Senders wait while it is full.
 pub(crate) const INBOX_MAX: usize = 4096;
@@ -161,6 +162,8 @@ pub(crate) enum CoreEvent {
     TypeLookedFor(TypeOutcome),
     /// Asks whether the control task still works. The answer comes behind everything that came before.
     Ping(oneshot::Sender<()>),
+    /// Metrics are asked for.
+    Readings(oneshot::Sender<Box<Readings>>),
     /// Asks for the status.
     Status(oneshot::Sender<Status>),
     /// Asks for the graph, also of a name that is not in use here.

@@ -77,6 +77,13 @@ impl LocalNetwork {
         self.daemon.browse(SERVICE)
     }
 
+    /// Stops to listen for announcements.
+    pub(crate) fn stop_browsing(&self) {
+        if let Err(error) = self.daemon.stop_browse(SERVICE) {
+            debug!(%error, "mDNS goes on to listen");
+        }
+    }
+
     /// Returns the news in an event, if it is about another router.
     pub(crate) fn heard(&self, event: ServiceEvent) -> Option<Sighting> {
         match event {

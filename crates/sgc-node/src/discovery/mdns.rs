@@ -78,7 +78,7 @@ pub(crate) async fn keep_some<H: KeepLink>(
 }
 
 /// The routers on the local network that are wanted.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct RouterFilter {
     /// As the user wrote it.
     pub(crate) written: String,

@@ -12,20 +12,17 @@ mod kept_link;
 mod link_keeper;
 mod local;
 mod mdns;
+mod searches;
 mod srv;
 mod srv_answer;
 mod target;
 mod urls;
 
-use std::sync::Arc;
 use std::time::Instant;
 
 use rand_chacha::ChaCha20Rng;
-use rand_core::SeedableRng as _;
-use sgc_config::RouterUrl;
 use sgc_session::{BACKOFF_MAX, BACKOFF_MIN, Backoff};
 use tokio::sync::watch;
-use tokio::task::JoinHandle;
 use tokio::time::sleep_until;
 use tracing::{debug, info, warn};
 
@@ -36,45 +33,13 @@ pub(crate) use dns::{Dns, Names};
 pub(crate) use link_keeper::{DialledLink, Failure, KeepLink, LinkKeeper, LinkRequest, Outcome};
 pub(crate) use local::LocalNetwork;
 pub(crate) use mdns::RouterFilter;
+pub(crate) use searches::{Searches, WantedRouters};
 pub(crate) use target::DialTarget;
 pub(crate) use urls::{SkippedUrl, WorkingUrls, is_over_udp};
 
 use crate::clock::time_now;
 use crate::link::in_use::place_in_use;
 use crate::link::roaming::Network;
-
-/// Starts the searches for the routers of the configuration and of tokens. `local` holds the local network and the
-/// routers wanted there.
-pub(crate) fn start(
-    configured: &[RouterUrl],
-    of_tokens: &[RouterUrl],
-    keeper: &LinkKeeper,
-    board: &Board,
-    local: Option<(Arc<LocalNetwork>, RouterFilter)>,
-    rng: &mut ChaCha20Rng,
-) -> Vec<JoinHandle<()>> {
-    let mut tasks = Vec::new();
-    for (urls, by) in [(configured, "static"), (of_tokens, "token")] {
-        for urls in urls::routers(urls) {
-            let (keeper, rng) = (keeper.clone(), ChaCha20Rng::from_rng(rng));
-            let Some(target) = DialTarget::by(urls) else { continue };
-            let written = RouterUrl::by(target.urls());
-            tasks.push(tokio::spawn(keep_at(target, keeper, board.row(written, by), rng)));
-        }
-    }
-    for url in configured.iter().chain(of_tokens) {
-        // One task below serves all entries of the local network.
-        let RouterUrl::Srv(domain) = url else { continue };
-        let (keeper, rng) = (keeper.clone(), ChaCha20Rng::from_rng(rng));
-        let (row, dns) = (board.row(url, "srv"), keeper.dns.clone());
-        tasks.push(tokio::spawn(srv::keep_one_of(domain.clone(), dns, keeper, row, rng)));
-    }
-    if let Some((local, wanted)) = local {
-        let (keeper, rng) = (keeper.clone(), ChaCha20Rng::from_rng(rng));
-        tasks.push(tokio::spawn(mdns::keep_some(local, wanted, keeper, board.clone(), rng)));
-    }
-    tasks
-}
 
 /// Keeps a link to one router: dials, and dials again with jittered back-off whenever the link ends.
 pub(crate) async fn keep_at<H: KeepLink>(

@@ -5,12 +5,15 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::future::Future;
 use std::net::SocketAddr;
-use std::sync::Mutex;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use rand_core::SeedableRng as _;
+use sgc_config::RouterUrl;
 use sgc_transport::{DialError, LinkError, LinkUrl};
 use sgc_wire::NodeId;
 use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, timeout};
 
 use super::dns::DnsError;

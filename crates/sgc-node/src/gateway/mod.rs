@@ -19,7 +19,7 @@ use sgc_cdr::{Layout, TypeName};
 use sgc_config::{GatewayConfig, GatewayUrl};
 use sgc_gateway::{
     Access, Client, FindDefinitions, GatewayError, GatewayStatus, Hub, HubOptions, ListenAt, LocalRos,
-    Server, ServerError, ServerOptions, Session, SessionLimits, TlsError, Types, certified_key,
+    NotListening, Server, ServerError, ServerOptions, Session, SessionLimits, TlsError, Types, certified_key,
 };
 use sgc_ros::{Reach, RosError};
 use sgc_sync::lock;
@@ -29,6 +29,7 @@ use tokio::sync::OnceCell;
 use zeroize::Zeroizing;
 
 use self::network::{GatewayNetwork, HubNetwork};
+use crate::control::faults::alerts::Alert;
 
 /// Opens the gateway's part of the local network. May block.
 pub type OpenLocalRos = Arc<dyn Fn() -> Result<Arc<dyn LocalRos>, RosError> + Send + Sync>;
@@ -183,6 +184,33 @@ impl Gateway {
         Ok(())
     }
 
+    /// Listens at these addresses from here on, and at no others, if there are sockets.
+    pub(crate) async fn listen_elsewhere(&self, listen: Vec<ListenAt>) -> Result<(), ServerError> {
+        match self.server() {
+            Some(server) => server.listen(listen).await,
+            None => Ok(()),
+        }
+    }
+
+    /// Closes the sockets, waits until their ports are free, and disconnects their clients.
+    pub(crate) async fn close_sockets(&self) {
+        let server = self.lock().take();
+        if let Some(server) = server {
+            // Without addresses nothing can fail.
+            let _ = server.listen(Vec::new()).await;
+        }
+    }
+
+    /// Returns an alert for each address at which it should listen and does not.
+    pub(crate) fn alerts(&self) -> Vec<Alert> {
+        let not_listening = self.server().map(|server| server.not_listening()).unwrap_or_default();
+        let alert = |NotListening { at, reason }: NotListening| Alert::GatewayNotListening {
+            at: at.to_string(),
+            reason,
+        };
+        not_listening.into_iter().map(alert).collect()
+    }
+
     /// Replaces the rules and the certificate. Returns `true` if the certificate changed. `key` is called at the moment
     /// of replacement.
     pub(crate) fn reconfigure(
@@ -240,7 +268,7 @@ impl Gateway {
 
     /// Closes the sockets and leaves the local network.
     pub(crate) async fn stop(&self) {
-        drop(self.lock().take());
+        self.close_sockets().await;
         if let Some(hub) = self.hub.get() {
             hub.stop().await;
         }
@@ -272,13 +300,6 @@ pub enum GatewayStartError {
         /// The fault.
         source: TlsError,
     },
-}
-
-impl GatewayStartError {
-    /// Returns `true` if it may go away by itself, as a port that another process has.
-    pub fn may_pass(&self) -> bool {
-        matches!(self, Self::Server(ServerError::Listen { .. }))
-    }
 }
 
 /// The certificate that the gateway shows within TLS.

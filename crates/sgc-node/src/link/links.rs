@@ -173,17 +173,27 @@ impl ReportedLink {
         std::future::pending().await
     }
 
-    /// Retires the link. The peer closes it in answer to the goodbye, which shows that it has received everything
-    /// before.
+    /// Retires the link, because a newer one replaced it.
     pub(super) async fn retire(&self, core: &mpsc::Sender<CoreEvent>) {
+        self.say_goodbye(CloseReason::Replaced, core).await;
+        info!(remote = %self.link.remote(), "a newer link replaced this one");
+    }
+
+    /// Ends the link, because its peer is not wanted any more.
+    pub(super) async fn leave(&self, core: &mpsc::Sender<CoreEvent>) {
+        self.say_goodbye(CloseReason::Goodbye, core).await;
+        info!(remote = %self.link.remote(), "link closed: its router is no longer configured");
+    }
+
+    /// Ends the link. The peer closes it in answer to the goodbye, which shows that it has received everything before.
+    async fn say_goodbye(&self, reason: CloseReason, core: &mpsc::Sender<CoreEvent>) {
         let goodbye = async {
             let _ = self.link.send_control(Control::Goodbye.to_bytes()).await;
             self.link.closed().await
         };
         let _ = timeout(GOODBYE_MAX, goodbye).await;
-        self.link.close(CloseReason::Replaced);
+        self.link.close(reason);
         self.end(core).await;
-        info!(remote = %self.link.remote(), "a newer link replaced this one");
     }
 }
 

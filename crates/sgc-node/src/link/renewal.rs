@@ -13,6 +13,7 @@ use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
 use sgc_session::{DialCause, Event, LinkFacts, LinkKey, LinkSupervisor, Output};
 use sgc_transport::{AnyLink, CloseReason, Link, LinkError, LinkUrl};
 use sgc_wire::NodeId;
+use tokio::runtime::Handle;
 use tokio::sync::{mpsc, watch};
 use tracing::{debug, info, warn};
 
@@ -86,6 +87,8 @@ struct Renewal<'a> {
     last_key: LinkKey,
     /// Reason given to peers whose links the supervisor closes.
     close_reason: CloseReason,
+    /// Whether the last link has ended.
+    has_ended: bool,
 }
 
 /// Serves a link and its replacements, and returns when the last of them has ended. [`LinkSupervisor`] decides when a
@@ -119,8 +122,24 @@ pub(crate) async fn keep_renewed(
         successor: None,
         last_key: key,
         close_reason: CloseReason::Goodbye,
+        has_ended: false,
     };
     renewal.run().await
+}
+
+/// Ends the links when the search for the router is ended.
+impl Drop for Renewal<'_> {
+    fn drop(&mut self) {
+        if self.has_ended || self.keeper.core.is_closed() {
+            return;
+        }
+        let Ok(runtime) = Handle::try_current() else { return };
+        let successor = self.successor.take().map(|successor| successor.held.reported);
+        for reported in [self.current.reported.clone()].into_iter().chain(successor) {
+            let core = self.keeper.core.clone();
+            runtime.spawn(async move { reported.leave(&core).await });
+        }
+    }
 }
 
 /// Waits until this node has a link of its own that has precedence.
@@ -164,7 +183,10 @@ impl Renewal<'_> {
             let deadline = loop {
                 match self.supervisor.poll_output() {
                     Output::Timeout(at) => break at,
-                    Output::Ended => return self.current.reported.link.closed().await,
+                    Output::Ended => {
+                        self.has_ended = true;
+                        return self.current.reported.link.closed().await;
+                    }
                     output => self.carry_out(output),
                 }
             };

@@ -2,11 +2,16 @@
 
 use std::sync::{Arc, Mutex, MutexGuard};
 
+use sgc_config::RosConfig;
 use sgc_ros::RosError;
 use sgc_sync::lock;
+use sgc_trust::Identity;
 
 /// Opens a network with the settings of the present one. May block.
 pub(crate) type OpenAgain<N> = Arc<dyn Fn() -> Result<Arc<N>, RosError> + Send + Sync>;
+
+/// Joins the local network of a configuration with an identity; blocks.
+pub(crate) type JoinNetwork = Arc<dyn Fn(&RosConfig, &Identity) -> Result<(), String> + Send + Sync>;
 
 /// The local network, once the node has joined one.
 pub(crate) struct NetworkSlot<N>(Arc<Mutex<Place<N>>>);

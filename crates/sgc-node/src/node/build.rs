@@ -97,7 +97,9 @@ pub(super) async fn build<N: RosNetwork>(
 ) -> Result<BuiltNode<N>, NodeError> {
     let NodeParts { config, identity, network, open, state, run_lock } = parts;
     let rules = Rules::load(&config, &identity, state.as_deref(), now().unix)?;
-    config.warnings().iter().chain(&rules.warnings).for_each(|warning| warn!("{warning}"));
+    let of_metrics = config.metrics.map(|metrics| metrics.warnings()).unwrap_or_default();
+    let warnings = config.warnings();
+    warnings.iter().chain(&of_metrics).chain(&rules.warnings).for_each(|warning| warn!("{warning}"));
     let (audit, audit_writer) = open_audit(&config, state.as_deref(), &rules)?;
     let anchors = with_kept_crls(state.as_deref(), rules.partners.extend(&identity)?, now());
     let sockets = LinkSockets::bind(&config, &identity, &rules, &anchors)?;
@@ -280,7 +282,7 @@ impl Machines {
 }
 
 /// Opens the sockets of the gateway, if the configuration has one.
-async fn listen_for_clients(
+pub(crate) async fn listen_for_clients(
     gateway: &Gateway,
     config: &Config,
     identity: &Arc<Identity>,

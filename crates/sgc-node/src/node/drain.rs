@@ -5,6 +5,7 @@ use std::time::Duration;
 use sgc_ros::RosNetwork;
 use sgc_transport::{CloseReason, Link};
 use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinHandle;
 use tokio::time::timeout;
 use tracing::warn;
 
@@ -20,15 +21,14 @@ const GOODBYE_MAX: Duration = Duration::from_secs(1);
 impl<N: RosNetwork> RunningNode<N> {
     /// Withdraws the node's names, drains its queues and ends its tasks.
     pub(super) async fn drain(mut self) {
-        if let Some(local) = &self.local {
+        if let Some(local) = self.reloader.searches.local() {
             local.say_goodbye().await;
         }
         self.gateway.stop().await;
         empty_queues(&self.events).await;
         say_goodbye(&self.events).await;
-        for task in self.tasks.into_iter().chain(self.reloader.take_dialling()) {
-            task.abort();
-        }
+        self.reloader.searches.stop();
+        self.tasks.iter().for_each(JoinHandle::abort);
         // A successor may own the socket by the time it is removed.
         self.socket.abort();
         let _ = self.socket.await;

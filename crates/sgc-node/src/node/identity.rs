@@ -51,7 +51,7 @@ pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
 }
 
 /// Returns the routers wanted on the local network, if any are.
-pub(super) fn wanted_nearby(
+pub(crate) fn wanted_nearby(
     routers: &[RouterUrl],
     identity: &Identity,
 ) -> Result<Option<RouterFilter>, NodeError> {

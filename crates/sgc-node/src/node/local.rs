@@ -14,10 +14,9 @@ use tokio::sync::mpsc;
 use tracing::warn;
 
 use crate::control::event::CoreEvent;
-use crate::control::settings::reload::JoinNetwork;
 use crate::gateway::{Gateway, OpenLocalRos};
 use crate::local::dds_discovery::discover;
-use crate::local::network_slot::{NetworkSlot, OpenAgain};
+use crate::local::network_slot::{JoinNetwork, NetworkSlot, OpenAgain};
 use crate::local::{discovery_server, strangers};
 use crate::node::error::NodeError;
 use crate::node::random::system_rng;

@@ -1,10 +1,10 @@
 //! A node from configuration to clean shutdown, in three steps: `build` makes machines and binds sockets, `spawn`
 //! starts the tasks, `drain` empties and ends them.
 
-mod build;
+pub(crate) mod build;
 mod drain;
 pub(crate) mod error;
-mod identity;
+pub(crate) mod identity;
 mod local;
 mod options;
 mod random;
@@ -16,6 +16,7 @@ use std::time::Duration;
 use sgc_config::Config;
 use sgc_ros::RosNetwork;
 use sgc_trust::Identity;
+use sgc_wire::UnixMillis;
 use tracing::{info, warn};
 
 pub use self::error::NodeError;
@@ -30,6 +31,18 @@ use crate::state::run_lock::RunLock;
 /// Time before its certificate's end at which a node starts to warn.
 const EXPIRY_WARNING: Duration = Duration::from_secs(14 * 86_400);
 
+/// Returns a warning if the certificate of an identity ends soon.
+pub fn expiry_warning(identity: &Identity, at: UnixMillis) -> Option<String> {
+    let left = Duration::from_millis(identity.not_after().0.saturating_sub(at.0));
+    (left < EXPIRY_WARNING).then(|| {
+        format!(
+            "this node's certificate ends in {} days, at {}: enroll it again before then, or nobody will let it in",
+            left.as_secs() / 86_400,
+            identity.not_after()
+        )
+    })
+}
+
 /// Runs a node until `shutdown` is ready. Then it withdraws its names, drains its queues and returns.
 pub async fn run(
     config: Config,
@@ -40,13 +53,8 @@ pub async fn run(
     if let Some(alert) = clock_alert(&identity, now().unix) {
         warn!("{alert}; this node starts all the same and waits: {}", alert.fix());
     }
-    let left = Duration::from_millis(identity.not_after().0.saturating_sub(now().unix.0));
-    if left < EXPIRY_WARNING {
-        warn!(
-            "this node's certificate ends in {} days, at {}: enroll it again before then, or nobody will let it in",
-            left.as_secs() / 86_400,
-            identity.not_after()
-        );
+    if let Some(warning) = expiry_warning(&identity, now().unix) {
+        warn!("{warning}");
     }
     let open = local::open_cyclone(identity.clone());
     run_opening(config, identity, open, options, shutdown).await

@@ -4,7 +4,6 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use rand_chacha::ChaCha20Rng;
 use sgc_config::Config;
 use sgc_ros::RosNetwork;
 use sgc_transport::{Dialer, ListenAddr, Listener};
@@ -12,13 +11,13 @@ use sgc_trust::Identity;
 use tokio::sync::{Mutex, Notify, mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio::time::MissedTickBehavior;
-use tracing::{info, warn};
+use tracing::info;
 
 use crate::admin::{self, Desk};
 use crate::control::event::CoreEvent;
 use crate::control::settings::file_watch::FileWatch;
 use crate::control::settings::reload::{Reloader, Running};
-use crate::discovery::{self, Claims, Dns, LinkKeeper, LocalNetwork, WorkingUrls};
+use crate::discovery::{Claims, Dns, LinkKeeper, Searches, WantedRouters, WorkingUrls};
 use crate::gateway::Gateway;
 use crate::link::lanes::LaneAdmission;
 use crate::link::links::{Admission, keep_accepting};
@@ -26,6 +25,7 @@ use crate::link::roaming::Network;
 use crate::local::dds_discovery::discover;
 use crate::local::network_slot::NetworkSlot;
 use crate::local::reopening;
+use crate::metrics::Metrics;
 use crate::node::build::BuiltNode;
 use crate::node::error::NodeError;
 use crate::node::identity::wanted_nearby;
@@ -49,8 +49,6 @@ pub(super) struct RunningNode<N: RosNetwork> {
     pub(super) lane_dialer: Arc<Dialer>,
     pub(super) gateway: Arc<Gateway>,
     pub(super) network: NetworkSlot<N>,
-    /// Search for routers on the local network by mDNS.
-    pub(super) local: Option<Arc<LocalNetwork>>,
     pub(super) audit: Audit,
     pub(super) audit_writer: Option<AuditWriter>,
     /// Ends when every thread and blocking task that uses this runtime has ended.
@@ -65,7 +63,7 @@ pub(super) async fn spawn<N: RosNetwork>(
     file_watch: Option<FileWatch>,
 ) -> Result<RunningNode<N>, NodeError> {
     let BuiltNode { config, identity, rules, audit, network, gateway, channels, sockets, board, .. } = node;
-    let (events, mut rng) = (channels.events, node.rng);
+    let (events, rng) = (channels.events, node.rng);
     let core = tokio::spawn(node.core.run(channels.inbox, channels.requested));
     if let Some(network) = network.get() {
         let events = events.clone();
@@ -75,9 +73,7 @@ pub(super) async fn spawn<N: RosNetwork>(
     let listening: Vec<_> = sockets.listeners.iter().map(|l| l.local().clone()).collect();
     let description = description(&config, &identity, &listening, options.file.as_deref());
     let nearby = wanted_nearby(&config.routers, &identity)?;
-    let announced = if config.announce { &listening[..] } else { &[] };
-    let uses_mdns = nearby.is_some() || config.announce;
-    let local = if uses_mdns { open_mdns(options.mdns_port, announced, &mut rng) } else { None };
+    let announced = if config.announce { listening.clone() } else { Vec::new() };
     let keeper = LinkKeeper {
         me: identity.node_id(),
         dialer: sockets.dialer.clone(),
@@ -89,8 +85,12 @@ pub(super) async fn spawn<N: RosNetwork>(
         network: Network::watch(),
         urls: WorkingUrls::open(node.state.as_deref()),
     };
-    let heard = local.clone().zip(nearby);
-    let mut tasks = discovery::start(&config.routers, &rules.routers, &keeper, &board, heard, &mut rng);
+    let searches = Searches::new(keeper.clone(), board, options.mdns_port, announced, rng);
+    searches.search(WantedRouters {
+        configured: config.routers.clone(),
+        of_tokens: rules.routers.clone(),
+        nearby,
+    });
     let lanes = LaneAdmission::default();
     let admission = || Admission {
         core: events.clone(),
@@ -101,18 +101,19 @@ pub(super) async fn spawn<N: RosNetwork>(
     };
     let accepting = sockets.listeners.into_iter().map(|listener| accept(listener, admission())).collect();
     let socket = admin_socket_path(&config, identity.node_name().as_str());
+    let mut tasks = Vec::new();
     tasks.push(tokio::spawn(reopening::watch(
         keeper.network.clone(),
         network.clone(),
         gateway.clone(),
         events.clone(),
     )));
+    let metrics = Arc::new(Metrics::new(config.metrics));
+    tasks.push(tokio::spawn(metrics.clone().run(events.clone(), gateway.clone())));
     let reloader = Arc::new(Reloader {
         source: options.source,
         join: node.open.map(|open| join_late(open, network.clone(), events.clone(), gateway.clone())),
-        keeper,
-        board,
-        dialling: std::sync::Mutex::default(),
+        searches,
         identity,
         credentials: sockets.credentials,
         state: node.state,
@@ -120,12 +121,13 @@ pub(super) async fn spawn<N: RosNetwork>(
         events: events.clone(),
         has_ros: AtomicBool::new(network.get().is_some()),
         gateway: gateway.clone(),
-        running: Mutex::new(Running { config, dialled: rules.routers.clone(), rules, suites: node.suites }),
+        metrics: metrics.clone(),
+        running: Mutex::new(Running { config, rules, suites: node.suites }),
         changed: Notify::new(),
     });
     tasks.extend(reload_tasks(&reloader, options.reload, file_watch));
     tasks.extend(options.watchdog.map(|watchdog| tokio::spawn(keep_fed(watchdog, events.clone()))));
-    let desk = Desk { events: events.clone(), reloader: reloader.clone(), gateway: gateway.clone() };
+    let desk = Desk { events: events.clone(), reloader: reloader.clone(), gateway: gateway.clone(), metrics };
     let socket = admin::begin(socket, desk);
     let program = options.program.unwrap_or_else(|| concat!("sgc ", env!("CARGO_PKG_VERSION")).to_owned());
     info!("{program}: {description}");
@@ -144,7 +146,6 @@ pub(super) async fn spawn<N: RosNetwork>(
         lane_dialer: sockets.lane_dialer,
         gateway,
         network,
-        local,
         audit,
         audit_writer: node.audit_writer,
         all_ended: channels.all_ended,
@@ -186,16 +187,6 @@ async fn keep_fed(watchdog: Watchdog, events: mpsc::Sender<CoreEvent>) {
         }
         (watchdog.feed)();
     }
-}
-
-/// Joins mDNS on the local network. Without it, the node runs all the same.
-fn open_mdns(
-    port: Option<u16>,
-    announced: &[ListenAddr],
-    rng: &mut ChaCha20Rng,
-) -> Option<Arc<LocalNetwork>> {
-    let failed = |why| warn!("mDNS on the local network cannot be used: {why}");
-    LocalNetwork::open(port, announced, rng).map(Arc::new).map_err(failed).ok()
 }
 
 fn accept(listener: Listener, admission: Admission) -> (JoinHandle<()>, oneshot::Sender<()>) {

@@ -3,7 +3,7 @@
 //! Each module with a rule walks all Markdown files of the repository and compares what they cite with the code: paths
 //! and links ([`paths`]), tests and long names ([`test_names`]), keys of the configuration ([`configuration`]),
 //! counters ([`counters`]), command lines of `sgc` ([`commands`]), `make` and `cargo test` ([`build_commands`]), pages
-//! of the book ([`summary`]). Placeholders, such as `…` and words in capitals, are passed over. Three reference pages
+//! of the book ([`summary`]). Placeholders, such as `…` and words in capitals, are passed over. Four reference pages
 //! are made of the code and compared with what is committed ([`generated`]). One rule reads the code alone: files of a
 //! crate import each other in one direction ([`import_circles`]).
 
@@ -17,6 +17,7 @@ mod counters;
 mod generated;
 mod import_circles;
 mod markdown;
+mod metrics_page;
 mod paths;
 mod report;
 mod repository;

@@ -18,6 +18,7 @@ mod hosts;
 mod keyed;
 #[path = "../support/lab.rs"]
 mod lab;
+mod metrics;
 mod partner;
 mod secured;
 #[path = "../support/mod.rs"]

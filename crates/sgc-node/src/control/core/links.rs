@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use sgc_ros::RosNetwork;
 use sgc_router::{LinkId, Neighbour};
-use sgc_transport::{AnyLink, Link, LinkUrl};
+use sgc_transport::{AnyLink, CloseReason, Link, LinkUrl};
 use sgc_trust::VerifiedPeer;
 use sgc_wire::{Control, NodeId};
 use tokio::sync::oneshot;
@@ -36,15 +36,19 @@ impl<N: RosNetwork> Core<N> {
         let record = AuditRecord::new(AuditEvent::LinkUp).peer(&link.peer().node_id).remote(remote);
         self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
         let rtt = link.stats().rtt;
-        let id = self.links.add(Instant::now(), link, url, control);
+        let id = self.links.add(Instant::now(), link.clone(), url, control);
         self.control_drops.link_up(id);
         self.data.drops().link_up(id);
         let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
-        if reply.send(Some(place)).is_err() {
-            debug!(%remote, "the link's task is gone");
-        }
+        let is_abandoned = reply.send(Some(place)).is_err();
         self.router.handle_link_up(now(), id, neighbour);
         self.router.handle_link_quality(now(), id, rtt, false);
+        if is_abandoned {
+            // Its task ended meanwhile, so nobody would report the end of the link.
+            debug!(%remote, "the link's task is gone");
+            link.close(CloseReason::Goodbye);
+            self.link_down(id, None);
+        }
     }
 
     /// Forgets a link. `in_use` is the place of another process with this node's identity, if the peer closed the link

@@ -10,13 +10,13 @@ use crate::admin::status::{LinkStatus, NameStatus, RouteLine, RouterLine, Status
 use crate::control::parts::link_table::LinkEntry;
 use crate::data::stats::CountDrops;
 use crate::drops::NodeDrop;
+use crate::metrics::readings::{LinkReadings, ROUTES_MAX, Readings, RouteReading};
 
 impl<N: RosNetwork> Core<N> {
     /// Returns the node's status.
     pub(super) fn status(&self) -> Status {
         let links = self.links.iter().map(|(id, entry)| self.link_status(id, entry));
         let names = self.forwards.stats().map(|(name, stats)| NameStatus::new(name, stats));
-        let router = self.router.stats();
         Status {
             node: self.certificates.identity().node_name().to_string(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -30,14 +30,64 @@ impl<N: RosNetwork> Core<N> {
             drops: self.all_drops(),
             refused: self.all_refused(),
             local_network_reopened: self.reopening.reopenings(),
-            router: RouterLine {
-                nodes: router.nodes,
-                names: router.names,
-                routed_names: router.routed_names,
-                branches: router.branches,
-            },
-            // The caller adds it, since the core knows nothing of the gateway.
+            router: self.router_line(),
+            // The caller adds them, since the core knows nothing of the gateway and of metrics.
             gateway: None,
+            metrics: None,
+        }
+    }
+
+    /// Returns the values of metrics. The caller adds those of the gateway.
+    pub(super) fn readings(&self) -> Readings {
+        let router = self.router_line();
+        let routes = self.routes.iter().flat_map(Routes::status);
+        let mut routes = routes
+            .filter_map(|route| RouteReading::new(&route, self.messages_of(&route).unwrap_or_default()));
+        let routes_shown = routes.by_ref().take(ROUTES_MAX).collect();
+        Readings {
+            node: self.certificates.identity().node_name().to_string(),
+            uptime: self.started.elapsed(),
+            certificate_until: self.certificates.identity().not_after(),
+            links: self.link_readings(),
+            routers: self.board.snapshot(),
+            routes: routes_shown,
+            routes_omitted: routes.count(),
+            alerts: self.alerts(),
+            problems: self.problems().len(),
+            drops: self.drops_by_reason(),
+            refused: self.all_refused(),
+            reopened: self.reopening.reopenings(),
+            router,
+            gateway: None,
+        }
+    }
+
+    fn link_readings(&self) -> LinkReadings {
+        let (sent_bytes, received_bytes) = self.links.total_bytes();
+        let established = self.links.established();
+        let mut readings =
+            LinkReadings { sent_bytes, received_bytes, established, ..LinkReadings::default() };
+        for (id, entry) in self.links.iter() {
+            let (_, is_silent) = self.router.link_cost(id).unwrap_or_default();
+            readings.silent += u64::from(is_silent);
+            match entry.url() {
+                Some(url) => {
+                    readings.dialled += 1;
+                    readings.round_trips.insert(url.to_owned(), entry.stats().rtt);
+                }
+                None => readings.accepted += 1,
+            }
+        }
+        readings
+    }
+
+    fn router_line(&self) -> RouterLine {
+        let router = self.router.stats();
+        RouterLine {
+            nodes: router.nodes,
+            names: router.names,
+            routed_names: router.routed_names,
+            branches: router.branches,
         }
     }
 
@@ -68,13 +118,25 @@ impl<N: RosNetwork> Core<N> {
 
     fn route_line(&self, route: RouteStatus) -> RouteLine {
         let calls = self.describe_calls(&route);
-        let messages = route.name.and_then(|n| {
-            let published = self.shares.get(&n).map(|s| s.published());
-            published.or_else(|| self.sinks.get(&n).map(|s| s.delivered()))
-        });
+        let messages = self.messages_of(&route);
         let share = route.name.and_then(|n| self.shares.get(&n));
         let compressed = share.and_then(|s| s.compressed());
         RouteLine::new(route, calls, messages, share.map_or(0, |s| s.signatures()), compressed)
+    }
+
+    /// Returns the number of messages that were published or delivered.
+    fn messages_of(&self, route: &RouteStatus) -> Option<u64> {
+        let name = route.name?;
+        let published = self.shares.get(&name).map(|s| s.published());
+        published.or_else(|| self.sinks.get(&name).map(|s| s.delivered()))
+    }
+
+    /// Returns everything that was dropped or refused, by kind alone.
+    fn drops_by_reason(&self) -> BTreeMap<String, u64> {
+        let mut drops = self.all_drops();
+        // No name of a kind has spaces, and rows of culprits have.
+        drops.retain(|key, _| !key.contains(' '));
+        drops
     }
 
     /// Returns everything that was dropped or refused, by kind and culprit. Control frames and packets share some

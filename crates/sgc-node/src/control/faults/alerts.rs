@@ -107,6 +107,20 @@ pub enum Alert {
         /// These parts, a sentence each.
         changes: Vec<String>,
     },
+    /// The gateway cannot listen at an address.
+    GatewayNotListening {
+        /// The address, as a URL.
+        at: String,
+        /// The reason.
+        reason: String,
+    },
+    /// The address for metrics cannot be bound.
+    MetricsNotServed {
+        /// The address.
+        at: String,
+        /// The reason.
+        reason: String,
+    },
     /// DDS Security protects both this node and local programs, and one does not admit the other.
     RefusedPrograms {
         /// The enclave that they name, `/` if they have none of their own.
@@ -178,6 +192,14 @@ impl Alert {
             Self::RestartPending { .. } => {
                 "restart the node when it suits you; until then it keeps the old values"
             }
+            Self::GatewayNotListening { .. } => {
+                "find the process that holds the port (`ss -ltnp`), or give this node another address: `listen` in [gateway]. The node \
+                 tries again by itself"
+            }
+            Self::MetricsNotServed { .. } => {
+                "find the process that holds the port (`ss -ltnp`), or give this node another address: `listen` in [metrics]. Each node of \
+                 a host needs a port of its own. The node tries again by itself"
+            }
             Self::RefusedPrograms { .. } => {
                 "the log says who refuses whom where Cyclone DDS does; compare CA, governance and permissions of the two enclaves, and when \
                  both certificates end"
@@ -247,6 +269,12 @@ impl fmt::Display for Alert {
                 "a program of enclave {enclave} announces itself to sgc, but none of its topics: DDS Security (SROS2) protects it, and \
                  this node has no enclave"
             ),
+            Self::GatewayNotListening { at, reason } => {
+                write!(f, "programs without ROS cannot connect at {at}: {reason}")
+            }
+            Self::MetricsNotServed { at, reason } => {
+                write!(f, "metrics are not served at {at}: {reason}")
+            }
             Self::RefusedPrograms { enclave } => write!(
                 f,
                 "a program of enclave {enclave} and this node do not admit each other: DDS Security (SROS2) protects both, and none of \

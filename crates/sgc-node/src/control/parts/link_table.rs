@@ -47,6 +47,8 @@ pub(crate) struct LinkTable {
     policies: PeerPolicies,
     /// Counts the packets that queues leave out.
     drops: Arc<dyn CountDrops>,
+    /// Bytes that were sent and received over links that have ended.
+    ended_bytes: (u64, u64),
 }
 
 /// Measurement of a link.
@@ -67,7 +69,8 @@ pub(crate) struct EndedLink {
 impl LinkTable {
     /// Creates the table without links. New links use the keep-alive policy.
     pub(crate) fn new(policy: KeepAlivePolicy, drops: Arc<dyn CountDrops>) -> Self {
-        Self { links: BTreeMap::new(), next: 1, look_due: None, policies: PeerPolicies::new(policy), drops }
+        let policies = PeerPolicies::new(policy);
+        Self { links: BTreeMap::new(), next: 1, look_due: None, policies, drops, ended_bytes: (0, 0) }
     }
 
     /// Adds a link, and looks at it from here on.
@@ -92,9 +95,20 @@ impl LinkTable {
     pub(crate) fn remove(&mut self, id: LinkId) -> Option<EndedLink> {
         let entry = self.links.remove(&id)?;
         let (node, remote) = (entry.peer().node_id, entry.remote());
+        self.ended_bytes = plus(self.ended_bytes, &entry.stats());
         self.policies.remember(node, entry.keep_alive.policy());
         entry.flows.values().for_each(|flow| flow.close());
         Some(EndedLink { node, remote, closed_for: entry.closed_for })
+    }
+
+    /// Returns the number of links since the start.
+    pub(crate) fn established(&self) -> u64 {
+        u64::from(self.next) - 1
+    }
+
+    /// Returns the numbers of bytes that were sent and received over all links since the start.
+    pub(crate) fn total_bytes(&self) -> (u64, u64) {
+        self.links.values().fold(self.ended_bytes, |total, entry| plus(total, &entry.stats()))
     }
 
     pub(crate) fn get(&self, id: LinkId) -> Option<&LinkEntry> {
@@ -190,6 +204,11 @@ impl LinkTable {
         };
         self.links.values().map(leave).collect()
     }
+}
+
+/// Adds the bytes of a link to a total of sent and received bytes.
+fn plus((sent, received): (u64, u64), link: &LinkStats) -> (u64, u64) {
+    (sent.saturating_add(link.sent_bytes), received.saturating_add(link.received_bytes))
 }
 
 impl LinkEntry {

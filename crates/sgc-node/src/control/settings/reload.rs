@@ -9,30 +9,30 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use rand_chacha::ChaCha20Rng;
-use rand_core::{OsRng, SeedableRng, TryRngCore};
 use rustls::sign::CertifiedKey;
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
-use sgc_config::{Config, ConfigErrors, GatewayConfig, RosConfig, RouterUrl};
+use sgc_config::{Config, ConfigErrors, GatewayConfig, RosConfig};
 use sgc_gateway::Access;
 use sgc_ros::{Direction, ShareRule, UseRule};
-use sgc_sync::lock;
 use sgc_transport::CredentialStore;
 use sgc_trust::{Identity, Suite, TrustAnchors};
 use sgc_wire::{Kind, UnixMillis};
 use tokio::sync::{Mutex, Notify, mpsc, oneshot};
-use tokio::task::JoinHandle;
 use tracing::{info, warn};
 
 use crate::clock::now;
 use crate::control::event::CoreEvent;
 use crate::control::settings::rules::Rules;
 use crate::data::sending::message_keys::{MessageKeys, make_for};
-use crate::discovery::{self, Board, LinkKeeper};
+use crate::discovery::{Searches, WantedRouters};
 use crate::gateway::access::access_with;
-use crate::gateway::{Gateway, ShownKey, key_of_files};
+use crate::gateway::{Gateway, ShownKey, key_of_files, listen_at};
+use crate::local::network_slot::JoinNetwork;
+use crate::metrics::Metrics;
+use crate::node::build::listen_for_clients;
 use crate::node::error::NodeError;
+use crate::node::identity::wanted_nearby;
 use crate::state::audit::{Audit, AuditEvent, AuditRecord};
 use crate::state::credentials::with_kept_crls;
 
@@ -65,26 +65,19 @@ pub(crate) struct Reloader {
     pub(crate) join: Option<JoinNetwork>,
     /// Whether there is a local network.
     pub(crate) has_ros: AtomicBool,
-    /// Dials the routers of tokens that are added later.
-    pub(crate) keeper: LinkKeeper,
-    pub(crate) board: Board,
-    pub(crate) dialling: std::sync::Mutex<Vec<JoinHandle<()>>>,
+    pub(crate) searches: Searches,
     pub(crate) gateway: Arc<Gateway>,
+    pub(crate) metrics: Arc<Metrics>,
     pub(crate) running: Mutex<Running>,
     /// Notified when the time of the next expiry changes.
     pub(crate) changed: Notify,
 }
-
-/// Joins the local network of a configuration with an identity; blocks.
-pub(crate) type JoinNetwork = Arc<dyn Fn(&RosConfig, &Identity) -> Result<(), String> + Send + Sync>;
 
 /// The current configuration and its consequences.
 pub(crate) struct Running {
     /// Restart-only settings as they were at start, the others as they are now.
     pub(crate) config: Config,
     pub(crate) rules: Rules,
-    /// Routers of tokens that are dialled. Their tasks end with the node.
-    pub(crate) dialled: Vec<RouterUrl>,
     /// Suites with a signing key.
     pub(crate) suites: BTreeSet<Suite>,
 }
@@ -166,44 +159,45 @@ impl Reloader {
         Ok(())
     }
 
-    /// Dials the routers of tokens that are not dialled yet, and returns them.
-    fn dial(&self, running: &mut Running, of_tokens: &[RouterUrl]) -> Vec<RouterUrl> {
-        let is_new = |url: &&RouterUrl| !running.dialled.contains(url);
-        let new: Vec<_> = of_tokens.iter().filter(is_new).cloned().collect();
-        let mut seed = [0; 32];
-        if new.is_empty() || OsRng.try_fill_bytes(&mut seed).is_err() {
-            return Vec::new();
-        }
-        let mut rng = ChaCha20Rng::from_seed(seed);
-        let tasks = discovery::start(&[], &new, &self.keeper, &self.board, None, &mut rng);
-        lock(&self.dialling).extend(tasks);
-        running.dialled.extend(new.iter().cloned());
-        new
-    }
-
-    /// Removes and returns the tasks that dial routers of later tokens.
-    pub(crate) fn take_dialling(&self) -> Vec<JoinHandle<()>> {
-        std::mem::take(&mut lock(&self.dialling))
-    }
-
     /// Applies `config`.
     async fn apply(&self, running: &mut Running, config: Config) -> Result<ReloadReport, String> {
         let PreparedReload { rules, anchors, message_keys, gateway } = self.prepare(running, &config).await?;
+        let nearby = wanted_nearby(&config.routers, &self.identity).map_err(|error| error.to_string())?;
         self.join(running, config.ros.as_ref()).await?;
         running.suites.extend(message_keys.keys().copied());
         let mut report = ReloadReport {
             changed: changes(&running.rules, &rules),
-            needs_restart: needs_restart(running, &config, &rules),
+            needs_restart: needs_restart(running, &config),
             warnings: rules.warnings.clone(),
         };
-        let dialled = self.dial(running, &rules.routers);
-        report.changed.extend(dialled.iter().map(|url| format!("{url} is dialled, which a token names")));
         // This precedes the control task's check of existing links.
         self.credentials.set_admitted(rules.partners.admitted.clone());
         self.reconfigure(&rules, anchors, message_keys).await?;
         // The control task has the newest revocation lists.
-        if let Some((access, files)) = gateway {
+        if let Some((access, files)) = gateway.filter(|_| running.config.gateway.is_some()) {
             report.changed.extend(self.reconfigure_gateway(running, &config, access, files)?);
+        }
+        let mut config = config;
+        match self.move_gateway(running, &config, &rules).await {
+            Ok(changed) => report.changed.extend(changed),
+            Err(error) => {
+                report.needs_restart.push(format!("the gateway is as it was: {error}"));
+                // The next reload tries again.
+                config.gateway.clone_from(&running.config.gateway);
+            }
+        }
+        // A router may be trusted only by the rules that hold from here on.
+        let (configured, of_tokens) = (config.routers.clone(), rules.routers.clone());
+        let searched = self.searches.search(WantedRouters { configured, of_tokens, nearby });
+        report.changed.extend(searched.begun.iter().map(|url| format!("{url} is searched for")));
+        report.changed.extend(searched.ended.iter().map(|url| format!("{url} is no longer searched for")));
+        if running.config.metrics != config.metrics {
+            self.metrics.set(config.metrics);
+            report.warnings.extend(config.metrics.iter().flat_map(|metrics| metrics.warnings()));
+            report.changed.push(match config.metrics {
+                Some(metrics) => format!("metrics are served at http://{}/metrics", metrics.listen),
+                None => "metrics are not served any more".to_owned(),
+            });
         }
         self.audit.set_names(rules.names.clone());
         running.config = merged(running.config.clone(), config);
@@ -217,9 +211,7 @@ impl Reloader {
     async fn prepare(&self, running: &Running, config: &Config) -> Result<PreparedReload, String> {
         // The identity may have been renewed since the start.
         let (identity, state) = (self.credentials.identity(), self.state.clone());
-        let (mut wanted, own, suites) =
-            (config.clone(), self.identity.anchors().clone(), running.suites.clone());
-        let running_gateway = running.config.gateway.clone();
+        let (wanted, own, suites) = (config.clone(), self.identity.anchors().clone(), running.suites.clone());
         let trusted = running.rules.partners.certificates.clone();
         let prepare = tokio::task::spawn_blocking(move || -> Result<PreparedReload, NodeError> {
             let rules = Rules::load(&wanted, &identity, state.as_deref(), now().unix)?;
@@ -234,9 +226,6 @@ impl Reloader {
                 )),
             };
             let message_keys = make_for(&rules.shares, |suite| suites.contains(&suite));
-            // A removed gateway runs until a restart, so its access rules are kept up to date: revoked clients lose
-            // access.
-            wanted.gateway = wanted.gateway.or(running_gateway);
             let access = access_with(&wanted, &identity, &rules.partners, state.as_deref(), now())?;
             let gateway = match access.zip(wanted.gateway.as_ref()) {
                 Some((access, gateway)) => Some((access, key_of_files(gateway)?)),
@@ -262,6 +251,34 @@ impl Reloader {
         let stopping = || "the node is stopping".to_owned();
         self.events.send(event).await.map_err(|_| stopping())?;
         done.await.map_err(|_| stopping())
+    }
+
+    /// Opens and closes sockets of the gateway. Returns the changes.
+    async fn move_gateway(
+        &self,
+        running: &Running,
+        config: &Config,
+        rules: &Rules,
+    ) -> Result<Vec<String>, String> {
+        match (&running.config.gateway, &config.gateway) {
+            (None, Some(after)) => {
+                let (identity, state) = (self.credentials.identity(), self.state.as_deref());
+                listen_for_clients(&self.gateway, config, &identity, rules, state, &self.audit)
+                    .await
+                    .map_err(|error| error.to_string())?;
+                self.gateway.set_anchors(&self.credentials.anchors());
+                Ok(vec![format!("programs without ROS may connect at {}", addresses(after))])
+            }
+            (Some(before), Some(after)) if before.listen != after.listen => {
+                self.gateway.listen_elsewhere(listen_at(after)).await.map_err(|error| error.to_string())?;
+                Ok(vec![format!("programs without ROS may connect at {}", addresses(after))])
+            }
+            (Some(_), None) => {
+                self.gateway.close_sockets().await;
+                Ok(vec!["programs without ROS may not connect any more".to_owned()])
+            }
+            (Some(_), Some(_)) | (None, None) => Ok(Vec::new()),
+        }
     }
 
     /// Applies new access rules and another certificate to the gateway. Returns the changes.
@@ -325,34 +342,33 @@ impl Reloader {
 /// Returns the configuration that runs after a reload. Restart-only settings keep their running values, so that the
 /// next reload reports them again.
 fn merged(before: Config, read: Config) -> Config {
-    let Config { shares, uses, tokens, partners, trust, accept, gateway, .. } = read;
+    let Config { routers, shares, uses, tokens, partners, trust, accept, gateway, metrics, .. } = read;
     let gateway = match (&before.gateway, gateway) {
-        (Some(before), Some(after)) => Some(restarted(before, &after)),
-        (before, _) => before.clone(),
+        (Some(before), Some(after)) => Some(with_bounds_of(before, &after)),
+        (_, after) => after,
     };
-    Config { shares, uses, tokens, partners, trust, accept, gateway, ..before }
+    Config { routers, shares, uses, tokens, partners, trust, accept, gateway, metrics, ..before }
 }
 
-/// Returns the part of a gateway's configuration that may change at run time.
+/// Returns the part of a gateway's configuration that decides who may connect.
 fn access_part(gateway: &GatewayConfig) -> GatewayConfig {
-    restarted(&GatewayConfig::default(), gateway)
+    let GatewayConfig { clients_max, client_bytes_max, listen, .. } = GatewayConfig::default();
+    GatewayConfig { clients_max, client_bytes_max, listen, ..gateway.clone() }
 }
 
-/// Returns the gateway's configuration after a reload: running sockets and bounds, and new access rules.
-fn restarted(before: &GatewayConfig, after: &GatewayConfig) -> GatewayConfig {
-    GatewayConfig {
-        listen: before.listen.clone(),
-        clients_max: before.clients_max,
-        client_bytes_max: before.client_bytes_max,
-        ..after.clone()
-    }
+/// Returns the gateway's configuration after a reload, with the running bounds.
+fn with_bounds_of(before: &GatewayConfig, after: &GatewayConfig) -> GatewayConfig {
+    let (clients_max, client_bytes_max) = (before.clients_max, before.client_bytes_max);
+    GatewayConfig { clients_max, client_bytes_max, ..after.clone() }
 }
 
-fn needs_other_sockets(before: Option<&GatewayConfig>, after: Option<&GatewayConfig>) -> bool {
-    match (before, after) {
-        (Some(before), Some(after)) => restarted(before, after) != *after,
-        (before, after) => before.is_some() != after.is_some(),
-    }
+fn needs_other_bounds(before: Option<&GatewayConfig>, after: Option<&GatewayConfig>) -> bool {
+    before.zip(after).is_some_and(|(before, after)| with_bounds_of(before, after) != *after)
+}
+
+/// Returns the listening addresses of a gateway.
+fn addresses(gateway: &GatewayConfig) -> String {
+    gateway.listen.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
 }
 
 /// Lists the differences, one line for each topic.
@@ -442,12 +458,11 @@ fn share_change(topic: &str, known: &ShareRule, rule: &ShareRule) -> String {
     format!("{topic}: {} changed{end}", what.join(", "))
 }
 
-fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<String> {
+fn needs_restart(running: &Running, config: &Config) -> Vec<String> {
     let now = &running.config;
-    let mut lines: Vec<String> = [
+    [
         (now.node_name != config.node_name, "`name`"),
         (now.identity != config.identity, "`identity`"),
-        (now.routers != config.routers, "`routers`"),
         (now.resolver != config.resolver, "`resolver`"),
         (now.keep_alive != config.keep_alive, "`keep_alive`"),
         (now.listen != config.listen, "`listen` in [router]"),
@@ -455,8 +470,11 @@ fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<Strin
         (now.mapping != config.mapping, "`mapping` in [router]"),
         (now.announce != config.announce, "`announce` in [router]"),
         // Shares and uses join the default network if the file has no `[ros]`.
-        (now.ros != config.ros, "[ros]"),
-        (needs_other_sockets(now.gateway.as_ref(), config.gateway.as_ref()), "[gateway]"),
+        (config.ros.is_some() && now.ros != config.ros, "[ros]"),
+        (
+            needs_other_bounds(now.gateway.as_ref(), config.gateway.as_ref()),
+            "`clients_max` or `client_bytes_max` in [gateway]",
+        ),
         (now.state != config.state, "`state`"),
         (now.watch != config.watch, "`watch`"),
         (now.authority != config.authority, "[authority]"),
@@ -468,10 +486,5 @@ fn needs_restart(running: &Running, config: &Config, rules: &Rules) -> Vec<Strin
     .into_iter()
     .filter(|(is_changed, _)| *is_changed)
     .map(|(_, what)| format!("{what} changed, which needs a restart"))
-    .collect();
-    let is_wanted = |url: &&RouterUrl| rules.routers.contains(url) || config.routers.contains(url);
-    if let Some(url) = running.dialled.iter().find(|url| !is_wanted(url)) {
-        lines.push(format!("{url} is of a token that is not used any more, and is dialled until a restart"));
-    }
-    lines
+    .collect()
 }
