@@ -48,6 +48,6 @@ pub(crate) fn demo(args: DemoArgs) -> Result<ExitCode, CliError> {
 
 /// Runs a peer of the demo until standard input ends.
 pub(crate) fn peer(args: PeerArgs) -> Result<(), CliError> {
-    start_log(None)?;
+    start_log(None, None)?;
     Ok(sgc_demo::peer(args.role, args.domain)?)
 }

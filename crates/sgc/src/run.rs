@@ -17,7 +17,7 @@ use tokio::sync::{mpsc, oneshot};
 
 use crate::environment::environment;
 use crate::error::CliError;
-use crate::log::start_log;
+use crate::log::{LogFormat, start_log};
 use crate::{heap, output, supervisor, version};
 
 /// Time by which working threads may delay the end of the process.
@@ -97,6 +97,9 @@ struct ProcessArgs {
     /// Log level: error, warn, info, debug, trace, or a filter such as sgc_node=debug,info [env: SGC_LOG]
     #[arg(long, value_name = "LEVEL")]
     log: Option<String>,
+    /// Form of the log [env: SGC_LOG_FORMAT]
+    #[arg(long, value_name = "FORMAT")]
+    log_format: Option<LogFormat>,
     /// End when standard input ends, so that a child does not outlive its parent
     #[arg(long, hide = true)]
     until_stdin_closes: bool,
@@ -107,7 +110,7 @@ struct ProcessArgs {
 
 /// Runs `sgc run`.
 pub(crate) fn run(args: RunArgs) -> Result<(), CliError> {
-    start_log(args.process.log.as_deref())?;
+    start_log(args.process.log.as_deref(), args.process.log_format)?;
     let is_open = args.to.is_empty() && args.share.iter().any(|share| !share.contains('='));
     let arguments = ArgsConfig {
         identity: args.identity,
@@ -134,7 +137,7 @@ pub(crate) fn run(args: RunArgs) -> Result<(), CliError> {
 
 /// Runs `sgc router`.
 pub(crate) fn router(args: RouterArgs) -> Result<(), CliError> {
-    start_log(args.process.log.as_deref())?;
+    start_log(args.process.log.as_deref(), args.process.log_format)?;
     let arguments = ArgsConfig {
         identity: Some(args.identity),
         peers: args.peer,

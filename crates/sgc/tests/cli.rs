@@ -7,6 +7,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
+use serde_json::Value;
 use sgc_trust::{EnrollRequest, Fleet, Identity, derive_name};
 use sgc_wire::{Metadata, UnixMillis};
 use tempfile::TempDir;
@@ -413,6 +414,28 @@ fn an_expired_identity_is_found_by_check_and_by_run() {
 }
 
 #[test]
+fn check_warns_of_a_certificate_that_ends_soon_and_of_metrics_that_others_reach() {
+    let place = Place::new();
+    place.good(&["fleet", "create", "lab"]);
+    place.good(&["fleet", "enroll", "arm-1", "--valid", "10d"]);
+    let base = "[node]\nname = 'arm-1'\nrouters = ['quic://127.0.0.1:1']\nstate = 'state'\n";
+    let check = |metrics: &str| {
+        place.write("node.toml", &format!("{base}{metrics}"));
+        place.run(&["check", "-c", "node.toml"]).stdout
+    };
+    let said = check("[metrics]\n");
+    assert!(said.contains("this node's certificate ends in 9 days"), "{said}");
+    assert!(said.contains("http://127.0.0.1:9464/metrics") && !said.contains("neither encrypted"), "{said}");
+    for (listen, warns) in [("[::1]:1", false), ("0.0.0.0:1", true), ("10.0.0.7:1", true)] {
+        let said = check(&format!("[metrics]\nlisten = '{listen}'\n"));
+        assert_eq!(said.contains("neither encrypted nor protected"), warns, "{said}");
+    }
+    place.write("node.toml", &format!("{base}[metrics]\nlisten = 'http://127.0.0.1:1'\n"));
+    let said = place.bad(2, &["check", "-c", "node.toml"]);
+    assert!(said.contains("it takes an IP address and a port"), "{said}");
+}
+
+#[test]
 fn an_identity_that_others_can_read_is_refused() {
     let place = Place::with_fleet();
     place.set_mode("arm-1.identity", 0o644);
@@ -585,6 +608,32 @@ fn arguments_that_make_no_node_are_told() {
     let output = place.command(&["run", "--identity", "arm-1.identity"]).env("SGC_LOG", "verbose").output();
     let said = String::from_utf8(output.unwrap().stderr).unwrap();
     assert!(said.starts_with(&format!("sgc: SGC_LOG is \"verbose\": {right}")), "{said}");
+}
+
+#[test]
+fn log_in_json_has_an_object_for_each_event() {
+    let place = Place::with_fleet();
+    let args =
+        ["router", "--identity", "cloud.identity", "--listen", "tls://127.0.0.1:0", "--until-stdin-closes"];
+    for (extra, variable) in [(&["--log-format", "json"][..], "text"), (&[], "json")] {
+        let mut command = place.command(&[&args[..], extra].concat());
+        let output = command.env("SGC_LOG_FORMAT", variable).output().unwrap();
+        let log = String::from_utf8(output.stderr).unwrap();
+        let events: Vec<Value> = log.lines().map(|line| serde_json::from_str(line).expect(line)).collect();
+        let is_it = |event: &&Value| {
+            event["message"]
+                .as_str()
+                .is_some_and(|text| text.starts_with("there is no place for this node's state"))
+        };
+        let event = events.iter().find(is_it).unwrap_or_else(|| panic!("{log}"));
+        assert_eq!((&event["level"], event["timestamp"].is_string()), (&"WARN".into(), true), "{event}");
+    }
+    let output = place.command(&args).env("SGC_LOG_FORMAT", "xml").output().unwrap();
+    assert_eq!(
+        String::from_utf8(output.stderr).unwrap(),
+        "sgc: SGC_LOG_FORMAT is \"xml\": write text or json\n"
+    );
+    assert_eq!(output.status.code(), Some(2));
 }
 
 #[test]
