@@ -37,6 +37,7 @@ soon() {
     fail "$what: not within $seconds s"
 }
 is_linked() { sgc status --node robot | grep -qx 'Links:'; }
+scrape() { python3 -c 'import urllib.request as web; assert b"sgc_links{" in web.urlopen("http://127.0.0.1:9464/metrics", timeout=5).read()'; }
 journal() { journalctl --sync; journalctl --no-pager -u "sgc@$1"; }
 pid() { systemctl show --value -p MainPID "sgc@$1"; }
 is_new() { [ "$(pid robot)" != "$1" ] && [ "$(pid robot)" != 0 ]; }
@@ -55,7 +56,8 @@ if [ ! -e rebooted ]; then
     expect "a desk is enrolled" sgc fleet enroll desk
     sed 's,tls://0.0.0.0:443,tls://127.0.0.1:443,; s,0.0.0.0,127.0.0.1,' /usr/share/doc/sgc/examples/router.toml >/etc/sgc/router.toml
     sed 's,router.example,127.0.0.1,' /usr/share/doc/sgc/examples/robot.toml >/etc/sgc/robot.toml
-    printf '\n[ros]\ndomain_id = 31\n' >>/etc/sgc/robot.toml
+    # Its domain reaches the service as a variable.
+    echo ROS_DOMAIN_ID=31 >/etc/sgc/robot.env
     cat >/etc/sgc/desk.toml <<'END'
 identity = "/var/lib/sgc/desk.identity"
 [node]
@@ -82,6 +84,9 @@ END
     refuse "two nodes have to be named" "--node: " sgc status
     expect "root finds a node by its name" sgc status --node router
     expect "and by its configuration" sgc status -c /etc/sgc/robot.toml
+    printf '\n[metrics]\n' >>/etc/sgc/router.toml
+    soon "a running node serves metrics" 10 scrape
+    expect "alert rules and a dashboard are installed" test -e /usr/share/doc/sgc/examples/prometheus/alerts.yml -a -e /usr/share/doc/sgc/examples/grafana/sgc.json
     expect "the router listens on port 443" grep -q ':443 ' <(ss -Hltn)
     useradd -m member -G sgc
     useradd -m stranger
