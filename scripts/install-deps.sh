@@ -3,6 +3,7 @@
 #   install-deps.sh build   requirements of the build
 #   install-deps.sh test    the same, and those of the test suite
 #   install-deps.sh dist    those of the build, of packages and of their test
+#   install-deps.sh image   those of the build, of images and of their test
 #   install-deps.sh bench   those of the build, of the systems beside SGC in `make bench`, and of counting instructions
 # A requirement is met if its probe succeeds, whatever installed it. The script names each missing one with its reason, and
 # installs the missing ones together.
@@ -47,7 +48,7 @@ have_rust() {
     done
 }
 
-case $what in build | test | dist | bench) ;; *) die "usage: install-deps.sh build|test|dist|bench" ;; esac
+case $what in build | test | dist | image | bench) ;; *) die "usage: install-deps.sh build|test|dist|image|bench" ;; esac
 have_rust
 need 'compiles c stdlib.h' gcc libc6-dev -- "C compiler: Cyclone DDS and AWS-LC are built from source"
 need 'compiles c++ vector' g++ -- "C++ compiler: the build of Cyclone DDS requires one"
@@ -71,6 +72,11 @@ if [ "$what" = dist ]; then
     need 'command -v dpkg-shlibdeps' dpkg-dev -- "the package's dependencies on libraries"
     need 'command -v debootstrap' debootstrap -- "a small Debian to try the package on"
     need 'command -v systemd-nspawn' systemd-container -- "starts its systemd"
+fi
+if [ "$what" = image ]; then
+    need 'command -v podman' podman crun netavark aardvark-dns iptables -- "builds and runs images"
+    need 'command -v podman-compose' podman-compose -- "runs several containers"
+    need 'command -v debootstrap' debootstrap -- "a small Debian to build the image on"
 fi
 if [ "$what" = bench ]; then
     need 'python3 -c "import venv, ensurepip"' python3 python3-venv -- "ROS 2 is installed into virtual environments"
