@@ -177,7 +177,7 @@ fn metrics_are_served_once_a_taken_port_is_free() {
     assert_eq!(cloud.status()["alerts"], serde_json::json!([]));
     // A reload moves it, and ends it.
     let report = cloud.reload(|config| config.metrics = anywhere());
-    assert!(report.to_string().contains("metrics are served"), "{report}");
+    assert!(report.to_string().contains("metrics are to be served"), "{report}");
     wait("it has moved", || served_at(&cloud) != listen);
     let elsewhere = served_at(&cloud);
     assert_eq!(get(elsewhere, "/").status, 200);

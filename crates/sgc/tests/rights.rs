@@ -360,14 +360,14 @@ fn gateway_comes_moves_and_goes_at_a_reload_and_a_taken_port_stops_nothing() {
 
     let reload = || place.good(&["reload", "--socket", "arm.sock"]);
     with("'ws://127.0.0.1:0'");
-    assert_eq!(reload(), "programs without ROS may connect at ws://127.0.0.1:0\n");
+    assert_eq!(reload(), "programs without ROS are to connect at ws://127.0.0.1:0\n");
     assert!(TcpStream::connect(url.strip_prefix("ws://").unwrap()).is_err(), "that address is closed");
     assert_eq!(listens_at().len(), 1);
     place.write("arm-1.toml", &base);
     assert_eq!(reload(), "programs without ROS may not connect any more\n");
     assert!(status()["gateway"].is_null());
     with(&format!("'{url}'"));
-    assert!(reload().contains(&format!("programs without ROS may connect at {url}")));
+    assert!(reload().contains(&format!("programs without ROS are to connect at {url}")));
     TcpStream::connect(url.strip_prefix("ws://").unwrap()).unwrap();
     // Bounds are those of the start.
     place.write("arm-1.toml", &(place.read("arm-1.toml") + "clients_max = 3\n"));

@@ -16,14 +16,28 @@ use crate::data::spacing::Spacing;
 
 /// Longest wait for acknowledgements of local readers.
 const ACKNOWLEDGED_WAIT_MAX: Duration = Duration::from_secs(1);
+/// Interval of looks for room during a wait, which otherwise lasts until all is acknowledged.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// Time after a wait in vain before a burst waits again.
+const STALLED_READER_PAUSE: Duration = Duration::from_secs(10);
 
 /// Holds back messages that would overwrite others. A reliable writer that keeps the last samples never blocks, so
 /// messages that come in a burst, or while a reader pauses, would overwrite themselves before readers take them.
 #[derive(Default)]
 pub(crate) struct Burst {
     pub(crate) room: Arc<Room>,
-    /// Whether a reader acknowledged nothing for so long that no message waits for it.
-    is_stalled: bool,
+    /// No message waits before this time, because a reader acknowledged nothing for so long.
+    stalled_until: Option<Instant>,
+}
+
+/// How a message came to a writer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Arrival {
+    /// Others follow it at once.
+    InBurst,
+    Alone,
+    /// Alone, and the caller may not wait.
+    AtOnce,
 }
 
 /// Upper bound of a writer's unacknowledged samples. Only the holder of the consumer's lock changes it.
@@ -115,7 +129,7 @@ impl Burst {
     pub(crate) fn before_next(
         &mut self,
         writer: &impl RosWriter,
-        is_alone: bool,
+        arrival: Arrival,
         bytes: usize,
         timestamp_ns: i64,
     ) {
@@ -126,13 +140,19 @@ impl Burst {
         if unacknowledged >= kept {
             unacknowledged = room.look(writer, kept);
         }
-        let wait = if unacknowledged < kept { Duration::ZERO } else { self.wait_max(is_alone, kept) };
-        if !wait.is_zero() {
-            // A slow reader that acknowledged some is not stalled.
-            let is_all = writer.wait_acknowledged(wait);
-            unacknowledged = if is_all { 0 } else { room.look(writer, kept) };
+        if unacknowledged >= kept {
+            let mut left = self.wait_max(arrival, kept);
+            let waits = !left.is_zero();
+            while unacknowledged >= kept && !left.is_zero() {
+                let is_all = writer.wait_acknowledged(left.min(LOOK_EVERY));
+                unacknowledged = if is_all { 0 } else { room.look(writer, kept) };
+                left = left.saturating_sub(LOOK_EVERY);
+            }
+            if waits {
+                self.stalled_until = Some(Instant::now() + STALLED_READER_PAUSE);
+            }
         }
-        self.is_stalled = unacknowledged >= kept && (self.is_stalled || !wait.is_zero());
+        self.stalled_until = self.stalled_until.filter(|_| unacknowledged >= kept);
 
         let kept_min = if unacknowledged == 0 { of_next } else { kept };
         room.kept_min.store(kept_min, Relaxed);
@@ -145,11 +165,17 @@ impl Burst {
     /// Returns the longest wait for room among so many samples. A message that came alone waits no longer than until
     /// readers have acknowledged nothing for [`ACKNOWLEDGED_WAIT_MAX`], so that a slow topic is not held up by a reader
     /// that stood still before.
-    fn wait_max(&self, is_alone: bool, kept: u32) -> Duration {
-        if self.is_stalled || (is_alone && !is_deep(kept)) {
+    fn wait_max(&self, arrival: Arrival, kept: u32) -> Duration {
+        let is_stalled = self.stalled_until.is_some_and(|until| Instant::now() < until);
+        let may_wait = match arrival {
+            Arrival::InBurst => true,
+            Arrival::Alone => is_deep(kept),
+            Arrival::AtOnce => false,
+        };
+        if is_stalled || !may_wait {
             return Duration::ZERO;
         }
-        let first = self.room.written().first.filter(|_| is_alone);
+        let first = self.room.written().first.filter(|_| arrival == Arrival::Alone);
         ACKNOWLEDGED_WAIT_MAX.saturating_sub(first.map_or(Duration::ZERO, |first| first.elapsed()))
     }
 }
@@ -162,6 +188,9 @@ mod tests {
     use sgc_ros::{Guid, RosError, SampleHead};
 
     use super::*;
+
+    /// Waits until a reader counts as stalled.
+    const WAITS: usize = (ACKNOWLEDGED_WAIT_MAX.as_millis() / LOOK_EVERY.as_millis()) as usize;
 
     struct Slow {
         kept: Option<u32>,
@@ -223,39 +252,43 @@ mod tests {
     fn a_burst_waits_for_its_readers_but_not_for_one_that_stands_still() {
         let writer = Slow::new(Some(10));
         let mut burst = Burst::default();
-        (0..100).for_each(|_| burst.before_next(&writer, true, 8, 0));
-        (0..100).for_each(|_| burst.before_next(&writer, false, 8, 0));
+        (0..100).for_each(|_| burst.before_next(&writer, Arrival::Alone, 8, 0));
+        (0..100).for_each(|_| burst.before_next(&writer, Arrival::InBurst, 8, 0));
         assert_eq!(writer.asked.swap(0, Relaxed), 19);
-        (0..100).for_each(|_| burst.before_next(&writer, false, 2000, 0));
+        (0..100).for_each(|_| burst.before_next(&writer, Arrival::InBurst, 2000, 0));
         assert_eq!(writer.asked.load(Relaxed), 20, "fewer of long ones are kept");
         assert_eq!(writer.waited.load(Relaxed), 0, "all are acknowledged");
         writer.stands_still.store(true, Relaxed);
-        (0..1000).for_each(|_| burst.before_next(&writer, true, 8, 0));
+        (0..1000).for_each(|_| burst.before_next(&writer, Arrival::Alone, 8, 0));
         assert_eq!(writer.waited.load(Relaxed), 0, "each alone");
-        (0..1000).for_each(|_| burst.before_next(&writer, false, 8, 0));
-        assert_eq!(writer.waited.load(Relaxed), 1, "once");
+        (0..1000).for_each(|_| burst.before_next(&writer, Arrival::InBurst, 8, 0));
+        assert_eq!(writer.waited.load(Relaxed), WAITS, "once");
         // After it has acknowledged, the next burst waits again.
         writer.stands_still.store(false, Relaxed);
-        burst.before_next(&writer, false, 8, 0);
+        burst.before_next(&writer, Arrival::InBurst, 8, 0);
         writer.stands_still.store(true, Relaxed);
-        (0..1000).for_each(|_| burst.before_next(&writer, false, 8, 0));
-        assert_eq!(writer.waited.load(Relaxed), 2);
+        (0..1000).for_each(|_| burst.before_next(&writer, Arrival::InBurst, 8, 0));
+        assert_eq!(writer.waited.load(Relaxed), 2 * WAITS);
+        // So does one that comes much later.
+        burst.stalled_until = Some(Instant::now());
+        (0..1000).for_each(|_| burst.before_next(&writer, Arrival::InBurst, 8, 0));
+        assert_eq!(writer.waited.load(Relaxed), 3 * WAITS);
         // A burst does not wait for samples that were acknowledged meanwhile.
         let acknowledging = Slow { unacknowledged: [Some(3); 2], ..Slow::new(Some(10)) };
         let mut burst = Burst::default();
-        (0..100).for_each(|_| burst.before_next(&acknowledging, false, 8, 0));
+        (0..100).for_each(|_| burst.before_next(&acknowledging, Arrival::InBurst, 8, 0));
         assert_eq!((acknowledging.waited.load(Relaxed), acknowledging.asked.load(Relaxed)), (0, 0));
         // A reader that acknowledged some in the longest wait is slow, and not stalled.
-        for (after, is_stalled) in [(4, false), (10, true)] {
+        for (after, waits, is_stalled) in [(4, 1, false), (10, WAITS, true)] {
             let lagging = Slow { unacknowledged: [Some(10), Some(after)], ..Slow::new(Some(10)) };
             lagging.stands_still.store(true, Relaxed);
             let mut burst = Burst::default();
-            (0..11).for_each(|_| burst.before_next(&lagging, false, 8, 0));
-            assert_eq!((lagging.waited.load(Relaxed), burst.is_stalled), (1, is_stalled));
+            (0..11).for_each(|_| burst.before_next(&lagging, Arrival::InBurst, 8, 0));
+            assert_eq!((lagging.waited.load(Relaxed), burst.stalled_until.is_some()), (waits, is_stalled));
             assert_eq!(burst.room.unacknowledged.load(Relaxed), after + 1);
         }
         let (writer, mut other) = (Slow::new(None), Burst::default());
-        (0..100).for_each(|_| other.before_next(&writer, false, 8, 0));
+        (0..100).for_each(|_| other.before_next(&writer, Arrival::InBurst, 8, 0));
         assert_eq!(writer.waited.load(Relaxed), 0, "one that blocks by itself");
     }
 
@@ -265,35 +298,39 @@ mod tests {
         let writer = Slow::new(Some(1000));
         writer.stands_still.store(true, Relaxed);
         let mut burst = Burst::default();
-        (0..1000).for_each(|_| burst.before_next(&writer, true, 8, 0));
+        (0..1000).for_each(|_| burst.before_next(&writer, Arrival::Alone, 8, 0));
         assert_eq!(writer.waited.load(Relaxed), 0);
         thread::sleep(Duration::from_millis(1));
         assert!(!burst.room.is_there(&writer, 8, 1), "although its time has come");
-        (0..100).for_each(|_| burst.before_next(&writer, true, 8, 0));
-        assert_eq!(writer.waited.load(Relaxed), 1, "once");
+        (0..100).for_each(|_| burst.before_next(&writer, Arrival::Alone, 8, 0));
+        assert_eq!(writer.waited.load(Relaxed), WAITS, "once");
         // A reader that has stood still for longer than a message waits holds up nobody.
         let mut burst = Burst::default();
-        (0..1000).for_each(|_| burst.before_next(&writer, true, 8, 0));
+        (0..1000).for_each(|_| burst.before_next(&writer, Arrival::Alone, 8, 0));
         burst.room.written().first = Instant::now().checked_sub(ACKNOWLEDGED_WAIT_MAX);
-        (0..100).for_each(|_| burst.before_next(&writer, true, 8, 0));
-        assert_eq!(writer.waited.load(Relaxed), 1);
+        (0..100).for_each(|_| burst.before_next(&writer, Arrival::Alone, 8, 0));
+        assert_eq!(writer.waited.load(Relaxed), WAITS);
+        // Nor does it hold up a thread that may not wait.
+        let mut burst = Burst::default();
+        (0..1010).for_each(|_| burst.before_next(&writer, Arrival::AtOnce, 8, 0));
+        assert_eq!(writer.waited.load(Relaxed), WAITS);
     }
 
     #[test]
     fn short_samples_overwrite_no_long_ones_that_are_unacknowledged() {
         let writer = Slow::new(Some(10));
         let mut burst = Burst::default();
-        (0..5).for_each(|_| burst.before_next(&writer, false, 2000, 0));
+        (0..5).for_each(|_| burst.before_next(&writer, Arrival::InBurst, 2000, 0));
         assert_eq!(writer.asked.load(Relaxed), 0);
-        burst.before_next(&writer, false, 8, 0);
+        burst.before_next(&writer, Arrival::InBurst, 8, 0);
         assert_eq!(writer.asked.load(Relaxed), 1, "five long ones are kept");
         // The long ones are acknowledged, so ten short ones are kept again.
-        (0..9).for_each(|_| burst.before_next(&writer, false, 8, 0));
+        (0..9).for_each(|_| burst.before_next(&writer, Arrival::InBurst, 8, 0));
         assert_eq!(writer.asked.load(Relaxed), 1);
         let stuck = Slow::new(Some(10));
         stuck.stands_still.store(true, Relaxed);
         let mut burst = Burst::default();
-        (0..5).for_each(|_| burst.before_next(&stuck, true, 2000, 0));
+        (0..5).for_each(|_| burst.before_next(&stuck, Arrival::Alone, 2000, 0));
         assert!(!burst.room.is_there(&stuck, 8, 0));
     }
 
@@ -303,13 +340,13 @@ mod tests {
         let mut burst = Burst::default();
         for _ in 0..35 {
             assert!(burst.room.is_there(&writer, 8, 0));
-            burst.before_next(&writer, true, 8, 0);
+            burst.before_next(&writer, Arrival::Alone, 8, 0);
         }
         assert_eq!(writer.asked.load(Relaxed), 3, "asked when as many were written as are kept");
         writer.stands_still.store(true, Relaxed);
         for _ in 0..5 {
             assert!(burst.room.is_there(&writer, 8, 0));
-            burst.before_next(&writer, true, 8, 0);
+            burst.before_next(&writer, Arrival::Alone, 8, 0);
         }
         assert!(!burst.room.is_there(&writer, 8, 0), "ten are under way");
         assert!(Burst::default().room.is_there(&Slow::new(None), 8, 0));

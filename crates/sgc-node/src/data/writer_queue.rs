@@ -24,7 +24,7 @@ use tokio::sync::mpsc;
 use tokio::time::sleep_until;
 use tracing::warn;
 
-use crate::data::burst::Burst;
+use crate::data::burst::{Arrival, Burst};
 use crate::data::conversion::{self, TypeSlot};
 use crate::data::queue::{PushError, PushOutcome, Queue};
 use crate::data::stats::{DataDrop, Drops};
@@ -167,6 +167,8 @@ pub(crate) type FramePrefix = Arc<ArcSwapOption<String>>;
 pub(crate) enum NextMessage {
     /// The queue is empty.
     Nothing,
+    /// The queue is empty, and the consumer may not wait.
+    NothingAtOnce,
     /// The next message waits for its time.
     Later,
     /// The next message follows at once.
@@ -381,12 +383,14 @@ impl WriterQueue {
             if next.keeps_pace() {
                 burst.room.space(&*writer, source, head.source_timestamp_ns);
             }
-            burst.before_next(
-                &*writer,
-                next == NextMessage::Nothing,
-                payload.len(),
-                head.source_timestamp_ns,
-            );
+            let arrival = match next {
+                NextMessage::Nothing => Arrival::Alone,
+                NextMessage::NothingAtOnce => Arrival::AtOnce,
+                NextMessage::Later | NextMessage::AtOnce | NextMessage::Last | NextMessage::Unheard => {
+                    Arrival::InBurst
+                }
+            };
+            burst.before_next(&*writer, arrival, payload.len(), head.source_timestamp_ns);
             let written = writer.write_ahead(head, payload);
             if !next.is_at_once() {
                 writer.flush();
@@ -568,7 +572,7 @@ impl WriterQueue {
         let mut evicted = 0;
         let at_once = may_write.then(|| self.at_once(&message)).flatten();
         if let Some(mut consumer) = at_once {
-            (consumer.take)(message, NextMessage::Nothing);
+            (consumer.take)(message, NextMessage::NothingAtOnce);
         } else if message.reliable {
             match self.queue.try_push(message, bytes, WRITER_BYTES_MAX) {
                 PushOutcome::Queued => self.wake(),

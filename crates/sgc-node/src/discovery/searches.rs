@@ -1,7 +1,7 @@
 //! [`Searches`]: the searches for routers that run, and how a reload changes them.
 
 use std::sync::{Arc, Mutex, MutexGuard};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng as _;
@@ -12,6 +12,7 @@ use tokio::task::JoinHandle;
 use tracing::warn;
 
 use super::{Board, DialTarget, LinkKeeper, LocalNetwork, RouterFilter, keep_at, mdns, srv, urls};
+use crate::clock::time_now;
 
 /// Time for which links to routers that are no longer wanted stay while others are dialled, so that topics move over.
 const HAND_OVER: Duration = Duration::from_secs(2);
@@ -63,11 +64,13 @@ pub(crate) struct Searches {
     mdns_port: Option<u16>,
     /// Addresses that this node announces on the local network.
     announced: Vec<ListenAddr>,
-    state: Mutex<State>,
+    state: Arc<Mutex<State>>,
 }
 
 struct State {
     running: Vec<Running>,
+    /// Searches that are no longer wanted, and when they end.
+    ending: Vec<(Instant, Running)>,
     /// The local network, once it is used.
     local: Option<Arc<LocalNetwork>>,
     rng: ChaCha20Rng,
@@ -81,10 +84,58 @@ struct Running {
 }
 
 impl Running {
+    fn is_nearby(&self) -> bool {
+        matches!(self.target, SearchTarget::Nearby(_))
+    }
+
     /// Ends the search. Its links end soon after.
-    async fn end(self) {
+    async fn end(mut self) {
         self.task.abort();
-        let _ = self.task.await;
+        let _ = (&mut self.task).await;
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+impl State {
+    /// Takes a search for this out of those that run, or that are about to end.
+    fn take(&mut self, target: &SearchTarget) -> Option<Running> {
+        if let Some(at) = self.running.iter().position(|running| running.target == *target) {
+            return Some(self.running.swap_remove(at));
+        }
+        let at = self.ending.iter().position(|(_, ending)| ending.target == *target)?;
+        Some(self.ending.swap_remove(at).1)
+    }
+
+    /// Takes a search of the local network that is about to end.
+    fn take_ending_nearby(&mut self) -> Option<Running> {
+        let at = self.ending.iter().position(|(_, ending)| ending.is_nearby())?;
+        Some(self.ending.swap_remove(at).1)
+    }
+}
+
+/// Ends the searches whose time has come.
+async fn end_due(state: Arc<Mutex<State>>, due: Instant) {
+    tokio::time::sleep_until(due.into()).await;
+    let (ended, kept) = {
+        let mut state = lock(&state);
+        std::mem::take(&mut state.ending).into_iter().partition::<Vec<_>, _>(|(at, _)| *at <= due)
+    };
+    lock(&state).ending.extend(kept);
+    let was_nearby = ended.iter().any(|(_, running)| running.is_nearby());
+    for (_, running) in ended {
+        running.end().await;
+    }
+    let state = lock(&state);
+    let all = state.running.iter().chain(state.ending.iter().map(|(_, ending)| ending));
+    if let Some(local) =
+        state.local.as_ref().filter(|_| was_nearby && !all.into_iter().any(Running::is_nearby))
+    {
+        local.stop_browsing();
     }
 }
 
@@ -98,8 +149,8 @@ impl Searches {
         announced: Vec<ListenAddr>,
         rng: ChaCha20Rng,
     ) -> Self {
-        let state = State { running: Vec::new(), local: None, rng, is_stopped: false };
-        let searches = Self { keeper, board, mdns_port, announced, state: Mutex::new(state) };
+        let state = State { running: Vec::new(), ending: Vec::new(), local: None, rng, is_stopped: false };
+        let searches = Self { keeper, board, mdns_port, announced, state: Arc::new(Mutex::new(state)) };
         if !searches.announced.is_empty() {
             searches.use_local(&mut searches.lock());
         }
@@ -113,44 +164,33 @@ impl Searches {
         if state.is_stopped {
             return SearchChanges::default();
         }
-        let wanted = search_targets(wanted);
-        let (kept, mut ended): (Vec<_>, Vec<_>) = std::mem::take(&mut state.running)
-            .into_iter()
-            .partition(|running| wanted.iter().any(|(target, _)| *target == running.target));
-        state.running = kept;
         let mut changes = SearchChanges::default();
-        for (target, found_by) in wanted {
-            if state.running.iter().any(|running| running.target == target) {
-                continue;
+        let (mut running, mut new) = (Vec::new(), Vec::new());
+        for (target, found_by) in search_targets(wanted) {
+            match state.take(&target) {
+                Some(known) => running.push(known),
+                None => new.push((target, found_by)),
             }
+        }
+        let ended = std::mem::replace(&mut state.running, running);
+        changes.ended = ended.iter().map(|running| running.target.written()).collect();
+        let pause = if new.is_empty() { Duration::ZERO } else { HAND_OVER };
+        let due = time_now() + pause;
+        let is_ending = !ended.is_empty();
+        state.ending.extend(ended.into_iter().map(|running| (due, running)));
+        for (target, found_by) in new {
             // One search at a time hears what is announced on the local network.
-            let is_nearby = |running: &Running| matches!(running.target, SearchTarget::Nearby(_));
             let before = match &target {
-                SearchTarget::Nearby(_) => ended.iter().position(is_nearby).map(|at| ended.swap_remove(at)),
+                SearchTarget::Nearby(_) => state.take_ending_nearby(),
                 SearchTarget::At(_) | SearchTarget::Domain(_) => None,
             };
-            if let Some(before) = &before {
-                changes.ended.push(before.target.written());
-            }
             if let Some(task) = self.begin(&target, found_by, before, &mut state) {
                 changes.begun.push(target.written());
                 state.running.push(Running { target, task });
             }
         }
-        changes.ended.extend(ended.iter().map(|running| running.target.written()));
-        let pause = if changes.begun.is_empty() { Duration::ZERO } else { HAND_OVER };
-        if !ended.is_empty() {
-            let local = state.local.clone();
-            tokio::spawn(async move {
-                tokio::time::sleep(pause).await;
-                for running in ended {
-                    let is_nearby = matches!(running.target, SearchTarget::Nearby(_));
-                    running.end().await;
-                    if let Some(local) = local.as_ref().filter(|_| is_nearby) {
-                        local.stop_browsing();
-                    }
-                }
-            });
+        if is_ending {
+            tokio::spawn(end_due(self.state.clone(), due));
         }
         changes
     }
@@ -159,7 +199,8 @@ impl Searches {
     pub(crate) fn stop(&self) {
         let mut state = self.lock();
         state.is_stopped = true;
-        state.running.drain(..).for_each(|running| running.task.abort());
+        state.running.clear();
+        state.ending.clear();
     }
 
     /// Returns the local network, if it is used.

@@ -10,6 +10,7 @@ use sgc_router::LinkId;
 use sgc_session::Activity;
 use sgc_transport::{AnyLink, CloseReason, CredentialStore, Link, LinkError, Listener};
 use sgc_wire::{Control, Decode, DecodeError, Encode};
+use tokio::runtime::Handle;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, timeout, timeout_at};
 use tracing::{debug, info, warn};
@@ -92,6 +93,25 @@ pub(crate) async fn keep_accepting(
     }
 }
 
+/// The place of a link, until it has come. If this is dropped before, and the control task has given the place, the link
+/// ends: nobody else would report that.
+struct AwaitedPlace {
+    place: oneshot::Receiver<Option<LinkPlace>>,
+    link: AnyLink,
+    core: mpsc::Sender<CoreEvent>,
+}
+
+impl Drop for AwaitedPlace {
+    fn drop(&mut self) {
+        self.place.close();
+        let (Ok(Some(place)), Ok(runtime)) = (self.place.try_recv(), Handle::try_current()) else { return };
+        self.link.close(CloseReason::Goodbye);
+        let core = self.core.clone();
+        let down = CoreEvent::LinkDown { id: place.id, in_use: None };
+        runtime.spawn(async move { core.send(down).await });
+    }
+}
+
 /// A link that was reported to the control task.
 pub(super) struct ReportedLink {
     pub(super) link: AnyLink,
@@ -121,7 +141,8 @@ impl ReportedLink {
         let (activity_tx, lanes_tx) = (activity.clone(), lanes.clone());
         let control = ControlTx::new(frames.clone(), labels, activity_tx, lanes_tx);
         let up = CoreEvent::LinkUp { link: link.clone(), url, control, reply };
-        let id = match (core.send(up).await, id.await) {
+        let mut place = AwaitedPlace { place: id, link: link.clone(), core: core.clone() };
+        let id = match (core.send(up).await, (&mut place.place).await) {
             (Ok(()), Ok(Some(LinkPlace { id, data, inbox }))) => {
                 info!(link = id.0, remote = %link.remote(), peer = %link.peer().node_id.short(), "link is up");
                 let inflow = Inflow::new(&link, id, data, activity);

@@ -95,9 +95,8 @@ impl RouteReading {
 impl Readings {
     /// Returns the reasons why the node carries nothing, none if it is ready.
     pub(crate) fn obstacles(&self) -> Vec<String> {
-        // A router that stands back has dialled this node, for example.
-        let is_linked = |row: &RouterStatus| matches!(row.state, "linked" | "standing back");
-        let unlinked = !self.routers.is_empty() && !self.routers.iter().any(is_linked);
+        // A router that was looked for may have dialled this node.
+        let unlinked = !self.routers.is_empty() && self.links.dialled + self.links.accepted == 0;
         let no_link = unlinked.then(|| "no router is linked".to_owned());
         let alerts = self.alerts.iter().filter(|alert| alert.stops_all()).map(ToString::to_string);
         no_link.into_iter().chain(alerts).collect()

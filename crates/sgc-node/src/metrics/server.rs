@@ -5,13 +5,14 @@
 //! otherwise. A web page of another site cannot read answers: the server allows no other origin, and over loopback it
 //! answers only requests to the host by its address or as `localhost`, so a page cannot read them by DNS rebinding.
 //!
-//! Clients that send no request keep nobody out: at the limit, the connection whose last request is longest ago gives way
-//! to a new one.
+//! Clients that send no request keep nobody out: at the limit, a connection that had none gives way to a new one, or else
+//! that whose last one is longest ago.
 
 use std::convert::Infallible;
 use std::fmt;
 use std::io;
 use std::net::{IpAddr, SocketAddr};
+use std::pin::pin;
 use std::sync::{Arc, Mutex as SyncMutex, OnceLock};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -112,8 +113,16 @@ impl Source {
 /// A connection that is served.
 struct Served {
     task: AbortHandle,
+    activity: Arc<SyncMutex<Activity>>,
+}
+
+/// The activity of a connection. The least gives way first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Activity {
+    is_answered: bool,
+    had_request: bool,
     /// When it was accepted, or its last request came.
-    active: Arc<SyncMutex<Instant>>,
+    at: Instant,
 }
 
 /// Serves connections until it is dropped.
@@ -132,29 +141,42 @@ pub(super) async fn serve(listener: TcpListener, source: Arc<Source>) {
         };
         while tasks.try_join_next().is_some() {}
         served.retain(|one| !one.task.is_finished());
-        if served.len() >= CONNECTIONS_MAX
-            && let Some(idlest) = (0..served.len()).min_by_key(|at| *lock(&served[*at].active))
-        {
-            served.swap_remove(idlest).task.abort();
+        if served.len() >= CONNECTIONS_MAX {
+            let activity = |at: &usize| *lock(&served[*at].activity);
+            match (0..served.len()).min_by_key(activity).filter(|at| !activity(at).is_answered) {
+                Some(idlest) => served.swap_remove(idlest).task.abort(),
+                None => continue,
+            }
         }
-        let (source, active) = (source.clone(), Arc::new(SyncMutex::new(Instant::now())));
-        let noted = active.clone();
+        let activity = Activity { is_answered: false, had_request: false, at: Instant::now() };
+        let activity = Arc::new(SyncMutex::new(activity));
+        let (source, noted) = (source.clone(), activity.clone());
         let task = tasks.spawn(async move { serve_one(stream, &source, &noted).await });
-        served.push(Served { task, active });
+        served.push(Served { task, activity });
     }
 }
 
 /// Serves a connection, and notes when requests come.
-async fn serve_one(stream: TcpStream, source: &Source, active: &SyncMutex<Instant>) {
+async fn serve_one(stream: TcpStream, source: &Source, activity: &SyncMutex<Activity>) {
     let is_local = stream.local_addr().is_ok_and(|at| at.ip().to_canonical().is_loopback());
-    let answer = service_fn(|request| {
-        *lock(active) = Instant::now();
-        answer(request, source, is_local)
+    let answer = service_fn(async |request| {
+        *lock(activity) = Activity { is_answered: true, had_request: true, at: Instant::now() };
+        let answered = answer(request, source, is_local).await;
+        lock(activity).is_answered = false;
+        answered
     });
     let mut server = http1::Builder::new();
     server.timer(TokioTimer::new()).header_read_timeout(REQUEST_MAX).max_buf_size(HEAD_BYTES_MAX);
-    let ended = timeout(CONNECTION_MAX, server.serve_connection(TokioIo::new(stream), answer)).await;
-    if let Ok(Err(error)) = ended {
+    let mut connection = pin!(server.serve_connection(TokioIo::new(stream), answer));
+    let ended = match timeout(CONNECTION_MAX, &mut connection).await {
+        Ok(ended) => ended,
+        Err(_) => {
+            // An answer under way is completed.
+            connection.as_mut().graceful_shutdown();
+            timeout(REQUEST_MAX, connection).await.unwrap_or(Ok(()))
+        }
+    };
+    if let Err(error) = ended {
         debug!(%error, "a connection for metrics ended");
     }
 }

@@ -73,7 +73,7 @@ fn a_reliable_topic_that_keeps_all_arrives_whole_however_fast_it_is_published() 
 #[test]
 fn a_reliable_topic_that_keeps_all_arrives_whole_if_its_subscriber_pauses() {
     const MESSAGES: u64 = 4_000;
-    const PAUSE: Duration = Duration::from_millis(900);
+    const PAUSE: Duration = Duration::from_millis(700);
     let lab = Lab::real(EXCLUSIVE, robot_to_desk("topic", ["/load"]));
     let extra = ["--depth", "0", "--rate", "2000", "--size", "100", "--insist"];
     for pair in PAIRS {

@@ -175,11 +175,26 @@ impl Reloader {
         self.reconfigure(&rules, anchors, message_keys).await?;
         // The control task has the newest revocation lists.
         if let Some((access, files)) = gateway.filter(|_| running.config.gateway.is_some()) {
-            report.changed.extend(self.reconfigure_gateway(running, &config, access, files)?);
+            match self.reconfigure_gateway(running, &config, access, files) {
+                Ok(changed) => report.changed.extend(changed),
+                Err(error) => {
+                    report.needs_restart.push(format!("who may connect to the gateway is as it was: {error}"))
+                }
+            }
         }
         let mut config = config;
         match self.move_gateway(running, &config, &rules).await {
-            Ok(changed) => report.changed.extend(changed),
+            Ok(changed) => {
+                report.changed.extend(changed);
+                report
+                    .warnings
+                    .extend(self.gateway.alerts().iter().map(|alert| format!("{alert}: {}", alert.fix())));
+                if let Some(after) =
+                    config.gateway.as_ref().filter(|_| running.config.gateway != config.gateway)
+                {
+                    report.warnings.extend(after.warnings());
+                }
+            }
             Err(error) => {
                 report.needs_restart.push(format!("the gateway is as it was: {error}"));
                 // The next reload tries again.
@@ -195,7 +210,7 @@ impl Reloader {
             self.metrics.set(config.metrics);
             report.warnings.extend(config.metrics.iter().flat_map(|metrics| metrics.warnings()));
             report.changed.push(match config.metrics {
-                Some(metrics) => format!("metrics are served at http://{}/metrics", metrics.listen),
+                Some(metrics) => format!("metrics are to be served at http://{}/metrics", metrics.listen),
                 None => "metrics are not served any more".to_owned(),
             });
         }
@@ -266,12 +281,14 @@ impl Reloader {
                 listen_for_clients(&self.gateway, config, &identity, rules, state, &self.audit)
                     .await
                     .map_err(|error| error.to_string())?;
+                // They may have been renewed meanwhile.
                 self.gateway.set_anchors(&self.credentials.anchors());
-                Ok(vec![format!("programs without ROS may connect at {}", addresses(after))])
+                self.gateway.set_identity(&self.credentials.identity());
+                Ok(vec![format!("programs without ROS are to connect at {}", addresses(after))])
             }
             (Some(before), Some(after)) if before.listen != after.listen => {
                 self.gateway.listen_elsewhere(listen_at(after)).await.map_err(|error| error.to_string())?;
-                Ok(vec![format!("programs without ROS may connect at {}", addresses(after))])
+                Ok(vec![format!("programs without ROS are to connect at {}", addresses(after))])
             }
             (Some(_), None) => {
                 self.gateway.close_sockets().await;
