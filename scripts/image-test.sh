@@ -27,10 +27,13 @@ podman=$(command -v podman)
 mkdir -p "$store/bin"
 cat >"$store/bin/podman" <<PODMAN
 #!/bin/sh
-exec $podman --root $store/storage --runroot $store/run --tmpdir $store/tmp --network-config-dir $store/networks \\
-    --storage-driver vfs --cgroup-manager cgroupfs --events-backend file "\$@"
+exec $podman --runtime runc --root $store/storage --runroot $store/run --tmpdir $store/tmp --network-config-dir $store/networks \\
+    --storage-driver overlay --cgroup-manager cgroupfs --events-backend file "\$@"
 PODMAN
 chmod +x "$store/bin/podman"
+# Its usual limits are higher than a container that runs this may set.
+printf '[containers]\ndefault_ulimits = ["nofile=4096:4096", "nproc=4096:4096"]\n' >"$store/containers.conf"
+export CONTAINERS_CONF=$store/containers.conf
 export PATH=$store/bin:$PATH
 log=$store/log
 compose() { (cd dist/container && SGC_IMAGE=localhost/sgc-test podman-compose --project-name sgctest "$@") >>"$log" 2>&1; }
@@ -40,6 +43,7 @@ clean() {
     for network in $(podman network ls --quiet 2>/dev/null); do
         podman network rm --force "$network" >/dev/null 2>&1 || true
     done
+    umount "$store/storage/overlay" 2>/dev/null || true
     rm -rf "$store"
 }
 trap clean EXIT
@@ -101,10 +105,10 @@ is_dead() { [ "$(podman inspect --format '{{.State.Running}}' sgctest_robot_1)" 
 is_new() { [ "$(podman inspect --format '{{.State.Pid}}' sgctest_robot_1)" != "$node" ]; }
 # A service of systemd restarts it where podman runs as one.
 eventually "it has ended" sh -c "$(declare -f is_dead is_new); node=$node; is_dead || is_new"
-podman start sgctest_robot_1 >/dev/null
+podman start sgctest_robot_1 >>"$log" 2>&1
 eventually "it is linked again" is_linked robot
 started=$SECONDS
-podman stop --time 10 sgctest_router_1 >/dev/null
+podman stop --time 10 sgctest_router_1 >>"$log" 2>&1
 check "it stops on SIGTERM" test $((SECONDS - started)) -lt 8
 check "it ends well" test "$(podman inspect --format '{{.State.ExitCode}}' sgctest_router_1)" = 0
 say "the image passed $passed checks"

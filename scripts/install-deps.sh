@@ -74,7 +74,7 @@ if [ "$what" = dist ]; then
     need 'command -v systemd-nspawn' systemd-container -- "starts its systemd"
 fi
 if [ "$what" = image ]; then
-    need 'command -v podman' podman crun netavark aardvark-dns iptables -- "builds and runs images"
+    need 'command -v podman' podman runc netavark aardvark-dns iptables -- "builds and runs images"
     need 'command -v podman-compose' podman-compose -- "runs several containers"
     need 'command -v debootstrap' debootstrap -- "a small Debian to build the image on"
 fi
