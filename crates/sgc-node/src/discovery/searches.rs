@@ -121,11 +121,12 @@ impl State {
 /// Ends the searches whose time has come.
 async fn end_due(state: Arc<Mutex<State>>, due: Instant) {
     tokio::time::sleep_until(due.into()).await;
-    let (ended, kept) = {
+    let ended: Vec<_> = {
         let mut state = lock(&state);
-        std::mem::take(&mut state.ending).into_iter().partition::<Vec<_>, _>(|(at, _)| *at <= due)
+        let (ended, kept) = std::mem::take(&mut state.ending).into_iter().partition(|(at, _)| *at <= due);
+        state.ending = kept;
+        ended
     };
-    lock(&state).ending.extend(kept);
     let was_nearby = ended.iter().any(|(_, running)| running.is_nearby());
     for (_, running) in ended {
         running.end().await;
@@ -195,7 +196,7 @@ impl Searches {
         changes
     }
 
-    /// Ends all searches. Their links stay.
+    /// Ends all searches, and begins none any more.
     pub(crate) fn stop(&self) {
         let mut state = self.lock();
         state.is_stopped = true;

@@ -119,7 +119,7 @@ struct Served {
 /// The activity of a connection. The least gives way first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Activity {
-    is_answered: bool,
+    is_answering: bool,
     had_request: bool,
     /// When it was accepted, or its last request came.
     at: Instant,
@@ -143,12 +143,12 @@ pub(super) async fn serve(listener: TcpListener, source: Arc<Source>) {
         served.retain(|one| !one.task.is_finished());
         if served.len() >= CONNECTIONS_MAX {
             let activity = |at: &usize| *lock(&served[*at].activity);
-            match (0..served.len()).min_by_key(activity).filter(|at| !activity(at).is_answered) {
+            match (0..served.len()).min_by_key(activity).filter(|at| !activity(at).is_answering) {
                 Some(idlest) => served.swap_remove(idlest).task.abort(),
                 None => continue,
             }
         }
-        let activity = Activity { is_answered: false, had_request: false, at: Instant::now() };
+        let activity = Activity { is_answering: false, had_request: false, at: Instant::now() };
         let activity = Arc::new(SyncMutex::new(activity));
         let (source, noted) = (source.clone(), activity.clone());
         let task = tasks.spawn(async move { serve_one(stream, &source, &noted).await });
@@ -160,9 +160,9 @@ pub(super) async fn serve(listener: TcpListener, source: Arc<Source>) {
 async fn serve_one(stream: TcpStream, source: &Source, activity: &SyncMutex<Activity>) {
     let is_local = stream.local_addr().is_ok_and(|at| at.ip().to_canonical().is_loopback());
     let answer = service_fn(async |request| {
-        *lock(activity) = Activity { is_answered: true, had_request: true, at: Instant::now() };
+        *lock(activity) = Activity { is_answering: true, had_request: true, at: Instant::now() };
         let answered = answer(request, source, is_local).await;
-        lock(activity).is_answered = false;
+        lock(activity).is_answering = false;
         answered
     });
     let mut server = http1::Builder::new();
