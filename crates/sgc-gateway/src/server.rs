@@ -200,6 +200,7 @@ impl Server {
     pub async fn start(hub: Hub, options: ServerOptions) -> Result<Self, ServerError> {
         let tls = tls_config(options.key.as_ref(), &options.access)?;
         let admission = Admission::new(options.access, options.clients_max);
+        #[cfg_attr(not(feature = "grpc"), expect(unused_mut, reason = "only gRPC has a task here"))]
         let mut tasks = JoinSet::new();
         let shared = Arc::new(ServerState {
             tls: watch::Sender::new(tls),
