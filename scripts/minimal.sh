@@ -8,7 +8,7 @@ cargo=${CARGO:-cargo}
 # The crates that only this feature needs.
 declare -A crates=(
     [dtls]="dimpl"
-    [grpc]="tonic prost hyper h2"
+    [grpc]="tonic prost h2"
 )
 
 for feature in "" dtls foxglove grpc rosbridge; do
