@@ -14,10 +14,11 @@ use std::time::Duration;
 
 use sgc_config::MetricsConfig;
 use sgc_sync::lock;
+use tokio::net::TcpListener;
 use tokio::sync::{mpsc, watch};
 use tracing::{info, warn};
 
-use self::server::{Source, bind, serve};
+use self::server::{Source, serve};
 use crate::control::event::CoreEvent;
 use crate::control::faults::alerts::Alert;
 use crate::gateway::Gateway;
@@ -96,7 +97,7 @@ impl Metrics {
 
     /// Serves at an address, or waits until it may be tried again.
     async fn serve_at(&self, at: SocketAddr, source: &Arc<Source>) {
-        match bind(at).await.and_then(|listener| Ok((listener.local_addr()?, listener))) {
+        match TcpListener::bind(at).await.and_then(|listener| Ok((listener.local_addr()?, listener))) {
             Ok((local, listener)) => {
                 if self.become_state(State::Serving(local)) {
                     info!("metrics are served at http://{local}/metrics");

@@ -10,8 +10,7 @@
 
 use std::convert::Infallible;
 use std::fmt;
-use std::io;
-use std::net::{IpAddr, SocketAddr};
+use std::net::IpAddr;
 use std::pin::pin;
 use std::sync::{Arc, Mutex as SyncMutex, OnceLock};
 use std::time::{Duration, Instant, SystemTime};
@@ -130,8 +129,8 @@ pub(super) async fn serve(listener: TcpListener, source: Arc<Source>) {
     let mut tasks = JoinSet::new();
     let mut served: Vec<Served> = Vec::new();
     loop {
-        let stream = match accept(&listener).await {
-            Ok(stream) => stream,
+        let stream = match listener.accept().await {
+            Ok((stream, _)) => stream,
             Err(error) => {
                 // The process may have too many open files, for example.
                 debug!(%error, "a connection for metrics is not accepted");
@@ -179,10 +178,6 @@ async fn serve_one(stream: TcpStream, source: &Source, activity: &SyncMutex<Acti
     if let Err(error) = ended {
         debug!(%error, "a connection for metrics ended");
     }
-}
-
-async fn accept(listener: &TcpListener) -> io::Result<TcpStream> {
-    listener.accept().await.map(|(stream, _)| stream)
 }
 
 /// Answers a request.
@@ -246,9 +241,4 @@ fn names_this_host(host: &HeaderValue) -> bool {
     let host = authority.host();
     let bare = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(host);
     bare.eq_ignore_ascii_case("localhost") || bare.parse::<IpAddr>().is_ok()
-}
-
-/// Binds an address.
-pub(super) async fn bind(at: SocketAddr) -> io::Result<TcpListener> {
-    TcpListener::bind(at).await
 }
