@@ -121,6 +121,7 @@ pub(crate) fn read(args: &ArgsConfig) -> (Draft, Vec<ConfigError>) {
         shares,
         uses,
         admin_socket: None,
+        observers: None,
         state: None,
         trust: Vec::new(),
         watch: None,

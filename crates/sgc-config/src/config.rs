@@ -79,6 +79,20 @@ pub struct Config {
     pub metrics: Option<MetricsConfig>,
     /// Path of the status socket, if not the usual one.
     pub admin_socket: Option<PathBuf>,
+    /// Nodes and groups of the fleet that may ask this node how it is doing; [`Config::observers`] has the usual ones
+    /// for `None`.
+    pub observers: Option<Vec<Recipient>>,
+}
+
+/// The group whose members may ask every node of their fleet how it is doing, unless the node names others.
+pub const OBSERVERS_GROUP: &str = "observers";
+
+impl Config {
+    /// Returns the nodes and groups of the fleet that may ask this node how it is doing.
+    pub fn observers(&self) -> Vec<Recipient> {
+        let usual = || OBSERVERS_GROUP.parse().map(Recipient::Group).into_iter().collect();
+        self.observers.clone().unwrap_or_else(usual)
+    }
 }
 
 /// A fleet's authority.

@@ -61,6 +61,7 @@ pub(crate) struct Draft {
     pub(crate) shares: Vec<ShareDraft>,
     pub(crate) uses: Vec<UseDraft>,
     pub(crate) admin_socket: Option<WithOrigin<PathBuf>>,
+    pub(crate) observers: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(crate) state: Option<WithOrigin<PathBuf>>,
     pub(crate) trust: Vec<WithOrigin<String>>,
     pub(crate) watch: Option<WithOrigin<bool>>,

@@ -390,6 +390,17 @@ pub enum Mistake {
         /// The value.
         value: String,
     },
+    /// An observer of another fleet.
+    #[error(
+        "`{key}` names {value:?}: observers are nodes (\"desk\"), groups (\"group:observers\") or all nodes (\"*\") of the \
+         own fleet"
+    )]
+    Observer {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+    },
     /// A value that is no node id.
     #[error("`{key}` names {value:?}; a node id is 64 hexadecimal digits: `sgc status` there shows it")]
     NodeId {

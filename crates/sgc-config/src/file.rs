@@ -125,6 +125,11 @@ impl FileReader<'_> {
             admin_socket: self
                 .string(admin.as_ref(), "socket", "a string, such as \"/run/sgc/arm-1.sock\"")
                 .map(|socket| socket.map(PathBuf::from)),
+            observers: self.strings(
+                admin.as_ref(),
+                "observers",
+                "an array of strings, such as [\"group:observers\"]",
+            ),
             state: self
                 .string(node.as_ref(), "state", "a string, such as \"/var/lib/sgc/arm-1\"")
                 .map(|state| state.map(PathBuf::from)),

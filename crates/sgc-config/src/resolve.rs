@@ -146,6 +146,7 @@ pub(crate) fn resolve(
     let tokens = resolver.tokens(draft);
     let trust = resolver.ca_files(&draft.trust, TRUST_MAX);
     let operators = draft.operators.as_ref().map(|operators| resolver.operators(operators));
+    let observers = draft.observers.as_ref().map(|observers| resolver.observers(observers));
     let authority = draft.authority.as_ref().and_then(|fleet| resolver.fleet(fleet));
     let authority =
         authority.map(|fleet| AuthorityConfig { fleet, operators: operators.unwrap_or_default() });
@@ -183,6 +184,7 @@ pub(crate) fn resolve(
             gateway,
             metrics,
             admin_socket,
+            observers,
         }),
         _ => Err(resolver.errors),
     }
@@ -399,23 +401,41 @@ impl Resolver<'_> {
         valid
     }
 
+    /// Operators are named one by one or by their groups, since they change the fleet.
     fn operators(&mut self, written: &WithOrigin<Vec<WithOrigin<String>>>) -> Vec<Recipient> {
+        self.members(written, |recipient| match recipient {
+            Recipient::Everyone | Recipient::Partner(_) => Err(|key, value| Mistake::Operator { key, value }),
+            Recipient::Node(_) | Recipient::Group(_) => Ok(()),
+        })
+    }
+
+    /// Observers are of the own fleet.
+    fn observers(&mut self, written: &WithOrigin<Vec<WithOrigin<String>>>) -> Vec<Recipient> {
+        self.members(written, |recipient| match recipient {
+            Recipient::Partner(_) => Err(|key, value| Mistake::Observer { key, value }),
+            Recipient::Everyone | Recipient::Node(_) | Recipient::Group(_) => Ok(()),
+        })
+    }
+
+    fn members(
+        &mut self,
+        written: &WithOrigin<Vec<WithOrigin<String>>>,
+        check: impl Fn(&Recipient) -> Result<(), fn(&'static str, String) -> Mistake>,
+    ) -> Vec<Recipient> {
         if written.value.len() > RECIPIENTS_MAX {
             let (key, count) = (written.key, written.value.len());
             self.record(&written.origin, Mistake::TooManyEntries { key, count, max: RECIPIENTS_MAX });
         }
         let mut valid = Vec::new();
         for one in written.value.iter().take(RECIPIENTS_MAX) {
-            let Some(operator) = self.keep(one, names::recipient) else { continue };
+            let Some(recipient) = self.keep(one, names::recipient) else { continue };
             let (key, value) = (one.key, one.value.clone());
-            match operator {
-                Recipient::Everyone | Recipient::Partner(_) => {
-                    self.record(&one.origin, Mistake::Operator { key, value });
-                }
-                _ if valid.contains(&operator) => {
+            match check(&recipient) {
+                Err(mistake) => self.record(&one.origin, mistake(key, value)),
+                Ok(()) if valid.contains(&recipient) => {
                     self.record(&one.origin, Mistake::Repeated { key, value });
                 }
-                Recipient::Node(_) | Recipient::Group(_) => valid.push(operator),
+                Ok(()) => valid.push(recipient),
             }
         }
         valid

@@ -172,7 +172,7 @@ impl Table {
             ],
             Self::Router => &["listen", "peer_rate", "mapping", "announce", "accept"],
             Self::Transport => &["congestion", "offload", "mtu_discovery", "dtls_1_2", "dscp", "lane_dscp"],
-            Self::Admin => &["socket"],
+            Self::Admin => &["socket", "observers"],
             Self::Authority => &["fleet", "operators"],
             Self::Rotation => &["every", "messages"],
             Self::Audit => &["file", "max_bytes", "files", "off"],

@@ -1,7 +1,8 @@
 //! Diagnosis: asks nodes for their documents, finds what is wrong and names the remedy.
 //!
 //! [`diagnose`] follows the path of a topic in a node's graph up to the first fault, and finds facts without words,
-//! which `words` renders. [`refusals`] explains counters, [`status`] a node's status, and [`check`] a configuration. Of
+//! which `words` renders. [`refusals`] explains counters, [`status`] a node's status, [`fleet`] those of all
+//! nodes, and [`check`] a configuration. Of
 //! these, only [`ask`] talks to nodes. The crate parses no arguments, prints nothing and knows no exit codes; `sgc`
 //! does.
 
@@ -10,6 +11,7 @@ pub mod check;
 pub mod diagnose;
 mod error;
 mod finding;
+pub mod fleet;
 pub mod names;
 mod near;
 pub mod refusals;

@@ -324,7 +324,8 @@ impl NameTraffic {
     }
 }
 
-fn duration(seconds: u64) -> String {
+/// Formats a time in the two largest units.
+pub(crate) fn duration(seconds: u64) -> String {
     match (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60, seconds % 60) {
         (0, 0, 0, s) => format!("{s} s"),
         (0, 0, m, s) => format!("{m} min {s} s"),

@@ -132,6 +132,27 @@ impl Decompressor {
     }
 }
 
+/// Packs a document: with Zstandard if it shrinks, or else as it is.
+pub(crate) fn pack(document: &Bytes) -> (PayloadEncoding, Bytes) {
+    match Compressor::default().compress(PayloadEncoding::Zstd, document) {
+        Some(packed) => (PayloadEncoding::Zstd, packed),
+        None => (PayloadEncoding::Plain, document.clone()),
+    }
+}
+
+/// Unpacks a received document, which has at most `most` bytes. It takes no more memory than that.
+pub(crate) fn unpack(
+    encoding: PayloadEncoding,
+    packed: &Bytes,
+    most: usize,
+) -> Result<Bytes, CompressionError> {
+    let claimed = Decompressor::original_bytes(encoding, packed);
+    if claimed > most {
+        return Err(CompressionError::TooLong(claimed.try_into().unwrap_or(u32::MAX)));
+    }
+    Decompressor::default().decompress(encoding, packed.clone())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -12,7 +12,7 @@ use rand_core::RngCore;
 use sgc_trust::{Identity, Policy, TrustAnchors, VerifiedPeer, verify_advert};
 use sgc_wire::{
     CatalogueSource, ClockWatch, Consumer, Control, Credentials, Name, NodeId, Now, OperationAnswer,
-    OperationRequest, Qos, RefuseReason, SignedBody, SinkId, SourceId, TopicGrant,
+    OperationRequest, Qos, RefuseReason, Report, ReportQuestion, SignedBody, SinkId, SourceId, TopicGrant,
 };
 
 use crate::config::EndpointConfig;
@@ -223,6 +223,21 @@ impl Endpoint {
         self.owner.answer_operation(&mut self.cx, sink, answer);
     }
 
+    /// Answers [`crate::Event::ReportAsked`].
+    pub fn answer_report(&mut self, now: Now, sink: SinkId, answer: Result<Report, RefuseReason>) {
+        self.cx.set_now(now);
+        self.owner.answer_report(&mut self.cx, sink, answer);
+    }
+
+    /// Takes questions for reports, or no more of them. Before the first call, none are taken.
+    pub fn offer_reports(&mut self, now: Now, is_offered: bool) {
+        self.cx.set_now(now);
+        match is_offered {
+            true => self.owner.offer_reports(&self.cx),
+            false => self.owner.withhold_reports(),
+        }
+    }
+
     /// Iterates over the members that ask this authority: sink, node, and signing request.
     pub fn renewing(&self) -> impl Iterator<Item = (SinkId, &VerifiedPeer, &Bytes)> {
         self.owner.renewing()
@@ -306,6 +321,14 @@ impl Endpoint {
     pub fn leave_consumers(&mut self, now: Now, peer: &NodeId) {
         self.cx.set_now(now);
         self.joiner.leave_consumers(&mut self.cx, peer);
+    }
+
+    /// Asks a node of this fleet for a report, in place of an earlier question to it. Returns the name of the question,
+    /// which the caller leaves after [`crate::Event::Report`] or [`crate::Event::ReportDenied`]. A node that gives no
+    /// reports, or of a version that cannot, does not advertise the name: then nothing happens.
+    pub fn ask_report(&mut self, now: Now, peer: NodeId, question: &ReportQuestion) -> Name {
+        self.cx.set_now(now);
+        self.joiner.ask_report(&mut self.cx, peer, question)
     }
 
     /// Joins a name of `owner`: waits for it if necessary, and joins again whenever it has to.

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use sgc_trust::{VerifiedAdvert, VerifiedPeer, verify_answer};
 use sgc_wire::{
     AnswerBody, Control, Decode, DescribedType, Encode as _, GrantContent, JoinBody, Name, NodeId,
-    OperationRequest, Recover, RefuseReason, RejectReason, SignedBody, SinkId, SourceId,
+    OperationRequest, Recover, RefuseReason, RejectReason, ReportQuestion, SignedBody, SinkId, SourceId,
     TYPES_PER_QUESTION_MAX,
 };
 
@@ -101,6 +101,14 @@ impl Joiner {
     /// Stops asking a node.
     pub(crate) fn leave_consumers(&mut self, cx: &mut Context, peer: &NodeId) {
         self.leave(cx, &BlindName::consumers(peer).name);
+    }
+
+    /// Asks a node of this fleet for a report, in place of an earlier question. Returns the name of the question.
+    pub(crate) fn ask_report(&mut self, cx: &mut Context, peer: NodeId, question: &ReportQuestion) -> Name {
+        let BlindName { name, .. } = BlindName::reports(&peer);
+        self.leave(cx, &name);
+        self.join(cx, name, peer, JoinKind::Report(question.to_bytes()));
+        name
     }
 
     /// Joins a name of `owner`: waits for it if necessary, and joins again whenever it has to.
@@ -295,7 +303,7 @@ impl Joiner {
         match (self.followed.get(&name), join.map(|j| (j.kind(), j.owner()))) {
             (Some(owner), _) => self.owner_lost(cx, *owner, reason),
             (None, Some((JoinKind::Consumers, peer))) => cx.event(Event::ConsumersLost { peer, reason }),
-            (None, Some((JoinKind::Renew(_) | JoinKind::Operate(_) | JoinKind::Types(_), _))) => {}
+            (None, Some((kind, _))) if kind.is_question() => {}
             (None, _) => cx.event(Event::Lost { name, reason }),
         }
     }
@@ -317,6 +325,7 @@ impl Joiner {
             (Some(owner), _) => cx.event(Event::OwnerRefused { owner, by }),
             (None, Some(JoinKind::Renew(_))) => cx.event(Event::RenewRefused { by }),
             (None, Some(JoinKind::Operate(_))) => cx.event(Event::OperationDenied { name, by }),
+            (None, Some(JoinKind::Report(_))) => cx.event(Event::ReportDenied { name, by }),
             // A missing description shows where it is needed.
             (None, Some(JoinKind::Types(_) | JoinKind::Consumers)) => {}
             (None, _) => cx.event(Event::Refused { name, by }),
@@ -348,6 +357,9 @@ impl Joiner {
             }
             (GrantContent::Operation(answer), Some(JoinKind::Operate(_))) => {
                 cx.event(Event::OperationAnswered { name, answer });
+            }
+            (GrantContent::Report(report), Some(JoinKind::Report(_))) => {
+                cx.event(Event::Report { name, report });
             }
             (GrantContent::Types(types), Some(JoinKind::Types(names))) => {
                 let asked = |t: &DescribedType| names.contains(&t.name);

@@ -85,6 +85,8 @@ pub enum JoinKind {
     Types(Vec<Name>),
     /// To get a node's consumers of this node's interfaces.
     Consumers,
+    /// To get a node's report: the answer to an encoded [`sgc_wire::ReportQuestion`].
+    Report(Bytes),
 }
 
 impl JoinKind {
@@ -93,7 +95,9 @@ impl JoinKind {
             Self::Subscribe { describe } => Request::Subscribe { describe: *describe },
             Self::Follow => Request::Subscribe { describe: false },
             Self::Publish(offer) => Request::Publish { offer: offer.clone() },
-            Self::Renew(what) | Self::Operate(what) => Request::Ask { what: what.clone() },
+            Self::Renew(what) | Self::Operate(what) | Self::Report(what) => {
+                Request::Ask { what: what.clone() }
+            }
             Self::Types(names) => {
                 let question = TypeQuestion { names: names.clone() };
                 Request::Ask { what: question.to_vec().into() }
@@ -104,7 +108,7 @@ impl JoinKind {
 
     /// Returns whether one answer ends the join: no data flows, and no better route is looked for.
     pub(crate) fn is_question(&self) -> bool {
-        matches!(self, Self::Renew(_) | Self::Operate(_) | Self::Types(_))
+        matches!(self, Self::Renew(_) | Self::Operate(_) | Self::Types(_) | Self::Report(_))
     }
 }
 

@@ -21,6 +21,7 @@ mod marks;
 mod names;
 mod output;
 mod owner;
+mod packed_report;
 mod packed_type;
 mod receivers;
 mod sink;
@@ -38,6 +39,7 @@ pub use joins::{JoinKind, JoinStatus, LostReason, RefusedBy};
 pub use marks::{MARK_AFTER, Marks};
 pub use output::{EndpointDrop, Event, Output, SignedKind, UnexpectedFrame};
 pub use owner::{ADVERT_INTERVAL, ADVERTS_BURST, ShareError, ShareSpec};
+pub use packed_report::{pack_report, unpack_report};
 pub use packed_type::{PackedType, unpack_type};
 pub use receivers::Receivers;
 pub use sink::{

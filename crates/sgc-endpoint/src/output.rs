@@ -6,7 +6,7 @@ use std::time::Instant;
 use sgc_trust::{GrantError, SignedError};
 use sgc_wire::{
     Catalogue, Consumer, Control, Credentials, DescribedType, Name, NodeId, OperationAnswer, Recover,
-    RefuseReason, Role, SinkId, TopicGrant,
+    RefuseReason, Report, Role, SinkId, TopicGrant,
 };
 
 use crate::joins::{LostReason, RefusedBy};
@@ -110,6 +110,29 @@ pub enum Event {
     /// An authority, or a router before it, refuses requests for operations.
     OperationDenied {
         /// The name of the request.
+        name: Name,
+        /// The refusing node, with the reason.
+        by: RefusedBy,
+    },
+    /// A node of this fleet asks for a report; [`crate::Endpoint::answer_report`] answers.
+    ReportAsked {
+        /// The sink to answer.
+        sink: SinkId,
+        /// The node.
+        peer: sgc_trust::VerifiedPeer,
+        /// An encoded [`sgc_wire::ReportQuestion`], not verified.
+        question: bytes::Bytes,
+    },
+    /// A node sent a report.
+    Report {
+        /// The name of the question.
+        name: Name,
+        /// The report.
+        report: Report,
+    },
+    /// A node, or a router before it, refuses a report.
+    ReportDenied {
+        /// The name of the question.
         name: Name,
         /// The refusing node, with the reason.
         by: RefusedBy,

@@ -3,10 +3,10 @@
 
 mod adverts;
 mod askers;
-mod authority;
 mod catalogue;
 mod consumers;
 mod granted;
+mod member_requests;
 mod share;
 mod shares;
 mod types;
@@ -19,17 +19,17 @@ use bytes::Bytes;
 use sgc_trust::{Kem, Policy, TopicSecret, VerifiedPeer, name_of, verify_join};
 use sgc_wire::{
     CatalogueSource, Consumer, Credentials, Decode, GrantContent, JoinBody, Name, NodeId, OperationAnswer,
-    Qos, Recover, RefuseReason, SignedBody, SinkId, SourceId, TopicGrant,
+    Qos, Recover, RefuseReason, Report, SignedBody, SinkId, SourceId, TopicGrant,
 };
 
 pub use self::adverts::{ADVERT_INTERVAL, ADVERTS_BURST};
 pub use self::share::{ShareError, ShareSpec};
 
 use self::adverts::Adverts;
-use self::authority::{AuthorityRequest, AuthorityRequests};
 use self::catalogue::CatalogueFeed;
 use self::consumers::ConsumerReports;
 use self::granted::GrantedSink;
+use self::member_requests::{MemberRequest, MemberRequests};
 use self::share::Share;
 use self::shares::Shares;
 use self::types::TypeAnswers;
@@ -46,6 +46,8 @@ const ENFORCE_EVERY: Duration = Duration::from_secs(20);
 
 /// Nodes that have a place at the operations name of an authority: operators are few.
 const OPERATIONS_ASKED_MAX: usize = 64;
+/// Nodes that have a place at the name of this node's reports: observers are few, and leave once they are answered.
+const REPORTS_ASKED_MAX: usize = 64;
 
 /// The receiver of a request, by the name of the request.
 #[derive(Clone, Copy, Debug)]
@@ -55,6 +57,7 @@ enum Desk {
     Operations,
     Types,
     Consumers,
+    Reports,
     Share,
 }
 
@@ -73,10 +76,11 @@ pub(crate) struct Owner {
     adverts: Adverts,
     shares: Shares,
     catalogue: CatalogueFeed,
-    renewals: AuthorityRequests,
-    operations: AuthorityRequests,
+    renewals: MemberRequests,
+    operations: MemberRequests,
     types: TypeAnswers,
     consumers: ConsumerReports,
+    reports: MemberRequests,
     /// Time of the next look for expired certificates.
     enforce_at: Option<Instant>,
 }
@@ -92,10 +96,11 @@ impl Owner {
             adverts: Adverts::default(),
             shares: Shares::default(),
             catalogue: CatalogueFeed::new(own_catalogues(cx)),
-            renewals: AuthorityRequests::new(renewals, cx.limits().sinks_per_name_max),
-            operations: AuthorityRequests::new(operations, OPERATIONS_ASKED_MAX),
+            renewals: MemberRequests::new(renewals, cx.limits().sinks_per_name_max),
+            operations: MemberRequests::new(operations, OPERATIONS_ASKED_MAX),
             types: TypeAnswers::new(&own),
             consumers: ConsumerReports::new(&own),
+            reports: MemberRequests::new(None, REPORTS_ASKED_MAX),
             enforce_at: None,
         };
         owner.advertise_all();
@@ -178,6 +183,7 @@ impl Owner {
         ended.for_each(|blind| self.adverts.withdraw(blind));
         self.types.withdraw(&mut self.adverts);
         self.consumers.withdraw(&mut self.adverts);
+        self.withhold_reports();
         self.enforce_at = None;
         self.catalogue.end_rest();
     }
@@ -219,6 +225,27 @@ impl Owner {
         answer: Result<OperationAnswer, RefuseReason>,
     ) {
         self.operations.answer(cx, sink, answer.map(GrantContent::Operation));
+    }
+
+    /// Answers a node that asks for a report.
+    pub(crate) fn answer_report(
+        &mut self,
+        cx: &mut Context,
+        sink: SinkId,
+        answer: Result<Report, RefuseReason>,
+    ) {
+        self.reports.answer(cx, sink, answer.map(GrantContent::Report));
+    }
+
+    /// Takes questions for reports from here on.
+    pub(crate) fn offer_reports(&mut self, cx: &Context) {
+        let name = BlindName::reports(&cx.identity().node_id());
+        self.reports.begin(name).into_iter().for_each(|blind| self.adverts.add(blind));
+    }
+
+    /// Takes no more questions for reports.
+    pub(crate) fn withhold_reports(&mut self) {
+        self.reports.end().into_iter().for_each(|blind| self.adverts.withdraw(blind));
     }
 
     /// Iterates over the members that ask this authority: sink, node, and signing request.
@@ -267,8 +294,9 @@ impl Owner {
     pub(crate) fn advertise_all(&mut self) {
         let types = self.types.is_advertised().then(|| self.types.name().blind);
         let consumers = self.consumers.is_advertised().then(|| self.consumers.name().blind);
-        let authority = self.renewals.blind().into_iter().chain(self.operations.blind());
-        let fixed = self.catalogue.blinds().chain(authority).chain(types).chain(consumers);
+        let asked = [&self.renewals, &self.operations, &self.reports];
+        let asked = asked.into_iter().filter_map(MemberRequests::blind);
+        let fixed = self.catalogue.blinds().chain(asked).chain(types).chain(consumers);
         self.adverts.add_all(fixed.chain(self.shares.iter().map(Share::blind)));
     }
 
@@ -325,6 +353,7 @@ impl Owner {
         self.operations.enforce(cx);
         self.types.enforce(cx);
         self.consumers.enforce(cx);
+        self.reports.enforce(cx);
     }
 
     pub(crate) fn handle_join(&mut self, cx: &mut Context, signed: &SignedBody) {
@@ -352,14 +381,20 @@ impl Owner {
             Some(Desk::Catalogue) => self.catalogue.handle_follow(cx, &self.shares, (name, sink), asked),
             Some(Desk::Renewals) => {
                 let request = self.renewals.handle_request(cx, name, sink, asked);
-                if let Some(AuthorityRequest { peer, what: csr }) = request {
+                if let Some(MemberRequest { peer, what: csr }) = request {
                     cx.event(Event::RenewAsked { sink, peer, csr });
                 }
             }
             Some(Desk::Operations) => {
                 let request = self.operations.handle_request(cx, name, sink, asked);
-                if let Some(AuthorityRequest { peer, what: request }) = request {
+                if let Some(MemberRequest { peer, what: request }) = request {
                     cx.event(Event::OperationAsked { sink, peer, request });
+                }
+            }
+            Some(Desk::Reports) => {
+                let request = self.reports.handle_request(cx, name, sink, asked);
+                if let Some(MemberRequest { peer, what: question }) = request {
+                    cx.event(Event::ReportAsked { sink, peer, question });
                 }
             }
             Some(Desk::Types) => self.types.handle_question(cx, &self.shares, sink, asked),
@@ -382,6 +417,7 @@ impl Owner {
             Some(Desk::Catalogue) => self.catalogue.handle_leave(name, sink),
             Some(Desk::Renewals) => self.renewals.handle_leave(sink),
             Some(Desk::Operations) => self.operations.handle_leave(sink),
+            Some(Desk::Reports) => self.reports.handle_leave(sink),
             Some(Desk::Types) => self.types.handle_leave(sink),
             Some(Desk::Consumers) => self.consumers.handle_leave(sink),
             Some(Desk::Share) => {
@@ -415,6 +451,8 @@ impl Owner {
             Some(Desk::Renewals)
         } else if self.operations.is_at(name) {
             Some(Desk::Operations)
+        } else if self.reports.is_at(name) {
+            Some(Desk::Reports)
         } else if self.types.name().name == *name {
             Some(Desk::Types)
         } else if self.consumers.name().name == *name {

@@ -4,10 +4,7 @@
 use bytes::Bytes;
 use sgc_wire::{DescribedType, Name, PayloadEncoding, TYPE_DESCRIPTION_BYTES_MAX, TYPE_HASH_BYTES_MAX};
 
-use crate::compression::{CompressionError, Compressor, Decompressor};
-
-/// Bytes of the length before a compressed description.
-const LENGTH_BYTES: usize = 4;
+use crate::compression::{CompressionError, pack, unpack};
 
 /// The description of a type as it travels.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -24,11 +21,7 @@ impl PackedType {
         if description.len() > TYPE_DESCRIPTION_BYTES_MAX || type_hash.len() > TYPE_HASH_BYTES_MAX {
             return None;
         }
-        let packed = Compressor::default().compress(PayloadEncoding::Zstd, description);
-        let (encoding, bytes) = match packed {
-            Some(packed) => (PayloadEncoding::Zstd, packed),
-            None => (PayloadEncoding::Plain, description.clone()),
-        };
+        let (encoding, bytes) = pack(description);
         Some(Self { type_hash: type_hash.to_owned(), encoding, bytes })
     }
 
@@ -40,20 +33,13 @@ impl PackedType {
 
 /// Unpacks a received description. It takes no more memory than a description may have.
 pub fn unpack_type(described: &DescribedType) -> Result<Bytes, CompressionError> {
-    let packed = described.description.clone();
-    if described.encoding != PayloadEncoding::Plain {
-        let length = packed.first_chunk::<LENGTH_BYTES>().ok_or(CompressionError::Malformed)?;
-        let claimed = u32::from_be_bytes(*length);
-        if claimed as usize > TYPE_DESCRIPTION_BYTES_MAX {
-            return Err(CompressionError::TooLong(claimed));
-        }
-    }
-    Decompressor::default().decompress(described.encoding, packed)
+    unpack(described.encoding, &described.description, TYPE_DESCRIPTION_BYTES_MAX)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::compression::Compressor;
 
     fn described(encoding: PayloadEncoding, description: impl Into<Bytes>) -> DescribedType {
         DescribedType {
@@ -81,7 +67,7 @@ mod tests {
         let refused = unpack_type(&described(PayloadEncoding::Zstd, bomb.clone()));
         assert_eq!(refused, Err(CompressionError::TooLong(8 << 20)));
         let mut lies = bomb.to_vec();
-        lies[..LENGTH_BYTES].copy_from_slice(&1000_u32.to_be_bytes());
+        lies[..4].copy_from_slice(&1000_u32.to_be_bytes());
         assert_eq!(unpack_type(&described(PayloadEncoding::Zstd, lies)), Err(CompressionError::Malformed));
         let cut = unpack_type(&described(PayloadEncoding::Zstd, &b"abc"[..]));
         assert_eq!(cut, Err(CompressionError::Malformed));

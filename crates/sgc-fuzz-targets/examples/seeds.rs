@@ -13,8 +13,8 @@ use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, Catalogue, CatalogueEntry, CatalogueSource, Challenge, Class,
     Consumer, Control, Credentials, DescribedType, Encode, GrantContent, Hello, JoinBody, MessageHead,
     MessageKind, Metadata, Name, OperationAnswer, PayloadEncoding, PayloadForm, Qos, Recover, RefuseReason,
-    RejectReason, Request, Role, RosNode, SecretBytes, SecretGeneration, SignedBody, SinkId, SourceId,
-    SourceOffer, TopicGrant, TypeQuestion, UnixMillis,
+    RejectReason, Report, ReportQuestion, Request, Role, RosNode, SecretBytes, SecretGeneration, SignedBody,
+    SinkId, SourceId, SourceOffer, TopicGrant, TypeQuestion, UnixMillis,
 };
 
 /// The time of the targets.
@@ -167,6 +167,10 @@ fn bodies() -> Vec<Vec<u8>> {
             consumer("teleop", Role::Publish, None),
         ]),
         GrantContent::Consumers(Vec::new()),
+        GrantContent::Report(Report {
+            encoding: PayloadEncoding::Plain,
+            document: Bytes::from_static(b"{\"version\":\"1\"}"),
+        }),
         GrantContent::Credentials(Credentials {
             chain: chain.clone(),
             secrets: vec![SecretGeneration { generation: 1, secret: SecretBytes::new([4; 32]) }],
@@ -181,6 +185,9 @@ fn bodies() -> Vec<Vec<u8>> {
     let json = MessageHead { form: PayloadForm::Json, ..head };
     all.extend([(4, metadata.to_vec()), (5, head.to_vec()), (5, json.to_vec())]);
     all.push((6, TypeQuestion { names: vec![NAME; 2] }.to_vec()));
+    all.push((8, ReportQuestion::Interface("/camera".into()).to_vec()));
+    let document = Bytes::from_static(b"{\"version\":\"1\"}");
+    all.push((9, Report { encoding: PayloadEncoding::Plain, document }.to_vec()));
     all.into_iter().map(|(which, body)| [&[which], &body[..]].concat()).collect()
 }
 

@@ -46,6 +46,8 @@ pub enum NodeDrop {
     RenewalUnusable,
     /// A node that is no operator requested an operation.
     OperationNotPermitted,
+    /// A node that is no observer asked for a report.
+    ReportNotPermitted,
     /// An operation was requested again, and not carried out again.
     OperationRepeated,
     /// The local definition of a type differs from the announced one.
@@ -133,6 +135,7 @@ impl NodeDrop {
             Self::RenewalRevoked => "renewal_revoked",
             Self::RenewalUnusable => "renewal_unusable",
             Self::OperationNotPermitted => "operation_not_permitted",
+            Self::ReportNotPermitted => "report_not_permitted",
             Self::OperationRepeated => "operation_repeated",
             Self::TypeDiffers => "type_differs",
             Self::TypeRefused => "type_refused",

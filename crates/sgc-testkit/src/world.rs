@@ -11,7 +11,8 @@ use sgc_router::{LinkClose, LinkId, MappingKind, Neighbour, RouterStats};
 use sgc_trust::{Identity, TopicSecret, derive_name, name_of};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Catalogue, Consumer, Control, Decode, Encode, JoinBody, LinkStateBody,
-    Metadata, Name, Packet, Qos, Role, RosNode, SinkId, SourceId, SourceOffer,
+    Metadata, Name, Packet, Qos, RefuseReason, Report, ReportQuestion, Role, RosNode, SinkId, SourceId,
+    SourceOffer,
 };
 
 use crate::cast::{Member, identity};
@@ -506,6 +507,46 @@ impl World {
         let (now, id) = (self.now_at(node), self.identity(other).node_id());
         if let Some(running) = &mut self.nodes[node.0].running {
             running.endpoint.ask_consumers(now, id);
+        }
+        self.settle(node);
+    }
+
+    /// Lets a node take questions for reports, or no more.
+    pub fn offer_reports(&mut self, node: NodeKey, is_offered: bool) {
+        self.note(format!("offer reports {node:?} {is_offered}"));
+        let now = self.now_at(node);
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.offer_reports(now, is_offered);
+        }
+        self.settle(node);
+    }
+
+    /// Asks another node for a report. Returns the name of the question.
+    pub fn ask_report(&mut self, node: NodeKey, other: NodeKey, question: &ReportQuestion) -> Option<Name> {
+        self.note(format!("ask report {node:?} {other:?}"));
+        let (now, id) = (self.now_at(node), self.identity(other).node_id());
+        let running = self.nodes[node.0].running.as_mut();
+        let name = running.map(|running| running.endpoint.ask_report(now, id, question));
+        self.settle(node);
+        name
+    }
+
+    /// Answers a question for a report.
+    pub fn answer_report(&mut self, node: NodeKey, sink: SinkId, answer: Result<Report, RefuseReason>) {
+        self.note(format!("answer report {node:?} {answer:?}"));
+        let now = self.now_at(node);
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.answer_report(now, sink, answer);
+        }
+        self.settle(node);
+    }
+
+    /// Ends a node's question, or its interest in a topic.
+    pub fn leave_name(&mut self, node: NodeKey, name: &Name) {
+        self.note(format!("leave {node:?} {}", name.short()));
+        let now = self.now_at(node);
+        if let Some(running) = &mut self.nodes[node.0].running {
+            running.endpoint.leave(now, name);
         }
         self.settle(node);
     }

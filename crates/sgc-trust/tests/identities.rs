@@ -99,6 +99,14 @@ fn pseudonyms_tags_and_node_ids_are_what_the_specification_says() {
         name_of(&owner, &consumers_blind(&owner)).to_string(),
         "234f5f5f41edbac0aa1df4fcc86e1890821e5266cf5685428698337c34faaff5"
     );
+    assert_eq!(
+        reports_blind(&owner).to_string(),
+        "a6069a78a02e76e7389f6902de2903be68d7f3ab8e620873e3e519b0ad915c1b"
+    );
+    assert_eq!(
+        name_of(&owner, &reports_blind(&owner)).to_string(),
+        "a51d8957bcee62f91c39f990fc8cfac2ca7b602dcf775061ecf3a02157bb5363"
+    );
 }
 
 #[test]

@@ -12,6 +12,7 @@ use crate::metadata::Metadata;
 use crate::operation::OperationAnswer;
 use crate::packet::Class;
 use crate::qos::Qos;
+use crate::report::Report;
 use crate::ros_node::RosNode;
 use crate::type_descriptions::{DescribedType, TYPE_HASH_BYTES_MAX, TYPES_PER_QUESTION_MAX};
 
@@ -43,6 +44,8 @@ pub enum GrantContent {
     Operation(OperationAnswer),
     /// A node's consumers of the interfaces of the owner that asked.
     Consumers(Vec<Consumer>),
+    /// A node's report for an observer.
+    Report(Report),
 }
 
 /// One epoch of one topic.
@@ -209,6 +212,10 @@ impl Encode for GrantContent {
                 w.u8(5);
                 w.list(consumers, |w, c| c.encode(w));
             }
+            Self::Report(report) => {
+                w.u8(6);
+                report.encode(w);
+            }
         }
     }
 }
@@ -241,6 +248,7 @@ impl Decode for GrantContent {
             3 => Ok(Self::Types(r.list("types", TYPES_PER_QUESTION_MAX, DescribedType::decode)?)),
             4 => Ok(Self::Operation(OperationAnswer::decode(r)?)),
             5 => Ok(Self::Consumers(r.list("consumers", CONSUMERS_MAX, Consumer::decode)?)),
+            6 => Ok(Self::Report(Report::decode(r)?)),
             v => Err(DecodeError::value("grant content", v.into())),
         }
     }

@@ -16,6 +16,7 @@ mod metadata;
 mod operation;
 mod packet;
 mod qos;
+mod report;
 mod ros_node;
 mod slab;
 mod type_descriptions;
@@ -53,6 +54,7 @@ pub use packet::{
     PACKET_VERSION, PAYLOAD_BYTES_MAX, Packet, PacketHeader, Payload,
 };
 pub use qos::{Durability, History, Liveliness, Qos, Reliability, Representations};
+pub use report::{REPORT_BYTES_MAX, REPORT_INTERFACE_BYTES_MAX, Report, ReportQuestion};
 pub use ros_node::RosNode;
 pub use slab::Slab;
 pub use type_descriptions::{

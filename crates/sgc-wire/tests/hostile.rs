@@ -7,9 +7,10 @@ use rand_chacha::rand_core::{RngCore, SeedableRng};
 use sgc_wire::{
     AdvertBody, Answer, AnswerBody, Blind, CONSUMERS_MAX, Catalogue, CatalogueEntry, CatalogueSource,
     Challenge, Class, Consumer, Control, Decode, Encode, GrantContent, Hello, JoinBody, Metadata, Name,
-    NodeId, Operation, OperationAnswer, OperationRefusal, OperationRequest, Packet, PacketHeader, Place, Qos,
-    Recover, RefuseReason, RejectReason, Request, Role, RosNode, RosterPage, RosterRow, RowCertificate,
-    SecretBytes, SignedBody, SinkId, SourceAnnounce, SourceId, TYPE_HASH_BYTES_MAX, TopicGrant, UnixMillis,
+    NodeId, Operation, OperationAnswer, OperationRefusal, OperationRequest, Packet, PacketHeader,
+    PayloadEncoding, Place, Qos, Recover, RefuseReason, RejectReason, Report, ReportQuestion, Request, Role,
+    RosNode, RosterPage, RosterRow, RowCertificate, SecretBytes, SignedBody, SinkId, SourceAnnounce,
+    SourceId, TYPE_HASH_BYTES_MAX, TopicGrant, UnixMillis,
 };
 
 const ROUNDS: u32 = 20_000;
@@ -173,6 +174,15 @@ fn operations_survive_mutation() {
     let refused = OperationAnswer::Refused { why: OperationRefusal::Fleet, detail: "no".into() };
     let contents = [OperationAnswer::Roster(page), refused].map(GrantContent::Operation);
     survives::<GrantContent>(&contents.map(|c| c.to_vec()), 9);
+}
+
+#[test]
+fn reports_survive_mutation_and_arbitrary_bytes() {
+    let questions = [ReportQuestion::Condition, ReportQuestion::Interface("/camera".into())];
+    survives::<ReportQuestion>(&questions.map(|q| q.to_vec()), 12);
+    let report = |encoding| Report { encoding, document: Bytes::from_static(b"{\"version\": \"1\"}") };
+    let contents = [PayloadEncoding::Plain, PayloadEncoding::Zstd].map(|e| GrantContent::Report(report(e)));
+    survives::<GrantContent>(&contents.map(|c| c.to_vec()), 13);
 }
 
 /// The encoding of consumers, and what stands in front of them: their tag and their number.

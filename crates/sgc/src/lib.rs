@@ -129,7 +129,7 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
     match command {
         Command::Demo(args) => return demo::demo(args),
         Command::Bench(args) => return bench::bench(args),
-        Command::Fleet(args) => fleet::fleet(args),
+        Command::Fleet(args) => return fleet::fleet(args),
         Command::Run(args) => run::run(args),
         Command::Router(args) => run::router(args),
         Command::Check(args) => check::check(&args),

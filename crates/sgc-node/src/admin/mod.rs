@@ -6,6 +6,7 @@
 //! which has the description of the type, if the node knows it. Other modules carry out the requests.
 
 pub mod graph;
+pub mod report;
 pub(crate) mod route_words;
 pub mod shell;
 mod socket;
@@ -19,9 +20,11 @@ use std::time::{Duration, Instant};
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use sgc_trust::NodeName;
-use sgc_wire::{CRL_BYTES_MAX, Decode as _, Encode as _, Name, Operation};
+use sgc_wire::{
+    CRL_BYTES_MAX, Decode as _, Encode as _, Name, Operation, REPORT_INTERFACE_BYTES_MAX, ReportQuestion,
+};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::UnixStream;
 use tokio::sync::{Semaphore, mpsc, oneshot};
@@ -34,9 +37,11 @@ pub use self::socket::{
     SocketError, connect, default_socket_path, find_socket, has_hidden_services, usual_sockets,
 };
 
-use crate::admin::graph::Side;
+use crate::admin::graph::{Graph, Side};
+use crate::admin::report::NodeReport;
 use crate::admin::shell::{CallRequest, PublishRequest};
 use crate::control::event::CoreEvent;
+use crate::control::fleet::inquiries::InquiryTarget;
 use crate::control::settings::reload::Reloader;
 use crate::data::tap::{Tap, TapMessage, TapRequest};
 use crate::gateway::Gateway;
@@ -75,7 +80,7 @@ pub enum AdminRequest {
     Reload,
     /// Apply this revocation list, DER.
     Crl(Vec<u8>),
-    /// Return the [`Graph`](crate::admin::graph::Graph), also for this name if it is not in use here.
+    /// Return the [`Graph`], also for this name if it is not in use here.
     Graph(Option<Name>),
     /// Send the messages of a topic until the connection ends.
     Tap {
@@ -97,6 +102,35 @@ pub enum AdminRequest {
         /// The operation.
         operation: Operation,
     },
+    /// Ask nodes of the fleet how they are doing.
+    Report(ReportRequest),
+}
+
+/// Most nodes in one [`ReportRequest`].
+pub const REPORT_NODES_MAX: usize = 256;
+
+/// Nodes to ask, and about what.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ReportRequest {
+    /// Names of the nodes, at most [`REPORT_NODES_MAX`]; if there are none, the fleet's authority is asked.
+    pub nodes: Vec<String>,
+    /// A topic, service or action by its name at these nodes, for their [`Graph`]s of it; without one, they are asked
+    /// for a [`NodeReport`].
+    pub interface: Option<String>,
+}
+
+/// What a node of a [`ReportRequest`] answered: one of the three.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct ReportAnswer {
+    /// The name by which it was asked; empty for the fleet's authority.
+    pub node: String,
+    /// How it is doing.
+    pub report: Option<NodeReport>,
+    /// Its graph of the interface.
+    pub graph: Option<Graph>,
+    /// The reason why there is no answer.
+    pub error: Option<String>,
 }
 
 /// Header of each message of a tap: [`TapHead::BYTES`] bytes, big endian, in this order. `carried` bytes of payload
@@ -205,6 +239,10 @@ impl AdminRequest {
                 Err(_) => Err(AdminError::Argument { word: "call" }),
             },
             ("operate", rest) => Self::parse_operate(rest).ok_or(AdminError::Argument { word: "operate" }),
+            ("report", wish) => match serde_json::from_str(wish) {
+                Ok(wish) => Ok(Self::Report(wish)),
+                Err(_) => Err(AdminError::Argument { word: "report" }),
+            },
             ("tap", rest) => Self::parse_tap(rest).ok_or(AdminError::Argument { word: "tap" }),
             (word, _) => Err(AdminError::Unknown { word: word.chars().take(32).collect() }),
         }
@@ -240,6 +278,7 @@ impl AdminRequest {
                 format!("{ADMIN_PREFIX}tap {} {bytes} {topic}\n", side.map_or("any", Side::label))
             }
             Self::Publish(wish) => format!("{ADMIN_PREFIX}publish {}\n", json(wish)),
+            Self::Report(wish) => format!("{ADMIN_PREFIX}report {}\n", json(wish)),
             Self::Call(wish) => format!("{ADMIN_PREFIX}call {}\n", json(wish)),
             Self::Operate { at, operation } => {
                 format!("{ADMIN_PREFIX}operate {at} {}\n", STANDARD.encode(operation.to_vec()))
@@ -276,7 +315,7 @@ pub enum AdminError {
     },
     /// The word is unknown.
     #[error(
-        "{word:?} is nothing that this node can be asked: status, reload, crl, graph, tap, publish, call and operate are"
+        "{word:?} is nothing that this node can be asked: status, reload, crl, graph, report, tap, publish, call and operate are"
     )]
     Unknown {
         /// The word.
@@ -534,6 +573,10 @@ async fn carry_out(request: AdminRequest, desk: &Desk) -> Result<String, String>
         AdminRequest::Tap { .. } => Err(AdminError::Argument { word: "tap" }.to_string()),
         AdminRequest::Publish(_) => Err(AdminError::Argument { word: "publish" }.to_string()),
         AdminRequest::Call(wish) => shell::call(gateway, &wish).await,
+        AdminRequest::Report(wish) => {
+            let answers = report(wish, events).await?;
+            serde_json::to_string(&answers).map_err(|error| error.to_string())
+        }
         AdminRequest::Operate { at, operation } => {
             let (reply, done) = oneshot::channel();
             let asked = CoreEvent::Operate { at, operation, reply };
@@ -554,6 +597,53 @@ async fn carry_out(request: AdminRequest, desk: &Desk) -> Result<String, String>
             Ok(serde_json::json!({ "news": is_news, "lists": lists }).to_string())
         }
     }
+}
+
+/// Asks nodes for reports, all at one time.
+async fn report(wish: ReportRequest, events: &mpsc::Sender<CoreEvent>) -> Result<Vec<ReportAnswer>, String> {
+    let stopping = || "the node is stopping".to_owned();
+    if wish.nodes.len() > REPORT_NODES_MAX {
+        return Err(format!("at most {REPORT_NODES_MAX} nodes are asked at one time"));
+    }
+    let question = match &wish.interface {
+        None => ReportQuestion::Condition,
+        Some(name) if name.len() > REPORT_INTERFACE_BYTES_MAX => {
+            return Err(format!("a name has at most {REPORT_INTERFACE_BYTES_MAX} bytes"));
+        }
+        Some(name) => ReportQuestion::Interface(name.clone()),
+    };
+    let node = |node: &String| match node.parse() {
+        Ok(name) => Ok((node.clone(), InquiryTarget::Node(name))),
+        Err(error) => Err(format!("{node:?}: {error}")),
+    };
+    let mut targets = wish.nodes.iter().map(node).collect::<Result<Vec<_>, _>>()?;
+    if targets.is_empty() {
+        targets.push((String::new(), InquiryTarget::Authority));
+    }
+    let mut asked = Vec::new();
+    for (node, at) in targets {
+        let (reply, told) = oneshot::channel();
+        let event = CoreEvent::Inquire { at, question: question.clone(), reply };
+        events.send(event).await.map_err(|_| stopping())?;
+        asked.push((node, told));
+    }
+    let mut answers = Vec::new();
+    for (node, told) in asked {
+        let mut answer = ReportAnswer { node, ..ReportAnswer::default() };
+        match told.await.map_err(|_| stopping())? {
+            Ok(document) if wish.interface.is_some() => match serde_json::from_slice(&document) {
+                Ok(graph) => answer.graph = Some(graph),
+                Err(error) => answer.error = Some(format!("its report cannot be read: {error}")),
+            },
+            Ok(document) => match serde_json::from_slice(&document) {
+                Ok(report) => answer.report = Some(report),
+                Err(error) => answer.error = Some(format!("its report cannot be read: {error}")),
+            },
+            Err(why) => answer.error = Some(why.to_string()),
+        }
+        answers.push(answer);
+    }
+    Ok(answers)
 }
 
 fn parse_name(text: &str) -> Option<Name> {
@@ -594,6 +684,10 @@ mod tests {
                 wait_for: 1,
                 depth: Some(3),
                 ..Default::default()
+            }),
+            AdminRequest::Report(ReportRequest {
+                nodes: vec!["arm-1".into()],
+                interface: Some("/a b".into()),
             }),
             AdminRequest::Call(CallRequest { request: "{\"a\":\n1}".into(), ..Default::default() }),
             AdminRequest::Operate {
@@ -642,6 +736,7 @@ mod tests {
             (b"sgc/1 operate keeper", AdminError::Argument { word: "operate" }),
             (b"sgc/1 operate keeper AA", AdminError::Argument { word: "operate" }),
             (b"sgc/1 publish /a", AdminError::Argument { word: "publish" }),
+            (b"sgc/1 report arm-1", AdminError::Argument { word: "report" }),
             (b"sgc/1 reload now", AdminError::Unknown { word: "reload".into() }),
         ] {
             assert_eq!(AdminRequest::parse(line), Err(error), "{}", line.escape_ascii());

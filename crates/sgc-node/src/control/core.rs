@@ -11,6 +11,7 @@ mod operations;
 mod outputs;
 mod publish;
 mod reopening;
+mod reports;
 mod ros;
 mod services;
 mod status;
@@ -27,7 +28,7 @@ use sgc_router::{Output as RouterOutput, Router};
 use sgc_session::KeepAlivePolicy;
 use sgc_sync::Workers;
 use sgc_transport::{AnyLink, CredentialStore};
-use sgc_trust::{Identity, TrustAnchors};
+use sgc_trust::{Grantees, Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
 use sgc_wire::{Control, Now};
 use tokio::sync::{mpsc, watch};
@@ -39,8 +40,10 @@ use crate::control::faults::alerts::Alerts;
 use crate::control::faults::problem_log::ProblemLog;
 use crate::control::faults::refusals::Refusals;
 use crate::control::fleet::authority::Authority;
+use crate::control::fleet::inquiries::Inquiries;
 use crate::control::fleet::members::{MemberNames, Members};
 use crate::control::fleet::operations::Operations;
+use crate::control::fleet::reports::Reports;
 use crate::control::graph::far_consumers::FarConsumers;
 use crate::control::graph::local_graph::LocalGraph;
 use crate::control::parts::certificates::Certificates;
@@ -105,6 +108,10 @@ pub(crate) struct Core<N: RosNetwork> {
     authority: Option<Authority>,
     /// Operations that users of this node request.
     operations: Operations,
+    /// Reports that observers ask for.
+    reports: Reports,
+    /// Reports that users of this node ask other nodes for.
+    inquiries: Inquiries,
     replays: Arc<Replays>,
     control_drops: Drops,
     problem_log: ProblemLog,
@@ -172,6 +179,8 @@ pub(crate) struct CoreParts<N> {
     pub definitions: Definitions,
     /// The names of members in rules.
     pub(crate) member_names: MemberNames,
+    /// The peers that may ask this node how it is doing.
+    pub(crate) observers: Grantees,
 }
 
 impl<N: RosNetwork> Core<N> {
@@ -192,7 +201,7 @@ impl<N: RosNetwork> Core<N> {
             parts.redial,
             now().unix,
         );
-        let core = Self {
+        let mut core = Self {
             certificates,
             router: parts.router,
             endpoint: parts.endpoint,
@@ -212,6 +221,8 @@ impl<N: RosNetwork> Core<N> {
             publishers: Publishers::new(parts.message_keys),
             authority: parts.authority,
             operations: Operations::default(),
+            reports: Reports::default(),
+            inquiries: Inquiries::default(),
             replays: Arc::default(),
             control_drops: Drops::default(),
             problem_log: ProblemLog::default(),
@@ -229,6 +240,7 @@ impl<N: RosNetwork> Core<N> {
             members,
             local_taps: Vec::new(),
         };
+        core.set_observers(parts.observers);
         (core, requested)
     }
 
@@ -302,9 +314,12 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::ServiceReady { name, spec, end } => self.service_ready(name, &spec, end),
             CoreEvent::DeskAnswered(answers) => self.desk_answered(answers),
             CoreEvent::Operate { at, operation, reply } => self.operate(&at, operation, reply),
+            CoreEvent::Inquire { at, question, reply } => self.inquire(&at, question, reply),
+            CoreEvent::ReportMade(question, report) => self.report_made(question, report),
             CoreEvent::NetworkJoined(routes) => self.routes = Some(*routes),
-            CoreEvent::Reload { shares, uses, anchors, message_keys, member_names, reply } => {
+            CoreEvent::Reload { shares, uses, anchors, message_keys, member_names, observers, reply } => {
                 self.add_message_keys(message_keys);
+                self.set_observers(observers);
                 self.members.set_names(member_names, self.certificates.identity());
                 self.reconfigure(shares, uses, anchors);
                 let _ = reply.send(());
@@ -389,6 +404,7 @@ impl<N: RosNetwork> Core<N> {
         }
         self.rotation_due(now);
         self.operations_due(now.instant);
+        self.inquiries_due(now.instant);
         self.services.handle_timeout(now.instant);
         self.types_due(now.instant);
         self.consumers_due(now);
@@ -441,6 +457,7 @@ impl<N: RosNetwork> Core<N> {
                     self.shares.deadline(),
                     self.links.deadline(),
                     self.operations.deadline(),
+                    self.inquiries.deadline(),
                 ];
                 let own = own.into_iter().chain([self.reopening.deadline()]);
                 let all = [router, endpoint, routes, self.sinks.deadline(), rekey, self.services.deadline()];
@@ -487,6 +504,7 @@ impl<N: RosNetwork> Core<N> {
     /// Withdraws the shares and says goodbye.
     fn stop(&mut self) -> Vec<AnyLink> {
         self.operations.stop();
+        self.inquiries.stop();
         self.endpoint.withdraw_all(now());
         self.drain();
         let links = self.links.say_goodbye();

@@ -9,13 +9,14 @@ use sgc_ros::{
 };
 use sgc_router::LinkId;
 use sgc_transport::AnyLink;
-use sgc_trust::{CrlError, NodeName, TrustAnchors};
-use sgc_wire::{Control, Name, NodeId, Operation, OperationAnswer, SourceId};
+use sgc_trust::{CrlError, Grantees, NodeName, TrustAnchors};
+use sgc_wire::{Control, Name, NodeId, Operation, OperationAnswer, Report, ReportQuestion, SourceId};
 use tokio::sync::oneshot;
 
 use crate::admin::graph::Graph;
 use crate::admin::status::Status;
 use crate::control::fleet::authority::DeskAnswers;
+use crate::control::fleet::inquiries::{InquiryAnswer, InquiryTarget};
 use crate::control::fleet::members::MemberNames;
 use crate::control::fleet::operations::OperationError;
 use crate::control::peers::control_queue::{FrameRoom, InboxShare};
@@ -135,6 +136,8 @@ pub(crate) enum CoreEvent {
         message_keys: MessageKeys,
         /// The names of members in these rules.
         member_names: MemberNames,
+        /// The peers that may ask this node how it is doing.
+        observers: Grantees,
         /// Notified when the change is under way.
         reply: oneshot::Sender<()>,
     },
@@ -149,6 +152,17 @@ pub(crate) enum CoreEvent {
         /// The channel for the answer.
         reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
     },
+    /// A user asks a node of the fleet for a report.
+    Inquire {
+        /// The node.
+        at: InquiryTarget,
+        /// The question.
+        question: ReportQuestion,
+        /// The channel for the document.
+        reply: oneshot::Sender<InquiryAnswer>,
+    },
+    /// A report for observers was made; `None` if it is too long.
+    ReportMade(ReportQuestion, Option<Report>),
     /// A user brings a revocation list. Answered with whether it is new, and with the lists that were in force before.
     Crl {
         /// The list, DER.

@@ -126,6 +126,7 @@ pub(super) async fn build<N: RosNetwork>(
         types,
         definitions,
         member_names: rules.members.clone(),
+        observers: rules.observers.clone(),
         board: board.clone(),
         keep_alive_policy: keep_alive_policy(&config),
         message_keys,

@@ -237,6 +237,11 @@ impl Router {
         Some(self.links.get(link)?.clock()?.ahead_ms(self.now))
     }
 
+    /// Returns `true` if the node forwards for others.
+    pub fn is_transit(&self) -> bool {
+        self.config.transit
+    }
+
     /// Returns the sizes of the tables.
     pub fn stats(&self) -> RouterStats {
         RouterStats {

@@ -13,6 +13,7 @@ mod nonces;
 mod partners;
 mod publishers;
 mod replay;
+mod reports;
 mod revocation;
 mod rotation;
 mod types;

@@ -1,4 +1,4 @@
-//! `sgc fleet`: makes fleets, and enrols, renews and revokes their nodes.
+//! `sgc fleet`: makes fleets, enrols, renews and revokes their nodes, and shows how they are doing.
 //!
 //! The files stay where they are written; the user brings them to their machines. `sgc-trust` defines their content.
 
@@ -7,10 +7,12 @@ mod create;
 mod enroll;
 mod heard_lists;
 mod keeping;
+mod looking;
 mod own_key;
 mod remote;
 
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::{Args, Subcommand};
@@ -24,7 +26,7 @@ use crate::files;
 
 const DAY: Duration = Duration::from_secs(86_400);
 
-/// Make a fleet, and enrol, renew and revoke its nodes.
+/// Make a fleet, enrol, renew and revoke its nodes, and show how they are doing.
 #[derive(Debug, Args)]
 pub(crate) struct FleetArgs {
     #[command(subcommand)]
@@ -40,6 +42,8 @@ enum FleetCommand {
     Extensions(own_key::ExtensionsArgs),
     Accept(own_key::AcceptArgs),
     List(keeping::ListArgs),
+    Status(looking::StatusArgs),
+    Why(looking::WhyArgs),
     Ca(keeping::CaArgs),
     Renew(enroll::RenewArgs),
     Revoke(keeping::RevokeArgs),
@@ -51,8 +55,10 @@ enum FleetCommand {
 }
 
 /// Runs `sgc fleet`.
-pub(crate) fn fleet(args: FleetArgs) -> Result<(), CliError> {
-    match args.command {
+pub(crate) fn fleet(args: FleetArgs) -> Result<ExitCode, CliError> {
+    let done = match args.command {
+        FleetCommand::Why(args) => return looking::why(&args),
+        FleetCommand::Status(args) => looking::status(&args),
         FleetCommand::Create(args) => create::create(&args),
         FleetCommand::Import(args) => create::import(&args),
         FleetCommand::Enroll(args) => enroll::enroll(&args),
@@ -68,7 +74,8 @@ pub(crate) fn fleet(args: FleetArgs) -> Result<(), CliError> {
         FleetCommand::RotateSecret(args) => keeping::rotate(&args),
         FleetCommand::RetireSecret(args) => keeping::retire(&args),
         FleetCommand::Set(args) => create::set(&args),
-    }
+    };
+    done.map(|()| ExitCode::SUCCESS)
 }
 
 /// The fleet of a command.

@@ -1,5 +1,5 @@
-//! `docs/reference/status.md`: the fields of `sgc status --json`, from the types that the node serialises and their doc
-//! comments.
+//! `docs/reference/status.md` and `fleet-status.md`: the fields of `sgc status --json` and `sgc fleet status --json`, from
+//! the types that are serialised and their doc comments.
 //!
 //! The types are read as source text, which needs no derive in the programs. An attribute of serde that is not understood
 //! here fails the test.
@@ -15,13 +15,36 @@ use syn::{
 use crate::generated::{self, cell, wrapped};
 use crate::repository::{REPOSITORY, Repository};
 
-const PAGE: &str = "docs/reference/status.md";
-/// The type of the whole document.
-const ROOT: &str = "Status";
+/// A page about a JSON document.
+struct DocumentPage {
+    path: &'static str,
+    title: &'static str,
+    /// Words before the fields.
+    about: &'static str,
+    /// The type of the whole document.
+    root: &'static str,
+}
+
+const STATUS: DocumentPage = DocumentPage {
+    path: "docs/reference/status.md",
+    title: "Status document",
+    about: "`sgc status --json` prints one JSON object, which the node makes. Later versions may add fields.",
+    root: "Status",
+};
+
+const FLEET_STATUS: DocumentPage = DocumentPage {
+    path: "docs/reference/fleet-status.md",
+    title: "Fleet status document",
+    about: "`sgc fleet status --json` prints one JSON object. Each node makes its `report`; nodes of another version have \
+            fewer fields or more.",
+    root: "FleetStatus",
+};
 
 #[test]
-fn the_page_of_the_status_is_what_the_types_say() {
-    generated::check(PAGE, &page(&REPOSITORY));
+fn pages_of_documents_are_what_the_types_say() {
+    for document in [&STATUS, &FLEET_STATUS] {
+        generated::check(document.path, &page(&REPOSITORY, document));
+    }
 }
 
 #[test]
@@ -31,7 +54,7 @@ fn fields_types_and_kinds_are_those_that_serde_writes() {
                   pub sizes: Option<(u64, u64)>,\n/// Counts.\npub counts: BTreeMap<String, u64> }\n\
                   /// A part.\n#[derive(Serialize)]\n#[serde(tag = \"kind\", rename_all = \"snake_case\")]\npub enum Part {\n\
                   /// It is old.\nTooOld {\n/// Seconds.\nage_s: u64 } }\nstruct Part2;";
-    let page = page(&Repository::make(&[("crates/a/src/x.rs", source)]));
+    let page = page(&Repository::make(&[("crates/a/src/x.rs", source)]), &STATUS);
     for part in [
         "| `type` | string or null | One \\| two. |",
         "| `parts` | array of [`parts`](#parts) | Parts. |",
@@ -50,15 +73,11 @@ enum Serialised {
     Enum(ItemEnum),
 }
 
-/// Returns the page of the type [`ROOT`] and of all types in it.
-fn page(repository: &Repository) -> String {
+/// Returns the page of a document: its type, and all types in it.
+fn page(repository: &Repository, document: &DocumentPage) -> String {
     let mut page = generated::note("the types of the status document");
-    page.push_str("# Status document\n\n");
-    page.push_str(&wrapped(
-        "`sgc status --json` prints one JSON object, which the node makes. Later versions may add fields.",
-        0,
-    ));
-    let mut waiting = VecDeque::from([(String::new(), ROOT.to_owned())]);
+    let _ = write!(page, "# {}\n\n{}", document.title, wrapped(document.about, 0));
+    let mut waiting = VecDeque::from([(String::new(), document.root.to_owned())]);
     while let Some((path, name)) = waiting.pop_front() {
         let found = find(repository, &name).unwrap_or_else(|| panic!("no type {name} that is serialised"));
         let attributes = match &found {
@@ -71,7 +90,7 @@ fn page(repository: &Repository) -> String {
         match &found {
             Serialised::Struct(item) => {
                 page.push_str("\n| field | type | meaning |\n|---|---|---|\n");
-                for field in &item.fields {
+                for field in item.fields.iter().filter(|field| !has_serde(&field.attrs, "skip")) {
                     let (field, shown, inner) = describe(field, &path);
                     let _ = writeln!(page, "| `{field}` | {shown} |",);
                     waiting.extend(inner);
@@ -238,7 +257,7 @@ fn has_serde(attributes: &[Attribute], name: &str) -> bool {
 
 /// Returns all serde attributes with their values, each of which is known here.
 fn serde_attributes(attributes: &[Attribute]) -> Vec<(String, Option<String>)> {
-    let known = ["rename", "tag", "rename_all", "skip_serializing_if", "default", "other"];
+    let known = ["rename", "tag", "rename_all", "skip", "skip_serializing_if", "default", "other"];
     let mut found = Vec::new();
     for attribute in attributes.iter().filter(|attribute| attribute.path().is_ident("serde")) {
         let read = attribute.parse_nested_meta(|meta| {

@@ -97,10 +97,8 @@ impl<N: RosNetwork> Core<N> {
                 self.control_drops.count_from(NodeDrop::OperationRepeated, node);
             }
             RequestStep::Job(job) => {
-                // Nodes that are connected now count as present.
-                let here: Vec<_> = self.endpoint.renewing().map(|(_, peer, _)| peer.node_id).collect();
-                authority.note_seen(here, now.unix);
-                match authority.push_or_return(job) {
+                self.note_present_members();
+                match self.authority.as_mut().and_then(|authority| authority.push_or_return(job)) {
                     None => self.answer_next_batch(),
                     Some(job) => self.operation_done(job.busy()),
                 }
@@ -114,6 +112,14 @@ impl<N: RosNetwork> Core<N> {
                 self.audit.write(AuditRecord::new(AuditEvent::Refused).peer(&node).reason(reason));
                 self.endpoint.answer_operation(now, sink, Err(RefuseReason::NotPermitted));
             }
+        }
+    }
+
+    /// Notes at this authority that the nodes which ask for credentials now are present.
+    pub(super) fn note_present_members(&mut self) {
+        if let Some(authority) = &mut self.authority {
+            let here = self.endpoint.renewing().map(|(_, peer, _)| peer.node_id);
+            authority.note_seen(here, now().unix);
         }
     }
 

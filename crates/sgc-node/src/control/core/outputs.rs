@@ -114,6 +114,9 @@ impl<N: RosNetwork> Core<N> {
         match event {
             Event::RenewAsked { sink, peer, csr } => self.answer_renewal(sink, peer, csr),
             Event::OperationAsked { sink, peer, request } => self.operation_asked(sink, &peer, &request),
+            Event::ReportAsked { sink, peer, question } => self.report_asked(sink, &peer, &question),
+            Event::Report { name, report } => self.report_told(name, &report),
+            Event::ReportDenied { name, by } => self.report_denied(name, by),
             Event::OperationAnswered { name, answer } => self.operation_answered(name, answer),
             Event::OperationDenied { name, by } => self.operation_denied(name, by),
             Event::Renewed { credentials } => self.take_credentials(credentials),
@@ -238,6 +241,9 @@ impl<N: RosNetwork> Core<N> {
             | Event::OperationAsked { .. }
             | Event::OperationAnswered { .. }
             | Event::OperationDenied { .. }
+            | Event::ReportAsked { .. }
+            | Event::Report { .. }
+            | Event::ReportDenied { .. }
             | Event::Rekeyed { .. }
             | Event::OwnGrant { .. }
             | Event::Recover(_)

@@ -116,7 +116,7 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    fn route_line(&self, route: RouteStatus) -> RouteLine {
+    pub(super) fn route_line(&self, route: RouteStatus) -> RouteLine {
         let calls = self.describe_calls(&route);
         let messages = self.messages_of(&route);
         let share = route.name.and_then(|n| self.shares.get(&n));
@@ -132,7 +132,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     /// Returns everything that was dropped or refused, by kind alone.
-    fn drops_by_reason(&self) -> BTreeMap<String, u64> {
+    pub(super) fn drops_by_reason(&self) -> BTreeMap<String, u64> {
         let mut drops = self.all_drops();
         // No name of a kind has spaces, and rows of culprits have.
         drops.retain(|key, _| !key.contains(' '));

@@ -18,15 +18,16 @@ use sgc_trust::{
     CertId, CrlReport, Fleet, FleetError, Grantees, ROSTER_NODES_MAX, TrustAnchors, VerifiedPeer,
     requested_key_hash, serial_of,
 };
-use sgc_wire::{Credentials, NodeId, Now, RefuseReason, SinkId, UnixMillis};
+use sgc_wire::{Credentials, NodeId, Now, RefuseReason, RosterRow, SinkId, UnixMillis};
 use tracing::{error, info, warn};
 
+use crate::admin::report::ReportMember;
 use crate::control::fleet::operators::{
-    OPERATIONS_WAITING_MAX, OperationJob, OperationOutcome, Operators, RequestStep,
+    OPERATIONS_WAITING_MAX, OperationJob, OperationOutcome, Operators, RequestStep, roster_row,
 };
 use crate::drops::NodeDrop;
 use crate::state::credentials::{is_due, lasts, renewal_interval};
-use crate::state::fleet_file::{FleetFileError, LockedFleet};
+use crate::state::fleet_file::{FleetFileError, LockedFleet, read_fleet};
 
 /// Shortest validity of a new certificate.
 const VALID_MIN: Duration = Duration::from_secs(60);
@@ -188,6 +189,7 @@ pub(crate) struct Authority {
     /// Times at which members last got an answer in this run; at most as many as a roster has.
     seen: BTreeMap<NodeId, UnixMillis>,
     own: NodeId,
+    file: PathBuf,
     desk: Arc<Mutex<FleetDesk>>,
 }
 
@@ -195,8 +197,8 @@ impl Authority {
     /// Creates the authority `own` with this fleet file and these operators.
     pub(crate) fn new(file: PathBuf, operators: Grantees, own: NodeId) -> Self {
         let (queue, operators) = (DeskQueue::default(), Operators::new(operators));
-        let desk = Arc::new(Mutex::new(FleetDesk::new(file)));
-        Self { queue, operators, seen: BTreeMap::new(), own, desk }
+        let desk = Arc::new(Mutex::new(FleetDesk::new(file.clone())));
+        Self { queue, operators, seen: BTreeMap::new(), own, file, desk }
     }
 
     /// Queues a request for credentials. It replaces an older one of the same node.
@@ -251,6 +253,22 @@ impl Authority {
             let operations = batch.operations.into_iter().map(done).collect();
             DeskAnswers { operations, renewals: desk.answer(batch.renewals, now) }
         })
+    }
+
+    /// Returns a blocking job that reads the members of the fleet, with the times at which they were last seen.
+    pub(crate) fn members_job(
+        &self,
+    ) -> impl FnOnce() -> Result<Vec<ReportMember>, FleetFileError> + Send + use<> {
+        let (file, seen) = (self.file.clone(), self.seen.clone());
+        move || {
+            let fleet = read_fleet(&file)?;
+            let member = |node| {
+                let row = roster_row(&fleet, node);
+                let seen = row.seen.max(seen.get(&row.id).copied());
+                ReportMember::new(RosterRow { seen, ..row })
+            };
+            Ok(fleet.nodes().map(member).collect())
+        }
     }
 
     /// Returns a blocking job that records the revocations of these lists in the file.

@@ -257,6 +257,8 @@ pub fn unknown_members(config: &Config, fleet: &Fleet) -> Vec<UnknownMember> {
     }
     let operators = config.authority.iter().flat_map(|authority| &authority.operators);
     operators.filter_map(named).for_each(|name| check(&|| "`operators`".to_owned(), name));
+    let observers = config.observers.iter().flatten();
+    observers.filter_map(named).for_each(|name| check(&|| "`observers`".to_owned(), name));
     unknown
 }
 

@@ -262,7 +262,8 @@ impl Reloader {
         let (reply, done) = oneshot::channel();
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
         let member_names = rules.members.clone();
-        let event = CoreEvent::Reload { shares, uses, anchors, message_keys, member_names, reply };
+        let observers = rules.observers.clone();
+        let event = CoreEvent::Reload { shares, uses, anchors, message_keys, member_names, observers, reply };
         let stopping = || "the node is stopping".to_owned();
         self.events.send(event).await.map_err(|_| stopping())?;
         done.await.map_err(|_| stopping())
@@ -359,12 +360,14 @@ impl Reloader {
 /// Returns the configuration that runs after a reload. Restart-only settings keep their running values, so that the
 /// next reload reports them again.
 fn merged(before: Config, read: Config) -> Config {
-    let Config { routers, shares, uses, tokens, partners, trust, accept, gateway, metrics, .. } = read;
+    let Config {
+        routers, shares, uses, tokens, partners, trust, accept, gateway, metrics, observers, ..
+    } = read;
     let gateway = match (&before.gateway, gateway) {
         (Some(before), Some(after)) => Some(with_bounds_of(before, &after)),
         (_, after) => after,
     };
-    Config { routers, shares, uses, tokens, partners, trust, accept, gateway, metrics, ..before }
+    Config { routers, shares, uses, tokens, partners, trust, accept, gateway, metrics, observers, ..before }
 }
 
 /// Returns the part of a gateway's configuration that decides who may connect.
@@ -435,6 +438,9 @@ fn changes(old: &Rules, new: &Rules) -> Vec<String> {
     }
     if old.partners.admitted != new.partners.admitted {
         lines.push("whose nodes may attach changed".to_owned());
+    }
+    if old.observers != new.observers {
+        lines.push("who may ask this node how it is doing changed".to_owned());
     }
     lines
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use sgc_config::{Config, Recipient, RouterUrl, TokenConfig, TokenSource, UseConfig};
 use sgc_ros::{Direction, Interface, Part, Shaping, ShareRule, UseRule, is_topic_name};
-use sgc_trust::{Identity, ShareToken, TOKEN_TEXT_BYTES_MAX, TokenError};
+use sgc_trust::{Grantees, Identity, ShareToken, TOKEN_TEXT_BYTES_MAX, TokenError};
 use sgc_wire::{Kind, NodeId, UnixMillis};
 
 use crate::control::fleet::members::{MemberNames, unknown_members};
@@ -31,6 +31,8 @@ pub(crate) struct Rules {
     pub(crate) routers: Vec<RouterUrl>,
     pub(crate) names: PeerNames,
     pub(crate) members: MemberNames,
+    /// The peers that may ask this node how it is doing.
+    pub(crate) observers: Grantees,
     /// Faults that prevent nothing.
     pub(crate) warnings: Vec<String>,
 }
@@ -62,6 +64,15 @@ impl Rules {
         rules.uses.splice(0..0, of_fleet);
         rules.names = peer_names(config, identity, &rules);
         rules.members = MemberNames::from_config(config, identity);
+        rules.observers = policy::grantees(&config.observers(), identity, &rules.partners);
+        let is_named = |one: &Recipient| matches!(one, Recipient::Node(_) | Recipient::Group(_));
+        if identity.fleet_secret().is_none() && config.observers.iter().flatten().any(is_named) {
+            rules.warnings.push(
+                "`observers` names nodes or groups, but this node only routes: it holds no secret of the fleet and recognises \
+                 neither. It can name all nodes (\"*\") or nobody"
+                    .to_owned(),
+            );
+        }
         if let Some(authority) = &config.authority
             && let Ok(fleet) = read_fleet(&authority.fleet)
         {
@@ -191,7 +202,7 @@ fn peer_names(config: &Config, identity: &Identity, rules: &Rules) -> PeerNames 
     names.extend(rules.uses.iter().map(|rule| (rule.owner, rule.owner_name.clone())));
     let named = config.shares.iter().flat_map(|s| s.to.iter().chain(&s.publish));
     let operators = config.authority.iter().flat_map(|authority| &authority.operators);
-    for recipient in named.chain(operators) {
+    for recipient in named.chain(operators).chain(config.observers.iter().flatten()) {
         if let Recipient::Node(node) = recipient {
             names.extend(identity.node_id_of(node.as_str()).map(|id| (id, node.to_string())));
         }

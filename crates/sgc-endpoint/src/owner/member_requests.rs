@@ -1,5 +1,5 @@
-//! [`AuthorityRequests`]: requests of this fleet's nodes to their authority, for credentials or for an operation. The
-//! authority answers later; each node has one place.
+//! [`MemberRequests`]: requests of this fleet's nodes that the driver answers later: for credentials, for an operation,
+//! or for a report. Each node has one place.
 
 use std::collections::BTreeMap;
 
@@ -12,9 +12,9 @@ use crate::context::Context;
 use crate::names::BlindName;
 use crate::output::UnexpectedFrame;
 
-/// The requests at one name of the authority.
+/// The requests at one name of this node.
 #[derive(Debug)]
-pub(crate) struct AuthorityRequests {
+pub(crate) struct MemberRequests {
     /// `None` if this node does not take such requests, or takes no more.
     name: Option<BlindName>,
     asked: BTreeMap<SinkId, GrantedSink>,
@@ -22,16 +22,21 @@ pub(crate) struct AuthorityRequests {
     max: usize,
 }
 
-/// A new request, for the authority.
-pub(crate) struct AuthorityRequest {
+/// A new request.
+pub(crate) struct MemberRequest {
     pub(crate) peer: VerifiedPeer,
-    /// The signing request or the operation, not verified.
+    /// The signing request, the operation or the question, not verified.
     pub(crate) what: Bytes,
 }
 
-impl AuthorityRequests {
+impl MemberRequests {
     pub(crate) fn new(name: Option<BlindName>, max: usize) -> Self {
         Self { name, asked: BTreeMap::new(), max }
+    }
+
+    /// Takes requests at this name. Returns the blind to advertise, unless it is advertised already.
+    pub(crate) fn begin(&mut self, name: BlindName) -> Option<Blind> {
+        self.name.replace(name).is_none().then_some(name.blind)
     }
 
     /// Returns the blind of the name.
@@ -44,8 +49,9 @@ impl AuthorityRequests {
         self.name.is_some_and(|own| own.name == *name)
     }
 
-    /// Takes no more requests. Returns the blind to withdraw.
+    /// Takes no more requests, and forgets those that it has. Returns the blind to withdraw.
     pub(crate) fn end(&mut self) -> Option<Blind> {
+        self.asked.clear();
         self.name.take().map(|name| name.blind)
     }
 
@@ -64,7 +70,7 @@ impl AuthorityRequests {
         name: Name,
         sink: SinkId,
         asked: GrantedSink,
-    ) -> Option<AuthorityRequest> {
+    ) -> Option<MemberRequest> {
         let Request::Ask { what } = asked.request.clone() else {
             cx.refuse(name, sink, 1, RefuseReason::RoleNotOffered);
             return None;
@@ -88,7 +94,7 @@ impl AuthorityRequests {
         }
         let serial = self.asked.get(&sink).map_or(0, |s| s.serial);
         self.asked.insert(sink, GrantedSink { serial, ..asked });
-        Some(AuthorityRequest { peer, what })
+        Some(MemberRequest { peer, what })
     }
 
     pub(crate) fn handle_leave(&mut self, sink: SinkId) {

@@ -1,0 +1,561 @@
+//! The fleet as an observer sees it: what its nodes report, and the tables of `sgc fleet status`.
+//!
+//! Reports come from other machines. Callers remove control characters from the lines before they print them.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+use std::time::Duration;
+
+use serde::Serialize;
+use sgc_node::admin::report::{NodeReport, ReportLink, ReportMember, ReportTopic};
+use sgc_node::admin::{AdminRequest, REPORT_NODES_MAX, ReportAnswer, ReportRequest};
+use sgc_process::output;
+use sgc_wire::UnixMillis;
+
+use crate::ask::{answer, ask};
+use crate::error::DiagnosisError;
+use crate::refusals;
+use crate::status::duration;
+
+/// Longest time for the node here to ask others. It gives up earlier.
+const ANSWER_MAX: Duration = Duration::from_secs(15);
+/// Time before the end of a certificate from which on it is shown as a fault. Renewal begins earlier.
+const CERTIFICATE_ENDS_SOON: Duration = Duration::from_secs(14 * 86_400);
+/// Difference of clocks from which on it is shown. Reports take some seconds at most.
+const CLOCKS_DIFFER: Duration = Duration::from_secs(30);
+/// Links that the overview names for each node.
+const LINKS_NAMED: usize = 2;
+/// State of a search whose router the node is linked to.
+const LINKED: &str = "linked";
+
+/// What an observer sees of its fleet at one moment.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct FleetStatus {
+    /// The time, milliseconds since 1970, by the observer's clock.
+    pub time_ms: u64,
+    /// The nodes, by name.
+    pub nodes: Vec<FleetNode>,
+    /// The number of members that the authority's report has no room for.
+    pub members_omitted: usize,
+    /// All known nodes by their ids: the name, and whether the node routes for others.
+    #[serde(skip)]
+    known: BTreeMap<String, (String, bool)>,
+    /// The ids of all nodes that a reporting node has a link to.
+    #[serde(skip)]
+    linked: BTreeSet<String>,
+}
+
+/// A node of the fleet.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct FleetNode {
+    /// The node's name.
+    pub name: String,
+    /// What the fleet's authority or file knows of the node; null if that was not asked or does not know it.
+    pub member: Option<ReportMember>,
+    /// How the node is doing; null if it gave no report.
+    pub report: Option<NodeReport>,
+    /// The reason why there is no report; null if there is one, or if the node was not asked because it is revoked.
+    pub error: Option<String>,
+}
+
+/// Asks nodes of the fleet by the node at this socket; without names, the fleet's authority.
+pub fn ask_nodes(
+    socket: &Path,
+    nodes: &[String],
+    interface: Option<&str>,
+) -> Result<Vec<ReportAnswer>, DiagnosisError> {
+    let mut answers = Vec::new();
+    let mut parts: Vec<_> = nodes.chunks(REPORT_NODES_MAX).collect();
+    if parts.is_empty() {
+        parts.push(&[]);
+    }
+    for nodes in parts {
+        let request = ReportRequest { nodes: nodes.to_vec(), interface: interface.map(str::to_owned) };
+        let text = ask(socket, &AdminRequest::Report(request), ANSWER_MAX)?;
+        answers.extend(answer::<Vec<ReportAnswer>>(socket, &text)?);
+    }
+    Ok(answers)
+}
+
+impl FleetStatus {
+    /// Joins the members of a fleet with the answers of nodes. With `named`, only these nodes are shown.
+    pub fn new(
+        now: UnixMillis,
+        members: Vec<ReportMember>,
+        answers: Vec<ReportAnswer>,
+        named: &[String],
+    ) -> Self {
+        let mut nodes: BTreeMap<String, FleetNode> = BTreeMap::new();
+        for member in members {
+            let node = FleetNode { name: member.name.clone(), member: Some(member), ..FleetNode::default() };
+            nodes.insert(node.name.clone(), node);
+        }
+        for ReportAnswer { node: name, report, error, .. } in answers {
+            let node = nodes.entry(name.clone()).or_default();
+            (node.name, node.report, node.error) = (name, report, error);
+        }
+        let known = nodes.values().filter_map(|node| {
+            let member = node.member.as_ref()?;
+            let is_router = member.router || node.report.as_ref().is_some_and(|report| report.is_router);
+            Some((member.id.clone(), (node.name.clone(), is_router)))
+        });
+        let known = known.collect();
+        let links = nodes.values().filter_map(|node| node.report.as_ref()).flat_map(|report| &report.links);
+        let linked = links.filter(|link| !link.silent).map(|link| link.peer.clone()).collect();
+        let is_shown = |node: &FleetNode| named.is_empty() || named.contains(&node.name);
+        let nodes = nodes.into_values().filter(is_shown).collect();
+        Self { time_ms: now.0, nodes, members_omitted: 0, known, linked }
+    }
+
+    /// Returns the overview: a row for each node, then what needs attention. `before` is an earlier look, from which
+    /// rates are computed.
+    pub fn overview(&self, before: Option<&Self>) -> Vec<String> {
+        let rate = if before.is_some() { "messages/s" } else { "messages" };
+        let head = ["node", "state", "up for", "version", "certificate", "secret", "links", "topics", rate];
+        let rows = self.nodes.iter().map(|node| self.row(node, before));
+        let table: Vec<_> = std::iter::once(head.map(str::to_owned).to_vec()).chain(rows).collect();
+        let mut lines = vec![self.summary(), String::new()];
+        lines.extend(output::columns(&table));
+        if self.members_omitted > 0 {
+            lines.push(format!(
+                "{} more are not shown: name them",
+                output::several(self.members_omitted as u64, "node")
+            ));
+        }
+        let faults: Vec<_> = self.nodes.iter().flat_map(|node| self.faults(node)).collect();
+        if !faults.is_empty() {
+            let head = ["node", "what", "do"].map(str::to_owned).to_vec();
+            let table: Vec<_> = std::iter::once(head).chain(faults).collect();
+            lines.extend([String::new(), "Needs attention:".to_owned()]);
+            lines.extend(output::columns(&table).into_iter().map(|line| format!("  {line}")));
+        }
+        lines
+    }
+
+    /// Returns everything that a node reports, under its name.
+    pub fn details(&self, node: &FleetNode) -> Vec<String> {
+        let mut lines = vec![String::new(), format!("{}:", node.name)];
+        let Some(report) = &node.report else {
+            lines.push(format!("  {}", node.error.as_deref().unwrap_or("revoked")));
+            return lines;
+        };
+        let mut section = |title: &str, head: &[&str], rows: Vec<Vec<String>>, omitted: usize| {
+            if rows.is_empty() {
+                lines.push(format!("  {title}: none"));
+                return;
+            }
+            let head = head.iter().map(|h| (*h).to_owned()).collect();
+            let table: Vec<_> = std::iter::once(head).chain(rows).collect();
+            lines.push(format!("  {title}:"));
+            lines.extend(output::columns(&table).into_iter().map(|line| format!("    {line}")));
+            if omitted > 0 {
+                lines.push(format!("    and {omitted} more"));
+            }
+        };
+        let links = report.links.iter().map(|link| self.link_row(link)).collect();
+        section("Links", &["to", "by", "round trip", "dialled by"], links, report.links_omitted);
+        if !report.routers.is_empty() {
+            let rows = report.routers.iter().map(|router| {
+                let failure = router.last_failure.clone().unwrap_or_default();
+                vec![router.router.clone(), router.state.clone(), failure]
+            });
+            section("Routers", &["router", "state", "last failure"], rows.collect(), 0);
+        }
+        let topics = report.topics.iter().map(topic_row).collect();
+        let head = ["", "topic", "type", "owner", "messages", "state"];
+        section("Topics", &head, topics, report.topics_omitted);
+        let counts = |counts: &BTreeMap<String, u64>, meaning: fn(&str) -> String| {
+            counts.iter().map(|(key, n)| vec![key.clone(), n.to_string(), meaning(key)]).collect()
+        };
+        let head = ["reason", "count", "meaning"];
+        section("Drops", &head, counts(&report.drops, refusals::drop_meaning), 0);
+        section("Refused peers", &head, counts(&report.refused, refusals::door_meaning), 0);
+        lines
+    }
+
+    fn summary(&self) -> String {
+        let count = |is_it: fn(&FleetNode) -> bool| self.nodes.iter().filter(|node| is_it(node)).count();
+        let here = count(|node| node.report.is_some());
+        let revoked = count(|node| node.is_revoked() && node.report.is_none());
+        let mut text = output::several(self.nodes.len() as u64, "node");
+        for (n, what) in
+            [(here, "here"), (self.nodes.len() - here - revoked, "without a report"), (revoked, "revoked")]
+        {
+            if n > 0 {
+                text.push_str(&format!(", {n} {what}"));
+            }
+        }
+        let faulty = self.nodes.iter().filter(|node| !self.faults(node).is_empty()).count();
+        match faulty {
+            0 => text + "; nothing needs attention",
+            n => text + &format!("; {n} of them need{} attention", if n == 1 { "s" } else { "" }),
+        }
+    }
+
+    fn row(&self, node: &FleetNode, before: Option<&Self>) -> Vec<String> {
+        let member = node.member.as_ref();
+        let dash = || "–".to_owned();
+        let until = node.report.as_ref().map(|report| report.certificate_until_ms);
+        let until = until.or(member.and_then(|member| member.expires_ms));
+        let generation = match (&node.report, member) {
+            (Some(report), _) => report.secret_generation,
+            (None, Some(member)) => Some(member.generation).filter(|generation| *generation > 0),
+            (None, None) => None,
+        };
+        let mut row = vec![
+            node.name.clone(),
+            self.state(node),
+            node.report.as_ref().map_or_else(dash, |report| duration(report.uptime_s)),
+            node.report.as_ref().map_or_else(dash, |report| report.version.clone()),
+            until.map_or_else(dash, |until| self.ends(until)),
+            generation.map_or_else(dash, |generation| generation.to_string()),
+        ];
+        let Some(report) = &node.report else {
+            row.extend([dash(), dash(), dash()]);
+            return row;
+        };
+        row.push(self.links(report));
+        row.push((report.topics.len() + report.topics_omitted).to_string());
+        row.push(match before {
+            None => messages(report).to_string(),
+            Some(before) => self.rate(node, before).map_or_else(dash, |rate| format!("{rate:.1}")),
+        });
+        row
+    }
+
+    fn state(&self, node: &FleetNode) -> String {
+        if node.report.is_some() {
+            return "here".to_owned();
+        }
+        if node.is_revoked() {
+            return "revoked".to_owned();
+        }
+        match node.member.as_ref().and_then(|member| member.seen_ms) {
+            _ if self.is_linked(node) => "no report, but linked".to_owned(),
+            Some(seen) => {
+                format!("no report, seen {} ago", duration(self.time_ms.saturating_sub(seen) / 1000))
+            }
+            None => "no report".to_owned(),
+        }
+    }
+
+    fn ends(&self, until_ms: u64) -> String {
+        match until_ms.checked_sub(self.time_ms) {
+            None | Some(0) => "ended".to_owned(),
+            Some(left) => format!("{} left", duration(left / 1000)),
+        }
+    }
+
+    fn links(&self, report: &NodeReport) -> String {
+        let named = report.links.iter().take(LINKS_NAMED).map(|link| {
+            let round_trip = if link.silent { "silent".to_owned() } else { output::millis(link.rtt_us) };
+            let direct = if self.is_router(&link.peer) { "" } else { " direct" };
+            format!("{} {round_trip}{direct}", self.name_of(link))
+        });
+        let mut named: Vec<_> = named.collect();
+        let more = report.links.len().saturating_sub(LINKS_NAMED) + report.links_omitted;
+        if more > 0 {
+            named.push(format!("{more} more"));
+        }
+        if named.is_empty() { "none".to_owned() } else { named.join(", ") }
+    }
+
+    fn link_row(&self, link: &ReportLink) -> Vec<String> {
+        vec![
+            self.name_of(link),
+            if self.is_router(&link.peer) { "a router" } else { "itself" }.to_owned(),
+            if link.silent { "silent".to_owned() } else { output::millis(link.rtt_us) },
+            if link.dialled { "this node" } else { "the other" }.to_owned(),
+        ]
+    }
+
+    /// Returns the name of the node at the other end of a link, or the beginning of its id.
+    fn name_of(&self, link: &ReportLink) -> String {
+        let known = self.known.get(&link.peer).map(|(name, _)| name.clone());
+        known.or_else(|| link.name.clone()).unwrap_or_else(|| link.peer.chars().take(8).collect())
+    }
+
+    /// Returns `true` if a node is known to route for others.
+    fn is_router(&self, id: &str) -> bool {
+        self.known.get(id).is_some_and(|(_, is_router)| *is_router)
+    }
+
+    /// Returns `true` if a node that reports has a link to this one.
+    fn is_linked(&self, node: &FleetNode) -> bool {
+        node.member.as_ref().is_some_and(|member| self.linked.contains(&member.id))
+    }
+
+    /// Returns the messages a second since an earlier look, unless the node was restarted meanwhile.
+    fn rate(&self, node: &FleetNode, before: &Self) -> Option<f64> {
+        let earlier = before.nodes.iter().find(|other| other.name == node.name)?.report.as_ref()?;
+        let report = node.report.as_ref()?;
+        let seconds = report.clock_ms.checked_sub(earlier.clock_ms).filter(|ms| *ms > 0)? as f64 / 1000.0;
+        let more = messages(report).checked_sub(messages(earlier))?;
+        (report.uptime_s >= earlier.uptime_s).then_some(more as f64 / seconds)
+    }
+
+    /// Returns what needs attention at a node: its name, the fault, the remedy.
+    fn faults(&self, node: &FleetNode) -> Vec<Vec<String>> {
+        let mut faults = Vec::new();
+        let mut add = |what: String, fix: &str| faults.push(vec![node.name.clone(), what, fix.to_owned()]);
+        let Some(report) = &node.report else {
+            // By default, nobody observes a router.
+            let is_expected = node.is_revoked()
+                || node.member.as_ref().is_some_and(|member| member.router) && self.is_linked(node);
+            if let Some(error) = node.error.as_ref().filter(|_| !is_expected) {
+                add(error.clone(), "run `sgc status` there");
+            }
+            return faults;
+        };
+        for alert in &report.alerts {
+            add(alert.to_string(), alert.fix());
+        }
+        if report.clock_ms.abs_diff(self.time_ms) > CLOCKS_DIFFER.as_millis() as u64 {
+            let by = duration(report.clock_ms.abs_diff(self.time_ms) / 1000);
+            let side = if report.clock_ms > self.time_ms { "ahead of" } else { "behind" };
+            add(format!("its clock is {by} {side} the one here"), "set the wrong one, for instance by NTP");
+        }
+        let left = report.certificate_until_ms.saturating_sub(self.time_ms);
+        if left < CERTIFICATE_ENDS_SOON.as_millis() as u64 {
+            let what = format!("its certificate: {}", self.ends(report.certificate_until_ms));
+            add(what, "`sgc fleet renew` it, or see why the authority does not");
+        }
+        let newest = self.nodes.iter().filter_map(|other| other.report.as_ref()?.secret_generation).max();
+        if let Some((own, newest)) = report.secret_generation.zip(newest).filter(|(own, newest)| own < newest)
+        {
+            let what = format!("it has generation {own} of the fleet's secret, others have {newest}");
+            add(what, "renew it, before `sgc fleet retire-secret`");
+        }
+        for link in report.links.iter().filter(|link| link.silent) {
+            add(format!("{} does not answer it", self.name_of(link)), "see the network between them");
+        }
+        if report.routers.iter().all(|router| router.state != LINKED) {
+            for router in &report.routers {
+                let why = router.last_failure.as_ref().map(|why| format!(": {why}")).unwrap_or_default();
+                add(format!("{} is {}{why}", router.router, router.state), "see that router");
+            }
+        }
+        for problem in &report.problems {
+            add(problem.clone(), "");
+        }
+        for (key, count) in &report.drops {
+            if let Some(refusal) = refusals::named_drop(key) {
+                add(format!("{count} × {}", refusal.means), refusal.fix);
+            }
+        }
+        faults
+    }
+}
+
+impl FleetNode {
+    fn is_revoked(&self) -> bool {
+        self.member.as_ref().is_some_and(|member| member.revoked_ms.is_some())
+    }
+}
+
+/// Returns the messages of all topics of a node.
+fn messages(report: &NodeReport) -> u64 {
+    report.topics.iter().fold(0, |sum, topic| sum.saturating_add(topic.messages))
+}
+
+fn topic_row(topic: &ReportTopic) -> Vec<String> {
+    vec![
+        topic.direction.clone(),
+        topic.topic.clone(),
+        topic.type_name.clone().unwrap_or_else(|| "?".into()),
+        topic.owner.clone(),
+        topic.messages.to_string(),
+        topic.state.clone(),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use sgc_node::admin::report::ReportRouter;
+    use sgc_node::alerts::Alert;
+
+    use super::*;
+
+    const NOW: u64 = 1_795_000_000_000;
+    const HOUR: u64 = 3_600_000;
+
+    fn member(name: &str, id: &str, router: bool) -> ReportMember {
+        ReportMember {
+            name: name.into(),
+            id: id.into(),
+            router,
+            generation: 2,
+            expires_ms: Some(NOW + 90 * 24 * HOUR),
+            seen_ms: (name != "lost").then_some(NOW - 3 * HOUR),
+            ..ReportMember::default()
+        }
+    }
+
+    fn report(name: &str, links: &[(&str, u64)]) -> NodeReport {
+        let link = |(peer, rtt_us): &(&str, u64)| ReportLink {
+            peer: (*peer).into(),
+            rtt_us: *rtt_us,
+            ..ReportLink::default()
+        };
+        let topic = ReportTopic {
+            direction: "share".into(),
+            topic: "/odom".into(),
+            messages: 500,
+            state: "granted".into(),
+            ..ReportTopic::default()
+        };
+        NodeReport {
+            node: name.into(),
+            version: "0.1.0".into(),
+            uptime_s: 7200,
+            clock_ms: NOW - 800,
+            certificate_until_ms: NOW + 80 * 24 * HOUR,
+            secret_generation: Some(2),
+            links: links.iter().map(link).collect(),
+            topics: vec![topic],
+            ..NodeReport::default()
+        }
+    }
+
+    fn told(report: NodeReport) -> ReportAnswer {
+        ReportAnswer { node: report.node.clone(), report: Some(report), ..ReportAnswer::default() }
+    }
+
+    fn untold(node: &str, error: &str) -> ReportAnswer {
+        ReportAnswer { node: node.into(), error: Some(error.into()), ..ReportAnswer::default() }
+    }
+
+    fn fleet(answers: Vec<ReportAnswer>) -> FleetStatus {
+        let mut stolen = member("stolen", "55", false);
+        stolen.revoked_ms = Some(NOW);
+        let members = vec![
+            member("cloud", "11", true),
+            member("arm", "22", false),
+            member("desk", "33", false),
+            member("lost", "44", false),
+            stolen,
+        ];
+        FleetStatus::new(UnixMillis(NOW), members, answers, &[])
+    }
+
+    #[test]
+    fn overview_names_links_and_says_what_is_absent() {
+        let fleet = fleet(vec![
+            told(report("arm", &[("11", 23_000), ("33", 500)])),
+            told(report("desk", &[("22", 500), ("99aabbccdd", 70), ("11", 1000)])),
+            untold("cloud", "not in reach"),
+            untold("lost", "not in reach"),
+        ]);
+        let lines = fleet.overview(None);
+        let summary = "5 nodes, 2 here, 2 without a report, 1 revoked; 1 of them needs attention";
+        assert_eq!(lines[0], summary);
+        let row = |name: &str| lines.iter().find(|line| line.starts_with(name)).cloned().unwrap_or_default();
+        for (name, parts) in [
+            (
+                "arm",
+                &["here", "2 h 0 min", "0.1.0", "80 d 0 h left", "cloud 23 ms, desk 0.50 ms direct", "500"][..],
+            ),
+            ("desk", &["arm 0.50 ms direct, 99aabbcc 0.07 ms direct, 1 more"]),
+            ("cloud", &["no report, but linked", "90 d 0 h left"]),
+            ("lost", &["no report  "]),
+            ("stolen", &["revoked"]),
+        ] {
+            for part in parts {
+                assert!(row(name).contains(part), "{part:?} is not in {:?}", row(name));
+            }
+        }
+        assert!(
+            lines.iter().any(|line| line.contains("lost") && line.contains("not in reach")),
+            "{lines:#?}"
+        );
+    }
+
+    #[test]
+    fn each_fault_of_a_report_needs_attention() {
+        let sound = report("arm", &[("11", 23_000)]);
+        let alert = Alert::RestartPending { changes: vec!["`listen` changed".into()] };
+        let router = |state: &str| ReportRouter {
+            router: "quic://cloud:7447".into(),
+            state: state.into(),
+            last_failure: Some("no answer".into()),
+        };
+        let silent = ReportLink { peer: "11".into(), silent: true, ..ReportLink::default() };
+        for (faulty, what) in [
+            (NodeReport { alerts: vec![alert], ..sound.clone() }, "`listen` changed"),
+            (
+                NodeReport { clock_ms: NOW - HOUR, ..sound.clone() },
+                "its clock is 1 h 0 min behind the one here",
+            ),
+            (NodeReport { clock_ms: NOW + HOUR, ..sound.clone() }, "ahead of the one here"),
+            (
+                NodeReport { certificate_until_ms: NOW + HOUR, ..sound.clone() },
+                "its certificate: 1 h 0 min left",
+            ),
+            (NodeReport { certificate_until_ms: 0, ..sound.clone() }, "its certificate: ended"),
+            (NodeReport { secret_generation: Some(1), ..sound.clone() }, "it has generation 1"),
+            (NodeReport { links: vec![silent], ..sound.clone() }, "cloud does not answer it"),
+            (
+                NodeReport { routers: vec![router("trying again")], ..sound.clone() },
+                "quic://cloud:7447 is trying again: no answer",
+            ),
+            (NodeReport { problems: vec!["/a: types differ".into()], ..sound.clone() }, "/a: types differ"),
+            (
+                NodeReport { drops: [("hop_limit".to_owned(), 3)].into(), ..sound.clone() },
+                "3 × it went in a circle",
+            ),
+        ] {
+            let lines = fleet(vec![told(faulty), told(report("desk", &[]))]).overview(None);
+            assert!(lines.iter().any(|line| line.contains(what)), "{what:?} is not in {lines:#?}");
+        }
+        // One of two routers is enough, and ordinary drops need nothing.
+        let well = NodeReport {
+            routers: vec![router("trying again"), router("linked")],
+            drops: [("stale".to_owned(), 3)].into(),
+            ..sound
+        };
+        let lines = fleet(vec![told(well)]).overview(None);
+        assert!(lines[0].ends_with("nothing needs attention"), "{lines:#?}");
+    }
+
+    #[test]
+    fn rates_are_of_the_time_between_two_looks() {
+        let before = fleet(vec![told(report("arm", &[])), told(report("desk", &[]))]);
+        let later = |name: &str, messages: u64, uptime_s: u64| {
+            let mut report = report(name, &[]);
+            (report.clock_ms, report.uptime_s) = (report.clock_ms + 2000, uptime_s);
+            report.topics.iter_mut().for_each(|topic| topic.messages = messages);
+            told(report)
+        };
+        let now = fleet(vec![later("arm", 520, 7202), later("desk", 3, 1)]);
+        let lines = now.overview(Some(&before));
+        let last = |name: &str| {
+            let line = lines.iter().find(|line| line.starts_with(name)).cloned().unwrap_or_default();
+            line.rsplit("  ").next().unwrap_or_default().to_owned()
+        };
+        assert!(lines.iter().any(|line| line.ends_with("messages/s")), "{lines:#?}");
+        assert_eq!((last("arm"), last("desk")), ("10.0".into(), "–".into()));
+    }
+
+    #[test]
+    fn details_have_every_topic_and_the_meaning_of_each_drop() {
+        let mut report = report("arm", &[("11", 23_000), ("33", 500)]);
+        report.drops = [("no_subscriber".to_owned(), 7)].into();
+        report.topics_omitted = 4;
+        let fleet = fleet(vec![told(report), untold("desk", "not in reach")]);
+        let of = |name: &str| {
+            let node = fleet.nodes.iter().find(|node| node.name == name);
+            node.map(|node| fleet.details(node).join("\n")).unwrap_or_default()
+        };
+        let arm = of("arm");
+        for part in [
+            "cloud  a router  23 ms",
+            "desk   itself    0.50 ms",
+            "share  /odom  ?",
+            "and 4 more",
+            "no_subscriber  7",
+        ] {
+            assert!(arm.contains(part), "{part:?} is not in {arm}");
+        }
+        assert!(of("desk").contains("not in reach") && of("stolen").contains("revoked"));
+    }
+}

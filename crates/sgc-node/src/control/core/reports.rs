@@ -1,0 +1,230 @@
+//! Reports: those that observers ask of this node, and those that its users ask of other nodes.
+
+use std::time::Instant;
+
+use bytes::Bytes;
+use sgc_endpoint::{JoinStatus, RefusedBy, pack_report, unpack_report};
+use sgc_ros::{RosNetwork, Routes};
+use sgc_trust::{Grantees, VerifiedPeer};
+use sgc_wire::{Decode as _, Name, RefuseReason, Report, ReportQuestion, SinkId};
+use tokio::sync::oneshot;
+use tracing::warn;
+
+use super::Core;
+use crate::admin::report::{
+    NodeReport, REPORT_FAULTS_MAX, REPORT_LINKS_MAX, REPORT_ROUTERS_MAX, REPORT_TOPICS_MAX, ReportLink,
+    ReportRouter, ReportTopic, keep_interface,
+};
+use crate::clock::now;
+use crate::control::event::CoreEvent;
+use crate::control::fleet::authority::Authority;
+use crate::control::fleet::inquiries::{InquiryAnswer, InquiryError, InquiryTarget};
+use crate::control::fleet::reports::ReportStep;
+use crate::drops::NodeDrop;
+use crate::state::audit::{AuditEvent, AuditRecord};
+
+/// Reports of this node.
+impl<N: RosNetwork> Core<N> {
+    /// Sets who may ask this node how it is doing.
+    pub(super) fn set_observers(&mut self, observers: Grantees) {
+        let is_offered = self.reports.set_observers(observers);
+        self.endpoint.offer_reports(now(), is_offered);
+    }
+
+    /// Answers an observer, and refuses others.
+    pub(super) fn report_asked(&mut self, sink: SinkId, peer: &VerifiedPeer, question: &Bytes) {
+        let refusal = match ReportQuestion::from_slice(question) {
+            _ if !self.reports.may_ask(peer) => {
+                let node = self.called(&peer.node_id);
+                if self.control_drops.count_from(NodeDrop::ReportNotPermitted, peer.node_id) {
+                    warn!("refused a report to {node}, which is no observer; counted from here on");
+                }
+                let record = AuditRecord::new(AuditEvent::Refused).peer(&peer.node_id);
+                self.audit.write(record.reason("a report: it is no observer"));
+                RefuseReason::NotPermitted
+            }
+            // A later version may know further questions.
+            Err(_) => RefuseReason::RoleNotOffered,
+            Ok(question) => match self.reports.ask(Instant::now(), &question, sink) {
+                ReportStep::Answer(report) => {
+                    return self.endpoint.answer_report(now(), sink, Ok(report));
+                }
+                ReportStep::Make => return self.make_report(question),
+                ReportStep::UnderWay => return,
+                ReportStep::Full => RefuseReason::Limit,
+            },
+        };
+        self.endpoint.answer_report(now(), sink, Err(refusal));
+    }
+
+    /// Makes a report on a blocking thread, since a document may be long and an authority reads its file.
+    fn make_report(&mut self, question: ReportQuestion) {
+        let Some(events) = self.events.upgrade() else { return };
+        let (alive, document) = (self.alive.clone(), self.document_job(&question));
+        tokio::task::spawn_blocking(move || {
+            let _alive = alive;
+            // A stopping node answers nobody.
+            let _ = events.blocking_send(CoreEvent::ReportMade(question, pack_report(&document())));
+        });
+    }
+
+    /// Answers those who wait for a report.
+    pub(super) fn report_made(&mut self, question: ReportQuestion, report: Option<Report>) {
+        for sink in self.reports.made(Instant::now(), question, report.as_ref()) {
+            self.endpoint.answer_report(now(), sink, report.clone().ok_or(RefuseReason::Limit));
+        }
+    }
+
+    /// Returns a blocking job that makes the document for a question, of the state as it is now.
+    fn document_job(&mut self, question: &ReportQuestion) -> Box<dyn FnOnce() -> Bytes + Send> {
+        match question {
+            ReportQuestion::Condition => {
+                self.note_present_members();
+                let members = self.authority.as_ref().map(Authority::members_job);
+                let mut report = self.condition();
+                Box::new(move || {
+                    match members.map(|read| read()) {
+                        Some(Ok(members)) => report.set_members(members),
+                        Some(Err(error)) => report.problems.push(format!("the fleet file: {error}")),
+                        None => {}
+                    }
+                    report.to_json().into()
+                })
+            }
+            ReportQuestion::Interface(interface) => {
+                let (mut graph, interface) = (self.graph(None), interface.clone());
+                Box::new(move || {
+                    keep_interface(&mut graph, &interface);
+                    serde_json::to_string(&graph).unwrap_or_default().into()
+                })
+            }
+        }
+    }
+
+    fn condition(&self) -> NodeReport {
+        let identity = self.certificates.identity();
+        let mut alerts = self.alerts();
+        alerts.extend(self.certificates.gateway_alerts());
+        alerts.truncate(REPORT_FAULTS_MAX);
+        let mut problems = self.problems();
+        problems.truncate(REPORT_FAULTS_MAX);
+        let topic = |route: sgc_ros::RouteStatus| {
+            let line = self.route_line(route);
+            ReportTopic {
+                direction: line.direction.to_owned(),
+                topic: line.topic,
+                type_name: line.type_name,
+                owner: line.owner,
+                state: line.state,
+                messages: line.messages,
+            }
+        };
+        let mut topics = self.routes.iter().flat_map(Routes::status);
+        let shown = topics.by_ref().take(REPORT_TOPICS_MAX).map(topic).collect();
+        let link = |(id, entry): (_, &crate::control::parts::link_table::LinkEntry)| {
+            let peer = entry.peer().node_id;
+            ReportLink {
+                peer: peer.to_string(),
+                name: self.audit.name_of(&peer),
+                rtt_us: entry.stats().rtt.as_micros().try_into().unwrap_or(u64::MAX),
+                silent: self.router.link_cost(id).is_some_and(|(_, is_silent)| is_silent),
+                dialled: entry.url().is_some(),
+            }
+        };
+        let routers = self.board.snapshot().into_iter().take(REPORT_ROUTERS_MAX);
+        NodeReport {
+            node: identity.node_name().to_string(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            uptime_s: self.started.elapsed().as_secs(),
+            clock_ms: now().unix.0,
+            has_ros: self.routes.is_some(),
+            is_router: self.router.is_transit(),
+            certificate_until_ms: identity.not_after().0,
+            secret_generation: identity.naming_secrets().first().map(|secret| secret.generation),
+            links: self.links.iter().take(REPORT_LINKS_MAX).map(link).collect(),
+            links_omitted: self.links.iter().count().saturating_sub(REPORT_LINKS_MAX),
+            routers: routers
+                .map(|search| ReportRouter {
+                    router: search.router,
+                    state: search.state.to_string(),
+                    last_failure: search.last_failure,
+                })
+                .collect(),
+            topics: shown,
+            topics_omitted: topics.count(),
+            drops: self.drops_by_reason(),
+            refused: self.all_refused(),
+            alerts,
+            problems,
+            members: None,
+            members_omitted: 0,
+        }
+    }
+}
+
+/// Reports of other nodes.
+impl<N: RosNetwork> Core<N> {
+    /// Asks a node for a report, on behalf of a user.
+    pub(super) fn inquire(
+        &mut self,
+        at: &InquiryTarget,
+        question: ReportQuestion,
+        reply: oneshot::Sender<InquiryAnswer>,
+    ) {
+        let identity = self.certificates.identity();
+        let node = match at {
+            InquiryTarget::Node(name) => identity.node_id_of(name.as_str()).ok_or(InquiryError::NoSecret),
+            InquiryTarget::Authority => identity.authority().ok_or(InquiryError::NoAuthority),
+        };
+        let is_own = matches!(at, InquiryTarget::Node(name) if name == identity.node_name())
+            || node.as_ref().is_ok_and(|node| *node == identity.node_id());
+        let node = match node {
+            _ if is_own => {
+                let document = self.document_job(&question);
+                tokio::task::spawn_blocking(move || reply.send(Ok(document())));
+                return;
+            }
+            Err(why) => {
+                let _ = reply.send(Err(why));
+                return;
+            }
+            Ok(node) => node,
+        };
+        self.inquiries.push(node, question, reply);
+        self.next_inquiry();
+    }
+
+    pub(super) fn report_told(&mut self, name: Name, report: &Report) {
+        let document = unpack_report(report).map_err(InquiryError::Unreadable);
+        if self.inquiries.end(name, document) {
+            self.leave_inquiry(&name);
+        }
+    }
+
+    pub(super) fn report_denied(&mut self, name: Name, by: RefusedBy) {
+        if self.inquiries.denied(name, by) {
+            self.leave_inquiry(&name);
+        }
+    }
+
+    pub(super) fn inquiries_due(&mut self, at: Instant) {
+        if self.inquiries.deadline().is_none_or(|due| due > at) {
+            return;
+        }
+        let endpoint = &self.endpoint;
+        let is_found = |name: &Name| !matches!(endpoint.join_status(name), None | Some(JoinStatus::Waiting));
+        for name in self.inquiries.expire(at, is_found) {
+            self.leave_inquiry(&name);
+        }
+    }
+
+    fn leave_inquiry(&mut self, name: &Name) {
+        self.endpoint.leave(now(), name);
+        self.next_inquiry();
+    }
+
+    fn next_inquiry(&mut self) {
+        let (at, endpoint) = (Instant::now(), &mut self.endpoint);
+        while self.inquiries.next(at, |node, question| endpoint.ask_report(now(), node, question)) {}
+    }
+}

@@ -1,0 +1,131 @@
+//! Observers ask nodes of their fleet how they are doing, over a router that learns nothing of it.
+
+#![allow(clippy::unwrap_used)]
+
+#[path = "support/lab.rs"]
+mod lab;
+mod support;
+
+use std::time::Instant;
+
+use lab::*;
+use sgc_node::admin::{AdminRequest, ReportAnswer, ReportRequest};
+use sgc_node::audit::AuditRecord;
+use sgc_node::config::{AuthorityConfig, Config, Recipient};
+use support::*;
+
+/// Returns a fleet with an authority `keeper`, an observer `desk`, and these nodes.
+fn observed(nodes: &[&str]) -> Lab {
+    let lab = Lab::new(&[]);
+    lab.with_fleet(|fleet| fleet.set_authority(Some("keeper".parse().unwrap()), unix_now()).unwrap());
+    lab.enroll("keeper", |_| {});
+    lab.enroll("desk", |request| request.groups.push("observers".parse().unwrap()));
+    nodes.iter().for_each(|node| lab.enroll(node, |_| {}));
+    lab
+}
+
+fn keeper(lab: &Lab) -> Node {
+    lab.start("keeper", |c| c.authority = Some(AuthorityConfig::new(lab.fleet_file())))
+}
+
+fn ask(node: &Node, nodes: &[&str], interface: Option<&str>) -> Vec<ReportAnswer> {
+    let nodes = nodes.iter().map(|node| (*node).to_owned()).collect();
+    let request = ReportRequest { nodes, interface: interface.map(str::to_owned) };
+    let mut answer = node.ask(&AdminRequest::Report(request));
+    serde_json::from_value(answer["ok"].take()).unwrap()
+}
+
+/// Asks one node until it gives a report.
+fn report_of(asker: &Node, node: &str) -> sgc_node::admin::report::NodeReport {
+    let ask = || ask(asker, &[node], None).remove(0).report;
+    wait(&format!("a report of {node}"), || ask().is_some());
+    ask().unwrap()
+}
+
+fn error_of(asker: &Node, node: &str) -> String {
+    ask(asker, &[node], None).remove(0).error.unwrap_or_default()
+}
+
+#[test]
+fn observer_learns_from_the_authority_who_is_there_and_from_each_node_how_it_is_doing() {
+    let lab = observed(&["robot", "absent"]);
+    let everyone = |c: &mut Config| c.observers = Some(vec![Recipient::Everyone]);
+    let (_cloud, _keeper) = (lab.cloud_with(everyone), keeper(&lab));
+    let robot = lab.start("robot", |c| c.shares = vec![share("/chatter", &["desk"])]);
+    let desk = lab.start("desk", |c| c.uses = vec![uses("/chatter")]);
+    let (talker, listener) = (lab.talker("robot", "/chatter"), lab.listener("desk", "/chatter"));
+    talker.wait_for_readers(1);
+    warm_up(&talker, &[&listener]);
+
+    // Without a name, the authority of the own identity is asked.
+    let of_authority = ask(&desk, &[], None).remove(0).report.unwrap();
+    assert_eq!(of_authority.node, "keeper");
+    let members = of_authority.members.unwrap();
+    let names: Vec<_> = members.iter().map(|member| member.name.as_str()).collect();
+    assert_eq!(names, ["absent", "cloud", "desk", "keeper", "robot"]);
+    let robot_s = members.iter().find(|member| member.name == "robot").unwrap();
+    assert_eq!((&robot_s.id, robot_s.router), (&lab.id("robot").to_string(), false));
+    wait("the authority has seen the robot", || {
+        let members = ask(&desk, &[], None).remove(0).report.and_then(|report| report.members);
+        members.is_some_and(|all| all.iter().any(|member| member.name == "robot" && member.seen_ms.is_some()))
+    });
+
+    let report = report_of(&desk, "robot");
+    assert_eq!((report.node.as_str(), report.has_ros, report.is_router), ("robot", true, false));
+    assert_eq!(report.version, env!("CARGO_PKG_VERSION"));
+    assert_eq!(report.secret_generation, Some(1));
+    assert!(report.clock_ms.abs_diff(unix_now().0) < 60_000 && report.certificate_until_ms > unix_now().0);
+    assert_eq!(report.links[0].peer, lab.id("cloud").to_string());
+    let topic = &report.topics[0];
+    assert_eq!((topic.direction.as_str(), topic.topic.as_str()), ("share", "/chatter"));
+    assert!(topic.messages > 0 && report.members.is_none());
+    // Others are asked beside one that is absent, and the own report is given, too.
+    let begun = Instant::now();
+    let all = ask(&desk, &["robot", "absent", "desk", "cloud"], None);
+    assert!(begun.elapsed().as_secs() < 9, "{:?}", begun.elapsed());
+    let seen: Vec<_> = all.iter().map(|answer| answer.report.as_ref().map(|r| r.is_router)).collect();
+    assert_eq!(seen, [Some(false), None, Some(false), Some(true)], "{all:?}");
+    assert!(all[1].error.as_ref().is_some_and(|error| error.starts_with("not in reach")), "{all:?}");
+
+    let of_topic = ask(&desk, &["robot"], Some("/chatter")).remove(0).graph.unwrap();
+    assert_eq!((of_topic.node.as_str(), of_topic.shares[0].routes.len()), ("robot", 1));
+    assert!(of_topic.endpoints.iter().any(|endpoint| endpoint.topic == "/chatter" && endpoint.writes));
+    let other = ask(&desk, &["robot"], Some("/other")).remove(0).graph.unwrap();
+    assert!(other.endpoints.is_empty() && other.shares[0].routes.is_empty() && other.names.is_empty());
+
+    // A node that dies gives no more reports, and gives them again after its start.
+    robot.kill();
+    wait("it is gone", || ask(&desk, &["robot"], None).remove(0).error.is_some());
+    let _robot = lab.start("robot", |_| {});
+    assert_eq!(report_of(&desk, "robot").topics.len(), 0);
+}
+
+#[test]
+fn node_that_is_no_observer_learns_nothing_and_a_reload_decides_anew() {
+    let lab = observed(&["robot", "guest"]);
+    let cloud = lab.cloud();
+    let _keeper = keeper(&lab);
+    let robot = lab.start("robot", |_| {});
+    let (desk, guest) = (lab.start("desk", |_| {}), lab.start("guest", |_| {}));
+    report_of(&desk, "robot");
+    let refused = "it does not take this node for an observer";
+    wait("the guest is refused", || error_of(&guest, "robot").starts_with(refused));
+    assert!(robot.drops("report_not_permitted") > 0);
+    let is_refusal =
+        |r: &AuditRecord| r.event == "refused" && r.reason.as_deref() == Some("a report: it is no observer");
+    wait("the audit log has it", || lab.audit("robot").iter().any(is_refusal));
+    // A router has no secret of the fleet, so it can find no node by its name, and by default nobody observes it.
+    assert!(error_of(&cloud, "robot").starts_with("this node is a router"));
+    assert!(error_of(&desk, "cloud").starts_with("not in reach"));
+
+    let report = robot.reload(|c| c.observers = Some(nodes(&["guest"])));
+    assert_eq!(report["changed"][0], "who may ask this node how it is doing changed");
+    assert_eq!(report_of(&guest, "robot").node, "robot");
+    assert!(error_of(&desk, "robot").starts_with(refused));
+    robot.reload(|c| c.observers = Some(Vec::new()));
+    wait("nobody is answered", || error_of(&guest, "robot").starts_with("not in reach"));
+    robot.reload(|c| c.observers = None);
+    report_of(&desk, "robot");
+    let none = ask(&guest, &[], None).remove(0);
+    assert!(none.error.is_some_and(|error| error.starts_with(refused)), "the authority decides for itself");
+}

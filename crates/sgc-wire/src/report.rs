@@ -1,0 +1,107 @@
+//! Reports over the wire: what an observer asks a node of its fleet, and the answer.
+//!
+//! The answer is a document in JSON, so that nodes of different versions understand each other's. Here it is bytes,
+//! compressed or not.
+
+use bytes::Bytes;
+
+use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
+use crate::message::PayloadEncoding;
+
+/// Longest report, bytes, before it is compressed.
+pub const REPORT_BYTES_MAX: usize = 1024 * 1024;
+/// Longest name of an interface in a question, bytes. A ROS 2 name with its prefix has at most 255 in DDS.
+pub const REPORT_INTERFACE_BYTES_MAX: usize = 255;
+
+/// A question at the name of a node's reports.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum ReportQuestion {
+    /// How the node is doing.
+    Condition,
+    /// Everything that explains whether this topic, service or action flows; by its name at that node.
+    Interface(String),
+}
+
+/// The answer to a [`ReportQuestion`].
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Report {
+    /// Compression of the document: none, or Zstandard.
+    pub encoding: PayloadEncoding,
+    /// The document, JSON.
+    pub document: Bytes,
+}
+
+impl Encode for ReportQuestion {
+    fn encode(&self, w: &mut Writer) {
+        match self {
+            Self::Condition => w.u8(0),
+            Self::Interface(name) => {
+                w.u8(1);
+                w.str(name);
+            }
+        }
+    }
+}
+
+impl Decode for ReportQuestion {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        match r.u8()? {
+            0 => Ok(Self::Condition),
+            1 => Ok(Self::Interface(r.str("interface", REPORT_INTERFACE_BYTES_MAX)?)),
+            v => Err(DecodeError::value("question for a report", v.into())),
+        }
+    }
+}
+
+impl Encode for Report {
+    fn encode(&self, w: &mut Writer) {
+        w.u8(self.encoding as u8);
+        w.bytes(&self.document);
+    }
+}
+
+impl Decode for Report {
+    fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
+        let encoding = match r.u8()? {
+            0 => PayloadEncoding::Plain,
+            1 => PayloadEncoding::Zstd,
+            v => return Err(DecodeError::value("encoding of a report", v.into())),
+        };
+        Ok(Self { encoding, document: r.bytes("report", REPORT_BYTES_MAX).map(Bytes::copy_from_slice)? })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::control::ASK_BYTES_MAX;
+
+    /// The bytes are normative.
+    #[test]
+    fn questions_and_reports_have_these_bytes() {
+        for (question, bytes) in [
+            (ReportQuestion::Condition, &[0][..]),
+            (ReportQuestion::Interface("/a".into()), &[1, 0, 0, 0, 2, b'/', b'a']),
+        ] {
+            assert_eq!(question.to_vec(), bytes);
+            assert_eq!(ReportQuestion::from_slice(bytes), Ok(question));
+        }
+        let report = Report { encoding: PayloadEncoding::Zstd, document: Bytes::from_static(b"xy") };
+        assert_eq!(report.to_vec(), [1, 0, 0, 0, 2, b'x', b'y']);
+        assert_eq!(Report::from_slice(&report.to_vec()), Ok(report));
+    }
+
+    #[test]
+    fn longer_and_unknown_ones_are_refused() {
+        let question = |bytes| ReportQuestion::Interface("a".repeat(bytes)).to_vec();
+        let longest = question(REPORT_INTERFACE_BYTES_MAX);
+        assert!(longest.len() <= ASK_BYTES_MAX && ReportQuestion::from_slice(&longest).is_ok());
+        let longer = ReportQuestion::from_slice(&question(REPORT_INTERFACE_BYTES_MAX + 1));
+        assert!(matches!(longer, Err(DecodeError::TooLong { .. })), "{longer:?}");
+        assert!(ReportQuestion::from_slice(&[2]).is_err() && ReportQuestion::from_slice(&[0, 0]).is_err());
+        assert!(Report::from_slice(&[2, 0, 0, 0, 0]).is_err());
+        let document = vec![0; REPORT_BYTES_MAX + 1].into();
+        let longer = Report::from_slice(&Report { encoding: PayloadEncoding::Plain, document }.to_vec());
+        assert!(matches!(longer, Err(DecodeError::TooLong { .. })), "{longer:?}");
+    }
+}

@@ -1,0 +1,189 @@
+//! `sgc fleet status` and `sgc fleet why`: what the nodes of the fleet report. A node of this user asks them over the mesh
+//! as an observer.
+
+use std::io::IsTerminal as _;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Args;
+use sgc_diagnosis::fleet::{FleetStatus, ask_nodes};
+use sgc_diagnosis::{DiagnosisError, Step, Verdict, diagnose};
+use sgc_node::admin::report::{NodeReport, ReportMember};
+use sgc_node::roster_row;
+use sgc_process::{ProcessError, unix_now};
+use sgc_trust::NodeName;
+
+use super::{WhichFleet, fleet_here, parse_span};
+use crate::error::{CliError, EXIT_FAILURE};
+use crate::{node, output};
+
+/// Shortest time between two looks. Nodes give the same report for half a second.
+const WATCH_MIN: Duration = Duration::from_secs(1);
+/// Clears the terminal.
+const CLEAR: &str = "\x1b[2J\x1b[H";
+
+/// Show how the nodes of the fleet are doing.
+///
+/// Your node that runs here asks the others over the mesh. They answer observers: enroll your node with `--group
+/// observers`. Without names, the fleet's authority is asked for the members, and each of them for its report. With
+/// names, everything that these nodes report is shown.
+#[derive(Debug, Args)]
+pub(super) struct StatusArgs {
+    /// Names of nodes, for their details
+    #[arg(value_name = "NODE")]
+    nodes: Vec<String>,
+    /// Fleet file with the members; without it, the fleet's authority is asked, then the only *.fleet file of this
+    /// directory
+    #[arg(long, value_name = "FILE")]
+    fleet: Option<PathBuf>,
+    /// Look again every TIME, such as 2s, and show rates; --watch alone looks every 5s
+    #[arg(long, value_name = "TIME", num_args = 0..=1, require_equals = true, default_missing_value = "5s",
+          value_parser = parse_span)]
+    watch: Option<Duration>,
+    /// Status socket of the node that asks, if it is not the only one here
+    #[arg(long, value_name = "PATH")]
+    socket: Option<PathBuf>,
+    /// Print a JSON document; with --watch, one in each line
+    #[arg(long)]
+    json: bool,
+}
+
+/// Explain why a topic, service or action of another node does not flow.
+///
+/// The command follows the path at that node, as `sgc why` does there. Your node that runs here asks for it over the
+/// mesh, as an observer. Exit code 0 means that nothing is wrong there; 1 means that something is, or that the node did
+/// not answer.
+#[derive(Debug, Args)]
+pub(super) struct WhyArgs {
+    /// Node, and topic, service or action by its name there, such as robot:/camera
+    #[arg(value_name = "NODE:/TOPIC")]
+    at: String,
+    /// Status socket of the node that asks, if it is not the only one here
+    #[arg(long, value_name = "PATH")]
+    socket: Option<PathBuf>,
+    /// Print the steps as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// The members of a fleet.
+#[derive(Default)]
+struct Members {
+    members: Vec<ReportMember>,
+    omitted: usize,
+}
+
+/// Runs `sgc fleet status`.
+pub(super) fn status(args: &StatusArgs) -> Result<(), CliError> {
+    for name in &args.nodes {
+        name.parse::<NodeName>()?;
+    }
+    let socket = node::socket(None, None, args.socket.as_deref())?;
+    let mut before = None;
+    loop {
+        let look = look(args, &socket)?;
+        show(args, &look, before.as_ref())?;
+        let Some(every) = args.watch else { return Ok(()) };
+        before = Some(look);
+        std::thread::sleep(every.max(WATCH_MIN));
+    }
+}
+
+fn look(args: &StatusArgs, socket: &Path) -> Result<FleetStatus, CliError> {
+    let found = members(args.fleet.as_deref(), socket);
+    let Members { members, omitted } = match found {
+        // Their details need no roster, which only adds names to their links.
+        Err(_) if !args.nodes.is_empty() && args.fleet.is_none() => Members::default(),
+        found => found?,
+    };
+    let is_asked = |member: &&ReportMember| member.revoked_ms.is_none();
+    let nodes = match args.nodes.is_empty() {
+        true => members.iter().filter(is_asked).map(|member| member.name.clone()).collect(),
+        false => args.nodes.clone(),
+    };
+    let answers = if nodes.is_empty() { Vec::new() } else { ask_nodes(socket, &nodes, None)? };
+    let mut status = FleetStatus::new(unix_now(), members, answers, &args.nodes);
+    status.members_omitted = omitted;
+    Ok(status)
+}
+
+fn show(args: &StatusArgs, look: &FleetStatus, before: Option<&FleetStatus>) -> Result<(), CliError> {
+    if args.json {
+        let json = match args.watch {
+            Some(_) => serde_json::to_string(look),
+            None => serde_json::to_string_pretty(look),
+        };
+        let json =
+            json.map_err(|e| ProcessError::System { what: "JSON", source: std::io::Error::other(e) })?;
+        return output::line(json);
+    }
+    if args.watch.is_some() && std::io::stdout().is_terminal() {
+        output::raw(CLEAR)?;
+    }
+    let mut lines = look.overview(before);
+    for node in look.nodes.iter().filter(|node| args.nodes.contains(&node.name)) {
+        lines.extend(look.details(node));
+    }
+    if args.watch.is_some() {
+        lines.push(String::new());
+    }
+    lines.iter().try_for_each(|line| output::line(output::clean(line)))
+}
+
+/// Returns the members of the fleet: from this file, from the authority, or from the fleet file of this directory.
+fn members(file: Option<&Path>, socket: &Path) -> Result<Members, CliError> {
+    if let Some(file) = file {
+        return of_file(file);
+    }
+    let reason = match ask_nodes(socket, &[], None)?.pop() {
+        Some(answer) => match (answer.report, answer.error) {
+            (Some(NodeReport { members: Some(members), members_omitted, .. }), _) => {
+                return Ok(Members { members, omitted: members_omitted });
+            }
+            (Some(report), _) => format!("{} has no fleet file", report.node),
+            (None, error) => error.unwrap_or_default(),
+        },
+        None => String::new(),
+    };
+    let file = fleet_here(None).map_err(|_| DiagnosisError::NotSeen {
+        reason: format!(
+            "the members of the fleet are not known here. Its authority: {reason}. Name nodes (`sgc fleet status robot`) or \
+             a fleet file (`--fleet lab.fleet`)"
+        ),
+    })?;
+    of_file(&file)
+}
+
+fn of_file(file: &Path) -> Result<Members, CliError> {
+    let (_, fleet) = WhichFleet { fleet: Some(file.to_owned()) }.read()?;
+    let members = fleet.nodes().map(|node| ReportMember::new(roster_row(&fleet, node))).collect();
+    Ok(Members { members, omitted: 0 })
+}
+
+/// Runs `sgc fleet why`.
+pub(super) fn why(args: &WhyArgs) -> Result<ExitCode, CliError> {
+    let Some((node, interface)) = args.at.split_once(':') else {
+        let reason =
+            format!("{:?} names no node and topic: write them with a colon, such as robot:/camera", args.at);
+        return Err(DiagnosisError::NotSeen { reason }.into());
+    };
+    node.parse::<NodeName>()?;
+    let socket = node::socket(None, None, args.socket.as_deref())?;
+    let answer = ask_nodes(&socket, &[node.to_owned()], Some(interface))?.pop().unwrap_or_default();
+    let Some(graph) = answer.graph else {
+        let reason = format!("{node}: {}", answer.error.unwrap_or_default());
+        return Err(DiagnosisError::NotSeen { reason }.into());
+    };
+    let steps = diagnose::interface(&graph, interface);
+    if args.json {
+        output::line(serde_json::to_string(&steps).unwrap_or_default())?;
+    } else {
+        output::line(format!("At {node}:"))?;
+        for line in steps.iter().flat_map(Step::lines) {
+            output::line(output::clean(&line))?;
+        }
+    }
+    let is_wrong = steps.iter().any(|step| step.verdict == Verdict::Wrong);
+    Ok(if is_wrong { ExitCode::from(EXIT_FAILURE) } else { ExitCode::SUCCESS })
+}
