@@ -236,7 +236,7 @@ pub(crate) const CONTROL: &[Refusal] = &[
         "a node that is no operator wants to change the fleet",
         "if it may, name it in `operators` of [authority]",
     ),
-    named(
+    counted(
         NodeDrop::ReportNotPermitted.key(),
         "a node that is no observer asks how this one is doing",
         "if it may, enroll it with `--group observers`, or name it in `observers` of [admin]",
@@ -828,12 +828,6 @@ pub(crate) fn drop_meaning(row: &str) -> String {
     let mut all: Vec<_> = all.into_iter().flatten().map(|refusal| refusal.means).collect();
     all.dedup();
     all.join("; or ")
-}
-
-/// Returns the explanation of a drop on which an operator has to act.
-pub(crate) fn named_drop(key: &str) -> Option<&'static Refusal> {
-    let all = [CONTROL, PACKETS, SINK].into_iter().filter_map(|table| find(table, key));
-    all.into_iter().find(|refusal| refusal.is_named)
 }
 
 /// Returns the meaning of a row of `sgc status`, Refused peers.

@@ -3,6 +3,7 @@
 mod golden;
 pub(crate) mod scenarios;
 
+use sgc_node::admin::report::keep_interface;
 use sgc_node::alerts::Alert;
 use sgc_node::graph::{
     Endpoint, Graph, Interface, LostCalls, NameLine, Qos, ServiceCalls, Share, ShareRoute, UnheardMember, Use,
@@ -72,6 +73,24 @@ fn publishers_whose_assertions_are_not_seen_elsewhere_are_pointed_out() {
     assert!(said(&with(owner(), 2, 99)) && !said(&with(owner(), 2, 100)) && !said(&with(owner(), 0, 99)));
     assert!(said(&with(publisher(), 2, 99)) && !said(&with(publisher(), 2, 100)) && !said(&publisher()));
     assert_eq!(wrong(&with(publisher(), 2, 99), "/a"), "", "it is no fault of the topic");
+}
+
+/// What another node reports of an interface has the same faults as the whole document there.
+#[test]
+fn graph_that_was_reduced_to_an_interface_has_the_same_fault() {
+    let sides =
+        [(owner as fn() -> Graph, owner_faults()), (user, user_faults()), (publisher, publisher_faults())];
+    for (make, faults) in sides {
+        for (found, fault) in faults {
+            let mut graph = make();
+            fault(&mut graph);
+            let whole = wrong(&graph, "/a");
+            keep_interface(&mut graph, "/a");
+            let reduced = wrong(&graph, "/a");
+            // The names of other interfaces, one of which may be meant, are not there.
+            assert!(!reduced.is_empty() && whole.starts_with(&reduced), "{found}: {reduced:?}, {whole:?}");
+        }
+    }
 }
 
 #[test]

@@ -324,7 +324,7 @@ impl Endpoint {
     }
 
     /// Asks a node of this fleet for a report, in place of an earlier question to it. Returns the name of the question,
-    /// which the caller leaves after [`crate::Event::Report`] or [`crate::Event::ReportDenied`]. A node that gives no
+    /// which the caller leaves after [`crate::Event::Report`] or [`crate::Event::ReportRefused`]. A node that gives no
     /// reports, or of a version that cannot, does not advertise the name: then nothing happens.
     pub fn ask_report(&mut self, now: Now, peer: NodeId, question: &ReportQuestion) -> Name {
         self.cx.set_now(now);

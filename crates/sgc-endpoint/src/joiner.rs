@@ -325,7 +325,7 @@ impl Joiner {
             (Some(owner), _) => cx.event(Event::OwnerRefused { owner, by }),
             (None, Some(JoinKind::Renew(_))) => cx.event(Event::RenewRefused { by }),
             (None, Some(JoinKind::Operate(_))) => cx.event(Event::OperationDenied { name, by }),
-            (None, Some(JoinKind::Report(_))) => cx.event(Event::ReportDenied { name, by }),
+            (None, Some(JoinKind::Report(_))) => cx.event(Event::ReportRefused { name, by }),
             // A missing description shows where it is needed.
             (None, Some(JoinKind::Types(_) | JoinKind::Consumers)) => {}
             (None, _) => cx.event(Event::Refused { name, by }),

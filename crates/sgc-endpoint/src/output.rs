@@ -131,7 +131,7 @@ pub enum Event {
         report: Report,
     },
     /// A node, or a router before it, refuses a report.
-    ReportDenied {
+    ReportRefused {
         /// The name of the question.
         name: Name,
         /// The refusing node, with the reason.

@@ -1,16 +1,17 @@
 //! Reports as they travel: packed, because they are long and repetitive.
 
 use bytes::Bytes;
-use sgc_wire::{REPORT_BYTES_MAX, Report};
+use sgc_wire::{REPORT_BYTES_MAX, REPORT_PACKED_BYTES_MAX, Report};
 
 use crate::compression::{CompressionError, pack, unpack};
 
-/// Packs a document. Returns `None` if it is too long for a report.
+/// Packs a document. Returns `None` if it is too long for a report, before or after.
 pub fn pack_report(document: &Bytes) -> Option<Report> {
-    (document.len() <= REPORT_BYTES_MAX).then(|| {
-        let (encoding, document) = pack(document);
-        Report { encoding, document }
-    })
+    if document.len() > REPORT_BYTES_MAX {
+        return None;
+    }
+    let (encoding, document) = pack(document);
+    (document.len() <= REPORT_PACKED_BYTES_MAX).then_some(Report { encoding, document })
 }
 
 /// Unpacks a received report. It takes no more memory than a report may have.
@@ -33,6 +34,13 @@ mod tests {
             assert_eq!(unpack_report(&packed), Ok(document));
         }
         assert_eq!(pack_report(&vec![0; REPORT_BYTES_MAX + 1].into()), None);
+        // It does not shrink.
+        let mut state = 1_u32;
+        let noise = std::iter::repeat_with(|| {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 24) as u8
+        });
+        assert_eq!(pack_report(&noise.take(REPORT_PACKED_BYTES_MAX + 1).collect()), None);
         let bomb =
             Compressor::default().compress(PayloadEncoding::Zstd, &vec![0; 8 << 20]).expect("zeros shrink");
         let bomb = Report { encoding: PayloadEncoding::Zstd, document: bomb };

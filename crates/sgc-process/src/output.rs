@@ -13,9 +13,14 @@ pub fn line(text: impl Display) -> Result<(), ProcessError> {
     writeln!(out, "{text}").and_then(|()| out.flush()).map_err(ProcessError::Output)
 }
 
-/// Removes control characters from a text of another machine.
+/// Replaces control characters, and marks that change the direction of text, in a text of another machine.
 pub fn clean(text: &str) -> String {
-    text.chars().map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect()
+    text.chars().map(|c| if is_harmful(c) { '\u{fffd}' } else { c }).collect()
+}
+
+/// Returns `true` for a control character, or a mark that changes the direction of text.
+pub fn is_harmful(c: char) -> bool {
+    c.is_control() || matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
 /// Returns a count with its noun: `1 node`, `3 nodes`.
@@ -79,6 +84,11 @@ mod tests {
         let row = |cells: &[&str]| cells.iter().map(|c| (*c).to_owned()).collect();
         assert_eq!(columns(&[row(&["a", "bb", "c"]), row(&["äöü", "d"])]), ["a    bb  c", "äöü  d"]);
         assert!(columns(&[]).is_empty());
+    }
+
+    #[test]
+    fn text_of_another_machine_neither_commands_the_terminal_nor_turns_around() {
+        assert_eq!(clean("a\u{1b}[2J\u{202e}b\nä"), "a\u{fffd}[2J\u{fffd}b\u{fffd}ä");
     }
 
     #[test]

@@ -54,7 +54,9 @@ pub use packet::{
     PACKET_VERSION, PAYLOAD_BYTES_MAX, Packet, PacketHeader, Payload,
 };
 pub use qos::{Durability, History, Liveliness, Qos, Reliability, Representations};
-pub use report::{REPORT_BYTES_MAX, REPORT_INTERFACE_BYTES_MAX, Report, ReportQuestion};
+pub use report::{
+    REPORT_BYTES_MAX, REPORT_INTERFACE_BYTES_MAX, REPORT_PACKED_BYTES_MAX, Report, ReportQuestion,
+};
 pub use ros_node::RosNode;
 pub use slab::Slab;
 pub use type_descriptions::{

@@ -10,6 +10,8 @@ use crate::message::PayloadEncoding;
 
 /// Longest report, bytes, before it is compressed.
 pub const REPORT_BYTES_MAX: usize = 1024 * 1024;
+/// Longest report as it travels, bytes. Sealed, it fits [`SEALED_BYTES_MAX`](crate::SEALED_BYTES_MAX).
+pub const REPORT_PACKED_BYTES_MAX: usize = 512 * 1024;
 /// Longest name of an interface in a question, bytes. A ROS 2 name with its prefix has at most 255 in DDS.
 pub const REPORT_INTERFACE_BYTES_MAX: usize = 255;
 
@@ -17,7 +19,7 @@ pub const REPORT_INTERFACE_BYTES_MAX: usize = 255;
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum ReportQuestion {
     /// How the node is doing.
-    Condition,
+    Node,
     /// Everything that explains whether this topic, service or action flows; by its name at that node.
     Interface(String),
 }
@@ -34,7 +36,7 @@ pub struct Report {
 impl Encode for ReportQuestion {
     fn encode(&self, w: &mut Writer) {
         match self {
-            Self::Condition => w.u8(0),
+            Self::Node => w.u8(0),
             Self::Interface(name) => {
                 w.u8(1);
                 w.str(name);
@@ -46,7 +48,7 @@ impl Encode for ReportQuestion {
 impl Decode for ReportQuestion {
     fn decode(r: &mut Reader<'_>) -> Result<Self, DecodeError> {
         match r.u8()? {
-            0 => Ok(Self::Condition),
+            0 => Ok(Self::Node),
             1 => Ok(Self::Interface(r.str("interface", REPORT_INTERFACE_BYTES_MAX)?)),
             v => Err(DecodeError::value("question for a report", v.into())),
         }
@@ -67,20 +69,24 @@ impl Decode for Report {
             1 => PayloadEncoding::Zstd,
             v => return Err(DecodeError::value("encoding of a report", v.into())),
         };
-        Ok(Self { encoding, document: r.bytes("report", REPORT_BYTES_MAX).map(Bytes::copy_from_slice)? })
+        Ok(Self {
+            encoding,
+            document: r.bytes("report", REPORT_PACKED_BYTES_MAX).map(Bytes::copy_from_slice)?,
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::control::ASK_BYTES_MAX;
+    use crate::catalogue::GrantContent;
+    use crate::control::{ASK_BYTES_MAX, SEALED_BYTES_MAX};
 
     /// The bytes are normative.
     #[test]
     fn questions_and_reports_have_these_bytes() {
         for (question, bytes) in [
-            (ReportQuestion::Condition, &[0][..]),
+            (ReportQuestion::Node, &[0][..]),
             (ReportQuestion::Interface("/a".into()), &[1, 0, 0, 0, 2, b'/', b'a']),
         ] {
             assert_eq!(question.to_vec(), bytes);
@@ -100,8 +106,10 @@ mod tests {
         assert!(matches!(longer, Err(DecodeError::TooLong { .. })), "{longer:?}");
         assert!(ReportQuestion::from_slice(&[2]).is_err() && ReportQuestion::from_slice(&[0, 0]).is_err());
         assert!(Report::from_slice(&[2, 0, 0, 0, 0]).is_err());
-        let document = vec![0; REPORT_BYTES_MAX + 1].into();
-        let longer = Report::from_slice(&Report { encoding: PayloadEncoding::Plain, document }.to_vec());
+        let report = |bytes| Report { encoding: PayloadEncoding::Plain, document: vec![0; bytes].into() };
+        let longest = GrantContent::Report(report(REPORT_PACKED_BYTES_MAX)).to_vec();
+        assert!(longest.len() < SEALED_BYTES_MAX && GrantContent::from_slice(&longest).is_ok());
+        let longer = Report::from_slice(&report(REPORT_PACKED_BYTES_MAX + 1).to_vec());
         assert!(matches!(longer, Err(DecodeError::TooLong { .. })), "{longer:?}");
     }
 }

@@ -178,7 +178,7 @@ fn operations_survive_mutation() {
 
 #[test]
 fn reports_survive_mutation_and_arbitrary_bytes() {
-    let questions = [ReportQuestion::Condition, ReportQuestion::Interface("/camera".into())];
+    let questions = [ReportQuestion::Node, ReportQuestion::Interface("/camera".into())];
     survives::<ReportQuestion>(&questions.map(|q| q.to_vec()), 12);
     let report = |encoding| Report { encoding, document: Bytes::from_static(b"{\"version\": \"1\"}") };
     let contents = [PayloadEncoding::Plain, PayloadEncoding::Zstd].map(|e| GrantContent::Report(report(e)));

@@ -9,6 +9,7 @@ use std::time::Duration;
 use clap::Args;
 use sgc_node::audit::{self, AuditEvent, AuditRecord};
 use sgc_node::config::{self, Config};
+use sgc_process::output::is_harmful;
 use sgc_process::{ProcessError, unix_now};
 
 use crate::environment::environment;
@@ -194,10 +195,6 @@ fn harmless(json: &str) -> String {
         false => c.to_string(),
     };
     json.chars().map(escape).collect()
-}
-
-fn is_harmful(c: char) -> bool {
-    c.is_control() || matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
 fn event(text: &str) -> Result<String, String> {

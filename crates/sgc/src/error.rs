@@ -424,7 +424,7 @@ fn chain(error: &dyn Error) -> String {
 }
 
 fn one_line(text: &str) -> String {
-    text.lines().map(str::trim).collect::<Vec<_>>().join(" ")
+    output::clean(&text.lines().map(str::trim).collect::<Vec<_>>().join(" "))
 }
 
 /// Lists the first few names.

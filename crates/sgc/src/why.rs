@@ -47,8 +47,13 @@ pub(crate) fn why(args: &WhyArgs) -> Result<ExitCode, CliError> {
         (Some(topic), None) => graph(args, None, |graph| diagnose::interface(graph, topic))?,
         (None, None) => Vec::new(),
     };
+    print_steps(&steps, args.json)
+}
+
+/// Prints the steps. Returns the exit code: whether one of them is wrong.
+pub(crate) fn print_steps(steps: &[Step], json: bool) -> Result<ExitCode, CliError> {
     let is_wrong = steps.iter().any(|step| step.verdict == Verdict::Wrong);
-    if args.json {
+    if json {
         output::line(serde_json::to_string(&steps).unwrap_or_default())?;
     } else {
         for line in steps.iter().flat_map(Step::lines) {

@@ -771,3 +771,71 @@ fn the_ca_is_shown_and_nothing_else() {
     assert_eq!(blocks[0].as_slice(), place.fleet().ca_certificate().as_ref());
     assert_eq!(shown.matches("-----BEGIN").count(), 1, "{shown}");
 }
+
+#[test]
+fn an_observer_sees_the_fleet_and_what_is_wrong_with_it() {
+    let place = Place::new();
+    place.good(&["fleet", "create", "lab", "--authority", "keeper"]);
+    place.good(&["fleet", "enroll", "cloud", "--router"]);
+    place.good(&["fleet", "enroll", "desk", "--group", "observers"]);
+    for node in ["keeper", "arm-1", "arm-2"] {
+        place.good(&["fleet", "enroll", node]);
+    }
+    let port = unused_port();
+    let _cloud = place.start("cloud", port, &format!("[router]\nlisten = [\"quic://127.0.0.1:{port}\"]\n"));
+    let _keeper = place.keeper(port);
+    let (_desk, arm) = (place.start("desk", port, ""), place.start("arm-1", port, ""));
+    let by_desk = |args: &[&str]| place.run(&[&["fleet"], args, &["--socket", "desk.sock"]].concat());
+    let status = |args: &[&str]| {
+        let ran = by_desk(&[&["status"], args].concat());
+        let text = String::from_utf8([ran.stdout, ran.stderr].concat()).unwrap();
+        (ran.status.code(), text)
+    };
+    let row = |text: &str, node: &str| {
+        text.lines().find(|line| line.split_whitespace().next() == Some(node)).unwrap_or_default().to_owned()
+    };
+    // Until all are linked, one or the other gives no report.
+    wait("both report", || {
+        let (_, text) = status(&[]);
+        ["keeper", "arm-1"].iter().all(|node| row(&text, node).contains("  here"))
+    });
+    let (code, text) = status(&[]);
+    assert_eq!(code, Some(0));
+    assert!(text.starts_with("5 nodes, 3 here, 2 without a report; 1 of them needs attention\n"), "{text}");
+    assert!(row(&text, "arm-1").contains("cloud "), "its link has the router's name: {text}");
+    assert!(row(&text, "cloud").contains("no report, but linked"), "{text}");
+    let absent = "Needs attention:\n  arm-2: it is not in reach, or gives no reports\n    see that it runs";
+    assert!(text.contains(absent), "{text}");
+
+    let (_, json) = status(&["--json", "arm-1"]);
+    let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert_eq!(json["nodes"].as_array().map(Vec::len), Some(1));
+    assert_eq!(json["nodes"][0]["report"]["node"], "arm-1");
+    let (_, text) = status(&["arm-1"]);
+    assert!(text.contains("\narm-1:\n  Links:\n") && text.contains("cloud  a router"), "{text}");
+
+    // `why` follows a path at another node, which has no ROS 2 network here.
+    let why = by_desk(&["why", "arm-1:/camera"]);
+    let text = String::from_utf8(why.stdout).unwrap();
+    assert_eq!(why.status.code(), Some(1), "{text}");
+    assert!(text.starts_with("At arm-1:\n✓ arm-1 runs"), "{text}");
+    for (at, says) in [
+        ("arm-1", "names no node and topic"),
+        ("arm-2:/camera", "arm-2: it is not in reach, or gives no reports; see that it runs"),
+    ] {
+        let why = by_desk(&["why", at]);
+        let text = String::from_utf8(why.stderr).unwrap();
+        assert!(why.status.code() == Some(1) && text.contains(says), "{text}");
+    }
+
+    // A node that is no observer learns how to become one.
+    let ran = place.run(&["fleet", "status", "--socket", "arm-1.sock"]);
+    let text = String::from_utf8(ran.stderr).unwrap();
+    assert_eq!(ran.status.code(), Some(1));
+    assert!(
+        text.contains("does not take the node here for an observer (enroll the node here with"),
+        "{text}"
+    );
+    drop(arm);
+    wait("its death shows", || row(&status(&[]).1, "arm-1").contains("no report, seen "));
+}

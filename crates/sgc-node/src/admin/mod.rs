@@ -12,6 +12,7 @@ pub mod shell;
 mod socket;
 pub(crate) mod status;
 
+use std::collections::BTreeSet;
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -28,7 +29,7 @@ use sgc_wire::{
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::UnixStream;
 use tokio::sync::{Semaphore, mpsc, oneshot};
-use tokio::task::JoinHandle;
+use tokio::task::{JoinHandle, JoinSet};
 use tracing::{debug, info, warn};
 use zeroize::Zeroizing;
 
@@ -37,11 +38,12 @@ pub use self::socket::{
     SocketError, connect, default_socket_path, find_socket, has_hidden_services, usual_sockets,
 };
 
-use crate::admin::graph::{Graph, Side};
+use crate::admin::graph::Side;
 use crate::admin::report::NodeReport;
 use crate::admin::shell::{CallRequest, PublishRequest};
+use crate::clock::now;
 use crate::control::event::CoreEvent;
-use crate::control::fleet::inquiries::InquiryTarget;
+use crate::control::fleet::inquiries::{InquiryAnswer, InquiryError, InquiryTarget};
 use crate::control::settings::reload::Reloader;
 use crate::data::tap::{Tap, TapMessage, TapRequest};
 use crate::gateway::Gateway;
@@ -80,7 +82,7 @@ pub enum AdminRequest {
     Reload,
     /// Apply this revocation list, DER.
     Crl(Vec<u8>),
-    /// Return the [`Graph`], also for this name if it is not in use here.
+    /// Return the [`Graph`](crate::admin::graph::Graph), also for this name if it is not in use here.
     Graph(Option<Name>),
     /// Send the messages of a topic until the connection ends.
     Tap {
@@ -114,23 +116,27 @@ pub const REPORT_NODES_MAX: usize = 256;
 pub struct ReportRequest {
     /// Names of the nodes, at most [`REPORT_NODES_MAX`]; if there are none, the fleet's authority is asked.
     pub nodes: Vec<String>,
-    /// A topic, service or action by its name at these nodes, for their [`Graph`]s of it; without one, they are asked
+    /// A topic, service or action by its name at these nodes, for their graphs of it; without one, they are asked
     /// for a [`NodeReport`].
     pub interface: Option<String>,
 }
 
-/// What a node of a [`ReportRequest`] answered: one of the three.
+/// The answer of a node of a [`ReportRequest`]: a report, a graph, or an error.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ReportAnswer {
     /// The name by which it was asked; empty for the fleet's authority.
     pub node: String,
+    /// The time of the answer by the clock of the node that asked, milliseconds since 1970.
+    pub at_ms: u64,
     /// How it is doing.
     pub report: Option<NodeReport>,
-    /// Its graph of the interface.
-    pub graph: Option<Graph>,
+    /// Its [`Graph`](crate::admin::graph::Graph) of the interface, as JSON that is not verified.
+    pub graph: Option<String>,
     /// The reason why there is no answer.
     pub error: Option<String>,
+    /// The remedy; empty if there is none to name.
+    pub fix: String,
 }
 
 /// Header of each message of a tap: [`TapHead::BYTES`] bytes, big endian, in this order. `carried` bytes of payload
@@ -573,8 +579,8 @@ async fn carry_out(request: AdminRequest, desk: &Desk) -> Result<String, String>
         AdminRequest::Tap { .. } => Err(AdminError::Argument { word: "tap" }.to_string()),
         AdminRequest::Publish(_) => Err(AdminError::Argument { word: "publish" }.to_string()),
         AdminRequest::Call(wish) => shell::call(gateway, &wish).await,
-        AdminRequest::Report(wish) => {
-            let answers = report(wish, events).await?;
+        AdminRequest::Report(request) => {
+            let answers = report(request, events).await?;
             serde_json::to_string(&answers).map_err(|error| error.to_string())
         }
         AdminRequest::Operate { at, operation } => {
@@ -600,50 +606,67 @@ async fn carry_out(request: AdminRequest, desk: &Desk) -> Result<String, String>
 }
 
 /// Asks nodes for reports, all at one time.
-async fn report(wish: ReportRequest, events: &mpsc::Sender<CoreEvent>) -> Result<Vec<ReportAnswer>, String> {
+async fn report(
+    request: ReportRequest,
+    events: &mpsc::Sender<CoreEvent>,
+) -> Result<Vec<ReportAnswer>, String> {
     let stopping = || "the node is stopping".to_owned();
-    if wish.nodes.len() > REPORT_NODES_MAX {
+    if request.nodes.len() > REPORT_NODES_MAX {
         return Err(format!("at most {REPORT_NODES_MAX} nodes are asked at one time"));
     }
-    let question = match &wish.interface {
-        None => ReportQuestion::Condition,
+    let question = match request.interface {
+        None => ReportQuestion::Node,
         Some(name) if name.len() > REPORT_INTERFACE_BYTES_MAX => {
             return Err(format!("a name has at most {REPORT_INTERFACE_BYTES_MAX} bytes"));
         }
-        Some(name) => ReportQuestion::Interface(name.clone()),
+        Some(name) => ReportQuestion::Interface(name),
     };
-    let node = |node: &String| match node.parse() {
-        Ok(name) => Ok((node.clone(), InquiryTarget::Node(name))),
+    let names: BTreeSet<String> = request.nodes.into_iter().collect();
+    let target = |node: String| match node.parse() {
+        Ok(name) => Ok((node, InquiryTarget::Node(name))),
         Err(error) => Err(format!("{node:?}: {error}")),
     };
-    let mut targets = wish.nodes.iter().map(node).collect::<Result<Vec<_>, _>>()?;
+    let mut targets = names.into_iter().map(target).collect::<Result<Vec<_>, _>>()?;
     if targets.is_empty() {
         targets.push((String::new(), InquiryTarget::Authority));
     }
-    let mut asked = Vec::new();
+    let mut asked = JoinSet::new();
     for (node, at) in targets {
-        let (reply, told) = oneshot::channel();
+        let (reply, answer) = oneshot::channel();
         let event = CoreEvent::Inquire { at, question: question.clone(), reply };
         events.send(event).await.map_err(|_| stopping())?;
-        asked.push((node, told));
+        asked.spawn(async move { (node, answer.await) });
     }
     let mut answers = Vec::new();
-    for (node, told) in asked {
-        let mut answer = ReportAnswer { node, ..ReportAnswer::default() };
-        match told.await.map_err(|_| stopping())? {
-            Ok(document) if wish.interface.is_some() => match serde_json::from_slice(&document) {
-                Ok(graph) => answer.graph = Some(graph),
-                Err(error) => answer.error = Some(format!("its report cannot be read: {error}")),
-            },
-            Ok(document) => match serde_json::from_slice(&document) {
-                Ok(report) => answer.report = Some(report),
-                Err(error) => answer.error = Some(format!("its report cannot be read: {error}")),
-            },
-            Err(why) => answer.error = Some(why.to_string()),
-        }
-        answers.push(answer);
+    while let Some(Ok((node, document))) = asked.join_next().await {
+        let document = document.map_err(|_| stopping())?;
+        answers.push(report_answer(node, &question, document));
     }
+    answers.sort_by(|a, b| a.node.cmp(&b.node));
     Ok(answers)
+}
+
+fn report_answer(node: String, question: &ReportQuestion, document: InquiryAnswer) -> ReportAnswer {
+    let unreadable = InquiryError::Unreadable;
+    let mut answer = ReportAnswer { node, at_ms: now().unix.0, ..ReportAnswer::default() };
+    let error = match (document, question) {
+        (Ok(document), ReportQuestion::Node) => match NodeReport::from_json(&document) {
+            Ok(report) => {
+                answer.report = Some(report);
+                return answer;
+            }
+            Err(_) => unreadable,
+        },
+        (Ok(document), ReportQuestion::Interface(_)) => match String::from_utf8(document.into()) {
+            Ok(graph) => {
+                answer.graph = Some(graph);
+                return answer;
+            }
+            Err(_) => unreadable,
+        },
+        (Err(error), _) => error,
+    };
+    ReportAnswer { error: Some(error.to_string()), fix: error.fix().to_owned(), ..answer }
 }
 
 fn parse_name(text: &str) -> Option<Name> {

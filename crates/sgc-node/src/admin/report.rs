@@ -3,13 +3,18 @@
 //! It comes from another machine, perhaps of another version: a reader takes a missing field for empty and ignores
 //! unknown ones.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::marker::PhantomData;
 
-use serde::{Deserialize, Serialize};
-use sgc_wire::{REPORT_BYTES_MAX, RosterRow};
+use serde::de::{IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer, Serialize};
+use sgc_ros::Interface;
+use sgc_wire::{Kind, REPORT_BYTES_MAX, RosterRow};
 
 use crate::admin::graph::Graph;
 use crate::control::faults::alerts::Alert;
+pub use crate::discovery::board::LINKED;
 
 /// Most links in a report.
 pub const REPORT_LINKS_MAX: usize = 64;
@@ -21,6 +26,10 @@ pub const REPORT_TOPICS_MAX: usize = 512;
 pub const REPORT_MEMBERS_MAX: usize = 2048;
 /// Most alerts, and most problems, in a report.
 pub const REPORT_FAULTS_MAX: usize = 32;
+/// Most reasons of drops, and of refused links, that are read.
+const REPORT_REASONS_MAX: usize = 512;
+/// Most characters of a text that is read. Names of topics have at most 255, and problems some hundred.
+const REPORT_TEXT_CHARS_MAX: usize = 1024;
 
 /// How a node is doing.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -40,27 +49,37 @@ pub struct NodeReport {
     pub is_router: bool,
     /// The end of the node's certificate, milliseconds since 1970.
     pub certificate_until_ms: u64,
+    /// The validity of the node's certificate from its beginning on, milliseconds. It is renewed when a third is left.
+    pub certificate_lasts_ms: u64,
     /// The newest generation of the fleet's secret that the node has; null if it has none.
     pub secret_generation: Option<u32>,
     /// Links that are up, at most 64.
+    #[serde(deserialize_with = "at_most::<REPORT_LINKS_MAX, _, _>")]
     pub links: Vec<ReportLink>,
     /// The number of further links.
     pub links_omitted: usize,
     /// Routers that the node looks for, at most 16.
+    #[serde(deserialize_with = "at_most::<REPORT_ROUTERS_MAX, _, _>")]
     pub routers: Vec<ReportRouter>,
     /// Shares and uses, at most 512.
+    #[serde(deserialize_with = "at_most::<REPORT_TOPICS_MAX, _, _>")]
     pub topics: Vec<ReportTopic>,
     /// The number of further shares and uses.
     pub topics_omitted: usize,
     /// Counts of drops and refusals since the node started, by reason.
+    #[serde(deserialize_with = "counts")]
     pub drops: BTreeMap<String, u64>,
     /// Counts of refused links since the node started, by reason.
+    #[serde(deserialize_with = "counts")]
     pub refused: BTreeMap<String, u64>,
     /// Alerts for an operator, at most 32.
+    #[serde(deserialize_with = "alerts")]
     pub alerts: Vec<Alert>,
     /// Contradictions between local endpoints and the other side, at most 32.
+    #[serde(deserialize_with = "at_most::<REPORT_FAULTS_MAX, _, _>")]
     pub problems: Vec<String>,
     /// The members of the fleet, at most 2048; null unless the node is the fleet's authority.
+    #[serde(deserialize_with = "at_most_if_any::<REPORT_MEMBERS_MAX, _, _>")]
     pub members: Option<Vec<ReportMember>>,
     /// The number of further members.
     pub members_omitted: usize,
@@ -109,6 +128,9 @@ pub struct ReportTopic {
     pub owner: String,
     /// The state, in words.
     pub state: String,
+    /// `true` if more is missing than local programs: the owner is out of reach, does not share it with the node, or
+    /// refuses it.
+    pub stuck: bool,
     /// The number of messages that were published or delivered.
     pub messages: u64,
 }
@@ -123,6 +145,8 @@ pub struct ReportMember {
     pub id: String,
     /// `true` if the node only routes.
     pub router: bool,
+    /// `true` if the node may route for others.
+    pub may_route: bool,
     /// The groups of the node.
     pub groups: Vec<String>,
     /// The end of its last certificate, milliseconds since 1970; null if all have ended.
@@ -142,6 +166,7 @@ impl ReportMember {
             name: row.name,
             id: row.id.to_string(),
             router: row.router,
+            may_route: row.may_route,
             groups: row.groups,
             expires_ms: row.expires.map(|at| at.0),
             revoked_ms: row.revoked.map(|at| at.0),
@@ -152,6 +177,27 @@ impl ReportMember {
 }
 
 impl NodeReport {
+    /// Reads the document of another node. Its texts and lists are cut to their bounds.
+    pub(crate) fn from_json(document: &[u8]) -> Result<Self, serde_json::Error> {
+        let mut report: Self = serde_json::from_slice(document)?;
+        let Self { node, version, links, routers, topics, problems, members, .. } = &mut report;
+        let of_links = links.iter_mut().flat_map(|link| [Some(&mut link.peer), link.name.as_mut()]);
+        let of_routers = routers.iter_mut().flat_map(|router| {
+            [Some(&mut router.router), Some(&mut router.state), router.last_failure.as_mut()]
+        });
+        let of_topics = topics.iter_mut().flat_map(|topic| {
+            let ReportTopic { direction, topic, type_name, owner, state, .. } = topic;
+            [Some(direction), Some(topic), type_name.as_mut(), Some(owner), Some(state)]
+        });
+        let of_members = members.iter_mut().flatten().flat_map(|member| {
+            member.groups.truncate(REPORT_FAULTS_MAX);
+            [&mut member.name, &mut member.id].into_iter().chain(&mut member.groups)
+        });
+        let texts = [node, version].into_iter().chain(problems).chain(of_members);
+        texts.chain(of_links.chain(of_routers).chain(of_topics).flatten()).for_each(cut);
+        Ok(report)
+    }
+
     /// Adds the members of the fleet.
     pub(crate) fn set_members(&mut self, mut members: Vec<ReportMember>) {
         self.members_omitted = members.len().saturating_sub(REPORT_MEMBERS_MAX);
@@ -160,7 +206,7 @@ impl NodeReport {
     }
 
     /// Returns the document. Topics and members that make it too long are left out, and counted.
-    pub(crate) fn to_json(mut self) -> String {
+    pub(crate) fn into_json(mut self) -> String {
         loop {
             let json = serde_json::to_string(&self).unwrap_or_default();
             let members = self.members.as_mut().filter(|members| !members.is_empty());
@@ -173,6 +219,13 @@ impl NodeReport {
     }
 }
 
+/// Cuts a text to its bound.
+fn cut(text: &mut String) {
+    if let Some((at, _)) = text.char_indices().nth(REPORT_TEXT_CHARS_MAX) {
+        text.truncate(at);
+    }
+}
+
 /// Drops the second half of a list. Returns the number of dropped ones.
 fn halve<T>(list: &mut Vec<T>) -> usize {
     let kept = list.len() / 2;
@@ -180,72 +233,198 @@ fn halve<T>(list: &mut Vec<T>) -> usize {
 }
 
 /// Reduces a graph to one interface, for an observer who asks about it: other programs of the local network are not the
-/// observer's business.
-pub(crate) fn keep_interface(graph: &mut Graph, interface: &str) {
-    graph.endpoints.retain(|endpoint| is_part(&endpoint.topic, interface));
-    graph.calls.retain(|calls| is_part(&calls.topic, interface));
-    graph.offers.retain(|offer| is_part(&offer.topic, interface));
+/// observer's business. What other owners offer to this node stays, since they have names of their own for it.
+pub fn keep_interface(graph: &mut Graph, interface: &str) {
+    let names = names_of(interface);
+    graph.endpoints.retain(|endpoint| names.contains(&endpoint.topic));
+    graph.calls.retain(|calls| names.contains(&calls.topic));
+    graph.problems.retain(|problem| words(problem).any(|word| names.contains(word)));
+    graph.drops.retain(|reason, _| !reason.contains(' '));
     for share in &mut graph.shares {
-        share.routes.retain(|route| is_part(&route.topic, interface));
+        share.routes.retain(|route| names.contains(&route.topic));
     }
     for used in &mut graph.uses {
-        used.routes.retain(|route| is_part(&route.topic, interface));
+        used.routes.retain(|route| names.contains(&route.topic));
     }
     let of_shares = graph.shares.iter().flat_map(|share| &share.routes).map(|route| &route.name);
     let of_uses = graph.uses.iter().flat_map(|used| &used.routes).map(|route| &route.name);
     let of_tokens = graph.uses.iter().filter_map(|used| used.name.as_ref());
     let of_offers = graph.offers.iter().map(|offer| &offer.name);
-    let kept: Vec<_> = of_shares.chain(of_uses).chain(of_tokens).chain(of_offers).cloned().collect();
+    let kept: BTreeSet<_> = of_shares.chain(of_uses).chain(of_tokens).chain(of_offers).cloned().collect();
     graph.names.retain(|name, _| kept.contains(name));
 }
 
-/// Returns `true` if a name of ROS 2 or DDS is that of the interface or of a part of it: the topics and services of an
-/// action, the services of parameters, the two topics of a service.
-fn is_part(name: &str, interface: &str) -> bool {
-    // `rq/addRequest` and `rr/addReply` are the topics of the service `/add`.
-    let of_service = |prefix: &str, suffix: &str| name.strip_prefix(prefix)?.strip_suffix(suffix);
-    let name = of_service("rq", "Request").or_else(|| of_service("rr", "Reply")).unwrap_or(name);
-    name.strip_prefix(interface).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+/// Returns the names of an interface and its parts, as ROS 2 and DDS have them, whichever kind of interface it is.
+fn names_of(interface: &str) -> BTreeSet<String> {
+    let kinds = [Interface::Topic, Interface::Service, Interface::Action, Interface::Parameters];
+    let names = kinds.iter().flat_map(|kind| kind.parts()).flat_map(|part| {
+        let name = part.name(interface);
+        let of_service = [format!("rq{name}Request"), format!("rr{name}Reply")];
+        let of_service = (part.kind == Kind::Service).then_some(of_service);
+        std::iter::once(name).chain(of_service.into_iter().flatten())
+    });
+    names.collect()
+}
+
+/// Splits a text into words, of which each may be a name of ROS 2.
+fn words(text: &str) -> impl Iterator<Item = &str> {
+    text.split(|c: char| !c.is_alphanumeric() && !matches!(c, '_' | '/'))
+}
+
+/// Reads at most `MAX` elements of a list, and skips the others: it comes from another machine.
+fn at_most<'de, const MAX: usize, T, D>(deserializer: D) -> Result<Vec<T>, D::Error>
+where
+    T: Deserialize<'de>,
+    D: Deserializer<'de>,
+{
+    deserializer.deserialize_seq(AtMost::<MAX, T>(PhantomData))
+}
+
+/// As [`at_most`], for a list that may be absent.
+fn at_most_if_any<'de, const MAX: usize, T, D>(deserializer: D) -> Result<Option<Vec<T>>, D::Error>
+where
+    T: Deserialize<'de>,
+    D: Deserializer<'de>,
+{
+    struct IfAny<const MAX: usize, T>(PhantomData<T>);
+    impl<'de, const MAX: usize, T: Deserialize<'de>> Visitor<'de> for IfAny<MAX, T> {
+        type Value = Option<Vec<T>>;
+        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            f.write_str("a list or null")
+        }
+        fn visit_unit<E>(self) -> Result<Self::Value, E> {
+            Ok(None)
+        }
+        fn visit_none<E>(self) -> Result<Self::Value, E> {
+            Ok(None)
+        }
+        fn visit_some<D: Deserializer<'de>>(self, deserializer: D) -> Result<Self::Value, D::Error> {
+            at_most::<MAX, T, D>(deserializer).map(Some)
+        }
+    }
+    deserializer.deserialize_option(IfAny::<MAX, T>(PhantomData))
+}
+
+struct AtMost<const MAX: usize, T>(PhantomData<T>);
+
+impl<'de, const MAX: usize, T: Deserialize<'de>> Visitor<'de> for AtMost<MAX, T> {
+    type Value = Vec<T>;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a list")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Vec<T>, A::Error> {
+        let mut read = Vec::new();
+        while read.len() < MAX {
+            match list.next_element()? {
+                Some(element) => read.push(element),
+                None => return Ok(read),
+            }
+        }
+        while list.next_element::<IgnoredAny>()?.is_some() {}
+        Ok(read)
+    }
+}
+
+/// Reads alerts. One of another version, whose fields may differ, becomes [`Alert::Other`].
+fn alerts<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<Alert>, D::Error> {
+    let read: Vec<serde_json::Value> = at_most::<REPORT_FAULTS_MAX, _, _>(deserializer)?;
+    Ok(read.into_iter().map(|alert| serde_json::from_value(alert).unwrap_or(Alert::Other)).collect())
+}
+
+/// Reads counts of reasons, as many as there are reasons in any version, and skips the others.
+fn counts<'de, D: Deserializer<'de>>(deserializer: D) -> Result<BTreeMap<String, u64>, D::Error> {
+    struct Counts;
+    impl<'de> Visitor<'de> for Counts {
+        type Value = BTreeMap<String, u64>;
+        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            f.write_str("counts by reason")
+        }
+        fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Self::Value, A::Error> {
+            let mut read = BTreeMap::new();
+            while let Some((reason, count)) = map.next_entry::<String, u64>()? {
+                if read.len() < REPORT_REASONS_MAX {
+                    read.insert(reason, count);
+                }
+            }
+            Ok(read)
+        }
+    }
+    deserializer.deserialize_map(Counts)
 }
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used)]
+
     use super::*;
-    use crate::admin::graph::{Endpoint, Offer, Share, ShareRoute};
+    use crate::admin::graph::{Endpoint, NameLine, Offer, Share, ShareRoute};
 
     #[test]
     fn long_report_leaves_topics_out_and_says_how_many() {
         let topic = ReportTopic { topic: "/t".repeat(5000), ..ReportTopic::default() };
         let report = NodeReport { topics: vec![topic; 300], topics_omitted: 2, ..NodeReport::default() };
-        let json = report.to_json();
+        let json = report.into_json();
         assert!(json.len() <= REPORT_BYTES_MAX, "{}", json.len());
-        let read: NodeReport = serde_json::from_str(&json).expect("as written");
+        let read = NodeReport::from_json(json.as_bytes()).unwrap();
         assert_eq!((read.topics.len(), read.topics_omitted), (75, 227));
     }
 
     #[test]
     fn report_of_another_version_is_read() {
-        let text = r#"{"node": "arm", "later": [1], "alerts": [{"kind": "of_a_later_version", "n": 1}]}"#;
-        let read: NodeReport = serde_json::from_str(text).expect("unknown fields are skipped");
-        assert_eq!(
-            (read.node.as_str(), &read.alerts[..], read.topics.len()),
-            ("arm", &[Alert::Other][..], 0)
-        );
+        let text = br#"{"node": "arm", "later": [1], "members": null, "alerts": [
+            {"kind": "of_a_later_version", "n": 1}, {"kind": "restart_pending", "changes": 5}, {"kind": "local_network_alone"}]}"#;
+        let read = NodeReport::from_json(text).unwrap();
+        assert_eq!(read.alerts, [Alert::Other, Alert::Other, Alert::LocalNetworkAlone]);
+        assert_eq!((read.node.as_str(), read.topics.len(), read.members), ("arm", 0, None));
     }
 
     #[test]
-    fn observer_sees_the_endpoints_of_the_interface_that_it_asks_about() {
+    fn report_of_a_lying_node_takes_no_more_than_its_bounds() {
+        let many = |what: &str, n: usize| vec![what; n].join(",");
+        let long = "\u{e4}".repeat(5000);
+        let text = format!(
+            r#"{{"version": "{long}", "links": [{}], "routers": [{}], "topics": [{}], "problems": [{}], "alerts": [{}],
+                "members": [{}], "drops": {{{}}}}}"#,
+            many("{}", 5000),
+            many("{}", 5000),
+            many(&format!(r#"{{"state": "{long}"}}"#), 1),
+            many("\"p\"", 5000),
+            many("{}", 5000),
+            many("{}", 5000),
+            (0..5000).map(|n| format!("\"r{n}\": 1")).collect::<Vec<_>>().join(","),
+        );
+        let read = NodeReport::from_json(text.as_bytes()).unwrap();
+        let lengths = [
+            read.links.len(),
+            read.routers.len(),
+            read.problems.len(),
+            read.alerts.len(),
+            read.members.unwrap().len(),
+            read.drops.len(),
+        ];
+        let bounds = [64, 16, 32, 32, 2048, 512];
+        assert_eq!((lengths, read.version.chars().count()), (bounds, REPORT_TEXT_CHARS_MAX));
+        assert_eq!(read.topics[0].state.chars().count(), REPORT_TEXT_CHARS_MAX);
+    }
+
+    #[test]
+    fn observer_sees_the_local_programs_of_the_interface_that_it_asks_about_and_no_others() {
         for (name, interface, is_it) in [
             ("/camera", "/camera", true),
-            ("/camera/info", "/camera", true),
+            ("/camera/info", "/camera", false),
             ("/camera2", "/camera", false),
-            ("/cam", "/camera", false),
             ("rq/addRequest", "/add", true),
             ("rr/addReply", "/add", true),
             ("rq/fib/_action/send_goalRequest", "/fib", true),
+            ("/fib/_action/status", "/fib", true),
+            ("rq/arm/get_parametersRequest", "/arm", true),
             ("rq/adderRequest", "/add", false),
+            ("/camera", "", false),
+            ("/camera", "/", false),
         ] {
-            assert_eq!(is_part(name, interface), is_it, "{name} {interface}");
+            assert_eq!(names_of(interface).contains(name), is_it, "{name} {interface}");
         }
         let endpoint = |topic: &str| Endpoint { topic: topic.into(), ..Endpoint::default() };
         let route = |topic: &str, name: &str| ShareRoute {
@@ -258,13 +437,16 @@ mod tests {
             endpoints: vec![endpoint("/a"), endpoint("/b")],
             shares: vec![rule],
             offers: vec![Offer { topic: "/b".into(), name: "3".into(), ..Offer::default() }],
-            names: ["1", "2", "3"].map(|name| (name.to_owned(), Default::default())).into(),
+            names: ["1", "2", "3"].map(|name| (name.to_owned(), NameLine::default())).into(),
+            problems: vec!["/a: types differ".into(), "/ab: types differ".into()],
+            drops: [("stale".to_owned(), 1), ("stale from link 3".to_owned(), 1)].into(),
             ..Graph::default()
         };
         keep_interface(&mut graph, "/a");
         let endpoints: Vec<_> = graph.endpoints.iter().map(|e| e.topic.as_str()).collect();
         let routes: Vec<_> = graph.shares[0].routes.iter().map(|r| r.topic.as_str()).collect();
-        assert_eq!((&endpoints[..], &routes[..], graph.offers.len()), (&["/a"][..], &["/a"][..], 0));
-        assert_eq!(graph.names.keys().collect::<Vec<_>>(), ["1"]);
+        assert_eq!((&endpoints[..], &routes[..], graph.offers.len()), (&["/a"][..], &["/a"][..], 1));
+        assert_eq!(graph.names.keys().collect::<Vec<_>>(), ["1", "3"]);
+        assert_eq!((graph.problems.len(), graph.drops.len()), (1, 1));
     }
 }

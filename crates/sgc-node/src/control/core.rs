@@ -70,6 +70,7 @@ use crate::drops::NodeDrop;
 use crate::gateway::Gateway;
 use crate::local::network_slot::NetworkSlot;
 use crate::local::network_state::NetworkState;
+use crate::metrics::Metrics;
 use crate::state::audit::Audit;
 use crate::state::credentials::StateWriter;
 
@@ -108,6 +109,8 @@ pub(crate) struct Core<N: RosNetwork> {
     authority: Option<Authority>,
     /// Operations that users of this node request.
     operations: Operations,
+    gateway: Arc<Gateway>,
+    metrics: Arc<Metrics>,
     /// Reports that observers ask for.
     reports: Reports,
     /// Reports that users of this node ask other nodes for.
@@ -139,6 +142,8 @@ pub(crate) struct CoreParts<N> {
     pub credentials: CredentialStore,
     /// Gateway, whose client certificates follow this node's trust anchors.
     pub gateway: Arc<Gateway>,
+    /// Server of metrics, for its alerts.
+    pub(crate) metrics: Arc<Metrics>,
     /// Rate limits of peers.
     pub(crate) rates: PeerRates,
     /// Set if this node is the authority of its fleet.
@@ -196,7 +201,7 @@ impl<N: RosNetwork> Core<N> {
         let certificates = Certificates::new(
             parts.identity,
             parts.credentials,
-            parts.gateway,
+            parts.gateway.clone(),
             parts.keeper,
             parts.redial,
             now().unix,
@@ -221,6 +226,8 @@ impl<N: RosNetwork> Core<N> {
             publishers: Publishers::new(parts.message_keys),
             authority: parts.authority,
             operations: Operations::default(),
+            gateway: parts.gateway,
+            metrics: parts.metrics,
             reports: Reports::default(),
             inquiries: Inquiries::default(),
             replays: Arc::default(),
@@ -405,6 +412,7 @@ impl<N: RosNetwork> Core<N> {
         self.rotation_due(now);
         self.operations_due(now.instant);
         self.inquiries_due(now.instant);
+        self.reports_due(now.instant);
         self.services.handle_timeout(now.instant);
         self.types_due(now.instant);
         self.consumers_due(now);
@@ -458,6 +466,7 @@ impl<N: RosNetwork> Core<N> {
                     self.links.deadline(),
                     self.operations.deadline(),
                     self.inquiries.deadline(),
+                    self.reports.deadline(),
                 ];
                 let own = own.into_iter().chain([self.reopening.deadline()]);
                 let all = [router, endpoint, routes, self.sinks.deadline(), rekey, self.services.deadline()];

@@ -14,6 +14,9 @@ use super::urls::SkippedUrl;
 use crate::clock::time_now;
 use crate::data::stats::Drops;
 
+/// State of a search whose router the node is linked to.
+pub const LINKED: &str = "linked";
+
 /// A router that the node looks for, or a place where it looks for routers.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct RouterStatus {
@@ -127,7 +130,7 @@ impl StatusRow {
     pub(crate) fn linked(&self, url: &LinkUrl, node: &NodeId) {
         self.change(|row, due| {
             row.at = Some(url.to_string());
-            row.state = "linked";
+            row.state = LINKED;
             row.peer = Some(node.to_string());
             row.failures = 0;
             *due = None;

@@ -23,6 +23,7 @@ use super::readings::{LinkReadings, Readings, RouteReading};
 use crate::control::faults::alerts::Alert;
 use crate::data::stats::DataDrop;
 use crate::discovery::RouterStatus;
+use crate::discovery::board::LINKED;
 use crate::drops::NodeDrop;
 
 /// The label that all series have.
@@ -188,7 +189,7 @@ pub const METRICS: &[Metric] = &[
         &["router"],
         "1 if linked, else 0, for each router, domain (`srv://…`) and the local network (`mdns://`) of the configuration \
          and of tokens.",
-        |s| by_router(s, |row, _| Some(f64::from(u8::from(row.state == "linked")))),
+        |s| by_router(s, |row, _| Some(f64::from(u8::from(row.state == LINKED)))),
     ),
     gauge("sgc_router_failures", &["router"], "Failures in a row to link with the router.", |s| {
         by_router(s, |row, _| Some(f64::from(row.failures)))
@@ -199,7 +200,7 @@ pub const METRICS: &[Metric] = &[
         "The smoothed round-trip time to the linked router, in seconds.",
         |s| {
             by_router(s, |row, links| {
-                let at = row.at.as_ref().filter(|_| row.state == "linked")?;
+                let at = row.at.as_ref().filter(|_| row.state == LINKED)?;
                 links.round_trips.get(at).map(Duration::as_secs_f64)
             })
         },

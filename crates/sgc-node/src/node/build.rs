@@ -33,6 +33,7 @@ use crate::discovery::Board;
 use crate::gateway::access::{access_with, refused_tokens};
 use crate::gateway::{Gateway, NodeDefinitions, OpenLocalRos, ShownKey, Sockets, key_of_files, listen_at};
 use crate::local::network_slot::NetworkSlot;
+use crate::metrics::Metrics;
 use crate::node::error::NodeError;
 use crate::node::local::{OpenNetwork, local_routes, open_again};
 use crate::node::random::system_rng;
@@ -69,6 +70,7 @@ pub(super) struct BuiltNode<N: RosNetwork> {
     pub(super) network: NetworkSlot<N>,
     pub(super) open: Option<OpenNetwork<N>>,
     pub(super) gateway: Arc<Gateway>,
+    pub(super) metrics: Arc<Metrics>,
     pub(super) core: Core<N>,
     pub(super) channels: CoreChannels,
     pub(super) board: Board,
@@ -112,6 +114,7 @@ pub(super) async fn build<N: RosNetwork>(
     let found = NodeDefinitions { files: definitions.clone(), described: types.clone() };
     let gateway = Gateway::new(open_gateway, identity.node_name().as_str(), found);
     listen_for_clients(&gateway, &config, &identity, &rules, state.as_deref(), &audit).await?;
+    let metrics = Arc::new(Metrics::new(config.metrics));
     let (events, inbox) = mpsc::channel(INBOX_MAX);
     // Every thread and blocking task that uses this runtime holds a clone of `alive`, since the runtime must outlive
     // them.
@@ -143,6 +146,7 @@ pub(super) async fn build<N: RosNetwork>(
         identity: identity.clone(),
         credentials: sockets.credentials.clone(),
         gateway: gateway.clone(),
+        metrics: metrics.clone(),
         router: machines.router,
         endpoint: machines.endpoint,
         routes: machines.routes,
@@ -164,6 +168,7 @@ pub(super) async fn build<N: RosNetwork>(
         network,
         open,
         gateway,
+        metrics,
         core,
         channels,
         board,

@@ -25,7 +25,6 @@ use crate::link::roaming::Network;
 use crate::local::dds_discovery::discover;
 use crate::local::network_slot::NetworkSlot;
 use crate::local::reopening;
-use crate::metrics::Metrics;
 use crate::node::build::BuiltNode;
 use crate::node::error::NodeError;
 use crate::node::identity::wanted_nearby;
@@ -108,7 +107,7 @@ pub(super) async fn spawn<N: RosNetwork>(
         gateway.clone(),
         events.clone(),
     )));
-    let metrics = Arc::new(Metrics::new(config.metrics));
+    let metrics = node.metrics;
     tasks.push(tokio::spawn(metrics.clone().run(events.clone(), gateway.clone())));
     let reloader = Arc::new(Reloader {
         source: options.source,

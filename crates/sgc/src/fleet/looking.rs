@@ -8,14 +8,17 @@ use std::time::Duration;
 
 use clap::Args;
 use sgc_diagnosis::fleet::{FleetStatus, ask_nodes};
-use sgc_diagnosis::{DiagnosisError, Step, Verdict, diagnose};
-use sgc_node::admin::report::{NodeReport, ReportMember};
+use sgc_diagnosis::{DiagnosisError, diagnose};
+use sgc_node::admin::ReportAnswer;
+use sgc_node::admin::report::ReportMember;
+use sgc_node::graph::Graph;
 use sgc_node::roster_row;
 use sgc_process::{ProcessError, unix_now};
 use sgc_trust::NodeName;
 
-use super::{WhichFleet, fleet_here, parse_span};
-use crate::error::{CliError, EXIT_FAILURE};
+use super::{WhichFleet, parse_span};
+use crate::error::CliError;
+use crate::why::print_steps;
 use crate::{node, output};
 
 /// Shortest time between two looks. Nodes give the same report for half a second.
@@ -33,8 +36,7 @@ pub(super) struct StatusArgs {
     /// Names of nodes, for their details
     #[arg(value_name = "NODE")]
     nodes: Vec<String>,
-    /// Fleet file with the members; without it, the fleet's authority is asked, then the only *.fleet file of this
-    /// directory
+    /// Fleet file with the members; without it, the fleet's authority is asked
     #[arg(long, value_name = "FILE")]
     fleet: Option<PathBuf>,
     /// Look again every TIME, such as 2s, and show rates; --watch alone looks every 5s
@@ -72,6 +74,8 @@ pub(super) struct WhyArgs {
 struct Members {
     members: Vec<ReportMember>,
     omitted: usize,
+    /// The answer of the authority, if it was asked for them.
+    authority: Option<ReportAnswer>,
 }
 
 /// Runs `sgc fleet status`.
@@ -82,27 +86,41 @@ pub(super) fn status(args: &StatusArgs) -> Result<(), CliError> {
     let socket = node::socket(None, None, args.socket.as_deref())?;
     let mut before = None;
     loop {
-        let look = look(args, &socket)?;
-        show(args, &look, before.as_ref())?;
-        let Some(every) = args.watch else { return Ok(()) };
-        before = Some(look);
-        std::thread::sleep(every.max(WATCH_MIN));
+        match (look(args, &socket), args.watch) {
+            (Ok(look), watch) => {
+                show(args, &look, before.as_ref())?;
+                before = Some(look);
+                if watch.is_none() {
+                    return Ok(());
+                }
+            }
+            // The node here may be restarted, or the authority out of reach for a while.
+            (Err(error), Some(_)) => drop(error.report()),
+            (Err(error), None) => return Err(error),
+        }
+        std::thread::sleep(args.watch.unwrap_or_default().max(WATCH_MIN));
     }
 }
 
 fn look(args: &StatusArgs, socket: &Path) -> Result<FleetStatus, CliError> {
-    let found = members(args.fleet.as_deref(), socket);
-    let Members { members, omitted } = match found {
-        // Their details need no roster, which only adds names to their links.
+    let found = match &args.fleet {
+        Some(file) => of_file(file),
+        None => of_authority(socket),
+    };
+    let Members { members, omitted, authority } = match found {
+        // Their details need no members, which only add names to their links.
         Err(_) if !args.nodes.is_empty() && args.fleet.is_none() => Members::default(),
         found => found?,
     };
+    let is_answered = |name: &String| authority.as_ref().is_some_and(|answer| answer.node == *name);
     let is_asked = |member: &&ReportMember| member.revoked_ms.is_none();
-    let nodes = match args.nodes.is_empty() {
+    let mut nodes: Vec<String> = match args.nodes.is_empty() {
         true => members.iter().filter(is_asked).map(|member| member.name.clone()).collect(),
         false => args.nodes.clone(),
     };
-    let answers = if nodes.is_empty() { Vec::new() } else { ask_nodes(socket, &nodes, None)? };
+    nodes.retain(|name| !is_answered(name));
+    let mut answers = if nodes.is_empty() { Vec::new() } else { ask_nodes(socket, &nodes, None)? };
+    answers.extend(authority);
     let mut status = FleetStatus::new(unix_now(), members, answers, &args.nodes);
     status.members_omitted = omitted;
     Ok(status)
@@ -131,59 +149,54 @@ fn show(args: &StatusArgs, look: &FleetStatus, before: Option<&FleetStatus>) -> 
     lines.iter().try_for_each(|line| output::line(output::clean(line)))
 }
 
-/// Returns the members of the fleet: from this file, from the authority, or from the fleet file of this directory.
-fn members(file: Option<&Path>, socket: &Path) -> Result<Members, CliError> {
-    if let Some(file) = file {
-        return of_file(file);
+/// Returns the members of the fleet as the authority knows them that the identity of the node here names.
+fn of_authority(socket: &Path) -> Result<Members, CliError> {
+    let mut answer = ask_nodes(socket, &[], None)?.pop().unwrap_or_default();
+    let members = answer.report.as_mut().and_then(|report| report.members.take());
+    if let (Some(members), Some(report)) = (members, &answer.report) {
+        answer.node = report.node.clone();
+        return Ok(Members { members, omitted: report.members_omitted, authority: Some(answer) });
     }
-    let reason = match ask_nodes(socket, &[], None)?.pop() {
-        Some(answer) => match (answer.report, answer.error) {
-            (Some(NodeReport { members: Some(members), members_omitted, .. }), _) => {
-                return Ok(Members { members, omitted: members_omitted });
-            }
-            (Some(report), _) => format!("{} has no fleet file", report.node),
-            (None, error) => error.unwrap_or_default(),
-        },
-        None => String::new(),
+    let reason = match (&answer.report, &answer.error) {
+        (Some(report), _) => format!("{} has no fleet file", report.node),
+        (None, Some(error)) if answer.fix.is_empty() => error.clone(),
+        (None, error) => format!("{} ({})", error.as_deref().unwrap_or_default(), answer.fix),
     };
-    let file = fleet_here(None).map_err(|_| DiagnosisError::NotSeen {
-        reason: format!(
-            "the members of the fleet are not known here. Its authority: {reason}. Name nodes (`sgc fleet status robot`) or \
-             a fleet file (`--fleet lab.fleet`)"
-        ),
-    })?;
-    of_file(&file)
+    let reason = format!(
+        "the members of the fleet are not known here. Its authority: {reason}. Or name nodes (`sgc fleet status robot`) or the \
+         fleet file (`--fleet lab.fleet`)"
+    );
+    Err(DiagnosisError::NotSeen { reason }.into())
 }
 
 fn of_file(file: &Path) -> Result<Members, CliError> {
     let (_, fleet) = WhichFleet { fleet: Some(file.to_owned()) }.read()?;
     let members = fleet.nodes().map(|node| ReportMember::new(roster_row(&fleet, node))).collect();
-    Ok(Members { members, omitted: 0 })
+    Ok(Members { members, ..Members::default() })
 }
 
 /// Runs `sgc fleet why`.
 pub(super) fn why(args: &WhyArgs) -> Result<ExitCode, CliError> {
+    let not_seen = |reason| CliError::from(DiagnosisError::NotSeen { reason });
     let Some((node, interface)) = args.at.split_once(':') else {
         let reason =
             format!("{:?} names no node and topic: write them with a colon, such as robot:/camera", args.at);
-        return Err(DiagnosisError::NotSeen { reason }.into());
+        return Err(not_seen(reason));
     };
     node.parse::<NodeName>()?;
     let socket = node::socket(None, None, args.socket.as_deref())?;
     let answer = ask_nodes(&socket, &[node.to_owned()], Some(interface))?.pop().unwrap_or_default();
     let Some(graph) = answer.graph else {
-        let reason = format!("{node}: {}", answer.error.unwrap_or_default());
-        return Err(DiagnosisError::NotSeen { reason }.into());
-    };
-    let steps = diagnose::interface(&graph, interface);
-    if args.json {
-        output::line(serde_json::to_string(&steps).unwrap_or_default())?;
-    } else {
-        output::line(format!("At {node}:"))?;
-        for line in steps.iter().flat_map(Step::lines) {
-            output::line(output::clean(&line))?;
+        let mut reason = format!("{node}: {}", answer.error.unwrap_or_default());
+        if !answer.fix.is_empty() {
+            reason.push_str(&format!("; {}", answer.fix));
         }
+        return Err(not_seen(reason));
+    };
+    let graph: Graph = serde_json::from_str(&graph)
+        .map_err(|_| not_seen(format!("{node}: its report cannot be read; compare the versions of sgc")))?;
+    if !args.json {
+        output::line(format!("At {node}:"))?;
     }
-    let is_wrong = steps.iter().any(|step| step.verdict == Verdict::Wrong);
-    Ok(if is_wrong { ExitCode::from(EXIT_FAILURE) } else { ExitCode::SUCCESS })
+    print_steps(&diagnose::interface(&graph, interface), args.json)
 }

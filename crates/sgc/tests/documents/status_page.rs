@@ -257,7 +257,16 @@ fn has_serde(attributes: &[Attribute], name: &str) -> bool {
 
 /// Returns all serde attributes with their values, each of which is known here.
 fn serde_attributes(attributes: &[Attribute]) -> Vec<(String, Option<String>)> {
-    let known = ["rename", "tag", "rename_all", "skip", "skip_serializing_if", "default", "other"];
+    let known = [
+        "rename",
+        "tag",
+        "rename_all",
+        "skip",
+        "skip_serializing_if",
+        "default",
+        "deserialize_with",
+        "other",
+    ];
     let mut found = Vec::new();
     for attribute in attributes.iter().filter(|attribute| attribute.path().is_ident("serde")) {
         let read = attribute.parse_nested_meta(|meta| {

@@ -115,8 +115,8 @@ impl<N: RosNetwork> Core<N> {
             Event::RenewAsked { sink, peer, csr } => self.answer_renewal(sink, peer, csr),
             Event::OperationAsked { sink, peer, request } => self.operation_asked(sink, &peer, &request),
             Event::ReportAsked { sink, peer, question } => self.report_asked(sink, &peer, &question),
-            Event::Report { name, report } => self.report_told(name, &report),
-            Event::ReportDenied { name, by } => self.report_denied(name, by),
+            Event::Report { name, report } => self.take_report(name, &report),
+            Event::ReportRefused { name, by } => self.report_refused(name, by),
             Event::OperationAnswered { name, answer } => self.operation_answered(name, answer),
             Event::OperationDenied { name, by } => self.operation_denied(name, by),
             Event::Renewed { credentials } => self.take_credentials(credentials),
@@ -243,7 +243,7 @@ impl<N: RosNetwork> Core<N> {
             | Event::OperationDenied { .. }
             | Event::ReportAsked { .. }
             | Event::Report { .. }
-            | Event::ReportDenied { .. }
+            | Event::ReportRefused { .. }
             | Event::Rekeyed { .. }
             | Event::OwnGrant { .. }
             | Event::Recover(_)

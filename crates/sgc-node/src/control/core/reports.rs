@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use sgc_endpoint::{JoinStatus, RefusedBy, pack_report, unpack_report};
-use sgc_ros::{RosNetwork, Routes};
+use sgc_ros::{RosNetwork, RouteState, RouteStatus, Routes};
 use sgc_trust::{Grantees, VerifiedPeer};
 use sgc_wire::{Decode as _, Name, RefuseReason, Report, ReportQuestion, SinkId};
 use tokio::sync::oneshot;
@@ -19,21 +19,24 @@ use crate::clock::now;
 use crate::control::event::CoreEvent;
 use crate::control::fleet::authority::Authority;
 use crate::control::fleet::inquiries::{InquiryAnswer, InquiryError, InquiryTarget};
-use crate::control::fleet::reports::ReportStep;
 use crate::drops::NodeDrop;
 use crate::state::audit::{AuditEvent, AuditRecord};
+use crate::state::credentials::lasts;
 
 /// Reports of this node.
 impl<N: RosNetwork> Core<N> {
     /// Sets who may ask this node how it is doing.
     pub(super) fn set_observers(&mut self, observers: Grantees) {
-        let is_offered = self.reports.set_observers(observers);
+        let (is_offered, gone) = self.reports.set_observers(observers);
+        for sink in gone {
+            self.endpoint.answer_report(now(), sink, Err(RefuseReason::NotPermitted));
+        }
         self.endpoint.offer_reports(now(), is_offered);
     }
 
-    /// Answers an observer, and refuses others.
+    /// Answers an observer, or soon, and refuses others.
     pub(super) fn report_asked(&mut self, sink: SinkId, peer: &VerifiedPeer, question: &Bytes) {
-        let refusal = match ReportQuestion::from_slice(question) {
+        let answer = match ReportQuestion::from_slice(question) {
             _ if !self.reports.may_ask(peer) => {
                 let node = self.called(&peer.node_id);
                 if self.control_drops.count_from(NodeDrop::ReportNotPermitted, peer.node_id) {
@@ -41,24 +44,28 @@ impl<N: RosNetwork> Core<N> {
                 }
                 let record = AuditRecord::new(AuditEvent::Refused).peer(&peer.node_id);
                 self.audit.write(record.reason("a report: it is no observer"));
-                RefuseReason::NotPermitted
+                Err(RefuseReason::NotPermitted)
             }
             // A later version may know further questions.
-            Err(_) => RefuseReason::RoleNotOffered,
-            Ok(question) => match self.reports.ask(Instant::now(), &question, sink) {
-                ReportStep::Answer(report) => {
-                    return self.endpoint.answer_report(now(), sink, Ok(report));
-                }
-                ReportStep::Make => return self.make_report(question),
-                ReportStep::UnderWay => return,
-                ReportStep::Full => RefuseReason::Limit,
+            Err(_) => Err(RefuseReason::RoleNotOffered),
+            Ok(question) => match self.reports.ask(Instant::now(), peer, sink, question) {
+                Some(report) => Ok(report),
+                None => return self.make_next_report(),
             },
         };
-        self.endpoint.answer_report(now(), sink, Err(refusal));
+        self.endpoint.answer_report(now(), sink, answer);
     }
 
-    /// Makes a report on a blocking thread, since a document may be long and an authority reads its file.
-    fn make_report(&mut self, question: ReportQuestion) {
+    pub(super) fn reports_due(&mut self, at: Instant) {
+        if self.reports.deadline().is_some_and(|due| due <= at) {
+            self.make_next_report();
+        }
+    }
+
+    /// Makes the next report that somebody waits for, on a blocking thread: a document may be long, and an authority
+    /// reads its file.
+    fn make_next_report(&mut self) {
+        let Some(question) = self.reports.next(Instant::now()) else { return };
         let Some(events) = self.events.upgrade() else { return };
         let (alive, document) = (self.alive.clone(), self.document_job(&question));
         tokio::task::spawn_blocking(move || {
@@ -73,26 +80,33 @@ impl<N: RosNetwork> Core<N> {
         for sink in self.reports.made(Instant::now(), question, report.as_ref()) {
             self.endpoint.answer_report(now(), sink, report.clone().ok_or(RefuseReason::Limit));
         }
+        self.make_next_report();
     }
 
     /// Returns a blocking job that makes the document for a question, of the state as it is now.
     fn document_job(&mut self, question: &ReportQuestion) -> Box<dyn FnOnce() -> Bytes + Send> {
         match question {
-            ReportQuestion::Condition => {
+            ReportQuestion::Node => {
                 self.note_present_members();
                 let members = self.authority.as_ref().map(Authority::members_job);
-                let mut report = self.condition();
+                let mut report = self.node_report();
                 Box::new(move || {
                     match members.map(|read| read()) {
                         Some(Ok(members)) => report.set_members(members),
-                        Some(Err(error)) => report.problems.push(format!("the fleet file: {error}")),
+                        Some(Err(_)) => {
+                            let problem = "the authority cannot read the fleet's file; its log says why";
+                            report.problems.insert(0, problem.to_owned());
+                            report.problems.truncate(REPORT_FAULTS_MAX);
+                        }
                         None => {}
                     }
-                    report.to_json().into()
+                    report.into_json().into()
                 })
             }
             ReportQuestion::Interface(interface) => {
                 let (mut graph, interface) = (self.graph(None), interface.clone());
+                graph.gateway_refused =
+                    self.gateway.status().map(|status| status.refused).unwrap_or_default();
                 Box::new(move || {
                     keep_interface(&mut graph, &interface);
                     serde_json::to_string(&graph).unwrap_or_default().into()
@@ -101,14 +115,18 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    fn condition(&self) -> NodeReport {
+    fn node_report(&self) -> NodeReport {
         let identity = self.certificates.identity();
         let mut alerts = self.alerts();
-        alerts.extend(self.certificates.gateway_alerts());
+        alerts.extend(self.gateway.alerts().into_iter().chain(self.metrics.alert()));
         alerts.truncate(REPORT_FAULTS_MAX);
         let mut problems = self.problems();
         problems.truncate(REPORT_FAULTS_MAX);
-        let topic = |route: sgc_ros::RouteStatus| {
+        let topic = |route: RouteStatus| {
+            let stuck = matches!(
+                route.state,
+                RouteState::Owner(_) | RouteState::NotListed { is_pattern: false } | RouteState::Refused(_)
+            );
             let line = self.route_line(route);
             ReportTopic {
                 direction: line.direction.to_owned(),
@@ -116,6 +134,7 @@ impl<N: RosNetwork> Core<N> {
                 type_name: line.type_name,
                 owner: line.owner,
                 state: line.state,
+                stuck,
                 messages: line.messages,
             }
         };
@@ -140,6 +159,7 @@ impl<N: RosNetwork> Core<N> {
             has_ros: self.routes.is_some(),
             is_router: self.router.is_transit(),
             certificate_until_ms: identity.not_after().0,
+            certificate_lasts_ms: lasts(identity.as_peer()),
             secret_generation: identity.naming_secrets().first().map(|secret| secret.generation),
             links: self.links.iter().take(REPORT_LINKS_MAX).map(link).collect(),
             links_omitted: self.links.iter().count().saturating_sub(REPORT_LINKS_MAX),
@@ -190,20 +210,23 @@ impl<N: RosNetwork> Core<N> {
             }
             Ok(node) => node,
         };
-        self.inquiries.push(node, question, reply);
+        self.inquiries.push(Instant::now(), node, question, reply);
         self.next_inquiry();
     }
 
-    pub(super) fn report_told(&mut self, name: Name, report: &Report) {
-        let document = unpack_report(report).map_err(InquiryError::Unreadable);
+    /// Takes a report of another node.
+    pub(super) fn take_report(&mut self, name: Name, report: &Report) {
+        let document = unpack_report(report).map_err(|_| InquiryError::Unreadable);
         if self.inquiries.end(name, document) {
-            self.leave_inquiry(&name);
+            self.endpoint.leave(now(), &name);
+            self.next_inquiry();
         }
     }
 
-    pub(super) fn report_denied(&mut self, name: Name, by: RefusedBy) {
-        if self.inquiries.denied(name, by) {
-            self.leave_inquiry(&name);
+    pub(super) fn report_refused(&mut self, name: Name, by: RefusedBy) {
+        if self.inquiries.refused(name, by) {
+            self.endpoint.leave(now(), &name);
+            self.next_inquiry();
         }
     }
 
@@ -214,12 +237,8 @@ impl<N: RosNetwork> Core<N> {
         let endpoint = &self.endpoint;
         let is_found = |name: &Name| !matches!(endpoint.join_status(name), None | Some(JoinStatus::Waiting));
         for name in self.inquiries.expire(at, is_found) {
-            self.leave_inquiry(&name);
+            self.endpoint.leave(now(), &name);
         }
-    }
-
-    fn leave_inquiry(&mut self, name: &Name) {
-        self.endpoint.leave(now(), name);
         self.next_inquiry();
     }
 

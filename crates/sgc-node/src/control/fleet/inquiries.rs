@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use sgc_endpoint::{CompressionError, RefusedBy};
+use sgc_endpoint::RefusedBy;
 use sgc_trust::NodeName;
 use sgc_wire::{Name, NodeId, RefuseReason, ReportQuestion};
 use tokio::sync::oneshot;
@@ -15,7 +15,9 @@ const ASKED_MAX: usize = 128;
 /// Most questions that are asked or wait.
 const INQUIRIES_MAX: usize = 1024;
 /// Longest time for one node to answer. Over a slow path it takes four passages and the document.
-pub(crate) const INQUIRY_MAX: Duration = Duration::from_secs(5);
+const ANSWER_MAX: Duration = Duration::from_secs(5);
+/// Longest time for a question, waiting for others included.
+const INQUIRY_MAX: Duration = Duration::from_secs(10);
 
 /// Reasons why there is no report.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -30,26 +32,45 @@ pub(crate) enum InquiryError {
     #[error("{INQUIRIES_MAX} questions wait at this node already")]
     Full,
     /// Nobody advertises the name.
-    #[error("not in reach, or it gives no reports (`observers` in its [admin])")]
+    #[error("it is not in reach, or gives no reports")]
     NotFound,
     /// This node is no observer.
-    #[error(
-        "it does not take this node for an observer: enroll this node with `--group observers`, or name it in `observers` \
-         of its [admin]"
-    )]
+    #[error("it does not take the node here for an observer")]
     NotObserver,
     /// The node or a router refused the request itself.
-    #[error("it was not asked: {0}")]
+    #[error("it refuses a report: {0}")]
     Denied(RefusedBy),
     /// The node did not answer.
     #[error("it does not answer")]
     Silent,
+    /// The node was not asked in time, since others were.
+    #[error("it was not asked: {ASKED_MAX} other nodes are being asked")]
+    Waited,
     /// The answer cannot be read.
-    #[error("its report cannot be read: {0}")]
-    Unreadable(CompressionError),
+    #[error("its report cannot be read")]
+    Unreadable,
     /// The node stops.
     #[error("the node is stopping")]
     Stopping,
+}
+
+impl InquiryError {
+    /// Returns the remedy; empty if there is none to name.
+    pub(crate) fn fix(&self) -> &'static str {
+        match self {
+            Self::NotFound => {
+                "see that it runs, with sgc of this version or a later one and `observers` in its [admin]; `sgc status` there \
+                 shows its links"
+            }
+            Self::NotObserver => {
+                "enroll the node here with `--group observers`, or name it in `observers` of [admin] there"
+            }
+            Self::NoAuthority => "`sgc fleet set --authority NODE`, then renew the node here",
+            Self::Unreadable => "compare the versions of sgc on both nodes",
+            Self::Silent | Self::Waited => "try again",
+            Self::NoSecret | Self::Full | Self::Denied(_) | Self::Stopping => "",
+        }
+    }
 }
 
 /// The document of a report, JSON that is not verified; or the reason why there is none.
@@ -64,67 +85,78 @@ pub(crate) enum InquiryTarget {
     Authority,
 }
 
-/// A question of a user.
+/// A question that users wait for.
 #[derive(Debug)]
 struct Inquiry {
     node: NodeId,
     question: ReportQuestion,
-    reply: oneshot::Sender<InquiryAnswer>,
+    until: Instant,
+    /// The name at which the node is asked, once it is.
+    name: Option<Name>,
+    replies: Vec<oneshot::Sender<InquiryAnswer>>,
 }
 
-/// A question that a node was asked.
-#[derive(Debug)]
-struct Asked {
-    inquiry: Inquiry,
-    name: Name,
-    until: Instant,
+impl Inquiry {
+    fn end(self, answer: InquiryAnswer) {
+        for reply in self.replies {
+            // A user may have left.
+            let _ = reply.send(answer.clone());
+        }
+    }
 }
 
 /// The questions that wait, and those under way.
 #[derive(Debug, Default)]
 pub(crate) struct Inquiries {
-    waiting: VecDeque<Inquiry>,
-    asked: Vec<Asked>,
+    all: VecDeque<Inquiry>,
 }
 
 impl Inquiries {
-    /// Queues a question. [`Inquiries::next`] begins it.
+    /// Queues a question. A user who asks the same as another gets the same answer. [`Inquiries::next`] begins it.
     pub(crate) fn push(
         &mut self,
+        now: Instant,
         node: NodeId,
         question: ReportQuestion,
         reply: oneshot::Sender<InquiryAnswer>,
     ) {
-        if self.waiting.len() + self.asked.len() >= INQUIRIES_MAX {
+        let users = self.all.iter().map(|inquiry| inquiry.replies.len()).sum::<usize>();
+        if users >= INQUIRIES_MAX {
             let _ = reply.send(Err(InquiryError::Full));
-            return;
+        } else if let Some(known) =
+            self.all.iter_mut().find(|known| (known.node, &known.question) == (node, &question))
+        {
+            known.replies.push(reply);
+        } else {
+            let (until, name, replies) = (now + INQUIRY_MAX, None, vec![reply]);
+            self.all.push_back(Inquiry { node, question, until, name, replies });
         }
-        self.waiting.push_back(Inquiry { node, question, reply });
     }
 
     /// Begins the next question to a node that is not being asked. `ask` asks it, and returns the name of the question.
     /// Returns `true` if there was one.
     pub(crate) fn next(&mut self, now: Instant, ask: impl FnOnce(NodeId, &ReportQuestion) -> Name) -> bool {
-        // Some users have left.
-        self.waiting.retain(|inquiry| !inquiry.reply.is_closed());
-        let is_free = |node: &NodeId| self.asked.iter().all(|asked| asked.inquiry.node != *node);
-        let next = self.waiting.iter().position(|inquiry| is_free(&inquiry.node));
-        let Some(next) = next.filter(|_| self.asked.len() < ASKED_MAX) else { return false };
-        let Some(inquiry) = self.waiting.remove(next) else { return false };
-        let name = ask(inquiry.node, &inquiry.question);
-        self.asked.push(Asked { inquiry, name, until: now + INQUIRY_MAX });
+        let asked: Vec<_> = self.all.iter().filter(|i| i.name.is_some()).map(|i| i.node).collect();
+        if asked.len() >= ASKED_MAX {
+            return false;
+        }
+        let is_next = |inquiry: &&mut Inquiry| inquiry.name.is_none() && !asked.contains(&inquiry.node);
+        let Some(inquiry) = self.all.iter_mut().find(is_next) else { return false };
+        inquiry.name = Some(ask(inquiry.node, &inquiry.question));
+        inquiry.until = inquiry.until.min(now + ANSWER_MAX);
         true
     }
 
     /// Ends the question at a name. Returns `true` if there was one, so that the name is to be left.
     pub(crate) fn end(&mut self, name: Name, answer: InquiryAnswer) -> bool {
-        let Some(at) = self.asked.iter().position(|asked| asked.name == name) else { return false };
-        let _ = self.asked.swap_remove(at).inquiry.reply.send(answer);
+        let at = self.all.iter().position(|inquiry| inquiry.name == Some(name));
+        let Some(inquiry) = at.and_then(|at| self.all.remove(at)) else { return false };
+        inquiry.end(answer);
         true
     }
 
     /// Ends the question at a name that is refused. Returns `true` if there was one.
-    pub(crate) fn denied(&mut self, name: Name, by: RefusedBy) -> bool {
+    pub(crate) fn refused(&mut self, name: Name, by: RefusedBy) -> bool {
         self.end(
             name,
             Err(match by {
@@ -136,28 +168,30 @@ impl Inquiries {
 
     /// Returns the time at which to call [`Inquiries::expire`].
     pub(crate) fn deadline(&self) -> Option<Instant> {
-        self.asked.iter().map(|asked| asked.until).min()
+        self.all.iter().map(|inquiry| inquiry.until).min()
     }
 
-    /// Ends the questions whose time is over, and those whose users have left. `is_found` returns whether a name is
-    /// advertised. Returns the names to leave.
+    /// Ends the questions whose time is over. `is_found` returns whether a name is advertised. Returns the names to
+    /// leave; only then may [`Inquiries::next`] ask the same nodes again.
     pub(crate) fn expire(&mut self, now: Instant, is_found: impl Fn(&Name) -> bool) -> Vec<Name> {
-        let is_over = |asked: &mut Asked| asked.until <= now || asked.inquiry.reply.is_closed();
-        let over: Vec<_> = self.asked.extract_if(.., is_over).collect();
-        let end = |asked: Asked| {
-            let why = if is_found(&asked.name) { InquiryError::Silent } else { InquiryError::NotFound };
-            let _ = asked.inquiry.reply.send(Err(why));
-            asked.name
+        let (over, left) = self.all.drain(..).partition(|inquiry| inquiry.until <= now);
+        self.all = left;
+        let over: VecDeque<Inquiry> = over;
+        let end = |inquiry: Inquiry| {
+            let name = inquiry.name;
+            inquiry.end(Err(match name {
+                None => InquiryError::Waited,
+                Some(name) if is_found(&name) => InquiryError::Silent,
+                Some(_) => InquiryError::NotFound,
+            }));
+            name
         };
-        over.into_iter().map(end).collect()
+        over.into_iter().filter_map(end).collect()
     }
 
     /// Ends all questions, because the node stops.
     pub(crate) fn stop(&mut self) {
-        let asked = self.asked.drain(..).map(|asked| asked.inquiry);
-        for inquiry in self.waiting.drain(..).chain(asked) {
-            let _ = inquiry.reply.send(Err(InquiryError::Stopping));
-        }
+        self.all.drain(..).for_each(|inquiry| inquiry.end(Err(InquiryError::Stopping)));
     }
 }
 
@@ -175,10 +209,19 @@ mod tests {
         Name(node.0)
     }
 
-    fn push(inquiries: &mut Inquiries, node: NodeId, question: ReportQuestion) -> Receiver<InquiryAnswer> {
+    fn push(
+        inquiries: &mut Inquiries,
+        now: Instant,
+        node: NodeId,
+        question: ReportQuestion,
+    ) -> Receiver<InquiryAnswer> {
         let (reply, replied) = oneshot::channel();
-        inquiries.push(node, question, reply);
+        inquiries.push(now, node, question, reply);
         replied
+    }
+
+    fn interface() -> ReportQuestion {
+        ReportQuestion::Interface("/a".into())
     }
 
     /// Begins all that can begin. Returns the asked nodes.
@@ -194,18 +237,21 @@ mod tests {
     #[test]
     fn nodes_are_asked_at_one_time_and_each_one_question_after_the_other() {
         let (now, mut inquiries) = (Instant::now(), Inquiries::default());
-        let mut first = push(&mut inquiries, ARM, ReportQuestion::Condition);
-        let mut second = push(&mut inquiries, ARM, ReportQuestion::Interface("/a".into()));
-        let mut of_desk = push(&mut inquiries, DESK, ReportQuestion::Condition);
+        let mut first = push(&mut inquiries, now, ARM, ReportQuestion::Node);
+        let mut second = push(&mut inquiries, now, ARM, interface());
+        let mut of_desk = push(&mut inquiries, now, DESK, ReportQuestion::Node);
+        let mut of_another_user = push(&mut inquiries, now, ARM, ReportQuestion::Node);
         assert_eq!(begin(&mut inquiries, now), [ARM, DESK]);
         assert!(!inquiries.end(Name([9; 32]), Err(InquiryError::Silent)), "of another name");
         assert!(inquiries.end(name(ARM), Ok(Bytes::from_static(b"{}"))));
-        assert_eq!(first.try_recv(), Ok(Ok(Bytes::from_static(b"{}"))));
+        for replied in [&mut first, &mut of_another_user] {
+            assert_eq!(replied.try_recv(), Ok(Ok(Bytes::from_static(b"{}"))));
+        }
         assert_eq!(begin(&mut inquiries, now), [ARM]);
-        assert!(inquiries.denied(name(ARM), RefusedBy::Owner(RefuseReason::NotPermitted)));
+        assert!(inquiries.refused(name(ARM), RefusedBy::Owner(RefuseReason::NotPermitted)));
         assert_eq!(second.try_recv(), Ok(Err(InquiryError::NotObserver)));
         let by = RefusedBy::Router(RejectReason::Limit);
-        assert!(inquiries.denied(name(DESK), by) && !inquiries.denied(name(DESK), by));
+        assert!(inquiries.refused(name(DESK), by) && !inquiries.refused(name(DESK), by));
         assert_eq!(of_desk.try_recv(), Ok(Err(InquiryError::Denied(by))));
         assert_eq!(inquiries.deadline(), None);
     }
@@ -213,34 +259,44 @@ mod tests {
     #[test]
     fn question_ends_in_time_and_says_whether_the_node_was_found() {
         let (now, mut inquiries) = (Instant::now(), Inquiries::default());
-        let mut of_arm = push(&mut inquiries, ARM, ReportQuestion::Condition);
-        let mut of_desk = push(&mut inquiries, DESK, ReportQuestion::Condition);
+        let mut of_arm = push(&mut inquiries, now, ARM, ReportQuestion::Node);
+        let mut of_desk = push(&mut inquiries, now, DESK, ReportQuestion::Node);
+        let mut behind = push(&mut inquiries, now, DESK, interface());
         begin(&mut inquiries, now);
-        assert_eq!(inquiries.deadline(), Some(now + INQUIRY_MAX));
+        assert_eq!(inquiries.deadline(), Some(now + ANSWER_MAX));
         assert!(inquiries.expire(now, |_| true).is_empty());
-        let mut left = inquiries.expire(now + INQUIRY_MAX, |asked| *asked == name(ARM));
-        left.sort();
-        assert_eq!(left, [name(ARM), name(DESK)]);
+        let later = now + ANSWER_MAX;
+        assert_eq!(inquiries.expire(later, |asked| *asked == name(ARM)), [name(ARM), name(DESK)]);
         assert_eq!(of_arm.try_recv(), Ok(Err(InquiryError::Silent)));
         assert_eq!(of_desk.try_recv(), Ok(Err(InquiryError::NotFound)));
+        // The question behind begins once the name was left, and has the rest of its time.
+        assert_eq!(
+            (begin(&mut inquiries, later), inquiries.deadline()),
+            (vec![DESK], Some(now + INQUIRY_MAX))
+        );
+        assert_eq!(inquiries.expire(now + INQUIRY_MAX, |_| true), [name(DESK)]);
+        assert_eq!(behind.try_recv(), Ok(Err(InquiryError::Silent)));
     }
 
     #[test]
-    fn questions_are_bounded_and_those_of_users_who_left_are_dropped() {
+    fn questions_are_bounded_and_those_that_are_never_asked_end_in_time() {
         let (now, mut inquiries) = (Instant::now(), Inquiries::default());
         let node =
             |n: usize| NodeId(std::array::from_fn(|at| if at < 2 { (n >> (8 * at)) as u8 } else { 7 }));
-        let mut waiting: Vec<_> =
-            (0..INQUIRIES_MAX).map(|n| push(&mut inquiries, node(n), ReportQuestion::Condition)).collect();
-        let mut one_more = push(&mut inquiries, ARM, ReportQuestion::Condition);
-        assert_eq!(one_more.try_recv(), Ok(Err(InquiryError::Full)));
+        let mut all: Vec<_> =
+            (0..INQUIRIES_MAX).map(|n| push(&mut inquiries, now, node(n), ReportQuestion::Node)).collect();
+        for one_more in [ARM, node(0)] {
+            let mut one_more = push(&mut inquiries, now, one_more, ReportQuestion::Node);
+            assert_eq!(one_more.try_recv(), Ok(Err(InquiryError::Full)));
+        }
         assert_eq!(begin(&mut inquiries, now).len(), ASKED_MAX);
-        waiting.truncate(ASKED_MAX + 1);
-        // One of the asked, and all that wait but one.
-        waiting.remove(0);
-        assert_eq!(inquiries.expire(now, |_| true).len(), 1);
-        assert_eq!(begin(&mut inquiries, now).len(), 1);
+        assert_eq!(inquiries.expire(now + INQUIRY_MAX, |_| true).len(), ASKED_MAX);
+        let waited = all.split_off(ASKED_MAX);
+        let ended = |mut replied: Receiver<InquiryAnswer>| replied.try_recv();
+        assert!(all.into_iter().map(ended).all(|end| end == Ok(Err(InquiryError::Silent))));
+        assert!(waited.into_iter().map(ended).all(|end| end == Ok(Err(InquiryError::Waited))));
+        let mut stopped = push(&mut inquiries, now, ARM, ReportQuestion::Node);
         inquiries.stop();
-        assert!(waiting.iter_mut().all(|replied| replied.try_recv() == Ok(Err(InquiryError::Stopping))));
+        assert_eq!(stopped.try_recv(), Ok(Err(InquiryError::Stopping)));
     }
 }

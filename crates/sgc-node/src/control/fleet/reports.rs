@@ -1,30 +1,27 @@
-//! Reports that this node gives observers: who may ask, and the last documents.
+//! Reports that this node gives observers: who may ask, the questions that wait, and the last documents.
+//!
+//! A document is a copy of the node's state. One is made at a time, and the next a while later, so that observers who ask
+//! much wait for each other and the control task for none.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use sgc_trust::{Grantees, VerifiedPeer};
-use sgc_wire::{Report, ReportQuestion, SinkId};
+use sgc_wire::{NodeId, Report, ReportQuestion, SinkId};
 
-/// Time for which a report is given again, so that a document is made at most twice a second for each question.
-pub(crate) const REPORT_KEPT: Duration = Duration::from_millis(500);
+/// Time for which a report is given again.
+const REPORT_KEPT: Duration = Duration::from_millis(500);
 /// Most reports that are kept.
 const REPORTS_KEPT_MAX: usize = 8;
+/// Time between the beginnings of two documents.
+const REPORT_INTERVAL: Duration = Duration::from_millis(50);
 
-/// Most questions that wait for a document under way.
-const REPORTS_WAITING_MAX: usize = 256;
-
-/// Next step for a question.
-#[derive(Debug, PartialEq, Eq)]
-pub(crate) enum ReportStep {
-    /// Send this report.
-    Answer(Report),
-    /// Make a document. [`Reports::made`] has those who wait for it.
-    Make,
-    /// A document for this question is being made.
-    UnderWay,
-    /// Too many wait.
-    Full,
+/// The last question of an observer that waits.
+#[derive(Debug)]
+struct Waiting {
+    peer: VerifiedPeer,
+    sink: SinkId,
+    question: ReportQuestion,
 }
 
 /// The observers of this node, and the reports that they got last.
@@ -32,15 +29,20 @@ pub(crate) enum ReportStep {
 pub(crate) struct Reports {
     observers: Grantees,
     kept: BTreeMap<ReportQuestion, (Instant, Report)>,
-    /// The sinks that wait, by their question.
-    waiting: BTreeMap<ReportQuestion, Vec<SinkId>>,
+    /// At most one question of each node; the endpoint has places for few nodes.
+    waiting: BTreeMap<NodeId, Waiting>,
+    /// Whether a document is being made.
+    is_making: bool,
+    /// Time from which the next document may be made.
+    next_at: Option<Instant>,
 }
 
 impl Reports {
-    /// Sets the observers. Returns whether there are any.
-    pub(crate) fn set_observers(&mut self, observers: Grantees) -> bool {
+    /// Sets the observers. Returns whether there are any, and the sinks of nodes that wait and are none any more.
+    pub(crate) fn set_observers(&mut self, observers: Grantees) -> (bool, Vec<SinkId>) {
+        let gone = self.take_waiting(|waiting| observers.find(&waiting.peer).is_none());
         self.observers = observers;
-        !self.observers.is_empty()
+        (!self.observers.is_empty(), gone)
     }
 
     /// Returns `true` if a peer is an observer.
@@ -48,35 +50,46 @@ impl Reports {
         self.observers.find(peer).is_some()
     }
 
-    /// Takes a question of an observer.
-    pub(crate) fn ask(&mut self, now: Instant, question: &ReportQuestion, sink: SinkId) -> ReportStep {
+    /// Takes a question of an observer, in place of an earlier one. Returns the report that it got a moment ago.
+    pub(crate) fn ask(
+        &mut self,
+        now: Instant,
+        peer: &VerifiedPeer,
+        sink: SinkId,
+        question: ReportQuestion,
+    ) -> Option<Report> {
         self.kept.retain(|_, (made, _)| now.saturating_duration_since(*made) < REPORT_KEPT);
-        if let Some((_, report)) = self.kept.get(question) {
-            return ReportStep::Answer(report.clone());
+        if let Some((_, report)) = self.kept.get(&question) {
+            return Some(report.clone());
         }
-        if self.waiting.values().map(Vec::len).sum::<usize>() >= REPORTS_WAITING_MAX {
-            return ReportStep::Full;
-        }
-        match self.waiting.get_mut(question) {
-            Some(waiting) => {
-                waiting.push(sink);
-                ReportStep::UnderWay
-            }
-            None => {
-                self.waiting.insert(question.clone(), vec![sink]);
-                ReportStep::Make
-            }
-        }
+        self.waiting.insert(peer.node_id, Waiting { peer: peer.clone(), sink, question });
+        None
     }
 
-    /// Takes a report that was made; `None` if the document is too long for one. Returns the sinks that wait for it.
+    /// Returns the question for which a document is to be made now.
+    pub(crate) fn next(&mut self, now: Instant) -> Option<ReportQuestion> {
+        if self.is_making || self.next_at.is_some_and(|at| at > now) {
+            return None;
+        }
+        let question = self.waiting.values().next()?.question.clone();
+        (self.is_making, self.next_at) = (true, Some(now + REPORT_INTERVAL));
+        Some(question)
+    }
+
+    /// Returns the time at which to call [`Reports::next`].
+    pub(crate) fn deadline(&self) -> Option<Instant> {
+        self.next_at.filter(|_| !self.is_making && !self.waiting.is_empty())
+    }
+
+    /// Takes the report that was made; `None` if the document is too long for one. Returns the sinks that wait for it.
     pub(crate) fn made(
         &mut self,
         now: Instant,
         question: ReportQuestion,
         report: Option<&Report>,
     ) -> Vec<SinkId> {
-        let waiting = self.waiting.remove(&question).unwrap_or_default();
+        self.is_making = false;
+        let answered = self.take_waiting(|waiting| waiting.question == question);
         if let Some(report) = report {
             let oldest = self.kept.iter().min_by_key(|(_, (made, _))| *made).map(|(q, _)| q.clone());
             if let Some(oldest) = oldest.filter(|_| self.kept.len() >= REPORTS_KEPT_MAX) {
@@ -84,14 +97,32 @@ impl Reports {
             }
             self.kept.insert(question, (now, report.clone()));
         }
-        waiting
+        answered
+    }
+
+    /// Removes the questions that are wanted. Returns their sinks.
+    fn take_waiting(&mut self, is_wanted: impl Fn(&Waiting) -> bool) -> Vec<SinkId> {
+        let mut taken = Vec::new();
+        self.waiting.retain(|_, waiting| {
+            let is_taken = is_wanted(waiting);
+            if is_taken {
+                taken.push(waiting.sink);
+            }
+            !is_taken
+        });
+        taken
     }
 }
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used)]
+
     use bytes::Bytes;
-    use sgc_wire::PayloadEncoding;
+    use rand_chacha::ChaCha20Rng;
+    use rand_core::SeedableRng as _;
+    use sgc_trust::{EnrollRequest, Fleet};
+    use sgc_wire::{PayloadEncoding, UnixMillis};
 
     use super::*;
 
@@ -106,33 +137,65 @@ mod tests {
         ReportQuestion::Interface(format!("/{n}"))
     }
 
-    #[test]
-    fn one_document_answers_all_who_ask_for_half_a_second() {
-        let (begin, mut reports) = (Instant::now(), Reports::default());
-        let question = ReportQuestion::Condition;
-        assert_eq!(reports.ask(begin, &question, A), ReportStep::Make);
-        assert_eq!(reports.ask(begin, &question, B), ReportStep::UnderWay);
-        assert_eq!(reports.ask(begin, &interface(0), B), ReportStep::Make);
-        assert_eq!(reports.made(begin, question.clone(), Some(&report("a"))), [A, B]);
-        let soon = begin + REPORT_KEPT / 2;
-        assert_eq!(reports.ask(soon, &question, B), ReportStep::Answer(report("a")));
-        assert_eq!(reports.ask(begin + REPORT_KEPT, &question, B), ReportStep::Make);
-        assert_eq!(reports.made(begin, interface(0), None), [B], "it was too long");
-        assert_eq!(reports.ask(begin, &interface(0), A), ReportStep::Make);
+    /// Returns two nodes of a fleet.
+    fn peers() -> [VerifiedPeer; 2] {
+        let (now, mut rng) = (UnixMillis(1_795_000_000_000), ChaCha20Rng::seed_from_u64(1));
+        let mut fleet = Fleet::create("lab".parse().unwrap(), now, &mut rng).unwrap();
+        ["arm", "desk"].map(|name| {
+            let request = EnrollRequest::new(name.parse().unwrap(), now);
+            fleet.enroll(&request, &mut rng).unwrap().as_peer().clone()
+        })
     }
 
     #[test]
-    fn questions_that_wait_and_reports_that_are_kept_are_bounded() {
-        let (now, mut reports) = (Instant::now(), Reports::default());
-        let asked: Vec<_> =
-            (0..=REPORTS_WAITING_MAX).map(|n| reports.ask(now, &interface(n / 2), A)).collect();
-        assert_eq!(
-            (&asked[..2], asked.last()),
-            (&[ReportStep::Make, ReportStep::UnderWay][..], Some(&ReportStep::Full))
-        );
+    fn one_document_answers_all_who_ask_for_half_a_second() {
+        let (begin, mut reports, [arm, desk]) = (Instant::now(), Reports::default(), peers());
+        let question = || ReportQuestion::Node;
+        assert_eq!(reports.ask(begin, &arm, A, question()), None);
+        assert_eq!(reports.next(begin), Some(question()));
+        assert_eq!(reports.ask(begin, &desk, B, question()), None);
+        assert_eq!((reports.next(begin), reports.deadline()), (None, None), "one is being made");
+        let mut answered = reports.made(begin, question(), Some(&report("a")));
+        answered.sort();
+        assert_eq!(answered, [A, B]);
+        let soon = begin + REPORT_KEPT / 2;
+        assert_eq!(reports.ask(soon, &arm, A, question()), Some(report("a")));
+        assert_eq!(reports.ask(begin + REPORT_KEPT, &arm, A, question()), None);
+        assert_eq!(reports.next(begin + REPORT_KEPT), Some(question()));
+        assert_eq!(reports.made(begin, question(), None), [A], "it was too long");
+        assert!(reports.kept.is_empty());
+    }
+
+    #[test]
+    fn observer_that_asks_much_waits_and_keeps_one_place() {
+        let (begin, mut reports, [arm, desk]) = (Instant::now(), Reports::default(), peers());
+        assert_eq!(reports.ask(begin, &arm, A, interface(0)), None);
+        assert_eq!(reports.next(begin), Some(interface(0)));
+        for n in 1..100 {
+            assert_eq!(reports.ask(begin, &arm, A, interface(n)), None);
+        }
+        assert_eq!(reports.waiting.len(), 1);
+        assert!(reports.made(begin, interface(0), Some(&report("a"))).is_empty(), "nobody wants it any more");
+        assert_eq!((reports.next(begin), reports.deadline()), (None, Some(begin + REPORT_INTERVAL)));
+        assert_eq!(reports.next(begin + REPORT_INTERVAL), Some(interface(99)));
+        assert_eq!(reports.made(begin, interface(99), None), [A]);
         for n in 0..2 * REPORTS_KEPT_MAX {
-            assert_eq!(reports.made(now, interface(n), Some(&report("b"))), [A, A]);
+            reports.ask(begin, &desk, B, interface(200 + n));
+            assert_eq!(reports.made(begin, interface(200 + n), Some(&report("b"))), [B]);
         }
         assert_eq!(reports.kept.len(), REPORTS_KEPT_MAX);
+    }
+
+    #[test]
+    fn node_that_waits_is_refused_when_it_is_no_observer_any_more() {
+        let (now, mut reports, [arm, desk]) = (Instant::now(), Reports::default(), peers());
+        let only = |peer: &VerifiedPeer| Grantees { nodes: [peer.node_id].into(), ..Grantees::default() };
+        for (peer, sink) in [(&arm, A), (&desk, B)] {
+            reports.ask(now, peer, sink, ReportQuestion::Node);
+        }
+        assert_eq!(reports.set_observers(only(&arm)), (true, vec![B]));
+        assert!(reports.may_ask(&arm) && !reports.may_ask(&desk));
+        assert_eq!(reports.made(now, ReportQuestion::Node, Some(&report("a"))), [A]);
+        assert_eq!(reports.set_observers(Grantees::default()), (false, vec![]));
     }
 }

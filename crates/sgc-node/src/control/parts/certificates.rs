@@ -11,7 +11,7 @@ use sgc_trust::{Identity, IdentityError, TrustAnchors, VerifiedPeer};
 use sgc_wire::{Credentials, Now, UnixMillis};
 use tokio::sync::watch;
 
-use crate::control::faults::alerts::{Alert, clock_alert};
+use crate::control::faults::alerts::clock_alert;
 use crate::gateway::Gateway;
 use crate::state::credentials::{StateWriter, renew_at, renewed};
 
@@ -81,11 +81,6 @@ impl Certificates {
     }
 
     /// Returns the time of the next request for renewal.
-    /// Returns the alerts of the gateway.
-    pub(crate) fn gateway_alerts(&self) -> Vec<Alert> {
-        self.gateway.alerts()
-    }
-
     pub(crate) fn deadline(&self) -> Option<Instant> {
         self.renew_due
     }
