@@ -23,6 +23,8 @@ const ANSWER_MAX: Duration = Duration::from_secs(15);
 const CERTIFICATE_PART: u64 = 5;
 /// Difference of clocks from which on it is shown. Reports take some seconds at most.
 const CLOCKS_DIFFER: Duration = Duration::from_secs(30);
+/// What to name where the authority does not tell the members.
+const OTHERWISE: &str = "nodes (`sgc fleet status robot`) or the fleet file (`--fleet lab.fleet`)";
 /// Nodes with the same fault that are named.
 const NODES_NAMED: usize = 4;
 /// Stuck topics of a node that are named.
@@ -88,6 +90,38 @@ pub fn ask_nodes(
     Ok(answers)
 }
 
+/// The members of a fleet.
+#[derive(Clone, Debug, Default)]
+pub struct Members {
+    /// The members, by name.
+    pub members: Vec<ReportMember>,
+    /// The number of further ones.
+    pub omitted: usize,
+    /// The report of the authority, if it was asked for them.
+    pub authority: Option<ReportAnswer>,
+}
+
+impl Members {
+    /// Asks the authority that the identity of the node at this socket names.
+    pub fn of_authority(socket: &Path) -> Result<Self, DiagnosisError> {
+        let mut answer = ask_nodes(socket, &[], None)?.pop().unwrap_or_default();
+        let members = answer.report.as_mut().and_then(|report| report.members.take());
+        if let (Some(members), Some(report)) = (members, &answer.report) {
+            answer.node = report.node.clone();
+            return Ok(Self { members, omitted: report.members_omitted, authority: Some(answer) });
+        }
+        let reason = match (&answer.report, &answer.error) {
+            (Some(report), _) => format!("{} has no fleet file", report.node),
+            (None, Some(error)) if answer.fix.is_empty() => error.clone(),
+            (None, error) => format!("{} ({})", error.as_deref().unwrap_or_default(), answer.fix),
+        };
+        let reason = format!(
+            "the members of the fleet are not known here. Its authority: {reason}. Or name {OTHERWISE}"
+        );
+        Err(DiagnosisError::NotSeen { reason })
+    }
+}
+
 impl FleetStatus {
     /// Joins the members of a fleet with the answers of nodes. With `named`, only these nodes are shown.
     pub fn new(
@@ -135,23 +169,32 @@ impl FleetStatus {
                 output::several(self.members_omitted as u64, "node")
             ));
         }
-        lines.extend(self.attention());
+        lines.extend(self.attention_lines());
         lines
     }
 
-    /// Returns what needs attention, with the nodes that have the same fault in one line.
-    fn attention(&self) -> Vec<String> {
-        let mut faults: Vec<(Fault, Vec<&str>)> = Vec::new();
+    /// Returns what needs attention, each fault with all nodes that have it.
+    pub fn attention(&self) -> Vec<FaultOfNodes> {
+        let mut faults: Vec<FaultOfNodes> = Vec::new();
         for node in &self.nodes {
-            for fault in self.faults(node) {
-                match faults.iter_mut().find(|(known, _)| *known == fault) {
-                    Some((_, nodes)) => nodes.push(&node.name),
-                    None => faults.push((fault, vec![&node.name])),
+            for Fault { what, fix } in self.faults(node) {
+                match faults.iter_mut().find(|known| (&known.what, &known.fix) == (&what, &fix)) {
+                    Some(known) => known.nodes.push(node.name.clone()),
+                    None => faults.push(FaultOfNodes { nodes: vec![node.name.clone()], what, fix }),
                 }
             }
         }
+        faults
+    }
+
+    /// Returns all known nodes by their ids: the name, and whether the node may route for others.
+    pub fn known(&self) -> &BTreeMap<String, (String, bool)> {
+        &self.known
+    }
+
+    fn attention_lines(&self) -> Vec<String> {
         let mut lines = Vec::new();
-        for (Fault { what, fix }, nodes) in faults {
+        for FaultOfNodes { nodes, what, fix } in self.attention() {
             lines.push(format!("  {}: {what}", listed(&nodes)));
             if !fix.is_empty() {
                 lines.push(format!("    {fix}"));
@@ -201,7 +244,8 @@ impl FleetStatus {
         lines
     }
 
-    fn summary(&self) -> String {
+    /// Returns the numbers of nodes that are here, absent, revoked and faulty, as a sentence.
+    pub fn summary(&self) -> String {
         let count = |is_it: fn(&FleetNode) -> bool| self.nodes.iter().filter(|node| is_it(node)).count();
         let here = count(|node| node.report.is_some());
         let revoked = count(|node| node.is_revoked() && node.report.is_none());
@@ -386,8 +430,19 @@ impl FleetStatus {
     }
 }
 
+/// Something that needs attention at some nodes.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct FaultOfNodes {
+    /// The names of the nodes.
+    pub nodes: Vec<String>,
+    /// The fault.
+    pub what: String,
+    /// The remedy; empty if there is none to name.
+    pub fix: String,
+}
+
 /// Something that needs attention.
-#[derive(Debug, PartialEq, Eq)]
+#[derive(Debug)]
 struct Fault {
     what: String,
     /// The remedy; empty if there is none to name.
@@ -406,7 +461,7 @@ fn messages(report: &NodeReport) -> u64 {
 }
 
 /// Lists names, the first ones of many.
-fn listed(names: &[&str]) -> String {
+fn listed(names: &[String]) -> String {
     match names.len().saturating_sub(NODES_NAMED) {
         0 => names.join(", "),
         more => format!("{} and {more} more", names[..NODES_NAMED].join(", ")),

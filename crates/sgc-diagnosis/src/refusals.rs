@@ -822,7 +822,7 @@ pub(crate) fn call_loss(key: &str) -> Option<(&'static str, &'static str)> {
 }
 
 /// Returns the meaning of a row of `sgc status`, Drops.
-pub(crate) fn drop_meaning(row: &str) -> String {
+pub fn drop_meaning(row: &str) -> String {
     let key = row.split(" from ").next().unwrap_or(row);
     let all = [CONTROL, PACKETS, SINK].map(|table| find(table, key));
     let mut all: Vec<_> = all.into_iter().flatten().map(|refusal| refusal.means).collect();

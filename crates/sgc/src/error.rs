@@ -9,6 +9,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::error::ErrorKind;
+use sgc_dashboard::DashboardError;
 use sgc_demo::DemoError;
 use sgc_diagnosis::DiagnosisError;
 use sgc_gateway::AccessTokenError;
@@ -252,6 +253,9 @@ pub(crate) enum CliError {
     /// A measurement between two machines cannot begin or continue.
     #[error(transparent)]
     Bench(MeasureError),
+    /// The page of the fleet cannot be served.
+    #[error(transparent)]
+    Dashboard(#[from] DashboardError),
     /// A node that cannot be asked, or an answer that cannot be used.
     #[error(transparent)]
     Diagnosis(#[from] DiagnosisError),
@@ -308,6 +312,7 @@ impl CliError {
             | Self::SecretLacking { .. }
             | Self::CheckIdentity { .. }
             | Self::Diagnosis(DiagnosisError::RouterCannotName { .. })
+            | Self::Dashboard(DashboardError::NotLoopback(_))
             | Self::LogFilter { .. }
             | Self::LogFormat { .. }
             | Self::SeveralNodes { .. }
@@ -336,6 +341,7 @@ impl CliError {
             Self::Process(_)
             | Self::FleetFile(FleetFileError::Read { .. } | FleetFileError::Write { .. })
             | Self::Diagnosis(_)
+            | Self::Dashboard(_)
             | Self::NoNodeHere { .. }
             | Self::ServicesOfOthers { .. }
             | Self::NodeRefused { .. }

@@ -13,6 +13,7 @@
 mod audit;
 mod bench;
 mod check;
+mod dashboard;
 mod demo;
 mod environment;
 mod error;
@@ -75,6 +76,7 @@ enum Command {
     Router(run::RouterArgs),
     Check(check::CheckArgs),
     Status(status::StatusArgs),
+    Dashboard(dashboard::DashboardArgs),
     Topic(topic::TopicArgs),
     Service(service::ServiceArgs),
     Why(why::WhyArgs),
@@ -137,6 +139,7 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::Topic(args) => return topic::topic(&args),
         Command::Service(args) => return service::service(&args),
         Command::Status(args) => status::status(&args),
+        Command::Dashboard(args) => dashboard::dashboard(&args),
         Command::Reload(args) => return reload::reload(&args),
         Command::Audit(args) => audit::audit(&args),
         Command::Policy(args) => return policy::policy(&args),

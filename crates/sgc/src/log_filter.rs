@@ -4,13 +4,14 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::LevelFilter;
 
 /// The log targets: the names of the crates that log.
-const LOG_TARGETS: [&str; 14] = [
+const LOG_TARGETS: [&str; 15] = [
     "sgc",
     "sgc_cdr",
     "sgc_dds",
     "sgc_demo",
     "sgc_endpoint",
     "sgc_gateway",
+    "sgc_http",
     "sgc_measure",
     "sgc_node",
     "sgc_ros",

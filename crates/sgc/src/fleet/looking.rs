@@ -7,9 +7,8 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
-use sgc_diagnosis::fleet::{FleetStatus, ask_nodes};
+use sgc_diagnosis::fleet::{FleetStatus, Members, ask_nodes};
 use sgc_diagnosis::{DiagnosisError, diagnose};
-use sgc_node::admin::ReportAnswer;
 use sgc_node::admin::report::ReportMember;
 use sgc_node::graph::Graph;
 use sgc_node::roster_row;
@@ -69,15 +68,6 @@ pub(super) struct WhyArgs {
     json: bool,
 }
 
-/// The members of a fleet.
-#[derive(Default)]
-struct Members {
-    members: Vec<ReportMember>,
-    omitted: usize,
-    /// The answer of the authority, if it was asked for them.
-    authority: Option<ReportAnswer>,
-}
-
 /// Runs `sgc fleet status`.
 pub(super) fn status(args: &StatusArgs) -> Result<(), CliError> {
     for name in &args.nodes {
@@ -104,8 +94,8 @@ pub(super) fn status(args: &StatusArgs) -> Result<(), CliError> {
 
 fn look(args: &StatusArgs, socket: &Path) -> Result<FleetStatus, CliError> {
     let found = match &args.fleet {
-        Some(file) => of_file(file),
-        None => of_authority(socket),
+        Some(file) => members_of_file(file),
+        None => Members::of_authority(socket).map_err(CliError::from),
     };
     let Members { members, omitted, authority } = match found {
         // Their details need no members, which only add names to their links.
@@ -149,27 +139,8 @@ fn show(args: &StatusArgs, look: &FleetStatus, before: Option<&FleetStatus>) -> 
     lines.iter().try_for_each(|line| output::line(output::clean(line)))
 }
 
-/// Returns the members of the fleet as the authority knows them that the identity of the node here names.
-fn of_authority(socket: &Path) -> Result<Members, CliError> {
-    let mut answer = ask_nodes(socket, &[], None)?.pop().unwrap_or_default();
-    let members = answer.report.as_mut().and_then(|report| report.members.take());
-    if let (Some(members), Some(report)) = (members, &answer.report) {
-        answer.node = report.node.clone();
-        return Ok(Members { members, omitted: report.members_omitted, authority: Some(answer) });
-    }
-    let reason = match (&answer.report, &answer.error) {
-        (Some(report), _) => format!("{} has no fleet file", report.node),
-        (None, Some(error)) if answer.fix.is_empty() => error.clone(),
-        (None, error) => format!("{} ({})", error.as_deref().unwrap_or_default(), answer.fix),
-    };
-    let reason = format!(
-        "the members of the fleet are not known here. Its authority: {reason}. Or name nodes (`sgc fleet status robot`) or the \
-         fleet file (`--fleet lab.fleet`)"
-    );
-    Err(DiagnosisError::NotSeen { reason }.into())
-}
-
-fn of_file(file: &Path) -> Result<Members, CliError> {
+/// Returns the members in a fleet file.
+pub(crate) fn members_of_file(file: &Path) -> Result<Members, CliError> {
     let (_, fleet) = WhichFleet { fleet: Some(file.to_owned()) }.read()?;
     let members = fleet.nodes().map(|node| ReportMember::new(roster_row(&fleet, node))).collect();
     Ok(Members { members, ..Members::default() })

@@ -21,6 +21,7 @@ use sgc_node::{LockedFleet, config};
 use sgc_process::ProcessError;
 use sgc_trust::Fleet;
 
+pub(crate) use self::looking::members_of_file;
 use crate::error::CliError;
 use crate::files;
 

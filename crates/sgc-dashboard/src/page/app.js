@@ -1,0 +1,441 @@
+// The page of `sgc dashboard`: asks its server for documents about the fleet and shows the newest.
+//
+// Texts come from other machines. They are set as text and never parsed as markup.
+
+const token = location.hash.slice(1);
+const by = (id) => document.getElementById(id);
+/** Time before a failed question is asked again, milliseconds. */
+const AGAIN_MS = 2000;
+const DAY_MS = 86_400_000;
+/** Marks by state, so that color alone tells nothing. */
+const MARKS = { here: "●", fault: "▲", linked: "◌", absent: "○", revoked: "✕" };
+
+let view = null;
+let arrived = 0;
+let selected = null;
+/** Of each node: the last report, and the rates since the one before, by direction and topic. */
+const rates = new Map();
+
+const ask = async (path) => {
+  const answer = await fetch(path, { headers: { authorization: `Bearer ${token}` } });
+  if (!answer.ok) throw new Error((await answer.text()) || answer.statusText);
+  return answer.json();
+};
+
+const setText = (element, text) => {
+  if (element.textContent !== text) element.textContent = text;
+};
+const setAttribute = (element, name, value) => {
+  if (element.getAttribute(name) !== value) element.setAttribute(name, value);
+};
+
+/** Sets a text in which `backquotes` stand around what a user types or finds in a file. */
+const setMarked = (element, text) => {
+  if (element.dataset.text === text) return;
+  element.dataset.text = text;
+  element.replaceChildren(
+    ...text.split("`").map((part, at) => {
+      if (at % 2 === 0) return part;
+      const code = document.createElement("code");
+      code.textContent = part;
+      return code;
+    }),
+  );
+};
+
+/** Makes the children of `parent` those of `items`, by their keys. Elements that stay keep the focus. */
+const sync = (parent, items, keyOf, create, update) => {
+  const known = new Map([...parent.children].map((child) => [child.dataset.key, child]));
+  let next = parent.firstElementChild;
+  for (const item of items) {
+    const key = keyOf(item);
+    let child = known.get(key);
+    if (child) known.delete(key);
+    else {
+      child = create(item);
+      child.dataset.key = key;
+    }
+    if (child === next) next = next.nextElementSibling;
+    else parent.insertBefore(child, next);
+    update(child, item);
+  }
+  for (const child of known.values()) child.remove();
+};
+
+/** Rows of text. A cell is a text, or an element that is made once. */
+const syncRows = (body, items, keyOf, cells) => {
+  const part = body.closest(".part");
+  if (part) part.hidden = items.length === 0;
+  sync(
+    body,
+    items,
+    keyOf,
+    (item) => {
+      const row = document.createElement("tr");
+      for (const { make, number } of cells) {
+        const cell = row.insertCell();
+        if (number) cell.className = "number";
+        if (make) cell.append(make(item));
+      }
+      return row;
+    },
+    (row, item) => {
+      cells.forEach(({ make, text }, at) => {
+        const cell = row.cells[at];
+        if (text) setText(make ? cell.firstElementChild : cell, text(item));
+      });
+    },
+  );
+};
+
+const duration = (seconds) => {
+  const [d, h, m] = [Math.floor(seconds / 86_400), Math.floor(seconds / 3600) % 24, Math.floor(seconds / 60) % 60];
+  if (d) return `${d} d ${h} h`;
+  if (h) return `${h} h ${m} min`;
+  return m ? `${m} min ${Math.floor(seconds % 60)} s` : `${Math.floor(seconds)} s`;
+};
+const millis = (us) => (us < 10_000 ? `${(us / 1000).toFixed(2)} ms` : `${Math.round(us / 1000)} ms`);
+const count = (n) => n.toLocaleString("en");
+
+const nameOf = (link) => view.known[link.peer]?.[0] ?? link.name ?? link.peer.slice(0, 8);
+const isRouter = (id) => view.known[id]?.[1] ?? false;
+const idOf = (node) => node.member?.id;
+const nodes = () => view.fleet.nodes;
+const faulty = () => new Set(view.faults.flatMap((fault) => fault.nodes));
+const linked = () =>
+  new Set(nodes().flatMap((node) => node.report?.links.filter((link) => !link.silent).map((link) => link.peer) ?? []));
+
+const stateOf = (node) => {
+  if (node.report) return faulty().has(node.name) ? "fault" : "here";
+  if (node.member?.revoked_ms) return "revoked";
+  return linked().has(idOf(node)) ? "linked" : "absent";
+};
+
+const stateText = (node) => {
+  switch (stateOf(node)) {
+    case "here": return "here";
+    case "fault": return "needs attention";
+    case "revoked": return "revoked";
+    case "linked": return "no report, but linked";
+    default: {
+      const seen = node.member?.seen_ms;
+      return seen ? `no report, seen ${duration((view.fleet.time_ms - seen) / 1000)} ago` : "no report";
+    }
+  }
+};
+
+const certificate = (node) => {
+  const until = node.report?.certificate_until_ms ?? node.member?.expires_ms;
+  if (!until) return "–";
+  const left = until - view.fleet.time_ms;
+  return left <= 0 ? "ended" : `${left > DAY_MS ? `${Math.floor(left / DAY_MS)} d` : duration(left / 1000)} left`;
+};
+
+const linksText = (report) => {
+  const shown = report.links.slice(0, 2).map((link) => `${nameOf(link)} ${link.silent ? "silent" : millis(link.rtt_us)}`);
+  const more = report.links.length + report.links_omitted - shown.length;
+  if (more > 0) shown.push(`${more} more`);
+  return shown.join(", ") || "none";
+};
+
+const topicKey = (topic) => `${topic.direction} ${topic.topic} ${topic.owner} ${topic.type ?? ""}`;
+
+/** Notes the reports of a new document, and the rates since those before. */
+const measure = () => {
+  for (const { name, report } of nodes()) {
+    const before = rates.get(name);
+    if (!report) {
+      rates.delete(name);
+      continue;
+    }
+    if (before?.report.clock_ms === report.clock_ms) continue;
+    let topics = null;
+    const seconds = before ? (report.clock_ms - before.report.clock_ms) / 1000 : 0;
+    // After a restart the counters begin anew.
+    if (seconds > 0 && report.uptime_s >= before.report.uptime_s) {
+      topics = new Map();
+      const earlier = new Map(before.report.topics.map((topic) => [topicKey(topic), topic.messages]));
+      for (const topic of report.topics) {
+        const more = topic.messages - (earlier.get(topicKey(topic)) ?? topic.messages);
+        if (more >= 0) topics.set(topicKey(topic), more / seconds);
+      }
+    }
+    rates.set(name, { report, topics });
+  }
+};
+
+const rateOf = (node, topic) => {
+  const rate = rates.get(node.name)?.topics?.get(topicKey(topic));
+  return rate === undefined ? "–" : rate.toFixed(1);
+};
+const rateOfNode = (node) => {
+  const topics = rates.get(node.name)?.topics;
+  return topics ? [...topics.values()].reduce((sum, rate) => sum + rate, 0).toFixed(1) : "–";
+};
+
+const button = (text, act) => {
+  const made = document.createElement("button");
+  made.type = "button";
+  made.textContent = text;
+  made.addEventListener("click", act);
+  return made;
+};
+
+const select = (name) => {
+  if (name !== selected) by("filter").value = "";
+  selected = name;
+  show();
+  by("details-title").focus();
+};
+
+const showFaults = () => {
+  by("no-faults").hidden = view.faults.length > 0;
+  sync(
+    by("faults"),
+    view.faults,
+    (fault) => `${fault.what}\n${fault.fix}`,
+    () => {
+      const item = document.createElement("li");
+      const [what, fix] = [document.createElement("div"), document.createElement("div")];
+      fix.className = "fix";
+      item.append(what, fix);
+      return item;
+    },
+    (item, { nodes, what, fix }) => {
+      const [first, second] = item.children;
+      if (first.dataset.nodes !== nodes.join()) {
+        first.dataset.nodes = nodes.join();
+        first.replaceChildren(
+          ...nodes.flatMap((name, at) => (at ? [", ", button(name, () => select(name))] : [button(name, () => select(name))])),
+          `: ${what}`,
+        );
+      }
+      setMarked(second, fix);
+    },
+  );
+};
+
+const showNodes = () => {
+  const dash = (node, of) => (node.report ? of(node.report) : "–");
+  syncRows(by("nodes"), nodes(), (node) => node.name, [
+    { make: (node) => button(node.name, () => select(node.name)) },
+    { make: () => document.createElement("span"), text: (node) => `${MARKS[stateOf(node)]} ${stateText(node)}` },
+    { text: (node) => dash(node, (report) => duration(report.uptime_s)) },
+    { text: (node) => dash(node, (report) => report.version) },
+    { text: certificate },
+    { text: (node) => dash(node, linksText) },
+    { number: true, text: (node) => dash(node, (report) => count(report.topics.length + report.topics_omitted)) },
+    { number: true, text: (node) => dash(node, () => rateOfNode(node)) },
+  ]);
+  for (const row of by("nodes").rows) {
+    const node = nodes().find((node) => node.name === row.dataset.key);
+    setAttribute(row.cells[1].firstElementChild, "class", stateOf(node));
+    setAttribute(row, "aria-current", String(node.name === selected));
+  }
+};
+
+const svg = (tag) => document.createElementNS("http://www.w3.org/2000/svg", tag);
+
+/** Returns a place for each node that has an id: routers inside, others around them. */
+const places = () => {
+  const all = nodes().filter(idOf);
+  const rings = [all.filter((node) => isRouter(idOf(node))), all.filter((node) => !isRouter(idOf(node)))];
+  const radii = [rings[0].length > 1 ? 90 : 0, 1];
+  const found = new Map();
+  rings.forEach((ring, at) => {
+    ring.forEach((node, n) => {
+      const angle = (2 * Math.PI * n) / ring.length - Math.PI / 2;
+      const [x, y] = at ? [380 * Math.cos(angle), 215 * Math.sin(angle)] : [radii[0] * Math.cos(angle), radii[0] * Math.sin(angle)];
+      found.set(idOf(node), { node, x, y });
+    });
+  });
+  return found;
+};
+
+const showMap = () => {
+  const at = places();
+  const lines = new Map();
+  for (const { report, member } of nodes()) {
+    for (const link of report?.links ?? []) {
+      if (!member || !at.has(link.peer)) continue;
+      const key = [member.id, link.peer].sort().join("-");
+      const known = lines.get(key);
+      const silent = link.silent || (known?.silent ?? false);
+      lines.set(key, { key, from: member.id, to: link.peer, rtt_us: link.rtt_us, silent });
+    }
+  }
+  const map = by("map");
+  if (!map.firstElementChild) map.append(svg("g"), svg("g"));
+  const [links, marks] = map.children;
+  sync(
+    links,
+    [...lines.values()],
+    (line) => line.key,
+    () => {
+      const line = svg("line");
+      line.append(svg("title"));
+      return line;
+    },
+    (element, { from, to, rtt_us, silent }) => {
+      const [a, b] = [at.get(from), at.get(to)];
+      for (const [name, value] of [["x1", a.x], ["y1", a.y], ["x2", b.x], ["y2", b.y]]) {
+        setAttribute(element, name, value.toFixed(1));
+      }
+      const direct = !isRouter(from) && !isRouter(to);
+      setAttribute(element, "class", [direct && "direct", silent && "silent"].filter(Boolean).join(" "));
+      setText(element.firstElementChild, `${a.node.name} – ${b.node.name}: ${silent ? "silent" : millis(rtt_us)}`);
+    },
+  );
+  sync(
+    marks,
+    [...at.values()],
+    ({ node }) => node.name,
+    ({ node }) => {
+      const group = svg("g");
+      const [mark, name] = [svg("text"), svg("text")];
+      name.setAttribute("class", "name");
+      name.setAttribute("y", "31");
+      group.append(mark, name);
+      setAttribute(group, "class", "node");
+      setAttribute(group, "role", "button");
+      setAttribute(group, "tabindex", "0");
+      group.addEventListener("click", () => select(node.name));
+      group.addEventListener("keydown", (event) => {
+        if (event.key === "Enter" || event.key === " ") {
+          event.preventDefault();
+          select(node.name);
+        }
+      });
+      return group;
+    },
+    (group, { node, x, y }) => {
+      const [mark, name] = group.children;
+      setAttribute(group, "transform", `translate(${x.toFixed(1)} ${y.toFixed(1)})`);
+      setAttribute(group, "aria-label", `${node.name}: ${stateText(node)}`);
+      setAttribute(group, "aria-pressed", String(node.name === selected));
+      setAttribute(mark, "class", `mark ${stateOf(node)}`);
+      setText(mark, MARKS[stateOf(node)]);
+      setText(name, node.name);
+    },
+  );
+};
+
+const explain = async (node, topic) => {
+  const dialog = by("why");
+  setText(by("why-title"), `${topic} at ${node}`);
+  by("steps").replaceChildren("asking");
+  dialog.showModal();
+  let why;
+  try {
+    why = await ask(`/api/why?${new URLSearchParams({ node, interface: topic })}`);
+  } catch (error) {
+    why = { error: error.message, steps: [] };
+  }
+  const marks = { fine: "✓", wrong: "✗", unknown: "?" };
+  const steps = why.error ? [{ verdict: "wrong", found: why.error, fix: null }] : why.steps;
+  by("steps").replaceChildren(
+    ...steps.map(({ verdict, found, fix }) => {
+      const [item, what, remedy] = [document.createElement("li"), document.createElement("div"), document.createElement("div")];
+      what.className = verdict;
+      what.textContent = `${marks[verdict] ?? "?"} ${found}`;
+      remedy.className = "fix";
+      setMarked(remedy, fix ?? "");
+      item.append(what, remedy);
+      return item;
+    }),
+  );
+};
+
+const showDetails = () => {
+  const node = nodes().find((node) => node.name === selected);
+  by("details").hidden = !node;
+  if (!node) return;
+  const { report, member } = node;
+  setText(by("details-title"), node.name);
+  const time = (ms) => (ms ? new Date(ms).toISOString().replace("T", " ").slice(0, 16) + " UTC" : "–");
+  const facts = [
+    ["state", `${stateText(node)}${node.error ? `: ${node.error}` : ""}`],
+    ["groups", member?.groups.join(", ") || "none"],
+    ["certificate until", time(report?.certificate_until_ms ?? member?.expires_ms)],
+    ["generation of the secret", String(report?.secret_generation ?? (member?.generation || "–"))],
+    ["last seen by the authority", time(member?.seen_ms)],
+    ["node id", member?.id ?? "–"],
+  ];
+  sync(
+    by("facts"),
+    facts.flatMap(([term, text]) => [{ tag: "dt", key: `dt ${term}`, text: term }, { tag: "dd", key: `dd ${term}`, text }]),
+    ({ key }) => key,
+    ({ tag }) => document.createElement(tag),
+    (element, { text }) => setText(element, text),
+  );
+  syncRows(by("links"), report?.links ?? [], (link) => link.peer, [
+    { text: nameOf },
+    { text: (link) => (isRouter(link.peer) ? "a router" : "itself") },
+    { number: true, text: (link) => (link.silent ? "silent" : millis(link.rtt_us)) },
+    { text: (link) => (link.dialled ? "this node" : "the other") },
+  ]);
+  syncRows(by("routers"), report?.routers ?? [], (router) => router.router, [
+    { text: (router) => router.router },
+    { text: (router) => router.state },
+    { text: (router) => router.last_failure ?? "" },
+  ]);
+  const wanted = by("filter").value.toLowerCase();
+  const topics = (report?.topics ?? []).filter((topic) => topicKey(topic).toLowerCase().includes(wanted));
+  const all = (report?.topics.length ?? 0) + (report?.topics_omitted ?? 0);
+  setText(by("shown"), `${count(topics.length)} of ${count(all)}`);
+  syncRows(by("topics"), topics, (topic) => `${node.name} ${topicKey(topic)}`, [
+    { text: (topic) => topic.direction },
+    { text: (topic) => topic.topic },
+    { text: (topic) => topic.type ?? "?" },
+    { text: (topic) => topic.owner },
+    { number: true, text: (topic) => rateOf(node, topic) },
+    { number: true, text: (topic) => count(topic.messages) },
+    { make: () => document.createElement("span"), text: (topic) => topic.state },
+    { make: (topic) => button("why?", () => explain(node.name, topic.topic)) },
+  ]);
+  topics.forEach((topic, at) => {
+    setAttribute(by("topics").rows[at].cells[6].firstElementChild, "class", topic.stuck ? "fault" : "");
+  });
+  syncRows(by("drops"), Object.entries(report?.drops ?? {}), ([reason]) => reason, [
+    { text: ([reason]) => reason },
+    { number: true, text: ([, n]) => count(n) },
+    { text: ([reason]) => view.meanings[reason] ?? "" },
+  ]);
+};
+
+const show = () => {
+  if (!view) return;
+  setText(by("summary"), view.summary);
+  document.title = view.faults.length ? `(${view.faults.length}) SGC fleet` : "SGC fleet";
+  showFaults();
+  showMap();
+  showNodes();
+  showDetails();
+};
+
+const fail = (text) => {
+  by("error").hidden = !text;
+  setText(by("error"), text ?? "");
+};
+
+by("filter").addEventListener("input", () => view && showDetails());
+setInterval(() => {
+  if (view) setText(by("age"), `as of ${duration((Date.now() - arrived) / 1000)} ago`);
+}, 1000);
+
+for (let seq = 0; ; ) {
+  try {
+    const next = await ask(`/api/fleet?after=${seq}`);
+    if (next.seq > seq) {
+      [view, seq, arrived] = [next, next.seq, Date.now()];
+      measure();
+      show();
+    }
+    fail(next.error);
+  } catch (error) {
+    fail(`The page cannot be kept up to date: ${error.message}`);
+    // A server that was started anew counts from the beginning.
+    seq = 0;
+    await new Promise((done) => setTimeout(done, AGAIN_MS));
+  }
+}

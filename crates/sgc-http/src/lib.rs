@@ -1,0 +1,161 @@
+//! A small HTTP server for documents: hyper's, with the bounds and checks that every server of this workspace wants.
+//!
+//! Clients that send no request keep nobody out: at the limit, a connection that had none gives way to a new one, or else
+//! that whose last one is longest ago. A web page of another site cannot read answers: the server allows no other origin,
+//! and over loopback it answers only requests to the host by its address or as `localhost`, so a page cannot read them by
+//! DNS rebinding.
+#![forbid(unsafe_code)]
+
+use std::convert::Infallible;
+use std::net::IpAddr;
+use std::pin::pin;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+pub use http;
+use http::header::{ALLOW, CACHE_CONTROL, CONTENT_TYPE, HOST, HeaderValue};
+use http::uri::Authority;
+use http::{Method, Request, Response, StatusCode};
+use http_body_util::Full;
+use hyper::body::Incoming;
+use hyper::server::conn::http1;
+use hyper::service::service_fn;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use sgc_sync::lock;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::task::{AbortHandle, JoinSet};
+use tokio::time::timeout;
+use tracing::debug;
+
+/// Most connections at a time.
+const CONNECTIONS_MAX: usize = 32;
+/// Longest time in which a request arrives, and in which a connection may be idle. Clients connect again.
+const REQUEST_MAX: Duration = Duration::from_secs(10);
+/// Longest life of a connection, so that a client that reads nothing keeps no place.
+const CONNECTION_MAX: Duration = Duration::from_secs(120);
+/// Most bytes of a request's head.
+const HEAD_BYTES_MAX: usize = 16 << 10;
+/// Pause after the system refused to accept a connection.
+const ACCEPT_RETRY: Duration = Duration::from_millis(100);
+
+/// An answer to a request.
+pub type Answer = Response<Full<Bytes>>;
+
+/// The content type of plain text.
+pub const TEXT: &str = "text/plain; charset=utf-8";
+
+/// A connection that is served.
+struct Served {
+    task: AbortHandle,
+    activity: Arc<Mutex<Activity>>,
+}
+
+/// The activity of a connection. The least gives way first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Activity {
+    is_answering: bool,
+    had_request: bool,
+    /// When it was accepted, or its last request came.
+    at: Instant,
+}
+
+/// Serves connections until it is dropped. `answer` answers a request by GET or HEAD, whose body is not read.
+pub async fn serve<A, F>(listener: TcpListener, answer: A)
+where
+    A: Fn(Request<()>) -> F + Clone + Send + Sync + 'static,
+    F: Future<Output = Answer> + Send,
+{
+    let mut tasks = JoinSet::new();
+    let mut served: Vec<Served> = Vec::new();
+    loop {
+        let stream = match listener.accept().await {
+            Ok((stream, _)) => stream,
+            Err(error) => {
+                // The process may have too many open files, for example.
+                debug!(%error, "a connection is not accepted");
+                tokio::time::sleep(ACCEPT_RETRY).await;
+                continue;
+            }
+        };
+        while tasks.try_join_next().is_some() {}
+        served.retain(|one| !one.task.is_finished());
+        if served.len() >= CONNECTIONS_MAX {
+            let activity = |at: &usize| *lock(&served[*at].activity);
+            match (0..served.len()).min_by_key(activity).filter(|at| !activity(at).is_answering) {
+                Some(idlest) => served.swap_remove(idlest).task.abort(),
+                None => continue,
+            }
+        }
+        let activity = Activity { is_answering: false, had_request: false, at: Instant::now() };
+        let activity = Arc::new(Mutex::new(activity));
+        let (answer, noted) = (answer.clone(), activity.clone());
+        let task = tasks.spawn(async move { serve_one(stream, &answer, &noted).await });
+        served.push(Served { task, activity });
+    }
+}
+
+/// Serves a connection, and notes when requests come.
+async fn serve_one<A, F>(stream: TcpStream, answer: &A, activity: &Mutex<Activity>)
+where
+    A: Fn(Request<()>) -> F,
+    F: Future<Output = Answer>,
+{
+    let is_local = stream.local_addr().is_ok_and(|at| at.ip().to_canonical().is_loopback());
+    let service = service_fn(async |request: Request<Incoming>| {
+        *lock(activity) = Activity { is_answering: true, had_request: true, at: Instant::now() };
+        let response = match objection(&request, is_local) {
+            Some(refused) => refused,
+            None => answer(request.map(drop)).await,
+        };
+        lock(activity).is_answering = false;
+        Ok::<_, Infallible>(response)
+    });
+    let mut server = http1::Builder::new();
+    server.timer(TokioTimer::new()).header_read_timeout(REQUEST_MAX).max_buf_size(HEAD_BYTES_MAX);
+    let mut connection = pin!(server.serve_connection(TokioIo::new(stream), service));
+    let ended = match timeout(CONNECTION_MAX, &mut connection).await {
+        Ok(ended) => ended,
+        Err(_) => {
+            // An answer under way is completed.
+            connection.as_mut().graceful_shutdown();
+            timeout(REQUEST_MAX, connection).await.unwrap_or(Ok(()))
+        }
+    };
+    if let Err(error) = ended {
+        debug!(%error, "a connection ended");
+    }
+}
+
+/// Returns the refusal of a request that no server here answers.
+fn objection(request: &Request<Incoming>, is_local: bool) -> Option<Answer> {
+    let host = request.headers().get(HOST);
+    if is_local && host.is_some_and(|host| !names_this_host(host)) {
+        let why = "this server answers only at its address and as localhost\n";
+        return Some(response(StatusCode::MISDIRECTED_REQUEST, TEXT, why));
+    }
+    if ![Method::GET, Method::HEAD].contains(request.method()) {
+        let mut refused = response(StatusCode::METHOD_NOT_ALLOWED, TEXT, "GET or HEAD only\n");
+        refused.headers_mut().insert(ALLOW, HeaderValue::from_static("GET, HEAD"));
+        return Some(refused);
+    }
+    None
+}
+
+/// Returns a response that is not stored anywhere.
+pub fn response(status: StatusCode, content_type: &'static str, body: impl Into<Bytes>) -> Answer {
+    let mut response = Response::new(Full::new(body.into()));
+    *response.status_mut() = status;
+    let headers = response.headers_mut();
+    headers.insert(CONTENT_TYPE, HeaderValue::from_static(content_type));
+    headers.insert(CACHE_CONTROL, HeaderValue::from_static("no-store"));
+    response
+}
+
+/// Returns `true` if the header names the host by an address or as `localhost`.
+fn names_this_host(host: &HeaderValue) -> bool {
+    let Ok(authority) = Authority::try_from(host.as_bytes()) else { return false };
+    let host = authority.host();
+    let bare = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(host);
+    bare.eq_ignore_ascii_case("localhost") || bare.parse::<IpAddr>().is_ok()
+}

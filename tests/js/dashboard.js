@@ -1,0 +1,107 @@
+// The page of `sgc dashboard` in headless Chromium, for a fleet of twenty nodes of which one has five hundred topics.
+// node dashboard.js URL DIRECTORY, a new one for the browser's data and the pictures. It writes "kill" once all is there,
+// waits until the death of the node `arm-03` shows, and writes "all is well". crates/sgc/tests/dashboard.rs has the fleet.
+import assert from "node:assert/strict";
+
+import { chromium } from "playwright-core";
+
+const [url, directory] = process.argv.slice(2);
+const executablePath = process.env.SGC_CHROMIUM || "/usr/bin/chromium";
+const PATIENCE = { timeout: 60_000 };
+setTimeout(() => fail(new Error("it took too long")), 240_000);
+let step = "start";
+
+function fail(error) {
+  console.error(step);
+  console.error(error);
+  process.exit(1);
+}
+
+try {
+  step = `start ${executablePath}`;
+  const browser = await chromium.launchPersistentContext(directory, {
+    executablePath,
+    headless: true,
+    viewport: { width: 1400, height: 1000 },
+    colorScheme: "light",
+    args: ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+      "--disable-component-update", "--disable-sync", "--no-proxy-server",
+      "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"],
+  });
+  const page = await browser.newPage();
+  const complaints = [];
+  page.on("console", (message) => ["error", "warning"].includes(message.type()) && complaints.push(message.text()));
+  page.on("pageerror", (error) => complaints.push(error.message));
+  page.on("request", (request) => assert.ok(request.url().startsWith(new URL(url).origin), request.url()));
+  const row = (name) => page.locator(`#nodes tr[data-key="${name}"]`);
+  const rowShows = (name, text) => row(name).filter({ hasText: text }).waitFor(PATIENCE);
+
+  step = "the fleet";
+  await page.goto(url);
+  for (let n = 0; n < 17; n++) await rowShows(`arm-${String(n).padStart(2, "0")}`, "● here");
+  await rowShows("busy", "● here");
+  await rowShows("router", "◌ no report, but linked");
+  await rowShows("absent", "○ no report");
+  assert.equal(await page.locator("#nodes tr").count(), 22);
+  assert.equal(await page.locator("#map .node").count(), 22);
+  await page.locator("#summary", { hasText: "22 nodes, 20 here, 2 without a report; 1 of them needs attention" }).waitFor(PATIENCE);
+  await page.locator("#faults li", { hasText: "absent: it is not in reach" }).waitFor(PATIENCE);
+  assert.equal(await page.locator("#map line").count(), 20);
+  await page.screenshot({ path: `${directory}/fleet.png` });
+
+  step = "five hundred topics";
+  await row("busy").locator("button").click();
+  await page.locator("#shown", { hasText: "500 of 500" }).waitFor(PATIENCE);
+  assert.equal(await page.locator("#topics tr").count(), 500);
+  await page.fill("#filter", "topic_499");
+  await page.locator("#shown", { hasText: "1 of 500" }).waitFor(PATIENCE);
+  assert.match(await page.locator("#topics tr").textContent(), /share\/topic_499.*waits for a local publisher/);
+
+  step = "why";
+  await page.locator("#topics button").click();
+  await page.locator("#steps li", { hasText: "✗ no publisher of /topic_499 is on the local network" }).waitFor(PATIENCE);
+  await page.keyboard.press("Escape");
+  assert.equal(await page.locator("#why").isVisible(), false);
+
+  step = "the keyboard";
+  await page.locator('#map .node[data-key="arm-07"]').focus();
+  await page.keyboard.press("Enter");
+  await page.locator("#details-title", { hasText: "arm-07" }).waitFor(PATIENCE);
+  assert.equal(await page.evaluate(() => document.activeElement.id), "details-title");
+  const kept = row("arm-07").locator("button");
+  await kept.focus();
+  const seen = await page.locator("#facts").textContent();
+  assert.match(seen, /node id[0-9a-f]{64}/);
+  // New documents leave the focus where it is.
+  await page.waitForTimeout(5000);
+  assert.equal(await kept.evaluate((button) => button === document.activeElement), true);
+
+  step = "light and dark";
+  const background = () => page.evaluate(() => getComputedStyle(document.body).backgroundColor);
+  const light = await background();
+  await page.emulateMedia({ colorScheme: "dark" });
+  assert.notEqual(await background(), light);
+  await page.screenshot({ path: `${directory}/dark.png`, fullPage: true });
+
+  step = "another token";
+  const stranger = await browser.newPage();
+  await stranger.goto(url.replace(/#.*/, "#0123"));
+  await stranger.locator("#error", { hasText: "open the URL that `sgc dashboard` printed" }).waitFor(PATIENCE);
+  assert.equal(await stranger.locator("#nodes tr").count(), 0);
+  await stranger.close();
+
+  step = "a node dies";
+  console.log("kill");
+  await rowShows("arm-03", "○ no report, seen");
+  await page.locator("#faults li", { hasText: "absent, arm-03: it is not in reach" }).waitFor(PATIENCE);
+  await rowShows("arm-04", "● here");
+  await page.screenshot({ path: `${directory}/dead.png` });
+  assert.deepEqual(complaints, []);
+
+  step = "close";
+  await browser.close();
+  console.log("all is well");
+  process.exit(0);
+} catch (error) {
+  fail(error);
+}
