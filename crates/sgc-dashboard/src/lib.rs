@@ -1,9 +1,9 @@
 //! `sgc dashboard`: a page that shows the fleet as an observer sees it, live, in a browser.
 //!
-//! The program asks a node of its user through the status socket, as `sgc fleet status` does ([`feed`]), and serves the page
-//! and its documents on loopback ([`sgc_http`]). It holds no key and joins no network. The page has a token in the fragment
-//! of its URL, which browsers send to nobody; each request for a document has to show it, so other users of the host see
-//! nothing.
+//! The program asks a node of its user through the status socket, as `sgc fleet status` does ([`feed`]), and serves the
+//! page and its documents on loopback ([`sgc_http`]). It holds no key and joins no network. The page has a token in the
+//! fragment of its URL, which browsers send to nobody; each request for a document has to show it, so other users of
+//! the host see nothing.
 #![forbid(unsafe_code)]
 
 mod feed;
@@ -11,7 +11,7 @@ mod view;
 
 use std::convert::Infallible;
 use std::net::{Ipv4Addr, SocketAddr};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -34,8 +34,9 @@ use self::view::WhyView;
 pub const DASHBOARD_PORT: u16 = 7480;
 /// Bytes of the token, before they become digits.
 const TOKEN_BYTES: usize = 16;
-/// Longest wait for news, before the last document is given again.
-const NEWS_MAX: Duration = Duration::from_secs(20);
+/// Longest wait for news, before the last document is given again. A connection that ends completes an answer within
+/// that time.
+const NEWS_MAX: Duration = Duration::from_secs(8);
 /// Most questions to single nodes at a time.
 const WHYS_MAX: usize = 4;
 
@@ -50,21 +51,24 @@ const FILES: [(&str, &str, &str); 3] = [
     ("/app.css", "text/css; charset=utf-8", include_str!("page/app.css")),
 ];
 
+/// Finds the members of the fleet of the node at a socket, or says why not.
+pub type FindMembers = Box<dyn Fn(&Path) -> Result<Members, String> + Send + Sync>;
+
 /// What the page shows, and where.
-#[derive(Clone, Debug)]
 pub struct DashboardOptions {
     /// Status socket of the node that asks the others.
     pub socket: PathBuf,
-    /// Members of the fleet, if its authority is not to be asked for them.
-    pub members: Option<Members>,
+    /// Finds the members of the fleet at each look.
+    pub find_members: FindMembers,
     /// Address of the page, on loopback; port 0 lets the system choose.
     pub listen: SocketAddr,
 }
 
 impl DashboardOptions {
-    /// Returns options for the usual address.
+    /// Returns options for the usual address, and for members as the fleet's authority knows them.
     pub fn new(socket: PathBuf) -> Self {
-        Self { socket, members: None, listen: (Ipv4Addr::LOCALHOST, DASHBOARD_PORT).into() }
+        let find = |socket: &Path| Members::of_authority(socket).map_err(|error| error.to_string());
+        Self { socket, find_members: Box::new(find), listen: (Ipv4Addr::LOCALHOST, DASHBOARD_PORT).into() }
     }
 }
 
@@ -73,8 +77,7 @@ impl DashboardOptions {
 pub enum DashboardError {
     /// The address is not on loopback.
     #[error(
-        "{0} is not an address of loopback: the page is plain HTTP. From another machine, use `ssh -L \
-         7480:localhost:7480` and the address here"
+        "{0} is not an address of loopback, and the page is plain HTTP: forward the port by SSH (docs/how-to/fleet.md)"
     )]
     NotLoopback(SocketAddr),
     /// The address cannot be had.
@@ -90,12 +93,12 @@ pub enum DashboardError {
     Process(#[from] ProcessError),
 }
 
-/// A question whose answers the page shows.
+/// Answers the requests of pages.
 struct Server {
     feed: Arc<Feed>,
     token: String,
     socket: PathBuf,
-    whys: Semaphore,
+    whys: Arc<Semaphore>,
 }
 
 /// Serves the page until the process ends. `ready` gets its URL.
@@ -110,8 +113,9 @@ pub fn run(options: DashboardOptions, ready: impl FnOnce(&str)) -> Result<Infall
     let listen = |source| DashboardError::Listen { at, source };
     let listener = runtime.block_on(TcpListener::bind(at)).map_err(listen)?;
     ready(&format!("http://{}/#{token}", listener.local_addr().map_err(listen)?));
-    let feed = Feed::start(options.socket.clone(), options.members).map_err(system)?;
-    let server = Arc::new(Server { feed, token, socket: options.socket, whys: Semaphore::new(WHYS_MAX) });
+    let feed = Feed::start(options.socket.clone(), options.find_members).map_err(system)?;
+    let whys = Arc::new(Semaphore::new(WHYS_MAX));
+    let server = Arc::new(Server { feed, token, socket: options.socket, whys });
     let answer = move |request| {
         let server = server.clone();
         async move { server.answer(&request).await }
@@ -163,11 +167,13 @@ impl Server {
 
     /// Explains why an interface of a node does not flow.
     async fn why(&self, node: String, interface: String) -> Answer {
-        let Ok(_place) = self.whys.acquire().await else {
+        let Ok(place) = self.whys.clone().acquire_owned().await else {
             return response(StatusCode::SERVICE_UNAVAILABLE, TEXT, "");
         };
         let socket = self.socket.clone();
         let view = tokio::task::spawn_blocking(move || {
+            // Also if the page has left meanwhile.
+            let _place = place;
             let answer = ask_nodes(&socket, &[node], Some(&interface))
                 .map_err(|error| error.to_string())?
                 .pop()

@@ -1,6 +1,7 @@
 //! The documents of the page.
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use serde::Serialize;
 use sgc_diagnosis::fleet::{FaultOfNodes, FleetStatus};
@@ -32,6 +33,14 @@ impl<'a> FleetView<'a> {
         let (faults, known) = (fleet.attention(), fleet.known());
         Self { seq, error, summary: fleet.summary(), fleet, faults, known, meanings }
     }
+}
+
+/// Returns the document as the page gets it: with the time since the node here last answered, milliseconds, and null
+/// for either if there is none yet.
+pub(crate) fn aged(age: Option<Duration>, view: &[u8]) -> String {
+    let age = age.map_or_else(|| "null".to_owned(), |age| age.as_millis().to_string());
+    let view = if view.is_empty() { "null".into() } else { String::from_utf8_lossy(view) };
+    format!("{{\"age_ms\":{age},\"view\":{view}}}")
 }
 
 /// The steps on the way of an interface, or the reason why they are not known.

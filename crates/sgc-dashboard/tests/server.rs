@@ -49,10 +49,11 @@ fn documents_need_the_token_and_the_page_tells_nothing() {
     }
     let (_, page) = ask(at, "GET /", &host);
     assert!(!page.contains("<script>") && !page.contains(" style=") && !page.contains("http"), "{page}");
-    let wrong = token.replace(|c: char| c.is_ascii_digit(), "0");
+    let first = if token.starts_with('0') { "1" } else { "0" };
+    let wrong = format!("{first}{}", &token[1..]);
     for lines in [
         host.clone(),
-        format!("{host}authorization: Bearer {wrong}x\r\n"),
+        format!("{host}authorization: Bearer {wrong}\r\n"),
         format!("{host}authorization: Bearer \r\n"),
         format!("{host}authorization: {token}\r\n"),
         format!("{host}cookie: {token}\r\n"),
@@ -62,6 +63,19 @@ fn documents_need_the_token_and_the_page_tells_nothing() {
             assert!(head.starts_with("HTTP/1.1 401"), "{path} {lines}: {head}");
         }
     }
+}
+
+/// Names of nodes and topics come from other machines.
+#[test]
+fn page_sets_texts_and_parses_no_markup() {
+    let (at, _) = start();
+    let (_, script) = ask(at, "GET /app.js", &format!("host: {at}\r\n"));
+    for way in
+        ["innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval(", "srcdoc", "DOMParser"]
+    {
+        assert!(!script.contains(way), "{way}");
+    }
+    assert!(script.contains("textContent"));
 }
 
 #[test]
@@ -84,8 +98,8 @@ fn without_a_node_the_documents_say_so() {
     let (head, body) = ask(at, "GET /api/fleet?after=0", &lines);
     assert!(head.starts_with("HTTP/1.1 200"), "{head}");
     let document: serde_json::Value = serde_json::from_str(&body).unwrap();
-    assert!(document["seq"].as_u64().unwrap() > 0, "{document}");
-    assert!(document["error"].as_str().unwrap().contains("no node runs"), "{document}");
+    assert!(document["view"]["seq"].as_u64().unwrap() > 0 && document["age_ms"].is_null(), "{document}");
+    assert!(document["view"]["error"].as_str().unwrap().contains("no node runs"), "{document}");
     let (_, body) = ask(at, "GET /api/why?node=arm&interface=%2Fa", &lines);
     assert!(body.contains("no node runs") && body.contains("\"steps\":[]"), "{body}");
     for path in ["/api/why", "/api/why?node=arm"] {

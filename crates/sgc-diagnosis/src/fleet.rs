@@ -7,7 +7,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use serde::Serialize;
-use sgc_node::admin::report::{LINKED, NodeReport, ReportLink, ReportMember, ReportTopic};
+use sgc_node::admin::report::{NodeReport, ReportLink, ReportMember, ReportTopic};
 use sgc_node::admin::{AdminRequest, REPORT_NODES_MAX, ReportAnswer, ReportRequest};
 use sgc_process::output;
 use sgc_wire::UnixMillis;
@@ -366,6 +366,16 @@ impl FleetStatus {
         (report.uptime_s >= earlier.uptime_s).then_some(more as f64 / seconds)
     }
 
+    /// Returns `true` if the report of a stuck topic's owner, or its absence, says why: it is absent itself, or its
+    /// publisher does not run.
+    fn is_explained(&self, topic: &ReportTopic) -> bool {
+        let Some(owner) = self.nodes.iter().find(|node| node.name == topic.owner) else { return false };
+        match &owner.report {
+            Some(report) => report.topics.iter().any(|share| share.waiting && share.topic == topic.topic),
+            None => !self.is_linked(owner),
+        }
+    }
+
     /// Returns what needs attention at a node.
     fn faults(&self, node: &FleetNode) -> Vec<Fault> {
         let mut faults = Vec::new();
@@ -401,20 +411,14 @@ impl FleetStatus {
         for link in report.links.iter().filter(|link| link.silent) {
             add(format!("{} does not answer it", self.name_of(link)), "see the network between them");
         }
-        let is_linked = report.routers.iter().any(|router| router.state == LINKED);
-        for router in report.routers.iter().filter(|router| router.state != LINKED) {
-            if is_linked && router.state != TRYING_AGAIN {
-                continue;
-            }
+        // Other searches stand back for a link that is there, or have just begun.
+        for router in report.routers.iter().filter(|router| router.state == TRYING_AGAIN) {
             let why = router.last_failure.as_ref().map(|why| format!(" ({why})")).unwrap_or_default();
             add(format!("its search for {}: {}{why}", router.router, router.state), "see that router");
         }
-        let mut stuck = report.topics.iter().filter(|topic| topic.stuck);
+        let mut stuck = report.topics.iter().filter(|topic| topic.stuck && !self.is_explained(topic));
         for ReportTopic { topic, state, .. } in stuck.by_ref().take(STUCK_NAMED) {
-            add(
-                format!("{topic}: {state}"),
-                &format!("`sgc fleet why {}:{topic}` follows its way", node.name),
-            );
+            add(format!("{topic}: {state}"), "`sgc fleet why NODE:/TOPIC` follows its way");
         }
         match stuck.count() {
             0 => {}
@@ -597,8 +601,23 @@ mod tests {
         };
         stuck.topics = (0..6).map(topic).collect();
         let lines = fleet(vec![answer_of(stuck)]).overview(None).join("\n");
-        assert!(lines.contains("desk: /t1: robot has gone\n    `sgc fleet why desk:/t1`"), "{lines}");
+        assert!(lines.contains("desk: /t1: robot has gone\n    `sgc fleet why NODE:/TOPIC`"), "{lines}");
         assert!(lines.contains("desk: 2 more of its topics are stuck") && !lines.contains("/t0"), "{lines}");
+        // The owner says that its publisher does not run, or is absent and has a fault of its own.
+        let mut stuck = report("desk", &[]);
+        let of = |owner: &str, topic: &str| ReportTopic {
+            topic: topic.into(),
+            owner: owner.into(),
+            state: "not now".into(),
+            stuck: true,
+            ..ReportTopic::default()
+        };
+        stuck.topics = vec![of("arm", "/a"), of("arm", "/b"), of("lost", "/c"), of("elsewhere", "/d")];
+        let mut arm = report("arm", &[]);
+        arm.topics = vec![ReportTopic { topic: "/a".into(), waiting: true, ..ReportTopic::default() }];
+        let fleet = fleet(vec![answer_of(stuck), answer_of(arm), error_of("lost", "not in reach")]);
+        let faults: Vec<_> = fleet.attention().into_iter().map(|fault| fault.what).collect();
+        assert_eq!(faults, ["/b: not now", "/d: not now", "not in reach"]);
     }
 
     #[test]
@@ -634,9 +653,9 @@ mod tests {
             let lines = fleet(vec![answer_of(faulty), answer_of(report("desk", &[]))]).overview(None);
             assert!(lines.iter().any(|line| line.contains(what)), "{what:?} is not in {lines:#?}");
         }
-        // A second router that is not dialled is no fault, nor is what was counted since the start.
+        // A router that has dialled this node is no fault, nor is what was counted since the start.
         let well = NodeReport {
-            routers: vec![router("standing back"), router("linked")],
+            routers: vec![router("standing back"), router("looking")],
             drops: [("hop_limit".to_owned(), 3)].into(),
             certificate_until_ms: NOW + 20 * 24 * HOUR,
             ..sound

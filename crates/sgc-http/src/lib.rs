@@ -1,9 +1,9 @@
 //! A small HTTP server for documents: hyper's, with the bounds and checks that every server of this workspace wants.
 //!
-//! Clients that send no request keep nobody out: at the limit, a connection that had none gives way to a new one, or else
-//! that whose last one is longest ago. A web page of another site cannot read answers: the server allows no other origin,
-//! and over loopback it answers only requests to the host by its address or as `localhost`, so a page cannot read them by
-//! DNS rebinding.
+//! Clients that send no request keep nobody out: at the limit, a connection that had none gives way to a new one, or
+//! else that whose last one is longest ago. A web page of another site cannot read answers: the server allows no other
+//! origin, and over loopback it answers only requests to the host by its address or as `localhost`, so a page cannot
+//! read them by DNS rebinding.
 #![forbid(unsafe_code)]
 
 use std::convert::Infallible;
@@ -45,8 +45,8 @@ pub type Answer = Response<Full<Bytes>>;
 /// The content type of plain text.
 pub const TEXT: &str = "text/plain; charset=utf-8";
 
-/// A connection that is served.
-struct Served {
+/// A connection that is connections.
+struct Connection {
     task: AbortHandle,
     activity: Arc<Mutex<Activity>>,
 }
@@ -67,7 +67,7 @@ where
     F: Future<Output = Answer> + Send,
 {
     let mut tasks = JoinSet::new();
-    let mut served: Vec<Served> = Vec::new();
+    let mut connections: Vec<Connection> = Vec::new();
     loop {
         let stream = match listener.accept().await {
             Ok((stream, _)) => stream,
@@ -79,11 +79,11 @@ where
             }
         };
         while tasks.try_join_next().is_some() {}
-        served.retain(|one| !one.task.is_finished());
-        if served.len() >= CONNECTIONS_MAX {
-            let activity = |at: &usize| *lock(&served[*at].activity);
-            match (0..served.len()).min_by_key(activity).filter(|at| !activity(at).is_answering) {
-                Some(idlest) => served.swap_remove(idlest).task.abort(),
+        connections.retain(|one| !one.task.is_finished());
+        if connections.len() >= CONNECTIONS_MAX {
+            let activity = |at: &usize| *lock(&connections[*at].activity);
+            match (0..connections.len()).min_by_key(activity).filter(|at| !activity(at).is_answering) {
+                Some(idlest) => connections.swap_remove(idlest).task.abort(),
                 None => continue,
             }
         }
@@ -91,7 +91,7 @@ where
         let activity = Arc::new(Mutex::new(activity));
         let (answer, noted) = (answer.clone(), activity.clone());
         let task = tasks.spawn(async move { serve_one(stream, &answer, &noted).await });
-        served.push(Served { task, activity });
+        connections.push(Connection { task, activity });
     }
 }
 

@@ -1,7 +1,7 @@
 //! `sgc dashboard`: the arguments of the page that `sgc-dashboard` serves.
 
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use sgc_dashboard::{DASHBOARD_PORT, DashboardOptions};
@@ -12,9 +12,9 @@ use crate::{fleet, output};
 
 /// Show the fleet in a browser, live.
 ///
-/// The command prints the URL of a page and serves it until Ctrl-C. Your node that runs here asks the others over the mesh.
-/// They answer observers: enroll your node with `--group observers`. The page is on loopback, and only who has its URL sees
-/// anything.
+/// The command prints the URL of a page and serves it until Ctrl-C. Your node that runs here asks the others over the
+/// mesh. They answer observers: enroll your node with `--group observers`. The page is on loopback and needs the token
+/// in its URL.
 #[derive(Debug, Args)]
 pub(crate) struct DashboardArgs {
     /// Address of the page, on loopback; port 0 lets the system choose
@@ -29,9 +29,13 @@ pub(crate) struct DashboardArgs {
 
 /// Runs `sgc dashboard`.
 pub(crate) fn dashboard(args: &DashboardArgs) -> Result<(), CliError> {
-    let members = args.fleet.as_deref().map(fleet::members_of_file).transpose()?;
-    let options =
-        DashboardOptions { members, listen: args.listen, ..DashboardOptions::new(args.node.socket()?) };
+    let mut options = DashboardOptions::new(args.node.socket()?);
+    options.listen = args.listen;
+    if let Some(file) = args.fleet.clone() {
+        fleet::members_of_file(&file)?;
+        let find = move |_: &Path| fleet::members_of_file(&file).map_err(|error| error.to_string());
+        options.find_members = Box::new(find);
+    }
     match sgc_dashboard::run(options, |url| {
         // Without a reader the URL is lost, and the page serves nobody.
         let _ = output::line(url);

@@ -6,6 +6,8 @@ const token = location.hash.slice(1);
 const by = (id) => document.getElementById(id);
 /** Time before a failed question is asked again, milliseconds. */
 const AGAIN_MS = 2000;
+/** Longest wait for an answer, milliseconds. The server waits for the nodes, and asks them for at most 10 s. */
+const PATIENCE_MS = 20_000;
 const DAY_MS = 86_400_000;
 /** Marks by state, so that color alone tells nothing. */
 const MARKS = { here: "●", fault: "▲", linked: "◌", absent: "○", revoked: "✕" };
@@ -17,7 +19,8 @@ let selected = null;
 const rates = new Map();
 
 const ask = async (path) => {
-  const answer = await fetch(path, { headers: { authorization: `Bearer ${token}` } });
+  const headers = { authorization: `Bearer ${token}` };
+  const answer = await fetch(path, { headers, signal: AbortSignal.timeout(PATIENCE_MS) });
   if (!answer.ok) throw new Error((await answer.text()) || answer.statusText);
   return answer.json();
 };
@@ -43,15 +46,27 @@ const setMarked = (element, text) => {
   );
 };
 
-/** Makes the children of `parent` those of `items`, by their keys. Elements that stay keep the focus. */
+/**
+ * Makes the children of `parent` those of `items`, by their keys; a key may come several times. Children that stay keep
+ * the focus, unless their order changes.
+ */
 const sync = (parent, items, keyOf, create, update) => {
-  const known = new Map([...parent.children].map((child) => [child.dataset.key, child]));
-  let next = parent.firstElementChild;
+  const times = new Map();
+  const wanted = new Map();
   for (const item of items) {
     const key = keyOf(item);
+    times.set(key, (times.get(key) ?? 0) + 1);
+    wanted.set(`${times.get(key)} ${key}`, item);
+  }
+  const known = new Map();
+  for (const child of [...parent.children]) {
+    if (wanted.has(child.dataset.key)) known.set(child.dataset.key, child);
+    else child.remove();
+  }
+  let next = parent.firstElementChild;
+  for (const [key, item] of wanted) {
     let child = known.get(key);
-    if (child) known.delete(key);
-    else {
+    if (!child) {
       child = create(item);
       child.dataset.key = key;
     }
@@ -59,7 +74,6 @@ const sync = (parent, items, keyOf, create, update) => {
     else parent.insertBefore(child, next);
     update(child, item);
   }
-  for (const child of known.values()) child.remove();
 };
 
 /** Rows of text. A cell is a text, or an element that is made once. */
@@ -101,14 +115,14 @@ const nameOf = (link) => view.known[link.peer]?.[0] ?? link.name ?? link.peer.sl
 const isRouter = (id) => view.known[id]?.[1] ?? false;
 const idOf = (node) => node.member?.id;
 const nodes = () => view.fleet.nodes;
-const faulty = () => new Set(view.faults.flatMap((fault) => fault.nodes));
-const linked = () =>
-  new Set(nodes().flatMap((node) => node.report?.links.filter((link) => !link.silent).map((link) => link.peer) ?? []));
+/** Of the newest document: the names of nodes with a fault, and the ids of nodes to which another has a link. */
+let faulty = new Set();
+let linked = new Set();
 
 const stateOf = (node) => {
-  if (node.report) return faulty().has(node.name) ? "fault" : "here";
+  if (node.report) return faulty.has(node.name) ? "fault" : "here";
   if (node.member?.revoked_ms) return "revoked";
-  return linked().has(idOf(node)) ? "linked" : "absent";
+  return linked.has(idOf(node)) ? "linked" : "absent";
 };
 
 const stateText = (node) => {
@@ -142,6 +156,11 @@ const topicKey = (topic) => `${topic.direction} ${topic.topic} ${topic.owner} ${
 
 /** Notes the reports of a new document, and the rates since those before. */
 const measure = () => {
+  const links = nodes().flatMap((node) => node.report?.links ?? []);
+  faulty = new Set(view.faults.flatMap((fault) => fault.nodes));
+  linked = new Set(links.filter((link) => !link.silent).map((link) => link.peer));
+  const names = new Set(nodes().map((node) => node.name));
+  for (const name of rates.keys()) if (!names.has(name)) rates.delete(name);
   for (const { name, report } of nodes()) {
     const before = rates.get(name);
     if (!report) {
@@ -156,7 +175,8 @@ const measure = () => {
       topics = new Map();
       const earlier = new Map(before.report.topics.map((topic) => [topicKey(topic), topic.messages]));
       for (const topic of report.topics) {
-        const more = topic.messages - (earlier.get(topicKey(topic)) ?? topic.messages);
+        const more = topic.messages - earlier.get(topicKey(topic));
+        // A topic that is new has no rate yet.
         if (more >= 0) topics.set(topicKey(topic), more / seconds);
       }
     }
@@ -193,24 +213,20 @@ const showFaults = () => {
   sync(
     by("faults"),
     view.faults,
-    (fault) => `${fault.what}\n${fault.fix}`,
-    () => {
-      const item = document.createElement("li");
-      const [what, fix] = [document.createElement("div"), document.createElement("div")];
+    // Its words may change, such as the time since something was seen.
+    (fault) => fault.nodes.join(),
+    ({ nodes }) => {
+      const [item, first] = [document.createElement("li"), document.createElement("div")];
+      const [what, fix] = [document.createElement("span"), document.createElement("div")];
+      const names = nodes.map((name) => button(name, () => select(name)));
+      first.append(...names.flatMap((name, at) => (at ? [", ", name] : [name])), ": ", what);
       fix.className = "fix";
-      item.append(what, fix);
+      item.append(first, fix);
       return item;
     },
-    (item, { nodes, what, fix }) => {
-      const [first, second] = item.children;
-      if (first.dataset.nodes !== nodes.join()) {
-        first.dataset.nodes = nodes.join();
-        first.replaceChildren(
-          ...nodes.flatMap((name, at) => (at ? [", ", button(name, () => select(name))] : [button(name, () => select(name))])),
-          `: ${what}`,
-        );
-      }
-      setMarked(second, fix);
+    (item, { what, fix }) => {
+      setText(item.querySelector("span"), what);
+      setMarked(item.querySelector(".fix"), fix);
     },
   );
 };
@@ -227,11 +243,11 @@ const showNodes = () => {
     { number: true, text: (node) => dash(node, (report) => count(report.topics.length + report.topics_omitted)) },
     { number: true, text: (node) => dash(node, () => rateOfNode(node)) },
   ]);
-  for (const row of by("nodes").rows) {
-    const node = nodes().find((node) => node.name === row.dataset.key);
+  nodes().forEach((node, at) => {
+    const row = by("nodes").rows[at];
     setAttribute(row.cells[1].firstElementChild, "class", stateOf(node));
     setAttribute(row, "aria-current", String(node.name === selected));
-  }
+  });
 };
 
 const svg = (tag) => document.createElementNS("http://www.w3.org/2000/svg", tag);
@@ -320,8 +336,12 @@ const showMap = () => {
   );
 };
 
+/** The number of the last question why. */
+let asked = 0;
+
 const explain = async (node, topic) => {
   const dialog = by("why");
+  const question = ++asked;
   setText(by("why-title"), `${topic} at ${node}`);
   by("steps").replaceChildren("asking");
   dialog.showModal();
@@ -331,6 +351,8 @@ const explain = async (node, topic) => {
   } catch (error) {
     why = { error: error.message, steps: [] };
   }
+  // The dialog may be about another topic by now.
+  if (question !== asked) return;
   const marks = { fine: "✓", wrong: "✗", unknown: "?" };
   const steps = why.error ? [{ verdict: "wrong", found: why.error, fix: null }] : why.steps;
   by("steps").replaceChildren(
@@ -405,7 +427,8 @@ const showDetails = () => {
 
 const show = () => {
   if (!view) return;
-  setText(by("summary"), view.summary);
+  const omitted = view.fleet.members_omitted;
+  setText(by("summary"), omitted ? `${view.summary}; ${count(omitted)} more are not shown` : view.summary);
   document.title = view.faults.length ? `(${view.faults.length}) SGC fleet` : "SGC fleet";
   showFaults();
   showMap();
@@ -415,27 +438,41 @@ const show = () => {
 
 const fail = (text) => {
   by("error").hidden = !text;
+  document.body.classList.toggle("stale", Boolean(text));
   setText(by("error"), text ?? "");
 };
 
 by("filter").addEventListener("input", () => view && showDetails());
+let age_ms = null;
 setInterval(() => {
-  if (view) setText(by("age"), `as of ${duration((Date.now() - arrived) / 1000)} ago`);
+  if (age_ms !== null) setText(by("age"), `as of ${duration((age_ms + Date.now() - arrived) / 1000)} ago`);
 }, 1000);
 
+/** Waits until the page can be seen, so that nodes are not asked for nobody. */
+const seen = () =>
+  new Promise((done) => {
+    const look = () => {
+      if (document.hidden) return;
+      document.removeEventListener("visibilitychange", look);
+      done();
+    };
+    document.addEventListener("visibilitychange", look);
+    look();
+  });
+
 for (let seq = 0; ; ) {
+  await seen();
   try {
-    const next = await ask(`/api/fleet?after=${seq}`);
-    if (next.seq > seq) {
-      [view, seq, arrived] = [next, next.seq, Date.now()];
+    const answer = await ask(`/api/fleet?after=${seq}`);
+    [age_ms, arrived] = [answer.age_ms, Date.now()];
+    if (answer.view && answer.view.seq > seq) {
+      [view, seq] = [answer.view, answer.view.seq];
       measure();
       show();
     }
-    fail(next.error);
+    fail(view?.error);
   } catch (error) {
     fail(`The page cannot be kept up to date: ${error.message}`);
-    // A server that was started anew counts from the beginning.
-    seq = 0;
     await new Promise((done) => setTimeout(done, AGAIN_MS));
   }
 }

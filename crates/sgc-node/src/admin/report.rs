@@ -1,4 +1,5 @@
-//! How a node is doing, in short: the document that it gives observers over the mesh, and that `sgc fleet status` shows.
+//! How a node is doing, in short: the document that it gives observers over the mesh, and that `sgc fleet status`
+//! shows.
 //!
 //! It comes from another machine, perhaps of another version: a reader takes a missing field for empty and ignores
 //! unknown ones.
@@ -14,7 +15,6 @@ use sgc_wire::{Kind, REPORT_BYTES_MAX, RosterRow};
 
 use crate::admin::graph::Graph;
 use crate::control::faults::alerts::Alert;
-pub use crate::discovery::board::LINKED;
 
 /// Most links in a report.
 pub const REPORT_LINKS_MAX: usize = 64;
@@ -28,6 +28,10 @@ pub const REPORT_MEMBERS_MAX: usize = 2048;
 pub const REPORT_FAULTS_MAX: usize = 32;
 /// Most reasons of drops, and of refused links, that are read.
 const REPORT_REASONS_MAX: usize = 512;
+/// Longest name of such a reason that is read, bytes.
+const REPORT_REASON_BYTES_MAX: usize = 64;
+/// Longest alert that is read, bytes of JSON. The mistakes of a configuration have at most 1000 characters.
+const REPORT_ALERT_BYTES_MAX: usize = 8192;
 /// Most characters of a text that is read. Names of topics have at most 255, and problems some hundred.
 const REPORT_TEXT_CHARS_MAX: usize = 1024;
 
@@ -117,7 +121,7 @@ pub struct ReportRouter {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ReportTopic {
-    /// `"share"` or `"use"`.
+    /// `"share"` or `"use"`; `"serve"` and `"call"` for services, `"publish"` for a use that publishes.
     pub direction: String,
     /// The name on the node's ROS 2 network.
     pub topic: String,
@@ -128,9 +132,10 @@ pub struct ReportTopic {
     pub owner: String,
     /// The state, in words.
     pub state: String,
-    /// `true` if more is missing than local programs: the owner is out of reach, does not share it with the node, or
-    /// refuses it.
+    /// `true` if the owner is out of reach, does not share it with the node now, or refuses it.
     pub stuck: bool,
+    /// `true` if it is shared, and waits for a local publisher or server.
+    pub waiting: bool,
     /// The number of messages that were published or delivered.
     pub messages: u64,
 }
@@ -327,10 +332,15 @@ impl<'de, const MAX: usize, T: Deserialize<'de>> Visitor<'de> for AtMost<MAX, T>
     }
 }
 
-/// Reads alerts. One of another version, whose fields may differ, becomes [`Alert::Other`].
+/// Reads alerts. One of another version, whose fields may differ, becomes [`Alert::Other`], as does one that is too
+/// long.
 fn alerts<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<Alert>, D::Error> {
     let read: Vec<serde_json::Value> = at_most::<REPORT_FAULTS_MAX, _, _>(deserializer)?;
-    Ok(read.into_iter().map(|alert| serde_json::from_value(alert).unwrap_or(Alert::Other)).collect())
+    let alert = |alert: serde_json::Value| match alert.to_string().len() <= REPORT_ALERT_BYTES_MAX {
+        true => serde_json::from_value(alert).unwrap_or(Alert::Other),
+        false => Alert::Other,
+    };
+    Ok(read.into_iter().map(alert).collect())
 }
 
 /// Reads counts of reasons, as many as there are reasons in any version, and skips the others.
@@ -344,7 +354,7 @@ fn counts<'de, D: Deserializer<'de>>(deserializer: D) -> Result<BTreeMap<String,
         fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Self::Value, A::Error> {
             let mut read = BTreeMap::new();
             while let Some((reason, count)) = map.next_entry::<String, u64>()? {
-                if read.len() < REPORT_REASONS_MAX {
+                if read.len() < REPORT_REASONS_MAX && reason.len() <= REPORT_REASON_BYTES_MAX {
                     read.insert(reason, count);
                 }
             }
@@ -391,9 +401,10 @@ mod tests {
             many("{}", 5000),
             many(&format!(r#"{{"state": "{long}"}}"#), 1),
             many("\"p\"", 5000),
+            many(&format!(r#"{{"kind": "restart_pending", "changes": ["{long}"]}}"#), 50),
             many("{}", 5000),
-            many("{}", 5000),
-            (0..5000).map(|n| format!("\"r{n}\": 1")).collect::<Vec<_>>().join(","),
+            (0..5000).map(|n| format!("\"r{n}\": 1")).collect::<Vec<_>>().join(",")
+                + &format!(",\"{long}\": 1"),
         );
         let read = NodeReport::from_json(text.as_bytes()).unwrap();
         let lengths = [
@@ -406,6 +417,7 @@ mod tests {
         ];
         let bounds = [64, 16, 32, 32, 2048, 512];
         assert_eq!((lengths, read.version.chars().count()), (bounds, REPORT_TEXT_CHARS_MAX));
+        assert!(read.alerts.iter().all(|alert| *alert == Alert::Other), "they are too long");
         assert_eq!(read.topics[0].state.chars().count(), REPORT_TEXT_CHARS_MAX);
     }
 

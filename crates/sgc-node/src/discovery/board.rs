@@ -15,7 +15,7 @@ use crate::clock::time_now;
 use crate::data::stats::Drops;
 
 /// State of a search whose router the node is linked to.
-pub const LINKED: &str = "linked";
+pub(crate) const LINKED: &str = "linked";
 
 /// A router that the node looks for, or a place where it looks for routers.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]

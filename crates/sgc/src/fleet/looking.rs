@@ -1,5 +1,5 @@
-//! `sgc fleet status` and `sgc fleet why`: what the nodes of the fleet report. A node of this user asks them over the mesh
-//! as an observer.
+//! `sgc fleet status` and `sgc fleet why`: what the nodes of the fleet report. A node of this user asks them over the
+//! mesh as an observer.
 
 use std::io::IsTerminal as _;
 use std::path::{Path, PathBuf};

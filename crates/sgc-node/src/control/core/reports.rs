@@ -123,6 +123,7 @@ impl<N: RosNetwork> Core<N> {
         let mut problems = self.problems();
         problems.truncate(REPORT_FAULTS_MAX);
         let topic = |route: RouteStatus| {
+            let waiting = route.state == RouteState::AwaitsLocal;
             let stuck = matches!(
                 route.state,
                 RouteState::Owner(_) | RouteState::NotListed { is_pattern: false } | RouteState::Refused(_)
@@ -135,6 +136,7 @@ impl<N: RosNetwork> Core<N> {
                 owner: line.owner,
                 state: line.state,
                 stuck,
+                waiting,
                 messages: line.messages,
             }
         };

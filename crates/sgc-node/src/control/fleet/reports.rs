@@ -1,7 +1,7 @@
 //! Reports that this node gives observers: who may ask, the questions that wait, and the last documents.
 //!
-//! A document is a copy of the node's state. One is made at a time, and the next a while later, so that observers who ask
-//! much wait for each other and the control task for none.
+//! A document is a copy of the node's state. One is made at a time, and the next a while later, so that observers who
+//! ask much wait for each other and the control task for none.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -22,6 +22,8 @@ struct Waiting {
     peer: VerifiedPeer,
     sink: SinkId,
     question: ReportQuestion,
+    /// The turn of the node. Another question of it takes the place with its turn.
+    turn: u64,
 }
 
 /// The observers of this node, and the reports that they got last.
@@ -31,6 +33,8 @@ pub(crate) struct Reports {
     kept: BTreeMap<ReportQuestion, (Instant, Report)>,
     /// At most one question of each node; the endpoint has places for few nodes.
     waiting: BTreeMap<NodeId, Waiting>,
+    /// The turn of the next node that begins to wait.
+    next_turn: u64,
     /// Whether a document is being made.
     is_making: bool,
     /// Time from which the next document may be made.
@@ -62,7 +66,9 @@ impl Reports {
         if let Some((_, report)) = self.kept.get(&question) {
             return Some(report.clone());
         }
-        self.waiting.insert(peer.node_id, Waiting { peer: peer.clone(), sink, question });
+        let turn = self.waiting.get(&peer.node_id).map_or(self.next_turn, |waiting| waiting.turn);
+        self.next_turn += 1;
+        self.waiting.insert(peer.node_id, Waiting { peer: peer.clone(), sink, question, turn });
         None
     }
 
@@ -71,7 +77,7 @@ impl Reports {
         if self.is_making || self.next_at.is_some_and(|at| at > now) {
             return None;
         }
-        let question = self.waiting.values().next()?.question.clone();
+        let question = self.waiting.values().min_by_key(|waiting| waiting.turn)?.question.clone();
         (self.is_making, self.next_at) = (true, Some(now + REPORT_INTERVAL));
         Some(question)
     }
@@ -184,6 +190,27 @@ mod tests {
             assert_eq!(reports.made(begin, interface(200 + n), Some(&report("b"))), [B]);
         }
         assert_eq!(reports.kept.len(), REPORTS_KEPT_MAX);
+    }
+
+    #[test]
+    fn observer_that_asks_much_does_not_keep_another_waiting() {
+        for [flooding, patient] in [[0, 1], [1, 0]] {
+            let (mut now, mut reports, peers) = (Instant::now(), Reports::default(), peers());
+            let (mut asked, mut served) = (0, Vec::new());
+            let mut flood = |reports: &mut Reports, now| {
+                asked += 1;
+                reports.ask(now, &peers[flooding], A, interface(asked));
+            };
+            flood(&mut reports, now);
+            reports.ask(now, &peers[patient], B, ReportQuestion::Node);
+            for _ in 0..3 {
+                let question = reports.next(now).unwrap();
+                served.extend(reports.made(now, question, None));
+                flood(&mut reports, now);
+                now += REPORT_INTERVAL;
+            }
+            assert_eq!(served[..2], [A, B], "each in its turn");
+        }
     }
 
     #[test]
