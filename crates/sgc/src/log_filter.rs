@@ -112,8 +112,9 @@ mod tests {
 
     #[test]
     fn log_targets_list_every_crate_that_logs() {
-        const SILENT: [&str; 9] = [
+        const SILENT: [&str; 10] = [
             "sgc_config",
+            "sgc_dashboard",
             "sgc_diagnosis",
             "sgc_executor",
             "sgc_fuzz_targets",
