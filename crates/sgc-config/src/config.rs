@@ -7,7 +7,7 @@ use std::time::Duration;
 use sgc_ros::{Interface, Naming, QosOverride, Shaping};
 use sgc_router::MappingKind;
 use sgc_transport::{Congestion, ListenAddr};
-use sgc_trust::{FleetName, NodeName, ShareToken, Suite};
+use sgc_trust::{FleetName, NodeName, OBSERVERS_GROUP, ShareToken, Suite};
 use sgc_wire::{Class, NodeId};
 
 use crate::gateway::GatewayConfig;
@@ -83,9 +83,6 @@ pub struct Config {
     /// for `None`.
     pub observers: Option<Vec<Recipient>>,
 }
-
-/// The group whose members may ask every node of their fleet how it is doing, unless the node names others.
-pub const OBSERVERS_GROUP: &str = "observers";
 
 impl Config {
     /// Returns the nodes and groups of the fleet that may ask this node how it is doing.

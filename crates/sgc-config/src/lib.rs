@@ -28,8 +28,8 @@ use std::path::Path;
 pub use args::ArgsConfig;
 pub use config::{
     AuditConfig, AuditRoom, AuthorityConfig, Config, DiscoveryRange, KEEP_ALIVE_MAX, KEEP_ALIVE_MIN,
-    OBSERVERS_GROUP, PEER_RATE_MAX, PEER_RATE_MIN, PartnerConfig, RosConfig, RotationConfig, SecurityConfig,
-    ShareConfig, ShareMetadata, TokenConfig, TokenSource, TransportConfig, UseConfig,
+    PEER_RATE_MAX, PEER_RATE_MIN, PartnerConfig, RosConfig, RotationConfig, SecurityConfig, ShareConfig,
+    ShareMetadata, TokenConfig, TokenSource, TransportConfig, UseConfig,
 };
 pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
 pub use gateway::{

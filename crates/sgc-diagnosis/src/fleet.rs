@@ -381,7 +381,7 @@ impl FleetStatus {
         let mut faults = Vec::new();
         let mut add = |what: String, fix: &str| faults.push(Fault { what, fix: fix.to_owned() });
         let Some(report) = &node.report else {
-            // By default, nobody observes a router.
+            // A router whose identity was made before there were observers gives no reports.
             let is_expected = node.is_revoked()
                 || node.member.as_ref().is_some_and(|member| member.router) && self.is_linked(node);
             if let Some(error) = node.error.as_ref().filter(|_| !is_expected) {

@@ -10,7 +10,7 @@ use lab::*;
 use sgc_node::admin::report::NodeReport;
 use sgc_node::admin::{AdminRequest, ReportAnswer, ReportRequest};
 use sgc_node::audit::AuditRecord;
-use sgc_node::config::{AuthorityConfig, Config, Recipient};
+use sgc_node::config::{AuthorityConfig, Recipient};
 use sgc_node::graph::Graph;
 use support::*;
 
@@ -58,8 +58,7 @@ fn error_of(asker: &Node, node: &str) -> String {
 #[test]
 fn observer_learns_from_the_authority_who_is_there_and_from_each_node_how_it_is_doing() {
     let lab = observed(&["robot", "absent"]);
-    let everyone = |c: &mut Config| c.observers = Some(vec![Recipient::Everyone]);
-    let (_cloud, _keeper) = (lab.cloud_with(everyone), keeper(&lab));
+    let (_cloud, _keeper) = (lab.cloud(), keeper(&lab));
     let robot = lab.start("robot", |c| c.shares = vec![share("/chatter", &["desk"])]);
     let desk = lab.start("desk", |c| c.uses = vec![uses("/chatter")]);
     let (talker, listener) = (lab.talker("robot", "/chatter"), lab.listener("desk", "/chatter"));
@@ -122,9 +121,19 @@ fn node_that_is_no_observer_learns_nothing_and_a_reload_decides_anew() {
     let is_refusal =
         |r: &AuditRecord| r.event == "refused" && r.reason.as_deref() == Some("a report: it is no observer");
     wait("the audit log has it", || lab.audit("robot").iter().any(is_refusal));
-    // A router has no secret of the fleet, so it can find no node by its name, and by default nobody observes it.
+    // A router has no secret of the fleet, so it finds no node by its name, but it knows observers.
     assert!(error_of(&cloud, "robot").starts_with("this node is a router"));
-    assert!(error_of(&desk, "cloud").starts_with("it is not in reach"));
+    wait("the router refuses the guest", || error_of(&guest, "cloud").starts_with(refused));
+    assert!(report_of(&desk, "cloud").is_router);
+    cloud.reload(|c| c.observers = Some(vec![Recipient::Everyone]));
+    report_of(&guest, "cloud");
+    let report = cloud.reload(|c| c.observers = Some(nodes(&["guest"])));
+    let warning = report["warnings"][0].as_str().unwrap();
+    assert!(
+        warning.starts_with("`observers` names \"guest\", which this node cannot recognise"),
+        "{warning}"
+    );
+    wait("nobody is left", || error_of(&guest, "cloud").starts_with("it is not in reach"));
 
     let report = robot.reload(|c| c.observers = Some(nodes(&["guest"])));
     assert_eq!(report["changed"][0], "who may ask this node how it is doing changed");

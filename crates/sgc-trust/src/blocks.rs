@@ -8,3 +8,4 @@ pub(crate) const ABOUT_BLOCK: &str = "SGC IDENTITY";
 pub(crate) const CA_BLOCK: &str = "SGC CA CERTIFICATE";
 pub(crate) const RESET_BLOCK: &str = "SGC RESET KEY";
 pub(crate) const AUTHORITY_BLOCK: &str = "SGC AUTHORITY";
+pub(crate) const OBSERVERS_BLOCK: &str = "SGC OBSERVERS";

@@ -16,7 +16,7 @@ use crate::fleet_error::FleetError;
 use crate::identity::Identity;
 use crate::issue::{Leaf, RequestedKey};
 use crate::key::Key;
-use crate::label::{GROUPS_MAX, GroupName, NodeName};
+use crate::label::{GROUPS_MAX, GroupName, NodeName, OBSERVERS_GROUP};
 use crate::member::Membership;
 use crate::peer::VerifiedPeer;
 use crate::roster::{IssuedCertificate, ROSTER_NODES_MAX, RosterNode};
@@ -241,6 +241,7 @@ impl Fleet {
             naming: if is_member { self.naming.clone() } else { Vec::new() },
             authority: self.roster.settings.authority.as_ref().map(|a| self.node_id_of(a)),
             post_quantum: self.roster.settings.post_quantum,
+            observers: (!is_member).then(|| self.secret.group_tag(OBSERVERS_GROUP)),
         })
     }
 

@@ -21,7 +21,7 @@ use crate::cert_error::CertError;
 use crate::identity_error::IdentityError;
 use crate::issue;
 use crate::key::Key;
-use crate::label::{FleetName, GroupName, NodeName};
+use crate::label::{FleetName, GroupName, NodeName, OBSERVERS_GROUP};
 use crate::member::{self, FileParts, Membership, check_generations};
 use crate::peer::{VerifiedPeer, node_id, signature_input};
 use crate::secret::{FleetSecret, NamingSecret};
@@ -79,8 +79,9 @@ impl Identity {
         let is_router = secret.is_none();
         let naming = secret.iter().map(|s| NamingSecret { generation: 1, secret: s.clone() }).collect();
         let anchors = TrustAnchors::new(cas).map_err(IdentityError::Ca)?;
-        let (authority, post_quantum) = (None, false);
-        let member = Membership { node, fleet, chain, anchors, secret, naming, authority, post_quantum };
+        let (authority, post_quantum, observers) = (None, false, None);
+        let member =
+            Membership { node, fleet, chain, anchors, secret, naming, authority, post_quantum, observers };
         let identity = Self::join(member, &key, rng)?;
         let own = &identity.own;
         if own.may_route && !may_route && !is_router {
@@ -220,6 +221,12 @@ impl Identity {
     /// Returns the fleet secret; a router has none.
     pub fn fleet_secret(&self) -> Option<&FleetSecret> {
         self.parts.member.secret.as_ref()
+    }
+
+    /// Returns the tag of a group of this fleet. A router knows that of the observers, if its fleet told it, and no other.
+    pub fn group_tag(&self, group: &str) -> Option<GroupTag> {
+        let told = self.parts.member.observers.filter(|_| group == OBSERVERS_GROUP);
+        self.fleet_secret().map(|secret| secret.group_tag(group)).or(told)
     }
 
     /// Returns chain and private key for TLS. The key can sign and cannot be read.

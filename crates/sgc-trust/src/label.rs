@@ -6,6 +6,9 @@
 use std::fmt;
 use std::str::FromStr;
 
+/// The group whose members may ask every node of their fleet how it is doing, unless a node names others.
+pub const OBSERVERS_GROUP: &str = "observers";
+
 /// Most groups of one node: that many fit into [`sgc_wire::CERT_BYTES_MAX`].
 pub const GROUPS_MAX: usize = 32;
 /// Longest name of a node, group or fleet, bytes.

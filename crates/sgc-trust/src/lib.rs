@@ -58,7 +58,7 @@ pub use grant::{GrantError, Kem, ReplyKey, seal_grant};
 pub use identity::{Identity, Import};
 pub use identity_error::IdentityError;
 pub use issue::{CA_VALIDITY, CLOCK_SKEW, CRL_VALIDITY, KeyRequest, certificate_uris, requested_key_hash};
-pub use label::{FleetName, GROUPS_MAX, GroupName, LABEL_BYTES_MAX, LabelError, NodeName};
+pub use label::{FleetName, GROUPS_MAX, GroupName, LABEL_BYTES_MAX, LabelError, NodeName, OBSERVERS_GROUP};
 pub use member::Membership;
 pub use message_key::{MessageKey, MessageKeyError};
 pub use names::{

@@ -4,10 +4,12 @@
 //! parts fit together.
 
 use rustls_pki_types::CertificateDer;
-use sgc_wire::{DecodeError, NodeId, Reader, SECRET_GENERATIONS_MAX, Writer};
+use sgc_wire::{DecodeError, GroupTag, NodeId, Reader, SECRET_GENERATIONS_MAX, Writer};
 use zeroize::Zeroizing;
 
-use crate::blocks::{ABOUT_BLOCK, AUTHORITY_BLOCK, CA_BLOCK, CERTIFICATE_BLOCK, KEY_BLOCK, RESET_BLOCK};
+use crate::blocks::{
+    ABOUT_BLOCK, AUTHORITY_BLOCK, CA_BLOCK, CERTIFICATE_BLOCK, KEY_BLOCK, OBSERVERS_BLOCK, RESET_BLOCK,
+};
 use crate::identity_error::IdentityError;
 use crate::label::{FleetName, LABEL_BYTES_MAX, NodeName};
 use crate::pem::{self, Block, FILE_BYTES_MAX};
@@ -31,6 +33,8 @@ pub struct Membership {
     pub(crate) naming: Vec<NamingSecret>,
     pub(crate) authority: Option<NodeId>,
     pub(crate) post_quantum: bool,
+    /// The tag of the group of observers, for a router, which has no secret to derive it.
+    pub(crate) observers: Option<GroupTag>,
 }
 
 /// Content of a file.
@@ -141,6 +145,7 @@ pub(crate) fn write(
     blocks.extend(member.secret.as_ref().map(|s| (SECRET_BLOCK, &s.expose()[..])));
     blocks.extend(naming.iter().map(|n| (NAMING_BLOCK, &n[..])));
     blocks.extend(member.authority.as_ref().map(|a| (AUTHORITY_BLOCK, &a.0[..])));
+    blocks.extend(member.observers.as_ref().map(|tag| (OBSERVERS_BLOCK, &tag.0[..])));
     blocks.extend(reset_key.map(|k| (RESET_BLOCK, k)));
     pem::write(comment, &blocks)
 }
@@ -152,6 +157,7 @@ pub(crate) fn read(text: &str) -> Result<FileParts, IdentityError> {
     let mut secret: Option<Block> = None;
     let mut reset_key: Option<Block> = None;
     let mut authority: Option<Block> = None;
+    let mut observers: Option<Block> = None;
     let mut chain = Vec::new();
     let mut cas = Vec::new();
     let mut naming = Vec::new();
@@ -175,6 +181,7 @@ pub(crate) fn read(text: &str) -> Result<FileParts, IdentityError> {
             SECRET_BLOCK => (SECRET_BLOCK, &mut secret),
             RESET_BLOCK => (RESET_BLOCK, &mut reset_key),
             AUTHORITY_BLOCK => (AUTHORITY_BLOCK, &mut authority),
+            OBSERVERS_BLOCK => (OBSERVERS_BLOCK, &mut observers),
             _ => return Err(IdentityError::UnknownBlock(block.label)),
         };
         if slot.replace(block).is_some() {
@@ -194,13 +201,15 @@ pub(crate) fn read(text: &str) -> Result<FileParts, IdentityError> {
         secret.map(|b| FleetSecret::read(&b.content).ok_or_else(length(SECRET_BLOCK))).transpose()?;
     let reset_key = reset_key.map(|b| bytes(b, RESET_BLOCK).map(Zeroizing::new)).transpose()?;
     let authority = authority.map(|b| bytes(b, AUTHORITY_BLOCK).map(NodeId)).transpose()?;
+    let observers = observers.map(|b| bytes(b, OBSERVERS_BLOCK).map(GroupTag)).transpose()?;
     if let Some(root) = secret.as_ref().filter(|_| about.names_from_root) {
         naming.push(NamingSecret { generation: 1, secret: root.clone() });
     }
     naming.sort_unstable_by_key(|n| std::cmp::Reverse(n.generation));
     let anchors = TrustAnchors::new(cas).map_err(IdentityError::Ca)?;
     let NodeSummary { node, fleet, post_quantum, .. } = about;
-    let member = Membership { node, fleet, chain, anchors, secret, naming, authority, post_quantum };
+    let member =
+        Membership { node, fleet, chain, anchors, secret, naming, authority, post_quantum, observers };
     member.check_secrets()?;
     Ok(FileParts { member, key: key.map(|b| b.content), reset_key })
 }

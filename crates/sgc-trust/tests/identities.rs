@@ -431,6 +431,9 @@ fn a_router_has_no_secret() {
     assert_eq!(back.node_id(), router.node_id());
     let arm = enroll(&fleet, &request("arm-1"));
     assert_eq!(back.anchors().verify(arm.chain(), NOW).unwrap().node_id, arm.node_id());
+    // It recognises observers, and no other group.
+    assert_eq!(back.group_tag("observers"), arm.group_tag("observers"));
+    assert!(arm.group_tag("observers").is_some() && back.group_tag("operators").is_none());
 }
 
 #[test]

@@ -17,8 +17,9 @@ use sgc_trust::NodeName;
 
 use super::{WhichFleet, parse_span};
 use crate::error::CliError;
+use crate::node::NodeArgs;
+use crate::output;
 use crate::why::print_steps;
-use crate::{node, output};
 
 /// Shortest time between two looks. Nodes give the same report for half a second.
 const WATCH_MIN: Duration = Duration::from_secs(1);
@@ -42,9 +43,8 @@ pub(super) struct StatusArgs {
     #[arg(long, value_name = "TIME", num_args = 0..=1, require_equals = true, default_missing_value = "5s",
           value_parser = parse_span)]
     watch: Option<Duration>,
-    /// Status socket of the node that asks, if it is not the only one here
-    #[arg(long, value_name = "PATH")]
-    socket: Option<PathBuf>,
+    #[command(flatten)]
+    node: NodeArgs,
     /// Print a JSON document; with --watch, one in each line
     #[arg(long)]
     json: bool,
@@ -60,9 +60,8 @@ pub(super) struct WhyArgs {
     /// Node, and topic, service or action by its name there, such as robot:/camera
     #[arg(value_name = "NODE:/TOPIC")]
     at: String,
-    /// Status socket of the node that asks, if it is not the only one here
-    #[arg(long, value_name = "PATH")]
-    socket: Option<PathBuf>,
+    #[command(flatten)]
+    node: NodeArgs,
     /// Print the steps as JSON
     #[arg(long)]
     json: bool,
@@ -73,7 +72,7 @@ pub(super) fn status(args: &StatusArgs) -> Result<(), CliError> {
     for name in &args.nodes {
         name.parse::<NodeName>()?;
     }
-    let socket = node::socket(None, None, args.socket.as_deref())?;
+    let socket = args.node.socket()?;
     let mut before = None;
     loop {
         match (look(args, &socket), args.watch) {
@@ -155,7 +154,7 @@ pub(super) fn why(args: &WhyArgs) -> Result<ExitCode, CliError> {
         return Err(not_seen(reason));
     };
     node.parse::<NodeName>()?;
-    let socket = node::socket(None, None, args.socket.as_deref())?;
+    let socket = args.node.socket()?;
     let answer = ask_nodes(&socket, &[node.to_owned()], Some(interface))?.pop().unwrap_or_default();
     let Some(graph) = answer.graph else {
         let mut reason = format!("{node}: {}", answer.error.unwrap_or_default());

@@ -161,7 +161,7 @@ fn add(set: &mut Grantees, recipient: &Recipient, identity: &Identity, partners:
         }
         Recipient::Node(node) => set.nodes.extend(identity.node_id_of(node.as_str())),
         Recipient::Group(group) => {
-            let tag = identity.fleet_secret().map(|s| s.group_tag(group.as_str()));
+            let tag = identity.group_tag(group.as_str());
             set.groups.extend(tag.map(|tag| (own, tag)));
         }
         Recipient::Partner(name) => match partners.configured.get(name) {

@@ -65,13 +65,16 @@ impl Rules {
         rules.names = peer_names(config, identity, &rules);
         rules.members = MemberNames::from_config(config, identity);
         rules.observers = policy::grantees(&config.observers(), identity, &rules.partners);
-        let is_named = |one: &Recipient| matches!(one, Recipient::Node(_) | Recipient::Group(_));
-        if identity.fleet_secret().is_none() && config.observers.iter().flatten().any(is_named) {
-            rules.warnings.push(
-                "`observers` names nodes or groups, but this node only routes: it holds no secret of the fleet and recognises \
-                 neither. It can name all nodes (\"*\") or nobody"
-                    .to_owned(),
-            );
+        let is_unknown = |one: &Recipient| match one {
+            Recipient::Node(node) => identity.node_id_of(node.as_str()).is_none(),
+            Recipient::Group(group) => identity.group_tag(group.as_str()).is_none(),
+            Recipient::Everyone | Recipient::Partner(_) => false,
+        };
+        if let Some(one) = config.observers.iter().flatten().find(|one| is_unknown(one)) {
+            rules.warnings.push(format!(
+                "`observers` names \"{one}\", which this node cannot recognise: it only routes and holds no secret of the \
+                 fleet. It knows \"group:observers\" and \"*\""
+            ));
         }
         if let Some(authority) = &config.authority
             && let Ok(fleet) = read_fleet(&authority.fleet)
