@@ -1,6 +1,6 @@
 //! `sgc dashboard`: a page that shows the fleet as an observer sees it, live, in a browser.
 //!
-//! The program asks a node of its user through the status socket, as `sgc fleet status` does ([`feed`]), and serves the
+//! The program asks a node of its user through the status socket, as `sgc fleet status` does (`feed`), and serves the
 //! page and its documents on loopback ([`sgc_http`]). It holds no key and joins no network. The page has a token in the
 //! fragment of its URL, which browsers send to nobody; each request for a document has to show it, so other users of
 //! the host see nothing.
