@@ -71,7 +71,7 @@ impl Feed {
 
     /// Waits for a document after this one, at most this long, and returns the newest with its age.
     pub(crate) async fn next_after(&self, seq: u64, most: Duration) -> String {
-        // What is there is old if nobody has looked for a while.
+        // The document at hand is old if nobody has looked for a while.
         let is_old = !self.is_watched();
         self.note_request();
         let mut documents = self.document.subscribe();
@@ -147,7 +147,7 @@ fn ask_if_any(socket: &Path, nodes: &[String]) -> Result<Vec<ReportAnswer>, Stri
     }
 }
 
-/// What was answered about the fleet.
+/// The members of the fleet, and their last answers.
 #[derive(Debug, Default)]
 struct Memory {
     members: Members,

@@ -54,7 +54,7 @@ const FILES: [(&str, &str, &str); 3] = [
 /// Finds the members of the fleet of the node at a socket, or says why not.
 pub type FindMembers = Box<dyn Fn(&Path) -> Result<Members, String> + Send + Sync>;
 
-/// What the page shows, and where.
+/// The settings of the dashboard: the fleet to show, and the address of the page.
 pub struct DashboardOptions {
     /// Status socket of the node that asks the others.
     pub socket: PathBuf,

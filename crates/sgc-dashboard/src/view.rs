@@ -8,7 +8,7 @@ use sgc_diagnosis::fleet::{FaultOfNodes, FleetStatus};
 use sgc_diagnosis::refusals::drop_meaning;
 use sgc_diagnosis::{Step, Verdict};
 
-/// What the page shows of the fleet.
+/// The fleet as the page shows it.
 #[derive(Debug, Serialize)]
 pub(crate) struct FleetView<'a> {
     /// The number of the document; a later one is larger.

@@ -23,7 +23,7 @@ const ANSWER_MAX: Duration = Duration::from_secs(15);
 const CERTIFICATE_PART: u64 = 5;
 /// Difference of clocks from which on it is shown. Reports take some seconds at most.
 const CLOCKS_DIFFER: Duration = Duration::from_secs(30);
-/// What to name where the authority does not tell the members.
+/// The arguments to use where the authority does not tell the members.
 const OTHERWISE: &str = "nodes (`sgc fleet status robot`) or the fleet file (`--fleet lab.fleet`)";
 /// Nodes with the same fault that are named.
 const NODES_NAMED: usize = 4;
@@ -34,7 +34,7 @@ const LINKS_NAMED: usize = 2;
 /// State of a search that failed, and goes on.
 const TRYING_AGAIN: &str = "trying again";
 
-/// What an observer sees of its fleet at one moment.
+/// The fleet as an observer sees it at one moment.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct FleetStatus {
     /// The time, milliseconds since 1970, by the observer's clock.
@@ -59,7 +59,7 @@ pub struct FleetStatus {
 pub struct FleetNode {
     /// The node's name.
     pub name: String,
-    /// What the fleet's authority or file knows of the node; null if that was not asked or does not know it.
+    /// The node as the fleet's authority or file knows it; null if that was not asked or does not know it.
     pub member: Option<ReportMember>,
     /// How the node is doing; null if it gave no report.
     pub report: Option<NodeReport>,

@@ -75,7 +75,7 @@ fn publishers_whose_assertions_are_not_seen_elsewhere_are_pointed_out() {
     assert_eq!(wrong(&with(publisher(), 2, 99), "/a"), "", "it is no fault of the topic");
 }
 
-/// What another node reports of an interface has the same faults as the whole document there.
+/// Another node's report of an interface has the same faults as the whole document there.
 #[test]
 fn graph_that_was_reduced_to_an_interface_has_the_same_fault() {
     let sides =
