@@ -8,18 +8,10 @@ import { readFile } from "node:fs/promises";
 import { createServer } from "node:http";
 import { extname } from "node:path";
 
-import { chromium } from "playwright-core";
+import { begin, fail, launch, limit } from "./chromium.js";
 
 const [gateway, token, directory] = process.argv.slice(2);
-const executablePath = process.env.SGC_CHROMIUM || "/usr/bin/chromium";
-setTimeout(() => fail(new Error("it took too long")), 90_000);
-let step = "start";
-
-function fail(error) {
-  console.error(step);
-  console.error(error);
-  process.exit(1);
-}
+limit(90_000);
 
 const TYPES = { ".html": "text/html", ".js": "text/javascript", ".mjs": "text/javascript" };
 
@@ -94,25 +86,12 @@ const text = (page, id) => page.locator(id).textContent();
 
 try {
   const port = await serve();
-  step = `start ${executablePath}`;
-  const browser = await chromium.launchPersistentContext(directory, {
-    executablePath,
-    headless: true,
-    args: [
-      "--no-sandbox",
-      "--disable-gpu",
-      "--disable-quic",
-      "--no-first-run",
-      "--disable-background-networking",
-      "--disable-component-update",
-      "--disable-sync",
-      // It finds the host of another origin here, and no other at all.
-      "--no-proxy-server",
-      "--host-resolver-rules=MAP dashboard.test 127.0.0.1, MAP * ~NOTFOUND, EXCLUDE localhost, EXCLUDE 127.0.0.1",
-    ],
-  });
+  const browser = await launch(
+    directory,
+    "MAP dashboard.test 127.0.0.1, MAP * ~NOTFOUND, EXCLUDE localhost, EXCLUDE 127.0.0.1",
+  );
 
-  step = "a page of this host";
+  begin("a page of this host");
   for (const host of ["localhost", "127.0.0.1"]) {
     const { page } = await open(browser, `http://${host}:${port}`, gateway);
     await see(page);
@@ -121,7 +100,7 @@ try {
     await page.close();
   }
 
-  step = "a page of elsewhere";
+  begin("a page of elsewhere");
   const elsewhere = `http://dashboard.test:${port}`;
   const stranger = await open(browser, elsewhere, gateway);
   await shows(stranger.page, "#state", "connected");
@@ -131,14 +110,14 @@ try {
   assert.deepEqual([await text(stranger.page, "#picture"), await text(stranger.page, "#odom")], ["", ""]);
   assert.equal(await stranger.page.evaluate(() => location.origin), elsewhere);
 
-  step = "a page of elsewhere with a token";
+  begin("a page of elsewhere with a token");
   const guest = await open(browser, elsewhere, `${gateway}?token=${token}`);
   await see(guest.page);
   const refused = "subscribe: dashboard may not subscribe to /odom: its scope does not have it";
   await shows(guest.page, "#refused", refused);
   assert.deepEqual([await text(guest.page, "#state"), await text(guest.page, "#odom")], ["connected", ""]);
 
-  step = "close";
+  begin("close");
   await browser.close();
   console.log("all is well");
   process.exit(0);

@@ -3,30 +3,16 @@
 // waits until the death of the node `arm-03` shows, and writes "all is well". crates/sgc/tests/dashboard.rs has the fleet.
 import assert from "node:assert/strict";
 
-import { chromium } from "playwright-core";
+import { begin, fail, launch, limit } from "./chromium.js";
 
 const [url, directory] = process.argv.slice(2);
-const executablePath = process.env.SGC_CHROMIUM || "/usr/bin/chromium";
 const PATIENCE = { timeout: 60_000 };
-setTimeout(() => fail(new Error("it took too long")), 240_000);
-let step = "start";
-
-function fail(error) {
-  console.error(step);
-  console.error(error);
-  process.exit(1);
-}
+limit(240_000);
 
 try {
-  step = `start ${executablePath}`;
-  const browser = await chromium.launchPersistentContext(directory, {
-    executablePath,
-    headless: true,
+  const browser = await launch(directory, "MAP * ~NOTFOUND, EXCLUDE 127.0.0.1", {
     viewport: { width: 1400, height: 1000 },
     colorScheme: "light",
-    args: ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-      "--disable-component-update", "--disable-sync", "--no-proxy-server",
-      "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"],
   });
   const page = await browser.newPage();
   const complaints = [];
@@ -36,7 +22,7 @@ try {
   const row = (name) => page.locator(`#nodes tr[data-key="1 ${name}"]`);
   const rowShows = (name, text) => row(name).filter({ hasText: text }).waitFor(PATIENCE);
 
-  step = "the fleet";
+  begin("the fleet");
   await page.goto(url);
   for (let n = 0; n < 17; n++) await rowShows(`arm-${String(n).padStart(2, "0")}`, "● here");
   await rowShows("busy", "● here");
@@ -49,7 +35,7 @@ try {
   assert.equal(await page.locator("#map line").count(), 20);
   await page.screenshot({ path: `${directory}/fleet.png` });
 
-  step = "five hundred topics";
+  begin("five hundred topics");
   await row("busy").locator("button").click();
   await page.locator("#shown", { hasText: "500 of 500" }).waitFor(PATIENCE);
   assert.equal(await page.locator("#topics tr").count(), 500);
@@ -57,13 +43,13 @@ try {
   await page.locator("#shown", { hasText: "1 of 500" }).waitFor(PATIENCE);
   assert.match(await page.locator("#topics tr").textContent(), /share\/topic_499.*waits for a local publisher/);
 
-  step = "why";
+  begin("why");
   await page.locator("#topics button").click();
   await page.locator("#steps li", { hasText: "✗ no publisher of /topic_499 is on the local network" }).waitFor(PATIENCE);
   await page.keyboard.press("Escape");
   assert.equal(await page.locator("#why").isVisible(), false);
 
-  step = "the keyboard";
+  begin("the keyboard");
   await page.locator('#map .node[data-key="1 arm-07"]').focus();
   await page.keyboard.press("Enter");
   await page.locator("#details-title", { hasText: "arm-07" }).waitFor(PATIENCE);
@@ -73,21 +59,21 @@ try {
   const seen = await page.locator("#facts").textContent();
   assert.match(seen, /node id[0-9a-f]{64}/);
 
-  step = "light and dark";
+  begin("light and dark");
   const background = () => page.evaluate(() => getComputedStyle(document.body).backgroundColor);
   const light = await background();
   await page.emulateMedia({ colorScheme: "dark" });
   assert.notEqual(await background(), light);
   await page.screenshot({ path: `${directory}/dark.png`, fullPage: true });
 
-  step = "another token";
+  begin("another token");
   const stranger = await browser.newPage();
   await stranger.goto(url.replace(/#.*/, "#0123"));
   await stranger.locator("#error", { hasText: "open the URL that `sgc dashboard` printed" }).waitFor(PATIENCE);
   assert.equal(await stranger.locator("#nodes tr").count(), 0);
   await stranger.close();
 
-  step = "a node dies";
+  begin("a node dies");
   await kept.focus();
   console.log("kill");
   await rowShows("arm-03", "○ no report, seen");
@@ -98,7 +84,7 @@ try {
   await page.screenshot({ path: `${directory}/dead.png` });
   assert.deepEqual(complaints, []);
 
-  step = "close";
+  begin("close");
   await browser.close();
   console.log("all is well");
   process.exit(0);
