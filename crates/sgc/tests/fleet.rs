@@ -653,6 +653,18 @@ impl Drop for Running {
 }
 
 impl Place {
+    /// Returns a place with the fleet `lab`: the authority `keeper`, a router, two arms, and a desk in this group.
+    fn with_authority(group_of_desk: &str) -> Self {
+        let place = Self::new();
+        place.good(&["fleet", "create", "lab", "--authority", "keeper"]);
+        place.good(&["fleet", "enroll", "cloud", "--router"]);
+        place.good(&["fleet", "enroll", "desk", "--group", group_of_desk]);
+        for node in ["keeper", "arm-1", "arm-2"] {
+            place.good(&["fleet", "enroll", node]);
+        }
+        place
+    }
+
     /// Runs a node of this directory until it is ready.
     fn start(&self, node: &str, port: u16, more: &str) -> Running {
         use std::io::BufRead as _;
@@ -690,13 +702,7 @@ fn wait(what: &str, is_so: impl Fn() -> bool) {
 
 #[test]
 fn an_operator_keeps_the_fleet_from_a_machine_without_its_file() {
-    let place = Place::new();
-    place.good(&["fleet", "create", "lab", "--authority", "keeper"]);
-    place.good(&["fleet", "enroll", "cloud", "--router"]);
-    place.good(&["fleet", "enroll", "desk", "--group", "operators"]);
-    for node in ["keeper", "arm-1", "arm-2"] {
-        place.good(&["fleet", "enroll", node]);
-    }
+    let place = Place::with_authority("operators");
     let port = unused_port();
     let _cloud = place.start("cloud", port, &format!("[router]\nlisten = [\"quic://127.0.0.1:{port}\"]\n"));
     let keeper = place.keeper(port);
@@ -774,13 +780,7 @@ fn the_ca_is_shown_and_nothing_else() {
 
 #[test]
 fn an_observer_sees_the_fleet_and_what_is_wrong_with_it() {
-    let place = Place::new();
-    place.good(&["fleet", "create", "lab", "--authority", "keeper"]);
-    place.good(&["fleet", "enroll", "cloud", "--router"]);
-    place.good(&["fleet", "enroll", "desk", "--group", "observers"]);
-    for node in ["keeper", "arm-1", "arm-2"] {
-        place.good(&["fleet", "enroll", node]);
-    }
+    let place = Place::with_authority("observers");
     let port = unused_port();
     let _cloud = place.start("cloud", port, &format!("[router]\nlisten = [\"quic://127.0.0.1:{port}\"]\n"));
     let _keeper = place.keeper(port);
