@@ -143,6 +143,11 @@ pub(crate) const CONTROL: &[Refusal] = &[
         "enroll it with --router or --may-route",
     ),
     named(
+        "invited",
+        "who was only invited to its fleet asks for more than its identity",
+        "end the invitation by revoking the node that it is for; the log names the link",
+    ),
+    named(
         "stale_flood",
         "a neighbour brings too many announcements that are old; more of them are not looked at for a while",
         "look at that neighbour: somebody behind it replays, or signs anew all the time; end the link to it if it goes on",
@@ -184,6 +189,11 @@ pub(crate) const CONTROL: &[Refusal] = &[
         "endpoint_catalogue_too_large",
         "this node shares more than fits into what it lists for others: some topics are left out",
         "share fewer topics, or give some to another node",
+    ),
+    named(
+        "endpoint_invited",
+        "who was only invited to the fleet asks for more than its identity, through a router of an earlier version",
+        "upgrade the router; the invitation ends by itself, or by revoking the node that it is for",
     ),
     counted(
         NodeDrop::JoinRefused.key(),

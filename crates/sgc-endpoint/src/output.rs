@@ -334,6 +334,12 @@ pub enum EndpointDrop {
         /// Number of missing entries.
         left_out: usize,
     },
+    /// The holder of an invitation asks for more than its identity.
+    #[error("node {} is only invited to its fleet, and asks for more than its identity", peer.short())]
+    Invited {
+        /// The holder.
+        peer: NodeId,
+    },
 }
 
 impl EndpointDrop {
@@ -350,6 +356,7 @@ impl EndpointDrop {
             Self::Grant(_) => "endpoint_grant",
             Self::Unexpected { .. } => "endpoint_unexpected",
             Self::CatalogueTooLarge { .. } => "endpoint_catalogue_too_large",
+            Self::Invited { .. } => "endpoint_invited",
         }
     }
 }

@@ -376,6 +376,13 @@ impl Owner {
         if needs_post_quantum && reply_key.len() != Kem::XWing.reply_key_bytes() {
             return cx.refuse(name, sink, 1, RefuseReason::NotVerified);
         }
+        // The holder of an invitation is no member yet, and asks the authority for an operation only.
+        if join.peer.invitation.is_some() && !self.operations.is_at(&name) {
+            if self.desk(&name).is_some() {
+                cx.refuse(name, sink, 1, RefuseReason::NotPermitted);
+            }
+            return cx.drop_frame(EndpointDrop::Invited { peer: join.peer.node_id });
+        }
         let asked = GrantedSink { peer: join.peer, request, reply_key, issued_at, serial: 0 };
         match self.desk(&name) {
             Some(Desk::Catalogue) => self.catalogue.handle_follow(cx, &self.shares, (name, sink), asked),

@@ -8,7 +8,7 @@ use sgc_endpoint::{
     ADVERT_INTERVAL, ADVERTS_BURST, Endpoint, EndpointConfig, EndpointDrop, Event, JoinKind, JoinStatus,
     Limits, LostReason, Output, ShareError, ShareSpec, SignedKind,
 };
-use sgc_testkit::{Clock, Member, identity};
+use sgc_testkit::{Clock, Member, identity, invited};
 use sgc_trust::{Grantees, Identity, Policy, ReplyKey, Suite, seal_grant};
 use sgc_wire::{
     ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, Class, Control, Decode, GrantContent, JoinBody,
@@ -233,6 +233,22 @@ fn a_joiner_whose_fleet_is_unknown_is_refused_and_told_why() {
         bench.dropped
     );
     assert_eq!(bench.endpoint.granted(&name), []);
+}
+
+/// A router of an earlier version passes such requests on.
+#[test]
+fn the_holder_of_an_invitation_is_refused_what_everyone_in_the_fleet_may_have() {
+    let mut bench = owner();
+    let topic = bench.share_with_fleet("/a");
+    let catalogue = bench.endpoint.catalogue_name().expect("it has one");
+    let holder = invited("acme");
+    for name in [topic, catalogue] {
+        let (frame, _) = join(&bench, &holder, name, 1);
+        bench.frame(frame);
+        assert_eq!(bench.answers(), [(SinkId([1; 16]), Some(RefuseReason::NotPermitted))]);
+        assert!(matches!(bench.dropped[..], [EndpointDrop::Invited { .. }]), "{:?}", bench.dropped);
+        assert_eq!(bench.endpoint.granted(&name), []);
+    }
 }
 
 #[test]

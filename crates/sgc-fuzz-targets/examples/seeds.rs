@@ -2,6 +2,7 @@
 //! `cargo run -p sgc-fuzz-targets --example seeds`.
 
 use std::path::Path;
+use std::time::Duration;
 use std::{fs, io};
 
 use bytes::Bytes;
@@ -251,7 +252,11 @@ fn certs() -> Vec<Vec<u8>> {
     let list = fleet.revocation_list(NOW).expect("a list");
     let again = fleet.enroll(&EnrollRequest { again: true, ..request }, rng).expect("an identity");
     let csr = KeyRequest::generate(None, rng).expect("a request").csr_text();
-    let seeds: [(u8, Vec<u8>); 10] = [
+    fleet.set_authority(Some("keeper".parse().expect("a name")), NOW).expect("a setting");
+    let invited = EnrollRequest::new("arm-2".parse().expect("a name"), NOW);
+    let routers = vec!["quic://hub:7447".to_owned()];
+    let invitation = fleet.invite(&invited, Duration::from_secs(900), routers, rng).expect("an invitation");
+    let seeds: [(u8, Vec<u8>); 11] = [
         (0, arm.to_text().as_bytes().to_vec()),
         (1, arm.to_text().as_bytes().to_vec()),
         (2, fleet.to_text().as_bytes().to_vec()),
@@ -262,6 +267,7 @@ fn certs() -> Vec<Vec<u8>> {
         (5, fleet.ca_certificate().to_vec()),
         (6, arm.csr()),
         (5, again.chain()[0].to_vec()),
+        (1, invitation.to_text().as_bytes().to_vec()),
     ];
     seeds.into_iter().map(|(which, seed)| [&[which], &seed[..]].concat()).collect()
 }

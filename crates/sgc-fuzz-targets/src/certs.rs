@@ -1,10 +1,10 @@
-//! Identity and fleet files, revocation lists, certificate chains and requests: no input panics.
+//! Identity and fleet files, invitations, revocation lists, certificate chains and requests: no input panics.
 use std::sync::OnceLock;
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use rustls_pki_types::CertificateDer;
-use sgc_trust::{EnrollRequest, Fleet, Identity, Membership, TrustAnchors, pem_contents};
+use sgc_trust::{EnrollRequest, Fleet, Identity, Invitation, Membership, TrustAnchors, pem_contents};
 use sgc_wire::UnixMillis;
 
 const NOW: UnixMillis = UnixMillis(1_795_000_000_000);
@@ -22,7 +22,12 @@ pub fn run(input: &[u8]) {
     let text = || String::from_utf8_lossy(input);
     match which % 7 {
         0 => drop(Identity::parse(&text())),
-        1 => drop(Membership::parse(&text())),
+        1 => {
+            drop(Membership::parse(&text()));
+            if let Ok(invitation) = Invitation::parse(&text()) {
+                drop(invitation.identity(&mut ChaCha20Rng::seed_from_u64(3)));
+            }
+        }
         2 => drop(Fleet::parse(&text())),
         3 => drop(pem_contents(&text(), &["CERTIFICATE"])),
         4 => drop(fleet().anchors().with_crl(input, NOW)),

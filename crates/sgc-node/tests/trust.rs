@@ -21,12 +21,13 @@ use sgc_node::config::{AuthorityConfig, Config, Recipient, TokenConfig, TokenSou
 use sgc_node::partners::{TokenRecord, TokenRecords};
 use sgc_transport::{AnyLink, CloseReason, Dialer, Link as _, LinkOptions};
 use sgc_trust::{
-    EnrollRequest, Identity, Kem, KeyRequest, Membership, ReplyKey, ShareToken, Suite, TopicSecret,
-    derive_name, name_of, operations_blind,
+    EnrollRequest, Identity, Invitation, Kem, KeyRequest, Membership, ReplyKey, ShareToken, Suite,
+    TopicSecret, derive_name, name_of, operations_blind, renewal_blind,
 };
 use sgc_wire::{
     Answer, AnswerBody, Control, Decode as _, Encode as _, GrantContent, Hello, JoinBody, Metadata, Name,
-    Operation, OperationAnswer, OperationRefusal, OperationRequest, Request, SignedBody, SinkId, UnixMillis,
+    Operation, OperationAnswer, OperationRefusal, OperationRequest, RefuseReason, Request, SignedBody,
+    SinkId, UnixMillis,
 };
 use support::*;
 
@@ -465,11 +466,11 @@ fn non_operator_changes_nothing() {
     assert_eq!(lab.certificates("mine"), 0);
     drop(keeper);
 
-    // Without operators, an authority does not even offer the name.
+    // Without operators, an authority answers the invited alone.
     let _keeper = lab.start("keeper", |c| c.authority = Some(AuthorityConfig::new(lab.fleet_file())));
     let desk = lab.start("desk", |_| {});
     let said = operate(&desk, "keeper", revoke("guest")).unwrap_err();
-    assert!(said.starts_with("no authority keeper is in reach"), "{said}");
+    assert!(said.starts_with("keeper does not take this node for an operator"), "{said}");
 }
 
 /// A member that speaks the protocol without a node.
@@ -483,7 +484,10 @@ struct ByHand {
 impl ByHand {
     /// Links to the router and waits until it knows `name`.
     fn start(lab: &Lab, node: &str, name: Name) -> Self {
-        let identity = lab.identity(node);
+        Self::start_as(lab, lab.identity(node), name)
+    }
+
+    fn start_as(lab: &Lab, identity: Arc<Identity>, name: Name) -> Self {
         let runtime = tokio::runtime::Runtime::new().unwrap();
         let _enter = runtime.enter();
         let dialer = Dialer::new(identity.clone(), LinkOptions::default(), Arc::default());
@@ -586,6 +590,84 @@ fn a_request_that_was_recorded_and_comes_again_is_not_carried_out_again() {
     assert!(matches!(stale, OperationAnswer::Refused { why: OperationRefusal::Stale, .. }), "{stale:?}");
     assert_eq!((lab.certificates("arm"), keeper.drops("operation_stale")), (1, 1));
     desk.runtime.block_on(desk.dialer.close(CloseReason::Goodbye));
+}
+
+#[test]
+fn the_holder_of_an_invitation_gets_its_identity_once_and_nothing_else() {
+    let lab = Lab::with_operator(&[]);
+    let (cloud, keeper) = (lab.cloud(), lab.keeper());
+    let desk = lab.start("desk", |_| {});
+    let invite = Operation::Invite {
+        node: "arm".into(),
+        groups: vec!["arms".into()],
+        router: false,
+        may_route: false,
+        again: false,
+        valid_ms: 3_600_000,
+        within_ms: 600_000,
+        routers: vec![lab.url()],
+    };
+    let done = operate(&desk, "keeper", invite);
+    let Ok(OperationAnswer::Invitation(code)) = done else { panic!("{done:?}") };
+    // A member has nothing to redeem.
+    let made = KeyRequest::generate(None, &mut OsRng.unwrap_err()).unwrap();
+    let redeem = || Operation::Redeem { csr: Bytes::copy_from_slice(made.csr()) };
+    let said = operate(&desk, "keeper", redeem()).unwrap_err();
+    assert!(said.starts_with("keeper does not take this node for an operator"), "{said}");
+
+    let invitation = Invitation::parse(code.expose()).unwrap();
+    let holder = Arc::new(invitation.identity(&mut OsRng.unwrap_err()).unwrap());
+    let ca = holder.as_peer().ca;
+    let name = name_of(&lab.id("keeper"), &operations_blind(&ca));
+    let guest = ByHand::start_as(&lab, holder, name);
+    let challenge = |sink| {
+        let (asks, key) = guest.request(name, sink, &OperationRequest::Challenge);
+        match guest.ask(name, sink, &asks, &key) {
+            OperationAnswer::Challenge(challenge) => challenge,
+            other => panic!("{other:?}"),
+        }
+    };
+    // It operates nothing, and reaches no other name.
+    let (list, challenge_1) = (Operation::List { after: None }, challenge(1));
+    let execute = OperationRequest::Execute { challenge: challenge_1, operation: list };
+    let (asks, _) = guest.request(name, 2, &execute);
+    guest.send(&Control::Join { signed: asks });
+    guest.hear(|frame| match frame {
+        Control::Answer { signed } => {
+            let body = AnswerBody::from_slice(&signed.body).unwrap();
+            (body.answer == Answer::Refuse { reason: RefuseReason::NotPermitted }).then_some(())
+        }
+        _ => None,
+    });
+    let renewals = name_of(&lab.id("keeper"), &renewal_blind(&ca));
+    let (asks, _) = guest.request(renewals, 3, &OperationRequest::Challenge);
+    guest.send(&Control::Join { signed: asks });
+    let is_rejected = |frame| matches!(frame, Control::Reject { name, .. } if name == renewals).then_some(());
+    guest.hear(is_rejected);
+    assert_eq!(cloud.drops("invited"), 1);
+
+    let execute = OperationRequest::Execute { challenge: challenge(4), operation: redeem() };
+    let (recorded, key) = guest.request(name, 5, &execute);
+    let first = guest.ask(name, 5, &recorded, &key);
+    let OperationAnswer::Membership(text) = &first else { panic!("{first:?}") };
+    let arm = Identity::join(Membership::parse(text.expose()).unwrap(), made.key(), &mut OsRng.unwrap_err());
+    let fleet = sgc_node::read_fleet(&lab.fleet_file()).unwrap();
+    assert_eq!(arm.unwrap().node_id(), fleet.node_id_of(&"arm".parse().unwrap()));
+    // The same request gets the same answer, and another one none.
+    assert_eq!(guest.ask(name, 5, &recorded, &key), first);
+    let execute = OperationRequest::Execute { challenge: challenge(6), operation: redeem() };
+    let (asks, key) = guest.request(name, 7, &execute);
+    let again = guest.ask(name, 7, &asks, &key);
+    let OperationAnswer::Refused { why: OperationRefusal::Fleet, detail } = again else {
+        panic!("{again:?}")
+    };
+    assert!(detail.starts_with("the invitation of arm was used at"), "{detail}");
+    let said: Vec<_> = lab.audit("keeper").into_iter().filter(|r| r.event == "operation").collect();
+    let said: Vec<_> = said.iter().map(|r| r.reason.as_deref().unwrap()).collect();
+    assert_eq!(said[..2], ["invite arm: done", "redeem the invitation of arm: done"]);
+    assert!(keeper.drops("operation_not_permitted") >= 2);
+    guest.runtime.block_on(guest.dialer.close(CloseReason::Goodbye));
+    drop(desk);
 }
 
 #[test]

@@ -105,6 +105,12 @@ pub enum DropReason {
         "says that it carries others' names, but its certificate does not let it: enroll it with --router or --may-route"
     )]
     NotRouter,
+    /// The holder of an invitation asks for another name than that of its fleet's authority.
+    #[error("node {} is only invited to its fleet, and asks for more than its identity", node.short())]
+    Invited {
+        /// The holder.
+        node: NodeId,
+    },
 }
 
 impl DropReason {
@@ -118,7 +124,8 @@ impl DropReason {
             | Self::StaleFlood
             | Self::Crl(_)
             | Self::Clock { .. }
-            | Self::NotRouter => true,
+            | Self::NotRouter
+            | Self::Invited { .. } => true,
             // An honest neighbour passes on what the CA signs.
             Self::ListFlood { .. }
             | Self::OwnerKey { .. }
@@ -148,6 +155,7 @@ impl DropReason {
             Self::ListFlood { .. } => "crl_flood",
             Self::Clock { .. } => "clock",
             Self::NotRouter => "not_router",
+            Self::Invited { .. } => "invited",
         }
     }
 }

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use sgc_router::{FibEntry, Limits, LinkId, MappingKind, Neighbour, Output, Router, RouterConfig};
-use sgc_testkit::{Clock, Member, identity};
-use sgc_trust::{Identity, name_of};
+use sgc_testkit::{Clock, Member, identity, invited};
+use sgc_trust::{Identity, name_of, operations_blind};
 use sgc_wire::{
     Adjacency, AdvertBody, Answer, AnswerBody, Blind, Control, Decode, Hello, JoinBody, LinkStateBody, Name,
     NodeId, RejectReason, Request, SinkId, UnixMillis,
@@ -353,6 +353,29 @@ fn a_node_that_may_not_route_cannot_say_that_it_does() {
     let signed = bench.owner.sign_link_state(&body);
     bench.frame(1, Control::LinkState { signed });
     assert_eq!((bench.dropped.as_slice(), bench.router.stats().nodes), (["not_router"].as_slice(), 0));
+}
+
+#[test]
+fn the_holder_of_an_invitation_reaches_the_authority_and_nobody_else() {
+    let mut bench = Bench::new();
+    bench.user = invited("acme");
+    let operations = operations_blind(&bench.owner.as_peer().ca);
+    bench.with_proxies();
+    bench.with_owner_behind(5000, 9000);
+    bench.advert(1, 11, &[A, operations]);
+    bench.join(4, 1, &A);
+    let rejected = |(link, frame): &(u32, Control)| {
+        *link == 4 && matches!(frame, Control::Reject { reason: RejectReason::NotVerified, .. })
+    };
+    assert!(bench.sent.len() == 1 && bench.sent.iter().all(rejected), "{:?}", bench.sent);
+    assert_eq!(bench.dropped, ["invited"]);
+    bench.join(4, 2, &operations);
+    assert!(matches!(bench.sent[..], [(1, Control::Join { .. })]), "{:?}", bench.sent);
+    // It has no names of its own.
+    bench.dropped.clear();
+    let own = bench.advert_of(&bench.user, 1, false, &[B]);
+    bench.frame(4, own);
+    assert_eq!((bench.sent.len(), bench.dropped.as_slice()), (0, ["not_verified"].as_slice()));
 }
 
 #[test]

@@ -122,6 +122,18 @@ pub fn identity(member: &Member) -> Arc<Identity> {
     identity
 }
 
+/// Returns the holder of an invitation to a fleet, whose authority is the node `keeper`.
+pub fn invited(fleet: &str) -> Arc<Identity> {
+    let mut cast = cast();
+    let mut copy = Fleet::parse(&cast.fleet(fleet).to_text()).expect("it was written by itself");
+    let rng = &mut rng(&format!("{fleet}/invited"));
+    copy.set_authority(Some("keeper".parse().expect("a legal name")), BIRTH).expect("a fresh fleet");
+    let request = EnrollRequest::new("invited".parse().expect("a legal name"), GENESIS);
+    let made =
+        copy.invite(&request, Duration::from_secs(86_400), Vec::new(), rng).expect("a fresh CA invites");
+    Arc::new(made.identity(rng).expect("it fits together"))
+}
+
 /// Returns these trust anchors with the CA of a fleet added.
 pub(crate) fn with_fleet(anchors: &TrustAnchors, fleet: &str) -> TrustAnchors {
     let ca = cast().fleet(fleet).ca_certificate().clone();

@@ -49,7 +49,7 @@ pub use allocator::{
     Allocations, CountingAllocator, allocated_here, allocated_since_last, allocations, allocations_of,
     live_bytes,
 };
-pub use cast::{Member, identity, revocation_list, serial_list};
+pub use cast::{Member, identity, invited, revocation_list, serial_list};
 pub use clock::Clock;
 pub use ids::{MessageId, NodeKey};
 pub use model::Model;

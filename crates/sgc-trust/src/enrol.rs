@@ -14,6 +14,8 @@ use sgc_wire::{Credentials, Pseudonym, UnixMillis};
 use crate::fleet::{Fleet, LEAF_VALIDITY_DEFAULT};
 use crate::fleet_error::FleetError;
 use crate::identity::Identity;
+use crate::invitation::Invitation;
+use crate::invitation_bounds::INVITATION_TIME_MAX;
 use crate::issue::{Leaf, RequestedKey};
 use crate::key::Key;
 use crate::label::{GROUPS_MAX, GroupName, NodeName, OBSERVERS_GROUP};
@@ -96,6 +98,75 @@ impl Fleet {
         self.credentials_for(&node, chain)
     }
 
+    /// Enters a node in the roster and invites it: the first holder of the invitation who asks the authority within this
+    /// time ([`Fleet::redeem`]) gets the node's identity. `routers` are URLs at which the authority can be reached.
+    pub fn invite(
+        &mut self,
+        request: &EnrollRequest,
+        within: Duration,
+        routers: Vec<String>,
+        rng: &mut impl CryptoRng,
+    ) -> Result<Invitation, FleetError> {
+        let authority = self.authority().cloned().ok_or(FleetError::NoAuthority)?;
+        if within > INVITATION_TIME_MAX || within < Duration::from_secs(1) {
+            return Err(FleetError::InvitationTime);
+        }
+        if !Invitation::fits(&routers) {
+            return Err(FleetError::InvitationRouters);
+        }
+        let incarnation = self.admit(request)?;
+        let (key, scalar) = Key::generate_with_scalar(rng);
+        let mut pseudonym = Pseudonym([0; 32]);
+        rng.fill_bytes(&mut pseudonym.0);
+        let leaf = Leaf {
+            // That of no node: a used or stolen invitation must not pass for the node.
+            pseudonym,
+            groups: Vec::new(),
+            may_route: false,
+            incarnation: 0,
+            invitation: Some(request.valid),
+            valid: within,
+            now: request.now,
+        };
+        let certificate = leaf.sign(&key, &self.certificate, &self.key, self.validity, rng)?;
+        self.record(request, incarnation, &certificate, false)?;
+        Ok(Invitation {
+            node: request.node.clone(),
+            fleet: self.name.clone(),
+            authority_id: self.node_id_of(&authority),
+            authority,
+            routers,
+            ca: self.certificate.clone(),
+            certificate,
+            scalar,
+            post_quantum: self.roster.settings.post_quantum,
+        })
+    }
+
+    /// Makes the identity of an invited node, for the key that signed `csr`, once. `peer` is the holder of the
+    /// invitation, as its certificate proves.
+    pub fn redeem(
+        &mut self,
+        csr: &[u8],
+        peer: &VerifiedPeer,
+        now: UnixMillis,
+        rng: &mut impl CryptoRng,
+    ) -> Result<Membership, FleetError> {
+        let valid = peer.invitation.ok_or(FleetError::NotInvited)?;
+        let is_it = |c: &IssuedCertificate| c.serial == peer.cert.serial;
+        let node = self.nodes().find(|n| n.certificates.iter().any(is_it)).ok_or(FleetError::NotInvited)?;
+        let node = self.active_node(&node.name)?.name.clone();
+        let known = self.roster.nodes.get(&node).into_iter().flat_map(|n| &n.certificates).find(|c| is_it(c));
+        if let Some(at) = known.ok_or(FleetError::NotInvited)?.revoked_at(self.revocation_of(&node)) {
+            return Err(FleetError::InvitationUsed { node, at });
+        }
+        let member = self.renew_member(csr, &node, valid, now, rng)?;
+        let entry = self.roster.nodes.get_mut(&node).into_iter().flat_map(|n| &mut n.certificates);
+        entry.filter(|c| is_it(c)).for_each(|c| c.revoked = Some(now));
+        self.sign_roster()?;
+        Ok(member)
+    }
+
     /// Enters a certificate in the roster that was made before there was one, so that it can be revoked.
     pub fn adopt(
         &mut self,
@@ -162,22 +233,43 @@ impl Fleet {
         request: &EnrollRequest,
         rng: &mut impl CryptoRng,
     ) -> Result<Membership, FleetError> {
+        let incarnation = self.admit(request)?;
+        let member = self.member(key, request, incarnation, rng)?;
+        let leaf = member.chain.first().ok_or(FleetError::CaName)?;
+        self.record(request, incarnation, leaf, true)?;
+        Ok(member)
+    }
+
+    /// Returns the incarnation in which a node may be enrolled.
+    fn admit(&mut self, request: &EnrollRequest) -> Result<u32, FleetError> {
         self.begin_roster_if_none(request.now)?;
+        self.check_ca_holds(request.now)?;
+        if request.groups.len() > GROUPS_MAX {
+            return Err(FleetError::TooManyGroups { groups: request.groups.len() });
+        }
         self.roster.prune(request.now);
         let known = self.roster.nodes.get(&request.node);
         if known.is_none() && self.roster.nodes.len() >= ROSTER_NODES_MAX {
             return Err(FleetError::TooManyNodes);
         }
         let known_incarnation = known.map_or(0, |n| n.incarnation);
-        let incarnation = match self.revocation_of(&request.node) {
+        match self.revocation_of(&request.node) {
             Some(revoked) if revoked.covers(known_incarnation) => {
                 let next = revoked.incarnation.checked_add(1).filter(|_| request.again);
-                next.ok_or(FleetError::NodeRevoked { node: request.node.clone(), at: revoked.at })?
+                next.ok_or(FleetError::NodeRevoked { node: request.node.clone(), at: revoked.at })
             }
-            _ => known_incarnation,
-        };
-        let member = self.member(key, request, incarnation, rng)?;
-        let leaf = member.chain.first().ok_or(FleetError::CaName)?;
+            _ => Ok(known_incarnation),
+        }
+    }
+
+    /// Enters a node with a new certificate in the roster. `is_handed`: the node gets the secrets in use now.
+    fn record(
+        &mut self,
+        request: &EnrollRequest,
+        incarnation: u32,
+        leaf: &CertificateDer<'_>,
+        is_handed: bool,
+    ) -> Result<(), FleetError> {
         let made = Validity::from_certificate(leaf).zip(serial_of(leaf)).ok_or(FleetError::CaName)?;
         let (Validity { not_after, .. }, serial) = made;
         let mut node = RosterNode {
@@ -187,8 +279,8 @@ impl Fleet {
             groups: request.groups.iter().cloned().collect::<BTreeSet<_>>().into_iter().collect(),
             router: request.router,
             may_route: request.router || request.may_route,
-            generation: if request.router { 0 } else { self.newest_generation() },
-            seen: Some(request.now),
+            generation: if request.router || !is_handed { 0 } else { self.newest_generation() },
+            seen: is_handed.then_some(request.now),
             certificates: Vec::new(),
         };
         if let Some(known) = self.roster.nodes.get(&request.node) {
@@ -197,6 +289,9 @@ impl Fleet {
             let later = UnixMillis(known.changed.0.saturating_add(1));
             node.changed = if is_same { known.changed } else { node.changed.max(later) };
             node.certificates = known.certificates.clone();
+            if !is_handed {
+                (node.generation, node.seen) = (known.generation, known.seen);
+            }
         }
         node.add_certificates([IssuedCertificate {
             serial: serial.into(),
@@ -205,8 +300,7 @@ impl Fleet {
             revoked: None,
         }]);
         self.roster.nodes.insert(request.node.clone(), node);
-        self.sign_roster()?;
-        Ok(member)
+        self.sign_roster()
     }
 
     /// Returns everything but the key, for this key.
@@ -227,6 +321,7 @@ impl Fleet {
             groups: groups.into_iter().map(|g| self.secret.group_tag(g.as_str())).collect(),
             may_route: request.router || request.may_route,
             incarnation,
+            invitation: None,
             valid: request.valid,
             now: request.now,
         };

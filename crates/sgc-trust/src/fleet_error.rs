@@ -5,6 +5,7 @@ use std::fmt;
 use sgc_wire::{DecodeError, SECRET_GENERATIONS_MAX, UnixMillis};
 
 use crate::blocks::{CERTIFICATE_BLOCK, FLEET_BLOCK, KEY_BLOCK, ROSTER_BLOCK};
+use crate::invitation_bounds::{INVITATION_ROUTERS_MAX, INVITATION_TIME_MAX, ROUTER_BYTES_MAX};
 use crate::label::{FleetName, GROUPS_MAX, LabelError, NodeName};
 use crate::pem::PemError;
 use crate::revocations::REVOKED_NODES_MAX;
@@ -90,6 +91,34 @@ pub enum FleetError {
         /// The node.
         node: NodeName,
         /// Time of the revocation.
+        at: UnixMillis,
+    },
+    /// The fleet has no authority, which has to answer whoever is invited.
+    #[error(
+        "the fleet has no authority, which an invited node asks: see `sgc fleet set --authority NODE`, and run that node \
+         with this file in its [authority]"
+    )]
+    NoAuthority,
+    /// The time of an invitation is out of bounds.
+    #[error("an invitation is for at least a second and at most {} days", INVITATION_TIME_MAX.as_secs() / 86_400)]
+    InvitationTime,
+    /// Too many routers for an invitation, or too long.
+    #[error(
+        "an invitation names at most {INVITATION_ROUTERS_MAX} routers, each of at most {ROUTER_BYTES_MAX} bytes"
+    )]
+    InvitationRouters,
+    /// The certificate is none of an invitation that this copy of the file made.
+    #[error("the invitation is not one of this fleet's file")]
+    NotInvited,
+    /// The invitation was used.
+    #[error(
+        "the invitation of {node} was used at {at}: ask for another one. If nobody of yours used it, revoke the node: \
+         sgc fleet revoke {node}"
+    )]
+    InvitationUsed {
+        /// The invited node.
+        node: NodeName,
+        /// Time of its use.
         at: UnixMillis,
     },
     /// A request for a certificate that cannot be used.

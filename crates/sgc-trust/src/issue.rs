@@ -23,7 +23,7 @@ use crate::cert_id::sha256;
 use crate::fleet_error::FleetError;
 use crate::key::Key;
 use crate::label::{GroupName, NodeName};
-use crate::peer::{GROUP_URI, INCARNATION_URI, NODE_URI, ROUTER_URI};
+use crate::peer::{GROUP_URI, INCARNATION_URI, INVITATION_URI, NODE_URI, ROUTER_URI};
 use crate::pem;
 use crate::revocations::{LIST_NODES_MAX, RevokedNodes};
 use crate::secret::FleetSecret;
@@ -66,6 +66,8 @@ pub(crate) struct Leaf {
     pub(crate) groups: Vec<GroupTag>,
     pub(crate) may_route: bool,
     pub(crate) incarnation: u32,
+    /// Validity of the certificate to which this one entitles, if it is an invitation.
+    pub(crate) invitation: Option<Duration>,
     pub(crate) valid: Duration,
     pub(crate) now: UnixMillis,
 }
@@ -75,6 +77,9 @@ impl Leaf {
         let mut params = CertificateParams::default();
         params.distinguished_name = common_name(&self.pseudonym.to_string());
         params.subject_alt_names = sans(&self.pseudonym, &self.groups, self.may_route, self.incarnation)?;
+        if let Some(valid) = self.invitation {
+            params.subject_alt_names.push(uri(format!("{INVITATION_URI}{}", valid.as_secs()))?);
+        }
         params.is_ca = IsCa::ExplicitNoCa;
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.extended_key_usages =
@@ -330,8 +335,11 @@ fn sans(
     may_route: bool,
     incarnation: u32,
 ) -> Result<Vec<SanType>, FleetError> {
-    let uri = |text: String| Ok(SanType::URI(text.try_into().map_err(FleetError::making)?));
     uris(pseudonym, groups, may_route, incarnation).into_iter().map(uri).collect()
+}
+
+fn uri(text: String) -> Result<SanType, FleetError> {
+    Ok(SanType::URI(text.try_into().map_err(FleetError::making)?))
 }
 
 fn uris(pseudonym: &Pseudonym, groups: &[GroupTag], may_route: bool, incarnation: u32) -> Vec<String> {

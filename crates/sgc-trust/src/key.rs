@@ -44,12 +44,17 @@ enum Pair {
 impl Key {
     /// Makes a P-256 key, which every transport can use.
     pub(crate) fn generate(rng: &mut impl CryptoRng) -> Self {
+        Self::generate_with_scalar(rng).0
+    }
+
+    /// Makes a P-256 key, and returns it with its scalar, from which [`Key::from_scalar`] makes it again.
+    pub(crate) fn generate_with_scalar(rng: &mut impl CryptoRng) -> (Self, Zeroizing<[u8; 32]>) {
         let mut scalar = Zeroizing::new([0; 32]);
         loop {
             rng.fill_bytes(&mut *scalar);
             // Zero and numbers above the group order are refused: once in 2^32 draws.
             if let Some(key) = Self::from_scalar(&scalar) {
-                return key;
+                return (key, scalar);
             }
         }
     }
@@ -73,7 +78,8 @@ impl Key {
         &self.pkcs8
     }
 
-    fn from_scalar(scalar: &[u8; 32]) -> Option<Self> {
+    /// Returns the P-256 key with this scalar; `None` if there is none.
+    pub(crate) fn from_scalar(scalar: &[u8; 32]) -> Option<Self> {
         let mut sec1 = Zeroizing::new(Vec::with_capacity(SEC1_HEAD.len() + 32 + SEC1_TAIL.len()));
         sec1.extend_from_slice(&SEC1_HEAD);
         sec1.extend_from_slice(scalar);

@@ -1,6 +1,7 @@
 //! [`VerifiedPeer`]: the node of a verified certificate chain, and the check of its signatures.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use rustls_pki_types::SignatureVerificationAlgorithm;
 use sgc_wire::{GroupTag, NodeId, Pseudonym, UnixMillis};
@@ -18,6 +19,8 @@ pub(crate) const ROUTER_URI: &str = "sgc:role:router";
 /// URI in certificates of nodes that were enrolled again after a revocation; a certificate without it has incarnation
 /// 0.
 pub(crate) const INCARNATION_URI: &str = "sgc:incarnation:";
+/// URI in certificates of invitations, followed by the validity in seconds of the certificate to which it entitles.
+pub(crate) const INVITATION_URI: &str = "sgc:invitation:";
 
 /// Signature algorithms of nodes for objects: one for each kind of key, so that a signature needs no algorithm field
 /// that an attacker could change.
@@ -49,6 +52,9 @@ pub struct VerifiedPeer {
     pub cert: CertId,
     /// Whether its certificate lets it carry others' names (`sgc:role:router`).
     pub may_route: bool,
+    /// `Some` if the certificate is that of an invitation: its holder may ask the authority for the identity of the
+    /// invited node, and may do nothing else. The certificate of that node is valid for this time.
+    pub invitation: Option<Duration>,
     /// All certificates of its path, from the one below the CA to its own.
     pub path: Arc<[CertId]>,
     key: Arc<[u8]>,
@@ -84,6 +90,7 @@ impl VerifiedPeer {
         let mut incarnation = None;
         let mut groups = Vec::new();
         let mut may_route = false;
+        let mut invitation = None;
         // Unknown URIs are for later versions.
         for uri in leaf.valid_uri_names() {
             if let Some(hex) = uri.strip_prefix(NODE_URI) {
@@ -99,10 +106,18 @@ impl VerifiedPeer {
                 groups.push(tag.map_err(|_| CertError::Malformed("a group tag is no hash".into()))?);
             } else if uri == ROUTER_URI {
                 may_route = true;
-            } else if let Some(number) = uri.strip_prefix(INCARNATION_URI)
-                && incarnation.replace(read_incarnation(number)?).is_some()
-            {
-                return Err(CertError::Malformed("it names two incarnations".into()));
+            } else if let Some(number) = uri.strip_prefix(INCARNATION_URI) {
+                let number = read_number(number)
+                    .ok_or_else(|| CertError::Malformed("its incarnation is no number from 1 on".into()))?;
+                if incarnation.replace(number).is_some() {
+                    return Err(CertError::Malformed("it names two incarnations".into()));
+                }
+            } else if let Some(secs) = uri.strip_prefix(INVITATION_URI) {
+                let secs = read_number(secs)
+                    .ok_or_else(|| CertError::Malformed("its invitation is no number from 1 on".into()))?;
+                if invitation.replace(Duration::from_secs(secs.into())).is_some() {
+                    return Err(CertError::Malformed("it is two invitations".into()));
+                }
             }
         }
         groups.sort_unstable();
@@ -130,6 +145,7 @@ impl VerifiedPeer {
             ca,
             cert,
             may_route,
+            invitation,
             path: path.into(),
             key: key.into(),
             algorithm,
@@ -137,10 +153,9 @@ impl VerifiedPeer {
     }
 }
 
-/// Parses an incarnation in certificates: decimal, from 1, in its shortest form.
-fn read_incarnation(number: &str) -> Result<u32, CertError> {
-    let read = number.parse::<u32>().ok().filter(|n| *n > 0 && n.to_string() == number);
-    read.ok_or_else(|| CertError::Malformed("its incarnation is no number from 1 on".into()))
+/// Parses a number in certificates: decimal, from 1, in its shortest form.
+fn read_number(number: &str) -> Option<u32> {
+    number.parse::<u32>().ok().filter(|n| *n > 0 && n.to_string() == number)
 }
 
 /// Returns `SHA-256(CA public key ‖ pseudonym)`, the CA's key as DER SubjectPublicKeyInfo (`docs/spec/names.md`).

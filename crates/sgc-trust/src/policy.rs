@@ -29,8 +29,12 @@ pub enum GrantReason {
 }
 
 impl Grantees {
-    /// Returns the reason why `peer` is in the set, if it is.
+    /// Returns the reason why `peer` is in the set, if it is. The holder of an invitation is in none, since it is no
+    /// member yet.
     pub fn find(&self, peer: &VerifiedPeer) -> Option<GrantReason> {
+        if peer.invitation.is_some() {
+            return None;
+        }
         self.find_parts(&peer.node_id, &peer.ca, &peer.groups)
     }
 

@@ -45,6 +45,9 @@ pub enum SignedError {
         /// The verifier's time.
         now: UnixMillis,
     },
+    /// The signer is only invited to the fleet, and owns no names.
+    #[error("its signer is only invited to the fleet")]
+    Invited,
     /// The sequence number is ahead of the time of signing by more than [`SEQ_AHEAD_MAX`].
     #[error("sequence number {seq} is too far ahead of {signed}, when it was signed")]
     Sequence {
@@ -140,7 +143,8 @@ impl Identity {
     }
 }
 
-/// Verifies an advertisement: chain, time, signature, sequence number; and derives the names it may claim.
+/// Verifies an advertisement: chain, time, signature, sequence number, and that its owner is no invitation; and derives
+/// the names it may claim.
 pub fn verify_advert(
     anchors: &TrustAnchors,
     signed: &SignedBody,
@@ -149,6 +153,9 @@ pub fn verify_advert(
     let body = AdvertBody::from_slice(&signed.body)?;
     let owner = verify_chain(anchors, &body.chain, body.issued_at, now)?;
     owner.verify_signature(ADVERT, &signed.body, &signed.signature)?;
+    if owner.invitation.is_some() {
+        return Err(SignedError::Invited);
+    }
     verify_seq(body.seq, body.issued_at)?;
     let mut names: Vec<_> = body.blinds.iter().map(|b| name_of(&owner.node_id, b)).collect();
     // A signer may repeat a name, and callers that count names rely on each being there once.

@@ -6,9 +6,6 @@
 
 use std::fmt;
 
-use aws_lc_rs::digest;
-use base64::Engine as _;
-use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use rustls_pki_types::CertificateDer;
 use sgc_wire::{
     CERT_BYTES_MAX, Decode as _, DecodeError, Encode as _, Kind, Metadata, Name, NodeId, Reader, UnixMillis,
@@ -16,6 +13,7 @@ use sgc_wire::{
 };
 use zeroize::Zeroizing;
 
+use crate::code_text::{CodeForm, TextFault};
 use crate::label::LABEL_BYTES_MAX;
 use crate::{AnchorError, CaFingerprint, NodeName, TopicSecret, TrustAnchors, name_of};
 
@@ -26,12 +24,15 @@ pub const TOKEN_ROUTERS_MAX: usize = 16;
 /// Longest text of a token, bytes: one with every field at its bound fits.
 pub const TOKEN_TEXT_BYTES_MAX: usize = 28 * 1024;
 
-/// Beginning of tokens of any version.
-const ANY_PREFIX: &str = "sgc-token-";
+/// A forged token passes the checksum, and the owner refuses the name that it leads to.
+const FORM: CodeForm = CodeForm {
+    prefix: TOKEN_PREFIX,
+    any_prefix: "sgc-token-",
+    domain: b"sgc token v1",
+    bytes_max: TOKEN_TEXT_BYTES_MAX,
+};
 const VERSION: u8 = 1;
 const ROUTER_BYTES_MAX: usize = 300;
-const CHECKSUM_BYTES: usize = 4;
-const CHECKSUM_DOMAIN: &[u8] = b"sgc token v1";
 
 /// One interface, handed to a partner. Secrets are compared in constant time; Debug shows nothing secret.
 #[derive(Clone, PartialEq, Eq)]
@@ -55,37 +56,12 @@ pub struct ShareToken {
 impl ShareToken {
     /// Reads a token; white space around it does not count.
     pub fn parse(text: &str) -> Result<Self, TokenError> {
-        let text = text.trim();
-        if text.len() > TOKEN_TEXT_BYTES_MAX {
-            return Err(TokenError::TooLong { bytes: text.len() });
-        }
-        let Some(base64) = text.strip_prefix(TOKEN_PREFIX) else {
-            return Err(match text.starts_with(ANY_PREFIX) {
-                true => TokenError::Version,
-                false => TokenError::Prefix,
-            });
-        };
-        let bytes = URL_SAFE_NO_PAD.decode(base64).map(Zeroizing::new).map_err(|_| TokenError::NotBase64)?;
-        let (content, found) = bytes
-            .len()
-            .checked_sub(CHECKSUM_BYTES)
-            .and_then(|at| bytes.split_at_checked(at))
-            .ok_or(TokenError::Checksum)?;
-        if found != checksum(content) {
-            return Err(TokenError::Checksum);
-        }
-        Self::decode(content)
+        Self::decode(&FORM.parse(text)?)
     }
 
     /// Returns the text of the token. It is a secret: everyone with it can derive the name.
     pub fn to_text(&self) -> Zeroizing<String> {
-        let mut content = Zeroizing::new(self.encode());
-        let sum = checksum(&content);
-        content.extend_from_slice(&sum);
-        let mut text = Zeroizing::new(String::with_capacity(TOKEN_TEXT_BYTES_MAX));
-        text.push_str(TOKEN_PREFIX);
-        URL_SAFE_NO_PAD.encode_string(content.as_slice(), &mut text);
-        text
+        FORM.to_text(&Zeroizing::new(self.encode()))
     }
 
     /// Returns the name of the interface.
@@ -111,8 +87,7 @@ impl ShareToken {
         tail.list(&self.routers, |w, url| w.str(url));
         self.expires.encode(&mut tail);
         let (head, tail) = (head.into_vec(), tail.into_vec());
-        let mut content =
-            Vec::with_capacity(head.len() + self.secret.expose().len() + tail.len() + CHECKSUM_BYTES);
+        let mut content = Vec::with_capacity(head.len() + self.secret.expose().len() + tail.len());
         content.extend_from_slice(&head);
         content.extend_from_slice(self.secret.expose());
         content.extend_from_slice(&tail);
@@ -167,15 +142,16 @@ impl fmt::Debug for ShareToken {
     }
 }
 
-/// Returns the checksum that detects a cut or mistyped token. It does not detect a forged one: the owner refuses the
-/// name that a forged token leads to.
-fn checksum(content: &[u8]) -> [u8; CHECKSUM_BYTES] {
-    let mut context = digest::Context::new(&digest::SHA256);
-    context.update(CHECKSUM_DOMAIN);
-    context.update(content);
-    let mut out = [0; CHECKSUM_BYTES];
-    out.iter_mut().zip(context.finish().as_ref()).for_each(|(out, byte)| *out = *byte);
-    out
+impl From<TextFault> for TokenError {
+    fn from(fault: TextFault) -> Self {
+        match fault {
+            TextFault::TooLong { bytes } => Self::TooLong { bytes },
+            TextFault::Prefix => Self::Prefix,
+            TextFault::Version => Self::Version,
+            TextFault::NotBase64 => Self::NotBase64,
+            TextFault::Checksum => Self::Checksum,
+        }
+    }
 }
 
 /// The reason why a text is no token. No error repeats the text, which may be a token but for a letter.

@@ -24,6 +24,10 @@ pub const ROSTER_ROWS_MAX: usize = 2048;
 pub const ROW_CERTIFICATES_MAX: usize = 256;
 /// Most generations of the naming secret.
 const GENERATIONS_MAX: usize = 8;
+/// Most routers that an invitation names.
+const INVITATION_ROUTERS_MAX: usize = 8;
+/// Longest URL of a router in an invitation, bytes.
+const ROUTER_BYTES_MAX: usize = 300;
 /// Longest serial number, bytes.
 const SERIAL_BYTES_MAX: usize = 20;
 /// Longest explanation of a refusal, bytes.
@@ -86,6 +90,31 @@ pub enum Operation {
         /// Its signing request (PKCS #10), DER.
         csr: Bytes,
     },
+    /// Makes the identity of the invited node, asked for by the holder of its invitation: nobody else may, and the
+    /// holder may ask for nothing else.
+    Redeem {
+        /// Its signing request (PKCS #10), DER.
+        csr: Bytes,
+    },
+    /// Enters a node in the roster and makes an invitation for it.
+    Invite {
+        /// Its name.
+        node: String,
+        /// Its groups.
+        groups: Vec<String>,
+        /// Whether it only routes.
+        router: bool,
+        /// Whether it may route for others as well.
+        may_route: bool,
+        /// Whether a revoked node may be enrolled again.
+        again: bool,
+        /// Requested validity of its certificate, milliseconds.
+        valid_ms: u64,
+        /// Time for which the invitation is valid, milliseconds.
+        within_ms: u64,
+        /// Routers that the invitation names, as URLs.
+        routers: Vec<String>,
+    },
 }
 
 /// An authority's answer to an [`OperationRequest`].
@@ -109,6 +138,8 @@ pub enum OperationAnswer {
     },
     /// The node is in the roster; this is the text that makes its identity, together with its key.
     Membership(SecretText),
+    /// The node is in the roster; this is the text of its invitation.
+    Invitation(SecretText),
 }
 
 /// The reason why an authority refuses an operation.
@@ -303,6 +334,19 @@ impl Encode for Operation {
                 w.u64(*valid_ms);
                 w.bytes(csr);
             }
+            Self::Redeem { csr } => {
+                w.u8(4);
+                w.bytes(csr);
+            }
+            Self::Invite { node, groups, router, may_route, again, valid_ms, within_ms, routers } => {
+                w.u8(5);
+                w.str(node);
+                w.list(groups, |w, group| w.str(group));
+                [router, may_route, again].into_iter().for_each(|flag| w.bool(*flag));
+                w.u64(*valid_ms);
+                w.u64(*within_ms);
+                w.list(routers, |w, url| w.str(url));
+            }
         }
     }
 }
@@ -322,6 +366,17 @@ impl Decode for Operation {
                 csr: csr(r)?,
             }),
             3 => Ok(Self::Renew { node: label(r, "node")?, valid_ms: r.u64()?, csr: csr(r)? }),
+            4 => Ok(Self::Redeem { csr: csr(r)? }),
+            5 => Ok(Self::Invite {
+                node: label(r, "node")?,
+                groups: r.list("groups", GROUPS_MAX, |r| label(r, "group"))?,
+                router: r.bool("router")?,
+                may_route: r.bool("may route")?,
+                again: r.bool("again")?,
+                valid_ms: r.u64()?,
+                within_ms: r.u64()?,
+                routers: r.list("routers", INVITATION_ROUTERS_MAX, |r| r.str("router", ROUTER_BYTES_MAX))?,
+            }),
             v => Err(DecodeError::value("operation", v.into())),
         }
     }
@@ -351,6 +406,10 @@ impl Encode for OperationAnswer {
                 w.u8(4);
                 w.bytes(text.expose().as_bytes());
             }
+            Self::Invitation(text) => {
+                w.u8(5);
+                w.bytes(text.expose().as_bytes());
+            }
         }
     }
 }
@@ -366,6 +425,7 @@ impl Decode for OperationAnswer {
             2 => Ok(Self::Roster(RosterPage::decode(r)?)),
             3 => Ok(Self::Revoked { list: r.u64()? }),
             4 => Ok(Self::Membership(SecretText(r.str("membership", SEALED_BYTES_MAX)?))),
+            5 => Ok(Self::Invitation(SecretText(r.str("invitation", SEALED_BYTES_MAX)?))),
             v => Err(DecodeError::value("answer to an operation", v.into())),
         }
     }

@@ -150,7 +150,19 @@ fn operations_survive_mutation() {
     };
     let challenge = Challenge([1; 16]);
     let revoke = Operation::Revoke { nodes: vec!["arm-1".into(), "desk".into()] };
-    let requests = [enroll, revoke].map(|operation| OperationRequest::Execute { challenge, operation });
+    let redeem = Operation::Redeem { csr: Bytes::from_static(b"csr") };
+    let invite = Operation::Invite {
+        node: "arm-2".into(),
+        groups: vec!["arms".into()],
+        router: false,
+        may_route: false,
+        again: true,
+        valid_ms: 2,
+        within_ms: 1,
+        routers: vec!["quic://r:1".into()],
+    };
+    let requests =
+        [enroll, revoke, redeem, invite].map(|operation| OperationRequest::Execute { challenge, operation });
     survives::<OperationRequest>(&requests.map(|r| r.to_vec()), 8);
     let row = RosterRow {
         name: "arm-1".into(),

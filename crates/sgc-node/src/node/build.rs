@@ -266,7 +266,7 @@ impl Machines {
         let endpoint_config = EndpointConfig {
             identity: identity.clone(),
             authority: config.authority.is_some(),
-            operations: config.authority.as_ref().is_some_and(|a| !a.operators.is_empty()),
+            operations: config.authority.is_some(),
             limits: sgc_endpoint::Limits {
                 rotate_every: config.rotation.every,
                 ..sgc_endpoint::Limits::default()

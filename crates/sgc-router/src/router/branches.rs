@@ -1,6 +1,6 @@
 //! Requests to join and their answers: verified, given a place by the trees, and passed on.
 
-use sgc_trust::{SignedError, VerifiedPeer, verify_answer, verify_join};
+use sgc_trust::{SignedError, VerifiedPeer, name_of, operations_blind, verify_answer, verify_join};
 use sgc_wire::{
     Answer, AnswerBody, Control, Decode, JoinBody, Name, Recover, RejectReason, SignedBody, SinkId,
 };
@@ -32,6 +32,14 @@ impl Router {
         let (name, sink) = (join.body.name, join.body.sink);
         let owner = self.names.owner(&name);
         let reject = |this: &mut Self, reason| this.send(link, Control::Reject { name, sink, reason });
+        // The holder of an invitation reaches the authority of its fleet, and nobody else.
+        if join.peer.invitation.is_some()
+            && let Some(owner) = owner
+            && name != name_of(&owner.node_id, &operations_blind(&join.peer.ca))
+        {
+            reject(self, RejectReason::NotVerified);
+            return self.drop_frame(link, DropReason::Invited { node: join.peer.node_id });
+        }
         match self.trees.place(link, &name, &sink, &join.peer, owner) {
             Place::New => {}
             Place::Taken => return reject(self, RejectReason::NoRoute),

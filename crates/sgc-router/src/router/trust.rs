@@ -133,6 +133,7 @@ impl Router {
             SignedError::Cert(_)
             | SignedError::Signature(_)
             | SignedError::Decode(_)
+            | SignedError::Invited
             | SignedError::Sequence { .. } => false,
         };
         // These two cost no verification, and a router may well bring many of them.

@@ -26,15 +26,18 @@ impl<N: RosNetwork> Core<N> {
         operation: Operation,
         reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
     ) {
-        let Some(authority) = self.certificates.identity().node_id_of(at.as_str()) else {
+        let own = self.certificates.identity();
+        // The holder of an invitation has no secret, and knows the authority by its id.
+        let invited = own.authority().filter(|_| own.as_peer().invitation.is_some());
+        let Some(authority) = own.node_id_of(at.as_str()).or(invited) else {
             let _ = reply.send(Err(OperationError::NoSecret));
             return;
         };
-        if authority == self.certificates.identity().node_id() {
+        if authority == own.node_id() {
             let _ = reply.send(Err(OperationError::OwnName { at: at.to_string() }));
             return;
         }
-        let is_named = self.certificates.identity().authority() == Some(authority);
+        let is_named = own.authority() == Some(authority);
         let wish = UserOperation { at: at.to_string(), authority, is_named, operation, reply };
         self.operations.push(Instant::now(), wish);
         self.next_operation();

@@ -36,6 +36,10 @@ impl<N: RosNetwork> Core<N> {
     /// Asks the authority for credentials, if the identity names one or this node is the authority.
     pub(super) fn ask_renewal(&mut self) {
         let now = now();
+        // An invitation is not renewed.
+        if self.certificates.identity().as_peer().invitation.is_some() {
+            return;
+        }
         let asked = if self.authority.is_some() {
             self.renew_own();
             true

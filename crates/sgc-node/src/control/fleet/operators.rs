@@ -49,12 +49,21 @@ pub(crate) enum RequestStep {
 }
 
 /// An operation to be carried out.
-#[derive(Debug, PartialEq, Eq)]
+#[derive(Debug)]
 pub(crate) struct OperationJob {
     challenge: Challenge,
-    node: NodeId,
+    peer: VerifiedPeer,
     operation: Operation,
 }
+
+impl PartialEq for OperationJob {
+    fn eq(&self, other: &Self) -> bool {
+        let key = |job: &Self| (job.challenge, job.peer.node_id);
+        key(self) == key(other) && self.operation == other.operation
+    }
+}
+
+impl Eq for OperationJob {}
 
 /// The outcome of an operation.
 pub(crate) struct OperationOutcome {
@@ -110,14 +119,18 @@ impl Operators {
         request: &Bytes,
         rng: &mut impl RngCore,
     ) -> RequestStep {
-        if self.permitted.find(peer).is_none() {
+        if peer.invitation.is_none() && self.permitted.find(peer).is_none() {
             return RequestStep::NotPermitted;
         }
         self.challenges.retain(|issued| now < issued.until);
         match OperationRequest::from_slice(request) {
             Ok(OperationRequest::Challenge) => RequestStep::Answer(self.challenge(now, peer.node_id, rng)),
             Ok(OperationRequest::Execute { challenge, operation }) => {
-                self.execute(peer.node_id, sink, challenge, operation)
+                // The holder of an invitation may redeem it, and do nothing else; and nobody else may.
+                if matches!(operation, Operation::Redeem { .. }) != peer.invitation.is_some() {
+                    return RequestStep::NotPermitted;
+                }
+                self.execute(peer, sink, challenge, operation)
             }
             Err(why) => RequestStep::Answer(refused(OperationRefusal::Malformed, why)),
         }
@@ -140,11 +153,12 @@ impl Operators {
 
     fn execute(
         &mut self,
-        node: NodeId,
+        peer: &VerifiedPeer,
         sink: SinkId,
         challenge: Challenge,
         operation: Operation,
     ) -> RequestStep {
+        let node = peer.node_id;
         if let Some(known) = self.executed.iter_mut().find(|e| e.challenge == challenge) {
             if known.node != node || known.operation != operation {
                 return RequestStep::Answer(refused(OperationRefusal::Stale, ""));
@@ -162,7 +176,7 @@ impl Operators {
         }
         let (answer, doing) = (None, operation.clone());
         self.executed.push_back(ExecutionRecord { challenge, node, operation: doing, sink, answer });
-        RequestStep::Job(OperationJob { challenge, node, operation })
+        RequestStep::Job(OperationJob { challenge, peer: peer.clone(), operation })
     }
 
     /// Records the outcome of a job. Returns the sink that waits for it.
@@ -193,9 +207,10 @@ impl OperationJob {
             Operation::Revoke { nodes } => {
                 revoke(file, own, nodes, now).map(|(answer, list)| (answer, Some(list)))
             }
-            Operation::Enroll { .. } | Operation::Renew { .. } => {
-                certify(file, &self.operation, now).map(|answer| (answer, None))
+            Operation::Enroll { .. } | Operation::Renew { .. } | Operation::Redeem { .. } => {
+                certify(file, &self.peer, &self.operation, now).map(|answer| (answer, None))
             }
+            Operation::Invite { .. } => invite(file, &self.operation, now).map(|answer| (answer, None)),
         };
         match done {
             Ok((answer, list)) => self.end(answer, list),
@@ -204,7 +219,8 @@ impl OperationJob {
     }
 
     fn end(self, answer: OperationAnswer, list: Option<Vec<u8>>) -> OperationOutcome {
-        let Self { challenge, node, operation } = self;
+        let Self { challenge, peer, operation } = self;
+        let requester = peer.node_id;
         let outcome = match &answer {
             OperationAnswer::Refused { why, detail } if detail.is_empty() => format!("refused: {why}"),
             OperationAnswer::Refused { detail, .. } => format!("refused: {detail}"),
@@ -215,8 +231,18 @@ impl OperationJob {
             Operation::Revoke { nodes } => format!("revoke {}", nodes.join(" ")),
             Operation::Enroll { node, .. } => format!("enroll {node}"),
             Operation::Renew { node, .. } => format!("renew {node}"),
+            Operation::Invite { node, .. } => format!("invite {node}"),
+            Operation::Redeem { .. } => match &answer {
+                OperationAnswer::Membership(text) => {
+                    let joined = Membership::parse(text.expose()).ok();
+                    let joined =
+                        joined.map_or_else(String::new, |member| format!(" of {}", member.node_name()));
+                    format!("redeem the invitation{joined}")
+                }
+                _ => "redeem an invitation".to_owned(),
+            },
         };
-        OperationOutcome { challenge, node, said: format!("{said}: {outcome}"), answer, list }
+        OperationOutcome { challenge, node: requester, said: format!("{said}: {outcome}"), answer, list }
     }
 }
 
@@ -285,8 +311,13 @@ fn revoke(
     Ok((OperationAnswer::Revoked { list: locked.fleet.crl_number() }, list))
 }
 
-/// Enrols or renews. The file has the certificate before the answer leaves.
-fn certify(file: &Path, operation: &Operation, now: UnixMillis) -> Result<OperationAnswer, Failure> {
+/// Enrols a node, renews it, or redeems its invitation. The file has the certificate before the answer leaves.
+fn certify(
+    file: &Path,
+    peer: &VerifiedPeer,
+    operation: &Operation,
+    now: UnixMillis,
+) -> Result<OperationAnswer, Failure> {
     let mut rng = OsRng.unwrap_err();
     let mut locked = LockedFleet::open(file)?;
     let member: Membership = match operation {
@@ -302,12 +333,31 @@ fn certify(file: &Path, operation: &Operation, now: UnixMillis) -> Result<Operat
             let valid = Duration::from_millis(*valid_ms);
             locked.fleet.renew_member(csr, &node.parse()?, valid, now, &mut rng)?
         }
-        Operation::List { .. } | Operation::Revoke { .. } => {
+        Operation::Redeem { csr } => locked.fleet.redeem(csr, peer, now, &mut rng)?,
+        Operation::List { .. } | Operation::Revoke { .. } | Operation::Invite { .. } => {
             return Err(Failure::Malformed("it makes no certificate".to_owned()));
         }
     };
     locked.save()?;
     Ok(OperationAnswer::Membership(SecretText::new(member.to_text().to_string())))
+}
+
+/// Invites a node. The key in the invitation is of no node, so the authority may make it.
+fn invite(file: &Path, operation: &Operation, now: UnixMillis) -> Result<OperationAnswer, Failure> {
+    let Operation::Invite { node, groups, router, may_route, again, valid_ms, within_ms, routers } =
+        operation
+    else {
+        return Err(Failure::Malformed("it makes no invitation".to_owned()));
+    };
+    let groups = groups.iter().map(|g| g.parse()).collect::<Result<_, _>>()?;
+    let (router, may_route, again) = (*router, *may_route, *again);
+    let (valid, within) = (Duration::from_millis(*valid_ms), Duration::from_millis(*within_ms));
+    let new = EnrollRequest::new(node.parse()?, now);
+    let request = EnrollRequest { groups, router, may_route, again, valid, ..new };
+    let mut locked = LockedFleet::open(file)?;
+    let invitation = locked.fleet.invite(&request, within, routers.clone(), &mut OsRng.unwrap_err())?;
+    locked.save()?;
+    Ok(OperationAnswer::Invitation(SecretText::new(invitation.to_text().to_string())))
 }
 
 fn list(
