@@ -18,7 +18,7 @@ use sgc_node::config::ConfigErrors;
 use sgc_node::partners::PartnerError;
 use sgc_node::{AccessError, FleetFileError, NodeError, RulesError, StateError};
 use sgc_process::{ProcessError, output};
-use sgc_trust::{CrlError, FleetError, IdentityError, LabelError, PemError, TokenError};
+use sgc_trust::{CrlError, FleetError, IdentityError, InvitationError, LabelError, PemError, TokenError};
 
 use crate::log_filter::LogFilterError;
 pub(crate) use sgc_process::EXIT_FAILURE;
@@ -75,6 +75,9 @@ pub(crate) enum CliError {
         /// The cause.
         source: IdentityError,
     },
+    /// A code with which a machine cannot join.
+    #[error("the code: {0}")]
+    Invitation(#[from] InvitationError),
     /// A fleet file that is broken, or a fleet that cannot enrol.
     #[error("{}: {source}", path.display())]
     Fleet {
@@ -303,6 +306,7 @@ impl CliError {
             | Self::NotInFile { .. }
             | Self::Pem { .. }
             | Self::Identity { .. }
+            | Self::Invitation(_)
             | Self::Fleet { .. }
             | Self::FleetFile(FleetFileError::Exposed { .. } | FleetFileError::Content { .. })
             | Self::List { .. }

@@ -769,6 +769,76 @@ fn an_operator_keeps_the_fleet_from_a_machine_without_its_file() {
 }
 
 #[test]
+fn a_machine_joins_with_a_code_and_the_code_is_good_once() {
+    let place = Place::with_authority("operators");
+    let port = unused_port();
+    let url = format!("quic://127.0.0.1:{port}");
+    let _cloud = place.start("cloud", port, &format!("[router]\nlisten = [\"{url}\"]\n"));
+    let keeper = place.keeper(port);
+    let _desk = place.start("desk", port, "");
+    let refused = |args: &[&str], code: i32| {
+        let ran = place.run(args);
+        assert_eq!((ran.status.code(), ran.stdout.as_slice()), (Some(code), &b""[..]), "{args:?}");
+        String::from_utf8(ran.stderr).unwrap()
+    };
+    // The code alone is on standard output.
+    let invite = |args: &[&str]| {
+        let ran = place.run(&[&["fleet", "invite"], args].concat());
+        assert!(ran.status.success(), "{ran:?}");
+        String::from_utf8(ran.stdout).unwrap().trim().to_owned()
+    };
+    let is_there = |file: &str| place.files().iter().any(|there| there == file);
+
+    // From the file, and by an operator, whose node knows the routers.
+    let code = invite(&["arm-7", "--group", "arms", "--valid", "30d", "--via", &url]);
+    let by_operator = ["arm-8", "--at", "keeper", "--socket", "desk.sock", "--within", "1h"];
+    let other = invite(&by_operator);
+    let said = place.good(&["join", &code]);
+    assert!(said.contains("node arm-7 of fleet lab") && said.contains("sgc run -c arm-7.toml"), "{said}");
+    let arm = place.identity("arm-7.identity");
+    assert_eq!(arm.groups(), [place.fleet().secret().group_tag("arms")]);
+    assert!(arm.not_after().0 < now().0 + 31 * 86_400_000);
+    assert_eq!(place.mode("arm-7.identity"), 0o600);
+    assert!(place.good(&["check", "-c", "arm-7.toml"]).contains("no mistakes"));
+
+    // An identity that is there is kept, and the code with it.
+    place.write("arm-8.identity", "something else", 0o600);
+    assert!(refused(&["join", &other], 2).contains("--force replaces it"));
+    let mut command = place.command(&["join", "--force"]);
+    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    std::io::Write::write_all(&mut child.stdin.take().unwrap(), other.as_bytes()).unwrap();
+    assert!(child.wait_with_output().unwrap().status.success());
+    assert_eq!(place.identity("arm-8.identity").node_name().as_str(), "arm-8");
+    assert!(place.read("arm-8.toml").contains(&url));
+
+    let said = refused(&["join", "--dir", "other", &code], 1);
+    assert!(said.contains("keeper refuses: the invitation of arm-7 was used at"), "{said}");
+    assert!(said.contains("sgc fleet revoke arm-7") && !is_there("other"), "{said}");
+    let said = refused(&["join", &code[..code.len() / 2]], 2);
+    assert!(said.contains("it was cut or mistyped"), "{said}");
+    assert!(!said.contains(&code[20..40]), "an error repeats a secret: {said}");
+
+    // Faults on the way name what to do, and cost no code.
+    let late = invite(&["arm-9", "--via", &format!("quic://127.0.0.1:{}", unused_port())]);
+    let said = refused(&["join", "--wait", "1s", &late], 1);
+    assert!(said.contains("no router within 1 s") && said.contains("--router names another"), "{said}");
+    drop(keeper);
+    let said = refused(&["join", "--router", &url, &late], 1);
+    assert!(said.contains("no authority keeper is in reach"), "{said}");
+    let _keeper = place.keeper(port);
+    place.good(&["join", "--router", &url, &late]);
+    assert!(is_there("arm-9.identity"));
+
+    // A node is revoked before it came.
+    let never = invite(&["arm-10", "--via", &url]);
+    place.good(&["fleet", "revoke", "arm-10"]);
+    assert!(refused(&["join", &never], 1).contains("node arm-10 was revoked at"));
+    let over = invite(&["arm-11", "--within", "1s", "--via", &url]);
+    std::thread::sleep(std::time::Duration::from_millis(2100));
+    assert!(refused(&["join", &over], 2).contains("the code ended at"));
+}
+
+#[test]
 fn the_ca_is_shown_and_nothing_else() {
     let place = Place::with_fleet();
     let shown = place.good(&["fleet", "ca"]);

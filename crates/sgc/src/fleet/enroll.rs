@@ -15,7 +15,7 @@ use sgc_wire::{Operation, UnixMillis};
 use zeroize::Zeroizing;
 
 use super::remote::{FleetPlace, Remote};
-use super::{DAY, copies, parse_span};
+use super::{DAY, copies, millis, parse_span};
 use crate::error::CliError;
 use crate::files::{self, Existing};
 use crate::output;
@@ -163,10 +163,6 @@ impl Keeper {
             }),
         }
     }
-}
-
-fn millis(time: Duration) -> u64 {
-    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
 pub(super) fn enroll(args: &EnrollArgs) -> Result<(), CliError> {

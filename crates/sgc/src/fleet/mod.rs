@@ -6,6 +6,8 @@ mod copies;
 mod create;
 mod enroll;
 mod heard_lists;
+mod invite;
+mod join;
 mod keeping;
 mod looking;
 mod own_key;
@@ -21,6 +23,7 @@ use sgc_node::{LockedFleet, config};
 use sgc_process::ProcessError;
 use sgc_trust::Fleet;
 
+pub(crate) use self::join::{JoinArgs, join};
 pub(crate) use self::looking::members_of_file;
 use crate::error::CliError;
 use crate::files;
@@ -39,6 +42,7 @@ enum FleetCommand {
     Create(create::CreateArgs),
     Import(create::ImportArgs),
     Enroll(enroll::EnrollArgs),
+    Invite(invite::InviteArgs),
     Request(own_key::RequestArgs),
     Extensions(own_key::ExtensionsArgs),
     Accept(own_key::AcceptArgs),
@@ -63,6 +67,7 @@ pub(crate) fn fleet(args: FleetArgs) -> Result<ExitCode, CliError> {
         FleetCommand::Create(args) => create::create(&args),
         FleetCommand::Import(args) => create::import(&args),
         FleetCommand::Enroll(args) => enroll::enroll(&args),
+        FleetCommand::Invite(args) => invite::invite(&args),
         FleetCommand::Request(args) => own_key::request(&args),
         FleetCommand::Extensions(args) => own_key::extensions(&args),
         FleetCommand::Accept(args) => own_key::accept(&args),
@@ -145,6 +150,10 @@ fn parse_span(text: &str) -> Result<Duration, String> {
         Some(span) => Ok(span),
         None => Err("a time is a number with its unit: 90d, 12h or 30min".into()),
     }
+}
+
+fn millis(time: Duration) -> u64 {
+    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
 /// Returns the `--fleet FILE` that a hint has to repeat, or nothing if the fleet is found without it.

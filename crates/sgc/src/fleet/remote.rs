@@ -6,11 +6,12 @@ use std::time::Duration;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use bytes::Bytes;
 use clap::Args;
 use serde::Deserialize;
 use sgc_diagnosis::{DiagnosisError, ask};
 use sgc_node::admin::AdminRequest;
-use sgc_trust::{IdentityError, Membership, NodeName};
+use sgc_trust::{Invitation, Membership, NodeName};
 use sgc_wire::{
     CSR_BYTES_MAX, Decode as _, Operation, OperationAnswer, OperationRefusal, REVOKED_AT_ONCE_MAX, RosterPage,
 };
@@ -38,6 +39,11 @@ pub(super) struct FleetPlace {
 }
 
 impl FleetPlace {
+    /// Returns the status socket that `--socket` names.
+    pub(super) fn socket(&self) -> Option<PathBuf> {
+        self.socket.clone()
+    }
+
     /// Returns the authority, if `--at` names one.
     pub(super) fn remote(&self) -> Result<Option<Remote>, CliError> {
         let Some(at) = &self.at else { return Ok(None) };
@@ -62,6 +68,11 @@ enum Answer {
 }
 
 impl Remote {
+    /// Returns the authority of that name, and the node with this socket to ask it.
+    pub(super) fn new(at: NodeName, socket: PathBuf) -> Self {
+        Self { at, socket }
+    }
+
     /// Returns the authority's name.
     pub(super) fn at(&self) -> &NodeName {
         &self.at
@@ -106,7 +117,18 @@ impl Remote {
             return Err(self.failed("the request for a certificate is too long"));
         }
         let OperationAnswer::Membership(text) = self.ask(operation)? else { return Err(self.surprised()) };
-        Membership::parse(text.expose()).map_err(|why: IdentityError| self.failed(&why.to_string()))
+        Membership::parse(text.expose()).map_err(|why| self.failed(&why.to_string()))
+    }
+
+    /// Enters a node in the roster and makes its invitation.
+    pub(super) fn invite(&self, operation: Operation) -> Result<Invitation, CliError> {
+        let OperationAnswer::Invitation(text) = self.ask(operation)? else { return Err(self.surprised()) };
+        Invitation::parse(text.expose()).map_err(|why| self.failed(&why.to_string()))
+    }
+
+    /// Uses the invitation that the node here holds. Returns the identity of the invited node without the key.
+    pub(super) fn redeem(&self, csr: &[u8]) -> Result<Membership, CliError> {
+        self.certify(Operation::Redeem { csr: Bytes::copy_from_slice(csr) })
     }
 
     fn ask(&self, operation: Operation) -> Result<OperationAnswer, CliError> {
