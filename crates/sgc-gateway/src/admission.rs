@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll};
 use std::time::Instant;
@@ -77,7 +77,7 @@ pub(crate) struct Admission {
     clients: Mutex<BTreeMap<u64, ClientEntry>>,
     refused: Mutex<BTreeMap<ClientRefusal, u64>>,
     next: AtomicU64,
-    clients_max: usize,
+    clients_max: AtomicUsize,
 }
 
 /// A client that has a place.
@@ -121,7 +121,12 @@ impl Admission {
     pub(crate) fn new(access: Access, clients_max: usize) -> Arc<Self> {
         let access = AccessWatch::new(access, WallClock::system());
         let (clients, refused, next) = (Mutex::default(), Mutex::default(), AtomicU64::new(0));
-        Arc::new(Self { access, clients, refused, next, clients_max })
+        Arc::new(Self { access, clients, refused, next, clients_max: AtomicUsize::new(clients_max) })
+    }
+
+    /// Changes the number of places for clients. Clients that have one keep it.
+    pub(crate) fn set_clients_max(&self, clients_max: usize) {
+        self.clients_max.store(clients_max, Ordering::Relaxed);
     }
 
     /// Returns the rules in force.
@@ -208,9 +213,10 @@ impl Admission {
 
     /// Returns the number of places for the clients of a pool.
     fn places_max(&self, pool: Pool) -> usize {
-        let remote = (self.clients_max - self.clients_max / LOCAL_PART).max(1);
+        let all = self.clients_max.load(Ordering::Relaxed);
+        let remote = (all - all / LOCAL_PART).max(1);
         match pool {
-            Pool::Total => self.clients_max,
+            Pool::Total => all,
             Pool::Remote => remote,
             Pool::Credential => (remote / CREDENTIAL_PART).max(1),
         }
@@ -228,7 +234,7 @@ impl Admission {
             let others = clients.iter().filter(|(number, _)| Some(**number) != except);
             others.filter(|(_, entered)| is_counted(entered)).count()
         };
-        if count(&|_| true) >= self.clients_max {
+        if count(&|_| true) >= self.places_max(Pool::Total) {
             return Some(Pool::Total);
         }
         if !client.is_local() && count(&|entered| !entered.is_local) >= self.places_max(Pool::Remote) {
@@ -441,6 +447,12 @@ mod tests {
         drop(local);
         assert!(enter("10.0.0.9:1").is_none() && enter("127.0.0.1:1").is_some());
         held.pop();
+        assert!(enter("10.0.0.9:1").is_some());
+        // Fewer places take none away from those that have one, and more count at once.
+        admission.set_clients_max(8);
+        assert!(enter("127.0.0.1:1").is_none());
+        assert_eq!(admission.clients().len(), 55);
+        admission.set_clients_max(72);
         assert!(enter("10.0.0.9:1").is_some());
     }
 }

@@ -290,6 +290,11 @@ impl Server {
         self.shared.admission.rules().change(|access| access.clone().with_gateway(gateway));
     }
 
+    /// Changes the number of clients that may be connected at once. Those that are stay.
+    pub fn set_clients_max(&self, clients_max: usize) {
+        self.shared.admission.set_clients_max(clients_max);
+    }
+
     /// Verifies certificates against other CAs or revocation lists from now on.
     pub fn set_anchors(&self, anchors: TrustAnchors) {
         self.shared.admission.rules().change(|access| access.clone().with_anchors(anchors));

@@ -298,6 +298,76 @@ fn certificates_and_secrets_are_renewed_while_messages_flow() {
 }
 
 #[test]
+fn a_reload_takes_the_identity_in_a_replaced_file_while_messages_flow() {
+    let lab = Lab::new(&["robot", "desk", "other"]);
+    let cloud = lab.cloud();
+    let robot = lab.start("robot", |c| c.shares = vec![share("/chatter", &["desk"])]);
+    let desk = lab.start("desk", |c| c.uses = vec![uses("/chatter")]);
+    let talker = lab.talker("robot", "/chatter");
+    let listener = lab.listener("desk", "/chatter");
+    talker.wait_for_readers(1);
+    warm_up(&talker, &[&listener]);
+    let stream = Stream::start(talker);
+    stream.more(100);
+    assert_eq!(robot.reload(|_| {})["changed"].as_array().map(Vec::len), Some(0));
+
+    // Another key, a later end and a group, at both ends and at the router.
+    let is_shown = |node: &str| {
+        let (id, until) = (lab.id(node).to_string(), lab.identity(node).not_after().to_string());
+        let status = cloud.status();
+        let links: Vec<_> = status["links"].as_array().unwrap().iter().filter(|l| l["peer"] == *id).collect();
+        links.len() == 1 && links[0]["peer_until"] == *until
+    };
+    for (node, running) in [("robot", &robot), ("desk", &desk), ("cloud", &cloud)] {
+        let before = lab.identity(node);
+        std::thread::sleep(Duration::from_millis(1100));
+        lab.enroll(node, |request| {
+            request.valid += Duration::from_secs(86_400);
+            request.router = node == "cloud";
+            request.groups = vec!["arms".parse().unwrap()];
+        });
+        assert_ne!(lab.identity(node).chain(), before.chain());
+        let report = running.reload(|_| {});
+        let said = report["changed"][0].as_str().unwrap();
+        assert!(said.starts_with("this node has the identity of its replaced file, until"), "{report}");
+        assert_eq!(report["needs_restart"].as_array().map(Vec::len), Some(0), "{report}");
+        if node != "cloud" {
+            wait("one link, with the new certificate", || is_shown(node));
+        }
+        stream.more(200);
+    }
+    let by_file = |r: &AuditRecord| {
+        r.event == "renewed"
+            && r.reason.as_deref().is_some_and(|reason| reason.contains("by a replaced file"))
+    };
+    assert!(lab.audit("robot").iter().any(by_file));
+    // The second reload finds what the first one took.
+    assert_eq!(robot.reload(|_| {})["changed"].as_array().map(Vec::len), Some(0));
+
+    // A file that this run cannot use is refused, and said.
+    let kept = lab.identity("desk");
+    fs::copy(lab.path("other.identity"), lab.path("desk.identity")).unwrap();
+    let report = desk.reload(|_| {});
+    let said = report["needs_restart"][0].as_str().unwrap();
+    assert!(said.contains("the file is of another node, which needs a restart"), "{report}");
+    let alerts = desk.status()["alerts"].to_string();
+    assert!(alerts.contains("restart_pending"), "{alerts}");
+    lab.enroll("desk", |request| request.now.0 -= 3_600_000);
+    let report = desk.reload(|_| {});
+    let said = report["needs_restart"][0].as_str().unwrap();
+    assert!(said.contains("the file is older than what this node has"), "{report}");
+    fs::write(lab.path("desk.identity"), "nothing").unwrap();
+    assert!(desk.ask(&AdminRequest::Reload)["error"].as_str().unwrap().contains("desk.identity"));
+    write_secret(&lab.path("desk.identity"), &kept.to_text());
+    assert_eq!(desk.reload(|_| {})["needs_restart"].as_array().map(Vec::len), Some(0));
+    stream.more(200);
+    let (_talker, last) = stream.end();
+    let lost = hears_some(&listener, 1, last);
+    eprintln!("replaced identities: {lost} of {last} messages lost while the links were replaced");
+    listener.hears_nothing();
+}
+
+#[test]
 fn a_node_that_asks_again_gets_the_same_certificate() {
     let lab = Lab::new(&[]);
     lab.with_fleet(|fleet| fleet.set_authority(Some("keeper".parse().unwrap()), unix_now()).unwrap());

@@ -324,7 +324,19 @@ impl<N: RosNetwork> Core<N> {
             CoreEvent::Inquire { at, question, reply } => self.inquire(&at, question, reply),
             CoreEvent::ReportMade(question, report) => self.report_made(question, report),
             CoreEvent::NetworkJoined(routes) => self.routes = Some(*routes),
-            CoreEvent::Reload { shares, uses, anchors, message_keys, member_names, observers, reply } => {
+            CoreEvent::Reload {
+                identity,
+                shares,
+                uses,
+                anchors,
+                message_keys,
+                member_names,
+                observers,
+                reply,
+            } => {
+                if let Some(identity) = identity {
+                    self.take_identity(identity);
+                }
                 self.add_message_keys(message_keys);
                 self.set_observers(observers);
                 self.members.set_names(member_names, self.certificates.identity());

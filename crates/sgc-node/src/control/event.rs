@@ -9,7 +9,7 @@ use sgc_ros::{
 };
 use sgc_router::LinkId;
 use sgc_transport::AnyLink;
-use sgc_trust::{CrlError, Grantees, NodeName, TrustAnchors};
+use sgc_trust::{CrlError, Grantees, Identity, NodeName, TrustAnchors};
 use sgc_wire::{Control, Name, NodeId, Operation, OperationAnswer, Report, ReportQuestion, SourceId};
 use tokio::sync::oneshot;
 
@@ -126,6 +126,8 @@ pub(crate) enum CoreEvent {
     NetworkJoined(Box<Routes<ChaCha20Rng>>),
     /// The configuration changed. Answered when the change is under way.
     Reload {
+        /// The identity in the replaced file, if it was replaced.
+        identity: Option<Arc<Identity>>,
         /// The new shares.
         shares: Vec<ShareRule>,
         /// The new uses.

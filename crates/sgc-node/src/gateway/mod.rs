@@ -229,6 +229,13 @@ impl Gateway {
         Ok(server.shown() != before)
     }
 
+    /// Changes the number of clients that may be connected at once.
+    pub(crate) fn set_clients_max(&self, clients_max: usize) {
+        if let Some(server) = self.server() {
+            server.set_clients_max(clients_max);
+        }
+    }
+
     /// Shows the node's renewed certificate to new connections, unless the configuration names another.
     pub(crate) fn set_identity(&self, identity: &Identity) {
         let Some(server) = self.server() else { return };

@@ -50,6 +50,42 @@ pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
     Ok(identity)
 }
 
+/// The identity file of a running node.
+pub(crate) enum FileIdentity {
+    /// It holds the identity in use.
+    Same,
+    /// It holds another identity of this node, which it can use.
+    Replaced(Arc<Identity>),
+    /// It holds an identity that this run cannot use, for the reason in words.
+    Refused(&'static str),
+}
+
+impl FileIdentity {
+    /// Reads the file of a node that runs with `own`. An error if it holds no identity, or one that has expired.
+    pub(crate) fn read(path: &Path, own: &Identity) -> Result<Self, NodeError> {
+        let found = load_identity(path)?;
+        if found.to_text() == own.to_text() {
+            return Ok(Self::Same);
+        }
+        match found.anchors().verify(found.chain(), now().unix) {
+            Ok(_) | Err(CertError::NotYetValid { .. }) => {}
+            Err(source) => return Err(NodeError::Certificate { path: path.to_owned(), source }),
+        }
+        let newest = |identity: &Identity| identity.naming_secrets().first().map(|n| n.generation);
+        let age = |identity: &Identity| (identity.as_peer().incarnation, identity.as_peer().not_before);
+        Ok(if found.node_id() != own.node_id() {
+            Self::Refused("is of another node, which needs a restart")
+        } else if found.fleet_secret().is_some() != own.fleet_secret().is_some() {
+            Self::Refused("makes a router of a member, or a member of a router, which needs a restart")
+        } else if age(&found) < age(own) || newest(&found) < newest(own) {
+            // The fleet's authority renewed this node, and the file could not be written.
+            Self::Refused("is older than what this node has")
+        } else {
+            Self::Replaced(Arc::new(found))
+        })
+    }
+}
+
 /// Returns the routers wanted on the local network, if any are.
 pub(crate) fn wanted_nearby(
     routers: &[RouterUrl],

@@ -263,7 +263,11 @@ fn answered_text(node: &NodeName, path: &Path) -> String {
 }
 
 fn renewed_text(path: &Path, node: &NodeName, not_after: UnixMillis) -> String {
-    format!("{}: node {node}, holds until {not_after}\nBring it to that node's machine.", path.display())
+    let file = path.display();
+    format!(
+        "{file}: node {node}, holds until {not_after}\nBring it to that node's machine, in place of the file there: a \
+         running node takes it at once, or by `sgc reload`."
+    )
 }
 
 fn enrolled_text(identity: &Identity, request: &EnrollRequest, path: &Path) -> String {

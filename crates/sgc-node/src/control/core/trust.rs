@@ -194,6 +194,15 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
+    /// Switches to the identity in the replaced file.
+    pub(super) fn take_identity(&mut self, identity: Arc<Identity>) {
+        let now = now();
+        let until = format!("this node's own, by a replaced file, until {}", identity.not_after());
+        self.audit.write(AuditRecord::new(AuditEvent::Renewed).reason(until));
+        self.certificates.replace(now, identity.clone());
+        self.identity_renewed(now, identity);
+    }
+
     /// Passes a renewed identity to the machines.
     fn identity_renewed(&mut self, now: Now, identity: Arc<Identity>) {
         if let (Some(routes), Some(newest)) = (&mut self.routes, identity.naming_secrets().first()) {

@@ -93,6 +93,12 @@ impl Certificates {
         credentials: Credentials,
     ) -> Result<Option<Arc<Identity>>, IdentityError> {
         let Some(identity) = renewed(&self.identity, credentials)?.map(Arc::new) else { return Ok(None) };
+        self.replace(now, identity.clone());
+        Ok(Some(identity))
+    }
+
+    /// Switches to this identity of the same node, and saves it.
+    pub(crate) fn replace(&mut self, now: Now, identity: Arc<Identity>) {
         self.keeper.identity(identity.clone());
         // A link shows the certificate only, so it stays if the certificate is the same.
         let shows_another = self.identity.chain() != identity.chain();
@@ -104,7 +110,6 @@ impl Certificates {
         if shows_another {
             self.redial.send_replace(());
         }
-        Ok(Some(identity))
     }
 
     /// Replaces the trust anchors, and saves their revocation lists.

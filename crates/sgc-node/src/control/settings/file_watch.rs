@@ -97,7 +97,8 @@ fn files_of(file: &Path, config: &Config) -> Vec<PathBuf> {
     let cas = config.partners.iter().map(|partner| &partner.ca).chain(&config.trust).chain(&config.accept);
     let shown = config.gateway.iter().filter_map(|gateway| gateway.tls.as_ref());
     let shown = shown.flat_map(|tls| [&tls.certificate, &tls.key]);
-    let named: BTreeSet<PathBuf> = tokens.chain(cas).chain(shown).cloned().collect();
+    let own = std::iter::once(&config.identity);
+    let named: BTreeSet<PathBuf> = own.chain(tokens).chain(cas).chain(shown).cloned().collect();
     std::iter::once(file.to_owned()).chain(named).collect()
 }
 

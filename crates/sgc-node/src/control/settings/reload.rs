@@ -32,7 +32,7 @@ use crate::local::network_slot::JoinNetwork;
 use crate::metrics::Metrics;
 use crate::node::build::listen_for_clients;
 use crate::node::error::NodeError;
-use crate::node::identity::wanted_nearby;
+use crate::node::identity::{FileIdentity, wanted_nearby};
 use crate::state::audit::{Audit, AuditEvent, AuditRecord};
 use crate::state::credentials::with_kept_crls;
 
@@ -85,6 +85,7 @@ pub(crate) struct Running {
 /// Everything that has to exist before a configuration is applied.
 struct PreparedReload {
     rules: Rules,
+    identity: FileIdentity,
     /// New trust anchors; `None` if they are unchanged.
     anchors: Option<TrustAnchors>,
     message_keys: MessageKeys,
@@ -161,7 +162,8 @@ impl Reloader {
 
     /// Applies `config`.
     async fn apply(&self, running: &mut Running, config: Config) -> Result<ReloadReport, String> {
-        let PreparedReload { rules, anchors, message_keys, gateway } = self.prepare(running, &config).await?;
+        let prepared = self.prepare(running, &config).await?;
+        let PreparedReload { rules, identity, anchors, message_keys, gateway } = prepared;
         let nearby = wanted_nearby(&config.routers, &self.identity).map_err(|error| error.to_string())?;
         self.join(running, config.ros.as_ref()).await?;
         running.suites.extend(message_keys.keys().copied());
@@ -170,9 +172,27 @@ impl Reloader {
             needs_restart: needs_restart(running, &config),
             warnings: rules.warnings.clone(),
         };
+        let identity = match identity {
+            FileIdentity::Same => None,
+            FileIdentity::Replaced(identity) => {
+                let until = identity.not_after();
+                report
+                    .changed
+                    .push(format!("this node has the identity of its replaced file, until {until}"));
+                if identity.post_quantum() != self.credentials.identity().post_quantum() {
+                    let changed = "the fleet's setting of post-quantum links changed, which needs a restart";
+                    report.needs_restart.push(changed.to_owned());
+                }
+                Some(identity)
+            }
+            FileIdentity::Refused(why) => {
+                report.needs_restart.push(format!("the identity is as it was: the file {why}"));
+                None
+            }
+        };
         // This precedes the control task's check of existing links.
         self.credentials.set_admitted(rules.partners.admitted.clone());
-        self.reconfigure(&rules, anchors, message_keys).await?;
+        self.reconfigure(&rules, identity, anchors, message_keys).await?;
         // The control task has the newest revocation lists.
         if let Some((access, files)) = gateway.filter(|_| running.config.gateway.is_some()) {
             match self.reconfigure_gateway(running, &config, access, files) {
@@ -226,12 +246,21 @@ impl Reloader {
     async fn prepare(&self, running: &Running, config: &Config) -> Result<PreparedReload, String> {
         // The identity may have been renewed since the start.
         let (identity, state) = (self.credentials.identity(), self.state.clone());
-        let (wanted, own, suites) = (config.clone(), self.identity.anchors().clone(), running.suites.clone());
+        let (wanted, suites) = (config.clone(), running.suites.clone());
+        let file = running.config.identity.clone();
         let trusted = running.rules.partners.certificates.clone();
         let prepare = tokio::task::spawn_blocking(move || -> Result<PreparedReload, NodeError> {
+            let found = FileIdentity::read(&file, &identity)?;
+            let before = identity;
+            let identity = match &found {
+                FileIdentity::Replaced(identity) => identity.clone(),
+                FileIdentity::Same | FileIdentity::Refused(_) => before.clone(),
+            };
             let rules = Rules::load(&wanted, &identity, state.as_deref(), now().unix)?;
+            let own = identity.anchors();
+            let has_other_cas = !own.certificates().eq(before.anchors().certificates());
             let certificates = &rules.partners.certificates;
-            let anchors = match same(&trusted, certificates) {
+            let anchors = match same(&trusted, certificates) && !has_other_cas {
                 true => None,
                 // The state directory may hold lists of a CA that was trusted before.
                 false => Some(with_kept_crls(
@@ -246,7 +275,7 @@ impl Reloader {
                 Some((access, gateway)) => Some((access, key_of_files(gateway)?)),
                 None => None,
             };
-            Ok(PreparedReload { rules, anchors, message_keys, gateway })
+            Ok(PreparedReload { rules, identity: found, anchors, message_keys, gateway })
         });
         let prepared = prepare.await.map_err(|_| "reading ended in a panic")?;
         prepared.map_err(|error| error.to_string())
@@ -256,6 +285,7 @@ impl Reloader {
     async fn reconfigure(
         &self,
         rules: &Rules,
+        identity: Option<Arc<Identity>>,
         anchors: Option<TrustAnchors>,
         message_keys: MessageKeys,
     ) -> Result<(), String> {
@@ -263,7 +293,16 @@ impl Reloader {
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
         let member_names = rules.members.clone();
         let observers = rules.observers.clone();
-        let event = CoreEvent::Reload { shares, uses, anchors, message_keys, member_names, observers, reply };
+        let event = CoreEvent::Reload {
+            identity,
+            shares,
+            uses,
+            anchors,
+            message_keys,
+            member_names,
+            observers,
+            reply,
+        };
         let stopping = || "the node is stopping".to_owned();
         self.events.send(event).await.map_err(|_| stopping())?;
         done.await.map_err(|_| stopping())
@@ -316,6 +355,12 @@ impl Reloader {
         if self.gateway.reconfigure(access, key).map_err(|error| error.to_string())? {
             changed.push("who connects to the gateway is shown another certificate".to_owned());
         }
+        if let Some((before, after)) = running.config.gateway.as_ref().zip(config.gateway.as_ref())
+            && before.clients_max != after.clients_max
+        {
+            self.gateway.set_clients_max(after.clients_max);
+            changed.push(format!("the gateway takes {} clients at once", after.clients_max));
+        }
         if running.config.gateway.as_ref().map(access_part) != config.gateway.as_ref().map(access_part) {
             changed.push("who may connect to the gateway changed".to_owned());
         }
@@ -364,7 +409,7 @@ fn merged(before: Config, read: Config) -> Config {
         routers, shares, uses, tokens, partners, trust, accept, gateway, metrics, observers, ..
     } = read;
     let gateway = match (&before.gateway, gateway) {
-        (Some(before), Some(after)) => Some(with_bounds_of(before, &after)),
+        (Some(before), Some(after)) => Some(with_buffers_of(before, &after)),
         (_, after) => after,
     };
     Config { routers, shares, uses, tokens, partners, trust, accept, gateway, metrics, observers, ..before }
@@ -376,14 +421,13 @@ fn access_part(gateway: &GatewayConfig) -> GatewayConfig {
     GatewayConfig { clients_max, client_bytes_max, listen, ..gateway.clone() }
 }
 
-/// Returns the gateway's configuration after a reload, with the running bounds.
-fn with_bounds_of(before: &GatewayConfig, after: &GatewayConfig) -> GatewayConfig {
-    let (clients_max, client_bytes_max) = (before.clients_max, before.client_bytes_max);
-    GatewayConfig { clients_max, client_bytes_max, ..after.clone() }
+/// Returns the gateway's configuration after a reload, with the bound of buffers that sessions have.
+fn with_buffers_of(before: &GatewayConfig, after: &GatewayConfig) -> GatewayConfig {
+    GatewayConfig { client_bytes_max: before.client_bytes_max, ..after.clone() }
 }
 
-fn needs_other_bounds(before: Option<&GatewayConfig>, after: Option<&GatewayConfig>) -> bool {
-    before.zip(after).is_some_and(|(before, after)| with_bounds_of(before, after) != *after)
+fn needs_other_buffers(before: Option<&GatewayConfig>, after: Option<&GatewayConfig>) -> bool {
+    before.zip(after).is_some_and(|(before, after)| with_buffers_of(before, after) != *after)
 }
 
 /// Returns the listening addresses of a gateway.
@@ -495,8 +539,8 @@ fn needs_restart(running: &Running, config: &Config) -> Vec<String> {
         // Shares and uses join the default network if the file has no `[ros]`.
         (config.ros.is_some() && now.ros != config.ros, "[ros]"),
         (
-            needs_other_bounds(now.gateway.as_ref(), config.gateway.as_ref()),
-            "`clients_max` or `client_bytes_max` in [gateway]",
+            needs_other_buffers(now.gateway.as_ref(), config.gateway.as_ref()),
+            "`client_bytes_max` in [gateway]",
         ),
         (now.state != config.state, "`state`"),
         (now.watch != config.watch, "`watch`"),
