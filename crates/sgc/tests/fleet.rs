@@ -769,6 +769,49 @@ fn an_operator_keeps_the_fleet_from_a_machine_without_its_file() {
 }
 
 #[test]
+fn a_lost_fleet_file_comes_back_from_a_copy() {
+    let place = Place::with_fleet();
+    place.good(&["fleet", "enroll", "arm-1"]);
+    let said = place.good(&["fleet", "backup"]);
+    let copy = place.files().into_iter().find(|file| file.ends_with(".fleet-backup")).unwrap();
+    assert!(
+        copy.starts_with("lab-20") && said.starts_with(&format!("{copy}: fleet lab, 1 nodes,")),
+        "{said}"
+    );
+    assert_eq!(place.mode(&copy), 0o600);
+    assert!(place.bad(&["fleet", "backup"]).contains("--force replaces it"));
+    // No command takes the copy for the file, and none overwrites the file.
+    place.good(&["fleet", "list"]);
+    assert!(place.bad(&["fleet", "restore", &copy]).contains("sgc fleet merge COPY"));
+
+    // By way of a program that encrypts it.
+    let piped = place.run(&["fleet", "backup", "-"]);
+    assert!(piped.status.success());
+    let before = place.read("lab.fleet");
+    assert_eq!(String::from_utf8(piped.stdout.clone()).unwrap(), before);
+    place.good(&["fleet", "enroll", "arm-2"]);
+    fs::rename(place.path("lab.fleet"), place.path("lost")).unwrap();
+    let mut child = place
+        .command(&["fleet", "restore", "-"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    std::io::Write::write_all(&mut child.stdin.take().unwrap(), &piped.stdout).unwrap();
+    let ran = child.wait_with_output().unwrap();
+    assert!(ran.status.success() && String::from_utf8(ran.stdout).unwrap().contains("sgc fleet adopt"));
+    assert_eq!((place.read("lab.fleet"), place.mode("lab.fleet")), (before, 0o600));
+    // As the command says, what was enrolled since is entered again.
+    assert!(place.bad(&["fleet", "revoke", "arm-2"]).contains("has no node arm-2"));
+    place.good(&["fleet", "adopt", "arm-2", "--certificate", "arm-2.identity"]);
+    place.good(&["fleet", "revoke", "arm-2"]);
+
+    place.write("torn.fleet-backup", &place.read(&copy)[..900], 0o600);
+    assert!(place.bad(&["fleet", "restore", "torn.fleet-backup", "--fleet", "new.fleet"]).contains("torn"));
+    assert!(!place.files().iter().any(|file| file == "new.fleet"));
+}
+
+#[test]
 fn a_machine_joins_with_a_code_and_the_code_is_good_once() {
     let place = Place::with_authority("operators");
     let port = unused_port();

@@ -2,6 +2,7 @@
 //!
 //! The files stay where they are written; the user brings them to their machines. `sgc-trust` defines their content.
 
+mod backup;
 mod copies;
 mod create;
 mod enroll;
@@ -53,6 +54,8 @@ enum FleetCommand {
     Renew(enroll::RenewArgs),
     Revoke(keeping::RevokeArgs),
     Merge(copies::MergeArgs),
+    Backup(backup::BackupArgs),
+    Restore(backup::RestoreArgs),
     Adopt(keeping::AdoptArgs),
     RotateSecret(keeping::RotateArgs),
     RetireSecret(keeping::RetireArgs),
@@ -76,6 +79,8 @@ pub(crate) fn fleet(args: FleetArgs) -> Result<ExitCode, CliError> {
         FleetCommand::Renew(args) => enroll::renew(&args),
         FleetCommand::Revoke(args) => keeping::revoke(&args),
         FleetCommand::Merge(args) => copies::merge(&args),
+        FleetCommand::Backup(args) => backup::backup(&args),
+        FleetCommand::Restore(args) => backup::restore(&args),
         FleetCommand::Adopt(args) => keeping::adopt(&args),
         FleetCommand::RotateSecret(args) => keeping::rotate(&args),
         FleetCommand::RetireSecret(args) => keeping::retire(&args),
