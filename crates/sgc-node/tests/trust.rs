@@ -741,6 +741,24 @@ fn the_holder_of_an_invitation_gets_its_identity_once_and_nothing_else() {
 }
 
 #[test]
+fn an_authority_with_a_restored_file_learns_the_revocations_that_it_kept() {
+    let lab = Lab::with_operator(&["thief"]);
+    let copy = fs::read(lab.fleet_file()).unwrap();
+    let (_cloud, keeper) = (lab.cloud(), lab.keeper());
+    assert_eq!(keeper.ask(&AdminRequest::Crl(lab.revoke("thief")))["ok"]["news"], true);
+    let kept = lab.state("keeper").join("crl");
+    wait("the list is kept", || fs::read_dir(&kept).is_ok_and(|files| files.count() == 1));
+    keeper.kill();
+    fs::write(lab.fleet_file(), copy).unwrap();
+    let _keeper = lab.keeper();
+    let is_revoked = || {
+        let fleet = sgc_node::read_fleet(&lab.fleet_file()).unwrap();
+        fleet.nodes().any(|node| node.name.as_str() == "thief" && fleet.revoked_at(node).is_some())
+    };
+    wait("the file knows", is_revoked);
+}
+
+#[test]
 fn telling_a_router_a_list_returns_those_that_it_has() {
     let lab = Lab::new(&["desk", "tab"]);
     let mut old_copy = sgc_node::read_fleet(&lab.fleet_file()).unwrap();

@@ -260,6 +260,8 @@ impl<N: RosNetwork> Core<N> {
         let mut batch = Vec::with_capacity(BATCH_MAX);
         let epoch_over = self.shares.epoch_over().clone();
         self.ask_renewal();
+        // The fleet file may have been restored from a copy since these lists came.
+        self.catch_up_file(self.certificates.anchors());
         let mut deadline = self.drain();
         loop {
             let timer = async {

@@ -85,7 +85,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     /// Records the revocations of these lists in the fleet file, if this node is the authority.
-    fn catch_up_file(&self, anchors: Arc<TrustAnchors>) {
+    pub(super) fn catch_up_file(&self, anchors: Arc<TrustAnchors>) {
         let Some(job) = self.authority.as_ref().map(|authority| authority.catch_up_job(anchors)) else {
             return;
         };
