@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Computes the golden values of names, identities and tokens with Python's library alone, and checks that each of them is
+"""Computes the golden values of names, identities, tokens and codes with Python's library alone, and checks that each of them is
 what a test of `sgc-trust` expects. (Those of sealing, signing and grants are `trust-vectors.py`'s.)"""
 
 import pathlib
@@ -31,11 +31,12 @@ def main() -> None:
     ca = re.search(r'"(MII[A-Za-z0-9+/=]+)"', joined((CRATE / "tests/tokens.rs").read_text()))
     if ca is None:
         sys.exit("tests/tokens.rs: no CA to make a token with")
-    values = printed("name-vectors.py") + printed("pki-vectors.py") + printed("token-vector.py", ca.group(1))
+    values = printed("name-vectors.py") + printed("pki-vectors.py")
+    values += printed("token-vector.py", ca.group(1)) + printed("join-code-vector.py", ca.group(1))
     unknown = [value for value in values if value not in sources]
-    if unknown or len(values) < 13:
+    if unknown or len(values) < 14:
         sys.exit(f"of {len(values)} values no test expects: {unknown}")
-    print(f"{len(values)} golden values of names, identities and tokens agree")
+    print(f"{len(values)} golden values of names, identities, tokens and codes agree")
 
 
 main()

@@ -144,8 +144,8 @@ pub(crate) const CONTROL: &[Refusal] = &[
     ),
     named(
         "invited",
-        "who was only invited to its fleet asks for more than its identity",
-        "end the invitation by revoking the node that it is for; the log names the link",
+        "the holder of a code of `sgc fleet invite` asks for more than its identity",
+        "a new invitation of the node that the code is for ends the code; the log names the link",
     ),
     named(
         "stale_flood",
@@ -192,8 +192,8 @@ pub(crate) const CONTROL: &[Refusal] = &[
     ),
     named(
         "endpoint_invited",
-        "who was only invited to the fleet asks for more than its identity, through a router of an earlier version",
-        "upgrade the router; the invitation ends by itself, or by revoking the node that it is for",
+        "the holder of a code of `sgc fleet invite` asks for more than its identity, through a router of an earlier version",
+        "upgrade the router; a new invitation of the node that the code is for ends the code",
     ),
     counted(
         NodeDrop::JoinRefused.key(),

@@ -335,7 +335,7 @@ pub enum EndpointDrop {
         left_out: usize,
     },
     /// The holder of an invitation asks for more than its identity.
-    #[error("node {} is only invited to its fleet, and asks for more than its identity", peer.short())]
+    #[error("node {} holds an invitation, and asks for more than its identity", peer.short())]
     Invited {
         /// The holder.
         peer: NodeId,

@@ -26,8 +26,8 @@ use sgc_trust::{
 };
 use sgc_wire::{
     Answer, AnswerBody, Control, Decode as _, Encode as _, GrantContent, Hello, JoinBody, Metadata, Name,
-    Operation, OperationAnswer, OperationRefusal, OperationRequest, RefuseReason, Request, SignedBody,
-    SinkId, UnixMillis,
+    Operation, OperationAnswer, OperationRefusal, OperationRequest, REDEEM_SINK, RefuseReason, Request,
+    SignedBody, SinkId, UnixMillis,
 };
 use support::*;
 
@@ -681,7 +681,11 @@ fn the_holder_of_an_invitation_gets_its_identity_once_and_nothing_else() {
     let Ok(OperationAnswer::Invitation(code)) = done else { panic!("{done:?}") };
     // A member has nothing to redeem.
     let made = KeyRequest::generate(None, &mut OsRng.unwrap_err()).unwrap();
-    let redeem = || Operation::Redeem { csr: Bytes::copy_from_slice(made.csr()) };
+    let sealed_to = ReplyKey::generate(Kem::X25519);
+    let redeem = || Operation::Redeem {
+        csr: Bytes::copy_from_slice(made.csr()),
+        reply_key: sealed_to.public().clone(),
+    };
     let said = operate(&desk, "keeper", redeem()).unwrap_err();
     assert!(said.starts_with("keeper does not take this node for an operator"), "{said}");
 
@@ -719,22 +723,41 @@ fn the_holder_of_an_invitation_gets_its_identity_once_and_nothing_else() {
     let execute = OperationRequest::Execute { challenge: challenge(4), operation: redeem() };
     let (recorded, key) = guest.request(name, 5, &execute);
     let first = guest.ask(name, 5, &recorded, &key);
-    let OperationAnswer::Membership(text) = &first else { panic!("{first:?}") };
+    let OperationAnswer::Sealed { enc, sealed } = &first else { panic!("{first:?}") };
+    // Another holder of the code may repeat the request, and gets an answer that it cannot open.
+    let (again, other_key) = guest.request(name, 6, &execute);
+    assert_eq!(guest.ask(name, 6, &again, &other_key), first);
+    assert!(other_key.open(&name, &REDEEM_SINK, 0, enc, sealed).is_err());
+    let opened = sealed_to.open(&name, &REDEEM_SINK, 0, enc, sealed).unwrap();
+    let GrantContent::Operation(OperationAnswer::Membership(text)) = opened else { panic!("{opened:?}") };
     let arm = Identity::join(Membership::parse(text.expose()).unwrap(), made.key(), &mut OsRng.unwrap_err());
     let fleet = sgc_node::read_fleet(&lab.fleet_file()).unwrap();
-    assert_eq!(arm.unwrap().node_id(), fleet.node_id_of(&"arm".parse().unwrap()));
-    // The same request gets the same answer, and another one none.
-    assert_eq!(guest.ask(name, 5, &recorded, &key), first);
-    let execute = OperationRequest::Execute { challenge: challenge(6), operation: redeem() };
-    let (asks, key) = guest.request(name, 7, &execute);
-    let again = guest.ask(name, 7, &asks, &key);
-    let OperationAnswer::Refused { why: OperationRefusal::Fleet, detail } = again else {
-        panic!("{again:?}")
+    let arm = arm.unwrap().node_id();
+    assert_eq!(arm, fleet.node_id_of(&"arm".parse().unwrap()));
+    // Another request gets none, and only a few are looked at.
+    let mut refusals = Vec::new();
+    for sink in 7..20 {
+        let execute = OperationRequest::Execute { challenge: challenge(sink), operation: redeem() };
+        let (asks, key) = guest.request(name, sink + 20, &execute);
+        match guest.ask(name, sink + 20, &asks, &key) {
+            OperationAnswer::Refused { why, detail } => refusals.push((why, detail)),
+            other => panic!("{other:?}"),
+        }
+    }
+    let used = |(why, detail): &(OperationRefusal, String)| {
+        *why == OperationRefusal::Fleet && detail.starts_with("the invitation of arm was used")
     };
-    assert!(detail.starts_with("the invitation of arm was used at"), "{detail}");
+    assert!(used(&refusals[0]), "{refusals:?}");
+    let busy = "too many attempts with this invitation";
+    assert!(refusals[12] == (OperationRefusal::Busy, busy.to_owned()), "{refusals:?}");
+    assert!(matches!(
+        operate(&desk, "keeper", Operation::List { after: None }),
+        Ok(OperationAnswer::Roster(_))
+    ));
     let said: Vec<_> = lab.audit("keeper").into_iter().filter(|r| r.event == "operation").collect();
-    let said: Vec<_> = said.iter().map(|r| r.reason.as_deref().unwrap()).collect();
-    assert_eq!(said[..2], ["invite arm: done", "redeem the invitation of arm: done"]);
+    assert_eq!(said[0].reason.as_deref(), Some("invite arm: done"));
+    let joined = (Some(arm.to_string()), Some("redeem the invitation of arm: done".to_owned()));
+    assert_eq!((said[1].peer.clone(), said[1].reason.clone()), joined);
     assert!(keeper.drops("operation_not_permitted") >= 2);
     guest.runtime.block_on(guest.dialer.close(CloseReason::Goodbye));
     drop(desk);

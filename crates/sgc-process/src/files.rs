@@ -4,17 +4,21 @@
 
 use std::fs::{self, File};
 use std::io::{self, Read, Write};
-use std::os::unix::fs::PermissionsExt;
+use std::os::unix::fs::{MetadataExt as _, PermissionsExt, fchown};
 use std::path::{Path, PathBuf};
 
 use sgc_trust::FLEET_FILE_BYTES_MAX;
+use tempfile::NamedTempFile;
 use zeroize::Zeroizing;
 
 use crate::error::ProcessError;
 
 /// Largest file that is read.
 const SECRET_FILE_BYTES_MAX: u64 = FLEET_FILE_BYTES_MAX as u64;
-const PUBLIC_MODE: u32 = 0o644;
+/// Mode of files that hold secrets.
+pub const SECRET_MODE: u32 = 0o600;
+/// Mode of files that hold none.
+pub const PUBLIC_MODE: u32 = 0o644;
 const PERMISSION_BITS: u32 = 0o7777;
 const OTHERS_BITS: u32 = 0o077;
 
@@ -29,33 +33,65 @@ pub enum Existing {
 
 /// Writes a file of mode 0600 atomically.
 pub fn write_secret(path: &Path, text: &str, existing: Existing) -> Result<(), ProcessError> {
-    let failed = |source| ProcessError::Write { path: path.to_owned(), source };
-    let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    // `tempfile` creates files with mode 0600, so the secret is never readable by others.
-    let mut file = tempfile::Builder::new().prefix(".sgc-").tempfile_in(dir).map_err(failed)?;
-    file.write_all(text.as_bytes()).map_err(failed)?;
-    file.as_file().sync_all().map_err(failed)?;
-    match existing {
-        Existing::Replace => file.persist(path).map_err(|e| failed(e.error))?,
-        Existing::Keep(hint) => file.persist_noclobber(path).map_err(|e| match e.error.kind() {
-            io::ErrorKind::AlreadyExists => ProcessError::Exists { path: path.to_owned(), hint },
-            _ => failed(e.error),
-        })?,
-    };
-    // Without this sync, a power cut may lose the directory entry of a complete file.
-    File::open(dir).and_then(|dir| dir.sync_all()).map_err(failed)
+    PendingFile::begin(path)?.commit(text.as_bytes(), SECRET_MODE, existing)
 }
 
 /// Writes a file that is no secret atomically. Replaces an existing file.
 pub fn write_public(path: &Path, content: &[u8]) -> Result<(), ProcessError> {
-    let failed = |source| ProcessError::Write { path: path.to_owned(), source };
-    let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut file = tempfile::Builder::new().prefix(".sgc-").tempfile_in(dir).map_err(failed)?;
-    file.write_all(content).map_err(failed)?;
-    file.as_file().set_permissions(fs::Permissions::from_mode(PUBLIC_MODE)).map_err(failed)?;
-    file.as_file().sync_all().map_err(failed)?;
-    file.persist(path).map_err(|e| failed(e.error))?;
-    Ok(())
+    PendingFile::begin(path)?.commit(content, PUBLIC_MODE, Existing::Replace)
+}
+
+/// A file that is begun beside its place, so that a directory that cannot be written is noticed before there is
+/// something to write. Dropped, it is removed.
+#[derive(Debug)]
+pub struct PendingFile {
+    file: NamedTempFile,
+    path: PathBuf,
+}
+
+impl PendingFile {
+    /// Begins the file.
+    pub fn begin(path: &Path) -> Result<Self, ProcessError> {
+        // `tempfile` creates files with mode 0600, so a secret is never readable by others.
+        let file = tempfile::Builder::new().prefix(".sgc-").tempfile_in(directory_of(path));
+        let file = file.map_err(|source| ProcessError::Write { path: path.to_owned(), source })?;
+        Ok(Self { file, path: path.to_owned() })
+    }
+
+    /// Gives the file to the user and the group that its directory has.
+    pub fn give_to_owner_of_directory(&self) -> Result<(), ProcessError> {
+        // By the descriptor: in a directory of another user, a path may lead elsewhere by now.
+        let owner = fs::metadata(directory_of(&self.path)).map_err(|source| self.failed(source))?;
+        fchown(self.file.as_file(), Some(owner.uid()), Some(owner.gid()))
+            .map_err(|source| self.failed(source))
+    }
+
+    /// Puts the file with this content and mode into its place.
+    pub fn commit(mut self, content: &[u8], mode: u32, existing: Existing) -> Result<(), ProcessError> {
+        let path = self.path.clone();
+        let failed = |source| ProcessError::Write { path: path.clone(), source };
+        self.file.write_all(content).map_err(failed)?;
+        self.file.as_file().set_permissions(fs::Permissions::from_mode(mode)).map_err(failed)?;
+        self.file.as_file().sync_all().map_err(failed)?;
+        match existing {
+            Existing::Replace => self.file.persist(&path).map_err(|e| failed(e.error))?,
+            Existing::Keep(hint) => self.file.persist_noclobber(&path).map_err(|e| match e.error.kind() {
+                io::ErrorKind::AlreadyExists => ProcessError::Exists { path: path.clone(), hint },
+                _ => failed(e.error),
+            })?,
+        };
+        // Without this sync, a power cut may lose the directory entry of a complete file.
+        let dir = directory_of(&path);
+        File::open(dir).and_then(|dir| dir.sync_all()).map_err(failed)
+    }
+
+    fn failed(&self, source: io::Error) -> ProcessError {
+        ProcessError::Write { path: self.path.clone(), source }
+    }
+}
+
+fn directory_of(path: &Path) -> &Path {
+    path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// Reads a text that is no secret.

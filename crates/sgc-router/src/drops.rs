@@ -106,7 +106,7 @@ pub enum DropReason {
     )]
     NotRouter,
     /// The holder of an invitation asks for another name than that of its fleet's authority.
-    #[error("node {} is only invited to its fleet, and asks for more than its identity", node.short())]
+    #[error("node {} holds an invitation, and asks for more than its identity", node.short())]
     Invited {
         /// The holder.
         node: NodeId,

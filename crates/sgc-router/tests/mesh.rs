@@ -371,11 +371,20 @@ fn the_holder_of_an_invitation_reaches_the_authority_and_nobody_else() {
     assert_eq!(bench.dropped, ["invited"]);
     bench.join(4, 2, &operations);
     assert!(matches!(bench.sent[..], [(1, Control::Join { .. })]), "{:?}", bench.sent);
-    // It has no names of its own.
+    // It has no names of its own, and no place in the mesh.
     bench.dropped.clear();
     let own = bench.advert_of(&bench.user, 1, false, &[B]);
     bench.frame(4, own);
-    assert_eq!((bench.sent.len(), bench.dropped.as_slice()), (0, ["not_verified"].as_slice()));
+    let signed = bench.user.sign_link_state(&bench.link_state(&bench.user, 1, &[]));
+    bench.frame(4, Control::LinkState { signed: signed.clone() });
+    assert_eq!((bench.sent.len(), bench.dropped.as_slice()), (0, ["not_verified"; 2].as_slice()));
+    // A router of an earlier version passes its word on, however often, and keeps its link; its own link ends.
+    for (link, is_closed) in [(1, false), (4, true)] {
+        for _ in 0..100 {
+            bench.frame(link, Control::LinkState { signed: signed.clone() });
+        }
+        assert_eq!(bench.closed.contains(&link), is_closed, "link {link}");
+    }
 }
 
 #[test]

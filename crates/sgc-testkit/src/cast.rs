@@ -129,8 +129,9 @@ pub fn invited(fleet: &str) -> Arc<Identity> {
     let rng = &mut rng(&format!("{fleet}/invited"));
     copy.set_authority(Some("keeper".parse().expect("a legal name")), BIRTH).expect("a fresh fleet");
     let request = EnrollRequest::new("invited".parse().expect("a legal name"), GENESIS);
-    let made =
-        copy.invite(&request, Duration::from_secs(86_400), Vec::new(), rng).expect("a fresh CA invites");
+    let made = copy
+        .invite(&request, Duration::from_secs(86_400), vec!["quic://hub:7447".into()], rng)
+        .expect("a fresh CA invites");
     Arc::new(made.identity(rng).expect("it fits together"))
 }
 

@@ -99,7 +99,8 @@ impl Fleet {
     }
 
     /// Enters a node in the roster and invites it: the first holder of the invitation who asks the authority within this
-    /// time ([`Fleet::redeem`]) gets the node's identity. `routers` are URLs at which the authority can be reached.
+    /// time ([`Fleet::redeem`]) gets the node's identity. Earlier unused invitations of the node end. `routers` are URLs
+    /// at which the authority can be reached.
     pub fn invite(
         &mut self,
         request: &EnrollRequest,
@@ -114,6 +115,12 @@ impl Fleet {
         if !Invitation::fits(&routers) {
             return Err(FleetError::InvitationRouters);
         }
+        // Certificates end with the CA; the certificate of an invitation holds this number of seconds.
+        let left = Duration::from_millis(self.validity.not_after.0.saturating_sub(request.now.0));
+        let valid = request.valid.min(left).min(Duration::from_secs(u32::MAX.into()));
+        if valid < Duration::from_secs(1) {
+            return Err(FleetError::InvitationTime);
+        }
         let incarnation = self.admit(request)?;
         let (key, scalar) = Key::generate_with_scalar(rng);
         let mut pseudonym = Pseudonym([0; 32]);
@@ -124,11 +131,15 @@ impl Fleet {
             groups: Vec::new(),
             may_route: false,
             incarnation: 0,
-            invitation: Some(request.valid),
+            invitation: Some(valid),
             valid: within,
             now: request.now,
         };
         let certificate = leaf.sign(&key, &self.certificate, &self.key, self.validity, rng)?;
+        if let Some(known) = self.roster.nodes.get_mut(&request.node) {
+            let open = known.certificates.iter_mut().filter(|c| c.is_invitation() && c.revoked.is_none());
+            open.for_each(|c| c.revoked = Some(request.now));
+        }
         self.record(request, incarnation, &certificate, false)?;
         Ok(Invitation {
             node: request.node.clone(),
@@ -157,8 +168,12 @@ impl Fleet {
         let node = self.nodes().find(|n| n.certificates.iter().any(is_it)).ok_or(FleetError::NotInvited)?;
         let node = self.active_node(&node.name)?.name.clone();
         let known = self.roster.nodes.get(&node).into_iter().flat_map(|n| &n.certificates).find(|c| is_it(c));
-        if let Some(at) = known.ok_or(FleetError::NotInvited)?.revoked_at(self.revocation_of(&node)) {
+        let known = known.ok_or(FleetError::NotInvited)?;
+        if let Some(at) = known.revoked {
             return Err(FleetError::InvitationUsed { node, at });
+        }
+        if let Some(at) = known.revoked_at(self.revocation_of(&node)) {
+            return Err(FleetError::InvitationRevoked { node, at });
         }
         let member = self.renew_member(csr, &node, valid, now, rng)?;
         let entry = self.roster.nodes.get_mut(&node).into_iter().flat_map(|n| &mut n.certificates);

@@ -99,21 +99,32 @@ pub enum FleetError {
          with this file in its [authority]"
     )]
     NoAuthority,
-    /// The time of an invitation is out of bounds.
-    #[error("an invitation is for at least a second and at most {} days", INVITATION_TIME_MAX.as_secs() / 86_400)]
-    InvitationTime,
-    /// Too many routers for an invitation, or too long.
+    /// The time of an invitation, or of the certificate to which it entitles, is out of bounds.
     #[error(
-        "an invitation names at most {INVITATION_ROUTERS_MAX} routers, each of at most {ROUTER_BYTES_MAX} bytes"
+        "an invitation is for at least a second and at most {} days, for a certificate of at least a second",
+        INVITATION_TIME_MAX.as_secs() / 86_400
+    )]
+    InvitationTime,
+    /// No router for an invitation, too many, or one too long.
+    #[error(
+        "an invitation names 1 to {INVITATION_ROUTERS_MAX} routers, each of at most {ROUTER_BYTES_MAX} bytes"
     )]
     InvitationRouters,
+    /// The node was revoked after it was invited.
+    #[error("{node} was revoked at {at}, after this invitation was made: ask for another one")]
+    InvitationRevoked {
+        /// The invited node.
+        node: NodeName,
+        /// Time of the revocation.
+        at: UnixMillis,
+    },
     /// The certificate is none of an invitation that this copy of the file made.
     #[error("the invitation is not one of this fleet's file")]
     NotInvited,
-    /// The invitation was used.
+    /// The invitation was used, or a later one replaced it.
     #[error(
-        "the invitation of {node} was used at {at}: ask for another one. If nobody of yours used it, revoke the node: \
-         sgc fleet revoke {node}"
+        "the invitation of {node} was used, or replaced by another one, at {at}: ask for another one. If nobody of \
+         yours used it, revoke the node: sgc fleet revoke {node}"
     )]
     InvitationUsed {
         /// The invited node.

@@ -90,7 +90,8 @@ impl Invitation {
 
     /// Returns `true` if an invitation may name these routers, so that it can be read.
     pub(crate) fn fits(routers: &[String]) -> bool {
-        routers.len() <= INVITATION_ROUTERS_MAX && routers.iter().all(|url| url.len() <= ROUTER_BYTES_MAX)
+        (1..=INVITATION_ROUTERS_MAX).contains(&routers.len())
+            && routers.iter().all(|url| url.len() <= ROUTER_BYTES_MAX)
     }
 
     fn encode(&self) -> Vec<u8> {

@@ -1,10 +1,13 @@
-//! Bounds of invitations, also for the errors of fleets.
+//! Bounds of invitations, and the mark of their certificates in a roster.
 
 use std::time::Duration;
 
-/// Most routers that one invitation names.
-pub const INVITATION_ROUTERS_MAX: usize = 8;
-/// Longest URL of a router in an invitation, bytes.
-pub(crate) const ROUTER_BYTES_MAX: usize = 300;
+pub use sgc_wire::INVITATION_ROUTERS_MAX;
+pub(crate) use sgc_wire::ROUTER_BYTES_MAX;
+
 /// Longest time for which an invitation is valid.
 pub const INVITATION_TIME_MAX: Duration = Duration::from_secs(7 * 86_400);
+
+/// Beginning of the serial numbers of invitations, which 16 random bytes follow. Those of nodes' certificates have 16
+/// bytes.
+pub(crate) const INVITATION_SERIAL: [u8; 4] = *b")sgc";

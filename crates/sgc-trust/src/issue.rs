@@ -21,6 +21,7 @@ use zeroize::Zeroizing;
 use crate::blocks::KEY_BLOCK;
 use crate::cert_id::sha256;
 use crate::fleet_error::FleetError;
+use crate::invitation_bounds::INVITATION_SERIAL;
 use crate::key::Key;
 use crate::label::{GroupName, NodeName};
 use crate::peer::{GROUP_URI, INCARNATION_URI, INVITATION_URI, NODE_URI, ROUTER_URI};
@@ -98,7 +99,15 @@ impl Leaf {
         rng: &mut impl CryptoRng,
     ) -> Result<CertificateDer<'static>, FleetError> {
         let mut params = self.params()?;
-        params.serial_number = Some(serial(rng));
+        params.serial_number = Some(match self.invitation {
+            None => serial(rng),
+            Some(_) => {
+                let mut bytes = [0; 20];
+                rng.fill_bytes(&mut bytes);
+                bytes[..INVITATION_SERIAL.len()].copy_from_slice(&INVITATION_SERIAL);
+                SerialNumber::from_slice(&bytes)
+            }
+        });
         // The validity lies within the CA's: a certificate that outlives its CA would fail unexpectedly.
         params.not_before = date_time!(before(self.now, CLOCK_SKEW).max(validity.not_before));
         params.not_after = date_time!(after(self.now, self.valid)?.min(validity.not_after));

@@ -78,6 +78,7 @@ pub use replay::{Freshness, REPLAY_WINDOW, ReplayWindow};
 pub use revocations::{CrlError, FLEET_LISTS_MAX, LIST_NODES_MAX, REVOKED_NODES_MAX, Revocation};
 pub use roster::{
     Generation, IssuedCertificate, NODE_CERTIFICATES_MAX, ROSTER_BYTES_MAX, ROSTER_NODES_MAX, RosterNode,
+    is_invitation,
 };
 pub use seal::{OpenError, SourceKey, TAG_BYTES, opened_bytes, sealed_bytes};
 pub use secret::{FleetSecret, NamingSecret};

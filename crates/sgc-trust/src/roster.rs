@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use sgc_wire::{DecodeError, Encode as _, Pseudonym, Reader, SECRET_GENERATIONS_MAX, UnixMillis, Writer};
 
+use crate::invitation_bounds::INVITATION_SERIAL;
 use crate::label::{GROUPS_MAX, GroupName, LABEL_BYTES_MAX, NodeName};
 use crate::revocations::{REVOKED_NODES_MAX, Revocation, RevokedNodes, add_revocation};
 use crate::secret::FleetSecret;
@@ -53,9 +54,10 @@ pub struct RosterNode {
 }
 
 impl RosterNode {
-    /// Returns the last moment at which an unrevoked certificate of the node is valid.
+    /// Returns the last moment at which an unrevoked certificate of the node is valid. Invitations do not count.
     pub fn expires(&self, revocation: Option<Revocation>) -> Option<UnixMillis> {
-        let good = self.certificates.iter().filter(|c| c.revoked_at(revocation).is_none());
+        let good =
+            self.certificates.iter().filter(|c| !c.is_invitation() && c.revoked_at(revocation).is_none());
         good.map(|c| c.not_after).max()
     }
 
@@ -103,11 +105,17 @@ pub struct IssuedCertificate {
     pub not_after: UnixMillis,
     /// The incarnation of its node.
     pub incarnation: u32,
-    /// Time of its revocation by serial number alone: from before there were incarnations.
+    /// Time of its revocation by serial number alone: of an invitation that was used or replaced, or from before there
+    /// were incarnations.
     pub(crate) revoked: Option<UnixMillis>,
 }
 
 impl IssuedCertificate {
+    /// Returns `true` if it is the certificate of an invitation, which entitles to one of the node.
+    pub fn is_invitation(&self) -> bool {
+        is_invitation(&self.serial)
+    }
+
     /// Returns the time of its revocation, given that of its node.
     pub fn revoked_at(&self, revocation: Option<Revocation>) -> Option<UnixMillis> {
         self.revoked.or_else(|| revocation.filter(|r| r.covers(self.incarnation)).map(|r| r.at))
@@ -118,6 +126,11 @@ impl IssuedCertificate {
         self.not_after = self.not_after.max(other.not_after);
         self.incarnation = self.incarnation.max(other.incarnation);
     }
+}
+
+/// Returns `true` for the serial number of an invitation.
+pub fn is_invitation(serial: &[u8]) -> bool {
+    serial.len() == SERIAL_BYTES_MAX && serial.starts_with(&INVITATION_SERIAL)
 }
 
 /// A generation of the naming secret, without the secret.

@@ -45,8 +45,8 @@ pub enum SignedError {
         /// The verifier's time.
         now: UnixMillis,
     },
-    /// The signer is only invited to the fleet, and owns no names.
-    #[error("its signer is only invited to the fleet")]
+    /// The signer only holds an invitation: it owns no names and has no place in the mesh.
+    #[error("its signer only holds an invitation to the fleet")]
     Invited,
     /// The sequence number is ahead of the time of signing by more than [`SEQ_AHEAD_MAX`].
     #[error("sequence number {seq} is too far ahead of {signed}, when it was signed")]
@@ -176,7 +176,7 @@ pub fn verify_join(
     Ok(VerifiedJoin { peer, body })
 }
 
-/// Verifies a link state: chain, time, signature, sequence number. The caller checks whether the node may carry others'
+/// Verifies a link state: chain, time, signature, sequence number, and that its node is no invitation. The caller checks whether the node may carry others'
 /// names.
 pub fn verify_link_state(
     anchors: &TrustAnchors,
@@ -186,6 +186,9 @@ pub fn verify_link_state(
     let body = LinkStateBody::from_slice(&signed.body)?;
     let node = verify_chain(anchors, &body.chain, body.issued_at, now)?;
     node.verify_signature(LINK_STATE, &signed.body, &signed.signature)?;
+    if node.invitation.is_some() {
+        return Err(SignedError::Invited);
+    }
     verify_seq(body.seq, body.issued_at)?;
     Ok(VerifiedLinkState { node, body })
 }

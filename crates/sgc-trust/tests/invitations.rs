@@ -27,8 +27,12 @@ fn request(node: &str) -> EnrollRequest {
     EnrollRequest { groups, valid: VALID, ..EnrollRequest::new(node.parse().unwrap(), NOW) }
 }
 
+fn routers() -> Vec<String> {
+    vec!["quic://hub:7447".to_owned()]
+}
+
 fn invite(fleet: &mut Fleet, node: &str) -> Invitation {
-    fleet.invite(&request(node), WITHIN, vec!["quic://hub:7447".into()], &mut rng(2)).unwrap()
+    fleet.invite(&request(node), WITHIN, routers(), &mut rng(2)).unwrap()
 }
 
 fn key(seed: u64) -> KeyRequest {
@@ -74,6 +78,38 @@ fn a_code_makes_its_node_once() {
     assert!(matches!(member, Err(FleetError::NotInvited)), "{member:?}");
 }
 
+/// Computed with Python's library: `scripts/join-code-vector.py` prints it, given the CA of `tokens.rs` in base64. The
+/// CA stands for both certificates.
+#[test]
+fn golden_vector() {
+    let text = concat!(
+        "sgc-join-1:AQAAAAVhcm0tNwAAAARhY21lAAAABmtlZXBlciIiIiIiIiIiIiIiIiIiIiIiIiIiIiIiIiIiIiIiIiI",
+        "iAAAAAgAAAB5xdWljOi8vcm91dGVyLmxhYi5leGFtcGxlOjc0NDcAAAAHbWRuczovLwEAAAGDMIIBfzCCASWgAwIBA",
+        "gIUI28IXvyZ7Gj2zMB3KCGFm5tjGvEwCgYIKoZIzj0EAwIwDDEKMAgGA1UEAwwBdjAgFw0yNjExMjExNTA4MDJaGA8",
+        "yMTI2MTAyODE1MDgwMlowDDEKMAgGA1UEAwwBdjBZMBMGByqGSM49AgEGCCqGSM49AwEHA0IABHyMue33KfolwjYak",
+        "54PA5JUnpz0lLOM3LBdhx5b8W2KeR7N3B0W2RBRL3Hthbdjx4H8Zyw8QuhvIAON6trqQfGjYzBhMB0GA1UdDgQWBBS",
+        "Z_J0SKxg30CLP_9a99SAj6z-_RjAfBgNVHSMEGDAWgBSZ_J0SKxg30CLP_9a99SAj6z-_RjAPBgNVHRMBAf8EBTADA",
+        "QH_MA4GA1UdDwEB_wQEAwICBDAKBggqhkjOPQQDAgNIADBFAiB66uLPBO-Muy_x07lck4JHO_NV8yJgloy4Hc4owYI",
+        "yIgIhAMREfJaNdITzjq9bkR5nzPdhYceuL7MCLyDUdUH0Z3UAAAABgzCCAX8wggEloAMCAQICFCNvCF78mexo9szAd",
+        "yghhZubYxrxMAoGCCqGSM49BAMCMAwxCjAIBgNVBAMMAXYwIBcNMjYxMTIxMTUwODAyWhgPMjEyNjEwMjgxNTA4MDJ",
+        "aMAwxCjAIBgNVBAMMAXYwWTATBgcqhkjOPQIBBggqhkjOPQMBBwNCAAR8jLnt9yn6JcI2GpOeDwOSVJ6c9JSzjNywX",
+        "YceW_FtinkezdwdFtkQUS9x7YW3Y8eB_GcsPELobyADjera6kHxo2MwYTAdBgNVHQ4EFgQUmfydEisYN9Aiz__WvfU",
+        "gI-s_v0YwHwYDVR0jBBgwFoAUmfydEisYN9Aiz__WvfUgI-s_v0YwDwYDVR0TAQH_BAUwAwEB_zAOBgNVHQ8BAf8EB",
+        "AMCAgQwCgYIKoZIzj0EAwIDSAAwRQIgeurizwTvjLsv8dO5XJOCRzvzVfMiYJaMuB3OKMGCMiICIQDERHyWjXSE846",
+        "vW5EeZ8z3YWHHri-zAi8g1HVB9Gd1ADMzMzMzMzMzMzMzMzMzMzMzMzMzMzMzMzMzMzMzMzMzGGpLSA",
+    );
+    let read = Invitation::parse(text).unwrap();
+    assert_eq!(read.to_text().as_str(), text);
+    assert_eq!(
+        (read.node.as_str(), read.fleet.as_str(), read.authority.as_str()),
+        ("arm-7", "acme", "keeper")
+    );
+    assert_eq!((read.authority_id.0, read.post_quantum), ([0x22; 32], true));
+    assert_eq!(read.routers, ["quic://router.lab.example:7447", "mdns://"]);
+    // The certificate is none of an invitation, and not of that key.
+    assert!(read.identity(&mut rng(1)).is_err());
+}
+
 #[test]
 fn an_invited_node_may_be_revoked_and_invited_again() {
     let mut fleet = fleet();
@@ -81,17 +117,67 @@ fn an_invited_node_may_be_revoked_and_invited_again() {
     let arm: NodeName = "arm-7".parse().unwrap();
     fleet.revoke(std::slice::from_ref(&arm), NOW).unwrap();
     assert!(matches!(redeem(&mut fleet, &first, &key(5)), Err(FleetError::NodeRevoked { .. })));
-    let refused = fleet.invite(&request("arm-7"), WITHIN, Vec::new(), &mut rng(8));
+    let refused = fleet.invite(&request("arm-7"), WITHIN, routers(), &mut rng(8));
     assert!(matches!(refused, Err(FleetError::NodeRevoked { .. })), "{refused:?}");
     let again = EnrollRequest { again: true, ..request("arm-7") };
-    let second =
-        fleet.invite(&again, WITHIN, Vec::new(), &mut rng(8)).unwrap().identity(&mut rng(3)).unwrap();
-    assert!(
-        matches!(redeem(&mut fleet, &first, &key(5)), Err(FleetError::InvitationUsed { .. })),
-        "revoked with its node"
-    );
+    let second = fleet.invite(&again, WITHIN, routers(), &mut rng(8)).unwrap().identity(&mut rng(3)).unwrap();
+    let late = redeem(&mut fleet, &first, &key(5));
+    assert!(matches!(late, Err(FleetError::InvitationUsed { .. })), "the second one replaced it: {late:?}");
     let made = redeem(&mut fleet, &second, &key(5)).unwrap();
     assert_eq!(Identity::join(made, key(5).key(), &mut rng(6)).unwrap().as_peer().incarnation, 1);
+}
+
+#[test]
+fn a_node_that_was_enrolled_again_leaves_its_old_invitation_behind() {
+    let mut fleet = fleet();
+    let holder = invite(&mut fleet, "arm-7").identity(&mut rng(3)).unwrap();
+    fleet.revoke(&["arm-7".parse().unwrap()], NOW).unwrap();
+    fleet.enroll(&EnrollRequest { again: true, ..request("arm-7") }, &mut rng(8)).unwrap();
+    let late = redeem(&mut fleet, &holder, &key(5));
+    assert!(matches!(late, Err(FleetError::InvitationRevoked { .. })), "{late:?}");
+    // The list of the revocation names the certificate, so that routers cut its link.
+    let list = fleet.revocation_list(NOW).unwrap();
+    let anchors = fleet.anchors().with_crl(&list, NOW).unwrap().unwrap();
+    assert!(matches!(anchors.verify(holder.chain(), NOW), Err(CertError::Revoked { .. })));
+}
+
+#[test]
+fn a_later_invitation_ends_an_earlier_one() {
+    let mut fleet = fleet();
+    let first = invite(&mut fleet, "arm-7").identity(&mut rng(3)).unwrap();
+    let other = EnrollRequest { groups: vec!["guests".parse().unwrap()], ..request("arm-7") };
+    let second = fleet.invite(&other, WITHIN, routers(), &mut rng(8)).unwrap().identity(&mut rng(3)).unwrap();
+    assert!(matches!(redeem(&mut fleet, &first, &key(5)), Err(FleetError::InvitationUsed { .. })));
+    redeem(&mut fleet, &second, &key(5)).unwrap();
+}
+
+/// The certificate of an invitation is none of its node: it does not make a node look enrolled, and keeps no old secret
+/// in use.
+#[test]
+fn an_open_invitation_does_not_count_as_a_certificate_of_its_node() {
+    let mut fleet = fleet();
+    invite(&mut fleet, "arm-7");
+    let node = fleet.node(&"arm-7".parse().unwrap()).unwrap();
+    assert!(node.certificates[0].is_invitation() && node.expires(None).is_none());
+    let newest = fleet.rotate_secret(NOW, &mut rng(7)).unwrap();
+    assert_eq!(fleet.lacking(newest, NOW).count(), 0);
+}
+
+#[test]
+fn a_certificate_holds_no_longer_than_the_ca_and_an_hour_stays_an_hour() {
+    let (mut fleet, mut codes) = (fleet(), rng(8));
+    for valid in [Duration::from_secs(3600), Duration::from_secs(200 * 365 * 86_400)] {
+        let request = EnrollRequest { valid, ..request("arm-7") };
+        let holder = fleet.invite(&request, WITHIN, routers(), &mut codes).unwrap();
+        let holder = holder.identity(&mut rng(3)).unwrap();
+        let made = redeem(&mut fleet, &holder, &key(5)).unwrap();
+        let arm = Identity::join(made, key(5).key(), &mut rng(6)).unwrap();
+        let end = UnixMillis(NOW.0 + valid.as_millis() as u64).min(fleet.not_after());
+        assert_eq!(arm.not_after().0 / 1000, end.0 / 1000);
+    }
+    let request = EnrollRequest { valid: Duration::from_millis(900), ..request("arm-7") };
+    let made = fleet.invite(&request, WITHIN, routers(), &mut rng(2));
+    assert!(matches!(made, Err(FleetError::InvitationTime)), "{made:?}");
 }
 
 #[test]
@@ -128,14 +214,15 @@ fn a_node_that_is_invited_again_keeps_its_certificate_and_its_place_in_the_roste
 #[test]
 fn impossible_invitations_are_not_made() {
     let mut lonely = Fleet::create("acme".parse().unwrap(), NOW, &mut rng(1)).unwrap();
-    let made = lonely.invite(&request("arm-7"), WITHIN, Vec::new(), &mut rng(2));
+    let made = lonely.invite(&request("arm-7"), WITHIN, routers(), &mut rng(2));
     assert!(matches!(made, Err(FleetError::NoAuthority)), "{made:?}");
     let mut fleet = fleet();
     for within in [Duration::ZERO, INVITATION_TIME_MAX + Duration::from_secs(1)] {
-        let made = fleet.invite(&request("arm-7"), within, Vec::new(), &mut rng(2));
+        let made = fleet.invite(&request("arm-7"), within, routers(), &mut rng(2));
         assert!(matches!(made, Err(FleetError::InvitationTime)), "{made:?}");
     }
-    for routers in [vec!["quic://r:1".to_owned(); INVITATION_ROUTERS_MAX + 1], vec!["r".repeat(301)]] {
+    let crowd = vec!["quic://r:1".to_owned(); INVITATION_ROUTERS_MAX + 1];
+    for routers in [crowd, vec!["r".repeat(301)], Vec::new()] {
         let made = fleet.invite(&request("arm-7"), WITHIN, routers, &mut rng(2));
         assert!(matches!(made, Err(FleetError::InvitationRouters)), "{made:?}");
     }

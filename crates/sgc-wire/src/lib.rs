@@ -45,9 +45,9 @@ pub use message::{
 };
 pub use metadata::{Kind, METADATA_FIELD_BYTES_MAX, METADATA_VERSION, Metadata};
 pub use operation::{
-    Challenge, Operation, OperationAnswer, OperationRefusal, OperationRequest, REFUSAL_DETAIL_BYTES_MAX,
-    REVOKED_AT_ONCE_MAX, ROSTER_ROWS_MAX, ROW_CERTIFICATES_MAX, RosterPage, RosterRow, RowCertificate,
-    SecretText,
+    Challenge, INVITATION_ROUTERS_MAX, Operation, OperationAnswer, OperationRefusal, OperationRequest,
+    REDEEM_SINK, REFUSAL_DETAIL_BYTES_MAX, REVOKED_AT_ONCE_MAX, ROSTER_ROWS_MAX, ROUTER_BYTES_MAX,
+    ROW_CERTIFICATES_MAX, RosterPage, RosterRow, RowCertificate, SecretText,
 };
 pub use packet::{
     AssociatedData, Class, HEADER_BYTES, HEADER_BYTES_MAX, HOP_LIMIT, LABEL_SAVES_BYTES, MESSAGE_BYTES_MAX,

@@ -9,8 +9,8 @@ use bytes::Bytes;
 use zeroize::Zeroize;
 
 use crate::codec::{Decode, DecodeError, Encode, Reader, Writer};
-use crate::control::{CSR_BYTES_MAX, SEALED_BYTES_MAX};
-use crate::ids::{NodeId, UnixMillis};
+use crate::control::{CSR_BYTES_MAX, REPLY_KEY_BYTES_MAX, SEALED_BYTES_MAX};
+use crate::ids::{NodeId, SinkId, UnixMillis};
 
 /// Longest name of a node or group, bytes.
 const LABEL_BYTES_MAX: usize = 64;
@@ -25,13 +25,16 @@ pub const ROW_CERTIFICATES_MAX: usize = 256;
 /// Most generations of the naming secret.
 const GENERATIONS_MAX: usize = 8;
 /// Most routers that an invitation names.
-const INVITATION_ROUTERS_MAX: usize = 8;
+pub const INVITATION_ROUTERS_MAX: usize = 8;
 /// Longest URL of a router in an invitation, bytes.
-const ROUTER_BYTES_MAX: usize = 300;
+pub const ROUTER_BYTES_MAX: usize = 300;
 /// Longest serial number, bytes.
 const SERIAL_BYTES_MAX: usize = 20;
 /// Longest explanation of a refusal, bytes.
 pub const REFUSAL_DETAIL_BYTES_MAX: usize = 512;
+
+/// Stands for the sink where the answer to [`Operation::Redeem`] is sealed to the key in the operation.
+pub const REDEEM_SINK: SinkId = SinkId([0; 16]);
 
 /// A challenge of an authority: random, for one operation of one operator.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -95,6 +98,8 @@ pub enum Operation {
     Redeem {
         /// Its signing request (PKCS #10), DER.
         csr: Bytes,
+        /// Public key to which the identity is sealed, X25519 or X-Wing: others may have the holder's certificate.
+        reply_key: Bytes,
     },
     /// Enters a node in the roster and makes an invitation for it.
     Invite {
@@ -140,6 +145,13 @@ pub enum OperationAnswer {
     Membership(SecretText),
     /// The node is in the roster; this is the text of its invitation.
     Invitation(SecretText),
+    /// The invitation is redeemed; this is the [`OperationAnswer::Membership`], sealed to the key in the request.
+    Sealed {
+        /// Encapsulated key.
+        enc: Bytes,
+        /// The sealed answer.
+        sealed: Bytes,
+    },
 }
 
 /// The reason why an authority refuses an operation.
@@ -334,9 +346,10 @@ impl Encode for Operation {
                 w.u64(*valid_ms);
                 w.bytes(csr);
             }
-            Self::Redeem { csr } => {
+            Self::Redeem { csr, reply_key } => {
                 w.u8(4);
                 w.bytes(csr);
+                w.bytes(reply_key);
             }
             Self::Invite { node, groups, router, may_route, again, valid_ms, within_ms, routers } => {
                 w.u8(5);
@@ -366,7 +379,11 @@ impl Decode for Operation {
                 csr: csr(r)?,
             }),
             3 => Ok(Self::Renew { node: label(r, "node")?, valid_ms: r.u64()?, csr: csr(r)? }),
-            4 => Ok(Self::Redeem { csr: csr(r)? }),
+            4 => {
+                let csr = csr(r)?;
+                let reply_key = Bytes::copy_from_slice(r.bytes("reply key", REPLY_KEY_BYTES_MAX)?);
+                Ok(Self::Redeem { csr, reply_key })
+            }
             5 => Ok(Self::Invite {
                 node: label(r, "node")?,
                 groups: r.list("groups", GROUPS_MAX, |r| label(r, "group"))?,
@@ -410,6 +427,11 @@ impl Encode for OperationAnswer {
                 w.u8(5);
                 w.bytes(text.expose().as_bytes());
             }
+            Self::Sealed { enc, sealed } => {
+                w.u8(6);
+                w.bytes(enc);
+                w.bytes(sealed);
+            }
         }
     }
 }
@@ -426,6 +448,11 @@ impl Decode for OperationAnswer {
             3 => Ok(Self::Revoked { list: r.u64()? }),
             4 => Ok(Self::Membership(SecretText(r.str("membership", SEALED_BYTES_MAX)?))),
             5 => Ok(Self::Invitation(SecretText(r.str("invitation", SEALED_BYTES_MAX)?))),
+            6 => {
+                let enc = Bytes::copy_from_slice(r.bytes("encapsulated key", REPLY_KEY_BYTES_MAX)?);
+                let sealed = Bytes::copy_from_slice(r.bytes("sealed answer", SEALED_BYTES_MAX)?);
+                Ok(Self::Sealed { enc, sealed })
+            }
             v => Err(DecodeError::value("answer to an operation", v.into())),
         }
     }

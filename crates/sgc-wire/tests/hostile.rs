@@ -150,7 +150,8 @@ fn operations_survive_mutation() {
     };
     let challenge = Challenge([1; 16]);
     let revoke = Operation::Revoke { nodes: vec!["arm-1".into(), "desk".into()] };
-    let redeem = Operation::Redeem { csr: Bytes::from_static(b"csr") };
+    let redeem =
+        Operation::Redeem { csr: Bytes::from_static(b"csr"), reply_key: Bytes::from_static(&[1; 32]) };
     let invite = Operation::Invite {
         node: "arm-2".into(),
         groups: vec!["arms".into()],
@@ -184,7 +185,9 @@ fn operations_survive_mutation() {
     };
     let page = RosterPage { fleet: "lab".into(), nodes: vec![row], ..RosterPage::default() };
     let refused = OperationAnswer::Refused { why: OperationRefusal::Fleet, detail: "no".into() };
-    let contents = [OperationAnswer::Roster(page), refused].map(GrantContent::Operation);
+    let sealed =
+        OperationAnswer::Sealed { enc: Bytes::from_static(&[1; 32]), sealed: Bytes::from_static(&[2; 64]) };
+    let contents = [OperationAnswer::Roster(page), refused, sealed].map(GrantContent::Operation);
     survives::<GrantContent>(&contents.map(|c| c.to_vec()), 9);
 }
 

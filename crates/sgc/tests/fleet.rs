@@ -854,9 +854,19 @@ fn a_machine_joins_with_a_code_and_the_code_is_good_once() {
     assert_eq!(place.identity("arm-8.identity").node_name().as_str(), "arm-8");
     assert!(place.read("arm-8.toml").contains(&url));
 
+    // A directory that cannot be written is noticed before the code is used.
+    let spare = invite(&["cloud-2", "--router", "--via", &url]);
+    assert!(refused(&["join", "--dir", "missing", &spare], 1).contains("missing"));
+    assert!(refused(&["join", "--service", "../robot", &spare], 2).contains("'/'"));
+    fs::create_dir(place.path("other")).unwrap();
+    place.good(&["join", "--dir", "other", &spare]);
+    assert!(place.good(&["check", "-c", "other/cloud-2.toml"]).contains("no mistakes"));
+    assert!(place.read("other/cloud-2.toml").contains("[router]\nlisten = "));
+    assert_eq!(fs::read_dir(place.path("other")).unwrap().count(), 2, "nothing unfinished is left");
+
     let said = refused(&["join", "--dir", "other", &code], 1);
-    assert!(said.contains("keeper refuses: the invitation of arm-7 was used at"), "{said}");
-    assert!(said.contains("sgc fleet revoke arm-7") && !is_there("other"), "{said}");
+    assert!(said.contains("keeper refuses: the invitation of arm-7 was used"), "{said}");
+    assert!(said.contains("sgc fleet revoke arm-7") && !is_there("other/arm-7.identity"), "{said}");
     let said = refused(&["join", &code[..code.len() / 2]], 2);
     assert!(said.contains("it was cut or mistyped"), "{said}");
     assert!(!said.contains(&code[20..40]), "an error repeats a secret: {said}");
@@ -867,7 +877,7 @@ fn a_machine_joins_with_a_code_and_the_code_is_good_once() {
     assert!(said.contains("no router within 1 s") && said.contains("--router names another"), "{said}");
     drop(keeper);
     let said = refused(&["join", "--router", &url, &late], 1);
-    assert!(said.contains("no authority keeper is in reach"), "{said}");
+    assert!(said.contains("no authority keeper is in reach: its node has to run"), "{said}");
     let _keeper = place.keeper(port);
     place.good(&["join", "--router", &url, &late]);
     assert!(is_there("arm-9.identity"));
@@ -876,6 +886,14 @@ fn a_machine_joins_with_a_code_and_the_code_is_good_once() {
     let never = invite(&["arm-10", "--via", &url]);
     place.good(&["fleet", "revoke", "arm-10"]);
     assert!(refused(&["join", &never], 1).contains("node arm-10 was revoked at"));
+    let listed = place.good(&["fleet", "list"]);
+    assert!(listed.lines().any(|line| line.starts_with("arm-9 ") && line.contains("until")), "{listed}");
+    invite(&["arm-12", "--via", &url]);
+    let listed = place.good(&["fleet", "list"]);
+    assert!(
+        listed.lines().any(|line| line.starts_with("arm-12") && line.contains("invited until")),
+        "{listed}"
+    );
     let over = invite(&["arm-11", "--within", "1s", "--via", &url]);
     std::thread::sleep(std::time::Duration::from_millis(2100));
     assert!(refused(&["join", &over], 2).contains("the code ended at"));

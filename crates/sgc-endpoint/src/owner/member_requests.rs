@@ -12,6 +12,10 @@ use crate::context::Context;
 use crate::names::BlindName;
 use crate::output::UnexpectedFrame;
 
+/// Most holders of invitations that have a place. A further one takes that of the first: what members need must not
+/// depend on how many codes are about.
+const HOLDERS_MAX: usize = 32;
+
 /// The requests at one name of this node.
 #[derive(Debug)]
 pub(crate) struct MemberRequests {
@@ -88,7 +92,17 @@ impl MemberRequests {
         if let Some((older, granted)) = older {
             granted.refuse(cx, name, older, RefuseReason::Limit);
         }
-        if self.asked.len() >= self.max {
+        let is_holder = |asked: &GrantedSink| asked.peer.invitation.is_some();
+        let holders = self.asked.values().filter(|asked| is_holder(asked)).count();
+        if is_holder(&asked) {
+            let first = self.asked.iter().filter(|(id, asked)| is_holder(asked) && **id != sink);
+            let first = first.min_by_key(|(_, asked)| asked.issued_at).map(|(id, _)| *id);
+            if let Some(first) = first.filter(|_| holders >= HOLDERS_MAX)
+                && let Some((id, first)) = self.asked.remove_entry(&first)
+            {
+                first.refuse(cx, name, id, RefuseReason::Limit);
+            }
+        } else if self.asked.len() - holders >= self.max {
             cx.refuse(name, sink, 1, RefuseReason::Limit);
             return None;
         }

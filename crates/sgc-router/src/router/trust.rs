@@ -128,12 +128,11 @@ impl Router {
                 | CertError::CaExpired { .. }
                 | CertError::Revoked { .. },
             ) => true,
-            // Another router may trust another CA.
-            SignedError::Cert(CertError::UnknownIssuer) => from_router,
+            // Another router may trust another CA, or be of a version before there were invitations.
+            SignedError::Cert(CertError::UnknownIssuer) | SignedError::Invited => from_router,
             SignedError::Cert(_)
             | SignedError::Signature(_)
             | SignedError::Decode(_)
-            | SignedError::Invited
             | SignedError::Sequence { .. } => false,
         };
         // These two cost no verification, and a router may well bring many of them.

@@ -414,6 +414,10 @@ impl Topology {
         }
         self.originated = Some(now.instant);
         self.originate_at = Some(now.instant + LEASE / 3);
+        // Nobody believes the holder of an invitation, and nobody looks for it.
+        if identity.as_peer().invitation.is_some() {
+            return false;
+        }
         self.own_seq = next_seq(self.own_seq, now.unix);
         let (routers, attached) = neighbours();
         let body = LinkStateBody {

@@ -1,5 +1,6 @@
 //! `sgc fleet invite`: makes a code with which a machine becomes a node by itself.
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -120,9 +121,9 @@ fn routers_here(socket: Option<PathBuf>) -> Result<Vec<String>, CliError> {
     let asked = || -> Result<Vec<String>, CliError> {
         let socket = node::socket(None, None, socket.as_deref())?;
         let graph = ask::graph(&socket, None)?;
-        let mut routers: Vec<_> = graph.routers.into_iter().map(|router| router.router).collect();
-        routers.dedup();
-        Ok(routers)
+        let mut seen = BTreeSet::new();
+        let routers = graph.routers.into_iter().map(|router| router.router);
+        Ok(routers.filter(|url| seen.insert(url.clone())).collect())
     };
     asked().map_err(|why| {
         let why = match why {

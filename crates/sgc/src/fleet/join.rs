@@ -3,18 +3,26 @@
 //! A node with the certificate of the invitation runs in this process for as long as it takes to ask the authority. So
 //! routers are found and dialled as they will be by the node itself.
 
-use std::io::{IsTerminal as _, Read as _};
-use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _, chown};
+use std::convert::Infallible;
+use std::fmt;
+use std::io::{BufRead as _, IsTerminal as _, Read as _};
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
 use clap::Args;
 use sgc_diagnosis::{DiagnosisError, ask};
 use sgc_node::config::{ArgsConfig, Config, load_args};
 use sgc_node::graph::Graph;
 use sgc_node::{NodeError, RunOptions};
-use sgc_process::{ProcessError, system_rng, unix_now};
-use sgc_trust::{INVITATION_TEXT_BYTES_MAX, Identity, Invitation, KeyRequest, Membership};
+use sgc_process::{EndSignals, ProcessError, system_rng, unix_now};
+use sgc_trust::{
+    INVITATION_TEXT_BYTES_MAX, Identity, Invitation, Kem, KeyRequest, Membership, NodeName, ReplyKey,
+    name_of, operations_blind,
+};
+use sgc_wire::{GrantContent, Operation, OperationAnswer, REDEEM_SINK};
 use tokio::sync::oneshot;
 use zeroize::Zeroizing;
 
@@ -22,7 +30,8 @@ use super::remote::Remote;
 use super::{millis, parse_span};
 use crate::environment::environment;
 use crate::error::CliError;
-use crate::files::{self, Existing};
+use crate::files::{self, Existing, PUBLIC_MODE, PendingFile, SECRET_MODE};
+use crate::name::toml_string;
 use crate::output;
 
 /// Time for which a router is looked for.
@@ -41,8 +50,9 @@ const SERVICE_CONFIG: &str = "/etc/sgc";
 /// configuration to begin with unless there is one.
 #[derive(Debug, Args)]
 pub(crate) struct JoinArgs {
-    /// The code; without it, it is read from standard input, so that it stays out of the history of the shell
-    code: Option<String>,
+    /// The code; without it, it is read from standard input. Then it is in no history of the shell, and other users do
+    /// not see it among the processes
+    code: Option<Code>,
     /// Directory for the two files
     #[arg(long, value_name = "DIR", default_value = ".", conflicts_with = "service")]
     dir: PathBuf,
@@ -60,49 +70,71 @@ pub(crate) struct JoinArgs {
     force: bool,
 }
 
+/// A code as the user gave it. Debug shows nothing.
+#[derive(Clone)]
+struct Code(Zeroizing<String>);
+
+impl fmt::Debug for Code {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Code(..)")
+    }
+}
+
+impl FromStr for Code {
+    type Err = Infallible;
+
+    fn from_str(text: &str) -> Result<Self, Infallible> {
+        Ok(Self(Zeroizing::new(text.to_owned())))
+    }
+}
+
 /// Places of the files.
 struct Places {
     identity: PathBuf,
     config: PathBuf,
-    service: Option<String>,
+    service: Option<NodeName>,
 }
 
 /// Runs `sgc join`.
 pub(crate) fn join(args: JoinArgs) -> Result<(), CliError> {
     let code = match args.code {
-        Some(code) => Zeroizing::new(code),
+        Some(Code(code)) => code,
         None => read_code()?,
     };
     let invitation = Invitation::parse(&code).map_err(CliError::Invitation)?;
     check_time(&invitation)?;
-    let places = places(&invitation, &args.dir, args.service)?;
+    let places = places(&invitation, &args.dir, args.service.as_deref())?;
     let existing = match args.force {
         true => Existing::Replace,
         false => Existing::Keep("; --force replaces it"),
     };
-    // Before the invitation is used up.
     if let Existing::Keep(hint) = existing
         && files::exists(&places.identity)
     {
         return Err(ProcessError::Exists { path: places.identity, hint }.into());
     }
-    let routers = match args.router.is_empty() {
-        true => invitation.routers.clone(),
-        false => args.router,
+    // The code is used up once the authority has answered, so both files are begun before.
+    let identity_file = PendingFile::begin(&places.identity)?;
+    if places.service.is_some() {
+        identity_file.give_to_owner_of_directory()?;
+    }
+    let config_file = match files::exists(&places.config) {
+        true => None,
+        false => Some(PendingFile::begin(&places.config)?),
     };
+    let routers = if args.router.is_empty() { &invitation.routers } else { &args.router };
+    let from = if args.router.is_empty() { "the code" } else { "--router" };
     let key = KeyRequest::generate(None, &mut system_rng()?).map_err(CliError::Making)?;
-    let member = ask_authority(&invitation, &routers, key.csr(), args.wait.unwrap_or(WAIT_DEFAULT))?;
+    let wait = args.wait.unwrap_or(WAIT_DEFAULT);
+    let member = ask_authority(&invitation, (routers, from), &key, wait)?;
     let is_router = member.is_router();
     let identity = Identity::join(member, key.key(), &mut system_rng()?)
         .map_err(|source| CliError::Identity { path: places.identity.clone(), source })?;
-    files::write_secret(&places.identity, &identity.to_text(), existing)?;
-    if places.service.is_some() {
-        give_to_service(&places.identity)?;
-    }
-    let is_new = !files::exists(&places.config);
-    if is_new {
-        let text = config_text(&identity, &places, &routers, is_router);
-        files::write_public(&places.config, text.as_bytes())?;
+    identity_file.commit(identity.to_text().as_bytes(), SECRET_MODE, existing)?;
+    let is_new = config_file.is_some();
+    if let Some(file) = config_file {
+        let text = config_text(&identity, &places, routers, is_router);
+        file.commit(text.as_bytes(), PUBLIC_MODE, Existing::Keep(""))?;
     }
     output::line(joined_text(&identity, &places, is_new))
 }
@@ -112,12 +144,14 @@ fn read_code() -> Result<Zeroizing<String>, CliError> {
     let stdin = std::io::stdin();
     let unreadable =
         |source| CliError::from(ProcessError::Read { path: PathBuf::from("standard input"), source });
-    let mut code = Zeroizing::new(String::with_capacity(INVITATION_TEXT_BYTES_MAX));
+    let mut code = Zeroizing::new(String::with_capacity(INVITATION_TEXT_BYTES_MAX + 1));
+    // One more than a code can have, so that a longer text is called too long and not mistyped.
+    let mut input = stdin.lock().take(INVITATION_TEXT_BYTES_MAX as u64 + 1);
     if stdin.is_terminal() {
         output::diagnostic("Code of `sgc fleet invite`:");
-        stdin.read_line(&mut code).map_err(unreadable)?;
+        input.read_line(&mut code).map_err(unreadable)?;
     } else {
-        stdin.take(INVITATION_TEXT_BYTES_MAX as u64).read_to_string(&mut code).map_err(unreadable)?;
+        input.read_to_string(&mut code).map_err(unreadable)?;
     }
     Ok(code)
 }
@@ -139,13 +173,14 @@ fn check_time(invitation: &Invitation) -> Result<(), CliError> {
     Ok(())
 }
 
-fn places(invitation: &Invitation, dir: &Path, service: Option<String>) -> Result<Places, CliError> {
+fn places(invitation: &Invitation, dir: &Path, service: Option<&str>) -> Result<Places, CliError> {
     let node = &invitation.node;
     let Some(service) = service else {
         let place = |name: String| if dir == Path::new(".") { PathBuf::from(name) } else { dir.join(name) };
         let (identity, config) = (place(format!("{node}.identity")), place(format!("{node}.toml")));
         return Ok(Places { identity, config, service: None });
     };
+    let service: NodeName = service.parse()?;
     let (state, configs) = (Path::new(SERVICE_STATE), Path::new(SERVICE_CONFIG));
     if !state.is_dir() || !configs.is_dir() {
         return Err(cannot(format!(
@@ -158,104 +193,158 @@ fn places(invitation: &Invitation, dir: &Path, service: Option<String>) -> Resul
     Ok(Places { identity, config, service: Some(service) })
 }
 
-/// Gives a file of root to the user of its directory, as which the service runs.
-fn give_to_service(path: &Path) -> Result<(), CliError> {
-    let failed = |source| ProcessError::Write { path: path.to_owned(), source };
-    let dir = std::fs::metadata(SERVICE_STATE).map_err(failed)?;
-    chown(path, Some(dir.uid()), Some(dir.gid())).map_err(failed)?;
-    Ok(())
-}
-
-/// Runs a node with the certificate of the invitation until the authority has answered.
+/// Runs a node with the certificate of the invitation until the authority has answered. `from` names the place where
+/// the routers are written.
 fn ask_authority(
     invitation: &Invitation,
-    routers: &[String],
-    csr: &[u8],
+    (routers, from): (&[String], &str),
+    key: &KeyRequest,
     wait: Duration,
 ) -> Result<Membership, CliError> {
     let private = std::fs::Permissions::from_mode(0o700);
     let dir = tempfile::Builder::new().prefix("sgc-join-").permissions(private).tempdir();
     let dir = dir.map_err(|source| ProcessError::System { what: "cannot make a directory", source })?;
+    let holder = invitation.identity(&mut system_rng()?).map_err(CliError::Invitation)?;
     let identity = dir.path().join("invitation.identity");
-    let guest = invitation.identity(&mut system_rng()?).map_err(CliError::Invitation)?;
-    files::write_secret(&identity, &guest.to_text(), Existing::Replace)?;
+    files::write_secret(&identity, &holder.to_text(), Existing::Replace)?;
     let arguments =
         ArgsConfig { identity: Some(identity), routers: routers.to_vec(), ..ArgsConfig::default() };
     let config = load_args(&arguments, &environment)
-        .map_err(|errors| CliError::Config { what: "the code".to_owned(), errors })?;
+        .map_err(|errors| CliError::Config { what: from.to_owned(), errors })?;
     let socket = dir.path().join("node.sock");
     let config = Config { admin_socket: Some(socket.clone()), state: Some(dir.path().to_owned()), ..config };
+    let question = Question::new(invitation, &holder, routers, key, socket);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
         .map_err(|source| ProcessError::System { what: "cannot start threads", source })?;
-    let (ready, when_ready) = oneshot::channel();
-    let (stop, stopped) = oneshot::channel::<()>();
-    let options = RunOptions { ready: Some(ready), ..RunOptions::default() };
-    let node = runtime.spawn(sgc_node::run(config, options, async move { drop(stopped.await) }));
-    let answer = match runtime.block_on(when_ready) {
-        Ok(_) => {
-            let remote = Remote::new(invitation.authority.clone(), socket.clone());
-            wait_for_link(&socket, routers, wait).and_then(|()| remote.redeem(csr))
+    let result = runtime.block_on(async {
+        // The directory has the key of the code, so a signal must not leave it behind.
+        let mut signals = EndSignals::new()?;
+        let (ready, when_ready) = oneshot::channel();
+        let (stop, stopped) = oneshot::channel::<()>();
+        let options = RunOptions { ready: Some(ready), ..RunOptions::default() };
+        let node = tokio::spawn(sgc_node::run(config, options, async move { drop(stopped.await) }));
+        let answer = async {
+            if when_ready.await.is_err() {
+                return None;
+            }
+            Some(tokio::task::spawn_blocking(move || question.ask(wait)).await)
+        };
+        let answer = tokio::select! {
+            answer = answer => answer,
+            () = signals.next() => {
+                return Err(failed("interrupted: the code stays good unless the authority has answered".to_owned()));
+            }
+        };
+        drop(stop);
+        match node.await {
+            Ok(Err(error)) => Err(CliError::Node(error)),
+            Err(_) => Err(CliError::Node(NodeError::Panicked)),
+            Ok(Ok(())) => match answer {
+                Some(Ok(answer)) => answer,
+                Some(Err(_)) | None => Err(CliError::Node(NodeError::Panicked)),
+            },
         }
-        // The node ended, which says why.
-        Err(_) => Err(failed("the node that asks the authority did not start".to_owned())),
-    };
-    drop(stop);
-    let ended = runtime.block_on(node);
+    });
     runtime.shutdown_timeout(RUNTIME_GRACE);
-    match ended {
-        Ok(Err(error)) => Err(CliError::Node(error)),
-        Err(_) => Err(CliError::Node(NodeError::Panicked)),
-        Ok(Ok(())) => answer,
-    }
+    result
 }
 
-/// Waits until the node in this process has a link.
-fn wait_for_link(socket: &Path, routers: &[String], wait: Duration) -> Result<(), CliError> {
-    let until = Instant::now() + wait;
-    loop {
-        let graph: Graph = ask::graph(socket, None)?;
-        if !graph.links.is_empty() {
-            return Ok(());
+/// The question to the authority.
+struct Question {
+    remote: Remote,
+    socket: PathBuf,
+    routers: Vec<String>,
+    operation: Operation,
+    /// Name at which the authority is asked.
+    name: sgc_wire::Name,
+    reply_key: ReplyKey,
+}
+
+impl Question {
+    fn new(
+        invitation: &Invitation,
+        holder: &Identity,
+        routers: &[String],
+        key: &KeyRequest,
+        socket: PathBuf,
+    ) -> Self {
+        let reply_key = ReplyKey::generate(Kem::for_fleet(invitation.post_quantum));
+        let csr = Bytes::copy_from_slice(key.csr());
+        Self {
+            remote: Remote::new(invitation.authority.clone(), socket.clone()),
+            socket,
+            routers: routers.to_vec(),
+            operation: Operation::Redeem { csr, reply_key: reply_key.public().clone() },
+            name: name_of(&invitation.authority_id, &operations_blind(&holder.as_peer().ca)),
+            reply_key,
         }
-        if Instant::now() >= until {
-            let failure = |router: &str| {
-                let search = graph.routers.iter().find(|search| search.router == router);
-                let why = search.and_then(|search| search.last_failure.clone());
-                format!("{router}: {}", why.unwrap_or_else(|| "no answer".to_owned()))
-            };
-            let failures: Vec<_> = routers.iter().map(|router| failure(router)).collect();
-            return Err(failed(format!(
-                "no router within {} s ({}). The code stays good until it is used; --router names another router",
-                millis(wait) / 1000,
-                failures.join("; ")
-            )));
+    }
+
+    /// Asks once there is a link.
+    fn ask(self, wait: Duration) -> Result<Membership, CliError> {
+        self.wait_for_link(wait)?;
+        let OperationAnswer::Sealed { enc, sealed } = self.remote.ask(self.operation)? else {
+            return Err(self.remote.surprised());
+        };
+        match self.reply_key.open(&self.name, &REDEEM_SINK, 0, &enc, &sealed) {
+            Ok(GrantContent::Operation(OperationAnswer::Membership(text))) => {
+                Membership::parse(text.expose()).map_err(|why| self.remote.failed(&why.to_string()))
+            }
+            Ok(_) => Err(self.remote.surprised()),
+            Err(why) => Err(self.remote.failed(&why.to_string())),
         }
-        std::thread::sleep(LOOK_EVERY);
+    }
+
+    /// Waits until the node in this process has a link.
+    fn wait_for_link(&self, wait: Duration) -> Result<(), CliError> {
+        // `None` waits for ever.
+        let until = Instant::now().checked_add(wait);
+        loop {
+            let graph: Graph = ask::graph(&self.socket, None)?;
+            if !graph.links.is_empty() {
+                return Ok(());
+            }
+            if until.is_some_and(|until| Instant::now() >= until) {
+                let failure = |router: &String| {
+                    let search = graph.routers.iter().find(|search| search.router == *router);
+                    let why = search.and_then(|search| search.last_failure.clone());
+                    format!("{router}: {}", why.unwrap_or_else(|| "no answer".to_owned()))
+                };
+                let failures: Vec<_> = self.routers.iter().map(failure).collect();
+                return Err(failed(format!(
+                    "no router within {} s ({}). The code stays good until it is used; --router names another router",
+                    millis(wait) / 1000,
+                    failures.join("; ")
+                )));
+            }
+            std::thread::sleep(LOOK_EVERY);
+        }
     }
 }
 
 fn config_text(identity: &Identity, places: &Places, routers: &[String], is_router: bool) -> String {
     let (node, fleet) = (identity.node_name(), identity.fleet_name());
-    let path = match &places.service {
-        Some(_) => places.identity.clone(),
-        None => places.identity.file_name().map_or_else(|| places.identity.clone(), PathBuf::from),
+    // A relative path is one from the directory of the configuration.
+    let file = match (&places.service, places.identity.file_name()) {
+        (None, Some(name)) => name.to_string_lossy().into_owned(),
+        (Some(_), _) | (None, None) => places.identity.display().to_string(),
     };
-    let name = places.service.as_ref().map(|service| format!("name = {service:?}\n")).unwrap_or_default();
-    let listen = if is_router { "listen = [\"quic://0.0.0.0:7447\"]\n" } else { "" };
-    let rules = match is_router {
-        true => "",
+    let routers: Vec<_> = routers.iter().map(|url| toml_string(url)).collect();
+    let rest = match is_router {
+        true => "[router]\nlisten = [\"quic://0.0.0.0:7447\"]\n",
         false => {
-            "\n# Topics of this machine that others may have:\n#[[share]]\n#topic = \"/camera/image\"\n\
-             #to = [\"desk\"]      # nodes, \"group:NAME\", or \"*\" for every member of the fleet\n\
-             \n# Topics of other nodes to have here:\n#[[use]]\n#from = \"desk\"\n#topic = \"/cmd_vel\"\n"
+            "# Topics of this machine that others may have:\n#[[share]]\n#topic = \"/camera/image\"\n\
+             #to = [\"desk\"]      # nodes, \"group:NAME\", or \"*\" for every member of the fleet\n\n\
+             # Topics of other nodes to have here:\n#[[use]]\n#from = \"desk\"\n#topic = \"/cmd_vel\"\n"
         }
     };
     format!(
-        "# Node {node} of fleet {fleet}. `sgc check` looks for mistakes.\nidentity = {:?}\n\n[node]\n{name}{listen}\
-         routers = {routers:?}\n{rules}",
-        path.display().to_string()
+        "# Node {node} of fleet {fleet}. `sgc check` looks for mistakes.\nidentity = {}\n\n[node]\nrouters = [{}]\n\n\
+         {rest}",
+        toml_string(&file),
+        routers.join(", ")
     )
 }
 

@@ -10,8 +10,8 @@ use serde::Serialize;
 use sgc_node::{LockedFleet, roster_head, roster_row};
 use sgc_process::{ProcessError, system_rng, unix_now};
 use sgc_transport::LinkUrl;
-use sgc_trust::{EnrollRequest, Fleet, NodeName, pem_contents, pem_text};
-use sgc_wire::{RosterPage, RosterRow, UnixMillis};
+use sgc_trust::{EnrollRequest, Fleet, NodeName, is_invitation, pem_contents, pem_text};
+use sgc_wire::{RosterPage, RosterRow, RowCertificate, UnixMillis};
 
 use super::remote::{FleetPlace, Remote};
 use super::{WhichFleet, heard_lists};
@@ -311,11 +311,14 @@ fn role(node: &RosterRow) -> &'static str {
 }
 
 fn state(node: &RosterRow, now: UnixMillis) -> String {
-    match (node.revoked, node.expires) {
-        (Some(at), _) => format!("revoked {at}"),
-        (None, Some(until)) if until < now => format!("expired {until}"),
-        (None, Some(until)) => format!("until {until}"),
-        (None, None) => "expired".to_owned(),
+    let open = |c: &&RowCertificate| is_invitation(&c.serial) && c.revoked.is_none() && c.expires >= now;
+    let invited = node.certificates.iter().filter(open).map(|c| c.expires).max();
+    match (node.revoked, node.expires, invited) {
+        (Some(at), _, _) => format!("revoked {at}"),
+        (None, Some(until), _) if until >= now => format!("until {until}"),
+        (None, _, Some(until)) => format!("invited until {until}"),
+        (None, Some(until), None) => format!("expired {until}"),
+        (None, None, None) => "expired".to_owned(),
     }
 }
 

@@ -6,7 +6,6 @@ use std::time::Duration;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use bytes::Bytes;
 use clap::Args;
 use serde::Deserialize;
 use sgc_diagnosis::{DiagnosisError, ask};
@@ -126,12 +125,8 @@ impl Remote {
         Invitation::parse(text.expose()).map_err(|why| self.failed(&why.to_string()))
     }
 
-    /// Uses the invitation that the node here holds. Returns the identity of the invited node without the key.
-    pub(super) fn redeem(&self, csr: &[u8]) -> Result<Membership, CliError> {
-        self.certify(Operation::Redeem { csr: Bytes::copy_from_slice(csr) })
-    }
-
-    fn ask(&self, operation: Operation) -> Result<OperationAnswer, CliError> {
+    /// Has an operation carried out.
+    pub(super) fn ask(&self, operation: Operation) -> Result<OperationAnswer, CliError> {
         let request = AdminRequest::Operate { at: self.at.clone(), operation };
         let text = Zeroizing::new(ask::ask(&self.socket, &request, ANSWER_MAX)?);
         let answer = match serde_json::from_str(&text) {
@@ -158,11 +153,11 @@ impl Remote {
         }
     }
 
-    fn failed(&self, why: &str) -> CliError {
+    pub(super) fn failed(&self, why: &str) -> CliError {
         DiagnosisError::NotSeen { reason: format!("{} refuses: {why}", self.at) }.into()
     }
 
-    fn surprised(&self) -> CliError {
+    pub(super) fn surprised(&self) -> CliError {
         let reason = format!("the node here or {} is of another version of sgc", self.at);
         DiagnosisError::NotSeen { reason }.into()
     }

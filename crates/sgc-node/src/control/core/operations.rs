@@ -38,7 +38,8 @@ impl<N: RosNetwork> Core<N> {
             return;
         }
         let is_named = own.authority() == Some(authority);
-        let wish = UserOperation { at: at.to_string(), authority, is_named, operation, reply };
+        let is_invited = invited.is_some();
+        let wish = UserOperation { at: at.to_string(), authority, is_named, is_invited, operation, reply };
         self.operations.push(Instant::now(), wish);
         self.next_operation();
     }
@@ -107,11 +108,16 @@ impl<N: RosNetwork> Core<N> {
                 }
             }
             RequestStep::NotPermitted => {
+                let (what, reason) = match peer.invitation {
+                    None => ("which is no operator", "an operation: it is no operator"),
+                    Some(_) => {
+                        ("which only holds an invitation", "an operation: it only holds an invitation")
+                    }
+                };
                 if self.control_drops.count_from(NodeDrop::OperationNotPermitted, node) {
                     let node = self.called(&node);
-                    warn!("refused an operation of {node}, which is no operator; counted from here on");
+                    warn!("refused an operation of {node}, {what}; counted from here on");
                 }
-                let reason = "an operation: it is no operator";
                 self.audit.write(AuditRecord::new(AuditEvent::Refused).peer(&node).reason(reason));
                 self.endpoint.answer_operation(now, sink, Err(RefuseReason::NotPermitted));
             }
@@ -129,7 +135,9 @@ impl<N: RosNetwork> Core<N> {
     /// Answers an operation that was carried out or refused, and announces a revocation to everyone.
     pub(super) fn operation_done(&mut self, done: OperationOutcome) {
         info!("{} asked for an operation: {}", self.called(&done.node), done.said);
-        self.audit.write(AuditRecord::new(AuditEvent::Operation).peer(&done.node).reason(&done.said));
+        // Where a node joined, the record is its own: the holder of an invitation may have used up its share.
+        let peer = done.joined.as_ref().unwrap_or(&done.node);
+        self.audit.write(AuditRecord::new(AuditEvent::Operation).peer(peer).reason(&done.said));
         let waits = self.authority.as_mut().and_then(|authority| authority.operation_done(&done));
         if let Some(sink) = waits {
             self.answer_operator(&done.node, sink, done.answer);

@@ -22,6 +22,7 @@ use sgc_wire::{Credentials, NodeId, Now, RefuseReason, RosterRow, SinkId, UnixMi
 use tracing::{error, info, warn};
 
 use crate::admin::report::ReportMember;
+use crate::control::fleet::holders::HOLDERS_WAITING_MAX;
 use crate::control::fleet::operators::{
     OPERATIONS_WAITING_MAX, OperationJob, OperationOutcome, Operators, RequestStep, roster_row,
 };
@@ -145,7 +146,12 @@ impl DeskQueue {
 
     /// Queues an operation unless too many wait: then it is returned.
     fn push_or_return(&mut self, job: OperationJob) -> Option<OperationJob> {
-        if self.operations.len() >= OPERATIONS_WAITING_MAX {
+        let holders = self.operations.iter().filter(|waiting| waiting.is_of_holder()).count();
+        let is_full = match job.is_of_holder() {
+            true => holders >= HOLDERS_WAITING_MAX,
+            false => self.operations.len().saturating_sub(holders) >= OPERATIONS_WAITING_MAX,
+        };
+        if is_full {
             return Some(job);
         }
         self.operations.push_back(job);
@@ -505,7 +511,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
 
     use sgc_trust::{EnrollRequest, Identity, KeyRequest, NodeName, pem_contents};
-    use sgc_wire::UnixMillis;
+    use sgc_wire::{Encode as _, Operation, OperationAnswer, OperationRequest, UnixMillis};
 
     use super::*;
     use crate::state;
@@ -637,6 +643,44 @@ mod tests {
             locked.save().unwrap();
             identity
         }
+    }
+
+    #[test]
+    fn requests_of_holders_of_invitations_leave_the_queue_to_operators() {
+        let bench = Bench::new();
+        let desk = bench.enroll("desk");
+        let mut locked = LockedFleet::open(&bench.file()).unwrap();
+        locked.fleet.set_authority(Some("keeper".parse().unwrap()), now().unix).unwrap();
+        let nodes = [desk.node_id()].into();
+        let mut operators = Operators::new(Grantees { nodes, ..Grantees::default() });
+        let mut rng = OsRng.unwrap_err();
+        let mut queue = DeskQueue::default();
+        let mut push = |peer: &VerifiedPeer, operation: Operation| {
+            let (at, sink) = (Instant::now(), SinkId([1; 16]));
+            let asked = operators.ask(at, peer, sink, &OperationRequest::Challenge.to_bytes(), &mut rng);
+            let RequestStep::Answer(OperationAnswer::Challenge(challenge)) = asked else {
+                panic!("{asked:?}")
+            };
+            let execute = OperationRequest::Execute { challenge, operation };
+            let asked = operators.ask(at, peer, sink, &execute.to_bytes(), &mut rng);
+            let RequestStep::Job(job) = asked else { panic!("{asked:?}") };
+            match queue.push_or_return(job) {
+                Some(job) => operators.done(&job.busy()).is_none(),
+                None => true,
+            }
+        };
+        let mut taken = 0;
+        for n in 0..2 * HOLDERS_WAITING_MAX {
+            let node = EnrollRequest::new(format!("arm-{n}").parse().unwrap(), now().unix);
+            let (hour, routers) = (Duration::from_secs(3600), vec!["quic://hub:1".to_owned()]);
+            let code = locked.fleet.invite(&node, hour, routers, &mut OsRng.unwrap_err()).unwrap();
+            let holder = code.identity(&mut OsRng.unwrap_err()).unwrap();
+            let redeem = Operation::Redeem { csr: Bytes::new(), reply_key: Bytes::new() };
+            taken += usize::from(push(holder.as_peer(), redeem));
+        }
+        assert_eq!(taken, HOLDERS_WAITING_MAX);
+        let mut list = || push(desk.as_peer(), Operation::List { after: None });
+        assert!((0..OPERATIONS_WAITING_MAX).all(|_| list()) && !list());
     }
 
     #[test]

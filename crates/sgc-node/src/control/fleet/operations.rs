@@ -31,8 +31,8 @@ pub enum OperationError {
     Full,
     /// The authority is out of reach.
     #[error(
-        "no authority {at} is in reach of this node{hint}: it has to run, with `operators` in its [authority], and the \
-         fleet's file names it by exactly that name (`sgc status` shows the links of this node)"
+        "no authority {at} is in reach of this node{hint}: it has to run, with the fleet's file in its [authority], and \
+         that file names it by exactly that name (`sgc status` shows the links of this node)"
     )]
     NotFound {
         /// The name.
@@ -71,9 +71,41 @@ pub enum OperationError {
         /// The authority.
         at: String,
     },
+    /// The authority that would redeem the invitation of this node is out of reach.
+    #[error("no authority {at} is in reach: its node has to run. The code stays good")]
+    AuthorityAway {
+        /// The authority.
+        at: String,
+    },
+    /// The authority is of a version before there were invitations.
+    #[error("{at} takes no codes: it is of an earlier version")]
+    NoInvitations {
+        /// The authority.
+        at: String,
+    },
+    /// The authority may have redeemed the invitation of this node.
+    #[error(
+        "{at} has not answered in time, or was restarted meanwhile: the code may be used up. Try it once more"
+    )]
+    MaybeJoined {
+        /// The authority.
+        at: String,
+    },
     /// The node stops.
     #[error("the node is stopping")]
     Stopping,
+}
+
+impl OperationError {
+    /// Returns the error in the words of the holder of an invitation.
+    fn of_holder(self) -> Self {
+        match self {
+            Self::NotFound { at, .. } => Self::AuthorityAway { at },
+            Self::NotOperator { at } => Self::NoInvitations { at },
+            Self::OutcomeUnknown { at } => Self::MaybeJoined { at },
+            other => other,
+        }
+    }
 }
 
 /// An operation that a user requests.
@@ -84,6 +116,8 @@ pub(crate) struct UserOperation {
     pub(crate) authority: NodeId,
     /// Whether this node's identity names that authority.
     pub(crate) is_named: bool,
+    /// Whether this node holds an invitation.
+    pub(crate) is_invited: bool,
     pub(crate) operation: Operation,
     pub(crate) reply: oneshot::Sender<Result<OperationAnswer, OperationError>>,
 }
@@ -232,6 +266,10 @@ impl Operations {
 
     fn end(&mut self, result: Result<OperationAnswer, OperationError>) -> Option<Step> {
         let Current { operation_request, name, .. } = self.current.take()?;
+        let result = match operation_request.is_invited {
+            true => result.map_err(OperationError::of_holder),
+            false => result,
+        };
         let _ = operation_request.reply.send(result);
         name.map(Step::Leave)
     }
@@ -267,8 +305,14 @@ mod tests {
     fn operation_request() -> (UserOperation, Reply) {
         let (reply, replied) = oneshot::channel();
         let at = "keeper".to_owned();
-        let operation_request =
-            UserOperation { at, authority: KEEPER, is_named: true, operation: list(), reply };
+        let operation_request = UserOperation {
+            at,
+            authority: KEEPER,
+            is_named: true,
+            is_invited: false,
+            operation: list(),
+            reply,
+        };
         (operation_request, replied)
     }
 

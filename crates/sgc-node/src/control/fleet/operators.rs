@@ -1,4 +1,5 @@
-//! Operations that a fleet's authority carries out for operators: revoke, enrol, renew, list.
+//! Operations that a fleet's authority carries out: for operators list, revoke, enrol, renew and invite, and for
+//! holders of invitations redeem.
 //!
 //! A request is a join, so its author is known by its certificate. A router could repeat it, so each operation names a
 //! challenge that this run of the authority gave the same node, and is carried out once. A repeated request gets the
@@ -10,13 +11,17 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use rand_core::{OsRng, RngCore, TryRngCore as _};
-use sgc_trust::{EnrollRequest, Fleet, FleetError, Grantees, Membership, NodeName, RosterNode, VerifiedPeer};
+use sgc_trust::{
+    EnrollRequest, Fleet, FleetError, Grantees, Kem, Membership, NodeName, RosterNode, VerifiedPeer, name_of,
+    operations_blind, seal_grant,
+};
 use sgc_wire::{
-    Challenge, Decode as _, Encode as _, NodeId, Operation, OperationAnswer, OperationRefusal,
-    OperationRequest, REFUSAL_DETAIL_BYTES_MAX, ROSTER_ROWS_MAX, ROW_CERTIFICATES_MAX, RosterPage, RosterRow,
-    RowCertificate, SecretText, SinkId, UnixMillis,
+    Challenge, Decode as _, Encode as _, GrantContent, NodeId, Operation, OperationAnswer, OperationRefusal,
+    OperationRequest, REDEEM_SINK, REFUSAL_DETAIL_BYTES_MAX, ROSTER_ROWS_MAX, ROW_CERTIFICATES_MAX,
+    RosterPage, RosterRow, RowCertificate, SecretText, SinkId, UnixMillis,
 };
 
+use crate::control::fleet::holders::{Attempts, HOLDER_CHALLENGES_MAX};
 use crate::state::fleet_file::{FleetFileError, LockedFleet, read_fleet};
 
 /// Most operations that wait for the fleet file.
@@ -27,7 +32,7 @@ const CHALLENGES_PER_NODE_MAX: usize = 4;
 const CHALLENGES_MAX: usize = 256;
 /// Validity of a challenge.
 const CHALLENGE_TIME: Duration = Duration::from_secs(60);
-/// Most operations whose answers are remembered. It exceeds the number that may wait, so that none under way is
+/// Most operations whose answers are remembered: as many as may be under way and wait together. None under way is
 /// forgotten.
 const EXECUTED_MAX: usize = 2 * OPERATIONS_WAITING_MAX;
 /// Most bytes of the rows in one page of a roster.
@@ -44,7 +49,7 @@ pub(crate) enum RequestStep {
     Job(OperationJob),
     /// The operation is under way. Its answer goes to the sink that asked last.
     UnderWay,
-    /// The node is no operator.
+    /// The node is no operator, or as the holder of an invitation may not ask for this.
     NotPermitted,
 }
 
@@ -74,6 +79,8 @@ pub(crate) struct OperationOutcome {
     pub(crate) answer: OperationAnswer,
     /// The resulting revocation list, DER.
     pub(crate) list: Option<Vec<u8>>,
+    /// The node that joined.
+    pub(crate) joined: Option<NodeId>,
 }
 
 /// Operators of a fleet, with their challenges and operations.
@@ -84,12 +91,16 @@ pub(crate) struct Operators {
     challenges: VecDeque<ChallengeRecord>,
     /// Operations, the oldest first.
     executed: VecDeque<ExecutionRecord>,
+    /// Requests of holders of invitations.
+    attempts: Attempts,
 }
 
 #[derive(Debug)]
 struct ChallengeRecord {
     challenge: Challenge,
     node: NodeId,
+    /// Whether the node holds an invitation.
+    is_holder: bool,
     until: Instant,
 }
 
@@ -107,7 +118,8 @@ struct ExecutionRecord {
 impl Operators {
     /// Creates the state of an authority with these operators.
     pub(crate) fn new(permitted: Grantees) -> Self {
-        Self { permitted, challenges: VecDeque::new(), executed: VecDeque::new() }
+        let (challenges, executed) = (VecDeque::new(), VecDeque::new());
+        Self { permitted, challenges, executed, attempts: Attempts::default() }
     }
 
     /// Judges a request.
@@ -124,7 +136,7 @@ impl Operators {
         }
         self.challenges.retain(|issued| now < issued.until);
         match OperationRequest::from_slice(request) {
-            Ok(OperationRequest::Challenge) => RequestStep::Answer(self.challenge(now, peer.node_id, rng)),
+            Ok(OperationRequest::Challenge) => RequestStep::Answer(self.challenge(now, peer, rng)),
             Ok(OperationRequest::Execute { challenge, operation }) => {
                 // The holder of an invitation may redeem it, and do nothing else; and nobody else may.
                 if matches!(operation, Operation::Redeem { .. }) != peer.invitation.is_some() {
@@ -136,18 +148,33 @@ impl Operators {
         }
     }
 
-    fn challenge(&mut self, now: Instant, node: NodeId, rng: &mut impl RngCore) -> OperationAnswer {
-        if self.challenges.iter().filter(|issued| issued.node == node).count() >= CHALLENGES_PER_NODE_MAX
-            && let Some(oldest) = self.challenges.iter().position(|issued| issued.node == node)
-        {
+    fn challenge(&mut self, now: Instant, peer: &VerifiedPeer, rng: &mut impl RngCore) -> OperationAnswer {
+        let (node, is_holder) = (peer.node_id, peer.invitation.is_some());
+        let is_own = |issued: &ChallengeRecord| issued.node == node;
+        let has_all =
+            self.challenges.iter().filter(|issued| is_own(issued)).count() >= CHALLENGES_PER_NODE_MAX;
+        let holders = self.challenges.iter().filter(|issued| issued.is_holder).count();
+        let oldest = match (has_all, is_holder) {
+            (true, _) => self.challenges.iter().position(is_own),
+            (false, true) if holders >= HOLDER_CHALLENGES_MAX => {
+                self.challenges.iter().position(|issued| issued.is_holder)
+            }
+            (false, _) => None,
+        };
+        if let Some(oldest) = oldest {
             self.challenges.remove(oldest);
         }
-        if self.challenges.len() >= CHALLENGES_MAX {
+        if !is_holder && self.challenges.len().saturating_sub(holders) >= CHALLENGES_MAX {
             return refused(OperationRefusal::Busy, "");
         }
         let mut challenge = Challenge([0; 16]);
         rng.fill_bytes(&mut challenge.0);
-        self.challenges.push_back(ChallengeRecord { challenge, node, until: now + CHALLENGE_TIME });
+        self.challenges.push_back(ChallengeRecord {
+            challenge,
+            node,
+            is_holder,
+            until: now + CHALLENGE_TIME,
+        });
         OperationAnswer::Challenge(challenge)
     }
 
@@ -171,8 +198,17 @@ impl Operators {
             return RequestStep::Answer(refused(OperationRefusal::Stale, ""));
         };
         self.challenges.remove(issued);
+        if peer.invitation.is_some() && !self.attempts.count(node) {
+            return RequestStep::Answer(refused(
+                OperationRefusal::Busy,
+                "too many attempts with this invitation",
+            ));
+        }
         if self.executed.len() >= EXECUTED_MAX {
-            self.executed.pop_front();
+            let Some(answered) = self.executed.iter().position(|e| e.answer.is_some()) else {
+                return RequestStep::Answer(refused(OperationRefusal::Busy, ""));
+            };
+            self.executed.remove(answered);
         }
         let (answer, doing) = (None, operation.clone());
         self.executed.push_back(ExecutionRecord { challenge, node, operation: doing, sink, answer });
@@ -188,9 +224,14 @@ impl Operators {
 }
 
 impl OperationJob {
+    /// Returns `true` if the holder of an invitation asks.
+    pub(crate) fn is_of_holder(&self) -> bool {
+        self.peer.invitation.is_some()
+    }
+
     /// Returns the outcome of an operation that cannot be queued.
     pub(crate) fn busy(self) -> OperationOutcome {
-        self.end(refused(OperationRefusal::Busy, ""), None)
+        self.end(Done::new(refused(OperationRefusal::Busy, "")))
     }
 
     /// Carries the operation out. Blocks on the fleet file. `own` is the authority, `seen` the times at which members
@@ -203,24 +244,25 @@ impl OperationJob {
         now: UnixMillis,
     ) -> OperationOutcome {
         let done = match &self.operation {
-            Operation::List { after } => list(file, after.as_deref(), seen).map(|answer| (answer, None)),
-            Operation::Revoke { nodes } => {
-                revoke(file, own, nodes, now).map(|(answer, list)| (answer, Some(list)))
+            Operation::List { after } => list(file, after.as_deref(), seen).map(Done::new),
+            Operation::Revoke { nodes } => revoke(file, own, nodes, now),
+            Operation::Enroll { .. } | Operation::Renew { .. } => {
+                certify(file, &self.operation, now).map(Done::new)
             }
-            Operation::Enroll { .. } | Operation::Renew { .. } | Operation::Redeem { .. } => {
-                certify(file, &self.peer, &self.operation, now).map(|answer| (answer, None))
-            }
-            Operation::Invite { .. } => invite(file, &self.operation, now).map(|answer| (answer, None)),
+            Operation::Redeem { csr, reply_key } => redeem(file, own, &self.peer, (csr, reply_key), now),
+            Operation::Invite { .. } => invite(file, &self.operation, now).map(Done::new),
         };
-        match done {
-            Ok((answer, list)) => self.end(answer, list),
-            Err(why) => self.end(why.into(), None),
-        }
+        let done = done.unwrap_or_else(|why| match why {
+            // A stranger learns nothing of this machine.
+            Failure::File(_) if self.is_of_holder() => Done::new(refused(OperationRefusal::File, "")),
+            why => Done::new(why.into()),
+        });
+        self.end(done)
     }
 
-    fn end(self, answer: OperationAnswer, list: Option<Vec<u8>>) -> OperationOutcome {
+    fn end(self, Done { answer, list, joined }: Done) -> OperationOutcome {
         let Self { challenge, peer, operation } = self;
-        let requester = peer.node_id;
+        let node = peer.node_id;
         let outcome = match &answer {
             OperationAnswer::Refused { why, detail } if detail.is_empty() => format!("refused: {why}"),
             OperationAnswer::Refused { detail, .. } => format!("refused: {detail}"),
@@ -232,17 +274,28 @@ impl OperationJob {
             Operation::Enroll { node, .. } => format!("enroll {node}"),
             Operation::Renew { node, .. } => format!("renew {node}"),
             Operation::Invite { node, .. } => format!("invite {node}"),
-            Operation::Redeem { .. } => match &answer {
-                OperationAnswer::Membership(text) => {
-                    let joined = Membership::parse(text.expose()).ok();
-                    let joined =
-                        joined.map_or_else(String::new, |member| format!(" of {}", member.node_name()));
-                    format!("redeem the invitation{joined}")
-                }
-                _ => "redeem an invitation".to_owned(),
+            Operation::Redeem { .. } => match &joined {
+                Some((name, _)) => format!("redeem the invitation of {name}"),
+                None => "redeem an invitation".to_owned(),
             },
         };
-        OperationOutcome { challenge, node: requester, said: format!("{said}: {outcome}"), answer, list }
+        let joined = joined.map(|(_, id)| id);
+        OperationOutcome { challenge, node, said: format!("{said}: {outcome}"), answer, list, joined }
+    }
+}
+
+/// The result of a job.
+struct Done {
+    answer: OperationAnswer,
+    /// The resulting revocation list, DER.
+    list: Option<Vec<u8>>,
+    /// The node that joined.
+    joined: Option<(NodeName, NodeId)>,
+}
+
+impl Done {
+    fn new(answer: OperationAnswer) -> Self {
+        Self { answer, list: None, joined: None }
     }
 }
 
@@ -294,12 +347,7 @@ fn refused(why: OperationRefusal, detail: impl ToString) -> OperationAnswer {
     OperationAnswer::Refused { why, detail }
 }
 
-fn revoke(
-    file: &Path,
-    own: &NodeId,
-    nodes: &[String],
-    now: UnixMillis,
-) -> Result<(OperationAnswer, Vec<u8>), Failure> {
+fn revoke(file: &Path, own: &NodeId, nodes: &[String], now: UnixMillis) -> Result<Done, Failure> {
     let nodes = nodes.iter().map(|n| n.parse()).collect::<Result<Vec<NodeName>, _>>()?;
     let mut locked = LockedFleet::open(file)?;
     if nodes.iter().any(|node| locked.fleet.node_id_of(node) == *own) {
@@ -308,16 +356,12 @@ fn revoke(
     locked.fleet.revoke(&nodes, now)?;
     let list = locked.fleet.revocation_list(now)?;
     locked.save()?;
-    Ok((OperationAnswer::Revoked { list: locked.fleet.crl_number() }, list))
+    let answer = OperationAnswer::Revoked { list: locked.fleet.crl_number() };
+    Ok(Done { list: Some(list), ..Done::new(answer) })
 }
 
-/// Enrols a node, renews it, or redeems its invitation. The file has the certificate before the answer leaves.
-fn certify(
-    file: &Path,
-    peer: &VerifiedPeer,
-    operation: &Operation,
-    now: UnixMillis,
-) -> Result<OperationAnswer, Failure> {
+/// Enrols or renews. The file has the certificate before the answer leaves.
+fn certify(file: &Path, operation: &Operation, now: UnixMillis) -> Result<OperationAnswer, Failure> {
     let mut rng = OsRng.unwrap_err();
     let mut locked = LockedFleet::open(file)?;
     let member: Membership = match operation {
@@ -333,13 +377,39 @@ fn certify(
             let valid = Duration::from_millis(*valid_ms);
             locked.fleet.renew_member(csr, &node.parse()?, valid, now, &mut rng)?
         }
-        Operation::Redeem { csr } => locked.fleet.redeem(csr, peer, now, &mut rng)?,
-        Operation::List { .. } | Operation::Revoke { .. } | Operation::Invite { .. } => {
+        Operation::List { .. }
+        | Operation::Revoke { .. }
+        | Operation::Redeem { .. }
+        | Operation::Invite { .. } => {
             return Err(Failure::Malformed("it makes no certificate".to_owned()));
         }
     };
     locked.save()?;
     Ok(OperationAnswer::Membership(SecretText::new(member.to_text().to_string())))
+}
+
+/// Redeems an invitation. The file knows that it was used before the answer leaves. The answer is sealed to the key in
+/// the operation: others may hold the same code, and ask again with the same challenge.
+fn redeem(
+    file: &Path,
+    own: &NodeId,
+    peer: &VerifiedPeer,
+    (csr, reply_key): (&[u8], &[u8]),
+    now: UnixMillis,
+) -> Result<Done, Failure> {
+    let mut locked = LockedFleet::open(file)?;
+    if reply_key.len() != Kem::for_fleet(locked.fleet.post_quantum()).reply_key_bytes() {
+        return Err(Failure::Malformed("its reply key is not of the kind that the fleet wants".to_owned()));
+    }
+    let member = locked.fleet.redeem(csr, peer, now, &mut OsRng.unwrap_err())?;
+    let joined = (member.node_name().clone(), locked.fleet.node_id_of(member.node_name()));
+    let text = SecretText::new(member.to_text().to_string());
+    let content = GrantContent::Operation(OperationAnswer::Membership(text));
+    let name = name_of(own, &operations_blind(&peer.ca));
+    let sealed = seal_grant(reply_key, &name, &REDEEM_SINK, 0, &content);
+    let (enc, sealed) = sealed.map_err(|why| Failure::Malformed(why.to_string()))?;
+    locked.save()?;
+    Ok(Done { joined: Some(joined), ..Done::new(OperationAnswer::Sealed { enc, sealed }) })
 }
 
 /// Invites a node. The key in the invitation is of no node, so the authority may make it.
@@ -573,11 +643,73 @@ mod tests {
         }
         assert_eq!(bench.operators.challenges.len(), CHALLENGES_PER_NODE_MAX);
         assert!(is_stale(&bench.ask(false, A, &revoke_guest(first))));
-        for _ in 0..2 * EXECUTED_MAX {
+        let mut jobs = Vec::new();
+        for _ in 0..EXECUTED_MAX {
             let challenge = bench.challenge();
-            assert!(matches!(bench.ask(false, A, &revoke_guest(challenge)), RequestStep::Job(_)));
+            let RequestStep::Job(job) = bench.ask(false, A, &revoke_guest(challenge)) else { panic!("room") };
+            jobs.push(job);
+        }
+        // None under way gives way to another; those that were answered do, the oldest first.
+        let challenge = bench.challenge();
+        assert!(is_busy(&bench.ask(false, A, &revoke_guest(challenge))));
+        let done = jobs.remove(1).busy();
+        assert_eq!(bench.operators.done(&done), Some(A));
+        for _ in 0..10 {
+            let challenge = bench.challenge();
+            let RequestStep::Job(job) = bench.ask(false, A, &revoke_guest(challenge)) else { panic!("room") };
+            assert_eq!(bench.operators.done(&job.busy()), Some(A));
+        }
+        for job in jobs {
+            assert_eq!(bench.operators.done(&job.busy()), Some(A), "it was not forgotten");
         }
         assert_eq!(bench.operators.executed.len(), EXECUTED_MAX);
+    }
+
+    #[test]
+    fn holders_of_invitations_take_nothing_that_operators_need() {
+        let mut bench = Bench::new();
+        let unix = crate::clock::now().unix;
+        let mut locked = LockedFleet::open(&bench.file).unwrap();
+        locked.fleet.set_authority(Some("keeper".parse().unwrap()), unix).unwrap();
+        let mut holder = |n: usize| {
+            let request = EnrollRequest::new(format!("arm-{n}").parse().unwrap(), unix);
+            let (hour, routers) = (Duration::from_secs(3600), vec!["quic://hub:1".to_owned()]);
+            let code = locked.fleet.invite(&request, hour, routers, &mut bench.rng).unwrap();
+            code.identity(&mut bench.rng).unwrap().as_peer().clone()
+        };
+        let holders: Vec<_> = (0..2 * HOLDER_CHALLENGES_MAX).map(&mut holder).collect();
+        locked.save().unwrap();
+        drop(locked);
+        let mut last = Vec::new();
+        for peer in &holders {
+            let asked = bench.operators.ask(
+                bench.now,
+                peer,
+                A,
+                &OperationRequest::Challenge.to_bytes(),
+                &mut bench.rng,
+            );
+            let RequestStep::Answer(OperationAnswer::Challenge(challenge)) = asked else {
+                panic!("{asked:?}")
+            };
+            last.push((peer, challenge));
+        }
+        assert_eq!(bench.operators.challenges.len(), HOLDER_CHALLENGES_MAX);
+        // A holder may redeem and nothing else.
+        let (peer, challenge) = *last.last().unwrap();
+        let list = OperationRequest::Execute { challenge, operation: Operation::List { after: None } };
+        let asked = bench.operators.ask(bench.now, peer, A, &list.to_bytes(), &mut bench.rng);
+        assert_eq!(asked, RequestStep::NotPermitted);
+        // Operators have all of their challenges.
+        for _ in 0..CHALLENGES_PER_NODE_MAX {
+            bench.challenge();
+        }
+        assert_eq!(bench.operators.challenges.len(), HOLDER_CHALLENGES_MAX + CHALLENGES_PER_NODE_MAX);
+    }
+
+    fn is_busy(asked: &RequestStep) -> bool {
+        let RequestStep::Answer(OperationAnswer::Refused { why, .. }) = asked else { return false };
+        *why == OperationRefusal::Busy
     }
 
     #[test]
