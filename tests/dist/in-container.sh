@@ -37,6 +37,7 @@ soon() {
     fail "$what: not within $seconds s"
 }
 is_linked() { sgc status --node robot | grep -qx 'Links:'; }
+is_arm_linked() { sgc status -c /etc/sgc/arm-service.toml | grep -qx 'Links:'; }
 scrape() { python3 -c 'import urllib.request as web; assert b"sgc_links{" in web.urlopen("http://127.0.0.1:9464/metrics", timeout=5).read()'; }
 journal() { journalctl --sync; journalctl --no-pager -u "sgc@$1"; }
 pid() { systemctl show --value -p MainPID "sgc@$1"; }
@@ -50,10 +51,11 @@ if [ ! -e rebooted ]; then
     expect "the version names a commit" grep -qE '^sgc [0-9.]+ \([0-9a-f]+' <(sgc --version)
     expect "completions are installed" bash -c '. /usr/share/bash-completion/completions/sgc && complete -p sgc'
     expect "man pages are installed" test -e /usr/share/man/man1/sgc-run.1.gz
-    expect "a fleet is made" sgc fleet create lab
+    expect "a fleet is made" sgc fleet create lab --authority keeper
     expect "a router is enrolled" sgc fleet enroll router --router
     expect "a robot is enrolled" sgc fleet enroll robot
     expect "a desk is enrolled" sgc fleet enroll desk
+    expect "the authority is enrolled" sgc fleet enroll keeper
     sed 's,tls://0.0.0.0:443,tls://127.0.0.1:443,; s,0.0.0.0,127.0.0.1,' /usr/share/doc/sgc/examples/router.toml >/etc/sgc/router.toml
     sed 's,router.example,127.0.0.1,' /usr/share/doc/sgc/examples/robot.toml >/etc/sgc/robot.toml
     # Its domain reaches the service as a variable.
@@ -67,6 +69,14 @@ domain_id = 32
 [[use]]
 from = "robot"
 topic = "/chatter"
+END
+
+    cat >/etc/sgc/keeper.toml <<'END'
+identity = "/var/lib/sgc/keeper.identity"
+[node]
+routers = ["quic://127.0.0.1:7447"]
+[authority]
+fleet = "/var/lib/sgc/lab.fleet"
 END
 
     # Mistakes first.
@@ -100,6 +110,17 @@ END
         printf 'home = /usr/bin\ninclude-system-site-packages = false\n' >"/ros/$distribution/pyvenv.cfg"
         ln -s "/peers/$distribution/lib" "/peers/$distribution/share" "/ros/$distribution"
     done
+    # A machine joins by a code, as the guide says.
+    install -o sgc -g sgc -m 600 lab.fleet /var/lib/sgc/
+    expect "the authority starts" systemctl start sgc@keeper
+    as sgc sgc fleet invite arm --fleet /var/lib/sgc/lab.fleet --via quic://127.0.0.1:7447 >code || fail "no code"
+    refuse "a user who may not write there keeps the code" "/var/lib/sgc" as stranger sgc join --service arm-service "$(cat code)"
+    expect "root joins by it" sgc join --service arm-service "$(cat code)"
+    expect "the identity is the service's" test "$(stat -c '%U %a' /var/lib/sgc/arm-service.identity)" = "sgc 600"
+    expect "the service starts under another name than the node" systemctl enable --now sgc@arm-service
+    soon "and links" 10 is_arm_linked
+    refuse "the code is used up" "was used" sgc join --dir /root "$(cat code)"
+    expect "it is stopped" systemctl disable --now sgc@arm-service
     expect "a desk starts" systemctl start sgc@desk
     ros 31 jazzy talk 60 >talk.log 2>&1 &
     expect "a message crosses from ROS 2 Jazzy to Kilted" ros 32 kilted hear 40
@@ -151,6 +172,7 @@ expect "the nodes are stopped" test "$(systemctl is-active sgc@robot)" != active
 expect "identities stay" test -e /var/lib/sgc/robot.identity
 expect "it installs again" dpkg -i first.deb
 expect "the nodes start" systemctl start sgc@router sgc@robot
+rm /var/lib/sgc/lab.fleet
 expect "it can be purged" dpkg -P sgc
 expect "identities are gone" test ! -e /var/lib/sgc
 expect "configurations stay" test -e /etc/sgc/robot.toml

@@ -297,7 +297,7 @@ impl<N: RosNetwork> Core<N> {
     fn handle(&mut self, event: CoreEvent) {
         match event {
             CoreEvent::LinkUp { link, url, control, reply } => self.link_up(link, url, control, reply),
-            CoreEvent::LinkDown { id, in_use } => self.link_down(id, in_use),
+            CoreEvent::LinkDown { id, in_use, end } => self.link_down(id, in_use, end),
             CoreEvent::Frame { link, frame: Control::IdentityInUse { place }, .. } => {
                 self.kept_out(link, place)
             }

@@ -56,6 +56,8 @@ pub(crate) enum CoreEvent {
         id: LinkId,
         /// Place of another process with this node's identity, if the peer closed the link for it.
         in_use: Option<String>,
+        /// How it ended, in words.
+        end: Option<String>,
     },
     /// A control frame arrived.
     Frame {

@@ -12,7 +12,7 @@ use sgc_wire::NodeId;
 use tokio::sync::{Semaphore, mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{sleep, sleep_until};
-use tracing::{debug, info, warn};
+use tracing::{debug, warn};
 
 use super::local::Sighting;
 use crate::drops::NodeDrop;
@@ -203,7 +203,7 @@ async fn attempt<H: KeepLink>(
         watch::channel(DialTarget { addresses: addresses.clone(), ..DialTarget::from(url.clone()) });
     let outcome = keeper.keep_link(target, &request, &row).await;
     match &outcome {
-        Outcome::Ended { remote, end } => info!(%remote, "link ended: {end}"),
+        Outcome::Ended { remote, end } => debug!(%remote, "the link ended: {end}"),
         Outcome::Failed(why) => debug!(%url, "a router on the local network: {why}"),
     }
     Attempt { addresses, outcome }

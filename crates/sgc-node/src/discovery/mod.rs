@@ -69,12 +69,12 @@ fn take_note(outcome: &Outcome, backoff: &mut Backoff, row: &StatusRow, rng: &mu
     match outcome {
         Outcome::Ended { remote, end } if place_in_use(end).is_some() => {
             // The control task logs this once, in words for the operator.
-            info!(%remote, "link ended: {end}");
+            debug!(%remote, "the link ended: {end}");
             row.ended(&end.to_string());
             backoff.displaced(now, rng);
         }
         Outcome::Ended { remote, end } => {
-            info!(%remote, "link ended: {end}");
+            debug!(%remote, "the link ended: {end}");
             row.ended(&end.to_string());
             backoff.ended(now, rng);
         }

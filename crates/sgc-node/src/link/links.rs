@@ -107,7 +107,7 @@ impl Drop for AwaitedPlace {
         let (Ok(Some(place)), Ok(runtime)) = (self.place.try_recv(), Handle::try_current()) else { return };
         self.link.close(CloseReason::Goodbye);
         let core = self.core.clone();
-        let down = CoreEvent::LinkDown { id: place.id, in_use: None };
+        let down = CoreEvent::LinkDown { id: place.id, in_use: None, end: None };
         runtime.spawn(async move { core.send(down).await });
     }
 }
@@ -144,7 +144,6 @@ impl ReportedLink {
         let mut place = AwaitedPlace { place: id, link: link.clone(), core: core.clone() };
         let id = match (core.send(up).await, (&mut place.place).await) {
             (Ok(()), Ok(Some(LinkPlace { id, data, inbox }))) => {
-                info!(link = id.0, remote = %link.remote(), peer = %link.peer().node_id.short(), "link is up");
                 let inflow = Inflow::new(&link, id, data, activity);
                 let of_lanes = inflow.clone();
                 lanes.start(move |lane, name| of_lanes.by_lane(lane, name).spawn());
@@ -168,7 +167,7 @@ impl ReportedLink {
         self.lanes.close();
         if let Some(id) = self.id {
             let in_use = place_in_use(&end).map(str::to_owned);
-            let _ = core.send(CoreEvent::LinkDown { id, in_use }).await;
+            let _ = core.send(CoreEvent::LinkDown { id, in_use, end: Some(end.to_string()) }).await;
         }
         end
     }

@@ -194,7 +194,7 @@ impl Renewal<'_> {
             let event = tokio::select! {
                 end = self.current.reported.end(&keeper.core) => {
                     if self.successor.is_some() {
-                        info!(url = %self.current.url, "link ended: {end}");
+                        debug!(url = %self.current.url, "the link ended: {end}");
                     }
                     Event::Closed(self.supervisor.link())
                 }

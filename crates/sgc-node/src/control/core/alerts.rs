@@ -35,7 +35,7 @@ impl<N: RosNetwork> Core<N> {
         let reason = CloseReason::InUse(place.clone());
         self.links.close(link, reason.to_string(), reason);
         if !alive {
-            info!(%link, peer = %node.short(), %remote, %place, "a newer process of the node takes the place of this link");
+            info!(%link, peer = self.called(&node), %remote, %place, "a newer process of the node takes the place of this link");
             return;
         }
         if let Some(holder) = by.and_then(|by| self.links.get(by)) {

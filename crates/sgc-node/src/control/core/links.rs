@@ -8,7 +8,7 @@ use sgc_transport::{AnyLink, CloseReason, Link, LinkUrl};
 use sgc_trust::VerifiedPeer;
 use sgc_wire::{Control, NodeId};
 use tokio::sync::oneshot;
-use tracing::{debug, warn};
+use tracing::{debug, info, warn};
 
 use super::Core;
 use crate::clock::now;
@@ -37,6 +37,7 @@ impl<N: RosNetwork> Core<N> {
         self.audit.write(record.by(url.as_deref().unwrap_or("the peer")));
         let rtt = link.stats().rtt;
         let id = self.links.add(Instant::now(), link.clone(), url, control);
+        info!(link = id.0, %remote, peer = self.called(&link.peer().node_id), "link is up");
         self.control_drops.link_up(id);
         self.data.drops().link_up(id);
         let place = LinkPlace { id, data: self.data.clone(), inbox: self.inbox.share() };
@@ -47,17 +48,19 @@ impl<N: RosNetwork> Core<N> {
             // Its task ended meanwhile, so nobody would report the end of the link.
             debug!(%remote, "the link's task is gone");
             link.close(CloseReason::Goodbye);
-            self.link_down(id, None);
+            self.link_down(id, None, None);
         }
     }
 
     /// Forgets a link. `in_use` is the place of another process with this node's identity, if the peer closed the link
-    /// for it.
-    pub(super) fn link_down(&mut self, id: LinkId, in_use: Option<String>) {
+    /// for it; `end` tells how the link ended.
+    pub(super) fn link_down(&mut self, id: LinkId, in_use: Option<String>, end: Option<String>) {
         self.router.handle_link_down(now(), id);
         self.control_drops.link_down(id);
         self.data.drops().link_down(id);
         if let Some(EndedLink { node, remote, closed_for }) = self.links.remove(id) {
+            let end = end.as_deref().or(closed_for.as_deref()).unwrap_or("its task ended");
+            info!(link = id.0, %remote, peer = self.called(&node), "link ended: {end}");
             let record = AuditRecord::new(AuditEvent::LinkClosed).peer(&node).remote(remote);
             self.audit.write(match closed_for {
                 Some(reason) => record.reason(reason),

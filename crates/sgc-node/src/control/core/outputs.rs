@@ -42,7 +42,7 @@ impl<N: RosNetwork> Core<N> {
                 let is_told =
                     dropped.reason.is_suspicious() || matches!(dropped.reason, DropReason::ListFlood { .. });
                 if first && is_told {
-                    let peer = dropped.peer.map(|p| p.short()).unwrap_or_default();
+                    let peer = dropped.peer.map(|p| self.called(&p)).unwrap_or_default();
                     warn!(link = %dropped.link, peer, reason = %dropped.reason, "control frame refused; counted from here on");
                 } else {
                     debug!(link = %dropped.link, reason = %dropped.reason, "control frame refused");
@@ -65,16 +65,16 @@ impl<N: RosNetwork> Core<N> {
                 let record = AuditRecord::new(AuditEvent::Revoked).peer(&node);
                 self.audit.write(record.remote(remote).reason("its link is cut"));
                 let why = self.certificates.objection(peer, now().unix).unwrap_or(CloseReason::Revoked);
-                info!(%link, peer = %node.short(), "{why}; its link is closed");
+                info!(%link, peer = self.called(&node), "{why}; its link is closed");
                 because = why.to_string();
                 why
             }
             LinkClose::Expired => {
-                info!(%link, peer = %node.short(), "the peer's certificate has ended; its link is closed");
+                info!(%link, peer = self.called(&node), "the peer's certificate has ended; its link is closed");
                 CloseReason::Expired
             }
             LinkClose::TooMany | LinkClose::Forgeries => {
-                warn!(%link, %remote, peer = %node.short(), "{reason}; its link is closed");
+                warn!(%link, %remote, peer = self.called(&node), "{reason}; its link is closed");
                 CloseReason::Denied(because.clone())
             }
             LinkClose::Greeting | LinkClose::Loop => {

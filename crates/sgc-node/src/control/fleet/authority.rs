@@ -445,7 +445,8 @@ impl FleetDesk {
 
 /// Records the certificate of a request if another copy of the file made it. Returns `true` if so.
 fn recognize(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> bool {
-    let peer = request.peer.node_id.short();
+    let node = fleet.node_by_pseudonym(&request.peer.pseudonym);
+    let peer = node.map_or_else(|| request.peer.node_id.short(), |node| node.name.to_string());
     match fleet.recognize(&request.peer, now.unix) {
         Ok(false) => false,
         Ok(true) => {
@@ -483,7 +484,9 @@ fn renew(fleet: &mut Fleet, request: &RenewalRequest, now: Now) -> FleetAnswer {
     match try_renew(fleet, request, now) {
         Ok(found) => found,
         Err(why) => {
-            warn!(peer = %request.peer.node_id.short(), %why, "refused credentials");
+            let node = fleet.node_by_pseudonym(&request.peer.pseudonym);
+            let peer = node.map_or_else(|| request.peer.node_id.short(), |node| node.name.to_string());
+            warn!(%peer, %why, "refused credentials");
             FleetAnswer::refused(RenewalRefusal::from_fleet(&why))
         }
     }
