@@ -50,7 +50,7 @@ trap cleanup EXIT
 
 # The files are of the earlier version, as they are after an upgrade.
 "$old" fleet create lab --authority keeper >/dev/null
-"$old" fleet enroll router --router >/dev/null
+"$old" fleet enroll router --role router >/dev/null 2>&1 || "$old" fleet enroll router --router >/dev/null
 for node in keeper robot desk; do "$old" fleet enroll "$node" >/dev/null; done
 cat >router.toml <<'END'
 identity = "router.identity"

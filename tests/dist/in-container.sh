@@ -52,7 +52,7 @@ if [ ! -e rebooted ]; then
     expect "completions are installed" bash -c '. /usr/share/bash-completion/completions/sgc && complete -p sgc'
     expect "man pages are installed" test -e /usr/share/man/man1/sgc-run.1.gz
     expect "a fleet is made" sgc fleet create lab --authority keeper
-    expect "a router is enrolled" sgc fleet enroll router --router
+    expect "a router is enrolled" sgc fleet enroll router --role router
     expect "a robot is enrolled" sgc fleet enroll robot
     expect "a desk is enrolled" sgc fleet enroll desk
     expect "the authority is enrolled" sgc fleet enroll keeper
@@ -128,9 +128,9 @@ END
     expect "the audit log is found" sgc audit -c /etc/sgc/robot.toml
     expect "also by name" sgc audit --node robot
     expect "sgc check does not mind whose the state is" test -z "$(sgc check -c /etc/sgc/robot.toml | grep 'state directory')"
-    expect "the service's user makes a token" as sgc sgc token create -c /etc/sgc/robot.toml --for test --subscribe /chatter
-    token=$(as sgc sgc token list -c /etc/sgc/robot.toml | awk 'NR == 2 { print $1 }')
-    expect "and revokes it" as sgc sgc token revoke -c /etc/sgc/robot.toml "$token"
+    expect "the service's user makes a token" as sgc sgc token access create -c /etc/sgc/robot.toml --for test --subscribe /chatter
+    token=$(as sgc sgc token access list -c /etc/sgc/robot.toml | awk 'NR == 2 { print $1 }')
+    expect "and revokes it" as sgc sgc token access revoke -c /etc/sgc/robot.toml "$token"
     cp out said
     expect "the running node hears of it" grep -q 'The node that runs knows it' said
     expect "the log has version, node and role in a line" grep -qE 'sgc [0-9.]+ \(.*\): node robot of fleet lab, proxy of ROS domain 31, configured by /etc/sgc/robot.toml' <(journal robot)

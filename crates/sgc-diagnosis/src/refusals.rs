@@ -102,7 +102,7 @@ pub(crate) const CONTROL: &[Refusal] = &[
     named(
         "not_owner",
         "a node that carries nobody else's names announced names of another node",
-        "if it is a router, enroll it with --router or --may-route; else find out what runs there",
+        "if it is a router, enroll it with --role router or --may-route; else find out what runs there",
     ),
     counted("stale", "older than what is known; a few when announcements cross are no fault", ""),
     named(
@@ -140,7 +140,7 @@ pub(crate) const CONTROL: &[Refusal] = &[
     named(
         "not_router",
         "a neighbour says that it carries others' names, and its certificate does not let it: nothing goes through it",
-        "enroll it with --router or --may-route",
+        "enroll it with --role router or --may-route",
     ),
     named(
         "invited",

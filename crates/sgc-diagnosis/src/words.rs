@@ -327,7 +327,7 @@ impl ShareFinding {
                     format!(
                         "if {node} may have it, add it to `to` of this [[share]] (`publish`, if it is to publish), then \
                          `sgc reload`; `sgc policy test` says who may. A node of another fleet needs a token (`sgc \
-                         share-token`)"
+                         token share create`)"
                     )
                 },
                 str::to_owned,
@@ -458,7 +458,7 @@ impl UseFinding {
                 )
             }
             Self::TokenRefused { owner, reason } => refusals::fix_at_asker(reason)
-                .map_or_else(|| format!("ask {owner} for a new token (`sgc share-token`)"), str::to_owned),
+                .map_or_else(|| format!("ask {owner} for a new token (`sgc token share create`)"), str::to_owned),
             Self::TokenUnanswered { owner } => {
                 format!("is {owner} running, and linked to a router that this node is linked to?")
             }

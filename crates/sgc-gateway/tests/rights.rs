@@ -127,7 +127,7 @@ impl Place {
         grant.sign(&self.robot).unwrap().to_text().to_string()
     }
 
-    /// Revokes these tokens, like a reload after `sgc token revoke`.
+    /// Revokes these tokens, like a reload after `sgc token access revoke`.
     fn revoke(&self, numbers: &[u8]) {
         let key = self.robot.certified_key();
         self.server.reconfigure(rules(&self.robot, &self.desk, numbers), Some(&key)).unwrap();

@@ -934,7 +934,7 @@ fn a_member_publishes_on_a_topic_of_another() {
     drop((cloud, robot, desk1));
 }
 
-/// Returns an owner's token for a partner, as `sgc share-token` makes it.
+/// Returns an owner's token for a partner, as `sgc token share` makes it.
 fn token_for(lab: &Lab, topic: &str, partner: &Lab, node: Option<&str>, recorded: bool) -> (ShareToken, u64) {
     let owner = lab.identity("robot");
     let mut share = share(topic, &["desk"]);

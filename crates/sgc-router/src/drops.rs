@@ -102,7 +102,7 @@ pub enum DropReason {
     },
     /// A neighbour claims to be a router without the certificate of one.
     #[error(
-        "says that it carries others' names, but its certificate does not let it: enroll it with --router or --may-route"
+        "says that it carries others' names, but its certificate does not let it: enroll it with --role router or --may-route"
     )]
     NotRouter,
     /// The holder of an invitation asks for another name than that of its fleet's authority.

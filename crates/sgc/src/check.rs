@@ -2,15 +2,17 @@
 //!
 //! It reads the configuration and its identity, and binds no socket.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use clap::Args;
 use sgc_diagnosis::check::summary;
 use sgc_node::config;
+use sgc_process::ProcessError;
 
 use crate::environment::environment;
 use crate::error::CliError;
-use crate::output;
+use crate::{files, output};
 
 /// List all mistakes of a configuration, or describe the node that would run with it. Binds no socket.
 ///
@@ -18,21 +20,44 @@ use crate::output;
 /// readable by its owner alone, belongs to this node, and is valid today.
 #[derive(Debug, Args)]
 pub(crate) struct CheckArgs {
-    /// Configuration file
+    /// Configuration file; without it, the only *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
-    config: PathBuf,
+    config: Option<PathBuf>,
+    /// Print the description as JSON: a list of texts for each heading
+    #[arg(long)]
+    json: bool,
 }
 
 /// Runs `sgc check`.
 pub(crate) fn check(args: &CheckArgs) -> Result<(), CliError> {
-    let what = args.config.display().to_string();
-    let config = config::load(&args.config, &environment)
+    let path = files::config_here(args.config.as_deref())?;
+    let what = path.display().to_string();
+    let config = config::load(&path, &environment)
         .map_err(|errors| CliError::Config { what: what.clone(), errors })?;
     let identity = sgc_node::check_identity(&config)
         .map_err(|source| CliError::CheckIdentity { what: what.clone(), source })?;
+    let summary = summary(&config, &identity, &path, &environment)?;
+    if args.json {
+        return output::line(json(&summary)?);
+    }
     output::line(format!("{what}: no mistakes"))?;
-    for line in output::columns(&summary(&config, &identity, &args.config, &environment)?) {
+    for line in output::columns(&summary) {
         output::line(line)?;
     }
     Ok(())
+}
+
+/// Returns the description as an object with a list of texts for each heading.
+fn json(rows: &[Vec<String>]) -> Result<String, CliError> {
+    let mut all: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    let mut heading = "";
+    for row in rows {
+        let [kind, text] = &row[..] else { continue };
+        // A row without a heading belongs to the one above.
+        if !kind.is_empty() {
+            heading = kind;
+        }
+        all.entry(heading).or_default().push(text);
+    }
+    serde_json::to_string_pretty(&all).map_err(|error| ProcessError::Output(error.into()).into())
 }

@@ -75,6 +75,14 @@ pub(crate) enum CliError {
         /// The cause.
         source: IdentityError,
     },
+    /// A command or option under its earlier name.
+    #[error("`{old}` has another name now: {new}")]
+    Moved {
+        /// The earlier name.
+        old: &'static str,
+        /// What to write in its place.
+        new: &'static str,
+    },
     /// A code with which a machine cannot join.
     #[error("the code: {0}")]
     Invitation(#[from] InvitationError),
@@ -188,7 +196,7 @@ pub(crate) enum CliError {
     /// A token was given on the command line.
     #[error(
         "a token on the command line is shown to every user of this host, and the shell remembers it: give it on standard \
-         input (`sgc use -`), or name a file of mode 0600 that holds it; if others use this host, have its owner \
+         input (`sgc token use -`), or name a file of mode 0600 that holds it; if others use this host, have its owner \
          withdraw it and make another"
     )]
     TokenShown,
@@ -307,6 +315,7 @@ impl CliError {
             | Self::Pem { .. }
             | Self::Identity { .. }
             | Self::Invitation(_)
+            | Self::Moved { .. }
             | Self::Fleet { .. }
             | Self::FleetFile(FleetFileError::Exposed { .. } | FleetFileError::Content { .. })
             | Self::List { .. }

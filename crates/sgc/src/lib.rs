@@ -23,6 +23,7 @@ mod heap;
 mod log;
 mod log_filter;
 mod memory;
+mod moved;
 mod name;
 mod node;
 mod output;
@@ -31,12 +32,10 @@ mod policy;
 mod reload;
 mod run;
 mod service;
-mod share_token;
 mod status;
 mod supervisor;
 mod token;
 mod topic;
-mod use_token;
 mod version;
 mod why;
 mod yaml;
@@ -85,8 +84,10 @@ enum Command {
     Audit(audit::AuditArgs),
     Policy(policy::PolicyArgs),
     Token(token::TokenArgs),
-    ShareToken(share_token::ShareTokenArgs),
-    Use(use_token::UseArgs),
+    #[command(hide = true)]
+    ShareToken(moved::MovedArgs),
+    #[command(hide = true)]
+    Use(moved::MovedArgs),
     Name(name::NameArgs),
     Completions(pages::CompletionsArgs),
     #[command(hide = true)]
@@ -146,8 +147,10 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::Audit(args) => audit::audit(&args),
         Command::Policy(args) => return policy::policy(&args),
         Command::Token(args) => token::token(&args),
-        Command::ShareToken(args) => share_token::share_token(&args),
-        Command::Use(args) => use_token::use_token(&args),
+        Command::ShareToken(_) => {
+            Err(moved::moved("sgc share-token", "sgc token share create, list and revoke"))
+        }
+        Command::Use(_) => Err(moved::moved("sgc use", "sgc token use")),
         Command::Name(args) => name::name(&args),
         Command::Completions(args) => pages::completions(&args),
         Command::Man(args) => pages::man(&args),

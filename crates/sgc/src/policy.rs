@@ -17,6 +17,7 @@ use sgc_wire::Role;
 
 use crate::environment::environment;
 use crate::error::{CliError, EXIT_FAILURE};
+use crate::moved::moved;
 use crate::{files, output};
 
 const CERTIFICATE_BYTES_MAX: u64 = 64 * 1024;
@@ -40,10 +41,12 @@ enum PolicyCommand {
 #[command(group = clap::ArgGroup::new("who").required(true))]
 struct TestArgs {
     /// Name of a node of this fleet
-    #[arg(long, value_name = "NODE", group = "who")]
+    #[arg(value_name = "NODE", group = "who")]
+    node: Option<String>,
+    #[arg(long, value_name = "NODE", hide = true, group = "who")]
     identity: Option<String>,
     /// Group of the node, because a name alone does not tell its groups; may be repeated
-    #[arg(long = "group", value_name = "GROUP", requires = "identity")]
+    #[arg(long = "group", value_name = "GROUP", requires = "node")]
     groups: Vec<String>,
     /// Identity file of a node
     #[arg(long, value_name = "FILE", group = "who")]
@@ -98,6 +101,9 @@ pub(crate) fn load(path: &Path) -> Result<(Config, Identity, Partners), CliError
 }
 
 fn test(args: &TestArgs) -> Result<ExitCode, CliError> {
+    if args.identity.is_some() {
+        return Err(moved("sgc policy test --identity NODE", "sgc policy test NODE"));
+    }
     let path = files::config_here(args.config.as_deref())?;
     let (config, identity, partners) = load(&path)?;
     let (who, subject) = subject(args, &config, &identity, &partners)?;
@@ -158,7 +164,7 @@ fn subject(
     partners: &Partners,
 ) -> Result<(String, SubjectResult), CliError> {
     let cannot = |reason: String| CliError::Cannot { reason };
-    if let Some(name) = &args.identity {
+    if let Some(name) = &args.node {
         let name: NodeName = name.parse()?;
         let groups = args.groups.iter().map(|g| g.parse()).collect::<Result<Vec<GroupName>, _>>()?;
         let (Some(secret), Some(node)) = (identity.fleet_secret(), identity.node_id_of(name.as_str())) else {

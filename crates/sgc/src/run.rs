@@ -71,7 +71,7 @@ pub(crate) struct RunArgs {
 /// With `--peer` it forms a mesh with other routers. With `--accept` it serves only the named fleets.
 #[derive(Debug, Args)]
 pub(crate) struct RouterArgs {
-    /// Identity file, as `sgc fleet enroll --router` writes it
+    /// Identity file, as `sgc fleet enroll --role router` writes it
     #[arg(long, value_name = "FILE")]
     identity: PathBuf,
     /// Address to listen on, such as quic://0.0.0.0:7447; may be repeated

@@ -38,7 +38,7 @@ impl Lab {
             &["fleet", "create", "other"],
             &["fleet", "enroll", "desk", "--fleet", "lab.fleet"],
             &["fleet", "enroll", "robot", "--fleet", "lab.fleet"],
-            &["fleet", "enroll", "cloud", "--router", "--fleet", "lab.fleet"],
+            &["fleet", "enroll", "cloud", "--role", "router", "--fleet", "lab.fleet"],
             &["fleet", "enroll", "stranger", "--fleet", "other.fleet"],
         ] {
             let output = lab.sgc(args).output().unwrap();

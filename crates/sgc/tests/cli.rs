@@ -39,7 +39,7 @@ impl Place {
         place.good(&["fleet", "create", "lab"]);
         place.good(&["fleet", "enroll", "arm-1", "--group", "arms"]);
         place.good(&["fleet", "enroll", "desk"]);
-        place.good(&["fleet", "enroll", "cloud", "--router"]);
+        place.good(&["fleet", "enroll", "cloud", "--role", "router"]);
         place
     }
 
@@ -528,8 +528,27 @@ fn invalid_share_has_no_name() {
 fn usage_errors_are_one_line_and_code_2() {
     let place = Place::new();
     place.says(2, &["fly"], "unrecognized subcommand 'fly'; see `sgc --help`");
-    let said = place.bad(2, &["token", "create", "--for", "x", "--valid", "soon"]);
-    assert!(said.trim_end().ends_with("see `sgc token create --help`"), "{said}");
+    // Earlier spellings are refused with the present ones, whatever stands behind them.
+    for (old, new) in [
+        (&["share-token", "-c", "x.toml", "--topic", "/t"][..], "sgc token share create, list and revoke"),
+        (&["share-token", "--list"], "sgc token share create, list and revoke"),
+        (&["use", "pose.token", "-c", "x.toml"], "sgc token use"),
+        (&["token", "create", "--for", "x"], "sgc token access create"),
+        (&["token", "list", "--json"], "sgc token access list"),
+        (&["token", "revoke", "3f9c"], "sgc token access revoke"),
+        (&["policy", "test", "--identity", "desk", "--topic", "/t"], "sgc policy test NODE"),
+        (&["fleet", "enroll", "hub", "--router"], "--role router"),
+    ] {
+        let said = place.bad(2, old);
+        assert!(said.contains("has another name now") && said.trim_end().ends_with(new), "{old:?}: {said}");
+    }
+    assert!(
+        place
+            .bad(2, &["fleet", "enroll", "x", "--role", "router", "--may-route"])
+            .contains("--may-route out")
+    );
+    let said = place.bad(2, &["token", "access", "create", "--for", "x", "--valid", "soon"]);
+    assert!(said.trim_end().ends_with("see `sgc token access create --help`"), "{said}");
     place.says(
         2,
         &["statos"],
@@ -560,7 +579,7 @@ fn example_configurations_of_the_package_have_no_mistakes() {
     let place = Place::new();
     place.good(&["fleet", "create", "lab"]);
     place.good(&["fleet", "enroll", "robot"]);
-    place.good(&["fleet", "enroll", "router", "--router"]);
+    place.good(&["fleet", "enroll", "router", "--role", "router"]);
     let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../dist/examples");
     for node in ["robot", "router"] {
         let text = fs::read_to_string(examples.join(format!("{node}.toml"))).unwrap();

@@ -34,7 +34,7 @@ impl Fleet {
         let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let fleet = Self { dir: tempfile::tempdir().unwrap(), port };
         fleet.good(&["create", "lab", "--authority", "keeper"]);
-        fleet.good(&["enroll", "router", "--router"]);
+        fleet.good(&["enroll", "router", "--role", "router"]);
         fleet.good(&["enroll", "desk", "--group", "observers"]);
         for member in members {
             fleet.good(&["enroll", member]);

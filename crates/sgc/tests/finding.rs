@@ -80,7 +80,7 @@ impl Drop for Place {
 
 #[test]
 fn routers_join_a_mesh_from_the_command_line() {
-    let place = Place::new(&["cloud1 --router", "cloud2 --router", "cloud3 --router"], None);
+    let place = Place::new(&["cloud1 --role router", "cloud2 --role router", "cloud3 --role router"], None);
     let listen = ["--listen", "quic://127.0.0.1:0"];
     let router = |node: &'static str, peers: &[&str]| {
         let identity = format!("{node}.identity");
@@ -110,7 +110,7 @@ fn a_router_on_another_machine_is_found_by_mdns_lost_and_found_again() {
     let instead = "mDNS is tested on this host's own interfaces instead";
     let cable = support::namespaces(lay_cable(), instead);
     let (here, there) = if cable.is_some() { (0, 1) } else { (0, 0) };
-    let place = Place::new(&["robot", "cloud --router"], cable);
+    let place = Place::new(&["robot", "cloud --role router"], cable);
     let listen = |port: &str| format!("quic://0.0.0.0:{port}");
     let start_cloud = |listen: &str| {
         let args = ["router", "--identity", "cloud.identity", "--announce", "--listen", listen];

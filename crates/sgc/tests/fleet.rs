@@ -173,7 +173,7 @@ fn the_roster_is_shown() {
     place.good(&["fleet", "create", "lab", "--authority", "desk", "--post-quantum"]);
     assert!(place.good(&["fleet", "list"]).contains("No nodes yet"));
     place.good(&["fleet", "enroll", "arm-1", "--group", "b", "--group", "a", "--valid", "12h"]);
-    place.good(&["fleet", "enroll", "cloud", "--router"]);
+    place.good(&["fleet", "enroll", "cloud", "--role", "router"]);
     place.good(&["fleet", "enroll", "relay", "--may-route"]);
     place.good(&["fleet", "revoke", "relay"]);
     let shown = place.good(&["fleet", "list"]);
@@ -657,7 +657,7 @@ impl Place {
     fn with_authority(group_of_desk: &str) -> Self {
         let place = Self::new();
         place.good(&["fleet", "create", "lab", "--authority", "keeper"]);
-        place.good(&["fleet", "enroll", "cloud", "--router"]);
+        place.good(&["fleet", "enroll", "cloud", "--role", "router"]);
         place.good(&["fleet", "enroll", "desk", "--group", group_of_desk]);
         for node in ["keeper", "arm-1", "arm-2"] {
             place.good(&["fleet", "enroll", node]);
@@ -855,7 +855,7 @@ fn a_machine_joins_with_a_code_and_the_code_is_good_once() {
     assert!(place.read("arm-8.toml").contains(&url));
 
     // A directory that cannot be written is noticed before the code is used.
-    let spare = invite(&["cloud-2", "--router", "--via", &url]);
+    let spare = invite(&["cloud-2", "--role", "router", "--via", &url]);
     assert!(refused(&["join", "--dir", "missing", &spare], 1).contains("missing"));
     assert!(refused(&["join", "--service", "../robot", &spare], 2).contains("'/'"));
     fs::create_dir(place.path("other")).unwrap();

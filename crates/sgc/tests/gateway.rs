@@ -176,7 +176,7 @@ fn a_token_opens_what_it_says_until_it_is_taken_back() {
         return support::say("without namespaces nobody is elsewhere: the token is not tried");
     }
     let _talker = talker(&lab);
-    let create = ["token", "create", "-c", "desk.toml", "--for", "dashboard", "--valid", "1h"];
+    let create = ["token", "access", "create", "-c", "desk.toml", "--for", "dashboard", "--valid", "1h"];
     let token = said(
         &lab.sgc(Some(Site::Desk), &[&create[..], &["--subscribe", "/chatter"]].concat()).output().unwrap(),
     );
@@ -189,9 +189,12 @@ fn a_token_opens_what_it_says_until_it_is_taken_back() {
     let mut program = lab.python(Site::Cloud, "gateway.py", &[&common[..], &["--token", &token]].concat());
     assert_eq!(program.wait("topics", |e| e["event"] == "topics")["topics"], serde_json::json!(["/chatter"]));
     assert!(!heard(&mut program).is_empty());
-    let listed = said(&lab.sgc(Some(Site::Desk), &["token", "list", "-c", "desk.toml"]).output().unwrap());
+    let listed =
+        said(&lab.sgc(Some(Site::Desk), &["token", "access", "list", "-c", "desk.toml"]).output().unwrap());
     let id = listed.lines().last().unwrap().split_whitespace().next().unwrap().to_owned();
-    said(&lab.sgc(Some(Site::Desk), &["token", "revoke", "-c", "desk.toml", &id]).output().unwrap());
+    said(
+        &lab.sgc(Some(Site::Desk), &["token", "access", "revoke", "-c", "desk.toml", &id]).output().unwrap(),
+    );
     let ended = program.wait("it is told", |event| event["event"] == "failed");
     assert_eq!(ended["code"], "UNAUTHENTICATED", "{ended}");
 }

@@ -28,7 +28,7 @@ impl Lab {
     fn new(name: &str) -> Self {
         let namespace = support::own_network(format!("sgcl-{name}-{}", std::process::id()));
         let dir = tempfile::tempdir().unwrap();
-        support::enroll(dir.path(), ["robot", "cloud --router", "desk"]);
+        support::enroll(dir.path(), ["robot", "cloud --role router", "desk"]);
         Self { dir, namespace, nodes: Vec::new() }
     }
 

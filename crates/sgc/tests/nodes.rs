@@ -31,7 +31,7 @@ impl Router {
     /// Starts it with further variables, for which it gets its directory.
     fn start_with(variables: impl FnOnce(&mut Command, &Path)) -> Self {
         let place = tempfile::tempdir().unwrap();
-        for args in [&["fleet", "create", "lab"][..], &["fleet", "enroll", "cloud", "--router"]] {
+        for args in [&["fleet", "create", "lab"][..], &["fleet", "enroll", "cloud", "--role", "router"]] {
             assert!(sgc(place.path(), args).output().unwrap().status.success());
         }
         let args = ["router", "--identity", "cloud.identity", "--listen", "quic://127.0.0.1:0"];
@@ -160,7 +160,8 @@ fn a_child_does_not_outlive_its_standard_input() {
 #[test]
 fn an_address_in_use_is_a_failure_and_named() {
     let router = Router::start();
-    let enrolled = sgc(router.place.path(), &["fleet", "enroll", "other", "--router"]).output().unwrap();
+    let enrolled =
+        sgc(router.place.path(), &["fleet", "enroll", "other", "--role", "router"]).output().unwrap();
     assert!(enrolled.status.success());
     let args = ["router", "--identity", "other.identity", "--listen", &router.address];
     let output = sgc(router.place.path(), &args).stderr(Stdio::piped()).output().unwrap();

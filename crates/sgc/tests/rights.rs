@@ -187,50 +187,46 @@ fn policy_is_answered_from_the_configuration_alone() {
         assert_eq!(place.policy(args), (Some(code), text.to_owned()), "{args:?}");
     };
     says(
-        &["--identity", "desk", "--topic", "/handoff/pose"],
+        &["desk", "--topic", "/handoff/pose"],
         0,
         "yes: desk may subscribe to /handoff/pose: `to` names \"desk\": that is this node",
     );
     // Groups are in certificates, so a name alone does not tell them.
     says(
-        &["--identity", "desk", "--topic", "/cmd_vel"],
+        &["desk", "--topic", "/cmd_vel"],
         1,
         "no: desk may not subscribe to /cmd_vel: `to` of /cmd_vel names \"group:operators\", and it is none of them (a \
          member of this fleet, in 0 groups)",
     );
     let by_group = "yes: desk may subscribe to /cmd_vel: `to` names \"group:operators\": its certificate puts it into that group";
-    says(&["--identity", "desk", "--group", "operators", "--topic", "/cmd_vel"], 0, by_group);
+    says(&["desk", "--group", "operators", "--topic", "/cmd_vel"], 0, by_group);
     says(&["--identity-file", "desk.identity", "--topic", "/cmd_vel"], 0, by_group);
     says(
-        &["--identity", "desk", "--topic", "/cmd_vel", "--publish"],
+        &["desk", "--topic", "/cmd_vel", "--publish"],
         0,
         "yes: desk may publish on /cmd_vel: `publish` names \"desk\": that is this node",
     );
     says(
-        &["--identity", "desk", "--topic", "/handoff/pose", "--publish"],
+        &["desk", "--topic", "/handoff/pose", "--publish"],
         1,
         "no: desk may not publish on /handoff/pose: `publish` of /handoff/pose names nobody",
     );
     says(
-        &["--identity", "arm-1", "--topic", "/handoff/pose", "--publish"],
+        &["arm-1", "--topic", "/handoff/pose", "--publish"],
         0,
         "yes: arm-1 may publish on /handoff/pose: it is the owner",
     );
-    says(
-        &["--identity", "desk", "--topic", "/other"],
-        1,
-        "no: desk may not subscribe to /other: arm-1 does not share it",
-    );
+    says(&["desk", "--topic", "/other"], 1, "no: desk may not subscribe to /other: arm-1 does not share it");
     let (code, text) = place.policy(&["--identity-file", "cart.identity", "--topic", "/cmd_vel"]);
     assert_eq!(code, Some(1));
     assert!(text.contains("its certificate is not believed"), "{text}");
-    let (_, json) = place.policy(&["--identity", "desk", "--topic", "/handoff/pose", "--json"]);
+    let (_, json) = place.policy(&["desk", "--topic", "/handoff/pose", "--json"]);
     let json: Value = serde_json::from_str(&json).unwrap();
     assert_eq!((&json["permitted"], &json["role"]), (&Value::Bool(true), &Value::from("subscribe")));
     assert_eq!(json["node_id"], place.identity("desk.identity").node_id().to_string());
     // A question without an answer gives neither yes nor no.
     place.bad(2, &["policy", "test", "-c", "arm-1.toml", "--topic", "/cmd_vel"]);
-    place.bad(2, &["policy", "test", "-c", "arm-1.toml", "--identity", "No One", "--topic", "/cmd_vel"]);
+    place.bad(2, &["policy", "test", "-c", "arm-1.toml", "No One", "--topic", "/cmd_vel"]);
 }
 
 #[test]
@@ -549,7 +545,8 @@ fn a_process_with_keys_leaves_no_core_and_is_not_traced_unless_its_user_says_so(
 #[test]
 fn a_token_hands_over_one_topic_and_is_taken_back() {
     let place = Place::new();
-    let give = ["share-token", "-c", "arm-1.toml", "--topic", "/handoff/pose", "--to", "acme-ca.pem"];
+    let give =
+        ["token", "share", "create", "-c", "arm-1.toml", "--topic", "/handoff/pose", "--to", "acme-ca.pem"];
     let said = place.bad(2, &give);
     assert!(said.contains("no node runs that could know it: add --type PACKAGE/msg/NAME"), "{said}");
     let ran = place.run(&[&give[..], &["--type", POSE, "--valid", "12h"]].concat());
@@ -568,7 +565,7 @@ fn a_token_hands_over_one_topic_and_is_taken_back() {
     let records = place.read("state/partners.json");
     assert!(!records.contains("sgc-token") && records.contains(&token.name().to_string()), "{records}");
 
-    let listed = place.good(&["share-token", "-c", "arm-1.toml", "--list"]);
+    let listed = place.good(&["token", "share", "list", "-c", "arm-1.toml"]);
     assert!(listed.contains("/handoff/pose") && listed.lines().count() == 2, "{listed}");
     let of_cart = ["--identity-file", "cart.identity", "--topic", "/handoff/pose"];
     let (code, text) = place.policy(&of_cart);
@@ -578,10 +575,10 @@ fn a_token_hands_over_one_topic_and_is_taken_back() {
 
     // A running node is told by itself.
     let node = place.start("arm-1.toml");
-    let said = place.good(&["share-token", "-c", "arm-1.toml", "--withdraw", "1"]);
+    let said = place.good(&["token", "share", "revoke", "-c", "arm-1.toml", "1"]);
     assert!(said.contains("/handoff/pose: who may subscribe changed"), "{said}");
     assert_eq!(place.policy(&of_cart).0, Some(1));
-    let said = place.bad(2, &["share-token", "-c", "arm-1.toml", "--withdraw", "1"]);
+    let said = place.bad(2, &["token", "share", "revoke", "-c", "arm-1.toml", "1"]);
     assert!(said.contains("no token has the number 1"), "{said}");
     node.end();
     // Numbers are not reused, and a token may be for one node of the partner alone.
@@ -589,21 +586,21 @@ fn a_token_hands_over_one_topic_and_is_taken_back() {
     for (to, permitted) in
         [(format!("acme-ca.pem:{cart}"), 0), (format!("acme-ca.pem:{}", "ab".repeat(32)), 1)]
     {
-        let args = [&give[..5], &["--to", &to, "--type", POSE]].concat();
+        let args = [&give[..7], &["--to", &to, "--type", POSE]].concat();
         let ran = place.run(&args);
         assert!(ran.stderr.contains("Token 2") || ran.stderr.contains("Token 3"), "{}", ran.stderr);
         assert_eq!(place.policy(&of_cart).0, Some(permitted), "{to}");
         let id = if permitted == 0 { "2" } else { "3" };
-        place.good(&["share-token", "-c", "arm-1.toml", "--withdraw", id]);
+        place.good(&["token", "share", "revoke", "-c", "arm-1.toml", id]);
     }
-    let said = place.bad(2, &[&give[..5], &["--to", "lab-ca.pem", "--type", POSE]].concat());
+    let said = place.bad(2, &[&give[..7], &["--to", "lab-ca.pem", "--type", POSE]].concat());
     assert!(said.contains("its nodes need no token"), "{said}");
 }
 
 #[test]
 fn a_program_without_ros_gets_a_token_that_is_taken_back() {
     let place = Place::new();
-    let create = ["token", "create", "-c", "arm-1.toml", "--for", "dashboard"];
+    let create = ["token", "access", "create", "-c", "arm-1.toml", "--for", "dashboard"];
     let said = place.bad(2, &create);
     assert!(said.contains("it permits nothing: name at least one interface"), "{said}");
     let said = place.bad(2, &[&create[..], &["--subscribe", "odom"]].concat());
@@ -628,21 +625,21 @@ fn a_program_without_ros_gets_a_token_that_is_taken_back() {
     assert!(!records.contains("sgc-access") && records.contains(&grant.id.to_string()), "{records}");
 
     let into = ["--for", "teleop", "--call", "/plan", "--out", "teleop.token"];
-    let make = [&create[..4], &into].concat();
+    let make = [&create[..5], &into].concat();
     assert_eq!(place.good(&make), "", "it is in the file alone");
     assert_eq!(place.mode("teleop.token"), 0o600);
     let second = AccessToken::parse(&place.read("teleop.token")).unwrap().id();
     let said = place.bad(2, &make);
     assert!(said.contains("teleop.token exists already"), "{said}");
 
-    let list = ["token", "list", "-c", "arm-1.toml"];
+    let list = ["token", "access", "list", "-c", "arm-1.toml"];
     let listed = place.good(&list);
     assert!(listed.contains("dashboard") && listed.contains("call /plan"), "{listed}");
     assert_eq!(listed.lines().count(), 3, "{listed}");
-    let said = place.bad(2, &["token", "revoke", "-c", "arm-1.toml", "0000"]);
+    let said = place.bad(2, &["token", "access", "revoke", "-c", "arm-1.toml", "0000"]);
     assert!(said.contains("no access token begins with"), "{said}");
     let id = grant.id.to_string();
-    let said = place.good(&["token", "revoke", "-c", "arm-1.toml", &id[..12]]);
+    let said = place.good(&["token", "access", "revoke", "-c", "arm-1.toml", &id[..12]]);
     assert!(said.contains("for dashboard is revoked") && said.contains("next start"), "{said}");
     let json = place.good(&[&list[..], &["--json"]].concat());
     let tokens: Vec<Value> = serde_json::from_str(&json).unwrap();
@@ -685,7 +682,9 @@ fn check_says_who_may_connect_to_a_gateway() {
 fn a_token_is_used_by_adding_three_lines() {
     let place = Place::new();
     let args = [
-        "share-token",
+        "token",
+        "share",
+        "create",
         "-c",
         "arm-1.toml",
         "--topic",
@@ -701,10 +700,10 @@ fn a_token_is_used_by_adding_three_lines() {
     place.write("cut.token", &token[..token.len() - 3]);
     let before = place.read("cart.toml");
     // Any user who lists processes would see the token.
-    let said = place.bad(2, &["use", token, "-c", "cart.toml"]);
+    let said = place.bad(2, &["token", "use", token, "-c", "cart.toml"]);
     assert!(said.contains("is shown to every user of this host") && !said.contains(&token[20..60]), "{said}");
     assert!(!place.path("cart-state").exists());
-    let said = place.good(&["use", "pose.token", "-c", "cart.toml", "--dry-run"]);
+    let said = place.good(&["token", "use", "pose.token", "-c", "cart.toml", "--dry-run"]);
     assert!(
         said.contains("/handoff/pose [geometry_msgs/msg/PoseStamped] of arm-1") && said.contains("[[use]]"),
         "{said}"
@@ -713,7 +712,7 @@ fn a_token_is_used_by_adding_three_lines() {
     assert!(!place.path("cart-state").exists());
 
     fs::set_permissions(place.path("cart.toml"), fs::Permissions::from_mode(0o640)).unwrap();
-    place.good(&["use", "--token-file", "pose.token", "-c", "cart.toml"]);
+    place.good(&["token", "use", "--token-file", "pose.token", "-c", "cart.toml"]);
     let after = place.read("cart.toml");
     assert!(after.starts_with(&before) && !after.contains("sgc-token"), "{after}");
     assert_eq!((place.mode("cart.toml"), place.mode("cart-state/tokens")), (0o640, 0o700));
@@ -721,9 +720,9 @@ fn a_token_is_used_by_adding_three_lines() {
     assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o7777, 0o600);
     assert!(Path::new(&file).file_name().unwrap().to_str().unwrap().starts_with("handoff-pose-"));
     assert!(place.good(&["check", "-c", "cart.toml"]).contains("no mistakes"));
-    let said = place.bad(2, &["use", "pose.token", "-c", "cart.toml"]);
+    let said = place.bad(2, &["token", "use", "pose.token", "-c", "cart.toml"]);
     assert!(said.contains("used with this very token already"), "{said}");
-    let said = place.bad(2, &["use", "cut.token", "-c", "cart.toml"]);
+    let said = place.bad(2, &["token", "use", "cut.token", "-c", "cart.toml"]);
     assert!(said.contains("cut or mistyped") && !said.contains(&token[20..60]), "{said}");
 
     // The node joins that name and reports what it waits for.
@@ -746,7 +745,7 @@ fn a_token_is_used_by_adding_three_lines() {
     let another = ["--router", "quic://127.0.0.1:10"];
     place.write("pose.token", place.good(&[&args[..], &another].concat()).trim());
     let node = place.start("cart.toml");
-    let said = place.good(&["use", "pose.token", "-c", "cart.toml"]);
+    let said = place.good(&["token", "use", "pose.token", "-c", "cart.toml"]);
     assert!(said.contains("/handoff/pose of arm-1 is used (by token)"), "{said}");
     assert!(said.contains("quic://127.0.0.1:10 is searched for"), "{said}");
     assert!(!said.contains("restart"), "{said}");

@@ -189,7 +189,7 @@ def connect(
     """Connects to a gateway.
 
     ``address`` is ``grpc://HOST[:PORT]``, or ``grpcs://HOST[:PORT]`` over TLS. A gateway admits a program by ``token``
-    (``sgc token create --out FILE`` makes one), by a client certificate (``certificate`` and its ``key``), or because
+    (``sgc token access create --out FILE`` makes one), by a client certificate (``certificate`` and its ``key``), or because
     it runs on the gateway's host. ``token_file=FILE`` reads the token from a file, which keeps it out of programs and
     command lines. ``ca`` has the certificates that verify the gateway, by default those that the system trusts.
     ``server_name`` is the name in the gateway's certificate, if it is not HOST. Files are in PEM. The call waits for

@@ -452,7 +452,7 @@ impl Access {
 pub enum Denial {
     /// The client showed neither a token nor a certificate, and this address needs one.
     #[error(
-        "a program at {ip} showed neither a token nor a certificate: make a token with `sgc token create`, name its \
+        "a program at {ip} showed neither a token nor a certificate: make a token with `sgc token access create`, name its \
          node in a [[gateway.client]], or see `anonymous` in [gateway]"
     )]
     NoCredentials {
@@ -481,7 +481,7 @@ pub enum Denial {
     #[error("a token was shown, but this gateway has no identity to verify it with")]
     NoTokens,
     /// The token has expired.
-    #[error("token {id} ended at {expires}: make a new one with `sgc token create`")]
+    #[error("token {id} ended at {expires}: make a new one with `sgc token access create`")]
     TokenExpired {
         /// The id of the token.
         id: TokenId,
@@ -489,7 +489,9 @@ pub enum Denial {
         expires: UnixMillis,
     },
     /// The token was revoked.
-    #[error("token {id} was revoked: if its holder may come back, make a new one with `sgc token create`")]
+    #[error(
+        "token {id} was revoked: if its holder may come back, make a new one with `sgc token access create`"
+    )]
     TokenRevoked {
         /// The id of the token.
         id: TokenId,
@@ -508,7 +510,7 @@ pub enum Denial {
     /// No rule gives rights to the certificate.
     #[error(
         "no [[gateway.client]] names node {node}, a group of it or its fleet: add it to the `who` of one, or make a token \
-         with `sgc token create`"
+         with `sgc token access create`"
     )]
     NotListed {
         /// The node of the certificate.
@@ -540,7 +542,7 @@ impl Denial {
     pub fn client_message(&self) -> &'static str {
         match self {
             Self::NoCredentials { .. } | Self::NotListed { .. } => {
-                "not admitted: this gateway wants a token (`sgc token create` there makes one) or a certificate of its fleet"
+                "not admitted: this gateway wants a token (`sgc token access create` there makes one) or a certificate of its fleet"
             }
             Self::Origin { .. } => "not admitted: pages of this origin may not connect without a token",
             Self::PlainToken => {

@@ -61,7 +61,7 @@ impl FromStr for TokenId {
 
 /// The text is not a token id.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("the id of a token is 32 hexadecimal digits in small letters: `sgc token list` shows them")]
+#[error("the id of a token is 32 hexadecimal digits in small letters: `sgc token access list` shows them")]
 pub struct TokenIdError;
 
 /// The content of a token.
@@ -238,7 +238,9 @@ pub enum AccessTokenError {
     #[error("its scope is wrong: {0}")]
     Scope(ScopeError),
     /// The token is for another gateway.
-    #[error("it is for the gateway of node {gateway}, not for this one: `sgc token create` there made it")]
+    #[error(
+        "it is for the gateway of node {gateway}, not for this one: `sgc token access create` there made it"
+    )]
     Elsewhere {
         /// The node of that gateway.
         gateway: NodeId,
@@ -246,7 +248,7 @@ pub enum AccessTokenError {
     /// The signature is not one of this gateway.
     #[error(
         "this node did not sign it: it was altered or forged, or the node has had another key since: make a new one with \
-         `sgc token create`"
+         `sgc token access create`"
     )]
     Signature,
 }

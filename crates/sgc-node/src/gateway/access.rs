@@ -271,7 +271,7 @@ pub enum AccessError {
     TooManyTokens,
     /// No token has that id.
     #[error(
-        "no access token begins with {digits:?}: `sgc token list` shows them; {PREFIX_DIGITS_MIN} digits at least, or all 32 \
+        "no access token begins with {digits:?}: `sgc token access list` shows them; {PREFIX_DIGITS_MIN} digits at least, or all 32 \
          of one that is not listed"
     )]
     NoSuchToken {
@@ -279,7 +279,7 @@ pub enum AccessError {
         digits: String,
     },
     /// Several tokens begin with these digits.
-    #[error("several access tokens begin with {digits:?}: add digits; `sgc token list` shows them")]
+    #[error("several access tokens begin with {digits:?}: add digits; `sgc token access list` shows them")]
     Ambiguous {
         /// The given digits.
         digits: String,

@@ -71,7 +71,7 @@ pub enum NodeError {
     },
     /// A router's identity cannot share or use.
     #[error(
-        "this identity is a router's and holds no fleet secret: it can neither share nor use. Enroll the node without --router"
+        "this identity is a router's and holds no fleet secret: it can neither share nor use. Enroll the node without --role router"
     )]
     RouterIdentity,
     /// `mdns://NODE` with a router's identity, which cannot recognise names.

@@ -159,7 +159,7 @@ fn created_text(fleet: &Fleet, path: &Path) -> String {
          Next, an identity for each node, and one for the router:\n  \
          sgc fleet enroll arm-1{option}\n  \
          sgc fleet enroll desk --group operators{option}\n  \
-         sgc fleet enroll cloud --router{option}",
+         sgc fleet enroll cloud --role router{option}",
         path.display(),
         fleet.name(),
         fleet.not_after(),

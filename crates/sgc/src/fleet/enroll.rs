@@ -15,6 +15,7 @@ use sgc_wire::{Operation, UnixMillis};
 use zeroize::Zeroizing;
 
 use super::remote::{FleetPlace, Remote};
+use super::role::RoleArgs;
 use super::{DAY, copies, millis, parse_span};
 use crate::error::CliError;
 use crate::files::{self, Existing};
@@ -33,12 +34,8 @@ pub(super) struct EnrollArgs {
     /// Group of the node; may be repeated
     #[arg(long = "group", value_name = "GROUP")]
     groups: Vec<String>,
-    /// Make the identity of a node that only routes: it lacks the fleet secret, so that the node can read no payload
-    #[arg(long, conflicts_with = "may_route")]
-    router: bool,
-    /// Let a member also route for others
-    #[arg(long)]
-    may_route: bool,
+    #[command(flatten)]
+    role: RoleArgs,
     /// Enrol a revoked node again
     #[arg(long)]
     again: bool,
@@ -168,11 +165,12 @@ impl Keeper {
 pub(super) fn enroll(args: &EnrollArgs) -> Result<(), CliError> {
     let node: NodeName = args.node.parse()?;
     let groups = args.groups.iter().map(|g| g.parse()).collect::<Result<Vec<GroupName>, _>>()?;
+    let role = args.role.role()?;
     let mut keeper = Keeper::open(&args.place)?;
     let request = EnrollRequest {
         groups,
-        router: args.router,
-        may_route: args.may_route,
+        router: role.is_router,
+        may_route: role.may_route,
         again: args.again,
         valid: args.output.valid(),
         ..EnrollRequest::new(node, unix_now())

@@ -14,6 +14,7 @@ use sgc_trust::{
 use sgc_wire::Operation;
 
 use super::remote::FleetPlace;
+use super::role::RoleArgs;
 use super::{millis, parse_span};
 use crate::error::CliError;
 use crate::{node, output};
@@ -33,12 +34,8 @@ pub(super) struct InviteArgs {
     /// Group of the node; may be repeated
     #[arg(long = "group", value_name = "GROUP")]
     groups: Vec<String>,
-    /// Invite a node that only routes: it gets no fleet secret, so that it can read no payload
-    #[arg(long, conflicts_with = "may_route")]
-    router: bool,
-    /// Let a member also route for others
-    #[arg(long)]
-    may_route: bool,
+    #[command(flatten)]
+    role: RoleArgs,
     /// Invite a revoked node again
     #[arg(long)]
     again: bool,
@@ -58,11 +55,12 @@ pub(super) fn invite(args: &InviteArgs) -> Result<(), CliError> {
     let name: NodeName = args.node.parse()?;
     let groups = args.groups.iter().map(|g| g.parse()).collect::<Result<Vec<GroupName>, _>>()?;
     let within = args.within.unwrap_or(WITHIN_DEFAULT);
+    let role = args.role.role()?;
     let routers = routers(args)?;
     let request = EnrollRequest {
         groups,
-        router: args.router,
-        may_route: args.may_route,
+        router: role.is_router,
+        may_route: role.may_route,
         again: args.again,
         valid: args.valid.unwrap_or(LEAF_VALIDITY_DEFAULT),
         ..EnrollRequest::new(name, unix_now())

@@ -13,6 +13,7 @@ mod keeping;
 mod looking;
 mod own_key;
 mod remote;
+mod role;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;

@@ -11,6 +11,7 @@ use sgc_trust::{
 };
 use zeroize::Zeroizing;
 
+use super::role::{NodeRole, RoleArgs};
 use crate::error::CliError;
 use crate::files::{self, Existing};
 use crate::output;
@@ -82,12 +83,8 @@ pub(super) struct ExtensionsArgs {
     /// Group of the node; may be repeated
     #[arg(long = "group", value_name = "GROUP")]
     groups: Vec<String>,
-    /// Write the extensions of a node that only routes
-    #[arg(long, conflicts_with_all = ["may_route", "groups"])]
-    router: bool,
-    /// Let a member also route for others
-    #[arg(long)]
-    may_route: bool,
+    #[command(flatten)]
+    role: RoleArgs,
     /// File for the extensions [default: NODE.ext]
     #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -97,16 +94,20 @@ pub(super) fn extensions(args: &ExtensionsArgs) -> Result<(), CliError> {
     let node: NodeName = args.node.parse()?;
     let groups = args.groups.iter().map(|g| g.parse()).collect::<Result<Vec<GroupName>, _>>()?;
     let secret = read_fleet_secret(&args.secret)?;
-    let may_route = args.router || args.may_route;
+    let NodeRole { is_router, may_route } = args.role.role()?;
+    if is_router && !groups.is_empty() {
+        return Err(CliError::Cannot { reason: "a router is in no group: leave --group out".to_owned() });
+    }
+    let routes = is_router || may_route;
     let path = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("{node}.ext")));
-    let uris = certificate_uris(&secret, &node, &groups, may_route);
-    files::write_public(&path, extensions_text(&node, &groups, may_route, &uris).as_bytes())?;
+    let uris = certificate_uris(&secret, &node, &groups, routes);
+    files::write_public(&path, extensions_text(&node, &groups, routes, &uris).as_bytes())?;
     let file = path.display();
     let mut accept = format!("sgc fleet accept {node}.pem --ca CA.pem --node {node} --fleet-name NAME");
-    if !args.router {
+    if !is_router {
         accept.push_str(" --secret FILE");
         groups.iter().for_each(|group| accept.push_str(&format!(" --group {group}")));
-        accept.push_str(if args.may_route { " --may-route" } else { "" });
+        accept.push_str(if may_route { " --may-route" } else { "" });
     }
     output::line(format!(
         "{file}: extensions for the certificate of {node}, no secret. Where the CA is:\n  \

@@ -3,7 +3,9 @@
 use std::process::ExitCode;
 
 use clap::Args;
-use sgc_node::graph::{Endpoint, Graph, Qos};
+use serde::Serialize;
+use sgc_node::graph::{Endpoint, Graph, Offer, Qos, ShareRoute, UseRoute};
+use sgc_process::ProcessError;
 
 use crate::error::{CliError, EXIT_FAILURE};
 use crate::node::NodeArgs;
@@ -17,12 +19,37 @@ pub(crate) struct InfoArgs {
     /// Show the GUID, QoS and type hash of each endpoint
     #[arg(short, long)]
     verbose: bool,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
     #[command(flatten)]
     node: NodeArgs,
 }
 
+/// The topic as `--json` shows it.
+#[derive(Serialize)]
+struct InfoJson<'a> {
+    topic: &'a str,
+    /// Endpoints on the local network.
+    endpoints: Vec<&'a Endpoint>,
+    /// What other nodes list for this one.
+    offers: Vec<&'a Offer>,
+    /// Routes of the rules that share it.
+    shares: Vec<&'a ShareRoute>,
+    /// Rules that use it, with their routes of this topic.
+    uses: Vec<UseJson<'a>>,
+}
+
+#[derive(Serialize)]
+struct UseJson<'a> {
+    owner: &'a str,
+    publishes: bool,
+    route: &'a UseRoute,
+}
+
 pub(super) fn info(args: &InfoArgs) -> Result<ExitCode, CliError> {
-    let lines = lines(&args.node.graph(None)?, &args.topic, args.verbose);
+    let graph = args.node.graph(None)?;
+    let lines = lines(&graph, &args.topic, args.verbose);
     if lines.is_empty() {
         output::diagnostic(&format!(
             "sgc: {}: nobody has it on the local network, and no node that this one follows lists it",
@@ -30,10 +57,30 @@ pub(super) fn info(args: &InfoArgs) -> Result<ExitCode, CliError> {
         ));
         return Ok(ExitCode::from(EXIT_FAILURE));
     }
+    if args.json {
+        let text = serde_json::to_string_pretty(&json(&graph, &args.topic));
+        output::line(text.map_err(|error| CliError::from(ProcessError::Output(error.into())))?)?;
+        return Ok(ExitCode::SUCCESS);
+    }
     for line in lines {
         output::line(output::clean(&line))?;
     }
     Ok(ExitCode::SUCCESS)
+}
+
+fn json<'a>(graph: &'a Graph, topic: &'a str) -> InfoJson<'a> {
+    let shares = graph.shares.iter().flat_map(|share| &share.routes);
+    let uses = graph.uses.iter().flat_map(|used| used.routes.iter().map(move |route| (used, route)));
+    InfoJson {
+        topic,
+        endpoints: graph.endpoints.iter().filter(|e| e.is_ros_topic && e.topic == topic).collect(),
+        offers: graph.offers.iter().filter(|offer| offer.topic == topic).collect(),
+        shares: shares.filter(|route| route.topic == topic).collect(),
+        uses: uses
+            .filter(|(_, route)| route.topic == topic)
+            .map(|(used, route)| UseJson { owner: &used.owner, publishes: used.publishes, route })
+            .collect(),
+    }
 }
 
 fn lines(graph: &Graph, topic: &str, verbose: bool) -> Vec<String> {

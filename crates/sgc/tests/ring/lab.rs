@@ -49,8 +49,8 @@ impl Lab {
             nodes: [const { None }; NODES.len()],
             namespaces: support::namespaces(make_namespaces(), "one host, and no link is cut"),
         };
-        let members =
-            NODES.map(|node| format!("{}{}", node.name(), if node.is_router() { " --router" } else { "" }));
+        let members = NODES
+            .map(|node| format!("{}{}", node.name(), if node.is_router() { " --role router" } else { "" }));
         support::enroll(&lab.dir, members.iter().map(String::as_str));
         NODES.into_iter().for_each(|node| lab.write_config(node, topics));
         NODES.into_iter().for_each(|node| lab.start(node));

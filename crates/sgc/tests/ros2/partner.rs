@@ -62,7 +62,7 @@ fn give(lab: &Lab, site: Site, topic: &str) -> Vec<u8> {
     };
     let router = format!("quic://{}", lab.cloud_address(other));
     let config = format!("{}.toml", site.name());
-    let args = ["share-token", "-c", &config, "--topic", topic, "--to", to, "--router", &router];
+    let args = ["token", "share", "create", "-c", &config, "--topic", topic, "--to", to, "--router", &router];
     let mut token = Vec::new();
     eventually(&format!("{config} gives {topic}"), || {
         let output = run(lab, &args, &[]);
@@ -75,7 +75,7 @@ fn give(lab: &Lab, site: Site, topic: &str) -> Vec<u8> {
 /// Takes a token while the node runs. Returns the output of the command line.
 fn take(lab: &Lab, site: Site, token: &[u8]) -> String {
     let config = format!("{}.toml", site.name());
-    let output = run(lab, &["use", "-", "-c", &config], token);
+    let output = run(lab, &["token", "use", "-", "-c", &config], token);
     assert!(output.status.success(), "{output:?}");
     String::from_utf8(output.stdout).unwrap()
 }

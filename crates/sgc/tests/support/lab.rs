@@ -108,7 +108,7 @@ impl Lab {
         // Labs on one host would meet.
         let turn = Turn::take(if namespaces.is_some() { plan.turn } else { TurnKind::Exclusive });
         let dir = tempfile::tempdir().unwrap();
-        support::enroll(dir.path(), ["robot", "cloud --router", "desk"]);
+        support::enroll(dir.path(), ["robot", "cloud --role router", "desk"]);
         let lab = Self { plan, number, dir, nodes: [const { None }; 3], namespaces, _turn: turn };
         lab.configure(Site::Robot, &robot);
         lab.configure(Site::Cloud, "");

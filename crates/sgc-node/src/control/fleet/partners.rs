@@ -175,7 +175,7 @@ impl Partners {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TokenRecords {
     version: u32,
-    /// Number of the next token. Numbers are never reused, so that `--withdraw` cannot hit another.
+    /// Number of the next token. Numbers are never reused, so that `sgc token share revoke` cannot hit another.
     next_id: u64,
     /// Tokens that were not withdrawn. Expired ones are removed when another is added.
     pub tokens: Vec<TokenRecord>,
@@ -280,7 +280,7 @@ pub enum PartnerError {
     },
     /// A record is invalid.
     #[error(
-        "token {id} in {RECORDS_FILE} has no usable CA or node; withdraw it: sgc share-token --withdraw {id}"
+        "token {id} in {RECORDS_FILE} has no usable CA or node; withdraw it: sgc token share revoke {id}"
     )]
     Record {
         /// Its number.
@@ -292,7 +292,7 @@ pub enum PartnerError {
     )]
     TooManyTokens,
     /// No token has that number.
-    #[error("no token has the number {id}; `sgc share-token --list` shows them")]
+    #[error("no token has the number {id}; `sgc token share list` shows them")]
     NoSuchToken {
         /// The number.
         id: u64,

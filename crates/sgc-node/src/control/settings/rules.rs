@@ -92,7 +92,7 @@ impl Rules {
             };
             if !config.shares.iter().any(is_shared) {
                 rules.warnings.push(format!(
-                    "token {} is for {} [{}], which is not shared any more: sgc share-token --withdraw {}",
+                    "token {} is for {} [{}], which is not shared any more: sgc token share revoke {}",
                     grant.id, grant.topic, grant.type_name, grant.id
                 ));
             }

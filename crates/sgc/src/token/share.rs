@@ -1,4 +1,4 @@
-//! `sgc share-token`: makes, lists and withdraws tokens that share one topic with a partner of another fleet.
+//! `sgc token share`: makes, lists and revokes tokens that share one topic with a partner of another fleet.
 //!
 //! It writes to the state directory and asks a running node to read that again.
 
@@ -6,12 +6,13 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use clap::Args;
+use clap::{Args, Subcommand};
+use serde::Serialize;
 use sgc_diagnosis::DiagnosisError;
 use sgc_node::config::{self, Config, Interface, RouterUrl, ShareConfig};
 use sgc_node::partners::{TokenRecord, TokenRecords, read_ca_file};
 use sgc_node::policy::metadata;
-use sgc_process::unix_now;
+use sgc_process::{ProcessError, unix_now};
 use sgc_transport::LinkUrl;
 use sgc_trust::{FleetSecret, Identity, ShareToken, TOKEN_ROUTERS_MAX, TopicSecret, TrustAnchors, pem_text};
 use sgc_wire::{NodeId, UnixMillis};
@@ -21,59 +22,98 @@ use crate::{files, output, policy, reload};
 
 const VALID_MAX: Duration = Duration::from_secs(3650 * 86_400);
 
-/// Share one topic with a partner of another fleet by a token.
+/// Share one topic with a partner of another fleet by a token, list such tokens, and revoke them.
+#[derive(Debug, Args)]
+pub(super) struct ShareArgs {
+    #[command(subcommand)]
+    command: ShareCommand,
+}
+
+#[derive(Debug, Subcommand)]
+enum ShareCommand {
+    Create(CreateArgs),
+    List(ListArgs),
+    Revoke(RevokeArgs),
+}
+
+/// Make a token that shares one topic with a partner of another fleet.
 ///
 /// The command prints the token once and does not keep it. Send it to the partner over a private channel; there,
-/// `sgc use FILE` takes it. It works for nodes of the CA that it was made for, until it expires or is withdrawn.
+/// `sgc token use FILE` takes it. It works for nodes of the CA that it was made for, until it expires or is revoked.
 #[derive(Debug, Args)]
-#[command(group = clap::ArgGroup::new("what").required(true))]
-pub(crate) struct ShareTokenArgs {
-    /// The owner's configuration; without it, the one *.toml of this directory
+struct CreateArgs {
+    /// The owner's configuration; without it, the only *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Topic; the configuration has to share it
-    #[arg(long, value_name = "/TOPIC", group = "what", requires = "to")]
-    topic: Option<String>,
+    #[arg(long, value_name = "/TOPIC")]
+    topic: String,
     /// Type of the topic, if neither the configuration nor a running node knows it
-    #[arg(long = "type", value_name = "TYPE", requires = "topic")]
+    #[arg(long = "type", value_name = "TYPE")]
     type_name: Option<String>,
     /// CA certificate of the partner, PEM; with :NODE-ID appended, the token is for that node alone
-    #[arg(long, value_name = "CA.pem[:NODE-ID]", requires = "topic")]
-    to: Option<String>,
+    #[arg(long, value_name = "CA.pem[:NODE-ID]")]
+    to: String,
     /// How long the token is valid
     #[arg(long, value_name = "TIME", default_value = "90d", value_parser = valid)]
     valid: Duration,
     /// Router at which the partner can reach this node; may be repeated [default: those of the configuration]
-    #[arg(long, value_name = "URL", requires = "topic")]
+    #[arg(long, value_name = "URL")]
     router: Vec<String>,
-    /// List the tokens in force
-    #[arg(long, group = "what")]
-    list: bool,
-    /// Withdraw the token with this number
-    #[arg(long, value_name = "ID", group = "what")]
-    withdraw: Option<u64>,
 }
 
-/// Runs `sgc share-token`.
-pub(crate) fn share_token(args: &ShareTokenArgs) -> Result<(), CliError> {
-    let path = files::config_here(args.config.as_deref())?;
+/// List the tokens in force.
+#[derive(Debug, Args)]
+struct ListArgs {
+    /// The owner's configuration; without it, the only *.toml of this directory
+    #[arg(short, long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Revoke a token: the partner's nodes are cut off.
+#[derive(Debug, Args)]
+struct RevokeArgs {
+    /// Number of the token
+    id: u64,
+    /// The owner's configuration; without it, the only *.toml of this directory
+    #[arg(short, long, value_name = "FILE")]
+    config: Option<PathBuf>,
+}
+
+/// Runs `sgc token share`.
+pub(super) fn share_token(args: &ShareArgs) -> Result<(), CliError> {
+    match &args.command {
+        ShareCommand::Create(args) => {
+            let (config, identity, state) = open(args.config.as_deref())?;
+            give(args, &args.topic, &config, &identity, &state)
+        }
+        ShareCommand::List(args) => list(&open(args.config.as_deref())?.2, args.json),
+        ShareCommand::Revoke(args) => {
+            let (config, identity, state) = open(args.config.as_deref())?;
+            let record = TokenRecords::change(&state, |records| records.withdraw(args.id))?;
+            output::line(format!(
+                "token {} for {} [{}] is revoked",
+                args.id, record.topic, record.type_name
+            ))?;
+            reload_node(&config, identity.node_name().as_str(), |line: String| output::line(line))
+        }
+    }
+}
+
+fn open(config: Option<&Path>) -> Result<(Config, Identity, PathBuf), CliError> {
+    let path = files::config_here(config)?;
     let (config, identity, _) = policy::load(&path)?;
-    let node = identity.node_name().as_str();
-    let state = sgc_node::state_dir(&config, node).ok_or(sgc_node::StateError::Nowhere)?;
+    let state = sgc_node::state_dir(&config, identity.node_name().as_str());
+    let state = state.ok_or(sgc_node::StateError::Nowhere)?;
     sgc_node::create_state_dir(&state)?;
-    if let Some(id) = args.withdraw {
-        let record = TokenRecords::change(&state, |records| records.withdraw(id))?;
-        output::line(format!("token {id} for {} [{}] is withdrawn", record.topic, record.type_name))?;
-        return reload_node(&config, node, |line: String| output::line(line));
-    }
-    match &args.topic {
-        Some(topic) => give(args, topic, &config, &identity, &state),
-        None => list(&state),
-    }
+    Ok((config, identity, state))
 }
 
 fn give(
-    args: &ShareTokenArgs,
+    args: &CreateArgs,
     topic: &str,
     config: &Config,
     identity: &Identity,
@@ -85,7 +125,7 @@ fn give(
     let Some(secret) = naming_secret(identity) else {
         return Err(DiagnosisError::RouterCannotName { path: config.identity.clone() }.into());
     };
-    let (ca, fingerprint, node) = recipient(args.to.as_deref().unwrap_or_default())?;
+    let (ca, fingerprint, node) = recipient(&args.to)?;
     if fingerprint == identity.as_peer().ca.to_string() {
         let why = "that is the CA of this fleet: its nodes need no token, name them in `to` of the [[share]]";
         return Err(cannot(why.to_owned()));
@@ -125,7 +165,7 @@ fn give(
     let id = TokenRecords::change(state, |records| records.add(record, now))?;
     output::diagnostic(&format!(
         "Token {id} for {topic} [{type_name}], until {}. Whoever has it and a certificate of that CA may subscribe: keep it secret.\n\
-         There: sgc use -, which reads it from standard input. To take it back: sgc share-token --withdraw {id}",
+         There: sgc token use -, which reads it from standard input. To take it back: sgc token share revoke {id}",
         token.expires
     ));
     let node = identity.node_name().as_str();
@@ -137,9 +177,36 @@ fn give(
     told
 }
 
+/// A token in force, as `--json` shows it.
+#[derive(Serialize)]
+struct RecordJson<'a> {
+    id: u64,
+    topic: &'a str,
+    #[serde(rename = "type")]
+    type_name: &'a str,
+    ca: &'a str,
+    node: Option<&'a str>,
+    created: String,
+    expires: String,
+}
+
+impl<'a> RecordJson<'a> {
+    fn new(record: &'a TokenRecord) -> Self {
+        Self {
+            id: record.id,
+            topic: &record.topic,
+            type_name: &record.type_name,
+            ca: &record.ca,
+            node: record.node.as_deref(),
+            created: UnixMillis(record.created).to_string(),
+            expires: UnixMillis(record.expires).to_string(),
+        }
+    }
+}
+
 /// Returns the types that programs on the local network use for a topic, as the running node sees them. Returns `None`
 /// if no node runs.
-pub(crate) fn seen_types(config: &Config, node: &str, topic: &str) -> Option<BTreeSet<String>> {
+pub(super) fn seen_types(config: &Config, node: &str, topic: &str) -> Option<BTreeSet<String>> {
     let socket = crate::node::socket_of(config, node);
     // Without an answer of the node, the user has to give the type.
     let graph = sgc_diagnosis::ask::graph(&socket, None).ok()?;
@@ -150,7 +217,7 @@ pub(crate) fn seen_types(config: &Config, node: &str, topic: &str) -> Option<BTr
 
 /// Returns the share of the topic, with the type that the token is for.
 fn share(
-    args: &ShareTokenArgs,
+    args: &CreateArgs,
     topic: &str,
     config: &Config,
     seen: Option<&BTreeSet<String>>,
@@ -235,7 +302,7 @@ fn recipient(to: &str) -> Result<(Vec<u8>, String, Option<NodeId>), CliError> {
     Ok((ca.to_vec(), fingerprint, node))
 }
 
-fn routers(args: &ShareTokenArgs, config: &Config) -> Result<Vec<String>, CliError> {
+fn routers(args: &CreateArgs, config: &Config) -> Result<Vec<String>, CliError> {
     if args.router.is_empty() {
         // A partner on another local network cannot find a router by mDNS.
         let routers = config.routers.iter().filter(|url| !matches!(url, RouterUrl::Mdns(_)));
@@ -248,10 +315,15 @@ fn routers(args: &ShareTokenArgs, config: &Config) -> Result<Vec<String>, CliErr
     args.router.iter().map(valid).collect()
 }
 
-fn list(state: &Path) -> Result<(), CliError> {
+fn list(state: &Path, json: bool) -> Result<(), CliError> {
     let now = unix_now();
     let records = TokenRecords::load(state)?;
     let in_force: Vec<_> = records.tokens.iter().filter(|record| record.expires > now.0).collect();
+    if json {
+        let rows: Vec<_> = in_force.iter().map(|record| RecordJson::new(record)).collect();
+        let text = serde_json::to_string(&rows).map_err(|error| ProcessError::Output(error.into()))?;
+        return output::line(text);
+    }
     if in_force.is_empty() {
         return output::line("no token is in force");
     }

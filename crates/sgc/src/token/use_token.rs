@@ -1,4 +1,4 @@
-//! `sgc use`: takes a token of another fleet's topic and adds a `[[use]]` for it to the configuration.
+//! `sgc token use`: takes a token of another fleet's topic and adds a `[[use]]` for it to the configuration.
 //!
 //! The token goes into a file of its own that only this user can read. The configuration gets three lines that name it.
 
@@ -12,9 +12,10 @@ use sgc_process::{ProcessError, unix_now};
 use sgc_trust::{ShareToken, TOKEN_PREFIX, TOKEN_TEXT_BYTES_MAX};
 use zeroize::Zeroizing;
 
+use super::share;
 use crate::environment::environment;
 use crate::error::CliError;
-use crate::{files, output, policy, reload, share_token};
+use crate::{files, output, policy, reload};
 
 const TOKENS_DIR: &str = "tokens";
 
@@ -23,7 +24,7 @@ const TOKENS_DIR: &str = "tokens";
 /// The command writes the token into the node's state directory and adds a `[[use]]` that names it to the
 /// configuration. The other lines of the configuration stay as they are.
 #[derive(Debug, Args)]
-pub(crate) struct UseArgs {
+pub(super) struct UseArgs {
     /// File that holds the token, or - for standard input
     #[arg(value_name = "FILE", required_unless_present = "token_file")]
     token: Option<String>,
@@ -38,8 +39,8 @@ pub(crate) struct UseArgs {
     dry_run: bool,
 }
 
-/// Runs `sgc use`.
-pub(crate) fn use_token(args: &UseArgs) -> Result<(), CliError> {
+/// Runs `sgc token use`.
+pub(super) fn use_token(args: &UseArgs) -> Result<(), CliError> {
     let path = files::config_here(args.config.as_deref())?;
     let (config, identity, _) = policy::load(&path)?;
     let given = args.token.as_deref().or(args.token_file.as_deref()).unwrap_or("-");
@@ -73,7 +74,7 @@ pub(crate) fn use_token(args: &UseArgs) -> Result<(), CliError> {
         return output::line(block.trim());
     }
     let (topic, type_name) = (&token.metadata.ros_name, &token.metadata.type_name);
-    let seen = share_token::seen_types(&config, node, topic).unwrap_or_default();
+    let seen = share::seen_types(&config, node, topic).unwrap_or_default();
     if let Some(other) = seen.iter().find(|seen| *seen != type_name) {
         output::diagnostic(&format!(
             "Programs here have {topic} as {other}: those get nothing of {type_name}."

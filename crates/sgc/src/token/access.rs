@@ -1,4 +1,4 @@
-//! `sgc token`: makes, lists and revokes access tokens for programs that connect to this node's gateway.
+//! `sgc token access`: makes, lists and revokes access tokens for programs that connect to this node's gateway.
 //!
 //! It signs a token with the node's identity, writes the records of tokens to the state directory, and asks a running
 //! node to read them again.
@@ -25,18 +25,18 @@ const ID_DIGITS: usize = 12;
 /// Make, list and revoke access tokens for programs that connect to a node's gateway.
 #[derive(Debug, Args)]
 #[command(after_help = "A dashboard in a browser, for twelve hours:
-  sgc token create -c arm-1.toml --for dashboard --subscribe /odom --subscribe '/camera/**' --valid 12h
+  sgc token access create -c arm-1.toml --for dashboard --subscribe /odom --subscribe '/camera/**' --valid 12h
 A program that drives:
-  sgc token create -c arm-1.toml --for teleop --subscribe /odom --publish /cmd_vel --out teleop.token
+  sgc token access create -c arm-1.toml --for teleop --subscribe /odom --publish /cmd_vel --out teleop.token
 Revoke a token:
-  sgc token revoke -c arm-1.toml 3f9c01aa52d4")]
-pub(crate) struct TokenArgs {
+  sgc token access revoke -c arm-1.toml 3f9c01aa52d4")]
+pub(super) struct AccessArgs {
     #[command(subcommand)]
-    command: TokenCommand,
+    command: AccessCommand,
 }
 
 #[derive(Debug, Subcommand)]
-enum TokenCommand {
+enum AccessCommand {
     Create(CreateArgs),
     List(ListArgs),
     Revoke(RevokeArgs),
@@ -96,12 +96,12 @@ struct RevokeArgs {
     config: Option<PathBuf>,
 }
 
-/// Runs `sgc token`.
-pub(crate) fn token(args: &TokenArgs) -> Result<(), CliError> {
+/// Runs `sgc token access`.
+pub(super) fn access(args: &AccessArgs) -> Result<(), CliError> {
     match &args.command {
-        TokenCommand::Create(args) => create(args),
-        TokenCommand::List(args) => list(args),
-        TokenCommand::Revoke(args) => revoke(args),
+        AccessCommand::Create(args) => create(args),
+        AccessCommand::List(args) => list(args),
+        AccessCommand::Revoke(args) => revoke(args),
     }
 }
 
@@ -137,7 +137,7 @@ fn create(args: &CreateArgs) -> Result<(), CliError> {
     note(&config, &state, AuditEvent::TokenMade, &format!("{short} for {label}, until {expires}: {scope}"));
     output::diagnostic(&format!(
         "Token {short} for {}, until {}: {}. Whoever has it may do that at the gateway of {}: keep it secret.\nTo take it \
-         back: sgc token revoke {short}",
+         back: sgc token access revoke {short}",
         grant.label,
         grant.expires,
         grant.scope,
