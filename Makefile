@@ -16,7 +16,7 @@ CLIENTS := $(addprefix --test ,foxglove grpc rosbridge)
 COMMIT = SGC_COMMIT=$${SGC_COMMIT-$$(git describe --always --dirty --abbrev=8 --exclude '*' 2>/dev/null)} \
 	SGC_COMMIT_DATE=$${SGC_COMMIT_DATE-$$(git log -1 --format=%cs 2>/dev/null)}
 
-.PHONY: help demo test build dist dist-test upgrade-test image image-test deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
+.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install the requirements of the build, build, and run the demo (ARGS="--seconds 10 --json")'
@@ -25,6 +25,7 @@ help:
 	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit and interop (ARGS goes to cargo test), docs, deny'
 	@echo 'not in it:       msrv (check with the oldest supported Rust), minimal (check without optional features, and with each alone)'
 	@echo '                 dist-test (the package on a small Debian with systemd; root)'
+	@echo '                 new-user (the commands and seconds from the package to the first topic; root)'
 	@echo '                 upgrade-test (this version together with an earlier one, SGC_OLD; root)'
 	@echo '                 image, image-test (the image of a container, with podman; root)'
 	@echo '                 book (the documents as a book, target/book/index.html; builds mdbook once)'
@@ -61,6 +62,10 @@ dist: deps-dist
 # Installs, runs, upgrades, removes and purges the package on a small Debian whose systemd is started in a container. Root.
 dist-test: dist
 	scripts/dist-test.sh
+
+# Plays a new user on a small Debian: from the package to the first topic and the dashboard. Root.
+new-user: dist
+	scripts/dist-test.sh new-user
 
 # Runs an earlier version and this one together, in every role, between programs of ROS 2. Root.
 upgrade-test: peers

@@ -2,6 +2,7 @@
 # Tries the package of target/dist on a small Debian whose systemd runs in a container: installs it, runs three nodes as
 # services between programs of ROS 2, reboots, upgrades, breaks things, removes and purges it. Needs root, and the web once for
 # the Debian and for ROS 2.
+# With `new-user`, plays somebody who follows the guides from the package to the first topic, and prints commands and times.
 #   SGC_DIST_SUITE    the release of Debian (that of this machine)
 set -euo pipefail
 # shellcheck source=scripts/lib.sh
@@ -9,6 +10,7 @@ set -euo pipefail
 cd "$root"
 
 PATIENCE_SECONDS=420
+plays=${1:-in-container}
 # The exit code of a container that reboots (EXIT_FORCE_RESTART).
 REBOOTS=133
 # shellcheck source=/dev/null
@@ -31,7 +33,7 @@ rm -rf "$machine" "$place/console.log"
 cp -a "$base" "$machine"
 
 mkdir "$machine/test"
-cp tests/dist/in-container.sh tests/dist/chatter.py "$machine/test"
+cp "tests/dist/$plays.sh" tests/dist/chatter.py "$machine/test"
 cp "$package" "$machine/test/first.deb"
 # The same program under a later version, for the upgrade.
 dpkg-deb -R "$package" "$place/later"
@@ -42,12 +44,13 @@ cat >"$machine/etc/systemd/system/sgc-test.service" <<'UNIT'
 [Unit]
 After=multi-user.target
 [Service]
-ExecStart=/test/in-container.sh
+ExecStart=/test/PLAYS.sh
 StandardOutput=append:/test/log
 StandardError=append:/test/log
 [Install]
 WantedBy=graphical.target
 UNIT
+sed -i "s/PLAYS/$plays/" "$machine/etc/systemd/system/sgc-test.service"
 ln -sf /lib/systemd/system/graphical.target "$machine/etc/systemd/system/default.target"
 mkdir -p "$machine/etc/systemd/system/graphical.target.wants"
 ln -s ../sgc-test.service "$machine/etc/systemd/system/graphical.target.wants/"
