@@ -20,6 +20,8 @@ use crate::error::CliError;
 use crate::log::{LogFormat, start_log};
 use crate::{heap, output, supervisor, version};
 
+/// Time after which a node uses no more of what only its start needs. Threads of the start end within it.
+const START_MAX: Duration = Duration::from_secs(10);
 /// Time by which working threads may delay the end of the process.
 const RUNTIME_GRACE: Duration = Duration::from_secs(1);
 
@@ -212,6 +214,10 @@ fn run_node(
         tokio::spawn(async move {
             let Ok(addresses) = when_ready.await else { return };
             supervisor::ready();
+            tokio::spawn(async {
+                tokio::time::sleep(START_MAX).await;
+                let _ = tokio::task::spawn_blocking(heap::drop_pages_of_start).await;
+            });
             if prints_ready {
                 let ready = addresses.iter().map(ToString::to_string).collect();
                 // A failure to print is ignored: if the parent is gone, standard input ends too.
