@@ -145,7 +145,7 @@ pub(crate) const CONTROL: &[Refusal] = &[
     named(
         "invited",
         "the holder of a code of `sgc fleet invite` asks for more than its identity",
-        "a new invitation of the node that the code is for ends the code; the log names the link",
+        "the code ends by itself, or by `sgc fleet revoke` of the node that it is for; the log names the link",
     ),
     named(
         "stale_flood",
@@ -193,7 +193,7 @@ pub(crate) const CONTROL: &[Refusal] = &[
     named(
         "endpoint_invited",
         "the holder of a code of `sgc fleet invite` asks for more than its identity, through a router of an earlier version",
-        "upgrade the router; a new invitation of the node that the code is for ends the code",
+        "upgrade the router; the code ends by itself, or by `sgc fleet revoke` of the node that it is for",
     ),
     counted(
         NodeDrop::JoinRefused.key(),
@@ -698,12 +698,12 @@ pub(crate) const GATEWAY: &[Refusal] = &[
     named(
         ClientRefusal::NotAdmitted.key(),
         "it shows no token, certificate or origin that holds here, or tries too often",
-        "make a token (`sgc token`), or name it in [gateway]; the log says at DEBUG why",
+        "make a token (`sgc token access create`), or name it in [gateway]; the log says at DEBUG why",
     ),
     named(
         "no longer admitted",
         "its token or certificate ended or was revoked while it was connected",
-        "make a new token (`sgc token`) if it may come back",
+        "make a new token (`sgc token access create`) if it may come back",
     ),
     counted(
         "no WebSocket",

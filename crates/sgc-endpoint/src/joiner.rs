@@ -62,9 +62,12 @@ impl Joiner {
     /// Asks the fleet's authority for credentials, in place of an earlier request. Returns `false` if the identity
     /// names no authority.
     pub(crate) fn renew(&mut self, cx: &mut Context, csr: Bytes) -> bool {
+        // The identity may have named another authority before.
+        let asked = self.joins.iter().filter(|(_, join)| matches!(join.kind(), JoinKind::Renew(_)));
+        let asked: Vec<_> = asked.map(|(name, _)| *name).collect();
+        asked.iter().for_each(|name| self.leave(cx, name));
         let Some(authority) = cx.identity().authority() else { return false };
         let BlindName { name, .. } = BlindName::renewal(&authority, cx.identity());
-        self.leave(cx, &name);
         self.join(cx, name, authority, JoinKind::Renew(csr));
         true
     }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use bytes::Bytes;
 use rand_chacha::ChaCha20Rng;
 use rand_core::SeedableRng;
 use sgc_endpoint::{
@@ -9,7 +10,7 @@ use sgc_endpoint::{
     Limits, LostReason, Output, ShareError, ShareSpec, SignedKind,
 };
 use sgc_testkit::{Clock, Member, identity, invited};
-use sgc_trust::{Grantees, Identity, Policy, ReplyKey, Suite, seal_grant};
+use sgc_trust::{Grantees, Identity, Policy, ReplyKey, Suite, name_of, operations_blind, seal_grant};
 use sgc_wire::{
     ADVERT_NAMES_MAX, AdvertBody, Answer, AnswerBody, Class, Control, Decode, GrantContent, JoinBody,
     Metadata, Name, Qos, RefuseReason, Request, SecretBytes, SinkId, TopicGrant,
@@ -28,9 +29,17 @@ struct Bench {
 
 impl Bench {
     fn new(name: &str, limits: Limits) -> Self {
+        Self::with(name, limits, false)
+    }
+
+    fn authority(name: &str) -> Self {
+        Self::with(name, Limits::default(), true)
+    }
+
+    fn with(name: &str, limits: Limits, is_authority: bool) -> Self {
         let (clock, identity) = (Clock::default(), identity(&Member::new(name)));
-        let config =
-            EndpointConfig { identity: identity.clone(), authority: false, operations: false, limits };
+        let (authority, operations) = (is_authority, is_authority);
+        let config = EndpointConfig { identity: identity.clone(), authority, operations, limits };
         let endpoint = Endpoint::new(config, ChaCha20Rng::seed_from_u64(1), clock.now());
         let (sent, events, dropped) = (Vec::new(), Vec::new(), Vec::new());
         let mut bench = Self { endpoint, clock, identity, sent, events, dropped, timeout: None };
@@ -241,7 +250,7 @@ fn the_holder_of_an_invitation_is_refused_what_everyone_in_the_fleet_may_have() 
     let mut bench = owner();
     let topic = bench.share_with_fleet("/a");
     let catalogue = bench.endpoint.catalogue_name().expect("it has one");
-    let holder = invited("acme");
+    let holder = invited("acme", 1);
     for name in [topic, catalogue] {
         let (frame, _) = join(&bench, &holder, name, 1);
         bench.frame(frame);
@@ -249,6 +258,43 @@ fn the_holder_of_an_invitation_is_refused_what_everyone_in_the_fleet_may_have() 
         assert!(matches!(bench.dropped[..], [EndpointDrop::Invited { .. }]), "{:?}", bench.dropped);
         assert_eq!(bench.endpoint.granted(&name), []);
     }
+}
+
+/// Holders displace each other, and take no place that members have.
+#[test]
+fn holders_of_invitations_have_places_of_their_own() {
+    let mut bench = Bench::authority("keeper");
+    let name = name_of(&bench.identity.node_id(), &operations_blind(&bench.identity.as_peer().ca));
+    let ask = |bench: &mut Bench, who: &Identity, sink: [u8; 16]| {
+        let body = JoinBody {
+            name,
+            sink: SinkId(sink),
+            request: Request::Ask { what: Bytes::from_static(b"x") },
+            issued_at: bench.clock.now().unix,
+            chain: who.chain_bytes(),
+            reply_key: ReplyKey::generate(sgc_trust::Kem::default()).public().clone(),
+        };
+        bench.frame(Control::Join { signed: who.sign_join(&body) });
+        bench.answers()
+    };
+    let sink = |number: u32| {
+        let mut id = [0; 16];
+        id[..4].copy_from_slice(&number.to_be_bytes());
+        id
+    };
+    let first = invited("acme", 0);
+    for number in 0..256 {
+        assert_eq!(ask(&mut bench, &invited("acme", number), sink(number)), []);
+        bench.clock.advance_to(bench.clock.instant() + std::time::Duration::from_millis(1));
+    }
+    // One that asks again has its place.
+    assert_eq!(ask(&mut bench, &invited("acme", 255), sink(255)), []);
+    assert_eq!(ask(&mut bench, &identity(&Member::new("desk")), [0xff; 16]), []);
+    let displaced = ask(&mut bench, &invited("acme", 256), sink(256));
+    assert_eq!(displaced, [(SinkId(sink(0)), Some(RefuseReason::Limit))]);
+    bench.clock.advance_to(bench.clock.instant() + std::time::Duration::from_millis(1));
+    let displaced = ask(&mut bench, &first, sink(1000));
+    assert_eq!(displaced, [(SinkId(sink(1)), Some(RefuseReason::Limit))]);
 }
 
 #[test]

@@ -358,7 +358,7 @@ fn a_node_that_may_not_route_cannot_say_that_it_does() {
 #[test]
 fn the_holder_of_an_invitation_reaches_the_authority_and_nobody_else() {
     let mut bench = Bench::new();
-    bench.user = invited("acme");
+    bench.user = invited("acme", 1);
     let operations = operations_blind(&bench.owner.as_peer().ca);
     bench.with_proxies();
     bench.with_owner_behind(5000, 9000);

@@ -122,11 +122,11 @@ pub fn identity(member: &Member) -> Arc<Identity> {
     identity
 }
 
-/// Returns the holder of an invitation to a fleet, whose authority is the node `keeper`.
-pub fn invited(fleet: &str) -> Arc<Identity> {
+/// Returns the holder with this number of an invitation to a fleet, whose authority is the node `keeper`.
+pub fn invited(fleet: &str, number: u32) -> Arc<Identity> {
     let mut cast = cast();
     let mut copy = Fleet::parse(&cast.fleet(fleet).to_text()).expect("it was written by itself");
-    let rng = &mut rng(&format!("{fleet}/invited"));
+    let rng = &mut rng(&format!("{fleet}/invited/{number}"));
     copy.set_authority(Some("keeper".parse().expect("a legal name")), BIRTH).expect("a fresh fleet");
     let request = EnrollRequest::new("invited".parse().expect("a legal name"), GENESIS);
     let made = copy

@@ -115,13 +115,13 @@ impl Fleet {
         if !Invitation::fits(&routers) {
             return Err(FleetError::InvitationRouters);
         }
+        let incarnation = self.admit(request)?;
         // Certificates end with the CA; the certificate of an invitation holds this number of seconds.
         let left = Duration::from_millis(self.validity.not_after.0.saturating_sub(request.now.0));
         let valid = request.valid.min(left).min(Duration::from_secs(u32::MAX.into()));
         if valid < Duration::from_secs(1) {
             return Err(FleetError::InvitationTime);
         }
-        let incarnation = self.admit(request)?;
         let (key, scalar) = Key::generate_with_scalar(rng);
         let mut pseudonym = Pseudonym([0; 32]);
         rng.fill_bytes(&mut pseudonym.0);
@@ -152,6 +152,22 @@ impl Fleet {
             scalar,
             post_quantum: self.roster.settings.post_quantum,
         })
+    }
+
+    /// Ends all unused invitations: the file comes from a copy, which does not know whether they were used. Returns the
+    /// invited nodes.
+    pub fn end_invitations(&mut self, now: UnixMillis) -> Result<Vec<NodeName>, FleetError> {
+        let mut ended = Vec::new();
+        for node in self.roster.nodes.values_mut() {
+            let open = node.certificates.iter_mut();
+            let open = open.filter(|c| c.is_invitation() && c.revoked.is_none() && c.not_after >= now);
+            let count = open.map(|c| c.revoked = Some(now)).count();
+            ended.extend((count > 0).then(|| node.name.clone()));
+        }
+        if !ended.is_empty() {
+            self.sign_roster()?;
+        }
+        Ok(ended)
     }
 
     /// Makes the identity of an invited node, for the key that signed `csr`, once. `peer` is the holder of the

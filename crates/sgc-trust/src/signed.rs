@@ -143,8 +143,8 @@ impl Identity {
     }
 }
 
-/// Verifies an advertisement: chain, time, signature, sequence number, and that its owner is no invitation; and derives
-/// the names it may claim.
+/// Verifies an advertisement: chain, time, signature, sequence number, and that its owner is more than invited; and
+/// derives the names it may claim.
 pub fn verify_advert(
     anchors: &TrustAnchors,
     signed: &SignedBody,
@@ -176,8 +176,8 @@ pub fn verify_join(
     Ok(VerifiedJoin { peer, body })
 }
 
-/// Verifies a link state: chain, time, signature, sequence number, and that its node is no invitation. The caller checks whether the node may carry others'
-/// names.
+/// Verifies a link state: chain, time, signature, sequence number, and that its signer is more than invited. The caller
+/// checks whether the node may carry others' names.
 pub fn verify_link_state(
     anchors: &TrustAnchors,
     signed: &SignedBody,

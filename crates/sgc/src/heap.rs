@@ -21,18 +21,18 @@ pub(crate) fn share_arenas() {}
 /// the file; those that only the start used do not.
 ///
 /// The kernel maps the 64 KB around each page that is used once, and keeps them.
-#[cfg(target_os = "linux")]
+#[cfg(all(target_os = "linux", target_pointer_width = "64"))]
 pub(crate) fn drop_pages_of_start() {
     // SAFETY: the callback and its data fit the declaration of the call.
     unsafe { libc::dl_iterate_phdr(Some(drop_unwritten_pages), std::ptr::null_mut()) };
 }
 
-/// Does nothing: only Linux is known to come back for the pages.
-#[cfg(not(target_os = "linux"))]
+/// Does nothing: only Linux on 64 bits was tried.
+#[cfg(not(all(target_os = "linux", target_pointer_width = "64")))]
 pub(crate) fn drop_pages_of_start() {}
 
 /// Handles the first object, which is the program, and ends the iteration.
-#[cfg(target_os = "linux")]
+#[cfg(all(target_os = "linux", target_pointer_width = "64"))]
 unsafe extern "C" fn drop_unwritten_pages(
     object: *mut libc::dl_phdr_info,
     _size: libc::size_t,
@@ -52,23 +52,25 @@ unsafe extern "C" fn drop_unwritten_pages(
         let begin = base.wrapping_add(header.p_vaddr) / page * page;
         let end = base.wrapping_add(header.p_vaddr).wrapping_add(header.p_memsz);
         let length = end.saturating_sub(begin).next_multiple_of(page);
-        // SAFETY: the range is one mapping of the program's file that was never written, so that each page is read from
-        // the file again when it is needed. A failure leaves the pages where they are.
+        // SAFETY: the range is one mapping of the program's file that the program never writes, so that each page is read
+        // from the file again when it is needed. A debugger or a uprobe may have written breakpoints, which are lost. A
+        // failure leaves the pages where they are.
         unsafe { libc::madvise(begin as *mut libc::c_void, length as usize, libc::MADV_DONTNEED) };
     }
     1
 }
 
-#[cfg(all(test, target_os = "linux"))]
+#[cfg(all(test, target_os = "linux", target_pointer_width = "64"))]
 mod tests {
     use super::*;
 
-    /// Returns the mapped pages of files, KiB.
+    /// Returns the mapped pages of files, those in memory alone included, KiB.
     fn mapped() -> u64 {
         let status = std::fs::read_to_string("/proc/self/status").expect("Linux has it");
-        let line =
-            status.lines().find_map(|line| line.strip_prefix("RssFile:")).expect("a kernel from 4.5 on");
-        line.trim_end_matches(" kB").trim().parse().expect("a number")
+        let is_meant = |line: &&str| line.starts_with("RssFile:") || line.starts_with("RssShmem:");
+        let number =
+            |line: &str| line.split_whitespace().nth(1).and_then(|number| number.parse::<u64>().ok());
+        status.lines().filter(is_meant).filter_map(number).sum()
     }
 
     #[test]

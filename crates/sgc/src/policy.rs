@@ -39,6 +39,9 @@ enum PolicyCommand {
 /// The command reads the configuration; no node has to run. Exit code 0 means yes, 1 means no.
 #[derive(Debug, Args)]
 #[command(group = clap::ArgGroup::new("who").required(true))]
+#[command(
+    override_usage = "sgc policy test [OPTIONS] --topic </TOPIC> <NODE|--identity-file <FILE>|--certificate <FILE>>"
+)]
 struct TestArgs {
     /// Name of a node of this fleet
     #[arg(value_name = "NODE", group = "who")]

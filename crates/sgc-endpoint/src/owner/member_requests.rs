@@ -14,7 +14,7 @@ use crate::output::UnexpectedFrame;
 
 /// Most holders of invitations that have a place. A further one takes that of the first: what members need must not
 /// depend on how many codes are about.
-const HOLDERS_MAX: usize = 32;
+const HOLDER_PLACES_MAX: usize = 256;
 
 /// The requests at one name of this node.
 #[derive(Debug)]
@@ -93,11 +93,11 @@ impl MemberRequests {
             granted.refuse(cx, name, older, RefuseReason::Limit);
         }
         let is_holder = |asked: &GrantedSink| asked.peer.invitation.is_some();
-        let holders = self.asked.values().filter(|asked| is_holder(asked)).count();
+        let holders = self.asked.iter().filter(|(id, asked)| is_holder(asked) && **id != sink).count();
         if is_holder(&asked) {
             let first = self.asked.iter().filter(|(id, asked)| is_holder(asked) && **id != sink);
             let first = first.min_by_key(|(_, asked)| asked.issued_at).map(|(id, _)| *id);
-            if let Some(first) = first.filter(|_| holders >= HOLDERS_MAX)
+            if let Some(first) = first.filter(|_| holders >= HOLDER_PLACES_MAX)
                 && let Some((id, first)) = self.asked.remove_entry(&first)
             {
                 first.refuse(cx, name, id, RefuseReason::Limit);

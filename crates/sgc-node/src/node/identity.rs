@@ -56,34 +56,47 @@ pub(crate) enum FileIdentity {
     Same,
     /// It holds another identity of this node, which it can use.
     Replaced(Arc<Identity>),
-    /// It holds an identity that this run cannot use, for the reason in words.
-    Refused(&'static str),
+    /// It holds the identity of another node, or of another role, for the reason in words.
+    OfAnother(&'static str),
+    /// It holds no identity that is better than the one in use, for the reason in words.
+    Unusable(String),
 }
 
 impl FileIdentity {
-    /// Reads the file of a node that runs with `own`. An error if it holds no identity, or one that has expired.
-    pub(crate) fn read(path: &Path, own: &Identity) -> Result<Self, NodeError> {
-        let found = load_identity(path)?;
+    /// Reads the file of a node that runs with `own`.
+    pub(crate) fn read(path: &Path, own: &Identity) -> Self {
+        let found = match load_identity(path) {
+            Ok(found) => found,
+            Err(why) => return Self::Unusable(why.to_string()),
+        };
         if found.to_text() == own.to_text() {
-            return Ok(Self::Same);
+            return Self::Same;
+        }
+        if found.node_id() != own.node_id() {
+            return Self::OfAnother("is of another node");
+        }
+        if found.fleet_secret().is_some() != own.fleet_secret().is_some() {
+            return Self::OfAnother("makes a router of a member, or a member of a router");
         }
         match found.anchors().verify(found.chain(), now().unix) {
             Ok(_) | Err(CertError::NotYetValid { .. }) => {}
-            Err(source) => return Err(NodeError::Certificate { path: path.to_owned(), source }),
+            Err(source) => {
+                return Self::Unusable(NodeError::Certificate { path: path.to_owned(), source }.to_string());
+            }
         }
-        let newest = |identity: &Identity| identity.naming_secrets().first().map(|n| n.generation);
-        let age = |identity: &Identity| (identity.as_peer().incarnation, identity.as_peer().not_before);
-        Ok(if found.node_id() != own.node_id() {
-            Self::Refused("is of another node, which needs a restart")
-        } else if found.fleet_secret().is_some() != own.fleet_secret().is_some() {
-            Self::Refused("makes a router of a member, or a member of a router, which needs a restart")
-        } else if age(&found) < age(own) || newest(&found) < newest(own) {
-            // The fleet's authority renewed this node, and the file could not be written.
-            Self::Refused("is older than what this node has")
-        } else {
-            Self::Replaced(Arc::new(found))
-        })
+        // The fleet's authority renewed this node, and the file could not be written.
+        if is_older(&found, own) {
+            return Self::Unusable(format!("{} is older than what this node has", path.display()));
+        }
+        Self::Replaced(Arc::new(found))
     }
+}
+
+/// Returns `true` if an identity of the same node was made before another one.
+pub(crate) fn is_older(identity: &Identity, other: &Identity) -> bool {
+    let newest = |identity: &Identity| identity.naming_secrets().first().map(|n| n.generation);
+    let age = |identity: &Identity| (identity.as_peer().incarnation, identity.as_peer().not_before);
+    age(identity) < age(other) || newest(identity) < newest(other)
 }
 
 /// Returns the routers wanted on the local network, if any are.

@@ -55,6 +55,7 @@ pub(crate) fn with_kept_crls(dir: Option<&Path>, anchors: TrustAnchors, now: Now
 pub(crate) struct StateWriter {
     anchors: watch::Sender<Option<Arc<TrustAnchors>>>,
     identity: watch::Sender<Option<Arc<Identity>>>,
+    run_lock: RunLock,
 }
 
 impl StateWriter {
@@ -70,11 +71,12 @@ impl StateWriter {
                 keep_crls(dir, anchors);
             }
         });
+        let lock = run_lock.clone();
         let identity = keep_newest(alive, move |identity: &Identity| {
             keep_identity(&identity_file, identity);
-            run_lock.follow();
+            lock.follow();
         });
-        Self { anchors, identity }
+        Self { anchors, identity, run_lock }
     }
 
     /// Saves the revocation lists of these anchors.
@@ -85,6 +87,13 @@ impl StateWriter {
     /// Saves this identity over the one that was read at start.
     pub(crate) fn identity(&self, identity: Arc<Identity>) {
         self.identity.send_replace(Some(identity));
+    }
+}
+
+impl StateWriter {
+    /// Locks the identity file that somebody put in the place of the one that was read at start.
+    pub(crate) fn identity_file_replaced(&self) {
+        self.run_lock.follow();
     }
 }
 

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use sgc_node::LockedFleet;
 use sgc_process::{ProcessError, unix_now};
-use sgc_trust::{FLEET_FILE_BYTES_MAX, Fleet};
+use sgc_trust::{FLEET_FILE_BYTES_MAX, Fleet, NodeName};
 use sgc_wire::UnixMillis;
 use zeroize::Zeroizing;
 
@@ -46,9 +46,9 @@ pub(super) struct RestoreArgs {
 }
 
 pub(super) fn backup(args: &BackupArgs) -> Result<(), CliError> {
-    // The lock keeps other programs from writing meanwhile.
-    let file = LockedFleet::open(&args.which.path()?)?;
-    let (fleet, text) = (&file.fleet, file.fleet.to_text());
+    // The lock keeps other programs from writing meanwhile. It is not held while a program behind a pipe takes its time.
+    let fleet = LockedFleet::open(&args.which.path()?)?.fleet;
+    let text = fleet.to_text();
     if args.out.as_deref() == Some(Path::new(STANDARD_STREAM)) {
         if std::io::stdout().is_terminal() {
             return Err(CliError::Cannot {
@@ -63,7 +63,7 @@ pub(super) fn backup(args: &BackupArgs) -> Result<(), CliError> {
     let out = args.out.clone().unwrap_or_else(default);
     let existing = if args.force { Existing::Replace } else { Existing::Keep("; --force replaces it") };
     files::write_secret(&out, &text, existing)?;
-    output::line(format!("{}: {}", out.display(), content_text(fleet)))
+    output::line(format!("{}: {}", out.display(), content_text(&fleet)))
 }
 
 pub(super) fn restore(args: &RestoreArgs) -> Result<(), CliError> {
@@ -71,18 +71,29 @@ pub(super) fn restore(args: &RestoreArgs) -> Result<(), CliError> {
         true => read_standard_input()?,
         false => files::read_secret(&args.backup, "a copy of a fleet file")?,
     };
-    let fleet =
-        Fleet::parse(&text).map_err(|source| CliError::Fleet { path: args.backup.clone(), source })?;
+    let failed = |source| CliError::Fleet { path: args.backup.clone(), source };
+    let mut fleet = Fleet::parse(&text).map_err(failed)?;
+    let invited = fleet.end_invitations(unix_now()).map_err(failed)?;
     let path = args.fleet.clone().unwrap_or_else(|| PathBuf::from(format!("{}.fleet", fleet.name())));
     let hint = "; what it lacks comes from a copy by `sgc fleet merge COPY`";
     files::write_secret(&path, &fleet.to_text(), Existing::Keep(hint))?;
     output::line(format!(
         "{}: {}\nNodes that were enrolled after the copy was made are not in it: they run on, and cannot be renewed or \
          revoked until `sgc fleet adopt NODE --certificate NODE.identity` enters them. Later revocations stay in force: \
-         `sgc fleet merge LIST.crl`, or the start of the authority, brings them here.",
+         `sgc fleet merge LIST.crl`, or the start of the authority, brings them here.{}",
         path.display(),
-        content_text(&fleet)
+        content_text(&fleet),
+        ended_text(&invited)
     ))
+}
+
+/// Tells which invitations ended. A copy does not know whether they were used.
+fn ended_text(invited: &[NodeName]) -> String {
+    if invited.is_empty() {
+        return String::new();
+    }
+    let nodes: Vec<_> = invited.iter().map(NodeName::as_str).collect();
+    format!("\nCodes for these nodes were open when the copy was made, and end now: {}", nodes.join(", "))
 }
 
 fn read_standard_input() -> Result<Zeroizing<String>, CliError> {

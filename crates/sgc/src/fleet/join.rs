@@ -22,7 +22,8 @@ use sgc_trust::{
     INVITATION_TEXT_BYTES_MAX, Identity, Invitation, Kem, KeyRequest, Membership, NodeName, ReplyKey,
     name_of, operations_blind,
 };
-use sgc_wire::{GrantContent, Operation, OperationAnswer, REDEEM_SINK};
+use sgc_wire::{GrantContent, Operation, OperationAnswer, OperationRefusal, REDEEM_SINK};
+use tokio::runtime::Runtime;
 use tokio::sync::oneshot;
 use zeroize::Zeroizing;
 
@@ -38,6 +39,8 @@ use crate::output;
 const WAIT_DEFAULT: Duration = Duration::from_secs(60);
 /// Time between two looks at the links of the node in this process.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
+/// Time between two requests to an authority that is busy.
+const BUSY_EVERY: Duration = Duration::from_secs(1);
 /// Time by which working threads may delay the end of the process.
 const RUNTIME_GRACE: Duration = Duration::from_secs(1);
 /// Places of a service's files, as the package has them.
@@ -113,6 +116,12 @@ pub(crate) fn join(args: JoinArgs) -> Result<(), CliError> {
     {
         return Err(ProcessError::Exists { path: places.identity, hint }.into());
     }
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(|source| ProcessError::System { what: "cannot start threads", source })?;
+    // From here on there are files that a signal must not leave behind.
+    let signals = runtime.block_on(async { EndSignals::new() })?;
     // The code is used up once the authority has answered, so both files are begun before.
     let identity_file = PendingFile::begin(&places.identity)?;
     if places.service.is_some() {
@@ -126,7 +135,7 @@ pub(crate) fn join(args: JoinArgs) -> Result<(), CliError> {
     let from = if args.router.is_empty() { "the code" } else { "--router" };
     let key = KeyRequest::generate(None, &mut system_rng()?).map_err(CliError::Making)?;
     let wait = args.wait.unwrap_or(WAIT_DEFAULT);
-    let member = ask_authority(&invitation, (routers, from), &key, wait)?;
+    let member = ask_authority(&invitation, (routers, from), &key, wait, (runtime, signals))?;
     let is_router = member.is_router();
     let identity = Identity::join(member, key.key(), &mut system_rng()?)
         .map_err(|source| CliError::Identity { path: places.identity.clone(), source })?;
@@ -200,6 +209,7 @@ fn ask_authority(
     (routers, from): (&[String], &str),
     key: &KeyRequest,
     wait: Duration,
+    (runtime, mut signals): (Runtime, EndSignals),
 ) -> Result<Membership, CliError> {
     let private = std::fs::Permissions::from_mode(0o700);
     let dir = tempfile::Builder::new().prefix("sgc-join-").permissions(private).tempdir();
@@ -214,13 +224,7 @@ fn ask_authority(
     let socket = dir.path().join("node.sock");
     let config = Config { admin_socket: Some(socket.clone()), state: Some(dir.path().to_owned()), ..config };
     let question = Question::new(invitation, &holder, routers, key, socket);
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .enable_all()
-        .build()
-        .map_err(|source| ProcessError::System { what: "cannot start threads", source })?;
     let result = runtime.block_on(async {
-        // The directory has the key of the code, so a signal must not leave it behind.
-        let mut signals = EndSignals::new()?;
         let (ready, when_ready) = oneshot::channel();
         let (stop, stopped) = oneshot::channel::<()>();
         let options = RunOptions { ready: Some(ready), ..RunOptions::default() };
@@ -284,10 +288,19 @@ impl Question {
 
     /// Asks once there is a link.
     fn ask(self, wait: Duration) -> Result<Membership, CliError> {
-        self.wait_for_link(wait)?;
-        let OperationAnswer::Sealed { enc, sealed } = self.remote.ask(self.operation)? else {
-            return Err(self.remote.surprised());
+        // `None` waits for ever.
+        let until = Instant::now().checked_add(wait);
+        self.wait_for_link(until, wait)?;
+        let answer = loop {
+            let answer = self.remote.exchange(self.operation.clone())?;
+            let is_busy = matches!(answer, OperationAnswer::Refused { why: OperationRefusal::Busy, .. });
+            // Others join at the same time.
+            if !is_busy || until.is_some_and(|until| Instant::now() >= until) {
+                break self.remote.accepted(answer)?;
+            }
+            std::thread::sleep(BUSY_EVERY);
         };
+        let OperationAnswer::Sealed { enc, sealed } = answer else { return Err(self.remote.surprised()) };
         match self.reply_key.open(&self.name, &REDEEM_SINK, 0, &enc, &sealed) {
             Ok(GrantContent::Operation(OperationAnswer::Membership(text))) => {
                 Membership::parse(text.expose()).map_err(|why| self.remote.failed(&why.to_string()))
@@ -298,9 +311,7 @@ impl Question {
     }
 
     /// Waits until the node in this process has a link.
-    fn wait_for_link(&self, wait: Duration) -> Result<(), CliError> {
-        // `None` waits for ever.
-        let until = Instant::now().checked_add(wait);
+    fn wait_for_link(&self, until: Option<Instant>, wait: Duration) -> Result<(), CliError> {
         loop {
             let graph: Graph = ask::graph(&self.socket, None)?;
             if !graph.links.is_empty() {

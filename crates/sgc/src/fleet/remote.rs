@@ -126,7 +126,12 @@ impl Remote {
     }
 
     /// Has an operation carried out.
-    pub(super) fn ask(&self, operation: Operation) -> Result<OperationAnswer, CliError> {
+    fn ask(&self, operation: Operation) -> Result<OperationAnswer, CliError> {
+        self.accepted(self.exchange(operation)?)
+    }
+
+    /// Returns the authority's answer to an operation, also if it is a refusal.
+    pub(super) fn exchange(&self, operation: Operation) -> Result<OperationAnswer, CliError> {
         let request = AdminRequest::Operate { at: self.at.clone(), operation };
         let text = Zeroizing::new(ask::ask(&self.socket, &request, ANSWER_MAX)?);
         let answer = match serde_json::from_str(&text) {
@@ -135,21 +140,23 @@ impl Remote {
             Err(_) => return Err(self.surprised()),
         };
         let bytes = Zeroizing::new(STANDARD.decode(answer.as_bytes()).map_err(|_| self.surprised())?);
-        match OperationAnswer::from_slice(&bytes) {
-            Ok(OperationAnswer::Refused { why: OperationRefusal::Stale, .. }) => {
+        OperationAnswer::from_slice(&bytes).map_err(|_| self.surprised())
+    }
+
+    /// Returns an answer unless it is a refusal.
+    pub(super) fn accepted(&self, answer: OperationAnswer) -> Result<OperationAnswer, CliError> {
+        match answer {
+            OperationAnswer::Refused { why: OperationRefusal::Stale, .. } => {
                 let at = self.at.to_string();
                 let reason = sgc_node::OperationError::OutcomeUnknown { at }.to_string();
                 Err(DiagnosisError::NotSeen { reason }.into())
             }
-            Ok(OperationAnswer::Refused { why: OperationRefusal::Fleet, detail }) => {
-                Err(self.failed(&detail))
-            }
-            Ok(OperationAnswer::Refused { why, detail }) if detail.is_empty() => {
+            OperationAnswer::Refused { why: OperationRefusal::Fleet, detail } => Err(self.failed(&detail)),
+            OperationAnswer::Refused { why, detail } if detail.is_empty() => {
                 Err(self.failed(&why.to_string()))
             }
-            Ok(OperationAnswer::Refused { why, detail }) => Err(self.failed(&format!("{why}: {detail}"))),
-            Ok(answer) => Ok(answer),
-            Err(_) => Err(self.surprised()),
+            OperationAnswer::Refused { why, detail } => Err(self.failed(&format!("{why}: {detail}"))),
+            answer => Ok(answer),
         }
     }
 

@@ -31,7 +31,7 @@ pub(super) struct UseArgs {
     /// The same as FILE
     #[arg(long, value_name = "FILE", conflicts_with = "token")]
     token_file: Option<String>,
-    /// The configuration; without it, the one *.toml of this directory
+    /// The configuration; without it, the only *.toml of this directory
     #[arg(short, long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Print the changes without making them

@@ -62,6 +62,9 @@ fn check(document: &Document, report: &mut Report) {
 
 /// Parses a command line as the program does.
 fn parse(words: &[String], is_whole: bool) -> Result<(), String> {
+    if let Some(hidden) = hidden(words) {
+        return Err(format!("{hidden} is hidden: it has another name now, or is none of the user's"));
+    }
     let Err(error) = sgc::command_line().try_get_matches_from(words) else { return Ok(()) };
     // A placeholder is no valid value.
     let has_placeholder = words.iter().any(|word| is_placeholder(word));
@@ -80,6 +83,27 @@ fn parse(words: &[String], is_whole: bool) -> Result<(), String> {
         _ => false,
     };
     if is_fine { Ok(()) } else { Err(error.to_string().lines().next().unwrap_or_default().to_owned()) }
+}
+
+/// Returns a word that names a hidden command or flag. The program takes those under their earlier names, to name the
+/// present ones.
+fn hidden(words: &[String]) -> Option<&str> {
+    let program = program();
+    let mut command = &program;
+    for word in words.iter().skip(1) {
+        if let Some(found) = command.find_subcommand(word) {
+            if found.is_hide_set() {
+                return Some(word);
+            }
+            command = found;
+        }
+        let flag = word.strip_prefix("--").and_then(|flag| flag.split('=').next());
+        let is_meant = |arg: &&clap::Arg| arg.is_hide_set() && arg.get_long() == flag;
+        if flag.is_some() && command.get_arguments().any(|arg| is_meant(&arg)) {
+            return Some(word);
+        }
+    }
+    None
 }
 
 /// Returns the definition with the flags that every command has.

@@ -197,10 +197,14 @@ impl<N: RosNetwork> Core<N> {
     /// Switches to the identity in the replaced file.
     pub(super) fn take_identity(&mut self, identity: Arc<Identity>) {
         let now = now();
+        if !self.certificates.adopt(now, &identity) {
+            return;
+        }
         let until = format!("this node's own, by a replaced file, until {}", identity.not_after());
         self.audit.write(AuditRecord::new(AuditEvent::Renewed).reason(until));
-        self.certificates.replace(now, identity.clone());
         self.identity_renewed(now, identity);
+        // It may name another authority, and have another key.
+        self.ask_renewal();
     }
 
     /// Passes a renewed identity to the machines.

@@ -16,6 +16,8 @@ const ASKED_MAX: usize = 128;
 const INQUIRIES_MAX: usize = 1024;
 /// Longest time for one node to answer. Over a slow path it takes four passages and the document.
 const ANSWER_MAX: Duration = Duration::from_secs(5);
+/// Longest time in which the name of a node has to be found. A node that is off has none.
+const FIND_MAX: Duration = Duration::from_secs(2);
 /// Longest time for a question, waiting for others included.
 const INQUIRY_MAX: Duration = Duration::from_secs(10);
 
@@ -91,6 +93,8 @@ struct Inquiry {
     node: NodeId,
     question: ReportQuestion,
     until: Instant,
+    /// The time by which its name has to be found, unless it was.
+    find_until: Option<Instant>,
     /// The name at which the node is asked, once it is.
     name: Option<Name>,
     replies: Vec<oneshot::Sender<InquiryAnswer>>,
@@ -128,8 +132,8 @@ impl Inquiries {
         {
             known.replies.push(reply);
         } else {
-            let (until, name, replies) = (now + INQUIRY_MAX, None, vec![reply]);
-            self.all.push_back(Inquiry { node, question, until, name, replies });
+            let (until, replies) = (now + INQUIRY_MAX, vec![reply]);
+            self.all.push_back(Inquiry { node, question, until, find_until: None, name: None, replies });
         }
     }
 
@@ -144,6 +148,7 @@ impl Inquiries {
         let Some(inquiry) = self.all.iter_mut().find(is_next) else { return false };
         inquiry.name = Some(ask(inquiry.node, &inquiry.question));
         inquiry.until = inquiry.until.min(now + ANSWER_MAX);
+        inquiry.find_until = Some(now + FIND_MAX);
         true
     }
 
@@ -168,13 +173,23 @@ impl Inquiries {
 
     /// Returns the time at which to call [`Inquiries::expire`].
     pub(crate) fn deadline(&self) -> Option<Instant> {
-        self.all.iter().map(|inquiry| inquiry.until).min()
+        self.all
+            .iter()
+            .map(|inquiry| inquiry.find_until.map_or(inquiry.until, |at| at.min(inquiry.until)))
+            .min()
     }
 
     /// Ends the questions whose time is over. `is_found` returns whether a name is advertised. Returns the names to
     /// leave; only then may [`Inquiries::next`] ask the same nodes again.
     pub(crate) fn expire(&mut self, now: Instant, is_found: impl Fn(&Name) -> bool) -> Vec<Name> {
-        let (over, left) = self.all.drain(..).partition(|inquiry| inquiry.until <= now);
+        for inquiry in &mut self.all {
+            let is_found = || inquiry.name.is_some_and(|name| is_found(&name));
+            inquiry.find_until = inquiry.find_until.filter(|at| *at > now || !is_found());
+        }
+        let is_over = |inquiry: &Inquiry| {
+            inquiry.until <= now || inquiry.find_until.is_some_and(|find_until| find_until <= now)
+        };
+        let (over, left) = self.all.drain(..).partition(is_over);
         self.all = left;
         let over: VecDeque<Inquiry> = over;
         let end = |inquiry: Inquiry| {
@@ -263,17 +278,21 @@ mod tests {
         let mut of_desk = push(&mut inquiries, now, DESK, ReportQuestion::Node);
         let mut behind = push(&mut inquiries, now, DESK, interface());
         begin(&mut inquiries, now);
-        assert_eq!(inquiries.deadline(), Some(now + ANSWER_MAX));
+        assert_eq!(inquiries.deadline(), Some(now + FIND_MAX));
         assert!(inquiries.expire(now, |_| true).is_empty());
-        let later = now + ANSWER_MAX;
-        assert_eq!(inquiries.expire(later, |asked| *asked == name(ARM)), [name(ARM), name(DESK)]);
-        assert_eq!(of_arm.try_recv(), Ok(Err(InquiryError::Silent)));
+        // A node without a name is off, and one that has a name may be slow.
+        let found = now + FIND_MAX;
+        assert_eq!(inquiries.expire(found, |asked| *asked == name(ARM)), [name(DESK)]);
         assert_eq!(of_desk.try_recv(), Ok(Err(InquiryError::NotFound)));
-        // The question behind begins once the name was left, and has the rest of its time.
-        assert_eq!(
-            (begin(&mut inquiries, later), inquiries.deadline()),
-            (vec![DESK], Some(now + INQUIRY_MAX))
-        );
+        assert_eq!(inquiries.deadline(), Some(now + ANSWER_MAX));
+        // The question behind begins once the name was left.
+        let later = now + ANSWER_MAX;
+        assert_eq!(begin(&mut inquiries, later), [DESK]);
+        assert_eq!(inquiries.expire(later, |_| true), [name(ARM)]);
+        assert_eq!(of_arm.try_recv(), Ok(Err(InquiryError::Silent)));
+        // It has the rest of its time.
+        assert!(inquiries.expire(later + FIND_MAX, |_| true).is_empty());
+        assert_eq!(inquiries.deadline(), Some(now + INQUIRY_MAX));
         assert_eq!(inquiries.expire(now + INQUIRY_MAX, |_| true), [name(DESK)]);
         assert_eq!(behind.try_recv(), Ok(Err(InquiryError::Silent)));
     }

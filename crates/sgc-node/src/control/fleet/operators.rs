@@ -21,7 +21,9 @@ use sgc_wire::{
     RosterPage, RosterRow, RowCertificate, SecretText, SinkId, UnixMillis,
 };
 
-use crate::control::fleet::holders::{Attempts, HOLDER_CHALLENGES_MAX};
+use tracing::error;
+
+use crate::control::fleet::holders::{Attempts, HOLDER_CHALLENGES_MAX, HOLDERS_EXECUTED_MAX};
 use crate::state::fleet_file::{FleetFileError, LockedFleet, read_fleet};
 
 /// Most operations that wait for the fleet file.
@@ -32,8 +34,8 @@ const CHALLENGES_PER_NODE_MAX: usize = 4;
 const CHALLENGES_MAX: usize = 256;
 /// Validity of a challenge.
 const CHALLENGE_TIME: Duration = Duration::from_secs(60);
-/// Most operations whose answers are remembered: as many as may be under way and wait together. None under way is
-/// forgotten.
+/// Most operations of operators whose answers are remembered: as many as may be under way and wait together. None under
+/// way is forgotten.
 const EXECUTED_MAX: usize = 2 * OPERATIONS_WAITING_MAX;
 /// Most bytes of the rows in one page of a roster.
 const PAGE_BYTES_MAX: usize = 512 * 1024;
@@ -108,6 +110,8 @@ struct ChallengeRecord {
 struct ExecutionRecord {
     challenge: Challenge,
     node: NodeId,
+    /// Whether the node holds an invitation.
+    is_holder: bool,
     operation: Operation,
     /// The sink that asked last.
     sink: SinkId,
@@ -198,20 +202,28 @@ impl Operators {
             return RequestStep::Answer(refused(OperationRefusal::Stale, ""));
         };
         self.challenges.remove(issued);
-        if peer.invitation.is_some() && !self.attempts.count(node) {
-            return RequestStep::Answer(refused(
-                OperationRefusal::Busy,
-                "too many attempts with this invitation",
-            ));
+        let is_holder = peer.invitation.is_some();
+        if is_holder && !self.attempts.count(node) {
+            let detail = "too many attempts with this code: ask for another one";
+            return RequestStep::Answer(refused(OperationRefusal::Fleet, detail));
         }
-        if self.executed.len() >= EXECUTED_MAX {
-            let Some(answered) = self.executed.iter().position(|e| e.answer.is_some()) else {
+        let max = if is_holder { HOLDERS_EXECUTED_MAX } else { EXECUTED_MAX };
+        if self.executed.iter().filter(|e| e.is_holder == is_holder).count() >= max {
+            let answered = |e: &ExecutionRecord| e.is_holder == is_holder && e.answer.is_some();
+            let Some(answered) = self.executed.iter().position(answered) else {
                 return RequestStep::Answer(refused(OperationRefusal::Busy, ""));
             };
             self.executed.remove(answered);
         }
         let (answer, doing) = (None, operation.clone());
-        self.executed.push_back(ExecutionRecord { challenge, node, operation: doing, sink, answer });
+        self.executed.push_back(ExecutionRecord {
+            challenge,
+            node,
+            is_holder,
+            operation: doing,
+            sink,
+            answer,
+        });
         RequestStep::Job(OperationJob { challenge, peer: peer.clone(), operation })
     }
 
@@ -219,6 +231,10 @@ impl Operators {
     pub(crate) fn done(&mut self, done: &OperationOutcome) -> Option<SinkId> {
         let known = self.executed.iter_mut().find(|e| e.challenge == done.challenge)?;
         known.answer = Some(done.answer.clone());
+        // What was not looked at costs no attempt.
+        if matches!(done.answer, OperationAnswer::Refused { why: OperationRefusal::Busy, .. }) {
+            self.attempts.forgive(&known.node);
+        }
         Some(known.sink)
     }
 }
@@ -254,7 +270,10 @@ impl OperationJob {
         };
         let done = done.unwrap_or_else(|why| match why {
             // A stranger learns nothing of this machine.
-            Failure::File(_) if self.is_of_holder() => Done::new(refused(OperationRefusal::File, "")),
+            Failure::File(why) if self.is_of_holder() => {
+                error!("cannot redeem an invitation: {why}");
+                Done::new(refused(OperationRefusal::File, ""))
+            }
             why => Done::new(why.into()),
         });
         self.end(done)

@@ -279,16 +279,14 @@ pub enum PartnerError {
         source: io::Error,
     },
     /// A record is invalid.
-    #[error(
-        "token {id} in {RECORDS_FILE} has no usable CA or node; withdraw it: sgc token share revoke {id}"
-    )]
+    #[error("token {id} in {RECORDS_FILE} has no usable CA or node; revoke it: sgc token share revoke {id}")]
     Record {
         /// Its number.
         id: u64,
     },
     /// There are too many tokens.
     #[error(
-        "{TOKENS_MAX} tokens are in force, which is the limit: withdraw some, or name the partner in a [[partner]]"
+        "{TOKENS_MAX} tokens are in force, which is the limit: revoke some, or name the partner in a [[partner]]"
     )]
     TooManyTokens,
     /// No token has that number.

@@ -13,6 +13,7 @@ use tokio::sync::watch;
 
 use crate::control::faults::alerts::clock_alert;
 use crate::gateway::Gateway;
+use crate::node::identity::is_older;
 use crate::state::credentials::{StateWriter, renew_at, renewed};
 
 /// This node's certificates, and those that it trusts.
@@ -93,13 +94,23 @@ impl Certificates {
         credentials: Credentials,
     ) -> Result<Option<Arc<Identity>>, IdentityError> {
         let Some(identity) = renewed(&self.identity, credentials)?.map(Arc::new) else { return Ok(None) };
-        self.replace(now, identity.clone());
+        self.keeper.identity(identity.clone());
+        self.switch(now, identity.clone());
         Ok(Some(identity))
     }
 
-    /// Switches to this identity of the same node, and saves it.
-    pub(crate) fn replace(&mut self, now: Now, identity: Arc<Identity>) {
-        self.keeper.identity(identity.clone());
+    /// Switches to the identity that the replaced file of this node holds. Returns `false` if the authority has sent a
+    /// newer one meanwhile.
+    pub(crate) fn adopt(&mut self, now: Now, identity: &Arc<Identity>) -> bool {
+        if is_older(identity, &self.identity) {
+            return false;
+        }
+        self.keeper.identity_file_replaced();
+        self.switch(now, identity.clone());
+        true
+    }
+
+    fn switch(&mut self, now: Now, identity: Arc<Identity>) {
         // A link shows the certificate only, so it stays if the certificate is the same.
         let shows_another = self.identity.chain() != identity.chain();
         self.identity = identity.clone();

@@ -33,6 +33,8 @@ const CHANGES: WatchFlags = WatchFlags::CLOSE_WRITE
 /// The files of a configuration, with their state when they were read.
 pub(crate) struct FileWatch {
     file: PathBuf,
+    /// The identity. Without it, a node goes on.
+    identity: PathBuf,
     files: Vec<PathBuf>,
     seen: Look,
 }
@@ -42,7 +44,7 @@ impl FileWatch {
     pub(crate) fn begin(file: PathBuf, config: &Config) -> Self {
         let files = files_of(&file, config);
         let seen = look(&files);
-        Self { file, files, seen }
+        Self { file, identity: config.identity.clone(), files, seen }
     }
 
     /// Reloads after each change, for as long as the node runs.
@@ -54,7 +56,7 @@ impl FileWatch {
     }
 
     async fn try_run(self, reloader: &Reloader) -> io::Result<()> {
-        let Self { file, mut files, mut seen } = self;
+        let Self { file, identity, mut files, mut seen } = self;
         let mut bell = Bell::new(seen.directories.clone())?;
         loop {
             let found = look_blocking(&files).await?;
@@ -64,7 +66,9 @@ impl FileWatch {
                 continue;
             }
             // While a file is being replaced, it may be missing.
-            if found.prints != seen.prints && found.prints.iter().all(Option::is_some) {
+            let is_whole =
+                || files.iter().zip(&found.prints).all(|(file, print)| print.is_some() || *file == identity);
+            if found.prints != seen.prints && is_whole() {
                 debug!(file = %file.display(), "changed");
                 seen = found;
                 // The log has the error; nobody waits for the result.
@@ -183,7 +187,8 @@ mod tests {
                     certificate = 'a.pem'\nkey = 'a.key'\n";
         let config = sgc_config::parse(text, "node.toml", Path::new("/etc/sgc"), &|_| None).unwrap();
         let files = files_of(Path::new("/etc/sgc/node.toml"), &config);
-        let wanted = ["/etc/sgc/node.toml", "/etc/sgc/a.key", "/etc/sgc/a.pem"].map(PathBuf::from);
+        let wanted =
+            ["/etc/sgc/node.toml", "/etc/sgc/a.key", "/etc/sgc/a.pem", "/etc/sgc/x"].map(PathBuf::from);
         assert_eq!(files, wanted);
     }
 }

@@ -93,6 +93,15 @@ struct PreparedReload {
     gateway: Option<(Access, Option<Arc<CertifiedKey>>)>,
 }
 
+/// Whether a reload looks at the identity file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum ReadIdentity {
+    /// A user, or a change of a file, asks for the reload.
+    Yes,
+    /// A token has ended. That must not depend on the file.
+    No,
+}
+
 impl Reloader {
     /// Returns the running configuration.
     pub(crate) async fn config(&self) -> Config {
@@ -143,7 +152,7 @@ impl Reloader {
             let why = "this node joined no ROS network when it started, so it can neither share nor use";
             return Err(format!("{why}: restart it"));
         }
-        self.apply(&mut running, config).await
+        self.apply(&mut running, config, ReadIdentity::Yes).await
     }
 
     /// Joins the local network if the node began without one.
@@ -161,8 +170,13 @@ impl Reloader {
     }
 
     /// Applies `config`.
-    async fn apply(&self, running: &mut Running, config: Config) -> Result<ReloadReport, String> {
-        let prepared = self.prepare(running, &config).await?;
+    async fn apply(
+        &self,
+        running: &mut Running,
+        config: Config,
+        reads: ReadIdentity,
+    ) -> Result<ReloadReport, String> {
+        let prepared = self.prepare(running, &config, reads).await?;
         let PreparedReload { rules, identity, anchors, message_keys, gateway } = prepared;
         let nearby = wanted_nearby(&config.routers, &self.identity).map_err(|error| error.to_string())?;
         self.join(running, config.ros.as_ref()).await?;
@@ -179,17 +193,25 @@ impl Reloader {
                 report
                     .changed
                     .push(format!("this node has the identity of its replaced file, until {until}"));
-                if identity.post_quantum() != self.credentials.identity().post_quantum() {
-                    let changed = "the fleet's setting of post-quantum links changed, which needs a restart";
-                    report.needs_restart.push(changed.to_owned());
-                }
                 Some(identity)
             }
-            FileIdentity::Refused(why) => {
-                report.needs_restart.push(format!("the identity is as it was: the file {why}"));
+            FileIdentity::OfAnother(why) => {
+                report
+                    .needs_restart
+                    .push(format!("the identity is as it was: the file {why}, which needs a restart"));
+                None
+            }
+            FileIdentity::Unusable(why) => {
+                report.warnings.push(format!("the identity is as it was: {why}"));
                 None
             }
         };
+        // Links have the setting of the start.
+        let present = identity.clone().unwrap_or_else(|| self.credentials.identity());
+        if present.post_quantum() != self.identity.post_quantum() {
+            let changed = "the fleet's setting of post-quantum links changed, which needs a restart";
+            report.needs_restart.push(changed.to_owned());
+        }
         // This precedes the control task's check of existing links.
         self.credentials.set_admitted(rules.partners.admitted.clone());
         self.reconfigure(&rules, identity, anchors, message_keys).await?;
@@ -243,18 +265,26 @@ impl Reloader {
     }
 
     /// Loads everything that `config` names. Nothing changes.
-    async fn prepare(&self, running: &Running, config: &Config) -> Result<PreparedReload, String> {
+    async fn prepare(
+        &self,
+        running: &Running,
+        config: &Config,
+        reads: ReadIdentity,
+    ) -> Result<PreparedReload, String> {
         // The identity may have been renewed since the start.
         let (identity, state) = (self.credentials.identity(), self.state.clone());
         let (wanted, suites) = (config.clone(), running.suites.clone());
         let file = running.config.identity.clone();
         let trusted = running.rules.partners.certificates.clone();
         let prepare = tokio::task::spawn_blocking(move || -> Result<PreparedReload, NodeError> {
-            let found = FileIdentity::read(&file, &identity)?;
+            let found = match reads {
+                ReadIdentity::Yes => FileIdentity::read(&file, &identity),
+                ReadIdentity::No => FileIdentity::Same,
+            };
             let before = identity;
             let identity = match &found {
                 FileIdentity::Replaced(identity) => identity.clone(),
-                FileIdentity::Same | FileIdentity::Refused(_) => before.clone(),
+                FileIdentity::Same | FileIdentity::OfAnother(_) | FileIdentity::Unusable(_) => before.clone(),
             };
             let rules = Rules::load(&wanted, &identity, state.as_deref(), now().unix)?;
             let own = identity.anchors();
@@ -387,7 +417,7 @@ impl Reloader {
             }
             let mut running = self.running.lock().await;
             let config = running.config.clone();
-            match self.apply(&mut running, config).await {
+            match self.apply(&mut running, config, ReadIdentity::No).await {
                 Ok(report) => {
                     let record = AuditRecord::new(AuditEvent::Reload).by("a token ended");
                     self.audit.write(record.reason(report.changed.join("; ")));
