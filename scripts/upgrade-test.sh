@@ -89,6 +89,7 @@ name_of() { [ "$1" = "$new" ] && echo new || echo old; }
 
 (while true; do peer 31 jazzy talk 50 || true; done) >talker.log 2>&1 &
 pids[talker]=$!
+disown
 for router in "$old" "$new"; do
     for robot in "$old" "$new"; do
         for desk in "$old" "$new"; do

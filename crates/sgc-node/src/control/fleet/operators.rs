@@ -203,10 +203,6 @@ impl Operators {
         };
         self.challenges.remove(issued);
         let is_holder = peer.invitation.is_some();
-        if is_holder && !self.attempts.count(node) {
-            let detail = "too many attempts with this code: ask for another one";
-            return RequestStep::Answer(refused(OperationRefusal::Fleet, detail));
-        }
         let max = if is_holder { HOLDERS_EXECUTED_MAX } else { EXECUTED_MAX };
         if self.executed.iter().filter(|e| e.is_holder == is_holder).count() >= max {
             let answered = |e: &ExecutionRecord| e.is_holder == is_holder && e.answer.is_some();
@@ -214,6 +210,10 @@ impl Operators {
                 return RequestStep::Answer(refused(OperationRefusal::Busy, ""));
             };
             self.executed.remove(answered);
+        }
+        if is_holder && !self.attempts.count(node) {
+            let detail = "too many attempts with this code: ask for another one";
+            return RequestStep::Answer(refused(OperationRefusal::Fleet, detail));
         }
         let (answer, doing) = (None, operation.clone());
         self.executed.push_back(ExecutionRecord {
