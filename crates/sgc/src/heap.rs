@@ -18,18 +18,18 @@ pub(crate) fn share_arenas() {
 pub(crate) fn share_arenas() {}
 
 /// Takes the pages of the program's code and constants out of the process's memory. Those that are used come back from
-/// the file; those that only the start used do not.
+/// the file; those that only the start or a seldom event used do not.
 ///
 /// The kernel maps the 64 KB around each page that is used once, and keeps them.
 #[cfg(all(target_os = "linux", target_pointer_width = "64"))]
-pub(crate) fn drop_pages_of_start() {
+pub(crate) fn drop_program_pages() {
     // SAFETY: the callback and its data fit the declaration of the call.
     unsafe { libc::dl_iterate_phdr(Some(drop_unwritten_pages), std::ptr::null_mut()) };
 }
 
 /// Does nothing: only Linux on 64 bits was tried.
 #[cfg(not(all(target_os = "linux", target_pointer_width = "64")))]
-pub(crate) fn drop_pages_of_start() {}
+pub(crate) fn drop_program_pages() {}
 
 /// Handles the first object, which is the program, and ends the iteration.
 #[cfg(all(target_os = "linux", target_pointer_width = "64"))]
@@ -76,7 +76,7 @@ mod tests {
     #[test]
     fn pages_of_the_program_go_and_come_back() {
         let before = mapped();
-        drop_pages_of_start();
+        drop_program_pages();
         let after = mapped();
         assert!(after < before, "{before} KiB, then {after} KiB");
         // Code, constants, and data that the loader relocated are as they were.

@@ -14,6 +14,7 @@ use sgc_process::children::ReadyLine;
 use sgc_process::{EndSignals, ProcessError, listen, stdin_closed};
 use tokio::signal::unix::{Signal, SignalKind};
 use tokio::sync::{mpsc, oneshot};
+use tokio::time::Instant;
 
 use crate::environment::environment;
 use crate::error::CliError;
@@ -22,6 +23,9 @@ use crate::{heap, output, supervisor, version};
 
 /// Time after which a node uses no more of what only its start needs. Threads of the start end within it.
 const START_MAX: Duration = Duration::from_secs(10);
+/// Time between two times at which a node gives back pages of its program. What it needs when peers come and go, it
+/// needs seldom.
+const PAGES_EVERY: Duration = Duration::from_secs(600);
 /// Time by which working threads may delay the end of the process.
 const RUNTIME_GRACE: Duration = Duration::from_secs(1);
 
@@ -215,8 +219,11 @@ fn run_node(
             let Ok(addresses) = when_ready.await else { return };
             supervisor::ready();
             tokio::spawn(async {
-                tokio::time::sleep(START_MAX).await;
-                let _ = tokio::task::spawn_blocking(heap::drop_pages_of_start).await;
+                let mut times = tokio::time::interval_at(Instant::now() + START_MAX, PAGES_EVERY);
+                loop {
+                    times.tick().await;
+                    let _ = tokio::task::spawn_blocking(heap::drop_program_pages).await;
+                }
             });
             if prints_ready {
                 let ready = addresses.iter().map(ToString::to_string).collect();
