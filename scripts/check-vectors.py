@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
-"""Computes the golden values of names, identities, tokens and codes with Python's library alone, and checks that each of them is
-what a test of `sgc-trust` expects. (Those of sealing, signing and grants are `trust-vectors.py`'s.)"""
+"""Computes the golden values of names, identities, tokens and codes with Python's library alone, and checks that each of
+them is the one that a test of `sgc-trust` expects. (Those of sealing, signing and grants are `trust-vectors.py`'s.)"""
 
 import pathlib
 import re

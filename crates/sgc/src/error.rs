@@ -80,7 +80,7 @@ pub(crate) enum CliError {
     Moved {
         /// The earlier name.
         old: &'static str,
-        /// What to write in its place.
+        /// The present name.
         new: &'static str,
     },
     /// A code with which a machine cannot join.

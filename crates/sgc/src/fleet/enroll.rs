@@ -15,7 +15,7 @@ use sgc_wire::{Operation, UnixMillis};
 use zeroize::Zeroizing;
 
 use super::remote::{FleetPlace, Remote};
-use super::role::RoleArgs;
+use super::role::AdmitArgs;
 use super::{DAY, copies, millis, parse_span};
 use crate::error::CliError;
 use crate::files::{self, Existing};
@@ -27,15 +27,8 @@ use crate::output;
 /// made its key itself (`sgc fleet request`), answer its request with --csr: the answer holds no key.
 #[derive(Debug, Args)]
 pub(super) struct EnrollArgs {
-    /// Name of the node: a-z, 0-9, '-', '_' and '.'
-    node: String,
     #[command(flatten)]
-    place: FleetPlace,
-    /// Group of the node; may be repeated
-    #[arg(long = "group", value_name = "GROUP")]
-    groups: Vec<String>,
-    #[command(flatten)]
-    role: RoleArgs,
+    admit: AdmitArgs,
     /// Enrol a revoked node again
     #[arg(long)]
     again: bool,
@@ -163,18 +156,8 @@ impl Keeper {
 }
 
 pub(super) fn enroll(args: &EnrollArgs) -> Result<(), CliError> {
-    let node: NodeName = args.node.parse()?;
-    let groups = args.groups.iter().map(|g| g.parse()).collect::<Result<Vec<GroupName>, _>>()?;
-    let role = args.role.role()?;
-    let mut keeper = Keeper::open(&args.place)?;
-    let request = EnrollRequest {
-        groups,
-        router: role.is_router,
-        may_route: role.may_route,
-        again: args.again,
-        valid: args.output.valid(),
-        ..EnrollRequest::new(node, unix_now())
-    };
+    let request = args.admit.request(args.again, args.output.valid())?;
+    let mut keeper = Keeper::open(&args.admit.place)?;
     if let Some(csr) = &args.csr {
         let path = args.output.path(&request.node, "answer");
         args.output.check_free(&path)?;

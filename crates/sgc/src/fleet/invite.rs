@@ -7,14 +7,11 @@ use std::time::Duration;
 use clap::Args;
 use sgc_diagnosis::ask;
 use sgc_node::config::RouterUrl;
-use sgc_process::{system_rng, unix_now};
-use sgc_trust::{
-    EnrollRequest, GroupName, INVITATION_ROUTERS_MAX, Invitation, LEAF_VALIDITY_DEFAULT, NodeName,
-};
+use sgc_process::system_rng;
+use sgc_trust::{INVITATION_ROUTERS_MAX, Invitation, LEAF_VALIDITY_DEFAULT};
 use sgc_wire::Operation;
 
-use super::remote::FleetPlace;
-use super::role::RoleArgs;
+use super::role::AdmitArgs;
 use super::{millis, parse_span};
 use crate::error::CliError;
 use crate::{node, output};
@@ -27,15 +24,8 @@ const WITHIN_DEFAULT: Duration = Duration::from_secs(15 * 60);
 /// short time. It is a secret: whoever uses it first is the node.
 #[derive(Debug, Args)]
 pub(super) struct InviteArgs {
-    /// Name of the node: a-z, 0-9, '-', '_' and '.'
-    node: String,
     #[command(flatten)]
-    place: FleetPlace,
-    /// Group of the node; may be repeated
-    #[arg(long = "group", value_name = "GROUP")]
-    groups: Vec<String>,
-    #[command(flatten)]
-    role: RoleArgs,
+    admit: AdmitArgs,
     /// Invite a revoked node again
     #[arg(long)]
     again: bool,
@@ -52,20 +42,11 @@ pub(super) struct InviteArgs {
 }
 
 pub(super) fn invite(args: &InviteArgs) -> Result<(), CliError> {
-    let name: NodeName = args.node.parse()?;
-    let groups = args.groups.iter().map(|g| g.parse()).collect::<Result<Vec<GroupName>, _>>()?;
+    let request = args.admit.request(args.again, args.valid.unwrap_or(LEAF_VALIDITY_DEFAULT))?;
     let within = args.within.unwrap_or(WITHIN_DEFAULT);
-    let role = args.role.role()?;
     let routers = routers(args)?;
-    let request = EnrollRequest {
-        groups,
-        router: role.is_router,
-        may_route: role.may_route,
-        again: args.again,
-        valid: args.valid.unwrap_or(LEAF_VALIDITY_DEFAULT),
-        ..EnrollRequest::new(name, unix_now())
-    };
-    let invitation = match args.place.remote()? {
+    let place = &args.admit.place;
+    let invitation = match place.remote()? {
         Some(remote) => remote.invite(Operation::Invite {
             node: request.node.to_string(),
             groups: request.groups.iter().map(ToString::to_string).collect(),
@@ -77,7 +58,7 @@ pub(super) fn invite(args: &InviteArgs) -> Result<(), CliError> {
             routers,
         })?,
         None => {
-            let mut file = args.place.which.open()?;
+            let mut file = place.which.open()?;
             let made = file.fleet.invite(&request, within, routers, &mut system_rng()?);
             let made = made.map_err(|e| file.error(e))?;
             file.save()?;
@@ -94,7 +75,7 @@ fn routers(args: &InviteArgs) -> Result<Vec<String>, CliError> {
     let given = !args.via.is_empty();
     let found = match given {
         true => args.via.clone(),
-        false => routers_here(args.place.socket())?,
+        false => routers_here(args.admit.place.socket())?,
     };
     if found.is_empty() {
         return Err(cannot(

@@ -1,7 +1,12 @@
-//! `--role` and `--may-route`: what a node may do for others.
+//! Name, groups and role of a node, as the commands that admit nodes take them.
+
+use std::time::Duration;
 
 use clap::{Args, ValueEnum};
+use sgc_process::unix_now;
+use sgc_trust::EnrollRequest;
 
+use super::remote::FleetPlace;
 use crate::error::CliError;
 use crate::moved::moved;
 
@@ -26,7 +31,7 @@ pub(super) struct RoleArgs {
     router: bool,
 }
 
-/// What a node may do for others.
+/// Rights of a node to act for others.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct NodeRole {
     pub(super) is_router: bool,
@@ -46,5 +51,37 @@ impl RoleArgs {
             });
         }
         Ok(NodeRole { is_router, may_route: self.may_route })
+    }
+}
+
+/// The node that a command admits to a fleet.
+#[derive(Debug, Args)]
+pub(super) struct AdmitArgs {
+    /// Name of the node: a-z, 0-9, '-', '_' and '.'
+    node: String,
+    #[command(flatten)]
+    pub(super) place: FleetPlace,
+    /// Group of the node; may be repeated
+    #[arg(long = "group", value_name = "GROUP")]
+    groups: Vec<String>,
+    #[command(flatten)]
+    role: RoleArgs,
+}
+
+impl AdmitArgs {
+    /// Returns the request to admit the node now, with a certificate that is valid for this time. `again` readmits a
+    /// revoked node.
+    pub(super) fn request(&self, again: bool, valid: Duration) -> Result<EnrollRequest, CliError> {
+        let node = self.node.parse()?;
+        let groups = self.groups.iter().map(|group| group.parse()).collect::<Result<_, _>>()?;
+        let NodeRole { is_router, may_route } = self.role.role()?;
+        Ok(EnrollRequest {
+            groups,
+            router: is_router,
+            may_route,
+            again,
+            valid,
+            ..EnrollRequest::new(node, unix_now())
+        })
     }
 }

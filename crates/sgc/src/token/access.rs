@@ -13,11 +13,11 @@ use sgc_node::audit::{self, AuditEvent, AuditRecord};
 use sgc_node::config::{self, Config};
 use sgc_node::{AccessRecord, AccessRecords};
 use sgc_process::{ProcessError, system_rng, unix_now};
-use sgc_trust::Identity;
 use sgc_wire::UnixMillis;
 
+use super::open;
 use crate::error::CliError;
-use crate::{files, output, policy, reload};
+use crate::{files, output, reload};
 
 /// Number of digits of an id that a list shows.
 const ID_DIGITS: usize = 12;
@@ -201,13 +201,6 @@ fn note(config: &Config, state: &Path, event: AuditEvent, what: &str) {
     if let Err(error) = audit::append(&path, &AuditRecord::new(event).reason(what).by(by)) {
         output::diagnostic(&format!("sgc: the audit log {} cannot be written: {error}", path.display()));
     }
-}
-
-fn open(config: Option<&Path>) -> Result<(Config, Identity, PathBuf), CliError> {
-    let path = files::config_here(config)?;
-    let (config, identity, _) = policy::load(&path)?;
-    let state = sgc_node::state_dir(&config, identity.node_name().as_str());
-    Ok((config, identity, state.ok_or(sgc_node::StateError::Nowhere)?))
 }
 
 fn short(id: &str) -> String {

@@ -4,10 +4,15 @@ mod access;
 mod share;
 mod use_token;
 
+use std::path::{Path, PathBuf};
+
 use clap::{Args, Subcommand};
+use sgc_node::config::Config;
+use sgc_trust::Identity;
 
 use crate::error::CliError;
 use crate::moved::{MovedArgs, moved};
+use crate::{files, policy};
 
 /// Make, list and revoke tokens for programs that connect to a node's gateway and for partners of other fleets, and use
 /// a partner's token.
@@ -40,4 +45,12 @@ pub(crate) fn token(args: &TokenArgs) -> Result<(), CliError> {
         TokenCommand::List(_) => Err(moved("sgc token list", "sgc token access list")),
         TokenCommand::Revoke(_) => Err(moved("sgc token revoke", "sgc token access revoke")),
     }
+}
+
+/// Returns the configuration of a node, its identity and its state directory, which may not exist yet.
+fn open(config: Option<&Path>) -> Result<(Config, Identity, PathBuf), CliError> {
+    let path = files::config_here(config)?;
+    let (config, identity, _) = policy::load(&path)?;
+    let state = sgc_node::state_dir(&config, identity.node_name().as_str());
+    Ok((config, identity, state.ok_or(sgc_node::StateError::Nowhere)?))
 }

@@ -17,8 +17,9 @@ use sgc_transport::LinkUrl;
 use sgc_trust::{FleetSecret, Identity, ShareToken, TOKEN_ROUTERS_MAX, TopicSecret, TrustAnchors, pem_text};
 use sgc_wire::{NodeId, UnixMillis};
 
+use super::open;
 use crate::error::CliError;
-use crate::{files, output, policy, reload};
+use crate::{output, reload};
 
 const VALID_MAX: Duration = Duration::from_secs(3650 * 86_400);
 
@@ -87,12 +88,12 @@ struct RevokeArgs {
 pub(super) fn share_token(args: &ShareArgs) -> Result<(), CliError> {
     match &args.command {
         ShareCommand::Create(args) => {
-            let (config, identity, state) = open(args.config.as_deref())?;
+            let (config, identity, state) = open_owned(args.config.as_deref())?;
             give(args, &args.topic, &config, &identity, &state)
         }
-        ShareCommand::List(args) => list(&open(args.config.as_deref())?.2, args.json),
+        ShareCommand::List(args) => list(&open_owned(args.config.as_deref())?.2, args.json),
         ShareCommand::Revoke(args) => {
-            let (config, identity, state) = open(args.config.as_deref())?;
+            let (config, identity, state) = open_owned(args.config.as_deref())?;
             let record = TokenRecords::change(&state, |records| records.withdraw(args.id))?;
             output::line(format!(
                 "token {} for {} [{}] is revoked",
@@ -103,13 +104,11 @@ pub(super) fn share_token(args: &ShareArgs) -> Result<(), CliError> {
     }
 }
 
-fn open(config: Option<&Path>) -> Result<(Config, Identity, PathBuf), CliError> {
-    let path = files::config_here(config)?;
-    let (config, identity, _) = policy::load(&path)?;
-    let state = sgc_node::state_dir(&config, identity.node_name().as_str());
-    let state = state.ok_or(sgc_node::StateError::Nowhere)?;
-    sgc_node::create_state_dir(&state)?;
-    Ok((config, identity, state))
+/// As [`open`], with the state directory made if it is missing, and this user's alone.
+fn open_owned(config: Option<&Path>) -> Result<(Config, Identity, PathBuf), CliError> {
+    let opened = open(config)?;
+    sgc_node::create_state_dir(&opened.2)?;
+    Ok(opened)
 }
 
 fn give(

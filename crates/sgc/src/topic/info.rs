@@ -32,7 +32,7 @@ struct InfoJson<'a> {
     topic: &'a str,
     /// Endpoints on the local network.
     endpoints: Vec<&'a Endpoint>,
-    /// What other nodes list for this one.
+    /// Entries that other nodes list for this one.
     offers: Vec<&'a Offer>,
     /// Routes of the rules that share it.
     shares: Vec<&'a ShareRoute>,

@@ -20,7 +20,6 @@ use sgc_wire::{
     OperationRequest, REDEEM_SINK, REFUSAL_DETAIL_BYTES_MAX, ROSTER_ROWS_MAX, ROW_CERTIFICATES_MAX,
     RosterPage, RosterRow, RowCertificate, SecretText, SinkId, UnixMillis,
 };
-
 use tracing::error;
 
 use crate::control::fleet::holders::{Attempts, HOLDER_CHALLENGES_MAX, HOLDERS_EXECUTED_MAX};
@@ -231,7 +230,7 @@ impl Operators {
     pub(crate) fn done(&mut self, done: &OperationOutcome) -> Option<SinkId> {
         let known = self.executed.iter_mut().find(|e| e.challenge == done.challenge)?;
         known.answer = Some(done.answer.clone());
-        // What was not looked at costs no attempt.
+        // A request that found no room costs no attempt.
         if matches!(done.answer, OperationAnswer::Refused { why: OperationRefusal::Busy, .. }) {
             self.attempts.forgive(&known.node);
         }
