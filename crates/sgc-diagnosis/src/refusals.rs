@@ -637,6 +637,11 @@ pub(crate) const DOOR: &[Refusal] = &[
         SAME_VERSION,
     ),
     named(
+        RefusalKind::NoLane.label(),
+        "it wants a link by `tls://` where only lanes of QUIC links are taken",
+        "dial this node by `quic://`, or let it listen on a `tls://` address, too",
+    ),
+    named(
         RefusalKind::TimedOut.label(),
         "it did not finish in time",
         "a few are scanners, or nodes on bad networks; many from one address are somebody who holds places",

@@ -96,7 +96,10 @@ impl Endpoint {
             Control::Probe { .. } => cx.unexpected(UnexpectedFrame::Probe),
             Control::Clock { .. } => cx.unexpected(UnexpectedFrame::Clock),
             Control::IdentityInUse { .. } => cx.unexpected(UnexpectedFrame::IdentityInUse),
-            Control::LaneOffer { .. } | Control::LaneAnswer { .. } | Control::LaneWanted { .. } => {
+            Control::LaneOffer { .. }
+            | Control::LaneAnswer { .. }
+            | Control::LaneWanted { .. }
+            | Control::BulkLaneWanted { .. } => {
                 cx.unexpected(UnexpectedFrame::Lane);
             }
         }

@@ -48,6 +48,10 @@ impl Link for AnyLink {
         each!(self, l => l.lane())
     }
 
+    fn has_bulk_lanes(&self) -> bool {
+        each!(self, l => l.has_bulk_lanes())
+    }
+
     async fn send_control(&self, frame: Bytes) -> Result<(), LinkError> {
         each!(self, l => l.send_control(frame).await)
     }

@@ -13,7 +13,7 @@ use crate::dtls::{DtlsDialer, DtlsListener};
 use crate::error::{CloseReason, DialError, Refusal};
 use crate::framing::Greeting;
 use crate::metrics::TransportMetrics;
-use crate::options::LinkOptions;
+use crate::options::{BulkLanes, LinkOptions};
 use crate::quic::{Flavor, QuicDialer, QuicListener};
 use crate::race;
 use crate::stream::{StreamDialer, StreamListener};
@@ -27,6 +27,8 @@ pub struct Listener {
 
 enum Kind {
     Quic(QuicListener),
+    /// The second takes bulk lanes of the first.
+    QuicWithLanes(QuicListener, StreamListener),
     Stream(StreamListener),
     Dtls(DtlsListener),
 }
@@ -43,8 +45,30 @@ impl Listener {
         let (local, kind) = match addr.scheme {
             Scheme::Quic | Scheme::Udp => {
                 let flavor = if addr.scheme == Scheme::Udp { Flavor::Udp } else { Flavor::Quic };
-                let listener = QuicListener::bind(flavor, addr.addr, credentials, options, metrics)?;
-                (listener.local_addr(), Kind::Quic(listener))
+                let bind = |credentials, options, metrics| {
+                    QuicListener::bind(flavor, addr.addr, credentials, options, metrics)
+                };
+                let listener = bind(credentials.clone(), options.clone(), Arc::clone(&metrics))?;
+                let local = listener.local_addr();
+                let lanes = match options.bulk_lanes {
+                    BulkLanes::Own if addr.scheme == Scheme::Quic => {
+                        let addr = ListenAddr::new(Scheme::Tls, local);
+                        let lanes = StreamListener::bind_for_lanes(&addr, credentials, options, metrics);
+                        lanes.inspect_err(|error| note_taken(local, error)).ok()
+                    }
+                    BulkLanes::Own | BulkLanes::Off => None,
+                    BulkLanes::ByTlsListener => {
+                        listener.announce_bulk_lanes();
+                        None
+                    }
+                };
+                match lanes {
+                    Some(lanes) => {
+                        listener.announce_bulk_lanes();
+                        (local, Kind::QuicWithLanes(listener, lanes))
+                    }
+                    None => (local, Kind::Quic(listener)),
+                }
             }
             Scheme::Dtls => {
                 let listener = DtlsListener::bind(addr.addr, credentials, options, metrics)?;
@@ -66,6 +90,10 @@ impl Listener {
     pub async fn accept(&mut self) -> Option<Result<AnyLink, RefusedPeer>> {
         let result = match &mut self.kind {
             Kind::Quic(listener) => listener.accept().await?.map(AnyLink::Quic),
+            Kind::QuicWithLanes(listener, lanes) => tokio::select! {
+                link = listener.accept() => link?.map(AnyLink::Quic),
+                lane = lanes.accept() => lane.map(AnyLink::Stream),
+            },
             Kind::Dtls(listener) => listener.accept().await?.map(AnyLink::Quic),
             Kind::Stream(listener) => listener.accept().await.map(AnyLink::Stream),
         };
@@ -81,10 +109,17 @@ impl Listener {
     pub async fn close(mut self, reason: CloseReason) {
         match &mut self.kind {
             Kind::Quic(listener) => listener.close(&reason).await,
+            Kind::QuicWithLanes(listener, lanes) => {
+                tokio::join!(listener.close(&reason), lanes.close(&reason));
+            }
             Kind::Stream(listener) => listener.close(&reason).await,
             Kind::Dtls(listener) => listener.close(&reason).await,
         }
     }
+}
+
+fn note_taken(local: SocketAddr, error: &io::Error) {
+    tracing::info!("TCP port {} is not to be had ({error}); large topics stay on QUIC", local.port());
 }
 
 /// A peer that came to a [`Listener`] and got no link.
@@ -132,7 +167,7 @@ impl Dialer {
 
     /// Makes a link to these addresses, at most 8, which the caller knows to be those of `url`.
     pub async fn dial_at(&self, url: &LinkUrl, addresses: Vec<SocketAddr>) -> Result<AnyLink, DialError> {
-        self.connect(url, addresses, Greeting::default()).await
+        self.connect(url, addresses, None).await
     }
 
     /// Dials a lane of a link that leads to this address, with the token that was agreed on there.
@@ -142,21 +177,29 @@ impl Dialer {
         address: SocketAddr,
         token: LaneToken,
     ) -> Result<AnyLink, DialError> {
-        self.connect(url, vec![address], Greeting { lane: Some(token) }).await
+        self.connect(url, vec![address], Some(token)).await
+    }
+
+    /// Dials a bulk lane of a QUIC link that leads to this address, at the TCP port of the same number.
+    pub async fn dial_bulk_lane(&self, address: SocketAddr, token: LaneToken) -> Result<AnyLink, DialError> {
+        let (host, port) = (address.ip().to_string(), address.port());
+        let url = LinkUrl { scheme: Scheme::Tls, host, port, path: None, cost_ms: None };
+        self.connect(&url, vec![address], Some(token)).await
     }
 
     async fn connect(
         &self,
         url: &LinkUrl,
         addresses: Vec<SocketAddr>,
-        greeting: Greeting,
+        lane: Option<LaneToken>,
     ) -> Result<AnyLink, DialError> {
         if addresses.is_empty() {
             return Err(DialError::NoAddress(url.clone()));
         }
+        let greeting = Greeting { lane, bulk_lanes: false };
         match url.scheme {
-            Scheme::Quic => self.quic.dial_at(url, addresses, greeting).await.map(AnyLink::Quic),
-            Scheme::Udp => self.udp.dial_at(url, addresses, greeting).await.map(AnyLink::Quic),
+            Scheme::Quic => self.quic.dial_at(url, addresses, lane).await.map(AnyLink::Quic),
+            Scheme::Udp => self.udp.dial_at(url, addresses, lane).await.map(AnyLink::Quic),
             Scheme::Dtls => self.dtls.dial_at(url, addresses, greeting).await.map(AnyLink::Quic),
             Scheme::Tls | Scheme::Tcp | Scheme::Ws | Scheme::Wss => {
                 self.stream.dial_at(url, addresses, greeting).await.map(AnyLink::Stream)

@@ -437,6 +437,9 @@ pub enum Refusal {
     /// The peer's first frame is no greeting.
     #[error("{0}")]
     Greeting(#[source] ProtocolError),
+    /// The peer wants a link where only lanes are taken.
+    #[error("only lanes of QUIC links are taken at this TCP port: dial quic://, or listen on tls:// as well")]
+    NoLane,
     /// The peer did not finish in time.
     #[error("it did not finish connecting within {} s", after.as_secs_f32())]
     TimedOut {
@@ -485,6 +488,7 @@ impl Refusal {
             Self::KeyExchange { .. } => RefusalKind::KeyExchange,
             Self::HandshakeTooLong => RefusalKind::HandshakeTooLong,
             Self::Greeting(_) => RefusalKind::BadGreeting,
+            Self::NoLane => RefusalKind::NoLane,
             Self::TimedOut { .. } => RefusalKind::TimedOut,
             Self::TooMany { .. } => RefusalKind::TooMany,
             Self::TooManyFromAddress { .. } => RefusalKind::TooManyFromAddress,

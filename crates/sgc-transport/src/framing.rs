@@ -21,6 +21,7 @@ const LENGTH_BYTES: usize = 4;
 const EXTENSIONS_MAX: usize = 16;
 const EXTENSION_BYTES_MAX: usize = 1024;
 const EXTENSION_LANE: u16 = 1;
+const EXTENSION_BULK_LANES: u16 = 2;
 
 /// Pieces of one frame that are to be written in order.
 pub(crate) type Chunks = Vec<Bytes>;
@@ -217,14 +218,19 @@ pub(crate) fn datagram(packet: &Packet, label: Option<Label>, slab: &mut Slab) -
 pub(crate) struct Greeting {
     /// Set if this connection is a lane that was agreed on over a link.
     pub(crate) lane: Option<LaneToken>,
+    /// Whether the sender dials or takes bulk lanes of this link.
+    pub(crate) bulk_lanes: bool,
 }
 
 impl Encode for Greeting {
     fn encode(&self, w: &mut Writer) {
         w.u16(LINK_VERSION);
-        w.list(self.lane.as_slice(), |w, lane| {
-            w.u16(EXTENSION_LANE);
-            w.bytes(&lane.0);
+        let lane = self.lane.as_ref().map(|token| (EXTENSION_LANE, token.0.as_slice()));
+        let bulk_lanes = self.bulk_lanes.then_some((EXTENSION_BULK_LANES, [].as_slice()));
+        let extensions: Vec<_> = lane.into_iter().chain(bulk_lanes).collect();
+        w.list(&extensions, |w, (id, content)| {
+            w.u16(*id);
+            w.bytes(content);
         });
     }
 }
@@ -239,8 +245,13 @@ impl Decode for Greeting {
         r.list("extensions", EXTENSIONS_MAX, |r| {
             let id = r.u16()?;
             let content = r.bytes("extension", EXTENSION_BYTES_MAX)?;
-            if id == EXTENSION_LANE {
-                greeting.lane = Some(LaneToken::from_slice(content)?);
+            match id {
+                EXTENSION_LANE => greeting.lane = Some(LaneToken::from_slice(content)?),
+                EXTENSION_BULK_LANES => {
+                    Reader::new(content).finish()?;
+                    greeting.bulk_lanes = true;
+                }
+                _ => {}
             }
             Ok(())
         })?;
@@ -378,7 +389,13 @@ mod tests {
 
     #[test]
     fn greetings_leave_room() {
-        for greeting in [Greeting::default(), Greeting { lane: Some(LaneToken([7; 16])) }] {
+        let lane = Some(LaneToken([7; 16]));
+        for greeting in [
+            Greeting::default(),
+            Greeting { lane, bulk_lanes: false },
+            Greeting { lane: None, bulk_lanes: true },
+            Greeting { lane, bulk_lanes: true },
+        ] {
             assert_eq!(Greeting::from_slice(&greeting.to_vec()), Ok(greeting));
         }
         let mut later = Writer::default();

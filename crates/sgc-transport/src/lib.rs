@@ -68,7 +68,7 @@ pub use flow::{Delivery, FlowRx, FlowTx};
 pub use limits::{CONTROL_FRAME_BYTES_MAX, FLOW_PACKET_BYTES_MAX, FLOW_VERSION, LINK_VERSION};
 pub use link::{Link, ReceivedDatagram};
 pub use metrics::{RefusalKind, TransportMetrics};
-pub use options::LinkOptions;
+pub use options::{BulkLanes, LinkOptions};
 pub use quic::QuicLink;
 pub use stats::{KeyExchange, LinkStats};
 #[cfg(feature = "fuzzing")]

@@ -29,6 +29,9 @@ pub trait Link: Clone + Send + Sync + 'static {
     /// The accepting side has to judge the token: only the peer's identity is proven here.
     fn lane(&self) -> Option<LaneToken>;
 
+    /// Returns `true` if the peer dials or takes bulk lanes of this link ([`crate::LinkOptions::bulk_lanes`]).
+    fn has_bulk_lanes(&self) -> bool;
+
     /// Sends a control frame of at most [`crate::CONTROL_FRAME_BYTES_MAX`]: reliable, in order, not copied. If the
     /// future is dropped, the frame is either not sent or sent as a whole.
     fn send_control(&self, frame: Bytes) -> impl Future<Output = Result<(), LinkError>> + Send;

@@ -27,6 +27,8 @@ pub enum RefusalKind {
     HandshakeTooLong,
     /// The peer connected and sent no valid greeting.
     BadGreeting,
+    /// The peer wants a link where only lanes are taken.
+    NoLane,
     /// The peer did not finish in time.
     TimedOut,
     /// Too many were connecting at once.
@@ -41,7 +43,7 @@ pub enum RefusalKind {
 
 impl RefusalKind {
     /// Every kind, in the order of the counters.
-    pub const ALL: [Self; 16] = [
+    pub const ALL: [Self; 17] = [
         Self::NoCertificate,
         Self::OtherCa,
         Self::NotAdmitted,
@@ -53,6 +55,7 @@ impl RefusalKind {
         Self::KeyExchange,
         Self::HandshakeTooLong,
         Self::BadGreeting,
+        Self::NoLane,
         Self::TimedOut,
         Self::TooMany,
         Self::TooManyFromAddress,
@@ -74,6 +77,7 @@ impl RefusalKind {
             Self::KeyExchange => "key_exchange",
             Self::HandshakeTooLong => "handshake_too_long",
             Self::BadGreeting => "bad_greeting",
+            Self::NoLane => "no_lane",
             Self::TimedOut => "timed_out",
             Self::TooMany => "too_many",
             Self::TooManyFromAddress => "too_many_from_address",

@@ -6,6 +6,18 @@ use std::time::Duration;
 use crate::budget::ReceiveBudget;
 use crate::congestion::Congestion;
 
+/// Whether QUIC links have bulk lanes, and which socket of a listener takes them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum BulkLanes {
+    /// Links have none.
+    #[default]
+    Off,
+    /// A QUIC listener opens the TCP port of its number for them. It does without them if the port is taken.
+    Own,
+    /// A TLS listener at the TCP port of the same number takes them. Dialers make no difference.
+    ByTlsListener,
+}
+
 /// Settings of the links of one listener or dialer. The defaults suit all.
 #[derive(Clone)]
 pub struct LinkOptions {
@@ -56,6 +68,8 @@ pub struct LinkOptions {
     pub dtls12: bool,
     /// The code point of differentiated services (RFC 2474), 0 to 63, on everything that a link sends.
     pub dscp: Option<u8>,
+    /// Whether QUIC links may have bulk lanes: TLS connections for large topics (`docs/spec/wire.md`, lanes).
+    pub bulk_lanes: BulkLanes,
     /// The congestion controller.
     pub congestion: Congestion,
 }
@@ -82,6 +96,7 @@ impl Default for LinkOptions {
             mtu_discovery: true,
             dtls12: false,
             dscp: None,
+            bulk_lanes: BulkLanes::Off,
             congestion: Congestion::Delay,
         }
     }
@@ -103,6 +118,7 @@ impl fmt::Debug for LinkOptions {
             .field("mtu_discovery", &self.mtu_discovery)
             .field("dtls12", &self.dtls12)
             .field("dscp", &self.dscp)
+            .field("bulk_lanes", &self.bulk_lanes)
             .field("congestion", &self.congestion)
             .finish_non_exhaustive()
     }

@@ -1,6 +1,6 @@
 //! Measurements of a link, and its key exchange.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Key exchange of the two ends of a link.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -48,4 +48,7 @@ pub struct LinkStats {
     pub mtu_bytes: u16,
     /// Key exchange of the link.
     pub key_exchange: KeyExchange,
+    /// Since when the peer owes an answer to a ping behind data; `None` if it owes none, or the transport has no such
+    /// pings.
+    pub waits_since: Option<Instant>,
 }

@@ -10,7 +10,7 @@ use bytes::Bytes;
 use quinn::{ConnectionError, VarInt};
 use sgc_transport::*;
 use sgc_trust::CertError;
-use sgc_wire::{DecodeError, Encode};
+use sgc_wire::{DecodeError, Encode, LaneToken};
 use support::*;
 
 // Destinations of links.
@@ -227,4 +227,44 @@ async fn a_malformed_datagram_is_dropped_alone() {
     assert!(matches!(results[0], ReceivedDatagram::Malformed(DecodeError::Version { found: 0x20, .. })));
     assert!(matches!(results[1], ReceivedDatagram::Malformed(DecodeError::Truncated { .. })));
     assert!(matches!(results[2], ReceivedDatagram::Packet(_)));
+}
+
+#[tokio::test]
+async fn only_lanes_are_taken_at_the_tcp_port_of_a_quic_listener() {
+    let fleet = fleet(1);
+    let options = LinkOptions { bulk_lanes: BulkLanes::Own, ..LinkOptions::default() };
+    let mut server = Server::start_on("quic", enroll(&fleet, "router"), options.clone());
+    let dialer = Dialer::new(enroll(&fleet, "arm-1"), options, Arc::default());
+    let near = soon(dialer.dial(&server.url)).await.unwrap();
+    let far = server.link().await;
+    assert!(near.has_bulk_lanes() && far.has_bulk_lanes());
+    let token = LaneToken([7; 16]);
+    let lane = soon(dialer.dial_bulk_lane(server.addr, token)).await.unwrap();
+    let taken = server.link().await;
+    assert_eq!((taken.lane(), taken.peer().node_id), (Some(token), far.peer().node_id));
+    assert!(!lane.has_bulk_lanes(), "a lane has no lanes");
+    let by_tls = format!("tls://{}", server.addr).parse().unwrap();
+    let link = soon(dialer.dial(&by_tls)).await;
+    let refused = server.refusal().await;
+    assert!(matches!(refused.reason, Refusal::NoLane), "{refused}");
+    if let Ok(link) = link {
+        let end = soon(link.closed()).await;
+        assert!(matches!(end, LinkError::Closed { reason: CloseReason::Denied(_), .. }), "{end}");
+    }
+    assert_eq!(server.metrics.refused(RefusalKind::NoLane), 1);
+}
+
+#[tokio::test]
+async fn nodes_without_bulk_lanes_announce_none() {
+    let fleet = fleet(1);
+    let with = LinkOptions { bulk_lanes: BulkLanes::Own, ..LinkOptions::default() };
+    for (at_listener, at_dialer) in [(LinkOptions::default(), with.clone()), (with, LinkOptions::default())] {
+        let is_on = |options: &LinkOptions| options.bulk_lanes != BulkLanes::Off;
+        let expected = (is_on(&at_listener), is_on(&at_dialer));
+        let mut server = Server::start_on("quic", enroll(&fleet, "router"), at_listener);
+        let dialer = Dialer::new(enroll(&fleet, "arm-1"), at_dialer, Arc::default());
+        let near = soon(dialer.dial(&server.url)).await.unwrap();
+        let far = server.link().await;
+        assert_eq!((near.has_bulk_lanes(), far.has_bulk_lanes()), expected);
+    }
 }

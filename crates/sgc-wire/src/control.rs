@@ -173,6 +173,11 @@ pub enum Control {
         /// Name.
         name: Name,
     },
+    /// The sender, which cannot dial, wants a bulk lane for this name.
+    BulkLaneWanted {
+        /// Name.
+        name: Name,
+    },
     /// The sender's wall clock. Only between the two nodes of a link: first behind the greeting, and again after the
     /// clock was set. It is a hint for operators; nothing is set or believed by it.
     Clock {
@@ -817,6 +822,10 @@ impl Encode for Control {
                 w.u8(25);
                 name.encode(w);
             }
+            Self::BulkLaneWanted { name } => {
+                w.u8(28);
+                name.encode(w);
+            }
             Self::Clock { time } => {
                 w.u8(26);
                 time.encode(w);
@@ -871,6 +880,7 @@ impl Decode for Control {
             23 => Self::LaneOffer { token: LaneToken::decode(r)?, name: Name::decode(r)? },
             24 => Self::LaneAnswer { token: LaneToken::decode(r)?, accepted: r.bool("accepted")? },
             25 => Self::LaneWanted { name: Name::decode(r)? },
+            28 => Self::BulkLaneWanted { name: Name::decode(r)? },
             26 => Self::Clock { time: UnixMillis::decode(r)? },
             27 => Self::IdentityInUse { place: Place { ip: r.array("address")?, port: r.u16()? } },
             v => return Err(DecodeError::value("control frame", v.into())),
@@ -916,6 +926,7 @@ mod tests {
             Control::LaneOffer { token: LaneToken([4; 16]), name },
             Control::LaneAnswer { token: LaneToken([4; 16]), accepted: true },
             Control::LaneWanted { name },
+            Control::BulkLaneWanted { name },
             Control::Clock { time: UnixMillis(79) },
             Control::IdentityInUse { place: Place { ip: [5; 16], port: 7447 } },
         ]

@@ -162,7 +162,10 @@ impl Router {
             Control::Clock { time } => self.handle_clock(link, time),
             // Its content is for the operator alone.
             Control::IdentityInUse { .. } => self.drop_frame(link, DropReason::Unknown { what: "identity" }),
-            Control::LaneOffer { .. } | Control::LaneAnswer { .. } | Control::LaneWanted { .. } => {
+            Control::LaneOffer { .. }
+            | Control::LaneAnswer { .. }
+            | Control::LaneWanted { .. }
+            | Control::BulkLaneWanted { .. } => {
                 self.drop_frame(link, DropReason::Unknown { what: "lane" });
             }
             Control::Goodbye => self.close(link, LinkClose::Goodbye),

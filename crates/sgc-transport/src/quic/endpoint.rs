@@ -14,7 +14,7 @@ use quinn::{AsyncUdpSocket, Connecting, Connection, ConnectionError, Endpoint, I
 use rustls::NamedGroup;
 use sgc_sync::lock;
 use sgc_trust::CertError;
-use sgc_wire::{Decode, DecodeError, Encode};
+use sgc_wire::{Decode, DecodeError, Encode, LaneToken};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::timeout;
 
@@ -29,7 +29,7 @@ use crate::error::{CloseReason, DialError, LinkError, PeerRefusal, ProtocolError
 use crate::framing::{Greeting, Pieces};
 use crate::handshakes::{Entry, Handshakes, Holder};
 use crate::metrics::TransportMetrics;
-use crate::options::LinkOptions;
+use crate::options::{BulkLanes, LinkOptions};
 use crate::quinn_runtime::PromptRuntime;
 use crate::race;
 use crate::socket;
@@ -81,6 +81,8 @@ struct Acceptor {
     metrics: Arc<TransportMetrics>,
     /// The associations below these links.
     dtls: Option<Arc<Mux>>,
+    /// Whether bulk lanes of these links are taken.
+    bulk_lanes: AtomicBool,
 }
 
 impl QuicListener {
@@ -110,12 +112,24 @@ impl QuicListener {
         let runtime = Arc::new(PromptRuntime);
         let endpoint = Endpoint::new_with_abstract_socket(endpoint_config, Some(server), socket, runtime)?;
         let places = Handshakes::new(&options);
-        let acceptor = Arc::new(Acceptor { flavor, credentials, options, metrics, dtls });
+        let acceptor = Arc::new(Acceptor {
+            flavor,
+            credentials,
+            options,
+            metrics,
+            dtls,
+            bulk_lanes: AtomicBool::new(false),
+        });
         Ok(Self { endpoint, local, acceptor, handshakes: JoinSet::new(), places })
     }
 
     pub(crate) fn local_addr(&self) -> SocketAddr {
         self.local
+    }
+
+    /// Tells the peers of links from here on that bulk lanes are taken at the TCP port of the same number.
+    pub(crate) fn announce_bulk_lanes(&self) {
+        self.acceptor.bulk_lanes.store(true, Relaxed);
     }
 
     pub(crate) async fn accept(&mut self) -> Option<Result<QuicLink, (SocketAddr, Refusal)>> {
@@ -209,7 +223,8 @@ impl Acceptor {
             let mut tx = Outlet::new(tx, Urgency::Control, &fate, &gate);
             let mut rx = ControlRx { inlet: Inlet::new(rx, &fate, None), pieces: Pieces::default() };
             let greeting = hear_greeting(&mut rx).await?;
-            send_frame(&mut tx, Greeting::default().to_bytes()).await?;
+            let own = Greeting { lane: None, bulk_lanes: self.bulk_lanes.load(Relaxed) };
+            send_frame(&mut tx, own.to_bytes()).await?;
             Ok((greeting, (tx, rx)))
         };
         match greeted.await {
@@ -259,8 +274,11 @@ impl QuicDialer {
         &self,
         url: &LinkUrl,
         addresses: Vec<SocketAddr>,
-        greeting: Greeting,
+        lane: Option<LaneToken>,
     ) -> Result<QuicLink, DialError> {
+        let has_lanes = self.options.bulk_lanes != BulkLanes::Off && self.flavor == Flavor::Quic;
+        let bulk_lanes = has_lanes && lane.is_none();
+        let greeting = Greeting { lane, bulk_lanes };
         let failed = |attempts| DialError::Failed { url: url.clone(), attempts };
         let connect = |address| {
             let started = self.start(address);
@@ -334,14 +352,14 @@ pub(crate) async fn greet(
         let mut rx = ControlRx { inlet: Inlet::new(rx, &fate, None), pieces: Pieces::default() };
         // Sent at once: the listener learns of the stream from its first bytes.
         send_frame(&mut tx, greeting.to_bytes()).await?;
-        hear_greeting(&mut rx).await?;
-        Ok((tx, rx))
+        let heard = hear_greeting(&mut rx).await?;
+        Ok((Greeting { lane: greeting.lane, ..heard }, (tx, rx)))
     };
     match timeout(after, greeted).await.unwrap_or(Err(LinkError::HandshakeTimedOut { after })) {
-        Ok(control) => {
+        Ok((agreed, control)) => {
             let places = Places::new(options.flows_max);
             let held = LinkResources { fate, places, lease, claim: None };
-            link(connection, &findings, true, greeting, control, held).map_err(LinkError::RefusedHere)
+            link(connection, &findings, true, agreed, control, held).map_err(LinkError::RefusedHere)
         }
         Err(error) => {
             if let LinkError::Protocol(why) = &error {
@@ -386,7 +404,7 @@ fn link(
     connection: Connection,
     findings: &Findings,
     is_dialer: bool,
-    Greeting { lane }: Greeting,
+    Greeting { lane, bulk_lanes }: Greeting,
     (control_tx, control_rx): (Outlet, ControlRx),
     LinkResources { fate, places, lease, claim }: LinkResources,
 ) -> Result<QuicLink, CertError> {
@@ -401,6 +419,7 @@ fn link(
         peer,
         is_dialer,
         lane,
+        bulk_lanes,
         key_exchange,
         control_tx,
         control_rx,

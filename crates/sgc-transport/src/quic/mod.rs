@@ -57,6 +57,7 @@ struct LinkInner {
     peer: VerifiedPeer,
     is_dialer: bool,
     lane: Option<LaneToken>,
+    bulk_lanes: bool,
     key_exchange: KeyExchange,
     control_tx: Mutex<Outlet>,
     control_rx: Mutex<ControlRx>,
@@ -137,6 +138,10 @@ impl Link for QuicLink {
 
     fn lane(&self) -> Option<LaneToken> {
         self.shared.lane
+    }
+
+    fn has_bulk_lanes(&self) -> bool {
+        self.shared.bulk_lanes
     }
 
     async fn send_control(&self, frame: Bytes) -> Result<(), LinkError> {
@@ -221,6 +226,7 @@ impl Link for QuicLink {
             congestion_window_bytes: stats.path.cwnd,
             mtu_bytes: stats.path.current_mtu,
             key_exchange: self.shared.key_exchange,
+            waits_since: None,
         }
     }
 

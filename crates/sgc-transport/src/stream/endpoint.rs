@@ -21,6 +21,7 @@ use crate::credentials::CredentialStore;
 use crate::error::{CloseReason, DialError, LinkError, Refusal};
 use crate::framing::Greeting;
 use crate::handshakes::{Entry, Handshakes, Holder};
+use crate::link::Link as _;
 use crate::metrics::TransportMetrics;
 use crate::options::LinkOptions;
 use crate::race;
@@ -48,6 +49,8 @@ pub(crate) struct StreamListener {
 struct Acceptor {
     scheme: Scheme,
     path: String,
+    /// Whether only lanes are taken, no links.
+    only_lanes: bool,
     credentials: CredentialStore,
     options: LinkOptions,
     metrics: Arc<TransportMetrics>,
@@ -83,12 +86,39 @@ impl StreamListener {
         options: LinkOptions,
         metrics: Arc<TransportMetrics>,
     ) -> io::Result<Self> {
+        Self::bind_as(addr, false, credentials, options, metrics)
+    }
+
+    /// Listens for lanes only.
+    pub(crate) fn bind_for_lanes(
+        addr: &ListenAddr,
+        credentials: CredentialStore,
+        options: LinkOptions,
+        metrics: Arc<TransportMetrics>,
+    ) -> io::Result<Self> {
+        Self::bind_as(addr, true, credentials, options, metrics)
+    }
+
+    fn bind_as(
+        addr: &ListenAddr,
+        only_lanes: bool,
+        credentials: CredentialStore,
+        options: LinkOptions,
+        metrics: Arc<TransportMetrics>,
+    ) -> io::Result<Self> {
         let tcp = listen(addr.addr)?;
         let local = tcp.local_addr()?;
         let (scheme, path) = (addr.scheme, addr.path().to_owned());
         let places = Handshakes::new(&options);
-        let acceptor =
-            Arc::new(Acceptor { scheme, path, credentials, options, metrics, links: Links::default() });
+        let acceptor = Arc::new(Acceptor {
+            scheme,
+            path,
+            only_lanes,
+            credentials,
+            options,
+            metrics,
+            links: Links::default(),
+        });
         Ok(Self { tcp, local, acceptor, handshakes: JoinSet::new(), places })
     }
 
@@ -167,6 +197,12 @@ impl Acceptor {
             handshake::accept(tcp, self.scheme, &self.path, &self.credentials, &self.options).await
         };
         match timeout(after, made).await.unwrap_or(Err(Refusal::TimedOut { after })) {
+            Ok(made) if self.only_lanes && made.lane.is_none() => {
+                let link = self.links.start(made, remote, false, &self.options);
+                link.close(CloseReason::Denied(Refusal::NoLane.to_string()));
+                self.metrics.count_refused(Refusal::NoLane.kind());
+                Err(Refusal::NoLane)
+            }
             Ok(made) => {
                 self.metrics.count_accepted();
                 Ok(self.links.start(made, remote, false, &self.options))

@@ -316,7 +316,7 @@ impl TlsConnection {
         }
     }
 
-    fn made(self, Greeting { lane }: Greeting) -> Result<EstablishedStream, Failure> {
+    fn made(self, Greeting { lane, .. }: Greeting) -> Result<EstablishedStream, Failure> {
         // TLS with mandatory certificates ends no handshake without a verdict. If it ever did, no link comes of it.
         let verdict = self.findings.verdict().cloned().unwrap_or(Err(CertError::NoCertificate));
         let peer = verdict.map_err(Failure::Certificate)?;

@@ -116,6 +116,10 @@ impl Link for StreamLink {
         self.handle.about.lane
     }
 
+    fn has_bulk_lanes(&self) -> bool {
+        false
+    }
+
     async fn send_control(&self, frame: Bytes) -> Result<(), LinkError> {
         if frame.len() > CONTROL_FRAME_BYTES_MAX {
             return Err(LinkError::FrameTooLong { bytes: frame.len() });
@@ -210,6 +214,7 @@ impl Link for StreamLink {
         let (sent_bytes, received_bytes) = shared.counters.read();
         let state = shared.lock();
         let (rtt, rtt_min) = state.mux.rtt();
+        let waits_since = state.mux.waits_since();
         LinkStats {
             rtt,
             rtt_min,
@@ -222,6 +227,7 @@ impl Link for StreamLink {
             congestion_window_bytes: state.mux.window_bytes(),
             mtu_bytes: about.mtu_bytes,
             key_exchange: about.key_exchange,
+            waits_since,
         }
     }
 

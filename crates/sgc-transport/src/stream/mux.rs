@@ -677,6 +677,11 @@ impl Mux {
         self.window.rtt()
     }
 
+    /// Returns the time of the oldest ping without an answer.
+    pub(crate) fn waits_since(&self) -> Option<Instant> {
+        self.window.waits_since()
+    }
+
     /// Notes the handshake's round trip, which counts until one is measured.
     pub(crate) fn note_handshake(&mut self, rtt: Duration) {
         self.window.note_handshake(rtt);

@@ -153,6 +153,11 @@ impl Window {
         (self.rtt.unwrap_or(self.handshake), self.rtt_min.map_or(self.handshake, |(rtt, _)| rtt))
     }
 
+    /// Returns the time of the oldest ping without an answer.
+    pub(crate) fn waits_since(&self) -> Option<Instant> {
+        self.pings.front().map(|ping| ping.at)
+    }
+
     /// Notes the handshake's round trip.
     pub(crate) fn note_handshake(&mut self, rtt: Duration) {
         self.handshake = rtt;
