@@ -117,6 +117,8 @@ pub struct TransportConfig {
     pub offload: bool,
     /// Whether links search for the longest packet that the path carries.
     pub mtu_discovery: bool,
+    /// Whether large topics of QUIC links may take bulk lanes, TLS connections at the TCP port of the link's number.
+    pub bulk_lanes: bool,
     /// Whether this node dials listeners that speak only DTLS 1.2, which see certificates in the clear.
     pub dtls12: bool,
     /// DSCP mark of packets, 0 to 63.
@@ -128,7 +130,15 @@ pub struct TransportConfig {
 impl Default for TransportConfig {
     fn default() -> Self {
         let congestion = Congestion::default();
-        Self { congestion, offload: true, mtu_discovery: true, dtls12: false, dscp: None, lane_dscp: None }
+        Self {
+            congestion,
+            offload: true,
+            mtu_discovery: true,
+            bulk_lanes: true,
+            dtls12: false,
+            dscp: None,
+            lane_dscp: None,
+        }
     }
 }
 

@@ -199,6 +199,7 @@ pub(crate) struct TransportDraft {
     pub(crate) congestion: Option<WithOrigin<String>>,
     pub(crate) offload: Option<WithOrigin<bool>>,
     pub(crate) mtu_discovery: Option<WithOrigin<bool>>,
+    pub(crate) bulk_lanes: Option<WithOrigin<bool>>,
     pub(crate) dtls_1_2: Option<WithOrigin<bool>>,
     pub(crate) dscp: Option<WithOrigin<String>>,
     pub(crate) lane_dscp: Option<WithOrigin<String>>,

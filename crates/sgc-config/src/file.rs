@@ -317,6 +317,7 @@ impl FileReader<'_> {
             congestion: self.string(transport, "congestion", "a string, such as \"delay\""),
             offload: self.boolean(transport, "offload", "true or false"),
             mtu_discovery: self.boolean(transport, "mtu_discovery", "true or false"),
+            bulk_lanes: self.boolean(transport, "bulk_lanes", "true or false"),
             dtls_1_2: self.boolean(transport, "dtls_1_2", "true or false"),
             dscp: self.string(transport, "dscp", MARK),
             lane_dscp: self.string(transport, "lane_dscp", MARK),

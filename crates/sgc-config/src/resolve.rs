@@ -621,6 +621,7 @@ impl Resolver<'_> {
             congestion: congestion.unwrap_or_default(),
             offload: written.offload.as_ref().is_none_or(|offload| offload.value),
             mtu_discovery: written.mtu_discovery.as_ref().is_none_or(|looks| looks.value),
+            bulk_lanes: written.bulk_lanes.as_ref().is_none_or(|allowed| allowed.value),
             dtls12: written.dtls_1_2.as_ref().is_some_and(|takes| takes.value),
             dscp: written.dscp.as_ref().and_then(|mark| self.keep(mark, names::dscp)),
             lane_dscp: written.lane_dscp.as_ref().and_then(|mark| self.keep(mark, names::dscp)),

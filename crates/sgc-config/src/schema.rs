@@ -171,7 +171,9 @@ impl Table {
                 "link",
             ],
             Self::Router => &["listen", "peer_rate", "mapping", "announce", "accept"],
-            Self::Transport => &["congestion", "offload", "mtu_discovery", "dtls_1_2", "dscp", "lane_dscp"],
+            Self::Transport => {
+                &["congestion", "offload", "mtu_discovery", "bulk_lanes", "dtls_1_2", "dscp", "lane_dscp"]
+            }
             Self::Admin => &["socket", "observers"],
             Self::Authority => &["fleet", "operators"],
             Self::Rotation => &["every", "messages"],

@@ -5,13 +5,58 @@
 mod lab;
 mod support;
 
+use std::cell::Cell;
+
 use lab::*;
 use sgc_node::config::ShareConfig;
-use support::{Listener, Node, wait};
+use support::{Listener, Node, Talker, wait};
 
 fn lanes(node: &Node) -> u64 {
     let status = node.status();
     status["links"].as_array().unwrap().iter().map(|link| link["lanes"].as_u64().unwrap()).sum()
+}
+
+fn bulk_lanes(node: &Node) -> u64 {
+    let status = node.status();
+    status["links"].as_array().unwrap().iter().map(|link| link["bulk_lanes"].as_u64().unwrap()).sum()
+}
+
+fn sent_bytes(node: &Node) -> u64 {
+    let status = node.status();
+    status["links"].as_array().unwrap().iter().map(|link| link["sent_bytes"].as_u64().unwrap()).sum()
+}
+
+fn port_of(url: &str) -> u16 {
+    url.rsplit(':').next().unwrap().parse().unwrap()
+}
+
+/// Length of a large message.
+const LARGE_BYTES: usize = 512 << 10;
+
+/// A topic of large messages, the numbers from 1 on.
+struct Camera {
+    talker: Talker,
+    listener: Listener,
+    next: Cell<u64>,
+}
+
+impl Camera {
+    /// Waits until the path from the robot to the desk exists.
+    fn start(lab: &Lab) -> Self {
+        let (talker, listener) = (lab.talker("robot", "/camera"), lab.listener("desk", "/camera"));
+        warm_up(&talker, &[&listener]);
+        Self { talker, listener, next: Cell::new(1) }
+    }
+
+    /// Publishes messages as fast as the listener takes them, and checks that each arrives once and in order.
+    fn exchange(&self, messages: u64) {
+        for _ in 0..messages {
+            let n = self.next.get();
+            self.talker.say(format!("{}{n:09}", "0".repeat(LARGE_BYTES - 9)));
+            hears_each(&self.listener, n, n);
+            self.next.set(n + 1);
+        }
+    }
 }
 
 fn dedicated(topic: &str) -> ShareConfig {
@@ -104,4 +149,61 @@ fn no_more_lanes_than_there_may_be() {
         warm_up(talker, &[listener]);
     }
     assert_eq!((lanes(&robot), lanes(&cloud)), (8, 8));
+}
+
+#[test]
+fn large_topic_takes_a_bulk_lane_on_each_link_and_a_short_one_does_not() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let cloud = lab.cloud();
+    let shares = vec![share("/camera", &["desk"]), share("/state", &["desk"])];
+    let robot = lab.start("robot", |c| c.shares = shares);
+    let desk = lab.start("desk", |c| c.uses = vec![uses("/camera"), uses("/state")]);
+    let state = lab.listener("desk", "/state");
+    let state_stream = begin_stream(&lab, "/state", &state);
+    let camera = Camera::start(&lab);
+    wait("bulk lanes are up", || {
+        camera.exchange(10);
+        (bulk_lanes(&robot), bulk_lanes(&desk), bulk_lanes(&cloud)) == (1, 1, 2)
+    });
+    assert_eq!((lanes(&robot), lanes(&desk)), (1, 1), "the short topic has none");
+    let before = sent_bytes(&robot);
+    camera.exchange(20);
+    let sent = sent_bytes(&robot) - before;
+    assert!(sent > 20 * LARGE_BYTES as u64, "bytes of a lane count as bytes of its link");
+    hears_each(&state, 1, state_stream.end().1);
+}
+
+#[test]
+fn large_topic_outlives_its_bulk_lane_and_its_router() {
+    let lab = Lab::new(&["robot", "desk"]);
+    let cloud = lab.cloud();
+    let robot = lab.start("robot", |c| c.shares = vec![share("/camera", &["desk"])]);
+    let _desk = lab.start("desk", |c| c.uses = vec![uses("/camera")]);
+    let camera = Camera::start(&lab);
+    wait("a bulk lane is up", || {
+        camera.exchange(10);
+        bulk_lanes(&robot) == 1
+    });
+    cloud.kill();
+    let cloud = lab.cloud();
+    wait("bulk lanes are up again", || {
+        camera.exchange(10);
+        bulk_lanes(&robot) == 1 && bulk_lanes(&cloud) == 2
+    });
+}
+
+#[test]
+fn large_topic_stays_on_its_link_where_bulk_lanes_are_off_or_their_port_is_taken() {
+    let lab = Lab::new(&["robot", "desk"]);
+    // Another program has the TCP port of the router's number.
+    let _taken = std::net::TcpListener::bind(("127.0.0.1", port_of(&lab.url()))).unwrap();
+    let cloud = lab.cloud();
+    let robot = lab.start("robot", |c| c.shares = vec![share("/camera", &["desk"])]);
+    let _desk = lab.start("desk", |c| {
+        c.uses = vec![uses("/camera")];
+        c.transport.bulk_lanes = false;
+    });
+    let camera = Camera::start(&lab);
+    camera.exchange(60);
+    assert_eq!((lanes(&robot), lanes(&cloud)), (0, 0));
 }

@@ -1,11 +1,12 @@
-//! Decisions about the links of a node, and about the traffic that it starts by itself: keep-alive, back-off, claims,
-//! candidates, questions for types, shaping. [`LinkSupervisor`] decides when a link is replaced.
+//! Decisions about the links of a node, and about the traffic that it starts by itself: keep-alive, back-off, bulk lanes,
+//! claims, candidates, questions for types, shaping. [`LinkSupervisor`] decides when a link is replaced.
 //!
 //! Pure machines: time and randomness are arguments, and nothing here opens a socket, spawns a task or waits.
 //! `sgc-node` observes, passes events in, and carries the results out.
 #![forbid(unsafe_code)]
 
 mod backoff;
+mod bulk;
 mod candidates;
 mod claims;
 mod failback;
@@ -16,6 +17,10 @@ mod supervisor;
 mod type_questions;
 
 pub use backoff::{BACKOFF_MAX, BACKOFF_MIN, Backoff, DISPLACED_MAX, STAND_BACK, doubled, jittered, wait};
+pub use bulk::{
+    BULK_MESSAGE_BYTES_MIN, BulkEnd, BulkLaneObservation, BulkLaneUse, BulkMeter, BulkPath,
+    BulkPathObservation,
+};
 pub use candidates::{ADDRESSES_MAX, AttemptResult, CANDIDATES_MAX, Candidates};
 pub use claims::ClaimTable;
 pub use failback::Failback;

@@ -72,12 +72,14 @@ pub struct LinkStatus {
     pub silent: bool,
     /// The time without a sign of life after which the node asks the peer for one, milliseconds.
     pub keep_alive_ms: u64,
-    /// Bytes sent over the link.
+    /// Bytes sent over the link and its lanes.
     pub sent_bytes: u64,
-    /// Bytes received over the link.
+    /// Bytes received over the link and its lanes.
     pub received_bytes: u64,
     /// The number of connections beside the link that carry one name each.
     pub lanes: usize,
+    /// The number of these that are bulk lanes: TLS for a large topic.
+    pub bulk_lanes: usize,
     /// The number of names for which this node sends labels.
     pub labels_sent: u32,
     /// The number of names for which the peer may send labels.

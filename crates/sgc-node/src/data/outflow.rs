@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
+use sgc_session::{BULK_MESSAGE_BYTES_MIN, BulkMeter};
 use sgc_transport::{AnyLink, FlowEnd, FlowTx, Link, LinkError};
 use sgc_wire::{Label, Name, Packet, SourceId};
 use tokio::sync::watch;
@@ -73,6 +74,7 @@ impl OutFlow {
                 link,
                 lanes,
                 label,
+                meter: BulkMeter::default(),
                 reliable: None,
                 messages: VecDeque::new(),
                 left_out: None,
@@ -244,6 +246,8 @@ struct Sender {
     lanes: Arc<Lanes>,
     /// Label of the name of all packets.
     label: Option<NameLabel>,
+    /// Measures whether the name is worth a bulk lane.
+    meter: BulkMeter,
     reliable: Option<FlowTx>,
     /// Best-effort messages of several packets that are being sent, the oldest first.
     messages: VecDeque<Message>,
@@ -256,6 +260,13 @@ impl Sender {
     /// Sends a packet, or keeps a reliable one for [`Self::flush`].
     async fn send(&mut self, packet: Packet) -> Result<(), LinkError> {
         if packet.header.index == 0 {
+            let bytes = u64::from(packet.header.total);
+            if packet.header.reliable
+                && bytes >= BULK_MESSAGE_BYTES_MIN
+                && self.meter.note(Instant::now(), bytes)
+            {
+                self.lanes.ask_for_bulk(self.name);
+            }
             self.choose().await?;
         }
         if !packet.header.reliable {

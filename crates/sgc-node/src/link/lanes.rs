@@ -1,5 +1,6 @@
-//! Lanes: connections beside a link, each for the packets of one name, so that a camera has its own congestion
-//! controller and queue (`link = "dedicated"`; `docs/spec/wire.md`, lanes).
+//! Lanes: connections beside a link, each for the packets of one name (`docs/spec/wire.md`, lanes). A dedicated lane
+//! gives a camera its own congestion controller and queue (`link = "dedicated"`). A bulk lane carries a large topic of a
+//! QUIC link by TLS, which takes less processor time; [`sgc_session::BulkPath`] decides when.
 //!
 //! The node that dialled the link dials its lanes, since the other node may be unable to. Everything else treats a lane
 //! as part of its link: packets of a lane came over the link, and without the lane the link carries its name as well.
@@ -11,9 +12,11 @@ use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha20Rng;
 use rand_core::{OsRng, SeedableRng as _, TryRngCore as _};
-use sgc_session::{BACKOFF_MAX, doubled, wait};
+use sgc_session::{
+    BACKOFF_MAX, BulkLaneObservation, BulkLaneUse, BulkPath, BulkPathObservation, doubled, wait,
+};
 use sgc_sync::lock;
-use sgc_transport::{AnyLink, CloseReason, DialError, Dialer, Link, LinkError, LinkUrl};
+use sgc_transport::{AnyLink, CloseReason, DialError, Dialer, Link, LinkError, LinkStats, LinkUrl};
 use sgc_wire::{Control, LaneToken, Name, NodeId};
 use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
@@ -24,6 +27,8 @@ use crate::control::peers::control_queue::ControlQueue;
 
 /// Most lanes of one link.
 pub(crate) const LANES_MAX: usize = 8;
+/// Most bulk lanes of one link that this node asks for.
+const BULK_LANES_MAX: usize = 4;
 /// Most agreed lanes of all links that have not arrived.
 const EXPECTED_MAX: usize = 1024;
 /// Time for the answer to an offer.
@@ -111,14 +116,75 @@ pub(crate) struct Lanes {
 struct Table {
     lanes: BTreeMap<Name, Lane>,
     answers: BTreeMap<LaneToken, oneshot::Sender<bool>>,
+    /// Whether bulk lanes suit the path.
+    path: BulkPath,
+    /// Bytes that were sent and received over lanes that have ended.
+    ended_bytes: (u64, u64),
 }
 
 #[derive(Default)]
 struct Lane {
+    kind: Kind,
     up: Option<(u64, AnyLink)>,
-    wanted_here: bool,
     /// Task that dials the lane, if this node dials.
     keeper: Option<AbortHandle>,
+}
+
+/// The reason for which a lane exists.
+enum Kind {
+    /// One of the nodes is configured to have it.
+    Dedicated {
+        /// Whether this node is.
+        wanted_here: bool,
+    },
+    /// The topic is large and the path is fast.
+    Bulk(BulkLaneUse),
+}
+
+impl Default for Kind {
+    fn default() -> Self {
+        Self::Dedicated { wanted_here: false }
+    }
+}
+
+impl Lane {
+    fn is_bulk(&self) -> bool {
+        matches!(self.kind, Kind::Bulk(_))
+    }
+
+    fn is_wanted_here(&self) -> bool {
+        matches!(self.kind, Kind::Dedicated { wanted_here: true })
+    }
+}
+
+impl Table {
+    /// Ends a lane and takes it out of the table.
+    fn remove(&mut self, name: &Name) {
+        if let Some(lane) = self.lanes.remove(name) {
+            self.end(lane);
+        }
+    }
+
+    /// Ends a lane that was taken out of the table.
+    fn end(&mut self, lane: Lane) {
+        if let Some(keeper) = lane.keeper {
+            keeper.abort();
+        }
+        if let Some((_, up)) = lane.up {
+            self.put_away(&up);
+            up.close(CloseReason::Goodbye);
+        }
+    }
+
+    /// Keeps the counters of a connection that carries no more packets.
+    fn put_away(&mut self, up: &AnyLink) {
+        self.ended_bytes = plus(self.ended_bytes, &up.stats());
+    }
+}
+
+/// Adds the bytes of a connection to a total of sent and received bytes.
+fn plus((sent, received): (u64, u64), stats: &LinkStats) -> (u64, u64) {
+    (sent.saturating_add(stats.sent_bytes), received.saturating_add(stats.received_bytes))
 }
 
 /// Reasons why a lane is missing.
@@ -168,27 +234,33 @@ impl Lanes {
         self.table().lanes.get(name)?.up.clone()
     }
 
-    /// Returns the number of lanes that are up.
-    pub(crate) fn count(&self) -> usize {
-        self.table().lanes.values().filter(|lane| lane.up.is_some()).count()
+    /// Returns the numbers of lanes that are up: all, and bulk lanes of these.
+    pub(crate) fn count(&self) -> (usize, usize) {
+        let table = self.table();
+        let up = table.lanes.values().filter(|lane| lane.up.is_some());
+        up.fold((0, 0), |(all, bulk), lane| (all + 1, bulk + usize::from(lane.is_bulk())))
     }
 
-    /// Starts or stops to want a lane for a name.
+    /// Returns the bytes sent and received over lanes since the link began.
+    pub(crate) fn bytes(&self) -> (u64, u64) {
+        let table = self.table();
+        let up = table.lanes.values().filter_map(|lane| lane.up.as_ref());
+        up.fold(table.ended_bytes, |total, (_, lane)| plus(total, &lane.stats()))
+    }
+
+    /// Starts or stops to want a dedicated lane for a name.
     pub(crate) fn set_wanted(self: &Arc<Self>, name: Name, wanted: bool) {
         if !wanted && !self.has_any.load(Ordering::Relaxed) {
             return;
         }
         let mut table = self.table();
         if !wanted {
-            if table.lanes.get(&name).is_some_and(|lane| lane.wanted_here)
-                && let Some(lane) = table.lanes.remove(&name)
-            {
-                end(lane);
+            if table.lanes.get(&name).is_some_and(Lane::is_wanted_here) {
+                table.remove(&name);
             }
             return;
         }
-        let is_known = table.lanes.get(&name).is_some_and(|lane| lane.wanted_here);
-        if is_known {
+        if table.lanes.get(&name).is_some_and(Lane::is_wanted_here) {
             return;
         }
         if !self.admit(&mut table, name) {
@@ -196,12 +268,73 @@ impl Lanes {
             return;
         }
         if let Some(lane) = table.lanes.get_mut(&name) {
-            lane.wanted_here = true;
+            lane.kind = Kind::Dedicated { wanted_here: true };
         }
         drop(table);
         if self.dial.is_none() && !self.frames.push(Control::LaneWanted { name }) {
             debug!(name = %name.short(), "the peer takes no control frames; no lane is requested");
         }
+    }
+
+    /// Asks for a bulk lane for a name with much data in long messages, unless the name has a lane or the path does not
+    /// suit one.
+    pub(crate) fn ask_for_bulk(self: &Arc<Self>, name: Name) {
+        if !self.link.has_bulk_lanes() {
+            return;
+        }
+        let now = Instant::now();
+        let mut table = self.table();
+        if table.lanes.contains_key(&name) || !table.path.is_open(now) {
+            return;
+        }
+        let bulk = table.lanes.values().filter(|lane| lane.is_bulk()).count();
+        if bulk >= BULK_LANES_MAX || !self.admit_bulk(&mut table, name, now) {
+            return;
+        }
+        drop(table);
+        if self.dial.is_none() && !self.frames.push(Control::BulkLaneWanted { name }) {
+            debug!(name = %name.short(), "the peer takes no control frames; no lane is requested");
+        }
+    }
+
+    /// Looks at the path and at bulk lanes, and ends those that do not suit it any more.
+    pub(crate) fn look(&self, now: Instant, link: &LinkStats) {
+        if !self.link.has_bulk_lanes() {
+            return;
+        }
+        let remote = self.link.remote();
+        let seen = BulkPathObservation {
+            rtt_min: link.rtt_min,
+            sent_packets: link.sent_packets,
+            lost_packets: link.lost_packets,
+        };
+        let mut table = self.table();
+        let Table { lanes, path, .. } = &mut *table;
+        let all = path.observe(now, &seen);
+        let mut ended = Vec::new();
+        for (name, lane) in lanes {
+            let Kind::Bulk(usage) = &mut lane.kind else { continue };
+            let seen = lane.up.as_ref().map(|(_, up)| up.stats()).map(|stats| BulkLaneObservation {
+                remote: remote.ip(),
+                rtt: stats.rtt,
+                waits_since: stats.waits_since,
+                bytes: stats.sent_bytes.saturating_add(stats.received_bytes),
+            });
+            let end = all.or_else(|| path.observe_lane(now, usage, seen.as_ref()));
+            ended.extend(end.map(|end| (*name, end)));
+        }
+        for (name, end) in ended {
+            debug!(%remote, name = %name.short(), ?end, "a bulk lane ends");
+            table.remove(&name);
+        }
+    }
+
+    /// Ends all bulk lanes.
+    pub(crate) fn end_bulk(&self) {
+        let mut table = self.table();
+        let bulk = table.lanes.iter().filter(|(_, lane)| lane.is_bulk());
+        let names: Vec<_> = bulk.map(|(name, _)| *name).collect();
+        names.iter().for_each(|name| table.remove(name));
     }
 
     /// Handles a frame about lanes. The error is a mistake of the peer.
@@ -236,6 +369,10 @@ impl Lanes {
                 }
                 Ok(())
             }
+            (Control::BulkLaneWanted { name }, Some(_)) => {
+                self.ask_for_bulk(*name);
+                Ok(())
+            }
             (frame, Some(_)) => Err(format!("a lane is not the dialled node's to offer: {frame:?}")),
             (frame, None) => Err(format!("a lane is not this node's to dial: {frame:?}")),
         }
@@ -243,13 +380,18 @@ impl Lanes {
 
     /// Ends all lanes together with the link.
     pub(crate) fn close(&self) {
-        let lanes = std::mem::take(&mut self.table().lanes);
+        let mut table = self.table();
+        let lanes = std::mem::take(&mut table.lanes);
         self.has_any.store(false, Ordering::Relaxed);
-        lanes.into_values().for_each(end);
+        lanes.into_values().for_each(|lane| table.end(lane));
     }
 
-    /// Adds a lane to the table, and dials it if this node does. Returns `false` if there is no room.
+    /// Adds a dedicated lane to the table, and dials it if this node does. It replaces a bulk lane. Returns `false` if
+    /// there is no room.
     fn admit(self: &Arc<Self>, table: &mut Table, name: Name) -> bool {
+        if table.lanes.get(&name).is_some_and(Lane::is_bulk) {
+            table.remove(&name);
+        }
         if !table.lanes.contains_key(&name) && table.lanes.len() >= LANES_MAX {
             return false;
         }
@@ -264,6 +406,24 @@ impl Lanes {
         true
     }
 
+    /// Adds a bulk lane for a name without a lane to the table, and dials it if this node does. Returns `false` if there
+    /// is no room.
+    fn admit_bulk(self: &Arc<Self>, table: &mut Table, name: Name, now: Instant) -> bool {
+        if table.lanes.len() >= LANES_MAX {
+            return false;
+        }
+        let keeper = self.dial.as_ref().map(|(dialer, _)| {
+            let keep = self.clone().keep_bulk(name, dialer.clone());
+            tokio::spawn(keep).abort_handle()
+        });
+        table.lanes.insert(
+            name,
+            Lane { kind: Kind::Bulk(BulkLaneUse::new(now, self.link.remote().ip())), up: None, keeper },
+        );
+        self.has_any.store(true, Ordering::Relaxed);
+        true
+    }
+
     /// Dials a lane, and dials again whenever it ends, until it is no longer wanted.
     async fn keep(self: Arc<Self>, name: Name, dial: Dial) {
         // The generator serves jitter only.
@@ -275,9 +435,8 @@ impl Lanes {
                     (failures, refusals) = (0, 0);
                     self.attach(name, lane.clone());
                     let end = lane.closed().await;
-                    let goodbye = matches!(&end, LinkError::Closed { reason: CloseReason::Goodbye, .. });
                     let mut table = self.table();
-                    if goodbye && table.lanes.get(&name).is_some_and(|lane| !lane.wanted_here) {
+                    if is_goodbye(&end) && table.lanes.get(&name).is_some_and(|lane| !lane.is_wanted_here()) {
                         table.lanes.remove(&name);
                         return;
                     }
@@ -302,8 +461,35 @@ impl Lanes {
         }
     }
 
+    /// Dials a bulk lane once. A topic that stays large asks for another, as soon as the path is open for one.
+    async fn keep_bulk(self: Arc<Self>, name: Name, dialer: Arc<Dialer>) {
+        let made = async {
+            let token = self.agree(name).await?;
+            self.check(dialer.dial_bulk_lane(self.link.remote(), token).await?)
+        };
+        match made.await {
+            // When the lane ends, the task of `attach` forgets it.
+            Ok(lane) => self.attach(name, lane),
+            Err(why) => {
+                debug!(remote = %self.link.remote(), name = %name.short(), "no bulk lane: {why}; the topic stays on the link");
+                let mut table = self.table();
+                // A dedicated lane may have taken its place.
+                if table.lanes.get(&name).is_some_and(|lane| lane.is_bulk() && lane.up.is_none()) {
+                    table.lanes.remove(&name);
+                }
+                table.path.fail(Instant::now());
+            }
+        }
+    }
+
     /// Agrees on a lane with the peer and dials it.
     async fn open(&self, name: Name, (dialer, url): &Dial) -> Result<AnyLink, LaneFailure> {
+        let token = self.agree(name).await?;
+        self.check(dialer.dial_lane(url, self.link.remote(), token).await?)
+    }
+
+    /// Agrees on a lane with the peer. Returns the token that the lane has to show.
+    async fn agree(&self, name: Name) -> Result<LaneToken, LaneFailure> {
         let mut token = [0; 16];
         OsRng.try_fill_bytes(&mut token).map_err(|_| LaneFailure::NoAnswer)?;
         let token = LaneToken(token);
@@ -316,11 +502,14 @@ impl Lanes {
         let accepted = timeout(ANSWER_MAX, asked).await;
         self.table().answers.remove(&token);
         match accepted {
-            Ok(Some(true)) => {}
-            Ok(Some(false)) => return Err(LaneFailure::Refused),
-            Ok(None) | Err(_) => return Err(LaneFailure::NoAnswer),
+            Ok(Some(true)) => Ok(token),
+            Ok(Some(false)) => Err(LaneFailure::Refused),
+            Ok(None) | Err(_) => Err(LaneFailure::NoAnswer),
         }
-        let lane = dialer.dial_lane(url, self.link.remote(), token).await?;
+    }
+
+    /// Returns a dialled lane if it leads to the link's peer, and closes it otherwise.
+    fn check(&self, lane: AnyLink) -> Result<AnyLink, LaneFailure> {
         if lane.peer().node_id != self.link.peer().node_id {
             lane.close(CloseReason::Denied("this is not the node that the lane was agreed on with".into()));
             return Err(LaneFailure::OtherNode);
@@ -337,32 +526,54 @@ impl Lanes {
             drop(table);
             return lane.close(CloseReason::Goodbye);
         };
-        let old = entry.up.replace((number, lane.clone()));
-        drop(table);
-        if let Some((_, old)) = old {
-            old.close(CloseReason::Replaced);
+        // An offer does not tell the kind of a lane; its transport does.
+        let is_bulk = matches!((&self.link, &lane), (AnyLink::Quic(_), AnyLink::Stream(_)));
+        if is_bulk && !entry.is_bulk() && !entry.is_wanted_here() {
+            entry.kind = Kind::Bulk(BulkLaneUse::new(Instant::now(), self.link.remote().ip()));
         }
-        debug!(remote = %lane.remote(), name = %name.short(), "a lane is up");
+        let old = entry.up.replace((number, lane.clone()));
+        if let Some((_, old)) = old {
+            table.put_away(&old);
+            drop(table);
+            old.close(CloseReason::Replaced);
+        } else {
+            drop(table);
+        }
+        debug!(remote = %lane.remote(), name = %name.short(), is_bulk, "a lane is up");
         receive(lane.clone(), name);
         let lanes = Arc::downgrade(self);
         tokio::spawn(async move {
-            lane.closed().await;
+            let end = lane.closed().await;
             if let Some(lanes) = lanes.upgrade() {
-                lanes.detach(&name, number);
+                lanes.detach(&name, number, &end);
             }
         });
     }
 
-    fn detach(&self, name: &Name, number: u64) {
+    /// Takes a lane that ended out of use.
+    fn detach(&self, name: &Name, number: u64, end: &LinkError) {
         let mut table = self.table();
         let Some(lane) = table.lanes.get_mut(name).filter(|l| l.up.as_ref().is_some_and(|up| up.0 == number))
         else {
             return;
         };
-        lane.up = None;
-        // The accepting side forgets a lane that ends, since the dialling side offers it again.
-        if self.dial.is_none() && !lane.wanted_here {
+        let up = lane.up.take();
+        // The accepting side forgets a dedicated lane that ends, since the dialling side offers it again. Both sides
+        // forget a bulk lane.
+        let now = Instant::now();
+        let is_lost = match &lane.kind {
+            Kind::Bulk(usage) => Some(!is_goodbye(end) || usage.is_recent(now)),
+            Kind::Dedicated { .. } => None,
+        };
+        if is_lost.is_some() || (self.dial.is_none() && !lane.is_wanted_here()) {
             table.lanes.remove(name);
+        }
+        if is_lost == Some(true) {
+            debug!(remote = %self.link.remote(), name = %name.short(), "a bulk lane broke: {end}");
+            table.path.fail(now);
+        }
+        if let Some((_, up)) = up {
+            table.put_away(&up);
         }
     }
 
@@ -371,13 +582,8 @@ impl Lanes {
     }
 }
 
-fn end(lane: Lane) {
-    if let Some(keeper) = lane.keeper {
-        keeper.abort();
-    }
-    if let Some((_, up)) = lane.up {
-        up.close(CloseReason::Goodbye);
-    }
+fn is_goodbye(end: &LinkError) -> bool {
+    matches!(end, LinkError::Closed { reason: CloseReason::Goodbye, .. })
 }
 
 #[cfg(test)]

@@ -193,6 +193,11 @@ impl ReportedLink {
         std::future::pending().await
     }
 
+    /// Ends bulk lanes, because they do not follow the link to another address.
+    pub(super) fn end_bulk_lanes(&self) {
+        self.lanes.end_bulk();
+    }
+
     /// Retires the link, because a newer one replaced it.
     pub(super) async fn retire(&self, core: &mpsc::Sender<CoreEvent>) {
         self.say_goodbye(CloseReason::Replaced, core).await;
@@ -307,7 +312,10 @@ impl ControlRx {
                 true => Ok(true),
                 false => Err(format!("label {} is acknowledged but was not given", label.index())),
             },
-            frame @ (Control::LaneOffer { .. } | Control::LaneAnswer { .. } | Control::LaneWanted { .. })
+            frame @ (Control::LaneOffer { .. }
+            | Control::LaneAnswer { .. }
+            | Control::LaneWanted { .. }
+            | Control::BulkLaneWanted { .. })
                 if is_greeted =>
             {
                 self.lanes.handle(&frame).map(|()| true)

@@ -232,6 +232,7 @@ impl Renewal<'_> {
             Output::Rebind => {
                 info!(remote = %self.current.reported.link.remote(), "the network changed; the link goes on from here");
                 self.keeper.rebind();
+                self.current.reported.end_bulk_lanes();
             }
             Output::Retire(_) => {
                 let (old, core) = (self.current.reported.clone(), self.keeper.core.clone());

@@ -175,13 +175,10 @@ pub const METRICS: &[Metric] = &[
         "Links that were made. If it grows all the time, links break.",
         |s| unlabelled(as_f64(s.readings.links.established)),
     ),
-    counter(
-        "sgc_sent_bytes_total",
-        &[],
-        "Bytes sent over all links, without lanes (`link = \"dedicated\"`).",
-        |s| unlabelled(as_f64(s.readings.links.sent_bytes)),
-    ),
-    counter("sgc_received_bytes_total", &[], "Bytes received over all links, without lanes.", |s| {
+    counter("sgc_sent_bytes_total", &[], "Bytes sent over all links and their lanes.", |s| {
+        unlabelled(as_f64(s.readings.links.sent_bytes))
+    }),
+    counter("sgc_received_bytes_total", &[], "Bytes received over all links and their lanes.", |s| {
         unlabelled(as_f64(s.readings.links.received_bytes))
     }),
     gauge(

@@ -13,7 +13,9 @@ use sgc_endpoint::{Endpoint, EndpointConfig};
 use sgc_ros::{RosNetwork, Routes};
 use sgc_router::{Router, RouterConfig};
 use sgc_session::KeepAlivePolicy;
-use sgc_transport::{CredentialStore, Dialer, LinkOptions, Listener, TransportMetrics};
+use sgc_transport::{
+    BulkLanes, CredentialStore, Dialer, LinkOptions, ListenAddr, Listener, Scheme, TransportMetrics,
+};
 use sgc_trust::{Identity, Suite, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
 use tokio::sync::{mpsc, watch};
@@ -29,7 +31,7 @@ use crate::control::settings::rules::Rules;
 use crate::data::sending::message_keys;
 use crate::data::sinks::SinkRequest;
 use crate::data::writer_queue::start_workers;
-use crate::discovery::Board;
+use crate::discovery::{Board, is_over_udp};
 use crate::gateway::access::{access_with, refused_tokens};
 use crate::gateway::{Gateway, NodeDefinitions, OpenLocalRos, ShownKey, Sockets, key_of_files, listen_at};
 use crate::local::network_slot::NetworkSlot;
@@ -199,8 +201,9 @@ impl LinkSockets {
         credentials.set_anchors(anchors.clone());
         credentials.set_admitted(rules.partners.admitted.clone());
         let options = link_options(config, identity);
-        let bind = |addr| {
-            Listener::bind(addr, credentials.clone(), options.clone(), metrics.clone())
+        let bind = |addr: &ListenAddr| {
+            let options = LinkOptions { bulk_lanes: bulk_lanes(config, addr), ..options.clone() };
+            Listener::bind(addr, credentials.clone(), options, metrics.clone())
                 .map_err(|source| NodeError::Listen { addr: addr.clone(), source })
         };
         let listeners = config.listen.iter().map(bind).collect::<Result<Vec<_>, _>>()?;
@@ -228,9 +231,25 @@ fn link_options(config: &Config, identity: &Identity) -> LinkOptions {
         congestion: config.transport.congestion,
         offload: config.transport.offload,
         mtu_discovery: config.transport.mtu_discovery,
+        bulk_lanes: if config.transport.bulk_lanes { BulkLanes::Own } else { BulkLanes::Off },
         dtls12: config.transport.dtls12,
         dscp: config.transport.dscp,
         ..LinkOptions::default()
+    }
+}
+
+/// Returns which socket takes the bulk lanes of a listener. A TCP port that the configuration gives to another listener is
+/// that one's.
+fn bulk_lanes(config: &Config, addr: &ListenAddr) -> BulkLanes {
+    if !config.transport.bulk_lanes {
+        return BulkLanes::Off;
+    }
+    let has_port = |other: &&ListenAddr| other.addr.port() == addr.addr.port() && addr.addr.port() != 0;
+    let mut beside = config.listen.iter().filter(has_port).map(|other| other.scheme);
+    match beside.find(|scheme| !is_over_udp(*scheme)) {
+        None => BulkLanes::Own,
+        Some(Scheme::Tls) => BulkLanes::ByTlsListener,
+        Some(_) => BulkLanes::Off,
     }
 }
 

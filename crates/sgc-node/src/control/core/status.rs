@@ -92,7 +92,7 @@ impl<N: RosNetwork> Core<N> {
     }
 
     fn link_status(&self, id: LinkId, entry: &LinkEntry) -> LinkStatus {
-        let stats = entry.stats();
+        let (stats, (lanes, bulk_lanes)) = (entry.stats(), entry.lanes());
         let (cost, silent) = self.router.link_cost(id).unwrap_or_default();
         let over = self.data.rates().over(&entry.peer().node_id);
         LinkStatus {
@@ -108,7 +108,8 @@ impl<N: RosNetwork> Core<N> {
             keep_alive_ms: entry.keep_alive_interval().as_millis().try_into().unwrap_or(u64::MAX),
             sent_bytes: stats.sent_bytes,
             received_bytes: stats.received_bytes,
-            lanes: entry.lanes(),
+            lanes,
+            bulk_lanes,
             labels_sent: entry.labels_sent(),
             labels_received: entry.labels_received(),
             peer_slowed: over.slowed,

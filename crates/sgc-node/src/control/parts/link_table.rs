@@ -147,6 +147,7 @@ impl LinkTable {
         self.look_due = (!self.links.is_empty()).then_some(now + LOOK_EVERY);
         let looks = self.links.iter_mut().map(|(id, entry)| {
             let stats = entry.link.stats();
+            entry.control.lanes().look(now, &stats);
             let is_silent = entry.look(now, stats.received_bytes, stats.rtt);
             LinkMeasurement { link: *id, rtt: stats.rtt, is_silent }
         });
@@ -225,8 +226,14 @@ impl LinkEntry {
         self.url.as_deref()
     }
 
+    /// Returns the measurements of the link, with the bytes of its lanes.
     pub(crate) fn stats(&self) -> LinkStats {
-        self.link.stats()
+        let (stats, (sent, received)) = (self.link.stats(), self.control.lanes().bytes());
+        LinkStats {
+            sent_bytes: stats.sent_bytes.saturating_add(sent),
+            received_bytes: stats.received_bytes.saturating_add(received),
+            ..stats
+        }
     }
 
     /// Returns the present interval of the keep-alive.
@@ -234,8 +241,8 @@ impl LinkEntry {
         self.keep_alive.step()
     }
 
-    /// Returns the number of lanes.
-    pub(crate) fn lanes(&self) -> usize {
+    /// Returns the numbers of lanes: all, and bulk lanes of these.
+    pub(crate) fn lanes(&self) -> (usize, usize) {
         self.control.lanes().count()
     }
 
