@@ -39,7 +39,7 @@ pub const CRL_VALIDITY: Duration = Duration::from_secs(30 * 86_400);
 pub const CLOCK_SKEW: Duration = Duration::from_secs(600);
 
 /// The year 9000: the times of certificates end a little later.
-const TIME_MAX: UnixMillis = UnixMillis(221_845_392_000_000);
+pub(crate) const TIME_MAX: UnixMillis = UnixMillis(221_845_392_000_000);
 
 /// A time in whole seconds, as in certificates. A macro, because the type of the result belongs to a crate (`time`)
 /// that is not a dependency of this one.
@@ -48,6 +48,7 @@ macro_rules! date_time {
         rcgen::date_time_ymd(1970, 1, 1) + Duration::from_secs($millis.secs())
     };
 }
+pub(crate) use date_time;
 
 /// Most bytes of a revocation list besides its entries: the name of its CA, a signature, and the fixed fields.
 const LIST_HEAD_BYTES_MAX: usize = 6500;
@@ -372,21 +373,21 @@ pub fn certificate_uris(
     uris(&secret.pseudonym(node.as_str()), &groups, may_route, 0)
 }
 
-fn common_name(name: &str) -> DistinguishedName {
+pub(crate) fn common_name(name: &str) -> DistinguishedName {
     let mut out = DistinguishedName::new();
     out.push(DnType::CommonName, name);
     out
 }
 
 /// Returns 126 random bits, positive and of a fixed length as RFC 5280, 4.1.2.2 requires.
-fn serial(rng: &mut impl CryptoRng) -> SerialNumber {
+pub(crate) fn serial(rng: &mut impl CryptoRng) -> SerialNumber {
     let mut bytes = [0; 16];
     rng.fill_bytes(&mut bytes);
     bytes[0] = (bytes[0] & 0x3f) | 0x40;
     SerialNumber::from_slice(&bytes)
 }
 
-fn before(now: UnixMillis, by: Duration) -> UnixMillis {
+pub(crate) fn before(now: UnixMillis, by: Duration) -> UnixMillis {
     UnixMillis(now.0.saturating_sub(by.as_millis() as u64))
 }
 

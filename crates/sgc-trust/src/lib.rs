@@ -38,6 +38,7 @@ mod revocations;
 mod roster;
 mod seal;
 mod secret;
+mod server_certificate;
 mod signed;
 mod suite;
 mod tls13;
@@ -82,6 +83,11 @@ pub use roster::{
 };
 pub use seal::{OpenError, SourceKey, TAG_BYTES, opened_bytes, sealed_bytes};
 pub use secret::{FleetSecret, NamingSecret};
+pub use server_certificate::{
+    CertificateName, CertificateNameError, SERVER_FILE_BYTES_MAX, SERVER_NAMES_MAX, SERVER_SKEW,
+    SERVER_VALIDITY, ServerCertificate, ServerCertificateError, certificate_end, certificate_names,
+    certificate_pin,
+};
 pub use signed::{
     CLOCK_SKEW_MAX, SEQ_AHEAD_MAX, SignedError, VerifiedAdvert, VerifiedJoin, VerifiedLinkState, next_seq,
     signed_digest, verify_advert, verify_answer, verify_join, verify_link_state,

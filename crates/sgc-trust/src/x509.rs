@@ -4,6 +4,7 @@
 //! This module verifies nothing. Its input was parsed by `webpki`, or is about to be verified; anything unexpected is
 //! `None`.
 
+use std::net::IpAddr;
 use std::sync::Arc;
 
 use sgc_wire::UnixMillis;
@@ -20,9 +21,13 @@ const SET: u8 = 0x31;
 const VERSION: u8 = 0xa0;
 const CERT_EXTENSIONS: u8 = 0xa3;
 const CRL_EXTENSIONS: u8 = 0xa0;
+/// Kinds of subject alternative names (RFC 5280, 4.2.1.6).
+const DNS_NAME: u8 = 0x82;
+const IP_ADDRESS: u8 = 0x87;
 
 const SUBJECT_KEY_ID: &[u8] = &[0x55, 0x1d, 0x0e];
 const BASIC_CONSTRAINTS: &[u8] = &[0x55, 0x1d, 0x13];
+const ALTERNATIVE_NAMES: &[u8] = &[0x55, 0x1d, 0x11];
 const KEY_USAGE: &[u8] = &[0x55, 0x1d, 0x0f];
 const CRL_NUMBER: &[u8] = &[0x55, 0x1d, 0x14];
 const DISTRIBUTION_POINT: &[u8] = &[0x55, 0x1d, 0x1c];
@@ -217,6 +222,37 @@ pub(crate) fn path_length(certificate: &[u8]) -> Option<Option<usize>> {
         [first, ..] if *first < 0x80 => Some(None),
         _ => None,
     }
+}
+
+/// A subject alternative name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum AlternativeName<'a> {
+    Dns(&'a str),
+    Ip(IpAddr),
+    /// A name of another kind.
+    Other,
+}
+
+/// Returns the subject alternative names of a DER certificate; an empty list if it has none.
+pub(crate) fn alternative_names(certificate: &[u8]) -> Option<Vec<AlternativeName<'_>>> {
+    let Some(extensions) = extensions_of(certificate)? else { return Some(Vec::new()) };
+    let Some(content) = extensions.find_extension(ALTERNATIVE_NAMES)? else { return Some(Vec::new()) };
+    let mut names = Der(content).enter(SEQUENCE)?;
+    let mut all = Vec::new();
+    while let Some(tag) = names.peek() {
+        let value = names.enter(tag)?.0;
+        all.push(match tag {
+            DNS_NAME => AlternativeName::Dns(std::str::from_utf8(value).ok()?),
+            IP_ADDRESS => AlternativeName::Ip(ip_address(value)?),
+            _ => AlternativeName::Other,
+        });
+    }
+    Some(all)
+}
+
+fn ip_address(octets: &[u8]) -> Option<IpAddr> {
+    let v4 = <[u8; 4]>::try_from(octets).map(IpAddr::from);
+    v4.or_else(|_| <[u8; 16]>::try_from(octets).map(IpAddr::from)).ok()
 }
 
 /// Returns the first byte of its key usage, if it has one.
