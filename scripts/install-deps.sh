@@ -64,6 +64,7 @@ if [ "$what" = test ]; then
     need 'command -v node && command -v npm' nodejs npm -- "clients of the gateway in JavaScript"
     # shellcheck disable=SC2016 # the probe is evaluated later
     need 'test -x "${SGC_CHROMIUM:-/usr/bin/chromium}"' chromium -- "a page that uses the gateway; SGC_CHROMIUM names another Chromium"
+    need 'command -v certutil' libnss3-tools -- "a browser that has imported a gateway's certificate"
     need 'command -v ip' iproute2 -- "isolated networks for the tests (ip netns)"
     need 'command -v nft' nftables -- "NATs and firewalls between them"
     need 'command -v openssl' openssl -- "an independent DTLS program, a keystore for DDS Security"

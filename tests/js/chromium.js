@@ -21,7 +21,7 @@ export function limit(most) {
 }
 
 /** Starts the browser with its data in a new directory. It finds the hosts of these rules, and no other at all. */
-export function launch(directory, hosts, options = {}) {
+export function launch(directory, hosts, options = {}, flags = []) {
   const executablePath = process.env.SGC_CHROMIUM || "/usr/bin/chromium";
   begin(`start ${executablePath}`);
   return chromium.launchPersistentContext(directory, {
@@ -38,6 +38,7 @@ export function launch(directory, hosts, options = {}) {
       "--disable-sync",
       "--no-proxy-server",
       `--host-resolver-rules=${hosts}`,
+      ...flags,
     ],
   });
 }

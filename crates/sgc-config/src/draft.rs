@@ -220,6 +220,8 @@ pub(crate) struct GatewayDraft {
     pub(crate) listen: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(crate) certificate: Option<WithOrigin<PathBuf>>,
     pub(crate) key: Option<WithOrigin<PathBuf>>,
+    /// The list has an origin of its own, since it excludes `certificate`.
+    pub(crate) names: Option<WithOrigin<Vec<WithOrigin<String>>>>,
     pub(crate) anonymous: Option<WithOrigin<String>>,
     pub(crate) origins: Vec<WithOrigin<String>>,
     pub(crate) plain: Option<WithOrigin<bool>>,

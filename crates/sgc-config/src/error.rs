@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use sgc_gateway::{PageOriginError, ScopeError};
 use sgc_transport::UrlError;
-use sgc_trust::TokenError;
+use sgc_trust::{CertificateNameError, TokenError};
 
 use crate::config::{PEER_RATE_MAX, PEER_RATE_MIN};
 use crate::gateway::{GatewayUrl, GatewayUrlError};
@@ -595,6 +595,25 @@ pub enum Mistake {
         /// The parsed URL.
         url: GatewayUrl,
     },
+    /// A value that is no name of a certificate.
+    #[error("`{key}` names {value:?}; {fault}")]
+    CertificateName {
+        /// The key.
+        key: &'static str,
+        /// The value.
+        value: String,
+        /// The fault.
+        fault: CertificateNameError,
+    },
+    /// Names for the gateway's own certificate, and another certificate.
+    #[error(
+        "`{key}` is for the gateway's own certificate, and `certificate` is another one, with names of its own: take one of \
+         the two out"
+    )]
+    NamesUnused {
+        /// The key.
+        key: &'static str,
+    },
     /// A value that is no origin of web pages.
     #[error("`{key}` names {value:?}; {fault}")]
     PageOrigin {
@@ -628,7 +647,9 @@ pub enum Mistake {
         fault: ScopeError,
     },
     /// One of two keys that need each other.
-    #[error("`{key}` needs `{other}` beside it: give both, or neither for the node's own certificate")]
+    #[error(
+        "`{key}` needs `{other}` beside it: give both, or neither for a certificate that the gateway makes itself"
+    )]
     Alone {
         /// The key that is present.
         key: &'static str,

@@ -366,6 +366,11 @@ impl FileReader<'_> {
             listen: self.strings(gateway, "listen", "an array of strings, such as [\"wss://0.0.0.0:9090\"]"),
             certificate,
             key,
+            names: self.strings(
+                gateway,
+                "names",
+                "an array of strings, such as [\"arm-1.lab.example\", \"10.0.0.7\"]",
+            ),
             anonymous: self.string(gateway, "anonymous", "a string, \"local\", \"none\" or \"all\""),
             origins: self.flat_strings(
                 gateway,

@@ -8,11 +8,14 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use sgc_gateway::{Anonymous, PageOrigin, Protocol, ProtocolNotBuilt, Scope};
+use sgc_trust::CertificateName;
 
 use crate::recipient::Recipient;
 
 /// Most origins of web pages that one gateway admits.
 pub const ORIGINS_MAX: usize = 64;
+/// Most names of the gateway's own certificate that one configuration lists.
+pub const GATEWAY_NAMES_MAX: usize = 32;
 /// Most `[[gateway.client]]` tables.
 pub const GATEWAY_CLIENTS_MAX: usize = 256;
 
@@ -26,8 +29,10 @@ const MIB: u64 = 1 << 20;
 pub struct GatewayConfig {
     /// Listen addresses; not empty, without duplicates.
     pub listen: Vec<GatewayUrl>,
-    /// Certificate and key for TLS; `None` uses the node's own.
+    /// Certificate and key for TLS; `None` uses one that the gateway makes itself.
     pub tls: Option<GatewayTls>,
+    /// Names in the certificate that the gateway makes itself, besides those that it knows by itself. Empty with `tls`.
+    pub names: Vec<CertificateName>,
     /// Rights of clients without a token or a certificate.
     pub anonymous: Anonymous,
     /// Origins whose pages may connect without a token, besides those of this host.
@@ -109,6 +114,7 @@ impl Default for GatewayConfig {
         Self {
             listen: Self::default_listen(),
             tls: None,
+            names: Vec::new(),
             anonymous: Anonymous::default(),
             origins: Vec::new(),
             plain: false,

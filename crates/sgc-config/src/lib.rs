@@ -33,8 +33,8 @@ pub use config::{
 };
 pub use error::{ConfigError, ConfigErrors, Mistake, Origin, TopicRule};
 pub use gateway::{
-    GATEWAY_CLIENTS_MAX, GatewayClientConfig, GatewayConfig, GatewayScheme, GatewayTls, GatewayUrl,
-    GatewayUrlError, ORIGINS_MAX,
+    GATEWAY_CLIENTS_MAX, GATEWAY_NAMES_MAX, GatewayClientConfig, GatewayConfig, GatewayScheme, GatewayTls,
+    GatewayUrl, GatewayUrlError, ORIGINS_MAX,
 };
 pub use metrics::MetricsConfig;
 pub use names::{FRAME_PREFIX_BYTES_MAX, PEER_BYTES_MAX, TYPE_BYTES_MAX};

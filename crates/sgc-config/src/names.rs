@@ -9,7 +9,7 @@ use std::time::Duration;
 use sgc_gateway::{PageOrigin, PageOriginError};
 use sgc_ros::{Interface, TOPIC_BYTES_MAX};
 use sgc_transport::{ListenAddr, UrlError};
-use sgc_trust::{FleetName, LABEL_BYTES_MAX, NodeName};
+use sgc_trust::{CertificateName, FleetName, LABEL_BYTES_MAX, NodeName};
 use sgc_wire::NodeId;
 
 use crate::config::{PEER_RATE_MAX, PEER_RATE_MIN};
@@ -366,6 +366,11 @@ pub(crate) fn gateway_listen(key: &'static str, value: &str) -> Result<GatewayUr
     let url: GatewayUrl = value.parse().map_err(mistake)?;
     url.scheme.protocol().check_built().map_err(|absent| mistake(absent.into()))?;
     Ok(url)
+}
+
+/// Parses a name of the gateway's certificate.
+pub(crate) fn certificate_name(key: &'static str, value: &str) -> Result<CertificateName, Mistake> {
+    value.parse().map_err(|fault| Mistake::CertificateName { key, value: value.to_owned(), fault })
 }
 
 /// Parses an origin of web pages.

@@ -184,6 +184,7 @@ impl Table {
                 "listen",
                 "certificate",
                 "key",
+                "names",
                 "anonymous",
                 "origins",
                 "plain",

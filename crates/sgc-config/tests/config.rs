@@ -8,9 +8,9 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use sgc_config::{
-    ArgsConfig, AuditConfig, AuditRoom, Config, ConfigErrors, DiscoveryRange, GatewayConfig, Naming,
-    Recipient, Rename, RotationConfig, SHARES_MAX, SUITES, SecurityConfig, Shaping, Table, TokenConfig,
-    TokenSource, TransportConfig, parse,
+    ArgsConfig, AuditConfig, AuditRoom, Config, ConfigErrors, DiscoveryRange, GATEWAY_NAMES_MAX,
+    GatewayConfig, Naming, Recipient, Rename, RotationConfig, SHARES_MAX, SUITES, SecurityConfig, Shaping,
+    Table, TokenConfig, TokenSource, TransportConfig, parse,
 };
 use sgc_gateway::{Anonymous, Right};
 use sgc_transport::Congestion;
@@ -1380,6 +1380,18 @@ fn every_key_of_a_gateway_is_taken_over() {
 }
 
 #[test]
+fn gateway_takes_names_for_the_certificate_that_it_makes_itself() {
+    let of =
+        |text: &str| good(&format!("{NODE}[gateway]\nlisten = ['wss://0.0.0.0']\n{text}")).gateway.unwrap();
+    assert_eq!(of("").names, []);
+    let names = of("names = ['Arm-1.lab.example', '10.0.0.7', 'fd00::7']").names;
+    assert_eq!(texts(&names), ["arm-1.lab.example", "10.0.0.7", "fd00::7"]);
+    let many: Vec<_> = (0..=GATEWAY_NAMES_MAX).map(|n| format!("'robot-{n}'")).collect();
+    let said = said_about(&format!("[gateway]\nnames = [{}]", many.join(", ")));
+    assert!(said.len() == 1 && said[0].contains("33"), "{said:?}");
+}
+
+#[test]
 fn metrics_are_served_on_loopback_unless_told_otherwise() {
     let of = |text: &str| good(&format!("{NODE}{text}")).metrics;
     assert_eq!(of(""), None);
@@ -1438,13 +1450,35 @@ fn mistakes_in_a_gateway_are_told() {
         (
             "[gateway]\ncertificate = 'a.pem'",
             &[
-                "node.toml:4: `certificate` needs `key` beside it: give both, or neither for the node's own certificate",
+                "node.toml:4: `certificate` needs `key` beside it: give both, or neither for a certificate that the \
+                 gateway makes itself",
             ],
         ),
         (
             "[gateway]\ncertificate = 'a.pem'\nkey = 'a.key'",
             &[
                 "node.toml:4: `certificate` is for wss:// and grpcs://, and `listen` has neither: take it out, or listen there",
+            ],
+        ),
+        (
+            "[gateway]\nnames = ['*.lab', 'wss://a', '0.0.0.0', 'a b', 'A', 'a.']",
+            &[
+                "node.toml:4: `names` names \"*.lab\"; it has a wildcard, and the certificate is for this gateway alone: list \
+                 each name",
+                "node.toml:4: `names` names \"wss://a\"; it takes a bare name, without a scheme, a port or a path: \
+                 \"arm-1.lab.example\"",
+                "node.toml:4: `names` names \"0.0.0.0\"; no client connects to that address: list the addresses that \
+                 clients use",
+                "node.toml:4: `names` names \"a b\"; it takes a DNS name or an IP address, such as \"arm-1.lab.example\" or \
+                 \"10.0.0.7\"",
+                "node.toml:4: `names` names \"a.\" twice; once is enough",
+            ],
+        ),
+        (
+            "[gateway]\nlisten = ['wss://127.0.0.1']\ncertificate = 'a.pem'\nkey = 'a.key'\nnames = ['robot']",
+            &[
+                "node.toml:7: `names` is for the gateway's own certificate, and `certificate` is another one, with names of \
+                 its own: take one of the two out",
             ],
         ),
         (
@@ -1512,7 +1546,7 @@ fn mistakes_in_a_gateway_are_told() {
         (
             "[gateway]\nport = 9090",
             &[
-                "node.toml:4: [gateway] has no key `port`; it has `listen`, `certificate`, `key`, `anonymous`, `origins`, `plain`, \
+                "node.toml:4: [gateway] has no key `port`; it has `listen`, `certificate`, `key`, `names`, `anonymous`, `origins`, `plain`, \
              `clients_max`, `client_bytes_max`, `client`",
             ],
         ),

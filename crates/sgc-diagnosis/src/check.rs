@@ -193,6 +193,8 @@ fn gateway_rows(gateway: &GatewayConfig) -> Vec<Vec<String>> {
     row("gateway", listen.join(", "));
     if let Some(tls) = &gateway.tls {
         row("", format!("shows the certificate in {}", tls.certificate.display()));
+    } else if gateway.listen.iter().any(|url| url.scheme.is_encrypted()) {
+        row("", "shows a certificate that it makes itself: `sgc gateway certificate`".to_owned());
     }
     row(
         "",
@@ -213,7 +215,8 @@ fn gateway_rows(gateway: &GatewayConfig) -> Vec<Vec<String>> {
         let who: Vec<_> = client.who.iter().map(ToString::to_string).collect();
         row("", format!("certificates of {}: {}", who.join(", "), client.scope));
     }
-    for warning in gateway.warnings() {
+    for warning in gateway.warnings().into_iter().chain(sgc_node::gateway_expiry_warning(gateway, unix_now()))
+    {
         row("warning", warning);
     }
     rows

@@ -56,6 +56,17 @@ struct Gateway {
     clients: Vec<GatewayClient>,
     refused: BTreeMap<String, u64>,
     readers: usize,
+    certificate: Option<GatewayCertificate>,
+}
+
+/// The certificate that a gateway shows.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct GatewayCertificate {
+    pin: String,
+    names: Vec<String>,
+    /// Its end, in milliseconds since the Unix epoch.
+    until: u64,
 }
 
 /// A client of a gateway.
@@ -230,6 +241,10 @@ impl Status {
                 section("Refused there", &head, counts(&gateway.refused, refusals::gateway_meaning));
             }
             lines.push(format!("  at {}; {} topics read", gateway.listen.join(", "), gateway.readers));
+            if let Some(GatewayCertificate { pin, names, until }) = &gateway.certificate {
+                let until = sgc_wire::UnixMillis(*until);
+                lines.push(format!("  certificate {pin} for {}, until {until}", names.join(", ")));
+            }
         }
         let RouterSize { nodes, names, routed_names, branches } = self.router;
         lines.push(String::new());

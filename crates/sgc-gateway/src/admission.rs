@@ -11,7 +11,10 @@ use std::time::Instant;
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
 use sgc_sync::lock;
-use sgc_trust::{AddressPrefix, PlaceDecision, PlaceLimits, Places, TrustAnchors, VerifiedPeer};
+use sgc_trust::{
+    AddressPrefix, PlaceDecision, PlaceLimits, Places, TrustAnchors, VerifiedPeer, certificate_end,
+    certificate_names, certificate_pin,
+};
 use sgc_wire::UnixMillis;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
 
@@ -59,6 +62,30 @@ pub struct GatewayStatus {
     pub refused: BTreeMap<String, u64>,
     /// The number of readers on the local network, shared by all clients.
     pub readers: usize,
+    /// The certificate that clients are shown within TLS; null without TLS.
+    pub certificate: Option<ShownCertificate>,
+}
+
+/// The certificate that clients of a gateway are shown.
+#[derive(Clone, Debug, Serialize, PartialEq, Eq)]
+pub struct ShownCertificate {
+    /// The pin of its key, `sha256/BASE64`.
+    pub pin: String,
+    /// Its DNS names and addresses.
+    pub names: Vec<String>,
+    /// The last moment at which it is valid, in milliseconds since the Unix epoch.
+    pub until: u64,
+}
+
+impl ShownCertificate {
+    /// Returns the properties of a certificate; `None` if it cannot be read.
+    pub fn of(certificate: &CertificateDer<'_>) -> Option<Self> {
+        Some(Self {
+            pin: certificate_pin(certificate)?,
+            names: certificate_names(certificate).iter().map(ToString::to_string).collect(),
+            until: certificate_end(certificate)?.0,
+        })
+    }
 }
 
 /// The properties of a connection before its client has sent anything.

@@ -61,7 +61,7 @@ pub use access_watch::AccessWatch;
 pub use action::{
     ActionEvent, ActionReplier, ActionServing, CancelAnswer, Feedback, Goal, GoalId, GoalStatus, Outcome,
 };
-pub use admission::{ClientStatus, GatewayStatus};
+pub use admission::{ClientStatus, GatewayStatus, ShownCertificate};
 pub use clock::WallClock;
 pub use content::{Content, Form};
 pub use definitions::{FindDefinitions, InterfaceType, ShippedDefinitions, Types};
@@ -78,4 +78,4 @@ pub use ros::{LocalReader, LocalRos};
 pub use server::{ListenAt, NotListening, Protocol, ProtocolNotBuilt, Server, ServerError, ServerOptions};
 pub use service::{Replier, Request, Serving};
 pub use session::{Advertise, Session, Subscribe};
-pub use tls::{TlsError, certified_key};
+pub use tls::{NODE_SERVER_NAME, TlsError, TlsKeys, certified_key};

@@ -14,7 +14,6 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use rustls::ServerConfig;
-use rustls::sign::CertifiedKey;
 use rustls_pki_types::CertificateDer;
 use sgc_sync::lock;
 use sgc_trust::{TrustAnchors, VerifiedPeer};
@@ -25,11 +24,11 @@ use tokio::time::Instant;
 use tokio_rustls::TlsAcceptor;
 
 use crate::access::Access;
-use crate::admission::{Admission, Arrival, Engagement, GatewayStatus, Handshakes};
+use crate::admission::{Admission, Arrival, Engagement, GatewayStatus, Handshakes, ShownCertificate};
 use crate::hub::Hub;
 use crate::limits::SessionLimits;
 use crate::refusal::ClientRefusal;
-use crate::tls::{TlsError, server_config};
+use crate::tls::{TlsError, TlsKeys, server_config};
 #[cfg(feature = "grpc")]
 use grpc::GrpcFront;
 use listening::Listening;
@@ -130,8 +129,8 @@ pub struct ServerOptions {
     pub listen: Vec<ListenAt>,
     /// The access rules.
     pub access: Access,
-    /// The certificate and key of the gateway for TLS.
-    pub key: Option<Arc<CertifiedKey>>,
+    /// The certificates and keys of the gateway for TLS.
+    pub keys: Option<TlsKeys>,
     /// Most clients at a time.
     pub clients_max: usize,
     /// The limits of each session.
@@ -162,8 +161,8 @@ pub enum ServerError {
 struct Tls {
     ws: Arc<ServerConfig>,
     grpc: Arc<ServerConfig>,
-    /// The certificates of both, the gateway's own first.
-    chain: Vec<CertificateDer<'static>>,
+    /// The certificates of both.
+    keys: TlsKeys,
 }
 
 struct ServerState {
@@ -186,11 +185,11 @@ pub struct Server {
     _tasks: JoinSet<()>,
 }
 
-fn tls_config(key: Option<&Arc<CertifiedKey>>, access: &Access) -> Result<Option<Tls>, TlsError> {
+fn tls_config(keys: Option<TlsKeys>, access: &Access) -> Result<Option<Tls>, TlsError> {
     let asks = access.takes_certificates();
-    key.map(|key| {
-        let ws = server_config(key, asks, &[b"http/1.1"])?;
-        Ok(Tls { ws, grpc: server_config(key, asks, &[b"h2"])?, chain: key.cert.clone() })
+    keys.map(|keys| {
+        let ws = server_config(&keys, asks, &[b"http/1.1"])?;
+        Ok(Tls { ws, grpc: server_config(&keys, asks, &[b"h2"])?, keys })
     })
     .transpose()
 }
@@ -198,7 +197,7 @@ fn tls_config(key: Option<&Arc<CertifiedKey>>, access: &Access) -> Result<Option
 impl Server {
     /// Serves clients at all addresses. One that cannot be bound is tried again ([`Self::not_listening`]).
     pub async fn start(hub: Hub, options: ServerOptions) -> Result<Self, ServerError> {
-        let tls = tls_config(options.key.as_ref(), &options.access)?;
+        let tls = tls_config(options.keys, &options.access)?;
         let admission = Admission::new(options.access, options.clients_max);
         #[cfg_attr(not(feature = "grpc"), expect(unused_mut, reason = "only gRPC has a task here"))]
         let mut tasks = JoinSet::new();
@@ -262,9 +261,9 @@ impl Server {
         lock(&self.listening)
     }
 
-    /// Applies other rules and another certificate. Clients that the rules no longer admit are disconnected.
-    pub fn reconfigure(&self, access: Access, key: Option<&Arc<CertifiedKey>>) -> Result<(), ServerError> {
-        let tls = tls_config(key, &access)?;
+    /// Applies other rules and other certificates. Clients that the rules no longer admit are disconnected.
+    pub fn reconfigure(&self, access: Access, keys: Option<TlsKeys>) -> Result<(), ServerError> {
+        let tls = tls_config(keys, &access)?;
         if tls.is_none() && self.lock().iter().any(|one| one.wanted().is_encrypted) {
             return Err(ServerError::NoKey);
         }
@@ -273,16 +272,21 @@ impl Server {
         Ok(())
     }
 
-    /// Shows another certificate to new connections. Existing connections stay.
-    pub fn show(&self, key: &Arc<CertifiedKey>) -> Result<(), ServerError> {
-        let tls = tls_config(Some(key), &self.shared.admission.access())?;
+    /// Shows other certificates to new connections. Existing connections stay.
+    pub fn show(&self, keys: TlsKeys) -> Result<(), ServerError> {
+        let tls = tls_config(Some(keys), &self.shared.admission.access())?;
         self.shared.tls.send_replace(tls);
         Ok(())
     }
 
+    /// Returns the certificates and keys for new connections; `None` without TLS.
+    pub fn keys(&self) -> Option<TlsKeys> {
+        self.shared.tls.borrow().as_ref().map(|tls| tls.keys.clone())
+    }
+
     /// Returns the certificates for new connections, the gateway's own first. The list is empty without TLS.
     pub fn shown(&self) -> Vec<CertificateDer<'static>> {
-        self.shared.tls.borrow().as_ref().map(|tls| tls.chain.clone()).unwrap_or_default()
+        self.keys().map(|keys| keys.shown.cert.clone()).unwrap_or_default()
     }
 
     /// Verifies tokens with this certificate of the gateway from now on.
@@ -307,6 +311,7 @@ impl Server {
             clients: self.shared.admission.clients(),
             refused: self.refused(),
             readers: self.shared.hub.readers(),
+            certificate: self.shown().first().and_then(|shown| ShownCertificate::of(shown)),
         }
     }
 

@@ -1,4 +1,7 @@
-//! TLS of the gateway: its certificate, and the request for client certificates.
+//! TLS of the gateway: its certificates, and the request for client certificates.
+//!
+//! A client that asks for the server name [`NODE_SERVER_NAME`] is shown the node's certificate, which members of the
+//! fleet verify by their CA. All others are shown the certificate for programs.
 //!
 //! Client certificates belong to fleets. [`sgc_trust::TrustAnchors`] verifies them after the handshake has proven
 //! that the client has the key.
@@ -13,6 +16,25 @@ use rustls::sign::CertifiedKey;
 use rustls::{DistinguishedName, Error, ServerConfig};
 use rustls_pki_types::pem::PemObject as _;
 use rustls_pki_types::{CertificateDer, PrivateKeyDer, UnixTime};
+
+/// The server name (SNI) by which a client asks for the certificate of the node. The name is reserved (RFC 2606), so it
+/// names no host.
+pub const NODE_SERVER_NAME: &str = "node.sgc.invalid";
+
+/// The certificates of a gateway with their keys.
+#[derive(Clone)]
+pub struct TlsKeys {
+    /// The certificate that clients are shown.
+    pub shown: Arc<CertifiedKey>,
+    /// The certificate for clients that ask for [`NODE_SERVER_NAME`]; without it, they are shown the other.
+    pub node: Option<Arc<CertifiedKey>>,
+}
+
+impl From<Arc<CertifiedKey>> for TlsKeys {
+    fn from(shown: Arc<CertifiedKey>) -> Self {
+        Self { shown, node: None }
+    }
+}
 
 /// The reason why a certificate and key cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -47,9 +69,9 @@ pub fn certified_key(certificate: &[u8], key: &[u8]) -> Result<Arc<CertifiedKey>
     CertifiedKey::from_der(chain, key, &provider()).map(Arc::new).map_err(TlsError::Unusable)
 }
 
-/// Creates a configuration of TLS 1.3 with this certificate. `asks` requests a client certificate.
+/// Creates a configuration of TLS 1.3 with these certificates. `asks` requests a client certificate.
 pub(crate) fn server_config(
-    key: &Arc<CertifiedKey>,
+    keys: &TlsKeys,
     asks: bool,
     protocols: &[&[u8]],
 ) -> Result<Arc<ServerConfig>, TlsError> {
@@ -63,23 +85,25 @@ pub(crate) fn server_config(
     } else {
         builder.with_no_client_auth()
     };
-    let mut config = builder.with_cert_resolver(Arc::new(FixedCertResolver(Arc::clone(key))));
+    let mut config = builder.with_cert_resolver(Arc::new(KeysBySni(keys.clone())));
     config.alpn_protocols = protocols.iter().map(|protocol| protocol.to_vec()).collect();
     Ok(Arc::new(config))
 }
 
-/// A resolver that returns the same certificate for every name.
-struct FixedCertResolver(Arc<CertifiedKey>);
+/// A resolver that returns the node's certificate for its server name, and the other for every other name or none.
+struct KeysBySni(TlsKeys);
 
-impl fmt::Debug for FixedCertResolver {
+impl fmt::Debug for KeysBySni {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("Always")
+        f.debug_tuple("KeysBySni").finish_non_exhaustive()
     }
 }
 
-impl ResolvesServerCert for FixedCertResolver {
-    fn resolve(&self, _hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
-        Some(Arc::clone(&self.0))
+impl ResolvesServerCert for KeysBySni {
+    fn resolve(&self, hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
+        let TlsKeys { shown, node } = &self.0;
+        let wants_node = hello.server_name().is_some_and(|name| name.eq_ignore_ascii_case(NODE_SERVER_NAME));
+        Some(Arc::clone(node.as_ref().filter(|_| wants_node).unwrap_or(shown)))
     }
 }
 

@@ -18,7 +18,7 @@ use sgc_gateway::{
     Access, AccessGrant, AccessRules, Advertise, Client, Content, Hub, HubOptions, ListenAt, Protocol, Scope,
     Server, ServerOptions, Session, SessionLimits, ShippedDefinitions, TokenId, Types,
 };
-use sgc_trust::{EnrollRequest, Fleet, Identity};
+use sgc_trust::{EnrollRequest, Fleet, Identity, ServerCertificate, certificate_pin, pem_text};
 use sgc_wire::{Qos, Reliability, UnixMillis};
 use tokio::process::Command;
 use tokio::task::JoinSet;
@@ -123,6 +123,16 @@ fn repository(file: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../").join(file)
 }
 
+/// Runs a program and checks that it succeeds.
+async fn run(mut node: Command) {
+    node.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).kill_on_drop(true);
+    let child = node.spawn().unwrap_or_else(|why| panic!("{why}: run `make deps-test peers` first: node"));
+    let output = tokio::time::timeout(PATIENCE, child.wait_with_output()).await;
+    let output = output.expect("it should have ended by now").unwrap();
+    let (said, errors) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success() && said.ends_with("all is well\n"), "{said}\n{errors}");
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_page_shows_a_camera_if_it_is_of_this_host_or_has_a_token() {
     let site = Site::new().await;
@@ -135,7 +145,7 @@ async fn a_page_shows_a_camera_if_it_is_of_this_host_or_has_a_token() {
         name: "arm-1".into(),
         listen: vec![at],
         access: Access::new(AccessRules { gateway, anchors, ..AccessRules::default() }),
-        key: None,
+        keys: None,
         clients_max: 16,
         limits: SessionLimits::default(),
     };
@@ -147,14 +157,42 @@ async fn a_page_shows_a_camera_if_it_is_of_this_host_or_has_a_token() {
         .arg(dir.path().join("browser"))
         .env("HOME", dir.path())
         .env("TMPDIR", dir.path());
-    node.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).kill_on_drop(true);
-    let child = node.spawn().unwrap_or_else(|why| panic!("{why}: run `make deps-test peers` first: node"));
-    let output = tokio::time::timeout(PATIENCE, child.wait_with_output()).await;
-    let output = output.expect("it should have ended by now").unwrap();
-    let (said, errors) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
-    assert!(output.status.success() && said.ends_with("all is well\n"), "{said}\n{errors}");
+    run(node).await;
     // Only the page from elsewhere without a token was refused.
     assert_eq!(server.status().refused.get("not admitted"), Some(&1));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_browser_verifies_a_gateway_that_makes_its_certificate_itself() {
+    let site = Site::new().await;
+    let names = ["localhost", "127.0.0.1", "robot.test"].map(|name| name.parse().unwrap()).into();
+    let mut rng = ChaCha20Rng::seed_from_u64(4);
+    let mut made = || ServerCertificate::generate(&names, now(), &mut rng).unwrap();
+    let (own, another) = (made(), made());
+    let bank = ["bank.test".parse().unwrap()].into();
+    let stolen = own.renewed(&bank, now(), &mut rng).unwrap().unwrap();
+    let mut servers = Vec::new();
+    for certificate in [&own, &another, &stolen] {
+        let at =
+            ListenAt { protocol: Protocol::WebSocket, is_encrypted: true, addr: ([127, 0, 0, 1], 0).into() };
+        let options = ServerOptions {
+            name: "arm-1".into(),
+            listen: vec![at],
+            access: Access::default(),
+            keys: Some(certificate.certified_key().unwrap().into()),
+            clients_max: 16,
+            limits: SessionLimits::default(),
+        };
+        servers.push(Server::start(site.hub.clone(), options).await.unwrap());
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let ca = dir.path().join("gateway.pem");
+    std::fs::write(&ca, pem_text("CERTIFICATE", own.authority())).unwrap();
+    let mut node = Command::new("node");
+    node.arg(repository("tests/js/verify.js"));
+    node.args(servers.iter().map(|server| server.local()[0].addr.port().to_string()));
+    node.arg(certificate_pin(own.server()).unwrap()).arg(&ca).arg(dir.path()).env("TMPDIR", dir.path());
+    run(node).await;
 }
 
 #[test]

@@ -43,7 +43,7 @@ async fn server(site: &Site, clients_max: usize) -> Server {
         name: "robot".into(),
         listen: vec![listen],
         access: Access::default(),
-        key: None,
+        keys: None,
         clients_max,
         limits: SessionLimits::default(),
     };

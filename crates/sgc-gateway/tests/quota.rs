@@ -389,7 +389,7 @@ async fn a_client_without_room_for_history_does_not_cut_that_of_others() {
         name: "robot".into(),
         listen: Vec::new(),
         access: Access::new(AccessRules::default()),
-        key: None,
+        keys: None,
         clients_max: 64,
         limits: LIMITS,
     };

@@ -19,12 +19,12 @@ use sgc_cdr::{Layout, TypeName};
 use sgc_gateway::grpc::proto::gateway_client::GatewayClient;
 use sgc_gateway::grpc::proto::{GetTypeRequest, SubscribeRequest, SubscribeResponse, WatchGraphRequest};
 use sgc_gateway::{
-    Access, AccessGrant, AccessRules, Anonymous, ClientRule, FindDefinitions, ListenAt, Protocol, Scope,
-    Server, ServerOptions, SessionLimits, TokenId, Types,
+    Access, AccessGrant, AccessRules, Anonymous, ClientRule, FindDefinitions, ListenAt, NODE_SERVER_NAME,
+    Protocol, Scope, Server, ServerOptions, SessionLimits, TlsKeys, TokenId, Types,
 };
 use sgc_ros::{RosNetwork as _, RosWriter as _, SampleKind};
 use sgc_testkit::FakeWriter;
-use sgc_trust::{EnrollRequest, Fleet, Grantees, Identity};
+use sgc_trust::{EnrollRequest, Fleet, Grantees, Identity, ServerCertificate, certificate_pin};
 use sgc_wire::{Qos, UnixMillis};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
@@ -96,7 +96,7 @@ impl Place {
                 at(Protocol::WebSocket, true),
             ],
             access: rules(&robot, &desk, &[]),
-            key: Some(robot.certified_key()),
+            keys: Some(robot.certified_key().into()),
             clients_max: 64,
             limits: SessionLimits::default(),
         };
@@ -129,8 +129,8 @@ impl Place {
 
     /// Revokes these tokens, like a reload after `sgc token access revoke`.
     fn revoke(&self, numbers: &[u8]) {
-        let key = self.robot.certified_key();
-        self.server.reconfigure(rules(&self.robot, &self.desk, numbers), Some(&key)).unwrap();
+        let keys = self.robot.certified_key().into();
+        self.server.reconfigure(rules(&self.robot, &self.desk, numbers), Some(keys)).unwrap();
     }
 
     async fn web_socket(&self, target: &str, subprotocol: Option<&str>) -> WebSocketStream<TcpStream> {
@@ -371,8 +371,13 @@ type Wss = WebSocketStream<tokio_rustls::client::TlsStream<TcpStream>>;
 
 impl Place {
     async fn wss(&self, connector: &TlsConnector, token: Option<&str>) -> Wss {
+        self.wss_named(connector, "robot", token).await
+    }
+
+    /// Asks for a certificate of this name.
+    async fn wss_named(&self, connector: &TlsConnector, name: &'static str, token: Option<&str>) -> Wss {
         let stream = TcpStream::connect(self.addr(2)).await.unwrap();
-        let name = ServerName::try_from("robot").unwrap();
+        let name = ServerName::try_from(name).unwrap();
         let stream = within(connector.connect(name, stream)).await.unwrap();
         let target = token.map(|token| format!("?token={token}")).unwrap_or_default();
         let request = format!("wss://robot/{target}").into_client_request().unwrap();
@@ -409,12 +414,38 @@ async fn a_renewed_certificate_is_shown_to_new_connections_and_tokens_go_on() {
     assert_eq!(shown(&before), place.robot.chain());
     let another = EnrollRequest::new("robot-2".parse().unwrap(), UnixMillis(now().0 - 1000));
     let another = place.fleet.enroll(&another, &mut place.rng).unwrap();
-    assert!(place.server.show(&another.certified_key()).is_ok());
+    assert!(place.server.show(another.certified_key().into()).is_ok());
     let after = place.wss(&connector, Some(&token)).await;
     assert_eq!(shown(&after), another.chain());
     // An existing client stays.
     say(&mut before, &json!({"op": "call_service", "id": "1", "service": "/rosapi/topics"})).await;
     assert_eq!(hear(&mut before).await["id"], "1");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn members_of_the_fleet_ask_for_the_certificate_of_the_node_and_programs_get_another() {
+    let place = Place::new().await;
+    let names = ["robot".parse().unwrap()].into();
+    let own = ServerCertificate::generate(&names, now(), &mut ChaCha20Rng::seed_from_u64(2)).unwrap();
+    let keys = TlsKeys { shown: own.certified_key().unwrap(), node: Some(place.robot.certified_key()) };
+    place.server.show(keys).unwrap();
+    let member = connector(Some(&place.desk));
+    let mut socket = place.wss_named(&member, NODE_SERVER_NAME, None).await;
+    assert_eq!(shown(&socket), place.robot.chain());
+    let chain = shown(&socket);
+    assert_eq!(place.desk.anchors().verify(&chain, now()).unwrap().node_id, place.robot.node_id());
+    // The certificate of the client counts as ever.
+    say(&mut socket, &json!({"op": "call_service", "id": "1", "service": "/rosapi/topics"})).await;
+    assert_eq!(hear(&mut socket).await["values"]["topics"], json!(["/odom"]));
+    for name in ["robot", "10.0.0.7", "other.invalid"] {
+        let socket = place.wss_named(&member, name, None).await;
+        assert_eq!(shown(&socket), [own.server().clone(), own.authority().clone()], "{name}");
+    }
+    let status = place.server.status().certificate.unwrap();
+    assert_eq!(
+        (status.pin, status.names),
+        (certificate_pin(own.server()).unwrap(), vec!["robot".to_owned()])
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -42,6 +42,9 @@ pub use drops::NodeDrop;
 pub use gateway::access::{
     ACCESS_TOKENS_MAX, AccessError, AccessRecord, AccessRecords, access_of, access_with,
 };
+pub use gateway::certificate::{
+    GatewayCertificate, GatewayCertificateError, gateway_expiry_warning, gateway_urls,
+};
 pub use gateway::{GatewayStartError, OpenLocalRos};
 pub use link::push_crl::{PushCrlError, push_crl};
 pub use metrics::series::{METRICS, Metric, MetricKind};

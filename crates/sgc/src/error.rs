@@ -16,7 +16,7 @@ use sgc_gateway::AccessTokenError;
 use sgc_measure::MeasureError;
 use sgc_node::config::ConfigErrors;
 use sgc_node::partners::PartnerError;
-use sgc_node::{AccessError, FleetFileError, NodeError, RulesError, StateError};
+use sgc_node::{AccessError, FleetFileError, GatewayCertificateError, NodeError, RulesError, StateError};
 use sgc_process::{ProcessError, output};
 use sgc_trust::{CrlError, FleetError, IdentityError, InvitationError, LabelError, PemError, TokenError};
 
@@ -187,6 +187,19 @@ pub(crate) enum CliError {
     /// Access tokens that were made.
     #[error(transparent)]
     Access(#[from] AccessError),
+    /// The certificate of the gateway.
+    #[error(transparent)]
+    GatewayCertificate(#[from] GatewayCertificateError),
+    /// A configuration without a gateway that has a certificate.
+    #[error(
+        "{}: no gateway listens with TLS here, so there is no certificate: add `listen = [\"wss://0.0.0.0:9443\"]` or a \
+         grpcs:// address to [gateway]",
+        path.display()
+    )]
+    NoGatewayTls {
+        /// The configuration.
+        path: PathBuf,
+    },
     /// An access token that cannot be made.
     #[error("such a token cannot be made: {0}")]
     AccessToken(#[from] AccessTokenError),
@@ -335,6 +348,8 @@ impl CliError {
             | Self::Rules(_)
             | Self::State(_)
             | Self::Access(_)
+            | Self::GatewayCertificate(_)
+            | Self::NoGatewayTls { .. }
             | Self::AccessToken(_)
             | Self::Token(_)
             | Self::TokenShown

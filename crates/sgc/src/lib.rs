@@ -19,6 +19,7 @@ mod environment;
 mod error;
 mod files;
 mod fleet;
+mod gateway;
 mod heap;
 mod log;
 mod log_filter;
@@ -84,6 +85,7 @@ enum Command {
     Audit(audit::AuditArgs),
     Policy(policy::PolicyArgs),
     Token(token::TokenArgs),
+    Gateway(gateway::GatewayArgs),
     #[command(hide = true)]
     ShareToken(moved::MovedArgs),
     #[command(hide = true)]
@@ -147,6 +149,7 @@ fn run(command: Command) -> Result<ExitCode, CliError> {
         Command::Audit(args) => audit::audit(&args),
         Command::Policy(args) => return policy::policy(&args),
         Command::Token(args) => token::token(&args),
+        Command::Gateway(args) => gateway::gateway(&args),
         Command::ShareToken(_) => {
             Err(moved::moved("sgc share-token", "sgc token share create, list and revoke"))
         }

@@ -9,13 +9,19 @@ use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::process::{Child, ChildStdout, Command, Stdio};
-use std::time::{Duration, Instant};
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+use rand_chacha::ChaCha20Rng;
+use rand_chacha::rand_core::SeedableRng as _;
 use rustix::process::{Pid, Signal, kill_process};
+use rustls::pki_types::pem::PemObject as _;
+use rustls::pki_types::{CertificateDer, ServerName};
+use rustls::{ClientConfig, ClientConnection, RootCertStore};
 use serde_json::Value;
 use sgc_gateway::{AccessToken, Right};
-use sgc_trust::{Identity, ShareToken, derive_name};
-use sgc_wire::Metadata;
+use sgc_trust::{Identity, ServerCertificate, ShareToken, derive_name};
+use sgc_wire::{Metadata, UnixMillis};
 use tempfile::TempDir;
 
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -375,6 +381,121 @@ fn gateway_comes_moves_and_goes_at_a_reload_and_a_taken_port_stops_nothing() {
     node.end();
 }
 
+/// Connects to a gateway that these certificates (PEM) verify, under this name. Returns the certificate that it shows.
+fn handshake(port: u16, name: &str, trusted: &str) -> Result<Vec<u8>, std::io::Error> {
+    let mut roots = RootCertStore::empty();
+    for certificate in CertificateDer::pem_slice_iter(trusted.as_bytes()) {
+        roots.add(certificate.unwrap()).unwrap();
+    }
+    let provider = Arc::new(rustls::crypto::aws_lc_rs::default_provider());
+    let config = ClientConfig::builder_with_provider(provider)
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .unwrap()
+        .with_root_certificates(roots)
+        .with_no_client_auth();
+    let name = ServerName::try_from(name.to_owned()).unwrap();
+    let mut client = ClientConnection::new(Arc::new(config), name).unwrap();
+    let mut socket = TcpStream::connect(("127.0.0.1", port))?;
+    socket.set_read_timeout(Some(PATIENCE))?;
+    while client.is_handshaking() {
+        client.complete_io(&mut socket)?;
+    }
+    Ok(client.peer_certificates().unwrap()[0].to_vec())
+}
+
+#[test]
+fn gateway_certificate_is_made_before_the_first_start_and_follows_its_names() {
+    let place = Place::new();
+    let base = place.read("arm-1.toml");
+    let certificate = |how: &[&'static str]| [&["gateway", "certificate", "-c", "arm-1.toml"], how].concat();
+    let said = place.bad(2, &certificate(&[]));
+    assert!(said.contains("no gateway listens with TLS here"), "{said}");
+    // A free port, for URLs that can be used.
+    let free = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = free.local_addr().unwrap().port();
+    drop(free);
+    let with = |more: &str| {
+        place.write("arm-1.toml", &format!("{base}\n[gateway]\nlisten = ['wss://0.0.0.0:{port}']\n{more}"));
+    };
+    with("names = ['robot.example']");
+    let trusted = place.good(&certificate(&["--pem"]));
+    assert_eq!(place.mode("state/gateway-certificate.pem"), 0o600);
+    assert!(!trusted.contains("PRIVATE"), "{trusted}");
+    let json = || -> Value { serde_json::from_str(&place.good(&certificate(&["--json"]))).unwrap() };
+    let first = json();
+    assert_eq!(first["urls"], serde_json::json!([format!("wss://robot.example:{port}")]));
+    assert_eq!((&first["own"], &first["pem"]), (&Value::Bool(true), &trusted.clone().into()));
+    let pin = first["pin"].as_str().unwrap().to_owned();
+    assert!(place.good(&certificate(&[])).contains(&pin));
+    let create = ["token", "access", "create", "-c", "arm-1.toml", "--for", "x", "--subscribe", "/odom"];
+    let hint = place.run(&create).stderr;
+    assert!(hint.contains(&pin) && hint.contains(&format!("wss://robot.example:{port}")), "{hint}");
+
+    let node = place.start("arm-1.toml");
+    let status = || -> Value {
+        serde_json::from_str(&place.good(&["status", "--socket", "arm.sock", "--json"])).unwrap()
+    };
+    let shown = || status()["gateway"]["certificate"].clone();
+    wait("it listens", || TcpStream::connect(("127.0.0.1", port)).is_ok());
+    assert_eq!(shown()["pin"], pin.as_str());
+    assert!(place.good(&["status", "--socket", "arm.sock"]).contains(&pin));
+    for name in ["robot.example", "localhost", "127.0.0.1"] {
+        let leaf = handshake(port, name, &trusted).unwrap();
+        assert_eq!(sgc_trust::certificate_pin(&leaf).as_deref(), Some(&*pin), "{name}");
+    }
+    // A name that is not the gateway's, and the certificate of another gateway.
+    assert!(handshake(port, "other.example", &trusted).is_err());
+    let (names, mut rng) = (["robot.example".parse().unwrap()].into(), ChaCha20Rng::seed_from_u64(1));
+    let another = ServerCertificate::generate(&names, UnixMillis(1_795_000_000_000), &mut rng).unwrap();
+    let another = sgc_trust::pem_text("CERTIFICATE", another.authority());
+    assert!(handshake(port, "robot.example", &another).is_err());
+
+    let reload = || place.good(&["reload", "--socket", "arm.sock"]);
+    with("names = ['arm.example']");
+    assert_eq!(reload(), "who connects to the gateway is shown another certificate\n");
+    assert_eq!(reload(), "nothing changed\n");
+    assert_eq!(shown()["pin"], pin.as_str(), "the key is the same");
+    let renewed = place.good(&certificate(&["--pem"]));
+    assert!(handshake(port, "arm.example", &renewed).is_ok());
+    assert!(handshake(port, "robot.example", &renewed).is_err(), "that is no name any more");
+    let log = node.end();
+    assert!(log.contains(&format!("the pin {pin}")), "{log}");
+
+    // The key outlives a restart.
+    let node = place.start("arm-1.toml");
+    assert_eq!(shown()["pin"], pin.as_str());
+    wait("it listens again", || handshake(port, "arm.example", &renewed).is_ok());
+    node.end();
+    place.write("state/gateway-certificate.pem", "?");
+    let said = place.bad(2, &certificate(&[]));
+    assert!(said.contains("remove it"), "{said}");
+}
+
+#[test]
+fn certificate_from_files_is_shown_with_its_pin_and_check_warns_before_its_end() {
+    let place = Place::new();
+    let base = place.read("arm-1.toml");
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_millis() as u64;
+    // Made so long ago that it ends in five days.
+    let made = UnixMillis(now + 5 * 86_400_000 - sgc_trust::SERVER_VALIDITY.as_millis() as u64);
+    let (names, mut rng) = (["robot.example".parse().unwrap()].into(), ChaCha20Rng::seed_from_u64(1));
+    let made = ServerCertificate::generate(&names, made, &mut rng).unwrap();
+    for file in ["gateway.pem", "gateway.key"] {
+        place.write(file, &made.to_text());
+    }
+    fs::set_permissions(place.path("gateway.key"), fs::Permissions::from_mode(0o600)).unwrap();
+    let gateway =
+        "\n[gateway]\nlisten = ['wss://0.0.0.0:9443']\ncertificate = 'gateway.pem'\nkey = 'gateway.key'\n";
+    place.write("arm-1.toml", &format!("{base}{gateway}"));
+    let json = place.good(&["gateway", "certificate", "-c", "arm-1.toml", "--json"]);
+    let json: Value = serde_json::from_str(&json).unwrap();
+    assert_eq!(json["pin"], sgc_trust::certificate_pin(made.server()).unwrap());
+    assert_eq!((&json["own"], &json["urls"][0]), (&Value::Bool(false), &"wss://robot.example:9443".into()));
+    assert!(!place.path("state/gateway-certificate.pem").exists());
+    let said = place.good(&["check", "-c", "arm-1.toml"]);
+    assert!(said.contains("gateway.pem ends in 4 days"), "{said}");
+}
+
 #[test]
 fn the_status_socket_answers_old_and_odd_questions() {
     let place = Place::new();
@@ -670,6 +791,7 @@ fn check_says_who_may_connect_to_a_gateway() {
     let said = place.good(&["check", "-c", "arm-1.toml"]);
     for part in [
         "gateway   grpcs://0.0.0.0:50051",
+        "shows a certificate that it makes itself",
         "whoever reaches it may do everything",
         "certificates of desk: subscribe /odom",
         "anonymous = \"all\": whoever reaches grpcs://0.0.0.0:50051 may receive",

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 import grpc
 
-from . import _cbor, _proto
+from . import _cbor, _pin, _proto
 from ._message import Info, Message
 
 _log = logging.getLogger("sgc")
@@ -184,6 +184,7 @@ def connect(
     certificate: Optional[Pem] = None,
     key: Optional[Pem] = None,
     server_name: Optional[str] = None,
+    pin: Optional[str] = None,
     timeout: float = 10.0,
 ) -> "Client":
     """Connects to a gateway.
@@ -192,8 +193,9 @@ def connect(
     (``sgc token access create --out FILE`` makes one), by a client certificate (``certificate`` and its ``key``), or because
     it runs on the gateway's host. ``token_file=FILE`` reads the token from a file, which keeps it out of programs and
     command lines. ``ca`` has the certificates that verify the gateway, by default those that the system trusts.
-    ``server_name`` is the name in the gateway's certificate, if it is not HOST. Files are in PEM. The call waits for
-    the connection up to ``timeout`` seconds.
+    ``server_name`` is the name in the gateway's certificate, if it is not HOST. Files are in PEM. ``pin`` verifies the
+    gateway without any CA: ``sha256/…``, as ``sgc gateway certificate`` shows it. The call waits for the connection up to
+    ``timeout`` seconds.
     """
     if token_file is not None:
         if token is not None:
@@ -207,12 +209,21 @@ def connect(
     target = f"{host}:{parts.port or _PORT}"
     options: List[Tuple[str, Any]] = list(_OPTIONS)
     if parts.scheme == "grpc":
-        if ca or certificate or key or server_name:
-            raise ValueError("certificates are for grpcs://")
+        if ca or certificate or key or server_name or pin:
+            raise ValueError("certificates and pins are for grpcs://")
         channel = grpc.insecure_channel(target, options)
     else:
         if server_name:
             options.append(("grpc.ssl_target_name_override", server_name))
+        if pin is not None:
+            if ca is not None:
+                raise ValueError("give either ca or pin")
+            try:
+                ca = _pin.certificate(parts.hostname, parts.port or _PORT, pin, server_name, timeout)
+            except _pin.PinMismatch as error:
+                raise GatewayError("UNAVAILABLE", f"the gateway at {address} is another one: {error}") from None
+            except OSError as error:
+                raise GatewayError("UNAVAILABLE", f"no gateway at {address}: {error}") from None
         credentials = grpc.ssl_channel_credentials(_pem(ca), _pem(key), _pem(certificate))
         channel = grpc.secure_channel(target, credentials, options)
     try:

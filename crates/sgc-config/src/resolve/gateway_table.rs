@@ -1,12 +1,14 @@
 //! Resolves the draft of `[gateway]`.
 
 use sgc_gateway::{Anonymous, Scope};
+use sgc_trust::CertificateName;
 
 use super::{LISTEN_MAX, Resolver, unknown_word};
 use crate::draft::{GatewayClientDraft, GatewayDraft, PartnerDraft, WithOrigin};
 use crate::error::{Mistake, Origin};
 use crate::gateway::{
-    GATEWAY_CLIENTS_MAX, GatewayClientConfig, GatewayConfig, GatewayTls, GatewayUrl, ORIGINS_MAX,
+    GATEWAY_CLIENTS_MAX, GATEWAY_NAMES_MAX, GatewayClientConfig, GatewayConfig, GatewayTls, GatewayUrl,
+    ORIGINS_MAX,
 };
 use crate::names;
 
@@ -16,6 +18,7 @@ impl Resolver<'_> {
         let plain = written.plain.as_ref().is_some_and(|plain| plain.value);
         let listen = self.gateway_listen(written, plain);
         let tls = self.gateway_tls(written, &listen);
+        let names = self.gateway_names(written);
         let bounds = (1, GatewayConfig::CLIENTS_MAX_MAX);
         let clients_max =
             written.clients_max.as_ref().and_then(|n| self.number(n, "a number of clients", bounds));
@@ -32,6 +35,7 @@ impl Resolver<'_> {
         GatewayConfig {
             listen,
             tls,
+            names,
             anonymous: written
                 .anonymous
                 .as_ref()
@@ -99,6 +103,14 @@ impl Resolver<'_> {
             }
         }
         Some(GatewayTls { certificate: chain_path, key: key_path })
+    }
+
+    fn gateway_names(&mut self, written: &GatewayDraft) -> Vec<CertificateName> {
+        let Some(names) = &written.names else { return Vec::new() };
+        if written.certificate.is_some() {
+            self.record(&names.origin, Mistake::NamesUnused { key: names.key });
+        }
+        self.addresses(&names.value, names::certificate_name, GATEWAY_NAMES_MAX)
     }
 
     fn gateway_client(

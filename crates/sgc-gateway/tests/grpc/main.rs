@@ -688,7 +688,7 @@ async fn calls_that_are_not_admitted_are_counted_whatever_the_rules_are_later() 
         name: "robot".into(),
         listen: vec![at],
         access: gateway.access_of(Anonymous::None, Vec::new()),
-        key: None,
+        keys: None,
         clients_max: 8,
         limits: SessionLimits::default(),
     };
@@ -714,7 +714,7 @@ async fn connections_without_a_client_take_no_place_of_clients() {
         name: "robot".into(),
         listen: vec![at],
         access: gateway.access_of(Anonymous::Local, Vec::new()),
-        key: None,
+        keys: None,
         clients_max: 1,
         limits: SessionLimits::default(),
     };

@@ -8,12 +8,14 @@ use std::sync::{Arc, mpsc};
 use std::time::Duration;
 
 use bytes::Bytes;
+use rand_chacha::ChaCha20Rng;
+use rand_chacha::rand_core::SeedableRng as _;
 use sgc_gateway::{
     Advertise, Anonymous, ClientRule, Content, ListenAt, Protocol, Scope, Server, ServerOptions,
     SessionLimits, certified_key,
 };
 use sgc_ros::{RosNetwork as _, RosWriter as _, Sample, SampleKind};
-use sgc_trust::Grantees;
+use sgc_trust::{Grantees, ServerCertificate, certificate_pin, pem_text};
 use sgc_wire::{Durability, History, Qos, UnixMillis};
 use tokio::process::Command;
 
@@ -183,7 +185,7 @@ async fn python_comes_over_tls_with_the_certificate_of_a_node_or_a_token() {
         name: "robot".into(),
         listen: vec![at],
         access,
-        key: Some(key),
+        keys: Some(key.into()),
         clients_max: 16,
         limits: SessionLimits::default(),
     };
@@ -194,4 +196,61 @@ async fn python_comes_over_tls_with_the_certificate_of_a_node_or_a_token() {
     python.args([&ca, &identity, &dir.path().join("partner.token")]);
     let said = scene.run_at(server.local()[0].addr.port(), python).await;
     assert!(said.ends_with("all is well\n"), "{said}");
+}
+
+/// A gateway with a certificate of its own, at a port for gRPC and one for WebSocket.
+async fn own_gateway(scene: &Scene, certificate: &ServerCertificate) -> Server {
+    let at = |protocol| ListenAt { protocol, is_encrypted: true, addr: ([127, 0, 0, 1], 0).into() };
+    let options = ServerOptions {
+        name: "robot".into(),
+        listen: vec![at(Protocol::Grpc), at(Protocol::WebSocket)],
+        access: scene.gateway.access_of(Anonymous::None, Vec::new()),
+        keys: Some(certificate.certified_key().unwrap().into()),
+        clients_max: 16,
+        limits: SessionLimits::default(),
+    };
+    Server::start(scene.gateway.site.hub.clone(), options).await.unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs programs that `make peers` builds: `make interop`"]
+async fn python_verifies_a_gateway_by_its_certificate_or_its_pin_and_refuses_another() {
+    let scene = Scene::new().await;
+    let dir = tempfile::tempdir().unwrap();
+    let names = ["localhost", "127.0.0.1", "robot.example"].map(|name| name.parse().unwrap()).into();
+    let mut rng = ChaCha20Rng::seed_from_u64(3);
+    let mut made = || ServerCertificate::generate(&names, now(), &mut rng).unwrap();
+    let (own, another) = (made(), made());
+    let (gateway, intruder) = (own_gateway(&scene, &own).await, own_gateway(&scene, &another).await);
+    let ca = dir.path().join("gateway.pem");
+    std::fs::write(&ca, pem_text("CERTIFICATE", own.authority())).unwrap();
+    let port = |server: &Server, at: usize| server.local()[at].addr.port().to_string();
+    let (library, pins) =
+        (wheel(dir.path()).await, [&own, &another].map(|of| certificate_pin(of.server()).unwrap()));
+    let ports = [port(&gateway, 1), port(&intruder, 0), port(&intruder, 1)];
+    let program = || {
+        let mut python = python();
+        python.env("PYTHONPATH", &library).arg("-B");
+        python.arg(repository("clients/python/tests/verify.py")).arg(&ca).args(&pins).args(&ports);
+        python
+    };
+    let to = gateway.local()[0].addr.port();
+    let said = scene.run_at(to, program()).await;
+    assert!(said.ends_with("all is well\n"), "{said}");
+    // The certificate is replaced, with another name, and clients go on with the file and the pin that they have.
+    let names = ["localhost", "127.0.0.1"].map(|name| name.parse().unwrap()).into();
+    let renewed = own.renewed(&names, now(), &mut rng).unwrap().unwrap();
+    gateway.show(renewed.certified_key().unwrap().into()).unwrap();
+    let said = scene.run_at(to, program()).await;
+    assert!(said.ends_with("all is well\n"), "{said}");
+}
+
+#[test]
+fn snippet_that_pins_is_the_one_in_the_documentation() {
+    let read = |file| std::fs::read_to_string(repository(file)).unwrap();
+    let program = read("clients/python/tests/verify.py");
+    let (_, rest) = program.split_once("# snippet begin\n").unwrap();
+    let (snippet, _) = rest.split_once("# snippet end\n").unwrap();
+    let page = read("docs/how-to/verify-a-gateway.md");
+    assert!(page.contains(snippet), "docs/how-to/verify-a-gateway.md has another snippet");
 }

@@ -5,29 +5,29 @@
 //! like any program, so shares and uses apply to its topics as well.
 
 pub(crate) mod access;
+pub(crate) mod certificate;
 mod network;
 
-use std::fs;
-use std::io;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
-use rustls::sign::CertifiedKey;
 use sgc_cdr::{Layout, TypeName};
 use sgc_config::{GatewayConfig, GatewayUrl};
 use sgc_gateway::{
     Access, Client, FindDefinitions, GatewayError, GatewayStatus, Hub, HubOptions, ListenAt, LocalRos,
-    NotListening, Server, ServerError, ServerOptions, Session, SessionLimits, TlsError, Types, certified_key,
+    NotListening, Server, ServerError, ServerOptions, Session, SessionLimits, ShownCertificate, TlsKeys,
+    Types,
 };
 use sgc_ros::{Reach, RosError};
 use sgc_sync::lock;
-use sgc_trust::{Identity, TrustAnchors};
+use sgc_trust::{Identity, ServerCertificate, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
+use sgc_wire::UnixMillis;
 use tokio::sync::OnceCell;
-use zeroize::Zeroizing;
+use tracing::{info, warn};
 
+use self::certificate::{GatewayCertificateError, ShownKey};
 use self::network::{GatewayNetwork, HubNetwork};
 use crate::control::faults::alerts::Alert;
 
@@ -57,7 +57,10 @@ impl FindDefinitions for NodeDefinitions {
 pub(crate) struct Sockets {
     pub(crate) listen: Vec<ListenAt>,
     pub(crate) access: Access,
-    pub(crate) key: ShownKey,
+    /// The certificate for programs; `None` if no address has TLS.
+    pub(crate) key: Option<ShownKey>,
+    /// The node, whose certificate members of its fleet may ask for.
+    pub(crate) identity: Arc<Identity>,
     pub(crate) clients_max: usize,
     pub(crate) client_bytes_max: usize,
 }
@@ -77,8 +80,8 @@ pub(crate) struct Gateway {
     server: Mutex<Option<Arc<Server>>>,
     /// Held while the shown certificates change, so that a reload does not undo a renewal.
     showing: Mutex<()>,
-    /// Whether the shown certificate is the node's own, not one of the configuration.
-    shows_own: AtomicBool,
+    /// The gateway's own certificate, if there is no state directory to keep it in.
+    unkept: Mutex<Option<ServerCertificate>>,
 }
 
 impl Gateway {
@@ -91,10 +94,10 @@ impl Gateway {
         let node = NODE_PREFIX.chars().chain(node_name.chars().map(fits)).collect();
         let definitions = Arc::new(definitions);
         let (hub, server) = (OnceCell::new(), Mutex::default());
-        let (name, showing, shows_own) = (node_name.to_owned(), Mutex::default(), AtomicBool::default());
+        let (name, showing, unkept) = (node_name.to_owned(), Mutex::default(), Mutex::default());
         let open = Mutex::new(open);
         let network = Mutex::default();
-        Arc::new(Self { open, definitions, name, node, hub, network, server, showing, shows_own })
+        Arc::new(Self { open, definitions, name, node, hub, network, server, showing, unkept })
     }
 
     /// Sets how to open a local network that the node joined after its start.
@@ -171,15 +174,12 @@ impl Gateway {
     pub(crate) async fn listen(&self, sockets: Sockets) -> Result<(), GatewayStartError> {
         let limits =
             SessionLimits { waiting_bytes_max: sockets.client_bytes_max, ..SessionLimits::default() };
-        let Sockets { listen, access, key, clients_max, .. } = sockets;
+        let Sockets { listen, access, key, identity, clients_max, .. } = sockets;
         let name = format!("sgc {}", self.name);
-        let key = {
-            let _showing = self.lock_showing();
-            self.shows_own.store(matches!(key, ShownKey::Own(_)), Ordering::Relaxed);
-            key.certified()
-        };
-        let options = ServerOptions { name, listen, access, key: Some(key), clients_max, limits };
+        let keys = key.map(|key| tls_keys(&key, &identity));
+        let options = ServerOptions { name, listen, access, keys, clients_max, limits };
         let server = Server::start(self.hub().await?.clone(), options).await?;
+        log_shown(&server);
         *self.lock() = Some(Arc::new(server));
         Ok(())
     }
@@ -211,22 +211,68 @@ impl Gateway {
         not_listening.into_iter().map(alert).collect()
     }
 
-    /// Replaces the rules and the certificate. Returns `true` if the certificate changed. `key` is called at the moment
-    /// of replacement.
+    /// Returns the certificate for programs of this configuration; `None` if no address has TLS. Blocks.
+    pub(crate) fn shown_key(
+        &self,
+        config: &GatewayConfig,
+        state: Option<&Path>,
+        now: UnixMillis,
+    ) -> Result<Option<ShownKey>, GatewayCertificateError> {
+        if !certificate::uses_tls(config) {
+            return Ok(None);
+        }
+        if let Some(tls) = &config.tls {
+            return Ok(Some(ShownKey::Files(certificate::key_of_files(tls)?)));
+        }
+        let names = certificate::wanted_names(config);
+        let Some(state) = state else {
+            let mut unkept = lock(&self.unkept);
+            if unkept.is_none() {
+                warn!(
+                    "the gateway's own certificate is not kept, since there is no state directory: its pin changes at each \
+                     start; set `state` in [node]"
+                );
+            }
+            let (own, _) = certificate::current(unkept.take(), &names, now)?;
+            let key = own.certified_key()?;
+            *unkept = Some(own);
+            return Ok(Some(ShownKey::Own(key)));
+        };
+        Ok(Some(ShownKey::Own(certificate::kept(&names, state, now)?.certified_key()?)))
+    }
+
+    /// Replaces the rules and the certificate for programs. Returns `true` if the certificate changed. `identity` is
+    /// called at the moment of replacement. Without a key, the certificates stay, since addresses that close later may
+    /// need them.
     pub(crate) fn reconfigure(
         &self,
         access: Access,
-        key: impl FnOnce() -> ShownKey,
+        key: Option<&ShownKey>,
+        identity: impl FnOnce() -> Arc<Identity>,
     ) -> Result<bool, ServerError> {
         let Some(server) = self.server() else { return Ok(false) };
         let _showing = self.lock_showing();
         let before = server.shown();
-        let key = key();
-        let shows_own = matches!(key, ShownKey::Own(_));
-        let key = key.certified();
-        server.reconfigure(access, Some(&key))?;
-        self.shows_own.store(shows_own, Ordering::Relaxed);
-        Ok(server.shown() != before)
+        let keys = key.map(|key| tls_keys(key, &identity()));
+        server.reconfigure(access, keys.or_else(|| server.keys()))?;
+        let is_another = server.shown() != before;
+        if is_another {
+            log_shown(&server);
+        }
+        Ok(is_another)
+    }
+
+    /// Shows this certificate to programs that connect from now on, if it is another.
+    pub(crate) fn show(&self, key: &ShownKey) -> Result<(), ServerError> {
+        let Some(server) = self.server() else { return Ok(()) };
+        let _showing = self.lock_showing();
+        if server.shown() == key.certified().cert {
+            return Ok(());
+        }
+        let node = server.keys().and_then(|keys| keys.node);
+        server.show(TlsKeys { shown: key.certified().clone(), node })?;
+        log_shown(&server);
+        Ok(())
     }
 
     /// Changes the number of clients that may be connected at once.
@@ -236,16 +282,14 @@ impl Gateway {
         }
     }
 
-    /// Shows the node's renewed certificate to new connections, unless the configuration names another.
+    /// Shows the node's renewed certificate to members of its fleet that connect from now on.
     pub(crate) fn set_identity(&self, identity: &Identity) {
         let Some(server) = self.server() else { return };
         let _showing = self.lock_showing();
         server.set_gateway(identity.as_peer().clone());
-        if !self.shows_own.load(Ordering::Relaxed) {
-            return;
-        }
-        if let Err(error) = server.show(&identity.certified_key()) {
-            tracing::warn!(%error, "the gateway cannot show the renewed certificate");
+        let Some(keys) = server.keys() else { return };
+        if let Err(error) = server.show(TlsKeys { node: Some(identity.certified_key()), ..keys }) {
+            warn!(%error, "the gateway cannot show the renewed certificate");
         }
     }
 
@@ -291,51 +335,25 @@ pub enum GatewayStartError {
     /// The sockets cannot be opened.
     #[error(transparent)]
     Server(#[from] ServerError),
-    /// The certificate or key file cannot be read.
-    #[error("the gateway's {}: {source}", path.display())]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// The error of the operating system.
-        source: io::Error,
-    },
-    /// TLS cannot use the certificate or key.
-    #[error("the gateway's {}: {source}", path.display())]
-    Certificate {
-        /// The certificate.
-        path: PathBuf,
-        /// The fault.
-        source: TlsError,
-    },
+    /// There is no certificate for TLS.
+    #[error(transparent)]
+    Certificate(#[from] GatewayCertificateError),
 }
 
-/// The certificate that the gateway shows within TLS.
-pub(crate) enum ShownKey {
-    /// The certificate that the configuration names.
-    Files(Arc<CertifiedKey>),
-    /// The certificate of the node itself.
-    Own(Arc<Identity>),
+/// Returns the certificates of a gateway: the one for programs, and that of the node.
+fn tls_keys(key: &ShownKey, identity: &Identity) -> TlsKeys {
+    TlsKeys { shown: key.certified().clone(), node: Some(identity.certified_key()) }
 }
 
-impl ShownKey {
-    fn certified(self) -> Arc<CertifiedKey> {
-        match self {
-            Self::Files(key) => key,
-            Self::Own(identity) => identity.certified_key(),
-        }
+/// Logs the certificate for programs, if there is one.
+fn log_shown(server: &Server) {
+    let shown = server.shown();
+    if let Some(ShownCertificate { pin, names, until }) =
+        shown.first().and_then(|leaf| ShownCertificate::of(leaf))
+    {
+        let until = UnixMillis(until);
+        info!("programs are shown a certificate with the pin {pin} for {}, until {until}", names.join(", "));
     }
-}
-
-/// Reads the certificate and key that the configuration names; `None` if the node's own are shown.
-pub(crate) fn key_of_files(config: &GatewayConfig) -> Result<Option<Arc<CertifiedKey>>, GatewayStartError> {
-    let Some(tls) = &config.tls else { return Ok(None) };
-    let read = |path: &Path| {
-        fs::read(path).map_err(|source| GatewayStartError::File { path: path.to_owned(), source })
-    };
-    let (certificate, key) = (read(&tls.certificate)?, Zeroizing::new(read(&tls.key)?));
-    let key = certified_key(&certificate, &key)
-        .map_err(|source| GatewayStartError::Certificate { path: tls.certificate.clone(), source })?;
-    Ok(Some(key))
 }
 
 /// Returns the listen addresses in the form of `sgc-gateway`.
@@ -352,14 +370,14 @@ pub(crate) fn listen_at(config: &GatewayConfig) -> Vec<ListenAt> {
 mod tests {
     use rand_chacha::ChaCha20Rng;
     use rand_chacha::rand_core::SeedableRng as _;
+    use rustls_pki_types::CertificateDer;
     use sgc_gateway::{LocalReader, Protocol, ShippedDefinitions};
     use sgc_ros::{
         DiscoveryHandler, EndpointSpec, GraphNode, RequestHandler, RosClient, RosServer, RosWriter,
         SampleHandler, ServiceSpec,
     };
     use sgc_testkit::FakeDomain;
-    use sgc_trust::{EnrollRequest, Fleet};
-    use sgc_wire::UnixMillis;
+    use sgc_trust::{EnrollRequest, Fleet, certificate_pin};
 
     use super::*;
 
@@ -427,38 +445,87 @@ mod tests {
         gateway.stop().await;
     }
 
-    #[tokio::test]
-    async fn a_renewed_certificate_is_shown_and_a_reload_does_not_undo_it() {
-        let (rng, now) = (&mut ChaCha20Rng::seed_from_u64(8), UnixMillis(1_795_000_000_000));
-        let mut fleet = Fleet::create("lab".parse().unwrap(), now, rng).unwrap();
-        let mut enroll = |name: &str| {
-            Arc::new(fleet.enroll(&EnrollRequest::new(name.parse().unwrap(), now), rng).unwrap())
-        };
-        let (first, renewed, file) = (enroll("one"), enroll("two"), enroll("file"));
+    /// A gateway of this network.
+    fn gateway() -> Arc<Gateway> {
         let domain = FakeDomain::default();
         let open: OpenLocalRos = Arc::new(move || Ok(Arc::new(domain.join(false)) as Arc<dyn LocalRos>));
-        let gateway = Gateway::new(Some(open), "arm-1", ShippedDefinitions);
+        Gateway::new(Some(open), "arm-1", ShippedDefinitions)
+    }
+
+    fn sockets(key: Option<ShownKey>, identity: &Arc<Identity>) -> Sockets {
         let at =
             ListenAt { protocol: Protocol::WebSocket, is_encrypted: true, addr: ([127, 0, 0, 1], 0).into() };
-        let sockets = Sockets {
+        Sockets {
             listen: vec![at],
             access: Access::default(),
-            key: ShownKey::Own(Arc::clone(&first)),
+            key,
+            identity: Arc::clone(identity),
             clients_max: 8,
             client_bytes_max: 1 << 20,
+        }
+    }
+
+    const NOW: UnixMillis = UnixMillis(1_795_000_000_000);
+
+    fn enroll<const N: usize>(names: [&str; N]) -> [Arc<Identity>; N] {
+        let rng = &mut ChaCha20Rng::seed_from_u64(8);
+        let mut fleet = Fleet::create("lab".parse().unwrap(), NOW, rng).unwrap();
+        names
+            .map(|name| Arc::new(fleet.enroll(&EnrollRequest::new(name.parse().unwrap(), NOW), rng).unwrap()))
+    }
+
+    #[tokio::test]
+    async fn a_renewed_certificate_is_shown_and_a_reload_does_not_undo_it() {
+        let [first, renewed, file] = enroll(["one", "two", "file"]);
+        let gateway = gateway();
+        let config = |names: &str| {
+            let text = format!(
+                "identity = 'x'\n[node]\nrouters = ['quic://r']\n[gateway]\nlisten = ['wss://127.0.0.1']\nnames = [{names}]"
+            );
+            let config = sgc_config::parse(&text, "node.toml", Path::new("/"), &|_| None);
+            config.unwrap().gateway.unwrap()
         };
-        gateway.listen(sockets).await.unwrap();
-        let shown = || gateway.server().unwrap().shown();
-        assert_eq!(shown(), first.chain());
+        let dir = tempfile::tempdir().unwrap();
+        let key = |names: &str| gateway.shown_key(&config(names), Some(dir.path()), NOW).unwrap().unwrap();
+        let own = key("");
+        gateway.listen(sockets(Some(own.clone()), &first)).await.unwrap();
+        let server = gateway.server().unwrap();
+        let of_node = || server.keys().unwrap().node.unwrap().cert.clone();
+        assert_eq!((server.shown(), of_node()), (own.certified().cert.clone(), first.chain().to_vec()));
         gateway.set_identity(&renewed);
-        assert_eq!(shown(), renewed.chain());
-        let reload = |key: ShownKey| gateway.reconfigure(Access::default(), || key).unwrap();
-        assert!(!reload(ShownKey::Own(Arc::clone(&renewed))), "it is the same");
-        // The node's certificate is not shown if the configuration names another one.
-        assert!(reload(ShownKey::Files(file.certified_key())));
+        assert_eq!((server.shown(), of_node()), (own.certified().cert.clone(), renewed.chain().to_vec()));
+        let reload = |key: Option<&ShownKey>| {
+            gateway.reconfigure(Access::default(), key, || Arc::clone(&renewed)).unwrap()
+        };
+        assert!(!reload(Some(&key(""))), "it is the same");
+        assert_eq!(of_node(), renewed.chain());
+        let named = key("'robot.example'");
+        assert!(reload(Some(&named)));
+        assert_eq!(server.shown(), named.certified().cert);
+        let files = ShownKey::Files(file.certified_key());
+        assert!(reload(Some(&files)));
         gateway.set_identity(&first);
-        assert_eq!(shown(), file.chain());
-        assert!(reload(ShownKey::Own(first)));
+        assert_eq!((server.shown(), of_node()), (file.chain().to_vec(), first.chain().to_vec()));
+        assert!(!reload(None), "the addresses with TLS close after the rules change");
+        gateway.show(&named).unwrap();
+        assert_eq!((server.shown(), of_node()), (named.certified().cert.clone(), first.chain().to_vec()));
         gateway.stop().await;
+    }
+
+    #[test]
+    fn certificate_without_a_state_directory_lasts_as_long_as_the_node() {
+        let gateway = gateway();
+        let config =
+            GatewayConfig { listen: vec!["wss://127.0.0.1".parse().unwrap()], ..GatewayConfig::default() };
+        let shown = |gateway: &Gateway, now| {
+            let key = gateway.shown_key(&config, None, now).unwrap().unwrap();
+            key.certified().cert.clone()
+        };
+        let first = shown(&gateway, NOW);
+        assert_eq!(shown(&gateway, NOW), first);
+        let later = shown(&gateway, UnixMillis(NOW.0 + 300 * 86_400_000));
+        let pin = |chain: &[CertificateDer<'_>]| certificate_pin(&chain[0]).unwrap();
+        assert!(later != first && pin(&later) == pin(&first));
+        assert!(gateway.shown_key(&GatewayConfig::default(), None, NOW).unwrap().is_none());
     }
 }

@@ -33,7 +33,8 @@ use crate::data::sinks::SinkRequest;
 use crate::data::writer_queue::start_workers;
 use crate::discovery::{Board, is_over_udp};
 use crate::gateway::access::{access_with, refused_tokens};
-use crate::gateway::{Gateway, NodeDefinitions, OpenLocalRos, ShownKey, Sockets, key_of_files, listen_at};
+use crate::gateway::certificate::gateway_expiry_warning;
+use crate::gateway::{Gateway, GatewayStartError, NodeDefinitions, OpenLocalRos, Sockets, listen_at};
 use crate::local::network_slot::NetworkSlot;
 use crate::metrics::Metrics;
 use crate::node::error::NodeError;
@@ -308,7 +309,7 @@ impl Machines {
 
 /// Opens the sockets of the gateway, if the configuration has one.
 pub(crate) async fn listen_for_clients(
-    gateway: &Gateway,
+    gateway: &Arc<Gateway>,
     config: &Config,
     identity: &Arc<Identity>,
     rules: &Rules,
@@ -317,15 +318,22 @@ pub(crate) async fn listen_for_clients(
 ) -> Result<(), NodeError> {
     let Some(wanted) = &config.gateway else { return Ok(()) };
     wanted.warnings().iter().for_each(|warning| warn!("{warning}"));
+    let (maker, of_key, dir) = (Arc::clone(gateway), wanted.clone(), state.map(Path::to_owned));
+    let make = move || {
+        if let Some(warning) = gateway_expiry_warning(&of_key, now().unix) {
+            warn!("{warning}");
+        }
+        maker.shown_key(&of_key, dir.as_deref(), now().unix)
+    };
+    let key = tokio::task::spawn_blocking(make).await.map_err(|_| NodeError::Panicked)?;
+    let key = key.map_err(GatewayStartError::from)?;
     let access = access_with(config, identity, &rules.partners, state, now())?;
     gateway
         .listen(Sockets {
             listen: listen_at(wanted),
             access: access.unwrap_or_default().with_refusal_listener(refused_tokens(audit.clone())),
-            key: match key_of_files(wanted)? {
-                Some(key) => ShownKey::Files(key),
-                None => ShownKey::Own(identity.clone()),
-            },
+            key,
+            identity: identity.clone(),
             clients_max: wanted.clients_max,
             client_bytes_max: wanted.client_bytes_max.try_into().unwrap_or(usize::MAX),
         })

@@ -7,7 +7,7 @@ pub(crate) mod error;
 pub(crate) mod identity;
 mod local;
 mod options;
-mod random;
+pub(crate) mod random;
 mod spawn;
 
 use std::sync::Arc;

@@ -6,7 +6,7 @@ use rand_core::{OsRng, SeedableRng, TryRngCore};
 use crate::node::error::NodeError;
 
 /// Returns a generator that the system seeds.
-pub(super) fn system_rng() -> Result<ChaCha20Rng, NodeError> {
+pub(crate) fn system_rng() -> Result<ChaCha20Rng, NodeError> {
     let mut seed = [0; 32];
     OsRng.try_fill_bytes(&mut seed).map_err(|e| NodeError::Randomness(e.to_string()))?;
     Ok(ChaCha20Rng::from_seed(seed))

@@ -125,6 +125,8 @@ pub(super) async fn spawn<N: RosNetwork>(
         changed: Notify::new(),
     });
     tasks.extend(reload_tasks(&reloader, options.reload, file_watch));
+    let (renewer, changes) = (reloader.clone(), keeper.network.onward());
+    tasks.push(tokio::spawn(async move { renewer.watch_gateway_certificate(changes).await }));
     tasks.extend(options.watchdog.map(|watchdog| tokio::spawn(keep_fed(watchdog, events.clone()))));
     let desk = Desk { events: events.clone(), reloader: reloader.clone(), gateway: gateway.clone(), metrics };
     let socket = admin::begin(socket, desk);

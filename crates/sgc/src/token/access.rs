@@ -17,6 +17,7 @@ use sgc_wire::UnixMillis;
 
 use super::open;
 use crate::error::CliError;
+use crate::gateway::{self, Reach};
 use crate::{files, output, reload};
 
 /// Number of digits of an id that a list shows.
@@ -143,8 +144,13 @@ fn create(args: &CreateArgs) -> Result<(), CliError> {
         grant.scope,
         identity.node_name()
     ));
-    if config.gateway.is_none() {
-        output::diagnostic("This configuration has no [gateway] yet, so there is nothing to connect to.");
+    // The token holds without it, so a broken certificate only costs the hint.
+    match gateway::reach(&config, &identity) {
+        Ok(None) => {
+            output::diagnostic("This configuration has no [gateway] yet, so there is nothing to connect to.")
+        }
+        Ok(Some((reach, _))) => output::diagnostic(&way_to(&reach)),
+        Err(error) => output::diagnostic(&format!("sgc: {error}")),
     }
     match &args.out {
         Some(path) => {
@@ -152,6 +158,18 @@ fn create(args: &CreateArgs) -> Result<(), CliError> {
             Ok(files::write_secret(path, &text, files::Existing::Keep(""))?)
         }
         None => output::line(token.to_text().as_str()),
+    }
+}
+
+/// Says where programs connect, and how they verify the gateway.
+fn way_to(reach: &Reach) -> String {
+    let at = format!("To connect: {}", reach.urls.join(" or "));
+    match &reach.shown {
+        Some(shown) => format!(
+            "{at}\nThe gateway's pin: {} (`sgc gateway certificate --pem` prints the certificate to trust)",
+            shown.pin
+        ),
+        None => at,
     }
 }
 

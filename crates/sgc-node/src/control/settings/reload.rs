@@ -9,7 +9,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use rustls::sign::CertifiedKey;
 use rustls_pki_types::CertificateDer;
 use serde::Serialize;
 use sgc_config::{Config, ConfigErrors, GatewayConfig, RosConfig};
@@ -27,7 +26,9 @@ use crate::control::settings::rules::Rules;
 use crate::data::sending::message_keys::{MessageKeys, make_for};
 use crate::discovery::{Searches, WantedRouters};
 use crate::gateway::access::access_with;
-use crate::gateway::{Gateway, ShownKey, key_of_files, listen_at};
+use crate::gateway::certificate::ShownKey;
+use crate::gateway::{Gateway, GatewayStartError, listen_at};
+use crate::link::roaming::Network;
 use crate::local::network_slot::JoinNetwork;
 use crate::metrics::Metrics;
 use crate::node::build::listen_for_clients;
@@ -41,6 +42,9 @@ pub type ConfigSource = Arc<dyn Fn() -> Result<Config, ConfigErrors> + Send + Sy
 
 /// Longest wait before expired tokens are searched again, so that setting the wall clock keeps no token in force.
 const EXPIRY_CHECK_MAX: Duration = Duration::from_secs(60);
+
+/// Interval between looks at the gateway's own certificate, whether it ends soon.
+const CERTIFICATE_CHECK: Duration = Duration::from_secs(600);
 
 /// Result of a reload.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
@@ -89,11 +93,11 @@ struct PreparedReload {
     /// New trust anchors; `None` if they are unchanged.
     anchors: Option<TrustAnchors>,
     message_keys: MessageKeys,
-    /// The gateway's access rules, and its certificate if that is not the node's own; `None` without a gateway.
-    gateway: Option<(Access, Option<Arc<CertifiedKey>>)>,
+    /// The gateway's access rules, and its certificate for programs if an address has TLS; `None` without a gateway.
+    gateway: Option<(Access, Option<ShownKey>)>,
 }
 
-/// Whether a reload looks at the identity file.
+/// Whether a reload looks at the identity file and at the gateway's certificate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum ReadIdentity {
     /// A user, or a change of a file, asks for the reload.
@@ -216,8 +220,8 @@ impl Reloader {
         self.credentials.set_admitted(rules.partners.admitted.clone());
         self.reconfigure(&rules, identity, anchors, message_keys).await?;
         // The control task has the newest revocation lists.
-        if let Some((access, files)) = gateway.filter(|_| running.config.gateway.is_some()) {
-            match self.reconfigure_gateway(running, &config, access, files) {
+        if let Some((access, key)) = gateway.filter(|_| running.config.gateway.is_some()) {
+            match self.reconfigure_gateway(running, &config, access, key.as_ref()) {
                 Ok(changed) => report.changed.extend(changed),
                 Err(error) => {
                     report.needs_restart.push(format!("who may connect to the gateway is as it was: {error}"))
@@ -276,6 +280,7 @@ impl Reloader {
         let (wanted, suites) = (config.clone(), running.suites.clone());
         let file = running.config.identity.clone();
         let trusted = running.rules.partners.certificates.clone();
+        let of_gateway = self.gateway.clone();
         let prepare = tokio::task::spawn_blocking(move || -> Result<PreparedReload, NodeError> {
             let found = match reads {
                 ReadIdentity::Yes => FileIdentity::read(&file, &identity),
@@ -302,7 +307,16 @@ impl Reloader {
             let message_keys = make_for(&rules.shares, |suite| suites.contains(&suite));
             let access = access_with(&wanted, &identity, &rules.partners, state.as_deref(), now())?;
             let gateway = match access.zip(wanted.gateway.as_ref()) {
-                Some((access, gateway)) => Some((access, key_of_files(gateway)?)),
+                Some((access, gateway)) => {
+                    let key = match reads {
+                        ReadIdentity::Yes => of_gateway
+                            .shown_key(gateway, state.as_deref(), now().unix)
+                            .map_err(GatewayStartError::from)?,
+                        // The present certificates stay.
+                        ReadIdentity::No => None,
+                    };
+                    Some((access, key))
+                }
                 None => None,
             };
             Ok(PreparedReload { rules, identity: found, anchors, message_keys, gateway })
@@ -374,15 +388,12 @@ impl Reloader {
         running: &Running,
         config: &Config,
         access: Access,
-        files: Option<Arc<CertifiedKey>>,
+        key: Option<&ShownKey>,
     ) -> Result<Vec<String>, String> {
         let mut changed = Vec::new();
         let access = access.with_anchors(TrustAnchors::clone(&self.credentials.anchors()));
-        let key = || match files {
-            Some(key) => ShownKey::Files(key),
-            None => ShownKey::Own(self.credentials.identity()),
-        };
-        if self.gateway.reconfigure(access, key).map_err(|error| error.to_string())? {
+        let identity = || self.credentials.identity();
+        if self.gateway.reconfigure(access, key, identity).map_err(|error| error.to_string())? {
             changed.push("who connects to the gateway is shown another certificate".to_owned());
         }
         if let Some((before, after)) = running.config.gateway.as_ref().zip(config.gateway.as_ref())
@@ -395,6 +406,38 @@ impl Reloader {
             changed.push("who may connect to the gateway changed".to_owned());
         }
         Ok(changed)
+    }
+
+    /// Renews the gateway's own certificate before it ends, and when the addresses of this host change. Never returns.
+    pub(crate) async fn watch_gateway_certificate(&self, mut network: Network) {
+        let mut failure = None;
+        loop {
+            tokio::select! {
+                () = tokio::time::sleep(CERTIFICATE_CHECK) => {}
+                () = network.changed() => {}
+            }
+            let failed = self.renew_gateway_certificate().await.err();
+            if let Some(error) = failed.as_ref().filter(|_| failed != failure) {
+                warn!("{error}; the gateway goes on with the certificate that it has");
+            }
+            failure = failed;
+        }
+    }
+
+    async fn renew_gateway_certificate(&self) -> Result<(), String> {
+        // A reload must not run meanwhile, since it shows a certificate, too.
+        let running = self.running.lock().await;
+        let own = running.config.gateway.clone().filter(|gateway| gateway.tls.is_none());
+        let Some(config) = own else { return Ok(()) };
+        let (gateway, state) = (self.gateway.clone(), self.state.clone());
+        let make = move || match gateway.shown_key(&config, state.as_deref(), now().unix) {
+            Ok(Some(key)) => gateway.show(&key).map_err(|error| error.to_string()),
+            Ok(None) => Ok(()),
+            Err(error) => Err(error.to_string()),
+        };
+        tokio::task::spawn_blocking(make)
+            .await
+            .map_err(|_| "making a certificate ended in a panic".to_owned())?
     }
 
     /// Removes expired tokens from the policies. Never returns.
@@ -447,8 +490,8 @@ fn merged(before: Config, read: Config) -> Config {
 
 /// Returns the part of a gateway's configuration that decides who may connect.
 fn access_part(gateway: &GatewayConfig) -> GatewayConfig {
-    let GatewayConfig { clients_max, client_bytes_max, listen, .. } = GatewayConfig::default();
-    GatewayConfig { clients_max, client_bytes_max, listen, ..gateway.clone() }
+    let GatewayConfig { clients_max, client_bytes_max, listen, names, .. } = GatewayConfig::default();
+    GatewayConfig { clients_max, client_bytes_max, listen, names, ..gateway.clone() }
 }
 
 /// Returns the gateway's configuration after a reload, with the bound of buffers that sessions have.
