@@ -148,10 +148,9 @@ def by_pin_and_websocket(pin: str, port: int, other: int, token: str) -> None:
 def main(ca: str, pin: str, other_pin: str, wss: str, other: str, other_wss: str, port: str, token: str) -> None:
     by_grpc(ca, pin, other_pin, int(port), int(other), token)
     by_pin_and_websocket(pin, int(wss), int(other_wss), token)
-    # A process of roslibpy has one transport.
-    for transport in ("twisted", "asyncio"):
-        environment = {**os.environ, "SSL_CERT_FILE": ca, "ROSLIBPY_TRANSPORT": transport}
-        subprocess.run([sys.executable, "-B", __file__, "roslibpy", wss, other_wss, token], env=environment, check=True)
+    # roslibpy's other transport, Twisted, verifies no server.
+    environment = {**os.environ, "SSL_CERT_FILE": ca, "ROSLIBPY_TRANSPORT": "asyncio"}
+    subprocess.run([sys.executable, "-B", __file__, "roslibpy", wss, other_wss, token], env=environment, check=True)
     print("all is well", flush=True)
 
 
