@@ -415,7 +415,7 @@ fn gateway_certificate_is_made_before_the_first_start_and_follows_its_names() {
     let port = free.local_addr().unwrap().port();
     drop(free);
     let with = |more: &str| {
-        place.write("arm-1.toml", &format!("{base}\n[gateway]\nlisten = ['wss://0.0.0.0:{port}']\n{more}"));
+        place.write("arm-1.toml", &format!("{base}\n[gateway]\nlisten = ['wss://127.0.0.1:{port}']\n{more}"));
     };
     with("names = ['robot.example']");
     let trusted = place.good(&certificate(&["--pem"]));
@@ -423,13 +423,13 @@ fn gateway_certificate_is_made_before_the_first_start_and_follows_its_names() {
     assert!(!trusted.contains("PRIVATE"), "{trusted}");
     let json = || -> Value { serde_json::from_str(&place.good(&certificate(&["--json"]))).unwrap() };
     let first = json();
-    assert_eq!(first["urls"], serde_json::json!([format!("wss://robot.example:{port}")]));
+    assert_eq!(first["urls"], serde_json::json!([format!("wss://127.0.0.1:{port}")]));
     assert_eq!((&first["own"], &first["pem"]), (&Value::Bool(true), &trusted.clone().into()));
     let pin = first["pin"].as_str().unwrap().to_owned();
     assert!(place.good(&certificate(&[])).contains(&pin));
     let create = ["token", "access", "create", "-c", "arm-1.toml", "--for", "x", "--subscribe", "/odom"];
     let hint = place.run(&create).stderr;
-    assert!(hint.contains(&pin) && hint.contains(&format!("wss://robot.example:{port}")), "{hint}");
+    assert!(hint.contains(&pin) && hint.contains(&format!("wss://127.0.0.1:{port}")), "{hint}");
 
     let node = place.start("arm-1.toml");
     let status = || -> Value {
