@@ -6,6 +6,7 @@ use std::time::Duration;
 use serde::Serialize;
 use sgc_diagnosis::fleet::{FaultOfNodes, FleetStatus};
 use sgc_diagnosis::refusals::drop_meaning;
+use sgc_diagnosis::rights::Recipients;
 use sgc_diagnosis::{Step, Verdict};
 
 /// The fleet as the page shows it.
@@ -21,6 +22,8 @@ pub(crate) struct FleetView<'a> {
     faults: Vec<FaultOfNodes>,
     /// Names of nodes by their ids, and whether they may route for others.
     known: &'a BTreeMap<String, (String, bool)>,
+    /// The members that rules permit.
+    recipients: Recipients,
     /// The meaning of each counter.
     meanings: BTreeMap<&'a str, String>,
 }
@@ -30,8 +33,8 @@ impl<'a> FleetView<'a> {
         let reports = fleet.nodes.iter().filter_map(|node| node.report.as_ref());
         let reasons = reports.flat_map(|report| report.drops.keys());
         let meanings = reasons.map(|reason| (reason.as_str(), drop_meaning(reason))).collect();
-        let (faults, known) = (fleet.attention(), fleet.known());
-        Self { seq, error, summary: fleet.summary(), fleet, faults, known, meanings }
+        let (faults, known, recipients) = (fleet.attention(), fleet.known(), fleet.recipients());
+        Self { seq, error, summary: fleet.summary(), fleet, faults, known, recipients, meanings }
     }
 }
 

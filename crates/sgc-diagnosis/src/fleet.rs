@@ -15,6 +15,7 @@ use sgc_wire::UnixMillis;
 use crate::ask::{answer, ask};
 use crate::error::DiagnosisError;
 use crate::refusals;
+use crate::rights::Recipients;
 use crate::status::duration;
 
 /// Longest time for the node here to ask others. It gives up earlier.
@@ -46,6 +47,9 @@ pub struct FleetStatus {
     /// All known nodes by their ids: the name, and whether the node routes for others.
     #[serde(skip)]
     known: BTreeMap<String, (String, bool)>,
+    /// All known nodes by name, also those that are not shown, as the fleet's authority or file knows them.
+    #[serde(skip)]
+    members: BTreeMap<String, Option<ReportMember>>,
     /// The newest generation of the fleet's secret that a member was given.
     #[serde(skip)]
     generation: Option<u32>,
@@ -149,9 +153,10 @@ impl FleetStatus {
         let links = nodes.values().filter_map(|node| node.report.as_ref()).flat_map(|report| &report.links);
         let linked = links.filter(|link| !link.silent).map(|link| link.peer.clone()).collect();
         let generation = nodes.values().filter_map(|node| Some(node.member.as_ref()?.generation)).max();
+        let members = nodes.values().map(|node| (node.name.clone(), node.member.clone())).collect();
         let is_shown = |node: &FleetNode| named.is_empty() || named.contains(&node.name);
         let nodes = nodes.into_values().filter(is_shown).collect();
-        Self { time_ms: now.0, nodes, members_omitted: 0, known, generation, linked }
+        Self { time_ms: now.0, nodes, members_omitted: 0, known, members, generation, linked }
     }
 
     /// Returns the overview: a row for each node, then what needs attention. `before` is an earlier look, from which
@@ -190,6 +195,14 @@ impl FleetStatus {
     /// Returns all known nodes by their ids: the name, and whether the node may route for others.
     pub fn known(&self) -> &BTreeMap<String, (String, bool)> {
         &self.known
+    }
+
+    /// Returns the members that the rules of all nodes permit.
+    pub fn recipients(&self) -> Recipients {
+        let nodes = self.members.iter().map(|(name, member)| (name.as_str(), member.as_ref()));
+        let is_complete = self.members_omitted == 0 && self.members.values().any(Option::is_some);
+        let reports = self.nodes.iter().filter_map(|node| node.report.as_ref());
+        Recipients::new(nodes, is_complete, reports.filter_map(|report| report.rights.as_ref()))
     }
 
     fn attention_lines(&self) -> Vec<String> {
@@ -235,6 +248,16 @@ impl FleetStatus {
         let topics = report.topics.iter().map(topic_row).collect();
         let head = ["", "topic", "type", "owner", "messages", "state"];
         section("Topics", &head, topics, report.topics_omitted);
+        if let Some(rights) = &report.rights {
+            let recipients = self.recipients();
+            let rows = rights.rules.iter().map(|rule| recipients.row(rule)).collect();
+            section(
+                "Rights",
+                &["shared", "may subscribe or call", "may publish"],
+                rows,
+                rights.rules_omitted,
+            );
+        }
         let counts = |counts: &BTreeMap<String, u64>, meaning: fn(&str) -> String| {
             counts.iter().map(|(key, n)| vec![key.clone(), n.to_string(), meaning(key)]).collect()
         };
@@ -485,7 +508,7 @@ fn topic_row(topic: &ReportTopic) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use sgc_node::admin::report::ReportRouter;
+    use sgc_node::admin::report::{ReportRights, ReportRouter, ReportRule};
     use sgc_node::alerts::Alert;
 
     use super::*;
@@ -681,6 +704,30 @@ mod tests {
         };
         assert!(lines.iter().any(|line| line.ends_with("messages/s")), "{lines:#?}");
         assert_eq!((last("arm"), last("desk")), ("10.0".into(), "–".into()));
+    }
+
+    #[test]
+    fn details_of_one_node_mark_recipients_by_all_members() {
+        let mut arm = report("arm", &[]);
+        let rule = ReportRule {
+            kind: "topic".into(),
+            interface: "/odom".into(),
+            to: ["desk", "stolen", "ghost"].map(str::to_owned).into(),
+            ..ReportRule::default()
+        };
+        arm.rights = Some(ReportRights { rules: vec![rule], rules_omitted: 7, ..ReportRights::default() });
+        let members = ["arm", "desk"].map(|name| member(name, name, false)).into();
+        let named = ["arm".to_owned()];
+        let mut fleet = FleetStatus::new(UnixMillis(NOW), members, vec![answer_of(arm)], &named);
+        let lines = fleet.details(&fleet.nodes[0]).join("\n");
+        assert!(
+            lines.contains("/odom   desk, stolen (no member has this name), ghost (no member"),
+            "{lines}"
+        );
+        assert!(lines.contains("and 7 more"), "{lines}");
+        fleet.members_omitted = 1;
+        let lines = fleet.details(&fleet.nodes[0]).join("\n");
+        assert!(lines.contains("ghost (it is not among the members that are known here)"), "{lines}");
     }
 
     #[test]

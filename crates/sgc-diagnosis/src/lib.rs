@@ -2,8 +2,7 @@
 //!
 //! [`diagnose`] follows the path of a topic in a node's graph up to the first fault, and finds facts without words,
 //! which `words` renders. [`refusals`] explains counters, [`status`] a node's status, [`fleet`] those of all
-//! nodes, and [`check`] a configuration. Of
-//! these, only [`ask`] talks to nodes. The crate parses no arguments, prints nothing and knows no exit codes; `sgc`
+//! nodes, [`rights`] the members that rules permit, and [`check`] a configuration. Of these, only [`ask`] talks to nodes. The crate parses no arguments, prints nothing and knows no exit codes; `sgc`
 //! does.
 
 pub mod ask;
@@ -15,6 +14,7 @@ pub mod fleet;
 pub mod names;
 mod near;
 pub mod refusals;
+pub mod rights;
 pub mod status;
 mod step;
 #[cfg(test)]

@@ -107,6 +107,42 @@ fn observer_learns_from_the_authority_who_is_there_and_from_each_node_how_it_is_
     assert_eq!(report_of(&desk, "robot").topics.len(), 0);
 }
 
+/// Returns the recipients of a report's first rule, the observers and the operators.
+fn rights_of(asker: &Node, node: &str) -> [Vec<String>; 3] {
+    let rights = report_of(asker, node).rights.unwrap();
+    let to = rights.rules.first().map(|rule| rule.to.clone()).unwrap_or_default();
+    [to, rights.observers, rights.operators]
+}
+
+#[test]
+fn observer_learns_the_rights_that_a_configuration_gives_and_a_reload_changes_them() {
+    let lab = observed(&["robot"]);
+    let _cloud = lab.cloud();
+    let mut authority = AuthorityConfig::new(lab.fleet_file());
+    authority.operators = nodes(&["desk"]);
+    let _keeper = lab.start("keeper", |c| c.authority = Some(authority));
+    let robot = lab.start("robot", |c| {
+        let mut wanted = share("/chatter", &["desk", "ghost"]);
+        wanted.publish = vec![Recipient::Group("arms".parse().unwrap())];
+        c.shares = vec![wanted];
+    });
+    let desk = lab.start("desk", |_| {});
+    let words = |words: &[&str]| words.iter().map(|word| (*word).to_owned()).collect::<Vec<_>>();
+    let observers = || words(&["group:observers"]);
+    assert_eq!(rights_of(&desk, "robot"), [words(&["desk", "ghost"]), observers(), words(&[])]);
+    let rule = report_of(&desk, "robot").rights.unwrap().rules.remove(0);
+    assert_eq!((rule.kind.as_str(), rule.interface.as_str()), ("topic", "/chatter"));
+    assert_eq!((rule.publish, rule.tokens, rule.omitted), (words(&["group:arms"]), vec![], 0));
+    assert_eq!(rights_of(&desk, "keeper"), [words(&[]), observers(), words(&["desk"])]);
+    robot.reload(|c| {
+        c.shares = vec![share("/chatter", &["keeper"])];
+        c.observers = Some(nodes(&["desk", "keeper"]));
+    });
+    // A report is given again for half a second.
+    let changed = [words(&["keeper"]), words(&["desk", "keeper"]), words(&[])];
+    wait("the new rights are reported", || rights_of(&desk, "robot") == changed);
+}
+
 #[test]
 fn node_that_is_no_observer_learns_nothing_and_a_reload_decides_anew() {
     let lab = observed(&["robot", "guest"]);

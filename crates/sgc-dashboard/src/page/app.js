@@ -9,6 +9,9 @@ const AGAIN_MS = 2000;
 /** Longest wait for an answer, milliseconds. The server waits for the nodes, and asks them for at most 10 s. */
 const PATIENCE_MS = 20_000;
 const DAY_MS = 86_400_000;
+/** Most rows and columns of the matrix of rights at first; each press of its button adds as many rows. */
+const ROWS_MAX = 100;
+const COLUMNS_MAX = 60;
 /** Marks by state, so that color alone tells nothing. */
 const MARKS = { here: "●", fault: "▲", linked: "◌", absent: "○", revoked: "✕" };
 
@@ -368,6 +371,17 @@ const explain = async (node, topic) => {
   );
 };
 
+/** Returns recipients with the members for whom they stand. */
+const recipientsText = (words) => {
+  const text = (word) => {
+    const { members, doubt } = view.recipients.meanings[word] ?? { members: [] };
+    const names = members.map((at) => view.recipients.members[at]);
+    if (doubt) return `${word} (${doubtOf(word)})`;
+    return word.startsWith("group:") ? `${word} (${names.join(", ")})` : word;
+  };
+  return words.map(text).join(", ") || "nobody";
+};
+
 const showDetails = () => {
   const node = nodes().find((node) => node.name === selected);
   by("details").hidden = !node;
@@ -378,6 +392,8 @@ const showDetails = () => {
   const facts = [
     ["state", `${stateText(node)}${node.error ? `: ${node.error}` : ""}`],
     ["groups", member?.groups.join(", ") || "none"],
+    ["may ask how it is doing", report?.rights ? recipientsText(report.rights.observers) : "–"],
+    ...(report?.rights?.operators.length ? [["may change the fleet here", recipientsText(report.rights.operators)]] : []),
     ["certificate until", time(report?.certificate_until_ms ?? member?.expires_ms)],
     ["generation of the secret", String(report?.secret_generation ?? (member?.generation || "–"))],
     ["last seen by the authority", time(member?.seen_ms)],
@@ -425,6 +441,166 @@ const showDetails = () => {
   ]);
 };
 
+/** The reason why a recipient stands for nobody, though it should. */
+const doubtOf = (word) => view.recipients.meanings[word]?.doubt ?? null;
+const interfaceOf = (rule) => (rule.kind === "topic" ? rule.interface : `${rule.kind} ${rule.interface}`);
+
+/** The rules of all nodes, each with its owner and the text by which it is found. */
+const rules = () =>
+  nodes().flatMap(({ name: owner, report }) =>
+    (report?.rights?.rules ?? []).map((rule) => {
+      const words = [...rule.to, ...rule.publish, ...rule.tokens.map((token) => `token ${token}`)];
+      return { owner, rule, text: `${owner}:${interfaceOf(rule)} ${rule.except.join(" ")} ${words.join(" ")}`.toLowerCase() };
+    }),
+  );
+
+/** The columns of the matrix: members, then partners, then tokens if there are any. */
+const columns = (all) => {
+  const { members, partners } = view.recipients;
+  const found = members.map((name, at) => ({ name, at, kind: "member" }));
+  found.push(...partners.map((name) => ({ name: `partner:${name}`, kind: "partner" })));
+  if (all.some(({ rule }) => rule.tokens.length)) found.push({ name: "tokens", kind: "tokens" });
+  return found;
+};
+
+/** Returns the rights of a column at a rule, as the classes of their marks. */
+const rightsOf = ({ owner, rule }, column) => {
+  if (column.kind === "tokens") return rule.tokens.length ? ["sub"] : [];
+  if (column.kind === "member" && column.name === owner) return ["own"];
+  const isMeant = (word) =>
+    column.kind === "partner" ? word === column.name : view.recipients.meanings[word]?.members.includes(column.at);
+  if (rule.kind !== "topic") return rule.to.some(isMeant) ? ["call"] : [];
+  return [...(rule.to.some(isMeant) ? ["sub"] : []), ...(rule.publish.some(isMeant) ? ["pub"] : [])];
+};
+
+const VERBS = { own: "shares", sub: "may subscribe to", pub: "may publish on", call: "may call" };
+let rowsMax = ROWS_MAX;
+/** The columns that the matrix has. */
+let head = "";
+
+const mark = (right) => {
+  const made = document.createElement("span");
+  made.className = `right ${right}`;
+  made.textContent = right;
+  return made;
+};
+
+/** Sets recipients as they are written in a rule, those that stand for nobody with the reason. */
+const setRecipients = (element, rule) => {
+  const tokens = rule.tokens.map((token) => ({ text: `token ${token}` }));
+  const more = rule.omitted ? [{ text: `${count(rule.omitted)} more` }] : [];
+  const named = (words) => words.map((word) => ({ text: word, doubt: doubtOf(word) }));
+  const lists = [["to", [...named(rule.to), ...tokens, ...more]], ["publish", rule.kind === "topic" ? named(rule.publish) : []]];
+  const key = JSON.stringify(lists);
+  if (element.dataset.shown === key) return;
+  element.dataset.shown = key;
+  element.replaceChildren(
+    ...lists.filter(([, words]) => words.length).flatMap(([title, words], nth) => [
+      `${nth ? ";" : ""} ${title} `,
+      ...words.flatMap(({ text, doubt }, at) => {
+        const part = document.createElement("span");
+        part.className = doubt ? "doubt" : "";
+        part.textContent = doubt ? `▲ ${text} (${doubt})` : text;
+        return at ? [", ", part] : [part];
+      }),
+    ]),
+  );
+};
+
+/** Says what the matrix does not show, and which recipients stand for nobody. */
+const showNotes = () => {
+  const doubtful = Object.keys(view.recipients.meanings).filter(doubtOf);
+  const notes = doubtful.slice(0, 5).map((word) => ({ className: "fault", text: `${word} has rights, but ${doubtOf(word)}.` }));
+  if (doubtful.length > 5) notes.push({ className: "fault", text: `${count(doubtful.length - 5)} more names in rules stand for nobody.` });
+  const gaps = (is, text) => {
+    const names = nodes().filter(is).map((node) => node.name);
+    const more = names.length > 5 ? ` and ${count(names.length - 5)} more` : "";
+    if (names.length) notes.push({ className: "gap", text: `${text}: ${names.slice(0, 5).join(", ")}${more}.` });
+  };
+  gaps((node) => !node.report && !node.member?.revoked_ms, "Not known, because there is no report, are the rules of");
+  gaps((node) => node.report && !node.report.rights, "Not known, because of an earlier version of sgc, are the rules of");
+  gaps((node) => node.report?.rights?.rules_omitted, "Not all rules have room in the report of");
+  sync(
+    by("rights-notes"),
+    notes,
+    (note) => note.text,
+    (note) => Object.assign(document.createElement("li"), { className: note.className, textContent: note.text }),
+    () => {},
+  );
+};
+
+const showRights = () => {
+  showNotes();
+  const all = rules();
+  const wanted = by("rights-filter").value.toLowerCase();
+  const found = all.filter((row) => row.text.includes(wanted));
+  const rows = found.slice(0, rowsMax);
+  const wantedMember = by("members-filter").value.toLowerCase();
+  const allColumns = columns(all);
+  const foundColumns = allColumns.filter((column) => column.name.toLowerCase().includes(wantedMember));
+  const shown = foundColumns.slice(0, COLUMNS_MAX);
+  setText(
+    by("rights-shown"),
+    all.length
+      ? `${count(rows.length)} of ${count(all.length)} interfaces, ${count(shown.length)} of ${count(allColumns.length)} columns`
+      : "No node shares anything.",
+  );
+  const more = by("rights-more");
+  more.hidden = rows.length === found.length;
+  setText(more, `Show ${count(Math.min(ROWS_MAX, found.length - rows.length))} more interfaces`);
+  by("matrix").hidden = rows.length === 0;
+  const names = JSON.stringify(shown.map((column) => column.name));
+  const body = by("rights");
+  if (head !== names) {
+    head = names;
+    body.replaceChildren();
+    by("rights-head").replaceChildren(
+      ...["interface, with its rule", ...shown.map((column) => column.name)].map((text, at) => {
+        const cell = document.createElement("th");
+        cell.scope = "col";
+        const inner = document.createElement("span");
+        inner.textContent = text;
+        inner.title = text;
+        cell.className = at ? "column" : "";
+        cell.append(inner);
+        return cell;
+      }),
+    );
+  }
+  sync(
+    body,
+    rows,
+    ({ owner, rule }) => `${owner} ${interfaceOf(rule)}`,
+    ({ owner, rule }) => {
+      const row = document.createElement("tr");
+      const title = document.createElement("th");
+      title.scope = "row";
+      const [of, except, words] = ["of", "", "words"].map((className) =>
+        Object.assign(document.createElement("span"), { className }),
+      );
+      of.textContent = `${owner}:`;
+      title.append(of, interfaceOf(rule), except, words);
+      row.append(title);
+      for (let at = 0; at < shown.length; at++) row.insertCell();
+      return row;
+    },
+    (element, row) => {
+      const except = row.rule.except.length ? ` except ${row.rule.except.join(", ")}` : "";
+      const [, exceptPart, words] = element.cells[0].children;
+      setText(exceptPart, except);
+      setRecipients(words, row.rule);
+      shown.forEach((column, at) => {
+        const cell = element.cells[at + 1];
+        const rights = rightsOf(row, column);
+        if (cell.dataset.shown === rights.join()) return;
+        cell.dataset.shown = rights.join();
+        cell.replaceChildren(...rights.map(mark));
+        cell.title = rights.map((right) => `${column.name} ${VERBS[right]} ${interfaceOf(row.rule)} of ${row.owner}`).join("; ");
+      });
+    },
+  );
+};
+
 const show = () => {
   if (!view) return;
   const omitted = view.fleet.members_omitted;
@@ -434,6 +610,7 @@ const show = () => {
   showMap();
   showNodes();
   showDetails();
+  showRights();
 };
 
 const fail = (text) => {
@@ -443,6 +620,16 @@ const fail = (text) => {
 };
 
 by("filter").addEventListener("input", () => view && showDetails());
+for (const id of ["rights-filter", "members-filter"]) {
+  by(id).addEventListener("input", () => {
+    rowsMax = ROWS_MAX;
+    if (view) showRights();
+  });
+}
+by("rights-more").addEventListener("click", () => {
+  rowsMax += ROWS_MAX;
+  showRights();
+});
 let age_ms = null;
 setInterval(() => {
   if (age_ms !== null) setText(by("age"), `as of ${duration((age_ms + Date.now() - arrived) / 1000)} ago`);

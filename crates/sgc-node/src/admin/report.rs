@@ -24,6 +24,10 @@ pub const REPORT_ROUTERS_MAX: usize = 16;
 pub const REPORT_TOPICS_MAX: usize = 512;
 /// Most members of the fleet in a report.
 pub const REPORT_MEMBERS_MAX: usize = 2048;
+/// Most rules of shares in a report.
+pub const REPORT_RULES_MAX: usize = 512;
+/// Most recipients, exceptions and tokens of a rule in a report, and most observers and operators.
+pub const REPORT_RECIPIENTS_MAX: usize = 64;
 /// Most alerts, and most problems, in a report.
 pub const REPORT_FAULTS_MAX: usize = 32;
 /// Most reasons of drops, and of refused links, that are read.
@@ -70,6 +74,8 @@ pub struct NodeReport {
     pub topics: Vec<ReportTopic>,
     /// The number of further shares and uses.
     pub topics_omitted: usize,
+    /// The rights that the node's configuration gives; null if it is of a version that does not tell them.
+    pub rights: Option<ReportRights>,
     /// Counts of drops and refusals since the node started, by reason.
     #[serde(deserialize_with = "counts")]
     pub drops: BTreeMap<String, u64>,
@@ -140,6 +146,51 @@ pub struct ReportTopic {
     pub messages: u64,
 }
 
+/// The rights that a node's configuration gives. A recipient is a node (`"desk"`), a group (`"group:operators"`), every
+/// member of the fleet (`"*"`) or a partner (`"partner:acme"`).
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct ReportRights {
+    /// The rules of shares, at most 512.
+    #[serde(deserialize_with = "at_most::<REPORT_RULES_MAX, _, _>")]
+    pub rules: Vec<ReportRule>,
+    /// The number of further rules.
+    pub rules_omitted: usize,
+    /// The recipients that may ask the node how it is doing, at most 64.
+    #[serde(deserialize_with = "at_most::<REPORT_RECIPIENTS_MAX, _, _>")]
+    pub observers: Vec<String>,
+    /// The recipients that may change the fleet at its authority, at most 64; empty at other nodes.
+    #[serde(deserialize_with = "at_most::<REPORT_RECIPIENTS_MAX, _, _>")]
+    pub operators: Vec<String>,
+}
+
+/// A rule of a share, and the recipients that it permits.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct ReportRule {
+    /// `"topic"`, `"service"`, `"action"` or `"parameters"`.
+    pub kind: String,
+    /// The name on the node's ROS 2 network, or a pattern.
+    pub interface: String,
+    /// Names and patterns that the rule does not cover, at most 64.
+    #[serde(deserialize_with = "at_most::<REPORT_RECIPIENTS_MAX, _, _>")]
+    pub except: Vec<String>,
+    /// The only ROS type that is shared; null if the rule names none.
+    #[serde(rename = "type")]
+    pub type_name: Option<String>,
+    /// The recipients that may subscribe or, unless it is a topic, call; at most 64.
+    #[serde(deserialize_with = "at_most::<REPORT_RECIPIENTS_MAX, _, _>")]
+    pub to: Vec<String>,
+    /// The recipients that may publish besides the node, at most 64.
+    #[serde(deserialize_with = "at_most::<REPORT_RECIPIENTS_MAX, _, _>")]
+    pub publish: Vec<String>,
+    /// The numbers of valid tokens whose holders may subscribe, at most 64.
+    #[serde(deserialize_with = "at_most::<REPORT_RECIPIENTS_MAX, _, _>")]
+    pub tokens: Vec<u64>,
+    /// The number of further exceptions, recipients and tokens.
+    pub omitted: usize,
+}
+
 /// A member of the fleet, as its authority knows it.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
@@ -185,7 +236,7 @@ impl NodeReport {
     /// Reads the document of another node. Its texts and lists are cut to their bounds.
     pub(crate) fn from_json(document: &[u8]) -> Result<Self, serde_json::Error> {
         let mut report: Self = serde_json::from_slice(document)?;
-        let Self { node, version, links, routers, topics, problems, members, .. } = &mut report;
+        let Self { node, version, links, routers, topics, problems, members, rights, .. } = &mut report;
         let of_links = links.iter_mut().flat_map(|link| [Some(&mut link.peer), link.name.as_mut()]);
         let of_routers = routers.iter_mut().flat_map(|router| {
             [Some(&mut router.router), Some(&mut router.state), router.last_failure.as_mut()]
@@ -198,7 +249,15 @@ impl NodeReport {
             member.groups.truncate(REPORT_FAULTS_MAX);
             [&mut member.name, &mut member.id].into_iter().chain(&mut member.groups)
         });
-        let texts = [node, version].into_iter().chain(problems).chain(of_members);
+        let of_rights = rights.iter_mut().flat_map(|rights| {
+            let ReportRights { rules, observers, operators, .. } = rights;
+            let of_rules = rules.iter_mut().flat_map(|rule| {
+                let ReportRule { kind, interface, except, type_name, to, publish, .. } = rule;
+                [kind, interface].into_iter().chain(type_name).chain(except).chain(to).chain(publish)
+            });
+            of_rules.chain(observers).chain(operators)
+        });
+        let texts = [node, version].into_iter().chain(problems).chain(of_members).chain(of_rights);
         texts.chain(of_links.chain(of_routers).chain(of_topics).flatten()).for_each(cut);
         Ok(report)
     }
@@ -210,15 +269,20 @@ impl NodeReport {
         self.members = Some(members);
     }
 
-    /// Returns the document. Topics and members that make it too long are left out, and counted.
+    /// Returns the document. Topics, rules and members that make it too long are left out, and counted.
     pub(crate) fn into_json(mut self) -> String {
         loop {
             let json = serde_json::to_string(&self).unwrap_or_default();
             let members = self.members.as_mut().filter(|members| !members.is_empty());
-            if json.len() <= REPORT_BYTES_MAX || (self.topics.is_empty() && members.is_none()) {
+            let rights = self.rights.as_mut().filter(|rights| !rights.rules.is_empty());
+            let is_bare = self.topics.is_empty() && members.is_none() && rights.is_none();
+            if json.len() <= REPORT_BYTES_MAX || is_bare {
                 return json;
             }
             self.topics_omitted += halve(&mut self.topics);
+            if let Some(rights) = rights {
+                rights.rules_omitted += halve(&mut rights.rules);
+            }
             self.members_omitted += members.map_or(0, halve);
         }
     }
@@ -379,6 +443,12 @@ mod tests {
         assert!(json.len() <= REPORT_BYTES_MAX, "{}", json.len());
         let read = NodeReport::from_json(json.as_bytes()).unwrap();
         assert_eq!((read.topics.len(), read.topics_omitted), (75, 227));
+        let rule = ReportRule { interface: "/t".repeat(5000), ..ReportRule::default() };
+        let rights = ReportRights { rules: vec![rule; 300], rules_omitted: 2, ..ReportRights::default() };
+        let json = NodeReport { rights: Some(rights), ..NodeReport::default() }.into_json();
+        assert!(json.len() <= REPORT_BYTES_MAX, "{}", json.len());
+        let rights = NodeReport::from_json(json.as_bytes()).unwrap().rights.unwrap();
+        assert_eq!((rights.rules.len(), rights.rules_omitted), (75, 227));
     }
 
     #[test]
@@ -388,6 +458,7 @@ mod tests {
         let read = NodeReport::from_json(text).unwrap();
         assert_eq!(read.alerts, [Alert::Other, Alert::Other, Alert::LocalNetworkAlone]);
         assert_eq!((read.node.as_str(), read.topics.len(), read.members), ("arm", 0, None));
+        assert_eq!(read.rights, None, "a version without rights is not one that gives none");
     }
 
     #[test]
@@ -396,13 +467,15 @@ mod tests {
         let long = "\u{e4}".repeat(5000);
         let text = format!(
             r#"{{"version": "{long}", "links": [{}], "routers": [{}], "topics": [{}], "problems": [{}], "alerts": [{}],
-                "members": [{}], "drops": {{{}}}}}"#,
+                "members": [{}], "rights": {{"rules": [{}], "observers": [{}]}}, "drops": {{{}}}}}"#,
             many("{}", 5000),
             many("{}", 5000),
             many(&format!(r#"{{"state": "{long}"}}"#), 1),
             many("\"p\"", 5000),
             many(&format!(r#"{{"kind": "restart_pending", "changes": ["{long}"]}}"#), 50),
             many("{}", 5000),
+            many(&format!(r#"{{"to": ["{long}", {}]}}"#, many("\"a\"", 100)), 600),
+            many("\"a\"", 100),
             (0..5000).map(|n| format!("\"r{n}\": 1")).collect::<Vec<_>>().join(",")
                 + &format!(",\"{long}\": 1"),
         );
@@ -419,6 +492,10 @@ mod tests {
         assert_eq!((lengths, read.version.chars().count()), (bounds, REPORT_TEXT_CHARS_MAX));
         assert!(read.alerts.iter().all(|alert| *alert == Alert::Other), "they are too long");
         assert_eq!(read.topics[0].state.chars().count(), REPORT_TEXT_CHARS_MAX);
+        let rights = read.rights.unwrap();
+        let to = &rights.rules[0].to;
+        assert_eq!((rights.rules.len(), to.len(), rights.observers.len()), (512, 64, 64));
+        assert_eq!(to[0].chars().count(), REPORT_TEXT_CHARS_MAX);
     }
 
     #[test]

@@ -34,6 +34,7 @@ use sgc_wire::{Control, Now};
 use tokio::sync::{mpsc, watch};
 use tracing::info;
 
+use crate::admin::report::ReportRights;
 use crate::clock::now;
 use crate::control::event::{CoreEvent, INBOX_MAX};
 use crate::control::faults::alerts::Alerts;
@@ -111,6 +112,8 @@ pub(crate) struct Core<N: RosNetwork> {
     operations: Operations,
     gateway: Arc<Gateway>,
     metrics: Arc<Metrics>,
+    /// The rights that the configuration gives, for reports.
+    rights: Arc<ReportRights>,
     /// Reports that observers ask for.
     reports: Reports,
     /// Reports that users of this node ask other nodes for.
@@ -186,6 +189,8 @@ pub(crate) struct CoreParts<N> {
     pub(crate) member_names: MemberNames,
     /// The peers that may ask this node how it is doing.
     pub(crate) observers: Grantees,
+    /// The rights that it tells them.
+    pub(crate) rights: Arc<ReportRights>,
 }
 
 impl<N: RosNetwork> Core<N> {
@@ -229,6 +234,7 @@ impl<N: RosNetwork> Core<N> {
             gateway: parts.gateway,
             metrics: parts.metrics,
             reports: Reports::default(),
+            rights: parts.rights,
             inquiries: Inquiries::default(),
             replays: Arc::default(),
             control_drops: Drops::default(),
@@ -334,6 +340,7 @@ impl<N: RosNetwork> Core<N> {
                 message_keys,
                 member_names,
                 observers,
+                rights,
                 reply,
             } => {
                 if let Some(identity) = identity {
@@ -341,6 +348,7 @@ impl<N: RosNetwork> Core<N> {
                 }
                 self.add_message_keys(message_keys);
                 self.set_observers(observers);
+                self.rights = rights;
                 self.members.set_names(member_names, self.certificates.identity());
                 self.reconfigure(shares, uses, anchors);
                 let _ = reply.send(());

@@ -14,6 +14,7 @@ use sgc_wire::{Control, Name, NodeId, Operation, OperationAnswer, Report, Report
 use tokio::sync::oneshot;
 
 use crate::admin::graph::Graph;
+use crate::admin::report::ReportRights;
 use crate::admin::status::Status;
 use crate::control::fleet::authority::DeskAnswers;
 use crate::control::fleet::inquiries::{InquiryAnswer, InquiryTarget};
@@ -142,6 +143,8 @@ pub(crate) enum CoreEvent {
         member_names: MemberNames,
         /// The peers that may ask this node how it is doing.
         observers: Grantees,
+        /// The rights that it tells them.
+        rights: Arc<ReportRights>,
         /// Notified when the change is under way.
         reply: oneshot::Sender<()>,
     },

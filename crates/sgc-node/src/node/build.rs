@@ -133,6 +133,7 @@ pub(super) async fn build<N: RosNetwork>(
         definitions,
         member_names: rules.members.clone(),
         observers: rules.observers.clone(),
+        rights: rules.rights.clone(),
         board: board.clone(),
         keep_alive_policy: keep_alive_policy(&config),
         message_keys,

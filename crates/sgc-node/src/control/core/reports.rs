@@ -13,7 +13,7 @@ use tracing::warn;
 use super::Core;
 use crate::admin::report::{
     NodeReport, REPORT_FAULTS_MAX, REPORT_LINKS_MAX, REPORT_ROUTERS_MAX, REPORT_TOPICS_MAX, ReportLink,
-    ReportRouter, ReportTopic, keep_interface,
+    ReportRights, ReportRouter, ReportTopic, keep_interface,
 };
 use crate::clock::now;
 use crate::control::event::CoreEvent;
@@ -174,6 +174,7 @@ impl<N: RosNetwork> Core<N> {
                 .collect(),
             topics: shown,
             topics_omitted: topics.count(),
+            rights: Some(ReportRights::clone(&self.rights)),
             drops: self.drops_by_reason(),
             refused: self.all_refused(),
             alerts,

@@ -5,11 +5,12 @@
 
 use std::fmt::Write as _;
 
-use sgc_config::{Recipient, ShareConfig};
+use sgc_config::{Config, Recipient, ShareConfig};
 use sgc_ros::{Interface, Part, ShareRule};
 use sgc_trust::{CaFingerprint, Grantees, Identity, Policy, VerifiedPeer};
 use sgc_wire::{GroupTag, Kind, Metadata, NodeId, Role};
 
+use crate::admin::report::{REPORT_RECIPIENTS_MAX, REPORT_RULES_MAX, ReportRights, ReportRule};
 use crate::control::fleet::partners::Partners;
 
 /// A node as its certificate proves it.
@@ -53,6 +54,42 @@ pub fn policy(share: &ShareConfig, identity: &Identity, partners: &Partners) -> 
         }
     }
     policy
+}
+
+/// Returns the rights that a configuration gives, in its words.
+pub(crate) fn written_rights(config: &Config, partners: &Partners) -> ReportRights {
+    let rules = config.shares.iter().take(REPORT_RULES_MAX).map(|share| written_rule(share, partners));
+    let operators = config.authority.iter().flat_map(|authority| &authority.operators);
+    ReportRights {
+        rules: rules.collect(),
+        rules_omitted: config.shares.len().saturating_sub(REPORT_RULES_MAX),
+        observers: first(config.observers().iter().map(ToString::to_string), &mut 0),
+        operators: first(operators.map(ToString::to_string), &mut 0),
+    }
+}
+
+fn written_rule(share: &ShareConfig, partners: &Partners) -> ReportRule {
+    let mut omitted = 0;
+    let words = |list: &[Recipient]| list.iter().map(ToString::to_string).collect::<Vec<_>>();
+    let is_topic = share.interface == Interface::Topic;
+    ReportRule {
+        kind: share.interface.key().to_owned(),
+        interface: share.topic.clone(),
+        except: first(share.naming.except.iter().cloned(), &mut omitted),
+        type_name: share.type_name.clone(),
+        to: first(words(&share.to), &mut omitted),
+        publish: first(words(&share.publish), &mut omitted),
+        tokens: first(tokens_of(share, partners).filter(|_| is_topic).map(|grant| grant.id), &mut omitted),
+        omitted,
+    }
+}
+
+/// Returns the first elements, as many as a report has room for, and counts the others.
+fn first<T>(all: impl IntoIterator<Item = T>, omitted: &mut usize) -> Vec<T> {
+    let mut all = all.into_iter();
+    let kept = all.by_ref().take(REPORT_RECIPIENTS_MAX).collect();
+    *omitted += all.count();
+    kept
 }
 
 /// Returns the route rules of a share, one for each topic and service.

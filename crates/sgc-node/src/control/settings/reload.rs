@@ -336,7 +336,7 @@ impl Reloader {
         let (reply, done) = oneshot::channel();
         let (shares, uses) = (rules.shares.clone(), rules.uses.clone());
         let member_names = rules.members.clone();
-        let observers = rules.observers.clone();
+        let (observers, rights) = (rules.observers.clone(), rules.rights.clone());
         let event = CoreEvent::Reload {
             identity,
             shares,
@@ -345,6 +345,7 @@ impl Reloader {
             message_keys,
             member_names,
             observers,
+            rights,
             reply,
         };
         let stopping = || "the node is stopping".to_owned();

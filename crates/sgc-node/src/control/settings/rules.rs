@@ -5,12 +5,14 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use sgc_config::{Config, Recipient, RouterUrl, TokenConfig, TokenSource, UseConfig};
 use sgc_ros::{Direction, Interface, Part, Shaping, ShareRule, UseRule, is_topic_name};
 use sgc_trust::{Grantees, Identity, ShareToken, TOKEN_TEXT_BYTES_MAX, TokenError};
 use sgc_wire::{Kind, NodeId, UnixMillis};
 
+use crate::admin::report::ReportRights;
 use crate::control::fleet::members::{MemberNames, unknown_members};
 use crate::control::fleet::partners::{PartnerError, Partners};
 use crate::control::settings::policy;
@@ -33,6 +35,8 @@ pub(crate) struct Rules {
     pub(crate) members: MemberNames,
     /// The peers that may ask this node how it is doing.
     pub(crate) observers: Grantees,
+    /// The rights in the words of the configuration, for observers.
+    pub(crate) rights: Arc<ReportRights>,
     /// Faults that prevent nothing.
     pub(crate) warnings: Vec<String>,
 }
@@ -64,6 +68,7 @@ impl Rules {
         rules.uses.splice(0..0, of_fleet);
         rules.names = peer_names(config, identity, &rules);
         rules.members = MemberNames::from_config(config, identity);
+        rules.rights = Arc::new(policy::written_rights(config, &rules.partners));
         rules.observers = policy::grantees(&config.observers(), identity, &rules.partners);
         let is_unknown = |one: &Recipient| match one {
             Recipient::Node(node) => identity.node_id_of(node.as_str()).is_none(),
