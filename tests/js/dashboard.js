@@ -1,11 +1,13 @@
 // The page of `sgc dashboard` in headless Chromium, for a fleet of twenty nodes of which one has five hundred topics.
-// node dashboard.js URL DIRECTORY, a new one for the browser's data and the pictures. It writes "kill" once all is there,
-// waits until the death of the node `arm-03` shows, and writes "all is well". crates/sgc/tests/dashboard.rs has the fleet.
+// node dashboard.js URL LOOK REFUSED DIRECTORY: the URLs of a page that may revoke, of one that only looks, and of one whose
+// node is no operator, and a new directory for the browser's data and the pictures. It revokes `arm-05` and writes
+// "revoked". It writes "kill", waits until the death of the node `arm-03` shows, and writes "all is well".
+// crates/sgc/tests/dashboard.rs has the fleet.
 import assert from "node:assert/strict";
 
 import { begin, fail, launch, limit } from "./chromium.js";
 
-const [url, directory] = process.argv.slice(2);
+const [url, look, refused, directory] = process.argv.slice(2);
 const PATIENCE = { timeout: 60_000 };
 limit(240_000);
 
@@ -16,8 +18,11 @@ try {
   });
   const page = await browser.newPage();
   const complaints = [];
-  page.on("console", (message) => ["error", "warning"].includes(message.type()) && complaints.push(message.text()));
-  page.on("pageerror", (error) => complaints.push(error.message));
+  const listen = (page) => {
+    page.on("console", (message) => ["error", "warning"].includes(message.type()) && complaints.push(message.text()));
+    page.on("pageerror", (error) => complaints.push(error.message));
+  };
+  listen(page);
   page.on("request", (request) => assert.ok(request.url().startsWith(new URL(url).origin), request.url()));
   const row = (name) => page.locator(`#nodes tr[data-key="1 ${name}"]`);
   const rowShows = (name, text) => row(name).filter({ hasText: text }).waitFor(PATIENCE);
@@ -59,12 +64,68 @@ try {
   const seen = await page.locator("#facts").textContent();
   assert.match(seen, /node id[0-9a-f]{64}/);
 
+  begin("rights");
+  await page.locator("#rights-shown", { hasText: "100 of 504 interfaces, 23 of 23 columns" }).waitFor(PATIENCE);
+  const right = async (rule, column) => {
+    const names = await page.locator("#rights-head th").allTextContents();
+    assert.ok(names.includes(column), names.join());
+    const cell = page.locator(`#rights tr[data-key="1 ${rule}"] > *`).nth(names.indexOf(column));
+    return (await cell.locator(".right").allTextContents()).join(" ");
+  };
+  for (const [rule, column, rights] of [
+    ["arm-00 /odom", "arm-00", "own"],
+    ["arm-00 /odom", "arm-01", "sub"],
+    ["arm-00 /odom", "router", "sub"],
+    ["arm-00 /cmd_vel", "router", ""],
+    ["arm-00 /odom", "partner:acme", "sub"],
+    ["arm-00 /cmd_vel", "desk", "sub pub"],
+    ["arm-00 /cmd_vel", "arm-01", ""],
+    ["arm-00 /cmd_vel", "partner:acme", ""],
+    ["arm-00 /camera/**", "busy", "sub"],
+    ["arm-00 /camera/**", "desk", "sub"],
+    ["arm-00 /camera/**", "keeper", ""],
+    ["arm-00 service /reset", "desk", "call"],
+    ["arm-00 service /reset", "busy", "call"],
+    ["arm-00 service /reset", "arm-01", ""],
+    ["busy /topic_0", "desk", "sub"],
+    ["busy /topic_0", "busy", "own"],
+    ["busy /topic_0", "arm-02", ""],
+  ]) {
+    assert.equal(await right(rule, column), rights, `${column} at ${rule}`);
+  }
+  const camera = page.locator('#rights tr[data-key="1 arm-00 /camera/**"]');
+  assert.match(await camera.textContent(), /except \/camera\/raw.*group:observers, ▲ ghost \(no member has this name\)/);
+  await page.locator("#rights-notes", { hasText: "ghost has rights, but no member has this name" }).waitFor(PATIENCE);
+  await page.locator("#rights-notes", { hasText: "the rules of: absent" }).waitFor(PATIENCE);
+  await page.locator("#rights-title").scrollIntoViewIfNeeded();
+  await page.locator("#rights-title").evaluate((title) => title.scrollIntoView());
+  await page.screenshot({ path: `${directory}/rights.png` });
+  // The head and the interfaces stay in sight.
+  const place = (selector) => page.locator(selector).first().evaluate((cell) => cell.getBoundingClientRect().top);
+  const top = await place("#rights-head th");
+  await page.locator("#matrix").focus();
+  await page.keyboard.press("End");
+  await page.waitForFunction(() => document.getElementById("matrix").scrollTop > 500, null, PATIENCE);
+  assert.equal(await place("#rights-head th"), top);
+  await page.locator("#rights-more").click();
+  await page.locator("#rights-shown", { hasText: "200 of 504 interfaces" }).waitFor(PATIENCE);
+  await page.fill("#rights-filter", "TOPIC_499");
+  await page.fill("#members-filter", "arm-1");
+  await page.locator("#rights-shown", { hasText: "1 of 504 interfaces, 7 of 23 columns" }).waitFor(PATIENCE);
+  await page.fill("#rights-filter", "group:operators");
+  await page.locator("#rights-shown", { hasText: "2 of 504 interfaces" }).waitFor(PATIENCE);
+  await page.fill("#rights-filter", "");
+  await page.fill("#members-filter", "");
+
   begin("light and dark");
   const background = () => page.evaluate(() => getComputedStyle(document.body).backgroundColor);
   const light = await background();
   await page.emulateMedia({ colorScheme: "dark" });
   assert.notEqual(await background(), light);
   await page.screenshot({ path: `${directory}/dark.png`, fullPage: true });
+  await page.locator("#rights-title").evaluate((title) => title.scrollIntoView());
+  await page.screenshot({ path: `${directory}/rights-dark.png` });
+  await page.emulateMedia({ colorScheme: "light" });
 
   begin("another token");
   const stranger = await browser.newPage();
@@ -72,6 +133,55 @@ try {
   await stranger.locator("#error", { hasText: "open the URL that `sgc dashboard` printed" }).waitFor(PATIENCE);
   assert.equal(await stranger.locator("#nodes tr").count(), 0);
   await stranger.close();
+
+  begin("a page that only looks");
+  const looking = await browser.newPage();
+  listen(looking);
+  await looking.goto(look);
+  await looking.locator('#nodes tr[data-key="1 arm-05"] button').click(PATIENCE);
+  await looking.locator("#details-title", { hasText: "arm-05" }).waitFor(PATIENCE);
+  assert.equal(await looking.locator("#revoke-ask").isVisible(), false);
+  await looking.close();
+
+  begin("a node that is no operator");
+  const powerless = await browser.newPage();
+  await powerless.goto(refused);
+  await powerless.locator('#nodes tr[data-key="1 arm-05"] button').click(PATIENCE);
+  await powerless.locator("#revoke-ask").click(PATIENCE);
+  await powerless.fill("#revoke-name", "arm-05");
+  await powerless.keyboard.press("Enter");
+  const reason = "keeper does not take this node for an operator: operators in its [authority] has to name it or a group of it";
+  await powerless.locator("#revoke-said", { hasText: reason }).waitFor(PATIENCE);
+  await powerless.screenshot({ path: `${directory}/refused.png` });
+  await powerless.close();
+
+  begin("revoke");
+  await row("arm-05").locator("button").focus();
+  await page.keyboard.press("Enter");
+  await page.locator("#details-title", { hasText: "arm-05" }).waitFor(PATIENCE);
+  await page.keyboard.press("Tab");
+  assert.equal(await page.evaluate(() => document.activeElement.id), "revoke-ask");
+  await page.keyboard.press("Enter");
+  await page.locator("#revoke-title", { hasText: "Revoke arm-05?" }).waitFor(PATIENCE);
+  for (const name of ["arm-0", "arm-055", "ARM-05", "arm-06"]) {
+    await page.fill("#revoke-name", name);
+    assert.equal(await page.locator("#revoke-do").isDisabled(), true, name);
+    await page.keyboard.press("Enter");
+  }
+  await page.keyboard.press("Escape");
+  assert.equal(await page.locator("#revoke").isVisible(), false);
+  await rowShows("arm-05", "● here");
+  await page.locator("#revoke-ask").click();
+  assert.equal(await page.inputValue("#revoke-name"), "");
+  await page.keyboard.type("arm-05");
+  await page.screenshot({ path: `${directory}/revoke.png` });
+  await page.keyboard.press("Enter");
+  await rowShows("arm-05", "✕ revoked");
+  assert.equal(await page.locator("#revoke").isVisible(), false);
+  assert.equal(await page.locator("#revoke-ask").isVisible(), false);
+  await page.locator("#rights-shown", { hasText: "22 of 22 columns" }).waitFor(PATIENCE);
+  await rowShows("arm-06", "● here");
+  console.log("revoked");
 
   begin("a node dies");
   await kept.focus();

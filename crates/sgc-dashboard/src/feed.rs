@@ -17,7 +17,7 @@ use sgc_wire::UnixMillis;
 use tokio::sync::watch;
 
 use crate::FindMembers;
-use crate::view::{FleetView, aged};
+use crate::view::{FleetView, enclosed};
 
 /// Time between two looks at nodes that answer.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
@@ -69,8 +69,9 @@ impl Feed {
         Ok(feed)
     }
 
-    /// Waits for a document after this one, at most this long, and returns the newest with its age.
-    pub(crate) async fn next_after(&self, seq: u64, most: Duration) -> String {
+    /// Waits for a document after this one, at most this long, and returns the newest with its age, and with whether the
+    /// page may revoke nodes.
+    pub(crate) async fn next_after(&self, seq: u64, most: Duration, may_operate: bool) -> String {
         // The document at hand is old if nobody has looked for a while.
         let is_old = !self.is_watched();
         self.note_request();
@@ -80,7 +81,7 @@ impl Feed {
         let _ = tokio::time::timeout(most, newer).await;
         self.note_request();
         let document = self.document.borrow();
-        aged(document.looked_at.map(|at| at.elapsed()), &document.json)
+        enclosed(document.looked_at.map(|at| at.elapsed()), may_operate, &document.json)
     }
 
     fn note_request(&self) {

@@ -4,6 +4,9 @@
 //! page and its documents on loopback ([`sgc_http`]). It holds no key and joins no network. The page has a token in the
 //! fragment of its URL, which browsers send to nobody; each request for a document has to show it, so other users of
 //! the host see nothing.
+//!
+//! Whoever starts it may let the page revoke nodes. That takes another token than looking does, and the same node of the
+//! user, which asks the fleet's authority as an operator. There is no other operation.
 #![forbid(unsafe_code)]
 
 mod feed;
@@ -16,12 +19,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use aws_lc_rs::constant_time::verify_slices_are_equal;
+use bytes::Bytes;
 use rand_core::RngCore as _;
+use serde::Deserialize;
 use sgc_diagnosis::diagnose;
 use sgc_diagnosis::fleet::{Members, ask_nodes};
 use sgc_http::http::header::{AUTHORIZATION, CONTENT_SECURITY_POLICY, HeaderName, HeaderValue};
-use sgc_http::http::{Request, StatusCode};
-use sgc_http::{Answer, TEXT, response};
+use sgc_http::http::{Method, Request, StatusCode};
+use sgc_http::{Answer, PostBounds, TEXT, only_reads, response};
 use sgc_node::graph::Graph;
 use sgc_process::{ProcessError, system_rng};
 use tokio::net::TcpListener;
@@ -39,6 +44,12 @@ const TOKEN_BYTES: usize = 16;
 const NEWS_MAX: Duration = Duration::from_secs(8);
 /// Most questions to single nodes at a time.
 const WHYS_MAX: usize = 4;
+/// Most operations at a time.
+const OPERATIONS_MAX: usize = 1;
+/// Most bytes of the body of an operation: names of nodes have at most 63.
+const OPERATION_BYTES_MAX: usize = 256;
+/// The place of the only operation.
+const REVOKE: &str = "/api/revoke";
 
 const JSON: &str = "application/json";
 /// The page may load its own files and ask its own server, and no page may have it in a frame.
@@ -54,6 +65,10 @@ const FILES: [(&str, &str, &str); 3] = [
 /// Finds the members of the fleet of the node at a socket, or says why not.
 pub type FindMembers = Box<dyn Fn(&Path) -> Result<Members, String> + Send + Sync>;
 
+/// Has the node at a socket ask the fleet's authority to revoke the node of this name. Returns the number of the new
+/// revocation list, or the reason why it was refused, with the remedy.
+pub type Revoke = Box<dyn Fn(&Path, &str) -> Result<u64, String> + Send + Sync>;
+
 /// The settings of the dashboard: the fleet to show, and the address of the page.
 pub struct DashboardOptions {
     /// Status socket of the node that asks the others.
@@ -62,13 +77,34 @@ pub struct DashboardOptions {
     pub find_members: FindMembers,
     /// Address of the page, on loopback; port 0 lets the system choose.
     pub listen: SocketAddr,
+    /// Revokes nodes; without it, the page only shows.
+    pub revoke: Option<Revoke>,
+}
+
+/// The URLs of the page.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PageUrls {
+    /// The URL whose token lets the page read.
+    pub look: String,
+    /// The URL whose token also lets it revoke; `None` if nobody may.
+    pub operate: Option<String>,
+}
+
+/// The right that a token gives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Right {
+    /// To read documents.
+    Look,
+    /// To read documents, and to revoke nodes.
+    Operate,
 }
 
 impl DashboardOptions {
     /// Returns options for the usual address, and for members as the fleet's authority knows them.
     pub fn new(socket: PathBuf) -> Self {
         let find = |socket: &Path| Members::of_authority(socket).map_err(|error| error.to_string());
-        Self { socket, find_members: Box::new(find), listen: (Ipv4Addr::LOCALHOST, DASHBOARD_PORT).into() }
+        let listen = (Ipv4Addr::LOCALHOST, DASHBOARD_PORT).into();
+        Self { socket, find_members: Box::new(find), listen, revoke: None }
     }
 }
 
@@ -96,31 +132,54 @@ pub enum DashboardError {
 /// Answers the requests of pages.
 struct Server {
     feed: Arc<Feed>,
-    token: String,
+    /// The token of each right that somebody has.
+    tokens: Vec<(Right, String)>,
     socket: PathBuf,
     whys: Arc<Semaphore>,
+    revoke: Option<Arc<Revoke>>,
+    operations: Arc<Semaphore>,
 }
 
-/// Serves the page until the process ends. `ready` gets its URL.
-pub fn run(options: DashboardOptions, ready: impl FnOnce(&str)) -> Result<Infallible, DashboardError> {
+/// The body of a request to revoke a node.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RevokeRequest {
+    node: String,
+}
+
+/// Serves the page until the process ends. `ready` gets its URLs.
+pub fn run(options: DashboardOptions, ready: impl FnOnce(&PageUrls)) -> Result<Infallible, DashboardError> {
     let at = options.listen;
     if !at.ip().to_canonical().is_loopback() {
         return Err(DashboardError::NotLoopback(at));
     }
-    let token = new_token()?;
+    let look = new_token()?;
+    let operate = options.revoke.is_some().then(new_token).transpose()?;
     let system = |source| ProcessError::System { what: "threads", source };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(system)?;
     let listen = |source| DashboardError::Listen { at, source };
     let listener = runtime.block_on(TcpListener::bind(at)).map_err(listen)?;
-    ready(&format!("http://{}/#{token}", listener.local_addr().map_err(listen)?));
+    let local = listener.local_addr().map_err(listen)?;
+    let url = |token: &String| format!("http://{local}/#{token}");
+    ready(&PageUrls { look: url(&look), operate: operate.as_ref().map(url) });
     let feed = Feed::start(options.socket.clone(), options.find_members).map_err(system)?;
-    let whys = Arc::new(Semaphore::new(WHYS_MAX));
-    let server = Arc::new(Server { feed, token, socket: options.socket, whys });
+    let server = Arc::new(Server {
+        feed,
+        tokens: std::iter::once((Right::Look, look))
+            .chain(operate.map(|token| (Right::Operate, token)))
+            .collect(),
+        socket: options.socket,
+        whys: Arc::new(Semaphore::new(WHYS_MAX)),
+        revoke: options.revoke.map(Arc::new),
+        operations: Arc::new(Semaphore::new(OPERATIONS_MAX)),
+    });
+    let admitting = server.clone();
+    let admit = move |head: &Request<()>| admitting.admit(head);
     let answer = move |request| {
         let server = server.clone();
         async move { server.answer(&request).await }
     };
-    runtime.block_on(sgc_http::serve(listener, answer));
+    runtime.block_on(sgc_http::serve_posts(listener, admit, answer));
     unreachable!("the server ends with the process")
 }
 
@@ -131,7 +190,25 @@ fn new_token() -> Result<String, ProcessError> {
 }
 
 impl Server {
-    async fn answer(&self, request: &Request<()>) -> Answer {
+    /// Returns the bounds of an operation, or its refusal. Its body is read only afterwards.
+    fn admit(&self, head: &Request<()>) -> Result<PostBounds, Box<Answer>> {
+        if head.uri().path() != REVOKE {
+            return Err(only_reads().into());
+        }
+        match self.right(head) {
+            None => Err(without_token().into()),
+            Some(Right::Look) => {
+                let why =
+                    "this page only shows: start it with `sgc dashboard --operate` and open the first URL\n";
+                Err(response(StatusCode::FORBIDDEN, TEXT, why).into())
+            }
+            Some(Right::Operate) => {
+                Ok(PostBounds { content_type: JSON, body_bytes_max: OPERATION_BYTES_MAX })
+            }
+        }
+    }
+
+    async fn answer(&self, request: &Request<Bytes>) -> Answer {
         let path = request.uri().path();
         if let Some((_, content_type, text)) = FILES.iter().find(|(file, ..)| *file == path) {
             return guarded(response(StatusCode::OK, content_type, *text));
@@ -139,8 +216,10 @@ impl Server {
         if !path.starts_with("/api/") {
             return response(StatusCode::NOT_FOUND, TEXT, "there is no such page\n");
         }
-        if !self.is_permitted(request) {
-            return response(StatusCode::UNAUTHORIZED, TEXT, "open the URL that `sgc dashboard` printed\n");
+        let Some(right) = self.right(request) else { return without_token() };
+        if request.method() == Method::POST {
+            // Only an admitted one comes here.
+            return self.revoke(request.body()).await;
         }
         let parameter = |name: &str| {
             let query = form_urlencoded::parse(request.uri().query().unwrap_or_default().as_bytes());
@@ -149,7 +228,11 @@ impl Server {
         match path {
             "/api/fleet" => {
                 let after = parameter("after").and_then(|after| after.parse().ok()).unwrap_or_default();
-                response(StatusCode::OK, JSON, self.feed.next_after(after, NEWS_MAX).await)
+                response(
+                    StatusCode::OK,
+                    JSON,
+                    self.feed.next_after(after, NEWS_MAX, right == Right::Operate).await,
+                )
             }
             "/api/why" => match parameter("node").zip(parameter("interface")) {
                 Some((node, interface)) => self.why(node, interface).await,
@@ -159,10 +242,37 @@ impl Server {
         }
     }
 
-    fn is_permitted(&self, request: &Request<()>) -> bool {
+    /// Returns the right of the token that a request shows.
+    fn right<B>(&self, request: &Request<B>) -> Option<Right> {
         let shown = request.headers().get(AUTHORIZATION).map(HeaderValue::as_bytes);
-        let token = shown.and_then(|shown| shown.strip_prefix(b"Bearer "));
-        token.is_some_and(|token| verify_slices_are_equal(token, self.token.as_bytes()).is_ok())
+        let shown = shown.and_then(|shown| shown.strip_prefix(b"Bearer "))?;
+        let is_shown = |token: &str| verify_slices_are_equal(shown, token.as_bytes()).is_ok();
+        self.tokens.iter().find(|(_, token)| is_shown(token)).map(|(right, _)| *right)
+    }
+
+    /// Revokes a node, if the authority takes the node here for an operator.
+    async fn revoke(&self, body: &Bytes) -> Answer {
+        let Some(revoke) = self.revoke.clone() else { return only_reads() };
+        let Ok(RevokeRequest { node }) = serde_json::from_slice(body) else {
+            return response(StatusCode::BAD_REQUEST, TEXT, "the name of a node is needed\n");
+        };
+        let Ok(place) = self.operations.clone().try_acquire_owned() else {
+            let why = "another operation is under way: wait until it has ended\n";
+            return response(StatusCode::SERVICE_UNAVAILABLE, TEXT, why);
+        };
+        let socket = self.socket.clone();
+        let done = tokio::task::spawn_blocking(move || {
+            // Also if the page has left meanwhile.
+            let _place = place;
+            revoke(&socket, &node)
+        });
+        match done
+            .await
+            .unwrap_or_else(|_| Err("the request failed: see whether it was carried out".to_owned()))
+        {
+            Ok(list) => response(StatusCode::OK, JSON, format!("{{\"list\":{list}}}")),
+            Err(why) => response(StatusCode::CONFLICT, TEXT, why + "\n"),
+        }
     }
 
     /// Explains why an interface of a node does not flow.
@@ -189,6 +299,11 @@ impl Server {
         let json = serde_json::to_string(&WhyView::new(view)).unwrap_or_default();
         response(StatusCode::OK, JSON, json)
     }
+}
+
+/// Returns the refusal of a request that shows no valid token.
+fn without_token() -> Answer {
+    response(StatusCode::UNAUTHORIZED, TEXT, "open the URL that `sgc dashboard` printed\n")
 }
 
 /// Adds the headers that keep other pages away from this one.

@@ -38,12 +38,12 @@ impl<'a> FleetView<'a> {
     }
 }
 
-/// Returns the document as the page gets it: with the time since the node here last answered, milliseconds, and null
-/// for either if there is none yet.
-pub(crate) fn aged(age: Option<Duration>, view: &[u8]) -> String {
+/// Returns the document as the page gets it: with the time since the node here last answered, milliseconds, null for
+/// either if there is none yet, and with whether the page may revoke nodes.
+pub(crate) fn enclosed(age: Option<Duration>, may_operate: bool, view: &[u8]) -> String {
     let age = age.map_or_else(|| "null".to_owned(), |age| age.as_millis().to_string());
     let view = if view.is_empty() { "null".into() } else { String::from_utf8_lossy(view) };
-    format!("{{\"age_ms\":{age},\"view\":{view}}}")
+    format!("{{\"age_ms\":{age},\"may_operate\":{may_operate},\"view\":{view}}}")
 }
 
 /// The steps on the way of an interface, or the reason why they are not known.

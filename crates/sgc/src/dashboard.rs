@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use sgc_dashboard::{DASHBOARD_PORT, DashboardOptions};
+use sgc_dashboard::{DASHBOARD_PORT, DashboardOptions, PageUrls};
 
 use crate::error::CliError;
 use crate::node::NodeArgs;
@@ -14,7 +14,7 @@ use crate::{fleet, output};
 ///
 /// The command prints the URL of a page and serves it until Ctrl-C. Your node that runs here asks the others over the
 /// mesh. They answer observers: enroll your node with `--group observers`. The page is on loopback and needs the token
-/// in its URL.
+/// in its URL. It only shows, unless you start it with --operate.
 #[derive(Debug, Args)]
 pub(crate) struct DashboardArgs {
     /// Address of the page, on loopback; port 0 lets the system choose
@@ -23,6 +23,10 @@ pub(crate) struct DashboardArgs {
     /// Fleet file with the members; without it, the fleet's authority is asked
     #[arg(long, value_name = "FILE")]
     fleet: Option<PathBuf>,
+    /// Let the page revoke nodes: whoever has the first of two printed URLs may do it, and with the second only look. The
+    /// fleet's authority carries it out if its configuration lists your node in `operators`
+    #[arg(long, conflicts_with = "fleet")]
+    operate: bool,
     #[command(flatten)]
     node: NodeArgs,
 }
@@ -36,8 +40,18 @@ pub(crate) fn dashboard(args: &DashboardArgs) -> Result<(), CliError> {
         let find = move |_: &Path| fleet::members_of_file(&file).map_err(|error| error.to_string());
         options.find_members = Box::new(find);
     }
-    match sgc_dashboard::run(options, |url| {
+    if args.operate {
+        let revoke = |socket: &Path, node: &str| {
+            fleet::revoke_by_authority(socket, node).map_err(|error| error.line())
+        };
+        options.revoke = Some(Box::new(revoke));
+    }
+    match sgc_dashboard::run(options, |PageUrls { look, operate }| {
+        let lines = match operate {
+            None => look.clone(),
+            Some(operate) => format!("{operate}\nto look only: {look}"),
+        };
         // Without a reader the URL is lost, and the page serves nobody.
-        let _ = output::line(url);
+        let _ = output::line(lines);
     })? {}
 }

@@ -307,7 +307,7 @@ impl CliError {
             }
             _ => {}
         }
-        output::diagnostic(&format!("sgc: {}", one_line(&chain(self))));
+        output::diagnostic(&format!("sgc: {}", self.line()));
         if let Self::Demo(DemoError::Failed { facts, .. }) | Self::Bench(MeasureError::Failed { facts, .. }) =
             self
         {
@@ -316,6 +316,11 @@ impl CliError {
             }
         }
         ExitCode::from(self.exit_code())
+    }
+
+    /// Returns the error with its sources as a line without control characters.
+    pub(crate) fn line(&self) -> String {
+        one_line(&chain(self))
     }
 
     fn exit_code(&self) -> u8 {

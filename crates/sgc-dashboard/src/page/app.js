@@ -8,6 +8,8 @@ const by = (id) => document.getElementById(id);
 const AGAIN_MS = 2000;
 /** Longest wait for an answer, milliseconds. The server waits for the nodes, and asks them for at most 10 s. */
 const PATIENCE_MS = 20_000;
+/** Longest wait for an operation, milliseconds. The server asks for the authority and gives it 40 s. */
+const OPERATION_MS = 60_000;
 const DAY_MS = 86_400_000;
 /** Most rows and columns of the matrix of rights at first; each press of its button adds as many rows. */
 const ROWS_MAX = 100;
@@ -18,6 +20,8 @@ const MARKS = { here: "●", fault: "▲", linked: "◌", absent: "○", revoked
 let view = null;
 let arrived = 0;
 let selected = null;
+/** Whether the token lets the page revoke nodes. */
+let mayOperate = false;
 /** Of each node: the last report, and the rates since the one before, by direction and topic. */
 const rates = new Map();
 
@@ -28,7 +32,19 @@ const ask = async (path) => {
   return answer.json();
 };
 
+/** Has the server revoke a node. */
+const revoke = async (node) => {
+  const answer = await fetch("/api/revoke", {
+    method: "POST",
+    headers: { authorization: `Bearer ${token}`, "content-type": "application/json" },
+    body: JSON.stringify({ node }),
+    signal: AbortSignal.timeout(OPERATION_MS),
+  });
+  if (!answer.ok) throw new Error((await answer.text()) || answer.statusText);
+};
+
 const setText = (element, text) => {
+  delete element.dataset.text;
   if (element.textContent !== text) element.textContent = text;
 };
 const setAttribute = (element, name, value) => {
@@ -382,12 +398,67 @@ const recipientsText = (words) => {
   return words.map(text).join(", ") || "nobody";
 };
 
+/** The node that the dialog is about. */
+let revoking = null;
+
+const askToRevoke = (node) => {
+  revoking = node.name;
+  setText(by("revoke-title"), `Revoke ${node.name}?`);
+  const warning = node.report?.members ? "It is the authority of the fleet: without it, nobody is renewed, enrolled or revoked from afar." : "";
+  by("revoke-warning").hidden = !warning;
+  setText(by("revoke-warning"), warning);
+  by("revoke-name").value = "";
+  by("revoke-name").disabled = false;
+  by("revoke-do").disabled = true;
+  setText(by("revoke-said"), "");
+  by("revoke").showModal();
+  by("revoke-name").focus();
+};
+
+by("revoke-name").addEventListener("input", () => {
+  by("revoke-do").disabled = by("revoke-name").value !== revoking;
+});
+by("revoke-cancel").addEventListener("click", () => by("revoke").close());
+by("revoke-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const name = revoking;
+  if (by("revoke-do").disabled || by("revoke-name").value !== name) return;
+  by("revoke-do").disabled = true;
+  by("revoke-name").disabled = true;
+  by("revoke-said").className = "";
+  setText(by("revoke-said"), "The authority is asked.");
+  let refused = null;
+  try {
+    await revoke(name);
+  } catch (error) {
+    refused = error.message;
+  }
+  // The dialog may be about another node by now.
+  if (revoking !== name) return;
+  if (refused === null) {
+    by("revoke").close();
+    by("details-title").focus();
+    return;
+  }
+  by("revoke-name").disabled = false;
+  by("revoke-do").disabled = false;
+  by("revoke-said").className = "absent";
+  setMarked(by("revoke-said"), refused);
+  by("revoke-name").focus();
+});
+by("revoke-ask").addEventListener("click", () => {
+  const node = view && nodes().find((node) => node.name === selected);
+  if (node) askToRevoke(node);
+});
+
 const showDetails = () => {
   const node = nodes().find((node) => node.name === selected);
   by("details").hidden = !node;
   if (!node) return;
   const { report, member } = node;
   setText(by("details-title"), node.name);
+  by("revoke-part").hidden = !mayOperate || !member || Boolean(member.revoked_ms);
+  setText(by("revoke-ask"), `Revoke ${node.name}…`);
   const time = (ms) => (ms ? new Date(ms).toISOString().replace("T", " ").slice(0, 16) + " UTC" : "–");
   const facts = [
     ["state", `${stateText(node)}${node.error ? `: ${node.error}` : ""}`],
@@ -651,7 +722,7 @@ for (let seq = 0; ; ) {
   await seen();
   try {
     const answer = await ask(`/api/fleet?after=${seq}`);
-    [age_ms, arrived] = [answer.age_ms, Date.now()];
+    [age_ms, arrived, mayOperate] = [answer.age_ms, Date.now(), answer.may_operate];
     if (answer.view && answer.view.seq > seq) {
       [view, seq] = [answer.view, answer.view.seq];
       measure();

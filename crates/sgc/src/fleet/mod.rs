@@ -27,6 +27,7 @@ use sgc_trust::Fleet;
 
 pub(crate) use self::join::{JoinArgs, join};
 pub(crate) use self::looking::members_of_file;
+pub(crate) use self::remote::revoke_by_authority;
 use crate::error::CliError;
 use crate::files;
 

@@ -1,13 +1,14 @@
 //! `--at AUTHORITY`: fleet operations that the authority carries out. A node of this user requests them over the mesh
 //! as an operator.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use clap::Args;
 use serde::Deserialize;
+use sgc_diagnosis::fleet::Members;
 use sgc_diagnosis::{DiagnosisError, ask};
 use sgc_node::admin::AdminRequest;
 use sgc_trust::{Invitation, Membership, NodeName};
@@ -55,6 +56,14 @@ impl FleetPlace {
 pub(super) struct Remote {
     at: NodeName,
     socket: PathBuf,
+}
+
+/// Has the fleet's authority revoke a node, as `sgc fleet revoke NODE --at AUTHORITY` does. The node at this socket asks.
+/// Returns the number of the new revocation list.
+pub(crate) fn revoke_by_authority(socket: &Path, node: &str) -> Result<u64, CliError> {
+    let node: NodeName = node.parse()?;
+    let authority = Members::of_authority(socket)?.authority.unwrap_or_default().node;
+    Remote::new(authority.parse()?, socket.to_owned()).revoke(&[node])
 }
 
 /// A node's answer.
