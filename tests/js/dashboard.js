@@ -183,6 +183,19 @@ try {
   await rowShows("arm-06", "● here");
   console.log("revoked");
 
+  begin("audit");
+  await page.fill("#audit-filter", "keeper operation");
+  const event = page.locator("#audit tr", { hasText: "revoke arm-05: done" });
+  await event.waitFor(PATIENCE);
+  assert.match(await event.textContent(), /^\d{4}-\d\d-\d\d \d\d:\d\d:\d\dkeeperoperationdesk/);
+  await page.fill("#audit-filter", "no operator");
+  await page.locator("#audit tr", { hasText: "busy" }).waitFor(PATIENCE);
+  await page.fill("#audit-filter", "desk started");
+  await page.locator("#audit-shown", { hasText: "the newest 1 of 1" }).waitFor(PATIENCE);
+  await page.fill("#audit-filter", "");
+  await page.locator("#audit-title").evaluate((title) => title.scrollIntoView());
+  await page.screenshot({ path: `${directory}/audit.png` });
+
   begin("a node dies");
   await kept.focus();
   console.log("kill");

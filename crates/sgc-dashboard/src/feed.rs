@@ -9,20 +9,23 @@ use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
+use sgc_diagnosis::ask::{answer, ask};
 use sgc_diagnosis::fleet::{FleetStatus, Members, ask_nodes};
-use sgc_node::admin::ReportAnswer;
+use sgc_node::admin::{AdminRequest, AuditAnswer, ReportAnswer};
 use sgc_process::unix_now;
 use sgc_sync::lock;
 use sgc_wire::UnixMillis;
 use tokio::sync::watch;
 
 use crate::FindMembers;
-use crate::view::{FleetView, enclosed};
+use crate::view::{AuditView, FleetView, enclosed};
 
 /// Time between two looks at nodes that answer.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
 /// Time between two looks at nodes that did not answer.
 const ABSENT_EVERY: Duration = Duration::from_secs(10);
+/// Longest wait for the audit log of the node here.
+const AUDIT_MAX: Duration = Duration::from_secs(5);
 /// Time after the last request for which nodes are still asked. A page that is looked at asks more often.
 const WATCHED_FOR: Duration = Duration::from_secs(15);
 
@@ -112,7 +115,11 @@ impl Feed {
     /// Asks for the members, then the nodes of which it is not known that they are absent.
     fn look(&self) {
         let members = (self.find_members)(&self.socket);
-        let nodes = lock(&self.memory).take_members(members);
+        let audit = own_audit(&self.socket);
+        let mut memory = lock(&self.memory);
+        memory.audit = audit;
+        let nodes = memory.take_members(members);
+        drop(memory);
         self.ask(&nodes);
     }
 
@@ -130,14 +137,21 @@ impl Feed {
         let mut memory = lock(&self.memory);
         memory.take_answers(Instant::now(), answers);
         let (fleet, error, looked_at) = (memory.fleet(unix_now()), memory.error.clone(), memory.looked_at);
+        let audit = AuditView::new(&memory.audit, &fleet);
         drop(memory);
         self.document.send_modify(|document| {
             document.seq += 1;
-            let view = FleetView::new(document.seq, error, &fleet);
+            let view = FleetView::new(document.seq, error, &fleet, &audit);
             document.json = serde_json::to_vec(&view).unwrap_or_default().into();
             document.looked_at = looked_at;
         });
     }
+}
+
+/// Asks the node here for the last records of its audit log.
+fn own_audit(socket: &Path) -> Result<AuditAnswer, String> {
+    let text = ask(socket, &AdminRequest::Audit, AUDIT_MAX).map_err(|error| error.to_string())?;
+    answer(socket, &text).map_err(|error| error.to_string())
 }
 
 /// Asks nodes; none if there are none.
@@ -149,15 +163,24 @@ fn ask_if_any(socket: &Path, nodes: &[String]) -> Result<Vec<ReportAnswer>, Stri
 }
 
 /// The members of the fleet, and their last answers.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Memory {
     members: Members,
+    /// The audit log of the node here, or the reason why it is not known.
+    audit: Result<AuditAnswer, String>,
     /// The last answer of each member that is not revoked.
     answers: BTreeMap<String, ReportAnswer>,
     /// The reason why the members, or the nodes, are not known now.
     error: Option<String>,
     /// Time of the last answer.
     looked_at: Option<Instant>,
+}
+
+impl Default for Memory {
+    fn default() -> Self {
+        let (members, answers) = (Members::default(), BTreeMap::new());
+        Self { members, audit: Ok(AuditAnswer::default()), answers, error: None, looked_at: None }
+    }
 }
 
 impl Memory {

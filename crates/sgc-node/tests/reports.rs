@@ -8,10 +8,11 @@ mod support;
 
 use lab::*;
 use sgc_node::admin::report::NodeReport;
-use sgc_node::admin::{AdminRequest, ReportAnswer, ReportRequest};
+use sgc_node::admin::{AdminRequest, AuditAnswer, ReportAnswer, ReportRequest};
 use sgc_node::audit::AuditRecord;
 use sgc_node::config::{AuthorityConfig, Recipient};
 use sgc_node::graph::Graph;
+use sgc_wire::Operation;
 use support::*;
 
 /// Returns a fleet with an authority `keeper`, an observer `desk`, and these nodes.
@@ -141,6 +142,49 @@ fn observer_learns_the_rights_that_a_configuration_gives_and_a_reload_changes_th
     // A report is given again for half a second.
     let changed = [words(&["keeper"]), words(&["desk", "keeper"]), words(&[])];
     wait("the new rights are reported", || rights_of(&desk, "robot") == changed);
+}
+
+#[test]
+fn authority_reports_who_changed_the_fleet_and_other_nodes_report_no_events() {
+    let lab = observed(&["robot", "guest"]);
+    let _cloud = lab.cloud();
+    let mut authority = AuthorityConfig::new(lab.fleet_file());
+    authority.operators = nodes(&["desk"]);
+    let keeper = lab.start("keeper", |c| c.authority = Some(authority));
+    let (_robot, desk, guest) =
+        (lab.start("robot", |_| {}), lab.start("desk", |_| {}), lab.start("guest", |_| {}));
+    let revoke = |by: &Node| {
+        let operation = Operation::Revoke { nodes: vec!["robot".to_owned()] };
+        by.ask(&AdminRequest::Operate { at: "keeper".parse().unwrap(), operation })
+    };
+    wait("the guest is refused", || {
+        let answer = revoke(&guest);
+        answer["error"]
+            .as_str()
+            .is_some_and(|error| error.contains("does not take this node for an operator"))
+    });
+    assert!(revoke(&desk)["ok"].is_object());
+    let events = report_of(&desk, "").events.unwrap();
+    let find = |event: &str, peer: &str, detail: &str| {
+        let peer = Some(peer.to_owned());
+        events.iter().find(|one| one.event == event && one.peer == peer && one.detail == detail)
+    };
+    let done = find("operation", "desk", "revoke robot: done");
+    assert!(done.is_some_and(|one| one.time_ms.abs_diff(unix_now().0) < 60_000), "{events:?}");
+    assert!(find("refused", "guest", "an operation: it is no operator").is_some(), "{events:?}");
+    assert!(events.iter().all(|one| !one.event.starts_with("link")), "{events:?}");
+    assert_eq!(report_of(&desk, "cloud").events, None);
+    assert_eq!(report_of(&desk, "desk").events, None);
+    // The user of a node gets all of its events.
+    let answer = keeper.ask(&AdminRequest::Audit)["ok"].take();
+    let AuditAnswer { node, records } = serde_json::from_value(answer).unwrap();
+    let records = records.unwrap();
+    assert_eq!((node.as_str(), records[0].event.as_str()), ("keeper", "started"));
+    assert!(records.iter().any(|record| record.event == "link_up"), "{records:?}");
+    assert!(
+        records.iter().any(|record| record.reason.as_deref() == Some("revoke robot: done")),
+        "{records:?}"
+    );
 }
 
 #[test]

@@ -17,7 +17,6 @@ use crate::error::CliError;
 use crate::output;
 
 const FILE_NAME: &str = "audit.jsonl";
-const NODE_CHARS: usize = 8;
 
 /// Show the audit log of a node: grants, refusals, revocations, links, reloads and access tokens.
 #[derive(Debug, Args)]
@@ -163,24 +162,9 @@ fn only_log(dirs: &[PathBuf]) -> Result<PathBuf, CliError> {
 }
 
 fn row(record: &AuditRecord) -> Vec<String> {
-    let short = || record.peer.as_ref().map(|peer| peer.chars().take(NODE_CHARS).collect());
-    let mut why = Vec::new();
-    if let (Some(of), Some(count)) = (&record.of, record.count) {
-        why.push(format!("{count} more of {of} since {}, the last", record.from.as_deref().unwrap_or("?")));
-    }
-    why.extend(record.reason.clone());
-    why.extend(record.by.as_ref().map(|by| format!("by {by}")));
-    why.extend(record.epoch.map(|epoch| format!("epoch {epoch}")));
-    why.extend(record.remote.as_ref().map(|remote| format!("at {remote}")));
-    why.extend(record.lost.map(|lost| format!("{lost} records were lost")));
-    let cells = [
-        Some(record.time.clone()),
-        Some(record.event.clone()),
-        record.topic.clone().or_else(|| record.name.as_ref().map(|n| n.chars().take(NODE_CHARS).collect())),
-        record.peer_name.clone().or_else(short),
-        Some(why.join(", ")),
-    ];
-    cells.into_iter().map(|cell| plain(&cell.unwrap_or_default())).collect()
+    let (subject, peer) = (record.subject().unwrap_or_default(), record.peer_word().unwrap_or_default());
+    let cells = [record.time.clone(), record.event.clone(), subject, peer, record.detail()];
+    cells.iter().map(|cell| plain(cell)).collect()
 }
 
 /// Removes control characters and marks that change the direction of text.

@@ -13,8 +13,16 @@ use std::time::{Duration, Instant};
 /// Nodes besides the router, the authority, the observer, the busy and the absent one.
 const ARMS: usize = 17;
 const TOPICS: usize = 500;
-const PICTURES: [&str; 7] =
-    ["fleet.png", "dark.png", "rights.png", "rights-dark.png", "revoke.png", "refused.png", "dead.png"];
+const PICTURES: [&str; 8] = [
+    "fleet.png",
+    "dark.png",
+    "rights.png",
+    "rights-dark.png",
+    "revoke.png",
+    "refused.png",
+    "audit.png",
+    "dead.png",
+];
 /// Rules of one node that permit each kind of recipient something.
 const RULES: &str = r#"
 [[partner]]

@@ -14,6 +14,11 @@ const DAY_MS = 86_400_000;
 /** Most rows and columns of the matrix of rights at first; each press of its button adds as many rows. */
 const ROWS_MAX = 100;
 const COLUMNS_MAX = 60;
+/** Most events of audit logs at first; each press of its button adds as many. */
+const EVENTS_MAX = 25;
+/** Events by which somebody lost a right or did not get one, and those that changed the fleet. */
+const REFUSALS = ["refused", "revoked", "cut", "link_refused", "token_refused", "token_revoked", "audit_lost"];
+const CHANGES = ["operation", "crl", "reload", "token_made"];
 /** Marks by state, so that color alone tells nothing. */
 const MARKS = { here: "●", fault: "▲", linked: "◌", absent: "○", revoked: "✕" };
 
@@ -126,6 +131,11 @@ const duration = (seconds) => {
   if (d) return `${d} d ${h} h`;
   if (h) return `${h} h ${m} min`;
   return m ? `${m} min ${Math.floor(seconds % 60)} s` : `${Math.floor(seconds)} s`;
+};
+/** Returns a time as text of this length. A clock of another machine may be anything. */
+const timeText = (ms, length) => {
+  const date = new Date(ms);
+  return Number.isNaN(date.getTime()) ? "?" : date.toISOString().replace("T", " ").slice(0, length);
 };
 const millis = (us) => (us < 10_000 ? `${(us / 1000).toFixed(2)} ms` : `${Math.round(us / 1000)} ms`);
 const count = (n) => n.toLocaleString("en");
@@ -459,7 +469,7 @@ const showDetails = () => {
   setText(by("details-title"), node.name);
   by("revoke-part").hidden = !mayOperate || !member || Boolean(member.revoked_ms);
   setText(by("revoke-ask"), `Revoke ${node.name}…`);
-  const time = (ms) => (ms ? new Date(ms).toISOString().replace("T", " ").slice(0, 16) + " UTC" : "–");
+  const time = (ms) => (ms ? `${timeText(ms, 16)} UTC` : "–");
   const facts = [
     ["state", `${stateText(node)}${node.error ? `: ${node.error}` : ""}`],
     ["groups", member?.groups.join(", ") || "none"],
@@ -672,6 +682,41 @@ const showRights = () => {
   );
 };
 
+let eventsMax = EVENTS_MAX;
+const isRefusal = (one) => REFUSALS.includes(one.event);
+const eventText = (one) => `${isRefusal(one) ? "▲ " : ""}${one.event.replaceAll("_", " ")}`;
+const eventMark = (one) => {
+  const className = isRefusal(one) ? "fault" : CHANGES.includes(one.event) ? "linked" : "";
+  return Object.assign(document.createElement("span"), { className });
+};
+
+const showAudit = () => {
+  const { events, gaps } = view.audit;
+  sync(
+    by("audit-gaps"),
+    gaps,
+    (gap) => gap,
+    (gap) => Object.assign(document.createElement("li"), { textContent: `Not known: ${gap}.` }),
+    () => {},
+  );
+  const wanted = by("audit-filter").value.toLowerCase();
+  const text = (one) => `${one.node} ${one.event} ${one.peer ?? ""} ${one.topic ?? ""} ${one.detail}`.toLowerCase();
+  const found = events.filter((one) => text(one).includes(wanted));
+  const shown = found.slice(0, eventsMax);
+  setText(by("audit-shown"), events.length ? `the newest ${count(shown.length)} of ${count(found.length)}` : "No events yet.");
+  const more = by("audit-more");
+  more.hidden = shown.length === found.length;
+  setText(more, `Show ${count(Math.min(EVENTS_MAX, found.length - shown.length))} more events`);
+  syncRows(by("audit"), shown, (one) => `${one.node} ${one.time_ms} ${one.event} ${one.peer} ${one.topic} ${one.detail}`, [
+    { text: (one) => timeText(one.time_ms, 19) },
+    { text: (one) => one.node },
+    { make: eventMark, text: eventText },
+    { text: (one) => one.peer ?? "" },
+    { text: (one) => one.topic ?? "" },
+    { text: (one) => one.detail },
+  ]);
+};
+
 const show = () => {
   if (!view) return;
   const omitted = view.fleet.members_omitted;
@@ -682,6 +727,7 @@ const show = () => {
   showNodes();
   showDetails();
   showRights();
+  showAudit();
 };
 
 const fail = (text) => {
@@ -697,6 +743,14 @@ for (const id of ["rights-filter", "members-filter"]) {
     if (view) showRights();
   });
 }
+by("audit-filter").addEventListener("input", () => {
+  eventsMax = EVENTS_MAX;
+  if (view) showAudit();
+});
+by("audit-more").addEventListener("click", () => {
+  eventsMax += EVENTS_MAX;
+  showAudit();
+});
 by("rights-more").addEventListener("click", () => {
   rowsMax += ROWS_MAX;
   showRights();

@@ -48,6 +48,7 @@ use crate::control::settings::reload::Reloader;
 use crate::data::tap::{Tap, TapMessage, TapRequest};
 use crate::gateway::Gateway;
 use crate::metrics::Metrics;
+use crate::state::audit::{Audit, AuditRecord};
 use crate::state::{ROOT, own_uid};
 
 /// Prefix of a request line. The number is the version of the protocol.
@@ -106,6 +107,18 @@ pub enum AdminRequest {
     },
     /// Ask nodes of the fleet how they are doing.
     Report(ReportRequest),
+    /// Return the [`AuditAnswer`].
+    Audit,
+}
+
+/// The last records of a node's audit log.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct AuditAnswer {
+    /// The node's name.
+    pub node: String,
+    /// The last records since the node started, at most [`RECENT_MAX`](crate::audit::RECENT_MAX), oldest first; null if it keeps no log.
+    pub records: Option<Vec<AuditRecord>>,
 }
 
 /// Most nodes in one [`ReportRequest`].
@@ -227,6 +240,7 @@ impl AdminRequest {
         match question.split_once(' ').unwrap_or((question, "")) {
             ("status", "") => Ok(Self::Status),
             ("reload", "") => Ok(Self::Reload),
+            ("audit", "") => Ok(Self::Audit),
             ("crl", list) => match STANDARD.decode(list) {
                 Ok(list) if !list.is_empty() && list.len() <= CRL_BYTES_MAX => Ok(Self::Crl(list)),
                 _ => Err(AdminError::Argument { word: "crl" }),
@@ -277,6 +291,7 @@ impl AdminRequest {
         match self {
             Self::Status => format!("{ADMIN_PREFIX}status\n"),
             Self::Reload => format!("{ADMIN_PREFIX}reload\n"),
+            Self::Audit => format!("{ADMIN_PREFIX}audit\n"),
             Self::Crl(list) => format!("{ADMIN_PREFIX}crl {}\n", STANDARD.encode(list)),
             Self::Graph(None) => format!("{ADMIN_PREFIX}graph\n"),
             Self::Graph(Some(name)) => format!("{ADMIN_PREFIX}graph {name}\n"),
@@ -321,7 +336,7 @@ pub enum AdminError {
     },
     /// The word is unknown.
     #[error(
-        "{word:?} is nothing that this node can be asked: status, reload, crl, graph, report, tap, publish, call and operate are"
+        "{word:?} is nothing that this node can be asked: status, reload, crl, graph, report, audit, tap, publish, call and operate are"
     )]
     Unknown {
         /// The word.
@@ -336,6 +351,9 @@ pub(crate) struct Desk {
     pub(crate) reloader: Arc<Reloader>,
     pub(crate) gateway: Arc<Gateway>,
     pub(crate) metrics: Arc<Metrics>,
+    pub(crate) audit: Audit,
+    /// The node's name.
+    pub(crate) node: String,
 }
 
 /// Binds the socket at `path` and answers there until the returned task is aborted. It retries while another process
@@ -591,6 +609,10 @@ async fn carry_out(request: AdminRequest, desk: &Desk) -> Result<String, String>
             let answer = Zeroizing::new(STANDARD.encode(Zeroizing::new(answer.to_vec())));
             Ok(serde_json::json!({ "answer": *answer }).to_string())
         }
+        AdminRequest::Audit => {
+            let answer = AuditAnswer { node: desk.node.clone(), records: desk.audit.recent() };
+            serde_json::to_string(&answer).map_err(|error| error.to_string())
+        }
         AdminRequest::Reload => {
             let report = reloader.reload("sgc reload").await?;
             serde_json::to_string(&report).map_err(|error| error.to_string())
@@ -697,6 +719,7 @@ mod tests {
         for request in [
             AdminRequest::Status,
             AdminRequest::Reload,
+            AdminRequest::Audit,
             AdminRequest::Crl(vec![0x30, 0, 255]),
             AdminRequest::Graph(None),
             AdminRequest::Graph(Some(Name([0xab; 32]))),
@@ -760,6 +783,7 @@ mod tests {
             (b"sgc/1 operate keeper AA", AdminError::Argument { word: "operate" }),
             (b"sgc/1 publish /a", AdminError::Argument { word: "publish" }),
             (b"sgc/1 report arm-1", AdminError::Argument { word: "report" }),
+            (b"sgc/1 audit now", AdminError::Unknown { word: "audit".into() }),
             (b"sgc/1 reload now", AdminError::Unknown { word: "reload".into() }),
         ] {
             assert_eq!(AdminRequest::parse(line), Err(error), "{}", line.escape_ascii());

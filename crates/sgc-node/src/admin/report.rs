@@ -15,6 +15,7 @@ use sgc_wire::{Kind, REPORT_BYTES_MAX, RosterRow};
 
 use crate::admin::graph::Graph;
 use crate::control::faults::alerts::Alert;
+use crate::state::audit::{AuditRecord, RECENT_OF_FLEET_MAX};
 
 /// Most links in a report.
 pub const REPORT_LINKS_MAX: usize = 64;
@@ -28,6 +29,8 @@ pub const REPORT_MEMBERS_MAX: usize = 2048;
 pub const REPORT_RULES_MAX: usize = 512;
 /// Most recipients, exceptions and tokens of a rule in a report, and most observers and operators.
 pub const REPORT_RECIPIENTS_MAX: usize = 64;
+/// Most audit events of an authority in a report.
+pub const REPORT_EVENTS_MAX: usize = RECENT_OF_FLEET_MAX;
 /// Most alerts, and most problems, in a report.
 pub const REPORT_FAULTS_MAX: usize = 32;
 /// Most reasons of drops, and of refused links, that are read.
@@ -93,6 +96,39 @@ pub struct NodeReport {
     pub members: Option<Vec<ReportMember>>,
     /// The number of further members.
     pub members_omitted: usize,
+    /// The last events of the audit log about the keeping of the fleet, oldest first, at most 64; null unless the node is
+    /// the fleet's authority and keeps a log.
+    #[serde(deserialize_with = "at_most_if_any::<REPORT_EVENTS_MAX, _, _>")]
+    pub events: Option<Vec<ReportEvent>>,
+}
+
+/// An event of a node's audit log.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct ReportEvent {
+    /// The time by the node's clock, milliseconds since 1970.
+    pub time_ms: u64,
+    /// The event, as `sgc audit` names it.
+    pub event: String,
+    /// The topic, or the beginning of its name on the wire; null if it is about none.
+    pub topic: Option<String>,
+    /// The peer's name, or the beginning of its node id; null if there is none.
+    pub peer: Option<String>,
+    /// Everything else, in words.
+    pub detail: String,
+}
+
+impl ReportEvent {
+    /// Returns a record of the audit log as a report shows it.
+    pub fn new(record: &AuditRecord) -> Self {
+        Self {
+            time_ms: record.unix_ms,
+            event: record.event.clone(),
+            topic: record.subject(),
+            peer: record.peer_word(),
+            detail: record.detail(),
+        }
+    }
 }
 
 /// A link of a reporting node.
@@ -236,7 +272,8 @@ impl NodeReport {
     /// Reads the document of another node. Its texts and lists are cut to their bounds.
     pub(crate) fn from_json(document: &[u8]) -> Result<Self, serde_json::Error> {
         let mut report: Self = serde_json::from_slice(document)?;
-        let Self { node, version, links, routers, topics, problems, members, rights, .. } = &mut report;
+        let Self { node, version, links, routers, topics, problems, members, rights, events, .. } =
+            &mut report;
         let of_links = links.iter_mut().flat_map(|link| [Some(&mut link.peer), link.name.as_mut()]);
         let of_routers = routers.iter_mut().flat_map(|router| {
             [Some(&mut router.router), Some(&mut router.state), router.last_failure.as_mut()]
@@ -257,7 +294,12 @@ impl NodeReport {
             });
             of_rules.chain(observers).chain(operators)
         });
-        let texts = [node, version].into_iter().chain(problems).chain(of_members).chain(of_rights);
+        let of_events = events.iter_mut().flatten().flat_map(|one| {
+            let ReportEvent { event, topic, peer, detail, .. } = one;
+            [event, detail].into_iter().chain(topic).chain(peer)
+        });
+        let texts =
+            [node, version].into_iter().chain(problems).chain(of_members).chain(of_rights).chain(of_events);
         texts.chain(of_links.chain(of_routers).chain(of_topics).flatten()).for_each(cut);
         Ok(report)
     }
@@ -467,7 +509,8 @@ mod tests {
         let long = "\u{e4}".repeat(5000);
         let text = format!(
             r#"{{"version": "{long}", "links": [{}], "routers": [{}], "topics": [{}], "problems": [{}], "alerts": [{}],
-                "members": [{}], "rights": {{"rules": [{}], "observers": [{}]}}, "drops": {{{}}}}}"#,
+                "members": [{}], "rights": {{"rules": [{}], "observers": [{}]}},
+                "events": [{}], "drops": {{{}}}}}"#,
             many("{}", 5000),
             many("{}", 5000),
             many(&format!(r#"{{"state": "{long}"}}"#), 1),
@@ -476,6 +519,7 @@ mod tests {
             many("{}", 5000),
             many(&format!(r#"{{"to": ["{long}", {}]}}"#, many("\"a\"", 100)), 600),
             many("\"a\"", 100),
+            many(&format!(r#"{{"detail": "{long}"}}"#), 100),
             (0..5000).map(|n| format!("\"r{n}\": 1")).collect::<Vec<_>>().join(",")
                 + &format!(",\"{long}\": 1"),
         );
@@ -496,6 +540,8 @@ mod tests {
         let to = &rights.rules[0].to;
         assert_eq!((rights.rules.len(), to.len(), rights.observers.len()), (512, 64, 64));
         assert_eq!(to[0].chars().count(), REPORT_TEXT_CHARS_MAX);
+        let events = read.events.unwrap();
+        assert_eq!((events.len(), events[0].detail.chars().count()), (64, REPORT_TEXT_CHARS_MAX));
     }
 
     #[test]

@@ -99,7 +99,8 @@ pub(super) async fn spawn<N: RosNetwork>(
         lanes: lanes.clone(),
     };
     let accepting = sockets.listeners.into_iter().map(|listener| accept(listener, admission())).collect();
-    let socket = admin_socket_path(&config, identity.node_name().as_str());
+    let node_name = identity.node_name().to_string();
+    let socket = admin_socket_path(&config, &node_name);
     let mut tasks = Vec::new();
     tasks.push(tokio::spawn(reopening::watch(
         keeper.network.clone(),
@@ -128,7 +129,14 @@ pub(super) async fn spawn<N: RosNetwork>(
     let (renewer, changes) = (reloader.clone(), keeper.network.onward());
     tasks.push(tokio::spawn(async move { renewer.watch_gateway_certificate(changes).await }));
     tasks.extend(options.watchdog.map(|watchdog| tokio::spawn(keep_fed(watchdog, events.clone()))));
-    let desk = Desk { events: events.clone(), reloader: reloader.clone(), gateway: gateway.clone(), metrics };
+    let desk = Desk {
+        events: events.clone(),
+        reloader: reloader.clone(),
+        gateway: gateway.clone(),
+        metrics,
+        audit: audit.clone(),
+        node: node_name,
+    };
     let socket = admin::begin(socket, desk);
     let program = options.program.unwrap_or_else(|| concat!("sgc ", env!("CARGO_PKG_VERSION")).to_owned());
     info!("{program}: {description}");

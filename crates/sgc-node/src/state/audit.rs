@@ -10,6 +10,7 @@
 
 mod file;
 mod quota;
+mod recent;
 mod record;
 
 use std::collections::BTreeMap;
@@ -30,8 +31,11 @@ use tracing::warn;
 use self::file::LogFile;
 pub use self::file::{Unread, read, rotated_path};
 use self::quota::Quotas;
+pub use self::recent::RECENT_MAX;
+pub(crate) use self::recent::RECENT_OF_FLEET_MAX;
+use self::recent::Recent;
 use self::record::Cause;
-pub use self::record::{AuditEvent, AuditRecord};
+pub use self::record::{AUDIT_ID_CHARS, AuditEvent, AuditRecord};
 use crate::clock::now;
 
 /// Records that may wait to be written.
@@ -57,6 +61,7 @@ struct AuditInner {
     lost: Arc<AtomicU64>,
     names: ArcSwap<PeerNames>,
     quotas: Arc<Mutex<Quotas>>,
+    recent: Mutex<Recent>,
     lost_total: AtomicU64,
 }
 
@@ -91,6 +96,7 @@ impl Audit {
             lost: lost.clone(),
             names: ArcSwap::from_pointee(names),
             quotas: quotas.clone(),
+            recent: Mutex::default(),
             lost_total: AtomicU64::new(0),
         });
         let thread = std::thread::Builder::new()
@@ -108,7 +114,21 @@ impl Audit {
         }
         let mut records = Vec::with_capacity(1);
         lock(&shared.quotas).handle(record, &mut records);
-        records.into_iter().for_each(|record| shared.send(record));
+        for record in records {
+            lock(&shared.recent).push(&record);
+            shared.send(record);
+        }
+    }
+
+    /// Returns the last records since the node started, at most [`RECENT_MAX`], oldest first; `None` if the log is
+    /// switched off.
+    pub fn recent(&self) -> Option<Vec<AuditRecord>> {
+        Some(lock(&self.shared.as_ref()?.recent).all())
+    }
+
+    /// Returns the last ones about the keeping of the fleet, at most [`RECENT_OF_FLEET_MAX`].
+    pub(crate) fn recent_of_fleet(&self) -> Option<Vec<AuditRecord>> {
+        Some(lock(&self.shared.as_ref()?.recent).of_fleet())
     }
 
     /// Replaces the names of peers.

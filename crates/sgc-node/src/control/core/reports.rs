@@ -12,8 +12,8 @@ use tracing::warn;
 
 use super::Core;
 use crate::admin::report::{
-    NodeReport, REPORT_FAULTS_MAX, REPORT_LINKS_MAX, REPORT_ROUTERS_MAX, REPORT_TOPICS_MAX, ReportLink,
-    ReportRights, ReportRouter, ReportTopic, keep_interface,
+    NodeReport, REPORT_FAULTS_MAX, REPORT_LINKS_MAX, REPORT_ROUTERS_MAX, REPORT_TOPICS_MAX, ReportEvent,
+    ReportLink, ReportRights, ReportRouter, ReportTopic, keep_interface,
 };
 use crate::clock::now;
 use crate::control::event::CoreEvent;
@@ -90,6 +90,8 @@ impl<N: RosNetwork> Core<N> {
                 self.note_present_members();
                 let members = self.authority.as_ref().map(Authority::members_job);
                 let mut report = self.node_report();
+                let events = self.authority.is_some().then(|| self.audit.recent_of_fleet()).flatten();
+                report.events = events.map(|records| records.iter().map(ReportEvent::new).collect());
                 Box::new(move || {
                     match members.map(|read| read()) {
                         Some(Ok(members)) => report.set_members(members),
@@ -181,6 +183,7 @@ impl<N: RosNetwork> Core<N> {
             problems,
             members: None,
             members_omitted: 0,
+            events: None,
         }
     }
 }

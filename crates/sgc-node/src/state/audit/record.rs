@@ -9,6 +9,8 @@ use crate::clock::now;
 
 /// Longest text of one field, bytes.
 const FIELD_BYTES_MAX: usize = 512;
+/// Digits of an id in a record for people.
+pub const AUDIT_ID_CHARS: usize = 8;
 
 /// Kind of event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -182,6 +184,43 @@ impl AuditRecord {
         Self { time, unix_ms: unix.0, event: label, kind, cause, ..Self::default() }
     }
 
+    /// Returns the topic or, if it is not known, the beginning of its name.
+    pub fn subject(&self) -> Option<String> {
+        self.topic.clone().or_else(|| self.name.as_ref().map(|name| beginning(name)))
+    }
+
+    /// Returns the peer's name or, if it has none, the beginning of its node id.
+    pub fn peer_word(&self) -> Option<String> {
+        self.peer_name.clone().or_else(|| self.peer.as_ref().map(|peer| beginning(peer)))
+    }
+
+    /// Returns everything else that the record says, in words.
+    pub fn detail(&self) -> String {
+        let mut words = Vec::new();
+        if let (Some(of), Some(count)) = (&self.of, self.count) {
+            words.push(format!(
+                "{count} more of {of} since {}, the last",
+                self.from.as_deref().unwrap_or("?")
+            ));
+        }
+        words.extend(self.reason.clone());
+        words.extend(self.by.as_ref().map(|by| format!("by {by}")));
+        words.extend(self.epoch.map(|epoch| format!("epoch {epoch}")));
+        words.extend(self.remote.as_ref().map(|remote| format!("at {remote}")));
+        words.extend(self.lost.map(|lost| format!("{lost} records were lost")));
+        words.join(", ")
+    }
+
+    /// Returns `true` if the record is about the keeping of the fleet: an operation, a revocation list, a renewal, or a
+    /// refusal that concerns no share.
+    pub(super) fn is_of_fleet(&self) -> bool {
+        match self.kind {
+            Some(AuditEvent::Operation | AuditEvent::Crl | AuditEvent::Renewed) => true,
+            Some(AuditEvent::Refused) => self.about.is_none() && self.topic.is_none(),
+            _ => false,
+        }
+    }
+
     /// Sets the topic.
     #[must_use]
     pub fn topic(mut self, topic: Option<&str>) -> Self {
@@ -256,6 +295,11 @@ pub(super) enum Cause {
     Peer(NodeId),
     /// A peer at this address without a valid certificate.
     Address(IpAddr),
+}
+
+/// Returns the first digits of an id.
+fn beginning(digits: &str) -> String {
+    digits.chars().take(AUDIT_ID_CHARS).collect()
 }
 
 fn bounded(text: &str) -> String {
