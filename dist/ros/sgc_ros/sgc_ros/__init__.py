@@ -1,0 +1,1 @@
+"""The package has only a launch file, and runs the program `sgc` of the host."""
