@@ -349,7 +349,7 @@ impl<N: RosNetwork> Core<N> {
                 self.add_message_keys(message_keys);
                 self.set_observers(observers);
                 self.rights = rights;
-                self.members.set_names(member_names, self.certificates.identity());
+                self.members.set_names(member_names, self.certificates.identity(), Instant::now());
                 self.reconfigure(shares, uses, anchors);
                 let _ = reply.send(());
                 self.answer_renewals();

@@ -79,6 +79,7 @@ impl<N: RosNetwork> Core<N> {
             self.router.handle_link_quality(now, link, rtt, is_silent);
         }
         self.warn_of_owners_here();
+        self.warn_of_misspelt(now.instant);
     }
 
     /// Passes a control frame to the router.
@@ -91,20 +92,19 @@ impl<N: RosNetwork> Core<N> {
         }
     }
 
-    /// Notes a member that was heard. Reports names in rules that are probably misspellings of it.
+    /// Notes a member that was heard.
     pub(super) fn hear_of(&mut self, peer: &VerifiedPeer) {
-        let misspelt = self.members.heard(peer, self.certificates.identity());
-        Self::warn_of_misspelt(&misspelt);
+        self.members.heard(peer, self.certificates.identity(), Instant::now());
     }
 
-    /// Does the same for a node whose catalogue has come.
+    /// Notes a node whose catalogue has come.
     pub(super) fn hear_of_owner(&mut self, owner: NodeId) {
-        let misspelt = self.members.heard_owner(owner, self.certificates.identity());
-        Self::warn_of_misspelt(&misspelt);
+        self.members.heard_owner(owner, self.certificates.identity(), Instant::now());
     }
 
-    fn warn_of_misspelt(misspelt: &[(String, String)]) {
-        for (written, meant) in misspelt {
+    /// Reports names in rules that are probably misspellings of heard members.
+    fn warn_of_misspelt(&mut self, now: Instant) {
+        for (written, meant) in self.members.take_misspelt(now) {
             warn!(
                 "a rule names \"{written}\", which nobody here is called; \"{meant}\" is here and may be meant"
             );

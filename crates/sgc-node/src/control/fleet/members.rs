@@ -5,6 +5,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
+use std::time::{Duration, Instant};
 
 use sgc_config::{Config, Recipient, nearest};
 use sgc_trust::{Fleet, Grantees, Identity, VerifiedPeer};
@@ -14,6 +15,8 @@ use sgc_wire::{GroupTag, NodeId};
 const HEARD_MAX: usize = 4096;
 /// Most spellings that are tried for one member, which takes some milliseconds.
 const SPELLINGS_MAX: usize = 4096;
+/// How long a name must look misspelt until the log says so: after a start, members are heard one after the other.
+const SUSPICION: Duration = Duration::from_secs(10);
 /// Letters of names (`sgc_trust` label rule).
 const LETTERS: &str = "abcdefghijklmnopqrstuvwxyz0123456789-_.";
 
@@ -67,9 +70,17 @@ pub(crate) struct Members {
     nodes: BTreeSet<NodeId>,
     groups: BTreeSet<GroupTag>,
     /// Misspelt names with the probable spelling.
-    meant: BTreeMap<String, String>,
+    meant: BTreeMap<String, Suspicion>,
     /// The same for names in `from`, also if the right spelling is in another rule.
     owners_meant: BTreeMap<String, String>,
+}
+
+/// A name that is probably misspelt.
+#[derive(Debug)]
+struct Suspicion {
+    meant: String,
+    since: Instant,
+    is_told: bool,
 }
 
 impl Members {
@@ -78,42 +89,46 @@ impl Members {
     }
 
     /// Replaces the names by those of another configuration.
-    pub(crate) fn set_names(&mut self, names: MemberNames, own: &Identity) {
+    pub(crate) fn set_names(&mut self, names: MemberNames, own: &Identity, now: Instant) {
         self.names = names;
-        self.meant.clear();
-        self.owners_meant.clear();
-        self.compare(own);
+        self.compare(own, now);
     }
 
-    /// Notes a heard member. Returns newly found misspellings of its names, each with the right spelling.
-    pub(crate) fn heard(&mut self, peer: &VerifiedPeer, own: &Identity) -> Vec<(String, String)> {
-        if peer.ca != own.as_peer().ca || self.nodes.len() >= HEARD_MAX || !self.nodes.insert(peer.node_id) {
-            return Vec::new();
+    /// Notes a heard member.
+    pub(crate) fn heard(&mut self, peer: &VerifiedPeer, own: &Identity, now: Instant) {
+        if peer.ca == own.as_peer().ca && self.nodes.len() < HEARD_MAX && self.nodes.insert(peer.node_id) {
+            let room = HEARD_MAX.saturating_sub(self.groups.len());
+            self.groups.extend(peer.groups.iter().take(room));
+            self.compare(own, now);
         }
-        let room = HEARD_MAX.saturating_sub(self.groups.len());
-        self.groups.extend(peer.groups.iter().take(room));
-        self.compared(own)
     }
 
-    /// Notes a node whose catalogue has come, as [`Self::heard`] does.
-    pub(crate) fn heard_owner(&mut self, node: NodeId, own: &Identity) -> Vec<(String, String)> {
-        if self.nodes.len() >= HEARD_MAX || !self.nodes.insert(node) {
-            return Vec::new();
+    /// Notes a node whose catalogue has come.
+    pub(crate) fn heard_owner(&mut self, node: NodeId, own: &Identity, now: Instant) {
+        if self.nodes.len() < HEARD_MAX && self.nodes.insert(node) {
+            self.compare(own, now);
         }
-        self.compared(own)
     }
 
-    /// Compares names with heard members. Returns newly found misspellings.
-    fn compared(&mut self, own: &Identity) -> Vec<(String, String)> {
-        let before = self.meant.clone();
-        self.compare(own);
-        let news = self.meant.iter().filter(|(written, _)| !before.contains_key(*written));
-        news.map(|(written, meant)| (written.clone(), meant.clone())).collect()
+    /// Returns the misspelt names that the log should report now, each once, with the right spelling.
+    pub(crate) fn take_misspelt(&mut self, now: Instant) -> Vec<(String, String)> {
+        let mut due = Vec::new();
+        for (written, suspicion) in &mut self.meant {
+            if !suspicion.is_told
+                && is_typing_error(written, &suspicion.meant)
+                && suspicion.since + SUSPICION <= now
+            {
+                suspicion.is_told = true;
+                due.push((written.clone(), suspicion.meant.clone()));
+            }
+        }
+        due
     }
 
     /// Iterates over the misspelt names with the right spelling.
     pub(crate) fn misspelt(&self) -> impl Iterator<Item = (&str, &str)> {
-        self.meant.iter().map(|(written, meant)| (written.as_str(), meant.as_str()))
+        let all = self.meant.iter().map(|(written, suspicion)| (written.as_str(), suspicion.meant.as_str()));
+        all.filter(|(written, meant)| is_typing_error(written, meant))
     }
 
     /// Returns the name of a heard member that differs by one letter from an owner's that was not heard.
@@ -127,12 +142,16 @@ impl Members {
         let nodes = nodes.filter_map(|id| self.names.nodes.get(id).cloned());
         let groups = grantees.groups.iter().filter(|(_, tag)| !self.groups.contains(tag));
         let groups = groups.filter_map(|(_, tag)| Some(group_word(self.names.groups.get(tag)?)));
-        let name = |written: String| UnheardName { meant: self.meant.get(&written).cloned(), written };
+        let name = |written: String| {
+            let meant = self.meant.get(&written).map(|suspicion| suspicion.meant.clone());
+            UnheardName { meant, written }
+        };
         nodes.chain(groups).map(name).collect()
     }
 
-    /// Compares spellings of the names in rules with heard members that no rule names.
-    fn compare(&mut self, own: &Identity) {
+    /// Compares spellings of the names in rules with heard members that no rule names. Names that were heard meanwhile
+    /// are suspected no longer.
+    fn compare(&mut self, own: &Identity, now: Instant) {
         let mut left = SPELLINGS_MAX;
         let mut spelt = |name: &str, is_heard: &dyn Fn(&str) -> bool| {
             let mut tried = 0;
@@ -141,34 +160,53 @@ impl Members {
             left -= tried;
             found
         };
+        // No rule means its own node.
+        let is_other = |id: &NodeId| self.nodes.contains(id) && *id != own.node_id();
+        let (mut meant, mut owners_meant) = (BTreeMap::new(), BTreeMap::new());
         for (_, name) in self.names.nodes.iter().filter(|(id, _)| !self.nodes.contains(*id)) {
             let is_heard = |spelling: &str| {
                 let id = own.node_id_of(spelling);
-                id.is_some_and(|id| self.nodes.contains(&id) && !self.names.nodes.contains_key(&id))
+                id.is_some_and(|id| is_other(&id) && !self.names.nodes.contains_key(&id))
             };
-            if let Some(meant) = spelt(name, &is_heard) {
-                self.meant.insert(name.clone(), meant);
+            if let Some(spelling) = spelt(name, &is_heard) {
+                meant.insert(name.clone(), spelling);
             }
         }
         for (_, name) in self.names.owners.iter().filter(|(id, _)| !self.nodes.contains(*id)) {
-            let heard = |spelling: &str| own.node_id_of(spelling).filter(|id| self.nodes.contains(id));
-            let Some(meant) = spelt(name, &|spelling| heard(spelling).is_some()) else { continue };
-            // Nodes of a fleet may have similar names, such as arm-1 and arm-2.
-            if heard(&meant).is_some_and(|id| !self.names.owners.contains_key(&id)) {
-                self.meant.insert(name.clone(), meant.clone());
+            let heard = |spelling: &str| own.node_id_of(spelling).filter(is_other);
+            let Some(spelling) = spelt(name, &|spelling| heard(spelling).is_some()) else { continue };
+            // Nodes of a fleet may have similar names, such as arm-left and arm-lift.
+            if heard(&spelling).is_some_and(|id| !self.names.owners.contains_key(&id)) {
+                meant.insert(name.clone(), spelling.clone());
             }
-            self.owners_meant.insert(name.clone(), meant);
+            owners_meant.insert(name.clone(), spelling);
         }
         for (_, name) in self.names.groups.iter().filter(|(tag, _)| !self.groups.contains(*tag)) {
             let is_heard = |spelling: &str| {
                 let tag = own.fleet_secret().map(|secret| secret.group_tag(spelling));
                 tag.is_some_and(|tag| self.groups.contains(&tag) && !self.names.groups.contains_key(&tag))
             };
-            if let Some(meant) = spelt(name, &is_heard) {
-                self.meant.insert(group_word(name), group_word(&meant));
+            if let Some(spelling) = spelt(name, &is_heard) {
+                meant.insert(group_word(name), group_word(&spelling));
             }
         }
+        let mut before = std::mem::take(&mut self.meant);
+        self.meant.extend(meant.into_iter().map(|(written, meant)| {
+            let suspicion = match before.remove(&written) {
+                Some(old) => Suspicion { meant, ..old },
+                None => Suspicion { meant, since: now, is_told: false },
+            };
+            (written, suspicion)
+        }));
+        self.owners_meant = owners_meant;
     }
+}
+
+/// Returns `true` if a name differs from the meant one in more than its digits. Nodes of a series, such as arm-1 and
+/// arm-2, are different nodes, and some of them may be off.
+fn is_typing_error(written: &str, meant: &str) -> bool {
+    let letters = |name: &str| name.chars().filter(|letter| !letter.is_ascii_digit()).collect::<String>();
+    letters(written) != letters(meant)
 }
 
 fn group_word(group: &str) -> String {
@@ -317,14 +355,17 @@ mod tests {
         let mut fleet = fleet();
         let [arm, desk] = members(&mut fleet, [("arm", &[]), ("desk", &["ops"])]);
         let config = config("[[use]]\nfrom = 'deks'\ntopic = '/b'\n");
+        let begun = Instant::now();
         let mut members = Members::new(MemberNames::from_config(&config, &arm), &arm);
         assert_eq!(members.owner_meant("deks"), None);
-        assert_eq!(members.heard(desk.as_peer(), &arm), [("deks".to_owned(), "desk".to_owned())]);
+        members.heard(desk.as_peer(), &arm, begun);
+        assert_eq!(members.misspelt().collect::<Vec<_>>(), [("deks", "desk")]);
         assert_eq!(members.owner_meant("deks"), Some("desk"));
         // A name that another rule has may be meant, but is no reason for a warning.
         let both = "[[use]]\nfrom = 'deks'\ntopic = '/b'\n[[use]]\nfrom = 'desk'\ntopic = '/c'\n";
         let mut members = Members::new(MemberNames::from_config(&super::tests::config(both), &arm), &arm);
-        assert_eq!(members.heard_owner(desk.node_id(), &arm), []);
+        members.heard_owner(desk.node_id(), &arm, begun);
+        assert_eq!(members.misspelt().next(), None);
         assert_eq!(members.owner_meant("deks"), Some("desk"));
     }
 
@@ -333,6 +374,7 @@ mod tests {
         let mut fleet = fleet();
         let [arm, desk] = members(&mut fleet, [("arm", &[]), ("desk", &["ops"])]);
         let config = config(RULES);
+        let begun = Instant::now();
         let mut members = Members::new(MemberNames::from_config(&config, &arm), &arm);
         let grantees =
             crate::control::settings::policy::grantees(&config.shares[0].to, &arm, &Default::default());
@@ -340,20 +382,24 @@ mod tests {
             members.unheard(&grantees).into_iter().map(|name| (name.written, name.meant)).collect()
         };
         assert!(unheard(&members).len() == 4 && unheard(&members).values().all(Option::is_none));
-        let news = members.heard(desk.as_peer(), &arm);
+        members.heard(desk.as_peer(), &arm, begun);
         let pair = |a: &str, b: &str| (a.to_owned(), b.to_owned());
-        assert_eq!(news, [pair("deks", "desk"), pair("group:op", "group:ops")]);
+        assert_eq!(members.take_misspelt(begun), [], "the others may still be heard");
+        let told = members.take_misspelt(begun + SUSPICION);
+        assert_eq!(told, [pair("deks", "desk"), pair("group:op", "group:ops")]);
         assert_eq!(unheard(&members)["deks"].as_deref(), Some("desk"));
         assert_eq!(unheard(&members)["lamp"], None);
-        assert!(members.heard(desk.as_peer(), &arm).is_empty(), "said once");
+        members.heard(desk.as_peer(), &arm, begun);
+        assert_eq!(members.take_misspelt(begun + 2 * SUSPICION), [], "said once");
         // A node of another fleet with this name is another node.
         let mut other = super::tests::fleet();
         let [_, stranger] = super::tests::members(&mut other, [("x", &[]), ("lamp", &["vision"])]);
-        assert!(members.heard(stranger.as_peer(), &arm).is_empty() && unheard(&members).contains_key("lamp"));
+        members.heard(stranger.as_peer(), &arm, begun);
+        assert!(members.misspelt().count() == 2 && unheard(&members).contains_key("lamp"));
         // The corrected name belongs to a member that was heard before.
         let mut right = config.clone();
         right.shares[0].to = vec![Recipient::Node("desk".parse().unwrap())];
-        members.set_names(MemberNames::from_config(&right, &arm), &arm);
+        members.set_names(MemberNames::from_config(&right, &arm), &arm, begun);
         assert!(members.misspelt().next().is_none());
         assert!(
             members
@@ -364,5 +410,25 @@ mod tests {
                 ))
                 .is_empty()
         );
+    }
+
+    #[test]
+    fn similar_names_are_suspected_only_until_their_nodes_are_heard() {
+        let mut fleet = fleet();
+        let [arm, left] = members(&mut fleet, [("arm-1", &[]), ("left", &[])]);
+        let [lift, third] = members(&mut fleet, [("lift", &[]), ("arm-3", &[])]);
+        let config = config("[[share]]\ntopic = '/a'\nto = ['left', 'arm-2']\n");
+        let begun = Instant::now();
+        let mut members = Members::new(MemberNames::from_config(&config, &arm), &arm);
+        let misspelt =
+            |members: &Members| members.misspelt().map(|(written, _)| written.to_owned()).collect::<Vec<_>>();
+        // The node's own name is near that of the second arm, and no other arm is suspected to be meant.
+        members.heard(third.as_peer(), &arm, begun);
+        assert_eq!(misspelt(&members), [] as [String; 0]);
+        members.heard(lift.as_peer(), &arm, begun);
+        assert_eq!(misspelt(&members), ["left"]);
+        members.heard(left.as_peer(), &arm, begun);
+        assert_eq!(misspelt(&members), [] as [String; 0]);
+        assert_eq!(members.take_misspelt(begun + SUSPICION), []);
     }
 }
