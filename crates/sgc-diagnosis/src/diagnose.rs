@@ -37,9 +37,11 @@ fn begin(graph: &Graph) -> (Walk, bool) {
     let stops = |alert: &Alert| (alert.stops_all() || is_clock(&alert)) && believed == 0;
     let (stopping, others): (Vec<_>, Vec<_>) = graph.alerts.iter().cloned().partition(stops);
     steps.extend(others.into_iter().map(|alert| Step::unknown(node(NodeFinding::Alert(alert)))));
-    steps.extend(refused(graph).into_iter().map(|refused| Step::unknown(Finding::Refused(refused))));
     let stopping = stopping.into_iter().next();
     let is_over = stopping.is_some();
+    if !is_over {
+        steps.extend(refused(graph).into_iter().map(|refused| Step::unknown(Finding::Refused(refused))));
+    }
     steps.extend(stopping.map(|alert| Step::wrong(node(NodeFinding::Alert(alert)))));
     (steps, is_over)
 }

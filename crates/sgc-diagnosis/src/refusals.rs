@@ -801,8 +801,19 @@ fn fixes(why: &str) -> Option<(&'static str, &'static str)> {
     JOINS.iter().find(|(answer, ..)| answer.is_said_as(why)).map(|(_, owner, asker)| (*owner, *asker))
 }
 
-/// Returns the remedy for a link that either end refused, by the reason at the end of `why`.
+/// What a failure says whose cause is the look-up of the router's name.
+const LOOKUPS: [&str; 3] =
+    ["cannot be looked up", "has no address", "the system's DNS servers are not known"];
+
+/// Returns the remedy for a link that could not be dialled for lack of an address, or that either end refused, by the
+/// reason at the end of `why`.
 pub(crate) fn fix_of_link(why: &str) -> Option<&'static str> {
+    if LOOKUPS.iter().any(|said| why.contains(said)) {
+        return Some(
+            "is the name spelt right, and does `getent hosts NAME` find it on this machine? If nothing answers, look at the network and at \
+             the DNS servers: `resolver` in [node], or /etc/resolv.conf. The node asks again by itself",
+        );
+    }
     let other_fleet = "`sgc check -c FILE` says of which fleet this node's identity is. If it is the wrong one, bring the right file here; if \
          the router is of another fleet on purpose, name this fleet's CA in `accept` there, and its CA in `trust` of [node] here";
     let fixes = [

@@ -433,7 +433,8 @@ fn operator_mistakes_come_first() {
     let kept_out = Alert::IdentityInUse { node: "here".into(), place: place(), ago_s: 3 };
     let early = Alert::ClockBeforeCertificate { not_before: "2026".into(), now: "1970".into() };
     let clock = Alert::ClocksDiffer { peer: "cloud".into(), remote: place(), ahead_ms: 7_200_000 };
-    for alert in [displaced, early] {
+    let over = Alert::CertificateOver { not_after: "2026".into(), now: "2031".into() };
+    for alert in [displaced, early, over] {
         let unlinked = Graph { alerts: vec![alert.clone()], links: vec![], ..owner() };
         assert_eq!(found(&unlinked, Verdict::Wrong), Some(alert.to_string()));
         // With links up, the alert is over or about to end.

@@ -32,7 +32,7 @@ use sgc_trust::{Grantees, Identity, TrustAnchors};
 use sgc_types::{Definitions, TypeStore};
 use sgc_wire::{Control, Now};
 use tokio::sync::{mpsc, watch};
-use tracing::info;
+use tracing::{info, warn};
 
 use crate::admin::report::ReportRights;
 use crate::clock::now;
@@ -47,7 +47,7 @@ use crate::control::fleet::operations::Operations;
 use crate::control::fleet::reports::Reports;
 use crate::control::graph::far_consumers::FarConsumers;
 use crate::control::graph::local_graph::LocalGraph;
-use crate::control::parts::certificates::Certificates;
+use crate::control::parts::certificates::{Certificates, Validity};
 use crate::control::parts::forward_table::ForwardTable;
 use crate::control::parts::link_table::LinkTable;
 use crate::control::parts::network_ends::{NetworkEnds, OpenEnd};
@@ -406,8 +406,10 @@ impl<N: RosNetwork> Core<N> {
 
     fn handle_timeouts(&mut self) {
         let now = now();
-        if self.certificates.clock_has_come(now.unix) {
-            info!("the clock is set: this node's certificate holds");
+        match self.certificates.validity_change(now.unix) {
+            Some(Validity::Holds) => info!("this node's certificate holds by the clock here"),
+            Some(Validity::Lost(alert)) => warn!("{alert}; {}", alert.fix()),
+            None => {}
         }
         self.look_at_links(now.instant);
         self.router.handle_timeout(now);

@@ -74,7 +74,7 @@ pub(crate) enum DnsError {
         name: String,
     },
     /// The host has no address.
-    #[error("{host}, which an SRV record names, has no address")]
+    #[error("{host} has no address in DNS")]
     NoAddress {
         /// The host.
         host: String,

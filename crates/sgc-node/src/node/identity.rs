@@ -24,8 +24,19 @@ pub fn load_identity(path: &Path) -> Result<Identity, NodeError> {
 }
 
 /// Checks the identity as [`run`](crate::run) does, and binds nothing. A certificate that is not valid yet passes, see
-/// [`clock_alert`](crate::control::faults::alerts::clock_alert).
+/// [`clock_alert`](crate::control::faults::alerts::clock_alert). One that has ended does not, although a node would start
+/// with it: whoever checks it can renew it now.
 pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
+    check(config, |error| matches!(error, CertError::NotYetValid { .. }))
+}
+
+/// Checks the identity of a node that starts. A certificate that is not valid by the clock passes: the clock may be
+/// wrong and be set later, as NTP does after the start of a machine without a battery.
+pub(crate) fn check_startable(config: &Config) -> Result<Identity, NodeError> {
+    check(config, CertError::is_expiry)
+}
+
+fn check(config: &Config, is_tolerable: impl Fn(&CertError) -> bool) -> Result<Identity, NodeError> {
     let identity = load_identity(&config.identity)?;
     let certified = identity.node_name().as_str();
     if let Some(configured) = config.node_name.as_ref().filter(|n| n.as_str() != certified) {
@@ -35,9 +46,10 @@ pub fn check_identity(config: &Config) -> Result<Identity, NodeError> {
         });
     }
     match identity.anchors().verify(identity.chain(), now().unix) {
-        // The clock may be behind and be set later, as NTP does after the start of a machine without a battery.
-        Ok(_) | Err(CertError::NotYetValid { .. }) => {}
-        Err(source) => return Err(NodeError::Certificate { path: config.identity.clone(), source }),
+        Err(source) if !is_tolerable(&source) => {
+            return Err(NodeError::Certificate { path: config.identity.clone(), source });
+        }
+        Ok(_) | Err(_) => {}
     }
     let touches_topics = !(config.shares.is_empty() && config.uses.is_empty() && config.tokens.is_empty());
     if identity.fleet_secret().is_none() && touches_topics {

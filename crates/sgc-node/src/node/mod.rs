@@ -20,6 +20,7 @@ use sgc_wire::UnixMillis;
 use tracing::{info, warn};
 
 pub use self::error::NodeError;
+use self::identity::check_startable;
 pub use self::identity::{check_identity, load_identity};
 pub use self::local::{OpenNetwork, enclave_of};
 pub use self::options::{RunOptions, Watchdog, admin_socket_path};
@@ -49,11 +50,10 @@ pub async fn run(
     options: RunOptions,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), NodeError> {
-    let identity = Arc::new(check_identity(&config)?);
+    let identity = Arc::new(check_startable(&config)?);
     if let Some(alert) = clock_alert(&identity, now().unix) {
         warn!("{alert}; this node starts all the same and waits: {}", alert.fix());
-    }
-    if let Some(warning) = expiry_warning(&identity, now().unix) {
+    } else if let Some(warning) = expiry_warning(&identity, now().unix) {
         warn!("{warning}");
     }
     let open = local::open_cyclone(identity.clone());

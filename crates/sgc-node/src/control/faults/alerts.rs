@@ -69,6 +69,13 @@ pub enum Alert {
         /// This node's time, RFC 3339.
         now: String,
     },
+    /// This node's clock is past the end of its certificate.
+    CertificateOver {
+        /// End of the certificate, RFC 3339.
+        not_after: String,
+        /// This node's time, RFC 3339.
+        now: String,
+    },
     /// Programs use a Discovery Server of Fast DDS, which this node cannot join.
     DiscoveryServer {
         /// The server, as `ROS_DISCOVERY_SERVER` names it.
@@ -153,7 +160,10 @@ impl Alert {
     pub fn stops_all(&self) -> bool {
         matches!(
             self,
-            Self::Displaced { .. } | Self::ClockBeforeCertificate { .. } | Self::LocalNetworkClosed { .. }
+            Self::Displaced { .. }
+                | Self::ClockBeforeCertificate { .. }
+                | Self::CertificateOver { .. }
+                | Self::LocalNetworkClosed { .. }
         )
     }
 
@@ -169,6 +179,10 @@ impl Alert {
             }
             Self::ClockBeforeCertificate { .. } => {
                 "set the clock, for instance by NTP (`timedatectl`); the node goes on by itself as soon as it is right"
+            }
+            Self::CertificateOver { .. } => {
+                "if `date -u` is wrong, set the clock, for instance by NTP (`timedatectl`); else renew the certificate with `sgc fleet renew` \
+                 where the fleet file is, and bring the identity file here. The node goes on by itself after either"
             }
             Self::DiscoveryServer { .. } => {
                 "start programs whose topics cross without ROS_DISCOVERY_SERVER, with ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST \
@@ -249,6 +263,10 @@ impl fmt::Display for Alert {
                 f,
                 "the clock here says {now}, and this node's certificate begins at {not_before}: the clock is wrong"
             ),
+            Self::CertificateOver { not_after, now } => write!(
+                f,
+                "the clock here says {now}, and this node's certificate ended at {not_after}: nobody links to this node"
+            ),
             Self::DiscoveryServer { server, program: None } => write!(
                 f,
                 "ROS_DISCOVERY_SERVER={server} is set: sgc cannot join a Discovery Server, and finds no program that uses one"
@@ -308,12 +326,16 @@ impl fmt::Display for Alert {
     }
 }
 
-/// Returns an alert if this node's certificate begins later than its clock shows.
+/// Returns an alert if this node's certificate is not valid by its clock.
 pub fn clock_alert(identity: &Identity, now: UnixMillis) -> Option<Alert> {
-    let not_before = identity.as_peer().not_before;
-    let is_early = now < not_before;
-    is_early
-        .then(|| Alert::ClockBeforeCertificate { not_before: not_before.to_string(), now: now.to_string() })
+    let (not_before, not_after) = (identity.as_peer().not_before, identity.not_after());
+    if now < not_before {
+        Some(Alert::ClockBeforeCertificate { not_before: not_before.to_string(), now: now.to_string() })
+    } else if now > not_after {
+        Some(Alert::CertificateOver { not_after: not_after.to_string(), now: now.to_string() })
+    } else {
+        None
+    }
 }
 
 /// Formats a duration for people: the two largest units.

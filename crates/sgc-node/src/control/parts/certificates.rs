@@ -11,7 +11,7 @@ use sgc_trust::{Identity, IdentityError, TrustAnchors, VerifiedPeer};
 use sgc_wire::{Credentials, Now, UnixMillis};
 use tokio::sync::watch;
 
-use crate::control::faults::alerts::clock_alert;
+use crate::control::faults::alerts::{Alert, clock_alert};
 use crate::gateway::Gateway;
 use crate::node::identity::is_older;
 use crate::state::credentials::{StateWriter, renew_at, renewed};
@@ -28,8 +28,17 @@ pub(crate) struct Certificates {
     redial: watch::Sender<()>,
     /// Time of the next request for renewal.
     renew_due: Option<Instant>,
-    /// Whether the clock is still before the start of this node's certificate.
-    awaits_clock: bool,
+    /// Whether the certificate is not valid by the clock.
+    is_out_of_time: bool,
+}
+
+/// A change of the clock, or of the certificate, that matters to this node's links.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Validity {
+    /// The certificate holds again.
+    Holds,
+    /// It does so no longer.
+    Lost(Alert),
 }
 
 impl Certificates {
@@ -42,8 +51,8 @@ impl Certificates {
         redial: watch::Sender<()>,
         now: UnixMillis,
     ) -> Self {
-        let awaits_clock = clock_alert(&identity, now).is_some();
-        Self { identity, store, gateway, keeper, redial, renew_due: None, awaits_clock }
+        let is_out_of_time = clock_alert(&identity, now).is_some();
+        Self { identity, store, gateway, keeper, redial, renew_due: None, is_out_of_time }
     }
 
     pub(crate) fn identity(&self) -> &Arc<Identity> {
@@ -64,11 +73,14 @@ impl Certificates {
         self.store.objection(peer, now)
     }
 
-    /// Returns `true` once, when the clock has reached the beginning of this node's certificate.
-    pub(crate) fn clock_has_come(&mut self, now: UnixMillis) -> bool {
-        let has_come = self.awaits_clock && clock_alert(&self.identity, now).is_none();
-        self.awaits_clock &= !has_come;
-        has_come
+    /// Returns a change of the certificate's validity by the clock, once.
+    pub(crate) fn validity_change(&mut self, now: UnixMillis) -> Option<Validity> {
+        let alert = clock_alert(&self.identity, now);
+        if alert.is_some() == self.is_out_of_time {
+            return None;
+        }
+        self.is_out_of_time = alert.is_some();
+        Some(alert.map_or(Validity::Holds, Validity::Lost))
     }
 
     /// Notes that new credentials were asked for. They are asked for again when the certificate is due.
@@ -191,14 +203,19 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn clock_before_the_certificate_is_reported_once_it_is_right() {
-        let begin = Bench::new(BEGIN).await.first.as_peer().not_before;
-        let early = UnixMillis(begin.0 - 1);
+    async fn certificate_that_holds_or_not_by_the_clock_is_reported_at_each_change() {
+        let identity = Bench::new(BEGIN).await.first;
+        let (begin, end) = (identity.as_peer().not_before, identity.not_after());
+        let (early, late) = (UnixMillis(begin.0 - 1), UnixMillis(end.0 + 1));
         let mut certificates = Bench::new(early).await.certificates;
-        assert!(!certificates.clock_has_come(early));
-        assert!(certificates.clock_has_come(begin) && !certificates.clock_has_come(begin));
-        assert!(!certificates.clock_has_come(early), "a clock that is set back is none that came");
-        assert!(!Bench::new(begin).await.certificates.clock_has_come(begin), "it was right at the start");
+        assert_eq!(certificates.validity_change(early), None, "it was so at the start");
+        assert_eq!(certificates.validity_change(begin), Some(Validity::Holds));
+        assert_eq!(certificates.validity_change(end), None);
+        let lost = certificates.validity_change(late);
+        assert!(matches!(lost, Some(Validity::Lost(Alert::CertificateOver { .. }))), "{lost:?}");
+        assert_eq!(certificates.validity_change(late), None);
+        let lost = Bench::new(begin).await.certificates.validity_change(early);
+        assert!(matches!(lost, Some(Validity::Lost(Alert::ClockBeforeCertificate { .. }))), "{lost:?}");
     }
 
     #[tokio::test]

@@ -1,0 +1,259 @@
+//! Faults around a node that an operator mends while the node runs: a wrong clock, a certificate that has ended, a name
+//! of the router that DNS does not know yet. The log, `sgc status`, `sgc why` and `sgc check` name cause and remedy, and
+//! the same process goes on once it is mended.
+
+#![allow(clippy::unwrap_used)]
+
+#[path = "../../sgc-node/tests/support/dns.rs"]
+mod dns;
+mod support;
+
+use std::fs;
+use std::path::PathBuf;
+use std::process::Command;
+
+use dns::DnsServer;
+use serde_json::Value;
+use sgc_testkit::netsim::Namespace;
+use support::{Running, eventually, own_network, say_log};
+use tempfile::TempDir;
+
+/// ROS domain where the network is shared with other programs.
+const DOMAIN: &str = "95";
+const PORT: u16 = 7447;
+const NO_TOPIC: &str = "no publisher of /chatter";
+
+/// A topic that the desk shares, and one that it uses of a node that is not there.
+const SHARED: &str = "/chatter";
+const USED: &str = "/far";
+
+/// A router and a desk in a network of their own.
+struct Place {
+    dir: TempDir,
+    network: Option<Namespace>,
+    /// Whether the desk has a clock of its own: the file `clock` has its offset, which libfaketime reads.
+    has_clock: bool,
+}
+
+impl Place {
+    fn new(test: &str) -> Self {
+        let network = own_network(format!("sgcmend-{}-{test}", std::process::id()));
+        Self { dir: tempfile::tempdir().unwrap(), network, has_clock: false }
+    }
+
+    /// Makes the fleet.
+    fn enroll(&self) {
+        for args in ["fleet create lab", "fleet enroll cloud --role router", "fleet enroll desk"] {
+            let output = self.by_clock(&args.split(' ').collect::<Vec<_>>()).output().unwrap();
+            assert!(output.status.success(), "{args}: {output:?}");
+        }
+    }
+
+    fn file(&self, name: &str) -> PathBuf {
+        self.dir.path().join(name)
+    }
+
+    fn set_clock(&mut self, offset: &str) {
+        self.has_clock = true;
+        // Whole: the desk reads it all the time.
+        fs::write(self.file("clock.new"), offset).unwrap();
+        fs::rename(self.file("clock.new"), self.file("clock")).unwrap();
+    }
+
+    fn sgc(&self, args: &[&str]) -> Command {
+        let mut command = support::sgc(self.network.as_ref(), self.dir.path());
+        command.args(args);
+        command
+    }
+
+    /// The same with the desk's clock.
+    fn by_clock(&self, args: &[&str]) -> Command {
+        let mut command = self.sgc(args);
+        if self.has_clock {
+            command.env("LD_PRELOAD", faketime()).env("FAKETIME_TIMESTAMP_FILE", self.file("clock"));
+            // It looks at the file once a second.
+            command.env("FAKETIME_CACHE_DURATION", "1").env("FAKETIME_DONT_FAKE_MONOTONIC", "1");
+        }
+        command
+    }
+
+    fn port(&self) -> u16 {
+        if self.network.is_some() { PORT } else { 20_000 + (std::process::id() % 10_000) as u16 }
+    }
+
+    fn start_cloud(&self) -> Running {
+        let text = format!(
+            "identity = \"cloud.identity\"\n[node]\nstate = \"cloud.state\"\n[admin]\nsocket = \"cloud.sock\"\n\
+             [router]\nlisten = [\"quic://127.0.0.1:{}\"]\n",
+            self.port()
+        );
+        fs::write(self.file("cloud.toml"), text).unwrap();
+        Running::start(self.sgc(&["run", "-c", "cloud.toml"]), &self.file("cloud.log"))
+    }
+
+    /// Starts the desk, which dials a router at `host`.
+    fn start_desk(&self, host: &str, node: &str) -> Running {
+        let domain = if self.network.is_some() { "0" } else { DOMAIN };
+        let text = format!(
+            "identity = \"desk.identity\"\n[node]\nstate = \"desk.state\"\nrouters = [\"quic://{host}:{}\"]\n{node}\n\
+             [admin]\nsocket = \"desk.sock\"\n\
+             [ros]\ndomain_id = {domain}\ndiscovery_range = \"localhost\"\nstatic_peers = []\n\
+             [[share]]\ntopic = \"{SHARED}\"\nto = [\"*\"]\n[[use]]\ntopic = \"{USED}\"\nfrom = \"robot\"\n",
+            self.port()
+        );
+        fs::write(self.file("desk.toml"), text).unwrap();
+        Running::start(self.by_clock(&["run", "-c", "desk.toml"]), &self.file("desk.log"))
+    }
+
+    fn log(&self) -> String {
+        fs::read_to_string(self.file("desk.log")).unwrap_or_default()
+    }
+
+    /// The text with which a command answers about the desk, on both outputs.
+    fn asked(&self, args: &[&str]) -> String {
+        let output = self.by_clock(args).args(["-c", "desk.toml"]).output().unwrap();
+        String::from_utf8([output.stdout, output.stderr].concat()).unwrap()
+    }
+
+    fn status(&self) -> Value {
+        serde_json::from_str(&self.asked(&["status", "--json"])).unwrap_or_default()
+    }
+
+    fn is_linked(&self) -> bool {
+        self.status()["links"].as_array().is_some_and(|links| links.len() == 1)
+    }
+
+    /// Asserts that log, `sgc status` and `sgc why` name the cause, and that the latter names the remedy.
+    fn assert_told(&self, topic: &str, cause: &str, remedy: &str) {
+        eventually(&format!("the log says {cause}"), || self.log().contains(cause));
+        let said = |args: &[&str]| {
+            let mut text = String::new();
+            eventually(&format!("{args:?} says {cause}"), || {
+                text = self.asked(args);
+                text.contains(cause)
+            });
+            text
+        };
+        said(&["status"]);
+        let why = said(&["why", topic]);
+        assert!(why.contains(remedy), "{why}");
+    }
+
+    /// Asserts that nothing is wrong any more but that nobody publishes.
+    fn assert_mended(&self) {
+        eventually("the desk is linked", || self.is_linked());
+        eventually("nothing else is wrong", || self.asked(&["why", SHARED]).contains(NO_TOPIC));
+        assert_eq!(self.status()["alerts"], serde_json::json!([]));
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            say_log("desk", &self.log());
+            say_log("cloud", &fs::read_to_string(self.file("cloud.log")).unwrap_or_default());
+        }
+    }
+}
+
+/// Returns the library of Debian's package `libfaketime`.
+fn faketime() -> PathBuf {
+    let places = fs::read_dir("/usr/lib").unwrap().flatten();
+    let mut found = places.map(|place| place.path().join("faketime/libfaketimeMT.so.1"));
+    found.find(|library| library.exists()).expect("libfaketime is missing: run `make deps-test`")
+}
+
+#[test]
+fn node_with_a_clock_days_behind_or_ahead_waits_and_goes_on_once_it_is_set() {
+    let mut place = Place::new("clock");
+    place.enroll();
+    let _cloud = place.start_cloud();
+    let set = "set the clock, for instance by NTP (`timedatectl`)";
+    for (offset, cause, checked) in [
+        ("-5d", "and this node's certificate begins at", "the clock is wrong. The node starts and waits"),
+        ("+200d", "and this node's certificate ended at", "enroll again, or set the clock"),
+    ] {
+        place.set_clock(offset);
+        let desk = place.start_desk("127.0.0.1", "");
+        place.assert_told(SHARED, cause, set);
+        let check = place.asked(&["check"]);
+        assert!(check.contains(checked), "{check}");
+        assert!(!place.is_linked());
+        place.set_clock("+0");
+        place.assert_mended();
+        // It is wrong while the node runs: the link ends, and the cause is told again.
+        if offset == "+200d" {
+            place.set_clock(offset);
+            eventually("the link ends", || !place.is_linked());
+            place.assert_told(SHARED, cause, set);
+            place.set_clock("+0");
+            place.assert_mended();
+        }
+        drop(desk);
+        fs::remove_file(place.file("desk.log")).unwrap();
+    }
+}
+
+#[test]
+fn clock_that_is_hours_ahead_of_the_router_is_told_and_forgotten_once_it_is_set() {
+    let mut place = Place::new("hours");
+    place.enroll();
+    let _cloud = place.start_cloud();
+    place.set_clock("+3h");
+    let _desk = place.start_desk("127.0.0.1", "");
+    place.assert_told(SHARED, "is 3 h 0 min behind the one here", "set the clock that is wrong");
+    place.set_clock("+0");
+    place.assert_mended();
+}
+
+#[test]
+fn node_whose_certificate_has_ended_starts_and_goes_on_once_it_is_renewed() {
+    let mut place = Place::new("renewed");
+    place.set_clock("-100d");
+    place.enroll();
+    place.has_clock = false;
+    let good = |args: &[&str]| {
+        let output = place.sgc(args).output().unwrap();
+        assert!(output.status.success(), "{args:?}: {output:?}");
+    };
+    good(&["fleet", "renew", "cloud"]);
+    let _cloud = place.start_cloud();
+    let _desk = place.start_desk("127.0.0.1", "");
+    place.assert_told(
+        SHARED,
+        "and this node's certificate ended at",
+        "renew the certificate with `sgc fleet renew`",
+    );
+    good(&["fleet", "renew", "desk"]);
+    place.assert_mended();
+}
+
+#[test]
+fn node_links_once_dns_knows_its_router() {
+    let place = Place::new("dns");
+    place.enroll();
+    let _cloud = place.start_cloud();
+    let start = || DnsServer::start();
+    let server = match &place.network {
+        Some(network) => network.within(start).unwrap(),
+        None => start(),
+    };
+    let _desk = place.start_desk("router.lab.example", &format!("resolver = \"{}\"", server.addr));
+    let remedy = "does `getent hosts NAME` find it on this machine?";
+    place.assert_told(USED, "router.lab.example has no address in DNS", remedy);
+    server.set_host("router.lab.example.", [127, 0, 0, 1]);
+    place.assert_mended();
+}
+
+#[test]
+fn node_without_a_dns_server_says_that_nobody_answers() {
+    let place = Place::new("resolver");
+    place.enroll();
+    // Nobody listens there.
+    let _desk = place.start_desk("router.lab.example", "resolver = \"127.0.0.1:9\"");
+    place.assert_told(
+        USED,
+        "router.lab.example cannot be looked up",
+        "look at the network and at the DNS servers",
+    );
+}
